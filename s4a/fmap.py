@@ -1,0 +1,119 @@
+"""Functional maps (3.3, 4.1): fit, map <-> match (eq. 2 and 4), ZoomOut.
+
+The source is the paper's M with basis Phi, the target its N with basis Psi.  C carries functions source -> target;
+a match holds, for every vertex of the target, a vertex of the source.
+"""
+
+import numpy as np
+
+
+def fmap_from_match(Phi_source, Phi_target, area_target, match):
+    """C = Psi^T A_N Phi[match]: the map of functions that a match gives (eq. 1 in both bases).
+
+    Parameters
+    ----------
+    Phi_source : float ndarray (n_source, k)
+    Phi_target : float ndarray (n_target, k)
+    area_target : float ndarray (n_target,), of sum 1
+    match : int ndarray (n_target,)
+
+    Returns
+    -------
+    C : float ndarray (k_target, k_source)
+    """
+    return Phi_target.T @ (area_target[:, None] * Phi_source[match])
+
+
+def nearest_rows(Q, D, *, block=2048):
+    """For every row of Q the index of the nearest row of D (Euclidean), by blocks of one matrix product each.
+
+    float32 throughout: above about 20 dims this is faster than a KD-tree; ties and differences below float32's
+    precision go to the lowest index among the equal ones.
+
+    Examples
+    --------
+    >>> nearest_rows(np.array([[0.1], [4.0]]), np.array([[0.0], [5.0]])).tolist()
+    [0, 1]
+    """
+    Q, D = np.ascontiguousarray(Q, np.float32), np.ascontiguousarray(D, np.float32)
+    half = 0.5 * np.einsum("ij,ij->i", D, D)
+    found = np.empty(len(Q), np.int64)
+    for start in range(0, len(Q), block):
+        score = Q[start : start + block] @ D.T
+        score -= half
+        found[start : start + block] = score.argmax(axis=1)
+    return found
+
+
+def match_from_fmap(C, Phi_source, Phi_target):
+    """Nearest neighbours of the rows of Psi among those of Phi C^T (eq. 2)."""
+    k_target, k_source = C.shape
+    return nearest_rows(Phi_target[:, :k_target], Phi_source[:, :k_source] @ C.T)
+
+
+def zoomout(C, Phi_source, Phi_target, area_target, k, *, step=5):
+    """ZoomOut (Melzi et al. 2019): C -> match -> a larger C, until it is k x k.
+
+    Parameters
+    ----------
+    C : float ndarray (k_init, k_init)
+    Phi_source, Phi_target : float ndarray (n, >= k)
+    area_target : float ndarray (n_target,), of sum 1
+    k : int
+        Final size.
+    step : int
+        Growth per round.
+
+    Returns
+    -------
+    C : float ndarray (k, k)
+    match : int ndarray (n_target,)
+        The match of the final C.
+    """
+    sizes = [*range(C.shape[0] + step, k, step), k] if k > C.shape[0] else []
+    for size in sizes:
+        match = match_from_fmap(C, Phi_source, Phi_target)
+        C = fmap_from_match(Phi_source[:, :size], Phi_target[:, :size], area_target, match)
+    return C, match_from_fmap(C, Phi_source, Phi_target)
+
+
+def heat_features(Phi, eigenvalue, vertices, times):
+    """Heat kernels h_t(x, v) = sum exp(-t lambda) phi(x) phi(v) of landmark vertices, as coefficients ``(k, v * t)``."""
+    decay = np.exp(-np.asarray(times)[:, None] * eigenvalue[None, :])
+    columns = np.einsum("tk,vk->kvt", decay, Phi[vertices]).reshape(Phi.shape[1], -1)
+    return columns / np.linalg.norm(columns, axis=0)
+
+
+def fit_landmarks(Phi_source, Phi_target, ev_source, ev_target, landmark_source, landmark_target, *, commute=1e-3):
+    """Fit of C on landmark pairs (step 4 of 4.1): descriptors preserved, Laplacians commute.
+
+    min |C F - G|^2 + commute |C Lambda_source - Lambda_target C|^2, where F and G are heat kernels around the
+    landmarks at several times.  The second term is diagonal in C, so each row of C has normal equations of its own,
+    solved directly (Ovsjanikov et al. 2012).
+
+    Parameters
+    ----------
+    Phi_source, Phi_target : float ndarray (n, k)
+    ev_source, ev_target : float ndarray (k,)
+    landmark_source, landmark_target : int ndarray (p,)
+        Corresponding vertices.
+
+    Returns
+    -------
+    C : float ndarray (k, k)
+    """
+    top = max(ev_source[-1], ev_target[-1])
+    times = np.geomspace(4 * np.log(10) / top, 4 * np.log(10) / max(ev_source[1], ev_target[1]), 8)
+    F = heat_features(Phi_source, ev_source, landmark_source, times)
+    G = heat_features(Phi_target, ev_target, landmark_target, times)
+    FF, GF = F @ F.T, G @ F.T
+    penalty = commute * np.trace(FF) * ((ev_target[:, None] - ev_source[None, :]) / top) ** 2
+    C = np.stack([np.linalg.solve(FF + np.diag(p), g) for p, g in zip(penalty, GF, strict=True)])
+    C[:, 0] = 0  # constants go to constants
+    C[0, 0] = np.sign(Phi_source[0, 0] * Phi_target[0, 0])
+    return C
+
+
+def orthogonality_error(C):
+    """|C^T C - I|_F / sqrt(k): 0 for a map that preserves areas."""
+    return float(np.linalg.norm(C.T @ C - np.eye(C.shape[1])) / np.sqrt(C.shape[1]))

@@ -1,0 +1,142 @@
+"""The table of every variable that a study holds: its dims, unit and meaning.
+
+Each step makes its output through :func:`variable`, so that names, dims and attributes are the same everywhere,
+and checks its input through :func:`require`.  A variable that is not in the table does not exist.
+"""
+
+import numpy as np
+import xarray as xr
+
+INPUT = "unit of the input"
+INPUT2 = "squared unit of the input"
+ONE = "1"
+UNIT_AREA = "1, for the surface scaled to unit area"
+
+# name: (dims, unit, long_name).  In the file of a single shape a leading dim `shape` is absent.
+TABLE = {
+    # a mesh, original or coarse
+    "position": (("vertex", "xyz"), INPUT, "vertex position"),
+    "corner_vertex": (("triangle", "corner"), ONE, "vertex at each corner of a triangle"),
+    "file_vertex": (("vertex",), ONE, "index of the vertex in its file"),
+    "vertex_of_file": (("file_vertex_index",), ONE, "vertex that a vertex of the file became, -1 where dropped"),
+    "label": (("vertex",), ONE, "label of the vertex"),
+    "landmark_name": (("landmark",), ONE, "name of the landmark"),
+    "landmark_position": (("landmark", "xyz"), INPUT, "position of the landmark"),
+    # low resolution (4.1) and its spectrum (3.3)
+    "vertex_area": (("vertex",), INPUT2, "lumped area of the vertex, the diagonal of A"),
+    "edge_vertex": (("edge", "end"), ONE, "vertices at both ends of an edge"),
+    "cotan_weight": (("edge",), ONE, "cotan weight of the edge, so that the Laplacian is A^-1 W"),
+    "sample_vertex": (("vertex",), ONE, "vertex of the original mesh that the coarse vertex is"),
+    "coarse_vertex": (("original_vertex", "corner"), ONE, "coarse vertices that carry an original vertex: columns of U"),
+    "coarse_weight": (("original_vertex", "corner"), ONE, "their barycentric weights: entries of U"),
+    "eigenvalue": (("mode",), UNIT_AREA, "eigenvalue of the Laplace-Beltrami operator"),
+    "eigenfunction": (("vertex", "mode"), UNIT_AREA, "eigenfunction, orthonormal in the vertex areas"),
+    # one pair (4.1)
+    "match": (("vertex",), ONE, "on each vertex of the target, the matched vertex of the source"),
+    # the network of maps (3.4)
+    "source": (("pair",), ONE, "shape whose functions the map takes"),
+    "target": (("pair",), ONE, "shape on which the map gives functions"),
+    "fmap": (("pair", "mode_target", "mode_source"), ONE, "functional map, source functions to target functions"),
+    "fmap_initial": (
+        ("pair", "mode_target_initial", "mode_source_initial"),
+        ONE,
+        "functional map before Consistent ZoomOut",
+    ),
+    "weight": (("pair",), ONE, "weight of the map in the consistent latent basis"),
+    "cycle_error": (("pair",), ONE, "mean |C_cycle - I|_F / sqrt(k) over the 3-cycles through the pair"),
+    "cycle_error_initial": (("pair",), ONE, "the same before Consistent ZoomOut"),
+    # latent basis and median (3.4 - 3.6, eq. 3 and 5)
+    "latent_basis": (("shape", "mode", "latent"), ONE, "consistent latent basis Y of each shape"),
+    "latent_eigenvalue": (("latent",), UNIT_AREA, "eigenvalue of the latent (limit) shape"),
+    "area_difference": (("shape", "latent", "latent_2"), ONE, "area-based shape difference D = Y^T Y"),
+    "conformal_difference": (("shape", "latent", "latent_2"), ONE, "conformal shape difference"),
+    "distance_to_median": (("shape",), ONE, "distance |D_i - I| of each shape to the limit shape (eq. 5)"),
+    "area_score": (("shape", "difference_component"), ONE, "PCA scores of the area-based shape differences"),
+    "conformal_score": (("shape", "difference_component"), ONE, "PCA scores of the conformal shape differences"),
+    "area_variance_ratio": (("difference_component",), ONE, "share of variance of the area-based differences"),
+    "conformal_variance_ratio": (("difference_component",), ONE, "share of variance of the conformal differences"),
+    # registration (eq. 6 - 8)
+    "registered_match": (("shape", "vertex"), ONE, "on each template vertex, the matched vertex of the shape"),
+    "displacement": (("shape", "vertex", "xyz"), INPUT, "registered shape minus template, smooth"),
+    "displacement_raw": (("shape", "vertex", "xyz"), INPUT, "matched vertex of the aligned shape minus template"),
+    "rotation": (("shape", "xyz", "xyz_2"), ONE, "rotation R of the alignment x -> s R x + t onto the template"),
+    "translation": (("shape", "xyz"), INPUT, "translation t of the alignment onto the template"),
+    "scale": (("shape",), ONE, "scale s of the alignment onto the template"),
+    "confidence": (("shape", "vertex"), ONE, "confidence of the match, 0 to 1"),
+    "template_triangle": (("original_vertex",), ONE, "template triangle on which the vertex of the shape lies"),
+    "template_barycentric": (("original_vertex", "corner"), ONE, "barycentric weights in that triangle"),
+    # modes (6.1)
+    "mean_displacement": (("vertex", "xyz"), INPUT, "mean of the displacements"),
+    "deformation": (("component", "vertex", "xyz"), INPUT, "deformation of one standard deviation along the component"),
+    "standard_deviation": (("component",), INPUT, "standard deviation of the component (area-weighted RMS)"),
+    "score": (("shape", "component"), ONE, "score of each shape, in standard deviations"),
+    "explained_variance_ratio": (("component",), ONE, "share of the variance at full resolution"),
+    "explained_variance_ratio_low": (("component",), ONE, "share of the variance at low resolution"),
+    # the report
+    "status": (("shape",), ONE, "ok, repaired or excluded"),
+    "reason": (("shape",), ONE, "what was found and done"),
+    "path": (("shape",), ONE, "file of the shape"),
+    "seconds": (("stage",), "s", "wall time of the stage"),
+    "peak_memory": (("stage",), "MiB", "peak resident memory of this process and its workers in the stage"),
+}
+
+
+def variable(name, data, **attrs):
+    """A variable of the table, with its dims, unit and meaning.
+
+    Parameters
+    ----------
+    name : str
+        A name of :data:`TABLE`.
+    data : array_like
+        Values; its number of axes must be that of the table, or one less where the table starts with ``shape``.
+    **attrs
+        Further attributes (str, int, float or lists of str, as netCDF holds no other).
+
+    Returns
+    -------
+    xarray.Variable
+
+    Raises
+    ------
+    ValueError
+        When the name is not in the table or the number of axes differs.
+
+    Examples
+    --------
+    >>> variable("position", [[0.0, 0.0, 1.0]]).dims
+    ('vertex', 'xyz')
+    """
+    if name not in TABLE:
+        raise ValueError(f"no variable {name!r} in the schema; add it to s4a.schema.TABLE first")
+    dims, unit, long_name = TABLE[name]
+    data = np.asarray(data)
+    if data.ndim == len(dims) - 1 and dims[0] in ("shape", "pair"):
+        dims = dims[1:]
+    if data.ndim != len(dims):
+        raise ValueError(f"{name} needs the dims {dims}, found an array of shape {data.shape}")
+    return xr.Variable(dims, data, {"units": unit, "long_name": long_name, **attrs})
+
+
+def dataset(attrs=None, **variables):
+    """A Dataset of variables of the table: ``dataset(position=x, corner_vertex=t)``; see :func:`variable`."""
+    return xr.Dataset({name: variable(name, data) for name, data in variables.items()}, attrs=attrs)
+
+
+def require(data, *names, what="dataset"):
+    """Raise ValueError unless every variable of `names` is in the Dataset, with the dims of the table.
+
+    Examples
+    --------
+    >>> require(dataset(position=[[0.0, 0.0, 1.0]]), "position")
+    """
+    missing = [name for name in names if name not in data]
+    if missing:
+        raise ValueError(
+            f"the {what} needs the variables {', '.join(names)}; it lacks {', '.join(missing)} "
+            f"and has {', '.join(map(str, data.data_vars)) or 'none'}"
+        )
+    for name in names:
+        dims = TABLE[name][0]
+        if set(data[name].dims) not in (set(dims), set(dims[1:])):
+            raise ValueError(f"{name} of the {what} needs the dims {dims}, found {data[name].dims}")
