@@ -72,6 +72,17 @@ TABLE = {
     "score": (("shape", "component"), ONE, "score of each shape, in standard deviations"),
     "explained_variance_ratio": (("component",), ONE, "share of the variance at full resolution"),
     "explained_variance_ratio_low": (("component",), ONE, "share of the variance at low resolution"),
+    # the truth of a synthetic collection
+    "reference_point": (("vertex", "xyz"), ONE, "point of the unit sphere that the vertex is the image of"),
+    "planted_score": (("shape", "planted_mode"), ONE, "planted score of each shape, in standard deviations"),
+    "planted_centre": (("planted_part", "xyz"), "mm", "centre of each localised field of the planted modes"),
+    "planted_width": (("planted_part",), "mm", "its width, the standard deviation of a Gaussian"),
+    "planted_push": (("planted_mode", "planted_part", "xyz"), "mm", "its translation in each planted mode"),
+    "planted_turn": (("planted_mode", "planted_part", "xyz"), "rad", "its rotation in each planted mode"),
+    "own_centre": (("shape", "own_part", "xyz"), "mm", "centres of the noise and, last, of the tumour of each shape"),
+    "own_width": (("shape", "own_part"), "mm", "their widths"),
+    "own_push": (("shape", "own_part", "xyz"), "mm", "their translations"),
+    "landmark_reference": (("landmark", "xyz"), ONE, "point of the unit sphere that the landmark is the image of"),
     # the report
     "status": (("shape",), ONE, "ok, repaired or excluded"),
     "reason": (("shape",), ONE, "what was found and done"),
