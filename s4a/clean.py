@@ -1,0 +1,489 @@
+"""Cleaning: from the triangles of a file to an oriented manifold surface, before everything else (4.1).
+
+A triangle corner is counted as half-edges are: corner h = i m + t is corner i of triangle t, and half-edge h runs from
+it to the next corner of the triangle (:func:`s4a.mesh.directed_edges`).  Two half-edges that the surface joins are
+mates; the rest of the topology follows from the mates.
+"""
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from s4a.mesh import as_arrays, as_dataset, triangle_areas, triangle_normals, unique_edges
+from s4a.schema import require
+
+RELATIVE_TOLERANCE = 1e-7  # of the diagonal of the bounding box: nearer vertices are one, lower triangles are flat
+MOST_AROUND_EDGE = 16  # an edge with more triangles is cut; pairing them would need their number squared
+
+REPAIRS = {
+    "nonfinite_vertices": "non-finite vertices removed",
+    "welded_vertices": "vertices welded",
+    "degenerate_triangles": "triangles with repeated corners dropped",
+    "duplicate_triangles": "duplicate triangles dropped",
+    "flipped_edges": "edges of zero-area triangles flipped",
+    "flat_triangles": "zero-area triangles dropped",
+    "nonmanifold_edges": "non-manifold edges separated",
+    "cut_edges": "sides of edges cut open",
+    "split_vertices": "vertices added by splitting non-manifold ones",
+    "inserted_vertices": "vertices inserted on edges that met twice",
+    "reoriented_triangles": "triangles reoriented",
+    "dropped_components": "components dropped",
+    "unreferenced_vertices": "vertices without triangles dropped",
+}
+
+
+def clean(mesh, *, components="largest", strict=False):
+    """A mesh made an oriented edge- and vertex-manifold surface.
+
+    Vertices nearer than 1e-7 of the bounding-box diagonal are welded, degenerate and duplicate triangles dropped,
+    zero-area triangles removed by flipping their long edge (collapsed where two of their corners weld), non-manifold
+    edges and vertices separated into sheets, triangles oriented consistently and outwards, small components dropped.
+    Holes stay as they are.
+
+    Parameters
+    ----------
+    mesh : Dataset
+        With ``position(vertex, xyz)`` and ``corner_vertex(triangle, corner)``.
+    components : "largest", "all" or int
+        Keep the component with the largest area, all of them, or that many of the largest.
+    strict : bool
+        Refuse vertices that are not finite instead of removing them with their triangles.
+
+    Returns
+    -------
+    Dataset
+        With ``position``, ``corner_vertex``, ``file_vertex`` (several vertices share one where it was split) and
+        ``vertex_of_file``; what was found and repaired is counted in the attributes, see :func:`clean_arrays`.
+
+    Raises
+    ------
+    ValueError
+        When indices are out of range, nothing is left, or the largest component has under half of the area.
+
+    Examples
+    --------
+    >>> from s4a.mesh import as_dataset
+    >>> tetrahedron = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3], [0, 1, 3]]  # the last triangle is there twice
+    >>> mesh = clean(as_dataset([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], tetrahedron))
+    >>> mesh.sizes["triangle"], mesh.attrs["duplicate_triangles"], mesh.attrs["genus"]
+    (4, 1, 0)
+    """
+    require(mesh, "position", "corner_vertex", what="mesh")
+    X, T, file_vertex, vertex_of_file, counts = clean_arrays(*as_arrays(mesh), components=components, strict=strict)
+    return as_dataset(X, T, {**mesh.attrs, **counts}, file_vertex=file_vertex, vertex_of_file=vertex_of_file)
+
+
+def clean_arrays(points, triangles, *, components="largest", strict=False):
+    """:func:`clean` on arrays.
+
+    Returns
+    -------
+    X : float ndarray (n, 3)
+    T : int32 ndarray (m, 3)
+    file_vertex : int32 ndarray (n,)
+        Row of `points` that each vertex is; a vertex inserted on an edge has that of one end.
+    vertex_of_file : int32 ndarray (len(points),)
+        A vertex that each row of `points` became, -1 where it was dropped.
+    counts : dict of str to int, and ``area_dropped``, the share of the area in the dropped components
+        The keys of :data:`REPAIRS`, sizes of the input (``file_vertices``, ``file_triangles``), ``components`` found,
+        and of the result ``holes`` (boundary loops), ``euler_characteristic`` and ``genus`` (sum over components).
+    """
+    P, F = _validated(points, triangles, components)
+    counts = {"file_vertices": len(P), "file_triangles": len(F), **dict.fromkeys(REPAIRS, 0)}
+    counts["unreferenced_vertices"] = int(len(P) - len(_used(F)))
+    F = _drop_nonfinite(P, F, strict, counts)
+    group, tolerance = _weld(P, F, counts)
+    F = _drop_repeated(F, group, counts)
+    F = _flip_flat(P, F, group, tolerance, counts)
+    if len(F) == 0:
+        raise ValueError(f"a surface needs triangles with area; none of the {counts['file_triangles']} has any")
+    F, mate = _mates(P, F, group, counts)
+    V, file_vertex = _umbrellas(F, mate)
+    counts["split_vertices"] = int(len(file_vertex) - len(_used(group[F])))
+    X, T, file_vertex = _split_double_edges(P[file_vertex], V, file_vertex, mate, counts)
+    X, T, kept = _largest_components(X, T, components, counts)
+    new = np.cumsum(kept) - 1
+    new[~kept] = -1
+    _count_topology(T, counts)
+    vertex_of_file = _vertex_of_file(group, new[V].ravel(), F.ravel())
+    return X, new[T].astype(np.int32), file_vertex[kept].astype(np.int32), vertex_of_file, counts
+
+
+def repairs(counts):
+    """What was repaired, in words; empty when the file was a clean surface.
+
+    Examples
+    --------
+    >>> repairs({"welded_vertices": 2, "cut_edges": 0, "dropped_components": 3, "area_dropped": 0.0214})
+    '2 vertices welded; 3 components dropped (2.1 % of the area)'
+    """
+    parts = [f"{counts[name]} {text}" for name, text in REPAIRS.items() if counts.get(name)]
+    return "; ".join(
+        f"{part} ({100 * counts['area_dropped']:.2g} % of the area)" if part.endswith("components dropped") else part
+        for part in parts
+    )
+
+
+def _validated(points, triangles, components):
+    """The arrays as float64 and int64, or ValueError."""
+    P, F = np.asarray(points, np.float64), np.asarray(triangles)
+    if P.ndim != 2 or P.shape[1] != 3 or F.ndim != 2 or F.shape[1] != 3 or len(F) == 0:
+        raise ValueError(f"a mesh needs points (n, 3) and triangles (m, 3); found {P.shape} and {F.shape}")
+    if not np.issubdtype(F.dtype, np.integer):
+        raise ValueError(f"triangles need integer vertex indices; found {F.dtype}")
+    if F.min() < 0 or F.max() >= len(P):
+        raise ValueError(
+            f"triangles need vertex indices 0..{len(P) - 1}, as there are {len(P)} vertices; "
+            f"found {F.min()}..{F.max()}, {((F < 0) | (F >= len(P))).any(axis=1).sum()} triangles out of range"
+        )
+    if components not in ("largest", "all") and not (isinstance(components, int | np.integer) and components >= 1):
+        raise ValueError(f'components needs to be "largest", "all" or a number from 1; found {components!r}')
+    return P, F.astype(np.int64)
+
+
+def _drop_nonfinite(P, F, strict, counts):
+    bad = ~(np.abs(P) < 1e100).all(axis=1)  # so that no product overflows; false for nan as well
+    counts["nonfinite_vertices"] = int(bad.sum())
+    if strict and bad.any():
+        raise ValueError(f"{bad.sum()} of {len(P)} vertices are not finite; strict=False removes them")
+    F = F[~bad[F].any(axis=1)]
+    if len(F) == 0:
+        raise ValueError(f"no triangle with finite vertices; {bad.sum()} of {len(P)} vertices are not finite")
+    return F
+
+
+def _weld(P, F, counts):
+    """For each row of P the number of its group of coincident vertices (-1 where no triangle uses it)."""
+    used = _used(F)
+    X = P[used]
+    corners = P[F]
+    side = np.linalg.norm(corners - corners[:, [1, 2, 0]], axis=2)
+    if not side.any():
+        raise ValueError(f"a surface needs extent; all {len(F)} triangles are points")
+    # the median side guards against a far outlier, whose bounding box would weld the whole shape
+    diagonal = np.linalg.norm(np.ptp(X, axis=0))
+    tolerance = min(RELATIVE_TOLERANCE * diagonal, 0.01 * np.median(side[side > 0]))
+    order = np.lexsort(X.T)
+    first = np.r_[True, (X[order[1:]] != X[order[:-1]]).any(axis=1)]
+    exact = np.empty(len(X), np.int64)
+    exact[order] = np.cumsum(first) - 1
+    tree = cKDTree(X[order[first]], balanced_tree=False, compact_nodes=False)
+    crowd = tree.count_neighbors(tree, tolerance) / tree.n
+    if crowd > 100:
+        raise ValueError(f"vertices crowd: each has {crowd:.0f} others within 1e-7 of the extent ({tolerance:.1e})")
+    near = tree.query_pairs(tolerance, output_type="ndarray")
+    n_groups, label = connected_components(_graph(near, first.sum()), directed=False)
+    group = np.full(len(P), -1)
+    group[used] = label[exact]
+    counts["welded_vertices"] = int(len(used) - n_groups)
+    return group, tolerance
+
+
+def _drop_repeated(F, group, counts):
+    """Without triangles that repeat a corner, and of triangles with the same corners one."""
+    T = np.sort(group[F], axis=1)
+    good = (T[:, 0] != T[:, 1]) & (T[:, 1] != T[:, 2])
+    counts["degenerate_triangles"] = int((~good).sum())
+    F, T = F[good], T[good]
+    order = np.lexsort(T.T)
+    new = np.r_[True, (T[order[1:]] != T[order[:-1]]).any(axis=1)][: len(T)]
+    counts["duplicate_triangles"] = int((~new).sum())
+    if new.all():
+        return F
+    copies = np.bincount(np.cumsum(new) - 1)
+    kept = order[new]
+    cancel = _touching_sheets(T[kept], copies % 2 == 0)
+    counts["duplicate_triangles"] += int(cancel.sum())
+    return F[np.sort(kept[~cancel])]
+
+
+def _touching_sheets(T, even):
+    """Of the triangles that lie there an even number of times, those where two sheets of a surface touch.
+
+    Around a patch of them the other triangles meet in pairs, so that to keep one copy would leave a fin; around a
+    superfluous copy they are single.  Decided patch by patch, by most of the edges around it that have others.
+    """
+    E, edge_of, count = unique_edges(T)
+    triangle = np.tile(np.arange(len(T)), 3)
+    inside = even[triangle]
+    n_inside = np.bincount(edge_of, inside, len(E)).astype(int)
+    _, patch = connected_components(
+        _graph(np.stack([triangle[inside], len(T) + edge_of[inside]], axis=1), len(T) + len(E)), directed=False
+    )
+    around = inside & (n_inside[edge_of] % 2 == 1)
+    outside = (count - n_inside)[edge_of[around]]
+    votes = np.where(outside == 0, 0, np.where(outside % 2 == 0, 1, -1))
+    return even & (np.bincount(patch[triangle[around]], votes, len(T) + len(E))[patch[: len(T)]] > 0)
+
+
+def _flip_flat(P, F, group, tolerance, counts, rounds=50):
+    """Without triangles lower than the tolerance, whose middle vertex lies on the long edge.
+
+    To delete one would open a crack: the long edge is flipped with the neighbour across.  Deleted are those whose long
+    edge is a boundary, where nothing opens, and those that no flip helps and that have no height at all.
+    """
+    F, alive, suspect = F.copy(), np.ones(len(F), bool), np.arange(len(F))
+    for _ in range(rounds):
+        flat = suspect[alive[suspect] & (_heights(P, F[suspect])[0] <= tolerance)]
+        if len(flat) == 0:
+            break
+        ring = np.flatnonzero(alive & np.isin(group[F], group[F[flat]]).any(axis=1))
+        flipped, pairs, at_boundary = _flips(P, F[ring], group, np.searchsorted(ring, flat), tolerance)
+        if len(pairs) == 0 and len(at_boundary) == 0:
+            break
+        F[ring[pairs]] = flipped
+        alive[ring[np.setdiff1d(at_boundary, pairs)]] = False
+        suspect = np.union1d(flat, ring[pairs])
+        counts["flipped_edges"] += len(pairs)
+    alive[suspect[_heights(P, F[suspect])[0] <= 1e-3 * tolerance]] = False
+    counts["flat_triangles"] = int((~alive).sum())
+    return F[alive]
+
+
+def _flips(P, F, group, flat, tolerance):
+    """Flips of the long edges of flat triangles, each triangle in one at most.
+
+    Returns the new triangles ``(c, 2, 3)``, the pairs of triangles they replace ``(c, 2)``, and the flat triangles
+    whose long edge is a boundary.
+    """
+    m, f = len(F), F.T.ravel()
+    E, edge_of, count = unique_edges(group[F], len(P))
+    half = flat + m * _heights(P, F[flat])[1]
+    at_boundary = flat[count[edge_of[half]] == 1]
+    mate = _manifold_mates(edge_of, count)[half]
+    half, mate = half[mate >= 0], mate[mate >= 0]
+    # the neighbour across keeps its orientation: it has the area
+    p, q, d, b = f[mate], f[(mate + m) % (3 * m)], f[(mate + 2 * m) % (3 * m)], f[(half + 2 * m) % (3 * m)]
+    pairs, key = np.stack([half, mate], axis=1) % m, np.sort(group[np.stack([b, d], axis=1)], axis=1) @ [len(P), 1]
+    flipped = np.stack([np.stack([p, b, d], axis=1), np.stack([b, q, d], axis=1)], axis=1)
+    old, new = np.linalg.norm(P[p] - P[q], axis=1), np.linalg.norm(P[b] - P[d], axis=1)
+    height = _heights(P, flipped.reshape(-1, 3))[0].reshape(-1, 2).min(axis=1)
+    good = (group[b] != group[d]) & ~np.isin(key, E @ [len(P), 1]) & ((height > tolerance) | (new < old))
+    good = np.flatnonzero(good)
+    good = good[_cheapest(-old[good], pairs[good])]
+    good = good[np.unique(key[good], return_index=True)[1]]
+    return flipped[good], pairs[good], at_boundary
+
+
+def _heights(P, F):
+    """Height of each triangle over its longest side, and the first corner of that side."""
+    X = P[F]
+    side = np.linalg.norm(X - X[:, [1, 2, 0]], axis=2)
+    return np.linalg.norm(triangle_normals(P, F), axis=1) / np.maximum(side.max(axis=1), 1e-300), side.argmax(axis=1)
+
+
+def _cheapest(cost, ends):
+    """Greedy matching: mask of the pairs taken in order of cost, each end once; ends ``(c, 2)`` int."""
+    if len(cost) == 0:
+        return np.zeros(0, bool)
+    rank = np.argsort(np.argsort(cost, kind="stable"))
+    items, ends = np.unique(ends, return_inverse=True)
+    ends = ends.reshape(-1, 2)
+    taken, used, open_ = np.zeros(len(cost), bool), np.zeros(len(items), bool), np.arange(len(cost))
+    while len(open_):
+        best = np.full(len(items), len(cost))
+        np.minimum.at(best, ends[open_], rank[open_, None])
+        win = open_[(best[ends[open_]] == rank[open_, None]).all(axis=1)]
+        taken[win], used[ends[win]] = True, True
+        open_ = open_[~used[ends[open_]].any(axis=1)]
+    return taken
+
+
+def _manifold_mates(edge_of, count):
+    """The mate of each half-edge on edges with two triangles, else -1."""
+    order = np.argsort(edge_of, kind="stable")
+    first = (np.cumsum(count) - count)[count == 2]
+    mate = np.full(len(edge_of), -1)
+    mate[order[first]], mate[order[first + 1]] = order[first + 1], order[first]
+    return mate
+
+
+def _mates(P, F, group, counts):
+    """The triangles oriented consistently, and the mate of each half-edge, -1 at boundaries and cuts."""
+    _, edge_of, count = unique_edges(group[F], len(P))
+    F, mate = _orient(P, F, group, _manifold_mates(edge_of, count), counts)
+    if (count > 2).any():
+        _, edge_of, count = unique_edges(group[F], len(P))
+        counts["nonmanifold_edges"] = int((count > 2).sum())
+        pairs, cost = _pairs_around_edges(P, F, group, edge_of, count)
+        pairs = pairs[_cheapest(cost, pairs)]
+        mate[pairs], mate[pairs[:, ::-1]] = pairs[:, ::-1], pairs
+        F, mate = _orient(P, F, group, mate, counts)
+    counts["cut_edges"] = int((mate < 0).sum() - (count == 1).sum())
+    return F, mate
+
+
+def _pairs_around_edges(P, F, group, edge_of, count):
+    """All pairs of half-edges on each non-manifold edge ``(c, 2)``, and how badly each continues the surface ``(c,)``.
+
+    The cost is 1 - cos of the bend, more for a pair that disagrees in orientation; between equal bends the pair that
+    encloses less of the inside goes first, so that solids that touch in an edge come apart.
+    """
+    order, first = np.argsort(edge_of, kind="stable"), np.cumsum(count) - count
+    pairs = [np.empty((0, 2), np.int64)]
+    for k in range(3, MOST_AROUND_EDGE + 1):
+        around = order[first[count == k][:, None] + np.arange(k)]
+        pairs += [around[:, [i, j]] for i in range(k) for j in range(i + 1, k)]
+    pairs = np.concatenate(pairs)
+    m, start = len(F), group[F].T.ravel()
+    N = triangle_normals(P, F)
+    N /= np.linalg.norm(N, axis=1, keepdims=True)
+    one, other = N[pairs[:, 0] % m], N[pairs[:, 1] % m]
+    twisted = start[pairs[:, 0]] == start[pairs[:, 1]]
+    cos = np.einsum("ij,ij->i", one, other) * np.where(twisted, -1, 1)
+    file_vertex = F.T.ravel()
+    towards = P[file_vertex[(pairs[:, 1] + 2 * m) % (3 * m)]] - P[file_vertex[pairs[:, 0]]]
+    convex = np.einsum("ij,ij->i", one, towards) < 0
+    return pairs, np.round(1 - cos, 6) + 4 * twisted - 1e-7 * convex
+
+
+def _orient(P, F, group, mate, counts):
+    """Triangles turned so that mates run against each other, most of the area of each patch as it was.
+
+    A triangle stands for two nodes, as it is and reversed; a patch whose two copies are connected cannot be oriented
+    (a Moebius strip), and is cut where the file's orientation changes.
+    """
+    m = len(F)
+    h = np.flatnonzero(mate > np.arange(3 * m))
+    g = mate[h]
+    start = group[F].T.ravel()
+    twisted = start[h] == start[g]
+    if not twisted.any():
+        return F, mate
+    t, u = h % m, g % m
+    ends = np.stack([np.r_[t, t + m], np.r_[u + m * twisted, u + m * ~twisted]], axis=1)
+    n_labels, label = connected_components(_graph(ends, 2 * m), directed=False)
+    same, turned = label[:m], label[m:]
+    area = np.bincount(same, triangle_areas(P, F), n_labels)
+    flip = (area[turned] > area[same]) | ((area[turned] == area[same]) & (turned < same))
+    cut = twisted & (same == turned)[t]
+    mate[h[cut]] = mate[g[cut]] = -1
+    counts["reoriented_triangles"] += int(flip.sum())
+    return _reverse(F, mate, np.flatnonzero(flip))
+
+
+def _reverse(F, mate, t):
+    """Triangles t with corners 0 and 1 exchanged, so that their half-edge 0 stays and 1 and 2 trade places."""
+    m, F = len(F), F.copy()
+    F[t] = F[t][:, [1, 0, 2]]
+    moved = np.arange(3 * m)
+    moved[t + m], moved[t + 2 * m] = t + 2 * m, t + m
+    mate = mate[moved]
+    return F, np.where(mate >= 0, moved[mate], -1)
+
+
+def _umbrellas(F, mate):
+    """Vertices as the sets of corners that mates join: ``(m, 3)``, and the smallest file vertex of each.
+
+    A bow-tie or the end of a separated edge falls apart into one vertex per umbrella.
+    """
+    m = len(F)
+    h = np.flatnonzero(mate > np.arange(3 * m))
+    g = mate[h]
+    ends = np.stack([np.r_[h, (h + m) % (3 * m)], np.r_[(g + m) % (3 * m), g]], axis=1)
+    n, label = connected_components(_graph(ends, 3 * m), directed=False)
+    file_vertex = np.full(n, np.iinfo(np.int64).max)
+    np.minimum.at(file_vertex, label, F.T.ravel())
+    order = np.argsort(file_vertex, kind="stable")
+    return np.argsort(order)[label].reshape(3, m).T, file_vertex[order]
+
+
+def _split_double_edges(X, V, file_vertex, mate, counts):
+    """Two sheets may share both ends of an edge and still be apart: each gets its own midpoint there."""
+    m, n = len(V), len(X)
+    E, edge_of, count = unique_edges(V, n)
+    start = V.T.ravel()
+    turn = np.bincount(edge_of, np.where(start < np.roll(start, -m), 1, -1))
+    half = np.flatnonzero(((count > 2) | ((count == 2) & (turn != 0)))[edge_of])
+    if len(half) == 0:
+        return X, V, file_vertex
+    sheet = np.where(mate[half] >= 0, np.minimum(mate[half], half), half)
+    sheets, middle = np.unique(sheet, return_inverse=True)
+    M = np.full(3 * m, -1)
+    M[half] = n + middle
+    M = M.reshape(3, m).T
+    t = np.flatnonzero((M >= 0).any(axis=1))
+    turn = ((M[t] >= 0).argmax(axis=1)[:, None] + np.arange(3)) % 3
+    (p, q, r), (a, b, c) = np.take_along_axis(V[t], turn, 1).T, np.take_along_axis(M[t], turn, 1).T
+    b, c = np.where(b < 0, r, b), np.where(c < 0, p, c)
+    fan = np.concatenate([np.stack(x, axis=1) for x in ((a, q, b), (a, b, r), (a, r, c), (a, c, p))])
+    fan = fan[(fan[:, 0] != fan[:, 2]) & (fan[:, 1] != fan[:, 2])]
+    ends = E[edge_of[sheets]]
+    counts["inserted_vertices"] = len(sheets)
+    X = np.concatenate([X, X[ends].mean(axis=1)])
+    return X, np.concatenate([np.delete(V, t, axis=0), fan]), np.r_[file_vertex, file_vertex[ends].min(axis=1)]
+
+
+def _largest_components(X, T, components, counts):
+    """The components asked for, outwards, in the old numbering; and the mask of their vertices."""
+    edges = np.concatenate([T[:, :2], T[:, 1:]])
+    n, label = connected_components(_graph(edges, len(X)), directed=False)
+    areas = triangle_areas(X, T)
+    area = np.bincount(label[T[:, 0]], areas, n)
+    order = np.argsort(-area, kind="stable")
+    share = area[order[0]] / area.sum()
+    if components == "largest" and share < 0.5:
+        raise ValueError(
+            f"the largest of {n} components has {100 * share:.1f} % of the area, under half; say how many belong to "
+            f"the shape: components={int(np.searchsorted(np.cumsum(area[order]), 0.9 * area.sum())) + 1} "
+            f'holds 90 %, components="all" keeps all'
+        )
+    number = {"largest": 1, "all": n}.get(components, components)
+    keep = np.zeros(n, bool)
+    keep[order[:number]] = True
+    counts["components"], counts["dropped_components"] = int(n), int(n - keep.sum())
+    counts["area_dropped"] = float(area[~keep].sum() / area.sum())
+    T = T[keep[label[T[:, 0]]]]
+    T, turned = _outwards(X, T, label, n)
+    counts["reoriented_triangles"] += turned
+    return X[keep[label]], T, keep[label]
+
+
+def _outwards(X, T, label, n):
+    """Components turned so that they enclose a positive volume, an open one as if its boundary were closed."""
+    E, _, count = unique_edges(T, len(X))
+    rim = np.unique(E[count == 1])
+    weight = np.zeros(len(X))
+    weight[rim] = 1
+    closed = np.bincount(label[rim], minlength=n) == 0
+    weight[closed[label]] = 1
+    total = np.maximum(np.bincount(label, weight, n), 1)
+    centre = np.stack([np.bincount(label, weight * X[:, i], n) / total for i in range(3)], axis=1)
+    of = label[T[:, 0]]
+    a, b, c = (X[T[:, i]] - centre[of] for i in range(3))
+    volume = np.bincount(of, np.einsum("ij,ij->i", a, np.cross(b, c)) / 6, n)
+    area = np.bincount(of, triangle_areas(X, T), n)
+    inwards = volume < np.where(closed, 0, -1e-3 * area**1.5)  # a flat open patch has no outside
+    return np.where(inwards[of][:, None], T[:, ::-1], T), int(inwards[of].sum())
+
+
+def _count_topology(T, counts):
+    E, _, count = unique_edges(T)
+    rim = E[count == 1]
+    vertex, rim_ends = np.unique(rim, return_inverse=True)
+    holes = connected_components(_graph(rim_ends.reshape(-1, 2), len(vertex)))[0] if len(rim) else 0
+    chi = len(_used(T)) - len(E) + len(T)
+    kept = counts["components"] - counts["dropped_components"]
+    counts |= {"holes": int(holes), "euler_characteristic": int(chi), "genus": int(2 * kept - holes - chi) // 2}
+
+
+def _vertex_of_file(group, new, file_vertex):
+    """The first new vertex at a corner of the file vertex, else of a vertex that was welded to it, else -1."""
+
+    def first(key, n):
+        result = np.full(n, np.iinfo(np.int64).max)
+        np.minimum.at(result, key[new >= 0], new[new >= 0])
+        return np.where(result < np.iinfo(np.int64).max, result, -1)
+
+    own = first(file_vertex, len(group))
+    welded = np.r_[first(group[file_vertex], group.max() + 1), -1]
+    return np.where(own >= 0, own, welded[group]).astype(np.int32)
+
+
+def _used(T):
+    return np.flatnonzero(np.bincount(T.ravel()))
+
+
+def _graph(ends, n):
+    return sp.coo_matrix((np.ones(len(ends), np.int8), (ends[:, 0], ends[:, 1])), (n, n))
