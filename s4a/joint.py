@@ -1,0 +1,179 @@
+"""Joint refinement of a match: the paper's own smoothing (eq. 8 and the line after it), iterated.
+
+The target N carries the match, the source M is searched.  A round moves N onto M with a displacement that lives in
+the first K eigenfunctions of N, then asks for the nearest neighbours in position, normal and, with ``spectral > 0``,
+spectrum together; K grows as in ZoomOut.  The idea of coupling both is that of Smooth Shells (Eisenberger, Laehner,
+Cremers, CVPR 2020).  All lengths are for surfaces of unit area.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
+
+from s4a.deform import onto, smoother
+from s4a.fmap import fmap_from_match, nearest_rows
+from s4a.mesh import edge_graph, edges, vertex_normals
+
+POSITION_WEIGHT, NORMAL_WEIGHT = 5.0, 0.3
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What the rounds need of a shape, for unit area.
+
+    ``X (n, 3)`` positions, ``T (m, 3)`` triangles, ``area (n,)`` of sum 1, ``Phi (n, k)`` the basis on its vertices:
+    area-orthonormal eigenfunctions at low resolution, U Phi at full resolution.
+    """
+
+    X: np.ndarray
+    T: np.ndarray
+    area: np.ndarray
+    Phi: np.ndarray
+
+    @cached_property
+    def tree(self):
+        """KD-tree over position and normal, 6 dims."""
+        return cKDTree(features(self.X, vertex_normals(self.X, self.T)))
+
+    @cached_property
+    def smooth(self):
+        """Coefficients of a field in the basis."""
+        return smoother(self.Phi, self.area)
+
+    @cached_property
+    def graph(self):
+        """Edge lengths as a sparse matrix."""
+        return edge_graph(self.X, self.T)
+
+
+def features(X, normals, spectrum=None):
+    """Rows in which nearest neighbours are searched: weighted position, normal and (optional) spectral coordinates."""
+    parts = [POSITION_WEIGHT * X, NORMAL_WEIGHT * normals]
+    return np.concatenate(parts if spectrum is None else [*parts, spectrum], axis=1)
+
+
+def registered(target, motion):
+    """The registered shape R x + t + Phi c ``(n, 3)`` of a target, c for the first columns of its basis."""
+    R, t, c = motion
+    return target.X @ R.T + t + target.Phi[:, : len(c)] @ c
+
+
+def search(source, target, X):
+    """The vertices of the source nearest to the registered target in position and normal ``(n_target,)``."""
+    return source.tree.query(features(X, vertex_normals(X, target.T)))[1]
+
+
+def low_rounds(source, target, match, *, k_first=30, k=100, step=5, rounds=2, spectral=0.0):
+    """Joint rounds on low-resolution meshes, for K = k_first, k_first + step, ..., k.
+
+    Parameters
+    ----------
+    source, target : Surface
+    match : int ndarray (n_target,)
+        Start, for example of ZoomOut.
+    spectral : float
+        The spectral coordinates weigh ``spectral / sqrt(K)``; 0 leaves 6 dimensions and a KD-tree.  0.1 for poses
+        that are far apart.
+
+    Returns
+    -------
+    match : int ndarray (n_target,)
+    motion : tuple (R, t, c)
+        See :func:`registered`.
+    """
+    k = min(k, target.Phi.shape[1], source.Phi.shape[1])
+    for K in [*range(min(k_first, k), k, step), k]:
+        Phi = target.Phi[:, :K]
+        for _ in range(rounds):
+            motion = onto(target.X, source.X[match], target.area, lambda d, Phi=Phi: Phi.T @ (target.area[:, None] * d))
+            X = registered(target, motion)
+            if not spectral:
+                match = search(source, target, X)
+                continue
+            w = spectral / np.sqrt(K)
+            C = fmap_from_match(source.Phi[:, :K], Phi, target.area, match)
+            match = nearest_rows(
+                features(X, vertex_normals(X, target.T), w * Phi),
+                features(source.X, vertex_normals(source.X, source.T), w * source.Phi[:, :K] @ C.T),
+            )
+    return match, motion
+
+
+def dense_rounds(source, target, motion, *, rounds=3):
+    """Joint rounds at full resolution, from the motion (R, t, c) of the low rounds.
+
+    Returns
+    -------
+    match : int ndarray (n_target,)
+    motion : tuple (R, t, c)
+    """
+    match = search(source, target, registered(target, motion))
+    for _ in range(rounds):
+        motion = onto(target.X, source.X[match], target.area, target.smooth)
+        match = search(source, target, registered(target, motion))
+    return match, motion
+
+
+def badness(source, target, match, motion, *, n_samples=300, limit=0.5):
+    """Score of a match without truth, lower is better: round trip + gaps both ways + 0.3 x edge stretch.
+
+    The round trip goes from a vertex of the target to its match and back to the vertex whose registered position
+    (in position and normal) is nearest, measured along the edges of the target and cut at `limit`; the gaps are the
+    mean distances between the registered surface and the source; the stretch is the median |log| ratio of edge
+    lengths of the registered surface.  Lengths are for unit area.
+
+    The stretch of the snapped match instead measures the two meshes' sampling: on independently meshed FAUST and
+    TOSCA pairs it prefers the worse of two candidates more often than not.
+    """
+    X = registered(target, motion)
+    tree = cKDTree(features(X, vertex_normals(X, target.T)))
+    back_gap = np.linalg.norm(source.X - X[tree.query(source.tree.data)[1]], axis=1)
+    gap = np.linalg.norm(X - source.X[match], axis=1)
+    sample = np.linspace(0, len(match) - 1, min(n_samples, len(match))).astype(int)
+    back = tree.query(source.tree.data[match[sample]])[1]
+    way = dijkstra(target.graph, indices=sample, limit=limit)
+    trip = np.minimum(way[np.arange(len(sample)), back], limit)
+    E = edges(target.T)
+    length = [np.linalg.norm(x[E[:, 0]] - x[E[:, 1]], axis=1) for x in (target.X, X)]
+    stretch = np.abs(np.log(np.maximum(length[1], 1e-12) / np.maximum(length[0], 1e-12)))
+    return float(trip.mean() + gap.mean() + back_gap.mean() + 0.3 * np.median(stretch))
+
+
+def best_candidate(source, target, starts, *, k=100, far=0.1):
+    """The best match at low resolution among several, by :func:`badness`.
+
+    Every start enters as it is ("intrinsic" when it is spectral) and after joint rounds in position and normal; where
+    the best of these still scores above `far`, rounds with spectral coordinates are tried too, as poses then lie far
+    apart.
+
+    Parameters
+    ----------
+    source, target : Surface
+    starts : dict
+        Name -> match (n_target,).
+
+    Returns
+    -------
+    name : str
+        ``"<start>"``, ``"<start>+joint"`` or ``"<start>+joint+spectral"``.
+    match : int ndarray (n_target,)
+    motion : tuple (R, t, c)
+    scores : dict
+        Badness of every candidate.
+    """
+    found = {}
+
+    def enter(name, match, motion):
+        found[name] = (badness(source, target, match, motion), match, motion)
+
+    for name, match in starts.items():
+        enter(name, match, onto(target.X, source.X[match], target.area, lambda d: target.Phi.T @ (target.area[:, None] * d)))
+        enter(f"{name}+joint", *low_rounds(source, target, match, k=k))
+    if min(score for score, *_ in found.values()) > far:
+        for name, match in starts.items():
+            enter(f"{name}+joint+spectral", *low_rounds(source, target, match, k=k, spectral=0.1))
+    best = min(found, key=lambda name: found[name][0])
+    return best, *found[best][1:], {name: score for name, (score, *_) in found.items()}

@@ -1,0 +1,126 @@
+"""Principal modes of the displacements (6.1): PCA by the small Gram matrix, synthesis of new shapes."""
+
+import numpy as np
+import xarray as xr
+
+from s4a.schema import dataset, require
+
+
+def gram_pca(d, area):
+    """PCA of vector fields under the inner product of the template's areas.
+
+    Parameters
+    ----------
+    d : float ndarray (s, n, 3)
+        One displacement field per shape.
+    area : float ndarray (n,)
+        Template vertex areas; their scale does not matter.
+
+    Returns
+    -------
+    mean : (n, 3)
+    deformation : (c, n, 3), one standard deviation along each component
+    standard_deviation : (c,), its area-weighted root mean square
+    score : (s, c), uncorrelated, of variance 1 (divisor s - 1); signs make the third moment positive
+    ratio : (c,), shares of the variance, descending
+    """
+    s = len(d)
+    w = (area / area.sum())[:, None]
+    mean = d.mean(axis=0)
+    X = (d - mean).astype(np.float64) * np.sqrt(w)
+    eigenvalue, V = np.linalg.eigh(np.einsum("inx,jnx->ij", X, X, optimize=True))
+    eigenvalue, V = np.maximum(eigenvalue[::-1], 0), V[:, ::-1]
+    keep = eigenvalue > 1e-12 * max(eigenvalue[0], np.finfo(float).tiny)
+    keep &= np.arange(s) < s - 1
+    eigenvalue, V = eigenvalue[keep], V[:, keep]
+    V = V * np.where((V**3).sum(0) < 0, -1.0, 1.0)
+    deformation = np.einsum("ic,inx->cnx", V, d - mean, optimize=True) / np.sqrt(s - 1)
+    total = eigenvalue.sum()
+    ratio = eigenvalue / total if total > 0 else eigenvalue
+    return mean, deformation, np.sqrt(eigenvalue / (s - 1)), V * np.sqrt(s - 1), ratio
+
+
+def low_vertices(coarse):
+    """For every coarse vertex the original vertex in which U weighs it most ``(n_coarse,)``."""
+    vertex, weight = coarse["coarse_vertex"].values, coarse["coarse_weight"].values
+    order = np.argsort(weight.ravel(), kind="stable")
+    found = np.zeros(coarse.sizes["vertex"], np.int64)
+    found[vertex.ravel()[order]] = order // vertex.shape[1]
+    return found
+
+
+def pca(registration, area, *, coarse=None):
+    """Principal modes of a registered collection (6.1, Fig. 4 and 5).
+
+    Parameters
+    ----------
+    registration : xarray.Dataset
+        With ``displacement(shape, vertex, xyz)`` in the unit of the input.
+    area : float ndarray (vertex,)
+        Template vertex areas, the weights of the Gram matrix.
+    coarse : xarray.Dataset, optional
+        The template's low-resolution mesh; gives the shares of variance at low resolution as well.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``mean_displacement``, ``deformation(component, vertex, xyz)`` of one standard deviation,
+        ``standard_deviation(component)``, ``score(shape, component)``, ``explained_variance_ratio`` and
+        ``explained_variance_ratio_low``.
+
+    Raises
+    ------
+    ValueError
+        With fewer than 3 shapes, or when all displacements are equal: there is no variation to analyse.
+    """
+    require(registration, "displacement", what="registration")
+    d = registration["displacement"].transpose("shape", "vertex", "xyz").values
+    if len(d) < 3:
+        raise ValueError(f"PCA needs at least 3 shapes, found {len(d)}")
+    mean, deformation, deviation, score, ratio = gram_pca(d, area)
+    size = np.linalg.norm(registration["position"].values.std(axis=0)) if "position" in registration else 1.0
+    if not len(ratio) or deviation[0] < 1e-9 * size:
+        raise ValueError("PCA needs shapes that differ; all displacements are equal")
+    found = dataset(
+        mean_displacement=mean.astype(np.float32),
+        deformation=deformation.astype(np.float32),
+        standard_deviation=deviation,
+        score=score,
+        explained_variance_ratio=ratio,
+    )
+    if coarse is not None:
+        low = gram_pca(d[:, low_vertices(coarse)], coarse["vertex_area"].values)[4]
+        padded = np.zeros(len(ratio))
+        padded[: len(low)] = low[: len(ratio)]
+        found = found.merge(dataset(explained_variance_ratio_low=padded))
+    return found.assign_coords(shape=registration["shape"])
+
+
+def synthesize(study, scores):
+    """The shape with given scores: template + mean displacement + sum of score times deformation.
+
+    Parameters
+    ----------
+    study : xarray.DataTree
+        With ``/registration`` and ``/pca``.
+    scores : array_like (c,)
+        In standard deviations, for the first c components.
+
+    Returns
+    -------
+    xarray.Dataset
+        A mesh with ``position(vertex, xyz)`` in the unit of the input and ``corner_vertex(triangle, corner)``.
+
+    Raises
+    ------
+    ValueError
+        When there are more scores than components.
+    """
+    scores = np.atleast_1d(np.asarray(scores, float))
+    pca, template = study["pca"].to_dataset(), study["registration"].to_dataset()
+    require(pca, "deformation", "mean_displacement", what="pca dataset")
+    if scores.ndim != 1 or len(scores) > pca.sizes["component"]:
+        raise ValueError(f"scores need at most {pca.sizes['component']} numbers, found shape {scores.shape}")
+    moved = np.tensordot(scores, pca["deformation"].values[: len(scores)], axes=1)
+    position = template["position"].values + pca["mean_displacement"].values + moved
+    return xr.merge([dataset(position=position), template[["corner_vertex"]]])

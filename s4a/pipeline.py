@@ -1,0 +1,419 @@
+"""The whole analysis (4, 6.1): runs the steps over a collection, the only writer of a study."""
+
+import contextlib
+import logging
+import os
+import resource
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from joblib import Parallel, delayed, effective_n_jobs
+from scipy.spatial import cKDTree
+from threadpoolctl import threadpool_limits
+from tqdm.auto import tqdm
+
+from s4a import fmap, latent, median, network, register, study
+from s4a.align import align, farthest_points
+from s4a.clean import clean
+from s4a.io import find_meshes
+from s4a.mesh import as_arrays, as_dataset, vertex_areas
+from s4a.pca import pca
+from s4a.remesh import coarsen
+from s4a.schema import dataset
+from s4a.shapes import read_shape
+from s4a.spectral import spectrum
+
+log = logging.getLogger(__name__)
+
+CHOICES = {
+    "init": ("dense", "landmarks"),
+    "refine": ("joint", "intrinsic"),
+    "how": ("ours", "standard"),
+    "norm": tuple(median.NORMS),
+    "preset": (None, "paper"),
+}
+PAPER = {"init": "landmarks", "refine": "intrinsic", "how": "ours"}
+SAMPLES = 1000  # vertices per shape in Consistent ZoomOut, but for its last round
+
+
+def checked(options):
+    """The options with the preset applied; ValueError where one is outside its range."""
+    for name, legal in CHOICES.items():
+        if options[name] not in legal:
+            raise ValueError(f"{name} must be one of {', '.join(map(repr, legal))}; found {options[name]!r}")
+    lowest = {"n_coarse": 100, "n_pairs": 1, "k_init": 4, "k": 4, "step": 1, "seed": 0, "n_latent": 2}
+    for name, least in lowest.items():
+        value = options[name]
+        if name == "n_latent" and value is None:
+            continue
+        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+            raise ValueError(f"{name} must be an integer of at least {least}; found {value!r}")
+    if options["k"] < options["k_init"]:
+        raise ValueError(f"k must be at least k_init = {options['k_init']}; found {options['k']}")
+    if (options["n_latent"] or 0) > options["k"]:
+        raise ValueError(f"n_latent must be at most k = {options['k']}; found {options['n_latent']}")
+    return options | (PAPER if options["preset"] == "paper" else {})
+
+
+class Run:
+    """One run over a study folder: does tasks that are not done yet, and keeps time, memory and failures."""
+
+    def __init__(self, folder, n_jobs):
+        self.folder, self.n_jobs = Path(folder), n_jobs
+        self.seconds, self.memory, self.failures = {}, {}, {}
+
+    @contextlib.contextmanager
+    def stage(self, name):
+        """Time and peak memory of a stage (seconds; MiB, this process and its workers together)."""
+        begin, self.workers = time.perf_counter(), {}
+        yield
+        self.seconds[name] = time.perf_counter() - begin
+        own = {os.getpid(): resource.getrusage(resource.RUSAGE_SELF).ru_maxrss}
+        self.memory[name] = sum((self.workers | own).values()) / 1024
+
+    def tasks(self, stage, function, tasks):
+        """Do the tasks (name, file, key, arguments) whose file is not done; a ValueError is kept as a failure."""
+        with self.stage(stage):
+            missing = [t for t in tasks if not study.is_done(self.folder / t[1], t[2])]
+            log.info("%s: %d of %d to do", stage, len(missing), len(tasks))
+            jobs = (
+                delayed(do_task)(function, name, self.folder / file, key, arguments)
+                for name, file, key, arguments in missing
+            )
+            results = Parallel(n_jobs=self.n_jobs, return_as="generator_unordered")(jobs)
+            for name, failure, pid, memory in tqdm(results, total=len(missing), desc=stage, disable=not missing):
+                self.workers[pid] = max(memory, self.workers.get(pid, 0))
+                if failure:
+                    self.failures[name] = f"{stage}: {failure}"
+
+
+def do_task(function, name, path, key, arguments):
+    """Compute one Dataset and write its file; with one BLAS thread, as tasks run side by side."""
+    try:
+        with threadpool_limits(1):
+            study.write(function(*arguments), path, key)
+        failure = ""
+    except ValueError as error:
+        failure = str(error)
+    return name, failure, os.getpid(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+def collection(shapes, pattern):
+    """What the user gave, as a dict name -> (path or Dataset, key of its content)."""
+    if isinstance(shapes, xr.DataTree):
+        if "original" not in shapes:
+            raise ValueError("the DataTree needs a node /original with one node per shape, as of s4a.read_shapes")
+        shapes = {name: node.to_dataset() for name, node in shapes["original"].children.items()}
+    if isinstance(shapes, dict):
+        meshes = {n: m if isinstance(m, xr.Dataset) else as_dataset(*m) for n, m in shapes.items()}
+        return {n: (m, study.task_key(*as_arrays(m))) for n, m in sorted(meshes.items())}
+    found = sorted((name, path) for path, name in find_meshes(shapes, pattern))
+    return {name: (str(path), study.task_key(Path(path).read_bytes())) for name, path in found}
+
+
+def original_task(source, components, strict):
+    if isinstance(source, str):
+        return read_shape(source, components=components, strict=strict)
+    return source if "file_vertex" in source else clean(source, components=components, strict=strict)
+
+
+def coarse_task(folder, name, n_coarse, wrap, seed, k):
+    mesh = study.read(folder / "original" / f"{name}.nc")
+    return spectrum(coarsen(mesh, n_coarse=n_coarse, wrap=wrap, seed=seed), k=k)
+
+
+def scan(folder, name):
+    """A shape of the study at both resolutions; its arrays are read when they are used."""
+    return register.Scan(*(study.read(folder / stage / f"{name}.nc") for stage in ("original", "coarse")))
+
+
+def low_shape(folder, name):
+    """Unit-area vertices, areas, eigenfunctions and eigenvalues of a coarse mesh, and its spread samples."""
+    with xr.open_dataset(folder / "coarse" / f"{name}.nc", engine=study.ENGINE) as coarse:
+        X, area = coarse["position"].values, coarse["vertex_area"].values
+        Phi, eigenvalue = coarse["eigenfunction"].values, coarse["eigenvalue"].values
+    w = area / area.sum()
+    return (X - w @ X) / np.sqrt(area.sum()), w, Phi, eigenvalue
+
+
+def alignment_task(folder, names, reference):
+    """Rigid motion of every shape onto the reference, for unit area and centred shapes."""
+    Y, area_y, *_ = low_shape(folder, reference)
+    motions = []
+    for name in names:
+        X, area, *_ = low_shape(folder, name)
+        motions.append(align(X, area, Y, area_y)[:2] if name != reference else (np.eye(3), np.zeros(3)))
+    R, t = (np.stack(part) for part in zip(*motions, strict=True))
+    return dataset({"reference": reference}, rotation=R, translation=t).assign_coords(shape=list(names))
+
+
+def relative_motion(alignment, source, target):
+    """The motion source -> target through the common reference."""
+    R, t = alignment["rotation"].sel(shape=source).values, alignment["translation"].sel(shape=source).values
+    Rt, tt = alignment["rotation"].sel(shape=target).values, alignment["translation"].sel(shape=target).values
+    return Rt.T @ R, Rt.T @ (t - tt)
+
+
+def first_maps_task(folder, pairs, k_init, init):
+    """First maps of some pairs, in both directions."""
+    alignment = study.read(folder / "network" / "alignment.nc")
+    shapes = {name: low_shape(folder, name) for name in sorted(set(sum(pairs, [])))}
+    directed, maps = [], []
+    for a, b in pairs:
+        R, t = network.pair_motion(shapes[a][0], shapes[b][0], relative_motion(alignment, a, b))
+        for s, g, motion in ((a, b, (R, t)), (b, a, (R.T, -R.T @ t))):
+            directed.append((s, g))
+            maps.append(network.first_map(shapes[s], shapes[g], motion, k_init=k_init, init=init))
+    source, target = zip(*directed, strict=True)
+    return dataset(source=np.array(source), target=np.array(target), fmap_initial=np.stack(maps))
+
+
+def consistent_maps(folder, names, first, options, n_jobs):
+    """Consistent ZoomOut over the network: the Datasets ``/network`` and ``/latent``."""
+    shapes = [low_shape(folder, name) for name in names]
+    k = min([options["k"], *(s[2].shape[1] for s in shapes)])
+    index = {name: i for i, name in enumerate(names)}
+    source = np.array([index[s] for s in first["source"].values])
+    target = np.array([index[t] for t in first["target"].values])
+    eigenvalues = np.stack([s[3][:k] for s in shapes])
+    C0 = first["fmap_initial"].values
+    with threadpool_limits(1), tqdm(total=k - C0.shape[1], desc="consistent ZoomOut") as bar:
+        C, weight, error, Y, latent_eigenvalue = latent.consistent_zoomout(
+            C0,
+            source,
+            target,
+            [s[2] for s in shapes],
+            [s[1] for s in shapes],
+            eigenvalues,
+            k,
+            step=options["step"],
+            n_latent=options["n_latent"],
+            samples=[farthest_points(s[0], SAMPLES) for s in shapes],
+            n_jobs=n_jobs,
+            progress=lambda size: bar.update(size - C0.shape[1] - bar.n),
+        )
+    initial_error = network.cycle_errors(C0, network.three_cycles(source.tolist(), target.tolist()))
+    net = first.merge(
+        dataset(fmap=C.astype(np.float32), weight=weight, cycle_error=error, cycle_error_initial=initial_error)
+    )
+    lat = dataset(latent_basis=Y, latent_eigenvalue=latent_eigenvalue).assign_coords(shape=list(names))
+    return net, median.median_shape(lat, eigenvalues, norm=options["norm"])
+
+
+def registration_task(folder, name, template, how, refine, scale):
+    """One shape registered to the template (eq. 6 at low resolution, then eq. 7, or eq. 3 and 4, then joint rounds)."""
+    target = scan(folder, template)
+    if name == template:
+        return register.identity(target)
+    source = scan(folder, name)
+    basis = study.read(folder / "latent.nc")["latent_basis"]
+    k = basis.sizes["mode"]
+    F_source, F_target = (s.low.Phi[:, :k] @ basis.sel(shape=n).values for s, n in ((source, name), (target, template)))
+    match = fmap.nearest_rows(F_target, F_source)
+    if how == "standard":
+        C = fmap.fmap_from_match(source.low.Phi[:, :k], target.low.Phi[:, :k], target.low.area, match)
+        F_source, F_target = source.low.Phi[:, :k] @ C.T, target.low.Phi[:, :k]
+        match = fmap.nearest_rows(F_target, F_source)
+    motion = relative_motion(study.read(folder / "network" / "alignment.nc"), name, template)
+    R, t = network.pair_motion(source.low.X, target.low.X, motion)
+    starts = {"intrinsic": match, "icp": cKDTree(source.low.X @ R.T + t).query(target.low.X)[1]}
+    return register.registration(source, target, starts, (F_source, F_target), k=k, refine=refine, scale=scale)
+
+
+def analyse(
+    shapes,
+    *,
+    n_coarse=6000,
+    n_pairs=500,
+    k_init=20,
+    k=100,
+    n_latent=None,
+    step=5,
+    init="dense",
+    refine="joint",
+    how="ours",
+    norm="h2",
+    scale=False,
+    components="largest",
+    strict=False,
+    wrap=False,
+    pattern=None,
+    preset=None,
+    template=None,
+    store=None,
+    n_jobs=None,
+    seed=0,
+):
+    """From a collection of meshes to a median shape, dense correspondences and modes: the whole of S4A.
+
+    Parameters
+    ----------
+    shapes : path, list of paths, dict or xarray.DataTree
+        A folder, a glob, files, or meshes in memory: name -> Dataset or (points, triangles), or what
+        :func:`s4a.read_shapes` gives.
+    n_coarse : int
+        Vertices of the low-resolution meshes (4.1).
+    n_pairs : int
+        Pairs of the network, each with maps both ways; all pairs where there are fewer (5.1).
+    k_init, k : int
+        Sizes of the first and of the refined maps.
+    n_latent : int, optional
+        Dimension of the latent space; k by default.
+    step : int
+        Growth of the maps per round of Consistent ZoomOut.
+    init : {"dense", "landmarks"}
+        First maps from all nearest neighbours after ICP, or the paper's fit on 10 landmarks.
+    refine : {"joint", "intrinsic"}
+        Registration with joint rounds (default), or the paper's spectral match alone.
+    how : {"ours", "standard"}
+        Full resolution by eq. 7, or by eq. 3 and 4.
+    norm : {"h2", "h1", "frobenius"}
+        Norm of eq. 5, see :func:`s4a.median.distance_to_identity`.
+    scale : bool
+        Whether size is taken out of the displacements.
+    components, strict, pattern
+        See :func:`s4a.read_shapes`.
+    wrap : bool
+        Whether shapes are wrapped watertight before they are remeshed.
+    preset : {None, "paper"}
+        ``"paper"`` sets init="landmarks", refine="intrinsic", how="ours".
+    template : str, optional
+        Name of the shape to register to; the median shape by default.
+    store : path, optional
+        Folder of the study.  A run that was killed goes on at the first missing file.
+    n_jobs : int, optional
+        Processes, as in joblib: -1 for all cores given to this process.  The result does not depend on it.
+    seed : int
+
+    Returns
+    -------
+    xarray.DataTree
+        The study: ``/original``, ``/coarse``, ``/network``, ``/latent``, ``/registration``, ``/pca``, ``/report``.
+
+    Raises
+    ------
+    ValueError
+        When an option is out of range, or fewer than 2 shapes can be used; the reasons are named.
+    """
+    options = {n: v for n, v in locals().items() if n not in ("shapes", "store", "n_jobs")}
+    options = checked(options)
+    given = collection(shapes, pattern)
+    if store is None:
+        with tempfile.TemporaryDirectory(prefix="s4a-") as folder:
+            run_stages(Run(folder, n_jobs), given, options)
+            tree = study.open_study(folder)
+            return xr.DataTree.from_dict({node.path: node.to_dataset().load() for node in tree.subtree})
+    with study.lock(store):
+        run_stages(Run(store, n_jobs), given, options)
+    return study.open_study(store)
+
+
+def run_stages(run, given, options):
+    """All stages in turn; each looks up which of its files are done."""
+    folder, o = run.folder, options
+    key_of = {n: study.task_key(content, o["components"], o["strict"]) for n, (_, content) in given.items()}
+    run.tasks(
+        "read and clean",
+        original_task,
+        [(n, f"original/{n}.nc", key_of[n], (source, o["components"], o["strict"])) for n, (source, _) in given.items()],
+    )
+    settings = (o["n_coarse"], o["wrap"], o["seed"], o["k"])
+    names = [n for n in given if n not in run.failures]
+    key_of = {n: study.task_key(key_of[n], settings) for n in names}
+    run.tasks(
+        "remesh and spectrum",
+        coarse_task,
+        [(n, f"coarse/{n}.nc", key_of[n], (folder, n, *settings)) for n in names],
+    )
+    names = [n for n in names if n not in run.failures]
+    if len(names) < 2:
+        reasons = "; ".join(f"{n}: {why}" for n, why in run.failures.items()) or "only one was given"
+        raise ValueError(f"an analysis needs at least 2 usable shapes, found {len(names)} ({reasons})")
+    if o["template"] is not None and o["template"] not in names:
+        raise ValueError(f"template {o['template']!r} is none of the shapes: {', '.join(names)}")
+
+    eigenvalues = [low_shape(folder, n)[3] for n in names]
+    k_signature = min(o["k_init"], *(len(e) for e in eigenvalues))
+    distance = network.spectral_distance([e[:k_signature] for e in eigenvalues])
+    pairs = [[names[i], names[j]] for i, j in network.choose_pairs(distance, o["n_pairs"])]
+    reference = names[int(np.argmin(distance.sum(1)))]
+    key = study.task_key([key_of[n] for n in names], names, reference)
+    run.tasks("align", alignment_task, [("alignment", "network/alignment.nc", key, (folder, names, reference))])
+
+    k_init = min(o["k_init"], k_signature)
+    size = max(4, -(-len(pairs) // 64))
+    batches = [pairs[i : i + size] for i in range(0, len(pairs), size)]
+    files = [f"network/first_{i:03d}.nc" for i in range(len(batches))]
+    keys = [study.task_key(key, batch, k_init, o["init"]) for batch in batches]
+    run.tasks(
+        "first maps",
+        first_maps_task,
+        [(f, f, q, (folder, batch, k_init, o["init"])) for f, q, batch in zip(files, keys, batches, strict=True)],
+    )
+
+    key = study.task_key(keys, o["k"], o["step"], o["n_latent"], o["norm"])
+    if not all(study.is_done(folder / f, key) for f in ("network.nc", "latent.nc")):
+        with run.stage("consistent ZoomOut and median"):
+            first = xr.concat([study.read(folder / f) for f in files], dim="pair")
+            n_threads = effective_n_jobs(run.n_jobs)
+            net, lat = consistent_maps(folder, names, first, o, n_threads)
+            study.write(net, folder / "network.nc", key)
+            study.write(lat, folder / "latent.nc", key)
+
+    template = o["template"] or study.read(folder / "latent.nc").attrs["median"]
+    settings = (template, o["how"], o["refine"], o["scale"])
+    X, T = as_arrays(study.read(folder / "original" / f"{template}.nc"))
+    mesh = as_dataset(X, T, {"template": template}, vertex_area=vertex_areas(X, T))
+    study.write(mesh, folder / "registration.nc", study.task_key(key, template))
+    run.tasks(
+        "registration",
+        registration_task,
+        [
+            (n, f"registration/{n}.nc", study.task_key(key, key_of[n], settings), (folder, n, *settings))
+            for n in names
+        ],
+    )
+    with run.stage("modes"):
+        names = [n for n in names if n not in run.failures]
+        no_modes = write_modes(folder, names, mesh, template)
+    write_report(run, given, options | {"template": template}, no_modes)
+
+
+def write_modes(folder, names, mesh, template):
+    """Write ``/pca``; returns the reason where there can be none."""
+    files = {n: study.read(folder / "registration" / f"{n}.nc") for n in names}
+    data = study.stack_registration(mesh, files, names)["registration"]
+    try:
+        modes = pca(data, mesh["vertex_area"].values, coarse=study.read(folder / "coarse" / f"{template}.nc"))
+    except ValueError as error:
+        log.warning("no modes: %s", error)
+        (folder / "pca.nc").unlink(missing_ok=True)
+        return str(error)
+    study.write(modes, folder / "pca.nc")
+    return ""
+
+
+def write_report(run, given, options, no_modes):
+    """Write ``/report``: the status of every shape, times and memory of every stage, the options."""
+    status, reason, path = [], [], []
+    for name, (source, _) in given.items():
+        path.append(source if isinstance(source, str) else "")
+        if name in run.failures:
+            status.append("excluded")
+            reason.append(run.failures[name])
+            continue
+        with xr.open_dataset(run.folder / "original" / f"{name}.nc", engine=study.ENGINE) as mesh:
+            status.append(str(mesh.attrs.get("status", "ok")))
+            reason.append(str(mesh.attrs.get("reason", "")))
+    data = dataset(
+        {"no_modes": no_modes, **{n: str(v) for n, v in options.items()}},
+        status=np.array(status),
+        reason=np.array(reason),
+        path=np.array(path),
+        seconds=np.array(list(run.seconds.values())),
+        peak_memory=np.array([run.memory[s] for s in run.seconds]),
+    )
+    study.write(data.assign_coords(shape=list(given), stage=list(run.seconds)), run.folder / "report.nc")

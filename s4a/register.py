@@ -1,0 +1,265 @@
+"""Registration at full resolution (eq. 3, 4, 6 and 7): one shape onto one template, and the way back."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.spatial import cKDTree
+
+from s4a import fmap, joint
+from s4a.align import align
+from s4a.deform import displacement_in_template, onto
+from s4a.mesh import as_arrays, closest_point_in_star, vertex_areas, vertex_normals
+from s4a.nearest import nearest_in_cells
+from s4a.schema import dataset, require
+
+CONFIDENCE_LENGTH = 0.02
+
+
+@dataclass(frozen=True)
+class Scan:
+    """One shape at both resolutions, centred and scaled to unit area: x -> (x - center) / size."""
+
+    original: object
+    coarse: object
+
+    @cached_property
+    def frame(self):
+        """Area centroid (3,) and the square root of the total area, in the unit of the input."""
+        X, T = as_arrays(self.original)
+        area = vertex_areas(X, T)
+        return area @ X / area.sum(), np.sqrt(area.sum())
+
+    @cached_property
+    def U(self):
+        """The projection operator of 4.1 as a sparse matrix (n, n_coarse)."""
+        columns, weights = self.coarse["coarse_vertex"].values, self.coarse["coarse_weight"].values
+        rows = np.repeat(np.arange(len(columns)), columns.shape[1])
+        return sp.csr_matrix((weights.ravel(), (rows, columns.ravel())), (len(columns), self.coarse.sizes["vertex"]))
+
+    @cached_property
+    def cell(self):
+        """The coarse vertex that weighs most in each original vertex (n,)."""
+        columns, weights = self.coarse["coarse_vertex"].values, self.coarse["coarse_weight"].values
+        return columns[np.arange(len(columns)), weights.argmax(1)]
+
+    @cached_property
+    def eigenvalue(self):
+        return self.coarse["eigenvalue"].values
+
+    @cached_property
+    def low(self):
+        """The low-resolution :class:`s4a.joint.Surface`."""
+        X, T = as_arrays(self.coarse)
+        area = self.coarse["vertex_area"].values
+        center, size = self.frame
+        return joint.Surface((X - center) / size, T, area / area.sum(), self.coarse["eigenfunction"].values)
+
+    @cached_property
+    def dense(self):
+        """The full-resolution :class:`s4a.joint.Surface`, with U Phi as its basis."""
+        X, T = as_arrays(self.original)
+        center, size = self.frame
+        X = (X - center) / size
+        return joint.Surface(X, T, vertex_areas(X, T), self.U @ self.low.Phi)
+
+
+def intrinsic_match(source, target, F_source, F_target):
+    """Full-resolution match by nearest rows of U F: eq. 7 with F = Phi Y, eq. 4 with F = Phi C^T and Psi.
+
+    Returns
+    -------
+    match : int ndarray (n_target,)
+    share : float
+        Share of the comparisons of an exhaustive search that were needed.
+    """
+    Q, D = target.U @ F_target.astype(np.float32), source.U @ F_source.astype(np.float32)
+    return nearest_in_cells(Q, target.cell, D, source.cell)
+
+
+def register(source, target, match_low, embeddings, *, k=100, refine="joint"):
+    """Registers the target (the template) to the source at full resolution.
+
+    Parameters
+    ----------
+    source, target : Scan
+    match_low : dict
+        Name -> match (n_target_coarse,): starts at low resolution; "intrinsic" must be among them.
+    embeddings : tuple (F_source, F_target)
+        Functions on both coarse meshes for the dense intrinsic match.
+    refine : {"joint", "intrinsic"}
+
+    Returns
+    -------
+    match : int ndarray (n_target,)
+    image : float ndarray (n_target, 3)
+        Registered template in the frame and unit of the source, smooth.
+    info : dict
+        ``method`` (the candidate kept), ``score`` (its badness), ``score_<candidate>`` of each.
+    """
+    low, scores = ("intrinsic", match_low["intrinsic"], None), {}
+    if refine == "joint":
+        *low, scores = joint.best_candidate(source.low, target.low, match_low, k=k)
+    method, match, motion = low
+    info = {f"score_{name}": score for name, score in scores.items()}
+    if "joint" in method:
+        match, motion = joint.dense_rounds(source.dense, target.dense, motion)
+    else:
+        match, info["compared_share"] = intrinsic_match(source, target, *embeddings)
+        motion = onto(target.dense.X, source.dense.X[match], target.dense.area, target.dense.smooth)
+    info |= {"method": method, "score": joint.badness(source.dense, target.dense, match, motion)}
+    center, size = source.frame
+    return match, joint.registered(target.dense, motion) * size + center, info
+
+
+def way_back(source, target, image):
+    """For every vertex of the source the closest point of the registered template, with agreeing normal.
+
+    The nearest template vertex in position and normal is looked up first, then the closest point on the triangles
+    around it.
+
+    Returns
+    -------
+    triangle : int ndarray (n_source,)
+    barycentric : float ndarray (n_source, 3)
+    """
+    center, size = source.frame
+    X, T = (image - center) / size, target.dense.T
+    tree = cKDTree(joint.features(X, vertex_normals(X, T)))
+    nearest = tree.query(joint.features(source.dense.X, vertex_normals(source.dense.X, source.dense.T)))[1]
+    return closest_point_in_star(source.dense.X, nearest, X, T)
+
+
+def confidence(source, target, match, image, triangle, barycentric):
+    """exp(-(r + g) / 0.02) for every template vertex ``(n_target,)``, in 0..1.
+
+    r is the round trip template -> shape -> template, g the gap between the registered template and the matched
+    vertex, both as shares of sqrt(area).
+    """
+    X, T = target.dense.X, target.dense.T
+    corner = T[triangle[match]]
+    back = np.einsum("nc,ncx->nx", barycentric[match], X[corner])
+    center, size = source.frame
+    gap = np.linalg.norm((image - center) / size - source.dense.X[match], axis=1)
+    return np.exp(-(np.linalg.norm(back - X, axis=1) + gap) / CONFIDENCE_LENGTH)
+
+
+def registration(source, target, match_low, embeddings, *, k=100, refine="joint", scale=False):
+    """One shape's file of ``/registration``: match, displacement, motion, confidence and the way back.
+
+    Parameters
+    ----------
+    source : Scan
+        The shape.
+    target : Scan
+        The template.
+    match_low, embeddings, k, refine : see :func:`register`
+    scale : bool
+        Whether size is taken out of the displacement.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``registered_match(vertex)``, ``displacement(vertex, xyz)``, ``displacement_raw``, ``rotation``,
+        ``translation``, ``scale``, ``confidence(vertex)``, ``template_triangle(original_vertex)``,
+        ``template_barycentric``; displacements in the unit of the input, in the template's frame.
+    """
+    match, image, info = register(source, target, match_low, embeddings, k=k, refine=refine)
+    triangle, barycentric = way_back(source, target, image)
+    X, _ = as_arrays(target.original)
+    displacement, R, t, s = displacement_in_template(X, image, target.dense.area, scale=scale)
+    raw = s * source.original["position"].values[match] @ R.T + t - X
+    return dataset(
+        info,
+        registered_match=match.astype(np.int32),
+        displacement=displacement.astype(np.float32),
+        displacement_raw=raw.astype(np.float32),
+        rotation=R,
+        translation=t,
+        scale=np.array(s),
+        confidence=confidence(source, target, match, image, triangle, barycentric).astype(np.float32),
+        template_triangle=triangle.astype(np.int32),
+        template_barycentric=barycentric,
+    )
+
+
+def match_pair(source, target, *, k_init=20, k=100, init="dense", refine="joint", n_coarse=6000, seed=0):
+    """Correspondence of two shapes at full resolution (4.1).
+
+    Parameters
+    ----------
+    source, target : xarray.Dataset
+        Clean meshes (``position``, ``corner_vertex``), as of :func:`s4a.read_shapes` or :func:`s4a.clean`.
+    k_init, k : int
+        Sizes of the first and of the refined functional map.
+    init : {"dense", "landmarks"}
+        First map from all nearest neighbours after ICP, or the paper's fit on 10 landmarks.
+    refine : {"joint", "intrinsic"}
+        Joint rounds after ZoomOut (default), or the paper's ZoomOut alone and eq. 4.
+    n_coarse : int
+        Vertices of the low-resolution meshes.
+    seed : int
+
+    Returns
+    -------
+    xarray.Dataset
+        ``fmap(mode_target, mode_source)`` after ZoomOut, ``fmap_initial``, ``match(vertex)`` = on each vertex of
+        the target the matched vertex of the source, ``displacement(vertex, xyz)`` from the target to the source
+        after rigid alignment (unit of the input), ``confidence(vertex)``; attrs ``score`` (see
+        :func:`s4a.joint.badness`) and ``method``.
+
+    Raises
+    ------
+    ValueError
+        When a mesh lacks its variables or an option is not one of those above.
+    """
+    from s4a.network import first_map  # the first map is shared with the network
+    from s4a.remesh import coarsen
+    from s4a.spectral import spectrum
+
+    if refine not in ("joint", "intrinsic") or init not in ("dense", "landmarks"):
+        raise ValueError(
+            f"refine must be 'joint' or 'intrinsic', init 'dense' or 'landmarks'; found {refine!r}, {init!r}"
+        )
+    scans = []
+    for mesh, what in ((source, "source"), (target, "target")):
+        require(mesh, "position", "corner_vertex", what=what)
+        scans.append(Scan(mesh, spectrum(coarsen(mesh, n_coarse=n_coarse, seed=seed), k=k)))
+    M, N = scans
+    motion = align(M.low.X, M.low.area, N.low.X, N.low.area)[:2]
+    C0 = first_map(
+        *((s.low.X, s.low.area, s.low.Phi, s.eigenvalue) for s in scans), motion, k_init=k_init, init=init
+    )
+    k = min(k, M.low.Phi.shape[1], N.low.Phi.shape[1])
+    C, match_low = fmap.zoomout(C0, M.low.Phi, N.low.Phi, N.low.area, k)
+    near = cKDTree(M.low.X @ motion[0].T + motion[1]).query(N.low.X)[1]
+    found = registration(
+        M,
+        N,
+        {"intrinsic": match_low, "icp": near},
+        (M.low.Phi[:, :k] @ C.T, N.low.Phi[:, :k]),
+        k=k,
+        refine=refine,
+    )
+    maps = dataset(fmap=C, fmap_initial=C0, match=found["registered_match"].values)
+    return maps.merge(found[["displacement", "displacement_raw", "confidence"]]).assign_attrs(found.attrs)
+
+
+def identity(target):
+    """The template's own file of ``/registration``: every vertex matches itself, nothing moves."""
+    X, T = as_arrays(target.original)
+    corner = np.argsort(T.ravel(), kind="stable")[np.cumsum(np.bincount(T.ravel(), minlength=len(X))) - 1]
+    zero = np.zeros(X.shape, np.float32)
+    return dataset(
+        {"method": "template", "score": 0.0},
+        registered_match=np.arange(len(X), dtype=np.int32),
+        displacement=zero,
+        displacement_raw=zero,
+        rotation=np.eye(3),
+        translation=np.zeros(3),
+        scale=np.array(1.0),
+        confidence=np.ones(len(X), np.float32),
+        template_triangle=(corner // 3).astype(np.int32),
+        template_barycentric=np.eye(3)[corner % 3],
+    )
