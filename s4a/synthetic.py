@@ -17,17 +17,17 @@ from scipy.special import ndtr, ndtri
 from s4a.mesh import as_dataset, vertex_areas
 from s4a.schema import dataset
 
-MODE_RMS = 6.0  # mm, root mean square displacement of mode 1 at one standard deviation
+MODE_RMS = 4.5  # mm, root mean square displacement of mode 1 at one standard deviation
 MODE_RATIO = 0.6  # of each mode to the one before it
 NOISE_RMS = 0.4  # mm, of the individual noise: 8 slides 16 to 28 mm wide
-TUMOUR = (4.0, 7.0)  # mm, least and largest height, on a third of the shapes; 9 to 13 mm wide
+TUMOUR = (4.0, 7.0)  # mm, least and largest height, on a third of the shapes; 10 to 14 mm wide
 POSE = (10.0, 8.0)  # largest rotation in degrees, standard deviation of the translation in mm
-SEMI_AXES = np.array([64.0, 86.0, 60.0])
+SEMI_AXES = np.array([64.0, 86.0, 61.0])
 
 # centre, width, push, turn of the slides and turns of each mode on the right; `mirror` 1 repeats it on the left as in
 # a mirror, -1 with the opposite sign, 0 not at all
 MODES = [
-    [((58, 0, 5), 36, (0, 0, 0), (1, 0, 0), 1)],
+    [((62, 0, 5), 44, (0, 0, 0), (1, 0, 0), 1)],
     [((0, 60, 10), 38, (0, 0, 0), (0, 1, 0), 0), ((0, -60, 10), 38, (0, 0, 0), (0, -1, 0), 0)],
     [((45, 30, -28), 28, (0, 1, 0.2), (0, 0, 0), 1), ((25, -55, -30), 28, (-0.8, 0, 0.6), (0, 0, 0), 1)],
     [((30, -45, 45), 28, (1, 0, -1), (0, 0, 0), -1)],
@@ -57,7 +57,7 @@ LANDMARKS = {
     "lateral left": (-1.0, -0.1, 0.1),
     "lateral right": (1.0, -0.1, 0.1),
     "vertex": (0.1, 0.0, 1.0),
-    "brainstem": (0.0, -0.28, -0.96),
+    "brainstem": (0.0, -0.36, -0.93),
 }
 
 
@@ -71,7 +71,7 @@ def _step(x, width):
     return 0.5 * (1 + np.tanh(x / width))
 
 
-def _fold_noise(p, wavelength=32.0, waves=48):
+def _fold_noise(p, wavelength=30.0, waves=48):
     """A random field of one wavelength, nearly mirror-symmetric in x, unit variance; its zeros are the sulci."""
     rng = np.random.default_rng(20)
     k = rng.normal(size=(waves, 3))
@@ -91,28 +91,30 @@ def reference_brain(u):
     p = u * SEMI_AXES
     mirrored = np.stack([np.sqrt(x**2 + 1e-3), y, z], axis=1)
     cerebellum = _bump(mirrored, (0.35, -0.72, -0.68), 9.0)
-    stem = _bump(u, (0, -0.28, -0.96), 60.0)
-    temporal = _bump(mirrored, (0.78, 0.22, -0.52), 9.0)
+    stem = _bump(u, (0, -0.36, -0.93), 110.0)
+    base = _bump(u, (0, 0.35, -0.94), 6.0)
+    temporal = _bump(mirrored, (0.72, 0.25, -0.62), 10.0)
     # grooves: longitudinal fissure, Sylvian fissure, gap between cerebrum and cerebellum
     top = _step(z + 0.25, 0.2) + 0.7 * _step(-0.6 - z, 0.1) * _step(y - 0.2, 0.1)
-    fissure = np.exp(-((x / 0.075) ** 2)) * top
+    fissure = np.exp(-((x / 0.07) ** 2)) * top
     sylvian = np.exp(-(((z + 0.2 - 0.35 * (0.25 - y)) / 0.075) ** 2)) * _step(side - 0.55, 0.1) * _step(y + 0.3, 0.12)
     tentorium = np.exp(-(((z + 0.36 - 0.15 * y) / 0.06) ** 2)) * _step(-0.35 - y, 0.12) * _step(z + 0.9, 0.1)
     # folds
-    cortex = np.clip(1 - cerebellum - 1.5 * stem, 0, 1) * _step(z + 0.72, 0.12)
-    sulci = np.exp(-((_fold_noise(p) / 0.42) ** 2)) * cortex
+    cortex = np.clip(1 - cerebellum - 1.5 * stem, 0, 1) * _step(z + 0.82, 0.1)
+    sulci = cortex / (1 + (_fold_noise(p) / 0.4) ** 2)
     folia = np.cos(70 * (z - 0.25 * y)) * np.clip(cerebellum * 1.4 - 0.3, 0, 1)
     f = (
         1
-        + 0.10 * temporal
-        + 0.13 * cerebellum
-        + 0.26 * stem
+        + 0.17 * temporal
+        + 0.14 * cerebellum
+        + 0.28 * stem
+        - 0.12 * base
         + 0.025 * _bump(u, (0.45, 0.85, 0), 8.0)
         + 0.03 * _bump(u, (-0.4, -0.9, 0), 8.0)
-        - 0.15 * fissure
+        - 0.20 * fissure
         - 0.11 * sylvian
         - 0.12 * tentorium
-        - 0.065 * sulci * (1 - 0.7 * fissure)
+        - 0.085 * sulci * (1 - fissure)
         + 0.012 * folia
     )
     p = p * f[:, None]
@@ -132,8 +134,8 @@ def _fields(x, centre, width, push, turn):
 def _planted_modes(n_modes):
     """Centres and widths of all parts, and each mode's push and turn of them.
 
-    On the reference brain the modes are orthogonal to rigid motions and to each other.  Rows of `rows` are generators: the six rigid motions (one part of infinite width), then the designed modes; their
-    Cholesky factor is Gram-Schmidt's.
+    On the reference brain the modes are orthogonal to rigid motions and to each other.  `rows` are generators: the six rigid
+    motions (one part of infinite width), then the designed modes; their Cholesky factor is Gram-Schmidt's.
     """
     if not 0 <= n_modes <= len(MODES):
         raise ValueError(f"n_modes needs a number from 0 to {len(MODES)}, found {n_modes}")
@@ -192,7 +194,7 @@ def plant(n=12, seed=0, *, n_modes=3):
     centre, width, push, turn = _planted_modes(n_modes)
     score = _planted_scores(n, n_modes, rng)
     own_centre = reference_brain(_random_directions(rng, n * 9)).reshape(n, 9, 3)
-    own_width = np.concatenate([rng.uniform(16, 28, (n, 8)), rng.uniform(9, 13, (n, 1))], axis=1)
+    own_width = np.concatenate([rng.uniform(16, 28, (n, 8)), rng.uniform(10, 14, (n, 1))], axis=1)
     own_push = rng.normal(size=(n, 9, 3))
     spread = _random_directions(rng, n)
     spread[:, 2] = np.abs(spread[:, 2])  # a tumour is on the upper half
