@@ -77,11 +77,11 @@ def boundary_vertices(T):
 
 def edge_graph(X, T):
     """Edge lengths as a symmetric CSR matrix ``(n, n)``: the graph for Dijkstra's distances."""
-    E = edges(T)
-    length = np.linalg.norm(X[E[:, 0]] - X[E[:, 1]], axis=1)
-    length = np.maximum(length, 1e-12 * (length.max(initial=0) or 1))  # an explicit zero would count as no edge
-    W = sp.coo_matrix((np.r_[length, length], (np.r_[E[:, 0], E[:, 1]], np.r_[E[:, 1], E[:, 0]])), (len(X), len(X)))
-    return W.tocsr()
+    i, j = directed_edges(T).T
+    G = sp.coo_matrix((np.ones(2 * len(i)), (np.r_[i, j], np.r_[j, i])), (len(X), len(X))).tocsr()
+    length = np.linalg.norm(X[np.repeat(np.arange(len(X)), np.diff(G.indptr))] - X[G.indices], axis=1)
+    G.data = np.maximum(length, 1e-12 * (length.max(initial=0) or 1))  # an explicit zero would count as no edge
+    return G
 
 
 def cotan_weights(X, T):
