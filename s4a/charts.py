@@ -1,0 +1,162 @@
+"""Charts of a study's numbers; every function takes arrays and gives a matplotlib Figure."""
+
+import io
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator, PercentFormatter
+
+from s4a.draw import SIGNED
+
+BLUE, ORANGE, GREY = "#0072b2", "#d55e00", "#777777"
+LOOK = {
+    "font.size": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.titlesize": 10,
+    "axes.edgecolor": GREY,
+    "svg.hashsalt": "s4a",
+}
+
+
+def svg(figure):
+    """The bytes of an SVG file of a Figure, the same for the same figure.
+
+    Examples
+    --------
+    >>> svg(variance([0.7, 0.3])).startswith(b"<?xml")
+    True
+    """
+    file = io.BytesIO()
+    with rc_context(LOOK):
+        figure.savefig(file, format="svg", transparent=True, metadata={"Date": None})
+    return file.getvalue()
+
+
+def _figure(width, height, columns=1, **options):
+    with rc_context(LOOK):
+        figure = Figure(figsize=(width, height), layout="constrained")
+        return figure, figure.subplots(1, columns, squeeze=False, **options)[0]
+
+
+def on_circle(n):
+    """Places ``(n, 2)`` spread evenly over the unit circle."""
+    angle = 2 * np.pi * np.arange(n) / max(n, 1)
+    return np.stack([np.sin(angle), np.cos(angle)], axis=1)
+
+
+def network(places, names, source, target, errors, highlight=None):
+    """The graph of maps, once for each named array of edge errors, on one colour scale.
+
+    Parameters
+    ----------
+    places : float ndarray (shape, 2)
+    names : sequence of str
+    source, target : int ndarray (pair,)
+        Which shape each map takes and gives.
+    errors : dict of str to float ndarray (pair,)
+        Title of each picture and the value that colours its edges.
+    highlight : int, optional
+        The shape to mark.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    figure, axes = _figure(4.6 * len(errors) + 0.6, 4.2, len(errors))
+    finite = np.concatenate([value[np.isfinite(value)] for value in errors.values()])
+    scale = ScalarMappable(Normalize(0, finite.max(initial=0) or 1), "viridis_r")
+    for ax, (title, value) in zip(axes, errors.items(), strict=True):
+        order = np.argsort(value)  # the worst on top
+        lines = np.stack([places[source], places[target]], axis=1)[order]
+        ax.add_collection(LineCollection(lines, colors=scale.to_rgba(value[order]), linewidths=1, alpha=0.8))
+        ax.scatter(*places.T, s=22, color="#333333", zorder=2)
+        if highlight is not None:
+            ax.scatter(*places[highlight], s=90, facecolor="none", edgecolor=ORANGE, linewidth=2, zorder=3)
+        if len(names) <= 60:
+            for place, name in zip(places, names, strict=True):
+                ax.annotate(
+                    name,
+                    place,
+                    (3, 4),
+                    textcoords="offset points",
+                    fontsize=6,
+                    color="#333333",
+                    zorder=4,
+                    parse_math=False,
+                )
+        ax.set_title(f"{title}, median {np.nanmedian(value):.3g}" if np.isfinite(value).any() else title)
+        ax.margins(0.12)
+        ax.set_axis_off()
+    figure.colorbar(scale, ax=list(axes), shrink=0.7, label="cycle error", pad=0.01)
+    return figure
+
+
+def matrices(named, limit=1.0):
+    """Matrices side by side with signed colours, blue positive; `named` maps titles to arrays."""
+    figure, axes = _figure(3.4 * len(named) + 0.7, 3.3, len(named))
+    for ax, (title, values) in zip(axes, named.items(), strict=True):
+        image = ax.imshow(values, cmap=SIGNED, vmin=-limit, vmax=limit, interpolation="nearest")
+        ax.set(title=title, xlabel="mode of the source", ylabel="mode of the target")
+        for axis in (ax.xaxis, ax.yaxis):
+            axis.set_major_locator(MaxNLocator(5, integer=True))
+    figure.colorbar(image, ax=list(axes), shrink=0.8, pad=0.01)
+    return figure
+
+
+def ranked(names, values, label, highlight=None):
+    """Bars in rising order; `highlight` is the index of a shape to mark."""
+    order = np.argsort(values)
+    figure, (ax,) = _figure(7.5, max(1.4, 0.5 + 0.17 * len(values)))
+    place = np.arange(len(order))
+    ax.barh(place, values[order], color=[ORANGE if i == highlight else BLUE for i in order], height=0.75)
+    ax.set_yticks(place, [names[i] for i in order], fontsize=7, parse_math=False)
+    ax.invert_yaxis()
+    ax.margins(y=0.01)
+    ax.set_xlabel(label)
+    return figure
+
+
+def variance(high, low=None):
+    """Cumulative share of variance over the number of components, at high and low resolution (Fig. 5)."""
+    figure, (ax,) = _figure(5.2, 3.2)
+    for values, label, color, marker in ((high, "high resolution", BLUE, "o"), (low, "low resolution", ORANGE, "s")):
+        if values is not None:
+            ratio = np.asarray(values)[:20]
+            ax.plot(np.arange(1, len(ratio) + 1), np.cumsum(ratio), marker, ls="-", color=color, label=label, ms=4)
+    ax.set(xlabel="number of components", ylabel="explained variance", ylim=(0, 1.03))
+    ax.yaxis.set_major_formatter(PercentFormatter(1))
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.grid(axis="y", color="#dddddd")
+    ax.legend(frameon=False, loc="lower right")
+    return figure
+
+
+def scores(score, names, highlight=None):
+    """Scores of the shapes on the first components, two by two, in standard deviations."""
+    planes = [(a, b) for a, b in ((0, 1), (0, 2)) if b < score.shape[1]] or [(0, 0)]
+    figure, axes = _figure(4.2 * len(planes), 3.8, len(planes))
+    for ax, (a, b) in zip(axes, planes, strict=True):
+        ax.axhline(0, color="#dddddd", lw=1)
+        ax.axvline(0, color="#dddddd", lw=1)
+        colors = [ORANGE if i == highlight else BLUE for i in range(len(score))]
+        ax.scatter(score[:, a], score[:, b], color=colors, s=20, zorder=2)
+        if len(names) <= 60:
+            for name, x, y in zip(names, score[:, a], score[:, b], strict=True):
+                ax.annotate(
+                    name, (x, y), (3, 3), textcoords="offset points", fontsize=6, color="#333333", parse_math=False
+                )
+        ax.set(xlabel=f"component {a + 1} (sd)", ylabel=f"component {b + 1} (sd)")
+        ax.margins(0.12)
+    return figure
+
+
+def color_bar(colormap, low, high, label):
+    """A horizontal colour bar."""
+    figure, (ax,) = _figure(4.2, 0.62)
+    figure.colorbar(ScalarMappable(Normalize(low, high), colormap), cax=ax, orientation="horizontal", label=label)
+    return figure

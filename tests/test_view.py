@@ -1,0 +1,232 @@
+"""Pictures and the page of a study, on a small made-up study of ellipsoids."""
+
+import re
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from s4a import draw, view
+from s4a.mesh import as_dataset, vertex_areas
+from s4a.schema import dataset
+
+K, N_SHAPES = 12, 6
+
+
+def sphere(n=14):
+    """A closed, outward oriented sphere: `n` rings of 2 n vertices and the poles."""
+    polar, around = np.pi * np.arange(1, n) / n, np.pi * np.arange(2 * n) / n
+    ring = np.stack(
+        np.broadcast_arrays(np.outer(np.sin(polar), np.cos(around)), np.outer(np.sin(polar), np.sin(around)))
+    )
+    ring = np.stack([*ring, np.broadcast_to(np.cos(polar)[:, None], ring.shape[1:])], axis=-1)
+    X = np.concatenate([[[0, 0, 1.0]], ring.reshape(-1, 3), [[0, 0, -1.0]]])
+    m, south = 2 * n, len(X) - 1
+    i, j = 1 + m * np.arange(n - 2)[:, None], np.arange(m)
+    k = (j + 1) % m
+    sides = [np.stack([i + j, i + m + j, i + k], -1), np.stack([i + k, i + m + j, i + m + k], -1)]
+    caps = [np.stack([0 * j, 1 + j, 1 + k], -1), np.stack([0 * j + south, south - m + k, south - m + j], -1)]
+    return X, np.concatenate([part.reshape(-1, 3) for part in (*sides, *caps)])
+
+
+def make_study(n=14):
+    """A study as the pipeline leaves it, of ellipsoids whose height is the only thing that varies much."""
+    rng = np.random.default_rng(0)
+    X, T = sphere(n)
+    X = X * [60, 80, 65] * (1 + 0.06 * np.sin(4 * np.arctan2(X[:, 1:2], X[:, :1])) * (1 - X[:, 2:] ** 2))
+    names = [f"shape-{i}" for i in range(N_SHAPES)]
+    score = rng.standard_normal((N_SHAPES, 3))
+    modes = np.stack([X * [0, 0, 0.09], X * [0.05, 0, 0], X * [0, 0.03, 0] * (X[:, 1:2] > 0)])
+    displacement = np.einsum("sc,cvx->svx", score, modes)
+    registered = X + displacement
+    tree = {"original": xr.Dataset(), "coarse": xr.Dataset()}
+    owner = np.zeros(len(X), int)
+    owner[T] = np.arange(len(T))[:, None]  # some triangle of each vertex
+    for name, position in zip(names, registered, strict=True):
+        tree[f"original/{name}"] = as_dataset(position + 5, T)
+        tree[f"coarse/{name}"] = as_dataset(position + 5, T, eigenvalue=np.arange(K))
+        weights = (T[owner] == np.arange(len(X))[:, None]).astype(float)
+        tree[f"registration/{name}"] = dataset(template_triangle=owner, template_barycentric=weights)
+    source, target = np.array(
+        [(i, j) for i in range(N_SHAPES) for j in range(N_SHAPES) if (i - j) % 6 in (1, 2, 4, 5)]
+    ).T
+    fmap = np.eye(K) + 0.15 * rng.standard_normal((len(source), K, K))
+    error = rng.random(len(source))
+    tree["network"] = dataset(
+        source=np.array(names)[source],
+        target=np.array(names)[target],
+        fmap=fmap,
+        fmap_initial=fmap[:, :6, :6] + 0.2 * rng.standard_normal((len(source), 6, 6)),
+        weight=np.exp(-error),
+        cycle_error=0.3 * error,
+        cycle_error_initial=error,
+    )
+    named = {"shape": names}
+    tree["latent"] = dataset(
+        {"median": "shape-2"}, distance_to_median=np.abs(score[:, 0]), area_score=score
+    ).assign_coords(named)
+    tree["registration"] = dataset(
+        {"template": "shape-2"},
+        position=X,
+        corner_vertex=T,
+        registered_match=np.tile(np.arange(len(X)), (N_SHAPES, 1)),
+        displacement=displacement,
+        rotation=np.tile(np.eye(3), (N_SHAPES, 1, 1)),
+        translation=np.full((N_SHAPES, 3), -5.0),
+        scale=np.ones(N_SHAPES),
+        confidence=np.clip(1 - np.abs(displacement).max(2) / 20, 0, 1),
+    ).assign_coords(named)
+    tree["pca"] = dataset(
+        mean_displacement=0 * X,
+        deformation=modes,
+        standard_deviation=np.sqrt((modes**2).sum(2) @ vertex_areas(X, T)),
+        score=score,
+        explained_variance_ratio=[0.7, 0.2, 0.1],
+        explained_variance_ratio_low=[0.6, 0.25, 0.15],
+    ).assign_coords(named)
+    tree["report"] = dataset(
+        {"n_coarse": 6000, "k": 100, "refine": "joint"},
+        status=["ok"] * 5 + ["repaired", "excluded"],
+        reason=[""] * 5 + ["3 duplicate triangles removed", "not a surface: <script>alert('&')</script>"],
+        path=[f"heads/shape-{i}.ply" for i in range(7)],
+        seconds=[1.5, 20.0, 3.25],
+        peak_memory=[300.0, 1200.0, 900.0],
+    ).assign_coords(shape=[*names, "broken <b>"], stage=["clean", "coarse", "network"])
+    return xr.DataTree.from_dict(tree)
+
+
+@pytest.fixture(scope="module")
+def study():
+    return make_study()
+
+
+@pytest.fixture(scope="module")
+def html(study):
+    return view.page(study, title="Seven <ellipsoids>")
+
+
+def test_a_sphere_is_drawn_as_a_disk_of_its_area():
+    X, T = sphere(40)
+    picture = draw.render(X, T, size=(200, 200))
+    assert picture.shape == (200, 200, 4)
+    assert picture[..., 3].sum() / 255 == pytest.approx(np.pi * (0.94 * 100) ** 2, rel=0.01)
+    assert picture[100, 100, 3] == 255
+    assert picture[0, 0, 3] == 0
+
+
+def test_the_nearer_surface_hides_the_farther_whatever_their_order():
+    X, T = sphere()
+    both = np.concatenate([X, 0.5 * X + draw.rotation()[2] * 2])
+    colors = np.repeat([[1.0, 0, 0], [0, 0, 1.0]], len(X), axis=0)
+    triangles = np.concatenate([T, T + len(X)])
+    pictures = [draw.render(both, t, colors=colors, size=(100, 100)) for t in (triangles, triangles[::-1])]
+    assert np.array_equal(pictures[0], pictures[1])
+    red, _, blue, opacity = pictures[0][50, 50].astype(int)
+    assert opacity == 255
+    assert blue > red
+    red, _, blue, _ = pictures[0][50, 12].astype(int)
+    assert red > blue
+
+
+def test_chunks_do_not_change_the_picture(monkeypatch):
+    X, T = sphere()
+    whole = draw.render(X, T, size=(80, 60))
+    monkeypatch.setattr(draw, "CHUNK", 1000)
+    assert np.array_equal(whole, draw.render(X, T, size=(80, 60)))
+
+
+def test_a_surface_turned_inside_out_looks_the_same():
+    X, T = sphere()
+    assert np.array_equal(draw.render(X, T, size=(80, 60)), draw.render(X, T[:, ::-1], size=(80, 60)))
+
+
+@pytest.mark.parametrize("up", ["x", "y", "z"])
+def test_the_up_axis_points_up_and_views_are_rotations(up):
+    axis = np.eye(3)["xyz".index(up)]
+    for name in draw.VIEWS:
+        R = draw.rotation(name, up)
+        assert np.allclose(R @ R.T, np.eye(3))
+        assert np.linalg.det(R) == pytest.approx(1)
+    assert np.allclose(draw.rotation("front", up) @ axis, [0, 1, 0])
+
+
+def test_labels_are_not_mixed():
+    X, T = sphere()
+    colors = draw.label_colors((X[:, 0] > 0).astype(int))
+    picture = draw.render(X, T, colors=colors, flat=True, view="top", size=(100, 100))
+    inner = picture[10:90, 10:90, :3][picture[10:90, 10:90, 3] == 255].astype(float)
+    hue = inner[:, 2] / inner.sum(1)
+    # orange has no blue and sky blue is mostly blue: only antialiased samples of the border lie in between
+    assert ((hue > 0.15) & (hue < 0.35)).mean() < 0.05
+
+
+def test_positive_is_blue_negative_is_red_and_unknown_is_grey():
+    X, T = sphere()
+    red, _, blue, _ = draw.render(X, T, colors=draw.signed_colors(np.ones(len(X)), 1), size=(60, 60))[30, 30].astype(
+        int
+    )
+    assert blue > red + 50
+    red, _, blue, _ = draw.render(X, T, colors=draw.signed_colors(-np.ones(len(X)), 1), size=(60, 60))[30, 30].astype(
+        int
+    )
+    assert red > blue + 50
+    grey = draw.render(X, T, colors=draw.signed_colors(np.full(len(X), np.nan), 1), size=(60, 60))[30, 30, :3]
+    assert np.ptp(grey.astype(int)) < 12
+
+
+def test_a_broken_surface_is_refused_with_advice():
+    X, T = sphere()
+    with pytest.raises(ValueError, match="clean the mesh"):
+        draw.render(np.where(X > 0.9, np.nan, X), T)
+    with pytest.raises(ValueError, match="front"):
+        draw.rotation("sideways")
+    with pytest.raises(ValueError, match="up needs"):
+        draw.rotation(up="w")
+
+
+def test_the_page_is_one_file_without_any_address_outside(html):
+    assert not re.findall(r"""(?:src|href)\s*=\s*["'](?!data:)""", html)
+    assert "http" not in re.sub(r"data:[^\"]*", "", html)
+    assert len(html) < 8e6
+    assert html.count("<section>") == len(view.SECTIONS)
+    assert "Not there" not in html
+
+
+def test_text_of_the_study_is_escaped(html):
+    assert "Seven &lt;ellipsoids&gt;" in html
+    assert "broken &lt;b&gt;" in html
+    assert "<script>alert" not in html
+    assert "&lt;script&gt;alert" in html
+
+
+def test_the_page_says_what_the_study_says(html):
+    summary = "7 shapes, 1 repaired, 1 excluded; median shape-2; template shape-2; the first 3 components hold 100%"
+    for text in (
+        summary,
+        "shape-2, the median",
+        "n_coarse",
+        "1,200",
+        "component 3, +3 σ, from behind",
+        "70.0% of the variance",
+    ):
+        assert text in html
+
+
+def test_the_page_is_the_same_every_time(study, html):
+    assert view.page(study, title="Seven <ellipsoids>") == html
+
+
+@pytest.mark.parametrize("node", ["original", "coarse", "network", "latent", "registration", "pca", "report"])
+def test_an_unfinished_study_shows_what_there_is(study, node, tmp_path, monkeypatch):
+    monkeypatch.setattr(view, "render", lambda *surface, **look: np.zeros((2, 2, 4), np.uint8))
+    part = study.copy()
+    del part[node]
+    text = view.write_page(part, tmp_path / "page.html").read_text(encoding="utf-8")
+    assert ("Not there" in text) == (node != "original")
+    assert text.count("<section>") == len(view.SECTIONS)
+
+
+def test_an_empty_study_gives_a_page_too():
+    text = view.page(xr.DataTree())
+    assert "The study is empty." in text
+    assert text.count("Not there") == len(view.SECTIONS)
