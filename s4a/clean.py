@@ -54,7 +54,8 @@ def clean(mesh, *, components="largest", strict=False):
     -------
     Dataset
         With ``position``, ``corner_vertex``, ``file_vertex`` (several vertices share one where it was split) and
-        ``vertex_of_file``; what was found and repaired is counted in the attributes, see :func:`clean_arrays`.
+        ``vertex_of_file``; what was found and repaired is counted in the attributes, see :func:`clean_arrays`, and
+        summed up as ``status`` (ok or repaired) and ``reason``.
 
     Raises
     ------
@@ -71,7 +72,9 @@ def clean(mesh, *, components="largest", strict=False):
     """
     require(mesh, "position", "corner_vertex", what="mesh")
     X, T, file_vertex, vertex_of_file, counts = clean_arrays(*as_arrays(mesh), components=components, strict=strict)
-    return as_dataset(X, T, {**mesh.attrs, **counts}, file_vertex=file_vertex, vertex_of_file=vertex_of_file)
+    reason = repairs(counts)
+    attrs = {**mesh.attrs, **counts, "status": "repaired" if reason else "ok", "reason": reason}
+    return as_dataset(X, T, attrs, file_vertex=file_vertex, vertex_of_file=vertex_of_file)
 
 
 def clean_arrays(points, triangles, *, components="largest", strict=False):

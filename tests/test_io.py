@@ -1,0 +1,334 @@
+import struct
+import zlib
+from base64 import b64encode
+from pathlib import Path
+
+import nibabel
+import numpy as np
+import pytest
+
+from s4a.io import find_meshes, read_mesh, slug, write_mesh
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+X = np.array([[0, 0, 0], [1.5, 0, 0], [1.5, 2, 0], [0, 2, 0], [0.25, 0.5, 3]])
+T = np.array([[0, 2, 1], [0, 3, 2], [0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
+
+
+def same_surface(path, points=X, triangles=T):
+    found, corners, attrs = read_mesh(path)
+    assert found.dtype == np.float64
+    assert corners.dtype == np.int32
+    np.testing.assert_array_equal(found[corners], points[triangles])
+    return attrs
+
+
+def file(tmp_path, name, content):
+    path = tmp_path / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".obj", ".off", ".stl", ".vtk", ".gii", ".npz"])
+def test_a_written_mesh_comes_back(tmp_path, suffix):
+    write_mesh(tmp_path / f"m{suffix}", X, T)
+    same_surface(tmp_path / f"m{suffix}")
+
+
+def test_text_formats_keep_every_digit(tmp_path):
+    points = X + np.random.default_rng(0).random(X.shape)
+    for name in ("m.obj", "m.off"):
+        write_mesh(tmp_path / name, points, T)
+        same_surface(tmp_path / name, points)
+
+
+def test_scalars_are_written_where_the_format_holds_them(tmp_path):
+    height = X[:, 2]
+    for name in ("m.ply", "m.vtk", "m.gii", "m.npz"):
+        write_mesh(tmp_path / name, X, T, height=height)
+        same_surface(tmp_path / name)
+    np.testing.assert_array_equal(nibabel.load(tmp_path / "m.gii").darrays[2].data, height)
+    with np.load(tmp_path / "m.npz") as arrays:
+        np.testing.assert_array_equal(arrays["height"], height)
+    with pytest.raises(ValueError, match=r"holds no values"):
+        write_mesh(tmp_path / "m.stl", X, T, height=height)
+    with pytest.raises(ValueError, match=r"each of 5 vertices"):
+        write_mesh(tmp_path / "m.ply", X, T, height=height[:3])
+
+
+def ply(order, quads=False):
+    """A file with extra vertex and face properties, an element before and, with `quads`, faces of mixed size."""
+    head = f"ply\nformat {order} 1.0\ncomment SPACE=LPS\nelement camera 1\nproperty float view\n"
+    head += f"element vertex {len(X)}\nproperty uchar red\nproperty double x\nproperty double y\nproperty double z\n"
+    faces = [[0, 3, 2, 1], *T[2:].tolist()] if quads else T.tolist()
+    head += f"element face {len(faces)}\nproperty uchar flag\nproperty list uchar int vertex_index\n"
+    head += "property list uchar float uv\nend_header\n"
+    if order == "ascii":
+        rows = ["0.5", *(f"7 {x} {y} {z}" for x, y, z in X)]
+        rows += [f"1 {len(f)} {' '.join(map(str, f))} 2 0.5 0.5" for f in faces]
+        return (head + "\n".join(rows) + "\n").encode()
+    end = "<" if "little" in order else ">"
+    body = struct.pack(end + "f", 0.5) + b"".join(struct.pack(end + "B3d", 7, *x) for x in X)
+    for f in faces:
+        body += struct.pack(f"{end}BB{len(f)}iB2f", 1, len(f), *f, 2, 0.5, np.nan)
+    return head.encode() + body
+
+
+@pytest.mark.parametrize("order", ["ascii", "binary_little_endian", "binary_big_endian"])
+@pytest.mark.parametrize("quads", [False, True])
+def test_ply_is_read_with_other_properties_and_polygons(tmp_path, order, quads):
+    expected = np.vstack([[[0, 3, 2], [0, 2, 1]], T[2:]]) if quads else T
+    assert same_surface(file(tmp_path, "m.ply", ply(order, quads)), X, expected)["coordinate_system"] == "LPS"
+
+
+def test_obj_is_read_with_textures_negative_indices_and_quads(tmp_path):
+    vertices = "".join(f"v {x} {y} {z}\n" for x, y, z in X)
+    text = "# a comment\nmtllib a.mtl\n" + vertices + "vt 0 0\nvn 0 0 1\ng part\nf 1/1/1 4/1/1 3/1/1 2/1/1\n"
+    text += "f 1//1 2//1 5//1\nf 2/1 3/1 5/1\nf -3 -2 \\\n -1\nf 4 1 5\n"
+    same_surface(file(tmp_path, "m.obj", text), X, np.vstack([[[0, 3, 2], [0, 2, 1]], T[2:]]))
+
+
+@pytest.mark.parametrize("head", ["OFF\n# made by hand\n5 5 0\n", "OFF 5 5 0\n", "OFF5 5 0\n"])
+def test_off_is_read_with_comments_and_polygons(tmp_path, head):
+    faces = "4 0 3 2 1 255 0 0\n3 0 1 4\n3 1 2 4\n\n3 2 3 4 0.5 # red\n3 3 0 4\n"
+    text = head + "".join(f"{x} {y} {z}\n" for x, y, z in X) + faces
+    same_surface(file(tmp_path, "m.off", text), X, np.vstack([[[0, 3, 2], [0, 2, 1]], T[2:]]))
+
+
+def test_off_with_colours_and_normals_gives_the_positions(tmp_path):
+    faces = "".join(f"3 {a} {b} {c}\n" for a, b, c in T)
+    for kind, extra in (("COFF", "255 0 0 255"), ("NOFF", "0 0 1"), ("CNOFF", "0 0 1 255 0 0 255")):
+        text = f"{kind}\n5 6 0\n" + "".join(f"{x} {y} {z} {extra}\n" for x, y, z in X) + faces
+        same_surface(file(tmp_path, "m.off", text))
+
+
+def ascii_stl():
+    text = "solid part\n"
+    for t in T:
+        rows = "".join(f"   vertex {x:e} {y:e} {z:e}\n" for x, y, z in X[t])
+        text += f" facet normal 0 0 0\n  outer loop\n{rows}  endloop\n endfacet\n"
+    return text + "endsolid part\n"
+
+
+def test_stl_is_read_as_text_and_as_binary_that_begins_with_solid(tmp_path):
+    same_surface(file(tmp_path, "a.stl", ascii_stl()))
+    write_mesh(tmp_path / "b.stl", X, T)
+    binary = (tmp_path / "b.stl").read_bytes()
+    same_surface(file(tmp_path, "c.stl", b"solid".ljust(80) + binary[80:]))
+    assert len(read_mesh(tmp_path / "c.stl")[0]) == len(X)
+
+
+VTK_HEAD = "# vtk DataFile Version {}\n3D Slicer output. SPACE=RAS\n{}\nDATASET POLYDATA\n"
+
+
+def test_vtk_is_read_as_text_with_quads_and_metadata(tmp_path):
+    text = VTK_HEAD.format("4.2", "ASCII") + "POINTS 5 float\n" + " ".join(map(str, X.ravel()))
+    text += "\nMETADATA\nINFORMATION 1\nNAME L2_NORM LOCATION vtkDataArray\nDATA 2 0 1\n\n"
+    text += "VERTICES 1 2\n1 0\nPOLYGONS 5 21\n4 0 3 2 1\n3 0 1 4\n3 1 2 4\n3 2 3 4\n3 3 0 4\n\nPOINT_DATA 5\n"
+    attrs = same_surface(file(tmp_path, "m.vtk", text), X, np.vstack([[[0, 3, 2], [0, 2, 1]], T[2:]]))
+    assert attrs == {"format": "VTK", "coordinate_system": "RAS"}
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_vtk_5_is_read_with_offsets(tmp_path, binary):
+    def array(values, code):
+        values = np.ravel(values)
+        return values.astype(code).tobytes() if binary else " ".join(map(str, values)).encode()
+
+    head = VTK_HEAD.format("5.1", "BINARY" if binary else "ASCII").encode()
+    data = head + b"POINTS 5 double\n" + array(X, ">f8") + b"\nPOLYGONS 7 18\nOFFSETS vtktypeint64\n"
+    data += array(np.arange(7) * 3, ">i8") + b"\nCONNECTIVITY vtktypeint64\n" + array(T, ">i8") + b"\n"
+    same_surface(file(tmp_path, "m.vtk", data))
+
+
+def vtp(how, compressed, header="UInt32"):
+    size, blob = {"UInt32": "<u4", "UInt64": "<u8"}[header], b""
+
+    def encode(values):
+        raw = values.tobytes()
+        if not compressed:
+            return [np.array([len(raw)], size).tobytes() + raw]
+        blocks = [raw[i : i + 32] for i in range(0, len(raw), 32)]
+        packed = [zlib.compress(block) for block in blocks]
+        sizes = [len(blocks), 32, len(blocks[-1]) % 32, *map(len, packed)]
+        return [np.array(sizes, size).tobytes(), b"".join(packed)]
+
+    def array(name, values, kind, width=1):
+        nonlocal blob
+        tag = f'<DataArray type="{kind}" Name="{name}" NumberOfComponents="{width}" format='
+        if how == "ascii":
+            return f'{tag}"ascii">{" ".join(map(str, values.ravel()))}</DataArray>'
+        parts = encode(values)
+        if how == "binary":
+            return f'{tag}"binary">\n  {b"".join(map(b64encode, parts)).decode()}\n</DataArray>'
+        offset = len(blob)
+        blob += b"".join(parts if how == "raw" else map(b64encode, parts))
+        return f'{tag}"appended" offset="{offset}"/>'
+
+    zlib_attr = ' compressor="vtkZLibDataCompressor"' if compressed else ""
+    text = (
+        f'<?xml version="1.0"?>\n<VTKFile type="PolyData" byte_order="LittleEndian" header_type="{header}"{zlib_attr}>'
+    )
+    text += '<PolyData><Piece NumberOfPoints="5" NumberOfVerts="0" NumberOfStrips="0" NumberOfPolys="6"><Points>'
+    text += array("Points", X.astype("<f8"), "Float64", 3) + "</Points><Polys>"
+    text += array("connectivity", T.astype("<i8"), "Int64") + array("offsets", np.arange(3, 19, 3), "Int64")
+    text += "</Polys></Piece></PolyData>"
+    if blob:
+        encoding = "raw" if how == "raw" else "base64"
+        return f'{text}\n<AppendedData encoding="{encoding}">\n   _'.encode() + blob + b"\n</AppendedData></VTKFile>"
+    return (text + "</VTKFile>").encode()
+
+
+@pytest.mark.parametrize("how", ["ascii", "binary", "raw", "base64"])
+@pytest.mark.parametrize("compressed", [False, True])
+@pytest.mark.parametrize("header", ["UInt32", "UInt64"])
+def test_vtp_is_read_in_every_encoding(tmp_path, how, compressed, header):
+    same_surface(file(tmp_path, "m.vtp", vtp(how, compressed, header)))
+
+
+def test_freesurfer_surfaces_are_read(tmp_path):
+    nibabel.freesurfer.io.write_geometry(tmp_path / "lh.pial", X, T, create_stamp="created")
+    assert same_surface(tmp_path / "lh.pial") == {"format": "FreeSurfer", "coordinate_system": "RAS", "unit": "mm"}
+
+
+@pytest.mark.parametrize("keys", ["V F", "vertices faces", "points triangles", "position corner_vertex", "X T"])
+def test_npz_is_read_by_any_of_its_keys(tmp_path, keys):
+    np.savez(tmp_path / "m.npz", **dict(zip(keys.split(), (X, T), strict=True)))
+    same_surface(tmp_path / "m.npz")
+
+
+def test_npz_with_pickled_objects_is_refused(tmp_path):
+    np.savez(tmp_path / "m.npz", V=np.array([{}, 1], object), F=T)
+    with pytest.raises(ValueError, match=r"m\.npz cannot be read as NPZ"):
+        read_mesh(tmp_path / "m.npz")
+
+
+def test_the_content_counts_and_not_the_name(tmp_path):
+    attrs = same_surface(file(tmp_path, "m.stl", ply("binary_little_endian")))
+    assert attrs["format"] == "PLY"
+    assert attrs["note"] == "named .stl but holds PLY"
+
+
+def all_formats(tmp_path):
+    for suffix in (".ply", ".off", ".stl", ".vtk", ".gii", ".npz"):
+        write_mesh(tmp_path / f"m{suffix}", X, T)
+        yield (tmp_path / f"m{suffix}").read_bytes()
+    yield from (ply("ascii", True), ply("binary_big_endian", True), ascii_stl().encode())
+    yield from (vtp(how, compressed) for how in ("ascii", "binary", "raw") for compressed in (False, True))
+    nibabel.freesurfer.io.write_geometry(tmp_path / "lh.pial", X, T, create_stamp="created")
+    yield (tmp_path / "lh.pial").read_bytes()
+
+
+def test_a_file_cut_anywhere_is_refused_with_its_name(tmp_path):
+    for whole in all_formats(tmp_path):
+        for length in range(0, len(whole) - 40, max(1, len(whole) // 50)):
+            with pytest.raises(ValueError, match=r"cut\.mesh"):
+                read_mesh(file(tmp_path, "cut.mesh", whole[:length]))
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # damaged floats, which numpy warns of when it casts them
+def test_a_damaged_file_is_read_or_refused_but_nothing_worse(tmp_path):
+    rng = np.random.default_rng(0)
+    for whole in all_formats(tmp_path):
+        for _ in range(40):
+            damaged = np.frombuffer(whole, np.uint8).copy()
+            damaged[rng.integers(0, len(whole), 3)] = rng.integers(0, 256, 3)
+            try:
+                points, triangles, _ = read_mesh(file(tmp_path, "m.mesh", damaged.tobytes()))
+            except ValueError:
+                continue
+            assert 0 <= triangles.min() <= triangles.max() < len(points)
+
+
+def test_counts_beyond_the_file_are_named(tmp_path):
+    promise = {
+        "a.ply": ply("binary_little_endian").replace(b"element vertex 5", b"element vertex 4000000000"),
+        "b.ply": ply("ascii").replace(b"element face 6", b"element face 4000000000"),
+        "c.off": b"OFF\n5 4000000000 0\n0 0 0\n",
+        "d.stl": b"x".ljust(80) + struct.pack("<I", 4_000_000_000) + bytes(500),
+        "e.vtk": (VTK_HEAD.format("3.0", "ASCII") + "POINTS 4000000000 float\n0 0 0\n").encode(),
+    }
+    for name, content in promise.items():
+        with pytest.raises(ValueError, match=rf"{name}.*expected \d+000000.*found"):
+            read_mesh(file(tmp_path, name, content))
+
+
+def test_indices_beyond_the_vertices_are_named(tmp_path):
+    text = "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n"
+    with pytest.raises(ValueError, match=r"indices 0\.\.2 expected for 3 vertices, found 0\.\.7"):
+        read_mesh(file(tmp_path, "m.off", text))
+
+
+def test_what_is_no_mesh_says_so(tmp_path):
+    with pytest.raises(ValueError, match=r"none of PLY, OBJ"):
+        read_mesh(file(tmp_path, "m.ply", "shopping list"))
+    with pytest.raises(ValueError, match=r"no file"):
+        read_mesh(tmp_path / "absent.ply")
+    with pytest.raises(ValueError, match=r"needs vertices and triangles"):
+        read_mesh(file(tmp_path, "m.off", "OFF\n3 0 0\n0 0 0\n1 0 0\n0 1 0\n"))
+
+
+# collections
+
+
+def touch(folder, *names):
+    for name in names:
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    return folder
+
+
+def test_a_pattern_picks_one_structure_of_a_download(tmp_path):
+    touch(tmp_path, "000003_brain.stl", "000003_liver.stl", "s0011_brain.stl", "readme.txt", "._s0011_brain.stl")
+    for pattern in ("*_brain", "*_brain.stl"):
+        assert [name for _, name in find_meshes(tmp_path, pattern)] == ["000003_brain", "s0011_brain"]
+    with pytest.raises(ValueError, match=r"no mesh of 3 files matching '\*_heart'"):
+        find_meshes(tmp_path, "*_heart")
+
+
+def test_names_are_unique_and_do_not_depend_on_the_order(tmp_path):
+    touch(
+        tmp_path,
+        "a/head.ply",
+        "b/head.ply",
+        "b/head.stl",
+        "b/HEAD.off",
+        "c/Kopf ä.ply",
+        "c/脳.ply",
+        "lh.pial",
+        "a_b.ply",
+    )
+    found = find_meshes(tmp_path)
+    names = [name for _, name in found]
+    assert len({name.casefold() for name in names}) == len(names) == 8
+    assert {"a_head", "b_head_ply", "b_head_stl", "lh_pial", "Kopf_a", slug("脳")} <= set(names)
+    assert find_meshes([path for path, _ in found[::-1]]) == found
+    assert find_meshes([tmp_path / "c", tmp_path, str(tmp_path / "**" / "*.ply")]) == found
+
+
+def test_accents_in_either_normal_form_give_one_name():
+    assert slug("a\u0308") == slug("\u00e4") == "a"
+
+
+def test_different_files_never_share_a_name(tmp_path):
+    touch(tmp_path, "a/b_c.ply", "a_b/c.ply", "a b/c.ply", "a.b/c.ply", "é.ply", "e.ply", "A/b_c.ply")
+    names = [name.casefold() for _, name in find_meshes(tmp_path)]
+    assert len(set(names)) == 7
+
+
+def test_a_missing_path_is_named(tmp_path):
+    with pytest.raises(ValueError, match=r"no file, folder or match of .*absent"):
+        find_meshes(tmp_path / "absent")
+    with pytest.raises(ValueError, match=r"no match|no file, folder or match"):
+        find_meshes(str(tmp_path / "*.ply"))
+    with pytest.raises(ValueError, match=r"no mesh"):
+        find_meshes(tmp_path)
+
+
+def test_published_brain_templates_are_read():
+    folder = DATA / "brain_templates" / "fsaverage5_conte69"
+    if not folder.exists():
+        pytest.skip("needs the shared data")
+    points, triangles, attrs = read_mesh(folder / "fsa5_lh.gii")
+    assert (len(points), len(triangles)) == (10242, 20480)
+    assert attrs["unit"] == "mm"
