@@ -166,7 +166,7 @@ def _weld(P, F, counts):
         raise ValueError(f"a surface needs extent; all {len(F)} triangles are points")
     # the median side guards against a far outlier, whose bounding box would weld the whole shape
     diagonal = np.linalg.norm(np.ptp(X, axis=0))
-    tolerance = min(RELATIVE_TOLERANCE * diagonal, 0.01 * np.median(side[side > 0]))
+    tolerance = min(RELATIVE_TOLERANCE * diagonal, 1e-3 * np.median(side[side > 0]))
     order = np.lexsort(X.T)
     first = np.r_[True, (X[order[1:]] != X[order[:-1]]).any(axis=1)]
     exact = np.empty(len(X), np.int64)
