@@ -7,14 +7,17 @@ The fields are sums of localised slides and turns, exp(-|x - c|^2 / 2 w^2) (push
 Millimetres, and RAS: x to the right, y to the front, z up.
 """
 
+from pathlib import Path
+
 import fpsample
 import numpy as np
 import xarray as xr
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, ndtri
 
-from s4a.mesh import as_dataset, vertex_areas
+from s4a.clean import clean
+from s4a.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.schema import dataset
 
 MODE_RMS = 4.5  # mm, root mean square displacement of mode 1 at one standard deviation
@@ -101,7 +104,7 @@ def reference_brain(u):
     tentorium = np.exp(-(((z + 0.36 - 0.15 * y) / 0.06) ** 2)) * _step(-0.35 - y, 0.12) * _step(z + 0.9, 0.1)
     # folds
     cortex = np.clip(1 - cerebellum - 1.5 * stem, 0, 1) * _step(z + 0.82, 0.1)
-    sulci = cortex / (1 + (_fold_noise(p) / 0.4) ** 2)
+    sulci = cortex / (1 + (_fold_noise(p) / 0.7) ** 2)
     folia = np.cos(70 * (z - 0.25 * y)) * np.clip(cerebellum * 1.4 - 0.3, 0, 1)
     f = (
         1
@@ -114,7 +117,7 @@ def reference_brain(u):
         - 0.20 * fissure
         - 0.11 * sylvian
         - 0.12 * tentorium
-        - 0.085 * sulci * (1 - fissure)
+        - 0.078 * sulci * (1 - fissure)
         + 0.012 * folia
     )
     p = p * f[:, None]
@@ -134,8 +137,8 @@ def _fields(x, centre, width, push, turn):
 def _planted_modes(n_modes):
     """Centres and widths of all parts, and each mode's push and turn of them.
 
-    On the reference brain the modes are orthogonal to rigid motions and to each other.  `rows` are generators: the six rigid
-    motions (one part of infinite width), then the designed modes; their Cholesky factor is Gram-Schmidt's.
+    On the reference brain the modes are orthogonal to rigid motions and to each other.  `rows` are generators: the six
+    rigid motions (one part of infinite width), then the designed modes; their Cholesky factor is Gram-Schmidt's.
     """
     if not 0 <= n_modes <= len(MODES):
         raise ValueError(f"n_modes needs a number from 0 to {len(MODES)}, found {n_modes}")
@@ -246,18 +249,22 @@ def position(truth, shape, reference_point):
     >>> position(plant(4), "brain_02", [[0, 1, 0], [0, -1, 0]]).shape
     (2, 3)
     """
-    if shape not in truth["shape"].values:
-        raise ValueError(f"truth has the shapes {', '.join(truth['shape'].values)}; found {shape!r}")
-    value = {
-        name: truth[name].sel(shape=shape).values if "shape" in truth[name].dims else truth[name].values
-        for name in truth.data_vars
-    }
+    i = _index(truth, shape)
+    value = {name: v.values[i] if v.dims[0] == "shape" else v.values for name, v in truth.data_vars.items()}
     x = reference_brain(reference_point)
     push, turn = (np.tensordot(value["planted_score"], value[f"planted_{name}"], 1) for name in ("push", "turn"))
     own_push = value["own_push"]
     moved = x + _fields(x, value["planted_centre"], value["planted_width"], push, turn)
     moved += _fields(x, value["own_centre"], value["own_width"], own_push, 0 * own_push)
     return moved @ value["rotation"].T + value["translation"]
+
+
+def _index(truth, shape):
+    """Row of a shape in the truth."""
+    names = truth["shape"].values.tolist()
+    if shape not in names:
+        raise ValueError(f"the truth needs the shape; found {shape!r}, and {', '.join(names)} in the truth")
+    return names.index(shape)
 
 
 def _unit(x):
@@ -327,6 +334,88 @@ def _annotated(mesh, truth, shape, reference_point):
     return mesh.merge(extra).assign_attrs(unit="mm", coordinate_system="RAS")
 
 
+def raw_brain(truth, shape, n_vertices=40_000, seed=0):
+    """A brain with the artefacts of scans, as it could lie in a file.
+
+    In numbers: 4 loose components of 12 to 60 vertices; 3 holes of 10 to 60 triangles; one bow-tie vertex for 8,000
+    triangles; and one for 2,000 triangles of each of these: non-manifold edges, duplicate vertices (a seam half around
+    the vertex), zero-area triangles (two where an edge is split at its end), duplicate triangles, flipped triangles,
+    unreferenced vertices; of all of these at least 3.  Vertices and triangles are shuffled.
+
+    Parameters
+    ----------
+    truth : as of :func:`position`
+    shape : str
+    n_vertices : int
+        Before the artefacts are put in.
+    seed : int
+
+    Returns
+    -------
+    points : (p, 3)
+    triangles : int32 (m, 3)
+    reference_point : (p, 3)
+        NaN in loose components and at unreferenced vertices.
+
+    Examples
+    --------
+    >>> points, triangles, reference_point = raw_brain(plant(2), "brain_01", 500)
+    >>> len(points) > 500, bool(np.isnan(reference_point).any())
+    (True, True)
+    """
+    i = _index(truth, shape)
+    u, T = _mesh(truth, shape, n_vertices, np.random.default_rng([seed, 1, i]))
+    return _soil(position(truth, shape, u), T, u, np.random.default_rng([seed, 2, i]))
+
+
+def _soil(X, T, u, rng):
+    """The artefacts of :func:`raw_brain` put into a clean mesh."""
+    few = max(3, len(T) // 2000)
+    keep = np.ones(len(T), bool)
+    centroids = cKDTree(_unit(u[T].mean(1)))
+    for size in rng.integers(10, 60, 3):
+        keep[centroids.query(u[rng.integers(len(u))], size)[1]] = False
+    for v in rng.choice(
+        len(u), max(3, few // 4), replace=False
+    ):  # two triangles that touch at v alone: two fans are left
+        star = np.flatnonzero((T == v).any(1))
+        apart = [t for t in star if len(np.intersect1d(T[t], T[star[0]])) == 1]
+        keep[[star[0], *apart[:1]]] = False
+    T = T[keep]
+    copies = []
+    for v in rng.choice(np.unique(T), few, replace=False):  # a seam: half of the star gets a copy of v
+        star = np.flatnonzero((T == v).any(1))
+        along = X[T[star]].mean(1) @ np.cross(u[v], rng.normal(size=3))
+        half = star[along > np.median(along)]
+        T[half] = np.where(T[half] == v, len(X) + len(copies), T[half])
+        copies.append(v)
+    split = rng.choice(len(T), few, replace=False)  # a b c becomes a m c, m b c and a b m with m at a
+    (A, B, C), M = T[split].T, len(X) + len(copies) + np.arange(few)
+    copies = np.r_[copies, np.where(A < len(X), A, np.r_[np.arange(len(X)), copies][A])].astype(int)
+    T[split] = np.c_[M, B, C]
+    extra = [np.c_[A, M, C], np.c_[A, B, M]]
+    X, u = np.r_[X, X[copies]], np.r_[u, u[copies]]
+    pick = rng.choice(len(T), (3, few), replace=False)
+    beyond = cKDTree(u).query(u[T[pick[0]]].mean(1), 15)[1][:, -1]  # a third triangle at an edge
+    extra += [np.c_[T[pick[0], :2], beyond], np.roll(T[pick[1]], 1, axis=1)]
+    T[pick[2]] = T[pick[2], ::-1]
+    debris = [_debris(X[v], rng) for v in rng.integers(len(X), size=4)]
+    for points, triangles in debris:
+        extra.append(triangles + len(X))
+        X = np.r_[X, points]
+    X = np.r_[X, rng.uniform(X.min(0), X.max(0), (few, 3))]
+    u = np.r_[u, np.full((len(X) - len(u), 3), np.nan)]
+    T = np.concatenate([T, *extra])
+    order = rng.permutation(len(X))
+    return X[order], np.argsort(order)[rng.permutation(T)].astype(np.int32), u[order]
+
+
+def _debris(near, rng):
+    """A small loose ellipsoid."""
+    u, T = _sphere(int(rng.integers(12, 61)))
+    return near * rng.uniform(0.8, 1.15) + u * rng.uniform(0.8, 3, 3), T
+
+
 def brains(n=12, n_vertices=40_000, seed=0, *, dirty=False, n_modes=3):
     """A population of brains with planted modes and exact correspondences.
 
@@ -335,7 +424,7 @@ def brains(n=12, n_vertices=40_000, seed=0, *, dirty=False, n_modes=3):
     n : int
         Number of shapes.
     n_vertices : int
-        Vertices of each; exact, unless `dirty`.  The population does not depend on it.
+        Vertices of each, exactly unless `dirty`.  The population does not depend on it.
     seed : int
     dirty : bool
         Whether the meshes are those of :func:`raw_brain`, cleaned; ``/raw`` then holds them as they were.
@@ -346,7 +435,7 @@ def brains(n=12, n_vertices=40_000, seed=0, *, dirty=False, n_modes=3):
     -------
     DataTree
         ``/original/<shape>`` as of ``read_shapes``; ``/truth``, see :func:`plant`; and in ``/truth/<shape>`` the
-        ``reference_point(vertex, xyz)`` of every vertex.
+        ``reference_point(vertex, xyz)`` of every vertex, NaN where cleaning has put a vertex elsewhere.
 
     Examples
     --------
@@ -359,13 +448,60 @@ def brains(n=12, n_vertices=40_000, seed=0, *, dirty=False, n_modes=3):
     truth = plant(n, seed, n_modes=n_modes)
     nodes = {"/truth": truth}
     for i, shape in enumerate(truth["shape"].values):
-        rng = np.random.default_rng([seed, 1, i])
-        u, T = _mesh(truth, shape, n_vertices, rng)
-        every = np.arange(n_vertices, dtype=np.int32)
-        mesh = as_dataset(position(truth, shape, u), T, file_vertex=every, vertex_of_file=every)
+        if dirty:
+            X, T, u = raw_brain(truth, shape, n_vertices, seed)
+            raw = as_dataset(X, T, reference_point=u)
+            nodes[f"/raw/{shape}"] = _annotated(raw, truth, shape, u)
+            mesh = clean(raw.drop_vars("reference_point"))
+            file_vertex = mesh["file_vertex"].values
+            moved = (mesh["position"].values != X[file_vertex]).any(axis=1)
+            u = np.where(moved[:, None], np.nan, u[file_vertex])
+        else:
+            u, T = _mesh(truth, shape, n_vertices, np.random.default_rng([seed, 1, i]))
+            every = np.arange(n_vertices, dtype=np.int32)
+            mesh = as_dataset(position(truth, shape, u), T, file_vertex=every, vertex_of_file=every)
         nodes[f"/original/{shape}"] = _annotated(mesh, truth, shape, u)
         nodes[f"/truth/{shape}"] = dataset(reference_point=u)
     return xr.DataTree.from_dict(nodes)
+
+
+def write(tree, folder):
+    """Write a collection as files: ``<shape>.ply`` with labels, and ``truth.nc``.
+
+    Parameters
+    ----------
+    tree : DataTree
+        Of :func:`brains`; the raw meshes are written where it has them.
+    folder : path
+        Made where it is missing.
+
+    Returns
+    -------
+    list of Path
+        The PLY files.  ``xarray.open_datatree("truth.nc")`` is the truth for :func:`position`, with each file's
+        ``reference_point`` in the order of its vertices, and its landmarks.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    nodes, paths = {"/": tree["truth"].to_dataset()}, []
+    for shape in tree["truth/shape"].values:
+        mesh = tree[f"raw/{shape}" if "raw" in tree.children else f"original/{shape}"].to_dataset()
+        u = mesh if "reference_point" in mesh else tree[f"truth/{shape}"].to_dataset(inherit=False)
+        nodes[f"/{shape}"] = xr.merge([u[["reference_point"]], mesh[["label", "landmark_position"]]])
+        paths.append(folder / f"{shape}.ply")
+        _write_ply(paths[-1], *as_arrays(mesh), mesh["label"].values)
+    xr.DataTree.from_dict(nodes).to_netcdf(folder / "truth.nc", engine="h5netcdf")
+    return paths
+
+
+def _write_ply(path, X, T, label):
+    vertex = np.rec.fromarrays([*X.T, label], dtype=[("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("label", "<i4")])
+    face = np.zeros(len(T), [("n", "u1"), ("v", "<i4", 3)])
+    face["n"], face["v"] = 3, T
+    header = "ply\nformat binary_little_endian 1.0\n"
+    header += f"element vertex {len(X)}\n" + "".join(f"property double {axis}\n" for axis in "xyz")
+    header += f"property int label\nelement face {len(T)}\nproperty list uchar int vertex_indices\nend_header\n"
+    path.write_bytes(header.encode() + vertex.tobytes() + face.tobytes())
 
 
 def sphere(n_vertices=2562, radius=1.0):
