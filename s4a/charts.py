@@ -124,10 +124,11 @@ def ranked(names, values, label, highlight=None):
 def variance(high, low=None):
     """Cumulative share of variance over the number of components, at high and low resolution (Fig. 5)."""
     figure, (ax,) = _figure(5.2, 3.2)
-    for values, label, color, marker in ((high, "high resolution", BLUE, "o"), (low, "low resolution", ORANGE, "s")):
+    curves = ((low, "low resolution", ORANGE, {"ms": 8, "mfc": "none"}), (high, "high resolution", BLUE, {"ms": 4}))
+    for values, label, color, marker in curves:  # rings around dots: both are seen where they agree
         if values is not None:
             ratio = np.asarray(values)[:20]
-            ax.plot(np.arange(1, len(ratio) + 1), np.cumsum(ratio), marker, ls="-", color=color, label=label, ms=4)
+            ax.plot(np.arange(1, len(ratio) + 1), np.cumsum(ratio), "o-", color=color, label=label, **marker)
     ax.set(xlabel="number of components", ylabel="explained variance", ylim=(0, 1.03))
     ax.yaxis.set_major_formatter(PercentFormatter(1))
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))

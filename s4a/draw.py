@@ -90,26 +90,29 @@ def rasterise(P, T, width, height):
         Barycentric weights in that triangle.
     depth : float32 ndarray (s,)
     """
-    corners = P[T]
-    low = np.maximum(np.ceil(corners[..., :2].min(1) - 0.5), 0).astype(np.int64)
-    high = np.minimum(np.floor(corners[..., :2].max(1) - 0.5), (width - 1, height - 1)).astype(np.int64)
+    A, B, C = (P[T[:, i]] for i in range(3))
+    low = np.minimum(np.minimum(A, B), C)[:, :2]
+    high = np.maximum(np.maximum(A, B), C)[:, :2]
+    low = np.maximum(np.ceil(low - 0.5), 0).astype(np.int64)
+    high = np.minimum(np.floor(high - 0.5), (width - 1, height - 1)).astype(np.int64)
     box = np.maximum(high - low + 1, 0)
-    (ax, ay), (bx, by), (cx, cy) = (corners[:, i, :2].T for i in range(3))
+    samples = box[:, 0] * box[:, 1]
+    (ax, ay), (bx, by), (cx, cy) = (corner[:, :2].T for corner in (A, B, C))
     double_area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
-    drawn = np.flatnonzero((box.prod(1) > 0) & (np.abs(double_area) > 1e-9))
+    drawn = np.flatnonzero((samples > 0) & (np.abs(double_area) > 1e-9))
     scale = 1 / np.where(double_area == 0, 1, double_area)
     # the weights of corners b and c are linear in the sample's place: slope x, slope y, value at the box's first sample
     slopes = np.stack([cy - ay, ax - cx, ay - by, bx - ax], axis=1) * scale[:, None]
     x, y = low[:, 0] + 0.5 - ax, low[:, 1] + 0.5 - ay
     start = np.stack([slopes[:, 0] * x + slopes[:, 1] * y, slopes[:, 2] * x + slopes[:, 3] * y], axis=1)
-    slopes, start, z = slopes.astype(np.float32), start.astype(np.float32), corners[..., 2].astype(np.float32)
+    slopes, start, z = slopes.astype(np.float32), start.astype(np.float32), P[:, 2].astype(np.float32)[T]
 
     nearest = np.full(width * height, -np.inf, np.float32)
     seen = np.full(width * height, -1, np.int64)
     weights = np.zeros((width * height, 3), np.float32)
-    total = np.cumsum(box[drawn].prod(1))
+    total = np.cumsum(samples[drawn])
     for part in np.split(drawn, np.searchsorted(total, np.arange(CHUNK, total[-1] if len(total) else 0, CHUNK))):
-        count = box[part].prod(1)
+        count = samples[part]
         owner = np.repeat(part, count)
         place = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
         dy, dx = np.divmod(place, box[owner, 0])
@@ -119,7 +122,7 @@ def rasterise(P, T, width, height):
         owner, wb, wc = owner[inside], wb[inside], wc[inside]
         sample = (low[owner, 1] + dy[inside]) * width + low[owner, 0] + dx[inside]
         w = np.stack([1 - wb - wc, wb, wc], axis=1).astype(np.float32)
-        depth = (w * z[owner]).sum(1)
+        depth = np.einsum("sc,sc->s", w, z[owner])
         np.maximum.at(nearest, sample, depth)
         front = np.flatnonzero(depth == nearest[sample])
         seen[sample[front]], weights[sample[front]] = owner[front], w[front]
@@ -291,6 +294,12 @@ def image_bytes(picture, kind="webp"):
     file = io.BytesIO()
     Image.fromarray(picture).save(file, kind, quality=88, optimize=True)
     return file.getvalue()
+
+
+def on_white(picture):
+    """A picture ``(height, width, 4)`` laid on white: ``(height, width, 3)``."""
+    opacity = picture[..., 3:] / 255
+    return (picture[..., :3] * opacity + 255 * (1 - opacity) + 0.5).astype(np.uint8)
 
 
 def data_uri(content, kind="image/webp"):

@@ -57,9 +57,10 @@ def grid(figures, kind="row"):
     return f'<div class="{kind}">{"".join(figures)}</div>'
 
 
-def missing(names):
-    """A box that says what the run lacks."""
-    return f'<p class="missing">Not there: this run has no {escape(", ".join(names))}.</p>'
+def missing(names, reason=""):
+    """A box that says what the run lacks, and why."""
+    text = f"Not there: this run has no {', '.join(names)}" + (f", because of this: {reason}" if reason else "")
+    return f'<p class="missing">{escape(text)}.</p>'
 
 
 def chart(figure, text):
@@ -81,7 +82,7 @@ def table(head, rows, classes=None):
 
     def cell(value):
         number = isinstance(value, int | float | np.number)
-        text = f"{value:,}" if isinstance(value, int | np.integer) else f"{value:,.4g}" if number else str(value)
+        text = f"{value:,}" if isinstance(value, int | np.integer) else f"{value:,.1f}" if number else str(value)
         return f"<td{' class=number' if number else ''}>{escape(text)}</td>"
 
     classes = [""] * len(rows) if classes is None else classes

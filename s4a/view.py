@@ -5,12 +5,19 @@ from pathlib import Path
 import numpy as np
 
 from s4a import charts, markup
-from s4a.draw import SIGNED, opposite, plane_box, position_colors, ramp_colors, render, signed_colors
-from s4a.mesh import vertex_normals
-
-SIGMA = 3  # the modes are shown from -3 to 3 standard deviations
-N_MODES = 3
-PANEL = (320, 270)  # pixels
+from s4a.draw import SIGNED, opposite, position_colors, ramp_colors, render
+from s4a.picture import (
+    N_MODES,
+    PANEL,
+    SIGMA,
+    aligned,
+    carried_colors,
+    has,
+    mesh_of,
+    mode_drawer,
+    names_of,
+    shared_frames,
+)
 
 
 def write_page(study, path, *, title="Shape study", view="corner", up="z"):
@@ -41,50 +48,19 @@ def page(study, *, title="Shape study", view="corner", up="z"):
     look = {"view": view, "up": up}
     sections = []
     for heading, needs, show in SECTIONS:
-        lacking = [name for name in needs if not _has(study, name)]
-        body = markup.missing(lacking) if lacking else show(study, look)
+        lacking = [name for name in needs if not has(study, name)]
+        reason = _attr(study, "report", "no_modes") if any(name.startswith("pca/") for name in lacking) else ""
+        body = markup.missing(lacking, reason) if lacking else show(study, look)
         sections.append(f"<section><h2>{heading}</h2>\n{body}</section>")
     return markup.document(title, _summary(study), sections)
-
-
-def _has(study, name):
-    """Whether the study holds the node, or the variable ``node/variable``."""
-    node, _, variable = name.partition("/")
-    if node not in study.children:
-        return False
-    return variable in study[node].data_vars if variable else bool(study[node].children)
 
 
 def _attr(study, node, name):
     return str(study[node].attrs.get(name, "")) if node in study.children else ""
 
 
-def _names(data):
-    return [str(name) for name in data["shape"].values]
-
-
 def _index(names, name):
     return names.index(name) if name in names else None
-
-
-def _mesh(node):
-    return node["position"].values, node["corner_vertex"].values
-
-
-def _aligned(study, name, X):
-    """Positions of a shape moved onto the template, where the run has registered it."""
-    if not _has(study, "registration/rotation") or name not in _names(study["registration"]):
-        return X
-    one = study["registration"].dataset.sel(shape=name)
-    scale = one["scale"].item() if "scale" in one else 1.0
-    return scale * X @ one["rotation"].values.T + one["translation"].values
-
-
-def _shared_frames(surfaces, look):
-    """For each surface a frame around itself, all of the size of the largest, so that sizes can be compared."""
-    boxes = [plane_box(X, **look) for X in surfaces]
-    half = np.max([box[1] - box[0] for box in boxes], axis=0) / 2
-    return [box.mean(0) + np.stack([-half, half]) for box in boxes]
 
 
 # ---- sections
@@ -92,16 +68,16 @@ def _shared_frames(surfaces, look):
 
 def _summary(study):
     parts = []
-    if _has(study, "report/status"):
+    if has(study, "report/status"):
         status = study["report"]["status"].values.astype(str)
         parts.append(
             f"{len(status)} shapes, {(status == 'repaired').sum()} repaired, {(status == 'excluded').sum()} excluded"
         )
     parts += [f"{key} {_attr(study, *where)}" for key, where in _MARKS.items() if _attr(study, *where)]
-    if _has(study, "pca/explained_variance_ratio"):
+    if has(study, "pca/explained_variance_ratio"):
         ratio = study["pca"]["explained_variance_ratio"].values[:N_MODES]
         parts.append(f"the first {len(ratio)} components hold {ratio.sum():.0%} of the variance")
-    if _has(study, "report/seconds"):
+    if has(study, "report/seconds"):
         parts.append(f"{study['report']['seconds'].values.sum():.0f} s of computing")
     return "; ".join(parts) + "." if parts else "The study is empty."
 
@@ -111,12 +87,12 @@ _MARKS = {"median": ("latent", "median"), "template": ("registration", "template
 
 def _shapes(study, look):
     report = study["report"].dataset
-    names = _names(report)
+    names = names_of(report)
     status = report["status"].values.astype(str)
-    columns = [key for key in ("reason", "path") if key in report]
+    columns = [key for key in ("reason", "path") if key in report and (report[key].values != "").any()]
     rows = []
     for i, name in enumerate(names):
-        mesh = study["original"][name] if _has(study, "original") and name in study["original"].children else None
+        mesh = study["original"][name] if has(study, "original") and name in study["original"].children else None
         size = [mesh.sizes["vertex"], mesh.sizes["triangle"]] if mesh is not None else ["", ""]
         rows.append([name, status[i], *size, *(report[key].values[i] for key in columns)])
     return markup.table(["shape", "status", "vertices", "triangles", *columns], rows, status)
@@ -124,9 +100,9 @@ def _shapes(study, look):
 
 def _gallery(study, look):
     nodes = study["coarse"].children
-    meshes = {name: _mesh(node) for name, node in nodes.items()}
-    meshes = {name: (_aligned(study, name, X), T) for name, (X, T) in meshes.items()}
-    frames = _shared_frames([X for X, _ in meshes.values()], look)
+    meshes = {name: mesh_of(node) for name, node in nodes.items()}
+    meshes = {name: (aligned(study, name, X), T) for name, (X, T) in meshes.items()}
+    frames = shared_frames([X for X, _ in meshes.values()], look)
     median = _attr(study, "latent", "median")
     figures = [
         markup.picture(
@@ -139,16 +115,22 @@ def _gallery(study, look):
     return markup.note("The low-resolution meshes, all at one scale.") + markup.grid(figures, "gallery")
 
 
+def _stage(pairs, dim):
+    """When a map was made, and its size."""
+    when = "before" if dim.endswith("initial") else "after"
+    return f"{when} Consistent ZoomOut" + (f", {pairs.sizes[dim]} modes" if dim in pairs.sizes else "")
+
+
 def _network(study, look):
     pairs = study["network"].dataset
     source, target = (pairs[key].values.astype(str) for key in ("source", "target"))
     names = list(np.unique(np.r_[source, target]))
     scores = study["latent"].dataset.get("area_score") if "latent" in study.children else None
-    usable = scores is not None and scores.sizes["difference_component"] > 1 and set(names) <= set(_names(scores))
+    usable = scores is not None and scores.sizes["difference_component"] > 1 and set(names) <= set(names_of(scores))
     places = scores.sel(shape=names).values[:, :2] if usable else charts.on_circle(len(names))
     where = "placed by the first two components of their area-based shape differences" if usable else "on a circle"
-    errors = {"before Consistent ZoomOut": "cycle_error_initial", "after": "cycle_error"}
-    errors = {title: pairs[key].values for title, key in errors.items() if key in pairs}
+    kinds = {"cycle_error_initial": "mode_source_initial", "cycle_error": "mode_source"}
+    errors = {_stage(pairs, dim): pairs[key].values for key, dim in kinds.items() if key in pairs}
     figure = charts.network(
         places,
         names,
@@ -157,7 +139,8 @@ def _network(study, look):
         errors,
         _index(names, _attr(study, "latent", "median")),
     )
-    note = f"{len(source)} maps among {len(names)} shapes, {where}; the median is circled."
+    note = f"{len(source)} maps among {len(names)} shapes, {where}; the median is circled. "
+    note += "A larger map has more to get wrong: the errors of maps of different sizes are not to be compared."
     return markup.note(note) + markup.chart(figure, "the network of maps, coloured by cycle error")
 
 
@@ -165,47 +148,39 @@ def _maps(study, look):
     pairs = study["network"].dataset
     order = np.argsort(pairs["cycle_error"].values) if "cycle_error" in pairs else np.arange(pairs.sizes["pair"])
     pair = pairs.isel(pair=order[len(order) // 2])
-    named = {"before Consistent ZoomOut": "fmap_initial", "after": "fmap"}
-    figure = charts.matrices({title: pair[key].values for title, key in named.items() if key in pair})
+    kinds = {"fmap_initial": "mode_source_initial", "fmap": "mode_source"}
+    figure = charts.matrices({_stage(pairs, dim): pair[key].values for key, dim in kinds.items() if key in pair})
     text = f"{pair['source'].item()} → {pair['target'].item()}, a pair of median cycle error"
     return markup.note(text) + markup.chart(figure, text)
 
 
 def _distances(study, look):
     distance = study["latent"]["distance_to_median"]
-    names = _names(distance)
+    names = names_of(distance)
     median = _index(names, _attr(study, "latent", "median"))
     figure = charts.ranked(names, distance.values, "distance to the limit shape", median)
-    return markup.chart(figure, "the shapes ranked by their distance to the limit shape")
+    return markup.note("The median (eq. 5) is the shape nearest to the limit shape.") + markup.chart(
+        figure, "the shapes ranked by their distance to the limit shape"
+    )
 
 
 def _modes(study, look):
-    pca = study["pca"].dataset
-    X, T = _mesh(study["registration"])
-    mean = X + pca["mean_displacement"].values
-    steps = pca["deformation"].values[:N_MODES]
-    signed = (steps * vertex_normals(mean, T)).sum(2)
-    limit = float(SIGMA * np.quantile(np.abs(signed), 0.99)) or 1.0
-    unit = str(pca["deformation"].attrs.get("units", ""))
-    sigmas = np.linspace(-SIGMA, SIGMA, 13 if len(X) < 50_000 else 7)
-    extremes = np.concatenate([mean + s * step for step in steps for s in (-SIGMA, SIGMA)])
-    behind = {**look, "view": opposite(look["view"])}
+    draw, limit = mode_drawer(study, look)
+    unit = study["pca"]["deformation"].attrs.get("units", "")
+    sigmas = np.linspace(-SIGMA, SIGMA, 13 if study["registration"].sizes["vertex"] < 50_000 else 7)
     rows, sliders = [], []
-
-    def draw(mode, s, look=look):
-        colors = signed_colors(s * signed[mode], limit)
-        return render(mean + s * steps[mode], T, colors=colors, size=PANEL, frame=plane_box(extremes, **look), **look)
-
-    for mode, ratio in enumerate(pca["explained_variance_ratio"].values[: len(steps)]):
+    for mode, ratio in enumerate(study["pca"]["explained_variance_ratio"].values[:N_MODES]):
         frames = [draw(mode, s) for s in sigmas]
         name = f"component {mode + 1}"
         labels = [f"{name}, {s:+.3g} σ".replace("-", "−") if s else f"{name}, mean" for s in sigmas]
         rows += [markup.picture(frames[i], labels[i]) for i in (0, len(frames) // 2, -1)]
-        rows.append(markup.picture(draw(mode, SIGMA, behind), f"{labels[-1]}, from behind"))
+        behind = draw(mode, SIGMA, view=opposite(look["view"]))
+        rows.append(markup.picture(behind, f"{labels[-1]}, from behind"))
         sliders.append(markup.slider(mode, frames, labels, f"{ratio:.1%} of the variance"))
-    bar = markup.chart(charts.color_bar(SIGNED, -limit, limit, f"displacement along the normal ({unit})"), "colour bar")
+    bar = charts.color_bar(SIGNED, -limit, limit, f"displacement along the normal ({unit})")
     note = markup.note("Blue is expansion, red is compression, against the mean; one colour scale for all.")
-    return f"{note}{markup.grid(rows, 'row four')}{bar}\n<h3>Move along a component</h3>{markup.grid(sliders)}"
+    sliders = f"<h3>Move along a component</h3>{markup.grid(sliders)}"
+    return f"{note}{markup.grid(rows, 'row four')}{markup.chart(bar, 'colour bar')}\n{sliders}"
 
 
 def _variance(study, look):
@@ -216,20 +191,20 @@ def _variance(study, look):
 
 def _scores(study, look):
     score = study["pca"]["score"]
-    names = _names(score)
+    names = names_of(score)
     template = _index(names, _attr(study, "registration", "template"))
     return markup.chart(charts.scores(score.values, names, template), "scores of the shapes; the template is orange")
 
 
 def _correspondence(study, look):
     registration = study["registration"]
-    X, T = _mesh(registration)
+    X, T = mesh_of(registration)
     colors, template = position_colors(X), registration.attrs.get("template", "")
     surfaces = {f"{template}, the template": (X, T, colors)}
-    for name in [name for name in _names(registration) if name != template][:5]:
-        if (carried := _carried(study, name, colors)) is not None:
+    for name in [name for name in names_of(registration) if name != template][:5]:
+        if (carried := carried_colors(study, name, colors)) is not None:
             surfaces[name] = carried
-    frames = _shared_frames([surface[0] for surface in surfaces.values()], look)
+    frames = shared_frames([surface[0] for surface in surfaces.values()], look)
     figures = [
         markup.picture(render(X, T, colors=colors, size=PANEL, frame=frame, **look), name)
         for (name, (X, T, colors)), frame in zip(surfaces.items(), frames, strict=True)
@@ -238,32 +213,15 @@ def _correspondence(study, look):
     return markup.note(note) + markup.grid(figures)
 
 
-def _carried(study, name, colors):
-    """Aligned mesh of a shape, with the colours of the template's vertices carried to it; None without its mesh."""
-    if not _has(study, "original") or name not in study["original"].children:
-        return None
-    X, T = _mesh(study["original"][name])
-    registration = study["registration"]
-    if name in registration.children and "template_triangle" in registration[name].data_vars:
-        corners = registration["corner_vertex"].values[registration[name]["template_triangle"].values]
-        painted = np.einsum("vc,vcx->vx", registration[name]["template_barycentric"].values, colors[corners])
-    else:
-        match = registration["registered_match"].sel(shape=name).values
-        count = np.bincount(match, minlength=len(X))[:, None]
-        painted = np.stack([np.bincount(match, channel, len(X)) for channel in colors.T], axis=1)
-        painted = np.where(count > 0, painted / np.maximum(count, 1), np.nan)
-    return _aligned(study, name, X), T, painted
-
-
 def _confidence(study, look):
     registration = study["registration"].dataset
-    X, T = _mesh(registration)
+    X, T = mesh_of(registration)
     confidence = registration["confidence"]
-    mean, names = confidence.mean("vertex").values, _names(registration)
+    mean, names = confidence.mean("vertex").values, names_of(registration)
     surfaces = {"mean over the shapes, on the template": (X, confidence.mean("shape").values)}
     for i in np.argsort(mean)[:2]:
-        moved = X + registration["displacement"].values[i]
-        surfaces[f"{names[i]}: {mean[i]:.2f} on average"] = (moved, confidence.values[i])
+        moved = X + registration["displacement"].isel(shape=i).values
+        surfaces[f"{names[i]}: {mean[i]:.2f} on average"] = (moved, confidence.isel(shape=i).values)
     figures = [
         markup.picture(render(X, T, colors=ramp_colors(value, 0, 1), size=PANEL, **look), caption)
         for caption, (X, value) in surfaces.items()
@@ -283,7 +241,7 @@ def _resources(study, look):
 
 
 def _parameters(study, look):
-    rows = [[key, value] for key, value in study["report"].attrs.items()]
+    rows = [[key, value] for key, value in study["report"].attrs.items() if str(value)]
     return markup.table(["parameter", "value"], rows) if rows else markup.missing(["parameters"])
 
 
@@ -292,8 +250,8 @@ SECTIONS = (
     ("Gallery", ["coarse"], _gallery),
     ("Network of maps", ["network/source", "network/target", "network/cycle_error"], _network),
     ("Functional maps", ["network/fmap"], _maps),
-    ("Distance to the median", ["latent/distance_to_median"], _distances),
-    ("Modes of variation", ["registration/position", "pca/deformation", "pca/mean_displacement"], _modes),
+    ("Distance to the limit shape", ["latent/distance_to_median"], _distances),
+    ("Modes of variation", ["registration/position", "pca/deformation"], _modes),
     ("Explained variance", ["pca/explained_variance_ratio"], _variance),
     ("Scores", ["pca/score"], _scores),
     ("Correspondence", ["registration/position", "registration/registered_match"], _correspondence),

@@ -5,8 +5,9 @@ import re
 import numpy as np
 import pytest
 import xarray as xr
+from PIL import Image
 
-from s4a import draw, view
+from s4a import draw, picture, view
 from s4a.mesh import as_dataset, vertex_areas
 from s4a.schema import dataset
 
@@ -218,7 +219,8 @@ def test_the_page_is_the_same_every_time(study, html):
 
 @pytest.mark.parametrize("node", ["original", "coarse", "network", "latent", "registration", "pca", "report"])
 def test_an_unfinished_study_shows_what_there_is(study, node, tmp_path, monkeypatch):
-    monkeypatch.setattr(view, "render", lambda *surface, **look: np.zeros((2, 2, 4), np.uint8))
+    for module in (view, picture):
+        monkeypatch.setattr(module, "render", lambda *surface, **look: np.zeros((2, 2, 4), np.uint8))
     part = study.copy()
     del part[node]
     text = view.write_page(part, tmp_path / "page.html").read_text(encoding="utf-8")
@@ -230,3 +232,25 @@ def test_an_empty_study_gives_a_page_too():
     text = view.page(xr.DataTree())
     assert "The study is empty." in text
     assert text.count("Not there") == len(view.SECTIONS)
+
+
+def test_modes_that_could_not_be_are_explained(study):
+    part = study.copy()
+    del part["pca"]
+    part["report"].attrs["no_modes"] = "three shapes are needed <found 2>"
+    del part["coarse"], part["registration"]
+    assert "three shapes are needed &lt;found 2&gt;" in view.page(part)
+
+
+def test_the_picture_of_the_modes_is_blue_where_the_shape_grows(study, tmp_path):
+    path = picture.write_picture(study, tmp_path / "modes.png", view="front", size=(120, 100))
+    pixels = np.asarray(Image.open(path)).astype(int)
+    assert pixels.shape == (300, 360, 3)
+    small, mean, large = np.split(pixels[:100], 3, axis=1)
+
+    def reddest(part):
+        return (part[..., 0] - part[..., 2])[np.ptp(part, axis=-1) > 60]
+
+    assert (reddest(small) > 0).all()
+    assert (reddest(large) < 0).all()
+    assert len(reddest(mean)) == 0
