@@ -2,6 +2,7 @@
 
 import itertools
 
+import fpsample
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -42,8 +43,8 @@ def rigid_transform(P, Q, weight=None, *, scale=False):
     return R, q - s * R @ p, s
 
 
-def farthest_points(X, m, start=None):
-    """Indices of m vertices, each as far as possible from those before it (Euclidean).
+def farthest_points(X, m):
+    """Indices of m vertices, each as far as possible from those before it (Euclidean); all where there are fewer.
 
     The first is the vertex farthest from the centroid, so that the choice follows the shape and not its numbering.
 
@@ -52,14 +53,11 @@ def farthest_points(X, m, start=None):
     >>> farthest_points(np.array([[0.0, 0, 0], [1, 0, 0], [5, 0, 0]]), 2).tolist()
     [2, 0]
     """
-    m = min(m, len(X))
-    chosen = np.empty(m, np.int64)
-    chosen[0] = np.argmax(((X - X.mean(0)) ** 2).sum(1)) if start is None else start
-    gap = ((X - X[chosen[0]]) ** 2).sum(1)
-    for i in range(1, m):
-        chosen[i] = np.argmax(gap)
-        np.minimum(gap, ((X - X[chosen[i]]) ** 2).sum(1), out=gap)
-    return chosen
+    start = int(np.argmax(((X - X.mean(0)) ** 2).sum(1)))
+    if m >= len(X):
+        return np.arange(len(X))
+    height = int(np.clip(np.log2(len(X)) - 4, 1, 7))  # a KD-tree with at least some 16 points in each leaf
+    return fpsample.bucket_fps_kdline_sampling(X, m, h=height, start_idx=start).astype(np.int64)
 
 
 def principal_axes(X, area):
@@ -133,3 +131,9 @@ def align(X, area, Y, area_y, *, n_points=1000, prefer=0.9):
     if best[2] > prefer * found[0][2]:
         best = found[0]
     return icp(X, area, Y, area_y, *best[:2])
+
+
+def realign(X, Y, start, *, n_points=1000):
+    """Rigid motion (R, t) of X onto Y by a short ICP on `n_points` spread vertices of each, from a start (R, t)."""
+    x, y = X[farthest_points(X, n_points)], Y[farthest_points(Y, n_points)]
+    return icp(x, np.ones(len(x)), y, np.ones(len(y)), *start, tolerance=1e-4)[:2]

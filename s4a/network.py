@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from s4a import fmap
-from s4a.align import farthest_points, icp
+from s4a.align import farthest_points
 
 
 def spectral_distance(eigenvalues):
@@ -97,12 +97,6 @@ def first_map(source, target, motion, *, k_init=20, init="dense", n_landmarks=10
     else:
         C = fmap.fmap_from_match(Phi, Psi, area, cKDTree(moved).query(Y)[1])
     return fmap.fmap_from_match(Phi, Psi, area, fmap.match_from_fmap(C, Phi, Psi))
-
-
-def pair_motion(X, Y, start, *, n_points=1000):
-    """Rigid motion X -> Y by a short ICP on `n_points` spread vertices of each, from a start (R, t)."""
-    x, y = X[farthest_points(X, n_points)], Y[farthest_points(Y, n_points)]
-    return icp(x, np.ones(len(x)), y, np.ones(len(y)), *start, tolerance=1e-4)[:2]
 
 
 def three_cycles(source, target):

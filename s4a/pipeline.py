@@ -16,14 +16,14 @@ from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
 from s4a import fmap, latent, median, network, register, study
-from s4a.align import align, farthest_points
+from s4a.align import align, farthest_points, realign
 from s4a.clean import clean
 from s4a.io import find_meshes
 from s4a.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.pca import pca
 from s4a.remesh import coarsen
 from s4a.schema import dataset
-from s4a.shapes import read_shape
+from s4a.shapes import read_shape, shape_report
 from s4a.spectral import spectrum
 
 log = logging.getLogger(__name__)
@@ -115,12 +115,16 @@ def collection(shapes, pattern):
 
 
 def original_task(source, components, strict):
+    """A file read and cleaned, or a mesh in memory cleaned where it is not yet."""
     if isinstance(source, str):
         return read_shape(source, components=components, strict=strict)
-    return source if "file_vertex" in source else clean(source, components=components, strict=strict)
+    if "file_vertex" in source:
+        return source.assign_attrs({"status": "ok", "reason": ""} | source.attrs)
+    return clean(source, components=components, strict=strict)
 
 
 def coarse_task(folder, name, n_coarse, wrap, seed, k):
+    """The low-resolution mesh of a shape of the study, its U and its spectrum."""
     mesh = study.read(folder / "original" / f"{name}.nc")
     return spectrum(coarsen(mesh, n_coarse=n_coarse, wrap=wrap, seed=seed), k=k)
 
@@ -163,7 +167,7 @@ def first_maps_task(folder, pairs, k_init, init):
     shapes = {name: low_shape(folder, name) for name in sorted(set(sum(pairs, [])))}
     directed, maps = [], []
     for a, b in pairs:
-        R, t = network.pair_motion(shapes[a][0], shapes[b][0], relative_motion(alignment, a, b))
+        R, t = realign(shapes[a][0], shapes[b][0], relative_motion(alignment, a, b))
         for s, g, motion in ((a, b, (R, t)), (b, a, (R.T, -R.T @ t))):
             directed.append((s, g))
             maps.append(network.first_map(shapes[s], shapes[g], motion, k_init=k_init, init=init))
@@ -218,7 +222,7 @@ def registration_task(folder, name, template, how, refine, scale):
         F_source, F_target = source.low.Phi[:, :k] @ C.T, target.low.Phi[:, :k]
         match = fmap.nearest_rows(F_target, F_source)
     motion = relative_motion(study.read(folder / "network" / "alignment.nc"), name, template)
-    R, t = network.pair_motion(source.low.X, target.low.X, motion)
+    R, t = realign(source.low.X, target.low.X, motion)
     starts = {"intrinsic": match, "icp": cKDTree(source.low.X @ R.T + t).query(target.low.X)[1]}
     return register.registration(source, target, starts, (F_source, F_target), k=k, refine=refine, scale=scale)
 
@@ -318,7 +322,10 @@ def run_stages(run, given, options):
     run.tasks(
         "read and clean",
         original_task,
-        [(n, f"original/{n}.nc", key_of[n], (source, o["components"], o["strict"])) for n, (source, _) in given.items()],
+        [
+            (n, f"original/{n}.nc", key_of[n], (source, o["components"], o["strict"]))
+            for n, (source, _) in given.items()
+        ],
     )
     settings = (o["n_coarse"], o["wrap"], o["seed"], o["k"])
     names = [n for n in given if n not in run.failures]
@@ -371,10 +378,7 @@ def run_stages(run, given, options):
     run.tasks(
         "registration",
         registration_task,
-        [
-            (n, f"registration/{n}.nc", study.task_key(key, key_of[n], settings), (folder, n, *settings))
-            for n in names
-        ],
+        [(n, f"registration/{n}.nc", study.task_key(key, key_of[n], settings), (folder, n, *settings)) for n in names],
     )
     with run.stage("modes"):
         names = [n for n in names if n not in run.failures]
@@ -397,23 +401,18 @@ def write_modes(folder, names, mesh, template):
 
 
 def write_report(run, given, options, no_modes):
-    """Write ``/report``: the status of every shape, times and memory of every stage, the options."""
-    status, reason, path = [], [], []
+    """Write ``/report``: status and counts of every shape, times and memory of every stage, the options."""
+    attrs = {}
     for name, (source, _) in given.items():
-        path.append(source if isinstance(source, str) else "")
         if name in run.failures:
-            status.append("excluded")
-            reason.append(run.failures[name])
-            continue
-        with xr.open_dataset(run.folder / "original" / f"{name}.nc", engine=study.ENGINE) as mesh:
-            status.append(str(mesh.attrs.get("status", "ok")))
-            reason.append(str(mesh.attrs.get("reason", "")))
-    data = dataset(
+            path = source if isinstance(source, str) else ""
+            attrs[name] = {"status": "excluded", "reason": run.failures[name], "path": path}
+        else:
+            with xr.open_dataset(run.folder / "original" / f"{name}.nc", engine=study.ENGINE) as mesh:
+                attrs[name] = dict(mesh.attrs)
+    stages = dataset(
         {"no_modes": no_modes, **{n: str(v) for n, v in options.items()}},
-        status=np.array(status),
-        reason=np.array(reason),
-        path=np.array(path),
         seconds=np.array(list(run.seconds.values())),
         peak_memory=np.array([run.memory[s] for s in run.seconds]),
-    )
-    study.write(data.assign_coords(shape=list(given), stage=list(run.seconds)), run.folder / "report.nc")
+    ).assign_coords(stage=list(run.seconds))
+    study.write(shape_report(attrs).assign(stages.variables).assign_attrs(stages.attrs), run.folder / "report.nc")

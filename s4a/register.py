@@ -103,11 +103,11 @@ def register(source, target, match_low, embeddings, *, k=100, refine="joint"):
         *low, scores = joint.best_candidate(source.low, target.low, match_low, k=k)
     method, match, motion = low
     info = {f"score_{name}": score for name, score in scores.items()}
-    if "joint" in method:
-        match, motion = joint.dense_rounds(source.dense, target.dense, motion)
-    else:
+    if method == "intrinsic":
         match, info["compared_share"] = intrinsic_match(source, target, *embeddings)
         motion = onto(target.dense.X, source.dense.X[match], target.dense.area, target.dense.smooth)
+    else:
+        match, motion = joint.dense_rounds(source.dense, target.dense, motion)
     info |= {"method": method, "score": joint.badness(source.dense, target.dense, match, motion)}
     center, size = source.frame
     return match, joint.registered(target.dense, motion) * size + center, info
@@ -228,9 +228,7 @@ def match_pair(source, target, *, k_init=20, k=100, init="dense", refine="joint"
         scans.append(Scan(mesh, spectrum(coarsen(mesh, n_coarse=n_coarse, seed=seed), k=k)))
     M, N = scans
     motion = align(M.low.X, M.low.area, N.low.X, N.low.area)[:2]
-    C0 = first_map(
-        *((s.low.X, s.low.area, s.low.Phi, s.eigenvalue) for s in scans), motion, k_init=k_init, init=init
-    )
+    C0 = first_map(*((s.low.X, s.low.area, s.low.Phi, s.eigenvalue) for s in scans), motion, k_init=k_init, init=init)
     k = min(k, M.low.Phi.shape[1], N.low.Phi.shape[1])
     C, match_low = fmap.zoomout(C0, M.low.Phi, N.low.Phi, N.low.area, k)
     near = cKDTree(M.low.X @ motion[0].T + motion[1]).query(N.low.X)[1]

@@ -27,7 +27,11 @@ TABLE = {
     "edge_vertex": (("edge", "end"), ONE, "vertices at both ends of an edge"),
     "cotan_weight": (("edge",), ONE, "cotan weight of the edge, so that the Laplacian is A^-1 W"),
     "sample_vertex": (("vertex",), ONE, "vertex of the original mesh that the coarse vertex is"),
-    "coarse_vertex": (("original_vertex", "corner"), ONE, "coarse vertices that carry an original vertex: columns of U"),
+    "coarse_vertex": (
+        ("original_vertex", "corner"),
+        ONE,
+        "coarse vertices that carry an original vertex: columns of U",
+    ),
     "coarse_weight": (("original_vertex", "corner"), ONE, "their barycentric weights: entries of U"),
     "eigenvalue": (("mode",), UNIT_AREA, "eigenvalue of the Laplace-Beltrami operator"),
     "eigenfunction": (("vertex", "mode"), UNIT_AREA, "eigenfunction, orthonormal in the vertex areas"),

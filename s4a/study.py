@@ -93,7 +93,9 @@ def stack_registration(template, files, names):
     parts = [files[name] for name in names]
     data = template[["position", "corner_vertex"]].assign_attrs(template=template.attrs["template"])
     stacked = {
-        name: xr.Variable(("shape", *parts[0][name].dims), np.stack([p[name].values for p in parts]), parts[0][name].attrs)
+        name: xr.Variable(
+            ("shape", *parts[0][name].dims), np.stack([p[name].values for p in parts]), parts[0][name].attrs
+        )
         for name in STACKED
     }
     methods = xr.Variable("shape", [p.attrs.get("method", "") for p in parts], {"long_name": "candidate kept"})
@@ -130,7 +132,9 @@ def open_study(folder):
     """
     folder = Path(folder)
     if not (folder / "original").is_dir():
-        raise ValueError(f"{folder} is not a study folder: it has no folder 'original'; run `s4a run ... --out {folder}`")
+        raise ValueError(
+            f"{folder} is not a study folder: it has no folder 'original'; run `s4a run ... --out {folder}`"
+        )
     report = read(folder / "report.nc") if (folder / "report.nc").exists() else None
     kept = None if report is None else set(report["shape"].values[report["status"].values != "excluded"].tolist())
     nodes = {}

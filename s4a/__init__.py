@@ -1,0 +1,43 @@
+"""S4A: scalable spectral statistical shape analysis of collections of high-resolution meshes.
+
+The public names, by section of the paper:
+
+========================  ====================================================================
+reading and cleaning      :func:`read_shapes`, :func:`clean`, :func:`write_mesh`
+4.1 low resolution        :func:`coarsen`
+3.3 spectrum              :func:`spectrum`, :func:`reconstruct`
+4.1 pairs                 :func:`match_pair`
+4.2, 6.1 collections      :func:`analyse`, :func:`open_study`, :func:`synthesize`
+the embedded collection   :mod:`s4a.synthetic`
+========================  ====================================================================
+"""
+
+from s4a import synthetic
+from s4a.clean import clean
+from s4a.io import read_mesh, write_mesh
+from s4a.pca import synthesize
+from s4a.pipeline import analyse
+from s4a.register import match_pair
+from s4a.remesh import coarsen
+from s4a.shapes import read_shape, read_shapes
+from s4a.spectral import reconstruct, spectrum
+from s4a.study import open_study
+from s4a.view import write_page
+
+__version__ = "0.1.0"
+__all__ = [
+    "analyse",
+    "clean",
+    "coarsen",
+    "match_pair",
+    "open_study",
+    "read_mesh",
+    "read_shape",
+    "read_shapes",
+    "reconstruct",
+    "spectrum",
+    "synthesize",
+    "synthetic",
+    "write_mesh",
+    "write_page",
+]

@@ -1,0 +1,242 @@
+"""Command line: ``s4a check | run | demo | view``.  Every option of :func:`s4a.analyse` is a flag of ``s4a run``."""
+
+import argparse
+import inspect
+import logging
+import sys
+import time
+import webbrowser
+from pathlib import Path
+
+import numpy as np
+
+from s4a import accuracy, synthetic
+from s4a.io import find_meshes
+from s4a.pipeline import CHOICES, analyse
+from s4a.shapes import read_shapes
+from s4a.study import open_study
+from s4a.view import write_page
+
+HELP = {
+    "n_coarse": "vertices of the low-resolution meshes",
+    "n_pairs": "pairs of the network",
+    "k_init": "size of the first functional maps",
+    "k": "size of the refined functional maps",
+    "n_latent": "dimension of the latent space (default: k)",
+    "step": "growth of the maps per round of Consistent ZoomOut",
+    "init": "first maps from all nearest neighbours, or the paper's fit on 10 landmarks",
+    "refine": "joint rounds, or the paper's spectral match alone",
+    "how": "full resolution by eq. 7, or by eq. 3 and 4",
+    "norm": "norm of eq. 5",
+    "scale": "take size out of the displacements",
+    "components": "'largest', 'all' or how many to keep",
+    "strict": "exclude shapes with vertices that are not finite instead of repairing them",
+    "wrap": "wrap the shapes watertight before they are remeshed",
+    "pattern": "only files whose name fits, for example '*brain*'",
+    "preset": "'paper' sets init, refine and how to the paper's",
+    "template": "name of the shape to register to (default: the median shape)",
+    "n_jobs": "processes; -1 for all cores",
+    "seed": "seed of all randomness",
+}
+
+
+def table(rows, head):
+    """Rows of text as aligned columns; numbers to the right.
+
+    Examples
+    --------
+    >>> print(table([["a", 1]], ["name", "n"]))
+    name  n
+    a     1
+    """
+    rows = [[str(x) for x in row] for row in rows]
+    width = [max(len(r[i]) for r in [head, *rows]) for i in range(len(head))]
+
+    def line(row):
+        return "  ".join(
+            x.rjust(w) if x[:1].isdigit() else x.ljust(w) for x, w in zip(row, width, strict=True)
+        ).rstrip()
+
+    return "\n".join(line(row) for row in [head, *rows])
+
+
+def add_options(parser):
+    """One flag for every option of `analyse`."""
+    for name, parameter in inspect.signature(analyse).parameters.items():
+        if name in ("shapes", "store"):
+            continue
+        flag, default = "--" + name.replace("_", "-"), parameter.default
+        if isinstance(default, bool):
+            parser.add_argument(flag, action=argparse.BooleanOptionalAction, default=default, help=HELP[name])
+        elif name in CHOICES:
+            legal = [c for c in CHOICES[name] if c]
+            parser.add_argument(flag, choices=legal, default=default, help=f"{HELP[name]} (default: {default})")
+        else:
+            number = isinstance(default, int) or name in ("n_latent", "n_jobs")
+            default = -1 if name == "n_jobs" else default
+            text = HELP[name] if default is None else f"{HELP[name]} (default: {default})"
+            parser.add_argument(flag, type=int if number else str, default=default, help=text)
+
+
+def options_of(args):
+    """The options of `analyse` from parsed flags."""
+    options = {n: getattr(args, n) for n in inspect.signature(analyse).parameters if hasattr(args, n)}
+    if options["components"].isdigit():
+        options["components"] = int(options["components"])
+    return options
+
+
+def check(args):
+    """Read and clean every file, and say what was found."""
+    report = read_shapes(args.paths, components=args.components, pattern=args.pattern)["report"].to_dataset()
+    columns = {
+        "file_vertices": "vertices",
+        "components": "components",
+        "genus": "genus",
+        "holes": "holes",
+        "nonmanifold_edges": "non-manifold",
+    }
+    rows = []
+    for name in report["shape"].values:
+        one = report.sel(shape=name)
+        counts = ["-" if v not in one or int(one[v]) < 0 else int(one[v]) for v in columns]
+        rows.append([name, *counts, one["status"].item(), one["reason"].item()])
+    write(table(rows, ["shape", *columns.values(), "status", "found and done"]))
+    return 0 if (report["status"] != "excluded").all() else 1
+
+
+def run(args):
+    """The whole analysis over a folder of meshes."""
+    begin = time.perf_counter()
+    study = analyse(args.paths, store=args.out, **options_of(args))
+    closing(study, time.perf_counter() - begin)
+    write(f"\nstudy: {args.out}; pictures: s4a view {args.out}")
+    return 0
+
+
+def closing(study, seconds):
+    """The table at the end of a run."""
+    report = study["report"].to_dataset()
+    rows = [
+        [stage, f"{s:.1f}", f"{m:.0f}"]
+        for stage, s, m in zip(
+            report["stage"].values, report["seconds"].values, report["peak_memory"].values, strict=True
+        )
+    ]
+    rows.append(["all", f"{seconds:.1f}", f"{report['peak_memory'].values.max():.0f}"])
+    write("\n" + table(rows, ["stage", "seconds", "peak MiB"]) + "\n")
+    status = report["status"].values
+    write(
+        f"{len(status)} shapes: {(status == 'ok').sum()} ok, {(status == 'repaired').sum()} repaired, "
+        f"{(status == 'excluded').sum()} excluded"
+    )
+    for name in report["shape"].values[status == "excluded"]:
+        write(f"  {name} excluded: {report['reason'].sel(shape=name).item()}")
+    latent = study["latent"].to_dataset()
+    order = latent["distance_to_median"].argsort().values[:3]
+    near = ", ".join(f"{latent['shape'].values[i]} {latent['distance_to_median'].values[i]:.4f}" for i in order)
+    write(f"median shape: {latent.attrs['median']}; nearest to the limit shape (eq. 5): {near}")
+    registration = study["registration"].to_dataset()
+    write(
+        f"registered to {registration.attrs['template']}; mean confidence {registration['confidence'].mean().item():.2f}"
+    )
+    if "pca" in study:
+        ratio = np.cumsum(study["pca"]["explained_variance_ratio"].values)
+        few = [c for c in (1, 3, 10) if c <= len(ratio)]
+        write("variance explained: " + ", ".join(f"{100 * ratio[c - 1]:.1f} % by {c}" for c in few))
+    else:
+        write(f"no modes: {report.attrs['no_modes']}")
+
+
+def demo(args):
+    """The whole analysis on the embedded collection, with its accuracy against the truth, as a page."""
+    begin = time.perf_counter()
+    collection = synthetic.brains(args.shapes, args.vertices, args.seed, dirty=args.dirty)
+    study = analyse(collection, store=args.out, n_jobs=args.n_jobs, seed=args.seed)
+    truth = collection["truth"]
+
+    def image(shape, template):
+        return synthetic.position(truth, shape, truth[template]["reference_point"].values)
+
+    errors = accuracy.accuracy(study, image, n_jobs=args.n_jobs)
+    closing(study, time.perf_counter() - begin)
+    mean = 100 * errors["error"].mean("shape")
+    write(
+        "\n"
+        + table(
+            [[m.item(), f"{e:.2f}"] for m, e in zip(mean["method"], mean.values, strict=True)],
+            ["mean distance to the truth", "% of sqrt(area)"],
+        )
+    )
+    planted = truth["planted_score"].sel(shape=study["pca"]["shape"]).values
+    score = study["pca"]["score"].values
+    both = np.abs(np.corrcoef(planted.T, score[:, : planted.shape[1]].T))[: planted.shape[1], planted.shape[1] :]
+    write("correlation of planted and recovered scores: " + ", ".join(f"{r:.3f}" for r in np.diag(both)))
+    page = Path(args.out) / "study.html"
+    write_page(study, page)
+    write(f"\npictures: {page} ({time.perf_counter() - begin:.0f} s in all)")
+    if args.open:
+        webbrowser.open(page.resolve().as_uri())
+    return 0
+
+
+def view(args):
+    """One self-contained page of a study."""
+    page = Path(args.out) if args.out else Path(args.study) / "study.html"
+    write_page(open_study(args.study), page)
+    write(f"wrote {page} ({page.stat().st_size / 1e6:.1f} MB)")
+    return 0
+
+
+def write(text):
+    sys.stdout.write(text + "\n")
+
+
+def parser():
+    """The parser of all commands."""
+    top = argparse.ArgumentParser(prog="s4a", description="Scalable spectral statistical shape analysis")
+    commands = top.add_subparsers(required=True, metavar="command")
+
+    def command(function, **arguments):
+        sub = commands.add_parser(function.__name__, help=function.__doc__, description=function.__doc__)
+        sub.set_defaults(function=function)
+        return sub
+
+    sub = command(check)
+    sub.add_argument("paths", nargs="+", metavar="PATH", help="folders, globs or mesh files")
+    sub.add_argument("--components", default="largest", help=HELP["components"])
+    sub.add_argument("--pattern", help=HELP["pattern"])
+    sub = command(run)
+    sub.add_argument("paths", nargs="+", metavar="PATH", help="folders, globs or mesh files")
+    sub.add_argument("--out", required=True, metavar="STUDY", help="folder of the study; an unfinished one is resumed")
+    add_options(sub)
+    sub = command(demo)
+    sub.add_argument("--out", default="demo", metavar="STUDY", help="folder of the study (default: demo)")
+    sub.add_argument("--shapes", type=int, default=12, help="number of shapes (default: 12)")
+    sub.add_argument("--vertices", type=int, default=40_000, help="vertices of each (default: 40000)")
+    sub.add_argument("--dirty", action="store_true", help="with loose parts, holes and non-manifold places")
+    sub.add_argument("--seed", type=int, default=0)
+    sub.add_argument("--n-jobs", type=int, default=-1, help=HELP["n_jobs"])
+    sub.add_argument("--open", action="store_true", help="open the page in a browser")
+    sub = command(view)
+    sub.add_argument("study", metavar="STUDY")
+    sub.add_argument("--out", metavar="PAGE", help="file of the page (default: STUDY/study.html)")
+    return top
+
+
+def main(arguments=None):
+    """Entry point; returns the exit code, and turns a ValueError into one line on the error stream."""
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
+    args = parser().parse_args(arguments)
+    try:
+        return args.function(args)
+    except ValueError as error:
+        sys.stderr.write(f"s4a: {error}\n")
+        return 2
+    except KeyboardInterrupt:
+        sys.stderr.write("s4a: interrupted; the same command goes on where it stopped\n")
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())
