@@ -12,13 +12,15 @@ from pathlib import Path
 import fpsample
 import numpy as np
 import xarray as xr
-from scipy.spatial import ConvexHull, cKDTree
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, ndtri
 
-from s4a.clean import clean
-from s4a.mesh import as_arrays, as_dataset, vertex_areas
+from s4a.artefacts import soil
+from s4a.io import write_mesh
+from s4a.mesh import as_arrays, as_dataset, edge_graph, vertex_areas
 from s4a.schema import dataset
+from s4a.shapes import read_shapes
 
 MODE_RMS = 4.5  # mm, root mean square displacement of mode 1 at one standard deviation
 MODE_RATIO = 0.6  # of each mode to the one before it
@@ -335,26 +337,20 @@ def _annotated(mesh, truth, shape, reference_point):
 
 
 def raw_brain(truth, shape, n_vertices=40_000, seed=0):
-    """A brain with the artefacts of scans, as it could lie in a file.
-
-    In numbers: 4 loose components of 12 to 60 vertices; 3 holes of 10 to 60 triangles; one bow-tie vertex for 8,000
-    triangles; and one for 2,000 triangles of each of these: non-manifold edges, duplicate vertices (a seam half around
-    the vertex), zero-area triangles (two where an edge is split at its end), duplicate triangles, flipped triangles,
-    unreferenced vertices; of all of these at least 3.  Vertices and triangles are shuffled.
+    """A brain with the artefacts of :func:`s4a.artefacts.soil`, as it could lie in a file.
 
     Parameters
     ----------
-    truth : as of :func:`position`
-    shape : str
+    truth, shape : as of :func:`position`
     n_vertices : int
         Before the artefacts are put in.
     seed : int
 
     Returns
     -------
-    points : (p, 3)
-    triangles : int32 (m, 3)
-    reference_point : (p, 3)
+    points : float ndarray (p, 3)
+    triangles : int32 ndarray (m, 3)
+    reference_point : float ndarray (p, 3)
         NaN in loose components and at unreferenced vertices.
 
     Examples
@@ -365,55 +361,18 @@ def raw_brain(truth, shape, n_vertices=40_000, seed=0):
     """
     i = _index(truth, shape)
     u, T = _mesh(truth, shape, n_vertices, np.random.default_rng([seed, 1, i]))
-    return _soil(position(truth, shape, u), T, u, np.random.default_rng([seed, 2, i]))
+    return soil(position(truth, shape, u), T, u, np.random.default_rng([seed, 2, i]))
 
 
-def _soil(X, T, u, rng):
-    """The artefacts of :func:`raw_brain` put into a clean mesh."""
-    few = max(3, len(T) // 2000)
-    keep = np.ones(len(T), bool)
-    centroids = cKDTree(_unit(u[T].mean(1)))
-    for size in rng.integers(10, 60, 3):
-        keep[centroids.query(u[rng.integers(len(u))], size)[1]] = False
-    for v in rng.choice(
-        len(u), max(3, few // 4), replace=False
-    ):  # two triangles that touch at v alone: two fans are left
-        star = np.flatnonzero((T == v).any(1))
-        apart = [t for t in star if len(np.intersect1d(T[t], T[star[0]])) == 1]
-        keep[[star[0], *apart[:1]]] = False
-    T = T[keep]
-    copies = []
-    for v in rng.choice(np.unique(T), few, replace=False):  # a seam: half of the star gets a copy of v
-        star = np.flatnonzero((T == v).any(1))
-        along = X[T[star]].mean(1) @ np.cross(u[v], rng.normal(size=3))
-        half = star[along > np.median(along)]
-        T[half] = np.where(T[half] == v, len(X) + len(copies), T[half])
-        copies.append(v)
-    split = rng.choice(len(T), few, replace=False)  # a b c becomes a m c, m b c and a b m with m at a
-    (A, B, C), M = T[split].T, len(X) + len(copies) + np.arange(few)
-    copies = np.r_[copies, np.where(A < len(X), A, np.r_[np.arange(len(X)), copies][A])].astype(int)
-    T[split] = np.c_[M, B, C]
-    extra = [np.c_[A, M, C], np.c_[A, B, M]]
-    X, u = np.r_[X, X[copies]], np.r_[u, u[copies]]
-    pick = rng.choice(len(T), (3, few), replace=False)
-    beyond = cKDTree(u).query(u[T[pick[0]]].mean(1), 15)[1][:, -1]  # a third triangle at an edge
-    extra += [np.c_[T[pick[0], :2], beyond], np.roll(T[pick[1]], 1, axis=1)]
-    T[pick[2]] = T[pick[2], ::-1]
-    debris = [_debris(X[v], rng) for v in rng.integers(len(X), size=4)]
-    for points, triangles in debris:
-        extra.append(triangles + len(X))
-        X = np.r_[X, points]
-    X = np.r_[X, rng.uniform(X.min(0), X.max(0), (few, 3))]
-    u = np.r_[u, np.full((len(X) - len(u), 3), np.nan)]
-    T = np.concatenate([T, *extra])
-    order = rng.permutation(len(X))
-    return X[order], np.argsort(order)[rng.permutation(T)].astype(np.int32), u[order]
-
-
-def _debris(near, rng):
-    """A small loose ellipsoid."""
-    u, T = _sphere(int(rng.integers(12, 61)))
-    return near * rng.uniform(0.8, 1.15) + u * rng.uniform(0.8, 3, 3), T
+def _cleaned_reference(mesh, raw, reference_point):
+    """Reference points of the cleaned vertices; of one that cleaning put on an edge, about its neighbours' mean."""
+    X, T = as_arrays(mesh)
+    file_vertex = mesh["file_vertex"].values
+    u = reference_point[file_vertex]
+    moved = (X != raw[file_vertex]).any(axis=1) | np.isnan(u).any(axis=1)
+    u[moved] = 0
+    u[moved] = _unit((edge_graph(X, T)[moved] != 0) @ u)
+    return u
 
 
 def brains(n=12, n_vertices=40_000, seed=0, *, dirty=False, n_modes=3):
@@ -427,15 +386,16 @@ def brains(n=12, n_vertices=40_000, seed=0, *, dirty=False, n_modes=3):
         Vertices of each, exactly unless `dirty`.  The population does not depend on it.
     seed : int
     dirty : bool
-        Whether the meshes are those of :func:`raw_brain`, cleaned; ``/raw`` then holds them as they were.
+        Whether the meshes are those of :func:`raw_brain`, cleaned; ``/raw/<shape>`` then holds them as they were.
     n_modes : int
         Number of planted modes.
 
     Returns
     -------
     DataTree
-        ``/original/<shape>`` as of ``read_shapes``; ``/truth``, see :func:`plant`; and in ``/truth/<shape>`` the
-        ``reference_point(vertex, xyz)`` of every vertex, NaN where cleaning has put a vertex elsewhere.
+        ``/original/<shape>`` and ``/report`` as of ``read_shapes``, with labels and landmarks; ``/truth``, see
+        :func:`plant`; and in ``/truth/<shape>`` the ``reference_point(vertex, xyz)`` of every vertex.  Of the few
+        vertices that cleaning puts on an edge it is that of a point nearby, all others are exact.
 
     Examples
     --------
@@ -446,20 +406,20 @@ def brains(n=12, n_vertices=40_000, seed=0, *, dirty=False, n_modes=3):
     True
     """
     truth = plant(n, seed, n_modes=n_modes)
-    nodes = {"/truth": truth}
-    for i, shape in enumerate(truth["shape"].values):
+    raw = {}
+    for i, shape in enumerate(truth["shape"].values.tolist()):
         if dirty:
-            X, T, u = raw_brain(truth, shape, n_vertices, seed)
-            raw = as_dataset(X, T, reference_point=u)
-            nodes[f"/raw/{shape}"] = _annotated(raw, truth, shape, u)
-            mesh = clean(raw.drop_vars("reference_point"))
-            file_vertex = mesh["file_vertex"].values
-            moved = (mesh["position"].values != X[file_vertex]).any(axis=1)
-            u = np.where(moved[:, None], np.nan, u[file_vertex])
+            raw[shape] = raw_brain(truth, shape, n_vertices, seed)
         else:
             u, T = _mesh(truth, shape, n_vertices, np.random.default_rng([seed, 1, i]))
-            every = np.arange(n_vertices, dtype=np.int32)
-            mesh = as_dataset(position(truth, shape, u), T, file_vertex=every, vertex_of_file=every)
+            raw[shape] = position(truth, shape, u), T, u
+    shapes = read_shapes({shape: (X, T) for shape, (X, T, _) in raw.items()})
+    nodes = {"/report": shapes["report"].to_dataset(), "/truth": truth}
+    for shape, (X, T, u) in raw.items():
+        mesh = shapes[f"original/{shape}"].to_dataset()
+        if dirty:
+            nodes[f"/raw/{shape}"] = _annotated(as_dataset(X, T, reference_point=u), truth, shape, u)
+        u = _cleaned_reference(mesh, X, u)
         nodes[f"/original/{shape}"] = _annotated(mesh, truth, shape, u)
         nodes[f"/truth/{shape}"] = dataset(reference_point=u)
     return xr.DataTree.from_dict(nodes)
@@ -489,19 +449,9 @@ def write(tree, folder):
         u = mesh if "reference_point" in mesh else tree[f"truth/{shape}"].to_dataset(inherit=False)
         nodes[f"/{shape}"] = xr.merge([u[["reference_point"]], mesh[["label", "landmark_position"]]])
         paths.append(folder / f"{shape}.ply")
-        _write_ply(paths[-1], *as_arrays(mesh), mesh["label"].values)
+        write_mesh(paths[-1], *as_arrays(mesh), label=mesh["label"].values)
     xr.DataTree.from_dict(nodes).to_netcdf(folder / "truth.nc", engine="h5netcdf")
     return paths
-
-
-def _write_ply(path, X, T, label):
-    vertex = np.rec.fromarrays([*X.T, label], dtype=[("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("label", "<i4")])
-    face = np.zeros(len(T), [("n", "u1"), ("v", "<i4", 3)])
-    face["n"], face["v"] = 3, T
-    header = "ply\nformat binary_little_endian 1.0\n"
-    header += f"element vertex {len(X)}\n" + "".join(f"property double {axis}\n" for axis in "xyz")
-    header += f"property int label\nelement face {len(T)}\nproperty list uchar int vertex_indices\nend_header\n"
-    path.write_bytes(header.encode() + vertex.tobytes() + face.tobytes())
 
 
 def sphere(n_vertices=2562, radius=1.0):

@@ -208,12 +208,12 @@ def test_truth_survives_cleaning(dirty_tree):
         cleaned = dirty_tree[f"original/{shape}"]
         raw = dirty_tree[f"raw/{shape}"]
         u = truth[f"{shape}/reference_point"].values
-        known = ~np.isnan(u).any(axis=1)
-        assert known.mean() > 0.999
         assert len(u) > 0.95 * 6000
-        exact = synthetic.position(truth, shape, u)
-        assert np.nanmax(np.abs(exact - cleaned["position"].values)) < 1e-9
-        assert np.array_equal(u[known], raw["reference_point"].values[cleaned["file_vertex"].values[known]])
+        error = np.linalg.norm(synthetic.position(truth, shape, u) - cleaned["position"].values, axis=1)
+        exact = error < 1e-9
+        assert (~exact).sum() <= cleaned.attrs["inserted_vertices"]
+        assert error.max() < 2  # mm; an edge is about 4
+        assert np.array_equal(u[exact], raw["reference_point"].values[cleaned["file_vertex"].values[exact]])
         assert (np.isnan(raw["reference_point"]).any("xyz") == (raw["label"] == 0)).all()
         assert (mesh.unique_edges(cleaned["corner_vertex"].values)[2] <= 2).all()
 
@@ -227,11 +227,11 @@ def test_files_and_their_truth_come_back(tmp_path, dirty):
         for path in paths:
             X, T = igl.read_triangle_mesh(str(path))
             stored = mesh.as_arrays(tree[f"{'raw' if dirty else 'original'}/{path.stem}"])
-            assert np.array_equal(X, stored[0])
+            assert np.abs(X - stored[0]).max() < 2e-5  # mm, single precision
             assert np.array_equal(T, stored[1])
             u = truth[path.stem]["reference_point"].values
             known = ~np.isnan(u).any(axis=1)
-            assert np.abs(synthetic.position(truth, path.stem, u) - X)[known].max() < 1e-9
+            assert np.abs(synthetic.position(truth, path.stem, u) - X)[known].max() < 2e-5
             assert known.sum() >= 700
 
 
