@@ -31,15 +31,23 @@ from s4a.voronoi import between_rims, components, cut_handles, dual, refine, thi
 FIRST, MOST = 0.95, 1.1  # share of n_coarse that is sampled first, and with which cutting handles begins
 
 
-def farthest_points(P, k, start=0):
-    """Sorted indices of k farthest-point samples of the rows of P, from the row `start` on."""
+def farthest_points(P, k, seed=0):
+    """Sorted indices of k farthest-point samples of the rows of P, the outermost first.
+
+    A point far away in one dimension more comes before them all: fpsample begins at a position in a tree of its own.
+    """
     k = min(k, len(P))
-    if k < 1:
-        return np.empty(0, np.int64)
-    height = min(7, int(np.log2(len(P))))
-    if height < 1:
+    height = min(7, int(np.log2(len(P) + 1)))
+    if k < 1 or height < 1:
         return np.arange(k)
-    return np.unique(fpsample.bucket_fps_kdline_sampling(P, k, h=height, start_idx=int(start)).astype(np.int64))
+    radius = np.linalg.norm(P, axis=1)
+    far = np.zeros((1, P.shape[1] + 1))
+    far[0, -1] = -8 * radius.max() - 1
+    if seed:
+        far[0, :-1] = -P[np.argsort(-radius, kind="stable")[seed % len(P)]]
+    P = np.concatenate([far, np.c_[P, np.zeros(len(P))]])
+    sample = np.unique(fpsample.bucket_fps_kdline_sampling(P, k + 1, h=height, start_idx=0).astype(np.int64))
+    return sample[sample > 0] - 1
 
 
 def sample_surface(X, T, G, rim, avoid, k, seed=0):
@@ -60,12 +68,10 @@ def sample_surface(X, T, G, rim, avoid, k, seed=0):
     rim = np.unique(rim)
     sample, free = np.empty(0, np.int64), np.flatnonzero(~avoid)
     if len(rim):
-        sample = rim[farthest_points(P[rim], min(int(np.ceil(length / spacing)), k // 2))]
-        near = dijkstra(G, indices=sample, min_only=True, limit=0.7 * spacing)
+        sample = rim[farthest_points(P[rim], min(int(np.ceil(length / (0.8 * spacing))), k // 2), seed)]
+        near = dijkstra(G, indices=rim, min_only=True, limit=0.6 * spacing)
         free = np.setdiff1d(np.flatnonzero(np.isinf(near) & ~avoid), rim)
-    outermost = np.argsort(-(X[free] ** 2).sum(1), kind="stable")
-    start = outermost[seed % len(free)] if len(free) else 0
-    return np.sort(np.r_[sample, free[farthest_points(P[free], k - len(sample), start)]])
+    return np.sort(np.r_[sample, free[farthest_points(P[free], k - len(sample), seed)]])
 
 
 def laplacian(X, T, area):
@@ -210,7 +216,7 @@ def coarsen(mesh, *, n_coarse=6000, wrap=False, seed=0):
     wrap : bool
         Coarsen a closed surface wrapped around the mesh, for scans whose inside is of no interest (needs pymeshlab).
     seed : int
-        The sampling starts at the (seed + 1)-th outermost vertex.
+        The sampling starts at an outermost vertex; another seed starts elsewhere.
 
     Returns
     -------

@@ -38,7 +38,9 @@ def add_samples(G, new, sample, cell, distance):
     number = np.full(len(cell), -1)
     number[new] = len(sample) + np.arange(len(new))
     nearer = to_new < distance
-    return np.r_[sample, new], np.where(nearer, number[nearest], cell), np.where(nearer, to_new, distance)
+    cell, distance = cell.copy(), distance.copy()
+    cell[nearer], distance[nearer] = number[nearest[nearer]], to_new[nearer]
+    return np.r_[sample, new], cell, distance
 
 
 def voronoi_cells(G, sample):
