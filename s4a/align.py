@@ -56,8 +56,7 @@ def farthest_points(X, m):
     start = int(np.argmax(((X - X.mean(0)) ** 2).sum(1)))
     if m >= len(X):
         return np.arange(len(X))
-    height = int(np.clip(np.log2(len(X)) - 4, 1, 7))  # a KD-tree with at least some 16 points in each leaf
-    return fpsample.bucket_fps_kdline_sampling(X, m, h=height, start_idx=start).astype(np.int64)
+    return fpsample.fps_sampling(X, m, start_idx=start).astype(np.int64)  # the faster variants choose their own start
 
 
 def principal_axes(X, area):
