@@ -120,17 +120,18 @@ def coarse_surface(X, T, n_coarse, seed=0):
         if not left:
             break
         region = thin_regions(F, E, count == 1, start[1], len(start[0]))
-        V, F, came_from = cut_handles(V, F, between_rims(G, F, region), 3 * triangle_areas(V, F).sum() / n_coarse)
+        V, F, came_from = cut_handles(V, F, between_rims(G, F, region), triangle_areas(V, F).sum() / n_coarse)
         origin = np.where(came_from >= 0, origin[came_from], -1)
     sample, cell_of, _ = state
     C = dual(F, cell_of)
     kept = np.flatnonzero(origin >= 0)
+    attrs = {"samples_first": len(first), "samples_added": len(sample) - len(first), "rounds": rounds}
     cell = np.full(len(X), -1)
     cell[origin[kept]] = cell_of[kept]
-    if (cell < 0).any():
+    attrs["vertices_cut"] = int((cell < 0).sum())
+    if attrs["vertices_cut"]:
         known = np.flatnonzero(cell >= 0)
         cell = cell[dijkstra(edge_graph(X, T), indices=known, min_only=True, return_predecessors=True)[2]]
-    attrs = {"samples_first": len(first), "samples_added": len(sample) - len(first), "rounds": rounds}
     return V[sample], C, origin[sample], cell, attrs
 
 
@@ -225,7 +226,8 @@ def coarsen(mesh, *, n_coarse=6000, wrap=False, seed=0):
         they are no vertex of the mesh);  ``edge_vertex``, ``cotan_weight``: W;  ``vertex_area``: A, the area of the
         original surface carried by U, so that it sums to the original area (of the coarse mesh after wrapping);
         ``coarse_vertex``, ``coarse_weight (original_vertex, corner)``: U, rows non-negative of sum 1.
-        The attributes count samples added, rounds, Euler characteristic and boundary loops before and after.
+        The attributes count samples, rounds, vertices that went with cut handles (U reaches them, too), Euler
+        characteristic and boundary loops, and say which Laplacian it is ("robust" where triangles are degenerate).
 
     Raises
     ------
@@ -261,7 +263,7 @@ def coarsen(mesh, *, n_coarse=6000, wrap=False, seed=0):
     V, F = sorted_mesh(*alpha_wrap(X, T))[:2] if wrap else (X, T)
     if len(V) <= n_coarse:
         Y, C, sample, cell = V, F, np.arange(len(V)), np.arange(len(V))
-        attrs.update(kept_whole=1, samples_first=len(V), samples_added=0, rounds=0)
+        attrs.update(kept_whole=1, samples_first=len(V), samples_added=0, rounds=0, vertices_cut=0)
     else:
         Y, C, sample, cell, counts = coarse_surface(V, F, n_coarse, seed)
         attrs.update(counts)
