@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from s4a import accuracy, synthetic
-from s4a.io import find_meshes
+from s4a.draw import VIEWS
+from s4a.picture import write_picture
 from s4a.pipeline import CHOICES, analyse
 from s4a.shapes import read_shapes
 from s4a.study import open_study
@@ -137,15 +138,24 @@ def closing(study, seconds):
     near = ", ".join(f"{latent['shape'].values[i]} {latent['distance_to_median'].values[i]:.4f}" for i in order)
     write(f"median shape: {latent.attrs['median']}; nearest to the limit shape (eq. 5): {near}")
     registration = study["registration"].to_dataset()
-    write(
-        f"registered to {registration.attrs['template']}; mean confidence {registration['confidence'].mean().item():.2f}"
-    )
+    confidence = registration["confidence"].mean().item()
+    write(f"registered to {registration.attrs['template']}; mean confidence {confidence:.2f}")
     if "pca" in study:
         ratio = np.cumsum(study["pca"]["explained_variance_ratio"].values)
         few = [c for c in (1, 3, 10) if c <= len(ratio)]
         write("variance explained: " + ", ".join(f"{100 * ratio[c - 1]:.1f} % by {c}" for c in few))
     else:
         write(f"no modes: {report.attrs['no_modes']}")
+
+
+def error_table(errors):
+    """Mean errors of :func:`s4a.accuracy.accuracy` over the shapes, a row per method."""
+    mean = 100 * errors.mean("shape")
+    rows = []
+    for method in mean["method"].values:
+        pair = [mean[name].sel(method=method).item() for name in ("error", "geodesic_error")]
+        rows.append([method, *("-" if np.isnan(e) else f"{e:.3f}" for e in pair)])
+    return table(rows, ["mean error, % of sqrt(area)", "straight line", "along edges"])
 
 
 def demo(args):
@@ -160,21 +170,15 @@ def demo(args):
 
     errors = accuracy.accuracy(study, image, n_jobs=args.n_jobs)
     closing(study, time.perf_counter() - begin)
-    mean = 100 * errors["error"].mean("shape")
-    write(
-        "\n"
-        + table(
-            [[m.item(), f"{e:.2f}"] for m, e in zip(mean["method"], mean.values, strict=True)],
-            ["mean distance to the truth", "% of sqrt(area)"],
-        )
-    )
+    write("\n" + error_table(errors))
     planted = truth["planted_score"].sel(shape=study["pca"]["shape"]).values
     score = study["pca"]["score"].values
     both = np.abs(np.corrcoef(planted.T, score[:, : planted.shape[1]].T))[: planted.shape[1], planted.shape[1] :]
     write("correlation of planted and recovered scores: " + ", ".join(f"{r:.3f}" for r in np.diag(both)))
     page = Path(args.out) / "study.html"
-    write_page(study, page)
-    write(f"\npictures: {page} ({time.perf_counter() - begin:.0f} s in all)")
+    write_page(study, page, title="Synthetic brains")
+    picture = write_picture(study, Path(args.out) / "modes.png")
+    write(f"\npictures: {page}, {picture} ({time.perf_counter() - begin:.0f} s in all)")
     if args.open:
         webbrowser.open(page.resolve().as_uri())
     return 0
@@ -183,7 +187,7 @@ def demo(args):
 def view(args):
     """One self-contained page of a study."""
     page = Path(args.out) if args.out else Path(args.study) / "study.html"
-    write_page(open_study(args.study), page)
+    write_page(open_study(args.study), page, title=args.title or Path(args.study).name, view=args.view, up=args.up)
     write(f"wrote {page} ({page.stat().st_size / 1e6:.1f} MB)")
     return 0
 
@@ -221,6 +225,9 @@ def parser():
     sub = command(view)
     sub.add_argument("study", metavar="STUDY")
     sub.add_argument("--out", metavar="PAGE", help="file of the page (default: STUDY/study.html)")
+    sub.add_argument("--title", help="title of the page (default: name of the folder)")
+    sub.add_argument("--view", default="corner", choices=list(VIEWS), help="from where (default: corner)")
+    sub.add_argument("--up", default="z", choices=["x", "y", "z"], help="axis that points up (default: z)")
     return top
 
 

@@ -78,7 +78,7 @@ def zoomout(C, Phi_source, Phi_target, area_target, k, *, step=5):
 
 
 def heat_features(Phi, eigenvalue, vertices, times):
-    """Heat kernels h_t(x, v) = sum exp(-t lambda) phi(x) phi(v) of landmark vertices, as coefficients ``(k, v * t)``."""
+    """Heat kernels sum exp(-t lambda) phi(x) phi(v) around landmark vertices v, as coefficients ``(k, v * t)``."""
     decay = np.exp(-np.asarray(times)[:, None] * eigenvalue[None, :])
     columns = np.einsum("tk,vk->kvt", decay, Phi[vertices]).reshape(Phi.shape[1], -1)
     return columns / np.linalg.norm(columns, axis=0)

@@ -6,12 +6,13 @@ import hashlib
 import os
 import re
 import unicodedata
+import zipfile
 from collections import Counter
 from pathlib import Path
 
 import numpy as np
 
-from s4a.formats import READERS, WRITERS
+from s4a.formats import NPZ_KEYS, READERS, WRITERS
 
 SURFER = (".pial", ".white", ".inflated", ".orig", ".smoothwm", ".sphere")  # FreeSurfer: the name is the suffix
 SUFFIXES = {
@@ -143,7 +144,8 @@ def find_meshes(paths, pattern=None):
     Parameters
     ----------
     paths : str, Path or list of these
-        Folders (searched to any depth), files, or globs such as ``"scans/*/head.stl"``.
+        Folders (searched to any depth; NPZ archives of other arrays are passed over), files, or globs such as
+        ``"scans/*/head.stl"``.
     pattern : str, optional
         Keep the files whose name, with or without suffix, it matches: ``"*_brain"`` picks one structure of many.
 
@@ -182,11 +184,20 @@ def _expand(path):
         return [path]
     if path.is_dir():
         found = (Path(folder, name) for folder, _, names in os.walk(path) for name in names)
-        return [file for file in found if file.suffix.lower() in known and not file.name.startswith(".")]
+        return [file for file in found if file.suffix.lower() in known and file.name[0] != "." and _may_be_mesh(file)]
     found = [Path(name) for name in glob.glob(str(path), recursive=True)] if glob.has_magic(str(path)) else []
     if not found:
         raise ValueError(f"no file, folder or match of {path}")
     return [file for name in found for file in ([name] if name.is_file() else _expand(name))]
+
+
+def _may_be_mesh(file):
+    """False for an NPZ archive of other arrays, which a folder may well hold beside its meshes."""
+    if file.suffix.lower() != ".npz" or not zipfile.is_zipfile(file):
+        return True
+    with zipfile.ZipFile(file) as archive:
+        names = {name.removesuffix(".npy") for name in archive.namelist()}
+    return any(names.issuperset(keys) for keys in NPZ_KEYS)
 
 
 def slug(text):

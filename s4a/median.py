@@ -13,7 +13,7 @@ def area_differences(Y):
 
 
 def conformal_differences(Y, eigenvalues, latent_eigenvalue):
-    """(Lambda^0)^+ Y_i^T Lambda_i Y_i ``(n, m, m)``: how the Dirichlet energies differ; the constant mode is left zero."""
+    """(Lambda^0)^+ Y_i^T Lambda_i Y_i ``(n, m, m)``: how Dirichlet energies differ; the constant mode is zero."""
     D = np.einsum("nkl,nk,nkm->nlm", Y, eigenvalues[:, : Y.shape[1]], Y)
     D[:, :1], D[:, :, :1] = 0, 0
     return inverse(latent_eigenvalue)[None, :, None] * D

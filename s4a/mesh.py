@@ -156,8 +156,9 @@ def closest_point_on_triangles(P, A, B, C):
     v, w = np.where(edge_ac, 0, v), np.where(edge_ac, ratio(d2, d2 - d6), w)
     edge_ab = (vc <= 0) & (d1 >= 0) & (d3 <= 0)
     v, w = np.where(edge_ab, ratio(d1, d1 - d3), v), np.where(edge_ab, 0, w)
-    for region, corner in (((d6 >= 0) & (d5 <= d6), (0, 1)), ((d3 >= 0) & (d4 <= d3), (1, 0)), ((d1 <= 0) & (d2 <= 0), (0, 0))):
-        v, w = np.where(region, corner[0], v), np.where(region, corner[1], w)
+    corners = (((d6 >= 0) & (d5 <= d6), 0, 1), ((d3 >= 0) & (d4 <= d3), 1, 0), ((d1 <= 0) & (d2 <= 0), 0, 0))
+    for region, at_b, at_c in corners:
+        v, w = np.where(region, at_b, v), np.where(region, at_c, w)
     return np.stack([np.maximum(1 - v - w, 0), v, w], axis=1)
 
 

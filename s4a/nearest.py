@@ -43,7 +43,7 @@ def squared_distances(A, B):
 
 
 def search(queries, cells, which, best, index):
-    """Compare `queries` with the rows of the cells `which`; update their best squared distances and indices in place."""
+    """Compare `queries` with the rows of the cells `which`; update best squared distances and indices in place."""
     rows = np.concatenate([cells.rows[cells.start[c] : cells.start[c + 1]] for c in which])
     numbers = np.concatenate([cells.order[cells.start[c] : cells.start[c + 1]] for c in which])
     D = squared_distances(queries, rows)

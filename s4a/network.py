@@ -120,18 +120,21 @@ def three_cycles(source, target):
     return np.array(cycles, np.int64).reshape(-1, 3)
 
 
-def cycle_errors(C, cycles):
+def cycle_errors(C, cycles, k=None):
     """How far each directed map is from closing its 3-cycles: mean |C_ki C_jk C_ij - I|_F / sqrt(k).
+
+    Of the product only the first `k` rows and columns are looked at, all by default; maps of different sizes can only
+    be compared at one k.
 
     Returns
     -------
     float ndarray (p,)
         NaN for maps in no 3-cycle.
     """
-    p, k = C.shape[:2]
+    p, k = len(C), k or C.shape[1]
     total, count = np.zeros(p), np.zeros(p)
     for a, b, c in cycles:
-        error = np.linalg.norm(C[c] @ C[b] @ C[a] - np.eye(k)) / np.sqrt(k)
+        error = np.linalg.norm(C[c, :k] @ C[b] @ C[a, :, :k] - np.eye(k)) / np.sqrt(k)
         total[[a, b, c]] += error
         count[[a, b, c]] += 1
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)

@@ -164,7 +164,7 @@ def relative_motion(alignment, source, target):
 def first_maps_task(folder, pairs, k_init, init):
     """First maps of some pairs, in both directions."""
     alignment = study.read(folder / "network" / "alignment.nc")
-    shapes = {name: low_shape(folder, name) for name in sorted(set(sum(pairs, [])))}
+    shapes = {name: low_shape(folder, name) for name in sorted({name for pair in pairs for name in pair})}
     directed, maps = [], []
     for a, b in pairs:
         R, t = realign(shapes[a][0], shapes[b][0], relative_motion(alignment, a, b))
@@ -185,7 +185,7 @@ def consistent_maps(folder, names, first, options, n_jobs):
     eigenvalues = np.stack([s[3][:k] for s in shapes])
     C0 = first["fmap_initial"].values
     with threadpool_limits(1), tqdm(total=k - C0.shape[1], desc="consistent ZoomOut") as bar:
-        C, weight, error, Y, latent_eigenvalue = latent.consistent_zoomout(
+        C, weight, _, Y, latent_eigenvalue = latent.consistent_zoomout(
             C0,
             source,
             target,
@@ -199,7 +199,9 @@ def consistent_maps(folder, names, first, options, n_jobs):
             n_jobs=n_jobs,
             progress=lambda size: bar.update(size - C0.shape[1] - bar.n),
         )
-    initial_error = network.cycle_errors(C0, network.three_cycles(source.tolist(), target.tolist()))
+    cycles = network.three_cycles(source.tolist(), target.tolist())
+    initial_error = network.cycle_errors(C0, cycles)
+    error = network.cycle_errors(C, cycles, k=C0.shape[1])
     net = first.merge(
         dataset(fmap=C.astype(np.float32), weight=weight, cycle_error=error, cycle_error_initial=initial_error)
     )
@@ -408,8 +410,13 @@ def write_report(run, given, options, no_modes):
             path = source if isinstance(source, str) else ""
             attrs[name] = {"status": "excluded", "reason": run.failures[name], "path": path}
         else:
-            with xr.open_dataset(run.folder / "original" / f"{name}.nc", engine=study.ENGINE) as mesh:
-                attrs[name] = dict(mesh.attrs)
+            mesh, coarse = (study.attributes(run.folder / stage / f"{name}.nc") for stage in ("original", "coarse"))
+            remarks = [
+                mesh["reason"],
+                "wrapped watertight before remeshing" if coarse["wrapped"] else "",
+                "not manifold at low resolution: robust Laplacian" if coarse["laplacian"] == "robust" else "",
+            ]
+            attrs[name] = mesh | {"reason": "; ".join(filter(None, remarks))}
     stages = dataset(
         {"no_modes": no_modes, **{n: str(v) for n, v in options.items()}},
         seconds=np.array(list(run.seconds.values())),

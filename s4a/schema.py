@@ -47,7 +47,11 @@ TABLE = {
         "functional map before Consistent ZoomOut",
     ),
     "weight": (("pair",), ONE, "weight of the map in the consistent latent basis"),
-    "cycle_error": (("pair",), ONE, "mean |C_cycle - I|_F / sqrt(k) over the 3-cycles through the pair"),
+    "cycle_error": (
+        ("pair",),
+        ONE,
+        "mean |C_cycle - I|_F over the 3-cycles through the pair, first k_init modes, by sqrt(k_init)",
+    ),
     "cycle_error_initial": (("pair",), ONE, "the same before Consistent ZoomOut"),
     # latent basis and median (3.4 - 3.6, eq. 3 and 5)
     "latent_basis": (("shape", "mode", "latent"), ONE, "consistent latent basis Y of each shape"),

@@ -58,11 +58,16 @@ def read(path):
         return data.load()
 
 
+def attributes(path):
+    """The attributes of one file."""
+    with xr.open_dataset(path, engine=ENGINE) as data:
+        return dict(data.attrs)
+
+
 def is_done(path, key):
     """Whether the file of a task is there, whole, and of this key."""
     try:
-        with xr.open_dataset(path, engine=ENGINE) as data:
-            return data.attrs.get("task_key") == key
+        return attributes(path).get("task_key") == key
     except (OSError, ValueError, KeyError, RuntimeError):  # absent, truncated, foreign: computed again
         return False
 
