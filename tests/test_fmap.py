@@ -1,0 +1,123 @@
+"""Functional maps (3.3): identity for identical shapes, permutations recovered exactly."""
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from s4a import coarsen, fmap, spectral, spectrum, synthetic
+from s4a.align import farthest_points
+
+
+@pytest.fixture(scope="module")
+def shape():
+    """Eigenfunctions, areas, eigenvalues and vertices of a shape without symmetry."""
+    mesh = spectrum(coarsen(synthetic.brains(1, 4000)["original/brain_01"].to_dataset(), n_coarse=900), k=40)
+    values = mesh["eigenfunction"], spectral.unit_area(mesh), mesh["eigenvalue"], mesh["position"]
+    return [np.asarray(v) for v in values]
+
+
+@pytest.fixture(scope="module")
+def permuted(shape):
+    """The same shape with its vertices renumbered and some signs turned, and the match from it to the shape."""
+    Phi, area, eigenvalue, X = shape
+    rng = np.random.default_rng(0)
+    order = rng.permutation(len(X))
+    sign = np.r_[1, rng.choice([-1, 1], Phi.shape[1] - 1)]
+    return Phi[order] * sign, area[order], eigenvalue, X[order], order, sign
+
+
+def test_identical_shapes_give_identity_maps(shape):
+    Phi, area, _, X = shape
+    C = fmap.fmap_from_match(Phi, Phi, area, np.arange(len(X)))
+    assert pytest.approx(np.eye(40), abs=1e-9) == C
+    assert (fmap.match_from_fmap(C, Phi, Phi) == np.arange(len(X))).all()
+
+
+def test_the_map_of_a_permutation_is_orthogonal_and_carries_functions(shape, permuted):
+    Phi, area, _, _ = shape
+    Psi, area_target, _, _, order, sign = permuted
+    C = fmap.fmap_from_match(Phi, Psi, area_target, order)
+    assert pytest.approx(np.diag(sign), abs=1e-9) == C
+    assert fmap.orthogonality_error(C) < 1e-9
+    f = Phi @ np.random.default_rng(1).normal(size=40)
+    assert Psi @ C @ spectral.project(Phi, area, f) == pytest.approx(f[order], abs=1e-8)
+
+
+def test_zoomout_recovers_a_permutation_exactly_from_a_small_noisy_map(shape, permuted):
+    Phi, _, _, _ = shape
+    Psi, area_target, _, _, order, sign = permuted
+    C0 = np.diag(sign[:8]) + np.random.default_rng(2).normal(0, 0.05, (8, 8))
+    C, match = fmap.zoomout(C0, Phi, Psi, area_target, 40, step=3)
+    assert (match == order).all()
+    assert pytest.approx(np.diag(sign), abs=1e-8) == C
+
+
+def test_zoomout_ends_at_k_whatever_the_step(shape):
+    Phi, area, _, _ = shape
+    for step in (1, 7, 100):
+        C, match = fmap.zoomout(np.eye(33), Phi, Phi, area, 40, step=step)
+        assert pytest.approx(np.eye(40), abs=1e-9) == C
+        assert (match == np.arange(len(Phi))).all()
+    assert (fmap.zoomout(np.eye(40), Phi, Phi, area, 40)[0] == np.eye(40)).all()
+
+
+def test_a_map_between_different_sizes_has_the_dims_target_by_source(shape):
+    Phi, area, _, X = shape
+    C = fmap.fmap_from_match(Phi[:, :12], Phi[:, :9], area, np.arange(len(X)))
+    assert pytest.approx(np.eye(9, 12), abs=1e-9) == C
+    assert fmap.match_from_fmap(C, Phi, Phi).shape == (len(X),)
+
+
+def test_the_landmark_fit_of_identical_shapes_is_near_the_identity(shape):
+    Phi, _, eigenvalue, X = shape
+    landmark = farthest_points(X, 10)
+    C = fmap.fit_landmarks(Phi[:, :20], Phi[:, :20], eigenvalue[:20], eigenvalue[:20], landmark, landmark)
+    assert pytest.approx(np.eye(20), abs=1e-6) == C
+
+
+def test_the_landmark_fit_finds_the_signs_of_the_eigenfunctions(shape, permuted):
+    Phi, _, eigenvalue, X = shape
+    Psi, _, _, _, order, sign = permuted
+    landmark = farthest_points(X, 10)
+    same = np.argsort(order)[landmark]
+    C = fmap.fit_landmarks(Phi[:, :20], Psi[:, :20], eigenvalue[:20], eigenvalue[:20], landmark, same)
+    assert pytest.approx(np.diag(sign[:20]), abs=1e-6) == C
+
+
+def test_the_landmark_fit_is_the_least_squares_solution_of_its_energy(shape):
+    Phi, _, eigenvalue, X = shape
+    k, commute = 6, 1e-2
+    landmark, other = farthest_points(X, 4), farthest_points(X, 9)[5:]
+    ev, ev_target = eigenvalue[:k], 1.3 * eigenvalue[:k]
+    C = fmap.fit_landmarks(Phi[:, :k], Phi[:, :k], ev, ev_target, landmark, other, commute=commute)
+    times = np.geomspace(4 * np.log(10) / ev_target[-1], 4 * np.log(10) / ev_target[1], 8)
+    F = fmap.heat_features(Phi[:, :k], ev, landmark, times)
+    G = fmap.heat_features(Phi[:, :k], ev_target, other, times)
+    weight = commute * np.trace(F @ F.T) / ev_target[-1] ** 2
+
+    slope = (C @ F - G) @ F.T + weight * (ev_target[:, None] - ev[None, :]) ** 2 * C
+    assert np.abs(slope[:, 1:]).max() < 1e-9  # the first column is not free: constants go to constants
+    assert C[:, 0].tolist() == [1, 0, 0, 0, 0, 0]
+
+
+@pytest.mark.parametrize("d", [1, 3, 30, 100])
+def test_nearest_rows_are_those_of_a_float64_search_but_for_ties(d):
+    rng = np.random.default_rng(d)
+    Q, D = rng.normal(size=(3000, d)), rng.normal(size=(2500, d))
+    found = fmap.nearest_rows(Q, D, block=700)
+    gap = cKDTree(D).query(Q)[0]
+    scale = (Q**2).sum(1) + (D**2).sum(1).max()
+    assert (((Q - D[found]) ** 2).sum(1) <= gap**2 + 1e-6 * scale).all()
+    if d > 1:
+        assert (found == cKDTree(D).query(Q)[1]).mean() > 0.999
+
+
+def test_nearest_rows_does_not_depend_on_the_block():
+    rng = np.random.default_rng(5)
+    Q, D = rng.normal(size=(1000, 20)), rng.normal(size=(900, 20))
+    assert (fmap.nearest_rows(Q, D, block=64) == fmap.nearest_rows(Q, D)).all()
+
+
+def test_of_equal_rows_the_first_is_given():
+    D = np.repeat(np.eye(4), 3, axis=0)
+    assert fmap.nearest_rows(np.eye(4), D).tolist() == [0, 3, 6, 9]
