@@ -87,9 +87,9 @@ def heat_features(Phi, eigenvalue, vertices, times):
 def fit_landmarks(Phi_source, Phi_target, ev_source, ev_target, landmark_source, landmark_target, *, commute=1e-3):
     """Fit of C on landmark pairs (step 4 of 4.1): descriptors preserved, Laplacians commute.
 
-    min |C F - G|^2 + commute |C Lambda_source - Lambda_target C|^2, where F and G are heat kernels around the
-    landmarks at several times.  The second term is diagonal in C, so each row of C has normal equations of its own,
-    solved directly (Ovsjanikov et al. 2012).
+    min |C F - G|^2 + commute |F|^2 |C Lambda_source - Lambda_target C|^2 / lambda_max^2 over the C that carry
+    constants to constants, where F and G are heat kernels around the landmarks at several times.  The second term is
+    diagonal in C, so each row of C has normal equations of its own, solved directly (Ovsjanikov et al. 2012).
 
     Parameters
     ----------
@@ -106,12 +106,12 @@ def fit_landmarks(Phi_source, Phi_target, ev_source, ev_target, landmark_source,
     times = np.geomspace(4 * np.log(10) / top, 4 * np.log(10) / max(ev_source[1], ev_target[1]), 8)
     F = heat_features(Phi_source, ev_source, landmark_source, times)
     G = heat_features(Phi_target, ev_target, landmark_target, times)
-    FF, GF = F @ F.T, G @ F.T
-    penalty = commute * np.trace(FF) * ((ev_target[:, None] - ev_source[None, :]) / top) ** 2
-    C = np.stack([np.linalg.solve(FF + np.diag(p), g) for p, g in zip(penalty, GF, strict=True)])
-    C[:, 0] = 0  # constants go to constants
-    C[0, 0] = np.sign(Phi_source[0, 0] * Phi_target[0, 0])
-    return C
+    constant = np.zeros(len(G))  # constants go to constants: this column of C is known
+    constant[0] = np.sign(Phi_source[0, 0] * Phi_target[0, 0])
+    FF, GF = F[1:] @ F[1:].T, (G - np.outer(constant, F[0])) @ F[1:].T
+    penalty = commute * np.trace(F @ F.T) * ((ev_target[:, None] - ev_source[None, 1:]) / top) ** 2
+    rest = [np.linalg.solve(FF + np.diag(p), g) for p, g in zip(penalty, GF, strict=True)]
+    return np.column_stack([constant, np.stack(rest)])
 
 
 def orthogonality_error(C):

@@ -50,7 +50,7 @@ def eigenpairs(E, w, area, k):
     eigenvalue, V = spla.eigsh(S, k=k, sigma=-shift, OPinv=inverse, v0=start, which="LM")
     order = np.argsort(eigenvalue)
     eigenvalue, Phi = eigenvalue[order], V[:, order] / np.sqrt(a)[:, None]
-    eigenvalue = np.where(np.abs(eigenvalue) < 1e-9 * eigenvalue[-1], 0.0, eigenvalue)
+    eigenvalue = np.where(np.abs(eigenvalue) < 1e-9 * max(eigenvalue[-1], 1.0), 0.0, eigenvalue)
     Phi *= np.where(a @ Phi**3 < 0, -1.0, 1.0)
     if (eigenvalue == 0).sum() == 1:
         Phi[:, 0] = 1.0  # exactly, so that constants stay constant in every map
@@ -77,12 +77,12 @@ def spectrum(mesh, *, k=100):
     -------
     xarray.Dataset
         The mesh with ``eigenvalue(mode)`` and ``eigenfunction(vertex, mode)`` for unit area: A^-1 W phi = lambda phi,
-        Phi^T A Phi = I with A of trace 1.
+        Phi^T A Phi = I with A of trace 1.  The attribute ``zero_eigenvalues`` counts the connected pieces.
 
     Raises
     ------
     ValueError
-        When k is not a positive integer, or the surface is not connected (more than one zero eigenvalue).
+        When k is not a positive integer, or the mesh has fewer than 3 vertices.
     """
     require(mesh, "vertex_area", "edge_vertex", "cotan_weight", what="mesh")
     if int(k) != k or k < 1:
