@@ -153,7 +153,7 @@ def error_table(errors):
     mean = 100 * errors.mean("shape")
     rows = []
     for method in mean["method"].values:
-        pair = [mean[name].sel(method=method).item() for name in ("error", "geodesic_error")]
+        pair = [mean[name].sel({"method": method}).item() for name in ("error", "geodesic_error")]
         rows.append([method, *("-" if np.isnan(e) else f"{e:.3f}" for e in pair)])
     return table(rows, ["mean error, % of sqrt(area)", "straight line", "along edges"])
 
