@@ -1,0 +1,101 @@
+"""Exact nearest neighbours over cells (eq. 7): the answer of an exhaustive search, with fewer comparisons."""
+
+import numpy as np
+import pytest
+
+from s4a.nearest import into_cells, nearest_in_cells
+
+
+def gaps(Q, D):
+    """All squared distances in float64."""
+    return (Q**2).sum(1)[:, None] + (D**2).sum(1) - 2 * Q @ D.T
+
+
+def check(Q, D, found):
+    """Each row found is as near as the nearest one, up to float32 rounding of the squared distance."""
+    gap = gaps(Q, D)
+    centred = np.concatenate([Q, D]) - D.mean(0)
+    slack = 2e-6 * (centred**2).sum(1).max()
+    assert (gap[np.arange(len(Q)), found] <= gap.min(1) + slack).all()
+    return (found == gap.argmin(1)).mean()
+
+
+def clustered(n, d, seed, spread=0.05):
+    """Rows in 40 clusters on the unit sphere and their cluster."""
+    centre = np.random.default_rng(99).normal(size=(40, d))
+    centre /= np.linalg.norm(centre, axis=1, keepdims=True)
+    rng = np.random.default_rng(seed)
+    cell = rng.integers(0, 40, n)
+    return centre[cell] + spread * rng.normal(size=(n, d)) / np.sqrt(d), cell
+
+
+@pytest.mark.parametrize("d", [1, 6, 50])
+@pytest.mark.parametrize("first", [1, 12, 1000])
+def test_the_answer_is_that_of_an_exhaustive_search_on_random_rows_in_random_cells(d, first):
+    rng = np.random.default_rng(d)
+    Q, D = rng.normal(size=(1500, d)), rng.normal(size=(1200, d))
+    found, _ = nearest_in_cells(Q, rng.integers(0, 37, 1500), D, rng.integers(0, 29, 1200), first=first)
+    assert check(Q, D, found) > (0.99 if d > 1 else 0.9)
+
+
+@pytest.mark.parametrize("first", [1, 12])
+def test_the_answer_is_that_of_an_exhaustive_search_on_clusters_with_few_comparisons(first):
+    (Q, cell_q), (D, cell_d) = clustered(3000, 20, 1), clustered(2500, 20, 2)
+    found, share = nearest_in_cells(Q, cell_q, D, cell_d, first=first)
+    assert check(Q, D, found) > 0.999
+    assert share < (0.1 if first == 1 else 0.5)
+
+
+def test_rows_far_from_the_origin_lose_nothing():
+    (Q, cell_q), (D, cell_d) = clustered(2000, 20, 3), clustered(2000, 20, 4)
+    far = np.full(20, 300.0)
+    found, _ = nearest_in_cells(Q + far, cell_q, D + far, cell_d)
+    assert (found == gaps(Q, D).argmin(1)).all()
+
+
+def test_rows_that_are_nearly_the_same_are_found_across_cells():
+    rng = np.random.default_rng(5)
+    D = rng.normal(size=(2000, 30))
+    order = rng.permutation(2000)
+    Q = D[order] + 1e-4 * rng.normal(size=D.shape)
+    found, _ = nearest_in_cells(Q, rng.integers(0, 50, 2000), D, rng.integers(0, 50, 2000), first=1)
+    assert (found == order).all()
+
+
+def test_the_numbering_of_the_cells_does_not_matter():
+    (Q, cell_q), (D, cell_d) = clustered(1000, 10, 6), clustered(900, 10, 7)
+    one, share = nearest_in_cells(Q, cell_q, D, cell_d)
+    numbers = np.random.default_rng(0).choice(10**6, 40, replace=False)  # most numbers are of empty cells
+    two, same = nearest_in_cells(Q, numbers[cell_q], D, numbers[::-1][cell_d])
+    assert (one == two).all()
+    assert share == pytest.approx(same, abs=0.02)
+
+
+def test_a_single_cell_is_an_exhaustive_search():
+    rng = np.random.default_rng(8)
+    Q, D = rng.normal(size=(50, 4)), rng.normal(size=(60, 4))
+    found, share = nearest_in_cells(Q, np.zeros(50, int), D, np.zeros(60, int))
+    assert share == 1
+    assert check(Q, D, found) == 1
+
+
+def test_cells_of_single_rows_work():
+    rng = np.random.default_rng(9)
+    D = rng.normal(size=(300, 5))
+    assert (nearest_in_cells(D, np.arange(300), D, np.arange(300))[0] == np.arange(300)).all()
+
+
+def test_of_equal_rows_one_is_given():
+    (D, cell), rng = clustered(200, 8, 10), np.random.default_rng(1)
+    found = nearest_in_cells(D, cell, np.concatenate([D, D]), rng.integers(0, 9, 400))[0]
+    assert (found % 200 == np.arange(200)).all()
+
+
+def test_cells_hold_all_rows_within_their_radius():
+    (D, cell) = clustered(500, 6, 11)
+    cells = into_cells(D, cell)
+    assert (np.sort(cells.order) == np.arange(500)).all()
+    assert cells.rows == pytest.approx(D[cells.order], abs=1e-6)
+    for c, (begin, end) in enumerate(zip(cells.start[:-1], cells.start[1:], strict=True)):
+        gap = np.linalg.norm(cells.rows[begin:end] - cells.center[c], axis=1)
+        assert gap.max() <= cells.radius[c] * (1 + 1e-5)
