@@ -9,6 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+BLOCK = 512  # cells of queries whose distances to all other cells are held at once
+
 
 @dataclass(frozen=True)
 class Cells:
@@ -30,7 +32,7 @@ def into_cells(rows, cell):
     start = np.concatenate([[0], np.cumsum(count)])
     center = np.add.reduceat(rows, start[:-1], axis=0) / count[:, None].astype(np.float32)
     gap = np.linalg.norm(rows - np.repeat(center, count, axis=0), axis=1)
-    return Cells(rows, order, start, center, np.maximum.reduceat(gap, start[:-1]))
+    return Cells(rows, order, start, center, np.maximum.reduceat(gap, start[:-1]) * np.float32(1 + 1e-5))
 
 
 def squared_distances(A, B):
@@ -42,9 +44,13 @@ def squared_distances(A, B):
     return np.maximum(D, 0, out=D)
 
 
-def search(queries, cells, which, best, index):
-    """Compare `queries` with the rows of the cells `which`; update best squared distances and indices in place."""
+def search(queries, origin, cells, which, best, index):
+    """Compare `queries` with the rows of the cells `which`; update their best squared distances and indices in place.
+
+    `queries` are relative to `origin`, a point near them, and the rows are made so: then small distances are exact.
+    """
     rows = np.concatenate([cells.rows[cells.start[c] : cells.start[c + 1]] for c in which])
+    rows -= origin
     numbers = np.concatenate([cells.order[cells.start[c] : cells.start[c + 1]] for c in which])
     D = squared_distances(queries, rows)
     column = D.argmin(axis=1)
@@ -53,8 +59,18 @@ def search(queries, cells, which, best, index):
     best[nearer], index[nearer] = gap[nearer], found[nearer]
 
 
+def least_distances(A, B):
+    """Distances ``(a, b)`` of float32 rows, reduced by what rounding may have added."""
+    D = squared_distances(A, B)
+    largest = np.einsum("ij,ij->i", A, A).max() + np.einsum("ij,ij->i", B, B).max()
+    D -= 8 * np.finfo(np.float32).eps * largest
+    return np.sqrt(np.maximum(D, 0, out=D), out=D)
+
+
 def nearest_in_cells(Q, cell_q, D, cell_d, *, first=12):
     """For every row of Q the index of the nearest row of D, exactly up to float32 rounding.
+
+    Where several rows are equally near, one of them is given.
 
     Parameters
     ----------
@@ -81,29 +97,33 @@ def nearest_in_cells(Q, cell_q, D, cell_d, *, first=12):
     >>> bool((index == np.arange(300)).all())
     True
     """
-    queries, cells = into_cells(Q, cell_q), into_cells(D, cell_d)
+    middle = np.mean(D, axis=0)
+    queries, cells = into_cells(Q - middle, cell_q), into_cells(D - middle, cell_d)
     index = np.empty(len(Q), np.int64)
-    between = np.sqrt(squared_distances(queries.center, cells.center))
     first = min(first, len(cells.center))
     size = np.diff(cells.start)
     compared = 0
-    for c, gap in enumerate(between):
-        rows = queries.rows[queries.start[c] : queries.start[c + 1]]
+    for c, origin in enumerate(queries.center):
+        if c % BLOCK == 0:
+            gaps = least_distances(queries.center[c : c + BLOCK], cells.center)
+        gap = gaps[c % BLOCK]
+        rows = queries.rows[queries.start[c] : queries.start[c + 1]] - origin
         best, found = np.full(len(rows), np.inf, np.float32), np.full(len(rows), len(D))
         near = np.argpartition(gap, first - 1)[:first]
-        search(rows, cells, near, best, found)
+        search(rows, origin, cells, near, best, found)
         compared += len(rows) * size[near].sum()
-        bound = np.sqrt(best)
+        bound = np.sqrt(best) * (1 + 1e-5)
         reach = gap - queries.radius[c] - cells.radius  # no row of the cell is nearer to any query of this one
         reach[near] = np.inf
-        open_cells = np.flatnonzero(reach <= bound.max() * (1 + 1e-5))
+        open_cells = np.flatnonzero(reach <= bound.max())
         if len(open_cells):
-            own = np.sqrt(squared_distances(rows, cells.center[open_cells])) - cells.radius[open_cells]
-            possible = own <= bound[:, None] * (1 + 1e-5)
+            possible = (
+                least_distances(rows, cells.center[open_cells] - origin) - cells.radius[open_cells] <= bound[:, None]
+            )
             who, which = possible.any(1), open_cells[possible.any(0)]
             if len(which):
                 part_best, part_found = best[who], found[who]
-                search(rows[who], cells, which, part_best, part_found)
+                search(rows[who], origin, cells, which, part_best, part_found)
                 compared += who.sum() * size[which].sum()
                 found[who] = part_found
         index[queries.order[queries.start[c] : queries.start[c + 1]]] = found
