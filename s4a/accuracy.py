@@ -3,13 +3,12 @@
 import numpy as np
 import xarray as xr
 from joblib import Parallel, delayed
-from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 
 from s4a import fmap
 from s4a.align import align
-from s4a.mesh import edge_graph
+from s4a.mesh import edge_graph, path_lengths, triangle_areas
 from s4a.network import first_map
 from s4a.register import Scan, intrinsic_match
 
@@ -49,10 +48,7 @@ def simple_matches(source, target, *, k_init=20):
 
 def geodesic_error(X, T, found, true, *, limit=1.0):
     """Distances along the edges from true to found vertices, as shares of sqrt(area) ``(p,)``, cut at `limit`."""
-    size = np.sqrt(0.5 * np.linalg.norm(np.cross(X[T[:, 1]] - X[T[:, 0]], X[T[:, 2]] - X[T[:, 0]]), axis=1).sum())
-    source, row = np.unique(true, return_inverse=True)
-    way = dijkstra(edge_graph(X / size, T), indices=source, limit=limit)
-    return np.minimum(way[row, found], limit)
+    return path_lengths(edge_graph(X / np.sqrt(triangle_areas(X, T).sum()), T), true, found, limit)
 
 
 def _errors(source, target, registered, image, n_geodesic):

@@ -10,12 +10,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from s4a.deform import onto, smoother
 from s4a.fmap import fmap_from_match, nearest_rows
-from s4a.mesh import edge_graph, vertex_normals
+from s4a.mesh import edge_graph, path_lengths, vertex_normals
 
 POSITION_WEIGHT, NORMAL_WEIGHT = 5.0, 0.3
 
@@ -132,8 +131,7 @@ def badness(source, target, match, motion, *, n_samples=300, limit=0.5):
     gap = np.linalg.norm(X - source.X[match], axis=1)
     sample = np.linspace(0, len(match) - 1, min(n_samples, len(match))).astype(int)
     back = tree.query(source.tree.data[match[sample]])[1]
-    way = dijkstra(target.graph, indices=sample, limit=limit)
-    trip = np.minimum(way[np.arange(len(sample)), back], limit)
+    trip = path_lengths(target.graph, sample, back, limit)
     return float(trip.mean() + gap.mean() + back_gap.mean())
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import scipy.sparse as sp
+from scipy.sparse.csgraph import dijkstra
 
 from s4a.schema import dataset
 
@@ -82,6 +83,38 @@ def edge_graph(X, T):
     length = np.linalg.norm(X[np.repeat(np.arange(len(X)), np.diff(G.indptr))] - X[G.indices], axis=1)
     G.data = np.maximum(length, 1e-12 * (length.max(initial=0) or 1))  # an explicit zero would count as no edge
     return G
+
+
+def path_lengths(G, start, end, limit):
+    """Lengths of the shortest paths along edges between pairs of vertices ``(p,)``, cut at `limit`.
+
+    Short paths are looked for first, and a few starts at a time, so that neither time nor memory grow with the whole
+    surface.
+
+    Parameters
+    ----------
+    G : sparse matrix (n, n)
+        As of :func:`edge_graph`.
+    start, end : int ndarray (p,)
+    limit : float
+        In the unit of the edges.
+
+    Examples
+    --------
+    >>> X = np.array([[0.0, 0, 0], [1, 0, 0], [1, 2, 0], [0, 2, 0]])
+    >>> G = edge_graph(X, np.array([[0, 1, 2], [0, 2, 3]]))
+    >>> path_lengths(G, np.array([0, 1, 1]), np.array([0, 3, 3]), 9.0).tolist()
+    [0.0, 3.0, 3.0]
+    """
+    length = np.full(len(start), np.inf)
+    for reach in (0.1 * limit, limit):
+        missing = np.flatnonzero(np.isinf(length))
+        origin, row = np.unique(start[missing], return_inverse=True)
+        for first in range(0, len(origin), 64):
+            way = dijkstra(G, indices=origin[first : first + 64], limit=reach)
+            here = (row >= first) & (row < first + 64)
+            length[missing[here]] = way[row[here] - first, end[missing[here]]]
+    return np.minimum(length, limit)
 
 
 def cotan_weights(X, T):
