@@ -5,6 +5,7 @@ import itertools
 import fpsample
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 
 def rigid_transform(P, Q, weight=None, *, scale=False):
@@ -68,11 +69,23 @@ def principal_axes(X, area):
     return c, V * np.array([1, 1, np.sign(np.linalg.det(V))])
 
 
-def icp(X, area, Y, area_y, R, t, *, rounds=30, tolerance=1e-5, trim=0.1):
+def icp(X, area, Y, area_y, R, t, *, n_points=None, rounds=60, tolerance=1e-5, trim=0.1):
     """Iterative closest points (Besl & McKay 1992) from a given start: moves X onto Y.
 
-    Each round pairs every vertex of X with the nearest one of Y and every vertex of Y with the nearest one of X,
-    leaves out the `trim` farthest pairs of both, and solves for the motion, weighted by area.
+    Each round pairs vertices of X with the nearest of all of Y and vertices of Y with the nearest of all of X, leaves
+    out the `trim` farthest pairs, and solves for the motion, weighted by area.
+
+    Parameters
+    ----------
+    X, Y : float ndarray (n, 3), (p, 3)
+    area, area_y : float ndarray (n,), (p,)
+    R, t : start, R x + t
+    n_points : int, optional
+        How many vertices of each, spread over it, are paired; all by default.
+    rounds : int
+    tolerance : float
+        The end comes when the residual falls by less, as a share of sqrt(area of X).
+    trim : float
 
     Returns
     -------
@@ -81,32 +94,62 @@ def icp(X, area, Y, area_y, R, t, *, rounds=30, tolerance=1e-5, trim=0.1):
     residual : float
         Trimmed root mean square distance of the pairs, both ways.
     """
-    tree = cKDTree(Y)
-    last = np.inf
+    tree_x, tree_y = cKDTree(X), cKDTree(Y)
+    i, j = (np.arange(len(P)) if n_points is None else farthest_points(P, n_points) for P in (X, Y))
+    weight = np.concatenate([area[i] / area[i].sum(), area_y[j] / area_y[j].sum()])
     size = np.sqrt(area.sum())
+    last = np.inf
     for _ in range(rounds):
-        moved = X @ R.T + t
-        forth_gap, forth = tree.query(moved)
-        back_gap, back = cKDTree(moved).query(Y)
-        P = np.concatenate([X, X[back]])
-        Q = np.concatenate([Y[forth], Y])
-        w = np.concatenate([area / area.sum(), area_y / area_y.sum()])
+        forth_gap, forth = tree_y.query(X[i] @ R.T + t)
+        back_gap, back = tree_x.query((Y[j] - t) @ R)
+        P, Q = np.concatenate([X[i], X[back]]), np.concatenate([Y[forth], Y[j]])
         gap = np.concatenate([forth_gap, back_gap])
         keep = gap <= np.quantile(gap, 1 - trim)
-        residual = float(np.sqrt(w[keep] @ gap[keep] ** 2 / w[keep].sum()))
-        R, t, _ = rigid_transform(P[keep], Q[keep], w[keep])
+        residual = float(np.sqrt(weight[keep] @ gap[keep] ** 2 / weight[keep].sum()))
+        R, t, _ = rigid_transform(P[keep], Q[keep], weight[keep])
         if last - residual < tolerance * size:
             break
         last = residual
     return R, t, residual
 
 
-def align(X, area, Y, area_y, *, n_points=1000, prefer=0.9):
+def tilted(X, area, Y, area_y, start, *, degrees=15.0, **options):
+    """ICP again from the end of an ICP tilted about each axis both ways, as long as that ends nearer.
+
+    ICP alone ends wherever no pair changes: on folded surfaces up to 20 degrees from the best rotation.
+
+    Parameters
+    ----------
+    X, area, Y, area_y : as of :func:`icp`
+    start : tuple (R, t, residual)
+        The end of an ICP with the same `options`.
+    degrees : float
+    **options
+        Of :func:`icp`.
+
+    Returns
+    -------
+    R, t, residual
+    """
+    best, center = start, area @ X / area.sum()
+    tilts = [Rotation.from_euler(axis, sign * degrees, True).as_matrix() for axis in "xyz" for sign in (1, -1)]
+    for _ in range(5):
+        R, t, residual = best
+        middle = R @ center + t
+        found = [icp(X, area, Y, area_y, P @ R, P @ (t - middle) + middle, **options) for P in tilts]
+        best = min(found, key=lambda f: f[2])
+        if best[2] > 0.999 * residual:
+            return R, t, residual
+    return best
+
+
+def align(X, area, Y, area_y, *, n_points=300, prefer=0.9):
     """Rigid motion of X onto Y by ICP, from the pose as given and from the four turns that align principal axes.
 
-    The starts are compared on about `n_points` vertices spread over each shape; the pose as given (centred) is kept
-    unless another start ends below `prefer` times its residual, as near-symmetric shapes would otherwise be flipped
-    by noise.  The best is then refined on all vertices.
+    The starts are compared by pairing `n_points` spread vertices of each shape.  Two go on, tilted: the best that ends
+    within 90 degrees of where the pose as given (centred) ends, and the best of the others.  The former is kept unless
+    the latter ends below `prefer` times its residual: near-symmetric shapes would otherwise be turned over by noise.
+    It is then refined on all vertices.
 
     Parameters
     ----------
@@ -119,20 +162,26 @@ def align(X, area, Y, area_y, *, n_points=1000, prefer=0.9):
     -------
     R, t, residual : as of :func:`icp`
     """
-    i, j = farthest_points(X, n_points), farthest_points(Y, n_points)
     cx, A = principal_axes(X, area)
     cy, B = principal_axes(Y, area_y)
     flips = [np.diag(d) for d in itertools.product((1, -1), repeat=3) if np.prod(d) == 1]
     starts = [np.eye(3)] + [B @ flip @ A.T for flip in flips]
-    ones, ones_y = np.ones(len(i)), np.ones(len(j))
-    found = [icp(X[i], ones, Y[j], ones_y, R, cy - R @ cx, tolerance=1e-4) for R in starts]
-    best = min(found, key=lambda f: f[2])
-    if best[2] > prefer * found[0][2]:
-        best = found[0]
+    options = {"n_points": n_points, "tolerance": 2e-5}
+    found = [icp(X, area, Y, area_y, R, cy - R @ cx, **options) for R in starts]
+    sides = {True: [], False: []}
+    for f in found:
+        sides[bool(np.trace(f[0].T @ found[0][0]) >= 1)].append(f)
+    ends = {
+        upright: tilted(X, area, Y, area_y, min(some, key=lambda f: f[2]), **options)
+        for upright, some in sides.items()
+        if some
+    }
+    best = ends[True]
+    if False in ends and ends[False][2] < prefer * best[2]:
+        best = ends[False]
     return icp(X, area, Y, area_y, *best[:2])
 
 
-def realign(X, Y, start, *, n_points=1000):
-    """Rigid motion (R, t) of X onto Y by a short ICP on `n_points` spread vertices of each, from a start (R, t)."""
-    x, y = X[farthest_points(X, n_points)], Y[farthest_points(Y, n_points)]
-    return icp(x, np.ones(len(x)), y, np.ones(len(y)), *start, tolerance=1e-4)[:2]
+def realign(X, area, Y, area_y, start, *, n_points=1000):
+    """Rigid motion (R, t) of X onto Y by ICP, `n_points` spread vertices of each paired, from a start (R, t)."""
+    return icp(X, area, Y, area_y, *start, n_points=n_points, tolerance=2e-5)[:2]

@@ -167,7 +167,7 @@ def first_maps_task(folder, pairs, k_init, init):
     shapes = {name: low_shape(folder, name) for name in sorted({name for pair in pairs for name in pair})}
     directed, maps = [], []
     for a, b in pairs:
-        R, t = realign(shapes[a][0], shapes[b][0], relative_motion(alignment, a, b))
+        R, t = realign(*shapes[a][:2], *shapes[b][:2], relative_motion(alignment, a, b))
         for s, g, motion in ((a, b, (R, t)), (b, a, (R.T, -R.T @ t))):
             directed.append((s, g))
             maps.append(network.first_map(shapes[s], shapes[g], motion, k_init=k_init, init=init))
@@ -224,7 +224,7 @@ def registration_task(folder, name, template, how, refine, scale):
         F_source, F_target = source.low.Phi[:, :k] @ C.T, target.low.Phi[:, :k]
         match = fmap.nearest_rows(F_target, F_source)
     motion = relative_motion(study.read(folder / "network" / "alignment.nc"), name, template)
-    R, t = realign(source.low.X, target.low.X, motion)
+    R, t = realign(source.low.X, source.low.area, target.low.X, target.low.area, motion)
     starts = {"intrinsic": match, "icp": cKDTree(source.low.X @ R.T + t).query(target.low.X)[1]}
     return register.registration(source, target, starts, (F_source, F_target), k=k, refine=refine, scale=scale)
 

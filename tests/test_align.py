@@ -77,6 +77,16 @@ def test_a_shape_turned_by_180_degrees_is_found(brain, axis):
     assert residual == pytest.approx(0, abs=1e-6)
 
 
+@pytest.mark.parametrize("degrees", [0, 15, 30, 60, 120])
+def test_the_alignment_of_two_different_shapes_does_not_depend_on_their_pose(degrees):
+    tree = synthetic.brains(2, 2500)["original"]
+    (X, area), (Y, area_y) = ((m["position"].values, vertex_areas(*as_arrays(m))) for m in tree.children.values())
+    still = align.align(X, area, Y, area_y)[0]
+    found = align.align(X @ turned(degrees).T, area, Y, area_y)[0]
+    away = Rotation.from_matrix(still.T @ found @ turned(degrees)).magnitude()
+    assert np.rad2deg(away) < 3
+
+
 def test_a_sphere_keeps_its_pose_as_no_other_is_better():
     X, T = as_arrays(synthetic.sphere(700))
     R, _, _ = align.align(X, vertex_areas(X, T), X, vertex_areas(X, T))
@@ -93,8 +103,8 @@ def test_alignment_does_not_depend_on_vertex_order(brain):
 
 
 def test_realign_ends_at_the_motion_from_near_it(brain):
-    X, _ = brain
-    R, t = align.realign(X, X @ turned(40).T, (turned(36), np.zeros(3)))
+    X, area = brain
+    R, t = align.realign(X, area, X @ turned(40).T, area, (turned(36), np.zeros(3)))
     assert turned(40) == pytest.approx(R, abs=0.01)
     assert t == pytest.approx(np.zeros(3), abs=0.005)
 
