@@ -22,6 +22,7 @@ img { max-width: 100%; height: auto; }
 .table { max-height: 30em; overflow: auto; } input[type=range] { width: 90%; }
 table { border-collapse: collapse; font-size: 85%; } th, td { text-align: left; padding: .2em .8em .2em 0; }
 td { border-top: 1px solid #eee; vertical-align: top; overflow-wrap: anywhere; } td.number { text-align: right; }
+td:nth-child(-n+2) { white-space: nowrap; }
 tr.excluded td { background: #fbe9e0; } tr.repaired td { background: #fdf6dd; }
 """
 SCRIPT = """

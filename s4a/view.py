@@ -129,8 +129,8 @@ def _network(study, look):
     usable = scores is not None and scores.sizes["difference_component"] > 1 and set(names) <= set(names_of(scores))
     places = scores.sel(shape=names).values[:, :2] if usable else charts.on_circle(len(names))
     where = "placed by the first two components of their area-based shape differences" if usable else "on a circle"
-    kinds = {"cycle_error_initial": "mode_source_initial", "cycle_error": "mode_source"}
-    errors = {_stage(pairs, dim): pairs[key].values for key, dim in kinds.items() if key in pairs}
+    kinds = {"cycle_error_initial": "before", "cycle_error": "after"}
+    errors = {f"{when} Consistent ZoomOut": pairs[key].values for key, when in kinds.items() if key in pairs}
     figure = charts.network(
         places,
         names,
@@ -140,7 +140,7 @@ def _network(study, look):
         _index(names, _attr(study, "latent", "median")),
     )
     note = f"{len(source)} maps among {len(names)} shapes, {where}; the median is circled. "
-    note += "A larger map has more to get wrong: the errors of maps of different sizes are not to be compared."
+    note += "Both errors are of the first modes, as many as the maps had before."
     return markup.note(note) + markup.chart(figure, "the network of maps, coloured by cycle error")
 
 
