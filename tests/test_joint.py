@@ -1,0 +1,129 @@
+"""Joint refinement and displacement (eq. 8): planted deformations, and the score of a match."""
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from s4a import coarsen, deform, joint, spectral, spectrum, synthetic
+from s4a.mesh import as_arrays, vertex_areas, vertex_normals
+
+
+def bumps(X):
+    """A smooth field that moves the points of a shape of unit area by a tenth of its radius."""
+    return 0.02 * np.stack([np.sin(6 * X[:, 1]), np.sin(5 * X[:, 2] + 1), np.cos(6 * X[:, 0])], axis=1)
+
+
+@pytest.fixture(scope="module")
+def surface():
+    """A shape of unit area with its eigenfunctions."""
+    mesh = spectrum(coarsen(synthetic.brains(1, 6000)["original/brain_01"].to_dataset(), n_coarse=1500), k=60)
+    X, T = as_arrays(mesh)
+    area = spectral.unit_area(mesh)
+    size = np.sqrt(mesh["vertex_area"].values.sum())
+    return joint.Surface((X - area @ X) / size, T, area, mesh["eigenfunction"].values)
+
+
+def moved(surface, X):
+    return joint.Surface(X, surface.T, surface.area, surface.Phi)
+
+
+def test_the_joint_rounds_leave_the_identity_alone(surface):
+    every = np.arange(len(surface.X))
+    match, motion = joint.low_rounds(surface, surface, every, k=60)
+    assert (match == every).all()
+    assert joint.registered(surface, motion) == pytest.approx(surface.X, abs=1e-12)
+
+
+@pytest.mark.parametrize("spectral_weight", [0.0, 0.1])
+def test_a_planted_deformation_is_recovered_and_far_better_than_by_nearest_neighbours(surface, spectral_weight):
+    source = moved(surface, surface.X + bumps(surface.X))
+    start = cKDTree(source.X).query(surface.X)[1]
+    match, motion = joint.low_rounds(source, surface, start, k=60, spectral=spectral_weight)
+    error = np.linalg.norm(joint.registered(surface, motion) - source.X, axis=1).mean()
+    nearest = np.linalg.norm(source.X[start] - source.X, axis=1).mean()
+    assert nearest > 0.015
+    assert error < 0.005
+    assert error < nearest / 4
+    assert (match == np.arange(len(match))).mean() > 0.6
+
+
+def test_a_rigid_motion_is_recovered_exactly_without_any_deformation(surface):
+    R = Rotation.from_rotvec([0.3, 0.2, -0.1]).as_matrix()
+    source = moved(surface, surface.X @ R.T + 0.2)
+    _, (found, t, c) = joint.low_rounds(source, surface, np.arange(len(surface.X)), k=40)
+    assert found == pytest.approx(R, abs=1e-9)
+    assert t == pytest.approx([0.2] * 3, abs=1e-9)
+    assert np.abs(c).max() < 1e-9
+
+
+def test_the_dense_rounds_keep_a_planted_deformation_of_the_span(surface):
+    c = np.zeros((60, 3))
+    c[4:12] = np.random.default_rng(0).normal(0, 0.008, (8, 3))
+    source = moved(surface, surface.X + surface.Phi @ c)
+    match, motion = joint.dense_rounds(source, surface, (np.eye(3), np.zeros(3), 0.9 * c))
+    assert (match == np.arange(len(match))).mean() > 0.95
+    assert np.linalg.norm(joint.registered(surface, motion) - source.X, axis=1).mean() < 2e-3
+
+
+def test_a_wrong_match_scores_worse_than_a_right_one(surface):
+    every = np.arange(len(surface.X))
+    source = moved(surface, surface.X + bumps(surface.X))
+
+    def score(match):
+        return joint.badness(
+            source, surface, match, deform.onto(surface.X, source.X[match], surface.area, surface.smooth)
+        )
+
+    right = score(every)
+    assert right < 0.02
+    assert score(cKDTree(source.X).query(surface.X)[1]) > right
+    assert score(np.random.default_rng(0).permutation(every)) > 10 * right
+
+
+def test_the_best_candidate_has_the_least_score_and_says_its_name(surface):
+    source = moved(surface, surface.X + bumps(surface.X))
+    near = cKDTree(source.X).query(surface.X)[1]
+    bad = np.zeros(len(near), int)
+    name, match, motion, scores = joint.best_candidate(source, surface, {"bad": bad, "icp": near}, k=60)
+    assert name == "icp+joint"
+    assert scores[name] == min(scores.values())
+    assert {"bad", "icp", "bad+joint", "icp+joint"} <= set(scores)
+    assert np.linalg.norm(joint.registered(surface, motion) - source.X, axis=1).mean() < 0.005
+    assert len(match) == len(surface.X)
+
+
+def test_smoothing_keeps_fields_of_the_span_and_is_a_projection(surface):
+    B = surface.Phi @ np.random.default_rng(1).normal(size=(60, 60))  # a basis that is not orthonormal
+    smooth = deform.smoother(B, surface.area)
+    d = surface.Phi[:, :60] @ np.random.default_rng(2).normal(size=(60, 3))
+    assert B @ smooth(d) == pytest.approx(d, abs=1e-6)
+    rough = np.random.default_rng(3).normal(size=d.shape)
+    left = rough - B @ smooth(rough)
+    assert B.T @ (surface.area[:, None] * left) == pytest.approx(np.zeros((60, 3)), abs=1e-7)
+
+
+@pytest.mark.parametrize("scale", [False, True])
+def test_the_displacement_in_the_template_is_image_minus_template_after_the_motion(scale):
+    rng = np.random.default_rng(4)
+    X, area = rng.normal(size=(50, 3)), rng.uniform(0.5, 1, 50)
+    R = Rotation.random(random_state=0).as_matrix()
+    image = 1.5 * X @ R.T + [1, 2, 3]
+    d, R_back, t, s = deform.displacement_in_template(X, image, area, scale=scale)
+    assert s * image @ R_back.T + t == pytest.approx(X + d)
+    assert R_back == pytest.approx(R.T)
+    if scale:
+        assert s == pytest.approx(1 / 1.5)
+        assert d == pytest.approx(np.zeros_like(d), abs=1e-12)
+    else:
+        assert s == 1
+        assert d == pytest.approx(0.5 * (X - area @ X / area.sum()))
+
+
+def test_growth_is_a_positive_displacement_along_the_normals():
+    X, T = as_arrays(synthetic.sphere(500))
+    normal = vertex_normals(X, T)
+    assert deform.normal_displacement(np.stack([0.1 * X, -0.2 * X]), normal) == pytest.approx(
+        np.repeat([[0.1], [-0.2]], 500, axis=1), rel=0.01
+    )
+    assert vertex_areas(X, T).sum() == pytest.approx(4 * np.pi, rel=0.02)

@@ -1,0 +1,189 @@
+"""Registration at full resolution (eq. 4, 6, 7): itself, a planted deformation, invariance, the way back."""
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from s4a import clean, coarsen, match_pair, register, spectrum, synthetic
+from s4a.deform import displacement_in_template
+from s4a.mesh import as_arrays, as_dataset, vertex_areas
+
+OPTIONS = {"n_coarse": 2000, "k": 60}
+
+
+def bumps(X, size):
+    return 0.015 * size * np.stack([np.sin(6 * X[:, 1]), np.sin(5 * X[:, 2] + 1), np.cos(6 * X[:, 0])], axis=1)
+
+
+@pytest.fixture(scope="module")
+def template():
+    return synthetic.brains(1, 5000)["original/brain_01"].to_dataset()
+
+
+@pytest.fixture(scope="module")
+def size(template):
+    """Square root of the template's area, in mm."""
+    return np.sqrt(vertex_areas(*as_arrays(template)).sum())
+
+
+@pytest.fixture(scope="module")
+def deformed(template, size):
+    """The template after a known smooth deformation, in the template's vertex order."""
+    X, T = as_arrays(template)
+    return clean(as_dataset(X + bumps(X / size, size), T))
+
+
+@pytest.fixture(scope="module")
+def pair(deformed, template):
+    return match_pair(deformed, template, **OPTIONS)
+
+
+@pytest.fixture(scope="module")
+def true_displacement(template, deformed):
+    X, T = as_arrays(template)
+    return displacement_in_template(X, deformed["position"].values, vertex_areas(X, T))[0]
+
+
+def apart(found, other, size):
+    """Mean distance of two displacements, as a share of sqrt(area)."""
+    return np.linalg.norm(found["displacement"].values - other, axis=1).mean() / size
+
+
+def test_a_shape_registered_to_itself_does_not_move(template, size):
+    found = match_pair(template, template, **OPTIONS)
+    assert (found["match"].values == np.arange(5000)).all()
+    assert np.abs(found["displacement"].values).max() < 1e-6 * size
+    assert np.abs(found["displacement_raw"].values).max() < 1e-6 * size
+    assert found["confidence"].values == pytest.approx(1, abs=1e-5)
+    assert found["fmap"].values == pytest.approx(np.eye(60), abs=1e-6)
+
+
+def test_a_planted_deformation_is_recovered_and_better_than_by_nearest_neighbours(
+    pair, template, deformed, true_displacement, size
+):
+    true = deformed["position"].values
+    near = cKDTree(true).query(template["position"].values)[1]
+    nearest = np.linalg.norm(true[near] - true, axis=1).mean() / size
+    assert nearest > 0.01
+    assert apart(pair, true_displacement, size) < 0.002
+    assert apart(pair, true_displacement, size) < nearest / 4
+    assert (pair["match"].values == np.arange(5000)).mean() > 0.7
+
+
+def test_the_displacement_brings_the_template_onto_the_matched_vertices(pair, template, size):
+    smooth, raw = pair["displacement"].values, pair["displacement_raw"].values
+    assert np.linalg.norm(smooth - raw, axis=1).mean() < 0.006 * size
+
+
+def test_the_paper_way_finds_a_correspondence_too_and_says_so(template, deformed, size):
+    found = match_pair(deformed, template, refine="intrinsic", init="landmarks", **OPTIONS)
+    assert found.attrs["method"] == "intrinsic"
+    assert 0 < found.attrs["compared_share"] < 1
+    gap = deformed["position"].values[found["match"].values] - deformed["position"].values
+    assert np.linalg.norm(gap, axis=1).mean() < 0.03 * size
+
+
+@pytest.mark.parametrize("degrees", [10, 70, 170])
+def test_the_displacement_does_not_depend_on_the_pose_of_the_source(
+    template, deformed, true_displacement, size, degrees
+):
+    X, T = as_arrays(deformed)
+    R = Rotation.from_rotvec(degrees * np.array([0.6, 0, 0.8]), True).as_matrix()
+    found = match_pair(clean(as_dataset(X @ R.T + 70, T)), template, **OPTIONS)
+    assert apart(found, true_displacement, size) < 0.003
+
+
+def test_the_result_does_not_depend_on_the_numbering_of_the_source(pair, template, deformed, size):
+    X, T = as_arrays(deformed)
+    order = np.random.default_rng(0).permutation(len(X))
+    other = clean(as_dataset(X[order], np.argsort(order)[T]))
+    found = match_pair(other, template, **OPTIONS)
+    assert apart(found, pair["displacement"].values, size) < 0.002
+    vertex = order[other["file_vertex"].values][found["match"].values]
+    assert (vertex == pair["match"].values).mean() > 0.7
+
+
+def test_the_displacement_does_not_depend_on_the_numbering_of_the_template(template, deformed, true_displacement, size):
+    X, T = as_arrays(template)
+    order = np.random.default_rng(1).permutation(len(X))
+    found = match_pair(deformed, as_dataset(X[order], np.argsort(order)[T]), **OPTIONS)
+    assert apart(found, true_displacement[order], size) < 0.003
+
+
+def test_a_thousandfold_unit_gives_a_thousandfold_displacement(pair, template, deformed, size):
+    found = match_pair(
+        *(as_dataset(1000 * m["position"].values, m["corner_vertex"]) for m in (deformed, template)), **OPTIONS
+    )
+    found["displacement"] /= 1000
+    assert apart(found, pair["displacement"].values, size) < 0.002
+    assert (found["match"].values == pair["match"].values).mean() > 0.7
+
+
+def test_the_same_call_gives_the_same_bits(pair, template, deformed):
+    assert match_pair(deformed, template, **OPTIONS).identical(pair)
+
+
+@pytest.fixture(scope="module")
+def scans(template, deformed):
+    return [register.Scan(m, spectrum(coarsen(m, n_coarse=800), k=30)) for m in (deformed, template)]
+
+
+def test_the_way_back_reproduces_the_positions(scans):
+    source, target = scans
+    image = source.original["position"].values  # the template deformed exactly
+    triangle, weight = register.way_back(source, target, image)
+    assert weight.sum(1) == pytest.approx(1)
+    assert weight.min() >= 0
+    found = np.einsum("nc,ncx->nx", weight, image[target.dense.T[triangle]])
+    assert found == pytest.approx(image, abs=1e-6)
+
+
+def test_confidence_is_one_for_a_perfect_match_and_low_where_it_is_broken(scans):
+    source, target = scans
+    image, every = source.original["position"].values, np.arange(5000)
+    back = register.way_back(source, target, image)
+    assert register.confidence(source, target, every, image, *back) == pytest.approx(1, abs=1e-5)
+    broken = every.copy()
+    right = np.flatnonzero(target.dense.X[:, 0] > 0.15)
+    broken[right] = np.random.default_rng(0).permutation(right)
+    found = register.confidence(source, target, broken, image, *back)
+    assert found.min() >= 0
+    assert found.max() <= 1
+    assert found[right].mean() < 0.2
+    assert np.delete(found, right) == pytest.approx(1, abs=1e-5)
+
+
+def test_the_template_is_registered_to_itself_by_definition(template):
+    own = register.identity(template_scan := register.Scan(template, template))
+    X, T = as_arrays(template)
+    corner = X[T[own["template_triangle"].values]]
+    assert np.einsum("nc,ncx->nx", own["template_barycentric"].values, corner) == pytest.approx(X)
+    assert (own["registered_match"].values == np.arange(5000)).all()
+    assert template_scan.frame[1] == pytest.approx(np.sqrt(vertex_areas(X, T).sum()))
+
+
+def test_size_can_be_taken_out_of_the_displacement(scans):
+    _, target = scans
+    X, T = as_arrays(target.original)
+    grown = clean(as_dataset(1.2 * X, T))
+    source = register.Scan(grown, spectrum(coarsen(grown, n_coarse=800), k=30))
+    start = {"intrinsic": cKDTree(source.low.X).query(target.low.X)[1]}
+    functions = source.low.Phi, target.low.Phi
+    with_size = register.registration(source, target, start, functions, k=30)
+    without = register.registration(source, target, start, functions, k=30, scale=True)
+    assert without["scale"].item() == pytest.approx(1 / 1.2, rel=1e-3)
+    radius = np.linalg.norm(X - X.mean(0), axis=1).mean()
+    assert np.linalg.norm(without["displacement"].values, axis=1).mean() < 0.005 * radius
+    assert np.linalg.norm(with_size["displacement"].values, axis=1).mean() == pytest.approx(0.2 * radius, rel=0.03)
+
+
+@pytest.mark.parametrize("options", [{"refine": "both"}, {"init": "random"}])
+def test_an_unknown_option_is_refused_with_those_there_are(template, options):
+    with pytest.raises(ValueError, match="'joint' or 'intrinsic', init 'dense' or 'landmarks'"):
+        match_pair(template, template, **options)
+
+
+def test_a_mesh_without_triangles_is_refused_by_name(template):
+    with pytest.raises(ValueError, match="source needs the variables position, corner_vertex"):
+        match_pair(template[["position"]], template)
