@@ -31,12 +31,12 @@ def task_key(*parts):
     digest = hashlib.sha256(f"s4a study format {FORMAT}".encode())
     for part in parts:
         if isinstance(part, np.ndarray):
-            digest.update(f"{part.dtype.str}{part.shape}".encode() + np.ascontiguousarray(part).tobytes())
+            kind, data = f"{part.dtype.str}{part.shape}", np.ascontiguousarray(part).tobytes()
         elif isinstance(part, bytes):
-            digest.update(part)
+            kind, data = "bytes", part
         else:
-            digest.update(json.dumps(part, sort_keys=True).encode())
-        digest.update(b"\0")
+            kind, data = "json", json.dumps(part, sort_keys=True, default=lambda number: number.item()).encode()
+        digest.update(f"{kind} {len(data)}:".encode() + data)
     return digest.hexdigest()[:32]
 
 
