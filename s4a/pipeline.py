@@ -18,11 +18,11 @@ from tqdm.auto import tqdm
 from s4a import fmap, latent, median, network, register, study
 from s4a.align import align, farthest_points, realign
 from s4a.clean import clean
-from s4a.io import find_meshes
+from s4a.io import find_meshes, slug
 from s4a.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.pca import pca
 from s4a.remesh import coarsen
-from s4a.schema import dataset
+from s4a.schema import dataset, require
 from s4a.shapes import read_shape, shape_report
 from s4a.spectral import spectrum
 
@@ -74,8 +74,11 @@ class Run:
         own = {os.getpid(): resource.getrusage(resource.RUSAGE_SELF).ru_maxrss}
         self.memory[name] = sum((self.workers | own).values()) / 1024
 
-    def tasks(self, stage, function, tasks):
-        """Do the tasks (name, file, key, arguments) whose file is not done; a ValueError is kept as a failure."""
+    def tasks(self, stage, function, tasks, *, each=True):
+        """Do the tasks (name, file, key, arguments) whose file is not done.
+
+        A ValueError is kept as a failure where the tasks are one for `each` shape, and raised where all need all.
+        """
         with self.stage(stage):
             missing = [t for t in tasks if not study.is_done(self.folder / t[1], t[2])]
             log.info("%s: %d of %d to do", stage, len(missing), len(tasks))
@@ -86,6 +89,8 @@ class Run:
             results = Parallel(n_jobs=self.n_jobs, return_as="generator_unordered")(jobs)
             for name, failure, pid, memory in tqdm(results, total=len(missing), desc=stage, disable=not missing):
                 self.workers[pid] = max(memory, self.workers.get(pid, 0))
+                if failure and not each:
+                    raise ValueError(f"{stage}: {failure}")
                 if failure:
                     self.failures[name] = f"{stage}: {failure}"
 
@@ -108,10 +113,22 @@ def collection(shapes, pattern):
             raise ValueError("the DataTree needs a node /original with one node per shape, as of s4a.read_shapes")
         shapes = {name: node.to_dataset() for name, node in shapes["original"].children.items()}
     if isinstance(shapes, dict):
-        meshes = {n: m if isinstance(m, xr.Dataset) else as_dataset(*m) for n, m in shapes.items()}
-        return {n: (m, study.task_key(*as_arrays(m))) for n, m in sorted(meshes.items())}
+        wrong = [n for n in shapes if not isinstance(n, str) or slug(n) != n]
+        if wrong or not shapes:
+            raise ValueError(f"shapes need names of letters, digits, _ and -; found {wrong or 'none'}")
+        meshes = {n: m if isinstance(m, xr.Dataset) else as_dataset(*m) for n, m in sorted(shapes.items())}
+        for name, mesh in meshes.items():
+            require(mesh, "position", "corner_vertex", what=f"shape {name}")
+        return {n: (m, content_key(m)) for n, m in meshes.items()}
     found = sorted((name, path) for path, name in find_meshes(shapes, pattern))
     return {name: (str(path), study.task_key(Path(path).read_bytes())) for name, path in found}
+
+
+def content_key(mesh):
+    """The key of everything a mesh in memory holds, labels and landmarks too."""
+    held = {str(name): v.values for name, v in sorted(mesh.variables.items())}
+    parts = [v.tolist() if v.dtype.hasobject else v for v in held.values()]
+    return study.task_key(list(held), *parts)
 
 
 def original_task(source, components, strict):
@@ -311,7 +328,7 @@ def analyse(
         with tempfile.TemporaryDirectory(prefix="s4a-") as folder:
             run_stages(Run(folder, n_jobs), given, options)
             tree = study.open_study(folder)
-            return xr.DataTree.from_dict({node.path: node.to_dataset().load() for node in tree.subtree})
+            return xr.DataTree.from_dict({n.path: n.to_dataset(inherit=False).load() for n in tree.subtree})
     with study.lock(store):
         run_stages(Run(store, n_jobs), given, options)
     return study.open_study(store)
@@ -350,7 +367,8 @@ def run_stages(run, given, options):
     pairs = [[names[i], names[j]] for i, j in network.choose_pairs(distance, o["n_pairs"])]
     reference = names[int(np.argmin(distance.sum(1)))]
     key = study.task_key([key_of[n] for n in names], names, reference)
-    run.tasks("align", alignment_task, [("alignment", "network/alignment.nc", key, (folder, names, reference))])
+    align_all = ("alignment", "network/alignment.nc", key, (folder, names, reference))
+    run.tasks("align", alignment_task, [align_all], each=False)
 
     k_init = min(o["k_init"], k_signature)
     size = max(4, -(-len(pairs) // 64))
@@ -361,6 +379,7 @@ def run_stages(run, given, options):
         "first maps",
         first_maps_task,
         [(f, f, q, (folder, batch, k_init, o["init"])) for f, q, batch in zip(files, keys, batches, strict=True)],
+        each=False,
     )
 
     key = study.task_key(keys, o["k"], o["step"], o["n_latent"], o["norm"])

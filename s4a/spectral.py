@@ -82,7 +82,7 @@ def spectrum(mesh, *, k=100):
     Raises
     ------
     ValueError
-        When k is not a positive integer, or the mesh has fewer than 3 vertices.
+        When k is not a positive integer, the mesh has fewer than 3 vertices, or the solver finds no eigenpairs.
     """
     require(mesh, "vertex_area", "edge_vertex", "cotan_weight", what="mesh")
     if int(k) != k or k < 1:
@@ -91,9 +91,11 @@ def spectrum(mesh, *, k=100):
     possible = min(int(k), n - 2)
     if possible < 1:
         raise ValueError(f"a spectrum needs at least 3 vertices, found {n}")
-    eigenvalue, Phi = eigenpairs(
-        mesh["edge_vertex"].values, mesh["cotan_weight"].values, mesh["vertex_area"].values, possible
-    )
+    E, w, area = (mesh[name].values for name in ("edge_vertex", "cotan_weight", "vertex_area"))
+    try:
+        eigenvalue, Phi = eigenpairs(E, w, area, possible)
+    except RuntimeError as error:  # of the factor or of ARPACK
+        raise ValueError(f"no {possible} eigenpairs of a mesh with {n} vertices: {error}") from error
     attrs = dict(mesh.attrs, zero_eigenvalues=int((eigenvalue == 0).sum()))
     if possible < k:
         log.warning("k reduced from %d to %d: the mesh has only %d vertices", k, possible, n)

@@ -152,7 +152,8 @@ def open_study(folder):
             nodes[stage] = xr.open_dataset(folder / f"{stage}.nc", engine=ENGINE)
     if (folder / "latent.nc").exists() and (folder / "registration.nc").exists():
         template = read(folder / "registration.nc")
-        names = [n for n in nodes["latent"]["shape"].values.tolist() if (folder / "registration" / f"{n}.nc").exists()]
+        names = [n for n in nodes["latent"]["shape"].values.tolist() if kept is None or n in kept]
+        names = [n for n in names if (folder / "registration" / f"{n}.nc").exists()]
         if names:
             files = {n: read(folder / "registration" / f"{n}.nc") for n in names}
             nodes |= stack_registration(template, files, names)
