@@ -4,6 +4,7 @@ import argparse
 import inspect
 import logging
 import sys
+import textwrap
 import time
 import webbrowser
 from pathlib import Path
@@ -41,24 +42,29 @@ HELP = {
 }
 
 
-def table(rows, head):
-    """Rows of text as aligned columns; numbers to the right.
+def table(rows, head, width=120):
+    """Rows of text as aligned columns: numbers to the right, a long last column wrapped at `width` characters.
 
     Examples
     --------
-    >>> print(table([["a", 1]], ["name", "n"]))
-    name  n
-    a     1
+    >>> print(table([["a", 1], ["b", 20]], ["name", "n"]))
+    name   n
+    a      1
+    b     20
     """
-    rows = [[str(x) for x in row] for row in rows]
-    width = [max(len(r[i]) for r in [head, *rows]) for i in range(len(head))]
-
-    def line(row):
-        return "  ".join(
-            x.rjust(w) if x[:1].isdigit() else x.ljust(w) for x, w in zip(row, width, strict=True)
-        ).rstrip()
-
-    return "\n".join(line(row) for row in [head, *rows])
+    rows = [[str(x) for x in row] for row in [head, *rows]]
+    widths = [max(len(row[i]) for row in rows) for i in range(len(head))]
+    numeric = [
+        all(x.replace(".", "", 1).isdigit() or x == "-" for x in column) for column in zip(*rows[1:], strict=True)
+    ]
+    margin = sum(widths[:-1]) + 2 * (len(head) - 1)
+    lines = []
+    for row in rows:
+        last = textwrap.wrap(row[-1], max(width - margin, 40)) or [""]
+        columns = zip([*row[:-1], last[0]], widths, numeric, strict=True)
+        lines.append("  ".join(x.rjust(w) if right else x.ljust(w) for x, w, right in columns).rstrip())
+        lines += [" " * margin + line for line in last[1:]]
+    return "\n".join(lines)
 
 
 def add_options(parser):
