@@ -12,6 +12,8 @@ the embedded collection   :mod:`s4a.synthetic`
 ========================  ====================================================================
 """
 
+from importlib.metadata import version
+
 from s4a import synthetic
 from s4a.clean import clean
 from s4a.io import read_mesh, write_mesh
@@ -24,7 +26,7 @@ from s4a.spectral import reconstruct, spectrum
 from s4a.study import open_study
 from s4a.view import write_page
 
-__version__ = "0.1.0"
+__version__ = version("s4a")
 __all__ = [
     "analyse",
     "clean",

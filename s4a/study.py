@@ -8,13 +8,14 @@ import hashlib
 import json
 import os
 from contextlib import contextmanager
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 
 ENGINE = "h5netcdf"
-FORMAT = 1
+VERSION = version("s4a")
 STACKED = (
     "registered_match",
     "displacement",
@@ -27,8 +28,8 @@ STACKED = (
 
 
 def task_key(*parts):
-    """A hash of everything a task's result depends on: strings, numbers, lists, dicts, arrays and bytes."""
-    digest = hashlib.sha256(f"s4a study format {FORMAT}".encode())
+    """A hash of all that a result depends on: strings, numbers, lists, dicts, arrays, bytes; and the version of S4A."""
+    digest = hashlib.sha256(f"s4a {VERSION}".encode())
     for part in parts:
         if isinstance(part, np.ndarray):
             kind, data = f"{part.dtype.str}{part.shape}", np.ascontiguousarray(part).tobytes()
