@@ -161,3 +161,36 @@ def color_bar(colormap, low, high, label):
     figure, (ax,) = _figure(4.2, 0.62)
     figure.colorbar(ScalarMappable(Normalize(low, high), colormap), cax=ax, orientation="horizontal", label=label)
     return figure
+
+
+def from_spec(spec, values=()):
+    """A chart of a notebook panel as a Figure: ``scatter``, ``bars``, ``lines``, ``graph`` or ``matrix``.
+
+    Parameters
+    ----------
+    spec : dict
+        ``kind`` and its numbers, as :class:`s4a.widgets.chart.Chart` sends them to the browser.
+    values : float ndarray
+        The entries of a matrix, row by row.
+    """
+    kind = spec["kind"]
+    if kind == "matrix":
+        return matrices({spec["title"]: np.reshape(values, (spec["rows"], spec["columns"]))}, spec["limit"])
+    figure, (ax,) = _figure(5, 3.6)
+    if kind == "bars":
+        ax.barh(spec["names"], spec["values"], color=BLUE)
+        ax.invert_yaxis()
+    if kind == "lines":
+        for one in spec["series"]:
+            ax.plot(one["x"], one["y"], color=one.get("color", BLUE), lw=1)
+    if kind == "graph":
+        places = np.stack([spec["x"], spec["y"]], axis=1)
+        lines = np.stack([places[spec["source"]], places[spec["target"]]], axis=1)
+        ax.add_collection(LineCollection(lines, colors=spec["colors"]))
+        ax.set_axis_off()
+    if kind in ("graph", "scatter"):
+        ax.scatter(spec["x"], spec["y"], color=BLUE, zorder=2)
+        for name, x, y in zip(spec["names"], spec["x"], spec["y"], strict=True):
+            ax.annotate(name, (x, y), (3, 3), textcoords="offset points", fontsize=6, parse_math=False)
+    ax.set(title=spec.get("title", ""), xlabel=spec.get("xlabel", spec.get("label", "")), ylabel=spec.get("ylabel", ""))
+    return figure

@@ -117,3 +117,48 @@ def fit_landmarks(Phi_source, Phi_target, ev_source, ev_target, landmark_source,
 def orthogonality_error(C):
     """|C^T C - I|_F / sqrt(k): 0 for a map that preserves areas."""
     return float(np.linalg.norm(C.T @ C - np.eye(C.shape[1])) / np.sqrt(C.shape[1]))
+
+
+def off_diagonal_mass(C):
+    """Share of the squared entries of C that is not on its diagonal: 0 for a map between equal spectra.
+
+    Examples
+    --------
+    >>> off_diagonal_mass(np.eye(3)), off_diagonal_mass(np.eye(2)[::-1])
+    (0.0, 1.0)
+    """
+    return float(1 - (np.diag(C) ** 2).sum() / (C**2).sum())
+
+
+def swapped_blocks(C, *, longest=6, inside=0.75, diagonal=0.5):
+    """Runs of modes that the map exchanges among each other, as near-equal eigenvalues of symmetric shapes do (Fig. 2).
+
+    A run counts when at least the share `inside` of the squared entries of its rows and columns lies in its
+    diagonal block, and less than the share `diagonal` of that on the diagonal itself; the shortest runs come first.
+
+    Parameters
+    ----------
+    C : float ndarray (k, k)
+    longest : int
+        Modes in the longest run that is looked for.
+
+    Returns
+    -------
+    list of (int, int)
+        First and last mode of each run, ascending; runs do not overlap.
+
+    Examples
+    --------
+    >>> swapped_blocks(np.eye(5)[[0, 2, 1, 3, 4]])
+    [(1, 2)]
+    """
+    S, taken, found = np.asarray(C, float) ** 2, set(), []
+    for length in range(2, longest + 1):
+        for a in range(min(S.shape) - length + 1):
+            run = slice(a, a + length)
+            block, around = S[run, run], (S[run].sum() + S[:, run].sum()) / 2
+            closed = around > 0 and block.sum() >= inside * around
+            if closed and np.trace(block) < diagonal * block.sum() and taken.isdisjoint(range(a, a + length)):
+                found.append((a, a + length - 1))
+                taken.update(range(a, a + length))
+    return sorted(found)

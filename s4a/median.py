@@ -85,3 +85,18 @@ def median_shape(latent, eigenvalues, *, norm="h2"):
     )
     median = str(latent["shape"].values[int(np.argmin(distance))])
     return latent.assign(found.data_vars).assign_attrs(latent.attrs, median=median, norm=norm)
+
+
+def near_ties(distance, *, within=0.05):
+    """Indices of the shapes whose distance is at most the share `within` above the smallest, nearest first.
+
+    More than one says that the median is a choice among near equals.
+
+    Examples
+    --------
+    >>> near_ties([1.04, 1.0, 2.0])
+    [1, 0]
+    """
+    distance = np.asarray(distance, float)
+    order = np.argsort(distance, kind="stable")
+    return [int(i) for i in order if distance[i] <= (1 + within) * distance[order[0]]]

@@ -3,6 +3,7 @@
 import itertools
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components, shortest_path
 from scipy.spatial import cKDTree
 
 from s4a import fmap
@@ -151,3 +152,36 @@ def cycle_weights(error):
         return np.ones(len(error))
     w = np.exp(-0.5 * (error / np.nanmedian(error)) ** 2)
     return np.maximum(np.where(known, w, np.nanmedian(w)), 0.01)
+
+
+def connectivity(pairs, n):
+    """How well unordered pairs connect n shapes.
+
+    Parameters
+    ----------
+    pairs : int ndarray (p, 2)
+    n : int
+
+    Returns
+    -------
+    dict of str to int
+        ``components``; ``triangles``; ``in_no_triangle``, the shapes whose maps no 3-cycle can check;
+        ``smallest_degree``; ``diameter``, the most maps from one shape to another (-1 where there is no way).
+
+    Examples
+    --------
+    >>> connectivity(np.array([[0, 1], [1, 2], [0, 2], [2, 3]]), 4)
+    {'components': 1, 'triangles': 1, 'in_no_triangle': 1, 'smallest_degree': 1, 'diameter': 2}
+    """
+    A = np.zeros((n, n))
+    pairs = np.asarray(pairs, int).reshape(-1, 2)
+    A[pairs[:, 0], pairs[:, 1]] = A[pairs[:, 1], pairs[:, 0]] = 1
+    through = np.diag(A @ A @ A) / 2
+    steps = shortest_path(A, unweighted=True)
+    return {
+        "components": int(connected_components(A)[0]),
+        "triangles": round(through.sum() / 3),
+        "in_no_triangle": int((through == 0).sum()),
+        "smallest_degree": int(A.sum(0).min()),
+        "diameter": int(steps.max()) if np.isfinite(steps).all() else -1,
+    }

@@ -3,6 +3,8 @@
 import numpy as np
 import xarray as xr
 
+from s4a.deform import normal_displacement
+from s4a.mesh import vertex_normals
 from s4a.schema import dataset, require
 
 
@@ -124,3 +126,57 @@ def synthesize(study, scores):
     moved = np.tensordot(scores, pca["deformation"].values[: len(scores)], axes=1)
     position = template["position"].values + pca["mean_displacement"].values + moved
     return xr.merge([dataset(position=position), template[["corner_vertex"]]])
+
+
+def deformed(mean, deformation, scores):
+    """The mean shape ``(n, 3)`` moved by the scores ``(c,)`` along the deformations ``(c, n, 3)``.
+
+    Examples
+    --------
+    >>> deformed(np.zeros((1, 3)), np.array([[[1.0, 0, 0]], [[0, 2.0, 0]]]), [0.5, -1]).tolist()
+    [[0.5, -2.0, 0.0]]
+    """
+    scores = np.asarray(scores, float)
+    return mean + np.tensordot(scores, deformation[: len(scores)], axes=1)
+
+
+def mahalanobis(scores):
+    """Mahalanobis distance of a shape from the mean: the length of its scores, which have unit variance.
+
+    Examples
+    --------
+    >>> mahalanobis([3, -4])
+    5.0
+    """
+    return float(np.linalg.norm(scores))
+
+
+def plausible_scores(n, *, seed=None, limit=3.0):
+    """Scores ``(n,)`` of a random shape: normal, those beyond the limit drawn again.
+
+    Examples
+    --------
+    >>> bool((abs(plausible_scores(1000, seed=0)) <= 3).all())
+    True
+    """
+    rng = np.random.default_rng(seed)
+    scores = rng.standard_normal(n)
+    while (beyond := np.abs(scores) > limit).any():
+        scores[beyond] = rng.standard_normal(beyond.sum())
+    return scores
+
+
+def color_limits(mean, triangles, deformation, *, sigma=3, n_modes=3):
+    """Displacements of the full colours: along the normal, and in length.
+
+    The 99 % quantile over the vertices and the first modes at `sigma` standard deviations: one scale for all modes,
+    on which a few outlying vertices do not count.
+
+    Returns
+    -------
+    (float, float)
+    """
+    steps = deformation[:n_modes]
+    along = np.quantile(np.abs(normal_displacement(steps, vertex_normals(mean, triangles))), 0.99)
+    length = np.quantile(np.linalg.norm(steps, axis=2), 0.99)
+    return float(sigma * along) or 1.0, float(sigma * length) or 1.0

@@ -128,3 +128,14 @@ def reconstruct(mesh, f, *, k=None):
     require(mesh, "eigenfunction", "vertex_area", what="mesh")
     Phi, f = mesh["eigenfunction"].values[:, :k], np.asarray(f, float)
     return Phi @ project(Phi, unit_area(mesh), f)
+
+
+def weyl(k):
+    """Weyl's law for a closed surface of unit area, ``(k,)``: the i-th eigenvalue grows like 4 pi i.
+
+    Examples
+    --------
+    >>> weyl(3).round(2).tolist()
+    [0.0, 12.57, 25.13]
+    """
+    return 4 * np.pi * np.arange(k)
