@@ -75,7 +75,15 @@ def is_done(path, key):
 
 @contextmanager
 def lock(folder):
-    """Hold a study folder against a second run; released by the system when the process ends in whatever way."""
+    """Hold a study folder against a second run; released by the system when the process ends in whatever way.
+
+    Temporary files of a run that was killed are removed.
+
+    Raises
+    ------
+    ValueError
+        When another process holds the folder; its number is named.
+    """
     import fcntl
 
     Path(folder).mkdir(parents=True, exist_ok=True)
@@ -91,6 +99,8 @@ def lock(folder):
         handle.truncate(0)
         handle.write(str(os.getpid()))
         handle.flush()
+        for left in Path(folder).rglob(".*.tmp"):
+            left.unlink(missing_ok=True)
         yield
 
 

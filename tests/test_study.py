@@ -110,6 +110,14 @@ def test_a_second_process_is_refused_while_the_first_holds_the_folder_and_let_in
         pass
 
 
+def test_what_a_killed_run_left_is_removed_by_the_next(file):
+    left = file.with_name(".shape.nc.77.tmp")
+    left.write_bytes(b"half")
+    with study.lock(file.parent):
+        assert not left.exists()
+        assert study.is_done(file, "key")
+
+
 @pytest.mark.parametrize("make", [None, "empty", "file"])
 def test_what_is_not_a_study_is_refused(tmp_path, make):
     folder = tmp_path / "study"
