@@ -1,0 +1,158 @@
+"""The command line: what it prints, how it ends, and that its options are those of `analyse`."""
+
+import inspect
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from s4a import analyse, cli, synthetic, write_mesh
+from s4a.mesh import as_arrays
+
+SMALL = ["--n-coarse", "400", "--k-init", "10", "--k", "20", "--n-jobs", "1"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Three small brains as files."""
+    folder = tmp_path_factory.mktemp("meshes")
+    synthetic.write(synthetic.brains(3, 1500, seed=4), folder)
+    (folder / "truth.nc").unlink()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def ran(folder, tmp_path_factory):
+    """The folder of a study, and what the run wrote."""
+    study = tmp_path_factory.mktemp("out") / "study"
+    arguments = [sys.executable, "-m", "s4a", "run", str(folder), "--out", str(study), *SMALL]
+    result = subprocess.run(arguments, capture_output=True, text=True, check=False)
+    return study, result
+
+
+def test_run_ends_well_and_says_what_it_found(ran):
+    study, result = ran
+    assert result.returncode == 0, result.stderr
+    assert (study / "pca.nc").exists()
+    for words in ("3 shapes: 3 ok, 0 repaired, 0 excluded", "median shape: brain_", "variance explained:", "peak MiB"):
+        assert words in result.stdout
+    assert f"s4a view {study}" in result.stdout
+
+
+def test_run_again_does_nothing_again(ran, folder, capsys):
+    study, _ = ran
+    before = (study / "latent.nc").stat().st_mtime_ns
+    assert cli.main(["run", str(folder), "--out", str(study), *SMALL]) == 0
+    assert (study / "latent.nc").stat().st_mtime_ns == before
+    assert "3 ok" in capsys.readouterr().out
+
+
+def test_view_writes_a_page_into_the_study_or_where_it_is_told(ran, tmp_path, monkeypatch, capsys):
+    study, _ = ran
+    page = tmp_path / "page.html"
+    monkeypatch.setattr(cli, "write_page", lambda tree, file, **_: file.write_text(f"{len(tree['original'])} shapes"))
+    assert cli.main(["view", str(study)]) == 0
+    assert cli.main(["view", str(study), "--out", str(page)]) == 0
+    assert (study / "study.html").read_text() == page.read_text() == "3 shapes"
+    assert f"wrote {page}" in capsys.readouterr().out
+
+
+def test_check_lists_every_shape(folder, capsys):
+    assert cli.main(["check", str(folder)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split()[:3] == ["shape", "vertices", "components"]
+    assert [line.split()[0] for line in lines[1:]] == ["brain_01", "brain_02", "brain_03"]
+    assert all(" 1500 " in line and " ok" in line for line in lines[1:])
+
+
+def test_check_ends_with_1_when_a_shape_is_excluded(folder, tmp_path, capsys):
+    bad = tmp_path / "bad.ply"
+    bad.write_text("no mesh")
+    assert cli.main(["check", str(folder), str(bad)]) == 1
+    said = capsys.readouterr().out
+    assert "excluded" in next(line for line in said.splitlines() if line.startswith("bad "))
+    assert "cannot be read" in " ".join(said.split())
+
+
+def test_check_takes_a_pattern(folder, capsys):
+    assert cli.main(["check", str(folder), "--pattern", "*_02"]) == 0
+    assert "brain_01" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["check", "nowhere"], "nowhere"),
+        (["view", "nowhere"], "not a study folder"),
+        (["run", "nowhere", "--out", "study"], "nowhere"),
+        (["run", "nowhere", "--out", "study", "--k", "3"], "k must be an integer of at least 4; found 3"),
+    ],
+)
+def test_an_error_is_one_line_and_the_exit_code_2(arguments, words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(arguments) == 2
+    caught = capsys.readouterr()
+    assert caught.out == ""
+    assert caught.err.startswith("s4a: ")
+    assert caught.err.count("\n") == 1
+    assert words in caught.err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("arguments", [[], ["dance"], ["run", "x"], ["run", "x", "--out", "y", "--init", "random"]])
+def test_wrong_usage_ends_with_2_and_says_how(arguments, capsys):
+    with pytest.raises(SystemExit) as end:
+        cli.main(arguments)
+    assert end.value.code == 2
+    assert "usage: s4a" in capsys.readouterr().err
+
+
+def test_every_option_of_analyse_is_a_flag_of_run_with_the_same_default():
+    options = {n: p.default for n, p in inspect.signature(analyse).parameters.items() if n not in ("shapes", "store")}
+    assert set(options) == set(cli.HELP)
+    found = cli.options_of(cli.parser().parse_args(["run", "a", "b", "--out", "study"]))
+    assert found == options | {"n_jobs": -1}  # on the command line all cores are taken
+
+
+def test_flags_give_the_options_their_values():
+    flags = "--n-coarse 500 --n-latent 40 --init landmarks --scale --no-strict --components 2 --template x --seed 7"
+    found = cli.options_of(cli.parser().parse_args(["run", "a", "--out", "study", *flags.split()]))
+    expected = {"n_coarse": 500, "n_latent": 40, "init": "landmarks", "scale": True, "strict": False, "components": 2}
+    assert {n: found[n] for n in expected} == expected
+    assert (found["template"], found["seed"], found["preset"]) == ("x", 7, None)
+
+
+@pytest.mark.parametrize("command", ["check", "run", "demo", "view"])
+def test_every_command_has_help(command, capsys):
+    with pytest.raises(SystemExit) as end:
+        cli.main([command, "--help"])
+    assert end.value.code == 0
+    assert f"usage: s4a {command}" in capsys.readouterr().out
+
+
+def test_two_shapes_end_well_without_modes_and_the_reason_is_told(folder, tmp_path, capsys):
+    paths = [str(folder / f"brain_0{i}.ply") for i in (1, 2)]
+    assert cli.main(["run", *paths, "--out", str(tmp_path / "study"), *SMALL]) == 0
+    assert "no modes: PCA needs at least 3 shapes, found 2" in capsys.readouterr().out
+
+
+def test_demo_finds_the_planted_modes_and_writes_its_page(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(cli, "write_page", lambda tree, file, **_: file.write_text("page"))
+    out = tmp_path / "demo"
+    assert cli.main(["demo", "--out", str(out), "--shapes", "4", "--vertices", "700", "--n-jobs", "1"]) == 0
+    said = capsys.readouterr().out
+    assert "correlation of planted and recovered scores" in said
+    assert "S4A, registered surface" in said
+    assert (out / "study.html").exists()
+
+
+def test_numbers_are_aligned_to_the_right_and_words_to_the_left():
+    lines = cli.table([["a", "1"], ["bcd", "200"]], ["name", "count"]).splitlines()
+    assert lines == ["name  count", "a         1", "bcd     200"]
+
+
+def test_a_mesh_written_by_the_library_passes_the_check(tmp_path, capsys):
+    write_mesh(tmp_path / "ball.obj", *as_arrays(synthetic.sphere(200)))
+    assert cli.main(["check", str(tmp_path)]) == 0
+    assert np.isin(["ball", "200"], capsys.readouterr().out.split()).all()
