@@ -1,0 +1,328 @@
+"""The whole analysis (4, 6.1): end to end, the same on any number of workers, resumed after a kill, failures named."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy.spatial.transform import Rotation
+
+from s4a import accuracy, analyse, open_study, study, synthesize, synthetic
+from s4a.mesh import as_arrays
+
+OPTIONS = {"n_coarse": 600, "k_init": 12, "k": 30, "n_jobs": 1}
+RESULTS = ("network", "latent", "registration", "pca")
+
+
+@pytest.fixture(scope="module")
+def brains():
+    return synthetic.brains(4, 2500, seed=1)
+
+
+@pytest.fixture(scope="module")
+def meshes(brains):
+    return {name: as_arrays(mesh) for name, mesh in brains["original"].children.items()}
+
+
+@pytest.fixture(scope="module")
+def folder(brains, tmp_path_factory):
+    """The folder of a finished study."""
+    folder = tmp_path_factory.mktemp("study") / "brains"
+    analyse(brains, store=folder, **OPTIONS).close()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def done(folder):
+    with open_study(folder) as tree:
+        yield tree.load()
+
+
+def assert_same(one, other):
+    """All results equal, bit for bit; times and file keys aside."""
+    for stage in RESULTS:
+        a, b = (t[stage].to_dataset().drop_attrs(deep=False) for t in (one, other))
+        assert a.identical(b), stage
+
+
+def files(folder):
+    """Time and size of every result of a folder; what is put together anew in each run left out."""
+    anew = ("report.nc", "registration.nc", "pca.nc", ".lock")
+    return {
+        p: (p.stat().st_mtime_ns, p.stat().st_size) for p in folder.rglob("*") if p.is_file() and p.name not in anew
+    }
+
+
+def test_a_study_has_all_stages_and_says_what_it_did(done, brains):
+    names = brains["truth"]["shape"].values.tolist()
+    assert {*RESULTS, "original", "coarse", "report"} == set(done.children)
+    assert list(done["original"].children) == list(done["coarse"].children) == names
+    registration, report = done["registration"].to_dataset(), done["report"].to_dataset()
+    template = registration.attrs["template"]
+    assert template == done["latent"].attrs["median"]
+    assert template == done["latent"]["distance_to_median"].idxmin().item()
+    assert registration["displacement"].sizes == {"shape": 4, "vertex": 2500, "xyz": 3}
+    assert (registration["displacement"].sel(shape=template) == 0).all()
+    assert (registration["confidence"].sel(shape=template) == 1).all()
+    assert report["status"].values.tolist() == ["ok"] * 4
+    assert report["seconds"].values.min() > 0
+    assert report["peak_memory"].values.min() > 10
+    assert report.attrs["k_init"] == "12"
+    assert done["network"].sizes["pair"] == 12
+    assert done["network"]["fmap"].shape == (12, 30, 30)
+
+
+def test_the_template_plus_displacement_is_the_shape_after_its_motion(done):
+    registration = done["registration"].to_dataset()
+    for name in registration["shape"].values:
+        one = registration.sel(shape=name)
+        X = done[f"original/{name}/position"].values[one["registered_match"].values]
+        moved = one["scale"].item() * X @ one["rotation"].values.T + one["translation"].values
+        raw = one["position"].values + one["displacement_raw"].values
+        assert np.abs(moved - raw).max() < 1e-4
+        assert np.linalg.norm(one["displacement"] - one["displacement_raw"], axis=1).mean() < 4
+
+
+def test_every_shape_is_synthesized_from_its_scores(done):
+    registration = done["registration"].to_dataset()
+    for name in registration["shape"].values:
+        made = synthesize(done, done["pca"]["score"].sel(shape=name).values)
+        true = registration["position"] + registration["displacement"].sel(shape=name)
+        assert np.abs(made["position"].values - true.values).max() < 1e-3  # mm, in float32
+
+
+def test_two_workers_give_the_bits_of_one(brains, done):
+    assert_same(analyse(brains, **OPTIONS | {"n_jobs": 2}), done)
+
+
+def test_labels_and_landmarks_stay_with_the_shapes(brains, done):
+    for name, mesh in brains["original"].children.items():
+        assert np.array_equal(done[f"original/{name}/label"], mesh["label"])
+        assert np.array_equal(done[f"original/{name}/landmark_position"], mesh["landmark_position"])
+
+
+@pytest.fixture(scope="module")
+def given(brains, tmp_path_factory):
+    """The shapes as files."""
+    return synthetic.write(brains, tmp_path_factory.mktemp("files"))
+
+
+@pytest.fixture(scope="module")
+def from_files(given):
+    return analyse(given, **OPTIONS)
+
+
+def test_the_order_of_the_files_does_not_matter(given, from_files):
+    assert_same(analyse(given[::-1], **OPTIONS), from_files)
+
+
+def test_a_study_of_files_knows_their_paths(given, from_files):
+    assert from_files["report"]["path"].values.tolist() == [str(p) for p in given]
+
+
+def test_meshes_in_memory_give_what_their_files_give(meshes, given, from_files):
+    rounded = {n: (X.astype(np.float32).astype(float), T) for n, (X, T) in meshes.items()}  # as PLY holds them
+    assert_same(analyse(rounded, **OPTIONS), from_files)
+
+
+def test_a_finished_study_is_not_computed_again(brains, folder, done):
+    before = files(folder)
+    with analyse(brains, store=folder, **OPTIONS) as again:
+        assert_same(again, done)
+    assert files(folder) == before
+
+
+def copied(folder, to):
+    for path in folder.rglob("*.nc"):
+        target = to / path.relative_to(folder)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(path.read_bytes())
+    return to
+
+
+def test_lost_and_broken_files_are_computed_again_and_no_others(brains, folder, done, tmp_path):
+    work = copied(folder, tmp_path / "study")
+    lost = work / "registration" / "brain_01.nc"
+    broken, empty = work / "coarse" / "brain_02.nc", work / "latent.nc"
+    lost.unlink()
+    broken.write_bytes(broken.read_bytes()[:5000])
+    empty.write_bytes(b"")
+    before = files(work)
+    with analyse(brains, store=work, **OPTIONS) as again:
+        assert_same(again, done)
+    changed = {p for p, state in files(work).items() if before.get(p) != state}
+    assert changed == {lost, broken, empty, work / "network.nc"}  # the network is written with the latent basis
+
+
+def test_an_option_changes_what_depends_on_it_and_nothing_else(brains, folder, tmp_path):
+    work = copied(folder, tmp_path / "study")
+    before = files(work)
+    with analyse(brains, store=work, **OPTIONS | {"refine": "intrinsic"}) as other:
+        assert set(other["registration"]["method"].values) == {"template", "intrinsic"}
+    changed = {p.relative_to(work).parts[0] for p, state in files(work).items() if before.get(p) != state}
+    assert changed == {"registration"}
+
+
+KILLED = """
+import sys
+from s4a import analyse
+analyse(sys.argv[2:], store=sys.argv[1], n_coarse=600, k_init=12, k=30, n_jobs=1)
+"""
+
+
+def test_a_killed_run_goes_on_where_it_was(given, from_files, tmp_path):
+    work = tmp_path / "study"
+    with subprocess.Popen(
+        [sys.executable, "-c", KILLED, str(work), *map(str, given)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    ) as run:
+        deadline = time.monotonic() + 60
+        while not (work / "network" / "alignment.nc").exists() and run.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.005)
+        os.kill(run.pid, signal.SIGKILL)
+    assert not (work / "report.nc").exists()
+    before = {p: s for p, s in files(work).items() if p.suffix == ".nc"}
+    assert len(before) >= 9
+    with analyse(given, store=work, **OPTIONS) as again:
+        assert_same(again, from_files)
+    after = files(work)
+    assert {p: after[p] for p in before} == before
+    assert not [p for p in after if p.suffix == ".tmp"]
+
+
+def test_the_paper_preset_runs_the_paper_way(brains):
+    tree = analyse(brains, preset="paper", **OPTIONS)
+    registration, report = tree["registration"].to_dataset(), tree["report"].to_dataset()
+    assert set(registration["method"].values) == {"template", "intrinsic"}
+    assert [report.attrs[o] for o in ("init", "refine", "how")] == ["landmarks", "intrinsic", "ours"]
+    assert tree["pca"]["explained_variance_ratio"].sum() == pytest.approx(1)
+
+
+def test_the_standard_way_runs(brains):
+    tree = analyse(brains, how="standard", refine="intrinsic", template="brain_02", n_latent=20, scale=True, **OPTIONS)
+    assert tree["latent"].sizes["latent"] == 20
+    assert tree["registration"].attrs["template"] == "brain_02"
+    others = tree["registration"]["scale"].drop_sel(shape="brain_02")
+    assert ((others - 1).__abs__() > 1e-6).all()
+    assert np.abs(others - 1).max() < 0.2
+
+
+def test_an_unknown_template_is_refused_with_the_names(brains):
+    with pytest.raises(ValueError, match="template 'x' is none of the shapes: brain_01, brain_02"):
+        analyse(brains, template="x", **OPTIONS)
+
+
+def test_bad_shapes_are_left_out_and_reported(given, tmp_path):
+    text, none = tmp_path / "text.ply", tmp_path / "none.off"
+    text.write_text("this is no mesh")
+    none.write_text("OFF\n0 0 0\n")
+    tree = analyse([*given, text, none], **OPTIONS)
+    report = tree["report"].to_dataset()
+    assert report["status"].sel(shape=["text", "none"]).values.tolist() == ["excluded"] * 2
+    assert "text.ply" in report["reason"].sel(shape="text").item()
+    assert (report["status"].values == "excluded").sum() == 2
+    assert tree["registration"].sizes["shape"] == 4
+    assert set(tree["original"].children) == {p.stem for p in given}
+
+
+def test_a_bad_mesh_in_memory_is_left_out_too(meshes):
+    X, T = meshes["brain_01"]
+    bad = {"out_of_range": (X, T + 99), "nothing": (X, T[:0])}
+    tree = analyse({**dict(list(meshes.items())[:3]), **bad}, **OPTIONS)
+    report = tree["report"].to_dataset()
+    assert report["shape"].values[report["status"].values == "excluded"].tolist() == ["nothing", "out_of_range"]
+
+
+def test_two_shapes_have_no_modes_and_the_study_says_why(meshes):
+    tree = analyse(dict(list(meshes.items())[:2]), **OPTIONS)
+    assert "pca" not in tree
+    assert tree["report"].attrs["no_modes"] == "PCA needs at least 3 shapes, found 2"
+    assert tree["registration"].sizes["shape"] == 2
+
+
+def test_identical_shapes_have_no_modes_and_all_distances_are_zero(meshes):
+    X, T = meshes["brain_01"]
+    R = Rotation.from_rotvec([0.05, 0.1, 0]).as_matrix()
+    tree = analyse({"a": (X, T), "b": (X, T), "c": (X @ R.T + 9, T)}, **OPTIONS)
+    assert np.abs(tree["registration"]["displacement"]).max() < 1e-3
+    assert tree["latent"]["distance_to_median"].max() < 1e-3
+    assert tree["network"]["cycle_error"].max() < 1e-3
+
+
+def test_one_usable_shape_is_not_enough_and_the_reasons_are_named(meshes):
+    X, T = meshes["brain_01"]
+    with pytest.raises(ValueError, match=r"at least 2 usable shapes, found 1 \(bad: .*\)"):
+        analyse({"good": (X, T), "bad": (X, T[:0])}, **OPTIONS)
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"init": "random"}, r"init must be one of 'dense', 'landmarks'; found 'random'"),
+        ({"refine": 1}, r"refine must be one of 'joint', 'intrinsic'"),
+        ({"how": "mine"}, r"how must be one of 'ours', 'standard'"),
+        ({"norm": "l2"}, r"norm must be one of 'h2', 'h1', 'frobenius'"),
+        ({"preset": "best"}, r"preset must be one of None, 'paper'"),
+        ({"n_coarse": 99}, r"n_coarse must be an integer of at least 100; found 99"),
+        ({"n_pairs": 2}, r"n_pairs = 2 cannot connect 4 shapes: give an integer from 3 \(a tree\) to 6 \(all pairs\)"),
+        ({"k_init": 3}, r"k_init must be an integer of at least 4; found 3"),
+        ({"k": 11}, r"k must be at least k_init = 12; found 11"),
+        ({"k": 30.0}, r"k must be an integer of at least 4; found 30.0"),
+        ({"step": 0}, r"step must be an integer of at least 1; found 0"),
+        ({"step": True}, r"step must be an integer of at least 1; found True"),
+        ({"n_latent": 31}, r"n_latent must be at most k = 30; found 31"),
+        ({"n_latent": 1}, r"n_latent must be an integer of at least 2; found 1"),
+        ({"seed": -1}, r"seed must be an integer of at least 0; found -1"),
+    ],
+)
+def test_an_option_out_of_range_is_refused_with_the_legal_range(brains, options, message):
+    with pytest.raises(ValueError, match=message):
+        analyse(brains, **OPTIONS | options)
+
+
+def test_names_that_would_nest_are_refused(meshes):
+    X, T = meshes["brain_01"]
+    with pytest.raises(ValueError, match="letters, digits, _ and -; found \\['a/b'\\]"):
+        analyse({"a/b": (X, T), "c": (X, T)}, **OPTIONS)
+
+
+def test_a_mesh_without_triangles_is_refused_by_name(brains):
+    mesh = brains["original/brain_01"].to_dataset()
+    with pytest.raises(ValueError, match="shape a needs the variables position, corner_vertex"):
+        analyse({"a": mesh[["position"]], "b": mesh}, **OPTIONS)
+
+
+def test_a_tree_without_shapes_is_refused(brains):
+    with pytest.raises(ValueError, match="node /original"):
+        analyse(xr.DataTree(), **OPTIONS)
+
+
+def test_numpy_integers_are_integers(meshes, tmp_path):
+    two = dict(list(meshes.items())[:2])
+    with analyse(two, store=tmp_path, **OPTIONS | {"k": np.int64(12), "seed": np.int32(0)}) as tree:
+        assert tree["network"].sizes["mode_source"] == 12
+
+
+def test_a_second_run_in_the_same_folder_is_refused(brains, folder):
+    with study.lock(folder), pytest.raises(ValueError, match="another run"):
+        analyse(brains, store=folder, **OPTIONS)
+
+
+def test_the_registered_surface_is_four_times_nearer_to_the_truth_than_nearest_neighbours():
+    tree = synthetic.brains(4, 8000)
+    truth = tree["truth"]
+    found = analyse(tree, n_coarse=3000, n_jobs=1)
+    errors = accuracy.accuracy(
+        found, lambda shape, template: synthetic.position(truth, shape, truth[template]["reference_point"].values)
+    )["error"]
+    methods = (accuracy.SURFACE, accuracy.MATCH, accuracy.ZOOMOUT, accuracy.ICP)
+    surface, matched, zoomout, icp = (errors.sel({"method": m}).values for m in methods)
+    assert surface.mean() < icp.mean() / 4
+    assert matched.mean() < zoomout.mean() / 2
+    assert (surface < matched).all()
+    assert (surface < zoomout).all()
