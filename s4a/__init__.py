@@ -8,6 +8,7 @@ reading and cleaning      :func:`read_shapes`, :func:`clean`, :func:`write_mesh`
 3.3 spectrum              :func:`spectrum`, :func:`reconstruct`
 4.1 pairs                 :func:`match_pair`
 4.2, 6.1 collections      :func:`analyse`, :func:`open_study`, :func:`synthesize`
+notebooks                 :func:`explore`
 the embedded collection   :mod:`s4a.synthetic`
 ========================  ====================================================================
 """
@@ -15,6 +16,7 @@ the embedded collection   :mod:`s4a.synthetic`
 from importlib.metadata import version
 
 from s4a import synthetic
+from s4a.accessor import explore
 from s4a.clean import clean
 from s4a.io import read_mesh, write_mesh
 from s4a.pca import synthesize
@@ -31,6 +33,7 @@ __all__ = [
     "analyse",
     "clean",
     "coarsen",
+    "explore",
     "match_pair",
     "open_study",
     "read_mesh",

@@ -1,0 +1,39 @@
+"""The notebook panels of a study, from the library's front door; they are imported when they are first used."""
+
+from importlib import import_module
+
+import xarray as xr
+
+
+def explore(study, *, view="corner", up="z"):
+    """Tabs over a finished or running study, for notebooks: modes, network, maps, median, correspondence, spectrum.
+
+    Parameters
+    ----------
+    study : xarray.DataTree
+        As :func:`s4a.analyse` or :func:`s4a.open_study` give it.
+    view, up
+        From where surfaces are seen first, and which axis points up; see :func:`s4a.draw.rotation`.
+
+    Returns
+    -------
+    s4a.widgets.Explore
+
+    Raises
+    ------
+    ImportError
+        Without the packages of ``pip install s4a[notebook]``.
+    """
+    return import_module("s4a.widgets").explore(study, view=view, up=up)
+
+
+@xr.register_datatree_accessor("s4a")
+class StudyAccessor:
+    """``study.s4a``: what can be done with a study."""
+
+    def __init__(self, study):
+        self._study = study
+
+    def explore(self, *, view="corner", up="z"):
+        """See :func:`s4a.explore`."""
+        return explore(self._study, view=view, up=up)

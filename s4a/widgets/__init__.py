@@ -1,0 +1,30 @@
+"""Panels of a study for notebooks: they show arrays, what is computed is in the step modules."""
+
+try:
+    import ipywidgets  # noqa: F401
+except ImportError as error:
+    raise ImportError(
+        "the panels need ipywidgets and anywidget, which are not installed; run: pip install s4a[notebook]"
+    ) from error
+
+from s4a.widgets.correspondence import Correspondence
+from s4a.widgets.explore import Explore, explore
+from s4a.widgets.functional import FunctionalMap
+from s4a.widgets.median import Median
+from s4a.widgets.modes import Modes
+from s4a.widgets.network import Network
+from s4a.widgets.scene import Scene, scene
+from s4a.widgets.spectrum import Spectrum
+
+__all__ = [
+    "Correspondence",
+    "Explore",
+    "FunctionalMap",
+    "Median",
+    "Modes",
+    "Network",
+    "Scene",
+    "Spectrum",
+    "explore",
+    "scene",
+]

@@ -1,0 +1,193 @@
+// Charts in SVG whose marks can be hovered, clicked and reached with the arrow keys. Every function takes a parent
+// element, a spec (plain numbers and names) and `pick`, which is called with the mark that was chosen.
+
+const BLUE = "#0072b2", ORANGE = "#d55e00", INK = "#333", FAINT = "#ddd";
+
+function ticks(low, high, count = 5) {
+  const span = high - low || 1, raw = span / count, power = 10 ** Math.floor(Math.log10(raw));
+  const step = [1, 2, 5, 10].map((m) => m * power).find((s) => s >= raw);
+  const out = [];
+  for (let x = Math.ceil(low / step) * step; x <= high + step * 1e-6; x += step) out.push(Math.abs(x) < step * 1e-6 ? 0 : x);
+  return out;
+}
+
+function bounds(values, margin = 0.08) {
+  const known = values.filter((x) => Number.isFinite(x));
+  const low = Math.min(...known), high = Math.max(...known), pad = margin * (high - low || 1);
+  return [low - pad, high + pad];
+}
+
+// A drawing of the given size with both axes; gives the scales.
+function plot(parent, { width, height, x, y, xlabel = "", ylabel = "", title = "", left = 48, grid = true }) {
+  const svg = node(parent, "svg", { viewBox: `0 0 ${width} ${height}`, class: "s4a-chart", role: "group", "aria-label": title });
+  svg.style.maxWidth = `${width}px`;
+  const top = title ? 22 : 8, bottom = height - 36, right = width - 10;
+  const X = (v) => left + ((v - x[0]) / (x[1] - x[0])) * (right - left);
+  const Y = (v) => bottom - ((v - y[0]) / (y[1] - y[0])) * (bottom - top);
+  if (title) node(svg, "text", { x: left, y: 14, "font-weight": "bold" }, title);
+  for (const t of ticks(...x, 6)) {
+    if (grid) node(svg, "line", { x1: X(t), x2: X(t), y1: top, y2: bottom, stroke: FAINT });
+    node(svg, "text", { x: X(t), y: bottom + 14, "text-anchor": "middle" }, short(t));
+  }
+  for (const t of ticks(...y, 5)) {
+    if (grid) node(svg, "line", { x1: left, x2: right, y1: Y(t), y2: Y(t), stroke: FAINT });
+    node(svg, "text", { x: left - 5, y: Y(t) + 4, "text-anchor": "end" }, short(t));
+  }
+  node(svg, "text", { x: (left + right) / 2, y: height - 5, "text-anchor": "middle" }, xlabel);
+  node(svg, "text", { transform: `translate(11 ${(top + bottom) / 2}) rotate(-90)`, "text-anchor": "middle" }, ylabel);
+  return { svg, X, Y, left, right, top, bottom };
+}
+
+// Makes marks focusable: one tab stop, the arrow keys go on, Enter picks; the text of a mark is read out below.
+function reachable(marks, readout, pick) {
+  marks.forEach(({ at, text, value }, i) => {
+    at.setAttribute("tabindex", i ? -1 : 0);
+    at.setAttribute("role", "button");
+    at.setAttribute("aria-label", text);
+    at.classList.add("s4a-mark");
+    node(at, "title", {}, text);
+    const say = () => (readout.textContent = text);
+    at.addEventListener("pointerenter", say);
+    at.addEventListener("focus", say);
+    at.addEventListener("click", () => pick(value));
+    at.addEventListener("keydown", (e) => {
+      const step = { ArrowRight: 1, ArrowDown: 1, ArrowLeft: -1, ArrowUp: -1 }[e.key];
+      if (step) {
+        const next = marks[(i + step + marks.length) % marks.length].at;
+        at.setAttribute("tabindex", -1);
+        next.setAttribute("tabindex", 0);
+        next.focus();
+      } else if (e.key === "Enter" || e.key === " ") pick(value);
+      else return;
+      e.preventDefault();
+      e.stopPropagation();
+    });
+  });
+}
+
+const line = (parent) => html(parent, "div", { class: "s4a-readout", "aria-live": "polite" }, " ");
+
+function scatter(parent, spec, pick) {
+  const { x, y, names, xlabel, ylabel, title, selected = -1, width = 360, height = 300 } = spec;
+  const frame = plot(parent, { width, height, x: bounds([...x, 0]), y: bounds([...y, 0]), xlabel, ylabel, title });
+  const marks = x.map((_, i) => {
+    const at = node(frame.svg, "circle", { cx: frame.X(x[i]), cy: frame.Y(y[i]), r: i === selected ? 7 : 5, fill: i === selected ? ORANGE : BLUE, stroke: "#fff" });
+    if (names.length <= 60) node(frame.svg, "text", { x: frame.X(x[i]) + 7, y: frame.Y(y[i]) - 4, class: "s4a-small" }, names[i]);
+    return { at, value: { index: i }, text: `${names[i]}: ${short(x[i])}, ${short(y[i])}` };
+  });
+  const cross = node(frame.svg, "path", { d: "M-7 0H7M0 -7V7", stroke: ORANGE, "stroke-width": 2, visibility: "hidden", class: "s4a-cross" });
+  reachable(marks, line(parent), pick);
+  return (a, b) => {
+    cross.setAttribute("visibility", "visible");
+    cross.setAttribute("transform", `translate(${frame.X(a)} ${frame.Y(b)})`);
+  };
+}
+
+function bars(parent, spec, pick) {
+  const { values, names, label, title, marked = [], selected = -1, width = 430 } = spec;
+  const row = values.length > 25 ? 15 : 20, height = 26 + row * values.length + 40, left = 10 + 6.5 * Math.max(...names.map((n) => n.length), 4);
+  const frame = plot(parent, { width, height, left, x: [0, Math.max(...values) * 1.18 || 1], y: [0, 1], xlabel: label, title, grid: false });
+  frame.svg.querySelectorAll("text[text-anchor=end]").forEach((t) => t.remove());
+  const marks = values.map((v, i) => {
+    const top = frame.top + 2 + i * row;
+    const at = node(frame.svg, "rect", { x: left, y: top, width: Math.max(1, frame.X(v) - left), height: row - 4, fill: marked.includes(i) ? ORANGE : BLUE });
+    if (i === selected) Object.entries({ stroke: INK, "stroke-width": 2.5 }).forEach(([k, s]) => at.setAttribute(k, s));
+    node(frame.svg, "text", { x: left - 4, y: top + row - 8, "text-anchor": "end" }, names[i]);
+    node(frame.svg, "text", { x: frame.X(v) + 4, y: top + row - 8 }, short(v));
+    return { at, value: { index: i }, text: `${names[i]}: ${v.toPrecision(4)}` };
+  });
+  reachable(marks, line(parent), pick);
+}
+
+function lines(parent, spec, pick) {
+  const { series, xlabel, ylabel, title, width = 430, height = 280, ymin, marker } = spec;
+  const y = bounds(series.flatMap((s) => s.y), 0.04);
+  const frame = plot(parent, { width, height, x: bounds(series.flatMap((s) => s.x), 0.02), y: [ymin ?? y[0], y[1]], xlabel, ylabel, title });
+  const drawn = series.map((s) => {
+    const d = s.x.map((v, i) => `${i ? "L" : "M"}${frame.X(v).toFixed(1)} ${frame.Y(s.y[i]).toFixed(1)}`).join("");
+    node(frame.svg, "path", { d, fill: "none", stroke: s.color || BLUE, "stroke-width": s.wide ? 2.5 : 1.2, "stroke-dasharray": s.dash || "", "pointer-events": "none" });
+    const at = node(frame.svg, "g", { fill: s.color || BLUE, class: "s4a-series" });
+    node(at, "path", { d, fill: "none", stroke: "transparent", "stroke-width": 9 });
+    if (s.dots) s.x.forEach((v, i) => node(at, "circle", { cx: frame.X(v), cy: frame.Y(s.y[i]), r: 3.2 }));
+    return { at, value: { series: series.indexOf(s) }, text: s.text || s.name };
+  });
+  series.filter((s) => s.legend).forEach((s, i) => {
+    node(frame.svg, "line", { x1: frame.left + 10, x2: frame.left + 34, y1: frame.top + 10 + 15 * i, y2: frame.top + 10 + 15 * i, stroke: s.color || BLUE, "stroke-width": 2, "stroke-dasharray": s.dash || "" });
+    node(frame.svg, "text", { x: frame.left + 40, y: frame.top + 14 + 15 * i }, s.name);
+  });
+  if (marker !== undefined) node(frame.svg, "line", { x1: frame.X(marker), x2: frame.X(marker), y1: frame.top, y2: frame.bottom, stroke: ORANGE, "stroke-width": 2 });
+  reachable(drawn, line(parent), pick);
+}
+
+function graph(parent, spec, pick) {
+  const { x, y, names, source, target, colors, values, weights, title, highlight = -1, node: chosen = -1, edge = -1, width = 460, height = 400 } = spec;
+  const svg = node(parent, "svg", { viewBox: `0 0 ${width} ${height}`, class: "s4a-chart", role: "group", "aria-label": title });
+  svg.style.maxWidth = `${width}px`;
+  node(svg, "text", { x: 8, y: 14, "font-weight": "bold" }, title);
+  const [x0, x1] = bounds(x, 0), [y0, y1] = bounds(y, 0);
+  const X = x.map((v) => 45 + ((v - x0) / (x1 - x0 || 1)) * (width - 110)), Y = y.map((v) => height - 25 - ((v - y0) / (y1 - y0 || 1)) * (height - 75));
+  const marks = source.map((s, i) => { // the two directions of a pair bend to either side
+    const t = target[i], dx = X[t] - X[s], dy = Y[t] - Y[s], bend = spec.both === false ? 0 : 0.06;
+    const d = `M${X[s]} ${Y[s]}Q${(X[s] + X[t]) / 2 - bend * dy} ${(Y[s] + Y[t]) / 2 + bend * dx} ${X[t]} ${Y[t]}`;
+    const at = node(svg, "g", { fill: "none", class: "s4a-edge", "data-edge": i });
+    node(at, "path", { d, stroke: "transparent", "stroke-width": 7 });
+    if (i === edge) node(at, "path", { d, stroke: INK, "stroke-width": 7 });
+    node(at, "path", { d, stroke: colors[i], "stroke-width": i === edge ? 4 : 1 + 1.8 * (weights ? weights[i] : 0.3), class: "s4a-line" });
+    const weight = weights ? `, weight ${short(weights[i])}` : "";
+    return { at, value: { edge: i }, text: `${names[s]} → ${names[t]}: ${spec.label} ${short(values[i])}${weight}` };
+  });
+  marks.push(...names.map((name, i) => {
+    const at = node(svg, "g", { "data-node": i });
+    if (i === highlight) node(at, "circle", { cx: X[i], cy: Y[i], r: 12, fill: "none", stroke: ORANGE, "stroke-width": 3 });
+    node(at, "circle", { cx: X[i], cy: Y[i], r: 8, fill: i === chosen ? ORANGE : INK, stroke: "#fff" });
+    if (names.length <= 60) node(svg, "text", { x: X[i] + 11, y: Y[i] - 8, class: "s4a-halo" }, name);
+    return { at, value: { node: i }, text: i === highlight ? `${name}, the median` : name };
+  }));
+  reachable([...marks.slice(source.length), ...marks.slice(0, source.length)], line(parent), pick);
+}
+
+// A matrix as pixels: `values` row by row, coloured by a table of 256 colours from -limit to limit.
+function matrix(parent, spec, pick) {
+  const { rows, columns, values, table, limit, blocks = [], label, title, row = -1, column = -1, size = 380 } = spec;
+  html(parent, "div", { class: "s4a-title" }, title);
+  const box = html(parent, "div", { class: "s4a-matrix", style: `width:${size}px;max-width:100%;aspect-ratio:${columns}/${rows}` });
+  const canvas = html(box, "canvas", { tabindex: 0, role: "application", "aria-label": `${title}: arrow keys move, Enter shows the cell` });
+  Object.assign(canvas, { width: columns, height: rows });
+  const paint = canvas.getContext("2d"), image = paint.createImageData(columns, rows);
+  values.forEach((v, i) => {
+    const at = Math.round(255 * Math.min(1, Math.max(0, 0.5 + (0.5 * v) / limit)));
+    image.data.set([table[3 * at], table[3 * at + 1], table[3 * at + 2], 255], 4 * i);
+  });
+  paint.putImageData(image, 0, 0);
+  const svg = node(box, "svg", { viewBox: `0 0 ${columns} ${rows}`, preserveAspectRatio: "none" });
+  for (const [a, b] of blocks) node(svg, "rect", { x: a, y: a, width: b - a + 1, height: b - a + 1, fill: "none", stroke: "#e69f00", "stroke-width": columns / 120 });
+  const cursor = node(svg, "rect", { width: 1, height: 1, fill: "none", stroke: "#000", "stroke-width": columns / 150, x: column, y: row, visibility: row < 0 ? "hidden" : "visible" });
+  const readout = line(parent), here = { row: Math.max(0, row), column: Math.max(0, column) };
+  const say = () => (readout.textContent = `C[${here.row}, ${here.column}] = ${short(values[here.row * columns + here.column])}   (${label(here)})`);
+  const place = (e) => {
+    const r = canvas.getBoundingClientRect();
+    here.column = Math.min(columns - 1, Math.max(0, Math.floor(((e.clientX - r.left) / r.width) * columns)));
+    here.row = Math.min(rows - 1, Math.max(0, Math.floor(((e.clientY - r.top) / r.height) * rows)));
+    say();
+  };
+  const choose = () => {
+    Object.entries({ x: here.column, y: here.row, visibility: "visible" }).forEach(([k, v]) => cursor.setAttribute(k, v));
+    pick({ ...here });
+  };
+  canvas.addEventListener("pointermove", place);
+  canvas.addEventListener("click", (e) => { place(e); choose(); });
+  canvas.addEventListener("keydown", (e) => {
+    const step = { ArrowRight: [0, 1], ArrowLeft: [0, -1], ArrowDown: [1, 0], ArrowUp: [-1, 0] }[e.key];
+    if (!step && e.key !== "Enter") return;
+    e.preventDefault();
+    e.stopPropagation();
+    if (!step) return choose();
+    here.row = Math.min(rows - 1, Math.max(0, here.row + step[0]));
+    here.column = Math.min(columns - 1, Math.max(0, here.column + step[1]));
+    Object.entries({ x: here.column, y: here.row, visibility: "visible" }).forEach(([k, v]) => cursor.setAttribute(k, v));
+    say();
+  });
+  if (row >= 0) say();
+}
+
+const CHARTS = { scatter, bars, lines, graph, matrix };

@@ -1,0 +1,24 @@
+export default {
+  render({ model, el }) {
+    el.classList.add("s4a");
+    const draw = () => {
+      const focused = el.contains(document.activeElement);
+      el.replaceChildren();
+      const spec = { ...model.get("spec") };
+      if (!spec.kind) return;
+      if (spec.kind === "matrix") {
+        spec.values = numbers(Float32Array, model.get("values"));
+        spec.table = numbers(Uint8Array, model.get("table"));
+        spec.label = ({ row, column }) => `source mode ${column} to target mode ${row}`;
+      }
+      CHARTS[spec.kind](el, spec, (mark) => {
+        model.set("picked", { ...mark, count: (model.get("picked").count || 0) + 1 });
+        model.save_changes();
+      });
+      if (focused) el.querySelector("[tabindex='0']")?.focus({ preventScroll: true });
+    };
+    draw();
+    model.on("change:spec", draw);
+    return () => model.off("change:spec", draw);
+  },
+};

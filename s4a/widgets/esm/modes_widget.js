@@ -1,0 +1,184 @@
+// The mean shape moved along its modes, wholly in the browser: p = mean + sum of score times deformation.
+class Modes {
+  constructor(model) {
+    this.model = model;
+    this.load();
+  }
+  load() {
+    const get = (name) => this.model.get(name);
+    this.mean = numbers(Float32Array, get("mean"));
+    this.corner = numbers(Uint32Array, get("corner"));
+    this.deformation = numbers(Float32Array, get("deformation"));
+    this.normal = normalsOf(this.mean, this.corner);
+    this.tables = { normal: numbers(Uint8Array, get("signed_table")), magnitude: numbers(Uint8Array, get("ramp_table")) };
+    this.limits = { normal: get("limit"), magnitude: get("limit_magnitude") };
+  }
+  positions(scores, out = new Float32Array(this.mean.length)) {
+    out.set(this.mean);
+    scores.forEach((score, c) => {
+      if (!score) return;
+      const start = c * out.length, D = this.deformation;
+      for (let i = 0; i < out.length; i++) out[i] += score * D[start + i];
+    });
+    return out;
+  }
+  colors(P, kind, out) {
+    const table = this.tables[kind];
+    if (!table) return null;
+    const M = this.mean, N = this.normal, limit = this.limits[kind];
+    for (let i = 0; i < P.length; i += 3) {
+      const x = P[i] - M[i], y = P[i + 1] - M[i + 1], z = P[i + 2] - M[i + 2];
+      const value = kind === "normal" ? 0.5 + (0.5 * (x * N[i] + y * N[i + 1] + z * N[i + 2])) / limit : Math.hypot(x, y, z) / limit;
+      const at = 3 * Math.round(255 * Math.min(1, Math.max(0, value)));
+      out[i] = table[at]; out[i + 1] = table[at + 1]; out[i + 2] = table[at + 2];
+    }
+    return out;
+  }
+  show(surface, scores, kind) {
+    const size = this.mean.length, fresh = surface.corner !== this.corner;
+    const P = this.positions(scores, fresh ? undefined : surface.position);
+    surface.corner = this.corner;
+    surface.setPosition(P);
+    surface.setColor(this.colors(P, kind, surface.color?.length === size ? surface.color : new Uint8Array(size)));
+  }
+}
+
+function modesWidget({ model, el }) {
+  el.classList.add("s4a");
+  const modes = new Modes(model), ratio = model.get("ratio"), count = ratio.length, range = 3;
+  const scores = () => [...model.get("scores")];
+  const box = html(el, "div", { class: "s4a-modes" }), left = html(box, "div"), right = html(box, "div");
+  const views = html(left, "div", { class: "s4a-views" }), bar = html(left, "div"), still = html(left, "img", { class: "s4a-still", hidden: "" });
+  let active = 0, shown = [], timer = 0, playing = 0, crosshair = null;
+  el.modes = modes;
+
+  const send = () => { // at most ten messages a second, each of a few hundred bytes
+    timer ||= setTimeout(() => { timer = 0; model.save_changes(); }, 100);
+  };
+  const set = (values, last = active) => {
+    active = last;
+    model.set("scores", values);
+    send();
+  };
+  const buttons = html(right, "div", { class: "s4a-buttons" });
+  const button = (text, act, help) => {
+    const it = html(buttons, "button", { type: "button", title: help }, text);
+    it.addEventListener("click", act);
+    return it;
+  };
+  button("Reset", () => set(scores().fill(0)), "all scores to 0: the mean shape");
+  const play = button("Play", () => toggle(), "moves the marked mode back and forth");
+  const beside = button("−3 · mean · +3", () => { model.set("beside", !model.get("beside")); send(); }, "the marked mode at both ends, side by side");
+  button("Random", () => set(scores().map(() => {
+    let z = range + 1; // one normal number each, those beyond the sliders drawn again
+    while (Math.abs(z) > range) z = Math.sqrt(-2 * Math.log(1 - Math.random())) * Math.cos(2 * Math.PI * Math.random());
+    return Math.round(100 * z) / 100;
+  })), "a plausible shape: scores drawn from the normal distribution");
+  const kinds = html(buttons, "select", { "aria-label": "colours" });
+  for (const [value, text] of [["normal", "along the normal"], ["magnitude", "distance"], ["none", "no colours"]]) html(kinds, "option", { value }, text);
+  kinds.addEventListener("change", () => { model.set("colors", kinds.value); send(); });
+  const sliders = html(right, "div", { class: "s4a-sliders" });
+  const rows = ratio.map((share, c) => {
+    const row = html(sliders, "label", { class: "s4a-slider" });
+    html(row, "span", {}, `PC${c + 1} · ${(100 * share).toFixed(1)} %`);
+    const input = html(row, "input", { type: "range", min: -range, max: range, step: 0.05, "aria-label": `component ${c + 1} in standard deviations` });
+    const output = html(row, "output", {}, "0.00");
+    input.addEventListener("input", () => { const s = scores(); s[c] = Number(input.value); set(s, c); });
+    input.addEventListener("focus", () => { active = c; mark(); });
+    input.addEventListener("keydown", (e) => e.stopPropagation()); // or the notebook takes the arrow keys
+    return { row, input, output };
+  });
+  const distance = html(right, "div", { class: "s4a-readout", "aria-live": "polite" });
+  const charts = html(el, "div", { class: "s4a-charts" }), scorePart = html(charts, "div"), variancePart = html(charts, "div");
+
+  const mark = () => rows.forEach(({ row }, c) => row.classList.toggle("s4a-active", c === active));
+  const toggle = (on = !playing) => {
+    cancelAnimationFrame(playing);
+    playing = 0;
+    play.textContent = on ? "Stop" : "Play";
+    if (!on) return;
+    const start = performance.now(), from = Math.asin(Math.max(-1, Math.min(1, (scores()[active] || 0) / range)));
+    const step = (now) => {
+      if (!el.isConnected) return toggle(false);
+      const s = scores();
+      s[active] = Math.round(100 * range * Math.sin(from + (now - start) / 700)) / 100;
+      set(s);
+      playing = requestAnimationFrame(step);
+    };
+    playing = requestAnimationFrame(step);
+  };
+  const arrange = () => {
+    shown.forEach((view) => view.dispose());
+    views.replaceChildren();
+    const three = model.get("beside");
+    beside.setAttribute("aria-pressed", three);
+    shown = (three ? [-range, 0, range] : [null]).map((at) => {
+      const part = html(views, "div"), caption = html(part, "div", { class: "s4a-title" });
+      const view = new View(part, { turn: model.get("turn"), group: model.get("group"), height: model.get("height"), label: "shape" });
+      view.surfaces = [new Surface()];
+      view.fit(modes.mean);
+      return Object.assign(view, { at, caption });
+    });
+    update();
+  };
+  const shape = (at) => (at === null ? scores() : scores().map((_, c) => (c === active ? at : 0)));
+  const update = () => {
+    const s = scores(), kind = model.get("colors");
+    shown.forEach((view) => {
+      if (!context()) return;
+      modes.show(view.surfaces[0], shape(view.at), kind);
+      view.caption.textContent = view.at === null ? "mean + Σ score · deformation" : view.at ? `PC${active + 1} at ${view.at > 0 ? "+" : "−"}3 σ` : "mean";
+      view.redraw();
+    });
+    rows.forEach(({ input, output }, c) => {
+      if (Number(input.value) !== s[c]) input.value = s[c];
+      output.textContent = `${s[c] < 0 ? "−" : "+"}${Math.abs(s[c]).toFixed(2)} σ`;
+    });
+    mark();
+    kinds.value = kind;
+    const far = Math.hypot(...s);
+    distance.textContent = `Mahalanobis distance ${far.toFixed(2)} (about ${Math.sqrt(count).toFixed(1)} is usual for a random shape)`;
+    colorBar(bar, model.get("bars")[kind]);
+    crosshair?.(s[0], s[1] ?? 0);
+  };
+  const chart = () => {
+    const samples = model.get("samples"), names = model.get("names"), low = model.get("ratio_low");
+    const sum = (values) => values.map((_, i) => values.slice(0, i + 1).reduce((a, b) => a + 100 * b, 0));
+    const series = [{ y: sum(ratio), name: "full resolution", color: BLUE, dots: true, wide: true, legend: true }];
+    if (low.length) series.unshift({ y: sum(low), name: "low resolution", color: ORANGE, dash: "5 3", dots: true, legend: true });
+    series.forEach((s) => {
+      s.x = s.y.map((_, i) => i + 1);
+      s.text = `${s.name}: ${s.y.map((v, i) => `${i + 1}: ${v.toFixed(1)} %`).slice(0, 12).join(", ")}`;
+    });
+    lines(variancePart, { series, title: "Cumulative variance", xlabel: "number of components", ylabel: "%", ymin: 0, width: 400 }, () => {});
+    crosshair = scatter(scorePart, {
+      x: samples.map((s) => s[0]), y: samples.map((s) => s[1] ?? 0), names, title: "Scores: click a shape to see it",
+      xlabel: "PC1 (σ)", ylabel: count > 1 ? "PC2 (σ)" : "", width: 400,
+    }, ({ index }) => { model.set("sample", index); set([...samples[index]]); });
+  };
+  const picture = () => {
+    const bytes = numbers(Uint8Array, model.get("still"));
+    if (bytes) still.src = URL.createObjectURL(new Blob([bytes], { type: "image/png" }));
+  };
+  const reload = () => { modes.load(); arrange(); };
+  const on = {
+    "change:scores": update, "change:colors": update, "change:beside": arrange, "change:deformation": reload,
+    "change:still": picture, "change:turn": () => shown[0].reset(model.get("turn")),
+  };
+  Object.entries(on).forEach(([event, act]) => model.on(event, act));
+  chart();
+  arrange();
+  const webgl = context() !== null;
+  views.hidden = !webgl;
+  still.hidden = webgl;
+  if (!webgl) picture();
+  model.set("webgl", webgl ? "yes" : "no");
+  model.save_changes();
+  return () => {
+    toggle(false);
+    clearTimeout(timer);
+    Object.entries(on).forEach(([event, act]) => model.off(event, act));
+    shown.forEach((view) => view.dispose());
+  };
+}
+export default { render: modesWidget };

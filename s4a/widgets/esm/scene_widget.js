@@ -1,0 +1,72 @@
+export default {
+  render({ model, el }) {
+    el.classList.add("s4a");
+    const title = html(el, "div", { class: "s4a-title" });
+    const send = (name, hit) => {
+      model.set(name, { ...(hit || { vertex: -1 }), count: (model.get(name).count || 0) + 1 });
+      model.save_changes();
+    };
+    let hovered = 0;
+    const view = new View(el, {
+      turn: model.get("turn"), group: model.get("group"), height: model.get("height"), label: model.get("title"),
+      onPick: (hit) => send("picked", hit),
+      onHover: (hit) => {
+        if (!model.get("hovering") || Date.now() - hovered < 120) return;
+        hovered = Date.now();
+        send("hovered", hit);
+      },
+    });
+    const still = html(el, "img", { alt: "", class: "s4a-still" }), bar = html(el, "div"), readout = html(el, "div", { class: "s4a-readout" });
+    const surface = new Surface(), ghost = new Surface(0.35);
+    const geometry = () => {
+      const position = numbers(Float32Array, model.get("position")), corner = numbers(Uint32Array, model.get("corner"));
+      if (!position || !corner) return;
+      surface.setMesh(position, corner);
+      view.fit(position);
+      color();
+    };
+    const color = () => {
+      surface.setColor(numbers(Uint8Array, model.get("color")));
+      view.redraw();
+    };
+    const ghosts = () => {
+      const position = numbers(Float32Array, model.get("ghost_position")), corner = numbers(Uint32Array, model.get("ghost_corner"));
+      view.surfaces = position && corner ? [surface, ghost] : [surface];
+      if (position && corner) ghost.setMesh(position, corner);
+      if (position && corner) ghost.setColor(new Uint8Array(position.length).map((_, i) => [90, 110, 160][i % 3]));
+      view.redraw();
+    };
+    const words = () => {
+      title.textContent = model.get("title");
+      readout.textContent = model.get("caption");
+      colorBar(bar, model.get("bar"));
+      view.points = model.get("points");
+      view.redraw();
+    };
+    const picture = () => {
+      const bytes = numbers(Uint8Array, model.get("still"));
+      if (still.src) URL.revokeObjectURL(still.src);
+      if (bytes) still.src = URL.createObjectURL(new Blob([bytes], { type: "image/png" }));
+      still.alt = `${model.get("title")}, a still picture: this browser has no WebGL2`;
+    };
+    const on = {
+      "change:position": geometry, "change:color": color, "change:ghost_position": ghosts, "change:title": words,
+      "change:caption": words, "change:bar": words, "change:points": words, "change:still": picture,
+      "change:turn": () => view.reset(model.get("turn")),
+    };
+    Object.entries(on).forEach(([event, act]) => model.on(event, act));
+    geometry(), ghosts(), words();
+    const webgl = context() !== null;
+    view.canvas.hidden = !webgl;
+    still.hidden = webgl;
+    if (!webgl) picture();
+    if (model.get("webgl") !== (webgl ? "yes" : "no")) {
+      model.set("webgl", webgl ? "yes" : "no");
+      model.save_changes();
+    }
+    return () => {
+      Object.entries(on).forEach(([event, act]) => model.off(event, act));
+      view.dispose();
+    };
+  },
+};

@@ -1,0 +1,155 @@
+// Surfaces in the browser. One WebGL2 context draws all surfaces of the page, and each view is a plain canvas to which
+// its picture is copied: any number of views, in any number of cells, costs one context.
+
+const VERTEX = `#version 300 es
+in vec3 position, normal, color;
+uniform mat3 turn;
+uniform vec3 centre;
+uniform vec4 place;
+uniform float depth, point;
+out vec3 n, c;
+void main() {
+  vec3 p = turn * (position - centre);
+  n = turn * normal;
+  c = color;
+  gl_Position = vec4(p.xy * place.xy + place.zw, -p.z * depth - (point > 0.0 ? 0.02 : 0.0), 1.0);
+  gl_PointSize = point;
+}`;
+const FRAGMENT = `#version 300 es
+precision highp float;
+in vec3 n, c;
+uniform float opacity, point;
+out vec4 pixel;
+void main() {
+  if (point > 0.0) {
+    float r = length(gl_PointCoord - 0.5) * 2.0;
+    if (r > 1.0) discard;
+    pixel = vec4(r > 0.7 ? vec3(0.1) : c, 1.0);
+    return;
+  }
+  vec3 N = normalize(n) * (gl_FrontFacing ? 1.0 : -1.0);
+  vec3 key = normalize(vec3(-0.42, 0.55, 0.72));
+  float wrap = clamp((dot(N, key) + 0.3) / 1.3, 0.0, 1.0), sky = 0.5 + 0.5 * N.y;
+  float rim = pow(clamp(1.0 - N.z, 0.0, 1.0), 3.0);
+  float gloss = pow(clamp(dot(N, normalize(key + vec3(0.0, 0.0, 1.0))), 0.0, 1.0), 40.0);
+  vec3 lit = c * (0.45 + 0.15 * sky + 0.52 * wrap) * (1.0 - 0.35 * rim) + 0.10 * gloss;
+  pixel = vec4(clamp(lit, 0.0, 1.0) * opacity, opacity);
+}`;
+const CLAY = [0.8, 0.76, 0.7];
+const ATTRIBUTES = ["position", "normal", "color"];
+
+function shader(gl, kind, source) {
+  const it = gl.createShader(kind);
+  gl.shaderSource(it, source);
+  gl.compileShader(it);
+  return it;
+}
+
+// The page's context, made at first use and made again after it was lost; null where there is no WebGL2.
+function context() {
+  const old = globalThis.s4aContext;
+  if (old === null || (old && !old.gl.isContextLost())) return old;
+  const gl = document.createElement("canvas").getContext("webgl2", { antialias: true, alpha: true });
+  if (!gl) return (globalThis.s4aContext = null);
+  const program = gl.createProgram();
+  gl.attachShader(program, shader(gl, gl.VERTEX_SHADER, VERTEX));
+  gl.attachShader(program, shader(gl, gl.FRAGMENT_SHADER, FRAGMENT));
+  ATTRIBUTES.forEach((name, i) => gl.bindAttribLocation(program, i, name));
+  gl.linkProgram(program);
+  gl.useProgram(program);
+  const at = {};
+  for (const name of ["turn", "centre", "place", "depth", "opacity", "point"]) at[name] = gl.getUniformLocation(program, name);
+  gl.enable(gl.DEPTH_TEST);
+  return (globalThis.s4aContext = { gl, at });
+}
+
+// Normals of the vertices: the sum of the area vectors of the triangles around, at unit length.
+function normalsOf(P, T, N = new Float32Array(P.length)) {
+  N.fill(0);
+  for (let t = 0; t < T.length; t += 3) {
+    const a = 3 * T[t], b = 3 * T[t + 1], c = 3 * T[t + 2];
+    const ux = P[b] - P[a], uy = P[b + 1] - P[a + 1], uz = P[b + 2] - P[a + 2];
+    const vx = P[c] - P[a], vy = P[c + 1] - P[a + 1], vz = P[c + 2] - P[a + 2];
+    const x = uy * vz - uz * vy, y = uz * vx - ux * vz, z = ux * vy - uy * vx;
+    N[a] += x; N[a + 1] += y; N[a + 2] += z;
+    N[b] += x; N[b + 1] += y; N[b + 2] += z;
+    N[c] += x; N[c + 1] += y; N[c + 2] += z;
+  }
+  for (let i = 0; i < N.length; i += 3) {
+    const length = Math.hypot(N[i], N[i + 1], N[i + 2]) || 1;
+    N[i] /= length; N[i + 1] /= length; N[i + 2] /= length;
+  }
+  return N;
+}
+
+class Surface {
+  constructor(opacity = 1) {
+    this.opacity = opacity;
+    this.position = new Float32Array();
+    this.corner = new Uint32Array();
+    this.color = null;
+  }
+  setMesh(position, corner) {
+    this.corner = corner;
+    this.color = null;
+    this.setPosition(position);
+  }
+  setPosition(position) {
+    this.position = position;
+    this.normal = normalsOf(position, this.corner, this.normal?.length === position.length ? this.normal : undefined);
+    this.stale = true;
+  }
+  setColor(color) {
+    this.color = color && color.length === this.position.length ? color : null;
+    this.stale = true;
+  }
+  upload(on) {
+    const { gl } = on;
+    if (this.on !== on) {
+      this.on = on;
+      this.array = gl.createVertexArray();
+      this.buffers = [...ATTRIBUTES, "corner"].map(() => gl.createBuffer());
+    }
+    gl.bindVertexArray(this.array);
+    [this.position, this.normal, this.color].forEach((data, i) => {
+      if (!data) return gl.disableVertexAttribArray(i);
+      gl.bindBuffer(gl.ARRAY_BUFFER, this.buffers[i]);
+      gl.bufferData(gl.ARRAY_BUFFER, data, gl.DYNAMIC_DRAW);
+      gl.enableVertexAttribArray(i);
+      gl.vertexAttribPointer(i, 3, data instanceof Uint8Array ? gl.UNSIGNED_BYTE : gl.FLOAT, data instanceof Uint8Array, 0, 0);
+    });
+    if (this.sent !== this.corner) {
+      gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.buffers[3]);
+      gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, this.corner, gl.STATIC_DRAW);
+      this.sent = this.corner;
+    }
+    this.stale = false;
+  }
+  draw(on) {
+    const { gl, at } = on;
+    if (this.on !== on) this.sent = null;
+    if (this.stale || this.on !== on) this.upload(on);
+    gl.bindVertexArray(this.array);
+    gl.vertexAttrib3f(2, ...CLAY);
+    gl.uniform1f(at.opacity, this.opacity);
+    gl.uniform1f(at.point, 0);
+    const triangles = () => gl.drawElements(gl.TRIANGLES, this.corner.length, gl.UNSIGNED_INT, 0);
+    if (this.opacity < 1) { // first the depth alone, so that only what is in front shines through
+      gl.colorMask(false, false, false, false);
+      triangles();
+      gl.colorMask(true, true, true, true);
+      gl.depthFunc(gl.LEQUAL);
+      gl.enable(gl.BLEND);
+      gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+      triangles();
+      gl.disable(gl.BLEND);
+      gl.depthFunc(gl.LESS);
+    } else triangles();
+  }
+  dispose() {
+    if (!this.on) return;
+    this.on.gl.deleteVertexArray(this.array);
+    this.buffers.forEach((buffer) => this.on.gl.deleteBuffer(buffer));
+    this.on = null;
+  }
+}

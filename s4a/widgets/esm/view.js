@@ -1,0 +1,174 @@
+// Cameras of one name move together, also between widgets.
+function camera(name, turn) {
+  const all = (globalThis.s4aCameras ??= new Map());
+  const found = (name && all.get(name)) || { views: new Set(), home: [...turn], turn: [...turn], zoom: 1, pan: [0, 0] };
+  if (name) all.set(name, found);
+  return found;
+}
+
+class View {
+  constructor(parent, { turn, group = "", height = 360, label = "surface", onPick, onHover }) {
+    Object.assign(this, { surfaces: [], points: [], onPick, onHover, group });
+    this.canvas = document.createElement("canvas");
+    Object.assign(this.canvas, { className: "s4a-view", tabIndex: 0, view: this });
+    this.canvas.setAttribute("role", "img");
+    this.canvas.setAttribute("aria-label", `${label}: drag or arrow keys turn, wheel or + and - zoom, shift and drag move, 0 resets`);
+    this.canvas.style.height = `${height}px`;
+    parent.append(this.canvas);
+    this.camera = camera(group, turn);
+    this.camera.views.add(this);
+    this.observer = new ResizeObserver(() => this.redraw());
+    this.observer.observe(this.canvas);
+    this.listen();
+  }
+  moved() { this.camera.views.forEach((view) => view.redraw()); }
+  listen() {
+    const canvas = this.canvas;
+    let last = null, travel = 0;
+    canvas.addEventListener("pointerdown", (e) => {
+      canvas.setPointerCapture(e.pointerId);
+      canvas.focus({ preventScroll: true });
+      last = [e.clientX, e.clientY];
+      travel = 0;
+    });
+    canvas.addEventListener("pointermove", (e) => {
+      if (!last) return this.onHover?.(this.pick(e));
+      const dx = e.clientX - last[0], dy = e.clientY - last[1];
+      last = [e.clientX, e.clientY];
+      travel += Math.abs(dx) + Math.abs(dy);
+      if (e.shiftKey || e.buttons > 1) this.shift(dx, dy);
+      else this.rotate(dx * 0.01, dy * 0.01);
+    });
+    canvas.addEventListener("pointerup", (e) => {
+      if (last && travel < 4) this.onPick?.(this.pick(e));
+      last = null;
+    });
+    canvas.addEventListener("contextmenu", (e) => e.preventDefault());
+    canvas.addEventListener("dblclick", () => this.reset());
+    canvas.addEventListener("wheel", (e) => {
+      if (document.activeElement !== canvas) return; // the page scrolls until the view was clicked
+      e.preventDefault();
+      this.scale(Math.exp(-0.0015 * e.deltaY));
+    }, { passive: false });
+    canvas.addEventListener("keydown", (e) => {
+      const act = {
+        ArrowLeft: () => this.rotate(-0.1, 0), ArrowRight: () => this.rotate(0.1, 0),
+        ArrowUp: () => this.rotate(0, -0.1), ArrowDown: () => this.rotate(0, 0.1),
+        "+": () => this.scale(1.1), "=": () => this.scale(1.1), "-": () => this.scale(1 / 1.1), 0: () => this.reset(),
+      }[e.key];
+      if (!act || e.ctrlKey || e.metaKey) return;
+      e.preventDefault();
+      e.stopPropagation();
+      act();
+    });
+  }
+  rotate(a, b) {
+    const [r, u, t] = [0, 3, 6].map((i) => this.camera.turn.slice(i, i + 3));
+    const mix = (x, y, c, s) => x.map((v, i) => c * v + s * y[i]);
+    const right = mix(r, t, Math.cos(a), Math.sin(a)), side = mix(t, r, Math.cos(a), -Math.sin(a));
+    this.camera.turn = [...right, ...mix(u, side, Math.cos(b), -Math.sin(b)), ...mix(side, u, Math.cos(b), Math.sin(b))];
+    this.moved();
+  }
+  shift(dx, dy) {
+    const { clientWidth: w, clientHeight: h } = this.canvas, [x, y] = this.camera.pan;
+    this.camera.pan = [x + dx / Math.min(w, h), y - dy / Math.min(w, h)];
+    this.moved();
+  }
+  scale(factor) {
+    this.camera.zoom = Math.min(40, Math.max(0.2, this.camera.zoom * factor));
+    this.moved();
+  }
+  reset(turn = this.camera.home) {
+    Object.assign(this.camera, { home: [...turn], turn: [...turn], zoom: 1, pan: [0, 0] });
+    this.moved();
+  }
+  fit(P) { // the ball around the box's centre that holds the surface
+    const low = [Infinity, Infinity, Infinity], high = low.map((x) => -x);
+    for (let i = 0; i < P.length; i++) {
+      low[i % 3] = Math.min(low[i % 3], P[i]);
+      high[i % 3] = Math.max(high[i % 3], P[i]);
+    }
+    const centre = low.map((x, i) => (x + high[i]) / 2);
+    let r2 = 0;
+    for (let i = 0; i < P.length; i += 3) r2 = Math.max(r2, (P[i] - centre[0]) ** 2 + (P[i + 1] - centre[1]) ** 2 + (P[i + 2] - centre[2]) ** 2);
+    this.frame = { centre, radius: Math.sqrt(r2) || 1 };
+  }
+  placement() {
+    const { clientWidth: w, clientHeight: h } = this.canvas, { zoom, pan } = this.camera, half = Math.min(w, h) / 2;
+    const scale = (0.97 * zoom * half) / this.frame.radius;
+    return { w, h, scale, x: 2 * half * pan[0], y: 2 * half * pan[1] };
+  }
+  redraw() {
+    if (this.waiting) return;
+    this.waiting = requestAnimationFrame(() => { this.waiting = 0; this.draw(); });
+  }
+  draw() {
+    const on = context(), { w, h, scale, x, y } = this.frame && this.canvas.clientWidth ? this.placement() : {};
+    if (!on || !w || !this.surfaces.length) return;
+    const { gl, at } = on, ratio = Math.min(2, globalThis.devicePixelRatio || 1);
+    const W = Math.round(w * ratio), H = Math.round(h * ratio);
+    if (gl.canvas.width < W) gl.canvas.width = W;
+    if (gl.canvas.height < H) gl.canvas.height = H;
+    gl.viewport(0, 0, W, H);
+    gl.clearColor(1, 1, 1, 1); // the background is fixed, so that colours mean the same in every theme
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    const R = this.camera.turn;
+    gl.uniformMatrix3fv(at.turn, true, R);
+    gl.uniform3f(at.centre, ...this.frame.centre);
+    gl.uniform4f(at.place, (2 * scale) / w, (2 * scale) / h, (2 * x) / w, (2 * y) / h);
+    gl.uniform1f(at.depth, 1 / (4 * this.frame.radius));
+    [...this.surfaces].sort((a, b) => b.opacity - a.opacity).forEach((surface) => surface.draw(on));
+    this.drawPoints(on, ratio);
+    if (this.canvas.width !== W || this.canvas.height !== H) Object.assign(this.canvas, { width: W, height: H });
+    this.canvas.getContext("2d").drawImage(gl.canvas, 0, gl.canvas.height - H, W, H, 0, 0, W, H);
+    this.frames = (this.frames || 0) + 1;
+  }
+  drawPoints({ gl, at }, ratio) { // [x, y, z, red, green, blue, pixels] each; few
+    gl.bindVertexArray(null);
+    for (const [x, y, z, r, g, b, size] of this.points) {
+      gl.vertexAttrib3f(0, x, y, z);
+      gl.vertexAttrib3f(1, 0, 0, 1);
+      gl.vertexAttrib3f(2, r, g, b);
+      gl.uniform1f(at.point, (size || 12) * ratio);
+      gl.drawArrays(gl.POINTS, 0, 1);
+    }
+  }
+  // What of the first surface lies under the pointer: triangle, weights, nearest corner and point; null for a miss.
+  pick(e) {
+    const surface = this.surfaces[0], box = this.canvas.getBoundingClientRect();
+    if (!surface || !this.frame || !this.canvas.clientWidth) return null;
+    const { w, h, scale, x, y } = this.placement(), R = this.camera.turn, c = this.frame.centre;
+    const px = (e.clientX - box.left - w / 2 - x) / scale, py = (h / 2 - (e.clientY - box.top) - y) / scale;
+    const { position: P, corner: T } = surface, n = P.length / 3;
+    const U = new Float32Array(n), V = new Float32Array(n), Z = new Float32Array(n);
+    for (let i = 0, j = 0; i < n; i++, j += 3) {
+      const a = P[j] - c[0], b = P[j + 1] - c[1], d = P[j + 2] - c[2];
+      U[i] = R[0] * a + R[1] * b + R[2] * d - px;
+      V[i] = R[3] * a + R[4] * b + R[5] * d - py;
+      Z[i] = R[6] * a + R[7] * b + R[8] * d;
+    }
+    let best = null, depth = -Infinity;
+    for (let t = 0; t < T.length; t += 3) {
+      const i = T[t], j = T[t + 1], k = T[t + 2];
+      const wi = U[j] * V[k] - U[k] * V[j], wj = U[k] * V[i] - U[i] * V[k], wk = U[i] * V[j] - U[j] * V[i];
+      if (!((wi >= 0 && wj >= 0 && wk >= 0) || (wi <= 0 && wj <= 0 && wk <= 0))) continue;
+      const sum = wi + wj + wk;
+      if (!sum) continue;
+      const z = (wi * Z[i] + wj * Z[j] + wk * Z[k]) / sum;
+      if (z > depth) [depth, best] = [z, { face: t / 3, weights: [wi / sum, wj / sum, wk / sum] }];
+    }
+    if (!best) return null;
+    const corners = [0, 1, 2].map((m) => T[3 * best.face + m]);
+    best.vertex = corners[best.weights.indexOf(Math.max(...best.weights))];
+    best.point = [0, 1, 2].map((m) => corners.reduce((s, v, q) => s + best.weights[q] * P[3 * v + m], 0));
+    return best;
+  }
+  dispose() {
+    this.observer.disconnect();
+    cancelAnimationFrame(this.waiting);
+    this.camera.views.delete(this);
+    if (!this.camera.views.size && this.group) globalThis.s4aCameras.delete(this.group);
+    this.surfaces.forEach((surface) => surface.dispose());
+    this.canvas.remove();
+  }
+}

@@ -1,0 +1,92 @@
+"""All panels of a study as tabs; each is built when its tab is first opened."""
+
+import ipywidgets
+
+from s4a.widgets.correspondence import Correspondence
+from s4a.widgets.functional import FunctionalMap
+from s4a.widgets.median import Median
+from s4a.widgets.modes import Modes
+from s4a.widgets.network import Network
+from s4a.widgets.panel import LAYOUT, close_all
+from s4a.widgets.spectrum import Spectrum
+
+PANELS = {
+    "Modes": Modes,
+    "Network": Network,
+    "Functional map": FunctionalMap,
+    "Median": Median,
+    "Correspondence": Correspondence,
+    "Spectrum": Spectrum,
+}
+
+
+class Explore(ipywidgets.VBox):
+    """Tabs over a study.
+
+    Parameters
+    ----------
+    study : xarray.DataTree
+        Finished or not; the tab of a stage that is not there yet says what is missing.
+    **options
+        Given to every panel: ``view`` and ``up``.
+
+    Attributes
+    ----------
+    panels : dict
+        Title of the tab -> panel, of those that were opened.
+    """
+
+    def __init__(self, study, **options):
+        self.study, self.options, self.panels = study, options, {}
+        self.tabs = ipywidgets.Tab(children=[ipywidgets.VBox() for _ in PANELS], titles=list(PANELS))
+        super().__init__([self.tabs], layout=LAYOUT)
+        self.tabs.observe(self.fill, "selected_index")
+        self.fill()
+
+    def fill(self, change=None):
+        """Build the panel of the selected tab, or say why there is none."""
+        title = list(PANELS)[self.tabs.selected_index or 0]
+        box = self.tabs.children[self.tabs.selected_index or 0]
+        if title in self.panels:
+            return
+        for child in box.children:
+            close_all(child)
+        try:
+            self.panels[title] = PANELS[title](self.study, **self.options)
+            box.children = [self.panels[title]]
+        except ValueError as error:
+            box.children = [ipywidgets.HTML(f'<p role="status">{error}</p>')]
+
+    def refresh(self, study):
+        """Show a newer state of the study, for example while it is being computed."""
+        self.study = study
+        for panel in self.panels.values():
+            panel.close()
+        self.panels.clear()
+        self.fill()
+
+    def __getitem__(self, title):
+        """The panel of a tab, which is opened for it."""
+        self.tabs.selected_index = list(PANELS).index(title)
+        return self.panels[title]
+
+    def close(self):
+        """Close all panels."""
+        close_all(self)
+
+
+def explore(study, *, view="corner", up="z"):
+    """Tabs over a finished or running study: modes, network, maps, median, correspondence and spectrum.
+
+    Parameters
+    ----------
+    study : xarray.DataTree
+        As :func:`s4a.analyse` or :func:`s4a.open_study` give it.
+    view, up
+        From where surfaces are seen first, and which axis points up; see :func:`s4a.draw.rotation`.
+
+    Returns
+    -------
+    Explore
+    """
+    return Explore(study, view=view, up=up)

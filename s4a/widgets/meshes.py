@@ -1,0 +1,23 @@
+"""The surfaces of a study as a panel shows them: every shape moved onto the template, at low or full resolution."""
+
+from uuid import uuid4
+
+from s4a.picture import aligned, mesh_of
+
+RESOLUTIONS = [("low resolution", "coarse"), ("full resolution", "original")]
+
+
+def surface(study, name, stage="coarse"):
+    """Aligned positions and triangles of a shape at the stage ``coarse`` or ``original``."""
+    X, T = mesh_of(study[stage][name])
+    return aligned(study, name, X), T
+
+
+def camera_group():
+    """A name that no other panel has: the views of one panel turn together, those of two panels do not."""
+    return uuid4().hex
+
+
+def available(study):
+    """The resolutions that the study holds, as the options of a switch."""
+    return [(text, stage) for text, stage in RESOLUTIONS if stage in study.children and study[stage].children]
