@@ -92,7 +92,7 @@ def accuracy(study, image, *, n_geodesic=0, n_jobs=None):
     Returns
     -------
     xarray.Dataset
-        ``error(method, shape)`` in a straight line and ``geodesic_error(method, shape)``, both as shares of
+        ``error(way, shape)`` in a straight line and ``geodesic_error(way, shape)``, both as shares of
         sqrt(area).  A matched vertex cannot be nearer to the truth than the sampling of the shape allows; the
         registered surface is not bound to vertices.
     """
@@ -115,8 +115,8 @@ def accuracy(study, image, *, n_geodesic=0, n_jobs=None):
     note = {"units": "share of sqrt(area)"}
     return xr.Dataset(
         {
-            name: (("method", "shape"), [[pair[i][m] for pair in found] for m in methods], note)
+            name: (("way", "shape"), [[pair[i][m] for pair in found] for m in methods], note)
             for i, name in enumerate(("error", "geodesic_error"))
         },
-        {"method": methods, "shape": shapes},
+        {"way": methods, "shape": shapes},
     )

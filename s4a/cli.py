@@ -1,4 +1,4 @@
-"""Command line: ``s4a check | run | demo | view``.  Every option of :func:`s4a.analyse` is a flag of ``s4a run``."""
+"""Command line: ``s4a check | run | demo | view | transfer``; every option of :func:`s4a.analyse` is a flag of run."""
 
 import argparse
 import inspect
@@ -12,10 +12,13 @@ from pathlib import Path
 import numpy as np
 
 from s4a import accuracy, synthetic
+from s4a import transfer as travel
+from s4a.annotations import labels_of_file, labels_of_mesh, read_labels, read_landmarks, write_landmarks
 from s4a.draw import VIEWS
+from s4a.io import read_mesh
 from s4a.picture import write_picture
 from s4a.pipeline import CHOICES, analyse
-from s4a.shapes import read_shapes
+from s4a.shapes import read_shape, read_shapes
 from s4a.study import open_study
 from s4a.view import write_page
 
@@ -158,8 +161,8 @@ def error_table(errors):
     """Mean errors of :func:`s4a.accuracy.accuracy` over the shapes, a row per method."""
     mean = 100 * errors.mean("shape")
     rows = []
-    for method in mean["method"].values:
-        pair = [mean[name].sel({"method": method}).item() for name in ("error", "geodesic_error")]
+    for method in mean["way"].values:
+        pair = [mean[name].sel(way=method).item() for name in ("error", "geodesic_error")]
         rows.append([method, *("-" if np.isnan(e) else f"{e:.3f}" for e in pair)])
     return table(rows, ["mean error, % of sqrt(area)", "straight line", "along edges"])
 
@@ -198,6 +201,78 @@ def view(args):
     return 0
 
 
+def transfer(args):
+    """Labels and landmarks of one mesh on others."""
+    if not (args.labels or args.landmarks):
+        raise ValueError("something to transfer needed: give --labels FILE, --landmarks FILE or both")
+    source, label, landmarks = read_shape(args.source), None, None
+    if args.labels:
+        label = labels_of_mesh(read_labels(args.labels, source.sizes["file_vertex_index"]), source)
+    if args.landmarks:
+        landmarks = read_landmarks(args.landmarks)
+        distance = travel.locate(landmarks, source)["landmark_distance"].values
+        write(f"{len(distance)} landmarks, at most {distance.max():.3g} from the surface of {args.source}")
+    if len(args.targets) == 1 and (Path(args.targets[0]) / "registration.nc").is_file():
+        study, excluded = open_study(args.targets[0]), []
+    else:
+        shapes = read_shapes(args.targets)
+        report = shapes["report"].to_dataset()
+        excluded = report["shape"].values[report["status"].values == "excluded"].tolist()
+        meshes = {name: node.to_dataset() for name, node in shapes["original"].children.items()}
+        for name in excluded:
+            write(f"{name} excluded: {report['reason'].sel(shape=name).item()}")
+        template = next(n for n in ("template", "template_", "template__") if n not in meshes)
+        options = {"n_coarse": args.n_coarse, "k": args.k, "k_init": min(20, args.k), "n_jobs": args.n_jobs}
+        study = travel.register_pairs(source, meshes, name=template, seed=args.seed, **options)
+        source = None  # it is the template now
+    out = Path(args.out)
+    out.mkdir(parents=True, exist_ok=True)
+    write(table(transfer_rows(study, source, label, landmarks, out), TRANSFERRED))
+    return 1 if excluded else 0
+
+
+TRANSFERRED = ["target", "confidence", "share of votes", "labels of dropped vertices", "landmarks", "spread"]
+
+
+def transfer_rows(study, source, label, landmarks, out):
+    """Write the files of every target and give the rows of the table that is shown."""
+    given = {"source": source}
+    labels = None if label is None else travel.transfer_labels(study, label, **given)
+    points = None if landmarks is None else travel.transfer_landmarks(study, landmarks, **given)
+    targets = list((labels if points is None else points).children)
+    meshes = {name: study["original"][name].to_dataset() for name in targets}
+    stems = {name: Path(mesh.attrs.get("path") or name).stem for name, mesh in meshes.items()}
+    rows = []
+    for name, mesh in meshes.items():
+        stem = stems[name] if list(stems.values()).count(stems[name]) == 1 else name
+        row = [stem, *["-"] * 5]
+        if labels is not None:
+            found = labels[name]
+            value, dropped = labels_of_file(found["label"].values, mesh, file_points(mesh))
+            np.save(out / f"{stem}.labels.npy", value)
+            row[1:4] = [
+                f"{found['confidence'].mean().item():.2f}",
+                f"{found['label_share'].mean().item():.2f}",
+                dropped,
+            ]
+        if points is not None:
+            found = points[name]
+            write_landmarks(out / f"{stem}.landmarks.csv", found)
+            row[4] = f"{found['landmark_confidence'].mean().item():.2f}"
+            row[5] = f"{found['landmark_spread'].mean().item():.3g}" if "landmark_spread" in found else "-"
+        rows.append(row)
+    return rows
+
+
+def file_points(mesh):
+    """The vertices of a mesh's file; those that were kept, where the file is gone."""
+    if Path(mesh.attrs.get("path") or "").is_file():
+        return read_mesh(mesh.attrs["path"])[0]
+    points = np.full((mesh.sizes["file_vertex_index"], 3), np.nan)
+    points[mesh["file_vertex"].values] = mesh["position"].values
+    return points
+
+
 def write(text):
     sys.stdout.write(text + "\n")
 
@@ -234,6 +309,16 @@ def parser():
     sub.add_argument("--title", help="title of the page (default: name of the folder)")
     sub.add_argument("--view", default="corner", choices=list(VIEWS), help="from where (default: corner)")
     sub.add_argument("--up", default="z", choices=["x", "y", "z"], help="axis that points up (default: z)")
+    sub = command(transfer)
+    sub.add_argument("source", metavar="SOURCE", help="mesh file that the labels and landmarks belong to")
+    sub.add_argument("targets", nargs="+", metavar="TARGET", help="mesh files, folders or globs; or one study folder")
+    sub.add_argument("--labels", metavar="FILE", help="NPY, NPZ (FILE:NAME), CSV, GIFTI label or FreeSurfer annot")
+    sub.add_argument("--landmarks", metavar="FILE", help="Slicer .mrk.json, CSV name,x,y,z or MeshLab picked points")
+    sub.add_argument("--out", required=True, metavar="DIR", help="for <target>.labels.npy and <target>.landmarks.csv")
+    sub.add_argument("--n-coarse", type=int, default=6000, help=HELP["n_coarse"])
+    sub.add_argument("--k", type=int, default=100, help=HELP["k"])
+    sub.add_argument("--n-jobs", type=int, default=-1, help=HELP["n_jobs"])
+    sub.add_argument("--seed", type=int, default=0, help=HELP["seed"])
     return top
 
 

@@ -135,11 +135,11 @@ def badness(source, target, match, motion, *, n_samples=300, limit=0.5):
     return float(trip.mean() + gap.mean() + back_gap.mean())
 
 
-def best_candidate(source, target, starts, *, k=100, far=0.03):
-    """The best match at low resolution among several, by :func:`badness`.
+def candidates(source, target, starts, *, k=100, far=0.03):
+    """Matches at low resolution and their scores: every start as it is, and after joint rounds.
 
-    Every start enters as it is and after joint rounds in position and normal; where the best of these still scores
-    above `far`, rounds with spectral coordinates from the better start are tried too, as the shapes then differ much.
+    Where the best of these still scores above `far`, rounds with spectral coordinates from the better start are
+    tried too, as the shapes then differ much.
 
     Parameters
     ----------
@@ -149,12 +149,9 @@ def best_candidate(source, target, starts, *, k=100, far=0.03):
 
     Returns
     -------
-    name : str
-        ``"<start>"``, ``"<start>+joint"`` or ``"<start>+joint+spectral"``.
-    match : int ndarray (n_target,)
-    motion : tuple (R, t, c)
-    scores : dict
-        Badness of every candidate.
+    dict
+        ``"<start>"``, ``"<start>+joint"`` or ``"<start>+joint+spectral"`` -> :func:`badness`, match (n_target,) and
+        motion (R, t, c).
     """
     found = {}
 
@@ -168,5 +165,13 @@ def best_candidate(source, target, starts, *, k=100, far=0.03):
     if min(score for score, *_ in found.values()) > far:
         start = min(joint, key=joint.get)
         enter(f"{start}+joint+spectral", *low_rounds(source, target, starts[start], k=k, spectral=0.1))
-    best = min(found, key=lambda name: found[name][0])
-    return best, *found[best][1:], {name: score for name, (score, *_) in found.items()}
+    return found
+
+
+def finalists(found, *, margin=1.25):
+    """Names of the candidates whose score is within `margin` of the least, at most two, best first.
+
+    Scores at low resolution have the coarse sampling in them; near ones can only be told apart at full resolution.
+    """
+    order = sorted(found, key=lambda name: found[name][0])[:2]
+    return [name for name in order if found[name][0] <= margin * found[order[0]][0]]

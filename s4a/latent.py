@@ -165,7 +165,7 @@ def consistent_zoomout(
             return solve[j] @ Phi[i][match, :larger]
 
         C = np.stack(
-            Parallel(n_jobs=n_jobs, prefer="threads")(
+            Parallel(n_jobs=n_jobs, backend="threading")(
                 delayed(larger_map)(i, j) for i, j in zip(source, target, strict=True)
             )
         )

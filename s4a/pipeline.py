@@ -74,8 +74,8 @@ class Run:
         own = {os.getpid(): resource.getrusage(resource.RUSAGE_SELF).ru_maxrss}
         self.memory[name] = sum((self.workers | own).values()) / 1024
 
-    def tasks(self, stage, function, tasks, *, each=True):
-        """Do the tasks (name, file, key, arguments) whose file is not done.
+    def tasks(self, stage, function, tasks, *, each=True, made_from=None):
+        """Do the tasks (name, file, key, arguments) whose file is not done; `made_from` as of :func:`s4a.study.write`.
 
         A ValueError is kept as a failure where the tasks are one for `each` shape, and raised where all need all.
         """
@@ -83,7 +83,7 @@ class Run:
             missing = [t for t in tasks if not study.is_done(self.folder / t[1], t[2])]
             log.info("%s: %d of %d to do", stage, len(missing), len(tasks))
             jobs = (
-                delayed(do_task)(function, name, self.folder / file, key, arguments)
+                delayed(do_task)(function, name, self.folder / file, key, arguments, (made_from or {}).get(name, []))
                 for name, file, key, arguments in missing
             )
             results = Parallel(n_jobs=self.n_jobs, return_as="generator_unordered")(jobs)
@@ -95,11 +95,11 @@ class Run:
                     self.failures[name] = f"{stage}: {failure}"
 
 
-def do_task(function, name, path, key, arguments):
+def do_task(function, name, path, key, arguments, made_from):
     """Compute one Dataset and write its file; with one BLAS thread, as tasks run side by side."""
     try:
         with threadpool_limits(1):
-            study.write(function(*arguments), path, key)
+            study.write(function(*arguments), path, key, made_from)
         failure = ""
     except ValueError as error:
         failure = str(error)
@@ -160,31 +160,34 @@ def low_shape(folder, name):
     return (X - w @ X) / np.sqrt(area.sum()), w, Phi, eigenvalue
 
 
-def alignment_task(folder, names, reference):
-    """Rigid motion of every shape onto the reference, for unit area and centred shapes."""
-    Y, area_y, *_ = low_shape(folder, reference)
-    motions = []
-    for name in names:
-        X, area, *_ = low_shape(folder, name)
-        motions.append(align(X, area, Y, area_y)[:2] if name != reference else (np.eye(3), np.zeros(3)))
-    R, t = (np.stack(part) for part in zip(*motions, strict=True))
-    return dataset({"reference": reference}, rotation=R, translation=t).assign_coords(shape=list(names))
+def alignment_task(folder, name, reference):
+    """Rigid motion of a shape onto the reference, both centred and for unit area."""
+    R, t = np.eye(3), np.zeros(3)
+    if name != reference:
+        (X, area, *_), (Y, area_y, *_) = low_shape(folder, name), low_shape(folder, reference)
+        R, t, _ = align(X, area, Y, area_y)
+    return dataset({"reference": reference}, rotation=R, translation=t)
 
 
-def relative_motion(alignment, source, target):
-    """The motion source -> target through the common reference."""
-    R, t = alignment["rotation"].sel(shape=source).values, alignment["translation"].sel(shape=source).values
-    Rt, tt = alignment["rotation"].sel(shape=target).values, alignment["translation"].sel(shape=target).values
-    return Rt.T @ R, Rt.T @ (t - tt)
+def motion_to_reference(folder, name):
+    """R and t of :func:`alignment_task`."""
+    motion = study.read(folder / "network" / f"motion_{name}.nc")
+    return motion["rotation"].values, motion["translation"].values
+
+
+def motion_between(source, target):
+    """The motion source -> target from the motions (R, t) of both onto a common reference."""
+    (R, t), (R_target, t_target) = source, target
+    return R_target.T @ R, R_target.T @ (t - t_target)
 
 
 def first_maps_task(folder, pairs, k_init, init):
     """First maps of some pairs, in both directions."""
-    alignment = study.read(folder / "network" / "alignment.nc")
     shapes = {name: low_shape(folder, name) for name in sorted({name for pair in pairs for name in pair})}
+    motions = {name: motion_to_reference(folder, name) for name in shapes}
     directed, maps = [], []
     for a, b in pairs:
-        R, t = realign(*shapes[a][:2], *shapes[b][:2], relative_motion(alignment, a, b))
+        R, t = realign(*shapes[a][:2], *shapes[b][:2], motion_between(motions[a], motions[b]))
         for s, g, motion in ((a, b, (R, t)), (b, a, (R.T, -R.T @ t))):
             directed.append((s, g))
             maps.append(network.first_map(shapes[s], shapes[g], motion, k_init=k_init, init=init))
@@ -240,7 +243,7 @@ def registration_task(folder, name, template, how, refine, scale):
         C = fmap.fmap_from_match(source.low.Phi[:, :k], target.low.Phi[:, :k], target.low.area, match)
         F_source, F_target = source.low.Phi[:, :k] @ C.T, target.low.Phi[:, :k]
         match = fmap.nearest_rows(F_target, F_source)
-    motion = relative_motion(study.read(folder / "network" / "alignment.nc"), name, template)
+    motion = motion_between(*(motion_to_reference(folder, n) for n in (name, template)))
     R, t = realign(source.low.X, source.low.area, target.low.X, target.low.area, motion)
     starts = {"intrinsic": match, "icp": cKDTree(source.low.X @ R.T + t).query(target.low.X)[1]}
     return register.registration(source, target, starts, (F_source, F_target), k=k, refine=refine, scale=scale)
@@ -348,11 +351,12 @@ def run_stages(run, given, options):
     )
     settings = (o["n_coarse"], o["wrap"], o["seed"], o["k"])
     names = [n for n in given if n not in run.failures]
-    key_of = {n: study.task_key(key_of[n], settings) for n in names}
+    key_of_original, key_of = key_of, {n: study.task_key(key_of[n], settings) for n in names}
     run.tasks(
         "remesh and spectrum",
         coarse_task,
         [(n, f"coarse/{n}.nc", key_of[n], (folder, n, *settings)) for n in names],
+        made_from={n: [key_of_original[n]] for n in names},
     )
     names = [n for n in names if n not in run.failures]
     if len(names) < 2:
@@ -367,8 +371,12 @@ def run_stages(run, given, options):
     pairs = [[names[i], names[j]] for i, j in network.choose_pairs(distance, o["n_pairs"])]
     reference = names[int(np.argmin(distance.sum(1)))]
     key = study.task_key([key_of[n] for n in names], names, reference)
-    align_all = ("alignment", "network/alignment.nc", key, (folder, names, reference))
-    run.tasks("align", alignment_task, [align_all], each=False)
+    run.tasks(
+        "align",
+        alignment_task,
+        [(n, f"network/motion_{n}.nc", study.task_key(key, n), (folder, n, reference)) for n in names],
+        each=False,
+    )
 
     k_init = min(o["k_init"], k_signature)
     size = max(4, -(-len(pairs) // 64))
@@ -388,26 +396,29 @@ def run_stages(run, given, options):
             first = xr.concat([study.read(folder / f) for f in files], dim="pair")
             n_threads = effective_n_jobs(run.n_jobs)
             net, lat = consistent_maps(folder, names, first, o, n_threads)
-            study.write(net, folder / "network.nc", key)
-            study.write(lat, folder / "latent.nc", key)
+            study.write(net, folder / "network.nc", key, list(key_of.values()))
+            study.write(lat, folder / "latent.nc", key, list(key_of.values()))
 
     template = o["template"] or study.read(folder / "latent.nc").attrs["median"]
     settings = (template, o["how"], o["refine"], o["scale"])
     X, T = as_arrays(study.read(folder / "original" / f"{template}.nc"))
     mesh = as_dataset(X, T, {"template": template}, vertex_area=vertex_areas(X, T))
-    study.write(mesh, folder / "registration.nc", study.task_key(key, template))
+    template_key = study.task_key(key, settings)
+    study.write(mesh, folder / "registration.nc", template_key, [key])
+    key_of = {n: study.task_key(template_key, key_of[n]) for n in names}
     run.tasks(
         "registration",
         registration_task,
-        [(n, f"registration/{n}.nc", study.task_key(key, key_of[n], settings), (folder, n, *settings)) for n in names],
+        [(n, f"registration/{n}.nc", key_of[n], (folder, n, *settings)) for n in names],
+        made_from={n: [template_key] for n in names},
     )
     with run.stage("modes"):
         names = [n for n in names if n not in run.failures]
-        no_modes = write_modes(folder, names, mesh, template)
-    write_report(run, given, options | {"template": template}, no_modes)
+        no_modes = write_modes(folder, names, mesh, template, [key_of[n] for n in names])
+    write_report(run, given, options | {"template": template}, no_modes, [key_of[n] for n in names])
 
 
-def write_modes(folder, names, mesh, template):
+def write_modes(folder, names, mesh, template, made_from):
     """Write ``/pca``; returns the reason where there can be none."""
     files = {n: study.read(folder / "registration" / f"{n}.nc") for n in names}
     data = study.stack_registration(mesh, files, names)["registration"]
@@ -417,11 +428,11 @@ def write_modes(folder, names, mesh, template):
         log.warning("no modes: %s", error)
         (folder / "pca.nc").unlink(missing_ok=True)
         return str(error)
-    study.write(modes, folder / "pca.nc")
+    study.write(modes, folder / "pca.nc", study.task_key(made_from), made_from)
     return ""
 
 
-def write_report(run, given, options, no_modes):
+def write_report(run, given, options, no_modes, made_from):
     """Write ``/report``: status and counts of every shape, times and memory of every stage, the options."""
     attrs = {}
     for name, (source, _) in given.items():
@@ -441,4 +452,5 @@ def write_report(run, given, options, no_modes):
         seconds=np.array(list(run.seconds.values())),
         peak_memory=np.array([run.memory[s] for s in run.seconds]),
     ).assign_coords(stage=list(run.seconds))
-    study.write(shape_report(attrs).assign(stages.variables).assign_attrs(stages.attrs), run.folder / "report.nc")
+    report = shape_report(attrs).assign(stages.variables).assign_attrs(stages.attrs)
+    study.write(report, run.folder / "report.nc", made_from=made_from)

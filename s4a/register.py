@@ -96,19 +96,22 @@ def register(source, target, match_low, embeddings, *, k=100, refine="joint"):
     image : float ndarray (n_target, 3)
         Registered template in the frame and unit of the source, smooth.
     info : dict
-        ``method`` (the candidate kept), ``score`` (its badness), ``score_<candidate>`` of each.
+        ``method`` (the candidate kept), ``score`` (its badness at full resolution), ``score_<candidate>`` of each at
+        low resolution.
     """
-    low, scores = ("intrinsic", match_low["intrinsic"], None), {}
-    if refine == "joint":
-        *low, scores = joint.best_candidate(source.low, target.low, match_low, k=k)
-    method, match, motion = low
-    info = {f"score_{name}": score for name, score in scores.items()}
-    if method == "intrinsic":
-        match, info["compared_share"] = intrinsic_match(source, target, *embeddings)
-        motion = onto(target.dense.X, source.dense.X[match], target.dense.area, target.dense.smooth)
-    else:
-        match, motion = joint.dense_rounds(source.dense, target.dense, motion)
-    info |= {"method": method, "score": joint.badness(source.dense, target.dense, match, motion)}
+    low = {} if refine == "intrinsic" else joint.candidates(source.low, target.low, match_low, k=k)
+    info = {f"score_{name}": score for name, (score, *_) in low.items()}
+    dense = {}
+    for name in joint.finalists(low) if low else ["intrinsic"]:
+        if name == "intrinsic":
+            match, info["compared_share"] = intrinsic_match(source, target, *embeddings)
+            motion = onto(target.dense.X, source.dense.X[match], target.dense.area, target.dense.smooth)
+        else:
+            match, motion = joint.dense_rounds(source.dense, target.dense, low[name][2])
+        dense[name] = joint.badness(source.dense, target.dense, match, motion), match, motion
+    method = min(dense, key=lambda name: dense[name][0])
+    score, match, motion = dense[method]
+    info |= {"method": method, "score": score}
     center, size = source.frame
     return match, joint.registered(target.dense, motion) * size + center, info
 
@@ -206,7 +209,9 @@ def match_pair(source, target, *, k_init=20, k=100, init="dense", refine="joint"
     xarray.Dataset
         ``fmap(mode_target, mode_source)`` after ZoomOut, ``fmap_initial``, ``match(vertex)`` = on each vertex of
         the target the matched vertex of the source, ``displacement(vertex, xyz)`` from the target to the source
-        after rigid alignment (unit of the input), ``confidence(vertex)``; attrs ``score`` (see
+        after rigid alignment (unit of the input), ``confidence(vertex)``; ``rotation``, ``translation``, ``scale`` of
+        that alignment of the source; the way back, ``template_triangle(original_vertex)`` and
+        ``template_barycentric``, from the source's vertices to the target; attrs ``score`` (see
         :func:`s4a.joint.badness`) and ``method``.
 
     Raises
@@ -214,7 +219,6 @@ def match_pair(source, target, *, k_init=20, k=100, init="dense", refine="joint"
     ValueError
         When a mesh lacks its variables or an option is not one of those above.
     """
-    from s4a.network import first_map  # the first map is shared with the network
     from s4a.remesh import coarsen
     from s4a.spectral import spectrum
 
@@ -226,22 +230,24 @@ def match_pair(source, target, *, k_init=20, k=100, init="dense", refine="joint"
     for mesh, what in ((source, "source"), (target, "target")):
         require(mesh, "position", "corner_vertex", what=what)
         scans.append(Scan(mesh, spectrum(coarsen(mesh, n_coarse=n_coarse, seed=seed), k=k)))
-    M, N = scans
+    found, C, C0 = match_scans(*scans, k_init=k_init, k=k, init=init, refine=refine)
+    maps = dataset(fmap=C, fmap_initial=C0, match=found["registered_match"].values)
+    return maps.merge(found.drop_vars("registered_match")).assign_attrs(found.attrs)
+
+
+def match_scans(source, target, *, k_init=20, k=100, init="dense", refine="joint"):
+    """:func:`match_pair` for two :class:`Scan`: what :func:`registration` gives, the final and the first map."""
+    from s4a.network import first_map  # the first map is shared with the network
+
+    M, N = source, target
     motion = align(M.low.X, M.low.area, N.low.X, N.low.area)[:2]
-    C0 = first_map(*((s.low.X, s.low.area, s.low.Phi, s.eigenvalue) for s in scans), motion, k_init=k_init, init=init)
+    C0 = first_map(*((s.low.X, s.low.area, s.low.Phi, s.eigenvalue) for s in (M, N)), motion, k_init=k_init, init=init)
     k = min(k, M.low.Phi.shape[1], N.low.Phi.shape[1])
     C, match_low = fmap.zoomout(C0, M.low.Phi, N.low.Phi, N.low.area, k)
     near = cKDTree(M.low.X @ motion[0].T + motion[1]).query(N.low.X)[1]
-    found = registration(
-        M,
-        N,
-        {"intrinsic": match_low, "icp": near},
-        (M.low.Phi[:, :k] @ C.T, N.low.Phi[:, :k]),
-        k=k,
-        refine=refine,
-    )
-    maps = dataset(fmap=C, fmap_initial=C0, match=found["registered_match"].values)
-    return maps.merge(found[["displacement", "displacement_raw", "confidence"]]).assign_attrs(found.attrs)
+    starts = {"intrinsic": match_low, "icp": near}
+    embeddings = M.low.Phi[:, :k] @ C.T, N.low.Phi[:, :k]
+    return registration(M, N, starts, embeddings, k=k, refine=refine), C, C0
 
 
 def identity(target):

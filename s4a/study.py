@@ -6,6 +6,7 @@ its task (content, parameters, version) stands in its attributes and says whethe
 
 import hashlib
 import json
+import logging
 import os
 from contextlib import contextmanager
 from importlib.metadata import version
@@ -14,7 +15,10 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+log = logging.getLogger(__name__)
+
 ENGINE = "h5netcdf"
+UNREADABLE = (OSError, ValueError, KeyError, RuntimeError)
 VERSION = version("s4a")
 STACKED = (
     "registered_match",
@@ -41,13 +45,17 @@ def task_key(*parts):
     return digest.hexdigest()[:32]
 
 
-def write(data, path, key=""):
-    """Write a Dataset to `path` at once: under a temporary name in the same folder, then renamed."""
+def write(data, path, key="", made_from=()):
+    """Write a Dataset to `path` at once: under a temporary name in the same folder, then renamed.
+
+    `made_from` are the keys of the files that it was computed from; :func:`open_study` leaves a file out when one of
+    them is no longer there, as after a run with other options was stopped half-way.
+    """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        data.assign_attrs(task_key=key).to_netcdf(temporary, engine=ENGINE)
+        data.assign_attrs(task_key=key, made_from=" ".join(made_from)).to_netcdf(temporary, engine=ENGINE)
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -69,7 +77,7 @@ def is_done(path, key):
     """Whether the file of a task is there, whole, and of this key."""
     try:
         return attributes(path).get("task_key") == key
-    except (OSError, ValueError, KeyError, RuntimeError):  # absent, truncated, foreign: computed again
+    except UNREADABLE:  # absent, truncated, foreign: computed again
         return False
 
 
@@ -130,7 +138,8 @@ def open_study(folder):
     """Open a study folder, finished or not.
 
     Per-shape nodes are read when they are used; the stages that are there are in the tree, those that are not yet
-    computed are absent.  ``/registration`` is put together in memory.
+    computed are absent, as are files that cannot be read or were made from others than those now in the folder (both
+    are said in a warning of the log).  ``/registration`` is put together in memory.
 
     Parameters
     ----------
@@ -151,21 +160,36 @@ def open_study(folder):
         raise ValueError(
             f"{folder} is not a study folder: it has no folder 'original'; run `s4a run ... --out {folder}`"
         )
-    report = read(folder / "report.nc") if (folder / "report.nc").exists() else None
-    kept = None if report is None else set(report["shape"].values[report["status"].values != "excluded"].tolist())
-    nodes = {}
-    for stage in ("original", "coarse"):
-        for path in sorted((folder / stage).glob("[!.]*.nc")):
-            if kept is None or path.stem in kept:
-                nodes[f"{stage}/{path.stem}"] = xr.open_dataset(path, engine=ENGINE)
-    for stage in ("network", "latent", "pca", "report"):
-        if (folder / f"{stage}.nc").exists():
-            nodes[stage] = xr.open_dataset(folder / f"{stage}.nc", engine=ENGINE)
-    if (folder / "latent.nc").exists() and (folder / "registration.nc").exists():
-        template = read(folder / "registration.nc")
-        names = [n for n in nodes["latent"]["shape"].values.tolist() if kept is None or n in kept]
-        names = [n for n in names if (folder / "registration" / f"{n}.nc").exists()]
-        if names:
-            files = {n: read(folder / "registration" / f"{n}.nc") for n in names}
-            nodes |= stack_registration(template, files, names)
-    return xr.DataTree.from_dict(nodes, name=folder.name)
+    known = set()
+
+    def opened(name):
+        """The lazily opened file of that name, or None."""
+        path = folder / f"{name}.nc"
+        try:
+            data = xr.open_dataset(path, engine=ENGINE)
+        except FileNotFoundError:
+            return None
+        except UNREADABLE as error:
+            log.warning("%s cannot be read and is left out (%s); run the analysis again", path, error)
+            return None
+        if not known.issuperset(data.attrs.get("made_from", "").split()):
+            log.warning("%s belongs to an earlier run and is left out; run the analysis again", path)
+            return None
+        known.add(data.attrs.get("task_key"))
+        return data
+
+    names = sorted(path.stem for path in (folder / "original").glob("[!.]*.nc"))
+    nodes = {f"{stage}/{name}": opened(f"{stage}/{name}") for stage in ("original", "coarse") for name in names}
+    nodes |= {stage: opened(stage) for stage in ("network", "latent")}
+    template = opened("registration")
+    if template is not None:
+        files = {name: opened(f"registration/{name}") for name in nodes["latent"]["shape"].values.tolist()}
+        files = {name: data.load() for name, data in files.items() if data is not None}
+        if files:
+            nodes |= stack_registration(template.load(), files, list(files))
+    nodes |= {stage: opened(stage) for stage in ("pca", "report")}
+    if nodes["report"] is not None:
+        report = nodes["report"]
+        excluded = set(report["shape"].values[report["status"].values == "excluded"].tolist())
+        nodes = {name: data for name, data in nodes.items() if name.rpartition("/")[2] not in excluded}
+    return xr.DataTree.from_dict({n: data for n, data in nodes.items() if data is not None}, name=folder.name)

@@ -81,14 +81,18 @@ def test_a_wrong_match_scores_worse_than_a_right_one(surface):
     assert score(np.random.default_rng(0).permutation(every)) > 10 * right
 
 
-def test_the_best_candidate_has_the_least_score_and_says_its_name(surface):
+def test_the_finalists_are_the_candidates_of_least_score(surface):
     source = moved(surface, surface.X + bumps(surface.X))
     near = cKDTree(source.X).query(surface.X)[1]
     bad = np.zeros(len(near), int)
-    name, match, motion, scores = joint.best_candidate(source, surface, {"bad": bad, "icp": near}, k=60)
+    found = joint.candidates(source, surface, {"bad": bad, "icp": near}, k=60)
+    assert {"bad", "icp", "bad+joint", "icp+joint"} <= set(found)
+    name, *others = joint.finalists(found)
     assert name == "icp+joint"
-    assert scores[name] == min(scores.values())
-    assert {"bad", "icp", "bad+joint", "icp+joint"} <= set(scores)
+    score, match, motion = found[name]
+    assert score == min(s for s, *_ in found.values())
+    assert all(found[other][0] <= 1.25 * score for other in others)
+    assert "bad" not in others
     assert np.linalg.norm(joint.registered(surface, motion) - source.X, axis=1).mean() < 0.005
     assert len(match) == len(surface.X)
 

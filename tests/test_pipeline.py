@@ -182,7 +182,7 @@ def test_a_killed_run_goes_on_where_it_was(given, from_files, tmp_path):
         stderr=subprocess.DEVNULL,
     ) as run:
         deadline = time.monotonic() + 60
-        while not (work / "network" / "alignment.nc").exists() and run.poll() is None and time.monotonic() < deadline:
+        while not any((work / "network").glob("motion_*.nc")) and run.poll() is None and time.monotonic() < deadline:
             time.sleep(0.005)
         os.kill(run.pid, signal.SIGKILL)
     assert not (work / "report.nc").exists()
@@ -321,7 +321,7 @@ def test_the_registered_surface_is_four_times_nearer_to_the_truth_than_nearest_n
         found, lambda shape, template: synthetic.position(truth, shape, truth[template]["reference_point"].values)
     )["error"]
     methods = (accuracy.SURFACE, accuracy.MATCH, accuracy.ZOOMOUT, accuracy.ICP)
-    surface, matched, zoomout, icp = (errors.sel({"method": m}).values for m in methods)
+    surface, matched, zoomout, icp = (errors.sel(way=m).values for m in methods)
     assert surface.mean() < icp.mean() / 4
     assert matched.mean() < zoomout.mean() / 2
     assert (surface < matched).all()
