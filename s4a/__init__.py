@@ -9,6 +9,8 @@ reading and cleaning      :func:`read_shapes`, :func:`clean`, :func:`write_mesh`
 4.1 pairs                 :func:`match_pair`
 4.2, 6.1 collections      :func:`analyse`, :func:`open_study`, :func:`synthesize`
 notebooks                 :func:`explore`
+6.2 transfer              :func:`transfer_labels`, :func:`transfer_landmarks`, :func:`transfer_scalars`,
+                          :func:`register_pairs`
 the embedded collection   :mod:`s4a.synthetic`
 ========================  ====================================================================
 """
@@ -26,6 +28,7 @@ from s4a.remesh import coarsen
 from s4a.shapes import read_shape, read_shapes
 from s4a.spectral import reconstruct, spectrum
 from s4a.study import open_study
+from s4a.transfer import register_pairs, transfer_labels, transfer_landmarks, transfer_scalars
 from s4a.view import write_page
 
 __version__ = version("s4a")
@@ -40,9 +43,13 @@ __all__ = [
     "read_shape",
     "read_shapes",
     "reconstruct",
+    "register_pairs",
     "spectrum",
     "synthesize",
     "synthetic",
+    "transfer_labels",
+    "transfer_landmarks",
+    "transfer_scalars",
     "write_mesh",
     "write_page",
 ]

@@ -73,6 +73,15 @@ TABLE = {
     "confidence": (("shape", "vertex"), ONE, "confidence of the match, 0 to 1"),
     "template_triangle": (("original_vertex",), ONE, "template triangle on which the vertex of the shape lies"),
     "template_barycentric": (("original_vertex", "corner"), ONE, "barycentric weights in that triangle"),
+    # what travels along a registration (6.2)
+    "label_share": (("vertex",), ONE, "share of the votes that the label of the vertex has, 0 to 1"),
+    "label_vote": (("vertex", "label_value"), ONE, "share of the votes for every label, rows sum to 1"),
+    "field": (("vertex",), ONE, "scalar field"),
+    "landmark_triangle": (("landmark",), ONE, "triangle of the mesh on which the landmark lies"),
+    "landmark_barycentric": (("landmark", "corner"), ONE, "barycentric weights of the landmark in that triangle"),
+    "landmark_confidence": (("landmark",), ONE, "confidence of the match at the landmark, 0 to 1"),
+    "landmark_distance": (("landmark",), INPUT, "distance of the given landmark from the surface it is marked on"),
+    "landmark_spread": (("landmark",), INPUT, "distance between the positions that different ways of transfer give"),
     # modes (6.1)
     "mean_displacement": (("vertex", "xyz"), INPUT, "mean of the displacements"),
     "deformation": (("component", "vertex", "xyz"), INPUT, "deformation of one standard deviation along the component"),

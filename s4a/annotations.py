@@ -1,0 +1,251 @@
+"""Files of labels and landmarks (6.2): read and write what experts marked on a mesh, in the order of its file."""
+
+import csv
+import json
+import xml.etree.ElementTree as ElementTree
+import zipfile
+from pathlib import Path
+
+import nibabel
+import numpy as np
+from scipy.spatial import cKDTree
+
+from s4a.schema import dataset, require
+
+MIRROR = np.array([-1.0, -1.0, 1.0])  # between RAS and LPS
+
+
+def read_labels(path, n=None):
+    """One label per vertex from a file.
+
+    Parameters
+    ----------
+    path : str or Path
+        NPY; NPZ, ``FILE.npz:NAME`` where several arrays fit; CSV or text, a row per vertex, with a header the column
+        ``label`` and, where there is one, the index ``vertex``; GIFTI label (.gii); FreeSurfer .annot.
+    n : int, optional
+        Number of vertices in the file of the mesh.
+
+    Returns
+    -------
+    ndarray (n,)
+        Integers or strings.
+
+    Raises
+    ------
+    ValueError
+        When the file is missing, is no label file, or has not `n` values.
+    """
+    file, _, name = str(path).partition(".npz:")
+    file = Path(f"{file}.npz" if name else file)
+    if not file.is_file():
+        raise ValueError(f"no file {file}")
+    kind = file.suffix.lower()
+    readers = {".npy": np.load, ".gii": _gifti_labels, ".annot": _annot_labels}
+    try:
+        if kind == ".npz" or zipfile.is_zipfile(file):
+            labels = _npz_labels(file, name, n)
+        else:
+            labels = np.asarray(readers.get(kind, _text_labels)(file))
+    except Exception as error:  # whatever the file holds, the message must name it
+        raise ValueError(f"{path} cannot be read as labels: {error or type(error).__name__}") from error
+    labels = labels[:, 0] if labels.ndim == 2 and labels.shape[1] == 1 else labels
+    if labels.ndim != 1 or (n is not None and len(labels) != n):
+        wanted = "one label per vertex" if n is None else f"{n} labels, one per vertex of the file of the mesh,"
+        raise ValueError(f"{path}: {wanted} needed, found an array of shape {labels.shape}")
+    if labels.dtype.kind == "f":
+        whole = np.round(labels)
+        if not (whole == labels).all():
+            raise ValueError(f"{path}: labels need whole numbers or names, found {labels[whole != labels][0]}")
+        labels = whole.astype(np.int64)
+    if labels.dtype.kind not in "iubU":
+        raise ValueError(f"{path}: labels need whole numbers or names, found {labels.dtype}")
+    return labels
+
+
+def _npz_labels(file, name, n):
+    with np.load(file, allow_pickle=False) as arrays:
+        fitting = [key for key in arrays if arrays[key].ndim == 1 and n in (None, len(arrays[key]))]
+        if name and name not in arrays:
+            raise ValueError(f"no array {name!r}; it has {', '.join(arrays)}")
+        if not name and len(fitting) != 1:
+            shapes = ", ".join(f"{key} {arrays[key].shape}" for key in arrays)
+            wanted = "one array" if n is None else f"one array of {n} values"
+            raise ValueError(f"{wanted} needed, found {shapes}; name it as {file.name}:NAME")
+        return arrays[name or fitting[0]]
+
+
+def _gifti_labels(file):
+    image = nibabel.load(file)
+    found = image.get_arrays_from_intent("NIFTI_INTENT_LABEL")
+    found = found or [a for a in image.darrays if a.data.ndim == 1]
+    if not found:
+        raise ValueError("a GIFTI array of labels needed, found none")
+    return found[0].data
+
+
+def _annot_labels(file):
+    return nibabel.freesurfer.read_annot(file)[0]
+
+
+def _rows(file):
+    """Rows of a table separated by commas, semicolons, tabs or spaces; comments and empty lines are left out."""
+    lines = [s for s in file.read_text("utf-8-sig").splitlines() if s.strip() and not s.startswith("#")]
+    if not lines:
+        raise ValueError("the file is empty")
+    mark = next((m for m in ",;\t" if m in lines[0]), " ")
+    return [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=mark, skipinitialspace=True)]
+
+
+def _is_number(text):
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _text_labels(file):
+    rows = _rows(file)
+    head = [cell.lower() for cell in rows[0]]
+    if "label" in head:
+        values = [row[head.index("label")] for row in rows[1:]]
+    elif len(head) == 1:
+        values = [row[0] for row in rows]
+    else:
+        raise ValueError(f"a column 'label' needed, found {', '.join(rows[0])}")
+    labels = np.array([float(v) for v in values]) if all(map(_is_number, values)) else np.array(values)
+    if "label" in head and "vertex" in head:
+        vertex = np.array([row[head.index("vertex")] for row in rows[1:]]).astype(int)
+        if not np.array_equal(np.sort(vertex), np.arange(len(vertex))):
+            raise ValueError(f"the column 'vertex' needs every index from 0 to {len(vertex) - 1} once")
+        labels = labels[np.argsort(vertex)]
+    return labels
+
+
+def read_landmarks(path):
+    """Named points from a file.
+
+    Parameters
+    ----------
+    path : str or Path
+        3D Slicer .mrk.json (points or the control points of curves), CSV ``name,x,y,z`` (a header is optional), or the
+        XML of MeshLab's picked points (.pp).
+
+    Returns
+    -------
+    Dataset
+        ``landmark_name(landmark)``, ``landmark_position(landmark, xyz)``; attribute ``coordinate_system``, RAS
+        or LPS where the file says which, else empty.
+
+    Raises
+    ------
+    ValueError
+        When the file is missing or holds no points.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ValueError(f"no file {path}")
+    try:
+        head = path.read_text("utf-8-sig").lstrip()[:1]
+        reader = {"{": _slicer_points, "<": _meshlab_points}.get(head, _table_points)
+        names, points, system = reader(path)
+        points = np.array(points, float).reshape(-1, 3)
+        if len(points) == 0 or not np.isfinite(points).all():
+            raise ValueError(f"points with finite coordinates needed, found {len(points)}")
+    except Exception as error:
+        raise ValueError(f"{path} cannot be read as landmarks: {error or type(error).__name__}") from error
+    names = [name or str(i + 1) for i, name in enumerate(names)]
+    return dataset({"coordinate_system": system}, landmark_name=np.array(names), landmark_position=points)
+
+
+def _slicer_points(path):
+    lists = json.loads(path.read_text("utf-8-sig"))["markups"]
+    systems = {str(m.get("coordinateSystem", "LPS")).upper() for m in lists}
+    if len(systems) != 1 or not systems <= {"LPS", "RAS"}:
+        raise ValueError(
+            f"one coordinateSystem, LPS or RAS, needed, found {', '.join(sorted(systems)) or 'no markups'}"
+        )
+    points = [p for m in lists for p in m["controlPoints"] if p.get("positionStatus", "defined") == "defined"]
+    return [p.get("label", "") for p in points], [p["position"] for p in points], systems.pop()
+
+
+def _meshlab_points(path):
+    points = [p for p in ElementTree.fromstring(path.read_text("utf-8-sig")).iter("point") if p.get("active") != "0"]
+    return [p.get("name", "") for p in points], [[p.get(axis) for axis in "xyz"] for p in points], ""
+
+
+def _table_points(path):
+    rows = _rows(path)
+    head = [cell.lower() for cell in rows[0]]
+    if all(axis in head for axis in "xyz"):
+        x = [head.index(axis) for axis in "xyz"]
+        name = next((head.index(n) for n in ("name", "label", "landmark") if n in head), None)
+        rows = rows[1:]
+    elif len(head) in (3, 4) and all(map(_is_number, rows[0][-3:])):
+        x, name = range(len(head) - 3, len(head)), 0 if len(head) == 4 else None
+    else:
+        raise ValueError(f"the columns name, x, y and z needed, found {', '.join(rows[0])}")
+    return ["" if name is None else row[name] for row in rows], [[row[i] for i in x] for row in rows], ""
+
+
+def write_landmarks(path, landmarks):
+    """Write ``landmark_name`` and ``landmark_position`` of a Dataset as CSV ``name,x,y,z``."""
+    require(landmarks, "landmark_name", "landmark_position", what="landmarks")
+    with open(path, "w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file)
+        table.writerow(["name", "x", "y", "z"])
+        names, points = landmarks["landmark_name"].values, landmarks["landmark_position"].values
+        table.writerows([name, *(repr(float(v)) for v in x)] for name, x in zip(names, points, strict=True))
+
+
+def labels_of_mesh(labels, mesh):
+    """Labels numbered as in the file of a mesh, for the vertices of the cleaned mesh.
+
+    Raises
+    ------
+    ValueError
+        When there is not one label per vertex of the file.
+
+    Examples
+    --------
+    >>> mesh = dataset(file_vertex=[2, 0], vertex_of_file=[1, -1, 0])
+    >>> labels_of_mesh(np.array([5, 6, 7]), mesh).tolist()
+    [7, 5]
+    """
+    require(mesh, "file_vertex", "vertex_of_file", what="mesh")
+    n = mesh.sizes["file_vertex_index"]
+    if np.shape(labels) != (n,):
+        raise ValueError(f"{n} labels, one per vertex of the file of the mesh, needed, found shape {np.shape(labels)}")
+    return np.asarray(labels)[mesh["file_vertex"].values]
+
+
+def labels_of_file(labels, mesh, points):
+    """Labels of a cleaned mesh, for the vertices as numbered in its file.
+
+    Parameters
+    ----------
+    labels : ndarray (n,)
+        One per vertex of the cleaned mesh.
+    mesh : Dataset
+        With ``position`` and ``vertex_of_file``.
+    points : float ndarray (p, 3)
+        The vertices of the file.
+
+    Returns
+    -------
+    labels : ndarray (p,)
+        A vertex that cleaning dropped has that of the nearest vertex that was kept; one that is not finite has that of
+        the vertex before it in the file.
+    n_dropped : int
+    """
+    require(mesh, "position", "vertex_of_file", what="mesh")
+    vertex = mesh["vertex_of_file"].values.copy()
+    if len(points) != len(vertex):
+        raise ValueError(f"the {len(vertex)} vertices of the file of the mesh needed, found {len(points)}")
+    dropped = vertex < 0
+    known = dropped & np.isfinite(points).all(axis=1)
+    vertex[known] = cKDTree(mesh["position"].values).query(points[known])[1]
+    last = np.maximum.accumulate(np.where(vertex >= 0, np.arange(len(vertex)), -1))
+    vertex = np.where(last >= 0, vertex[last], 0)
+    return np.asarray(labels)[vertex], int(dropped.sum())

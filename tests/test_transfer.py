@@ -1,0 +1,352 @@
+"""Transfer (6.2): labels, landmarks and fields on known correspondences, the files, the command, real templates."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import nibabel
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from s4a import (
+    clean,
+    cli,
+    match_pair,
+    read_shape,
+    register_pairs,
+    synthetic,
+    transfer_labels,
+    transfer_landmarks,
+    transfer_scalars,
+    write_mesh,
+)
+from s4a.annotations import labels_of_file, labels_of_mesh, read_labels, read_landmarks, write_landmarks
+from s4a.link import at, closest_facing_point, closest_point, elect, interpolation
+from s4a.mesh import as_arrays, as_dataset, vertex_areas
+from s4a.schema import dataset
+from s4a.transfer import locate, pair_study
+
+DATA = Path(__file__).parents[2] / "shared" / "data"
+OPTIONS = {"n_coarse": 1200, "k": 60}
+
+
+@pytest.fixture(scope="module")
+def tree():
+    return synthetic.brains(3, 5000, seed=2)
+
+
+@pytest.fixture(scope="module")
+def meshes(tree):
+    return {name: node.to_dataset() for name, node in tree["original"].children.items()}
+
+
+@pytest.fixture(scope="module")
+def size(meshes):
+    return np.sqrt(vertex_areas(*as_arrays(meshes["brain_01"])).sum())
+
+
+@pytest.fixture(scope="module")
+def study(meshes):
+    """The first brain registered to the two others, one pair after the other, both ways."""
+    others = {name: mesh for name, mesh in meshes.items() if name != "brain_01"}
+    return register_pairs(meshes["brain_01"], others, name="brain_01", **OPTIONS)
+
+
+@pytest.fixture(scope="module")
+def moved(meshes):
+    """The first brain with its vertices in another order, turned and shifted; and the order."""
+    X, T = as_arrays(meshes["brain_01"])
+    order = np.random.default_rng(0).permutation(len(X))
+    R = Rotation.from_euler("zyx", [20, 10, -15], degrees=True).as_matrix()
+    return clean(as_dataset((X @ R.T + [30, -20, 5])[order], np.argsort(order)[T])), order, R
+
+
+def distance(a, b):
+    return np.linalg.norm(a - b, axis=-1)
+
+
+def test_labels_and_landmarks_of_a_moved_and_renumbered_copy_are_exact(meshes, moved, size):
+    mesh = meshes["brain_01"]
+    copy, order, R = moved
+    study = pair_study(match_pair(copy, mesh, **OPTIONS), copy, mesh)
+    label = np.arange(mesh.sizes["vertex"])  # every vertex its own
+    found = transfer_labels(study, label)["source"]
+    assert (found["label"].values == order).all()
+    assert found["label_share"].values == pytest.approx(1, abs=1e-4)
+    assert found["confidence"].values == pytest.approx(1, abs=1e-3)
+    landmarks = mesh[["landmark_name", "landmark_position"]]
+    place = transfer_landmarks(study, landmarks)["source"]
+    exact = locate(landmarks, mesh)["landmark_position"].values @ R.T + [30, -20, 5]
+    assert distance(place["landmark_position"].values, exact).max() < 1e-4 * size
+    assert place["landmark_name"].values.tolist() == list(synthetic.LANDMARKS)
+    back = transfer_landmarks(study, place, source="source")["target"]
+    assert distance(back["landmark_position"].values, locate(landmarks, mesh)["landmark_position"]).max() < 1e-4 * size
+
+
+def test_labels_of_deformed_brains_are_nearly_right_and_better_than_by_the_nearest_vertex(study, meshes):
+    found = transfer_labels(study, meshes["brain_01"]["label"].values)
+    assert set(found.children) == {"brain_02", "brain_03"}
+    for name, node in found.children.items():
+        true = meshes[name]["label"].values
+        right = node["label"].values == true
+        near = cKDTree(meshes["brain_01"]["position"]).query(meshes[name]["position"])[1]
+        assert right.mean() > 0.95
+        assert right.mean() > (meshes["brain_01"]["label"].values[near] == true).mean() + 0.1
+        assert node["label_share"].values[right].mean() > node["label_share"].values[~right].mean() + 0.1
+        assert 0 < node["confidence"].values.min() <= node["confidence"].values.max() <= 1
+
+
+def test_landmarks_lie_inside_triangles_of_the_shape_and_near_the_truth(study, meshes, size):
+    landmarks = meshes["brain_01"][["landmark_name", "landmark_position"]]
+    for name, node in transfer_landmarks(study, landmarks).children.items():
+        X, T = as_arrays(meshes[name])
+        point = node["landmark_position"].values
+        on = at(X, T, node["landmark_triangle"].values, node["landmark_barycentric"].values)
+        assert distance(point, on).max() < 1e-9 * size
+        error = distance(point, meshes[name]["landmark_position"].values)
+        nearest_vertex = distance(X[cKDTree(X).query(meshes[name]["landmark_position"])[1]], point)
+        assert error.mean() < 0.01 * size
+        assert nearest_vertex.min() > 0
+        assert (node["landmark_spread"].values < 0.03 * size).all()
+
+
+def test_a_shape_gives_its_labels_through_the_template_to_the_others(study, meshes):
+    label = meshes["brain_02"]["label"].values
+    found = transfer_labels(study, label, source="brain_02", votes=True)
+    assert set(found.children) == {"brain_01", "brain_03"}
+    for name, node in found.children.items():
+        assert (node["label"].values == meshes[name]["label"].values).mean() > 0.93
+        assert node["label_vote"].sum("label_value").values == pytest.approx(1, abs=1e-4)
+        assert node["label_value"].values.tolist() == np.unique(label).tolist()
+
+
+def test_named_labels_travel_too(study, meshes):
+    names = np.array(synthetic.LABELS)[meshes["brain_01"]["label"].values]
+    found = transfer_labels(study, names, targets=["brain_02"])["brain_02"]["label"].values
+    numbers = transfer_labels(study, meshes["brain_01"]["label"].values, targets=["brain_02"])["brain_02"]["label"]
+    assert (found == np.array(synthetic.LABELS)[numbers.values]).mean() > 0.999
+
+
+def test_fields_are_interpolated_and_unknown_values_stay_unknown(study, meshes, tree, size):
+    field = meshes["brain_01"]["position"].values[:, 1].copy()
+    found = transfer_scalars(study, field)["brain_02"]["field"].values
+    u = tree["truth/brain_02/reference_point"].values
+    exact = synthetic.position(tree["truth"], "brain_01", u)[:, 1]
+    assert np.abs(found - exact).mean() < 0.01 * size
+    field[:2500] = np.nan
+    some = transfer_scalars(study, field)["brain_02"]["field"].values
+    assert 0.2 < np.isnan(some).mean() < 0.8
+    known = np.isfinite(some)
+    assert np.abs(some - found)[known].mean() < 0.005 * size
+
+
+def test_matching_both_ways_is_symmetric_and_one_way_is_possible(study, meshes):
+    one = register_pairs(meshes["brain_01"], {"a": meshes["brain_02"]}, both=False, **OPTIONS)
+    assert "reverse" not in one.children
+    label = meshes["brain_01"]["label"].values
+    a = transfer_labels(one, label)["a"]["label"].values
+    b = transfer_labels(study, label)["brain_02"]["label"].values
+    assert (a == b).mean() > 0.95
+
+
+def test_the_label_with_most_votes_wins_and_ties_go_to_the_first():
+    W = sp.csr_matrix([[0.5, 0.2, 0.3], [0.3, 0.3, 0.4], [0.5, 0.5, 0.0]])
+    winner, vote, value = elect(W, np.array(["b", "a", "a"]))
+    assert winner.tolist() == ["a", "a", "a"]
+    assert value.tolist() == ["a", "b"]
+    assert vote[1] == pytest.approx([0.7, 0.3])
+
+
+def test_interpolation_is_exact_for_linear_functions_and_walls_are_not_crossed():
+    X, T = as_arrays(synthetic.sphere(500))
+    P = np.random.default_rng(1).normal(size=(50, 3))
+    P /= np.linalg.norm(P, axis=1, keepdims=True)
+    found = closest_point(P, X, T)
+    assert interpolation(T, *found, len(X)) @ X == pytest.approx(at(X, T, *found))
+    assert distance(at(X, T, *found), P).max() < 0.02
+    shell = np.concatenate([X, 0.99 * X])  # a wall, its inner side turned inwards
+    both = np.concatenate([T, T[:, ::-1] + len(X)])
+    for normal, side in ((1, T.max() + 1), (-1, 2 * len(X))):
+        triangle, _ = closest_facing_point(0.994 * P, normal * P, shell, both)
+        assert (both[triangle].max(1) < side).all()
+        assert (both[triangle].min(1) >= side - len(X)).all()
+
+
+def test_wrong_sources_targets_and_lengths_are_refused(study, meshes):
+    label = meshes["brain_01"]["label"].values
+    with pytest.raises(ValueError, match="5000 vertices of the source, found shape \\(7,\\)"):
+        transfer_labels(study, label[:7])
+    with pytest.raises(ValueError, match="no shape 'brain_9' in the study; it has brain_01"):
+        transfer_labels(study, label, targets=["brain_9"])
+    with pytest.raises(ValueError, match="a registered study is needed"):
+        transfer_labels(study.drop_nodes("registration"), label)
+    with pytest.raises(ValueError, match="other than the template, 'x', needed; found none"):
+        register_pairs(meshes["brain_01"], {}, name="x")
+    far = dataset(landmark_name=np.array(["nose"]), landmark_position=np.array([[0.0, 0, 900]]))
+    with pytest.raises(ValueError, match=r"'nose' is .* away"):
+        transfer_landmarks(study, far)
+
+
+# files
+
+
+def test_every_label_file_gives_the_same_labels(tmp_path):
+    label = np.array([3, 0, 5, 3, 3])
+    np.save(tmp_path / "a.npy", label)
+    np.save(tmp_path / "float.npy", label.astype(float))
+    np.savez(tmp_path / "one.npz", labels=label, other=np.zeros(9))
+    np.savez(tmp_path / "two.npz", labels=label, other=label + 1)
+    (tmp_path / "plain.csv").write_text("\n".join(map(str, label)))
+    (tmp_path / "head.csv").write_text("vertex,label\n" + "\n".join(f"{i},{label[i]}" for i in (4, 3, 2, 1, 0)))
+    gifti = nibabel.gifti.GiftiImage(
+        darrays=[nibabel.gifti.GiftiDataArray(label.astype(np.int32), "NIFTI_INTENT_LABEL")]
+    )
+    nibabel.save(gifti, tmp_path / "a.label.gii")
+    colours = np.array([[i, i, i, 0, 0] for i in range(1, 7)])
+    nibabel.freesurfer.write_annot(tmp_path / "lh.annot", label, colours, list("abcdef"), fill_ctab=True)
+    for name in ("a.npy", "float.npy", "one.npz", "two.npz:labels", "plain.csv", "head.csv", "a.label.gii", "lh.annot"):
+        assert read_labels(tmp_path / name, 5).tolist() == label.tolist(), name
+    (tmp_path / "names.csv").write_text("label\nleft\nright\n")
+    assert read_labels(tmp_path / "names.csv", 2).tolist() == ["left", "right"]
+
+
+def test_a_wrong_label_file_is_named_with_what_was_expected_and_found(tmp_path):
+    np.save(tmp_path / "a.npy", np.arange(4))
+    np.save(tmp_path / "half.npy", np.array([0.5, 1]))
+    np.savez(tmp_path / "two.npz", p=np.arange(4), q=np.arange(4))
+    (tmp_path / "a.csv").write_text("p,q\n1,2\n")
+    for name, n, text in (
+        ("a.npy", 5, r"a.npy: 5 labels.* found an array of shape \(4,\)"),
+        ("half.npy", 2, "half.npy: labels need whole numbers or names, found 0.5"),
+        ("two.npz", 4, r"one array of 4 values needed, found p \(4,\), q \(4,\); name it as two.npz:NAME"),
+        ("two.npz:r", 4, "no array 'r'; it has p, q"),
+        ("a.csv", 1, "a column 'label' needed, found p, q"),
+        ("none.npy", 1, "no file .*none.npy"),
+    ):
+        with pytest.raises(ValueError, match=text):
+            read_labels(tmp_path / name, n)
+
+
+def test_every_landmark_file_gives_the_same_points(tmp_path):
+    points = [[1.5, 2, 3], [-4, 5.25, 6]]
+    control = [{"label": n, "position": p} for n, p in zip(("a", "b"), points, strict=True)]
+    skipped = {"label": "c", "position": [0, 0, 0], "positionStatus": "undefined"}
+    markup = {"markups": [{"coordinateSystem": "LPS", "controlPoints": [*control, skipped]}]}
+    (tmp_path / "a.mrk.json").write_text(json.dumps(markup))
+    (tmp_path / "a.csv").write_text("name,x,y,z\na,1.5,2,3\nb,-4,5.25,6\n")
+    (tmp_path / "plain.csv").write_text("a 1.5 2 3\nb -4 5.25 6\n")
+    (tmp_path / "a.pp").write_text(
+        '<!DOCTYPE PickedPoints><PickedPoints><point name="a" x="1.5" y="2" z="3" active="1"/>'
+        '<point x="-4" y="5.25" z="6" name="b"/><point x="0" y="0" z="0" name="c" active="0"/></PickedPoints>'
+    )
+    for name in ("a.mrk.json", "a.csv", "plain.csv", "a.pp"):
+        found = read_landmarks(tmp_path / name)
+        assert found["landmark_name"].values.tolist() == ["a", "b"], name
+        assert found["landmark_position"].values.tolist() == points, name
+        assert found.attrs["coordinate_system"] == ("LPS" if name == "a.mrk.json" else "")
+    write_landmarks(tmp_path / "out.csv", found)
+    assert (tmp_path / "out.csv").read_text().split() == ["name,x,y,z", "a,1.5,2.0,3.0", "b,-4.0,5.25,6.0"]
+    (tmp_path / "empty.csv").write_text("p,q\n1,2\n")
+    with pytest.raises(ValueError, match=r"empty.csv cannot be read as landmarks: the columns name, x, y and z needed"):
+        read_landmarks(tmp_path / "empty.csv")
+
+
+def test_lps_landmarks_find_their_place_on_a_ras_mesh(meshes):
+    mesh = meshes["brain_01"]
+    assert mesh.attrs["coordinate_system"] == "RAS"
+    X = mesh["position"].values[:40]
+    mirrored = dataset(landmark_name=np.array([str(i) for i in range(40)]), landmark_position=X * [-1, -1, 1])
+    mirrored.attrs["coordinate_system"] = "LPS"
+    unknown = mesh.assign_attrs(coordinate_system="")
+    for surface in (mesh, unknown):  # where the mesh says nothing, the frame in which the landmarks fit
+        found = locate(mirrored, surface)
+        assert found["landmark_position"].values == pytest.approx(X)
+        assert found["landmark_distance"].values == pytest.approx(0, abs=1e-9)
+    with pytest.raises(ValueError, match="RAS, LPS"):
+        locate(mirrored.assign_attrs(coordinate_system="RAS"), mesh, farthest=0.001)
+
+
+def test_landmarks_off_the_surface_are_brought_onto_it_and_the_distance_is_told():
+    mesh = synthetic.sphere(2000)
+    given = dataset(landmark_name=np.array(["a"]), landmark_position=np.array([[0, 0, 1.05]]))
+    found = locate(given, mesh)
+    assert found["landmark_distance"].values == pytest.approx(0.05, abs=2e-3)
+    assert np.linalg.norm(found["landmark_position"].values) == pytest.approx(1, abs=2e-3)
+
+
+def test_labels_are_numbered_as_in_the_file_and_dropped_vertices_have_the_nearest_label():
+    X, T = as_arrays(synthetic.sphere(300))
+    small, S = as_arrays(synthetic.sphere(20, radius=0.05))
+    points = np.concatenate([[[np.nan] * 3], small + [0, 0, 1.2], X])  # a broken vertex, a loose part, the sphere
+    mesh = clean(as_dataset(points, np.concatenate([S + 1, T + 21])))
+    height = (mesh["position"].values[:, 2] > 0).astype(int) + 1
+    label, dropped = labels_of_file(height, mesh, points)
+    assert dropped == 21
+    assert (label[1:21] == 2).all()
+    assert (label[21:] == (X[:, 2] > 0) + 1).all()
+    assert (labels_of_mesh(label, mesh) == height).all()
+    with pytest.raises(ValueError, match=r"321 labels, .* found shape \(300,\)"):
+        labels_of_mesh(height, mesh)
+
+
+def test_the_command_writes_labels_per_vertex_of_the_file_and_landmarks(tmp_path, meshes, capsys):
+    source, target = meshes["brain_01"], meshes["brain_02"]
+    loose, L = as_arrays(synthetic.sphere(50, radius=2.0))
+    X, T = as_arrays(target)
+    points = np.concatenate([loose + X[10] + 20, X])
+    write_mesh(tmp_path / "source.ply", *as_arrays(source))
+    write_mesh(tmp_path / "target one.obj", points, np.concatenate([L, T + len(loose)]))
+    np.save(tmp_path / "labels.npy", source["label"].values)
+    write_landmarks(tmp_path / "marks.csv", source)
+    given = ["--labels", tmp_path / "labels.npy", "--landmarks", tmp_path / "marks.csv", "--out", tmp_path / "out"]
+    given += ["--n-coarse", 1200, "--k", 60, "--n-jobs", 1]
+    command = ["transfer", tmp_path / "source.ply", tmp_path / "target one.obj", *given]
+    assert cli.main([str(a) for a in command]) == 0
+    label = np.load(tmp_path / "out" / "target one.labels.npy")
+    assert label.shape == (len(points),)
+    assert (label[50:] == target["label"].values).mean() > 0.93
+    rows = (tmp_path / "out" / "target one.landmarks.csv").read_text().splitlines()
+    assert rows[0] == "name,x,y,z"
+    place = read_landmarks(tmp_path / "out" / "target one.landmarks.csv")
+    assert distance(place["landmark_position"].values, target["landmark_position"].values).mean() < 4
+    assert "50" in capsys.readouterr().out.splitlines()[-1].split()
+    assert cli.main(["transfer", "a.ply", "b.ply", "--out", str(tmp_path)]) == 2
+    assert "--labels FILE" in capsys.readouterr().err
+
+
+# real data
+
+
+@pytest.fixture(scope="module")
+def templates(tmp_path_factory):
+    """Two cortical templates, fsaverage5 and conte69, left, and their labels."""
+    if not (DATA / "unpack.py").exists():
+        pytest.skip("needs the shared data")
+    folder = tmp_path_factory.mktemp("brains")
+    subprocess.run([sys.executable, DATA / "unpack.py", folder, "brains"], check=True, stdout=subprocess.DEVNULL)
+    meshes, labels = {}, {}
+    for name, mesh in (("fsa5", "fsa5_lh.gii"), ("conte69", "conte69_32k_lh.gii")):
+        meshes[name] = read_shape(folder / "brains" / mesh)
+        with np.load(folder / "brains" / f"labels_{name}_lh_then_rh.npz") as arrays:
+            labels[name] = arrays["aparc"][: meshes[name].sizes["vertex"]]
+    return meshes, labels
+
+
+def dice(found, true):
+    both = [2 * ((found == v) & (true == v)).sum() / ((found == v).sum() + (true == v).sum()) for v in np.unique(true)]
+    return np.mean(both)
+
+
+def test_the_parcellation_of_one_brain_template_comes_out_on_another(templates):
+    meshes, labels = templates
+    study = register_pairs(meshes["fsa5"], {"conte69": meshes["conte69"]})
+    found, true = transfer_labels(study, labels["fsa5"])["conte69"]["label"].values, labels["conte69"]
+    near = cKDTree(meshes["fsa5"]["position"]).query(meshes["conte69"]["position"])[1]
+    nearest = labels["fsa5"][near]
+    assert (nearest == true).mean() == pytest.approx(0.890, abs=0.001)
+    assert (found == true).mean() > 0.915
+    assert dice(found, true) > dice(nearest, true) + 0.02
