@@ -140,7 +140,6 @@ def consistent_zoomout(
         Weights and cycle errors of the final maps.
     Y, latent_eigenvalue : as of :func:`latent_basis`
     """
-    n = len(Phi)
     cycles = three_cycles(source.tolist(), target.tolist())
     sizes = [*range(C.shape[1], k, step), k]
     everything = [np.arange(len(a)) for a in area]
@@ -152,7 +151,7 @@ def consistent_zoomout(
         if progress:
             progress(size)
         if larger is None:
-            return C, weight, error, Y, latent_eigenvalue
+            break
         vertices = everything if samples is None or larger == k else samples
         points = [np.asarray(Phi[i][v, :size] @ Y[i], np.float32) for i, v in enumerate(vertices)]
         solve = [
@@ -169,4 +168,4 @@ def consistent_zoomout(
                 delayed(larger_map)(i, j) for i, j in zip(source, target, strict=True)
             )
         )
-    raise AssertionError(f"no size reaches {k} for {n} shapes")
+    return C, weight, error, Y, latent_eigenvalue
