@@ -169,7 +169,7 @@ def plausible_scores(n, *, seed=None, limit=3.0):
 def color_limits(mean, triangles, deformation, *, sigma=3, n_modes=3):
     """Displacements of the full colours: along the normal, and in length.
 
-    The 99 % quantile over the vertices and the first modes at `sigma` standard deviations: one scale for all modes,
+    The 95 % quantile over the vertices and the first modes at `sigma` standard deviations: one scale for all modes,
     on which a few outlying vertices do not count.
 
     Returns
@@ -177,6 +177,6 @@ def color_limits(mean, triangles, deformation, *, sigma=3, n_modes=3):
     (float, float)
     """
     steps = deformation[:n_modes]
-    along = np.quantile(np.abs(normal_displacement(steps, vertex_normals(mean, triangles))), 0.99)
-    length = np.quantile(np.linalg.norm(steps, axis=2), 0.99)
+    along = np.quantile(np.abs(normal_displacement(steps, vertex_normals(mean, triangles))), 0.95)
+    length = np.quantile(np.linalg.norm(steps, axis=2), 0.95)
     return float(sigma * along) or 1.0, float(sigma * length) or 1.0

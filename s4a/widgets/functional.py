@@ -9,7 +9,7 @@ from s4a.fmap import off_diagonal_mass, orthogonality_error, swapped_blocks, zoo
 from s4a.spectral import unit_area
 from s4a.widgets.chart import chart
 from s4a.widgets.meshes import camera_group, surface
-from s4a.widgets.panel import Panel, beside, row
+from s4a.widgets.panel import Panel, beside, paragraph, row
 from s4a.widgets.scene import color_bar, scene
 
 STEP = 5
@@ -105,10 +105,12 @@ class FunctionalMap(Panel):
         )
         values = self.meshes[0]["eigenvalue"].values
         told = [f"{a}–{b} (eigenvalues {values[a]:.1f}–{values[b]:.1f})" for a, b in blocks]
-        swapped = f" Exchanged among each other, framed: modes {', '.join(told)}." if told else " No swapped blocks."
-        self.numbers.value = (
+        more = f" and {len(told) - 3} more" if len(told) > 3 else ""
+        swapped = f" Exchanged among each other, framed: modes {', '.join(told[:3])}{more}." if told else ""
+        self.numbers.value = paragraph(
             f"off the diagonal {off_diagonal_mass(C):.1%} of the squared entries; "
-            f"|CᵀC − I| / √k = {orthogonality_error(C):.3f}.{swapped} Blue is positive, red negative, −1 to 1."
+            f"|CᵀC − I| / √k = {orthogonality_error(C):.3f}.{swapped or ' No swapped blocks.'} "
+            "Blue is positive, red negative, −1 to 1."
         )
 
     def show_cell(self):

@@ -8,7 +8,7 @@ from s4a.median import NORMS, distance_to_identity, near_ties
 from s4a.picture import names_of
 from s4a.widgets.chart import chart
 from s4a.widgets.meshes import available, camera_group, surface
-from s4a.widgets.panel import Panel, beside, row
+from s4a.widgets.panel import Panel, beside, paragraph, row
 from s4a.widgets.scene import scene
 
 OPERATORS = {"area": "area_difference", "conformal": "conformal_difference"}
@@ -65,7 +65,7 @@ class Median(Panel):
         self.median = self.names[self.order[0]]
         near = [self.names[i] for i in near_ties(self.distance)]
         others = f"Near ties, at most 5 % farther: {', '.join(near[1:])}." if near[1:] else "No other within 5 %."
-        self.ties.value = f"<b>The median is {self.median}</b>, at {self.distance.min():.4g}. {others}"
+        self.ties.value = paragraph(f"<b>The median is {self.median}</b>, at {self.distance.min():.4g}. {others}")
         self.draw_bars()
         if self.selected:
             self.show()

@@ -14,7 +14,7 @@ from s4a.widgets.scene import Surfaces, as_bytes, color_bar, scene, table
 def bars(limit, limit_magnitude, unit):
     """The colour bars of the three kinds of colours."""
     return {
-        "normal": color_bar(SIGNED, -limit, limit, f"compression · along the normal ({unit}) · expansion"),
+        "normal": color_bar(SIGNED, -limit, limit, f"compression · normal displacement ({unit}) · expansion"),
         "magnitude": color_bar("viridis", 0, limit_magnitude, f"distance from the mean ({unit})"),
         "none": {},
     }

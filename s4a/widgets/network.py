@@ -4,7 +4,7 @@ import ipywidgets
 import numpy as np
 import traitlets
 from matplotlib import colormaps
-from matplotlib.colors import to_hex
+from matplotlib.colors import ListedColormap, to_hex
 
 from s4a import charts
 from s4a.draw import position_colors
@@ -13,13 +13,17 @@ from s4a.network import choose_pairs, connectivity, spectral_distance
 from s4a.picture import names_of
 from s4a.widgets.chart import chart
 from s4a.widgets.meshes import camera_group, surface
-from s4a.widgets.panel import Panel, beside, row
+from s4a.widgets.panel import Panel, beside, paragraph, row
 from s4a.widgets.scene import color_bar, scene
 
 STAGES = [
     ("after Consistent ZoomOut", "cycle_error"),
     ("before Consistent ZoomOut", "cycle_error_initial"),
 ]
+
+
+# without the bright end, which is hard to see on white
+ERRORS = ListedColormap(colormaps["viridis_r"](np.linspace(0.15, 1, 256)))
 
 
 class Network(Panel):
@@ -55,6 +59,8 @@ class Network(Panel):
         )
         options = [("choose a map", -1), *((f"{s} → {t}", i) for i, (s, t) in enumerate(self.directed()))]
         self.choice = ipywidgets.Dropdown(options=options, value=-1, description="map")
+        self.where = ipywidgets.Dropdown(options=["circle", "shape differences"], description="places")
+        self.on_change(self.where, lambda _: self.draw())
         self.facts, self.bar = ipywidgets.HTML(), ipywidgets.HTML()
         self.graph, self.matrix = chart(), chart()
         group = camera_group()
@@ -65,11 +71,10 @@ class Network(Panel):
         self.on_change(self.graph, self.pick, "picked")
         self.on_change(self, self.show_edge, "edge")
         self.on_change(self, self.show_node, "node")
-        self.places = self.layout_of_nodes()
         self.draw()
         self.node = str(self.study["latent"].attrs.get("median", "")) or self.names[0]
         return [
-            row(self.stage, self.choice),
+            row(self.stage, self.choice, self.where),
             row(self.budget, self.facts),
             beside(ipywidgets.VBox([self.graph, self.bar]), self.matrix),
             beside(*self.scenes),
@@ -80,9 +85,13 @@ class Network(Panel):
         return list(zip(self.source, self.target, strict=True))
 
     def layout_of_nodes(self):
-        """Places ``(n, 2)``: the first two components of the area-based shape differences, or a circle."""
+        """Places ``(n, 2)``: a circle, or the first two components of the area-based shape differences."""
         latent = self.study["latent"].dataset
-        if latent.sizes.get("difference_component", 0) < 2 or not set(self.names) <= set(names_of(latent)):
+        if (
+            self.where.value == "circle"
+            or latent.sizes.get("difference_component", 0) < 2
+            or not set(self.names) <= set(names_of(latent))
+        ):
             return charts.on_circle(len(self.names))
         return latent["area_score"].sel(shape=self.names).values[:, :2]
 
@@ -96,15 +105,16 @@ class Network(Panel):
         ends = np.sort(np.stack(self.ends, axis=1), axis=1).tolist()
         self.shown = [i for i, pair in enumerate(ends) if tuple(pair) in kept]
         share = np.nan_to_num(values[self.shown] / top, nan=0.0)
+        places = self.layout_of_nodes()
         median = str(self.study["latent"].attrs.get("median", ""))
         self.graph.draw(
             "graph",
-            x=self.places[:, 0],
-            y=self.places[:, 1],
+            x=places[:, 0],
+            y=places[:, 1],
             names=self.names,
             source=self.ends[0][self.shown],
             target=self.ends[1][self.shown],
-            colors=[to_hex(color) for color in colormaps["viridis_r"](share)],
+            colors=[to_hex(color) for color in ERRORS(share)],
             values=values[self.shown],
             weights=network["weight"].values[self.shown],
             label="cycle error",
@@ -121,12 +131,12 @@ class Network(Panel):
         held = f", {len(self.shown)} maps of them in the study" if len(self.shown) < 2 * len(pairs) else ""
         known = values[np.isfinite(values)]
         middle = f"; median cycle error {np.median(known):.3f}" if len(known) else ""
-        self.facts.value = (
+        self.facts.value = paragraph(
             f"{len(pairs)} pairs{held}: {'connected' if c['components'] == 1 else 'NOT connected'}, "
             f"{c['triangles']} triangles, {c['in_no_triangle']} shapes in none, smallest degree "
             f"{c['smallest_degree']}, at most {c['diameter']} maps apart{middle}"
         )
-        colors = ",".join(color_bar("viridis_r", 0, top, "")["colors"])
+        colors = ",".join(color_bar(ERRORS, 0, top, "")["colors"])
         self.bar.value = (
             f'<div style="max-width:420px;height:12px;background:linear-gradient(90deg,{colors})"></div>'
             f'<div style="max-width:420px;display:flex;justify-content:space-between"><span>0</span>'

@@ -24,6 +24,11 @@ def close_all(widget):
     ipywidgets.Widget.close(widget)
 
 
+def paragraph(text):
+    """A paragraph of HTML, with the usual distance of lines."""
+    return f'<div style="line-height:1.4">{text}</div>'
+
+
 def row(*widgets):
     """Widgets side by side, on several lines where it is narrow."""
     return ipywidgets.HBox(widgets, layout={"flex_flow": "row wrap", "align_items": "center"})

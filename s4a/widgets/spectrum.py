@@ -11,6 +11,8 @@ from s4a.widgets.meshes import camera_group, surface
 from s4a.widgets.panel import Panel, beside, row
 from s4a.widgets.scene import color_bar, scene
 
+TITLES = ("Eigenvalues: click a curve", "The same, less Weyl's law")
+
 
 class Spectrum(Panel):
     """Eigenvalues with Weyl's line; one eigenfunction on the surface; the surface from its first k coefficients.
@@ -35,26 +37,27 @@ class Spectrum(Panel):
         self.k = ipywidgets.IntSlider(
             min(20, k), min=1, max=k, description="first k", continuous_update=False, layout=wide
         )
-        self.curves = chart()
+        self.curves, self.gaps = chart(), chart()
         group = camera_group()
         self.function = scene(group=group, view=view, up=up, height=300)
         self.rebuilt = scene(group=group, view=view, up=up, height=300)
         self.on_change(self.choice, lambda value: self.set_trait("shape", value))
         self.on_change(self.curves, self.pick, "picked")
+        self.on_change(self.gaps, self.pick, "picked")
         self.on_change(self.mode, lambda _: self.show_mode())
         self.on_change(self.k, lambda _: self.show_rebuilt())
         self.on_change(self, lambda _: self.take(), "shape")
         self.shape = self.names[0]
         return [
             row(self.choice),
-            self.curves,
+            beside(self.curves, self.gaps),
             beside(ipywidgets.VBox([self.mode, self.function]), ipywidgets.VBox([self.k, self.rebuilt])),
         ]
 
     def pick(self, mark):
         """The curve that was clicked."""
-        if mark["series"] > 0:
-            self.shape = self.names[mark["series"] - 1]
+        if mark["series"] in self.names:
+            self.shape = mark["series"]
 
     def take(self):
         """Another shape."""
@@ -67,24 +70,38 @@ class Spectrum(Panel):
         self.show_rebuilt()
 
     def draw(self):
-        """The eigenvalues of all shapes and Weyl's line."""
+        """The eigenvalues of all shapes, as they are and as they differ from Weyl's law."""
         longest = max(len(values) for values in self.values)
-        line = {"name": "Weyl: 4 π k", "x": np.arange(longest), "y": weyl(longest), "color": "#777777", "dash": "6 4"}
-        series = [line | {"wide": True, "legend": True}]
-        for name, values in zip(self.names, self.values, strict=True):
-            chosen = name == self.shape
-            text = f"{name}: the second eigenvalue {values[1]:.2f}, number {len(values) - 1} is {values[-1]:.1f}"
-            one = {"name": name, "x": np.arange(len(values)), "y": values, "text": text, "wide": chosen}
-            series.append(one | {"color": "#d55e00" if chosen else "#0072b2", "legend": chosen})
-        self.curves.draw(
-            "lines",
-            series=series,
-            marker=self.mode.value,
-            xlabel="mode k",
-            ylabel="eigenvalue, unit area",
-            title="Eigenvalues: click a curve to choose its shape",
-            width=640,
-        )
+        line = {"name": "Weyl: 4 π k", "x": np.arange(longest), "color": "#777777", "dash": "6 4", "legend": True}
+        order = sorted(range(len(self.names)), key=lambda i: self.names[i] == self.shape)  # the chosen one on top
+        for view, away, label in (
+            (self.curves, False, "eigenvalue, unit area"),
+            (self.gaps, True, "eigenvalue − 4 π k"),
+        ):
+            series = [line | {"wide": True, "y": weyl(longest) * (not away)}]
+            series += [self.curve(i, away) for i in order]
+            view.draw(
+                "lines",
+                series=series,
+                marker=self.mode.value,
+                xlabel="mode k",
+                ylabel=label,
+                title=TITLES[away],
+                legend="bottom",
+            )
+
+    def curve(self, i, away):
+        """The curve of a shape; from Weyl's law where it is drawn `away` from it."""
+        name, values, chosen = self.names[i], self.values[i], self.names[i] == self.shape
+        return {
+            "name": name,
+            "x": np.arange(len(values)),
+            "y": values - weyl(len(values)) * away,
+            "text": f"{name}: the second eigenvalue is {values[1]:.2f}, number {len(values) - 1} is {values[-1]:.1f}",
+            "wide": chosen,
+            "color": "#d55e00" if chosen else "#0072b2",
+            "legend": chosen,
+        }
 
     def show_mode(self):
         """One eigenfunction as colours."""

@@ -69,7 +69,7 @@ const line = (parent) => html(parent, "div", { class: "s4a-readout", "aria-live"
 
 function scatter(parent, spec, pick) {
   const { x, y, names, xlabel, ylabel, title, selected = -1, width = 360, height = 300 } = spec;
-  const frame = plot(parent, { width, height, x: bounds([...x, 0]), y: bounds([...y, 0]), xlabel, ylabel, title });
+  const frame = plot(parent, { width, height, x: bounds([...x, ...(spec.reach || [0])]), y: bounds([...y, ...(spec.reach || [0])]), xlabel, ylabel, title });
   const marks = x.map((_, i) => {
     const at = node(frame.svg, "circle", { cx: frame.X(x[i]), cy: frame.Y(y[i]), r: i === selected ? 7 : 5, fill: i === selected ? ORANGE : BLUE, stroke: "#fff" });
     if (names.length <= 60) node(frame.svg, "text", { x: frame.X(x[i]) + 7, y: frame.Y(y[i]) - 4, class: "s4a-small" }, names[i]);
@@ -109,11 +109,13 @@ function lines(parent, spec, pick) {
     const at = node(frame.svg, "g", { fill: s.color || BLUE, class: "s4a-series" });
     node(at, "path", { d, fill: "none", stroke: "transparent", "stroke-width": 9 });
     if (s.dots) s.x.forEach((v, i) => node(at, "circle", { cx: frame.X(v), cy: frame.Y(s.y[i]), r: 3.2 }));
-    return { at, value: { series: series.indexOf(s) }, text: s.text || s.name };
+    return { at, value: { series: s.name }, text: s.text || s.name };
   });
-  series.filter((s) => s.legend).forEach((s, i) => {
-    node(frame.svg, "line", { x1: frame.left + 10, x2: frame.left + 34, y1: frame.top + 10 + 15 * i, y2: frame.top + 10 + 15 * i, stroke: s.color || BLUE, "stroke-width": 2, "stroke-dasharray": s.dash || "" });
-    node(frame.svg, "text", { x: frame.left + 40, y: frame.top + 14 + 15 * i }, s.name);
+  const told = series.filter((s) => s.legend), below = spec.legend === "bottom";
+  told.forEach((s, i) => {
+    const x0 = below ? frame.right - 130 : frame.left + 10, y0 = below ? frame.bottom - 15 * (told.length - i) : frame.top + 10 + 15 * i;
+    node(frame.svg, "line", { x1: x0, x2: x0 + 24, y1: y0, y2: y0, stroke: s.color || BLUE, "stroke-width": 2, "stroke-dasharray": s.dash || "" });
+    node(frame.svg, "text", { x: x0 + 30, y: y0 + 4, class: "s4a-halo" }, s.name);
   });
   if (marker !== undefined) node(frame.svg, "line", { x1: frame.X(marker), x2: frame.X(marker), y1: frame.top, y2: frame.bottom, stroke: ORANGE, "stroke-width": 2 });
   reachable(drawn, line(parent), pick);
@@ -134,6 +136,7 @@ function graph(parent, spec, pick) {
     if (i === edge) node(at, "path", { d, stroke: INK, "stroke-width": 7 });
     node(at, "path", { d, stroke: colors[i], "stroke-width": i === edge ? 4 : 1 + 1.8 * (weights ? weights[i] : 0.3), class: "s4a-line" });
     const weight = weights ? `, weight ${short(weights[i])}` : "";
+    if (i === edge) svg.append(at);
     return { at, value: { edge: i }, text: `${names[s]} → ${names[t]}: ${spec.label} ${short(values[i])}${weight}` };
   });
   marks.push(...names.map((name, i) => {

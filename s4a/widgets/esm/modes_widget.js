@@ -145,15 +145,15 @@ function modesWidget({ model, el }) {
     const samples = model.get("samples"), names = model.get("names"), low = model.get("ratio_low");
     const sum = (values) => values.map((_, i) => values.slice(0, i + 1).reduce((a, b) => a + 100 * b, 0));
     const series = [{ y: sum(ratio), name: "full resolution", color: BLUE, dots: true, wide: true, legend: true }];
-    if (low.length) series.unshift({ y: sum(low), name: "low resolution", color: ORANGE, dash: "5 3", dots: true, legend: true });
+    if (low.length) series.push({ y: sum(low), name: "low resolution", color: ORANGE, dash: "5 3", dots: true, wide: true, legend: true });
     series.forEach((s) => {
       s.x = s.y.map((_, i) => i + 1);
       s.text = `${s.name}: ${s.y.map((v, i) => `${i + 1}: ${v.toFixed(1)} %`).slice(0, 12).join(", ")}`;
     });
-    lines(variancePart, { series, title: "Cumulative variance", xlabel: "number of components", ylabel: "%", ymin: 0, width: 400 }, () => {});
+    lines(variancePart, { series, title: "Cumulative variance", xlabel: "number of components", ylabel: "%", ymin: 0, width: 400, legend: "bottom" }, () => {});
     crosshair = scatter(scorePart, {
       x: samples.map((s) => s[0]), y: samples.map((s) => s[1] ?? 0), names, title: "Scores: click a shape to see it",
-      xlabel: "PC1 (σ)", ylabel: count > 1 ? "PC2 (σ)" : "", width: 400,
+      xlabel: "PC1 (σ)", ylabel: count > 1 ? "PC2 (σ)" : "", width: 400, reach: [-range, range],
     }, ({ index }) => { model.set("sample", index); set([...samples[index]]); });
   };
   const picture = () => {
