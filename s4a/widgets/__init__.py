@@ -13,7 +13,6 @@ from s4a.widgets.functional import FunctionalMap
 from s4a.widgets.median import Median
 from s4a.widgets.modes import Modes
 from s4a.widgets.network import Network
-from s4a.widgets.scene import Scene, scene
 from s4a.widgets.spectrum import Spectrum
 
 __all__ = [
@@ -23,8 +22,6 @@ __all__ = [
     "Median",
     "Modes",
     "Network",
-    "Scene",
     "Spectrum",
     "explore",
-    "scene",
 ]

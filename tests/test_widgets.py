@@ -1,0 +1,382 @@
+"""Panels without a browser: what they show equals the arrays, clicks do what they say, closing leaves nothing."""
+
+import json
+import logging
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import xarray as xr
+
+pytest.importorskip("anywidget")
+from ipywidgets.widgets import widget as registry  # the open widgets are counted in it
+
+import s4a
+from s4a.draw import position_colors
+from s4a.mesh import vertex_normals
+from s4a.picture import aligned, mesh_of
+from s4a.widgets import Correspondence, Explore, FunctionalMap, Median, Modes, Network, Spectrum
+from s4a.widgets import chart as chart_module
+from s4a.widgets import modes_view as modes_module
+from s4a.widgets import scene as scene_module
+from s4a.widgets.modes_view import StillModes, painted
+from s4a.widgets.scene import StillScene, color_bytes, scene
+
+
+@pytest.fixture(scope="module")
+def study():
+    return s4a.analyse(s4a.synthetic.brains(5, 1500, seed=1), n_coarse=400, k=24, k_init=10, n_jobs=1)
+
+
+@pytest.fixture
+def panel(study):
+    """Make a panel that is closed after the test, when nothing of it may be left."""
+    before, made = len(registry._instances), []
+
+    def make(kind, **options):
+        made.append(kind(study, **options))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+    assert len(registry._instances) == before
+
+
+def floats(data, columns=3):
+    return np.frombuffer(data, "<f4").reshape(-1, columns)
+
+
+def tetrahedron():
+    X = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    return X, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+
+
+# ---- scene
+
+
+def test_a_scene_holds_the_arrays_as_float32_and_uint32():
+    X, T = tetrahedron()
+    view = scene(title="solid")
+    view.show(X, T, position_colors(X))
+    assert (floats(view.position) == X.astype(np.float32)).all()
+    assert (np.frombuffer(view.corner, "<u4").reshape(-1, 3) == T).all()
+    assert len(view.color) == 12
+    view.over(X + 1, T)
+    assert (floats(view.ghost_position) == X + 1).all()
+    view.close()
+
+
+def test_unknown_colours_are_grey():
+    assert list(color_bytes([[np.nan] * 3, [0, 0.5, 1]])) == [153, 153, 153, 0, 128, 255]
+
+
+def test_without_webgl_a_still_picture_is_sent():
+    view = scene()
+    view.show(*tetrahedron())
+    assert view.still == b""
+    view.webgl = "no"
+    assert view.still[1:4] == b"PNG"
+    first = view.still
+    view.paint(np.tile([1.0, 0, 0], (4, 1)))
+    assert view.still != first
+    view.close()
+
+
+def test_a_still_picture_looks_from_where_the_view_stands():
+    X, T = tetrahedron()
+    pictures = []
+    for direction in ("front", "top"):
+        view = StillScene(view=direction)
+        view.show(X * [1, 2, 3], T)
+        pictures.append(view.image.value)
+        view.close()
+    assert pictures[0] != pictures[1]
+
+
+# ---- modes
+
+
+def test_the_vertices_are_the_mean_plus_the_sum_of_scores_times_modes(study, panel):
+    modes = panel(Modes)
+    modes.scores = [1.5, -2.0, 0.0, 0.25]
+    expected = s4a.synthesize(study, modes.scores)["position"].values
+    np.testing.assert_allclose(modes.vertices(), expected, atol=1e-4)
+    assert modes.view.scores == [1.5, -2.0, 0.0, 0.25]
+    assert modes.distance == pytest.approx(np.hypot(np.hypot(1.5, 2), 0.25))
+
+
+def test_the_browser_gets_mean_and_modes_as_they_are(study, panel):
+    modes = panel(Modes, resolution="full")
+    X = study["registration"]["position"].values + study["pca"]["mean_displacement"].values
+    assert (floats(modes.view.mean) == X.astype(np.float32)).all()
+    assert (floats(modes.view.deformation) == study["pca"]["deformation"].values.reshape(-1, 3)).all()
+    modes.resolution.value = "coarse"
+    assert len(floats(modes.view.mean)) == study["coarse"][study["registration"].attrs["template"]].sizes["vertex"]
+    assert len(floats(modes.view.deformation)) == 4 * len(floats(modes.view.mean))
+
+
+def test_a_random_shape_is_repeatable_and_within_three_standard_deviations(panel):
+    modes = panel(Modes)
+    assert modes.random(seed=3) == modes.random(seed=3)
+    assert max(map(abs, modes.scores)) <= 3
+
+
+def test_the_mesh_is_saved_with_its_displacement_along_the_normal(study, panel, tmp_path):
+    modes = panel(Modes)
+    modes.scores = [2.0, 0, 0, 0]
+    modes.save_mesh(tmp_path / "shape.ply")
+    np.testing.assert_allclose(s4a.read_mesh(tmp_path / "shape.ply")[0], modes.vertices(), atol=1e-3)
+    assert b"normal_displacement" in (tmp_path / "shape.ply").read_bytes()[:1000]
+    modes.save_mesh(tmp_path / "shape.obj")
+    assert (tmp_path / "shape.obj").exists()
+
+
+def test_fewer_modes_can_be_shown(panel):
+    modes = panel(Modes, n_modes=2)
+    assert len(modes.scores) == len(modes.view.ratio) == 2
+
+
+@pytest.fixture
+def bare(monkeypatch):
+    """As it is where anywidget is not installed."""
+    for module in (scene_module, chart_module, modes_module):
+        monkeypatch.setattr(module, "anywidget", None)
+
+
+def test_without_anywidget_every_panel_shows_pictures(study, panel, bare):
+    for kind in (Modes, Network, FunctionalMap, Median, Correspondence, Spectrum):
+        text = "".join(str(part.value)[:20] for part in parts_of(panel(kind)) if hasattr(part, "value"))
+        assert "PNG" in text, kind
+
+
+def parts_of(widget):
+    yield widget
+    for child in getattr(widget, "children", ()):
+        yield from parts_of(child)
+
+
+def test_without_anywidget_python_deforms(study, bare):
+    pca, (X, T) = study["pca"].dataset, mesh_of(study["registration"])
+    mean = X + pca["mean_displacement"].values
+    samples = pca["score"].values.tolist()
+    view = StillModes(
+        mean,
+        T,
+        pca["deformation"].values,
+        limits=(1.0, 1.0),
+        ratio=pca["explained_variance_ratio"].values.tolist(),
+        samples=samples,
+        names=[str(name) for name in pca["shape"].values],
+        unit="mm",
+        view="corner",
+        up="z",
+    )
+    still = view.shape.image.value
+    view.sliders[1].value = 2.0
+    assert view.scores == [0, 2.0, 0, 0]
+    assert view.shape.image.value != still
+    (points, _), colors = painted(view)
+    np.testing.assert_allclose(points, mean + 2 * pca["deformation"].values[1], atol=1e-5)
+    along = ((points - mean) * vertex_normals(mean, T)).sum(1)
+    assert colors[along.argmax()][2] > colors[along.argmax()][0], "blue is expansion"
+    view.choice.value = 0
+    assert view.scores == samples[0]
+
+
+# ---- network, maps
+
+
+def test_a_clicked_edge_shows_its_map_and_both_meshes(study, panel):
+    network = panel(Network)
+    network.graph.picked = {"edge": 3, "count": 1}
+    row = study["network"].dataset.isel(pair=network.edge)
+    assert network.matrix.spec["title"].startswith(f"{row['source'].item()} → {row['target'].item()}")
+    shown = np.frombuffer(network.matrix.values, "<f4").reshape(row["fmap"].shape)
+    assert (shown == row["fmap"].values.astype(np.float32)).all()
+    for view, key in zip(network.scenes, ("source", "target"), strict=True):
+        name = row[key].item()
+        X = aligned(study, name, study["coarse"][name]["position"].values)
+        assert (floats(view.position) == X.astype(np.float32)).all()
+    assert network.choice.value == network.edge
+
+
+def test_a_clicked_node_shows_its_mesh_alone(study, panel):
+    network = panel(Network)
+    network.edge = 0
+    network.graph.picked = {"node": 2, "count": 1}
+    assert network.node == network.names[2]
+    assert network.edge == -1
+    assert network.scenes[0].title == network.names[2]
+    assert network.scenes[1].layout.display == "none"
+
+
+def test_the_edge_budget_tells_how_the_network_hangs_together(panel):
+    network = panel(Network)
+    assert "10 pairs" in network.facts.value
+    network.budget.value = 4
+    assert re.search(r"4 pairs.*: connected, 0 triangles, 5 shapes in none", network.facts.value)
+    assert len(network.graph.spec["source"]) == 8
+    network.graph.picked = {"edge": 7, "count": 1}
+    assert network.edge == network.shown[7]
+
+
+def test_edges_are_coloured_before_and_after_on_one_scale(study, panel):
+    network = panel(Network)
+    bar, after = network.bar.value, network.graph.spec["values"]
+    network.stage.value = "cycle_error_initial"
+    assert network.bar.value == bar
+    assert network.graph.spec["values"] != after
+    np.testing.assert_allclose(network.graph.spec["values"], study["network"]["cycle_error_initial"].values)
+
+
+def test_zoomout_is_replayed_as_the_step_module_does_it(study, panel):
+    fmap = panel(FunctionalMap, pair=1)
+    fmap.kind.value = "zoomout"
+    row = study["network"].dataset.isel(pair=1)
+    source, target = (study["coarse"][row[key].item()] for key in ("source", "target"))
+    area = target["vertex_area"].values / target["vertex_area"].values.sum()
+    bases = source["eigenfunction"].values, target["eigenfunction"].values
+    C, _ = s4a.fmap.zoomout(row["fmap_initial"].values, *bases, area, 24)
+    np.testing.assert_allclose(fmap.C, C)
+    fmap.k.value = 10
+    np.testing.assert_array_equal(fmap.C, row["fmap_initial"].values)
+    assert "off the diagonal" in fmap.numbers.value
+
+
+def test_a_clicked_cell_shows_the_two_eigenfunctions(study, panel):
+    fmap = panel(FunctionalMap)
+    fmap.matrix.picked = {"row": 4, "column": 6, "count": 1}
+    assert fmap.cell == (4, 6)
+    value = study["network"]["fmap"].values[0, 4, 6]
+    assert fmap.scenes[1].caption == f"C[4, 6] = {value:.3f}"
+    eigenvalue = study["coarse"][fmap.source[0]]["eigenvalue"].values[6]
+    assert fmap.scenes[0].title.endswith(f"eigenvalue {eigenvalue:.2f}")
+
+
+# ---- median, correspondence, spectrum
+
+
+def test_bars_are_the_stored_distances_in_rising_order(study, panel):
+    median = panel(Median)
+    latent = study["latent"].dataset
+    np.testing.assert_allclose(median.bars.spec["values"], np.sort(latent["distance_to_median"].values))
+    assert median.median == latent.attrs["median"] == median.selected
+    median.bars.picked = {"index": 2, "count": 1}
+    assert median.selected == median.bars.spec["names"][2]
+    assert len(median.scene.ghost_position) > 0
+    assert "rank 3 of 5" in median.scene.caption
+
+
+def test_the_median_can_be_ranked_by_other_operators_norms_and_modes(study, panel):
+    median = panel(Median)
+    values = median.bars.spec["values"]
+    median.operator.value, median.modes.value = "conformal", 12
+    D = study["latent"]["conformal_difference"].values[:, :12, :12]
+    expected = s4a.median.distance_to_identity(D, study["latent"]["latent_eigenvalue"].values[:12])
+    np.testing.assert_allclose(median.bars.spec["values"], np.sort(expected))
+    assert median.bars.spec["values"] != values
+    assert "The median is" in median.ties.value
+
+
+def test_points_are_carried_there_and_back(study, panel):
+    both = panel(Correspondence)
+    match = study["registration"]["registered_match"].sel(shape=both.shape).values
+    both.scenes[0].picked = {"vertex": 17, "count": 1}
+    assert both.image == match[17]
+    assert both.scenes[1].points[0][:3] == both.pair[1][0][match[17]].tolist()
+    both.scenes[1].picked = {"vertex": 40, "count": 2}
+    node = study["registration"][both.shape]
+    corners = study["registration"]["corner_vertex"].values[node["template_triangle"].values[40]]
+    assert both.vertex in corners
+    assert both.image == 40
+
+
+@pytest.mark.parametrize("kind", ["low", "dense"])
+def test_the_match_of_the_latent_basis_can_be_shown(panel, kind):
+    both = panel(Correspondence)
+    both.map.value = kind
+    assert both.message.value == ""
+    assert len(both.match()) == len(both.pair[0][0])
+    colors = np.frombuffer(both.scenes[0].color, np.uint8).reshape(-1, 3)
+    shape = np.frombuffer(both.scenes[1].color, np.uint8).reshape(-1, 3)
+    assert (colors == shape[both.match()]).all()
+
+
+def test_confidence_is_shown_with_its_bar(study, panel):
+    both = panel(Correspondence)
+    both.colors.value = "confidence"
+    assert both.scenes[0].bar["label"].startswith("confidence")
+    assert len(both.scenes[1].color) == 3 * study["original"][both.shape].sizes["vertex"]
+
+
+def test_the_spectrum_shows_every_shape_beside_weyls_line(study, panel):
+    spectrum = panel(Spectrum)
+    series = {one["name"]: one["y"] for one in spectrum.curves.spec["series"]}
+    for name in study["coarse"].children:
+        np.testing.assert_allclose(series[name], study["coarse"][name]["eigenvalue"].values)
+    assert series["Weyl: 4 π k"][1] == pytest.approx(4 * np.pi)
+    spectrum.curves.picked = {"series": "brain_03", "count": 1}
+    assert spectrum.shape == "brain_03"
+    spectrum.k.value = 24
+    all_of_it = float(re.search(r"surface ([\d.e-]+)", spectrum.rebuilt.caption)[1])
+    spectrum.k.value = 5
+    assert float(re.search(r"surface ([\d.e-]+)", spectrum.rebuilt.caption)[1]) > all_of_it
+
+
+# ---- all of it
+
+
+def test_tabs_are_built_when_opened_and_leave_nothing(study):
+    before = len(registry._instances)
+    for _ in range(2):
+        tabs = study.s4a.explore()
+        assert list(tabs.panels) == ["Modes"]
+        for title in tabs.tabs.titles:
+            assert tabs[title].title
+        tabs.refresh(study)
+        tabs.close()
+    assert len(registry._instances) == before
+
+
+def test_an_unfinished_study_says_what_is_missing(study):
+    started = xr.DataTree.from_dict({f"coarse/{n}": c.to_dataset() for n, c in study["coarse"].children.items()})
+    tabs = Explore(started)
+    assert "pca/deformation" in tabs.tabs.children[0].children[0].value
+    assert tabs["Spectrum"].names == list(study["coarse"].children)
+    with pytest.raises(ValueError, match="network/source"):
+        Network(started)
+    tabs.refresh(study)
+    assert tabs["Modes"].scores == [0.0] * 4
+    tabs.close()
+
+
+def test_errors_in_callbacks_are_shown_and_logged(panel, caplog):
+    modes = panel(Modes)
+    modes.path.value = "shape.docx"
+    with caplog.at_level(logging.ERROR):
+        modes.ply.click()
+    assert "shape.docx" in modes.message.value
+    assert caplog.records
+
+
+def test_a_page_needs_nothing_from_elsewhere(panel, tmp_path):
+    for kind in (Modes, Network, FunctionalMap, Median, Correspondence, Spectrum):
+        text = panel(kind).save_html(tmp_path / "page.html").read_text(encoding="utf-8")
+        links = set(re.findall(r"(?:src|href)=[\"']?([^\"'> ]{1,12})|https?://[^\"'` )]+", text))
+        assert {link for link in links if link and not link.startswith("data:")} == set()
+        for state in re.findall(r'<script type="application/json"[^>]*>(.*?)</script>', text, re.DOTALL):
+            json.loads(state)
+
+
+def test_the_error_names_what_to_install(tmp_path):
+    code = (
+        "import sys; sys.modules['ipywidgets'] = None\n"
+        "import s4a\n"
+        "try: s4a.explore(None)\n"
+        "except ImportError as error: sys.stdout.write(str(error))"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert "pip install s4a[notebook]" in out
