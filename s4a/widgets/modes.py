@@ -11,6 +11,7 @@ from s4a.io import write_mesh
 from s4a.mesh import vertex_normals
 from s4a.pca import color_limits, deformed, low_vertices, mahalanobis, plausible_scores
 from s4a.picture import has, mesh_of, names_of
+from s4a.widgets.meshes import camera_group
 from s4a.widgets.modes_view import modes_view
 from s4a.widgets.panel import Panel, row
 
@@ -60,6 +61,7 @@ class Modes(Panel):
             else [],
             samples=pca["score"].values[:, :n_modes].tolist(),
             names=names_of(pca),
+            group=camera_group(),
             view=view,
             up=up,
         )

@@ -76,8 +76,12 @@ if anywidget is not None:
         def draw_still(self, change=None):
             """Send a still picture where the browser has no WebGL2."""
             if self.webgl == "no":
-                self.surface, self.painted = painted(self)
                 self.still = self.picture()
+
+        def picture(self):
+            """PNG bytes of the shape as the sliders stand."""
+            self.surface, self.painted = painted(self)
+            return super().picture()
 
 
 def painted(view):

@@ -38,6 +38,8 @@ def state_of(widget):
     """The state of a widget as JSON, bytes in base 64."""
     names = [name for name in widget.trait_names(sync=True) if not name.startswith("_") and name != "layout"]
     values = {name: getattr(widget, name) for name in names}
+    if "still" in values:  # for a browser without WebGL2: nobody will be there to draw it
+        values["still"] = widget.still or widget.picture()
     values = {
         name: {"base64": base64.b64encode(value).decode()} if isinstance(value, bytes) else value
         for name, value in values.items()

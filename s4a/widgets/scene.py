@@ -68,7 +68,9 @@ class Surfaces:
         self.points = [[*p, *c, size] for p, c in zip(points.tolist(), colors.tolist(), strict=True)]
 
     def picture(self):
-        """PNG bytes of the surface from where the view first stands."""
+        """PNG bytes of the surface from where the view first stands; empty without a surface."""
+        if self.surface is None:
+            return b""
         turn = np.reshape(self.turn, (3, 3))
         points, triangles = self.surface
         # the rotation is applied here, and the renderer then looks along z from the top
