@@ -1,6 +1,7 @@
 """Command line: ``s4a check | run | demo | view | transfer``; every option of :func:`s4a.analyse` is a flag of run."""
 
 import argparse
+import contextlib
 import inspect
 import logging
 import sys
@@ -10,6 +11,7 @@ import webbrowser
 from pathlib import Path
 
 import numpy as np
+from joblib import parallel_config
 
 from s4a import accuracy, synthetic
 from s4a import transfer as travel
@@ -118,10 +120,36 @@ def check(args):
 def run(args):
     """The whole analysis over a folder of meshes."""
     begin = time.perf_counter()
-    study = analyse(args.paths, store=args.out, **options_of(args))
+    with cluster(args.cluster):
+        study = analyse(args.paths, store=args.out, **options_of(args))
     closing(study, time.perf_counter() - begin)
     write(f"\nstudy: {args.out}; pictures: s4a view {args.out}")
     return 0
+
+
+@contextlib.contextmanager
+def cluster(address):
+    """Run joblib's tasks on a dask scheduler: ``tcp://host:port``, or ``local:N`` for N processes started here.
+
+    The workers must see the study's folder under the same path.
+    """
+    if address is None:
+        yield
+        return
+    try:
+        from dask.distributed import Client, LocalCluster
+    except ImportError as error:
+        raise ValueError("--cluster needs dask.distributed: pip install 's4a[cluster]'") from error
+    number = address.removeprefix("local:")
+    if not address.startswith("tcp://") and not (number != address and number.isdigit() and int(number)):
+        raise ValueError(f"--cluster needs tcp://host:port or local:N, found {address!r}")
+    with contextlib.ExitStack() as stack:
+        if number != address:
+            local = LocalCluster(n_workers=int(number), threads_per_worker=1, dashboard_address=None)
+            address = stack.enter_context(local).scheduler_address
+        stack.enter_context(Client(address))
+        stack.enter_context(parallel_config(backend="dask"))
+        yield
 
 
 def closing(study, seconds):
@@ -294,6 +322,7 @@ def parser():
     sub = command(run)
     sub.add_argument("paths", nargs="+", metavar="PATH", help="folders, globs or mesh files")
     sub.add_argument("--out", required=True, metavar="STUDY", help="folder of the study; an unfinished one is resumed")
+    sub.add_argument("--cluster", metavar="ADDRESS", help="dask scheduler tcp://host:port, or local:N worker processes")
     add_options(sub)
     sub = command(demo)
     sub.add_argument("--out", default="demo", metavar="STUDY", help="folder of the study (default: demo)")

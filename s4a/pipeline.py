@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
-from joblib import Parallel, delayed, effective_n_jobs
+from joblib import Parallel, delayed, effective_n_jobs, parallel_config
 from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
@@ -394,7 +394,8 @@ def run_stages(run, given, options):
     if not all(study.is_done(folder / f, key) for f in ("network.nc", "latent.nc")):
         with run.stage("consistent ZoomOut and median"):
             first = xr.concat([study.read(folder / f) for f in files], dim="pair")
-            n_threads = effective_n_jobs(run.n_jobs)
+            with parallel_config(backend="threading"):  # these run here, whatever backend the tasks run on
+                n_threads = effective_n_jobs(run.n_jobs)
             net, lat = consistent_maps(folder, names, first, o, n_threads)
             study.write(net, folder / "network.nc", key, list(key_of.values()))
             study.write(lat, folder / "latent.nc", key, list(key_of.values()))
