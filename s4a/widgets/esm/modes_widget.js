@@ -46,19 +46,24 @@ class Modes {
 function modesWidget({ model, el }) {
   el.classList.add("s4a");
   const modes = new Modes(model), ratio = model.get("ratio"), count = ratio.length, range = 3;
-  const scores = () => [...model.get("scores")];
+  let current = [...model.get("scores")]; // ahead of the model's while a slider moves
+  const scores = () => [...current];
   const box = html(el, "div", { class: "s4a-modes" }), left = html(box, "div"), right = html(box, "div");
   const views = html(left, "div", { class: "s4a-views" }), bar = html(left, "div"), still = html(left, "img", { class: "s4a-still", hidden: "" });
   let active = 0, shown = [], timer = 0, playing = 0, crosshair = null;
   el.modes = modes;
 
-  const send = () => { // at most ten messages a second, each of a few hundred bytes
-    timer ||= setTimeout(() => { timer = 0; model.save_changes(); }, 100);
-  };
+  const tell = (name, value) => { model.set(name, value); model.save_changes(); };
   const set = (values, last = active) => {
     active = last;
-    model.set("scores", values);
-    send();
+    current = [...values];
+    update();
+    timer ||= setTimeout(() => { timer = 0; tell("scores", current); }, 100); // ten messages a second at most
+  };
+  const told = () => { // an answer to an earlier message must not move the slider back
+    if (timer || model.get("scores").every((s, c) => s === current[c])) return;
+    current = [...model.get("scores")];
+    update();
   };
   const buttons = html(right, "div", { class: "s4a-buttons" });
   const button = (text, act, help) => {
@@ -68,7 +73,7 @@ function modesWidget({ model, el }) {
   };
   button("Reset", () => set(scores().fill(0)), "all scores to 0: the mean shape");
   const play = button("Play", () => toggle(), "moves the marked mode back and forth");
-  const beside = button("−3 · mean · +3", () => { model.set("beside", !model.get("beside")); send(); }, "the marked mode at both ends, side by side");
+  const beside = button("−3 · mean · +3", () => tell("beside", !model.get("beside")), "the marked mode at both ends, side by side");
   button("Random", () => set(scores().map(() => {
     let z = range + 1; // one normal number each, those beyond the sliders drawn again
     while (Math.abs(z) > range) z = Math.sqrt(-2 * Math.log(1 - Math.random())) * Math.cos(2 * Math.PI * Math.random());
@@ -76,7 +81,7 @@ function modesWidget({ model, el }) {
   })), "a plausible shape: scores drawn from the normal distribution");
   const kinds = html(buttons, "select", { "aria-label": "colours" });
   for (const [value, text] of [["normal", "along the normal"], ["magnitude", "distance"], ["none", "no colours"]]) html(kinds, "option", { value }, text);
-  kinds.addEventListener("change", () => { model.set("colors", kinds.value); send(); });
+  kinds.addEventListener("change", () => tell("colors", kinds.value));
   const sliders = html(right, "div", { class: "s4a-sliders" });
   const rows = ratio.map((share, c) => {
     const row = html(sliders, "label", { class: "s4a-slider" });
@@ -154,7 +159,7 @@ function modesWidget({ model, el }) {
     crosshair = scatter(scorePart, {
       x: samples.map((s) => s[0]), y: samples.map((s) => s[1] ?? 0), names, title: "Scores: click a shape to see it",
       xlabel: "PC1 (σ)", ylabel: count > 1 ? "PC2 (σ)" : "", width: 400, reach: [-range, range],
-    }, ({ index }) => { model.set("sample", index); set([...samples[index]]); });
+    }, ({ index }) => { tell("sample", index); set(samples[index]); });
   };
   const picture = () => {
     const bytes = numbers(Uint8Array, model.get("still"));
@@ -162,7 +167,7 @@ function modesWidget({ model, el }) {
   };
   const reload = () => { modes.load(); arrange(); };
   const on = {
-    "change:scores": update, "change:colors": update, "change:beside": arrange, "change:deformation": reload,
+    "change:scores": told, "change:colors": update, "change:beside": arrange, "change:deformation": reload,
     "change:still": picture, "change:turn": () => shown[0].reset(model.get("turn")),
   };
   Object.entries(on).forEach(([event, act]) => model.on(event, act));
