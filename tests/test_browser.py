@@ -237,6 +237,15 @@ def test_a_clicked_point_is_carried_to_the_shape(page, study):
     assert study["registration"]["registered_match"].sel(shape=shape).values[int(vertex)] == int(image)
 
 
+def test_a_landmark_is_placed_and_carried_over(page, study):
+    open_tab(page, "Transfer")
+    canvas = visible(page, VIEW).first
+    box, count = canvas.bounding_box(), study["original/brain_01"].sizes["landmark"]
+    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    visible(page, "td").filter(has_text=f"landmark {count + 1}").wait_for()
+    assert visible(page, VIEW).nth(1).evaluate("(c) => c.view.points.length") == count + 1
+
+
 @pytest.mark.parametrize("title", ["Functional map", "Spectrum"])
 def test_the_other_tabs_draw(page, title):
     open_tab(page, title)

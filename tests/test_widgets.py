@@ -19,7 +19,7 @@ import s4a
 from s4a.draw import position_colors
 from s4a.mesh import vertex_normals
 from s4a.picture import aligned, mesh_of
-from s4a.widgets import Correspondence, Explore, FunctionalMap, Median, Modes, Network, Spectrum
+from s4a.widgets import Correspondence, Explore, FunctionalMap, Median, Modes, Network, Spectrum, Transfer
 from s4a.widgets import chart as chart_module
 from s4a.widgets import modes_view as modes_module
 from s4a.widgets import scene as scene_module
@@ -149,7 +149,7 @@ def bare(monkeypatch):
 
 
 def test_without_anywidget_every_panel_shows_pictures(study, panel, bare):
-    for kind in (Modes, Network, FunctionalMap, Median, Correspondence, Spectrum):
+    for kind in (Modes, Network, FunctionalMap, Median, Correspondence, Transfer, Spectrum):
         pictures = [part.value for part in parts_of(panel(kind)) if isinstance(part, Image)]
         assert any(bytes(picture[1:4]) == b"PNG" for picture in pictures), kind
 
@@ -314,6 +314,42 @@ def test_confidence_is_shown_with_its_bar(study, panel):
     assert len(both.scenes[1].color) == 3 * study["original"][both.shape].sizes["vertex"]
 
 
+def test_labels_and_landmarks_are_carried_as_the_step_module_does_it(study, panel, tmp_path):
+    both = panel(Transfer)
+    source, target = both.source, both.target
+    mesh = study["original"][source].to_dataset()
+    names = mesh["landmark_name"].values.tolist()
+    assert list(both.marks) == names
+    expected = s4a.transfer.transfer_landmarks(study, mesh, source=source, targets=[target])[target]
+    points = aligned(study, target, expected["landmark_position"].values)
+    np.testing.assert_allclose([p[:3] for p in both.scenes[1].points], points)
+    label = s4a.transfer.transfer_labels(study, mesh["label"].values, source=source, targets=[target])[target]["label"]
+    shown = np.frombuffer(both.scenes[1].color, np.uint8).reshape(-1, 3)
+    here = np.frombuffer(both.scenes[0].color, np.uint8).reshape(-1, 3)
+    value = label.values[0]
+    assert (shown[0] == here[mesh["label"].values == value]).all()
+
+
+def test_a_click_places_or_moves_a_landmark_and_it_is_saved(study, panel, tmp_path):
+    both = panel(Transfer)
+    count = len(both.marks)
+    both.scenes[0].picked = {"vertex": 3, "face": 20, "weights": [0.5, 0.25, 0.25], "count": 1}
+    assert len(both.marks) == len(both.scenes[1].points) == count + 1
+    X, T = mesh_of(study["original"][both.source])
+    np.testing.assert_allclose(both.marks[f"landmark {count + 1}"], [0.5, 0.25, 0.25] @ X[T[20]])
+    both.landmark = "vertex"
+    before = both.marks["vertex"]
+    both.scenes[0].picked = {"vertex": 3, "face": 40, "weights": [1.0, 0, 0], "count": 2}
+    assert len(both.marks) == count + 1
+    assert (both.marks["vertex"] != before).any()
+    lines = both.save_csv(tmp_path / "marks.csv").read_text().splitlines()
+    assert lines[0] == "name,x,y,z"
+    assert len(lines) == count + 2
+    both.remove.click()
+    assert "vertex" not in both.marks
+    assert both.message.value == ""
+
+
 def test_the_spectrum_shows_every_shape_beside_weyls_line(study, panel):
     spectrum = panel(Spectrum)
     series = {one["name"]: one["y"] for one in spectrum.curves.spec["series"]}
@@ -365,7 +401,7 @@ def test_errors_in_callbacks_are_shown_and_logged(panel, caplog):
 
 
 def test_a_page_needs_nothing_from_elsewhere(panel, tmp_path):
-    for kind in (Modes, Network, FunctionalMap, Median, Correspondence, Spectrum):
+    for kind in (Modes, Network, FunctionalMap, Median, Correspondence, Transfer, Spectrum):
         text = panel(kind).save_html(tmp_path / "page.html").read_text(encoding="utf-8")
         links = set(re.findall(r"(?:src|href)=[\"']?([^\"'> ]{1,12})|https?://[^\"'` )]+", text))
         assert {link for link in links if link and not link.startswith("data:")} == set()

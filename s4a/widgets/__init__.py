@@ -14,6 +14,7 @@ from s4a.widgets.median import Median
 from s4a.widgets.modes import Modes
 from s4a.widgets.network import Network
 from s4a.widgets.spectrum import Spectrum
+from s4a.widgets.transfer import Transfer
 
 __all__ = [
     "Correspondence",
@@ -23,5 +24,6 @@ __all__ = [
     "Modes",
     "Network",
     "Spectrum",
+    "Transfer",
     "explore",
 ]

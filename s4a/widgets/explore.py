@@ -9,6 +9,7 @@ from s4a.widgets.modes import Modes
 from s4a.widgets.network import Network
 from s4a.widgets.panel import LAYOUT, close_all
 from s4a.widgets.spectrum import Spectrum
+from s4a.widgets.transfer import Transfer
 
 PANELS = {
     "Modes": Modes,
@@ -16,6 +17,7 @@ PANELS = {
     "Functional map": FunctionalMap,
     "Median": Median,
     "Correspondence": Correspondence,
+    "Transfer": Transfer,
     "Spectrum": Spectrum,
 }
 
@@ -76,7 +78,7 @@ class Explore(ipywidgets.VBox):
 
 
 def explore(study, *, view="corner", up="z"):
-    """Tabs over a finished or running study: modes, network, maps, median, correspondence and spectrum.
+    """Tabs over a finished or running study: modes, network, maps, median, correspondence, transfer, spectrum.
 
     Parameters
     ----------
