@@ -9,6 +9,7 @@ reading and cleaning      :func:`read_shapes`, :func:`clean`, :func:`write_mesh`
 4.1 pairs                 :func:`match_pair`
 4.2, 6.1 collections      :func:`analyse`, :func:`open_study`, :func:`synthesize`
 notebooks                 :func:`explore`
+new shapes                :func:`insert`
 6.2 transfer              :func:`transfer_labels`, :func:`transfer_landmarks`, :func:`transfer_scalars`,
                           :func:`register_pairs`
 the embedded collection   :mod:`s4a.synthetic`
@@ -20,6 +21,7 @@ from importlib.metadata import version
 from s4a import synthetic
 from s4a.accessor import explore
 from s4a.clean import clean
+from s4a.insert import insert
 from s4a.io import read_mesh, write_mesh
 from s4a.pca import synthesize
 from s4a.pipeline import analyse
@@ -37,6 +39,7 @@ __all__ = [
     "clean",
     "coarsen",
     "explore",
+    "insert",
     "match_pair",
     "open_study",
     "read_mesh",

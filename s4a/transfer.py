@@ -138,7 +138,7 @@ def plan(study, source, targets):
     source = template if source is None else source
     external = isinstance(source, xr.Dataset)
     targets = [n for n in names if external or n != source] if targets is None else list(targets)
-    wrong = [n for n in [*targets, *([] if external else [source])] if n not in names]
+    wrong = [n for n in [*targets, *([] if external or source == template else [source])] if n not in names]
     if wrong:
         raise ValueError(f"no shape {', '.join(map(repr, wrong))} in the study; it has {', '.join(names)}")
     if external:
@@ -276,9 +276,10 @@ def locate(landmarks, mesh, *, farthest=FARTHEST_LANDMARK):
     triangle, weights, point, distance = found
     if distance.max() > limit:
         worst = int(distance.argmax())
+        name = str(landmarks["landmark_name"].values[worst])
         raise ValueError(
             f"landmarks within {limit:.4g} of the surface needed ({100 * farthest:g} % of sqrt(area)); "
-            f"{str(landmarks['landmark_name'].values[worst])!r} is {distance[worst]:.4g} away: is it of another mesh, unit "
+            f"{name!r} is {distance[worst]:.4g} away: is it of another mesh, unit "
             "or coordinate system (RAS, LPS)?"
         )
     return dataset(

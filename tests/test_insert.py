@@ -1,0 +1,141 @@
+"""New shapes in a finished study: against the truth and a full recomputation, independent, the others kept."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from s4a import analyse, insert, synthetic, transfer_labels, transfer_landmarks
+from s4a.insert import frozen_basis, project_scores
+from s4a.mesh import as_arrays, as_dataset, vertex_areas
+from s4a.pca import gram_pca
+
+OPTIONS = {"n_coarse": 1500, "k": 60, "seed": 0}
+
+
+@pytest.fixture(scope="module")
+def tree():
+    return synthetic.brains(8, 5000, seed=5, n_modes=2)
+
+
+@pytest.fixture(scope="module")
+def meshes(tree):
+    return {name: node.to_dataset() for name, node in tree["original"].children.items()}
+
+
+@pytest.fixture(scope="module")
+def study(meshes):
+    """Seven of eight brains."""
+    return analyse({n: m for n, m in meshes.items() if n != "brain_08"}, **OPTIONS)
+
+
+@pytest.fixture(scope="module")
+def inserted(study, meshes):
+    return insert(study, {"brain_08": meshes["brain_08"]})
+
+
+def errors(tree, study, shape):
+    """Distances of the registered template to the truth on one shape, as shares of sqrt(area)."""
+    data = study["registration"].to_dataset()
+    u = tree["truth"][data.attrs["template"]]["reference_point"].values
+    one = data.sel(shape=shape)
+    X = data["position"].values + one["displacement"].values
+    image = (X - one["translation"].values) @ one["rotation"].values / one["scale"].item()
+    size = np.sqrt(vertex_areas(*as_arrays(data)).sum())
+    return np.linalg.norm(image - synthetic.position(tree["truth"], shape, u), axis=1) / size
+
+
+def test_a_new_shape_is_registered_about_as_well_as_those_of_the_study(tree, study, inserted):
+    template = study["registration"].attrs["template"]
+    known = [errors(tree, study, n).mean() for n in study["registration"]["shape"].values if n != template]
+    assert errors(tree, inserted, "brain_08").mean() < 1.5 * max(known)
+    assert 0.2 < inserted["registration"]["confidence"].mean() <= 1
+
+
+def test_a_new_shape_is_close_to_what_a_full_recomputation_gives(meshes, study, inserted):
+    template = study["registration"].attrs["template"]
+    full = analyse(meshes, template=template, **OPTIONS)
+    area = vertex_areas(*as_arrays(study["registration"].to_dataset()))
+    names = ("mean_displacement", "deformation", "standard_deviation")
+    modes = [study["pca"][n].values for n in names]
+    d = full["registration"]["displacement"].sel(shape=["brain_08"]).values
+    again, _ = project_scores(d, *modes, area)
+    assert inserted["pca"]["score"].values[0, :2] == pytest.approx(again[0, :2], abs=0.25)
+    gap = np.linalg.norm(inserted["registration"]["displacement"].values - d, axis=2)[0]
+    assert gap.mean() < 0.006 * np.sqrt(area.sum())
+    assert inserted["latent"]["distance_to_median"].item() == pytest.approx(
+        full["latent"]["distance_to_median"].sel(shape="brain_08").item(), rel=0.6
+    )
+
+
+def test_the_study_stays_as_it_is_and_the_result_does_not_depend_on_other_new_shapes(study, meshes, inserted):
+    before = {node.path: node.to_dataset(inherit=False).copy(deep=True) for node in study.subtree}
+    both = insert(study, {"brain_08": meshes["brain_08"], "again": meshes["brain_01"]}, n_jobs=2)
+    assert all(node.to_dataset(inherit=False).identical(before[node.path]) for node in study.subtree)
+    one = both["registration"].to_dataset().sel(shape="brain_08")
+    for name, values in inserted["registration"].to_dataset().isel(shape=0).data_vars.items():
+        np.testing.assert_array_equal(one[name].values, values.values, err_msg=name)
+    assert (both["pca"]["score"].sel(shape="brain_08") == inserted["pca"]["score"][0]).all()
+    assert (both["latent"]["latent_basis"].sel(shape="brain_08") == inserted["latent"]["latent_basis"][0]).all()
+
+
+def test_a_shape_of_the_study_gets_its_own_scores_back(study, meshes):
+    template = study["registration"].attrs["template"]
+    name = next(n for n in meshes if n not in (template, "brain_08"))
+    found = insert(study, {"copy": meshes[name]})
+    assert found["pca"]["score"].values[0, :2] == pytest.approx(
+        study["pca"]["score"].sel(shape=name).values[:2], abs=0.25
+    )
+    assert found["report"]["status"].item() == "ok"
+
+
+def test_labels_travel_from_the_template_and_from_an_external_mesh_to_new_shapes(study, meshes, inserted):
+    template = study["registration"].attrs["template"]
+    right = {
+        name: (node["label"].values == meshes[name]["label"].values).mean()
+        for tree in (study, inserted)
+        for name, node in transfer_labels(tree, meshes[template]["label"].values).children.items()
+    }
+    assert right["brain_08"] > 0.85
+    assert right["brain_08"] > min(right.values()) - 0.05
+    other = synthetic.brains(1, 6000, seed=9)["original/brain_01"].to_dataset()
+    outside = transfer_labels(study, other["label"].values, source=other)
+    assert set(outside.children) == set(study["registration"]["shape"].values)
+    for name, node in outside.children.items():
+        assert (node["label"].values == meshes[name]["label"].values).mean() > 0.9
+    place = transfer_landmarks(study, other[["landmark_name", "landmark_position"]], source=other, targets=["brain_02"])
+    gap = place["brain_02"]["landmark_position"].values - meshes["brain_02"]["landmark_position"].values
+    assert np.linalg.norm(gap, axis=1).mean() < 5  # mm
+
+
+def test_a_shape_that_cannot_be_used_is_excluded_and_does_not_stop_the_others(study, meshes):
+    tetrahedron = as_dataset([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
+    found = insert(study, {"small": tetrahedron, "brain_08": meshes["brain_08"]})
+    assert found["registration"]["shape"].values.tolist() == ["brain_08"]
+    assert found["report"]["status"].sel(shape="small").item() == "excluded"
+    with pytest.raises(ValueError, match=r"no shape can be inserted \(small: "):
+        insert(study, {"small": tetrahedron})
+
+
+def test_unfinished_studies_and_the_name_of_the_template_are_refused(study, meshes):
+    with pytest.raises(ValueError, match="a finished study is needed; this one lacks latent"):
+        insert(xr.DataTree.from_dict({n: study[n] for n in ("original", "coarse", "registration")}), meshes)
+    template = study["registration"].attrs["template"]
+    with pytest.raises(ValueError, match="other names than the template"):
+        insert(study, {template: meshes["brain_08"]})
+
+
+def test_the_frozen_basis_is_exact_for_exact_maps():
+    rng = np.random.default_rng(0)
+    Y = np.linalg.qr(rng.normal(size=(3, 6, 6)))[0]
+    new = np.linalg.qr(rng.normal(size=(6, 6)))[0]
+    out, into = Y @ new.T, new @ np.swapaxes(Y, 1, 2)  # C_out new = Y, C_in Y = new
+    assert frozen_basis(out, into, Y) == pytest.approx(new)
+
+
+def test_scores_on_the_modes_that_made_them_are_the_scores():
+    rng = np.random.default_rng(1)
+    d, area = rng.normal(size=(5, 40, 3)), rng.uniform(1, 2, 40)
+    mean, deformation, deviation, score, _ = gram_pca(d, area)
+    found, left = project_scores(d, mean, deformation, deviation, area)
+    assert found == pytest.approx(score)
+    assert left == pytest.approx(0, abs=1e-6)
