@@ -10,6 +10,7 @@ reading and cleaning      :func:`read_shapes`, :func:`clean`, :func:`write_mesh`
 4.2, 6.1 collections      :func:`analyse`, :func:`open_study`, :func:`synthesize`
 notebooks                 :func:`explore`
 new shapes                :func:`insert`
+6.1 statistics            :mod:`s4a.statistics`
 6.2 transfer              :func:`transfer_labels`, :func:`transfer_landmarks`, :func:`transfer_scalars`,
                           :func:`register_pairs`
 the embedded collection   :mod:`s4a.synthetic`
@@ -18,7 +19,7 @@ the embedded collection   :mod:`s4a.synthetic`
 
 from importlib.metadata import version
 
-from s4a import synthetic
+from s4a import statistics, synthetic
 from s4a.accessor import explore
 from s4a.clean import clean
 from s4a.insert import insert
@@ -48,6 +49,7 @@ __all__ = [
     "reconstruct",
     "register_pairs",
     "spectrum",
+    "statistics",
     "synthesize",
     "synthetic",
     "transfer_labels",

@@ -1,0 +1,299 @@
+"""Statistics (6.1): closed forms of a one-mode family, planted groups, and p values under no difference."""
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy import stats
+from scipy.integrate import quad
+from sklearn.svm import SVC
+
+from s4a import model, permutation, statistics, synthetic
+from s4a.mesh import as_arrays, as_dataset, vertex_areas
+from s4a.pca import gram_pca, pca
+from s4a.schema import dataset
+
+SCORES = np.array([-1.9, -1.1, -0.6, -0.2, 0.1, 0.4, 0.9, 1.2, 1.2])
+
+
+def study_of(X, T, d, **subjects):
+    """A finished study of given displacements (s, n, 3) of a template."""
+    names = [f"shape_{i:02d}" for i in range(len(d))]
+    mesh = as_dataset(X, T, {"template": "shape_00"}).merge(dataset(displacement=d)).assign_coords(shape=names)
+    modes = pca(mesh, vertex_areas(X, T))
+    table = xr.Dataset({n: ("shape", v) for n, v in subjects.items()}, {"shape": names})
+    return xr.DataTree.from_dict({"registration": mesh, "pca": modes, "subjects": table})
+
+
+@pytest.fixture(scope="module")
+def family():
+    """Ellipsoids that differ in one semi-axis, and the root mean square of the mode."""
+    X, T = as_arrays(synthetic.ellipsoid(900))
+    mode = X * [0, 0, 1]
+    area = vertex_areas(X, T)
+    return study_of(X, T, SCORES[:, None, None] * mode), np.sqrt(area @ mode[:, 2] ** 2 / area.sum())
+
+
+def smooth_noise(rng, u, s, size=0.1, waves=12):
+    """Smooth random fields (s, n, 3) on points u of the unit sphere."""
+    k, phase = rng.normal(0, 2.0, (waves, 3)), rng.uniform(0, 2 * np.pi, waves)
+    return size * np.einsum("swx,nw->snx", rng.normal(size=(s, waves, 3)), np.cos(u @ k.T + phase)) / np.sqrt(waves)
+
+
+@pytest.fixture(scope="module")
+def planted():
+    """30 spheres with noise; in every other one a patch is pushed out.  Study, groups, patch, age."""
+    rng = np.random.default_rng(3)
+    u, T = as_arrays(synthetic.sphere(1200))
+    group = np.tile(["control", "patient"], 15)
+    bump = np.exp(8 * (u @ [0, 0.6, 0.8] - 1))
+    age = rng.uniform(20, 80, 30)
+    d = smooth_noise(rng, u, 30) + 0.35 * (group == "patient")[:, None, None] * bump[:, None] * u
+    d += (age - 50)[:, None, None] / 60 * 0.3 * u * [1, 0, 0]
+    return study_of(u, T, d, group=group, age=age), group, bump > 0.5, age
+
+
+# the model
+
+
+def test_a_one_mode_family_has_the_closed_form_of_every_measure(family):
+    study, rms = family
+    found = statistics.evaluate(study, n_samples=4000, n_points=200, n_surface=50)
+    assert found.sizes["component"] == 1
+    assert found["compactness"].values == pytest.approx(SCORES.var(ddof=1) * rms**2)
+    assert found["compactness_error"].values == pytest.approx(np.sqrt(2 / 9) * SCORES.var(ddof=1) * rms**2)
+    others = (SCORES.sum() - SCORES) / 8
+    assert found.attrs["generalization_0"] == pytest.approx(np.abs(SCORES - others).mean() * rms)
+    assert found["generalization"].values == pytest.approx(0, abs=1e-6)  # one mode describes each left-out shape
+    mean, deviation = SCORES.mean(), SCORES.std(ddof=1)
+    nearest = quad(
+        lambda x: np.abs(x - SCORES).min() * stats.norm.pdf(x, mean, deviation), -8, 8, limit=400, points=SCORES
+    )[0]
+    error = found["specificity_error"].item()
+    assert abs(found["specificity"].item() - nearest * rms) < 4 * error
+    assert 0 < error < 0.05 * nearest * rms
+    assert 0 < found["specificity_surface"].item() < nearest * rms
+    assert found["generalization_surface"].values == pytest.approx(0, abs=1e-6)
+    assert "optimistic" in found.attrs["correspondence"]
+
+
+def test_left_out_shapes_are_reconstructed_as_by_a_model_of_the_others():
+    rng = np.random.default_rng(0)
+    d, area = rng.normal(size=(6, 30, 3)), rng.uniform(1, 2, 30)
+    error, score = model.leave_one_out(model.gram(d, area))
+    w = (area / area.sum())[:, None]
+    for i in range(6):
+        mean, deformation, deviation, _, _ = gram_pca(np.delete(d, i, axis=0), area)
+        left = d[i] - mean
+        for c in range(5):
+            assert error[i, c] == pytest.approx(np.sqrt((w * left**2).sum()))
+            if c < 4:
+                own = (w * left * deformation[c]).sum() / deviation[c] ** 2
+                assert abs(own) == pytest.approx(abs(score[i, c]))
+                left = left - own * deformation[c]
+
+
+def test_specificity_is_the_distance_between_the_fields():
+    rng = np.random.default_rng(1)
+    d, area = rng.normal(size=(5, 20, 3)), rng.uniform(1, 2, 20)
+    K = model.gram(d - d.mean(0), area)
+    distance, nearest, score = model.specificity(K, 7, rng)
+    variance, V = model.principal(model.centred(K))
+    modes = np.einsum("sc,snx->cnx", V, d - d.mean(0)) / np.sqrt(4)
+    w = (area / area.sum())[:, None]
+    assert distance.shape == (len(variance), 7) == (4, 7)
+    for c in range(4):
+        drawn = d.mean(0) + np.einsum("pc,cnx->pnx", score[:, : c + 1], modes[: c + 1])
+        gap = np.sqrt((w * (drawn[:, None] - d) ** 2).sum((2, 3)))
+        assert distance[c] == pytest.approx(gap.min(1))
+        assert (nearest[c] == gap.argmin(1)).all()
+
+
+def test_only_components_above_chance_explain_more_than_permuted_coefficients():
+    rng = np.random.default_rng(2)
+    features = rng.normal(size=(20, 60))
+    features[:, :30] += 3 * np.outer(rng.normal(size=20), rng.normal(size=30))
+    variance = np.linalg.svd(features - features.mean(0), compute_uv=False) ** 2
+    null = model.variance_baseline(features, 100, rng)
+    assert null.sum(1) == pytest.approx(1)
+    above = variance[:19] / variance.sum() > np.quantile(null, 0.95, axis=0)
+    assert above[0]
+    assert not above[1:].any()
+
+
+def test_the_evaluation_of_many_modes_is_ordered(planted):
+    found = statistics.evaluate(planted[0], n_samples=200, n_permutations=20, n_points=100, n_surface=5)
+    assert (np.diff(found["compactness"]) > 0).all()
+    left = found["generalization"].values
+    assert np.isnan(left[-1])
+    assert (np.diff(left[:-1]) <= 1e-12).all()
+    assert left[0] < found.attrs["generalization_0"]
+    assert (found["generalization_surface"].values[:-1] < left[:-1]).all()
+    assert (found["specificity_surface"].values < found["specificity"].values).all()
+    ratio, null = found["variance_ratio"].values, found["variance_ratio_null_95"].values
+    assert ratio[0] > null[0]
+    assert (found["variance_ratio_null"].values <= null + 1e-12).all()
+
+
+def test_samples_have_the_drawn_scores(planted):
+    drawn = statistics.sample(planted[0], 4, n_components=3, seed=1)
+    assert drawn["score"].shape == (4, 3)
+    assert set(drawn.children) == {f"sample_{i}" for i in range(1, 5)}
+    template = planted[0]["registration"]["position"].values + planted[0]["pca"]["mean_displacement"].values
+    moved = np.tensordot(drawn["score"].values[0], planted[0]["pca"]["deformation"].values[:3], 1)
+    assert drawn["sample_1"]["position"].values == pytest.approx(template + moved, abs=1e-6)
+    with pytest.raises(ValueError, match="a number from 1 to 29, found 30"):
+        statistics.sample(planted[0], 2, n_components=30)
+
+
+# groups and variables
+
+
+def test_planted_groups_are_found_and_the_map_marks_the_patch(planted):
+    study, group, patch, _ = planted
+    whole = statistics.group_test(study, "group", covariates={"age": "age"}, n_permutations=999)
+    assert whole["p_value"].item() == whole.attrs["smallest_p"] == 0.001
+    assert whole.attrs["groups"] == "control: 15, patient: 15"
+    found = statistics.group_map(study, group, covariates={"age": "age"})
+    marked = found["p_family_wise"].values < 0.05
+    dice = 2 * (marked & patch).sum() / (marked.sum() + patch.sum())
+    assert dice > 0.8
+    assert (found["p_false_discovery"].values[patch] < 0.05).mean() > 0.95
+    top = int(found["explained_share"].values.argmax())
+    assert patch[top]
+    u = study["registration"]["position"].values
+    assert found["effect"].values[top] @ u[top] == pytest.approx(0.35, abs=0.08)
+    assert found["effect_size"].values[patch].min() > 1
+
+
+def test_groups_without_a_difference_are_not_found(planted):
+    study, group, _, _ = planted
+    shuffled = np.random.default_rng(5).permutation(group)
+    assert statistics.group_test(study, shuffled, n_permutations=199)["p_value"] > 0.02
+    assert statistics.group_map(study, shuffled, n_permutations=199)["p_family_wise"].min() > 0.02
+
+
+def test_a_continuous_variable_is_found_with_its_slope_and_its_shapes_move(planted):
+    study, group, _, age = planted
+    found = statistics.regression(study, "age", covariates={"group": (group == "patient").astype(float)})
+    assert found["p_value"].item() == 0.001
+    u = study["registration"]["position"].values
+    slope = found["effect"].values
+    planted_slope = 0.3 / 60 * u * [1, 0, 0]
+    assert np.vdot(slope, planted_slope) / np.linalg.norm(slope) / np.linalg.norm(planted_slope) > 0.8
+    old, young = (statistics.predict(study, found, a)["position"].values for a in (80, 20))
+    assert np.ptp(old[:, 0]) > np.ptp(young[:, 0]) + 0.3
+    assert statistics.predict(study, found, age.mean())["position"].values == pytest.approx(
+        u + study["registration"]["displacement"].mean("shape").values, abs=1e-6
+    )
+
+
+@pytest.mark.parametrize("with_covariates", [False, True])
+def test_p_values_are_uniform_without_a_difference(with_covariates):
+    p = []
+    x = np.repeat([0.0, 1.0], [8, 10])
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        Z = rng.normal(size=(18, 2)) + x[:, None] if with_covariates else None
+        scores = rng.standard_t(5, size=(18, 4)) @ rng.normal(size=(4, 4))
+        scores += 0 if Z is None else 2 * Z[:, :1]
+        p.append(permutation.permutation_test(scores, x, covariates=Z, n_permutations=99, seed=seed)[1])
+    assert stats.kstest(p, "uniform").pvalue > 0.05
+    assert np.mean(np.array(p) <= 0.05) <= 0.11
+
+
+def test_family_wise_p_values_keep_their_level():
+    x = np.repeat([0.0, 1.0], 9)
+    found = [
+        permutation.vertex_test(np.random.default_rng(seed).normal(size=(18, 60, 3)), x, n_permutations=99, seed=seed)
+        for seed in range(100)
+    ]
+    smallest = np.array([p_max.min() for _, _, p_max in found])
+    assert stats.kstest(smallest, "uniform").pvalue > 0.01
+    assert 0.03 < np.mean([(p <= 0.05).mean() for _, p, _ in found]) < 0.07
+
+
+def test_the_statistics_are_those_of_the_textbook():
+    rng = np.random.default_rng(4)
+    d, x = rng.normal(size=(14, 5, 3)), np.repeat([0.0, 1.0], [6, 8])
+    share, _, _ = permutation.vertex_test(d, x, n_permutations=0)
+    for v in range(5):
+        a, b = d[:6, v], d[6:, v]
+        S = (np.cov(a.T, bias=True) * 6 + np.cov(b.T, bias=True) * 8) / 12
+        gap = b.mean(0) - a.mean(0)
+        assert 12 * share[v] / (1 - share[v]) == pytest.approx(6 * 8 / 14 * gap @ np.linalg.solve(S, gap), rel=1e-4)
+    one, _, _ = permutation.vertex_test(d[..., :1], x, n_permutations=0)
+    t = stats.ttest_ind(d[:6, :, 0], d[6:, :, 0]).statistic
+    assert 12 * one / (1 - one) == pytest.approx(t**2, rel=1e-4)
+    three = np.repeat(["a", "b", "c"], [4, 5, 5])
+    F = stats.f_oneway(*(d[three == g, :, 0] for g in "abc")).statistic
+    share, _, _ = permutation.vertex_test(d[..., :1], permutation.indicators(three)[1], n_permutations=0)
+    assert 11 / 2 * share / (1 - share) == pytest.approx(F, rel=1e-4)
+
+
+def test_small_groups_are_refused_or_warned_of_and_the_smallest_p_is_told(caplog):
+    rng = np.random.default_rng(0)
+    u, T = as_arrays(synthetic.sphere(200))
+    study = study_of(u, T, smooth_noise(rng, u, 7))
+    with pytest.raises(ValueError, match="each of at least 3 shapes; found a: 2, b: 5"):
+        statistics.group_test(study, list("aabbbbb"))
+    found = statistics.group_test(study, list("aaabbbb"), n_permutations=999)
+    assert "under 10 shapes" in caplog.text
+    assert found.attrs["smallest_p"] == pytest.approx(1 / 35)
+    assert found["p_value"] >= 0.02
+    with pytest.raises(ValueError, match="lacks shape_03"):
+        statistics.group_test(study, {f"shape_{i:02d}": "a" for i in range(7) if i != 3})
+    with pytest.raises(ValueError, match="needs one value for each of 7 shapes"):
+        statistics.regression(study, np.arange(6))
+    with pytest.raises(ValueError, match="constant or a combination of the covariates"):
+        statistics.regression(study, np.arange(7), covariates=2 * np.arange(7) + 1)
+    with pytest.raises(ValueError, match="'age' needs a variable of that name in /subjects"):
+        statistics.regression(study, "age")
+    with pytest.raises(ValueError, match="at least 4 shapes, found 3"):
+        statistics.outliers(study_of(u, T, smooth_noise(rng, u, 3)))
+
+
+# outliers and classes
+
+
+def test_a_strange_shape_and_a_far_one_are_outliers_and_the_others_are_not():
+    rng = np.random.default_rng(7)
+    u, T = as_arrays(synthetic.sphere(400))
+    modes = smooth_noise(rng, u, 2)
+    d = np.einsum("sc,cnx->snx", rng.normal(size=(24, 2)), modes) + smooth_noise(rng, u, 24, size=0.005)
+    d[5] += smooth_noise(rng, u, 1, size=0.05)[0]  # not like the others
+    d[9] = 6 * modes[0]  # like them, but far away
+    found = statistics.outliers(study_of(u, T, d), n_components=2)
+    marked = found["shape"].values[found["outlier"]].tolist()
+    assert {"shape_05", "shape_09"} <= set(marked)
+    assert len(marked) <= 3
+    assert int(found["left_out_error"].values.argmax()) == 5
+    assert int(found["mahalanobis"].values.argmax()) == 9
+
+
+def test_distances_of_a_normal_population_have_uniform_p_values():
+    rng = np.random.default_rng(8)
+    u, T = as_arrays(synthetic.sphere(100))
+    modes = smooth_noise(rng, u, 3)
+    p = np.concatenate(
+        [
+            statistics.outliers(
+                study_of(u, T, np.einsum("sc,cnx->snx", rng.normal(size=(15, 3)), modes)), n_components=3
+            )["outlier_p"].values
+            for _ in range(20)
+        ]
+    )
+    assert abs(np.mean(p) - 0.5) < 0.06
+    assert np.mean(p < 0.05) < 0.1
+
+
+def test_planted_groups_are_classified_and_shuffled_ones_are_not(planted):
+    study, group, _, _ = planted
+    found = statistics.classify(study, group, n_permutations=19)
+    assert found.attrs["balanced_accuracy"] > 0.85
+    assert found["p_value"] == pytest.approx(0.05)
+    svm = statistics.classify(study, "group", SVC(), n_folds=3, n_permutations=0)
+    assert svm.sizes["fold"] == 3
+    assert svm.attrs["balanced_accuracy"] > 0.8
+    shuffled = [np.random.default_rng(seed).permutation(group) for seed in range(10)]
+    by_chance = [statistics.classify(study, g, n_permutations=0).attrs["balanced_accuracy"] for g in shuffled]
+    assert 0.35 < np.mean(by_chance) < 0.6
