@@ -21,3 +21,9 @@ def camera_group():
 def available(study):
     """The resolutions that the study holds, as the options of a switch."""
     return [(text, stage) for text, stage in RESOLUTIONS if stage in study.children and study[stage].children]
+
+
+def unit_of(study, name):
+    """The unit of a shape's positions where its file says it, or that it is the input's."""
+    node = study["original"].children.get(name) if "original" in study.children else None
+    return str((node.attrs.get("unit") if node is not None else "") or "unit of the input")

@@ -11,7 +11,7 @@ from s4a.io import write_mesh
 from s4a.mesh import vertex_normals
 from s4a.pca import color_limits, deformed, low_vertices, mahalanobis, plausible_scores
 from s4a.picture import has, mesh_of, names_of
-from s4a.widgets.meshes import camera_group
+from s4a.widgets.meshes import camera_group, unit_of
 from s4a.widgets.modes_view import modes_view
 from s4a.widgets.panel import Panel, row
 
@@ -54,7 +54,7 @@ class Modes(Panel):
         self.view = modes_view(
             *self.arrays(resolution),
             limits=color_limits(*self.arrays("full" if self.coarse is None else "coarse")),
-            unit=str(pca["deformation"].attrs.get("units", "")),
+            unit=unit_of(self.study, template),
             ratio=pca["explained_variance_ratio"].values[:n_modes].tolist(),
             ratio_low=pca["explained_variance_ratio_low"].values[:n_modes].tolist()
             if "explained_variance_ratio_low" in pca

@@ -7,7 +7,7 @@ import traitlets
 from s4a.draw import SIGNED, signed_colors
 from s4a.spectral import reconstruct, weyl
 from s4a.widgets.chart import chart
-from s4a.widgets.meshes import camera_group, surface
+from s4a.widgets.meshes import camera_group, surface, unit_of
 from s4a.widgets.panel import Panel, beside, row
 from s4a.widgets.scene import color_bar, scene
 
@@ -117,6 +117,6 @@ class Spectrum(Panel):
         X, T = self.surface
         rebuilt = reconstruct(self.mesh, X, k=self.k.value)
         gap = np.linalg.norm(rebuilt - X, axis=1)
-        unit = self.mesh["position"].attrs.get("units", "")
+        unit = unit_of(self.study, self.shape)
         self.rebuilt.show(rebuilt, T, title=f"from {self.k.value} of {len(self.mesh['eigenvalue'])} eigenfunctions")
         self.rebuilt.caption = f"mean distance to the surface {gap.mean():.3g} ({unit})"

@@ -127,13 +127,13 @@ function graph(parent, spec, pick) {
   svg.style.maxWidth = `${width}px`;
   node(svg, "text", { x: 8, y: 14, "font-weight": "bold" }, title);
   const [x0, x1] = bounds(x, 0), [y0, y1] = bounds(y, 0);
-  const X = x.map((v) => 45 + ((v - x0) / (x1 - x0 || 1)) * (width - 110)), Y = y.map((v) => height - 25 - ((v - y0) / (y1 - y0 || 1)) * (height - 75));
+  const X = x.map((v) => 80 + ((v - x0) / (x1 - x0 || 1)) * (width - 160)), Y = y.map((v) => height - 25 - ((v - y0) / (y1 - y0 || 1)) * (height - 75));
   const marks = source.map((s, i) => { // the two directions of a pair bend to either side
     const t = target[i], dx = X[t] - X[s], dy = Y[t] - Y[s], bend = spec.both === false ? 0 : 0.06;
     const d = `M${X[s]} ${Y[s]}Q${(X[s] + X[t]) / 2 - bend * dy} ${(Y[s] + Y[t]) / 2 + bend * dx} ${X[t]} ${Y[t]}`;
     const at = node(svg, "g", { fill: "none", class: "s4a-edge", "data-edge": i });
     node(at, "path", { d, stroke: "transparent", "stroke-width": 7 });
-    if (i === edge) node(at, "path", { d, stroke: INK, "stroke-width": 7 });
+    if (i === edge) node(at, "path", { d, stroke: ORANGE, "stroke-width": 9 });
     node(at, "path", { d, stroke: colors[i], "stroke-width": i === edge ? 4 : 1 + 1.8 * (weights ? weights[i] : 0.3), class: "s4a-line" });
     const weight = weights ? `, weight ${short(weights[i])}` : "";
     if (i === edge) svg.append(at);
@@ -143,7 +143,9 @@ function graph(parent, spec, pick) {
     const at = node(svg, "g", { "data-node": i });
     if (i === highlight) node(at, "circle", { cx: X[i], cy: Y[i], r: 12, fill: "none", stroke: ORANGE, "stroke-width": 3 });
     node(at, "circle", { cx: X[i], cy: Y[i], r: 8, fill: i === chosen ? ORANGE : INK, stroke: "#fff" });
-    if (names.length <= 60) node(svg, "text", { x: X[i] + 11, y: Y[i] - 8, class: "s4a-halo" }, name);
+    const side = X[i] < width / 2 - 20 ? -1 : 1; // names stand outside of the ring
+    const place = { x: X[i] + 12 * side, y: Y[i] + (Y[i] < height / 2 ? -5 : 13), "text-anchor": side < 0 ? "end" : "start" };
+    if (names.length <= 60) node(svg, "text", { ...place, class: "s4a-halo" }, name);
     return { at, value: { node: i }, text: i === highlight ? `${name}, the median` : name };
   }));
   reachable([...marks.slice(source.length), ...marks.slice(0, source.length)], line(parent), pick);

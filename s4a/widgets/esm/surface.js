@@ -49,7 +49,7 @@ function shader(gl, kind, source) {
 function context() {
   const old = globalThis.s4aContext;
   if (old === null || (old && !old.gl.isContextLost())) return old;
-  const gl = document.createElement("canvas").getContext("webgl2", { antialias: true, alpha: true });
+  const gl = document.createElement("canvas").getContext("webgl2", { antialias: false, alpha: true });
   if (!gl) return (globalThis.s4aContext = null);
   const program = gl.createProgram();
   gl.attachShader(program, shader(gl, gl.VERTEX_SHADER, VERTEX));

@@ -98,15 +98,17 @@ class View {
     const scale = (0.97 * zoom * half) / this.frame.radius;
     return { w, h, scale, x: 2 * half * pan[0], y: 2 * half * pan[1] };
   }
-  redraw() {
+  redraw() { // quickly while things move; smoothly, from twice the pixels, once they rest
+    clearTimeout(this.resting);
+    this.resting = setTimeout(() => this.draw(2), 150);
     if (this.waiting) return;
     this.waiting = requestAnimationFrame(() => { this.waiting = 0; this.draw(); });
   }
-  draw() {
+  draw(smooth = 1) {
     const on = context(), { w, h, scale, x, y } = this.frame && this.canvas.clientWidth ? this.placement() : {};
     if (!on || !w || !this.surfaces.length) return;
     const { gl, at } = on, ratio = Math.min(2, globalThis.devicePixelRatio || 1);
-    const W = Math.round(w * ratio), H = Math.round(h * ratio);
+    const width = Math.round(w * ratio), height = Math.round(h * ratio), W = smooth * width, H = smooth * height;
     if (gl.canvas.width < W) gl.canvas.width = W;
     if (gl.canvas.height < H) gl.canvas.height = H;
     gl.viewport(0, 0, W, H);
@@ -118,9 +120,9 @@ class View {
     gl.uniform4f(at.place, (2 * scale) / w, (2 * scale) / h, (2 * x) / w, (2 * y) / h);
     gl.uniform1f(at.depth, 1 / (4 * this.frame.radius));
     [...this.surfaces].sort((a, b) => b.opacity - a.opacity).forEach((surface) => surface.draw(on));
-    this.drawPoints(on, ratio);
-    if (this.canvas.width !== W || this.canvas.height !== H) Object.assign(this.canvas, { width: W, height: H });
-    this.canvas.getContext("2d").drawImage(gl.canvas, 0, gl.canvas.height - H, W, H, 0, 0, W, H);
+    this.drawPoints(on, smooth * ratio);
+    if (this.canvas.width !== width || this.canvas.height !== height) Object.assign(this.canvas, { width, height });
+    this.canvas.getContext("2d").drawImage(gl.canvas, 0, gl.canvas.height - H, W, H, 0, 0, width, height);
     this.frames = (this.frames || 0) + 1;
   }
   drawPoints({ gl, at }, ratio) { // [x, y, z, red, green, blue, pixels] each; few
@@ -166,6 +168,7 @@ class View {
   dispose() {
     this.observer.disconnect();
     cancelAnimationFrame(this.waiting);
+    clearTimeout(this.resting);
     this.camera.views.delete(this);
     if (!this.camera.views.size && this.group) globalThis.s4aCameras.delete(this.group);
     this.surfaces.forEach((surface) => surface.dispose());
