@@ -13,6 +13,7 @@ new shapes                :func:`insert`
 6.1 statistics            :mod:`s4a.statistics`
 6.2 transfer              :func:`transfer_labels`, :func:`transfer_landmarks`, :func:`transfer_scalars`,
                           :func:`register_pairs`
+for other programs        :func:`write_registered`, :func:`write_training_set`
 the embedded collection   :mod:`s4a.synthetic`
 ========================  ====================================================================
 """
@@ -22,6 +23,7 @@ from importlib.metadata import version
 from s4a import statistics, synthetic
 from s4a.accessor import explore
 from s4a.clean import clean
+from s4a.export import write_registered, write_training_set
 from s4a.insert import insert
 from s4a.io import read_mesh, write_mesh
 from s4a.pca import synthesize
@@ -57,4 +59,6 @@ __all__ = [
     "transfer_scalars",
     "write_mesh",
     "write_page",
+    "write_registered",
+    "write_training_set",
 ]
