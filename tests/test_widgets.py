@@ -6,6 +6,7 @@ import logging
 import re
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ import s4a
 from s4a.draw import position_colors
 from s4a.mesh import vertex_normals
 from s4a.picture import aligned, mesh_of
-from s4a.widgets import Correspondence, Explore, FunctionalMap, Median, Modes, Network, Spectrum, Transfer
+from s4a.widgets import Correspondence, Explore, FunctionalMap, Median, Modes, Network, Progress, Spectrum, Transfer
 from s4a.widgets import chart as chart_module
 from s4a.widgets import modes_view as modes_module
 from s4a.widgets import scene as scene_module
@@ -362,6 +363,49 @@ def test_the_spectrum_shows_every_shape_beside_weyls_line(study, panel):
     all_of_it = float(re.search(r"surface ([\d.e-]+)", spectrum.rebuilt.caption)[1])
     spectrum.k.value = 5
     assert float(re.search(r"surface ([\d.e-]+)", spectrum.rebuilt.caption)[1]) > all_of_it
+
+
+# ---- progress
+
+
+def ended(panel, seconds=60):
+    panel.process.join(seconds)
+    for _ in range(100):
+        if panel.stop.disabled:
+            return panel.state
+        time.sleep(0.05)
+    raise TimeoutError(panel.total.value)
+
+
+def test_an_analysis_shows_its_progress_and_its_panels(tmp_path):
+    before = len(registry._instances)
+    shapes = s4a.synthetic.brains(3, 500, seed=1)
+    panel = Progress(shapes, tmp_path / "study", n_coarse=200, k=12, k_init=6, n_jobs=1)
+    assert ended(panel) == "finished"
+    assert [bar.value for bar in panel.bars.values()] == [3, 3, 1, 1, 3, 1]
+    assert {bar.bar_style for bar in panel.bars.values()} == {"success"}
+    panel.view.click()
+    assert panel.explored["Network"].names == ["brain_01", "brain_02", "brain_03"]
+    panel.view.click()
+    assert panel.message.value == ""
+    panel.close()
+    assert len(registry._instances) == before
+
+
+def test_a_failed_analysis_says_why(tmp_path):
+    panel = Progress({"one": tetrahedron()}, tmp_path / "study", n_jobs=1)
+    assert ended(panel) == "failed"
+    assert "at least 2" in panel.message.value
+    panel.close()
+
+
+def test_a_cancelled_analysis_ends(tmp_path):
+    panel = Progress(s4a.synthetic.brains(3, 20_000, seed=1), tmp_path / "study", n_jobs=1)
+    panel.stop.click()
+    assert panel.state == "cancelled"
+    panel.process.join(20)
+    assert not panel.process.is_alive()
+    panel.close()
 
 
 # ---- all of it

@@ -13,6 +13,7 @@ from s4a.widgets.functional import FunctionalMap
 from s4a.widgets.median import Median
 from s4a.widgets.modes import Modes
 from s4a.widgets.network import Network
+from s4a.widgets.progress import Progress
 from s4a.widgets.spectrum import Spectrum
 from s4a.widgets.transfer import Transfer
 
@@ -23,6 +24,7 @@ __all__ = [
     "Median",
     "Modes",
     "Network",
+    "Progress",
     "Spectrum",
     "Transfer",
     "explore",

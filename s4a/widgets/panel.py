@@ -83,15 +83,14 @@ class Panel(ipywidgets.VBox):
 
         @functools.wraps(function)
         def call(*arguments):
+            if "#a40000" in self.message.value:
+                self.say("")
             try:
-                result = function(*arguments)
+                return function(*arguments)
             except Exception as error:
                 log.exception("%s: %s", self.title, function.__name__)
                 self.say(f"{type(error).__name__}: {error}", error=True)
                 return None
-            if "#a40000" in self.message.value:
-                self.say("")
-            return result
 
         return call
 

@@ -1,0 +1,165 @@
+"""An analysis in a process of its own: stage by stage how far it is, cancelled or opened while it runs."""
+
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from pathlib import Path
+
+import ipywidgets
+
+from s4a.pipeline import analyse
+from s4a.study import open_study
+from s4a.widgets.panel import Panel, paragraph, row
+
+# stage: the files that it writes, and whether there is one for each shape
+STAGES = {
+    "read and clean": ("original/[!.]*.nc", True),
+    "low resolution and spectrum": ("coarse/[!.]*.nc", True),
+    "first maps, in batches": ("network/first_*.nc", False),
+    "consistent maps and median": ("latent.nc", False),
+    "registration": ("registration/[!.]*.nc", True),
+    "modes": ("pca.nc", False),
+}
+EVERY = 0.5  # seconds
+
+
+def work(answer, shapes, options):
+    """Analyse, in the process of its own; the answer is the error's text, empty without one."""
+    try:
+        analyse(shapes, **options)
+        answer.send("")
+    except KeyboardInterrupt:
+        answer.send("cancelled")
+    except Exception as error:  # whatever it is, the panel must show it
+        answer.send(f"{type(error).__name__}: {error}")
+
+
+def clock(seconds):
+    """Minutes and seconds.
+
+    Examples
+    --------
+    >>> clock(75.2)
+    '1:15'
+    """
+    return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
+
+
+class Progress(Panel):
+    """Runs :func:`s4a.analyse` in a process of its own and shows how far it is.
+
+    Parameters
+    ----------
+    shapes : see :func:`s4a.analyse`
+    store : path
+        Folder of the study; a cancelled run goes on where it stopped when it is started with the same.
+    **options
+        Of :func:`s4a.analyse`.
+
+    Attributes
+    ----------
+    state : {"running", "finished", "cancelled", "failed"}
+    explored : Explore or None
+        The panels, once they were opened.
+    """
+
+    title = "Progress"
+
+    def __init__(self, shapes, store, **options):
+        self.folder, self.state, self.explored = Path(store), "running", None
+        self.stopped, self.started = threading.Event(), time.monotonic()
+        self.first = {}
+        super().__init__(None)
+        context = multiprocessing.get_context("spawn")
+        self.answer, there = context.Pipe(duplex=False)
+        options = options | {"store": str(store)}
+        self.process = context.Process(target=work, args=(there, shapes, options))
+        self.process.start()
+        there.close()
+        threading.Thread(target=self.watch, daemon=True).start()
+
+    def build(self):
+        """A bar for each stage, and the buttons."""
+        wide = {"description_width": "200px"}
+        self.bars = {
+            stage: ipywidgets.IntProgress(description=stage, max=1, style=wide, layout={"width": "440px"})
+            for stage in STAGES
+        }
+        self.texts = {stage: ipywidgets.HTML() for stage in STAGES}
+        self.total = ipywidgets.HTML()
+        self.stop = ipywidgets.Button(description="Cancel", tooltip="what is finished stays and is used again")
+        self.view = ipywidgets.Button(description="Open", tooltip="the stages that are finished")
+        self.stop.on_click(self.guarded(lambda _: self.cancel()))
+        self.view.on_click(self.guarded(lambda _: self.show()))
+        lines = [ipywidgets.HBox([self.bars[stage], self.texts[stage]]) for stage in STAGES]
+        return [*lines, row(self.stop, self.view, self.total)]
+
+    def watch(self):
+        """Look at the folder until the process ends, in a thread of its own."""
+        while self.process.is_alive() and not self.stopped.wait(EVERY):
+            self.guarded(self.look)()
+        if not self.stopped.is_set():
+            self.guarded(self.finish)()
+
+    def look(self):
+        """Count the files of every stage; what is left is told from the pace since the first file of the stage."""
+        now = time.monotonic()
+        counts = {stage: len(list(self.folder.glob(pattern))) for stage, (pattern, _) in STAGES.items()}
+        shapes = counts["read and clean"]
+        after = list(STAGES)
+        for i, (stage, (_, each)) in enumerate(STAGES.items()):
+            done = counts[stage]
+            later = any(counts[name] for name in after[i + 1 :])
+            whole = shapes if each and i else max(done, 1)
+            bar, text = self.bars[stage], f"{done}" + (f" of {whole}" if each and i else "")
+            bar.max, bar.value = max(whole, 1), done
+            bar.bar_style = "success" if done and (later or (done >= whole and i == len(after) - 1)) else "info"
+            begin, had = self.first.setdefault(stage, (now, done)) if done else (now, 0)
+            if each and i and had < done < whole:
+                text += f", about {clock((now - begin) / (done - had) * (whole - done))} left"
+            self.texts[stage].value = text
+        self.total.value = paragraph(f"{self.state}, {clock(now - self.started)}")
+
+    def finish(self):
+        """What the process said at its end."""
+        self.process.join()
+        try:
+            said = self.answer.recv() if self.answer.poll() else f"the process ended with code {self.process.exitcode}"
+        except EOFError:
+            said = f"the process ended with code {self.process.exitcode}"
+        if self.state == "running":
+            self.state = {"": "finished", "cancelled": "cancelled"}.get(said, "failed")
+        self.look()
+        if self.state == "failed":
+            self.say(said, error=True)
+        self.stop.disabled = True
+
+    def cancel(self):
+        """End the process; the files that it wrote stay."""
+        self.state = "cancelled"
+        if self.process.is_alive():
+            os.kill(self.process.pid, signal.SIGINT)
+            self.process.join(5)
+            if self.process.is_alive():
+                self.process.terminate()
+        self.say("cancelled; with the same store it goes on where it stopped")
+
+    def show(self):
+        """Open the panels of what is finished, or bring them up to date."""
+        from s4a.widgets.explore import Explore
+
+        study = open_study(self.folder)
+        if self.explored is None:
+            self.explored = Explore(study)
+            self.children = [*self.children, self.explored]
+        else:
+            self.explored.refresh(study)
+
+    def close(self):
+        """Cancel a run that goes on, and close everything."""
+        self.stopped.set()
+        if getattr(self, "process", None) is not None and self.process.is_alive():
+            self.cancel()
+        super().close()
