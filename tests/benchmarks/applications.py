@@ -1,0 +1,172 @@
+"""What correspondences are good for: ``python tests/benchmarks/applications.py [groups brains skulls faces heads]``.
+
+Transfer between two brain templates and between skulls, displacements and modes of faces against the published ones, a
+tenth head inserted into a study of nine, planted groups.  All but the last need the shared data beside the checkout.
+"""
+
+import itertools
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from scipy import stats
+from scipy.spatial import cKDTree
+
+import s4a
+from s4a import permutation, statistics, synthetic, transfer
+from s4a.align import align
+from s4a.annotations import read_landmarks
+from s4a.deform import displacement_in_template
+from s4a.insert import project_scores
+from s4a.link import at, closest_point
+from s4a.mesh import as_arrays, vertex_areas
+
+DATA = Path(__file__).parents[3] / "shared" / "data"
+
+
+def say(text):
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
+def icp_motion(source, target):
+    """R, t of ICP on up to 6,000 spread vertices, in the unit of the input."""
+    low = []
+    for mesh in (source, target):
+        X, T = as_arrays(mesh)
+        every = slice(None, None, max(1, len(X) // 6000))
+        low += [X[every], vertex_areas(X, T)[every]]
+    return align(*low)[:2]
+
+
+def brains(folder):
+    names, meshes, labels = {"fsa5": "fsa5_lh", "conte69": "conte69_32k_lh"}, {}, {}
+    for name, file in names.items():
+        meshes[name] = s4a.read_shape(folder / "brains" / f"{file}.gii")
+        with np.load(folder / "brains" / f"labels_{name}_lh_then_rh.npz") as arrays:
+            labels[name] = arrays["aparc"][: meshes[name].sizes["vertex"]]
+    (X, _), (Y, _), true = *(as_arrays(m) for m in meshes.values()), labels["conte69"]
+    R, t = icp_motion(*meshes.values())
+    found = {
+        "nearest vertex as they lie": labels["fsa5"][cKDTree(X).query(Y)[1]],
+        "nearest vertex after ICP": labels["fsa5"][cKDTree(X @ R.T + t).query(Y)[1]],
+    }
+    for both in (False, True):
+        study = transfer.register_pairs(meshes["fsa5"], {"conte69": meshes["conte69"]}, both=both)
+        name = "S4A, matched both ways" if both else "S4A, one way"
+        found[name] = s4a.transfer_labels(study, labels["fsa5"])["conte69"]["label"].values
+    for name, label in found.items():
+        dice = [
+            2 * ((label == v) & (true == v)).sum() / ((label == v).sum() + (true == v).sum()) for v in np.unique(true)
+        ]
+        say(f"{name}: {100 * (label == true).mean():.1f} % of vertices right, mean Dice {np.mean(dice):.3f}")
+
+
+def skulls(folder):
+    files = sorted((folder / "skulls").glob("*.ply"))
+    meshes = {f.stem: s4a.read_shape(f) for f in files}
+    marks = {f.stem: read_landmarks(f.with_suffix(".mrk.json")) for f in files}
+    point = {name: m["landmark_position"].values for name, m in marks.items()}
+    error = {"nearest surface point after ICP": [], "S4A": []}
+    for a, b in itertools.combinations(meshes, 2):
+        study = transfer.register_pairs(meshes[a], {b: meshes[b]}, name=a)
+        for p, q in ((a, b), (b, a)):
+            R, t = icp_motion(meshes[p], meshes[q])
+            X, T = as_arrays(meshes[q])
+            near = at(X, T, *closest_point(point[p] @ R.T + t, X, T))
+            ours = s4a.transfer_landmarks(study, marks[p], source=p, targets=[q])[q]["landmark_position"].values
+            for name, found in zip(error, (near, ours), strict=True):
+                error[name].append(np.linalg.norm(found - point[q], axis=1))
+    for name, values in error.items():
+        values = np.stack(values)
+        say(f"{name}: mean {values.mean():.3f} mm, median {np.median(values):.3f}, {values.shape[0]} ordered pairs")
+
+
+def faces(folder):
+    study = s4a.analyse(folder / "faces", n_jobs=-1, template="generic_neutral_mesh")
+    data = study["registration"].to_dataset()
+    X, T = as_arrays(data)
+    area = vertex_areas(X, T)
+    w = area / area.sum()
+    names = [n for n in data["shape"].values.tolist() if n != "generic_neutral_mesh"]
+    ours = data["displacement"].sel(shape=names).values.astype(float)
+    true = np.stack([displacement_in_template(X, study["original"][n]["position"].values, area)[0] for n in names])
+    inner = [np.einsum("nx,nx,n->", a, b, w) for a, b in zip(ours, true, strict=True)]
+    size = [np.sqrt(np.einsum("nx,nx,n->", d, d, w)) for d in (*ours, *true)]
+    cosine = np.array(inner) / size[: len(names)] / size[len(names) :]
+    say(f"cosines of displacements: mean {cosine.mean():.4f}, median {np.median(cosine):.4f}, least {cosine.min():.4f}")
+    for c in (3, 5, 10):
+        bases = []
+        for d in (ours, true):
+            d = ((d - d.mean(0)) * np.sqrt(w)[:, None]).reshape(len(d), -1)
+            bases.append(np.linalg.svd(d, full_matrices=False)[2][:c])
+        angle = np.degrees(np.arccos(np.clip(np.linalg.svd(bases[0] @ bases[1].T, compute_uv=False), 0, 1)))
+        say(f"principal angles of {c} modes, degrees: {', '.join(f'{a:.1f}' for a in angle)}")
+
+
+def heads(folder):
+    files = sorted((folder / "heads").glob("*.ply"))
+    nine = s4a.analyse(files[:-1], n_jobs=-1)
+    begin = time.perf_counter()
+    found = s4a.insert(nine, files[-1])
+    seconds = time.perf_counter() - begin
+    ten = s4a.analyse(files, n_jobs=-1, template=nine["registration"].attrs["template"])
+    area = vertex_areas(*as_arrays(nine["registration"].to_dataset()))
+
+    def gap(a, b):
+        distance = np.linalg.norm(a - b, axis=-1)
+        return f"mean {area @ distance / area.sum():.2f} mm, median {np.median(distance):.2f}"
+
+    d, before = (tree["registration"]["displacement"] for tree in (ten, nine))
+    name, new = files[-1].stem, found["registration"]["displacement"][0].values
+    say(f"inserted in {seconds:.1f} s; from the recomputation {gap(new, d.sel(shape=name).values)}")
+    modes = [nine["pca"][v].values for v in ("mean_displacement", "deformation", "standard_deviation")]
+    again = project_scores(d.sel(shape=[name]).values, *modes, area)[0][0]
+    say(f"scores {found['pca']['score'].values[0].round(2)}, from the recomputation {again.round(2)}")
+    for other in before["shape"].values.tolist():
+        say(f"  {other} in both: {gap(before.sel(shape=other).values, d.sel(shape=other).values)}")
+
+
+def groups():
+    tree = synthetic.brains(24, 5000, seed=11)
+    truth = tree["truth"]
+    group = np.where(truth["planted_score"].values[:, 1] > 0, "high", "low")
+    shapes = {name: node.to_dataset() for name, node in tree["original"].children.items()}
+    study = s4a.analyse(shapes, n_coarse=1500, k=60, n_jobs=-1)
+    group = dict(zip(truth["shape"].values.tolist(), group.tolist(), strict=True))
+    whole = statistics.group_test(study, group)
+    say(f"planted groups: p = {whole['p_value'].item():.4f}, least possible {whole.attrs['smallest_p']:.4f}")
+    where = statistics.group_map(study, group)
+    u = truth[study["registration"].attrs["template"]]["reference_point"].values
+    part = [truth[f"planted_{v}"].values for v in ("centre", "width", "push", "turn")]
+    field = synthetic._fields(synthetic.reference_brain(u), *part[:2], part[2][1], part[3][1])
+    size = np.linalg.norm(field, axis=1)
+    region = size > 0.25 * size.max()
+    for name in ("p_family_wise", "p_false_discovery"):
+        marked = where[name].values < 0.05
+        say(f"{name} < 0.05 and the region: Dice {2 * (marked & region).sum() / (marked.sum() + region.sum()):.2f}")
+    effect = where["effect"].values
+    cosine = abs(np.vdot(effect, field)) / np.linalg.norm(effect) / np.linalg.norm(field)
+    say(f"effect and planted mode: cosine {cosine:.2f}")
+    x, p = np.repeat([0.0, 1.0], [8, 10]), []
+    for seed in range(100):
+        scores = np.random.default_rng(seed).standard_t(5, size=(18, 4))
+        p.append(permutation.permutation_test(scores, x, n_permutations=199, seed=seed)[1])
+    tenths = np.histogram(p, np.linspace(0, 1, 11))[0]
+    uniform = stats.kstest(p, "uniform").pvalue
+    say(f"p values of 100 seeds without a difference, by tenths: {tenths}, Kolmogorov-Smirnov p {uniform:.2f}")
+
+
+if __name__ == "__main__":
+    chosen = sys.argv[1:] or ["groups", *(["brains", "skulls", "faces", "heads"] if DATA.is_dir() else [])]
+    for name in chosen:
+        say(f"\n{name}")
+        if name == "groups":
+            groups()
+            continue
+        with tempfile.TemporaryDirectory() as folder:
+            subprocess.run([sys.executable, DATA / "unpack.py", folder, name], check=True, stdout=subprocess.DEVNULL)
+            globals()[name](Path(folder))
