@@ -3,18 +3,19 @@
 import numpy as np
 import pytest
 import xarray as xr
+from scipy.spatial import cKDTree
 
 from s4a import analyse, insert, synthetic, transfer_labels, transfer_landmarks
 from s4a.insert import frozen_basis, project_scores
 from s4a.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.pca import gram_pca
 
-OPTIONS = {"n_coarse": 1500, "k": 60, "seed": 0}
+OPTIONS = {"n_coarse": 1000, "k": 50, "seed": 0}
 
 
 @pytest.fixture(scope="module")
 def tree():
-    return synthetic.brains(8, 5000, seed=5, n_modes=2)
+    return synthetic.brains(7, 3500, seed=5, n_modes=2)
 
 
 @pytest.fixture(scope="module")
@@ -24,13 +25,13 @@ def meshes(tree):
 
 @pytest.fixture(scope="module")
 def study(meshes):
-    """Seven of eight brains."""
-    return analyse({n: m for n, m in meshes.items() if n != "brain_08"}, **OPTIONS)
+    """Six of seven brains."""
+    return analyse({n: m for n, m in meshes.items() if n != "brain_07"}, **OPTIONS)
 
 
 @pytest.fixture(scope="module")
 def inserted(study, meshes):
-    return insert(study, {"brain_08": meshes["brain_08"]})
+    return insert(study, {"brain_07": meshes["brain_07"]})
 
 
 def errors(tree, study, shape):
@@ -47,7 +48,7 @@ def errors(tree, study, shape):
 def test_a_new_shape_is_registered_about_as_well_as_those_of_the_study(tree, study, inserted):
     template = study["registration"].attrs["template"]
     known = [errors(tree, study, n).mean() for n in study["registration"]["shape"].values if n != template]
-    assert errors(tree, inserted, "brain_08").mean() < 1.5 * max(known)
+    assert errors(tree, inserted, "brain_07").mean() < 1.5 * max(known)
     assert 0.2 < inserted["registration"]["confidence"].mean() <= 1
 
 
@@ -57,30 +58,30 @@ def test_a_new_shape_is_close_to_what_a_full_recomputation_gives(meshes, study, 
     area = vertex_areas(*as_arrays(study["registration"].to_dataset()))
     names = ("mean_displacement", "deformation", "standard_deviation")
     modes = [study["pca"][n].values for n in names]
-    d = full["registration"]["displacement"].sel(shape=["brain_08"]).values
+    d = full["registration"]["displacement"].sel(shape=["brain_07"]).values
     again, _ = project_scores(d, *modes, area)
     assert inserted["pca"]["score"].values[0, :2] == pytest.approx(again[0, :2], abs=0.25)
     gap = np.linalg.norm(inserted["registration"]["displacement"].values - d, axis=2)[0]
     assert gap.mean() < 0.006 * np.sqrt(area.sum())
     assert inserted["latent"]["distance_to_median"].item() == pytest.approx(
-        full["latent"]["distance_to_median"].sel(shape="brain_08").item(), rel=0.6
+        full["latent"]["distance_to_median"].sel(shape="brain_07").item(), rel=0.6
     )
 
 
 def test_the_study_stays_as_it_is_and_the_result_does_not_depend_on_other_new_shapes(study, meshes, inserted):
     before = {node.path: node.to_dataset(inherit=False).copy(deep=True) for node in study.subtree}
-    both = insert(study, {"brain_08": meshes["brain_08"], "again": meshes["brain_01"]}, n_jobs=2)
+    both = insert(study, {"brain_07": meshes["brain_07"], "again": meshes["brain_01"]}, n_jobs=2)
     assert all(node.to_dataset(inherit=False).identical(before[node.path]) for node in study.subtree)
-    one = both["registration"].to_dataset().sel(shape="brain_08")
+    one = both["registration"].to_dataset().sel(shape="brain_07")
     for name, values in inserted["registration"].to_dataset().isel(shape=0).data_vars.items():
         np.testing.assert_array_equal(one[name].values, values.values, err_msg=name)
-    assert (both["pca"]["score"].sel(shape="brain_08") == inserted["pca"]["score"][0]).all()
-    assert (both["latent"]["latent_basis"].sel(shape="brain_08") == inserted["latent"]["latent_basis"][0]).all()
+    assert (both["pca"]["score"].sel(shape="brain_07") == inserted["pca"]["score"][0]).all()
+    assert (both["latent"]["latent_basis"].sel(shape="brain_07") == inserted["latent"]["latent_basis"][0]).all()
 
 
 def test_a_shape_of_the_study_gets_its_own_scores_back(study, meshes):
     template = study["registration"].attrs["template"]
-    name = next(n for n in meshes if n not in (template, "brain_08"))
+    name = next(n for n in meshes if n not in (template, "brain_07"))
     found = insert(study, {"copy": meshes[name]})
     assert found["pca"]["score"].values[0, :2] == pytest.approx(
         study["pca"]["score"].sel(shape=name).values[:2], abs=0.25
@@ -95,13 +96,15 @@ def test_labels_travel_from_the_template_and_from_an_external_mesh_to_new_shapes
         for tree in (study, inserted)
         for name, node in transfer_labels(tree, meshes[template]["label"].values).children.items()
     }
-    assert right["brain_08"] > 0.85
-    assert right["brain_08"] > min(right.values()) - 0.05
-    other = synthetic.brains(1, 6000, seed=9)["original/brain_01"].to_dataset()
+    assert right["brain_07"] > 0.85
+    assert right["brain_07"] > min(right.values()) - 0.05
+    other = synthetic.brains(1, 4000, seed=9)["original/brain_01"].to_dataset()
     outside = transfer_labels(study, other["label"].values, source=other)
     assert set(outside.children) == set(study["registration"]["shape"].values)
     for name, node in outside.children.items():
-        assert (node["label"].values == meshes[name]["label"].values).mean() > 0.9
+        near = cKDTree(other["position"]).query(meshes[name]["position"])[1]
+        nearest = (other["label"].values[near] == meshes[name]["label"].values).mean()
+        assert (node["label"].values == meshes[name]["label"].values).mean() > max(0.8, nearest)
     place = transfer_landmarks(study, other[["landmark_name", "landmark_position"]], source=other, targets=["brain_02"])
     gap = place["brain_02"]["landmark_position"].values - meshes["brain_02"]["landmark_position"].values
     assert np.linalg.norm(gap, axis=1).mean() < 5  # mm
@@ -109,8 +112,8 @@ def test_labels_travel_from_the_template_and_from_an_external_mesh_to_new_shapes
 
 def test_a_shape_that_cannot_be_used_is_excluded_and_does_not_stop_the_others(study, meshes):
     tetrahedron = as_dataset([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
-    found = insert(study, {"small": tetrahedron, "brain_08": meshes["brain_08"]})
-    assert found["registration"]["shape"].values.tolist() == ["brain_08"]
+    found = insert(study, {"small": tetrahedron, "brain_07": meshes["brain_07"]})
+    assert found["registration"]["shape"].values.tolist() == ["brain_07"]
     assert found["report"]["status"].sel(shape="small").item() == "excluded"
     with pytest.raises(ValueError, match=r"no shape can be inserted \(small: "):
         insert(study, {"small": tetrahedron})
@@ -121,7 +124,7 @@ def test_unfinished_studies_and_the_name_of_the_template_are_refused(study, mesh
         insert(xr.DataTree.from_dict({n: study[n] for n in ("original", "coarse", "registration")}), meshes)
     template = study["registration"].attrs["template"]
     with pytest.raises(ValueError, match="other names than the template"):
-        insert(study, {template: meshes["brain_08"]})
+        insert(study, {template: meshes["brain_07"]})
 
 
 def test_the_frozen_basis_is_exact_for_exact_maps():
