@@ -72,10 +72,18 @@ def table(rows, head, width=120):
     return "\n".join(lines)
 
 
+def components(text):
+    """A number of components, or the word as it is."""
+    return int(text) if text.isdigit() else text
+
+
 def add_options(parser):
     """One flag for every option of `analyse`."""
     for name, parameter in inspect.signature(analyse).parameters.items():
         if name in ("shapes", "store"):
+            continue
+        if name == "components":
+            parser.add_argument("--components", type=components, default=parameter.default, help=HELP[name])
             continue
         flag, default = "--" + name.replace("_", "-"), parameter.default
         if isinstance(default, bool):
@@ -93,8 +101,6 @@ def add_options(parser):
 def options_of(args):
     """The options of `analyse` from parsed flags."""
     options = {n: getattr(args, n) for n in inspect.signature(analyse).parameters if hasattr(args, n)}
-    if options["components"].isdigit():
-        options["components"] = int(options["components"])
     return options
 
 
@@ -317,7 +323,7 @@ def parser():
 
     sub = command(check)
     sub.add_argument("paths", nargs="+", metavar="PATH", help="folders, globs or mesh files")
-    sub.add_argument("--components", default="largest", help=HELP["components"])
+    sub.add_argument("--components", type=components, default="largest", help=HELP["components"])
     sub.add_argument("--pattern", help=HELP["pattern"])
     sub = command(run)
     sub.add_argument("paths", nargs="+", metavar="PATH", help="folders, globs or mesh files")
@@ -352,12 +358,12 @@ def parser():
 
 
 def main(arguments=None):
-    """Entry point; returns the exit code, and turns a ValueError into one line on the error stream."""
+    """Entry point; returns the exit code, and turns a ValueError or OSError into one line on the error stream."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
     args = parser().parse_args(arguments)
     try:
         return args.function(args)
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         sys.stderr.write(f"s4a: {error}\n")
         return 2
     except KeyboardInterrupt:

@@ -13,17 +13,24 @@ def area_differences(Y):
 
 
 def conformal_differences(Y, eigenvalues, latent_eigenvalue):
-    """(Lambda^0)^+ Y_i^T Lambda_i Y_i ``(n, m, m)``: how Dirichlet energies differ; the constant mode is zero."""
+    """(Lambda^0)^+ Y_i^T Lambda_i Y_i ``(n, m, m)``: how Dirichlet energies differ; constant modes are zero."""
     D = np.einsum("nkl,nk,nkm->nlm", Y, eigenvalues[:, : Y.shape[1]], Y)
-    D[:, :1], D[:, :, :1] = 0, 0
+    null = constant_modes(latent_eigenvalue)
+    D[:, null], D[:, :, null] = 0, 0
     return inverse(latent_eigenvalue)[None, :, None] * D
 
 
 def inverse(latent_eigenvalue, power=1.0):
-    """Diagonal of ((Lambda^0)^+)^power; the constant mode maps to 0."""
-    out = np.zeros(len(latent_eigenvalue))
-    out[1:] = np.maximum(latent_eigenvalue[1:], 1e-12) ** -power
-    return out
+    """Diagonal of ((Lambda^0)^+)^power; constant modes map to 0."""
+    null = constant_modes(latent_eigenvalue)
+    return np.where(null, 0.0, np.where(null, 1.0, latent_eigenvalue) ** -power)
+
+
+def constant_modes(latent_eigenvalue):
+    """Which latent functions are constant on every component, ``(m,)``: one for each component that was kept."""
+    null = latent_eigenvalue < 1e-6 * np.max(latent_eigenvalue, initial=0.0)
+    null[:1] = True
+    return null
 
 
 def distance_to_identity(D, latent_eigenvalue, norm="h2"):
@@ -31,13 +38,15 @@ def distance_to_identity(D, latent_eigenvalue, norm="h2"):
 
     The paper writes the norm of H_0^2 and does not define it.  ``"h2"`` is our reading: the Hilbert-Schmidt norm of
     D - I as an operator H^2 -> L^2, |(D - I) (Lambda^0)^+|_F, in which fine detail weighs less.  ``"h1"`` takes
-    the square root of the inverse, ``"frobenius"`` none.  The constant mode is left out.
+    the square root of the inverse, ``"frobenius"`` none.  Constant modes, one for each
+    component of the surface, are left out.
     """
     if norm not in NORMS:
         raise ValueError(f"norm must be one of {', '.join(NORMS)}, found {norm!r}")
     m = D.shape[1]
     w = inverse(latent_eigenvalue, NORMS[norm])
-    return np.linalg.norm(((D - np.eye(m)) * w)[:, 1:, 1:], axis=(1, 2))
+    varying = ~constant_modes(latent_eigenvalue)
+    return np.linalg.norm(((D - np.eye(m)) * w)[:, varying][:, :, varying], axis=(1, 2))
 
 
 def difference_pca(D):

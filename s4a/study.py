@@ -190,6 +190,6 @@ def open_study(folder):
     nodes |= {stage: opened(stage) for stage in ("pca", "report")}
     if nodes["report"] is not None:
         report = nodes["report"]
-        excluded = set(report["shape"].values[report["status"].values == "excluded"].tolist())
-        nodes = {name: data for name, data in nodes.items() if name.rpartition("/")[2] not in excluded}
+        used = set(report["shape"].values[report["status"].values != "excluded"].tolist())
+        nodes = {name: data for name, data in nodes.items() if "/" not in name or name.rpartition("/")[2] in used}
     return xr.DataTree.from_dict({n: data for n, data in nodes.items() if data is not None}, name=folder.name)

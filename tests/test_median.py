@@ -74,3 +74,12 @@ def test_equal_differences_have_no_variance():
     score, ratio = median.difference_pca(np.stack([np.eye(3)] * 4))
     assert np.abs(score).max() == 0
     assert ratio.tolist() == [0, 0, 0]
+
+
+def test_surfaces_of_two_components_have_two_constant_modes():
+    latent_eigenvalue = np.array([1e-28, 7.5e-14, 36.3, 40.0])
+    D = np.stack([np.diag([1.0, 3.0, 1.0, 1.0]), np.diag([1.0, 1.0, 2.0, 1.0])])
+    for norm in median.NORMS:
+        near, far = median.distance_to_identity(D, latent_eigenvalue, norm)
+        assert near == 0
+        assert 0 < far < 2
