@@ -7,6 +7,7 @@ reading and cleaning      :func:`read_shapes`, :func:`clean`, :func:`write_mesh`
 4.1 low resolution        :func:`coarsen`
 3.3 spectrum              :func:`spectrum`, :func:`reconstruct`
 4.1 pairs                 :func:`match_pair`
+5.1 metrics               :mod:`s4a.metrics`
 4.2, 6.1 collections      :func:`analyse`, :func:`open_study`, :func:`synthesize`
 notebooks                 :func:`explore`
 new shapes                :func:`insert`
@@ -20,7 +21,7 @@ the embedded collection   :mod:`s4a.synthetic`
 
 from importlib.metadata import version
 
-from s4a import statistics, synthetic
+from s4a import metrics, statistics, synthetic
 from s4a.accessor import explore
 from s4a.clean import clean
 from s4a.export import write_registered, write_training_set
@@ -44,6 +45,7 @@ __all__ = [
     "explore",
     "insert",
     "match_pair",
+    "metrics",
     "open_study",
     "read_mesh",
     "read_shape",

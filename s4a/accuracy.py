@@ -8,7 +8,7 @@ from threadpoolctl import threadpool_limits
 
 from s4a import fmap
 from s4a.align import align
-from s4a.mesh import edge_graph, path_lengths, triangle_areas
+from s4a.metrics import geodesic_error
 from s4a.network import first_map
 from s4a.register import Scan, intrinsic_match
 
@@ -44,11 +44,6 @@ def simple_matches(source, target, *, k_init=20):
     k = min(M.Phi.shape[1], N.Phi.shape[1])
     C, _ = fmap.zoomout(C, M.Phi, N.Phi, N.area, k)
     return {ICP: near, ZOOMOUT: intrinsic_match(source, target, M.Phi[:, :k] @ C.T, N.Phi[:, :k])[0]}
-
-
-def geodesic_error(X, T, found, true, *, limit=1.0):
-    """Distances along the edges from true to found vertices, as shares of sqrt(area) ``(p,)``, cut at `limit`."""
-    return path_lengths(edge_graph(X / np.sqrt(triangle_areas(X, T).sum()), T), true, found, limit)
 
 
 def _errors(source, target, registered, image, n_geodesic):

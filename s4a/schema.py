@@ -10,6 +10,7 @@ import xarray as xr
 INPUT = "unit of the input"
 INPUT2 = "squared unit of the input"
 ONE = "1"
+SHARE = "share of sqrt(area)"
 UNIT_AREA = "1, for the surface scaled to unit area"
 
 # name: (dims, unit, long_name).  In the file of a single shape a leading dim `shape` is absent.
@@ -37,6 +38,22 @@ TABLE = {
     "eigenfunction": (("vertex", "mode"), UNIT_AREA, "eigenfunction, orthonormal in the vertex areas"),
     # one pair (4.1)
     "match": (("vertex",), ONE, "on each vertex of the target, the matched vertex of the source"),
+    # metrics of a pair (5.1, eq. 9 - 11)
+    "chamfer": ((), SHARE, "Chamfer distance of the source and the image of the target (eq. 9)"),
+    "hausdorff": ((), SHARE, "Hausdorff distance of the source and the image of the target"),
+    "hausdorff_paper": ((), SHARE, "the same as eq. 10 prints it: a sum, with 1/n on the second term"),
+    "dirichlet": ((), ONE, "Dirichlet energy of the image's coordinates, source of unit area; 2 if conformal (eq. 11)"),
+    "coverage": ((), ONE, "share of the source's area whose vertices are matched to"),
+    "bijectivity": ((), SHARE, "round trip target, source, target along edges, mean"),
+    "conformal_distortion": ((), ONE, "log(s1 / s2) of the maps of triangles that do not collapse, median by area"),
+    "area_distortion": ((), ONE, "|log(area of image / area)| of them, surfaces of unit area, median by area"),
+    "collapsed_share": ((), ONE, "share of the target's area in triangles whose image has no area"),
+    "geodesic_error": ((), SHARE, "distance along edges of matched and true vertices, mean"),
+    "straight_error": ((), SHARE, "distance in a straight line of image and true position, mean"),
+    "error_curve": (("threshold",), ONE, "share of the vertices whose geodesic error is no larger"),
+    "label_accuracy": ((), ONE, "share of the area that gets its own label"),
+    "label_dice": ((), ONE, "Dice's overlap by area, mean over the labels of the target"),
+    "landmark_error": ((), SHARE, "distance in a straight line of carried and given landmarks, mean"),
     # the network of maps (3.4)
     "source": (("pair",), ONE, "shape whose functions the map takes"),
     "target": (("pair",), ONE, "shape on which the map gives functions"),
