@@ -11,7 +11,6 @@ demo: $(VENV)/.core
 
 test: check
 	$(BIN)/python -m pytest
-	$(if $(wildcard notebooks/*.ipynb),$(BIN)/python -m pytest --nbmake notebooks)
 
 check: $(VENV)/.test
 	$(BIN)/ruff check .

@@ -10,7 +10,8 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 
-from s4a.draw import SIGNED
+from s4a.draw import SIGNED, render, signed_colors
+from s4a.mesh import as_arrays
 
 BLUE, ORANGE, GREY = "#0072b2", "#d55e00", "#777777"
 LOOK = {
@@ -47,6 +48,61 @@ def on_circle(n):
     """Places ``(n, 2)`` spread evenly over the unit circle."""
     angle = 2 * np.pi * np.arange(n) / max(n, 1)
     return np.stack([np.sin(angle), np.cos(angle)], axis=1)
+
+
+def surfaces(meshes, values=None, *, limit=None, label="", columns=4, flat=False, view="corner", up="z"):
+    """Pictures of surfaces side by side.
+
+    Parameters
+    ----------
+    meshes : dict of str to Dataset
+        Title of each picture and its mesh.
+    values : dict of str to float ndarray, optional
+        For the same titles colours ``(vertex, 3)``, or signed numbers ``(vertex,)``: these are drawn on one scale
+        from -`limit` to `limit`, blue positive, with a colour bar.
+    limit : float, optional
+        By default the largest 99 % quantile of the absolute numbers.
+    label : str
+        Of the colour bar.
+    columns : int
+        Most pictures in a row.
+    flat : bool
+        Colours of labels: they are not mixed within a triangle.
+    view, up
+        See :func:`s4a.draw.rotation`.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Examples
+    --------
+    >>> from s4a.synthetic import sphere
+    >>> mesh = sphere(100)
+    >>> [ax.get_title() for ax in surfaces({"height": mesh}, {"height": mesh["position"].values[:, 2]}).axes]
+    ['height', '']
+    """
+    values = {} if values is None else {title: np.asarray(v) for title, v in values.items()}
+    signed = [v for v in values.values() if v.ndim == 1]
+    if limit is None:
+        limit = max((float(np.quantile(np.abs(v), 0.99)) for v in signed), default=1.0) or 1.0
+    rows = -(-len(meshes) // columns)
+    wide = min(columns, len(meshes))
+    with rc_context(LOOK):
+        figure = Figure(figsize=(2.5 * wide + 0.7 * bool(signed), 2.35 * rows), layout="constrained")
+        axes = figure.subplots(rows, wide, squeeze=False)
+    for ax in axes.flat:
+        ax.set_axis_off()
+    for ax, (title, mesh) in zip(axes.flat, meshes.items(), strict=False):
+        colors = values.get(title)
+        if colors is not None and colors.ndim == 1:
+            colors = signed_colors(colors, limit)
+        ax.imshow(render(*as_arrays(mesh), colors=colors, flat=flat, view=view, up=up, size=(360, 300)))
+        ax.set_title(title, parse_math=False)
+    if signed:
+        scale = ScalarMappable(Normalize(-limit, limit), SIGNED)
+        figure.colorbar(scale, ax=axes, shrink=0.7, label=label, pad=0.01)
+    return figure
 
 
 def network(places, names, source, target, errors, highlight=None):

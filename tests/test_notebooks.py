@@ -1,0 +1,86 @@
+"""The course runs: every notebook from a clean kernel, its exercises without an answer and with the one of the book."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+nbformat = pytest.importorskip("nbformat")
+nbclient = pytest.importorskip("nbclient")
+pytest.importorskip("ipykernel")
+
+FOLDER = Path(__file__).parent.parent / "notebooks"
+NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
+MEMORY = 1500  # MiB, of the 2 GB that Binder gives
+OPEN = "answer = ..."
+SPENT = """
+import json, resource, sys
+own, child = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+unit = 2**20 if sys.platform == "darwin" else 2**10
+seconds = sum(r.ru_utime + r.ru_stime for r in (own, child))
+json.dumps({"seconds": seconds, "MiB": (own.ru_maxrss + child.ru_maxrss) / unit})
+"""
+each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+
+
+def tags(cell):
+    return cell.metadata.get("tags", [])
+
+
+def exercises(notebook):
+    """Index of each exercise and the code of its solution, which is in the next cell, folded."""
+    for i, cell in enumerate(notebook.cells):
+        if "exercise" in tags(cell):
+            solution = notebook.cells[i + 1].source
+            assert solution.startswith("<details>"), f"no solution after the exercise: {cell.source}"
+            yield i, re.search(r"```python\n(.*?)\n```", solution, re.DOTALL)[1]
+
+
+def added(client, source):
+    """Run code that is not in the notebook; what it shows as text."""
+    cell = nbformat.v4.new_code_cell(source)
+    client.nb.cells.append(cell)
+    client.execute_cell(cell, len(client.nb.cells) - 1)
+    return "".join(o["data"]["text/plain"] for o in cell.outputs if o.output_type == "execute_result")
+
+
+@each_notebook
+def test_it_runs_and_its_exercises_fail_open_and_pass_solved(path, tmp_path, record_property):
+    notebook = nbformat.read(path, as_version=4)
+    solutions = dict(exercises(notebook))
+    client = nbclient.NotebookClient(
+        notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}
+    )
+    with client.setup_kernel():
+        for i, cell in enumerate(list(notebook.cells)):
+            client.execute_cell(cell, i)  # CellExecutionError where it fails and may not
+            outputs = cell.get("outputs", [])
+            told = [o for o in outputs if o.output_type == "stream" and o.name == "stderr" and "Warning" in o.text]
+            assert not told, told
+            if i in solutions:
+                errors = [(o.ename, o.evalue) for o in outputs if o.output_type == "error"]
+                assert [name for name, _ in errors] == ["AssertionError"], cell.source
+                assert re.match("No answer yet: .*Hint: .{10,}", errors[0][1])
+                assert cell.source.count(OPEN) == 1
+                assert added(client, cell.source.replace(OPEN, solutions[i])) == "'Right.'"
+        spent = json.loads(added(client, SPENT).strip("'"))
+    record_property("notebook", (path.stem, spent["seconds"], spent["MiB"]))
+    assert spent["MiB"] < MEMORY
+
+
+@each_notebook
+def test_it_is_kept_without_outputs_and_with_an_exercise_that_lets_the_others_run(path):
+    notebook = nbformat.read(path, as_version=4)
+    nbformat.validate(notebook)
+    assert notebook.metadata.kernelspec.name == "python3"
+    for cell in notebook.cells:
+        assert cell.cell_type != "code" or (not cell.outputs and cell.execution_count is None)
+    found = [i for i, _ in exercises(notebook)]
+    assert found
+    assert all("raises-exception" in tags(notebook.cells[i]) for i in found)
+
+
+@each_notebook
+def test_the_table_of_lessons_has_it(path):
+    assert f"({path.name})" in (FOLDER / "README.md").read_text(encoding="utf-8")
