@@ -128,6 +128,13 @@ def repairs(counts):
     )
 
 
+def check_components(components):
+    """ValueError unless `components` is "largest", "all" or a number from 1."""
+    number = isinstance(components, int | np.integer) and not isinstance(components, bool)
+    if components not in ("largest", "all") and not (number and components >= 1):
+        raise ValueError(f'components needs to be "largest", "all" or a number from 1; found {components!r}')
+
+
 def _validated(points, triangles, components):
     """The arrays as float64 and int64, or ValueError."""
     P, F = np.asarray(points, np.float64), np.asarray(triangles)
@@ -140,8 +147,7 @@ def _validated(points, triangles, components):
             f"triangles need vertex indices 0..{len(P) - 1}, as there are {len(P)} vertices; "
             f"found {F.min()}..{F.max()}, {((F < 0) | (F >= len(P))).any(axis=1).sum()} triangles out of range"
         )
-    if components not in ("largest", "all") and not (isinstance(components, int | np.integer) and components >= 1):
-        raise ValueError(f'components needs to be "largest", "all" or a number from 1; found {components!r}')
+    check_components(components)
     return P, F.astype(np.int64)
 
 

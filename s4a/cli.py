@@ -18,8 +18,9 @@ from s4a import transfer as travel
 from s4a.annotations import labels_of_file, labels_of_mesh, read_labels, read_landmarks, write_landmarks
 from s4a.draw import VIEWS
 from s4a.io import read_mesh
+from s4a.options import CHOICES, DEFAULTS
 from s4a.picture import write_picture
-from s4a.pipeline import CHOICES, analyse
+from s4a.pipeline import analyse
 from s4a.shapes import read_shape, read_shapes
 from s4a.study import open_study
 from s4a.view import write_page
@@ -90,7 +91,9 @@ def add_options(parser):
             parser.add_argument(flag, action=argparse.BooleanOptionalAction, default=default, help=HELP[name])
         elif name in CHOICES:
             legal = [c for c in CHOICES[name] if c]
-            parser.add_argument(flag, choices=legal, default=default, help=f"{HELP[name]} (default: {default})")
+            parser.add_argument(
+                flag, choices=legal, default=default, help=f"{HELP[name]} (default: {DEFAULTS.get(name, default)})"
+            )
         else:
             number = isinstance(default, int) or name in ("n_latent", "n_jobs")
             default = -1 if name == "n_jobs" else default

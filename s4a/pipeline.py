@@ -1,14 +1,18 @@
 """The whole analysis (4, 6.1): runs the steps over a collection, the only writer of a study."""
 
 import contextlib
+import json
 import logging
 import os
-import resource
+import sys
 import tempfile
+import threading
 import time
+from functools import cache
 from pathlib import Path
 
 import numpy as np
+import psutil
 import xarray as xr
 from joblib import Parallel, delayed, effective_n_jobs, parallel_config
 from scipy.spatial import cKDTree
@@ -20,6 +24,7 @@ from s4a.align import align, farthest_points, realign
 from s4a.clean import clean
 from s4a.io import find_meshes, slug
 from s4a.mesh import as_arrays, as_dataset, vertex_areas
+from s4a.options import check_against, checked
 from s4a.pca import pca
 from s4a.remesh import coarsen
 from s4a.schema import dataset, require
@@ -28,62 +33,53 @@ from s4a.spectral import spectrum
 
 log = logging.getLogger(__name__)
 
-CHOICES = {
-    "init": ("dense", "landmarks"),
-    "refine": ("joint", "intrinsic"),
-    "how": ("ours", "standard"),
-    "norm": tuple(median.NORMS),
-    "preset": (None, "paper"),
-}
-PAPER = {"init": "landmarks", "refine": "intrinsic", "how": "ours"}
 SAMPLES = 1000  # vertices per shape in Consistent ZoomOut, but for its last round
-
-
-def checked(options):
-    """The options with the preset applied; ValueError where one is outside its range."""
-    for name, legal in CHOICES.items():
-        if options[name] not in legal:
-            raise ValueError(f"{name} must be one of {', '.join(map(repr, legal))}; found {options[name]!r}")
-    lowest = {"n_coarse": 100, "n_pairs": 1, "k_init": 4, "k": 4, "step": 1, "seed": 0, "n_latent": 2}
-    for name, least in lowest.items():
-        value = options[name]
-        if name == "n_latent" and value is None:
-            continue
-        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-            raise ValueError(f"{name} must be an integer of at least {least}; found {value!r}")
-    if options["k"] < options["k_init"]:
-        raise ValueError(f"k must be at least k_init = {options['k_init']}; found {options['k']}")
-    if (options["n_latent"] or 0) > options["k"]:
-        raise ValueError(f"n_latent must be at most k = {options['k']}; found {options['n_latent']}")
-    return options | (PAPER if options["preset"] == "paper" else {})
 
 
 class Run:
     """One run over a study folder: does tasks that are not done yet, and keeps time, memory and failures."""
 
-    def __init__(self, folder, n_jobs):
-        self.folder, self.n_jobs = Path(folder), n_jobs
-        self.seconds, self.memory, self.failures = {}, {}, {}
+    def __init__(self, claim, n_jobs):
+        self.folder, self.n_jobs, self.claim = claim.folder, n_jobs, claim
+        self.failures, self.costs = {}, {}
+        with contextlib.suppress(OSError, ValueError):
+            self.costs = {n: [float(x) for x in c] for n, c in json.loads(self.costs_file.read_text()).items()}
+
+    @property
+    def costs_file(self):
+        return self.folder / ".costs.json"
 
     @contextlib.contextmanager
-    def stage(self, name):
-        """Time and peak memory of a stage (seconds; MiB, this process and its workers together)."""
+    def stage(self, name, share=1.0):
+        """Time and peak memory of a stage (seconds; MiB, this process and its workers together).
+
+        They are added to those of earlier runs over the folder where a `share` of the stage is left to do, and take
+        their place where all of it is.
+        """
         begin, self.workers = time.perf_counter(), {}
-        yield
-        self.seconds[name] = time.perf_counter() - begin
-        own = {os.getpid(): resource.getrusage(resource.RUSAGE_SELF).ru_maxrss}
-        self.memory[name] = sum((self.workers | own).values()) / 1024
+        seconds, memory = self.costs.get(name, (0.0, 0.0)) if share < 1 else (0.0, 0.0)
+        try:
+            yield
+        finally:  # an interrupted stage has cost something too
+            if share > 0 or name not in self.costs:
+                own = {os.getpid(): peak_memory()}
+                memory = np.fmax(memory, sum((self.workers | own).values()))
+                self.costs[name] = [seconds + time.perf_counter() - begin, float(memory)]
+                with contextlib.suppress(OSError):
+                    self.costs_file.write_text(json.dumps(self.costs))
 
     def tasks(self, stage, function, tasks, *, each=True, made_from=None):
         """Do the tasks (name, file, key, arguments) whose file is not done; `made_from` as of :func:`s4a.study.write`.
 
         A ValueError is kept as a failure where the tasks are one for `each` shape, and raised where all need all.
         """
-        with self.stage(stage):
-            missing = [t for t in tasks if not study.is_done(self.folder / t[1], t[2])]
+        missing = [t for t in tasks if not study.is_done(self.folder / t[1], t[2])]
+        with self.stage(stage, len(missing) / max(len(tasks), 1)):
             log.info("%s: %d of %d to do", stage, len(missing), len(tasks))
             jobs = (
-                delayed(do_task)(function, name, self.folder / file, key, arguments, (made_from or {}).get(name, []))
+                delayed(do_task)(
+                    function, name, self.folder / file, key, arguments, (made_from or {}).get(name, []), self.claim
+                )
                 for name, file, key, arguments in missing
             )
             results = Parallel(n_jobs=self.n_jobs, return_as="generator_unordered")(jobs)
@@ -95,15 +91,43 @@ class Run:
                     self.failures[name] = f"{stage}: {failure}"
 
 
-def do_task(function, name, path, key, arguments, made_from):
+def do_task(function, name, path, key, arguments, made_from, claim):
     """Compute one Dataset and write its file; with one BLAS thread, as tasks run side by side."""
+    end_with(claim.owner)
+    claim.check()
     try:
         with threadpool_limits(1):
-            study.write(function(*arguments), path, key, made_from)
+            data = function(*arguments)
         failure = ""
     except ValueError as error:
         failure = str(error)
-    return name, failure, os.getpid(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    if not failure:
+        study.write(data, path, key, made_from, claim)
+    return name, failure, os.getpid(), peak_memory()
+
+
+@cache
+def end_with(owner):
+    """Let a worker process that process `owner` started end within a second of it, however that ended."""
+    if os.getppid() != owner:
+        return
+
+    def watch():
+        while os.getppid() == owner:
+            time.sleep(0.5)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def peak_memory():
+    """Peak resident memory of this process in MiB; nan where the system does not say."""
+    try:
+        import resource
+    except ImportError:  # on Windows
+        return getattr(psutil.Process().memory_info(), "peak_wset", np.nan) / 2**20
+    unit = 2**20 if sys.platform == "darwin" else 2**10
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 
 
 def collection(shapes, pattern):
@@ -258,9 +282,9 @@ def analyse(
     k=100,
     n_latent=None,
     step=5,
-    init="dense",
-    refine="joint",
-    how="ours",
+    init=None,
+    refine=None,
+    how=None,
     norm="h2",
     scale=False,
     components="largest",
@@ -290,12 +314,12 @@ def analyse(
         Dimension of the latent space; k by default.
     step : int
         Growth of the maps per round of Consistent ZoomOut.
-    init : {"dense", "landmarks"}
-        First maps from all nearest neighbours after ICP, or the paper's fit on 10 landmarks.
-    refine : {"joint", "intrinsic"}
+    init : {"dense", "landmarks"}, optional
+        First maps from all nearest neighbours after ICP (default), or the paper's fit on 10 landmarks.
+    refine : {"joint", "intrinsic"}, optional
         Registration with joint rounds (default), or the paper's spectral match alone.
-    how : {"ours", "standard"}
-        Full resolution by eq. 7, or by eq. 3 and 4.
+    how : {"ours", "standard"}, optional
+        Full resolution by eq. 7 (default), or by eq. 3 and 4.
     norm : {"h2", "h1", "frobenius"}
         Norm of eq. 5, see :func:`s4a.median.distance_to_identity`.
     scale : bool
@@ -305,7 +329,7 @@ def analyse(
     wrap : bool
         Whether shapes are wrapped watertight before they are remeshed.
     preset : {None, "paper"}
-        ``"paper"`` sets init="landmarks", refine="intrinsic", how="ours".
+        ``"paper"`` sets init="landmarks", refine="intrinsic", how="ours"; another value of these is refused.
     template : str, optional
         Name of the shape to register to; the median shape by default.
     store : path, optional
@@ -327,13 +351,15 @@ def analyse(
     options = {n: v for n, v in locals().items() if n not in ("shapes", "store", "n_jobs")}
     options = checked(options)
     given = collection(shapes, pattern)
+    check_against(options, list(given))
     if store is None:
         with tempfile.TemporaryDirectory(prefix="s4a-") as folder:
-            run_stages(Run(folder, n_jobs), given, options)
+            with study.lock(folder) as claim:
+                run_stages(Run(claim, n_jobs), given, options)
             tree = study.open_study(folder)
             return xr.DataTree.from_dict({n.path: n.to_dataset(inherit=False).load() for n in tree.subtree})
-    with study.lock(store):
-        run_stages(Run(store, n_jobs), given, options)
+    with study.lock(store) as claim:
+        run_stages(Run(claim, n_jobs), given, options)
     return study.open_study(store)
 
 
@@ -362,8 +388,8 @@ def run_stages(run, given, options):
     if len(names) < 2:
         reasons = "; ".join(f"{n}: {why}" for n, why in run.failures.items()) or "only one was given"
         raise ValueError(f"an analysis needs at least 2 usable shapes, found {len(names)} ({reasons})")
-    if o["template"] is not None and o["template"] not in names:
-        raise ValueError(f"template {o['template']!r} is none of the shapes: {', '.join(names)}")
+    if o["template"] in run.failures:
+        raise ValueError(f"template {o['template']!r} cannot be used: {run.failures[o['template']]}")
 
     eigenvalues = [low_shape(folder, n)[3] for n in names]
     k_signature = min(o["k_init"], *(len(e) for e in eigenvalues))
@@ -448,10 +474,13 @@ def write_report(run, given, options, no_modes, made_from):
                 "not manifold at low resolution: robust Laplacian" if coarse["laplacian"] == "robust" else "",
             ]
             attrs[name] = mesh | {"reason": "; ".join(filter(None, remarks))}
-    stages = dataset(
+            if isinstance(source, str):
+                attrs[name]["path"] = source  # the file may have moved since it was read
+    stages = list(run.costs)
+    costs = dataset(
         {"no_modes": no_modes, **{n: str(v) for n, v in options.items()}},
-        seconds=np.array(list(run.seconds.values())),
-        peak_memory=np.array([run.memory[s] for s in run.seconds]),
-    ).assign_coords(stage=list(run.seconds))
-    report = shape_report(attrs).assign(stages.variables).assign_attrs(stages.attrs)
+        seconds=np.array([run.costs[s][0] for s in stages]),
+        peak_memory=np.array([run.costs[s][1] for s in stages]),
+    ).assign_coords(stage=stages)
+    report = shape_report(attrs).assign(costs.variables).assign_attrs(costs.attrs)
     study.write(report, run.folder / "report.nc", made_from=made_from)

@@ -8,7 +8,9 @@ import hashlib
 import json
 import logging
 import os
+import uuid
 from contextlib import contextmanager
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
@@ -45,17 +47,42 @@ def task_key(*parts):
     return digest.hexdigest()[:32]
 
 
-def write(data, path, key="", made_from=()):
+@dataclass(frozen=True)
+class Claim:
+    """The right of one run to write into a folder, as it stands in its lock; it travels to the workers."""
+
+    folder: Path
+    token: str
+
+    @property
+    def owner(self):
+        """Number of the process of the run."""
+        return int(self.token.split()[0])
+
+    def check(self):
+        """ValueError when the folder has been taken over, as by the run that follows one that was killed."""
+        try:
+            held = (self.folder / ".lock").read_text()
+        except OSError:
+            held = ""
+        if held != self.token:
+            raise ValueError(f"the run of process {self.owner} no longer holds {self.folder}")
+
+
+def write(data, path, key="", made_from=(), claim=None):
     """Write a Dataset to `path` at once: under a temporary name in the same folder, then renamed.
 
     `made_from` are the keys of the files that it was computed from; :func:`open_study` leaves a file out when one of
-    them is no longer there, as after a run with other options was stopped half-way.
+    them is no longer there, as after a run with other options was stopped half-way.  With a `claim` nothing is
+    written when it no longer holds.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         data.assign_attrs(task_key=key, made_from=" ".join(made_from)).to_netcdf(temporary, engine=ENGINE)
+        if claim is not None:
+            claim.check()
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -87,29 +114,38 @@ def lock(folder):
 
     Temporary files of a run that was killed are removed.
 
+    Yields
+    ------
+    Claim
+
     Raises
     ------
     ValueError
         When another process holds the folder; its number is named.
     """
-    import fcntl
-
+    try:
+        import fcntl
+    except ImportError:  # on Windows
+        fcntl = None
+        log.warning("this system cannot lock %s; start no second run in it", folder)
     Path(folder).mkdir(parents=True, exist_ok=True)
     with open(Path(folder) / ".lock", "a+") as handle:
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if fcntl:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             handle.seek(0)
             raise ValueError(
-                f"another run (process {handle.read().strip() or 'unknown'}) is working on {folder}; "
+                f"another run (process {(handle.read().split() or ['unknown'])[0]}) is working on {folder}; "
                 "wait for it to end or give another folder"
             ) from None
+        token = f"{os.getpid()} {uuid.uuid4().hex}"
         handle.truncate(0)
-        handle.write(str(os.getpid()))
+        handle.write(token)
         handle.flush()
         for left in Path(folder).rglob(".*.tmp"):
             left.unlink(missing_ok=True)
-        yield
+        yield Claim(Path(folder), token)
 
 
 def stack_registration(template, files, names):
