@@ -22,7 +22,7 @@ from s4a.options import CHOICES, DEFAULTS
 from s4a.picture import write_picture
 from s4a.pipeline import analyse
 from s4a.shapes import read_shape, read_shapes
-from s4a.study import open_study
+from s4a.study import VERSION, open_study
 from s4a.view import write_page
 
 HELP = {
@@ -217,14 +217,17 @@ def demo(args):
     errors = accuracy.accuracy(study, image, n_jobs=args.n_jobs)
     closing(study, time.perf_counter() - begin)
     write("\n" + error_table(errors))
-    planted = truth["planted_score"].sel(shape=study["pca"]["shape"]).values
-    score = study["pca"]["score"].values
-    both = np.abs(np.corrcoef(planted.T, score[:, : planted.shape[1]].T))[: planted.shape[1], planted.shape[1] :]
-    write("correlation of planted and recovered scores: " + ", ".join(f"{r:.3f}" for r in np.diag(both)))
     page = Path(args.out) / "study.html"
     write_page(study, page, title="Synthetic brains")
-    picture = write_picture(study, Path(args.out) / "modes.png")
-    write(f"\npictures: {page}, {picture} ({time.perf_counter() - begin:.0f} s in all)")
+    pictures = [str(page)]
+    if "pca" in study:
+        planted = truth["planted_score"].sel(shape=study["pca"]["shape"]).values
+        score = study["pca"]["score"].values
+        n = min(planted.shape[1], score.shape[1])
+        both = np.abs(np.corrcoef(planted[:, :n].T, score[:, :n].T))[:n, n:]
+        write("correlation of planted and recovered scores: " + ", ".join(f"{r:.3f}" for r in np.diag(both)))
+        pictures.append(str(write_picture(study, Path(args.out) / "modes.png")))
+    write(f"\npictures: {', '.join(pictures)} ({time.perf_counter() - begin:.0f} s in all)")
     if args.open:
         webbrowser.open(page.resolve().as_uri())
     return 0
@@ -317,6 +320,7 @@ def write(text):
 def parser():
     """The parser of all commands."""
     top = argparse.ArgumentParser(prog="s4a", description="Scalable spectral statistical shape analysis")
+    top.add_argument("--version", action="version", version=f"s4a {VERSION}")
     commands = top.add_subparsers(required=True, metavar="command")
 
     def command(function, **arguments):

@@ -116,9 +116,12 @@ def synthesize(study, scores):
     Raises
     ------
     ValueError
-        When there are more scores than components.
+        When there are more scores than components, or the study has no modes.
     """
     scores = np.atleast_1d(np.asarray(scores, float))
+    if "pca" not in study.children:
+        reason = study["report"].attrs.get("no_modes") if "report" in study.children else ""
+        raise ValueError(f"a study with modes is needed; this one has none: {reason or 'it is not finished'}")
     pca, template = study["pca"].to_dataset(), study["registration"].to_dataset()
     require(pca, "deformation", "mean_displacement", what="pca dataset")
     if scores.ndim != 1 or len(scores) > pca.sizes["component"]:

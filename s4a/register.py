@@ -1,5 +1,6 @@
 """Registration at full resolution (eq. 3, 4, 6 and 7): one shape onto one template, and the way back."""
 
+import logging
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -12,7 +13,10 @@ from s4a.align import align
 from s4a.deform import displacement_in_template, onto
 from s4a.mesh import as_arrays, closest_point_in_star, vertex_areas, vertex_normals
 from s4a.nearest import nearest_in_cells
+from s4a.options import checked
 from s4a.schema import dataset, require
+
+log = logging.getLogger(__name__)
 
 CONFIDENCE_LENGTH = 0.02
 
@@ -212,25 +216,27 @@ def match_pair(source, target, *, k_init=20, k=100, init="dense", refine="joint"
         after rigid alignment (unit of the input), ``confidence(vertex)``; ``rotation``, ``translation``, ``scale`` of
         that alignment of the source; the way back, ``template_triangle(original_vertex)`` and
         ``template_barycentric``, from the source's vertices to the target; attrs ``score`` (see
-        :func:`s4a.joint.badness`) and ``method``.
+        :func:`s4a.joint.badness`) and ``method``, and ``note`` where k had to be reduced.
 
     Raises
     ------
     ValueError
-        When a mesh lacks its variables or an option is not one of those above.
+        When a mesh lacks its variables or an option is outside its range, see :func:`s4a.analyse`.
     """
     from s4a.remesh import coarsen
     from s4a.spectral import spectrum
 
-    if refine not in ("joint", "intrinsic") or init not in ("dense", "landmarks"):
-        raise ValueError(
-            f"refine must be 'joint' or 'intrinsic', init 'dense' or 'landmarks'; found {refine!r}, {init!r}"
-        )
+    given = {"k_init": k_init, "k": k, "init": init, "refine": refine, "n_coarse": n_coarse, "seed": seed}
+    given = checked(given)
     scans = []
     for mesh, what in ((source, "source"), (target, "target")):
         require(mesh, "position", "corner_vertex", what=what)
         scans.append(Scan(mesh, spectrum(coarsen(mesh, n_coarse=n_coarse, seed=seed), k=k)))
-    found, C, C0 = match_scans(*scans, k_init=k_init, k=k, init=init, refine=refine)
+    init, refine, least = given["init"], given["refine"], min(s.low.Phi.shape[1] for s in scans)
+    found, C, C0 = match_scans(*scans, k_init=min(k_init, least), k=k, init=init, refine=refine)
+    if least < k:
+        found.attrs["note"] = f"k = {k} reduced to {least}, the eigenfunctions that the smaller mesh has"
+        log.warning("%s", found.attrs["note"])
     maps = dataset(fmap=C, fmap_initial=C0, match=found["registered_match"].values)
     return maps.merge(found.drop_vars("registered_match")).assign_attrs(found.attrs)
 

@@ -228,4 +228,8 @@ def open_study(folder):
         report = nodes["report"]
         used = set(report["shape"].values[report["status"].values != "excluded"].tolist())
         nodes = {name: data for name, data in nodes.items() if "/" not in name or name.rpartition("/")[2] in used}
+        paths = dict(zip(report["shape"].values.tolist(), report["path"].values.tolist(), strict=True))
+        for name in used & {n.removeprefix("original/") for n, data in nodes.items() if data is not None}:
+            if paths[name]:  # the file may have moved since it was read
+                nodes[f"original/{name}"] = nodes[f"original/{name}"].assign_attrs(path=paths[name])
     return xr.DataTree.from_dict({n: data for n, data in nodes.items() if data is not None}, name=folder.name)

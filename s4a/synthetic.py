@@ -307,7 +307,8 @@ def _mesh(truth, shape, n_vertices, rng):
     u = _unit(u + rng.normal(0, 0.3 * np.sqrt(4 * np.pi / len(u)), u.shape))
     x = position(truth, shape, u).astype(np.float32)
     start = int(rng.integers(len(u)))
-    u = u[np.sort(fpsample.bucket_fps_kdline_sampling(x, n_vertices, h=7, start_idx=start))]
+    h = min(7, int(np.log2(len(u))))  # levels of its tree, whose leaves must not be empty
+    u = u[np.sort(fpsample.bucket_fps_kdline_sampling(x, n_vertices, h=h, start_idx=start))]
     return u, _delaunay(u)
 
 

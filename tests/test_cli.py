@@ -3,6 +3,7 @@
 import inspect
 import subprocess
 import sys
+from importlib.metadata import version
 
 import numpy as np
 import pytest
@@ -145,6 +146,22 @@ def test_demo_finds_the_planted_modes_and_writes_its_page(tmp_path, monkeypatch,
     assert "correlation of planted and recovered scores" in said
     assert "S4A, registered surface" in said
     assert (out / "study.html").exists()
+
+
+def test_demo_of_two_shapes_ends_well_without_modes(tmp_path, capsys):
+    arguments = ["demo", "--shapes", "2", "--vertices", "300", "--n-jobs", "1", "--out", str(tmp_path)]
+    assert cli.main(arguments) == 0
+    out = capsys.readouterr().out
+    assert "no modes: PCA needs at least 3 shapes" in out
+    assert "study.html" in out
+    assert "modes.png" not in out
+
+
+def test_the_version_is_told(capsys):
+    with pytest.raises(SystemExit) as end:
+        cli.main(["--version"])
+    assert end.value.code == 0
+    assert capsys.readouterr().out == f"s4a {version('s4a')}\n"
 
 
 def test_numbers_are_aligned_to_the_right_and_words_to_the_left():

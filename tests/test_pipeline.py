@@ -212,7 +212,8 @@ def test_the_standard_way_runs(brains):
     assert np.abs(others - 1).max() < 0.2
 
 
-def test_an_unknown_template_is_refused_with_the_names(brains):
+def test_an_unknown_template_is_refused_with_the_names_before_a_shape_is_read(brains, monkeypatch):
+    monkeypatch.setattr("s4a.pipeline.original_task", None)
     with pytest.raises(ValueError, match="template 'x' is none of the shapes: brain_01, brain_02"):
         analyse(brains, template="x", **OPTIONS)
 
@@ -243,6 +244,8 @@ def test_two_shapes_have_no_modes_and_the_study_says_why(meshes):
     assert "pca" not in tree
     assert tree["report"].attrs["no_modes"] == "PCA needs at least 3 shapes, found 2"
     assert tree["registration"].sizes["shape"] == 2
+    with pytest.raises(ValueError, match="a study with modes is needed; this one has none: PCA needs at least 3"):
+        synthesize(tree, [1.0])
 
 
 def test_identical_shapes_have_no_modes_and_all_distances_are_zero(meshes):
@@ -277,10 +280,20 @@ def test_one_usable_shape_is_not_enough_and_the_reasons_are_named(meshes):
         ({"step": True}, r"step must be an integer of at least 1; found True"),
         ({"n_latent": 31}, r"n_latent must be at most k = 30; found 31"),
         ({"n_latent": 1}, r"n_latent must be an integer of at least 2; found 1"),
+        ({"strict": "no"}, r"strict must be True or False; found 'no'"),
+        ({"scale": 1}, r"scale must be True or False; found 1"),
+        ({"components": "foo"}, r'components needs to be "largest", "all" or a number from 1; found \'foo\''),
+        ({"components": True}, r'components needs to be "largest", "all" or a number from 1; found True'),
+        ({"pattern": 3}, r"pattern must be a text or None; found 3"),
+        ({"preset": "paper", "refine": "joint"}, r"preset 'paper' sets refine='intrinsic'; found refine='joint'"),
+        ({"preset": "paper", "how": "standard"}, r"preset 'paper' sets how='ours'; found how='standard'"),
         ({"seed": -1}, r"seed must be an integer of at least 0; found -1"),
     ],
 )
-def test_an_option_out_of_range_is_refused_with_the_legal_range(brains, options, message):
+def test_an_option_out_of_range_is_refused_with_the_legal_range_before_a_shape_is_read(
+    brains, options, message, monkeypatch
+):
+    monkeypatch.setattr("s4a.pipeline.original_task", None)
     with pytest.raises(ValueError, match=message):
         analyse(brains, **OPTIONS | options)
 

@@ -257,3 +257,8 @@ def test_known_surfaces_have_their_area_volume_and_genus():
 def test_wrong_arguments_say_what_is_needed(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_a_brain_may_have_few_vertices():
+    for n in (4, 10, 30):
+        assert brains(1, n)["original/brain_01"].sizes["vertex"] <= n
