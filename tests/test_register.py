@@ -178,10 +178,25 @@ def test_size_can_be_taken_out_of_the_displacement(scans):
     assert np.linalg.norm(with_size["displacement"].values, axis=1).mean() == pytest.approx(0.2 * radius, rel=0.03)
 
 
-@pytest.mark.parametrize("options", [{"refine": "both"}, {"init": "random"}])
-def test_an_unknown_option_is_refused_with_those_there_are(template, options):
-    with pytest.raises(ValueError, match="'joint' or 'intrinsic', init 'dense' or 'landmarks'"):
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"refine": "both"}, "refine must be one of 'joint', 'intrinsic'; found 'both'"),
+        ({"init": "random"}, "init must be one of 'dense', 'landmarks'; found 'random'"),
+        ({"k_init": 0}, "k_init must be an integer of at least 4; found 0"),
+        ({"k": 10}, "k must be at least k_init = 20; found 10"),
+    ],
+)
+def test_an_option_out_of_range_is_refused_with_those_there_are(template, options, message):
+    with pytest.raises(ValueError, match=message):
         match_pair(template, template, **options)
+
+
+def test_more_functions_than_a_mesh_has_are_reduced_and_it_is_said():
+    meshes = synthetic.brains(2, 40)["original"]
+    found = match_pair(*(meshes[n].to_dataset() for n in meshes), k=60, k_init=10, n_coarse=100)
+    assert found["fmap"].shape == (38, 38)
+    assert found.attrs["note"] == "k = 60 reduced to 38, the eigenfunctions that the smaller mesh has"
 
 
 def test_a_mesh_without_triangles_is_refused_by_name(template):

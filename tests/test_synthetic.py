@@ -261,4 +261,4 @@ def test_wrong_arguments_say_what_is_needed(call, message):
 
 def test_a_brain_may_have_few_vertices():
     for n in (4, 10, 30):
-        assert brains(1, n)["original/brain_01"].sizes["vertex"] <= n
+        assert synthetic.brains(1, n)["original/brain_01"].sizes["vertex"] <= n
