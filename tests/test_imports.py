@@ -27,7 +27,7 @@ def imports(path):
     return found
 
 
-STEPS = "clean remesh spectral align fmap network latent median nearest deform joint register pca".split()
+STEPS = "clean remesh spectral align descriptors fmap network latent median nearest deform joint register pca".split()
 GRAPH = {name: imports(path) for name, path in MODULES.items()}
 
 

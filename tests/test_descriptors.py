@@ -1,0 +1,236 @@
+"""Descriptors and the fit of a functional map on them: known answers, the optimum, and agreement with pyFM."""
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from s4a import coarsen, descriptors, fmap, metrics, spectral, spectrum, synthetic
+from s4a.align import farthest_points
+from s4a.mesh import as_arrays, vertex_normals
+
+
+@pytest.fixture(scope="module")
+def brains():
+    tree = synthetic.brains(2, 4000)
+    return [spectrum(coarsen(tree[f"original/brain_0{i}"].to_dataset(), n_coarse=800), k=60) for i in (1, 2)]
+
+
+@pytest.fixture(scope="module")
+def shape(brains):
+    mesh = brains[0]
+    return mesh["eigenfunction"].values, spectral.unit_area(mesh), mesh["eigenvalue"].values, *as_arrays(mesh)
+
+
+def test_signatures_are_those_of_pyfm_at_its_own_settings(shape):
+    signatures = pytest.importorskip("pyFM.signatures")
+    Phi, _, ev, _, _ = shape
+    for ours, theirs in ((descriptors.hks, signatures.auto_HKS), (descriptors.wks, signatures.auto_WKS)):
+        for landmark in (None, np.array([5, 70, 300])):
+            found, expected = ours(Phi, ev, n=30, landmark=landmark), theirs(ev, Phi, 30, landmarks=landmark)
+            assert found == pytest.approx(expected, rel=1e-9, abs=1e-9)
+
+
+@pytest.mark.parametrize("signature", [descriptors.hks, descriptors.wks])
+def test_signatures_do_not_change_with_signs_and_numbering_and_those_of_landmarks_follow_them(shape, signature):
+    Phi, _, ev, _, _ = shape
+    rng = np.random.default_rng(0)
+    order, sign = rng.permutation(len(Phi)), rng.choice([-1, 1], Phi.shape[1])
+    turned, landmark = (Phi * sign)[order], np.array([4, 9])
+    same = np.argsort(order)[landmark]
+    assert signature(turned, ev) == pytest.approx(signature(Phi, ev)[order])
+    expected = signature(Phi, ev, landmark=landmark)[order]
+    assert signature(turned, ev, landmark=same) == pytest.approx(expected, abs=1e-9)
+
+
+def test_a_sphere_has_the_same_signature_everywhere():
+    ball = spectrum(coarsen(synthetic.sphere(8000), n_coarse=2500), k=49)  # all of the modes of degree 0 to 6
+    for signature in (descriptors.hks, descriptors.wks):
+        found = signature(ball["eigenfunction"].values, ball["eigenvalue"].values, n=20)
+        assert found.std(axis=0) == pytest.approx(0, abs=0.06)
+        assert found.mean(axis=0) == pytest.approx(1, abs=0.03)  # filters of sum 1, functions of norm 1
+
+
+def test_the_heat_kernel_around_a_landmark_is_that_of_the_plane_at_short_times(shape):
+    Phi, area, ev, X, _ = shape
+    t = 4 * np.log(10) / ev[-1]
+    kernel = np.exp(-t * ev)
+    heat = descriptors.landmark_signature(Phi, kernel[None], np.array([100]))[:, 0]
+    assert area @ heat == pytest.approx(1)  # heat is kept
+    assert heat[100] == pytest.approx(1 / (4 * np.pi * t), rel=0.5)
+    assert np.linalg.norm(X - X[100], axis=1)[np.argmax(heat)] < 0.05 * np.ptp(X, axis=0).max()
+
+
+def test_both_spectra_of_a_pair_are_filtered_at_the_same_times_and_energies():
+    low, high = np.array([0.0, 1, 2, 3, 9]), np.array([0.0, 2, 4, 5, 6, 30])
+    for kernel in (descriptors.heat_filter, descriptors.wave_filter):
+        one, other = kernel(low, high, n=7), kernel(high, low, n=7)
+        both = np.intersect1d(low, high)[1:]
+        ratio = [k[:, np.searchsorted(s, both)] for k, s in ((one, low), (other, high))]
+        assert ratio[0][:, 0] / one[:, 2] == pytest.approx(np.ones(7))
+        assert one.sum(axis=1) == pytest.approx(np.ones(7))
+    heat = [np.exp(-t) for t in np.diff(np.log(descriptors.heat_filter(low, high, n=7)[:, 1:3]), axis=1)[:, 0]]
+    assert np.log(heat) == pytest.approx(np.geomspace(4 * np.log(10) / 30, 4 * np.log(10) / 2, 7))
+
+
+def test_modes_of_eigenvalue_0_take_no_part_in_the_wave_kernel():
+    assert (descriptors.wave_filter(np.array([0.0, 0, 1, 2, 3]), n=5)[:, :2] == 0).all()
+
+
+def test_products_act_on_functions_of_the_basis(shape):
+    Phi, area, _, _, _ = shape
+    f = Phi[:, 1:3] @ [[1.0, 0.0], [0.0, 2.0]]
+    for column, P in zip(f.T, descriptors.multiplication(Phi, area, f), strict=True):
+        assert pytest.approx(P.T) == P
+        assert P[:, 0] == pytest.approx(Phi.T @ (area * column), abs=1e-9)  # the product with 1
+
+
+def test_the_orientation_operator_of_x_takes_y_to_1_on_a_square_and_to_minus_1_turned_over():
+    x, y = np.meshgrid(np.linspace(0, 2, 9), np.linspace(0, 3, 7), indexing="ij")
+    X = np.c_[x.ravel(), y.ravel(), np.zeros(x.size)]
+    i, j = np.meshgrid(np.arange(8), np.arange(6), indexing="ij")
+    a, b, c, d = (((i + p) * 7 + j + q).ravel() for p, q in ((0, 0), (1, 0), (1, 1), (0, 1)))
+    T = np.concatenate([np.c_[a, b, c], np.c_[a, c, d]])
+    Phi = np.c_[np.ones(len(X)), X[:, :2]]
+    P = descriptors.orientation(X, T, Phi, X[:, :2])
+    area = 6.0
+    assert P[0, 0] == pytest.approx([0, 0, area])
+    assert P[1, 0] == pytest.approx([0, -area, 0])
+    assert descriptors.orientation(X, T[:, ::-1], Phi, X[:, :2]) == pytest.approx(-P)
+    assert descriptors.orientation(5 * X, T, Phi, X[:, :2]) == pytest.approx(P)
+
+
+def test_the_orientation_operator_is_that_of_pyfm(shape):
+    pyfm = pytest.importorskip("pyFM.mesh")
+    Phi, _, _, X, T = shape
+    f = X[:, :2] * [1.0, 0.01]
+    mesh = pyfm.TriMesh(X, T)
+    ours = descriptors.orientation(X, T, Phi[:, :12], f)
+    for column, P in zip(f.T, ours, strict=True):
+        operator = mesh.orientation_op(mesh.gradient(column))
+        theirs = Phi[:, :12].T @ (np.asarray(mesh.vertex_areas)[:, None] * (operator @ Phi[:, :12]))
+        assert pytest.approx(theirs, abs=1e-6 * np.abs(theirs).max()) == P
+
+
+def problem(rng, k_source=6, k_target=6, p=3):
+    F, G = rng.normal(size=(k_source, 4)), rng.normal(size=(k_target, 4))
+    P, Q = rng.normal(size=(p, k_source, k_source)), rng.normal(size=(p, k_target, k_target))
+    skew = [M - M.transpose(0, 2, 1) for M in (P, Q)]
+    penalty = rng.uniform(size=(k_target, k_source))
+    return F, G, {"penalty": penalty, "operators": [(0.3, P, Q), (0.2, *skew)]}
+
+
+def energy(C, F, G, penalty, operators):
+    terms = [w * ((C @ P - Q @ C) ** 2).sum() for w, P, Q in operators]
+    return ((C @ F - G) ** 2).sum() + (penalty * C**2).sum() + sum(terms)
+
+
+@pytest.mark.parametrize("sizes", [(6, 6), (7, 5), (4, 6)])
+@pytest.mark.parametrize("with_operators", [True, False])
+def test_the_fit_is_what_a_slow_optimiser_finds(sizes, with_operators):
+    F, G, terms = problem(np.random.default_rng(1), *sizes)
+    if not with_operators:
+        terms["operators"] = []
+    C = fmap.fit(F, G, **terms, constant=-1.0)
+    assert C[:, 0].tolist() == [-1, *[0] * (sizes[1] - 1)]
+
+    def with_columns(free):
+        return np.column_stack([C[:, 0], free.reshape(sizes[1], -1)])
+
+    slow = minimize(lambda free: energy(with_columns(free), F, G, **terms), np.zeros(C[:, 1:].size), tol=1e-12)
+    assert with_columns(slow.x) == pytest.approx(C, abs=1e-5)
+    assert energy(C, F, G, **terms) <= slow.fun * (1 + 1e-12)
+
+
+def test_without_weight_operators_change_nothing():
+    F, G, terms = problem(np.random.default_rng(2), 5, 5)
+    F, G = (np.column_stack([M, np.random.default_rng(3).normal(size=(5, 3))]) for M in (F, G))
+    row_by_row = fmap.fit(F, G, penalty=terms["penalty"])
+    _, P, Q = terms["operators"][0]
+    assert fmap.fit(F, G, penalty=terms["penalty"], operators=[(0.0, P, Q)]) == pytest.approx(row_by_row)
+
+
+@pytest.mark.parametrize("oriented", [0.0, 0.5])
+def test_the_fit_is_where_that_of_pyfm_ends(brains, oriented):
+    functional = pytest.importorskip("pyFM.functional")
+    weights = pytest.importorskip("pyFM.optimize.weights")
+    pyfm = pytest.importorskip("pyFM.mesh")
+    k = 8
+    peer = functional.FunctionalMapping(
+        *(pyfm.TriMesh(m["position"].values / np.sqrt(m["vertex_area"].values.sum()), as_arrays(m)[1]) for m in brains)
+    )
+    peer.preprocess(n_descr=20, subsample_step=5, k_process=30, k_descr=30)
+    ratio = np.array([1e-1, 1e-3, 1.0, oriented])
+    peer.fit(K=(k, k), w_orient=oriented, factr=10, pgtol=1e-12)
+
+    ends = []
+    for mesh, f in ((peer.mesh1, peer.descr1), (peer.mesh2, peer.descr2)):
+        Phi, area = mesh.eigenvectors[:, :k], mesh.A.diagonal()
+        turn = descriptors.orientation(mesh.vertices, mesh.faces, Phi, f)
+        ends.append((Phi.T @ (area[:, None] * f), descriptors.multiplication(Phi, area, f), turn))
+    (F, P, W), (G, Q, V) = ends
+    mask = weights.resolvent_mask(peer.mesh1.eigenvalues[:k], peer.mesh2.eigenvalues[:k])
+    tau = weights.canonical_taus(F, G, (P, Q), (W, V) if oriented else [], mask)
+    w = ratio / ratio.sum() / tau
+    operators = [(w[2], P, Q)] + ([(w[3], W, V)] if oriented else [])
+    start = peer._get_x0("zeros")[0, 0]
+    ours = fmap.fit(np.sqrt(w[0]) * F, np.sqrt(w[0]) * G, penalty=w[1] * mask, operators=operators, constant=start)
+    assert ours == pytest.approx(peer.FM_12, abs=1e-3)
+
+
+def test_the_fit_on_descriptors_of_a_shape_and_itself_renumbered_is_the_map_between_them(brains):
+    mesh = brains[0]
+    rng = np.random.default_rng(0)
+    order, sign = rng.permutation(mesh.sizes["vertex"]), rng.choice([-1, 1], mesh.sizes["mode"])
+    sign[0] = 1
+    other = mesh.isel(vertex=order).assign(
+        corner_vertex=(mesh["corner_vertex"].dims, np.argsort(order)[mesh["corner_vertex"].values])
+    )
+    other["eigenfunction"] = other["eigenfunction"] * sign
+    for kind in ("wks", "hks"):
+        C = fmap.fit_descriptors(mesh, other, kind=kind)["fmap"].values
+        match = fmap.zoomout(
+            C, mesh["eigenfunction"].values, other["eigenfunction"].values, spectral.unit_area(other), 60
+        )
+        assert (match[1] == order).all(), kind
+
+
+def test_descriptors_alone_match_different_brains_and_landmarks_help(brains):
+    source, target = brains
+    (X, T), (Phi, Psi) = as_arrays(source), (m["eigenfunction"].values for m in brains)
+    landmark = farthest_points(X, 8)
+    nearest = np.linalg.norm(X[landmark][:, None] - target["position"].values, axis=2).argmin(1)
+    error = {}
+    for name, marks in (("alone", None), ("landmarks", (landmark, nearest))):
+        C = fmap.fit_descriptors(source, target, landmarks=marks)["fmap"].values
+        match = fmap.match_from_fmap(C, Phi, Psi)
+        true = np.linalg.norm(X[:, None] - target["position"].values, axis=2).argmin(0)
+        error[name] = metrics.geodesic_error(X, T, match, true).mean()
+    assert error["landmarks"] < error["alone"] < 0.3
+
+
+def test_the_orientation_term_prefers_the_map_that_keeps_the_sides_over_its_mirror_image():
+    ellipsoid = spectrum(coarsen(synthetic.ellipsoid(4000), n_coarse=1000), k=20)
+    Phi, area = ellipsoid["eigenfunction"].values, spectral.unit_area(ellipsoid)
+    X, T = as_arrays(ellipsoid)
+    assert ((vertex_normals(X, T) * X).sum(1) > 0).mean() > 0.99
+    mirror = np.linalg.norm(X[:, None] * [1, 1, -1] - X[None], axis=2).argmin(1)
+    f = X[:, :2] * X[:, 2:]
+    W = descriptors.orientation(X, T, Phi, f)
+    turned = descriptors.orientation(X, T, Phi, f[mirror])
+    C = fmap.fmap_from_match(Phi, Phi, area, mirror)
+    kept = (W**2).sum()
+    assert ((C @ W - turned @ C) ** 2).sum() > 2 * kept
+    assert ((C @ W + turned @ C) ** 2).sum() < 0.1 * kept
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"k": 61}, "source needs 61 eigenfunctions"),
+        ({"kind": "sift"}, "kind must be"),
+        ({"landmarks": ([1, 2], [3])}, "as many vertices"),
+    ],
+)
+def test_a_fit_that_cannot_be_is_refused(brains, options, message):
+    with pytest.raises(ValueError, match=message):
+        fmap.fit_descriptors(*brains, **options)
