@@ -7,8 +7,6 @@ the sum over the modes of filter x phi(v) x phi.  Eigenvalues and eigenfunctions
 
 import numpy as np
 
-from s4a.mesh import triangle_normals
-
 
 def heat_filter(eigenvalue, *others, n=100):
     """Filters exp(-t lambda) of the heat kernel at n times ``(n, k)``, each of sum 1 (Sun, Ovsjanikov, Guibas 2009).
@@ -133,28 +131,30 @@ def multiplication(Phi, area, f):
     return np.stack([weighted.T @ (column[:, None] * Phi) for column in f.T])
 
 
-def orientation(X, T, Phi, f):
+def orientation(T, Phi, f):
     """Operators g -> <grad f x grad g, normal> in the basis ``(d, k, k)`` (Ren, Poulenard, Wonka, Ovsjanikov 2018).
 
-    They change sign where a map turns the surface over, which tells a shape from its mirror image.
+    Of linear functions on a triangle its integral is half the determinant of their differences along two sides: the
+    triangle's shape drops out.  The operators change sign where a map turns the surface over, which tells the sides of
+    a symmetric shape apart.
 
     Parameters
     ----------
-    X, T : the mesh, triangles turned the same way
+    T : int ndarray (m, 3)
+        Triangles, turned the same way.
     Phi : float ndarray (n, k)
+        Basis, orthonormal in the vertex areas.
     f : float ndarray (n, d)
+
+    Examples
+    --------
+    >>> orientation(np.array([[0, 1, 2]]), np.eye(3), np.array([[0.0], [1.0], [0.0]])).round(3)[0, 0].tolist()
+    [-0.167, 0.0, 0.167]
     """
-    normal = triangle_normals(X, T)
-    double_area = np.linalg.norm(normal, axis=1)
-    solid = double_area > 0
-    T, normal, double_area = T[solid], normal[solid], double_area[solid]
-    side = X[T[:, [2, 0, 1]]] - X[T[:, [1, 2, 0]]]  # opposite to each corner
-    turned = side / double_area[:, None, None]  # gradient of the corner's hat function, a quarter turn back
-    gradient = np.cross((normal / double_area[:, None])[:, None], turned)
-    gradient_Phi = np.einsum("mcx,mck->mkx", gradient, Phi[T])
-    mean = (double_area / 2)[:, None] * Phi[T].mean(axis=1)
+    mean = Phi[T].mean(axis=1)
+    first, second = (Phi[T[:, i]] - Phi[T[:, 0]] for i in (1, 2))
     found = []
     for column in f.T:
-        across = -np.einsum("mcx,mc->mx", turned, column[T])  # normal x gradient
-        found.append(mean.T @ np.einsum("mkx,mx->mk", gradient_Phi, across))
+        along, across = (column[T[:, i]] - column[T[:, 0]] for i in (1, 2))
+        found.append(mean.T @ (along[:, None] * second - across[:, None] * first) / 2)
     return np.stack(found)

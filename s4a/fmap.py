@@ -181,7 +181,7 @@ def fit_landmarks(Phi_source, Phi_target, ev_source, ev_target, landmark_source,
 
 
 def fit_descriptors(
-    source, target, *, k=20, landmarks=None, kind="wks", n=100, every=5, laplacian=1e-3, commute=1.0, oriented=0.0
+    source, target, *, k=20, landmarks=None, kind="wks", n=100, every=5, laplacian=1e-3, commute=1.0, oriented=1.0
 ):
     """Fit of a functional map on descriptors, with or without landmarks (step 4 of 4.1).
 
@@ -223,12 +223,12 @@ def fit_descriptors(
         if mesh.sizes["mode"] < k:
             raise ValueError(f"the {what} needs {k} eigenfunctions, found {mesh.sizes['mode']}: give a smaller k")
         area = mesh["vertex_area"].values
-        ends.append((mesh["eigenvalue"].values, mesh["eigenfunction"].values, area / area.sum(), *as_arrays(mesh)))
+        ends.append((mesh["eigenvalue"].values, mesh["eigenfunction"].values, area / area.sum(), as_arrays(mesh)[1]))
     marks = (None, None) if landmarks is None else [np.asarray(v) for v in landmarks]
     if landmarks is not None and (len(marks) != 2 or marks[0].shape != marks[1].shape or marks[0].ndim != 1):
         raise ValueError(f"landmarks need as many vertices of the source as of the target, found {landmarks!r}")
     F, products, turns = [], [], []
-    for (ev, Phi, area, X, T), (other, *_), mark in zip(ends, ends[::-1], marks, strict=True):
+    for (ev, Phi, area, T), (other, *_), mark in zip(ends, ends[::-1], marks, strict=True):
         kernel = filters[kind](ev, other, n=n)[::every]
         f = signature(Phi, kernel)
         if mark is not None:
@@ -238,7 +238,7 @@ def fit_descriptors(
         B = Phi[:, :k]
         F.append(B.T @ (area[:, None] * f))
         products.append(multiplication(B, area, f) if commute else None)
-        turns.append(orientation(X, T, B, f) if oriented else None)
+        turns.append(orientation(T, B, f) if oriented else None)
     operators = [(w / (P**2).sum(), P, Q) for w, (P, Q) in ((commute, products), (oriented, turns)) if w]
     ev, ev_target = (e[0][:k] for e in ends)
     size = np.linalg.norm(F[0])
