@@ -88,7 +88,7 @@ def _annot_labels(file):
     return nibabel.freesurfer.read_annot(file)[0]
 
 
-def _rows(file):
+def table_rows(file):
     """Rows of a table separated by commas, semicolons, tabs or spaces; comments and empty lines are left out."""
     lines = [s for s in file.read_text("utf-8-sig").splitlines() if s.strip() and not s.startswith("#")]
     if not lines:
@@ -97,7 +97,7 @@ def _rows(file):
     return [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=mark, skipinitialspace=True)]
 
 
-def _is_number(text):
+def is_number(text):
     try:
         float(text)
     except ValueError:
@@ -106,7 +106,7 @@ def _is_number(text):
 
 
 def _text_labels(file):
-    rows = _rows(file)
+    rows = table_rows(file)
     head = [cell.lower() for cell in rows[0]]
     if "label" in head:
         values = [row[head.index("label")] for row in rows[1:]]
@@ -114,7 +114,7 @@ def _text_labels(file):
         values = [row[0] for row in rows]
     else:
         raise ValueError(f"a column 'label' needed, found {', '.join(rows[0])}")
-    labels = np.array([float(v) for v in values]) if all(map(_is_number, values)) else np.array(values)
+    labels = np.array([float(v) for v in values]) if all(map(is_number, values)) else np.array(values)
     if "label" in head and "vertex" in head:
         vertex = np.array([row[head.index("vertex")] for row in rows[1:]]).astype(int)
         if not np.array_equal(np.sort(vertex), np.arange(len(vertex))):
@@ -176,13 +176,13 @@ def _meshlab_points(path):
 
 
 def _table_points(path):
-    rows = _rows(path)
+    rows = table_rows(path)
     head = [cell.lower() for cell in rows[0]]
     if all(axis in head for axis in "xyz"):
         x = [head.index(axis) for axis in "xyz"]
         name = next((head.index(n) for n in ("name", "label", "landmark") if n in head), None)
         rows = rows[1:]
-    elif len(head) in (3, 4) and all(map(_is_number, rows[0][-3:])):
+    elif len(head) in (3, 4) and all(map(is_number, rows[0][-3:])):
         x, name = range(len(head) - 3, len(head)), 0 if len(head) == 4 else None
     else:
         raise ValueError(f"the columns name, x, y and z needed, found {', '.join(rows[0])}")

@@ -43,6 +43,7 @@ HELP = {
     "pattern": "only files whose name fits, for example '*brain*'",
     "preset": "'paper' sets init, refine and how to the paper's",
     "template": "name of the shape to register to (default: the median shape)",
+    "table": "CSV with a column 'shape', covariates and groups, for the statistics",
     "n_jobs": "processes; -1 for all cores",
     "seed": "seed of all randomness",
 }

@@ -17,7 +17,7 @@ from s4a.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.network import first_map, spectral_distance
 from s4a.register import Scan, registration
 from s4a.remesh import coarsen
-from s4a.schema import dataset, require
+from s4a.schema import dataset, in_unit, require, unit_of
 from s4a.shapes import read_shapes, shape_report
 from s4a.spectral import spectrum, unit_area
 
@@ -157,7 +157,7 @@ def project_scores(d, mean, deformation, standard_deviation, area):
     return np.array(scores), np.array(lefts)
 
 
-def _options(study):
+def options_of(study):
     """What of the options of the study a new shape needs."""
     given = study["report"].attrs if "report" in study else {}
     numbers = {n: int(given.get(n, d)) for n, d in (("n_coarse", 6000), ("k_init", 20), ("step", 5), ("seed", 0))}
@@ -242,7 +242,7 @@ def insert(study, shapes, *, n_jobs=None):
     missing = [n for n in ("original", "coarse", "latent", "registration") if n not in study.children]
     if missing:
         raise ValueError(f"a finished study is needed; this one lacks {', '.join(missing)}")
-    o = _options(study)
+    o = options_of(study)
     template = study["registration"].attrs["template"]
     meshes, attrs = _read({"new": shapes} if isinstance(shapes, xr.Dataset) else shapes, o)
     if template in meshes:
@@ -274,7 +274,9 @@ def insert(study, shapes, *, n_jobs=None):
     bases = np.stack([basis for _, basis, _ in done.values()])
     spectra = np.stack([low["eigenvalue"].values for low, *_ in done.values()])
     nodes["latent"] = _latent(bases, spectra, latent_eigenvalue, o["norm"]).assign_coords(shape=list(done))
-    mesh = as_dataset(*as_arrays(template_scan.original), {"template": template})
+    X, T = as_arrays(template_scan.original)
+    mesh = as_dataset(X, T, {"template": template}, vertex_area=vertex_areas(X, T))
+    mesh = in_unit(mesh, unit_of(template_scan.original["position"]))
     nodes |= store.stack_registration(mesh, {n: files[2] for n, files in done.items()}, list(done))
     if "pca" in study:
         nodes["pca"] = _scores(study["pca"].to_dataset(), nodes["registration"])
@@ -319,4 +321,5 @@ def _scores(modes, registered):
         *(modes[n].values for n in names),
         vertex_areas(*as_arrays(registered)),
     )
-    return frozen.merge(dataset(score=score, reconstruction_error=left)).assign_coords(shape=registered["shape"])
+    found = in_unit(dataset(score=score, reconstruction_error=left), unit_of(modes["deformation"]))
+    return frozen.merge(found).assign_coords(shape=registered["shape"])

@@ -70,12 +70,6 @@ def unique_edges(T, n=None):
     return np.stack([key // max(n, 1), key % max(n, 1)], axis=1), edge_of, count
 
 
-def boundary_vertices(T):
-    """Indices of the vertices on edges with a single triangle."""
-    E, _, count = unique_edges(T)
-    return np.unique(E[count == 1])
-
-
 def edge_graph(X, T):
     """Edge lengths as a symmetric CSR matrix ``(n, n)``: the graph for Dijkstra's distances."""
     i, j = directed_edges(T).T

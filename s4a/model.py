@@ -15,7 +15,7 @@ from s4a.deform import smoother
 from s4a.mesh import as_arrays, vertex_areas
 from s4a.pca import synthesize
 from s4a.register import Scan
-from s4a.schema import dataset, require
+from s4a.schema import dataset, in_unit, require, unit_of
 
 KEPT = "kept from the whole collection: optimistic"
 
@@ -46,6 +46,41 @@ def principal(K):
     return value[keep][::-1] / (len(K) - 1), V[:, keep][:, ::-1]
 
 
+def left_out(inner, cross, own):
+    """A field against the model of others.
+
+    Parameters
+    ----------
+    inner : float ndarray (n, n)
+        Gram matrix of the others.
+    cross : float ndarray (n,)
+        Inner products of the field and the others.
+    own : float
+        Of the field with itself.
+
+    Returns
+    -------
+    error : float ndarray (n,)
+        Vertex distance after reconstruction with 0, 1, ... n - 1 components.
+    score : float ndarray (n - 1,)
+        Scores in standard deviations; NaN where there are fewer components.
+    steps : float ndarray (c, n)
+        Row c: what component c adds, in terms of the others less their mean.
+    """
+    n = len(inner)
+    error, score = np.zeros(n), np.full(n - 1, np.nan)
+    variance, V = principal(centred(inner))
+    total = own - 2 * cross.mean() + inner.mean()
+    # <x - mean, x_j - mean>
+    cross = cross - inner.mean(0) - cross.mean() + inner.mean()
+    coefficient = (cross @ V) / np.sqrt(variance * (n - 1))
+    left = total - np.concatenate([[0], np.cumsum(coefficient**2)])
+    error[:] = np.sqrt(np.maximum(left[-1], 0))
+    error[: len(left)] = np.sqrt(np.maximum(left, 0))
+    score[: len(variance)] = coefficient / np.sqrt(variance)
+    return error, score, (coefficient / np.sqrt(variance * (n - 1)))[:, None] * V.T
+
+
 def leave_one_out(K):
     """Every field against the model of all others.
 
@@ -65,16 +100,7 @@ def leave_one_out(K):
     error, score = np.zeros((s, s - 1)), np.full((s, s - 2), np.nan)
     for i in range(s):
         J = np.flatnonzero(np.arange(s) != i)
-        inner = K[np.ix_(J, J)]
-        variance, V = principal(centred(inner))
-        # <x_i - mean, x_j - mean> and |x_i - mean|^2
-        cross = K[i, J] - inner.mean(0) - K[i, J].mean() + inner.mean()
-        total = K[i, i] - 2 * K[i, J].mean() + inner.mean()
-        coefficient = (cross @ V) / np.sqrt(variance * (s - 2))
-        left = total - np.concatenate([[0], np.cumsum(coefficient**2)])
-        error[i] = np.sqrt(np.maximum(left[-1], 0))
-        error[i, : len(left)] = np.sqrt(np.maximum(left, 0))
-        score[i, : len(variance)] = coefficient / np.sqrt(variance)
+        error[i], score[i], _ = left_out(K[np.ix_(J, J)], K[i, J], K[i, i])
     return error, score
 
 
@@ -164,9 +190,10 @@ def evaluate(study, *, n_samples=1000, n_permutations=100, n_points=500, n_surfa
     -------
     Dataset
         ``compactness(component)`` = sum of the variances, standard error sqrt(2 / s) times it (Davies 2002);
-        ``generalization(component)``, leave-one-out with the correspondences kept, therefore optimistic, NaN for the
-        last component; ``specificity(component)``; each with its standard error, as root mean square over the area
-        between vertices, and ``_surface`` as mean distance from points to the surface, all in the unit of the input;
+        ``generalization(component)``, leave-one-out with the correspondences kept, therefore optimistic
+        (:func:`s4a.statistics.generalization` recomputes them), NaN for the last component;
+        ``specificity(component)``; each with its standard error, as root mean square over the area between vertices,
+        and ``_surface`` as mean distance from points to the surface, all in the unit of the input;
         ``variance_ratio``, ``variance_ratio_null``, ``variance_ratio_null_95``.  The attribute ``generalization_0`` is
         that of the mean shape alone.
 
@@ -201,10 +228,16 @@ def evaluate(study, *, n_samples=1000, n_permutations=100, n_points=500, n_surfa
     X, T = as_arrays(data)
     if n_points:
         points = np.sort(rng.choice(len(X), min(n_points, len(X)), replace=False, p=area))
-        surface = _surface_distances(X, T, d, K, points, score[:n_surface], nearest[:, :n_surface])
+        kept, drawn = _surface_distances(X, T, d, K, points, score[:n_surface], nearest[:, :n_surface])
         found = found.merge(
-            dataset(generalization_surface=per_component(surface[0]), specificity_surface=per_component(surface[1]))
+            dataset(
+                generalization_surface=per_component(kept.mean(0)),
+                generalization_surface_error=per_component(standard_error(kept)),
+                specificity_surface=drawn.mean(1),
+                specificity_surface_error=standard_error(drawn, 1),
+            )
         )
+    found = in_unit(found, unit_of(data["displacement"]))
     features = _coefficients(study, d, area)
     own = np.linalg.svd(features - features.mean(0), compute_uv=False)[:c] ** 2
     null = variance_baseline(features, n_permutations, rng)[:, :c]
@@ -229,35 +262,47 @@ def _coefficients(study, d, area):
 
 
 def _surface_distances(X, T, d, K, points, score, nearest):
-    """Mean distances from points of the reconstructions to left-out shapes, and of random shapes to the nearest."""
-    s, c, T = len(d), len(nearest), T.astype(np.int64)
+    """Distances from points of the reconstructions to each left-out shape, and of random shapes to the nearest."""
+    s, c = len(d), len(nearest)
     at = (X + d)[:, points].astype(float)
     _, V = principal(centred(K))
     modes = np.einsum("sc,spx->cpx", V, at - at.mean(0)) / np.sqrt(s - 1)
     drawn = at.mean(0) + np.cumsum(score[:, :, None, None] * modes, axis=1)  # sample, component, point, xyz
-    left_out, random = np.full((s, max(s - 2, 1)), np.nan), np.zeros(nearest.shape)
+    kept, random = np.full((s, max(s - 2, 1)), np.nan), np.zeros(nearest.shape)
     for i in range(s):
-        surface = np.ascontiguousarray(X + d[i], np.float64)
-        tree = igl.AABB()
-        tree.init(surface, T)
-
-        def gap(P, surface=surface, tree=tree):
-            squared = tree.squared_distance(surface, T, np.ascontiguousarray(P.reshape(-1, 3)))[0]
-            return np.sqrt(np.maximum(squared, 0)).reshape(P.shape[:-1]).mean(-1)
-
+        gap = distance_to(X + d[i], T)
         which = np.argwhere(nearest == i)
         if len(which):
             random[which[:, 0], which[:, 1]] = gap(drawn[which[:, 1], which[:, 0]])
         J = np.flatnonzero(np.arange(s) != i)
-        inner = K[np.ix_(J, J)]
-        v, W = principal(centred(inner))
-        cross = K[i, J] - inner.mean(0) - K[i, J].mean() + inner.mean()
-        others = np.einsum("sc,spx->cpx", W, at[J] - at[J].mean(0)) / np.sqrt(v * (s - 2))[:, None, None]
-        steps = np.cumsum((cross @ W / np.sqrt(v * (s - 2)))[:, None, None] * others, axis=0)
-        distance = gap(at[J].mean(0) + steps)
-        left_out[i] = distance[-1]
-        left_out[i, : len(distance)] = distance
-    return left_out.mean(0)[:c], random.mean(1)
+        *_, steps = left_out(K[np.ix_(J, J)], K[i, J], K[i, i])
+        distance = gap(reconstructed(at[J], steps))
+        kept[i] = distance[-1]
+        kept[i, : len(distance)] = distance
+    return kept[:, :c], random
+
+
+def distance_to(X, T):
+    """Function of points (..., p, 3): their mean distance to a surface (...)."""
+    X, T = np.ascontiguousarray(X, np.float64), np.ascontiguousarray(T, np.int64)
+    tree = igl.AABB()
+    tree.init(X, T)
+
+    def gap(P):
+        squared = tree.squared_distance(X, T, np.ascontiguousarray(P.reshape(-1, 3)))[0]
+        return np.sqrt(np.maximum(squared, 0)).reshape(P.shape[:-1]).mean(-1)
+
+    return gap
+
+
+def reconstructed(at, steps):
+    """Points of a field with 1, 2, ... components of others ``(c, p, 3)``: theirs ``(n, p, 3)``, :func:`left_out`."""
+    return at.mean(0) + np.cumsum(np.einsum("cn,npx->cpx", steps, at - at.mean(0)), axis=0)
+
+
+def standard_error(values, axis=0):
+    """Of the mean along an axis."""
+    return values.std(axis, ddof=1) / np.sqrt(values.shape[axis])
 
 
 def sample(study, n, *, n_components=None, seed=0):

@@ -5,7 +5,7 @@ import xarray as xr
 
 from s4a.deform import normal_displacement
 from s4a.mesh import vertex_normals
-from s4a.schema import dataset, require
+from s4a.schema import dataset, in_unit, require, unit_of
 
 
 def gram_pca(d, area):
@@ -61,7 +61,9 @@ def pca(registration, area, *, coarse=None):
     area : float ndarray (vertex,)
         Template vertex areas, the weights of the Gram matrix.
     coarse : xarray.Dataset, optional
-        The template's low-resolution mesh; gives the shares of variance at low resolution as well.
+        The template's low-resolution mesh; gives the shares of variance at low resolution as well, where the
+        registration has ``displacement_low``.  They are of the matches of eq. 6 as they are: the smooth displacement,
+        looked at on fewer vertices, would have the shares of the full resolution.
 
     Returns
     -------
@@ -90,12 +92,13 @@ def pca(registration, area, *, coarse=None):
         score=score,
         explained_variance_ratio=ratio,
     )
-    if coarse is not None:
-        low = gram_pca(d[:, low_vertices(coarse)], coarse["vertex_area"].values)[4]
+    if coarse is not None and "displacement_low" in registration:
+        low = registration["displacement_low"].transpose("shape", "low_vertex", "xyz").values
+        low = gram_pca(low, coarse["vertex_area"].values)[4]
         padded = np.zeros(len(ratio))
         padded[: len(low)] = low[: len(ratio)]
         found = found.merge(dataset(explained_variance_ratio_low=padded))
-    return found.assign_coords(shape=registration["shape"])
+    return in_unit(found, unit_of(registration["displacement"])).assign_coords(shape=registration["shape"])
 
 
 def synthesize(study, scores):
@@ -128,7 +131,8 @@ def synthesize(study, scores):
         raise ValueError(f"scores need at most {pca.sizes['component']} numbers, found shape {scores.shape}")
     moved = np.tensordot(scores, pca["deformation"].values[: len(scores)], axes=1)
     position = template["position"].values + pca["mean_displacement"].values + moved
-    return xr.merge([dataset(position=position), template[["corner_vertex"]]])
+    mesh = xr.merge([dataset(position=position), template[["corner_vertex"]]])
+    return in_unit(mesh, unit_of(template["position"]))
 
 
 def deformed(mean, deformation, scores):

@@ -27,9 +27,10 @@ from s4a.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.options import check_against, checked
 from s4a.pca import pca
 from s4a.remesh import coarsen
-from s4a.schema import dataset, require
+from s4a.schema import dataset, in_unit, require, unit_of
 from s4a.shapes import read_shape, shape_report
 from s4a.spectral import spectrum
+from s4a.subjects import read_table
 
 log = logging.getLogger(__name__)
 
@@ -160,14 +161,17 @@ def original_task(source, components, strict):
     if isinstance(source, str):
         return read_shape(source, components=components, strict=strict)
     if "file_vertex" in source:
-        return source.assign_attrs({"status": "ok", "reason": ""} | source.attrs)
-    return clean(source, components=components, strict=strict)
+        mesh = source.assign_attrs({"status": "ok", "reason": ""} | source.attrs)
+    else:
+        mesh = clean(source, components=components, strict=strict)
+    return in_unit(mesh, source.attrs.get("unit"))
 
 
 def coarse_task(folder, name, n_coarse, wrap, seed, k):
     """The low-resolution mesh of a shape of the study, its U and its spectrum."""
     mesh = study.read(folder / "original" / f"{name}.nc")
-    return spectrum(coarsen(mesh, n_coarse=n_coarse, wrap=wrap, seed=seed), k=k)
+    low = spectrum(coarsen(mesh, n_coarse=n_coarse, wrap=wrap, seed=seed), k=k)
+    return in_unit(low, unit_of(mesh["position"]))
 
 
 def scan(folder, name):
@@ -293,6 +297,7 @@ def analyse(
     pattern=None,
     preset=None,
     template=None,
+    table=None,
     store=None,
     n_jobs=None,
     seed=0,
@@ -332,6 +337,10 @@ def analyse(
         ``"paper"`` sets init="landmarks", refine="intrinsic", how="ours"; another value of these is refused.
     template : str, optional
         Name of the shape to register to; the median shape by default.
+    table : path, optional
+        CSV with a column ``shape`` and covariates or groups, see :func:`s4a.subjects.read_table`; they become
+        ``/subjects``, so that :mod:`s4a.statistics` takes their names.  Nothing else depends on it.  Without one, a
+        table given to an earlier run stays.
     store : path, optional
         Folder of the study.  A run that was killed goes on at the first missing file.
     n_jobs : int, optional
@@ -341,7 +350,8 @@ def analyse(
     Returns
     -------
     xarray.DataTree
-        The study: ``/original``, ``/coarse``, ``/network``, ``/latent``, ``/registration``, ``/pca``, ``/report``.
+        The study: ``/original``, ``/coarse``, ``/network``, ``/latent``, ``/registration``, ``/pca``, ``/report`` and,
+        with a table, ``/subjects``.
 
     Raises
     ------
@@ -350,22 +360,26 @@ def analyse(
     """
     options = {n: v for n, v in locals().items() if n not in ("shapes", "store", "n_jobs")}
     options = checked(options)
+    options["table"] = None if table is None else str(table)
     given = collection(shapes, pattern)
     check_against(options, list(given))
+    subjects = None if table is None else read_table(table, list(given))
     if store is None:
         with tempfile.TemporaryDirectory(prefix="s4a-") as folder:
             with study.lock(folder) as claim:
-                run_stages(Run(claim, n_jobs), given, options)
+                run_stages(Run(claim, n_jobs), given, options, subjects)
             tree = study.open_study(folder)
             return xr.DataTree.from_dict({n.path: n.to_dataset(inherit=False).load() for n in tree.subtree})
     with study.lock(store) as claim:
-        run_stages(Run(claim, n_jobs), given, options)
+        run_stages(Run(claim, n_jobs), given, options, subjects)
     return study.open_study(store)
 
 
-def run_stages(run, given, options):
+def run_stages(run, given, options, subjects=None):
     """All stages in turn; each looks up which of its files are done."""
     folder, o = run.folder, options
+    if subjects is not None:
+        study.write(subjects, folder / "subjects.nc")
     key_of = {n: study.task_key(content, o["components"], o["strict"]) for n, (_, content) in given.items()}
     run.tasks(
         "read and clean",
@@ -428,8 +442,10 @@ def run_stages(run, given, options):
 
     template = o["template"] or study.read(folder / "latent.nc").attrs["median"]
     settings = (template, o["how"], o["refine"], o["scale"])
-    X, T = as_arrays(study.read(folder / "original" / f"{template}.nc"))
+    original = study.read(folder / "original" / f"{template}.nc")
+    X, T = as_arrays(original)
     mesh = as_dataset(X, T, {"template": template}, vertex_area=vertex_areas(X, T))
+    mesh = in_unit(mesh, unit_of(original["position"]))
     template_key = study.task_key(key, settings)
     study.write(mesh, folder / "registration.nc", template_key, [key])
     key_of = {n: study.task_key(template_key, key_of[n]) for n in names}

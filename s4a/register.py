@@ -14,7 +14,7 @@ from s4a.deform import displacement_in_template, onto
 from s4a.mesh import as_arrays, closest_point_in_star, vertex_areas, vertex_normals
 from s4a.nearest import nearest_in_cells
 from s4a.options import checked
-from s4a.schema import dataset, require
+from s4a.schema import INPUT, dataset, in_unit, require
 
 log = logging.getLogger(__name__)
 
@@ -138,18 +138,43 @@ def way_back(source, target, image):
     return closest_point_in_star(source.dense.X, nearest, X, T)
 
 
+def round_trip(target, match, triangle, barycentric):
+    """Length of the way template -> shape -> template ``(n_target,)`` as a share of sqrt(area): the cycle error."""
+    X, T = target.dense.X, target.dense.T
+    back = np.einsum("nc,ncx->nx", barycentric[match], X[T[triangle[match]]])
+    return np.linalg.norm(back - X, axis=1)
+
+
 def confidence(source, target, match, image, triangle, barycentric):
     """exp(-(r + g) / 0.02) for every template vertex ``(n_target,)``, in 0..1.
 
-    r is the round trip template -> shape -> template, g the gap between the registered template and the matched
-    vertex, both as shares of sqrt(area).
+    r is :func:`round_trip`, g the gap between the registered template and the matched vertex, both as shares of
+    sqrt(area).
     """
-    X, T = target.dense.X, target.dense.T
-    corner = T[triangle[match]]
-    back = np.einsum("nc,ncx->nx", barycentric[match], X[corner])
     center, size = source.frame
     gap = np.linalg.norm((image - center) / size - source.dense.X[match], axis=1)
-    return np.exp(-(np.linalg.norm(back - X, axis=1) + gap) / CONFIDENCE_LENGTH)
+    return np.exp(-(round_trip(target, match, triangle, barycentric) + gap) / CONFIDENCE_LENGTH)
+
+
+def distortion(image, X, T):
+    """log(a / A) for every vertex ``(n,)``: its share of the area on the registered template, by that on the template.
+
+    0 where nothing is stretched but the size as a whole.
+
+    Examples
+    --------
+    >>> X, T = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]])
+    >>> (distortion(2 * X, X, T) + 0.0).tolist()
+    [0.0, 0.0, 0.0]
+    """
+    share = [np.maximum(a / a.sum(), np.finfo(np.float32).tiny) for a in (vertex_areas(image, T), vertex_areas(X, T))]
+    return np.log(share[0]) - np.log(share[1])
+
+
+def common_unit(*meshes):
+    """The unit that all meshes say; "unit of the input" where they do not."""
+    units = {mesh.attrs.get("unit") or INPUT for mesh in meshes}
+    return units.pop() if len(units) == 1 else INPUT
 
 
 def registration(source, target, match_low, embeddings, *, k=100, refine="joint", scale=False):
@@ -168,27 +193,35 @@ def registration(source, target, match_low, embeddings, *, k=100, refine="joint"
     Returns
     -------
     xarray.Dataset
-        ``registered_match(vertex)``, ``displacement(vertex, xyz)``, ``displacement_raw``, ``rotation``,
-        ``translation``, ``scale``, ``confidence(vertex)``, ``template_triangle(original_vertex)``,
+        ``registered_match(vertex)``, ``displacement(vertex, xyz)``, ``displacement_raw``,
+        ``displacement_low(low_vertex, xyz)`` of the match of eq. 6 as it is, ``rotation``, ``translation``,
+        ``scale``, ``confidence(vertex)``, ``round_trip``, ``distortion``, ``template_triangle(original_vertex)``,
         ``template_barycentric``; displacements in the unit of the input, in the template's frame.
     """
     match, image, info = register(source, target, match_low, embeddings, k=k, refine=refine)
     triangle, barycentric = way_back(source, target, image)
-    X, _ = as_arrays(target.original)
+    X, T = as_arrays(target.original)
     displacement, R, t, s = displacement_in_template(X, image, target.dense.area, scale=scale)
     raw = s * source.original["position"].values[match] @ R.T + t - X
-    return dataset(
+    low = s * source.coarse["position"].values[match_low["intrinsic"]] @ R.T + t - target.coarse["position"].values
+    sure = confidence(source, target, match, image, triangle, barycentric)
+    trip = round_trip(target, match, triangle, barycentric)
+    found = dataset(
         info,
         registered_match=match.astype(np.int32),
         displacement=displacement.astype(np.float32),
         displacement_raw=raw.astype(np.float32),
+        displacement_low=low.astype(np.float32),
         rotation=R,
         translation=t,
         scale=np.array(s),
-        confidence=confidence(source, target, match, image, triangle, barycentric).astype(np.float32),
+        confidence=sure.astype(np.float32),
+        round_trip=trip.astype(np.float32),
+        distortion=distortion(image, X, T).astype(np.float32),
         template_triangle=triangle.astype(np.int32),
         template_barycentric=barycentric,
     )
+    return in_unit(found, common_unit(source.original, target.original))
 
 
 def match_pair(source, target, *, k_init=20, k=100, init="dense", refine="joint", n_coarse=6000, seed=0):
@@ -213,10 +246,11 @@ def match_pair(source, target, *, k_init=20, k=100, init="dense", refine="joint"
     xarray.Dataset
         ``fmap(mode_target, mode_source)`` after ZoomOut, ``fmap_initial``, ``match(vertex)`` = on each vertex of
         the target the matched vertex of the source, ``displacement(vertex, xyz)`` from the target to the source
-        after rigid alignment (unit of the input), ``confidence(vertex)``; ``rotation``, ``translation``, ``scale`` of
-        that alignment of the source; the way back, ``template_triangle(original_vertex)`` and
-        ``template_barycentric``, from the source's vertices to the target; attrs ``score`` (see
-        :func:`s4a.joint.badness`) and ``method``, and ``note`` where k had to be reduced.
+        after rigid alignment (unit of the input), ``confidence(vertex)``, ``round_trip``, ``distortion``;
+        ``rotation``, ``translation``, ``scale`` of that alignment of the source; the way back,
+        ``template_triangle(original_vertex)`` and ``template_barycentric``, from the source's vertices to the target;
+        attrs ``score`` (see :func:`s4a.joint.badness`) and ``method``, and ``note`` where k had to be
+        reduced.
 
     Raises
     ------
@@ -261,7 +295,8 @@ def identity(target):
     X, T = as_arrays(target.original)
     corner = np.argsort(T.ravel(), kind="stable")[np.cumsum(np.bincount(T.ravel(), minlength=len(X))) - 1]
     zero = np.zeros(X.shape, np.float32)
-    return dataset(
+    low = {} if target.coarse is None else {"displacement_low": np.zeros(target.coarse["position"].shape, np.float32)}
+    found = dataset(
         {"method": "template", "score": 0.0},
         registered_match=np.arange(len(X), dtype=np.int32),
         displacement=zero,
@@ -270,6 +305,10 @@ def identity(target):
         translation=np.zeros(3),
         scale=np.array(1.0),
         confidence=np.ones(len(X), np.float32),
+        round_trip=zero[:, 0],
+        distortion=zero[:, 0],
         template_triangle=(corner // 3).astype(np.int32),
         template_barycentric=np.eye(3)[corner % 3],
+        **low,
     )
+    return in_unit(found, common_unit(target.original))

@@ -87,7 +87,24 @@ TABLE = {
     "rotation": (("shape", "xyz", "xyz_2"), ONE, "rotation R of the alignment x -> s R x + t onto the template"),
     "translation": (("shape", "xyz"), INPUT, "translation t of the alignment onto the template"),
     "scale": (("shape",), ONE, "scale s of the alignment onto the template"),
+    "displacement_low": (
+        ("shape", "low_vertex", "xyz"),
+        INPUT,
+        "matched vertex of the aligned coarse shape minus coarse template (eq. 6)",
+    ),
     "confidence": (("shape", "vertex"), ONE, "confidence of the match, 0 to 1"),
+    "round_trip": (
+        ("shape", "vertex"),
+        "share of sqrt(area)",
+        "cycle error: way from the vertex to the shape and back",
+    ),
+    "distortion": (
+        ("shape", "vertex"),
+        ONE,
+        "log of the vertex's share of the area, on the shape over on the template",
+    ),
+    "method": (("shape",), ONE, "start of the match that was kept"),
+    "badness": (("shape",), "share of sqrt(area)", "round trip and gaps between the surfaces, mean"),
     "template_triangle": (("original_vertex",), ONE, "template triangle on which the vertex of the shape lies"),
     "template_barycentric": (("original_vertex", "corner"), ONE, "barycentric weights in that triangle"),
     # what travels along a registration (6.2)
@@ -106,16 +123,22 @@ TABLE = {
     "score": (("shape", "component"), ONE, "score of each shape, in standard deviations"),
     "reconstruction_error": (("shape",), INPUT, "root mean square over the area of what the modes do not describe"),
     "explained_variance_ratio": (("component",), ONE, "share of the variance at full resolution"),
-    "explained_variance_ratio_low": (("component",), ONE, "share of the variance at low resolution"),
+    "explained_variance_ratio_low": (
+        ("component",),
+        ONE,
+        "share of the variance at low resolution, of the matches as they are",
+    ),
     # evaluation of the model, tests and outliers (6.1)
     "compactness": (("component",), INPUT2, "variance of the first components together"),
     "compactness_error": (("component",), INPUT2, "its standard error"),
     "generalization": (("component",), INPUT, "distance of a left-out shape to its reconstruction, mean over shapes"),
     "generalization_error": (("component",), INPUT, "its standard error"),
     "generalization_surface": (("component",), INPUT, "the same from points to the surface, mean distance"),
+    "generalization_surface_error": (("component",), INPUT, "its standard error"),
     "specificity": (("component",), INPUT, "distance of a random shape of the model to the nearest shape"),
     "specificity_error": (("component",), INPUT, "its standard error"),
     "specificity_surface": (("component",), INPUT, "the same from points to the surface, mean distance"),
+    "specificity_surface_error": (("component",), INPUT, "its standard error"),
     "variance_ratio": (("component",), ONE, "share of the variance, in the basis of the baseline"),
     "variance_ratio_null": (("component",), ONE, "the same when every coefficient is permuted, mean"),
     "variance_ratio_null_95": (("component",), ONE, "the same, 95th percentile"),
@@ -210,9 +233,52 @@ def variable(name, data, **attrs):
     return xr.Variable(dims, data, {"units": unit, "long_name": long_name, **attrs})
 
 
+def covariate(name, data):
+    """A column of the table of the shapes, the one kind of variable whose names users choose.
+
+    Examples
+    --------
+    >>> covariate("age", [31, 42]).attrs["long_name"]
+    "column 'age' of the table of the shapes"
+    """
+    return xr.Variable(
+        ("shape",),
+        np.asarray(data),
+        {"units": "as in the table", "long_name": f"column {name!r} of the table of the shapes"},
+    )
+
+
 def dataset(attrs=None, **variables):
     """A Dataset of variables of the table: ``dataset(position=x, corner_vertex=t)``; see :func:`variable`."""
     return xr.Dataset({name: variable(name, data) for name, data in variables.items()}, attrs=attrs)
+
+
+def unit_of(values):
+    """The unit of a length, from the attributes of a variable or of a mesh; "unit of the input" where none is known.
+
+    Examples
+    --------
+    >>> unit_of(in_unit(dataset(position=[[0.0, 0.0, 1.0]]), "mm")["position"])
+    'mm'
+    """
+    return str(values.attrs.get("units") or values.attrs.get("unit") or INPUT)
+
+
+def in_unit(data, unit):
+    """A Dataset with the known unit in place of "unit of the input"; empty where it is not known.
+
+    Examples
+    --------
+    >>> in_unit(dataset(vertex_area=[1.0]), "mm")["vertex_area"].attrs["units"]
+    'mm^2'
+    """
+    if not unit or unit == INPUT:
+        return data
+    units = {INPUT: unit, INPUT2: f"{unit}^2"}
+    data = data.copy()
+    for values in data.data_vars.values():
+        values.attrs["units"] = units.get(values.attrs.get("units"), values.attrs.get("units", ONE))
+    return data
 
 
 def require(data, *names, what="dataset"):

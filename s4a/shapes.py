@@ -9,7 +9,7 @@ import xarray as xr
 from s4a.clean import REPAIRS, clean
 from s4a.io import find_meshes, read_mesh, slug
 from s4a.mesh import as_dataset
-from s4a.schema import dataset
+from s4a.schema import dataset, in_unit
 
 COUNTS = (*REPAIRS, "file_vertices", "file_triangles", "components", "holes", "genus")
 
@@ -43,7 +43,7 @@ def read_shape(path, *, components="largest", strict=False):
         raise ValueError(f"{path}: {error}") from error
     if "note" in attrs:
         mesh.attrs["reason"] = "; ".join(filter(None, [mesh.attrs.pop("note"), mesh.attrs["reason"]]))
-    return mesh
+    return in_unit(mesh, mesh.attrs.get("unit"))
 
 
 def read_shapes(paths, *, components="largest", strict=False, pattern=None):
@@ -118,7 +118,7 @@ def _cleaned(source, **options):
     if isinstance(source, Path):
         return read_shape(source, **options)
     if isinstance(source, xr.Dataset):
-        return clean(source, **options)
+        return in_unit(clean(source, **options), source.attrs.get("unit"))
     points, triangles = (np.asarray(values) for values in source)
     if triangles.dtype.kind not in "iu":
         raise ValueError(f"triangles need integer vertex indices; found {triangles.dtype}")

@@ -6,6 +6,7 @@ All take a study and give a Dataset; what works on plain arrays is in :mod:`s4a.
 import logging
 
 import numpy as np
+import xarray as xr
 from scipy import stats
 from sklearn.base import clone
 from sklearn.decomposition import PCA
@@ -17,22 +18,41 @@ from sklearn.preprocessing import StandardScaler
 
 from s4a import model
 from s4a import permutation as test
+from s4a.generalize import generalization
 from s4a.mesh import as_arrays, vertex_normals
 from s4a.model import evaluate, registered, sample
 from s4a.schema import dataset
 
 log = logging.getLogger(__name__)
 
-__all__ = ["classify", "evaluate", "group_map", "group_test", "outliers", "predict", "regression", "sample"]
+__all__ = [
+    "classify",
+    "evaluate",
+    "generalization",
+    "group_map",
+    "group_test",
+    "outliers",
+    "predict",
+    "regression",
+    "sample",
+]
 
 
 def values_of(study, given, what):
     """One value per shape: of an array in the order of the study, a dict of name to value, or a column of /subjects."""
     names = study["registration"]["shape"].values.tolist()
     if isinstance(given, str):
-        if "subjects" not in study or given not in study["subjects"].data_vars:
-            raise ValueError(f"{what} {given!r} needs a variable of that name in /subjects; give the values themselves")
-        given = study["subjects"][given].sel(shape=names).values
+        what = f"{what} {given!r}"
+        held = study["subjects"].to_dataset() if "subjects" in study.children else xr.Dataset()
+        if given not in held:
+            raise ValueError(
+                f"{what} needs a column of that name in /subjects, which has {', '.join(held.data_vars) or 'none'}; "
+                "give a table, or the values themselves"
+            )
+        lacking = [n for n in names if n not in held["shape"].values]
+        if lacking:
+            raise ValueError(f"{what} needs a row in /subjects for every shape; it lacks {', '.join(lacking)}")
+        given = held[given].sel(shape=names).values
     if isinstance(given, dict):
         missing = [n for n in names if n not in given]
         if missing:
@@ -41,6 +61,11 @@ def values_of(study, given, what):
     given = np.asarray(given)
     if given.ndim == 0 or len(given) != len(names):
         raise ValueError(f"{what} needs one value for each of {len(names)} shapes, found shape {given.shape}")
+    unknown = ~np.isfinite(given) if given.dtype.kind == "f" else given == "" if given.dtype.kind == "U" else False
+    unknown = np.broadcast_to(unknown, given.shape).reshape(len(names), -1).any(1)
+    if unknown.any():
+        lacking = ", ".join(n for n, u in zip(names, unknown, strict=True) if u)
+        raise ValueError(f"{what} needs a finite value for every shape; leave out of the study, or fill in: {lacking}")
     return given
 
 
@@ -61,11 +86,14 @@ def groups_of(study, group):
 def _covariates(study, covariates):
     if covariates is None:
         return None
-    if isinstance(covariates, dict) and not set(covariates) >= set(study["registration"]["shape"].values.tolist()):
+    if isinstance(covariates, list) and all(isinstance(n, str) for n in covariates):
+        columns = [values_of(study, name, "covariate") for name in covariates]
+    elif isinstance(covariates, dict) and not set(covariates) >= set(study["registration"]["shape"].values.tolist()):
         columns = [values_of(study, v, f"covariate {n}") for n, v in covariates.items()]
     else:
-        columns = [values_of(study, covariates, "covariates")]
-    return np.column_stack([np.asarray(c, float).reshape(len(c), -1) for c in columns])
+        columns = [values_of(study, covariates, "covariate")]
+    columns = [test.indicators(c)[1] if c.dtype.kind in "OU" else np.asarray(c, float) for c in columns]
+    return np.column_stack([c.reshape(len(c), -1) for c in columns])
 
 
 def enough_components(ratio, s, share=0.9):
@@ -99,8 +127,8 @@ def group_test(study, group, *, covariates=None, n_components=None, n_permutatio
     ----------
     study : DataTree
     group : array_like (shape,), dict of shape to value, or name in /subjects
-    covariates : as `group`, or a dict of name to these, or an array (shape, covariate)
-        Accounted for after Freedman and Lane (1983).
+    covariates : as `group`, or a dict of name to these, a list of names in /subjects, an array (shape, covariate)
+        Accounted for after Freedman and Lane (1983); text as indicators of its values.
     n_components : int, optional
         As many as hold 90 % of the variance by default, at most half of the number of shapes.
     n_permutations : int
@@ -204,9 +232,10 @@ def regression(study, variable, *, covariates=None, of="vector", n_components=No
     ValueError
         When the variable is constant, not finite, or a combination of the covariates.
     """
-    x = np.asarray(values_of(study, variable, "variable"), float)
-    if not np.isfinite(x).all():
-        raise ValueError("the variable needs finite values for all shapes; leave the others out of the study")
+    x = values_of(study, variable, "variable")
+    if x.dtype.kind not in "iufb":
+        raise ValueError(f"a regression needs a variable of numbers, found {x.dtype}; a group test takes text")
+    x = x.astype(float)
     scores, _ = _scores(study, n_components)
     Z = _covariates(study, covariates)
     statistic, p = test.permutation_test(scores, x, covariates=Z, n_permutations=n_permutations, seed=seed)

@@ -17,6 +17,8 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from s4a.schema import INPUT, in_unit, unit_of, variable
+
 log = logging.getLogger(__name__)
 
 ENGINE = "h5netcdf"
@@ -26,10 +28,13 @@ STACKED = (
     "registered_match",
     "displacement",
     "displacement_raw",
+    "displacement_low",
     "rotation",
     "translation",
     "scale",
     "confidence",
+    "round_trip",
+    "distortion",
 )
 
 
@@ -149,18 +154,19 @@ def lock(folder):
 
 
 def stack_registration(template, files, names):
-    """The rectangular ``/registration`` from the files of its shapes, and the nodes of the way back."""
+    """The rectangular ``/registration`` from the files of its shapes, and the nodes of the way back.
+
+    Its lengths have a unit where all shapes say the same.
+    """
     parts = [files[name] for name in names]
-    data = template[["position", "corner_vertex"]].assign_attrs(template=template.attrs["template"])
-    stacked = {
-        name: xr.Variable(
-            ("shape", *parts[0][name].dims), np.stack([p[name].values for p in parts]), parts[0][name].attrs
-        )
-        for name in STACKED
-    }
-    methods = xr.Variable("shape", [p.attrs.get("method", "") for p in parts], {"long_name": "candidate kept"})
-    score = xr.Variable("shape", [p.attrs.get("score", np.nan) for p in parts], {"long_name": "badness of the match"})
-    data = data.assign(stacked).assign(method=methods, badness=score).assign_coords(shape=list(names))
+    own = [name for name in ("position", "corner_vertex", "vertex_area") if name in template]
+    data = template[own].assign_attrs(template=template.attrs["template"])
+    held = [name for name in STACKED if all(name in p for p in parts)]
+    stacked = {name: variable(name, np.stack([p[name].values for p in parts])) for name in held}
+    stacked["method"] = variable("method", [p.attrs.get("method", "") for p in parts])
+    stacked["badness"] = variable("badness", [p.attrs.get("score", np.nan) for p in parts])
+    units = {unit_of(p["displacement"]) for p in parts}
+    data = in_unit(data.assign(stacked), units.pop() if len(units) == 1 else INPUT).assign_coords(shape=list(names))
     nodes = {
         f"registration/{name}": files[name][["template_triangle", "template_barycentric"]].assign_attrs(
             files[name].attrs
@@ -223,7 +229,7 @@ def open_study(folder):
         files = {name: data.load() for name, data in files.items() if data is not None}
         if files:
             nodes |= stack_registration(template.load(), files, list(files))
-    nodes |= {stage: opened(stage) for stage in ("pca", "report")}
+    nodes |= {stage: opened(stage) for stage in ("pca", "subjects", "report")}
     if nodes["report"] is not None:
         report = nodes["report"]
         used = set(report["shape"].values[report["status"].values != "excluded"].tolist())

@@ -19,7 +19,7 @@ from scipy.special import ndtr, ndtri
 from s4a.artefacts import soil
 from s4a.io import write_mesh
 from s4a.mesh import as_arrays, as_dataset, edge_graph, vertex_areas
-from s4a.schema import dataset
+from s4a.schema import dataset, in_unit
 from s4a.shapes import read_shapes
 
 MODE_RMS = 4.5  # mm, root mean square displacement of mode 1 at one standard deviation
@@ -334,7 +334,7 @@ def _annotated(mesh, truth, shape, reference_point):
         landmark_position=position(truth, shape, truth["landmark_reference"].values),
     )
     extra["label"].attrs["names"] = LABELS
-    return mesh.merge(extra).assign_attrs(unit="mm", coordinate_system="RAS")
+    return in_unit(mesh.merge(extra).assign_attrs(unit="mm", coordinate_system="RAS"), "mm")
 
 
 def raw_brain(truth, shape, n_vertices=40_000, seed=0):

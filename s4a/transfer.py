@@ -16,7 +16,7 @@ from s4a.link import at, blended, closest_point, elect, link, point_along
 from s4a.mesh import as_arrays, as_dataset, triangle_areas, vertex_areas
 from s4a.register import Scan, identity, match_scans
 from s4a.remesh import coarsen
-from s4a.schema import dataset, require
+from s4a.schema import dataset, in_unit, require
 from s4a.spectral import spectrum
 
 FARTHEST_LANDMARK = 0.03  # of sqrt(area): a landmark farther from its surface belongs to another mesh or frame
@@ -44,6 +44,7 @@ def _tree(name, template, shapes, forth, back):
     meshes = {name: template, **shapes}
     files = {name: identity(Scan(template, None)), **forth}
     mesh = as_dataset(*as_arrays(template), {"template": name}, vertex_area=vertex_areas(*as_arrays(template)))
+    mesh = in_unit(mesh, template.attrs.get("unit"))
     nodes = {f"original/{n}": m for n, m in meshes.items()} | store.stack_registration(mesh, files, list(meshes))
     return xr.DataTree.from_dict(nodes | {f"reverse/{n}": data for n, data in back.items()})
 

@@ -12,7 +12,7 @@ import xarray as xr
 from scipy.spatial.transform import Rotation
 
 from s4a import accuracy, analyse, open_study, study, synthesize, synthetic
-from s4a.mesh import as_arrays
+from s4a.mesh import as_arrays, vertex_areas
 
 OPTIONS = {"n_coarse": 600, "k_init": 12, "k": 30, "n_jobs": 1}
 RESULTS = ("network", "latent", "registration", "pca")
@@ -74,6 +74,27 @@ def test_a_study_has_all_stages_and_says_what_it_did(done, brains):
     assert report.attrs["k_init"] == "12"
     assert done["network"].sizes["pair"] == 12
     assert done["network"]["fmap"].shape == (12, 30, 30)
+    assert registration["vertex_area"].sum() == pytest.approx(
+        vertex_areas(*as_arrays(done["original"][template].to_dataset())).sum()
+    )
+    assert set(registration["method"].values) >= {"template"}
+
+
+def test_lengths_have_the_unit_that_all_shapes_say(done):
+    for node, name, unit in (
+        ("original/brain_02", "position", "mm"),
+        ("coarse/brain_02", "vertex_area", "mm^2"),
+        ("registration", "displacement", "mm"),
+        ("registration", "position", "mm"),
+        ("pca", "deformation", "mm"),
+    ):
+        assert done[node][name].attrs["units"] == unit, (node, name)
+
+
+def test_at_low_resolution_the_matches_as_they_are_hold_more_than_the_smooth_modes(done):
+    full, low = (done["pca"][n].values for n in ("explained_variance_ratio", "explained_variance_ratio_low"))
+    assert low.sum() == pytest.approx(1)
+    assert np.abs(low - full).max() > 1e-3
 
 
 def test_the_template_plus_displacement_is_the_shape_after_its_motion(done):

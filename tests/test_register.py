@@ -56,6 +56,8 @@ def test_a_shape_registered_to_itself_does_not_move(template, size):
     assert np.abs(found["displacement"].values).max() < 1e-6 * size
     assert np.abs(found["displacement_raw"].values).max() < 1e-6 * size
     assert found["confidence"].values == pytest.approx(1, abs=1e-5)
+    assert found["round_trip"].values == pytest.approx(0, abs=1e-5)
+    assert found["distortion"].values == pytest.approx(0, abs=1e-4)
     assert found["fmap"].values == pytest.approx(np.eye(60), abs=1e-6)
 
 
@@ -202,3 +204,24 @@ def test_more_functions_than_a_mesh_has_are_reduced_and_it_is_said():
 def test_a_mesh_without_triangles_is_refused_by_name(template):
     with pytest.raises(ValueError, match="source needs the variables position, corner_vertex"):
         match_pair(template[["position"]], template)
+
+
+def test_distortion_is_the_log_of_the_areas_ratio_and_size_does_not_count():
+    X, T = as_arrays(synthetic.sphere(2000))
+    assert register.distortion(3 * X, X, T) == pytest.approx(0)
+    half = X * [1, 1, 2]  # an ellipsoid: a band around the equator grows twofold, the poles stay
+    found = register.distortion(half, X, T)
+    total = np.log(vertex_areas(half, T).sum() / vertex_areas(X, T).sum())
+    height = np.abs(X[:, 2])
+    assert np.median(found[height < 0.05]) == pytest.approx(np.log(2) - total, abs=0.02)
+    assert np.median(found[height > 0.99]) == pytest.approx(-total, abs=0.03)
+
+
+def test_the_match_of_eq_6_is_kept_at_low_resolution_as_it_is(pair, deformed, template, size):
+    low = pair["displacement_low"].values
+    assert low.shape[1] == 3
+    assert low.shape[0] < 2500
+    template_low, shape_low = (coarsen(m, n_coarse=2000)["position"].values for m in (template, deformed))
+    R, t = pair["rotation"].values, pair["translation"].values
+    gap = cKDTree(shape_low @ R.T + t).query(template_low + low)[0]
+    assert gap.max() < 1e-4 * size  # every one is at a vertex of the coarse shape

@@ -9,7 +9,6 @@ from s4a.clean import clean
 from s4a.mesh import (
     as_arrays,
     as_dataset,
-    boundary_vertices,
     edge_graph,
     unique_edges,
     vertex_areas,
@@ -26,6 +25,11 @@ def grid(nx, ny, wrap=(False, False)):
     a, b = (i * ny + j).ravel(), ((i + 1) % nx * ny + j).ravel()
     c, d = ((i + 1) % nx * ny + (j + 1) % ny).ravel(), (i * ny + (j + 1) % ny).ravel()
     return np.concatenate([np.c_[a, b, c], np.c_[a, c, d]])
+
+
+def boundary_vertices(T):
+    E, _, count = unique_edges(T)
+    return np.unique(E[count == 1])
 
 
 def plane(n=60):

@@ -246,7 +246,7 @@ def test_small_groups_are_refused_or_warned_of_and_the_smallest_p_is_told(caplog
         statistics.regression(study, np.arange(6))
     with pytest.raises(ValueError, match="constant or a combination of the covariates"):
         statistics.regression(study, np.arange(7), covariates=2 * np.arange(7) + 1)
-    with pytest.raises(ValueError, match="'age' needs a variable of that name in /subjects"):
+    with pytest.raises(ValueError, match="'age' needs a column of that name in /subjects"):
         statistics.regression(study, "age")
     with pytest.raises(ValueError, match="at least 4 shapes, found 3"):
         statistics.outliers(study_of(u, T, smooth_noise(rng, u, 3)))
