@@ -1,4 +1,7 @@
-"""Command line: ``s4a check | run | demo | view | transfer``; every option of :func:`s4a.analyse` is a flag of run."""
+"""Command line: ``s4a check | run | statistics | insert | transfer | view | demo``.
+
+Every option of :func:`s4a.analyse` is a flag of run.
+"""
 
 import argparse
 import contextlib
@@ -14,15 +17,21 @@ import numpy as np
 from joblib import parallel_config
 
 from s4a import accuracy, synthetic
+from s4a import statistics as tests
 from s4a import transfer as travel
 from s4a.annotations import labels_of_file, labels_of_mesh, read_labels, read_landmarks, write_landmarks
 from s4a.draw import VIEWS
+from s4a.export import write_registered, write_results
+from s4a.insert import insert as place
 from s4a.io import read_mesh
+from s4a.mesh import as_arrays, vertex_areas
 from s4a.options import CHOICES, DEFAULTS
-from s4a.picture import write_picture
+from s4a.pca import mahalanobis
+from s4a.picture import write_animation, write_picture
 from s4a.pipeline import analyse
 from s4a.shapes import read_shape, read_shapes
-from s4a.study import VERSION, open_study
+from s4a.study import ENGINE, VERSION, open_study
+from s4a.subjects import with_table
 from s4a.view import write_page
 
 HELP = {
@@ -185,8 +194,11 @@ def closing(study, seconds):
     near = ", ".join(f"{latent['shape'].values[i]} {latent['distance_to_median'].values[i]:.4f}" for i in order)
     write(f"median shape: {latent.attrs['median']}; nearest to the limit shape (eq. 5): {near}")
     registration = study["registration"].to_dataset()
-    confidence = registration["confidence"].mean().item()
-    write(f"registered to {registration.attrs['template']}; mean confidence {confidence:.2f}")
+    confidence, trip = (registration[name].mean().item() for name in ("confidence", "round_trip"))
+    write(
+        f"registered to {registration.attrs['template']}; mean confidence {confidence:.2f}, cycle error {trip:.4f} of "
+        f"sqrt(area), median |distortion| {np.median(np.abs(registration['distortion'])):.3f}"
+    )
     if "pca" in study:
         ratio = np.cumsum(study["pca"]["explained_variance_ratio"].values)
         few = [c for c in (1, 3, 10) if c <= len(ratio)]
@@ -272,6 +284,116 @@ def transfer(args):
     return 1 if excluded else 0
 
 
+def statistics(args):
+    """Evaluation of the modes and outliers of a study; tests of groups and variables of its table."""
+    study, out = open_study(args.study), args.out or str(Path(args.study) / "statistics")
+    study = with_table(study, args.table) if args.table else study
+    test = {"covariates": args.covariates or None, "seed": args.seed}
+    test |= {} if args.permutations is None else {"n_permutations": args.permutations}
+    kept = tests.evaluate(study, seed=args.seed)
+    results = {"evaluation": kept, "outliers": tests.outliers(study)}
+    if args.recompute:
+        results["generalization"] = tests.generalization(study, n_jobs=args.n_jobs, seed=args.seed)
+    if args.group:
+        results["group"] = tests.group_test(study, args.group, **test)
+        results["group_map"] = tests.group_map(study, args.group, **test)
+        few = {} if args.permutations is None else {"n_permutations": min(args.permutations, 99)}
+        results["classification"] = tests.classify(study, args.group, seed=args.seed, **few)
+    if args.variable:
+        results["regression"] = tests.regression(study, args.variable, **test)
+    for name, found in results.items():
+        write_results(found, out, name)
+    write(evaluation_table(kept, results.get("generalization")))
+    far = results["outliers"]
+    names = far["shape"].values[far["outlier"].values].tolist()
+    write(f"\noutliers: {', '.join(names) or 'none'}")
+    if args.group:
+        write("\n" + tested(results["group"], results["group_map"], f"groups of {args.group}", study))
+        found = results["classification"]
+        share, chance = (100 * found.attrs[name] for name in ("balanced_accuracy", "chance"))
+        write(f"classified {share:.0f} % right, chance {chance:.0f} %, p = {found['p_value'].item():.3g}")
+    if args.variable:
+        write("\n" + tested(results["regression"], results["regression"], args.variable, study))
+        moving = tests.regression_modes(study, results["regression"], args.variable)
+        write_page(moving, Path(out) / "regression.html", title=f"Regression on {args.variable}")
+        write_animation(moving, Path(out) / "regression.gif")
+    confidence = study["registration"]["confidence"].mean().item()
+    write(f"\nmean confidence of the registration {confidence:.2f}; results: {out}")
+    return 0
+
+
+def evaluation_table(kept, anew):
+    """Measures by number of components, with their standard errors."""
+    unit = kept["generalization"].attrs["units"]
+    columns = [("compactness", kept), ("generalization, kept: optimistic", kept), ("specificity", kept)]
+    columns[2:2] = [("generalization, recomputed", anew)] if anew is not None else []
+    rows = []
+    for c in range(min(10, kept.sizes["component"])):
+        row = [c + 1]
+        for head, found in columns:
+            name = head.partition(",")[0]
+            value, error = (
+                found[n].values[c] if c < found.sizes["component"] else np.nan for n in (name, f"{name}_error")
+            )
+            row.append("-" if np.isnan(value) else f"{value:.4g} ± {error:.2g}")
+        rows.append(row)
+    return f"lengths in {unit}, ± standard error\n" + table(rows, ["components", *(head for head, _ in columns)])
+
+
+def tested(whole, where, name, study):
+    """What a test and its map found, in words."""
+    area = study["registration"].to_dataset()
+    area = vertex_areas(*as_arrays(area))
+    p, least = whole["p_value"].item(), whole.attrs["smallest_p"]
+    text = f"{name} ({whole.attrs['groups']})" if "groups" in whole.attrs else name
+    text += f": p = {p:.3g} over the whole shape, the smallest that can be reached is {least:.2g}"
+    for key, words in (("p_family_wise", "family-wise"), ("p_false_discovery", "false discovery rate")):
+        share = area @ (where[key].values < 0.05) / area.sum()
+        text += f"\n  {100 * share:.1f} % of the area under 0.05 ({words}), smallest {where[key].values.min():.3g}"
+    return text
+
+
+def insert(args):
+    """New shapes in a finished study, which stays as it is."""
+    study = open_study(args.study)
+    found = place(study, args.shapes, n_jobs=args.n_jobs)
+    out = Path(args.out)
+    out.mkdir(parents=True, exist_ok=True)
+    found.to_netcdf(out / "inserted.nc", engine=ENGINE)
+    write_registered(found, out)
+    report, data, latent = (found[n].to_dataset() for n in ("report", "registration", "latent"))
+    rows = []
+    for name in report["shape"].values.tolist():
+        if report["status"].sel(shape=name).item() == "excluded":
+            rows.append([name, *["-"] * 6, f"excluded: {report['reason'].sel(shape=name).item()}"])
+            continue
+        one = data.sel(shape=name)
+        row = [name, f"{one['confidence'].mean().item():.2f}", f"{one['round_trip'].mean().item():.4f}"]
+        row += [
+            f"{np.median(np.abs(one['distortion'])):.3f}",
+            f"{latent['distance_to_median'].sel(shape=name).item():.4f}",
+        ]
+        if "pca" in found:
+            scores = found["pca"].sel(shape=name)
+            row += [f"{scores['reconstruction_error'].item():.4g}", f"{mahalanobis(scores['score']):.1f}"]
+            row += [" ".join(f"{s:+.2f}" for s in scores["score"].values[:5])]
+        rows.append(row + ["-"] * (8 - len(row)))
+    unit = data["displacement"].attrs["units"]
+    head = [
+        "shape",
+        "confidence",
+        "round trip",
+        "|distortion|",
+        "to limit shape",
+        f"left ({unit})",
+        "Mahalanobis",
+        "scores",
+    ]
+    write(table(rows, head))
+    write(f"\nwritten: {out / 'inserted.nc'}, registered meshes and scores in {out}")
+    return 1 if (report["status"] == "excluded").any() else 0
+
+
 TRANSFERRED = ["target", "confidence", "share of votes", "labels of dropped vertices", "landmarks", "spread"]
 
 
@@ -352,6 +474,24 @@ def parser():
     sub.add_argument("--title", help="title of the page (default: name of the folder)")
     sub.add_argument("--view", default="corner", choices=list(VIEWS), help="from where (default: corner)")
     sub.add_argument("--up", default="z", choices=["x", "y", "z"], help="axis that points up (default: z)")
+    sub = command(statistics)
+    sub.add_argument("study", metavar="STUDY")
+    sub.add_argument("--group", metavar="COLUMN", help="test and map of the difference between groups; classification")
+    sub.add_argument("--variable", metavar="COLUMN", help="regression of shape on a number, such as age; its animation")
+    sub.add_argument("--covariates", nargs="+", metavar="COLUMN", help="accounted for in both")
+    sub.add_argument("--table", metavar="FILE", help="in place of the table of the study")
+    sub.add_argument("--recompute", action="store_true", help="generalization with correspondences found anew (slow)")
+    sub.add_argument(
+        "--permutations", type=int, help="of every test (default: 9999, at every vertex 999, of classes 99)"
+    )
+    sub.add_argument("--out", metavar="DIR", help="for netCDF and CSV (default: STUDY/statistics)")
+    sub.add_argument("--n-jobs", type=int, default=-1, help=HELP["n_jobs"])
+    sub.add_argument("--seed", type=int, default=0, help=HELP["seed"])
+    sub = command(insert)
+    sub.add_argument("study", metavar="STUDY")
+    sub.add_argument("shapes", nargs="+", metavar="SHAPE", help="mesh files, folders or globs")
+    sub.add_argument("--out", required=True, metavar="DIR", help="for inserted.nc, registered meshes and scores")
+    sub.add_argument("--n-jobs", type=int, default=-1, help=HELP["n_jobs"])
     sub = command(transfer)
     sub.add_argument("source", metavar="SOURCE", help="mesh file that the labels and landmarks belong to")
     sub.add_argument("targets", nargs="+", metavar="TARGET", help="mesh files, folders or globs; or one study folder")

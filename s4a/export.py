@@ -146,3 +146,50 @@ def write_training_set(study, folder, *, label=None, landmarks=None, source=None
     split = {"train": sorted(names[i] for i in order[n_test:]), "test": sorted(names[i] for i in order[:n_test])}
     (folder / "split.json").write_text(json.dumps(split, indent=1) + "\n")
     return split
+
+
+def write_results(found, folder, name):
+    """Write a Dataset of :mod:`s4a.statistics` as netCDF, and a CSV for each of its one-dimensional tables.
+
+    Parameters
+    ----------
+    found : Dataset
+    folder : path
+        Made where it is missing.
+    name : str
+
+    Returns
+    -------
+    list of Path
+        ``<name>.nc`` with everything; ``<name>.<dim>.csv``, a row per shape, component, fold or vertex and a column per
+        variable over this dim alone, and ``<name>.csv`` with the numbers that have none.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from s4a.schema import dataset
+    >>> paths = write_results(dataset(p_value=0.5, outlier=[True, False]), tempfile.mkdtemp(), "test")
+    >>> [path.name for path in paths], paths[2].read_text().split()
+    (['test.nc', 'test.csv', 'test.shape.csv'], ['shape,outlier', '0,True', '1,False'])
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / f"{name}.nc"]
+    store.write(found, paths[0])
+    tables = {}
+    for variable, values in found.data_vars.items():
+        if values.ndim < 2:
+            tables.setdefault(values.dims, {})[variable] = np.atleast_1d(values.values)
+    for dims, columns in sorted(tables.items(), key=lambda item: item[0]):
+        paths.append(folder / f"{'.'.join([name, *dims])}.csv")
+        rows = list(zip(*(values.tolist() for values in columns.values()), strict=True))
+        if dims:
+            index = (
+                found[dims[0]].values.tolist()
+                if dims[0] in found.coords
+                else range(dims[0] == "component", len(rows) + 1)
+            )
+            rows = [(i, *row) for i, row in zip(index, rows, strict=False)]
+        with open(paths[-1], "w", newline="", encoding="utf-8") as file:
+            csv.writer(file).writerows([[*dims, *columns], *rows])
+    return paths

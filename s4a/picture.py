@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from s4a.draw import image_bytes, on_white, plane_box, render, signed_colors
 from s4a.mesh import vertex_normals
@@ -86,6 +87,41 @@ def mode_drawer(study, look):
         return render(mean + s * steps[mode], T, colors=colors, size=size, frame=plane_box(extremes, **seen), **seen)
 
     return draw, limit
+
+
+def write_animation(study, path, *, mode=0, n_frames=24, seconds=4.0, view="corner", up="z", size=(400, 340)):
+    """Write a component as an animated GIF, from -3 to 3 standard deviations and back.
+
+    Parameters
+    ----------
+    study : xarray.DataTree
+        With ``/registration`` and ``/pca``, or as :func:`s4a.statistics.regression_modes` makes it of a regression.
+    path : str or Path
+    mode : int
+        The component, from 0.
+    n_frames : int
+        Pictures of one way there and back.
+    seconds : float
+        That it takes.
+    view, up
+        See :func:`s4a.draw.rotation`.
+    size : (int, int)
+        Width and height in pixels.
+
+    Returns
+    -------
+    pathlib.Path
+    """
+    draw, _ = mode_drawer(study, {"view": view, "up": up})
+    steps = -SIGMA * np.cos(2 * np.pi * np.arange(n_frames) / n_frames)
+    frames = [
+        Image.fromarray(on_white(draw(mode, s, size))).convert("P", palette=Image.Palette.ADAPTIVE) for s in steps
+    ]
+    path = Path(path)
+    frames[0].save(
+        path, "GIF", save_all=True, append_images=frames[1:], duration=round(1000 * seconds / n_frames), loop=0
+    )
+    return path
 
 
 def write_picture(study, path, *, view="corner", up="z", size=(400, 340)):

@@ -151,6 +151,7 @@ TABLE = {
     "effect_size": (("vertex",), ONE, "effect size"),
     "effect": (("vertex", "xyz"), INPUT, "difference of the groups' means, or change per unit of the variable"),
     "intercept": (("vertex", "xyz"), INPUT, "displacement where the variable is at its mean"),
+    "standard_score": (("shape",), ONE, "variable of the regression, less its mean, in standard deviations"),
     "mahalanobis": (("shape",), ONE, "distance to the mean of all others, in their standard deviations"),
     "outlier_p": (("shape",), ONE, "p value of that distance for a normal population"),
     "left_out_error": (("shape",), INPUT, "distance of the shape to its reconstruction by the model of all others"),

@@ -21,7 +21,7 @@ from s4a import permutation as test
 from s4a.generalize import generalization
 from s4a.mesh import as_arrays, vertex_normals
 from s4a.model import evaluate, registered, sample
-from s4a.schema import dataset
+from s4a.schema import dataset, in_unit, unit_of
 
 log = logging.getLogger(__name__)
 
@@ -34,6 +34,7 @@ __all__ = [
     "outliers",
     "predict",
     "regression",
+    "regression_modes",
     "sample",
 ]
 
@@ -165,7 +166,7 @@ def _map(study, x, Z, of, n_permutations, seed):
     columns = np.column_stack([np.ones(len(d)), x] if Z is None else [np.ones(len(d)), x, Z])
     columns[:, 1:] -= columns[:, 1:].mean(0)
     B = np.linalg.pinv(columns) @ d.reshape(len(d), -1).astype(float)
-    return dataset(
+    found = dataset(
         explained_share=share,
         p_vertex=p,
         p_family_wise=p_max,
@@ -173,6 +174,7 @@ def _map(study, x, Z, of, n_permutations, seed):
         effect=B[1].reshape(-1, 3),
         intercept=B[0].reshape(-1, 3),
     )
+    return in_unit(found, unit_of(data["displacement"]))
 
 
 def group_map(study, group, *, covariates=None, of="vector", n_permutations=999, seed=0):
@@ -225,7 +227,8 @@ def regression(study, variable, *, covariates=None, of="vector", n_components=No
     Dataset
         The global test, ``statistic`` and ``p_value``, as of :func:`group_test`; the test at every vertex as of
         :func:`group_map`, ``effect(vertex, xyz)`` per unit of the variable, ``effect_size`` = Cohen's f, and
-        ``intercept(vertex, xyz)``.  Attributes ``mean``, ``lowest`` and ``highest`` of the variable, ``smallest_p``.
+        ``intercept(vertex, xyz)``; ``standard_score(shape)`` of the variable.  Attributes ``mean``,
+        ``standard_deviation``, ``lowest`` and ``highest`` of the variable, ``smallest_p``.
 
     Raises
     ------
@@ -242,13 +245,19 @@ def regression(study, variable, *, covariates=None, of="vector", n_components=No
     found = _map(study, x, Z, of, n_permutations, seed)
     share = found["explained_share"].values
     attrs = {"mean": float(x.mean()), "lowest": float(x.min()), "highest": float(x.max()), "of": of}
+    attrs["standard_deviation"] = float(x.std(ddof=1))
     attrs |= {"components": scores.shape[1], "smallest_p": test.smallest_p(n_permutations, n=len(x))}
-    extra = dataset(statistic=statistic, p_value=p, effect_size=np.sqrt(share / np.maximum(1 - share, 1e-12)))
+    extra = dataset(
+        statistic=statistic,
+        p_value=p,
+        effect_size=np.sqrt(share / np.maximum(1 - share, 1e-12)),
+        standard_score=(x - attrs["mean"]) / attrs["standard_deviation"],
+    ).assign_coords(shape=study["registration"]["shape"].values)
     return found.merge(extra).assign_attrs(attrs | {"permutations": n_permutations})
 
 
 def predict(study, fit, value):
-    """The shape at a value of the variable of a :func:`regression`; a row of values is an animation.
+    """The shape at a value of the variable of a :func:`regression`; :func:`regression_modes` animates it.
 
     Returns
     -------
@@ -258,6 +267,47 @@ def predict(study, fit, value):
     template = study["registration"].to_dataset()
     moved = fit["intercept"].values + (value - fit.attrs["mean"]) * fit["effect"].values
     return dataset(position=template["position"].values + moved, corner_vertex=template["corner_vertex"].values)
+
+
+def regression_modes(study, fit, name="variable"):
+    """A :func:`regression` in the form of a study with one mode, for everything that shows modes.
+
+    ``s4a.explore`` and the panel of the modes play it with a slider, :func:`s4a.write_page` and
+    :func:`s4a.picture.write_animation` make it a file; one standard deviation of the mode is one of the variable.
+
+    Parameters
+    ----------
+    study : DataTree
+    fit : Dataset
+        Of :func:`regression`.
+    name : str
+        Of the variable.
+
+    Returns
+    -------
+    DataTree
+        ``/registration`` and ``/coarse`` of the study, and ``/pca`` with one component: ``deformation`` by the effect
+        of one standard deviation, ``score`` the variable of each shape, ``explained_variance_ratio`` the share of the
+        variance of the displacements that it explains.
+    """
+    d, area, names, data = registered(study)
+    deviation = fit.attrs["standard_deviation"]
+    step = fit["effect"].values * deviation
+    size = np.sqrt(np.einsum("nx,nx,n->", step, step, area))
+    total = model.gram(d - d.mean(0), area).trace() / (len(d) - 1)
+    modes = dataset(
+        {"variable": name},
+        mean_displacement=fit["intercept"].values.astype(np.float32),
+        deformation=step[None].astype(np.float32),
+        standard_deviation=np.array([size]),
+        score=fit["standard_score"].values[:, None],
+        explained_variance_ratio=np.array([size**2 / total]),
+    )
+    modes = in_unit(modes, unit_of(data["displacement"])).assign_coords(shape=names)
+    nodes = {
+        n.path: n.to_dataset(inherit=False) for n in study.subtree if n.path.split("/")[1] in ("coarse", "original")
+    }
+    return xr.DataTree.from_dict(nodes | {"/registration": data, "/pca": modes}, name=study.name)
 
 
 def outliers(study, *, n_components=None, level=0.01):
@@ -278,7 +328,7 @@ def outliers(study, *, n_components=None, level=0.01):
         new observation), ``left_out_error(shape)`` in the unit of the input, and ``outlier(shape)``: p under `level`,
         or the error more than 3.5 robust standard deviations over the median (Iglewicz and Hoaglin 1993).
     """
-    d, area, names, _ = registered(study)
+    d, area, names, data = registered(study)
     s = len(d)
     K = model.gram(d - d.mean(0), area)
     variance, _ = model.principal(model.centred(K))
@@ -300,7 +350,7 @@ def outliers(study, *, n_components=None, level=0.01):
         left_out_error=left,
         outlier=(p < level) | (far & (spread > 0)),
     )
-    return found.assign_coords(shape=names)
+    return in_unit(found, unit_of(data["displacement"])).assign_coords(shape=names)
 
 
 def classify(study, group, estimator=None, *, n_components=None, n_folds=5, n_permutations=99, seed=0):

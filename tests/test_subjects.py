@@ -1,0 +1,190 @@
+"""The table of the shapes: what is read, what is refused, and that nothing but the statistics knows of it."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from s4a import analyse, cli, insert, open_study, statistics, synthetic
+from s4a.subjects import read_table, with_table
+
+OPTIONS = {"n_coarse": 300, "k_init": 8, "k": 12, "n_jobs": 1}
+NAMES = [f"brain_{i:02d}" for i in range(1, 8)]
+TABLE = "shape;sex;age;score\n" + "".join(f"{n};{'fm'[i % 2]};{20 + 7 * i};{i / 2}\n" for i, n in enumerate(NAMES))
+
+
+@pytest.fixture(scope="module")
+def brains():
+    return {n: m.to_dataset() for n, m in synthetic.brains(7, 700, seed=3)["original"].children.items()}
+
+
+@pytest.fixture(scope="module")
+def folder(brains, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("subjects")
+    (folder / "table.csv").write_text(TABLE)
+    given = {n: m for n, m in brains.items() if n != "brain_07"}
+    (folder / "six.csv").write_text("\n".join(TABLE.splitlines()[:-1]))
+    analyse(given, store=folder / "study", table=folder / "six.csv", **OPTIONS).close()
+    return folder
+
+
+def test_columns_are_whole_numbers_numbers_or_text_in_the_order_of_the_shapes(tmp_path):
+    file = tmp_path / "table.csv"
+    file.write_text('age,shape,site,weight\n31,"b 1.ply",Bern,60.5\n40,a,,NA\n')
+    found = read_table(file, ["a", "b_1"])
+    assert found["age"].values.tolist() == [40, 31]
+    assert found["age"].dtype == np.int64
+    assert found["site"].values.tolist() == ["", "Bern"]
+    assert found["weight"].values == pytest.approx([np.nan, 60.5], nan_ok=True)
+    assert found["age"].attrs["long_name"] == "column 'age' of the table of the shapes"
+
+
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        ("name,age\na,1\n", "a column 'shape' .* needed; found \\['name', 'age'\\]"),
+        ("shape,age\na,1\n", "no row for b"),
+        ("shape,age\na,1\nb,2\nc.ply,3\n", "no shape is called 'c.ply'"),
+        ("shape,age\na,1\nA,2\n", "no shape is called 'A'; no row for b"),
+        ("shape,age\na,1\nb,2\na,3\n", "found two for 'a'"),
+        ("shape,age\na,1\nb\n", "2 cells in every row needed; row 3 has 1"),
+        ("shape,a/b\na,1\nb,2\n", "without '/'; found 'a/b'"),
+        ("shape,age,age\na,1,2\nb,1,2\n", "found 'age'"),
+        ("shape\na\nb\n", "a column beside 'shape' needed"),
+        ("", "cannot be read as a table: the file is empty"),
+    ],
+)
+def test_a_wrong_table_is_named_with_what_was_needed_and_found(text, words, tmp_path):
+    file = tmp_path / "wrong.csv"
+    file.write_text(text)
+    with pytest.raises(ValueError, match=f"wrong.csv.*{words}"):
+        read_table(file, ["a", "b"])
+
+
+def test_a_study_has_the_table_and_nothing_else_depends_on_it(folder, brains):
+    given = {n: m for n, m in brains.items() if n != "brain_07"}
+    without = analyse(given, **OPTIONS)
+    assert "subjects" not in without
+    with open_study(folder / "study") as study:
+        assert study["subjects"]["age"].values.tolist() == [20, 27, 34, 41, 48, 55]
+        assert study["report"].attrs["table"].endswith("six.csv")
+        for node in ("latent", "registration", "pca"):
+            one, other = (t[node].to_dataset().drop_attrs(deep=False) for t in (study, without))
+            assert one.identical(other), node
+    before = {p: p.stat().st_mtime_ns for p in (folder / "study" / "registration").iterdir()}
+    (folder / "six.csv").write_text((folder / "six.csv").read_text().replace("20", "99"))
+    with analyse(given, store=folder / "study", table=folder / "six.csv", **OPTIONS) as again:
+        assert again["subjects"]["age"].values[0] == 99
+    assert {p: p.stat().st_mtime_ns for p in before} == before
+    with analyse(given, store=folder / "study", **OPTIONS) as again:
+        assert again["subjects"]["age"].values[0] == 99  # a table stays until another is given
+
+
+def test_statistics_take_columns_and_say_which_values_are_missing(folder):
+    with open_study(folder / "study") as study:
+        by_name = statistics.group_test(study, "sex", covariates=["age"], n_permutations=19)
+        age = study["subjects"]["age"].values
+        assert by_name.identical(statistics.group_test(study, list("fmfmfm"), covariates=age, n_permutations=19))
+        assert statistics.regression(study, "age", covariates=["sex"], n_permutations=9).attrs["highest"] == age.max()
+        with pytest.raises(ValueError, match=r"group 'size' needs a column of that name .* has sex, age, score"):
+            statistics.group_test(study, "size")
+        with pytest.raises(ValueError, match="a regression needs a variable of numbers"):
+            statistics.regression(study, "sex")
+        table = study["subjects"].to_dataset()
+        holes = xr.DataTree.from_dict(
+            {"registration": study["registration"].to_dataset(), "subjects": table.where(table["age"] < 50)}
+        )
+        with pytest.raises(ValueError, match=r"variable 'age' needs a finite value .*: brain_01, brain_06"):
+            statistics.regression(holes, "age")
+
+
+def test_a_table_can_take_the_place_of_the_first(folder):
+    (folder / "other.csv").write_text("shape,site\n" + "".join(f"{n},x\n" for n in NAMES[:6]))
+    with open_study(folder / "study") as study:
+        other = with_table(study, folder / "other.csv")
+        assert list(other["subjects"].data_vars) == ["site"]
+        assert "sex" in study["subjects"]
+
+
+def test_the_command_prints_tables_and_writes_files(folder, capsys, monkeypatch):
+    monkeypatch.setattr(cli, "write_page", lambda tree, file, **_: file.write_text(str(tree["pca"].sizes["component"])))
+    command = ["statistics", str(folder / "study"), "--group", "sex", "--variable", "age", "--permutations", "19"]
+    assert cli.main([*command, "--recompute", "--n-jobs", "1"]) == 0
+    said, out = capsys.readouterr().out, folder / "study" / "statistics"
+    for words in (
+        "generalization, recomputed",
+        "groups of sex (f: 3, m: 3)",
+        "family-wise",
+        "outliers:",
+        "lengths in mm",
+    ):
+        assert words in said, words
+    assert (out / "regression.html").read_text() == "1"
+    assert (out / "regression.gif").read_bytes()[:3] == b"GIF"
+    rows = (out / "outliers.shape.csv").read_text().splitlines()
+    assert rows[0] == "shape,mahalanobis,outlier_p,left_out_error,outlier"
+    assert [row.split(",")[0] for row in rows[1:]] == NAMES[:6]
+    evaluation = np.genfromtxt(out / "evaluation.component.csv", delimiter=",", names=True)
+    with xr.open_dataset(out / "evaluation.nc") as found:
+        assert evaluation["compactness"] == pytest.approx(found["compactness"].values)
+        assert evaluation["component"].tolist() == list(range(1, found.sizes["component"] + 1))
+    for name in ("generalization", "group", "group_map", "classification", "regression"):
+        assert (out / f"{name}.nc").is_file(), name
+    assert cli.main(["statistics", str(folder / "study"), "--group", "site"]) == 2
+    assert "group 'site' needs a column of that name" in capsys.readouterr().err
+
+
+def test_the_command_inserts_shapes(folder, brains, tmp_path, capsys):
+    from s4a import write_mesh
+    from s4a.mesh import as_arrays
+
+    write_mesh(tmp_path / "brain_07.ply", *as_arrays(brains["brain_07"]))
+    (tmp_path / "broken.ply").write_text("no mesh")
+    command = ["insert", str(folder / "study"), str(tmp_path), "--out", str(tmp_path / "out"), "--n-jobs", "1"]
+    assert cli.main(command) == 1  # one of them is excluded
+    said = capsys.readouterr().out.splitlines()
+    assert said[0].split()[:4] == ["shape", "confidence", "round", "trip"]
+    assert "excluded" in said[2]
+    with xr.open_datatree(tmp_path / "out" / "inserted.nc") as tree, open_study(folder / "study") as study:
+        alone = insert(study, tmp_path / "brain_07.ply")
+        np.testing.assert_array_equal(tree["pca"]["score"], alone["pca"]["score"])
+        assert tree["registration/brain_07"]["template_triangle"].sizes == {"original_vertex": 700}
+    scores = (tmp_path / "out" / "scores.csv").read_text().splitlines()
+    assert scores[1].split(",")[0] == "brain_07"
+    assert (tmp_path / "out" / "brain_07.ply").is_file()
+
+
+# true generalization
+
+
+def test_recomputed_correspondences_generalize_less_well_than_those_that_knew_the_shape(folder):
+    with open_study(folder / "study") as study:
+        kept = statistics.evaluate(study, n_samples=20, n_permutations=2, n_points=0)
+        anew = statistics.generalization(study, n_points=100)
+        assert "optimistic" in kept.attrs["correspondence"]
+        assert "recomputed" in anew.attrs["correspondence"]
+        assert anew["generalization"].attrs["units"] == "mm"
+        assert anew.sizes["component"] == 4
+        assert anew.attrs["generalization_0"] > 0.8 * kept.attrs["generalization_0"]
+        assert anew["generalization"].values[-1] > kept["generalization"].values[-2]
+        assert (np.diff(anew["generalization"]) <= 1e-9).all()
+        assert (anew["generalization_surface"] < anew["generalization"]).all()
+        assert (anew["generalization_error"] > 0).all()
+        with pytest.raises(ValueError, match="lacks original"):
+            statistics.generalization(study.drop_nodes("original"))
+
+
+def test_without_its_template_a_study_is_registered_to_the_next(folder):
+    from s4a.generalize import without
+
+    with open_study(folder / "study") as study:
+        template = study["registration"].attrs["template"]
+        other = without(study, template)
+        near = study["latent"]["distance_to_median"].drop_sel(shape=template).idxmin().item()
+        data = other["registration"].to_dataset()
+        assert data.attrs["template"] == near
+        assert template not in data["shape"]
+        assert (data["displacement"].sel(shape=near) == 0).all()
+        assert data["confidence"].min() < 1
+        kept = next(n for n in NAMES[:6] if n not in (template, near))
+        same = without(study, kept)["registration"].to_dataset()
+        assert same.identical(study["registration"].to_dataset().drop_sel(shape=kept))
