@@ -129,19 +129,20 @@ def read_landmarks(path):
     Parameters
     ----------
     path : str or Path
-        3D Slicer .mrk.json (points or the control points of curves), CSV ``name,x,y,z`` (a header is optional), or the
-        XML of MeshLab's picked points (.pp).
+        3D Slicer .mrk.json (points, curves, closed curves), CSV ``name,x,y,z`` (a header is optional; with one, also
+        ``curve``, the name of the curve or empty, and ``closed``), or the XML of MeshLab's picked points (.pp).
 
     Returns
     -------
     Dataset
-        ``landmark_name(landmark)``, ``landmark_position(landmark, xyz)``; attribute ``coordinate_system``, RAS
-        or LPS where the file says which, else empty.
+        ``landmark_name(landmark)``, ``landmark_position(landmark, xyz)``; where there are curves, ``landmark_curve``
+        and ``landmark_closed``, the points in order along each; attribute ``coordinate_system``, RAS or LPS where the
+        file says which, else empty.
 
     Raises
     ------
     ValueError
-        When the file is missing or holds no points.
+        When the file is missing or holds no points, or a curve has one point only.
     """
     path = Path(path)
     if not path.is_file():
@@ -149,14 +150,18 @@ def read_landmarks(path):
     try:
         head = path.read_text("utf-8-sig").lstrip()[:1]
         reader = {"{": _slicer_points, "<": _meshlab_points}.get(head, _table_points)
-        names, points, system = reader(path)
+        names, points, system, curve, closed = reader(path)
         points = np.array(points, float).reshape(-1, 3)
         if len(points) == 0 or not np.isfinite(points).all():
             raise ValueError(f"points with finite coordinates needed, found {len(points)}")
+        short = [name for name in dict.fromkeys(curve) if name and curve.count(name) < 2]
+        if short:
+            raise ValueError(f"a curve needs two points or more; {short[0]!r} has one")
     except Exception as error:
         raise ValueError(f"{path} cannot be read as landmarks: {error or type(error).__name__}") from error
     names = [name or str(i + 1) for i, name in enumerate(names)]
-    return dataset({"coordinate_system": system}, landmark_name=np.array(names), landmark_position=points)
+    curves = {"landmark_curve": np.array(curve), "landmark_closed": np.array(closed, bool)} if any(curve) else {}
+    return dataset({"coordinate_system": system}, landmark_name=np.array(names), landmark_position=points, **curves)
 
 
 def _slicer_points(path):
@@ -166,13 +171,23 @@ def _slicer_points(path):
         raise ValueError(
             f"one coordinateSystem, LPS or RAS, needed, found {', '.join(sorted(systems)) or 'no markups'}"
         )
-    points = [p for m in lists for p in m["controlPoints"] if p.get("positionStatus", "defined") == "defined"]
-    return [p.get("label", "") for p in points], [p["position"] for p in points], systems.pop()
+    rows, taken = [], set()
+    for i, m in enumerate(lists, 1):
+        curve = ""
+        if m.get("type") in ("Curve", "ClosedCurve"):
+            curve = m.get("name") or f"curve_{i}"
+            curve = f"{curve}_{i}" if curve in taken else curve
+            taken.add(curve)
+        points = [p for p in m["controlPoints"] if p.get("positionStatus", "defined") == "defined"]
+        rows += [(p.get("label", ""), p["position"], curve, m.get("type") == "ClosedCurve") for p in points]
+    names, points, curve, closed = zip(*rows, strict=True) if rows else ((),) * 4
+    return names, points, systems.pop(), curve, closed
 
 
 def _meshlab_points(path):
     points = [p for p in ElementTree.fromstring(path.read_text("utf-8-sig")).iter("point") if p.get("active") != "0"]
-    return [p.get("name", "") for p in points], [[p.get(axis) for axis in "xyz"] for p in points], ""
+    names = [p.get("name", "") for p in points]
+    return names, [[p.get(axis) for axis in "xyz"] for p in points], "", [""] * len(names), []
 
 
 def _table_points(path):
@@ -181,22 +196,29 @@ def _table_points(path):
     if all(axis in head for axis in "xyz"):
         x = [head.index(axis) for axis in "xyz"]
         name = next((head.index(n) for n in ("name", "label", "landmark") if n in head), None)
+        curve, closed = (head.index(n) if n in head else None for n in ("curve", "closed"))
         rows = rows[1:]
     elif len(head) in (3, 4) and all(map(is_number, rows[0][-3:])):
-        x, name = range(len(head) - 3, len(head)), 0 if len(head) == 4 else None
+        x, name, curve, closed = range(len(head) - 3, len(head)), 0 if len(head) == 4 else None, None, None
     else:
         raise ValueError(f"the columns name, x, y and z needed, found {', '.join(rows[0])}")
-    return ["" if name is None else row[name] for row in rows], [[row[i] for i in x] for row in rows], ""
+    names, curves, rings = (["" if i is None else row[i] for row in rows] for i in (name, curve, closed))
+    return names, [[row[i] for i in x] for row in rows], "", curves, [c.lower() in ("1", "true", "yes") for c in rings]
 
 
 def write_landmarks(path, landmarks):
-    """Write ``landmark_name`` and ``landmark_position`` of a Dataset as CSV ``name,x,y,z``."""
+    """Write ``landmark_name`` and ``landmark_position`` as CSV ``name,x,y,z``; with curves also ``curve,closed``."""
     require(landmarks, "landmark_name", "landmark_position", what="landmarks")
     with open(path, "w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
-        table.writerow(["name", "x", "y", "z"])
+        curves = ["landmark_curve", "landmark_closed"] if "landmark_curve" in landmarks else []
+        table.writerow(["name", "x", "y", "z", *(name.removeprefix("landmark_") for name in curves)])
         names, points = landmarks["landmark_name"].values, landmarks["landmark_position"].values
-        table.writerows([name, *(repr(float(v)) for v in x)] for name, x in zip(names, points, strict=True))
+        further = (
+            zip(*(landmarks[name].values.tolist() for name in curves), strict=True) if curves else [()] * len(names)
+        )
+        rows = zip(names, points, further, strict=True)
+        table.writerows([name, *(repr(float(v)) for v in x), *more] for name, x, more in rows)
 
 
 def labels_of_mesh(labels, mesh):

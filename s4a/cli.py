@@ -394,7 +394,8 @@ def insert(args):
     return 1 if (report["status"] == "excluded").any() else 0
 
 
-TRANSFERRED = ["target", "confidence", "share of votes", "labels of dropped vertices", "landmarks", "spread"]
+TRANSFERRED = ["target", "cycle error", "|distortion|", "confidence", "share of votes"]
+TRANSFERRED += ["labels of dropped vertices", "landmarks", "spread"]
 
 
 def transfer_rows(study, source, label, landmarks, out):
@@ -408,12 +409,16 @@ def transfer_rows(study, source, label, landmarks, out):
     rows = []
     for name, mesh in meshes.items():
         stem = stems[name] if list(stems.values()).count(stems[name]) == 1 else name
-        row = [stem, *["-"] * 5]
+        row = [stem, *["-"] * 7]
+        one = study["registration"].to_dataset().sel(shape=name)
+        row[1:3] = f"{one['round_trip'].mean().item():.4f}", f"{np.median(np.abs(one['distortion'])):.3f}"
         if labels is not None:
             found = labels[name]
-            value, dropped = labels_of_file(found["label"].values, mesh, file_points(mesh))
+            points_of_file = file_points(mesh)
+            value, dropped = labels_of_file(found["label"].values, mesh, points_of_file)
             np.save(out / f"{stem}.labels.npy", value)
-            row[1:4] = [
+            np.save(out / f"{stem}.confidence.npy", labels_of_file(found["confidence"].values, mesh, points_of_file)[0])
+            row[3:6] = [
                 f"{found['confidence'].mean().item():.2f}",
                 f"{found['label_share'].mean().item():.2f}",
                 dropped,
@@ -421,8 +426,8 @@ def transfer_rows(study, source, label, landmarks, out):
         if points is not None:
             found = points[name]
             write_landmarks(out / f"{stem}.landmarks.csv", found)
-            row[4] = f"{found['landmark_confidence'].mean().item():.2f}"
-            row[5] = f"{found['landmark_spread'].mean().item():.3g}" if "landmark_spread" in found else "-"
+            row[6] = f"{found['landmark_confidence'].mean().item():.2f}"
+            row[7] = f"{found['landmark_spread'].mean().item():.3g}" if "landmark_spread" in found else "-"
         rows.append(row)
     return rows
 
@@ -496,8 +501,10 @@ def parser():
     sub.add_argument("source", metavar="SOURCE", help="mesh file that the labels and landmarks belong to")
     sub.add_argument("targets", nargs="+", metavar="TARGET", help="mesh files, folders or globs; or one study folder")
     sub.add_argument("--labels", metavar="FILE", help="NPY, NPZ (FILE:NAME), CSV, GIFTI label or FreeSurfer annot")
-    sub.add_argument("--landmarks", metavar="FILE", help="Slicer .mrk.json, CSV name,x,y,z or MeshLab picked points")
-    sub.add_argument("--out", required=True, metavar="DIR", help="for <target>.labels.npy and <target>.landmarks.csv")
+    sub.add_argument("--landmarks", metavar="FILE", help="points and curves: Slicer .mrk.json, CSV or MeshLab .pp")
+    sub.add_argument(
+        "--out", required=True, metavar="DIR", help="for <target>.labels.npy, .confidence.npy, .landmarks.csv"
+    )
     sub.add_argument("--n-coarse", type=int, default=6000, help=HELP["n_coarse"])
     sub.add_argument("--k", type=int, default=100, help=HELP["k"])
     sub.add_argument("--n-jobs", type=int, default=-1, help=HELP["n_jobs"])

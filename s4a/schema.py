@@ -23,6 +23,8 @@ TABLE = {
     "label": (("vertex",), ONE, "label of the vertex"),
     "landmark_name": (("landmark",), ONE, "name of the landmark"),
     "landmark_position": (("landmark", "xyz"), INPUT, "position of the landmark"),
+    "landmark_curve": (("landmark",), ONE, "curve of the point, in order along it; empty where it has none"),
+    "landmark_closed": (("landmark",), ONE, "whether that curve is closed"),
     # low resolution (4.1) and its spectrum (3.3)
     "vertex_area": (("vertex",), INPUT2, "lumped area of the vertex, the diagonal of A"),
     "edge_vertex": (("edge", "end"), ONE, "vertices at both ends of an edge"),

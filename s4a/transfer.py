@@ -13,12 +13,14 @@ from threadpoolctl import threadpool_limits
 from s4a import study as store
 from s4a.annotations import MIRROR
 from s4a.link import at, blended, closest_point, elect, link, point_along
-from s4a.mesh import as_arrays, as_dataset, triangle_areas, vertex_areas
+from s4a.mesh import as_arrays, as_dataset, edge_graph, triangle_areas, vertex_areas
 from s4a.register import Scan, identity, match_scans
 from s4a.remesh import coarsen
 from s4a.schema import dataset, in_unit, require
 from s4a.spectral import spectrum
 
+NAMED = ("landmark_name", "landmark_curve", "landmark_closed")
+ROUNDS = 12  # halvings of a segment of a curve
 FARTHEST_LANDMARK = 0.03  # of sqrt(area): a landmark farther from its surface belongs to another mesh or frame
 
 
@@ -284,18 +286,90 @@ def locate(landmarks, mesh, *, farthest=FARTHEST_LANDMARK):
             "or coordinate system (RAS, LPS)?"
         )
     return dataset(
-        landmark_name=landmarks["landmark_name"].values,
         landmark_position=point,
         landmark_triangle=triangle.astype(np.int32),
         landmark_barycentric=weights,
         landmark_distance=distance,
+        **{name: landmarks[name].values for name in NAMED if name in landmarks},
+    )
+
+
+def follow(P, X, T, *, closed=False, spacing):
+    """A polyline on a surface: through points, with further ones in between.
+
+    Every segment that is longer than `spacing` is halved, and its middle moved to the closest point of the surface.
+
+    Parameters
+    ----------
+    P : float ndarray (p, 3)
+        In order along the curve, on the surface.
+    X, T : the mesh
+    closed : bool
+        Whether a segment leads from the last point to the first.
+    spacing : float
+        In the unit of the mesh.
+
+    Returns
+    -------
+    points : float ndarray (q, 3)
+    given : bool ndarray (q,)
+        Which of them are those of P.
+
+    Examples
+    --------
+    >>> X, T = np.array([[0.0, 0, 0], [4, 0, 0], [0, 4, 0]]), np.array([[0, 1, 2]])
+    >>> points, given = follow(X[:2], X, T, spacing=1.5)
+    >>> points[:, 0].tolist(), given.tolist()
+    ([0.0, 1.0, 2.0, 3.0, 4.0], [True, False, False, False, True])
+    """
+    P = np.concatenate([P, P[:1]]) if closed else P
+    given = np.ones(len(P), bool)
+    for _ in range(ROUNDS):
+        long = np.flatnonzero(np.linalg.norm(np.diff(P, axis=0), axis=1) > spacing)
+        if not len(long):
+            break
+        middle = (P[long] + P[long + 1]) / 2
+        P = np.insert(P, long + 1, at(X, T, *closest_point(middle, X, T)), axis=0)
+        given = np.insert(given, long + 1, False)
+    return (P[:-1], given[:-1]) if closed else (P, given)
+
+
+def traced(marked, mesh):
+    """Landmarks of :func:`locate`, with the points in between of every curve: a vertex of the polyline for each edge.
+
+    The points in between have no name; their curve is that of their neighbours.
+    """
+    X, T = as_arrays(mesh)
+    spacing = edge_graph(X, T).data.mean()
+    curve, closed = (marked[name].values for name in ("landmark_curve", "landmark_closed"))
+    rows = [(np.flatnonzero(curve == ""), marked["landmark_position"].values[curve == ""], None)]
+    for name in dict.fromkeys(curve[curve != ""].tolist()):
+        own = np.flatnonzero(curve == name)
+        points, given = follow(
+            marked["landmark_position"].values[own], X, T, closed=bool(closed[own[0]]), spacing=spacing
+        )
+        rows.append((own[np.cumsum(given) - 1], points, given))
+    before = np.concatenate([index for index, *_ in rows])
+    points = np.concatenate([P for _, P, _ in rows])
+    given = np.concatenate([np.ones(len(i), bool) if g is None else g for i, _, g in rows])
+    triangle, weights = closest_point(points, X, T)
+    return dataset(
+        landmark_name=np.where(given, marked["landmark_name"].values[before], ""),
+        landmark_curve=curve[before],
+        landmark_closed=closed[before],
+        landmark_position=points,
+        landmark_triangle=triangle.astype(np.int32),
+        landmark_barycentric=weights,
+        landmark_distance=np.where(given, marked["landmark_distance"].values[before], 0.0),
     )
 
 
 def transfer_landmarks(study, landmarks, *, source=None, targets=None, farthest=FARTHEST_LANDMARK):
     """Landmarks of one mesh on every shape of a registered study, at points inside triangles (6.2, Fig. 7).
 
-    The points of a curve, in order, come out as a polyline on every shape.
+    Where the landmarks have curves (``landmark_curve``, see :func:`s4a.annotations.read_landmarks`), points in between
+    are added along the surface of the source, an edge's length apart, and all carried over: curves come out as
+    polylines.
 
     Parameters
     ----------
@@ -307,7 +381,8 @@ def transfer_landmarks(study, landmarks, *, source=None, targets=None, farthest=
     DataTree
         For every target ``landmark_name``, ``landmark_position(landmark, xyz)`` on its surface, in its coordinates,
         ``landmark_triangle``, ``landmark_barycentric(landmark, corner)``, ``landmark_confidence`` and, where there are
-        several routes, ``landmark_spread``, the largest distance of one from their mean.
+        several routes, ``landmark_spread``, the largest distance of one from their mean; with curves
+        ``landmark_curve`` and ``landmark_closed``, and no name for the points in between.
 
     Raises
     ------
@@ -316,6 +391,8 @@ def transfer_landmarks(study, landmarks, *, source=None, targets=None, farthest=
     """
     mesh, each = plan(study, source, targets)
     marked = locate(landmarks, mesh, farthest=farthest)
+    if "landmark_curve" in landmarks:
+        marked = traced(marked, mesh)
     start = marked["landmark_triangle"].values, marked["landmark_barycentric"].values
     found = {}
     for name, target, routes in each:
@@ -326,7 +403,7 @@ def transfer_landmarks(study, landmarks, *, source=None, targets=None, farthest=
         mean = np.einsum("rp,rpx->px", confidence + 1e-9, points) / (confidence + 1e-9).sum(0)[:, None]
         triangle, weights = closest_point(mean, X, T) if len(ends) > 1 else ends[0][:2]
         found[name] = dataset(
-            landmark_name=marked["landmark_name"].values,
+            **{v: marked[v].values for v in NAMED if v in marked},
             landmark_position=at(X, T, triangle, weights),
             landmark_triangle=triangle.astype(np.int32),
             landmark_barycentric=weights,

@@ -227,7 +227,16 @@ def _confidence(study, look):
         for caption, (X, value) in surfaces.items()
     ]
     bar = markup.chart(charts.color_bar("viridis", 0, 1, "confidence"), "colour bar")
-    note = "Everywhere, and the shapes where it is lowest."
+    for name, words in (
+        ("round_trip", "cycle error, shares of sqrt(area)"),
+        ("distortion", "distortion |log(area ratio)|"),
+    ):
+        if name in registration:
+            value = np.abs(registration[name]).mean("shape").values
+            limit = float(np.quantile(value, 0.95)) or 1.0
+            picture = render(X, T, colors=ramp_colors(value, 0, limit), size=PANEL, **look)
+            figures.append(markup.picture(picture, f"{words}, from 0 to {limit:.2g}; mean over the shapes"))
+    note = "Everywhere, and the shapes where it is lowest; what the registration does to the surface."
     return markup.note(note) + markup.grid(figures) + bar
 
 

@@ -3,14 +3,17 @@
 import numpy as np
 import pytest
 import xarray as xr
+from PIL import Image
 from scipy import stats
 from scipy.integrate import quad
 from sklearn.svm import SVC
 
-from s4a import model, permutation, statistics, synthetic
+from s4a import model, permutation, statistics, synthesize, synthetic, write_page
 from s4a.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.pca import gram_pca, pca
+from s4a.picture import write_animation
 from s4a.schema import dataset
+from s4a.widgets.modes import Modes
 
 SCORES = np.array([-1.9, -1.1, -0.6, -0.2, 0.1, 0.4, 0.9, 1.2, 1.2])
 
@@ -297,3 +300,20 @@ def test_planted_groups_are_classified_and_shuffled_ones_are_not(planted):
     shuffled = [np.random.default_rng(seed).permutation(group) for seed in range(10)]
     by_chance = [statistics.classify(study, g, n_permutations=0).attrs["balanced_accuracy"] for g in shuffled]
     assert 0.35 < np.mean(by_chance) < 0.6
+
+
+def test_a_regression_is_a_mode_that_page_panel_and_animation_show(planted, tmp_path):
+    study, _, _, age = planted
+    fit = statistics.regression(study, "age", n_permutations=9)
+    moving = statistics.regression_modes(study, fit, "age")
+    assert moving["pca"]["score"].values[:, 0] == pytest.approx((age - age.mean()) / age.std(ddof=1))
+    later = statistics.predict(study, fit, age.mean() + 1.5 * age.std(ddof=1))["position"].values
+    assert synthesize(moving, [1.5])["position"].values == pytest.approx(later, abs=1e-5)
+    assert 0.1 < moving["pca"]["explained_variance_ratio"].item() < 0.9
+    panel = Modes(moving)
+    panel.scores = [1.5]
+    assert panel.vertices() == pytest.approx(later, abs=1e-5)
+    panel.close()
+    assert "component 1" in write_page(moving, tmp_path / "page.html").read_text()
+    with Image.open(write_animation(moving, tmp_path / "age.gif", n_frames=4, size=(60, 50))) as picture:
+        assert (picture.n_frames, picture.size) == (4, (60, 50))

@@ -191,6 +191,31 @@ def test_wrong_sources_targets_and_lengths_are_refused(study, meshes):
         transfer_landmarks(study, far)
 
 
+def test_curves_are_carried_as_polylines_between_the_vertices(study, meshes, tree, size):
+    angle = np.linspace(0, 2 * np.pi, 41)[:-1]
+    ring = np.stack([np.cos(angle), 0.3 + 0 * angle, np.sin(angle)], axis=1) / np.sqrt(1.09)
+    given = dataset(
+        landmark_name=np.array([*(f"p{i}" for i in range(40)), "alone"]),
+        landmark_position=synthetic.position(tree["truth"], "brain_01", np.r_[ring, [[0, 1, 0]]]),
+        landmark_curve=np.array(["ring"] * 40 + [""]),
+        landmark_closed=np.array([True] * 40 + [False]),
+    )
+    found = transfer_landmarks(study, given, targets=["brain_02"])["brain_02"]
+    of_ring = found["landmark_curve"].values == "ring"
+    names = found["landmark_name"].values
+    assert names[~of_ring].tolist() == ["alone"]
+    assert [n for n in names[of_ring] if n] == [f"p{i}" for i in range(40)]  # in order, others in between
+    assert of_ring.sum() > 60
+    line = found["landmark_position"].values[of_ring]
+    X, T = as_arrays(meshes["brain_02"])
+    assert distance(at(X, T, *closest_point(line, X, T)), line).max() < 1e-6 * size
+    dense = np.linspace(0, 2 * np.pi, 2000)
+    exact = np.stack([np.cos(dense), 0.3 + 0 * dense, np.sin(dense)], axis=1) / np.sqrt(1.09)
+    exact = synthetic.position(tree["truth"], "brain_02", exact)
+    assert cKDTree(exact).query(line)[0].mean() < 0.01 * size
+    assert cKDTree(line).query(exact)[0].mean() < 0.015 * size  # closed: no part of the true ring is left out
+
+
 # files
 
 
@@ -255,6 +280,30 @@ def test_every_landmark_file_gives_the_same_points(tmp_path):
         read_landmarks(tmp_path / "empty.csv")
 
 
+def test_curves_of_slicer_and_of_tables_come_out_of_their_files_in_order(tmp_path):
+    def control(*points):
+        return [{"label": f"p{i}", "position": p} for i, p in enumerate(points)]
+
+    sulcus, rim = [[0, 0, 0], [1, 0, 0], [2, 1, 0]], [[0, 0, 1], [1, 0, 1], [1, 1, 1]]
+    lists = [
+        {"type": "Fiducial", "controlPoints": control([5, 5, 5])},
+        {"type": "Curve", "name": "sulcus", "controlPoints": control(*sulcus)},
+        {"type": "ClosedCurve", "controlPoints": control(*rim)},
+    ]
+    markups = {"markups": [m | {"coordinateSystem": "RAS"} for m in lists]}
+    (tmp_path / "a.mrk.json").write_text(json.dumps(markups))
+    found = read_landmarks(tmp_path / "a.mrk.json")
+    assert found["landmark_curve"].values.tolist() == ["", *["sulcus"] * 3, *["curve_3"] * 3]
+    assert found["landmark_closed"].values.tolist() == [False] * 4 + [True] * 3
+    write_landmarks(tmp_path / "a.csv", found)
+    assert (tmp_path / "a.csv").read_text().splitlines()[0] == "name,x,y,z,curve,closed"
+    again = read_landmarks(tmp_path / "a.csv")
+    assert again.drop_attrs().identical(found.drop_attrs())
+    (tmp_path / "one.csv").write_text("name,x,y,z,curve\na,1,2,3,rim\n")
+    with pytest.raises(ValueError, match=r"one.csv .* a curve needs two points or more; 'rim' has one"):
+        read_landmarks(tmp_path / "one.csv")
+
+
 def test_lps_landmarks_find_their_place_on_a_ras_mesh(meshes):
     mesh = meshes["brain_01"]
     assert mesh.attrs["coordinate_system"] == "RAS"
@@ -309,6 +358,9 @@ def test_the_command_writes_labels_per_vertex_of_the_file_and_landmarks(tmp_path
     label = np.load(tmp_path / "out" / "target one.labels.npy")
     assert label.shape == (len(points),)
     assert (label[50:] == target["label"].values).mean() > 0.93
+    sure = np.load(tmp_path / "out" / "target one.confidence.npy")
+    assert sure.shape == (len(points),)
+    assert 0 < sure.min() <= sure.max() <= 1
     rows = (tmp_path / "out" / "target one.landmarks.csv").read_text().splitlines()
     assert rows[0] == "name,x,y,z"
     place = read_landmarks(tmp_path / "out" / "target one.landmarks.csv")
