@@ -308,12 +308,12 @@ def statistics(args):
     names = far["shape"].values[far["outlier"].values].tolist()
     write(f"\noutliers: {', '.join(names) or 'none'}")
     if args.group:
-        write("\n" + tested(results["group"], results["group_map"], f"groups of {args.group}", study))
+        write("\n" + findings(results["group"], results["group_map"], f"groups of {args.group}", study))
         found = results["classification"]
         share, chance = (100 * found.attrs[name] for name in ("balanced_accuracy", "chance"))
         write(f"classified {share:.0f} % right, chance {chance:.0f} %, p = {found['p_value'].item():.3g}")
     if args.variable:
-        write("\n" + tested(results["regression"], results["regression"], args.variable, study))
+        write("\n" + findings(results["regression"], results["regression"], args.variable, study))
         moving = tests.regression_modes(study, results["regression"], args.variable)
         write_page(moving, Path(out) / "regression.html", title=f"Regression on {args.variable}")
         write_animation(moving, Path(out) / "regression.gif")
@@ -340,7 +340,7 @@ def evaluation_table(kept, anew):
     return f"lengths in {unit}, ± standard error\n" + table(rows, ["components", *(head for head, _ in columns)])
 
 
-def tested(whole, where, name, study):
+def findings(whole, where, name, study):
     """What a test and its map found, in words."""
     area = study["registration"].to_dataset()
     area = vertex_areas(*as_arrays(area))
