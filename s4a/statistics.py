@@ -62,7 +62,7 @@ def values_of(study, given, what):
     given = np.asarray(given)
     if given.ndim == 0 or len(given) != len(names):
         raise ValueError(f"{what} needs one value for each of {len(names)} shapes, found shape {given.shape}")
-    unknown = ~np.isfinite(given) if given.dtype.kind == "f" else given == "" if given.dtype.kind == "U" else False
+    unknown = ~np.isfinite(given) if given.dtype.kind == "f" else given == "" if given.dtype.kind in "OU" else False
     unknown = np.broadcast_to(unknown, given.shape).reshape(len(names), -1).any(1)
     if unknown.any():
         lacking = ", ".join(n for n, u in zip(names, unknown, strict=True) if u)
