@@ -190,6 +190,21 @@ def fit_descriptors(
     with them, and the same once more with `oriented` for the operators that a mirror image turns over.  Descriptors are
     taken with all eigenfunctions that the meshes have, less their mean, scaled to norm 1.
 
+    Mean geodesic error after ZoomOut to 100, in % of sqrt(area), at 5,700 vertices (three pairs of poses of a child,
+    two of a cat, two faces):
+
+    ======================================  ==================  ============  ============
+    first map, 20 x 20                      child               cat           face
+    ======================================  ==================  ============  ============
+    nearest neighbours after ICP            0.96, 10.1, 64.9    4.73, 1.33    0.12, 0.15
+    10 landmarks found by ICP               2.28, 21.2, 64.1    6.08, 4.67    0.12, 0.15
+    10 true landmarks                       0.89, 1.41, 4.46    2.20, 1.14    0.12, 0.15
+    wave kernels                            0.84, 10.5, 4.52    2.38, 1.11    0.12, 0.15
+    wave kernels, ``oriented=0``            0.84, 35.8, 4.48    18.3, 3.14    0.12, 22.2
+    heat kernels                            0.83, 1.49, 4.51    2.48, 1.14    0.12, 0.15
+    wave kernels and 10 true landmarks      0.85, 1.49, 4.50    2.22, 1.12    0.12, 0.15
+    ======================================  ==================  ============  ============
+
     Parameters
     ----------
     source, target : Dataset
