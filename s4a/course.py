@@ -36,9 +36,9 @@ def check(answer, expected, hint="", *, within=0.01):
     ...
     AssertionError: Not yet: the answer is 3.1. Hint: once around.
     """
-    hint = f" Hint: {hint.rstrip('.')}." if hint else ""
+    hint = f" Hint: {hint}{'' if hint.endswith(('.', '?')) else '.'}" if hint else ""
     if answer is ...:
-        raise AssertionError(f"No answer yet: put yours in the place of the dots of `answer = ...`.{hint}")
+        raise _shown(f"No answer yet: put yours in the place of the dots of `answer = ...`.{hint}")
     if callable(expected):
         right = bool(expected(answer))
     elif np.asarray(expected).dtype.kind in "iuf":
@@ -46,8 +46,15 @@ def check(answer, expected, hint="", *, within=0.01):
     else:
         right = np.array_equal(answer, expected)
     if not right:
-        raise AssertionError(f"Not yet: the answer is {_told(answer)}.{hint}")
+        raise _shown(f"Not yet: the answer is {_told(answer)}.{hint}")
     return "Right."
+
+
+def _shown(message):
+    """The error, which IPython shows without the way it took through this file."""
+    error = AssertionError(message)
+    error._render_traceback_ = lambda: [message]
+    return error
 
 
 def _near(answer, expected, within):
