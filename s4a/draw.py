@@ -283,6 +283,43 @@ def position_colors(points):
     return 0.12 + 0.83 * (points - low) / np.maximum(high - low, np.finfo(float).tiny)
 
 
+def checkerboard(coordinates, cell):
+    """Brightness ``(n,)`` of a checkerboard of cubes of the side `cell`: 1 and 0.5 in turn; NaN stays NaN.
+
+    Examples
+    --------
+    >>> checkerboard(np.array([[0.1, 0.1, 0.1], [1.1, 0.1, 0.1], [1.1, 1.9, 0.1]]), 1.0)
+    array([1. , 0.5, 1. ])
+    """
+    return 1 - 0.5 * (np.floor(np.asarray(coordinates) / cell).sum(1) % 2)
+
+
+def with_balls(points, triangles, colors, balls):
+    """A surface with spheres: points, triangles and colours of all; each ball is x, y, z, red, green, blue, radius.
+
+    Examples
+    --------
+    >>> X, T, colors = with_balls(np.zeros((3, 3)), np.array([[0, 1, 2]]), None, [[5, 0, 0, 1, 0, 0, 2.0]])
+    >>> float(X[:, 0].min()), float(X[:, 0].max()), colors[-1].tolist()
+    (0.0, 7.0, [1.0, 0.0, 0.0])
+    """
+    if not len(balls):
+        return points, triangles, colors
+    rings, around = 10, 16
+    a, b = np.meshgrid(np.linspace(0, np.pi, rings + 1), np.linspace(0, 2 * np.pi, around + 1), indexing="ij")
+    unit = np.stack([np.sin(a) * np.cos(b), np.sin(a) * np.sin(b), np.cos(a)], -1).reshape(-1, 3)
+    here = (np.arange(rings)[:, None] * (around + 1) + np.arange(around)).ravel()
+    below = here + around + 1
+    T = np.concatenate([np.stack([here, below, here + 1], 1), np.stack([here + 1, below, below + 1], 1)])
+    colors = np.tile(CLAY, (len(points), 1)) if colors is None else np.asarray(colors)
+    parts = [np.asarray(points)], [np.asarray(triangles)], [colors]
+    for i, (*centre, red, green, blue, radius) in enumerate(balls):
+        parts[0].append(np.array(centre) + radius * unit)
+        parts[1].append(T + len(points) + i * len(unit))
+        parts[2].append(np.tile([red, green, blue], (len(unit), 1)))
+    return tuple(np.concatenate(part) for part in parts)
+
+
 def image_bytes(picture, kind="webp"):
     """The bytes of an image file of a picture ``(height, width, 4)``: ``webp``, a tenth of the size, or exact ``png``.
 

@@ -419,8 +419,7 @@ def run_stages(run, given, options, subjects=None):
     )
 
     k_init = min(o["k_init"], k_signature)
-    size = max(4, -(-len(pairs) // 64))
-    batches = [pairs[i : i + size] for i in range(0, len(pairs), size)]
+    batches = in_batches(pairs)
     files = [f"network/first_{i:03d}.nc" for i in range(len(batches))]
     keys = [study.task_key(key, batch, k_init, o["init"]) for batch in batches]
     run.tasks(
@@ -459,6 +458,18 @@ def run_stages(run, given, options, subjects=None):
         names = [n for n in names if n not in run.failures]
         no_modes = write_modes(folder, names, mesh, template, [key_of[n] for n in names])
     write_report(run, given, options | {"template": template}, no_modes, [key_of[n] for n in names])
+
+
+def in_batches(pairs):
+    """The pairs in batches for the tasks of the first maps: four in each, or 64 batches.
+
+    Examples
+    --------
+    >>> [len(batch) for batch in in_batches(range(10))]
+    [4, 4, 2]
+    """
+    size = max(4, -(-len(pairs) // 64))
+    return [pairs[i : i + size] for i in range(0, len(pairs), size)]
 
 
 def write_modes(folder, names, mesh, template, made_from):

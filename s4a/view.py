@@ -6,6 +6,7 @@ import numpy as np
 
 from s4a import charts, markup
 from s4a.draw import SIGNED, opposite, position_colors, ramp_colors, render
+from s4a.live import modes_html
 from s4a.picture import (
     N_MODES,
     PANEL,
@@ -179,7 +180,7 @@ def _modes(study, look):
         sliders.append(markup.slider(mode, frames, labels, f"{ratio:.1%} of the variance"))
     bar = charts.color_bar(SIGNED, -limit, limit, f"displacement along the normal ({unit})")
     note = markup.note("Blue is expansion, red is compression, against the mean; one colour scale for all.")
-    sliders = f"<h3>Move along a component</h3>{markup.grid(sliders)}"
+    sliders = "<h3>Move along the components</h3>" + modes_html(study, markup.grid(sliders), **look)
     return f"{note}{markup.grid(rows, 'row four')}{markup.chart(bar, 'colour bar')}\n{sliders}"
 
 

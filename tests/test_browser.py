@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 import s4a
+from s4a.picture import aligned
 
 playwright = pytest.importorskip("playwright.sync_api")
 pytest.importorskip("jupyterlab")
@@ -31,11 +32,16 @@ SWITCHES = (
 HARMLESS = ("t.on is not a function", "Unsatisfied version")  # both are JupyterLab's own
 VIEW = "canvas.s4a-view"
 DRAWN = f"[...document.querySelectorAll('{VIEW}')].some((c) => c.offsetParent && c.view.frames > 0)"
-NO_WEBGL = """
-const get = HTMLCanvasElement.prototype.getContext;
-HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
-  return kind === "webgl2" ? null : get.call(this, kind, ...rest);
-};
+SEEN = "[...document.querySelectorAll('canvas.s4a-view')].filter((c) => c.offsetParent).map((c) => c.view)"
+STILLS = "[...document.querySelectorAll('img.s4a-still')].filter((i) => i.offsetParent && i.naturalWidth > 100)"
+IDLE = "[...document.querySelectorAll('.jp-InputPrompt')].every((p) => !p.textContent.includes('*'))"
+
+
+PROGRESS = """
+import s4a
+from s4a.widgets import Progress
+
+Progress(s4a.synthetic.brains(3, 12000, seed=1), {store!r}, n_coarse=300, k=12, k_init=6, n_jobs=1)
 """
 
 
@@ -52,8 +58,13 @@ def folder(study, tmp_path_factory):
     notebook = json.loads(NOTEBOOK.read_text(encoding="utf-8"))
     cell = next(c for c in notebook["cells"] if "s4a.analyse" in "".join(c["source"]))
     store = Path(study["coarse/brain_01"].to_dataset().encoding["source"]).parent.parent
-    cell["source"] = f"import s4a\n\nstudy = s4a.open_study({str(store)!r})"
+    opened = f"import s4a\n\nstudy = s4a.open_study({str(store)!r})"
+    cell["source"] = opened
     (folder / NOTEBOOK.name).write_text(json.dumps(notebook), encoding="utf-8")
+    notebook["cells"] = [cell | {"source": f"{opened}\nstudy.s4a.explore()", "id": "small"}]
+    (folder / "small.ipynb").write_text(json.dumps(notebook), encoding="utf-8")
+    notebook["cells"] = [cell | {"source": PROGRESS.format(store=str(folder / "run")), "id": "progress"}]
+    (folder / "progress.ipynb").write_text(json.dumps(notebook), encoding="utf-8")
     (folder / "app").mkdir()
     news = {"@jupyterlab/apputils-extension:notification": {"fetchNews": "false", "checkForUpdates": False}}
     (folder / "app" / "overrides.json").write_text(json.dumps(news), encoding="utf-8")
@@ -96,11 +107,24 @@ def wait_for(address, log, seconds=60):
 
 
 @pytest.fixture(scope="module")
-def browser():
+def driver():
     with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=SWITCHES)
-        yield browser
-        browser.close()
+        yield driver
+
+
+@pytest.fixture(scope="module")
+def browser(driver):
+    browser = driver.chromium.launch(executable_path=CHROMIUM, args=SWITCHES)
+    yield browser
+    browser.close()
+
+
+@pytest.fixture(scope="module")
+def flat(driver):
+    """A browser that has no WebGL."""
+    browser = driver.chromium.launch(executable_path=CHROMIUM, args=[*SWITCHES, "--disable-3d-apis"])
+    yield browser
+    browser.close()
 
 
 @pytest.fixture(scope="module")
@@ -108,21 +132,34 @@ def messages():
     return []
 
 
+def watched(page, messages):
+    """A page whose errors are collected, those of its console as well."""
+    page.on("console", lambda m: m.type == "error" and messages.append(m.text))
+    page.on("pageerror", lambda error: messages.append(str(error)))
+    return page
+
+
+def serious(messages):
+    return [text for text in messages if not any(known in text for known in HARMLESS)]
+
+
+def run_notebook(page, lab, name):
+    """Open a notebook and run all of its cells."""
+    page.goto(f"{lab}/lab/tree/{name}?reset")
+    page.wait_for_selector(".jp-Notebook .jp-Cell", timeout=120_000)
+    page.wait_for_selector("text=Python 3 (ipykernel) | Idle", timeout=120_000)
+    page.get_by_role("menuitem", name="Run", exact=True).click()
+    page.get_by_role("menuitem", name="Run All Cells", exact=True).click()
+
+
 @pytest.fixture(scope="module")
 def page(browser, lab, messages):
     """The notebook, after all of its cells ran."""
-    page = browser.new_page(viewport={"width": 1280, "height": 1300})
-    page.on("console", lambda m: m.type == "error" and messages.append(m.text))
-    page.on("pageerror", lambda error: messages.append(str(error)))
-    page.goto(f"{lab}/lab/tree/{NOTEBOOK.name}?reset")
-    page.wait_for_selector(".jp-Notebook .jp-Cell", timeout=60_000)
-    page.wait_for_selector("text=Python 3 (ipykernel) | Idle", timeout=60_000)
-    page.get_by_role("menuitem", name="Run", exact=True).click()
-    page.get_by_role("menuitem", name="Run All Cells", exact=True).click()
-    page.wait_for_function(DRAWN, timeout=60_000)
-    page.wait_for_function(
-        "[...document.querySelectorAll('.jp-InputPrompt')].every((p) => !p.textContent.includes('*'))"
-    )
+    page = watched(browser.new_page(viewport={"width": 1280, "height": 1300}), messages)
+    page.set_default_timeout(60_000)
+    run_notebook(page, lab, NOTEBOOK.name)
+    page.wait_for_function(DRAWN, timeout=120_000)
+    page.wait_for_function(IDLE)
     return page
 
 
@@ -246,6 +283,74 @@ def test_a_landmark_is_placed_and_carried_over(page, study):
     assert visible(page, VIEW).nth(1).evaluate("(c) => c.view.points.length") == count + 1
 
 
+def cursor(canvas, *keys):
+    """Start the cursor on a view and press keys; the vertex on which it then stands."""
+    canvas.focus()
+    for key in ("c", *keys):
+        canvas.press(key)
+    return int(canvas.get_attribute("data-cursor"))
+
+
+def test_the_keyboard_places_a_landmark(page, study):
+    canvas = visible(page, VIEW).first
+    count = canvas.evaluate("(c) => c.view.points.length")
+    start, moved = cursor(canvas), cursor(canvas, *["ArrowRight"] * 4)
+    X = vertices(canvas)
+    right = canvas.evaluate("(c) => c.view.camera.turn.slice(0, 3)")
+    assert (X[moved] - X[start]) @ right > 0.05 * np.ptp(X, axis=0).max(), "the arrow keys move the cursor"
+    canvas.press("Enter")
+    visible(page, "td").filter(has_text=f"landmark {count + 1}").wait_for()
+    placed = np.array(canvas.evaluate("(c) => c.view.points.at(-1)"))
+    np.testing.assert_allclose(placed[:3], X[moved], rtol=1e-4, atol=1e-3)
+    canvas.press("Escape")
+    assert canvas.evaluate("(c) => c.view.cursor") == -1
+
+
+def test_a_landmark_is_a_lit_sphere_of_its_radius_in_the_datas_unit(page):
+    canvas = visible(page, VIEW).first
+    before, radius = pixels(canvas), canvas.evaluate("(c) => c.view.points[0][6]")
+    field = visible(page, ".widget-text input[type=number]").first
+    field.fill(str(2 * radius))
+    field.press("Enter")
+    page.wait_for_function(f"(r) => {SEEN}.some((view) => view.points[0]?.[6] === r)", arg=2 * radius)
+    assert pixels(canvas) != before
+
+
+def test_the_keyboard_carries_points_to_the_shape(page, study):
+    open_tab(page, "Correspondence")
+    canvas = visible(page, VIEW).first
+    at = cursor(canvas, "ArrowUp", "ArrowUp")
+    readout = visible(page, ".s4a-readout").filter(has_text=f"template vertex {at} ").first
+    readout.wait_for()
+    shape, image = re.search(r"↔ (\w+) vertex (\d+)", readout.inner_text()).groups()
+    assert study["registration"]["registered_match"].sel(shape=shape).values[at] == int(image)
+    canvas.press("Escape")
+
+
+def test_the_checkerboard_is_drawn(page):
+    canvas = visible(page, VIEW).nth(1)
+    before = pixels(canvas)
+    visible(page, "select").filter(has_text="checkerboard").select_option("checkerboard")
+    page.wait_for_function(f"{SEEN}.some((view) => view.surfaces[0]?.cell > 0)")
+    assert pixels(canvas) != before
+
+
+def test_whatever_can_be_clicked_has_a_name_and_is_reached_by_the_keyboard(page):
+    for title in ("Correspondence", "Network", "Modes"):
+        open_tab(page, title)
+        for canvas in visible(page, VIEW).all():
+            assert canvas.get_attribute("tabindex") == "0"
+            assert "arrow keys turn" in canvas.get_attribute("aria-label")
+        unnamed = page.evaluate(
+            "[...document.querySelectorAll('.s4a input, .s4a select, .s4a button, .s4a [role=button]')]"
+            ".filter((e) => e.offsetParent && !(e.ariaLabel || e.textContent.trim() || e.labels?.length)).length"
+        )
+        assert unnamed == 0
+    visible(page, ".s4a-slider input").first.focus()
+    page.keyboard.press("Tab")
+    assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") == "solid", "focus is seen"
+
+
 @pytest.mark.parametrize("title", ["Functional map", "Spectrum"])
 def test_the_other_tabs_draw(page, title):
     open_tab(page, title)
@@ -263,8 +368,46 @@ def test_nothing_is_cut_off_at_800_pixels(page):
             assert part.bounding_box()["x"] + part.bounding_box()["width"] <= 800
 
 
+def test_without_webgl_the_notebook_shows_still_pictures(flat, lab, study):
+    messages = []
+    page = watched(flat.new_page(viewport={"width": 1280, "height": 1300}), messages)
+    page.set_default_timeout(60_000)
+    run_notebook(page, lab, "small.ipynb")
+    page.wait_for_function(f"{STILLS}.length > 0", timeout=120_000)
+    assert visible(page, VIEW).count() == 0
+    first = visible(page, "img.s4a-still").first.get_attribute("src")
+    move(visible(page, ".s4a-slider input").first, 3)
+    page.wait_for_function(f"(old) => {STILLS}.some((i) => i.src !== old)", arg=first)
+    page.locator(".jupyter-widgets .lm-TabBar-tabLabel", has_text="Correspondence").first.click()
+    page.wait_for_function(f"{STILLS}.length === 2")
+    assert serious(messages) == []
+    page.close()
+
+
+def test_an_analysis_is_opened_while_it_runs_and_cancelled_and_resumed(browser, lab, folder, messages):
+    page = watched(browser.new_page(viewport={"width": 1280, "height": 1300}), messages)
+    page.set_default_timeout(60_000)
+    run_notebook(page, lab, "progress.ipynb")
+    page.wait_for_function("document.querySelectorAll('.progress-bar-success').length >= 2", timeout=120_000)
+    page.get_by_role("button", name="Open", exact=True).click()
+    page.locator(".jupyter-widgets .lm-TabBar-tabLabel", has_text="Spectrum").first.click()
+    page.wait_for_function(DRAWN)
+    page.get_by_role("button", name="Cancel", exact=True).click()
+    page.wait_for_selector("text=cancelled; Resume")
+    kept = {path: path.stat().st_mtime_ns for path in (folder / "run" / "coarse").glob("*.nc")}
+    assert len(kept) == 3
+    assert not (folder / "run" / "pca.nc").exists()
+    page.get_by_role("button", name="Resume", exact=True).click()
+    page.wait_for_selector("text=/finished, \\d/", timeout=180_000)
+    assert (folder / "run" / "pca.nc").exists()
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept, "what was done is not done again"
+    page.locator(".jupyter-widgets .lm-TabBar-tabLabel", has_text="Modes").first.click()
+    page.wait_for_selector(".s4a-slider >> visible=true")
+    page.close()
+
+
 def test_the_console_has_no_errors(page, messages):
-    assert [text for text in messages if not any(known in text for known in HARMLESS)] == []
+    assert serious(messages) == []
 
 
 # ---- without a kernel
@@ -277,35 +420,157 @@ def offline(browser):
     context.close()
 
 
-def opened(context, panel, path):
-    panel.save_html(path)
-    panel.close()
+def opened(context, path):
     page, errors = context.new_page(), []
-    page.on("pageerror", lambda error: errors.append(str(error)))
-    page.goto(path.as_uri())
+    page.set_default_timeout(30_000)
+    watched(page, errors).goto(path.as_uri())
     return page, errors
 
 
+def saved(panel, path):
+    """The page of a panel, whose widgets are closed."""
+    panel.save_html(path)
+    panel.close()
+    return path
+
+
+def chosen(page, control, label):
+    """Choose a value of a page's control."""
+    page.locator(f"#c-{control}").select_option(label)
+
+
 def test_the_page_deforms_without_kernel_and_network(offline, study, tmp_path):
-    page, errors = opened(offline, widgets.Modes(study), tmp_path / "modes.html")
+    page, errors = opened(offline, saved(widgets.Modes(study), tmp_path / "modes.html"))
     page.wait_for_function(DRAWN)
     check_sliders(page, study)
     assert errors == []
+    page.close()
 
 
-def test_other_panels_are_pages_too(offline, study, tmp_path):
-    panel = widgets.Network(study)
-    panel.edge = 2
-    page, errors = opened(offline, panel, tmp_path / "network.html")
+def test_the_page_of_a_study_has_live_sliders(offline, study, tmp_path):
+    page, errors = opened(offline, s4a.write_page(study, tmp_path / "study.html"))
     page.wait_for_function(DRAWN)
-    assert visible(page, VIEW).count() == 2
+    check_sliders(page, study)
+    assert not page.locator("#modes-instead").is_visible()
     assert errors == []
+    page.close()
 
 
-def test_without_webgl_there_is_a_still_picture(offline, study, tmp_path):
-    offline.add_init_script(NO_WEBGL)
-    page, errors = opened(offline, widgets.Modes(study), tmp_path / "still.html")
-    page.wait_for_function("document.querySelector('img.s4a-still').naturalWidth > 100")
-    assert visible(page, "img.s4a-still").count() == 1
-    assert visible(page, VIEW).count() == 0
+def test_the_page_of_the_network_shows_the_map_that_is_clicked(offline, study, tmp_path):
+    page, errors = opened(offline, saved(widgets.Network(study), tmp_path / "network.html"))
+    page.wait_for_function(DRAWN)
+    edge = visible(page, ".s4a-edge").nth(6)
+    source, target = re.match(r"(\w+) → (\w+)", edge.get_attribute("aria-label")).groups()
+    edge.dispatch_event("click")
+    visible(page, ".s4a-title").filter(has_text=f"{source} → {target}").wait_for()
+    visible(page, ".s4a-title").filter(has_text=f"{target}, the target").wait_for()
+    assert page.locator("#c-choice option:checked").inner_text() == f"{source} → {target}"
+    net = study["network"].dataset
+    C = net["fmap"].values[(net["source"].values == source) & (net["target"].values == target)][0]
+    page.locator(".s4a-matrix canvas").focus()
+    page.keyboard.press("ArrowRight")
+    text = visible(page, ".s4a-readout").filter(has_text="C[0, 1]").inner_text()
+    assert float(re.search(r"= (\S+)", text)[1]) == pytest.approx(C[0, 1], rel=6e-3)
+    move(page.locator("#c-budget"), 0)
+    page.wait_for_selector("text=/4 pairs.*: connected/")
+    assert visible(page, ".s4a-edge").count() == 8
+    chosen(page, "stage", "before Consistent ZoomOut")
+    visible(page, ".s4a-title").filter(has_text="10 × 10").wait_for()
+    visible(page, "[data-node]").nth(1).dispatch_event("click")
+    visible(page, ".s4a-title").filter(has_text=re.compile("^brain_02$")).wait_for()
+    assert visible(page, VIEW).count() == 1
     assert errors == []
+    page.close()
+
+
+def test_the_page_of_a_map_replays_zoomout_and_shows_its_modes(offline, study, tmp_path):
+    page, errors = opened(offline, saved(widgets.FunctionalMap(study), tmp_path / "map.html"))
+    page.wait_for_function(DRAWN)
+    before = pixels(visible(page, VIEW).first)
+    move(page.locator("#c-k"), 1)
+    visible(page, ".s4a-title").filter(has_text="15 × 15").wait_for()
+    page.locator(".s4a-matrix canvas").focus()
+    for key in ("ArrowDown", "ArrowRight", "ArrowRight", "Enter"):
+        page.keyboard.press(key)
+    visible(page, ".s4a-title").filter(has_text="source φ3").wait_for()
+    visible(page, ".s4a-title").filter(has_text="target ψ2").wait_for()
+    assert pixels(visible(page, VIEW).first) != before
+    chosen(page, "choice", "brain_02 → brain_03")
+    visible(page, ".s4a-title").filter(has_text="φ3 on brain_02").wait_for()
+    assert errors == []
+    page.close()
+
+
+def test_the_page_of_the_median_ranks_by_the_operator_that_is_chosen(offline, study, tmp_path):
+    page, errors = opened(offline, saved(widgets.Median(study), tmp_path / "median.html"))
+    page.wait_for_function(DRAWN)
+    chosen(page, "operator", "conformal")
+    D = study["latent"]["conformal_difference"].values
+    distance = np.sort(s4a.median.distance_to_identity(D, study["latent"]["latent_eigenvalue"].values))
+    bar = visible(page, "rect.s4a-mark").nth(3)
+    name, value = bar.get_attribute("aria-label").split(": ")
+    assert float(value) == pytest.approx(distance[3], rel=1e-3)
+    bar.click()
+    visible(page, ".s4a-title").filter(has_text=f"{name}, in ").wait_for()
+    visible(page, ".s4a-readout").filter(has_text="rank 4 of 5").wait_for()
+    assert errors == []
+    page.close()
+
+
+def test_the_page_of_the_spectrum_moves_through_modes_and_reconstructions(offline, study, tmp_path):
+    page, errors = opened(offline, saved(widgets.Spectrum(study), tmp_path / "spectrum.html"))
+    page.wait_for_function(DRAWN)
+    move(page.locator("#c-mode"), 7)
+    visible(page, ".s4a-title").filter(has_text="φ7 of brain_01").wait_for()
+    canvas = visible(page, VIEW).nth(1)
+    before = vertices(canvas)
+    move(page.locator("#c-k"), 4)
+    visible(page, ".s4a-title").filter(has_text="from 5 of 24").wait_for()
+    mesh = study["coarse"]["brain_01"].to_dataset()
+    X = aligned(study, "brain_01", mesh["position"].values)
+    np.testing.assert_allclose(vertices(canvas), s4a.spectral.reconstruct(mesh, X, k=5), atol=1e-3)
+    assert (vertices(canvas) != before).any()
+    assert errors == []
+    page.close()
+
+
+def test_the_page_of_correspondences_follows_the_pointer_and_the_keyboard(offline, study, tmp_path):
+    panel = widgets.Correspondence(study)
+    page, errors = opened(offline, saved(panel, tmp_path / "correspondence.html"))
+    page.wait_for_function(DRAWN)
+    chosen(page, "choice", "brain_04")
+    chosen(page, "colors", "checkerboard")
+    at = cursor(visible(page, VIEW).first, "ArrowRight")
+    readout = visible(page, ".s4a-readout").filter(has_text=f"template vertex {at} ↔ brain_04").first
+    image = int(re.search(r"brain_04 vertex (\d+)", readout.inner_text())[1])
+    assert study["registration"]["registered_match"].sel(shape="brain_04").values[at] == image
+    shape = visible(page, VIEW).nth(1)
+    np.testing.assert_allclose(shape.evaluate("(c) => c.view.points[0].slice(0, 3)"), vertices(shape)[image])
+    assert shape.evaluate("(c) => c.view.surfaces[0].cell") > 0
+    assert errors == []
+    page.close()
+
+
+def test_the_page_of_a_transfer_says_what_needs_python(offline, study, tmp_path):
+    page, errors = opened(offline, saved(widgets.Transfer(study), tmp_path / "transfer.html"))
+    page.wait_for_function(DRAWN)
+    assert "placing landmarks" in page.locator(".note").inner_text()
+    chosen(page, "target", "brain_05")
+    visible(page, ".s4a-title").filter(has_text="brain_05, the target").wait_for()
+    page.wait_for_selector("text=Landmarks on brain_05")
+    assert errors == []
+    page.close()
+
+
+def test_without_webgl_pages_have_still_pictures(flat, study, tmp_path):
+    for path in (saved(widgets.Modes(study), tmp_path / "modes.html"), s4a.write_page(study, tmp_path / "study.html")):
+        page, errors = opened(flat, path)
+        page.wait_for_function("[...document.querySelectorAll('img')].some((i) => i.naturalWidth > 100)")
+        assert visible(page, VIEW).count() == 0
+        assert errors == []
+        if path.name == "study.html":
+            image, slider = page.locator("#modes-instead img").first, page.locator("#modes-instead input").first
+            before = image.get_attribute("src")
+            move(slider, 0)
+            assert image.get_attribute("src") != before
+        page.close()

@@ -1,5 +1,7 @@
 """Pictures and the page of a study, on a small made-up study of ellipsoids."""
 
+import base64
+import json
 import re
 
 import numpy as np
@@ -187,7 +189,7 @@ def test_a_broken_surface_is_refused_with_advice():
 
 def test_the_page_is_one_file_without_any_address_outside(html):
     assert not re.findall(r"""(?:src|href)\s*=\s*["'](?!data:)""", html)
-    assert "http" not in re.sub(r"data:[^\"]*", "", html)
+    assert "http" not in re.sub(r"data:[^\"]*|http://www.w3.org/2000/svg", "", html)
     assert len(html) < 8e6
     assert html.count("<section>") == len(view.SECTIONS)
     assert "Not there" not in html
@@ -211,6 +213,14 @@ def test_the_page_says_what_the_study_says(html):
         "70.0% of the variance",
     ):
         assert text in html
+
+
+def test_the_page_holds_the_modes_as_they_are(study, html):
+    state = json.loads(re.search(r'id="modes-state">(.*?)</script>', html, re.DOTALL)[1])
+    deformation = np.frombuffer(base64.b64decode(state["deformation"]["base64"]), "<f4")
+    assert (deformation == study["pca"]["deformation"].values.ravel().astype(np.float32)).all()
+    assert state["ratio"] == [0.7, 0.2, 0.1]
+    assert 'id="modes-instead"' in html.replace("'", '"')
 
 
 def test_the_page_is_the_same_every_time(study, html):

@@ -18,14 +18,17 @@ from ipywidgets.widgets import widget as registry  # the open widgets are counte
 
 import s4a
 from s4a.draw import position_colors
+from s4a.live import color_bytes
 from s4a.mesh import vertex_normals
 from s4a.picture import aligned, mesh_of
 from s4a.widgets import Correspondence, Explore, FunctionalMap, Median, Modes, Network, Progress, Spectrum, Transfer
 from s4a.widgets import chart as chart_module
+from s4a.widgets import explore as explore_module
 from s4a.widgets import modes_view as modes_module
+from s4a.widgets import page as page_module
 from s4a.widgets import scene as scene_module
 from s4a.widgets.modes_view import StillModes, painted
-from s4a.widgets.scene import StillScene, color_bytes, scene
+from s4a.widgets.scene import StillScene, scene
 
 
 @pytest.fixture(scope="module")
@@ -195,6 +198,7 @@ def test_without_anywidget_python_deforms(study, bare):
 def test_a_clicked_edge_shows_its_map_and_both_meshes(study, panel):
     network = panel(Network)
     network.graph.picked = {"edge": 3, "count": 1}
+    assert network.edge == 3
     row = study["network"].dataset.isel(pair=network.edge)
     assert network.matrix.spec["title"].startswith(f"{row['source'].item()} → {row['target'].item()}")
     shown = np.frombuffer(network.matrix.values, "<f4").reshape(row["fmap"].shape)
@@ -209,7 +213,7 @@ def test_a_clicked_edge_shows_its_map_and_both_meshes(study, panel):
 def test_a_clicked_node_shows_its_mesh_alone(study, panel):
     network = panel(Network)
     network.edge = 0
-    network.graph.picked = {"node": 2, "count": 1}
+    network.graph.picked = {"node": network.names[2], "count": 1}
     assert network.node == network.names[2]
     assert network.edge == -1
     assert network.scenes[0].title == network.names[2]
@@ -222,8 +226,7 @@ def test_the_edge_budget_tells_how_the_network_hangs_together(panel):
     network.budget.value = 4
     assert re.search(r"4 pairs.*: connected, 0 triangles, 5 shapes in none", network.facts.value)
     assert len(network.graph.spec["source"]) == 8
-    network.graph.picked = {"edge": 7, "count": 1}
-    assert network.edge == network.shown[7]
+    assert network.graph.spec["edges"] == network.shown
 
 
 def test_edges_are_coloured_before_and_after_on_one_scale(study, panel):
@@ -253,8 +256,8 @@ def test_a_clicked_cell_shows_the_two_eigenfunctions(study, panel):
     fmap = panel(FunctionalMap)
     fmap.matrix.picked = {"row": 4, "column": 6, "count": 1}
     assert fmap.cell == (4, 6)
-    value = study["network"]["fmap"].values[0, 4, 6]
-    assert fmap.scenes[1].caption == f"C[4, 6] = {value:.3f}"
+    assert (fmap.matrix.spec["row"], fmap.matrix.spec["column"]) == (4, 6)
+    assert (fmap.row.value, fmap.column.value) == (4, 6)
     eigenvalue = study["coarse"][fmap.source[0]]["eigenvalue"].values[6]
     assert fmap.scenes[0].title.endswith(f"eigenvalue {eigenvalue:.2f}")
 
@@ -313,6 +316,48 @@ def test_confidence_is_shown_with_its_bar(study, panel):
     both.colors.value = "confidence"
     assert both.scenes[0].bar["label"].startswith("confidence")
     assert len(both.scenes[1].color) == 3 * study["original"][both.shape].sizes["vertex"]
+
+
+def test_the_checkerboard_is_evaluated_from_the_templates_coordinates(study, panel):
+    both = panel(Correspondence)
+    both.colors.value = "checker"
+    template, shape = (floats(view.coordinate) for view in both.scenes)
+    assert (template == study["registration"]["position"].values.astype(np.float32)).all()
+    node = study["registration"][both.shape]
+    corners = study["registration"]["corner_vertex"].values[node["template_triangle"].values]
+    carried = np.einsum("vc,vcx->vx", node["template_barycentric"].values, template[corners])
+    np.testing.assert_allclose(shape, carried, atol=1e-3)
+    assert both.scenes[0].cell == both.scenes[1].cell > 0
+    both.map.value = "low"
+    template, shape = (floats(view.coordinate) for view in both.scenes)
+    assert (template == shape[both.match()]).all()
+    both.colors.value = "place"
+    assert both.scenes[0].coordinate == b""
+    assert both.scenes[0].cell == 0
+
+
+def test_the_browser_knows_the_image_of_every_vertex(study, panel):
+    both = panel(Correspondence)
+    there, back = (np.frombuffer(view.link, "<i4") for view in both.scenes)
+    assert (there == study["registration"]["registered_match"].sel(shape=both.shape).values).all()
+    both.scenes[1].picked = {"vertex": 40, "count": 2}
+    assert both.vertex == back[40]
+    sure = study["registration"]["confidence"].sel(shape=both.shape).values
+    np.testing.assert_allclose(np.frombuffer(both.scenes[0].link_values, np.uint8) / 100, sure, atol=0.006)
+    both.map.value = "low"
+    back = np.frombuffer(both.scenes[1].link, "<i4")
+    assert set(back[back >= 0]) <= set(range(len(both.match())))
+    assert (both.match()[back[back >= 0]] == np.flatnonzero(back >= 0)).all()
+
+
+def test_landmarks_are_spheres_of_a_radius_in_the_datas_unit(panel):
+    both = panel(Transfer)
+    both.radius.value = 2.5
+    assert {point[6] for view in both.scenes for point in view.points} == {2.5}
+    X, T = tetrahedron()
+    moved, _, colors = s4a.draw.with_balls(X, T, None, [[9, 9, 9, 1, 0, 0, 2.5]])
+    np.testing.assert_allclose(np.linalg.norm(moved[4:] - 9, axis=1), 2.5)
+    assert (colors[4:] == [1, 0, 0]).all()
 
 
 def test_labels_and_landmarks_are_carried_as_the_step_module_does_it(study, panel, tmp_path):
@@ -382,11 +427,15 @@ def test_an_analysis_shows_its_progress_and_its_panels(tmp_path):
     shapes = s4a.synthetic.brains(3, 500, seed=1)
     panel = Progress(shapes, tmp_path / "study", n_coarse=200, k=12, k_init=6, n_jobs=1)
     assert ended(panel) == "finished"
-    assert [bar.value for bar in panel.bars.values()] == [3, 3, 1, 1, 3, 1]
+    assert [(bar.value, bar.max) for bar in panel.bars.values()] == [(n, n) for n in (3, 3, 1, 1, 3, 1)]
     assert {bar.bar_style for bar in panel.bars.values()} == {"success"}
     panel.view.click()
     assert panel.explored["Network"].names == ["brain_01", "brain_02", "brain_03"]
+    network = panel.explored["Network"]
+    panel.explored.extend(panel.explored.study)
+    assert panel.explored["Network"] is network
     panel.view.click()
+    assert panel.explored["Network"] is not network
     assert panel.message.value == ""
     panel.close()
     assert len(registry._instances) == before
@@ -408,7 +457,33 @@ def test_a_cancelled_analysis_ends(tmp_path):
     panel.close()
 
 
+def test_the_number_of_batches_is_known_before_they_are_done(tmp_path):
+    panel = Progress({"one": tetrahedron()}, tmp_path / "study", n_jobs=1, n_pairs=20)
+    assert [panel.totals(n)["first maps, in batches"] for n in (3, 5, 10)] == [1, 3, 5]
+    panel.close()
+
+
 # ---- all of it
+
+
+def test_a_cell_that_runs_again_closes_the_tabs_of_its_run_before(study, monkeypatch):
+    before = len(registry._instances)
+    runs = iter([("cell", "run 1"), ("cell", "run 1"), ("cell", "run 2"), ("other", "run 3")])
+    monkeypatch.setattr(explore_module, "running_cell", lambda: next(runs))
+    one = s4a.explore(study)
+    count = len(registry._instances) - before
+    tabs = [s4a.explore(study) for _ in range(3)]
+    assert len(registry._instances) == before + 2 * count
+    assert one.comm is None
+    assert [t.comm is None for t in tabs] == [True, False, False]
+    for t in tabs[1:]:
+        t.close()
+    explore_module.OPEN.clear()
+    assert len(registry._instances) == before
+
+
+def test_no_cell_runs_outside_of_a_notebook():
+    assert explore_module.running_cell() is None
 
 
 def test_tabs_are_built_when_opened_and_leave_nothing(study):
@@ -453,11 +528,43 @@ def test_a_page_needs_nothing_from_elsewhere(panel, tmp_path):
             json.loads(state)
 
 
+def recording(text):
+    return json.loads(re.search(r'id="recording">(.*?)</script>', text, re.DOTALL)[1])
+
+
+def test_a_page_keeps_what_python_shows_for_every_value_of_its_controls(study, panel, tmp_path):
+    fmap = panel(FunctionalMap, pair=3)
+    before = fmap.matrix.values, fmap.scenes[0].color
+    data = recording(fmap.save_html(tmp_path / "page.html").read_text(encoding="utf-8"))
+    assert (fmap.matrix.values, fmap.scenes[0].color) == before
+    labels = [control["id"] for control in data["controls"]]
+    group = data["groups"][0]
+    order = [labels[i] for i in group["controls"]]
+    slot = next(i for i, (_, name, key) in enumerate(group["slots"]) if name == "values")
+    choice = {"c-k": fmap.k.options.index(15), "c-kind": 1, "c-block": 0, "c-choice": 7}
+    kept = data["values"][group["rows"][",".join(str(choice[name]) for name in order)][slot]]
+    fmap.pair, fmap.kind.value, fmap.k.value = 7, "zoomout", 15
+    assert base64.b64decode(json.loads(kept)["base64"]) == fmap.matrix.values
+
+
+def test_a_full_page_says_what_it_does_not_keep(panel, tmp_path, monkeypatch):
+    monkeypatch.setattr(page_module, "LIMIT", 60_000)
+    spectrum = panel(Spectrum)
+    text = spectrum.save_html(tmp_path / "page.html").read_text(encoding="utf-8")
+    data = recording(text)
+    shapes = next(control for control in data["controls"] if control["id"] == "c-choice")
+    assert shapes["open"] == [0]
+    assert "Needs Python" in text
+    assert "changing shape" in text
+
+
 def test_a_page_holds_stills_for_browsers_without_webgl(panel, tmp_path):
     for kind in (Modes, Correspondence):
         text = panel(kind).save_html(tmp_path / "page.html").read_text(encoding="utf-8")
         states = re.findall(r'<script type="application/json"[^>]*>(.*?)</script>', text, re.DOTALL)
-        assert all(base64.b64decode(json.loads(state)["still"]["base64"])[1:4] == b"PNG" for state in states)
+        stills = [json.loads(state)["still"]["base64"] for state in states if '"still"' in state]
+        assert stills
+        assert all(base64.b64decode(still)[1:4] == b"PNG" for still in stills)
 
 
 def test_the_error_names_what_to_install(tmp_path):

@@ -8,7 +8,7 @@ except ImportError as error:
     ) from error
 
 from s4a.widgets.correspondence import Correspondence
-from s4a.widgets.explore import Explore, explore
+from s4a.widgets.explore import Explore
 from s4a.widgets.functional import FunctionalMap
 from s4a.widgets.median import Median
 from s4a.widgets.modes import Modes
@@ -27,5 +27,4 @@ __all__ = [
     "Progress",
     "Spectrum",
     "Transfer",
-    "explore",
 ]

@@ -6,8 +6,8 @@ import traitlets
 
 from s4a import charts
 from s4a.draw import SIGNED, data_uri
-from s4a.widgets.browser import CHART, STYLE, anywidget
-from s4a.widgets.scene import as_bytes, table
+from s4a.live import STYLE, as_bytes, table
+from s4a.widgets.browser import CHART, anywidget
 
 
 def plain(value):

@@ -1,4 +1,4 @@
-"""Correspondence (eq. 3, 6, 7): the template and a shape, with the colours and points that the map carries."""
+"""Correspondence (eq. 3, 6, 7): the template and a shape, with the colours, texture and points that the map carries."""
 
 import ipywidgets
 import numpy as np
@@ -6,22 +6,26 @@ import traitlets
 
 from s4a.draw import position_colors, ramp_colors
 from s4a.fmap import nearest_rows
+from s4a.live import color_bar
 from s4a.picture import carried_colors, has, mesh_of, names_of
 from s4a.register import Scan, intrinsic_match
-from s4a.widgets.meshes import camera_group, surface
+from s4a.widgets.meshes import camera_group, nice, surface, unit_of
 from s4a.widgets.panel import Panel, beside, row
-from s4a.widgets.scene import color_bar, scene
+from s4a.widgets.scene import extent, scene
 
 MAPS = [
     ("registration, full resolution", "registered"),
     ("latent basis, low resolution (eq. 3)", "low"),
     ("latent basis, full resolution (eq. 7)", "dense"),
 ]
-SHOWN = [("coordinates of the template", "place"), ("confidence", "confidence")]
+SHOWN = [("coordinates", "place"), ("checkerboard", "checker"), ("confidence", "confidence")]
+CELLS = 14  # of the checkerboard along the surface's extent
 
 
 class Correspondence(Panel):
     """Two linked surfaces; a point under the pointer, or clicked, is shown at its image on the other.
+
+    The keyboard does the same: C starts a cursor that the arrow keys move over the surface.
 
     Attributes
     ----------
@@ -35,6 +39,7 @@ class Correspondence(Panel):
     title = "Correspondence"
     shape = traitlets.Unicode("")
     vertex, image = traitlets.Int(-1), traitlets.Int(-1)
+    live = (("colors", "choice"), ("hover",))
 
     def build(self, view="corner", up="z"):
         """Choices and the two surfaces."""
@@ -49,7 +54,7 @@ class Correspondence(Panel):
         self.colors = ipywidgets.Dropdown(options=SHOWN, description="colours", layout={"width": "320px"})
         self.hover = ipywidgets.Checkbox(True, description="follow the pointer", indent=False)
         group = camera_group()
-        self.scenes = [scene(group=group, view=view, up=up, height=400) for _ in range(2)]
+        self.scenes = [scene(group=group, view=view, up=up, height=400, clickable=True) for _ in range(2)]
         self.matches = {}
         self.on_change(self.choice, lambda value: self.set_trait("shape", value))
         self.on_change(self.map, lambda _: self.draw())
@@ -94,27 +99,59 @@ class Correspondence(Panel):
         self.pair = surface(self.study, self.template, stage), surface(self.study, self.shape, stage)
         if self.map.value == "registered":
             self.pair = mesh_of(self.study["registration"]), self.pair[1]
-        colors, bar, note = self.painted()
+        colors, coordinates, bar, note = self.painted()
+        cell = nice(extent(self.pair[0][0]) / CELLS)
+        if coordinates[0] is not None:
+            note += f"; checkerboard of cubes of {cell:g} ({unit_of(self.study, self.template)})"
         names = f"{self.template}, the template", self.shape
-        for view, (X, T), color, name in zip(self.scenes, self.pair, colors, names, strict=True):
-            view.show(X, T, title=f"{name}, {len(X):,} vertices")
-            view.paint(color, bar)
+        for i, (view, name) in enumerate(zip(self.scenes, names, strict=True)):
+            view.show(*self.pair[i], title=f"{name}, {len(self.pair[i][0]):,} vertices")
+            view.paint(colors[i], bar, coordinates[i], cell)
             view.caption = note
+        self.connect()
 
     def painted(self):
-        """Colours of both surfaces, their colour bar and what they are."""
+        """Of both surfaces the colours and the coordinates of a checkerboard, their colour bar and what they are."""
         (X, _), (Y, _) = self.pair
+        kind = self.colors.value
         if self.map.value != "registered":
+            match, note = self.match(), "the shape's coordinates, pulled to the template"
             colors = position_colors(Y)
-            return (colors[self.match()], colors), None, "the shape's coordinates, pulled to the template"
-        if self.colors.value == "confidence":
+            if kind == "confidence":
+                note = f"the confidence belongs to the registration; here {note}"
+            return (colors[match], colors), (Y[match], Y) if kind == "checker" else (None, None), None, note
+        bar, coordinates, note = None, (None, None), "the template's coordinates, carried to the shape"
+        colors = position_colors(X)
+        if kind == "confidence":
             value = self.study["registration"]["confidence"].sel(shape=self.shape).values
-            colors = ramp_colors(value, 0, 1)
+            colors, note = ramp_colors(value, 0, 1), "the registration's confidence, carried to the shape"
             bar = color_bar("viridis", 0, 1, f"confidence, {value.mean():.2f} on average")
-        else:
-            colors, bar = position_colors(X), None
+        if kind == "checker":
+            carried = carried_colors(self.study, self.shape, X)
+            coordinates = X, None if carried is None else np.nan_to_num(carried[2])
         carried = carried_colors(self.study, self.shape, colors)
-        return (colors, None if carried is None else carried[2]), bar, "the template's colours, carried to the shape"
+        return (colors, None if carried is None else carried[2]), coordinates, bar, note
+
+    def connect(self):
+        """Give the browser the images of all vertices, so that it marks them by itself."""
+        match, sure, back = self.match(), None, self.way_back()
+        if self.map.value == "registered" and "confidence" in self.study["registration"].data_vars:
+            sure = self.study["registration"]["confidence"].sel(shape=self.shape).values
+        there = None if sure is None else sure[back] * (back >= 0)
+        text = f"template vertex {{}} ↔ {self.shape} vertex {{}}"
+        self.scenes[0].connect(match, text.format("{here}", "{there}"), sure)
+        self.scenes[1].connect(back, text.format("{there}", "{here}"), there)
+
+    def way_back(self):
+        """On each vertex of the shape the vertex of the template that lies there, -1 for none."""
+        node = self.study["registration"].children.get(self.shape)
+        if self.map.value == "registered" and node is not None and "template_triangle" in node.data_vars:
+            corners = self.pair[0][1][node["template_triangle"].values]
+            return np.take_along_axis(corners, node["template_barycentric"].values.argmax(1)[:, None], axis=1)[:, 0]
+        match = self.match()
+        back = np.full(len(self.pair[1][0]), -1)
+        back[match[::-1]] = np.arange(len(match))[::-1]
+        return back
 
     def to_shape(self, place):
         """A place of the template: its image on the shape."""
@@ -129,19 +166,10 @@ class Correspondence(Panel):
         vertex = place.get("vertex", -1)
         if vertex < 0:
             return
-        node = self.study["registration"].children.get(self.shape)
-        X, T = self.pair[0]
-        if self.map.value == "registered" and node is not None and "template_triangle" in node.data_vars:
-            corners = T[node["template_triangle"].values[vertex]]
-            weights = node["template_barycentric"].values[vertex]
-            self.vertex, point = int(corners[weights.argmax()]), weights @ X[corners]
-        else:
-            from_here = np.flatnonzero(self.match() == vertex)
-            if not len(from_here):
-                return self.say(f"no vertex of the template is matched to vertex {vertex} of {self.shape}")
-            self.vertex, point = int(from_here[0]), X[from_here[0]]
-        self.image = vertex
-        self.point(point, self.pair[1][0][vertex])
+        self.vertex, self.image = int(self.way_back()[vertex]), vertex
+        if self.vertex < 0:
+            return self.say(f"no vertex of the template is matched to vertex {vertex} of {self.shape}")
+        self.point(self.pair[0][0][self.vertex], self.pair[1][0][vertex])
 
     def point(self, on_template, on_shape):
         """Mark two corresponding points and say which they are."""

@@ -1,6 +1,7 @@
 """All panels of a study as tabs; each is built when its tab is first opened."""
 
 import ipywidgets
+from IPython import get_ipython
 
 from s4a.widgets.correspondence import Correspondence
 from s4a.widgets.functional import FunctionalMap
@@ -60,11 +61,15 @@ class Explore(ipywidgets.VBox):
             box.children = [ipywidgets.HTML(f'<p role="status">{error}</p>')]
 
     def refresh(self, study):
-        """Show a newer state of the study, for example while it is being computed."""
-        self.study = study
+        """Show a newer state of the study in all panels."""
         for panel in self.panels.values():
             panel.close()
         self.panels.clear()
+        self.extend(study)
+
+    def extend(self, study):
+        """Show what a newer state of the study has more; panels that are open stay as they are."""
+        self.study = study
         self.fill()
 
     def __getitem__(self, title):
@@ -77,18 +82,27 @@ class Explore(ipywidgets.VBox):
         close_all(self)
 
 
-def explore(study, *, view="corner", up="z"):
-    """Tabs over a finished or running study: modes, network, maps, median, correspondence, transfer, spectrum.
+OPEN = {}  # cell of a notebook -> the run of it, and the tabs that this run opened
 
-    Parameters
-    ----------
-    study : xarray.DataTree
-        As :func:`s4a.analyse` or :func:`s4a.open_study` give it.
-    view, up
-        From where surfaces are seen first, and which axis points up; see :func:`s4a.draw.rotation`.
 
-    Returns
-    -------
-    Explore
-    """
-    return Explore(study, view=view, up=up)
+def running_cell():
+    """The cell of a notebook that runs, and which run of it this is; None elsewhere."""
+    kernel = getattr(get_ipython(), "kernel", None)
+    message = {} if kernel is None else kernel.get_parent()
+    cell = message.get("metadata", {}).get("cellId")
+    return cell and (cell, message["header"]["msg_id"])
+
+
+def explore(study, **options):
+    """Tabs in place of those that an earlier run of the same cell opened, which are closed: nothing piles up."""
+    found = running_cell()
+    if found is None:
+        return Explore(study, **options)
+    cell, run = found
+    before, opened = OPEN.get(cell, (run, []))
+    if before != run:
+        for tabs in opened:
+            tabs.close()
+        opened = []
+    OPEN[cell] = run, [*opened, Explore(study, **options)]
+    return OPEN[cell][1][-1]

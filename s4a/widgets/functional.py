@@ -6,11 +6,12 @@ import traitlets
 
 from s4a.draw import SIGNED, signed_colors
 from s4a.fmap import off_diagonal_mass, orthogonality_error, swapped_blocks, zoomout
+from s4a.live import color_bar
 from s4a.spectral import unit_area
 from s4a.widgets.chart import chart
 from s4a.widgets.meshes import camera_group, surface
 from s4a.widgets.panel import Panel, beside, paragraph, row
-from s4a.widgets.scene import color_bar, scene
+from s4a.widgets.scene import scene
 
 STEP = 5
 KINDS = [("consistent ZoomOut, as in the study", "study"), ("ZoomOut of this pair alone", "zoomout")]
@@ -31,6 +32,9 @@ class FunctionalMap(Panel):
     title = "Functional map"
     pair = traitlets.Int(0)
     cell = traitlets.Tuple((1, 1))
+    live = (("k", "kind", "block", "choice"), ("row", "choice"), ("column", "choice"))
+    every = ("row", "column")
+    clicks = (("matrix", "row", "row"), ("matrix", "column", "column"))
 
     def build(self, pair=0, view="corner", up="z"):
         """Choices, matrix and the two surfaces."""
@@ -45,6 +49,11 @@ class FunctionalMap(Panel):
             options=steps, value=sizes[1], description="modes k", continuous_update=False, layout={"width": "340px"}
         )
         self.block = ipywidgets.Checkbox(description="first ten modes only", indent=False)
+        wide = {"width": "300px"}
+        self.row, self.column = (
+            ipywidgets.IntSlider(1, min=0, max=sizes[1] - 1, description=text, continuous_update=False, layout=wide)
+            for text in ("target ψ", "source φ")
+        )
         self.matrix, self.numbers = chart(), ipywidgets.HTML()
         group = camera_group()
         self.scenes = [scene(group=group, view=view, up=up, height=250) for _ in range(2)]
@@ -54,13 +63,16 @@ class FunctionalMap(Panel):
         self.on_change(self.kind, lambda _: self.draw())
         self.on_change(self.block, lambda _: self.draw())
         self.on_change(self.matrix, lambda mark: self.set_trait("cell", (mark["row"], mark["column"])), "picked")
+        for slider in (self.row, self.column):
+            self.on_change(slider, lambda _: self.set_trait("cell", (self.row.value, self.column.value)))
         self.on_change(self, self.take, "pair")
-        self.on_change(self, lambda _: self.show_cell(), "cell")
+        self.on_change(self, self.show_cell, "cell")
         self.pair = pair
         self.take(pair)
         return [
             row(self.choice, self.kind),
             row(self.k, self.block),
+            row(self.column, self.row),
             self.numbers,
             beside(ipywidgets.VBox([self.matrix]), ipywidgets.VBox(self.scenes)),
         ]
@@ -73,7 +85,7 @@ class FunctionalMap(Panel):
         self.draw()
         for view, name in zip(self.scenes, (self.source[pair], self.target[pair]), strict=True):
             view.show(*surface(self.study, str(name)))
-        self.show_cell()
+        self.show_cell(self.cell)
 
     def map_of(self, k):
         """C at the size k: cut out of the study's map, or by ZoomOut from the first map of the pair."""
@@ -100,7 +112,7 @@ class FunctionalMap(Panel):
             C[:shown, :shown],
             title=f"{self.source[self.pair]} → {self.target[self.pair]}, {k} × {k}",
             blocks=[block for block in blocks if block[1] < shown],
-            row=self.cell[0] if max(self.cell) < shown else -1,
+            row=self.cell[0],
             column=self.cell[1],
         )
         values = self.meshes[0]["eigenvalue"].values
@@ -113,19 +125,16 @@ class FunctionalMap(Panel):
             "Blue is positive, red negative, −1 to 1."
         )
 
-    def show_cell(self):
+    def show_cell(self, cell):
         """The two eigenfunctions that a cell links, on one colour scale."""
-        target_mode, source_mode = self.cell
-        for view, mesh, mode, role in zip(
-            self.scenes, self.meshes, (source_mode, target_mode), ("source φ", "target ψ"), strict=True
-        ):
+        self.row.value, self.column.value = cell
+        self.matrix.spec = self.matrix.spec | {"row": cell[0], "column": cell[1]}
+        for view, mesh, mode, role in zip(self.scenes, self.meshes, cell[::-1], ("source φ", "target ψ"), strict=True):
             function = mesh["eigenfunction"].values[:, mode]
             limit = float(np.quantile(np.abs(function), 0.99))
             value = mesh["eigenvalue"].values[mode]
             view.title = f"{role}{mode} on {self.name_of(view)}, eigenvalue {value:.2f}"
             view.paint(signed_colors(function, limit), color_bar(SIGNED, -limit, limit, "eigenfunction"))
-        if max(self.cell) < len(self.C):
-            self.scenes[1].caption = f"C[{target_mode}, {source_mode}] = {self.C[target_mode, source_mode]:.3f}"
 
     def name_of(self, view):
         """The shape that one of the two views shows."""

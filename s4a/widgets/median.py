@@ -26,6 +26,8 @@ class Median(Panel):
     needs = ("latent/area_difference", "latent/latent_eigenvalue")
     title = "Median shape"
     selected = traitlets.Unicode("")
+    live = (("operator", "norm", "modes", "shape"),)
+    clicks = (("bars", "name", "shape"),)
 
     def build(self, view="corner", up="z"):
         """Choices, bars and the surface."""

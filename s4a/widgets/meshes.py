@@ -2,6 +2,8 @@
 
 from uuid import uuid4
 
+import numpy as np
+
 from s4a.picture import aligned, mesh_of
 
 RESOLUTIONS = [("low resolution", "coarse"), ("full resolution", "original")]
@@ -27,3 +29,15 @@ def unit_of(study, name):
     """The unit of a shape's positions where its file says it, or that it is the input's."""
     node = study["original"].children.get(name) if "original" in study.children else None
     return str((node.attrs.get("unit") if node is not None else "") or "unit of the input")
+
+
+def nice(x):
+    """The next number below that is 1, 2 or 5 times a power of ten.
+
+    Examples
+    --------
+    >>> nice(17.3), nice(0.6)
+    (10.0, 0.5)
+    """
+    power = 10.0 ** np.floor(np.log10(x))
+    return float(power * max(m for m in (1, 2, 5) if m * power <= x * (1 + 1e-9)))

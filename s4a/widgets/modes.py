@@ -8,9 +8,9 @@ import traitlets
 
 from s4a.deform import normal_displacement
 from s4a.io import write_mesh
+from s4a.live import mode_arrays, study_state, template_coarse
 from s4a.mesh import vertex_normals
-from s4a.pca import color_limits, deformed, low_vertices, mahalanobis, plausible_scores
-from s4a.picture import has, mesh_of, names_of
+from s4a.pca import color_limits, deformed, mahalanobis, plausible_scores
 from s4a.widgets.meshes import camera_group, unit_of
 from s4a.widgets.modes_view import modes_view
 from s4a.widgets.panel import Panel, row
@@ -41,13 +41,13 @@ class Modes(Panel):
     needs = ("registration/position", "pca/deformation")
     title = "Modes of variation"
     scores = traitlets.List(traitlets.Float())
+    python = ("saving the mesh",)
 
     def build(self, resolution=None, n_modes=None, view="corner", up="z"):
         """Sliders, shape and charts in the browser; below them resolution and export."""
         pca, self.n_modes = self.study["pca"].dataset, n_modes
         template = str(self.study["registration"].attrs.get("template", ""))
-        known = has(self.study, "coarse") and template in self.study["coarse"].children
-        self.coarse = self.study["coarse"][template].to_dataset() if known else None
+        self.coarse = template_coarse(self.study)
         size = pca["deformation"].isel(component=slice(n_modes)).nbytes
         small = self.coarse is not None and size > LARGE
         resolution = resolution or ("coarse" if small else "full")
@@ -55,12 +55,7 @@ class Modes(Panel):
             *self.arrays(resolution),
             limits=color_limits(*self.arrays("full" if self.coarse is None else "coarse")),
             unit=unit_of(self.study, template),
-            ratio=pca["explained_variance_ratio"].values[:n_modes].tolist(),
-            ratio_low=pca["explained_variance_ratio_low"].values[:n_modes].tolist()
-            if "explained_variance_ratio_low" in pca
-            else [],
-            samples=pca["score"].values[:, :n_modes].tolist(),
-            names=names_of(pca),
+            **study_state(self.study, n_modes),
             group=camera_group(),
             view=view,
             up=up,
@@ -80,13 +75,7 @@ class Modes(Panel):
 
     def arrays(self, resolution):
         """Mean shape, triangles and deformations at the resolution."""
-        X, T = mesh_of(self.study["registration"])
-        pca = self.study["pca"].dataset.isel(component=slice(self.n_modes))
-        mean, deformation = X + pca["mean_displacement"].values, pca["deformation"].values
-        if resolution == "full":
-            return mean, T, deformation
-        kept = low_vertices(self.coarse)
-        return mean[kept], self.coarse["corner_vertex"].values, deformation[:, kept]
+        return mode_arrays(self.study, None if resolution == "full" else self.coarse, self.n_modes)
 
     def page_path(self):
         """The name of the page beside that of the mesh."""

@@ -4,21 +4,12 @@ import ipywidgets
 import numpy as np
 import traitlets
 
-from s4a.draw import SIGNED, rotation, signed_colors
+from s4a.draw import signed_colors
+from s4a.live import MODES, STYLE, bars, look_state, mesh_state
 from s4a.mesh import vertex_normals
 from s4a.pca import deformed
-from s4a.widgets.browser import MODES, STYLE, anywidget
-from s4a.widgets.scene import Surfaces, as_bytes, color_bar, scene, table
-
-
-def bars(limit, limit_magnitude, unit):
-    """The colour bars of the three kinds of colours."""
-    return {
-        "normal": color_bar(SIGNED, -limit, limit, f"compression · normal displacement ({unit}) · expansion"),
-        "magnitude": color_bar("viridis", 0, limit_magnitude, f"distance from the mean ({unit})"),
-        "none": {},
-    }
-
+from s4a.widgets.browser import anywidget
+from s4a.widgets.scene import Surfaces, scene
 
 if anywidget is not None:
 
@@ -51,15 +42,8 @@ if anywidget is not None:
         def __init__(self, mean, triangles, deformation, *, limits, unit, view="corner", up="z", **options):
             self.arrays = mean, triangles, deformation
             super().__init__(
-                mean=as_bytes(mean, "float32"),
-                corner=as_bytes(triangles, "uint32"),
-                deformation=as_bytes(deformation, "float32"),
-                signed_table=table(SIGNED),
-                ramp_table=table("viridis"),
-                limit=limits[0],
-                limit_magnitude=limits[1],
-                bars=bars(*limits, unit),
-                turn=rotation(view, up).ravel().tolist(),
+                **mesh_state(mean, triangles, deformation),
+                **look_state(limits, unit, view, up),
                 scores=[0.0] * len(deformation),
                 **options,
             )
@@ -69,8 +53,8 @@ if anywidget is not None:
             """Other vertices of the same shapes, in one message."""
             self.arrays = mean, triangles, deformation
             with self.hold_sync():
-                self.mean, self.corner = as_bytes(mean, "float32"), as_bytes(triangles, "uint32")
-                self.deformation = as_bytes(deformation, "float32")
+                for name, value in mesh_state(*self.arrays).items():
+                    setattr(self, name, value)
             self.draw_still()
 
         def draw_still(self, change=None):

@@ -9,12 +9,13 @@ from matplotlib.colors import ListedColormap, to_hex
 from s4a import charts
 from s4a.draw import position_colors
 from s4a.fmap import match_from_fmap
+from s4a.live import color_bar
 from s4a.network import choose_pairs, connectivity, spectral_distance
 from s4a.picture import names_of
 from s4a.widgets.chart import chart
 from s4a.widgets.meshes import camera_group, surface
 from s4a.widgets.panel import Panel, beside, paragraph, row
-from s4a.widgets.scene import color_bar, scene
+from s4a.widgets.scene import scene
 
 STAGES = [
     ("after Consistent ZoomOut", "cycle_error"),
@@ -41,6 +42,8 @@ class Network(Panel):
     title = "Network of maps"
     edge = traitlets.Int(-1)
     node = traitlets.Unicode("")
+    live = (("stage", "budget", "where"), ("stage", "choice"))
+    clicks = (("graph", "edge", "choice"), ("graph", "node", "choice"))
 
     def build(self, view="corner", up="z"):
         """Choices, graph, matrix and two surfaces."""
@@ -57,17 +60,20 @@ class Network(Panel):
         self.budget = ipywidgets.IntSlider(
             used, min=n - 1, max=max(n - 1, n * (n - 1) // 2), description="pairs", layout={"width": "340px"}
         )
-        options = [("choose a map", -1), *((f"{s} → {t}", i) for i, (s, t) in enumerate(self.directed()))]
-        self.choice = ipywidgets.Dropdown(options=options, value=-1, description="map")
+        options = [
+            *((name, name) for name in self.names),
+            *((f"{s} → {t}", i) for i, (s, t) in enumerate(self.directed())),
+        ]
+        self.choice = ipywidgets.Dropdown(options=options, description="show")
         self.where = ipywidgets.Dropdown(options=["circle", "shape differences"], description="places")
         self.on_change(self.where, lambda _: self.draw())
         self.facts, self.bar = ipywidgets.HTML(), ipywidgets.HTML()
         self.graph, self.matrix = chart(), chart()
         group = camera_group()
         self.scenes = [scene(group=group, view=view, up=up, height=300) for _ in range(2)]
-        self.on_change(self.stage, lambda _: self.draw())
+        self.on_change(self.stage, lambda _: self.show_edge(self.edge) if self.edge >= 0 else self.draw())
         self.on_change(self.budget, lambda _: self.draw())
-        self.on_change(self.choice, lambda value: self.set_trait("edge", value))
+        self.on_change(self.choice, self.choose)
         self.on_change(self.graph, self.pick, "picked")
         self.on_change(self, self.show_edge, "edge")
         self.on_change(self, self.show_node, "node")
@@ -121,7 +127,8 @@ class Network(Panel):
             title="Click a shape or a map",
             highlight=self.names.index(median) if median in self.names else -1,
             node=self.names.index(self.node) if self.node in self.names else -1,
-            edge=self.shown.index(self.edge) if self.edge in self.shown else -1,
+            edge=self.edge,
+            edges=self.shown,
         )
         self.tell(pairs, values[self.shown], top)
 
@@ -145,16 +152,21 @@ class Network(Panel):
 
     def pick(self, mark):
         """What was clicked in the graph."""
-        if "edge" in mark:
-            self.edge = self.shown[mark["edge"]]
+        self.choose(mark["edge"] if "edge" in mark else mark["node"])
+
+    def choose(self, what):
+        """A map by its row of ``/network``, or a shape by its name."""
+        if isinstance(what, str):
+            self.node = what
         else:
-            self.node = self.names[mark["node"]]
+            self.edge = what
 
     def show_node(self, name):
         """One shape."""
         if not name:
             return
         self.edge = -1
+        self.choice.value = name
         self.matrix.layout.display = self.scenes[1].layout.display = "none"
         self.scenes[0].show(*surface(self.study, name), title=name)
         self.scenes[0].caption = f"{(self.source == name).sum()} maps from it, {(self.target == name).sum()} to it"
@@ -162,9 +174,9 @@ class Network(Panel):
 
     def show_edge(self, edge):
         """A map: its matrix, and the colours that it carries from source to target."""
-        self.choice.value = edge
         if edge < 0:
             return
+        self.choice.value = edge
         self.node = ""
         network = self.study["network"].dataset.isel(pair=edge)
         key = "fmap" if self.stage.value == "cycle_error" else "fmap_initial"

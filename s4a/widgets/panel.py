@@ -57,6 +57,10 @@ class Panel(ipywidgets.VBox):
 
     needs = ()
     title = "Panel"
+    live = ()  # groups of controls, by their names, whose values a saved page keeps; the last varies slowest
+    clicks = ()  # chart, part of the mark that is clicked, and the control that it sets
+    every = ()  # sliders of which a page keeps every value, and not only two dozen of them
+    python = ()  # what else needs Python
 
     def __init__(self, study, **options):
         from s4a.picture import has
@@ -72,6 +76,10 @@ class Panel(ipywidgets.VBox):
     def build(self, **options):
         """The parts of the panel, as a list of widgets."""
         raise NotImplementedError
+
+    def control(self, name):
+        """The control of a name in `live`."""
+        return getattr(self, name)
 
     def say(self, text, error=False):
         """Show a line below the panel."""
@@ -101,14 +109,15 @@ class Panel(ipywidgets.VBox):
     def save_html(self, path):
         """Write the panel, as it stands, as one HTML file that needs no kernel and no network.
 
-        Surfaces still turn and charts still say their numbers; what Python would have to compute stays as it is.
+        Surfaces turn, charts say their numbers, and controls show what Python showed for their values, which are gone
+        through one by one and kept, up to 24 MB of them; the page says what needs Python.
 
         Returns
         -------
         pathlib.Path
         """
         path = Path(path)
-        path.write_text(page(self, self.title), encoding="utf-8")
+        path.write_text(page(self), encoding="utf-8")
         return path
 
     def close(self):

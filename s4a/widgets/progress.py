@@ -1,5 +1,6 @@
 """An analysis in a process of its own: stage by stage how far it is, cancelled or opened while it runs."""
 
+import inspect
 import multiprocessing
 import os
 import signal
@@ -9,7 +10,7 @@ from pathlib import Path
 
 import ipywidgets
 
-from s4a.pipeline import analyse
+from s4a.pipeline import analyse, collection, in_batches
 from s4a.study import open_study
 from s4a.widgets.panel import Panel, paragraph, row
 
@@ -22,6 +23,7 @@ STAGES = {
     "registration": ("registration/[!.]*.nc", True),
     "modes": ("pca.nc", False),
 }
+N_PAIRS = inspect.signature(analyse).parameters["n_pairs"].default
 EVERY = 0.5  # seconds
 
 
@@ -49,7 +51,7 @@ def clock(seconds):
 
 
 class Progress(Panel):
-    """Runs :func:`s4a.analyse` in a process of its own and shows how far it is.
+    """Runs :func:`s4a.analyse` in a process of its own and shows how far it is, while the notebook stays free.
 
     Parameters
     ----------
@@ -69,17 +71,23 @@ class Progress(Panel):
     title = "Progress"
 
     def __init__(self, shapes, store, **options):
-        self.folder, self.state, self.explored = Path(store), "running", None
-        self.stopped, self.started = threading.Event(), time.monotonic()
-        self.first = {}
+        self.folder, self.explored = Path(store), None
+        self.arguments = shapes, options | {"store": str(store)}
+        self.given = len(collection(shapes, options.get("pattern")))
         super().__init__(None)
+        self.start()
+
+    def start(self):
+        """Run, from the beginning or where it stopped."""
+        self.state, self.stopped, self.started = "running", threading.Event(), time.monotonic()
+        self.first = {}
         context = multiprocessing.get_context("spawn")
         self.answer, there = context.Pipe(duplex=False)
-        options = options | {"store": str(store)}
-        self.process = context.Process(target=work, args=(there, shapes, options))
+        self.process = context.Process(target=work, args=(there, *self.arguments))
         self.process.start()
         there.close()
-        threading.Thread(target=self.watch, daemon=True).start()
+        self.stop.disabled, self.go_on.disabled = False, True
+        threading.Thread(target=self.watch, args=(self.stopped,), daemon=True).start()
 
     def build(self):
         """A bar for each stage, and the buttons."""
@@ -92,36 +100,53 @@ class Progress(Panel):
         self.total = ipywidgets.HTML()
         self.stop = ipywidgets.Button(description="Cancel", tooltip="what is finished stays and is used again")
         self.view = ipywidgets.Button(description="Open", tooltip="the stages that are finished")
+        self.go_on = ipywidgets.Button(description="Resume", tooltip="where it stopped", disabled=True)
+        self.go_on.on_click(self.guarded(lambda _: self.start()))
         self.stop.on_click(self.guarded(lambda _: self.cancel()))
         self.view.on_click(self.guarded(lambda _: self.show()))
-        lines = [ipywidgets.HBox([self.bars[stage], self.texts[stage]]) for stage in STAGES]
-        return [*lines, row(self.stop, self.view, self.total)]
+        lines = [row(self.bars[stage], self.texts[stage]) for stage in STAGES]
+        return [*lines, row(self.stop, self.go_on, self.view, self.total)]
 
-    def watch(self):
+    def watch(self, stopped):
         """Look at the folder until the process ends, in a thread of its own."""
-        while self.process.is_alive() and not self.stopped.wait(EVERY):
+        while self.process.is_alive() and not stopped.wait(EVERY):
             self.guarded(self.look)()
-        if not self.stopped.is_set():
+        if not stopped.is_set():
             self.guarded(self.finish)()
+
+    def totals(self, shapes):
+        """How many files each stage writes when so many shapes are usable."""
+        pairs = min(self.arguments[1].get("n_pairs", N_PAIRS), shapes * (shapes - 1) // 2)
+        batches = len(in_batches(range(max(pairs, shapes - 1))))
+        each = {stage: shapes for stage, (_, one_each) in STAGES.items() if one_each}
+        return dict.fromkeys(STAGES, 1) | each | {"read and clean": self.given, "first maps, in batches": batches}
 
     def look(self):
         """Count the files of every stage; what is left is told from the pace since the first file of the stage."""
         now = time.monotonic()
         counts = {stage: len(list(self.folder.glob(pattern))) for stage, (pattern, _) in STAGES.items()}
-        shapes = counts["read and clean"]
-        after = list(STAGES)
-        for i, (stage, (_, each)) in enumerate(STAGES.items()):
-            done = counts[stage]
+        totals, after = self.totals(counts["read and clean"] or self.given), list(STAGES)
+        for i, stage in enumerate(STAGES):
+            done, whole = counts[stage], totals[stage]
             later = any(counts[name] for name in after[i + 1 :])
-            whole = shapes if each and i else max(done, 1)
-            bar, text = self.bars[stage], f"{done}" + (f" of {whole}" if each and i else "")
-            bar.max, bar.value = max(whole, 1), done
-            bar.bar_style = "success" if done and (later or (done >= whole and i == len(after) - 1)) else "info"
-            begin, had = self.first.setdefault(stage, (now, done)) if done else (now, 0)
-            if each and i and had < done < whole:
+            bar, text = self.bars[stage], f"{done} of {whole}"
+            bar.max, bar.value = whole, done
+            ended = done >= whole or (done and later)
+            bar.bar_style = "success" if ended else "info"
+            begin, had, end = self.first.get(stage, (now, done, now))
+            before = i == 0 or self.bars[after[i - 1]].bar_style == "success"
+            if before and not (ended and stage not in self.first):
+                self.first[stage] = begin, had, end if ended and end > begin else now
+                text += f", {clock(self.first[stage][2] - begin)}"
+            if had < done < whole:
                 text += f", about {clock((now - begin) / (done - had) * (whole - done))} left"
             self.texts[stage].value = text
         self.total.value = paragraph(f"{self.state}, {clock(now - self.started)}")
+        ready = [stage for stage in STAGES if self.bars[stage].bar_style == "success"]
+        self.view.disabled = not ready
+        if self.explored is not None and ready != self.opened:
+            self.opened = ready
+            self.explored.extend(open_study(self.folder))
 
     def finish(self):
         """What the process said at its end."""
@@ -135,7 +160,7 @@ class Progress(Panel):
         self.look()
         if self.state == "failed":
             self.say(said, error=True)
-        self.stop.disabled = True
+        self.stop.disabled, self.go_on.disabled = True, self.state == "finished"
 
     def cancel(self):
         """End the process; the files that it wrote stay."""
@@ -145,12 +170,13 @@ class Progress(Panel):
             self.process.join(5)
             if self.process.is_alive():
                 self.process.terminate()
-        self.say("cancelled; with the same store it goes on where it stopped")
+        self.say("cancelled; Resume, or the same store, goes on where it stopped")
 
     def show(self):
-        """Open the panels of what is finished, or bring them up to date."""
+        """Open the panels of what is finished; they fill as other stages end, or at another click."""
         from s4a.widgets.explore import Explore
 
+        self.opened = [stage for stage in STAGES if self.bars[stage].bar_style == "success"]
         study = open_study(self.folder)
         if self.explored is None:
             self.explored = Explore(study)
@@ -161,6 +187,6 @@ class Progress(Panel):
     def close(self):
         """Cancel a run that goes on, and close everything."""
         self.stopped.set()
-        if getattr(self, "process", None) is not None and self.process.is_alive():
+        if self.process.is_alive():
             self.cancel()
         super().close()

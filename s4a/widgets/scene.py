@@ -4,77 +4,77 @@ import ipywidgets
 import numpy as np
 import traitlets
 
-from s4a.draw import image_bytes, on_white, render, rotation
-from s4a.widgets.browser import SCENE, STYLE, anywidget
+from s4a.draw import checkerboard, image_bytes, on_white, render, rotation, with_balls
+from s4a.live import STYLE, as_bytes, color_bytes
+from s4a.widgets.browser import SCENE, anywidget
 
 SIZE = (460, 360)  # pixels of a still picture
 
 
-def as_bytes(array, kind):
-    """The bytes of an array of numbers, little-endian and contiguous, as the browser reads them.
+def extent(points):
+    """Length of the diagonal of the points' box.
 
     Examples
     --------
-    >>> as_bytes([1, 256], "uint16")
-    b'\\x01\\x00\\x00\\x01'
+    >>> extent(np.array([[0, 0, 0], [1, 2, 2.0]]))
+    3.0
     """
-    return np.ascontiguousarray(array, np.dtype(kind).newbyteorder("<")).tobytes()
-
-
-def color_bytes(colors):
-    """Colours ``(n, 3)`` from 0 to 1 as bytes; rows that are not finite become grey."""
-    colors = np.asarray(colors, float)
-    return as_bytes(255 * np.where(np.isfinite(colors), np.clip(colors, 0, 1), 0.6) + 0.5, "uint8")
-
-
-def color_bar(colormap, low, high, label):
-    """What the browser draws as a colour bar: eleven colours of a colour map, both ends and a label."""
-    from matplotlib import colormaps
-    from matplotlib.colors import to_hex
-
-    colors = colormaps.get_cmap(colormap)(np.linspace(0, 1, 11))
-    return {"colors": [to_hex(c) for c in colors], "low": float(low), "high": float(high), "label": label}
-
-
-def table(colormap):
-    """The 256 colours of a colour map as bytes."""
-    from matplotlib import colormaps
-
-    return color_bytes(colormaps.get_cmap(colormap)(np.linspace(0, 1, 256))[:, :3])
+    return float(np.linalg.norm(np.ptp(points, axis=0)))
 
 
 class Surfaces:
     """What a view of a surface does, whoever draws it: the arrays are kept, and a still picture can be made."""
 
+    surface = painted = texture = None
+    points = ()
+
     def show(self, points, triangles, colors=None, title=None):
         """Show a surface ``(n, 3)``, ``(m, 3)`` with colours ``(n, 3)``; what was marked is forgotten."""
         self.surface = np.asarray(points), np.asarray(triangles)
-        self.painted = colors
+        self.painted, self.texture = colors, None
+        self.unlink()
         if title is not None:
             self.title = title
         self.points = []
         self.draw_surface()
 
-    def paint(self, colors, bar=None):
-        """Colours of the vertices ``(n, 3)``, None for none, and the colour bar that explains them."""
-        self.painted = colors
+    def paint(self, colors, bar=None, coordinates=None, cell=0.0):
+        """Colours of the vertices, and a checkerboard over them.
+
+        Parameters
+        ----------
+        colors : float ndarray (n, 3)
+            None for none.
+        bar : dict, optional
+            The colour bar that explains them.
+        coordinates : float ndarray (n, 3), optional
+            Where the checkerboard is evaluated; cubes of the side `cell` are bright and dark in turn.
+        """
+        self.painted, self.texture = colors, None if coordinates is None else (np.asarray(coordinates), cell)
         self.bar = bar or {}
         self.draw_colors()
 
-    def mark(self, points, colors=((0.9, 0.6, 0.0),), size=12):
-        """Discs at some points ``(p, 3)`` of the surface; one colour or one for each."""
+    def mark(self, points, colors=((0.9, 0.6, 0.0),), radius=None):
+        """Spheres around some points ``(p, 3)``, in the unit of the data; one colour or one for each.
+
+        The radius is by default a hundredth of the surface's extent.
+        """
         points = np.asarray(points, float).reshape(-1, 3)
         colors = np.broadcast_to(np.asarray(colors, float), (len(points), 3))
-        self.points = [[*p, *c, size] for p, c in zip(points.tolist(), colors.tolist(), strict=True)]
+        self.radius = float(extent(self.surface[0]) / 100 if radius is None else radius)
+        self.points = [[*p, *c, self.radius] for p, c in zip(points.tolist(), colors.tolist(), strict=True)]
 
     def picture(self):
         """PNG bytes of the surface from where the view first stands; empty without a surface."""
         if self.surface is None:
             return b""
         turn = np.reshape(self.turn, (3, 3))
-        points, triangles = self.surface
+        colors = self.painted
+        if self.texture is not None:
+            colors = np.asarray(colors) * checkerboard(*self.texture)[:, None]
+        points, triangles, colors = with_balls(*self.surface, colors, self.points)
         # the rotation is applied here, and the renderer then looks along z from the top
-        drawn = render(points @ turn.T, triangles, colors=self.painted, view="top", size=SIZE)
+        drawn = render(points @ turn.T, triangles, colors=colors, view="top", size=SIZE)
         return image_bytes(on_white(drawn), "png")
 
 
@@ -95,13 +95,19 @@ if anywidget is not None:
 
         Attributes
         ----------
+        clickable : bool
+            Whether places can be picked: by a click, or with a cursor that the arrow keys move over the surface.
         picked, hovered : dict
             The place that was clicked, or is under the pointer (where `hovering` is set): ``vertex`` (-1 beside the
             surface), ``face``, ``weights`` in that triangle, and ``point``.
         """
 
         _esm, _css = SCENE, STYLE
-        position, corner, color, still = (traitlets.Bytes().tag(sync=True) for _ in range(4))
+        position, corner, color, coordinate, still = (traitlets.Bytes().tag(sync=True) for _ in range(5))
+        cell, radius = (traitlets.Float(0.0).tag(sync=True) for _ in range(2))
+        link, link_values = (traitlets.Bytes().tag(sync=True) for _ in range(2))
+        link_text = traitlets.Unicode("").tag(sync=True)
+        clickable = traitlets.Bool(False).tag(sync=True)
         ghost_position, ghost_corner = (traitlets.Bytes().tag(sync=True) for _ in range(2))
         points = traitlets.List().tag(sync=True)
         bar, picked, hovered = (traitlets.Dict().tag(sync=True) for _ in range(3))
@@ -113,20 +119,41 @@ if anywidget is not None:
 
         def __init__(self, *, view="corner", up="z", **options):
             super().__init__(turn=rotation(view, up).ravel().tolist(), **options)
-            self.surface = self.painted = None
-            self.observe(self.draw_still, "webgl")
+            self.observe(self.draw_still, ["webgl", "points"])
 
         def draw_surface(self):
             """Send the surface and its colours, in one message."""
             with self.hold_sync():
                 self.corner = as_bytes(self.surface[1], "uint32")
-                self.color = b"" if self.painted is None else color_bytes(self.painted)
+                self.send_colors()
                 self.position = as_bytes(self.surface[0], "float32")
             self.draw_still()
 
+        def send_colors(self):
+            """Colours and checkerboard as bytes."""
+            self.color = b"" if self.painted is None else color_bytes(self.painted)
+            self.coordinate = b"" if self.texture is None else as_bytes(self.texture[0], "float32")
+            self.cell = 0.0 if self.texture is None else float(self.texture[1])
+
+        def connect(self, link, text, values=None):
+            """Let the browser mark on the other view of the group what is picked on this one.
+
+            `link` is a vertex of the other view for each vertex, -1 for none; `text` says so, with ``{here}`` and
+            ``{there}`` for the two; `values` from 0 to 1 are the confidence.
+            """
+            with self.hold_sync():
+                self.link, self.link_text = as_bytes(link, "int32"), text
+                self.link_values = b"" if values is None else as_bytes(100 * np.asarray(values) + 0.5, "uint8")
+
+        def unlink(self):
+            """Nothing is marked on another view."""
+            with self.hold_sync():
+                self.link = self.link_values = b""
+
         def draw_colors(self):
             """Send the colours."""
-            self.color = b"" if self.painted is None else color_bytes(self.painted)
+            with self.hold_sync():
+                self.send_colors()
             self.draw_still()
 
         def over(self, points=None, triangles=None):
@@ -144,14 +171,13 @@ if anywidget is not None:
 class StillScene(Surfaces, ipywidgets.VBox):
     """The view where anywidget is not installed: a picture that Python draws again at every change."""
 
-    title, caption = traitlets.Unicode(""), traitlets.Unicode("")
+    title, caption, radius = traitlets.Unicode(""), traitlets.Unicode(""), traitlets.Float(0.0)
     points, turn = traitlets.List(), traitlets.List()
     bar, picked, hovered = traitlets.Dict(), traitlets.Dict(), traitlets.Dict()
     hovering = traitlets.Bool(False)
 
     def __init__(self, *, view="corner", up="z", title="", **options):
         self.image, self.text = ipywidgets.Image(format="png"), ipywidgets.HTML()
-        self.surface = self.painted = None
         super().__init__([self.text, self.image], turn=rotation(view, up).ravel().tolist())
         self.observe(self.write, ["title", "caption", "bar"])
         self.title = title
@@ -168,6 +194,12 @@ class StillScene(Surfaces, ipywidgets.VBox):
         self.image.value = self.picture()
 
     draw_colors = draw_surface
+
+    def connect(self, link, text, values=None):
+        """Nothing runs in the browser that could mark a point."""
+
+    def unlink(self):
+        """There is nothing to undo."""
 
     def over(self, points=None, triangles=None):
         """A second surface cannot shine through a picture: nothing is drawn."""

@@ -5,11 +5,12 @@ import numpy as np
 import traitlets
 
 from s4a.draw import SIGNED, signed_colors
+from s4a.live import color_bar
 from s4a.spectral import reconstruct, weyl
 from s4a.widgets.chart import chart
 from s4a.widgets.meshes import camera_group, surface, unit_of
 from s4a.widgets.panel import Panel, beside, row
-from s4a.widgets.scene import color_bar, scene
+from s4a.widgets.scene import scene
 
 TITLES = ("Eigenvalues: click a curve", "The same, less Weyl's law")
 
@@ -25,6 +26,9 @@ class Spectrum(Panel):
     needs = ("coarse",)
     title = "Spectrum"
     shape = traitlets.Unicode("")
+    live = (("mode", "choice"), ("k", "choice"))
+    every = ("mode",)
+    clicks = (("curves", "series", "choice"), ("gaps", "series", "choice"))
 
     def build(self, view="corner", up="z"):
         """Choices, curves and two surfaces."""

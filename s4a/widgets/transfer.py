@@ -14,16 +14,18 @@ from s4a.mesh import as_arrays
 from s4a.picture import aligned, names_of
 from s4a.schema import dataset
 from s4a.transfer import transfer_labels, transfer_landmarks
-from s4a.widgets.meshes import camera_group
+from s4a.widgets.meshes import camera_group, nice, unit_of
 from s4a.widgets.panel import Panel, beside, paragraph, row
-from s4a.widgets.scene import scene
+from s4a.widgets.scene import extent, scene
 
 COLUMNS = ["name", "x", "y", "z", "confidence"]
 LEGEND = 24  # labels that have colours of their own
 
 
 class Transfer(Panel):
-    """Labels in colours and landmarks as discs on two shapes; a click on the source places or moves a landmark.
+    """Labels in colours and landmarks as spheres on two shapes; a click on the source places or moves a landmark.
+
+    The keyboard does the same: C on the source starts a cursor, the arrow keys move it over the surface, Enter places.
 
     Attributes
     ----------
@@ -36,6 +38,8 @@ class Transfer(Panel):
     needs = ("registration/position", "registration/registered_match")
     title = "Transfer"
     source, target, landmark = (traitlets.Unicode("") for _ in range(3))
+    live = (("labels", "target"),)
+    python = ("placing landmarks",)
 
     def build(self, view="corner", up="z"):
         """Choices, the two surfaces, legend and table."""
@@ -49,9 +53,12 @@ class Transfer(Panel):
         self.remove = ipywidgets.Button(description="Remove", tooltip="the landmark that is named")
         self.path = ipywidgets.Text("landmarks.csv", description="file", layout={"width": "260px"})
         self.csv = ipywidgets.Button(description="Save CSV", tooltip="the landmarks on the target")
+        self.radius = ipywidgets.BoundedFloatText(
+            1, min=0, max=np.inf, step=0.5, description="radius", tooltip="of the spheres", layout={"width": "180px"}
+        )
         self.legend, self.table = ipywidgets.HTML(), ipywidgets.HTML()
         group = camera_group()
-        self.scenes = [scene(group=group, view=view, up=up, height=380) for _ in range(2)]
+        self.scenes = [scene(group=group, view=view, up=up, height=380, clickable=not i) for i in range(2)]
         for role, choice in self.choices.items():
             self.on_change(choice, lambda value, role=role: self.set_trait(role, value))
             self.on_change(self, lambda _: self.draw(), role)
@@ -61,16 +68,24 @@ class Transfer(Panel):
         self.on_change(self.scenes[0], self.place, "picked")
         self.remove.on_click(self.guarded(lambda _: self.drop(self.landmark)))
         self.csv.on_click(self.guarded(lambda _: self.say(f"written: {self.save_csv(self.path.value)}")))
+        size = extent(self.study["registration"]["position"].values)
+        self.radius.value, self.radius.description = nice(size / 80), f"radius ({unit_of(self.study, template)})"
+        self.radius.style.description_width = "initial"
+        self.on_change(self.radius, lambda _: self.carry())
         with self.hold_trait_notifications():
             self.source = str(template)
             self.target = next(name for name in names if name != template)
         return [
             row(*self.choices.values(), self.labels),
-            row(self.name, self.remove, self.path, self.csv),
+            row(self.name, self.remove, self.radius, self.path, self.csv),
             beside(*self.scenes),
             self.legend,
             self.table,
         ]
+
+    def control(self, name):
+        """The control of a name in `live`."""
+        return self.choices.get(name) or super().control(name)
 
     def mesh(self, name):
         """The mesh of a shape, in its own coordinates."""
@@ -150,7 +165,7 @@ class Transfer(Panel):
         there = np.zeros((0, 3)) if found is None else found["landmark_position"].values
         colors = label_colors(np.arange(len(here))) if len(here) else ()
         for view, name, points in zip(self.scenes, (self.source, self.target), (here, there), strict=True):
-            view.mark(aligned(self.study, name, points), colors) if len(points) else view.mark([])
+            view.mark(aligned(self.study, name, points), colors, self.radius.value) if len(points) else view.mark([])
         if found is None:
             self.table.value = paragraph("Click on the source to place a landmark.")
             return

@@ -73,7 +73,7 @@ function scatter(parent, spec, pick) {
   const marks = x.map((_, i) => {
     const at = node(frame.svg, "circle", { cx: frame.X(x[i]), cy: frame.Y(y[i]), r: i === selected ? 7 : 5, fill: i === selected ? ORANGE : BLUE, stroke: "#fff" });
     if (names.length <= 60) node(frame.svg, "text", { x: frame.X(x[i]) + 7, y: frame.Y(y[i]) - 4, class: "s4a-small" }, names[i]);
-    return { at, value: { index: i }, text: `${names[i]}: ${short(x[i])}, ${short(y[i])}` };
+    return { at, value: { index: i, name: names[i] }, text: `${names[i]}: ${short(x[i])}, ${short(y[i])}` };
   });
   const cross = node(frame.svg, "path", { d: "M-7 0H7M0 -7V7", stroke: ORANGE, "stroke-width": 2, visibility: "hidden", class: "s4a-cross" });
   reachable(marks, line(parent), pick);
@@ -94,7 +94,7 @@ function bars(parent, spec, pick) {
     if (i === selected) Object.entries({ stroke: INK, "stroke-width": 2.5 }).forEach(([k, s]) => at.setAttribute(k, s));
     node(frame.svg, "text", { x: left - 4, y: top + row - 8, "text-anchor": "end" }, names[i]);
     node(frame.svg, "text", { x: frame.X(v) + 4, y: top + row - 8 }, short(v));
-    return { at, value: { index: i }, text: `${names[i]}: ${v.toPrecision(4)}` };
+    return { at, value: { index: i, name: names[i] }, text: `${names[i]}: ${v.toPrecision(4)}` };
   });
   reachable(marks, line(parent), pick);
 }
@@ -122,7 +122,7 @@ function lines(parent, spec, pick) {
 }
 
 function graph(parent, spec, pick) {
-  const { x, y, names, source, target, colors, values, weights, title, highlight = -1, node: chosen = -1, edge = -1, width = 460, height = 400 } = spec;
+  const { x, y, names, source, target, colors, values, weights, title, edges, highlight = -1, node: chosen = -1, edge = -1, width = 460, height = 400 } = spec;
   const svg = node(parent, "svg", { viewBox: `0 0 ${width} ${height}`, class: "s4a-chart", role: "group", "aria-label": title });
   svg.style.maxWidth = `${width}px`;
   node(svg, "text", { x: 8, y: 14, "font-weight": "bold" }, title);
@@ -133,11 +133,12 @@ function graph(parent, spec, pick) {
     const d = `M${X[s]} ${Y[s]}Q${(X[s] + X[t]) / 2 - bend * dy} ${(Y[s] + Y[t]) / 2 + bend * dx} ${X[t]} ${Y[t]}`;
     const at = node(svg, "g", { fill: "none", class: "s4a-edge", "data-edge": i });
     node(at, "path", { d, stroke: "transparent", "stroke-width": 7 });
-    if (i === edge) node(at, "path", { d, stroke: ORANGE, "stroke-width": 9 });
-    node(at, "path", { d, stroke: colors[i], "stroke-width": i === edge ? 4 : 1 + 1.8 * (weights ? weights[i] : 0.3), class: "s4a-line" });
+    const marked = edge >= 0 && edges[i] === edge;
+    if (marked) node(at, "path", { d, stroke: ORANGE, "stroke-width": 9 });
+    node(at, "path", { d, stroke: colors[i], "stroke-width": marked ? 4 : 1 + 1.8 * (weights ? weights[i] : 0.3), class: "s4a-line" });
     const weight = weights ? `, weight ${short(weights[i])}` : "";
-    if (i === edge) svg.append(at);
-    return { at, value: { edge: i }, text: `${names[s]} → ${names[t]}: ${spec.label} ${short(values[i])}${weight}` };
+    if (marked) svg.append(at);
+    return { at, value: { edge: edges[i] }, text: `${names[s]} → ${names[t]}: ${spec.label} ${short(values[i])}${weight}` };
   });
   marks.push(...names.map((name, i) => {
     const at = node(svg, "g", { "data-node": i });
@@ -146,7 +147,7 @@ function graph(parent, spec, pick) {
     const side = X[i] < width / 2 - 20 ? -1 : 1; // names stand outside of the ring
     const place = { x: X[i] + 12 * side, y: Y[i] + (Y[i] < height / 2 ? -5 : 13), "text-anchor": side < 0 ? "end" : "start" };
     if (names.length <= 60) node(svg, "text", { ...place, class: "s4a-halo" }, name);
-    return { at, value: { node: i }, text: i === highlight ? `${name}, the median` : name };
+    return { at, value: { node: name }, text: i === highlight ? `${name}, the median` : name };
   }));
   reachable([...marks.slice(source.length), ...marks.slice(0, source.length)], line(parent), pick);
 }
@@ -156,6 +157,7 @@ function matrix(parent, spec, pick) {
   const { rows, columns, values, table, limit, blocks = [], label, title, row = -1, column = -1, size = 380 } = spec;
   html(parent, "div", { class: "s4a-title" }, title);
   const box = html(parent, "div", { class: "s4a-matrix", style: `width:${size}px;max-width:100%;aspect-ratio:${columns}/${rows}` });
+  const inside = (at) => at.row >= 0 && at.row < rows && at.column < columns;
   const canvas = html(box, "canvas", { tabindex: 0, role: "application", "aria-label": `${title}: arrow keys move, Enter shows the cell` });
   Object.assign(canvas, { width: columns, height: rows });
   const paint = canvas.getContext("2d"), image = paint.createImageData(columns, rows);
@@ -166,8 +168,8 @@ function matrix(parent, spec, pick) {
   paint.putImageData(image, 0, 0);
   const svg = node(box, "svg", { viewBox: `0 0 ${columns} ${rows}`, preserveAspectRatio: "none" });
   for (const [a, b] of blocks) node(svg, "rect", { x: a, y: a, width: b - a + 1, height: b - a + 1, fill: "none", stroke: "#e69f00", "stroke-width": columns / 120 });
-  const cursor = node(svg, "rect", { width: 1, height: 1, fill: "none", stroke: "#000", "stroke-width": columns / 150, x: column, y: row, visibility: row < 0 ? "hidden" : "visible" });
-  const readout = line(parent), here = { row: Math.max(0, row), column: Math.max(0, column) };
+  const cursor = node(svg, "rect", { width: 1, height: 1, fill: "none", stroke: "#000", "stroke-width": columns / 150, x: column, y: row, visibility: inside({ row, column }) ? "visible" : "hidden" });
+  const readout = line(parent), here = inside({ row, column }) ? { row, column } : { row: 0, column: 0 };
   const say = () => (readout.textContent = `C[${here.row}, ${here.column}] = ${short(values[here.row * columns + here.column])}   (${label(here)})`);
   const place = (e) => {
     const r = canvas.getBoundingClientRect();
@@ -192,7 +194,7 @@ function matrix(parent, spec, pick) {
     Object.entries({ x: here.column, y: here.row, visibility: "visible" }).forEach(([k, v]) => cursor.setAttribute(k, v));
     say();
   });
-  if (row >= 0) say();
+  if (inside({ row, column })) say();
 }
 
 const CHARTS = { scatter, bars, lines, graph, matrix };

@@ -8,6 +8,7 @@ export default {
       if (!spec.kind) return;
       if (spec.kind === "matrix") {
         spec.values = numbers(Float32Array, model.get("values"));
+        if (spec.values.length !== spec.rows * spec.columns) return; // the other half of the message is on its way
         spec.table = numbers(Uint8Array, model.get("table"));
         spec.label = ({ row, column }) => `source mode ${column} to target mode ${row}`;
       }
@@ -18,7 +19,7 @@ export default {
       if (focused) el.querySelector("[tabindex='0']")?.focus({ preventScroll: true });
     };
     draw();
-    model.on("change:spec", draw);
-    return () => model.off("change:spec", draw);
+    for (const name of ["spec", "values"]) model.on(`change:${name}`, draw);
+    return () => { for (const name of ["spec", "values"]) model.off(`change:${name}`, draw); };
   },
 };

@@ -6,28 +6,51 @@ export default {
       model.set(name, { ...(hit || { vertex: -1 }), count: (model.get(name).count || 0) + 1 });
       model.save_changes();
     };
-    let hovered = 0;
+    let hovered = 0, link = null, values = null;
+    // The image of a vertex on the other view of the group: marked at once, without a kernel.
+    const carry = (hit) => {
+      if (!link || !hit || hit.vertex < 0 || hit.vertex >= link.length) return;
+      const there = link[hit.vertex], radius = model.get("radius"), ball = (at) => [...at, 0.9, 0.6, 0, radius];
+      const sure = values ? `, confidence ${(values[hit.vertex] / 100).toFixed(2)}` : "";
+      view.points = [ball(view.at(hit.vertex))];
+      for (const other of view.camera.views) {
+        if (other === view) continue;
+        other.points = there < 0 ? [] : [ball(other.at(there))];
+        other.readout.textContent = readout.textContent = there < 0 ? "nothing is matched to this vertex"
+          : model.get("link_text").replace("{here}", hit.vertex).replace("{there}", there) + sure;
+      }
+      view.moved();
+    };
     const view = new View(el, {
       turn: model.get("turn"), group: model.get("group"), height: model.get("height"), label: model.get("title"),
-      onPick: (hit) => send("picked", hit),
-      onHover: (hit) => {
+      onPick: model.get("clickable") && ((hit) => { carry(hit); send("picked", hit); }),
+      onHover: model.get("clickable") && ((hit) => {
         if (!model.get("hovering") || Date.now() - hovered < 120) return;
         hovered = Date.now();
+        carry(hit);
         send("hovered", hit);
-      },
+      }),
     });
-    const still = html(el, "img", { alt: "", class: "s4a-still" }), bar = html(el, "div"), readout = html(el, "div", { class: "s4a-readout" });
+    const still = html(el, "img", { alt: "", class: "s4a-still" }), bar = html(el, "div"), readout = html(el, "div", { class: "s4a-readout", "aria-live": "polite" });
+    view.readout = readout;
     const surface = new Surface(), ghost = new Surface(0.35);
     const geometry = () => {
       const position = numbers(Float32Array, model.get("position")), corner = numbers(Uint32Array, model.get("corner"));
       if (!position || !corner) return;
       surface.setMesh(position, corner);
       view.fit(position);
+      view.cursor = -1;
       color();
+      links();
     };
     const color = () => {
       surface.setColor(numbers(Uint8Array, model.get("color")));
+      surface.setTexture(numbers(Float32Array, model.get("coordinate")), model.get("cell"));
       view.redraw();
+    };
+    const links = () => {
+      link = numbers(Int32Array, model.get("link"));
+      values = numbers(Uint8Array, model.get("link_values"));
     };
     const ghosts = () => {
       const position = numbers(Float32Array, model.get("ghost_position")), corner = numbers(Uint32Array, model.get("ghost_corner"));
@@ -38,6 +61,7 @@ export default {
     };
     const words = () => {
       title.textContent = model.get("title");
+      view.name(model.get("title") || "surface");
       readout.textContent = model.get("caption");
       colorBar(bar, model.get("bar"));
       view.points = model.get("points");
@@ -50,7 +74,8 @@ export default {
       still.alt = `${model.get("title")}, a still picture: this browser has no WebGL2`;
     };
     const on = {
-      "change:position": geometry, "change:color": color, "change:ghost_position": ghosts, "change:title": words,
+      "change:position": geometry, "change:color": color, "change:coordinate": color, "change:cell": color, "change:link": links, "change:link_values": links,
+      "change:ghost_position": ghosts, "change:title": words,
       "change:caption": words, "change:bar": words, "change:points": words, "change:still": picture,
       "change:turn": () => view.reset(model.get("turn")),
     };

@@ -2,41 +2,52 @@
 // its picture is copied: any number of views, in any number of cells, costs one context.
 
 const VERTEX = `#version 300 es
-in vec3 position, normal, color;
+in vec3 position, normal, color, coordinate;
 uniform mat3 turn;
 uniform vec3 centre;
-uniform vec4 place;
-uniform float depth, point;
-out vec3 n, c;
+uniform vec4 place, ball;
+uniform float depth;
+out vec3 n, c, q;
 void main() {
-  vec3 p = turn * (position - centre);
+  vec3 p = turn * ((ball.w > 0.0 ? ball.xyz + ball.w * position : position) - centre);
   n = turn * normal;
   c = color;
-  gl_Position = vec4(p.xy * place.xy + place.zw, -p.z * depth - (point > 0.0 ? 0.02 : 0.0), 1.0);
-  gl_PointSize = point;
+  q = coordinate;
+  gl_Position = vec4(p.xy * place.xy + place.zw, -p.z * depth, 1.0);
 }`;
 const FRAGMENT = `#version 300 es
 precision highp float;
-in vec3 n, c;
-uniform float opacity, point;
+in vec3 n, c, q;
+uniform float opacity, cell;
 out vec4 pixel;
 void main() {
-  if (point > 0.0) {
-    float r = length(gl_PointCoord - 0.5) * 2.0;
-    if (r > 1.0) discard;
-    pixel = vec4(r > 0.7 ? vec3(0.1) : c, 1.0);
-    return;
+  vec3 base = c;
+  if (cell > 0.0) { // a checkerboard of cubes in the space of the coordinates that the surface carries
+    vec3 at = floor(q / cell);
+    base *= mod(at.x + at.y + at.z, 2.0) < 0.5 ? 1.0 : 0.5;
   }
   vec3 N = normalize(n) * (gl_FrontFacing ? 1.0 : -1.0);
   vec3 key = normalize(vec3(-0.42, 0.55, 0.72));
   float wrap = clamp((dot(N, key) + 0.3) / 1.3, 0.0, 1.0), sky = 0.5 + 0.5 * N.y;
   float rim = pow(clamp(1.0 - N.z, 0.0, 1.0), 3.0);
   float gloss = pow(clamp(dot(N, normalize(key + vec3(0.0, 0.0, 1.0))), 0.0, 1.0), 40.0);
-  vec3 lit = c * (0.45 + 0.15 * sky + 0.52 * wrap) * (1.0 - 0.35 * rim) + 0.10 * gloss;
+  vec3 lit = base * (0.45 + 0.15 * sky + 0.52 * wrap) * (1.0 - 0.35 * rim) + 0.10 * gloss;
   pixel = vec4(clamp(lit, 0.0, 1.0) * opacity, opacity);
 }`;
 const CLAY = [0.8, 0.76, 0.7];
-const ATTRIBUTES = ["position", "normal", "color"];
+const ATTRIBUTES = ["position", "normal", "color", "coordinate"];
+
+// The unit sphere, whose vertices are their own normals.
+function ballMesh(rings = 10, around = 16) {
+  const P = [], T = [];
+  for (let i = 0; i <= rings; i++) for (let j = 0; j < around; j++) {
+    const a = (Math.PI * i) / rings, b = (2 * Math.PI * j) / around;
+    P.push(Math.sin(a) * Math.cos(b), Math.sin(a) * Math.sin(b), Math.cos(a));
+    const here = i * around + j, next = i * around + ((j + 1) % around);
+    if (i < rings) T.push(here, here + around, next, next, here + around, next + around);
+  }
+  return [new Float32Array(P), new Uint32Array(T)];
+}
 
 function shader(gl, kind, source) {
   const it = gl.createShader(kind);
@@ -58,7 +69,7 @@ function context() {
   gl.linkProgram(program);
   gl.useProgram(program);
   const at = {};
-  for (const name of ["turn", "centre", "place", "depth", "opacity", "point"]) at[name] = gl.getUniformLocation(program, name);
+  for (const name of ["turn", "centre", "place", "depth", "opacity", "ball", "cell"]) at[name] = gl.getUniformLocation(program, name);
   gl.enable(gl.DEPTH_TEST);
   return (globalThis.s4aContext = { gl, at });
 }
@@ -87,11 +98,13 @@ class Surface {
     this.opacity = opacity;
     this.position = new Float32Array();
     this.corner = new Uint32Array();
-    this.color = null;
+    this.color = this.coordinate = null;
+    this.cell = 0;
   }
   setMesh(position, corner) {
     this.corner = corner;
-    this.color = null;
+    this.color = this.coordinate = this.ring = null;
+    this.cell = 0;
     this.setPosition(position);
   }
   setPosition(position) {
@@ -103,6 +116,26 @@ class Surface {
     this.color = color && color.length === this.position.length ? color : null;
     this.stale = true;
   }
+  setTexture(coordinate, cell) {
+    this.coordinate = cell > 0 && coordinate && coordinate.length === this.position.length ? coordinate : null;
+    this.cell = this.coordinate ? cell : 0;
+    this.stale = true;
+  }
+  faceOf(vertex) { return Math.floor(this.corner.indexOf(vertex) / 3); }
+  neighbours(vertex) { // from a table of the corners at every vertex, made at first use
+    if (!this.ring) {
+      const start = new Uint32Array(this.position.length / 3 + 1), T = this.corner;
+      for (const v of T) start[v + 1]++;
+      for (let v = 1; v < start.length; v++) start[v] += start[v - 1];
+      const next = start.slice(), place = new Uint32Array(T.length);
+      T.forEach((v, i) => (place[next[v]++] = i));
+      this.ring = { start, place };
+    }
+    const { start, place } = this.ring, found = new Set();
+    for (let i = start[vertex]; i < start[vertex + 1]; i++) for (let m = 0; m < 3; m++) found.add(this.corner[place[i] - (place[i] % 3) + m]);
+    found.delete(vertex);
+    return [...found];
+  }
   upload(on) {
     const { gl } = on;
     if (this.on !== on) {
@@ -111,7 +144,7 @@ class Surface {
       this.buffers = [...ATTRIBUTES, "corner"].map(() => gl.createBuffer());
     }
     gl.bindVertexArray(this.array);
-    [this.position, this.normal, this.color].forEach((data, i) => {
+    [this.position, this.normal, this.color, this.coordinate].forEach((data, i) => {
       if (!data) return gl.disableVertexAttribArray(i);
       gl.bindBuffer(gl.ARRAY_BUFFER, this.buffers[i]);
       gl.bufferData(gl.ARRAY_BUFFER, data, gl.DYNAMIC_DRAW);
@@ -119,7 +152,7 @@ class Surface {
       gl.vertexAttribPointer(i, 3, data instanceof Uint8Array ? gl.UNSIGNED_BYTE : gl.FLOAT, data instanceof Uint8Array, 0, 0);
     });
     if (this.sent !== this.corner) {
-      gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.buffers[3]);
+      gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.buffers[ATTRIBUTES.length]);
       gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, this.corner, gl.STATIC_DRAW);
       this.sent = this.corner;
     }
@@ -130,9 +163,10 @@ class Surface {
     if (this.on !== on) this.sent = null;
     if (this.stale || this.on !== on) this.upload(on);
     gl.bindVertexArray(this.array);
-    gl.vertexAttrib3f(2, ...CLAY);
+    gl.vertexAttrib3f(2, ...(this.tint || CLAY));
     gl.uniform1f(at.opacity, this.opacity);
-    gl.uniform1f(at.point, 0);
+    gl.uniform1f(at.cell, this.cell);
+    gl.uniform4f(at.ball, ...(this.ball || [0, 0, 0, 0]));
     const triangles = () => gl.drawElements(gl.TRIANGLES, this.corner.length, gl.UNSIGNED_INT, 0);
     if (this.opacity < 1) { // first the depth alone, so that only what is in front shines through
       gl.colorMask(false, false, false, false);
@@ -145,6 +179,13 @@ class Surface {
       gl.disable(gl.BLEND);
       gl.depthFunc(gl.LESS);
     } else triangles();
+  }
+  balls(on, points) { // [x, y, z, red, green, blue, radius] each
+    for (const [x, y, z, r, g, b, radius] of points) {
+      this.ball = [x, y, z, radius];
+      this.tint = [r, g, b];
+      this.draw(on);
+    }
   }
   dispose() {
     if (!this.on) return;

@@ -8,11 +8,13 @@ function camera(name, turn) {
 
 class View {
   constructor(parent, { turn, group = "", height = 360, label = "surface", onPick, onHover }) {
-    Object.assign(this, { surfaces: [], points: [], onPick, onHover, group });
+    Object.assign(this, { surfaces: [], points: [], cursor: -1, onPick, onHover, group });
+    this.ball = new Surface();
+    this.ball.setMesh(...ballMesh());
     this.canvas = document.createElement("canvas");
     Object.assign(this.canvas, { className: "s4a-view", tabIndex: 0, view: this });
-    this.canvas.setAttribute("role", "img");
-    this.canvas.setAttribute("aria-label", `${label}: drag or arrow keys turn, wheel or + and - zoom, shift and drag move, 0 resets`);
+    this.canvas.setAttribute("role", onPick ? "application" : "img");
+    this.name(label);
     this.canvas.style.height = `${height}px`;
     parent.append(this.canvas);
     this.camera = camera(group, turn);
@@ -20,6 +22,10 @@ class View {
     this.observer = new ResizeObserver(() => this.redraw());
     this.observer.observe(this.canvas);
     this.listen();
+  }
+  name(label) {
+    const choose = this.onPick ? ", C starts a cursor that the arrow keys move over the surface, with shift by one edge, Enter picks its vertex, Escape ends it" : "";
+    this.canvas.setAttribute("aria-label", `${label}: drag or arrow keys turn, wheel or + and - zoom, shift and drag move, 0 resets${choose}`);
   }
   moved() { this.camera.views.forEach((view) => view.redraw()); }
   listen() {
@@ -51,7 +57,11 @@ class View {
       this.scale(Math.exp(-0.0015 * e.deltaY));
     }, { passive: false });
     canvas.addEventListener("keydown", (e) => {
-      const act = {
+      const way = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[e.key];
+      const act = (this.cursor >= 0 && {
+        Enter: () => this.onPick(this.hit(this.cursor)), " ": () => this.onPick(this.hit(this.cursor)), Escape: () => this.place(-1),
+        ...(way && { [e.key]: () => this.walk(...way, e.shiftKey) }),
+      }[e.key]) || (this.onPick && { c: () => this.start(), C: () => this.start() }[e.key]) || {
         ArrowLeft: () => this.rotate(-0.1, 0), ArrowRight: () => this.rotate(0.1, 0),
         ArrowUp: () => this.rotate(0, -0.1), ArrowDown: () => this.rotate(0, 0.1),
         "+": () => this.scale(1.1), "=": () => this.scale(1.1), "-": () => this.scale(1 / 1.1), 0: () => this.reset(),
@@ -61,6 +71,50 @@ class View {
       e.stopPropagation();
       act();
     });
+  }
+  // The cursor: a vertex of the first surface that the keyboard moves.
+  start() {
+    const surface = this.surfaces[0], R = this.camera.turn;
+    if (!surface?.position.length || !this.frame) return;
+    const { w, h } = this.placement(), box = this.canvas.getBoundingClientRect();
+    const middle = this.pick({ clientX: box.left + w / 2, clientY: box.top + h / 2 });
+    if (middle) return this.place(middle.vertex);
+    let best = 0, far = -Infinity; // nothing lies in the middle: what is nearest to the viewer
+    for (let i = 0, P = surface.position; i < P.length; i += 3) {
+      const z = R[6] * P[i] + R[7] * P[i + 1] + R[8] * P[i + 2];
+      if (z > far) [far, best] = [z, i / 3];
+    }
+    this.place(best);
+  }
+  place(vertex) {
+    this.cursor = vertex;
+    if (vertex >= 0) this.onHover?.(this.hit(vertex));
+    this.canvas.dataset.cursor = vertex;
+    this.redraw();
+  }
+  at(vertex) { return Array.from(this.surfaces[0].position.subarray(3 * vertex, 3 * vertex + 3)); }
+  hit(vertex) {
+    const face = this.surfaces[0].faceOf(vertex);
+    return { vertex, face, weights: [0, 1, 2].map((m) => +(this.surfaces[0].corner[3 * face + m] === vertex)), point: this.at(vertex) };
+  }
+  walk(x, y, fine) { // along edges, 3 % of the radius or one edge; the surface turns when its back is reached
+    const surface = this.surfaces[0], R = this.camera.turn, dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+    const d = [0, 1, 2].map((i) => x * R[i] + y * R[3 + i]);
+    let here = this.cursor, gone = 0;
+    while (gone < 0.03 * this.frame.radius) {
+      const N = Array.from(surface.normal.subarray(3 * here, 3 * here + 3)), P = this.at(here), along = d.map((v, i) => v - dot(d, N) * N[i]);
+      let best = -1, most = 0.3 * Math.hypot(...along), length = 0;
+      for (const v of surface.neighbours(here)) {
+        const e = this.at(v).map((p, i) => p - P[i]), long = Math.hypot(...e) || 1;
+        if (dot(e, along) / long > most) [best, most, length] = [v, dot(e, along) / long, long];
+      }
+      if (best < 0) break;
+      here = best;
+      gone += length;
+      if (fine) break;
+    }
+    if (dot(Array.from(surface.normal.subarray(3 * here, 3 * here + 3)), R.slice(6)) < 0.35) this.rotate(-0.2 * x, 0.2 * y);
+    this.place(here);
   }
   rotate(a, b) {
     const [r, u, t] = [0, 3, 6].map((i) => this.camera.turn.slice(i, i + 3));
@@ -120,20 +174,11 @@ class View {
     gl.uniform4f(at.place, (2 * scale) / w, (2 * scale) / h, (2 * x) / w, (2 * y) / h);
     gl.uniform1f(at.depth, 1 / (4 * this.frame.radius));
     [...this.surfaces].sort((a, b) => b.opacity - a.opacity).forEach((surface) => surface.draw(on));
-    this.drawPoints(on, smooth * ratio);
+    this.ball.balls(on, this.points);
+    if (this.cursor >= 0 && 3 * this.cursor < this.surfaces[0].position.length) this.ball.balls(on, [[...this.at(this.cursor), 0.84, 0.37, 0, 0.018 * this.frame.radius]]);
     if (this.canvas.width !== width || this.canvas.height !== height) Object.assign(this.canvas, { width, height });
     this.canvas.getContext("2d").drawImage(gl.canvas, 0, gl.canvas.height - H, W, H, 0, 0, width, height);
     this.frames = (this.frames || 0) + 1;
-  }
-  drawPoints({ gl, at }, ratio) { // [x, y, z, red, green, blue, pixels] each; few
-    gl.bindVertexArray(null);
-    for (const [x, y, z, r, g, b, size] of this.points) {
-      gl.vertexAttrib3f(0, x, y, z);
-      gl.vertexAttrib3f(1, 0, 0, 1);
-      gl.vertexAttrib3f(2, r, g, b);
-      gl.uniform1f(at.point, (size || 12) * ratio);
-      gl.drawArrays(gl.POINTS, 0, 1);
-    }
   }
   // What of the first surface lies under the pointer: triangle, weights, nearest corner and point; null for a miss.
   pick(e) {
@@ -171,7 +216,7 @@ class View {
     clearTimeout(this.resting);
     this.camera.views.delete(this);
     if (!this.camera.views.size && this.group) globalThis.s4aCameras.delete(this.group);
-    this.surfaces.forEach((surface) => surface.dispose());
+    [...this.surfaces, this.ball].forEach((surface) => surface.dispose());
     this.canvas.remove();
   }
 }
