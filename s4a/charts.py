@@ -1,6 +1,7 @@
 """Charts of a study's numbers; every function takes arrays and gives a matplotlib Figure."""
 
 import io
+import re
 
 import numpy as np
 from matplotlib import rc_context
@@ -105,6 +106,48 @@ def surfaces(meshes, values=None, *, limit=None, label="", columns=4, flat=False
     return figure
 
 
+def brief(names, room=16):
+    """Names as short as they can be told apart: what all share at both ends is left out where one is long.
+
+    Examples
+    --------
+    >>> brief(["brain_01", "brain_02"]), brief(["subject_0001_left_hippocampus", "subject_0020_left_hippocampus"])
+    (['brain_01', 'brain_02'], ['…0001…', '…0020…'])
+    """
+    if max(map(len, names), default=0) <= room:
+        return list(names)
+
+    def shared(texts):
+        low, high = min(texts), max(texts)
+        n = next((i for i, (a, b) in enumerate(zip(low, high, strict=False)) if a != b), len(low))
+        return len(re.match(r"(.*[_\W])?", low[:n], re.DOTALL)[0])  # up to a separator
+
+    start = shared(names)
+    stop = shared([name[start:][::-1] for name in names])
+    found = ["…" * (start > 0) + name[start : len(name) - stop] + "…" * (stop > 0) for name in names]
+    return [name if len(name) <= room else f"{name[: room // 2 - 1]}…{name[-room // 2 :]}" for name in found]
+
+
+def _names(ax, places, names, size=6):
+    """Names beside their points, each where it hides no other; one that finds no place is left out."""
+    figure = ax.figure.get_size_inches() * 72 / [len(ax.figure.axes), 1]  # in points, as fonts are
+    span = np.ptp(places, axis=0)
+    at = (places - places.min(0)) / np.where(span > 0, span, 1) * 0.68 * figure
+    room = (-0.06 * figure[0], 0.74 * figure[0])
+    taken = [(x - 3, y - 3, x + 3, y + 3) for x, y in at]
+    for i, (name, (x, y)) in enumerate(zip(brief(names), at, strict=True)):
+        wide = 0.58 * size * len(name)
+        for left, down in ((3, 3), (-3 - wide, 3), (3, -3 - size), (-3 - wide, -3 - size)):
+            a, b, c, d = x + left, y + down, x + left + wide, y + down + size
+            inside = room[0] <= a and c <= room[1]
+            if inside and all(j == i or c < p or r < a or d < q or s < b for j, (p, q, r, s) in enumerate(taken)):
+                taken.append((a, b, c, d))
+                look = {"fontsize": size, "color": "#333333", "zorder": 4, "parse_math": False}
+                side = "left" if left > 0 else "right"
+                ax.annotate(name, places[i], (np.copysign(3, left), down), textcoords="offset points", ha=side, **look)
+                break
+
+
 def network(places, names, source, target, errors, highlight=None):
     """The graph of maps, once for each named array of edge errors, on one colour scale.
 
@@ -133,18 +176,7 @@ def network(places, names, source, target, errors, highlight=None):
         ax.scatter(*places.T, s=22, color="#333333", zorder=2)
         if highlight is not None:
             ax.scatter(*places[highlight], s=90, facecolor="none", edgecolor=ORANGE, linewidth=2, zorder=3)
-        if len(names) <= 60:
-            for place, name in zip(places, names, strict=True):
-                ax.annotate(
-                    name,
-                    place,
-                    (3, 4),
-                    textcoords="offset points",
-                    fontsize=6,
-                    color="#333333",
-                    zorder=4,
-                    parse_math=False,
-                )
+        _names(ax, places, names)
         ax.set_title(f"{title}, median {np.nanmedian(value):.3g}" if np.isfinite(value).any() else title)
         ax.margins(0.12)
         ax.set_axis_off()
@@ -170,7 +202,7 @@ def ranked(names, values, label, highlight=None):
     figure, (ax,) = _figure(7.5, max(1.4, 0.5 + 0.17 * len(values)))
     place = np.arange(len(order))
     ax.barh(place, values[order], color=[ORANGE if i == highlight else BLUE for i in order], height=0.75)
-    ax.set_yticks(place, [names[i] for i in order], fontsize=7, parse_math=False)
+    ax.set_yticks(place, np.array(brief(names), object)[order], fontsize=7, parse_math=False)
     ax.invert_yaxis()
     ax.margins(y=0.01)
     ax.set_xlabel(label)
@@ -202,11 +234,7 @@ def scores(score, names, highlight=None):
         ax.axvline(0, color="#dddddd", lw=1)
         colors = [ORANGE if i == highlight else BLUE for i in range(len(score))]
         ax.scatter(score[:, a], score[:, b], color=colors, s=20, zorder=2)
-        if len(names) <= 60:
-            for name, x, y in zip(names, score[:, a], score[:, b], strict=True):
-                ax.annotate(
-                    name, (x, y), (3, 3), textcoords="offset points", fontsize=6, color="#333333", parse_math=False
-                )
+        _names(ax, score[:, [a, b]], names)
         ax.set(xlabel=f"component {a + 1} (sd)", ylabel=f"component {b + 1} (sd)")
         ax.margins(0.12)
     return figure
@@ -234,7 +262,9 @@ def from_spec(spec, values=()):
         return matrices({spec["title"]: np.reshape(values, (spec["rows"], spec["columns"]))}, spec["limit"])
     figure, (ax,) = _figure(5, 3.6)
     if kind == "bars":
-        ax.barh(spec["names"], spec["values"], color=BLUE)
+        place = np.arange(len(spec["names"]))
+        ax.barh(place, spec["values"], color=BLUE)
+        ax.set_yticks(place, brief(spec["names"]), parse_math=False)
         ax.invert_yaxis()
     if kind == "lines":
         for one in spec["series"]:
@@ -246,7 +276,6 @@ def from_spec(spec, values=()):
         ax.set_axis_off()
     if kind in ("graph", "scatter"):
         ax.scatter(spec["x"], spec["y"], color=BLUE, zorder=2)
-        for name, x, y in zip(spec["names"], spec["x"], spec["y"], strict=True):
-            ax.annotate(name, (x, y), (3, 3), textcoords="offset points", fontsize=6, parse_math=False)
+        _names(ax, np.stack([spec["x"], spec["y"]], axis=1), spec["names"])
     ax.set(title=spec.get("title", ""), xlabel=spec.get("xlabel", spec.get("label", "")), ylabel=spec.get("ylabel", ""))
     return figure

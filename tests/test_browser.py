@@ -41,7 +41,7 @@ PROGRESS = """
 import s4a
 from s4a.widgets import Progress
 
-Progress(s4a.synthetic.brains(3, 12000, seed=1), {store!r}, n_coarse=300, k=12, k_init=6, n_jobs=1)
+Progress(s4a.synthetic.brains(3, 8000, seed=1), {store!r}, n_coarse=300, k=12, k_init=6, n_jobs=1)
 """
 
 
@@ -331,7 +331,7 @@ def test_the_checkerboard_is_drawn(page):
     canvas = visible(page, VIEW).nth(1)
     before = pixels(canvas)
     visible(page, "select").filter(has_text="checkerboard").select_option("checkerboard")
-    page.wait_for_function(f"{SEEN}.some((view) => view.surfaces[0]?.cell > 0)")
+    page.wait_for_function(f"{SEEN}.every((view) => view.surfaces[0].cell > 0)")
     assert pixels(canvas) != before
 
 
@@ -447,8 +447,13 @@ def test_the_page_deforms_without_kernel_and_network(offline, study, tmp_path):
     page.close()
 
 
-def test_the_page_of_a_study_has_live_sliders(offline, study, tmp_path):
-    page, errors = opened(offline, s4a.write_page(study, tmp_path / "study.html"))
+@pytest.fixture(scope="module")
+def study_page(study, tmp_path_factory):
+    return s4a.write_page(study, tmp_path_factory.mktemp("page") / "study.html")
+
+
+def test_the_page_of_a_study_has_live_sliders(offline, study, study_page):
+    page, errors = opened(offline, study_page)
     page.wait_for_function(DRAWN)
     check_sliders(page, study)
     assert not page.locator("#modes-instead").is_visible()
@@ -562,8 +567,8 @@ def test_the_page_of_a_transfer_says_what_needs_python(offline, study, tmp_path)
     page.close()
 
 
-def test_without_webgl_pages_have_still_pictures(flat, study, tmp_path):
-    for path in (saved(widgets.Modes(study), tmp_path / "modes.html"), s4a.write_page(study, tmp_path / "study.html")):
+def test_without_webgl_pages_have_still_pictures(flat, study, study_page, tmp_path):
+    for path in (saved(widgets.Modes(study), tmp_path / "modes.html"), study_page):
         page, errors = opened(flat, path)
         page.wait_for_function("[...document.querySelectorAll('img')].some((i) => i.naturalWidth > 100)")
         assert visible(page, VIEW).count() == 0

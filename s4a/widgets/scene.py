@@ -32,6 +32,7 @@ class Surfaces:
         """Show a surface ``(n, 3)``, ``(m, 3)`` with colours ``(n, 3)``; what was marked is forgotten."""
         self.surface = np.asarray(points), np.asarray(triangles)
         self.painted, self.texture = colors, None
+        self.radius = extent(self.surface[0]) / 100
         self.unlink()
         if title is not None:
             self.title = title
@@ -61,7 +62,7 @@ class Surfaces:
         """
         points = np.asarray(points, float).reshape(-1, 3)
         colors = np.broadcast_to(np.asarray(colors, float), (len(points), 3))
-        self.radius = float(extent(self.surface[0]) / 100 if radius is None else radius)
+        self.radius = self.radius if radius is None else float(radius)
         self.points = [[*p, *c, self.radius] for p, c in zip(points.tolist(), colors.tolist(), strict=True)]
 
     def picture(self):

@@ -54,7 +54,7 @@ class Transfer(Panel):
         self.path = ipywidgets.Text("landmarks.csv", description="file", layout={"width": "260px"})
         self.csv = ipywidgets.Button(description="Save CSV", tooltip="the landmarks on the target")
         self.radius = ipywidgets.BoundedFloatText(
-            1, min=0, max=np.inf, step=0.5, description="radius", tooltip="of the spheres", layout={"width": "180px"}
+            1, min=0, max=1e9, step=0.5, description="radius", tooltip="of the spheres", layout={"width": "180px"}
         )
         self.legend, self.table = ipywidgets.HTML(), ipywidgets.HTML()
         group = camera_group()
@@ -69,7 +69,7 @@ class Transfer(Panel):
         self.remove.on_click(self.guarded(lambda _: self.drop(self.landmark)))
         self.csv.on_click(self.guarded(lambda _: self.say(f"written: {self.save_csv(self.path.value)}")))
         size = extent(self.study["registration"]["position"].values)
-        self.radius.value, self.radius.description = nice(size / 80), f"radius ({unit_of(self.study, template)})"
+        self.radius.value, self.radius.description = nice(size / 60), f"radius ({unit_of(self.study, template)})"
         self.radius.style.description_width = "initial"
         self.on_change(self.radius, lambda _: self.carry())
         with self.hold_trait_notifications():

@@ -38,6 +38,37 @@ function plot(parent, { width, height, x, y, xlabel = "", ylabel = "", title = "
   return { svg, X, Y, left, right, top, bottom };
 }
 
+// Names as short as they can be told apart: what all share at both ends is left out where one is long.
+function brief(names, room = 16) {
+  if (Math.max(...names.map((name) => name.length)) <= room) return names;
+  const shared = (texts) => {
+    let n = 0;
+    while (texts.every((text) => n < text.length && text[n] === texts[0][n])) n++;
+    return texts[0].slice(0, n).match(/^(.*[_\W])?/s)[0].length; // up to a separator
+  };
+  const start = shared(names), stop = shared(names.map((name) => [...name.slice(start)].reverse().join("")));
+  return names.map((name) => {
+    const text = `${start ? "…" : ""}${name.slice(start, name.length - stop)}${stop ? "…" : ""}`;
+    return text.length <= room ? text : `${text.slice(0, room / 2 - 1)}…${text.slice(-room / 2)}`;
+  });
+}
+
+// Names beside their marks, each where it hides nothing; one that finds no place is left to the hover and the focus.
+function labels(svg, { x, y, names, width, height, sides, letter = 5.3, gap = 7, ...look }) {
+  const taken = x.map((v, i) => [v - 6, y[i] - 6, v + 6, y[i] + 6]);
+  brief(names).forEach((text, i) => {
+    const wide = letter * text.length;
+    for (const [right, down] of sides ? sides(i) : [[1, -4], [-1, -4], [1, 12], [-1, 12]]) {
+      const left = right > 0 ? x[i] + gap : x[i] - gap - wide, low = y[i] + down, box = [left, low - 9, left + wide, low + 2];
+      if (box[0] < 0 || box[2] > width || box[1] < 0 || box[3] > height) continue;
+      if (taken.some((other, j) => j !== i && box[0] < other[2] && other[0] < box[2] && box[1] < other[3] && other[1] < box[3])) continue;
+      taken.push(box);
+      node(svg, "text", { x: x[i] + right * gap, y: low, "text-anchor": right > 0 ? "start" : "end", ...look }, text);
+      return;
+    }
+  });
+}
+
 // Makes marks focusable: one tab stop, the arrow keys go on, Enter picks; the text of a mark is read out below.
 function reachable(marks, readout, pick) {
   marks.forEach(({ at, text, value }, i) => {
@@ -72,9 +103,9 @@ function scatter(parent, spec, pick) {
   const frame = plot(parent, { width, height, x: bounds([...x, ...(spec.reach || [0])]), y: bounds([...y, ...(spec.reach || [0])]), xlabel, ylabel, title });
   const marks = x.map((_, i) => {
     const at = node(frame.svg, "circle", { cx: frame.X(x[i]), cy: frame.Y(y[i]), r: i === selected ? 7 : 5, fill: i === selected ? ORANGE : BLUE, stroke: "#fff" });
-    if (names.length <= 60) node(frame.svg, "text", { x: frame.X(x[i]) + 7, y: frame.Y(y[i]) - 4, class: "s4a-small" }, names[i]);
     return { at, value: { index: i, name: names[i] }, text: `${names[i]}: ${short(x[i])}, ${short(y[i])}` };
   });
+  labels(frame.svg, { x: x.map(frame.X), y: y.map(frame.Y), names, width, height: frame.bottom, class: "s4a-small" });
   const cross = node(frame.svg, "path", { d: "M-7 0H7M0 -7V7", stroke: ORANGE, "stroke-width": 2, visibility: "hidden", class: "s4a-cross" });
   reachable(marks, line(parent), pick);
   return (a, b) => {
@@ -84,15 +115,15 @@ function scatter(parent, spec, pick) {
 }
 
 function bars(parent, spec, pick) {
-  const { values, names, label, title, marked = [], selected = -1, width = 430 } = spec;
-  const row = values.length > 25 ? 15 : 20, height = 26 + row * values.length + 40, left = 10 + 6.5 * Math.max(...names.map((n) => n.length), 4);
+  const { values, names, label, title, marked = [], selected = -1, width = 430 } = spec, told = brief(names);
+  const row = values.length > 25 ? 15 : 20, height = 26 + row * values.length + 40, left = 10 + 6.5 * Math.max(...told.map((n) => n.length), 4);
   const frame = plot(parent, { width, height, left, x: [0, Math.max(...values) * 1.18 || 1], y: [0, 1], xlabel: label, title, grid: false });
   frame.svg.querySelectorAll("text[text-anchor=end]").forEach((t) => t.remove());
   const marks = values.map((v, i) => {
     const top = frame.top + 2 + i * row;
     const at = node(frame.svg, "rect", { x: left, y: top, width: Math.max(1, frame.X(v) - left), height: row - 4, fill: marked.includes(i) ? ORANGE : BLUE });
     if (i === selected) Object.entries({ stroke: INK, "stroke-width": 2.5 }).forEach(([k, s]) => at.setAttribute(k, s));
-    node(frame.svg, "text", { x: left - 4, y: top + row - 8, "text-anchor": "end" }, names[i]);
+    node(frame.svg, "text", { x: left - 4, y: top + row - 8, "text-anchor": "end" }, told[i]);
     node(frame.svg, "text", { x: frame.X(v) + 4, y: top + row - 8 }, short(v));
     return { at, value: { index: i, name: names[i] }, text: `${names[i]}: ${v.toPrecision(4)}` };
   });
@@ -127,7 +158,8 @@ function graph(parent, spec, pick) {
   svg.style.maxWidth = `${width}px`;
   node(svg, "text", { x: 8, y: 14, "font-weight": "bold" }, title);
   const [x0, x1] = bounds(x, 0), [y0, y1] = bounds(y, 0);
-  const X = x.map((v) => 80 + ((v - x0) / (x1 - x0 || 1)) * (width - 160)), Y = y.map((v) => height - 25 - ((v - y0) / (y1 - y0 || 1)) * (height - 75));
+  const edgeRoom = 20 + 6.4 * Math.max(...brief(names).map((n) => n.length));
+  const X = x.map((v) => edgeRoom + ((v - x0) / (x1 - x0 || 1)) * (width - 2 * edgeRoom)), Y = y.map((v) => height - 25 - ((v - y0) / (y1 - y0 || 1)) * (height - 75));
   const marks = source.map((s, i) => { // the two directions of a pair bend to either side
     const t = target[i], dx = X[t] - X[s], dy = Y[t] - Y[s], bend = spec.both === false ? 0 : 0.06;
     const d = `M${X[s]} ${Y[s]}Q${(X[s] + X[t]) / 2 - bend * dy} ${(Y[s] + Y[t]) / 2 + bend * dx} ${X[t]} ${Y[t]}`;
@@ -144,11 +176,13 @@ function graph(parent, spec, pick) {
     const at = node(svg, "g", { "data-node": i });
     if (i === highlight) node(at, "circle", { cx: X[i], cy: Y[i], r: 12, fill: "none", stroke: ORANGE, "stroke-width": 3 });
     node(at, "circle", { cx: X[i], cy: Y[i], r: 8, fill: i === chosen ? ORANGE : INK, stroke: "#fff" });
-    const side = X[i] < width / 2 - 20 ? -1 : 1; // names stand outside of the ring
-    const place = { x: X[i] + 12 * side, y: Y[i] + (Y[i] < height / 2 ? -5 : 13), "text-anchor": side < 0 ? "end" : "start" };
-    if (names.length <= 60) node(svg, "text", { ...place, class: "s4a-halo" }, name);
     return { at, value: { node: name }, text: i === highlight ? `${name}, the median` : name };
   }));
+  const sides = (i) => { // names stand outside of the ring
+    const out = X[i] < width / 2 - 20 ? -1 : 1, down = Y[i] < height / 2 ? -5 : 13;
+    return [[out, down], [out, 4], [-out, down]];
+  };
+  labels(svg, { x: X, y: Y, names, width, height, sides, letter: 6.4, gap: 12, class: "s4a-halo" });
   reachable([...marks.slice(source.length), ...marks.slice(0, source.length)], line(parent), pick);
 }
 

@@ -6,7 +6,7 @@ export default {
       model.set(name, { ...(hit || { vertex: -1 }), count: (model.get(name).count || 0) + 1 });
       model.save_changes();
     };
-    let hovered = 0, link = null, values = null;
+    let hovered = 0, later = 0, link = null, values = null;
     // The image of a vertex on the other view of the group: marked at once, without a kernel.
     const carry = (hit) => {
       if (!link || !hit || hit.vertex < 0 || hit.vertex >= link.length) return;
@@ -25,10 +25,10 @@ export default {
       turn: model.get("turn"), group: model.get("group"), height: model.get("height"), label: model.get("title"),
       onPick: model.get("clickable") && ((hit) => { carry(hit); send("picked", hit); }),
       onHover: model.get("clickable") && ((hit) => {
-        if (!model.get("hovering") || Date.now() - hovered < 120) return;
-        hovered = Date.now();
+        if (!model.get("hovering")) return;
         carry(hit);
-        send("hovered", hit);
+        clearTimeout(later); // the kernel hears of eight places a second, and of the last
+        later = setTimeout(() => { hovered = Date.now(); send("hovered", hit); }, Math.max(0, 120 + hovered - Date.now()));
       }),
     });
     const still = html(el, "img", { alt: "", class: "s4a-still" }), bar = html(el, "div"), readout = html(el, "div", { class: "s4a-readout", "aria-live": "polite" });
@@ -90,6 +90,7 @@ export default {
       model.save_changes();
     }
     return () => {
+      clearTimeout(later);
       Object.entries(on).forEach(([event, act]) => model.off(event, act));
       view.dispose();
     };
