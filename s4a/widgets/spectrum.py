@@ -91,7 +91,7 @@ class Spectrum(Panel):
                 xlabel="mode k",
                 ylabel=label,
                 title=TITLES[away],
-                legend="bottom",
+                legend="left" if away else "bottom",
             )
 
     def curve(self, i, away):

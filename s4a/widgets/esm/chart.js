@@ -142,9 +142,9 @@ function lines(parent, spec, pick) {
     if (s.dots) s.x.forEach((v, i) => node(at, "circle", { cx: frame.X(v), cy: frame.Y(s.y[i]), r: 3.2 }));
     return { at, value: { series: s.name }, text: s.text || s.name };
   });
-  const told = series.filter((s) => s.legend), below = spec.legend === "bottom";
+  const told = series.filter((s) => s.legend), below = Boolean(spec.legend);
   told.forEach((s, i) => {
-    const x0 = below ? frame.right - 130 : frame.left + 10, y0 = below ? frame.bottom - 15 * (told.length - i) : frame.top + 10 + 15 * i;
+    const x0 = spec.legend === "bottom" ? frame.right - 130 : frame.left + 10, y0 = below ? frame.bottom - 15 * (told.length - i) : frame.top + 10 + 15 * i;
     node(frame.svg, "line", { x1: x0, x2: x0 + 24, y1: y0, y2: y0, stroke: s.color || BLUE, "stroke-width": 2, "stroke-dasharray": s.dash || "" });
     node(frame.svg, "text", { x: x0 + 30, y: y0 + 4, class: "s4a-halo" }, s.name);
   });
