@@ -362,6 +362,8 @@ def test_nothing_is_cut_off_at_800_pixels(page):
     for title in ("Network", "Modes"):
         open_tab(page, title)
         page.wait_for_timeout(300)
+        for label in page.locator(".s4a-tabs .lm-TabBar-tabLabel").all():
+            assert label.evaluate("(e) => e.scrollWidth <= e.clientWidth + 1"), label.inner_text()
         assert visible(page, ".s4a").count() > 0
         for part in visible(page, ".s4a").all():
             assert part.evaluate("(e) => e.scrollWidth <= e.clientWidth + 2")

@@ -42,6 +42,7 @@ class Explore(ipywidgets.VBox):
     def __init__(self, study, **options):
         self.study, self.options, self.panels = study, options, {}
         self.tabs = ipywidgets.Tab(children=[ipywidgets.VBox() for _ in PANELS], titles=list(PANELS))
+        self.tabs.add_class("s4a-tabs")  # in style.css
         super().__init__([self.tabs], layout=LAYOUT)
         self.tabs.observe(self.fill, "selected_index")
         self.fill()
