@@ -116,8 +116,8 @@ def consistent_zoomout(
     """Consistent ZoomOut: latent basis -> matches -> larger maps, until all maps of the network are k x k.
 
     Each round embeds every shape in the latent space (rows of Phi_i Y_i), matches nearest neighbours for every map
-    (eq. 3) and solves for the next larger maps in the least-squares sense, on `samples` only; the factor of the
-    least squares is made once per shape.  The last round uses all vertices.
+    (eq. 3) and solves for the next larger maps in the least-squares sense, on `samples` of the target only; the factor
+    of the least squares is made once per shape.  The last round uses all vertices.
 
     Parameters
     ----------
@@ -127,7 +127,8 @@ def consistent_zoomout(
     area : list of float ndarray (n_i,), each of sum 1
     eigenvalues : float ndarray (n, >= k)
     samples : list of int ndarray, optional
-        Spread vertices of every shape; all vertices by default.
+        Spread vertices of every shape; all vertices by default.  Their neighbours are looked for among all vertices of
+        the source: among its samples they would be off by the spacing of these, which costs eq. 7 a third.
     n_jobs : int
         Threads; the result does not depend on it.
     progress : callable, optional
@@ -153,14 +154,14 @@ def consistent_zoomout(
         if larger is None:
             break
         vertices = everything if samples is None or larger == k else samples
-        points = [np.asarray(Phi[i][v, :size] @ Y[i], np.float32) for i, v in enumerate(vertices)]
+        points = [np.asarray(F[:, :size] @ y, np.float32) for F, y in zip(Phi, Y, strict=True)]
         solve = [
             np.linalg.pinv(Phi[i][v, :larger] * np.sqrt(area[i][v])[:, None]) * np.sqrt(area[i][v])
             for i, v in enumerate(vertices)
         ]
 
         def larger_map(i, j, points=points, solve=solve, vertices=vertices, larger=larger):
-            match = vertices[i][nearest_rows(points[j], points[i])]
+            match = nearest_rows(points[j][vertices[j]], points[i])
             return solve[j] @ Phi[i][match, :larger]
 
         C = np.stack(
