@@ -82,6 +82,29 @@ def intrinsic_match(source, target, F_source, F_target):
     return nearest_in_cells(Q, target.cell, D, source.cell)
 
 
+def sharpened(C, Phi_source, Phi_target, area_target, U_source, cell_source):
+    """One more round of ZoomOut in which the target's coarse vertices look among all vertices of the source.
+
+    ZoomOut on the coarse meshes can only match coarse vertices, half their spacing off; that noise is in its C.
+
+    Parameters
+    ----------
+    C : float ndarray (k_target, k_source)
+    Phi_source, Phi_target : float ndarray (n_coarse, >= k)
+    area_target : float ndarray (n_coarse_target,), of sum 1
+    U_source : sparse matrix (n_source, n_coarse_source)
+    cell_source : int ndarray (n_source,)
+
+    Returns
+    -------
+    C : float ndarray (k_target, k_source)
+    """
+    k_target, k_source = C.shape
+    Phi, Psi = Phi_source[:, :k_source], Phi_target[:, :k_target]
+    match = nearest_in_cells(Psi, np.arange(len(Psi)), U_source @ (Phi @ C.T), cell_source)[0]
+    return Psi.T @ (area_target[:, None] * (U_source[match] @ Phi))
+
+
 def register(source, target, match_low, embeddings, *, k=100, refine="joint"):
     """Registers the target (the template) to the source at full resolution.
 
@@ -104,6 +127,11 @@ def register(source, target, match_low, embeddings, *, k=100, refine="joint"):
         low resolution.
     """
     low = {} if refine == "intrinsic" else joint.candidates(source.low, target.low, match_low, k=k)
+    return at_full_resolution(source, target, low, embeddings)
+
+
+def at_full_resolution(source, target, low, embeddings):
+    """Second half of :func:`register`, from the candidates `low` of :func:`s4a.joint.candidates`, or none."""
     info = {f"score_{name}": score for name, (score, *_) in low.items()}
     dense = {}
     for name in joint.finalists(low) if low else ["intrinsic"]:
@@ -284,6 +312,7 @@ def match_scans(source, target, *, k_init=20, k=100, init="dense", refine="joint
     C0 = first_map(*((s.low.X, s.low.area, s.low.Phi, s.eigenvalue) for s in (M, N)), motion, k_init=k_init, init=init)
     k = min(k, M.low.Phi.shape[1], N.low.Phi.shape[1])
     C, match_low = fmap.zoomout(C0, M.low.Phi, N.low.Phi, N.low.area, k)
+    C = sharpened(C, M.low.Phi, N.low.Phi, N.low.area, M.U, M.cell)
     near = cKDTree(M.low.X @ motion[0].T + motion[1]).query(N.low.X)[1]
     starts = {"intrinsic": match_low, "icp": near}
     embeddings = M.low.Phi[:, :k] @ C.T, N.low.Phi[:, :k]
