@@ -8,6 +8,7 @@ reading and cleaning      :func:`read_shapes`, :func:`clean`, :func:`write_mesh`
 3.3 spectrum              :func:`spectrum`, :func:`reconstruct`
 4.1 pairs                 :func:`match_pair`
 5.1 metrics               :mod:`s4a.metrics`
+5.2, 5.3 comparison       :mod:`s4a.compare`
 4.2, 6.1 collections      :func:`analyse`, :func:`open_study`, :func:`synthesize`
 notebooks                 :func:`explore`
 new shapes                :func:`insert`
@@ -21,7 +22,7 @@ the embedded collection   :mod:`s4a.synthetic`
 
 from importlib.metadata import version
 
-from s4a import metrics, statistics, synthetic
+from s4a import compare, metrics, statistics, synthetic
 from s4a.accessor import explore
 from s4a.clean import clean
 from s4a.export import write_registered, write_training_set
@@ -42,6 +43,7 @@ __all__ = [
     "analyse",
     "clean",
     "coarsen",
+    "compare",
     "explore",
     "insert",
     "match_pair",

@@ -15,6 +15,7 @@ from s4a.draw import SIGNED, render, signed_colors
 from s4a.mesh import as_arrays
 
 BLUE, ORANGE, GREY = "#0072b2", "#d55e00", "#777777"
+PARTS = ("#bbbbbb", "#e69f00", "#009e73", BLUE, "#cc79a7", ORANGE, "#56b4e9", "#f0e442")
 LOOK = {
     "font.size": 9,
     "axes.spines.top": False,
@@ -206,6 +207,28 @@ def ranked(names, values, label, highlight=None):
     ax.invert_yaxis()
     ax.margins(y=0.01)
     ax.set_xlabel(label)
+    return figure
+
+
+def stacked(names, parts, seconds):
+    """Bars of seconds stacked by part, one for each name, the total at their end (Fig. 3).
+
+    Parameters
+    ----------
+    names, parts : sequence of str
+    seconds : float ndarray (name, part)
+    """
+    figure, (ax,) = _figure(8, 0.45 * len(names) + 1.4)
+    left = np.zeros(len(names))
+    for i, (part, length) in enumerate(zip(parts, np.transpose(seconds), strict=True)):
+        ax.barh(np.arange(len(names)), length, left=left, height=0.65, label=part, color=PARTS[i % len(PARTS)])
+        left = left + length
+    for place, total in enumerate(left):
+        ax.annotate(f"{total:.3g} s", (total, place), (4, 0), textcoords="offset points", va="center", fontsize=8)
+    ax.set_yticks(np.arange(len(names)), names, parse_math=False)
+    ax.invert_yaxis()
+    ax.set(xlabel="CPU time (s)", xlim=(0, 1.12 * left.max(initial=0) or 1))
+    figure.legend(loc="outside lower center", ncols=4, frameon=False)
     return figure
 
 

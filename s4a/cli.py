@@ -1,4 +1,4 @@
-"""Command line: ``s4a check | run | statistics | insert | transfer | view | demo``.
+"""Command line: ``s4a check | run | statistics | insert | transfer | compare | view | demo``.
 
 Every option of :func:`s4a.analyse` is a flag of run.
 """
@@ -16,14 +16,15 @@ from pathlib import Path
 import numpy as np
 from joblib import parallel_config
 
-from s4a import accuracy, synthetic
+from s4a import accuracy, charts, synthetic
+from s4a import compare as comparison
 from s4a import statistics as tests
 from s4a import transfer as travel
 from s4a.annotations import labels_of_file, labels_of_mesh, read_labels, read_landmarks, write_landmarks
 from s4a.draw import VIEWS
 from s4a.export import write_registered, write_results
 from s4a.insert import insert as place
-from s4a.io import read_mesh
+from s4a.io import find_meshes, read_mesh
 from s4a.mesh import as_arrays, vertex_areas
 from s4a.options import CHOICES, DEFAULTS
 from s4a.pca import mahalanobis
@@ -441,6 +442,104 @@ def file_points(mesh):
     return points
 
 
+TRUTH = "for each target, NPY or text: per vertex of its file that of the source's (from 0; -1: none), or x, y, z"
+METRICS = {
+    "geodesic_error": ("error %", 100, 3),
+    "straight_error": ("straight %", 100, 3),
+    "chamfer": ("Chamfer %", 100, 3),
+    "hausdorff": ("Hausdorff %", 100, 2),
+    "dirichlet": ("Dirichlet", 1, 2),
+    "coverage": ("coverage", 1, 3),
+    "bijectivity": ("round trip %", 100, 3),
+    "conformal_distortion": ("conformal", 1, 3),
+    "area_distortion": ("area", 1, 3),
+    "label_accuracy": ("labels", 1, 3),
+    "landmark_error": ("landmarks %", 100, 2),
+}
+
+
+def comparison_table(found):
+    """Table 1: mean over the pairs of every metric, and the CPU seconds; lengths in % of sqrt(area)."""
+    mean = found.mean("pair")
+    columns = {name: column for name, column in METRICS.items() if name in mean}
+    rows = []
+    for way in mean["way"].values:
+        one = mean.sel(way=way)
+        row = [f"{scale * one[name].item():.{digits}f}" for name, (_, scale, digits) in columns.items()]
+        rows.append([way, f"{one['block_seconds'].sum().item():.1f}", *row])
+    return table(rows, ["method", "CPU s", *(title for title, *_ in columns.values())])
+
+
+def block_table(ways, blocks, seconds):
+    """CPU seconds of every method by block (Fig. 3)."""
+    rows = [
+        [way, *(f"{s:.1f}" for s in row), f"{row.sum():.1f}"]
+        for way, row in zip(ways, np.asarray(seconds), strict=True)
+    ]
+    return table(rows, ["CPU s", *blocks, "all"])
+
+
+def collection_table(found):
+    """Table 2: mean Chamfer distance to the template, CPU seconds by block, and the median shape."""
+    rows = []
+    for way in found["way"].values:
+        for how in found["how"].values:
+            one = found.sel(way=way, how=how)
+            seconds = one["collection_seconds"].values
+            chamfer = f"{100 * one['collection_chamfer'].mean().item():.4f}"
+            rows.append([way, how, chamfer, *(f"{s:.1f}" for s in seconds), f"{seconds.sum():.1f}"])
+            rows[-1].append(one["median_shape"].item())
+    blocks = [f"{block}, s" for block in found["block"].values]
+    return table(rows, ["method", "way up", "Chamfer %", *blocks, "all, s", "median shape"])
+
+
+def compare(args):
+    """The methods of the paper's Table 1 on pairs, or of its Table 2 on a collection."""
+    out = Path(args.out)
+    if args.collection:
+        if args.paths or args.truth:
+            raise ValueError("--collection takes the shapes alone: no SOURCE, TARGET or --truth")
+        methods = args.methods or list(comparison.COLLECTION_METHODS)
+        found = comparison.collection(
+            args.collection, methods=methods, n_coarse=args.n_coarse, n_pairs=args.n_pairs, k=args.k, seed=args.seed
+        )
+        names = [f"{way}, {how}" for way in methods for how in found["how"].values]
+        seconds = found["collection_seconds"].values.reshape(len(names), -1)
+        text = collection_table(found)
+    else:
+        if len(args.paths) < 2:
+            raise ValueError("compare needs SOURCE and TARGET, or --collection PATH...")
+        source, *targets = args.paths
+        targets = {name: path for target in targets for path, name in find_meshes(target)}
+        found = comparison.pairs(
+            source,
+            targets,
+            methods=args.methods or comparison.METHODS,
+            truth=per_target(args.truth, targets, "--truth"),
+            n_coarse=args.n_coarse,
+            k=args.k,
+            seed=args.seed,
+        )
+        names, seconds = found["way"].values.tolist(), found["block_seconds"].mean("pair").values
+        text = comparison_table(found) + "\n\n" + block_table(names, found["block"].values, seconds)
+    out.mkdir(parents=True, exist_ok=True)
+    found.to_netcdf(out / "compare.nc", engine="h5netcdf")
+    figure = charts.stacked(names, found["block"].values.tolist(), seconds)
+    figure.savefig(out / "compare.png", dpi=150)
+    write(text)
+    write(f"\nlengths in % of sqrt(area), times in CPU seconds of one core; in {out}: compare.nc, compare.png")
+    return 0
+
+
+def per_target(files, names, flag):
+    """The truth in one file for every target, in the same order, or none."""
+    if not files:
+        return None
+    if len(files) != len(names):
+        raise ValueError(f"{flag} needs a file for each of the {len(names)} targets, found {len(files)}")
+    return {name: comparison.read_truth(file) for name, file in zip(names, files, strict=True)}
+
+
 def write(text):
     sys.stdout.write(text + "\n")
 
@@ -508,6 +607,16 @@ def parser():
     sub.add_argument("--n-coarse", type=int, default=6000, help=HELP["n_coarse"])
     sub.add_argument("--k", type=int, default=100, help=HELP["k"])
     sub.add_argument("--n-jobs", type=int, default=-1, help=HELP["n_jobs"])
+    sub.add_argument("--seed", type=int, default=0, help=HELP["seed"])
+    sub = command(compare)
+    sub.add_argument("paths", nargs="*", metavar="SOURCE TARGET", help="the reference and one or more other meshes")
+    sub.add_argument("--collection", nargs="+", metavar="PATH", help="Table 2 on these folders, globs or mesh files")
+    sub.add_argument("--methods", nargs="+", metavar="METHOD", help=f"of {', '.join(comparison.METHODS)}")
+    sub.add_argument("--truth", nargs="+", metavar="FILE", help=TRUTH)
+    sub.add_argument("--out", default="compare", metavar="DIR", help="for compare.nc and compare.png")
+    sub.add_argument("--n-coarse", type=int, default=6000, help=HELP["n_coarse"])
+    sub.add_argument("--n-pairs", type=int, default=500, help=HELP["n_pairs"])
+    sub.add_argument("--k", type=int, default=100, help=HELP["k"])
     sub.add_argument("--seed", type=int, default=0, help=HELP["seed"])
     return top
 

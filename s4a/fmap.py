@@ -6,6 +6,7 @@ a match holds, for every vertex of the target, a vertex of the source.
 
 import numpy as np
 import scipy.linalg
+import scipy.sparse as sp
 
 from s4a.descriptors import (
     heat_filter,
@@ -27,13 +28,15 @@ def fmap_from_match(Phi_source, Phi_target, area_target, match):
     ----------
     Phi_source : float ndarray (n_source, k)
     Phi_target : float ndarray (n_target, k)
-    area_target : float ndarray (n_target,), of sum 1
+    area_target : float ndarray (n_target,), of sum 1, or a sparse mass matrix in which Phi_target is orthonormal
     match : int ndarray (n_target,)
 
     Returns
     -------
     C : float ndarray (k_target, k_source)
     """
+    if sp.issparse(area_target):
+        return (area_target @ Phi_target).T @ Phi_source[match]
     return Phi_target.T @ (area_target[:, None] * Phi_source[match])
 
 
@@ -70,24 +73,26 @@ def nearest_rows(Q, D, *, block=2048):
     return found
 
 
-def match_from_fmap(C, Phi_source, Phi_target):
+def match_from_fmap(C, Phi_source, Phi_target, *, nearest=nearest_rows):
     """Nearest neighbours of the rows of Psi among those of Phi C^T (eq. 2)."""
     k_target, k_source = C.shape
-    return nearest_rows(Phi_target[:, :k_target], Phi_source[:, :k_source] @ C.T)
+    return nearest(Phi_target[:, :k_target], Phi_source[:, :k_source] @ C.T)
 
 
-def zoomout(C, Phi_source, Phi_target, area_target, k, *, step=5):
+def zoomout(C, Phi_source, Phi_target, area_target, k, *, step=5, nearest=nearest_rows):
     """ZoomOut (Melzi et al. 2019): C -> match -> a larger C, until it is k x k.
 
     Parameters
     ----------
     C : float ndarray (k_init, k_init)
     Phi_source, Phi_target : float ndarray (n, >= k)
-    area_target : float ndarray (n_target,), of sum 1
+    area_target : see :func:`fmap_from_match`
     k : int
         Final size.
     step : int
         Growth per round.
+    nearest : callable
+        As :func:`nearest_rows`, which is it by default.
 
     Returns
     -------
@@ -97,9 +102,9 @@ def zoomout(C, Phi_source, Phi_target, area_target, k, *, step=5):
     """
     sizes = [*range(C.shape[0] + step, k, step), k] if k > C.shape[0] else []
     for size in sizes:
-        match = match_from_fmap(C, Phi_source, Phi_target)
+        match = match_from_fmap(C, Phi_source, Phi_target, nearest=nearest)
         C = fmap_from_match(Phi_source[:, :size], Phi_target[:, :size], area_target, match)
-    return C, match_from_fmap(C, Phi_source, Phi_target)
+    return C, match_from_fmap(C, Phi_source, Phi_target, nearest=nearest)
 
 
 def fit(F, G, *, penalty=0.0, operators=(), constant=1.0):

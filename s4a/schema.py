@@ -171,6 +171,15 @@ TABLE = {
     "own_width": (("shape", "own_part"), "mm", "their widths"),
     "own_push": (("shape", "own_part", "xyz"), "mm", "their translations"),
     "landmark_reference": (("landmark", "xyz"), ONE, "point of the unit sphere that the landmark is the image of"),
+    # the comparison (Table 1, Fig. 3, Table 2)
+    "block_seconds": (("way", "pair", "block"), "s", "CPU time of the block, of one core"),
+    "collection_chamfer": (
+        ("way", "how", "shape"),
+        SHARE,
+        "Chamfer distance of the shape and the image of the template (eq. 9)",
+    ),
+    "collection_seconds": (("way", "how", "block"), "s", "CPU time of the block for the whole collection, of one core"),
+    "median_shape": (("way",), ONE, "median shape (eq. 5)"),
     # the report
     "status": (("shape",), ONE, "ok, repaired or excluded"),
     "reason": (("shape",), ONE, "what was found and done"),

@@ -1,0 +1,142 @@
+"""The comparison of Table 1 and Table 2."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from s4a import compare, synthetic
+from s4a.cli import main
+from s4a.io import write_mesh
+from s4a.mesh import as_arrays
+from s4a.scalable import Reduced
+
+SMALL = {"n_coarse": 400, "k": 30, "n_geodesic": 100}
+
+
+@pytest.fixture(scope="module")
+def brains():
+    tree = synthetic.brains(3, 1500)
+    meshes = {name: node.to_dataset() for name, node in tree["original"].children.items()}
+    (reference, source), *others = meshes.items()
+    truth = {n: synthetic.position(tree["truth"], reference, tree["truth"][n]["reference_point"]) for n, _ in others}
+    return source, dict(others), {n: np.asarray(t) for n, t in truth.items()}
+
+
+@pytest.fixture(scope="module")
+def found(brains):
+    source, targets, truth = brains
+    return compare.pairs(source, targets, truth=truth, **SMALL)
+
+
+def test_every_method_has_every_metric_and_its_time_by_block(found):
+    assert found["way"].values.tolist() == list(compare.METHODS)
+    assert found.sizes["pair"] == 2
+    for name in ("geodesic_error", "straight_error", "chamfer", "hausdorff", "dirichlet", "coverage", "bijectivity"):
+        assert set(found[name].dims) == {"way", "pair"}, name
+        assert np.isfinite(found[name]).all(), name
+    spent = found["block_seconds"].mean("pair")
+    assert spent.dims == ("way", "block")
+    assert (spent.sel(block="sample").sel(way=["kNN", "ZO", "FMAP+ZO"]) == 0).all()
+    assert (spent.sel(block="sample").sel(way=["SCALABLE", "RE-MATCH"]) > 0).all()
+    assert (spent.sel(block=["basis", "map", "refine"]).sel(way="FMAP+ZO") > 0).all()
+    assert (spent.sel(block="align") > 0).all()
+    assert spent.sel(way="RE-MATCH joint").sum() > spent.sel(way="RE-MATCH").sum()
+
+
+def test_joint_rounds_are_nearer_to_the_truth_than_every_other_method(found):
+    error = found["straight_error"].mean("pair")
+    assert error.sel(way="RE-MATCH joint") < 0.85 * error.drop_sel(way="RE-MATCH joint").min()
+
+
+def test_every_method_finds_a_shape_in_itself():
+    mesh = synthetic.brains(2, 1500)["original/brain_01"].to_dataset()
+    same = np.arange(mesh.sizes["vertex"])
+    found = compare.pair(mesh, mesh, truth=same, **SMALL)
+    exact = [way for way in compare.METHODS if way not in ("RE-MATCH", "SCALABLE")]
+    assert (found["geodesic_error"].sel(way=exact) == 0).all()
+    assert (found["geodesic_error"] < 0.005).all()
+    assert (found["bijectivity"].sel(way=exact) == 0).all()
+
+
+def test_given_landmarks_make_up_for_a_rigid_alignment_that_is_wrong():
+    mesh = synthetic.ellipsoid(1500, (1.2, 1.1, 1.0))
+    wavy = mesh.assign(position=mesh["position"] * (1 + 0.15 * np.cos(5 * mesh["position"][:, 0])))
+    turned = wavy.assign(position=wavy["position"] * [-1.0, -1.0, 1.0])
+    same = np.arange(1500)
+    some = same[::150]
+    found = compare.pair(wavy, turned, truth=same, landmarks=(some, some), methods=["RE-MATCH"], **SMALL)
+    assert found["geodesic_error"].item() < 0.02
+
+
+def test_truth_and_landmarks_of_files_count_the_rows_of_the_files(tmp_path):
+    X, T = as_arrays(synthetic.brains(2, 800)["original/brain_01"].to_dataset())
+    order = np.random.default_rng(0).permutation(len(X))
+    rank = np.argsort(order)
+    write_mesh(tmp_path / "a.ply", np.r_[[[9e3, 0, 0]], X], T + 1)  # an idle vertex first: it is dropped
+    write_mesh(tmp_path / "b.ply", X[order], rank[T])
+    found = compare.pair(tmp_path / "a.ply", tmp_path / "b.ply", truth=order + 1, methods=["kNN"], n_geodesic=100)
+    assert found["geodesic_error"].item() == 0
+    assert found["block_seconds"].sel(block="load and clean").item() > 0
+
+
+def test_what_is_wrong_is_said(brains):
+    source, targets, _ = brains
+    target = next(iter(targets.values()))
+    with pytest.raises(ValueError, match="methods must be some of kNN"):
+        compare.pair(source, target, methods=["ICP"])
+    with pytest.raises(ValueError, match="landmarks need two arrays"):
+        compare.pair(source, target, landmarks=(np.arange(4), np.arange(5)), methods=["kNN"])
+    with pytest.raises(ValueError, match="all paths or all Datasets"):
+        compare.pair(source, "b.ply")
+    with pytest.raises(ValueError, match="at least 2 shapes"):
+        compare.collection({"only": source})
+    with pytest.raises(ValueError, match="methods must be some of SCALABLE"):
+        compare.collection({"a": source, "b": target}, methods=["kNN"])
+
+
+def test_both_ways_to_full_resolution_share_all_but_the_last_block(brains):
+    source, targets, _ = brains
+    found = compare.collection({"brain_01": source, **targets}, n_coarse=400, k=30)
+    assert found["collection_chamfer"].dims == ("way", "how", "shape")
+    seconds = found["collection_seconds"]
+    shared = seconds.drop_sel(block="full resolution")
+    assert (shared.sel(how="standard") == shared.sel(how="ours")).all()
+    for way in found["way"].values:
+        template = found["median_shape"].sel(way=way).item()
+        known = found["collection_chamfer"].sel(way=way).drop_sel(shape=template)
+        assert (known < 0.06).all()
+        assert found["distance_to_median"].sel(way=way).idxmin().item() == template
+
+
+def test_the_space_of_a_mesh_itself_has_no_projection():
+    dense = compare.Shape(synthetic.sphere(500), k=9).dense
+    assert isinstance(dense, Reduced)
+    assert dense.U is None
+    np.testing.assert_allclose(dense.eigenvalue[1:4], 8 * np.pi, rtol=0.03)
+
+
+def test_the_command_writes_table_file_and_figure(tmp_path, capsys):
+    meshes = synthetic.brains(3, 700)["original"].children
+    for name, node in meshes.items():
+        write_mesh(tmp_path / f"{name}.ply", *as_arrays(node.to_dataset()))
+    one, two, _ = (str(tmp_path / f"{name}.ply") for name in meshes)
+    np.save(tmp_path / "truth.npy", meshes["brain_01"]["position"].values[:700])
+    out = tmp_path / "out"
+    options = ["--out", str(out), "--n-coarse", "200", "--k", "20"]
+    assert (
+        main(["compare", one, two, "--methods", "kNN", "RE-MATCH", "--truth", str(tmp_path / "truth.npy"), *options])
+        == 0
+    )
+    text = capsys.readouterr().out
+    assert "RE-MATCH" in text
+    assert "CPU seconds" in text
+    with xr.open_dataset(out / "compare.nc") as found:
+        assert found["way"].values.tolist() == ["kNN", "RE-MATCH"]
+        assert "geodesic_error" in found
+    assert (out / "compare.png").stat().st_size > 5000
+
+    assert main(["compare", "--collection", str(tmp_path), "--methods", "RE-MATCH", *options]) == 0
+    assert "median shape" in capsys.readouterr().out
+    assert main(["compare", one, *options]) == 2
+    assert "SOURCE and TARGET" in capsys.readouterr().err
+    assert main(["compare", one, "--collection", str(tmp_path), *options]) == 2
