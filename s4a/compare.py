@@ -160,7 +160,7 @@ def fit(M, N, landmarks, k):
         )
         for s, _ in ends
     ]
-    return fmap.fit_descriptors(*meshes, k=k, landmarks=[mark for _, mark in ends])["fmap"].values
+    return fmap.fit_descriptors(*meshes, k=k, landmarks=[mark for _, mark in ends], oriented=0)["fmap"].values
 
 
 def spectral_match(way, source, target, motion, landmarks, clock, *, k_init, k, step, dense_step):
