@@ -10,6 +10,7 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from s4a import holes
 from s4a.mesh import as_arrays, as_dataset, triangle_areas, triangle_normals, unique_edges
 from s4a.schema import require
 
@@ -30,16 +31,17 @@ REPAIRS = {
     "reoriented_triangles": "triangles reoriented",
     "dropped_components": "components dropped",
     "unreferenced_vertices": "vertices without triangles dropped",
+    "closed_holes": "holes closed",
 }
 
 
-def clean(mesh, *, components="largest", strict=False):
+def clean(mesh, *, components="largest", strict=False, close_holes=False):
     """A mesh made an oriented edge- and vertex-manifold surface.
 
     Vertices nearer than 1e-7 of the bounding-box diagonal are welded, degenerate and duplicate triangles dropped,
     zero-area triangles removed by flipping their long edge (collapsed where two of their corners weld), non-manifold
     edges and vertices separated into sheets, triangles oriented consistently and outwards, small components dropped.
-    Holes stay as they are.
+    Holes stay as they are unless `close_holes` is set.
 
     Parameters
     ----------
@@ -49,6 +51,8 @@ def clean(mesh, *, components="largest", strict=False):
         Keep the component with the largest area, all of them, or that many of the largest.
     strict : bool
         Refuse vertices that are not finite instead of removing them with their triangles.
+    close_holes : bool
+        Close every hole by a fan of triangles around a new vertex, see :func:`s4a.holes.close_holes`.
 
     Returns
     -------
@@ -71,13 +75,20 @@ def clean(mesh, *, components="largest", strict=False):
     (4, 1, 0)
     """
     require(mesh, "position", "corner_vertex", what="mesh")
-    X, T, file_vertex, vertex_of_file, counts = clean_arrays(*as_arrays(mesh), components=components, strict=strict)
+    X, T, file_vertex, vertex_of_file, counts = clean_arrays(
+        *as_arrays(mesh), components=components, strict=strict, close_holes=close_holes
+    )
     reason = repairs(counts)
-    attrs = {**mesh.attrs, **counts, "status": "repaired" if reason else "ok", "reason": reason}
+    status = "repaired" if reason else "ok"
+    if counts["holes"]:
+        reason = (
+            f"{reason}; " * bool(reason) + f"{counts['holes']} holes kept as boundary (close_holes=True closes them)"
+        )
+    attrs = {**mesh.attrs, **counts, "status": status, "reason": reason}
     return as_dataset(X, T, attrs, file_vertex=file_vertex, vertex_of_file=vertex_of_file)
 
 
-def clean_arrays(points, triangles, *, components="largest", strict=False):
+def clean_arrays(points, triangles, *, components="largest", strict=False, close_holes=False):
     """:func:`clean` on arrays.
 
     Returns
@@ -85,10 +96,11 @@ def clean_arrays(points, triangles, *, components="largest", strict=False):
     X : float ndarray (n, 3)
     T : int32 ndarray (m, 3)
     file_vertex : int32 ndarray (n,)
-        Row of `points` that each vertex is; a vertex inserted on an edge has that of one end.
+        Row of `points` that each vertex is; a vertex inserted on an edge has that of one end, one in a hole that of a
+        vertex around it.
     vertex_of_file : int32 ndarray (len(points),)
         A vertex that each row of `points` became, -1 where it was dropped.
-    counts : dict of str to int, and ``area_dropped``, the share of the area in the dropped components
+    counts : dict of str to int; and ``area``, and ``area_dropped``, the share of it in the dropped components
         The keys of :data:`REPAIRS`, sizes of the input (``file_vertices``, ``file_triangles``), ``components`` found,
         and of the result ``holes`` (boundary loops), ``euler_characteristic`` and ``genus`` (sum over components).
     """
@@ -108,9 +120,15 @@ def clean_arrays(points, triangles, *, components="largest", strict=False):
     X, T, kept = _largest_components(X, T, components, counts)
     new = np.cumsum(kept) - 1
     new[~kept] = -1
+    T, file_vertex = new[T], file_vertex[kept]
+    if close_holes:
+        X, T, nearby = holes.close_holes(X, T)
+        file_vertex = np.r_[file_vertex, file_vertex[nearby]]
+        counts["closed_holes"] = len(nearby)
     _count_topology(T, counts)
+    counts["area"] = float(triangle_areas(X, T).sum())
     vertex_of_file = _vertex_of_file(group, new[V].ravel(), F.ravel())
-    return X, new[T].astype(np.int32), file_vertex[kept].astype(np.int32), vertex_of_file, counts
+    return X, T.astype(np.int32), file_vertex.astype(np.int32), vertex_of_file, counts
 
 
 def repairs(counts):

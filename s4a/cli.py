@@ -24,7 +24,7 @@ from s4a.annotations import labels_of_file, labels_of_mesh, read_labels, read_la
 from s4a.draw import VIEWS
 from s4a.export import write_registered, write_results
 from s4a.insert import insert as place
-from s4a.io import find_meshes, read_mesh
+from s4a.io import find_meshes, read_mesh, stem_of
 from s4a.mesh import as_arrays, vertex_areas
 from s4a.options import CHOICES, DEFAULTS
 from s4a.pca import mahalanobis
@@ -50,6 +50,8 @@ HELP = {
     "components": "'largest', 'all' or how many to keep",
     "strict": "exclude shapes with vertices that are not finite instead of repairing them",
     "wrap": "wrap the shapes watertight before they are remeshed",
+    "close_holes": "close every hole by a fan of triangles",
+    "intersections": "count triangles that pass through others",
     "pattern": "only files whose name fits, for example '*brain*'",
     "preset": "'paper' sets init, refine and how to the paper's",
     "template": "name of the shape to register to (default: the median shape)",
@@ -120,7 +122,8 @@ def options_of(args):
 
 def check(args):
     """Read and clean every file, and say what was found."""
-    report = read_shapes(args.paths, components=args.components, pattern=args.pattern)["report"].to_dataset()
+    options = {n: getattr(args, n) for n in ("components", "strict", "close_holes", "pattern", "intersections")}
+    report = read_shapes(args.paths, **options)["report"].to_dataset()
     columns = {
         "file_vertices": "vertices",
         "components": "components",
@@ -134,7 +137,16 @@ def check(args):
         counts = ["-" if v not in one or int(one[v]) < 0 else int(one[v]) for v in columns]
         rows.append([name, *counts, one["status"].item(), one["reason"].item()])
     write(table(rows, ["shape", *columns.values(), "status", "found and done"]))
+    write_warnings(report)
     return 0 if (report["status"] != "excluded").all() else 1
+
+
+def write_warnings(report):
+    """What looks wrong with shapes, and what concerns the collection."""
+    for name in report["shape"].values[report["warning"].values != ""]:
+        write(f"  {name}, warning: {report['warning'].sel(shape=name).item()}")
+    for remark in report.attrs["remarks"].splitlines():
+        write(f"  {remark}")
 
 
 def run(args):
@@ -190,6 +202,9 @@ def closing(study, seconds):
     )
     for name in report["shape"].values[status == "excluded"]:
         write(f"  {name} excluded: {report['reason'].sel(shape=name).item()}")
+    for name in report["shape"].values[(status != "excluded") & (report["reason"].values != "")]:
+        write(f"  {name}: {report['reason'].sel(shape=name).item()}")
+    write_warnings(report)
     latent = study["latent"].to_dataset()
     order = latent["distance_to_median"].argsort().values[:3]
     near = ", ".join(f"{latent['shape'].values[i]} {latent['distance_to_median'].values[i]:.4f}" for i in order)
@@ -269,7 +284,7 @@ def transfer(args):
     if len(args.targets) == 1 and (Path(args.targets[0]) / "registration.nc").is_file():
         study, excluded = open_study(args.targets[0]), []
     else:
-        shapes = read_shapes(args.targets)
+        shapes = read_shapes(args.targets, compare=False)
         report = shapes["report"].to_dataset()
         excluded = report["shape"].values[report["status"].values == "excluded"].tolist()
         meshes = {name: node.to_dataset() for name, node in shapes["original"].children.items()}
@@ -406,7 +421,7 @@ def transfer_rows(study, source, label, landmarks, out):
     points = None if landmarks is None else travel.transfer_landmarks(study, landmarks, **given)
     targets = list((labels if points is None else points).children)
     meshes = {name: study["original"][name].to_dataset() for name in targets}
-    stems = {name: Path(mesh.attrs.get("path") or name).stem for name, mesh in meshes.items()}
+    stems = {name: stem_of(mesh.attrs.get("path") or name) for name, mesh in meshes.items()}
     rows = []
     for name, mesh in meshes.items():
         stem = stems[name] if list(stems.values()).count(stems[name]) == 1 else name
@@ -559,6 +574,9 @@ def parser():
     sub.add_argument("paths", nargs="+", metavar="PATH", help="folders, globs or mesh files")
     sub.add_argument("--components", type=components, default="largest", help=HELP["components"])
     sub.add_argument("--pattern", help=HELP["pattern"])
+    for name, default in {"strict": False, "close_holes": False, "intersections": True}.items():
+        flag = "--" + name.replace("_", "-")
+        sub.add_argument(flag, action=argparse.BooleanOptionalAction, default=default, help=HELP[name])
     sub = command(run)
     sub.add_argument("paths", nargs="+", metavar="PATH", help="folders, globs or mesh files")
     sub.add_argument("--out", required=True, metavar="STUDY", help="folder of the study; an unfinished one is resumed")

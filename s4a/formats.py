@@ -2,10 +2,12 @@
 
 import io
 import re
+import zipfile
 
 import nibabel
 import numpy as np
 
+from s4a import bounded
 from s4a.vtk import parse_vtk, parse_vtp, vtk_bytes
 
 NPZ_KEYS = (("V", "F"), ("vertices", "faces"), ("points", "triangles"), ("position", "corner_vertex"), ("X", "T"))
@@ -232,6 +234,7 @@ def _distinct(points):
 
 
 def _read_gifti(data):
+    bounded.check_zlib_blocks(data)
     image = nibabel.gifti.GiftiImage.from_bytes(data)
     found = [image.get_arrays_from_intent(name) for name in ("NIFTI_INTENT_POINTSET", "NIFTI_INTENT_TRIANGLE")]
     if not all(found):
@@ -249,6 +252,8 @@ def _read_freesurfer(data):
 
 
 def _read_npz(data):
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        bounded.check(sum(member.file_size for member in archive.infolist()), len(data))
     with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
         for keys in NPZ_KEYS:
             if all(key in arrays for key in keys):

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from s4a import bounded
 from s4a.formats import NPZ_KEYS, READERS, WRITERS
 
 SURFER = (".pial", ".white", ".inflated", ".orig", ".smoothwm", ".sphere")  # FreeSurfer: the name is the suffix
@@ -28,6 +29,9 @@ SUFFIXES = {
 }
 
 
+OTHERS = (".json", ".csv", ".txt", ".md", ".html", ".png", ".jpg", ".nc", ".npy", ".annot", ".nii")  # of a glob
+
+
 def read_mesh(path):
     """Points and triangles of a mesh file; the format is told by the content, not by the name.
 
@@ -35,7 +39,8 @@ def read_mesh(path):
     ----------
     path : str or Path
         PLY, OBJ, OFF, STL, VTK legacy polydata, VTP, GIFTI, FreeSurfer surface, or NPZ with the keys V and F, vertices
-        and faces, points and triangles, position and corner_vertex, or X and T.  Polygons become fans of triangles.
+        and faces, points and triangles, position and corner_vertex, or X and T; each of them compressed by gzip too
+        (.ply.gz), which may unpack to 1 GiB.  Polygons become fans of triangles.
 
     Returns
     -------
@@ -54,9 +59,12 @@ def read_mesh(path):
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"no file {path}")
-    data = path.read_bytes().removeprefix(b"\xef\xbb\xbf")
+    data = path.read_bytes()
     found = "mesh"
     try:
+        if data.startswith(bounded.GZIP):
+            data = bounded.gunzip(data)
+        data = data.removeprefix(b"\xef\xbb\xbf")
         found = _sniff(data)
         points, triangles, attrs = READERS[found](data)
         points, triangles = _checked(points, triangles)
@@ -65,10 +73,28 @@ def read_mesh(path):
     space = re.search(rb"SPACE=(RAS|LPS)", data[:1000])  # as 3D Slicer writes it into any header
     if space:
         attrs["coordinate_system"] = space[1].decode()
-    promised = [name for name, suffixes in SUFFIXES.items() if path.suffix.lower() in suffixes]
+    promised = [name for name, suffixes in SUFFIXES.items() if suffix_of(path) in suffixes]
     if promised and found not in promised:
-        attrs["note"] = f"named {path.suffix} but holds {found}"
+        attrs["note"] = f"named {path.suffix} but holds {found}, and was read as that; rename it"
     return points, triangles, {"format": found, **attrs}
+
+
+def suffix_of(path):
+    """What the name promises: the suffix in lower case, that before .gz where there is one.
+
+    Examples
+    --------
+    >>> suffix_of("a.PLY"), suffix_of("lh.pial.gz"), suffix_of("a.tar.gz")
+    ('.ply', '.pial', '.tar')
+    """
+    return Path(Path(path).name.lower().removesuffix(".gz")).suffix
+
+
+def stem_of(path):
+    """The name without the suffix of its format, and without .gz; FreeSurfer's suffixes are names."""
+    name = Path(path).name
+    name = name[:-3] if name.lower().endswith(".gz") else name
+    return name if suffix_of(path) in SURFER else Path(name).stem
 
 
 def _sniff(data):
@@ -98,15 +124,18 @@ def _sniff(data):
         return "OBJ"
     if b"\0" in head and len(data) >= 84:
         return "STL"
-    raise ValueError(f"{len(data)} bytes that are none of {', '.join(SUFFIXES)}")
+    formats = ", ".join(SUFFIXES)
+    raise ValueError(f"one of {formats} expected, found {len(data)} bytes" + " of something else" * bool(data))
 
 
 def _checked(points, triangles):
     points, triangles = np.asarray(points, np.float64), np.asarray(triangles, np.int64)
     if points.ndim != 2 or points.shape[1] != 3 or triangles.ndim != 2 or triangles.shape[1] != 3:
         raise ValueError(f"points (n, 3) and triangles (m, 3) needed, found {points.shape} and {triangles.shape}")
-    if len(points) == 0 or len(triangles) == 0:
-        raise ValueError(f"a surface needs vertices and triangles, found {len(points)} and {len(triangles)}")
+    if len(points) and len(triangles) == 0:
+        raise ValueError(f"no faces: a surface needs triangles, found {len(points)} points and nothing else")
+    if len(points) == 0:
+        raise ValueError(f"a surface needs vertices and triangles, found 0 and {len(triangles)}")
     low, high = triangles.min(), triangles.max()
     if low < 0 or high >= len(points):
         raise ValueError(f"face indices 0..{len(points) - 1} expected for {len(points)} vertices, found {low}..{high}")
@@ -144,7 +173,7 @@ def find_meshes(paths, pattern=None):
     Parameters
     ----------
     paths : str, Path or list of these
-        Folders (searched to any depth; NPZ archives of other arrays are passed over), files, or globs such as
+        Folders (searched to any depth; what is no mesh is passed over, see :func:`not_meshes`), files, or globs such as
         ``"scans/*/head.stl"``.
     pattern : str, optional
         Keep the files whose name, with or without suffix, it matches: ``"*_brain"`` picks one structure of many.
@@ -160,44 +189,84 @@ def find_meshes(paths, pattern=None):
     ValueError
         When a path is missing or no mesh is found.
     """
-    given = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
-    found = sorted((os.path.abspath(file), str(file)) for path in given for file in _expand(path))
-    files = [Path(file) for i, (where, file) in enumerate(found) if i == 0 or where != found[i - 1][0]]
+    files = [file for file, why in _files(paths) if not why]
     chosen = [file for file in files if pattern is None or _matches(file, pattern)]
     if not chosen:
         suffixes = ", ".join(suffix for group in SUFFIXES.values() for suffix in group)
-        where = ", ".join(map(str, given)) or "an empty list"
+        where = ", ".join(map(str, _listed(paths))) or "an empty list"
         filtered = f" of {len(files)} files matching {pattern!r}" if pattern and files else f" ({suffixes})"
         raise ValueError(f"no mesh{filtered} in {where}")
     return list(zip(chosen, slugs(chosen), strict=True))
 
 
+def not_meshes(paths, pattern=None):
+    """The files of folders and globs that are named like meshes, or matched, and hold something else.
+
+    Returns
+    -------
+    list of (Path, str)
+        Sorted by path, with what they are.
+    """
+    return [(file, why) for file, why in _files(paths) if why and (pattern is None or _matches(file, pattern))]
+
+
+def _listed(paths):
+    return [paths] if isinstance(paths, str | os.PathLike) else list(paths)
+
+
+def _files(paths):
+    """All files that are meant, once and sorted, with the reason why they are no meshes or ""."""
+    found = sorted((os.path.abspath(file), str(file), why) for path in _listed(paths) for file, why in _expand(path))
+    return [(Path(file), why) for i, (at, file, why) in enumerate(found) if i == 0 or at != found[i - 1][0]]
+
+
 def _matches(file, pattern):
-    return fnmatch.fnmatchcase(file.name, pattern) or fnmatch.fnmatchcase(file.stem, pattern)
+    return any(fnmatch.fnmatchcase(name, pattern) for name in (file.name, file.stem, stem_of(file)))
 
 
 def _expand(path):
-    """The files that a folder, a file or a glob means."""
+    """The files that a folder, a file or a glob means, with the reason why they are no meshes or ""."""
     known = tuple(suffix for group in SUFFIXES.values() for suffix in group)
     path = Path(path).expanduser()
     if path.is_file():
-        return [path]
+        return [(path, "")]
     if path.is_dir():
         found = (Path(folder, name) for folder, _, names in os.walk(path) for name in names)
-        return [file for file in found if file.suffix.lower() in known and file.name[0] != "." and _may_be_mesh(file)]
+        return [(file, _other(file)) for file in found if suffix_of(file) in known and file.name[0] != "."]
     found = [Path(name) for name in glob.glob(str(path), recursive=True)] if glob.has_magic(str(path)) else []
     if not found:
         raise ValueError(f"no file, folder or match of {path}")
-    return [file for name in found for file in ([name] if name.is_file() else _expand(name))]
+    return [one for name in found for one in ([(name, _other(name))] if name.is_file() else _expand(name))]
 
 
-def _may_be_mesh(file):
-    """False for an NPZ archive of other arrays, which a folder may well hold beside its meshes."""
-    if file.suffix.lower() != ".npz" or not zipfile.is_zipfile(file):
-        return True
-    with zipfile.ZipFile(file) as archive:
-        names = {name.removesuffix(".npy") for name in archive.namelist()}
-    return any(names.issuperset(keys) for keys in NPZ_KEYS)
+def _other(file):
+    """What a file holds that may well lie beside the meshes of a collection and is none; "" where it may be one."""
+    try:
+        if suffix_of(file) == ".npz":
+            with zipfile.ZipFile(file) as archive:
+                names = {name.removesuffix(".npy") for name in archive.namelist()}
+            return "" if any(names.issuperset(keys) for keys in NPZ_KEYS) else "an archive of other arrays"
+        if suffix_of(file) == ".gii":
+            data = file.read_bytes()
+            data = bounded.gunzip(data) if data.startswith(bounded.GZIP) else data
+            return "" if b"<GIFTI" not in data or b"NIFTI_INTENT_POINTSET" in data else "a GIFTI file without points"
+        if suffix_of(file) in (
+            ".json",
+            ".csv",
+            ".txt",
+            ".md",
+            ".html",
+            ".png",
+            ".jpg",
+            ".nc",
+            ".npy",
+            ".annot",
+            ".nii",
+        ):
+            return f"a {suffix_of(file)} file"
+    except (OSError, ValueError, zipfile.BadZipFile):  # it will be said when it is read
+        pass
+    return ""
 
 
 def slug(text):
@@ -220,7 +289,7 @@ def slugs(files):
     level = dict.fromkeys(relative, 0)
 
     def name(path):
-        stem = path if Path(path).suffix.lower() in SURFER else path.removesuffix(Path(path).suffix)
+        stem = Path(path).with_name(stem_of(path)).as_posix()
         digest = hashlib.sha256(os.fsencode(path)).hexdigest()[:8]
         return slug([Path(stem).name, stem, path, f"{path}_{digest}"][level[path]])
 

@@ -15,7 +15,7 @@ CHOICES = {
 DEFAULTS = {"init": "dense", "refine": "joint", "how": "ours"}  # of the options that a preset sets
 PRESETS = {None: DEFAULTS, "paper": {"init": "landmarks", "refine": "intrinsic", "how": "ours"}}
 LOWEST = {"n_coarse": 100, "n_pairs": 1, "k_init": 4, "k": 4, "step": 1, "seed": 0, "n_latent": 2}
-SWITCHES = ("scale", "strict", "wrap", "close_holes")
+SWITCHES = ("scale", "strict", "wrap", "close_holes", "intersections")
 
 
 def checked(options):

@@ -19,16 +19,16 @@ from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
-from s4a import fmap, latent, median, network, register, study
+from s4a import findings, fmap, latent, median, network, register, study, suspects
 from s4a.align import align, farthest_points, realign
 from s4a.clean import clean
 from s4a.io import find_meshes, slug
-from s4a.mesh import as_arrays, as_dataset, vertex_areas
+from s4a.mesh import as_arrays, as_dataset, triangle_areas, vertex_areas
 from s4a.options import check_against, checked
 from s4a.pca import pca
 from s4a.remesh import coarsen
 from s4a.schema import dataset, in_unit, require, unit_of
-from s4a.shapes import read_shape, shape_report
+from s4a.shapes import passed_over, read_shape, shape_report
 from s4a.spectral import spectrum
 from s4a.subjects import read_table
 
@@ -156,15 +156,23 @@ def content_key(mesh):
     return study.task_key(list(held), *parts)
 
 
-def original_task(source, components, strict):
+def original_task(source, options):
     """A file read and cleaned, or a mesh in memory cleaned where it is not yet."""
     if isinstance(source, str):
-        return read_shape(source, components=components, strict=strict)
+        return read_shape(source, **options)
     if "file_vertex" in source:
-        mesh = source.assign_attrs({"status": "ok", "reason": ""} | source.attrs)
+        area = float(triangle_areas(*as_arrays(source)).sum())
+        mesh = source.assign_attrs({"status": "ok", "reason": "", "area": area} | source.attrs)
     else:
-        mesh = clean(source, components=components, strict=strict)
+        mesh = clean(source, **options)
     return in_unit(mesh, source.attrs.get("unit"))
+
+
+def look_task(folder, name, reference, intersections):
+    """What :func:`s4a.suspects.look` sees in a shape beside the reference."""
+    mesh, other = (study.read(folder / "original" / f"{n}.nc") for n in (name, reference))
+    found = suspects.look(mesh, suspects.sample(other), intersections)
+    return dataset({n: v for n, v in found.items() if n != "rotation"}, rotation=found["rotation"])
 
 
 def coarse_task(folder, name, n_coarse, wrap, seed, k):
@@ -293,7 +301,9 @@ def analyse(
     scale=False,
     components="largest",
     strict=False,
+    close_holes=False,
     wrap=False,
+    intersections=True,
     pattern=None,
     preset=None,
     template=None,
@@ -329,7 +339,7 @@ def analyse(
         Norm of eq. 5, see :func:`s4a.median.distance_to_identity`.
     scale : bool
         Whether size is taken out of the displacements.
-    components, strict, pattern
+    components, strict, close_holes, intersections, pattern
         See :func:`s4a.read_shapes`.
     wrap : bool
         Whether shapes are wrapped watertight before they are remeshed.
@@ -361,36 +371,47 @@ def analyse(
     options = {n: v for n, v in locals().items() if n not in ("shapes", "store", "n_jobs")}
     options = checked(options)
     options["table"] = None if table is None else str(table)
-    given = collection(shapes, pattern)
+    given, remarks = collection(shapes, pattern), passed_over(shapes, pattern)
     check_against(options, list(given))
     subjects = None if table is None else read_table(table, list(given))
     if store is None:
         with tempfile.TemporaryDirectory(prefix="s4a-") as folder:
             with study.lock(folder) as claim:
-                run_stages(Run(claim, n_jobs), given, options, subjects)
+                run_stages(Run(claim, n_jobs), given, options, remarks, subjects)
             tree = study.open_study(folder)
             return xr.DataTree.from_dict({n.path: n.to_dataset(inherit=False).load() for n in tree.subtree})
     with study.lock(store) as claim:
-        run_stages(Run(claim, n_jobs), given, options, subjects)
+        run_stages(Run(claim, n_jobs), given, options, remarks, subjects)
     return study.open_study(store)
 
 
-def run_stages(run, given, options, subjects=None):
+def run_stages(run, given, options, remarks, subjects=None):
     """All stages in turn; each looks up which of its files are done."""
     folder, o = run.folder, options
     if subjects is not None:
         study.write(subjects, folder / "subjects.nc")
-    key_of = {n: study.task_key(content, o["components"], o["strict"]) for n, (_, content) in given.items()}
+    cleaning = {n: o[n] for n in ("components", "strict", "close_holes")}
+    key_of = {n: study.task_key(content, cleaning) for n, (_, content) in given.items()}
     run.tasks(
         "read and clean",
         original_task,
-        [
-            (n, f"original/{n}.nc", key_of[n], (source, o["components"], o["strict"]))
-            for n, (source, _) in given.items()
-        ],
+        [(n, f"original/{n}.nc", key_of[n], (source, cleaning)) for n, (source, _) in given.items()],
     )
     settings = (o["n_coarse"], o["wrap"], o["seed"], o["k"])
     names = [n for n in given if n not in run.failures]
+    if len(names) > 1:
+        areas = {n: study.attributes(folder / "original" / f"{n}.nc")["area"] for n in names}
+        reference = suspects.median_size(areas)
+        key = study.task_key(key_of[reference], reference, o["intersections"])
+        run.tasks(
+            "compare",
+            look_task,
+            [
+                (n, f"network/look_{n}.nc", study.task_key(key, key_of[n]), (folder, n, reference, o["intersections"]))
+                for n in names
+            ],
+            each=False,
+        )
     key_of_original, key_of = key_of, {n: study.task_key(key_of[n], settings) for n in names}
     run.tasks(
         "remesh and spectrum",
@@ -457,7 +478,7 @@ def run_stages(run, given, options, subjects=None):
     with run.stage("modes"):
         names = [n for n in names if n not in run.failures]
         no_modes = write_modes(folder, names, mesh, template, [key_of[n] for n in names])
-    write_report(run, given, options | {"template": template}, no_modes, [key_of[n] for n in names])
+    write_report(run, given, options | {"template": template}, remarks, no_modes, [key_of[n] for n in names])
 
 
 def in_batches(pairs):
@@ -486,28 +507,48 @@ def write_modes(folder, names, mesh, template, made_from):
     return ""
 
 
-def write_report(run, given, options, no_modes, made_from):
+def write_report(run, given, options, remarks, no_modes, made_from):
     """Write ``/report``: status and counts of every shape, times and memory of every stage, the options."""
-    attrs = {}
+    attrs, looks, badness, functions = {}, {}, {}, {}
     for name, (source, _) in given.items():
         if name in run.failures:
             path = source if isinstance(source, str) else ""
             attrs[name] = {"status": "excluded", "reason": run.failures[name], "path": path}
         else:
             mesh, coarse = (study.attributes(run.folder / stage / f"{name}.nc") for stage in ("original", "coarse"))
-            remarks = [
+            done = [
                 mesh["reason"],
                 "wrapped watertight before remeshing" if coarse["wrapped"] else "",
+                f"all vertices are used, as there are fewer than n_coarse = {options['n_coarse']}"
+                if coarse["kept_whole"]
+                else "",
                 "not manifold at low resolution: robust Laplacian" if coarse["laplacian"] == "robust" else "",
             ]
-            attrs[name] = mesh | {"reason": "; ".join(filter(None, remarks))}
+            attrs[name] = mesh | {"reason": "; ".join(filter(None, done))}
             if isinstance(source, str):
                 attrs[name]["path"] = source  # the file may have moved since it was read
+            found = study.read(run.folder / "network" / f"look_{name}.nc")
+            looks[name] = found.attrs | {"rotation": found["rotation"].values}
+            badness[name] = study.attributes(run.folder / "registration" / f"{name}.nc")["score"]
+            functions[name] = study.read(run.folder / "coarse" / f"{name}.nc").sizes["mode"]
+    net, lat = (study.read(run.folder / f"{stage}.nc") for stage in ("network", "latent"))
+    doubts, doubtful = findings.doubtful(badness)
+    remarks = [
+        *remarks,
+        *doubtful,
+        *findings.reductions(options, list(badness), net.sizes["pair"] // 2, lat.sizes["mode"], functions),
+        *findings.tied(lat["shape"].values.tolist(), lat["distance_to_median"].values),
+    ]
     stages = list(run.costs)
     costs = dataset(
         {"no_modes": no_modes, **{n: str(v) for n, v in options.items()}},
         seconds=np.array([run.costs[s][0] for s in stages]),
         peak_memory=np.array([run.costs[s][1] for s in stages]),
     ).assign_coords(stage=stages)
-    report = shape_report(attrs).assign(costs.variables).assign_attrs(costs.attrs)
+    report = shape_report(attrs, looks, remarks, doubts)
+    report = report.assign(costs.variables).assign_attrs(costs.attrs)
+    template = options["template"]
+    warning = report["warning"].sel(shape=template).item()
+    if warning:
+        report.attrs["remarks"] += f"\nthe template {template} is itself doubtful ({warning}): give template=NAME"
     study.write(report, run.folder / "report.nc", made_from=made_from)

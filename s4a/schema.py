@@ -183,7 +183,10 @@ TABLE = {
     # the report
     "status": (("shape",), ONE, "ok, repaired or excluded"),
     "reason": (("shape",), ONE, "what was found and done"),
+    "warning": (("shape",), ONE, "what looks wrong and was left as it is"),
     "path": (("shape",), ONE, "file of the shape"),
+    "area": (("shape",), INPUT2, "area of the surface"),
+    "self_intersections": (("shape",), ONE, "triangles that pass through others, -1 where not counted"),
     "file_vertices": (("shape",), ONE, "vertices in the file"),
     "file_triangles": (("shape",), ONE, "triangles in the file"),
     "nonfinite_vertices": (("shape",), ONE, "vertices that are not finite"),
@@ -198,6 +201,7 @@ TABLE = {
     "inserted_vertices": (("shape",), ONE, "vertices inserted on edges where two sheets share both ends"),
     "reoriented_triangles": (("shape",), ONE, "triangles reoriented"),
     "unreferenced_vertices": (("shape",), ONE, "vertices without triangles"),
+    "closed_holes": (("shape",), ONE, "holes closed"),
     "components": (("shape",), ONE, "connected components found"),
     "dropped_components": (("shape",), ONE, "connected components dropped"),
     "area_dropped": (("shape",), ONE, "share of the area in the dropped components"),

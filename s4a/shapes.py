@@ -6,22 +6,25 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from s4a import suspects
 from s4a.clean import REPAIRS, clean
-from s4a.io import find_meshes, read_mesh, slug
+from s4a.io import find_meshes, not_meshes, read_mesh, slug
 from s4a.mesh import as_dataset
+from s4a.options import checked
 from s4a.schema import dataset, in_unit
 
-COUNTS = (*REPAIRS, "file_vertices", "file_triangles", "components", "holes", "genus")
+COUNTS = (*REPAIRS, "file_vertices", "file_triangles", "components", "holes", "genus", "self_intersections")
+TEXTS = ("status", "reason", "warning", "path")
 
 
-def read_shape(path, *, components="largest", strict=False):
+def read_shape(path, *, components="largest", strict=False, close_holes=False):
     """One mesh file, cleaned.
 
     Parameters
     ----------
     path : str or Path
         See :func:`s4a.io.read_mesh` for the formats.
-    components, strict
+    components, strict, close_holes
         See :func:`s4a.clean.clean`.
 
     Returns
@@ -38,7 +41,8 @@ def read_shape(path, *, components="largest", strict=False):
     points, triangles, attrs = read_mesh(path)
     name = os.fsencode(Path(path)).decode("utf-8", "replace")
     try:
-        mesh = clean(as_dataset(points, triangles, {"path": name, **attrs}), components=components, strict=strict)
+        mesh = as_dataset(points, triangles, {"path": name, **attrs})
+        mesh = clean(mesh, components=components, strict=strict, close_holes=close_holes)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     if "note" in attrs:
@@ -46,7 +50,9 @@ def read_shape(path, *, components="largest", strict=False):
     return in_unit(mesh, mesh.attrs.get("unit"))
 
 
-def read_shapes(paths, *, components="largest", strict=False, pattern=None):
+def read_shapes(
+    paths, *, components="largest", strict=False, close_holes=False, pattern=None, compare=True, intersections=True
+):
     """A collection of shapes, cleaned, and a report.
 
     Parameters
@@ -54,21 +60,26 @@ def read_shapes(paths, *, components="largest", strict=False, pattern=None):
     paths : str, Path, list of these, or dict
         A folder, a glob, a file or several of these, see :func:`s4a.io.find_meshes`; or shapes in memory as a dict of
         name to ``(points, triangles)`` or to a mesh Dataset.
-    components, strict
+    components, strict, close_holes
         See :func:`s4a.clean.clean`.
     pattern : str, optional
         Of the files found, those whose name it matches, such as ``"*_brain"``.
+    compare : bool
+        Whether each shape is compared with the others: unit, handedness, pose, genus (:mod:`s4a.suspects`).
+    intersections : bool
+        Whether triangles that pass through others are counted then.
 
     Returns
     -------
     DataTree
         ``/original/<shape>`` for every shape that could be used, and ``/report`` over all shapes with ``status`` (ok,
-        repaired or excluded), ``reason``, ``path`` and counts.
+        repaired or excluded), ``reason`` (what was found and done), ``warning`` (what looks wrong and was left as it
+        is), ``path`` and counts; the attribute ``remarks`` has what concerns several shapes or none, one a line.
 
     Raises
     ------
     ValueError
-        When no shape can be used; the message has every reason.
+        When an option is out of range, or no shape can be used; the message has every reason.
 
     Examples
     --------
@@ -78,10 +89,11 @@ def read_shapes(paths, *, components="largest", strict=False, pattern=None):
     >>> list(shapes["original"]), shapes["report"]["status"].values.tolist()
     (['good'], ['excluded', 'ok'])
     """
+    checked({"components": components, "strict": strict, "close_holes": close_holes, "pattern": pattern})
     meshes, attrs = {}, {}
     for name, source in _sources(paths, pattern).items():
         try:
-            meshes[name] = _cleaned(source, components=components, strict=strict)
+            meshes[name] = _cleaned(source, components=components, strict=strict, close_holes=close_holes)
             attrs[name] = meshes[name].attrs
         except ValueError as error:
             path = str(source) if isinstance(source, Path) else ""
@@ -89,19 +101,37 @@ def read_shapes(paths, *, components="largest", strict=False, pattern=None):
     if not meshes:
         reasons = "; ".join(f"{name}: {given['reason']}" for name, given in attrs.items())
         raise ValueError(f"none of {len(attrs)} shapes can be used ({reasons})")
+    looks, remarks = {}, passed_over(paths, pattern)
+    if compare and len(meshes) > 1:
+        reference = suspects.sample(meshes[suspects.median_size({n: m.attrs["area"] for n, m in meshes.items()})])
+        looks = {name: suspects.look(mesh, reference, intersections) for name, mesh in meshes.items()}
     nodes = {f"/original/{name}": mesh for name, mesh in meshes.items()}
-    return xr.DataTree.from_dict({**nodes, "/report": shape_report(attrs)})
+    return xr.DataTree.from_dict({**nodes, "/report": shape_report(attrs, looks, remarks)})
 
 
-def shape_report(attrs):
+def passed_over(paths, pattern=None):
+    """The files among `paths` that are no meshes, in words."""
+    if isinstance(paths, dict | xr.DataTree):
+        return []
+    return [f"{file} is not a mesh ({why}) and was passed over" for file, why in not_meshes(paths, pattern)]
+
+
+def shape_report(attrs, looks=None, remarks=(), doubts=None):
     """The report on shapes from the attributes of each: a dict of name to ``status``, ``reason``, ``path``, counts.
 
-    Counts are -1 where a shape was excluded.
+    Counts are -1 where a shape was excluded.  `looks` are of :func:`s4a.suspects.look`; `remarks` are kept as they are,
+    with those on the collection; `doubts` are further warnings, a dict of name to str.
     """
-    columns = {name: [str(given.get(name, "")) for given in attrs.values()] for name in ("status", "reason", "path")}
+    used = {name: given for name, given in attrs.items() if given["status"] != "excluded"}
+    warning, of_all = suspects.warnings(used, looks or {})
+    counted = {n: {"self_intersections": look["self_intersections"]} for n, look in (looks or {}).items()}
+    said = {n: "; ".join(filter(None, [warning.get(n), (doubts or {}).get(n)])) for n in attrs}
+    attrs = {n: given | counted.get(n, {}) | {"warning": said[n]} for n, given in attrs.items()}
+    columns = {name: [str(given.get(name, "")) for given in attrs.values()] for name in TEXTS}
     columns |= {name: np.array([given.get(name, -1) for given in attrs.values()], np.int64) for name in COUNTS}
-    columns["area_dropped"] = [float(given.get("area_dropped", np.nan)) for given in attrs.values()]
-    return dataset(**columns).assign_coords(shape=list(attrs))
+    for name in ("area", "area_dropped"):
+        columns[name] = [float(given.get(name, np.nan)) for given in attrs.values()]
+    return dataset({"remarks": "\n".join([*remarks, *of_all])}, **columns).assign_coords(shape=list(attrs))
 
 
 def _sources(paths, pattern):

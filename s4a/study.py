@@ -5,11 +5,12 @@ its task (content, parameters, version) stands in its attributes and says whethe
 """
 
 import hashlib
+import io
 import json
 import logging
 import os
 import uuid
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -17,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from s4a.io import slug
 from s4a.schema import INPUT, in_unit, unit_of, variable
 
 log = logging.getLogger(__name__)
@@ -82,15 +84,23 @@ def write(data, path, key="", made_from=(), claim=None):
     written when it no longer holds.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    whole = io.BytesIO()  # HDF5 brings the process down when the disk is full
+    data.assign_attrs(task_key=key, made_from=" ".join(made_from)).to_netcdf(whole, engine=ENGINE)
     try:
-        data.assign_attrs(task_key=key, made_from=" ".join(made_from)).to_netcdf(temporary, engine=ENGINE)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary.write_bytes(whole.getbuffer())
         if claim is not None:
             claim.check()
         os.replace(temporary, path)
+    except OSError as error:
+        raise OSError(
+            f"{path} cannot be written ({error}): is the disk full, or the folder read-only? Finished files are whole; "
+            "the same command goes on where it stopped"
+        ) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
 def read(path):
@@ -133,8 +143,12 @@ def lock(folder):
     except ImportError:  # on Windows
         fcntl = None
         log.warning("this system cannot lock %s; start no second run in it", folder)
-    Path(folder).mkdir(parents=True, exist_ok=True)
-    with open(Path(folder) / ".lock", "a+") as handle:
+    try:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        handle = open(Path(folder) / ".lock", "a+")
+    except OSError as error:
+        raise OSError(f"{folder} cannot be written ({error}): give another folder") from error
+    with handle:
         try:
             if fcntl:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -217,6 +231,12 @@ def open_study(folder):
         if not known.issuperset(data.attrs.get("made_from", "").split()):
             log.warning("%s belongs to an earlier run and is left out; run the analysis again", path)
             return None
+        names = data["shape"].values.tolist() if "shape" in data.coords else []
+        names += [data.attrs[name] for name in ("template", "median") if name in data.attrs]
+        wrong = [name for name in names if slug(str(name)) != name]
+        if wrong:  # they become names of files
+            log.warning("%s is left out: shapes need names of letters, digits, _ and -; found %s", path, wrong)
+            return None
         known.add(data.attrs.get("task_key"))
         return data
 
@@ -224,7 +244,7 @@ def open_study(folder):
     nodes = {f"{stage}/{name}": opened(f"{stage}/{name}") for stage in ("original", "coarse") for name in names}
     nodes |= {stage: opened(stage) for stage in ("network", "latent")}
     template = opened("registration")
-    if template is not None:
+    if template is not None and nodes["latent"] is not None:
         files = {name: opened(f"registration/{name}") for name in nodes["latent"]["shape"].values.tolist()}
         files = {name: data.load() for name, data in files.items() if data is not None}
         if files:

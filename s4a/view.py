@@ -90,7 +90,7 @@ def _shapes(study, look):
     report = study["report"].dataset
     names = names_of(report)
     status = report["status"].values.astype(str)
-    columns = [key for key in ("reason", "path") if key in report and (report[key].values != "").any()]
+    columns = [key for key in ("reason", "warning", "path") if key in report and (report[key].values != "").any()]
     rows = []
     for i, name in enumerate(names):
         mesh = study["original"][name] if has(study, "original") and name in study["original"].children else None

@@ -2,12 +2,12 @@
 
 import base64
 import itertools
-import lzma
 import re
 import xml.etree.ElementTree as ElementTree
-import zlib
 
 import numpy as np
+
+from s4a.bounded import check, limit_of, unpack
 
 LEGACY_TYPES = {
     "char": "i1",
@@ -25,7 +25,7 @@ LEGACY_TYPES = {
     "double": "f8",
 }
 XML_TYPES = {"Int": "i", "UInt": "u", "Float": "f"}
-DECOMPRESS = {"vtkZLibDataCompressor": zlib.decompress, "vtkLZMADataCompressor": lzma.decompress}
+COMPRESSORS = {"vtkZLibDataCompressor": "zlib", "vtkLZMADataCompressor": "lzma"}
 
 
 def fans(connectivity, offsets):
@@ -219,12 +219,17 @@ def _unpack(data, is_base64, size, compressor):
     w = size.itemsize
     if not compressor:
         return take(w, int(np.frombuffer(take(0, w), size)[0]))
-    if compressor not in DECOMPRESS:
-        raise ValueError(f"{' or '.join(DECOMPRESS)} expected, found {compressor}")
+    if compressor not in COMPRESSORS:
+        raise ValueError(f"{' or '.join(COMPRESSORS)} expected, found {compressor}")
     blocks = int(np.frombuffer(take(0, w), size)[0])
     lengths = np.frombuffer(take(3 * w, blocks * w), size).tolist()
     start = (3 + blocks) * w
     if is_base64:  # header and blocks are encoded apart
         data, start = data[4 * -(-start // 3) :], 0
     body, ends = take(start, sum(lengths)), np.cumsum([0, *lengths])
-    return b"".join(DECOMPRESS[compressor](body[a:b]) for a, b in itertools.pairwise(ends))
+    parts, found = [], 0
+    for a, b in itertools.pairwise(ends):
+        parts.append(unpack(body[a:b], COMPRESSORS[compressor], limit_of(len(data))))
+        found += len(parts[-1])
+        check(found, len(data))
+    return b"".join(parts)

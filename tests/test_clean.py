@@ -411,7 +411,10 @@ def test_a_bad_file_is_excluded_with_its_reason_and_the_rest_goes_on(tmp_path):
     cut, named, twice = report["reason"].values.tolist()
     assert "cut.ply" in cut
     assert "expected 396 rows of face" in cut
-    assert (named, twice) == ("named .obj but holds PLY", "1 duplicate triangles dropped")
+    assert (named, twice) == (
+        "named .obj but holds PLY, and was read as that; rename it",
+        "1 duplicate triangles dropped",
+    )
     assert report["file_vertices"].values.tolist() == [-1, 200, 200]
     assert list(shapes["original"]) == ["named", "twice"]
     assert not shapes["original"].to_dataset().variables

@@ -12,6 +12,7 @@ import pytest
 
 from s4a import analyse, study, synthetic
 from s4a.pipeline import Run
+from s4a.schema import dataset
 
 OPTIONS = {"n_coarse": 150, "k_init": 8, "k": 12}
 RUN = """
@@ -109,3 +110,61 @@ def test_a_study_knows_the_files_in_a_folder_that_was_renamed(files, tmp_path):
         paths = [str(tmp_path / "after" / p.name) for p in meshes]
         assert tree["report"]["path"].values.tolist() == paths
         assert [tree[f"original/{n}"].attrs["path"] for n in tree["original"]] == paths
+
+
+def test_another_version_computes_again(tmp_path, monkeypatch):
+    path = tmp_path / "a.nc"
+    study.write(synthetic.sphere(50), path, study.task_key("content"))
+    assert study.is_done(path, study.task_key("content"))
+    monkeypatch.setattr(study, "VERSION", "999.0")
+    assert not study.is_done(path, study.task_key("content"))
+
+
+FULL = """
+import resource, sys
+from s4a import cli
+resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, 60_000))
+small = ["--n-coarse", "150", "--k-init", "8", "--k", "12", "--n-jobs", sys.argv[1], "--no-intersections"]
+sys.exit(cli.main(["run", sys.argv[3], "--out", sys.argv[2], *small]))
+"""
+
+
+@pytest.mark.parametrize("n_jobs", [1, 2])
+def test_a_disk_that_takes_no_more_ends_in_one_error_and_leaves_whole_files(files, tmp_path, n_jobs):
+    folder = tmp_path / "study"
+    arguments = [sys.executable, "-c", FULL, str(n_jobs), str(folder), str(files[0].parent / "*.ply")]
+    found = subprocess.run(arguments, capture_output=True, text=True, check=False)
+    assert found.returncode == 2, found.stderr
+    lines = [line for line in found.stderr.splitlines() if line.startswith("s4a: ")]
+    assert len(lines) == 1, found.stderr
+    assert "cannot be written" in lines[0]
+    assert "goes on where it stopped" in lines[0]
+    whole = sorted(folder.rglob("[!.]*.nc"))
+    assert whole
+    assert all(study.attributes(path)["task_key"] for path in whole)
+    assert not list(folder.rglob(".*.tmp"))
+
+
+def test_a_folder_that_cannot_be_written_is_one_error(tmp_path, monkeypatch):
+    study.write(synthetic.sphere(50), tmp_path / "a.nc", "key")
+
+    def refused(*_):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(os, "replace", refused)
+    with pytest.raises(OSError, match=r"a.nc cannot be written .*Permission denied.*Finished files are whole"):
+        study.write(synthetic.sphere(60), tmp_path / "a.nc", "key")
+    assert study.read(tmp_path / "a.nc").sizes["vertex"] == 50
+    assert [p.name for p in tmp_path.iterdir()] == ["a.nc"]
+
+
+def test_names_that_lead_out_of_a_study_are_left_out(tmp_path, caplog):
+    folder, outside = tmp_path / "study", tmp_path / "outside.nc"
+    mesh = synthetic.sphere(50)
+    study.write(mesh, folder / "original" / "a.nc")
+    study.write(dataset(latent_eigenvalue=[0.0, 1.0]).assign_coords(shape=["a", "../../outside"]), folder / "latent.nc")
+    study.write(mesh.assign_attrs(template="../../outside"), folder / "registration.nc")
+    study.write(mesh, outside)
+    with study.open_study(folder) as tree:
+        assert list(tree.children) == ["original"]
+    assert "shapes need names of letters, digits, _ and -; found ['../../outside']" in caplog.text

@@ -7,7 +7,7 @@ import nibabel
 import numpy as np
 import pytest
 
-from s4a.io import find_meshes, read_mesh, slug, write_mesh
+from s4a.io import find_meshes, not_meshes, read_mesh, slug, write_mesh
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 X = np.array([[0, 0, 0], [1.5, 0, 0], [1.5, 2, 0], [0, 2, 0], [0.25, 0.5, 3]])
@@ -205,7 +205,7 @@ def test_npz_with_pickled_objects_is_refused(tmp_path):
 def test_the_content_counts_and_not_the_name(tmp_path):
     attrs = same_surface(file(tmp_path, "m.stl", ply("binary_little_endian")))
     assert attrs["format"] == "PLY"
-    assert attrs["note"] == "named .stl but holds PLY"
+    assert attrs["note"] == "named .stl but holds PLY, and was read as that; rename it"
 
 
 def all_formats(tmp_path):
@@ -259,11 +259,11 @@ def test_indices_beyond_the_vertices_are_named(tmp_path):
 
 
 def test_what_is_no_mesh_says_so(tmp_path):
-    with pytest.raises(ValueError, match=r"none of PLY, OBJ"):
+    with pytest.raises(ValueError, match=r"one of PLY, OBJ.* expected, found"):
         read_mesh(file(tmp_path, "m.ply", "shopping list"))
     with pytest.raises(ValueError, match=r"no file"):
         read_mesh(tmp_path / "absent.ply")
-    with pytest.raises(ValueError, match=r"needs vertices and triangles"):
+    with pytest.raises(ValueError, match=r"no faces: a surface needs triangles, found 3 points"):
         read_mesh(file(tmp_path, "m.off", "OFF\n3 0 0\n0 0 0\n1 0 0\n0 1 0\n"))
 
 
@@ -332,3 +332,13 @@ def test_published_brain_templates_are_read():
     points, triangles, attrs = read_mesh(folder / "fsa5_lh.gii")
     assert (len(points), len(triangles)) == (10242, 20480)
     assert attrs["unit"] == "mm"
+
+
+def test_what_lies_beside_the_meshes_of_a_folder_is_passed_over_and_named(tmp_path):
+    write_mesh(tmp_path / "a.ply", X, T)
+    np.savez(tmp_path / "scores.npz", score=np.zeros(3))
+    (tmp_path / "a.json").write_text("{}")
+    assert [path.name for path, _ in find_meshes(tmp_path)] == ["a.ply"]
+    assert [(path.name, why) for path, why in not_meshes(tmp_path)] == [("scores.npz", "an archive of other arrays")]
+    assert [path.name for path, _ in not_meshes(tmp_path / "*")] == ["a.json", "scores.npz"]
+    assert not_meshes(tmp_path, "a") == []

@@ -1,0 +1,537 @@
+"""Faulty files, one function each, in a folder beside ten good shapes."""
+
+import gzip
+from dataclasses import dataclass
+
+import numpy as np
+
+from s4a import synthetic, write_mesh
+from s4a.io import WRITERS
+from s4a.mesh import as_arrays
+
+BUMPS = np.array([[1, 0.4, 0.3], [-0.5, 1, 0.5], [-0.3, -0.8, 0.9], [0.3, -0.5, -1]])
+HEIGHTS = np.array([0.9, 0.6, 0.45, 0.3])
+SPHERE = as_arrays(synthetic.sphere(300))
+
+
+def shape(seed=0, n=300):
+    """A closed surface of about 100 mm that no reflection and no turn brings onto itself."""
+    u, T = SPHERE if n == 300 else as_arrays(synthetic.sphere(n))
+    centre = BUMPS / np.linalg.norm(BUMPS, axis=1, keepdims=True)
+    height = HEIGHTS * (1 + 0.15 * np.random.default_rng(seed).normal(size=4))
+    r = 1 + np.exp(6 * (u @ centre.T - 1)) @ height
+    return 40 * r[:, None] * u * [1.4, 1.1, 0.8], T
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A cell of the table: its input, the file and the outcome that are promised.
+
+    `make` writes `file` into a folder; `said` must be found in the report's column `where` (or in its attribute
+    ``remarks``) for the shape `name`; `outcome` and `change` are for the documentation.
+    """
+
+    input: str
+    file: str
+    make: object
+    status: str
+    said: str
+    outcome: str
+    change: str
+    name: str = ""
+    where: str = "reason"
+
+    @property
+    def shape(self):
+        return self.name or self.file.split(".")[0]
+
+
+FAULTS = []
+
+
+def fault(input, file, status, said, outcome, change, **others):
+    def enter(make):
+        FAULTS.append(Fault(input, file, make, status, said, outcome, change, **others))
+        return make
+
+    return enter
+
+
+def write(path, X, T):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(WRITERS[".ply"](X, T, {}))
+
+
+AGAIN = "export the file again"
+
+
+@fault("zero-byte file", "zero.ply", "excluded", "found 0 bytes", "excluded", AGAIN)
+def zero(path):
+    path.write_bytes(b"")
+
+
+@fault("truncated file", "cut.ply", "excluded", "expected 596 rows of face, found", "excluded", AGAIN)
+def cut(path):
+    write(path, *shape())
+    path.write_bytes(path.read_bytes()[:-1000])
+
+
+@fault("text in a binary PLY", "text.ply", "excluded", "expected .*found", "excluded", AGAIN)
+def text(path):
+    X, T = shape()
+    write(path, X, T)
+    head = path.read_bytes().partition(b"end_header\n")[0]
+    rows = [*(" ".join(map(str, x)) for x in X), *("3 " + " ".join(map(str, t)) for t in T)]
+    path.write_bytes(head + b"end_header\n" + "\n".join(rows).encode())
+
+
+@fault(
+    "header that promises more than is there",
+    "promise.ply",
+    "excluded",
+    "expected 9000000 rows of vertex, found",
+    "excluded before memory is asked for",
+    AGAIN,
+)
+def promise(path):
+    write(path, *shape())
+    path.write_bytes(path.read_bytes().replace(b"vertex 300", b"vertex 9000000"))
+
+
+@fault("PLY named .stl", "ply_inside.stl", "ok", "named .stl but holds PLY", "read as what it is", "rename the file")
+def ply_inside(path):
+    write(path, *shape(1))
+
+
+@fault("STL named .ply", "stl_inside.ply", "ok", "named .ply but holds STL", "read as what it is", "rename the file")
+def stl_inside(path):
+    path.write_bytes(WRITERS[".stl"](*shape(2), {}))
+
+
+@fault("compressed file", "packed.ply.gz", "ok", "^$", "read", "nothing to do")
+def packed(path):
+    path.write_bytes(gzip.compress(WRITERS[".ply"](*shape(3), {})))
+
+
+@fault(
+    "compressed file that unpacks to too much",
+    "bomb.ply.gz",
+    "excluded",
+    "at most 64 MiB expected in .* compressed bytes, found more",
+    "excluded at 200 times its size (64 MiB at least, 1 GiB at most)",
+    "unpack it yourself",
+)
+def bomb(path):
+    path.write_bytes(gzip.compress(bytes(2**26 + 2**20), 1))
+
+
+@fault("points only", "points.off", "excluded", "no faces", "excluded", "export the surface, not the points")
+def points(path):
+    path.write_text("OFF\n300 0 0\n" + "\n".join("{} {} {}".format(*x) for x in shape()[0]))
+
+
+@fault("quads and polygons", "quads.obj", "ok", "^$", "triangulated", "nothing to do")
+def quads(path):
+    X, T = shape(4)
+    rows = ["v {} {} {}".format(*x) for x in X]
+    a, b, c = T[0]
+    pair = np.flatnonzero((T == a).any(axis=1) & (T == b).any(axis=1))
+    d = np.setdiff1d(T[pair], T[0])[0]
+    faces = [[a, d, b, c], *np.delete(T, pair, axis=0).tolist()]
+    path.write_text("\n".join(rows + ["f " + " ".join(str(i + 1) for i in f) for f in faces]))
+
+
+@fault(
+    "face index out of range",
+    "beyond.off",
+    "excluded",
+    r"face indices 0\.\.299 expected for 300 vertices, found 0\.\.5000",
+    "excluded before native code",
+    AGAIN,
+)
+def beyond(path):
+    X, T = shape()
+    path.write_bytes(WRITERS[".off"](X, np.r_[T[:-1], [[0, 1, 5000]]], {}))
+
+
+@fault(
+    "negative face index",
+    "negative.ply",
+    "excluded",
+    r"face indices 0\.\.299 expected for 300 vertices, found -7\.\.",
+    "excluded before native code",
+    AGAIN,
+)
+def negative(path):
+    X, T = shape()
+    write(path, X, np.r_[T[:-1], [[0, 1, -7]]])
+
+
+@fault(
+    "NaN or infinite coordinates",
+    "nan.ply",
+    "repaired",
+    "2 non-finite vertices removed.*1 holes|2 non-finite vertices removed.*2 holes",
+    "the vertices and their faces are removed, `file_vertex` leads to the file's",
+    "`strict=True` excludes the shape; `close_holes=True` closes what is left open",
+)
+def nan(path):
+    X, T = shape(5)
+    X[10], X[200] = np.nan, np.inf
+    write(path, X, T)
+
+
+@fault(
+    "unreferenced vertices",
+    "unreferenced.ply",
+    "repaired",
+    "3 vertices without triangles dropped",
+    "dropped, `file_vertex` kept",
+    "nothing to do",
+)
+def unreferenced(path):
+    X, T = shape(6)
+    write(path, np.r_[np.ones((3, 3)), X], T + 3)
+
+
+@fault(
+    "duplicate vertices",
+    "duplicate_vertices.obj",
+    "repaired",
+    "1488 vertices welded",
+    "welded at 1e-7 of the bounding box, `file_vertex` kept",
+    "nothing to do",
+)
+def duplicate_vertices(path):
+    X, T = shape(7)
+    soup = X[T].reshape(-1, 3) + np.random.default_rng(0).uniform(-1e-6, 1e-6, (3 * len(T), 3))
+    path.write_bytes(WRITERS[".obj"](soup, np.arange(len(soup)).reshape(-1, 3), {}))
+
+
+@fault("STL soup", "soup.stl", "ok", "^$", "corners in the same place are one vertex", "nothing to do")
+def soup(path):
+    path.write_bytes(WRITERS[".stl"](*shape(8), {}))
+
+
+@fault(
+    "zero-area faces",
+    "flat.ply",
+    "repaired",
+    "zero-area triangles",
+    "long edges flipped, so that no crack opens; else dropped",
+    "nothing to do",
+)
+def flat(path):
+    X, T = shape(9)
+    a, b, c = T[0]
+    middle = len(X)
+    X = np.r_[X, [(X[a] + X[b]) / 2]]
+    write(path, X, np.r_[T[1:], [[a, middle, c], [middle, b, c], [a, b, middle]]])
+
+
+@fault(
+    "faces that repeat a corner",
+    "repeated.ply",
+    "repaired",
+    "2 triangles with repeated corners dropped",
+    "dropped",
+    "nothing to do",
+)
+def repeated(path):
+    X, T = shape(10)
+    write(path, X, np.r_[T, [[3, 3, 4], [5, 6, 5]]])
+
+
+@fault("duplicate faces", "twice.ply", "repaired", "5 duplicate triangles dropped", "one is kept", "nothing to do")
+def twice(path):
+    X, T = shape(11)
+    write(path, X, np.r_[T, T[:5]])
+
+
+@fault(
+    "flipped faces",
+    "flipped.ply",
+    "repaired",
+    "100 triangles reoriented",
+    "turned to agree, and outwards",
+    "nothing to do",
+)
+def flipped(path):
+    X, T = shape(12)
+    T = T.copy()
+    T[:100] = T[:100, ::-1]
+    write(path, X, T)
+
+
+@fault(
+    "non-manifold edges",
+    "fin.ply",
+    "repaired",
+    "1 non-manifold edges separated",
+    "separated into sheets; a robust Laplacian where the low-resolution mesh still has some",
+    "`wrap=True` wraps the shape watertight",
+)
+def fin(path):
+    X, T = shape(13)
+    write(path, np.r_[X, [[90.0, 90, 90]]], np.r_[T, [[T[0, 0], T[0, 1], len(X)]]])
+
+
+@fault(
+    "bow-tie vertices",
+    "bowtie.ply",
+    "repaired",
+    "1 vertices added by splitting non-manifold ones",
+    "split",
+    "nothing to do",
+)
+def bowtie(path):
+    X, T = shape(14)
+    u, S = as_arrays(synthetic.sphere(20))
+    top = np.argmax(X[:, 2])
+    low = np.argmin(u[:, 2])
+    Y = 5 * (u - u[low]) + X[top]
+    S = np.where(S == low, top, S + len(X))
+    write(path, np.r_[X, Y], np.r_[T, S])
+
+
+@fault(
+    "holes, open boundary",
+    "hole.ply",
+    "ok",
+    "1 holes kept as boundary",
+    "kept as boundary",
+    "`close_holes=True` closes each by a fan",
+)
+def hole(path):
+    X, T = shape(15)
+    write(path, X, T[1:])
+
+
+def spheres(X, T, *radii):
+    for i, radius in enumerate(radii):
+        u, S = as_arrays(synthetic.sphere(60))
+        X, T = np.r_[X, radius * u + [300 + 300 * i, 0, 0]], np.r_[T, S + len(X)]
+    return X, T
+
+
+@fault(
+    "several components",
+    "debris.ply",
+    "repaired",
+    r"2 components dropped \([0-9.]+ % of the area\)",
+    "the largest is kept, and the share of the area that was dropped is said",
+    '`components=N` or `"all"` keeps more',
+)
+def debris(path):
+    write(path, *spheres(*shape(16), 4, 5))
+
+
+@fault(
+    "components with more than a tenth of the area",
+    "parts.ply",
+    "repaired",
+    "% of the area was in dropped components",
+    "the largest is kept, warned",
+    '`components=N` or `"all"` keeps more',
+    where="warning",
+)
+def parts(path):
+    write(path, *spheres(*shape(17), 30))
+
+
+@fault(
+    "largest component under half of the area",
+    "halves.ply",
+    "excluded",
+    r"the largest of 3 components has .* under half; say how many .* components=3",
+    "excluded",
+    '`components=N` or `"all"`',
+)
+def halves(path):
+    X, T = shape()
+    write(path, np.r_[X, X + 300, X + 600], np.r_[T, T + len(X), T + 2 * len(X)])
+
+
+@fault(
+    "self-intersections",
+    "crossing.ply",
+    "ok",
+    "triangles pass through others",
+    "counted and warned",
+    "`wrap=True` makes a surface without; `intersections=False` does not look for them",
+    where="warning",
+)
+def crossing(path):
+    X, T = shape(18)
+    X[np.argmax(X[:, 2])] *= [1, 1, -1.6]
+    write(path, X, T)
+
+
+@fault(
+    "genus other than the rest",
+    "handle.ply",
+    "ok",
+    "genus 1, but 0 in",
+    "warned, with the table of genus",
+    "`wrap=True` closes tunnels; or leave the shape out",
+    where="warning",
+)
+def handle(path):
+    X, T = as_arrays(synthetic.torus(30, 12, 50, 20))
+    write(path, X, T)
+
+
+@fault(
+    "shape in other units",
+    "metres.ply",
+    "ok",
+    r"times the size of the others, near 10\^-3",
+    "warned with the factor; size is kept",
+    "scale the file",
+    where="warning",
+)
+def metres(path):
+    X, T = shape(19)
+    write(path, X / 1000, T)
+
+
+@fault(
+    "mirrored shape",
+    "mirrored.ply",
+    "ok",
+    "fits as a mirror image",
+    "warned with both ICP residuals; kept as it is",
+    "mirror the file, or leave it out",
+    where="warning",
+)
+def mirrored(path):
+    X, T = shape(20)
+    write(path, X * [-1, 1, 1], T[:, ::-1])
+
+
+@fault(
+    "shape upside down",
+    "upside_down.ply",
+    "ok",
+    "turned by 1[678]. degrees against most others",
+    "warned; ICP starts from several turns",
+    "turn the file if pictures look wrong",
+    where="warning",
+)
+def upside_down(path):
+    X, T = shape(21)
+    write(path, X * [1, -1, -1], T)
+
+
+@fault("coordinates offset by 1e6", "far.obj", "ok", "^$", "the same as centred", "nothing to do")
+def far(path):
+    X, T = shape(22)
+    path.write_bytes(WRITERS[".obj"](X + 1e6, T, {}))
+
+
+@fault(
+    "scale 1e-9",
+    "tiny.obj",
+    "ok",
+    "1e-09 times the size of the others|e-10 times the size of the others",
+    "the same as scaled, in the input's units; warned as another unit",
+    "scale the file",
+    where="warning",
+)
+def tiny(path):
+    X, T = shape(23)
+    path.write_bytes(WRITERS[".obj"](X * 1e-9, T, {}))
+
+
+@fault(
+    "scale 1e9",
+    "huge.obj",
+    "ok",
+    r"e\+0?[89] times the size of the others",
+    "the same as scaled, in the input's units; warned as another unit",
+    "scale the file",
+    where="warning",
+)
+def huge(path):
+    X, T = shape(24)
+    path.write_bytes(WRITERS[".obj"](X * 1e9, T, {}))
+
+
+@fault("fewer vertices than the target resolution", "few.ply", "ok", "", "used as it is, said in the report", "nothing")
+def few(path):
+    write(path, *shape(25, 80))
+
+
+@fault(
+    "spaces and letters outside ASCII in a path",
+    "Schädel der Maus 脳.ply",
+    "ok",
+    "^$",
+    "works; the name is made of ASCII letters",
+    "nothing to do",
+    name="Schadel_der_Maus_u8133",
+)
+def letters(path):
+    write(path, *shape(26))
+
+
+@fault("two files with one stem", "left/one.ply", "ok", "^$", "named by their folders", "nothing", name="left_one")
+def left(path):
+    write(path, *shape(27))
+
+
+@fault("two files with one stem", "right/one.ply", "ok", "^$", "named by their folders", "nothing", name="right_one")
+def right(path):
+    write(path, *shape(28))
+
+
+@fault(
+    "HTML in a shape's name",
+    "<img src=x onerror=alert(1)>.ply",
+    "ok",
+    "^$",
+    "escaped wherever it is shown",
+    "rename the file",
+    name="_img_src_x_onerror_alert_1__",
+)
+def html(path):
+    write(path, *shape(29))
+
+
+class Evil:
+    def __reduce__(self):
+        return (exec, ("raise SystemExit('a pickle was executed')",))
+
+
+@fault("pickle in an NPZ", "pickle.npz", "excluded", "pickle", "excluded, never executed", "save plain arrays")
+def pickle(path):
+    np.savez(path, V=np.array([Evil()], object), F=np.array([[0, 1, 2]]))
+
+
+@fault(
+    "labels beside the surfaces",
+    "some.label.gii",
+    "",
+    "some.label.gii is not a mesh .a GIFTI file without points. and was passed over",
+    "passed over and said; no lost shape",
+    "nothing to do",
+    where="remarks",
+)
+def label(path):
+    import nibabel
+
+    array = nibabel.gifti.GiftiDataArray(np.arange(300, dtype=np.int32), "NIFTI_INTENT_LABEL")
+    path.write_bytes(nibabel.gifti.GiftiImage(darrays=[array]).to_bytes())
+
+
+GOOD = [f"good_{i}" for i in range(10)]
+
+
+def make(folder):
+    """All faults and ten good shapes."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for one in FAULTS:
+        one.make(folder / one.file)
+    for i, name in enumerate(GOOD):
+        write_mesh(folder / f"{name}.ply", *shape(100 + i))
+    return folder

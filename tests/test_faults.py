@@ -1,0 +1,212 @@
+"""Faulty input (docs/faults.md): in Python, in ``s4a check`` and in ``s4a run`` the outcome that is promised."""
+
+import contextlib
+import io
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from faults import shapes as faulty
+from faults import studies, table
+
+from s4a import analyse, cli, findings, open_study, read_shapes
+from s4a.mesh import as_dataset, euler_characteristic
+from s4a.view import page
+
+SMALL = {"n_coarse": 100, "k_init": 6, "k": 10, "step": 4, "refine": "intrinsic"}
+FLAGS = [part for name, value in SMALL.items() for part in ("--" + name.replace("_", "-"), str(value))]
+BY_NAME = {one.shape: one for one in faulty.FAULTS}
+
+
+def found_in(folder):
+    """The report of Python."""
+    return read_shapes(folder)["report"].to_dataset()
+
+
+def example(report):
+    """What the report says of every faulty shape, without the paths of this machine."""
+    said = {}
+    for one in faulty.FAULTS:
+        text = report.attrs["remarks"] if one.where == "remarks" else report[one.where].sel(shape=one.shape).item()
+        lines = [line for line in text.splitlines() if one.where != "remarks" or one.file in line]
+        said[one.shape] = re.sub(r"\S*/(?=[^/\s]+)", "", " ".join(lines))
+    return said
+
+
+def printed(*arguments):
+    """The exit code of a command and what it wrote, in one line."""
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        code = cli.main(list(arguments))
+    return code, re.sub(r"(?<=\w)- (?=\w)", "-", re.sub(r"\s+", " ", out.getvalue()))  # wrapped at hyphens too
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory):
+    return faulty.make(tmp_path_factory.mktemp("faults") / "meshes")
+
+
+@pytest.fixture(scope="session")
+def in_python(folder):
+    return found_in(folder)
+
+
+@pytest.fixture(scope="session")
+def checked(folder):
+    return printed("check", str(folder))
+
+
+@pytest.fixture(scope="session")
+def ran(folder, tmp_path_factory):
+    """What a run over all wrote, and its study."""
+    out = tmp_path_factory.mktemp("out") / "study"
+    more = ["--n-pairs", "49", "--template", "good_0", "--n-jobs", "1"]
+    code, text = printed("run", str(folder), "--out", str(out), *FLAGS, *more)
+    with open_study(out) as study:
+        yield code, text, study
+
+
+def said(report, one):
+    return report.attrs["remarks"] if one.where == "remarks" else report[one.where].sel(shape=one.shape).item()
+
+
+@pytest.mark.parametrize("name", BY_NAME)
+def test_every_fault_has_its_outcome(name, in_python, checked, ran):
+    one, in_run = BY_NAME[name], ran[2]["report"].to_dataset()
+    silent = one.said in ("", "^$")
+    for report in (in_python, in_run):
+        if one.where == "remarks":
+            assert name not in report["shape"].values
+        else:
+            assert report["status"].sel(shape=name).item() == one.status
+        if not (silent and report is in_run):  # a run has other things to say of them
+            assert re.search(one.said, said(report, one))
+    assert (name in ran[2]["registration"]["shape"].values) == (one.status in ("ok", "repaired"))
+    for _, text, *_ in (checked, ran):
+        assert name in text or silent
+        assert silent or re.search(one.said, text)
+
+
+def test_a_run_over_all_faults_ends_with_ten_good_shapes(in_python, checked, ran):
+    code, text, study = ran
+    assert code == 0
+    assert checked[0] == 1  # as shapes were excluded
+    assert in_python.sel(shape=faulty.GOOD)["status"].values.tolist() == ["ok"] * 10
+    assert in_python.sel(shape=faulty.GOOD)["warning"].values.tolist() == [""] * 10
+    assert set(faulty.GOOD) <= set(study["registration"]["shape"].values)
+    assert study["report"].sizes["shape"] == 10 + sum(one.where != "remarks" for one in faulty.FAULTS)
+    for data in (study[stage].to_dataset() for stage in ("network", "latent", "registration", "pca")):
+        for name, variable in data.variables.items():
+            if not name.startswith("cycle_error"):  # a pair in no 3-cycle has none
+                assert variable.dtype.kind != "f" or np.isfinite(variable.values).all(), name
+    assert "genus 0: " in text
+    assert "genus 1: handle" in text
+
+
+def test_the_page_of_a_study_escapes_the_names_of_files(ran):
+    html = page(ran[2])
+    assert "<img src=x" not in html
+    assert "&lt;img src=x" in html
+
+
+def test_the_documentation_is_current(in_python):
+    assert table.PAGE.read_text(encoding="utf-8") == table.page(faulty.FAULTS, studies.PROOFS, example(in_python))
+
+
+@pytest.mark.parametrize("proof", studies.PROOFS, ids=lambda proof: proof[3])
+def test_every_other_row_of_the_table_has_its_test(proof):
+    _, _, file, test = proof
+    assert f"def {test}(" in (Path(__file__).parent / file).read_text()
+
+
+# rows that need more than a file
+
+
+def test_strict_excludes_what_would_be_repaired(tmp_path):
+    faulty.nan(tmp_path / "nan.ply")
+    faulty.far(tmp_path / "far.obj")
+    report = read_shapes(tmp_path, strict=True)["report"].to_dataset()
+    assert report["status"].values.tolist() == ["ok", "excluded"]
+    assert "2 of 300 vertices are not finite; strict=False removes them" in report["reason"].values[1]
+
+
+def test_holes_are_closed_on_demand(tmp_path):
+    faulty.nan(tmp_path / "nan.ply")
+    tree = read_shapes(tmp_path, close_holes=True)
+    mesh = tree["original/nan"].to_dataset()
+    assert mesh.attrs["holes"] == 0
+    assert mesh.attrs["closed_holes"] == 2
+    assert euler_characteristic(mesh["corner_vertex"].values) == 2
+    assert mesh.sizes["vertex"] == 300  # two went, and one came for each hole
+    X = faulty.shape(5)[0]
+    kept = slice(298)
+    assert np.allclose(mesh["position"][kept], X[mesh["file_vertex"][kept]], atol=1e-4)
+    assert "2 holes closed" in tree["report"]["reason"].item()
+
+
+def collection(factor=1.0, offset=0.0):
+    return {f"shape_{i}": (factor * X + offset, T) for i in range(3) for X, T in [faulty.shape(i)]}
+
+
+def test_the_study_does_not_depend_on_place_and_unit():
+    options = SMALL | {"n_jobs": 1, "intersections": False}
+    reference = analyse(collection(), **options)
+    for factor, offset in ((1, 1e6), (1e-9, 0), (1e9, 0)):
+        found = analyse(collection(factor, offset), **options)
+        one, other = (t["registration"].to_dataset() for t in (reference, found))
+        assert one.attrs["template"] == other.attrs["template"]
+        assert np.allclose(other["displacement"] / factor, one["displacement"], atol=1e-3)
+        assert np.allclose(found["pca"]["score"], reference["pca"]["score"], atol=1e-3)
+        assert found["report"]["warning"].values.tolist() == reference["report"]["warning"].values.tolist()
+
+
+def test_files_of_different_units_are_told():
+    meshes = {name: as_dataset(*mesh) for name, mesh in collection().items()}
+    meshes["shape_0"].attrs |= {"unit": "mm", "coordinate_system": "RAS"}
+    meshes["shape_1"].attrs |= {"unit": "m", "coordinate_system": "LPS"}
+    remarks = read_shapes(meshes)["report"].attrs["remarks"]
+    assert "the files name different units, and none was converted (m: shape_1; mm: shape_0)" in remarks
+    assert "different coordinate systems, and none was converted (LPS: shape_1; RAS: shape_0)" in remarks
+
+
+def test_of_two_mirror_images_none_is_the_right_one():
+    X, T = faulty.shape()
+    report = read_shapes({"a": (X, T), "b": (X * [1, -1, 1], T)})["report"].to_dataset()
+    assert report["warning"].values.tolist() == ["", ""]
+    assert "mirror images of each other, by ICP: a and b; kept as they are" in report.attrs["remarks"]
+
+
+def test_an_odd_reference_does_not_make_the_others_odd():
+    X, T = faulty.shape()
+    shapes = {f"s{i}": (Y, S) for i in range(4) for Y, S in [faulty.shape(i)]}
+    reference = sorted(shapes, key=lambda n: as_area(*shapes[n]))[1]  # the one with the median area
+    X, T = shapes[reference]
+    shapes[reference] = X * [-1, 1, 1], T
+    warning = read_shapes(shapes)["report"]["warning"]
+    assert "fits as a mirror image" in warning.sel(shape=reference).item()
+    assert (warning.drop_sel(shape=reference) == "").all()
+
+
+def as_area(X, T):
+    return np.linalg.norm(np.cross(X[T[:, 1]] - X[T[:, 0]], X[T[:, 2]] - X[T[:, 0]]), axis=1).sum()
+
+
+def test_reduced_numbers_are_told():
+    meshes = {name: faulty.shape(i, n) for i, (name, n) in enumerate({"a": 60, "b": 20, "c": 60}.items())}
+    report = analyse(meshes, **SMALL | {"k": 40}, n_jobs=1, intersections=False)["report"]
+    assert "all 3 pairs of 3 shapes are used (n_pairs = 500)" in report.attrs["remarks"]
+    assert re.search(r"k = 40 reduced to 1\d, the eigenfunctions of b", report.attrs["remarks"])
+    assert "all vertices are used, as there are fewer than n_coarse = 100" in report["reason"].sel(shape="a").item()
+
+
+def test_a_wrong_registration_is_told():
+    wrong, remarks = findings.doubtful({"a": 0.0, "b": 0.02, "c": 0.1})
+    assert list(wrong) == ["c"]
+    assert "badness 0.100" in wrong["c"]
+    assert remarks == []
+    assert findings.doubtful({"a": 0.0, "b": 0.12, "c": 0.1})[0] == {}
+
+
+def test_two_shapes_share_the_median_and_it_is_told():
+    assert "the median is not unique: a, b are equally near" in findings.tied(["a", "b"], [0.1, 0.1 + 1e-12])[0]
+    assert findings.tied(["a", "b", "c"], [0.1, 0.2, 0.3]) == []
