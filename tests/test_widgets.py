@@ -158,6 +158,12 @@ def test_without_anywidget_every_panel_shows_pictures(study, panel, bare):
         assert any(bytes(picture[1:4]) == b"PNG" for picture in pictures), kind
 
 
+def test_without_anywidget_a_page_says_that_its_controls_need_python(panel, bare, tmp_path):
+    text = panel(Spectrum).save_html(tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "Needs Python, in a notebook: changing shape, mode, first k" in text
+    assert 'type="range"' not in text
+
+
 def parts_of(widget):
     yield widget
     for child in getattr(widget, "children", ()):

@@ -104,13 +104,15 @@ class Recording:
 
     def __init__(self, panel):
         self.parts = [part for part in parts(panel) if part is not panel and part is not panel.message]
-        names = list(dict.fromkeys(itertools.chain.from_iterable(panel.live)))
+        drawn = any(hasattr(part, "_esm") for part in self.parts)  # or Python would have to draw a picture for each
+        live = panel.live if drawn else ()
+        names = list(dict.fromkeys(itertools.chain.from_iterable(live)))
         self.controls = {name: Control(panel.control(name), name, name in panel.every) for name in names}
         self.values, self.place, self.size = [], {}, 0
         with ExitStack() as held:
             for part in self.parts:  # the notebook's browser is told the end only, which is the beginning
                 held.enter_context(part.hold_sync())
-            runs = [self.run(group, LIMIT * (i + 1) // len(panel.live)) for i, group in enumerate(panel.live)]
+            runs = [self.run(group, LIMIT * (i + 1) // len(live)) for i, group in enumerate(live)]
         depends = [differing(*run) for run in runs]
         self.groups = [self.group(*run, mine, depends) for run, mine in zip(runs, depends, strict=True)]
         self.open = {}
@@ -120,6 +122,7 @@ class Recording:
         self.clicks = [
             {"id": getattr(panel, chart), "part": part, "control": names.index(name)}
             for chart, part, name in panel.clicks
+            if drawn
         ]
 
     def kept(self, value):
@@ -246,7 +249,7 @@ class Page:
             for part in parts(panel)
             if hasattr(part, "value")
             and getattr(part, "description", "")
-            and not isinstance(part, ipywidgets.Button | ipywidgets.Text | ipywidgets.HTML | ipywidgets.FloatText)
+            and not isinstance(part, ipywidgets.Button | ipywidgets.Text | ipywidgets.HTML | ipywidgets.IntProgress)
             and len(self.recording.open.get(self.names.get(part), ())) < 2
         ]
         some = [
