@@ -419,7 +419,7 @@ def test_the_spectrum_shows_every_shape_beside_weyls_line(study, panel):
 # ---- progress
 
 
-def ended(panel, seconds=60):
+def ended(panel, seconds=400):
     panel.process.join(seconds)
     for _ in range(100):
         if panel.stop.disabled:
