@@ -421,7 +421,7 @@ def test_the_spectrum_shows_every_shape_beside_weyls_line(study, panel):
 
 def ended(panel, seconds=400):
     panel.process.join(seconds)
-    for _ in range(100):
+    for _ in range(1000):
         if panel.stop.disabled:
             return panel.state
         time.sleep(0.05)
