@@ -2,29 +2,35 @@
 
 import numpy as np
 import scipy.linalg
+import scipy.sparse as sp
 
 from s4a.align import rigid_transform
 
 
-def smoother(B, area):
-    """The A-orthogonal projection d -> B (B^T A B)^-1 B^T A d: the paper's U Phi (U Phi)^+ d, area-weighted.
+def smoother(Phi, area, U=None):
+    """The A-orthogonal projection d -> B (B^T A B)^-1 B^T A d, B = U Phi: the paper's U Phi (U Phi)^+ d, area-weighted.
 
-    At full resolution B = U Phi is not orthonormal: projecting as if it were loses detail.
+    At full resolution B is not orthonormal: projecting as if it were loses detail.  B itself is never formed, as
+    B^T A B = Phi^T (U^T A U) Phi with a sparse matrix in the middle.
 
     Parameters
     ----------
-    B : float ndarray (n, k)
+    Phi : float ndarray (n_coarse, k)
         Basis.
     area : float ndarray (n,)
         Vertex areas.
+    U : sparse matrix (n, n_coarse), optional
+        Projection operator; the identity by default.
 
     Returns
     -------
     callable
         Takes a field (n, 3), gives its coefficients (k, 3).
     """
-    factor = scipy.linalg.cho_factor(B.T @ (area[:, None] * B), check_finite=False)
-    return lambda d: scipy.linalg.cho_solve(factor, B.T @ (area[:, None] * d), check_finite=False)
+    weighted = sp.diags_array(area) if U is None else sp.diags_array(area) @ U
+    mass = weighted if U is None else U.T @ weighted
+    factor = scipy.linalg.cho_factor(Phi.T @ (mass @ Phi), check_finite=False)
+    return lambda d: scipy.linalg.cho_solve(factor, Phi.T @ (weighted.T @ d), check_finite=False)
 
 
 def onto(X, image, area, coefficients_of):

@@ -23,14 +23,16 @@ POSITION_WEIGHT, NORMAL_WEIGHT = 5.0, 0.3
 class Surface:
     """What the rounds need of a shape, for unit area.
 
-    ``X (n, 3)`` positions, ``T (m, 3)`` triangles, ``area (n,)`` of sum 1, ``Phi (n, k)`` the basis on its vertices:
-    area-orthonormal eigenfunctions at low resolution, U Phi at full resolution.
+    ``X (n, 3)`` positions, ``T (m, 3)`` triangles, ``area (n,)`` of sum 1, ``Phi (n_coarse, k)`` area-orthonormal
+    eigenfunctions at low resolution; at full resolution with ``U (n, n_coarse)``, whose product with Phi is the
+    basis, and is never formed.
     """
 
     X: np.ndarray
     T: np.ndarray
     area: np.ndarray
     Phi: np.ndarray
+    U: object = None
 
     @cached_property
     def tree(self):
@@ -40,7 +42,12 @@ class Surface:
     @cached_property
     def smooth(self):
         """Coefficients of a field in the basis."""
-        return smoother(self.Phi, self.area)
+        return smoother(self.Phi, self.area, self.U)
+
+    def field(self, c):
+        """The field ``(n, 3)`` with coefficients c in the first columns of the basis."""
+        low = self.Phi[:, : len(c)] @ c
+        return low if self.U is None else self.U @ low
 
     @cached_property
     def graph(self):
@@ -57,7 +64,7 @@ def features(X, normals, spectrum=None):
 def registered(target, motion):
     """The registered shape R x + t + Phi c ``(n, 3)`` of a target, c for the first columns of its basis."""
     R, t, c = motion
-    return target.X @ R.T + t + target.Phi[:, : len(c)] @ c
+    return target.X @ R.T + t + target.field(c)
 
 
 def search(source, target, X):

@@ -255,7 +255,7 @@ def _coefficients(study, d, area):
     template = study["registration"].attrs["template"]
     if "coarse" in study and template in study["coarse"].children:
         scan = Scan(study["original"][template].to_dataset(), study["coarse"][template].to_dataset())
-        B = scan.dense.Phi
+        B = scan.U @ scan.low.Phi
         B = B @ np.linalg.inv(np.linalg.cholesky(B.T @ (area[:, None] * B))).T
         return np.stack([smoother(B, area)(field) for field in d.astype(float)]).reshape(len(d), -1)
     return (d * np.sqrt(area)[:, None]).reshape(len(d), -1).astype(float)

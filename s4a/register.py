@@ -62,11 +62,11 @@ class Scan:
 
     @cached_property
     def dense(self):
-        """The full-resolution :class:`s4a.joint.Surface`, with U Phi as its basis."""
+        """The full-resolution :class:`s4a.joint.Surface`, with the basis U Phi."""
         X, T = as_arrays(self.original)
         center, size = self.frame
         X = (X - center) / size
-        return joint.Surface(X, T, vertex_areas(X, T), self.U @ self.low.Phi)
+        return joint.Surface(X, T, vertex_areas(X, T), self.low.Phi, self.U)
 
 
 def intrinsic_match(source, target, F_source, F_target):
