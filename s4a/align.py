@@ -69,7 +69,12 @@ def principal_axes(X, area):
     return c, V * np.array([1, 1, np.sign(np.linalg.det(V))])
 
 
-def icp(X, area, Y, area_y, R, t, *, n_points=None, rounds=60, tolerance=1e-5, trim=0.1):
+def cloud(X, n_points=None):
+    """A KD-tree of all vertices, and the indices of `n_points` spread ones: what ICP needs of a shape."""
+    return cKDTree(X), np.arange(len(X)) if n_points is None else farthest_points(X, n_points)
+
+
+def icp(X, area, Y, area_y, R, t, *, n_points=None, clouds=None, rounds=60, tolerance=1e-5, trim=0.1):
     """Iterative closest points (Besl & McKay 1992) from a given start: moves X onto Y.
 
     Each round pairs vertices of X with the nearest of all of Y and vertices of Y with the nearest of all of X, leaves
@@ -82,6 +87,8 @@ def icp(X, area, Y, area_y, R, t, *, n_points=None, rounds=60, tolerance=1e-5, t
     R, t : start, R x + t
     n_points : int, optional
         How many vertices of each, spread over it, are paired; all by default.
+    clouds : tuple, optional
+        :func:`cloud` of X and of Y, where they are at hand.
     rounds : int
     tolerance : float
         The end comes when the residual falls by less, as a share of sqrt(area of X).
@@ -94,8 +101,7 @@ def icp(X, area, Y, area_y, R, t, *, n_points=None, rounds=60, tolerance=1e-5, t
     residual : float
         Trimmed root mean square distance of the pairs, both ways.
     """
-    tree_x, tree_y = cKDTree(X), cKDTree(Y)
-    i, j = (np.arange(len(P)) if n_points is None else farthest_points(P, n_points) for P in (X, Y))
+    (tree_x, i), (tree_y, j) = clouds or (cloud(X, n_points), cloud(Y, n_points))
     weight = np.concatenate([area[i] / area[i].sum(), area_y[j] / area_y[j].sum()])
     size = np.sqrt(area.sum())
     last = np.inf
@@ -166,7 +172,7 @@ def align(X, area, Y, area_y, *, n_points=300, prefer=0.9):
     cy, B = principal_axes(Y, area_y)
     flips = [np.diag(d) for d in itertools.product((1, -1), repeat=3) if np.prod(d) == 1]
     starts = [np.eye(3)] + [B @ flip @ A.T for flip in flips]
-    options = {"n_points": n_points, "tolerance": 2e-5}
+    options = {"clouds": (cloud(X, n_points), cloud(Y, n_points)), "tolerance": 2e-5}
     found = [icp(X, area, Y, area_y, R, cy - R @ cx, **options) for R in starts]
     sides = {True: [], False: []}
     for f in found:
@@ -182,6 +188,6 @@ def align(X, area, Y, area_y, *, n_points=300, prefer=0.9):
     return icp(X, area, Y, area_y, *best[:2])
 
 
-def realign(X, area, Y, area_y, start, *, n_points=1000):
+def realign(X, area, Y, area_y, start, *, n_points=300):
     """Rigid motion (R, t) of X onto Y by ICP, `n_points` spread vertices of each paired, from a start (R, t)."""
     return icp(X, area, Y, area_y, *start, n_points=n_points, tolerance=2e-5)[:2]

