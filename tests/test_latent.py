@@ -78,14 +78,14 @@ def test_a_map_without_weight_does_not_count(maps, eigenvalues):
     C[3] += 1
     weight[3] = 0
     Y, _ = latent.latent_basis(C, source, target, weight, eigenvalues)
-    assert closing(np.delete(C, 3, 0), np.delete(source, 3), np.delete(target, 3), Y) < 1e-8
+    assert closing(np.delete(C, 3, 0), np.delete(source, 3), np.delete(target, 3), Y) < 1e-6
 
 
 def test_the_quadratic_form_is_the_sum_of_the_residuals(maps):
     C, source, target, _ = maps
     rng = np.random.default_rng(4)
     weight, Y = rng.uniform(size=len(C)), rng.normal(size=(5, 8, 3))
-    L = latent.consistency_matrix(C, source, target, weight, 5)
+    L = latent.consistency_form(C, source, target, weight, 5)(np.eye(40))
     total = sum(w * ((c @ Y[i] - Y[j]) ** 2).sum() for c, i, j, w in zip(C, source, target, weight, strict=True))
     assert np.trace(Y.reshape(40, 3).T @ L @ Y.reshape(40, 3)) == pytest.approx(total)
     assert pytest.approx(L.T) == L
@@ -96,7 +96,7 @@ def test_the_smallest_eigenvectors_span_what_a_full_eigensolver_gives(seed):
     rng = np.random.default_rng(seed)
     Q = np.linalg.qr(rng.normal(size=(120, 120)))[0]
     L = (Q * np.r_[rng.uniform(0, 0.1, 15), rng.uniform(0.2, 5, 105)]) @ Q.T
-    V = latent.smallest_eigenvectors(L, rng.normal(size=(120, 15)))
+    V = latent.smallest_eigenvectors(L.__matmul__, rng.normal(size=(120, 15)))
     assert V.T @ V == pytest.approx(np.eye(15), abs=1e-10)
     true = scipy.linalg.eigh(L, subset_by_index=[0, 14])[1]
     assert scipy.linalg.subspace_angles(V, true).max() < 1e-3
