@@ -34,7 +34,7 @@ from s4a.subjects import read_table
 
 log = logging.getLogger(__name__)
 
-SAMPLES = 1000  # vertices per shape in Consistent ZoomOut, but for its last round
+SAMPLES = 1000  # vertices per shape whose matches Consistent ZoomOut looks for
 
 
 class Run:

@@ -1,0 +1,474 @@
+"""Seconds and memory of every stage, beside what one would call otherwise, and how they grow.
+
+Every row runs in a process of its own with one BLAS thread, ours and the other in turn, on the same input: seconds of
+CPU, of the clock, and the peak of memory above what the process holds before.  pyFM is on PyPI as ``pyfmaps`` (the
+extra ``bench``).  ``speed.py stages``, ``pipelines`` or ``growth`` runs one part, ``speed.py whole 51 100000`` the
+whole analysis of so many synthetic shapes of so many vertices.
+"""
+
+import itertools
+import multiprocessing
+import os
+import resource
+import sys
+import tempfile
+import time
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(name, "1")
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+import s4a
+from s4a import fmap, latent, network, register, synthetic
+from s4a.align import align, farthest_points
+from s4a.fmap import nearest_rows
+from s4a.mesh import as_arrays, triangle_areas
+from s4a.nearest import nearest_in_cells
+from s4a.pca import gram_pca
+
+VERTICES, NETWORK, K_INIT, K = 100_000, 10, 20, 100
+HEAD = f"{'stage':36} {'':34} {'CPU s':>8} {'wall s':>8} {'MiB':>8} {'ratio':>7}"
+
+
+def say(text):
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
+def child(function, *arguments):
+    """What the function gives, its seconds of CPU and of the clock, and its peak memory in MiB."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # some native filters print
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    cpu, wall = time.process_time(), time.perf_counter()
+    result = function(*arguments)
+    spent = time.process_time() - cpu, time.perf_counter() - wall
+    return result, *spent, (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+
+
+def measured(function, *arguments):
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(child, function, *arguments).result()
+
+
+def beside(stage, ours, *others):
+    """Print a row for ours and each of the others: (name, function, arguments); gives what they return."""
+    results, first = [], None
+    for name, function, *arguments in (ours, *others):
+        result, cpu, wall, memory = measured(function, *arguments)
+        first = first or cpu
+        say(f"{stage:36} {name:34} {cpu:8.2f} {wall:8.2f} {memory:8.0f} {cpu / first:7.1f}")
+        stage = ""
+        results.append(result)
+    return results
+
+
+# ours -----------------------------------------------------------------------------------------------------------------
+
+
+def our_read(path):
+    return s4a.read_shape(path)
+
+
+def our_remesh(mesh):
+    return s4a.coarsen(mesh)
+
+
+def our_both(mesh):
+    return s4a.spectrum(s4a.coarsen(mesh), k=K)
+
+
+def our_spectrum(coarse):
+    return s4a.spectrum(coarse, k=K)
+
+
+def our_first_map(a, b, motion):
+    return network.first_map(a, b, motion, k_init=K_INIT)
+
+
+def our_zoomout(C, a, b):
+    return fmap.zoomout(C, a[2], b[2], b[1], K)[0]
+
+
+def our_network(C, source, target, shapes):
+    samples = [farthest_points(s[0], 1000) for s in shapes]
+    eigenvalues = np.stack([s[3][:K] for s in shapes])
+    found = latent.consistent_zoomout(
+        C, source, target, [s[2] for s in shapes], [s[1] for s in shapes], eigenvalues, K, samples=samples
+    )
+    return found[3]
+
+
+def our_nearest(Q, D, cell_q, cell_d):
+    return nearest_in_cells(Q, cell_q, D, cell_d)[0]
+
+
+def our_modes(d, area):
+    return gram_pca(d, area)[2]
+
+
+# the others -----------------------------------------------------------------------------------------------------------
+
+
+def meshlab(path):
+    import pymeshlab
+
+    found = pymeshlab.MeshSet(verbose=False)
+    found.load_new_mesh(str(path))
+    return found
+
+
+def other_read(path):
+    found = meshlab(path)
+    for name in (
+        "meshing_remove_duplicate_vertices",
+        "meshing_remove_duplicate_faces",
+        "meshing_remove_null_faces",
+        "meshing_repair_non_manifold_edges",
+        "meshing_remove_unreferenced_vertices",
+    ):
+        found.apply_filter(name)
+    return found.current_mesh().vertex_number()
+
+
+def closest_points(X, V, F):
+    """Closest points of X on a mesh, as the rows of a U by Euclidean distance."""
+    import igl
+
+    index = igl.point_mesh_squared_distance(X, V, F)[1]
+    return index, np.abs(igl.barycentric_coordinates(X, *(V[F[index, i]] for i in range(3))))
+
+
+def other_quadric(path, X):
+    found = meshlab(path)
+    found.meshing_decimation_quadric_edge_collapse(targetfacenum=12_000)
+    mesh = found.current_mesh()
+    return closest_points(X, mesh.vertex_matrix(), mesh.face_matrix().astype(np.int64))
+
+
+def other_isotropic(path, X):
+    import pymeshlab
+
+    found = meshlab(path)
+    area = found.get_geometric_measures()["surface_area"]
+    length = np.sqrt(area / 12_000 * 4 / np.sqrt(3))
+    found.meshing_isotropic_explicit_remeshing(targetlen=pymeshlab.PureValue(length), iterations=5)
+    mesh = found.current_mesh()
+    return closest_points(X, mesh.vertex_matrix(), mesh.face_matrix().astype(np.int64))
+
+
+def trimesh(X, T):
+    from pyFM.mesh import TriMesh
+
+    return TriMesh(np.ascontiguousarray(X), np.ascontiguousarray(T))
+
+
+def other_spectrum(X, T):
+    return trimesh(X, T).process(k=K, verbose=False).eigenvalues
+
+
+def other_icp(source, target):
+    import pymeshlab
+
+    found = pymeshlab.MeshSet(verbose=False)
+    for X, T in (target, source):
+        found.add_mesh(pymeshlab.Mesh(X, T))
+    found.compute_matrix_by_icp_between_meshes(referencemesh=0, sourcemesh=1)
+    return found.current_mesh().transform_matrix()
+
+
+def processed(X, T, Phi, eigenvalue):
+    """A mesh of pyFM with a spectrum that is already there."""
+    mesh = trimesh(X, T)
+    mesh.process(k=0, verbose=False)
+    mesh.eigenvectors, mesh.eigenvalues = Phi, eigenvalue
+    return mesh
+
+
+def other_first_map(a, b, landmarks):
+    from pyFM.functional import FunctionalMapping
+
+    model = FunctionalMapping(processed(*a), processed(*b))
+    model.preprocess(n_descr=100, landmarks=landmarks, subsample_step=5, k_process=K, k_descr=K)
+    model.fit(K=(K_INIT, K_INIT))
+    return model.FM
+
+
+def other_zoomout(C, a, b):
+    from pyFM.refine.zoomout import zoomout_refine
+
+    return zoomout_refine(C, a[2], b[2], nit=(K - K_INIT) // 5, step=5, A2=b[1], n_jobs=1)
+
+
+def other_network(C, source, target, shapes):
+    from pyFM.FMN import FMN
+
+    meshes = [processed(*s) for s in shapes]
+    found = FMN(meshes, {(int(i), int(j)): c for i, j, c in zip(source, target, C, strict=True)})
+    found.zoomout_refine(nit=(K - K_INIT) // 5, step=5, subsample=1000, isometric=True, cclb_ratio=1, n_jobs=1)
+    found.compute_W()
+    found.compute_CLB()
+    found.compute_CCLB(K, verbose=False)
+    return found.CCLB
+
+
+def other_nearest(Q, D):
+    from pyFM.spectral.nearest_neighbor import knn_query
+
+    return np.ravel(knn_query(D, Q, n_jobs=1))
+
+
+def scipy_nearest(Q, D):
+    from scipy.spatial import cKDTree
+
+    return cKDTree(D).query(Q)[1]
+
+
+def sklearn_nearest(Q, D):
+    from sklearn.neighbors import NearestNeighbors
+
+    return NearestNeighbors(n_neighbors=1, algorithm="brute").fit(D).kneighbors(Q, return_distance=False)[:, 0]
+
+
+def other_modes(d, area):
+    from sklearn.decomposition import PCA
+
+    return PCA().fit((d * np.sqrt(area)[:, None]).reshape(len(d), -1)).explained_variance_
+
+
+# the tables -----------------------------------------------------------------------------------------------------------
+
+
+def collection(n, n_vertices, folder):
+    """A synthetic collection as PLY files; the paths and the truth, with the reference point of every vertex."""
+    tree = synthetic.brains(n, n_vertices)
+    return synthetic.write(tree, folder), tree["truth"]
+
+
+def pipeline_low(scan):
+    """Unit-area vertices, areas, eigenfunctions, eigenvalues of the coarse mesh, as the pipeline holds them."""
+    return scan.low.X, scan.low.area, scan.low.Phi, scan.eigenvalue
+
+
+def stages(folder):
+    """The table of stages."""
+    say(f"\nStages: shapes of {VERTICES:,} vertices; the network has {NETWORK} shapes, all pairs\n\n{HEAD}")
+    paths, _ = collection(2, VERTICES, folder / "two")
+
+    mesh, _ = beside("read and clean", ("s4a.read_shape", our_read, paths[0]), ("pymeshlab", other_read, paths[0]))
+    X = mesh["position"].values
+    coarse, *_ = beside(
+        "remesh to 6,000 with U",
+        ("s4a.coarsen", our_remesh, mesh),
+        ("pymeshlab quadric + igl", other_quadric, str(paths[0]), X),
+        ("pymeshlab isotropic + igl", other_isotropic, str(paths[0]), X),
+    )
+    V, F = as_arrays(coarse)
+    spectra = beside(
+        f"{K} eigenpairs at 6,000",
+        ("s4a.spectrum", our_spectrum, coarse),
+        ("pyFM TriMesh.process", other_spectrum, V, F),
+    )
+    gap = np.abs(spectra[0]["eigenvalue"].values / coarse["vertex_area"].sum().item() - spectra[1])[1:]
+    say(f"{'':36} largest difference of eigenvalues {(gap / spectra[1][1:]).max():.1e}")
+    beside(
+        f"{K} eigenpairs at {VERTICES:,}",
+        ("s4a: coarsen + spectrum", our_both, mesh),
+        ("pyFM TriMesh.process", other_spectrum, *as_arrays(mesh)),
+    )
+
+    second = s4a.read_shape(paths[1])
+    scans = [register.Scan(mesh, spectra[0]), register.Scan(second, s4a.spectrum(s4a.coarsen(second), k=K))]
+    a, b = map(pipeline_low, scans)
+    meshes = [(s.low.X, s.low.T) for s in scans]
+    (R, t, _), _ = beside(
+        "align, any start",
+        ("s4a.align", align, *a[:2], *b[:2]),
+        ("pymeshlab ICP, one start", other_icp, *meshes),
+    )
+    few = [(s.low.X, s.low.T, s.low.Phi, s.eigenvalue) for s in scans]
+    landmark = farthest_points(a[0] @ R.T + t, 10)
+    near = nearest_rows(a[0][landmark] @ R.T + t, b[0])
+    C, _ = beside(
+        f"first map, k = {K_INIT}",
+        ("s4a: dense, one round more", our_first_map, a, b, (R, t)),
+        ("pyFM fit, WKS + 10 landmarks", other_first_map, *few, np.c_[landmark, near]),
+    )
+    C, _ = beside(
+        f"ZoomOut {K_INIT} -> {K}, step 5",
+        ("s4a.fmap.zoomout", our_zoomout, C, a, b),
+        ("pyFM zoomout_refine", other_zoomout, C, a, b),
+    )
+    Q, D = ((scans[1].U @ b[2]).astype(np.float32), (scans[0].U @ (a[2] @ C.T)).astype(np.float32))
+    ours, *found = beside(
+        f"nearest neighbours, {len(Q):,}, {K} dims",
+        ("s4a.nearest_in_cells", our_nearest, Q, D, scans[1].cell, scans[0].cell),
+        ("scipy KD-tree", scipy_nearest, Q, D),
+        ("scikit-learn brute", sklearn_nearest, Q, D),
+        ("pyFM knn_query", other_nearest, Q, D),
+    )
+    gaps = [np.linalg.norm(Q.astype(float) - D[i], axis=1) for i in (ours, found[0])]
+    say(f"{'':36} our distances exceed the KD-tree's by at most {(gaps[0] - gaps[1]).max():.1e}")
+
+    network_table()
+    d, area = np.random.default_rng(0).normal(size=(51, VERTICES, 3)), np.full(VERTICES, 1 / VERTICES)
+    beside(
+        f"PCA of 51 displacements, {VERTICES:,}",
+        ("s4a.pca.gram_pca", our_modes, d, area),
+        ("scikit-learn PCA", other_modes, d, area),
+    )
+
+
+def network_table():
+    """Consistent ZoomOut of a complete network, with the error of the matches that its basis gives."""
+    tree = synthetic.brains(NETWORK, 20_000)
+    names = list(tree["original"].children)
+    meshes = [tree["original"][n].to_dataset() for n in names]
+    scans = [register.Scan(m, s4a.spectrum(s4a.coarsen(m), k=K)) for m in meshes]
+    shapes = [pipeline_low(s) for s in scans]
+    source, target = np.array(list(itertools.permutations(range(NETWORK), 2))).T
+    first = [
+        network.first_map(shapes[i], shapes[j], align(*shapes[i][:2], *shapes[j][:2])[:2], k_init=K_INIT)
+        for i, j in zip(source, target, strict=True)
+    ]
+    given = np.stack(first), source, target
+    bases = beside(
+        f"Consistent ZoomOut, {len(first)} maps",
+        ("s4a.latent.consistent_zoomout", our_network, *given, shapes),
+        (
+            "pyFM FMN.zoomout_refine",
+            other_network,
+            *given,
+            [(s.low.X, s.low.T, *p[2:]) for s, p in zip(scans, shapes, strict=True)],
+        ),
+    )
+    here = [cKDTree(m["position"]).query(s.coarse["position"])[1] for m, s in zip(meshes, scans, strict=True)]
+    for name, Y in zip(("s4a", "pyFM"), bases, strict=True):
+        F = [shape[2][:, :K] @ y for shape, y in zip(shapes, Y, strict=True)]
+        gaps = []
+        for i in range(1, NETWORK):
+            match = nearest_rows(F[0], F[i])
+            u = tree[f"truth/{names[0]}/reference_point"].values[here[0]]
+            image = scans[i].coarse["position"].values[match]
+            gaps.append(error(synthetic.position(tree["truth"], names[i], u), image, scans[0].frame[1]))
+        say(f"{'':36} {name}: low-resolution matches {np.mean(gaps):.2f} % of sqrt(area) from the truth")
+
+
+def error(true, found, size):
+    """Mean distance in % of sqrt(area)."""
+    return 100 * np.linalg.norm(true - found, axis=1).mean() / size
+
+
+def our_pipeline(paths, folder, refine, template):
+    s4a.analyse(paths, store=folder, n_jobs=1, refine=refine, template=template)
+    tree = s4a.open_study(folder)
+    data = tree["registration"].to_dataset()
+    return {n: data["registered_match"].sel(shape=n).values for n in data["shape"].values.tolist()}
+
+
+def other_pipeline(paths, template):
+    """The same steps put together from pymeshlab, igl, pyFM and their nearest neighbours."""
+    shapes = {}
+    for path in paths:
+        found = meshlab(path)
+        X = found.current_mesh().vertex_matrix()
+        index, weights = other_quadric(path, X)
+        found.meshing_decimation_quadric_edge_collapse(targetfacenum=12_000)
+        mesh = trimesh(found.current_mesh().vertex_matrix(), found.current_mesh().face_matrix().astype(np.int64))
+        shapes[Path(path).stem] = (X, index, weights, mesh.process(k=K, verbose=False))
+    names = list(shapes)
+    moved = {n: shapes[n][3].vertices for n in names}
+    for n in names:
+        if n != template:
+            M = other_icp((moved[n], shapes[n][3].faces), (moved[template], shapes[template][3].faces))
+            moved[n] = moved[n] @ M[:3, :3].T + M[:3, 3]
+    from pyFM.FMN import FMN
+    from pyFM.functional import FunctionalMapping
+
+    maps = {}
+    for i, j in itertools.permutations(range(len(names)), 2):
+        a, b = names[i], names[j]
+        landmark = farthest_points(moved[a], 10)
+        model = FunctionalMapping(shapes[a][3], shapes[b][3])
+        landmarks = np.c_[landmark, nearest_rows(moved[a][landmark], moved[b])]
+        model.preprocess(n_descr=100, landmarks=landmarks, subsample_step=5, k_process=K, k_descr=K)
+        model.fit(K=(K_INIT, K_INIT))
+        maps[i, j] = model.FM
+    found = FMN([shapes[n][3] for n in names], maps)
+    found.zoomout_refine(nit=(K - K_INIT) // 5, step=5, subsample=1000, isometric=True, cclb_ratio=1, n_jobs=1)
+    found.compute_W()
+    found.compute_CLB()
+    found.compute_CCLB(K, verbose=False)
+    dense = {}
+    for n, Y in zip(names, found.CCLB, strict=True):
+        _, index, weights, mesh = shapes[n]
+        F = mesh.eigenvectors[:, :K] @ Y
+        dense[n] = np.einsum("nc,ncd->nd", weights, F[mesh.faces[index]])
+    return {n: other_nearest(dense[template], dense[n]) for n in names if n != template}
+
+
+def pipelines(folder, n=6, n_vertices=50_000):
+    """The whole pipeline, ours and the one from pyFM, with errors against the truth."""
+    say(f"\nPipelines: {n} shapes of {n_vertices:,} vertices, all pairs, the first is the template\n\n{HEAD}")
+    paths, truth = collection(n, n_vertices, folder / "files")
+    paths, template = [str(p) for p in paths], Path(paths[0]).stem
+    names = ("s4a, refine='joint'", "s4a, refine='intrinsic'", "pymeshlab + igl + pyFM")
+    found = beside(
+        "files -> dense matches",
+        (names[0], our_pipeline, paths, folder / "joint", "joint", template),
+        (names[1], our_pipeline, paths, folder / "intrinsic", "intrinsic", template),
+        (names[2], other_pipeline, paths, template),
+    )
+    X = {Path(p).stem: s4a.read_mesh(p)["position"].values for p in paths}
+    T = s4a.read_mesh(paths[0])["corner_vertex"].values
+    size = np.sqrt(triangle_areas(X[template], T).sum())
+    u = truth[f"{template}/reference_point"].values
+    for name, match in zip(names, found, strict=True):
+        gaps = [error(synthetic.position(truth, s, u), X[s][m], size) for s, m in match.items() if s != template]
+        say(f"{'':36} {name}: {np.mean(gaps):.2f} % of sqrt(area) from the truth, worst shape {np.max(gaps):.2f}")
+
+
+def stage_seconds(folder, n, n_vertices, n_pairs):
+    paths, _ = collection(n, n_vertices, folder / "files")
+    s4a.analyse(paths, store=folder / "study", n_jobs=1, n_pairs=n_pairs)
+    report = s4a.open_study(folder / "study")["report"]
+    return dict(zip(report["stage"].values.tolist(), report["seconds"].values.tolist(), strict=True))
+
+
+def growth(folder):
+    """How the seconds of every stage grow; the exponent is the slope of log seconds over log size."""
+    for what, sizes in (
+        ("vertices", [(4, v, 500) for v in (25_000, 50_000, 100_000)]),
+        ("shapes", [(n, 10_000, 4 * n) for n in (8, 16, 32)]),
+        ("pairs", [(24, 10_000, p) for p in (60, 120, 240)]),
+    ):
+        say(f"\n{what} x1 x2 x4 (shapes, vertices, pairs): {sizes}; seconds with one process\n")
+        found = [measured(stage_seconds, folder / what / str(i), *size)[0] for i, size in enumerate(sizes)]
+        for stage in found[0]:
+            seconds = np.array([max(f[stage], 1e-3) for f in found])
+            slope = np.polyfit(np.log([1, 2, 4]), np.log(seconds), 1)[0]
+            say(f"{stage:36} {'  '.join(f'{t:8.2f}' for t in seconds)}   exponent {slope:5.2f}")
+
+
+def whole(folder, n=51, n_vertices=VERTICES):
+    """One collection on all cores: the table of stages of the report."""
+    paths, _ = collection(n, n_vertices, folder / "files")
+    begin = time.perf_counter()
+    s4a.analyse(paths, store=folder / "study", n_jobs=-1)
+    wall = time.perf_counter() - begin
+    report = s4a.open_study(folder / "study")["report"]
+    say(f"\n{n} shapes of {n_vertices:,} vertices, all defaults: {wall:.0f} s on {os.cpu_count()} cores\n")
+    for stage, seconds, memory in zip(*(report[v].values for v in ("stage", "seconds", "peak_memory")), strict=True):
+        say(f"{stage:36} {seconds:8.1f} s {memory:8.0f} MiB")
+
+
+PARTS = {"stages": stages, "pipelines": pipelines, "growth": growth, "whole": whole}
+
+if __name__ == "__main__":
+    part, *numbers = sys.argv[1:] or [""]
+    for run in [PARTS[part]] if part else [stages, pipelines, growth]:
+        with tempfile.TemporaryDirectory() as folder:
+            run(Path(folder), *map(int, numbers))
