@@ -1,7 +1,10 @@
 """The same run on a dask scheduler with two worker processes."""
 
+import contextlib
+import json
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -12,20 +15,74 @@ from s4a import cli, synthetic
 SMALL = {"n_coarse": 400, "k": 30, "k_init": 12}
 
 
-def test_two_dask_workers_give_the_bits_of_a_local_run(tmp_path):
-    pytest.importorskip("distributed")
-    synthetic.write(synthetic.brains(4, 1500, 5), tmp_path / "brains")
-    local = s4a.analyse(tmp_path / "brains", **SMALL)
-    flags = [text for name, value in SMALL.items() for text in (f"--{name.replace('_', '-')}", str(value))]
-    command = ["run", tmp_path / "brains", "--out", tmp_path / "study", "--cluster", "local:2", *flags]
-    subprocess.run([sys.executable, "-m", "s4a", *command], check=True, capture_output=True, timeout=300)
-    study = s4a.open_study(tmp_path / "study")
+@pytest.fixture(scope="module")
+def brains(tmp_path_factory):
+    """A folder of meshes, and the study of a local run."""
+    folder = tmp_path_factory.mktemp("collection") / "brains"
+    synthetic.write(synthetic.brains(4, 1500, 5), folder)
+    return folder, s4a.analyse(folder, **SMALL)
+
+
+def command(*words):
+    return [sys.executable, "-m", *map(str, words)]
+
+
+def run(folder, out, cluster):
+    flags = [text for name, value in SMALL.items() for text in (f"--{name.replace('_', '-')}", value)]
+    return command("s4a", "run", folder, "--out", out, "--cluster", cluster, *flags)
+
+
+def assert_the_same(out, local):
+    study = s4a.open_study(out)
     assert [n.path for n in study.subtree] == [n.path for n in local.subtree]
     for node in study.subtree:
         if node.path != "/report":  # it has the times
             for name, values in node.to_dataset().data_vars.items():
                 np.testing.assert_array_equal(values, local[node.path][name], err_msg=f"{node.path}/{name}")
     study.close()
+
+
+def test_two_dask_workers_give_the_bits_of_a_local_run(brains, tmp_path):
+    pytest.importorskip("distributed")
+    folder, local = brains
+    subprocess.run(run(folder, tmp_path / "study", "local:2"), check=True, capture_output=True, timeout=300)
+    assert_the_same(tmp_path / "study", local)
+
+
+def wait_for(found, what, seconds=120):
+    end = time.monotonic() + seconds
+    while not found():
+        assert time.monotonic() < end, f"no {what} in {seconds} s"
+        time.sleep(0.02)
+
+
+def test_a_worker_killed_in_the_middle_costs_only_its_task(brains, tmp_path):
+    pytest.importorskip("distributed")
+    folder, local = brains
+    where, out = tmp_path / "scheduler.json", tmp_path / "study"
+    with contextlib.ExitStack() as stack:
+
+        def start(*words):
+            process = subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+            stack.callback(process.wait)
+            stack.callback(process.kill)
+            return process
+
+        start(*command("distributed.cli.dask_scheduler", "--port", 0, "--no-dashboard", "--scheduler-file", where))
+        wait_for(lambda: where.exists() and where.stat().st_size, "scheduler")
+        address = json.loads(where.read_text())["address"]
+        workers = [
+            start(*command("distributed.cli.dask_worker", address, "--nthreads", 1, "--no-nanny", "--no-dashboard"))
+            for _ in range(2)
+        ]
+        process = start(*run(folder, out, address))
+        wait_for(lambda: any(out.glob("coarse/*.nc")), "task done")
+        done = {path: path.stat().st_mtime_ns for path in out.rglob("*.nc")}
+        workers[0].kill()
+        assert process.wait(timeout=300) == 0
+        assert workers[1].poll() is None
+    assert_the_same(out, local)
+    assert {path: path.stat().st_mtime_ns for path in done} == done
 
 
 @pytest.mark.parametrize("address", ["nowhere", "local:", "local:0", "local:two"])
