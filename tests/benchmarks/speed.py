@@ -16,11 +16,9 @@ import time
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
-for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-    os.environ.setdefault(name, "1")
-
 import numpy as np
 from scipy.spatial import cKDTree
+from threadpoolctl import threadpool_limits
 
 import s4a
 from s4a import fmap, latent, network, register, synthetic
@@ -44,7 +42,8 @@ def child(function, *arguments):
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # some native filters print
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     cpu, wall = time.process_time(), time.perf_counter()
-    result = function(*arguments)
+    with threadpool_limits(1):
+        result = function(*arguments)
     spent = time.process_time() - cpu, time.perf_counter() - wall
     return result, *spent, (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
 
