@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check format bench lab clean
+.PHONY: demo test check fuzz format bench lab clean
 
 demo: $(VENV)/.core
 	$(BIN)/s4a demo
@@ -15,6 +15,9 @@ test: check
 check: $(VENV)/.test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+
+fuzz: $(VENV)/.test
+	$(BIN)/python tests/fuzz.py
 
 format: $(VENV)/.test
 	$(BIN)/ruff check --fix .
