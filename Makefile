@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check fuzz format bench lab clean
+.PHONY: demo test check format bench lab docs clean
 
 demo: $(VENV)/.core
 	$(BIN)/s4a demo
@@ -16,9 +16,6 @@ check: $(VENV)/.test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-fuzz: $(VENV)/.test
-	$(BIN)/python tests/fuzz.py
-
 format: $(VENV)/.test
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
@@ -28,6 +25,10 @@ bench: $(VENV)/.bench
 
 lab: $(VENV)/.notebook
 	$(BIN)/jupyter lab $(wildcard notebooks)
+
+# S4A_DOCS=off leaves the outputs of the notebooks out, for a quick look
+docs: $(VENV)/.docs
+	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
 
 clean:
 	rm -rf $(VENV)

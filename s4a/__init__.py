@@ -3,14 +3,15 @@
 The public names, by section of the paper:
 
 ========================  ====================================================================
-reading and cleaning      :func:`read_shapes`, :func:`clean`, :func:`write_mesh`
+reading and cleaning      :func:`read_shapes`, :func:`read_shape`, :func:`clean`, :func:`read_mesh`,
+                          :func:`write_mesh`
 4.1 low resolution        :func:`coarsen`
 3.3 spectrum              :func:`spectrum`, :func:`reconstruct`
 4.1 pairs                 :func:`match_pair`
 5.1 metrics               :mod:`s4a.metrics`
 5.2, 5.3 comparison       :mod:`s4a.compare`
 4.2, 6.1 collections      :func:`analyse`, :func:`open_study`, :func:`synthesize`
-notebooks                 :func:`explore`
+notebooks, pages          :func:`explore`, :func:`write_page`
 new shapes                :func:`insert`
 6.1 statistics            :mod:`s4a.statistics`
 6.2 transfer              :func:`transfer_labels`, :func:`transfer_landmarks`, :func:`transfer_scalars`,

@@ -24,6 +24,13 @@ def explore(study, *, view="corner", up="z"):
     ------
     ImportError
         Without the packages of ``pip install s4a[notebook]``.
+
+    Examples
+    --------
+    With the ``study`` of six small brains:
+
+    >>> explore(study).tabs.titles[:3]
+    ('Modes', 'Network', 'Functional map')
     """
     return import_module("s4a.widgets.explore").explore(study, view=view, up=up)
 

@@ -556,6 +556,7 @@ def per_target(files, names, flag):
 
 
 def write(text):
+    """One text to the output, and a new line."""
     sys.stdout.write(text + "\n")
 
 

@@ -25,6 +25,8 @@ from s4a.schema import dataset, require, variable
 from s4a.shapes import read_shape, read_shapes
 from s4a.spectral import eigenpairs, spectrum
 
+__all__ = ["COLLECTION_METHODS", "METHODS", "collection", "pair", "pairs"]
+
 METHODS = ("kNN", "ZO", "FMAP+ZO", "SCALABLE", "RE-MATCH", "RE-MATCH joint")
 BLOCKS = ("load and clean", "align", "sample", "basis", "map", "refine", "full resolution")
 COLLECTION_BLOCKS = ("load and clean", "basis and first maps", "consistent ZoomOut", "full resolution")
@@ -205,6 +207,7 @@ def joint_match(source, target, motion, low, clock, k):
 
 
 def checked_methods(methods):
+    """ValueError unless all are some of :data:`METHODS`."""
     wrong = [m for m in methods if m not in METHODS]
     if wrong or not len(methods) or isinstance(methods, str):
         raise ValueError(f"methods must be some of {', '.join(METHODS)}; found {wrong or methods!r}")
@@ -349,6 +352,14 @@ def pairs(
     ------
     ValueError
         When a method is unknown, a mesh lacks its variables, or truth or landmarks do not fit.
+
+    Examples
+    --------
+    >>> from s4a import synthetic
+    >>> ball = synthetic.ellipsoid(300)
+    >>> found = pairs(ball, {"itself": ball}, methods=["kNN", "RE-MATCH"], n_coarse=100, k_init=6, k=10)
+    >>> found["chamfer"].sel(pair="itself", way="kNN").item()
+    0.0
     """
     checked_methods(methods)
     rows = []
@@ -376,6 +387,7 @@ def pairs(
 
 
 def check_landmarks(at_source, at_target, source, target):
+    """ValueError unless they are pairs of vertices of both shapes."""
     ends = ((at_source, source), (at_target, target))
     good = all(v.ndim == 1 and v.dtype.kind in "iu" and v.min(initial=0) >= 0 for v, _ in ends)
     if not good or len(at_source) != len(at_target) or len(at_source) < 3 or any(v.max() >= len(s.X) for v, s in ends):
@@ -445,6 +457,12 @@ def collection(shapes, *, methods=COLLECTION_METHODS, n_coarse=6000, n_pairs=500
     ------
     ValueError
         When a method is unknown or fewer than 2 shapes can be used.
+
+    Examples
+    --------
+    >>> found = collection(brains, methods=["RE-MATCH"], n_coarse=100, n_pairs=6, k_init=6, k=10)
+    >>> found["collection_chamfer"].dims
+    ('way', 'how', 'shape')
     """
     wrong = [m for m in methods if m not in COLLECTION_METHODS]
     if wrong or not len(methods):

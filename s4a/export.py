@@ -54,6 +54,13 @@ def write_registered(study, folder, *, format="ply", frame="template", n_modes=3
     ------
     ValueError
         When the study is not registered, a shape is named ``template``, or an option is not one of those above.
+
+    Examples
+    --------
+    With the ``study`` of six small brains:
+
+    >>> [path.name for path in write_registered(study, folder)][5:8]
+    ['brain_06.ply', 'template.ply', 'scores.csv']
     """
     if format not in FORMATS or frame not in ("template", "shape"):
         legal = ", ".join(FORMATS)
@@ -119,6 +126,15 @@ def write_training_set(study, folder, *, label=None, landmarks=None, source=None
     ------
     ValueError
         When there is nothing to learn, or the share leaves no shape to train or to test on.
+
+    Examples
+    --------
+    With the ``study`` of six small brains:
+
+    >>> label = study["original/brain_01/label"].values
+    >>> split = write_training_set(study, folder, label=label, source="brain_01")
+    >>> len(split["train"]), len(split["test"])
+    (4, 2)
     """
     if label is None and landmarks is None:
         raise ValueError("a training set needs labels, landmarks or both; found neither")

@@ -123,6 +123,13 @@ def generalization(study, *, n_points=500, n_jobs=None, seed=0):
     ------
     ValueError
         When the study is not finished, or has fewer than 5 shapes.
+
+    Examples
+    --------
+    With the ``study`` of six small brains:
+
+    >>> generalization(study).attrs["shapes"]
+    6
     """
     missing = [n for n in ("original", "coarse", "latent", "registration", "report") if n not in study.children]
     if missing:

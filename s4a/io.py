@@ -55,6 +55,13 @@ def read_mesh(path):
     ------
     ValueError
         When the file is not a mesh, ends early or contradicts itself; the message names the file.
+
+    Examples
+    --------
+    >>> path = write_mesh(folder / "one.off", [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+    >>> points, triangles = read_mesh(folder / "one.off")[:2]
+    >>> points.shape, triangles.tolist()
+    ((3, 3), [[0, 1, 2]])
     """
     path = Path(path)
     if not path.is_file():
@@ -66,9 +73,8 @@ def read_mesh(path):
             data = bounded.gunzip(data)
         data = data.removeprefix(b"\xef\xbb\xbf")
         found = _sniff(data)
-        with np.errstate(all="ignore"):  # nonsense in the file is refused, or left to the cleaning
-            points, triangles, attrs = READERS[found](data)
-            points, triangles = _checked(points, triangles)
+        points, triangles, attrs = READERS[found](data)
+        points, triangles = _checked(points, triangles)
     except Exception as error:  # whatever a file holds, it must not end the run over a collection
         raise ValueError(f"{path} cannot be read as {found}: {error or type(error).__name__}") from error
     space = re.search(rb"SPACE=(RAS|LPS)", data[:1000])  # as 3D Slicer writes it into any header
@@ -121,7 +127,7 @@ def _sniff(data):
         return "STL"
     if re.match(rb"solid\b", head, re.I) and re.search(rb"\bfacet\b|\bendsolid\b", data, re.I):
         return "STL"
-    if b"\0" not in head and re.search(rb"^[ \t]*v[ \t]+[-+.\dn]", data, re.M):
+    if b"\0" not in head and re.search(rb"^\s*v\s+[-+.\dn]", data, re.M):
         return "OBJ"
     if b"\0" in head and len(data) >= 84:
         return "STL"
@@ -153,6 +159,17 @@ def write_mesh(path, points, triangles, **vertex_scalars):
     triangles : int ndarray (m, 3)
     **vertex_scalars : float ndarray (n,)
         Values per vertex by name; PLY, VTK, GIFTI and NPZ hold them, as float32 but for NPZ.
+
+    Raises
+    ------
+    ValueError
+        When the suffix is another, the format holds no values or their number is not that of the vertices.
+
+    Examples
+    --------
+    >>> write_mesh(folder / "one.ply", np.eye(3), [[0, 1, 2]], height=np.zeros(3))
+    >>> (folder / "one.ply").stat().st_size > 0
+    True
     """
     path = Path(path)
     points, triangles = _checked(points, triangles)

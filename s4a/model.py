@@ -201,6 +201,14 @@ def evaluate(study, *, n_samples=1000, n_permutations=100, n_points=500, n_surfa
     ------
     ValueError
         When the study is not registered or has fewer than 4 shapes.
+
+    Examples
+    --------
+    With the ``study`` of six small brains; more modes describe a left-out shape better:
+
+    >>> found = evaluate(study)
+    >>> bool(found["generalization"][0] > found["generalization"][3])
+    True
     """
     d, area, _, data = registered(study)
     s, rng = len(d), np.random.default_rng(seed)
@@ -320,6 +328,18 @@ def sample(study, n, *, n_components=None, seed=0):
     -------
     DataTree
         ``/sample_1`` ... with a mesh each, and at the root ``score(shape, component)``.
+
+    Raises
+    ------
+    ValueError
+        When there are not as many components.
+
+    Examples
+    --------
+    With the ``study`` of six small brains:
+
+    >>> sample(study, 2)["score"].dims
+    ('shape', 'component')
     """
     c = study["pca"].sizes["component"]
     c = c if n_components is None else n_components

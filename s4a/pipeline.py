@@ -365,6 +365,13 @@ def analyse(
     ------
     ValueError
         When an option is out of range, or fewer than 2 shapes can be used; the reasons are named.
+
+    Examples
+    --------
+    >>> from s4a import synthetic
+    >>> study = analyse(synthetic.brains(3, 200), n_coarse=100, k=10, k_init=6, n_pairs=3)
+    >>> list(study["pca"]["score"].dims), study["registration"].sizes["vertex"]
+    (['shape', 'component'], 200)
     """
     options = {n: v for n, v in locals().items() if n not in ("shapes", "store", "n_jobs")}
     options = checked(options)

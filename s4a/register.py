@@ -284,6 +284,17 @@ def match_pair(source, target, *, k_init=20, k=100, init="dense", refine="joint"
     ------
     ValueError
         When a mesh lacks its variables or an option is outside its range, see :func:`s4a.analyse`.
+
+    Examples
+    --------
+    A shape and the same after a turn by 90 degrees:
+
+    >>> from s4a import synthetic
+    >>> mesh = synthetic.ellipsoid(200)
+    >>> turned = mesh.assign(position=mesh["position"][:, [1, 0, 2]] * [-1, 1, 1])
+    >>> found = match_pair(mesh, turned, n_coarse=100, k=10, k_init=6)
+    >>> found["fmap"].shape, bool((abs(found["displacement"]) < 1e-6).all())
+    ((10, 10), True)
     """
     from s4a.remesh import coarsen
     from s4a.spectral import spectrum

@@ -37,6 +37,15 @@ def read_shape(path, *, components="largest", strict=False, close_holes=False):
     ------
     ValueError
         When the file cannot be read or cleaned.
+
+    Examples
+    --------
+    >>> from s4a.io import write_mesh
+    >>> from s4a.synthetic import sphere
+    >>> from s4a.mesh import as_arrays
+    >>> written = write_mesh(folder / "ball.ply", *as_arrays(sphere(100)))
+    >>> read_shape(folder / "ball.ply").sizes["vertex"]
+    100
     """
     points, triangles, attrs = read_mesh(path)
     name = os.fsencode(Path(path)).decode("utf-8", "replace")

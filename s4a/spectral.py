@@ -83,6 +83,16 @@ def spectrum(mesh, *, k=100):
     ------
     ValueError
         When k is not a positive integer, the mesh has fewer than 3 vertices, or the solver finds no eigenpairs.
+
+    Examples
+    --------
+    A sphere of radius 1, whose area is 4 pi, has the eigenvalues 0, 2 (three times), 6 (five times):
+
+    >>> from s4a.remesh import coarsen
+    >>> from s4a.synthetic import sphere
+    >>> found = spectrum(coarsen(sphere(2000), n_coarse=1000), k=9)
+    >>> (found["eigenvalue"].values / (4 * np.pi)).round().tolist()
+    [0.0, 2.0, 2.0, 2.0, 6.0, 6.0, 6.0, 6.0, 6.0]
     """
     require(mesh, "vertex_area", "edge_vertex", "cotan_weight", what="mesh")
     if int(k) != k or k < 1:
@@ -124,6 +134,16 @@ def reconstruct(mesh, f, *, k=None):
     Returns
     -------
     float ndarray, of the shape of `f`
+
+    Examples
+    --------
+    The positions of a sphere are eigenfunctions, so that four of them are enough:
+
+    >>> from s4a.remesh import coarsen
+    >>> from s4a.synthetic import sphere
+    >>> ball = spectrum(coarsen(sphere(2000), n_coarse=1000), k=4)
+    >>> bool(abs(reconstruct(ball, ball["position"]) - ball["position"].values).max() < 0.01)
+    True
     """
     require(mesh, "eigenfunction", "vertex_area", what="mesh")
     Phi, f = mesh["eigenfunction"].values[:, :k], np.asarray(f, float)

@@ -218,6 +218,13 @@ def open_study(folder):
     ------
     ValueError
         When the folder is not a study.
+
+    Examples
+    --------
+    With ``store``, the folder of six small brains:
+
+    >>> sorted(open_study(store).children)
+    ['coarse', 'latent', 'network', 'original', 'pca', 'registration', 'report']
     """
     folder = Path(folder)
     if not (folder / "original").is_dir():

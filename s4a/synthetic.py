@@ -181,11 +181,24 @@ def _planted_scores(n, n_modes, rng):
 def plant(n=12, seed=0, *, n_modes=3):
     """The planted parameters of a population: everything that :func:`position` needs, without any mesh.
 
+    Parameters
+    ----------
+    n : int
+        Number of shapes.
+    seed : int
+    n_modes : int
+        Number of planted modes.
+
     Returns
     -------
     Dataset
         ``planted_score(shape, planted_mode)``, the parts of the modes, of each shape's noise and tumour (the last part;
         its push is zero where there is none), its pose, and the landmarks' reference points.
+
+    Raises
+    ------
+    ValueError
+        When there is no shape.
 
     Examples
     --------
@@ -446,6 +459,12 @@ def write(tree, folder):
     list of Path
         The PLY files.  ``xarray.open_datatree("truth.nc")`` is the truth for :func:`position`, with each file's
         ``reference_point`` in the order of its vertices, and its landmarks.
+
+    Examples
+    --------
+    >>> paths = write(brains(2, 200), folder)
+    >>> [path.name for path in paths], (folder / "truth.nc").is_file()
+    (['brain_01.ply', 'brain_02.ply'], True)
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -485,6 +504,12 @@ def ellipsoid(n_vertices=2562, semi_axes=(3.0, 2.0, 1.0)):
 
 def torus(n_around=72, n_across=36, radius=3.0, thickness=1.0):
     """A torus around the z axis: a grid of `n_around` by `n_across` vertices; area 4 pi^2 radius thickness.
+
+    Parameters
+    ----------
+    n_around, n_across : int
+    radius, thickness : float
+        Of the circle in the middle of the tube, and of the tube.
 
     Examples
     --------

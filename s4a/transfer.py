@@ -90,6 +90,13 @@ def register_pairs(
     ------
     ValueError
         When a shape has the name of the template, or a mesh lacks its variables.
+
+    Examples
+    --------
+    >>> source, target = (brains[f"original/{name}"].to_dataset() for name in ("brain_01", "brain_02"))
+    >>> pairs = register_pairs(source, {"brain_02": target}, n_coarse=100, k_init=6, k=10)
+    >>> transfer_labels(pairs, source["label"].values)["brain_02"]["label"].sizes["vertex"]
+    200
     """
     if name in shapes or not shapes:
         raise ValueError(f"shapes other than the template, {name!r}, needed; found {', '.join(shapes) or 'none'}")
@@ -187,6 +194,15 @@ def transfer_labels(study, label, *, source=None, targets=None, votes=False):
     ------
     ValueError
         When the labels do not fit the source, or a shape is not in the study.
+
+    Examples
+    --------
+    With the ``study`` of six small brains, where the labels of every brain are known:
+
+    >>> given, true = (study[f"original/{name}/label"].values for name in ("brain_01", "brain_02"))
+    >>> carried = transfer_labels(study, given, source="brain_01", targets=["brain_02"])
+    >>> bool((carried["brain_02/label"].values == true).mean() > 0.5)
+    True
     """
     mesh, each = plan(study, source, targets)
     label = _per_vertex(label, mesh, "label")
@@ -213,6 +229,14 @@ def transfer_scalars(study, field, *, source=None, targets=None):
     -------
     DataTree
         For every target ``field(vertex)``, NaN where over half of the weight is on NaN, and ``confidence(vertex)``.
+
+    Examples
+    --------
+    With the ``study`` of six small brains; what is constant stays so:
+
+    >>> carried = transfer_scalars(study, np.ones(200), targets=["brain_02"])
+    >>> bool(np.allclose(carried["brain_02/field"], 1))
+    True
     """
     mesh, each = plan(study, source, targets)
     field = _per_vertex(field, mesh, "field").astype(float)
@@ -388,6 +412,16 @@ def transfer_landmarks(study, landmarks, *, source=None, targets=None, farthest=
     ------
     ValueError
         When a landmark is not on the source, or a shape is not in the study.
+
+    Examples
+    --------
+    With the ``study`` of six small brains:
+
+    >>> source = study["original/brain_01"].to_dataset()
+    >>> landmarks = source[["landmark_name", "landmark_position"]]
+    >>> carried = transfer_landmarks(study, landmarks, source="brain_01", targets=["brain_02"])
+    >>> carried["brain_02/landmark_position"].dims
+    ('landmark', 'xyz')
     """
     mesh, each = plan(study, source, targets)
     marked = locate(landmarks, mesh, farthest=farthest)

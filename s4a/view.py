@@ -38,6 +38,12 @@ def write_page(study, path, *, title="Shape study", view="corner", up="z"):
     Returns
     -------
     pathlib.Path
+
+    Examples
+    --------
+    >>> import xarray as xr
+    >>> write_page(xr.DataTree(), folder / "empty.html").name
+    'empty.html'
     """
     path = Path(path)
     path.write_text(page(study, title=title, view=view, up=up), encoding="utf-8")

@@ -1,0 +1,136 @@
+"""The documentation: docstrings, the course, pages in words; no network is needed, to build it or to read it."""
+
+import os
+import re
+from importlib.metadata import version as version_of
+from pathlib import Path
+
+import nbformat
+from docutils import nodes
+from latex2mathml.converter import convert
+
+import s4a
+from s4a import cli
+from s4a.schema import TABLE
+
+HERE = Path(__file__).parent
+NOTEBOOKS = HERE.parent / "notebooks"
+
+project, author = "S4A", "S4A developers"
+copyright = author
+release = version_of("s4a")
+extensions = ["sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode", "myst_nb"]
+exclude_patterns = ["_build", "_variables.md", "_commands.md"]
+root_doc = "index"
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "none"
+napoleon_google_docstring = False
+napoleon_use_param = False  # types are words, not references
+napoleon_use_rtype = False
+napoleon_preprocess_types = False
+default_role = "code"
+
+myst_enable_extensions = ["dollarmath", "colon_fence"]
+myst_heading_anchors = 2
+suppress_warnings = ["mystnb.unknown_mime_type"]
+
+# S4A_DOCS=off leaves the outputs out, for a quick look at words
+nb_execution_mode = os.environ.get("S4A_DOCS", "cache")
+nb_execution_cache_path = str(HERE / "_build" / "notebooks")
+nb_execution_timeout = 600
+nb_execution_raise_on_error = True
+nb_execution_in_temp = True
+nb_merge_streams = True
+nb_render_error_lexer = "text"  # messages of open exercises
+nb_output_stderr = "remove"  # bars of progress
+nb_mime_priority_overrides = [("html", "text/html", 0)]  # of a panel, its page that needs no kernel
+
+html_math_renderer = "mathml"
+html_theme = "furo"
+html_title = "S4A"
+html_static_path = ["_static"]
+html_css_files = ["s4a.css"]
+html_show_sphinx = False
+
+# Run first in every notebook: what needs a kernel is shown as a page of its own, or for some values of its slider.
+WITHOUT_KERNEL = (HERE / "without_kernel.py").read_text(encoding="utf-8")
+
+
+def take_course():
+    """The notebooks beside the pages, each with a cell that shows panels and sliders without a kernel."""
+    folder = HERE / "course"
+    folder.mkdir(exist_ok=True)
+    for path in sorted(NOTEBOOKS.glob("*.ipynb")):
+        notebook = nbformat.read(path, as_version=4)
+        cell = nbformat.v4.new_code_cell(WITHOUT_KERNEL, id="without-kernel", metadata={"tags": ["remove-cell"]})
+        notebook.cells.insert(1, cell)
+        write(folder / path.name, nbformat.writes(notebook))
+    for left in folder.glob("*.ipynb"):
+        if not (NOTEBOOKS / left.name).exists():
+            left.unlink()
+    lessons = "\n".join(path.stem for path in sorted(NOTEBOOKS.glob("*.ipynb")))
+    words = (NOTEBOOKS / "README.md").read_text(encoding="utf-8")
+    write(folder / "index.md", f"{words}\n```{{toctree}}\n:hidden:\n\n{lessons}\n```\n")
+
+
+def list_variables():
+    """Every variable of a study, from the table itself."""
+    rows = [
+        f"| `{name}` | {', '.join(dims)} | {unit} | {words.replace('|', chr(92) + '|')} |"
+        for name, (dims, unit, words) in TABLE.items()
+    ]
+    write(
+        HERE / "_variables.md", "\n".join(["| variable | dims | unit | meaning |", "|---|---|---|---|", *rows]) + "\n"
+    )
+
+
+def list_commands():
+    """The options of every command, as --help prints them."""
+    os.environ["COLUMNS"] = "100"
+    (commands,) = (action for action in cli.parser()._actions if hasattr(action, "choices") and action.choices)
+    parts = [f"### s4a {name}\n\n```text\n{sub.format_help()}```\n" for name, sub in commands.choices.items()]
+    write(HERE / "_commands.md", "\n".join(parts))
+
+
+def write(path, text):
+    """Write where it differs, so that nothing is built again without need."""
+    if not path.exists() or path.read_text(encoding="utf-8") != text:
+        path.write_text(text, encoding="utf-8")
+
+
+def bars(app, what, name, obj, options, lines):
+    """Norms and sizes of sets are written with bars, which are marks of substitutions in reStructuredText."""
+    for i, line in enumerate(lines):
+        if not re.match(r"\s*(>>>|\.\.\.) ", line):
+            lines[i] = re.sub(r"``.*?``|:math:`.*?`|(\|)", lambda found: "\\|" if found[1] else found[0], line)
+
+
+def front_door(app, env, node, content):
+    """A reference to a public name, as `s4a.analyse`, goes where its module is documented."""
+    name = node.get("reftarget", "").removeprefix("s4a.")
+    found = getattr(s4a, name, None) if "." not in name else None
+    module = getattr(found, "__module__", None)
+    if module is None or node.get("refdomain") != "py":
+        return None
+    return env.get_domain("py").resolve_xref(
+        env, node["refdoc"], app.builder, "func", f"{module}.{name}", node, content
+    )
+
+
+def formula(translator, node):
+    """MathML, which browsers draw themselves: no script from elsewhere."""
+    display = "inline" if isinstance(node, nodes.math) else "block"
+    text = convert(node.astext().replace(r"\lVert", r"\|").replace(r"\rVert", r"\|"), display=display)
+    translator.body.append(text if display == "inline" else f'<div class="math">{text}</div>')
+    raise nodes.SkipNode
+
+
+def setup(app):
+    """Sphinx calls this before it reads the pages."""
+    take_course()
+    list_variables()
+    list_commands()
+    app.add_html_math_renderer("mathml", (formula, None), (formula, None))
+    app.connect("autodoc-process-docstring", bars)
+    app.connect("missing-reference", front_door)
