@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check format bench lab docs clean
+.PHONY: demo test check fuzz format bench lab docs clean
 
 demo: $(VENV)/.core
 	$(BIN)/s4a demo
@@ -16,6 +16,9 @@ check: $(VENV)/.test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
+fuzz: $(VENV)/.test
+	$(BIN)/python tests/fuzz.py
+
 format: $(VENV)/.test
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
@@ -23,7 +26,7 @@ format: $(VENV)/.test
 bench: $(VENV)/.bench
 	@set -e; for script in $(wildcard tests/benchmarks/*.py); do echo "$$script"; $(BIN)/python "$$script"; done
 
-lab: $(VENV)/.notebook
+lab: $(VENV)/.course
 	$(BIN)/jupyter lab $(wildcard notebooks)
 
 # S4A_DOCS=off leaves the outputs of the notebooks out, for a quick look

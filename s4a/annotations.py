@@ -2,16 +2,18 @@
 
 import csv
 import json
-import xml.etree.ElementTree as ElementTree
 import zipfile
+from collections import Counter
 from pathlib import Path
 
-import nibabel
 import numpy as np
 from scipy.spatial import cKDTree
 
+from s4a import bounded
+from s4a.gifti import parse_gifti
 from s4a.schema import dataset, require
 
+LONGEST = 255  # characters of a name: an array of names has room for the longest in each place
 MIRROR = np.array([-1.0, -1.0, 1.0])  # between RAS and LPS
 
 
@@ -22,7 +24,8 @@ def read_labels(path, n=None):
     ----------
     path : str or Path
         NPY; NPZ, ``FILE.npz:NAME`` where several arrays fit; CSV or text, a row per vertex, with a header the column
-        ``label`` and, where there is one, the index ``vertex``; GIFTI label (.gii); FreeSurfer .annot.
+        ``label`` and, where there is one, the index ``vertex``; GIFTI label (.gii); FreeSurfer .annot, whose labels are
+        rows of its colour table, -1 for the annotation 0.
     n : int, optional
         Number of vertices in the file of the mesh.
 
@@ -41,7 +44,7 @@ def read_labels(path, n=None):
     if not file.is_file():
         raise ValueError(f"no file {file}")
     kind = file.suffix.lower()
-    readers = {".npy": np.load, ".gii": _gifti_labels, ".annot": _annot_labels}
+    readers = {".npy": _npy_labels, ".gii": _gifti_labels, ".annot": _annot_labels}
     try:
         if kind == ".npz" or zipfile.is_zipfile(file):
             labels = _npz_labels(file, name, n)
@@ -54,38 +57,91 @@ def read_labels(path, n=None):
         wanted = "one label per vertex" if n is None else f"{n} labels, one per vertex of the file of the mesh,"
         raise ValueError(f"{path}: {wanted} needed, found an array of shape {labels.shape}")
     if labels.dtype.kind == "f":
-        whole = np.round(labels)
-        if not (whole == labels).all():
-            raise ValueError(f"{path}: labels need whole numbers or names, found {labels[whole != labels][0]}")
-        labels = whole.astype(np.int64)
+        wrong = (np.round(labels) != labels) | ~(np.abs(labels) < 2**53)
+        if wrong.any():
+            raise ValueError(f"{path}: labels need whole numbers or names, found {labels[wrong][0]}")
+        labels = labels.astype(np.int64)
     if labels.dtype.kind not in "iubU":
         raise ValueError(f"{path}: labels need whole numbers or names, found {labels.dtype}")
     return labels
 
 
 def _npz_labels(file, name, n):
-    with np.load(file, allow_pickle=False) as arrays:
-        fitting = [key for key in arrays if arrays[key].ndim == 1 and n in (None, len(arrays[key]))]
-        if name and name not in arrays:
+    arrays = bounded.npz(file.read_bytes())
+    if name:
+        if name not in arrays:
             raise ValueError(f"no array {name!r}; it has {', '.join(arrays)}")
-        if not name and len(fitting) != 1:
-            shapes = ", ".join(f"{key} {arrays[key].shape}" for key in arrays)
-            wanted = "one array" if n is None else f"one array of {n} values"
-            raise ValueError(f"{wanted} needed, found {shapes}; name it as {file.name}:NAME")
-        return arrays[name or fitting[0]]
+        return arrays[name]()
+    arrays = {key: read() for key, read in arrays.items()}
+    fitting = [key for key, values in arrays.items() if values.ndim == 1 and n in (None, len(values))]
+    if len(fitting) != 1:
+        shapes = ", ".join(f"{key} {values.shape}" for key, values in arrays.items())
+        wanted = "one array" if n is None else f"one array of {n} values"
+        raise ValueError(f"{wanted} needed, found {shapes}; name it as {file.name}:NAME")
+    return arrays[fitting[0]]
+
+
+def _npy_labels(file):
+    return bounded.npy(file.read_bytes())
 
 
 def _gifti_labels(file):
-    image = nibabel.load(file)
-    found = image.get_arrays_from_intent("NIFTI_INTENT_LABEL")
-    found = found or [a for a in image.darrays if a.data.ndim == 1]
+    arrays = parse_gifti(file.read_bytes())
+    found = [values for intent, values in arrays if intent == "LABEL"]
+    found = found or [values for _, values in arrays if values.ndim == 1]
     if not found:
         raise ValueError("a GIFTI array of labels needed, found none")
-    return found[0].data
+    return found[0]
 
 
 def _annot_labels(file):
-    return nibabel.freesurfer.read_annot(file)[0]
+    """Rows of the colour table; nibabel's reader gives some row to an annotation that is not in the table."""
+    data, at = file.read_bytes(), 0
+
+    def take(count):
+        """The next big-endian integers."""
+        nonlocal at
+        if not 0 <= 4 * count <= len(data) - at:
+            raise ValueError(f"expected {count} numbers, found {(len(data) - at) // 4}: the file is cut short")
+        at += 4 * count
+        return np.frombuffer(data, ">i4", count, at - 4 * count).astype(np.int64)
+
+    def skip_text():
+        nonlocal at
+        length = take(1)[0]
+        if not 0 <= length <= len(data) - at:
+            raise ValueError(f"expected a text of {length} bytes, found {len(data) - at}: the file is cut short")
+        at += int(length)
+
+    vertex, annotation = take(2 * int(take(1)[0])).reshape(-1, 2).T
+    if not np.array_equal(np.sort(vertex), np.arange(len(vertex))):
+        raise ValueError(f"every vertex from 0 to {len(vertex) - 1} expected once")
+    if not take(1)[0]:
+        raise ValueError("a colour table expected, found none")
+    count, rows = int(take(1)[0]), {}
+    if count < 0:
+        if count != -2:
+            raise ValueError(f"a colour table of version 2 expected, found {-count}")
+        take(1)
+        skip_text()
+        count = int(take(1)[0])
+        numbered = True
+    else:
+        skip_text()
+        numbered = False
+    for i in range(count):
+        row = int(take(1)[0]) if numbered else i
+        skip_text()
+        r, g, b, _ = take(4)
+        rows.setdefault(int(r + 256 * g + 65536 * b), row)
+    rows[0] = -1
+    values, of_value = np.unique(annotation, return_inverse=True)
+    unknown = [value for value in values.tolist() if value not in rows]
+    if unknown:
+        raise ValueError(f"annotations of the colour table expected, found {unknown[:3]}, which are not in it")
+    labels = np.empty(len(vertex), np.int64)
+    labels[vertex] = np.array([rows[value] for value in values.tolist()], np.int64)[of_value]
+    return labels
 
 
 def table_rows(file):
@@ -95,6 +151,14 @@ def table_rows(file):
         raise ValueError("the file is empty")
     mark = next((m for m in ",;\t" if m in lines[0]), " ")
     return [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=mark, skipinitialspace=True)]
+
+
+def short(texts):
+    """`texts`, none of which is so long that an array of them would fill the memory."""
+    longest = max(map(len, texts), default=0)
+    if longest > LONGEST:
+        raise ValueError(f"names of at most {LONGEST} characters expected, found one of {longest}")
+    return texts
 
 
 def is_number(text):
@@ -115,7 +179,7 @@ def _text_labels(file):
         values = [row[0] for row in rows]
     else:
         raise ValueError(f"a column 'label' needed, found {', '.join(rows[0])}")
-    labels = np.array([float(v) for v in values]) if all(map(is_number, values)) else np.array(values)
+    labels = np.array([float(v) for v in values]) if all(map(is_number, values)) else np.array(short(values))
     if "label" in head and "vertex" in head:
         vertex = np.array([row[head.index("vertex")] for row in rows[1:]]).astype(int)
         if not np.array_equal(np.sort(vertex), np.arange(len(vertex))):
@@ -155,12 +219,13 @@ def read_landmarks(path):
         points = np.array(points, float).reshape(-1, 3)
         if len(points) == 0 or not np.isfinite(points).all():
             raise ValueError(f"points with finite coordinates needed, found {len(points)}")
-        short = [name for name in dict.fromkeys(curve) if name and curve.count(name) < 2]
-        if short:
-            raise ValueError(f"a curve needs two points or more; {short[0]!r} has one")
+        single = [name for name, count in Counter(curve).items() if name and count < 2]
+        if single:
+            raise ValueError(f"a curve needs two points or more; {single[0]!r} has one")
+        names = short([str(name) or str(i + 1) for i, name in enumerate(names)])
+        curve = short([str(name) for name in curve])
     except Exception as error:
         raise ValueError(f"{path} cannot be read as landmarks: {error or type(error).__name__}") from error
-    names = [name or str(i + 1) for i, name in enumerate(names)]
     curves = {"landmark_curve": np.array(curve), "landmark_closed": np.array(closed, bool)} if any(curve) else {}
     return dataset({"coordinate_system": system}, landmark_name=np.array(names), landmark_position=points, **curves)
 
@@ -186,7 +251,7 @@ def _slicer_points(path):
 
 
 def _meshlab_points(path):
-    points = [p for p in ElementTree.fromstring(path.read_text("utf-8-sig")).iter("point") if p.get("active") != "0"]
+    points = [p for p in bounded.xml(path.read_text("utf-8-sig")).iter("point") if p.get("active") != "0"]
     names = [p.get("name", "") for p in points]
     return names, [[p.get(axis) for axis in "xyz"] for p in points], "", [""] * len(names), []
 

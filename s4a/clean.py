@@ -170,7 +170,7 @@ def _validated(points, triangles, components):
 
 
 def _drop_nonfinite(P, F, strict, counts):
-    bad = ~(np.abs(P) < 1e100).all(axis=1)  # so that no product overflows; false for nan as well
+    bad = ~(np.abs(P) < 1e60).all(axis=1)  # so that no squared area overflows; false for nan as well
     counts["nonfinite_vertices"] = int(bad.sum())
     if strict and bad.any():
         raise ValueError(f"{bad.sum()} of {len(P)} vertices are not finite; strict=False removes them")
@@ -355,7 +355,7 @@ def _pairs_around_edges(P, F, group, edge_of, count):
     pairs = np.concatenate(pairs)
     m, start = len(F), group[F].T.ravel()
     N = triangle_normals(P, F)
-    N /= np.linalg.norm(N, axis=1, keepdims=True)
+    N /= np.maximum(np.linalg.norm(N, axis=1, keepdims=True), np.finfo(float).tiny)  # some have lost theirs to rounding
     one, other = N[pairs[:, 0] % m], N[pairs[:, 1] % m]
     twisted = start[pairs[:, 0]] == start[pairs[:, 1]]
     cos = np.einsum("ij,ij->i", one, other) * np.where(twisted, -1, 1)

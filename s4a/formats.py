@@ -2,12 +2,12 @@
 
 import io
 import re
-import zipfile
 
 import nibabel
 import numpy as np
 
 from s4a import bounded
+from s4a.gifti import parse_gifti
 from s4a.vtk import parse_vtk, parse_vtp, vtk_bytes
 
 NPZ_KEYS = (("V", "F"), ("vertices", "faces"), ("points", "triangles"), ("position", "corner_vertex"), ("X", "T"))
@@ -22,8 +22,21 @@ def _fan(polygons):
     [[0, 1, 2], [0, 2, 3]]
     """
     k = polygons.shape[1]
-    corners = [polygons[:, [0, i, i + 1]] for i in range(1, k - 1)]
-    return np.stack(corners, axis=1).reshape(-1, 3) if corners else np.empty((0, 3), np.int64)
+    if k < 3:
+        return np.empty((0, 3), np.int64)
+    first = np.broadcast_to(polygons[:, :1], (len(polygons), k - 2))
+    return np.stack([first, polygons[:, 1:-1], polygons[:, 2:]], axis=2).reshape(-1, 3)
+
+
+def _whole(values):
+    """Indices as integers; those of a text file of numbers are floats."""
+    values = np.asarray(values)
+    if values.dtype.kind == "f" and not (np.abs(values) < 2**53).all():
+        raise ValueError("face indices are no numbers, or far too large")
+    whole = values.astype(np.int64)
+    if values.dtype.kind == "f" and (whole != values).any():
+        raise ValueError(f"whole numbers expected as face indices, found {values[whole != values][0]}")
+    return whole
 
 
 def _need(expected, found, what):
@@ -37,7 +50,8 @@ def _polygons(rows):
     triangles, order = [np.empty((0, 3), np.int64)], [np.empty(0, np.int64)]
     for k in np.unique(sizes[sizes > 2]):
         chosen = np.flatnonzero(sizes == k)
-        triangles.append(_fan(np.array([rows[i] for i in chosen]).astype(np.int64)))
+        corners = [rows[i] for i in chosen]
+        triangles.append(_fan(_whole(np.array(corners, np.int64 if isinstance(corners[0], list) else None))))
         order.append(np.repeat(chosen, k - 2))
     return np.concatenate(triangles)[np.argsort(np.concatenate(order), kind="stable")]
 
@@ -110,7 +124,7 @@ def _ply_rows(body, at, name, count, properties):
                 if (columns[key] != lengths[key]).any():
                     break
                 if key.startswith("vertex_ind"):
-                    columns[key] = _fan(_column(block, offset, types[1], lengths[key]).astype(np.int64))
+                    columns[key] = _fan(_whole(_column(block, offset, types[1], lengths[key])))
                 offset += lengths[key] * size(types[1])
         else:
             return columns, at + count * stride
@@ -173,7 +187,7 @@ def _read_obj(data):
     lines = text.splitlines()
     words = [line.split() for line in lines if line.lstrip()[:2] in (b"v ", b"f ", b"v\t", b"f\t")]
     vertex = np.array([row[0] == b"v" for row in words], bool)
-    points = np.array([row[1:4] for row in words if row[0] == b"v"]).astype(np.float64)
+    points = np.array([row[1:4] for row in words if row[0] == b"v"], np.float64)
     so_far = np.cumsum(vertex)[~vertex]
     faces = [[corner.partition(b"/")[0] for corner in row[1:]] for row in words if row[0] == b"f"]
     short = sum(len(face) < 3 for face in faces)
@@ -196,7 +210,7 @@ def _read_off(data):
     if min(n, m) < 0:
         raise ValueError(f"counts from 0 expected, found {n} vertices and {m} faces")
     _need(n + m, len(lines) - 1, "lines of vertices and faces")
-    points = np.array([line.split()[:3] for line in lines[1 : n + 1]]).astype(np.float64)
+    points = np.array([line.split()[:3] for line in lines[1 : n + 1]], np.float64)
     faces = []
     for line in lines[n + 1 : n + 1 + m]:
         row = line.split()
@@ -212,7 +226,7 @@ def _read_stl(data):
         rows = re.findall(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", data, re.I)
         _need(3 * len(re.findall(rb"\bfacet\b", data, re.I)), len(rows), "vertices of facets")
         _need(1, len(re.findall(rb"\bendsolid\b", data, re.I)), "endsolid")
-        points = np.array(rows).astype(np.float64)
+        points = np.array(rows, np.float64)
     else:
         _need(count, (len(data) - 84) // 50, "triangles")
         points = np.frombuffer(data, np.dtype([("n", "<f4", 3), ("x", "<f4", (3, 3)), ("a", "<u2")]), count, 84)["x"]
@@ -234,12 +248,11 @@ def _distinct(points):
 
 
 def _read_gifti(data):
-    bounded.check_zlib_blocks(data)
-    image = nibabel.gifti.GiftiImage.from_bytes(data)
-    found = [image.get_arrays_from_intent(name) for name in ("NIFTI_INTENT_POINTSET", "NIFTI_INTENT_TRIANGLE")]
+    arrays = parse_gifti(data)
+    found = [[values for intent, values in arrays if intent == wanted] for wanted in ("POINTSET", "TRIANGLE")]
     if not all(found):
         raise ValueError(f"one set of points and one of triangles expected, found {len(found[0])} and {len(found[1])}")
-    return found[0][0].data, found[1][0].data, {"coordinate_system": "RAS", "unit": "mm"}
+    return found[0][0], _whole(found[1][0]), {"coordinate_system": "RAS", "unit": "mm"}
 
 
 def _read_freesurfer(data):
@@ -252,17 +265,17 @@ def _read_freesurfer(data):
 
 
 def _read_npz(data):
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        bounded.check(sum(member.file_size for member in archive.infolist()), len(data))
-    with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-        for keys in NPZ_KEYS:
-            if all(key in arrays for key in keys):
-                points, triangles = (arrays[key] for key in keys)
-                if not np.issubdtype(triangles.dtype, np.integer):
-                    raise ValueError(f"integer indices expected in {keys[1]}, found {triangles.dtype}")
-                return points, triangles, {}
-        wanted = " or ".join(" and ".join(keys) for keys in NPZ_KEYS)
-        raise ValueError(f"the keys {wanted} expected, found {', '.join(arrays) or 'none'}")
+    arrays = bounded.npz(data)
+    for keys in NPZ_KEYS:
+        if all(key in arrays for key in keys):
+            points, triangles = (arrays[key]() for key in keys)
+            if triangles.dtype.kind not in "iu":
+                raise ValueError(f"integer indices expected in {keys[1]}, found {triangles.dtype}")
+            if points.dtype.kind not in "iuf":
+                raise ValueError(f"numbers expected in {keys[0]}, found {points.dtype}")
+            return points, triangles, {}
+    wanted = " or ".join(" and ".join(keys) for keys in NPZ_KEYS)
+    raise ValueError(f"the keys {wanted} expected, found {', '.join(arrays) or 'none'}")
 
 
 READERS = {

@@ -73,8 +73,9 @@ def read_mesh(path):
             data = bounded.gunzip(data)
         data = data.removeprefix(b"\xef\xbb\xbf")
         found = _sniff(data)
-        points, triangles, attrs = READERS[found](data)
-        points, triangles = _checked(points, triangles)
+        with np.errstate(all="ignore"):  # nonsense in the file is refused, or left to the cleaning
+            points, triangles, attrs = READERS[found](data)
+            points, triangles = _checked(points, triangles)
     except Exception as error:  # whatever a file holds, it must not end the run over a collection
         raise ValueError(f"{path} cannot be read as {found}: {error or type(error).__name__}") from error
     space = re.search(rb"SPACE=(RAS|LPS)", data[:1000])  # as 3D Slicer writes it into any header
@@ -127,7 +128,7 @@ def _sniff(data):
         return "STL"
     if re.match(rb"solid\b", head, re.I) and re.search(rb"\bfacet\b|\bendsolid\b", data, re.I):
         return "STL"
-    if b"\0" not in head and re.search(rb"^\s*v\s+[-+.\dn]", data, re.M):
+    if b"\0" not in head and re.search(rb"^[ \t]*v[ \t]+[-+.\dn]", data, re.M):
         return "OBJ"
     if b"\0" in head and len(data) >= 84:
         return "STL"

@@ -130,7 +130,7 @@ def encoded(value):
             return {"base64": base64.b64encode(it).decode()}
         raise TypeError(f"{type(it).__name__} cannot be kept in a page")
 
-    return json.dumps(value, default=known, ensure_ascii=False).replace("</", "<\\/")
+    return json.dumps(value, default=known, ensure_ascii=False).replace("<", "\\u003c")
 
 
 def widget_html(name, state):

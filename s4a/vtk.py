@@ -3,11 +3,10 @@
 import base64
 import itertools
 import re
-import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 
-from s4a.bounded import check, limit_of, unpack
+from s4a.bounded import limit_of, unpack, xml
 
 LEGACY_TYPES = {
     "char": "i1",
@@ -96,11 +95,15 @@ class _Legacy:
         if self.binary:
             start, self.at = self.at, self.at + count * dtype.itemsize
             return np.frombuffer(self.data, dtype, count, start)
-        words = self.data[self.at :].split(None, count)
+        end = min(self.at + 64 * count + 1000, len(self.data))  # the rest is not copied for each of many short arrays
+        words = self.data[self.at : end].split(None, count)
+        if len(words) <= count:
+            end = len(self.data)
+            words = self.data[self.at :].split(None, count)
         if len(words) < count:
             raise ValueError(f"expected {count} values, found {len(words)}: the file is cut short")
-        self.at = len(self.data) - sum(map(len, words[count:]))
-        return np.array(words[:count]).astype(dtype.newbyteorder("="))
+        self.at = end - sum(map(len, words[count:]))
+        return np.array(words[:count], dtype.newbyteorder("="))
 
     def polygons(self, n, size):
         """Triangles of a section of cells: counts between the corners, or offsets and connectivity (5.1)."""
@@ -163,28 +166,31 @@ def vtk_bytes(X, T, scalars):
 
 def parse_vtp(data):
     """Points, triangles and attributes of an XML file: inline or appended, ascii, base64 or raw, compressed or not."""
-    appended = re.search(rb"<AppendedData[^>]*encoding\s*=\s*[\"'](\w+)[\"'][^>]*>\s*_", data)
+    appended = re.search(rb"<AppendedData([^<>]{0,400})>\s{0,99}_", data)
     encoding, blob = None, b""
     if appended:  # raw bytes are no XML
-        encoding, blob = appended[1].decode(), data[appended.end() :]
+        encoding, blob = "raw" if b"raw" in appended[1] else "base64", memoryview(data)[appended.end() :]
         data = data[: appended.start()] + b"</VTKFile>"
-    root = ElementTree.fromstring(data)
+    root = xml(data)
     if root.get("type") != "PolyData":
         raise ValueError(f"PolyData expected, found {root.get('type')}; save the surface as polydata")
     order = ">" if root.get("byte_order") == "BigEndian" else "<"
     size = np.dtype(order + ("u8" if root.get("header_type") == "UInt64" else "u4"))
-    compressor = root.get("compressor")
+    compressor, left = root.get("compressor"), limit_of(len(data) + len(blob))
 
     def array(node):
+        nonlocal left
         kind, bits = re.match(r"([A-Za-z]+)(\d+)", node.get("type")).groups()
         dtype = np.dtype(f"{order}{XML_TYPES[kind]}{int(bits) // 8}")
         how = node.get("format")
         if how == "ascii":
-            return np.array((node.text or "").split()).astype(dtype)
+            return np.array((node.text or "").split(), dtype)
         if how == "appended":
-            rest = blob[int(node.get("offset")) :]
-            return np.frombuffer(_unpack(rest, encoding == "base64", size, compressor), dtype)
-        return np.frombuffer(_unpack((node.text or "").strip().encode(), True, size, compressor), dtype)
+            found = _unpack(blob[int(node.get("offset")) :], encoding == "base64", size, compressor, left)
+        else:
+            found = _unpack((node.text or "").strip().encode(), True, size, compressor, left)
+        left -= len(found)  # many arrays may name one place
+        return np.frombuffer(found, dtype)
 
     points, triangles, before = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], 0
     for piece in root.iter("Piece"):
@@ -202,8 +208,8 @@ def parse_vtp(data):
     return np.concatenate(points), np.concatenate(triangles), {}
 
 
-def _unpack(data, is_base64, size, compressor):
-    """The bytes of one array: a header of sizes, then the array or its compressed blocks."""
+def _unpack(data, is_base64, size, compressor, limit):
+    """The bytes of one array, `limit` at most: a header of sizes, then the array or its compressed blocks."""
 
     def take(start, length):
         """Bytes start .. start + length of what is encoded from the beginning of `data`."""
@@ -218,7 +224,10 @@ def _unpack(data, is_base64, size, compressor):
 
     w = size.itemsize
     if not compressor:
-        return take(w, int(np.frombuffer(take(0, w), size)[0]))
+        length = int(np.frombuffer(take(0, w), size)[0])
+        if length > limit:
+            raise ValueError(f"arrays of at most {limit} bytes more expected, found {length}")
+        return take(w, length)
     if compressor not in COMPRESSORS:
         raise ValueError(f"{' or '.join(COMPRESSORS)} expected, found {compressor}")
     blocks = int(np.frombuffer(take(0, w), size)[0])
@@ -227,9 +236,8 @@ def _unpack(data, is_base64, size, compressor):
     if is_base64:  # header and blocks are encoded apart
         data, start = data[4 * -(-start // 3) :], 0
     body, ends = take(start, sum(lengths)), np.cumsum([0, *lengths])
-    parts, found = [], 0
+    parts = []
     for a, b in itertools.pairwise(ends):
-        parts.append(unpack(body[a:b], COMPRESSORS[compressor], limit_of(len(data))))
-        found += len(parts[-1])
-        check(found, len(data))
+        parts.append(unpack(body[a:b], COMPRESSORS[compressor], limit))
+        limit -= len(parts[-1])
     return b"".join(parts)

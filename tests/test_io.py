@@ -225,7 +225,6 @@ def test_a_file_cut_anywhere_is_refused_with_its_name(tmp_path):
                 read_mesh(file(tmp_path, "cut.mesh", whole[:length]))
 
 
-@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # damaged floats, which numpy warns of when it casts them
 def test_a_damaged_file_is_read_or_refused_but_nothing_worse(tmp_path):
     rng = np.random.default_rng(0)
     for whole in all_formats(tmp_path):

@@ -382,6 +382,27 @@ def test_labels_and_landmarks_are_carried_as_the_step_module_does_it(study, pane
     assert (shown[0] == here[mesh["label"].values == value]).all()
 
 
+def test_names_of_labels_and_landmarks_are_text_in_panels_and_saved_pages(study, tmp_path):
+    bad = "<img src=x onerror=alert()><!--<script>"
+    tree = study.copy()
+    for node in tree["original"].children.values():
+        data = node.to_dataset()
+        label = np.array([bad, "b"])[data["label"].values % 2]
+        data["label"] = xr.Variable("vertex", label)
+        names = data["landmark_name"].values.tolist()
+        data["landmark_name"] = xr.Variable("landmark", np.array([bad, *names[1:]]))
+        node.dataset = data
+    both = Transfer(tree)
+    both.landmark = bad
+    texts = [both.legend.value, both.table.value, both.save_html(tmp_path / "page.html").read_text(encoding="utf-8")]
+    both.say(bad, error=True)
+    for text in [*texts, both.message.value]:
+        assert "&lt;img src=x" in text
+        assert "<img src=x" not in text
+        assert "<!--<script" not in text
+    both.close()
+
+
 def test_a_click_places_or_moves_a_landmark_and_it_is_saved(study, panel, tmp_path):
     both = panel(Transfer)
     count = len(both.marks)

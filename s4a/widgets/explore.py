@@ -1,5 +1,7 @@
 """All panels of a study as tabs; each is built when its tab is first opened."""
 
+from html import escape
+
 import ipywidgets
 from IPython import get_ipython
 
@@ -59,7 +61,7 @@ class Explore(ipywidgets.VBox):
             self.panels[title] = PANELS[title](self.study, **self.options)
             box.children = [self.panels[title]]
         except ValueError as error:
-            box.children = [ipywidgets.HTML(f'<p role="status">{error}</p>')]
+            box.children = [ipywidgets.HTML(f'<p role="status">{escape(str(error))}</p>')]
 
     def refresh(self, study):
         """Show a newer state of the study in all panels."""

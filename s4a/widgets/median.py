@@ -1,5 +1,7 @@
 """The median shape (3.5, 3.6, eq. 5): every shape ranked by its distance to the limit shape."""
 
+from html import escape
+
 import ipywidgets
 import numpy as np
 import traitlets
@@ -67,7 +69,8 @@ class Median(Panel):
         self.median = self.names[self.order[0]]
         near = [self.names[i] for i in near_ties(self.distance)]
         others = f"Near ties, at most 5 % farther: {', '.join(near[1:])}." if near[1:] else "No other within 5 %."
-        self.ties.value = paragraph(f"<b>The median is {self.median}</b>, at {self.distance.min():.4g}. {others}")
+        least = f"<b>The median is {escape(self.median)}</b>, at {self.distance.min():.4g}."
+        self.ties.value = paragraph(f"{least} {escape(others)}")
         self.draw_bars()
         if self.selected:
             self.show()

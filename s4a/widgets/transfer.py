@@ -110,7 +110,7 @@ class Transfer(Panel):
     def paint(self):
         """The source's labels on both surfaces, and what their colours are."""
         mesh = self.mesh(self.source)
-        self.legend.value = "" if "label" in mesh else paragraph(f"{self.source} has no labels.")
+        self.legend.value = "" if "label" in mesh else paragraph(f"{escape(self.source)} has no labels.")
         if "label" not in mesh or not self.labels.value:
             for view in self.scenes:
                 view.paint(None)
@@ -125,7 +125,7 @@ class Transfer(Panel):
         self.scenes[1].caption = f"labels carried from {self.source}, confidence {confidence:.2f} on average"
         names = "".join(
             f'<span style="white-space:nowrap;margin-right:1em"><span style="display:inline-block;width:1em;height:1em;'
-            f'background:rgb({",".join(str(round(255 * c)) for c in color)})"></span> {value}: '
+            f'background:rgb({",".join(str(round(255 * c)) for c in color)})"></span> {escape(str(value))}: '
             f"{np.mean(label == value):.1%}, {np.mean(found == value):.1%}</span>"
             for value, color in zip(values, colors, strict=True)
         )

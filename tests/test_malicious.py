@@ -1,0 +1,180 @@
+"""Files made to do harm: nothing in them is run, they fill no memory and reach no other file."""
+
+import base64
+import io
+import itertools
+import json
+import os
+import zipfile
+import zlib
+
+import fuzz
+import numpy as np
+import pytest
+
+from s4a.annotations import read_labels, read_landmarks, write_landmarks
+from s4a.io import read_mesh, stem_of
+
+
+def file(path, content):
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+class Harm:
+    """Unpickled, it makes a folder."""
+
+    def __init__(self, path):
+        self.path = str(path)
+
+    def __reduce__(self):
+        return os.mkdir, (self.path,)
+
+
+def test_pickles_are_never_executed(tmp_path):
+    made, harm = tmp_path / "made", np.array([Harm(tmp_path / "made")], object)
+    triangle = {"F": np.array([[0, 1, 2]])}
+    np.save(tmp_path / "a.npy", harm, allow_pickle=True)
+    np.savez(tmp_path / "b.npz", label=harm)
+    np.savez(tmp_path / "c.npz", V=harm, **triangle)
+    for read, name in ((read_labels, "a.npy"), (read_labels, "b.npz"), (read_mesh, "c.npz")):
+        with pytest.raises(ValueError, match=rf"{name}.*no pickled objects"):
+            read(tmp_path / name)
+        assert not made.exists()
+    with np.load(tmp_path / "b.npz", allow_pickle=True) as arrays:  # that it would have done harm
+        arrays["label"]
+    assert made.is_dir()
+
+
+def xml_files():
+    """A whole file of every format in XML, the name of its root, and what reads it."""
+    table = fuzz.seeds()
+    readers = {"mesh": read_mesh, "labels": read_labels, "landmarks": read_landmarks}
+    for name, root in (
+        ("VTP", b"VTKFile"),
+        ("GIFTI", b"GIFTI"),
+        ("GIFTI labels", b"GIFTI"),
+        ("MeshLab", b"PickedPoints"),
+    ):
+        suffix, kind, given = table[name]
+        body = given[0][0]
+        yield suffix, root, body[body.index(b"<" + root) :], readers[kind]
+
+
+BOMB = '<!ENTITY a "aaaaaaaaaa">' + "".join(
+    f'<!ENTITY {b} "{10 * f"&{a};"}">' for a, b in itertools.pairwise("abcdefghi")
+)
+
+
+@pytest.mark.parametrize(
+    "entities", [BOMB, '<!ENTITY i SYSTEM "file:///etc/hostname">', '<!ENTITY % i SYSTEM "x.dtd"> %i;']
+)
+def test_xml_with_entities_is_refused(tmp_path, entities):
+    for suffix, root, body, read in xml_files():
+        declared = b'<?xml version="1.0"?>\n<!DOCTYPE %s [%s]>\n' % (root, entities.encode())
+        hurt = body.replace(b"<Points>" if root == b"VTKFile" else b">", b">&i;", 1) if entities == BOMB else body
+        with pytest.raises(ValueError, match=r"without entities expected, found a declaration of '[ai]'"):
+            read(file(tmp_path / f"file{suffix}", declared + hurt))
+        read(file(tmp_path / f"file{suffix}", declared.split(b" [")[0] + b' SYSTEM "http://a.b/c.dtd">' + body))
+
+
+def test_a_gifti_file_opens_no_other_file(tmp_path):
+    file(tmp_path / "secret", bytes(12))
+    text = (
+        '<GIFTI Version="1.0"><DataArray Intent="NIFTI_INTENT_LABEL" DataType="NIFTI_TYPE_INT32" '
+        'Dimensionality="1" Dim0="3" Encoding="ExternalFileBinary" ExternalFileName="secret" ExternalFileOffset="0" '
+        'ArrayIndexingOrder="RowMajorOrder" Endian="LittleEndian"><Data/></DataArray></GIFTI>'
+    )
+    with pytest.raises(ValueError, match="data inside the file expected, found ExternalFileBinary secret"):
+        read_labels(file(tmp_path / "a.gii", text))
+
+
+def npz(**members):
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in members.items():
+            archive.writestr(f"{name}.npy", data)
+    return out.getvalue()
+
+
+def array(shape, data=b"", kind="<i4"):
+    header = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    return b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + data
+
+
+def test_label_files_that_unpack_to_more_than_64_mib_and_200_times_their_size_are_refused(tmp_path):
+    zeros = bytes(80_000_000)
+    packed = base64.b64encode(zlib.compress(zeros)).decode()
+    gifti = (
+        '<GIFTI Version="1.0"><DataArray Intent="NIFTI_INTENT_LABEL" DataType="NIFTI_TYPE_INT32" '
+        'Dimensionality="1" Dim0="20000000" Encoding="GZipBase64Binary" ArrayIndexingOrder="RowMajorOrder" '
+        f'Endian="LittleEndian"><Data>{packed}</Data></DataArray></GIFTI>'
+    )
+    bombs = {"a.npz": npz(label=array((20_000_000,), zeros)), "b.gii": gifti.encode()}
+    for name, data in bombs.items():
+        assert len(data) < 200_000
+        with pytest.raises(ValueError, match=rf"{name}.*at most .* expected in .*compressed .*found more"):
+            read_labels(file(tmp_path / name, data))
+
+
+def test_an_array_that_promises_more_than_its_file_is_refused_before_room_is_made_for_it(tmp_path):
+    for shape, kind in (((10**12,), "<i4"), ((10**12,), "<U0"), ((10**6, 10**6, 10**6), "<f8")):
+        for name, data in (
+            ("a.npy", array(shape, bytes(12), kind)),
+            ("b.npz", npz(label=array(shape, bytes(12), kind))),
+        ):
+            with pytest.raises(ValueError, match=rf"{name}.*bytes of .* expected for the shape .*, found 12"):
+                read_labels(file(tmp_path / name, data))
+
+
+def test_many_arrays_at_one_place_of_a_file_count_each(tmp_path):
+    raw = bytes(600_000)
+    body = np.array([1, len(raw), 0, len(p := zlib.compress(raw))], "<u4").tobytes() + p
+    piece = '<DataArray type="Float32" format="appended" offset="0"/>'
+    piece = f'<Piece NumberOfPoints="50000"><Points>{piece}</Points></Piece>'
+    text = '<VTKFile type="PolyData" compressor="vtkZLibDataCompressor"><PolyData>' + 400 * piece
+    text += '</PolyData><AppendedData encoding="raw">_'
+    with pytest.raises(ValueError, match=r"at most \d+ bytes expected in a compressed block, found more"):
+        read_mesh(file(tmp_path / "a.vtp", text.encode() + body + b"</AppendedData></VTKFile>"))
+
+
+def test_one_long_word_does_not_widen_all_others(tmp_path):
+    long = "1" * 100_000
+    obj = "".join(f"v {i} 0 0\n" for i in range(20_000)) + f"v 0.{long} 1 0\nf 1 2 20001\n"
+    assert len(read_mesh(file(tmp_path / "a.obj", obj))[0]) == 20_001  # in words of one width they are 6 GB
+    rows = "label\n" + "x\n" * 100_000 + "y" * 100_000
+    with pytest.raises(ValueError, match=r"names of at most 255 characters expected, found one of 100000"):
+        read_labels(file(tmp_path / "a.csv", rows))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"v" + b"\n" * 300_000,
+        b"<VTKFile " + b"<AppendedData " * 50_000,
+        b"<VTKFile " + b'<AppendedData encoding="' * 30_000,
+        b"# vtk DataFile Version 3.0\na\nASCII\nDATASET POLYDATA\n" + b"FIELD a 1\nb 1 1 int\n1\n" * 20_000,
+        b"\x1f\x8b\x08\0\0\0\0\0\2\xff\3\0\0\0\0\0\0\0\0\0" * 20_000,
+    ],
+    ids=["empty lines", "tags", "attributes", "fields", "gzip members"],
+)
+def test_no_reader_takes_the_square_of_the_size(tmp_path, content):
+    import time
+
+    start = time.process_time()
+    with pytest.raises(ValueError):
+        read_mesh(file(tmp_path / "a.mesh", content))
+    assert time.process_time() - start < fuzz.SECONDS  # the limit of the fuzzer; with the square it is minutes
+
+
+def test_names_in_annotations_are_no_paths(tmp_path):
+    names = ["../../a", "/b", "..\\c", "d/e", "nul\tf"]
+    points = [{"label": name, "position": [i, 0, 0]} for i, name in enumerate(names)]
+    given = {"markups": [{"type": "Fiducial", "coordinateSystem": "LPS", "controlPoints": points}]}
+    path = file(tmp_path / "a.mrk.json", json.dumps(given))
+    (tmp_path / "out").mkdir()
+    write_landmarks(tmp_path / "out" / "l.csv", read_landmarks(path))
+    assert sorted(p.name for p in tmp_path.rglob("*")) == ["a.mrk.json", "l.csv", "out"]
+    assert read_landmarks(tmp_path / "out" / "l.csv")["landmark_name"].values.tolist() == names
+    for path in ("../../x.ply", "/x.ply", "a/../x.ply.gz"):
+        assert stem_of(path) == "x"
