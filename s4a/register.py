@@ -161,7 +161,7 @@ def way_back(source, target, image):
     """
     center, size = source.frame
     X, T = (image - center) / size, target.dense.T
-    tree = cKDTree(joint.features(X, vertex_normals(X, T)))
+    tree = joint.feature_tree(X, T)
     nearest = tree.query(joint.features(source.dense.X, vertex_normals(source.dense.X, source.dense.T)))[1]
     return closest_point_in_star(source.dense.X, nearest, X, T)
 

@@ -5,7 +5,7 @@ from collections import Counter
 
 import numpy as np
 
-from s4a.align import icp, principal_axes
+from s4a.align import cloud, icp, principal_axes
 from s4a.mesh import as_arrays, vertex_areas
 
 N_POINTS, N_PAIRED = 3000, 300  # vertices of each shape that are looked at, and that ICP pairs
@@ -30,13 +30,14 @@ def pose(shape, reference):
         Least residual of ICP of the shape and of its mirror image, as shares of sqrt(area).
     """
     (P, p), (Q, q) = _unit(*shape), _unit(*reference)
-    options = {"n_points": N_PAIRED, "tolerance": 1e-4, "rounds": 30}
+    options, cloud_q = {"tolerance": 1e-4, "rounds": 30}, cloud(Q, N_PAIRED)
     halves = [np.diag(d).astype(float) for d in itertools.product((1, -1), repeat=3) if np.prod(d) == 1]
 
     def ends(X):
         A, B = principal_axes(X, p)[1], principal_axes(Q, q)[1]
         starts = halves + [B @ half @ A.T for half in halves]
-        return [icp(X, p, Q, q, R, np.zeros(3), **options) for R in starts]
+        clouds = cloud(X, N_PAIRED), cloud_q
+        return [icp(X, p, Q, q, R, np.zeros(3), clouds=clouds, **options) for R in starts]
 
     found, mirrored = ends(P), ends(P * [-1, 1, 1])
     as_it_is, best = found[0], min(found, key=lambda f: f[2])
