@@ -31,7 +31,7 @@ napoleon_use_rtype = False
 napoleon_preprocess_types = False
 default_role = "code"
 
-myst_enable_extensions = ["dollarmath", "colon_fence"]
+myst_enable_extensions = ["deflist", "dollarmath"]
 myst_heading_anchors = 2
 suppress_warnings = ["mystnb.unknown_mime_type"]
 
@@ -42,6 +42,7 @@ nb_execution_timeout = 600
 nb_execution_raise_on_error = True
 nb_execution_in_temp = True
 nb_merge_streams = True
+nb_ipywidgets_js = {}  # of a server elsewhere
 nb_render_error_lexer = "text"  # messages of open exercises
 nb_output_stderr = "remove"  # bars of progress
 nb_mime_priority_overrides = [("html", "text/html", 0)]  # of a panel, its page that needs no kernel
@@ -118,10 +119,19 @@ def front_door(app, env, node, content):
     )
 
 
+def script(letter):
+    """The script letter of a letter: browsers draw the character, not the style."""
+    older = {"B": "ℬ", "E": "ℰ", "F": "ℱ", "H": "ℋ", "I": "ℐ", "L": "ℒ", "M": "ℳ", "R": "ℛ"}
+    return older.get(letter, chr(0x1D49C + ord(letter) - ord("A")))
+
+
 def formula(translator, node):
     """MathML, which browsers draw themselves: no script from elsewhere."""
     display = "inline" if isinstance(node, nodes.math) else "block"
-    text = convert(node.astext().replace(r"\lVert", r"\|").replace(r"\rVert", r"\|"), display=display)
+    text = node.astext().replace(r"\lVert", r"\|").replace(r"\rVert", r"\|")
+    text = re.sub(r"\\mathcal\s*(?:\{([A-Z])\}|([A-Z]))", lambda found: script(found[1] or found[2]), text)
+    text = re.sub(r"\\mathbb\s*\{?R\}?", "ℝ", text)
+    text = convert(text, display=display)
     translator.body.append(text if display == "inline" else f'<div class="math">{text}</div>')
     raise nodes.SkipNode
 

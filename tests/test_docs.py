@@ -109,4 +109,7 @@ def test_every_page_is_reached_and_every_link_between_pages_leads_somewhere():
 
 
 def test_nothing_is_fetched_to_build_or_to_read_it():
-    assert "intersphinx" not in (DOCS / "conf.py").read_text(encoding="utf-8")
+    conf = (DOCS / "conf.py").read_text(encoding="utf-8")
+    assert "intersphinx" not in conf
+    assert "sphinx.ext.mathjax" not in conf
+    assert "nb_ipywidgets_js = {}" in conf
