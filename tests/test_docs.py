@@ -3,7 +3,10 @@
 import ast
 import importlib
 import inspect
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -113,3 +116,14 @@ def test_nothing_is_fetched_to_build_or_to_read_it():
     assert "intersphinx" not in conf
     assert "sphinx.ext.mathjax" not in conf
     assert "nb_ipywidgets_js = {}" in conf
+
+
+def test_it_builds_without_a_warning(tmp_path):
+    for package in ("furo", "latex2mathml", "myst_nb", "sphinx"):
+        pytest.importorskip(package)
+    command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-b", "html", str(DOCS), str(tmp_path)]
+    found = subprocess.run(
+        command, env=os.environ | {"S4A_DOCS": "off"}, cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert found.returncode == 0, found.stderr
+    assert not re.search(r"(src|href)=\"https?://[^\"]+\\.(js|css)\"", (tmp_path / "glossary.html").read_text("utf-8"))
