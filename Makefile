@@ -10,7 +10,7 @@ demo: $(VENV)/.core
 	$(BIN)/s4a demo
 
 test: check
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n logical --dist loadfile
 
 check: $(VENV)/.test
 	$(BIN)/ruff check .
