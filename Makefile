@@ -31,7 +31,7 @@ lab: $(VENV)/.course
 
 # S4A_DOCS=off leaves the outputs of the notebooks out, for a quick look
 docs: $(VENV)/.docs
-	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
+	$(BIN)/python -m sphinx -W --keep-going -b html -d docs/_build/doctrees docs docs/_build/html
 
 clean:
 	rm -rf $(VENV)

@@ -38,6 +38,7 @@ def framed(panel):
 
 for kind in (Panel, explore.Explore):
     format_of.formatters["text/html"].for_type(kind, framed)
+format_of.formatters["text/html"].for_type(ipywidgets.HTML, lambda widget: widget.value)
 
 
 def html_of(value):
