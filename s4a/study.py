@@ -9,8 +9,9 @@ import io
 import json
 import logging
 import os
+import sys
 import uuid
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -87,7 +88,8 @@ def write(data, path, key="", made_from=(), claim=None):
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     whole = io.BytesIO()  # HDF5 brings the process down when the disk is full
-    data.assign_attrs(task_key=key, made_from=" ".join(made_from)).to_netcdf(whole, engine=ENGINE)
+    with alone():
+        data.assign_attrs(task_key=key, made_from=" ".join(made_from)).to_netcdf(whole, engine=ENGINE)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary.write_bytes(whole.getbuffer())
@@ -102,6 +104,12 @@ def write(data, path, key="", made_from=(), claim=None):
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def alone():
+    """Keeps xarray from asking a dask scheduler, where there is one, for a lock on a buffer that only we have."""
+    dask = sys.modules.get("dask")
+    return dask.config.set(scheduler="synchronous") if dask else nullcontext()
 
 
 def read(path):

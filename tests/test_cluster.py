@@ -82,7 +82,8 @@ def test_a_worker_killed_in_the_middle_costs_only_its_task(brains, tmp_path):
         assert process.wait(timeout=300) == 0
         assert workers[1].poll() is None
     assert_the_same(out, local)
-    assert {path: path.stat().st_mtime_ns for path in done} == done
+    again = [path for path, time in done.items() if path.stat().st_mtime_ns != time]
+    assert len(again) <= 1  # the task of the dead worker may have been written, but not yet told to the scheduler
 
 
 @pytest.mark.parametrize("address", ["nowhere", "local:", "local:0", "local:two"])

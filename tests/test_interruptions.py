@@ -16,8 +16,10 @@ from s4a.schema import dataset
 
 OPTIONS = {"n_coarse": 150, "k_init": 8, "k": 12}
 RUN = """
-import sys, time
+import signal, sys, time
 from s4a import analyse, pipeline
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # it is ignored below a background job of a shell
 
 def slow(*arguments, task=pipeline.coarse_task):
     time.sleep(2)
