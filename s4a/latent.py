@@ -205,7 +205,7 @@ def consistent_zoomout(
         ]
 
         def larger_map(i, j, queries=queries, rows=rows, solve=solve, searched=searched, larger=larger):
-            match = searched[i][nearest_rows(queries[j], rows[i])]
+            match = searched[i][nearest_rows(queries[j], rows[i], exact=False)]
             return solve[j] @ Phi[i][match, :larger]
 
         C = np.stack(

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from s4a import fmap, joint
 from s4a.align import align
 from s4a.deform import displacement_in_template, onto
-from s4a.mesh import as_arrays, closest_point_in_star, vertex_areas, vertex_normals
+from s4a.mesh import as_arrays, closest_point_in_star, vertex_areas
 from s4a.nearest import nearest_in_cells
 from s4a.options import checked
 from s4a.schema import INPUT, dataset, in_unit, require
@@ -161,8 +161,7 @@ def way_back(source, target, image):
     """
     center, size = source.frame
     X, T = (image - center) / size, target.dense.T
-    tree = joint.feature_tree(X, T)
-    nearest = tree.query(joint.features(source.dense.X, vertex_normals(source.dense.X, source.dense.T)))[1]
+    nearest = joint.feature_tree(X, T).query(source.dense.tree.data)[1]
     return closest_point_in_star(source.dense.X, nearest, X, T)
 
 
