@@ -45,12 +45,12 @@ def added(client, source):
     return "".join(o["data"]["text/plain"] for o in cell.outputs if o.output_type == "execute_result")
 
 
-@each_notebook
-def test_it_runs_and_its_exercises_fail_open_and_pass_solved(path, tmp_path, record_property):
+def played(path, folder):
+    """Run a notebook from a clean kernel, every exercise open and solved; its seconds of CPU and peak memory in MiB."""
     notebook = nbformat.read(path, as_version=4)
     solutions = dict(exercises(notebook))
     client = nbclient.NotebookClient(
-        notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}
+        notebook, timeout=150, kernel_name="python3", resources={"metadata": {"path": str(folder)}}
     )
     with client.setup_kernel():
         for i, cell in enumerate(list(notebook.cells)):
@@ -64,7 +64,15 @@ def test_it_runs_and_its_exercises_fail_open_and_pass_solved(path, tmp_path, rec
                 assert re.match("No answer yet: .*Hint: .{10,}", errors[0][1])
                 assert cell.source.count(OPEN) == 1
                 assert added(client, cell.source.replace(OPEN, solutions[i])) == "'Right.'"
-        spent = json.loads(added(client, SPENT).strip("'"))
+        return json.loads(added(client, SPENT).strip("'"))
+
+
+@each_notebook
+def test_it_runs_and_its_exercises_fail_open_and_pass_solved(path, tmp_path, record_property):
+    try:
+        spent = played(path, tmp_path)
+    except nbclient.exceptions.CellTimeoutError:  # once in many runs a kernel is idle while the client waits for it
+        spent = played(path, tmp_path)
     record_property("notebook", (path.stem, spent["seconds"], spent["MiB"]))
     assert spent["MiB"] < MEMORY
 
