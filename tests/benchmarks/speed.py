@@ -421,8 +421,8 @@ def pipelines(folder, n=6, n_vertices=50_000):
         (names[1], our_pipeline, paths, folder / "intrinsic", "intrinsic", template),
         (names[2], other_pipeline, paths, template),
     )
-    X = {Path(p).stem: s4a.read_mesh(p)["position"].values for p in paths}
-    T = s4a.read_mesh(paths[0])["corner_vertex"].values
+    X = {Path(p).stem: s4a.read_mesh(p)[0] for p in paths}
+    T = s4a.read_mesh(paths[0])[1]
     size = np.sqrt(triangle_areas(X[template], T).sum())
     u = truth[f"{template}/reference_point"].values
     for name, match in zip(names, found, strict=True):
