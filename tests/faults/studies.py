@@ -94,7 +94,13 @@ PROOFS = [
         "test_a_disk_that_takes_no_more_ends_in_one_error_and_leaves_whole_files",
     ),
     (
-        "kill -9",
+        "kill -9 at any stage",
+        "the next run goes on there and ends with the same study; files of finished tasks stay",
+        ENDS,
+        "test_a_run_killed_in_every_stage_ends_with_the_same_study",
+    ),
+    (
+        "kill -9 of a run with workers",
         "resumes; its workers are gone within seconds and write nothing",
         ENDS,
         "test_workers_are_gone_within_seconds_of_the_end_of_a_run_and_the_study_is_resumable",
