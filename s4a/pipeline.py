@@ -431,7 +431,7 @@ def run_stages(run, given, options, remarks, subjects=None):
     if o["template"] in run.failures:
         raise ValueError(f"template {o['template']!r} cannot be used: {run.failures[o['template']]}")
 
-    eigenvalues = [low_shape(folder, n)[3] for n in names]
+    eigenvalues = [study.arrays(folder / "coarse" / f"{n}.nc", "eigenvalue")[0] for n in names]
     k_signature = min(o["k_init"], *(len(e) for e in eigenvalues))
     distance = network.spectral_distance([e[:k_signature] for e in eigenvalues])
     pairs = [[names[i], names[j]] for i, j in network.choose_pairs(distance, o["n_pairs"])]
@@ -535,7 +535,7 @@ def write_report(run, given, options, remarks, no_modes, made_from):
             found = study.read(run.folder / "network" / f"look_{name}.nc")
             looks[name] = found.attrs | {"rotation": found["rotation"].values}
             badness[name] = study.attributes(run.folder / "registration" / f"{name}.nc")["score"]
-            functions[name] = study.read(run.folder / "coarse" / f"{name}.nc").sizes["mode"]
+            functions[name] = len(study.arrays(run.folder / "coarse" / f"{name}.nc", "eigenvalue")[0])
     net, lat = (study.read(run.folder / f"{stage}.nc") for stage in ("network", "latent"))
     doubts, doubtful = findings.doubtful(badness)
     remarks = [

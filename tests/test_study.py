@@ -186,3 +186,31 @@ def test_an_unfinished_study_opens_with_what_is_there(tmp_path):
     assert list(tree["original"].children) == ["a", "b"]
     assert "pca" not in tree
     tree.close()
+
+
+def test_every_file_of_a_study_is_read_as_xarray_reads_it(small_store):
+    files = sorted(small_store.rglob("*.nc"))
+    assert len(files) > 20
+    for file in files:
+        with xr.open_dataset(file, engine=study.ENGINE) as there:
+            here = study.opened(file)
+            xr.testing.assert_identical(here, there)
+            assert {n: v.dtype for n, v in here.variables.items()} == {n: v.dtype for n, v in there.variables.items()}
+            assert study.attributes(file) == there.attrs
+
+
+def test_parts_of_a_stored_variable_are_parts_of_the_whole(tmp_path):
+    whole = np.random.default_rng(0).normal(size=(700, 3))
+    study.write(dataset(position=whole), tmp_path / "a.nc", "k")
+    position = study.opened(tmp_path / "a.nc")["position"]
+    assert (position[::-2].values == whole[::-2]).all()
+    assert (position[[5, 3], 1].values == whole[[5, 3], 1]).all()
+    assert (position.values == whole).all()
+
+
+def test_a_file_written_anew_after_it_was_opened_is_refused(tmp_path):
+    study.write(dataset(position=np.zeros((700, 3))), tmp_path / "a.nc", "k")
+    found = study.opened(tmp_path / "a.nc")
+    study.write(dataset(position=np.ones((700, 3))), tmp_path / "a.nc", "other")
+    with pytest.raises(ValueError, match="written anew since it was opened; open the study again"):
+        found.load()
