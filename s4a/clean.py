@@ -184,8 +184,7 @@ def _weld(P, F, counts):
     """For each row of P the number of its group of coincident vertices (-1 where no triangle uses it)."""
     used = _used(F)
     X = P[used]
-    corners = P[F]
-    side = np.linalg.norm(corners - corners[:, [1, 2, 0]], axis=2)
+    side = _sides(P, F)
     if not side.any():
         raise ValueError(f"a surface needs extent; all {len(F)} triangles are points")
     # the median side guards against a far outlier, whose bounding box would weld the whole shape
@@ -195,16 +194,26 @@ def _weld(P, F, counts):
     first = np.r_[True, (X[order[1:]] != X[order[:-1]]).any(axis=1)]
     exact = np.empty(len(X), np.int64)
     exact[order] = np.cumsum(first) - 1
-    tree = cKDTree(X[order[first]], balanced_tree=False, compact_nodes=False)
-    crowd = tree.count_neighbors(tree, tolerance) / tree.n
-    if crowd > 100:
-        raise ValueError(f"vertices crowd: each has {crowd:.0f} others within 1e-7 of the extent ({tolerance:.1e})")
-    near = tree.query_pairs(tolerance, output_type="ndarray")
+    near = _near_pairs(X[order[first]], tolerance)
     n_groups, label = connected_components(_graph(near, first.sum()), directed=False)
     group = np.full(len(P), -1)
     group[used] = label[exact]
     counts["welded_vertices"] = int(len(used) - n_groups)
     return group, tolerance
+
+
+def _near_pairs(X, tolerance):
+    """Pairs of points within the tolerance ``(p, 2)``, sought among those that have another so near in x, y and z."""
+    some = np.arange(len(X))
+    for x in X.T:
+        some = some[np.argsort(x[some])]
+        close = np.flatnonzero(np.diff(x[some]) <= tolerance)
+        some = some[np.union1d(close, close + 1)]
+    tree = cKDTree(X[some], balanced_tree=False, compact_nodes=False)
+    crowd = tree.count_neighbors(tree, tolerance) / len(X)
+    if crowd > 100:
+        raise ValueError(f"vertices crowd: each has {crowd:.0f} others within 1e-7 of the extent ({tolerance:.1e})")
+    return some[tree.query_pairs(tolerance, output_type="ndarray").astype(np.int64)]
 
 
 def _drop_repeated(F, group, counts):
@@ -252,7 +261,7 @@ def _flip_flat(P, F, group, tolerance, counts, rounds=50):
     """
     F, alive, suspect = F.copy(), np.ones(len(F), bool), np.arange(len(F))
     for _ in range(rounds):
-        flat = suspect[alive[suspect] & (_heights(P, F[suspect])[0] <= tolerance)]
+        flat = suspect = suspect[alive[suspect] & (_heights(P, F[suspect])[0] <= tolerance)]
         if len(flat) == 0:
             break
         ring = np.flatnonzero(alive & np.isin(group[F], group[F[flat]]).any(axis=1))
@@ -295,9 +304,15 @@ def _flips(P, F, group, flat, tolerance):
 
 def _heights(P, F):
     """Height of each triangle over its longest side, and the first corner of that side."""
-    X = P[F]
-    side = np.linalg.norm(X - X[:, [1, 2, 0]], axis=2)
+    side = _sides(P, F)
     return np.linalg.norm(triangle_normals(P, F), axis=1) / np.maximum(side.max(axis=1), 1e-300), side.argmax(axis=1)
+
+
+def _sides(P, F):
+    """Lengths of the sides 0-1, 1-2 and 2-0 of each triangle ``(m, 3)``."""
+    X = [P.take(corner, axis=0) for corner in F.T]
+    gaps = (X[0] - X[1], X[1] - X[2], X[2] - X[0])
+    return np.stack([np.sqrt(np.einsum("ij,ij->i", d, d)) for d in gaps], axis=1)
 
 
 def _cheapest(cost, ends):

@@ -6,7 +6,7 @@ spectrum together; K grows as in ZoomOut.  The idea of coupling both is that of 
 Cremers, CVPR 2020).  All lengths are for surfaces of unit area.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -25,7 +25,7 @@ class Surface:
 
     ``X (n, 3)`` positions, ``T (m, 3)`` triangles, ``area (n,)`` of sum 1, ``Phi (n_coarse, k)`` area-orthonormal
     eigenfunctions at low resolution; at full resolution with ``U (n, n_coarse)``, whose product with Phi is the
-    basis, and is never formed.
+    basis, and is never formed; ``some (s,)`` the vertices that rounds look at, all by default.
     """
 
     X: np.ndarray
@@ -33,6 +33,7 @@ class Surface:
     area: np.ndarray
     Phi: np.ndarray
     U: object = None
+    some: object = field(default_factory=lambda: slice(None))
 
     @cached_property
     def tree(self):
@@ -41,8 +42,8 @@ class Surface:
 
     @cached_property
     def smooth(self):
-        """Coefficients of a field in the basis."""
-        return smoother(self.Phi, self.area, self.U)
+        """Coefficients, in the basis, of a field given at ``some``."""
+        return smoother(self.Phi, self.area[self.some], self.U if self.U is None else self.U[self.some])
 
     def field(self, c):
         """The field ``(n, 3)`` with coefficients c in the first columns of the basis."""
@@ -72,9 +73,14 @@ def registered(target, motion):
     return target.X @ R.T + t + target.field(c)
 
 
-def search(source, target, X):
-    """The vertices of the source nearest to the registered target in position and normal ``(n_target,)``."""
-    return source.tree.query(features(X, vertex_normals(X, target.T)))[1]
+def search(source, target, X, some=slice(None)):
+    """The vertices of the source nearest to (some of) the registered target X in position and normal."""
+    return source.tree.query(features(X, vertex_normals(X, target.T))[some])[1]
+
+
+def fitted(source, target, match):
+    """The motion (R, t, c) that brings ``some`` of the target's vertices onto their matches ``(s,)``."""
+    return onto(target.X[target.some], source.X[match], target.area[target.some], target.smooth)
 
 
 def low_rounds(source, target, match, *, k_first=30, k=100, step=5, rounds=2, spectral=0.0):
@@ -114,38 +120,50 @@ def low_rounds(source, target, match, *, k_first=30, k=100, step=5, rounds=2, sp
 
 
 def dense_rounds(source, target, motion, *, rounds=3):
-    """Joint rounds at full resolution, from the motion (R, t, c) of the low rounds.
+    """Joint rounds at full resolution, on ``some`` vertices of the target.
+
+    Parameters
+    ----------
+    source, target : Surface
+    motion : tuple (R, t, c)
+        The end of the low rounds.
 
     Returns
     -------
-    match : int ndarray (n_target,)
+    match : int ndarray (s,)
     motion : tuple (R, t, c)
     """
-    match = search(source, target, registered(target, motion))
+    match = search(source, target, registered(target, motion), target.some)
     for _ in range(rounds):
-        motion = onto(target.X, source.X[match], target.area, target.smooth)
-        match = search(source, target, registered(target, motion))
+        motion = fitted(source, target, match)
+        match = search(source, target, registered(target, motion), target.some)
     return match, motion
 
 
-def badness(source, target, match, motion, *, n_samples=300, n_gaps=25_000, limit=0.5):
+def badness(source, target, match, motion, *, n_samples=300, limit=0.5):
     """Score of a match without truth, lower is better: round trip + gaps between the surfaces, both ways.
 
     The round trip goes from a vertex of the target to its match and back to the vertex whose registered position
     (in position and normal) is nearest, measured along the edges of the target and cut at `limit`; the gaps are the
-    mean distances of the registered target and the source, the way back from about `n_gaps` vertices of the source.
+    mean distances of the registered target and the source, at ``some`` of the vertices of each.
     Lengths are for unit area.
 
     Stretch of edges is left out: on heads and brains with known warps it prefers maps that move nothing.
+
+    Parameters
+    ----------
+    source, target : Surface
+    match : int ndarray (s,)
+        For ``some`` vertices of the target.
+    motion : tuple (R, t, c)
     """
     X = registered(target, motion)
-    tree = feature_tree(X, target.T)
-    some = slice(None, None, max(1, len(source.X) // n_gaps))
-    back_gap = np.linalg.norm(source.X[some] - X[tree.query(source.tree.data[some])[1]], axis=1)
-    gap = np.linalg.norm(X - source.X[match], axis=1)
+    tree, some = feature_tree(X, target.T), np.arange(len(X))[target.some]
+    back_gap = np.linalg.norm(source.X[source.some] - X[tree.query(source.tree.data[source.some])[1]], axis=1)
+    gap = np.linalg.norm(X[some] - source.X[match], axis=1)
     sample = np.linspace(0, len(match) - 1, min(n_samples, len(match))).astype(int)
     back = tree.query(source.tree.data[match[sample]])[1]
-    trip = path_lengths(target.graph, sample, back, limit)
+    trip = path_lengths(target.graph, some[sample], back, limit)
     return float(trip.mean() + gap.mean() + back_gap.mean())
 
 
@@ -174,7 +192,7 @@ def candidates(source, target, starts, *, k=100, far=0.03):
         return found[name][0]
 
     for name, match in starts.items():
-        enter(name, match, onto(target.X, source.X[match], target.area, target.smooth))
+        enter(name, match, fitted(source, target, match))
     joint = {name: enter(f"{name}+joint", *low_rounds(source, target, match, k=k)) for name, match in starts.items()}
     if min(score for score, *_ in found.values()) > far:
         start = min(joint, key=joint.get)

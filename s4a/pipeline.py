@@ -8,7 +8,7 @@ import sys
 import tempfile
 import threading
 import time
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -187,6 +187,12 @@ def scan(folder, name):
     return register.Scan(*(study.read(folder / stage / f"{name}.nc") for stage in ("original", "coarse")))
 
 
+@lru_cache(maxsize=1)
+def template_scan(folder, name, key):
+    """The template as a :func:`scan`, which a worker keeps from shape to shape, as long as its `key` is the same."""
+    return scan(folder, name)
+
+
 def low_shape(folder, name):
     """Unit-area vertices, areas, eigenfunctions and eigenvalues of a coarse mesh, and its spread samples."""
     variables = ("position", "vertex_area", "eigenfunction", "eigenvalue")
@@ -263,9 +269,9 @@ def consistent_maps(folder, names, first, options, n_jobs):
     return net, median.median_shape(lat, eigenvalues, norm=options["norm"])
 
 
-def registration_task(folder, name, template, how, refine, scale):
+def registration_task(folder, name, template_key, template, how, refine, scale):
     """One shape registered to the template (eq. 6 at low resolution, then eq. 7, or eq. 3 and 4, then joint rounds)."""
-    target = scan(folder, template)
+    target = template_scan(folder, template, template_key)
     if name == template:
         return register.identity(target)
     source = scan(folder, name)
@@ -477,9 +483,10 @@ def run_stages(run, given, options, remarks, subjects=None):
     run.tasks(
         "registration",
         registration_task,
-        [(n, f"registration/{n}.nc", key_of[n], (folder, n, *settings)) for n in names],
+        [(n, f"registration/{n}.nc", key_of[n], (folder, n, template_key, *settings)) for n in names],
         made_from={n: [template_key] for n in names},
     )
+    template_scan.cache_clear()  # of this process, where it did tasks itself
     with run.stage("modes"):
         names = [n for n in names if n not in run.failures]
         no_modes = write_modes(folder, names, mesh, template, [key_of[n] for n in names])

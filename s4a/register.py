@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from s4a import fmap, joint
 from s4a.align import align
-from s4a.deform import displacement_in_template, onto
+from s4a.deform import displacement_in_template
 from s4a.mesh import as_arrays, closest_point_in_star, vertex_areas
 from s4a.nearest import nearest_in_cells
 from s4a.options import checked
@@ -19,6 +19,7 @@ from s4a.schema import INPUT, dataset, in_unit, require
 log = logging.getLogger(__name__)
 
 CONFIDENCE_LENGTH = 0.02
+N_CENTRAL = 25_000  # vertices by which dense rounds move a shape
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,15 @@ class Scan:
         X, T = as_arrays(self.original)
         center, size = self.frame
         X = (X - center) / size
-        return joint.Surface(X, T, vertex_areas(X, T), self.low.Phi, self.U)
+        return joint.Surface(X, T, vertex_areas(X, T), self.low.Phi, self.U, self.central)
+
+    @cached_property
+    def central(self):
+        """The N_CENTRAL original vertices with the largest weights of U, thus nearest to coarse ones; all of few."""
+        weight = self.coarse["coarse_weight"].values.max(1)
+        if len(weight) <= N_CENTRAL:
+            return np.arange(len(weight))
+        return np.flatnonzero(weight >= np.partition(weight, -N_CENTRAL)[-N_CENTRAL])
 
 
 def intrinsic_match(source, target, F_source, F_target):
@@ -133,19 +142,22 @@ def register(source, target, match_low, embeddings, *, k=100, refine="joint"):
 def at_full_resolution(source, target, low, embeddings):
     """Second half of :func:`register`, from the candidates `low` of :func:`s4a.joint.candidates`, or none."""
     info = {f"score_{name}": score for name, (score, *_) in low.items()}
-    dense = {}
+    M, N, dense = source.dense, target.dense, {}
     for name in joint.finalists(low) if low else ["intrinsic"]:
         if name == "intrinsic":
             match, info["compared_share"] = intrinsic_match(source, target, *embeddings)
-            motion = onto(target.dense.X, source.dense.X[match], target.dense.area, target.dense.smooth)
+            motion = joint.fitted(M, N, match[N.some])
+            dense[name] = joint.badness(M, N, match[N.some], motion), motion
         else:
-            match, motion = joint.dense_rounds(source.dense, target.dense, low[name][2])
-        dense[name] = joint.badness(source.dense, target.dense, match, motion), match, motion
+            dense[name] = joint.badness(M, N, *(found := joint.dense_rounds(M, N, low[name][2]))), found[1]
     method = min(dense, key=lambda name: dense[name][0])
-    score, match, motion = dense[method]
+    score, motion = dense[method]
+    X = joint.registered(N, motion)
+    if method != "intrinsic":
+        match = joint.search(M, N, X)
     info |= {"method": method, "score": score}
     center, size = source.frame
-    return match, joint.registered(target.dense, motion) * size + center, info
+    return match, X * size + center, info
 
 
 def way_back(source, target, image):
