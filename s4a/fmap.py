@@ -40,41 +40,58 @@ def fmap_from_match(Phi_source, Phi_target, area_target, match):
     return Phi_target.T @ (area_target[:, None] * Phi_source[match])
 
 
-def nearest_rows(Q, D, *, exact=True, block=128):
+def nearest_rows(Q, D, *, block=128):
     """For every row of Q the index of the nearest row of D (Euclidean), by blocks of one matrix product each.
 
     The product is of (q, -1) and (d, |d|^2 / 2), largest where the distance is least; its blocks stay in the cache.
     float32 first, which above about 20 dims is faster than a KD-tree; where it cannot tell two rows apart, float64
-    decides, unless `exact` is False, which takes a third less time.  Of rows that are equally near the first is given.
+    decides.  Of rows that are equally near the first is given.
 
     Examples
     --------
     >>> nearest_rows(np.array([[0.1], [4.0]]), np.array([[0.0], [5.0]])).tolist()
     [0, 1]
     """
-    q, d = np.asarray(Q, np.float32), np.asarray(D, np.float32)
-    half = np.einsum("ij,ij->i", d, d) / 2
-    longest = np.sqrt(2 * half.max())
-    rounding = 16 * np.finfo(np.float32).eps * longest * (np.linalg.norm(q, axis=1) + longest)
-    q = np.column_stack([q, np.full(len(q), -1, np.float32)])
-    d = np.ascontiguousarray(np.column_stack([d, half]).T)
-    found, scores = np.empty(len(q), np.int64), np.empty((min(block, len(q)), d.shape[1]), np.float32)
-    for start in range(0, len(q), block):
-        rows = slice(start, start + block)
-        score = np.matmul(q[rows], d, out=scores[: len(q[rows])])
-        found[rows] = best = score.argmax(axis=1)
-        if not exact:
-            continue
+    q, d = queries(Q), searched(D)
+    longest = np.sqrt(2 * d[-1].max())
+    rounding = 16 * np.finfo(np.float32).eps * longest * (np.linalg.norm(q[:, :-1], axis=1) + longest)
+    found = np.empty(len(q), np.int64)
+    for start, score in products(q, d, block):
+        best = score.argmax(axis=1)
         line = np.arange(len(best))
-        least = score[line, best] - rounding[rows]
+        least = score[line, best] - rounding[start : start + block]
         score[line, best] = -np.inf
         for i in np.flatnonzero(score.max(axis=1) >= least):
             score[i, best[i]] = np.inf
             close = np.flatnonzero(score[i] >= least[i])
             gap = D[close].astype(float) - Q[start + i]
             best[i] = close[np.einsum("ij,ij->i", gap, gap).argmin()]
-        found[rows] = best
+        found[start : start + block] = best
     return found
+
+
+def queries(Q):
+    """(q, -1) for the rows of Q ``(n, d + 1)`` float32."""
+    return np.column_stack([Q, np.full(len(Q), -1)]).astype(np.float32)
+
+
+def searched(D):
+    """(d, |d|^2 / 2) for the rows of D, as columns ``(d + 1, p)`` float32."""
+    d = np.asarray(D, np.float32)
+    return np.ascontiguousarray(np.column_stack([d, np.einsum("ij,ij->i", d, d) / 2]).T)
+
+
+def products(q, d, block=128):
+    """The products of :func:`queries` and :func:`searched`, block by block in one array: (first row, block)."""
+    scores = np.empty((min(block, len(q)), d.shape[1]), np.float32)
+    for start in range(0, len(q), block):
+        part = q[start : start + block]
+        yield start, np.matmul(part, d, out=scores[: len(part)])
+
+
+def nearly_nearest(q, d):
+    """:func:`nearest_rows` up to float32 rounding, from :func:`queries` and :func:`searched` made once for many."""
+    return np.concatenate([score.argmax(axis=1) for _, score in products(q, d)])
 
 
 def match_from_fmap(C, Phi_source, Phi_target, *, nearest=nearest_rows):

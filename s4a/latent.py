@@ -11,12 +11,13 @@ from joblib import Parallel, delayed
 from scipy.sparse.csgraph import breadth_first_order
 from scipy.sparse.linalg import LinearOperator, eigsh
 
-from s4a.fmap import nearest_rows
+from s4a.fmap import nearly_nearest, queries, searched
 from s4a.network import cycle_errors, cycle_weights, three_cycles
 
 log = logging.getLogger(__name__)
 
 WIDE = 4  # last rounds of Consistent ZoomOut, which look among all vertices
+ROUGH, FINE = 1e-4, 1e-6  # tolerances of the latent basis: on the way, and at the end
 
 
 def consistency_form(C, source, target, weight, n, *, n_jobs=1):
@@ -62,7 +63,7 @@ def spanning_start(C, source, target, n):
     return Y
 
 
-def smallest_eigenvectors(apply, start, *, tolerance=1e-6, max_rounds=100):
+def smallest_eigenvectors(apply, start, *, tolerance=FINE, max_rounds=100):
     """The eigenvectors of the smallest eigenvalues of a positive semi-definite form, by Chebyshev-filtered subspaces.
 
     Each round damps all above the largest Ritz value of the block by a Chebyshev polynomial of the form, and solves
@@ -104,7 +105,7 @@ def filtered(apply, V, least, cut, top):
     return new
 
 
-def latent_basis(C, source, target, weight, eigenvalues, m=None, *, n_jobs=1):
+def latent_basis(C, source, target, weight, eigenvalues, m=None, *, tolerance=FINE, n_jobs=1):
     """Canonical consistent latent basis of a network of functional maps.
 
     Minimises sum w |C_ij Y_i - Y_j|^2 under sum Y_i^T Y_i = n I, then turns the latent space so that
@@ -120,6 +121,8 @@ def latent_basis(C, source, target, weight, eigenvalues, m=None, *, n_jobs=1):
         Laplacian eigenvalues of the n shapes, for unit area.
     m : int, optional
         Dimension of the latent space; k by default.
+    tolerance : float
+        Largest residual of the eigenvectors, as a share of the largest eigenvalue.
     n_jobs : int
         Threads; the result does not depend on it.
 
@@ -133,7 +136,7 @@ def latent_basis(C, source, target, weight, eigenvalues, m=None, *, n_jobs=1):
     m = k if m is None else m
     start = spanning_start(C, source, target, n).reshape(n * k, k)[:, :m]
     form = consistency_form(C, source, target, weight, n, n_jobs=n_jobs)
-    Y = smallest_eigenvectors(form, start).reshape(n, k, m) * np.sqrt(n)
+    Y = smallest_eigenvectors(form, start, tolerance=tolerance).reshape(n, k, m) * np.sqrt(n)
     mean = np.einsum("nkl,nk,nkm->lm", Y, eigenvalues[:, :k], Y) / n
     latent_eigenvalue, turn = np.linalg.eigh(mean)
     Y = Y @ turn
@@ -156,6 +159,9 @@ def consistent_zoomout(
     (eq. 3) and solves for the next larger maps in the least-squares sense, on `samples` only; the factor of the
     least squares is made once per shape.  In the last rounds (``WIDE``) the samples look among all vertices of the
     source: among its samples they are off by the spacing of these.
+
+    The latent basis is found to ``ROUGH`` on the way and to ``FINE`` at the end: for 51 brains of 100,000 vertices a
+    sixth less time than ``FINE`` throughout, and the same error of eq. 7 (1.780 for 1.779 % of sqrt(area)).
 
     Of 1,000 maps of 51 brains a round takes 3 s of CPU from samples to samples and 15 s among all vertices at
     k = 100; from all vertices to all, 80 s, it closes cycles little better (0.073 for 0.092) and is no nearer to the
@@ -184,34 +190,33 @@ def consistent_zoomout(
     """
     cycles = three_cycles(source.tolist(), target.tolist())
     sizes = [*range(C.shape[1], k, step), k]
-    everything = [np.arange(len(a)) for a in area]
+    shapes, everything = range(len(area)), [np.arange(len(a)) for a in area]
+    into = [source[target == j] for j in shapes]
+    row = np.argsort(np.argsort(target, kind="stable"), kind="stable")
+
+    def in_threads(function, *arguments):
+        return Parallel(n_jobs=n_jobs, backend="threading")(delayed(function)(*a) for a in zip(*arguments, strict=True))
+
     samples = everything if samples is None else samples
     for size, larger in zip(sizes, [*sizes[1:], None], strict=True):
-        error = cycle_errors(C, cycles)
+        error = cycle_errors(C, cycles, n_jobs=n_jobs)
         weight = cycle_weights(error)
         m = latent_size(n_latent, size, k)
-        Y, latent_eigenvalue = latent_basis(C, source, target, weight, eigenvalues, m, n_jobs=n_jobs)
+        tolerance = ROUGH if larger else FINE
+        Y, latent_eigenvalue = latent_basis(
+            C, source, target, weight, eigenvalues, m, tolerance=tolerance, n_jobs=n_jobs
+        )
         if progress:
             progress(size)
         if larger is None:
             break
-        searched = everything if size in sizes[:-1][-WIDE:] else samples
-        queries, rows = (
-            [np.asarray(Phi[i][v, :size] @ Y[i], np.float32) for i, v in enumerate(vertices)]
-            for vertices in (samples, searched)
-        )
-        solve = [
-            np.linalg.pinv(Phi[i][v, :larger] * np.sqrt(area[i][v])[:, None]) * np.sqrt(area[i][v])
-            for i, v in enumerate(samples)
-        ]
+        among = everything if size in sizes[:-1][-WIDE:] else samples
+        rows = in_threads(lambda F, v, y: searched(F[v, : len(y)] @ y), Phi, among, Y)
 
-        def larger_map(i, j, queries=queries, rows=rows, solve=solve, searched=searched, larger=larger):
-            match = searched[i][nearest_rows(queries[j], rows[i], exact=False)]
-            return solve[j] @ Phi[i][match, :larger]
+        def larger_maps(j, size=size, larger=larger, among=among, rows=rows, Y=Y):
+            F, w = Phi[j][samples[j], :larger], np.sqrt(area[j][samples[j]])
+            q, solve = queries(F[:, :size] @ Y[j]), np.linalg.pinv(F * w[:, None]) * w
+            return [solve @ Phi[i].take(among[i][nearly_nearest(q, rows[i])], axis=0)[:, :larger] for i in into[j]]
 
-        C = np.stack(
-            Parallel(n_jobs=n_jobs, backend="threading")(
-                delayed(larger_map)(i, j) for i, j in zip(source, target, strict=True)
-            )
-        )
+        C = np.stack([c for maps in in_threads(larger_maps, shapes) for c in maps])[row]
     return C, weight, error, Y, latent_eigenvalue

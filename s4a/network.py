@@ -3,6 +3,7 @@
 import itertools
 
 import numpy as np
+from joblib import Parallel, delayed
 from scipy.sparse.csgraph import connected_components, shortest_path
 from scipy.spatial import cKDTree
 
@@ -121,7 +122,7 @@ def three_cycles(source, target):
     return np.array(cycles, np.int64).reshape(-1, 3)
 
 
-def cycle_errors(C, cycles, k=None):
+def cycle_errors(C, cycles, k=None, *, n_jobs=1):
     """How far each directed map is from closing its 3-cycles: mean |C_ki C_jk C_ij - I|_F / sqrt(k).
 
     Of the product only the first `k` rows and columns are looked at, all by default; maps of different sizes can only
@@ -132,12 +133,15 @@ def cycle_errors(C, cycles, k=None):
     float ndarray (p,)
         NaN for maps in no 3-cycle.
     """
-    p, k = len(C), k or C.shape[1]
-    total, count = np.zeros(p), np.zeros(p)
-    for a, b, c in cycles:
-        error = np.linalg.norm(C[c, :k] @ C[b] @ C[a, :, :k] - np.eye(k)) / np.sqrt(k)
-        total[[a, b, c]] += error
-        count[[a, b, c]] += 1
+    k = k or C.shape[1]
+
+    def of(some):
+        a, b, c = some.T
+        return np.linalg.norm(C[c][:, :k] @ (C[b] @ C[a][:, :, :k]) - np.eye(k), axis=(1, 2)) / np.sqrt(k)
+
+    parts = np.array_split(cycles, len(cycles) // 32 + 1)
+    error = np.concatenate(Parallel(n_jobs=n_jobs, backend="threading")(delayed(of)(some) for some in parts))
+    total, count = (np.bincount(cycles.ravel(), w, len(C)) for w in (np.repeat(error, 3), None))
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
