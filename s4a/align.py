@@ -188,6 +188,6 @@ def align(X, area, Y, area_y, *, n_points=300, prefer=0.9):
     return icp(X, area, Y, area_y, *best[:2])
 
 
-def realign(X, area, Y, area_y, start, *, n_points=300):
+def realign(X, area, Y, area_y, start, *, n_points=300, clouds=None):
     """Rigid motion (R, t) of X onto Y by ICP, `n_points` spread vertices of each paired, from a start (R, t)."""
-    return icp(X, area, Y, area_y, *start, n_points=n_points, tolerance=2e-5)[:2]
+    return icp(X, area, Y, area_y, *start, n_points=n_points, clouds=clouds, tolerance=2e-5)[:2]

@@ -40,7 +40,7 @@ def fmap_from_match(Phi_source, Phi_target, area_target, match):
     return Phi_target.T @ (area_target[:, None] * Phi_source[match])
 
 
-def nearest_rows(Q, D, *, block=128):
+def nearest_rows(Q, D, *, block=256):
     """For every row of Q the index of the nearest row of D (Euclidean), by blocks of one matrix product each.
 
     The product is of (q, -1) and (d, |d|^2 / 2), largest where the distance is least; its blocks stay in the cache.
@@ -81,7 +81,7 @@ def searched(D):
     return np.ascontiguousarray(np.column_stack([d, np.einsum("ij,ij->i", d, d) / 2]).T)
 
 
-def products(q, d, block=128):
+def products(q, d, block=256):
     """The products of :func:`queries` and :func:`searched`, block by block in one array: (first row, block)."""
     scores = np.empty((min(block, len(q)), d.shape[1]), np.float32)
     for start in range(0, len(q), block):

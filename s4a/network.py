@@ -98,7 +98,8 @@ def first_map(source, target, motion, *, k_init=20, init="dense", n_landmarks=10
         )
     else:
         C = fmap.fmap_from_match(Phi, Psi, area, cKDTree(moved).query(Y)[1])
-    return fmap.fmap_from_match(Phi, Psi, area, fmap.match_from_fmap(C, Phi, Psi))
+    match = fmap.nearly_nearest(fmap.queries(Psi), fmap.searched(Phi @ C.T))
+    return fmap.fmap_from_match(Phi, Psi, area, match)
 
 
 def three_cycles(source, target):

@@ -20,7 +20,7 @@ from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
 from s4a import findings, fmap, latent, median, network, register, study, suspects
-from s4a.align import align, farthest_points, realign
+from s4a.align import align, cloud, farthest_points, realign
 from s4a.clean import clean
 from s4a.io import find_meshes, slug
 from s4a.mesh import as_arrays, as_dataset, triangle_areas, vertex_areas
@@ -225,9 +225,11 @@ def first_maps_task(folder, pairs, k_init, init):
     """First maps of some pairs, in both directions."""
     shapes = {name: low_shape(folder, name) for name in sorted({name for pair in pairs for name in pair})}
     motions = {name: motion_to_reference(folder, name) for name in shapes}
+    clouds = {name: cloud(shape[0], 300) for name, shape in shapes.items()}
     directed, maps = [], []
     for a, b in pairs:
-        R, t = realign(*shapes[a][:2], *shapes[b][:2], motion_between(motions[a], motions[b]))
+        start = motion_between(motions[a], motions[b])
+        R, t = realign(*shapes[a][:2], *shapes[b][:2], start, clouds=(clouds[a], clouds[b]))
         for s, g, motion in ((a, b, (R, t)), (b, a, (R.T, -R.T @ t))):
             directed.append((s, g))
             maps.append(network.first_map(shapes[s], shapes[g], motion, k_init=k_init, init=init))
