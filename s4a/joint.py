@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from s4a.deform import onto, smoother
 from s4a.fmap import fmap_from_match, nearest_rows
-from s4a.mesh import edge_graph, path_lengths, vertex_normals
+from s4a.mesh import edge_graph, edges, path_lengths, vertex_normals
 
 POSITION_WEIGHT, NORMAL_WEIGHT = 5.0, 0.3
 
@@ -53,7 +53,7 @@ class Surface:
     @cached_property
     def graph(self):
         """Edge lengths as a sparse matrix."""
-        return edge_graph(self.X, self.T)
+        return edge_graph(self.X, edges(self.T))
 
 
 def features(X, normals, spectrum=None):

@@ -72,13 +72,13 @@ def unique_edges(T, n=None):
     return np.stack([key // max(n, 1), key % max(n, 1)], axis=1), edge_of, count
 
 
-def edge_graph(X, T):
-    """Edge lengths as a symmetric CSR matrix ``(n, n)``: the graph for Dijkstra's distances."""
-    i, j = directed_edges(T).T
-    G = sp.coo_matrix((np.ones(2 * len(i)), (np.r_[i, j], np.r_[j, i])), (len(X), len(X))).tocsr()
-    length = np.linalg.norm(X[np.repeat(np.arange(len(X)), np.diff(G.indptr))] - X[G.indices], axis=1)
-    G.data = np.maximum(length, 1e-12 * (length.max(initial=0) or 1))  # an explicit zero would count as no edge
-    return G
+def edge_graph(X, E):
+    """Lengths of the edges E ``(e, 2)`` as a symmetric CSR matrix ``(n, n)``: the graph for Dijkstra's distances."""
+    i, j = E.T
+    length = np.linalg.norm(X[i] - X[j], axis=1)
+    length = np.maximum(length, 1e-12 * (length.max(initial=0) or 1))  # an explicit zero would count as no edge
+    half = sp.coo_matrix((length, (i, j)), (len(X), len(X))).tocsr()
+    return half + half.T
 
 
 def path_lengths(G, start, end, limit):
@@ -98,7 +98,7 @@ def path_lengths(G, start, end, limit):
     Examples
     --------
     >>> X = np.array([[0.0, 0, 0], [1, 0, 0], [1, 2, 0], [0, 2, 0]])
-    >>> G = edge_graph(X, np.array([[0, 1, 2], [0, 2, 3]]))
+    >>> G = edge_graph(X, edges(np.array([[0, 1, 2], [0, 2, 3]])))
     >>> path_lengths(G, np.array([0, 1, 1]), np.array([0, 3, 3]), 9.0).tolist()
     [0.0, 3.0, 3.0]
     """
@@ -139,9 +139,14 @@ def stiffness(E, w, n):
     return W - sp.diags(np.asarray(W.sum(axis=1)).ravel())
 
 
-def euler_characteristic(T):
-    """V - E + F over the vertices in use."""
-    return len(np.unique(T)) - len(edges(T)) + len(T)
+def n_used(T):
+    """How many vertices triangles have."""
+    return int(np.count_nonzero(np.bincount(T.ravel())))
+
+
+def euler_characteristic(T, E=None):
+    """V - E + F over the vertices in use; E the edges, where they are at hand."""
+    return n_used(T) - len(edges(T) if E is None else E) + len(T)
 
 
 def volume(X, T):

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from s4a.link import at, closest_point
-from s4a.mesh import as_arrays, cotan_weights, edge_graph, path_lengths, triangle_areas, vertex_areas
+from s4a.mesh import as_arrays, cotan_weights, edge_graph, edges, path_lengths, triangle_areas, vertex_areas
 from s4a.schema import dataset, require
 
 THRESHOLDS = np.linspace(0, 0.25, 101)  # of the error curve, as in Kim et al. (2011), Fig. 6
@@ -137,7 +137,7 @@ def geodesic_error(X, T, found, true, *, limit=1.0):
     >>> geodesic_error(X, T, np.array([0, 1, 2, 0]), np.arange(4)).tolist()
     [0.0, 0.0, 0.0, 1.0]
     """
-    return path_lengths(edge_graph(X / np.sqrt(triangle_areas(X, T).sum()), T), true, found, limit)
+    return path_lengths(edge_graph(X / np.sqrt(triangle_areas(X, T).sum()), edges(T)), true, found, limit)
 
 
 def error_curve(error, thresholds=THRESHOLDS):

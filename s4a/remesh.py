@@ -20,6 +20,9 @@ from s4a.mesh import (
     cotan_weights,
     directed_edges,
     edge_graph,
+    edges,
+    euler_characteristic,
+    n_used,
     triangle_areas,
     unique_edges,
     vertex_areas,
@@ -96,7 +99,7 @@ def sorted_mesh(X, T):
     rank[order] = np.arange(len(X))
     T = rank[T]
     T = np.take_along_axis(T, (T.argmin(1)[:, None] + np.arange(3)) % 3, axis=1)
-    return X[order], T[np.lexsort(T.T[::-1])], order
+    return X[order], T[np.lexsort((T[:, 2], T[:, 0] * len(X) + T[:, 1]))], order
 
 
 def coarse_surface(X, T, n_coarse, seed=0):
@@ -113,7 +116,8 @@ def coarse_surface(X, T, n_coarse, seed=0):
     """
     V, F, origin = X, T, np.arange(len(X))
     for most in (MOST, MOST, MOST, np.inf):
-        G, (E, _, count) = edge_graph(V, F), unique_edges(F, len(V))
+        E, _, count = unique_edges(F, len(V))
+        G = edge_graph(V, E)
         first = sample_surface(V, F, G, E[count == 1], origin < 0, max(4, round(FIRST * n_coarse)), seed)
         start = voronoi_cells(G, first)
         state, rounds, left = refine(G, F, E, count == 1, start, most * n_coarse, origin < 0)
@@ -131,7 +135,7 @@ def coarse_surface(X, T, n_coarse, seed=0):
     attrs["vertices_cut"] = int((cell < 0).sum())
     if attrs["vertices_cut"]:
         known = np.flatnonzero(cell >= 0)
-        cell = cell[dijkstra(edge_graph(X, T), indices=known, min_only=True, return_predecessors=True)[2]]
+        cell = cell[dijkstra(edge_graph(X, edges(T)), indices=known, min_only=True, return_predecessors=True)[2]]
     return V[sample], C, origin[sample], cell, attrs
 
 
@@ -183,7 +187,7 @@ def topology(T):
     rim, vertex = np.unique(E[count == 1], return_inverse=True)
     loops = components(vertex.reshape(-1, 2), len(rim)).max(initial=-1) + 1
     return {
-        "euler_characteristic": len(np.unique(T)) - len(E) + len(T),
+        "euler_characteristic": euler_characteristic(T, E),
         "boundary_loops": int(loops),
         "nonmanifold_edges": int((count > 2).sum()),
     }
@@ -195,7 +199,7 @@ def check_clean(X, T):
         raise ValueError(
             "coarsen needs triangles of existing vertices at finite positions; found others: clean the mesh first"
         )
-    idle, found = len(X) - len(np.unique(T)), topology(T)
+    idle, found = len(X) - n_used(T), topology(T)
     knots = found["nonmanifold_edges"]
     if idle or knots:
         raise ValueError(

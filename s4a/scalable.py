@@ -68,7 +68,8 @@ def spread(X, T, p, seed=0):
     G : sparse matrix (n, n)
         Edge lengths.
     """
-    G, (E, _, count) = edge_graph(X, T), unique_edges(T, len(X))
+    E, _, count = unique_edges(T, len(X))
+    G = edge_graph(X, E)
     first = sample_surface(X, T, G, E[count == 1], np.zeros(len(X), bool), min(p, len(X)), seed)
     radius = RADIUS * np.sqrt(vertex_areas(X, T).sum() / (np.pi * len(first)))
     sample, cell, distance = voronoi_cells(G, first)

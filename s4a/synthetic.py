@@ -18,7 +18,7 @@ from scipy.special import ndtr, ndtri
 
 from s4a.artefacts import soil
 from s4a.io import write_mesh
-from s4a.mesh import as_arrays, as_dataset, edge_graph, vertex_areas
+from s4a.mesh import as_arrays, as_dataset, edge_graph, edges, vertex_areas
 from s4a.schema import dataset, in_unit
 from s4a.shapes import read_shapes
 
@@ -385,7 +385,7 @@ def _cleaned_reference(mesh, raw, reference_point):
     u = reference_point[file_vertex]
     moved = (X != raw[file_vertex]).any(axis=1) | np.isnan(u).any(axis=1)
     u[moved] = 0
-    u[moved] = _unit((edge_graph(X, T)[moved] != 0) @ u)
+    u[moved] = _unit((edge_graph(X, edges(T))[moved] != 0) @ u)
     return u
 
 

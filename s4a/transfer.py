@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 from s4a import study as store
 from s4a.annotations import MIRROR
 from s4a.link import at, blended, closest_point, elect, link, point_along
-from s4a.mesh import as_arrays, as_dataset, edge_graph, triangle_areas, vertex_areas
+from s4a.mesh import as_arrays, as_dataset, edge_graph, edges, triangle_areas, vertex_areas
 from s4a.register import Scan, identity, match_scans
 from s4a.remesh import coarsen
 from s4a.schema import dataset, in_unit, require
@@ -364,7 +364,7 @@ def traced(marked, mesh):
     The points in between have no name; their curve is that of their neighbours.
     """
     X, T = as_arrays(mesh)
-    spacing = edge_graph(X, T).data.mean()
+    spacing = edge_graph(X, edges(T)).data.mean()
     curve, closed = (marked[name].values for name in ("landmark_curve", "landmark_closed"))
     rows = [(np.flatnonzero(curve == ""), marked["landmark_position"].values[curve == ""], None)]
     for name in dict.fromkeys(curve[curve != ""].tolist()):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from s4a import fmap, synthetic
-from s4a.mesh import edge_graph, path_lengths
+from s4a.mesh import edge_graph, edges, path_lengths
 from s4a.nearest import nearest_in_cells
 from s4a.scalable import local_functions, local_space, reduce, spread
 
@@ -39,7 +39,7 @@ def test_local_functions_do_not_cross_a_thin_wall():
     X = np.concatenate([m["position"].values for m in (outer, inner)])
     T = np.concatenate([outer["corner_vertex"].values, inner["corner_vertex"].values + 3000])
     sample, _, radius, _ = spread(X, T, 600)
-    U = local_functions(X, edge_graph(X, T), sample, radius)
+    U = local_functions(X, edge_graph(X, edges(T)), sample, radius)
     i, j = U.nonzero()
     assert ((i < 3000) == (sample[j] < 3000)).all()
 
