@@ -20,7 +20,7 @@ WIDE = 4  # last rounds of Consistent ZoomOut, which look among all vertices
 ROUGH, FINE = 1e-4, 1e-6  # tolerances of the latent basis: on the way, and at the end
 
 
-def consistency_form(C, source, target, weight, n, *, n_jobs=1):
+def consistency_form(C, source, target, weight, n, *, dtype=float, n_jobs=1):
     """The quadratic form sum w |C_ij Y_i - Y_j|^2 of the stacked Y, as its product with vectors ``(n k, q)``.
 
     The form is never assembled: every shape has its rows of k x k blocks, one for itself and one for each shape that
@@ -34,14 +34,21 @@ def consistency_form(C, source, target, weight, n, *, n_jobs=1):
         blocks[i][j] = blocks[i].get(j, 0) - w * c.T
         blocks[j][i] = blocks[j].get(i, 0) - w * c
     joined = [sorted(row) for row in blocks]
-    rows = [np.concatenate([row[j] for j in near], axis=1) for row, near in zip(blocks, joined, strict=True)]
+    rows = [
+        np.concatenate([row[j] for j in near], axis=1, dtype=dtype) for row, near in zip(blocks, joined, strict=True)
+    ]
+
+    def product(some, V):
+        return [rows[i] @ V[joined[i]].reshape(-1, V.shape[2]) for i in some]
+
+    shares = np.array_split(np.arange(n), n_jobs)
 
     def apply(V):
-        V = V.reshape(n, k, -1)
-        parts = Parallel(n_jobs=n_jobs, backend="threading")(
-            delayed(np.matmul)(row, V[near].reshape(-1, V.shape[2])) for row, near in zip(rows, joined, strict=True)
-        )
-        return np.concatenate(parts)
+        V = np.asarray(V, dtype).reshape(n, k, -1)
+        if V.shape[2] == 1:  # as long as it takes to start a thread
+            return np.concatenate(product(range(n), V))
+        parts = Parallel(n_jobs=n_jobs, backend="threading")(delayed(product)(some, V) for some in shares)
+        return np.concatenate([block for part in parts for block in part])
 
     return apply
 
@@ -135,7 +142,8 @@ def latent_basis(C, source, target, weight, eigenvalues, m=None, *, tolerance=FI
     n, k = len(eigenvalues), C.shape[1]
     m = k if m is None else m
     start = spanning_start(C, source, target, n).reshape(n * k, k)[:, :m]
-    form = consistency_form(C, source, target, weight, n, n_jobs=n_jobs)
+    dtype = np.float32 if tolerance >= ROUGH else float
+    form = consistency_form(C, source, target, weight, n, dtype=dtype, n_jobs=n_jobs)
     Y = smallest_eigenvectors(form, start, tolerance=tolerance).reshape(n, k, m) * np.sqrt(n)
     mean = np.einsum("nkl,nk,nkm->lm", Y, eigenvalues[:, :k], Y) / n
     latent_eigenvalue, turn = np.linalg.eigh(mean)
