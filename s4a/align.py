@@ -110,7 +110,7 @@ def icp(X, area, Y, area_y, R, t, *, n_points=None, clouds=None, rounds=60, tole
         back_gap, back = tree_x.query((Y[j] - t) @ R)
         P, Q = np.concatenate([X[i], X[back]]), np.concatenate([Y[forth], Y[j]])
         gap = np.concatenate([forth_gap, back_gap])
-        keep = gap <= np.quantile(gap, 1 - trim)
+        keep = gap <= (1 + 1e-9) * np.quantile(gap, 1 - trim)  # two that are each other's nearest stay or go together
         residual = float(np.sqrt(weight[keep] @ gap[keep] ** 2 / weight[keep].sum()))
         R, t, _ = rigid_transform(P[keep], Q[keep], weight[keep])
         if last - residual < tolerance * size:
@@ -120,9 +120,10 @@ def icp(X, area, Y, area_y, R, t, *, n_points=None, clouds=None, rounds=60, tole
 
 
 def tilted(X, area, Y, area_y, start, *, degrees=15.0, **options):
-    """ICP again from the end of an ICP tilted about each axis both ways, as long as that ends nearer.
+    """ICP again from the end of an ICP tilted about each axis of Y both ways, as long as that ends nearer.
 
-    ICP alone ends wherever no pair changes: on folded surfaces up to 20 degrees from the best rotation.
+    ICP alone ends wherever no pair changes: on folded surfaces up to 20 degrees from the best rotation.  The axes are
+    the principal ones, so that the end does not depend on how both lie.
 
     Parameters
     ----------
@@ -138,7 +139,10 @@ def tilted(X, area, Y, area_y, start, *, degrees=15.0, **options):
     R, t, residual
     """
     best, center = start, area @ X / area.sum()
-    tilts = [Rotation.from_euler(axis, sign * degrees, True).as_matrix() for axis in "xyz" for sign in (1, -1)]
+    B = principal_axes(Y, area_y)[1]
+    tilts = [
+        B @ Rotation.from_euler(axis, sign * degrees, True).as_matrix() @ B.T for axis in "xyz" for sign in (1, -1)
+    ]
     for _ in range(5):
         R, t, residual = best
         middle = R @ center + t
@@ -149,13 +153,15 @@ def tilted(X, area, Y, area_y, start, *, degrees=15.0, **options):
     return best
 
 
-def align(X, area, Y, area_y, *, n_points=300, prefer=0.9):
+def align(X, area, Y, area_y, *, n_points=300, clearly=0.98, prefer=0.9):
     """Rigid motion of X onto Y by ICP, from the pose as given and from the four turns that align principal axes.
 
-    The starts are compared by pairing `n_points` spread vertices of each shape.  Two go on, tilted: the best that ends
-    within 90 degrees of where the pose as given (centred) ends, and the best of the others.  The former is kept unless
-    the latter ends below `prefer` times its residual: near-symmetric shapes would otherwise be turned over by noise.
-    It is then refined on all vertices.
+    The starts are compared by pairing `n_points` spread vertices of each shape.  Two go on, tilted: of the four turns,
+    the best that ends within 90 degrees of where the pose as given (centred) ends, and the best of the others.  The
+    former is kept unless the latter ends below `prefer` times its residual: near-symmetric shapes would otherwise be
+    turned over by noise.  The pose as given takes its place only where that ends below `clearly` times its residual, as
+    with shapes whose principal axes mean little; so the end does not depend on how the shapes were turned, as long as
+    they lie within about 90 degrees of each other.  What is kept is then refined on all vertices.
 
     Parameters
     ----------
@@ -173,16 +179,19 @@ def align(X, area, Y, area_y, *, n_points=300, prefer=0.9):
     flips = [np.diag(d) for d in itertools.product((1, -1), repeat=3) if np.prod(d) == 1]
     starts = [np.eye(3)] + [B @ flip @ A.T for flip in flips]
     options = {"clouds": (cloud(X, n_points), cloud(Y, n_points)), "tolerance": 2e-5}
-    found = [icp(X, area, Y, area_y, R, cy - R @ cx, **options) for R in starts]
+    given, *found = [icp(X, area, Y, area_y, R, cy - R @ cx, **options) for R in starts]
     sides = {True: [], False: []}
     for f in found:
-        sides[bool(np.trace(f[0].T @ found[0][0]) >= 1)].append(f)
+        sides[bool(np.trace(f[0].T @ given[0]) >= 1)].append(f)
     ends = {
         upright: tilted(X, area, Y, area_y, min(some, key=lambda f: f[2]), **options)
         for upright, some in sides.items()
         if some
     }
-    best = ends[True]
+    if True in ends and clearly * ends[True][2] <= given[2]:
+        best = ends[True]
+    else:
+        best = tilted(X, area, Y, area_y, given, **options)
     if False in ends and ends[False][2] < prefer * best[2]:
         best = ends[False]
     return icp(X, area, Y, area_y, *best[:2])

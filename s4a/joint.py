@@ -41,6 +41,11 @@ class Surface:
         return feature_tree(self.X, self.T)
 
     @cached_property
+    def outwards(self):
+        """Rows of ``some`` by the distance from the centre: an order that pose and numbering leave as it is."""
+        return np.argsort(((self.X[self.some] - self.area @ self.X) ** 2).sum(1), kind="stable")
+
+    @cached_property
     def smooth(self):
         """Coefficients, in the basis, of a field given at ``some``."""
         return smoother(self.Phi, self.area[self.some], self.U if self.U is None else self.U[self.some])
@@ -161,7 +166,7 @@ def badness(source, target, match, motion, *, n_samples=300, limit=0.5):
     tree, some = feature_tree(X, target.T), np.arange(len(X))[target.some]
     back_gap = np.linalg.norm(source.X[source.some] - X[tree.query(source.tree.data[source.some])[1]], axis=1)
     gap = np.linalg.norm(X[some] - source.X[match], axis=1)
-    sample = np.linspace(0, len(match) - 1, min(n_samples, len(match))).astype(int)
+    sample = target.outwards[np.linspace(0, len(match) - 1, min(n_samples, len(match))).astype(int)]
     back = tree.query(source.tree.data[match[sample]])[1]
     trip = path_lengths(target.graph, some[sample], back, limit)
     return float(trip.mean() + gap.mean() + back_gap.mean())

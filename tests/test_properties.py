@@ -6,14 +6,16 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from s4a import clean, coarsen, match_pair, spectrum, synthetic
+from s4a import analyse, clean, coarsen, match_pair, spectrum, synthetic
 from s4a.mesh import as_arrays, as_dataset, vertex_areas
 
 SEED = st.integers(0, 2**32 - 1)
 UNIT = st.sampled_from([1e-3, 1e-2, 1.0, 25.4, 1e3])
 ANGLE = st.floats(-3.0, 3.0)
 SHIFT = st.floats(-300.0, 300.0)
-MOTION = st.tuples(st.tuples(ANGLE, ANGLE, ANGLE), st.tuples(SHIFT, SHIFT, SHIFT))
+PLACE = st.tuples(SHIFT, SHIFT, SHIFT)
+MOTION = st.tuples(st.tuples(ANGLE, ANGLE, ANGLE), PLACE)
+TURNED = st.tuples(st.tuples(*3 * [st.floats(-0.4, 0.4)]), PLACE)  # two by 40 degrees: from 90 on the pose counts
 
 
 def few(n):
@@ -86,13 +88,50 @@ def pair(brains):
     return match_pair(as_dataset(*source), as_dataset(*target), **OPTIONS)["displacement"].values
 
 
-@given(shift=st.tuples(SHIFT, SHIFT, SHIFT), unit=UNIT, seed=SEED)
+@given(motions=st.tuples(TURNED, TURNED), unit=UNIT, seed=SEED)
 @few(4)
-def test_the_displacement_of_a_pair(brains, pair, shift, unit, seed):
+def test_the_displacement_of_a_pair(brains, pair, motions, unit, seed):
     (X, T), (Y, S) = list(brains.values())[:2]
     size = size_of(Y, S)
-    X, T, _ = renumbered(moved(X, (np.zeros(3), shift), unit), T, seed)
-    Y, S, order = renumbered(unit * Y, S, seed + 1)
+    X, T, _ = renumbered(moved(X, motions[0], unit), T, seed)
+    Y, S, order = renumbered(moved(Y, motions[1], unit), S, seed + 1)
     found = match_pair(as_dataset(X, T), as_dataset(Y, S), **OPTIONS)["displacement"].values / unit
-    # the displacement is kept in single precision; turned sources have tests of their own (test_register)
-    assert np.linalg.norm(found - pair[order], axis=1).max() < 1e-5 * size
+    wanted = Rotation.from_rotvec(motions[1][0]).apply(pair[order])
+    # the displacement is kept in single precision
+    assert np.linalg.norm(found - wanted, axis=1).max() < 1e-5 * size
+
+
+OF_STUDY = {"n_coarse": 300, "k_init": 12, "k": 20, "intersections": False}
+
+
+@pytest.fixture(scope="module")
+def collection():
+    """Four shapes as (points, triangles), and their study."""
+    tree = synthetic.brains(4, 1200, seed=2)["original"]
+    shapes = {name: as_arrays(mesh) for name, mesh in tree.children.items()}
+    return shapes, analyse(shapes, **OF_STUDY)
+
+
+@given(motions=st.tuples(*4 * [TURNED]), unit=UNIT, seed=SEED, order=st.permutations(range(4)))
+@few(3)
+def test_the_study_of_a_collection(collection, motions, unit, seed, order):
+    shapes, one = collection
+    names, given, old_vertex = list(shapes), {}, {}
+    for i in order:
+        X, T = shapes[names[i]]
+        *given[names[i]], old_vertex[names[i]] = renumbered(moved(X, motions[i], unit), T, seed + i)
+    other = analyse(given, **OF_STUDY)
+    template = one["registration"].attrs["template"]
+    assert other["latent"].attrs["median"] == other["registration"].attrs["template"] == template
+    close = {"rtol": 1e-4, "atol": 1e-6}
+    for variable in ("distance_to_median", "latent_eigenvalue"):
+        np.testing.assert_allclose(other["latent"][variable], one["latent"][variable], **close)
+    found, wanted = other["pca"].to_dataset(), one["pca"].to_dataset()
+    np.testing.assert_allclose(found["standard_deviation"] / unit, wanted["standard_deviation"], **close)
+    np.testing.assert_allclose(found["explained_variance_ratio"], wanted["explained_variance_ratio"], **close)
+    sign = np.sign((found["score"] * wanted["score"]).sum("shape"))
+    np.testing.assert_allclose(found["score"] * sign, wanted["score"], rtol=0, atol=1e-4)
+    d, e = (tree["registration"]["displacement"].values for tree in (one, other))
+    d = Rotation.from_rotvec(motions[names.index(template)][0]).apply(d[:, old_vertex[template]].reshape(-1, 3))
+    gap = np.linalg.norm(e / unit - d.reshape(e.shape), axis=2)
+    assert gap.max() < 1e-4 * size_of(*shapes[template])
