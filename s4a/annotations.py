@@ -1,6 +1,7 @@
 """Files of labels and landmarks (6.2): read and write what experts marked on a mesh, in the order of its file."""
 
 import csv
+import io
 import json
 import zipfile
 from collections import Counter
@@ -25,7 +26,7 @@ def read_labels(path, n=None):
     path : str or Path
         NPY; NPZ, ``FILE.npz:NAME`` where several arrays fit; CSV or text, a row per vertex, with a header the column
         ``label`` and, where there is one, the index ``vertex``; GIFTI label (.gii); FreeSurfer .annot, whose labels are
-        rows of its colour table, -1 for the annotation 0.
+        rows of its colour table, -1 for the annotation 0; each compressed by gzip too (.annot.gz).
     n : int, optional
         Number of vertices in the file of the mesh.
 
@@ -43,13 +44,14 @@ def read_labels(path, n=None):
     file = Path(f"{file}.npz" if name else file)
     if not file.is_file():
         raise ValueError(f"no file {file}")
-    kind = file.suffix.lower()
-    readers = {".npy": _npy_labels, ".gii": _gifti_labels, ".annot": _annot_labels}
+    kind = Path(file.name.lower().removesuffix(".gz")).suffix
+    readers = {".npy": bounded.npy, ".gii": _gifti_labels, ".annot": _annot_labels}
     try:
-        if kind == ".npz" or zipfile.is_zipfile(file):
-            labels = _npz_labels(file, name, n)
+        data = bounded.content(file)
+        if kind == ".npz" or zipfile.is_zipfile(io.BytesIO(data)):
+            labels = _npz_labels(data, file.name, name, n)
         else:
-            labels = np.asarray(readers.get(kind, _text_labels)(file))
+            labels = np.asarray(readers.get(kind, _text_labels)(data))
     except Exception as error:  # whatever the file holds, the message must name it
         raise ValueError(f"{path} cannot be read as labels: {error or type(error).__name__}") from error
     labels = labels[:, 0] if labels.ndim == 2 and labels.shape[1] == 1 else labels
@@ -66,8 +68,8 @@ def read_labels(path, n=None):
     return labels
 
 
-def _npz_labels(file, name, n):
-    arrays = bounded.npz(file.read_bytes())
+def _npz_labels(data, file, name, n):
+    arrays = bounded.npz(data)
     if name:
         if name not in arrays:
             raise ValueError(f"no array {name!r}; it has {', '.join(arrays)}")
@@ -77,16 +79,12 @@ def _npz_labels(file, name, n):
     if len(fitting) != 1:
         shapes = ", ".join(f"{key} {values.shape}" for key, values in arrays.items())
         wanted = "one array" if n is None else f"one array of {n} values"
-        raise ValueError(f"{wanted} needed, found {shapes}; name it as {file.name}:NAME")
+        raise ValueError(f"{wanted} needed, found {shapes}; name it as {file}:NAME")
     return arrays[fitting[0]]
 
 
-def _npy_labels(file):
-    return bounded.npy(file.read_bytes())
-
-
-def _gifti_labels(file):
-    arrays = parse_gifti(file.read_bytes())
+def _gifti_labels(data):
+    arrays = parse_gifti(data)
     found = [values for intent, values in arrays if intent == "LABEL"]
     found = found or [values for _, values in arrays if values.ndim == 1]
     if not found:
@@ -94,9 +92,9 @@ def _gifti_labels(file):
     return found[0]
 
 
-def _annot_labels(file):
+def _annot_labels(data):
     """Rows of the colour table; nibabel's reader gives some row to an annotation that is not in the table."""
-    data, at = file.read_bytes(), 0
+    at = 0
 
     def take(count):
         """The next big-endian integers."""
@@ -144,9 +142,9 @@ def _annot_labels(file):
     return labels
 
 
-def table_rows(file):
+def table_rows(data):
     """Rows of a table separated by commas, semicolons, tabs or spaces; comments and empty lines are left out."""
-    lines = [s for s in file.read_text("utf-8-sig").splitlines() if s.strip() and not s.startswith("#")]
+    lines = [s for s in data.decode("utf-8-sig").splitlines() if s.strip() and not s.startswith("#")]
     if not lines:
         raise ValueError("the file is empty")
     mark = next((m for m in ",;\t" if m in lines[0]), " ")
@@ -170,8 +168,8 @@ def is_number(text):
     return True
 
 
-def _text_labels(file):
-    rows = table_rows(file)
+def _text_labels(data):
+    rows = table_rows(data)
     head = [cell.lower() for cell in rows[0]]
     if "label" in head:
         values = [row[head.index("label")] for row in rows[1:]]
@@ -195,7 +193,8 @@ def read_landmarks(path):
     ----------
     path : str or Path
         3D Slicer .mrk.json (points, curves, closed curves), CSV ``name,x,y,z`` (a header is optional; with one, also
-        ``curve``, the name of the curve or empty, and ``closed``), or the XML of MeshLab's picked points (.pp).
+        ``curve``, the name of the curve or empty, and ``closed``), or the XML of MeshLab's picked points (.pp); each
+        compressed by gzip too.
 
     Returns
     -------
@@ -213,9 +212,10 @@ def read_landmarks(path):
     if not path.is_file():
         raise ValueError(f"no file {path}")
     try:
-        head = path.read_text("utf-8-sig").lstrip()[:1]
+        data = bounded.content(path)
+        head = data.decode("utf-8-sig").lstrip()[:1]
         reader = {"{": _slicer_points, "<": _meshlab_points}.get(head, _table_points)
-        names, points, system, curve, closed = reader(path)
+        names, points, system, curve, closed = reader(data)
         points = np.array(points, float).reshape(-1, 3)
         if len(points) == 0 or not np.isfinite(points).all():
             raise ValueError(f"points with finite coordinates needed, found {len(points)}")
@@ -230,8 +230,8 @@ def read_landmarks(path):
     return dataset({"coordinate_system": system}, landmark_name=np.array(names), landmark_position=points, **curves)
 
 
-def _slicer_points(path):
-    lists = json.loads(path.read_text("utf-8-sig"))["markups"]
+def _slicer_points(data):
+    lists = json.loads(data.decode("utf-8-sig"))["markups"]
     systems = {str(m.get("coordinateSystem", "LPS")).upper() for m in lists}
     if len(systems) != 1 or not systems <= {"LPS", "RAS"}:
         raise ValueError(
@@ -250,14 +250,14 @@ def _slicer_points(path):
     return names, points, systems.pop(), curve, closed
 
 
-def _meshlab_points(path):
-    points = [p for p in bounded.xml(path.read_text("utf-8-sig")).iter("point") if p.get("active") != "0"]
+def _meshlab_points(data):
+    points = [p for p in bounded.xml(data.decode("utf-8-sig")).iter("point") if p.get("active") != "0"]
     names = [p.get("name", "") for p in points]
     return names, [[p.get(axis) for axis in "xyz"] for p in points], "", [""] * len(names), []
 
 
-def _table_points(path):
-    rows = table_rows(path)
+def _table_points(data):
+    rows = table_rows(data)
     head = [cell.lower() for cell in rows[0]]
     if all(axis in head for axis in "xyz"):
         x = [head.index(axis) for axis in "xyz"]

@@ -8,6 +8,7 @@ import re
 import xml.etree.ElementTree as ElementTree
 import zipfile
 import zlib
+from pathlib import Path
 from xml.parsers import expat
 
 import numpy as np
@@ -53,6 +54,12 @@ def gunzip(data):
         raise ValueError(f"damaged gzip data ({error})") from error
     check(len(found), len(data))
     return found
+
+
+def content(path):
+    """The bytes of a file, unpacked where it is compressed by gzip."""
+    data = Path(path).read_bytes()
+    return gunzip(data) if data.startswith(GZIP) else data
 
 
 def unpack(data, compressor, limit):

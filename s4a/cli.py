@@ -406,6 +406,7 @@ def insert(args):
         "scores",
     ]
     write(table(rows, head))
+    write_warnings(report)
     write(f"\nwritten: {out / 'inserted.nc'}, registered meshes and scores in {out}")
     return 1 if (report["status"] == "excluded").any() else 0
 
@@ -618,7 +619,9 @@ def parser():
     sub = command(transfer)
     sub.add_argument("source", metavar="SOURCE", help="mesh file that the labels and landmarks belong to")
     sub.add_argument("targets", nargs="+", metavar="TARGET", help="mesh files, folders or globs; or one study folder")
-    sub.add_argument("--labels", metavar="FILE", help="NPY, NPZ (FILE:NAME), CSV, GIFTI label or FreeSurfer annot")
+    sub.add_argument(
+        "--labels", metavar="FILE", help="NPY, NPZ (FILE:NAME), CSV, GIFTI label or FreeSurfer annot, also .gz"
+    )
     sub.add_argument("--landmarks", metavar="FILE", help="points and curves: Slicer .mrk.json, CSV or MeshLab .pp")
     sub.add_argument(
         "--out", required=True, metavar="DIR", help="for <target>.labels.npy, .confidence.npy, .landmarks.csv"

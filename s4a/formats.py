@@ -72,6 +72,7 @@ PLY_TYPES = {
     )
     for name in names.split()
 }
+PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
 def _read_ply(data):
@@ -81,12 +82,19 @@ def _read_ply(data):
     elements, kind = [], None
     for words in (line.split() for line in data[: end.start()].decode("latin-1").splitlines()):
         if words[:1] == ["format"]:
-            kind = words[1]
+            kind = words[1] if words[1:] else None
         elif words[:1] == ["element"]:
             elements.append((words[1], int(words[2]), []))
         elif words[:1] == ["property"]:
-            elements[-1][2].append((words[-1], [PLY_TYPES[word] for word in words[1:-1] if word != "list"]))
-    order = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}[kind]
+            codes = [PLY_TYPES.get(word) for word in words[1:-1] if word != "list"]
+            if not elements or not all(codes):
+                raise ValueError(
+                    f"properties of elements, of the types of PLY, expected, found {' '.join(words)[:80]!r}"
+                )
+            elements[-1][2].append((words[-1], codes))
+    if kind not in PLY_ORDERS:
+        raise ValueError(f"one of the formats {', '.join(PLY_ORDERS)} expected in the header, found {kind}")
+    order = PLY_ORDERS[kind]
     body = data[end.end() :] if order else np.array(data[end.end() :].split(), np.float64)
     at, table = 0, {}
     for name, count, properties in elements:
@@ -94,7 +102,11 @@ def _read_ply(data):
         table[name], at = _ply_rows(body, at, name, count, properties)
         if "vertex" in table and "face" in table:
             break
-    points = np.stack([np.asarray(table["vertex"][axis], np.float64) for axis in "xyz"], axis=1)
+    vertex = table.get("vertex", {})
+    if not all(axis in vertex for axis in "xyz"):
+        held = f"an element vertex with {', '.join(vertex) or 'nothing'}" if "vertex" in table else ", ".join(table)
+        raise ValueError(f"an element vertex with x, y and z expected, found {held or 'no element'}")
+    points = np.stack([np.asarray(vertex[axis], np.float64) for axis in "xyz"], axis=1)
     face = table.get("face", {})
     triangles = face.get("vertex_indices", face.get("vertex_index"))
     return points, np.empty((0, 3)) if triangles is None else triangles, {}

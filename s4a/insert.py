@@ -20,6 +20,7 @@ from s4a.remesh import coarsen
 from s4a.schema import dataset, in_unit, require, unit_of
 from s4a.shapes import read_shapes, shape_report
 from s4a.spectral import spectrum, unit_area
+from s4a.suspects import look, sample, warnings
 
 NEIGHBOURS, FINAL = 6, 3  # shapes of the study in the rounds on samples, and in the last round on all vertices
 SAMPLES = 1000
@@ -161,14 +162,14 @@ def options_of(study):
     """What of the options of the study a new shape needs."""
     given = study["report"].attrs if "report" in study else {}
     numbers = {n: int(given.get(n, d)) for n, d in (("n_coarse", 6000), ("k_init", 20), ("step", 5), ("seed", 0))}
-    flags = {n: given.get(n, "False") == "True" for n in ("wrap", "scale", "strict")}
+    flags = {n: given.get(n, "False") == "True" for n in ("wrap", "scale", "strict", "intersections")}
     words = {n: given.get(n, d) for n, d in (("init", "dense"), ("refine", "joint"), ("norm", "h2"), ("how", "ours"))}
     components = given.get("components", "largest")
     return numbers | flags | words | {"components": int(components) if components.isdigit() else components}
 
 
-def _insert_one(mesh, template, others, turns, o):
-    """``/coarse``, latent basis and registration of one new shape; or why there are none."""
+def _insert_one(mesh, template, others, turns, o, compare):
+    """``/coarse``, latent basis, registration and :func:`look` of one new shape; or why there are none."""
     k = len(others[0].Y)
     try:
         with threadpool_limits(1):
@@ -194,12 +195,13 @@ def _insert_one(mesh, template, others, turns, o):
                 match = nearest_rows(F_target, F_source)
             starts = {"intrinsic": match, "icp": cKDTree(shape.low.X @ R.T + t).query(template.low.X)[1]}
             options = {"k": k, "refine": o["refine"], "scale": o["scale"]}
-            return low, Y, registration(shape, template, starts, (F_source, F_target), **options)
+            seen = look(mesh, sample(template.original), o["intersections"]) if compare else {}
+            return low, Y, registration(shape, template, starts, (F_source, F_target), **options), seen
     except ValueError as error:
         return str(error)
 
 
-def insert(study, shapes, *, n_jobs=None):
+def insert(study, shapes, *, compare=True, n_jobs=None):
     """New shapes placed into a finished study, which stays as it is.
 
     Each new shape is remeshed, aligned and mapped to the template and the five shapes of the study with the most alike
@@ -212,6 +214,9 @@ def insert(study, shapes, *, n_jobs=None):
         Of :func:`s4a.analyse` or :func:`s4a.open_study`.
     shapes : path, list of paths, dict or Dataset
         See :func:`s4a.read_shapes`; a single mesh Dataset is named ``new``.
+    compare : bool
+        Whether each new shape is compared with those of the study: unit, handedness, pose, genus, as
+        :func:`s4a.read_shapes` does it; what looks wrong is named in ``/report`` and left as it is.
     n_jobs : int, optional
         As in joblib; the result does not depend on it.
 
@@ -258,7 +263,7 @@ def insert(study, shapes, *, n_jobs=None):
     others = [neighbour(c, bases[i]) for c, i in zip(coarse, order, strict=True)]
     turns = [study["registration"]["rotation"].sel(shape=names[i]).values for i in order]
     found = Parallel(n_jobs=n_jobs)(
-        delayed(_insert_one)(mesh, template_scan, others, turns, o) for mesh in meshes.values()
+        delayed(_insert_one)(mesh, template_scan, others, turns, o, compare) for mesh in meshes.values()
     )
     done = {}
     for name, files in zip(meshes, found, strict=True):
@@ -271,7 +276,7 @@ def insert(study, shapes, *, n_jobs=None):
         raise ValueError(f"no shape can be inserted ({reasons})")
     nodes = {f"original/{name}": meshes[name] for name in done} | {f"original/{template}": template_scan.original}
     nodes |= {f"coarse/{name}": low for name, (low, *_) in done.items()}
-    bases = np.stack([basis for _, basis, _ in done.values()])
+    bases = np.stack([basis for _, basis, *_ in done.values()])
     spectra = np.stack([low["eigenvalue"].values for low, *_ in done.values()])
     nodes["latent"] = _latent(bases, spectra, latent_eigenvalue, o["norm"]).assign_coords(shape=list(done))
     X, T = as_arrays(template_scan.original)
@@ -280,7 +285,8 @@ def insert(study, shapes, *, n_jobs=None):
     nodes |= store.stack_registration(mesh, {n: files[2] for n, files in done.items()}, list(done))
     if "pca" in study:
         nodes["pca"] = _scores(study["pca"].to_dataset(), nodes["registration"])
-    return xr.DataTree.from_dict(nodes | {"report": shape_report(attrs)})
+    looks = {name: files[3] for name, files in done.items()}
+    return xr.DataTree.from_dict(nodes | {"report": _compared(study, attrs, looks) if compare else shape_report(attrs)})
 
 
 def _read(shapes, o):
@@ -299,6 +305,22 @@ def _read(shapes, o):
             attrs[name] = new[name].attrs if name in new else one
         ready |= new
     return ready, attrs
+
+
+def _compared(study, attrs, looks):
+    """The report on the new shapes, each beside those of the study: these are taken as they lie after registration."""
+    turns = study["registration"]["rotation"]
+    known = {n: study["original"][n].attrs for n in turns["shape"].values.tolist()}
+    seen = {"residual": 0.0, "mirrored": 1.0, "self_intersections": -1}  # the hand of the study is the right one
+    known_looks = {n: seen | {"rotation": turns.sel(shape=n).values} for n in known}
+    before = warnings(known, known_looks)[1]
+    reports, remarks = [], {}
+    for name, given in attrs.items():
+        one = {name: looks[name]} if name in looks else {}
+        found = shape_report(known | {name: given}, known_looks | one)
+        reports.append(found.sel(shape=[name]))
+        remarks |= dict.fromkeys(line for line in found.attrs["remarks"].splitlines() if line not in before)
+    return xr.concat(reports, dim="shape").assign_attrs(remarks="\n".join(remarks))
 
 
 def _latent(Y, eigenvalues, latent_eigenvalue, norm):

@@ -66,12 +66,9 @@ def read_mesh(path):
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"no file {path}")
-    data = path.read_bytes()
     found = "mesh"
     try:
-        if data.startswith(bounded.GZIP):
-            data = bounded.gunzip(data)
-        data = data.removeprefix(b"\xef\xbb\xbf")
+        data = bounded.content(path).removeprefix(b"\xef\xbb\xbf")
         found = _sniff(data)
         with np.errstate(all="ignore"):  # nonsense in the file is refused, or left to the cleaning
             points, triangles, attrs = READERS[found](data)
@@ -266,8 +263,7 @@ def _other(file):
                 names = {name.removesuffix(".npy") for name in archive.namelist()}
             return "" if any(names.issuperset(keys) for keys in NPZ_KEYS) else "an archive of other arrays"
         if suffix_of(file) == ".gii":
-            data = file.read_bytes()
-            data = bounded.gunzip(data) if data.startswith(bounded.GZIP) else data
+            data = bounded.content(file)
             return "" if b"<GIFTI" not in data or b"NIFTI_INTENT_POINTSET" in data else "a GIFTI file without points"
         if suffix_of(file) in (
             ".json",

@@ -1,19 +1,21 @@
 """Covariates and groups of the shapes (6.1): a table beside the meshes, on which nothing but the statistics depends."""
 
+import csv
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 
 from s4a.annotations import is_number, table_rows
+from s4a.bounded import content
 from s4a.io import slug
 from s4a.schema import covariate
 
 
 def _head_and_rows(path):
     try:
-        head, *rows = table_rows(path)
-    except (OSError, ValueError, UnicodeDecodeError) as error:
+        head, *rows = table_rows(content(path))
+    except (OSError, ValueError, csv.Error) as error:
         raise ValueError(f"{path} cannot be read as a table: {error}") from error
     if "shape" not in head:
         raise ValueError(f"{path}: a column 'shape' with the names or files of the shapes needed; found {head}")

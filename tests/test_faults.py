@@ -10,7 +10,7 @@ import pytest
 from faults import shapes as faulty
 from faults import studies, table
 
-from s4a import analyse, cli, findings, open_study, read_shapes
+from s4a import analyse, cli, findings, insert, open_study, read_shapes
 from s4a.mesh import as_dataset, euler_characteristic
 from s4a.view import page
 
@@ -148,16 +148,37 @@ def collection(factor=1.0, offset=0.0):
     return {f"shape_{i}": (factor * X + offset, T) for i in range(3) for X, T in [faulty.shape(i)]}
 
 
-def test_the_study_does_not_depend_on_place_and_unit():
-    options = SMALL | {"n_jobs": 1, "intersections": False}
-    reference = analyse(collection(), **options)
+OPTIONS = SMALL | {"n_jobs": 1, "intersections": False}
+
+
+@pytest.fixture(scope="module")
+def reference():
+    """The study of three good shapes."""
+    return analyse(collection(), **OPTIONS)
+
+
+def test_the_study_does_not_depend_on_place_and_unit(reference):
     for factor, offset in ((1, 1e6), (1e-9, 0), (1e9, 0)):
-        found = analyse(collection(factor, offset), **options)
+        found = analyse(collection(factor, offset), **OPTIONS)
         one, other = (t["registration"].to_dataset() for t in (reference, found))
         assert one.attrs["template"] == other.attrs["template"]
         assert np.allclose(other["displacement"] / factor, one["displacement"], atol=1e-3)
         assert np.allclose(found["pca"]["score"], reference["pca"]["score"], atol=1e-3)
         assert found["report"]["warning"].values.tolist() == reference["report"]["warning"].values.tolist()
+
+
+def test_what_looks_wrong_with_a_new_shape_beside_a_study_is_told(reference):
+    X, T = faulty.shape(5)
+    given = {"good": X, "metres": X / 1000, "mirrored": X * [-1, 1, 1], "upside_down": X * [1, -1, -1]}
+    found = insert(reference, {name: (Y, T) for name, Y in given.items()})
+    warning = dict(zip(found["report"]["shape"].values.tolist(), found["report"]["warning"].values, strict=True))
+    assert warning["good"] == ""
+    assert "near 10^-3: another unit" in warning["metres"]
+    assert "fits as a mirror image" in warning["mirrored"]
+    assert "degrees against most others: upside down" in warning["upside_down"]
+    assert "near 10" not in warning["mirrored"] + warning["upside_down"]
+    assert np.ptp(found["original/metres"]["position"].values) == pytest.approx(np.ptp(X) / 1000)
+    assert (insert(reference, {"mirrored": (given["mirrored"], T)}, compare=False)["report"]["warning"] == "").all()
 
 
 def test_files_of_different_units_are_told():

@@ -251,6 +251,23 @@ def test_counts_beyond_the_file_are_named(tmp_path):
             read_mesh(file(tmp_path, name, content))
 
 
+@pytest.mark.parametrize(
+    "before, after, found",
+    [
+        ("element vertex", "element point", "an element vertex with x, y and z expected, found point, face"),
+        ("float z", "float w", "an element vertex with x, y and z expected, found an element vertex with x, y, w"),
+        ("float z", "real z", "properties of elements, of the types of PLY, expected, found 'property real z'"),
+        ("format ascii", "format binary", "one of the formats ascii, .* expected in the header, found binary"),
+    ],
+)
+def test_a_ply_says_what_its_header_lacks(tmp_path, before, after, found):
+    head = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    head += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    (tmp_path / "m.ply").write_text(head.replace(before, after) + "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
+    with pytest.raises(ValueError, match=f"m.ply cannot be read as PLY: {found}"):
+        read_mesh(tmp_path / "m.ply")
+
+
 def test_indices_beyond_the_vertices_are_named(tmp_path):
     text = "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n"
     with pytest.raises(ValueError, match=r"indices 0\.\.2 expected for 3 vertices, found 0\.\.7"):

@@ -164,7 +164,7 @@ def test_recomputed_correspondences_generalize_less_well_than_those_that_knew_th
         assert anew["generalization"].attrs["units"] == "mm"
         assert anew.sizes["component"] == 4
         assert anew.attrs["generalization_0"] > 0.8 * kept.attrs["generalization_0"]
-        assert anew["generalization"].values[-1] > kept["generalization"].values[-2]
+        assert anew["generalization"].values[:3].mean() > kept["generalization"].values[:3].mean()
         assert (np.diff(anew["generalization"]) <= 1e-9).all()
         assert (anew["generalization_surface"] < anew["generalization"]).all()
         assert (anew["generalization_error"] > 0).all()

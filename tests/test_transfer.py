@@ -1,5 +1,6 @@
 """Transfer (6.2): labels, landmarks and fields on known correspondences, the files, the command, real templates."""
 
+import gzip
 import json
 import subprocess
 import sys
@@ -233,8 +234,11 @@ def test_every_label_file_gives_the_same_labels(tmp_path):
     nibabel.save(gifti, tmp_path / "a.label.gii")
     colours = np.array([[i, i, i, 0, 0] for i in range(1, 7)])
     nibabel.freesurfer.write_annot(tmp_path / "lh.annot", label, colours, list("abcdef"), fill_ctab=True)
-    for name in ("a.npy", "float.npy", "one.npz", "two.npz:labels", "plain.csv", "head.csv", "a.label.gii", "lh.annot"):
-        assert read_labels(tmp_path / name, 5).tolist() == label.tolist(), name
+    for name in ("a.npy", "float.npy", "one.npz", "plain.csv", "head.csv", "a.label.gii", "lh.annot"):
+        (tmp_path / f"{name}.gz").write_bytes(gzip.compress((tmp_path / name).read_bytes()))
+        for file in (name, f"{name}.gz"):
+            assert read_labels(tmp_path / file, 5).tolist() == label.tolist(), file
+    assert read_labels(tmp_path / "two.npz:labels", 5).tolist() == label.tolist()
     (tmp_path / "names.csv").write_text("label\nleft\nright\n")
     assert read_labels(tmp_path / "names.csv", 2).tolist() == ["left", "right"]
 
@@ -268,7 +272,8 @@ def test_every_landmark_file_gives_the_same_points(tmp_path):
         '<!DOCTYPE PickedPoints><PickedPoints><point name="a" x="1.5" y="2" z="3" active="1"/>'
         '<point x="-4" y="5.25" z="6" name="b"/><point x="0" y="0" z="0" name="c" active="0"/></PickedPoints>'
     )
-    for name in ("a.mrk.json", "a.csv", "plain.csv", "a.pp"):
+    (tmp_path / "packed.csv.gz").write_bytes(gzip.compress((tmp_path / "a.csv").read_bytes()))
+    for name in ("a.mrk.json", "a.csv", "plain.csv", "a.pp", "packed.csv.gz"):
         found = read_landmarks(tmp_path / name)
         assert found["landmark_name"].values.tolist() == ["a", "b"], name
         assert found["landmark_position"].values.tolist() == points, name

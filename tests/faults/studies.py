@@ -19,6 +19,12 @@ PROOFS = [
         "test_the_study_does_not_depend_on_place_and_unit",
     ),
     (
+        "a new shape in other units, mirrored or upside down (`insert`)",
+        "warned by a comparison with the shapes of the study; kept as it is",
+        FAULTS,
+        "test_what_looks_wrong_with_a_new_shape_beside_a_study_is_told",
+    ),
+    (
         "files that name different units or coordinate systems",
         "said, none is converted",
         FAULTS,
