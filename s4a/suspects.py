@@ -25,7 +25,7 @@ def pose(shape, reference):
     Returns
     -------
     R : float ndarray (3, 3)
-        Rotation onto the reference; of the pose as it is, unless a turn is clearly better.
+        Rotation onto the reference; of the pose as it is, unless a turn is clearly better, and no mirror image is.
     residual, mirrored : float
         Least residual of ICP of the shape and of its mirror image, as shares of sqrt(area).
     """
@@ -40,9 +40,9 @@ def pose(shape, reference):
         return [icp(X, p, Q, q, R, np.zeros(3), clouds=clouds, **options) for R in starts]
 
     found, mirrored = ends(P), ends(P * [-1, 1, 1])
-    as_it_is, best = found[0], min(found, key=lambda f: f[2])
-    R = (best if best[2] < CLEARLY * as_it_is[2] else as_it_is)[0]
-    return R, best[2], min(f[2] for f in mirrored)
+    as_it_is, best, reflected = found[0], min(found, key=lambda f: f[2]), min(f[2] for f in mirrored)
+    turned = best[2] < CLEARLY * as_it_is[2] and reflected >= CLEARLY * best[2]
+    return (best if turned else as_it_is)[0], best[2], reflected
 
 
 def sample(mesh):

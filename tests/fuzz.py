@@ -231,6 +231,7 @@ def seeds():
         "".join(f'<point x="{x}" y="{y}" z="{z}" active="1" name="n{x}"/>\n' for x, y, z in X[:4]) + "</PickedPoints>\n"
     )
     marks = "name,x,y,z,curve,closed\n" + "".join(f"p{i},{x},{y},{z},c,1\n" for i, (x, y, z) in enumerate(X[:4]))
+    covariates = "shape,age,site,weight\nleft.ply,31,Bern,60.5\nright,40,,NA\nmiddle,55,Genf,7e1\n"
     V, F = npy(X), npy(T)
     bare = "\n".join(marks.replace(",c,1", "").splitlines()[1:]).encode()
     vtps = [vtp(how) for how in ("ascii", "binary", "raw", "base64")]
@@ -252,13 +253,14 @@ def seeds():
         "NPZ": (".npz", "mesh", npzs),
         "gzip": (".gz", "mesh", [zipped(off), (ply(orders[1]), zipped), (text, zipped)]),
         "GIFTI labels": (".gii", "labels", [gifti(how, *marked) for how in encodings]),
-        "annot": (".annot", "labels", [annot, old]),
+        "annot": (".annot", "labels", [annot, old, (annot, zipped)]),
         "NPY": (".npy", "labels", [npy(label), npy(np.array(list("abc"))[label])]),
         "NPZ labels": (".npz", "labels", [packed({"a.npy": npy(label)}), (npy(label), lambda d: packed({"a.npy": d}))]),
         "CSV labels": (".csv", "labels", [named, "\n".join(map(str, label)).encode()]),
         "Slicer": (".mrk.json", "landmarks", [json.dumps(slicer, indent=1).encode()]),
         "MeshLab": (".pp", "landmarks", [picked.encode()]),
         "CSV landmarks": (".csv", "landmarks", [marks.encode(), bare]),
+        "CSV subjects": (".csv", "subjects", [covariates.encode(), covariates.replace(",", ";").encode()]),
     }  # fmt: skip
     return {
         name: (suffix, reader, [one if isinstance(one, tuple) else (one, whole) for one in given])
@@ -367,9 +369,12 @@ def read(path, kind):
     from s4a.annotations import read_labels, read_landmarks
     from s4a.clean import clean_arrays
     from s4a.io import read_mesh
+    from s4a.subjects import read_table
 
+    readers = {"mesh": read_mesh, "labels": read_labels, "landmarks": read_landmarks}
+    readers["subjects"] = lambda path: read_table(path, ["left", "middle", "right"])
     try:
-        found = {"mesh": read_mesh, "labels": read_labels, "landmarks": read_landmarks}[kind](path)
+        found = readers[kind](path)
     except ValueError as error:
         if str(path) not in str(error):
             raise AssertionError(f"the message does not name the file: {error}") from error
@@ -401,7 +406,7 @@ def work(task):
     """Read files of some formats one after the other; what happens goes to standard output, line by line."""
     table = seeds()
     path = Path(task["folder"]) / "none"
-    read_all = {"mesh": b"OFF", "labels": b"1", "landmarks": b"0 0 0"}
+    read_all = {"mesh": b"OFF", "labels": b"1", "landmarks": b"0 0 0", "subjects": b"shape"}
     for kind, data in read_all.items():  # so that nothing is imported under the limit
         path.write_bytes(data)
         try:
