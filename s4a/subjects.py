@@ -80,7 +80,11 @@ def read_table(path, names):
     columns = {n: [found[name][i] for name in names] for i, n in enumerate(head) if n != "shape"}
     if not columns:
         raise ValueError(f"{path}: a column beside 'shape' needed, found none")
-    return subjects({name: _values(cells) for name, cells in columns.items()}, names, str(path))
+    columns = {name: _values(cells) for name, cells in columns.items()}
+    for name, values in columns.items():
+        if values.dtype.kind == "f" and np.isinf(values).any():
+            raise ValueError(f"{path}: finite numbers, or nothing, needed in the column {name!r}; found {np.inf}")
+    return subjects(columns, names, str(path))
 
 
 def _values(cells):
@@ -89,7 +93,7 @@ def _values(cells):
     if not known or not all(map(is_number, known)):
         return np.array(cells)
     numbers = np.array([float(c) if c in known else np.nan for c in cells])
-    whole = len(known) == len(cells) and all(c.lstrip("+-").isdigit() for c in cells)
+    whole = len(known) == len(cells) and all(c.lstrip("+-").isdigit() for c in cells) and (abs(numbers) < 2**53).all()
     return numbers.astype(np.int64) if whole else numbers
 
 

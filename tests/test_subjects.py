@@ -38,6 +38,12 @@ def test_columns_are_whole_numbers_numbers_or_text_in_the_order_of_the_shapes(tm
     assert found["age"].attrs["long_name"] == "column 'age' of the table of the shapes"
 
 
+def test_whole_numbers_that_no_integer_holds_are_numbers(tmp_path):
+    file = tmp_path / "table.csv"
+    file.write_text(f"shape,size\na,1{30 * '0'}\nb,-1\n")
+    assert read_table(file, ["a", "b"])["size"].values.tolist() == [1e30, -1.0]
+
+
 @pytest.mark.parametrize(
     "text, words",
     [
@@ -50,6 +56,7 @@ def test_columns_are_whole_numbers_numbers_or_text_in_the_order_of_the_shapes(tm
         ("shape,a/b\na,1\nb,2\n", "without '/'; found 'a/b'"),
         ("shape,age,age\na,1,2\nb,1,2\n", "found 'age'"),
         ("shape\na\nb\n", "a column beside 'shape' needed"),
+        ("shape,age\na,1\nb,1e999\n", "finite numbers, or nothing, needed in the column 'age'; found inf"),
         ("", "cannot be read as a table: the file is empty"),
     ],
 )
