@@ -459,6 +459,7 @@ def file_points(mesh):
 
 
 TRUTH = "for each target, NPY or text: per vertex of its file that of the source's (from 0; -1: none), or x, y, z"
+LANDMARKS = "points by name, of the source's file and of each target's: Slicer .mrk.json, CSV or MeshLab .pp"
 METRICS = {
     "geodesic_error": ("error %", 100, 3),
     "straight_error": ("straight %", 100, 3),
@@ -513,8 +514,8 @@ def compare(args):
     """The methods of the paper's Table 1 on pairs, or of its Table 2 on a collection."""
     out = Path(args.out)
     if args.collection:
-        if args.paths or args.truth:
-            raise ValueError("--collection takes the shapes alone: no SOURCE, TARGET or --truth")
+        if args.paths or args.truth or args.landmarks:
+            raise ValueError("--collection takes the shapes alone: no SOURCE, TARGET, --truth or --landmarks")
         methods = args.methods or list(comparison.COLLECTION_METHODS)
         found = comparison.collection(
             args.collection, methods=methods, n_coarse=args.n_coarse, n_pairs=args.n_pairs, k=args.k, seed=args.seed
@@ -532,6 +533,7 @@ def compare(args):
             targets,
             methods=args.methods or comparison.METHODS,
             truth=per_target(args.truth, targets, "--truth"),
+            landmarks=landmark_pairs(args.landmarks, targets),
             n_coarse=args.n_coarse,
             k=args.k,
             seed=args.seed,
@@ -554,6 +556,27 @@ def per_target(files, names, flag):
     if len(files) != len(names):
         raise ValueError(f"{flag} needs a file for each of the {len(names)} targets, found {len(files)}")
     return {name: comparison.read_truth(file) for name, file in zip(names, files, strict=True)}
+
+
+def landmark_pairs(files, targets):
+    """Positions of the landmarks that source and target both have by name, for every target, or none."""
+    if not files:
+        return None
+    if len(files) != 1 + len(targets):
+        raise ValueError(
+            f"--landmarks needs a file for the source and each target, {1 + len(targets)}; found {len(files)}"
+        )
+    source, *others = (
+        dict(zip(found["landmark_name"].values.tolist(), found["landmark_position"].values, strict=True))
+        for found in map(read_landmarks, files)
+    )
+    pairs = {}
+    for name, file, target in zip(targets, files[1:], others, strict=True):
+        both = [landmark for landmark in source if landmark in target]
+        if len(both) < 3:
+            raise ValueError(f"{files[0]} and {file} need 3 landmarks or more of the same names, found {len(both)}")
+        pairs[name] = [np.stack([end[landmark] for landmark in both]) for end in (source, target)]
+    return pairs
 
 
 def write(text):
@@ -635,6 +658,7 @@ def parser():
     sub.add_argument("--collection", nargs="+", metavar="PATH", help="Table 2 on these folders, globs or mesh files")
     sub.add_argument("--methods", nargs="+", metavar="METHOD", help=f"of {', '.join(comparison.METHODS)}")
     sub.add_argument("--truth", nargs="+", metavar="FILE", help=TRUTH)
+    sub.add_argument("--landmarks", nargs="+", metavar="FILE", help=LANDMARKS)
     sub.add_argument("--out", default="compare", metavar="DIR", help="for compare.nc and compare.png")
     sub.add_argument("--n-coarse", type=int, default=6000, help=HELP["n_coarse"])
     sub.add_argument("--n-pairs", type=int, default=500, help=HELP["n_pairs"])

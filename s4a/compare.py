@@ -15,10 +15,11 @@ from tqdm.auto import tqdm
 
 from s4a import fmap, joint, latent, median, metrics, network
 from s4a.align import align, farthest_points, realign
+from s4a.lift import SPARE, lift
 from s4a.mesh import as_arrays, vertex_areas
 from s4a.nearest import nearest_in_cells
 from s4a.pipeline import SAMPLES, motion_between
-from s4a.register import Scan, at_full_resolution, intrinsic_match, sharpened
+from s4a.register import Scan, at_full_resolution, intrinsic_match
 from s4a.remesh import coarsen, laplacian
 from s4a.scalable import Reduced, local_space, spectral_space
 from s4a.schema import dataset, require, variable
@@ -96,32 +97,70 @@ class Shape:
         return self.timed("local basis", spectral_space, *parts, self.k)
 
     @cached_property
+    def low(self):
+        """The low-resolution mesh of RE-MATCH, with a few eigenfunctions more than are used."""
+        coarse = self.timed("lifted sample", coarsen, self.mesh, n_coarse=self.n_coarse, seed=self.seed)
+        return self.timed("lifted basis", spectrum, coarse, k=self.k + SPARE)
+
+    @cached_property
     def scan(self):
         """Both resolutions of RE-MATCH."""
-        coarse = self.timed("coarse sample", coarsen, self.mesh, n_coarse=self.n_coarse, seed=self.seed)
-        return Scan(self.mesh, self.timed("coarse basis", spectrum, coarse, k=self.k))
+        return Scan(self.mesh, self.low.isel(mode=slice(self.k)))
 
     @cached_property
     def coarse(self):
-        """The space of RE-MATCH."""
-        return space_of(self.scan)
+        """The low-resolution mesh as a space of its own eigenfunctions."""
+        scan = self.scan
+        return Reduced(scan.low.X, scan.low.area, scan.low.area, scan.low.Phi, scan.eigenvalue, scan.U, scan.cell)
+
+    @cached_property
+    def lifted(self):
+        """The space of RE-MATCH: the vertices of the low-resolution mesh, and functions of :mod:`s4a.lift`."""
+        scan = self.scan
+        spectral = self.seconds["lifted basis"]
+        space = self.timed("lifted basis", lifted_space, scan, self.low, self.k)
+        self.seconds["lifted basis"] += spectral
+        return space
 
 
-def space_of(scan):
-    """The low-resolution mesh of a :class:`s4a.register.Scan` as a space of its eigenfunctions."""
-    low = scan.low
-    return Reduced(low.X, low.area, low.area, low.Phi, scan.eigenvalue, scan.U, scan.cell)
+@dataclass(frozen=True)
+class Lifted(Reduced):
+    """The vertices of a low-resolution mesh, with functions ``B (n, k)`` that all vertices have; Phi are rows of B."""
+
+    B: np.ndarray
 
 
-def nearest_dense(M, N):
-    """Nearest rows of the source's F among those of the target's, both on low-resolution points, at all vertices."""
+def lifted_space(scan, low, k):
+    """The functions of :mod:`s4a.lift`, made orthonormal for the areas of the low-resolution mesh, as ZoomOut needs it.
 
-    def nearest(F_target, F_source):
-        if M.U is None:
-            return nearest_in_cells(F_target, N.cell, F_source, M.cell)[0]
-        return intrinsic_match(M, N, F_source, F_target)[0]
+    Parameters
+    ----------
+    scan : Scan
+    low : Dataset
+        The low-resolution mesh with some eigenfunctions more than k.
+    """
+    X, T = as_arrays(scan.original)
+    eigenvalue, B = lift(X, T, vertex_areas(X, T), scan.U, low, k)
+    at = low["sample_vertex"].values.copy()
+    cell, some = np.unique(scan.cell, return_index=True)
+    at[cell] = np.where(at[cell] < 0, some, at[cell])  # centres of closed openings are no vertices
+    area, Phi = scan.low.area, B[at].astype(float)
+    turn = np.linalg.inv(np.linalg.cholesky(Phi.T @ (area[:, None] * Phi))).T
+    B = B @ turn.astype(B.dtype)
+    return Lifted(scan.low.X, area, area, B[at].astype(float), eigenvalue, scan.U, scan.cell, B)
 
-    return nearest
+
+def at_all_vertices(space, C=None):
+    """The functions of a space, or Phi C^T, at all vertices of its mesh ``(n, k)``."""
+    Phi = space.B if isinstance(space, Lifted) else space.Phi
+    F = Phi if C is None else Phi[:, : C.shape[1]] @ C.T.astype(Phi.dtype)
+    return F if space.U is None or isinstance(space, Lifted) else space.U @ F.astype(np.float32)
+
+
+def sharpened(C, M, N):
+    """A round of ZoomOut in which the target's low-resolution vertices look among all vertices of the source."""
+    match = nearest_in_cells(N.Phi, np.arange(len(N.Phi)), at_all_vertices(M, C), M.cell)[0]
+    return fmap.fmap_from_match(M.B, N.Phi, N.mass, match)
 
 
 class Clock:
@@ -165,7 +204,7 @@ def fit(M, N, landmarks, k):
     return fmap.fit_descriptors(*meshes, k=k, landmarks=[mark for _, mark in ends], oriented=0)["fmap"].values
 
 
-def spectral_match(way, source, target, motion, landmarks, clock, *, k_init, k, step, dense_step):
+def spectral_match(way, source, target, motion, landmarks, clock, *, k_init, k, step):
     """ZO, FMAP+ZO, SCALABLE and RE-MATCH: first map, ZoomOut and match at full resolution.
 
     Returns
@@ -176,7 +215,7 @@ def spectral_match(way, source, target, motion, landmarks, clock, *, k_init, k, 
     low : tuple
         Match at low resolution and functions of both ends, for joint rounds.
     """
-    name = {"ZO": "dense", "FMAP+ZO": "dense", "SCALABLE": "local"}.get(way, "coarse")
+    name = {"ZO": "dense", "FMAP+ZO": "dense", "SCALABLE": "local"}.get(way, "lifted")
     M, N = getattr(source, name), getattr(target, name)
     for block in ("sample", "basis"):
         clock.seconds[block] += sum(s.seconds.get(f"{name} {block}", 0.0) for s in (source, target))
@@ -185,17 +224,19 @@ def spectral_match(way, source, target, motion, landmarks, clock, *, k_init, k, 
         C = clock("map", fmap.fmap_from_match, M.Phi[:, :k_init], N.Phi[:, :k_init], N.mass, match)
     else:
         C = clock("map", fit, M, N, landmarks, k_init)
-    nearest = nearest_dense(M, N)
+    options = {"step": step}
     if name == "dense":
-        options = {"step": dense_step, "nearest": nearest}
-    else:
-        options = {"step": step}
+        options["nearest"] = lambda Q, D: nearest_in_cells(Q, N.cell, D, M.cell)[0]
     C, low = clock("refine", fmap.zoomout, C, M.Phi, N.Phi, N.mass, k, **options)
-    if name == "coarse":
-        C = clock("refine", sharpened, C, M.Phi, N.Phi, N.mass, M.U, M.cell)
-    F = M.Phi[:, :k] @ C.T, N.Phi[:, :k]
-    match = low if name == "dense" else clock("full resolution", nearest, F[1], F[0])
-    return match, lambda: nearest_dense(N, M)(F[0], F[1]), (low, F)
+    if name == "lifted":
+        for _ in range(2):
+            C = clock("refine", sharpened, C, M, N)
+    F = clock("full resolution", at_all_vertices, M, C), at_all_vertices(N)
+    if name == "dense":
+        match = low
+    else:
+        match = clock("full resolution", nearest_in_cells, F[1], N.cell, F[0], M.cell)[0]
+    return match, lambda: nearest_in_cells(F[0], M.cell, F[1], N.cell)[0], (low, F)
 
 
 def joint_match(source, target, motion, low, clock, k):
@@ -303,8 +344,7 @@ def pairs(
     n_coarse=6000,
     k_init=20,
     k=100,
-    step=5,
-    dense_step=10,
+    step=10,
     n_geodesic=1000,
     seed=0,
 ):
@@ -312,8 +352,9 @@ def pairs(
 
     kNN: nearest neighbour in space after rigid alignment.  ZO: from that match, ZoomOut at full resolution.  FMAP+ZO:
     functional map fitted on landmarks and descriptors at full resolution, then ZoomOut.  SCALABLE: the same in the
-    space of :mod:`s4a.scalable`.  RE-MATCH: the same on the low-resolution mesh, and eq. 4.  RE-MATCH joint: joint
-    rounds after that.
+    space of :mod:`s4a.scalable`.  RE-MATCH: the same on the low-resolution mesh, with the eigenfunctions of
+    :mod:`s4a.lift` at its vertices, and eq. 4; the last two rounds of ZoomOut look among all vertices of the source.
+    RE-MATCH joint: joint rounds after that.
 
     Parameters
     ----------
@@ -327,16 +368,15 @@ def pairs(
         Name of the pair -> true vertices or positions, as of :func:`s4a.metrics.evaluate`; for shapes given as paths
         all vertices, here and in `landmarks`, are those of the files.
     landmarks : dict, optional
-        Name of the pair -> corresponding vertices (of the source, of the target); by default 10 spread vertices of the
-        source and the vertices of the target that are nearest after alignment (4.1, step 3).
+        Name of the pair -> corresponding vertices or positions ``(p, 3)`` (of the source, of the target); by default 10
+        spread vertices of the source and the vertices of the target that are nearest after alignment (4.1, step 3).
     n_coarse : int
         Vertices of the low-resolution mesh, and samples of SCALABLE.
     k_init, k : int
         Sizes of the first and of the refined map.
-    step, dense_step : int
-        Growth of the map per round of ZoomOut at low and at full resolution, where a round is a search among all
-        vertices: measured on faces and cats, steps of 10 end within 4 % of steps of 5 there, at half the cost; steps of
-        20 are worse by 8 to 60 %.
+    step : int
+        Growth of the map per round of ZoomOut: measured on faces and cats, steps of 10 end within 4 % of steps of 5 at
+        full resolution, at half the cost; steps of 20 are worse by 8 to 60 %.
     n_geodesic : int
         See :func:`s4a.metrics.evaluate`.
     seed : int
@@ -373,17 +413,26 @@ def pairs(
             N = Shape(mesh, n_coarse, k, seed)
             given = None if landmarks is None else [np.asarray(v) for v in landmarks[name]]
             truth_here = None if truth is None else truth[name]
-            if given is not None and not isinstance(target, xr.Dataset):
-                given = [in_mesh(v, s.mesh) for v, s in zip(given, (M, N), strict=True)]
             if given is not None:
+                given = [
+                    landmark_vertices(v, s.mesh, isinstance(target, xr.Dataset))
+                    for v, s in zip(given, (M, N), strict=True)
+                ]
                 check_landmarks(*given, M, N)
             if truth is not None and not isinstance(target, xr.Dataset):
                 truth_here = truth_in_meshes(truth_here, M.mesh, N.mesh)
-            options = {"k_init": k_init, "k": k, "step": step, "dense_step": dense_step}
+            options = {"k_init": k_init, "k": k, "step": step}
             rows.append(one_pair(M, N, methods, given, load + seconds, truth_here, n_geodesic, options))
     found = xr.concat(rows, "pair", combine_attrs="drop_conflicts")
-    attrs = {"n_coarse": n_coarse, "k_init": k_init, "k": k, "step": step, "dense_step": dense_step, "seed": seed}
-    return found.assign_coords(pair=list(targets)).assign_attrs(attrs)
+    attrs = {"n_coarse": n_coarse, "k_init": k_init, "k": k, "step": step, "seed": seed}
+    return found.assign_coords(pair=list(targets)).transpose("way", "pair", ...).assign_attrs(attrs)
+
+
+def landmark_vertices(given, mesh, clean):
+    """Vertices of the mesh: the nearest ones to positions ``(p, 3)``, or those that rows of its file became."""
+    if given.ndim == 2 and given.shape[1] == 3:
+        return cKDTree(mesh["position"].values).query(given)[1]
+    return given if clean or given.dtype.kind not in "iu" else in_mesh(given, mesh)
 
 
 def check_landmarks(at_source, at_target, source, target):
@@ -397,18 +446,30 @@ def check_landmarks(at_source, at_target, source, target):
         )
 
 
+def motion_and_landmarks(source, target, landmarks, low, clock):
+    """Steps 2 and 3 of 4.1: by the low-resolution meshes, as RE-MATCH has them, or else by spread points."""
+    ends = [(s.scan.low.X, s.scan.low.area) if low else s.spread[:2] for s in (source, target)]
+    motion = clock("align", align, *ends[0], *ends[1])[:2]
+    if not low:
+        clock.seconds["align"] += source.seconds["spread"] + target.seconds["spread"]
+    if landmarks is None:
+        landmarks = clock("align", default_landmarks, source, target, motion)
+    return motion, landmarks
+
+
 def one_pair(source, target, methods, landmarks, load, truth, n_geodesic, options):
     """All methods on one pair: metrics and times over ``way``."""
-    common = Clock()
-    motion = common("align", align, *source.spread[:2], *target.spread[:2])[:2]
-    common.seconds["align"] += source.seconds["spread"] + target.seconds["spread"]
-    common.seconds["load and clean"] = load
-    if landmarks is None:
-        landmarks = common("align", default_landmarks, source, target, motion)
+    aligned = {}
+    for low in (False, True):
+        common = Clock()
+        common.seconds["load and clean"] = load
+        if any(way.startswith("RE-MATCH") == low for way in methods):
+            aligned[low] = motion_and_landmarks(source, target, landmarks, low, common), common.seconds
     done, rows, times = {}, [], []
     for way in methods:
         clock, image, reverse = Clock(), None, None
-        clock.seconds |= common.seconds
+        (motion, marks), spent = aligned[way.startswith("RE-MATCH")]
+        clock.seconds |= spent
         if way == "kNN":
             match, back = clock("full resolution", knn, source, target, motion)
             reverse = lambda back=back: back  # noqa: E731
@@ -416,7 +477,7 @@ def one_pair(source, target, methods, landmarks, load, truth, n_geodesic, option
             stem = way.removesuffix(" joint")
             if stem not in done:
                 shared = Clock()
-                done[stem] = *spectral_match(stem, source, target, motion, landmarks, shared, **options), shared.seconds
+                done[stem] = *spectral_match(stem, source, target, motion, marks, shared, **options), shared.seconds
             match, reverse, low, spent = done[stem]
             for block, seconds in spent.items():
                 clock.seconds[block] += seconds

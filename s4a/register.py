@@ -81,13 +81,18 @@ class Scan:
 def intrinsic_match(source, target, F_source, F_target):
     """Full-resolution match by nearest rows of U F: eq. 7 with F = Phi Y, eq. 4 with F = Phi C^T and Psi.
 
+    Functions that have a row for every original vertex are taken as they are.
+
     Returns
     -------
     match : int ndarray (n_target,)
     share : float
         Share of the comparisons of an exhaustive search that were needed.
     """
-    Q, D = target.U @ F_target.astype(np.float32), source.U @ F_source.astype(np.float32)
+    Q, D = (
+        F if len(F) == len(end.cell) else end.U @ F.astype(np.float32)
+        for end, F in ((target, F_target), (source, F_source))
+    )
     return nearest_in_cells(Q, target.cell, D, source.cell)
 
 

@@ -30,6 +30,8 @@ def found(brains):
 
 def test_every_method_has_every_metric_and_its_time_by_block(found):
     assert found["way"].values.tolist() == list(compare.METHODS)
+    assert found["chamfer"].dims == found["geodesic_error"].dims == ("way", "pair")
+    assert found["block_seconds"].dims == ("way", "pair", "block")
     assert found.sizes["pair"] == 2
     for name in ("geodesic_error", "straight_error", "chamfer", "hausdorff", "dirichlet", "coverage", "bijectivity"):
         assert set(found[name].dims) == {"way", "pair"}, name
@@ -64,8 +66,11 @@ def test_given_landmarks_make_up_for_a_rigid_alignment_that_is_wrong():
     turned = wavy.assign(position=wavy["position"] * [-1.0, -1.0, 1.0])
     same = np.arange(1500)
     some = same[::150]
-    found = compare.pair(wavy, turned, truth=same, landmarks=(some, some), methods=["RE-MATCH"], **SMALL)
+    found = compare.pair(wavy, turned, truth=same, landmarks=(some, some), methods=["RE-MATCH"], **SMALL | {"k": 40})
     assert found["geodesic_error"].item() < 0.02
+    places = wavy["position"].values[some], turned["position"].values[some]
+    again = compare.pair(wavy, turned, truth=same, landmarks=places, methods=["RE-MATCH"], **SMALL | {"k": 40})
+    assert again["geodesic_error"].item() == found["geodesic_error"].item()
 
 
 def test_truth_and_landmarks_of_files_count_the_rows_of_the_files(tmp_path):
@@ -135,6 +140,15 @@ def test_the_command_writes_table_file_and_figure(tmp_path, capsys):
         assert "geodesic_error" in found
     assert (out / "compare.png").stat().st_size > 5000
 
+    marks = meshes["brain_01"]["position"].values[:60:10]
+    for name, points in (("source", marks), ("target", marks[::-1])):
+        rows = "\n".join(f"{i},{x},{y},{z}" for i, (x, y, z) in enumerate(points))
+        (tmp_path / f"{name}.csv").write_text("name,x,y,z\n" + rows)
+    given = ["--methods", "RE-MATCH", "--landmarks", str(tmp_path / "source.csv"), str(tmp_path / "target.csv")]
+    assert main(["compare", one, two, *given, *options]) == 0
+    assert "RE-MATCH" in capsys.readouterr().out
+    assert main(["compare", one, two, *given[:-1], *options]) == 2
+    assert "a file for the source and each target" in capsys.readouterr().err
     assert main(["compare", "--collection", str(tmp_path), "--methods", "RE-MATCH", *options]) == 0
     assert "median shape" in capsys.readouterr().out
     assert main(["compare", one, *options]) == 2
