@@ -86,8 +86,8 @@ def intrinsic_match(source, target, F_source, F_target):
     Returns
     -------
     match : int ndarray (n_target,)
-    share : float
-        Share of the comparisons of an exhaustive search that were needed.
+    compared, certified : float
+        Shares of :func:`s4a.nearest.nearest_in_cells`.
     """
     Q, D = (
         F if len(F) == len(end.cell) else end.U @ F.astype(np.float32)
@@ -150,7 +150,7 @@ def at_full_resolution(source, target, low, embeddings):
     M, N, dense = source.dense, target.dense, {}
     for name in joint.finalists(low) if low else ["intrinsic"]:
         if name == "intrinsic":
-            match, info["compared_share"] = intrinsic_match(source, target, *embeddings)
+            match, info["compared_share"], info["certified_share"] = intrinsic_match(source, target, *embeddings)
             motion = joint.fitted(M, N, match[N.some])
             dense[name] = joint.badness(M, N, match[N.some], motion), motion
         else:

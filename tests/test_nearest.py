@@ -34,14 +34,14 @@ def clustered(n, d, seed, spread=0.05):
 def test_the_answer_is_that_of_an_exhaustive_search_on_random_rows_in_random_cells(d, first):
     rng = np.random.default_rng(d)
     Q, D = rng.normal(size=(1500, d)), rng.normal(size=(1200, d))
-    found, _ = nearest_in_cells(Q, rng.integers(0, 37, 1500), D, rng.integers(0, 29, 1200), first=first)
+    found, *_ = nearest_in_cells(Q, rng.integers(0, 37, 1500), D, rng.integers(0, 29, 1200), first=first)
     assert check(Q, D, found) > (0.99 if d > 1 else 0.9)
 
 
 @pytest.mark.parametrize("first", [1, 12])
 def test_the_answer_is_that_of_an_exhaustive_search_on_clusters_with_few_comparisons(first):
     (Q, cell_q), (D, cell_d) = clustered(3000, 20, 1), clustered(2500, 20, 2)
-    found, share = nearest_in_cells(Q, cell_q, D, cell_d, first=first)
+    found, share, _ = nearest_in_cells(Q, cell_q, D, cell_d, first=first)
     assert check(Q, D, found) > 0.999
     assert share < (0.1 if first == 1 else 0.5)
 
@@ -49,7 +49,7 @@ def test_the_answer_is_that_of_an_exhaustive_search_on_clusters_with_few_compari
 def test_rows_far_from_the_origin_lose_nothing():
     (Q, cell_q), (D, cell_d) = clustered(2000, 20, 3), clustered(2000, 20, 4)
     far = np.full(20, 300.0)
-    found, _ = nearest_in_cells(Q + far, cell_q, D + far, cell_d)
+    found, *_ = nearest_in_cells(Q + far, cell_q, D + far, cell_d)
     assert (found == gaps(Q, D).argmin(1)).all()
 
 
@@ -58,23 +58,34 @@ def test_rows_that_are_nearly_the_same_are_found_across_cells():
     D = rng.normal(size=(2000, 30))
     order = rng.permutation(2000)
     Q = D[order] + 1e-4 * rng.normal(size=D.shape)
-    found, _ = nearest_in_cells(Q, rng.integers(0, 50, 2000), D, rng.integers(0, 50, 2000), first=1)
+    found, *_ = nearest_in_cells(Q, rng.integers(0, 50, 2000), D, rng.integers(0, 50, 2000), first=1)
     assert (found == order).all()
 
 
 def test_the_numbering_of_the_cells_does_not_matter():
     (Q, cell_q), (D, cell_d) = clustered(1000, 10, 6), clustered(900, 10, 7)
-    one, share = nearest_in_cells(Q, cell_q, D, cell_d)
+    one, share, _ = nearest_in_cells(Q, cell_q, D, cell_d)
     numbers = np.random.default_rng(0).choice(10**6, 40, replace=False)  # most numbers are of empty cells
-    two, same = nearest_in_cells(Q, numbers[cell_q], D, numbers[::-1][cell_d])
+    two, same, _ = nearest_in_cells(Q, numbers[cell_q], D, numbers[::-1][cell_d])
     assert (one == two).all()
     assert share == pytest.approx(same, abs=0.02)
+
+
+def test_queries_far_from_all_other_cells_are_certified_and_those_between_two_are_not():
+    rng = np.random.default_rng(2)
+    cell = np.repeat(np.arange(10), 50)
+    D = 100.0 * np.eye(10)[cell] + rng.normal(size=(500, 10))
+    assert nearest_in_cells(D, cell, D, cell, first=1)[2] == 1
+    between = 50.0 * (np.eye(10)[0] + np.eye(10)[1]) + rng.normal(size=(30, 10))
+    found, _, certified = nearest_in_cells(between, np.zeros(30, int), D, cell, first=1)
+    assert certified < 0.5
+    assert check(between, D, found) == 1
 
 
 def test_a_single_cell_is_an_exhaustive_search():
     rng = np.random.default_rng(8)
     Q, D = rng.normal(size=(50, 4)), rng.normal(size=(60, 4))
-    found, share = nearest_in_cells(Q, np.zeros(50, int), D, np.zeros(60, int))
+    found, share, _ = nearest_in_cells(Q, np.zeros(50, int), D, np.zeros(60, int))
     assert share == 1
     assert check(Q, D, found) == 1
 

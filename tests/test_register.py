@@ -82,6 +82,7 @@ def test_the_paper_way_finds_a_correspondence_too_and_says_so(template, deformed
     found = match_pair(deformed, template, refine="intrinsic", init="landmarks", **OPTIONS)
     assert found.attrs["method"] == "intrinsic"
     assert 0 < found.attrs["compared_share"] < 1
+    assert 0 < found.attrs["certified_share"] <= 1
     gap = deformed["position"].values[found["match"].values] - deformed["position"].values
     assert np.linalg.norm(gap, axis=1).mean() < 0.03 * size
 

@@ -2,14 +2,15 @@
 
 Every row runs in a process of its own with one BLAS thread, ours and the other in turn, on the same input: seconds of
 CPU, of the clock, and the peak of memory above what the process holds before.  pyFM is on PyPI as ``pyfmaps`` (the
-extra ``bench``).  ``speed.py stages``, ``pipelines`` or ``growth`` runs one part, ``speed.py whole 51 100000`` the
-whole analysis of so many synthetic shapes of so many vertices.
+extra ``bench``).  ``speed.py stages``, ``pipelines``, ``growth`` or ``nearest`` runs one part, ``speed.py whole 51
+100000`` the whole analysis of so many synthetic shapes of so many vertices.
 """
 
 import itertools
 import multiprocessing
 import os
 import resource
+import subprocess
 import sys
 import tempfile
 import time
@@ -24,10 +25,12 @@ import s4a
 from s4a import fmap, latent, network, register, synthetic
 from s4a.align import align, farthest_points
 from s4a.fmap import nearest_rows
+from s4a.io import find_meshes
 from s4a.mesh import as_arrays, triangle_areas
 from s4a.nearest import nearest_in_cells
 from s4a.pca import gram_pca
 
+DATA = Path(__file__).parents[3] / "shared" / "data"
 VERTICES, NETWORK, K_INIT, K = 100_000, 10, 20, 100
 HEAD = f"{'stage':36} {'':34} {'CPU s':>8} {'wall s':>8} {'MiB':>8} {'ratio':>7}"
 
@@ -452,6 +455,34 @@ def growth(folder):
             say(f"{stage:36} {'  '.join(f'{t:8.2f}' for t in seconds)}   exponent {slope:5.2f}")
 
 
+def certificates(folder, n_checked=1000):
+    """The dense search of eq. 4 on two shapes of every real collection: what the bound leaves to compare."""
+    if not DATA.is_dir():
+        return
+    say(f"\nNearest neighbours on real shapes: {K} dims, first shape -> second; {n_checked} checked in float64\n")
+    subprocess.run([sys.executable, DATA / "unpack.py", folder], check=True, stdout=subprocess.DEVNULL)
+    for one in sorted(p for p in folder.iterdir() if p.is_dir()):
+        files = [file for file, _ in find_meshes(one)][:2]
+        if len(files) < 2:
+            continue
+        meshes = [s4a.read_shape(file) for file in files]
+        M, N = (register.Scan(mesh, s4a.spectrum(s4a.coarsen(mesh), k=K)) for mesh in meshes)
+        motion = align(M.low.X, M.low.area, N.low.X, N.low.area)[:2]
+        C = network.first_map(pipeline_low(M), pipeline_low(N), motion, k_init=K_INIT)
+        C = fmap.zoomout(C, M.low.Phi, N.low.Phi, N.low.area, min(K, M.low.Phi.shape[1], N.low.Phi.shape[1]))[0]
+        F = M.low.Phi[:, : C.shape[1]] @ C.T, N.low.Phi[:, : C.shape[0]]
+        begin = time.process_time()
+        index, compared, certified = register.intrinsic_match(M, N, *F)
+        seconds = time.process_time() - begin
+        D, some = M.U @ F[0], np.linspace(0, len(index) - 1, n_checked).astype(int)
+        gap = np.linalg.norm(N.U[some] @ F[1] - D[index[some]], axis=1)
+        least = cKDTree(D).query(N.U[some] @ F[1])[0]
+        say(
+            f"{one.name:10} {len(D):8,} x {len(index):8,}  {seconds:6.2f} s  compared {100 * compared:6.3f} %  "
+            f"certified at once {100 * certified:6.2f} %  farther than the nearest by at most {(gap - least).max():.1e}"
+        )
+
+
 def whole(folder, n=51, n_vertices=VERTICES):
     """One collection on all cores: the table of stages of the report."""
     paths, _ = collection(n, n_vertices, folder / "files")
@@ -464,10 +495,10 @@ def whole(folder, n=51, n_vertices=VERTICES):
         say(f"{stage:36} {seconds:8.1f} s {memory:8.0f} MiB")
 
 
-PARTS = {"stages": stages, "pipelines": pipelines, "growth": growth, "whole": whole}
+PARTS = {"stages": stages, "pipelines": pipelines, "growth": growth, "nearest": certificates, "whole": whole}
 
 if __name__ == "__main__":
     part, *numbers = sys.argv[1:] or [""]
-    for run in [PARTS[part]] if part else [stages, pipelines, growth]:
+    for run in [PARTS[part]] if part else [stages, pipelines, growth, certificates]:
         with tempfile.TemporaryDirectory() as folder:
             run(Path(folder), *map(int, numbers))
