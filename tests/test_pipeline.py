@@ -11,7 +11,7 @@ import pytest
 import xarray as xr
 from scipy.spatial.transform import Rotation
 
-from s4a import accuracy, analyse, open_study, study, synthesize, synthetic
+from s4a import accuracy, analyse, open_study, statistics, study, synthesize, synthetic
 from s4a.mesh import as_arrays, vertex_areas
 
 OPTIONS = {"n_coarse": 600, "k_init": 12, "k": 30, "n_jobs": 1}
@@ -269,13 +269,36 @@ def test_two_shapes_have_no_modes_and_the_study_says_why(meshes):
         synthesize(tree, [1.0])
 
 
-def test_identical_shapes_have_no_modes_and_all_distances_are_zero(meshes):
+def test_shapes_that_differ_in_pose_alone_do_not_differ(meshes):
     X, T = meshes["brain_01"]
     R = Rotation.from_rotvec([0.05, 0.1, 0]).as_matrix()
     tree = analyse({"a": (X, T), "b": (X, T), "c": (X @ R.T + 9, T)}, **OPTIONS)
     assert np.abs(tree["registration"]["displacement"]).max() < 1e-3
     assert tree["latent"]["distance_to_median"].max() < 1e-3
     assert tree["network"]["cycle_error"].max() < 1e-3
+
+
+@pytest.mark.parametrize(
+    "given, no_modes",
+    [
+        ("aa", "PCA needs at least 3 shapes, found 2"),
+        ("aaa", "PCA needs shapes that differ; all displacements are equal"),
+        ("aab", ""),
+    ],
+)
+def test_identical_shapes_give_finite_results_and_modes_only_beside_a_shape_that_differs(meshes, given, no_modes):
+    mesh = {"a": meshes["brain_01"], "b": meshes["brain_02"]}
+    tree = analyse({f"s{i}": mesh[one] for i, one in enumerate(given)}, **OPTIONS)
+    for node in tree.subtree:
+        for name, data in node.to_dataset(inherit=False).data_vars.items():
+            if data.dtype.kind == "f" and (len(given) > 2 or "cycle" not in name):  # two shapes make no 3-cycle
+                assert np.isfinite(data).all(), f"{node.path} {name}"
+    assert np.abs(tree["registration"]["displacement"].sel(shape=["s0", "s1"]).diff("shape")).max() < 1e-3
+    assert tree["report"].attrs["no_modes"] == no_modes
+    assert ("pca" in tree) == (not no_modes)
+    assert "the median is not unique" in tree["report"].attrs["remarks"]
+    with pytest.raises(ValueError, match="statistics need at least 4 shapes"):
+        statistics.evaluate(tree)
 
 
 def test_one_usable_shape_is_not_enough_and_the_reasons_are_named(meshes):

@@ -49,10 +49,10 @@ PROOFS = [
         "test_two_shapes_have_no_modes_and_the_study_says_why",
     ),
     (
-        "all shapes identical",
-        "all distances zero, no NaN",
+        "two identical shapes, among others or alone; all shapes identical",
+        "maps and median; all distances zero, no NaN; modes only where shapes differ, else the reason; tests refuse",
         PIPELINE,
-        "test_identical_shapes_have_no_modes_and_all_distances_are_zero",
+        "test_identical_shapes_give_finite_results_and_modes_only_beside_a_shape_that_differs",
     ),
     (
         "fewer than k eigenfunctions",
