@@ -32,8 +32,12 @@ def smoothed(S, R, B, rounds=ROUNDS, least=LEAST):
     B = B + step
     for _ in range(rounds - 1):
         last, ratio = ratio, 1 / (2 * middle / half - ratio)
-        step = np.float32(ratio * last) * step + np.float32(2 * ratio / half) * (R - S @ B)
-        B = B + step
+        rest = S @ B
+        np.subtract(R, rest, out=rest)
+        rest *= np.float32(2 * ratio / half)
+        step *= np.float32(ratio * last)
+        step += rest
+        B += step
     return B
 
 
@@ -72,11 +76,11 @@ def inverse_step(W, area, U, W_coarse, area_coarse, Phi, eigenvalue):
     return smoothed(S, R, B)
 
 
-def rayleigh_ritz(W, area, B):
-    """The best eigenpairs in the span of B, ascending: eigenvalues (k,), and B times the coefficients ``(n, k)``."""
+def rayleigh_ritz(W, area, B, k):
+    """The k least eigenpairs in the span of B: eigenvalues (k,), and B times the coefficients ``(n, k)``."""
     stiff, mass = B.T @ (W.astype(B.dtype) @ B), B.T @ (area.astype(B.dtype)[:, None] * B)
     eigenvalue, V = scipy.linalg.eigh((stiff + stiff.T).astype(float) / 2, (mass + mass.T).astype(float) / 2)
-    return eigenvalue, B @ V.astype(B.dtype)
+    return eigenvalue[:k], B @ V[:, :k].astype(B.dtype)
 
 
 def lift(X, T, area, U, coarse, k):
@@ -117,6 +121,6 @@ def lift(X, T, area, U, coarse, k):
     B = inverse_step(W, area, U, stiffness(E, w, len(a)), a / a.sum(), Phi, eigenvalue)
     zero = eigenvalue == 0
     B[:, zero] = U @ Phi[:, zero]  # the constants of the pieces are eigenfunctions as they are
-    eigenvalue, B = rayleigh_ritz(W, area, B)
-    B = B[:, :k] * np.where(area @ B[:, :k] ** 3 < 0, np.float32(-1), np.float32(1))
-    return np.maximum(eigenvalue[:k], 0.0), B
+    eigenvalue, B = rayleigh_ritz(W, area, B, k)
+    B *= np.where(np.einsum("n,nk,nk,nk->k", area.astype(B.dtype), B, B, B) < 0, -1, 1).astype(B.dtype)
+    return np.maximum(eigenvalue, 0.0), B
