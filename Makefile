@@ -10,7 +10,7 @@ demo: $(VENV)/.core
 	$(BIN)/s4a demo
 
 test: check
-	$(BIN)/python -m pytest -n logical --dist loadfile
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --dist loadfile  # one process a core, one thread a process
 
 check: $(VENV)/.test
 	$(BIN)/ruff check .

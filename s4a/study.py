@@ -162,7 +162,9 @@ def opened(path):
             else:
                 values = indexing.LazilyIndexedArray(Stored(path, stored, attrs.get("task_key")))
             variables[name] = xr.Variable(dims, values, _attributes(stored))
-    return xr.decode_cf(xr.Dataset(variables, attrs=attrs), decode_times=False)
+    data = xr.decode_cf(xr.Dataset(variables, attrs=attrs), decode_times=False)
+    data.encoding["source"] = str(path)
+    return data
 
 
 def _attributes(stored):

@@ -1,5 +1,6 @@
 """The course runs: every notebook from a clean kernel, its exercises without an answer and with the one of the book."""
 
+import asyncio
 import json
 import re
 from pathlib import Path
@@ -37,24 +38,24 @@ def exercises(notebook):
             yield i, re.search(r"```python\n(.*?)\n```", solution, re.DOTALL)[1]
 
 
-def added(client, source):
+async def added(client, source):
     """Run code that is not in the notebook; what it shows as text."""
     cell = nbformat.v4.new_code_cell(source)
     client.nb.cells.append(cell)
-    client.execute_cell(cell, len(client.nb.cells) - 1)
+    await client.async_execute_cell(cell, len(client.nb.cells) - 1)
     return "".join(o["data"]["text/plain"] for o in cell.outputs if o.output_type == "execute_result")
 
 
-def played(path, folder):
+async def played(path, folder):
     """Run a notebook from a clean kernel, every exercise open and solved; its seconds of CPU and peak memory in MiB."""
     notebook = nbformat.read(path, as_version=4)
     solutions = dict(exercises(notebook))
     client = nbclient.NotebookClient(
         notebook, timeout=150, kernel_name="python3", resources={"metadata": {"path": str(folder)}}
     )
-    with client.setup_kernel():
+    async with client.async_setup_kernel():
         for i, cell in enumerate(list(notebook.cells)):
-            client.execute_cell(cell, i)  # CellExecutionError where it fails and may not
+            await client.async_execute_cell(cell, i)  # CellExecutionError where it fails and may not
             outputs = cell.get("outputs", [])
             told = [o for o in outputs if o.output_type == "stream" and o.name == "stderr" and "Warning" in o.text]
             assert not told, told
@@ -63,16 +64,19 @@ def played(path, folder):
                 assert [name for name, _ in errors] == ["AssertionError"], cell.source
                 assert re.match("No answer yet: .*Hint: .{10,}", errors[0][1])
                 assert cell.source.count(OPEN) == 1
-                assert added(client, cell.source.replace(OPEN, solutions[i])) == "'Right.'"
-        return json.loads(added(client, SPENT).strip("'"))
+                assert await added(client, cell.source.replace(OPEN, solutions[i])) == "'Right.'"
+        return json.loads((await added(client, SPENT)).strip("'"))
 
 
 @each_notebook
 def test_it_runs_and_its_exercises_fail_open_and_pass_solved(path, tmp_path, record_property):
-    try:
-        spent = played(path, tmp_path)
-    except nbclient.exceptions.CellTimeoutError:  # once in many runs a kernel is idle while the client waits for it
-        spent = played(path, tmp_path)
+    for tries_left in (2, 1, 0):
+        try:
+            spent = asyncio.run(played(path, tmp_path))
+            break
+        except nbclient.exceptions.CellTimeoutError:  # once in many runs a kernel is idle while the client waits for it
+            if not tries_left:
+                raise
     record_property("notebook", (path.stem, spent["seconds"], spent["MiB"]))
     assert spent["MiB"] < MEMORY
 
