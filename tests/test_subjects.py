@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from s4a import analyse, cli, insert, open_study, statistics, synthetic
+from s4a import analyse, cli, commands, insert, open_study, statistics, synthetic
 from s4a.subjects import read_table, with_table
 
 OPTIONS = {"n_coarse": 300, "k_init": 8, "k": 12, "n_jobs": 1}
@@ -112,7 +112,9 @@ def test_a_table_can_take_the_place_of_the_first(folder):
 
 
 def test_the_command_prints_tables_and_writes_files(folder, capsys, monkeypatch):
-    monkeypatch.setattr(cli, "write_page", lambda tree, file, **_: file.write_text(str(tree["pca"].sizes["component"])))
+    monkeypatch.setattr(
+        commands, "write_page", lambda tree, file, **_: file.write_text(str(tree["pca"].sizes["component"]))
+    )
     command = ["statistics", str(folder / "study"), "--group", "sex", "--variable", "age", "--permutations", "19"]
     assert cli.main([*command, "--recompute", "--n-jobs", "1"]) == 0
     said, out = capsys.readouterr().out, folder / "study" / "statistics"

@@ -11,7 +11,7 @@ from pathlib import Path
 import s4a
 from s4a import synthetic
 from s4a.accuracy import accuracy
-from s4a.cli import error_table
+from s4a.tables import error_table
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 

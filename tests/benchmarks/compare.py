@@ -18,8 +18,8 @@ from threadpoolctl import threadpool_limits
 import s4a
 from s4a import compare, metrics, synthetic
 from s4a.align import farthest_points
-from s4a.cli import METRICS, block_table, collection_table, comparison_table, table
 from s4a.schema import variable
+from s4a.tables import METRICS, block_table, collection_table, comparison_table, table
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 CORRESPONDING = {"faust15k": 6890}  # of these only the first vertices correspond
