@@ -21,6 +21,7 @@ from s4a.annotations import labels_of_file, labels_of_mesh, read_labels, read_la
 from s4a.export import write_registered, write_results
 from s4a.insert import insert as place
 from s4a.io import find_meshes, read_mesh, stem_of
+from s4a.landmarks import locate
 from s4a.picture import write_animation, write_picture
 from s4a.pipeline import analyse
 from s4a.shapes import read_shape, read_shapes
@@ -174,7 +175,7 @@ def transfer(args):
         label = labels_of_mesh(read_labels(args.labels, source.sizes["file_vertex_index"]), source)
     if args.landmarks:
         landmarks = read_landmarks(args.landmarks)
-        distance = travel.locate(landmarks, source)["landmark_distance"].values
+        distance = locate(landmarks, source)["landmark_distance"].values
         write(f"{len(distance)} landmarks, at most {distance.max():.3g} from the surface of {args.source}")
     if len(args.targets) == 1 and (Path(args.targets[0]) / "registration.nc").is_file():
         study, excluded = open_study(args.targets[0]), []

@@ -26,10 +26,11 @@ from s4a import (
     write_mesh,
 )
 from s4a.annotations import labels_of_file, labels_of_mesh, read_labels, read_landmarks, write_landmarks
+from s4a.landmarks import locate
 from s4a.link import at, closest_facing_point, closest_point, elect, interpolation
 from s4a.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.schema import dataset
-from s4a.transfer import locate, pair_study
+from s4a.transfer import pair_study
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 OPTIONS = {"n_coarse": 1200, "k": 60}
