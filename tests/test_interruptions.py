@@ -11,8 +11,8 @@ import psutil
 import pytest
 
 from s4a import analyse, study, synthetic
-from s4a.pipeline import Run
 from s4a.schema import dataset
+from s4a.tasks import Run
 
 OPTIONS = {"n_coarse": 150, "k_init": 8, "k": 12}
 RUN = """
