@@ -1,21 +1,26 @@
 """Cleaning: from the triangles of a file to an oriented manifold surface, before everything else (4.1).
 
-A triangle corner is counted as half-edges are: corner h = i m + t is corner i of triangle t, and half-edge h runs from
-it to the next corner of the triangle (:func:`s4a.mesh.directed_edges`).  Two half-edges that the surface joins are
-mates; the rest of the topology follows from the mates.
+What makes the triangles a manifold, edge by edge, is in :mod:`s4a.manifold`, which says how half-edges are counted.
 """
 
 import numpy as np
-import scipy.sparse as sp
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from s4a import holes
-from s4a.mesh import as_arrays, as_dataset, triangle_areas, triangle_normals, unique_edges
+from s4a.manifold import cheapest, manifold_mates, mates, split_double_edges, umbrellas
+from s4a.mesh import (
+    as_arrays,
+    as_dataset,
+    components,
+    euler_characteristic,
+    n_used,
+    triangle_areas,
+    triangle_normals,
+    unique_edges,
+)
 from s4a.schema import require
 
 RELATIVE_TOLERANCE = 1e-7  # of the diagonal of the bounding box: nearer vertices are one, lower triangles are flat
-MOST_AROUND_EDGE = 16  # an edge with more triangles is cut; pairing them would need their number squared
 
 REPAIRS = {
     "nonfinite_vertices": "non-finite vertices removed",
@@ -106,17 +111,17 @@ def clean_arrays(points, triangles, *, components="largest", strict=False, close
     """
     P, F = _validated(points, triangles, components)
     counts = {"file_vertices": len(P), "file_triangles": len(F), **dict.fromkeys(REPAIRS, 0)}
-    counts["unreferenced_vertices"] = int(len(P) - len(_used(F)))
+    counts["unreferenced_vertices"] = len(P) - n_used(F)
     F = _drop_nonfinite(P, F, strict, counts)
     group, tolerance = _weld(P, F, counts)
     F = _drop_repeated(F, group, counts)
     F = _flip_flat(P, F, group, tolerance, counts)
     if len(F) == 0:
         raise ValueError(f"a surface needs triangles with area; none of the {counts['file_triangles']} has any")
-    F, mate = _mates(P, F, group, counts)
-    V, file_vertex = _umbrellas(F, mate)
-    counts["split_vertices"] = int(len(file_vertex) - len(_used(group[F])))
-    X, T, file_vertex = _split_double_edges(P[file_vertex], V, file_vertex, mate, counts)
+    F, mate = mates(P, F, group, counts)
+    V, file_vertex = umbrellas(F, mate)
+    counts["split_vertices"] = len(file_vertex) - n_used(group[F])
+    X, T, file_vertex = split_double_edges(P[file_vertex], V, file_vertex, mate, counts)
     X, T, kept = _largest_components(X, T, components, counts)
     new = np.cumsum(kept) - 1
     new[~kept] = -1
@@ -182,7 +187,7 @@ def _drop_nonfinite(P, F, strict, counts):
 
 def _weld(P, F, counts):
     """For each row of P the number of its group of coincident vertices (-1 where no triangle uses it)."""
-    used = _used(F)
+    used = np.flatnonzero(np.bincount(F.ravel()))
     X = P[used]
     side = _sides(P, F)
     if not side.any():
@@ -195,10 +200,10 @@ def _weld(P, F, counts):
     exact = np.empty(len(X), np.int64)
     exact[order] = np.cumsum(first) - 1
     near = _near_pairs(X[order[first]], tolerance)
-    n_groups, label = connected_components(_graph(near, first.sum()), directed=False)
+    label = components(near, first.sum())
     group = np.full(len(P), -1)
     group[used] = label[exact]
-    counts["welded_vertices"] = int(len(used) - n_groups)
+    counts["welded_vertices"] = int(len(used) - label.max() - 1)
     return group, tolerance
 
 
@@ -244,9 +249,7 @@ def _touching_sheets(T, even):
     triangle = np.tile(np.arange(len(T)), 3)
     inside = even[triangle]
     n_inside = np.bincount(edge_of, inside, len(E)).astype(int)
-    _, patch = connected_components(
-        _graph(np.stack([triangle[inside], len(T) + edge_of[inside]], axis=1), len(T) + len(E)), directed=False
-    )
+    patch = components(np.stack([triangle[inside], len(T) + edge_of[inside]], axis=1), len(T) + len(E))
     around = inside & (n_inside[edge_of] % 2 == 1)
     outside = (count - n_inside)[edge_of[around]]
     votes = np.where(outside == 0, 0, np.where(outside % 2 == 0, 1, -1))
@@ -287,7 +290,7 @@ def _flips(P, F, group, flat, tolerance):
     E, edge_of, count = unique_edges(group[F], len(P))
     half = flat + m * _heights(P, F[flat])[1]
     at_boundary = flat[count[edge_of[half]] == 1]
-    mate = _manifold_mates(edge_of, count)[half]
+    mate = manifold_mates(edge_of, count)[half]
     half, mate = half[mate >= 0], mate[mate >= 0]
     # the neighbour across keeps its orientation: it has the area
     p, q, d, b = f[mate], f[(mate + m) % (3 * m)], f[(mate + 2 * m) % (3 * m)], f[(half + 2 * m) % (3 * m)]
@@ -297,7 +300,7 @@ def _flips(P, F, group, flat, tolerance):
     height = _heights(P, flipped.reshape(-1, 3))[0].reshape(-1, 2).min(axis=1)
     good = (group[b] != group[d]) & ~np.isin(key, E @ [len(P), 1]) & ((height > tolerance) | (new < old))
     good = np.flatnonzero(good)
-    good = good[_cheapest(-old[good], pairs[good])]
+    good = good[cheapest(-old[good], pairs[good])]
     good = good[np.unique(key[good], return_index=True)[1]]
     return flipped[good], pairs[good], at_boundary
 
@@ -315,163 +318,21 @@ def _sides(P, F):
     return np.stack([np.sqrt(np.einsum("ij,ij->i", d, d)) for d in gaps], axis=1)
 
 
-def _cheapest(cost, ends):
-    """Greedy matching: mask of the pairs taken in order of cost, each end once; ends ``(c, 2)`` int."""
-    if len(cost) == 0:
-        return np.zeros(0, bool)
-    rank = np.argsort(np.argsort(cost, kind="stable"))
-    items, ends = np.unique(ends, return_inverse=True)
-    ends = ends.reshape(-1, 2)
-    taken, used, open_ = np.zeros(len(cost), bool), np.zeros(len(items), bool), np.arange(len(cost))
-    while len(open_):
-        best = np.full(len(items), len(cost))
-        np.minimum.at(best, ends[open_], rank[open_, None])
-        win = open_[(best[ends[open_]] == rank[open_, None]).all(axis=1)]
-        taken[win], used[ends[win]] = True, True
-        open_ = open_[~used[ends[open_]].any(axis=1)]
-    return taken
-
-
-def _manifold_mates(edge_of, count):
-    """The mate of each half-edge on edges with two triangles, else -1."""
-    order = np.argsort(edge_of, kind="stable")
-    first = (np.cumsum(count) - count)[count == 2]
-    mate = np.full(len(edge_of), -1)
-    mate[order[first]], mate[order[first + 1]] = order[first + 1], order[first]
-    return mate
-
-
-def _mates(P, F, group, counts):
-    """The triangles oriented consistently, and the mate of each half-edge, -1 at boundaries and cuts."""
-    _, edge_of, count = unique_edges(group[F], len(P))
-    F, mate = _orient(P, F, group, _manifold_mates(edge_of, count), counts)
-    if (count > 2).any():
-        _, edge_of, count = unique_edges(group[F], len(P))
-        counts["nonmanifold_edges"] = int((count > 2).sum())
-        pairs, cost = _pairs_around_edges(P, F, group, edge_of, count)
-        pairs = pairs[_cheapest(cost, pairs)]
-        mate[pairs], mate[pairs[:, ::-1]] = pairs[:, ::-1], pairs
-        F, mate = _orient(P, F, group, mate, counts)
-    counts["cut_edges"] = int((mate < 0).sum() - (count == 1).sum())
-    return F, mate
-
-
-def _pairs_around_edges(P, F, group, edge_of, count):
-    """All pairs of half-edges on each non-manifold edge ``(c, 2)``, and how badly each continues the surface ``(c,)``.
-
-    The cost is 1 - cos of the bend, more for a pair that disagrees in orientation; between equal bends the pair that
-    encloses less of the inside goes first, so that solids that touch in an edge come apart.
-    """
-    order, first = np.argsort(edge_of, kind="stable"), np.cumsum(count) - count
-    pairs = [np.empty((0, 2), np.int64)]
-    for k in range(3, MOST_AROUND_EDGE + 1):
-        around = order[first[count == k][:, None] + np.arange(k)]
-        pairs += [around[:, [i, j]] for i in range(k) for j in range(i + 1, k)]
-    pairs = np.concatenate(pairs)
-    m, start = len(F), group[F].T.ravel()
-    N = triangle_normals(P, F)
-    N /= np.maximum(np.linalg.norm(N, axis=1, keepdims=True), np.finfo(float).tiny)  # some have lost theirs to rounding
-    one, other = N[pairs[:, 0] % m], N[pairs[:, 1] % m]
-    twisted = start[pairs[:, 0]] == start[pairs[:, 1]]
-    cos = np.einsum("ij,ij->i", one, other) * np.where(twisted, -1, 1)
-    file_vertex = F.T.ravel()
-    towards = P[file_vertex[(pairs[:, 1] + 2 * m) % (3 * m)]] - P[file_vertex[pairs[:, 0]]]
-    convex = np.einsum("ij,ij->i", one, towards) < 0
-    return pairs, np.round(1 - cos, 6) + 4 * twisted - 1e-7 * convex
-
-
-def _orient(P, F, group, mate, counts):
-    """Triangles turned so that mates run against each other, most of the area of each patch as it was.
-
-    A triangle stands for two nodes, as it is and reversed; a patch whose two copies are connected cannot be oriented
-    (a Moebius strip), and is cut where the file's orientation changes.
-    """
-    m = len(F)
-    h = np.flatnonzero(mate > np.arange(3 * m))
-    g = mate[h]
-    start = group[F].T.ravel()
-    twisted = start[h] == start[g]
-    if not twisted.any():
-        return F, mate
-    t, u = h % m, g % m
-    ends = np.stack([np.r_[t, t + m], np.r_[u + m * twisted, u + m * ~twisted]], axis=1)
-    n_labels, label = connected_components(_graph(ends, 2 * m), directed=False)
-    same, turned = label[:m], label[m:]
-    area = np.bincount(same, triangle_areas(P, F), n_labels)
-    flip = (area[turned] > area[same]) | ((area[turned] == area[same]) & (turned < same))
-    cut = twisted & (same == turned)[t]
-    mate[h[cut]] = mate[g[cut]] = -1
-    counts["reoriented_triangles"] += int(flip.sum())
-    return _reverse(F, mate, np.flatnonzero(flip))
-
-
-def _reverse(F, mate, t):
-    """Triangles t with corners 0 and 1 exchanged, so that their half-edge 0 stays and 1 and 2 trade places."""
-    m, F = len(F), F.copy()
-    F[t] = F[t][:, [1, 0, 2]]
-    moved = np.arange(3 * m)
-    moved[t + m], moved[t + 2 * m] = t + 2 * m, t + m
-    mate = mate[moved]
-    return F, np.where(mate >= 0, moved[mate], -1)
-
-
-def _umbrellas(F, mate):
-    """Vertices as the sets of corners that mates join: ``(m, 3)``, and the smallest file vertex of each.
-
-    A bow-tie or the end of a separated edge falls apart into one vertex per umbrella.
-    """
-    m = len(F)
-    h = np.flatnonzero(mate > np.arange(3 * m))
-    g = mate[h]
-    ends = np.stack([np.r_[h, (h + m) % (3 * m)], np.r_[(g + m) % (3 * m), g]], axis=1)
-    n, label = connected_components(_graph(ends, 3 * m), directed=False)
-    file_vertex = np.full(n, np.iinfo(np.int64).max)
-    np.minimum.at(file_vertex, label, F.T.ravel())
-    order = np.argsort(file_vertex, kind="stable")
-    return np.argsort(order)[label].reshape(3, m).T, file_vertex[order]
-
-
-def _split_double_edges(X, V, file_vertex, mate, counts):
-    """Two sheets may share both ends of an edge and still be apart: each gets its own midpoint there."""
-    m, n = len(V), len(X)
-    E, edge_of, count = unique_edges(V, n)
-    start = V.T.ravel()
-    turn = np.bincount(edge_of, np.where(start < np.roll(start, -m), 1, -1))
-    half = np.flatnonzero(((count > 2) | ((count == 2) & (turn != 0)))[edge_of])
-    if len(half) == 0:
-        return X, V, file_vertex
-    sheet = np.where(mate[half] >= 0, np.minimum(mate[half], half), half)
-    sheets, middle = np.unique(sheet, return_inverse=True)
-    M = np.full(3 * m, -1)
-    M[half] = n + middle
-    M = M.reshape(3, m).T
-    t = np.flatnonzero((M >= 0).any(axis=1))
-    turn = ((M[t] >= 0).argmax(axis=1)[:, None] + np.arange(3)) % 3
-    (p, q, r), (a, b, c) = np.take_along_axis(V[t], turn, 1).T, np.take_along_axis(M[t], turn, 1).T
-    b, c = np.where(b < 0, r, b), np.where(c < 0, p, c)
-    fan = np.concatenate([np.stack(x, axis=1) for x in ((a, q, b), (a, b, r), (a, r, c), (a, c, p))])
-    fan = fan[(fan[:, 0] != fan[:, 2]) & (fan[:, 1] != fan[:, 2])]
-    ends = E[edge_of[sheets]]
-    counts["inserted_vertices"] = len(sheets)
-    X = np.concatenate([X, X[ends].mean(axis=1)])
-    return X, np.concatenate([np.delete(V, t, axis=0), fan]), np.r_[file_vertex, file_vertex[ends].min(axis=1)]
-
-
-def _largest_components(X, T, components, counts):
+def _largest_components(X, T, wanted, counts):
     """The components asked for, outwards, in the old numbering; and the mask of their vertices."""
-    edges = np.concatenate([T[:, :2], T[:, 1:]])
-    n, label = connected_components(_graph(edges, len(X)), directed=False)
+    label = components(np.concatenate([T[:, :2], T[:, 1:]]), len(X))
+    n = label.max() + 1
     areas = triangle_areas(X, T)
     area = np.bincount(label[T[:, 0]], areas, n)
     order = np.argsort(-area, kind="stable")
     share = area[order[0]] / area.sum()
-    if components == "largest" and share < 0.5:
+    if wanted == "largest" and share < 0.5:
         raise ValueError(
             f"the largest of {n} components has {100 * share:.1f} % of the area, under half; say how many belong to "
             f"the shape: components={int(np.searchsorted(np.cumsum(area[order]), 0.9 * area.sum())) + 1} "
             f'holds 90 %, components="all" keeps all'
         )
-    number = {"largest": 1, "all": n}.get(components, components)
+    number = {"largest": 1, "all": n}.get(wanted, wanted)
     keep = np.zeros(n, bool)
     keep[order[:number]] = True
     counts["components"], counts["dropped_components"] = int(n), int(n - keep.sum())
@@ -504,8 +365,8 @@ def _count_topology(T, counts):
     E, _, count = unique_edges(T)
     rim = E[count == 1]
     vertex, rim_ends = np.unique(rim, return_inverse=True)
-    holes = connected_components(_graph(rim_ends.reshape(-1, 2), len(vertex)))[0] if len(rim) else 0
-    chi = len(_used(T)) - len(E) + len(T)
+    holes = components(rim_ends.reshape(-1, 2), len(vertex)).max(initial=-1) + 1
+    chi = euler_characteristic(T, E)
     kept = counts["components"] - counts["dropped_components"]
     counts |= {"holes": int(holes), "euler_characteristic": int(chi), "genus": int(2 * kept - holes - chi) // 2}
 
@@ -521,11 +382,3 @@ def _vertex_of_file(group, new, file_vertex):
     own = first(file_vertex, len(group))
     welded = np.r_[first(group[file_vertex], group.max() + 1), -1]
     return np.where(own >= 0, own, welded[group]).astype(np.int32)
-
-
-def _used(T):
-    return np.flatnonzero(np.bincount(T.ravel()))
-
-
-def _graph(ends, n):
-    return sp.coo_matrix((np.ones(len(ends), np.int8), (ends[:, 0], ends[:, 1])), (n, n))

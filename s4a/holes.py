@@ -1,10 +1,8 @@
 """Holes of a surface closed by fans of triangles, for those who want it closed (4.1, the input)."""
 
 import numpy as np
-import scipy.sparse as sp
-from scipy.sparse.csgraph import connected_components
 
-from s4a.mesh import directed_edges
+from s4a.mesh import components, directed_edges
 
 
 def close_holes(X, T):
@@ -35,8 +33,8 @@ def close_holes(X, T):
     E = E[~np.isin(E @ [n, 1], E[:, ::-1] @ [n, 1])]
     rim, ends = np.unique(E, return_inverse=True)
     ends = ends.reshape(-1, 2)
-    h, loop = connected_components(sp.coo_matrix((np.ones(len(E)), ends.T), (len(rim), len(rim))), directed=False)
-    of = loop[ends[:, 0]]
+    loop = components(ends, len(rim))
+    of, h = loop[ends[:, 0]], loop.max(initial=-1) + 1
     length = np.linalg.norm(X[E[:, 0]] - X[E[:, 1]], axis=1)
     weight = length / np.bincount(of, length, h)[of] if len(E) else length
     middle = np.stack([np.bincount(of, weight * X[E, i].mean(1), h) for i in range(3)], axis=1)

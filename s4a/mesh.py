@@ -2,7 +2,7 @@
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.sparse.csgraph import dijkstra
+from scipy.sparse.csgraph import connected_components, dijkstra
 
 from s4a.schema import dataset
 
@@ -70,6 +70,12 @@ def unique_edges(T, n=None):
     key = np.minimum(start, end) * n + np.maximum(start, end)
     key, edge_of, count = np.unique(key, return_inverse=True, return_counts=True)
     return np.stack([key // max(n, 1), key % max(n, 1)], axis=1), edge_of, count
+
+
+def components(pairs, n):
+    """Connected component of each of n nodes that the pairs ``(p, 2)`` link, numbered from 0."""
+    links = sp.coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), (n, n))
+    return connected_components(links, directed=False)[1]
 
 
 def edge_graph(X, E):

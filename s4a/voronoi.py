@@ -9,13 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from s4a.mesh import directed_edges, triangle_areas, unique_edges
-
-
-def components(pairs, n):
-    """Connected component of each of n nodes that the pairs ``(p, 2)`` link."""
-    links = sp.coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (n, n))
-    return connected_components(links, directed=False)[1]
+from s4a.mesh import components, directed_edges, triangle_areas, unique_edges
 
 
 def farthest_of_each(group, vertex, distance):
