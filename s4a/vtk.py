@@ -35,10 +35,10 @@ def fans(connectivity, offsets):
     >>> fans(np.array([0, 1, 2, 4, 5, 6, 7]), np.array([0, 3, 7])).tolist()
     [[0, 1, 2], [4, 5, 6], [4, 6, 7]]
     """
-    sizes = np.diff(offsets)
-    if (sizes < 0).any() or (len(offsets) and (offsets[0] < 0 or offsets[-1] > len(connectivity))):
+    falls = (offsets[1:] < offsets[:-1]).any()  # their differences could overflow, and look like sizes
+    if falls or (len(offsets) and (offsets[0] < 0 or offsets[-1] > len(connectivity))):
         raise ValueError(f"polygons of {offsets[-1]} corners promised, found {len(connectivity)}")
-    repeat = np.maximum(sizes - 2, 0)
+    repeat = np.maximum(np.diff(offsets) - 2, 0)
     start = np.repeat(offsets[:-1], repeat)
     step = np.arange(repeat.sum()) - np.repeat(np.cumsum(repeat) - repeat, repeat)
     return connectivity[np.stack([start, start + step + 1, start + step + 2], axis=1)]

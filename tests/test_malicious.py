@@ -138,6 +138,20 @@ def test_many_arrays_at_one_place_of_a_file_count_each(tmp_path):
         read_mesh(file(tmp_path / "a.vtp", text.encode() + body + b"</AppendedData></VTKFile>"))
 
 
+def test_offsets_of_polygons_whose_differences_overflow_are_refused(tmp_path):
+    offsets = f"{2**63 - 1} -2 9"  # in 64 bits each is above the one before by a positive number, and few in all
+    arrays = {"connectivity": "0 1 2 0 1 2 0 1 2", "offsets": offsets}
+    polys = "".join(f'<DataArray type="Int64" Name="{n}" format="ascii">{v}</DataArray>' for n, v in arrays.items())
+    points = '<DataArray type="Float32" format="ascii">0 0 0 1 0 0 0 1 0</DataArray>'
+    xml = f"<Piece NumberOfPoints='3' NumberOfPolys='3'><Points>{points}</Points><Polys>{polys}</Polys></Piece>"
+    legacy = "# vtk DataFile Version 5.1\na\nASCII\nDATASET POLYDATA\nPOINTS 3 float\n0 0 0 1 0 0 0 1 0\nPOLYGONS 4 9\n"
+    legacy += f"OFFSETS vtktypeint64\n0 {offsets}\nCONNECTIVITY vtktypeint64\n{arrays['connectivity']}\n"
+    files = {"a.vtp": f'<VTKFile type="PolyData"><PolyData>{xml}</PolyData></VTKFile>', "a.vtk": legacy}
+    for name, content in files.items():
+        with pytest.raises(ValueError, match=rf"{name}.*polygons of 9 corners promised, found 9"):
+            read_mesh(file(tmp_path / name, content))
+
+
 def test_one_long_word_does_not_widen_all_others(tmp_path):
     long = "1" * 100_000
     obj = "".join(f"v {i} 0 0\n" for i in range(20_000)) + f"v 0.{long} 1 0\nf 1 2 20001\n"
