@@ -28,7 +28,6 @@ from s4a.schema import INPUT, in_unit, unit_of, variable
 log = logging.getLogger(__name__)
 
 ENGINE = "h5netcdf"
-UNREADABLE = (OSError, ValueError, KeyError, RuntimeError)
 VERSION = version("s4a")
 STACKED = (
     "registered_match",
@@ -135,6 +134,18 @@ class Stored(BackendArray):
             return file[self.name][()][key]
 
 
+@contextmanager
+def readable(path):
+    """An open file of a study; whatever comes of damage in it is one OSError that names the file."""
+    try:
+        with h5py.File(path) as file:
+            yield file
+    except FileNotFoundError:
+        raise
+    except Exception as error:  # HDF5, h5py and NumPy each have their own ways with damage
+        raise OSError(f"{path} cannot be read ({error}): remove it and run the analysis again") from error
+
+
 def opened(path):
     """The Dataset of one file; its larger variables are read when they are used.
 
@@ -142,7 +153,7 @@ def opened(path):
     dimension of each variable.  Only files as :func:`write` writes them can be read: no groups, no chunks.
     """
     path = Path(path).absolute()  # what is read later does not follow the working directory
-    with h5py.File(path) as file:
+    with readable(path) as file:
         attrs = _attributes(file)
         variables = {}
         for name, stored in file.items():
@@ -162,7 +173,7 @@ def opened(path):
             else:
                 values = indexing.LazilyIndexedArray(Stored(path, stored, attrs.get("task_key")))
             variables[name] = xr.Variable(dims, values, _attributes(stored))
-    data = xr.decode_cf(xr.Dataset(variables, attrs=attrs), decode_times=False)
+        data = xr.decode_cf(xr.Dataset(variables, attrs=attrs), decode_times=False)
     data.encoding["source"] = str(path)
     return data
 
@@ -179,22 +190,22 @@ def read(path):
 
 def arrays(path, *names):
     """The values of some variables of one file, without a Dataset."""
-    with h5py.File(path) as file:
+    with readable(path) as file:
         return [file[name][()] for name in names]
 
 
 def attributes(path):
     """The attributes of one file."""
-    with h5py.File(path) as file:
+    with readable(path) as file:
         return _attributes(file)
 
 
 def is_done(path, key):
     """Whether the file of a task is there, whole, and of this key."""
     try:
-        with h5py.File(path) as file:
-            return file.attrs.get("task_key") == key
-    except UNREADABLE:  # absent, truncated, foreign: computed again
+        with readable(path) as file:
+            return bool(file.attrs.get("task_key") == key)
+    except OSError:  # absent, truncated, foreign: computed again
         return False
 
 
@@ -300,15 +311,15 @@ def open_study(folder):
         )
     known = set()
 
-    def part(name):
-        """The lazily opened file of that name, or None."""
+    def part(name, open_file=opened):
+        """The file of that name, or None."""
         path = folder / f"{name}.nc"
         try:
-            data = opened(path)
+            data = open_file(path)
         except FileNotFoundError:
             return None
-        except UNREADABLE as error:
-            log.warning("%s cannot be read and is left out (%s); run the analysis again", path, error)
+        except OSError as error:
+            log.warning("%s; it is left out", error)
             return None
         if not known.issuperset(data.attrs.get("made_from", "").split()):
             log.warning("%s belongs to an earlier run and is left out; run the analysis again", path)
@@ -325,12 +336,12 @@ def open_study(folder):
     names = sorted(path.stem for path in (folder / "original").glob("[!.]*.nc"))
     nodes = {f"{stage}/{name}": part(f"{stage}/{name}") for stage in ("original", "coarse") for name in names}
     nodes |= {stage: part(stage) for stage in ("network", "latent")}
-    template = part("registration")
+    template = part("registration", read)
     if template is not None and nodes["latent"] is not None:
-        files = {name: part(f"registration/{name}") for name in nodes["latent"]["shape"].values.tolist()}
-        files = {name: data.load() for name, data in files.items() if data is not None}
+        files = {name: part(f"registration/{name}", read) for name in nodes["latent"]["shape"].values.tolist()}
+        files = {name: data for name, data in files.items() if data is not None}
         if files:
-            nodes |= stack_registration(template.load(), files, list(files))
+            nodes |= stack_registration(template, files, list(files))
     nodes |= {stage: part(stage) for stage in ("pca", "subjects", "report")}
     if nodes["report"] is not None:
         report = nodes["report"]

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 
+import h5py
 import numpy as np
 import pytest
 import xarray as xr
@@ -65,6 +66,23 @@ def test_a_truncated_file_is_not_done(file, share):
 def test_a_foreign_file_is_not_done(file, content):
     file.write_bytes(content)
     assert not study.is_done(file, "key")
+
+
+def lose_a_variable(file):
+    file["gone"] = h5py.SoftLink("/nowhere")
+
+
+def lose_a_dimension(file):
+    scale = file[file["position"].attrs["DIMENSION_LIST"][0][0]].name
+    del file[scale]
+
+
+@pytest.mark.parametrize("damage", [lose_a_variable, lose_a_dimension])
+def test_damage_within_a_file_is_one_error_that_names_it(file, damage):
+    with h5py.File(file, "a") as inside:
+        damage(inside)
+    with pytest.raises(OSError, match=r"shape\.nc cannot be read \(.*\): remove it and run the analysis again"):
+        study.read(file)
 
 
 def test_a_folder_in_the_place_of_a_file_is_not_done(tmp_path):
@@ -151,6 +169,17 @@ def write_tree(folder, names, template):
     for i, name in enumerate(names):
         data = dataset({"method": "icp", "score": 0.1 * i}, **one | {"displacement": one["displacement"] * i})
         study.write(data, folder / "registration" / f"{name}.nc")
+
+
+@pytest.mark.parametrize("name", ["original/a", "registration/c", "registration"])
+def test_a_damaged_file_is_left_out_of_the_study_and_said(tmp_path, caplog, name):
+    write_tree(tmp_path, ["a", "b", "c"], "a")
+    with h5py.File(tmp_path / f"{name}.nc", "a") as inside:
+        lose_a_variable(inside)
+    groups = study.open_study(tmp_path).groups
+    assert f"/{name}" not in groups
+    assert "/original/b" in groups
+    assert f"{name}.nc cannot be read" in caplog.text
 
 
 def test_a_tree_survives_the_round_trip(tmp_path):
