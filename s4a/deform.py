@@ -33,17 +33,56 @@ def smoother(Phi, area, U=None):
     return lambda d: scipy.linalg.cho_solve(factor, Phi.T @ (weighted.T @ d), check_finite=False)
 
 
-def onto(X, image, area, coefficients_of):
+def onto(X, image, area, coefficients_of, spectrum=None):
     """The motion that brings X onto its image, and the coefficients of the displacement that is left.
+
+    Where a `spectrum` is given, the motion is not one but that of :func:`rigid_parts`.
 
     Returns
     -------
-    R, t : rotation (3, 3) and translation (3,)
+    R, t : rotation (3, 3) and translation (3,), or (n, 3, 3) and (n, 3) of the parts
     c : float ndarray (k, 3)
         So that R x + t + B c is the registered shape.
     """
-    R, t, _ = rigid_transform(X, image, area)
-    return R, t, coefficients_of(image - X @ R.T - t)
+    if spectrum is None:
+        R, t, _ = rigid_transform(X, image, area)
+        return R, t, coefficients_of(image - X @ R.T - t)
+    R, t = rigid_parts(X, image, area, *spectrum)
+    return R, t, coefficients_of(image - np.einsum("nij,nj->ni", R, X) - t)
+
+
+def rigid_parts(X, image, area, Phi, eigenvalue, *, spread=3.0):
+    """For every vertex the motion that brings its surroundings closest to their image.
+
+    :func:`s4a.align.rigid_transform` at every vertex, all others weighted by the heat kernel around it: eq. 8 and the
+    line after it move what K functions cannot express, such as fingers, with the whole; here they turn with the arm.
+
+    Parameters
+    ----------
+    X, image : float ndarray (n, 3)
+    area : float ndarray (n,), of sum 1
+    Phi, eigenvalue : float ndarray (n, K), (K,)
+        Orthonormal eigenfunctions.
+    spread : float
+        Time of the heat kernel, by the inverse of the last eigenvalue.
+
+    Returns
+    -------
+    R : float ndarray (n, 3, 3)
+    t : float ndarray (n, 3)
+        The motions R x + t.
+    """
+    falling = np.exp(-spread * eigenvalue / eigenvalue[-1])[:, None]
+
+    def around(f):
+        return Phi @ (falling * (Phi.T @ (area[:, None] * f)))
+
+    p, q = around(X), around(image)
+    moment = around(np.einsum("ni,nj->nij", image, X).reshape(-1, 9)).reshape(-1, 3, 3) - q[:, :, None] * p[:, None]
+    U, _, Vt = np.linalg.svd(moment)
+    U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
+    R = U @ Vt
+    return R, q - np.einsum("nij,nj->ni", R, p)
 
 
 def displacement_in_template(X, registered, area, *, scale=False):

@@ -128,6 +128,12 @@ def zoomout(C, Phi_source, Phi_target, area_target, k, *, step=5, nearest=neares
     return C, match_from_fmap(C, Phi_source, Phi_target, nearest=nearest)
 
 
+def once_refined(C, Phi_source, Phi_target, area_target):
+    """One step of ZoomOut without growth: C -> match -> C of the same size."""
+    Phi, Psi = Phi_source[:, : C.shape[1]], Phi_target[:, : len(C)]
+    return fmap_from_match(Phi, Psi, area_target, nearly_nearest(queries(Psi), searched(Phi @ C.T)))
+
+
 def fit(F, G, *, penalty=0.0, operators=(), constant=1.0):
     """The C of least energy that carries constants to constants (step 4 of 4.1; Ovsjanikov et al. 2012).
 
@@ -206,6 +212,56 @@ def fit_landmarks(Phi_source, Phi_target, ev_source, ev_target, landmark_source,
     return fit(F, G, penalty=penalty, constant=np.sign(Phi_source[0, 0] * Phi_target[0, 0]))
 
 
+FILTERS = {"wks": wave_filter, "hks": heat_filter}
+
+
+def fmap_of_descriptors(
+    source,
+    target,
+    *,
+    k=20,
+    marks=(None, None),
+    kind="wks",
+    n=100,
+    every=5,
+    laplacian=1e-3,
+    commute=1.0,
+    oriented=1.0,
+):
+    """:func:`fit_descriptors` for plain arrays.
+
+    Parameters
+    ----------
+    source, target : tuple (eigenvalue, Phi, area, T)
+        Eigenvalues (k,), eigenfunctions (n, k), vertex areas of sum 1, triangles.
+    marks : tuple of int ndarray (p,)
+        Corresponding vertices.
+
+    Returns
+    -------
+    C : float ndarray (k, k)
+    """
+    ends = source, target
+    F, products, turns = [], [], []
+    for (ev, Phi, area, T), (other, *_), mark in zip(ends, ends[::-1], marks, strict=True):
+        kernel = FILTERS[kind](ev, other, n=n)[::every]
+        f = signature(Phi, kernel)
+        if mark is not None:
+            f = np.column_stack([f, landmark_signature(Phi, kernel, mark)])
+        f = f - area @ f
+        f /= np.sqrt(area @ f**2)
+        B = Phi[:, :k]
+        F.append(B.T @ (area[:, None] * f))
+        products.append(multiplication(B, area, f) if commute else None)
+        turns.append(orientation(T, B, f) if oriented else None)
+    operators = [(w / (P**2).sum(), P, Q) for w, (P, Q) in ((commute, products), (oriented, turns)) if w]
+    ev, ev_target = (e[0][:k] for e in ends)
+    size = np.linalg.norm(F[0])
+    penalty = laplacian * ((ev_target[:, None] - ev) / max(ev[-1], ev_target[-1])) ** 2
+    constant = np.sign(ends[0][1][0, 0] * ends[1][1][0, 0])
+    return fit(F[0] / size, F[1] / size, penalty=penalty, operators=operators, constant=constant)
+
+
 def fit_descriptors(
     source, target, *, k=20, landmarks=None, kind="wks", n=100, every=5, laplacian=1e-3, commute=1.0, oriented=1.0
 ):
@@ -255,8 +311,7 @@ def fit_descriptors(
     ValueError
         When a mesh lacks its spectrum or has fewer than k eigenfunctions, or the options are not as above.
     """
-    filters = {"wks": wave_filter, "hks": heat_filter}
-    if kind not in filters:
+    if kind not in FILTERS:
         raise ValueError(f"kind must be 'wks' or 'hks', found {kind!r}")
     ends = []
     for mesh, what in ((source, "source"), (target, "target")):
@@ -268,24 +323,10 @@ def fit_descriptors(
     marks = (None, None) if landmarks is None else [np.asarray(v) for v in landmarks]
     if landmarks is not None and (len(marks) != 2 or marks[0].shape != marks[1].shape or marks[0].ndim != 1):
         raise ValueError(f"landmarks need as many vertices of the source as of the target, found {landmarks!r}")
-    F, products, turns = [], [], []
-    for (ev, Phi, area, T), (other, *_), mark in zip(ends, ends[::-1], marks, strict=True):
-        kernel = filters[kind](ev, other, n=n)[::every]
-        f = signature(Phi, kernel)
-        if mark is not None:
-            f = np.column_stack([f, landmark_signature(Phi, kernel, mark)])
-        f = f - area @ f
-        f /= np.sqrt(area @ f**2)
-        B = Phi[:, :k]
-        F.append(B.T @ (area[:, None] * f))
-        products.append(multiplication(B, area, f) if commute else None)
-        turns.append(orientation(T, B, f) if oriented else None)
-    operators = [(w / (P**2).sum(), P, Q) for w, (P, Q) in ((commute, products), (oriented, turns)) if w]
-    ev, ev_target = (e[0][:k] for e in ends)
-    size = np.linalg.norm(F[0])
-    penalty = laplacian * ((ev_target[:, None] - ev) / max(ev[-1], ev_target[-1])) ** 2
-    constant = np.sign(ends[0][1][0, 0] * ends[1][1][0, 0])
-    return dataset(fmap=fit(F[0] / size, F[1] / size, penalty=penalty, operators=operators, constant=constant))
+    C = fmap_of_descriptors(
+        *ends, k=k, marks=marks, kind=kind, n=n, every=every, laplacian=laplacian, commute=commute, oriented=oriented
+    )
+    return dataset(fmap=C)
 
 
 def orthogonality_error(C):

@@ -98,8 +98,7 @@ def first_map(source, target, motion, *, k_init=20, init="dense", n_landmarks=10
         )
     else:
         C = fmap.fmap_from_match(Phi, Psi, area, cKDTree(moved).query(Y)[1])
-    match = fmap.nearly_nearest(fmap.queries(Psi), fmap.searched(Phi @ C.T))
-    return fmap.fmap_from_match(Phi, Psi, area, match)
+    return fmap.once_refined(C, Phi, Psi, area)
 
 
 def three_cycles(source, target):

@@ -12,13 +12,14 @@ from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
-from s4a import findings, fmap, latent, median, network, register, study, suspects
+from s4a import findings, fmap, joint, latent, median, network, register, study, suspects
 from s4a.align import align, cloud, farthest_points, realign
 from s4a.clean import clean
 from s4a.io import find_meshes, slug
 from s4a.mesh import as_arrays, as_dataset, triangle_areas, vertex_areas
 from s4a.options import check_against, checked
 from s4a.pca import pca
+from s4a.poses import best_first_map
 from s4a.remesh import coarsen
 from s4a.schema import dataset, in_unit, require, unit_of
 from s4a.shapes import passed_over, read_shape, shape_report
@@ -133,6 +134,11 @@ def first_maps_task(folder, pairs, k_init, init):
         for s, g, motion in ((a, b, (R, t)), (b, a, (R.T, -R.T @ t))):
             directed.append((s, g))
             maps.append(network.first_map(shapes[s], shapes[g], motion, k_init=k_init, init=init))
+        if init == "dense":
+            M, N = (scan(folder, name).low for name in (a, b))
+            if joint.far_apart(M, N, cKDTree(M.X @ R.T + t).query(N.X)[1]):
+                _, C = best_first_map(M, N, maps[-2])
+                maps[-2:] = C, fmap.once_refined(C.T, N.Phi, M.Phi, M.area)
     source, target = zip(*directed, strict=True)
     return dataset(source=np.array(source), target=np.array(target), fmap_initial=np.stack(maps))
 
@@ -236,7 +242,8 @@ def analyse(
     step : int
         Growth of the maps per round of Consistent ZoomOut.
     init : {"dense", "landmarks"}, optional
-        First maps from all nearest neighbours after ICP (default), or the paper's fit on 10 landmarks.
+        First maps from all nearest neighbours after ICP (default), or the paper's fit on 10 landmarks.  Of pairs in
+        far poses the former are replaced, see :func:`s4a.match_pair`.
     refine : {"joint", "intrinsic"}, optional
         Registration with joint rounds (default), or the paper's spectral match alone.
     how : {"ours", "standard"}, optional

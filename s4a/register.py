@@ -14,6 +14,7 @@ from s4a.deform import displacement_in_template
 from s4a.mesh import as_arrays, closest_point_in_star, vertex_areas
 from s4a.nearest import nearest_in_cells
 from s4a.options import checked
+from s4a.poses import best_first_map
 from s4a.schema import INPUT, dataset, in_unit, require
 
 log = logging.getLogger(__name__)
@@ -59,7 +60,9 @@ class Scan:
         X, T = as_arrays(self.coarse)
         area = self.coarse["vertex_area"].values
         center, size = self.frame
-        return joint.Surface((X - center) / size, T, area / area.sum(), self.coarse["eigenfunction"].values)
+        return joint.Surface(
+            (X - center) / size, T, area / area.sum(), self.coarse["eigenfunction"].values, eigenvalue=self.eigenvalue
+        )
 
     @cached_property
     def dense(self):
@@ -278,7 +281,8 @@ def match_pair(source, target, *, k_init=20, k=100, init="dense", refine="joint"
     k_init, k : int
         Sizes of the first and of the refined functional map.
     init : {"dense", "landmarks"}
-        First map from all nearest neighbours after ICP, or the paper's fit on 10 landmarks.
+        First map from all nearest neighbours after ICP, or the paper's fit on 10 landmarks.  Where the former say
+        that poses are far apart, :func:`s4a.poses.best_first_map` is taken, which costs about 2 s more.
     refine : {"joint", "intrinsic"}
         Joint rounds after ZoomOut (default), or the paper's ZoomOut alone and eq. 4.
     n_coarse : int
@@ -293,8 +297,8 @@ def match_pair(source, target, *, k_init=20, k=100, init="dense", refine="joint"
         after rigid alignment (unit of the input), ``confidence(vertex)``, ``round_trip``, ``distortion``;
         ``rotation``, ``translation``, ``scale`` of that alignment of the source; the way back,
         ``template_triangle(original_vertex)`` and ``template_barycentric``, from the source's vertices to the target;
-        attrs ``score`` (see :func:`s4a.joint.badness`) and ``method``, and ``note`` where k had to be
-        reduced.
+        attrs ``score`` (see :func:`s4a.joint.badness`), ``method``, ``first_map`` ("landmarks", "dense", or of
+        far poses "icp", "hks" or "wks"), and ``note`` where k had to be reduced.
 
     Raises
     ------
@@ -337,13 +341,17 @@ def match_scans(source, target, *, k_init=20, k=100, init="dense", refine="joint
     M, N = source, target
     motion = align(M.low.X, M.low.area, N.low.X, N.low.area)[:2]
     C0 = first_map(*((s.low.X, s.low.area, s.low.Phi, s.eigenvalue) for s in (M, N)), motion, k_init=k_init, init=init)
+    near = cKDTree(M.low.X @ motion[0].T + motion[1]).query(N.low.X)[1]
+    first = init
+    if init == "dense" and joint.far_apart(M.low, N.low, near):
+        first, C0 = best_first_map(M.low, N.low, C0)
     k = min(k, M.low.Phi.shape[1], N.low.Phi.shape[1])
     C, match_low = fmap.zoomout(C0, M.low.Phi, N.low.Phi, N.low.area, k)
     C = sharpened(C, M.low.Phi, N.low.Phi, N.low.area, M.U, M.cell)
-    near = cKDTree(M.low.X @ motion[0].T + motion[1]).query(N.low.X)[1]
     starts = {"intrinsic": match_low, "icp": near}
     embeddings = M.low.Phi[:, :k] @ C.T, N.low.Phi[:, :k]
-    return registration(M, N, starts, embeddings, k=k, refine=refine), C, C0
+    found = registration(M, N, starts, embeddings, k=k, refine=refine)
+    return found.assign_attrs(first_map=first), C, C0
 
 
 def identity(target):

@@ -1,0 +1,48 @@
+"""First maps of shapes whose poses are far apart, where nearest neighbours after ICP (4.1) are wrong."""
+
+import numpy as np
+
+from s4a import fmap, joint
+from s4a.mesh import edges
+
+
+def stretch(target, motion):
+    """Median |log| of the lengths of the registered edges by those of the target."""
+    X, ends = joint.registered(target, motion), edges(target.T)
+    new, old = (np.linalg.norm(np.subtract(*P[ends.T]), axis=1) for P in (X, target.X))
+    return float(np.median(np.abs(np.log(np.maximum(new, 1e-12) / old))))
+
+
+def best_first_map(source, target, C, *, k=60, step=10):
+    """The best of a first map and of those from heat and from wave kernel signatures, which no pose changes.
+
+    Either kind alone fails on some pairs: shapes that nearly are their own mirror image are turned over, or limbs
+    exchanged.  Each map is refined by a short ZoomOut and a few rounds of :func:`s4a.joint.low_rounds` by parts; their
+    end is scored without truth, :func:`s4a.joint.badness` + :func:`stretch`, as a pose hardly stretches the surface.
+
+    Parameters
+    ----------
+    source, target : s4a.joint.Surface
+        At low resolution.
+    C : float ndarray (k_init, k_init)
+        First map from ICP.
+    k, step : int
+        Of the short ZoomOut.
+
+    Returns
+    -------
+    name : {"icp", "hks", "wks"}
+    C : float ndarray (k_init, k_init)
+    """
+    ends = [(s.eigenvalue, s.Phi, s.area, s.T) for s in (source, target)]
+    k_init, found, scores = len(C), {"icp": C}, {}
+    for kind in ("hks", "wks"):
+        fitted = fmap.fmap_of_descriptors(*ends, k=k_init, kind=kind)
+        found[kind] = fmap.once_refined(fitted, source.Phi, target.Phi, target.area)
+    k = min(k, source.Phi.shape[1], target.Phi.shape[1])
+    for name, first in found.items():
+        match = fmap.zoomout(first, source.Phi, target.Phi, target.area, k, step=step)[1]
+        end = joint.low_rounds(source, target, match, k_first=20, step=20, rounds=1, by_parts=True)
+        scores[name] = joint.badness(source, target, *end) + stretch(target, end[1])
+    best = min(scores, key=scores.get)
+    return best, found[best]

@@ -1,0 +1,110 @@
+"""Shapes in far poses: parts that turn on their own, first maps that no pose changes, and who pays for them."""
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from s4a import analyse, deform, joint, match_pair, poses, register, synthetic
+from s4a.mesh import as_arrays, vertex_areas
+from s4a.register import Scan
+from s4a.remesh import coarsen
+from s4a.spectral import spectrum
+
+
+def worm(n, bend):
+    """A tapering tube of length 8 with a knob at one side, bent by an angle of 8 `bend`: vertex i is vertex i."""
+    mesh = synthetic.sphere(n)
+    u = as_arrays(mesh)[0]
+    s, (y, z) = 4 * u[:, 0], 0.4 * (1 + 0.3 * u[:, 0]) * u[:, 1:].T
+    y = y + 0.35 * np.exp(-8 * ((u - [0.48, 0.6, 0.64]) ** 2).sum(1))
+    if bend:
+        r, angle = 1 / bend, bend * s
+        s, y = (r - y) * np.sin(angle), r - (r - y) * np.cos(angle)
+    return mesh.assign(position=(mesh["position"].dims, np.stack([s, y, z], axis=1)))
+
+
+def error(found, source):
+    """Mean distance to the true vertex, as a share of sqrt(area)."""
+    X, T = as_arrays(source)
+    return np.linalg.norm(X[found["match"].values] - X, axis=1).mean() / np.sqrt(vertex_areas(X, T).sum())
+
+
+@pytest.fixture(scope="module")
+def bent():
+    return worm(2500, 0), worm(2500, -0.5)
+
+
+@pytest.fixture(scope="module")
+def scans(bent):
+    return [Scan(mesh, spectrum(coarsen(mesh, n_coarse=1000), k=50)) for mesh in bent]
+
+
+def test_a_far_pose_is_matched_where_nearest_neighbours_begin_wrong(bent, monkeypatch):
+    found = match_pair(*bent, n_coarse=1000, k=50)
+    assert found.attrs["method"] == "intrinsic+parts"
+    assert found.attrs["first_map"] in ("hks", "wks")
+    assert error(found, bent[0]) < 0.002
+    monkeypatch.setattr(joint, "far_apart", lambda *_: False)
+    assert error(match_pair(*bent, n_coarse=1000, k=50), bent[0]) > 0.05
+
+
+def test_one_motion_of_all_parts_is_that_of_the_whole(scans):
+    low = scans[0].low
+    R = Rotation.from_rotvec([0.3, 2.0, -0.1]).as_matrix()
+    found, t = deform.rigid_parts(low.X, low.X @ R.T + 0.2, low.area, low.Phi, low.eigenvalue)
+    assert found == pytest.approx(np.broadcast_to(R, found.shape), abs=1e-6)
+    assert t == pytest.approx(0.2, abs=1e-6)
+
+
+def test_parts_follow_a_bend_that_displacements_alone_cannot(scans):
+    straight = scans[0].low
+    true = scans[0].coarse["sample_vertex"].values
+    X = scans[1].original["position"].values[true]
+    X = (X - scans[1].frame[0]) / scans[1].frame[1]
+    few = straight.Phi[:, :20]
+
+    def gap(spectrum):
+        R, t, c = deform.onto(straight.X, X, straight.area, lambda d: few.T @ (straight.area[:, None] * d), spectrum)
+        return np.linalg.norm(joint.registered(straight, (R, t, c)) - X, axis=1).mean()
+
+    assert gap((few, straight.eigenvalue[:20])) < 0.25 * gap(None)
+
+
+def test_the_parts_of_the_full_resolution_are_those_of_its_coarse_vertices(scans):
+    low, dense = scans[0].low, scans[0].dense
+    R, t = deform.rigid_parts(low.X, 2 * low.X[:, [1, 0, 2]] * [1, -1, 1], low.area, low.Phi, low.eigenvalue)
+    at = scans[0].coarse["sample_vertex"].values
+    assert joint.turned(dense, R, t)[at] == pytest.approx(joint.turned(low, R, t), abs=1e-6)
+
+
+def test_shapes_in_one_pose_pay_nothing_and_keep_their_first_map(monkeypatch):
+    tree = synthetic.brains(2, 1500)
+    source, target = (node.to_dataset() for node in tree["original"].children.values())
+
+    def refuse(*_):
+        raise AssertionError
+
+    monkeypatch.setattr(register, "best_first_map", refuse)
+    assert match_pair(source, target, n_coarse=600, k=40).attrs["first_map"] == "dense"
+
+
+def test_poses_are_far_apart_only_where_no_rigid_motion_brings_the_shapes_together(scans):
+    M, N = (s.low for s in scans)
+    assert not joint.far_apart(M, M, np.arange(len(M.X)))
+    assert joint.far_apart(M, N, cKDTree(M.X).query(N.X)[1])
+
+
+def test_of_first_maps_the_one_that_fits_is_taken(scans):
+    low = scans[0].low
+    name, C = poses.best_first_map(low, low, np.diag((-1.0) ** np.arange(20)))
+    assert name in ("hks", "wks")
+    assert np.diag(C).min() > 0.9
+
+
+def test_the_network_of_an_analysis_starts_from_maps_that_no_pose_changes(bent):
+    straight, other = bent
+    study = analyse({"a": straight, "b": other}, n_coarse=1000, k=50, n_pairs=1, template="b")
+    X = straight["position"].values
+    match = study["registration"]["registered_match"].sel(shape="a").values
+    assert np.linalg.norm(X[match] - X, axis=1).mean() / np.sqrt(vertex_areas(*as_arrays(straight)).sum()) < 0.005
