@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 BLOCK = 512  # cells of queries whose distances to all other cells are held at once
+PAIRS = 2048  # of rows, whose differences stay in the cache
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,68 @@ def least_distances(A, B):
     largest = np.einsum("ij,ij->i", A, A).max() + np.einsum("ij,ij->i", B, B).max()
     D -= 8 * np.finfo(np.float32).eps * largest
     return np.sqrt(np.maximum(D, 0, out=D), out=D)
+
+
+def compare_pairs(queries, cells, who, which, best, index):
+    """Compare the query ``who[i]`` with the rows of the cell ``which[i]``; update `best` and `index` in place.
+
+    `who` is sorted.
+    """
+    size = (cells.start[1:] - cells.start[:-1])[which]
+    end = np.cumsum(size)
+    row = np.arange(end[-1]) + np.repeat(cells.start[which] - (end - size), size)
+    query, gap = np.repeat(who, size), np.empty(len(row), np.float32)
+    for i in range(0, len(row), PAIRS):
+        difference = cells.rows[row[i : i + PAIRS]] - queries[query[i : i + PAIRS]]
+        gap[i : i + PAIRS] = np.einsum("ij,ij->i", difference, difference)
+    who, head, count = np.unique(query, return_index=True, return_counts=True)
+    least = np.minimum.reduceat(gap, head)
+    hit = np.flatnonzero(gap == np.repeat(least, count))
+    found = np.full(len(queries), np.iinfo(np.int64).max)
+    np.minimum.at(found, query[hit], cells.order[row[hit]])
+    nearer = (least < best[who]) | ((least == best[who]) & (found[who] < index[who]))
+    best[who[nearer]], index[who[nearer]] = least[nearer], found[who[nearer]]
+
+
+def nearest_of_few(Q, D, cell_d, *, block=256):
+    """:func:`nearest_in_cells` for queries that are few and far apart, as one in every cell: all at once, in pairs.
+
+    For the vertices of a coarse mesh among all of 60,000 or 150,000, 100 dims, it takes a third of the time.
+
+    Parameters
+    ----------
+    Q : float ndarray (n, d)
+    D : float ndarray (p, d)
+    cell_d : int ndarray (p,)
+    block : int
+        Queries whose distances to all cells are held at once.
+
+    Returns
+    -------
+    index : int ndarray (n,)
+        Of rows that are equally near the first.
+
+    Examples
+    --------
+    >>> rows = np.random.default_rng(0).normal(size=(300, 5))
+    >>> bool((nearest_of_few(rows[:20], rows, np.arange(300) % 7) == np.arange(20)).all())
+    True
+    """
+    middle = np.mean(D, axis=0)
+    Q, cells = np.asarray(Q - middle, np.float32), into_cells(D - middle, cell_d)
+    best, index = np.full(len(Q), np.inf, np.float32), np.full(len(Q), len(D))
+    for i in range(0, len(Q), block):
+        who = np.arange(i, min(i + block, len(Q)))
+        gap = least_distances(Q[who], cells.center)
+        near = gap.argmin(axis=1)
+        compare_pairs(Q, cells, who, near, best, index)
+        gap -= cells.radius  # no row of the cell is nearer
+        gap[np.arange(len(who)), near] = np.inf
+        reached = gap <= np.sqrt(best[who])[:, None] * np.float32(1 + 1e-5)
+        at, which = np.divmod(np.flatnonzero(reached), len(cells.center))
+        if len(at):
+            compare_pairs(Q, cells, who[at], which, best, index)
+    return index
 
 
 def nearest_in_cells(Q, cell_q, D, cell_d, *, first=12):

@@ -12,7 +12,7 @@ from s4a import fmap, joint
 from s4a.align import align
 from s4a.deform import displacement_in_template
 from s4a.mesh import as_arrays, closest_point_in_star, vertex_areas
-from s4a.nearest import nearest_in_cells
+from s4a.nearest import nearest_in_cells, nearest_of_few
 from s4a.options import checked
 from s4a.poses import best_first_map
 from s4a.schema import INPUT, dataset, in_unit, require
@@ -99,7 +99,7 @@ def intrinsic_match(source, target, F_source, F_target):
     return nearest_in_cells(Q, target.cell, D, source.cell)
 
 
-def sharpened(C, Phi_source, Phi_target, area_target, U_source, cell_source):
+def sharpened(C, B_source, Phi_target, area_target, cell_source):
     """One more round of ZoomOut in which the target's coarse vertices look among all vertices of the source.
 
     ZoomOut on the coarse meshes can only match coarse vertices, half their spacing off; that noise is in its C.
@@ -107,9 +107,10 @@ def sharpened(C, Phi_source, Phi_target, area_target, U_source, cell_source):
     Parameters
     ----------
     C : float ndarray (k_target, k_source)
-    Phi_source, Phi_target : float ndarray (n_coarse, >= k)
+    B_source : float ndarray (n_source, >= k_source)
+        The source's basis at all its vertices, as U Phi.
+    Phi_target : float ndarray (n_coarse_target, >= k_target)
     area_target : float ndarray (n_coarse_target,), of sum 1
-    U_source : sparse matrix (n_source, n_coarse_source)
     cell_source : int ndarray (n_source,)
 
     Returns
@@ -117,9 +118,8 @@ def sharpened(C, Phi_source, Phi_target, area_target, U_source, cell_source):
     C : float ndarray (k_target, k_source)
     """
     k_target, k_source = C.shape
-    Phi, Psi = Phi_source[:, :k_source], Phi_target[:, :k_target]
-    match = nearest_in_cells(Psi, np.arange(len(Psi)), U_source @ (Phi @ C.T), cell_source)[0]
-    return Psi.T @ (area_target[:, None] * (U_source[match] @ Phi))
+    B, Psi = B_source[:, :k_source], Phi_target[:, :k_target]
+    return fmap.fmap_from_match(B, Psi, area_target, nearest_of_few(Psi, B @ C.T.astype(B.dtype), cell_source))
 
 
 def register(source, target, match_low, embeddings, *, k=100, refine="joint"):
@@ -347,7 +347,7 @@ def match_scans(source, target, *, k_init=20, k=100, init="dense", refine="joint
         first, C0 = best_first_map(M.low, N.low, C0)
     k = min(k, M.low.Phi.shape[1], N.low.Phi.shape[1])
     C, match_low = fmap.zoomout(C0, M.low.Phi, N.low.Phi, N.low.area, k)
-    C = sharpened(C, M.low.Phi, N.low.Phi, N.low.area, M.U, M.cell)
+    C = sharpened(C, M.U.astype(np.float32) @ M.low.Phi[:, :k].astype(np.float32), N.low.Phi, N.low.area, M.cell)
     starts = {"intrinsic": match_low, "icp": near}
     embeddings = M.low.Phi[:, :k] @ C.T, N.low.Phi[:, :k]
     found = registration(M, N, starts, embeddings, k=k, refine=refine)

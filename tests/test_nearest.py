@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from s4a.nearest import into_cells, nearest_in_cells
+from s4a.nearest import into_cells, nearest_in_cells, nearest_of_few
 
 
 def gaps(Q, D):
@@ -110,3 +110,24 @@ def test_cells_hold_all_rows_within_their_radius():
     for c, (begin, end) in enumerate(zip(cells.start[:-1], cells.start[1:], strict=True)):
         gap = np.linalg.norm(cells.rows[begin:end] - cells.center[c], axis=1)
         assert gap.max() <= cells.radius[c] * (1 + 1e-5)
+
+
+@pytest.mark.parametrize("d", [1, 6, 50])
+@pytest.mark.parametrize("block", [7, 256])
+def test_few_queries_have_the_answer_of_an_exhaustive_search(d, block):
+    rng = np.random.default_rng(d)
+    Q, D = rng.normal(size=(200, d)), rng.normal(size=(1200, d))
+    found = nearest_of_few(Q, D, rng.integers(0, 29, 1200), block=block)
+    assert check(Q, D, found) > (0.99 if d > 1 else 0.9)
+
+
+def test_few_queries_among_clusters_far_from_the_origin_lose_nothing():
+    (Q, _), (D, cell) = clustered(300, 20, 3), clustered(2000, 20, 4)
+    assert (nearest_of_few(Q + 300, D + 300, cell) == gaps(Q, D).argmin(1)).all()
+
+
+def test_few_queries_take_the_first_of_equally_near_rows():
+    rng = np.random.default_rng(8)
+    D = rng.normal(size=(200, 12))
+    found = nearest_of_few(D, np.concatenate([D, D]), rng.integers(0, 9, 400))
+    assert (found == np.arange(200)).all()

@@ -38,7 +38,7 @@ def unpacked(name, folder):
     return sorted((Path(folder) / name).glob("*.ply"))
 
 
-def peer(source, target, landmarks, truth, k_init=20, k=100, step=10):
+def peer(source, target, landmarks, truth, k_init=20, k=100, step=5):
     """pyFM's own pipeline: spectrum, wave kernel and landmark descriptors, fit, ZoomOut, match."""
     from pyFM.functional import FunctionalMapping
     from pyFM.mesh import TriMesh
@@ -140,7 +140,7 @@ def embedded(n_vertices=20_000):
 
 def heads():
     """One real head and five others; no truth.  Every pair is printed when it is done."""
-    options, rows = {"k_init": 20, "k": 100, "step": 10}, []
+    options, rows = {"k_init": 20, "k": 100, "step": 5}, []
     with tempfile.TemporaryDirectory() as folder, threadpool_limits(1):
         first, *others = unpacked("heads", folder)[:6]
         mesh, load = compare.loaded(first, "source")
