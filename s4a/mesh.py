@@ -119,6 +119,15 @@ def path_lengths(G, start, end, limit):
     return np.minimum(length, limit)
 
 
+def half_cotangents(X, T):
+    """Half the cotangent of the angle opposite to each half-edge ``(3 m,)``, as :func:`directed_edges` orders them."""
+    double_area, found = np.maximum(2 * triangle_areas(X, T), np.finfo(float).tiny), []
+    for i in range(3):
+        o = X[T[:, (i + 2) % 3]]
+        found.append(np.einsum("ij,ij->i", X[T[:, i]] - o, X[T[:, (i + 1) % 3]] - o) / (2 * double_area))
+    return np.concatenate(found)
+
+
 def cotan_weights(X, T):
     """Cotan weights of the edges: half the sum of the cotangents of the opposite angles.
 
@@ -128,14 +137,8 @@ def cotan_weights(X, T):
     w : float ndarray (e,)
         The stiffness matrix has ``-w`` off the diagonal and row sums 0, and L = A^-1 W (Pinkall & Polthier 1993).
     """
-    half_cotan = []
-    for i in range(3):
-        o, p, q = X[T[:, (i + 2) % 3]], X[T[:, i]], X[T[:, (i + 1) % 3]]
-        u, v = p - o, q - o
-        double_area = np.linalg.norm(np.cross(u, v), axis=1)
-        half_cotan.append(0.5 * (u * v).sum(1) / np.maximum(double_area, np.finfo(float).tiny))
     E, edge_of, _ = unique_edges(T, len(X))
-    return E, np.bincount(edge_of, np.concatenate(half_cotan), len(E))
+    return E, np.bincount(edge_of, half_cotangents(X, T), len(E))
 
 
 def stiffness(E, w, n):

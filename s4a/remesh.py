@@ -17,11 +17,11 @@ from scipy.spatial import cKDTree
 from s4a.mesh import (
     as_arrays,
     closest_point_in_star,
-    cotan_weights,
     directed_edges,
     edge_graph,
     edges,
     euler_characteristic,
+    half_cotangents,
     n_used,
     triangle_areas,
     unique_edges,
@@ -83,13 +83,13 @@ def laplacian(X, T, area):
     The areas are the given ones, raised to a thousandth of their mean so that none vanishes.
     """
     area = np.maximum(area, 1e-3 * area.mean())
-    count = unique_edges(T, len(X))[2]
+    E, edge_of, count = unique_edges(T, len(X))
     half = directed_edges(T)
     longest = ((X[half[:, 0]] - X[half[:, 1]]) ** 2).sum(1).reshape(3, -1).max(0)
     if (count > 2).any() or (triangle_areas(X, T) < 1e-6 * longest).any():
         L = sp.triu(robust_laplacian.mesh_laplacian(X, T)[0], 1).tocoo()
         return np.stack([L.row, L.col], axis=1), -L.data, area, "robust"
-    return *cotan_weights(X, T), area, "cotan"
+    return E, np.bincount(edge_of, half_cotangents(X, T), len(E)), area, "cotan"
 
 
 def sorted_mesh(X, T):

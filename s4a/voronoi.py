@@ -91,7 +91,7 @@ def many_rims(T, cell, suspect):
     return suspect & (np.bincount(owner, minlength=len(suspect)) != 1)
 
 
-def faults(T, E, open_edge, cell, n):
+def faults(T, E, open_edge, cell, n, among=None):
     """Cells, pairs of cells and triangles that keep the dual from being a manifold.
 
     Parameters
@@ -101,6 +101,8 @@ def faults(T, E, open_edge, cell, n):
     cell : int ndarray (vertices,)
     n : int
         Number of cells.
+    among : bool ndarray (n,), optional
+        Faults in which none of these cells takes part are not looked for.
 
     Returns
     -------
@@ -113,7 +115,9 @@ def faults(T, E, open_edge, cell, n):
     repeated : int ndarray
         Triangles of the mesh whose three cells meet elsewhere, too.
     """
-    L, ends = cell[T], cell[E]
+    among = np.ones(n, bool) if among is None else among
+    triangle, edge = (np.flatnonzero(np.logical_or.reduce([among[cell][v] for v in rows.T])) for rows in (T, E))
+    L, ends, open_edge = cell[T[triangle]], cell[E[edge]], open_edge[edge]
     inner = ends[:, 0] == ends[:, 1]
     a, b, c = L[:, 0] == L[:, 1], L[:, 1] == L[:, 2], L[:, 2] == L[:, 0]
     euler = np.bincount(cell, minlength=n) - np.bincount(ends[inner, 0], minlength=n)
@@ -121,11 +125,13 @@ def faults(T, E, open_edge, cell, n):
     corner = np.flatnonzero(~(a | b | c))
     C = L[corner]
     stretches = np.bincount(ends[open_edge & ~inner].ravel(), minlength=n)
-    bad = many_rims(T, cell, euler != 1) | (stretches > 2) | (np.bincount(C.ravel(), minlength=n) == 0)
+    bad = many_rims(T[triangle], cell, among & (euler != 1))
+    bad |= among & ((stretches > 2) | (np.bincount(C.ravel(), minlength=n) == 0))
 
     border = np.flatnonzero(~inner)
     pair, strip = np.unique(np.sort(ends[border], axis=1) @ [n, 1], return_inverse=True)
-    half = np.sort(directed_edges(C), axis=1) @ [n, 1]
+    half = directed_edges(C)
+    half = np.sort(half[among[half].any(1)], axis=1) @ [n, 1]
     strip_ends = np.bincount(np.searchsorted(pair, half), minlength=len(pair))
     strip_ends += np.bincount(strip[open_edge[border]], minlength=len(pair))
     bad_pair = strip_ends != 2
@@ -134,7 +140,7 @@ def faults(T, E, open_edge, cell, n):
 
     _, triple, count = np.unique(np.sort(C, axis=1) @ [n * n, n, 1], return_inverse=True, return_counts=True)
     pairs = np.stack([pair[bad_pair] // n, pair[bad_pair] % n], axis=1)
-    return bad, pairs, border[at], row[strip[at]], corner[count[triple] > 1]
+    return bad, pairs, edge[border[at]], row[strip[at]], triangle[corner[count[triple] > 1]]
 
 
 def refine(G, T, E, open_edge, state, most, avoid):
@@ -143,11 +149,11 @@ def refine(G, T, E, open_edge, state, most, avoid):
     The vertices to avoid are only taken where there are no others.  Returns the samples, cells and distances, the
     number of rounds, and whether faults are left.
     """
-    rounds = 0
+    rounds, changed = 0, np.ones(len(state[0]), bool)
     while True:
         sample, cell, distance = state
         distance = np.where(avoid, 1e-9, 1) * distance
-        bad, _, edge, row, repeated = faults(T, E, open_edge, cell, len(sample))
+        bad, _, edge, row, repeated = faults(T, E, open_edge, cell, len(sample), changed)
         inside = np.flatnonzero(bad[cell])
         new = np.concatenate(
             [
@@ -160,6 +166,9 @@ def refine(G, T, E, open_edge, state, most, avoid):
         if len(new) == 0 or len(sample) > most:
             return state, rounds, len(new) > 0
         state = add_samples(G, farthest_of_each(cell[new], new, distance), *state)  # one in each cell
+        moved = state[1] != cell
+        changed = np.zeros(len(state[0]), bool)  # every fault had a new sample in one of its cells: others have none
+        changed[cell[moved]] = changed[state[1][moved]] = True
         rounds += 1
 
 
