@@ -218,10 +218,12 @@ def spectral_match(way, source, target, motion, landmarks, clock, *, k_init, k, 
         C = clock("map", fmap.fmap_from_match, M.Phi[:, :k_init], N.Phi[:, :k_init], N.mass, match)
     else:
         C = clock("map", fit, M, N, landmarks, k_init)
-    options = {"step": step}
-    if name == "dense":
-        options["nearest"] = lambda Q, D: nearest_in_cells(Q, N.cell, D, M.cell)[0]
-    C, low = clock("refine", fmap.zoomout, C, M.Phi, N.Phi, N.mass, k, **options)
+    nearest = {
+        "dense": lambda Q, D: nearest_in_cells(Q, N.cell, D, M.cell)[0],
+        "local": fmap.nearest_rows,
+        "lifted": lambda Q, D: fmap.nearly_nearest(fmap.queries(Q), fmap.searched(D)),  # other searches follow
+    }[name]
+    C, low = clock("refine", fmap.zoomout, C, M.Phi, N.Phi, N.mass, k, step=step, nearest=nearest)
     if name == "lifted":
         for _ in range(2):
             C = clock("refine", sharpened, C, M.B, N.Phi, N.mass, M.cell)
@@ -380,7 +382,8 @@ def pairs(
     Dataset
         Every metric of :func:`s4a.metrics.evaluate` over ``(way, pair)``, ``way`` the method, and
         ``block_seconds(way, pair, block)``, the blocks of Fig. 3, in CPU seconds of one core.  What two methods share,
-        as the alignment or a basis, is made once and charged to both.
+        as the alignment or a basis, is made once and charged to both; the alignment only to those that use it, which
+        with given landmarks are kNN, ZO and the joint rounds.
 
     Raises
     ------
@@ -444,8 +447,6 @@ def motion_and_landmarks(source, target, landmarks, low, clock):
     """Steps 2 and 3 of 4.1: by the low-resolution meshes, as RE-MATCH has them, or else by spread points."""
     ends = [(s.scan.low.X, s.scan.low.area) if low else s.spread[:2] for s in (source, target)]
     motion = clock("align", align, *ends[0], *ends[1])[:2]
-    if not low:
-        clock.seconds["align"] += source.seconds["spread"] + target.seconds["spread"]
     if landmarks is None:
         landmarks = clock("align", default_landmarks, source, target, motion)
     return motion, landmarks
@@ -456,14 +457,18 @@ def one_pair(source, target, methods, landmarks, load, truth, n_geodesic, option
     aligned = {}
     for low in (False, True):
         common = Clock()
-        common.seconds["load and clean"] = load
         if any(way.startswith("RE-MATCH") == low for way in methods):
             aligned[low] = motion_and_landmarks(source, target, landmarks, low, common), common.seconds
     done, rows, times = {}, [], []
     for way in methods:
         clock, image, reverse = Clock(), None, None
-        (motion, marks), spent = aligned[way.startswith("RE-MATCH")]
-        clock.seconds |= spent
+        remeshed = way.startswith("RE-MATCH")
+        (motion, marks), spent = aligned[remeshed]
+        clock.seconds["load and clean"] = load
+        aligns = landmarks is None or way in ("kNN", "ZO", "RE-MATCH joint")
+        clock.seconds["align"] = spent["align"] * aligns
+        if not remeshed and (aligns or way == "FMAP+ZO"):
+            clock.seconds["sample"] += source.seconds["spread"] + target.seconds["spread"]
         if way == "kNN":
             match, back = clock("full resolution", knn, source, target, motion)
             reverse = lambda back=back: back  # noqa: E731
