@@ -468,7 +468,7 @@ def one_pair(source, target, methods, landmarks, load, truth, n_geodesic, option
         aligns = landmarks is None or way in ("kNN", "ZO", "RE-MATCH joint")
         clock.seconds["align"] = spent["align"] * aligns
         if not remeshed and (aligns or way == "FMAP+ZO"):
-            clock.seconds["sample"] += source.seconds["spread"] + target.seconds["spread"]
+            clock.seconds["align" if aligns else "refine"] += source.seconds["spread"] + target.seconds["spread"]
         if way == "kNN":
             match, back = clock("full resolution", knn, source, target, motion)
             reverse = lambda back=back: back  # noqa: E731

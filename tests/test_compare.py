@@ -60,6 +60,16 @@ def test_every_method_finds_a_shape_in_itself():
     assert (found["bijectivity"].sel(way=exact) == 0).all()
 
 
+def test_an_alignment_that_given_landmarks_make_needless_is_not_charged(brains):
+    source, targets, _ = brains
+    target = next(iter(targets.values()))
+    marks = np.arange(0, 50, 10), np.arange(0, 50, 10)
+    found = compare.pair(source, target, landmarks=marks, methods=["kNN", "FMAP+ZO", "RE-MATCH"], **SMALL)
+    align = found["block_seconds"].sel(block="align").isel(pair=0)
+    assert align.sel(way="kNN") > 0
+    assert (align.sel(way=["FMAP+ZO", "RE-MATCH"]) == 0).all()
+
+
 def test_given_landmarks_make_up_for_a_rigid_alignment_that_is_wrong():
     mesh = synthetic.ellipsoid(1500, (1.2, 1.1, 1.0))
     wavy = mesh.assign(position=mesh["position"] * (1 + 0.15 * np.cos(5 * mesh["position"][:, 0])))
