@@ -2,7 +2,7 @@
 
 import numpy as np
 
-DOUBTFUL = 0.06  # badness: of shapes of one kind 0.02 to 0.03, of a cat and a man, or of far poses 0.09 to 0.16
+DOUBTFUL = 0.06  # badness: of one kind 0.02 to 0.03, in far poses 0.01 to 0.03, of a cat and a man 0.14 to 0.16
 
 
 def doubtful(badness):

@@ -19,6 +19,7 @@ import s4a
 from s4a import fmap, joint, synthetic
 from s4a.align import align
 from s4a.network import first_map
+from s4a.poses import best_first_map
 from s4a.register import Scan
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
@@ -36,8 +37,10 @@ def errors(source, target, image):
         M, N = scan(source), scan(target)
         motion = R, t, _ = align(M.low.X, M.low.area, N.low.X, N.low.area)
         low = [(s.low.X, s.low.area, s.low.Phi, s.eigenvalue) for s in (M, N)]
-        _, match = fmap.zoomout(first_map(*low, motion[:2]), M.low.Phi, N.low.Phi, N.low.area, 100)
-        starts = {"intrinsic": match, "icp": cKDTree(M.low.X @ R.T + t).query(N.low.X)[1]}
+        C, near = first_map(*low, motion[:2]), cKDTree(M.low.X @ R.T + t).query(N.low.X)[1]
+        if joint.far_apart(M.low, N.low, near):
+            C = best_first_map(M.low, N.low, C)[1]
+        starts = {"intrinsic": fmap.zoomout(C, M.low.Phi, N.low.Phi, N.low.area, 100)[1], "icp": near}
         center, size = M.frame
         sample = N.coarse["sample_vertex"].values
         true = (np.where(sample[:, None] >= 0, image[sample], np.nan) - center) / size
