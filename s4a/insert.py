@@ -12,9 +12,11 @@ from threadpoolctl import threadpool_limits
 from s4a import study as store
 from s4a.align import align, farthest_points, realign
 from s4a.fmap import fmap_from_match, nearest_rows
+from s4a.joint import Surface
 from s4a.median import area_differences, conformal_differences, distance_to_identity
 from s4a.mesh import as_arrays, as_dataset, vertex_areas
-from s4a.network import first_map, spectral_distance
+from s4a.network import spectral_distance
+from s4a.poses import first_map_of
 from s4a.register import Scan, registration
 from s4a.remesh import coarsen
 from s4a.schema import dataset, in_unit, require, unit_of
@@ -56,27 +58,24 @@ def frozen_basis(C_out, C_in, Y):
 
 @dataclass(frozen=True)
 class Neighbour:
-    """A shape of the study at low resolution, for unit area: vertices, areas of sum 1, basis, spectrum, Y, samples."""
+    """A shape of the study: its :class:`s4a.joint.Surface` at low resolution, latent basis ``Y (k, m)`` and samples."""
 
-    X: np.ndarray
-    area: np.ndarray
-    Phi: np.ndarray
-    eigenvalue: np.ndarray
+    low: Surface
     Y: np.ndarray
     sample: np.ndarray
 
     @cached_property
     def F(self):
         """The latent functions Phi Y (n, m)."""
-        return self.Phi[:, : len(self.Y)] @ self.Y
+        return self.low.Phi[:, : len(self.Y)] @ self.Y
 
 
 def neighbour(coarse, Y):
     """A :class:`Neighbour` from the low-resolution mesh and the latent basis of a shape."""
-    X, area = coarse["position"].values, unit_area(coarse)
+    (X, T), area = as_arrays(coarse), unit_area(coarse)
     X = (X - area @ X) / np.sqrt(coarse["vertex_area"].values.sum())
-    names = ("eigenfunction", "eigenvalue")
-    return Neighbour(X, area, *(coarse[n].values for n in names), Y, farthest_points(X, SAMPLES))
+    low = Surface(X, T, area, coarse["eigenfunction"].values, eigenvalue=coarse["eigenvalue"].values)
+    return Neighbour(low, Y, farthest_points(X, SAMPLES))
 
 
 def latent_of(new, others, motions, *, k_init=20, step=5, init="dense", rounds=2):
@@ -102,32 +101,26 @@ def latent_of(new, others, motions, *, k_init=20, step=5, init="dense", rounds=2
     """
     k, m = others[0].Y.shape
     first = [
-        first_map(
-            (o.X, o.area, o.Phi, o.eigenvalue),
-            (new.X, new.area, new.Phi, new.eigenvalue),
-            motion,
-            k_init=k_init,
-            init=init,
-        )
+        first_map_of(o.low, new.low, motion, k_init=k_init, init=init)[1]
         for o, motion in zip(others, motions, strict=True)
     ]
     Y = np.mean([C @ o.Y[:k_init, : min(k_init, m)] for C, o in zip(first, others, strict=True)], axis=0)
-    root = np.sqrt(new.area[new.sample])
+    root = np.sqrt(new.low.area[new.sample])
     while len(Y) < k:
         size = min(len(Y) + step, k)
-        points = new.Phi[new.sample, : len(Y)] @ Y
-        solve = np.linalg.pinv(new.Phi[new.sample, :size] * root[:, None]) * root
+        points = new.low.Phi[new.sample, : len(Y)] @ Y
+        solve = np.linalg.pinv(new.low.Phi[new.sample, :size] * root[:, None]) * root
         carried = 0
         for o in others:
             F = o.F[o.sample]
             carried = carried + F[nearest_rows(points, F[:, : points.shape[1]]), : min(size, m)]
         Y = solve @ carried / len(others)
-    Phi = new.Phi[:, :k]
+    Phi = new.low.Phi[:, :k]
     for _ in range(rounds):
         points, out, into = Phi @ Y, [], []
         for o in others[:FINAL]:
-            out.append(fmap_from_match(Phi, o.Phi[:, :k], o.area, nearest_rows(o.F, points)))
-            into.append(fmap_from_match(o.Phi[:, :k], Phi, new.area, nearest_rows(points, o.F)))
+            out.append(fmap_from_match(Phi, o.low.Phi[:, :k], o.low.area, nearest_rows(o.F, points)))
+            into.append(fmap_from_match(o.low.Phi[:, :k], Phi, new.low.area, nearest_rows(points, o.F)))
         Y = frozen_basis(np.stack(out), np.stack(into), np.stack([o.Y for o in others[:FINAL]]))
     return Y
 
@@ -178,12 +171,14 @@ def _insert_one(mesh, template, others, turns, o, compare):
                 raise ValueError(f"the study needs {k} eigenfunctions, this shape has only {low.sizes['mode']}")
             shape, new = Scan(mesh, low), neighbour(low, None)
             few = min(o["k_init"], k)
-            distance = spectral_distance([n.eigenvalue[:few] for n in (new, *others)])[0, 2:]
+            distance = spectral_distance([n.low.eigenvalue[:few] for n in (new, *others)])[0, 2:]
             chosen = [0, *(1 + np.argsort(distance, kind="stable")[: NEIGHBOURS - 1])]
             R, t, _ = align(shape.low.X, shape.low.area, template.low.X, template.low.area)
             motions = []
             for j in chosen:
-                S, u = realign(new.X, new.area, others[j].X, others[j].area, (turns[j].T @ R, np.zeros(3)))
+                S, u = realign(
+                    new.low.X, new.low.area, others[j].low.X, others[j].low.area, (turns[j].T @ R, np.zeros(3))
+                )
                 motions.append((S.T, -S.T @ u))
             options = {"k_init": few, "step": o["step"], "init": o["init"]}
             Y = latent_of(new, [others[j] for j in chosen], motions, **options)

@@ -72,7 +72,7 @@ def choose_pairs(distance, n_pairs):
     return np.array(sorted(itertools.islice(wanted, int(n_pairs))))
 
 
-def first_map(source, target, motion, *, k_init=20, init="dense", n_landmarks=10):
+def first_map(source, target, motion, *, k_init=20, init="dense", n_landmarks=10, near=None):
     """First functional map of a directed pair (4.1, steps 2 to 4), with one ZoomOut step ahead (4.2).
 
     Parameters
@@ -83,6 +83,8 @@ def first_map(source, target, motion, *, k_init=20, init="dense", n_landmarks=10
         Rigid motion of the source onto the target.
     init : {"dense", "landmarks"}
         From all vertices' nearest neighbours, or the paper's fit on `n_landmarks` farthest points.
+    near : int ndarray (n_target,), optional
+        The nearest neighbours, where they are known.
 
     Returns
     -------
@@ -97,7 +99,8 @@ def first_map(source, target, motion, *, k_init=20, init="dense", n_landmarks=10
             Phi, Psi, ev[:k_init], ev_target[:k_init], landmark, cKDTree(Y).query(moved[landmark])[1]
         )
     else:
-        C = fmap.fmap_from_match(Phi, Psi, area, cKDTree(moved).query(Y)[1])
+        near = cKDTree(moved).query(Y)[1] if near is None else near
+        C = fmap.fmap_from_match(Phi, Psi, area, near)
     return fmap.once_refined(C, Phi, Psi, area)
 
 

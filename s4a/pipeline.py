@@ -19,7 +19,7 @@ from s4a.io import find_meshes, slug
 from s4a.mesh import as_arrays, as_dataset, triangle_areas, vertex_areas
 from s4a.options import check_against, checked
 from s4a.pca import pca
-from s4a.poses import best_first_map
+from s4a.poses import first_map_of
 from s4a.remesh import coarsen
 from s4a.schema import dataset, in_unit, require, unit_of
 from s4a.shapes import passed_over, read_shape, shape_report
@@ -95,19 +95,19 @@ def template_scan(folder, name, key):
 
 
 def low_shape(folder, name):
-    """Unit-area vertices, areas, eigenfunctions and eigenvalues of a coarse mesh, and its spread samples."""
-    variables = ("position", "vertex_area", "eigenfunction", "eigenvalue")
-    X, area, Phi, eigenvalue = study.arrays(folder / "coarse" / f"{name}.nc", *variables)
+    """The coarse mesh of a shape, centred and for unit area."""
+    variables = ("position", "corner_vertex", "vertex_area", "eigenfunction", "eigenvalue")
+    X, T, area, Phi, eigenvalue = study.arrays(folder / "coarse" / f"{name}.nc", *variables)
     w = area / area.sum()
-    return (X - w @ X) / np.sqrt(area.sum()), w, Phi, eigenvalue
+    return joint.Surface((X - w @ X) / np.sqrt(area.sum()), T, w, Phi, eigenvalue=eigenvalue)
 
 
 def alignment_task(folder, name, reference):
     """Rigid motion of a shape onto the reference, both centred and for unit area."""
     R, t = np.eye(3), np.zeros(3)
     if name != reference:
-        (X, area, *_), (Y, area_y, *_) = low_shape(folder, name), low_shape(folder, reference)
-        R, t, _ = align(X, area, Y, area_y)
+        M, N = low_shape(folder, name), low_shape(folder, reference)
+        R, t, _ = align(M.X, M.area, N.X, N.area)
     return dataset({"reference": reference}, rotation=R, translation=t)
 
 
@@ -126,19 +126,19 @@ def first_maps_task(folder, pairs, k_init, init):
     """First maps of some pairs, in both directions."""
     shapes = {name: low_shape(folder, name) for name in sorted({name for pair in pairs for name in pair})}
     motions = {name: motion_to_reference(folder, name) for name in shapes}
-    clouds = {name: cloud(shape[0], 300) for name, shape in shapes.items()}
+    clouds = {name: cloud(shape.X, 300) for name, shape in shapes.items()}
     directed, maps = [], []
     for a, b in pairs:
+        M, N = shapes[a], shapes[b]
         start = motion_between(motions[a], motions[b])
-        R, t = realign(*shapes[a][:2], *shapes[b][:2], start, clouds=(clouds[a], clouds[b]))
-        for s, g, motion in ((a, b, (R, t)), (b, a, (R.T, -R.T @ t))):
-            directed.append((s, g))
-            maps.append(network.first_map(shapes[s], shapes[g], motion, k_init=k_init, init=init))
-        if init == "dense":
-            M, N = (scan(folder, name).low for name in (a, b))
-            if joint.far_apart(M, N, cKDTree(M.X @ R.T + t).query(N.X)[1]):
-                _, C = best_first_map(M, N, maps[-2])
-                maps[-2:] = C, fmap.once_refined(C.T, N.Phi, M.Phi, M.area)
+        R, t = realign(M.X, M.area, N.X, N.area, start, clouds=(clouds[a], clouds[b]))
+        first, C, _ = first_map_of(M, N, (R, t), k_init=k_init, init=init)
+        if first == init:
+            back = first_map_of(N, M, (R.T, -R.T @ t), k_init=k_init, init=init)[1]
+        else:
+            back = fmap.once_refined(C.T, N.Phi, M.Phi, M.area)
+        directed += [(a, b), (b, a)]
+        maps += [C, back]
     source, target = zip(*directed, strict=True)
     return dataset(source=np.array(source), target=np.array(target), fmap_initial=np.stack(maps))
 
@@ -146,24 +146,24 @@ def first_maps_task(folder, pairs, k_init, init):
 def consistent_maps(folder, names, first, options, n_jobs):
     """Consistent ZoomOut over the network: the Datasets ``/network`` and ``/latent``."""
     shapes = [low_shape(folder, name) for name in names]
-    k = min([options["k"], *(s[2].shape[1] for s in shapes)])
+    k = min([options["k"], *(s.Phi.shape[1] for s in shapes)])
     index = {name: i for i, name in enumerate(names)}
     source = np.array([index[s] for s in first["source"].values])
     target = np.array([index[t] for t in first["target"].values])
-    eigenvalues = np.stack([s[3][:k] for s in shapes])
+    eigenvalues = np.stack([s.eigenvalue[:k] for s in shapes])
     C0 = first["fmap_initial"].values
     with threadpool_limits(1), tqdm(total=k - C0.shape[1], desc="consistent ZoomOut") as bar:
         C, weight, _, Y, latent_eigenvalue = latent.consistent_zoomout(
             C0,
             source,
             target,
-            [s[2] for s in shapes],
-            [s[1] for s in shapes],
+            [s.Phi for s in shapes],
+            [s.area for s in shapes],
             eigenvalues,
             k,
             step=options["step"],
             n_latent=options["n_latent"],
-            samples=[farthest_points(s[0], SAMPLES) for s in shapes],
+            samples=[farthest_points(s.X, SAMPLES) for s in shapes],
             n_jobs=n_jobs,
             progress=lambda size: bar.update(size - C0.shape[1] - bar.n),
         )

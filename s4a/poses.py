@@ -1,9 +1,11 @@
 """First maps of shapes whose poses are far apart, where nearest neighbours after ICP (4.1) are wrong."""
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from s4a import fmap, joint
 from s4a.mesh import edges
+from s4a.network import first_map
 
 
 def stretch(target, motion):
@@ -46,3 +48,30 @@ def best_first_map(source, target, C, *, k=60, step=10):
         scores[name] = joint.badness(source, target, *end) + stretch(target, end[1])
     best = min(scores, key=scores.get)
     return best, found[best]
+
+
+def first_map_of(source, target, motion, *, k_init=20, init="dense"):
+    """:func:`s4a.network.first_map`, or :func:`best_first_map` where that is dense and poses are far apart.
+
+    Parameters
+    ----------
+    source, target : s4a.joint.Surface
+        At low resolution.
+    motion : tuple (R, t)
+        Rigid motion of the source onto the target.
+    k_init, init : see :func:`s4a.network.first_map`
+
+    Returns
+    -------
+    name : str
+        `init`, or what :func:`best_first_map` chose.
+    C : float ndarray (k_init, k_init)
+    near : int ndarray (n_target,)
+        Nearest neighbours in space after the motion.
+    """
+    near = cKDTree(source.X @ motion[0].T + motion[1]).query(target.X)[1]
+    ends = ((s.X, s.area, s.Phi, s.eigenvalue) for s in (source, target))
+    C = first_map(*ends, motion, k_init=k_init, init=init, near=near)
+    if init == "dense" and joint.far_apart(source, target, near):
+        return *best_first_map(source, target, C), near
+    return init, C, near

@@ -6,7 +6,6 @@ from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.spatial import cKDTree
 
 from s4a import fmap, joint
 from s4a.align import align
@@ -14,7 +13,7 @@ from s4a.deform import displacement_in_template
 from s4a.mesh import as_arrays, closest_point_in_star, vertex_areas
 from s4a.nearest import nearest_in_cells, nearest_of_few
 from s4a.options import checked
-from s4a.poses import best_first_map
+from s4a.poses import first_map_of
 from s4a.schema import INPUT, dataset, in_unit, require
 
 log = logging.getLogger(__name__)
@@ -336,15 +335,9 @@ def match_pair(source, target, *, k_init=20, k=100, init="dense", refine="joint"
 
 def match_scans(source, target, *, k_init=20, k=100, init="dense", refine="joint"):
     """:func:`match_pair` for two :class:`Scan`: what :func:`registration` gives, the final and the first map."""
-    from s4a.network import first_map  # the first map is shared with the network
-
     M, N = source, target
     motion = align(M.low.X, M.low.area, N.low.X, N.low.area)[:2]
-    C0 = first_map(*((s.low.X, s.low.area, s.low.Phi, s.eigenvalue) for s in (M, N)), motion, k_init=k_init, init=init)
-    near = cKDTree(M.low.X @ motion[0].T + motion[1]).query(N.low.X)[1]
-    first = init
-    if init == "dense" and joint.far_apart(M.low, N.low, near):
-        first, C0 = best_first_map(M.low, N.low, C0)
+    first, C0, near = first_map_of(M.low, N.low, motion, k_init=k_init, init=init)
     k = min(k, M.low.Phi.shape[1], N.low.Phi.shape[1])
     C, match_low = fmap.zoomout(C0, M.low.Phi, N.low.Phi, N.low.area, k)
     C = sharpened(C, M.U.astype(np.float32) @ M.low.Phi[:, :k].astype(np.float32), N.low.Phi, N.low.area, M.cell)

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from s4a import analyse, deform, joint, match_pair, poses, register, synthetic
+from s4a import analyse, deform, insert, joint, match_pair, poses, synthetic
 from s4a.mesh import as_arrays, vertex_areas
 from s4a.register import Scan
 from s4a.remesh import coarsen
@@ -85,7 +85,7 @@ def test_shapes_in_one_pose_pay_nothing_and_keep_their_first_map(monkeypatch):
     def refuse(*_):
         raise AssertionError
 
-    monkeypatch.setattr(register, "best_first_map", refuse)
+    monkeypatch.setattr(poses, "best_first_map", refuse)
     assert match_pair(source, target, n_coarse=600, k=40).attrs["first_map"] == "dense"
 
 
@@ -107,4 +107,13 @@ def test_the_network_of_an_analysis_starts_from_maps_that_no_pose_changes(bent):
     study = analyse({"a": straight, "b": other}, n_coarse=1000, k=50, n_pairs=1, template="b")
     X = straight["position"].values
     match = study["registration"]["registered_match"].sel(shape="a").values
+    assert np.linalg.norm(X[match] - X, axis=1).mean() / np.sqrt(vertex_areas(*as_arrays(straight)).sum()) < 0.005
+
+
+def test_a_new_shape_in_another_pose_finds_its_place_in_a_study(bent):
+    straight, other = bent
+    study = analyse({"a": straight, "b": worm(2500, -0.1)}, n_coarse=1000, k=50, n_pairs=1, template="a")
+    found = insert(study, {"new": other})["registration"]
+    X = straight["position"].values
+    match = found["registered_match"].sel(shape="new").values
     assert np.linalg.norm(X[match] - X, axis=1).mean() / np.sqrt(vertex_areas(*as_arrays(straight)).sum()) < 0.005
