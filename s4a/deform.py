@@ -62,7 +62,7 @@ def rigid_parts(X, image, area, Phi, eigenvalue, *, spread=3.0):
     X, image : float ndarray (n, 3)
     area : float ndarray (n,), of sum 1
     Phi, eigenvalue : float ndarray (n, K), (K,)
-        Orthonormal eigenfunctions.
+        Orthonormal eigenfunctions.  Where all eigenvalues are 0, each piece of a surface moves as a whole.
     spread : float
         Time of the heat kernel, by the inverse of the last eigenvalue.
 
@@ -72,7 +72,7 @@ def rigid_parts(X, image, area, Phi, eigenvalue, *, spread=3.0):
     t : float ndarray (n, 3)
         The motions R x + t.
     """
-    falling = np.exp(-spread * eigenvalue / eigenvalue[-1])[:, None]
+    falling = np.exp(-spread * eigenvalue / max(eigenvalue[-1], np.finfo(float).tiny))[:, None]
 
     def around(f):
         return Phi @ (falling * (Phi.T @ (area[:, None] * f)))

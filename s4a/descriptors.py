@@ -49,7 +49,8 @@ def wave_filter(eigenvalue, *others, n=100):
     energy = np.linspace(low + 2 * sigma, high - 2 * sigma, n)
     moving = eigenvalue > 0
     kernel = np.zeros((n, len(eigenvalue)))
-    kernel[:, moving] = np.exp(-((energy[:, None] - np.log(eigenvalue[moving])) ** 2) / (2 * sigma**2))
+    exponent = -((energy[:, None] - np.log(eigenvalue[moving])) ** 2) / (2 * sigma**2)
+    kernel[:, moving] = np.exp(exponent - exponent.max(axis=1, keepdims=True))  # far from all eigenvalues, too
     return kernel / kernel.sum(axis=1, keepdims=True)
 
 

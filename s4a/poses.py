@@ -12,7 +12,7 @@ def stretch(target, motion):
     """Median |log| of the lengths of the registered edges by those of the target."""
     X, ends = joint.registered(target, motion), edges(target.T)
     new, old = (np.linalg.norm(np.subtract(*P[ends.T]), axis=1) for P in (X, target.X))
-    return float(np.median(np.abs(np.log(np.maximum(new, 1e-12) / old))))
+    return float(np.median(np.abs(np.log(np.maximum(new, 1e-12) / np.maximum(old, 1e-12)))))
 
 
 def best_first_map(source, target, C, *, k=60, step=10):
@@ -50,8 +50,16 @@ def best_first_map(source, target, C, *, k=60, step=10):
     return best, found[best]
 
 
+def have_signatures(source, target, k):
+    """Whether the first k eigenvalues of both shapes, less those of 0, have a range in common: of pieces not always."""
+    least = max(s.eigenvalue[s.eigenvalue > 0].min(initial=np.inf) for s in (source, target))
+    return bool(1.01 * least < min(s.eigenvalue[k - 1] for s in (source, target)))
+
+
 def first_map_of(source, target, motion, *, k_init=20, init="dense"):
     """:func:`s4a.network.first_map`, or :func:`best_first_map` where that is dense and poses are far apart.
+
+    Without signatures, :func:`have_signatures`, it stays as it is.
 
     Parameters
     ----------
@@ -72,6 +80,6 @@ def first_map_of(source, target, motion, *, k_init=20, init="dense"):
     near = cKDTree(source.X @ motion[0].T + motion[1]).query(target.X)[1]
     ends = ((s.X, s.area, s.Phi, s.eigenvalue) for s in (source, target))
     C = first_map(*ends, motion, k_init=k_init, init=init, near=near)
-    if init == "dense" and joint.far_apart(source, target, near):
+    if init == "dense" and joint.far_apart(source, target, near) and have_signatures(source, target, k_init):
         return *best_first_map(source, target, C), near
     return init, C, near

@@ -102,7 +102,7 @@ def faults(T, E, open_edge, cell, n, among=None):
     n : int
         Number of cells.
     among : bool ndarray (n,), optional
-        Faults in which none of these cells takes part are not looked for.
+        Faults in which none of these cells takes part are not looked for, but their neighbours without triangle are.
 
     Returns
     -------
@@ -126,7 +126,8 @@ def faults(T, E, open_edge, cell, n, among=None):
     C = L[corner]
     stretches = np.bincount(ends[open_edge & ~inner].ravel(), minlength=n)
     bad = many_rims(T[triangle], cell, among & (euler != 1))
-    bad |= among & ((stretches > 2) | (np.bincount(C.ravel(), minlength=n) == 0))
+    seen = np.bincount(ends.ravel(), minlength=n) > 0
+    bad |= (among & (stretches > 2)) | (seen & (np.bincount(C.ravel(), minlength=n) == 0))
 
     border = np.flatnonzero(~inner)
     pair, strip = np.unique(np.sort(ends[border], axis=1) @ [n, 1], return_inverse=True)

@@ -233,3 +233,8 @@ def test_the_orientation_term_prefers_the_map_that_keeps_the_sides_over_its_mirr
 def test_a_fit_that_cannot_be_is_refused(brains, options, message):
     with pytest.raises(ValueError, match=message):
         fmap.fit_descriptors(*brains, **options)
+
+
+def test_wave_filters_of_a_narrow_common_range_have_sum_one():
+    kernel = descriptors.wave_filter(np.array([0, 5.0, 26.0, 125.0]), np.array([0, 12.7, 12.9, 14.7]))
+    assert kernel.sum(axis=1) == pytest.approx(1)

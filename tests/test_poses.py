@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from s4a import analyse, deform, insert, joint, match_pair, poses, synthetic
-from s4a.mesh import as_arrays, vertex_areas
+from s4a.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.register import Scan
 from s4a.remesh import coarsen
 from s4a.spectral import spectrum
@@ -117,3 +117,28 @@ def test_a_new_shape_in_another_pose_finds_its_place_in_a_study(bent):
     X = straight["position"].values
     match = found["registered_match"].sel(shape="new").values
     assert np.linalg.norm(X[match] - X, axis=1).mean() / np.sqrt(vertex_areas(*as_arrays(straight)).sum()) < 0.005
+
+
+def spheres(places, size, n=30):
+    X, T = as_arrays(synthetic.sphere(n))
+    return as_dataset(
+        np.concatenate([size * X + x for x in places]), np.concatenate([T + i * n for i in range(len(places))])
+    )
+
+
+@pytest.mark.parametrize("k", [20, 30])
+def test_of_more_pieces_than_functions_the_first_map_is_that_of_nearest_neighbours(k):
+    i = np.arange(25)
+    source, target = spheres(np.c_[3 * i, 0 * i, 0 * i], 1), spheres(np.c_[0 * i, i**2 / 2, i % 3], [4, 1, 0.7])
+    found = match_pair(source, target, n_coarse=750, k=k)
+    assert found.attrs["first_map"] == "dense"
+    assert np.isfinite(found["displacement"]).all()
+
+
+def test_pieces_of_one_function_each_move_as_a_whole():
+    low, apart = synthetic.sphere(30), np.repeat([0, 1], 30)
+    X = np.concatenate([as_arrays(low)[0], as_arrays(low)[0] + 5])
+    R = np.stack([Rotation.from_rotvec(v).as_matrix() for v in ([0.3, 0, 0], [0, 0.5, 1])])[apart]
+    Phi = np.sqrt(2) * (apart[:, None] == [0, 1])
+    found, _ = deform.rigid_parts(X, np.einsum("nij,nj->ni", R, X), np.full(60, 1 / 60), Phi, np.zeros(2))
+    assert found == pytest.approx(R, abs=1e-6)
