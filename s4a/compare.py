@@ -503,7 +503,7 @@ def collection(shapes, *, methods=COLLECTION_METHODS, n_coarse=6000, n_pairs=500
     methods : sequence of str
         Some of :data:`COLLECTION_METHODS`.
     n_coarse, n_pairs, k_init, k, step, seed
-        See :func:`s4a.analyse`; first maps are those of its default.
+        See :func:`s4a.analyse`; first maps are those of nearest neighbours after alignment.
 
     Returns
     -------

@@ -198,7 +198,7 @@ def badness(source, target, match, motion, *, n_samples=300, limit=0.5):
 
 
 def far_apart(source, target, match):
-    """Whether poses differ: a tenth of the target is farther than 0.04 from its matches after the best rigid motion.
+    """Whether poses differ: a tenth of the target's vertices lie over 0.04 from their matches after a rigid motion.
 
     For nearest neighbours after ICP that tenth lies 0.005 to 0.031 away between faces, brains, heads or skulls, 0.025
     to 0.046 between femurs or vertebrae, and 0.044 to 0.23 between bodies, children or cats in other poses.

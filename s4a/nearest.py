@@ -92,7 +92,8 @@ def compare_pairs(queries, cells, who, which, best, index):
 def nearest_of_few(Q, D, cell_d, *, block=256):
     """:func:`nearest_in_cells` for queries that are few and far apart, as one in every cell: all at once, in pairs.
 
-    For the vertices of a coarse mesh among all of 60,000 or 150,000, 100 dims, it takes a third of the time.
+    For the vertices of a coarse mesh among all of 60,000 or 150,000, 100 dims, it takes 0.3 to 0.45 of the time.  Where
+    the bound leaves nothing out, all pairs of a block are compared at once: 1 GB for 60,000 rows without any structure.
 
     Parameters
     ----------

@@ -134,7 +134,8 @@ def first_maps_task(folder, pairs, k_init, init):
         R, t = realign(M.X, M.area, N.X, N.area, start, clouds=(clouds[a], clouds[b]))
         first, C, _ = first_map_of(M, N, (R, t), k_init=k_init, init=init)
         if first == init:
-            back = first_map_of(N, M, (R.T, -R.T @ t), k_init=k_init, init=init)[1]
+            ends = ((s.X, s.area, s.Phi, s.eigenvalue) for s in (N, M))
+            back = network.first_map(*ends, (R.T, -R.T @ t), k_init=k_init, init=init)
         else:
             back = fmap.once_refined(C.T, N.Phi, M.Phi, M.area)
         directed += [(a, b), (b, a)]

@@ -140,7 +140,7 @@ def readable(path):
     try:
         with h5py.File(path) as file:
             yield file
-    except FileNotFoundError:
+    except (FileNotFoundError, PermissionError, MemoryError):
         raise
     except Exception as error:  # HDF5, h5py and NumPy each have their own ways with damage
         raise OSError(f"{path} cannot be read ({error}): remove it and run the analysis again") from error
