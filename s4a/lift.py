@@ -44,7 +44,7 @@ def smoothed(S, R, B, rounds=ROUNDS, least=LEAST):
 
 
 def inverse_step(W, area, U, W_coarse, area_coarse, Phi, eigenvalue):
-    """One cycle of two grids for W B = A (U Phi) Lambda, from B = U Phi: smoothing, correction on the coarse mesh, smoothing.
+    """One cycle of two grids for W B = A (U Phi) Lambda, from B = U Phi: smoothing, coarse correction, smoothing.
 
     The smoother is Jacobi's with the row sums of |W| in the place of its diagonal, which obtuse triangles do not upset.
 
