@@ -12,14 +12,12 @@ from pathlib import Path
 
 import numpy as np
 from joblib import Parallel, delayed
-from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 
 import s4a
 from s4a import fmap, joint, synthetic
 from s4a.align import align
-from s4a.network import first_map
-from s4a.poses import best_first_map
+from s4a.poses import first_map_of
 from s4a.register import Scan
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
@@ -35,11 +33,7 @@ def errors(source, target, image):
     """Candidate -> (score, error), for the true images of the target's coarse vertices; NaN where unknown."""
     with threadpool_limits(1):
         M, N = scan(source), scan(target)
-        motion = R, t, _ = align(M.low.X, M.low.area, N.low.X, N.low.area)
-        low = [(s.low.X, s.low.area, s.low.Phi, s.eigenvalue) for s in (M, N)]
-        C, near = first_map(*low, motion[:2]), cKDTree(M.low.X @ R.T + t).query(N.low.X)[1]
-        if joint.far_apart(M.low, N.low, near):
-            C = best_first_map(M.low, N.low, C)[1]
+        _, C, near = first_map_of(M.low, N.low, align(M.low.X, M.low.area, N.low.X, N.low.area)[:2])
         starts = {"intrinsic": fmap.zoomout(C, M.low.Phi, N.low.Phi, N.low.area, 100)[1], "icp": near}
         center, size = M.frame
         sample = N.coarse["sample_vertex"].values
