@@ -126,8 +126,10 @@ def faults(T, E, open_edge, cell, n, among=None):
     C = L[corner]
     stretches = np.bincount(ends[open_edge & ~inner].ravel(), minlength=n)
     bad = many_rims(T[triangle], cell, among & (euler != 1))
-    seen = np.bincount(ends.ravel(), minlength=n) > 0
-    bad |= (among & (stretches > 2)) | (seen & (np.bincount(C.ravel(), minlength=n) == 0))
+    lone = (np.bincount(ends.ravel(), minlength=n) > 0) & (np.bincount(C.ravel(), minlength=n) == 0)
+    if (lone & ~among).any():  # of neighbours not all triangles were looked at
+        lone[dual(T, cell)] = False
+    bad |= lone | (among & (stretches > 2))
 
     border = np.flatnonzero(~inner)
     pair, strip = np.unique(np.sort(ends[border], axis=1) @ [n, 1], return_inverse=True)
