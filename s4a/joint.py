@@ -19,7 +19,7 @@ from s4a.fmap import fmap_from_match, nearest_rows
 from s4a.mesh import edge_graph, edges, path_lengths, vertex_normals
 
 POSITION_WEIGHT, NORMAL_WEIGHT = 5.0, 0.3
-FAR = 0.04
+FAR = 0.035
 
 
 @dataclass(frozen=True)
@@ -198,13 +198,15 @@ def badness(source, target, match, motion, *, n_samples=300, limit=0.5):
 
 
 def far_apart(source, target, match):
-    """Whether poses differ: a tenth of the target's vertices lie over 0.04 from their matches after a rigid motion.
+    """Whether poses differ: a tenth of the target's vertices lie far from their matches after the best rigid motion.
 
-    For nearest neighbours after ICP that tenth lies 0.005 to 0.031 away between faces, brains, heads or skulls, 0.025
-    to 0.046 between femurs or vertebrae, and 0.044 to 0.23 between bodies, children or cats in other poses.
+    Far is 0.035 and 0.4 of the mean spacing 1 / sqrt(n) of the source's vertices, which alone keep matches apart: 0.04
+    for 6,000.  For nearest neighbours after ICP that tenth lies 0.005 to 0.031 away between faces, brains, heads or
+    skulls, 0.025 to 0.046 between femurs or vertebrae, 0.044 to 0.23 between bodies, children or cats in other poses.
     """
     R, t, _ = rigid_transform(target.X, source.X[match], target.area)
-    return bool(np.quantile(np.linalg.norm(turned(target, R, t) - source.X[match], axis=1), 0.9) > FAR)
+    gap = np.linalg.norm(turned(target, R, t) - source.X[match], axis=1)
+    return bool(np.quantile(gap, 0.9) > FAR + 0.4 / np.sqrt(len(source.X)))
 
 
 def candidates(source, target, starts, *, k=100, far=0.03):
