@@ -371,8 +371,8 @@ def pairs(
     k_init, k : int
         Sizes of the first and of the refined map.
     step : int
-        Growth of the map per round of ZoomOut, as in :func:`s4a.analyse`.  Steps of 10 take half the time of ZO and
-        FMAP+ZO.
+        Growth of the map per round of ZoomOut, as in :func:`s4a.analyse`.  Steps of 10 take half the time of that block
+        of ZO and FMAP+ZO; on two children of 60,000 vertices they end 7 to 9 % farther from the truth.
     n_geodesic : int
         See :func:`s4a.metrics.evaluate`.
     seed : int
