@@ -372,7 +372,7 @@ def pairs(
         Sizes of the first and of the refined map.
     step : int
         Growth of the map per round of ZoomOut, as in :func:`s4a.analyse`.  Steps of 10 take half the time of that block
-        of ZO and FMAP+ZO; on two children of 60,000 vertices they end 7 to 9 % farther from the truth.
+        of ZO and FMAP+ZO; on a child of 60,000 vertices in two poses they end 7 to 9 % farther from the truth.
     n_geodesic : int
         See :func:`s4a.metrics.evaluate`.
     seed : int
