@@ -1,4 +1,7 @@
-"""What examples of docstrings find: six small ``brains``, their ``study`` and its ``store``, an empty ``folder``."""
+"""What examples of docstrings find.
+
+Six small ``brains``, their ``study`` and its ``store``, an empty ``folder``.
+"""
 
 import re
 
@@ -30,7 +33,12 @@ def examples(request):
     if not isinstance(request.node, pytest.DoctestItem):
         return
     source = " ".join(example.source for example in request.node.dtest.examples)
-    known = {"brains": "small_brains", "study": "small_study", "store": "small_store", "folder": "tmp_path"}
+    known = {
+        "brains": "small_brains",
+        "study": "small_study",
+        "store": "small_store",
+        "folder": "tmp_path",
+    }
     for name, fixture in known.items():
         if name not in request.node.dtest.globs and re.search(rf"\b{name}\b", source):
             request.node.dtest.globs[name] = request.getfixturevalue(fixture)

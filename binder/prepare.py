@@ -1,6 +1,9 @@
-"""The study of 51 synthetic brains that the notebook of the sliders opens, reduced to what the panels show.
+"""The study of 51 synthetic brains that the notebook of the sliders opens.
 
-``python binder/prepare.py`` makes it where it is not there yet; Binder does so when its image is built.
+Reduced to what the panels show.
+
+``python binder/prepare.py`` makes it where it is not there yet; Binder does so when its image is
+built.
 """
 
 import argparse
@@ -11,19 +14,29 @@ from pathlib import Path
 import numpy as np
 
 import s4a
-from s4a import study
+from s4a.study import store
 
 FOLDER = Path(__file__).resolve().parent / "study_51"
 LIMIT = 15e6  # bytes
 BITS = 12
 NOT_SHOWN = (
-    *("displacement_raw", "displacement_low", "round_trip", "distortion", "file_vertex", "vertex_of_file"),
+    *(
+        "displacement_raw",
+        "displacement_low",
+        "round_trip",
+        "distortion",
+        "file_vertex",
+        "vertex_of_file",
+    ),
     *("sample_vertex", "edge_vertex", "cotan_weight"),
 )
 
 
 def reduced(data):
-    """A Dataset of a study without what no panel shows, rounded to about four digits, to be compressed on disk."""
+    """A Dataset of a study without what no panel shows, rounded to about four digits.
+
+    To be compressed on disk.
+    """
     data = data.drop_vars(NOT_SHOWN, errors="ignore")
     for name, values in data.data_vars.items():
         if values.dtype.kind == "f":
@@ -31,7 +44,12 @@ def reduced(data):
         elif values.dtype == np.int64:
             data[name] = values.astype(np.int32)
         if values.size > 1000:  # a chunk has costs of its own
-            data[name].encoding = {"zlib": True, "shuffle": True, "complevel": 9, "chunksizes": values.shape}
+            data[name].encoding = {
+                "zlib": True,
+                "shuffle": True,
+                "complevel": 9,
+                "chunksizes": values.shape,
+            }
     return data
 
 
@@ -52,9 +70,9 @@ def reduce(whole, small):
     for path in sorted(Path(whole).rglob("*.nc")):
         name = path.relative_to(whole)
         if name.parent.name != "network":  # first maps and motions, on the way to what is shown
-            data = study.read(path)
+            data = store.read(path)
             key, made_from = data.attrs["task_key"], data.attrs["made_from"].split()
-            study.write(reduced(data), Path(small) / name, key, made_from)
+            store.write(reduced(data), Path(small) / name, key, made_from)
 
 
 def collection(folder=FOLDER, *, n=51, n_vertices=2000, n_coarse=600, n_pairs=150, k=30):
@@ -74,7 +92,9 @@ def collection(folder=FOLDER, *, n=51, n_vertices=2000, n_coarse=600, n_pairs=15
         s4a.analyse(brains, n_coarse=n_coarse, n_pairs=n_pairs, k=k, store=whole)
         reduce(whole, small)
         if (size := size_of(small)) > LIMIT:
-            raise ValueError(f"the study needs at most {LIMIT / 1e6:.0f} MB, found {size / 1e6:.1f}; lower n_vertices")
+            raise ValueError(
+                f"the study needs at most {LIMIT / 1e6:.0f} MB, found {size / 1e6:.1f}; lower n_vertices"
+            )
         shutil.move(small, folder)
     return folder
 

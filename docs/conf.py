@@ -1,4 +1,7 @@
-"""The documentation: docstrings, the course, pages in words; no network is needed, to build it or to read it."""
+"""The documentation: docstrings, the course, pages in words.
+
+No network is needed, to build it or to read it.
+"""
 
 import os
 import re
@@ -60,12 +63,17 @@ WITHOUT_KERNEL = (HERE / "without_kernel.py").read_text(encoding="utf-8")
 
 
 def take_course():
-    """The notebooks beside the pages, each with a cell that shows panels and sliders without a kernel."""
+    """The notebooks beside the pages.
+
+    Each with a cell that shows panels and sliders without a kernel.
+    """
     folder = HERE / "course"
     folder.mkdir(exist_ok=True)
     for path in sorted(NOTEBOOKS.glob("*.ipynb")):
         notebook = nbformat.read(path, as_version=4)
-        cell = nbformat.v4.new_code_cell(WITHOUT_KERNEL, id="without-kernel", metadata={"tags": ["remove-cell"]})
+        cell = nbformat.v4.new_code_cell(
+            WITHOUT_KERNEL, id="without-kernel", metadata={"tags": ["remove-cell"]}
+        )
         notebook.cells.insert(1, cell)
         write(folder / path.name, nbformat.writes(notebook))
     for left in folder.glob("*.ipynb"):
@@ -83,15 +91,21 @@ def list_variables():
         for name, (dims, unit, words) in TABLE.items()
     ]
     write(
-        HERE / "_variables.md", "\n".join(["| variable | dims | unit | meaning |", "|---|---|---|---|", *rows]) + "\n"
+        HERE / "_variables.md",
+        "\n".join(["| variable | dims | unit | meaning |", "|---|---|---|---|", *rows]) + "\n",
     )
 
 
 def list_commands():
     """The options of every command, as --help prints them."""
     os.environ["COLUMNS"] = "100"
-    (commands,) = (action for action in cli.parser()._actions if hasattr(action, "choices") and action.choices)
-    parts = [f"### s4a {name}\n\n```text\n{sub.format_help()}```\n" for name, sub in commands.choices.items()]
+    (commands,) = (
+        action for action in cli.parser()._actions if hasattr(action, "choices") and action.choices
+    )
+    parts = [
+        f"### s4a {name}\n\n```text\n{sub.format_help()}```\n"
+        for name, sub in commands.choices.items()
+    ]
     write(HERE / "_commands.md", "\n".join(parts))
 
 
@@ -102,10 +116,15 @@ def write(path, text):
 
 
 def bars(app, what, name, obj, options, lines):
-    """Norms and sizes of sets are written with bars, which are marks of substitutions in reStructuredText."""
+    """Norms and sizes of sets are written with bars.
+
+    Which are marks of substitutions in reStructuredText.
+    """
     for i, line in enumerate(lines):
         if not re.match(r"\s*(>>>|\.\.\.) ", line):
-            lines[i] = re.sub(r"``.*?``|:math:`.*?`|(\|)", lambda found: "\\|" if found[1] else found[0], line)
+            lines[i] = re.sub(
+                r"``.*?``|:math:`.*?`|(\|)", lambda found: "\\|" if found[1] else found[0], line
+            )
 
 
 def front_door(app, env, node, content):
@@ -130,7 +149,9 @@ def formula(translator, node):
     """MathML, which browsers draw themselves: no script from elsewhere."""
     display = "inline" if isinstance(node, nodes.math) else "block"
     text = node.astext().replace(r"\lVert", r"\|").replace(r"\rVert", r"\|")
-    text = re.sub(r"\\mathcal\s*(?:\{([A-Z])\}|([A-Z]))", lambda found: script(found[1] or found[2]), text)
+    text = re.sub(
+        r"\\mathcal\s*(?:\{([A-Z])\}|([A-Z]))", lambda found: script(found[1] or found[2]), text
+    )
     text = re.sub(r"\\mathbb\s*\{?R\}?", "ℝ", text)
     text = convert(text, display=display)
     translator.body.append(text if display == "inline" else f'<div class="math">{text}</div>')

@@ -1,4 +1,7 @@
-"""The first cell of every notebook of the documentation: panels and sliders as HTML that needs no kernel."""
+"""The first cell of every notebook of the documentation.
+
+Panels and sliders as HTML that needs no kernel.
+"""
 
 import base64
 import contextlib
@@ -50,7 +53,9 @@ def html_of(value):
             data = data.encode() if isinstance(data, str) and mime == "image/svg+xml" else data
             text = data if isinstance(data, str) else base64.b64encode(data).decode()
             return f'<img alt="" src="data:{mime};base64,{text.strip()}">'
-    return found.get("text/html") or f"<pre>{escape(found.get('text/plain', ''))}</pre>" * bool(found)
+    return found.get("text/html") or f"<pre>{escape(found.get('text/plain', ''))}</pre>" * bool(
+        found
+    )
 
 
 def values_of(slider, n):
@@ -65,10 +70,17 @@ def values_of(slider, n):
 
 
 def interact(function, **sliders):
-    """In place of that of ipywidgets: the results for some values, and sliders that choose among them."""
+    """In place of that of ipywidgets.
+
+    The results for some values, and sliders that choose among them.
+    """
     found = [values_of(slider, N_VALUES if len(sliders) == 1 else 3) for slider in sliders.values()]
     strides = [math.prod(len(values) for values, _ in found[i + 1 :]) for i in range(len(found))]
-    start, frames, controls = sum(at * stride for (_, at), stride in zip(found, strides, strict=True)), [], []
+    start, frames, controls = (
+        sum(at * stride for (_, at), stride in zip(found, strides, strict=True)),
+        [],
+        [],
+    )
     for i, chosen in enumerate(itertools.product(*(values for values, _ in found))):
         with contextlib.redirect_stdout(io.StringIO()) as told:
             shown = html_of(function(**dict(zip(sliders, chosen, strict=True))))

@@ -23,22 +23,31 @@ the embedded collection   :mod:`s4a.synthetic`
 
 from importlib.metadata import version
 
-from s4a import compare, metrics, statistics, synthetic
+from s4a._moved import install
 from s4a.accessor import explore
-from s4a.clean import clean
-from s4a.export import write_registered, write_training_set
-from s4a.insert import insert
-from s4a.io import read_mesh, write_mesh
-from s4a.pca import synthesize
-from s4a.pipeline import analyse
-from s4a.register import match_pair
-from s4a.remesh import coarsen
-from s4a.shapes import read_shape, read_shapes
-from s4a.spectral import reconstruct, spectrum
-from s4a.study import open_study
-from s4a.transfer import register_pairs, transfer_labels, transfer_landmarks, transfer_scalars
-from s4a.view import write_page
+from s4a.analysis import statistics
+from s4a.analysis.export import write_registered, write_training_set
+from s4a.analysis.transfer import (
+    register_pairs,
+    transfer_labels,
+    transfer_landmarks,
+    transfer_scalars,
+)
+from s4a.datasets import synthetic
+from s4a.evaluation import compare, metrics
+from s4a.input.clean import clean
+from s4a.input.collection import read_shape, read_shapes
+from s4a.input.files import read_mesh, write_mesh
+from s4a.method.pca import synthesize
+from s4a.method.remesh import coarsen
+from s4a.method.spectral import reconstruct, spectrum
+from s4a.show.page import write_page
+from s4a.study.insert import insert
+from s4a.study.pair import match_pair
+from s4a.study.pipeline import analyse
+from s4a.study.store import open_study
 
+install()
 __version__ = version("s4a")
 __all__ = [
     "analyse",

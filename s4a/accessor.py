@@ -1,4 +1,7 @@
-"""The notebook panels of a study, from the library's front door; they are imported when they are first used."""
+"""The notebook panels of a study, from the library's front door.
+
+They are imported when they are first used.
+"""
 
 from importlib import import_module
 
@@ -6,19 +9,23 @@ import xarray as xr
 
 
 def explore(study, *, view="corner", up="z"):
-    """Tabs over a finished or running study, for notebooks: modes, network, maps, median, correspondence, spectrum.
+    """Tabs over a finished or running study, for notebooks.
+
+    Modes, network, maps, median, correspondence, spectrum.
 
     Parameters
     ----------
     study : xarray.DataTree
         As :func:`s4a.analyse` or :func:`s4a.open_study` give it.
     view, up
-        From where surfaces are seen first, and which axis points up; see :func:`s4a.draw.rotation`.
+        From where surfaces are seen first, and which axis points up; see
+        :func:`s4a.show.draw.rotation`.
 
     Returns
     -------
     s4a.widgets.Explore
-        Whose ``close()`` frees everything; a cell that runs again closes the tabs of its run before.
+        Whose ``close()`` frees everything; a cell that runs again closes the tabs of its run
+        before.
 
     Raises
     ------

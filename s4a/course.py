@@ -1,4 +1,7 @@
-"""Exercises of the notebooks: a cell leaves ``answer = ...`` open, and what the reader puts there is checked."""
+"""Exercises of the notebooks.
+
+A cell leaves ``answer = ...`` open, and what the reader puts there is checked.
+"""
 
 import numpy as np
 

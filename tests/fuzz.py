@@ -1,9 +1,10 @@
 """Damaged files for every reader, 20,000 a format: ``python tests/fuzz.py --files 20000``.
 
-Files are read, and meshes cleaned, in a child process with a limit of memory and of processor time.  A failure is: the
-process dies, a file takes over 5 s or more memory than the limit, another exception than a ValueError that names the
-file leaves the reader, or a warning does.  File i of a format is always the same: ``--only FORMAT --first i --files 1``
-reads it again, ``--keep FOLDER`` keeps the failing ones.
+Files are read, and meshes cleaned, in a child process with a limit of memory and of processor time.
+A failure is: the process dies, a file takes over 5 s or more memory than the limit, another
+exception than a ValueError that names the file leaves the reader, or a warning does.  File i of a
+format is always the same: ``--only FORMAT --first i --files 1`` reads it again, ``--keep FOLDER``
+keeps the failing ones.
 """
 
 import argparse
@@ -58,7 +59,13 @@ def surface():
     import numpy as np
 
     X = np.array(
-        [[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if 0 < abs(x) + abs(y) + abs(z) < 3]
+        [
+            [x, y, z]
+            for x in (-1, 0, 1)
+            for y in (-1, 0, 1)
+            for z in (-1, 0, 1)
+            if 0 < abs(x) + abs(y) + abs(z) < 3
+        ]
     )
     X = X / np.linalg.norm(X, axis=1, keepdims=True) * [1.0, 1.5, 2.0]
     from scipy.spatial import ConvexHull
@@ -77,7 +84,9 @@ def packed(members):
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in members.items():
-            archive.writestr(zipfile.ZipInfo(name), data, zipfile.ZIP_DEFLATED)  # without the time of the day
+            archive.writestr(
+                zipfile.ZipInfo(name), data, zipfile.ZIP_DEFLATED
+            )  # without the time of the day
     return out.getvalue()
 
 
@@ -102,18 +111,19 @@ def seeds():
     import nibabel
     import numpy as np
 
-    from s4a.io import WRITERS
+    from s4a.input.files import WRITERS
 
     X, T = surface()
     label = np.arange(len(X)) % 3
 
     def ply(order):
-        head = (
-            f"ply\nformat {order} 1.0\nelement vertex {len(X)}\nproperty float x\nproperty float y\nproperty float z\n"
-        )
+        head = f"ply\nformat {order} 1.0\nelement vertex {len(X)}\nproperty float x\nproperty float y\nproperty float z\n"
         head += f"property uchar red\nelement face {len(T)}\nproperty list uchar int vertex_indices\nend_header\n"
         if order == "ascii":
-            rows = [*(f"{x} {y} {z} 7" for x, y, z in X), *("3 " + " ".join(map(str, t)) for t in T)]
+            rows = [
+                *(f"{x} {y} {z} 7" for x, y, z in X),
+                *("3 " + " ".join(map(str, t)) for t in T),
+            ]
             return (head + "\n".join(rows) + "\n").encode()
         end = "<" if "little" in order else ">"
         vertex, face = (
@@ -162,7 +172,9 @@ def seeds():
                 return [np.array([len(raw)], "<" + size).tobytes() + raw]
             blocks = [zlib.compress(raw[i : i + 256]) for i in range(0, len(raw), 256)]
             return [
-                np.array([len(blocks), 256, len(raw) % 256, *map(len, blocks)], "<" + size).tobytes(),
+                np.array(
+                    [len(blocks), 256, len(raw) % 256, *map(len, blocks)], "<" + size
+                ).tobytes(),
                 b"".join(blocks),
             ]
 
@@ -174,7 +186,9 @@ def seeds():
             if how == "binary":
                 return f'{tag}"binary">{b"".join(map(base64.b64encode, encoded(values))).decode()}</DataArray>'
             offset = len(blob)
-            blob += b"".join(encoded(values) if how == "raw" else map(base64.b64encode, encoded(values)))
+            blob += b"".join(
+                encoded(values) if how == "raw" else map(base64.b64encode, encoded(values))
+            )
             return f'{tag}"appended" offset="{offset}"/>'
 
         attributes = ' compressor="vtkZLibDataCompressor"' if compressed else ""
@@ -186,7 +200,11 @@ def seeds():
         text += array("offsets", np.arange(3, T.size + 1, 3, dtype="<i8"), "Int64")
         text += "</Polys></Piece></PolyData>"
         if blob:
-            return f'{text}<AppendedData encoding="{how}">\n_'.encode() + blob + b"\n</AppendedData></VTKFile>"
+            return (
+                f'{text}<AppendedData encoding="{how}">\n_'.encode()
+                + blob
+                + b"\n</AppendedData></VTKFile>"
+            )
         return (text + "</VTKFile>").encode()
 
     def gifti(encoding, *arrays):
@@ -209,17 +227,33 @@ def seeds():
         head = np.array([1, len(data), 0, len(p := zlib.compress(data))], "<u4").tobytes()
         one = vtp("binary", True)
         found = re.search(rb'format="binary">([^<]*)<', one)
-        return one[: found.start(1)] + base64.b64encode(head) + base64.b64encode(p) + one[found.end(1) :]
+        return (
+            one[: found.start(1)]
+            + base64.b64encode(head)
+            + base64.b64encode(p)
+            + one[found.end(1) :]
+        )
 
     encodings = [f"GIFTI_ENCODING_{kind}" for kind in ("ASCII", "B64BIN", "B64GZ")]
-    freesurfer = made(lambda path: nibabel.freesurfer.write_geometry(path, X, T, create_stamp="by hand"))
+    freesurfer = made(
+        lambda path: nibabel.freesurfer.write_geometry(path, X, T, create_stamp="by hand")
+    )
     colours = np.array([[10, 20, 30, 0, 0], [40, 50, 60, 0, 0], [70, 80, 90, 0, 0]])
-    annot = made(lambda path: nibabel.freesurfer.write_annot(path, label, colours, ["a", "b", "c"], fill_ctab=True))
+    annot = made(
+        lambda path: nibabel.freesurfer.write_annot(
+            path, label, colours, ["a", "b", "c"], fill_ctab=True
+        )
+    )
     old = np.array(
-        [len(X), *np.stack([np.arange(len(X)), np.full(len(X), 10 + 256 * 20)]).T.ravel(), 1, 1, 2], ">i4"
+        [len(X), *np.stack([np.arange(len(X)), np.full(len(X), 10 + 256 * 20)]).T.ravel(), 1, 1, 2],
+        ">i4",
     ).tobytes()
-    old += b"x\0" + np.array([2], ">i4").tobytes() + b"a\0" + np.array([10, 20, 0, 0], ">i4").tobytes()
-    clicked = [{"label": f"p{i}", "position": X[i].tolist(), "positionStatus": "defined"} for i in range(3)]
+    old += (
+        b"x\0" + np.array([2], ">i4").tobytes() + b"a\0" + np.array([10, 20, 0, 0], ">i4").tobytes()
+    )
+    clicked = [
+        {"label": f"p{i}", "position": X[i].tolist(), "positionStatus": "defined"} for i in range(3)
+    ]
     slicer = {
         "markups": [
             {"type": kind, "name": kind, "coordinateSystem": "LPS", "controlPoints": clicked}
@@ -228,9 +262,12 @@ def seeds():
     }
     picked = "<!DOCTYPE PickedPoints>\n<PickedPoints>\n <DocumentData/>\n"
     picked += (
-        "".join(f'<point x="{x}" y="{y}" z="{z}" active="1" name="n{x}"/>\n' for x, y, z in X[:4]) + "</PickedPoints>\n"
+        "".join(f'<point x="{x}" y="{y}" z="{z}" active="1" name="n{x}"/>\n' for x, y, z in X[:4])
+        + "</PickedPoints>\n"
     )
-    marks = "name,x,y,z,curve,closed\n" + "".join(f"p{i},{x},{y},{z},c,1\n" for i, (x, y, z) in enumerate(X[:4]))
+    marks = "name,x,y,z,curve,closed\n" + "".join(
+        f"p{i},{x},{y},{z},c,1\n" for i, (x, y, z) in enumerate(X[:4])
+    )
     covariates = "shape,age,site,weight\nleft.ply,31,Bern,60.5\nright,40,,NA\nmiddle,55,Genf,7e1\n"
     V, F = npy(X), npy(T)
     bare = "\n".join(marks.replace(",c,1", "").splitlines()[1:]).encode()
@@ -365,11 +402,14 @@ def damaged(seed, name, i, table):
 
 
 def read(path, kind):
-    """Read a file as the library does, a mesh up to what comes after its cleaning; "parsed" or "refused"."""
-    from s4a.annotations import read_labels, read_landmarks
-    from s4a.clean import clean_arrays
-    from s4a.io import read_mesh
-    from s4a.subjects import read_table
+    """Read a file as the library does, a mesh up to what comes after its cleaning.
+
+    "parsed" or "refused".
+    """
+    from s4a.input.annotations import read_labels, read_landmarks
+    from s4a.input.clean import clean_arrays
+    from s4a.input.files import read_mesh
+    from s4a.input.subjects import read_table
 
     readers = {"mesh": read_mesh, "labels": read_labels, "landmarks": read_landmarks}
     readers["subjects"] = lambda path: read_table(path, ["left", "middle", "right"])
@@ -403,7 +443,10 @@ def tell(line):
 
 
 def work(task):
-    """Read files of some formats one after the other; what happens goes to standard output, line by line."""
+    """Read files of some formats one after the other.
+
+    What happens goes to standard output, line by line.
+    """
     table = seeds()
     path = Path(task["folder"]) / "none"
     read_all = {"mesh": b"OFF", "labels": b"1", "landmarks": b"0 0 0", "subjects": b"shape"}
@@ -414,7 +457,7 @@ def work(task):
         except ValueError:
             pass
     X, T = surface()
-    from s4a.clean import clean_arrays
+    from s4a.input.clean import clean_arrays
 
     clean_arrays(X, T)
     most = int(memory("VmSize") * 2**20) + MEMORY
@@ -460,8 +503,8 @@ def fuzz(formats, files, seed=0, first=0, keep=None):
     Returns
     -------
     totals : dict of format to dict
-        How many were parsed, parsed but not cleaned, refused, and failed; the slowest in seconds of processor time; the
-        most memory above the start in MiB; processor seconds in all.
+        How many were parsed, parsed but not cleaned, refused, and failed; the slowest in seconds of
+        processor time; the most memory above the start in MiB; processor seconds in all.
     failures : list of (format, number, reason)
     """
     shared = Path("/dev/shm")
@@ -479,14 +522,21 @@ def fuzz(formats, files, seed=0, first=0, keep=None):
                     total = totals[name]
                     for key, count in counts.items():
                         total[key] = total.get(key, 0) + count
-                    total["slowest"], total["memory"] = max(total["slowest"], slowest), max(total["memory"], most)
+                    total["slowest"], total["memory"] = (
+                        max(total["slowest"], slowest),
+                        max(total["memory"], most),
+                    )
                     total["seconds"] += spent
                     parts = parts[1:]
             if code:
                 if at is None:
-                    raise RuntimeError(f"the child ended with code {code} before the first file:\n{lines}")
+                    raise RuntimeError(
+                        f"the child ended with code {code} before the first file:\n{lines}"
+                    )
                 name, i = at
-                why = {-signal.SIGPROF: f"over {SECONDS} s", "waits": f"over {PATIENCE} s"}.get(code, f"died: {code}")
+                why = {-signal.SIGPROF: f"over {SECONDS} s", "waits": f"over {PATIENCE} s"}.get(
+                    code, f"died: {code}"
+                )
                 failures.append((name, i, why))
                 totals[name]["failed"] = totals[name].get("failed", 0) + 1
                 # counts of the part that died are lost: it is said
@@ -507,7 +557,12 @@ def child(task, folder):
     progress.unlink(missing_ok=True)
     out = Path(folder) / "out"
     paths = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
-    environment = {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1", "PYTHONWARNINGS": "ignore"}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": paths,
+        "OMP_NUM_THREADS": "1",
+        "PYTHONWARNINGS": "ignore",
+    }
     with open(out, "wb") as lines:
         process = subprocess.Popen(
             [sys.executable, __file__, "--work", json.dumps(task)],
@@ -544,14 +599,25 @@ def main():
         return 0
     failed = 0
     keys = ["parsed", "parsed, not cleaned", "refused", "failed", "died before"]
-    heads = ["parsed", "not cleaned", "refused", "failed", "not counted", "slowest s", "MiB", "CPU s"]
+    heads = [
+        "parsed",
+        "not cleaned",
+        "refused",
+        "failed",
+        "not counted",
+        "slowest s",
+        "MiB",
+        "CPU s",
+    ]
     sys.stdout.write(f"{'format':16}" + "".join(f"{head:>13}" for head in heads) + "\n")
     for name in args.only or seeds():
         totals, failures = fuzz([name], args.files, args.seed, args.first, args.keep)
         row = totals[name]
         counts = [row.get(key, 0) for key in keys]
         sys.stdout.write(f"{name:16}" + "".join(f"{count:13}" for count in counts))
-        sys.stdout.write("".join(f"{row[key]:13.3g}" for key in ("slowest", "memory", "seconds")) + "\n")
+        sys.stdout.write(
+            "".join(f"{row[key]:13.3g}" for key in ("slowest", "memory", "seconds")) + "\n"
+        )
         for one, i, why in failures[:20]:
             sys.stdout.write(f"  {one} {i}: {why}\n")
         sys.stdout.flush()

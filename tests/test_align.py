@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from s4a import align, synthetic
-from s4a.mesh import as_arrays, vertex_areas
+from s4a import synthetic
+from s4a.geometry import align
+from s4a.geometry.mesh import as_arrays, vertex_areas
 
 
 def turned(degrees, axis=(1, 2, 3)):
@@ -26,7 +27,11 @@ def brain():
 def test_a_motion_and_a_scale_are_recovered_exactly(seed):
     rng = np.random.default_rng(seed)
     P, weight = rng.normal(size=(40, 3)), rng.uniform(0.1, 2, 40)
-    R, t, s = Rotation.random(random_state=seed).as_matrix(), rng.normal(size=3), rng.uniform(0.2, 5)
+    R, t, s = (
+        Rotation.random(random_state=seed).as_matrix(),
+        rng.normal(size=3),
+        rng.uniform(0.2, 5),
+    )
     found = align.rigid_transform(P, s * P @ R.T + t, weight, scale=True)
     for one, two in zip(found, (R, t, s), strict=True):
         assert one == pytest.approx(two, abs=1e-12)
@@ -80,7 +85,9 @@ def test_a_shape_turned_by_180_degrees_is_found(brain, axis):
 @pytest.mark.parametrize("degrees", [0, 15, 30, 60, 120])
 def test_the_alignment_of_two_different_shapes_does_not_depend_on_their_pose(degrees):
     tree = synthetic.brains(2, 2500)["original"]
-    (X, area), (Y, area_y) = ((m["position"].values, vertex_areas(*as_arrays(m))) for m in tree.children.values())
+    (X, area), (Y, area_y) = (
+        (m["position"].values, vertex_areas(*as_arrays(m))) for m in tree.children.values()
+    )
     still = align.align(X, area, Y, area_y)[0]
     found = align.align(X @ turned(degrees).T, area, Y, area_y)[0]
     away = Rotation.from_matrix(still.T @ found @ turned(degrees)).magnitude()

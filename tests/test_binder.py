@@ -1,4 +1,7 @@
-"""What Binder builds: its files agree with pyproject.toml, the paths of the links exist, and the study is made."""
+"""What Binder builds: its files agree with pyproject.toml, the paths of the links exist.
+
+And the study is made.
+"""
 
 import importlib.util
 import os
@@ -11,7 +14,7 @@ import numpy as np
 import pytest
 
 import s4a
-from s4a.study import open_study
+from s4a.study.store import open_study
 
 ROOT = Path(__file__).parent.parent
 BINDER = ROOT / "binder"
@@ -45,7 +48,9 @@ def whole(tmp_path_factory):
 @pytest.fixture
 def folder(prepare, whole, monkeypatch, tmp_path):
     """What is made where nothing is there yet; the analysis itself is that of `whole`."""
-    monkeypatch.setattr(s4a, "analyse", lambda shapes, *, store, **options: shutil.copytree(whole, store))
+    monkeypatch.setattr(
+        s4a, "analyse", lambda shapes, *, store, **options: shutil.copytree(whole, store)
+    )
     return prepare.collection(tmp_path / "study", n=3, n_vertices=300)
 
 
@@ -61,7 +66,10 @@ def test_what_they_install_besides_has_lower_bounds_only_and_stands_nowhere_else
     others = distributions(line for line in lines("requirements.txt") if not line.startswith("-e"))
     assert others
     listed = distributions(
-        sum((PROJECT["optional-dependencies"][e] for e in ("notebook", "course")), PROJECT["dependencies"])
+        sum(
+            (PROJECT["optional-dependencies"][e] for e in ("notebook", "course")),
+            PROJECT["dependencies"],
+        )
     )
     assert not set(others) & set(listed)
     assert all(re.fullmatch(r">=[\d.]+", bound) for bound in others.values())
@@ -75,7 +83,9 @@ def test_the_runtime_is_a_python_that_the_project_allows():
 
 
 def test_the_system_libraries_are_those_that_the_checks_install():
-    wanted = set(re.findall(r"lib\w+\.so\.\d+:(\w+)", (ROOT / ".ci" / "run").read_text(encoding="utf-8")))
+    wanted = set(
+        re.findall(r"lib\w+\.so\.\d+:(\w+)", (ROOT / ".ci" / "run").read_text(encoding="utf-8"))
+    )
     assert set(lines("apt.txt")) == wanted == {"libgl1", "libopengl0"}
 
 
@@ -91,7 +101,11 @@ def test_post_build_is_executable_stops_at_an_error_and_runs_what_is_there():
 
 def test_the_links_of_the_readme_open_notebooks_that_are_there():
     text = (ROOT / "README.md").read_text(encoding="utf-8")
-    links = re.findall(r"^\[[\w -]+\]: https://mybinder\.org/v2/gh/[\w.-]+/[\w.-]+/HEAD\?urlpath=(\S+)$", text, re.M)
+    links = re.findall(
+        r"^\[[\w -]+\]: https://mybinder\.org/v2/gh/[\w.-]+/[\w.-]+/HEAD\?urlpath=(\S+)$",
+        text,
+        re.M,
+    )
     opened = [re.fullmatch(r"(lab/tree|voila/render)/(.+\.ipynb)", link).groups() for link in links]
     assert {kind for kind, _ in opened} == {"lab/tree", "voila/render"}
     assert all((ROOT / path).is_file() for _, path in opened)
@@ -110,7 +124,12 @@ def test_the_study_of_51_has_what_every_panel_shows(folder):
 
 def test_it_is_that_of_the_analysis_to_four_digits(folder, whole):
     study, exact = open_study(folder), open_study(whole)
-    for name in ("pca/deformation", "registration/displacement", "latent/area_difference", "network/fmap"):
+    for name in (
+        "pca/deformation",
+        "registration/displacement",
+        "latent/area_difference",
+        "network/fmap",
+    ):
         scale = np.abs(exact[name].values).max()
         assert np.abs(study[name].values - exact[name].values).max() < 2e-4 * scale
     assert study["latent"].attrs["median"] == exact["latent"].attrs["median"]

@@ -8,7 +8,7 @@ from io import BytesIO
 import numpy as np
 import pytest
 
-from s4a.io import WRITERS, find_meshes, read_mesh, write_mesh
+from s4a.input.files import WRITERS, find_meshes, read_mesh, write_mesh
 
 X = np.array([[0, 0, 0], [1.5, 0, 0], [1.5, 2, 0], [0, 2, 0], [0.25, 0.5, 3]])
 T = np.array([[0, 2, 1], [0, 3, 2], [0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
@@ -22,19 +22,25 @@ def file(path, content):
 def test_compressed_files_are_read_as_what_they_hold(tmp_path):
     for suffix in (".ply", ".obj", ".off", ".stl", ".vtk", ".gii", ".npz"):
         write_mesh(tmp_path / f"m{suffix}", X, T)
-        packed = file(tmp_path / f"m{suffix}.gz", gzip.compress((tmp_path / f"m{suffix}").read_bytes()))
+        packed = file(
+            tmp_path / f"m{suffix}.gz", gzip.compress((tmp_path / f"m{suffix}").read_bytes())
+        )
         (tmp_path / f"m{suffix}").unlink()
         points, triangles, attrs = read_mesh(packed)
         assert np.array_equal(points[triangles], X[T])
         assert "note" not in attrs
-    assert [name for _, name in find_meshes(tmp_path)] == [f"m_{s}_gz" for s in "gii npz obj off ply stl vtk".split()]
+    assert [name for _, name in find_meshes(tmp_path)] == [
+        f"m_{s}_gz" for s in "gii npz obj off ply stl vtk".split()
+    ]
     (tmp_path / "one").mkdir()
     (tmp_path / "m.ply.gz").rename(tmp_path / "one" / "brain.ply.gz")
     assert [name for _, name in find_meshes(tmp_path / "one", "brain")] == ["brain"]
 
 
 def test_a_compressed_file_that_is_cut_or_damaged_is_refused(tmp_path):
-    packed = gzip.compress(WRITERS[".obj"](np.random.default_rng(0).random((50, 3)), T, {}), mtime=0)
+    packed = gzip.compress(
+        WRITERS[".obj"](np.random.default_rng(0).random((50, 3)), T, {}), mtime=0
+    )
     with pytest.raises(ValueError, match="the gzip data ends early: found 40 bytes"):
         read_mesh(file(tmp_path / "m.ply.gz", packed[:40]))
     with pytest.raises(ValueError, match="damaged gzip data"):

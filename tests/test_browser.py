@@ -1,4 +1,7 @@
-"""The main notebook in a real JupyterLab, driven in Chromium: what is seen and clicked; pages without a kernel."""
+"""The main notebook in a real JupyterLab, driven in Chromium: what is seen and clicked.
+
+Pages without a kernel.
+"""
 
 import contextlib
 import json
@@ -16,13 +19,15 @@ import numpy as np
 import pytest
 
 import s4a
-from s4a.picture import aligned
+from s4a.show.pictures import aligned
 
 playwright = pytest.importorskip("playwright.sync_api")
 pytest.importorskip("jupyterlab")
 widgets = pytest.importorskip("s4a.widgets")
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+CHROMIUM = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+)
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium")
 NOTEBOOK = Path(__file__).parent.parent / "notebooks" / "00_explore.ipynb"
 SWITCHES = (
@@ -34,7 +39,9 @@ VIEW = "canvas.s4a-view"
 DRAWN = f"[...document.querySelectorAll('{VIEW}')].some((c) => c.offsetParent && c.view.frames > 0)"
 SEEN = "[...document.querySelectorAll('canvas.s4a-view')].filter((c) => c.offsetParent).map((c) => c.view)"
 STILLS = "[...document.querySelectorAll('img.s4a-still')].filter((i) => i.offsetParent && i.naturalWidth > 100)"
-IDLE = "[...document.querySelectorAll('.jp-InputPrompt')].every((p) => !p.textContent.includes('*'))"
+IDLE = (
+    "[...document.querySelectorAll('.jp-InputPrompt')].every((p) => !p.textContent.includes('*'))"
+)
 
 
 PROGRESS = """
@@ -48,12 +55,17 @@ Progress(s4a.synthetic.brains(3, 8000, seed=1), {store!r}, n_coarse=300, k=12, k
 @pytest.fixture(scope="module")
 def study(tmp_path_factory):
     folder = tmp_path_factory.mktemp("study")
-    return s4a.analyse(s4a.synthetic.brains(5, 2000, seed=1), n_coarse=500, k=24, k_init=10, store=folder, n_jobs=1)
+    return s4a.analyse(
+        s4a.synthetic.brains(5, 2000, seed=1), n_coarse=500, k=24, k_init=10, store=folder, n_jobs=1
+    )
 
 
 @pytest.fixture(scope="module")
 def folder(study, tmp_path_factory):
-    """A folder with the main notebook, in which the study of this test takes the place of the analysis."""
+    """A folder with the main notebook.
+
+    In which the study of this test takes the place of the analysis.
+    """
     folder = tmp_path_factory.mktemp("lab")
     notebook = json.loads(NOTEBOOK.read_text(encoding="utf-8"))
     cell = next(c for c in notebook["cells"] if "s4a.analyse" in "".join(c["source"]))
@@ -63,10 +75,17 @@ def folder(study, tmp_path_factory):
     (folder / NOTEBOOK.name).write_text(json.dumps(notebook), encoding="utf-8")
     notebook["cells"] = [cell | {"source": f"{opened}\nstudy.s4a.explore()", "id": "small"}]
     (folder / "small.ipynb").write_text(json.dumps(notebook), encoding="utf-8")
-    notebook["cells"] = [cell | {"source": PROGRESS.format(store=str(folder / "run")), "id": "progress"}]
+    notebook["cells"] = [
+        cell | {"source": PROGRESS.format(store=str(folder / "run")), "id": "progress"}
+    ]
     (folder / "progress.ipynb").write_text(json.dumps(notebook), encoding="utf-8")
     (folder / "app").mkdir()
-    news = {"@jupyterlab/apputils-extension:notification": {"fetchNews": "false", "checkForUpdates": False}}
+    news = {
+        "@jupyterlab/apputils-extension:notification": {
+            "fetchNews": "false",
+            "checkForUpdates": False,
+        }
+    }
     (folder / "app" / "overrides.json").write_text(json.dumps(news), encoding="utf-8")
     return folder
 
@@ -77,7 +96,9 @@ def lab(folder):
     with contextlib.closing(socket.socket()) as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    own = {f"JUPYTER_{name}_DIR": str(folder / name.lower()) for name in ("CONFIG", "DATA", "RUNTIME")}
+    own = {
+        f"JUPYTER_{name}_DIR": str(folder / name.lower()) for name in ("CONFIG", "DATA", "RUNTIME")
+    }
     options = {
         "ServerApp.port": port,
         "ServerApp.root_dir": folder,
@@ -85,10 +106,19 @@ def lab(folder):
         "IdentityProvider.token": "",
         "LabApp.app_settings_dir": folder / "app",
     }
-    command = [sys.executable, "-m", "jupyterlab", "--allow-root", *(f"--{k}={v}" for k, v in options.items())]
+    command = [
+        sys.executable,
+        "-m",
+        "jupyterlab",
+        "--allow-root",
+        *(f"--{k}={v}" for k, v in options.items()),
+    ]
     with open(folder / "lab.log", "w") as log:
         process = subprocess.Popen(
-            command, env=os.environ | own | {"IPYTHONDIR": str(folder / "ipython")}, stdout=log, stderr=log
+            command,
+            env=os.environ | own | {"IPYTHONDIR": str(folder / "ipython")},
+            stdout=log,
+            stderr=log,
         )
         try:
             wait_for(f"http://127.0.0.1:{port}/api", folder / "lab.log")
@@ -122,7 +152,9 @@ def browser(driver):
 @pytest.fixture(scope="module")
 def flat(driver):
     """A browser that has no WebGL."""
-    browser = driver.chromium.launch(executable_path=CHROMIUM, args=[*SWITCHES, "--disable-3d-apis"])
+    browser = driver.chromium.launch(
+        executable_path=CHROMIUM, args=[*SWITCHES, "--disable-3d-apis"]
+    )
     yield browser
     browser.close()
 
@@ -177,7 +209,9 @@ def pixels(canvas):
 
 
 def vertices(canvas):
-    return np.array(canvas.evaluate("(c) => Array.from(c.view.surfaces[0].position)"), np.float32).reshape(-1, 3)
+    return np.array(
+        canvas.evaluate("(c) => Array.from(c.view.surfaces[0].position)"), np.float32
+    ).reshape(-1, 3)
 
 
 def move(slider, value):
@@ -185,7 +219,10 @@ def move(slider, value):
 
 
 def check_sliders(page, study):
-    """Every slider moves the shape to mean + sum of score times deformation, and other pixels are seen."""
+    """Every slider moves the shape to mean + sum of score times deformation.
+
+    And other pixels are seen.
+    """
     canvas, sliders = visible(page, VIEW).first, visible(page, ".s4a-slider input")
     pca = study["pca"].dataset
     mean = study["registration"]["position"].values + pca["mean_displacement"].values
@@ -198,14 +235,18 @@ def check_sliders(page, study):
         scores[mode] = 2.5 - mode
         move(sliders.nth(mode), scores[mode])
         expected = mean + np.tensordot(scores, pca["deformation"].values, axes=1)
-        np.testing.assert_allclose(vertices(canvas), expected, rtol=0, atol=4e-7 * np.abs(expected).max())
+        np.testing.assert_allclose(
+            vertices(canvas), expected, rtol=0, atol=4e-7 * np.abs(expected).max()
+        )
         assert pixels(canvas) != before
     return scores
 
 
 def test_every_slider_moves_the_shape_along_its_mode(page, study):
     scores = check_sliders(page, study)
-    visible(page, ".s4a-readout").filter(has_text=f"Mahalanobis distance {np.linalg.norm(scores):.2f}").wait_for()
+    visible(page, ".s4a-readout").filter(
+        has_text=f"Mahalanobis distance {np.linalg.norm(scores):.2f}"
+    ).wait_for()
 
 
 def test_arrow_keys_move_a_slider_and_not_the_notebook(page):
@@ -228,7 +269,9 @@ def test_both_ends_of_a_mode_side_by_side(page):
     button = page.get_by_role("button", name="−3 · mean · +3")
     button.click()
     assert visible(page, VIEW).count() == 3
-    page.wait_for_function(f"[...document.querySelectorAll('{VIEW}')].every((c) => !c.offsetParent || c.view.frames)")
+    page.wait_for_function(
+        f"[...document.querySelectorAll('{VIEW}')].every((c) => !c.offsetParent || c.view.frames)"
+    )
     shown = visible(page, VIEW)
     assert len({pixels(shown.nth(i)) for i in range(3)}) == 3
     turned = shown.nth(2).evaluate("(c) => [...c.view.camera.turn]")
@@ -270,8 +313,12 @@ def test_a_clicked_point_is_carried_to_the_shape(page, study):
     page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
     readout = visible(page, ".s4a-readout").filter(has_text="template vertex").first
     readout.wait_for()
-    vertex, shape, image = re.search(r"vertex (\d+) ↔ (\w+) vertex (\d+)", readout.inner_text()).groups()
-    assert study["registration"]["registered_match"].sel(shape=shape).values[int(vertex)] == int(image)
+    vertex, shape, image = re.search(
+        r"vertex (\d+) ↔ (\w+) vertex (\d+)", readout.inner_text()
+    ).groups()
+    assert study["registration"]["registered_match"].sel(shape=shape).values[int(vertex)] == int(
+        image
+    )
 
 
 def test_a_landmark_is_placed_and_carried_over(page, study):
@@ -297,7 +344,9 @@ def test_the_keyboard_places_a_landmark(page, study):
     start, moved = cursor(canvas), cursor(canvas, *["ArrowRight"] * 4)
     X = vertices(canvas)
     right = canvas.evaluate("(c) => c.view.camera.turn.slice(0, 3)")
-    assert (X[moved] - X[start]) @ right > 0.05 * np.ptp(X, axis=0).max(), "the arrow keys move the cursor"
+    assert (X[moved] - X[start]) @ right > 0.05 * np.ptp(X, axis=0).max(), (
+        "the arrow keys move the cursor"
+    )
     canvas.press("Enter")
     visible(page, "td").filter(has_text=f"landmark {count + 1}").wait_for()
     placed = np.array(canvas.evaluate("(c) => c.view.points.at(-1)"))
@@ -312,7 +361,9 @@ def test_a_landmark_is_a_lit_sphere_of_its_radius_in_the_datas_unit(page):
     field = visible(page, ".widget-text input[type=number]").first
     field.fill(str(2 * radius))
     field.press("Enter")
-    page.wait_for_function(f"(r) => {SEEN}.some((view) => view.points[0]?.[6] === r)", arg=2 * radius)
+    page.wait_for_function(
+        f"(r) => {SEEN}.some((view) => view.points[0]?.[6] === r)", arg=2 * radius
+    )
     assert pixels(canvas) != before
 
 
@@ -348,7 +399,9 @@ def test_whatever_can_be_clicked_has_a_name_and_is_reached_by_the_keyboard(page)
         assert unnamed == 0
     visible(page, ".s4a-slider input").first.focus()
     page.keyboard.press("Tab")
-    assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") == "solid", "focus is seen"
+    assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") == "solid", (
+        "focus is seen"
+    )
 
 
 @pytest.mark.parametrize("title", ["Functional map", "Spectrum"])
@@ -386,11 +439,15 @@ def test_without_webgl_the_notebook_shows_still_pictures(flat, lab, study):
     page.close()
 
 
-def test_an_analysis_is_opened_while_it_runs_and_cancelled_and_resumed(browser, lab, folder, messages):
+def test_an_analysis_is_opened_while_it_runs_and_cancelled_and_resumed(
+    browser, lab, folder, messages
+):
     page = watched(browser.new_page(viewport={"width": 1280, "height": 1300}), messages)
     page.set_default_timeout(60_000)
     run_notebook(page, lab, "progress.ipynb")
-    page.wait_for_function("document.querySelectorAll('.progress-bar-success').length >= 2", timeout=120_000)
+    page.wait_for_function(
+        "document.querySelectorAll('.progress-bar-success').length >= 2", timeout=120_000
+    )
     page.get_by_role("button", name="Open", exact=True).click()
     page.locator(".jupyter-widgets .lm-TabBar-tabLabel", has_text="Spectrum").first.click()
     page.wait_for_function(DRAWN)
@@ -402,7 +459,9 @@ def test_an_analysis_is_opened_while_it_runs_and_cancelled_and_resumed(browser, 
     page.get_by_role("button", name="Resume", exact=True).click()
     page.wait_for_selector("text=/finished, \\d/", timeout=180_000)
     assert (folder / "run" / "pca.nc").exists()
-    assert {path: path.stat().st_mtime_ns for path in kept} == kept, "what was done is not done again"
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept, (
+        "what was done is not done again"
+    )
     page.locator(".jupyter-widgets .lm-TabBar-tabLabel", has_text="Modes").first.click()
     page.wait_for_selector(".s4a-slider >> visible=true")
     page.close()
@@ -513,7 +572,9 @@ def test_the_page_of_the_median_ranks_by_the_operator_that_is_chosen(offline, st
     page.wait_for_function(DRAWN)
     chosen(page, "operator", "conformal")
     D = study["latent"]["conformal_difference"].values
-    distance = np.sort(s4a.median.distance_to_identity(D, study["latent"]["latent_eigenvalue"].values))
+    distance = np.sort(
+        s4a.method.median.distance_to_identity(D, study["latent"]["latent_eigenvalue"].values)
+    )
     bar = visible(page, "rect.s4a-mark").nth(3)
     name, value = bar.get_attribute("aria-label").split(": ")
     assert float(value) == pytest.approx(distance[3], rel=1e-3)
@@ -535,7 +596,9 @@ def test_the_page_of_the_spectrum_moves_through_modes_and_reconstructions(offlin
     visible(page, ".s4a-title").filter(has_text="from 5 of 24").wait_for()
     mesh = study["coarse"]["brain_01"].to_dataset()
     X = aligned(study, "brain_01", mesh["position"].values)
-    np.testing.assert_allclose(vertices(canvas), s4a.spectral.reconstruct(mesh, X, k=5), atol=1e-3)
+    np.testing.assert_allclose(
+        vertices(canvas), s4a.method.spectral.reconstruct(mesh, X, k=5), atol=1e-3
+    )
     assert (vertices(canvas) != before).any()
     assert errors == []
     page.close()
@@ -548,11 +611,15 @@ def test_the_page_of_correspondences_follows_the_pointer_and_the_keyboard(offlin
     chosen(page, "choice", "brain_04")
     chosen(page, "colors", "checkerboard")
     at = cursor(visible(page, VIEW).first, "ArrowRight")
-    readout = visible(page, ".s4a-readout").filter(has_text=f"template vertex {at} ↔ brain_04").first
+    readout = (
+        visible(page, ".s4a-readout").filter(has_text=f"template vertex {at} ↔ brain_04").first
+    )
     image = int(re.search(r"brain_04 vertex (\d+)", readout.inner_text())[1])
     assert study["registration"]["registered_match"].sel(shape="brain_04").values[at] == image
     shape = visible(page, VIEW).nth(1)
-    np.testing.assert_allclose(shape.evaluate("(c) => c.view.points[0].slice(0, 3)"), vertices(shape)[image])
+    np.testing.assert_allclose(
+        shape.evaluate("(c) => c.view.points[0].slice(0, 3)"), vertices(shape)[image]
+    )
     assert shape.evaluate("(c) => c.view.surfaces[0].cell") > 0
     assert errors == []
     page.close()
@@ -572,11 +639,16 @@ def test_the_page_of_a_transfer_says_what_needs_python(offline, study, tmp_path)
 def test_without_webgl_pages_have_still_pictures(flat, study, study_page, tmp_path):
     for path in (saved(widgets.Modes(study), tmp_path / "modes.html"), study_page):
         page, errors = opened(flat, path)
-        page.wait_for_function("[...document.querySelectorAll('img')].some((i) => i.naturalWidth > 100)")
+        page.wait_for_function(
+            "[...document.querySelectorAll('img')].some((i) => i.naturalWidth > 100)"
+        )
         assert visible(page, VIEW).count() == 0
         assert errors == []
         if path.name == "study.html":
-            image, slider = page.locator("#modes-instead img").first, page.locator("#modes-instead input").first
+            image, slider = (
+                page.locator("#modes-instead img").first,
+                page.locator("#modes-instead input").first,
+            )
             before = image.get_attribute("src")
             move(slider, 0)
             assert image.get_attribute("src") != before

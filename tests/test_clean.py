@@ -7,16 +7,19 @@ import pytest
 import xarray as xr
 from scipy.spatial import ConvexHull
 
-from s4a.clean import clean, clean_arrays
-from s4a.io import write_mesh
-from s4a.mesh import as_dataset, triangle_areas, volume
-from s4a.shapes import read_shape, read_shapes
+from s4a.geometry.mesh import as_dataset, triangle_areas, volume
+from s4a.input.clean import clean, clean_arrays
+from s4a.input.collection import read_shape, read_shapes
+from s4a.input.files import write_mesh
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
 def assert_oriented_manifold(X, T):
-    """Every directed edge once, and one fan of triangles around every vertex: in plain Python, on its own."""
+    """Every directed edge once, and one fan of triangles around every vertex.
+
+    In plain Python, on its own.
+    """
     after, directed = defaultdict(dict), set()
     for a, b, c in T.tolist():
         assert len({a, b, c}) == 3
@@ -46,7 +49,10 @@ def sphere(n=200, seed=0):
     X = np.random.default_rng(seed).normal(size=(n, 3))
     X /= np.linalg.norm(X, axis=1, keepdims=True)
     hull = ConvexHull(X)
-    N = np.cross(X[hull.simplices[:, 1]] - X[hull.simplices[:, 0]], X[hull.simplices[:, 2]] - X[hull.simplices[:, 0]])
+    N = np.cross(
+        X[hull.simplices[:, 1]] - X[hull.simplices[:, 0]],
+        X[hull.simplices[:, 2]] - X[hull.simplices[:, 0]],
+    )
     inwards = (N * hull.equations[:, :3]).sum(1) < 0
     return X, np.where(inwards[:, None], hull.simplices[:, ::-1], hull.simplices)
 
@@ -75,7 +81,9 @@ def triangle_set(X, T):
     """The triangles as points, from their smallest corner on, sorted."""
     points = np.round(X, 4)[T]
     first = (points @ [1e8, 1e4, 1]).argmin(axis=1)
-    points = np.take_along_axis(points, ((first[:, None] + np.arange(3)) % 3)[:, :, None], 1).reshape(len(T), 9)
+    points = np.take_along_axis(
+        points, ((first[:, None] + np.arange(3)) % 3)[:, :, None], 1
+    ).reshape(len(T), 9)
     return points[np.lexsort(points.T)]
 
 
@@ -114,14 +122,20 @@ def test_holes_and_genus_are_counted():
 def test_a_triangle_soup_is_welded():
     X, T = sphere()
     noise = 1e-8 * np.random.default_rng(0).normal(size=(3 * len(T), 3))
-    for soup in (X[T].reshape(-1, 3), X[T].reshape(-1, 3) + noise, X[T].reshape(-1, 3).astype(np.float32)):
+    for soup in (
+        X[T].reshape(-1, 3),
+        X[T].reshape(-1, 3) + noise,
+        X[T].reshape(-1, 3).astype(np.float32),
+    ):
         Y, _, counts = cleaned(soup, np.arange(3 * len(T)).reshape(-1, 3))
         assert (len(Y), counts["components"], counts["genus"], counts["holes"]) == (len(X), 1, 0, 0)
 
 
 def test_a_far_outlier_does_not_weld_the_shape():
     X, T = sphere()
-    Y, _, counts = cleaned(*together((X, T), (1e9 + cube([0, 0, 0])[0], cube([0, 0, 0])[1])), components="all")
+    Y, _, counts = cleaned(
+        *together((X, T), (1e9 + cube([0, 0, 0])[0], cube([0, 0, 0])[1])), components="all"
+    )
     assert (len(Y), counts["components"]) == (len(X) + 8, 2)
 
 
@@ -143,7 +157,9 @@ def test_vertices_that_are_not_finite_go_with_their_triangles():
 
 def test_the_way_to_the_file_and_back():
     X, T = sphere()
-    X = np.concatenate([[[9, 9, 9]], X, X[[5]], [[np.inf, 0, 0]]])  # unused, ..., a copy of file vertex 6, not finite
+    X = np.concatenate(
+        [[[9, 9, 9]], X, X[[5]], [[np.inf, 0, 0]]]
+    )  # unused, ..., a copy of file vertex 6, not finite
     T = T + 1
     T[np.flatnonzero((T == 6).any(axis=1))[0]] = np.where(
         T[(T == 6).any(axis=1)][0] == 6, 201, T[(T == 6).any(axis=1)][0]
@@ -183,7 +199,9 @@ def test_solids_glued_face_to_face_become_one():
 def test_a_zero_area_triangle_goes_without_a_crack():
     X, T = sphere()
     p, q, r = T[0]
-    X = np.concatenate([X, [(X[p] + X[q]) / 2]])  # on the edge p q, as a corner of the triangle below it only
+    X = np.concatenate(
+        [X, [(X[p] + X[q]) / 2]]
+    )  # on the edge p q, as a corner of the triangle below it only
     T = np.concatenate([T[1:], [[p, len(X) - 1, r], [len(X) - 1, q, r], [p, q, len(X) - 1]]])
     Y, S, counts = cleaned(X, T)
     assert (counts["flipped_edges"], counts["holes"], counts["genus"], len(Y)) == (1, 0, 0, len(X))
@@ -220,7 +238,13 @@ def test_solids_that_touch_in_an_edge_or_a_vertex_come_apart():
 
 
 def test_a_surface_that_touches_itself_in_an_edge_stays_closed():
-    ring = [[0, 0, 0], [1, 1, 0], [1, 1, 1], [0, 1, 1], [0, 0, 1]]  # the first two cubes touch in an edge
+    ring = [
+        [0, 0, 0],
+        [1, 1, 0],
+        [1, 1, 1],
+        [0, 1, 1],
+        [0, 0, 1],
+    ]  # the first two cubes touch in an edge
     X, T = together(*[cube(corner) for corner in ring])
     _, _, counts = cleaned(X, T)
     assert counts["nonmanifold_edges"] > 0
@@ -230,8 +254,14 @@ def test_a_surface_that_touches_itself_in_an_edge_stays_closed():
 def test_a_fin_is_cut_off():
     X, T = sphere()
     fin = [T[0, 0], T[0, 1], len(X)]
-    Y, S, counts = cleaned(np.concatenate([X, [2 * X[T[0, 0]]]]), np.concatenate([T, [fin]]), components="largest")
-    assert (counts["nonmanifold_edges"], counts["cut_edges"], counts["dropped_components"]) == (1, 1, 1)
+    Y, S, counts = cleaned(
+        np.concatenate([X, [2 * X[T[0, 0]]]]), np.concatenate([T, [fin]]), components="largest"
+    )
+    assert (counts["nonmanifold_edges"], counts["cut_edges"], counts["dropped_components"]) == (
+        1,
+        1,
+        1,
+    )
     np.testing.assert_array_equal(triangle_set(Y, S), triangle_set(X, T))
 
 
@@ -248,21 +278,35 @@ def test_random_winding_is_made_consistent_and_outwards():
 def test_an_open_shape_faces_outwards_too():
     X, T = sphere()
     T = T[X[T].mean(1)[:, 2] > -0.8]
-    np.testing.assert_array_equal(triangle_set(*cleaned(X + 100, T[:, ::-1])[:2]), triangle_set(X + 100, T))
+    np.testing.assert_array_equal(
+        triangle_set(*cleaned(X + 100, T[:, ::-1])[:2]), triangle_set(X + 100, T)
+    )
 
 
 def test_a_moebius_strip_is_cut_into_one_that_has_two_sides():
     n = 20
     u = 2 * np.pi * np.arange(n) / n
     rim = [
-        np.stack([(3 + s * np.cos(u / 2)) * np.cos(u), (3 + s * np.cos(u / 2)) * np.sin(u), s * np.sin(u / 2)], 1)
+        np.stack(
+            [
+                (3 + s * np.cos(u / 2)) * np.cos(u),
+                (3 + s * np.cos(u / 2)) * np.sin(u),
+                s * np.sin(u / 2),
+            ],
+            1,
+        )
         for s in (-1, 1)
     ]
     a, b = np.arange(n), n + np.arange(n)
     c, d = np.r_[a[1:], b[0]], np.r_[b[1:], a[0]]
     T = np.concatenate([np.stack([a, c, d], axis=1), np.stack([a, d, b], axis=1)])
     _, S, counts = cleaned(np.concatenate(rim), T)
-    assert (len(S), counts["components"], counts["holes"], counts["euler_characteristic"]) == (2 * n, 1, 1, 1)
+    assert (len(S), counts["components"], counts["holes"], counts["euler_characteristic"]) == (
+        2 * n,
+        1,
+        1,
+        1,
+    )
 
 
 def test_an_edge_with_very_many_triangles_is_cut():
@@ -281,13 +325,19 @@ def test_components_are_kept_as_asked():
     X, T = together(ball, (0.3 * ball[0] + 3, ball[1]), (0.2 * ball[0] - 3, ball[1]))
     for asked, kept in (("largest", 1), (2, 2), ("all", 3), (7, 3)):
         Y, _, counts = cleaned(X, T, components=asked)
-        assert (len(Y), counts["components"], counts["dropped_components"]) == (kept * len(ball[0]), 3, 3 - kept)
+        assert (len(Y), counts["components"], counts["dropped_components"]) == (
+            kept * len(ball[0]),
+            3,
+            3 - kept,
+        )
     assert cleaned(X, T)[2]["area_dropped"] == pytest.approx(0.13 / 1.13)
 
 
 def test_a_largest_component_under_half_is_an_error_with_the_way_out():
     X, T = together(cube([0, 0, 0]), cube([5, 0, 0]), cube([0, 5, 0]))
-    with pytest.raises(ValueError, match=r"largest of 3 components has 33\.3 %.*components=3 holds 90 %"):
+    with pytest.raises(
+        ValueError, match=r"largest of 3 components has 33\.3 %.*components=3 holds 90 %"
+    ):
         clean_arrays(X, T)
     assert cleaned(X, T, components=1)[2]["dropped_components"] == 2
 
@@ -341,14 +391,20 @@ def shuffled(X, T, seed=0):
     rng = np.random.default_rng(seed)
     order = rng.permutation(len(X))
     T = np.argsort(order)[T][rng.permutation(len(T))]
-    return X[order], np.take_along_axis(T, (rng.integers(0, 3, len(T))[:, None] + np.arange(3)) % 3, 1)
+    return X[order], np.take_along_axis(
+        T, (rng.integers(0, 3, len(T))[:, None] + np.arange(3)) % 3, 1
+    )
 
 
 def test_the_order_of_vertices_and_triangles_does_not_matter():
-    X, T = together(*[cube(c) for c in ([0, 0, 0], [1, 1, 0], [1, 1, 1], [0, 1, 1], [0, 0, 1])], torus())
+    X, T = together(
+        *[cube(c) for c in ([0, 0, 0], [1, 1, 0], [1, 1, 1], [0, 1, 1], [0, 0, 1])], torus()
+    )
     expected = triangle_set(*cleaned(X, T, components="all")[:2])
     for seed in range(5):
-        np.testing.assert_array_equal(triangle_set(*cleaned(*shuffled(X, T, seed), components="all")[:2]), expected)
+        np.testing.assert_array_equal(
+            triangle_set(*cleaned(*shuffled(X, T, seed), components="all")[:2]), expected
+        )
 
 
 # real files
@@ -381,7 +437,11 @@ def packed(name):
 def test_a_head_keeps_its_surface_and_its_tunnels():
     mesh = packed("synthseg_brains/icv_mc_01.npz")
     assert_oriented_manifold(mesh["position"].values, mesh["corner_vertex"].values)
-    assert (mesh.attrs["euler_characteristic"], mesh.attrs["holes"], mesh.attrs["components"]) == (-242, 0, 824)
+    assert (mesh.attrs["euler_characteristic"], mesh.attrs["holes"], mesh.attrs["components"]) == (
+        -242,
+        0,
+        824,
+    )
     assert mesh.attrs["reason"] == "823 components dropped (4.6 % of the area)"
 
 
@@ -424,7 +484,9 @@ def test_a_collection_goes_through_a_netcdf_file(tmp_path):
     shapes = read_shapes({"a": sphere(), "b": as_dataset(*torus())})
     shapes.to_netcdf(tmp_path / "shapes.nc", engine="h5netcdf")
     with xr.open_datatree(tmp_path / "shapes.nc", engine="h5netcdf") as back:
-        xr.testing.assert_identical(back["original/b"].to_dataset().load(), shapes["original/b"].to_dataset())
+        xr.testing.assert_identical(
+            back["original/b"].to_dataset().load(), shapes["original/b"].to_dataset()
+        )
         assert back["report"]["genus"].values.tolist() == [0, 1]
 
 

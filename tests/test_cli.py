@@ -8,8 +8,9 @@ from importlib.metadata import version
 import numpy as np
 import pytest
 
-from s4a import analyse, cli, commands, synthetic, tables, write_mesh
-from s4a.mesh import as_arrays
+from s4a import analyse, cli, synthetic, write_mesh
+from s4a.cli import commands, tables
+from s4a.geometry.mesh import as_arrays
 
 SMALL = ["--n-coarse", "400", "--k-init", "10", "--k", "20", "--n-jobs", "1"]
 
@@ -36,7 +37,12 @@ def test_run_ends_well_and_says_what_it_found(ran):
     study, result = ran
     assert result.returncode == 0, result.stderr
     assert (study / "pca.nc").exists()
-    for words in ("3 shapes: 3 ok, 0 repaired, 0 excluded", "median shape: brain_", "variance explained:", "peak MiB"):
+    for words in (
+        "3 shapes: 3 ok, 0 repaired, 0 excluded",
+        "median shape: brain_",
+        "variance explained:",
+        "peak MiB",
+    ):
         assert words in result.stdout
     assert f"s4a view {study}" in result.stdout
 
@@ -53,7 +59,9 @@ def test_view_writes_a_page_into_the_study_or_where_it_is_told(ran, tmp_path, mo
     study, _ = ran
     page = tmp_path / "page.html"
     monkeypatch.setattr(
-        commands, "write_page", lambda tree, file, **_: file.write_text(f"{len(tree['original'])} shapes")
+        commands,
+        "write_page",
+        lambda tree, file, **_: file.write_text(f"{len(tree['original'])} shapes"),
     )
     assert cli.main(["view", str(study)]) == 0
     assert cli.main(["view", str(study), "--out", str(page)]) == 0
@@ -89,7 +97,10 @@ def test_check_takes_a_pattern(folder, capsys):
         (["check", "nowhere"], "nowhere"),
         (["view", "nowhere"], "not a study folder"),
         (["run", "nowhere", "--out", "study"], "nowhere"),
-        (["run", "nowhere", "--out", "study", "--k", "3"], "k must be an integer of at least 4; found 3"),
+        (
+            ["run", "nowhere", "--out", "study", "--k", "3"],
+            "k must be an integer of at least 4; found 3",
+        ),
     ],
 )
 def test_an_error_is_one_line_and_the_exit_code_2(arguments, words, tmp_path, monkeypatch, capsys):
@@ -103,7 +114,9 @@ def test_an_error_is_one_line_and_the_exit_code_2(arguments, words, tmp_path, mo
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("arguments", [[], ["dance"], ["run", "x"], ["run", "x", "--out", "y", "--init", "random"]])
+@pytest.mark.parametrize(
+    "arguments", [[], ["dance"], ["run", "x"], ["run", "x", "--out", "y", "--init", "random"]]
+)
 def test_wrong_usage_ends_with_2_and_says_how(arguments, capsys):
     with pytest.raises(SystemExit) as end:
         cli.main(arguments)
@@ -112,7 +125,11 @@ def test_wrong_usage_ends_with_2_and_says_how(arguments, capsys):
 
 
 def test_every_option_of_analyse_is_a_flag_of_run_with_the_same_default():
-    options = {n: p.default for n, p in inspect.signature(analyse).parameters.items() if n not in ("shapes", "store")}
+    options = {
+        n: p.default
+        for n, p in inspect.signature(analyse).parameters.items()
+        if n not in ("shapes", "store")
+    }
     assert list(options) == list(cli.HELP)
     found = commands.options_of(cli.parser().parse_args(["run", "a", "b", "--out", "study"]))
     assert found == options | {"n_jobs": -1}  # on the command line all cores are taken
@@ -120,13 +137,24 @@ def test_every_option_of_analyse_is_a_flag_of_run_with_the_same_default():
 
 def test_flags_give_the_options_their_values():
     flags = "--n-coarse 500 --n-latent 40 --init landmarks --scale --no-strict --components 2 --template x --seed 7"
-    found = commands.options_of(cli.parser().parse_args(["run", "a", "--out", "study", *flags.split()]))
-    expected = {"n_coarse": 500, "n_latent": 40, "init": "landmarks", "scale": True, "strict": False, "components": 2}
+    found = commands.options_of(
+        cli.parser().parse_args(["run", "a", "--out", "study", *flags.split()])
+    )
+    expected = {
+        "n_coarse": 500,
+        "n_latent": 40,
+        "init": "landmarks",
+        "scale": True,
+        "strict": False,
+        "components": 2,
+    }
     assert {n: found[n] for n in expected} == expected
     assert (found["template"], found["seed"], found["preset"]) == ("x", 7, None)
 
 
-@pytest.mark.parametrize("command", "check run demo view statistics insert transfer compare".split())
+@pytest.mark.parametrize(
+    "command", "check run demo view statistics insert transfer compare".split()
+)
 def test_every_command_has_help(command, capsys):
     with pytest.raises(SystemExit) as end:
         cli.main([command, "--help"])
@@ -143,7 +171,10 @@ def test_two_shapes_end_well_without_modes_and_the_reason_is_told(folder, tmp_pa
 def test_demo_finds_the_planted_modes_and_writes_its_page(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(commands, "write_page", lambda tree, file, **_: file.write_text("page"))
     out = tmp_path / "demo"
-    assert cli.main(["demo", "--out", str(out), "--shapes", "4", "--vertices", "700", "--n-jobs", "1"]) == 0
+    assert (
+        cli.main(["demo", "--out", str(out), "--shapes", "4", "--vertices", "700", "--n-jobs", "1"])
+        == 0
+    )
     said = capsys.readouterr().out
     assert "correlation of planted and recovered scores" in said
     assert "S4A, registered surface" in said
@@ -151,7 +182,17 @@ def test_demo_finds_the_planted_modes_and_writes_its_page(tmp_path, monkeypatch,
 
 
 def test_demo_of_two_shapes_ends_well_without_modes(tmp_path, capsys):
-    arguments = ["demo", "--shapes", "2", "--vertices", "300", "--n-jobs", "1", "--out", str(tmp_path)]
+    arguments = [
+        "demo",
+        "--shapes",
+        "2",
+        "--vertices",
+        "300",
+        "--n-jobs",
+        "1",
+        "--out",
+        str(tmp_path),
+    ]
     assert cli.main(arguments) == 0
     out = capsys.readouterr().out
     assert "no modes: PCA needs at least 3 shapes" in out

@@ -28,7 +28,9 @@ def command(*words):
 
 
 def run(folder, out, cluster):
-    flags = [text for name, value in SMALL.items() for text in (f"--{name.replace('_', '-')}", value)]
+    flags = [
+        text for name, value in SMALL.items() for text in (f"--{name.replace('_', '-')}", value)
+    ]
     return command("s4a", "run", folder, "--out", out, "--cluster", cluster, *flags)
 
 
@@ -38,14 +40,18 @@ def assert_the_same(out, local):
     for node in study.subtree:
         if node.path != "/report":  # it has the times
             for name, values in node.to_dataset().data_vars.items():
-                np.testing.assert_array_equal(values, local[node.path][name], err_msg=f"{node.path}/{name}")
+                np.testing.assert_array_equal(
+                    values, local[node.path][name], err_msg=f"{node.path}/{name}"
+                )
     study.close()
 
 
 def test_two_dask_workers_give_the_bits_of_a_local_run(brains, tmp_path):
     pytest.importorskip("distributed")
     folder, local = brains
-    subprocess.run(run(folder, tmp_path / "study", "local:2"), check=True, capture_output=True, timeout=300)
+    subprocess.run(
+        run(folder, tmp_path / "study", "local:2"), check=True, capture_output=True, timeout=300
+    )
     assert_the_same(tmp_path / "study", local)
 
 
@@ -63,16 +69,36 @@ def test_a_worker_killed_in_the_middle_costs_only_its_task(brains, tmp_path):
     with contextlib.ExitStack() as stack:
 
         def start(*words):
-            process = subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+            process = subprocess.Popen(
+                words, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+            )
             stack.callback(process.wait)
             stack.callback(process.kill)
             return process
 
-        start(*command("distributed.cli.dask_scheduler", "--port", 0, "--no-dashboard", "--scheduler-file", where))
+        start(
+            *command(
+                "distributed.cli.dask_scheduler",
+                "--port",
+                0,
+                "--no-dashboard",
+                "--scheduler-file",
+                where,
+            )
+        )
         wait_for(lambda: where.exists() and where.stat().st_size, "scheduler")
         address = json.loads(where.read_text())["address"]
         workers = [
-            start(*command("distributed.cli.dask_worker", address, "--nthreads", 1, "--no-nanny", "--no-dashboard"))
+            start(
+                *command(
+                    "distributed.cli.dask_worker",
+                    address,
+                    "--nthreads",
+                    1,
+                    "--no-nanny",
+                    "--no-dashboard",
+                )
+            )
             for _ in range(2)
         ]
         process = start(*run(folder, out, address))
@@ -83,11 +109,16 @@ def test_a_worker_killed_in_the_middle_costs_only_its_task(brains, tmp_path):
         assert workers[1].poll() is None
     assert_the_same(out, local)
     again = [path for path, time in done.items() if path.stat().st_mtime_ns != time]
-    assert len(again) <= 1  # the task of the dead worker may have been written, but not yet told to the scheduler
+    assert (
+        len(again) <= 1
+    )  # the task of the dead worker may have been written, but not yet told to the scheduler
 
 
 @pytest.mark.parametrize("address", ["nowhere", "local:", "local:0", "local:two"])
 def test_an_address_that_is_none_says_what_is_needed(address, capsys, tmp_path):
     pytest.importorskip("distributed")
-    assert cli.main(["run", str(tmp_path), "--out", str(tmp_path / "study"), "--cluster", address]) == 2
+    assert (
+        cli.main(["run", str(tmp_path), "--out", str(tmp_path / "study"), "--cluster", address])
+        == 2
+    )
     assert "tcp://host:port or local:N" in capsys.readouterr().err

@@ -6,9 +6,9 @@ import xarray as xr
 
 from s4a import compare, synthetic
 from s4a.cli import main
-from s4a.io import write_mesh
-from s4a.mesh import as_arrays
-from s4a.scalable import Reduced
+from s4a.geometry.mesh import as_arrays
+from s4a.input.files import write_mesh
+from s4a.method.scalable import Reduced
 
 SMALL = {"n_coarse": 400, "k": 30, "n_geodesic": 100}
 
@@ -18,7 +18,10 @@ def brains():
     tree = synthetic.brains(3, 1500)
     meshes = {name: node.to_dataset() for name, node in tree["original"].children.items()}
     (reference, source), *others = meshes.items()
-    truth = {n: synthetic.position(tree["truth"], reference, tree["truth"][n]["reference_point"]) for n, _ in others}
+    truth = {
+        n: synthetic.position(tree["truth"], reference, tree["truth"][n]["reference_point"])
+        for n, _ in others
+    }
     return source, dict(others), {n: np.asarray(t) for n, t in truth.items()}
 
 
@@ -33,7 +36,15 @@ def test_every_method_has_every_metric_and_its_time_by_block(found):
     assert found["chamfer"].dims == found["geodesic_error"].dims == ("way", "pair")
     assert found["block_seconds"].dims == ("way", "pair", "block")
     assert found.sizes["pair"] == 2
-    for name in ("geodesic_error", "straight_error", "chamfer", "hausdorff", "dirichlet", "coverage", "bijectivity"):
+    for name in (
+        "geodesic_error",
+        "straight_error",
+        "chamfer",
+        "hausdorff",
+        "dirichlet",
+        "coverage",
+        "bijectivity",
+    ):
         assert set(found[name].dims) == {"way", "pair"}, name
         assert np.isfinite(found[name]).all(), name
     spent = found["block_seconds"].mean("pair")
@@ -64,7 +75,9 @@ def test_an_alignment_that_given_landmarks_make_needless_is_not_charged(brains):
     source, targets, _ = brains
     target = next(iter(targets.values()))
     marks = np.arange(0, 50, 10), np.arange(0, 50, 10)
-    found = compare.pair(source, target, landmarks=marks, methods=["kNN", "FMAP+ZO", "RE-MATCH"], **SMALL)
+    found = compare.pair(
+        source, target, landmarks=marks, methods=["kNN", "FMAP+ZO", "RE-MATCH"], **SMALL
+    )
     align = found["block_seconds"].sel(block="align").isel(pair=0)
     assert align.sel(way="kNN") > 0
     assert (align.sel(way=["FMAP+ZO", "RE-MATCH"]) == 0).all()
@@ -76,10 +89,14 @@ def test_given_landmarks_make_up_for_a_rigid_alignment_that_is_wrong():
     turned = wavy.assign(position=wavy["position"] * [-1.0, -1.0, 1.0])
     same = np.arange(1500)
     some = same[::150]
-    found = compare.pair(wavy, turned, truth=same, landmarks=(some, some), methods=["RE-MATCH"], **SMALL | {"k": 40})
+    found = compare.pair(
+        wavy, turned, truth=same, landmarks=(some, some), methods=["RE-MATCH"], **SMALL | {"k": 40}
+    )
     assert found["geodesic_error"].item() < 0.02
     places = wavy["position"].values[some], turned["position"].values[some]
-    again = compare.pair(wavy, turned, truth=same, landmarks=places, methods=["RE-MATCH"], **SMALL | {"k": 40})
+    again = compare.pair(
+        wavy, turned, truth=same, landmarks=places, methods=["RE-MATCH"], **SMALL | {"k": 40}
+    )
     assert again["geodesic_error"].item() == found["geodesic_error"].item()
 
 
@@ -87,9 +104,13 @@ def test_truth_and_landmarks_of_files_count_the_rows_of_the_files(tmp_path):
     X, T = as_arrays(synthetic.brains(2, 800)["original/brain_01"].to_dataset())
     order = np.random.default_rng(0).permutation(len(X))
     rank = np.argsort(order)
-    write_mesh(tmp_path / "a.ply", np.r_[[[9e3, 0, 0]], X], T + 1)  # an idle vertex first: it is dropped
+    write_mesh(
+        tmp_path / "a.ply", np.r_[[[9e3, 0, 0]], X], T + 1
+    )  # an idle vertex first: it is dropped
     write_mesh(tmp_path / "b.ply", X[order], rank[T])
-    found = compare.pair(tmp_path / "a.ply", tmp_path / "b.ply", truth=order + 1, methods=["kNN"], n_geodesic=100)
+    found = compare.pair(
+        tmp_path / "a.ply", tmp_path / "b.ply", truth=order + 1, methods=["kNN"], n_geodesic=100
+    )
     assert found["geodesic_error"].item() == 0
     assert found["block_seconds"].sel(block="load and clean").item() > 0
 
@@ -139,7 +160,19 @@ def test_the_command_writes_table_file_and_figure(tmp_path, capsys):
     out = tmp_path / "out"
     options = ["--out", str(out), "--n-coarse", "200", "--k", "20"]
     assert (
-        main(["compare", one, two, "--methods", "kNN", "RE-MATCH", "--truth", str(tmp_path / "truth.npy"), *options])
+        main(
+            [
+                "compare",
+                one,
+                two,
+                "--methods",
+                "kNN",
+                "RE-MATCH",
+                "--truth",
+                str(tmp_path / "truth.npy"),
+                *options,
+            ]
+        )
         == 0
     )
     text = capsys.readouterr().out
@@ -154,7 +187,13 @@ def test_the_command_writes_table_file_and_figure(tmp_path, capsys):
     for name, points in (("source", marks), ("target", marks[::-1])):
         rows = "\n".join(f"{i},{x},{y},{z}" for i, (x, y, z) in enumerate(points))
         (tmp_path / f"{name}.csv").write_text("name,x,y,z\n" + rows)
-    given = ["--methods", "RE-MATCH", "--landmarks", str(tmp_path / "source.csv"), str(tmp_path / "target.csv")]
+    given = [
+        "--methods",
+        "RE-MATCH",
+        "--landmarks",
+        str(tmp_path / "source.csv"),
+        str(tmp_path / "target.csv"),
+    ]
     assert main(["compare", one, two, *given, *options]) == 0
     assert "RE-MATCH" in capsys.readouterr().out
     assert main(["compare", one, two, *given[:-1], *options]) == 2

@@ -1,37 +1,57 @@
-"""Descriptors and the fit of a functional map on them: known answers, the optimum, and agreement with pyFM."""
+"""Descriptors and the fit of a functional map on them.
+
+Known answers, the optimum, and agreement with pyFM.
+"""
 
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from s4a import coarsen, descriptors, fmap, metrics, spectral, spectrum, synthetic
-from s4a.align import farthest_points
-from s4a.mesh import as_arrays, vertex_normals
+from s4a import coarsen, metrics, spectrum, synthetic
+from s4a.geometry.align import farthest_points
+from s4a.geometry.mesh import as_arrays, vertex_normals
+from s4a.method import descriptors, fmap, spectral
 
 
 @pytest.fixture(scope="module")
 def brains():
     tree = synthetic.brains(2, 4000)
-    return [spectrum(coarsen(tree[f"original/brain_0{i}"].to_dataset(), n_coarse=800), k=60) for i in (1, 2)]
+    return [
+        spectrum(coarsen(tree[f"original/brain_0{i}"].to_dataset(), n_coarse=800), k=60)
+        for i in (1, 2)
+    ]
 
 
 @pytest.fixture(scope="module")
 def shape(brains):
     mesh = brains[0]
-    return mesh["eigenfunction"].values, spectral.unit_area(mesh), mesh["eigenvalue"].values, *as_arrays(mesh)
+    return (
+        mesh["eigenfunction"].values,
+        spectral.unit_area(mesh),
+        mesh["eigenvalue"].values,
+        *as_arrays(mesh),
+    )
 
 
 def test_signatures_are_those_of_pyfm_at_its_own_settings(shape):
     signatures = pytest.importorskip("pyFM.signatures")
     Phi, _, ev, _, _ = shape
-    for ours, theirs in ((descriptors.hks, signatures.auto_HKS), (descriptors.wks, signatures.auto_WKS)):
+    for ours, theirs in (
+        (descriptors.hks, signatures.auto_HKS),
+        (descriptors.wks, signatures.auto_WKS),
+    ):
         for landmark in (None, np.array([5, 70, 300])):
-            found, expected = ours(Phi, ev, n=30, landmark=landmark), theirs(ev, Phi, 30, landmarks=landmark)
+            found, expected = (
+                ours(Phi, ev, n=30, landmark=landmark),
+                theirs(ev, Phi, 30, landmarks=landmark),
+            )
             assert found == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
 
 @pytest.mark.parametrize("signature", [descriptors.hks, descriptors.wks])
-def test_signatures_do_not_change_with_signs_and_numbering_and_those_of_landmarks_follow_them(shape, signature):
+def test_signatures_do_not_change_with_signs_and_numbering_and_those_of_landmarks_follow_them(
+    shape, signature
+):
     Phi, _, ev, _, _ = shape
     rng = np.random.default_rng(0)
     order, sign = rng.permutation(len(Phi)), rng.choice([-1, 1], Phi.shape[1])
@@ -43,11 +63,15 @@ def test_signatures_do_not_change_with_signs_and_numbering_and_those_of_landmark
 
 
 def test_a_sphere_has_the_same_signature_everywhere():
-    ball = spectrum(coarsen(synthetic.sphere(8000), n_coarse=2500), k=49)  # all of the modes of degree 0 to 6
+    ball = spectrum(
+        coarsen(synthetic.sphere(8000), n_coarse=2500), k=49
+    )  # all of the modes of degree 0 to 6
     for signature in (descriptors.hks, descriptors.wks):
         found = signature(ball["eigenfunction"].values, ball["eigenvalue"].values, n=20)
         assert found.std(axis=0) == pytest.approx(0, abs=0.06)
-        assert found.mean(axis=0) == pytest.approx(1, abs=0.03)  # filters of sum 1, functions of norm 1
+        assert found.mean(axis=0) == pytest.approx(
+            1, abs=0.03
+        )  # filters of sum 1, functions of norm 1
 
 
 def test_the_heat_kernel_around_a_landmark_is_that_of_the_plane_at_short_times(shape):
@@ -68,7 +92,10 @@ def test_both_spectra_of_a_pair_are_filtered_at_the_same_times_and_energies():
         ratio = [k[:, np.searchsorted(s, both)] for k, s in ((one, low), (other, high))]
         assert ratio[0][:, 0] / one[:, 2] == pytest.approx(np.ones(7))
         assert one.sum(axis=1) == pytest.approx(np.ones(7))
-    heat = [np.exp(-t) for t in np.diff(np.log(descriptors.heat_filter(low, high, n=7)[:, 1:3]), axis=1)[:, 0]]
+    heat = [
+        np.exp(-t)
+        for t in np.diff(np.log(descriptors.heat_filter(low, high, n=7)[:, 1:3]), axis=1)[:, 0]
+    ]
     assert np.log(heat) == pytest.approx(np.geomspace(4 * np.log(10) / 30, 4 * np.log(10) / 2, 7))
 
 
@@ -135,7 +162,9 @@ def test_the_fit_is_what_a_slow_optimiser_finds(sizes, with_operators):
     def with_columns(free):
         return np.column_stack([C[:, 0], free.reshape(sizes[1], -1)])
 
-    slow = minimize(lambda free: energy(with_columns(free), F, G, **terms), np.zeros(C[:, 1:].size), tol=1e-12)
+    slow = minimize(
+        lambda free: energy(with_columns(free), F, G, **terms), np.zeros(C[:, 1:].size), tol=1e-12
+    )
     assert with_columns(slow.x) == pytest.approx(C, abs=1e-5)
     assert energy(C, F, G, **terms) <= slow.fun * (1 + 1e-12)
 
@@ -145,7 +174,9 @@ def test_without_weight_operators_change_nothing():
     F, G = (np.column_stack([M, np.random.default_rng(3).normal(size=(5, 3))]) for M in (F, G))
     row_by_row = fmap.fit(F, G, penalty=terms["penalty"])
     _, P, Q = terms["operators"][0]
-    assert fmap.fit(F, G, penalty=terms["penalty"], operators=[(0.0, P, Q)]) == pytest.approx(row_by_row)
+    assert fmap.fit(F, G, penalty=terms["penalty"], operators=[(0.0, P, Q)]) == pytest.approx(
+        row_by_row
+    )
 
 
 @pytest.mark.parametrize("oriented", [0.0, 0.5])
@@ -155,7 +186,12 @@ def test_the_fit_is_where_that_of_pyfm_ends(brains, oriented):
     pyfm = pytest.importorskip("pyFM.mesh")
     k = 8
     peer = functional.FunctionalMapping(
-        *(pyfm.TriMesh(m["position"].values / np.sqrt(m["vertex_area"].values.sum()), as_arrays(m)[1]) for m in brains)
+        *(
+            pyfm.TriMesh(
+                m["position"].values / np.sqrt(m["vertex_area"].values.sum()), as_arrays(m)[1]
+            )
+            for m in brains
+        )
     )
     peer.preprocess(n_descr=20, subsample_step=5, k_process=30, k_descr=30)
     ratio = np.array([1e-1, 1e-3, 1.0, oriented])
@@ -172,7 +208,13 @@ def test_the_fit_is_where_that_of_pyfm_ends(brains, oriented):
     w = ratio / ratio.sum() / tau
     operators = [(w[2], P, Q)] + ([(w[3], W, V)] if oriented else [])
     start = peer._get_x0("zeros")[0, 0]
-    ours = fmap.fit(np.sqrt(w[0]) * F, np.sqrt(w[0]) * G, penalty=w[1] * mask, operators=operators, constant=start)
+    ours = fmap.fit(
+        np.sqrt(w[0]) * F,
+        np.sqrt(w[0]) * G,
+        penalty=w[1] * mask,
+        operators=operators,
+        constant=start,
+    )
     assert ours == pytest.approx(peer.FM_12, abs=1e-4)
 
 
@@ -188,7 +230,11 @@ def test_the_fit_on_descriptors_of_a_shape_and_itself_renumbered_is_the_map_betw
     for kind in ("wks", "hks"):
         C = fmap.fit_descriptors(mesh, other, kind=kind)["fmap"].values
         match = fmap.zoomout(
-            C, mesh["eigenfunction"].values, other["eigenfunction"].values, spectral.unit_area(other), 60
+            C,
+            mesh["eigenfunction"].values,
+            other["eigenfunction"].values,
+            spectral.unit_area(other),
+            60,
         )
         assert (match[1] == order).all(), kind
 
@@ -236,5 +282,7 @@ def test_a_fit_that_cannot_be_is_refused(brains, options, message):
 
 
 def test_wave_filters_of_a_narrow_common_range_have_sum_one():
-    kernel = descriptors.wave_filter(np.array([0, 5.0, 26.0, 125.0]), np.array([0, 12.7, 12.9, 14.7]))
+    kernel = descriptors.wave_filter(
+        np.array([0, 5.0, 26.0, 125.0]), np.array([0, 12.7, 12.9, 14.7])
+    )
     assert kernel.sum(axis=1) == pytest.approx(1)

@@ -1,4 +1,7 @@
-"""The documentation holds every public name, every module and every page; the glossary agrees with the schema."""
+"""The documentation holds every public name, every module and every page.
+
+The glossary agrees with the schema.
+"""
 
 import ast
 import importlib
@@ -16,10 +19,22 @@ from s4a.schema import TABLE
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
-MODULES = sorted(path for path in (ROOT / "s4a").glob("*.py") if not path.stem.startswith("_"))
+PACKAGE = ROOT / "s4a"
+MODULES = sorted(
+    path
+    for path in PACKAGE.rglob("*.py")
+    if not path.stem.startswith("_") and path.parent.name != "widgets"
+)
+
+
+def dotted(path):
+    """The name of a module below s4a, such as ``method.latent``."""
+    return ".".join(path.relative_to(PACKAGE).with_suffix("").parts)
+
+
 PAGES = sorted(DOCS.glob("*.md")) + sorted((DOCS / "api").glob("*.md"))
 GLOSSARY = (DOCS / "glossary.md").read_text(encoding="utf-8")
-each_module = pytest.mark.parametrize("path", MODULES, ids=lambda path: path.stem)
+each_module = pytest.mark.parametrize("path", MODULES, ids=lambda path: dotted(path))
 
 
 def rows(text):
@@ -32,14 +47,18 @@ def rows(text):
 
 def test_every_module_is_in_the_reference_once():
     text = "".join(page.read_text(encoding="utf-8") for page in PAGES)
-    found = re.findall(r"automodule:: s4a\.(\w+)\n", text)
-    assert sorted(found) == sorted([path.stem for path in MODULES] + ["widgets"])
+    found = re.findall(r"automodule:: s4a\.([\w.]+)\n", text)
+    assert sorted(found) == sorted([*map(dotted, MODULES), "widgets"])
 
 
 @each_module
 def test_everything_public_has_a_docstring_and_so_stands_in_the_reference(path):
     tree = ast.parse(path.read_text(encoding="utf-8"))
-    public = [n for n in tree.body if isinstance(n, ast.FunctionDef | ast.ClassDef) and not n.name.startswith("_")]
+    public = [
+        n
+        for n in tree.body
+        if isinstance(n, ast.FunctionDef | ast.ClassDef) and not n.name.startswith("_")
+    ]
     assert ast.get_docstring(tree)
     assert [node.name for node in public if not ast.get_docstring(node)] == []
 
@@ -58,7 +77,9 @@ def functions():
             continue
         for member in getattr(found, "__all__", [n for n in vars(found) if not n.startswith("_")]):
             function = getattr(found, member)
-            if inspect.isfunction(function) and (hasattr(found, "__all__") or function.__module__ == found.__name__):
+            if inspect.isfunction(function) and (
+                hasattr(found, "__all__") or function.__module__ == found.__name__
+            ):
                 yield f"{name}.{member}", function
 
 
@@ -82,7 +103,10 @@ def test_the_glossary_has_the_dims_of_the_schema():
             known += [known[0].removeprefix("shape, ")]
             if "edge_vertex" in here or dims not in known:
                 others = re.findall(r"`(\w+)`", here)
-                assert any(", ".join(TABLE[n][0]) == dims for n in others if n in TABLE) or dims in known, (name, dims)
+                assert (
+                    any(", ".join(TABLE[n][0]) == dims for n in others if n in TABLE)
+                    or dims in known
+                ), (name, dims)
             checked += 1
     assert checked > 25
 
@@ -92,7 +116,9 @@ def test_every_function_that_the_glossary_names_exists():
     assert len(names) > 15
     for name in set(names) - {"schema.TABLE"}:
         module, _, function = name.rpartition(".")
-        assert hasattr(importlib.import_module(f"s4a.{module}" if module else "s4a"), function), name
+        assert hasattr(importlib.import_module(f"s4a.{module}" if module else "s4a"), function), (
+            name
+        )
 
 
 def test_the_glossary_has_every_equation_of_the_paper():
@@ -101,7 +127,9 @@ def test_the_glossary_has_every_equation_of_the_paper():
 
 
 def test_every_page_is_reached_and_every_link_between_pages_leads_somewhere():
-    text = (DOCS / "index.md").read_text(encoding="utf-8") + (DOCS / "api" / "index.md").read_text(encoding="utf-8")
+    text = (DOCS / "index.md").read_text(encoding="utf-8") + (DOCS / "api" / "index.md").read_text(
+        encoding="utf-8"
+    )
     inside = set("\n".join(re.findall(r"```\{toctree\}\n(.*?)```", text, re.DOTALL)).split())
     for page in PAGES:
         if page.stem != "index" and not page.stem.startswith("_"):
@@ -121,9 +149,28 @@ def test_nothing_is_fetched_to_build_or_to_read_it():
 def test_it_builds_without_a_warning(tmp_path):
     for package in ("furo", "latex2mathml", "myst_nb", "sphinx"):
         pytest.importorskip(package)
-    command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-b", "html", str(DOCS), str(tmp_path)]
+    command = [
+        sys.executable,
+        "-m",
+        "sphinx",
+        "-q",
+        "-W",
+        "--keep-going",
+        "-b",
+        "html",
+        str(DOCS),
+        str(tmp_path),
+    ]
     found = subprocess.run(
-        command, env=os.environ | {"S4A_DOCS": "off"}, cwd=ROOT, capture_output=True, text=True, check=False
+        command,
+        env=os.environ | {"S4A_DOCS": "off"},
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert found.returncode == 0, found.stderr
-    assert not re.search(r"(src|href)=\"https?://[^\"]+\\.(js|css)\"", (tmp_path / "glossary.html").read_text("utf-8"))
+    assert not re.search(
+        r"(src|href)=\"https?://[^\"]+\\.(js|css)\"",
+        (tmp_path / "glossary.html").read_text("utf-8"),
+    )

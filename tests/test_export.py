@@ -8,12 +8,14 @@ import pytest
 import xarray as xr
 
 from s4a import analyse, read_mesh, synthetic, write_registered, write_training_set
-from s4a.mesh import as_arrays
+from s4a.geometry.mesh import as_arrays
 
 
 @pytest.fixture(scope="module")
 def meshes():
-    return {n: m.to_dataset() for n, m in synthetic.brains(4, 1500, seed=6)["original"].children.items()}
+    return {
+        n: m.to_dataset() for n, m in synthetic.brains(4, 1500, seed=6)["original"].children.items()
+    }
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +24,8 @@ def study(meshes):
 
 
 @pytest.mark.parametrize(
-    "format, suffix", [("ply", "ply"), ("vtk", "vtk"), ("obj", "obj"), ("npz", "npz"), ("gifti", "gii")]
+    "format, suffix",
+    [("ply", "ply"), ("vtk", "vtk"), ("obj", "obj"), ("npz", "npz"), ("gifti", "gii")],
 )
 def test_every_shape_is_written_with_the_triangles_of_the_template(study, tmp_path, format, suffix):
     paths = write_registered(study, tmp_path, format=format)
@@ -39,7 +42,9 @@ def test_scores_and_modes_are_written_as_tables_and_netcdf(study, tmp_path):
     write_registered(study, tmp_path, n_modes=2)
     rows = list(csv.reader((tmp_path / "scores.csv").read_text().splitlines()))
     assert rows[0] == ["shape", "component_1", "component_2", "component_3"]
-    assert np.array([row[1:] for row in rows[1:]], float) == pytest.approx(study["pca"]["score"].values)
+    assert np.array([row[1:] for row in rows[1:]], float) == pytest.approx(
+        study["pca"]["score"].values
+    )
     mode = np.loadtxt(tmp_path / "mode_2.csv", delimiter=",", skiprows=1)
     assert mode == pytest.approx(study["pca"]["deformation"].values[1])
     assert not (tmp_path / "mode_3.csv").exists()
@@ -59,7 +64,9 @@ def test_in_the_frame_of_the_shape_the_registered_surface_lies_on_it(study, mesh
 def test_a_training_set_has_meshes_labels_landmarks_and_a_split(study, meshes, tmp_path):
     template = meshes[study["registration"].attrs["template"]]
     marks = template[["landmark_name", "landmark_position"]]
-    split = write_training_set(study, tmp_path, label=template["label"].values, landmarks=marks, test_share=0.25)
+    split = write_training_set(
+        study, tmp_path, label=template["label"].values, landmarks=marks, test_share=0.25
+    )
     assert split == json.loads((tmp_path / "split.json").read_text())
     assert len(split["test"]) == 1
     assert sorted(split["train"] + split["test"]) == sorted(meshes)

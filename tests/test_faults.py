@@ -1,4 +1,7 @@
-"""Faulty input (docs/faults.md): in Python, in ``s4a check`` and in ``s4a run`` the outcome that is promised."""
+"""Faulty input (docs/faults.md).
+
+In Python, in ``s4a check`` and in ``s4a run`` the outcome that is promised.
+"""
 
 import contextlib
 import io
@@ -10,12 +13,15 @@ import pytest
 from faults import shapes as faulty
 from faults import studies, table
 
-from s4a import analyse, cli, findings, insert, open_study, read_shapes
-from s4a.mesh import as_dataset, euler_characteristic
-from s4a.view import page
+from s4a import analyse, cli, insert, open_study, read_shapes
+from s4a.geometry.mesh import as_dataset, euler_characteristic
+from s4a.show.page import page
+from s4a.study.report import doubtful, tied
 
 SMALL = {"n_coarse": 100, "k_init": 6, "k": 10, "step": 4, "refine": "intrinsic"}
-FLAGS = [part for name, value in SMALL.items() for part in ("--" + name.replace("_", "-"), str(value))]
+FLAGS = [
+    part for name, value in SMALL.items() for part in ("--" + name.replace("_", "-"), str(value))
+]
 BY_NAME = {one.shape: one for one in faulty.FAULTS}
 
 
@@ -28,7 +34,11 @@ def example(report):
     """What the report says of every faulty shape, without the paths of this machine."""
     said = {}
     for one in faulty.FAULTS:
-        text = report.attrs["remarks"] if one.where == "remarks" else report[one.where].sel(shape=one.shape).item()
+        text = (
+            report.attrs["remarks"]
+            if one.where == "remarks"
+            else report[one.where].sel(shape=one.shape).item()
+        )
         lines = [line for line in text.splitlines() if one.where != "remarks" or one.file in line]
         said[one.shape] = re.sub(r"\S*/(?=[^/\s]+)", "", " ".join(lines))
     return said
@@ -38,7 +48,9 @@ def printed(*arguments):
     """The exit code of a command and what it wrote, in one line."""
     with contextlib.redirect_stdout(io.StringIO()) as out:
         code = cli.main(list(arguments))
-    return code, re.sub(r"(?<=\w)- (?=\w)", "-", re.sub(r"\s+", " ", out.getvalue()))  # wrapped at hyphens too
+    return code, re.sub(
+        r"(?<=\w)- (?=\w)", "-", re.sub(r"\s+", " ", out.getvalue())
+    )  # wrapped at hyphens too
 
 
 @pytest.fixture(scope="session")
@@ -67,7 +79,11 @@ def ran(folder, tmp_path_factory):
 
 
 def said(report, one):
-    return report.attrs["remarks"] if one.where == "remarks" else report[one.where].sel(shape=one.shape).item()
+    return (
+        report.attrs["remarks"]
+        if one.where == "remarks"
+        else report[one.where].sel(shape=one.shape).item()
+    )
 
 
 @pytest.mark.parametrize("name", BY_NAME)
@@ -94,8 +110,12 @@ def test_a_run_over_all_faults_ends_with_ten_good_shapes(in_python, checked, ran
     assert in_python.sel(shape=faulty.GOOD)["status"].values.tolist() == ["ok"] * 10
     assert in_python.sel(shape=faulty.GOOD)["warning"].values.tolist() == [""] * 10
     assert set(faulty.GOOD) <= set(study["registration"]["shape"].values)
-    assert study["report"].sizes["shape"] == 10 + sum(one.where != "remarks" for one in faulty.FAULTS)
-    for data in (study[stage].to_dataset() for stage in ("network", "latent", "registration", "pca")):
+    assert study["report"].sizes["shape"] == 10 + sum(
+        one.where != "remarks" for one in faulty.FAULTS
+    )
+    for data in (
+        study[stage].to_dataset() for stage in ("network", "latent", "registration", "pca")
+    ):
         for name, variable in data.variables.items():
             if not name.startswith("cycle_error"):  # a pair in no 3-cycle has none
                 assert variable.dtype.kind != "f" or np.isfinite(variable.values).all(), name
@@ -110,7 +130,9 @@ def test_the_page_of_a_study_escapes_the_names_of_files(ran):
 
 
 def test_the_documentation_is_current(in_python):
-    assert table.PAGE.read_text(encoding="utf-8") == table.page(faulty.FAULTS, studies.PROOFS, example(in_python))
+    assert table.PAGE.read_text(encoding="utf-8") == table.page(
+        faulty.FAULTS, studies.PROOFS, example(in_python)
+    )
 
 
 @pytest.mark.parametrize("proof", studies.PROOFS, ids=lambda proof: proof[3])
@@ -127,7 +149,9 @@ def test_strict_excludes_what_would_be_repaired(tmp_path):
     faulty.far(tmp_path / "far.obj")
     report = read_shapes(tmp_path, strict=True)["report"].to_dataset()
     assert report["status"].values.tolist() == ["ok", "excluded"]
-    assert "2 of 300 vertices are not finite; strict=False removes them" in report["reason"].values[1]
+    assert (
+        "2 of 300 vertices are not finite; strict=False removes them" in report["reason"].values[1]
+    )
 
 
 def test_holes_are_closed_on_demand(tmp_path):
@@ -164,21 +188,36 @@ def test_the_study_does_not_depend_on_place_and_unit(reference):
         assert one.attrs["template"] == other.attrs["template"]
         assert np.allclose(other["displacement"] / factor, one["displacement"], atol=1e-3)
         assert np.allclose(found["pca"]["score"], reference["pca"]["score"], atol=1e-3)
-        assert found["report"]["warning"].values.tolist() == reference["report"]["warning"].values.tolist()
+        assert (
+            found["report"]["warning"].values.tolist()
+            == reference["report"]["warning"].values.tolist()
+        )
 
 
 def test_what_looks_wrong_with_a_new_shape_beside_a_study_is_told(reference):
     X, T = faulty.shape(5)
-    given = {"good": X, "metres": X / 1000, "mirrored": X * [-1, 1, 1], "upside_down": X * [1, -1, -1]}
+    given = {
+        "good": X,
+        "metres": X / 1000,
+        "mirrored": X * [-1, 1, 1],
+        "upside_down": X * [1, -1, -1],
+    }
     found = insert(reference, {name: (Y, T) for name, Y in given.items()})
-    warning = dict(zip(found["report"]["shape"].values.tolist(), found["report"]["warning"].values, strict=True))
+    warning = dict(
+        zip(
+            found["report"]["shape"].values.tolist(), found["report"]["warning"].values, strict=True
+        )
+    )
     assert warning["good"] == ""
     assert "near 10^-3: another unit" in warning["metres"]
     assert "fits as a mirror image" in warning["mirrored"]
     assert "degrees against most others: upside down" in warning["upside_down"]
     assert "near 10" not in warning["mirrored"] + warning["upside_down"]
     assert np.ptp(found["original/metres"]["position"].values) == pytest.approx(np.ptp(X) / 1000)
-    assert (insert(reference, {"mirrored": (given["mirrored"], T)}, compare=False)["report"]["warning"] == "").all()
+    assert (
+        insert(reference, {"mirrored": (given["mirrored"], T)}, compare=False)["report"]["warning"]
+        == ""
+    ).all()
 
 
 def test_files_of_different_units_are_told():
@@ -186,15 +225,23 @@ def test_files_of_different_units_are_told():
     meshes["shape_0"].attrs |= {"unit": "mm", "coordinate_system": "RAS"}
     meshes["shape_1"].attrs |= {"unit": "m", "coordinate_system": "LPS"}
     remarks = read_shapes(meshes)["report"].attrs["remarks"]
-    assert "the files name different units, and none was converted (m: shape_1; mm: shape_0)" in remarks
-    assert "different coordinate systems, and none was converted (LPS: shape_1; RAS: shape_0)" in remarks
+    assert (
+        "the files name different units, and none was converted (m: shape_1; mm: shape_0)"
+        in remarks
+    )
+    assert (
+        "different coordinate systems, and none was converted (LPS: shape_1; RAS: shape_0)"
+        in remarks
+    )
 
 
 def test_of_two_mirror_images_none_is_the_right_one():
     X, T = faulty.shape()
     report = read_shapes({"a": (X, T), "b": (X * [1, -1, 1], T)})["report"].to_dataset()
     assert report["warning"].values.tolist() == ["", ""]
-    assert "mirror images of each other, by ICP: a and b; kept as they are" in report.attrs["remarks"]
+    assert (
+        "mirror images of each other, by ICP: a and b; kept as they are" in report.attrs["remarks"]
+    )
 
 
 def test_an_odd_reference_does_not_make_the_others_odd():
@@ -213,21 +260,28 @@ def as_area(X, T):
 
 
 def test_reduced_numbers_are_told():
-    meshes = {name: faulty.shape(i, n) for i, (name, n) in enumerate({"a": 60, "b": 20, "c": 60}.items())}
+    meshes = {
+        name: faulty.shape(i, n) for i, (name, n) in enumerate({"a": 60, "b": 20, "c": 60}.items())
+    }
     report = analyse(meshes, **SMALL | {"k": 40}, n_jobs=1, intersections=False)["report"]
     assert "all 3 pairs of 3 shapes are used (n_pairs = 500)" in report.attrs["remarks"]
     assert re.search(r"k = 40 reduced to 1\d, the eigenfunctions of b", report.attrs["remarks"])
-    assert "all vertices are used, as there are fewer than n_coarse = 100" in report["reason"].sel(shape="a").item()
+    assert (
+        "all vertices are used, as there are fewer than n_coarse = 100"
+        in report["reason"].sel(shape="a").item()
+    )
 
 
 def test_a_wrong_registration_is_told():
-    wrong, remarks = findings.doubtful({"a": 0.0, "b": 0.02, "c": 0.1})
+    wrong, remarks = doubtful({"a": 0.0, "b": 0.02, "c": 0.1})
     assert list(wrong) == ["c"]
     assert "badness 0.100" in wrong["c"]
     assert remarks == []
-    assert findings.doubtful({"a": 0.0, "b": 0.12, "c": 0.1})[0] == {}
+    assert doubtful({"a": 0.0, "b": 0.12, "c": 0.1})[0] == {}
 
 
 def test_two_shapes_share_the_median_and_it_is_told():
-    assert "the median is not unique: a, b are equally near" in findings.tied(["a", "b"], [0.1, 0.1 + 1e-12])[0]
-    assert findings.tied(["a", "b", "c"], [0.1, 0.2, 0.3]) == []
+    assert (
+        "the median is not unique: a, b are equally near" in tied(["a", "b"], [0.1, 0.1 + 1e-12])[0]
+    )
+    assert tied(["a", "b", "c"], [0.1, 0.2, 0.3]) == []

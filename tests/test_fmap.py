@@ -6,22 +6,28 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from s4a import clean, coarsen, descriptors, fmap, spectral, spectrum, synthetic
-from s4a.align import align, farthest_points
-from s4a.mesh import as_dataset
+from s4a import clean, coarsen, spectrum, synthetic
+from s4a.geometry.align import align, farthest_points
+from s4a.geometry.mesh import as_dataset
+from s4a.method import descriptors, fmap, spectral
 
 
 @pytest.fixture(scope="module")
 def shape():
     """Eigenfunctions, areas, eigenvalues and vertices of a shape without symmetry."""
-    mesh = spectrum(coarsen(synthetic.brains(1, 4000)["original/brain_01"].to_dataset(), n_coarse=900), k=40)
+    mesh = spectrum(
+        coarsen(synthetic.brains(1, 4000)["original/brain_01"].to_dataset(), n_coarse=900), k=40
+    )
     values = mesh["eigenfunction"], spectral.unit_area(mesh), mesh["eigenvalue"], mesh["position"]
     return [np.asarray(v) for v in values]
 
 
 @pytest.fixture(scope="module")
 def permuted(shape):
-    """The same shape with its vertices renumbered and some signs turned, and the match from it to the shape."""
+    """The same shape with its vertices renumbered and some signs turned.
+
+    And the match from it to the shape.
+    """
     Phi, area, eigenvalue, X = shape
     rng = np.random.default_rng(0)
     order = rng.permutation(len(X))
@@ -74,7 +80,9 @@ def test_a_map_between_different_sizes_has_the_dims_target_by_source(shape):
 def test_the_landmark_fit_of_identical_shapes_is_near_the_identity(shape):
     Phi, _, eigenvalue, X = shape
     landmark = farthest_points(X, 10)
-    C = fmap.fit_landmarks(Phi[:, :20], Phi[:, :20], eigenvalue[:20], eigenvalue[:20], landmark, landmark)
+    C = fmap.fit_landmarks(
+        Phi[:, :20], Phi[:, :20], eigenvalue[:20], eigenvalue[:20], landmark, landmark
+    )
     assert pytest.approx(np.eye(20), abs=1e-6) == C
 
 
@@ -83,7 +91,9 @@ def test_the_landmark_fit_finds_the_signs_of_the_eigenfunctions(shape, permuted)
     Psi, _, _, _, order, sign = permuted
     landmark = farthest_points(X, 10)
     same = np.argsort(order)[landmark]
-    C = fmap.fit_landmarks(Phi[:, :20], Psi[:, :20], eigenvalue[:20], eigenvalue[:20], landmark, same)
+    C = fmap.fit_landmarks(
+        Phi[:, :20], Psi[:, :20], eigenvalue[:20], eigenvalue[:20], landmark, same
+    )
     assert pytest.approx(np.diag(sign[:20]), abs=1e-6) == C
 
 
@@ -93,13 +103,19 @@ def test_the_landmark_fit_is_the_least_squares_solution_of_its_energy(shape):
     landmark, other = farthest_points(X, 4), farthest_points(X, 9)[5:]
     ev, ev_target = eigenvalue[:k], 1.3 * eigenvalue[:k]
     C = fmap.fit_landmarks(Phi[:, :k], Phi[:, :k], ev, ev_target, landmark, other, commute=commute)
-    F = descriptors.landmark_coefficients(Phi[:, :k], descriptors.heat_filter(ev, ev_target, n=8), landmark)
-    G = descriptors.landmark_coefficients(Phi[:, :k], descriptors.heat_filter(ev_target, ev, n=8), other)
+    F = descriptors.landmark_coefficients(
+        Phi[:, :k], descriptors.heat_filter(ev, ev_target, n=8), landmark
+    )
+    G = descriptors.landmark_coefficients(
+        Phi[:, :k], descriptors.heat_filter(ev_target, ev, n=8), other
+    )
     F, G = F / np.linalg.norm(F, axis=0), G / np.linalg.norm(G, axis=0)
     weight = commute * np.trace(F @ F.T) / ev_target[-1] ** 2
 
     slope = (C @ F - G) @ F.T + weight * (ev_target[:, None] - ev[None, :]) ** 2 * C
-    assert np.abs(slope[:, 1:]).max() < 1e-9  # the first column is not free: constants go to constants
+    assert (
+        np.abs(slope[:, 1:]).max() < 1e-9
+    )  # the first column is not free: constants go to constants
     assert C[:, 0].tolist() == [1, 0, 0, 0, 0, 0]
 
 
@@ -137,7 +153,10 @@ def real_pairs():
     """Pairs of real surfaces, by name: arrays of positions and triangles."""
     face = np.load(DATA / "ict_face/face_head_neck.npz")
     kid = np.load(DATA / "kids/kid1_first6.npz")
-    return {"faces": [(face["V"][i], face["F"]) for i in (1, 2)], "kids": [(kid["V"][i], kid["F"]) for i in (0, 1)]}
+    return {
+        "faces": [(face["V"][i], face["F"]) for i in (1, 2)],
+        "kids": [(kid["V"][i], kid["F"]) for i in (0, 1)],
+    }
 
 
 @pytest.mark.parametrize("name", ["brains", "faces", "kids"])
@@ -152,11 +171,14 @@ def test_zoomout_is_that_of_pyfm_to_the_last_index(name):
         pytest.skip("the shared surfaces are absent")
     source, target = (spectrum(coarsen(mesh, n_coarse=2000), k=60) for mesh in pair)
     (M, Phi, area_source), (N, Psi, area) = (
-        (mesh["position"].values, mesh["eigenfunction"].values, spectral.unit_area(mesh)) for mesh in (source, target)
+        (mesh["position"].values, mesh["eigenfunction"].values, spectral.unit_area(mesh))
+        for mesh in (source, target)
     )
     R, t, _ = align(M, area_source, N, area)
     C = fmap.fmap_from_match(Phi[:, :20], Psi[:, :20], area, cKDTree(M @ R.T + t).query(N)[1])
-    peer, their_match = refine.zoomout_refine(C, Phi, Psi, nit=8, step=5, A2=area, return_p2p=True, n_jobs=1)
+    peer, their_match = refine.zoomout_refine(
+        C, Phi, Psi, nit=8, step=5, A2=area, return_p2p=True, n_jobs=1
+    )
     ours, match = fmap.zoomout(C, Phi, Psi, area, 60, step=5)
     assert (match == their_match).all()
     assert ours == pytest.approx(peer, abs=1e-12)

@@ -1,4 +1,7 @@
-"""Damaged files of every format (tests/fuzz.py, in short): read or refused by name, and nothing worse."""
+"""Damaged files of every format (tests/fuzz.py, in short).
+
+Read or refused by name, and nothing worse.
+"""
 
 import sys
 
@@ -32,4 +35,6 @@ def test_damaged_files_are_read_or_refused_by_name_in_bounded_time_and_memory():
     for name in names:
         refused = totals[name].pop("refused")
         assert 0 < refused < FILES
-        assert refused + totals[name]["parsed"] + totals[name].get("parsed, not cleaned", 0) == FILES
+        assert (
+            refused + totals[name]["parsed"] + totals[name].get("parsed, not cleaned", 0) == FILES
+        )

@@ -1,4 +1,7 @@
-"""New shapes in a finished study: against the truth and a full recomputation, independent, the others kept."""
+"""New shapes in a finished study.
+
+Against the truth and a full recomputation, independent, the others kept.
+"""
 
 import numpy as np
 import pytest
@@ -6,9 +9,9 @@ import xarray as xr
 from scipy.spatial import cKDTree
 
 from s4a import analyse, insert, synthetic, transfer_labels, transfer_landmarks
-from s4a.insert import frozen_basis, project_scores
-from s4a.mesh import as_arrays, as_dataset, vertex_areas
-from s4a.pca import gram_pca
+from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
+from s4a.method.pca import gram_pca
+from s4a.study.insert import frozen_basis, project_scores
 
 OPTIONS = {"n_coarse": 1000, "k": 50, "seed": 0}
 
@@ -47,7 +50,11 @@ def errors(tree, study, shape):
 
 def test_a_new_shape_is_registered_about_as_well_as_those_of_the_study(tree, study, inserted):
     template = study["registration"].attrs["template"]
-    known = [errors(tree, study, n).mean() for n in study["registration"]["shape"].values if n != template]
+    known = [
+        errors(tree, study, n).mean()
+        for n in study["registration"]["shape"].values
+        if n != template
+    ]
     assert errors(tree, inserted, "brain_07").mean() < 1.5 * max(known)
     assert 0.2 < inserted["registration"]["confidence"].mean() <= 1
 
@@ -68,15 +75,22 @@ def test_a_new_shape_is_close_to_what_a_full_recomputation_gives(meshes, study, 
     )
 
 
-def test_the_study_stays_as_it_is_and_the_result_does_not_depend_on_other_new_shapes(study, meshes, inserted):
+def test_the_study_stays_as_it_is_and_the_result_does_not_depend_on_other_new_shapes(
+    study, meshes, inserted
+):
     before = {node.path: node.to_dataset(inherit=False).copy(deep=True) for node in study.subtree}
     both = insert(study, {"brain_07": meshes["brain_07"], "again": meshes["brain_01"]}, n_jobs=2)
-    assert all(node.to_dataset(inherit=False).identical(before[node.path]) for node in study.subtree)
+    assert all(
+        node.to_dataset(inherit=False).identical(before[node.path]) for node in study.subtree
+    )
     one = both["registration"].to_dataset().sel(shape="brain_07")
     for name, values in inserted["registration"].to_dataset().isel(shape=0).data_vars.items():
         np.testing.assert_array_equal(one[name].values, values.values, err_msg=name)
     assert (both["pca"]["score"].sel(shape="brain_07") == inserted["pca"]["score"][0]).all()
-    assert (both["latent"]["latent_basis"].sel(shape="brain_07") == inserted["latent"]["latent_basis"][0]).all()
+    assert (
+        both["latent"]["latent_basis"].sel(shape="brain_07")
+        == inserted["latent"]["latent_basis"][0]
+    ).all()
 
 
 def test_a_shape_of_the_study_gets_its_own_scores_back(study, meshes):
@@ -89,7 +103,9 @@ def test_a_shape_of_the_study_gets_its_own_scores_back(study, meshes):
     assert found["report"]["status"].item() == "ok"
 
 
-def test_labels_travel_from_the_template_and_from_an_external_mesh_to_new_shapes(study, meshes, inserted):
+def test_labels_travel_from_the_template_and_from_an_external_mesh_to_new_shapes(
+    study, meshes, inserted
+):
     template = study["registration"].attrs["template"]
     right = {
         name: (node["label"].values == meshes[name]["label"].values).mean()
@@ -105,13 +121,20 @@ def test_labels_travel_from_the_template_and_from_an_external_mesh_to_new_shapes
         near = cKDTree(other["position"]).query(meshes[name]["position"])[1]
         nearest = (other["label"].values[near] == meshes[name]["label"].values).mean()
         assert (node["label"].values == meshes[name]["label"].values).mean() > max(0.8, nearest)
-    place = transfer_landmarks(study, other[["landmark_name", "landmark_position"]], source=other, targets=["brain_02"])
-    gap = place["brain_02"]["landmark_position"].values - meshes["brain_02"]["landmark_position"].values
+    place = transfer_landmarks(
+        study, other[["landmark_name", "landmark_position"]], source=other, targets=["brain_02"]
+    )
+    gap = (
+        place["brain_02"]["landmark_position"].values
+        - meshes["brain_02"]["landmark_position"].values
+    )
     assert np.linalg.norm(gap, axis=1).mean() < 5  # mm
 
 
 def test_a_shape_that_cannot_be_used_is_excluded_and_does_not_stop_the_others(study, meshes):
-    tetrahedron = as_dataset([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
+    tetrahedron = as_dataset(
+        [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]
+    )
     found = insert(study, {"small": tetrahedron, "brain_07": meshes["brain_07"]})
     assert found["registration"]["shape"].values.tolist() == ["brain_07"]
     assert found["report"]["status"].sel(shape="small").item() == "excluded"
@@ -121,7 +144,10 @@ def test_a_shape_that_cannot_be_used_is_excluded_and_does_not_stop_the_others(st
 
 def test_unfinished_studies_and_the_name_of_the_template_are_refused(study, meshes):
     with pytest.raises(ValueError, match="a finished study is needed; this one lacks latent"):
-        insert(xr.DataTree.from_dict({n: study[n] for n in ("original", "coarse", "registration")}), meshes)
+        insert(
+            xr.DataTree.from_dict({n: study[n] for n in ("original", "coarse", "registration")}),
+            meshes,
+        )
     template = study["registration"].attrs["template"]
     with pytest.raises(ValueError, match="other names than the template"):
         insert(study, {template: meshes["brain_07"]})

@@ -1,4 +1,7 @@
-"""Runs that end before their time: nothing goes on behind them, nothing is damaged, the next one goes on."""
+"""Runs that end before their time.
+
+Nothing goes on behind them, nothing is damaged, the next one goes on.
+"""
 
 import contextlib
 import os
@@ -10,14 +13,16 @@ import time
 import psutil
 import pytest
 
-from s4a import analyse, study, synthetic
+from s4a import analyse, synthetic
 from s4a.schema import dataset
-from s4a.tasks import Run
+from s4a.study import store
+from s4a.study.runner import Run
 
 OPTIONS = {"n_coarse": 150, "k_init": 8, "k": 12}
 RUN = """
 import signal, sys, time
-from s4a import analyse, pipeline
+from s4a import analyse
+from s4a.study import pipeline
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # it is ignored below a background job of a shell
 
@@ -38,7 +43,10 @@ def files(tmp_path_factory):
 
 @contextlib.contextmanager
 def running(folder, files):
-    """A run in a session of its own, with two workers in the middle of their tasks; gives it and their processes."""
+    """A run in a session of its own, with two workers in the middle of their tasks.
+
+    Gives it and their processes.
+    """
     arguments = [sys.executable, "-c", RUN, str(folder), *map(str, files)]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
     with subprocess.Popen(arguments, start_new_session=True, **quiet) as run:
@@ -56,7 +64,9 @@ def running(folder, files):
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
-def test_workers_are_gone_within_seconds_of_the_end_of_a_run_and_the_study_is_resumable(files, tmp_path, how):
+def test_workers_are_gone_within_seconds_of_the_end_of_a_run_and_the_study_is_resumable(
+    files, tmp_path, how
+):
     folder, files = tmp_path / "study", files[:2]
     with running(folder, files) as (run, workers):
         assert len(workers) >= 2
@@ -77,7 +87,9 @@ def test_workers_are_gone_within_seconds_of_the_end_of_a_run_and_the_study_is_re
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from s4a import cli, study, synthetic
+from s4a import synthetic
+from s4a import cli
+from s4a.study import store
 
 log, out, rename, kills = Path(sys.argv[1]), Path(sys.argv[2]), os.replace, sys.argv[3].split(",")
 
@@ -91,8 +103,8 @@ def renamed(temporary, path):
     rename(temporary, path)
 
 log.write_text("")
-study.write(synthetic.sphere(9), log.with_suffix(".nc"))  # imports all that the runs below need, once
-study.attributes(log.with_suffix(".nc"))
+store.write(synthetic.sphere(9), log.with_suffix(".nc"))  # imports all that the runs below need, once
+store.attributes(log.with_suffix(".nc"))
 os.replace = renamed
 code = -signal.SIGKILL
 while code == -signal.SIGKILL:
@@ -119,13 +131,36 @@ KILLS = [
 
 
 def test_a_run_killed_in_every_stage_ends_with_the_same_study(files, tmp_path):
-    flags = ["--n-coarse", "150", "--k-init", "8", "--k", "12", "--n-jobs", "1", "--no-intersections"]
-    script = [sys.executable, "-c", KILLED, tmp_path / "log", tmp_path / "study", ",".join(KILLS), *files, *flags]
+    flags = [
+        "--n-coarse",
+        "150",
+        "--k-init",
+        "8",
+        "--k",
+        "12",
+        "--n-jobs",
+        "1",
+        "--no-intersections",
+    ]
+    script = [
+        sys.executable,
+        "-c",
+        KILLED,
+        tmp_path / "log",
+        tmp_path / "study",
+        ",".join(KILLS),
+        *files,
+        *flags,
+    ]
     subprocess.run(script, check=True, capture_output=True)
     told = (tmp_path / "log").read_text().splitlines()
     assert [line for line in told if line[:6] == "killed"] == [f"killed {file}" for file in KILLS]
     found = contents(tmp_path / "study")
-    shared = {"network.nc", "registration.nc", "pca.nc"}  # of two files or none a task: made again, and the same
+    shared = {
+        "network.nc",
+        "registration.nc",
+        "pca.nc",
+    }  # of two files or none a task: made again, and the same
     for file in set(found) - shared:
         assert told.count(f"written {file}") == 1, file
     assert not list((tmp_path / "study").rglob(".*.tmp"))
@@ -138,26 +173,34 @@ def test_a_run_killed_in_every_stage_ends_with_the_same_study(files, tmp_path):
 
 def contents(folder):
     """Every file of a study, without what the clock says."""
-    files = {path.relative_to(folder).as_posix(): study.read(path) for path in folder.rglob("[!.]*.nc")}
+    files = {
+        path.relative_to(folder).as_posix(): store.read(path) for path in folder.rglob("[!.]*.nc")
+    }
     times = ["seconds", "peak_memory"]
-    return {file: data.drop_vars(times) if file == "report.nc" else data for file, data in files.items()}
+    return {
+        file: data.drop_vars(times) if file == "report.nc" else data for file, data in files.items()
+    }
 
 
 def test_a_worker_of_a_run_that_is_over_writes_nothing(tmp_path):
-    with study.lock(tmp_path) as old:
-        study.write(synthetic.sphere(50), tmp_path / "a.nc", "key", claim=old)
-    with study.lock(tmp_path) as new:
+    with store.lock(tmp_path) as old:
+        store.write(synthetic.sphere(50), tmp_path / "a.nc", "key", claim=old)
+    with store.lock(tmp_path) as new:
         with pytest.raises(ValueError, match=f"the run of process {os.getpid()} no longer holds"):
-            study.write(synthetic.sphere(60), tmp_path / "a.nc", "key", claim=old)
-        assert study.read(tmp_path / "a.nc").sizes["vertex"] == 50
-        study.write(synthetic.sphere(60), tmp_path / "a.nc", "key", claim=new)
-    assert study.read(tmp_path / "a.nc").sizes["vertex"] == 60
+            store.write(synthetic.sphere(60), tmp_path / "a.nc", "key", claim=old)
+        assert store.read(tmp_path / "a.nc").sizes["vertex"] == 50
+        store.write(synthetic.sphere(60), tmp_path / "a.nc", "key", claim=new)
+    assert store.read(tmp_path / "a.nc").sizes["vertex"] == 60
     assert not list(tmp_path.glob(".*.tmp"))
 
 
-def test_costs_add_up_over_the_runs_that_share_a_stage_and_stay_where_nothing_is_left_to_do(tmp_path):
-    with study.lock(tmp_path) as claim:
-        Run(claim, 1).costs_file.write_text('{"a": [5.0, 7000000.0], "b": [5.0, 7.0], "c": [5.0, 7.0]}')
+def test_costs_add_up_over_the_runs_that_share_a_stage_and_stay_where_nothing_is_left_to_do(
+    tmp_path,
+):
+    with store.lock(tmp_path) as claim:
+        Run(claim, 1).costs_file.write_text(
+            '{"a": [5.0, 7000000.0], "b": [5.0, 7.0], "c": [5.0, 7.0]}'
+        )
         run = Run(claim, 1)
         for name, share in {"a": 0.5, "b": 0.0, "c": 1.0}.items():
             with run.stage(name, share):
@@ -185,10 +228,10 @@ def test_a_study_knows_the_files_in_a_folder_that_was_renamed(files, tmp_path):
 
 def test_another_version_computes_again(tmp_path, monkeypatch):
     path = tmp_path / "a.nc"
-    study.write(synthetic.sphere(50), path, study.task_key("content"))
-    assert study.is_done(path, study.task_key("content"))
-    monkeypatch.setattr(study, "VERSION", "999.0")
-    assert not study.is_done(path, study.task_key("content"))
+    store.write(synthetic.sphere(50), path, store.task_key("content"))
+    assert store.is_done(path, store.task_key("content"))
+    monkeypatch.setattr(store, "VERSION", "999.0")
+    assert not store.is_done(path, store.task_key("content"))
 
 
 FULL = """
@@ -201,7 +244,9 @@ sys.exit(cli.main(["run", *sys.argv[3:], "--out", sys.argv[2], *small]))
 
 
 @pytest.mark.parametrize("n_jobs", [1, 2])
-def test_a_disk_that_takes_no_more_ends_in_one_error_and_leaves_whole_files(files, tmp_path, n_jobs):
+def test_a_disk_that_takes_no_more_ends_in_one_error_and_leaves_whole_files(
+    files, tmp_path, n_jobs
+):
     folder = tmp_path / "study"
     arguments = [sys.executable, "-c", FULL, str(n_jobs), str(folder), *map(str, files[:2])]
     found = subprocess.run(arguments, capture_output=True, text=True, check=False)
@@ -212,30 +257,35 @@ def test_a_disk_that_takes_no_more_ends_in_one_error_and_leaves_whole_files(file
     assert "goes on where it stopped" in lines[0]
     whole = sorted(folder.rglob("[!.]*.nc"))
     assert whole
-    assert all(study.attributes(path)["task_key"] for path in whole)
+    assert all(store.attributes(path)["task_key"] for path in whole)
     assert not list(folder.rglob(".*.tmp"))
 
 
 def test_a_folder_that_cannot_be_written_is_one_error(tmp_path, monkeypatch):
-    study.write(synthetic.sphere(50), tmp_path / "a.nc", "key")
+    store.write(synthetic.sphere(50), tmp_path / "a.nc", "key")
 
     def refused(*_):
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(os, "replace", refused)
-    with pytest.raises(OSError, match=r"a.nc cannot be written .*Permission denied.*Finished files are whole"):
-        study.write(synthetic.sphere(60), tmp_path / "a.nc", "key")
-    assert study.read(tmp_path / "a.nc").sizes["vertex"] == 50
+    with pytest.raises(
+        OSError, match=r"a.nc cannot be written .*Permission denied.*Finished files are whole"
+    ):
+        store.write(synthetic.sphere(60), tmp_path / "a.nc", "key")
+    assert store.read(tmp_path / "a.nc").sizes["vertex"] == 50
     assert [p.name for p in tmp_path.iterdir()] == ["a.nc"]
 
 
 def test_names_that_lead_out_of_a_study_are_left_out(tmp_path, caplog):
     folder, outside = tmp_path / "study", tmp_path / "outside.nc"
     mesh = synthetic.sphere(50)
-    study.write(mesh, folder / "original" / "a.nc")
-    study.write(dataset(latent_eigenvalue=[0.0, 1.0]).assign_coords(shape=["a", "../../outside"]), folder / "latent.nc")
-    study.write(mesh.assign_attrs(template="../../outside"), folder / "registration.nc")
-    study.write(mesh, outside)
-    with study.open_study(folder) as tree:
+    store.write(mesh, folder / "original" / "a.nc")
+    store.write(
+        dataset(latent_eigenvalue=[0.0, 1.0]).assign_coords(shape=["a", "../../outside"]),
+        folder / "latent.nc",
+    )
+    store.write(mesh.assign_attrs(template="../../outside"), folder / "registration.nc")
+    store.write(mesh, outside)
+    with store.open_study(folder) as tree:
         assert list(tree.children) == ["original"]
     assert "shapes need names of letters, digits, _ and -; found ['../../outside']" in caplog.text

@@ -7,7 +7,7 @@ import nibabel
 import numpy as np
 import pytest
 
-from s4a.io import find_meshes, not_meshes, read_mesh, slug, write_mesh
+from s4a.input.files import find_meshes, not_meshes, read_mesh, slug, write_mesh
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 X = np.array([[0, 0, 0], [1.5, 0, 0], [1.5, 2, 0], [0, 2, 0], [0.25, 0.5, 3]])
@@ -56,11 +56,16 @@ def test_scalars_are_written_where_the_format_holds_them(tmp_path):
 
 
 def ply(order, quads=False):
-    """A file with extra vertex and face properties, an element before and, with `quads`, faces of mixed size."""
+    """A file with extra vertex and face properties, an element before and, with `quads`.
+
+    Faces of mixed size.
+    """
     head = f"ply\nformat {order} 1.0\ncomment SPACE=LPS\nelement camera 1\nproperty float view\n"
     head += f"element vertex {len(X)}\nproperty uchar red\nproperty double x\nproperty double y\nproperty double z\n"
     faces = [[0, 3, 2, 1], *T[2:].tolist()] if quads else T.tolist()
-    head += f"element face {len(faces)}\nproperty uchar flag\nproperty list uchar int vertex_index\n"
+    head += (
+        f"element face {len(faces)}\nproperty uchar flag\nproperty list uchar int vertex_index\n"
+    )
     head += "property list uchar float uv\nend_header\n"
     if order == "ascii":
         rows = ["0.5", *(f"7 {x} {y} {z}" for x, y, z in X)]
@@ -77,12 +82,19 @@ def ply(order, quads=False):
 @pytest.mark.parametrize("quads", [False, True])
 def test_ply_is_read_with_other_properties_and_polygons(tmp_path, order, quads):
     expected = np.vstack([[[0, 3, 2], [0, 2, 1]], T[2:]]) if quads else T
-    assert same_surface(file(tmp_path, "m.ply", ply(order, quads)), X, expected)["coordinate_system"] == "LPS"
+    assert (
+        same_surface(file(tmp_path, "m.ply", ply(order, quads)), X, expected)["coordinate_system"]
+        == "LPS"
+    )
 
 
 def test_obj_is_read_with_textures_negative_indices_and_quads(tmp_path):
     vertices = "".join(f"v {x} {y} {z}\n" for x, y, z in X)
-    text = "# a comment\nmtllib a.mtl\n" + vertices + "vt 0 0\nvn 0 0 1\ng part\nf 1/1/1 4/1/1 3/1/1 2/1/1\n"
+    text = (
+        "# a comment\nmtllib a.mtl\n"
+        + vertices
+        + "vt 0 0\nvn 0 0 1\ng part\nf 1/1/1 4/1/1 3/1/1 2/1/1\n"
+    )
     text += "f 1//1 2//1 5//1\nf 2/1 3/1 5/1\nf -3 -2 \\\n -1\nf 4 1 5\n"
     same_surface(file(tmp_path, "m.obj", text), X, np.vstack([[[0, 3, 2], [0, 2, 1]], T[2:]]))
 
@@ -124,7 +136,9 @@ def test_vtk_is_read_as_text_with_quads_and_metadata(tmp_path):
     text = VTK_HEAD.format("4.2", "ASCII") + "POINTS 5 float\n" + " ".join(map(str, X.ravel()))
     text += "\nMETADATA\nINFORMATION 1\nNAME L2_NORM LOCATION vtkDataArray\nDATA 2 0 1\n\n"
     text += "VERTICES 1 2\n1 0\nPOLYGONS 5 21\n4 0 3 2 1\n3 0 1 4\n3 1 2 4\n3 2 3 4\n3 3 0 4\n\nPOINT_DATA 5\n"
-    attrs = same_surface(file(tmp_path, "m.vtk", text), X, np.vstack([[[0, 3, 2], [0, 2, 1]], T[2:]]))
+    attrs = same_surface(
+        file(tmp_path, "m.vtk", text), X, np.vstack([[[0, 3, 2], [0, 2, 1]], T[2:]])
+    )
     assert attrs == {"format": "VTK", "coordinate_system": "RAS"}
 
 
@@ -135,8 +149,12 @@ def test_vtk_5_is_read_with_offsets(tmp_path, binary):
         return values.astype(code).tobytes() if binary else " ".join(map(str, values)).encode()
 
     head = VTK_HEAD.format("5.1", "BINARY" if binary else "ASCII").encode()
-    data = head + b"POINTS 5 double\n" + array(X, ">f8") + b"\nPOLYGONS 7 18\nOFFSETS vtktypeint64\n"
-    data += array(np.arange(7) * 3, ">i8") + b"\nCONNECTIVITY vtktypeint64\n" + array(T, ">i8") + b"\n"
+    data = (
+        head + b"POINTS 5 double\n" + array(X, ">f8") + b"\nPOLYGONS 7 18\nOFFSETS vtktypeint64\n"
+    )
+    data += (
+        array(np.arange(7) * 3, ">i8") + b"\nCONNECTIVITY vtktypeint64\n" + array(T, ">i8") + b"\n"
+    )
     same_surface(file(tmp_path, "m.vtk", data))
 
 
@@ -165,16 +183,20 @@ def vtp(how, compressed, header="UInt32"):
         return f'{tag}"appended" offset="{offset}"/>'
 
     zlib_attr = ' compressor="vtkZLibDataCompressor"' if compressed else ""
-    text = (
-        f'<?xml version="1.0"?>\n<VTKFile type="PolyData" byte_order="LittleEndian" header_type="{header}"{zlib_attr}>'
-    )
+    text = f'<?xml version="1.0"?>\n<VTKFile type="PolyData" byte_order="LittleEndian" header_type="{header}"{zlib_attr}>'
     text += '<PolyData><Piece NumberOfPoints="5" NumberOfVerts="0" NumberOfStrips="0" NumberOfPolys="6"><Points>'
     text += array("Points", X.astype("<f8"), "Float64", 3) + "</Points><Polys>"
-    text += array("connectivity", T.astype("<i8"), "Int64") + array("offsets", np.arange(3, 19, 3), "Int64")
+    text += array("connectivity", T.astype("<i8"), "Int64") + array(
+        "offsets", np.arange(3, 19, 3), "Int64"
+    )
     text += "</Polys></Piece></PolyData>"
     if blob:
         encoding = "raw" if how == "raw" else "base64"
-        return f'{text}\n<AppendedData encoding="{encoding}">\n   _'.encode() + blob + b"\n</AppendedData></VTKFile>"
+        return (
+            f'{text}\n<AppendedData encoding="{encoding}">\n   _'.encode()
+            + blob
+            + b"\n</AppendedData></VTKFile>"
+        )
     return (text + "</VTKFile>").encode()
 
 
@@ -187,10 +209,16 @@ def test_vtp_is_read_in_every_encoding(tmp_path, how, compressed, header):
 
 def test_freesurfer_surfaces_are_read(tmp_path):
     nibabel.freesurfer.io.write_geometry(tmp_path / "lh.pial", X, T, create_stamp="created")
-    assert same_surface(tmp_path / "lh.pial") == {"format": "FreeSurfer", "coordinate_system": "RAS", "unit": "mm"}
+    assert same_surface(tmp_path / "lh.pial") == {
+        "format": "FreeSurfer",
+        "coordinate_system": "RAS",
+        "unit": "mm",
+    }
 
 
-@pytest.mark.parametrize("keys", ["V F", "vertices faces", "points triangles", "position corner_vertex", "X T"])
+@pytest.mark.parametrize(
+    "keys", ["V F", "vertices faces", "points triangles", "position corner_vertex", "X T"]
+)
 def test_npz_is_read_by_any_of_its_keys(tmp_path, keys):
     np.savez(tmp_path / "m.npz", **dict(zip(keys.split(), (X, T), strict=True)))
     same_surface(tmp_path / "m.npz")
@@ -213,7 +241,9 @@ def all_formats(tmp_path):
         write_mesh(tmp_path / f"m{suffix}", X, T)
         yield (tmp_path / f"m{suffix}").read_bytes()
     yield from (ply("ascii", True), ply("binary_big_endian", True), ascii_stl().encode())
-    yield from (vtp(how, compressed) for how in ("ascii", "binary", "raw") for compressed in (False, True))
+    yield from (
+        vtp(how, compressed) for how in ("ascii", "binary", "raw") for compressed in (False, True)
+    )
     nibabel.freesurfer.io.write_geometry(tmp_path / "lh.pial", X, T, create_stamp="created")
     yield (tmp_path / "lh.pial").read_bytes()
 
@@ -240,7 +270,9 @@ def test_a_damaged_file_is_read_or_refused_but_nothing_worse(tmp_path):
 
 def test_counts_beyond_the_file_are_named(tmp_path):
     promise = {
-        "a.ply": ply("binary_little_endian").replace(b"element vertex 5", b"element vertex 4000000000"),
+        "a.ply": ply("binary_little_endian").replace(
+            b"element vertex 5", b"element vertex 4000000000"
+        ),
         "b.ply": ply("ascii").replace(b"element face 6", b"element face 4000000000"),
         "c.off": b"OFF\n5 4000000000 0\n0 0 0\n",
         "d.stl": b"x".ljust(80) + struct.pack("<I", 4_000_000_000) + bytes(500),
@@ -254,10 +286,26 @@ def test_counts_beyond_the_file_are_named(tmp_path):
 @pytest.mark.parametrize(
     "before, after, found",
     [
-        ("element vertex", "element point", "an element vertex with x, y and z expected, found point, face"),
-        ("float z", "float w", "an element vertex with x, y and z expected, found an element vertex with x, y, w"),
-        ("float z", "real z", "properties of elements, of the types of PLY, expected, found 'property real z'"),
-        ("format ascii", "format binary", "one of the formats ascii, .* expected in the header, found binary"),
+        (
+            "element vertex",
+            "element point",
+            "an element vertex with x, y and z expected, found point, face",
+        ),
+        (
+            "float z",
+            "float w",
+            "an element vertex with x, y and z expected, found an element vertex with x, y, w",
+        ),
+        (
+            "float z",
+            "real z",
+            "properties of elements, of the types of PLY, expected, found 'property real z'",
+        ),
+        (
+            "format ascii",
+            "format binary",
+            "one of the formats ascii, .* expected in the header, found binary",
+        ),
     ],
 )
 def test_a_ply_says_what_its_header_lacks(tmp_path, before, after, found):
@@ -295,9 +343,19 @@ def touch(folder, *names):
 
 
 def test_a_pattern_picks_one_structure_of_a_download(tmp_path):
-    touch(tmp_path, "000003_brain.stl", "000003_liver.stl", "s0011_brain.stl", "readme.txt", "._s0011_brain.stl")
+    touch(
+        tmp_path,
+        "000003_brain.stl",
+        "000003_liver.stl",
+        "s0011_brain.stl",
+        "readme.txt",
+        "._s0011_brain.stl",
+    )
     for pattern in ("*_brain", "*_brain.stl"):
-        assert [name for _, name in find_meshes(tmp_path, pattern)] == ["000003_brain", "s0011_brain"]
+        assert [name for _, name in find_meshes(tmp_path, pattern)] == [
+            "000003_brain",
+            "s0011_brain",
+        ]
     with pytest.raises(ValueError, match=r"no mesh of 3 files matching '\*_heart'"):
         find_meshes(tmp_path, "*_heart")
 
@@ -327,7 +385,9 @@ def test_accents_in_either_normal_form_give_one_name():
 
 
 def test_different_files_never_share_a_name(tmp_path):
-    touch(tmp_path, "a/b_c.ply", "a_b/c.ply", "a b/c.ply", "a.b/c.ply", "é.ply", "e.ply", "A/b_c.ply")
+    touch(
+        tmp_path, "a/b_c.ply", "a_b/c.ply", "a b/c.ply", "a.b/c.ply", "é.ply", "e.ply", "A/b_c.ply"
+    )
     names = [name.casefold() for _, name in find_meshes(tmp_path)]
     assert len(set(names)) == 7
 
@@ -355,6 +415,8 @@ def test_what_lies_beside_the_meshes_of_a_folder_is_passed_over_and_named(tmp_pa
     np.savez(tmp_path / "scores.npz", score=np.zeros(3))
     (tmp_path / "a.json").write_text("{}")
     assert [path.name for path, _ in find_meshes(tmp_path)] == ["a.ply"]
-    assert [(path.name, why) for path, why in not_meshes(tmp_path)] == [("scores.npz", "an archive of other arrays")]
+    assert [(path.name, why) for path, why in not_meshes(tmp_path)] == [
+        ("scores.npz", "an archive of other arrays")
+    ]
     assert [path.name for path, _ in not_meshes(tmp_path / "*")] == ["a.json", "scores.npz"]
     assert not_meshes(tmp_path, "a") == []

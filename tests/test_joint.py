@@ -5,19 +5,24 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from s4a import coarsen, deform, joint, spectral, spectrum, synthetic
-from s4a.mesh import as_arrays, vertex_areas, vertex_normals
+from s4a import coarsen, spectrum, synthetic
+from s4a.geometry.mesh import as_arrays, vertex_areas, vertex_normals
+from s4a.method import deform, joint, spectral
 
 
 def bumps(X):
     """A smooth field that moves the points of a shape of unit area by a tenth of its radius."""
-    return 0.02 * np.stack([np.sin(6 * X[:, 1]), np.sin(5 * X[:, 2] + 1), np.cos(6 * X[:, 0])], axis=1)
+    return 0.02 * np.stack(
+        [np.sin(6 * X[:, 1]), np.sin(5 * X[:, 2] + 1), np.cos(6 * X[:, 0])], axis=1
+    )
 
 
 @pytest.fixture(scope="module")
 def surface():
     """A shape of unit area with its eigenfunctions."""
-    mesh = spectrum(coarsen(synthetic.brains(1, 6000)["original/brain_01"].to_dataset(), n_coarse=1500), k=60)
+    mesh = spectrum(
+        coarsen(synthetic.brains(1, 6000)["original/brain_01"].to_dataset(), n_coarse=1500), k=60
+    )
     X, T = as_arrays(mesh)
     area = spectral.unit_area(mesh)
     size = np.sqrt(mesh["vertex_area"].values.sum())
@@ -36,7 +41,9 @@ def test_the_joint_rounds_leave_the_identity_alone(surface):
 
 
 @pytest.mark.parametrize("spectral_weight", [0.0, 0.1])
-def test_a_planted_deformation_is_recovered_and_far_better_than_by_nearest_neighbours(surface, spectral_weight):
+def test_a_planted_deformation_is_recovered_and_far_better_than_by_nearest_neighbours(
+    surface, spectral_weight
+):
     source = moved(surface, surface.X + bumps(surface.X))
     start = cKDTree(source.X).query(surface.X)[1]
     match, motion = joint.low_rounds(source, surface, start, k=60, spectral=spectral_weight)
@@ -72,7 +79,10 @@ def test_a_wrong_match_scores_worse_than_a_right_one(surface):
 
     def score(match):
         return joint.badness(
-            source, surface, match, deform.onto(surface.X, source.X[match], surface.area, surface.smooth)
+            source,
+            surface,
+            match,
+            deform.onto(surface.X, source.X[match], surface.area, surface.smooth),
         )
 
     right = score(every)
@@ -98,7 +108,9 @@ def test_the_finalists_are_the_candidates_of_least_score(surface):
 
 
 def test_smoothing_keeps_fields_of_the_span_and_is_a_projection(surface):
-    B = surface.Phi @ np.random.default_rng(1).normal(size=(60, 60))  # a basis that is not orthonormal
+    B = surface.Phi @ np.random.default_rng(1).normal(
+        size=(60, 60)
+    )  # a basis that is not orthonormal
     smooth = deform.smoother(B, surface.area)
     d = surface.Phi[:, :60] @ np.random.default_rng(2).normal(size=(60, 3))
     assert B @ smooth(d) == pytest.approx(d, abs=1e-6)

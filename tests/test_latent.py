@@ -1,4 +1,7 @@
-"""Consistent latent basis and Consistent ZoomOut (3.4): exactly consistent maps are closed exactly."""
+"""Consistent latent basis and Consistent ZoomOut (3.4).
+
+Exactly consistent maps are closed exactly.
+"""
 
 import itertools
 
@@ -6,7 +9,8 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from s4a import coarsen, latent, median, network, spectral, spectrum, synthetic
+from s4a import coarsen, spectrum, synthetic
+from s4a.method import latent, median, network, spectral
 
 
 def complete(n):
@@ -86,7 +90,10 @@ def test_the_quadratic_form_is_the_sum_of_the_residuals(maps):
     rng = np.random.default_rng(4)
     weight, Y = rng.uniform(size=len(C)), rng.normal(size=(5, 8, 3))
     L = latent.consistency_form(C, source, target, weight, 5)(np.eye(40))
-    total = sum(w * ((c @ Y[i] - Y[j]) ** 2).sum() for c, i, j, w in zip(C, source, target, weight, strict=True))
+    total = sum(
+        w * ((c @ Y[i] - Y[j]) ** 2).sum()
+        for c, i, j, w in zip(C, source, target, weight, strict=True)
+    )
     assert np.trace(Y.reshape(40, 3).T @ L @ Y.reshape(40, 3)) == pytest.approx(total)
     assert pytest.approx(L.T) == L
 
@@ -123,7 +130,9 @@ def zoomed(shapes, first, **options):
     Phi = [s["eigenfunction"].values for s in shapes]
     area = [spectral.unit_area(s) for s in shapes]
     eigenvalues = np.stack([s["eigenvalue"].values for s in shapes])
-    return latent.consistent_zoomout(first, *complete(len(shapes)), Phi, area, eigenvalues, 25, step=4, **options)
+    return latent.consistent_zoomout(
+        first, *complete(len(shapes)), Phi, area, eigenvalues, 25, step=4, **options
+    )
 
 
 @pytest.fixture(scope="module")
@@ -174,4 +183,6 @@ def test_progress_is_told_the_size_of_every_round(shapes, first):
 def test_maps_that_have_their_size_stay_as_they_are(maps, eigenvalues):
     C, source, target, _ = maps
     Phi, area = [np.random.default_rng(0).normal(size=(30, 8))] * 5, [np.full(30, 1 / 30)] * 5
-    assert np.array_equal(latent.consistent_zoomout(C, source, target, Phi, area, eigenvalues, 8)[0], C)
+    assert np.array_equal(
+        latent.consistent_zoomout(C, source, target, Phi, area, eigenvalues, 8)[0], C
+    )

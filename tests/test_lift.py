@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 import s4a
-from s4a import lift, synthetic
-from s4a.mesh import as_arrays, stiffness, vertex_areas
-from s4a.register import Scan
-from s4a.remesh import laplacian
-from s4a.spectral import eigenpairs
+from s4a import synthetic
+from s4a.geometry.mesh import as_arrays, stiffness, vertex_areas
+from s4a.method import lift
+from s4a.method.register import Scan
+from s4a.method.remesh import laplacian
+from s4a.method.spectral import eigenpairs
 
 K = 30
 
@@ -58,7 +59,9 @@ def test_lifted_functions_are_orthonormal_and_the_first_is_constant(shape, exact
     assert np.allclose(B[:, 0], 1, atol=1e-4)
 
 
-def test_the_eigenvalue_of_constants_is_zero_so_that_descriptors_do_not_take_it_for_a_frequency(shape):
+def test_the_eigenvalue_of_constants_is_zero_so_that_descriptors_do_not_take_it_for_a_frequency(
+    shape,
+):
     found, _ = lifted(shape)
     assert found[0] == 0
     assert found[1] > 1
@@ -66,7 +69,9 @@ def test_the_eigenvalue_of_constants_is_zero_so_that_descriptors_do_not_take_it_
 
 def test_the_smoother_damps_what_is_rough_and_enlarges_nothing():
     rates = np.linspace(0, 1, 101)
-    left = lift.smoothed(np.diag(rates), np.zeros((101, 1)), np.ones((101, 1)), rounds=4, least=0.05).ravel()
+    left = lift.smoothed(
+        np.diag(rates), np.zeros((101, 1)), np.ones((101, 1)), rounds=4, least=0.05
+    ).ravel()
     assert np.abs(left).max() <= 1
     assert np.abs(left[5:]).max() < 0.4
 
@@ -87,7 +92,7 @@ def test_a_mesh_of_obtuse_triangles_is_lifted_too(shape):
 def test_every_piece_of_a_mesh_keeps_its_constant():
     ball = synthetic.sphere(1500)
     X, T = as_arrays(ball)
-    two = s4a.mesh.as_dataset(np.r_[X, X + [3, 0, 0]], np.r_[T, T + len(X)])
+    two = s4a.geometry.mesh.as_dataset(np.r_[X, X + [3, 0, 0]], np.r_[T, T + len(X)])
     scan = Scan(two, s4a.spectrum(s4a.coarsen(two, n_coarse=400), k=12))
     X, T = as_arrays(two)
     eigenvalue, B = lift.lift(X, T, vertex_areas(X, T), scan.U, scan.coarse, 6)

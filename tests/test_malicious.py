@@ -12,8 +12,8 @@ import fuzz
 import numpy as np
 import pytest
 
-from s4a.annotations import read_labels, read_landmarks, write_landmarks
-from s4a.io import read_mesh, stem_of
+from s4a.input.annotations import read_labels, read_landmarks, write_landmarks
+from s4a.input.files import read_mesh, stem_of
 
 
 def file(path, content):
@@ -67,15 +67,27 @@ BOMB = '<!ENTITY a "aaaaaaaaaa">' + "".join(
 
 
 @pytest.mark.parametrize(
-    "entities", [BOMB, '<!ENTITY i SYSTEM "file:///etc/hostname">', '<!ENTITY % i SYSTEM "x.dtd"> %i;']
+    "entities",
+    [BOMB, '<!ENTITY i SYSTEM "file:///etc/hostname">', '<!ENTITY % i SYSTEM "x.dtd"> %i;'],
 )
 def test_xml_with_entities_is_refused(tmp_path, entities):
     for suffix, root, body, read in xml_files():
         declared = b'<?xml version="1.0"?>\n<!DOCTYPE %s [%s]>\n' % (root, entities.encode())
-        hurt = body.replace(b"<Points>" if root == b"VTKFile" else b">", b">&i;", 1) if entities == BOMB else body
-        with pytest.raises(ValueError, match=r"without entities expected, found a declaration of '[ai]'"):
+        hurt = (
+            body.replace(b"<Points>" if root == b"VTKFile" else b">", b">&i;", 1)
+            if entities == BOMB
+            else body
+        )
+        with pytest.raises(
+            ValueError, match=r"without entities expected, found a declaration of '[ai]'"
+        ):
             read(file(tmp_path / f"file{suffix}", declared + hurt))
-        read(file(tmp_path / f"file{suffix}", declared.split(b" [")[0] + b' SYSTEM "http://a.b/c.dtd">' + body))
+        read(
+            file(
+                tmp_path / f"file{suffix}",
+                declared.split(b" [")[0] + b' SYSTEM "http://a.b/c.dtd">' + body,
+            )
+        )
 
 
 def test_a_gifti_file_opens_no_other_file(tmp_path):
@@ -85,7 +97,9 @@ def test_a_gifti_file_opens_no_other_file(tmp_path):
         'Dimensionality="1" Dim0="3" Encoding="ExternalFileBinary" ExternalFileName="secret" ExternalFileOffset="0" '
         'ArrayIndexingOrder="RowMajorOrder" Endian="LittleEndian"><Data/></DataArray></GIFTI>'
     )
-    with pytest.raises(ValueError, match="data inside the file expected, found ExternalFileBinary secret"):
+    with pytest.raises(
+        ValueError, match="data inside the file expected, found ExternalFileBinary secret"
+    ):
         read_labels(file(tmp_path / "a.gii", text))
 
 
@@ -113,7 +127,9 @@ def test_label_files_that_unpack_to_more_than_64_mib_and_200_times_their_size_ar
     bombs = {"a.npz": npz(label=array((20_000_000,), zeros)), "b.gii": gifti.encode()}
     for name, data in bombs.items():
         assert len(data) < 200_000
-        with pytest.raises(ValueError, match=rf"{name}.*at most .* expected in .*compressed .*found more"):
+        with pytest.raises(
+            ValueError, match=rf"{name}.*at most .* expected in .*compressed .*found more"
+        ):
             read_labels(file(tmp_path / name, data))
 
 
@@ -123,7 +139,9 @@ def test_an_array_that_promises_more_than_its_file_is_refused_before_room_is_mad
             ("a.npy", array(shape, bytes(12), kind)),
             ("b.npz", npz(label=array(shape, bytes(12), kind))),
         ):
-            with pytest.raises(ValueError, match=rf"{name}.*bytes of .* expected for the shape .*, found 12"):
+            with pytest.raises(
+                ValueError, match=rf"{name}.*bytes of .* expected for the shape .*, found 12"
+            ):
                 read_labels(file(tmp_path / name, data))
 
 
@@ -134,19 +152,29 @@ def test_many_arrays_at_one_place_of_a_file_count_each(tmp_path):
     piece = f'<Piece NumberOfPoints="50000"><Points>{piece}</Points></Piece>'
     text = '<VTKFile type="PolyData" compressor="vtkZLibDataCompressor"><PolyData>' + 400 * piece
     text += '</PolyData><AppendedData encoding="raw">_'
-    with pytest.raises(ValueError, match=r"at most \d+ bytes expected in a compressed block, found more"):
+    with pytest.raises(
+        ValueError, match=r"at most \d+ bytes expected in a compressed block, found more"
+    ):
         read_mesh(file(tmp_path / "a.vtp", text.encode() + body + b"</AppendedData></VTKFile>"))
 
 
 def test_offsets_of_polygons_whose_differences_overflow_are_refused(tmp_path):
     offsets = f"{2**63 - 1} -2 9"  # in 64 bits each is above the one before by a positive number, and few in all
     arrays = {"connectivity": "0 1 2 0 1 2 0 1 2", "offsets": offsets}
-    polys = "".join(f'<DataArray type="Int64" Name="{n}" format="ascii">{v}</DataArray>' for n, v in arrays.items())
+    polys = "".join(
+        f'<DataArray type="Int64" Name="{n}" format="ascii">{v}</DataArray>'
+        for n, v in arrays.items()
+    )
     points = '<DataArray type="Float32" format="ascii">0 0 0 1 0 0 0 1 0</DataArray>'
     xml = f"<Piece NumberOfPoints='3' NumberOfPolys='3'><Points>{points}</Points><Polys>{polys}</Polys></Piece>"
     legacy = "# vtk DataFile Version 5.1\na\nASCII\nDATASET POLYDATA\nPOINTS 3 float\n0 0 0 1 0 0 0 1 0\nPOLYGONS 4 9\n"
-    legacy += f"OFFSETS vtktypeint64\n0 {offsets}\nCONNECTIVITY vtktypeint64\n{arrays['connectivity']}\n"
-    files = {"a.vtp": f'<VTKFile type="PolyData"><PolyData>{xml}</PolyData></VTKFile>', "a.vtk": legacy}
+    legacy += (
+        f"OFFSETS vtktypeint64\n0 {offsets}\nCONNECTIVITY vtktypeint64\n{arrays['connectivity']}\n"
+    )
+    files = {
+        "a.vtp": f'<VTKFile type="PolyData"><PolyData>{xml}</PolyData></VTKFile>',
+        "a.vtk": legacy,
+    }
     for name, content in files.items():
         with pytest.raises(ValueError, match=rf"{name}.*polygons of 9 corners promised, found 9"):
             read_mesh(file(tmp_path / name, content))
@@ -155,9 +183,13 @@ def test_offsets_of_polygons_whose_differences_overflow_are_refused(tmp_path):
 def test_one_long_word_does_not_widen_all_others(tmp_path):
     long = "1" * 100_000
     obj = "".join(f"v {i} 0 0\n" for i in range(20_000)) + f"v 0.{long} 1 0\nf 1 2 20001\n"
-    assert len(read_mesh(file(tmp_path / "a.obj", obj))[0]) == 20_001  # in words of one width they are 6 GB
+    assert (
+        len(read_mesh(file(tmp_path / "a.obj", obj))[0]) == 20_001
+    )  # in words of one width they are 6 GB
     rows = "label\n" + "x\n" * 100_000 + "y" * 100_000
-    with pytest.raises(ValueError, match=r"names of at most 255 characters expected, found one of 100000"):
+    with pytest.raises(
+        ValueError, match=r"names of at most 255 characters expected, found one of 100000"
+    ):
         read_labels(file(tmp_path / "a.csv", rows))
 
 
@@ -167,7 +199,8 @@ def test_one_long_word_does_not_widen_all_others(tmp_path):
         b"v" + b"\n" * 300_000,
         b"<VTKFile " + b"<AppendedData " * 50_000,
         b"<VTKFile " + b'<AppendedData encoding="' * 30_000,
-        b"# vtk DataFile Version 3.0\na\nASCII\nDATASET POLYDATA\n" + b"FIELD a 1\nb 1 1 int\n1\n" * 20_000,
+        b"# vtk DataFile Version 3.0\na\nASCII\nDATASET POLYDATA\n"
+        + b"FIELD a 1\nb 1 1 int\n1\n" * 20_000,
         b"\x1f\x8b\x08\0\0\0\0\0\2\xff\3\0\0\0\0\0\0\0\0\0" * 20_000,
     ],
     ids=["empty lines", "tags", "attributes", "fields", "gzip members"],
@@ -178,7 +211,9 @@ def test_no_reader_takes_the_square_of_the_size(tmp_path, content):
     start = time.process_time()
     with pytest.raises(ValueError):
         read_mesh(file(tmp_path / "a.mesh", content))
-    assert time.process_time() - start < fuzz.SECONDS  # the limit of the fuzzer; with the square it is minutes
+    assert (
+        time.process_time() - start < fuzz.SECONDS
+    )  # the limit of the fuzzer; with the square it is minutes
 
 
 def test_names_in_annotations_are_no_paths(tmp_path):

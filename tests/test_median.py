@@ -3,14 +3,17 @@
 import numpy as np
 import pytest
 
-from s4a import median
+from s4a.method import median
 from s4a.schema import dataset
 
 EIGENVALUES = np.array([0.0, 2.0, 4.0])
 
 
 def three_shapes():
-    """Y of the limit shape itself, of one with its second function doubled, and one a little turned."""
+    """Y of the limit shape itself, of one with its second function doubled.
+
+    And one a little turned.
+    """
     turned = np.eye(3)
     turned[1:, 1:] = [[0.8, -0.6], [0.6, 0.8]]
     return np.stack([np.eye(3), np.diag([1.0, 2, 1]), turned])

@@ -5,9 +5,9 @@ import pytest
 import xarray as xr
 
 from s4a import metrics, synthetic
-from s4a.mesh import as_arrays, cotan_weights, triangle_areas, vertex_areas
+from s4a.geometry.mesh import as_arrays, cotan_weights, triangle_areas, vertex_areas
+from s4a.method.spectral import eigenpairs
 from s4a.schema import dataset
-from s4a.spectral import eigenpairs
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,9 @@ def shuffled(ball):
     return np.random.default_rng(0).permutation(ball.sizes["vertex"])
 
 
-def test_a_random_permutation_scores_0_on_chamfer_and_hausdorff_and_badly_where_truth_is_seen(ball, shuffled):
+def test_a_random_permutation_scores_0_on_chamfer_and_hausdorff_and_badly_where_truth_is_seen(
+    ball, shuffled
+):
     same = np.arange(len(shuffled))
     wrong = metrics.evaluate(ball, ball, shuffled, reverse=np.argsort(shuffled), truth=same)
     for name in ("chamfer", "hausdorff", "hausdorff_paper", "bijectivity"):
@@ -64,7 +66,9 @@ def test_the_printed_hausdorff_distance_all_but_ignores_one_of_both_ways():
         metrics.hausdorff(near, far, "printed")
 
 
-def test_the_dirichlet_energy_of_the_coordinates_is_twice_the_area_and_of_an_eigenfunction_its_eigenvalue(arrays):
+def test_the_dirichlet_energy_of_the_coordinates_is_twice_the_area_and_of_an_eigenfunction_its_eigenvalue(
+    arrays,
+):
     X, T = arrays
     E, w = cotan_weights(X, T)
     assert metrics.dirichlet(X, E, w) == pytest.approx(2 * triangle_areas(X, T).sum())
@@ -124,7 +128,9 @@ def test_the_geodesic_error_is_the_arc_on_a_sphere_of_unit_area_up_to_the_edges(
     X, T = arrays
     north, south = X[:, 2].argmax(), X[:, 2].argmin()
     for scale in (1.0, 20.0):
-        error = metrics.geodesic_error(scale * X, T, np.array([south, north]), np.array([north, north]), limit=2.0)
+        error = metrics.geodesic_error(
+            scale * X, T, np.array([south, north]), np.array([north, north]), limit=2.0
+        )
         assert error[1] == 0
         arc = np.pi / np.sqrt(4 * np.pi)
         assert 0.99 * arc < error[0] < 1.12 * arc
@@ -141,7 +147,9 @@ def test_a_cycle_of_rotations_of_the_numbering_closes_and_a_broken_one_does_not(
     back = np.argsort(shuffled)
     assert (metrics.bijectivity(X, T, shuffled, back) == 0).all()
     assert (metrics.cycle_error(X, T, shuffled, shuffled, back[back]) == 0).all()
-    assert metrics.cycle_error(X, T, shuffled, np.roll(back, 1), vertices=np.arange(50)).mean() > 0.2
+    assert (
+        metrics.cycle_error(X, T, shuffled, np.roll(back, 1), vertices=np.arange(50)).mean() > 0.2
+    )
 
 
 def test_a_symmetric_flip_there_and_back_is_not_seen_by_the_round_trip_but_by_the_truth(ball):
@@ -216,7 +224,10 @@ def test_where_the_truth_is_unknown_nothing_is_measured(ball, shuffled):
 
 def test_evaluations_stack_over_ways_and_pairs(ball, shuffled):
     same = np.arange(len(shuffled))
-    rows = [xr.concat([metrics.evaluate(ball, ball, m, truth=same) for m in (same, shuffled)], "way") for _ in range(2)]
+    rows = [
+        xr.concat([metrics.evaluate(ball, ball, m, truth=same) for m in (same, shuffled)], "way")
+        for _ in range(2)
+    ]
     table = xr.concat(rows, "pair")
     assert dict(table["chamfer"].sizes) == {"pair": 2, "way": 2}
     assert table["chamfer"].attrs["units"] == "share of sqrt(area)"

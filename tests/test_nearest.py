@@ -1,9 +1,12 @@
-"""Exact nearest neighbours over cells (eq. 7): the answer of an exhaustive search, with fewer comparisons."""
+"""Exact nearest neighbours over cells (eq. 7).
+
+The answer of an exhaustive search, with fewer comparisons.
+"""
 
 import numpy as np
 import pytest
 
-from s4a.nearest import into_cells, nearest_in_cells, nearest_of_few
+from s4a.method.nearest import into_cells, nearest_in_cells, nearest_of_few
 
 
 def gaps(Q, D):
@@ -12,7 +15,10 @@ def gaps(Q, D):
 
 
 def check(Q, D, found):
-    """Each row found is as near as the nearest one, up to float32 rounding of the squared distance."""
+    """Each row found is as near as the nearest one.
+
+    Up to float32 rounding of the squared distance.
+    """
     gap = gaps(Q, D)
     centred = np.concatenate([Q, D]) - D.mean(0)
     slack = 2e-6 * (centred**2).sum(1).max()
@@ -34,7 +40,9 @@ def clustered(n, d, seed, spread=0.05):
 def test_the_answer_is_that_of_an_exhaustive_search_on_random_rows_in_random_cells(d, first):
     rng = np.random.default_rng(d)
     Q, D = rng.normal(size=(1500, d)), rng.normal(size=(1200, d))
-    found, *_ = nearest_in_cells(Q, rng.integers(0, 37, 1500), D, rng.integers(0, 29, 1200), first=first)
+    found, *_ = nearest_in_cells(
+        Q, rng.integers(0, 37, 1500), D, rng.integers(0, 29, 1200), first=first
+    )
     assert check(Q, D, found) > (0.99 if d > 1 else 0.9)
 
 
@@ -58,14 +66,18 @@ def test_rows_that_are_nearly_the_same_are_found_across_cells():
     D = rng.normal(size=(2000, 30))
     order = rng.permutation(2000)
     Q = D[order] + 1e-4 * rng.normal(size=D.shape)
-    found, *_ = nearest_in_cells(Q, rng.integers(0, 50, 2000), D, rng.integers(0, 50, 2000), first=1)
+    found, *_ = nearest_in_cells(
+        Q, rng.integers(0, 50, 2000), D, rng.integers(0, 50, 2000), first=1
+    )
     assert (found == order).all()
 
 
 def test_the_numbering_of_the_cells_does_not_matter():
     (Q, cell_q), (D, cell_d) = clustered(1000, 10, 6), clustered(900, 10, 7)
     one, share, _ = nearest_in_cells(Q, cell_q, D, cell_d)
-    numbers = np.random.default_rng(0).choice(10**6, 40, replace=False)  # most numbers are of empty cells
+    numbers = np.random.default_rng(0).choice(
+        10**6, 40, replace=False
+    )  # most numbers are of empty cells
     two, same, _ = nearest_in_cells(Q, numbers[cell_q], D, numbers[::-1][cell_d])
     assert (one == two).all()
     assert share == pytest.approx(same, abs=0.02)

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.sparse.csgraph import connected_components
 
-from s4a import coarsen, network, spectral, spectrum, synthetic
+from s4a import coarsen, spectrum, synthetic
+from s4a.method import network, spectral
 
 
 def distances(n, seed=0):
@@ -37,7 +38,9 @@ def test_the_smallest_budget_gives_the_minimum_spanning_tree():
 
 
 def test_all_pairs_are_given_where_the_budget_allows():
-    assert network.choose_pairs(distances(6), 500).tolist() == [list(p) for p in itertools.combinations(range(6), 2)]
+    assert network.choose_pairs(distances(6), 500).tolist() == [
+        list(p) for p in itertools.combinations(range(6), 2)
+    ]
 
 
 @pytest.mark.parametrize("n", [3, 6, 15])
@@ -72,7 +75,9 @@ def test_the_spectral_distance_of_scaled_spectra_is_the_logarithm_of_the_scale()
 
 @pytest.fixture(scope="module")
 def low():
-    mesh = spectrum(coarsen(synthetic.brains(1, 3000)["original/brain_01"].to_dataset(), n_coarse=700), k=20)
+    mesh = spectrum(
+        coarsen(synthetic.brains(1, 3000)["original/brain_01"].to_dataset(), n_coarse=700), k=20
+    )
     area = spectral.unit_area(mesh)
     X = mesh["position"].values / np.sqrt(mesh["vertex_area"].values.sum())
     return X - area @ X, area, mesh["eigenfunction"].values, mesh["eigenvalue"].values
@@ -91,7 +96,11 @@ def consistent():
     """Maps C_ij = Y_j Y_i^-1 of four shapes, all pairs both ways."""
     Y = np.random.default_rng(0).normal(size=(4, 6, 6)) + 3 * np.eye(6)
     source, target = np.array(list(itertools.permutations(range(4), 2))).T
-    return np.stack([Y[j] @ np.linalg.inv(Y[i]) for i, j in zip(source, target, strict=True)]), source, target
+    return (
+        np.stack([Y[j] @ np.linalg.inv(Y[i]) for i, j in zip(source, target, strict=True)]),
+        source,
+        target,
+    )
 
 
 def test_every_directed_cycle_is_found_once(consistent):

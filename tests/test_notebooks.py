@@ -1,4 +1,7 @@
-"""The course runs: every notebook from a clean kernel, its exercises without an answer and with the one of the book."""
+"""The course runs: every notebook from a clean kernel.
+
+Its exercises without an answer and with the one of the book.
+"""
 
 import asyncio
 import json
@@ -34,7 +37,9 @@ def exercises(notebook):
     for i, cell in enumerate(notebook.cells):
         if "exercise" in tags(cell):
             solution = notebook.cells[i + 1].source
-            assert solution.startswith("<details>"), f"no solution after the exercise: {cell.source}"
+            assert solution.startswith("<details>"), (
+                f"no solution after the exercise: {cell.source}"
+            )
             yield i, re.search(r"```python\n(.*?)\n```", solution, re.DOTALL)[1]
 
 
@@ -43,11 +48,16 @@ async def added(client, source):
     cell = nbformat.v4.new_code_cell(source)
     client.nb.cells.append(cell)
     await client.async_execute_cell(cell, len(client.nb.cells) - 1)
-    return "".join(o["data"]["text/plain"] for o in cell.outputs if o.output_type == "execute_result")
+    return "".join(
+        o["data"]["text/plain"] for o in cell.outputs if o.output_type == "execute_result"
+    )
 
 
 async def played(path, folder):
-    """Run a notebook from a clean kernel, every exercise open and solved; its seconds of CPU and peak memory in MiB."""
+    """Run a notebook from a clean kernel, every exercise open and solved.
+
+    Its seconds of CPU and peak memory in MiB.
+    """
     notebook = nbformat.read(path, as_version=4)
     solutions = dict(exercises(notebook))
     client = nbclient.NotebookClient(
@@ -55,9 +65,15 @@ async def played(path, folder):
     )
     async with client.async_setup_kernel():
         for i, cell in enumerate(list(notebook.cells)):
-            await client.async_execute_cell(cell, i)  # CellExecutionError where it fails and may not
+            await client.async_execute_cell(
+                cell, i
+            )  # CellExecutionError where it fails and may not
             outputs = cell.get("outputs", [])
-            told = [o for o in outputs if o.output_type == "stream" and o.name == "stderr" and "Warning" in o.text]
+            told = [
+                o
+                for o in outputs
+                if o.output_type == "stream" and o.name == "stderr" and "Warning" in o.text
+            ]
             assert not told, told
             if i in solutions:
                 errors = [(o.ename, o.evalue) for o in outputs if o.output_type == "error"]
@@ -74,7 +90,9 @@ def test_it_runs_and_its_exercises_fail_open_and_pass_solved(path, tmp_path, rec
         try:
             spent = asyncio.run(played(path, tmp_path))
             break
-        except nbclient.exceptions.CellTimeoutError:  # once in many runs a kernel is idle while the client waits for it
+        except (
+            nbclient.exceptions.CellTimeoutError
+        ):  # once in many runs a kernel is idle while the client waits for it
             if not tries_left:
                 raise
     record_property("notebook", (path.stem, spent["seconds"], spent["MiB"]))

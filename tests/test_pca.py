@@ -1,11 +1,15 @@
-"""Principal modes (6.1): planted modes come back with their variances; every shape is made again from its scores."""
+"""Principal modes (6.1): planted modes come back with their variances.
+
+Every shape is made again from its scores.
+"""
 
 import numpy as np
 import pytest
 import xarray as xr
 
-from s4a import pca, synthesize, synthetic
-from s4a.mesh import as_arrays, as_dataset, vertex_areas
+from s4a import synthesize, synthetic
+from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
+from s4a.method import pca
 from s4a.schema import dataset
 
 DEVIATIONS = np.array([3.0, 1.5, 0.5])
@@ -13,7 +17,10 @@ DEVIATIONS = np.array([3.0, 1.5, 0.5])
 
 @pytest.fixture(scope="module")
 def planted():
-    """Ten displacement fields of three area-orthonormal modes with uncorrelated scores, and a mean."""
+    """Ten displacement fields of three area-orthonormal modes with uncorrelated scores.
+
+    And a mean.
+    """
     X, T = as_arrays(synthetic.ellipsoid(800, (60, 80, 50)))
     area = vertex_areas(X, T)
     rng = np.random.default_rng(0)
@@ -38,7 +45,9 @@ def modes(planted):
 def test_planted_modes_come_back_with_their_standard_deviations_and_shares(planted, modes):
     variance = DEVIATIONS**2
     assert modes["standard_deviation"].values[:3] == pytest.approx(DEVIATIONS, rel=1e-5)
-    assert modes["explained_variance_ratio"].values[:3] == pytest.approx(variance / variance.sum(), rel=1e-5)
+    assert modes["explained_variance_ratio"].values[:3] == pytest.approx(
+        variance / variance.sum(), rel=1e-5
+    )
     assert modes["mean_displacement"].values == pytest.approx(planted[4], abs=1e-5)
 
 
@@ -52,7 +61,9 @@ def test_a_deformation_is_the_mode_times_its_standard_deviation(planted, modes):
     _, area, mode, _, _ = planted
     deformation = modes["deformation"].values[:3].astype(float)
     w = area / area.sum()
-    assert np.sqrt(np.einsum("cnx,cnx,n->c", deformation, deformation, w)) == pytest.approx(DEVIATIONS, rel=1e-5)
+    assert np.sqrt(np.einsum("cnx,cnx,n->c", deformation, deformation, w)) == pytest.approx(
+        DEVIATIONS, rel=1e-5
+    )
     along = np.einsum("cnx,dnx,n->cd", deformation, mode, w)
     assert np.abs(along) == pytest.approx(np.diag(DEVIATIONS), abs=1e-4)
 
@@ -87,7 +98,9 @@ def test_scores_of_the_first_components_are_enough(planted, modes):
 
 
 def test_too_many_scores_are_refused(planted, modes):
-    with pytest.raises(ValueError, match=f"at most {modes.sizes['component']} numbers, found shape"):
+    with pytest.raises(
+        ValueError, match=f"at most {modes.sizes['component']} numbers, found shape"
+    ):
         synthesize(study_of(planted[0], modes), np.zeros(modes.sizes["component"] + 1))
 
 
@@ -111,7 +124,10 @@ def test_the_unit_of_the_area_does_not_matter_and_that_of_the_input_scales():
 
 def test_the_order_of_the_shapes_only_orders_the_scores(planted):
     order = np.random.default_rng(3).permutation(10)
-    one, two = (pca.gram_pca(planted[0]["displacement"].values[i], planted[1]) for i in (np.arange(10), order))
+    one, two = (
+        pca.gram_pca(planted[0]["displacement"].values[i], planted[1])
+        for i in (np.arange(10), order)
+    )
     assert two[3][:, :3] == pytest.approx(one[3][order, :3], abs=1e-4)
 
 

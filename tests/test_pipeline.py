@@ -1,4 +1,7 @@
-"""The whole analysis (4, 6.1): end to end, the same on any number of workers, resumed after a kill, failures named."""
+"""The whole analysis (4, 6.1).
+
+End to end, the same on any number of workers, resumed after a kill, failures named.
+"""
 
 import os
 import signal
@@ -11,8 +14,10 @@ import pytest
 import xarray as xr
 from scipy.spatial.transform import Rotation
 
-from s4a import accuracy, analyse, open_study, statistics, study, synthesize, synthetic
-from s4a.mesh import as_arrays, vertex_areas
+from s4a import analyse, open_study, statistics, synthesize, synthetic
+from s4a.evaluation import accuracy
+from s4a.geometry.mesh import as_arrays, vertex_areas
+from s4a.study import store
 
 OPTIONS = {"n_coarse": 600, "k_init": 12, "k": 30, "n_jobs": 1}
 RESULTS = ("network", "latent", "registration", "pca")
@@ -53,7 +58,9 @@ def files(folder):
     """Time and size of every result of a folder; what is put together anew in each run left out."""
     anew = ("report.nc", "registration.nc", "pca.nc", ".lock", ".costs.json")
     return {
-        p: (p.stat().st_mtime_ns, p.stat().st_size) for p in folder.rglob("*") if p.is_file() and p.name not in anew
+        p: (p.stat().st_mtime_ns, p.stat().st_size)
+        for p in folder.rglob("*")
+        if p.is_file() and p.name not in anew
     }
 
 
@@ -92,7 +99,9 @@ def test_lengths_have_the_unit_that_all_shapes_say(done):
 
 
 def test_at_low_resolution_the_matches_as_they_are_hold_more_than_the_smooth_modes(done):
-    full, low = (done["pca"][n].values for n in ("explained_variance_ratio", "explained_variance_ratio_low"))
+    full, low = (
+        done["pca"][n].values for n in ("explained_variance_ratio", "explained_variance_ratio_low")
+    )
     assert low.sum() == pytest.approx(1)
     assert np.abs(low - full).max() > 1e-3
 
@@ -146,7 +155,9 @@ def test_a_study_of_files_knows_their_paths(given, from_files):
 
 
 def test_meshes_in_memory_give_what_their_files_give(meshes, given, from_files):
-    rounded = {n: (X.astype(np.float32).astype(float), T) for n, (X, T) in meshes.items()}  # as PLY holds them
+    rounded = {
+        n: (X.astype(np.float32).astype(float), T) for n, (X, T) in meshes.items()
+    }  # as PLY holds them
     assert_same(analyse(rounded, **OPTIONS), from_files)
 
 
@@ -176,7 +187,12 @@ def test_lost_and_broken_files_are_computed_again_and_no_others(brains, folder, 
     with analyse(brains, store=work, **OPTIONS) as again:
         assert_same(again, done)
     changed = {p for p, state in files(work).items() if before.get(p) != state}
-    assert changed == {lost, broken, empty, work / "network.nc"}  # the network is written with the latent basis
+    assert changed == {
+        lost,
+        broken,
+        empty,
+        work / "network.nc",
+    }  # the network is written with the latent basis
 
 
 def test_an_option_changes_what_depends_on_it_and_nothing_else(brains, folder, tmp_path):
@@ -184,7 +200,9 @@ def test_an_option_changes_what_depends_on_it_and_nothing_else(brains, folder, t
     before = files(work)
     with analyse(brains, store=work, **OPTIONS | {"refine": "intrinsic"}) as other:
         assert set(other["registration"]["method"].values) == {"template", "intrinsic"}
-    changed = {p.relative_to(work).parts[0] for p, state in files(work).items() if before.get(p) != state}
+    changed = {
+        p.relative_to(work).parts[0] for p, state in files(work).items() if before.get(p) != state
+    }
     assert changed == {"registration"}
 
 
@@ -203,7 +221,11 @@ def test_a_killed_run_goes_on_where_it_was(given, from_files, tmp_path):
         stderr=subprocess.DEVNULL,
     ) as run:
         deadline = time.monotonic() + 60
-        while not any((work / "network").glob("motion_*.nc")) and run.poll() is None and time.monotonic() < deadline:
+        while (
+            not any((work / "network").glob("motion_*.nc"))
+            and run.poll() is None
+            and time.monotonic() < deadline
+        ):
             time.sleep(0.005)
         os.kill(run.pid, signal.SIGKILL)
     assert not (work / "report.nc").exists()
@@ -220,12 +242,24 @@ def test_the_paper_preset_runs_the_paper_way(brains):
     tree = analyse(brains, preset="paper", **OPTIONS)
     registration, report = tree["registration"].to_dataset(), tree["report"].to_dataset()
     assert set(registration["method"].values) == {"template", "intrinsic"}
-    assert [report.attrs[o] for o in ("init", "refine", "how")] == ["landmarks", "intrinsic", "ours"]
+    assert [report.attrs[o] for o in ("init", "refine", "how")] == [
+        "landmarks",
+        "intrinsic",
+        "ours",
+    ]
     assert tree["pca"]["explained_variance_ratio"].sum() == pytest.approx(1)
 
 
 def test_the_standard_way_runs(brains):
-    tree = analyse(brains, how="standard", refine="intrinsic", template="brain_02", n_latent=20, scale=True, **OPTIONS)
+    tree = analyse(
+        brains,
+        how="standard",
+        refine="intrinsic",
+        template="brain_02",
+        n_latent=20,
+        scale=True,
+        **OPTIONS,
+    )
     assert tree["latent"].sizes["latent"] == 20
     assert tree["registration"].attrs["template"] == "brain_02"
     others = tree["registration"]["scale"].drop_sel(shape="brain_02")
@@ -257,7 +291,10 @@ def test_a_bad_mesh_in_memory_is_left_out_too(meshes):
     bad = {"out_of_range": (X, T + 99), "nothing": (X, T[:0])}
     tree = analyse({**dict(list(meshes.items())[:3]), **bad}, **OPTIONS)
     report = tree["report"].to_dataset()
-    assert report["shape"].values[report["status"].values == "excluded"].tolist() == ["nothing", "out_of_range"]
+    assert report["shape"].values[report["status"].values == "excluded"].tolist() == [
+        "nothing",
+        "out_of_range",
+    ]
 
 
 def test_two_shapes_have_no_modes_and_the_study_says_why(meshes):
@@ -265,7 +302,9 @@ def test_two_shapes_have_no_modes_and_the_study_says_why(meshes):
     assert "pca" not in tree
     assert tree["report"].attrs["no_modes"] == "PCA needs at least 3 shapes, found 2"
     assert tree["registration"].sizes["shape"] == 2
-    with pytest.raises(ValueError, match="a study with modes is needed; this one has none: PCA needs at least 3"):
+    with pytest.raises(
+        ValueError, match="a study with modes is needed; this one has none: PCA needs at least 3"
+    ):
         synthesize(tree, [1.0])
 
 
@@ -286,14 +325,21 @@ def test_shapes_that_differ_in_pose_alone_do_not_differ(meshes):
         ("aab", ""),
     ],
 )
-def test_identical_shapes_give_finite_results_and_modes_only_beside_a_shape_that_differs(meshes, given, no_modes):
+def test_identical_shapes_give_finite_results_and_modes_only_beside_a_shape_that_differs(
+    meshes, given, no_modes
+):
     mesh = {"a": meshes["brain_01"], "b": meshes["brain_02"]}
     tree = analyse({f"s{i}": mesh[one] for i, one in enumerate(given)}, **OPTIONS)
     for node in tree.subtree:
         for name, data in node.to_dataset(inherit=False).data_vars.items():
-            if data.dtype.kind == "f" and (len(given) > 2 or "cycle" not in name):  # two shapes make no 3-cycle
+            if data.dtype.kind == "f" and (
+                len(given) > 2 or "cycle" not in name
+            ):  # two shapes make no 3-cycle
                 assert np.isfinite(data).all(), f"{node.path} {name}"
-    assert np.abs(tree["registration"]["displacement"].sel(shape=["s0", "s1"]).diff("shape")).max() < 1e-3
+    assert (
+        np.abs(tree["registration"]["displacement"].sel(shape=["s0", "s1"]).diff("shape")).max()
+        < 1e-3
+    )
     assert tree["report"].attrs["no_modes"] == no_modes
     assert ("pca" in tree) == (not no_modes)
     assert "the median is not unique" in tree["report"].attrs["remarks"]
@@ -316,7 +362,10 @@ def test_one_usable_shape_is_not_enough_and_the_reasons_are_named(meshes):
         ({"norm": "l2"}, r"norm must be one of 'h2', 'h1', 'frobenius'"),
         ({"preset": "best"}, r"preset must be one of None, 'paper'"),
         ({"n_coarse": 99}, r"n_coarse must be an integer of at least 100; found 99"),
-        ({"n_pairs": 2}, r"n_pairs = 2 cannot connect 4 shapes: give an integer from 3 \(a tree\) to 6 \(all pairs\)"),
+        (
+            {"n_pairs": 2},
+            r"n_pairs = 2 cannot connect 4 shapes: give an integer from 3 \(a tree\) to 6 \(all pairs\)",
+        ),
         ({"k_init": 3}, r"k_init must be an integer of at least 4; found 3"),
         ({"k": 11}, r"k must be at least k_init = 12; found 11"),
         ({"k": 30.0}, r"k must be an integer of at least 4; found 30.0"),
@@ -326,11 +375,23 @@ def test_one_usable_shape_is_not_enough_and_the_reasons_are_named(meshes):
         ({"n_latent": 1}, r"n_latent must be an integer of at least 2; found 1"),
         ({"strict": "no"}, r"strict must be True or False; found 'no'"),
         ({"scale": 1}, r"scale must be True or False; found 1"),
-        ({"components": "foo"}, r'components needs to be "largest", "all" or a number from 1; found \'foo\''),
-        ({"components": True}, r'components needs to be "largest", "all" or a number from 1; found True'),
+        (
+            {"components": "foo"},
+            r'components needs to be "largest", "all" or a number from 1; found \'foo\'',
+        ),
+        (
+            {"components": True},
+            r'components needs to be "largest", "all" or a number from 1; found True',
+        ),
         ({"pattern": 3}, r"pattern must be a text or None; found 3"),
-        ({"preset": "paper", "refine": "joint"}, r"preset 'paper' sets refine='intrinsic'; found refine='joint'"),
-        ({"preset": "paper", "how": "standard"}, r"preset 'paper' sets how='ours'; found how='standard'"),
+        (
+            {"preset": "paper", "refine": "joint"},
+            r"preset 'paper' sets refine='intrinsic'; found refine='joint'",
+        ),
+        (
+            {"preset": "paper", "how": "standard"},
+            r"preset 'paper' sets how='ours'; found how='standard'",
+        ),
         ({"seed": -1}, r"seed must be an integer of at least 0; found -1"),
     ],
 )
@@ -366,7 +427,7 @@ def test_numpy_integers_are_integers(meshes, tmp_path):
 
 
 def test_a_second_run_in_the_same_folder_is_refused(brains, folder):
-    with study.lock(folder), pytest.raises(ValueError, match="another run"):
+    with store.lock(folder), pytest.raises(ValueError, match="another run"):
         analyse(brains, store=folder, **OPTIONS)
 
 
@@ -375,7 +436,10 @@ def test_the_registered_surface_is_four_times_nearer_to_the_truth_than_nearest_n
     truth = tree["truth"]
     found = analyse(tree, n_coarse=3000, n_jobs=1)
     errors = accuracy.accuracy(
-        found, lambda shape, template: synthetic.position(truth, shape, truth[template]["reference_point"].values)
+        found,
+        lambda shape, template: synthetic.position(
+            truth, shape, truth[template]["reference_point"].values
+        ),
     )["error"]
     methods = (accuracy.SURFACE, accuracy.MATCH, accuracy.ZOOMOUT, accuracy.ICP)
     surface, matched, zoomout, icp = (errors.sel(way=m).values for m in methods)

@@ -1,19 +1,26 @@
-"""Shapes in far poses: parts that turn on their own, first maps that no pose changes, and who pays for them."""
+"""Shapes in far poses: parts that turn on their own, first maps that no pose changes.
+
+And who pays for them.
+"""
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from s4a import analyse, deform, insert, joint, match_pair, poses, synthetic
-from s4a.mesh import as_arrays, as_dataset, vertex_areas
-from s4a.register import Scan
-from s4a.remesh import coarsen
-from s4a.spectral import spectrum
+from s4a import analyse, insert, match_pair, synthetic
+from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
+from s4a.method import deform, first_map, joint
+from s4a.method.register import Scan
+from s4a.method.remesh import coarsen
+from s4a.method.spectral import spectrum
 
 
 def worm(n, bend):
-    """A tapering tube of length 8 with a knob at one side, bent by an angle of 8 `bend`: vertex i is vertex i."""
+    """A tapering tube of length 8 with a knob at one side, bent by an angle of 8 `bend`.
+
+    Vertex i is vertex i.
+    """
     mesh = synthetic.sphere(n)
     u = as_arrays(mesh)[0]
     s, (y, z) = 4 * u[:, 0], 0.4 * (1 + 0.3 * u[:, 0]) * u[:, 1:].T
@@ -27,7 +34,9 @@ def worm(n, bend):
 def error(found, source):
     """Mean distance to the true vertex, as a share of sqrt(area)."""
     X, T = as_arrays(source)
-    return np.linalg.norm(X[found["match"].values] - X, axis=1).mean() / np.sqrt(vertex_areas(X, T).sum())
+    return np.linalg.norm(X[found["match"].values] - X, axis=1).mean() / np.sqrt(
+        vertex_areas(X, T).sum()
+    )
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +74,9 @@ def test_parts_follow_a_bend_that_displacements_alone_cannot(scans):
     few = straight.Phi[:, :20]
 
     def gap(spectrum):
-        R, t, c = deform.onto(straight.X, X, straight.area, lambda d: few.T @ (straight.area[:, None] * d), spectrum)
+        R, t, c = deform.onto(
+            straight.X, X, straight.area, lambda d: few.T @ (straight.area[:, None] * d), spectrum
+        )
         return np.linalg.norm(joint.registered(straight, (R, t, c)) - X, axis=1).mean()
 
     assert gap((few, straight.eigenvalue[:20])) < 0.25 * gap(None)
@@ -73,7 +84,9 @@ def test_parts_follow_a_bend_that_displacements_alone_cannot(scans):
 
 def test_the_parts_of_the_full_resolution_are_those_of_its_coarse_vertices(scans):
     low, dense = scans[0].low, scans[0].dense
-    R, t = deform.rigid_parts(low.X, 2 * low.X[:, [1, 0, 2]] * [1, -1, 1], low.area, low.Phi, low.eigenvalue)
+    R, t = deform.rigid_parts(
+        low.X, 2 * low.X[:, [1, 0, 2]] * [1, -1, 1], low.area, low.Phi, low.eigenvalue
+    )
     at = scans[0].coarse["sample_vertex"].values
     assert joint.turned(dense, R, t)[at] == pytest.approx(joint.turned(low, R, t), abs=1e-6)
 
@@ -85,7 +98,7 @@ def test_shapes_in_one_pose_pay_nothing_and_keep_their_first_map(monkeypatch):
     def refuse(*_):
         raise AssertionError
 
-    monkeypatch.setattr(poses, "best_first_map", refuse)
+    monkeypatch.setattr(first_map, "best_first_map", refuse)
     assert match_pair(source, target, n_coarse=600, k=40).attrs["first_map"] == "dense"
 
 
@@ -97,7 +110,7 @@ def test_poses_are_far_apart_only_where_no_rigid_motion_brings_the_shapes_togeth
 
 def test_of_first_maps_the_one_that_fits_is_taken(scans):
     low = scans[0].low
-    name, C = poses.best_first_map(low, low, np.diag((-1.0) ** np.arange(20)))
+    name, C = first_map.best_first_map(low, low, np.diag((-1.0) ** np.arange(20)))
     assert name in ("hks", "wks")
     assert np.diag(C).min() > 0.9
 
@@ -107,29 +120,43 @@ def test_the_network_of_an_analysis_starts_from_maps_that_no_pose_changes(bent):
     study = analyse({"a": straight, "b": other}, n_coarse=1000, k=50, n_pairs=1, template="b")
     X = straight["position"].values
     match = study["registration"]["registered_match"].sel(shape="a").values
-    assert np.linalg.norm(X[match] - X, axis=1).mean() / np.sqrt(vertex_areas(*as_arrays(straight)).sum()) < 0.005
+    assert (
+        np.linalg.norm(X[match] - X, axis=1).mean()
+        / np.sqrt(vertex_areas(*as_arrays(straight)).sum())
+        < 0.005
+    )
 
 
 def test_a_new_shape_in_another_pose_finds_its_place_in_a_study(bent):
     straight, other = bent
-    study = analyse({"a": straight, "b": worm(2500, -0.1)}, n_coarse=1000, k=50, n_pairs=1, template="a")
+    study = analyse(
+        {"a": straight, "b": worm(2500, -0.1)}, n_coarse=1000, k=50, n_pairs=1, template="a"
+    )
     found = insert(study, {"new": other})["registration"]
     X = straight["position"].values
     match = found["registered_match"].sel(shape="new").values
-    assert np.linalg.norm(X[match] - X, axis=1).mean() / np.sqrt(vertex_areas(*as_arrays(straight)).sum()) < 0.005
+    assert (
+        np.linalg.norm(X[match] - X, axis=1).mean()
+        / np.sqrt(vertex_areas(*as_arrays(straight)).sum())
+        < 0.005
+    )
 
 
 def spheres(places, size, n=30):
     X, T = as_arrays(synthetic.sphere(n))
     return as_dataset(
-        np.concatenate([size * X + x for x in places]), np.concatenate([T + i * n for i in range(len(places))])
+        np.concatenate([size * X + x for x in places]),
+        np.concatenate([T + i * n for i in range(len(places))]),
     )
 
 
 @pytest.mark.parametrize("k", [20, 30])
 def test_of_more_pieces_than_functions_the_first_map_is_that_of_nearest_neighbours(k):
     i = np.arange(25)
-    source, target = spheres(np.c_[3 * i, 0 * i, 0 * i], 1), spheres(np.c_[0 * i, i**2 / 2, i % 3], [4, 1, 0.7])
+    source, target = (
+        spheres(np.c_[3 * i, 0 * i, 0 * i], 1),
+        spheres(np.c_[0 * i, i**2 / 2, i % 3], [4, 1, 0.7]),
+    )
     found = match_pair(source, target, n_coarse=750, k=k)
     assert found.attrs["first_map"] == "dense"
     assert np.isfinite(found["displacement"]).all()
@@ -140,5 +167,7 @@ def test_pieces_of_one_function_each_move_as_a_whole():
     X = np.concatenate([as_arrays(low)[0], as_arrays(low)[0] + 5])
     R = np.stack([Rotation.from_rotvec(v).as_matrix() for v in ([0.3, 0, 0], [0, 0.5, 1])])[apart]
     Phi = np.sqrt(2) * (apart[:, None] == [0, 1])
-    found, _ = deform.rigid_parts(X, np.einsum("nij,nj->ni", R, X), np.full(60, 1 / 60), Phi, np.zeros(2))
+    found, _ = deform.rigid_parts(
+        X, np.einsum("nij,nj->ni", R, X), np.full(60, 1 / 60), Phi, np.zeros(2)
+    )
     assert found == pytest.approx(R, abs=1e-6)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from s4a import analyse, clean, coarsen, match_pair, spectrum, synthetic
-from s4a.mesh import as_arrays, as_dataset, vertex_areas
+from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 
 SEED = st.integers(0, 2**32 - 1)
 UNIT = st.sampled_from([1e-3, 1e-2, 1.0, 25.4, 1e3])
@@ -15,13 +15,18 @@ ANGLE = st.floats(-3.0, 3.0)
 SHIFT = st.floats(-300.0, 300.0)
 PLACE = st.tuples(SHIFT, SHIFT, SHIFT)
 MOTION = st.tuples(st.tuples(ANGLE, ANGLE, ANGLE), PLACE)
-TURNED = st.tuples(st.tuples(*3 * [st.floats(-0.4, 0.4)]), PLACE)  # two by 40 degrees: from 90 on the pose counts
+TURNED = st.tuples(
+    st.tuples(*3 * [st.floats(-0.4, 0.4)]), PLACE
+)  # two by 40 degrees: from 90 on the pose counts
 
 
 def few(n):
     """Settings for n examples, the same every time."""
     checks = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
-    how = {"phases": [Phase.generate], "suppress_health_check": checks}  # to shrink an example takes minutes
+    how = {
+        "phases": [Phase.generate],
+        "suppress_health_check": checks,
+    }  # to shrink an example takes minutes
     return settings(max_examples=n, derandomize=True, database=None, deadline=None, **how)
 
 
@@ -31,17 +36,27 @@ def moved(X, motion, unit=1.0):
 
 
 def renumbered(X, T, seed):
-    """The surface with vertices, triangles and corners in another order, and the old number of each vertex."""
+    """The surface with vertices, triangles and corners in another order.
+
+    And the old number of each vertex.
+    """
     rng = np.random.default_rng(seed)
     order = rng.permutation(len(X))
     corners = np.argsort(order)[T][rng.permutation(len(T))]
-    return X[order], np.take_along_axis(corners, (rng.integers(0, 3, (len(T), 1)) + np.arange(3)) % 3, 1), order
+    return (
+        X[order],
+        np.take_along_axis(corners, (rng.integers(0, 3, (len(T), 1)) + np.arange(3)) % 3, 1),
+        order,
+    )
 
 
 @pytest.fixture(scope="module")
 def brains():
     """Three shapes as (points, triangles)."""
-    return {name: as_arrays(mesh) for name, mesh in synthetic.brains(3, 700, seed=2)["original"].children.items()}
+    return {
+        name: as_arrays(mesh)
+        for name, mesh in synthetic.brains(3, 700, seed=2)["original"].children.items()
+    }
 
 
 def size_of(X, T):
@@ -52,13 +67,28 @@ def size_of(X, T):
 @few(10)
 def test_cleaning_a_dirty_surface(brains, motion, unit, seed):
     X, T = next(iter(brains.values()))
-    X = np.vstack([X, X[:40], X[0] + [[500, 0, 0], [501, 0, 0], [500, 1, 0]], X[:3]])  # copies, debris, loose ones
-    T = np.vstack([np.where(T[:700] < 40, T[:700] + 700, T[:700]), T[700:, [1, 0, 2]], T[:9], [[740, 741, 742]]])
+    X = np.vstack(
+        [X, X[:40], X[0] + [[500, 0, 0], [501, 0, 0], [500, 1, 0]], X[:3]]
+    )  # copies, debris, loose ones
+    T = np.vstack(
+        [
+            np.where(T[:700] < 40, T[:700] + 700, T[:700]),
+            T[700:, [1, 0, 2]],
+            T[:9],
+            [[740, 741, 742]],
+        ]
+    )
     one = clean(as_dataset(X, T))
     Y, S, _ = renumbered(moved(X, motion, unit), T, seed)
     other = clean(as_dataset(Y, S))
     counts = [key for key, value in one.attrs.items() if isinstance(value, int | np.integer)]
-    assert min(one.attrs[key] for key in ("welded_vertices", "duplicate_triangles", "dropped_components")) > 0
+    assert (
+        min(
+            one.attrs[key]
+            for key in ("welded_vertices", "duplicate_triangles", "dropped_components")
+        )
+        > 0
+    )
     # to turn most of the faces, or the few others, depends on which the file has first; all else is the same
     for key in set(counts) - {"reoriented_triangles"}:
         assert other.attrs[key] == one.attrs[key], key
@@ -127,11 +157,17 @@ def test_the_study_of_a_collection(collection, motions, unit, seed, order):
     for variable in ("distance_to_median", "latent_eigenvalue"):
         np.testing.assert_allclose(other["latent"][variable], one["latent"][variable], **close)
     found, wanted = other["pca"].to_dataset(), one["pca"].to_dataset()
-    np.testing.assert_allclose(found["standard_deviation"] / unit, wanted["standard_deviation"], **close)
-    np.testing.assert_allclose(found["explained_variance_ratio"], wanted["explained_variance_ratio"], **close)
+    np.testing.assert_allclose(
+        found["standard_deviation"] / unit, wanted["standard_deviation"], **close
+    )
+    np.testing.assert_allclose(
+        found["explained_variance_ratio"], wanted["explained_variance_ratio"], **close
+    )
     sign = np.sign((found["score"] * wanted["score"]).sum("shape"))
     np.testing.assert_allclose(found["score"] * sign, wanted["score"], rtol=0, atol=1e-4)
     d, e = (tree["registration"]["displacement"].values for tree in (one, other))
-    d = Rotation.from_rotvec(motions[names.index(template)][0]).apply(d[:, old_vertex[template]].reshape(-1, 3))
+    d = Rotation.from_rotvec(motions[names.index(template)][0]).apply(
+        d[:, old_vertex[template]].reshape(-1, 3)
+    )
     gap = np.linalg.norm(e / unit - d.reshape(e.shape), axis=2)
     assert gap.max() < 1e-4 * size_of(*shapes[template])

@@ -1,19 +1,27 @@
-"""Registration at full resolution (eq. 4, 6, 7): itself, a planted deformation, invariance, the way back."""
+"""Registration at full resolution (eq. 4, 6, 7).
+
+Itself, a planted deformation, invariance, the way back.
+"""
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from s4a import clean, coarsen, match_pair, register, spectrum, synthetic
-from s4a.deform import displacement_in_template
-from s4a.mesh import as_arrays, as_dataset, vertex_areas
+from s4a import clean, coarsen, match_pair, spectrum, synthetic
+from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
+from s4a.method import register
+from s4a.method.deform import displacement_in_template
 
 OPTIONS = {"n_coarse": 2000, "k": 60}
 
 
 def bumps(X, size):
-    return 0.015 * size * np.stack([np.sin(6 * X[:, 1]), np.sin(5 * X[:, 2] + 1), np.cos(6 * X[:, 0])], axis=1)
+    return (
+        0.015
+        * size
+        * np.stack([np.sin(6 * X[:, 1]), np.sin(5 * X[:, 2] + 1), np.cos(6 * X[:, 0])], axis=1)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +115,9 @@ def test_the_result_does_not_depend_on_the_numbering_of_the_source(pair, templat
     assert (vertex == pair["match"].values).mean() > 0.7
 
 
-def test_the_displacement_does_not_depend_on_the_numbering_of_the_template(template, deformed, true_displacement, size):
+def test_the_displacement_does_not_depend_on_the_numbering_of_the_template(
+    template, deformed, true_displacement, size
+):
     X, T = as_arrays(template)
     order = np.random.default_rng(1).permutation(len(X))
     found = match_pair(deformed, as_dataset(X[order], np.argsort(order)[T]), **OPTIONS)
@@ -116,7 +126,11 @@ def test_the_displacement_does_not_depend_on_the_numbering_of_the_template(templ
 
 def test_a_thousandfold_unit_gives_a_thousandfold_displacement(pair, template, deformed, size):
     found = match_pair(
-        *(as_dataset(1000 * m["position"].values, m["corner_vertex"]) for m in (deformed, template)), **OPTIONS
+        *(
+            as_dataset(1000 * m["position"].values, m["corner_vertex"])
+            for m in (deformed, template)
+        ),
+        **OPTIONS,
     )
     found["displacement"] /= 1000
     assert apart(found, pair["displacement"].values, size) < 0.002
@@ -129,7 +143,9 @@ def test_the_same_call_gives_the_same_bits(pair, template, deformed):
 
 @pytest.fixture(scope="module")
 def scans(template, deformed):
-    return [register.Scan(m, spectrum(coarsen(m, n_coarse=800), k=30)) for m in (deformed, template)]
+    return [
+        register.Scan(m, spectrum(coarsen(m, n_coarse=800), k=30)) for m in (deformed, template)
+    ]
 
 
 def test_the_way_back_reproduces_the_positions(scans):
@@ -178,7 +194,9 @@ def test_size_can_be_taken_out_of_the_displacement(scans):
     assert without["scale"].item() == pytest.approx(1 / 1.2, rel=1e-3)
     radius = np.linalg.norm(X - X.mean(0), axis=1).mean()
     assert np.linalg.norm(without["displacement"].values, axis=1).mean() < 0.005 * radius
-    assert np.linalg.norm(with_size["displacement"].values, axis=1).mean() == pytest.approx(0.2 * radius, rel=0.03)
+    assert np.linalg.norm(with_size["displacement"].values, axis=1).mean() == pytest.approx(
+        0.2 * radius, rel=0.03
+    )
 
 
 @pytest.mark.parametrize(
@@ -199,7 +217,9 @@ def test_more_functions_than_a_mesh_has_are_reduced_and_it_is_said():
     meshes = synthetic.brains(2, 40)["original"]
     found = match_pair(*(meshes[n].to_dataset() for n in meshes), k=60, k_init=10, n_coarse=100)
     assert found["fmap"].shape == (38, 38)
-    assert found.attrs["note"] == "k = 60 reduced to 38, the eigenfunctions that the smaller mesh has"
+    assert (
+        found.attrs["note"] == "k = 60 reduced to 38, the eigenfunctions that the smaller mesh has"
+    )
 
 
 def test_a_mesh_without_triangles_is_refused_by_name(template):
@@ -222,7 +242,9 @@ def test_the_match_of_eq_6_is_kept_at_low_resolution_as_it_is(pair, deformed, te
     low = pair["displacement_low"].values
     assert low.shape[1] == 3
     assert low.shape[0] < 2500
-    template_low, shape_low = (coarsen(m, n_coarse=2000)["position"].values for m in (template, deformed))
+    template_low, shape_low = (
+        coarsen(m, n_coarse=2000)["position"].values for m in (template, deformed)
+    )
     R, t = pair["rotation"].values, pair["translation"].values
     gap = cKDTree(shape_low @ R.T + t).query(template_low + low)[0]
     assert gap.max() < 1e-4 * size  # every one is at a vertex of the coarse shape

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 from scipy.sparse.csgraph import connected_components
 
-from s4a.clean import clean
-from s4a.mesh import (
+from s4a.geometry.mesh import (
     as_arrays,
     as_dataset,
     edge_graph,
@@ -14,15 +13,19 @@ from s4a.mesh import (
     unique_edges,
     vertex_areas,
 )
-from s4a.remesh import coarsen
-from s4a.spectral import spectrum
-from s4a.voronoi import faults
+from s4a.geometry.voronoi import faults
+from s4a.input.clean import clean
+from s4a.method.remesh import coarsen
+from s4a.method.spectral import spectrum
 
 DATA = Path(__file__).parents[2] / "shared/data"
 
 
 def grid(nx, ny, wrap=(False, False)):
-    """Triangles of a grid whose vertex (i, j) is i * ny + j, glued along its sides where wrapped."""
+    """Triangles of a grid whose vertex (i, j) is i * ny + j.
+
+    Glued along its sides where wrapped.
+    """
     i, j = np.meshgrid(np.arange(nx - (not wrap[0])), np.arange(ny - (not wrap[1])), indexing="ij")
     a, b = (i * ny + j).ravel(), ((i + 1) % nx * ny + j).ravel()
     c, d = ((i + 1) % nx * ny + (j + 1) % ny).ravel(), (i * ny + (j + 1) % ny).ravel()
@@ -41,7 +44,9 @@ def plane(n=60):
 
 def sphere(subdivisions=4):
     X = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
-    T = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
+    T = np.array(
+        [[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]]
+    )
     X, T = igl.upsample(X, T, subdivisions)
     return X / np.linalg.norm(X, axis=1, keepdims=True), T
 
@@ -50,11 +55,15 @@ def bumpy(subdivisions=5):
     """A sphere with bumps of no symmetry."""
     X, T = sphere(subdivisions)
     x, y, z = X.T
-    return X * (1 + 0.2 * np.sin(3 * x + 1) * np.cos(4 * y + z) + 0.1 * np.sin(5 * z + 2 * x * y))[:, None], T
+    return X * (1 + 0.2 * np.sin(3 * x + 1) * np.cos(4 * y + z) + 0.1 * np.sin(5 * z + 2 * x * y))[
+        :, None
+    ], T
 
 
 def torus(nu=150, nv=50):
-    u, v = np.meshgrid(np.arange(nu) * 2 * np.pi / nu, np.arange(nv) * 2 * np.pi / nv, indexing="ij")
+    u, v = np.meshgrid(
+        np.arange(nu) * 2 * np.pi / nu, np.arange(nv) * 2 * np.pi / nv, indexing="ij"
+    )
     r = 1 + 0.35 * np.cos(v)
     X = np.stack([r * np.cos(u), r * np.sin(u), 0.35 * np.sin(v)], axis=-1).reshape(-1, 3)
     return X, grid(nu, nv, (True, True))
@@ -91,7 +100,9 @@ def assert_manifold(coarse, pieces=1, euler=None):
     assert (np.unique(T) == np.arange(len(X))).all()
     assert len(np.unique(np.sort(T, axis=1), axis=0)) == len(T)
     half = np.concatenate([T[:, [0, 1]], T[:, [1, 2]], T[:, [2, 0]]])
-    assert len(np.unique(half, axis=0)) == len(half), "two triangles run through an edge the same way"
+    assert len(np.unique(half, axis=0)) == len(half), (
+        "two triangles run through an edge the same way"
+    )
     fans = {}  # around every vertex, corners that share an edge are linked: one fan each
     for t, row in enumerate(T):
         for k in range(3):
@@ -110,14 +121,25 @@ def assert_manifold(coarse, pieces=1, euler=None):
 
 
 def apply_u(coarse, f):
-    return np.einsum("ij,ij...->i...", coarse["coarse_weight"].values, f[coarse["coarse_vertex"].values])
+    return np.einsum(
+        "ij,ij...->i...", coarse["coarse_weight"].values, f[coarse["coarse_vertex"].values]
+    )
 
 
 @pytest.mark.parametrize(
     "surface, n_coarse, euler",
-    [(sphere, 300, 2), (bumpy, 800, 2), (torus, 300, 0), (torus, 60, 0), (double_torus, 800, -2), (plane, 300, 1)],
+    [
+        (sphere, 300, 2),
+        (bumpy, 800, 2),
+        (torus, 300, 0),
+        (torus, 60, 0),
+        (double_torus, 800, -2),
+        (plane, 300, 1),
+    ],
 )
-def test_the_coarse_mesh_is_a_manifold_of_the_same_topology_near_the_size_asked_for(surface, n_coarse, euler):
+def test_the_coarse_mesh_is_a_manifold_of_the_same_topology_near_the_size_asked_for(
+    surface, n_coarse, euler
+):
     coarse = coarsen(as_dataset(*surface()), n_coarse=n_coarse)
     assert coarse.attrs["euler_characteristic_original"] == euler
     assert_manifold(coarse, euler=euler)
@@ -131,7 +153,9 @@ def test_rows_of_u_are_convex_weights_and_samples_carry_themselves(surface):
     weight, sample = coarse["coarse_weight"].values, coarse["sample_vertex"].values
     assert weight.min() >= 0
     np.testing.assert_allclose(weight.sum(1), 1, atol=1e-12)
-    np.testing.assert_array_equal(apply_u(coarse, np.arange(len(sample)))[sample], np.arange(len(sample)))
+    np.testing.assert_array_equal(
+        apply_u(coarse, np.arange(len(sample)))[sample], np.arange(len(sample))
+    )
     np.testing.assert_array_equal(coarse["position"], X[sample])
     np.testing.assert_allclose(coarse["vertex_area"].sum(), vertex_areas(X, T).sum(), rtol=1e-6)
 
@@ -152,7 +176,10 @@ def test_no_weight_crosses_a_thin_wall():
     coarse = coarsen(as_dataset(X, T), n_coarse=400)
     assert_manifold(coarse, euler=2)
     top, vertex = X[:, 2] > 0.002, coarse["coarse_vertex"].values
-    across = (coarse["coarse_weight"].values * (top[coarse["sample_vertex"].values][vertex] != top[:, None])).sum(1)
+    across = (
+        coarse["coarse_weight"].values
+        * (top[coarse["sample_vertex"].values][vertex] != top[:, None])
+    ).sum(1)
     inside = ((X[:, :2] > 0.12) & (X[:, :2] < 0.88)).all(1)
     assert inside.sum() > 5000
     assert across[inside].max() == 0
@@ -204,7 +231,9 @@ def test_a_thin_neck_is_never_cut_when_it_holds_the_surface_together():
 def test_every_component_gets_samples_by_its_area():
     (X, T), n = sphere(5), len(sphere(5)[0])
     parts = [X, 0.5 * X + [3, 0, 0], 0.01 * X + [0, 3, 0]]
-    coarse = coarsen(as_dataset(np.concatenate(parts), np.concatenate([T, T + n, T + 2 * n])), n_coarse=1000)
+    coarse = coarsen(
+        as_dataset(np.concatenate(parts), np.concatenate([T, T + n, T + 2 * n])), n_coarse=1000
+    )
     share = np.bincount(coarse["sample_vertex"].values // n)
     assert_manifold(coarse, pieces=3, euler=6)
     assert 3 < share[0] / share[1] < 5
@@ -225,7 +254,9 @@ def test_numbering_does_not_matter():
     rng = np.random.default_rng(0)
     order, shuffled = rng.permutation(len(X)), np.empty(len(X), int)
     shuffled[order] = np.arange(len(X))
-    U = np.take_along_axis(shuffled[T], (rng.integers(0, 3, (len(T), 1)) + np.arange(3)) % 3, axis=1)
+    U = np.take_along_axis(
+        shuffled[T], (rng.integers(0, 3, (len(T), 1)) + np.arange(3)) % 3, axis=1
+    )
     one = coarsen(as_dataset(X, T), n_coarse=500)
     other = coarsen(as_dataset(X[order], rng.permutation(U)), n_coarse=500)
     for name in ("position", "corner_vertex", "cotan_weight", "edge_vertex"):
@@ -241,7 +272,10 @@ def test_rigid_motion_and_scale_keep_the_samples():
     Q[:, 0] *= np.linalg.det(Q)
     one = coarsen(as_dataset(X, T), n_coarse=500)
     other = coarsen(as_dataset(3 * X @ Q.T + [10, -20, 30], T), n_coarse=500)
-    assert len(np.intersect1d(one["sample_vertex"], other["sample_vertex"])) >= 0.98 * one.sizes["vertex"]
+    assert (
+        len(np.intersect1d(one["sample_vertex"], other["sample_vertex"]))
+        >= 0.98 * one.sizes["vertex"]
+    )
     first, second = spectrum(one, k=20)["eigenvalue"], spectrum(other, k=20)["eigenvalue"]
     np.testing.assert_allclose(first, second, rtol=2e-3, atol=1e-6)
 
@@ -270,7 +304,9 @@ def test_a_mesh_that_is_small_enough_is_kept():
 
 def test_degenerate_coarse_triangles_go_through_the_robust_laplacian():
     X, T = voxels(np.ones((20, 20, 20), bool))
-    X[X[:, 2] == 20, :2] = np.round(X[X[:, 2] == 20, :2] / 20, 3) * 1e-9 + 10  # the lid is shrunk to nothing
+    X[X[:, 2] == 20, :2] = (
+        np.round(X[X[:, 2] == 20, :2] / 20, 3) * 1e-9 + 10
+    )  # the lid is shrunk to nothing
     coarse = coarsen(as_dataset(X, T), n_coarse=4000)
     assert coarse.attrs["laplacian"] == "robust"
     assert spectrum(coarse, k=5).attrs["zero_eigenvalues"] == 1
@@ -282,7 +318,12 @@ def test_degenerate_coarse_triangles_go_through_the_robust_laplacian():
         (np.eye(3), [[0, 1, 3]], {}, "existing vertices"),
         (np.full((3, 3), np.nan), [[0, 1, 2]], {}, "finite"),
         (np.eye(4, 3), [[0, 1, 2]], {}, "1 vertices without triangle"),
-        (np.random.default_rng(0).random((5, 3)), [[0, 1, 2], [0, 1, 3], [0, 1, 4]], {}, "1 edges of three"),
+        (
+            np.random.default_rng(0).random((5, 3)),
+            [[0, 1, 2], [0, 1, 3], [0, 1, 4]],
+            {},
+            "1 edges of three",
+        ),
         (np.eye(3), [[0, 1, 2]], {"n_coarse": 3}, "at least 4"),
     ],
 )

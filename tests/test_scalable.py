@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from s4a import fmap, synthetic
-from s4a.mesh import edge_graph, edges, path_lengths
-from s4a.nearest import nearest_in_cells
-from s4a.scalable import local_functions, local_space, reduce, spread
+from s4a import synthetic
+from s4a.geometry.mesh import edge_graph, edges, path_lengths
+from s4a.method import fmap
+from s4a.method.nearest import nearest_in_cells
+from s4a.method.scalable import local_functions, local_space, reduce, spread
 
 
 @pytest.fixture(scope="module")

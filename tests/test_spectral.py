@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from s4a import coarsen, reconstruct, spectral, spectrum, synthetic
-from s4a.mesh import cotan_weights, vertex_areas
+from s4a import coarsen, reconstruct, spectrum, synthetic
+from s4a.geometry.mesh import cotan_weights, vertex_areas
+from s4a.method import spectral
 from s4a.schema import dataset
 
 SPHERE = np.repeat([0.0, 2.0, 6.0, 12.0], [1, 3, 5, 7]) * 4 * np.pi  # l (l + 1), for unit area
@@ -13,7 +14,9 @@ SPHERE = np.repeat([0.0, 2.0, 6.0, 12.0], [1, 3, 5, 7]) * 4 * np.pi  # l (l + 1)
 def prepared(X, T):
     """A mesh as `spectrum` takes it, without coarsening."""
     E, w = cotan_weights(X, T)
-    return dataset(position=X, corner_vertex=T, vertex_area=vertex_areas(X, T), edge_vertex=E, cotan_weight=w)
+    return dataset(
+        position=X, corner_vertex=T, vertex_area=vertex_areas(X, T), edge_vertex=E, cotan_weight=w
+    )
 
 
 def arrays(mesh):
@@ -28,7 +31,9 @@ def ellipsoid():
 def test_the_spectrum_of_the_sphere_is_0_three_times_2_five_times_6_and_converges():
     worst = []
     for n in (300, 1200, 4800):
-        eigenvalue = spectrum(prepared(*arrays(synthetic.sphere(n, radius=3.0))), k=16)["eigenvalue"].values
+        eigenvalue = spectrum(prepared(*arrays(synthetic.sphere(n, radius=3.0))), k=16)[
+            "eigenvalue"
+        ].values
         assert eigenvalue[0] == 0
         worst.append(np.abs(eigenvalue[1:] / SPHERE[1:] - 1).max())
     assert worst[0] < 0.05
@@ -59,7 +64,9 @@ def test_the_spectrum_does_not_depend_on_unit_or_motion(ellipsoid):
     X, T = arrays(synthetic.ellipsoid(900))
     turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
     other = spectrum(prepared(1000 * X @ turn.T + 50, T), k=20)
-    assert other["eigenvalue"].values == pytest.approx(ellipsoid["eigenvalue"].values, rel=1e-8, abs=1e-8)
+    assert other["eigenvalue"].values == pytest.approx(
+        ellipsoid["eigenvalue"].values, rel=1e-8, abs=1e-8
+    )
 
 
 def test_the_same_mesh_gives_the_same_bits(ellipsoid):
@@ -67,7 +74,9 @@ def test_the_same_mesh_gives_the_same_bits(ellipsoid):
 
 
 def test_the_sign_of_an_eigenfunction_makes_its_third_moment_positive(ellipsoid):
-    mesh = spectrum(coarsen(synthetic.brains(1, 3000)["original/brain_01"].to_dataset(), n_coarse=500), k=15)
+    mesh = spectrum(
+        coarsen(synthetic.brains(1, 3000)["original/brain_01"].to_dataset(), n_coarse=500), k=15
+    )
     assert (spectral.unit_area(mesh) @ mesh["eigenfunction"].values[:, 1:] ** 3 > 0).all()
 
 
@@ -78,7 +87,9 @@ def test_renumbered_vertices_give_the_same_functions_on_a_shape_without_symmetry
     one = spectrum(prepared(X, T), k=15)
     two = spectrum(prepared(X[order], np.argsort(order)[T]), k=15)
     assert two["eigenvalue"].values == pytest.approx(one["eigenvalue"].values, abs=1e-7)
-    assert two["eigenfunction"].values == pytest.approx(one["eigenfunction"].values[order], abs=1e-6)
+    assert two["eigenfunction"].values == pytest.approx(
+        one["eigenfunction"].values[order], abs=1e-6
+    )
 
 
 def test_renumbered_vertices_give_the_same_eigenspaces_of_the_sphere():
@@ -87,7 +98,9 @@ def test_renumbered_vertices_give_the_same_eigenspaces_of_the_sphere():
     one = spectrum(prepared(X, T), k=9)["eigenfunction"].values[order]
     two = spectrum(prepared(X[order], np.argsort(order)[T]), k=9)["eigenfunction"].values
     for block in (slice(0, 1), slice(1, 4), slice(4, 9)):
-        assert np.abs(two[:, block] @ two[:, block].T - one[:, block] @ one[:, block].T).max() < 1e-5
+        assert (
+            np.abs(two[:, block] @ two[:, block].T - one[:, block] @ one[:, block].T).max() < 1e-5
+        )
 
 
 def test_functions_in_the_span_are_reconstructed_exactly(ellipsoid):

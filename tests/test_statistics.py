@@ -1,4 +1,7 @@
-"""Statistics (6.1): closed forms of a one-mode family, planted groups, and p values under no difference."""
+"""Statistics (6.1): closed forms of a one-mode family, planted groups.
+
+And p values under no difference.
+"""
 
 import numpy as np
 import pytest
@@ -8,11 +11,12 @@ from scipy import stats
 from scipy.integrate import quad
 from sklearn.svm import SVC
 
-from s4a import model, permutation, statistics, synthesize, synthetic, write_page
-from s4a.mesh import as_arrays, as_dataset, vertex_areas
-from s4a.pca import gram_pca, pca
-from s4a.picture import write_animation
+from s4a import statistics, synthesize, synthetic, write_page
+from s4a.analysis import model, permutation
+from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
+from s4a.method.pca import gram_pca, pca
 from s4a.schema import dataset
+from s4a.show.pictures import write_animation
 from s4a.widgets.modes import Modes
 
 SCORES = np.array([-1.9, -1.1, -0.6, -0.2, 0.1, 0.4, 0.9, 1.2, 1.2])
@@ -21,7 +25,11 @@ SCORES = np.array([-1.9, -1.1, -0.6, -0.2, 0.1, 0.4, 0.9, 1.2, 1.2])
 def study_of(X, T, d, **subjects):
     """A finished study of given displacements (s, n, 3) of a template."""
     names = [f"shape_{i:02d}" for i in range(len(d))]
-    mesh = as_dataset(X, T, {"template": "shape_00"}).merge(dataset(displacement=d)).assign_coords(shape=names)
+    mesh = (
+        as_dataset(X, T, {"template": "shape_00"})
+        .merge(dataset(displacement=d))
+        .assign_coords(shape=names)
+    )
     modes = pca(mesh, vertex_areas(X, T))
     table = xr.Dataset({n: ("shape", v) for n, v in subjects.items()}, {"shape": names})
     return xr.DataTree.from_dict({"registration": mesh, "pca": modes, "subjects": table})
@@ -33,18 +41,27 @@ def family():
     X, T = as_arrays(synthetic.ellipsoid(900))
     mode = X * [0, 0, 1]
     area = vertex_areas(X, T)
-    return study_of(X, T, SCORES[:, None, None] * mode), np.sqrt(area @ mode[:, 2] ** 2 / area.sum())
+    return study_of(X, T, SCORES[:, None, None] * mode), np.sqrt(
+        area @ mode[:, 2] ** 2 / area.sum()
+    )
 
 
 def smooth_noise(rng, u, s, size=0.1, waves=12):
     """Smooth random fields (s, n, 3) on points u of the unit sphere."""
     k, phase = rng.normal(0, 2.0, (waves, 3)), rng.uniform(0, 2 * np.pi, waves)
-    return size * np.einsum("swx,nw->snx", rng.normal(size=(s, waves, 3)), np.cos(u @ k.T + phase)) / np.sqrt(waves)
+    return (
+        size
+        * np.einsum("swx,nw->snx", rng.normal(size=(s, waves, 3)), np.cos(u @ k.T + phase))
+        / np.sqrt(waves)
+    )
 
 
 @pytest.fixture(scope="module")
 def planted():
-    """30 spheres with noise; in every other one a patch is pushed out.  Study, groups, patch, age."""
+    """30 spheres with noise.
+
+    In every other one a patch is pushed out.  Study, groups, patch, age.
+    """
     rng = np.random.default_rng(3)
     u, T = as_arrays(synthetic.sphere(1200))
     group = np.tile(["control", "patient"], 15)
@@ -63,13 +80,21 @@ def test_a_one_mode_family_has_the_closed_form_of_every_measure(family):
     found = statistics.evaluate(study, n_samples=4000, n_points=200, n_surface=50)
     assert found.sizes["component"] == 1
     assert found["compactness"].values == pytest.approx(SCORES.var(ddof=1) * rms**2)
-    assert found["compactness_error"].values == pytest.approx(np.sqrt(2 / 9) * SCORES.var(ddof=1) * rms**2)
+    assert found["compactness_error"].values == pytest.approx(
+        np.sqrt(2 / 9) * SCORES.var(ddof=1) * rms**2
+    )
     others = (SCORES.sum() - SCORES) / 8
     assert found.attrs["generalization_0"] == pytest.approx(np.abs(SCORES - others).mean() * rms)
-    assert found["generalization"].values == pytest.approx(0, abs=1e-6)  # one mode describes each left-out shape
+    assert found["generalization"].values == pytest.approx(
+        0, abs=1e-6
+    )  # one mode describes each left-out shape
     mean, deviation = SCORES.mean(), SCORES.std(ddof=1)
     nearest = quad(
-        lambda x: np.abs(x - SCORES).min() * stats.norm.pdf(x, mean, deviation), -8, 8, limit=400, points=SCORES
+        lambda x: np.abs(x - SCORES).min() * stats.norm.pdf(x, mean, deviation),
+        -8,
+        8,
+        limit=400,
+        points=SCORES,
     )[0]
     error = found["specificity_error"].item()
     assert abs(found["specificity"].item() - nearest * rms) < 4 * error
@@ -124,7 +149,9 @@ def test_only_components_above_chance_explain_more_than_permuted_coefficients():
 
 
 def test_the_evaluation_of_many_modes_is_ordered(planted):
-    found = statistics.evaluate(planted[0], n_samples=200, n_permutations=20, n_points=100, n_surface=5)
+    found = statistics.evaluate(
+        planted[0], n_samples=200, n_permutations=20, n_points=100, n_surface=5
+    )
     assert (np.diff(found["compactness"]) > 0).all()
     left = found["generalization"].values
     assert np.isnan(left[-1])
@@ -141,7 +168,10 @@ def test_samples_have_the_drawn_scores(planted):
     drawn = statistics.sample(planted[0], 4, n_components=3, seed=1)
     assert drawn["score"].shape == (4, 3)
     assert set(drawn.children) == {f"sample_{i}" for i in range(1, 5)}
-    template = planted[0]["registration"]["position"].values + planted[0]["pca"]["mean_displacement"].values
+    template = (
+        planted[0]["registration"]["position"].values
+        + planted[0]["pca"]["mean_displacement"].values
+    )
     moved = np.tensordot(drawn["score"].values[0], planted[0]["pca"]["deformation"].values[:3], 1)
     assert drawn["sample_1"]["position"].values == pytest.approx(template + moved, abs=1e-6)
     with pytest.raises(ValueError, match="a number from 1 to 29, found 30"):
@@ -177,12 +207,16 @@ def test_groups_without_a_difference_are_not_found(planted):
 
 def test_a_continuous_variable_is_found_with_its_slope_and_its_shapes_move(planted):
     study, group, _, age = planted
-    found = statistics.regression(study, "age", covariates={"group": (group == "patient").astype(float)})
+    found = statistics.regression(
+        study, "age", covariates={"group": (group == "patient").astype(float)}
+    )
     assert found["p_value"].item() == 0.001
     u = study["registration"]["position"].values
     slope = found["effect"].values
     planted_slope = 0.3 / 60 * u * [1, 0, 0]
-    assert np.vdot(slope, planted_slope) / np.linalg.norm(slope) / np.linalg.norm(planted_slope) > 0.8
+    assert (
+        np.vdot(slope, planted_slope) / np.linalg.norm(slope) / np.linalg.norm(planted_slope) > 0.8
+    )
     old, young = (statistics.predict(study, found, a)["position"].values for a in (80, 20))
     assert np.ptp(old[:, 0]) > np.ptp(young[:, 0]) + 0.3
     assert statistics.predict(study, found, age.mean())["position"].values == pytest.approx(
@@ -199,7 +233,9 @@ def test_p_values_are_uniform_without_a_difference(with_covariates):
         Z = rng.normal(size=(18, 2)) + x[:, None] if with_covariates else None
         scores = rng.standard_t(5, size=(18, 4)) @ rng.normal(size=(4, 4))
         scores += 0 if Z is None else 2 * Z[:, :1]
-        p.append(permutation.permutation_test(scores, x, covariates=Z, n_permutations=99, seed=seed)[1])
+        p.append(
+            permutation.permutation_test(scores, x, covariates=Z, n_permutations=99, seed=seed)[1]
+        )
     assert stats.kstest(p, "uniform").pvalue > 0.05
     assert np.mean(np.array(p) <= 0.05) <= 0.11
 
@@ -207,7 +243,9 @@ def test_p_values_are_uniform_without_a_difference(with_covariates):
 def test_family_wise_p_values_keep_their_level():
     x = np.repeat([0.0, 1.0], 9)
     found = [
-        permutation.vertex_test(np.random.default_rng(seed).normal(size=(18, 60, 3)), x, n_permutations=99, seed=seed)
+        permutation.vertex_test(
+            np.random.default_rng(seed).normal(size=(18, 60, 3)), x, n_permutations=99, seed=seed
+        )
         for seed in range(100)
     ]
     smallest = np.array([p_max.min() for _, _, p_max in found])
@@ -223,13 +261,17 @@ def test_the_statistics_are_those_of_the_textbook():
         a, b = d[:6, v], d[6:, v]
         S = (np.cov(a.T, bias=True) * 6 + np.cov(b.T, bias=True) * 8) / 12
         gap = b.mean(0) - a.mean(0)
-        assert 12 * share[v] / (1 - share[v]) == pytest.approx(6 * 8 / 14 * gap @ np.linalg.solve(S, gap), rel=1e-4)
+        assert 12 * share[v] / (1 - share[v]) == pytest.approx(
+            6 * 8 / 14 * gap @ np.linalg.solve(S, gap), rel=1e-4
+        )
     one, _, _ = permutation.vertex_test(d[..., :1], x, n_permutations=0)
     t = stats.ttest_ind(d[:6, :, 0], d[6:, :, 0]).statistic
     assert 12 * one / (1 - one) == pytest.approx(t**2, rel=1e-4)
     three = np.repeat(["a", "b", "c"], [4, 5, 5])
     F = stats.f_oneway(*(d[three == g, :, 0] for g in "abc")).statistic
-    share, _, _ = permutation.vertex_test(d[..., :1], permutation.indicators(three)[1], n_permutations=0)
+    share, _, _ = permutation.vertex_test(
+        d[..., :1], permutation.indicators(three)[1], n_permutations=0
+    )
     assert 11 / 2 * share / (1 - share) == pytest.approx(F, rel=1e-4)
 
 
@@ -262,7 +304,9 @@ def test_a_strange_shape_and_a_far_one_are_outliers_and_the_others_are_not():
     rng = np.random.default_rng(7)
     u, T = as_arrays(synthetic.sphere(400))
     modes = smooth_noise(rng, u, 2)
-    d = np.einsum("sc,cnx->snx", rng.normal(size=(24, 2)), modes) + smooth_noise(rng, u, 24, size=0.005)
+    d = np.einsum("sc,cnx->snx", rng.normal(size=(24, 2)), modes) + smooth_noise(
+        rng, u, 24, size=0.005
+    )
     d[5] += smooth_noise(rng, u, 1, size=0.05)[0]  # not like the others
     d[9] = 6 * modes[0]  # like them, but far away
     found = statistics.outliers(study_of(u, T, d), n_components=2)
@@ -280,7 +324,8 @@ def test_distances_of_a_normal_population_have_uniform_p_values():
     p = np.concatenate(
         [
             statistics.outliers(
-                study_of(u, T, np.einsum("sc,cnx->snx", rng.normal(size=(15, 3)), modes)), n_components=3
+                study_of(u, T, np.einsum("sc,cnx->snx", rng.normal(size=(15, 3)), modes)),
+                n_components=3,
             )["outlier_p"].values
             for _ in range(20)
         ]
@@ -298,7 +343,9 @@ def test_planted_groups_are_classified_and_shuffled_ones_are_not(planted):
     assert svm.sizes["fold"] == 3
     assert svm.attrs["balanced_accuracy"] > 0.8
     shuffled = [np.random.default_rng(seed).permutation(group) for seed in range(10)]
-    by_chance = [statistics.classify(study, g, n_permutations=0).attrs["balanced_accuracy"] for g in shuffled]
+    by_chance = [
+        statistics.classify(study, g, n_permutations=0).attrs["balanced_accuracy"] for g in shuffled
+    ]
     assert 0.35 < np.mean(by_chance) < 0.6
 
 
@@ -306,7 +353,9 @@ def test_a_regression_is_a_mode_that_page_panel_and_animation_show(planted, tmp_
     study, _, _, age = planted
     fit = statistics.regression(study, "age", n_permutations=9)
     moving = statistics.regression_modes(study, fit, "age")
-    assert moving["pca"]["score"].values[:, 0] == pytest.approx((age - age.mean()) / age.std(ddof=1))
+    assert moving["pca"]["score"].values[:, 0] == pytest.approx(
+        (age - age.mean()) / age.std(ddof=1)
+    )
     later = statistics.predict(study, fit, age.mean() + 1.5 * age.std(ddof=1))["position"].values
     assert synthesize(moving, [1.5])["position"].values == pytest.approx(later, abs=1e-5)
     assert 0.1 < moving["pca"]["explained_variance_ratio"].item() < 0.9
@@ -315,5 +364,7 @@ def test_a_regression_is_a_mode_that_page_panel_and_animation_show(planted, tmp_
     assert panel.vertices() == pytest.approx(later, abs=1e-5)
     panel.close()
     assert "component 1" in write_page(moving, tmp_path / "page.html").read_text()
-    with Image.open(write_animation(moving, tmp_path / "age.gif", n_frames=4, size=(60, 50))) as picture:
+    with Image.open(
+        write_animation(moving, tmp_path / "age.gif", n_frames=4, size=(60, 50))
+    ) as picture:
         assert (picture.n_frames, picture.size) == (4, (60, 50))

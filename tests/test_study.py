@@ -8,64 +8,69 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from s4a import study, synthetic
+from s4a import synthetic
 from s4a.schema import dataset
+from s4a.study import store
 
 PARTS = ["content", 3, 2.5, None, True, [1, 2], {"a": 1}, np.arange(4), b"bytes"]
 
 
 def test_a_key_is_the_same_for_the_same_parts():
-    assert study.task_key(*PARTS) == study.task_key(*PARTS)
-    assert study.task_key({"a": 1, "b": 2}) == study.task_key({"b": 2, "a": 1})
+    assert store.task_key(*PARTS) == store.task_key(*PARTS)
+    assert store.task_key({"a": 1, "b": 2}) == store.task_key({"b": 2, "a": 1})
 
 
 def test_a_key_changes_with_each_part():
     others = ["contents", 4, 2.6, "None", False, [2, 1], {"a": 2}, np.arange(4.0), b"byte"]
     for i, other in enumerate(others):
-        assert study.task_key(*PARTS) != study.task_key(*PARTS[:i], other, *PARTS[i + 1 :])
+        assert store.task_key(*PARTS) != store.task_key(*PARTS[:i], other, *PARTS[i + 1 :])
 
 
 def test_a_key_changes_with_the_order_and_the_limits_of_the_parts():
-    assert study.task_key("a", "b") != study.task_key("b", "a")
-    assert study.task_key("ab") != study.task_key("a", "b")
-    assert study.task_key(b"a\0b") != study.task_key(b"a", b"b")
-    assert study.task_key('"a"') != study.task_key(b'"a"')
-    assert study.task_key(np.zeros((2, 3))) != study.task_key(np.zeros((3, 2)))
+    assert store.task_key("a", "b") != store.task_key("b", "a")
+    assert store.task_key("ab") != store.task_key("a", "b")
+    assert store.task_key(b"a\0b") != store.task_key(b"a", b"b")
+    assert store.task_key('"a"') != store.task_key(b'"a"')
+    assert store.task_key(np.zeros((2, 3))) != store.task_key(np.zeros((3, 2)))
 
 
 def test_numpy_numbers_make_the_key_of_the_numbers():
-    assert study.task_key(np.int64(3), np.float64(2.5), np.bool_(True)) == study.task_key(3, 2.5, True)
+    assert store.task_key(np.int64(3), np.float64(2.5), np.bool_(True)) == store.task_key(
+        3, 2.5, True
+    )
 
 
 @pytest.fixture
 def file(tmp_path):
     path = tmp_path / "shape.nc"
-    study.write(synthetic.sphere(200), path, "key")
+    store.write(synthetic.sphere(200), path, "key")
     return path
 
 
 def test_a_written_file_is_done_for_its_key_and_no_other(file):
-    assert study.is_done(file, "key")
-    assert not study.is_done(file, "other")
-    assert not study.is_done(file.with_name("absent.nc"), "key")
+    assert store.is_done(file, "key")
+    assert not store.is_done(file, "other")
+    assert not store.is_done(file.with_name("absent.nc"), "key")
 
 
 def test_what_is_read_is_what_was_written(file):
-    assert study.read(file).drop_attrs().identical(synthetic.sphere(200).drop_attrs())
-    assert study.read(file).attrs["task_key"] == "key"
+    assert store.read(file).drop_attrs().identical(synthetic.sphere(200).drop_attrs())
+    assert store.read(file).attrs["task_key"] == "key"
 
 
 @pytest.mark.parametrize("share", [0, 0.001, 0.02, 0.3, 0.6, 0.9, 0.999])
 def test_a_truncated_file_is_not_done(file, share):
     data = file.read_bytes()
     file.write_bytes(data[: int(share * len(data))])
-    assert not study.is_done(file, "key")
+    assert not store.is_done(file, "key")
 
 
-@pytest.mark.parametrize("content", [b"", b"ply\nformat ascii 1.0\n", b"\0" * 4096, b"\x89HDF\r\n\x1a\n", b"CDF\x01"])
+@pytest.mark.parametrize(
+    "content", [b"", b"ply\nformat ascii 1.0\n", b"\0" * 4096, b"\x89HDF\r\n\x1a\n", b"CDF\x01"]
+)
 def test_a_foreign_file_is_not_done(file, content):
     file.write_bytes(content)
-    assert not study.is_done(file, "key")
+    assert not store.is_done(file, "key")
 
 
 def lose_a_variable(file):
@@ -81,59 +86,69 @@ def lose_a_dimension(file):
 def test_damage_within_a_file_is_one_error_that_names_it(file, damage):
     with h5py.File(file, "a") as inside:
         damage(inside)
-    with pytest.raises(OSError, match=r"shape\.nc cannot be read \(.*\): remove it and run the analysis again"):
-        study.read(file)
+    with pytest.raises(
+        OSError, match=r"shape\.nc cannot be read \(.*\): remove it and run the analysis again"
+    ):
+        store.read(file)
 
 
 def test_a_folder_in_the_place_of_a_file_is_not_done(tmp_path):
-    assert not study.is_done(tmp_path, "key")
+    assert not store.is_done(tmp_path, "key")
 
 
 def test_writing_leaves_one_file_and_nothing_temporary(file):
-    study.write(synthetic.sphere(100), file, "again")
+    store.write(synthetic.sphere(100), file, "again")
     assert [f.name for f in file.parent.iterdir()] == ["shape.nc"]
-    assert study.read(file).sizes["vertex"] == 100
+    assert store.read(file).sizes["vertex"] == 100
 
 
 def test_a_write_that_fails_leaves_the_old_file_and_nothing_temporary(file):
     bad = synthetic.sphere(100).assign_attrs(broken=object())
     with pytest.raises(TypeError):
-        study.write(bad, file, "again")
+        store.write(bad, file, "again")
     assert [f.name for f in file.parent.iterdir()] == ["shape.nc"]
-    assert study.is_done(file, "key")
+    assert store.is_done(file, "key")
 
 
 HOLDER = """
 import sys
-from s4a import study
-with study.lock(sys.argv[1]):
+from s4a.study import store
+with store.lock(sys.argv[1]):
     sys.stdout.write("held\\n")
     sys.stdout.flush()
     sys.stdin.read()
 """
 
 
-def test_a_second_process_is_refused_while_the_first_holds_the_folder_and_let_in_when_it_is_killed(tmp_path):
+def test_a_second_process_is_refused_while_the_first_holds_the_folder_and_let_in_when_it_is_killed(
+    tmp_path,
+):
     with subprocess.Popen(
-        [sys.executable, "-c", HOLDER, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", HOLDER, str(tmp_path)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
     ) as first:
         assert first.stdout.readline() == "held\n"
-        with pytest.raises(ValueError, match=f"process {first.pid}.*another folder"), study.lock(tmp_path):
+        with (
+            pytest.raises(ValueError, match=f"process {first.pid}.*another folder"),
+            store.lock(tmp_path),
+        ):
             pass
         first.kill()
         first.wait()
-        with study.lock(tmp_path):
+        with store.lock(tmp_path):
             pass
-    with study.lock(tmp_path):  # and again
+    with store.lock(tmp_path):  # and again
         pass
 
 
 def test_what_a_killed_run_left_is_removed_by_the_next(file):
     left = file.with_name(".shape.nc.77.tmp")
     left.write_bytes(b"half")
-    with study.lock(file.parent):
+    with store.lock(file.parent):
         assert not left.exists()
-        assert study.is_done(file, "key")
+        assert store.is_done(file, "key")
 
 
 @pytest.mark.parametrize("make", [None, "empty", "file"])
@@ -144,17 +159,19 @@ def test_what_is_not_a_study_is_refused(tmp_path, make):
     if make == "file":
         folder.write_text("no")
     with pytest.raises(ValueError, match="is not a study folder"):
-        study.open_study(folder)
+        store.open_study(folder)
 
 
 def write_tree(folder, names, template):
     """A small finished study written by hand; gives what its nodes should be."""
     mesh = synthetic.sphere(50)
     for name in names:
-        study.write(mesh.assign_attrs(reason=name), folder / "original" / f"{name}.nc", "o")
-        study.write(mesh, folder / "coarse" / f"{name}.nc", "c")
-    study.write(dataset(latent_eigenvalue=[0.0, 1.0]).assign_coords(shape=names), folder / "latent.nc")
-    study.write(mesh.assign_attrs(template=template), folder / "registration.nc")
+        store.write(mesh.assign_attrs(reason=name), folder / "original" / f"{name}.nc", "o")
+        store.write(mesh, folder / "coarse" / f"{name}.nc", "c")
+    store.write(
+        dataset(latent_eigenvalue=[0.0, 1.0]).assign_coords(shape=names), folder / "latent.nc"
+    )
+    store.write(mesh.assign_attrs(template=template), folder / "registration.nc")
     one = {
         "registered_match": np.arange(50),
         "displacement": np.ones((50, 3), np.float32),
@@ -167,8 +184,10 @@ def write_tree(folder, names, template):
         "template_barycentric": np.full((70, 3), 1 / 3),
     }
     for i, name in enumerate(names):
-        data = dataset({"method": "icp", "score": 0.1 * i}, **one | {"displacement": one["displacement"] * i})
-        study.write(data, folder / "registration" / f"{name}.nc")
+        data = dataset(
+            {"method": "icp", "score": 0.1 * i}, **one | {"displacement": one["displacement"] * i}
+        )
+        store.write(data, folder / "registration" / f"{name}.nc")
 
 
 @pytest.mark.parametrize("name", ["original/a", "registration/c", "registration"])
@@ -176,7 +195,7 @@ def test_a_damaged_file_is_left_out_of_the_study_and_said(tmp_path, caplog, name
     write_tree(tmp_path, ["a", "b", "c"], "a")
     with h5py.File(tmp_path / f"{name}.nc", "a") as inside:
         lose_a_variable(inside)
-    groups = study.open_study(tmp_path).groups
+    groups = store.open_study(tmp_path).groups
     assert f"/{name}" not in groups
     assert "/original/b" in groups
     assert f"{name}.nc cannot be read" in caplog.text
@@ -185,7 +204,7 @@ def test_a_damaged_file_is_left_out_of_the_study_and_said(tmp_path, caplog, name
 def test_a_tree_survives_the_round_trip(tmp_path):
     names = ["b", "a", "c"]
     write_tree(tmp_path, names, "a")
-    tree = study.open_study(tmp_path)
+    tree = store.open_study(tmp_path)
     assert list(tree["original"].children) == ["a", "b", "c"]
     registration = tree["registration"].to_dataset()
     assert registration["shape"].values.tolist() == names  # the order of the latent basis
@@ -197,10 +216,12 @@ def test_a_tree_survives_the_round_trip(tmp_path):
     assert tree["registration/c"].to_dataset(inherit=False)["template_triangle"].shape == (70,)
     assert tree["original/b"].attrs["reason"] == "b"
     file = tmp_path / "tree.nc"
-    tree.to_netcdf(file, engine=study.ENGINE)
-    with xr.open_datatree(file, engine=study.ENGINE) as again:
+    tree.to_netcdf(file, engine=store.ENGINE)
+    with xr.open_datatree(file, engine=store.ENGINE) as again:
         for node in tree.subtree:
-            assert again[node.path].to_dataset(inherit=False).identical(node.to_dataset(inherit=False)), node.path
+            assert (
+                again[node.path].to_dataset(inherit=False).identical(node.to_dataset(inherit=False))
+            ), node.path
     tree.close()
 
 
@@ -209,7 +230,7 @@ def test_an_unfinished_study_opens_with_what_is_there(tmp_path):
     (tmp_path / "registration" / "b.nc").unlink()
     (tmp_path / "coarse" / "b.nc").unlink()
     (tmp_path / "original" / ".c.nc.77.tmp").write_bytes(b"half")
-    tree = study.open_study(tmp_path)
+    tree = store.open_study(tmp_path)
     assert tree["registration"]["shape"].values.tolist() == ["a"]
     assert list(tree["coarse"].children) == ["a"]
     assert list(tree["original"].children) == ["a", "b"]
@@ -221,26 +242,29 @@ def test_every_file_of_a_study_is_read_as_xarray_reads_it(small_store):
     files = sorted(small_store.rglob("*.nc"))
     assert len(files) > 20
     for file in files:
-        with xr.open_dataset(file, engine=study.ENGINE) as there:
-            here = study.opened(file)
+        with xr.open_dataset(file, engine=store.ENGINE) as there:
+            here = store.opened(file)
             xr.testing.assert_identical(here, there)
-            kinds = [{n: v.dtype.str.split("U")[0] for n, v in data.variables.items()} for data in (here, there)]
+            kinds = [
+                {n: v.dtype.str.split("U")[0] for n, v in data.variables.items()}
+                for data in (here, there)
+            ]
             assert kinds[0] == kinds[1]
-            assert study.attributes(file) == there.attrs
+            assert store.attributes(file) == there.attrs
 
 
 def test_parts_of_a_stored_variable_are_parts_of_the_whole(tmp_path):
     whole = np.random.default_rng(0).normal(size=(700, 3))
-    study.write(dataset(position=whole), tmp_path / "a.nc", "k")
-    position = study.opened(tmp_path / "a.nc")["position"]
+    store.write(dataset(position=whole), tmp_path / "a.nc", "k")
+    position = store.opened(tmp_path / "a.nc")["position"]
     assert (position[::-2].values == whole[::-2]).all()
     assert (position[[5, 3], 1].values == whole[[5, 3], 1]).all()
     assert (position.values == whole).all()
 
 
 def test_a_file_written_anew_after_it_was_opened_is_refused(tmp_path):
-    study.write(dataset(position=np.zeros((700, 3))), tmp_path / "a.nc", "k")
-    found = study.opened(tmp_path / "a.nc")
-    study.write(dataset(position=np.ones((700, 3))), tmp_path / "a.nc", "other")
+    store.write(dataset(position=np.zeros((700, 3))), tmp_path / "a.nc", "k")
+    found = store.opened(tmp_path / "a.nc")
+    store.write(dataset(position=np.ones((700, 3))), tmp_path / "a.nc", "other")
     with pytest.raises(ValueError, match="written anew since it was opened; open the study again"):
         found.load()

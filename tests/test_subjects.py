@@ -1,20 +1,28 @@
-"""The table of the shapes: what is read, what is refused, and that nothing but the statistics knows of it."""
+"""The table of the shapes.
+
+What is read, what is refused, and that nothing but the statistics knows of it.
+"""
 
 import numpy as np
 import pytest
 import xarray as xr
 
-from s4a import analyse, cli, commands, insert, open_study, statistics, synthetic
-from s4a.subjects import read_table, with_table
+from s4a import analyse, cli, insert, open_study, statistics, synthetic
+from s4a.cli import commands
+from s4a.input.subjects import read_table, with_table
 
 OPTIONS = {"n_coarse": 300, "k_init": 8, "k": 12, "n_jobs": 1}
 NAMES = [f"brain_{i:02d}" for i in range(1, 8)]
-TABLE = "shape;sex;age;score\n" + "".join(f"{n};{'fm'[i % 2]};{20 + 7 * i};{i / 2}\n" for i, n in enumerate(NAMES))
+TABLE = "shape;sex;age;score\n" + "".join(
+    f"{n};{'fm'[i % 2]};{20 + 7 * i};{i / 2}\n" for i, n in enumerate(NAMES)
+)
 
 
 @pytest.fixture(scope="module")
 def brains():
-    return {n: m.to_dataset() for n, m in synthetic.brains(7, 700, seed=3)["original"].children.items()}
+    return {
+        n: m.to_dataset() for n, m in synthetic.brains(7, 700, seed=3)["original"].children.items()
+    }
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +64,10 @@ def test_whole_numbers_that_no_integer_holds_are_numbers(tmp_path):
         ("shape,a/b\na,1\nb,2\n", "without '/'; found 'a/b'"),
         ("shape,age,age\na,1,2\nb,1,2\n", "found 'age'"),
         ("shape\na\nb\n", "a column beside 'shape' needed"),
-        ("shape,age\na,1\nb,1e999\n", "finite numbers, or nothing, needed in the column 'age'; found inf"),
+        (
+            "shape,age\na,1\nb,1e999\n",
+            "finite numbers, or nothing, needed in the column 'age'; found inf",
+        ),
         ("", "cannot be read as a table: the file is empty"),
     ],
 )
@@ -74,11 +85,15 @@ def test_a_study_has_the_table_and_nothing_else_depends_on_it(folder, brains):
         assert study["subjects"]["age"].values.tolist() == [20, 27, 34, 41, 48, 55]
         assert study["report"].attrs["table"].endswith("six.csv")
         modes = study["pca"].to_dataset().load()
-    before = {p: p.stat().st_mtime_ns for p in [work / "latent.nc", *(work / "registration").iterdir()]}
+    before = {
+        p: p.stat().st_mtime_ns for p in [work / "latent.nc", *(work / "registration").iterdir()]
+    }
     (folder / "other.csv").write_text((folder / "six.csv").read_text().replace("20", "99"))
     with analyse(given, store=work, table=folder / "other.csv", **OPTIONS) as again:
         assert again["subjects"]["age"].values[0] == 99
-        assert again["pca"].to_dataset().drop_attrs(deep=False).identical(modes.drop_attrs(deep=False))
+        assert (
+            again["pca"].to_dataset().drop_attrs(deep=False).identical(modes.drop_attrs(deep=False))
+        )
     with analyse(given, store=work, **OPTIONS) as again:
         assert again["subjects"]["age"].values[0] == 99  # a table stays until another is given
     analyse(given, store=work, table=folder / "six.csv", **OPTIONS).close()
@@ -89,15 +104,27 @@ def test_statistics_take_columns_and_say_which_values_are_missing(folder):
     with open_study(folder / "study") as study:
         by_name = statistics.group_test(study, "sex", covariates=["age"], n_permutations=19)
         age = study["subjects"]["age"].values
-        assert by_name.identical(statistics.group_test(study, list("fmfmfm"), covariates=age, n_permutations=19))
-        assert statistics.regression(study, "age", covariates=["sex"], n_permutations=9).attrs["highest"] == age.max()
-        with pytest.raises(ValueError, match=r"group 'size' needs a column of that name .* has sex, age, score"):
+        assert by_name.identical(
+            statistics.group_test(study, list("fmfmfm"), covariates=age, n_permutations=19)
+        )
+        assert (
+            statistics.regression(study, "age", covariates=["sex"], n_permutations=9).attrs[
+                "highest"
+            ]
+            == age.max()
+        )
+        with pytest.raises(
+            ValueError, match=r"group 'size' needs a column of that name .* has sex, age, score"
+        ):
             statistics.group_test(study, "size")
         with pytest.raises(ValueError, match="a regression needs a variable of numbers"):
             statistics.regression(study, "sex")
         table = study["subjects"].to_dataset()
         holes = xr.DataTree.from_dict(
-            {"registration": study["registration"].to_dataset(), "subjects": table.where(table["age"] < 50)}
+            {
+                "registration": study["registration"].to_dataset(),
+                "subjects": table.where(table["age"] < 50),
+            }
         )
         with pytest.raises(ValueError, match=r"variable 'age' needs a finite value .*: brain_06"):
             statistics.regression(holes, "age")
@@ -113,9 +140,20 @@ def test_a_table_can_take_the_place_of_the_first(folder):
 
 def test_the_command_prints_tables_and_writes_files(folder, capsys, monkeypatch):
     monkeypatch.setattr(
-        commands, "write_page", lambda tree, file, **_: file.write_text(str(tree["pca"].sizes["component"]))
+        commands,
+        "write_page",
+        lambda tree, file, **_: file.write_text(str(tree["pca"].sizes["component"])),
     )
-    command = ["statistics", str(folder / "study"), "--group", "sex", "--variable", "age", "--permutations", "19"]
+    command = [
+        "statistics",
+        str(folder / "study"),
+        "--group",
+        "sex",
+        "--variable",
+        "age",
+        "--permutations",
+        "19",
+    ]
     assert cli.main([*command, "--recompute", "--n-jobs", "1"]) == 0
     said, out = capsys.readouterr().out, folder / "study" / "statistics"
     for words in (
@@ -143,16 +181,27 @@ def test_the_command_prints_tables_and_writes_files(folder, capsys, monkeypatch)
 
 def test_the_command_inserts_shapes(folder, brains, tmp_path, capsys):
     from s4a import write_mesh
-    from s4a.mesh import as_arrays
+    from s4a.geometry.mesh import as_arrays
 
     write_mesh(tmp_path / "brain_07.ply", *as_arrays(brains["brain_07"]))
     (tmp_path / "broken.ply").write_text("no mesh")
-    command = ["insert", str(folder / "study"), str(tmp_path), "--out", str(tmp_path / "out"), "--n-jobs", "1"]
+    command = [
+        "insert",
+        str(folder / "study"),
+        str(tmp_path),
+        "--out",
+        str(tmp_path / "out"),
+        "--n-jobs",
+        "1",
+    ]
     assert cli.main(command) == 1  # one of them is excluded
     said = capsys.readouterr().out.splitlines()
     assert said[0].split()[:4] == ["shape", "confidence", "round", "trip"]
     assert "excluded" in said[2]
-    with xr.open_datatree(tmp_path / "out" / "inserted.nc") as tree, open_study(folder / "study") as study:
+    with (
+        xr.open_datatree(tmp_path / "out" / "inserted.nc") as tree,
+        open_study(folder / "study") as study,
+    ):
         alone = insert(study, tmp_path / "brain_07.ply")
         np.testing.assert_array_equal(tree["pca"]["score"], alone["pca"]["score"])
         assert tree["registration/brain_07"]["template_triangle"].sizes == {"original_vertex": 700}
@@ -182,7 +231,7 @@ def test_recomputed_correspondences_generalize_less_well_than_those_that_knew_th
 
 
 def test_without_its_template_a_study_is_registered_to_the_next(folder):
-    from s4a.generalize import without
+    from s4a.analysis.generalization import without
 
     with open_study(folder / "study") as study:
         template = study["registration"].attrs["template"]

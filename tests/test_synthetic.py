@@ -8,7 +8,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from s4a import align, mesh, synthetic
+from s4a import synthetic
+from s4a.geometry import align, mesh
 
 
 @pytest.fixture(scope="module")
@@ -107,8 +108,13 @@ def test_space_is_nowhere_folded_at_three_standard_deviations(n_modes):
     centre, width, push, turn = synthetic._planted_modes(n_modes)
     x = np.stack(np.meshgrid(*[np.linspace(-110, 110, 18)] * 3), axis=-1).reshape(-1, 3)
     h = 1e-3 * np.eye(3)
-    fields = [lambda x, a=a, b=b: synthetic._fields(x, centre, width, a, b) for a, b in zip(push, turn, strict=True)]
-    slopes = np.stack([np.stack([(f(x + e) - f(x - e)) / 2e-3 for e in h], axis=-1) for f in fields])
+    fields = [
+        lambda x, a=a, b=b: synthetic._fields(x, centre, width, a, b)
+        for a, b in zip(push, turn, strict=True)
+    ]
+    slopes = np.stack(
+        [np.stack([(f(x + e) - f(x - e)) / 2e-3 for e in h], axis=-1) for f in fields]
+    )
     for signs in itertools.product((-3, 3), repeat=n_modes):
         assert np.linalg.det(np.eye(3) + np.tensordot(signs, slopes, 1)).min() > 0
 
@@ -129,7 +135,11 @@ def inverted(truth, shape, n_vertices):
 
 def test_no_triangle_of_the_population_is_inverted():
     truth = synthetic.plant(12)
-    assert [inverted(truth, shape, 12_000) for shape in ("brain_01", "brain_05", "brain_09")] == [0, 0, 0]
+    assert [inverted(truth, shape, 12_000) for shape in ("brain_01", "brain_05", "brain_09")] == [
+        0,
+        0,
+        0,
+    ]
 
 
 @pytest.mark.parametrize("scores", [(3, 3, 3), (-3, 3, -3), (3, -3, -3), (-3, -3, 3)])
@@ -142,13 +152,18 @@ def test_nearest_neighbours_after_icp_are_wrong_by_two_to_four_percent():
     tree = synthetic.brains(12, 8000)
     truth, error = tree["truth"], []
     shapes = truth["shape"].values
-    for a, b in [*zip(shapes, np.roll(shapes, 1), strict=True), *zip(shapes, np.roll(shapes, -4), strict=True)]:
+    for a, b in [
+        *zip(shapes, np.roll(shapes, 1), strict=True),
+        *zip(shapes, np.roll(shapes, -4), strict=True),
+    ]:
         (X, T), (Y, T_b) = (mesh.as_arrays(tree[f"original/{s}"]) for s in (a, b))
         area, area_b = mesh.vertex_areas(X, T), mesh.vertex_areas(Y, T_b)
         exact = synthetic.position(truth, b, truth[f"{a}/reference_point"])
         R, t, _ = align.icp(X, area, Y, area_b, *align.rigid_transform(X, exact)[:2], rounds=3)
         nearest = cKDTree(Y).query(X @ R.T + t)[1]
-        error.append(area @ np.linalg.norm(Y[nearest] - exact, axis=1) / area.sum() / np.sqrt(area_b.sum()))
+        error.append(
+            area @ np.linalg.norm(Y[nearest] - exact, axis=1) / area.sum() / np.sqrt(area_b.sum())
+        )
     assert 0.02 < np.mean(error) < 0.04
 
 
@@ -186,7 +201,9 @@ def test_raw_meshes_hold_every_artefact(dirty_tree):
     half = mesh.directed_edges(T[surface])
     assert len(half) - len(np.unique(half, axis=0)) >= 2 * few  # flipped triangles
     place = np.unique(X, axis=0, return_inverse=True)[1].ravel()[T[~flat]]
-    assert components(np.searchsorted(np.unique(place), place)).max() == 4  # the brain and four loose ones
+    assert (
+        components(np.searchsorted(np.unique(place), place)).max() == 4
+    )  # the brain and four loose ones
     assert bow_ties(T) >= 3
 
 
@@ -197,7 +214,9 @@ def bow_ties(T):
     key = np.repeat(corner, 2).astype(np.int64) * (T.max() + 1) + other
     _, spoke = np.unique(key, return_inverse=True)
     spoke = n + spoke
-    graph = coo_matrix((np.ones(2 * n), (np.repeat(np.arange(n), 2), spoke)), (spoke.max() + 1,) * 2)
+    graph = coo_matrix(
+        (np.ones(2 * n), (np.repeat(np.arange(n), 2), spoke)), (spoke.max() + 1,) * 2
+    )
     fan = connected_components(graph, directed=False)[1][:n]
     return (np.bincount(np.unique(np.stack([corner, fan]), axis=1)[0]) > 1).sum()
 
@@ -209,11 +228,15 @@ def test_truth_survives_cleaning(dirty_tree):
         raw = dirty_tree[f"raw/{shape}"]
         u = truth[f"{shape}/reference_point"].values
         assert len(u) > 0.95 * 6000
-        error = np.linalg.norm(synthetic.position(truth, shape, u) - cleaned["position"].values, axis=1)
+        error = np.linalg.norm(
+            synthetic.position(truth, shape, u) - cleaned["position"].values, axis=1
+        )
         exact = error < 1e-9
         assert (~exact).sum() <= cleaned.attrs["inserted_vertices"]
         assert error.max() < 2  # mm; an edge is about 4
-        assert np.array_equal(u[exact], raw["reference_point"].values[cleaned["file_vertex"].values[exact]])
+        assert np.array_equal(
+            u[exact], raw["reference_point"].values[cleaned["file_vertex"].values[exact]]
+        )
         assert (np.isnan(raw["reference_point"]).any("xyz") == (raw["label"] == 0)).all()
         assert (mesh.unique_edges(cleaned["corner_vertex"].values)[2] <= 2).all()
 

@@ -16,7 +16,9 @@ def test_the_arrays_arrive_as_the_browser_needs_them():
     geometry = surface.geometry
     assert geometry.index.array.dtype == np.uint32
     np.testing.assert_array_equal(geometry.index.array, mesh["corner_vertex"].values.ravel())
-    np.testing.assert_array_equal(geometry.attributes["position"].array, mesh["position"].values.astype("f4"))
+    np.testing.assert_array_equal(
+        geometry.attributes["position"].array, mesh["position"].values.astype("f4")
+    )
     np.testing.assert_array_equal(geometry.attributes["color"].array, colors.astype("f4"))
     normals = geometry.attributes["normal"].array
     assert np.einsum("nx,nx->n", normals, mesh["position"].values).min() > 0.99

@@ -1,4 +1,7 @@
-"""Transfer (6.2): labels, landmarks and fields on known correspondences, the files, the command, real templates."""
+"""Transfer (6.2): labels, landmarks and fields on known correspondences, the files, the command.
+
+Real templates.
+"""
 
 import gzip
 import json
@@ -25,12 +28,18 @@ from s4a import (
     transfer_scalars,
     write_mesh,
 )
-from s4a.annotations import labels_of_file, labels_of_mesh, read_labels, read_landmarks, write_landmarks
-from s4a.landmarks import locate
-from s4a.link import at, closest_facing_point, closest_point, elect, interpolation
-from s4a.mesh import as_arrays, as_dataset, vertex_areas
+from s4a.analysis.landmarks import locate
+from s4a.analysis.link import at, closest_facing_point, closest_point, elect, interpolation
+from s4a.analysis.transfer import pair_study
+from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
+from s4a.input.annotations import (
+    labels_of_file,
+    labels_of_mesh,
+    read_labels,
+    read_landmarks,
+    write_landmarks,
+)
 from s4a.schema import dataset
-from s4a.transfer import pair_study
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 OPTIONS = {"n_coarse": 1200, "k": 60}
@@ -86,10 +95,17 @@ def test_labels_and_landmarks_of_a_moved_and_renumbered_copy_are_exact(meshes, m
     assert distance(place["landmark_position"].values, exact).max() < 1e-4 * size
     assert place["landmark_name"].values.tolist() == list(synthetic.LANDMARKS)
     back = transfer_landmarks(study, place, source="source")["target"]
-    assert distance(back["landmark_position"].values, locate(landmarks, mesh)["landmark_position"]).max() < 1e-4 * size
+    assert (
+        distance(
+            back["landmark_position"].values, locate(landmarks, mesh)["landmark_position"]
+        ).max()
+        < 1e-4 * size
+    )
 
 
-def test_labels_of_deformed_brains_are_nearly_right_and_better_than_by_the_nearest_vertex(study, meshes):
+def test_labels_of_deformed_brains_are_nearly_right_and_better_than_by_the_nearest_vertex(
+    study, meshes
+):
     found = transfer_labels(study, meshes["brain_01"]["label"].values)
     assert set(found.children) == {"brain_02", "brain_03"}
     for name, node in found.children.items():
@@ -98,7 +114,10 @@ def test_labels_of_deformed_brains_are_nearly_right_and_better_than_by_the_neare
         near = cKDTree(meshes["brain_01"]["position"]).query(meshes[name]["position"])[1]
         assert right.mean() > 0.95
         assert right.mean() > (meshes["brain_01"]["label"].values[near] == true).mean() + 0.1
-        assert node["label_share"].values[right].mean() > node["label_share"].values[~right].mean() + 0.1
+        assert (
+            node["label_share"].values[right].mean()
+            > node["label_share"].values[~right].mean() + 0.1
+        )
         assert 0 < node["confidence"].values.min() <= node["confidence"].values.max() <= 1
 
 
@@ -129,7 +148,9 @@ def test_a_shape_gives_its_labels_through_the_template_to_the_others(study, mesh
 def test_named_labels_travel_too(study, meshes):
     names = np.array(synthetic.LABELS)[meshes["brain_01"]["label"].values]
     found = transfer_labels(study, names, targets=["brain_02"])["brain_02"]["label"].values
-    numbers = transfer_labels(study, meshes["brain_01"]["label"].values, targets=["brain_02"])["brain_02"]["label"]
+    numbers = transfer_labels(study, meshes["brain_01"]["label"].values, targets=["brain_02"])[
+        "brain_02"
+    ]["label"]
     assert (found == np.array(synthetic.LABELS)[numbers.values]).mean() > 0.999
 
 
@@ -206,7 +227,9 @@ def test_curves_are_carried_as_polylines_between_the_vertices(study, meshes, tre
     of_ring = found["landmark_curve"].values == "ring"
     names = found["landmark_name"].values
     assert names[~of_ring].tolist() == ["alone"]
-    assert [n for n in names[of_ring] if n] == [f"p{i}" for i in range(40)]  # in order, others in between
+    assert [n for n in names[of_ring] if n] == [
+        f"p{i}" for i in range(40)
+    ]  # in order, others in between
     assert of_ring.sum() > 60
     line = found["landmark_position"].values[of_ring]
     X, T = as_arrays(meshes["brain_02"])
@@ -215,7 +238,9 @@ def test_curves_are_carried_as_polylines_between_the_vertices(study, meshes, tre
     exact = np.stack([np.cos(dense), 0.3 + 0 * dense, np.sin(dense)], axis=1) / np.sqrt(1.09)
     exact = synthetic.position(tree["truth"], "brain_02", exact)
     assert cKDTree(exact).query(line)[0].mean() < 0.01 * size
-    assert cKDTree(line).query(exact)[0].mean() < 0.015 * size  # closed: no part of the true ring is left out
+    assert (
+        cKDTree(line).query(exact)[0].mean() < 0.015 * size
+    )  # closed: no part of the true ring is left out
 
 
 # files
@@ -228,14 +253,26 @@ def test_every_label_file_gives_the_same_labels(tmp_path):
     np.savez(tmp_path / "one.npz", labels=label, other=np.zeros(9))
     np.savez(tmp_path / "two.npz", labels=label, other=label + 1)
     (tmp_path / "plain.csv").write_text("\n".join(map(str, label)))
-    (tmp_path / "head.csv").write_text("vertex,label\n" + "\n".join(f"{i},{label[i]}" for i in (4, 3, 2, 1, 0)))
+    (tmp_path / "head.csv").write_text(
+        "vertex,label\n" + "\n".join(f"{i},{label[i]}" for i in (4, 3, 2, 1, 0))
+    )
     gifti = nibabel.gifti.GiftiImage(
         darrays=[nibabel.gifti.GiftiDataArray(label.astype(np.int32), "NIFTI_INTENT_LABEL")]
     )
     nibabel.save(gifti, tmp_path / "a.label.gii")
     colours = np.array([[i, i, i, 0, 0] for i in range(1, 7)])
-    nibabel.freesurfer.write_annot(tmp_path / "lh.annot", label, colours, list("abcdef"), fill_ctab=True)
-    for name in ("a.npy", "float.npy", "one.npz", "plain.csv", "head.csv", "a.label.gii", "lh.annot"):
+    nibabel.freesurfer.write_annot(
+        tmp_path / "lh.annot", label, colours, list("abcdef"), fill_ctab=True
+    )
+    for name in (
+        "a.npy",
+        "float.npy",
+        "one.npz",
+        "plain.csv",
+        "head.csv",
+        "a.label.gii",
+        "lh.annot",
+    ):
         (tmp_path / f"{name}.gz").write_bytes(gzip.compress((tmp_path / name).read_bytes()))
         for file in (name, f"{name}.gz"):
             assert read_labels(tmp_path / file, 5).tolist() == label.tolist(), file
@@ -252,7 +289,11 @@ def test_a_wrong_label_file_is_named_with_what_was_expected_and_found(tmp_path):
     for name, n, text in (
         ("a.npy", 5, r"a.npy: 5 labels.* found an array of shape \(4,\)"),
         ("half.npy", 2, "half.npy: labels need whole numbers or names, found 0.5"),
-        ("two.npz", 4, r"one array of 4 values needed, found p \(4,\), q \(4,\); name it as two.npz:NAME"),
+        (
+            "two.npz",
+            4,
+            r"one array of 4 values needed, found p \(4,\), q \(4,\); name it as two.npz:NAME",
+        ),
         ("two.npz:r", 4, "no array 'r'; it has p, q"),
         ("a.csv", 1, "a column 'label' needed, found p, q"),
         ("none.npy", 1, "no file .*none.npy"),
@@ -280,9 +321,16 @@ def test_every_landmark_file_gives_the_same_points(tmp_path):
         assert found["landmark_position"].values.tolist() == points, name
         assert found.attrs["coordinate_system"] == ("LPS" if name == "a.mrk.json" else "")
     write_landmarks(tmp_path / "out.csv", found)
-    assert (tmp_path / "out.csv").read_text().split() == ["name,x,y,z", "a,1.5,2.0,3.0", "b,-4.0,5.25,6.0"]
+    assert (tmp_path / "out.csv").read_text().split() == [
+        "name,x,y,z",
+        "a,1.5,2.0,3.0",
+        "b,-4.0,5.25,6.0",
+    ]
     (tmp_path / "empty.csv").write_text("p,q\n1,2\n")
-    with pytest.raises(ValueError, match=r"empty.csv cannot be read as landmarks: the columns name, x, y and z needed"):
+    with pytest.raises(
+        ValueError,
+        match=r"empty.csv cannot be read as landmarks: the columns name, x, y and z needed",
+    ):
         read_landmarks(tmp_path / "empty.csv")
 
 
@@ -306,7 +354,9 @@ def test_curves_of_slicer_and_of_tables_come_out_of_their_files_in_order(tmp_pat
     again = read_landmarks(tmp_path / "a.csv")
     assert again.drop_attrs().identical(found.drop_attrs())
     (tmp_path / "one.csv").write_text("name,x,y,z,curve\na,1,2,3,rim\n")
-    with pytest.raises(ValueError, match=r"one.csv .* a curve needs two points or more; 'rim' has one"):
+    with pytest.raises(
+        ValueError, match=r"one.csv .* a curve needs two points or more; 'rim' has one"
+    ):
         read_landmarks(tmp_path / "one.csv")
 
 
@@ -314,10 +364,15 @@ def test_lps_landmarks_find_their_place_on_a_ras_mesh(meshes):
     mesh = meshes["brain_01"]
     assert mesh.attrs["coordinate_system"] == "RAS"
     X = mesh["position"].values[:40]
-    mirrored = dataset(landmark_name=np.array([str(i) for i in range(40)]), landmark_position=X * [-1, -1, 1])
+    mirrored = dataset(
+        landmark_name=np.array([str(i) for i in range(40)]), landmark_position=X * [-1, -1, 1]
+    )
     mirrored.attrs["coordinate_system"] = "LPS"
     unknown = mesh.assign_attrs(coordinate_system="")
-    for surface in (mesh, unknown):  # where the mesh says nothing, the frame in which the landmarks fit
+    for surface in (
+        mesh,
+        unknown,
+    ):  # where the mesh says nothing, the frame in which the landmarks fit
         found = locate(mirrored, surface)
         assert found["landmark_position"].values == pytest.approx(X)
         assert found["landmark_distance"].values == pytest.approx(0, abs=1e-9)
@@ -336,7 +391,9 @@ def test_landmarks_off_the_surface_are_brought_onto_it_and_the_distance_is_told(
 def test_labels_are_numbered_as_in_the_file_and_dropped_vertices_have_the_nearest_label():
     X, T = as_arrays(synthetic.sphere(300))
     small, S = as_arrays(synthetic.sphere(20, radius=0.05))
-    points = np.concatenate([[[np.nan] * 3], small + [0, 0, 1.2], X])  # a broken vertex, a loose part, the sphere
+    points = np.concatenate(
+        [[[np.nan] * 3], small + [0, 0, 1.2], X]
+    )  # a broken vertex, a loose part, the sphere
     mesh = clean(as_dataset(points, np.concatenate([S + 1, T + 21])))
     height = (mesh["position"].values[:, 2] > 0).astype(int) + 1
     label, dropped = labels_of_file(height, mesh, points)
@@ -357,7 +414,14 @@ def test_the_command_writes_labels_per_vertex_of_the_file_and_landmarks(tmp_path
     write_mesh(tmp_path / "target one.obj", points, np.concatenate([L, T + len(loose)]))
     np.save(tmp_path / "labels.npy", source["label"].values)
     write_landmarks(tmp_path / "marks.csv", source)
-    given = ["--labels", tmp_path / "labels.npy", "--landmarks", tmp_path / "marks.csv", "--out", tmp_path / "out"]
+    given = [
+        "--labels",
+        tmp_path / "labels.npy",
+        "--landmarks",
+        tmp_path / "marks.csv",
+        "--out",
+        tmp_path / "out",
+    ]
     given += ["--n-coarse", 1200, "--k", 60, "--n-jobs", 1]
     command = ["transfer", tmp_path / "source.ply", tmp_path / "target one.obj", *given]
     assert cli.main([str(a) for a in command]) == 0
@@ -370,7 +434,9 @@ def test_the_command_writes_labels_per_vertex_of_the_file_and_landmarks(tmp_path
     rows = (tmp_path / "out" / "target one.landmarks.csv").read_text().splitlines()
     assert rows[0] == "name,x,y,z"
     place = read_landmarks(tmp_path / "out" / "target one.landmarks.csv")
-    assert distance(place["landmark_position"].values, target["landmark_position"].values).mean() < 4
+    assert (
+        distance(place["landmark_position"].values, target["landmark_position"].values).mean() < 4
+    )
     assert "50" in capsys.readouterr().out.splitlines()[-1].split()
     assert cli.main(["transfer", "a.ply", "b.ply", "--out", str(tmp_path)]) == 2
     assert "--labels FILE" in capsys.readouterr().err
@@ -385,7 +451,11 @@ def templates(tmp_path_factory):
     if not (DATA / "unpack.py").exists():
         pytest.skip("needs the shared data")
     folder = tmp_path_factory.mktemp("brains")
-    subprocess.run([sys.executable, DATA / "unpack.py", folder, "brains"], check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(
+        [sys.executable, DATA / "unpack.py", folder, "brains"],
+        check=True,
+        stdout=subprocess.DEVNULL,
+    )
     meshes, labels = {}, {}
     for name, mesh in (("fsa5", "fsa5_lh.gii"), ("conte69", "conte69_32k_lh.gii")):
         meshes[name] = read_shape(folder / "brains" / mesh)
@@ -395,14 +465,20 @@ def templates(tmp_path_factory):
 
 
 def dice(found, true):
-    both = [2 * ((found == v) & (true == v)).sum() / ((found == v).sum() + (true == v).sum()) for v in np.unique(true)]
+    both = [
+        2 * ((found == v) & (true == v)).sum() / ((found == v).sum() + (true == v).sum())
+        for v in np.unique(true)
+    ]
     return np.mean(both)
 
 
 def test_the_parcellation_of_one_brain_template_comes_out_on_another(templates):
     meshes, labels = templates
     study = register_pairs(meshes["fsa5"], {"conte69": meshes["conte69"]})
-    found, true = transfer_labels(study, labels["fsa5"])["conte69"]["label"].values, labels["conte69"]
+    found, true = (
+        transfer_labels(study, labels["fsa5"])["conte69"]["label"].values,
+        labels["conte69"],
+    )
     near = cKDTree(meshes["fsa5"]["position"]).query(meshes["conte69"]["position"])[1]
     nearest = labels["fsa5"][near]
     assert (nearest == true).mean() == pytest.approx(0.890, abs=0.001)

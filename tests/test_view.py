@@ -9,9 +9,9 @@ import pytest
 import xarray as xr
 from PIL import Image
 
-from s4a import draw, picture, view
-from s4a.mesh import as_dataset, vertex_areas
+from s4a.geometry.mesh import as_dataset, vertex_areas
 from s4a.schema import dataset
+from s4a.show import draw, page, pictures
 
 K, N_SHAPES = 12, 6
 
@@ -20,7 +20,9 @@ def sphere(n=14):
     """A closed, outward oriented sphere: `n` rings of 2 n vertices and the poles."""
     polar, around = np.pi * np.arange(1, n) / n, np.pi * np.arange(2 * n) / n
     ring = np.stack(
-        np.broadcast_arrays(np.outer(np.sin(polar), np.cos(around)), np.outer(np.sin(polar), np.sin(around)))
+        np.broadcast_arrays(
+            np.outer(np.sin(polar), np.cos(around)), np.outer(np.sin(polar), np.sin(around))
+        )
     )
     ring = np.stack([*ring, np.broadcast_to(np.cos(polar)[:, None], ring.shape[1:])], axis=-1)
     X = np.concatenate([[[0, 0, 1.0]], ring.reshape(-1, 3), [[0, 0, -1.0]]])
@@ -28,15 +30,25 @@ def sphere(n=14):
     i, j = 1 + m * np.arange(n - 2)[:, None], np.arange(m)
     k = (j + 1) % m
     sides = [np.stack([i + j, i + m + j, i + k], -1), np.stack([i + k, i + m + j, i + m + k], -1)]
-    caps = [np.stack([0 * j, 1 + j, 1 + k], -1), np.stack([0 * j + south, south - m + k, south - m + j], -1)]
+    caps = [
+        np.stack([0 * j, 1 + j, 1 + k], -1),
+        np.stack([0 * j + south, south - m + k, south - m + j], -1),
+    ]
     return X, np.concatenate([part.reshape(-1, 3) for part in (*sides, *caps)])
 
 
 def make_study(n=14):
-    """A study as the pipeline leaves it, of ellipsoids whose height is the only thing that varies much."""
+    """A study as the pipeline leaves it.
+
+    Of ellipsoids whose height is the only thing that varies much.
+    """
     rng = np.random.default_rng(0)
     X, T = sphere(n)
-    X = X * [60, 80, 65] * (1 + 0.06 * np.sin(4 * np.arctan2(X[:, 1:2], X[:, :1])) * (1 - X[:, 2:] ** 2))
+    X = (
+        X
+        * [60, 80, 65]
+        * (1 + 0.06 * np.sin(4 * np.arctan2(X[:, 1:2], X[:, :1])) * (1 - X[:, 2:] ** 2))
+    )
     names = [f"shape-{i}" for i in range(N_SHAPES)]
     score = rng.standard_normal((N_SHAPES, 3))
     modes = np.stack([X * [0, 0, 0.09], X * [0.05, 0, 0], X * [0, 0.03, 0] * (X[:, 1:2] > 0)])
@@ -49,7 +61,9 @@ def make_study(n=14):
         tree[f"original/{name}"] = as_dataset(position + 5, T)
         tree[f"coarse/{name}"] = as_dataset(position + 5, T, eigenvalue=np.arange(K))
         weights = (T[owner] == np.arange(len(X))[:, None]).astype(float)
-        tree[f"registration/{name}"] = dataset(template_triangle=owner, template_barycentric=weights)
+        tree[f"registration/{name}"] = dataset(
+            template_triangle=owner, template_barycentric=weights
+        )
     source, target = np.array(
         [(i, j) for i in range(N_SHAPES) for j in range(N_SHAPES) if (i - j) % 6 in (1, 2, 4, 5)]
     ).T
@@ -90,7 +104,8 @@ def make_study(n=14):
     tree["report"] = dataset(
         {"n_coarse": 6000, "k": 100, "refine": "joint"},
         status=["ok"] * 5 + ["repaired", "excluded"],
-        reason=[""] * 5 + ["3 duplicate triangles removed", "not a surface: <script>alert('&')</script>"],
+        reason=[""] * 5
+        + ["3 duplicate triangles removed", "not a surface: <script>alert('&')</script>"],
         path=[f"heads/shape-{i}.ply" for i in range(7)],
         seconds=[1.5, 20.0, 3.25],
         peak_memory=[300.0, 1200.0, 900.0],
@@ -105,13 +120,13 @@ def study():
 
 @pytest.fixture(scope="module")
 def html(study):
-    return view.page(study, title="Seven <ellipsoids>")
+    return page.page(study, title="Seven <ellipsoids>")
 
 
 def test_a_sphere_is_drawn_as_a_disk_of_its_area():
     X, T = sphere(40)
     picture = draw.render(X, T, size=(200, 200))
-    assert picture.shape == (200, 200, 4)
+    assert pictures.shape == (200, 200, 4)
     assert picture[..., 3].sum() / 255 == pytest.approx(np.pi * (0.94 * 100) ** 2, rel=0.01)
     assert picture[100, 100, 3] == 255
     assert picture[0, 0, 3] == 0
@@ -122,7 +137,9 @@ def test_the_nearer_surface_hides_the_farther_whatever_their_order():
     both = np.concatenate([X, 0.5 * X + draw.rotation()[2] * 2])
     colors = np.repeat([[1.0, 0, 0], [0, 0, 1.0]], len(X), axis=0)
     triangles = np.concatenate([T, T + len(X)])
-    pictures = [draw.render(both, t, colors=colors, size=(100, 100)) for t in (triangles, triangles[::-1])]
+    pictures = [
+        draw.render(both, t, colors=colors, size=(100, 100)) for t in (triangles, triangles[::-1])
+    ]
     assert np.array_equal(pictures[0], pictures[1])
     red, _, blue, opacity = pictures[0][50, 50].astype(int)
     assert opacity == 255
@@ -140,7 +157,9 @@ def test_chunks_do_not_change_the_picture(monkeypatch):
 
 def test_a_surface_turned_inside_out_looks_the_same():
     X, T = sphere()
-    assert np.array_equal(draw.render(X, T, size=(80, 60)), draw.render(X, T[:, ::-1], size=(80, 60)))
+    assert np.array_equal(
+        draw.render(X, T, size=(80, 60)), draw.render(X, T[:, ::-1], size=(80, 60))
+    )
 
 
 @pytest.mark.parametrize("up", ["x", "y", "z"])
@@ -165,15 +184,17 @@ def test_labels_are_not_mixed():
 
 def test_positive_is_blue_negative_is_red_and_unknown_is_grey():
     X, T = sphere()
-    red, _, blue, _ = draw.render(X, T, colors=draw.signed_colors(np.ones(len(X)), 1), size=(60, 60))[30, 30].astype(
-        int
-    )
+    red, _, blue, _ = draw.render(
+        X, T, colors=draw.signed_colors(np.ones(len(X)), 1), size=(60, 60)
+    )[30, 30].astype(int)
     assert blue > red + 50
-    red, _, blue, _ = draw.render(X, T, colors=draw.signed_colors(-np.ones(len(X)), 1), size=(60, 60))[30, 30].astype(
-        int
-    )
+    red, _, blue, _ = draw.render(
+        X, T, colors=draw.signed_colors(-np.ones(len(X)), 1), size=(60, 60)
+    )[30, 30].astype(int)
     assert red > blue + 50
-    grey = draw.render(X, T, colors=draw.signed_colors(np.full(len(X), np.nan), 1), size=(60, 60))[30, 30, :3]
+    grey = draw.render(X, T, colors=draw.signed_colors(np.full(len(X), np.nan), 1), size=(60, 60))[
+        30, 30, :3
+    ]
     assert np.ptp(grey.astype(int)) < 12
 
 
@@ -191,7 +212,7 @@ def test_the_page_is_one_file_without_any_address_outside(html):
     assert not re.findall(r"""(?:src|href)\s*=\s*["'](?!data:)""", html)
     assert "http" not in re.sub(r"data:[^\"]*|http://www.w3.org/2000/svg", "", html)
     assert len(html) < 8e6
-    assert html.count("<section>") == len(view.SECTIONS)
+    assert html.count("<section>") == len(page.SECTIONS)
     assert "Not there" not in html
 
 
@@ -224,24 +245,28 @@ def test_the_page_holds_the_modes_as_they_are(study, html):
 
 
 def test_the_page_is_the_same_every_time(study, html):
-    assert view.page(study, title="Seven <ellipsoids>") == html
+    assert page.page(study, title="Seven <ellipsoids>") == html
 
 
-@pytest.mark.parametrize("node", ["original", "coarse", "network", "latent", "registration", "pca", "report"])
+@pytest.mark.parametrize(
+    "node", ["original", "coarse", "network", "latent", "registration", "pca", "report"]
+)
 def test_an_unfinished_study_shows_what_there_is(study, node, tmp_path, monkeypatch):
-    for module in (view, picture):
-        monkeypatch.setattr(module, "render", lambda *surface, **look: np.zeros((2, 2, 4), np.uint8))
+    for module in (page, pictures):
+        monkeypatch.setattr(
+            module, "render", lambda *surface, **look: np.zeros((2, 2, 4), np.uint8)
+        )
     part = study.copy()
     del part[node]
-    text = view.write_page(part, tmp_path / "page.html").read_text(encoding="utf-8")
+    text = page.write_page(part, tmp_path / "page.html").read_text(encoding="utf-8")
     assert ("Not there" in text) == (node != "original")
-    assert text.count("<section>") == len(view.SECTIONS)
+    assert text.count("<section>") == len(page.SECTIONS)
 
 
 def test_an_empty_study_gives_a_page_too():
-    text = view.page(xr.DataTree())
+    text = page.page(xr.DataTree())
     assert "The study is empty." in text
-    assert text.count("Not there") == len(view.SECTIONS)
+    assert text.count("Not there") == len(page.SECTIONS)
 
 
 def test_modes_that_could_not_be_are_explained(study):
@@ -249,11 +274,11 @@ def test_modes_that_could_not_be_are_explained(study):
     del part["pca"]
     part["report"].attrs["no_modes"] = "three shapes are needed <found 2>"
     del part["coarse"], part["registration"]
-    assert "three shapes are needed &lt;found 2&gt;" in view.page(part)
+    assert "three shapes are needed &lt;found 2&gt;" in page.page(part)
 
 
 def test_the_picture_of_the_modes_is_blue_where_the_shape_grows(study, tmp_path):
-    path = picture.write_picture(study, tmp_path / "modes.png", view="front", size=(120, 100))
+    path = pictures.write_picture(study, tmp_path / "modes.png", view="front", size=(120, 100))
     pixels = np.asarray(Image.open(path)).astype(int)
     assert pixels.shape == (300, 360, 3)
     small, mean, large = np.split(pixels[:100], 3, axis=1)

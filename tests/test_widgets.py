@@ -1,4 +1,7 @@
-"""Panels without a browser: what they show equals the arrays, clicks do what they say, closing leaves nothing."""
+"""Panels without a browser.
+
+What they show equals the arrays, clicks do what they say, closing leaves nothing.
+"""
 
 import base64
 import json
@@ -17,11 +20,21 @@ from ipywidgets import Image
 from ipywidgets.widgets import widget as registry  # the open widgets are counted in it
 
 import s4a
-from s4a.draw import position_colors
-from s4a.live import color_bytes
-from s4a.mesh import vertex_normals
-from s4a.picture import aligned, mesh_of
-from s4a.widgets import Correspondence, Explore, FunctionalMap, Median, Modes, Network, Progress, Spectrum, Transfer
+from s4a.geometry.mesh import vertex_normals
+from s4a.show.draw import position_colors
+from s4a.show.live import color_bytes
+from s4a.show.pictures import aligned, mesh_of
+from s4a.widgets import (
+    Correspondence,
+    Explore,
+    FunctionalMap,
+    Median,
+    Modes,
+    Network,
+    Progress,
+    Spectrum,
+    Transfer,
+)
 from s4a.widgets import chart as chart_module
 from s4a.widgets import explore as explore_module
 from s4a.widgets import modes_view as modes_module
@@ -33,7 +46,9 @@ from s4a.widgets.scene import StillScene, scene
 
 @pytest.fixture(scope="module")
 def study():
-    return s4a.analyse(s4a.synthetic.brains(5, 1500, seed=1), n_coarse=400, k=24, k_init=10, n_jobs=1)
+    return s4a.analyse(
+        s4a.synthetic.brains(5, 1500, seed=1), n_coarse=400, k=24, k_init=10, n_jobs=1
+    )
 
 
 @pytest.fixture
@@ -118,9 +133,14 @@ def test_the_browser_gets_mean_and_modes_as_they_are(study, panel):
     modes = panel(Modes, resolution="full")
     X = study["registration"]["position"].values + study["pca"]["mean_displacement"].values
     assert (floats(modes.view.mean) == X.astype(np.float32)).all()
-    assert (floats(modes.view.deformation) == study["pca"]["deformation"].values.reshape(-1, 3)).all()
+    assert (
+        floats(modes.view.deformation) == study["pca"]["deformation"].values.reshape(-1, 3)
+    ).all()
     modes.resolution.value = "coarse"
-    assert len(floats(modes.view.mean)) == study["coarse"][study["registration"].attrs["template"]].sizes["vertex"]
+    assert (
+        len(floats(modes.view.mean))
+        == study["coarse"][study["registration"].attrs["template"]].sizes["vertex"]
+    )
     assert len(floats(modes.view.deformation)) == 4 * len(floats(modes.view.mean))
 
 
@@ -134,7 +154,9 @@ def test_the_mesh_is_saved_with_its_displacement_along_the_normal(study, panel, 
     modes = panel(Modes)
     modes.scores = [2.0, 0, 0, 0]
     modes.save_mesh(tmp_path / "shape.ply")
-    np.testing.assert_allclose(s4a.read_mesh(tmp_path / "shape.ply")[0], modes.vertices(), atol=1e-3)
+    np.testing.assert_allclose(
+        s4a.read_mesh(tmp_path / "shape.ply")[0], modes.vertices(), atol=1e-3
+    )
     assert b"normal_displacement" in (tmp_path / "shape.ply").read_bytes()[:1000]
     modes.save_mesh(tmp_path / "shape.obj")
     assert (tmp_path / "shape.obj").exists()
@@ -206,7 +228,9 @@ def test_a_clicked_edge_shows_its_map_and_both_meshes(study, panel):
     network.graph.picked = {"edge": 3, "count": 1}
     assert network.edge == 3
     row = study["network"].dataset.isel(pair=network.edge)
-    assert network.matrix.spec["title"].startswith(f"{row['source'].item()} → {row['target'].item()}")
+    assert network.matrix.spec["title"].startswith(
+        f"{row['source'].item()} → {row['target'].item()}"
+    )
     shown = np.frombuffer(network.matrix.values, "<f4").reshape(row["fmap"].shape)
     assert (shown == row["fmap"].values.astype(np.float32)).all()
     for view, key in zip(network.scenes, ("source", "target"), strict=True):
@@ -241,7 +265,9 @@ def test_edges_are_coloured_before_and_after_on_one_scale(study, panel):
     network.stage.value = "cycle_error_initial"
     assert network.bar.value == bar
     assert network.graph.spec["values"] != after
-    np.testing.assert_allclose(network.graph.spec["values"], study["network"]["cycle_error_initial"].values)
+    np.testing.assert_allclose(
+        network.graph.spec["values"], study["network"]["cycle_error_initial"].values
+    )
 
 
 def test_zoomout_is_replayed_as_the_step_module_does_it(study, panel):
@@ -251,7 +277,7 @@ def test_zoomout_is_replayed_as_the_step_module_does_it(study, panel):
     source, target = (study["coarse"][row[key].item()] for key in ("source", "target"))
     area = target["vertex_area"].values / target["vertex_area"].values.sum()
     bases = source["eigenfunction"].values, target["eigenfunction"].values
-    C, _ = s4a.fmap.zoomout(row["fmap_initial"].values, *bases, area, 24)
+    C, _ = s4a.method.fmap.zoomout(row["fmap_initial"].values, *bases, area, 24)
     np.testing.assert_allclose(fmap.C, C)
     fmap.k.value = 10
     np.testing.assert_array_equal(fmap.C, row["fmap_initial"].values)
@@ -274,7 +300,9 @@ def test_a_clicked_cell_shows_the_two_eigenfunctions(study, panel):
 def test_bars_are_the_stored_distances_in_rising_order(study, panel):
     median = panel(Median)
     latent = study["latent"].dataset
-    np.testing.assert_allclose(median.bars.spec["values"], np.sort(latent["distance_to_median"].values))
+    np.testing.assert_allclose(
+        median.bars.spec["values"], np.sort(latent["distance_to_median"].values)
+    )
     assert median.median == latent.attrs["median"] == median.selected
     median.bars.picked = {"index": 2, "count": 1}
     assert median.selected == median.bars.spec["names"][2]
@@ -287,7 +315,9 @@ def test_the_median_can_be_ranked_by_other_operators_norms_and_modes(study, pane
     values = median.bars.spec["values"]
     median.operator.value, median.modes.value = "conformal", 12
     D = study["latent"]["conformal_difference"].values[:, :12, :12]
-    expected = s4a.median.distance_to_identity(D, study["latent"]["latent_eigenvalue"].values[:12])
+    expected = s4a.method.median.distance_to_identity(
+        D, study["latent"]["latent_eigenvalue"].values[:12]
+    )
     np.testing.assert_allclose(median.bars.spec["values"], np.sort(expected))
     assert median.bars.spec["values"] != values
     assert "The median is" in median.ties.value
@@ -349,7 +379,9 @@ def test_the_browser_knows_the_image_of_every_vertex(study, panel):
     both.scenes[1].picked = {"vertex": 40, "count": 2}
     assert both.vertex == back[40]
     sure = study["registration"]["confidence"].sel(shape=both.shape).values
-    np.testing.assert_allclose(np.frombuffer(both.scenes[0].link_values, np.uint8) / 100, sure, atol=0.006)
+    np.testing.assert_allclose(
+        np.frombuffer(both.scenes[0].link_values, np.uint8) / 100, sure, atol=0.006
+    )
     both.map.value = "low"
     back = np.frombuffer(both.scenes[1].link, "<i4")
     assert set(back[back >= 0]) <= set(range(len(both.match())))
@@ -361,7 +393,7 @@ def test_landmarks_are_spheres_of_a_radius_in_the_datas_unit(panel):
     both.radius.value = 2.5
     assert {point[6] for view in both.scenes for point in view.points} == {2.5}
     X, T = tetrahedron()
-    moved, _, colors = s4a.draw.with_balls(X, T, None, [[9, 9, 9, 1, 0, 0, 2.5]])
+    moved, _, colors = s4a.show.draw.with_balls(X, T, None, [[9, 9, 9, 1, 0, 0, 2.5]])
     np.testing.assert_allclose(np.linalg.norm(moved[4:] - 9, axis=1), 2.5)
     assert (colors[4:] == [1, 0, 0]).all()
 
@@ -372,10 +404,14 @@ def test_labels_and_landmarks_are_carried_as_the_step_module_does_it(study, pane
     mesh = study["original"][source].to_dataset()
     names = mesh["landmark_name"].values.tolist()
     assert list(both.marks) == names
-    expected = s4a.transfer.transfer_landmarks(study, mesh, source=source, targets=[target])[target]
+    expected = s4a.analysis.transfer.transfer_landmarks(
+        study, mesh, source=source, targets=[target]
+    )[target]
     points = aligned(study, target, expected["landmark_position"].values)
     np.testing.assert_allclose([p[:3] for p in both.scenes[1].points], points)
-    label = s4a.transfer.transfer_labels(study, mesh["label"].values, source=source, targets=[target])[target]["label"]
+    label = s4a.transfer_labels(study, mesh["label"].values, source=source, targets=[target])[
+        target
+    ]["label"]
     shown = np.frombuffer(both.scenes[1].color, np.uint8).reshape(-1, 3)
     here = np.frombuffer(both.scenes[0].color, np.uint8).reshape(-1, 3)
     value = label.values[0]
@@ -394,7 +430,11 @@ def test_names_of_labels_and_landmarks_are_text_in_panels_and_saved_pages(study,
         node.dataset = data
     both = Transfer(tree)
     both.landmark = bad
-    texts = [both.legend.value, both.table.value, both.save_html(tmp_path / "page.html").read_text(encoding="utf-8")]
+    texts = [
+        both.legend.value,
+        both.table.value,
+        both.save_html(tmp_path / "page.html").read_text(encoding="utf-8"),
+    ]
     both.say(bad, error=True)
     for text in [*texts, both.message.value]:
         assert "&lt;img src=x" in text
@@ -454,7 +494,9 @@ def test_an_analysis_shows_its_progress_and_its_panels(tmp_path):
     shapes = s4a.synthetic.brains(3, 500, seed=1)
     panel = Progress(shapes, tmp_path / "study", n_coarse=200, k=12, k_init=6, n_jobs=1)
     assert ended(panel) == "finished"
-    assert [(bar.value, bar.max) for bar in panel.bars.values()] == [(n, n) for n in (3, 3, 1, 1, 3, 1)]
+    assert [(bar.value, bar.max) for bar in panel.bars.values()] == [
+        (n, n) for n in (3, 3, 1, 1, 3, 1)
+    ]
     assert {bar.bar_style for bar in panel.bars.values()} == {"success"}
     panel.view.click()
     assert panel.explored["Network"].names == ["brain_01", "brain_02", "brain_03"]
@@ -526,7 +568,9 @@ def test_tabs_are_built_when_opened_and_leave_nothing(study):
 
 
 def test_an_unfinished_study_says_what_is_missing(study):
-    started = xr.DataTree.from_dict({f"coarse/{n}": c.to_dataset() for n, c in study["coarse"].children.items()})
+    started = xr.DataTree.from_dict(
+        {f"coarse/{n}": c.to_dataset() for n, c in study["coarse"].children.items()}
+    )
     tabs = Explore(started)
     assert "pca/deformation" in tabs.tabs.children[0].children[0].value
     assert tabs["Spectrum"].names == list(study["coarse"].children)
@@ -551,7 +595,9 @@ def test_a_page_needs_nothing_from_elsewhere(panel, tmp_path):
         text = panel(kind).save_html(tmp_path / "page.html").read_text(encoding="utf-8")
         links = set(re.findall(r"(?:src|href)=[\"']?([^\"'> ]{1,12})|https?://[^\"'` )]+", text))
         assert {link for link in links if link and not link.startswith("data:")} == set()
-        for state in re.findall(r'<script type="application/json"[^>]*>(.*?)</script>', text, re.DOTALL):
+        for state in re.findall(
+            r'<script type="application/json"[^>]*>(.*?)</script>', text, re.DOTALL
+        ):
             json.loads(state)
 
 
@@ -601,5 +647,7 @@ def test_the_error_names_what_to_install(tmp_path):
         "try: s4a.explore(None)\n"
         "except ImportError as error: sys.stdout.write(str(error))"
     )
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    out = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout
     assert "pip install s4a[notebook]" in out

@@ -1,6 +1,6 @@
 """What runs in the browser: the scripts of this package, put together for a widget."""
 
-from s4a.live import script
+from s4a.show.live import script
 
 try:
     import anywidget

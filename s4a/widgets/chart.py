@@ -4,9 +4,9 @@ import ipywidgets
 import numpy as np
 import traitlets
 
-from s4a import charts
-from s4a.draw import SIGNED, data_uri
-from s4a.live import STYLE, as_bytes, table
+from s4a.show import charts
+from s4a.show.draw import SIGNED, data_uri
+from s4a.show.live import STYLE, as_bytes, table
 from s4a.widgets.browser import CHART, anywidget
 
 
@@ -30,7 +30,10 @@ class ChartBase:
     """What a chart does, whoever draws it."""
 
     def draw(self, kind, **spec):
-        """Draw a chart: ``scatter``, ``bars``, ``lines`` or ``graph`` with the numbers that the kind needs."""
+        """Draw a chart: ``scatter``, ``bars``.
+
+        ``lines`` or ``graph`` with the numbers that the kind needs.
+        """
         self.spec = plain({"kind": kind, **spec})
 
     def matrix(self, values, limit=1.0, **spec):
@@ -43,7 +46,10 @@ class ChartBase:
 if anywidget is not None:
 
     class Chart(ChartBase, anywidget.AnyWidget):
-        """A chart in the browser; `picked` is the mark that was clicked: an index, node, edge, or row and column."""
+        """A chart in the browser.
+
+        `picked` is the mark that was clicked: an index, node, edge, or row and column.
+        """
 
         _esm, _css = CHART, STYLE
         spec, picked = traitlets.Dict().tag(sync=True), traitlets.Dict().tag(sync=True)

@@ -1,14 +1,17 @@
-"""Correspondence (eq. 3, 6, 7): the template and a shape, with the colours, texture and points that the map carries."""
+"""Correspondence (eq. 3, 6, 7).
+
+The template and a shape, with the colours, texture and points that the map carries.
+"""
 
 import ipywidgets
 import numpy as np
 import traitlets
 
-from s4a.draw import position_colors, ramp_colors
-from s4a.fmap import nearest_rows
-from s4a.live import color_bar
-from s4a.picture import carried_colors, has, mesh_of, names_of
-from s4a.register import Scan, intrinsic_match
+from s4a.method.fmap import nearest_rows
+from s4a.method.register import Scan, intrinsic_match
+from s4a.show.draw import position_colors, ramp_colors
+from s4a.show.live import color_bar
+from s4a.show.pictures import carried_colors, has, mesh_of, names_of
 from s4a.widgets.meshes import camera_group, nice, surface, unit_of
 from s4a.widgets.panel import Panel, beside, row
 from s4a.widgets.scene import extent, scene
@@ -23,7 +26,9 @@ CELLS = 14  # of the checkerboard along the surface's extent
 
 
 class Correspondence(Panel):
-    """Two linked surfaces; a point under the pointer, or clicked, is shown at its image on the other.
+    """Two linked surfaces; a point under the pointer, or clicked.
+
+    Is shown at its image on the other.
 
     The keyboard does the same: C starts a cursor that the arrow keys move over the surface.
 
@@ -51,10 +56,14 @@ class Correspondence(Panel):
         self.map = ipywidgets.Dropdown(
             options=MAPS if latent else MAPS[:1], description="map", layout={"width": "360px"}
         )
-        self.colors = ipywidgets.Dropdown(options=SHOWN, description="colours", layout={"width": "320px"})
+        self.colors = ipywidgets.Dropdown(
+            options=SHOWN, description="colours", layout={"width": "320px"}
+        )
         self.hover = ipywidgets.Checkbox(True, description="follow the pointer", indent=False)
         group = camera_group()
-        self.scenes = [scene(group=group, view=view, up=up, height=400, clickable=True) for _ in range(2)]
+        self.scenes = [
+            scene(group=group, view=view, up=up, height=400, clickable=True) for _ in range(2)
+        ]
         self.matches = {}
         self.on_change(self.choice, lambda value: self.set_trait("shape", value))
         self.on_change(self.map, lambda _: self.draw())
@@ -74,7 +83,10 @@ class Correspondence(Panel):
             view.hovering = bool(on)
 
     def match(self):
-        """On each vertex of the template that is shown, the matched vertex of the shape that is shown."""
+        """On each vertex of the template that is shown.
+
+        The matched vertex of the shape that is shown.
+        """
         key = self.shape, self.map.value
         if key[1] == "registered":
             return self.study["registration"]["registered_match"].sel(shape=self.shape).values
@@ -87,7 +99,10 @@ class Correspondence(Panel):
             if key[1] == "low":
                 self.matches[key] = nearest_rows(F[1], F[0])
             else:
-                scans = [Scan(self.study["original"][n].to_dataset(), c) for n, c in zip(names, coarse, strict=True)]
+                scans = [
+                    Scan(self.study["original"][n].to_dataset(), c)
+                    for n, c in zip(names, coarse, strict=True)
+                ]
                 self.matches[key] = intrinsic_match(*scans, *F)[0]
         return self.matches[key]
 
@@ -96,7 +111,10 @@ class Correspondence(Panel):
         self.choice.value = self.shape
         self.vertex = self.image = -1
         stage = "coarse" if self.map.value == "low" else "original"
-        self.pair = surface(self.study, self.template, stage), surface(self.study, self.shape, stage)
+        self.pair = (
+            surface(self.study, self.template, stage),
+            surface(self.study, self.shape, stage),
+        )
         if self.map.value == "registered":
             self.pair = mesh_of(self.study["registration"]), self.pair[1]
         colors, coordinates, bar, note = self.painted()
@@ -111,7 +129,10 @@ class Correspondence(Panel):
         self.connect()
 
     def painted(self):
-        """Of both surfaces the colours and the coordinates of a checkerboard, their colour bar and what they are."""
+        """Of both surfaces the colours and the coordinates of a checkerboard.
+
+        Their colour bar and what they are.
+        """
         (X, _), (Y, _) = self.pair
         kind = self.colors.value
         if self.map.value != "registered":
@@ -119,12 +140,24 @@ class Correspondence(Panel):
             colors = position_colors(Y)
             if kind == "confidence":
                 note = f"the confidence belongs to the registration; here {note}"
-            return (colors[match], colors), (Y[match], Y) if kind == "checker" else (None, None), None, note
-        bar, coordinates, note = None, (None, None), "the template's coordinates, carried to the shape"
+            return (
+                (colors[match], colors),
+                (Y[match], Y) if kind == "checker" else (None, None),
+                None,
+                note,
+            )
+        bar, coordinates, note = (
+            None,
+            (None, None),
+            "the template's coordinates, carried to the shape",
+        )
         colors = position_colors(X)
         if kind == "confidence":
             value = self.study["registration"]["confidence"].sel(shape=self.shape).values
-            colors, note = ramp_colors(value, 0, 1), "the registration's confidence, carried to the shape"
+            colors, note = (
+                ramp_colors(value, 0, 1),
+                "the registration's confidence, carried to the shape",
+            )
             bar = color_bar("viridis", 0, 1, f"confidence, {value.mean():.2f} on average")
         if kind == "checker":
             carried = carried_colors(self.study, self.shape, X)
@@ -145,9 +178,15 @@ class Correspondence(Panel):
     def way_back(self):
         """On each vertex of the shape the vertex of the template that lies there, -1 for none."""
         node = self.study["registration"].children.get(self.shape)
-        if self.map.value == "registered" and node is not None and "template_triangle" in node.data_vars:
+        if (
+            self.map.value == "registered"
+            and node is not None
+            and "template_triangle" in node.data_vars
+        ):
             corners = self.pair[0][1][node["template_triangle"].values]
-            return np.take_along_axis(corners, node["template_barycentric"].values.argmax(1)[:, None], axis=1)[:, 0]
+            return np.take_along_axis(
+                corners, node["template_barycentric"].values.argmax(1)[:, None], axis=1
+            )[:, 0]
         match = self.match()
         back = np.full(len(self.pair[1][0]), -1)
         back[match[::-1]] = np.arange(len(match))[::-1]
@@ -168,7 +207,9 @@ class Correspondence(Panel):
             return
         self.vertex, self.image = int(self.way_back()[vertex]), vertex
         if self.vertex < 0:
-            return self.say(f"no vertex of the template is matched to vertex {vertex} of {self.shape}")
+            return self.say(
+                f"no vertex of the template is matched to vertex {vertex} of {self.shape}"
+            )
         self.point(self.pair[0][0][self.vertex], self.pair[1][0][vertex])
 
     def point(self, on_template, on_shape):
@@ -177,6 +218,8 @@ class Correspondence(Panel):
             view.mark([place])
         text = f"template vertex {self.vertex} ↔ {self.shape} vertex {self.image}"
         if self.map.value == "registered" and "confidence" in self.study["registration"].data_vars:
-            value = self.study["registration"]["confidence"].sel(shape=self.shape).values[self.vertex]
+            value = (
+                self.study["registration"]["confidence"].sel(shape=self.shape).values[self.vertex]
+            )
             text += f", confidence {value:.2f}"
         self.scenes[0].caption = self.scenes[1].caption = text

@@ -43,7 +43,9 @@ class Explore(ipywidgets.VBox):
 
     def __init__(self, study, **options):
         self.study, self.options, self.panels = study, options, {}
-        self.tabs = ipywidgets.Tab(children=[ipywidgets.VBox() for _ in PANELS], titles=list(PANELS))
+        self.tabs = ipywidgets.Tab(
+            children=[ipywidgets.VBox() for _ in PANELS], titles=list(PANELS)
+        )
         self.tabs.add_class("s4a-tabs")  # in style.css
         super().__init__([self.tabs], layout=LAYOUT)
         self.tabs.observe(self.fill, "selected_index")
@@ -97,7 +99,10 @@ def running_cell():
 
 
 def explore(study, **options):
-    """Tabs in place of those that an earlier run of the same cell opened, which are closed: nothing piles up."""
+    """Tabs in place of those that an earlier run of the same cell opened, which are closed.
+
+    Nothing piles up.
+    """
     found = running_cell()
     if found is None:
         return Explore(study, **options)

@@ -1,10 +1,13 @@
-"""The surfaces of a study as a panel shows them: every shape moved onto the template, at low or full resolution."""
+"""The surfaces of a study as a panel shows them.
+
+Every shape moved onto the template, at low or full resolution.
+"""
 
 from uuid import uuid4
 
 import numpy as np
 
-from s4a.picture import aligned, mesh_of
+from s4a.show.pictures import aligned, mesh_of
 
 RESOLUTIONS = [("low resolution", "coarse"), ("full resolution", "original")]
 
@@ -16,13 +19,20 @@ def surface(study, name, stage="coarse"):
 
 
 def camera_group():
-    """A name that no other panel has: the views of one panel turn together, those of two panels do not."""
+    """A name that no other panel has.
+
+    The views of one panel turn together, those of two panels do not.
+    """
     return uuid4().hex
 
 
 def available(study):
     """The resolutions that the study holds, as the options of a switch."""
-    return [(text, stage) for text, stage in RESOLUTIONS if stage in study.children and study[stage].children]
+    return [
+        (text, stage)
+        for text, stage in RESOLUTIONS
+        if stage in study.children and study[stage].children
+    ]
 
 
 def unit_of(study, name):

@@ -6,11 +6,11 @@ import ipywidgets
 import numpy as np
 import traitlets
 
-from s4a.deform import normal_displacement
-from s4a.io import write_mesh
-from s4a.live import mode_arrays, study_state, template_coarse
-from s4a.mesh import vertex_normals
-from s4a.pca import color_limits, deformed, mahalanobis, plausible_scores
+from s4a.geometry.mesh import vertex_normals
+from s4a.input.files import write_mesh
+from s4a.method.deform import normal_displacement
+from s4a.method.pca import color_limits, deformed, mahalanobis, plausible_scores
+from s4a.show.live import mode_arrays, study_state, template_coarse
 from s4a.widgets.meshes import camera_group, unit_of
 from s4a.widgets.modes_view import modes_view
 from s4a.widgets.panel import Panel, row
@@ -26,11 +26,12 @@ class Modes(Panel):
     study : xarray.DataTree
         With ``/registration`` and ``/pca``.
     resolution : {None, "full", "coarse"}
-        Which vertices of the template; by default the full resolution, unless its modes are more than 40 MB.
+        Which vertices of the template; by default the full resolution, unless its modes are more
+        than 40 MB.
     n_modes : int, optional
         How many modes; all by default.
     view, up
-        From where the shape is seen first; see :func:`s4a.draw.rotation`.
+        From where the shape is seen first; see :func:`s4a.show.draw.rotation`.
 
     Attributes
     ----------
@@ -64,13 +65,23 @@ class Modes(Panel):
         sizes = [(f"full, {self.study['registration'].sizes['vertex']:,} vertices", "full")]
         if self.coarse is not None:
             sizes.append((f"coarse, {self.coarse.sizes['vertex']:,} vertices", "coarse"))
-        self.resolution = ipywidgets.Dropdown(options=sizes, value=resolution, description="resolution")
+        self.resolution = ipywidgets.Dropdown(
+            options=sizes, value=resolution, description="resolution"
+        )
         self.path = ipywidgets.Text("shape.ply", description="file", layout={"width": "260px"})
-        self.ply = ipywidgets.Button(description="Save mesh", tooltip="the shape as it stands, at full resolution")
-        self.html = ipywidgets.Button(description="Save page", tooltip="one HTML file with these sliders, for offline")
+        self.ply = ipywidgets.Button(
+            description="Save mesh", tooltip="the shape as it stands, at full resolution"
+        )
+        self.html = ipywidgets.Button(
+            description="Save page", tooltip="one HTML file with these sliders, for offline"
+        )
         self.on_change(self.resolution, lambda value: self.view.change_mesh(*self.arrays(value)))
-        self.ply.on_click(self.guarded(lambda _: self.say(f"written: {self.save_mesh(self.path.value)}")))
-        self.html.on_click(self.guarded(lambda _: self.say(f"written: {self.save_html(self.page_path())}")))
+        self.ply.on_click(
+            self.guarded(lambda _: self.say(f"written: {self.save_mesh(self.path.value)}"))
+        )
+        self.html.on_click(
+            self.guarded(lambda _: self.say(f"written: {self.save_html(self.page_path())}"))
+        )
         return [self.view, row(self.resolution, self.path, self.ply, self.html)]
 
     def arrays(self, resolution):
@@ -97,13 +108,20 @@ class Modes(Panel):
         return self.scores
 
     def save_mesh(self, path):
-        """Write the shape as the sliders stand, at full resolution, in any format of :func:`s4a.write_mesh`."""
+        """Write the shape as the sliders stand, at full resolution.
+
+        In any format of :func:`s4a.write_mesh`.
+        """
         mean, T, _ = self.arrays("full")
         X, path = self.vertices(), Path(path)
         values = (
             {}
             if path.suffix.lower() in (".obj", ".off", ".stl")
-            else {"normal_displacement": normal_displacement(X - mean, vertex_normals(mean, T)).astype(np.float32)}
+            else {
+                "normal_displacement": normal_displacement(
+                    X - mean, vertex_normals(mean, T)
+                ).astype(np.float32)
+            }
         )
         write_mesh(path, X, T, **values)
         return path

@@ -1,20 +1,25 @@
-"""The modes of a collection as sliders that deform the mean shape: in the browser, or in Python without anywidget."""
+"""The modes of a collection as sliders that deform the mean shape.
+
+In the browser, or in Python without anywidget.
+"""
 
 import ipywidgets
 import numpy as np
 import traitlets
 
-from s4a.draw import signed_colors
-from s4a.live import MODES, STYLE, bars, look_state, mesh_state
-from s4a.mesh import vertex_normals
-from s4a.pca import deformed
+from s4a.geometry.mesh import vertex_normals
+from s4a.method.pca import deformed
+from s4a.show.draw import signed_colors
+from s4a.show.live import MODES, STYLE, bars, look_state, mesh_state
 from s4a.widgets.browser import anywidget
 from s4a.widgets.scene import Surfaces, scene
 
 if anywidget is not None:
 
     class ModesView(Surfaces, anywidget.AnyWidget):
-        """Sliders, shape and charts in the browser; only the scores come back, some hundred bytes a step.
+        """Sliders, shape and charts in the browser.
+
+        Only the scores come back, some hundred bytes a step.
 
         Attributes
         ----------
@@ -31,7 +36,9 @@ if anywidget is not None:
         mean, corner, deformation, still = (traitlets.Bytes().tag(sync=True) for _ in range(4))
         signed_table, ramp_table = (traitlets.Bytes().tag(sync=True) for _ in range(2))
         limit, limit_magnitude = (traitlets.Float(1.0).tag(sync=True) for _ in range(2))
-        scores, ratio, ratio_low, samples, names, turn = (traitlets.List().tag(sync=True) for _ in range(6))
+        scores, ratio, ratio_low, samples, names, turn = (
+            traitlets.List().tag(sync=True) for _ in range(6)
+        )
         bars = traitlets.Dict().tag(sync=True)
         colors = traitlets.Enum(["normal", "magnitude", "none"], "normal").tag(sync=True)
         beside = traitlets.Bool(False).tag(sync=True)
@@ -39,7 +46,9 @@ if anywidget is not None:
         group, webgl = (traitlets.Unicode("").tag(sync=True) for _ in range(2))
         height = traitlets.Int(420).tag(sync=True)
 
-        def __init__(self, mean, triangles, deformation, *, limits, unit, view="corner", up="z", **options):
+        def __init__(
+            self, mean, triangles, deformation, *, limits, unit, view="corner", up="z", **options
+        ):
             self.arrays = mean, triangles, deformation
             super().__init__(
                 **mesh_state(mean, triangles, deformation),
@@ -84,16 +93,36 @@ class StillModes(ipywidgets.VBox):
     scores, sample = traitlets.List(), traitlets.Int(-1)
     colors, beside = traitlets.Unicode("normal"), traitlets.Bool(False)
 
-    def __init__(self, mean, triangles, deformation, *, limits, ratio, samples, names, unit, view, up, **options):
+    def __init__(
+        self,
+        mean,
+        triangles,
+        deformation,
+        *,
+        limits,
+        ratio,
+        samples,
+        names,
+        unit,
+        view,
+        up,
+        **options,
+    ):
         self.arrays, self.limit, self.samples = (mean, triangles, deformation), limits[0], samples
         self.shape = scene(title="mean + Σ score · deformation", view=view, up=up)
         self.shape.bar = bars(*limits, unit)["normal"]
         self.sliders = [
-            ipywidgets.FloatSlider(0, min=-3, max=3, step=0.05, description=f"PC{i + 1} · {share:.1%}")
+            ipywidgets.FloatSlider(
+                0, min=-3, max=3, step=0.05, description=f"PC{i + 1} · {share:.1%}"
+            )
             for i, share in enumerate(ratio)
         ]
-        self.choice = ipywidgets.Dropdown(options=[("mean", -1), *((n, i) for i, n in enumerate(names))])
-        super().__init__([ipywidgets.HBox([self.shape, ipywidgets.VBox([self.choice, *self.sliders])])])
+        self.choice = ipywidgets.Dropdown(
+            options=[("mean", -1), *((n, i) for i, n in enumerate(names))]
+        )
+        super().__init__(
+            [ipywidgets.HBox([self.shape, ipywidgets.VBox([self.choice, *self.sliders])])]
+        )
         self.scores = [0.0] * len(deformation)
         for slider in self.sliders:
             slider.observe(self.collect, "value")
@@ -106,7 +135,9 @@ class StillModes(ipywidgets.VBox):
     def choose(self, change):
         """The scores of the sample that was chosen."""
         self.sample = change["new"]
-        self.scores = [0.0] * len(self.scores) if self.sample < 0 else list(self.samples[self.sample])
+        self.scores = (
+            [0.0] * len(self.scores) if self.sample < 0 else list(self.samples[self.sample])
+        )
 
     def change_mesh(self, mean, triangles, deformation):
         """Other vertices of the same shapes."""

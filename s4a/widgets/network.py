@@ -6,12 +6,12 @@ import traitlets
 from matplotlib import colormaps
 from matplotlib.colors import ListedColormap, to_hex
 
-from s4a import charts
-from s4a.draw import position_colors
-from s4a.fmap import match_from_fmap
-from s4a.live import color_bar
-from s4a.network import choose_pairs, connectivity, spectral_distance
-from s4a.picture import names_of
+from s4a.method.fmap import match_from_fmap
+from s4a.method.network import choose_pairs, connectivity, spectral_distance
+from s4a.show import charts
+from s4a.show.draw import position_colors
+from s4a.show.live import color_bar
+from s4a.show.pictures import names_of
 from s4a.widgets.chart import chart
 from s4a.widgets.meshes import camera_group, surface
 from s4a.widgets.panel import Panel, beside, paragraph, row
@@ -50,28 +50,43 @@ class Network(Panel):
         network = self.study["network"].dataset
         self.source, self.target = (network[key].values.astype(str) for key in ("source", "target"))
         self.names = [str(name) for name in np.unique(np.r_[self.source, self.target])]
-        self.ends = np.searchsorted(self.names, self.source), np.searchsorted(self.names, self.target)
+        self.ends = (
+            np.searchsorted(self.names, self.source),
+            np.searchsorted(self.names, self.target),
+        )
         spectra = [self.study["coarse"][name]["eigenvalue"].values for name in self.names]
         k = min(20, *(len(values) for values in spectra))
         self.distance = spectral_distance([values[:k] for values in spectra])
         n = len(self.names)
-        self.stage = ipywidgets.Dropdown(options=STAGES, description="colours", layout={"width": "320px"})
-        used = len({tuple(sorted(pair)) for pair in zip(*(end.tolist() for end in self.ends), strict=True)})
+        self.stage = ipywidgets.Dropdown(
+            options=STAGES, description="colours", layout={"width": "320px"}
+        )
+        used = len(
+            {tuple(sorted(pair)) for pair in zip(*(end.tolist() for end in self.ends), strict=True)}
+        )
         self.budget = ipywidgets.IntSlider(
-            used, min=n - 1, max=max(n - 1, n * (n - 1) // 2), description="pairs", layout={"width": "340px"}
+            used,
+            min=n - 1,
+            max=max(n - 1, n * (n - 1) // 2),
+            description="pairs",
+            layout={"width": "340px"},
         )
         options = [
             *((name, name) for name in self.names),
             *((f"{s} → {t}", i) for i, (s, t) in enumerate(self.directed())),
         ]
         self.choice = ipywidgets.Dropdown(options=options, description="show")
-        self.where = ipywidgets.Dropdown(options=["circle", "shape differences"], description="places")
+        self.where = ipywidgets.Dropdown(
+            options=["circle", "shape differences"], description="places"
+        )
         self.on_change(self.where, lambda _: self.draw())
         self.facts, self.bar = ipywidgets.HTML(), ipywidgets.HTML()
         self.graph, self.matrix = chart(), chart()
         group = camera_group()
         self.scenes = [scene(group=group, view=view, up=up, height=300) for _ in range(2)]
-        self.on_change(self.stage, lambda _: self.show_edge(self.edge) if self.edge >= 0 else self.draw())
+        self.on_change(
+            self.stage, lambda _: self.show_edge(self.edge) if self.edge >= 0 else self.draw()
+        )
         self.on_change(self.budget, lambda _: self.draw())
         self.on_change(self.choice, self.choose)
         self.on_change(self.graph, self.pick, "picked")
@@ -91,7 +106,10 @@ class Network(Panel):
         return list(zip(self.source, self.target, strict=True))
 
     def layout_of_nodes(self):
-        """Places ``(n, 2)``: a circle, or the first two components of the area-based shape differences."""
+        """Places ``(n, 2)``: a circle.
+
+        Or the first two components of the area-based shape differences.
+        """
         latent = self.study["latent"].dataset
         if (
             self.where.value == "circle"
@@ -135,7 +153,11 @@ class Network(Panel):
     def tell(self, pairs, values, top):
         """Numbers of the graph, and what its colours mean."""
         c = connectivity(pairs, len(self.names))
-        held = f", {len(self.shown)} maps of them in the study" if len(self.shown) < 2 * len(pairs) else ""
+        held = (
+            f", {len(self.shown)} maps of them in the study"
+            if len(self.shown) < 2 * len(pairs)
+            else ""
+        )
         known = values[np.isfinite(values)]
         middle = f"; median cycle error {np.median(known):.3f}" if len(known) else ""
         self.facts.value = paragraph(
@@ -169,7 +191,11 @@ class Network(Panel):
         self.choice.value = name
         self.matrix.layout.display = self.scenes[1].layout.display = "none"
         self.scenes[0].show(*surface(self.study, name), title=name)
-        self.scenes[0].caption = f"{(self.source == name).sum()} maps from it, {(self.target == name).sum()} to it"
+        self.scenes[
+            0
+        ].caption = (
+            f"{(self.source == name).sum()} maps from it, {(self.target == name).sum()} to it"
+        )
         self.draw()
 
     def show_edge(self, edge):
@@ -190,5 +216,9 @@ class Network(Panel):
         self.scenes[1].show(Y, S, colors[match_from_fmap(C, *bases)], f"{names[1]}, the target")
         error, weight = network[self.stage.value].item(), network["weight"].item()
         self.scenes[0].caption = "its coordinates as colours"
-        self.scenes[1].caption = f"the colours that the map carries; cycle error {error:.3f}, weight {weight:.2f}"
+        self.scenes[
+            1
+        ].caption = (
+            f"the colours that the map carries; cycle error {error:.3f}, weight {weight:.2f}"
+        )
         self.draw()

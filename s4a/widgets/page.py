@@ -1,4 +1,7 @@
-"""A panel as one HTML file: the same scripts, and a recording of what Python shows for the values of its controls."""
+"""A panel as one HTML file.
+
+The same scripts, and a recording of what Python shows for the values of its controls.
+"""
 
 import base64
 import itertools
@@ -10,7 +13,7 @@ from html import escape
 import ipywidgets
 from tqdm.auto import tqdm
 
-from s4a.live import MODEL, STYLE, encoded, module, script, widget_html
+from s4a.show.live import MODEL, STYLE, encoded, module, script, widget_html
 
 LIMIT = 24_000_000  # characters of recorded values in a page
 LADDER = 24  # values of a slider that are kept
@@ -21,7 +24,14 @@ body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 1100px; mar
 .value input[type=range] { width: 15em; vertical-align: middle; } [hidden] { display: none !important; }
 :focus-visible { outline: 3px solid #d55e00; outline-offset: 1px; } .note { color: #555; font-size: 90%; }
 """
-LOCAL = {"picked", "hovered", "webgl", "still", "sample", "spec"}  # the browser's own; `spec` goes key by key
+LOCAL = {
+    "picked",
+    "hovered",
+    "webgl",
+    "still",
+    "sample",
+    "spec",
+}  # the browser's own; `spec` goes key by key
 
 
 def parts(widget):
@@ -33,7 +43,11 @@ def parts(widget):
 
 def synced(widget):
     """The traits of a widget that its script reads."""
-    return [name for name in widget.trait_names(sync=True) if not name.startswith("_") and name != "layout"]
+    return [
+        name
+        for name in widget.trait_names(sync=True)
+        if not name.startswith("_") and name != "layout"
+    ]
 
 
 def state_of(widget):
@@ -41,7 +55,11 @@ def state_of(widget):
     values = {name: getattr(widget, name) for name in synced(widget)}
     if "still" in values:  # for a browser without WebGL2: nobody will be there to draw it
         values["still"] = widget.still or widget.picture()
-    return {name: value for name, value in values.items() if isinstance(value, bytes | str | int | float | list | dict)}
+    return {
+        name: value
+        for name, value in values.items()
+        if isinstance(value, bytes | str | int | float | list | dict)
+    }
 
 
 def shown(widget):
@@ -50,13 +68,18 @@ def shown(widget):
     if isinstance(widget, ipywidgets.HTML):
         found["html", None] = widget.value
     if hasattr(widget, "_esm"):
-        found |= {(name, None): getattr(widget, name) for name in synced(widget) if name not in LOCAL}
+        found |= {
+            (name, None): getattr(widget, name) for name in synced(widget) if name not in LOCAL
+        }
         found |= {("spec", key): value for key, value in getattr(widget, "spec", {}).items()}
     return found
 
 
 class Control:
-    """A control of a panel, and the values of it that a page can keep: of long sliders two dozen, or `every` one."""
+    """A control of a panel, and the values of it that a page can keep.
+
+    Of long sliders two dozen, or `every` one.
+    """
 
     def __init__(self, widget, name, every):
         self.widget, self.id, self.now = widget, f"c-{name}", widget.value
@@ -78,7 +101,10 @@ class Control:
 
     def html(self, kept):
         """The control in a page; values that are not kept cannot be chosen."""
-        name, told = escape(self.widget.description), f"<output>{escape(self.labels[self.at])}</output>"
+        name, told = (
+            escape(self.widget.description),
+            f"<output>{escape(self.labels[self.at])}</output>",
+        )
         if len(kept) < 2:
             return f'<span id="{self.id}">{name} <b>{told}</b></span>'
         if isinstance(self.widget, ipywidgets.Checkbox):
@@ -87,7 +113,10 @@ class Control:
             ends = f'min="0" max="{len(kept) - 1}" value="{kept.index(self.at)}"'
             text = f'aria-valuetext="{escape(self.labels[self.at])}"'
             return f'<label>{name} <input id="{self.id}" type="range" {ends} {text}> {told}</label>'
-        marks = [" selected" * (i == self.at) + " disabled" * (i not in kept) for i in range(len(self.labels))]
+        marks = [
+            " selected" * (i == self.at) + " disabled" * (i not in kept)
+            for i in range(len(self.labels))
+        ]
         options = "".join(
             f'<option value="{i}"{mark}>{escape(text)}</option>'
             for i, (mark, text) in enumerate(zip(marks, self.labels, strict=True))
@@ -98,27 +127,44 @@ class Control:
 class Recording:
     """What a panel shows for the values of its controls.
 
-    The values of every group of controls that the panel names in `live` are gone through together, the last control
-    slowest; what differs is kept, each different value once, until the page is full.
+    The values of every group of controls that the panel names in `live` are gone through together,
+    the last control slowest; what differs is kept, each different value once, until the page is
+    full.
     """
 
     def __init__(self, panel):
-        self.parts = [part for part in parts(panel) if part is not panel and part is not panel.message]
-        drawn = any(hasattr(part, "_esm") for part in self.parts)  # or Python would have to draw a picture for each
+        self.parts = [
+            part for part in parts(panel) if part is not panel and part is not panel.message
+        ]
+        drawn = any(
+            hasattr(part, "_esm") for part in self.parts
+        )  # or Python would have to draw a picture for each
         live = panel.live if drawn else ()
         names = list(dict.fromkeys(itertools.chain.from_iterable(live)))
-        self.controls = {name: Control(panel.control(name), name, name in panel.every) for name in names}
+        self.controls = {
+            name: Control(panel.control(name), name, name in panel.every) for name in names
+        }
         self.values, self.place, self.size = [], {}, 0
         with ExitStack() as held:
-            for part in self.parts:  # the notebook's browser is told the end only, which is the beginning
+            for (
+                part
+            ) in self.parts:  # the notebook's browser is told the end only, which is the beginning
                 held.enter_context(part.hold_sync())
             runs = [self.run(group, LIMIT * (i + 1) // len(live)) for i, group in enumerate(live)]
         depends = [differing(*run) for run in runs]
-        self.groups = [self.group(*run, mine, depends) for run, mine in zip(runs, depends, strict=True)]
+        self.groups = [
+            self.group(*run, mine, depends) for run, mine in zip(runs, depends, strict=True)
+        ]
         self.open = {}
         for name, control in self.controls.items():
-            kept = [{key[group.index(name)] for key in states} for group, states in runs if name in group]
-            self.open[name] = [i for i in range(len(control.values)) if all(i in places for places in kept)]
+            kept = [
+                {key[group.index(name)] for key in states}
+                for group, states in runs
+                if name in group
+            ]
+            self.open[name] = [
+                i for i in range(len(control.values)) if all(i in places for places in kept)
+            ]
         self.clicks = [
             {"id": getattr(panel, chart), "part": part, "control": names.index(name)}
             for chart, part, name in panel.clicks
@@ -137,7 +183,10 @@ class Recording:
         return self.place[key]
 
     def run(self, names, limit):
-        """Go through the values of some controls: their places -> (part, name, key) -> place of the value."""
+        """Go through the values of some controls.
+
+        Their places -> (part, name, key) -> place of the value.
+        """
         controls = [self.controls[name] for name in names]
         states, start = {}, self.size
         orders = [control.order() for control in reversed(controls)]
@@ -149,15 +198,24 @@ class Recording:
             for control, i in zip(controls, places, strict=True):
                 control.widget.value = control.values[i]
             states[places] = {
-                (i, *slot): self.kept(value) for i, part in enumerate(self.parts) for slot, value in shown(part).items()
+                (i, *slot): self.kept(value)
+                for i, part in enumerate(self.parts)
+                for slot, value in shown(part).items()
             }
         for control in controls:
             control.widget.value = control.now
         return names, states
 
     def group(self, names, states, mine, depends):
-        """One group for the page: its slots, less those that another group knows in more detail, and their values."""
-        slots = [slot for slot in mine if not any(mine[slot] < other.get(slot, set()) for other in depends)]
+        """One group for the page.
+
+        Its slots, less those that another group knows in more detail, and their values.
+        """
+        slots = [
+            slot
+            for slot in mine
+            if not any(mine[slot] < other.get(slot, set()) for other in depends)
+        ]
         nothing = self.kept(None)
         return {
             "controls": [list(self.controls).index(name) for name in names],
@@ -169,7 +227,10 @@ class Recording:
         }
 
     def data(self, ids):
-        """What the page's script reads: `ids` are those of the widgets; only values that are used."""
+        """What the page's script reads: `ids` are those of the widgets.
+
+        Only values that are used.
+        """
         used = sorted({i for group in self.groups for row in group["rows"].values() for i in row})
         new = {old: i for i, old in enumerate(used)}
         controls = [
@@ -191,11 +252,19 @@ class Recording:
             for group in self.groups
         ]
         clicks = [click | {"id": ids[click["id"]]} for click in self.clicks]
-        return {"controls": controls, "values": [self.values[i] for i in used], "groups": groups, "clicks": clicks}
+        return {
+            "controls": controls,
+            "values": [self.values[i] for i in used],
+            "groups": groups,
+            "clicks": clicks,
+        }
 
 
 def differing(names, states):
-    """The slots that differ over the states of a group: slot -> the controls on which it depends."""
+    """The slots that differ over the states of a group.
+
+    Slot -> the controls on which it depends.
+    """
     depends = {}
     for slot in dict.fromkeys(slot for state in states.values() for slot in state):
         value = {places: state.get(slot) for places, state in states.items()}
@@ -203,13 +272,17 @@ def differing(names, states):
             depends[slot] = {
                 name
                 for c, name in enumerate(names)
-                if len({(p[:c] + p[c + 1 :], v) for p, v in value.items()}) > len({p[:c] + p[c + 1 :] for p in value})
+                if len({(p[:c] + p[c + 1 :], v) for p, v in value.items()})
+                > len({p[:c] + p[c + 1 :] for p in value})
             }
     return depends
 
 
 class Page:
-    """The HTML of a panel's widgets; the script of each kind is collected with the names of its widgets."""
+    """The HTML of a panel's widgets.
+
+    The script of each kind is collected with the names of its widgets.
+    """
 
     def __init__(self, panel):
         self.recording = Recording(panel)
@@ -249,7 +322,9 @@ class Page:
             for part in parts(panel)
             if hasattr(part, "value")
             and getattr(part, "description", "")
-            and not isinstance(part, ipywidgets.Button | ipywidgets.Text | ipywidgets.HTML | ipywidgets.IntProgress)
+            and not isinstance(
+                part, ipywidgets.Button | ipywidgets.Text | ipywidgets.HTML | ipywidgets.IntProgress
+            )
             and len(self.recording.open.get(self.names.get(part), ())) < 2
         ]
         some = [

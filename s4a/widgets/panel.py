@@ -1,4 +1,7 @@
-"""What all panels share: a line for messages, callbacks that show their errors, closing, and a page of their own."""
+"""What all panels share.
+
+A line for messages, callbacks that show their errors, closing, and a page of their own.
+"""
 
 import functools
 import logging
@@ -14,7 +17,10 @@ LAYOUT = {"max_width": "1000px", "overflow": "hidden"}
 
 
 def close_all(widget):
-    """Close a widget, all widgets in it, and their layouts and styles: nothing of them stays in the kernel."""
+    """Close a widget, all widgets in it, and their layouts and styles.
+
+    Nothing of them stays in the kernel.
+    """
     for child in getattr(widget, "children", ()):
         close_all(child)
     for name in ("layout", "style"):
@@ -63,11 +69,13 @@ class Panel(ipywidgets.VBox):
     python = ()  # what else needs Python
 
     def __init__(self, study, **options):
-        from s4a.picture import has
+        from s4a.show.pictures import has
 
         lacking = [name for name in self.needs if not has(study, name)]
         if lacking:
-            raise ValueError(f"the panel {self.title} needs {', '.join(lacking)}, which this study does not have (yet)")
+            raise ValueError(
+                f"the panel {self.title} needs {', '.join(lacking)}, which this study does not have (yet)"
+            )
         super().__init__(layout=LAYOUT)
         self.study = study
         self.message = ipywidgets.HTML()
@@ -84,10 +92,15 @@ class Panel(ipywidgets.VBox):
     def say(self, text, error=False):
         """Show a line below the panel."""
         style = "color:#a40000;font-weight:bold" if error else "color:#444"
-        self.message.value = f'<div role="status" style="{style}">{escape(text)}</div>' if text else ""
+        self.message.value = (
+            f'<div role="status" style="{style}">{escape(text)}</div>' if text else ""
+        )
 
     def guarded(self, function):
-        """`function` as a callback whose errors are shown in the panel, and logged with their place."""
+        """`function` as a callback whose errors are shown in the panel.
+
+        And logged with their place.
+        """
 
         @functools.wraps(function)
         def call(*arguments):
@@ -109,8 +122,9 @@ class Panel(ipywidgets.VBox):
     def save_html(self, path):
         """Write the panel, as it stands, as one HTML file that needs no kernel and no network.
 
-        Surfaces turn, charts say their numbers, and controls show what Python showed for their values, which are gone
-        through one by one and kept, up to 24 MB of them; the page says what needs Python.
+        Surfaces turn, charts say their numbers, and controls show what Python showed for their
+        values, which are gone through one by one and kept, up to 24 MB of them; the page says what
+        needs Python.
 
         Returns
         -------

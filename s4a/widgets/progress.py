@@ -1,4 +1,7 @@
-"""An analysis in a process of its own: stage by stage how far it is, cancelled or opened while it runs."""
+"""An analysis in a process of its own.
+
+Stage by stage how far it is, cancelled or opened while it runs.
+"""
 
 import inspect
 import multiprocessing
@@ -10,8 +13,8 @@ from pathlib import Path
 
 import ipywidgets
 
-from s4a.pipeline import analyse, collection, in_batches
-from s4a.study import open_study
+from s4a.study.pipeline import analyse, collection, in_batches
+from s4a.study.store import open_study
 from s4a.widgets.panel import Panel, paragraph, row
 
 # stage: the files that it writes, and whether there is one for each shape
@@ -51,13 +54,16 @@ def clock(seconds):
 
 
 class Progress(Panel):
-    """Runs :func:`s4a.analyse` in a process of its own and shows how far it is, while the notebook stays free.
+    """Runs :func:`s4a.analyse` in a process of its own and shows how far it is.
+
+    While the notebook stays free.
 
     Parameters
     ----------
     shapes : see :func:`s4a.analyse`
     store : path
-        Folder of the study; a cancelled run goes on where it stopped when it is started with the same.
+        Folder of the study; a cancelled run goes on where it stopped when it is started with the
+        same.
     **options
         Of :func:`s4a.analyse`.
 
@@ -93,14 +99,20 @@ class Progress(Panel):
         """A bar for each stage, and the buttons."""
         wide = {"description_width": "200px"}
         self.bars = {
-            stage: ipywidgets.IntProgress(description=stage, max=1, style=wide, layout={"width": "440px"})
+            stage: ipywidgets.IntProgress(
+                description=stage, max=1, style=wide, layout={"width": "440px"}
+            )
             for stage in STAGES
         }
         self.texts = {stage: ipywidgets.HTML() for stage in STAGES}
         self.total = ipywidgets.HTML()
-        self.stop = ipywidgets.Button(description="Cancel", tooltip="what is finished stays and is used again")
+        self.stop = ipywidgets.Button(
+            description="Cancel", tooltip="what is finished stays and is used again"
+        )
         self.view = ipywidgets.Button(description="Open", tooltip="the stages that are finished")
-        self.go_on = ipywidgets.Button(description="Resume", tooltip="where it stopped", disabled=True)
+        self.go_on = ipywidgets.Button(
+            description="Resume", tooltip="where it stopped", disabled=True
+        )
         self.go_on.on_click(self.guarded(lambda _: self.start()))
         self.stop.on_click(self.guarded(lambda _: self.cancel()))
         self.view.on_click(self.guarded(lambda _: self.show()))
@@ -119,12 +131,21 @@ class Progress(Panel):
         pairs = min(self.arguments[1].get("n_pairs", N_PAIRS), shapes * (shapes - 1) // 2)
         batches = len(in_batches(range(max(pairs, shapes - 1))))
         each = {stage: shapes for stage, (_, one_each) in STAGES.items() if one_each}
-        return dict.fromkeys(STAGES, 1) | each | {"read and clean": self.given, "first maps, in batches": batches}
+        return (
+            dict.fromkeys(STAGES, 1)
+            | each
+            | {"read and clean": self.given, "first maps, in batches": batches}
+        )
 
     def look(self):
-        """Count the files of every stage; what is left is told from the pace since the first file of the stage."""
+        """Count the files of every stage.
+
+        What is left is told from the pace since the first file of the stage.
+        """
         now = time.monotonic()
-        counts = {stage: len(list(self.folder.glob(pattern))) for stage, (pattern, _) in STAGES.items()}
+        counts = {
+            stage: len(list(self.folder.glob(pattern))) for stage, (pattern, _) in STAGES.items()
+        }
         totals, after = self.totals(counts["read and clean"] or self.given), list(STAGES)
         for i, stage in enumerate(STAGES):
             done, whole = counts[stage], totals[stage]
@@ -152,7 +173,11 @@ class Progress(Panel):
         """What the process said at its end."""
         self.process.join()
         try:
-            said = self.answer.recv() if self.answer.poll() else f"the process ended with code {self.process.exitcode}"
+            said = (
+                self.answer.recv()
+                if self.answer.poll()
+                else f"the process ended with code {self.process.exitcode}"
+            )
         except EOFError:
             said = f"the process ended with code {self.process.exitcode}"
         if self.state == "running":
@@ -173,7 +198,10 @@ class Progress(Panel):
         self.say("cancelled; Resume, or the same store, goes on where it stopped")
 
     def show(self):
-        """Open the panels of what is finished; they fill as other stages end, or at another click."""
+        """Open the panels of what is finished.
+
+        They fill as other stages end, or at another click.
+        """
         from s4a.widgets.explore import Explore
 
         self.opened = [stage for stage in STAGES if self.bars[stage].bar_style == "success"]

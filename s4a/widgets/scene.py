@@ -1,11 +1,14 @@
-"""A surface in three dimensions: arrays in, a view that turns, is coloured and can be clicked out."""
+"""A surface in three dimensions.
+
+Arrays in, a view that turns, is coloured and can be clicked out.
+"""
 
 import ipywidgets
 import numpy as np
 import traitlets
 
-from s4a.draw import checkerboard, image_bytes, on_white, render, rotation, with_balls
-from s4a.live import STYLE, as_bytes, color_bytes
+from s4a.show.draw import checkerboard, image_bytes, on_white, render, rotation, with_balls
+from s4a.show.live import STYLE, as_bytes, color_bytes
 from s4a.widgets.browser import SCENE, anywidget
 
 SIZE = (460, 360)  # pixels of a still picture
@@ -23,13 +26,19 @@ def extent(points):
 
 
 class Surfaces:
-    """What a view of a surface does, whoever draws it: the arrays are kept, and a still picture can be made."""
+    """What a view of a surface does, whoever draws it.
+
+    The arrays are kept, and a still picture can be made.
+    """
 
     surface = painted = texture = None
     points = ()
 
     def show(self, points, triangles, colors=None, title=None):
-        """Show a surface ``(n, 3)``, ``(m, 3)`` with colours ``(n, 3)``; what was marked is forgotten."""
+        """Show a surface ``(n, 3)``, ``(m, 3)`` with colours ``(n, 3)``.
+
+        What was marked is forgotten.
+        """
         self.surface = np.asarray(points), np.asarray(triangles)
         self.painted, self.texture = colors, None
         self.radius = extent(self.surface[0]) / 100
@@ -49,21 +58,29 @@ class Surfaces:
         bar : dict, optional
             The colour bar that explains them.
         coordinates : float ndarray (n, 3), optional
-            Where the checkerboard is evaluated; cubes of the side `cell` are bright and dark in turn.
+            Where the checkerboard is evaluated; cubes of the side `cell` are bright and dark in
+            turn.
         """
-        self.painted, self.texture = colors, None if coordinates is None else (np.asarray(coordinates), cell)
+        self.painted, self.texture = (
+            colors,
+            None if coordinates is None else (np.asarray(coordinates), cell),
+        )
         self.bar = bar or {}
         self.draw_colors()
 
     def mark(self, points, colors=((0.9, 0.6, 0.0),), radius=None):
-        """Spheres around some points ``(p, 3)``, in the unit of the data; one colour or one for each.
+        """Spheres around some points ``(p, 3)``, in the unit of the data.
+
+        One colour or one for each.
 
         The radius is by default a hundredth of the surface's extent.
         """
         points = np.asarray(points, float).reshape(-1, 3)
         colors = np.broadcast_to(np.asarray(colors, float), (len(points), 3))
         self.radius = self.radius if radius is None else float(radius)
-        self.points = [[*p, *c, self.radius] for p, c in zip(points.tolist(), colors.tolist(), strict=True)]
+        self.points = [
+            [*p, *c, self.radius] for p, c in zip(points.tolist(), colors.tolist(), strict=True)
+        ]
 
     def picture(self):
         """PNG bytes of the surface from where the view first stands; empty without a surface."""
@@ -90,21 +107,25 @@ if anywidget is not None:
         group : str
             Views of one group turn together.
         view, up
-            From where the surface is seen first; see :func:`s4a.draw.rotation`.
+            From where the surface is seen first; see :func:`s4a.show.draw.rotation`.
         height : int
             In pixels.
 
         Attributes
         ----------
         clickable : bool
-            Whether places can be picked: by a click, or with a cursor that the arrow keys move over the surface.
+            Whether places can be picked: by a click, or with a cursor that the arrow keys move over
+            the surface.
         picked, hovered : dict
-            The place that was clicked, or is under the pointer (where `hovering` is set): ``vertex`` (-1 beside the
-            surface), ``face``, ``weights`` in that triangle, and ``point``.
+            The place that was clicked, or is under the pointer (where `hovering` is set):
+            ``vertex`` (-1 beside the surface), ``face``, ``weights`` in that triangle, and
+            ``point``.
         """
 
         _esm, _css = SCENE, STYLE
-        position, corner, color, coordinate, still = (traitlets.Bytes().tag(sync=True) for _ in range(5))
+        position, corner, color, coordinate, still = (
+            traitlets.Bytes().tag(sync=True) for _ in range(5)
+        )
         cell, radius = (traitlets.Float(0.0).tag(sync=True) for _ in range(2))
         link, link_values = (traitlets.Bytes().tag(sync=True) for _ in range(2))
         link_text = traitlets.Unicode("").tag(sync=True)
@@ -139,12 +160,14 @@ if anywidget is not None:
         def connect(self, link, text, values=None):
             """Let the browser mark on the other view of the group what is picked on this one.
 
-            `link` is a vertex of the other view for each vertex, -1 for none; `text` says so, with ``{here}`` and
-            ``{there}`` for the two; `values` from 0 to 1 are the confidence.
+            `link` is a vertex of the other view for each vertex, -1 for none; `text` says so, with
+            ``{here}`` and ``{there}`` for the two; `values` from 0 to 1 are the confidence.
             """
             with self.hold_sync():
                 self.link, self.link_text = as_bytes(link, "int32"), text
-                self.link_values = b"" if values is None else as_bytes(100 * np.asarray(values) + 0.5, "uint8")
+                self.link_values = (
+                    b"" if values is None else as_bytes(100 * np.asarray(values) + 0.5, "uint8")
+                )
 
         def unlink(self):
             """Nothing is marked on another view."""
@@ -170,7 +193,10 @@ if anywidget is not None:
 
 
 class StillScene(Surfaces, ipywidgets.VBox):
-    """The view where anywidget is not installed: a picture that Python draws again at every change."""
+    """The view where anywidget is not installed.
+
+    A picture that Python draws again at every change.
+    """
 
     title, caption, radius = traitlets.Unicode(""), traitlets.Unicode(""), traitlets.Float(0.0)
     points, turn = traitlets.List(), traitlets.List()

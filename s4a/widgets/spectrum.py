@@ -1,12 +1,15 @@
-"""Spectra (3.3): the eigenvalues of all shapes, their eigenfunctions, and what a few of them can say of a shape."""
+"""Spectra (3.3): the eigenvalues of all shapes, their eigenfunctions.
+
+And what a few of them can say of a shape.
+"""
 
 import ipywidgets
 import numpy as np
 import traitlets
 
-from s4a.draw import SIGNED, signed_colors
-from s4a.live import color_bar
-from s4a.spectral import reconstruct, weyl
+from s4a.method.spectral import reconstruct, weyl
+from s4a.show.draw import SIGNED, signed_colors
+from s4a.show.live import color_bar
 from s4a.widgets.chart import chart
 from s4a.widgets.meshes import camera_group, surface, unit_of
 from s4a.widgets.panel import Panel, beside, row
@@ -16,7 +19,9 @@ TITLES = ("Eigenvalues: click a curve", "The same, less Weyl's law")
 
 
 class Spectrum(Panel):
-    """Eigenvalues with Weyl's line; one eigenfunction on the surface; the surface from its first k coefficients.
+    """Eigenvalues with Weyl's line; one eigenfunction on the surface.
+
+    The surface from its first k coefficients.
 
     Attributes
     ----------
@@ -32,7 +37,11 @@ class Spectrum(Panel):
 
     def build(self, view="corner", up="z"):
         """Choices, curves and two surfaces."""
-        self.names = [name for name, node in self.study["coarse"].children.items() if "eigenvalue" in node.data_vars]
+        self.names = [
+            name
+            for name, node in self.study["coarse"].children.items()
+            if "eigenvalue" in node.data_vars
+        ]
         self.values = [self.study["coarse"][name]["eigenvalue"].values for name in self.names]
         k = min(len(values) for values in self.values)
         self.choice = ipywidgets.Dropdown(options=self.names, description="shape")
@@ -55,7 +64,9 @@ class Spectrum(Panel):
         return [
             row(self.choice),
             beside(self.curves, self.gaps),
-            beside(ipywidgets.VBox([self.mode, self.function]), ipywidgets.VBox([self.k, self.rebuilt])),
+            beside(
+                ipywidgets.VBox([self.mode, self.function]), ipywidgets.VBox([self.k, self.rebuilt])
+            ),
         ]
 
     def pick(self, mark):
@@ -76,8 +87,16 @@ class Spectrum(Panel):
     def draw(self):
         """The eigenvalues of all shapes, as they are and as they differ from Weyl's law."""
         longest = max(len(values) for values in self.values)
-        line = {"name": "Weyl: 4 π k", "x": np.arange(longest), "color": "#777777", "dash": "6 4", "legend": True}
-        order = sorted(range(len(self.names)), key=lambda i: self.names[i] == self.shape)  # the chosen one on top
+        line = {
+            "name": "Weyl: 4 π k",
+            "x": np.arange(longest),
+            "color": "#777777",
+            "dash": "6 4",
+            "legend": True,
+        }
+        order = sorted(
+            range(len(self.names)), key=lambda i: self.names[i] == self.shape
+        )  # the chosen one on top
         for view, away, label in (
             (self.curves, False, "eigenvalue, unit area"),
             (self.gaps, True, "eigenvalue − 4 π k"),
@@ -112,8 +131,12 @@ class Spectrum(Panel):
         mode = self.mode.value
         function = self.mesh["eigenfunction"].values[:, mode]
         limit = float(np.quantile(np.abs(function), 0.99))
-        self.function.title = f"φ{mode} of {self.shape}, eigenvalue {self.mesh['eigenvalue'].values[mode]:.2f}"
-        self.function.paint(signed_colors(function, limit), color_bar(SIGNED, -limit, limit, "eigenfunction"))
+        self.function.title = (
+            f"φ{mode} of {self.shape}, eigenvalue {self.mesh['eigenvalue'].values[mode]:.2f}"
+        )
+        self.function.paint(
+            signed_colors(function, limit), color_bar(SIGNED, -limit, limit, "eigenfunction")
+        )
         self.draw()
 
     def show_rebuilt(self):
@@ -122,5 +145,9 @@ class Spectrum(Panel):
         rebuilt = reconstruct(self.mesh, X, k=self.k.value)
         gap = np.linalg.norm(rebuilt - X, axis=1)
         unit = unit_of(self.study, self.shape)
-        self.rebuilt.show(rebuilt, T, title=f"from {self.k.value} of {len(self.mesh['eigenvalue'])} eigenfunctions")
+        self.rebuilt.show(
+            rebuilt,
+            T,
+            title=f"from {self.k.value} of {len(self.mesh['eigenvalue'])} eigenfunctions",
+        )
         self.rebuilt.caption = f"mean distance to the surface {gap.mean():.3g} ({unit})"

@@ -1,13 +1,14 @@
 """Surfaces as pythreejs objects, for scenes of your own: the one file that imports pythreejs.
 
-The panels draw with a small script of their own, as pythreejs bundles three.js of 2018 and its morph targets stop at
-eight modes.  Whoever composes a scene with lines, sprites or other objects takes a surface from here.
+The panels draw with a small script of their own, as pythreejs bundles three.js of 2018 and its
+morph targets stop at eight modes.  Whoever composes a scene with lines, sprites or other objects
+takes a surface from here.
 """
 
 import numpy as np
 import pythreejs as three
 
-from s4a.mesh import as_arrays, vertex_normals
+from s4a.geometry.mesh import as_arrays, vertex_normals
 from s4a.schema import require
 
 
@@ -19,7 +20,7 @@ def surface(mesh, colors=None):
     mesh : xarray.Dataset
         With ``position(vertex, xyz)`` and ``corner_vertex(triangle, corner)``.
     colors : float ndarray (vertex, 3), optional
-        From 0 to 1, for example of :func:`s4a.draw.signed_colors`.
+        From 0 to 1, for example of :func:`s4a.show.draw.signed_colors`.
 
     Returns
     -------
@@ -34,16 +35,26 @@ def surface(mesh, colors=None):
     X, T = as_arrays(mesh)
     if not np.isfinite(X).all():
         wrong = (~np.isfinite(X)).any(1).sum()
-        raise ValueError(f"finite positions needed, found {wrong} vertices that are not; s4a.clean repairs the mesh")
-    attributes = {"position": X.astype(np.float32), "normal": vertex_normals(X, T).astype(np.float32)}
+        raise ValueError(
+            f"finite positions needed, found {wrong} vertices that are not; s4a.clean repairs the mesh"
+        )
+    attributes = {
+        "position": X.astype(np.float32),
+        "normal": vertex_normals(X, T).astype(np.float32),
+    }
     look = {"color": "#cfc7b8"}
     if colors is not None:
         colors = np.asarray(colors, np.float32)[:, :3]
         if len(colors) != len(X):
-            raise ValueError(f"one colour for each of {len(X)} vertices needed, found {len(colors)}")
+            raise ValueError(
+                f"one colour for each of {len(X)} vertices needed, found {len(colors)}"
+            )
         attributes["color"], look = np.ascontiguousarray(colors), {"vertexColors": "VertexColors"}
     geometry = three.BufferGeometry(
-        attributes={name: three.BufferAttribute(values, normalized=False) for name, values in attributes.items()},
+        attributes={
+            name: three.BufferAttribute(values, normalized=False)
+            for name, values in attributes.items()
+        },
         index=three.BufferAttribute(T.astype(np.uint32).ravel(), normalized=False),
     )
     material = three.MeshStandardMaterial(roughness=0.7, metalness=0.05, side="DoubleSide", **look)
@@ -64,7 +75,10 @@ def renderer(*objects, size=(600, 450)):
     if not points:
         raise ValueError("a renderer needs at least one surface to look at")
     points = np.concatenate(points)
-    middle, radius = (points.max(0) + points.min(0)) / 2, float(np.linalg.norm(np.ptp(points, axis=0))) / 2
+    middle, radius = (
+        (points.max(0) + points.min(0)) / 2,
+        float(np.linalg.norm(np.ptp(points, axis=0))) / 2,
+    )
     camera = three.PerspectiveCamera(
         position=(middle + radius * np.array([1.5, -2.0, 0.8])).tolist(),
         up=[0, 0, 1],
@@ -76,6 +90,10 @@ def renderer(*objects, size=(600, 450)):
     )
     camera.lookAt(middle.tolist())
     controls = three.OrbitControls(controlling=camera, target=middle.tolist())
-    scene = three.Scene(children=[*objects, camera, three.AmbientLight(intensity=0.5)], background="#ffffff")
+    scene = three.Scene(
+        children=[*objects, camera, three.AmbientLight(intensity=0.5)], background="#ffffff"
+    )
     width, height = size
-    return three.Renderer(scene=scene, camera=camera, controls=[controls], width=width, height=height, antialias=True)
+    return three.Renderer(
+        scene=scene, camera=camera, controls=[controls], width=width, height=height, antialias=True
+    )

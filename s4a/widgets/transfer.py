@@ -1,4 +1,7 @@
-"""Transfer (6.2, Fig. 6 and 7): labels and landmarks of one shape, carried to another while they are placed."""
+"""Transfer (6.2, Fig. 6 and 7).
+
+Labels and landmarks of one shape, carried to another while they are placed.
+"""
 
 import itertools
 from html import escape
@@ -8,12 +11,12 @@ import ipywidgets
 import numpy as np
 import traitlets
 
-from s4a.annotations import write_landmarks
-from s4a.draw import label_colors
-from s4a.mesh import as_arrays
-from s4a.picture import aligned, names_of
+from s4a.analysis.transfer import transfer_labels, transfer_landmarks
+from s4a.geometry.mesh import as_arrays
+from s4a.input.annotations import write_landmarks
 from s4a.schema import dataset
-from s4a.transfer import transfer_labels, transfer_landmarks
+from s4a.show.draw import label_colors
+from s4a.show.pictures import aligned, names_of
 from s4a.widgets.meshes import camera_group, nice, unit_of
 from s4a.widgets.panel import Panel, beside, paragraph, row
 from s4a.widgets.scene import extent, scene
@@ -23,9 +26,12 @@ LEGEND = 24  # labels that have colours of their own
 
 
 class Transfer(Panel):
-    """Labels in colours and landmarks as spheres on two shapes; a click on the source places or moves a landmark.
+    """Labels in colours and landmarks as spheres on two shapes.
 
-    The keyboard does the same: C on the source starts a cursor, the arrow keys move it over the surface, Enter places.
+    A click on the source places or moves a landmark.
+
+    The keyboard does the same: C on the source starts a cursor, the arrow keys move it over the
+    surface, Enter places.
 
     Attributes
     ----------
@@ -43,22 +49,35 @@ class Transfer(Panel):
 
     def build(self, view="corner", up="z"):
         """Choices, the two surfaces, legend and table."""
-        names, template = names_of(self.study["registration"].dataset), self.study["registration"].attrs["template"]
+        names, template = (
+            names_of(self.study["registration"].dataset),
+            self.study["registration"].attrs["template"],
+        )
         self.choices = {
             "source": ipywidgets.Dropdown(options=names, value=str(template), description="source"),
             "target": ipywidgets.Dropdown(options=names, description="target"),
         }
-        self.labels = ipywidgets.Checkbox(True, description="labels", indent=False, layout={"width": "auto"})
+        self.labels = ipywidgets.Checkbox(
+            True, description="labels", indent=False, layout={"width": "auto"}
+        )
         self.name = ipywidgets.Combobox(description="landmark", placeholder="a name, then click")
         self.remove = ipywidgets.Button(description="Remove", tooltip="the landmark that is named")
         self.path = ipywidgets.Text("landmarks.csv", description="file", layout={"width": "260px"})
         self.csv = ipywidgets.Button(description="Save CSV", tooltip="the landmarks on the target")
         self.radius = ipywidgets.BoundedFloatText(
-            1, min=0, max=1e9, step=0.5, description="radius", tooltip="of the spheres", layout={"width": "180px"}
+            1,
+            min=0,
+            max=1e9,
+            step=0.5,
+            description="radius",
+            tooltip="of the spheres",
+            layout={"width": "180px"},
         )
         self.legend, self.table = ipywidgets.HTML(), ipywidgets.HTML()
         group = camera_group()
-        self.scenes = [scene(group=group, view=view, up=up, height=380, clickable=not i) for i in range(2)]
+        self.scenes = [
+            scene(group=group, view=view, up=up, height=380, clickable=not i) for i in range(2)
+        ]
         for role, choice in self.choices.items():
             self.on_change(choice, lambda value, role=role: self.set_trait(role, value))
             self.on_change(self, lambda _: self.draw(), role)
@@ -67,9 +86,14 @@ class Transfer(Panel):
         self.on_change(self, lambda value: setattr(self.name, "value", value), "landmark")
         self.on_change(self.scenes[0], self.place, "picked")
         self.remove.on_click(self.guarded(lambda _: self.drop(self.landmark)))
-        self.csv.on_click(self.guarded(lambda _: self.say(f"written: {self.save_csv(self.path.value)}")))
+        self.csv.on_click(
+            self.guarded(lambda _: self.say(f"written: {self.save_csv(self.path.value)}"))
+        )
         size = extent(self.study["registration"]["position"].values)
-        self.radius.value, self.radius.description = nice(size / 60), f"radius ({unit_of(self.study, template)})"
+        self.radius.value, self.radius.description = (
+            nice(size / 60),
+            f"radius ({unit_of(self.study, template)})",
+        )
         self.radius.style.description_width = "initial"
         self.on_change(self.radius, lambda _: self.carry())
         with self.hold_trait_notifications():
@@ -101,28 +125,38 @@ class Transfer(Panel):
         if "landmark_position" in mesh:
             names = mesh["landmark_name"].values.astype(str)
             self.marks = dict(zip(names.tolist(), mesh["landmark_position"].values, strict=True))
-        for view, name, role in zip(self.scenes, (self.source, self.target), ("source", "target"), strict=True):
+        for view, name, role in zip(
+            self.scenes, (self.source, self.target), ("source", "target"), strict=True
+        ):
             X, T = as_arrays(self.mesh(name))
-            view.show(aligned(self.study, name, X), T, title=f"{name}, the {role}, {len(X):,} vertices")
+            view.show(
+                aligned(self.study, name, X), T, title=f"{name}, the {role}, {len(X):,} vertices"
+            )
         self.paint()
         self.carry()
 
     def paint(self):
         """The source's labels on both surfaces, and what their colours are."""
         mesh = self.mesh(self.source)
-        self.legend.value = "" if "label" in mesh else paragraph(f"{escape(self.source)} has no labels.")
+        self.legend.value = (
+            "" if "label" in mesh else paragraph(f"{escape(self.source)} has no labels.")
+        )
         if "label" not in mesh or not self.labels.value:
             for view in self.scenes:
                 view.paint(None)
             return
         label = mesh["label"].values
-        self.carried = transfer_labels(self.study, label, source=self.source, targets=[self.target])[self.target]
+        self.carried = transfer_labels(
+            self.study, label, source=self.source, targets=[self.target]
+        )[self.target]
         found, confidence = self.carried["label"].values, self.carried["confidence"].values.mean()
         values = np.unique(label)
         colors = label_colors(values)  # in the order of the values, so that both surfaces agree
         for view, one in zip(self.scenes, (label, found), strict=True):
             view.paint(colors[np.searchsorted(values, one)])
-        self.scenes[1].caption = f"labels carried from {self.source}, confidence {confidence:.2f} on average"
+        self.scenes[
+            1
+        ].caption = f"labels carried from {self.source}, confidence {confidence:.2f} on average"
         names = "".join(
             f'<span style="white-space:nowrap;margin-right:1em"><span style="display:inline-block;width:1em;height:1em;'
             f'background:rgb({",".join(str(round(255 * c)) for c in color)})"></span> {escape(str(value))}: '
@@ -130,7 +164,9 @@ class Transfer(Panel):
             for value, color in zip(values, colors, strict=True)
         )
         more = " Colours repeat." if len(values) > LEGEND else ""
-        self.legend.value = paragraph(f"Labels, shares of the vertices on source and target: {names}{more}")
+        self.legend.value = paragraph(
+            f"Labels, shares of the vertices on source and target: {names}{more}"
+        )
 
     def place(self, place):
         """A click on the source: the landmark that is named comes there; a new one gets a name."""
@@ -150,10 +186,15 @@ class Transfer(Panel):
         self.carry()
 
     def landmarks(self):
-        """The landmarks on the target, as :func:`s4a.transfer_landmarks` gives them; None without any."""
+        """The landmarks on the target, as :func:`s4a.transfer_landmarks` gives them.
+
+        None without any.
+        """
         if not self.marks:
             return None
-        marked = dataset(landmark_name=list(self.marks), landmark_position=np.stack(list(self.marks.values())))
+        marked = dataset(
+            landmark_name=list(self.marks), landmark_position=np.stack(list(self.marks.values()))
+        )
         found = transfer_landmarks(self.study, marked, source=self.source, targets=[self.target])
         return found[self.target].to_dataset()
 
@@ -164,8 +205,12 @@ class Transfer(Panel):
         here = np.stack(list(self.marks.values())) if self.marks else np.zeros((0, 3))
         there = np.zeros((0, 3)) if found is None else found["landmark_position"].values
         colors = label_colors(np.arange(len(here))) if len(here) else ()
-        for view, name, points in zip(self.scenes, (self.source, self.target), (here, there), strict=True):
-            view.mark(aligned(self.study, name, points), colors, self.radius.value) if len(points) else view.mark([])
+        for view, name, points in zip(
+            self.scenes, (self.source, self.target), (here, there), strict=True
+        ):
+            view.mark(aligned(self.study, name, points), colors, self.radius.value) if len(
+                points
+            ) else view.mark([])
         if found is None:
             self.table.value = paragraph("Click on the source to place a landmark.")
             return
@@ -184,8 +229,13 @@ class Transfer(Panel):
 
 def html_table(caption, columns, rows):
     """A small table, escaped."""
-    head = "".join(f"<th style='text-align:left;padding-right:1em'>{escape(c)}</th>" for c in columns)
+    head = "".join(
+        f"<th style='text-align:left;padding-right:1em'>{escape(c)}</th>" for c in columns
+    )
     body = "".join(
-        "<tr>" + "".join(f"<td style='padding-right:1em'>{escape(str(c))}</td>" for c in row) + "</tr>" for row in rows
+        "<tr>"
+        + "".join(f"<td style='padding-right:1em'>{escape(str(c))}</td>" for c in row)
+        + "</tr>"
+        for row in rows
     )
     return f"<table style='line-height:1.4'><caption>{escape(caption)}</caption><tr>{head}</tr>{body}</table>"

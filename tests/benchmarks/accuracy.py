@@ -1,6 +1,9 @@
-"""Correspondence errors against the truth, beside nearest neighbour after ICP and pairwise ZoomOut on the same shapes.
+"""Correspondence errors against the truth.
 
-The embedded collection, clean and dirty, and 25 registered faces where the shared data are beside the checkout.
+Beside nearest neighbour after ICP and pairwise ZoomOut on the same shapes.
+
+The embedded collection, clean and dirty, and 25 registered faces where the shared data are beside
+the checkout.
 """
 
 import subprocess
@@ -10,8 +13,8 @@ from pathlib import Path
 
 import s4a
 from s4a import synthetic
-from s4a.accuracy import accuracy
-from s4a.tables import error_table
+from s4a.cli.tables import error_table
+from s4a.evaluation.accuracy import accuracy
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 
@@ -28,13 +31,19 @@ def embedded(dirty):
     report(
         f"embedded collection, {'dirty' if dirty else 'clean'}",
         s4a.analyse(collection, n_jobs=-1),
-        lambda shape, template: synthetic.position(truth, shape, truth[template]["reference_point"].values),
+        lambda shape, template: synthetic.position(
+            truth, shape, truth[template]["reference_point"].values
+        ),
     )
 
 
 def faces():
     with tempfile.TemporaryDirectory() as folder:
-        subprocess.run([sys.executable, DATA / "unpack.py", folder, "faces"], check=True, stdout=subprocess.DEVNULL)
+        subprocess.run(
+            [sys.executable, DATA / "unpack.py", folder, "faces"],
+            check=True,
+            stdout=subprocess.DEVNULL,
+        )
         study = s4a.analyse(Path(folder) / "faces", n_jobs=-1)
     position = {name: node["position"].values for name, node in study["original"].children.items()}
     report("registered faces, vertex i is vertex i", study, lambda shape, template: position[shape])

@@ -1,8 +1,10 @@
-"""What correspondences are good for: ``applications.py [ellipsoids groups brains skulls faces heads]``.
+"""What correspondences are good for.
 
-A one-mode family against the closed form, planted groups, transfer between two brain templates and between skulls,
-displacements and modes of faces against the published ones, a tenth head inserted into a study of nine.  All but the
-first two need the shared data beside the checkout.
+``applications.py [ellipsoids groups brains skulls faces heads]``.
+
+A one-mode family against the closed form, planted groups, transfer between two brain templates and
+between skulls, displacements and modes of faces against the published ones, a tenth head inserted
+into a study of nine.  All but the first two need the shared data beside the checkout.
 """
 
 import itertools
@@ -19,14 +21,15 @@ from scipy.integrate import quad
 from scipy.spatial import cKDTree
 
 import s4a
-from s4a import permutation, statistics, synthetic, transfer
-from s4a.align import align
-from s4a.annotations import read_landmarks
-from s4a.deform import displacement_in_template
-from s4a.insert import project_scores
-from s4a.link import at, closest_point
-from s4a.mesh import as_arrays, as_dataset, vertex_areas
+from s4a import statistics, synthetic
+from s4a.analysis import permutation, transfer
+from s4a.analysis.link import at, closest_point
+from s4a.geometry.align import align
+from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
+from s4a.input.annotations import read_landmarks
+from s4a.method.deform import displacement_in_template
 from s4a.schema import dataset
+from s4a.study.insert import project_scores
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 
@@ -64,9 +67,12 @@ def brains(folder):
         found[name] = s4a.transfer_labels(study, labels["fsa5"])["conte69"]["label"].values
     for name, label in found.items():
         dice = [
-            2 * ((label == v) & (true == v)).sum() / ((label == v).sum() + (true == v).sum()) for v in np.unique(true)
+            2 * ((label == v) & (true == v)).sum() / ((label == v).sum() + (true == v).sum())
+            for v in np.unique(true)
         ]
-        say(f"{name}: {100 * (label == true).mean():.1f} % of vertices right, mean Dice {np.mean(dice):.3f}")
+        say(
+            f"{name}: {100 * (label == true).mean():.1f} % of vertices right, mean Dice {np.mean(dice):.3f}"
+        )
 
 
 def skulls(folder):
@@ -81,12 +87,16 @@ def skulls(folder):
             R, t = icp_motion(meshes[p], meshes[q])
             X, T = as_arrays(meshes[q])
             near = at(X, T, *closest_point(point[p] @ R.T + t, X, T))
-            ours = s4a.transfer_landmarks(study, marks[p], source=p, targets=[q])[q]["landmark_position"].values
+            ours = s4a.transfer_landmarks(study, marks[p], source=p, targets=[q])[q][
+                "landmark_position"
+            ].values
             for name, found in zip(error, (near, ours), strict=True):
                 error[name].append(np.linalg.norm(found - point[q], axis=1))
     for name, values in error.items():
         values = np.stack(values)
-        say(f"{name}: mean {values.mean():.3f} mm, median {np.median(values):.3f}, {values.shape[0]} ordered pairs")
+        say(
+            f"{name}: mean {values.mean():.3f} mm, median {np.median(values):.3f}, {values.shape[0]} ordered pairs"
+        )
 
 
 def faces(folder):
@@ -97,17 +107,26 @@ def faces(folder):
     w = area / area.sum()
     names = [n for n in data["shape"].values.tolist() if n != "generic_neutral_mesh"]
     ours = data["displacement"].sel(shape=names).values.astype(float)
-    true = np.stack([displacement_in_template(X, study["original"][n]["position"].values, area)[0] for n in names])
+    true = np.stack(
+        [
+            displacement_in_template(X, study["original"][n]["position"].values, area)[0]
+            for n in names
+        ]
+    )
     inner = [np.einsum("nx,nx,n->", a, b, w) for a, b in zip(ours, true, strict=True)]
     size = [np.sqrt(np.einsum("nx,nx,n->", d, d, w)) for d in (*ours, *true)]
     cosine = np.array(inner) / size[: len(names)] / size[len(names) :]
-    say(f"cosines of displacements: mean {cosine.mean():.4f}, median {np.median(cosine):.4f}, least {cosine.min():.4f}")
+    say(
+        f"cosines of displacements: mean {cosine.mean():.4f}, median {np.median(cosine):.4f}, least {cosine.min():.4f}"
+    )
     for c in (3, 5, 10):
         bases = []
         for d in (ours, true):
             d = ((d - d.mean(0)) * np.sqrt(w)[:, None]).reshape(len(d), -1)
             bases.append(np.linalg.svd(d, full_matrices=False)[2][:c])
-        angle = np.degrees(np.arccos(np.clip(np.linalg.svd(bases[0] @ bases[1].T, compute_uv=False), 0, 1)))
+        angle = np.degrees(
+            np.arccos(np.clip(np.linalg.svd(bases[0] @ bases[1].T, compute_uv=False), 0, 1))
+        )
         say(f"principal angles of {c} modes, degrees: {', '.join(f'{a:.1f}' for a in angle)}")
 
 
@@ -127,14 +146,22 @@ def heads(folder):
     d, before = (tree["registration"]["displacement"] for tree in (ten, nine))
     name, new = files[-1].stem, found["registration"]["displacement"][0].values
     n = found["original"][name].sizes["vertex"]
-    say(f"{n} vertices inserted in {seconds:.1f} s of CPU; to the recomputation {gap(new, d.sel(shape=name).values)}")
-    sure, trip, stretch = (found["registration"][v].values for v in ("confidence", "round_trip", "distortion"))
+    say(
+        f"{n} vertices inserted in {seconds:.1f} s of CPU; to the recomputation {gap(new, d.sel(shape=name).values)}"
+    )
+    sure, trip, stretch = (
+        found["registration"][v].values for v in ("confidence", "round_trip", "distortion")
+    )
     say(
         f"confidence {sure.mean():.2f}, round trip {trip.mean():.4f}, median |distortion| {np.median(abs(stretch)):.3f}"
     )
-    modes = [nine["pca"][v].values for v in ("mean_displacement", "deformation", "standard_deviation")]
+    modes = [
+        nine["pca"][v].values for v in ("mean_displacement", "deformation", "standard_deviation")
+    ]
     again = project_scores(d.sel(shape=[name]).values, *modes, area)[0][0]
-    say(f"scores {found['pca']['score'].values[0].round(2)}, from the recomputation {again.round(2)}")
+    say(
+        f"scores {found['pca']['score'].values[0].round(2)}, from the recomputation {again.round(2)}"
+    )
     for other in before["shape"].values.tolist():
         say(f"  {other} in both: {gap(before.sel(shape=other).values, d.sel(shape=other).values)}")
 
@@ -144,19 +171,36 @@ def ellipsoids():
     score = np.array([-1.9, -1.1, -0.6, -0.2, 0.1, 0.4, 0.9, 1.2, 1.2])
     mode, area = X * [0, 0, 1], vertex_areas(X, T)
     names = [f"ellipsoid_{i}" for i in range(len(score))]
-    data = as_dataset(X, T, {"template": names[0]}).merge(dataset(displacement=score[:, None, None] * mode))
+    data = as_dataset(X, T, {"template": names[0]}).merge(
+        dataset(displacement=score[:, None, None] * mode)
+    )
     study = xr.DataTree.from_dict({"registration": data.assign_coords(shape=names)})
     found = s4a.statistics.evaluate(study, n_samples=20_000)
-    size, mean, deviation = np.sqrt(area @ mode[:, 2] ** 2 / area.sum()), score.mean(), score.std(ddof=1)
+    size, mean, deviation = (
+        np.sqrt(area @ mode[:, 2] ** 2 / area.sum()),
+        score.mean(),
+        score.std(ddof=1),
+    )
 
     def to_nearest(x):
         return np.abs(x - score).min() * stats.norm.pdf(x, mean, deviation)
 
     others = (score.sum() - score) / (len(score) - 1)
     closed = {
-        "compactness": (score.var(ddof=1) * size**2, found["compactness"].item(), found["compactness_error"].item()),
-        "generalization of the mean": (np.abs(score - others).mean() * size, found.attrs["generalization_0"], np.nan),
-        "generalization of one mode": (0.0, *(found[f"generalization{e}"].item() for e in ("", "_error"))),
+        "compactness": (
+            score.var(ddof=1) * size**2,
+            found["compactness"].item(),
+            found["compactness_error"].item(),
+        ),
+        "generalization of the mean": (
+            np.abs(score - others).mean() * size,
+            found.attrs["generalization_0"],
+            np.nan,
+        ),
+        "generalization of one mode": (
+            0.0,
+            *(found[f"generalization{e}"].item() for e in ("", "_error")),
+        ),
         "specificity": (
             quad(to_nearest, -9, 9, limit=400, points=score)[0] * size,
             *(found[f"specificity{e}"].item() for e in ("", "_error")),
@@ -179,10 +223,16 @@ def groups():
             value, error = (found[f"{measure}{e}"].values for e in ("", "_error"))
             row = ", ".join(f"{value[c - 1]:.3f} ± {error[c - 1]:.3f} by {c}" for c in (1, 3, 10))
             say(f"{measure} in mm, correspondences {which}: {row}")
-    low, full = (np.cumsum(study["pca"][f"explained_variance_ratio{r}"].values) for r in ("_low", ""))
-    say(f"variance explained by ten: {100 * full[9]:.1f} % at full, {100 * low[9]:.1f} % at low resolution")
+    low, full = (
+        np.cumsum(study["pca"][f"explained_variance_ratio{r}"].values) for r in ("_low", "")
+    )
+    say(
+        f"variance explained by ten: {100 * full[9]:.1f} % at full, {100 * low[9]:.1f} % at low resolution"
+    )
     whole = statistics.group_test(study, group)
-    say(f"planted groups: p = {whole['p_value'].item():.4f}, least possible {whole.attrs['smallest_p']:.4f}")
+    say(
+        f"planted groups: p = {whole['p_value'].item():.4f}, least possible {whole.attrs['smallest_p']:.4f}"
+    )
     where = statistics.group_map(study, group)
     u = truth[study["registration"].attrs["template"]]["reference_point"].values
     part = [truth[f"planted_{v}"].values for v in ("centre", "width", "push", "turn")]
@@ -191,7 +241,9 @@ def groups():
     region = size > 0.25 * size.max()
     for name in ("p_family_wise", "p_false_discovery"):
         marked = where[name].values < 0.05
-        say(f"{name} < 0.05 and the region: Dice {2 * (marked & region).sum() / (marked.sum() + region.sum()):.2f}")
+        say(
+            f"{name} < 0.05 and the region: Dice {2 * (marked & region).sum() / (marked.sum() + region.sum()):.2f}"
+        )
     effect = where["effect"].values
     cosine = abs(np.vdot(effect, field)) / np.linalg.norm(effect) / np.linalg.norm(field)
     say(f"effect and planted mode: cosine {cosine:.2f}")
@@ -201,7 +253,9 @@ def groups():
         p.append(permutation.permutation_test(scores, x, n_permutations=199, seed=seed)[1])
     tenths = np.histogram(p, np.linspace(0, 1, 11))[0]
     uniform = stats.kstest(p, "uniform").pvalue
-    say(f"p values of 100 seeds without a difference, by tenths: {tenths}, Kolmogorov-Smirnov p {uniform:.2f}")
+    say(
+        f"p values of 100 seeds without a difference, by tenths: {tenths}, Kolmogorov-Smirnov p {uniform:.2f}"
+    )
 
 
 if __name__ == "__main__":
@@ -216,5 +270,9 @@ if __name__ == "__main__":
             globals()[name]()
             continue
         with tempfile.TemporaryDirectory() as folder:
-            subprocess.run([sys.executable, DATA / "unpack.py", folder, name], check=True, stdout=subprocess.DEVNULL)
+            subprocess.run(
+                [sys.executable, DATA / "unpack.py", folder, name],
+                check=True,
+                stdout=subprocess.DEVNULL,
+            )
             globals()[name](Path(folder))

@@ -1,7 +1,8 @@
 """How often the score without truth picks the better candidate, on pairs with known correspondence.
 
-For every pair: the error at low resolution of each candidate of s4a.joint.candidates, that of the one picked, and
-that of the best.  Errors are mean straight-line distances in % of sqrt(area), to the image of each coarse vertex.
+For every pair: the error at low resolution of each candidate of s4a.method.joint.candidates, that
+of the one picked, and that of the best.  Errors are mean straight-line distances in % of
+sqrt(area), to the image of each coarse vertex.
 """
 
 import subprocess
@@ -15,10 +16,11 @@ from joblib import Parallel, delayed
 from threadpoolctl import threadpool_limits
 
 import s4a
-from s4a import fmap, joint, synthetic
-from s4a.align import align
-from s4a.poses import first_map_of
-from s4a.register import Scan
+from s4a import synthetic
+from s4a.geometry.align import align
+from s4a.method import fmap, joint
+from s4a.method.first_map import first_map_of
+from s4a.method.register import Scan
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 CORRESPONDING = {"faust15k": 6890}  # of these only the first vertices correspond
@@ -30,11 +32,17 @@ def scan(mesh):
 
 
 def errors(source, target, image):
-    """Candidate -> (score, error), for the true images of the target's coarse vertices; NaN where unknown."""
+    """Candidate -> (score, error), for the true images of the target's coarse vertices.
+
+    NaN where unknown.
+    """
     with threadpool_limits(1):
         M, N = scan(source), scan(target)
         _, C, near = first_map_of(M.low, N.low, align(M.low.X, M.low.area, N.low.X, N.low.area)[:2])
-        starts = {"intrinsic": fmap.zoomout(C, M.low.Phi, N.low.Phi, N.low.area, 100)[1], "icp": near}
+        starts = {
+            "intrinsic": fmap.zoomout(C, M.low.Phi, N.low.Phi, N.low.area, 100)[1],
+            "icp": near,
+        }
         center, size = M.frame
         sample = N.coarse["sample_vertex"].values
         true = (np.where(sample[:, None] >= 0, image[sample], np.nan) - center) / size
@@ -62,7 +70,9 @@ def report(name, found):
 
 
 def registered(name, folder, limit=6):
-    subprocess.run([sys.executable, DATA / "unpack.py", folder, name], check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(
+        [sys.executable, DATA / "unpack.py", folder, name], check=True, stdout=subprocess.DEVNULL
+    )
     meshes = s4a.read_shapes(Path(folder) / name, pattern="*.ply")["original"].children
     pairs = list(pairwise(meshes))[:limit]
     jobs = []
@@ -75,16 +85,27 @@ def registered(name, folder, limit=6):
         ok = (in_file < known) & (there >= 0)
         image[ok] = source["position"].values[there[ok]]
         jobs.append(delayed(errors)(source, target, image))
-    report(name, list(zip([f"{a} -> {b}" for a, b in pairs], Parallel(n_jobs=-1)(jobs), strict=True)))
+    report(
+        name, list(zip([f"{a} -> {b}" for a, b in pairs], Parallel(n_jobs=-1)(jobs), strict=True))
+    )
 
 
 def embedded(limit=6):
     tree = synthetic.brains(limit + 1, 20_000)
     shapes = {name: node.to_dataset() for name, node in tree["original"].children.items()}
     pairs = list(pairwise(shapes))
-    images = [synthetic.position(tree["truth"], a, tree["truth"][b]["reference_point"].values) for a, b in pairs]
-    jobs = (delayed(errors)(shapes[a], shapes[b], image) for (a, b), image in zip(pairs, images, strict=True))
-    report("embedded", list(zip([f"{a} -> {b}" for a, b in pairs], Parallel(n_jobs=-1)(jobs), strict=True)))
+    images = [
+        synthetic.position(tree["truth"], a, tree["truth"][b]["reference_point"].values)
+        for a, b in pairs
+    ]
+    jobs = (
+        delayed(errors)(shapes[a], shapes[b], image)
+        for (a, b), image in zip(pairs, images, strict=True)
+    )
+    report(
+        "embedded",
+        list(zip([f"{a} -> {b}" for a, b in pairs], Parallel(n_jobs=-1)(jobs), strict=True)),
+    )
 
 
 if __name__ == "__main__":

@@ -1,7 +1,9 @@
-"""The paper's Table 1 and Table 2 on real and on synthetic shapes, with truth where there is any, beside pyFM.
+"""The paper's Table 1 and Table 2 on real and on synthetic shapes.
 
-The real shapes are those of the shared data beside the checkout; what is absent is skipped.  Times are CPU seconds of
-one core.  Arguments pick parts: registered, both, embedded, heads, collection.
+With truth where there is any, beside pyFM.
+
+The real shapes are those of the shared data beside the checkout; what is absent is skipped.  Times
+are CPU seconds of one core.  Arguments pick parts: registered, both, embedded, heads, collection.
 """
 
 import importlib.util
@@ -18,9 +20,9 @@ from threadpoolctl import threadpool_limits
 
 import s4a
 from s4a import compare, metrics, synthetic
-from s4a.align import farthest_points
+from s4a.cli.tables import METRICS, block_table, collection_table, comparison_table, table
+from s4a.geometry.align import farthest_points
 from s4a.schema import variable
-from s4a.tables import METRICS, block_table, collection_table, comparison_table, table
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 CORRESPONDING = {"faust15k": 6890}  # of these only the first vertices correspond
@@ -34,7 +36,9 @@ def say(text):
 
 
 def unpacked(name, folder):
-    subprocess.run([sys.executable, DATA / "unpack.py", folder, name], check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(
+        [sys.executable, DATA / "unpack.py", folder, name], check=True, stdout=subprocess.DEVNULL
+    )
     return sorted((Path(folder) / name).glob("*.ply"))
 
 
@@ -47,7 +51,9 @@ def peer(source, target, landmarks, truth, k_init=20, k=100, step=5):
     meshes = [TriMesh(*compare.as_arrays(mesh)) for mesh in (source, target)]
     model = FunctionalMapping(*(mesh.process(k=k, verbose=False) for mesh in meshes))
     marks = np.stack(landmarks, axis=1)
-    model.preprocess(n_descr=100, descr_type="WKS", landmarks=marks, subsample_step=5, k_process=k, verbose=False)
+    model.preprocess(
+        n_descr=100, descr_type="WKS", landmarks=marks, subsample_step=5, k_process=k, verbose=False
+    )
     model.fit(K=(k_init, k_init), w_descr=1, w_lap=1e-2, w_dcomm=1e-1, verbose=False)
     refined = model.zoomout_refine(nit=(k - k_init) // step, step=step)
     match = model.get_p2p(refined)
@@ -60,7 +66,10 @@ def peer(source, target, landmarks, truth, k_init=20, k=100, step=5):
 
 
 def registered_pairs(name, n_pairs):
-    """Source, target, true source vertex of each target vertex (-1: none), and ten true pairs as landmarks."""
+    """Source, target, true source vertex of each target vertex (-1.
+
+    None), and ten true pairs as landmarks.
+    """
     with tempfile.TemporaryDirectory() as folder:
         meshes = [s4a.read_shape(path) for path in unpacked(name, folder)[: n_pairs + 1]]
     for source, target in pairwise(meshes):
@@ -77,7 +86,9 @@ def embedded_pairs(n_vertices, n_pairs):
     tree = synthetic.brains(n_pairs + 1, n_vertices)
     meshes = {name: node.to_dataset() for name, node in tree["original"].children.items()}
     for (name, source), (other, target) in pairwise(meshes.items()):
-        truth = np.asarray(synthetic.position(tree["truth"], name, tree["truth"][other]["reference_point"]))
+        truth = np.asarray(
+            synthetic.position(tree["truth"], name, tree["truth"][other]["reference_point"])
+        )
         marks = farthest_points(target["position"].values, N_LANDMARKS)
         yield source, target, truth, (truth[marks], target["position"].values[marks])
 
@@ -94,20 +105,36 @@ def registered(name, n_pairs):
             found = xr.concat([found, line.assign_coords(pair=found["pair"])], "way")
         rows.append(found)
     found, n = xr.concat(rows, "pair"), source.sizes["vertex"]
-    say(f"\nTable 1 on registered shapes, {name}: {n_pairs} pairs of {n} vertices, {N_LANDMARKS} true landmarks")
+    say(
+        f"\nTable 1 on registered shapes, {name}: {n_pairs} pairs of {n} vertices, {N_LANDMARKS} true landmarks"
+    )
     say(comparison_table(found))
     figure_3(found)
     verdict(found)
 
 
 def both(pairs, what):
-    """FMAP+ZO at full resolution and RE-MATCH on more pairs: errors, CPU seconds, and the ratios of their means."""
+    """FMAP+ZO at full resolution and RE-MATCH on more pairs.
+
+    Errors, CPU seconds, and the ratios of their means.
+    """
     rows, found = [], []
     for source, target, truth, marks in pairs:
-        one = compare.pair(source, target, methods=["FMAP+ZO", "RE-MATCH"], truth=truth, landmarks=marks)
-        error, seconds = 100 * one["geodesic_error"].values[:, 0], one["block_seconds"].sum("block").values[:, 0]
+        one = compare.pair(
+            source, target, methods=["FMAP+ZO", "RE-MATCH"], truth=truth, landmarks=marks
+        )
+        error, seconds = (
+            100 * one["geodesic_error"].values[:, 0],
+            one["block_seconds"].sum("block").values[:, 0],
+        )
         found.append([*error, *seconds])
-        rows.append([str(source.sizes["vertex"]), *(f"{e:.3f}" for e in error), *(f"{s:.1f}" for s in seconds)])
+        rows.append(
+            [
+                str(source.sizes["vertex"]),
+                *(f"{e:.3f}" for e in error),
+                *(f"{s:.1f}" for s in seconds),
+            ]
+        )
     error, other, seconds, others = np.mean(found, axis=0)
     say(f"\n{what}: error in % of sqrt(area), CPU seconds")
     say(table(rows, ["vertices", "FMAP+ZO %", "RE-MATCH %", "FMAP+ZO s", "RE-MATCH s"]))
@@ -117,7 +144,11 @@ def both(pairs, what):
 def verdict(found):
     """What holds of the paper's claims (5.2), and of ours, on the means of these pairs."""
     mean = found.mean("pair")
-    of = {name: dict(zip(mean["way"].values, mean[name].values, strict=True)) for name in METRICS if name in mean}
+    of = {
+        name: dict(zip(mean["way"].values, mean[name].values, strict=True))
+        for name in METRICS
+        if name in mean
+    }
     time_of = dict(zip(mean["way"].values, mean["block_seconds"].sum("block").values, strict=True))
     five = [way for way in compare.METHODS if way != "RE-MATCH joint"]
     spectral = [way for way in five if way != "kNN"]
@@ -125,11 +156,15 @@ def verdict(found):
     share = time_of["RE-MATCH"] / time_of["FMAP+ZO"]
     claims = {
         "kNN has the largest Chamfer distance of the five": max(five, key=chamfer.get) == "kNN",
-        "RE-MATCH has the smallest Chamfer distance of the five": min(five, key=chamfer.get) == "RE-MATCH",
-        "RE-MATCH has the smallest Hausdorff distance of the five": min(five, key=hausdorff.get) == "RE-MATCH",
-        "RE-MATCH is the fastest of the spectral methods": min(spectral, key=time_of.get) == "RE-MATCH",
+        "RE-MATCH has the smallest Chamfer distance of the five": min(five, key=chamfer.get)
+        == "RE-MATCH",
+        "RE-MATCH has the smallest Hausdorff distance of the five": min(five, key=hausdorff.get)
+        == "RE-MATCH",
+        "RE-MATCH is the fastest of the spectral methods": min(spectral, key=time_of.get)
+        == "RE-MATCH",
         f"RE-MATCH takes a tenth of the time of FMAP+ZO or less ({share:.2f})": share <= 0.1,
-        "SCALABLE is faster than ZO and FMAP+ZO": time_of["SCALABLE"] < min(time_of["ZO"], time_of["FMAP+ZO"]),
+        "SCALABLE is faster than ZO and FMAP+ZO": time_of["SCALABLE"]
+        < min(time_of["ZO"], time_of["FMAP+ZO"]),
     }
     if "geodesic_error" in of:
         error = of["geodesic_error"]
@@ -137,7 +172,8 @@ def verdict(found):
         claims |= {
             "kNN is the farthest from the truth of the five": max(five, key=error.get) == "kNN",
             f"RE-MATCH is as near to the truth as FMAP+ZO, within 5 % ({worse:.2f})": worse <= 1.05,
-            "joint rounds are nearer to the truth than all five": error["RE-MATCH joint"] < min(error[w] for w in five),
+            "joint rounds are nearer to the truth than all five": error["RE-MATCH joint"]
+            < min(error[w] for w in five),
             "the order by Chamfer distance is the order by the truth": sorted(five, key=chamfer.get)
             == sorted(five, key=error.get),
         }
@@ -146,7 +182,11 @@ def verdict(found):
 
 
 def figure_3(found):
-    say(block_table(found["way"].values, found["block"].values, found["block_seconds"].mean("pair").values))
+    say(
+        block_table(
+            found["way"].values, found["block"].values, found["block_seconds"].mean("pair").values
+        )
+    )
 
 
 def embedded(n_vertices=20_000):
@@ -154,9 +194,14 @@ def embedded(n_vertices=20_000):
     tree = synthetic.brains(6, n_vertices)
     meshes = {name: node.to_dataset() for name, node in tree["original"].children.items()}
     (reference, source), *others = meshes.items()
-    truth = {n: synthetic.position(tree["truth"], reference, tree["truth"][n]["reference_point"]) for n, _ in others}
+    truth = {
+        n: synthetic.position(tree["truth"], reference, tree["truth"][n]["reference_point"])
+        for n, _ in others
+    }
     found = compare.pairs(source, dict(others), truth={n: np.asarray(t) for n, t in truth.items()})
-    say(f"\nTable 1 on the embedded collection: 5 pairs of {n_vertices} vertices, landmarks as in 4.1")
+    say(
+        f"\nTable 1 on the embedded collection: 5 pairs of {n_vertices} vertices, landmarks as in 4.1"
+    )
     say(comparison_table(found))
     figure_3(found)
     verdict(found)
@@ -172,7 +217,11 @@ def heads():
         for path in others:
             mesh, seconds = compare.loaded(path, "target")
             target, begin = compare.Shape(mesh), load + seconds
-            rows.append(compare.one_pair(reference, target, compare.METHODS, None, begin, None, 300, options))
+            rows.append(
+                compare.one_pair(
+                    reference, target, compare.METHODS, None, begin, None, 300, options
+                )
+            )
             say(f"\nTable 1, {first.stem} and {path.stem}")
             say(comparison_table(xr.concat(rows[-1:], "pair")))
             figure_3(xr.concat(rows[-1:], "pair"))
@@ -191,15 +240,22 @@ def table_2():
     say(collection_table(found))
     names = found["shape"].values
     rows = [
-        [way, *(f"{d:.4f}" for d in found["distance_to_median"].sel(way=way).values)] for way in found["way"].values
+        [way, *(f"{d:.4f}" for d in found["distance_to_median"].sel(way=way).values)]
+        for way in found["way"].values
     ]
-    seconds, chamfer = found["collection_seconds"].sum("block"), found["collection_chamfer"].mean("shape")
+    seconds, chamfer = (
+        found["collection_seconds"].sum("block"),
+        found["collection_chamfer"].mean("shape"),
+    )
     claims = {
-        "both methods have the same median shape": len(set(found["median_shape"].values.tolist())) == 1,
+        "both methods have the same median shape": len(set(found["median_shape"].values.tolist()))
+        == 1,
         "ours takes less time than the standard way": bool(
             (seconds.sel(how="ours") < seconds.sel(how="standard")).all()
         ),
-        "ours has the smaller Chamfer distance": bool((chamfer.sel(how="ours") < chamfer.sel(how="standard")).all()),
+        "ours has the smaller Chamfer distance": bool(
+            (chamfer.sel(how="ours") < chamfer.sel(how="standard")).all()
+        ),
         "RE-MATCH takes less time than SCALABLE": bool(
             (seconds.sel(way="RE-MATCH") < seconds.sel(way="SCALABLE")).all()
         ),

@@ -1,9 +1,10 @@
 """Seconds and memory of every stage, beside what one would call otherwise, and how they grow.
 
-Every row runs in a process of its own with one BLAS thread, ours and the other in turn, on the same input: seconds of
-CPU, of the clock, and the peak of memory above what the process holds before.  pyFM is on PyPI as ``pyfmaps`` (the
-extra ``bench``).  ``speed.py stages``, ``pipelines``, ``growth`` or ``nearest`` runs one part, ``speed.py whole 51
-100000`` the whole analysis of so many synthetic shapes of so many vertices.
+Every row runs in a process of its own with one BLAS thread, ours and the other in turn, on the same
+input: seconds of CPU, of the clock, and the peak of memory above what the process holds before.
+pyFM is on PyPI as ``pyfmaps`` (the extra ``bench``).  ``speed.py stages``, ``pipelines``,
+``growth`` or ``nearest`` runs one part, ``speed.py whole 51 100000`` the whole analysis of so many
+synthetic shapes of so many vertices.
 """
 
 import itertools
@@ -22,13 +23,14 @@ from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 
 import s4a
-from s4a import fmap, latent, network, register, synthetic
-from s4a.align import align, farthest_points
-from s4a.fmap import nearest_rows
-from s4a.io import find_meshes
-from s4a.mesh import as_arrays, triangle_areas
-from s4a.nearest import nearest_in_cells
-from s4a.pca import gram_pca
+from s4a import synthetic
+from s4a.geometry.align import align, farthest_points
+from s4a.geometry.mesh import as_arrays, triangle_areas
+from s4a.input.files import find_meshes
+from s4a.method import fmap, latent, network, register
+from s4a.method.fmap import nearest_rows
+from s4a.method.nearest import nearest_in_cells
+from s4a.method.pca import gram_pca
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 VERTICES, NETWORK, K_INIT, K = 100_000, 10, 20, 100
@@ -57,7 +59,10 @@ def measured(function, *arguments):
 
 
 def beside(stage, ours, *others):
-    """Print a row for ours and each of the others: (name, function, arguments); gives what they return."""
+    """Print a row for ours and each of the others: (name, function, arguments).
+
+    Gives what they return.
+    """
     results, first = [], None
     for name, function, *arguments in (ours, *others):
         result, cpu, wall, memory = measured(function, *arguments)
@@ -99,7 +104,14 @@ def our_network(C, source, target, shapes):
     samples = [farthest_points(s[0], 1000) for s in shapes]
     eigenvalues = np.stack([s[3][:K] for s in shapes])
     found = latent.consistent_zoomout(
-        C, source, target, [s[2] for s in shapes], [s[1] for s in shapes], eigenvalues, K, samples=samples
+        C,
+        source,
+        target,
+        [s[2] for s in shapes],
+        [s[1] for s in shapes],
+        eigenvalues,
+        K,
+        samples=samples,
     )
     return found[3]
 
@@ -210,7 +222,9 @@ def other_network(C, source, target, shapes):
 
     meshes = [processed(*s) for s in shapes]
     found = FMN(meshes, {(int(i), int(j)): c for i, j, c in zip(source, target, C, strict=True)})
-    found.zoomout_refine(nit=(K - K_INIT) // 5, step=5, subsample=1000, isometric=True, cclb_ratio=1, n_jobs=1)
+    found.zoomout_refine(
+        nit=(K - K_INIT) // 5, step=5, subsample=1000, isometric=True, cclb_ratio=1, n_jobs=1
+    )
     found.compute_W()
     found.compute_CLB()
     found.compute_CCLB(K, verbose=False)
@@ -232,7 +246,11 @@ def scipy_nearest(Q, D):
 def sklearn_nearest(Q, D):
     from sklearn.neighbors import NearestNeighbors
 
-    return NearestNeighbors(n_neighbors=1, algorithm="brute").fit(D).kneighbors(Q, return_distance=False)[:, 0]
+    return (
+        NearestNeighbors(n_neighbors=1, algorithm="brute")
+        .fit(D)
+        .kneighbors(Q, return_distance=False)[:, 0]
+    )
 
 
 def other_modes(d, area):
@@ -245,22 +263,34 @@ def other_modes(d, area):
 
 
 def collection(n, n_vertices, folder):
-    """A synthetic collection as PLY files; the paths and the truth, with the reference point of every vertex."""
+    """A synthetic collection as PLY files.
+
+    The paths and the truth, with the reference point of every vertex.
+    """
     tree = synthetic.brains(n, n_vertices)
     return synthetic.write(tree, folder), tree["truth"]
 
 
 def pipeline_low(scan):
-    """Unit-area vertices, areas, eigenfunctions, eigenvalues of the coarse mesh, as the pipeline holds them."""
+    """Unit-area vertices, areas, eigenfunctions, eigenvalues of the coarse mesh.
+
+    As the pipeline holds them.
+    """
     return scan.low.X, scan.low.area, scan.low.Phi, scan.eigenvalue
 
 
 def stages(folder):
     """The table of stages."""
-    say(f"\nStages: shapes of {VERTICES:,} vertices; the network has {NETWORK} shapes, all pairs\n\n{HEAD}")
+    say(
+        f"\nStages: shapes of {VERTICES:,} vertices; the network has {NETWORK} shapes, all pairs\n\n{HEAD}"
+    )
     paths, _ = collection(2, VERTICES, folder / "two")
 
-    mesh, _ = beside("read and clean", ("s4a.read_shape", our_read, paths[0]), ("pymeshlab", other_read, paths[0]))
+    mesh, _ = beside(
+        "read and clean",
+        ("s4a.read_shape", our_read, paths[0]),
+        ("pymeshlab", other_read, paths[0]),
+    )
     X = mesh["position"].values
     coarse, *_ = beside(
         "remesh to 6,000 with U",
@@ -274,7 +304,9 @@ def stages(folder):
         ("s4a.spectrum", our_spectrum, coarse),
         ("pyFM TriMesh.process", other_spectrum, V, F),
     )
-    gap = np.abs(spectra[0]["eigenvalue"].values / coarse["vertex_area"].sum().item() - spectra[1])[1:]
+    gap = np.abs(spectra[0]["eigenvalue"].values / coarse["vertex_area"].sum().item() - spectra[1])[
+        1:
+    ]
     say(f"{'':36} largest difference of eigenvalues {(gap / spectra[1][1:]).max():.1e}")
     beside(
         f"{K} eigenpairs at {VERTICES:,}",
@@ -283,12 +315,15 @@ def stages(folder):
     )
 
     second = s4a.read_shape(paths[1])
-    scans = [register.Scan(mesh, spectra[0]), register.Scan(second, s4a.spectrum(s4a.coarsen(second), k=K))]
+    scans = [
+        register.Scan(mesh, spectra[0]),
+        register.Scan(second, s4a.spectrum(s4a.coarsen(second), k=K)),
+    ]
     a, b = map(pipeline_low, scans)
     meshes = [(s.low.X, s.low.T) for s in scans]
     (R, t, _), _ = beside(
         "align, any start",
-        ("s4a.align", align, *a[:2], *b[:2]),
+        ("s4a.geometry.align", align, *a[:2], *b[:2]),
         ("pymeshlab ICP, one start", other_icp, *meshes),
     )
     few = [(s.low.X, s.low.T, s.low.Phi, s.eigenvalue) for s in scans]
@@ -316,7 +351,10 @@ def stages(folder):
     say(f"{'':36} our distances exceed the KD-tree's by at most {(gaps[0] - gaps[1]).max():.1e}")
 
     network_table()
-    d, area = np.random.default_rng(0).normal(size=(51, VERTICES, 3)), np.full(VERTICES, 1 / VERTICES)
+    d, area = (
+        np.random.default_rng(0).normal(size=(51, VERTICES, 3)),
+        np.full(VERTICES, 1 / VERTICES),
+    )
     beside(
         f"PCA of 51 displacements, {VERTICES:,}",
         ("s4a.pca.gram_pca", our_modes, d, area),
@@ -325,7 +363,10 @@ def stages(folder):
 
 
 def network_table():
-    """Consistent ZoomOut of a complete network, with the error of the matches that its basis gives."""
+    """Consistent ZoomOut of a complete network.
+
+    With the error of the matches that its basis gives.
+    """
     tree = synthetic.brains(NETWORK, 20_000)
     names = list(tree["original"].children)
     meshes = [tree["original"][n].to_dataset() for n in names]
@@ -333,7 +374,9 @@ def network_table():
     shapes = [pipeline_low(s) for s in scans]
     source, target = np.array(list(itertools.permutations(range(NETWORK), 2))).T
     first = [
-        network.first_map(shapes[i], shapes[j], align(*shapes[i][:2], *shapes[j][:2])[:2], k_init=K_INIT)
+        network.first_map(
+            shapes[i], shapes[j], align(*shapes[i][:2], *shapes[j][:2])[:2], k_init=K_INIT
+        )
         for i, j in zip(source, target, strict=True)
     ]
     given = np.stack(first), source, target
@@ -347,7 +390,10 @@ def network_table():
             [(s.low.X, s.low.T, *p[2:]) for s, p in zip(scans, shapes, strict=True)],
         ),
     )
-    here = [cKDTree(m["position"]).query(s.coarse["position"])[1] for m, s in zip(meshes, scans, strict=True)]
+    here = [
+        cKDTree(m["position"]).query(s.coarse["position"])[1]
+        for m, s in zip(meshes, scans, strict=True)
+    ]
     for name, Y in zip(("s4a", "pyFM"), bases, strict=True):
         F = [shape[2][:, :K] @ y for shape, y in zip(shapes, Y, strict=True)]
         gaps = []
@@ -355,8 +401,12 @@ def network_table():
             match = nearest_rows(F[0], F[i])
             u = tree[f"truth/{names[0]}/reference_point"].values[here[0]]
             image = scans[i].coarse["position"].values[match]
-            gaps.append(error(synthetic.position(tree["truth"], names[i], u), image, scans[0].frame[1]))
-        say(f"{'':36} {name}: low-resolution matches {np.mean(gaps):.2f} % of sqrt(area) from the truth")
+            gaps.append(
+                error(synthetic.position(tree["truth"], names[i], u), image, scans[0].frame[1])
+            )
+        say(
+            f"{'':36} {name}: low-resolution matches {np.mean(gaps):.2f} % of sqrt(area) from the truth"
+        )
 
 
 def error(true, found, size):
@@ -379,13 +429,18 @@ def other_pipeline(paths, template):
         X = found.current_mesh().vertex_matrix()
         index, weights = other_quadric(path, X)
         found.meshing_decimation_quadric_edge_collapse(targetfacenum=12_000)
-        mesh = trimesh(found.current_mesh().vertex_matrix(), found.current_mesh().face_matrix().astype(np.int64))
+        mesh = trimesh(
+            found.current_mesh().vertex_matrix(),
+            found.current_mesh().face_matrix().astype(np.int64),
+        )
         shapes[Path(path).stem] = (X, index, weights, mesh.process(k=K, verbose=False))
     names = list(shapes)
     moved = {n: shapes[n][3].vertices for n in names}
     for n in names:
         if n != template:
-            M = other_icp((moved[n], shapes[n][3].faces), (moved[template], shapes[template][3].faces))
+            M = other_icp(
+                (moved[n], shapes[n][3].faces), (moved[template], shapes[template][3].faces)
+            )
             moved[n] = moved[n] @ M[:3, :3].T + M[:3, 3]
     from pyFM.FMN import FMN
     from pyFM.functional import FunctionalMapping
@@ -400,7 +455,9 @@ def other_pipeline(paths, template):
         model.fit(K=(K_INIT, K_INIT))
         maps[i, j] = model.FM
     found = FMN([shapes[n][3] for n in names], maps)
-    found.zoomout_refine(nit=(K - K_INIT) // 5, step=5, subsample=1000, isometric=True, cclb_ratio=1, n_jobs=1)
+    found.zoomout_refine(
+        nit=(K - K_INIT) // 5, step=5, subsample=1000, isometric=True, cclb_ratio=1, n_jobs=1
+    )
     found.compute_W()
     found.compute_CLB()
     found.compute_CCLB(K, verbose=False)
@@ -414,7 +471,9 @@ def other_pipeline(paths, template):
 
 def pipelines(folder, n=6, n_vertices=50_000):
     """The whole pipeline, ours and the one from pyFM, with errors against the truth."""
-    say(f"\nPipelines: {n} shapes of {n_vertices:,} vertices, all pairs, the first is the template\n\n{HEAD}")
+    say(
+        f"\nPipelines: {n} shapes of {n_vertices:,} vertices, all pairs, the first is the template\n\n{HEAD}"
+    )
     paths, truth = collection(n, n_vertices, folder / "files")
     paths, template = [str(p) for p in paths], Path(paths[0]).stem
     names = ("s4a, refine='joint'", "s4a, refine='intrinsic'", "pymeshlab + igl + pyFM")
@@ -429,26 +488,40 @@ def pipelines(folder, n=6, n_vertices=50_000):
     size = np.sqrt(triangle_areas(X[template], T).sum())
     u = truth[f"{template}/reference_point"].values
     for name, match in zip(names, found, strict=True):
-        gaps = [error(synthetic.position(truth, s, u), X[s][m], size) for s, m in match.items() if s != template]
-        say(f"{'':36} {name}: {np.mean(gaps):.2f} % of sqrt(area) from the truth, worst shape {np.max(gaps):.2f}")
+        gaps = [
+            error(synthetic.position(truth, s, u), X[s][m], size)
+            for s, m in match.items()
+            if s != template
+        ]
+        say(
+            f"{'':36} {name}: {np.mean(gaps):.2f} % of sqrt(area) from the truth, worst shape {np.max(gaps):.2f}"
+        )
 
 
 def stage_seconds(folder, n, n_vertices, n_pairs):
     paths, _ = collection(n, n_vertices, folder / "files")
     s4a.analyse(paths, store=folder / "study", n_jobs=1, n_pairs=n_pairs)
     report = s4a.open_study(folder / "study")["report"]
-    return dict(zip(report["stage"].values.tolist(), report["seconds"].values.tolist(), strict=True))
+    return dict(
+        zip(report["stage"].values.tolist(), report["seconds"].values.tolist(), strict=True)
+    )
 
 
 def growth(folder):
-    """How the seconds of every stage grow; the exponent is the slope of log seconds over log size."""
+    """How the seconds of every stage grow.
+
+    The exponent is the slope of log seconds over log size.
+    """
     for what, sizes in (
         ("vertices", [(4, v, 500) for v in (25_000, 50_000, 100_000)]),
         ("shapes", [(n, 10_000, 4 * n) for n in (8, 16, 32)]),
         ("pairs", [(24, 10_000, p) for p in (60, 120, 240)]),
     ):
         say(f"\n{what} x1 x2 x4 (shapes, vertices, pairs): {sizes}; seconds with one process\n")
-        found = [measured(stage_seconds, folder / what / str(i), *size)[0] for i, size in enumerate(sizes)]
+        found = [
+            measured(stage_seconds, folder / what / str(i), *size)[0]
+            for i, size in enumerate(sizes)
+        ]
         for stage in found[0]:
             seconds = np.array([max(f[stage], 1e-3) for f in found])
             slope = np.polyfit(np.log([1, 2, 4]), np.log(seconds), 1)[0]
@@ -456,11 +529,18 @@ def growth(folder):
 
 
 def certificates(folder, n_checked=1000):
-    """The dense search of eq. 4 on two shapes of every real collection: what the bound leaves to compare."""
+    """The dense search of eq. 4 on two shapes of every real collection.
+
+    What the bound leaves to compare.
+    """
     if not DATA.is_dir():
         return
-    say(f"\nNearest neighbours on real shapes: {K} dims, first shape -> second; {n_checked} checked in float64\n")
-    subprocess.run([sys.executable, DATA / "unpack.py", folder], check=True, stdout=subprocess.DEVNULL)
+    say(
+        f"\nNearest neighbours on real shapes: {K} dims, first shape -> second; {n_checked} checked in float64\n"
+    )
+    subprocess.run(
+        [sys.executable, DATA / "unpack.py", folder], check=True, stdout=subprocess.DEVNULL
+    )
     for one in sorted(p for p in folder.iterdir() if p.is_dir()):
         files = [file for file, _ in find_meshes(one)][:2]
         if len(files) < 2:
@@ -469,7 +549,9 @@ def certificates(folder, n_checked=1000):
         M, N = (register.Scan(mesh, s4a.spectrum(s4a.coarsen(mesh), k=K)) for mesh in meshes)
         motion = align(M.low.X, M.low.area, N.low.X, N.low.area)[:2]
         C = network.first_map(pipeline_low(M), pipeline_low(N), motion, k_init=K_INIT)
-        C = fmap.zoomout(C, M.low.Phi, N.low.Phi, N.low.area, min(K, M.low.Phi.shape[1], N.low.Phi.shape[1]))[0]
+        C = fmap.zoomout(
+            C, M.low.Phi, N.low.Phi, N.low.area, min(K, M.low.Phi.shape[1], N.low.Phi.shape[1])
+        )[0]
         F = M.low.Phi[:, : C.shape[1]] @ C.T, N.low.Phi[:, : C.shape[0]]
         begin = time.process_time()
         index, compared, certified = register.intrinsic_match(M, N, *F)
@@ -490,12 +572,22 @@ def whole(folder, n=51, n_vertices=VERTICES):
     s4a.analyse(paths, store=folder / "study", n_jobs=-1)
     wall = time.perf_counter() - begin
     report = s4a.open_study(folder / "study")["report"]
-    say(f"\n{n} shapes of {n_vertices:,} vertices, all defaults: {wall:.0f} s on {os.cpu_count()} cores\n")
-    for stage, seconds, memory in zip(*(report[v].values for v in ("stage", "seconds", "peak_memory")), strict=True):
+    say(
+        f"\n{n} shapes of {n_vertices:,} vertices, all defaults: {wall:.0f} s on {os.cpu_count()} cores\n"
+    )
+    for stage, seconds, memory in zip(
+        *(report[v].values for v in ("stage", "seconds", "peak_memory")), strict=True
+    ):
         say(f"{stage:36} {seconds:8.1f} s {memory:8.0f} MiB")
 
 
-PARTS = {"stages": stages, "pipelines": pipelines, "growth": growth, "nearest": certificates, "whole": whole}
+PARTS = {
+    "stages": stages,
+    "pipelines": pipelines,
+    "growth": growth,
+    "nearest": certificates,
+    "whole": whole,
+}
 
 if __name__ == "__main__":
     part, *numbers = sys.argv[1:] or [""]

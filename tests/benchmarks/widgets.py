@@ -1,8 +1,11 @@
-"""What the panels cost: bytes per interaction, time to the first picture, time per step, at 6k, 30k and 100k vertices.
+"""What the panels cost: bytes per interaction, time to the first picture, time per step, at 6k.
 
-Bytes and Python's time are those of one step in a notebook, counted where the widgets hand their messages over.  The
-first picture is that of the panel's page in Chromium with a software renderer, opened without a kernel, and a frame is
-one drawing of all its surfaces from scratch, their arrays uploaded again.
+30k and 100k vertices.
+
+Bytes and Python's time are those of one step in a notebook, counted where the widgets hand their
+messages over.  The first picture is that of the panel's page in Chromium with a software renderer,
+opened without a kernel, and a frame is one drawing of all its surfaces from scratch, their arrays
+uploaded again.
 """
 
 import json
@@ -19,7 +22,9 @@ import s4a
 from s4a import widgets
 from s4a.widgets import page
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+CHROMIUM = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+)
 SWITCHES = "--no-sandbox --disable-gpu --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader".split()
 SIZES = (6_000, 30_000, 100_000)
 STEPS = 6
@@ -33,7 +38,15 @@ FRAME = f"""() => {{
   }});
   return performance.now() - start;
 }}"""
-COLUMNS = ("panel", "vertices", "bytes a step", "Python (ms)", "frame (ms)", "first picture (s)", "page (MB)")
+COLUMNS = (
+    "panel",
+    "vertices",
+    "bytes a step",
+    "Python (ms)",
+    "frame (ms)",
+    "first picture (s)",
+    "page (MB)",
+)
 
 
 class Count:
@@ -55,8 +68,12 @@ def place(panel, i):
 
 STEP = {  # what the user does, for the i-th time
     "Modes": lambda panel, i: panel.view.set_trait("scores", [0.1 * (i + 1)] * len(panel.scores)),
-    "Network": lambda panel, i: panel.graph.set_trait("picked", {"edge": i % len(panel.source), "count": i + 1}),
-    "FunctionalMap": lambda panel, i: panel.matrix.set_trait("picked", {"row": i + 2, "column": i + 3}),
+    "Network": lambda panel, i: panel.graph.set_trait(
+        "picked", {"edge": i % len(panel.source), "count": i + 1}
+    ),
+    "FunctionalMap": lambda panel, i: panel.matrix.set_trait(
+        "picked", {"row": i + 2, "column": i + 3}
+    ),
     "Median": lambda panel, i: panel.select(panel.names[i % len(panel.names)]),
     "Correspondence": lambda panel, i: panel.scenes[0].set_trait("hovered", place(panel, i)),
     "Transfer": lambda panel, i: panel.scenes[0].set_trait("picked", place(panel, i)),
@@ -80,7 +97,9 @@ def measure(study, browser, count, folder):
         tab = browser.new_page(viewport={"width": 1280, "height": 1000})
         start = time.monotonic()
         tab.goto(path.as_uri())
-        tab.wait_for_function(f"{VIEWS}.length && {VIEWS}.every((view) => view.frames > 0)", timeout=120_000)
+        tab.wait_for_function(
+            f"{VIEWS}.length && {VIEWS}.every((view) => view.frames > 0)", timeout=120_000
+        )
         first = time.monotonic() - start
         frame = np.median([tab.evaluate(FRAME) for _ in range(STEPS)])
         tab.close()

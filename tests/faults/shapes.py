@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from s4a import synthetic, write_mesh
-from s4a.io import WRITERS
-from s4a.mesh import as_arrays
+from s4a.geometry.mesh import as_arrays
+from s4a.input.files import WRITERS
 
 BUMPS = np.array([[1, 0.4, 0.3], [-0.5, 1, 0.5], [-0.3, -0.8, 0.9], [0.3, -0.5, -1]])
 HEIGHTS = np.array([0.9, 0.6, 0.45, 0.3])
@@ -27,8 +27,9 @@ def shape(seed=0, n=300):
 class Fault:
     """A cell of the table: its input, the file and the outcome that are promised.
 
-    `make` writes `file` into a folder; `said` must be found in the report's column `where` (or in its attribute
-    ``remarks``) for the shape `name`; `outcome` and `change` are for the documentation.
+    `make` writes `file` into a folder; `said` must be found in the report's column `where` (or in
+    its attribute ``remarks``) for the shape `name`; `outcome` and `change` are for the
+    documentation.
     """
 
     input: str
@@ -70,7 +71,9 @@ def zero(path):
     path.write_bytes(b"")
 
 
-@fault("truncated file", "cut.ply", "excluded", "expected 596 rows of face, found", "excluded", AGAIN)
+@fault(
+    "truncated file", "cut.ply", "excluded", "expected 596 rows of face, found", "excluded", AGAIN
+)
 def cut(path):
     write(path, *shape())
     path.write_bytes(path.read_bytes()[:-1000])
@@ -98,12 +101,26 @@ def promise(path):
     path.write_bytes(path.read_bytes().replace(b"vertex 300", b"vertex 9000000"))
 
 
-@fault("PLY named .stl", "ply_inside.stl", "ok", "named .stl but holds PLY", "read as what it is", "rename the file")
+@fault(
+    "PLY named .stl",
+    "ply_inside.stl",
+    "ok",
+    "named .stl but holds PLY",
+    "read as what it is",
+    "rename the file",
+)
 def ply_inside(path):
     write(path, *shape(1))
 
 
-@fault("STL named .ply", "stl_inside.ply", "ok", "named .ply but holds STL", "read as what it is", "rename the file")
+@fault(
+    "STL named .ply",
+    "stl_inside.ply",
+    "ok",
+    "named .ply but holds STL",
+    "read as what it is",
+    "rename the file",
+)
 def stl_inside(path):
     path.write_bytes(WRITERS[".stl"](*shape(2), {}))
 
@@ -125,7 +142,14 @@ def bomb(path):
     path.write_bytes(gzip.compress(bytes(2**26 + 2**20), 1))
 
 
-@fault("points only", "points.off", "excluded", "no faces", "excluded", "export the surface, not the points")
+@fault(
+    "points only",
+    "points.off",
+    "excluded",
+    "no faces",
+    "excluded",
+    "export the surface, not the points",
+)
 def points(path):
     path.write_text("OFF\n300 0 0\n" + "\n".join("{} {} {}".format(*x) for x in shape()[0]))
 
@@ -208,7 +232,9 @@ def duplicate_vertices(path):
     path.write_bytes(WRITERS[".obj"](soup, np.arange(len(soup)).reshape(-1, 3), {}))
 
 
-@fault("STL soup", "soup.stl", "ok", "^$", "corners in the same place are one vertex", "nothing to do")
+@fault(
+    "STL soup", "soup.stl", "ok", "^$", "corners in the same place are one vertex", "nothing to do"
+)
 def soup(path):
     path.write_bytes(WRITERS[".stl"](*shape(8), {}))
 
@@ -242,7 +268,14 @@ def repeated(path):
     write(path, X, np.r_[T, [[3, 3, 4], [5, 6, 5]]])
 
 
-@fault("duplicate faces", "twice.ply", "repaired", "5 duplicate triangles dropped", "one is kept", "nothing to do")
+@fault(
+    "duplicate faces",
+    "twice.ply",
+    "repaired",
+    "5 duplicate triangles dropped",
+    "one is kept",
+    "nothing to do",
+)
 def twice(path):
     X, T = shape(11)
     write(path, X, np.r_[T, T[:5]])
@@ -457,7 +490,14 @@ def huge(path):
     path.write_bytes(WRITERS[".obj"](X * 1e9, T, {}))
 
 
-@fault("fewer vertices than the target resolution", "few.ply", "ok", "", "used as it is, said in the report", "nothing")
+@fault(
+    "fewer vertices than the target resolution",
+    "few.ply",
+    "ok",
+    "",
+    "used as it is, said in the report",
+    "nothing",
+)
 def few(path):
     write(path, *shape(25, 80))
 
@@ -475,12 +515,28 @@ def letters(path):
     write(path, *shape(26))
 
 
-@fault("two files with one stem", "left/one.ply", "ok", "^$", "named by their folders", "nothing", name="left_one")
+@fault(
+    "two files with one stem",
+    "left/one.ply",
+    "ok",
+    "^$",
+    "named by their folders",
+    "nothing",
+    name="left_one",
+)
 def left(path):
     write(path, *shape(27))
 
 
-@fault("two files with one stem", "right/one.ply", "ok", "^$", "named by their folders", "nothing", name="right_one")
+@fault(
+    "two files with one stem",
+    "right/one.ply",
+    "ok",
+    "^$",
+    "named by their folders",
+    "nothing",
+    name="right_one",
+)
 def right(path):
     write(path, *shape(28))
 
@@ -503,7 +559,14 @@ class Evil:
         return (exec, ("raise SystemExit('a pickle was executed')",))
 
 
-@fault("pickle in an NPZ", "pickle.npz", "excluded", "pickle", "excluded, never executed", "save plain arrays")
+@fault(
+    "pickle in an NPZ",
+    "pickle.npz",
+    "excluded",
+    "pickle",
+    "excluded, never executed",
+    "save plain arrays",
+)
 def pickle(path):
     np.savez(path, V=np.array([Evil()], object), F=np.array([[0, 1, 2]]))
 

@@ -1,7 +1,12 @@
 """Faults that are not of one mesh file: what is promised, and the test that proves it."""
 
 PIPELINE, CLEAN, TRANSFER = "test_pipeline.py", "test_clean.py", "test_transfer.py"
-STUDY, ENDS, FAULTS, BOUNDED = "test_study.py", "test_interruptions.py", "test_faults.py", "test_bounded.py"
+STUDY, ENDS, FAULTS, BOUNDED = (
+    "test_study.py",
+    "test_interruptions.py",
+    "test_faults.py",
+    "test_bounded.py",
+)
 
 # input, outcome, file and name of the test
 PROOFS = [

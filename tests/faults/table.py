@@ -1,4 +1,7 @@
-"""The page of the documentation on faults, from the entries of the tests: ``python tests/faults/table.py``."""
+"""The page of the documentation on faults, from the entries of the tests.
+
+``python tests/faults/table.py``.
+"""
 
 import sys
 from pathlib import Path
@@ -33,11 +36,27 @@ def cell(text):
 def page(faults, proofs, said):
     """The page; `said` is the text that the report has for every shape."""
     rows = [
-        [cell(f.input), f.status or "no shape", cell(f.outcome), cell(said[f.shape]), cell(f.change)] for f in faults
+        [
+            cell(f.input),
+            f.status or "no shape",
+            cell(f.outcome),
+            cell(said[f.shape]),
+            cell(f.change),
+        ]
+        for f in faults
     ]
-    tests = [[cell(given), cell(outcome), f"`{file}`: {test}"] for given, outcome, file, test in proofs]
+    tests = [
+        [cell(given), cell(outcome), f"`{file}`: {test}"] for given, outcome, file, test in proofs
+    ]
     lines = ["| " + " | ".join(row) + " |" for row in rows]
-    return HEAD + "\n".join(lines) + "\n" + REST + "\n".join("| " + " | ".join(r) + " |" for r in tests) + "\n"
+    return (
+        HEAD
+        + "\n".join(lines)
+        + "\n"
+        + REST
+        + "\n".join("| " + " | ".join(r) + " |" for r in tests)
+        + "\n"
+    )
 
 
 if __name__ == "__main__":

@@ -1,0 +1,1 @@
+"""What is done with a registered collection (6): statistics, the model, transfer."""

@@ -1,0 +1,187 @@
+"""True generalization (6.1).
+
+Each shape left out, its correspondences found anew in the study of all others.
+"""
+
+import logging
+
+import numpy as np
+import xarray as xr
+from joblib import Parallel, delayed
+from scipy.spatial import cKDTree
+from threadpoolctl import threadpool_limits
+from tqdm.auto import tqdm
+
+from s4a.analysis import model
+from s4a.geometry.align import realign
+from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
+from s4a.method.fmap import nearest_rows
+from s4a.method.register import Scan, identity, registration
+from s4a.schema import dataset, in_unit, unit_of
+from s4a.study import store
+from s4a.study.insert import insert, options_of
+
+log = logging.getLogger(__name__)
+
+RECOMPUTED = "recomputed for every left-out shape, as a new one in the study of the others"
+
+
+def _onto(shape, template, bases, motion, k, o):
+    """One registration of a shape of a study to another template, its latent basis as it is."""
+    with threadpool_limits(1):
+        F = [scan.low.Phi[:, :k] @ Y for scan, Y in zip((shape, template), bases, strict=True)]
+        R, t = realign(shape.low.X, shape.low.area, template.low.X, template.low.area, motion)
+        starts = {
+            "intrinsic": nearest_rows(F[1], F[0]),
+            "icp": cKDTree(shape.low.X @ R.T + t).query(template.low.X)[1],
+        }
+        return registration(shape, template, starts, F, k=k, refine=o["refine"], scale=o["scale"])
+
+
+def without(study, name, *, n_jobs=None):
+    """The study of all other shapes.
+
+    That of `name` leaves the latent space, the registration and the modes.
+
+    Where it is the template, the shape next nearest to the limit shape (eq. 5) takes its place, and
+    all others are registered to that.  The other shapes' latent bases stay: they came out of a
+    network that had the shape.
+    """
+    data = study["registration"].to_dataset()
+    latent = study["latent"].to_dataset()
+    kept = [n for n in data["shape"].values.tolist() if n != name]
+    nodes = {f"{s}/{n}": study[s][n].to_dataset() for s in ("original", "coarse") for n in kept}
+    nodes |= {"latent": latent.sel(shape=kept), "report": study["report"].to_dataset()}
+    if data.attrs["template"] != name:
+        nodes |= {"registration": data.sel(shape=kept)}
+        return xr.DataTree.from_dict(nodes)
+    template = str(latent["distance_to_median"].sel(shape=kept).idxmin().item())
+    scans = {n: Scan(nodes[f"original/{n}"].load(), nodes[f"coarse/{n}"].load()) for n in kept}
+    bases = {n: latent["latent_basis"].sel(shape=n).values for n in kept}
+    turn = {n: data["rotation"].sel(shape=n).values for n in kept}
+    o, k = options_of(study), latent.sizes["mode"]
+    others = [n for n in kept if n != template]
+    found = Parallel(n_jobs=n_jobs)(
+        delayed(_onto)(
+            scans[n],
+            scans[template],
+            (bases[n], bases[template]),
+            (turn[template].T @ turn[n], np.zeros(3)),
+            k,
+            o,
+        )
+        for n in others
+    )
+    files = dict(zip(others, found, strict=True)) | {template: identity(scans[template])}
+    X, T = as_arrays(scans[template].original)
+    mesh = as_dataset(X, T, {"template": template}, vertex_area=vertex_areas(X, T))
+    return xr.DataTree.from_dict(nodes | store.stack_registration(mesh, files, kept))
+
+
+def _left_out(study, name, n_points, seed, n_jobs):
+    """Vertex distances and distances to the surface of one left-out shape, for 0, 1.
+
+    ... components of the others.
+    """
+    others = without(study, name, n_jobs=n_jobs)
+    mesh = study["original"][name].to_dataset().load()
+    new = insert(others, {name: mesh}, compare=False)["registration"].to_dataset()
+    data = others["registration"].to_dataset()
+    X, T = as_arrays(data)
+    area = vertex_areas(X, T)
+    d, own = data["displacement"].values, new["displacement"].values
+    K = model.gram(np.concatenate([d, own]) - d.mean(0), area)
+    n = len(d)
+    error, _, steps = model.left_out(K[:n, :n], K[n, :n], K[n, n])
+    surface = np.full(n, np.nan)
+    if n_points:
+        rng = np.random.default_rng(seed)
+        points = np.sort(
+            rng.choice(len(X), min(n_points, len(X)), replace=False, p=area / area.sum())
+        )
+        R, t, s = (new[v].values[0] for v in ("rotation", "translation", "scale"))
+        gap = model.distance_to(s * mesh["position"].values @ R.T + t, mesh["corner_vertex"].values)
+        at = (X + d)[:, points].astype(float)
+        distance = gap(np.concatenate([at.mean(0)[None], model.reconstructed(at, steps)]))
+        surface[:] = distance[-1]
+        surface[: len(distance)] = distance
+    return error, surface
+
+
+def generalization(study, *, n_points=500, n_jobs=None, seed=0):
+    """Generalization with the correspondences recomputed.
+
+    Every shape in turn is new to the study of the others.
+
+    :func:`s4a.analysis.statistics.evaluate` leaves a shape out of the modes alone, which is
+    optimistic: its correspondences were made with it.  Here it is also left out of the
+    registration, and :func:`s4a.insert` finds its correspondences against the frozen others.  What
+    still knows it are the latent bases of the others, which came out of one network.
+
+    Parameters
+    ----------
+    study : DataTree
+        Finished, with at least 5 shapes.
+    n_points : int
+        Vertices of the reconstructions from which distances to the left-out shape's own surface, as
+        it was read, are measured; 0 leaves these out.
+    n_jobs : int, optional
+        As in joblib; the result does not depend on it.
+    seed : int
+        Of these vertices.
+
+    Returns
+    -------
+    Dataset
+        ``generalization(component)``, root mean square over the area between vertices, and
+        ``generalization_surface(component)``, mean distance from points to the surface; both with
+        their standard errors over the shapes, in the unit of the input.  Attributes
+        ``generalization_0`` of the mean shape alone, ``correspondence``, ``shapes``.
+
+    Raises
+    ------
+    ValueError
+        When the study is not finished, or has fewer than 5 shapes.
+
+    Examples
+    --------
+    With the ``study`` of six small brains:
+
+    >>> generalization(study).attrs["shapes"]
+    6
+    """
+    missing = [
+        n
+        for n in ("original", "coarse", "latent", "registration", "report")
+        if n not in study.children
+    ]
+    if missing:
+        raise ValueError(f"a finished study is needed; this one lacks {', '.join(missing)}")
+    data = study["registration"].to_dataset()
+    names = data["shape"].values.tolist()
+    if len(names) < 5:
+        raise ValueError(f"at least 5 shapes needed to leave one out, found {len(names)}")
+    template = data.attrs["template"]
+    order = [
+        template,
+        *(n for n in names if n != template),
+    ]  # the template's own turn has work to share out
+    first = [_left_out(study, template, n_points, seed, n_jobs)]
+    rest = Parallel(n_jobs=n_jobs, return_as="generator")(
+        delayed(_left_out)(study, name, n_points, seed, 1) for name in order[1:]
+    )
+    found = first + list(tqdm(rest, total=len(names) - 1, desc="shapes left out"))
+    error, surface = (np.stack([f[i] for f in found]) for i in (0, 1))
+    measures = {
+        "generalization": error[:, 1:].mean(0),
+        "generalization_error": model.standard_error(error[:, 1:]),
+    }
+    if n_points:
+        measures["generalization_surface"] = surface[:, 1:].mean(0)
+        measures["generalization_surface_error"] = model.standard_error(surface[:, 1:])
+    attrs = {
+        "correspondence": RECOMPUTED,
+        "shapes": len(names),
+        "generalization_0": float(error[:, 0].mean()),
+    }
+    return in_unit(dataset(attrs, **measures), unit_of(data["displacement"]))

@@ -1,0 +1,213 @@
+"""Permutation tests on plain arrays.
+
+Hotelling's T^2 with shrinkage, covariates after Freedman and Lane, maps (6.1).
+
+The general linear model is Y = Z G + X B + E: Z the intercept and the covariates, X what is tested
+(a variable, or the indicators of groups).  After Freedman & Lane (1983) the residuals of Y on Z are
+permuted; only the part of X that is orthogonal to Z counts.
+"""
+
+import math
+
+import numpy as np
+from sklearn.covariance import ledoit_wolf
+
+
+def design(x, covariates=None):
+    """Orthonormal bases of Z, ``(n, r)``, and of the part of X orthogonal to it, ``(n, q)``.
+
+    Parameters
+    ----------
+    x : float ndarray (n,) or (n, q)
+    covariates : float ndarray (n, c), optional
+
+    Raises
+    ------
+    ValueError
+        When X is a combination of the covariates, or too few shapes are left to estimate anything.
+    """
+    n = len(x)
+    x = np.asarray(x, float).reshape(n, -1)
+    Z = np.ones((n, 1)) if covariates is None else np.column_stack([np.ones(n), covariates])
+    U, S, _ = np.linalg.svd(Z, full_matrices=False)
+    Z = U[:, S > 1e-10 * S[0]]
+    rest = x - Z @ (Z.T @ x)
+    U, S, _ = np.linalg.svd(rest, full_matrices=False)
+    Q = U[:, S > 1e-8 * max(np.linalg.norm(x - x.mean(0)), 1e-300)]
+    if Q.shape[1] < max(1, np.linalg.matrix_rank(x - x.mean(0))):
+        raise ValueError(
+            "what is tested is constant or a combination of the covariates; leave one of them out"
+        )
+    if n - Z.shape[1] - Q.shape[1] < 2:
+        raise ValueError(
+            f"{n} shapes are too few for {Z.shape[1]} + {Q.shape[1]} columns of the model"
+        )
+    return Z, Q
+
+
+def indicators(group):
+    """Names of the groups, sorted.
+
+    And their indicator columns but for the first, ``(n, g - 1)``.
+    """
+    names, code = np.unique(group, return_inverse=True)
+    return names, (code[:, None] == np.arange(1, len(names))).astype(float)
+
+
+def hotelling(E, Q, dof):
+    """Hotelling's T^2 (Lawley and Hotelling's trace for several columns).
+
+    Covariance after Ledoit & Wolf (2004).
+
+    Parameters
+    ----------
+    E : float ndarray (n, p)
+        Residuals of the scores on the covariates.
+    Q : float ndarray (n, q)
+        As of :func:`design`.
+    dof : int
+        Degrees of freedom of the error, n - r - q.
+
+    Returns
+    -------
+    float
+    """
+    H = Q.T @ E
+    left = E - Q @ H
+    S = ledoit_wolf(left, assume_centered=True)[0] * len(E) / dof
+    return float(np.einsum("qp,pq->", H, np.linalg.solve(S, H.T)))
+
+
+def smallest_p(n_permutations, group=None, n=None):
+    """The smallest p that a permutation test can reach.
+
+    Bound by the number of permutations drawn, and by how many are different: two that only exchange
+    shapes within groups, or groups of equal size, give the same statistic.
+
+    Examples
+    --------
+    >>> smallest_p(999), smallest_p(9999, group=list("aaabbb"))
+    (0.001, 0.1)
+    """
+    drawn = 1 / (n_permutations + 1)
+    if group is None:
+        return max(drawn, 1 / math.factorial(n)) if n is not None and n < 20 else drawn
+    sizes = np.unique(group, return_counts=True)[1].tolist()
+    same = math.prod(math.factorial(sizes.count(s)) for s in set(sizes))
+    different = math.factorial(sum(sizes)) // math.prod(map(math.factorial, sizes))
+    return max(drawn, same / different)
+
+
+def permutation_test(scores, x, *, covariates=None, n_permutations=9999, seed=0):
+    """Permutation test of Hotelling's T^2 of scores on a variable or on groups.
+
+    With covariates after Freedman-Lane.
+
+    Parameters
+    ----------
+    scores : float ndarray (n, p)
+    x : float ndarray (n,) or (n, q)
+        A variable, or :func:`indicators`.
+    covariates : float ndarray (n, c), optional
+    n_permutations : int
+    seed : int
+
+    Returns
+    -------
+    statistic : float
+    p : float
+        (1 + number of permutations that reach the statistic) / (1 + n_permutations).
+
+    Examples
+    --------
+    >>> scores = np.random.default_rng(0).normal(size=(20, 3))
+    >>> x = np.repeat([0.0, 1.0], 10)
+    >>> permutation_test(scores + 3 * x[:, None], x, n_permutations=99, seed=1)[1]
+    0.01
+    """
+    Z, Q = design(x, covariates)
+    E = scores - Z @ (Z.T @ scores)
+    dof = len(E) - Z.shape[1] - Q.shape[1]
+    rng = np.random.default_rng(seed)
+    statistic = hotelling(E, Q, dof)
+    reached = 0
+    for _ in range(n_permutations):
+        permuted = E[rng.permutation(len(E))]
+        reached += hotelling(permuted - Z @ (Z.T @ permuted), Q, dof) >= statistic * (1 - 1e-12)
+    return statistic, (1 + reached) / (1 + n_permutations)
+
+
+def whitened(E):
+    """Residual vectors per vertex (n, v, d) in the metric of their own scatter, W^-1/2 e.
+
+    0 where there is none.
+    """
+    W = np.einsum("nvd,nve->vde", E, E)
+    value, V = np.linalg.eigh(W)
+    top = value[:, -1:]
+    inverse = np.where(
+        value > 1e-10 * np.where(top > 0, top, 1), 1 / np.sqrt(np.where(value > 0, value, 1)), 0.0
+    )
+    return np.einsum("nvd,vde,ve->nve", E, V, inverse, optimize=True)
+
+
+def vertex_test(d, x, *, covariates=None, n_permutations=999, seed=0):
+    """Permutation test at every vertex.
+
+    With p values corrected for all of them by the largest statistic (max-T).
+
+    The statistic is Pillai's trace, the share 0..1 of the vectors' scatter that X explains; for one
+    column of X, T^2 = dof V / (1 - V).  The scatter is that of the residuals on Z, which
+    permutations without covariates leave as it is, and with covariates nearly.
+
+    Parameters
+    ----------
+    d : float ndarray (n, v, k)
+        Fields of vectors, or with k = 1 of numbers.
+    x, covariates, n_permutations, seed : see :func:`permutation_test`
+
+    Returns
+    -------
+    share : float ndarray (v,)
+    p : float ndarray (v,), of each vertex alone
+    p_max : float ndarray (v,), family-wise (Westfall & Young 1993, single step)
+    """
+    Z, Q = design(x, covariates)
+    n, v, k = d.shape
+    E = np.asarray(d, float).reshape(n, -1)
+    E = whitened((E - Z @ (Z.T @ E)).reshape(n, v, k)).reshape(n, -1).astype(np.float32)
+    q = Q.shape[1]
+
+    def shares(columns):
+        return ((columns.T.astype(np.float32) @ E) ** 2).reshape(-1, q, v, k).sum(axis=(1, 3))
+
+    rng = np.random.default_rng(seed)
+    share = shares(Q)[0]
+    reached, largest = np.zeros(v, np.int64), []
+    block = max(1, int(2e7 // (v * k * q)))
+    for first in range(0, n_permutations, block):
+        orders = [rng.permutation(n) for _ in range(min(block, n_permutations - first))]
+        # Q^T (I - Z Z^T) P E = (P^T Q)^T E, as Q is orthogonal to Z
+        permuted = shares(np.concatenate([Q[np.argsort(order)] for order in orders], axis=1))
+        reached += (permuted >= share * (1 - 1e-6)).sum(0)
+        largest.append(permuted.max(1))
+    largest = np.sort(np.concatenate(largest)) if largest else np.empty(0)
+    beyond = len(largest) - np.searchsorted(largest, share * (1 - 1e-6), side="left")
+    return share, (1 + reached) / (1 + n_permutations), (1 + beyond) / (1 + n_permutations)
+
+
+def false_discovery_rate(p):
+    """Adjusted p values of Benjamini & Hochberg (1995).
+
+    Rejecting those up to q keeps the rate of false ones under q.
+
+    Examples
+    --------
+    >>> false_discovery_rate(np.array([0.01, 0.5, 0.02])).round(3).tolist()
+    [0.03, 0.5, 0.03]
+    """
+    order = np.argsort(p, kind="stable")
+    scaled = p[order] * len(p) / np.arange(1, len(p) + 1)
+    q = np.empty(len(p))
+    q[order] = np.minimum(np.minimum.accumulate(scaled[::-1])[::-1], 1)
+    return q

@@ -1,0 +1,1 @@
+"""Surfaces as arrays (3.1): triangles, normals, areas, distances, rigid motions."""

@@ -1,0 +1,416 @@
+"""Files of labels and landmarks (6.2).
+
+Read and write what experts marked on a mesh, in the order of its file.
+"""
+
+import csv
+import io
+import json
+import zipfile
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from s4a.input import bounded
+from s4a.input.gifti import parse_gifti
+from s4a.schema import dataset, require
+
+LONGEST = 255  # characters of a name: an array of names has room for the longest in each place
+MIRROR = np.array([-1.0, -1.0, 1.0])  # between RAS and LPS
+
+
+def read_labels(path, n=None):
+    """One label per vertex from a file.
+
+    Parameters
+    ----------
+    path : str or Path
+        NPY; NPZ, ``FILE.npz:NAME`` where several arrays fit; CSV or text, a row per vertex, with a
+        header the column ``label`` and, where there is one, the index ``vertex``; GIFTI label
+        (.gii); FreeSurfer .annot, whose labels are rows of its colour table, -1 for the annotation
+        0; each compressed by gzip too (.annot.gz).
+    n : int, optional
+        Number of vertices in the file of the mesh.
+
+    Returns
+    -------
+    ndarray (n,)
+        Integers or strings.
+
+    Raises
+    ------
+    ValueError
+        When the file is missing, is no label file, or has not `n` values.
+    """
+    file, _, name = str(path).partition(".npz:")
+    file = Path(f"{file}.npz" if name else file)
+    if not file.is_file():
+        raise ValueError(f"no file {file}")
+    kind = Path(file.name.lower().removesuffix(".gz")).suffix
+    readers = {".npy": bounded.npy, ".gii": _gifti_labels, ".annot": _annot_labels}
+    try:
+        data = bounded.content(file)
+        if kind == ".npz" or zipfile.is_zipfile(io.BytesIO(data)):
+            labels = _npz_labels(data, file.name, name, n)
+        else:
+            labels = np.asarray(readers.get(kind, _text_labels)(data))
+    except Exception as error:  # whatever the file holds, the message must name it
+        raise ValueError(
+            f"{path} cannot be read as labels: {error or type(error).__name__}"
+        ) from error
+    labels = labels[:, 0] if labels.ndim == 2 and labels.shape[1] == 1 else labels
+    if labels.ndim != 1 or (n is not None and len(labels) != n):
+        wanted = (
+            "one label per vertex"
+            if n is None
+            else f"{n} labels, one per vertex of the file of the mesh,"
+        )
+        raise ValueError(f"{path}: {wanted} needed, found an array of shape {labels.shape}")
+    if labels.dtype.kind == "f":
+        wrong = (np.round(labels) != labels) | ~(np.abs(labels) < 2**53)
+        if wrong.any():
+            raise ValueError(
+                f"{path}: labels need whole numbers or names, found {labels[wrong][0]}"
+            )
+        labels = labels.astype(np.int64)
+    if labels.dtype.kind not in "iubU":
+        raise ValueError(f"{path}: labels need whole numbers or names, found {labels.dtype}")
+    return labels
+
+
+def _npz_labels(data, file, name, n):
+    arrays = bounded.npz(data)
+    if name:
+        if name not in arrays:
+            raise ValueError(f"no array {name!r}; it has {', '.join(arrays)}")
+        return arrays[name]()
+    arrays = {key: read() for key, read in arrays.items()}
+    fitting = [
+        key for key, values in arrays.items() if values.ndim == 1 and n in (None, len(values))
+    ]
+    if len(fitting) != 1:
+        shapes = ", ".join(f"{key} {values.shape}" for key, values in arrays.items())
+        wanted = "one array" if n is None else f"one array of {n} values"
+        raise ValueError(f"{wanted} needed, found {shapes}; name it as {file}:NAME")
+    return arrays[fitting[0]]
+
+
+def _gifti_labels(data):
+    arrays = parse_gifti(data)
+    found = [values for intent, values in arrays if intent == "LABEL"]
+    found = found or [values for _, values in arrays if values.ndim == 1]
+    if not found:
+        raise ValueError("a GIFTI array of labels needed, found none")
+    return found[0]
+
+
+def _annot_labels(data):
+    """Rows of the colour table.
+
+    Nibabel's reader gives some row to an annotation that is not in the table.
+    """
+    at = 0
+
+    def take(count):
+        """The next big-endian integers."""
+        nonlocal at
+        if not 0 <= 4 * count <= len(data) - at:
+            raise ValueError(
+                f"expected {count} numbers, found {(len(data) - at) // 4}: the file is cut short"
+            )
+        at += 4 * count
+        return np.frombuffer(data, ">i4", count, at - 4 * count).astype(np.int64)
+
+    def skip_text():
+        nonlocal at
+        length = take(1)[0]
+        if not 0 <= length <= len(data) - at:
+            raise ValueError(
+                f"expected a text of {length} bytes, found {len(data) - at}: the file is cut short"
+            )
+        at += int(length)
+
+    vertex, annotation = take(2 * int(take(1)[0])).reshape(-1, 2).T
+    if not np.array_equal(np.sort(vertex), np.arange(len(vertex))):
+        raise ValueError(f"every vertex from 0 to {len(vertex) - 1} expected once")
+    if not take(1)[0]:
+        raise ValueError("a colour table expected, found none")
+    count, rows = int(take(1)[0]), {}
+    if count < 0:
+        if count != -2:
+            raise ValueError(f"a colour table of version 2 expected, found {-count}")
+        take(1)
+        skip_text()
+        count = int(take(1)[0])
+        numbered = True
+    else:
+        skip_text()
+        numbered = False
+    for i in range(count):
+        row = int(take(1)[0]) if numbered else i
+        skip_text()
+        r, g, b, _ = take(4)
+        rows.setdefault(int(r + 256 * g + 65536 * b), row)
+    rows[0] = -1
+    values, of_value = np.unique(annotation, return_inverse=True)
+    unknown = [value for value in values.tolist() if value not in rows]
+    if unknown:
+        raise ValueError(
+            f"annotations of the colour table expected, found {unknown[:3]}, which are not in it"
+        )
+    labels = np.empty(len(vertex), np.int64)
+    labels[vertex] = np.array([rows[value] for value in values.tolist()], np.int64)[of_value]
+    return labels
+
+
+def table_rows(data):
+    """Rows of a table separated by commas, semicolons, tabs or spaces.
+
+    Comments and empty lines are left out.
+    """
+    lines = [
+        s for s in data.decode("utf-8-sig").splitlines() if s.strip() and not s.startswith("#")
+    ]
+    if not lines:
+        raise ValueError("the file is empty")
+    mark = next((m for m in ",;\t" if m in lines[0]), " ")
+    return [
+        [cell.strip() for cell in row]
+        for row in csv.reader(lines, delimiter=mark, skipinitialspace=True)
+    ]
+
+
+def short(texts):
+    """`texts`, none of which is so long that an array of them would fill the memory."""
+    longest = max(map(len, texts), default=0)
+    if longest > LONGEST:
+        raise ValueError(f"names of at most {LONGEST} characters expected, found one of {longest}")
+    return texts
+
+
+def is_number(text):
+    """Whether a text is that of a number."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _text_labels(data):
+    rows = table_rows(data)
+    head = [cell.lower() for cell in rows[0]]
+    if "label" in head:
+        values = [row[head.index("label")] for row in rows[1:]]
+    elif len(head) == 1:
+        values = [row[0] for row in rows]
+    else:
+        raise ValueError(f"a column 'label' needed, found {', '.join(rows[0])}")
+    labels = (
+        np.array([float(v) for v in values])
+        if all(map(is_number, values))
+        else np.array(short(values))
+    )
+    if "label" in head and "vertex" in head:
+        vertex = np.array([row[head.index("vertex")] for row in rows[1:]]).astype(int)
+        if not np.array_equal(np.sort(vertex), np.arange(len(vertex))):
+            raise ValueError(
+                f"the column 'vertex' needs every index from 0 to {len(vertex) - 1} once"
+            )
+        labels = labels[np.argsort(vertex)]
+    return labels
+
+
+def read_landmarks(path):
+    """Named points from a file.
+
+    Parameters
+    ----------
+    path : str or Path
+        3D Slicer .mrk.json (points, curves, closed curves), CSV ``name,x,y,z`` (a header is
+        optional; with one, also ``curve``, the name of the curve or empty, and ``closed``), or the
+        XML of MeshLab's picked points (.pp); each compressed by gzip too.
+
+    Returns
+    -------
+    Dataset
+        ``landmark_name(landmark)``, ``landmark_position(landmark, xyz)``; where there are curves,
+        ``landmark_curve`` and ``landmark_closed``, the points in order along each; attribute
+        ``coordinate_system``, RAS or LPS where the file says which, else empty.
+
+    Raises
+    ------
+    ValueError
+        When the file is missing or holds no points, or a curve has one point only.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ValueError(f"no file {path}")
+    try:
+        data = bounded.content(path)
+        head = data.decode("utf-8-sig").lstrip()[:1]
+        reader = {"{": _slicer_points, "<": _meshlab_points}.get(head, _table_points)
+        names, points, system, curve, closed = reader(data)
+        points = np.array(points, float).reshape(-1, 3)
+        if len(points) == 0 or not np.isfinite(points).all():
+            raise ValueError(f"points with finite coordinates needed, found {len(points)}")
+        single = [name for name, count in Counter(curve).items() if name and count < 2]
+        if single:
+            raise ValueError(f"a curve needs two points or more; {single[0]!r} has one")
+        names = short([str(name) or str(i + 1) for i, name in enumerate(names)])
+        curve = short([str(name) for name in curve])
+    except Exception as error:
+        raise ValueError(
+            f"{path} cannot be read as landmarks: {error or type(error).__name__}"
+        ) from error
+    curves = (
+        {"landmark_curve": np.array(curve), "landmark_closed": np.array(closed, bool)}
+        if any(curve)
+        else {}
+    )
+    return dataset(
+        {"coordinate_system": system},
+        landmark_name=np.array(names),
+        landmark_position=points,
+        **curves,
+    )
+
+
+def _slicer_points(data):
+    lists = json.loads(data.decode("utf-8-sig"))["markups"]
+    systems = {str(m.get("coordinateSystem", "LPS")).upper() for m in lists}
+    if len(systems) != 1 or not systems <= {"LPS", "RAS"}:
+        raise ValueError(
+            f"one coordinateSystem, LPS or RAS, needed, found {', '.join(sorted(systems)) or 'no markups'}"
+        )
+    rows, taken = [], set()
+    for i, m in enumerate(lists, 1):
+        curve = ""
+        if m.get("type") in ("Curve", "ClosedCurve"):
+            curve = m.get("name") or f"curve_{i}"
+            curve = f"{curve}_{i}" if curve in taken else curve
+            taken.add(curve)
+        points = [p for p in m["controlPoints"] if p.get("positionStatus", "defined") == "defined"]
+        rows += [
+            (p.get("label", ""), p["position"], curve, m.get("type") == "ClosedCurve")
+            for p in points
+        ]
+    names, points, curve, closed = zip(*rows, strict=True) if rows else ((),) * 4
+    return names, points, systems.pop(), curve, closed
+
+
+def _meshlab_points(data):
+    points = [
+        p for p in bounded.xml(data.decode("utf-8-sig")).iter("point") if p.get("active") != "0"
+    ]
+    names = [p.get("name", "") for p in points]
+    return names, [[p.get(axis) for axis in "xyz"] for p in points], "", [""] * len(names), []
+
+
+def _table_points(data):
+    rows = table_rows(data)
+    head = [cell.lower() for cell in rows[0]]
+    if all(axis in head for axis in "xyz"):
+        x = [head.index(axis) for axis in "xyz"]
+        name = next((head.index(n) for n in ("name", "label", "landmark") if n in head), None)
+        curve, closed = (head.index(n) if n in head else None for n in ("curve", "closed"))
+        rows = rows[1:]
+    elif len(head) in (3, 4) and all(map(is_number, rows[0][-3:])):
+        x, name, curve, closed = (
+            range(len(head) - 3, len(head)),
+            0 if len(head) == 4 else None,
+            None,
+            None,
+        )
+    else:
+        raise ValueError(f"the columns name, x, y and z needed, found {', '.join(rows[0])}")
+    names, curves, rings = (
+        ["" if i is None else row[i] for row in rows] for i in (name, curve, closed)
+    )
+    return (
+        names,
+        [[row[i] for i in x] for row in rows],
+        "",
+        curves,
+        [c.lower() in ("1", "true", "yes") for c in rings],
+    )
+
+
+def write_landmarks(path, landmarks):
+    """Write ``landmark_name`` and ``landmark_position`` as CSV ``name,x,y,z``.
+
+    With curves also ``curve,closed``.
+    """
+    require(landmarks, "landmark_name", "landmark_position", what="landmarks")
+    with open(path, "w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file)
+        curves = ["landmark_curve", "landmark_closed"] if "landmark_curve" in landmarks else []
+        table.writerow(
+            ["name", "x", "y", "z", *(name.removeprefix("landmark_") for name in curves)]
+        )
+        names, points = landmarks["landmark_name"].values, landmarks["landmark_position"].values
+        further = (
+            zip(*(landmarks[name].values.tolist() for name in curves), strict=True)
+            if curves
+            else [()] * len(names)
+        )
+        rows = zip(names, points, further, strict=True)
+        table.writerows([name, *(repr(float(v)) for v in x), *more] for name, x, more in rows)
+
+
+def labels_of_mesh(labels, mesh):
+    """Labels numbered as in the file of a mesh, for the vertices of the cleaned mesh.
+
+    Raises
+    ------
+    ValueError
+        When there is not one label per vertex of the file.
+
+    Examples
+    --------
+    >>> mesh = dataset(file_vertex=[2, 0], vertex_of_file=[1, -1, 0])
+    >>> labels_of_mesh(np.array([5, 6, 7]), mesh).tolist()
+    [7, 5]
+    """
+    require(mesh, "file_vertex", "vertex_of_file", what="mesh")
+    n = mesh.sizes["file_vertex_index"]
+    if np.shape(labels) != (n,):
+        raise ValueError(
+            f"{n} labels, one per vertex of the file of the mesh, needed, found shape {np.shape(labels)}"
+        )
+    return np.asarray(labels)[mesh["file_vertex"].values]
+
+
+def labels_of_file(labels, mesh, points):
+    """Labels of a cleaned mesh, for the vertices as numbered in its file.
+
+    Parameters
+    ----------
+    labels : ndarray (n,)
+        One per vertex of the cleaned mesh.
+    mesh : Dataset
+        With ``position`` and ``vertex_of_file``.
+    points : float ndarray (p, 3)
+        The vertices of the file.
+
+    Returns
+    -------
+    labels : ndarray (p,)
+        A vertex that cleaning dropped has that of the nearest vertex that was kept; one that is not
+        finite has that of the vertex before it in the file.
+    n_dropped : int
+    """
+    require(mesh, "position", "vertex_of_file", what="mesh")
+    vertex = mesh["vertex_of_file"].values.copy()
+    if len(points) != len(vertex):
+        raise ValueError(
+            f"the {len(vertex)} vertices of the file of the mesh needed, found {len(points)}"
+        )
+    dropped = vertex < 0
+    known = dropped & np.isfinite(points).all(axis=1)
+    vertex[known] = cKDTree(mesh["position"].values).query(points[known])[1]
+    last = np.maximum.accumulate(np.where(vertex >= 0, np.arange(len(vertex)), -1))
+    vertex = np.where(last >= 0, vertex[last], 0)
+    return np.asarray(labels)[vertex], int(dropped.sum())

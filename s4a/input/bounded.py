@@ -1,0 +1,154 @@
+"""Containers that cannot fill the memory or run anything: gzip, NPZ, NPY, XML (5, the data)."""
+
+import gzip
+import io
+import lzma
+import math
+import re
+import xml.etree.ElementTree as ElementTree
+import zipfile
+import zlib
+from pathlib import Path
+from xml.parsers import expat
+
+import numpy as np
+
+LARGEST = 2**30  # bytes that a file may unpack to: 30 million vertices and their triangles
+LEAST, RATIO = (
+    2**26,
+    200,
+)  # unpacked size that is never refused, and how many times the size of the file beyond it
+GZIP = b"\x1f\x8b"
+
+
+def limit_of(size):
+    """Most bytes that a file of `size` bytes may unpack to.
+
+    Examples
+    --------
+    >>> limit_of(1000) == LEAST, limit_of(10**6), limit_of(10**9) == LARGEST
+    (True, 200000000, True)
+    """
+    return min(LARGEST, max(LEAST, RATIO * size))
+
+
+def check(unpacked, size):
+    """ValueError when `unpacked` bytes are more than a file of `size` bytes may hold."""
+    if unpacked > limit_of(size):
+        raise ValueError(
+            f"at most {limit_of(size) / 2**20:.0f} MiB expected in {size} compressed bytes, found more: "
+            "unpack the file yourself if you trust it"
+        )
+
+
+def gunzip(data):
+    """The bytes of a gzip file (several members too).
+
+    Or ValueError where they are too many or end early.
+
+    Examples
+    --------
+    >>> gunzip(gzip.compress(b"ply") + gzip.compress(b" format"))
+    b'ply format'
+    """
+    try:
+        found = gzip.GzipFile(fileobj=io.BytesIO(data)).read(limit_of(len(data)) + 1)
+    except EOFError as error:
+        raise ValueError(f"the gzip data ends early: found {len(data)} bytes") from error
+    except (OSError, zlib.error) as error:
+        raise ValueError(f"damaged gzip data ({error})") from error
+    check(len(found), len(data))
+    return found
+
+
+def content(path):
+    """The bytes of a file, unpacked where it is compressed by gzip."""
+    data = Path(path).read_bytes()
+    return gunzip(data) if data.startswith(GZIP) else data
+
+
+def unpack(data, compressor, limit):
+    """The bytes of one stream, `limit` at most: of ``"zlib"`` or ``"lzma"``."""
+    makers = {"zlib": zlib.decompressobj, "lzma": lambda: lzma.LZMADecompressor(memlimit=2**28)}
+    stream = makers[compressor]()
+    found = stream.decompress(data, max(limit, 0) + 1)
+    if len(found) > limit:
+        raise ValueError(f"at most {limit} bytes expected in a compressed block, found more")
+    if not stream.eof:
+        raise ValueError(f"a compressed block ends early: found {len(data)} bytes")
+    return found
+
+
+def xml(text):
+    """The root of an XML file.
+
+    ValueError where it declares entities, which could grow or name other files.
+
+    Examples
+    --------
+    >>> xml('<!DOCTYPE a SYSTEM "a.dtd"><a b="1"/>').get("b")
+    '1'
+    >>> xml('<!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>')
+    Traceback (most recent call last):
+    ValueError: an XML file without entities expected, found a declaration of 'b'
+    """
+
+    def refuse(name, *_):
+        raise ValueError(
+            f"an XML file without entities expected, found a declaration of {name[:40]!r}"
+        )
+
+    parser = expat.ParserCreate()
+    parser.EntityDeclHandler = refuse
+    parser.Parse(text, True)
+    return ElementTree.fromstring(text)
+
+
+def npz(data):
+    """name -> function that reads the array, of an NPZ archive.
+
+    ValueError where it holds too much.
+    """
+    archive = zipfile.ZipFile(io.BytesIO(data))
+    members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
+    check(sum(member.file_size for member in members.values()), len(data))
+    return {
+        name: lambda member=member: npy(archive.read(member)) for name, member in members.items()
+    }
+
+
+NPY = re.compile(
+    rb"\{ *'descr': *'([<>|=]?[biufU]\d{1,9})', *'fortran_order': *(True|False), *"
+    rb"'shape': *\(([\d, ]{0,400})\),? *\}\s*"
+)
+
+
+def npy(data):
+    """The array of a NPY file of numbers or text; nothing in the file is evaluated or unpickled.
+
+    Examples
+    --------
+    >>> out = io.BytesIO()
+    >>> np.save(out, np.array([[1, 2], [3, 4]], order="F"))
+    >>> npy(out.getvalue()).tolist()
+    [[1, 2], [3, 4]]
+    """
+    if not data.startswith(b"\x93NUMPY") or data[6:8] not in (b"\1\0", b"\2\0"):
+        raise ValueError("an array of NumPy's format 1.0 or 2.0 expected, found something else")
+    width = 2 * data[6]
+    start = 8 + width + int.from_bytes(data[8 : 8 + width], "little")
+    header = NPY.fullmatch(data, 8 + width, start)
+    if not header:
+        found = data[8 + width : start].strip()[:100]
+        raise ValueError(
+            f"an array of numbers or text expected, and no pickled objects; found the header {found!r}"
+        )
+    dtype = np.dtype(header[1].decode())
+    shape = tuple(int(size) for size in header[3].split(b",") if size.strip())
+    expected, found = math.prod(shape) * dtype.itemsize, len(data) - start
+    if dtype.itemsize == 0 or expected > found:
+        raise ValueError(
+            f"{expected} bytes of {dtype} expected for the shape {shape}, found {found}"
+        )
+    values = np.frombuffer(data, dtype, math.prod(shape), start)
+    return values.reshape(shape, order="F" if header[2] == b"True" else "C").copy()

@@ -1,0 +1,174 @@
+"""Spectrum (3.3): eigenpairs of the Laplace-Beltrami operator, projection and reconstruction."""
+
+import logging
+
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg as spla
+import xarray as xr
+
+from s4a.geometry.mesh import stiffness
+from s4a.schema import dataset, require
+
+log = logging.getLogger(__name__)
+
+
+def eigenpairs(E, w, area, k):
+    """The k smallest eigenpairs of W phi = lambda A phi, for the surface scaled to unit area.
+
+    Parameters
+    ----------
+    E : int ndarray (e, 2)
+        Edges.
+    w : float ndarray (e,)
+        Cotan weights.
+    area : float ndarray (n,)
+        Lumped vertex areas, in any unit.
+    k : int
+        Number of eigenpairs, smaller than n.
+
+    Returns
+    -------
+    eigenvalue : float ndarray (k,)
+    Phi : float ndarray (n, k)
+        Phi^T A Phi = I for areas of sum 1; the sign of a column makes its third moment positive.
+    """
+    n = len(area)
+    a = area / area.sum()
+    # A^-1/2 W A^-1/2 is symmetric with the same eigenvalues; the tiny shift keeps its factor away from the null space
+    root = sp.diags(1 / np.sqrt(a))
+    S = (root @ stiffness(E, w, n) @ root).tocsc()
+    shift = 1e-8 * S.diagonal().mean()
+    solve = spla.splu(
+        (S + shift * sp.identity(n)).tocsc(),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    ).solve
+    inverse = spla.LinearOperator((n, n), matvec=solve, dtype=float)
+    start = np.sqrt(a) + 1e-3 * np.cos(np.arange(n))
+    eigenvalue, V = spla.eigsh(S, k=k, sigma=-shift, OPinv=inverse, v0=start, which="LM")
+    order = np.argsort(eigenvalue)
+    eigenvalue, Phi = eigenvalue[order], V[:, order] / np.sqrt(a)[:, None]
+    eigenvalue = np.where(np.abs(eigenvalue) < 1e-9 * max(eigenvalue[-1], 1.0), 0.0, eigenvalue)
+    Phi *= np.where(a @ Phi**3 < 0, -1.0, 1.0)
+    if (eigenvalue == 0).sum() == 1:
+        Phi[:, 0] = 1.0  # exactly, so that constants stay constant in every map
+    return eigenvalue, Phi
+
+
+def project(Phi, area, f):
+    """Coefficients Phi^T A f of functions `f` (n, ...) in an area-orthonormal basis.
+
+    `area` of sum 1.
+    """
+    return Phi.T @ (area[:, None] * f.reshape(len(f), -1)) if f.ndim > 1 else Phi.T @ (area * f)
+
+
+def spectrum(mesh, *, k=100):
+    """Area-orthonormal Laplace-Beltrami eigenpairs of a low-resolution mesh (3.3).
+
+    Parameters
+    ----------
+    mesh : xarray.Dataset
+        Needs ``vertex_area``, ``edge_vertex`` and ``cotan_weight`` as :func:`s4a.coarsen` gives
+        them.
+    k : int
+        Number of eigenpairs.  Where the mesh has too few vertices for it, as many as it can carry
+        are given and the attribute ``k_reduced_from`` says so.
+
+    Returns
+    -------
+    xarray.Dataset
+        The mesh with ``eigenvalue(mode)`` and ``eigenfunction(vertex, mode)`` for unit area: A^-1 W
+        phi = lambda phi, Phi^T A Phi = I with A of trace 1.  The attribute ``zero_eigenvalues``
+        counts the connected pieces.
+
+    Raises
+    ------
+    ValueError
+        When k is not a positive integer, the mesh has fewer than 3 vertices, or the solver finds no
+        eigenpairs.
+
+    Examples
+    --------
+    A sphere of radius 1, whose area is 4 pi, has the eigenvalues 0, 2 (three times), 6 (five times):
+
+    >>> from s4a.method.remesh import coarsen
+    >>> from s4a.datasets.synthetic import sphere
+    >>> found = spectrum(coarsen(sphere(2000), n_coarse=1000), k=9)
+    >>> (found["eigenvalue"].values / (4 * np.pi)).round().tolist()
+    [0.0, 2.0, 2.0, 2.0, 6.0, 6.0, 6.0, 6.0, 6.0]
+    """
+    require(mesh, "vertex_area", "edge_vertex", "cotan_weight", what="mesh")
+    if int(k) != k or k < 1:
+        raise ValueError(f"k must be a positive integer, found {k!r}")
+    n = mesh.sizes["vertex"]
+    possible = min(int(k), n - 2)
+    if possible < 1:
+        raise ValueError(f"a spectrum needs at least 3 vertices, found {n}")
+    E, w, area = (mesh[name].values for name in ("edge_vertex", "cotan_weight", "vertex_area"))
+    try:
+        eigenvalue, Phi = eigenpairs(E, w, area, possible)
+    except RuntimeError as error:  # of the factor or of ARPACK
+        raise ValueError(
+            f"no {possible} eigenpairs of a mesh with {n} vertices: {error}"
+        ) from error
+    attrs = dict(mesh.attrs, zero_eigenvalues=int((eigenvalue == 0).sum()))
+    if possible < k:
+        log.warning("k reduced from %d to %d: the mesh has only %d vertices", k, possible, n)
+        attrs["k_reduced_from"] = int(k)
+    return xr.merge([mesh, dataset(eigenvalue=eigenvalue, eigenfunction=Phi)]).assign_attrs(attrs)
+
+
+def unit_area(mesh):
+    """Vertex areas of a mesh Dataset scaled to sum 1, ``(n,)``.
+
+    The A in which its eigenfunctions are orthonormal.
+    """
+    area = mesh["vertex_area"].values
+    return area / area.sum()
+
+
+def reconstruct(mesh, f, *, k=None):
+    """A function on the mesh from its first k coefficients: Phi Phi^T A f.
+
+    Parameters
+    ----------
+    mesh : xarray.Dataset
+        With ``eigenfunction`` and ``vertex_area``.
+    f : array_like (vertex, ...)
+        One or several functions, for example the positions.
+    k : int, optional
+        How many eigenfunctions; all by default.
+
+    Returns
+    -------
+    float ndarray, of the shape of `f`
+
+    Examples
+    --------
+    The positions of a sphere are eigenfunctions, so that four of them are enough:
+
+    >>> from s4a.method.remesh import coarsen
+    >>> from s4a.datasets.synthetic import sphere
+    >>> ball = spectrum(coarsen(sphere(2000), n_coarse=1000), k=4)
+    >>> bool(abs(reconstruct(ball, ball["position"]) - ball["position"].values).max() < 0.01)
+    True
+    """
+    require(mesh, "eigenfunction", "vertex_area", what="mesh")
+    Phi, f = mesh["eigenfunction"].values[:, :k], np.asarray(f, float)
+    return Phi @ project(Phi, unit_area(mesh), f)
+
+
+def weyl(k):
+    """Weyl's law for a closed surface of unit area, ``(k,)``.
+
+    The i-th eigenvalue grows like 4 pi i.
+
+    Examples
+    --------
+    >>> weyl(3).round(2).tolist()
+    [0.0, 12.57, 25.13]
+    """
+    return 4 * np.pi * np.arange(k)

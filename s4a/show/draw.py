@@ -1,0 +1,397 @@
+"""Pictures of surfaces without a graphics card.
+
+A small renderer in NumPy, and the colours that S4A uses.
+"""
+
+import base64
+import io
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import ListedColormap
+from PIL import Image
+from scipy.ndimage import gaussian_filter
+
+from s4a.geometry.mesh import triangle_normals, vertex_normals
+
+VIEWS = {
+    "front": (-90, 0),
+    "back": (90, 0),
+    "left": (180, 0),
+    "right": (0, 0),
+    "top": (-90, 90),
+    "bottom": (-90, -90),
+    "corner": (-50, 22),
+}
+CLAY = (0.80, 0.76, 0.70)
+UNKNOWN = (0.6, 0.6, 0.6)
+# Okabe and Ito's colours, told apart with every common kind of colour blindness
+OKABE_ITO = ("#e69f00", "#56b4e9", "#009e73", "#f0e442", "#0072b2", "#d55e00", "#cc79a7", "#999999")
+# red, white, blue, without the ends, which are too dark to show the shading
+SIGNED = ListedColormap(colormaps["RdBu"](np.linspace(0.06, 0.94, 255)), "signed")
+CHUNK = 2_000_000  # candidate samples at a time, some 100 MB
+
+
+def rotation(view="corner", up="z"):
+    """Rotation ``(3, 3)`` into the picture: rows right, up and towards the viewer.
+
+    Parameters
+    ----------
+    view : str or (float, float)
+        A name of :data:`VIEWS`, or where the viewer stands: azimuth around the up axis and
+        elevation, in degrees.
+    up : {"x", "y", "z"}
+        The axis that points up; the other two follow it in cyclic order.
+
+    Examples
+    --------
+    >>> rotation("top").round().astype(int).tolist()
+    [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    """
+    if up not in ("x", "y", "z"):
+        raise ValueError(f"up needs x, y or z, found {up!r}")
+    a, e = np.deg2rad(_angles(view))
+    right = np.array([-np.sin(a), np.cos(a), 0])
+    towards = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+    R = np.stack([right, np.cross(towards, right), towards])
+    return np.roll(R, "zxy".index(up), axis=1)
+
+
+def opposite(view):
+    """The view from the other side, as azimuth and elevation.
+
+    The two together show all that can be seen.
+
+    Examples
+    --------
+    >>> opposite("front")
+    (90, 0)
+    """
+    azimuth, elevation = _angles(view)
+    return azimuth + 180, -elevation
+
+
+def _angles(view):
+    if isinstance(view, str) and view not in VIEWS:
+        raise ValueError(
+            f"view needs one of {', '.join(VIEWS)} or (azimuth, elevation), found {view!r}"
+        )
+    return VIEWS[view] if isinstance(view, str) else view
+
+
+def rasterise(P, T, width, height):
+    """Which triangle each sample of the picture sees, by a z-buffer.
+
+    Parameters
+    ----------
+    P : float ndarray (n, 3)
+        Columns: x to the right and y down in samples, z towards the viewer.
+    T : int ndarray (m, 3)
+    width, height : int
+
+    Returns
+    -------
+    sample : int ndarray (s,)
+        The samples ``y * width + x`` that see something.
+    triangle : int ndarray (s,)
+    weights : float32 ndarray (s, 3)
+        Barycentric weights in that triangle.
+    depth : float32 ndarray (s,)
+    """
+    A, B, C = (P[T[:, i]] for i in range(3))
+    low = np.minimum(np.minimum(A, B), C)[:, :2]
+    high = np.maximum(np.maximum(A, B), C)[:, :2]
+    low = np.maximum(np.ceil(low - 0.5), 0).astype(np.int64)
+    high = np.minimum(np.floor(high - 0.5), (width - 1, height - 1)).astype(np.int64)
+    box = np.maximum(high - low + 1, 0)
+    samples = box[:, 0] * box[:, 1]
+    (ax, ay), (bx, by), (cx, cy) = (corner[:, :2].T for corner in (A, B, C))
+    double_area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
+    drawn = np.flatnonzero((samples > 0) & (np.abs(double_area) > 1e-9))
+    scale = 1 / np.where(double_area == 0, 1, double_area)
+    # the weights of corners b and c are linear in the sample's place: slope x, slope y, value at the box's first sample
+    slopes = np.stack([cy - ay, ax - cx, ay - by, bx - ax], axis=1) * scale[:, None]
+    x, y = low[:, 0] + 0.5 - ax, low[:, 1] + 0.5 - ay
+    start = np.stack(
+        [slopes[:, 0] * x + slopes[:, 1] * y, slopes[:, 2] * x + slopes[:, 3] * y], axis=1
+    )
+    slopes, start, z = (
+        slopes.astype(np.float32),
+        start.astype(np.float32),
+        P[:, 2].astype(np.float32)[T],
+    )
+
+    nearest = np.full(width * height, -np.inf, np.float32)
+    seen = np.full(width * height, -1, np.int64)
+    weights = np.zeros((width * height, 3), np.float32)
+    total = np.cumsum(samples[drawn])
+    for part in np.split(
+        drawn, np.searchsorted(total, np.arange(CHUNK, total[-1] if len(total) else 0, CHUNK))
+    ):
+        count = samples[part]
+        owner = np.repeat(part, count)
+        place = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
+        dy, dx = np.divmod(place, box[owner, 0])
+        wb = start[owner, 0] + slopes[owner, 0] * dx + slopes[owner, 1] * dy
+        wc = start[owner, 1] + slopes[owner, 2] * dx + slopes[owner, 3] * dy
+        inside = np.flatnonzero((wb >= 0) & (wc >= 0) & (wb + wc <= 1))
+        owner, wb, wc = owner[inside], wb[inside], wc[inside]
+        sample = (low[owner, 1] + dy[inside]) * width + low[owner, 0] + dx[inside]
+        w = np.stack([1 - wb - wc, wb, wc], axis=1).astype(np.float32)
+        depth = np.einsum("sc,sc->s", w, z[owner])
+        np.maximum.at(nearest, sample, depth)
+        front = np.flatnonzero(depth == nearest[sample])
+        seen[sample[front]], weights[sample[front]] = owner[front], w[front]
+    sample = np.flatnonzero(seen >= 0)
+    return sample, seen[sample], weights[sample], nearest[sample]
+
+
+def plane_box(points, view="corner", up="z"):
+    """The box ``(2, 2)`` of the points in the picture's plane, lowest and highest corner.
+
+    A `frame` for render.
+    """
+    plane = np.asarray(points, float).reshape(-1, 3) @ rotation(view, up)[:2].T
+    return np.stack([plane.min(0), plane.max(0)])
+
+
+def render(
+    points,
+    triangles,
+    *,
+    colors=None,
+    flat=False,
+    view="corner",
+    up="z",
+    size=(500, 400),
+    frame=None,
+):
+    """A picture of a surface: orthographic, softly lit, antialiased, on a transparent background.
+
+    Parameters
+    ----------
+    points : float ndarray (n, 3)
+    triangles : int ndarray (m, 3)
+    colors : float ndarray (n, 3), optional
+        Red, green and blue of each vertex, 0 to 1; see :func:`signed_colors`, :func:`ramp_colors`
+        and :func:`label_colors`.  A row of NaN is drawn grey.
+    flat : bool
+        Take the colour of the nearest corner instead of mixing three: for labels.
+    view, up
+        See :func:`rotation`.
+    size : (int, int)
+        Width and height in pixels.
+    frame : float ndarray (2, 2), optional
+        What part of the picture's plane to show, as :func:`plane_box` gives it, so that several
+        pictures share a scale; by default the surface fills the picture.
+
+    Returns
+    -------
+    uint8 ndarray (height, width, 4)
+        Red, green, blue and opacity.
+
+    Raises
+    ------
+    ValueError
+        For an empty surface, or positions that are not finite.
+
+    Examples
+    --------
+    >>> tetrahedron = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    >>> picture = render(tetrahedron, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]), size=(60, 40))
+    >>> picture.shape, picture[0, 0, 3].item(), picture[20, 30, 3].item()
+    ((40, 60, 4), 0, 255)
+    """
+    X, T = np.asarray(points, float), np.asarray(triangles, np.int64)
+    if not len(T) or not np.isfinite(X).all():
+        raise ValueError(
+            f"render needs triangles and finite positions, found {len(T)} triangles; clean the mesh first"
+        )
+    X = X @ rotation(view, up).T
+    width, height = 2 * size[0], 2 * size[1]  # two by two samples a pixel
+    frame = np.stack([X[:, :2].min(0), X[:, :2].max(0)]) if frame is None else np.asarray(frame)
+    extent = np.maximum(frame[1] - frame[0], np.finfo(float).tiny)
+    scale = 0.94 * min(width / extent[0], height / extent[1])
+    P = (X - [*frame.mean(0), 0]) * [scale, -scale, scale] + [width / 2, height / 2, 0]
+    sample, triangle, weights, depth = rasterise(P, T, width, height)
+    corners = T[triangle]
+    N = np.einsum("sc,scx->sx", weights, vertex_normals(X, T).astype(np.float32)[corners])
+    N *= np.where(
+        triangle_normals(X, T)[triangle, 2:] < 0, -1, 1
+    )  # a surface seen from behind is lit all the same
+    N /= np.maximum(np.linalg.norm(N, axis=1, keepdims=True), 1e-6)
+    base = (
+        np.asarray(CLAY, np.float32) if colors is None else _sampled(colors, corners, weights, flat)
+    )
+    shade = np.zeros((height, width, 4), np.float32)
+    shade.reshape(-1, 4)[sample, :3] = _light(N, base, _creases(sample, depth, width, height))
+    shade.reshape(-1, 4)[sample, 3] = 1
+    pixels = _halved(shade)
+    pixels[..., :3] /= np.maximum(pixels[..., 3:], 0.25)  # the mean over the covered samples only
+    return (255 * np.clip(pixels, 0, 1) + 0.5).astype(np.uint8)
+
+
+def _sampled(colors, corners, weights, flat):
+    """The colour of every sample from the colours of the corners of its triangle."""
+    colors = np.asarray(colors, np.float32)
+    colors = np.where(np.isfinite(colors), colors, np.float32(UNKNOWN))
+    if flat:
+        return colors[np.take_along_axis(corners, weights.argmax(1)[:, None], axis=1)[:, 0]]
+    return np.einsum("sc,scx->sx", weights, colors[corners])
+
+
+def _creases(sample, depth, width, height):
+    """Darkness ``(s,)`` of samples that lie deeper than what is around them (unsharp masking of the depth)."""
+    flat = np.zeros((2, height * width), np.float32)
+    flat[0, sample], flat[1, sample] = depth, 1
+    sigma = 0.004 * (width + height)
+    total, cover = (
+        gaussian_filter(_halved(a.reshape(height, width)), sigma, truncate=2.5) for a in flat
+    )
+    around = total / np.maximum(cover, 1e-3)
+    y, x = np.divmod(sample, width)
+    return np.clip((around[y // 2, x // 2] - depth) / (5 * sigma), 0, 1)
+
+
+def _halved(samples):
+    """The mean of each two by two samples."""
+    return (samples[::2, ::2] + samples[1::2, ::2] + samples[::2, 1::2] + samples[1::2, 1::2]) / 4
+
+
+def _light(N, base, crease):
+    """Colours ``(s, 3)`` under a key light from the upper left, a soft sky and a little gloss."""
+    key = np.array([-0.42, 0.55, 0.72], np.float32)
+    key /= np.linalg.norm(key)
+    gloss = key + [0, 0, 1]
+    gloss = (gloss / np.linalg.norm(gloss)).astype(np.float32)
+    wrap = np.clip((N @ key + 0.3) / 1.3, 0, 1)
+    sky = 0.5 + 0.5 * N[:, 1]
+    rim = np.clip(1 - N[:, 2], 0, 1) ** 3
+    light = (0.47 + 0.15 * sky + 0.48 * wrap) * (1 - 0.5 * crease) * (1 - 0.3 * rim)
+    shine = 0.10 * np.clip(N @ gloss, 0, 1) ** 40 * (1 - crease)
+    return np.clip(base * light[:, None] + shine[:, None], 0, 1)
+
+
+def signed_colors(values, limit):
+    """Colours ``(n, 3)`` of signed values, white at 0.
+
+    Blue is positive (expansion), red is negative (compression).
+
+    Parameters
+    ----------
+    values : float ndarray (n,)
+    limit : float
+        The absolute value of the full colours.
+
+    Examples
+    --------
+    >>> red, white, blue = signed_colors(np.array([-2.0, 0.0, 2.0]), limit=2)
+    >>> bool(red[0] > red[2]), bool(white.min() > 0.9), bool(blue[2] > blue[0])
+    (True, True, True)
+    """
+    return ramp_colors(values, -limit, limit, SIGNED)
+
+
+def ramp_colors(values, low=None, high=None, colormap="viridis"):
+    """Colours ``(n, 3)`` of values from `low` to `high` (by default their range); NaN stays NaN."""
+    values = np.asarray(values, float)
+    low = np.nanmin(values) if low is None else low
+    high = np.nanmax(values) if high is None else high
+    span = high - low if high > low else 1.0
+    colors = colormaps.get_cmap(colormap)(np.nan_to_num((values - low) / span))[..., :3]
+    return np.where(np.isnan(values)[..., None], np.nan, colors)
+
+
+def label_colors(labels):
+    """Colours ``(n, 3)`` of integer labels.
+
+    Eight that everybody tells apart, then darker and lighter ones of them.
+
+    Examples
+    --------
+    >>> len(np.unique(label_colors(np.arange(24)), axis=0))
+    24
+    """
+    palette = np.array([[int(c[i : i + 2], 16) / 255 for i in (1, 3, 5)] for c in OKABE_ITO])
+    palette = np.concatenate([palette, 0.55 * palette, 0.45 + 0.55 * palette])
+    return palette[
+        np.unique(labels, return_inverse=True)[1].reshape(np.shape(labels)) % len(palette)
+    ]
+
+
+def position_colors(points):
+    """Colours ``(n, 3)`` that tell places apart: the coordinates as red, green and blue."""
+    points = np.asarray(points, float)
+    low, high = points.min(0), points.max(0)
+    return 0.12 + 0.83 * (points - low) / np.maximum(high - low, np.finfo(float).tiny)
+
+
+def checkerboard(coordinates, cell):
+    """Brightness ``(n,)`` of a checkerboard of cubes of the side `cell`: 1 and 0.5 in turn.
+
+    NaN stays NaN.
+
+    Examples
+    --------
+    >>> checkerboard(np.array([[0.1, 0.1, 0.1], [1.1, 0.1, 0.1], [1.1, 1.9, 0.1]]), 1.0)
+    array([1. , 0.5, 1. ])
+    """
+    return 1 - 0.5 * (np.floor(np.asarray(coordinates) / cell).sum(1) % 2)
+
+
+def with_balls(points, triangles, colors, balls):
+    """A surface with spheres: points, triangles and colours of all.
+
+    Each ball is x, y, z, red, green, blue, radius.
+
+    Examples
+    --------
+    >>> X, T, colors = with_balls(np.zeros((3, 3)), np.array([[0, 1, 2]]), None, [[5, 0, 0, 1, 0, 0, 2.0]])
+    >>> float(X[:, 0].min()), float(X[:, 0].max()), colors[-1].tolist()
+    (0.0, 7.0, [1.0, 0.0, 0.0])
+    """
+    if not len(balls):
+        return points, triangles, colors
+    rings, around = 10, 16
+    a, b = np.meshgrid(
+        np.linspace(0, np.pi, rings + 1), np.linspace(0, 2 * np.pi, around + 1), indexing="ij"
+    )
+    unit = np.stack([np.sin(a) * np.cos(b), np.sin(a) * np.sin(b), np.cos(a)], -1).reshape(-1, 3)
+    here = (np.arange(rings)[:, None] * (around + 1) + np.arange(around)).ravel()
+    below = here + around + 1
+    T = np.concatenate(
+        [np.stack([here, below, here + 1], 1), np.stack([here + 1, below, below + 1], 1)]
+    )
+    colors = np.tile(CLAY, (len(points), 1)) if colors is None else np.asarray(colors)
+    parts = [np.asarray(points)], [np.asarray(triangles)], [colors]
+    for i, (*centre, red, green, blue, radius) in enumerate(balls):
+        parts[0].append(np.array(centre) + radius * unit)
+        parts[1].append(T + len(points) + i * len(unit))
+        parts[2].append(np.tile([red, green, blue], (len(unit), 1)))
+    return tuple(np.concatenate(part) for part in parts)
+
+
+def image_bytes(picture, kind="webp"):
+    """The bytes of an image file of a picture ``(height, width, 4)``.
+
+    ``webp``, a tenth of the size, or exact ``png``.
+
+    Examples
+    --------
+    >>> image_bytes(np.zeros((2, 2, 4), np.uint8), "png")[1:4]
+    b'PNG'
+    """
+    file = io.BytesIO()
+    Image.fromarray(picture).save(file, kind, quality=88, optimize=True)
+    return file.getvalue()
+
+
+def on_white(picture):
+    """A picture ``(height, width, 4)`` laid on white: ``(height, width, 3)``."""
+    opacity = picture[..., 3:] / 255
+    return (picture[..., :3] * opacity + 255 * (1 - opacity) + 0.5).astype(np.uint8)
+
+
+def data_uri(content, kind="image/webp"):
+    """Bytes as the address of an image inside a page."""
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
