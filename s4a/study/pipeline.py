@@ -127,7 +127,9 @@ def alignment_task(folder, name, reference):
 
 def motion_to_reference(folder, name):
     """R and t of :func:`alignment_task`."""
-    return tuple(archive.arrays(folder / "network" / f"motion_{name}.nc", "rotation", "translation"))
+    return tuple(
+        archive.arrays(folder / "network" / f"motion_{name}.nc", "rotation", "translation")
+    )
 
 
 def motion_between(source, target):

@@ -2,7 +2,7 @@
 
 PIPELINE, CLEAN, TRANSFER = "test_pipeline.py", "test_clean.py", "test_transfer.py"
 STUDY, ENDS, FAULTS, BOUNDED = (
-    "test_study.py",
+    "test_store.py",
     "test_interruptions.py",
     "test_faults.py",
     "test_bounded.py",

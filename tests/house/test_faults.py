@@ -6,12 +6,12 @@ In Python, in ``s4a check`` and in ``s4a run`` the outcome that is promised.
 import contextlib
 import io
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 from faults import shapes as faulty
 from faults import studies, table
+from paths import TESTS
 
 from s4a import analyse, cli, insert, open_study, read_shapes
 from s4a.geometry.mesh import as_dataset, euler_characteristic
@@ -23,25 +23,6 @@ FLAGS = [
     part for name, value in SMALL.items() for part in ("--" + name.replace("_", "-"), str(value))
 ]
 BY_NAME = {one.shape: one for one in faulty.FAULTS}
-
-
-def found_in(folder):
-    """The report of Python."""
-    return read_shapes(folder)["report"].to_dataset()
-
-
-def example(report):
-    """What the report says of every faulty shape, without the paths of this machine."""
-    said = {}
-    for one in faulty.FAULTS:
-        text = (
-            report.attrs["remarks"]
-            if one.where == "remarks"
-            else report[one.where].sel(shape=one.shape).item()
-        )
-        lines = [line for line in text.splitlines() if one.where != "remarks" or one.file in line]
-        said[one.shape] = re.sub(r"\S*/(?=[^/\s]+)", "", " ".join(lines))
-    return said
 
 
 def printed(*arguments):
@@ -60,7 +41,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def in_python(folder):
-    return found_in(folder)
+    return table.report_of(folder)
 
 
 @pytest.fixture(scope="session")
@@ -130,15 +111,13 @@ def test_the_page_of_a_study_escapes_the_names_of_files(ran):
 
 
 def test_the_documentation_is_current(in_python):
-    assert table.PAGE.read_text(encoding="utf-8") == table.page(
-        faulty.FAULTS, studies.PROOFS, example(in_python)
-    )
+    assert table.PAGE.read_text(encoding="utf-8") == table.page(table.sentences(in_python))
 
 
 @pytest.mark.parametrize("proof", studies.PROOFS, ids=lambda proof: proof[3])
 def test_every_other_row_of_the_table_has_its_test(proof):
     _, _, file, test = proof
-    assert f"def {test}(" in (Path(__file__).parent / file).read_text()
+    assert f"def {test}(" in next(TESTS.rglob(file)).read_text(encoding="utf-8")
 
 
 # rows that need more than a file

@@ -7,12 +7,12 @@ import gzip
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import nibabel
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from paths import DATA
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -41,7 +41,6 @@ from s4a.input.annotations import (
 )
 from s4a.schema import dataset
 
-DATA = Path(__file__).parents[2] / "shared" / "data"
 OPTIONS = {"n_coarse": 1200, "k": 60}
 
 

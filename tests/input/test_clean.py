@@ -1,18 +1,16 @@
 from collections import defaultdict
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
+from paths import DATA
 from scipy.spatial import ConvexHull
 
 from s4a.geometry.mesh import as_dataset, triangle_areas, volume
 from s4a.input.clean import clean, clean_arrays
 from s4a.input.collection import read_shape, read_shapes
 from s4a.input.files import write_mesh
-
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
 def assert_oriented_manifold(X, T):

@@ -1,15 +1,14 @@
 import struct
 import zlib
 from base64 import b64encode
-from pathlib import Path
 
 import nibabel
 import numpy as np
 import pytest
+from paths import DATA
 
 from s4a.input.files import find_meshes, not_meshes, read_mesh, slug, write_mesh
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 X = np.array([[0, 0, 0], [1.5, 0, 0], [1.5, 2, 0], [0, 2, 0], [0.25, 0.5, 3]])
 T = np.array([[0, 2, 1], [0, 3, 2], [0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
 

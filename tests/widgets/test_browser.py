@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from paths import NOTEBOOKS
 
 import s4a
 from s4a.show.pictures import aligned
@@ -29,7 +30,7 @@ CHROMIUM = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
 )
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium")
-NOTEBOOK = Path(__file__).parent.parent / "notebooks" / "00_explore.ipynb"
+NOTEBOOK = NOTEBOOKS / "00_explore.ipynb"
 SWITCHES = (
     "--no-sandbox --disable-gpu --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader --disable-quic "
     "--disable-background-networking --no-first-run --disable-component-update --disable-sync"

@@ -10,15 +10,13 @@ import os
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
+from paths import DOCS, ROOT
 
 import s4a
 from s4a.schema import TABLE
 
-ROOT = Path(__file__).parent.parent
-DOCS = ROOT / "docs"
 PACKAGE = ROOT / "s4a"
 MODULES = sorted(
     path

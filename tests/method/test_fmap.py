@@ -1,9 +1,8 @@
 """Functional maps (3.3): identity for identical shapes, permutations recovered exactly."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
+from paths import DATA
 from scipy.spatial import cKDTree
 
 from s4a import clean, coarsen, spectrum, synthetic
@@ -144,9 +143,6 @@ def test_nearest_rows_does_not_depend_on_the_block():
 def test_of_equal_rows_the_first_is_given():
     D = np.repeat(np.eye(4), 3, axis=0)
     assert fmap.nearest_rows(np.eye(4), D).tolist() == [0, 3, 6, 9]
-
-
-DATA = Path(__file__).parents[2] / "shared/data"
 
 
 def real_pairs():

@@ -8,15 +8,14 @@ import os
 import re
 import shutil
 import tomllib
-from pathlib import Path
 
 import numpy as np
 import pytest
+from paths import ROOT
 
 import s4a
 from s4a.study.store import open_study
 
-ROOT = Path(__file__).parent.parent
 BINDER = ROOT / "binder"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 

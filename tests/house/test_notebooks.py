@@ -6,16 +6,15 @@ Its exercises without an answer and with the one of the book.
 import asyncio
 import json
 import re
-from pathlib import Path
 
 import pytest
+from paths import NOTEBOOKS
 
 nbformat = pytest.importorskip("nbformat")
 nbclient = pytest.importorskip("nbclient")
 pytest.importorskip("ipykernel")
 
-FOLDER = Path(__file__).parent.parent / "notebooks"
-NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
+LESSONS = sorted(NOTEBOOKS.glob("*.ipynb"))
 MEMORY = 1500  # MiB, of the 2 GB that Binder gives
 OPEN = "answer = ..."
 SPENT = """
@@ -25,7 +24,7 @@ unit = 2**20 if sys.platform == "darwin" else 2**10
 seconds = sum(r.ru_utime + r.ru_stime for r in (own, child))
 json.dumps({"seconds": seconds, "MiB": (own.ru_maxrss + child.ru_maxrss) / unit})
 """
-each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+each_notebook = pytest.mark.parametrize("path", LESSONS, ids=lambda path: path.stem)
 
 
 def tags(cell):
@@ -113,4 +112,4 @@ def test_it_is_kept_without_outputs_and_with_an_exercise_that_lets_the_others_ru
 
 @each_notebook
 def test_the_table_of_lessons_has_it(path):
-    assert f"({path.name})" in (FOLDER / "README.md").read_text(encoding="utf-8")
+    assert f"({path.name})" in (NOTEBOOKS / "README.md").read_text(encoding="utf-8")

@@ -1,8 +1,7 @@
-from pathlib import Path
-
 import igl
 import numpy as np
 import pytest
+from paths import DATA
 from scipy.sparse.csgraph import connected_components
 
 from s4a.geometry.mesh import (
@@ -17,8 +16,6 @@ from s4a.geometry.voronoi import faults
 from s4a.input.clean import clean
 from s4a.method.remesh import coarsen
 from s4a.method.spectral import spectrum
-
-DATA = Path(__file__).parents[2] / "shared/data"
 
 
 def grid(nx, ny, wrap=(False, False)):
