@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from s4a.analysis.link import at, closest_point
+from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays, edge_graph, edges, triangle_areas
 from s4a.input.annotations import MIRROR
 from s4a.schema import dataset, require
@@ -49,7 +49,7 @@ def locate(landmarks, mesh, *, farthest=FARTHEST_LANDMARK):
 
     def placed(P):
         found = closest_point(P, X, T)
-        point = at(X, T, *found)
+        point = interpolate(X, T, *found)
         return *found, point, np.linalg.norm(point - P, axis=1)
 
     found = placed(P * MIRROR if theirs and ours and theirs != ours else P)
@@ -109,7 +109,7 @@ def follow(P, X, T, *, closed=False, spacing):
         if not len(long):
             break
         middle = (P[long] + P[long + 1]) / 2
-        P = np.insert(P, long + 1, at(X, T, *closest_point(middle, X, T)), axis=0)
+        P = np.insert(P, long + 1, interpolate(X, T, *closest_point(middle, X, T)), axis=0)
         given = np.insert(given, long + 1, False)
     return (P[:-1], given[:-1]) if closed else (P, given)
 

@@ -10,66 +10,11 @@ point of the shape.  A route is a chain of links with their directions.
 from dataclasses import dataclass
 from functools import cached_property
 
-import igl
 import numpy as np
 import scipy.sparse as sp
-from scipy.spatial import cKDTree
 
-from s4a.geometry.mesh import (
-    as_arrays,
-    closest_point_in_star,
-    closest_point_on_triangles,
-    triangle_areas,
-    triangle_normals,
-    vertex_normals,
-)
-from s4a.method.joint import features
-
-
-def interpolation(T, triangle, weights, n):
-    """Sparse matrix ``(p, n)`` that takes values on n vertices to p points given by triangle and barycentric weights.
-
-    Examples
-    --------
-    >>> W = interpolation(np.array([[0, 1, 2]]), np.array([0]), np.array([[0.5, 0.25, 0.25]]), 3)
-    >>> W.toarray().tolist()
-    [[0.5, 0.25, 0.25]]
-    """
-    rows = np.repeat(np.arange(len(triangle)), 3)
-    return sp.csr_matrix((weights.ravel(), (rows, T[triangle].ravel())), (len(triangle), n))
-
-
-def at(values, T, triangle, weights):
-    """Values (n, d) on vertices, at points given by triangle and barycentric weights ``(p, d)``."""
-    return np.einsum("pc,pcd->pd", weights, values[T[triangle]])
-
-
-def closest_point(P, X, T):
-    """The point of a surface closest to each row of P: triangle ``(p,)``, weights ``(p, 3)``."""
-    P, X, T = (
-        np.ascontiguousarray(a, t) for a, t in ((P, np.float64), (X, np.float64), (T, np.int64))
-    )
-    triangle = igl.point_mesh_squared_distance(P, X, T)[1].reshape(-1)
-    return triangle, closest_point_on_triangles(P, *(X[T[triangle, i]] for i in range(3)))
-
-
-def closest_facing_point(P, N, X, T):
-    """As :func:`closest_point`.
-
-    On the side of the surface that faces as the normals N of the points do.
-
-    Where the closest point lies on a triangle turned away, such as the other side of a thin wall,
-    it is searched around the vertex that is nearest in position and normal.
-    """
-    triangle, weights = closest_point(P, X, T)
-    away = np.flatnonzero(np.einsum("px,px->p", triangle_normals(X, T)[triangle], N) <= 0)
-    if len(away):
-        size = np.sqrt(triangle_areas(X, T).sum())
-        near = cKDTree(features(X / size, vertex_normals(X, T))).query(
-            features(P[away] / size, N[away])
-        )[1]
-        triangle[away], weights[away] = closest_point_in_star(P[away], near, X, T)
-    return triangle, weights
+from s4a.geometry.closest import closest_facing_point, interpolate, interpolation_matrix
+from s4a.geometry.mesh import as_arrays, vertex_normals
 
 
 @dataclass(frozen=True)
@@ -94,7 +39,7 @@ class Link:
     @cached_property
     def down(self):
         """Matrix from the template's vertices to the shape's, and its confidence on the shape."""
-        W = interpolation(self.T, self.triangle, self.weights, len(self.X))
+        W = interpolation_matrix(self.T, self.triangle, self.weights, len(self.X))
         return W, W @ self.confidence
 
     @cached_property
@@ -104,7 +49,7 @@ class Link:
         And its confidence on the template.
         """
         found = closest_facing_point(self.image, vertex_normals(self.image, self.T), self.Y, self.S)
-        return interpolation(self.S, *found, len(self.Y)), self.confidence
+        return interpolation_matrix(self.S, *found, len(self.Y)), self.confidence
 
     def point_down(self, triangle, weights):
         """Points on the template -> triangle and weights of their places on the shape.
@@ -112,7 +57,7 @@ class Link:
         And confidence.
         """
         P, N, confidence = (
-            at(values, self.T, triangle, weights)
+            interpolate(values, self.T, triangle, weights)
             for values in (self.image, vertex_normals(self.image, self.T), self.confidence[:, None])
         )
         return *closest_facing_point(P, N, self.Y, self.S), confidence[:, 0]
@@ -123,11 +68,11 @@ class Link:
         And confidence.
         """
         P, N = (
-            at(values, self.S, triangle, weights)
+            interpolate(values, self.S, triangle, weights)
             for values in (self.Y, vertex_normals(self.Y, self.S))
         )
         found = closest_facing_point(P, N, self.image, self.T)
-        return *found, at(self.confidence[:, None], self.T, *found)[:, 0]
+        return *found, interpolate(self.confidence[:, None], self.T, *found)[:, 0]
 
 
 def link(template, shape, registered):

@@ -11,7 +11,8 @@ from joblib import Parallel, delayed
 from threadpoolctl import threadpool_limits
 
 from s4a.analysis.landmarks import FARTHEST_LANDMARK, NAMED, locate, traced
-from s4a.analysis.link import at, blended, closest_point, elect, link, point_along
+from s4a.analysis.link import blended, elect, link, point_along
+from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.method.register import Scan, identity
 from s4a.method.remesh import coarsen
@@ -351,7 +352,7 @@ def transfer_landmarks(study, landmarks, *, source=None, targets=None, farthest=
     for name, target, routes in each:
         X, T = as_arrays(target)
         ends = [point_along(route, *start) for route in routes or [[]]]
-        points = np.stack([at(X, T, triangle, weights) for triangle, weights, _ in ends])
+        points = np.stack([interpolate(X, T, triangle, weights) for triangle, weights, _ in ends])
         confidence = np.stack([c for *_, c in ends])
         mean = (
             np.einsum("rp,rpx->px", confidence + 1e-9, points) / (confidence + 1e-9).sum(0)[:, None]
@@ -359,7 +360,7 @@ def transfer_landmarks(study, landmarks, *, source=None, targets=None, farthest=
         triangle, weights = closest_point(mean, X, T) if len(ends) > 1 else ends[0][:2]
         found[name] = dataset(
             **{v: marked[v].values for v in NAMED if v in marked},
-            landmark_position=at(X, T, triangle, weights),
+            landmark_position=interpolate(X, T, triangle, weights),
             landmark_triangle=triangle.astype(np.int32),
             landmark_barycentric=weights,
             landmark_confidence=confidence.mean(0),

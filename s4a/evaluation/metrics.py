@@ -9,7 +9,7 @@ so that its lengths are shares of sqrt(area).
 import numpy as np
 from scipy.spatial import cKDTree
 
-from s4a.analysis.link import at, closest_point
+from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import (
     as_arrays,
     cotan_weights,
@@ -551,6 +551,8 @@ def evaluate(
         shared = [name for name in theirs if name in ours]
         if shared:
             place = closest_point(np.array([theirs[name] for name in shared]), Y, S)
-            error = landmark_error(at(image, S, *place), np.array([ours[name] for name in shared]))
+            error = landmark_error(
+                interpolate(image, S, *place), np.array([ours[name] for name in shared])
+            )
             found["landmark_error"] = error.mean() / size
     return dataset(**found).assign_coords(coords)

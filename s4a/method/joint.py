@@ -11,14 +11,13 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from s4a.geometry.align import rigid_transform
+from s4a.geometry.closest import feature_tree, features
 from s4a.geometry.mesh import edge_graph, edges, path_lengths, vertex_normals
 from s4a.method.deform import onto, smoother
 from s4a.method.fmap import fmap_from_match, nearest_rows
 
-POSITION_WEIGHT, NORMAL_WEIGHT = 5.0, 0.3
 FAR = 0.035
 
 
@@ -69,23 +68,6 @@ class Surface:
     def graph(self):
         """Edge lengths as a sparse matrix."""
         return edge_graph(self.X, edges(self.T))
-
-
-def features(X, normals, spectrum=None):
-    """Rows in which nearest neighbours are searched.
-
-    Weighted position, normal and (optional) spectral coordinates.
-    """
-    parts = [POSITION_WEIGHT * X, NORMAL_WEIGHT * normals]
-    return np.concatenate(parts if spectrum is None else [*parts, spectrum], axis=1)
-
-
-def feature_tree(X, T):
-    """KD-tree over the :func:`features` of a surface.
-
-    With 64 rows a leaf its queries take a quarter less time.
-    """
-    return cKDTree(features(X, vertex_normals(X, T)), leafsize=64)
 
 
 def turned(target, R, t):

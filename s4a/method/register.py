@@ -10,7 +10,8 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse as sp
 
-from s4a.geometry.mesh import as_arrays, closest_point_in_star, vertex_areas
+from s4a.geometry.closest import closest_point_in_star, feature_tree
+from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.method import fmap, joint
 from s4a.method.deform import displacement_in_template
 from s4a.method.nearest import nearest_in_cells, nearest_of_few
@@ -204,7 +205,7 @@ def way_back(source, target, image):
     """
     center, size = source.frame
     X, T = (image - center) / size, target.dense.T
-    nearest = joint.feature_tree(X, T).query(source.dense.tree.data)[1]
+    nearest = feature_tree(X, T).query(source.dense.tree.data)[1]
     return closest_point_in_star(source.dense.X, nearest, X, T)
 
 

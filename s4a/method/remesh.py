@@ -17,9 +17,9 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
+from s4a.geometry.closest import closest_point_in_star
 from s4a.geometry.mesh import (
     as_arrays,
-    closest_point_in_star,
     directed_edges,
     edge_graph,
     edges,

@@ -29,8 +29,14 @@ from s4a import (
     write_mesh,
 )
 from s4a.analysis.landmarks import locate
-from s4a.analysis.link import at, closest_facing_point, closest_point, elect, interpolation
+from s4a.analysis.link import elect
 from s4a.analysis.transfer import pair_study
+from s4a.geometry.closest import (
+    closest_facing_point,
+    closest_point,
+    interpolate,
+    interpolation_matrix,
+)
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.input.annotations import (
     labels_of_file,
@@ -125,7 +131,9 @@ def test_landmarks_lie_inside_triangles_of_the_shape_and_near_the_truth(study, m
     for name, node in transfer_landmarks(study, landmarks).children.items():
         X, T = as_arrays(meshes[name])
         point = node["landmark_position"].values
-        on = at(X, T, node["landmark_triangle"].values, node["landmark_barycentric"].values)
+        on = interpolate(
+            X, T, node["landmark_triangle"].values, node["landmark_barycentric"].values
+        )
         assert distance(point, on).max() < 1e-9 * size
         error = distance(point, meshes[name]["landmark_position"].values)
         nearest_vertex = distance(X[cKDTree(X).query(meshes[name]["landmark_position"])[1]], point)
@@ -188,8 +196,8 @@ def test_interpolation_is_exact_for_linear_functions_and_walls_are_not_crossed()
     P = np.random.default_rng(1).normal(size=(50, 3))
     P /= np.linalg.norm(P, axis=1, keepdims=True)
     found = closest_point(P, X, T)
-    assert interpolation(T, *found, len(X)) @ X == pytest.approx(at(X, T, *found))
-    assert distance(at(X, T, *found), P).max() < 0.02
+    assert interpolation_matrix(T, *found, len(X)) @ X == pytest.approx(interpolate(X, T, *found))
+    assert distance(interpolate(X, T, *found), P).max() < 0.02
     shell = np.concatenate([X, 0.99 * X])  # a wall, its inner side turned inwards
     both = np.concatenate([T, T[:, ::-1] + len(X)])
     for normal, side in ((1, T.max() + 1), (-1, 2 * len(X))):
@@ -232,7 +240,7 @@ def test_curves_are_carried_as_polylines_between_the_vertices(study, meshes, tre
     assert of_ring.sum() > 60
     line = found["landmark_position"].values[of_ring]
     X, T = as_arrays(meshes["brain_02"])
-    assert distance(at(X, T, *closest_point(line, X, T)), line).max() < 1e-6 * size
+    assert distance(interpolate(X, T, *closest_point(line, X, T)), line).max() < 1e-6 * size
     dense = np.linspace(0, 2 * np.pi, 2000)
     exact = np.stack([np.cos(dense), 0.3 + 0 * dense, np.sin(dense)], axis=1) / np.sqrt(1.09)
     exact = synthetic.position(tree["truth"], "brain_02", exact)

@@ -23,8 +23,8 @@ from scipy.spatial import cKDTree
 import s4a
 from s4a import statistics, synthetic
 from s4a.analysis import permutation, transfer
-from s4a.analysis.link import at, closest_point
 from s4a.geometry.align import align
+from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.input.annotations import read_landmarks
 from s4a.method.deform import displacement_in_template
@@ -86,7 +86,7 @@ def skulls(folder):
         for p, q in ((a, b), (b, a)):
             R, t = icp_motion(meshes[p], meshes[q])
             X, T = as_arrays(meshes[q])
-            near = at(X, T, *closest_point(point[p] @ R.T + t, X, T))
+            near = interpolate(X, T, *closest_point(point[p] @ R.T + t, X, T))
             ours = s4a.transfer_landmarks(study, marks[p], source=p, targets=[q])[q][
                 "landmark_position"
             ].values
