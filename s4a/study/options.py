@@ -1,9 +1,17 @@
-"""The options of an analysis: what each may be, what the preset sets.
+"""The options of an analysis (4, 5.1): what each may be, what the preset sets.
 
-Checked before anything is read or computed.
+Checked when they are made, before anything is read or computed.
 """
 
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from types import NoneType
+from typing import Self, get_args
+
 import numpy as np
+import xarray as xr
 
 from s4a.input.clean import check_components
 from s4a.method.median import NORMS
@@ -16,23 +24,15 @@ CHOICES = {
     "norm": tuple(NORMS),
     "preset": (None, "paper"),
 }
-DEFAULTS = {"init": "dense", "refine": "joint", "how": "ours"}  # of the options that a preset sets
+# what a preset sets; one of these options that is not given is None until then
+DEFAULTS = {"init": "dense", "refine": "joint", "how": "ours"}
 PRESETS = {None: DEFAULTS, "paper": {"init": "landmarks", "refine": "intrinsic", "how": "ours"}}
 LOWEST = {"n_coarse": 100, "n_pairs": 1, "k_init": 4, "k": 4, "step": 1, "seed": 0, "n_latent": 2}
-SWITCHES = ("scale", "strict", "wrap", "close_holes", "intersections")
 
 
-def checked(options):
-    """The options that are given, each in its range, with those of the preset.
-
-    Parameters
-    ----------
-    options : dict
-        Any of the options of :func:`s4a.analyse`; None for one that the preset may set.
-
-    Returns
-    -------
-    dict
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """The options of :func:`s4a.analyse`, which says what they are, with those of the preset.
 
     Raises
     ------
@@ -41,64 +41,144 @@ def checked(options):
 
     Examples
     --------
-    >>> checked({"preset": "paper", "refine": None, "k_init": 20, "k": 100})
-    {'preset': 'paper', 'refine': 'intrinsic', 'k_init': 20, 'k': 100}
-    >>> checked({"preset": "paper", "refine": "joint"})
+    >>> options = Options(preset="paper", k=50)
+    >>> options.refine, options.k, options.k_init
+    ('intrinsic', 50, 20)
+    >>> Options(preset="paper", refine="joint")
     Traceback (most recent call last):
     ValueError: preset 'paper' sets refine='intrinsic'; found refine='joint': leave out one of both
     """
-    preset = options.get("preset")
-    for name, legal in CHOICES.items():
-        if name not in options or (options[name] is None and name in DEFAULTS):
-            continue
-        if options[name] not in legal:
-            raise ValueError(
-                f"{name} must be one of {', '.join(map(repr, legal))}; found {options[name]!r}"
-            )
-    options = dict(options)
-    for name, value in PRESETS[preset].items():
-        if preset and options.get(name) not in (None, value):
-            raise ValueError(
-                f"preset {preset!r} sets {name}={value!r}; found {name}={options[name]!r}: leave out one of both"
-            )
-        if name in options and options[name] is None:
-            options[name] = value
-    _check_numbers(options)
-    for name in SWITCHES:
-        check_switch(name, options.get(name, False))
-    check_components(options.get("components", "largest"))
-    for name in ("pattern", "template"):
-        check_text(name, options.get(name))
-    return options
 
+    n_coarse: int = 6000
+    n_pairs: int = 500
+    k_init: int = 20
+    k: int = 100
+    n_latent: int | None = None
+    step: int = 5
+    init: str | None = None
+    refine: str | None = None
+    how: str | None = None
+    norm: str = "h2"
+    scale: bool = False
+    components: str | int = "largest"
+    strict: bool = False
+    close_holes: bool = False
+    wrap: bool = False
+    intersections: bool = True
+    pattern: str | None = None
+    preset: str | None = None
+    template: str | None = None
+    table: Path | str | None = None
+    seed: int = 0
 
-def _check_numbers(options):
-    for name, least in LOWEST.items():
-        value = options.get(name)
-        if name not in options or (name == "n_latent" and value is None):
-            continue
-        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-            raise ValueError(f"{name} must be an integer of at least {least}; found {value!r}")
-    if "k" in options and options["k"] < options.get("k_init", 0):
-        raise ValueError(f"k must be at least k_init = {options['k_init']}; found {options['k']}")
-    if (options.get("n_latent") or 0) > options.get("k", np.inf):
-        raise ValueError(
-            f"n_latent must be at most k = {options['k']}; found {options['n_latent']}"
+    def __post_init__(self):
+        self._check_choices()
+        self._apply_preset()
+        self._check_numbers()
+        for field in fields(self):
+            if field.type is bool:
+                check_switch(field.name, getattr(self, field.name))
+        check_components(self.components)
+        check_text("pattern", self.pattern)
+        check_text("template", self.template)
+
+    def _check_choices(self):
+        for name, legal in CHOICES.items():
+            value = getattr(self, name)
+            if value not in legal and not (value is None and name in DEFAULTS):
+                choices = ", ".join(map(repr, legal))
+                raise ValueError(f"{name} must be one of {choices}; found {value!r}")
+
+    def _apply_preset(self):
+        for name, value in PRESETS[self.preset].items():
+            own = getattr(self, name)
+            if self.preset and own not in (None, value):
+                raise ValueError(
+                    f"preset {self.preset!r} sets {name}={value!r}; found {name}={own!r}: "
+                    "leave out one of both"
+                )
+            object.__setattr__(self, name, own or value)
+
+    def _check_numbers(self):
+        for name, least in LOWEST.items():
+            value = getattr(self, name)
+            if name == "n_latent" and value is None:
+                continue
+            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+                raise ValueError(f"{name} must be an integer of at least {least}; found {value!r}")
+        if self.k < self.k_init:
+            raise ValueError(f"k must be at least k_init = {self.k_init}; found {self.k}")
+        if self.n_latent is not None and self.n_latent > self.k:
+            raise ValueError(f"n_latent must be at most k = {self.k}; found {self.n_latent}")
+
+    def check_against(self, names: list[str]) -> None:
+        """Raise ValueError where the options do not fit the shapes of these names.
+
+        A template that is none of them, or too few pairs.
+        """
+        if self.template is not None and self.template not in names:
+            raise ValueError(
+                f"template {self.template!r} is none of the shapes: {', '.join(names)}"
+            )
+        n = len(names)
+        if self.n_pairs < n - 1:
+            raise ValueError(
+                f"n_pairs = {self.n_pairs!r} cannot connect {n} shapes: give an integer from "
+                f"{n - 1} (a tree) to {n * (n - 1) // 2} (all pairs)"
+            )
+
+    def to_report(self) -> dict[str, str]:
+        """The options in words, as the attributes of ``/report``."""
+        return {field.name: str(getattr(self, field.name)) for field in fields(self)}
+
+    @classmethod
+    def from_report(cls, study: xr.DataTree) -> Self:
+        """The options of a study from its ``/report``; the default of one that it does not name.
+
+        Examples
+        --------
+        >>> options = Options(k=50, components=2, scale=True)
+        >>> report = xr.Dataset(attrs=options.to_report())
+        >>> Options.from_report(xr.DataTree.from_dict({"report": report})) == options
+        True
+        """
+        words = study["report"].attrs if "report" in study else {}
+        return cls(
+            **{
+                field.name: _in_kind(words[field.name], get_args(field.type) or (field.type,))
+                for field in fields(cls)
+                if field.name in words
+            }
         )
+
+
+def _in_kind(word, kinds):
+    """The value of an option that may be of these kinds, from its word in a report."""
+    if word == "None" and NoneType in kinds:
+        return None
+    if bool in kinds:
+        return word == "True"
+    return int(word) if int in kinds and word.isdigit() else word
+
+
+def takes_options(function: Callable) -> Callable:
+    """Decorate a function of ``**options`` so that its signature shows those of :class:`Options`.
+
+    Each option and its default stand in :class:`Options` alone.
+    """
+    signature = inspect.signature(function)
+    own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
+    options = inspect.signature(Options).parameters.values()
+    function.__signature__ = signature.replace(parameters=[*own, *options])
+    return function
+
+
+def checked(options):
+    """The options of a dict, checked, with those of the preset."""
+    whole = Options(**options)
+    return {name: getattr(whole, name) for name in options}
 
 
 def check_against(options, names):
-    """ValueError where the options do not fit the shapes of these names.
-
-    A template that is none, too few pairs.
-    """
-    if options["template"] is not None and options["template"] not in names:
-        raise ValueError(
-            f"template {options['template']!r} is none of the shapes: {', '.join(names)}"
-        )
-    n = len(names)
-    if options["n_pairs"] < n - 1:
-        raise ValueError(
-            f"n_pairs = {options['n_pairs']!r} cannot connect {n} shapes: give an integer from {n - 1} (a tree) "
-            f"to {n * (n - 1) // 2} (all pairs)"
-        )
+    """See :meth:`Options.check_against`."""
+    Options(**options).check_against(names)
