@@ -300,13 +300,14 @@ def coarsen(mesh, *, n_coarse=6000, wrap=False, seed=0):
     Examples
     --------
     >>> import numpy as np
+    >>> import s4a
     >>> from s4a.geometry.mesh import as_dataset
     >>> x, y = np.meshgrid(np.arange(30.0), np.arange(30.0), indexing="ij")
     >>> i = np.arange(900).reshape(30, 30)[:-1, :-1].ravel()
     >>> grid = as_dataset(
     ...     np.c_[x.ravel(), y.ravel(), 0 * x.ravel()], np.r_[np.c_[i, i + 30, i + 31], np.c_[i, i + 31, i + 1]]
     ... )
-    >>> coarse = coarsen(grid, n_coarse=100)
+    >>> coarse = s4a.coarsen(grid, n_coarse=100)
     >>> coarse.attrs["euler_characteristic"], bool(np.allclose(coarse["coarse_weight"].sum("corner"), 1))
     (1, True)
     """
