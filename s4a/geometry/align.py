@@ -1,5 +1,9 @@
-"""Rigid alignment by iterative closest points, and landmark sampling (4.1, steps 2 and 3)."""
+"""Rigid alignment by iterative closest points, and spread landmarks (4.1, steps 2 and 3).
 
+A motion ``R, t`` carries x to R x + t, rows of X to ``X @ R.T + t``.
+"""
+
+import functools
 import itertools
 
 import fpsample
@@ -7,8 +11,16 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+Motion = tuple[np.ndarray, np.ndarray]  # R (3, 3), t (3,)
+End = tuple[np.ndarray, np.ndarray, float]  # of an ICP: R, t and the residual
+Cloud = tuple[cKDTree, np.ndarray]  # of all vertices, and the indices of spread ones
 
-def rigid_transform(P, Q, weight=None, *, scale=False):
+ROUGH = 2e-5  # tolerance where few points are paired, or ends are only compared: twice icp's own
+
+
+def rigid_transform(
+    P: np.ndarray, Q: np.ndarray, weight: np.ndarray | None = None, *, scale: bool = False
+) -> tuple[np.ndarray, np.ndarray, float]:
     """The motion s R x + t that brings points P closest to Q in the (weighted) least-squares sense.
 
     Kabsch's solution by the SVD of the cross-covariance; with ``scale=True`` Umeyama's (1991).
@@ -29,8 +41,6 @@ def rigid_transform(P, Q, weight=None, *, scale=False):
 
     Examples
     --------
-    >>> import numpy as np
-    >>> from s4a.geometry.align import rigid_transform
     >>> P = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]])
     >>> R, t, s = rigid_transform(P, P + [1.0, 2, 3])
     >>> np.allclose(R, np.eye(3)), t.round(6).tolist()
@@ -38,41 +48,68 @@ def rigid_transform(P, Q, weight=None, *, scale=False):
     """
     w = np.ones(len(P)) if weight is None else weight
     w = w / w.sum()
-    p, q = w @ P, w @ Q
+    p, q = w @ P, w @ Q  # centroids
     U, S, Vt = np.linalg.svd((Q - q).T @ ((P - p) * w[:, None]))
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])  # -1: no reflection
     R = (U * sign) @ Vt
     s = float(S @ sign / (w @ ((P - p) ** 2).sum(1))) if scale else 1.0
     return R, q - s * R @ p, s
 
 
-def farthest_points(X, m):
-    """Indices of m vertices, each as far as possible from those before it (Euclidean).
+def farthest_points(
+    P: np.ndarray, k: int, *, center: np.ndarray | None = None, seed: int = 0
+) -> np.ndarray:
+    """Indices of k points, each as far as possible from those before it (Euclidean).
 
-    All where there are fewer.
+    The first is the point farthest from the centre, so that the choice follows the shape and not
+    its numbering.  Where there are no more than k points, all are given in their own order.
 
-    The first is the vertex farthest from the centroid, so that the choice follows the shape and not
-    its numbering.
+    Parameters
+    ----------
+    P : float ndarray (n, d)
+    k : int
+    center : float ndarray (d,), optional
+        The mean of the points by default.
+    seed : int
+        Another seed starts elsewhere, near the seed-th farthest point.
+
+    Returns
+    -------
+    int ndarray (k,)
+        In the order of sampling; fewer where the points are fewer, or coincide.
 
     Examples
     --------
-    >>> import numpy as np
-    >>> from s4a.geometry.align import farthest_points
     >>> farthest_points(np.array([[0.0, 0, 0], [1, 0, 0], [5, 0, 0]]), 2).tolist()
     [2, 0]
     """
-    start = int(np.argmax(((X - X.mean(0)) ** 2).sum(1)))
-    if m >= len(X):
-        return np.arange(len(X))
-    return fpsample.fps_sampling(X, m, start_idx=start).astype(
-        np.int64
-    )  # the faster variants choose their own start
+    if k >= len(P):
+        return np.arange(len(P))
+    if k < 1:
+        return np.arange(0)
+    P = P - (P.mean(0) if center is None else center)
+    radius = np.linalg.norm(P, axis=1)
+    # fpsample starts at a place in a tree of its own.  So a beacon is added, far away in one more
+    # dimension; it may be taken again when all others coincide with samples, but goes in any case.
+    beacon = np.zeros((1, P.shape[1] + 1))
+    beacon[0, -1] = -8 * radius.max() - 1
+    if seed:
+        beacon[0, :-1] = -P[np.argsort(-radius, kind="stable")[seed % len(P)]]
+    points = np.concatenate([beacon, np.c_[P, np.zeros(len(P))]])  # (n + 1, d + 1)
+    height = min(7, int(np.log2(len(points))))  # of the tree; every leaf needs a point
+    sample = fpsample.bucket_fps_kdline_sampling(points, k + 1, h=height, start_idx=0)
+    _, first = np.unique(sample, return_index=True)
+    return sample[np.sort(first)][1:].astype(np.int64) - 1
 
 
-def principal_axes(X, area):
-    """Centroid and principal axes (columns, proper rotation.
+def principal_axes(X: np.ndarray, area: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centroid and principal axes of an area-weighted point set.
 
-    Longest first) of an area-weighted point set.
+    Returns
+    -------
+    center : float ndarray (3,)
+    axes : float ndarray (3, 3)
+        A proper rotation, the axes in its columns, the longest first.
     """
     w = area / area.sum()
     c = w @ X
@@ -81,17 +118,25 @@ def principal_axes(X, area):
     return c, V * np.array([1, 1, np.sign(np.linalg.det(V))])
 
 
-def cloud(X, n_points=None):
-    """A KD-tree of all vertices, and the indices of `n_points` spread ones.
-
-    What ICP needs of a shape.
-    """
+def cloud(X: np.ndarray, n_points: int | None = None) -> Cloud:
+    """What ICP needs of a shape: a KD-tree of all vertices, and `n_points` spread ones (or all)."""
     return cKDTree(X), np.arange(len(X)) if n_points is None else farthest_points(X, n_points)
 
 
 def icp(
-    X, area, Y, area_y, R, t, *, n_points=None, clouds=None, rounds=60, tolerance=1e-5, trim=0.1
-):
+    X: np.ndarray,
+    area: np.ndarray,
+    Y: np.ndarray,
+    area_y: np.ndarray,
+    R: np.ndarray,
+    t: np.ndarray,
+    *,
+    n_points: int | None = None,
+    clouds: tuple[Cloud, Cloud] | None = None,
+    rounds: int = 60,
+    tolerance: float = 1e-5,
+    trim: float = 0.1,
+) -> End:
     """Iterative closest points (Besl & McKay 1992) from a given start: moves X onto Y.
 
     Each round pairs vertices of X with the nearest of all of Y and vertices of Y with the nearest
@@ -125,11 +170,11 @@ def icp(
     for _ in range(rounds):
         forth_gap, forth = tree_y.query(X[i] @ R.T + t)
         back_gap, back = tree_x.query((Y[j] - t) @ R)
-        P, Q = np.concatenate([X[i], X[back]]), np.concatenate([Y[forth], Y[j]])
+        P = np.concatenate([X[i], X[back]])  # (pairs, 3)
+        Q = np.concatenate([Y[forth], Y[j]])
         gap = np.concatenate([forth_gap, back_gap])
-        keep = gap <= (1 + 1e-9) * np.quantile(
-            gap, 1 - trim
-        )  # two that are each other's nearest stay or go together
+        # two that are each other's nearest stay or go together, whatever the rounding
+        keep = gap <= (1 + 1e-9) * np.quantile(gap, 1 - trim)
         residual = float(np.sqrt(weight[keep] @ gap[keep] ** 2 / weight[keep].sum()))
         R, t, _ = rigid_transform(P[keep], Q[keep], weight[keep])
         if last - residual < tolerance * size:
@@ -138,10 +183,22 @@ def icp(
     return R, t, residual
 
 
-def tilted(X, area, Y, area_y, start, *, degrees=15.0, **options):
-    """ICP again from the end of an ICP tilted about each axis of Y both ways.
+def residual_of(end: End) -> float:
+    """The residual of an ICP's end."""
+    return end[2]
 
-    As long as that ends nearer.
+
+def try_tilts(
+    X: np.ndarray,
+    area: np.ndarray,
+    Y: np.ndarray,
+    area_y: np.ndarray,
+    start: End,
+    *,
+    degrees: float = 15.0,
+    **options,
+) -> End:
+    """ICP again from its end tilted about each axis of Y both ways, as long as that ends nearer.
 
     ICP alone ends wherever no pair changes: on folded surfaces up to 20 degrees from the best
     rotation.  The axes are the principal ones, so that the end does not depend on how both lie.
@@ -159,38 +216,48 @@ def tilted(X, area, Y, area_y, start, *, degrees=15.0, **options):
     -------
     R, t, residual
     """
-    best, center = start, area @ X / area.sum()
-    B = principal_axes(Y, area_y)[1]
+    _, axes = principal_axes(Y, area_y)
     tilts = [
-        B @ Rotation.from_euler(axis, sign * degrees, True).as_matrix() @ B.T
+        axes @ Rotation.from_euler(axis, sign * degrees, degrees=True).as_matrix() @ axes.T
         for axis in "xyz"
         for sign in (1, -1)
     ]
+    center = area @ X / area.sum()
+    best = start
     for _ in range(5):
         R, t, residual = best
-        middle = R @ center + t
-        found = [
-            icp(X, area, Y, area_y, P @ R, P @ (t - middle) + middle, **options) for P in tilts
+        middle = R @ center + t  # the tilts turn X about where its centre has come to lie
+        ends = [
+            icp(X, area, Y, area_y, tilt @ R, tilt @ (t - middle) + middle, **options)
+            for tilt in tilts
         ]
-        best = min(found, key=lambda f: f[2])
-        if best[2] > 0.999 * residual:
-            return R, t, residual
+        end = min(ends, key=residual_of)
+        if residual_of(end) > 0.999 * residual:
+            return best
+        best = end
     return best
 
 
-def align(X, area, Y, area_y, *, n_points=300, clearly=0.98, prefer=0.9):
-    """Rigid motion of X onto Y by ICP.
-
-    From the pose as given and from the four turns that align principal axes.
+def align(
+    X: np.ndarray,
+    area: np.ndarray,
+    Y: np.ndarray,
+    area_y: np.ndarray,
+    *,
+    n_points: int = 300,
+    clearly: float = 0.98,
+    prefer: float = 0.9,
+) -> End:
+    """Rigid motion of X onto Y by ICP, from the pose as given and from the turns of principal axes.
 
     The starts are compared by pairing `n_points` spread vertices of each shape.  Two go on, tilted:
-    of the four turns, the best that ends within 90 degrees of where the pose as given (centred)
-    ends, and the best of the others.  The former is kept unless the latter ends below `prefer`
-    times its residual: near-symmetric shapes would otherwise be turned over by noise.  The pose as
-    given takes its place only where that ends below `clearly` times its residual, as with shapes
-    whose principal axes mean little; so the end does not depend on how the shapes were turned, as
-    long as they lie within about 90 degrees of each other.  What is kept is then refined on all
-    vertices.
+    of the four turns that align principal axes, the best that ends within 90 degrees of where the
+    pose as given (centred) ends, and the best of the others.  The former is kept unless the latter
+    ends below `prefer` times its residual: near-symmetric shapes would otherwise be turned over by
+    noise.  The pose as given takes its place only where that ends below `clearly` times its
+    residual, as with shapes whose principal axes mean little; so the end does not depend on how the
+    shapes were turned, as long as they lie within about 90 degrees of each other.  What is kept is
+    then refined on all vertices.
 
     Parameters
     ----------
@@ -203,32 +270,48 @@ def align(X, area, Y, area_y, *, n_points=300, clearly=0.98, prefer=0.9):
     -------
     R, t, residual : as of :func:`icp`
     """
-    cx, A = principal_axes(X, area)
-    cy, B = principal_axes(Y, area_y)
+    center, A = principal_axes(X, area)
+    center_y, B = principal_axes(Y, area_y)
     flips = [np.diag(d) for d in itertools.product((1, -1), repeat=3) if np.prod(d) == 1]
     starts = [np.eye(3)] + [B @ flip @ A.T for flip in flips]
-    options = {"clouds": (cloud(X, n_points), cloud(Y, n_points)), "tolerance": 2e-5}
-    given, *found = [icp(X, area, Y, area_y, R, cy - R @ cx, **options) for R in starts]
-    sides = {True: [], False: []}
-    for f in found:
-        sides[bool(np.trace(f[0].T @ given[0]) >= 1)].append(f)
-    ends = {
-        upright: tilted(X, area, Y, area_y, min(some, key=lambda f: f[2]), **options)
-        for upright, some in sides.items()
-        if some
-    }
-    if True in ends and clearly * ends[True][2] <= given[2]:
-        best = ends[True]
-    else:
-        best = tilted(X, area, Y, area_y, given, **options)
-    if False in ends and ends[False][2] < prefer * best[2]:
-        best = ends[False]
-    return icp(X, area, Y, area_y, *best[:2])
+    options = {"clouds": (cloud(X, n_points), cloud(Y, n_points)), "tolerance": ROUGH}
+    posed, *turned = [icp(X, area, Y, area_y, R, center_y - R @ center, **options) for R in starts]
+    # the trace of a rotation is 1 + 2 cos(angle): 1 at 90 degrees
+    upright = [end for end in turned if np.trace(end[0].T @ posed[0]) >= 1]
+    upside_down = [end for end in turned if np.trace(end[0].T @ posed[0]) < 1]
+    tilt = functools.partial(try_tilts, X, area, Y, area_y, **options)
+    best = tilt(min(upright, key=residual_of)) if upright else None
+    if best is None or clearly * residual_of(best) > residual_of(posed):
+        best = tilt(posed)
+    if upside_down:
+        other = tilt(min(upside_down, key=residual_of))
+        if residual_of(other) < prefer * residual_of(best):
+            best = other
+    R, t, _ = best
+    return icp(X, area, Y, area_y, R, t)
 
 
-def realign(X, area, Y, area_y, start, *, n_points=300, clouds=None):
-    """Rigid motion (R, t) of X onto Y by ICP, `n_points` spread vertices of each paired.
+def realign(
+    X: np.ndarray,
+    area: np.ndarray,
+    Y: np.ndarray,
+    area_y: np.ndarray,
+    start: Motion,
+    *,
+    n_points: int = 300,
+    clouds: tuple[Cloud, Cloud] | None = None,
+) -> Motion:
+    """Rigid motion of X onto Y by ICP from a start, `n_points` spread vertices of each paired.
 
-    From a start (R, t).
+    Parameters
+    ----------
+    X, area, Y, area_y, clouds : as of :func:`icp`
+    start : tuple (R, t)
+    n_points : int
+
+    Returns
+    -------
+    R, t
     """
-    return icp(X, area, Y, area_y, *start, n_points=n_points, clouds=clouds, tolerance=2e-5)[:2]
+    R, t, _ = icp(X, area, Y, area_y, *start, n_points=n_points, clouds=clouds, tolerance=ROUGH)
+    return R, t

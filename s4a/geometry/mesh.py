@@ -1,13 +1,22 @@
-"""Discrete surfaces (3.1): areas, normals, edges and cotan weights of a triangle mesh."""
+"""Discrete surfaces (3.1): a mesh (X, T) as arrays, its areas, normals, edges and cotan weights.
+
+X holds the positions of the n vertices ``(n, 3)``, T the corners of the m triangles ``(m, 3)``,
+counter-clockwise as seen from outside.
+"""
+
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
+import xarray as xr
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from s4a.schema import dataset
 
 
-def as_dataset(points, triangles, attrs=None, **variables):
+def as_dataset(
+    points: np.ndarray, triangles: np.ndarray, attrs: dict[str, Any] | None = None, **variables
+) -> xr.Dataset:
     """A mesh Dataset: ``position(vertex, xyz)``, ``corner_vertex(triangle, corner)``."""
     return dataset(
         attrs,
@@ -17,91 +26,91 @@ def as_dataset(points, triangles, attrs=None, **variables):
     )
 
 
-def as_arrays(mesh):
+def as_arrays(mesh: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
     """Positions ``(n, 3)`` float64 and triangles ``(m, 3)`` int32 of a mesh Dataset."""
     return mesh["position"].values, mesh["corner_vertex"].values
 
 
-def triangle_normals(X, T):
+def triangle_normals(X: np.ndarray, T: np.ndarray) -> np.ndarray:
     """Normals of the triangles ``(m, 3)``, as long as twice their area."""
     a, b, c = (X.take(corner, axis=0) for corner in T.T)
-    (ux, uy, uz), (vx, vy, vz) = (b - a).T, (c - a).T
-    return np.stack(
-        [uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx], axis=1
-    )  # 3 times as fast as np.cross
+    ux, uy, uz = (b - a).T
+    vx, vy, vz = (c - a).T
+    # written out: np.cross gives the same bits in twice the time
+    return np.stack([uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx], axis=1)
 
 
-def triangle_areas(X, T):
+def triangle_areas(X: np.ndarray, T: np.ndarray) -> np.ndarray:
     """Areas of the triangles ``(m,)``."""
     return 0.5 * np.linalg.norm(triangle_normals(X, T), axis=1)
 
 
-def vertex_areas(X, T):
+def vertex_areas(X: np.ndarray, T: np.ndarray) -> np.ndarray:
     """Lumped (barycentric) area of every vertex ``(n,)``: a third of each incident triangle."""
     return np.bincount(T.ravel(), np.repeat(triangle_areas(X, T) / 3, 3), len(X))
 
 
-def vertex_normals(X, T):
+def vertex_normals(X: np.ndarray, T: np.ndarray) -> np.ndarray:
     """Unit normals of the vertices ``(n, 3)``, area-weighted; zero where a vertex has no area."""
-    touches = sp.csc_matrix(
-        (np.ones(T.size), T.ravel(), np.arange(0, T.size + 1, 3)), (len(X), len(T))
-    )
-    N = touches @ triangle_normals(X, T)
+    ones, first_corner = np.ones(T.size), np.arange(0, T.size + 1, 3)
+    touches = sp.csc_matrix((ones, T.ravel(), first_corner), (len(X), len(T)))
+    N = touches @ triangle_normals(X, T)  # (n, 3)
     length = np.linalg.norm(N, axis=1, keepdims=True)
     return N / np.where(length > 0, length, 1)
 
 
-def directed_edges(T):
+def directed_edges(T: np.ndarray) -> np.ndarray:
     """The half-edges ``(3 m, 2)`` of the triangles: corners 0-1 of all, then 1-2, then 2-0."""
     return np.concatenate([T[:, [0, 1]], T[:, [1, 2]], T[:, [2, 0]]])
 
 
-def edges(T):
+def edges(T: np.ndarray) -> np.ndarray:
     """The undirected edges ``(e, 2)``, each once, smaller index first, sorted.
 
     Examples
     --------
-    >>> import numpy as np
-    >>> from s4a.geometry.mesh import edges
     >>> edges(np.array([[0, 1, 2], [2, 1, 3]])).tolist()
     [[0, 1], [0, 2], [1, 2], [1, 3], [2, 3]]
     """
     return unique_edges(T)[0]
 
 
-def unique_edges(T, n=None):
-    """Undirected edges ``(e, 2)``, the edge of each half-edge ``(3 m,)``.
+def unique_edges(T: np.ndarray, n: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The undirected edges and what belongs to each; n is the number of vertices, if at hand.
 
-    And their number of triangles ``(e,)``.
+    Returns
+    -------
+    E : int ndarray (e, 2)
+        Smaller index first, sorted.
+    edge_of : int ndarray (3 m,)
+        Row of E of each half-edge, in the order of :func:`directed_edges`.
+    count : int ndarray (e,)
+        Triangles at the edge: 2 inside of a manifold, 1 on its boundary.
     """
     start, end = directed_edges(np.asarray(T, np.int64)).T
-    n = int(max(start.max(initial=-1), end.max(initial=-1))) + 1 if n is None else n
+    if n is None:
+        n = int(max(start.max(initial=-1), end.max(initial=-1))) + 1
     key = np.minimum(start, end) * n + np.maximum(start, end)
     key, edge_of, count = np.unique(key, return_inverse=True, return_counts=True)
-    return np.stack([key // max(n, 1), key % max(n, 1)], axis=1), edge_of, count
+    return np.stack(np.divmod(key, max(n, 1)), axis=1), edge_of, count
 
 
-def components(pairs, n):
+def components(pairs: np.ndarray, n: int) -> np.ndarray:
     """Connected component of each of n nodes that the pairs ``(p, 2)`` link, numbered from 0."""
     links = sp.coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), (n, n))
     return connected_components(links, directed=False)[1]
 
 
-def edge_graph(X, E):
-    """Lengths of the edges E ``(e, 2)`` as a symmetric CSR matrix ``(n, n)``.
-
-    The graph for Dijkstra's distances.
-    """
+def edge_graph(X: np.ndarray, E: np.ndarray) -> sp.csr_matrix:
+    """Lengths of the edges E ``(e, 2)`` as a symmetric matrix ``(n, n)``: Dijkstra's graph."""
     i, j = E.T
-    length = np.linalg.norm(X[i] - X[j], axis=1)
-    length = np.maximum(
-        length, 1e-12 * (length.max(initial=0) or 1)
-    )  # an explicit zero would count as no edge
-    half = sp.coo_matrix((length, (i, j)), (len(X), len(X))).tocsr()
+    length = np.linalg.norm(X[i] - X[j], axis=1)  # (e,)
+    least = 1e-12 * (length.max(initial=0) or 1)  # an explicit zero would count as no edge
+    half = sp.coo_matrix((np.maximum(length, least), (i, j)), (len(X), len(X))).tocsr()
     return half + half.T
 
 
-def path_lengths(G, start, end, limit):
+def path_lengths(G: sp.csr_matrix, start: np.ndarray, end: np.ndarray, limit: float) -> np.ndarray:
     """Lengths of the shortest paths along edges between pairs of vertices ``(p,)``, cut at `limit`.
 
     Short paths are looked for first, and a few starts at a time, so that neither time nor memory
@@ -117,8 +126,6 @@ def path_lengths(G, start, end, limit):
 
     Examples
     --------
-    >>> import numpy as np
-    >>> from s4a.geometry.mesh import edge_graph, edges, path_lengths
     >>> X = np.array([[0.0, 0, 0], [1, 0, 0], [1, 2, 0], [0, 2, 0]])
     >>> G = edge_graph(X, edges(np.array([[0, 1, 2], [0, 2, 3]])))
     >>> path_lengths(G, np.array([0, 1, 1]), np.array([0, 3, 3]), 9.0).tolist()
@@ -129,27 +136,30 @@ def path_lengths(G, start, end, limit):
         missing = np.flatnonzero(np.isinf(length))
         origin, row = np.unique(start[missing], return_inverse=True)
         for first in range(0, len(origin), 64):
-            way = dijkstra(G, indices=origin[first : first + 64], limit=reach)
+            distance = dijkstra(G, indices=origin[first : first + 64], limit=reach)  # (64, n)
             here = (row >= first) & (row < first + 64)
-            length[missing[here]] = way[row[here] - first, end[missing[here]]]
+            length[missing[here]] = distance[row[here] - first, end[missing[here]]]
     return np.minimum(length, limit)
 
 
-def half_cotangents(X, T):
+def half_cotangents(X: np.ndarray, T: np.ndarray) -> np.ndarray:
     """Half the cotangent of the angle opposite to each half-edge ``(3 m,)``.
 
-    As :func:`directed_edges` orders them.
+    In the order of :func:`directed_edges`.
     """
-    double_area, found = np.maximum(2 * triangle_areas(X, T), np.finfo(float).tiny), []
-    for i in range(3):
-        o = X[T[:, (i + 2) % 3]]
-        found.append(
-            np.einsum("ij,ij->i", X[T[:, i]] - o, X[T[:, (i + 1) % 3]] - o) / (2 * double_area)
-        )
-    return np.concatenate(found)
+    #        o          cot(angle at o) = u.v / |u x v|,
+    #      u/ \v        and |u x v| is twice the area of the triangle
+    #      i---j
+    double_area = np.maximum(2 * triangle_areas(X, T), np.finfo(float).tiny)
+    half_cotangent = []
+    for i, j, opposite in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        o = X[T[:, opposite]]
+        dot = np.einsum("ij,ij->i", X[T[:, i]] - o, X[T[:, j]] - o)  # (m,)
+        half_cotangent.append(dot / (2 * double_area))
+    return np.concatenate(half_cotangent)
 
 
-def cotan_weights(X, T):
+def cotan_weights(X: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Cotan weights of the edges: half the sum of the cotangents of the opposite angles.
 
     Returns
@@ -163,23 +173,24 @@ def cotan_weights(X, T):
     return E, np.bincount(edge_of, half_cotangents(X, T), len(E))
 
 
-def stiffness(E, w, n):
-    """Sparse symmetric stiffness matrix ``(n, n)`` of the edges' weights."""
-    i, j = E[:, 0], E[:, 1]
+def stiffness(E: np.ndarray, w: np.ndarray, n: int) -> sp.csr_matrix:
+    """Sparse symmetric stiffness matrix W ``(n, n)`` of the edges' weights."""
+    i, j = E.T
     W = sp.coo_matrix((-np.r_[w, w], (np.r_[i, j], np.r_[j, i])), (n, n)).tocsr()
     return W - sp.diags(np.asarray(W.sum(axis=1)).ravel())
 
 
-def n_used(T):
+def n_used(T: np.ndarray) -> int:
     """How many vertices triangles have."""
     return int(np.count_nonzero(np.bincount(T.ravel())))
 
 
-def euler_characteristic(T, E=None):
+def euler_characteristic(T: np.ndarray, E: np.ndarray | None = None) -> int:
     """V - E + F over the vertices in use; E the edges, where they are at hand."""
     return n_used(T) - len(edges(T) if E is None else E) + len(T)
 
 
-def volume(X, T):
+def volume(X: np.ndarray, T: np.ndarray) -> float:
     """Signed enclosed volume; positive when the normals point outwards."""
-    return float(np.einsum("ij,ij->", X[T[:, 0]], np.cross(X[T[:, 1]], X[T[:, 2]])) / 6)
+    a, b, c = (X[corner] for corner in T.T)
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)

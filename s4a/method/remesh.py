@@ -10,13 +10,13 @@ triangles around its own cell.
 import contextlib
 import os
 
-import fpsample
 import numpy as np
 import robust_laplacian
 import scipy.sparse as sp
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
+from s4a.geometry.align import farthest_points
 from s4a.geometry.closest import closest_point_in_star
 from s4a.geometry.mesh import (
     as_arrays,
@@ -48,28 +48,6 @@ FIRST, MOST = (
 )  # share of n_coarse that is sampled first, and with which cutting handles begins
 
 
-def farthest_points(P, k, seed=0):
-    """Sorted indices of k farthest-point samples of the rows of P, the outermost first.
-
-    A point far away in one dimension more comes before them all: fpsample begins at a position in a
-    tree of its own.
-    """
-    k = min(k, len(P))
-    height = min(7, int(np.log2(len(P) + 1)))
-    if k < 1 or height < 1:
-        return np.arange(k)
-    radius = np.linalg.norm(P, axis=1)
-    far = np.zeros((1, P.shape[1] + 1))
-    far[0, -1] = -8 * radius.max() - 1
-    if seed:
-        far[0, :-1] = -P[np.argsort(-radius, kind="stable")[seed % len(P)]]
-    P = np.concatenate([far, np.c_[P, np.zeros(len(P))]])
-    sample = np.unique(
-        fpsample.bucket_fps_kdline_sampling(P, k + 1, h=height, start_idx=0).astype(np.int64)
-    )
-    return sample[sample > 0] - 1
-
-
 def sample_surface(X, T, G, rim, avoid, k, seed=0):
     """About k vertices spread over the surface, its boundary edges `rim` at the same spacing.
 
@@ -85,16 +63,24 @@ def sample_surface(X, T, G, rim, avoid, k, seed=0):
         N /= np.maximum(np.linalg.norm(N, axis=1, keepdims=True), 1e-300)
     X = X - area @ X / area.sum()
     P = np.c_[X / spacing, N]
+    origin = np.zeros(6)
     length = np.linalg.norm(X[rim[:, 0]] - X[rim[:, 1]], axis=1).sum()
     rim = np.unique(rim)
     sample, free = np.empty(0, np.int64), np.flatnonzero(~avoid)
     if len(rim):
         sample = rim[
-            farthest_points(P[rim], min(int(np.ceil(length / (0.8 * spacing))), k // 2), seed)
+            farthest_points(
+                P[rim],
+                min(int(np.ceil(length / (0.8 * spacing))), k // 2),
+                center=origin,
+                seed=seed,
+            )
         ]
         near = dijkstra(G, indices=rim, min_only=True, limit=0.6 * spacing)
         free = np.setdiff1d(np.flatnonzero(np.isinf(near) & ~avoid), rim)
-    return np.sort(np.r_[sample, free[farthest_points(P[free], k - len(sample), seed)]])
+    return np.sort(
+        np.r_[sample, free[farthest_points(P[free], k - len(sample), center=origin, seed=seed)]]
+    )
 
 
 def laplacian(X, T, area):
@@ -300,14 +286,13 @@ def coarsen(mesh, *, n_coarse=6000, wrap=False, seed=0):
     Examples
     --------
     >>> import numpy as np
-    >>> import s4a
     >>> from s4a.geometry.mesh import as_dataset
     >>> x, y = np.meshgrid(np.arange(30.0), np.arange(30.0), indexing="ij")
     >>> i = np.arange(900).reshape(30, 30)[:-1, :-1].ravel()
     >>> grid = as_dataset(
     ...     np.c_[x.ravel(), y.ravel(), 0 * x.ravel()], np.r_[np.c_[i, i + 30, i + 31], np.c_[i, i + 31, i + 1]]
     ... )
-    >>> coarse = s4a.coarsen(grid, n_coarse=100)
+    >>> coarse = coarsen(grid, n_coarse=100)
     >>> coarse.attrs["euler_characteristic"], bool(np.allclose(coarse["coarse_weight"].sum("corner"), 1))
     (1, True)
     """
