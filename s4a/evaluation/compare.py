@@ -392,10 +392,9 @@ def pair(source, target, *, truth=None, landmarks=None, **options):
 
     Examples
     --------
-    >>> import numpy as np
-    >>> import s4a
-    >>> ball = s4a.synthetic.ellipsoid(600)
-    >>> found = s4a.compare.pair(ball, ball, methods=["kNN"], truth=np.arange(600))
+    >>> from s4a import synthetic
+    >>> ball = synthetic.ellipsoid(600)
+    >>> found = pair(ball, ball, methods=["kNN"], truth=np.arange(600))
     >>> float(found["geodesic_error"].sel(way="kNN").item())
     0.0
     """
@@ -473,10 +472,9 @@ def pairs(
 
     Examples
     --------
-    >>> import s4a
-    >>> ball = s4a.synthetic.ellipsoid(300)
-    >>> options = {"n_coarse": 100, "k_init": 6, "k": 10}
-    >>> found = s4a.compare.pairs(ball, {"itself": ball}, methods=["kNN", "RE-MATCH"], **options)
+    >>> from s4a import synthetic
+    >>> ball = synthetic.ellipsoid(300)
+    >>> found = pairs(ball, {"itself": ball}, methods=["kNN", "RE-MATCH"], n_coarse=100, k_init=6, k=10)
     >>> found["chamfer"].sel(pair="itself", way="kNN").item()
     0.0
     """
@@ -643,10 +641,7 @@ def collection(
 
     Examples
     --------
-    >>> import s4a
-    >>> brains = s4a.synthetic.brains(6, 200)
-    >>> options = {"n_coarse": 100, "n_pairs": 6, "k_init": 6, "k": 10}
-    >>> found = s4a.compare.collection(brains, methods=["RE-MATCH"], **options)
+    >>> found = collection(brains, methods=["RE-MATCH"], n_coarse=100, n_pairs=6, k_init=6, k=10)
     >>> found["collection_chamfer"].dims
     ('way', 'how', 'shape')
     """

@@ -1,10 +1,15 @@
-"""Geodesic Voronoi cells on a surface and their dual as a manifold mesh (4.1, step 1).
+"""Geodesic Voronoi cells on a surface, and their dual as a manifold mesh (4.1, step 1).
 
-The dual of the cells is a manifold when every cell has one rim, every two neighbouring cells share
-one border, and no three cells meet twice.  Where this fails, samples are added (:func:`refine`);
-where that would cost too many, as on scans full of pin-holes, the surface itself is simplified:
-tubes about a cell thin are cut (:func:`cut_handles`).
+The dual has a vertex for every cell, and a triangle where three cells meet.  It is a manifold when
+every cell has one rim, every two neighbouring cells share one border, and no three cells meet
+twice.  Where this fails, samples are added (:func:`refine`); where that would cost too many, as on
+scans full of pin-holes, the surface itself is simplified: tubes about a cell thin are cut
+(:func:`cut_handles`).
+
+A region, a cell or a part is an array with a number for each vertex.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -13,23 +18,43 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from s4a.geometry.mesh import components, directed_edges, triangle_areas, unique_edges
 
 
-def farthest_of_each(group, vertex, distance):
-    """The vertex of greatest distance in every group."""
+class Voronoi(NamedTuple):
+    """Samples of a surface and what is nearest to each along edges."""
+
+    sample: np.ndarray  # (samples,) vertex that each sample is
+    cell: np.ndarray  # (n,) number of each vertex's nearest sample
+    distance: np.ndarray  # (n,) to that sample
+
+
+class Faults(NamedTuple):
+    """What keeps the dual of cells from being a manifold; see :func:`faults`."""
+
+    cell: np.ndarray
+    pair: np.ndarray
+    edge: np.ndarray
+    edge_pair: np.ndarray
+    triangle: np.ndarray
+
+
+def farthest_of_each(group: np.ndarray, vertex: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """The vertex of greatest distance in every group; `group` and `vertex` go side by side."""
     order = np.lexsort((distance[vertex], group))
-    return vertex[order[np.append(np.diff(group[order]) != 0, True)[: len(order)]]]
+    last = np.append(np.diff(group[order]) != 0, True)[: len(order)]
+    return vertex[order[last]]
 
 
-def add_samples(G, new, sample, cell, distance):
-    """Voronoi cells along edges after new samples.
+def add_samples(
+    G: sp.csr_matrix, new: np.ndarray, sample: np.ndarray, cell: np.ndarray, distance: np.ndarray
+) -> Voronoi:
+    """Voronoi cells along edges after new samples: only vertices nearer to one of these change.
 
-    Only vertices that are nearer to one of these change.
-
-    Returns
-    -------
-    sample : int ndarray (samples,)
-    cell : int ndarray (n,)
-        Number of each vertex's nearest sample.
-    distance : float ndarray (n,)
+    Parameters
+    ----------
+    G : sparse matrix (n, n)
+        Lengths of the edges, :func:`s4a.geometry.mesh.edge_graph`.
+    new : int ndarray
+        Vertices to add.
+    sample, cell, distance : of :class:`Voronoi`
     """
     to_new, _, nearest = dijkstra(
         G, indices=new, min_only=True, return_predecessors=True, limit=distance.max()
@@ -38,32 +63,29 @@ def add_samples(G, new, sample, cell, distance):
     number[new] = len(sample) + np.arange(len(new))
     nearer = to_new < distance
     cell, distance = cell.copy(), distance.copy()
-    cell[nearer], distance[nearer] = number[nearest[nearer]], to_new[nearer]
-    return np.r_[sample, new], cell, distance
+    cell[nearer] = number[nearest[nearer]]
+    distance[nearer] = to_new[nearer]
+    return Voronoi(np.r_[sample, new], cell, distance)
 
 
-def voronoi_cells(G, sample):
-    """Samples, cells and distances of :func:`add_samples`.
-
-    With a sample more in every component that had none.
-    """
+def voronoi_cells(G: sp.csr_matrix, sample: np.ndarray) -> Voronoi:
+    """Voronoi cells of samples, and of one sample more in every component that had none."""
     n = G.shape[0]
-    part = connected_components(G, directed=False)[1]
-    first = np.unique(part, return_index=True)[1]
+    _, part = connected_components(G, directed=False)
+    _, first = np.unique(part, return_index=True)
     sample = np.union1d(sample, first[~np.isin(part[first], part[sample])])
     return add_samples(G, sample, np.empty(0, np.int64), np.full(n, -1), np.full(n, np.inf))
 
 
-def dual(T, cell):
-    """Triangles between cells.
-
-    One for each triangle of the mesh whose corners lie in three cells.
-    """
+def dual(T: np.ndarray, cell: np.ndarray) -> np.ndarray:
+    """Triangles between cells: one for each triangle of T whose corners lie in three cells."""
     L = cell[T]
     return L[(L[:, 0] != L[:, 1]) & (L[:, 1] != L[:, 2]) & (L[:, 2] != L[:, 0])]
 
 
-def rims(T, region):
+def rims(
+    T: np.ndarray, region: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Rims of regions: the closed rows of edges and triangles that lead out of each region.
 
     Parameters
@@ -79,16 +101,25 @@ def rims(T, region):
     owner : int ndarray
         Region of each rim.
     """
+    # A rim goes on through a triangle from one edge (inside, outside) to the next:
+    #
+    #          i               i inside, j and k outside: from edge (i, j) to edge (i, k)
+    #         / \
+    #      --/---\--> rim      j and k inside, i outside: from edge (j, i) to edge (k, i)
+    #       j-----k
     n, L = len(region), region[T]
-    across = np.flatnonzero((L >= 0).any(1) & ~((L[:, 0] == L[:, 1]) & (L[:, 1] == L[:, 2])))
-    t, L, step = T[across].astype(np.int64), L[across], []
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        alone = (L[:, i] >= 0) & (L[:, i] != L[:, j]) & (L[:, i] != L[:, k])
-        pair = (L[:, j] >= 0) & (L[:, j] == L[:, k]) & (L[:, i] != L[:, j])
-        step.append(np.stack([across, t[:, i] * n + t[:, j], t[:, i] * n + t[:, k]], axis=1)[alone])
-        step.append(np.stack([across, t[:, j] * n + t[:, i], t[:, k] * n + t[:, i]], axis=1)[pair])
-    step = np.concatenate(step)  # a triangle leads from one edge (inside, outside) to the next
+    whole = (L[:, 0] == L[:, 1]) & (L[:, 1] == L[:, 2])
+    across = np.flatnonzero((L >= 0).any(1) & ~whole)
+    corners, L = T[across].astype(np.int64), L[across]
+    steps = []
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        at_i, at_j, at_k = corners[:, i], corners[:, j], corners[:, k]
+        apart = (L[:, i] != L[:, j]) & (L[:, i] != L[:, k])
+        alone = apart & (L[:, i] >= 0)
+        both = apart & (L[:, j] == L[:, k]) & (L[:, j] >= 0)
+        steps.append(np.stack([across, at_i * n + at_j, at_i * n + at_k], axis=1)[alone])
+        steps.append(np.stack([across, at_j * n + at_i, at_k * n + at_i], axis=1)[both])
+    step = np.concatenate(steps)  # (s, 3): the triangle, the edge before, the edge after
     edge, link = np.unique(step[:, 1:], return_inverse=True)
     rim = components(link.reshape(-1, 2), len(edge))
     owner = np.empty(rim.max(initial=-1) + 1, np.int64)
@@ -96,17 +127,26 @@ def rims(T, region):
     return np.repeat(step[:, 0], 2), step[:, 1:].ravel() // n, rim[link.ravel()], owner
 
 
-def many_rims(T, cell, suspect):
-    """Which of the suspect cells have no rim or several.
+def faults(
+    T: np.ndarray,
+    E: np.ndarray,
+    open_edge: np.ndarray,
+    cell: np.ndarray,
+    n: int,
+    among: np.ndarray | None = None,
+) -> Faults:
+    r"""Cells, pairs of cells and triangles that keep the dual from being a manifold.
 
-    Handles and holes inside a single rim do no harm.
-    """
-    owner = rims(T, np.where(suspect[cell], cell, -1))[3]
-    return suspect & (np.bincount(owner, minlength=len(suspect)) != 1)
+    ::
 
-
-def faults(T, E, open_edge, cell, n, among=None):
-    """Cells, pairs of cells and triangles that keep the dual from being a manifold.
+        a cell of two rims      a border in two pieces      a corner that is there twice
+         +-------------+             +-----+-----+                 .*.
+         |   1         |             |     |     |               / / \ \     1, 2 and 3 cover a
+         |    +---+    |             |   +---+   |              | |   | |    ball like the slices
+         |    | 2 |    |             | 1 | 3 | 2 |              |1| 2 |3|    of an orange, and
+         |    +---+    |             |   +---+   |              | |   | |    meet at both poles
+         |             |             |     |     |               \ \ / /
+         +-------------+             +-----+-----+                 '*'
 
     Parameters
     ----------
@@ -121,122 +161,170 @@ def faults(T, E, open_edge, cell, n, among=None):
 
     Returns
     -------
-    bad_cell : bool ndarray (n,)
+    cell : bool ndarray (n,)
         No disk (V - E + F != 1) with several rims, several stretches of boundary, or no triangle.
     pair : int ndarray (p, 2)
         Neighbouring cells whose common border is not one strip: it has not two ends.
     edge, edge_pair : int ndarray
         Edges across those borders and the row of `pair` they belong to.
-    repeated : int ndarray
+    triangle : int ndarray
         Triangles of the mesh whose three cells meet elsewhere, too.
     """
     among = np.ones(n, bool) if among is None else among
-    triangle, edge = (
-        np.flatnonzero(np.logical_or.reduce([among[cell][v] for v in rows.T])) for rows in (T, E)
-    )
-    L, ends, open_edge = cell[T[triangle]], cell[E[edge]], open_edge[edge]
-    inner = ends[:, 0] == ends[:, 1]
-    a, b, c = L[:, 0] == L[:, 1], L[:, 1] == L[:, 2], L[:, 2] == L[:, 0]
-    euler = np.bincount(cell, minlength=n) - np.bincount(ends[inner, 0], minlength=n)
-    euler += np.bincount(L[a & b, 0], minlength=n)
-    corner = np.flatnonzero(~(a | b | c))
-    C = L[corner]
-    stretches = np.bincount(ends[open_edge & ~inner].ravel(), minlength=n)
-    bad = many_rims(T[triangle], cell, among & (euler != 1))
+    near = among[cell]
+    triangle = np.flatnonzero(near[T[:, 0]] | near[T[:, 1]] | near[T[:, 2]])
+    edge = np.flatnonzero(near[E[:, 0]] | near[E[:, 1]])
+    T_near, ends, open_edge = T[triangle], cell[E[edge]], open_edge[edge]
+    L = cell[T_near]
+    corner = np.flatnonzero((L[:, 0] != L[:, 1]) & (L[:, 1] != L[:, 2]) & (L[:, 2] != L[:, 0]))
+    C = L[corner]  # (corners, 3) cells that meet in each corner
+
+    bad = faulty_cells(T_near, ends, open_edge, cell, C, among)
     lone = (np.bincount(ends.ravel(), minlength=n) > 0) & (np.bincount(C.ravel(), minlength=n) == 0)
     if (lone & ~among).any():  # of neighbours not all triangles were looked at
         lone[dual(T, cell)] = False
-    bad |= lone | (among & (stretches > 2))
-
-    border = np.flatnonzero(~inner)
-    pair, strip = np.unique(np.sort(ends[border], axis=1) @ [n, 1], return_inverse=True)
-    half = directed_edges(C)
-    half = np.sort(half[among[half].any(1)], axis=1) @ [n, 1]
-    strip_ends = np.bincount(np.searchsorted(pair, half), minlength=len(pair))
-    strip_ends += np.bincount(strip[open_edge[border]], minlength=len(pair))
-    bad_pair = strip_ends != 2
-    at = bad_pair[strip]
-    row = np.cumsum(bad_pair) - 1
-
-    _, triple, count = np.unique(
-        np.sort(C, axis=1) @ [n * n, n, 1], return_inverse=True, return_counts=True
-    )
-    pairs = np.stack([pair[bad_pair] // n, pair[bad_pair] % n], axis=1)
-    return bad, pairs, edge[border[at]], row[strip[at]], triangle[corner[count[triple] > 1]]
+    pair, across, row = faulty_borders(ends, open_edge, C, among)
+    return Faults(bad | lone, pair, edge[across], row, triangle[corner[is_repeated(C, n)]])
 
 
-def refine(G, T, E, open_edge, state, most, avoid):
-    """Add samples where the dual is not a manifold until it is.
+def faulty_cells(
+    T: np.ndarray,
+    ends: np.ndarray,
+    open_edge: np.ndarray,
+    cell: np.ndarray,
+    C: np.ndarray,
+    among: np.ndarray,
+) -> np.ndarray:
+    """Which cells have no rim, several rims, or several stretches of boundary ``(n,)``.
 
-    Or until there are more than `most`.
-
-    The vertices to avoid are only taken where there are no others.  Returns the samples, cells and
-    distances, the number of rounds, and whether faults are left.
+    Handles and holes inside a single rim do no harm: they vanish with the cell.  `ends` are the
+    cells at both ends of the edges ``(e, 2)``.
     """
-    rounds, changed = 0, np.ones(len(state[0]), bool)
+    n, L = len(among), cell[T]
+    inner = ends[:, 0] == ends[:, 1]
+    whole = (L[:, 0] == L[:, 1]) & (L[:, 1] == L[:, 2])
+    euler = np.bincount(cell, minlength=n)
+    euler -= np.bincount(ends[inner, 0], minlength=n)
+    euler += np.bincount(L[whole, 0], minlength=n)
+    suspect = among & (euler != 1)  # only these can have another number of rims than one
+    *_, owner = rims(T, np.where(suspect[cell], cell, -1))
+    stretch_ends = np.bincount(ends[open_edge & ~inner].ravel(), minlength=n)
+    return (suspect & (np.bincount(owner, minlength=n) != 1)) | (among & (stretch_ends > 2))
+
+
+def faulty_borders(
+    ends: np.ndarray, open_edge: np.ndarray, C: np.ndarray, among: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pairs of cells ``(p, 2)`` whose border is not one strip, edges across, and their rows.
+
+    A strip of edges ends at a corner or at an open edge; a border in one piece has two such ends.
+    """
+    n = len(among)
+    across = np.flatnonzero(ends[:, 0] != ends[:, 1])
+    key, border = np.unique(np.sort(ends[across], axis=1) @ [n, 1], return_inverse=True)
+    sides = directed_edges(C)  # (3 corners, 2): the three borders that end in each corner
+    sides = np.sort(sides[among[sides].any(1)], axis=1) @ [n, 1]
+    n_ends = np.bincount(np.searchsorted(key, sides), minlength=len(key))
+    n_ends += np.bincount(border[open_edge[across]], minlength=len(key))
+    bad = n_ends != 2
+    at = bad[border]
+    row = np.cumsum(bad) - 1
+    return np.stack(np.divmod(key[bad], n), axis=1), across[at], row[border[at]]
+
+
+def is_repeated(C: np.ndarray, n: int) -> np.ndarray:
+    """Which corners ``(c, 3)`` are of three cells that meet more than once."""
+    key = np.sort(C, axis=1) @ [n * n, n, 1]
+    _, triple, count = np.unique(key, return_inverse=True, return_counts=True)
+    return count[triple] > 1
+
+
+def refine(
+    G: sp.csr_matrix,
+    T: np.ndarray,
+    E: np.ndarray,
+    open_edge: np.ndarray,
+    state: Voronoi,
+    most: float,
+    avoid: np.ndarray,
+) -> tuple[Voronoi, int, bool]:
+    """Add samples where the dual is no manifold, until it is or there are more than `most`.
+
+    The vertices to avoid are only taken where there are no others.
+
+    Returns
+    -------
+    state : Voronoi
+    rounds : int
+    faulty : bool
+        Whether faults are left.
+    """
+    changed = np.ones(len(state.sample), bool)
+    rounds = 0
     while True:
         sample, cell, distance = state
         distance = np.where(avoid, 1e-9, 1) * distance
-        bad, _, edge, row, repeated = faults(T, E, open_edge, cell, len(sample), changed)
-        inside = np.flatnonzero(bad[cell])
+        fault = faults(T, E, open_edge, cell, len(sample), changed)
+        inside = np.flatnonzero(fault.cell[cell])
+        across, corners = E[fault.edge].ravel(), T[fault.triangle].ravel()
         new = np.concatenate(
             [
                 farthest_of_each(cell[inside], inside, distance),
-                farthest_of_each(np.repeat(row, 2), E[edge].ravel(), distance),
-                farthest_of_each(np.repeat(repeated, 3), T[repeated].ravel(), distance),
+                farthest_of_each(np.repeat(fault.edge_pair, 2), across, distance),
+                farthest_of_each(np.repeat(fault.triangle, 3), corners, distance),
             ]
         )
         new = new[distance[new] > 0]
         if len(new) == 0 or len(sample) > most:
             return state, rounds, len(new) > 0
-        state = add_samples(
-            G, farthest_of_each(cell[new], new, distance), *state
-        )  # one in each cell
-        moved = state[1] != cell
-        changed = np.zeros(
-            len(state[0]), bool
-        )  # every fault had a new sample in one of its cells: others have none
-        changed[cell[moved]] = changed[state[1][moved]] = True
+        new = farthest_of_each(cell[new], new, distance)  # one in each cell
+        state = add_samples(G, new, *state)
+        moved = state.cell != cell
+        # every fault had a new sample in one of its cells, so others than these have no faults
+        changed = np.zeros(len(state.sample), bool)
+        changed[cell[moved]] = True
+        changed[state.cell[moved]] = True
         rounds += 1
 
 
-def thin_regions(T, E, open_edge, cell, n):
-    """Cells that are no disk.
-
-    And pairs of cells that are none together, as disjoint regions of vertices.
-    """
-    bad, pair, _, _, _ = faults(T, E, open_edge, cell, n)
-    pair = pair[~bad[pair].any(1)]
+def thin_regions(
+    T: np.ndarray, E: np.ndarray, open_edge: np.ndarray, cell: np.ndarray, n: int
+) -> np.ndarray:
+    """Cells that are no disk, and pairs of cells that are none together, as disjoint regions."""
+    fault = faults(T, E, open_edge, cell, n)
+    pair = fault.pair[~fault.cell[fault.pair].any(1)]
     number = np.arange(len(pair))
-    first = np.full(n, len(pair))
+    first = np.full(n, len(pair))  # pair of lowest number in which a cell takes part
     np.minimum.at(first, pair.ravel(), np.repeat(number, 2))
     pair = pair[(first[pair] == number[:, None]).all(1)]
-    region = np.where(bad, np.arange(n), -1)
+    region = np.where(fault.cell, np.arange(n), -1)
     region[pair] = pair[:, :1]
     return region[cell]
 
 
-def between_rims(G, T, region):
-    """Triangles half-way between the rims of a region: without them, a tube is cut through."""
+def between_rims(G: sp.csr_matrix, T: np.ndarray, region: np.ndarray) -> np.ndarray:
+    """Triangles half-way between the rims of a region ``(m,)``: without them, a tube is cut."""
     triangle, vertex, rim, _ = rims(T, region)
     rim_of = np.full(len(region), -1)
-    rim_of[vertex[::-1]] = rim[::-1]
+    rim_of[vertex[::-1]] = rim[::-1]  # a vertex in several rims goes to the first
     inside = np.flatnonzero(region >= 0)
     local = G[inside][:, inside].tocoo()
     same = region[inside[local.row]] == region[inside[local.col]]
     local = sp.csr_matrix((local.data[same], (local.row[same], local.col[same])), local.shape)
     seeds = np.flatnonzero(rim_of[inside] >= 0)
-    nearest = dijkstra(local, indices=seeds, min_only=True, return_predecessors=True)[2]
-    part = np.full(len(region), -1)
+    _, _, nearest = dijkstra(local, indices=seeds, min_only=True, return_predecessors=True)
+    part = np.full(len(region), -1)  # the rim that is nearest within the region
     part[inside] = np.where(nearest >= 0, rim_of[inside[nearest]], -1)
-    P, R = part[T], region[T]
-    i, j = [0, 1, 2], [1, 2, 0]
-    removed = ((R[:, i] == R[:, j]) & (R[:, i] >= 0) & (P[:, i] != P[:, j])).any(1)
+    P, R = part[T], region[T]  # (m, 3)
+    P_next, R_next = part[T[:, [1, 2, 0]]], region[T[:, [1, 2, 0]]]
+    removed = ((R == R_next) & (R >= 0) & (P != P_next)).any(1)
     removed[triangle[part[vertex] != rim]] = True
     return removed
 
 
-def cut_handles(X, T, removed, crumb):
+def cut_handles(
+    X: np.ndarray, T: np.ndarray, removed: np.ndarray, crumb: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The surface without some triangles, the openings closed by a fan around their centre.
 
     Vertices where sheets would touch go, too; pieces of less area than `crumb` that come off are
@@ -252,36 +340,50 @@ def cut_handles(X, T, removed, crumb):
     E, edge_of, count = unique_edges(T, n)
     component = components(E, n)
 
-    def rim_count():
+    def left_at_edge():
+        """How many triangles of each edge are left."""
         return np.bincount(edge_of, np.tile(~removed, 3), len(E)).astype(int)
 
     while removed.any():
-        pinched = np.bincount(E[rim_count() == 1].ravel(), minlength=n) > 2
+        pinched = np.bincount(E[left_at_edge() == 1].ravel(), minlength=n) > 2
         if pinched.any():
             removed = removed | pinched[T].any(1)
             continue
-        part = components(E[rim_count() > 0], n)
+        part = components(E[left_at_edge() > 0], n)
         part_area = np.bincount(part[T[:, 0]], np.where(removed, 0, area), n)
         small = part_area < crumb
-        small[farthest_of_each(component, part, part_area)] = (
-            False  # of every component something stays
-        )
+        small[farthest_of_each(component, part, part_area)] = False  # the largest of a component
         small &= np.isin(np.arange(n), part[T[removed]])
         gone = removed | small[part[T[:, 0]]]
-        hole, at = components(directed_edges(T[gone]), n), np.unique(T[gone])
-        at = at[np.isin(part[at], part[T[~gone, 0]])]
-        cut_off = np.unique(np.stack([hole[at], part[at]], axis=1), axis=0)[:, 0]
-        restore = gone & (np.bincount(cut_off, minlength=n) > 1)[hole[T[:, 0]]]
-        if not restore.any():
+        restored = gone & cuts_apart(T, gone, part)
+        if not restored.any():
             removed = gone
             break
-        removed = removed & ~restore
-    open_half = np.tile(~removed, 3) & ((rim_count() == 1) & (count == 2))[edge_of]
-    half = directed_edges(T)[open_half]
+        removed = removed & ~restored
+    was_closed = (left_at_edge() == 1) & (count == 2)
+    opened = np.tile(~removed, 3) & was_closed[edge_of]
+    return close_with_fans(X, T[~removed], directed_edges(T)[opened])
+
+
+def cuts_apart(T: np.ndarray, gone: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """Triangles ``(m,)`` at holes of the triangles `gone` that touch several parts that stay."""
+    hole = components(directed_edges(T[gone]), len(part))
+    vertex = np.unique(T[gone])
+    vertex = vertex[np.isin(part[vertex], part[T[~gone, 0]])]
+    touching = np.unique(np.stack([hole[vertex], part[vertex]], axis=1), axis=0)  # (hole, part)
+    return (np.bincount(touching[:, 0], minlength=len(part)) > 1)[hole[T[:, 0]]]
+
+
+def close_with_fans(
+    X: np.ndarray, T: np.ndarray, half: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The mesh with every loop of the open half-edges ``(h, 2)`` closed by a fan."""
+    n = len(X)
     corner, link = np.unique(half, return_inverse=True)
-    loop = components(link.reshape(-1, 2), len(corner))[link.reshape(-1, 2)[:, 0]]
-    centre = sp.csr_matrix((np.ones(len(half)), (loop, half[:, 0])), (loop.max(initial=-1) + 1, n))
-    centre = (centre @ X) / np.asarray(centre.sum(axis=1))
-    T = np.concatenate([T[~removed], np.stack([half[:, 1], half[:, 0], n + loop], axis=1)])
+    link = link.reshape(-1, 2)
+    loop = components(link, len(corner))[link[:, 0]]  # (h,)
+    on_loop = sp.csr_matrix((np.ones(len(half)), (loop, half[:, 0])), (loop.max(initial=-1) + 1, n))
+    centre = (on_loop @ X) / np.asarray(on_loop.sum(axis=1))
+    T = np.concatenate([T, np.stack([half[:, 1], half[:, 0], n + loop], axis=1)])
     used, T = np.unique(T, return_inverse=True)
     return np.concatenate([X, centre])[used], T.reshape(-1, 3), np.where(used < n, used, -1)

@@ -26,7 +26,6 @@ def limit_of(size):
 
     Examples
     --------
-    >>> from s4a.input.bounded import LARGEST, LEAST, limit_of
     >>> limit_of(1000) == LEAST, limit_of(10**6), limit_of(10**9) == LARGEST
     (True, 200000000, True)
     """
@@ -49,8 +48,6 @@ def gunzip(data):
 
     Examples
     --------
-    >>> import gzip
-    >>> from s4a.input.bounded import gunzip
     >>> gunzip(gzip.compress(b"ply") + gzip.compress(b" format"))
     b'ply format'
     """
@@ -89,7 +86,6 @@ def xml(text):
 
     Examples
     --------
-    >>> from s4a.input.bounded import xml
     >>> xml('<!DOCTYPE a SYSTEM "a.dtd"><a b="1"/>').get("b")
     '1'
     >>> xml('<!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>')
@@ -132,9 +128,6 @@ def npy(data):
 
     Examples
     --------
-    >>> import io
-    >>> import numpy as np
-    >>> from s4a.input.bounded import npy
     >>> out = io.BytesIO()
     >>> np.save(out, np.array([[1, 2], [3, 4]], order="F"))
     >>> npy(out.getvalue()).tolist()

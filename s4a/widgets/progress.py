@@ -47,7 +47,6 @@ def clock(seconds):
 
     Examples
     --------
-    >>> from s4a.widgets.progress import clock
     >>> clock(75.2)
     '1:15'
     """
