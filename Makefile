@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check fuzz format bench lab docs clean
+.PHONY: demo test check fuzz format bench structure lab docs clean
 
 demo: $(VENV)/.core
 	$(BIN)/s4a demo
@@ -25,6 +25,10 @@ format: $(VENV)/.test
 
 bench: $(VENV)/.bench
 	@set -e; for script in $(wildcard tests/benchmarks/*.py); do echo "$$script"; $(BIN)/python "$$script"; done
+
+# the picture, the measures and the map of the rooms, made from the code
+structure: $(VENV)/.core
+	$(BIN)/python tests/benchmarks/structure.py --write
 
 lab: $(VENV)/.course
 	$(BIN)/jupyter lab $(wildcard notebooks)

@@ -36,7 +36,9 @@ def explore(study, *, view="corner", up="z"):
     --------
     With the ``study`` of six small brains:
 
-    >>> explore(study).tabs.titles[:3]
+    >>> import s4a
+    >>> study = s4a.synthetic.example_study()
+    >>> s4a.explore(study).tabs.titles[:3]
     ('Modes', 'Network', 'Functional map')
     """
     return import_module("s4a.widgets.explore").explore(study, view=view, up=up)

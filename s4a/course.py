@@ -32,6 +32,8 @@ def check(answer, expected, hint="", *, within=0.01):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.course import check
     >>> check(6.28, 2 * np.pi)
     'Right.'
     >>> check(3.1, 2 * np.pi, "once around")

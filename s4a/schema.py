@@ -449,6 +449,7 @@ def variable(name, data, **attrs):
 
     Examples
     --------
+    >>> from s4a.schema import variable
     >>> variable("position", [[0.0, 0.0, 1.0]]).dims
     ('vertex', 'xyz')
     """
@@ -468,6 +469,7 @@ def covariate(name, data):
 
     Examples
     --------
+    >>> from s4a.schema import covariate
     >>> covariate("age", [31, 42]).attrs["long_name"]
     "column 'age' of the table of the shapes"
     """
@@ -493,6 +495,7 @@ def unit_of(values):
 
     Examples
     --------
+    >>> from s4a.schema import dataset, in_unit, unit_of
     >>> unit_of(in_unit(dataset(position=[[0.0, 0.0, 1.0]]), "mm")["position"])
     'mm'
     """
@@ -504,6 +507,7 @@ def in_unit(data, unit):
 
     Examples
     --------
+    >>> from s4a.schema import dataset, in_unit
     >>> in_unit(dataset(vertex_area=[1.0]), "mm")["vertex_area"].attrs["units"]
     'mm^2'
     """
@@ -523,6 +527,7 @@ def require(data, *names, what="dataset"):
 
     Examples
     --------
+    >>> from s4a.schema import dataset, require
     >>> require(dataset(position=[[0.0, 0.0, 1.0]]), "position")
     """
     missing = [name for name in names if name not in data]

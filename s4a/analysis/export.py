@@ -68,7 +68,11 @@ def write_registered(study, folder, *, format="ply", frame="template", n_modes=3
     --------
     With the ``study`` of six small brains:
 
-    >>> [path.name for path in write_registered(study, folder)][5:8]
+    >>> import tempfile
+    >>> import s4a
+    >>> study = s4a.synthetic.example_study()
+    >>> folder = tempfile.mkdtemp()
+    >>> [path.name for path in s4a.write_registered(study, folder)][5:8]
     ['brain_06.ply', 'template.ply', 'scores.csv']
     """
     if format not in FORMATS or frame not in ("template", "shape"):
@@ -160,8 +164,12 @@ def write_training_set(
     --------
     With the ``study`` of six small brains:
 
+    >>> import tempfile
+    >>> import s4a
+    >>> study = s4a.synthetic.example_study()
+    >>> folder = tempfile.mkdtemp()
     >>> label = study["original/brain_01/label"].values
-    >>> split = write_training_set(study, folder, label=label, source="brain_01")
+    >>> split = s4a.write_training_set(study, folder, label=label, source="brain_01")
     >>> len(split["train"]), len(split["test"])
     (4, 2)
     """
@@ -227,6 +235,7 @@ def write_results(found, folder, name):
     Examples
     --------
     >>> import tempfile
+    >>> from s4a.analysis.export import write_results
     >>> from s4a.schema import dataset
     >>> paths = write_results(dataset(p_value=0.5, outlier=[True, False]), tempfile.mkdtemp(), "test")
     >>> [path.name for path in paths], paths[2].read_text().split()

@@ -147,6 +147,9 @@ def generalization(study, *, n_points=500, n_jobs=None, seed=0):
     --------
     With the ``study`` of six small brains:
 
+    >>> import s4a
+    >>> from s4a.analysis.generalization import generalization
+    >>> study = s4a.synthetic.example_study()
     >>> generalization(study).attrs["shapes"]
     6
     """

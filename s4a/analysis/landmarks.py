@@ -97,6 +97,8 @@ def follow(P, X, T, *, closed=False, spacing):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.analysis.landmarks import follow
     >>> X, T = np.array([[0.0, 0, 0], [4, 0, 0], [0, 4, 0]]), np.array([[0, 1, 2]])
     >>> points, given = follow(X[:2], X, T, spacing=1.5)
     >>> points[:, 0].tolist(), given.tolist()

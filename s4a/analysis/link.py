@@ -146,6 +146,9 @@ def elect(W, label):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> import scipy.sparse as sp
+    >>> from s4a.analysis.link import elect
     >>> elect(sp.csr_matrix([[0.5, 0.2, 0.3]]), np.array([4, 7, 7]))[0].tolist()
     [4]
     """

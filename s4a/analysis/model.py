@@ -27,6 +27,8 @@ def gram(d, area):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.analysis.model import gram
     >>> gram(np.array([[[1.0, 0, 0], [3, 0, 0]]]), np.array([1.0, 1.0])).round(6).tolist()
     [[5.0]]
     """
@@ -219,6 +221,9 @@ def evaluate(study, *, n_samples=1000, n_permutations=100, n_points=500, n_surfa
     --------
     With the ``study`` of six small brains; more modes describe a left-out shape better:
 
+    >>> import s4a
+    >>> from s4a.analysis.model import evaluate
+    >>> study = s4a.synthetic.example_study()
     >>> found = evaluate(study)
     >>> bool(found["generalization"][0] > found["generalization"][3])
     True
@@ -366,6 +371,9 @@ def sample(study, n, *, n_components=None, seed=0):
     --------
     With the ``study`` of six small brains:
 
+    >>> import s4a
+    >>> from s4a.analysis.model import sample
+    >>> study = s4a.synthetic.example_study()
     >>> sample(study, 2)["score"].dims
     ('shape', 'component')
     """

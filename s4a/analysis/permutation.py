@@ -86,6 +86,7 @@ def smallest_p(n_permutations, group=None, n=None):
 
     Examples
     --------
+    >>> from s4a.analysis.permutation import smallest_p
     >>> smallest_p(999), smallest_p(9999, group=list("aaabbb"))
     (0.001, 0.1)
     """
@@ -120,6 +121,8 @@ def permutation_test(scores, x, *, covariates=None, n_permutations=9999, seed=0)
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.analysis.permutation import permutation_test
     >>> scores = np.random.default_rng(0).normal(size=(20, 3))
     >>> x = np.repeat([0.0, 1.0], 10)
     >>> permutation_test(scores + 3 * x[:, None], x, n_permutations=99, seed=1)[1]
@@ -203,6 +206,8 @@ def false_discovery_rate(p):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.analysis.permutation import false_discovery_rate
     >>> false_discovery_rate(np.array([0.01, 0.5, 0.02])).round(3).tolist()
     [0.03, 0.5, 0.03]
     """

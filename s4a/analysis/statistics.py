@@ -130,7 +130,9 @@ def enough_components(ratio, s, share=0.9):
 
     Examples
     --------
-    >>> enough_components(np.array([0.6, 0.3, 0.1]), 20)
+    >>> import numpy as np
+    >>> import s4a
+    >>> s4a.statistics.enough_components(np.array([0.6, 0.3, 0.1]), 20)
     2
     """
     return int(max(1, min(np.searchsorted(np.cumsum(ratio), share - 1e-9) + 1, s // 2, len(ratio))))
@@ -187,7 +189,9 @@ def group_test(study, group, *, covariates=None, n_components=None, n_permutatio
     --------
     With the ``study`` of six small brains, split at random:
 
-    >>> found = group_test(study, ["a", "a", "a", "b", "b", "b"], n_permutations=99)
+    >>> import s4a
+    >>> study = s4a.synthetic.example_study()
+    >>> found = s4a.statistics.group_test(study, ["a", "a", "a", "b", "b", "b"], n_permutations=99)
     >>> found.attrs["groups"], bool(found["p_value"] > 0.05)
     ('a: 3, b: 3', True)
     """
@@ -262,7 +266,9 @@ def group_map(study, group, *, covariates=None, of="vector", n_permutations=999,
     --------
     With the ``study`` of six small brains, split at random:
 
-    >>> found = group_map(study, ["a", "a", "a", "b", "b", "b"], n_permutations=99)
+    >>> import s4a
+    >>> study = s4a.synthetic.example_study()
+    >>> found = s4a.statistics.group_map(study, ["a", "a", "a", "b", "b", "b"], n_permutations=99)
     >>> found["effect"].dims, bool((found["p_family_wise"] > 0.05).all())
     (('vertex', 'xyz'), True)
     """
@@ -309,10 +315,12 @@ def regression(
     --------
     With the ``study`` of six small brains; the score of the first mode itself is what it follows:
 
-    >>> from s4a.method.pca import synthesize
+    >>> import s4a
+    >>> study = s4a.synthetic.example_study()
     >>> score = study["pca"]["score"].values[:, 0]
-    >>> fit = regression(study, score, n_permutations=99)
-    >>> bool(abs(predict(study, fit, 2.0)["position"] - synthesize(study, [2.0])["position"]).max() < 1e-2)
+    >>> fit = s4a.statistics.regression(study, score, n_permutations=99)
+    >>> predicted = s4a.statistics.predict(study, fit, 2.0)["position"]
+    >>> bool(abs(predicted - s4a.synthesize(study, [2.0])["position"]).max() < 1e-2)
     True
     """
     x = values_of(study, variable, "variable")
@@ -366,8 +374,11 @@ def predict(study, fit, value):
     --------
     With the ``study`` of six small brains; between the ages of 0 and 5 a shape moves by five times the effect:
 
-    >>> fit = regression(study, range(6), n_permutations=99)
-    >>> young, old = (predict(study, fit, age)["position"] for age in (0, 5))
+    >>> import numpy as np
+    >>> import s4a
+    >>> study = s4a.synthetic.example_study()
+    >>> fit = s4a.statistics.regression(study, range(6), n_permutations=99)
+    >>> young, old = (s4a.statistics.predict(study, fit, age)["position"] for age in (0, 5))
     >>> bool(np.allclose(old - young, 5 * fit["effect"]))
     True
     """
@@ -405,8 +416,10 @@ def regression_modes(study, fit, name="variable"):
     --------
     With the ``study`` of six small brains:
 
-    >>> fit = regression(study, range(6), n_permutations=99)
-    >>> regression_modes(study, fit, "age")["pca"].sizes["component"]
+    >>> import s4a
+    >>> study = s4a.synthetic.example_study()
+    >>> fit = s4a.statistics.regression(study, range(6), n_permutations=99)
+    >>> s4a.statistics.regression_modes(study, fit, "age")["pca"].sizes["component"]
     1
     """
     d, area, names, data = registered(study)
@@ -459,7 +472,9 @@ def outliers(study, *, n_components=None, level=0.01):
     --------
     With the ``study`` of six small brains:
 
-    >>> outliers(study)["outlier"].values.any()
+    >>> import s4a
+    >>> study = s4a.synthetic.example_study()
+    >>> s4a.statistics.outliers(study)["outlier"].values.any()
     np.False_
     """
     d, area, names, data = registered(study)
@@ -526,7 +541,9 @@ def classify(
     --------
     With the ``study`` of six small brains, split at random:
 
-    >>> found = classify(study, ["a", "a", "a", "b", "b", "b"], n_permutations=9)
+    >>> import s4a
+    >>> study = s4a.synthetic.example_study()
+    >>> found = s4a.statistics.classify(study, ["a", "a", "a", "b", "b", "b"], n_permutations=9)
     >>> found["predicted"].sizes["shape"], found.attrs["chance"]
     (6, 0.5)
     """

@@ -109,9 +109,11 @@ def register_pairs(
 
     Examples
     --------
+    >>> import s4a
+    >>> brains = s4a.synthetic.brains(6, 200)
     >>> source, target = (brains[f"original/{name}"].to_dataset() for name in ("brain_01", "brain_02"))
-    >>> pairs = register_pairs(source, {"brain_02": target}, n_coarse=100, k_init=6, k=10)
-    >>> transfer_labels(pairs, source["label"].values)["brain_02"]["label"].sizes["vertex"]
+    >>> pairs = s4a.register_pairs(source, {"brain_02": target}, n_coarse=100, k_init=6, k=10)
+    >>> s4a.transfer_labels(pairs, source["label"].values)["brain_02"]["label"].sizes["vertex"]
     200
     """
     if name in shapes or not shapes:
@@ -233,8 +235,10 @@ def transfer_labels(study, label, *, source=None, targets=None, votes=False):
     --------
     With the ``study`` of six small brains, where the labels of every brain are known:
 
+    >>> import s4a
+    >>> study = s4a.synthetic.example_study()
     >>> given, true = (study[f"original/{name}/label"].values for name in ("brain_01", "brain_02"))
-    >>> carried = transfer_labels(study, given, source="brain_01", targets=["brain_02"])
+    >>> carried = s4a.transfer_labels(study, given, source="brain_01", targets=["brain_02"])
     >>> bool((carried["brain_02/label"].values == true).mean() > 0.5)
     True
     """
@@ -275,7 +279,10 @@ def transfer_scalars(study, field, *, source=None, targets=None):
     --------
     With the ``study`` of six small brains; what is constant stays so:
 
-    >>> carried = transfer_scalars(study, np.ones(200), targets=["brain_02"])
+    >>> import numpy as np
+    >>> import s4a
+    >>> study = s4a.synthetic.example_study()
+    >>> carried = s4a.transfer_scalars(study, np.ones(200), targets=["brain_02"])
     >>> bool(np.allclose(carried["brain_02/field"], 1))
     True
     """
@@ -337,9 +344,11 @@ def transfer_landmarks(study, landmarks, *, source=None, targets=None, farthest=
     --------
     With the ``study`` of six small brains:
 
+    >>> import s4a
+    >>> study = s4a.synthetic.example_study()
     >>> source = study["original/brain_01"].to_dataset()
     >>> landmarks = source[["landmark_name", "landmark_position"]]
-    >>> carried = transfer_landmarks(study, landmarks, source="brain_01", targets=["brain_02"])
+    >>> carried = s4a.transfer_landmarks(study, landmarks, source="brain_01", targets=["brain_02"])
     >>> carried["brain_02/landmark_position"].dims
     ('landmark', 'xyz')
     """

@@ -41,6 +41,7 @@ def table(rows, head, width=120):
 
     Examples
     --------
+    >>> from s4a.cli.tables import table
     >>> print(table([["a", 1], ["b", 20]], ["name", "n"]))
     name   n
     a      1

@@ -392,9 +392,10 @@ def pair(source, target, *, truth=None, landmarks=None, **options):
 
     Examples
     --------
-    >>> from s4a import synthetic
-    >>> ball = synthetic.ellipsoid(600)
-    >>> found = pair(ball, ball, methods=["kNN"], truth=np.arange(600))
+    >>> import numpy as np
+    >>> import s4a
+    >>> ball = s4a.synthetic.ellipsoid(600)
+    >>> found = s4a.compare.pair(ball, ball, methods=["kNN"], truth=np.arange(600))
     >>> float(found["geodesic_error"].sel(way="kNN").item())
     0.0
     """
@@ -472,9 +473,10 @@ def pairs(
 
     Examples
     --------
-    >>> from s4a import synthetic
-    >>> ball = synthetic.ellipsoid(300)
-    >>> found = pairs(ball, {"itself": ball}, methods=["kNN", "RE-MATCH"], n_coarse=100, k_init=6, k=10)
+    >>> import s4a
+    >>> ball = s4a.synthetic.ellipsoid(300)
+    >>> options = {"n_coarse": 100, "k_init": 6, "k": 10}
+    >>> found = s4a.compare.pairs(ball, {"itself": ball}, methods=["kNN", "RE-MATCH"], **options)
     >>> found["chamfer"].sel(pair="itself", way="kNN").item()
     0.0
     """
@@ -641,7 +643,10 @@ def collection(
 
     Examples
     --------
-    >>> found = collection(brains, methods=["RE-MATCH"], n_coarse=100, n_pairs=6, k_init=6, k=10)
+    >>> import s4a
+    >>> brains = s4a.synthetic.brains(6, 200)
+    >>> options = {"n_coarse": 100, "n_pairs": 6, "k_init": 6, "k": 10}
+    >>> found = s4a.compare.collection(brains, methods=["RE-MATCH"], **options)
     >>> found["collection_chamfer"].dims
     ('way', 'how', 'shape')
     """

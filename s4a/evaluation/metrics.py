@@ -54,7 +54,9 @@ def chamfer(X, Y):
 
     Examples
     --------
-    >>> chamfer(np.zeros((2, 3)), np.array([[3.0, 4.0, 0.0]]))
+    >>> import numpy as np
+    >>> import s4a
+    >>> s4a.metrics.chamfer(np.zeros((2, 3)), np.array([[3.0, 4.0, 0.0]]))
     10.0
     """
     return float(sum(gap.mean() for gap in gaps(X, Y)))
@@ -83,8 +85,10 @@ def hausdorff(X, Y, formula="standard"):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> import s4a
     >>> X, Y = np.array([[0.0, 0, 0], [1, 0, 0]]), np.array([[0.0, 0, 0], [3, 0, 0]])
-    >>> hausdorff(X, Y), hausdorff(X, Y, "paper")
+    >>> s4a.metrics.hausdorff(X, Y), s4a.metrics.hausdorff(X, Y, "paper")
     (2.0, 2.0)
     """
     if formula not in ("standard", "paper"):
@@ -120,8 +124,11 @@ def dirichlet(f, E, w):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> import s4a
+    >>> from s4a.geometry.mesh import cotan_weights
     >>> X, T = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]])
-    >>> dirichlet(X, *cotan_weights(X, T))  # twice the area of the triangle
+    >>> s4a.metrics.dirichlet(X, *cotan_weights(X, T))  # twice the area of the triangle
     1.0
     """
     difference = (f[E[:, 0]] - f[E[:, 1]]).reshape(len(E), -1)
@@ -153,8 +160,10 @@ def geodesic_error(X, T, found, true, *, limit=1.0):
     --------
     A square of area 1, in two triangles; one vertex of four is a side's length off:
 
+    >>> import numpy as np
+    >>> import s4a
     >>> X, T = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
-    >>> geodesic_error(X, T, np.array([0, 1, 2, 0]), np.arange(4)).tolist()
+    >>> s4a.metrics.geodesic_error(X, T, np.array([0, 1, 2, 0]), np.arange(4)).tolist()
     [0.0, 0.0, 0.0, 1.0]
     """
     return path_lengths(
@@ -171,7 +180,9 @@ def error_curve(error, thresholds=THRESHOLDS):
 
     Examples
     --------
-    >>> error_curve(np.array([0.0, 0.1, 0.3]), [0.0, 0.1, 0.2]).round(2).tolist()
+    >>> import numpy as np
+    >>> import s4a
+    >>> s4a.metrics.error_curve(np.array([0.0, 0.1, 0.3]), [0.0, 0.1, 0.2]).round(2).tolist()
     [0.33, 0.67, 0.67]
     """
     return np.searchsorted(np.sort(error), thresholds, side="right") / len(error)
@@ -190,7 +201,9 @@ def coverage(match, area):
 
     Examples
     --------
-    >>> coverage(np.array([0, 0, 2]), np.array([1.0, 2.0, 1.0]))
+    >>> import numpy as np
+    >>> import s4a
+    >>> s4a.metrics.coverage(np.array([0, 0, 2]), np.array([1.0, 2.0, 1.0]))
     0.5
     """
     return float(area[np.unique(match)].sum() / area.sum())
@@ -219,9 +232,11 @@ def cycle_error(X, T, *matches, vertices=None, limit=1.0):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> import s4a
     >>> X, T = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
     >>> turn = np.array([1, 2, 3, 0])
-    >>> cycle_error(X, T, turn, turn, turn, turn).tolist()
+    >>> s4a.metrics.cycle_error(X, T, turn, turn, turn, turn).tolist()
     [0.0, 0.0, 0.0, 0.0]
     """
     start = np.arange(len(X)) if vertices is None else vertices
@@ -252,9 +267,11 @@ def bijectivity(X, T, match, reverse, *, vertices=None, limit=1.0):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> import s4a
     >>> X, T = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
     >>> turn = np.array([1, 2, 3, 0])
-    >>> bijectivity(X, T, turn, np.argsort(turn)).tolist()
+    >>> s4a.metrics.bijectivity(X, T, turn, np.argsort(turn)).tolist()
     [0.0, 0.0, 0.0, 0.0]
     """
     return cycle_error(X, T, match, reverse, vertices=vertices, limit=limit)
@@ -285,8 +302,10 @@ def distortion(X, image, T):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> import s4a
     >>> X, T = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]])
-    >>> conformal, area = distortion(X, X * [2.0, 4.0, 1.0], T)
+    >>> conformal, area = s4a.metrics.distortion(X, X * [2.0, 4.0, 1.0], T)
     >>> bool(np.isclose(conformal[0], np.log(2))), bool(np.isclose(area[0], np.log(8)))
     (True, True)
     """
@@ -323,7 +342,9 @@ def label_accuracy(found, true, area=None):
 
     Examples
     --------
-    >>> label_accuracy(np.array([1, 1, 2]), np.array([1, 2, 2]), np.array([1.0, 1.0, 2.0]))
+    >>> import numpy as np
+    >>> import s4a
+    >>> s4a.metrics.label_accuracy(np.array([1, 1, 2]), np.array([1, 2, 2]), np.array([1.0, 1.0, 2.0]))
     0.75
     """
     return float(np.average(np.asarray(found) == np.asarray(true), weights=area))
@@ -349,7 +370,9 @@ def dice(found, true, area=None):
 
     Examples
     --------
-    >>> overlap = dice(np.array([1, 1, 2]), np.array([1, 2, 2]))
+    >>> import numpy as np
+    >>> import s4a
+    >>> overlap = s4a.metrics.dice(np.array([1, 1, 2]), np.array([1, 2, 2]))
     >>> [round(overlap[label], 3) for label in (1, 2)]
     [0.667, 0.667]
     """
@@ -477,12 +500,15 @@ def evaluate(
 
     Examples
     --------
-    >>> from s4a import synthetic
-    >>> ball = synthetic.sphere(162)
+    >>> import numpy as np
+    >>> import s4a
+    >>> ball = s4a.synthetic.sphere(162)
     >>> same = np.arange(162)
-    >>> found = evaluate(ball, ball, same, reverse=same, truth=same)
-    >>> float(found["coverage"]), float(found["geodesic_error"]), round(float(found["dirichlet"]), 6)
-    (1.0, 0.0, 2.0)
+    >>> found = s4a.metrics.evaluate(ball, ball, same, reverse=same, truth=same)
+    >>> float(found["coverage"]), float(found["geodesic_error"])
+    (1.0, 0.0)
+    >>> round(float(found["dirichlet"]), 6)
+    2.0
     """
     for mesh, what in ((source, "source"), (target, "target")):
         require(mesh, "position", "corner_vertex", what=what)

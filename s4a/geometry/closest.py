@@ -28,6 +28,8 @@ def interpolation_matrix(
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.geometry.closest import interpolation_matrix
     >>> W = interpolation_matrix(
     ...     np.array([[0, 1, 2]]), np.array([0]), np.array([[0.5, 0.25, 0.25]]), 3
     ... )

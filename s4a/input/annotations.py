@@ -370,6 +370,9 @@ def labels_of_mesh(labels, mesh):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.input.annotations import labels_of_mesh
+    >>> from s4a.schema import dataset
     >>> mesh = dataset(file_vertex=[2, 0], vertex_of_file=[1, -1, 0])
     >>> labels_of_mesh(np.array([5, 6, 7]), mesh).tolist()
     [7, 5]

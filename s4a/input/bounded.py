@@ -26,6 +26,7 @@ def limit_of(size):
 
     Examples
     --------
+    >>> from s4a.input.bounded import LARGEST, LEAST, limit_of
     >>> limit_of(1000) == LEAST, limit_of(10**6), limit_of(10**9) == LARGEST
     (True, 200000000, True)
     """
@@ -48,6 +49,8 @@ def gunzip(data):
 
     Examples
     --------
+    >>> import gzip
+    >>> from s4a.input.bounded import gunzip
     >>> gunzip(gzip.compress(b"ply") + gzip.compress(b" format"))
     b'ply format'
     """
@@ -86,6 +89,7 @@ def xml(text):
 
     Examples
     --------
+    >>> from s4a.input.bounded import xml
     >>> xml('<!DOCTYPE a SYSTEM "a.dtd"><a b="1"/>').get("b")
     '1'
     >>> xml('<!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>')
@@ -128,6 +132,9 @@ def npy(data):
 
     Examples
     --------
+    >>> import io
+    >>> import numpy as np
+    >>> from s4a.input.bounded import npy
     >>> out = io.BytesIO()
     >>> np.save(out, np.array([[1, 2], [3, 4]], order="F"))
     >>> npy(out.getvalue()).tolist()

@@ -81,9 +81,10 @@ def clean(mesh, *, components="largest", strict=False, close_holes=False):
 
     Examples
     --------
+    >>> import s4a
     >>> from s4a.geometry.mesh import as_dataset
     >>> tetrahedron = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3], [0, 1, 3]]  # the last triangle is there twice
-    >>> mesh = clean(as_dataset([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], tetrahedron))
+    >>> mesh = s4a.clean(as_dataset([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], tetrahedron))
     >>> mesh.sizes["triangle"], mesh.attrs["duplicate_triangles"], mesh.attrs["genus"]
     (4, 1, 0)
     """
@@ -154,6 +155,7 @@ def repairs(counts):
 
     Examples
     --------
+    >>> from s4a.input.clean import repairs
     >>> repairs({"welded_vertices": 2, "cut_edges": 0, "dropped_components": 3, "area_dropped": 0.0214})
     '2 vertices welded; 3 components dropped (2.1 % of the area)'
     """

@@ -50,11 +50,13 @@ def read_shape(path, *, components="largest", strict=False, close_holes=False):
 
     Examples
     --------
-    >>> from s4a.input.files import write_mesh
-    >>> from s4a.datasets.synthetic import sphere
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import s4a
     >>> from s4a.geometry.mesh import as_arrays
-    >>> written = write_mesh(folder / "ball.ply", *as_arrays(sphere(100)))
-    >>> read_shape(folder / "ball.ply").sizes["vertex"]
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> written = s4a.write_mesh(folder / "ball.ply", *as_arrays(s4a.synthetic.sphere(100)))
+    >>> s4a.read_shape(folder / "ball.ply").sizes["vertex"]
     100
     """
     points, triangles, attrs = read_mesh(path)
@@ -113,9 +115,10 @@ def read_shapes(
 
     Examples
     --------
+    >>> import s4a
     >>> points = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
     >>> triangles = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]
-    >>> shapes = read_shapes({"good": (points, triangles), "bad": (points, [[0, 1, 9]])})
+    >>> shapes = s4a.read_shapes({"good": (points, triangles), "bad": (points, [[0, 1, 9]])})
     >>> list(shapes["original"]), shapes["report"]["status"].values.tolist()
     (['good'], ['excluded', 'ok'])
     """

@@ -79,8 +79,12 @@ def read_mesh(path):
 
     Examples
     --------
-    >>> path = write_mesh(folder / "one.off", [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
-    >>> points, triangles = read_mesh(folder / "one.off")[:2]
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import s4a
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> path = s4a.write_mesh(folder / "one.off", [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+    >>> points, triangles = s4a.read_mesh(folder / "one.off")[:2]
     >>> points.shape, triangles.tolist()
     ((3, 3), [[0, 1, 2]])
     """
@@ -112,6 +116,7 @@ def suffix_of(path):
 
     Examples
     --------
+    >>> from s4a.input.files import suffix_of
     >>> suffix_of("a.PLY"), suffix_of("lh.pial.gz"), suffix_of("a.tar.gz")
     ('.ply', '.pial', '.tar')
     """
@@ -202,7 +207,12 @@ def write_mesh(path, points, triangles, **vertex_scalars):
 
     Examples
     --------
-    >>> write_mesh(folder / "one.ply", np.eye(3), [[0, 1, 2]], height=np.zeros(3))
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import numpy as np
+    >>> import s4a
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> s4a.write_mesh(folder / "one.ply", np.eye(3), [[0, 1, 2]], height=np.zeros(3))
     >>> (folder / "one.ply").stat().st_size > 0
     True
     """
@@ -376,6 +386,7 @@ def slug(text):
 
     Examples
     --------
+    >>> from s4a.input.files import slug
     >>> slug("Crâne 3.b"), slug("脳")
     ('Crane_3_b', 'u8133')
     """

@@ -27,6 +27,8 @@ def _fan(polygons):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.input.formats import _fan
     >>> _fan(np.array([[0, 1, 2, 3]])).tolist()
     [[0, 1, 2], [0, 2, 3]]
     """

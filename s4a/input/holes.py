@@ -25,6 +25,8 @@ def close_holes(X, T):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.input.holes import close_holes
     >>> X = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     >>> X, T, nearby = close_holes(X, np.array([[0, 1, 3], [1, 2, 3], [2, 0, 3]]))
     >>> X[4].round(2).tolist(), T[3:].tolist(), nearby.tolist()

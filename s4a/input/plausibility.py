@@ -106,6 +106,7 @@ def median_size(areas):
 
     Examples
     --------
+    >>> from s4a.input.plausibility import median_size
     >>> median_size({"a": 1.0, "b": 5.0, "c": 2.0})
     'c'
     """

@@ -69,6 +69,8 @@ def read_table(path, names):
     Examples
     --------
     >>> import tempfile
+    >>> from pathlib import Path
+    >>> from s4a.input.subjects import read_table
     >>> file = Path(tempfile.mkdtemp()) / "subjects.csv"
     >>> _ = file.write_text("shape,sex,age\\nb.ply,f,31\\na,m,NA\\n")
     >>> read_table(file, ["a", "b"])["age"].values.tolist(), read_table(file, ["a", "b"])["sex"].values.tolist()

@@ -28,6 +28,8 @@ def heat_filter(eigenvalue, *others, n=100):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.method.descriptors import heat_filter
     >>> heat_filter(np.array([0.0, 1.0, 2.0]), n=2).round(3).tolist()
     [[0.99, 0.01, 0.0], [1.0, 0.0, 0.0]]
     """
@@ -112,6 +114,8 @@ def hks(Phi, eigenvalue, *, n=100, landmark=None):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.method.descriptors import hks
     >>> Phi = np.array([[1.0, 1.0], [1.0, -1.0]])
     >>> hks(Phi, np.array([0.0, 9.0]), n=1).round(6).tolist(), hks(Phi, np.array([0.0, 9.0]), n=2, landmark=[0]).shape
     ([[1.0], [1.0]], (2, 2))
@@ -150,6 +154,8 @@ def multiplication(Phi, area, f):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.method.descriptors import multiplication
     >>> multiplication(np.ones((2, 1)), np.array([0.5, 0.5]), np.array([[1.0, 4.0], [3.0, 4.0]])).ravel().tolist()
     [2.0, 4.0]
     """
@@ -176,6 +182,8 @@ def orientation(T, Phi, f):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.method.descriptors import orientation
     >>> orientation(np.array([[0, 1, 2]]), np.eye(3), np.array([[0.0], [1.0], [0.0]])).round(3)[0, 0].tolist()
     [-0.167, 0.0, 0.167]
     """

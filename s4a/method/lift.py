@@ -35,6 +35,8 @@ def smoothed(S, R, B, rounds=ROUNDS, least=LEAST):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.method.lift import smoothed
     >>> smoothed(np.eye(2), np.ones((2, 1)), np.zeros((2, 1)), rounds=9, least=0.5).round(6).ravel().tolist()
     [1.0, 1.0]
     """
@@ -124,12 +126,13 @@ def lift(X, T, area, U, coarse, k):
 
     Examples
     --------
-    >>> from s4a import coarsen, spectrum
+    >>> import numpy as np
+    >>> import s4a
     >>> from s4a.geometry.mesh import as_arrays, vertex_areas
+    >>> from s4a.method.lift import lift
     >>> from s4a.method.register import Scan
-    >>> from s4a.datasets.synthetic import sphere
-    >>> ball = sphere(2000)
-    >>> scan = Scan(ball, spectrum(coarsen(ball, n_coarse=300), k=16))
+    >>> ball = s4a.synthetic.sphere(2000)
+    >>> scan = Scan(ball, s4a.spectrum(s4a.coarsen(ball, n_coarse=300), k=16))
     >>> X, T = as_arrays(ball)
     >>> (lift(X, T, vertex_areas(X, T), scan.U, scan.coarse, 9)[0] / (4 * np.pi)).round(1).tolist()
     [0.0, 2.0, 2.0, 2.0, 6.0, 6.0, 6.0, 6.0, 6.0]

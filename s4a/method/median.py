@@ -122,6 +122,7 @@ def near_ties(distance, *, within=0.05):
 
     Examples
     --------
+    >>> from s4a.method.median import near_ties
     >>> near_ties([1.04, 1.0, 2.0])
     [1, 0]
     """

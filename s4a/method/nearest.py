@@ -129,6 +129,8 @@ def nearest_of_few(Q, D, cell_d, *, block=256):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.method.nearest import nearest_of_few
     >>> rows = np.random.default_rng(0).normal(size=(300, 5))
     >>> bool((nearest_of_few(rows[:20], rows, np.arange(300) % 7) == np.arange(20)).all())
     True
@@ -178,6 +180,8 @@ def nearest_in_cells(Q, cell_q, D, cell_d, *, first=12):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.method.nearest import nearest_in_cells
     >>> rows = np.random.default_rng(0).normal(size=(300, 5))
     >>> index, compared, certified = nearest_in_cells(rows, np.arange(300) % 10, rows, np.arange(300) % 7)
     >>> bool((index == np.arange(300)).all())

@@ -49,6 +49,8 @@ def choose_pairs(distance, n_pairs):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.method.network import choose_pairs
     >>> choose_pairs(np.array([[0, 1, 2.0], [1, 0, 1.5], [2, 1.5, 0]]), 2).tolist()
     [[0, 1], [1, 2]]
     """
@@ -128,6 +130,7 @@ def three_cycles(source, target):
 
     Examples
     --------
+    >>> from s4a.method.network import three_cycles
     >>> three_cycles([0, 1, 2], [1, 2, 0]).tolist()
     [[0, 1, 2]]
     """
@@ -203,6 +206,8 @@ def connectivity(pairs, n):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.method.network import connectivity
     >>> connectivity(np.array([[0, 1], [1, 2], [0, 2], [2, 3]]), 4)
     {'components': 1, 'triangles': 1, 'in_no_triangle': 1, 'smallest_degree': 1, 'diameter': 2}
     """

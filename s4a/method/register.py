@@ -239,6 +239,8 @@ def distortion(image, X, T):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.method.register import distortion
     >>> X, T = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]])
     >>> (distortion(2 * X, X, T) + 0.0).tolist()
     [0.0, 0.0, 0.0]

@@ -94,9 +94,9 @@ def spectrum(mesh, *, k=100):
     --------
     A sphere of radius 1, whose area is 4 pi, has the eigenvalues 0, 2 (three times), 6 (five times):
 
-    >>> from s4a.method.remesh import coarsen
-    >>> from s4a.datasets.synthetic import sphere
-    >>> found = spectrum(coarsen(sphere(2000), n_coarse=1000), k=9)
+    >>> import numpy as np
+    >>> import s4a
+    >>> found = s4a.spectrum(s4a.coarsen(s4a.synthetic.sphere(2000), n_coarse=1000), k=9)
     >>> (found["eigenvalue"].values / (4 * np.pi)).round().tolist()
     [0.0, 2.0, 2.0, 2.0, 6.0, 6.0, 6.0, 6.0, 6.0]
     """
@@ -150,10 +150,9 @@ def reconstruct(mesh, f, *, k=None):
     --------
     The positions of a sphere are eigenfunctions, so that four of them are enough:
 
-    >>> from s4a.method.remesh import coarsen
-    >>> from s4a.datasets.synthetic import sphere
-    >>> ball = spectrum(coarsen(sphere(2000), n_coarse=1000), k=4)
-    >>> bool(abs(reconstruct(ball, ball["position"]) - ball["position"].values).max() < 0.01)
+    >>> import s4a
+    >>> ball = s4a.spectrum(s4a.coarsen(s4a.synthetic.sphere(2000), n_coarse=1000), k=4)
+    >>> bool(abs(s4a.reconstruct(ball, ball["position"]) - ball["position"].values).max() < 0.01)
     True
     """
     require(mesh, "eigenfunction", "vertex_area", what="mesh")
@@ -168,6 +167,7 @@ def weyl(k):
 
     Examples
     --------
+    >>> from s4a.method.spectral import weyl
     >>> weyl(3).round(2).tolist()
     [0.0, 12.57, 25.13]
     """

@@ -31,6 +31,7 @@ def svg(figure):
 
     Examples
     --------
+    >>> from s4a.show.charts import svg, variance
     >>> svg(variance([0.7, 0.3])).startswith(b"<?xml")
     True
     """
@@ -81,8 +82,9 @@ def surfaces(
 
     Examples
     --------
-    >>> from s4a.datasets.synthetic import sphere
-    >>> mesh = sphere(100)
+    >>> import s4a
+    >>> from s4a.show.charts import surfaces
+    >>> mesh = s4a.synthetic.sphere(100)
     >>> [ax.get_title() for ax in surfaces({"height": mesh}, {"height": mesh["position"].values[:, 2]}).axes]
     ['height', '']
     """
@@ -120,6 +122,7 @@ def brief(names, room=16):
 
     Examples
     --------
+    >>> from s4a.show.charts import brief
     >>> brief(["brain_01", "brain_02"]), brief(["subject_0001_left_hippocampus", "subject_0020_left_hippocampus"])
     (['brain_01', 'brain_02'], ['…0001…', '…0020…'])
     """

@@ -45,6 +45,7 @@ def rotation(view="corner", up="z"):
 
     Examples
     --------
+    >>> from s4a.show.draw import rotation
     >>> rotation("top").round().astype(int).tolist()
     [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
     """
@@ -64,6 +65,7 @@ def opposite(view):
 
     Examples
     --------
+    >>> from s4a.show.draw import opposite
     >>> opposite("front")
     (90, 0)
     """
@@ -197,6 +199,8 @@ def render(
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.show.draw import render
     >>> tetrahedron = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     >>> picture = render(tetrahedron, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]), size=(60, 40))
     >>> picture.shape, picture[0, 0, 3].item(), picture[20, 30, 3].item()
@@ -285,6 +289,8 @@ def signed_colors(values, limit):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.show.draw import signed_colors
     >>> red, white, blue = signed_colors(np.array([-2.0, 0.0, 2.0]), limit=2)
     >>> bool(red[0] > red[2]), bool(white.min() > 0.9), bool(blue[2] > blue[0])
     (True, True, True)
@@ -309,6 +315,8 @@ def label_colors(labels):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.show.draw import label_colors
     >>> len(np.unique(label_colors(np.arange(24)), axis=0))
     24
     """
@@ -333,6 +341,8 @@ def checkerboard(coordinates, cell):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.show.draw import checkerboard
     >>> checkerboard(np.array([[0.1, 0.1, 0.1], [1.1, 0.1, 0.1], [1.1, 1.9, 0.1]]), 1.0)
     array([1. , 0.5, 1. ])
     """
@@ -346,6 +356,8 @@ def with_balls(points, triangles, colors, balls):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.show.draw import with_balls
     >>> X, T, colors = with_balls(np.zeros((3, 3)), np.array([[0, 1, 2]]), None, [[5, 0, 0, 1, 0, 0, 2.0]])
     >>> float(X[:, 0].min()), float(X[:, 0].max()), colors[-1].tolist()
     (0.0, 7.0, [1.0, 0.0, 0.0])
@@ -378,6 +390,8 @@ def image_bytes(picture, kind="webp"):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.show.draw import image_bytes
     >>> image_bytes(np.zeros((2, 2, 4), np.uint8), "png")[1:4]
     b'PNG'
     """

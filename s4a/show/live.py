@@ -34,6 +34,7 @@ def as_bytes(array, kind):
 
     Examples
     --------
+    >>> from s4a.show.live import as_bytes
     >>> as_bytes([1, 256], "uint16")
     b'\\x01\\x00\\x00\\x01'
     """
@@ -137,6 +138,7 @@ def encoded(value):
 
     Examples
     --------
+    >>> from s4a.show.live import encoded
     >>> encoded({"n": 1, "b": b"abc"})
     '{"n": 1, "b": {"base64": "YWJj"}}'
     """

@@ -41,8 +41,12 @@ def write_page(study, path, *, title="Shape study", view="corner", up="z"):
 
     Examples
     --------
+    >>> import tempfile
+    >>> from pathlib import Path
     >>> import xarray as xr
-    >>> write_page(xr.DataTree(), folder / "empty.html").name
+    >>> import s4a
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> s4a.write_page(xr.DataTree(), folder / "empty.html").name
     'empty.html'
     """
     path = Path(path)

@@ -41,6 +41,7 @@ class Options:
 
     Examples
     --------
+    >>> from s4a.study.options import Options
     >>> options = Options(preset="paper", k=50)
     >>> options.refine, options.k, options.k_init
     ('intrinsic', 50, 20)
@@ -137,6 +138,8 @@ class Options:
 
         Examples
         --------
+        >>> import xarray as xr
+        >>> from s4a.study.options import Options
         >>> options = Options(k=50, components=2, scale=True)
         >>> report = xr.Dataset(attrs=options.to_report())
         >>> Options.from_report(xr.DataTree.from_dict({"report": report})) == options

@@ -60,10 +60,10 @@ def match_pair(
     --------
     A shape and the same after a turn by 90 degrees:
 
-    >>> from s4a import synthetic
-    >>> mesh = synthetic.ellipsoid(200)
+    >>> import s4a
+    >>> mesh = s4a.synthetic.ellipsoid(200)
     >>> turned = mesh.assign(position=mesh["position"][:, [1, 0, 2]] * [-1, 1, 1])
-    >>> found = match_pair(mesh, turned, n_coarse=100, k=10, k_init=6)
+    >>> found = s4a.match_pair(mesh, turned, n_coarse=100, k=10, k_init=6)
     >>> found["fmap"].shape, bool((abs(found["displacement"]) < 1e-6).all())
     ((10, 10), True)
     """

@@ -324,8 +324,8 @@ def analyse(
 
     Examples
     --------
-    >>> from s4a import synthetic
-    >>> study = analyse(synthetic.brains(3, 200), n_coarse=100, k=10, k_init=6, n_pairs=3)
+    >>> import s4a
+    >>> study = s4a.analyse(s4a.synthetic.brains(3, 200), n_coarse=100, k=10, k_init=6, n_pairs=3)
     >>> list(study["pca"]["score"].dims), study["registration"].sizes["vertex"]
     (['shape', 'component'], 200)
     """
@@ -477,6 +477,7 @@ def in_batches(pairs):
 
     Examples
     --------
+    >>> from s4a.study.pipeline import in_batches
     >>> [len(batch) for batch in in_batches(range(10))]
     [4, 4, 2]
     """

@@ -346,7 +346,13 @@ def open_study(folder):
     --------
     With ``store``, the folder of six small brains:
 
-    >>> sorted(open_study(store).children)
+    >>> import tempfile
+    >>> import s4a
+    >>> store = tempfile.mkdtemp()
+    >>> study = s4a.analyse(
+    ...     s4a.synthetic.brains(3, 200), n_coarse=100, k=10, k_init=6, n_pairs=3, store=store
+    ... )
+    >>> sorted(s4a.open_study(store).children)
     ['coarse', 'latent', 'network', 'original', 'pca', 'registration', 'report']
     """
     folder = Path(folder)

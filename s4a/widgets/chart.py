@@ -15,6 +15,8 @@ def plain(value):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.widgets.chart import plain
     >>> plain({"x": np.array([1.0, np.nan]), "n": np.int64(3)})
     {'x': [1.0, None], 'n': 3}
     """

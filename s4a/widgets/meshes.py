@@ -46,6 +46,7 @@ def nice(x):
 
     Examples
     --------
+    >>> from s4a.widgets.meshes import nice
     >>> nice(17.3), nice(0.6)
     (10.0, 0.5)
     """

@@ -47,6 +47,7 @@ def clock(seconds):
 
     Examples
     --------
+    >>> from s4a.widgets.progress import clock
     >>> clock(75.2)
     '1:15'
     """

@@ -19,6 +19,8 @@ def extent(points):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.widgets.scene import extent
     >>> extent(np.array([[0, 0, 0], [1, 2, 2.0]]))
     3.0
     """

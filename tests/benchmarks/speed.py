@@ -336,7 +336,7 @@ def stages(folder):
     )
     C, _ = beside(
         f"ZoomOut {K_INIT} -> {K}, step 5",
-        ("s4a.fmap.zoomout", our_zoomout, C, a, b),
+        ("s4a.method.fmap.zoomout", our_zoomout, C, a, b),
         ("pyFM zoomout_refine", other_zoomout, C, a, b),
     )
     Q, D = ((scans[1].U @ b[2]).astype(np.float32), (scans[0].U @ (a[2] @ C.T)).astype(np.float32))
@@ -357,7 +357,7 @@ def stages(folder):
     )
     beside(
         f"PCA of 51 displacements, {VERTICES:,}",
-        ("s4a.pca.gram_pca", our_modes, d, area),
+        ("s4a.method.pca.gram_pca", our_modes, d, area),
         ("scikit-learn PCA", other_modes, d, area),
     )
 
@@ -382,7 +382,7 @@ def network_table():
     given = np.stack(first), source, target
     bases = beside(
         f"Consistent ZoomOut, {len(first)} maps",
-        ("s4a.latent.consistent_zoomout", our_network, *given, shapes),
+        ("s4a.method.latent.consistent_zoomout", our_network, *given, shapes),
         (
             "pyFM FMN.zoomout_refine",
             other_network,
