@@ -15,6 +15,7 @@ test: check
 check: $(VENV)/.test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/mypy
 
 fuzz: $(VENV)/.test
 	$(BIN)/python tests/fuzz.py

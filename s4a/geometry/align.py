@@ -3,8 +3,8 @@
 A motion ``R, t`` carries x to R x + t, rows of X to ``X @ R.T + t``.
 """
 
-import functools
 import itertools
+from typing import Any
 
 import fpsample
 import numpy as np
@@ -196,7 +196,7 @@ def try_tilts(
     start: End,
     *,
     degrees: float = 15.0,
-    **options,
+    **options: Any,
 ) -> End:
     """ICP again from its end tilted about each axis of Y both ways, as long as that ends nearer.
 
@@ -274,12 +274,18 @@ def align(
     center_y, B = principal_axes(Y, area_y)
     flips = [np.diag(d) for d in itertools.product((1, -1), repeat=3) if np.prod(d) == 1]
     starts = [np.eye(3)] + [B @ flip @ A.T for flip in flips]
-    options = {"clouds": (cloud(X, n_points), cloud(Y, n_points)), "tolerance": ROUGH}
+    options: dict[str, Any] = {
+        "clouds": (cloud(X, n_points), cloud(Y, n_points)),
+        "tolerance": ROUGH,
+    }
     posed, *turned = [icp(X, area, Y, area_y, R, center_y - R @ center, **options) for R in starts]
     # the trace of a rotation is 1 + 2 cos(angle): 1 at 90 degrees
     upright = [end for end in turned if np.trace(end[0].T @ posed[0]) >= 1]
     upside_down = [end for end in turned if np.trace(end[0].T @ posed[0]) < 1]
-    tilt = functools.partial(try_tilts, X, area, Y, area_y, **options)
+
+    def tilt(start: End) -> End:
+        return try_tilts(X, area, Y, area_y, start, **options)
+
     best = tilt(min(upright, key=residual_of)) if upright else None
     if best is None or clearly * residual_of(best) > residual_of(posed):
         best = tilt(posed)

@@ -15,7 +15,7 @@ from s4a.schema import dataset
 
 
 def as_dataset(
-    points: np.ndarray, triangles: np.ndarray, attrs: dict[str, Any] | None = None, **variables
+    points: np.ndarray, triangles: np.ndarray, attrs: dict[str, Any] | None = None, **variables: Any
 ) -> xr.Dataset:
     """A mesh Dataset: ``position(vertex, xyz)``, ``corner_vertex(triangle, corner)``."""
     return dataset(

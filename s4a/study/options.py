@@ -172,7 +172,8 @@ def takes_options(function: Callable) -> Callable:
     signature = inspect.signature(function)
     own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
     options = inspect.signature(Options).parameters.values()
-    function.__signature__ = signature.replace(parameters=[*own, *options])
+    shown = signature.replace(parameters=[*own, *options])
+    function.__signature__ = shown  # type: ignore[attr-defined]
     return function
 
 
