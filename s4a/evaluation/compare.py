@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
 from s4a.evaluation import metrics
-from s4a.geometry.align import align, farthest_points, realign
+from s4a.geometry.align import align, farthest_points, motion_between, realign
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.input.collection import read_shape, read_shapes
 from s4a.method import fmap, joint, latent, median, network
@@ -27,7 +27,6 @@ from s4a.method.remesh import coarsen, laplacian
 from s4a.method.scalable import Reduced, local_space, spectral_space
 from s4a.method.spectral import eigenpairs, spectrum
 from s4a.schema import dataset, require, variable
-from s4a.study.pipeline import SAMPLES, motion_between
 
 __all__ = ["COLLECTION_METHODS", "METHODS", "collection", "pair", "pairs"]
 
@@ -708,7 +707,7 @@ def one_collection(meshes, way, load, n_coarse, n_pairs, k_init, k, step, seed):
         eigenvalues,
         k,
         step=step,
-        samples=[farthest_points(s.X, SAMPLES) for s in spaces.values()],
+        samples=[farthest_points(s.X, latent.SAMPLES) for s in spaces.values()],
     )
     found = dataset(latent_basis=Y, latent_eigenvalue=latent_eigenvalue).assign_coords(shape=names)
     found = median.median_shape(found, eigenvalues)

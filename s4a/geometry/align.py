@@ -321,3 +321,20 @@ def realign(
     """
     R, t, _ = icp(X, area, Y, area_y, *start, n_points=n_points, clouds=clouds, tolerance=ROUGH)
     return R, t
+
+
+def motion_between(
+    source: tuple[np.ndarray, np.ndarray], target: tuple[np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The motion source -> target from the motions (R, t) of both onto a common reference.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.geometry.align import motion_between
+    >>> R, t = motion_between((np.eye(3), np.ones(3)), (np.eye(3), np.zeros(3)))
+    >>> t.tolist()
+    [1.0, 1.0, 1.0]
+    """
+    (R, t), (R_target, t_target) = source, target
+    return R_target.T @ R, R_target.T @ (t - t_target)

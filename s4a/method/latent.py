@@ -19,6 +19,7 @@ log = logging.getLogger(__name__)
 
 WIDE = 4  # last rounds of Consistent ZoomOut, which look among all vertices
 ROUGH, FINE = 1e-4, 1e-6  # tolerances of the latent basis: on the way, and at the end
+SAMPLES = 1000  # vertices per shape whose matches Consistent ZoomOut looks for
 
 
 def consistency_form(C, source, target, weight, n, *, dtype=float, n_jobs=1):

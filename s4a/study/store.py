@@ -23,6 +23,7 @@ import xarray as xr
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
+from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.input.files import slug
 from s4a.schema import INPUT, in_unit, unit_of, variable
 
@@ -291,6 +292,13 @@ def lock(folder):
         for left in Path(folder).rglob(".*.tmp"):
             left.unlink(missing_ok=True)
         yield Claim(Path(folder), token)
+
+
+def template_mesh(original, name):
+    """The mesh of ``/registration`` from the original mesh of the template of that name."""
+    X, T = as_arrays(original)
+    mesh = as_dataset(X, T, {"template": name}, vertex_area=vertex_areas(X, T))
+    return in_unit(mesh, unit_of(original["position"]))
 
 
 def stack_registration(template, files, names):

@@ -3,7 +3,6 @@
 Stage by stage how far it is, cancelled or opened while it runs.
 """
 
-import inspect
 import multiprocessing
 import os
 import signal
@@ -13,7 +12,9 @@ from pathlib import Path
 
 import ipywidgets
 
-from s4a.study.pipeline import analyse, collection, in_batches
+from s4a.study.options import Options
+from s4a.study.pipeline import analyse, in_batches
+from s4a.study.sources import find_sources
 from s4a.study.store import open_study
 from s4a.widgets.panel import Panel, paragraph, row
 
@@ -26,7 +27,6 @@ STAGES = {
     "registration": ("registration/[!.]*.nc", True),
     "modes": ("pca.nc", False),
 }
-N_PAIRS = inspect.signature(analyse).parameters["n_pairs"].default
 EVERY = 0.5  # seconds
 
 
@@ -80,7 +80,7 @@ class Progress(Panel):
     def __init__(self, shapes, store, **options):
         self.folder, self.explored = Path(store), None
         self.arguments = shapes, options | {"store": str(store)}
-        self.given = len(collection(shapes, options.get("pattern")))
+        self.given = len(find_sources(shapes, options.get("pattern")))
         super().__init__(None)
         self.start()
 
@@ -129,7 +129,7 @@ class Progress(Panel):
 
     def totals(self, shapes):
         """How many files each stage writes when so many shapes are usable."""
-        pairs = min(self.arguments[1].get("n_pairs", N_PAIRS), shapes * (shapes - 1) // 2)
+        pairs = min(self.arguments[1].get("n_pairs", Options.n_pairs), shapes * (shapes - 1) // 2)
         batches = len(in_batches(range(max(pairs, shapes - 1))))
         each = {stage: shapes for stage, (_, one_each) in STAGES.items() if one_each}
         return (

@@ -22,16 +22,16 @@ OPTIONS = {"n_coarse": 150, "k_init": 8, "k": 12}
 RUN = """
 import signal, sys, time
 from s4a import analyse
-from s4a.study import pipeline
+from s4a.study import tasks
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # it is ignored below a background job of a shell
 
-def slow(*arguments, task=pipeline.coarse_task):
+def slow(*arguments, task=tasks.remesh_shape):
     time.sleep(2)
     return task(*arguments)
 
 if __name__ == "__main__":
-    pipeline.coarse_task = slow
+    tasks.remesh_shape = slow
     analyse(sys.argv[2:], store=sys.argv[1], n_coarse=150, k_init=8, k=12, n_jobs=2)
 """
 

@@ -1,0 +1,171 @@
+"""What a worker computes, one file of a study at a time: the steps of 4 for one shape or some pairs.
+
+A task gets paths and names, reads the files of earlier tasks, and returns the Dataset of its own.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from scipy.spatial import cKDTree
+from threadpoolctl import threadpool_limits
+from tqdm.auto import tqdm
+
+from s4a.geometry.align import align, cloud, farthest_points, motion_between, realign
+from s4a.geometry.mesh import as_arrays, triangle_areas
+from s4a.input import plausibility
+from s4a.input.clean import clean
+from s4a.input.collection import read_shape
+from s4a.method import fmap, joint, latent, median, network, register
+from s4a.method.first_map import first_map_of
+from s4a.method.remesh import coarsen
+from s4a.method.spectral import spectrum
+from s4a.schema import dataset, in_unit, unit_of
+from s4a.study.options import Options
+from s4a.study.store import arrays, read
+
+
+def clean_shape(source: str | xr.Dataset, cleaning: dict) -> xr.Dataset:
+    """A file read and cleaned, or a mesh in memory cleaned where it is not yet."""
+    if isinstance(source, str):
+        return read_shape(source, **cleaning)
+    if "file_vertex" in source:
+        area = float(triangle_areas(*as_arrays(source)).sum())
+        mesh = source.assign_attrs({"status": "ok", "reason": "", "area": area} | source.attrs)
+    else:
+        mesh = clean(source, **cleaning)
+    return in_unit(mesh, source.attrs.get("unit"))
+
+
+def compare_shape(folder: Path, name: str, reference: str, intersections: bool) -> xr.Dataset:
+    """What :func:`s4a.input.plausibility.look` sees in a shape beside the reference."""
+    mesh, other = (read(folder / "original" / f"{n}.nc") for n in (name, reference))
+    look = plausibility.look(mesh, plausibility.sample(other), intersections)
+    rotation = look.pop("rotation")
+    return dataset(look, rotation=rotation)
+
+
+def remesh_shape(folder: Path, name: str, n_coarse: int, wrap: bool, seed: int, k: int):
+    """The low-resolution mesh of a shape of the study, its U (4.1) and its spectrum (3.3)."""
+    mesh = read(folder / "original" / f"{name}.nc")
+    low = spectrum(coarsen(mesh, n_coarse=n_coarse, wrap=wrap, seed=seed), k=k)
+    return in_unit(low, unit_of(mesh["position"]))
+
+
+def scan(folder: Path, name: str) -> register.Scan:
+    """A shape of the study at both resolutions."""
+    return register.Scan(*(read(folder / stage / f"{name}.nc") for stage in ("original", "coarse")))
+
+
+def low_shape(folder: Path, name: str) -> joint.Surface:
+    """The coarse mesh of a shape, centred and for unit area."""
+    variables = ("position", "corner_vertex", "vertex_area", "eigenfunction", "eigenvalue")
+    X, T, area, Phi, eigenvalue = arrays(folder / "coarse" / f"{name}.nc", *variables)
+    w = area / area.sum()
+    return joint.Surface((X - w @ X) / np.sqrt(area.sum()), T, w, Phi, eigenvalue=eigenvalue)
+
+
+def align_shape(folder: Path, name: str, reference: str) -> xr.Dataset:
+    """Rigid motion of a shape onto the reference, both centred and for unit area (4.1, step 2)."""
+    R, t = np.eye(3), np.zeros(3)
+    if name != reference:
+        M, N = low_shape(folder, name), low_shape(folder, reference)
+        R, t, _ = align(M.X, M.area, N.X, N.area)
+    return dataset({"reference": reference}, rotation=R, translation=t)
+
+
+def motion_to_reference(folder: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """R and t of :func:`align_shape`."""
+    R, t = arrays(folder / "network" / f"motion_{name}.nc", "rotation", "translation")
+    return R, t
+
+
+def first_maps(folder: Path, pairs: list, k_init: int, init: str) -> xr.Dataset:
+    """First maps of some pairs, in both directions (4.1, steps 3 and 4)."""
+    names = sorted({name for pair in pairs for name in pair})
+    shapes = {name: low_shape(folder, name) for name in names}
+    motions = {name: motion_to_reference(folder, name) for name in names}
+    clouds = {name: cloud(shape.X, 300) for name, shape in shapes.items()}
+    source, target, maps = [], [], []
+    for a, b in pairs:
+        M, N = shapes[a], shapes[b]
+        start = motion_between(motions[a], motions[b])
+        R, t = realign(M.X, M.area, N.X, N.area, start, clouds=(clouds[a], clouds[b]))
+        kind, C, _ = first_map_of(M, N, (R, t), k_init=k_init, init=init)
+        if kind == init:
+            ends = ((s.X, s.area, s.Phi, s.eigenvalue) for s in (N, M))
+            back = network.first_map(*ends, (R.T, -R.T @ t), k_init=k_init, init=init)
+        else:  # of far poses: the other direction must tell the same limbs apart
+            back = fmap.once_refined(C.T, N.Phi, M.Phi, M.area)
+        source += [a, b]
+        target += [b, a]
+        maps += [C, back]
+    return dataset(source=np.array(source), target=np.array(target), fmap_initial=np.stack(maps))
+
+
+def consistent_maps(
+    folder: Path, names: list[str], first: xr.Dataset, options: Options, n_jobs: int
+) -> tuple[xr.Dataset, xr.Dataset]:
+    """Consistent ZoomOut over the network and the median (4.2): ``/network`` and ``/latent``."""
+    shapes = [low_shape(folder, name) for name in names]
+    k = min([options.k, *(shape.Phi.shape[1] for shape in shapes)])
+    k_init = first.sizes["mode_source_initial"]
+    source, target = (
+        np.array([names.index(name) for name in first[end].values]) for end in ("source", "target")
+    )
+    eigenvalues = np.stack([shape.eigenvalue[:k] for shape in shapes])  # (n, k)
+    C_initial = first["fmap_initial"].values  # (p, k_init, k_init)
+    with threadpool_limits(1), tqdm(total=k - k_init, desc="consistent ZoomOut") as bar:
+        C, weight, _, Y, latent_eigenvalue = latent.consistent_zoomout(
+            C_initial,
+            source,
+            target,
+            [shape.Phi for shape in shapes],
+            [shape.area for shape in shapes],
+            eigenvalues,
+            k,
+            step=options.step,
+            n_latent=options.n_latent,
+            samples=[farthest_points(shape.X, latent.SAMPLES) for shape in shapes],
+            n_jobs=n_jobs,
+            progress=lambda size: bar.update(size - k_init - bar.n),
+        )
+    cycles = network.three_cycles(source.tolist(), target.tolist())
+    refined = dataset(
+        fmap=C.astype(np.float32),
+        weight=weight,
+        cycle_error=network.cycle_errors(C, cycles, k=k_init),
+        cycle_error_initial=network.cycle_errors(C_initial, cycles),
+    )
+    basis = dataset(latent_basis=Y, latent_eigenvalue=latent_eigenvalue)
+    basis = basis.assign_coords(shape=names)
+    return first.merge(refined), median.median_shape(basis, eigenvalues, norm=options.norm)
+
+
+def register_shape(
+    folder: Path, name: str, template: str, how: str, refine: str, scale: bool
+) -> xr.Dataset:
+    """One shape registered to the template: eq. 6 at low resolution, then eq. 7 or eq. 3 and 4."""
+    target = scan(folder, template)
+    if name == template:
+        return register.identity(target)
+    source = scan(folder, name)
+    basis = read(folder / "latent.nc")["latent_basis"]
+    k = basis.sizes["mode"]
+    F_source, F_target = (
+        s.low.Phi[:, :k] @ basis.sel(shape=n).values
+        for s, n in ((source, name), (target, template))
+    )
+    match = fmap.nearest_rows(F_target, F_source)
+    if how == "standard":
+        C = fmap.fmap_from_match(
+            source.low.Phi[:, :k], target.low.Phi[:, :k], target.low.area, match
+        )
+        F_source, F_target = source.low.Phi[:, :k] @ C.T, target.low.Phi[:, :k]
+        match = fmap.nearest_rows(F_target, F_source)
+    motion = motion_between(*(motion_to_reference(folder, n) for n in (name, template)))
+    R, t = realign(source.low.X, source.low.area, target.low.X, target.low.area, motion)
+    starts = {"intrinsic": match, "icp": cKDTree(source.low.X @ R.T + t).query(target.low.X)[1]}
+    return register.registration(
+        source, target, starts, (F_source, F_target), k=k, refine=refine, scale=scale
+    )
