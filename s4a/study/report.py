@@ -109,6 +109,7 @@ def doubtful(badness: dict[str, float]) -> tuple[dict[str, str], list[str]]:
 
     Examples
     --------
+    >>> from s4a.study.report import doubtful
     >>> of_shapes, of_all = doubtful({"template": 0.0, "good": 0.02, "wrong": 0.12})
     >>> list(of_shapes), of_all
     (['wrong'], [])
@@ -140,6 +141,8 @@ def reductions(options: Options, n_pairs: int, k: int, spectra: dict) -> list[st
 
     Examples
     --------
+    >>> from s4a.study.options import Options
+    >>> from s4a.study.report import reductions
     >>> spectra = {"a": range(100), "b": range(57), "c": range(100)}
     >>> for words in reductions(Options(n_pairs=500, k=100), 3, 57, spectra):
     ...     print(words)
@@ -162,6 +165,7 @@ def tied(names: list[str], distance: np.ndarray, relative: float = 1e-6) -> list
 
     Examples
     --------
+    >>> from s4a.study.report import tied
     >>> tied(["c", "a", "b"], [0.5, 0.5, 0.7])[0][:64]
     'the median is not unique: a, c are equally near the limit shape;'
     """

@@ -44,6 +44,7 @@ class Task:
 
     Examples
     --------
+    >>> from s4a.study.runner import Task
     >>> task = Task("a", "coarse/a.nc", dict, (), ("key of original/a.nc", 6000))
     >>> task.key == Task("a", "coarse/a.nc", dict, (), ("key of original/a.nc", 3000)).key
     False

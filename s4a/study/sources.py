@@ -27,6 +27,7 @@ def find_sources(shapes, pattern: str | None = None) -> dict[str, tuple[str | xr
     Examples
     --------
     >>> from s4a.datasets.synthetic import sphere
+    >>> from s4a.study.sources import find_sources
     >>> list(find_sources({"b": sphere(9), "a": sphere(12)}))
     ['a', 'b']
     """
