@@ -337,7 +337,7 @@ def _random_directions(rng, n):
 
 
 def _fibonacci(n):
-    """n points spread evenly over the unit sphere along a spiral."""
+    """Points spread evenly over the unit sphere along a spiral, n of them."""
     i = np.arange(n) + 0.5
     z, angle = 1 - 2 * i / n, np.pi * (1 + np.sqrt(5)) * i
     r = np.sqrt(1 - z * z)

@@ -109,7 +109,7 @@ def xml(text):
 
 
 def npz(data):
-    """name -> function that reads the array, of an NPZ archive.
+    """The arrays of an NPZ archive: their names, and for each a function that reads it.
 
     ValueError where it holds too much.
     """

@@ -182,7 +182,7 @@ def _reinterpret(body, count, stride):
 
 
 def _column(block, offset, dtype, k):
-    """k values from `offset` on in each row."""
+    """The values from `offset` on in each row, k of them."""
     if dtype is None:
         return block[:, offset : offset + k]
     return (

@@ -54,6 +54,7 @@ class Scan:
 
     @cached_property
     def eigenvalue(self):
+        """Eigenvalues of the coarse mesh (k,)."""
         return self.coarse["eigenvalue"].values
 
     @cached_property

@@ -157,6 +157,7 @@ class Stored(BackendArray):
         )
 
     def part(self, key):
+        """Read the selection from the file; ValueError where it was written anew."""
         with h5py.File(self.path) as file:
             if file.attrs.get("task_key") != self.key:
                 raise ValueError(
