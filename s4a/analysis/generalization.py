@@ -1,21 +1,20 @@
-"""True generalization (6.1).
-
-Each shape left out, its correspondences found anew in the study of all others.
-"""
+"""True generalization (6.1): each shape left out, and found anew by the study of the others."""
 
 import logging
 
 import numpy as np
 import xarray as xr
 from joblib import Parallel, delayed
+from scipy import stats
 from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
-from s4a.analysis import model
+from s4a.analysis.model import describe_by_others, draw_points, surface_error
 from s4a.geometry.align import realign
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.method.fmap import nearest_rows
+from s4a.method.pca import gram
 from s4a.method.register import Scan, identity, registration
 from s4a.schema import dataset, in_unit, unit_of
 from s4a.study import store
@@ -78,40 +77,35 @@ def without(study, name, *, n_jobs=None):
     return xr.DataTree.from_dict(nodes | store.stack_registration(mesh, files, kept))
 
 
-def _left_out(study, name, n_points, seed, n_jobs):
-    """Vertex distances and distances to the surface of one left-out shape, for 0, 1.
+def _errors_of(study, name, n_points, seed, n_jobs):
+    """Errors of one left-out shape with 0, 1, ... components of the others ``(n,)``.
 
-    ... components of the others.
+    Vertex distances, and distances to its own surface, as it was read.
     """
     others = without(study, name, n_jobs=n_jobs)
     mesh = study["original"][name].to_dataset().load()
     new = insert(others, {name: mesh}, compare=False)["registration"].to_dataset()
-    data = others["registration"].to_dataset()
-    X, T = as_arrays(data)
+    registration = others["registration"].to_dataset()
+    X, T = as_arrays(registration)
     area = vertex_areas(X, T)
-    d, own = data["displacement"].values, new["displacement"].values
-    K = model.gram(np.concatenate([d, own]) - d.mean(0), area)
+    d = registration["displacement"].values  # (n, v, 3)
+    own = new["displacement"].values  # (1, v, 3)
+    K = gram(np.concatenate([d, own]) - d.mean(0), area)
     n = len(d)
-    error, _, steps = model.left_out(K[:n, :n], K[n, :n], K[n, n])
-    surface = np.full(n, np.nan)
-    if n_points:
-        rng = np.random.default_rng(seed)
-        points = np.sort(
-            rng.choice(len(X), min(n_points, len(X)), replace=False, p=area / area.sum())
-        )
-        R, t, s = (new[v].values[0] for v in ("rotation", "translation", "scale"))
-        gap = model.distance_to(s * mesh["position"].values @ R.T + t, mesh["corner_vertex"].values)
-        at = (X + d)[:, points].astype(float)
-        distance = gap(np.concatenate([at.mean(0)[None], model.reconstructed(at, steps)]))
-        surface[:] = distance[-1]
-        surface[: len(distance)] = distance
-    return error, surface
+    error, _, steps = describe_by_others(K[:n, :n], K[n, :n], K[n, n])
+    if not n_points:
+        return error, np.full(n, np.nan)
+    points = draw_points(area / area.sum(), n_points, np.random.default_rng(seed))
+    R, t, s = (new[v].values[0] for v in ("rotation", "translation", "scale"))
+    surface = s * mesh["position"].values @ R.T + t
+    there = X[points] + d[:, points]  # (n, p, 3)
+    return error, surface_error(there, steps, surface, mesh["corner_vertex"].values)
 
 
-def generalization(study, *, n_points=500, n_jobs=None, seed=0):
-    """Generalization with the correspondences recomputed.
-
-    Every shape in turn is new to the study of the others.
+def generalization(
+    study: xr.DataTree, *, n_points: int = 500, n_jobs: int | None = None, seed: int = 0
+) -> xr.Dataset:
+    """Generalization with correspondences found anew, each shape new to the study of the others.
 
     :func:`s4a.analysis.statistics.evaluate` leaves a shape out of the modes alone, which is
     optimistic: its correspondences were made with it.  Here it is also left out of the
@@ -153,38 +147,33 @@ def generalization(study, *, n_points=500, n_jobs=None, seed=0):
     >>> generalization(study).attrs["shapes"]
     6
     """
-    missing = [
-        n
-        for n in ("original", "coarse", "latent", "registration", "report")
-        if n not in study.children
-    ]
+    nodes = ("original", "coarse", "latent", "registration", "report")
+    missing = [node for node in nodes if node not in study.children]
     if missing:
         raise ValueError(f"a finished study is needed; this one lacks {', '.join(missing)}")
-    data = study["registration"].to_dataset()
-    names = data["shape"].values.tolist()
+    registration = study["registration"].to_dataset()
+    names = registration["shape"].values.tolist()
     if len(names) < 5:
         raise ValueError(f"at least 5 shapes needed to leave one out, found {len(names)}")
-    template = data.attrs["template"]
-    order = [
-        template,
-        *(n for n in names if n != template),
-    ]  # the template's own turn has work to share out
-    first = [_left_out(study, template, n_points, seed, n_jobs)]
+    # first the template, alone: to leave it out is the one turn with work to share out
+    template = registration.attrs["template"]
+    others = [name for name in names if name != template]
+    first = _errors_of(study, template, n_points, seed, n_jobs)
     rest = Parallel(n_jobs=n_jobs, return_as="generator")(
-        delayed(_left_out)(study, name, n_points, seed, 1) for name in order[1:]
+        delayed(_errors_of)(study, name, n_points, seed, 1) for name in others
     )
-    found = first + list(tqdm(rest, total=len(names) - 1, desc="shapes left out"))
-    error, surface = (np.stack([f[i] for f in found]) for i in (0, 1))
+    errors = [first, *tqdm(rest, total=len(names) - 1, desc="shapes left out")]
+    error, surface = (np.stack(values) for values in zip(*errors, strict=True))  # (s, s - 1) each
     measures = {
         "generalization": error[:, 1:].mean(0),
-        "generalization_error": model.standard_error(error[:, 1:]),
+        "generalization_error": stats.sem(error[:, 1:]),
     }
     if n_points:
         measures["generalization_surface"] = surface[:, 1:].mean(0)
-        measures["generalization_surface_error"] = model.standard_error(surface[:, 1:])
+        measures["generalization_surface_error"] = stats.sem(surface[:, 1:])
     attrs = {
         "correspondence": RECOMPUTED,
         "shapes": len(names),
         "generalization_0": float(error[:, 0].mean()),
     }
-    return in_unit(dataset(attrs, **measures), unit_of(data["displacement"]))
+    return in_unit(dataset(attrs, **measures), unit_of(registration["displacement"]))

@@ -1,6 +1,4 @@
-"""Evaluation of the model of variation.
-
-Compactness, generalization, specificity, permutation baseline (6.1, Fig. 5).
+"""How good a model of variation is: compactness, generalization, specificity, chance (6.1, Fig. 5).
 
 The measures are those of Davies (2002) and Styner et al. (2003), in the unit of the data.  A vertex
 distance is the root of the area-weighted mean square distance between corresponding vertices; it
@@ -9,51 +7,24 @@ template, the correspondences and the alignment were made from all shapes togeth
 here is left out of the model only, and the attribute ``correspondence`` says so.
 """
 
-import igl
 import numpy as np
 import xarray as xr
+from scipy import stats
 
-from s4a.geometry.mesh import as_arrays, vertex_areas
+from s4a.analysis.inputs import displacements_of
+from s4a.geometry.closest import distance_to_surface
+from s4a.geometry.mesh import as_arrays
 from s4a.method.deform import smoother
-from s4a.method.pca import synthesize
+from s4a.method.pca import center_gram, gram, principal_components, synthesize
 from s4a.method.register import Scan
-from s4a.schema import dataset, in_unit, require, unit_of
+from s4a.schema import dataset, in_unit, unit_of
 
 KEPT = "kept from the whole collection: optimistic"
 
 
-def gram(d, area):
-    """Inner products of fields (s, n, 3) under the areas scaled to sum 1, ``(s, s)``.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from s4a.analysis.model import gram
-    >>> gram(np.array([[[1.0, 0, 0], [3, 0, 0]]]), np.array([1.0, 1.0])).round(6).tolist()
-    [[5.0]]
-    """
-    X = np.asarray(d, np.float64) * np.sqrt(area / area.sum())[:, None]
-    X = X.reshape(len(X), -1)
-    return X @ X.T
-
-
-def centred(K):
-    """Gram matrix of the fields less their mean."""
-    return K - K.mean(0) - K.mean(1)[:, None] + K.mean()
-
-
-def principal(K):
-    """Variances (c,) (divisor s - 1).
-
-    And eigenvectors (s, c) of a centred Gram matrix, largest first.
-    """
-    value, V = np.linalg.eigh(K)
-    keep = value > 1e-12 * max(value[-1], np.finfo(float).tiny)
-    keep[0] = False  # the mean is gone
-    return value[keep][::-1] / (len(K) - 1), V[:, keep][:, ::-1]
-
-
-def left_out(inner, cross, own):
+def describe_by_others(
+    inner: np.ndarray, cross: np.ndarray, own: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A field against the model of others.
 
     Parameters
@@ -75,26 +46,30 @@ def left_out(inner, cross, own):
         Row c: what component c adds, in terms of the others less their mean.
     """
     n = len(inner)
-    error, score = np.zeros(n), np.full(n - 1, np.nan)
-    variance, V = principal(centred(inner))
+    variance, V = principal_components(center_gram(inner))
+    c = len(variance)
+    deviation = np.sqrt(variance)
+    length = np.sqrt(variance * (n - 1))  # of the components, as sums of the others
+    # with m the mean of the others: <x - m, x - m>, and <x - m, x_j - m>
     total = own - 2 * cross.mean() + inner.mean()
-    # <x - mean, x_j - mean>
     cross = cross - inner.mean(0) - cross.mean() + inner.mean()
-    coefficient = (cross @ V) / np.sqrt(variance * (n - 1))
-    left = total - np.concatenate([[0], np.cumsum(coefficient**2)])
-    error[:] = np.sqrt(np.maximum(left[-1], 0))
-    error[: len(left)] = np.sqrt(np.maximum(left, 0))
-    score[: len(variance)] = coefficient / np.sqrt(variance)
-    return error, score, (coefficient / np.sqrt(variance * (n - 1)))[:, None] * V.T
+    coefficient = (cross @ V) / length  # (c,)
+    squared = total - np.concatenate([[0], np.cumsum(coefficient**2)])  # (c + 1,)
+    error = np.sqrt(np.maximum(squared, 0))
+    return (
+        np.pad(error, (0, n - 1 - c), mode="edge"),
+        np.pad(coefficient / deviation, (0, n - 1 - c), constant_values=np.nan),
+        (coefficient / length)[:, None] * V.T,
+    )
 
 
-def leave_one_out(K):
+def leave_one_out(K: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
     """Every field against the model of all others.
 
     Parameters
     ----------
     K : float ndarray (s, s)
-        As of :func:`gram`.
+        As of :func:`s4a.method.pca.gram`.
 
     Returns
     -------
@@ -102,16 +77,20 @@ def leave_one_out(K):
         Vertex distance after reconstruction with 0, 1, ... s - 2 components.
     score : float ndarray (s, s - 2)
         Scores in standard deviations of the others' model.
+    steps : list of float ndarray (c, s - 1)
+        As of :func:`describe_by_others`.
     """
-    s = len(K)
-    error, score = np.zeros((s, s - 1)), np.full((s, s - 2), np.nan)
-    for i in range(s):
-        J = np.flatnonzero(np.arange(s) != i)
-        error[i], score[i], _ = left_out(K[np.ix_(J, J)], K[i, J], K[i, i])
-    return error, score
+    described = []
+    for i in range(len(K)):
+        others = np.delete(np.arange(len(K)), i)
+        described.append(describe_by_others(K[np.ix_(others, others)], K[i, others], K[i, i]))
+    error, score, steps = zip(*described, strict=True)
+    return np.array(error), np.array(score), list(steps)
 
 
-def specificity(K, n_samples, rng):
+def specificity(
+    K: np.ndarray, n_samples: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Vertex distances of random shapes of the model to the nearest shape of the collection.
 
     Parameters
@@ -127,21 +106,26 @@ def specificity(K, n_samples, rng):
     nearest : int ndarray (c, n_samples)
     score : float ndarray (n_samples, c)
     """
-    variance, V = principal(centred(K))
-    own = V * np.sqrt(variance * (len(K) - 1))  # coordinates of the collection
+    variance, V = principal_components(center_gram(K))
+    shapes = V * np.sqrt(variance * (len(K) - 1))  # (s, c), coordinates of the collection
     score = rng.normal(size=(n_samples, len(variance)))
-    drawn = score * np.sqrt(variance)
-    squared = np.tile((own**2).sum(1), (n_samples, 1))  # to the mean shape
+    samples = score * np.sqrt(variance)  # (n_samples, c)
+    # |a - b|^2 from sample a to shape b is |b|^2 at the mean, a = 0, and each component of a adds
+    # a_c^2 - 2 a_c b_c
+    squared = np.tile((shapes**2).sum(1), (n_samples, 1))  # (n_samples, s)
     distance, nearest = [], []
     for c in range(len(variance)):
-        squared += drawn[:, c : c + 1] ** 2 - 2 * drawn[:, c : c + 1] * own[:, c]
+        a = samples[:, c : c + 1]
+        squared += a**2 - 2 * a * shapes[:, c]
         distance.append(np.sqrt(np.maximum(squared.min(1), 0)))
         nearest.append(squared.argmin(1))
     return np.array(distance), np.array(nearest), score
 
 
-def variance_baseline(features, n_permutations, rng):
-    """Shares of variance when every feature is permuted over the shapes by itself (parallel analysis, Horn 1965).
+def variance_baseline(
+    features: np.ndarray, n_permutations: int, rng: np.random.Generator
+) -> np.ndarray:
+    """Shares of variance by chance: every feature permuted over the shapes by itself (Horn 1965).
 
     Parameters
     ----------
@@ -163,28 +147,73 @@ def variance_baseline(features, n_permutations, rng):
     return ratio
 
 
-def registered(study):
-    """Displacements (s, n, 3), template areas (n,) of sum 1, names (s,) and the template's mesh.
+def count_components(
+    variance: np.ndarray, s: int, n_components: int | None, *, most: int, share: float = 0.9
+) -> int:
+    """How many components of s shapes a test takes; ValueError where it would be more than `most`.
 
-    Of a study.
+    By default as many as hold `share` of the variance, at most half of the shapes.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.analysis.model import count_components
+    >>> count_components(np.array([6.0, 3.0, 1.0]), 20, None, most=3)
+    2
     """
-    if "registration" not in study:
-        raise ValueError(
-            f"a registered study is needed; this one has {', '.join(study.children) or 'no nodes'}"
-        )
-    data = study["registration"].to_dataset()
-    require(data, "displacement", "position", "corner_vertex", what="registration")
-    if data.sizes["shape"] < 4:
-        raise ValueError(f"statistics need at least 4 shapes, found {data.sizes['shape']}")
-    area = vertex_areas(*as_arrays(data))
-    d = data["displacement"].transpose("shape", "vertex", "xyz").values
-    return d, area / area.sum(), data["shape"].values.tolist(), data
+    if n_components is None:
+        explained = np.cumsum(variance / variance.sum())
+        enough = int(np.searchsorted(explained, share - 1e-9)) + 1
+        n_components = max(1, min(enough, s // 2, len(variance)))
+    c = int(n_components)
+    if not 1 <= c <= most:
+        raise ValueError(f"n_components needs a number from 1 to {most}, found {c}")
+    return c
 
 
-def evaluate(study, *, n_samples=1000, n_permutations=100, n_points=500, n_surface=20, seed=0):
-    """Compactness, generalization and specificity for every number of components.
+def mean_distance(P: np.ndarray, X: np.ndarray, T: np.ndarray) -> np.ndarray:
+    """Mean distance of points ``(..., p, 3)`` to a surface ``(...)``."""
+    return distance_to_surface(P.reshape(-1, 3), X, T).reshape(P.shape[:-1]).mean(-1)
 
-    And a baseline of the variance.
+
+def surface_error(
+    points: np.ndarray, steps: np.ndarray, X: np.ndarray, T: np.ndarray
+) -> np.ndarray:
+    """Mean distances of reconstructions of a left-out shape to its surface X, T.
+
+    Parameters
+    ----------
+    points : float ndarray (n, p, 3)
+        The same points on all other shapes.
+    steps : float ndarray (c, n)
+        As of :func:`describe_by_others`.
+
+    Returns
+    -------
+    float ndarray (n,)
+        With 0, 1, ... n - 1 components.
+    """
+    mean = points.mean(0)
+    added = np.einsum("cn,npx->cpx", steps, points - mean)  # by each component
+    P = np.concatenate([mean[None], mean + np.cumsum(added, axis=0)])  # (c + 1, p, 3)
+    return np.pad(mean_distance(P, X, T), (0, len(points) - len(P)), mode="edge")
+
+
+def draw_points(area: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Vertices ``(n,)`` to measure distances to surfaces from: drawn by area (of sum 1), sorted."""
+    return np.sort(rng.choice(len(area), min(n, len(area)), replace=False, p=area))
+
+
+def evaluate(
+    study: xr.DataTree,
+    *,
+    n_samples: int = 1000,
+    n_permutations: int = 100,
+    n_points: int = 500,
+    n_surface: int = 20,
+    seed: int = 0,
+) -> xr.Dataset:
+    """Compactness, generalization and specificity for every number of components, and chance.
 
     Parameters
     ----------
@@ -224,129 +253,100 @@ def evaluate(study, *, n_samples=1000, n_permutations=100, n_points=500, n_surfa
     >>> import s4a
     >>> from s4a.analysis.model import evaluate
     >>> study = s4a.synthetic.example_study()
-    >>> found = evaluate(study)
-    >>> bool(found["generalization"][0] > found["generalization"][3])
+    >>> quality = evaluate(study)
+    >>> bool(quality["generalization"][0] > quality["generalization"][3])
     True
     """
-    d, area, _, data = registered(study)
-    s, rng = len(d), np.random.default_rng(seed)
+    registration, d, area = displacements_of(study)
+    s = len(d)
+    rng = np.random.default_rng(seed)
     K = gram(d - d.mean(0), area)
-    variance, _ = principal(centred(K))
+    error, _, steps = leave_one_out(K)
+    distance, nearest, score = specificity(K, n_samples, rng)
+    variance, _ = principal_components(center_gram(K))
     c = len(variance)
-    error, _ = leave_one_out(K)
-    drawn, nearest, score = specificity(K, n_samples, rng)
     compactness = np.cumsum(variance)
-
-    def per_component(values):
-        out = np.full(c, np.nan)
-        out[: min(c, len(values))] = values[:c]
-        return out
-
-    found = dataset(
+    quality = dataset(
         {"correspondence": KEPT, "shapes": s, "generalization_0": float(error[:, 0].mean())},
         compactness=compactness,
         compactness_error=np.sqrt(2 / s) * compactness,
-        generalization=per_component(error[:, 1:].mean(0)),
-        generalization_error=per_component(error[:, 1:].std(0, ddof=1) / np.sqrt(s)),
-        specificity=drawn.mean(1),
-        specificity_error=drawn.std(1, ddof=1) / np.sqrt(n_samples),
+        generalization=_per_component(error[:, 1:].mean(0), c),
+        generalization_error=_per_component(stats.sem(error[:, 1:]), c),
+        specificity=distance.mean(1),
+        specificity_error=stats.sem(distance, axis=1),
     )
-    X, T = as_arrays(data)
     if n_points:
-        points = np.sort(rng.choice(len(X), min(n_points, len(X)), replace=False, p=area))
-        kept, drawn = _surface_distances(
-            X, T, d, K, points, score[:n_surface], nearest[:, :n_surface]
+        points = draw_points(area, n_points, rng)
+        kept = _surface_errors(registration, d, points, steps)
+        random = _surface_specificity(
+            registration, d, K, points, score[:n_surface], nearest[:, :n_surface]
         )
-        found = found.merge(
+        quality = quality.merge(
             dataset(
-                generalization_surface=per_component(kept.mean(0)),
-                generalization_surface_error=per_component(standard_error(kept)),
-                specificity_surface=drawn.mean(1),
-                specificity_surface_error=standard_error(drawn, 1),
+                generalization_surface=_per_component(kept[:, 1:].mean(0), c),
+                generalization_surface_error=_per_component(stats.sem(kept[:, 1:]), c),
+                specificity_surface=random.mean(1),
+                specificity_surface_error=stats.sem(random, axis=1),
             )
         )
-    found = in_unit(found, unit_of(data["displacement"]))
+    quality = in_unit(quality, unit_of(registration["displacement"]))
     features = _coefficients(study, d, area)
-    own = np.linalg.svd(features - features.mean(0), compute_uv=False)[:c] ** 2
+    ratio = np.linalg.svd(features - features.mean(0), compute_uv=False)[:c] ** 2
     null = variance_baseline(features, n_permutations, rng)[:, :c]
-    return found.merge(
+    return quality.merge(
         dataset(
-            variance_ratio=own / own.sum(),
+            variance_ratio=ratio / ratio.sum(),
             variance_ratio_null=null.mean(0),
             variance_ratio_null_95=np.quantile(null, 0.95, axis=0),
         )
     )
 
 
-def _coefficients(study, d, area):
-    """Displacements in an orthonormal basis of the template's smooth functions (s, f).
+def _per_component(values, c):
+    """Values of 1, 2, ... components ``(c,)``; NaN for those that no left-out shape can have."""
+    return np.pad(values, (0, c), constant_values=np.nan)[:c]
 
-    In all vertices without one.
+
+def _surface_errors(registration, d, points, steps):
+    """:func:`surface_error` of every shape, left out of the model ``(s, s - 1)``."""
+    X, T = as_arrays(registration)
+    P = X[points] + d[:, points]  # (s, p, 3)
+    return np.stack(
+        [surface_error(np.delete(P, i, axis=0), steps[i], X + d[i], T) for i in range(len(d))]
+    )
+
+
+def _surface_specificity(registration, d, K, points, score, nearest):
+    """Mean distances of random shapes to the surface of the nearest shape ``(c, n_samples)``."""
+    X, T = as_arrays(registration)
+    P = X[points] + d[:, points]  # (s, p, 3)
+    _, V = principal_components(center_gram(K))
+    modes = np.einsum("sc,spx->cpx", V, P - P.mean(0)) / np.sqrt(len(d) - 1)
+    samples = P.mean(0) + np.cumsum(score[:, :, None, None] * modes, axis=1)  # (n_samples, c, p, 3)
+    distance = np.zeros(nearest.shape)
+    for i in np.unique(nearest):
+        component, sample = np.nonzero(nearest == i)
+        distance[component, sample] = mean_distance(samples[sample, component], X + d[i], T)
+    return distance
+
+
+def _coefficients(study, d, area):
+    """Displacements in an orthonormal basis of the template's smooth functions ``(s, f)``.
+
+    In all vertices where the study has no eigenfunctions.
     """
     template = study["registration"].attrs["template"]
-    if "coarse" in study and template in study["coarse"].children:
-        scan = Scan(
-            study["original"][template].to_dataset(), study["coarse"][template].to_dataset()
-        )
-        B = scan.U @ scan.low.Phi
-        B = B @ np.linalg.inv(np.linalg.cholesky(B.T @ (area[:, None] * B))).T
-        return np.stack([smoother(B, area)(field) for field in d.astype(float)]).reshape(len(d), -1)
-    return (d * np.sqrt(area)[:, None]).reshape(len(d), -1).astype(float)
+    if "coarse" not in study or template not in study["coarse"].children:
+        return (d * np.sqrt(area)[:, None]).reshape(len(d), -1).astype(float)
+    scan = Scan(study["original"][template].to_dataset(), study["coarse"][template].to_dataset())
+    B = scan.U @ scan.low.Phi  # (n, k)
+    B = B @ np.linalg.inv(np.linalg.cholesky(B.T @ (area[:, None] * B))).T
+    return np.stack([smoother(B, area)(field) for field in d.astype(float)]).reshape(len(d), -1)
 
 
-def _surface_distances(X, T, d, K, points, score, nearest):
-    """Distances from points of the reconstructions to each left-out shape.
-
-    And of random shapes to the nearest.
-    """
-    s, c = len(d), len(nearest)
-    at = (X + d)[:, points].astype(float)
-    _, V = principal(centred(K))
-    modes = np.einsum("sc,spx->cpx", V, at - at.mean(0)) / np.sqrt(s - 1)
-    drawn = at.mean(0) + np.cumsum(
-        score[:, :, None, None] * modes, axis=1
-    )  # sample, component, point, xyz
-    kept, random = np.full((s, max(s - 2, 1)), np.nan), np.zeros(nearest.shape)
-    for i in range(s):
-        gap = distance_to(X + d[i], T)
-        which = np.argwhere(nearest == i)
-        if len(which):
-            random[which[:, 0], which[:, 1]] = gap(drawn[which[:, 1], which[:, 0]])
-        J = np.flatnonzero(np.arange(s) != i)
-        *_, steps = left_out(K[np.ix_(J, J)], K[i, J], K[i, i])
-        distance = gap(reconstructed(at[J], steps))
-        kept[i] = distance[-1]
-        kept[i, : len(distance)] = distance
-    return kept[:, :c], random
-
-
-def distance_to(X, T):
-    """Function of points (..., p, 3): their mean distance to a surface (...)."""
-    X, T = np.ascontiguousarray(X, np.float64), np.ascontiguousarray(T, np.int64)
-    tree = igl.AABB()
-    tree.init(X, T)
-
-    def gap(P):
-        squared = tree.squared_distance(X, T, np.ascontiguousarray(P.reshape(-1, 3)))[0]
-        return np.sqrt(np.maximum(squared, 0)).reshape(P.shape[:-1]).mean(-1)
-
-    return gap
-
-
-def reconstructed(at, steps):
-    """Points of a field with 1, 2, ... components of others ``(c, p, 3)``.
-
-    Theirs ``(n, p, 3)``, :func:`left_out`.
-    """
-    return at.mean(0) + np.cumsum(np.einsum("cn,npx->cpx", steps, at - at.mean(0)), axis=0)
-
-
-def standard_error(values, axis=0):
-    """Of the mean along an axis."""
-    return values.std(axis, ddof=1) / np.sqrt(values.shape[axis])
-
-
-def sample(study, n, *, n_components=None, seed=0):
+def sample(
+    study: xr.DataTree, n: int, *, n_components: int | None = None, seed: int = 0
+) -> xr.DataTree:
     """New shapes from the model: normal scores on the first components.
 
     Parameters
@@ -377,13 +377,11 @@ def sample(study, n, *, n_components=None, seed=0):
     >>> sample(study, 2)["score"].dims
     ('shape', 'component')
     """
-    c = study["pca"].sizes["component"]
-    c = c if n_components is None else n_components
-    if not 1 <= c <= study["pca"].sizes["component"]:
-        raise ValueError(
-            f"n_components needs a number from 1 to {study['pca'].sizes['component']}, found {c}"
-        )
+    most = study["pca"].sizes["component"]
+    c = most if n_components is None else n_components
+    if not 1 <= c <= most:
+        raise ValueError(f"n_components needs a number from 1 to {most}, found {c}")
     score = np.random.default_rng(seed).normal(size=(n, c))
     names = [f"sample_{i + 1:0{len(str(n))}d}" for i in range(n)]
-    nodes = {name: synthesize(study, row) for name, row in zip(names, score, strict=True)}
-    return xr.DataTree.from_dict({"/": dataset(score=score).assign_coords(shape=names), **nodes})
+    meshes = {name: synthesize(study, row) for name, row in zip(names, score, strict=True)}
+    return xr.DataTree.from_dict({"/": dataset(score=score).assign_coords(shape=names), **meshes})

@@ -197,22 +197,3 @@ def vertex_test(d, x, *, covariates=None, n_permutations=999, seed=0):
     largest = np.sort(np.concatenate(largest)) if largest else np.empty(0)
     beyond = len(largest) - np.searchsorted(largest, share * (1 - 1e-6), side="left")
     return share, (1 + reached) / (1 + n_permutations), (1 + beyond) / (1 + n_permutations)
-
-
-def false_discovery_rate(p):
-    """Adjusted p values of Benjamini & Hochberg (1995).
-
-    Rejecting those up to q keeps the rate of false ones under q.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from s4a.analysis.permutation import false_discovery_rate
-    >>> false_discovery_rate(np.array([0.01, 0.5, 0.02])).round(3).tolist()
-    [0.03, 0.5, 0.03]
-    """
-    order = np.argsort(p, kind="stable")
-    scaled = p[order] * len(p) / np.arange(1, len(p) + 1)
-    q = np.empty(len(p))
-    q[order] = np.minimum(np.minimum.accumulate(scaled[::-1])[::-1], 1)
-    return q

@@ -1,32 +1,38 @@
-"""Statistics of a finished study (6.1).
+"""Statistics of a finished study (6.1): the model, groups and variables, outliers, classes.
 
-Evaluation of its model, groups and variables, outliers, classification.
-
-All take a study and give a Dataset; what works on plain arrays is in
+All take a study and give a Dataset.  What works on plain arrays is in
 :mod:`s4a.analysis.permutation` and :mod:`s4a.analysis.model`.
-"""
 
-import logging
+To add a statistic:
+
+1. ``registration, d, area = displacements_of(study)``: d are the displacements (shape, vertex,
+   xyz), area that of the vertices; ``values_of``, ``groups_of`` and ``covariates_of`` take arrays,
+   dicts and columns of ``/subjects`` alike (:mod:`s4a.analysis.inputs`);
+2. its arithmetic is a function of plain arrays, tested on a known answer;
+3. its variables are in :data:`s4a.schema.TABLE`; give them as ``in_unit(dataset(...), unit)``;
+4. its name is in ``__all__`` below, its command in :mod:`s4a.cli.commands`;
+5. a test plants an effect, which is found, and none, which is not.
+"""
 
 import numpy as np
 import xarray as xr
 from scipy import stats
-from sklearn.base import clone
+from sklearn.base import ClassifierMixin, clone
 from sklearn.decomposition import PCA
 from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import balanced_accuracy_score
-from sklearn.model_selection import StratifiedKFold, permutation_test_score
+from sklearn.model_selection import StratifiedKFold, cross_val_predict, permutation_test_score
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
-from s4a.analysis import model
-from s4a.analysis import permutation as test
 from s4a.analysis.generalization import generalization
-from s4a.analysis.model import evaluate, registered, sample
+from s4a.analysis.inputs import Values, covariates_of, displacements_of, groups_of, values_of
+from s4a.analysis.model import KEPT, count_components, evaluate, leave_one_out, sample
+from s4a.analysis.permutation import indicators, permutation_test, smallest_p, vertex_test
 from s4a.geometry.mesh import as_arrays, vertex_normals
+from s4a.method.deform import normal_displacement
+from s4a.method.pca import center_gram, gram, principal_components
 from s4a.schema import dataset, in_unit, unit_of
-
-log = logging.getLogger(__name__)
 
 __all__ = [
     "classify",
@@ -42,123 +48,15 @@ __all__ = [
 ]
 
 
-def values_of(study, given, what):
-    """One value per shape: of an array in the order of the study, a dict of name to value.
-
-    Or a column of /subjects.
-    """
-    names = study["registration"]["shape"].values.tolist()
-    if isinstance(given, str):
-        what = f"{what} {given!r}"
-        held = study["subjects"].to_dataset() if "subjects" in study.children else xr.Dataset()
-        if given not in held:
-            raise ValueError(
-                f"{what} needs a column of that name in /subjects, which has {', '.join(held.data_vars) or 'none'}; "
-                "give a table, or the values themselves"
-            )
-        lacking = [n for n in names if n not in held["shape"].values]
-        if lacking:
-            raise ValueError(
-                f"{what} needs a row in /subjects for every shape; it lacks {', '.join(lacking)}"
-            )
-        given = held[given].sel(shape=names).values
-    if isinstance(given, dict):
-        missing = [n for n in names if n not in given]
-        if missing:
-            raise ValueError(f"{what} needs a value for every shape; it lacks {', '.join(missing)}")
-        given = [given[n] for n in names]
-    given = np.asarray(given)
-    if given.ndim == 0 or len(given) != len(names):
-        raise ValueError(
-            f"{what} needs one value for each of {len(names)} shapes, found shape {given.shape}"
-        )
-    unknown = (
-        ~np.isfinite(given)
-        if given.dtype.kind == "f"
-        else given == ""
-        if given.dtype.kind in "OU"
-        else False
-    )
-    unknown = np.broadcast_to(unknown, given.shape).reshape(len(names), -1).any(1)
-    if unknown.any():
-        lacking = ", ".join(n for n, u in zip(names, unknown, strict=True) if u)
-        raise ValueError(
-            f"{what} needs a finite value for every shape; leave out of the study, or fill in: {lacking}"
-        )
-    return given
-
-
-def groups_of(study, group):
-    """The groups of the shapes.
-
-    ValueError where one has fewer than 3 shapes, a warning under 10.
-    """
-    group = values_of(study, group, "group")
-    names, count = np.unique(group, return_counts=True)
-    sizes = ", ".join(f"{n}: {c}" for n, c in zip(names, count, strict=True))
-    if len(names) < 2 or count.min() < 3:
-        raise ValueError(
-            f"a test needs two groups or more, each of at least 3 shapes; found {sizes}"
-        )
-    if count.min() < 10:
-        log.warning(
-            "groups under 10 shapes (%s): only large differences can be found, effect sizes are uncertain",
-            sizes,
-        )
-    return group, sizes
-
-
-def _covariates(study, covariates):
-    if covariates is None:
-        return None
-    if isinstance(covariates, list) and all(isinstance(n, str) for n in covariates):
-        columns = [values_of(study, name, "covariate") for name in covariates]
-    elif isinstance(covariates, dict) and not set(covariates) >= set(
-        study["registration"]["shape"].values.tolist()
-    ):
-        columns = [values_of(study, v, f"covariate {n}") for n, v in covariates.items()]
-    else:
-        columns = [values_of(study, covariates, "covariate")]
-    columns = [
-        test.indicators(c)[1] if c.dtype.kind in "OU" else np.asarray(c, float) for c in columns
-    ]
-    return np.column_stack([c.reshape(len(c), -1) for c in columns])
-
-
-def enough_components(ratio, s, share=0.9):
-    """How many components hold `share` of the variance, at most half of the shapes.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import s4a
-    >>> s4a.statistics.enough_components(np.array([0.6, 0.3, 0.1]), 20)
-    2
-    """
-    return int(max(1, min(np.searchsorted(np.cumsum(ratio), share - 1e-9) + 1, s // 2, len(ratio))))
-
-
-def _scores(study, n_components):
-    """Scores on the first components in standard deviations ``(s, c)``.
-
-    And all in the unit of the input.
-    """
-    d, area, _, _ = registered(study)
-    variance, V = model.principal(model.centred(model.gram(d - d.mean(0), area)))
-    if not len(variance):
-        raise ValueError("a test needs shapes that differ; all displacements are equal")
-    c = (
-        enough_components(variance / variance.sum(), len(d))
-        if n_components is None
-        else int(n_components)
-    )
-    if not 1 <= c <= len(variance):
-        raise ValueError(f"n_components needs a number from 1 to {len(variance)}, found {c}")
-    root = np.sqrt(len(d) - 1)
-    return V[:, :c] * root, V * np.sqrt(variance) * root
-
-
-def group_test(study, group, *, covariates=None, n_components=None, n_permutations=9999, seed=0):
+def group_test(
+    study: xr.DataTree,
+    group: Values,
+    *,
+    covariates: Values | None = None,
+    n_components: int | None = None,
+    n_permutations: int = 9999,
+    seed: int = 0,
+) -> xr.Dataset:
     """Do groups of shapes differ?  Permutation Hotelling T^2 on the scores.
 
     Covariance shrunk after Ledoit and Wolf.
@@ -167,8 +65,9 @@ def group_test(study, group, *, covariates=None, n_components=None, n_permutatio
     ----------
     study : DataTree
     group : array_like (shape,), dict of shape to value, or name in /subjects
-    covariates : as `group`, or a dict of name to these, a list of names in /subjects, an array (shape, covariate)
-        Accounted for after Freedman and Lane (1983); text as indicators of its values.
+    covariates : as `group`, a dict of name to these, or an array_like (shape, covariate)
+        Or a list of names in /subjects.  Accounted for after Freedman and Lane (1983); text as
+        indicators of its values.
     n_components : int, optional
         As many as hold 90 % of the variance by default, at most half of the number of shapes.
     n_permutations : int
@@ -191,55 +90,28 @@ def group_test(study, group, *, covariates=None, n_components=None, n_permutatio
 
     >>> import s4a
     >>> study = s4a.synthetic.example_study()
-    >>> found = s4a.statistics.group_test(study, ["a", "a", "a", "b", "b", "b"], n_permutations=99)
-    >>> found.attrs["groups"], bool(found["p_value"] > 0.05)
+    >>> test = s4a.statistics.group_test(study, ["a", "a", "a", "b", "b", "b"], n_permutations=99)
+    >>> test.attrs["groups"], bool(test["p_value"] > 0.05)
     ('a: 3, b: 3', True)
     """
     group, sizes = groups_of(study, group)
-    scores, _ = _scores(study, n_components)
-    _, x = test.indicators(group)
-    Z = _covariates(study, covariates)
-    statistic, p = test.permutation_test(
-        scores, x, covariates=Z, n_permutations=n_permutations, seed=seed
+    options = {"n_permutations": n_permutations, "seed": seed}
+    _, x = indicators(group)
+    test = _test_scores(study, x, covariates_of(study, covariates), n_components, options)
+    return test.assign_attrs(
+        groups=sizes, smallest_p=smallest_p(n_permutations, group), permutations=n_permutations
     )
-    least = test.smallest_p(n_permutations, group)
-    attrs = {
-        "groups": sizes,
-        "components": scores.shape[1],
-        "smallest_p": least,
-        "permutations": n_permutations,
-    }
-    return dataset(attrs, statistic=statistic, p_value=p)
 
 
-def _map(study, x, Z, of, n_permutations, seed):
-    """Test at every vertex and the effect of the first column of x."""
-    d, _, _, data = registered(study)
-    if of not in ("vector", "normal"):
-        raise ValueError(f"of must be 'vector' or 'normal', found {of!r}")
-    fields = (
-        d
-        if of == "vector"
-        else np.einsum("snx,nx->sn", d, vertex_normals(*as_arrays(data)))[..., None]
-    )
-    share, p, p_max = test.vertex_test(
-        fields, x, covariates=Z, n_permutations=n_permutations, seed=seed
-    )
-    columns = np.column_stack([np.ones(len(d)), x] if Z is None else [np.ones(len(d)), x, Z])
-    columns[:, 1:] -= columns[:, 1:].mean(0)
-    B = np.linalg.pinv(columns) @ d.reshape(len(d), -1).astype(float)
-    found = dataset(
-        explained_share=share,
-        p_vertex=p,
-        p_family_wise=p_max,
-        p_false_discovery=test.false_discovery_rate(p),
-        effect=B[1].reshape(-1, 3),
-        intercept=B[0].reshape(-1, 3),
-    )
-    return in_unit(found, unit_of(data["displacement"]))
-
-
-def group_map(study, group, *, covariates=None, of="vector", n_permutations=999, seed=0):
+def group_map(
+    study: xr.DataTree,
+    group: Values,
+    *,
+    covariates: Values | None = None,
+    of: str = "vector",
+    n_permutations: int = 999,
+    seed: int = 0,
+) -> xr.Dataset:
     """Where do groups of shapes differ?  A permutation test at every vertex of the template.
 
     Parameters
@@ -268,26 +140,37 @@ def group_map(study, group, *, covariates=None, of="vector", n_permutations=999,
 
     >>> import s4a
     >>> study = s4a.synthetic.example_study()
-    >>> found = s4a.statistics.group_map(study, ["a", "a", "a", "b", "b", "b"], n_permutations=99)
-    >>> found["effect"].dims, bool((found["p_family_wise"] > 0.05).all())
+    >>> where = s4a.statistics.group_map(study, ["a", "a", "a", "b", "b", "b"], n_permutations=99)
+    >>> where["effect"].dims, bool((where["p_family_wise"] > 0.05).all())
     (('vertex', 'xyz'), True)
     """
     group, sizes = groups_of(study, group)
-    names, x = test.indicators(group)
-    Z = _covariates(study, covariates)
-    found = _map(study, x, Z, of, n_permutations, seed)
-    n, k = len(group), 0 if Z is None else Z.shape[1]
-    ratio = found["explained_share"].values / np.maximum(1 - found["explained_share"].values, 1e-12)
-    if len(names) == 2:
-        ratio = ratio * (n - 2 - k) * (1 / np.unique(group, return_counts=True)[1]).sum()
-    least = test.smallest_p(n_permutations, group)
-    attrs = {"groups": sizes, "smallest_p": least, "permutations": n_permutations, "of": of}
-    return found.merge(dataset(effect_size=np.sqrt(ratio))).assign_attrs(attrs)
+    names, x = indicators(group)
+    Z = covariates_of(study, covariates)
+    options = {"n_permutations": n_permutations, "seed": seed}
+    effect_map = _test_vertices(study, x, Z, of, options)
+    squared = _squared_cohen_f(effect_map)
+    if len(names) == 2:  # Mahalanobis distance of the means: T^2 (1 / n_1 + 1 / n_2)
+        dof = len(group) - 2 - (0 if Z is None else Z.shape[1])
+        squared = squared * dof * (1 / np.unique(group, return_counts=True)[1]).sum()
+    return effect_map.merge(dataset(effect_size=np.sqrt(squared))).assign_attrs(
+        groups=sizes,
+        smallest_p=smallest_p(n_permutations, group),
+        permutations=n_permutations,
+        of=of,
+    )
 
 
 def regression(
-    study, variable, *, covariates=None, of="vector", n_components=None, n_permutations=999, seed=0
-):
+    study: xr.DataTree,
+    variable: Values,
+    *,
+    covariates: Values | None = None,
+    of: str = "vector",
+    n_components: int | None = None,
+    n_permutations: int = 999,
+    seed: int = 0,
+) -> xr.Dataset:
     """How does shape change with a continuous variable, such as age?
 
     Parameters
@@ -329,29 +212,32 @@ def regression(
             f"a regression needs a variable of numbers, found {x.dtype}; a group test takes text"
         )
     x = x.astype(float)
-    scores, _ = _scores(study, n_components)
-    Z = _covariates(study, covariates)
-    statistic, p = test.permutation_test(
-        scores, x, covariates=Z, n_permutations=n_permutations, seed=seed
-    )
-    found = _map(study, x, Z, of, n_permutations, seed)
-    share = found["explained_share"].values
-    attrs = {"mean": float(x.mean()), "lowest": float(x.min()), "highest": float(x.max()), "of": of}
-    attrs["standard_deviation"] = float(x.std(ddof=1))
-    attrs |= {
-        "components": scores.shape[1],
-        "smallest_p": test.smallest_p(n_permutations, n=len(x)),
-    }
-    extra = dataset(
-        statistic=statistic,
-        p_value=p,
-        effect_size=np.sqrt(share / np.maximum(1 - share, 1e-12)),
-        standard_score=(x - attrs["mean"]) / attrs["standard_deviation"],
+    Z = covariates_of(study, covariates)
+    options = {"n_permutations": n_permutations, "seed": seed}
+    test = _test_scores(study, x, Z, n_components, options)
+    effect_map = _test_vertices(study, x, Z, of, options)
+    mean = float(x.mean())
+    deviation = float(x.std(ddof=1))
+    sizes = dataset(
+        effect_size=np.sqrt(_squared_cohen_f(effect_map)), standard_score=(x - mean) / deviation
     ).assign_coords(shape=study["registration"]["shape"].values)
-    return found.merge(extra).assign_attrs(attrs | {"permutations": n_permutations})
+    return (
+        effect_map.merge(test)
+        .merge(sizes)
+        .assign_attrs(
+            mean=mean,
+            lowest=float(x.min()),
+            highest=float(x.max()),
+            of=of,
+            standard_deviation=deviation,
+            components=test.attrs["components"],
+            smallest_p=smallest_p(n_permutations, n=len(x)),
+            permutations=n_permutations,
+        )
+    )
 
 
-def predict(study, fit, value):
+def predict(study: xr.DataTree, fit: xr.Dataset, value: float) -> xr.Dataset:
     """The shape at a value of the variable of a :func:`regression`.
 
     :func:`regression_modes` animates it.
@@ -372,7 +258,8 @@ def predict(study, fit, value):
 
     Examples
     --------
-    With the ``study`` of six small brains; between the ages of 0 and 5 a shape moves by five times the effect:
+    With the ``study`` of six small brains; from an age of 0 to 5 a shape moves by five times the
+    effect:
 
     >>> import numpy as np
     >>> import s4a
@@ -383,13 +270,14 @@ def predict(study, fit, value):
     True
     """
     template = study["registration"].to_dataset()
-    moved = fit["intercept"].values + (value - fit.attrs["mean"]) * fit["effect"].values
+    displacement = fit["intercept"].values + (value - fit.attrs["mean"]) * fit["effect"].values
     return dataset(
-        position=template["position"].values + moved, corner_vertex=template["corner_vertex"].values
+        position=template["position"].values + displacement,
+        corner_vertex=template["corner_vertex"].values,
     )
 
 
-def regression_modes(study, fit, name="variable"):
+def regression_modes(study: xr.DataTree, fit: xr.Dataset, name: str = "variable") -> xr.DataTree:
     """A :func:`regression` in the form of a study with one mode, for everything that shows modes.
 
     ``s4a.explore`` and the panel of the modes play it with a slider, :func:`s4a.write_page` and
@@ -422,11 +310,10 @@ def regression_modes(study, fit, name="variable"):
     >>> s4a.statistics.regression_modes(study, fit, "age")["pca"].sizes["component"]
     1
     """
-    d, area, names, data = registered(study)
-    deviation = fit.attrs["standard_deviation"]
-    step = fit["effect"].values * deviation
+    registration, d, area = displacements_of(study)
+    step = fit["effect"].values * fit.attrs["standard_deviation"]  # (n, 3)
     size = np.sqrt(np.einsum("nx,nx,n->", step, step, area))
-    total = model.gram(d - d.mean(0), area).trace() / (len(d) - 1)
+    total = gram(d - d.mean(0), area).trace() / (len(d) - 1)
     modes = dataset(
         {"variable": name},
         mean_displacement=fit["intercept"].values.astype(np.float32),
@@ -435,16 +322,20 @@ def regression_modes(study, fit, name="variable"):
         score=fit["standard_score"].values[:, None],
         explained_variance_ratio=np.array([size**2 / total]),
     )
-    modes = in_unit(modes, unit_of(data["displacement"])).assign_coords(shape=names)
+    modes = in_unit(modes, unit_of(registration["displacement"]))
     nodes = {
-        n.path: n.to_dataset(inherit=False)
-        for n in study.subtree
-        if n.path.split("/")[1] in ("coarse", "original")
+        "/registration": registration,
+        "/pca": modes.assign_coords(shape=registration["shape"].values),
     }
-    return xr.DataTree.from_dict(nodes | {"/registration": data, "/pca": modes}, name=study.name)
+    for node in study.subtree:
+        if node.path.split("/")[1] in ("coarse", "original"):
+            nodes[node.path] = node.to_dataset(inherit=False)
+    return xr.DataTree.from_dict(nodes, name=study.name)
 
 
-def outliers(study, *, n_components=None, level=0.01):
+def outliers(
+    study: xr.DataTree, *, n_components: int | None = None, level: float = 0.01
+) -> xr.Dataset:
     """Shapes that the model of all others describes badly, or finds far from its mean.
 
     Parameters
@@ -477,38 +368,39 @@ def outliers(study, *, n_components=None, level=0.01):
     >>> s4a.statistics.outliers(study)["outlier"].values.any()
     np.False_
     """
-    d, area, names, data = registered(study)
+    registration, d, area = displacements_of(study)
     s = len(d)
-    K = model.gram(d - d.mean(0), area)
-    variance, _ = model.principal(model.centred(K))
-    c = (
-        enough_components(variance / variance.sum(), s)
-        if n_components is None
-        else int(n_components)
-    )
-    if not 1 <= c <= s - 3:
-        raise ValueError(f"n_components needs a number from 1 to {s - 3}, found {c}")
-    error, score = model.leave_one_out(K)
+    K = gram(d - d.mean(0), area)
+    variance, _ = principal_components(center_gram(K))
+    c = count_components(variance, s, n_components, most=s - 3)
+    error, score, _ = leave_one_out(K)
+    error = error[:, c]
     squared = np.nansum(score[:, :c] ** 2, axis=1)
     n = s - 1
     p = stats.f.sf(squared * n * (n - c) / (c * (n * n - 1)), c, n - c)
-    left = error[:, c]
-    spread = 1.4826 * np.median(np.abs(left - np.median(left)))
-    far = left - np.median(left) > 3.5 * max(spread, 1e-12 * max(left.max(), 1e-300))
-    attrs = {"components": c, "correspondence": model.KEPT, "level": level}
-    found = dataset(
-        attrs,
+    spread = stats.median_abs_deviation(error, scale="normal")
+    is_strange = (spread > 0) & (error - np.median(error) > 3.5 * max(spread, 1e-12 * error.max()))
+    result = dataset(
+        {"components": c, "correspondence": KEPT, "level": level},
         mahalanobis=np.sqrt(squared),
         outlier_p=p,
-        left_out_error=left,
-        outlier=(p < level) | (far & (spread > 0)),
+        left_out_error=error,
+        outlier=(p < level) | is_strange,
     )
-    return in_unit(found, unit_of(data["displacement"])).assign_coords(shape=names)
+    result = in_unit(result, unit_of(registration["displacement"]))
+    return result.assign_coords(shape=registration["shape"].values)
 
 
 def classify(
-    study, group, estimator=None, *, n_components=None, n_folds=5, n_permutations=99, seed=0
-):
+    study: xr.DataTree,
+    group: Values,
+    estimator: ClassifierMixin | None = None,
+    *,
+    n_components: int | None = None,
+    n_folds: int = 5,
+    n_permutations: int = 99,
+    seed: int = 0,
+) -> xr.Dataset:
     """Can the groups be told from the shapes?  Cross-validated.
 
     With the modes made inside every fold.
@@ -543,39 +435,89 @@ def classify(
 
     >>> import s4a
     >>> study = s4a.synthetic.example_study()
-    >>> found = s4a.statistics.classify(study, ["a", "a", "a", "b", "b", "b"], n_permutations=9)
-    >>> found["predicted"].sizes["shape"], found.attrs["chance"]
+    >>> classes = s4a.statistics.classify(study, ["a", "a", "a", "b", "b", "b"], n_permutations=9)
+    >>> classes["predicted"].sizes["shape"], classes.attrs["chance"]
     (6, 0.5)
     """
     group, sizes = groups_of(study, group)
     names, count = np.unique(group, return_counts=True)
     n_folds = min(n_folds, int(count.min()))
-    chosen, coordinates = _scores(study, n_components)
-    c = min(chosen.shape[1], len(group) - int(np.ceil(len(group) / n_folds)) - 2)
+    folds = StratifiedKFold(n_folds, shuffle=True, random_state=seed)
+    scores, coordinates = _scores_of(study, n_components)
+    n_training = len(group) - int(np.ceil(len(group) / n_folds))
+    c = min(scores.shape[1], n_training - 2)
     steps = make_pipeline(
         PCA(c, svd_solver="full"),
         StandardScaler(),
         LogisticRegression(max_iter=1000) if estimator is None else clone(estimator),
     )
-    folds = StratifiedKFold(n_folds, shuffle=True, random_state=seed)
-    predicted, accuracy = group.copy(), []
-    for train, left_out in folds.split(coordinates, group):
-        predicted[left_out] = (
-            clone(steps).fit(coordinates[train], group[train]).predict(coordinates[left_out])
-        )
-        accuracy.append(balanced_accuracy_score(group[left_out], predicted[left_out]))
-    attrs = {"permutations": n_permutations, "smallest_p": test.smallest_p(n_permutations, group)}
+    predicted = cross_val_predict(steps, coordinates, group, cv=folds)
+    accuracy = [
+        balanced_accuracy_score(group[left_out], predicted[left_out])
+        for _, left_out in folds.split(coordinates, group)
+    ]
     p = 1.0
     if n_permutations:
         options = {"cv": folds, "scoring": "balanced_accuracy", "n_permutations": n_permutations}
         *_, p = permutation_test_score(steps, coordinates, group, random_state=seed, **options)
-    attrs |= {
+    attrs = {
+        "permutations": n_permutations,
+        "smallest_p": smallest_p(n_permutations, group),
         "groups": sizes,
         "balanced_accuracy": float(balanced_accuracy_score(group, predicted)),
         "chance": 1 / len(names),
         "components": c,
-        "correspondence": model.KEPT,
+        "correspondence": KEPT,
     }
-    return dataset(
-        attrs, predicted=predicted, accuracy=np.array(accuracy), p_value=p
-    ).assign_coords(shape=study["registration"]["shape"].values)
+    result = dataset(attrs, predicted=predicted, accuracy=np.array(accuracy), p_value=p)
+    return result.assign_coords(shape=study["registration"]["shape"].values)
+
+
+# what several of them share
+
+
+def _scores_of(study, n_components):
+    """Scores on the first components ``(s, c)``, and all coordinates in the unit of the input."""
+    _, d, area = displacements_of(study)
+    variance, V = principal_components(center_gram(gram(d - d.mean(0), area)))
+    if not len(variance):
+        raise ValueError("a test needs shapes that differ; all displacements are equal")
+    c = count_components(variance, len(d), n_components, most=len(variance))
+    root = np.sqrt(len(d) - 1)
+    return V[:, :c] * root, V * np.sqrt(variance) * root
+
+
+def _test_scores(study, x, Z, n_components, options):
+    """One test for the whole shape: Hotelling's T^2 of the scores on x, Z accounted for."""
+    scores, _ = _scores_of(study, n_components)
+    statistic, p = permutation_test(scores, x, covariates=Z, **options)
+    return dataset({"components": scores.shape[1]}, statistic=statistic, p_value=p)
+
+
+def _test_vertices(study, x, Z, of, options):
+    """A test at every vertex, and the effect of the first column of x on the displacement."""
+    registration, d, _ = displacements_of(study)
+    if of not in ("vector", "normal"):
+        raise ValueError(f"of must be 'vector' or 'normal', found {of!r}")
+    fields = d  # (s, n, 3), or (s, n, 1) along the normals
+    if of == "normal":
+        fields = normal_displacement(d, vertex_normals(*as_arrays(registration)))[..., None]
+    share, p, p_max = vertex_test(fields, x, covariates=Z, **options)
+    columns = np.column_stack([np.ones(len(d)), x] if Z is None else [np.ones(len(d)), x, Z])
+    columns[:, 1:] -= columns[:, 1:].mean(0)  # so that the intercept is where x is at its mean
+    B = np.linalg.pinv(columns) @ d.reshape(len(d), -1).astype(float)  # (columns, 3 n)
+    effect_map = dataset(
+        explained_share=share,
+        p_vertex=p,
+        p_family_wise=p_max,
+        p_false_discovery=stats.false_discovery_control(p),
+        effect=B[1].reshape(-1, 3),
+        intercept=B[0].reshape(-1, 3),
+    )
+    return in_unit(effect_map, unit_of(registration["displacement"]))
+
+
+def _squared_cohen_f(effect_map):
+    """Cohen's f^2 at every vertex ``(n,)``: what is explained over what is not."""
+    share = effect_map["explained_share"].values
+    return share / np.maximum(1 - share, 1e-12)

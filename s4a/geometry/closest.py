@@ -50,6 +50,16 @@ def closest_point(P: np.ndarray, X: np.ndarray, T: np.ndarray) -> tuple[np.ndarr
     return triangle, closest_point_on_triangles(P, X[a], X[b], X[c])
 
 
+def distance_to_surface(P: np.ndarray, X: np.ndarray, T: np.ndarray) -> np.ndarray:
+    """Distances ``(p,)`` of points from a surface."""
+    squared = igl.point_mesh_squared_distance(
+        np.ascontiguousarray(P, np.float64),
+        np.ascontiguousarray(X, np.float64),
+        np.ascontiguousarray(T, np.int64),
+    )[0]
+    return np.sqrt(np.maximum(squared, 0))
+
+
 def closest_facing_point(
     P: np.ndarray, N: np.ndarray, X: np.ndarray, T: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:

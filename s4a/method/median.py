@@ -1,48 +1,52 @@
 """Shape differences and the median shape (3.5, 3.6, eq. 5)."""
 
 import numpy as np
+import xarray as xr
 
 from s4a.schema import dataset, require
 
+# Power of the latent eigenvalues by which each norm of eq. 5 weighs fine detail less.
 NORMS = {"h2": 1.0, "h1": 0.5, "frobenius": 0.0}
 
 
-def area_differences(Y):
-    """D_i = Y_i^T Y_i ``(n, m, m)``.
+def area_differences(Y: np.ndarray) -> np.ndarray:
+    """D_i = Y_i^T Y_i ``(n, m, m)``: how each shape's areas differ from the latent mean.
 
-    How each shape's areas differ from the latent mean (Huang et al. 2019).
+    After Huang et al. (2019); Y ``(n, k, m)`` are the consistent latent bases.
     """
     return np.einsum("nkl,nkm->nlm", Y, Y)
 
 
-def conformal_differences(Y, eigenvalues, latent_eigenvalue):
+def conformal_differences(
+    Y: np.ndarray, eigenvalues: np.ndarray, latent_eigenvalue: np.ndarray
+) -> np.ndarray:
     """(Lambda^0)^+ Y_i^T Lambda_i Y_i ``(n, m, m)``: how Dirichlet energies differ.
 
     Constant modes are zero.
     """
     D = np.einsum("nkl,nk,nkm->nlm", Y, eigenvalues[:, : Y.shape[1]], Y)
-    null = constant_modes(latent_eigenvalue)
-    D[:, null], D[:, :, null] = 0, 0
+    constant = constant_modes(latent_eigenvalue)
+    D[:, constant] = 0
+    D[:, :, constant] = 0
     return inverse(latent_eigenvalue)[None, :, None] * D
 
 
-def inverse(latent_eigenvalue, power=1.0):
-    """Diagonal of ((Lambda^0)^+)^power; constant modes map to 0."""
-    null = constant_modes(latent_eigenvalue)
-    return np.where(null, 0.0, np.where(null, 1.0, latent_eigenvalue) ** -power)
+def inverse(latent_eigenvalue: np.ndarray, power: float = 1.0) -> np.ndarray:
+    """Diagonal ``(m,)`` of ((Lambda^0)^+)^power; constant modes map to 0."""
+    constant = constant_modes(latent_eigenvalue)
+    return np.where(constant, 0.0, np.where(constant, 1.0, latent_eigenvalue) ** -power)
 
 
-def constant_modes(latent_eigenvalue):
-    """Which latent functions are constant on every component, ``(m,)``.
-
-    One for each component that was kept.
-    """
-    null = latent_eigenvalue < 1e-6 * np.max(latent_eigenvalue, initial=0.0)
-    null[:1] = True
-    return null
+def constant_modes(latent_eigenvalue: np.ndarray) -> np.ndarray:
+    """Which latent functions are constant on every component, ``(m,)``: one for each component."""
+    constant = latent_eigenvalue < 1e-6 * np.max(latent_eigenvalue, initial=0.0)
+    constant[:1] = True
+    return constant
 
 
-def distance_to_identity(D, latent_eigenvalue, norm="h2"):
+def distance_to_identity(
+    D: np.ndarray, latent_eigenvalue: np.ndarray, norm: str = "h2"
+) -> np.ndarray:
     """E(M_i) = |D_i - I| of eq. 5 ``(n,)``.
 
     The paper writes the norm of H_0^2 and does not define it.  ``"h2"`` is our reading: the
@@ -58,10 +62,10 @@ def distance_to_identity(D, latent_eigenvalue, norm="h2"):
     return np.linalg.norm(((D - np.eye(m)) * w)[:, varying][:, :, varying], axis=(1, 2))
 
 
-def difference_pca(D):
-    """PCA of vectorised operators (3.6).
+def difference_pca(D: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """PCA of vectorised operators ``(n, m, m)`` (3.6).
 
-    Scores ``(n, c)`` in their own units and shares of variance ``(c,)``.
+    Scores ``(n, n - 1)`` in the unit of the operators and shares of variance ``(n - 1,)``.
     """
     X = D.reshape(len(D), -1)
     U, S, _ = np.linalg.svd(X - X.mean(0), full_matrices=False)
@@ -71,10 +75,8 @@ def difference_pca(D):
     return U * S, S**2 / (total if total > 0 else 1.0)
 
 
-def median_shape(latent, eigenvalues, *, norm="h2"):
-    """Shape differences of a collection, the distance of every shape to the limit shape.
-
-    And the median (eq. 5).
+def median_shape(latent: xr.Dataset, eigenvalues: np.ndarray, *, norm: str = "h2") -> xr.Dataset:
+    """Shape differences of a collection, its distances to the limit shape, and the median (eq. 5).
 
     Parameters
     ----------
@@ -96,11 +98,9 @@ def median_shape(latent, eigenvalues, *, norm="h2"):
     area = area_differences(Y)
     conformal = conformal_differences(Y, np.asarray(eigenvalues, float), latent_eigenvalue)
     distance = distance_to_identity(area, latent_eigenvalue, norm)
-    (area_score, area_ratio), (conformal_score, conformal_ratio) = (
-        difference_pca(area),
-        difference_pca(conformal),
-    )
-    found = dataset(
+    area_score, area_ratio = difference_pca(area)
+    conformal_score, conformal_ratio = difference_pca(conformal)
+    differences = dataset(
         area_difference=area,
         conformal_difference=conformal,
         distance_to_median=distance,
@@ -110,13 +110,11 @@ def median_shape(latent, eigenvalues, *, norm="h2"):
         conformal_variance_ratio=conformal_ratio,
     )
     median = str(latent["shape"].values[int(np.argmin(distance))])
-    return latent.assign(found.data_vars).assign_attrs(latent.attrs, median=median, norm=norm)
+    return latent.assign(differences.data_vars).assign_attrs(latent.attrs, median=median, norm=norm)
 
 
-def near_ties(distance, *, within=0.05):
-    """Indices of the shapes whose distance is at most the share `within` above the smallest.
-
-    Nearest first.
+def near_ties(distance: np.ndarray, *, within: float = 0.05) -> list[int]:
+    """Indices of the shapes at most the share `within` farther than the nearest, nearest first.
 
     More than one says that the median is a choice among near equals.
 

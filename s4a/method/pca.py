@@ -1,7 +1,10 @@
-"""Principal modes of the displacements (6.1).
+"""Principal modes of the displacements (6.1, Fig. 4 and 5): PCA, and new shapes from scores.
 
-PCA by the small Gram matrix, synthesis of new shapes.
+There are far fewer shapes s than vertices n, so that PCA works on the Gram matrix ``(s, s)`` of the
+displacements and costs next to nothing on large meshes.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -11,50 +14,93 @@ from s4a.method.deform import normal_displacement
 from s4a.schema import dataset, in_unit, require, unit_of
 
 
-def gram_pca(d, area):
-    """PCA of vector fields under the inner product of the template's areas.
+class PrincipalModes(NamedTuple):
+    """What :func:`gram_pca` finds in s fields: c modes, c at most s - 1.
+
+    ``mean (n, d)``; ``deformation (c, n, d)`` of one standard deviation along each mode;
+    ``standard_deviation (c,)``, its area-weighted root mean square; ``score (s, c)``, uncorrelated
+    and of variance 1 (divisor s - 1); ``ratio (c,)``, shares of the variance, descending.
+    """
+
+    mean: np.ndarray
+    deformation: np.ndarray
+    standard_deviation: np.ndarray
+    score: np.ndarray
+    ratio: np.ndarray
+
+
+def gram(fields: np.ndarray, area: np.ndarray) -> np.ndarray:
+    """Inner products of fields ``(s, n, d)`` under the areas scaled to sum 1, ``(s, s)``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.method.pca import gram
+    >>> gram(np.array([[[1.0, 0, 0], [3, 0, 0]]]), np.array([1.0, 1.0])).round(6).tolist()
+    [[5.0]]
+    """
+    rows = np.asarray(fields, np.float64) * np.sqrt(area / area.sum())[:, None]
+    rows = rows.reshape(len(rows), -1)  # (s, n d)
+    return rows @ rows.T
+
+
+def center_gram(K: np.ndarray) -> np.ndarray:
+    """Gram matrix ``(s, s)`` of the fields less their mean, from that of the fields."""
+    return K - K.mean(0) - K.mean(1)[:, None] + K.mean()
+
+
+def principal_components(K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Variances ``(c,)`` and unit eigenvectors ``(s, c)`` of a centred Gram matrix, largest first.
+
+    The divisor of the variances is s - 1; components without variance are left out.
+    """
+    eigenvalue, V = np.linalg.eigh(K)  # ascending
+    keep = eigenvalue > 1e-12 * max(eigenvalue[-1], np.finfo(float).tiny)
+    keep[0] = False  # s fields less their mean span s - 1 dimensions
+    return eigenvalue[keep][::-1] / (len(K) - 1), V[:, keep][:, ::-1]
+
+
+def gram_pca(fields: np.ndarray, area: np.ndarray) -> PrincipalModes:
+    """PCA of fields under the inner product of the vertex areas.
 
     Parameters
     ----------
-    d : float ndarray (s, n, 3)
+    fields : float ndarray (s, n, d)
         One displacement field per shape.
     area : float ndarray (n,)
         Template vertex areas; their scale does not matter.
 
     Returns
     -------
-    mean : (n, 3)
-    deformation : (c, n, 3), one standard deviation along each component
-    standard_deviation : (c,), its area-weighted root mean square
-    score : (s, c), uncorrelated, of variance 1 (divisor s - 1); signs make the third moment positive
-    ratio : (c,), shares of the variance, descending
+    PrincipalModes
+        Their signs make the third moment of the scores positive.
     """
-    s = len(d)
-    w = (area / area.sum())[:, None]
-    mean = d.mean(axis=0)
-    X = (d - mean).astype(np.float64) * np.sqrt(w)
-    eigenvalue, V = np.linalg.eigh(np.einsum("inx,jnx->ij", X, X, optimize=True))
+    s = len(fields)
+    mean = fields.mean(axis=0)
+    eigenvalue, V = np.linalg.eigh(gram(fields - mean, area))
     eigenvalue, V = np.maximum(eigenvalue[::-1], 0), V[:, ::-1]
     keep = eigenvalue > 1e-12 * max(eigenvalue[0], np.finfo(float).tiny)
     keep &= np.arange(s) < s - 1
     eigenvalue, V = eigenvalue[keep], V[:, keep]
-    V = V * np.where((V**3).sum(0) < 0, -1.0, 1.0)
-    deformation = np.einsum("ic,inx->cnx", V, d - mean, optimize=True) / np.sqrt(s - 1)
-    total = eigenvalue.sum()
-    ratio = eigenvalue / total if total > 0 else eigenvalue
-    return mean, deformation, np.sqrt(eigenvalue / (s - 1)), V * np.sqrt(s - 1), ratio
+    V = V * np.where((V**3).sum(0) < 0, -1.0, 1.0)  # (s, c)
+    deformation = np.einsum("sc,snd->cnd", V, fields - mean, optimize=True) / np.sqrt(s - 1)
+    ratio = eigenvalue / eigenvalue.sum()
+    deviation = np.sqrt(eigenvalue / (s - 1))
+    return PrincipalModes(mean, deformation, deviation, V * np.sqrt(s - 1), ratio)
 
 
-def low_vertices(coarse):
+def low_vertices(coarse: xr.Dataset) -> np.ndarray:
     """For every coarse vertex the original vertex in which U weighs it most ``(n_coarse,)``."""
-    vertex, weight = coarse["coarse_vertex"].values, coarse["coarse_weight"].values
-    order = np.argsort(weight.ravel(), kind="stable")
-    found = np.zeros(coarse.sizes["vertex"], np.int64)
-    found[vertex.ravel()[order]] = order // vertex.shape[1]
-    return found
+    vertex = coarse["coarse_vertex"].values  # (n, 3)
+    order = np.argsort(coarse["coarse_weight"].values.ravel(), kind="stable")
+    heaviest = np.zeros(coarse.sizes["vertex"], np.int64)
+    heaviest[vertex.ravel()[order]] = order // vertex.shape[1]  # the last one written stays
+    return heaviest
 
 
-def pca(registration, area, *, coarse=None):
+def pca(
+    registration: xr.Dataset, area: np.ndarray, *, coarse: xr.Dataset | None = None
+) -> xr.Dataset:
     """Principal modes of a registered collection (6.1, Fig. 4 and 5).
 
     Parameters
@@ -86,33 +132,29 @@ def pca(registration, area, *, coarse=None):
     d = registration["displacement"].transpose("shape", "vertex", "xyz").values
     if len(d) < 3:
         raise ValueError(f"PCA needs at least 3 shapes, found {len(d)}")
-    mean, deformation, deviation, score, ratio = gram_pca(d, area)
-    size = (
-        np.linalg.norm(registration["position"].values.std(axis=0))
-        if "position" in registration
-        else 1.0
-    )
-    if not len(ratio) or deviation[0] < 1e-9 * size:
+    modes = gram_pca(d, area)
+    size = 1.0
+    if "position" in registration:
+        size = float(np.linalg.norm(registration["position"].values.std(axis=0)))
+    if not len(modes.ratio) or modes.standard_deviation[0] < 1e-9 * size:
         raise ValueError("PCA needs shapes that differ; all displacements are equal")
-    found = dataset(
-        mean_displacement=mean.astype(np.float32),
-        deformation=deformation.astype(np.float32),
-        standard_deviation=deviation,
-        score=score,
-        explained_variance_ratio=ratio,
+    result = dataset(
+        mean_displacement=modes.mean.astype(np.float32),
+        deformation=modes.deformation.astype(np.float32),
+        standard_deviation=modes.standard_deviation,
+        score=modes.score,
+        explained_variance_ratio=modes.ratio,
     )
     if coarse is not None and "displacement_low" in registration:
         low = registration["displacement_low"].transpose("shape", "low_vertex", "xyz").values
-        low = gram_pca(low, coarse["vertex_area"].values)[4]
-        padded = np.zeros(len(ratio))
-        padded[: len(low)] = low[: len(ratio)]
-        found = found.merge(dataset(explained_variance_ratio_low=padded))
-    return in_unit(found, unit_of(registration["displacement"])).assign_coords(
-        shape=registration["shape"]
-    )
+        ratio_low = gram_pca(low, coarse["vertex_area"].values).ratio
+        ratio_low = np.pad(ratio_low, (0, len(d)))[: len(modes.ratio)]  # as many as at full
+        result = result.merge(dataset(explained_variance_ratio_low=ratio_low))
+    result = in_unit(result, unit_of(registration["displacement"]))
+    return result.assign_coords(shape=registration["shape"])
 
 
-def synthesize(study, scores):
+def synthesize(study: xr.DataTree, scores: np.ndarray) -> xr.Dataset:
     """The shape with given scores: template + mean displacement + sum of score times deformation.
 
     Parameters
@@ -137,6 +179,9 @@ def synthesize(study, scores):
     --------
     With the ``study`` of six small brains; scores of 0 give the mean shape:
 
+    >>> import s4a
+    >>> from s4a.method.pca import synthesize
+    >>> study = s4a.synthetic.example_study()
     >>> mean, larger = synthesize(study, [0.0]), synthesize(study, [2.0])
     >>> moved = (larger["position"] - mean["position"]) / 2
     >>> bool(abs(moved - study["pca"]["deformation"][0].values).max() < 1e-4)
@@ -148,48 +193,52 @@ def synthesize(study, scores):
         raise ValueError(
             f"a study with modes is needed; this one has none: {reason or 'it is not finished'}"
         )
-    pca, template = study["pca"].to_dataset(), study["registration"].to_dataset()
-    require(pca, "deformation", "mean_displacement", what="pca dataset")
-    if scores.ndim != 1 or len(scores) > pca.sizes["component"]:
+    modes = study["pca"].to_dataset()
+    require(modes, "deformation", "mean_displacement", what="pca dataset")
+    if scores.ndim != 1 or len(scores) > modes.sizes["component"]:
         raise ValueError(
-            f"scores need at most {pca.sizes['component']} numbers, found shape {scores.shape}"
+            f"scores need at most {modes.sizes['component']} numbers, found shape {scores.shape}"
         )
-    moved = np.tensordot(scores, pca["deformation"].values[: len(scores)], axes=1)
-    position = template["position"].values + pca["mean_displacement"].values + moved
+    template = study["registration"].to_dataset()
+    mean = template["position"].values + modes["mean_displacement"].values
+    position = apply_scores(mean, modes["deformation"].values, scores)
     mesh = xr.merge([dataset(position=position), template[["corner_vertex"]]])
     return in_unit(mesh, unit_of(template["position"]))
 
 
-def deformed(mean, deformation, scores):
+def apply_scores(mean: np.ndarray, deformation: np.ndarray, scores: np.ndarray) -> np.ndarray:
     """The mean shape ``(n, 3)`` moved by the scores ``(c,)`` along the deformations ``(c, n, 3)``.
 
     Examples
     --------
-    >>> deformed(np.zeros((1, 3)), np.array([[[1.0, 0, 0]], [[0, 2.0, 0]]]), [0.5, -1]).tolist()
+    >>> import numpy as np
+    >>> from s4a.method.pca import apply_scores
+    >>> deformation = np.array([[[1.0, 0, 0]], [[0, 2.0, 0]]])
+    >>> apply_scores(np.zeros((1, 3)), deformation, [0.5, -1]).tolist()
     [[0.5, -2.0, 0.0]]
     """
     scores = np.asarray(scores, float)
     return mean + np.tensordot(scores, deformation[: len(scores)], axes=1)
 
 
-def mahalanobis(scores):
-    """Mahalanobis distance of a shape from the mean.
-
-    The length of its scores, which have unit variance.
+def mahalanobis(scores: np.ndarray) -> float:
+    """Mahalanobis distance of a shape from the mean: the length of its scores, of unit variance.
 
     Examples
     --------
+    >>> from s4a.method.pca import mahalanobis
     >>> mahalanobis([3, -4])
     5.0
     """
     return float(np.linalg.norm(scores))
 
 
-def plausible_scores(n, *, seed=None, limit=3.0):
+def plausible_scores(n: int, *, seed: int | None = None, limit: float = 3.0) -> np.ndarray:
     """Scores ``(n,)`` of a random shape: normal, those beyond the limit drawn again.
 
     Examples
     --------
+    >>> from s4a.method.pca import plausible_scores
     >>> bool((abs(plausible_scores(1000, seed=0)) <= 3).all())
     True
     """
@@ -200,17 +249,20 @@ def plausible_scores(n, *, seed=None, limit=3.0):
     return scores
 
 
-def color_limits(mean, triangles, deformation, *, sigma=3, n_modes=3):
+def color_limits(
+    mean: np.ndarray,
+    triangles: np.ndarray,
+    deformation: np.ndarray,
+    *,
+    sigma: float = 3,
+    n_modes: int = 3,
+) -> tuple[float, float]:
     """Displacements of the full colours: along the normal, and in length.
 
     The 95 % quantile over the vertices and the first modes at `sigma` standard deviations: one
     scale for all modes, on which a few outlying vertices do not count.
-
-    Returns
-    -------
-    (float, float)
     """
-    steps = deformation[:n_modes]
+    steps = deformation[:n_modes]  # (c, n, 3)
     along = np.quantile(np.abs(normal_displacement(steps, vertex_normals(mean, triangles))), 0.95)
     length = np.quantile(np.linalg.norm(steps, axis=2), 0.95)
     return float(sigma * along) or 1.0, float(sigma * length) or 1.0

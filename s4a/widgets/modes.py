@@ -9,7 +9,7 @@ import traitlets
 from s4a.geometry.mesh import vertex_normals
 from s4a.input.files import write_mesh
 from s4a.method.deform import normal_displacement
-from s4a.method.pca import color_limits, deformed, mahalanobis, plausible_scores
+from s4a.method.pca import apply_scores, color_limits, mahalanobis, plausible_scores
 from s4a.show.live import mode_arrays, study_state, template_coarse
 from s4a.widgets.meshes import camera_group, unit_of
 from s4a.widgets.modes_view import modes_view
@@ -95,7 +95,7 @@ class Modes(Panel):
     def vertices(self, resolution="full"):
         """Vertices ``(n, 3)`` of the shape as the sliders stand, in the unit of the input."""
         mean, _, deformation = self.arrays(resolution)
-        return deformed(mean, deformation, self.scores)
+        return apply_scores(mean, deformation, self.scores)
 
     @property
     def distance(self):

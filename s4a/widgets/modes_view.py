@@ -8,7 +8,7 @@ import numpy as np
 import traitlets
 
 from s4a.geometry.mesh import vertex_normals
-from s4a.method.pca import deformed
+from s4a.method.pca import apply_scores
 from s4a.show.draw import signed_colors
 from s4a.show.live import MODES, STYLE, bars, look_state, mesh_state
 from s4a.widgets.browser import anywidget
@@ -80,7 +80,7 @@ if anywidget is not None:
 def painted(view):
     """Surface and signed colours of the scores of a view."""
     mean, triangles, deformation = view.arrays
-    moved = deformed(mean, deformation, view.scores)
+    moved = apply_scores(mean, deformation, view.scores)
     if view.colors != "normal":
         return (moved, triangles), None
     along = ((moved - mean) * vertex_normals(mean, triangles)).sum(1)
