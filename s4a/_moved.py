@@ -64,7 +64,7 @@ class OldNames(MetaPathFinder, Loader):
         module.__spec__ = self.own_spec  # the import system has put that of the old name here
 
 
-def install():
+def install() -> None:
     """Let the old names be found, after all that really are modules."""
     if not any(isinstance(finder, OldNames) for finder in sys.meta_path):
         sys.meta_path.append(OldNames())

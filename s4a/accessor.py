@@ -4,11 +4,15 @@ They are imported when they are first used.
 """
 
 from importlib import import_module
+from typing import TYPE_CHECKING
 
 import xarray as xr
 
+if TYPE_CHECKING:
+    from s4a.widgets.explore import Explore
 
-def explore(study, *, view="corner", up="z"):
+
+def explore(study: xr.DataTree, *, view: str = "corner", up: str = "z") -> "Explore":
     """Tabs over a finished or running study, for notebooks.
 
     Modes, network, maps, median, correspondence, spectrum.
@@ -48,9 +52,9 @@ def explore(study, *, view="corner", up="z"):
 class StudyAccessor:
     """``study.s4a``: what can be done with a study."""
 
-    def __init__(self, study):
+    def __init__(self, study: xr.DataTree):
         self._study = study
 
-    def explore(self, *, view="corner", up="z"):
+    def explore(self, *, view: str = "corner", up: str = "z") -> "Explore":
         """See :func:`s4a.explore`."""
         return explore(self._study, view=view, up=up)

@@ -3,10 +3,12 @@
 A cell leaves ``answer = ...`` open, and what the reader puts there is checked.
 """
 
+from typing import Any
+
 import numpy as np
 
 
-def check(answer, expected, hint="", *, within=0.01):
+def check(answer: Any, expected: Any, hint: str = "", *, within: float = 0.01) -> str:
     """Check the answer to an exercise.
 
     Parameters

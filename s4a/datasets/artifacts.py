@@ -7,7 +7,9 @@ import numpy as np
 from scipy.spatial import ConvexHull, cKDTree
 
 
-def soil(X, T, u, rng):
+def soil(
+    X: np.ndarray, T: np.ndarray, u: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A clean mesh made as dirty as a file from a scanner.
 
     4 loose components of 12 to 60 vertices; 3 holes of 10 to 60 triangles; one bow-tie vertex for

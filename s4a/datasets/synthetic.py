@@ -15,6 +15,7 @@ from pathlib import Path
 import fpsample
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, ndtri
@@ -97,7 +98,7 @@ def _fold_noise(p, wavelength=30.0, waves=48):
     return total * 2 / np.sqrt(waves)
 
 
-def reference_brain(u):
+def reference_brain(u: ArrayLike) -> np.ndarray:
     """Positions (p, 3) in mm of points u (p, 3) of the unit sphere on the reference brain."""
     u = np.asarray(u, float)
     x, y, z = u.T
@@ -202,7 +203,7 @@ def _planted_scores(n, n_modes, rng):
             return score
 
 
-def plant(n=12, seed=0, *, n_modes=3):
+def plant(n: int = 12, seed: int = 0, *, n_modes: int = 3) -> xr.Dataset:
     """The planted parameters of a population.
 
     Everything that :func:`position` needs, without any mesh.
@@ -279,7 +280,7 @@ def plant(n=12, seed=0, *, n_modes=3):
     return truth.assign_coords(shape=[f"brain_{i + 1:0{max(2, len(str(n)))}d}" for i in range(n)])
 
 
-def position(truth, shape, reference_point):
+def position(truth: xr.Dataset | xr.DataTree, shape: str, reference_point: ArrayLike) -> np.ndarray:
     """Exact positions of reference points on a shape.
 
     Parameters
@@ -373,7 +374,7 @@ def _mesh(truth, shape, n_vertices, rng):
     return u, _delaunay(u)
 
 
-def labels(reference_point):
+def labels(reference_point: ArrayLike) -> np.ndarray:
     """Labels of reference points, the index in :data:`LABELS` of the nearest region seed.
 
     0 where NaN.
@@ -405,7 +406,9 @@ def _annotated(mesh, truth, shape, reference_point):
     return in_unit(mesh.merge(extra).assign_attrs(unit="mm", coordinate_system="RAS"), "mm")
 
 
-def raw_brain(truth, shape, n_vertices=40_000, seed=0):
+def raw_brain(
+    truth: xr.Dataset | xr.DataTree, shape: str, n_vertices: int = 40_000, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A brain with the artefacts of :func:`s4a.datasets.artifacts.soil`, as it could lie in a file.
 
     Parameters
@@ -450,7 +453,9 @@ def _cleaned_reference(mesh, raw, reference_point):
     return u
 
 
-def brains(n=12, n_vertices=40_000, seed=0, *, dirty=False, n_modes=3):
+def brains(
+    n: int = 12, n_vertices: int = 40_000, seed: int = 0, *, dirty: bool = False, n_modes: int = 3
+) -> xr.DataTree:
     """A population of brains with planted modes and exact correspondences.
 
     Parameters
@@ -511,7 +516,7 @@ def brains(n=12, n_vertices=40_000, seed=0, *, dirty=False, n_modes=3):
     return xr.DataTree.from_dict(nodes)
 
 
-def write(tree, folder):
+def write(tree: xr.DataTree, folder: Path | str) -> list[Path]:
     """Write a collection as files: ``<shape>.ply`` with labels, and ``truth.nc``.
 
     Parameters
@@ -542,9 +547,10 @@ def write(tree, folder):
     nodes, paths = {"/": tree["truth"].to_dataset()}, []
     for shape in tree["truth/shape"].values:
         mesh = tree[f"raw/{shape}" if "raw" in tree.children else f"original/{shape}"].to_dataset()
-        u = mesh if "reference_point" in mesh else tree[f"truth/{shape}"].to_dataset(inherit=False)
+        node = tree["truth"].children[shape]
+        reference = mesh if "reference_point" in mesh else node.to_dataset(inherit=False)
         nodes[f"/{shape}"] = xr.merge(
-            [u[["reference_point"]], mesh[["label", "landmark_position"]]]
+            [reference[["reference_point"]], mesh[["label", "landmark_position"]]]
         )
         paths.append(folder / f"{shape}.ply")
         write_mesh(paths[-1], *as_arrays(mesh), label=mesh["label"].values)
@@ -570,7 +576,7 @@ def example_study() -> xr.DataTree:
     return analyse(brains(6, 200), n_coarse=100, k=10, k_init=6, n_pairs=6)
 
 
-def sphere(n_vertices=2562, radius=1.0):
+def sphere(n_vertices: int = 2562, radius: float = 1.0) -> xr.Dataset:
     """A sphere with vertices along a Fibonacci spiral, triangles nearly equilateral.
 
     Examples
@@ -582,7 +588,9 @@ def sphere(n_vertices=2562, radius=1.0):
     return ellipsoid(n_vertices, (radius,) * 3)
 
 
-def ellipsoid(n_vertices=2562, semi_axes=(3.0, 2.0, 1.0)):
+def ellipsoid(
+    n_vertices: int = 2562, semi_axes: tuple[float, float, float] = (3.0, 2.0, 1.0)
+) -> xr.Dataset:
     """An ellipsoid, the affine image of :func:`sphere`.
 
     Examples
@@ -595,7 +603,9 @@ def ellipsoid(n_vertices=2562, semi_axes=(3.0, 2.0, 1.0)):
     return as_dataset(u * np.asarray(semi_axes), T)
 
 
-def torus(n_around=72, n_across=36, radius=3.0, thickness=1.0):
+def torus(
+    n_around: int = 72, n_across: int = 36, radius: float = 3.0, thickness: float = 1.0
+) -> xr.Dataset:
     """A torus around the z axis: a grid of `n_around` by `n_across` vertices.
 
     Area 4 pi^2 radius thickness.

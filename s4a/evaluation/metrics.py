@@ -6,7 +6,11 @@ The plain functions take arrays in any one unit; :func:`evaluate` scales the sur
 so that its lengths are shares of sqrt(area).
 """
 
+from typing import Any
+
 import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from s4a.geometry.closest import closest_point, interpolate
@@ -24,7 +28,7 @@ from s4a.schema import dataset, require
 THRESHOLDS = np.linspace(0, 0.25, 101)  # of the error curve, as in Kim et al. (2011), Fig. 6
 
 
-def gaps(X, Y):
+def gaps(X: np.ndarray, Y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distances of every point of X to the nearest of Y ``(n,)``.
 
     And of every point of Y to the nearest of X.
@@ -32,7 +36,7 @@ def gaps(X, Y):
     return cKDTree(Y).query(X)[0], cKDTree(X).query(Y)[0]
 
 
-def chamfer(X, Y):
+def chamfer(X: np.ndarray, Y: np.ndarray) -> float:
     """Chamfer distance of two sets of points (eq. 9).
 
     Mean distance to the nearest point, both ways, summed.
@@ -62,7 +66,7 @@ def chamfer(X, Y):
     return float(sum(gap.mean() for gap in gaps(X, Y)))
 
 
-def hausdorff(X, Y, formula="standard"):
+def hausdorff(X: np.ndarray, Y: np.ndarray, formula: str = "standard") -> float:
     """Hausdorff distance of two sets of points (eq. 10): the largest distance to the nearest point.
 
     It sees the worst place only, and like :func:`chamfer` no permutation.
@@ -97,7 +101,7 @@ def hausdorff(X, Y, formula="standard"):
     return float(max(forth, back) if formula == "standard" else forth + back / len(Y))
 
 
-def dirichlet(f, E, w):
+def dirichlet(f: np.ndarray, E: np.ndarray, w: np.ndarray) -> float:
     """Dirichlet energy f^T A L f of functions on the vertices (eq. 11), summed over the functions.
 
     With L = A^-1 W it is f^T W f, the sum of w (f_i - f_j)^2 over the edges: the areas cancel, and
@@ -135,7 +139,9 @@ def dirichlet(f, E, w):
     return float(w @ (difference**2).sum(axis=1))
 
 
-def geodesic_error(X, T, found, true, *, limit=1.0):
+def geodesic_error(
+    X: np.ndarray, T: np.ndarray, found: np.ndarray, true: np.ndarray, *, limit: float = 1.0
+) -> np.ndarray:
     """Distances from true to found vertices along the edges, as shares of sqrt(area).
 
     Cut at `limit`.
@@ -171,7 +177,7 @@ def geodesic_error(X, T, found, true, *, limit=1.0):
     )
 
 
-def error_curve(error, thresholds=THRESHOLDS):
+def error_curve(error: np.ndarray, thresholds: ArrayLike = THRESHOLDS) -> np.ndarray:
     """Share of the errors that are no larger than each threshold, ``(t,)``.
 
     The cumulative curve of the protocol.
@@ -188,7 +194,7 @@ def error_curve(error, thresholds=THRESHOLDS):
     return np.searchsorted(np.sort(error), thresholds, side="right") / len(error)
 
 
-def coverage(match, area):
+def coverage(match: np.ndarray, area: np.ndarray) -> float:
     """Share of the source's area whose vertices are matched to by some vertex of the target.
 
     It sees a map that collapses.  It cannot see a wrong one: a random permutation scores 1.  With
@@ -209,7 +215,13 @@ def coverage(match, area):
     return float(area[np.unique(match)].sum() / area.sum())
 
 
-def cycle_error(X, T, *matches, vertices=None, limit=1.0):
+def cycle_error(
+    X: np.ndarray,
+    T: np.ndarray,
+    *matches: np.ndarray,
+    vertices: np.ndarray | None = None,
+    limit: float = 1.0,
+) -> np.ndarray:
     """How far vertices are from where they started after a chain of matches that leads back.
 
     See `geodesic_error`.
@@ -246,7 +258,15 @@ def cycle_error(X, T, *matches, vertices=None, limit=1.0):
     return geodesic_error(X, T, end, start, limit=limit)
 
 
-def bijectivity(X, T, match, reverse, *, vertices=None, limit=1.0):
+def bijectivity(
+    X: np.ndarray,
+    T: np.ndarray,
+    match: np.ndarray,
+    reverse: np.ndarray,
+    *,
+    vertices: np.ndarray | None = None,
+    limit: float = 1.0,
+) -> np.ndarray:
     """Round trip target -> source -> target, a :func:`cycle_error` of two matches.
 
     0 for a map and its inverse.
@@ -277,7 +297,7 @@ def bijectivity(X, T, match, reverse, *, vertices=None, limit=1.0):
     return cycle_error(X, T, match, reverse, vertices=vertices, limit=limit)
 
 
-def distortion(X, image, T):
+def distortion(X: np.ndarray, image: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Conformal and area distortion of every triangle that a map carries.
 
     With s1 >= s2 the singular values of the linear map of a triangle: log(s1 / s2), 0 where angles
@@ -327,7 +347,7 @@ def distortion(X, image, T):
     return np.where(flat, np.nan, conformal), np.where(flat, np.nan, area)
 
 
-def label_accuracy(found, true, area=None):
+def label_accuracy(found: ArrayLike, true: ArrayLike, area: np.ndarray | None = None) -> float:
     """Share of the vertices, or of the area, whose label is right.
 
     It sees gross errors only, as most vertices lie far from any border; :func:`dice` sees small
@@ -350,7 +370,7 @@ def label_accuracy(found, true, area=None):
     return float(np.average(np.asarray(found) == np.asarray(true), weights=area))
 
 
-def dice(found, true, area=None):
+def dice(found: ArrayLike, true: ArrayLike, area: np.ndarray | None = None) -> dict[Any, float]:
     """Dice's overlap 2 |A n B| / (|A| + |B|) of each label, by vertices or by area.
 
     It sees each region, small ones as strictly as large ones.  It cannot see errors inside a
@@ -388,7 +408,7 @@ def dice(found, true, area=None):
     }
 
 
-def landmark_error(found, true):
+def landmark_error(found: ArrayLike, true: ArrayLike) -> np.ndarray:
     """Straight distances of found to true landmarks ``(p,)``, in their unit.
 
     It sees the map at a few places that an expert knows, with the expert's own error in it, and
@@ -445,16 +465,16 @@ def _match_of(match, mesh, other, what):
 
 
 def evaluate(
-    source,
-    target,
-    match,
+    source: xr.Dataset,
+    target: xr.Dataset,
+    match: np.ndarray,
     *,
-    image=None,
-    reverse=None,
-    truth=None,
-    n_geodesic=1000,
-    thresholds=THRESHOLDS,
-):
+    image: np.ndarray | None = None,
+    reverse: np.ndarray | None = None,
+    truth: ArrayLike | None = None,
+    n_geodesic: int = 1000,
+    thresholds: ArrayLike = THRESHOLDS,
+) -> xr.Dataset:
     """Every metric of a correspondence that the inputs allow, as scalars of a Dataset.
 
     Lengths are shares of sqrt(area) of the surface on which they are measured.
