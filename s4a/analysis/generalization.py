@@ -6,35 +6,34 @@ import numpy as np
 import xarray as xr
 from joblib import Parallel, delayed
 from scipy import stats
-from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
 from s4a.analysis.model import describe_by_others, draw_points, surface_error
 from s4a.geometry.align import realign
-from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
-from s4a.method.fmap import nearest_rows
+from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.method.pca import gram
-from s4a.method.register import Scan, identity, registration
+from s4a.method.register import from_latent, identity
+from s4a.method.shape import Shape
 from s4a.schema import dataset, in_unit, unit_of
 from s4a.study import store
-from s4a.study.insert import insert, options_of
+from s4a.study.insert import insert
+from s4a.study.options import Options
 
 log = logging.getLogger(__name__)
 
 RECOMPUTED = "recomputed for every left-out shape, as a new one in the study of the others"
 
 
-def _onto(shape, template, bases, motion, k, o):
+def _onto(shape, template, bases, start, options):
     """One registration of a shape of a study to another template, its latent basis as it is."""
     with threadpool_limits(1):
-        F = [scan.low.Phi[:, :k] @ Y for scan, Y in zip((shape, template), bases, strict=True)]
-        R, t = realign(shape.low.X, shape.low.area, template.low.X, template.low.area, motion)
-        starts = {
-            "intrinsic": nearest_rows(F[1], F[0]),
-            "icp": cKDTree(shape.low.X @ R.T + t).query(template.low.X)[1],
-        }
-        return registration(shape, template, starts, F, k=k, refine=o["refine"], scale=o["scale"])
+        M = shape.low
+        N = template.low
+        motion = realign(M.X, M.area, N.X, N.area, start)
+        return from_latent(
+            shape, template, bases, motion, refine=options.refine, scale=options.scale
+        )
 
 
 def without(study, name, *, n_jobs=None):
@@ -55,25 +54,23 @@ def without(study, name, *, n_jobs=None):
         nodes |= {"registration": data.sel(shape=kept)}
         return xr.DataTree.from_dict(nodes)
     template = str(latent["distance_to_median"].sel(shape=kept).idxmin().item())
-    scans = {n: Scan(nodes[f"original/{n}"].load(), nodes[f"coarse/{n}"].load()) for n in kept}
+    shapes = {n: Shape(nodes[f"original/{n}"].load(), nodes[f"coarse/{n}"].load()) for n in kept}
     bases = {n: latent["latent_basis"].sel(shape=n).values for n in kept}
     turn = {n: data["rotation"].sel(shape=n).values for n in kept}
-    o, k = options_of(study), latent.sizes["mode"]
+    options = Options.from_report(study)
     others = [n for n in kept if n != template]
     found = Parallel(n_jobs=n_jobs)(
         delayed(_onto)(
-            scans[n],
-            scans[template],
+            shapes[n],
+            shapes[template],
             (bases[n], bases[template]),
             (turn[template].T @ turn[n], np.zeros(3)),
-            k,
-            o,
+            options,
         )
         for n in others
     )
-    files = dict(zip(others, found, strict=True)) | {template: identity(scans[template])}
-    X, T = as_arrays(scans[template].original)
-    mesh = as_dataset(X, T, {"template": template}, vertex_area=vertex_areas(X, T))
+    files = dict(zip(others, found, strict=True)) | {template: identity(shapes[template])}
+    mesh = store.template_mesh(shapes[template].original, template)
     return xr.DataTree.from_dict(nodes | store.stack_registration(mesh, files, kept))
 
 

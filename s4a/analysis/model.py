@@ -16,7 +16,7 @@ from s4a.geometry.closest import distance_to_surface
 from s4a.geometry.mesh import as_arrays
 from s4a.method.deform import smoother
 from s4a.method.pca import center_gram, gram, principal_components, synthesize
-from s4a.method.register import Scan
+from s4a.method.shape import Shape
 from s4a.schema import dataset, in_unit, unit_of
 
 KEPT = "kept from the whole collection: optimistic"
@@ -338,8 +338,8 @@ def _coefficients(study, d, area):
     template = study["registration"].attrs["template"]
     if "coarse" not in study or template not in study["coarse"].children:
         return (d * np.sqrt(area)[:, None]).reshape(len(d), -1).astype(float)
-    scan = Scan(study["original"][template].to_dataset(), study["coarse"][template].to_dataset())
-    B = scan.U @ scan.low.Phi  # (n, k)
+    shape = Shape(study["original"][template].to_dataset(), study["coarse"][template].to_dataset())
+    B = shape.U @ shape.low.Phi  # (n, k)
     B = B @ np.linalg.inv(np.linalg.cholesky(B.T @ (area[:, None] * B))).T
     return np.stack([smoother(B, area)(field) for field in d.astype(float)]).reshape(len(d), -1)
 

@@ -14,12 +14,13 @@ from s4a.analysis.landmarks import FARTHEST_LANDMARK, NAMED, locate, traced
 from s4a.analysis.link import blended, elect, link, point_along
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
-from s4a.method.register import Scan, identity
+from s4a.method.register import identity
 from s4a.method.remesh import coarsen
+from s4a.method.shape import Shape
 from s4a.method.spectral import spectrum
 from s4a.schema import dataset, in_unit, require
 from s4a.study import store
-from s4a.study.pair import match_scans
+from s4a.study.pair import match_shapes
 
 
 def pair_study(found, source, target):
@@ -44,7 +45,7 @@ def pair_study(found, source, target):
 def _tree(name, template, shapes, forth, back):
     """A registered study; `back` holds the registrations of the template to each shape as the template."""
     meshes = {name: template, **shapes}
-    files = {name: identity(Scan(template, None)), **forth}
+    files = {name: identity(Shape(template)), **forth}
     mesh = as_dataset(
         *as_arrays(template), {"template": name}, vertex_area=vertex_areas(*as_arrays(template))
     )
@@ -57,13 +58,13 @@ def _tree(name, template, shapes, forth, back):
 
 def _low(mesh, n_coarse, seed, k):
     with threadpool_limits(1):
-        return Scan(mesh, spectrum(coarsen(mesh, n_coarse=n_coarse, seed=seed), k=k))
+        return Shape(mesh, spectrum(coarsen(mesh, n_coarse=n_coarse, seed=seed), k=k))
 
 
 def _both(shape, template, options, both):
     with threadpool_limits(1):
-        forth = match_scans(shape, template, **options)[0]
-        return forth, match_scans(template, shape, **options)[0] if both else None
+        forth = match_shapes(shape, template, **options)[0]
+        return forth, match_shapes(template, shape, **options)[0] if both else None
 
 
 def register_pairs(
@@ -153,7 +154,7 @@ def _entrance(study, mesh):
     """Steps from an external mesh to the study's template, matched both ways."""
     template = study["registration"].attrs["template"]
     coarse = study["coarse"][template].to_dataset().load()
-    low = Scan(study["original"][template].to_dataset().load(), coarse)
+    low = Shape(study["original"][template].to_dataset().load(), coarse)
     k = coarse.sizes["mode"]
     outside = _low(mesh, 6000, 0, k)
     forth, back = _both(low, outside, {"k_init": min(20, k), "k": k}, True)

@@ -12,8 +12,9 @@ from threadpoolctl import threadpool_limits
 from s4a.evaluation.metrics import geodesic_error
 from s4a.geometry.align import align
 from s4a.method import fmap
-from s4a.method.network import first_map
-from s4a.method.register import Scan, intrinsic_match
+from s4a.method.first_map import map_after_motion, nearest_after_motion
+from s4a.method.register import match_functions
+from s4a.method.shape import Shape
 
 ICP, ZOOMOUT, MATCH, SURFACE = (
     "nearest neighbour after ICP",
@@ -28,28 +29,22 @@ def simple_matches(source, target, *, k_init=20):
 
     Parameters
     ----------
-    source, target : s4a.method.register.Scan
+    source, target : Shape
 
     Returns
     -------
     dict
         Method -> int ndarray (n_target,), vertices of the source.
     """
-    M, N = source.low, target.low
-    motion = R, t, _ = align(M.X, M.area, N.X, N.area)
-    near = cKDTree(source.dense.X @ R.T + t).query(target.dense.X)[1]
-    C = first_map(
-        (M.X, M.area, M.Phi, source.eigenvalue),
-        (N.X, N.area, N.Phi, target.eigenvalue),
-        motion[:2],
-        k_init=k_init,
-    )
-    k = min(M.Phi.shape[1], N.Phi.shape[1])
-    C, _ = fmap.zoomout(C, M.Phi, N.Phi, N.area, k)
-    return {
-        ICP: near,
-        ZOOMOUT: intrinsic_match(source, target, M.Phi[:, :k] @ C.T, N.Phi[:, :k])[0],
-    }
+    M = source.low
+    N = target.low
+    R, t, _ = align(M.X, M.area, N.X, N.area)
+    near = nearest_after_motion(source.full, target.full, (R, t))
+    C = map_after_motion(M, N, (R, t), k_init=k_init)
+    k = min(M.k, N.k)
+    C, _ = fmap.zoomout(M, N, C, k)
+    match, *_ = match_functions(source, target, M.Phi[:, :k] @ C.T, N.Phi[:, :k])
+    return {ICP: near, ZOOMOUT: match}
 
 
 def _errors(source, target, registered, image, n_geodesic):
@@ -108,14 +103,14 @@ def accuracy(study, image, *, n_geodesic=0, n_jobs=None):
     template = registration.attrs["template"]
     shapes = [s for s in registration["shape"].values.tolist() if s != template]
 
-    def scan(name):
-        return Scan(*(study[stage][name].to_dataset().load() for stage in ("original", "coarse")))
+    def shape(name):
+        return Shape(*(study[stage][name].to_dataset().load() for stage in ("original", "coarse")))
 
     keep = ["registered_match", "displacement", "rotation", "translation", "scale"]
-    target = scan(template)
+    target = shape(template)
     found = Parallel(n_jobs=n_jobs)(
         delayed(_errors)(
-            scan(s),
+            shape(s),
             target,
             registration[keep].sel(shape=s).load(),
             np.asarray(image(s, template)),

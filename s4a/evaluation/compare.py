@@ -1,13 +1,9 @@
-"""The methods of the paper's comparison side by side.
+"""The methods of the paper's comparison side by side: Table 1 and Fig. 3 (5.2), Table 2 (5.3).
 
-Table 1 and Fig. 3 (5.2), Table 2 (5.3), on one cleaned input.
-
-Times are CPU seconds of one core, so that a busy machine does not change them.
+All work on one cleaned input.  What the methods are is in :mod:`s4a.evaluation.methods`.
 """
 
 import time
-from dataclasses import dataclass, field
-from functools import cached_property, partial
 
 import numpy as np
 import xarray as xr
@@ -16,288 +12,25 @@ from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
 from s4a.evaluation import metrics
-from s4a.geometry.align import align, farthest_points, motion_between, realign
-from s4a.geometry.mesh import as_arrays, vertex_areas
+from s4a.evaluation.methods import BLOCKS, METHODS, Pair, Spaces
+from s4a.geometry.align import align, motion_between, realign
 from s4a.input.collection import read_shape, read_shapes
-from s4a.method import fmap, joint, latent, median, network
-from s4a.method.lift import SPARE, lift
-from s4a.method.nearest import nearest_in_cells
-from s4a.method.register import Scan, at_full_resolution, intrinsic_match, sharpened
-from s4a.method.remesh import coarsen, laplacian
-from s4a.method.scalable import Reduced, local_space, spectral_space
-from s4a.method.spectral import eigenpairs, spectrum
+from s4a.method import latent, median, network
+from s4a.method.first_map import map_after_motion
+from s4a.method.register import latent_functions, mapped_functions, match_functions
+from s4a.method.shape import Basis, Shape
 from s4a.schema import dataset, require, variable
 
 __all__ = ["COLLECTION_METHODS", "METHODS", "collection", "pair", "pairs"]
 
-METHODS = ("kNN", "ZO", "FMAP+ZO", "SCALABLE", "RE-MATCH", "RE-MATCH joint")
-BLOCKS = ("load and clean", "align", "sample", "basis", "map", "refine", "full resolution")
+COLLECTION_METHODS = ("SCALABLE", "RE-MATCH")
 COLLECTION_BLOCKS = (
     "load and clean",
     "basis and first maps",
     "consistent ZoomOut",
     "full resolution",
 )
-COLLECTION_METHODS, HOW = ("SCALABLE", "RE-MATCH"), ("standard", "ours")
-SPREAD = 3000  # points of each shape by which it is aligned, and around which full-resolution searches are grouped
-N_LANDMARKS = 10
-
-
-@dataclass
-class Shape:
-    """A clean mesh and what the methods make of it, each made once.
-
-    ``seconds`` says what it took, by its name.
-    """
-
-    mesh: object
-    n_coarse: int = 6000
-    k: int = 100
-    seed: int = 0
-    seconds: dict = field(default_factory=dict)
-
-    def timed(self, what, function, *arguments, **options):
-        begin = time.process_time()
-        found = function(*arguments, **options)
-        self.seconds[what] = time.process_time() - begin
-        return found
-
-    @cached_property
-    def frame(self):
-        X, T = as_arrays(self.mesh)
-        area = vertex_areas(X, T)
-        return area @ X / area.sum(), np.sqrt(area.sum())
-
-    @cached_property
-    def X(self):
-        """Vertices centred and for unit area ``(n, 3)``."""
-        center, size = self.frame
-        return (self.mesh["position"].values - center) / size
-
-    @cached_property
-    def spread(self):
-        """Spread points ``(p, 3)``, their areas of sum 1.
-
-        And the nearest of them for every vertex ``(n,)``.
-        """
-
-        def spread():
-            X, T = as_arrays(self.mesh)
-            some = farthest_points(self.X, SPREAD)
-            cell = cKDTree(self.X[some]).query(self.X)[1]
-            area = np.bincount(cell, vertex_areas(X, T), len(some))
-            return self.X[some], area / area.sum(), cell
-
-        return self.timed("spread", spread)
-
-    @cached_property
-    def dense(self):
-        """The mesh itself as a space of its first eigenfunctions, U the identity."""
-
-        def dense():
-            X, T = as_arrays(self.mesh)
-            E, w, area, _ = laplacian(X, T, vertex_areas(X, T))
-            eigenvalue, Phi = eigenpairs(E, w, area, self.k)
-            area = area / area.sum()
-            return Reduced(self.X, area, area, Phi, eigenvalue, None, self.spread[2])
-
-        return self.timed("dense basis", dense)
-
-    @cached_property
-    def local(self):
-        """The space of SCALABLE."""
-        parts = self.timed("local sample", local_space, self.mesh, self.n_coarse, self.seed)
-        return self.timed("local basis", spectral_space, *parts, self.k)
-
-    @cached_property
-    def low(self):
-        """The low-resolution mesh of RE-MATCH, with a few eigenfunctions more than are used."""
-        coarse = self.timed(
-            "lifted sample", coarsen, self.mesh, n_coarse=self.n_coarse, seed=self.seed
-        )
-        return self.timed("lifted basis", spectrum, coarse, k=self.k + SPARE)
-
-    @cached_property
-    def scan(self):
-        """Both resolutions of RE-MATCH."""
-        return Scan(self.mesh, self.low.isel(mode=slice(self.k)))
-
-    @cached_property
-    def coarse(self):
-        """The low-resolution mesh as a space of its own eigenfunctions."""
-        scan = self.scan
-        return Reduced(
-            scan.low.X,
-            scan.low.area,
-            scan.low.area,
-            scan.low.Phi,
-            scan.eigenvalue,
-            scan.U,
-            scan.cell,
-        )
-
-    @cached_property
-    def lifted(self):
-        """The space of RE-MATCH.
-
-        The vertices of the low-resolution mesh, and functions of :mod:`s4a.method.lift`.
-        """
-        scan = self.scan
-        spectral = self.seconds["lifted basis"]
-        space = self.timed("lifted basis", lifted_space, scan, self.low, self.k)
-        self.seconds["lifted basis"] += spectral
-        return space
-
-
-@dataclass(frozen=True)
-class Lifted(Reduced):
-    """The vertices of a low-resolution mesh, with functions ``B (n, k)`` that all vertices have.
-
-    Phi are rows of B.
-    """
-
-    B: np.ndarray
-
-
-def lifted_space(scan, low, k):
-    """The functions of :mod:`s4a.method.lift`.
-
-    Made orthonormal for the areas of the low-resolution mesh, as ZoomOut needs it.
-
-    Parameters
-    ----------
-    scan : Scan
-    low : Dataset
-        The low-resolution mesh with some eigenfunctions more than k.
-    """
-    X, T = as_arrays(scan.original)
-    eigenvalue, B = lift(X, T, vertex_areas(X, T), scan.U, low, k)
-    at = low["sample_vertex"].values.copy()
-    cell, some = np.unique(scan.cell, return_index=True)
-    at[cell] = np.where(at[cell] < 0, some, at[cell])  # centres of closed openings are no vertices
-    area, Phi = scan.low.area, B[at].astype(float)
-    turn = np.linalg.inv(np.linalg.cholesky(Phi.T @ (area[:, None] * Phi))).T
-    B = B @ turn.astype(B.dtype)
-    return Lifted(scan.low.X, area, area, B[at].astype(float), eigenvalue, scan.U, scan.cell, B)
-
-
-def at_all_vertices(space, C=None):
-    """The functions of a space, or Phi C^T, at all vertices of its mesh ``(n, k)``."""
-    Phi = space.B if isinstance(space, Lifted) else space.Phi
-    F = Phi if C is None else Phi[:, : C.shape[1]] @ C.T.astype(Phi.dtype)
-    return F if space.U is None or isinstance(space, Lifted) else space.U @ F.astype(np.float32)
-
-
-class Clock:
-    """CPU seconds by block."""
-
-    def __init__(self):
-        self.seconds = dict.fromkeys(BLOCKS, 0.0)
-
-    def __call__(self, block, function, *arguments, **options):
-        begin = time.process_time()
-        found = function(*arguments, **options)
-        self.seconds[block] += time.process_time() - begin
-        return found
-
-
-def default_landmarks(source, target, motion, n=N_LANDMARKS):
-    """Steps 2 and 3 of 4.1: spread vertices of the source.
-
-    And the vertices of the target nearest to them.
-    """
-    some = farthest_points(source.X, n)
-    return some, cKDTree(target.X).query(source.X[some] @ motion[0].T + motion[1])[1]
-
-
-def knn(source, target, motion):
-    """Nearest neighbours of the aligned shapes in space.
-
-    Of the target's vertices and of the source's.
-    """
-    moved = source.X @ motion[0].T + motion[1]
-    return cKDTree(moved).query(target.X)[1], cKDTree(target.X).query(moved)[1]
-
-
-def fit(M, N, landmarks, k):
-    """First map from landmarks and wave kernel signatures, in any space ``(k, k)``.
-
-    See `fit_descriptors`.
-    """
-    ends = [
-        (s, mark if s.U is None else s.cell[mark])
-        for s, mark in zip((M, N), landmarks, strict=True)
-    ]
-    meshes = [
-        dataset(
-            position=s.X,
-            corner_vertex=np.zeros(
-                (0, 3), np.int32
-            ),  # they are for orientation, which is not asked for
-            vertex_area=s.area,
-            eigenvalue=s.eigenvalue,
-            eigenfunction=s.Phi,
-        )
-        for s, _ in ends
-    ]
-    return fmap.fit_descriptors(*meshes, k=k, landmarks=[mark for _, mark in ends], oriented=0)[
-        "fmap"
-    ].values
-
-
-def spectral_match(way, source, target, motion, landmarks, clock, *, k_init, k, step):
-    """ZO, FMAP+ZO, SCALABLE and RE-MATCH: first map, ZoomOut and match at full resolution.
-
-    Returns
-    -------
-    match : int ndarray (n_target,)
-    reverse : callable
-        Gives the match the other way, which no method needs.
-    low : tuple
-        Match at low resolution and functions of both ends, for joint rounds.
-    """
-    name = {"ZO": "dense", "FMAP+ZO": "dense", "SCALABLE": "local"}.get(way, "lifted")
-    M, N = getattr(source, name), getattr(target, name)
-    for block in ("sample", "basis"):
-        clock.seconds[block] += sum(s.seconds.get(f"{name} {block}", 0.0) for s in (source, target))
-    if way == "ZO":
-        match = clock("map", lambda: knn(source, target, motion)[0])
-        C = clock("map", fmap.fmap_from_match, M.Phi[:, :k_init], N.Phi[:, :k_init], N.mass, match)
-    else:
-        C = clock("map", fit, M, N, landmarks, k_init)
-    nearest = {
-        "dense": lambda Q, D: nearest_in_cells(Q, N.cell, D, M.cell)[0],
-        "local": fmap.nearest_rows,
-        "lifted": lambda Q, D: fmap.nearly_nearest(
-            fmap.queries(Q), fmap.searched(D)
-        ),  # other searches follow
-    }[name]
-    C, low = clock("refine", fmap.zoomout, C, M.Phi, N.Phi, N.mass, k, step=step, nearest=nearest)
-    if name == "lifted":
-        for _ in range(2):
-            C = clock("refine", sharpened, C, M.B, N.Phi, N.mass, M.cell)
-    F = clock("full resolution", at_all_vertices, M, C), at_all_vertices(N)
-    if name == "dense":
-        match = low
-    else:
-        match = clock("full resolution", nearest_in_cells, F[1], N.cell, F[0], M.cell)[0]
-    return match, lambda: nearest_in_cells(F[0], M.cell, F[1], N.cell)[0], (low, F)
-
-
-def joint_match(source, target, motion, low, clock, k):
-    """RE-MATCH with joint rounds: match and registered surface at full resolution."""
-    M, N = source.scan, target.scan
-    starts = {
-        "intrinsic": low[0],
-        "icp": cKDTree(M.low.X @ motion[0].T + motion[1]).query(N.low.X)[1],
-    }
-    found = clock("refine", joint.candidates, M.low, N.low, starts, k=k)
-    return clock("full resolution", at_full_resolution, M, N, found, low[1])[:2]
-
-
-def nearest_vertices(mesh, image):
-    """The nearest row of an image ``(p, 3)`` for every vertex of a mesh ``(n,)``."""
-    return cKDTree(image).query(mesh["position"].values)[1]
+HOW = ("standard", "ours")
 
 
 def checked_methods(methods):
@@ -309,7 +42,7 @@ def checked_methods(methods):
         )
 
 
-def loaded(shape, what):
+def load_mesh(shape, what):
     """A mesh and the seconds it took to read and clean it.
 
     None for a Dataset, which is taken as clean.
@@ -480,34 +213,32 @@ def pairs(
     0.0
     """
     checked_methods(methods)
+    in_memory = isinstance(source, xr.Dataset)
+    if any(isinstance(target, xr.Dataset) != in_memory for target in targets.values()):
+        raise ValueError("source and targets need to be all paths or all Datasets")
+    options = {"k_init": k_init, "k": k, "step": step}
     rows = []
     with threadpool_limits(1):
-        if any(
-            isinstance(t, xr.Dataset) != isinstance(source, xr.Dataset) for t in targets.values()
-        ):
-            raise ValueError("source and targets need to be all paths or all Datasets")
-        mesh, load = loaded(source, "source")
-        M = Shape(mesh, n_coarse, k, seed)
+        mesh, load_source = load_mesh(source, "source")
+        M = Spaces(mesh, n_coarse, k, seed)
         for name, target in tqdm(targets.items(), desc="pairs", disable=len(targets) < 2):
-            mesh, seconds = loaded(target, f"target {name}")
-            N = Shape(mesh, n_coarse, k, seed)
-            given = None if landmarks is None else [np.asarray(v) for v in landmarks[name]]
-            truth_here = None if truth is None else truth[name]
-            if given is not None:
-                given = [
-                    landmark_vertices(v, s.mesh, isinstance(target, xr.Dataset))
-                    for v, s in zip(given, (M, N), strict=True)
+            mesh, load_target = load_mesh(target, f"target {name}")
+            N = Spaces(mesh, n_coarse, k, seed)
+            vertices = None
+            if landmarks is not None:
+                vertices = [
+                    landmark_vertices(np.asarray(marks), end.mesh, in_memory)
+                    for marks, end in zip(landmarks[name], (M, N), strict=True)
                 ]
-                check_landmarks(*given, M, N)
-            if truth is not None and not isinstance(target, xr.Dataset):
-                truth_here = truth_in_meshes(truth_here, M.mesh, N.mesh)
-            options = {"k_init": k_init, "k": k, "step": step}
-            rows.append(
-                one_pair(M, N, methods, given, load + seconds, truth_here, n_geodesic, options)
-            )
-    found = xr.concat(rows, "pair", combine_attrs="drop_conflicts")
-    attrs = {"n_coarse": n_coarse, "k_init": k_init, "k": k, "step": step, "seed": seed}
-    return found.assign_coords(pair=list(targets)).transpose("way", "pair", ...).assign_attrs(attrs)
+                check_landmarks(*vertices, M, N)
+            true = None if truth is None else truth[name]
+            if truth is not None and not in_memory:
+                true = truth_in_meshes(true, M.mesh, N.mesh)
+            load = load_source + load_target
+            rows.append(metrics_of_pair(M, N, methods, vertices, load, true, n_geodesic, options))
+    table = xr.concat(rows, "pair", combine_attrs="drop_conflicts")
+    attrs = options | {"n_coarse": n_coarse, "seed": seed}
+    return table.assign_coords(pair=list(targets)).transpose("way", "pair", ...).assign_attrs(attrs)
 
 
 def landmark_vertices(given, mesh, clean):
@@ -536,71 +267,27 @@ def check_landmarks(at_source, at_target, source, target):
         )
 
 
-def motion_and_landmarks(source, target, landmarks, low, clock):
-    """Steps 2 and 3 of 4.1: by the low-resolution meshes, as RE-MATCH has them.
-
-    Or else by spread points.
-    """
-    ends = [(s.scan.low.X, s.scan.low.area) if low else s.spread[:2] for s in (source, target)]
-    motion = clock("align", align, *ends[0], *ends[1])[:2]
-    if landmarks is None:
-        landmarks = clock("align", default_landmarks, source, target, motion)
-    return motion, landmarks
-
-
-def one_pair(source, target, methods, landmarks, load, truth, n_geodesic, options):
+def metrics_of_pair(source, target, methods, landmarks, load, truth, n_geodesic, options):
     """All methods on one pair: metrics and times over ``way``."""
-    aligned = {}
-    for low in (False, True):
-        common = Clock()
-        if any(way.startswith("RE-MATCH") == low for way in methods):
-            aligned[low] = (
-                motion_and_landmarks(source, target, landmarks, low, common),
-                common.seconds,
-            )
-    done, rows, times = {}, [], []
-    for way in methods:
-        clock, image, reverse = Clock(), None, None
-        remeshed = way.startswith("RE-MATCH")
-        (motion, marks), spent = aligned[remeshed]
-        clock.seconds["load and clean"] = load
-        aligns = landmarks is None or way in ("kNN", "ZO", "RE-MATCH joint")
-        clock.seconds["align"] = spent["align"] * aligns
-        if not remeshed and (aligns or way == "FMAP+ZO"):
-            clock.seconds["align" if aligns else "refine"] += (
-                source.seconds["spread"] + target.seconds["spread"]
-            )
-        if way == "kNN":
-            match, back = clock("full resolution", knn, source, target, motion)
-            reverse = partial(np.asarray, back)
-        else:
-            stem = way.removesuffix(" joint")
-            if stem not in done:
-                shared = Clock()
-                done[stem] = (
-                    *spectral_match(stem, source, target, motion, marks, shared, **options),
-                    shared.seconds,
-                )
-            match, reverse, low, spent = done[stem]
-            for block, seconds in spent.items():
-                clock.seconds[block] += seconds
-            if way != stem:
-                match, image = joint_match(source, target, motion, low, clock, options["k"])
-                reverse = partial(nearest_vertices, source.mesh, image)
-        found = metrics.evaluate(
+    both = Pair(source, target, landmarks, **options)
+    rows, seconds = [], []
+    for method in methods:
+        outcome = both.run(method)
+        row = metrics.evaluate(
             source.mesh,
             target.mesh,
-            match,
-            image=image,
-            reverse=reverse(),
+            outcome.match,
+            image=outcome.image,
+            reverse=outcome.reverse,
             truth=truth,
             n_geodesic=n_geodesic,
         )
-        rows.append(found)
-        times.append([clock.seconds[block] for block in BLOCKS])
-    found = xr.concat(rows, "way", combine_attrs="drop_conflicts")
-    found["block_seconds"] = variable("block_seconds", np.array(times)[:, None]).isel(pair=0)
-    return found.assign_coords(way=list(methods), block=list(BLOCKS))
+        rows.append(row)
+        spent = {"load and clean": load} | outcome.seconds
+        seconds.append([spent.get(block, 0.0) for block in BLOCKS])
+    table = xr.concat(rows, "way", combine_attrs="drop_conflicts")
+    table["block_seconds"] = variable("block_seconds", np.array(seconds)[:, None]).isel(pair=0)
+    return table.assign_coords(way=list(methods), block=list(BLOCKS))
 
 
 def collection(
@@ -668,75 +355,91 @@ def collection(
     return xr.concat(rows, "way").assign_coords(way=list(methods))
 
 
-def one_collection(meshes, way, load, n_coarse, n_pairs, k_init, k, step, seed):
+def one_collection(
+    meshes: dict[str, xr.Dataset],
+    way: str,
+    load: float,
+    n_coarse: int,
+    n_pairs: int,
+    k_init: int,
+    k: int,
+    step: int,
+    seed: int,
+) -> xr.Dataset:
     """One row of Table 2."""
-    names, begin = list(meshes), time.process_time()
-    given = {n: Shape(mesh, n_coarse, k, seed) for n, mesh in meshes.items()}
-    spaces = {n: shape.local if way == "SCALABLE" else shape.coarse for n, shape in given.items()}
-    eigenvalues = np.stack([s.eigenvalue for s in spaces.values()])
-    distance = network.spectral_distance(eigenvalues[:, :k_init])
-    reference = names[int(np.argmin(distance.sum(1)))]
-    to_reference = {n: (np.eye(3), np.zeros(3)) for n in names}
-    for n in names:
-        if n != reference:
-            to_reference[n] = align(
-                spaces[n].X, spaces[n].area, spaces[reference].X, spaces[reference].area
-            )[:2]
-    source, target, maps = [], [], []
-    for i, j in network.choose_pairs(distance, n_pairs):
-        M, N = spaces[names[i]], spaces[names[j]]
-        R, t = realign(
-            M.X, M.area, N.X, N.area, motion_between(to_reference[names[i]], to_reference[names[j]])
-        )
-        for a, b, motion in ((i, j, (R, t)), (j, i, (R.T, -R.T @ t))):
-            ends = [
-                (s.X, s.mass, s.Phi, s.eigenvalue) for s in (spaces[names[a]], spaces[names[b]])
-            ]
-            maps.append(network.first_map(*ends, motion, k_init=k_init))
-            source.append(a)
-            target.append(b)
-    spent = {"load and clean": load, "basis and first maps": time.process_time() - begin}
+    names = list(meshes)
+    begin = time.process_time()
+    spaces = [Spaces(mesh, n_coarse, k, seed) for mesh in meshes.values()]
+    shapes = [space.local if way == "SCALABLE" else space.coarse for space in spaces]
+    bases = [shape.low for shape in shapes]
+    source, target, maps = first_maps(bases, n_pairs, k_init)
+    network_seconds = time.process_time() - begin
 
     begin = time.process_time()
     _, _, _, Y, latent_eigenvalue = latent.consistent_zoomout(
-        np.stack(maps),
-        np.array(source),
-        np.array(target),
-        [s.Phi for s in spaces.values()],
-        [s.area for s in spaces.values()],
-        eigenvalues,
-        k,
-        step=step,
-        samples=[farthest_points(s.X, latent.SAMPLES) for s in spaces.values()],
+        bases, maps, source, target, k, step=step, samples=[basis.spread for basis in bases]
     )
     found = dataset(latent_basis=Y, latent_eigenvalue=latent_eigenvalue).assign_coords(shape=names)
-    found = median.median_shape(found, eigenvalues)
-    spent["consistent ZoomOut"] = time.process_time() - begin
+    found = median.median_shape(found, np.stack([basis.eigenvalue for basis in bases]))
+    zoomout_seconds = time.process_time() - begin
 
-    template = found.attrs["median"]
-    N, others = spaces[template], [n for n in names if n != template]
-    chamfer, seconds = np.full((len(HOW), len(names)), np.nan), []
-    for h, how in enumerate(HOW):
-        total = 0.0
-        for n in others:
-            begin, M = time.process_time(), spaces[n]
-            F = M.Phi @ Y[names.index(n)], N.Phi @ Y[names.index(template)]
-            if how == "standard":
-                C = fmap.fmap_from_match(M.Phi, N.Phi, N.mass, fmap.nearest_rows(F[1], F[0]))
-                F = M.Phi @ C.T, N.Phi
-            match = intrinsic_match(M, N, *F)[0]
-            total += time.process_time() - begin
-            X = given[n].X
-            chamfer[h, names.index(n)] = metrics.chamfer(X, X[match])
-        seconds.append([*spent.values(), total])
+    template = names.index(found.attrs["median"])
+    chamfer = np.full((len(HOW), len(names)), np.nan)
+    seconds = []
+    for row, how in enumerate(HOW):
+        chamfer[row], full_seconds = chamfer_to_template(spaces, shapes, Y, template, how)
+        seconds.append([load, network_seconds, zoomout_seconds, full_seconds])
     row = xr.Dataset(
         {
             "collection_chamfer": variable("collection_chamfer", chamfer[None]).isel(way=0),
             "collection_seconds": variable("collection_seconds", np.array(seconds)[None]).isel(
                 way=0
             ),
-            "median_shape": variable("median_shape", np.array([template])).isel(way=0),
+            "median_shape": variable("median_shape", np.array([names[template]])).isel(way=0),
             "distance_to_median": found["distance_to_median"].variable,
         }
     )
     return row.assign_coords(how=list(HOW), block=list(COLLECTION_BLOCKS), shape=names)
+
+
+def first_maps(
+    bases: list[Basis], n_pairs: int, k_init: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """First maps of a network, both ways: sources and targets ``(p,)``, maps ``(p, k, k)``."""
+    distance = network.spectral_distance([basis.eigenvalue[:k_init] for basis in bases])
+    reference = bases[int(np.argmin(distance.sum(1)))]
+    motions = []
+    for basis in bases:
+        motion = np.eye(3), np.zeros(3)
+        if basis is not reference:
+            motion = align(basis.X, basis.area, reference.X, reference.area)[:2]
+        motions.append(motion)
+    source, target, maps = [], [], []
+    for i, j in network.choose_pairs(distance, n_pairs):
+        M, N = bases[i], bases[j]
+        start = motion_between(motions[i], motions[j])
+        R, t = realign(M.X, M.area, N.X, N.area, start)
+        maps.append(map_after_motion(M, N, (R, t), k_init=k_init))
+        maps.append(map_after_motion(N, M, (R.T, -R.T @ t), k_init=k_init))
+        source += [i, j]
+        target += [j, i]
+    return np.array(source), np.array(target), np.stack(maps)
+
+
+def chamfer_to_template(
+    spaces: list[Spaces], shapes: list[Shape], Y: np.ndarray, template: int, how: str
+) -> tuple[np.ndarray, float]:
+    """Eq. 9 of each shape and the image of the template ``(n,)``, NaN for it; CPU seconds."""
+    chamfer = np.full(len(shapes), np.nan)
+    seconds = 0.0
+    for i, (space, shape) in enumerate(zip(spaces, shapes, strict=True)):
+        if i == template:
+            continue
+        begin = time.process_time()
+        functions = latent_functions(shape, shapes[template], (Y[i], Y[template]))
+        if how == "standard":
+            functions = mapped_functions(shape, shapes[template], functions, shape.low.k)
+        match, *_ = match_functions(shape, shapes[template], *functions)
+        seconds += time.process_time() - begin
+        chamfer[i] = metrics.chamfer(space.X, space.X[match])
+    return chamfer, seconds

@@ -1,7 +1,9 @@
-"""Displacement of the template onto a shape.
+"""Displacement (4.2, eq. 8) of the template onto a shape, and its spectral smoothing.
 
-And its spectral smoothing (eq. 8 and the line after it).
+The smoothing is the line after eq. 8: projection onto the first functions U Phi.
 """
+
+from collections.abc import Callable
 
 import numpy as np
 import scipy.linalg
@@ -10,13 +12,12 @@ import scipy.sparse as sp
 from s4a.geometry.align import rigid_transform
 
 
-def smoother(Phi, area, U=None):
+def smoother(Phi: np.ndarray, area: np.ndarray, U: sp.spmatrix | None = None) -> Callable:
     """The A-orthogonal projection d -> B (B^T A B)^-1 B^T A d, B = U Phi.
 
-    The paper's U Phi (U Phi)^+ d, area-weighted.
-
-    At full resolution B is not orthonormal: projecting as if it were loses detail.  B itself is
-    never formed, as B^T A B = Phi^T (U^T A U) Phi with a sparse matrix in the middle.
+    The paper's U Phi (U Phi)^+ d, weighted by area.  At full resolution B is not orthonormal:
+    projecting as if it were loses detail.  B itself is never formed, as B^T A B =
+    Phi^T (U^T A U) Phi with a sparse matrix in the middle.
 
     Parameters
     ----------
@@ -32,18 +33,34 @@ def smoother(Phi, area, U=None):
     callable
         Takes a field (n, 3), gives its coefficients (k, 3).
     """
-    weighted = sp.diags_array(area) if U is None else sp.diags_array(area) @ U
-    mass = weighted if U is None else U.T @ weighted
+    A = sp.diags_array(area)
+    weighted = A if U is None else A @ U  # (n, n_coarse)
+    mass = weighted if U is None else U.T @ weighted  # (n_coarse, n_coarse)
     factor = scipy.linalg.cho_factor(Phi.T @ (mass @ Phi), check_finite=False)
-    return lambda d: scipy.linalg.cho_solve(factor, Phi.T @ (weighted.T @ d), check_finite=False)
+
+    def coefficients(d):
+        return scipy.linalg.cho_solve(factor, Phi.T @ (weighted.T @ d), check_finite=False)
+
+    return coefficients
 
 
-def onto(X, image, area, coefficients_of, spectrum=None):
-    """The motion that brings X onto its image.
+def onto(
+    X: np.ndarray,
+    image: np.ndarray,
+    area: np.ndarray,
+    coefficients: Callable,
+    spectrum: tuple[np.ndarray, np.ndarray] | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The motion that brings X onto its image, and the displacement that it leaves, smoothed.
 
-    And the coefficients of the displacement that is left.
-
-    Where a `spectrum` is given, the motion is not one but that of :func:`rigid_parts`.
+    Parameters
+    ----------
+    X, image : float ndarray (n, 3)
+    area : float ndarray (n,)
+    coefficients : callable
+        Of a field (n, 3), as of :func:`smoother`.
+    spectrum : tuple (Phi, eigenvalue), optional
+        Where it is given, the motion is not one but that of :func:`rigid_parts`.
 
     Returns
     -------
@@ -53,12 +70,20 @@ def onto(X, image, area, coefficients_of, spectrum=None):
     """
     if spectrum is None:
         R, t, _ = rigid_transform(X, image, area)
-        return R, t, coefficients_of(image - X @ R.T - t)
+        return R, t, coefficients(image - X @ R.T - t)
     R, t = rigid_parts(X, image, area, *spectrum)
-    return R, t, coefficients_of(image - np.einsum("nij,nj->ni", R, X) - t)
+    return R, t, coefficients(image - np.einsum("nij,nj->ni", R, X) - t)
 
 
-def rigid_parts(X, image, area, Phi, eigenvalue, *, spread=3.0):
+def rigid_parts(
+    X: np.ndarray,
+    image: np.ndarray,
+    area: np.ndarray,
+    Phi: np.ndarray,
+    eigenvalue: np.ndarray,
+    *,
+    spread: float = 3.0,
+) -> tuple[np.ndarray, np.ndarray]:
     """For every vertex the motion that brings its surroundings closest to their image.
 
     :func:`s4a.geometry.align.rigid_transform` at every vertex, all others weighted by the heat
@@ -81,26 +106,29 @@ def rigid_parts(X, image, area, Phi, eigenvalue, *, spread=3.0):
     t : float ndarray (n, 3)
         The motions R x + t.
     """
-    falling = np.exp(-spread * eigenvalue / max(eigenvalue[-1], np.finfo(float).tiny))[:, None]
+    largest = max(eigenvalue[-1], np.finfo(float).tiny)
+    heat = np.exp(-spread * eigenvalue / largest)[:, None]  # (K, 1)
 
     def around(f):
-        return Phi @ (falling * (Phi.T @ (area[:, None] * f)))
+        """Mean of a function around every vertex, weighted by the heat kernel."""
+        return Phi @ (heat * (Phi.T @ (area[:, None] * f)))
 
-    p, q = around(X), around(image)
-    moment = (
-        around(np.einsum("ni,nj->nij", image, X).reshape(-1, 9)).reshape(-1, 3, 3)
-        - q[:, :, None] * p[:, None]
-    )
-    U, _, Vt = np.linalg.svd(moment)
+    p = around(X)  # (n, 3)
+    q = around(image)  # (n, 3)
+    products = np.einsum("ni,nj->nij", image, X).reshape(-1, 9)
+    covariance = around(products).reshape(-1, 3, 3) - q[:, :, None] * p[:, None]
+    U, _, Vt = np.linalg.svd(covariance)  # Kabsch's solution, at every vertex
     U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
     R = U @ Vt
     return R, q - np.einsum("nij,nj->ni", R, p)
 
 
-def displacement_in_template(X, registered, area, *, scale=False):
-    """Displacement of the template (eq. 8.
+def displacement_in_template(
+    X: np.ndarray, registered: np.ndarray, area: np.ndarray, *, scale: bool = False
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Displacement of the template, image minus template (eq. 8), in the template's frame.
 
-    As image minus template) after the shape is moved rigidly onto it.
+    The shape is moved rigidly onto the template before.
 
     Parameters
     ----------
@@ -122,9 +150,9 @@ def displacement_in_template(X, registered, area, *, scale=False):
     return s * registered @ R.T + t - X, R, t, s
 
 
-def normal_displacement(displacement, normals):
-    """Signed displacement along the outward normals ``(..., n)``.
+def normal_displacement(displacement: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Signed displacement along the outward normals ``(..., n)``: positive is expansion.
 
-    Positive is expansion (blue in Fig. 4).
+    That is blue in Fig. 4.
     """
     return np.einsum("...nx,nx->...n", displacement, normals)

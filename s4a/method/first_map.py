@@ -1,36 +1,99 @@
-"""First maps of shapes whose poses are far apart.
+"""First functional maps (4.1, steps 2 to 4), and one step of ZoomOut ahead (4.2).
 
-Where nearest neighbours after ICP (4.1) are wrong.
+The paper's way is from nearest neighbours after ICP, of all vertices or of 10 landmarks.  Where
+poses are far apart these are wrong: then the best of several maps is taken.
 """
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from s4a.geometry.align import farthest_points
 from s4a.geometry.mesh import edges
 from s4a.method import fmap, joint
-from s4a.method.network import first_map
+from s4a.method.shape import Basis
+
+N_LANDMARKS = 10  # of step 3
 
 
-def stretch(target, motion):
+def nearest_after_motion(
+    source: Basis, target: Basis, motion: tuple[np.ndarray, np.ndarray]
+) -> np.ndarray:
+    """The vertex of the moved source nearest to every vertex of the target ``(n_target,)``."""
+    R, t = motion
+    return cKDTree(source.X @ R.T + t).query(target.X)[1]
+
+
+def landmarks_after_motion(
+    source: Basis, target: Basis, motion: tuple[np.ndarray, np.ndarray], n: int = N_LANDMARKS
+) -> tuple[np.ndarray, np.ndarray]:
+    """Step 3: n spread vertices of the source, and the vertices of the target nearest to them."""
+    R, t = motion
+    landmark = farthest_points(source.X, n)
+    return landmark, cKDTree(target.X).query(source.X[landmark] @ R.T + t)[1]
+
+
+def map_after_motion(
+    source: Basis,
+    target: Basis,
+    motion: tuple[np.ndarray, np.ndarray],
+    *,
+    k_init: int = 20,
+    init: str = "dense",
+    near: np.ndarray | None = None,
+) -> np.ndarray:
+    """First functional map of a directed pair (4.1, steps 3 and 4), with one ZoomOut step ahead.
+
+    Parameters
+    ----------
+    source, target : Basis
+        At low resolution.
+    motion : tuple (R, t)
+        Rigid motion of the source onto the target (step 2).
+    init : {"dense", "landmarks"}
+        From all vertices' nearest neighbours, or the paper's fit on 10 farthest points.
+    near : int ndarray (n_target,), optional
+        :func:`nearest_after_motion`, where it is known.
+
+    Returns
+    -------
+    C : float ndarray (k_init, k_init)
+    """
+    source = source.first(k_init)
+    target = target.first(k_init)
+    if init == "landmarks":
+        C = fmap.fmap_from_landmarks(
+            source, target, *landmarks_after_motion(source, target, motion)
+        )
+    else:
+        near = nearest_after_motion(source, target, motion) if near is None else near
+        C = fmap.fmap_from_match(source.Phi, target.Phi, target.mass, near)
+    return fmap.refine_once(source, target, C)
+
+
+def stretch(target: Basis, motion: joint.Motion) -> float:
     """Median |log| of the lengths of the registered edges by those of the target."""
-    X, ends = joint.registered(target, motion), edges(target.T)
-    new, old = (np.linalg.norm(np.subtract(*P[ends.T]), axis=1) for P in (X, target.X))
-    return float(np.median(np.abs(np.log(np.maximum(new, 1e-12) / np.maximum(old, 1e-12)))))
+    ends = edges(target.T).T  # (2, e)
+    after, before = (
+        np.maximum(np.linalg.norm(np.subtract(*X[ends]), axis=1), 1e-12)
+        for X in (joint.move(target, motion), target.X)
+    )
+    return float(np.median(np.abs(np.log(after / before))))
 
 
-def best_first_map(source, target, C, *, k=60, step=10):
-    """The best of a first map and of those from heat and from wave kernel signatures.
-
-    Which no pose changes.
+def best_first_map(
+    source: Basis, target: Basis, C: np.ndarray, *, k: int = 60, step: int = 10
+) -> tuple[str, np.ndarray]:
+    """The best of a first map and of those from heat and from wave kernels, which no pose changes.
 
     Either kind alone fails on some pairs: shapes that nearly are their own mirror image are turned
     over, or limbs exchanged.  Each map is refined by a short ZoomOut and a few rounds of
     :func:`s4a.method.joint.low_rounds` by parts; their end is scored without truth,
-    :func:`s4a.method.joint.badness` + :func:`stretch`, as a pose hardly stretches the surface.
+    :func:`s4a.method.joint.registration_score` + :func:`stretch`, as a pose hardly stretches the
+    surface.
 
     Parameters
     ----------
-    source, target : s4a.method.joint.Surface
+    source, target : Basis
         At low resolution.
     C : float ndarray (k_init, k_init)
         First map from ICP.
@@ -42,43 +105,49 @@ def best_first_map(source, target, C, *, k=60, step=10):
     name : {"icp", "hks", "wks"}
     C : float ndarray (k_init, k_init)
     """
-    ends = [(s.eigenvalue, s.Phi, s.area, s.T) for s in (source, target)]
-    k_init, found, scores = len(C), {"icp": C}, {}
+    maps = {"icp": C}
     for kind in ("hks", "wks"):
-        fitted = fmap.fmap_of_descriptors(*ends, k=k_init, kind=kind)
-        found[kind] = fmap.once_refined(fitted, source.Phi, target.Phi, target.area)
-    k = min(k, source.Phi.shape[1], target.Phi.shape[1])
-    for name, first in found.items():
-        match = fmap.zoomout(first, source.Phi, target.Phi, target.area, k, step=step)[1]
+        fit = fmap.fmap_from_descriptors(source, target, k=len(C), kind=kind)
+        maps[kind] = fmap.refine_once(source, target, fit)
+    k = min(k, source.k, target.k)
+    score = {}
+    for name, first in maps.items():
+        match = fmap.zoomout(source, target, first, k, step=step)[1]
         end = joint.low_rounds(source, target, match, k_first=20, step=20, rounds=1, by_parts=True)
-        scores[name] = joint.badness(source, target, *end) + stretch(target, end[1])
-    best = min(scores, key=scores.get)
-    return best, found[best]
+        score[name] = joint.registration_score(source, target, *end) + stretch(target, end[1])
+    best = min(score, key=score.get)
+    return best, maps[best]
 
 
-def have_signatures(source, target, k):
-    """Whether the first k eigenvalues of both shapes, less those of 0, have a range in common.
+def have_signatures(source: Basis, target: Basis, k: int) -> bool:
+    """Whether the first k eigenvalues of both, less those of 0, have a range in common.
 
-    Of pieces not always.
+    Those of a surface in many pieces may be 0 all.
     """
-    least = max(s.eigenvalue[s.eigenvalue > 0].min(initial=np.inf) for s in (source, target))
-    return bool(1.01 * least < min(s.eigenvalue[k - 1] for s in (source, target)))
+    ends = (source.eigenvalue, target.eigenvalue)
+    least = max(value[value > 0].min(initial=np.inf) for value in ends)
+    return bool(1.01 * least < min(value[k - 1] for value in ends))
 
 
-def first_map_of(source, target, motion, *, k_init=20, init="dense"):
-    """:func:`s4a.method.network.first_map`.
+def first_map(
+    source: Basis,
+    target: Basis,
+    motion: tuple[np.ndarray, np.ndarray],
+    *,
+    k_init: int = 20,
+    init: str = "dense",
+) -> tuple[str, np.ndarray, np.ndarray]:
+    """:func:`map_after_motion`, or :func:`best_first_map` where poses are far apart.
 
-    Or :func:`best_first_map` where that is dense and poses are far apart.
-
-    Without signatures, :func:`have_signatures`, it stays as it is.
+    The latter only where `init` is dense and there are signatures, :func:`have_signatures`.
 
     Parameters
     ----------
-    source, target : s4a.method.joint.Surface
+    source, target : Basis
         At low resolution.
     motion : tuple (R, t)
         Rigid motion of the source onto the target.
-    k_init, init : see :func:`s4a.method.network.first_map`
+    k_init, init : see :func:`map_after_motion`
 
     Returns
     -------
@@ -88,13 +157,10 @@ def first_map_of(source, target, motion, *, k_init=20, init="dense"):
     near : int ndarray (n_target,)
         Nearest neighbours in space after the motion.
     """
-    near = cKDTree(source.X @ motion[0].T + motion[1]).query(target.X)[1]
-    ends = ((s.X, s.area, s.Phi, s.eigenvalue) for s in (source, target))
-    C = first_map(*ends, motion, k_init=k_init, init=init, near=near)
-    if (
-        init == "dense"
-        and joint.far_apart(source, target, near)
-        and have_signatures(source, target, k_init)
-    ):
-        return *best_first_map(source, target, C), near
+    near = nearest_after_motion(source, target, motion)
+    C = map_after_motion(source, target, motion, k_init=k_init, init=init, near=near)
+    far = init == "dense" and joint.far_apart(source, target, near)
+    if far and have_signatures(source, target, k_init):
+        name, C = best_first_map(source, target, C)
+        return name, C, near
     return init, C, near

@@ -1,14 +1,15 @@
-"""Functional maps (3.3, 4.1): fit, map <-> match (eq. 2 and 4), ZoomOut.
+"""Functional maps (3.3, 4.1): fit, map <-> match (eq. 1, 2 and 4), ZoomOut.
 
 The source is the paper's M with basis Phi, the target its N with basis Psi.  C carries functions
 source -> target; a match holds, for every vertex of the target, a vertex of the source.
 """
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
 
-from s4a.geometry.mesh import as_arrays
 from s4a.method.descriptors import (
     heat_filter,
     landmark_coefficients,
@@ -18,17 +19,32 @@ from s4a.method.descriptors import (
     signature,
     wave_filter,
 )
+from s4a.method.nearest import (
+    columns_with_norm,
+    nearest_in_single,
+    nearest_rows,
+    rows_with_minus_one,
+)
+from s4a.method.shape import Basis, Shape
 from s4a.schema import dataset, require
 
+FILTERS = {"wks": wave_filter, "hks": heat_filter}
 
-def fmap_from_match(Phi_source, Phi_target, area_target, match):
+
+def fmap_from_match(
+    Phi_source: np.ndarray,
+    Phi_target: np.ndarray,
+    area_target: np.ndarray | sp.sparray | sp.spmatrix,
+    match: np.ndarray,
+) -> np.ndarray:
     """C = Psi^T A_N Phi[match]: the map of functions that a match gives (eq. 1 in both bases).
 
     Parameters
     ----------
     Phi_source : float ndarray (n_source, k)
     Phi_target : float ndarray (n_target, k)
-    area_target : float ndarray (n_target,), of sum 1, or a sparse mass matrix in which Phi_target is orthonormal
+    area_target : float ndarray (n_target,), of sum 1, or a sparse matrix
+        What Phi_target is orthonormal in.
     match : int ndarray (n_target,)
 
     Returns
@@ -40,90 +56,40 @@ def fmap_from_match(Phi_source, Phi_target, area_target, match):
     return Phi_target.T @ (area_target[:, None] * Phi_source[match])
 
 
-def nearest_rows(Q, D, *, block=256):
-    """For every row of Q the index of the nearest row of D (Euclidean).
-
-    By blocks of one matrix product each.
-
-    The product is of (q, -1) and (d, |d|^2 / 2), largest where the distance is least; its blocks
-    stay in the cache. float32 first, which above about 20 dims is faster than a KD-tree; where it
-    cannot tell two rows apart, float64 decides.  Of rows that are equally near the first is given.
-
-    Examples
-    --------
-    >>> nearest_rows(np.array([[0.1], [4.0]]), np.array([[0.0], [5.0]])).tolist()
-    [0, 1]
-    """
-    q, d = queries(Q), searched(D)
-    longest = np.sqrt(2 * d[-1].max())
-    rounding = (
-        16 * np.finfo(np.float32).eps * longest * (np.linalg.norm(q[:, :-1], axis=1) + longest)
-    )
-    found = np.empty(len(q), np.int64)
-    for start, score in products(q, d, block):
-        best = score.argmax(axis=1)
-        line = np.arange(len(best))
-        least = score[line, best] - rounding[start : start + block]
-        score[line, best] = -np.inf
-        for i in np.flatnonzero(score.max(axis=1) >= least):
-            score[i, best[i]] = np.inf
-            close = np.flatnonzero(score[i] >= least[i])
-            gap = D[close].astype(float) - Q[start + i]
-            best[i] = close[np.einsum("ij,ij->i", gap, gap).argmin()]
-        found[start : start + block] = best
-    return found
-
-
-def queries(Q):
-    """(q, -1) for the rows of Q ``(n, d + 1)`` float32."""
-    return np.column_stack([Q, np.full(len(Q), -1)]).astype(np.float32)
-
-
-def searched(D):
-    """(d, |d|^2 / 2) for the rows of D, as columns ``(d + 1, p)`` float32."""
-    d = np.asarray(D, np.float32)
-    return np.ascontiguousarray(np.column_stack([d, np.einsum("ij,ij->i", d, d) / 2]).T)
-
-
-def products(q, d, block=256):
-    """The products of :func:`queries` and :func:`searched`, block by block in one array.
-
-    (first row, block).
-    """
-    scores = np.empty((min(block, len(q)), d.shape[1]), np.float32)
-    for start in range(0, len(q), block):
-        part = q[start : start + block]
-        yield start, np.matmul(part, d, out=scores[: len(part)])
-
-
-def nearly_nearest(q, d):
-    """:func:`nearest_rows` up to float32 rounding.
-
-    From :func:`queries` and :func:`searched` made once for many.
-    """
-    return np.concatenate([score.argmax(axis=1) for _, score in products(q, d)])
-
-
-def match_from_fmap(C, Phi_source, Phi_target, *, nearest=nearest_rows):
+def match_from_fmap(
+    C: np.ndarray,
+    Phi_source: np.ndarray,
+    Phi_target: np.ndarray,
+    *,
+    nearest: Callable = nearest_rows,
+) -> np.ndarray:
     """Nearest neighbours of the rows of Psi among those of Phi C^T (eq. 2)."""
     k_target, k_source = C.shape
     return nearest(Phi_target[:, :k_target], Phi_source[:, :k_source] @ C.T)
 
 
-def zoomout(C, Phi_source, Phi_target, area_target, k, *, step=5, nearest=nearest_rows):
-    """ZoomOut (Melzi et al. 2019): C -> match -> a larger C, until it is k x k.
+def zoomout(
+    source: Basis,
+    target: Basis,
+    C: np.ndarray,
+    k: int,
+    *,
+    step: int = 5,
+    nearest: Callable = nearest_rows,
+) -> tuple[np.ndarray, np.ndarray]:
+    """ZoomOut (4.1; Melzi et al. 2019): C -> match -> a larger C, until it is k x k.
 
     Parameters
     ----------
+    source, target : Basis
+        With k functions or more.
     C : float ndarray (k_init, k_init)
-    Phi_source, Phi_target : float ndarray (n, >= k)
-    area_target : see :func:`fmap_from_match`
     k : int
         Final size.
     step : int
         Growth per round.
     nearest : callable
-        As :func:`nearest_rows`, which is it by default.
+        As :func:`s4a.method.nearest.nearest_rows`, which is it by default.
 
     Returns
     -------
@@ -133,21 +99,30 @@ def zoomout(C, Phi_source, Phi_target, area_target, k, *, step=5, nearest=neares
     """
     sizes = [*range(C.shape[0] + step, k, step), k] if k > C.shape[0] else []
     for size in sizes:
-        match = match_from_fmap(C, Phi_source, Phi_target, nearest=nearest)
-        C = fmap_from_match(Phi_source[:, :size], Phi_target[:, :size], area_target, match)
-    return C, match_from_fmap(C, Phi_source, Phi_target, nearest=nearest)
+        match = match_from_fmap(C, source.Phi, target.Phi, nearest=nearest)
+        C = fmap_from_match(source.Phi[:, :size], target.Phi[:, :size], target.mass, match)
+    return C, match_from_fmap(C, source.Phi, target.Phi, nearest=nearest)
 
 
-def once_refined(C, Phi_source, Phi_target, area_target):
-    """One step of ZoomOut without growth: C -> match -> C of the same size."""
-    Phi, Psi = Phi_source[:, : C.shape[1]], Phi_target[:, : len(C)]
-    return fmap_from_match(Phi, Psi, area_target, nearly_nearest(queries(Psi), searched(Phi @ C.T)))
+def refine_once(source: Basis, target: Basis, C: np.ndarray) -> np.ndarray:
+    """One step of ZoomOut without growth (4.2): C -> match -> C of the same size."""
+    Phi = source.Phi[:, : C.shape[1]]
+    Psi = target.Phi[:, : len(C)]
+    match = nearest_in_single(rows_with_minus_one(Psi), columns_with_norm(Phi @ C.T))
+    return fmap_from_match(Phi, Psi, target.mass, match)
 
 
-def fit(F, G, *, penalty=0.0, operators=(), constant=1.0):
-    """The C of least energy that carries constants to constants (step 4 of 4.1.
+def fit(
+    F: np.ndarray,
+    G: np.ndarray,
+    *,
+    penalty: np.ndarray | float = 0.0,
+    operators: Sequence[tuple[float, np.ndarray, np.ndarray]] = (),
+    constant: float = 1.0,
+) -> np.ndarray:
+    """The C of least energy that carries constants to constants (step 4 of 4.1).
 
-    Ovsjanikov et al. 2012).
+    After Ovsjanikov et al. (2012).
 
     E(C) = |C F - G|^2 + sum penalty C^2 + sum w |C P - Q C|^2, whose normal equations are solved
     directly: row by row where there are no operators, else all k_target (k_source - 1) unknowns at
@@ -179,39 +154,55 @@ def fit(F, G, *, penalty=0.0, operators=(), constant=1.0):
     k_target, k_source = len(G), len(F)
     C = np.zeros((k_target, k_source))
     C[0, 0] = constant
-    FF, GF = F @ F.T, G @ F.T
+    FF = F @ F.T  # (k_source, k_source)
+    GF = G @ F.T  # (k_target, k_source)
     penalty = np.broadcast_to(penalty, C.shape)
     if not operators:
         for row, p, g in zip(C, penalty, GF, strict=True):
             row[1:] = np.linalg.solve(FF[1:, 1:] + np.diag(p[1:]), g[1:] - row[0] * FF[0, 1:])
         return C
+    # the quadratic form of all entries of C, row after row
     H = np.kron(np.eye(k_target), FF) + np.diag(penalty.ravel())
-    for w, P, Q in operators:
-        right, left = np.einsum("pij,pkj->ik", P, P), np.einsum("pji,pjk->ik", Q, Q)
+    for weight, P, Q in operators:
+        right = np.einsum("pij,pkj->ik", P, P)  # sum of P P^T
+        left = np.einsum("pji,pjk->ik", Q, Q)  # sum of Q^T Q
         mixed = np.tensordot(Q, P, (0, 0)).transpose(0, 2, 1, 3).reshape(H.shape)
-        H += w * (
+        H += weight * (
             np.kron(np.eye(k_target), right) + np.kron(left, np.eye(k_source)) - mixed - mixed.T
         )
-    free = np.flatnonzero(np.arange(C.size) % k_source)
+    free = np.flatnonzero(np.arange(C.size) % k_source)  # all but the first column
     b = (GF.ravel() - constant * H[:, 0])[free]
     C.ravel()[free] = scipy.linalg.solve(H[np.ix_(free, free)], b, assume_a="pos")
     return C
 
 
-def fit_landmarks(
-    Phi_source, Phi_target, ev_source, ev_target, landmark_source, landmark_target, *, commute=1e-3
-):
-    """Fit of C on landmark pairs (step 4 of 4.1).
+def commutator(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """(mu_i - lambda_j)^2 / lambda_max^2 ``(k_target, k_source)``: C commutes with the Laplacians."""
+    return ((target[:, None] - source) / max(source[-1], target[-1])) ** 2
 
-    Heat kernels around them preserved, Laplacians commute.
+
+def constant_to_constant(source: Basis, target: Basis) -> float:
+    """C[0, 0] of a map that takes constants to constants: the product of their signs."""
+    return np.sign(source.Phi[0, 0] * target.Phi[0, 0])
+
+
+def fmap_from_landmarks(
+    source: Basis,
+    target: Basis,
+    landmark_source: np.ndarray,
+    landmark_target: np.ndarray,
+    *,
+    commute: float = 1e-3,
+) -> np.ndarray:
+    """C from landmark pairs (step 4 of 4.1): heat kernels around them kept, Laplacians commute.
 
     :func:`fit` with F and G at 8 times and the penalty commute |F|^2 (mu_i - lambda_j)^2 /
     lambda_max^2.
 
     Parameters
     ----------
-    Phi_source, Phi_target : float ndarray (n, k)
-    ev_source, ev_target : float ndarray (k,)
+    source, target : Basis
+        With k functions.
     landmark_source, landmark_target : int ndarray (p,)
         Corresponding vertices.
 
@@ -219,69 +210,66 @@ def fit_landmarks(
     -------
     C : float ndarray (k, k)
     """
-    F, G = (
-        landmark_coefficients(Phi, heat_filter(ev, other, n=8), landmark)
-        for Phi, ev, other, landmark in (
-            (Phi_source, ev_source, ev_target, landmark_source),
-            (Phi_target, ev_target, ev_source, landmark_target),
-        )
-    )
-    F, G = F / np.linalg.norm(F, axis=0), G / np.linalg.norm(G, axis=0)
-    top = max(ev_source[-1], ev_target[-1])
-    penalty = commute * np.trace(F @ F.T) * ((ev_target[:, None] - ev_source) / top) ** 2
-    return fit(F, G, penalty=penalty, constant=np.sign(Phi_source[0, 0] * Phi_target[0, 0]))
+    coefficients = []
+    for end, other, landmark in (
+        (source, target, landmark_source),
+        (target, source, landmark_target),
+    ):
+        kernel = heat_filter(end.eigenvalue, other.eigenvalue, n=8)  # (8, k)
+        F = landmark_coefficients(end.Phi, kernel, landmark)  # (k, 8 p)
+        coefficients.append(F / np.linalg.norm(F, axis=0))
+    F, G = coefficients
+    penalty = commute * np.trace(F @ F.T) * commutator(source.eigenvalue, target.eigenvalue)
+    return fit(F, G, penalty=penalty, constant=constant_to_constant(source, target))
 
 
-FILTERS = {"wks": wave_filter, "hks": heat_filter}
-
-
-def fmap_of_descriptors(
-    source,
-    target,
+def fmap_from_descriptors(
+    source: Basis,
+    target: Basis,
     *,
-    k=20,
-    marks=(None, None),
-    kind="wks",
-    n=100,
-    every=5,
-    laplacian=1e-3,
-    commute=1.0,
-    oriented=1.0,
-):
-    """:func:`fit_descriptors` for plain arrays.
+    k: int = 20,
+    landmarks: tuple[np.ndarray, np.ndarray] | tuple[None, None] = (None, None),
+    kind: str = "wks",
+    n: int = 100,
+    every: int = 5,
+    laplacian: float = 1e-3,
+    commute: float = 1.0,
+    oriented: float = 1.0,
+) -> np.ndarray:
+    """C ``(k, k)`` from descriptors: :func:`fit_descriptors` for two bases.
 
     Parameters
     ----------
-    source, target : tuple (eigenvalue, Phi, area, T)
-        Eigenvalues (k,), eigenfunctions (n, k), vertex areas of sum 1, triangles.
-    marks : tuple of int ndarray (p,)
+    source, target : Basis
+        With all functions that there are; the triangles are for `oriented`.
+    landmarks : tuple of int ndarray (p,)
         Corresponding vertices.
-
-    Returns
-    -------
-    C : float ndarray (k, k)
+    kind, n, every, laplacian, commute, oriented : see :func:`fit_descriptors`
     """
-    ends = source, target
-    F, products, turns = [], [], []
-    for (ev, Phi, area, T), (other, *_), mark in zip(ends, ends[::-1], marks, strict=True):
-        kernel = FILTERS[kind](ev, other, n=n)[::every]
-        f = signature(Phi, kernel)
-        if mark is not None:
-            f = np.column_stack([f, landmark_signature(Phi, kernel, mark)])
-        f = f - area @ f
-        f /= np.sqrt(area @ f**2)
-        B = Phi[:, :k]
-        F.append(B.T @ (area[:, None] * f))
-        products.append(multiplication(B, area, f) if commute else None)
-        turns.append(orientation(T, B, f) if oriented else None)
-    operators = [
-        (w / (P**2).sum(), P, Q) for w, (P, Q) in ((commute, products), (oriented, turns)) if w
-    ]
-    ev, ev_target = (e[0][:k] for e in ends)
+    F, products, turns = [], [], []  # of source and target
+    for end, other, landmark in zip((source, target), (target, source), landmarks, strict=True):
+        kernel = FILTERS[kind](end.eigenvalue, other.eigenvalue, n=n)[::every]
+        f = signature(end.Phi, kernel)  # (n, d)
+        if landmark is not None:
+            f = np.column_stack([f, landmark_signature(end.Phi, kernel, landmark)])
+        f = f - end.area @ f
+        f /= np.sqrt(end.area @ f**2)
+        Phi = end.Phi[:, :k]
+        F.append(Phi.T @ (end.area[:, None] * f))  # (k, d)
+        products.append(multiplication(Phi, end.area, f) if commute else None)
+        turns.append(orientation(end.T, Phi, f) if oriented else None)
+    operators = []
+    for weight, (P, Q) in ((commute, products), (oriented, turns)):
+        if weight:
+            operators.append((weight / (P**2).sum(), P, Q))
     size = np.linalg.norm(F[0])
-    penalty = laplacian * ((ev_target[:, None] - ev) / max(ev[-1], ev_target[-1])) ** 2
-    constant = np.sign(ends[0][1][0, 0] * ends[1][1][0, 0])
-    return fit(F[0] / size, F[1] / size, penalty=penalty, operators=operators, constant=constant)
+    return fit(
+        F[0] / size,
+        F[1] / size,
+        penalty=laplacian * commutator(source.eigenvalue[:k], target.eigenvalue[:k]),
+        operators=operators,
+        constant=constant_to_constant(source, target),
+    )
 
 
 def fit_descriptors(
@@ -348,41 +336,25 @@ def fit_descriptors(
     """
     if kind not in FILTERS:
         raise ValueError(f"kind must be 'wks' or 'hks', found {kind!r}")
-    ends = []
+    variables = ("position", "corner_vertex", "vertex_area", "eigenvalue", "eigenfunction")
     for mesh, what in ((source, "source"), (target, "target")):
-        require(
-            mesh,
-            "position",
-            "corner_vertex",
-            "vertex_area",
-            "eigenvalue",
-            "eigenfunction",
-            what=what,
-        )
+        require(mesh, *variables, what=what)
         if mesh.sizes["mode"] < k:
             raise ValueError(
                 f"the {what} needs {k} eigenfunctions, found {mesh.sizes['mode']}: give a smaller k"
             )
-        area = mesh["vertex_area"].values
-        ends.append(
-            (
-                mesh["eigenvalue"].values,
-                mesh["eigenfunction"].values,
-                area / area.sum(),
-                as_arrays(mesh)[1],
-            )
-        )
-    marks = (None, None) if landmarks is None else [np.asarray(v) for v in landmarks]
+    vertices = [None, None] if landmarks is None else [np.asarray(v) for v in landmarks]
     if landmarks is not None and (
-        len(marks) != 2 or marks[0].shape != marks[1].shape or marks[0].ndim != 1
+        len(vertices) != 2 or vertices[0].shape != vertices[1].shape or vertices[0].ndim != 1
     ):
         raise ValueError(
             f"landmarks need as many vertices of the source as of the target, found {landmarks!r}"
         )
-    C = fmap_of_descriptors(
-        *ends,
+    C = fmap_from_descriptors(
+        Shape(None, source).low,
+        Shape(None, target).low,
         k=k,
-        marks=marks,
+        landmarks=vertices,
         kind=kind,
         n=n,
         every=every,

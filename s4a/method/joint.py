@@ -1,113 +1,86 @@
-"""Joint refinement of a match: the paper's own smoothing (eq. 8 and the line after it), iterated.
+"""Joint rounds: the smoothing of the displacement (4.2, eq. 8 and the line after it), iterated.
 
 The target N carries the match, the source M is searched.  A round moves N onto M with a
 displacement that lives in the first K eigenfunctions of N, then asks for the nearest neighbours in
 position, normal and, with ``spectral > 0``, spectrum together; K grows as in ZoomOut.  The idea of
 coupling both is that of Smooth Shells (Eisenberger, Laehner, Cremers, CVPR 2020).  Where poses are
 far apart, every part of N turns on its own before.  All lengths are for surfaces of unit area.
+
+A *motion* (R, t, c) takes N to R x + t + Phi c, with one R (3, 3) and t (3,) for all of N, or one
+for each vertex of low resolution.
 """
 
-from dataclasses import dataclass, field
-from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from s4a.geometry.align import rigid_transform
 from s4a.geometry.closest import feature_tree, features
-from s4a.geometry.mesh import edge_graph, edges, path_lengths, vertex_normals
-from s4a.method.deform import onto, smoother
-from s4a.method.fmap import fmap_from_match, nearest_rows
+from s4a.geometry.mesh import path_lengths, vertex_normals
+from s4a.method.deform import onto
+from s4a.method.fmap import fmap_from_match
+from s4a.method.nearest import nearest_rows
+from s4a.method.shape import Basis
 
-FAR = 0.035
+FAR = 0.035  # between shapes of one pose the tenth that is farthest lies nearer, see `far_apart`
 
-
-@dataclass(frozen=True)
-class Surface:
-    """What the rounds need of a shape, for unit area.
-
-    ``X (n, 3)`` positions, ``T (m, 3)`` triangles, ``area (n,)`` of sum 1, ``Phi (n_coarse, k)``
-    area-orthonormal eigenfunctions at low resolution; at full resolution with ``U (n, n_coarse)``,
-    whose product with Phi is the basis, and is never formed; ``some (s,)`` the vertices that rounds
-    look at, all by default; ``eigenvalue (k,)``, which only rounds by parts need.
-    """
-
-    X: np.ndarray
-    T: np.ndarray
-    area: np.ndarray
-    Phi: np.ndarray
-    U: object = None
-    some: object = field(default_factory=lambda: slice(None))
-    eigenvalue: object = None
-
-    @cached_property
-    def tree(self):
-        """KD-tree over position and normal, 6 dims."""
-        return feature_tree(self.X, self.T)
-
-    @cached_property
-    def outwards(self):
-        """Rows of ``some`` by the distance from the centre.
-
-        An order that pose and numbering leave as it is.
-        """
-        return np.argsort(((self.X[self.some] - self.area @ self.X) ** 2).sum(1), kind="stable")
-
-    @cached_property
-    def smooth(self):
-        """Coefficients, in the basis, of a field given at ``some``."""
-        return smoother(
-            self.Phi, self.area[self.some], self.U if self.U is None else self.U[self.some]
-        )
-
-    def field(self, c):
-        """The field ``(n, 3)`` with coefficients c in the first columns of the basis."""
-        low = self.Phi[:, : len(c)] @ c
-        return low if self.U is None else self.U @ low
-
-    @cached_property
-    def graph(self):
-        """Edge lengths as a sparse matrix."""
-        return edge_graph(self.X, edges(self.T))
+Motion = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
-def turned(target, R, t):
-    """R x + t ``(n, 3)``, with one R (3, 3) and t (3,), or R (n_coarse, 3, 3) and t (n_coarse.
+class Candidate(NamedTuple):
+    """A registration at low resolution, and its score without truth (lower is better)."""
 
-    3).
-    """
+    score: float
+    match: np.ndarray
+    motion: Motion
+
+
+def turn(target: Basis, R: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """R x + t for every vertex ``(n, 3)``, with one R and t for all, or one a low vertex."""
     if R.ndim == 2:
         return target.X @ R.T + t
-    R, t = (v if target.U is None else target.U @ v for v in (R.reshape(-1, 9), t))
+    R = R.reshape(-1, 9)
+    if target.U is not None:
+        R = target.U @ R  # (n, 9)
+        t = target.U @ t  # (n, 3)
     return np.einsum("nij,nj->ni", R.reshape(-1, 3, 3), target.X) + t
 
 
-def registered(target, motion):
-    """The registered shape R x + t + Phi c ``(n, 3)`` of a target.
-
-    C for the first columns of its basis.
-    """
+def move(target: Basis, motion: Motion) -> np.ndarray:
+    """The registered target R x + t + Phi c ``(n, 3)``."""
     R, t, c = motion
-    return turned(target, R, t) + target.field(c)
+    return turn(target, R, t) + target.field(c)
 
 
-def search(source, target, X, some=slice(None)):
-    """The vertices of the source nearest to (some of) the registered target X in position and normal."""
-    return source.tree.query(features(X, vertex_normals(X, target.T))[some])[1]
+def nearest_vertices(source: Basis, target: Basis, X: np.ndarray, rows=slice(None)) -> np.ndarray:
+    """The vertices of the source nearest in position and normal to rows of the target at X."""
+    return source.tree.query(features(X, vertex_normals(X, target.T))[rows])[1]
 
 
-def fitted(source, target, match):
-    """The motion (R, t, c) that brings ``some`` of the target's vertices onto their matches ``(s,)``."""
-    return onto(target.X[target.some], source.X[match], target.area[target.some], target.smooth)
+def fit_motion(source: Basis, target: Basis, match: np.ndarray) -> Motion:
+    """The motion that brings the central vertices of the target onto their matches ``(s,)``."""
+    central = target.central
+    return onto(target.X[central], source.X[match], target.area[central], target.smooth)
 
 
 def low_rounds(
-    source, target, match, *, k_first=30, k=100, step=5, rounds=2, spectral=0.0, by_parts=False
-):
+    source: Basis,
+    target: Basis,
+    match: np.ndarray,
+    *,
+    k_first: int = 30,
+    k: int = 100,
+    step: int = 5,
+    rounds: int = 2,
+    spectral: float = 0.0,
+    by_parts: bool = False,
+) -> tuple[np.ndarray, Motion]:
     """Joint rounds on low-resolution meshes, for K = k_first, k_first + step, ..., k.
 
     Parameters
     ----------
-    source, target : Surface
+    source, target : Basis
+        At low resolution.
     match : int ndarray (n_target,)
         Start, for example of ZoomOut.
     spectral : float
@@ -121,40 +94,40 @@ def low_rounds(
     -------
     match : int ndarray (n_target,)
     motion : tuple (R, t, c)
-        See :func:`registered`.
     """
-    k = min(k, target.Phi.shape[1], source.Phi.shape[1])
+    k = min(k, target.k, source.k)
+    normals = vertex_normals(source.X, source.T) if spectral else None
     for K in [*range(min(k_first, k), k, step), k]:
         Phi = target.Phi[:, :K]
+        spectrum = (Phi, target.eigenvalue[:K]) if by_parts else None
+
+        def coefficients(d, Phi=Phi):
+            return Phi.T @ (target.area[:, None] * d)  # (K, 3)
+
         for _ in range(rounds):
-            motion = onto(
-                target.X,
-                source.X[match],
-                target.area,
-                lambda d, Phi=Phi: Phi.T @ (target.area[:, None] * d),
-                (Phi, target.eigenvalue[:K]) if by_parts else None,
-            )
-            X = registered(target, motion)
+            motion = onto(target.X, source.X[match], target.area, coefficients, spectrum)
+            X = move(target, motion)
             if not spectral:
-                match = search(source, target, X)
+                match = nearest_vertices(source, target, X)
                 continue
-            w = spectral / np.sqrt(K)
+            weight = spectral / np.sqrt(K)
             C = fmap_from_match(source.Phi[:, :K], Phi, target.area, match)
             match = nearest_rows(
-                features(X, vertex_normals(X, target.T), w * Phi),
-                features(source.X, vertex_normals(source.X, source.T), w * source.Phi[:, :K] @ C.T),
+                features(X, vertex_normals(X, target.T), weight * Phi),
+                features(source.X, normals, weight * source.Phi[:, :K] @ C.T),
             )
     return match, motion
 
 
-def dense_rounds(source, target, motion, *, rounds=3):
-    """Joint rounds at full resolution, on ``some`` vertices of the target.
-
-    Motions of its parts stay as they are.
+def dense_rounds(
+    source: Basis, target: Basis, motion: Motion, *, rounds: int = 3
+) -> tuple[np.ndarray, Motion]:
+    """Joint rounds at full resolution, on the central vertices; motions of parts stay as they are.
 
     Parameters
     ----------
-    source, target : Surface
+    source, target : Basis
+        At full resolution.
     motion : tuple (R, t, c)
         The end of the low rounds.
 
@@ -163,64 +136,79 @@ def dense_rounds(source, target, motion, *, rounds=3):
     match : int ndarray (s,)
     motion : tuple (R, t, c)
     """
-    match = search(source, target, registered(target, motion), target.some)
+    match = nearest_vertices(source, target, move(target, motion), target.central)
     R, t, _ = motion
     for _ in range(rounds):
         if R.ndim == 2:
-            motion = fitted(source, target, match)
+            motion = fit_motion(source, target, match)
         else:
-            motion = R, t, target.smooth(source.X[match] - turned(target, R, t)[target.some])
-        match = search(source, target, registered(target, motion), target.some)
+            motion = R, t, target.smooth(source.X[match] - turn(target, R, t)[target.central])
+        match = nearest_vertices(source, target, move(target, motion), target.central)
     return match, motion
 
 
-def badness(source, target, match, motion, *, n_samples=300, limit=0.5):
-    """Score of a match without truth, lower is better.
-
-    Round trip + gaps between the surfaces, both ways.
+def registration_score(
+    source: Basis,
+    target: Basis,
+    match: np.ndarray,
+    motion: Motion,
+    *,
+    n_samples: int = 300,
+    limit: float = 0.5,
+) -> float:
+    """Score of a registration without truth, lower is better: round trip + gaps, both ways.
 
     The round trip goes from a vertex of the target to its match and back to the vertex whose
     registered position (in position and normal) is nearest, measured along the edges of the target
     and cut at `limit`; the gaps are the mean distances of the registered target and the source, at
-    ``some`` of the vertices of each. Lengths are for unit area.
+    the central vertices of each.  Lengths are for unit area.
 
     Stretch of edges is left out: on heads and brains with known warps it prefers maps that move
     nothing.
 
     Parameters
     ----------
-    source, target : Surface
+    source, target : Basis
+        At one resolution.
     match : int ndarray (s,)
-        For ``some`` vertices of the target.
+        For the central vertices of the target.
     motion : tuple (R, t, c)
     """
-    X = registered(target, motion)
-    tree, some = feature_tree(X, target.T), np.arange(len(X))[target.some]
-    back_gap = np.linalg.norm(
-        source.X[source.some] - X[tree.query(source.tree.data[source.some])[1]], axis=1
-    )
-    gap = np.linalg.norm(X[some] - source.X[match], axis=1)
-    sample = target.outwards[np.linspace(0, len(match) - 1, min(n_samples, len(match))).astype(int)]
-    back = tree.query(source.tree.data[match[sample]])[1]
-    trip = path_lengths(target.graph, some[sample], back, limit)
+    X = move(target, motion)
+    tree = feature_tree(X, target.T)
+    central = np.arange(len(X))[target.central]
+    back = X[tree.query(source.tree.data[source.central])[1]]
+    back_gap = np.linalg.norm(source.X[source.central] - back, axis=1)
+    gap = np.linalg.norm(X[central] - source.X[match], axis=1)
+    n_samples = min(n_samples, len(match))
+    sample = target.outwards[np.linspace(0, len(match) - 1, n_samples).astype(int)]
+    end = tree.query(source.tree.data[match[sample]])[1]
+    trip = path_lengths(target.graph, central[sample], end, limit)
     return float(trip.mean() + gap.mean() + back_gap.mean())
 
 
-def far_apart(source, target, match):
-    """Whether poses differ: a tenth of the target's vertices lie far from their matches after the best rigid motion.
+def far_apart(source: Basis, target: Basis, match: np.ndarray) -> bool:
+    """Whether poses differ: a tenth of the target lies far from its match after a rigid motion.
 
-    Far is 0.035 and 0.4 of the mean spacing 1 / sqrt(n) of the source's vertices, which alone keep
+    Far is 0.035 and 0.4 of the mean spacing 1 / sqrt(n) of the source's vertices, which alone keeps
     matches apart: 0.04 for 6,000.  For nearest neighbours after ICP that tenth lies 0.005 to 0.031
     away between faces, brains, heads or skulls, 0.025 to 0.046 between femurs or vertebrae, 0.044
     to 0.23 between bodies, children or cats in other poses.
     """
     R, t, _ = rigid_transform(target.X, source.X[match], target.area)
-    gap = np.linalg.norm(turned(target, R, t) - source.X[match], axis=1)
+    gap = np.linalg.norm(turn(target, R, t) - source.X[match], axis=1)
     return bool(np.quantile(gap, 0.9) > FAR + 0.4 / np.sqrt(len(source.X)))
 
 
-def candidates(source, target, starts, *, k=100, far=0.03):
-    """Matches at low resolution and their scores: every start as it is, and after joint rounds.
+def candidates(
+    source: Basis,
+    target: Basis,
+    starts: dict[str, np.ndarray],
+    *,
+    k: int = 100,
+    far: float = 0.03,
+) -> dict[str, Candidate]:
+    """Registrations at low resolution: every start as it is, and after joint rounds.
 
     From the better start more rounds, with spectral coordinates, are tried: by parts where all
     starts say that the poses are :func:`far_apart`, else in one piece where the best of these still
@@ -228,7 +216,8 @@ def candidates(source, target, starts, *, k=100, far=0.03):
 
     Parameters
     ----------
-    source, target : Surface
+    source, target : Basis
+        At low resolution.
     starts : dict
         Name -> match (n_target,).
 
@@ -236,36 +225,33 @@ def candidates(source, target, starts, *, k=100, far=0.03):
     -------
     dict
         ``"<start>"``, ``"<start>+joint"``, ``"<start>+joint+spectral"`` or ``"<start>+parts"`` ->
-        :func:`badness`, match (n_target,) and motion (R, t, c).
+        :class:`Candidate`.
     """
-    found = {}
+    tried = {}
 
     def enter(name, match, motion):
-        found[name] = (badness(source, target, match, motion), match, motion)
-        return found[name][0]
+        score = registration_score(source, target, match, motion)
+        tried[name] = Candidate(score, match, motion)
 
     for name, match in starts.items():
-        enter(name, match, fitted(source, target, match))
-    joint = {
-        name: enter(f"{name}+joint", *low_rounds(source, target, match, k=k))
-        for name, match in starts.items()
-    }
-    start = min(joint, key=joint.get)
+        enter(name, match, fit_motion(source, target, match))
+    for name, match in starts.items():
+        enter(f"{name}+joint", *low_rounds(source, target, match, k=k))
+    best = min(starts, key=lambda name: tried[f"{name}+joint"].score)
     if all(far_apart(source, target, match) for match in starts.values()):
         options = {"k_first": 20, "k": k, "rounds": 1, "spectral": 0.2, "by_parts": True}
-        enter(f"{start}+parts", *low_rounds(source, target, starts[start], **options))
-    elif min(score for score, *_ in found.values()) > far:
-        enter(
-            f"{start}+joint+spectral", *low_rounds(source, target, starts[start], k=k, spectral=0.1)
-        )
-    return found
+        enter(f"{best}+parts", *low_rounds(source, target, starts[best], **options))
+    elif min(candidate.score for candidate in tried.values()) > far:
+        end = low_rounds(source, target, starts[best], k=k, spectral=0.1)
+        enter(f"{best}+joint+spectral", *end)
+    return tried
 
 
-def finalists(found, *, margin=1.25):
+def finalists(tried: dict[str, Candidate], *, margin: float = 1.25) -> list[str]:
     """Names of the candidates whose score is within `margin` of the least, at most two, best first.
 
     Scores at low resolution have the coarse sampling in them; near ones can only be told apart at
     full resolution.
     """
-    order = sorted(found, key=lambda name: found[name][0])[:2]
-    return [name for name in order if found[name][0] <= margin * found[order[0]][0]]
+    order = sorted(tried, key=lambda name: tried[name].score)[:2]
+    return [name for name in order if tried[name].score <= margin * tried[order[0]].score]

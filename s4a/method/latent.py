@@ -6,20 +6,28 @@ U_i Phi_i Y_i.
 """
 
 import logging
+from collections.abc import Callable
 
 import numpy as np
 from joblib import Parallel, delayed
 from scipy.sparse.csgraph import breadth_first_order
 from scipy.sparse.linalg import LinearOperator, eigsh
 
-from s4a.method.fmap import nearly_nearest, queries, searched
+from s4a.method.fmap import fmap_from_match
+from s4a.method.nearest import (
+    columns_with_norm,
+    nearest_in_single,
+    nearest_rows,
+    rows_with_minus_one,
+)
 from s4a.method.network import cycle_errors, cycle_weights, three_cycles
+from s4a.method.shape import Basis
 
 log = logging.getLogger(__name__)
 
+FINAL = 3  # shapes of a study in the last rounds of a new one, on all vertices
 WIDE = 4  # last rounds of Consistent ZoomOut, which look among all vertices
 ROUGH, FINE = 1e-4, 1e-6  # tolerances of the latent basis: on the way, and at the end
-SAMPLES = 1000  # vertices per shape whose matches Consistent ZoomOut looks for
 
 
 def consistency_form(C, source, target, weight, n, *, dtype=float, n_jobs=1):
@@ -177,46 +185,40 @@ def latent_size(n_latent, k, k_final):
 
 
 def consistent_zoomout(
-    C,
-    source,
-    target,
-    Phi,
-    area,
-    eigenvalues,
-    k,
+    bases: list[Basis],
+    C: np.ndarray,
+    source: np.ndarray,
+    target: np.ndarray,
+    k: int,
     *,
-    step=5,
-    n_latent=None,
-    samples=None,
-    n_jobs=1,
-    progress=None,
-):
-    """Consistent ZoomOut: latent basis -> matches -> larger maps.
-
-    Until all maps of the network are k x k.
+    step: int = 5,
+    n_latent: int | None = None,
+    samples: list[np.ndarray] | None = None,
+    n_jobs: int | None = 1,
+    progress: Callable | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Consistent ZoomOut (4.2): latent basis -> matches -> larger maps, until all are k x k.
 
     Each round embeds every shape in the latent space (rows of Phi_i Y_i), matches nearest
     neighbours for every map (eq. 3) and solves for the next larger maps in the least-squares sense,
     on `samples` only; the factor of the least squares is made once per shape.  In the last rounds
     (``WIDE``) the samples look among all vertices of the source: among its samples they are off by
-    the spacing of these.
-
-    The latent basis is found to ``ROUGH`` on the way and to ``FINE`` at the end: for 51 brains of
-    100,000 vertices a sixth less time than ``FINE`` throughout, and the same error of eq. 7 (1.780
-    for 1.779 % of sqrt(area)).
-
-    Of 1,000 maps of 51 brains a round takes 3 s of CPU from samples to samples and 15 s among all
-    vertices at k = 100; from all vertices to all, 80 s, it closes cycles little better (0.073 for
-    0.092) and is no nearer to the truth.  Eq. 7 on six faces with 0, 1, 2, 4, 8, 16 wide rounds:
-    0.25, 0.14, 0.09, 0.07, 0.06, 0.05 % of sqrt(area).
+    the spacing of these.  The latent basis is found to ``ROUGH`` on the way and to ``FINE`` at the
+    end.
 
     Parameters
     ----------
+    bases : list of Basis
+        The shapes of the network at low resolution, with k functions or more.
     C : float ndarray (p, k_init, k_init)
     source, target : int ndarray (p,)
-    Phi : list of float ndarray (n_i, >= k)
-    area : list of float ndarray (n_i,), each of sum 1
-    eigenvalues : float ndarray (n, >= k)
+        Which shape's functions each map takes, and on which it gives functions.
+    k : int
+        Final size.
+    step : int
+        Growth per round.
+    n_latent : int, optional
+        Latent dimension at the end; k by default.
     samples : list of int ndarray, optional
         Spread vertices of every shape; all vertices by default.
     n_jobs : int
@@ -232,16 +234,9 @@ def consistent_zoomout(
     Y, latent_eigenvalue : as of :func:`latent_basis`
     """
     cycles = three_cycles(source.tolist(), target.tolist())
+    eigenvalues = np.stack([basis.eigenvalue[:k] for basis in bases])
     sizes = [*range(C.shape[1], k, step), k]
-    shapes, everything = range(len(area)), [np.arange(len(a)) for a in area]
-    into = [source[target == j] for j in shapes]
-    row = np.argsort(np.argsort(target, kind="stable"), kind="stable")
-
-    def in_threads(function, *arguments):
-        return Parallel(n_jobs=n_jobs, backend="threading")(
-            delayed(function)(*a) for a in zip(*arguments, strict=True)
-        )
-
+    everything = [np.arange(len(basis.area)) for basis in bases]
     samples = everything if samples is None else samples
     for size, larger in zip(sizes, [*sizes[1:], None], strict=True):
         error = cycle_errors(C, cycles, n_jobs=n_jobs)
@@ -253,18 +248,141 @@ def consistent_zoomout(
         )
         if progress:
             progress(size)
-        if larger is None:
-            break
-        among = everything if size in sizes[:-1][-WIDE:] else samples
-        rows = in_threads(lambda F, v, y: searched(F[v, : len(y)] @ y), Phi, among, Y)
-
-        def larger_maps(j, size=size, larger=larger, among=among, rows=rows, Y=Y):
-            F, w = Phi[j][samples[j], :larger], np.sqrt(area[j][samples[j]])
-            q, solve = queries(F[:, :size] @ Y[j]), np.linalg.pinv(F * w[:, None]) * w
-            return [
-                solve @ Phi[i].take(among[i][nearly_nearest(q, rows[i])], axis=0)[:, :larger]
-                for i in into[j]
-            ]
-
-        C = np.stack([c for maps in in_threads(larger_maps, shapes) for c in maps])[row]
+        if larger:
+            among = everything if size in sizes[:-1][-WIDE:] else samples
+            C = larger_maps(bases, Y, source, target, larger, samples, among, n_jobs)
     return C, weight, error, Y, latent_eigenvalue
+
+
+def larger_maps(
+    bases: list[Basis],
+    Y: np.ndarray,
+    source: np.ndarray,
+    target: np.ndarray,
+    k: int,
+    samples: list[np.ndarray],
+    among: list[np.ndarray],
+    n_jobs: int | None = 1,
+) -> np.ndarray:
+    """Maps ``(p, k, k)`` from the matches of latent functions (eq. 3), one step of ZoomOut each.
+
+    Parameters
+    ----------
+    Y : float ndarray (n, size, m)
+        Latent bases, of a smaller size.
+    samples, among : list of int ndarray
+        Vertices of every shape for which matches are looked for, and among which.
+    """
+    size = Y.shape[1]
+
+    def latent_rows(basis, vertices, y):
+        return columns_with_norm(basis.Phi[vertices, :size] @ y)
+
+    def maps_into(j):
+        """The maps into shape j: its least squares are factored once."""
+        F = bases[j].Phi[samples[j], :k]
+        root = np.sqrt(bases[j].area[samples[j]])
+        solve = np.linalg.pinv(F * root[:, None]) * root  # (k, s)
+        query = rows_with_minus_one(F[:, :size] @ Y[j])
+        maps = []
+        for i in source[target == j]:
+            match = among[i][nearest_in_single(query, rows[i])]
+            maps.append(solve @ bases[i].Phi.take(match, axis=0)[:, :k])
+        return maps
+
+    threads = Parallel(n_jobs=n_jobs, backend="threading")
+    rows = threads(map(delayed(latent_rows), bases, among, Y))
+    by_target = threads(delayed(maps_into)(j) for j in range(len(bases)))
+    C = np.stack([map_ for maps in by_target for map_ in maps])
+    given_order = np.argsort(np.argsort(target, kind="stable"), kind="stable")
+    return C[given_order]
+
+
+def frozen_basis(C_out: np.ndarray, C_in: np.ndarray, Y: np.ndarray) -> np.ndarray:
+    """Latent basis of one shape from its maps to and from others whose bases stay (eq. 3).
+
+    One block of the unknowns of :func:`latent_basis`: minimises
+    sum_j |C_out_j Y_new - Y_j|^2 + |C_in_j Y_j - Y_new|^2.
+
+    Parameters
+    ----------
+    C_out, C_in : float ndarray (p, k, k)
+        Functional maps from the new shape to the others, and from them to it.
+    Y : float ndarray (p, k, m)
+        The others' bases.
+
+    Returns
+    -------
+    float ndarray (k, m)
+
+    Examples
+    --------
+    >>> Y = np.array([[[1.0], [2.0]]])
+    >>> frozen_basis(np.eye(2)[None], np.eye(2)[None], Y).tolist()
+    [[1.0], [2.0]]
+    """
+    k = C_out.shape[1]
+    left = len(Y) * np.eye(k) + np.einsum("pab,pac->bc", C_out, C_out)
+    right = np.einsum("pab,pac->bc", C_out, Y) + np.einsum("pab,pbc->ac", C_in, Y)
+    return np.linalg.solve(left, right)
+
+
+def latent_basis_of_new(
+    new: Basis,
+    others: list[Basis],
+    Y: np.ndarray,
+    C: list[np.ndarray],
+    *,
+    step: int = 5,
+    rounds: int = 2,
+) -> np.ndarray:
+    """Latent basis of a new shape, those of all others frozen: Consistent ZoomOut of one shape.
+
+    It starts from the first maps of the others; in every round the rows of the first latent
+    functions are matched with those of each of the others, on samples, and more of the functions
+    carried over; the last rounds use all vertices.
+
+    Parameters
+    ----------
+    new : Basis
+    others : list of Basis
+    Y : float ndarray (p, k, m)
+        Latent bases of the others.
+    C : list of float ndarray (k_init, k_init)
+        First maps from each of the others to the new shape.
+    step : int
+        Growth per round.
+    rounds : int
+        Of :func:`frozen_basis`, with the first ``FINAL`` of the others.
+
+    Returns
+    -------
+    float ndarray (k, m)
+    """
+    _, k, m = Y.shape
+    k_init = len(C[0])
+    F = [other.Phi[:, :k] @ y for other, y in zip(others, Y, strict=True)]  # latent functions
+    y = np.mean(
+        [c @ y[:k_init, : min(k_init, m)] for c, y in zip(C, Y, strict=True)], axis=0
+    )  # (k_init, <= m)
+    root = np.sqrt(new.area[new.spread])
+    while len(y) < k:
+        size = min(len(y) + step, k)
+        query = new.Phi[new.spread, : len(y)] @ y
+        solve = np.linalg.pinv(new.Phi[new.spread, :size] * root[:, None]) * root
+        carried = 0
+        for other, functions in zip(others, F, strict=True):
+            rows = functions[other.spread]
+            match = nearest_rows(query, rows[:, : query.shape[1]])
+            carried = carried + rows[match, : min(size, m)]
+        y = solve @ carried / len(others)
+    Phi = new.Phi[:, :k]
+    for _ in range(rounds):
+        query = Phi @ y
+        C_out, C_in = [], []
+        for other, functions in zip(others[:FINAL], F, strict=False):
+            Psi = other.Phi[:, :k]
+            C_out.append(fmap_from_match(Phi, Psi, other.area, nearest_rows(functions, query)))
+            C_in.append(fmap_from_match(Psi, Phi, new.area, nearest_rows(query, functions)))
+        y = frozen_basis(np.stack(C_out), np.stack(C_in), Y[:FINAL])
+    return y

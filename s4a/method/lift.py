@@ -130,11 +130,11 @@ def lift(X, T, area, U, coarse, k):
     >>> import s4a
     >>> from s4a.geometry.mesh import as_arrays, vertex_areas
     >>> from s4a.method.lift import lift
-    >>> from s4a.method.register import Scan
+    >>> from s4a.method.shape import Shape
     >>> ball = s4a.synthetic.sphere(2000)
-    >>> scan = Scan(ball, s4a.spectrum(s4a.coarsen(ball, n_coarse=300), k=16))
+    >>> shape = Shape(ball, s4a.spectrum(s4a.coarsen(ball, n_coarse=300), k=16))
     >>> X, T = as_arrays(ball)
-    >>> (lift(X, T, vertex_areas(X, T), scan.U, scan.coarse, 9)[0] / (4 * np.pi)).round(1).tolist()
+    >>> (lift(X, T, vertex_areas(X, T), shape.U, shape.coarse, 9)[0] / (4 * np.pi)).round(1).tolist()
     [0.0, 2.0, 2.0, 2.0, 6.0, 6.0, 6.0, 6.0, 6.0]
     """
     E, w, area, _ = laplacian(X, T, area)

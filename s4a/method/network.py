@@ -8,10 +8,6 @@ import itertools
 import numpy as np
 from joblib import Parallel, delayed
 from scipy.sparse.csgraph import connected_components, shortest_path
-from scipy.spatial import cKDTree
-
-from s4a.geometry.align import farthest_points
-from s4a.method import fmap
 
 
 def spectral_distance(eigenvalues):
@@ -82,45 +78,6 @@ def choose_pairs(distance, n_pairs):
     )
     wanted = dict.fromkeys((min(p), max(p)) for p in [*tree, *closing, *rest])
     return np.array(sorted(itertools.islice(wanted, int(n_pairs))))
-
-
-def first_map(source, target, motion, *, k_init=20, init="dense", n_landmarks=10, near=None):
-    """First functional map of a directed pair (4.1, steps 2 to 4).
-
-    With one ZoomOut step ahead (4.2).
-
-    Parameters
-    ----------
-    source, target : tuple (X, area, Phi, eigenvalue)
-        Low-resolution vertices (n, 3), their areas of sum 1, eigenfunctions and eigenvalues.
-    motion : tuple (R, t)
-        Rigid motion of the source onto the target.
-    init : {"dense", "landmarks"}
-        From all vertices' nearest neighbours, or the paper's fit on `n_landmarks` farthest points.
-    near : int ndarray (n_target,), optional
-        The nearest neighbours, where they are known.
-
-    Returns
-    -------
-    C : float ndarray (k_init, k_init)
-    """
-    (X, _, Phi, ev), (Y, area, Psi, ev_target) = source, target
-    Phi, Psi = Phi[:, :k_init], Psi[:, :k_init]
-    moved = X @ motion[0].T + motion[1]
-    if init == "landmarks":
-        landmark = farthest_points(X, n_landmarks)
-        C = fmap.fit_landmarks(
-            Phi,
-            Psi,
-            ev[:k_init],
-            ev_target[:k_init],
-            landmark,
-            cKDTree(Y).query(moved[landmark])[1],
-        )
-    else:
-        near = cKDTree(moved).query(Y)[1] if near is None else near
-        C = fmap.fmap_from_match(Phi, Psi, area, near)
-    return fmap.once_refined(C, Phi, Psi, area)
 
 
 def three_cycles(source, target):

@@ -266,3 +266,37 @@ def color_limits(
     along = np.quantile(np.abs(normal_displacement(steps, vertex_normals(mean, triangles))), 0.95)
     length = np.quantile(np.linalg.norm(steps, axis=2), 0.95)
     return float(sigma * along) or 1.0, float(sigma * length) or 1.0
+
+
+def project_scores(
+    d: np.ndarray,
+    mean: np.ndarray,
+    deformation: np.ndarray,
+    standard_deviation: np.ndarray,
+    area: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Scores of displacements on given modes, and what the modes leave.
+
+    Parameters
+    ----------
+    d : float ndarray (s, n, 3)
+    mean : (n, 3), deformation : (c, n, 3), standard_deviation : (c,)
+        As of :func:`gram_pca`.
+    area : float ndarray (n,)
+
+    Returns
+    -------
+    score : (s, c), in standard deviations
+    residual : (s,), root mean square over the area of what is left
+    """
+    w = area / area.sum()
+    scores, residuals = [], []
+    for field in d:  # one by one, so that the last digit does not depend on the others
+        x = np.asarray(field, float) - mean
+        along = np.einsum("cnx,nx->c", deformation, x * w[:, None], optimize=True)
+        score = along / standard_deviation**2
+        total = np.einsum("nx,nx,n->", x, x, w, optimize=True)
+        left = total - ((score * standard_deviation) ** 2).sum()
+        scores.append(score)
+        residuals.append(np.sqrt(max(left, 0.0)))
+    return np.array(scores), np.array(residuals)

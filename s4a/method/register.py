@@ -1,100 +1,73 @@
-"""Registration at full resolution (eq. 3, 4, 6 and 7).
+"""Registration (4.2; eq. 3, 4, 6, 7, 8): one shape onto the template at full resolution, and back.
 
-One shape onto one template, and the way back.
+The source is the shape, the target the template: a match holds, on every vertex of the template, a
+vertex of the shape.
 """
 
-import logging
-from dataclasses import dataclass
-from functools import cached_property
-
 import numpy as np
-import scipy.sparse as sp
+import xarray as xr
 
 from s4a.geometry.closest import closest_point_in_star, feature_tree
 from s4a.geometry.mesh import as_arrays, vertex_areas
-from s4a.method import fmap, joint
+from s4a.method import joint
 from s4a.method.deform import displacement_in_template
-from s4a.method.nearest import nearest_in_cells, nearest_of_few
+from s4a.method.first_map import nearest_after_motion
+from s4a.method.fmap import fmap_from_match
+from s4a.method.nearest import nearest_in_cells, nearest_of_few, nearest_rows
+from s4a.method.shape import Shape
 from s4a.schema import INPUT, dataset, in_unit
 
-log = logging.getLogger(__name__)
+CONFIDENCE_LENGTH = 0.02  # share of sqrt(area) at which the confidence has fallen to 1 / e
 
-CONFIDENCE_LENGTH = 0.02
-N_CENTRAL = 25_000  # vertices by which dense rounds move a shape
-
-
-@dataclass(frozen=True)
-class Scan:
-    """One shape at both resolutions, centred and scaled to unit area: x -> (x - center) / size."""
-
-    original: object
-    coarse: object
-
-    @cached_property
-    def frame(self):
-        """Area centroid (3,) and the square root of the total area, in the unit of the input."""
-        X, T = as_arrays(self.original)
-        area = vertex_areas(X, T)
-        return area @ X / area.sum(), np.sqrt(area.sum())
-
-    @cached_property
-    def U(self):
-        """The projection operator of 4.1 as a sparse matrix (n, n_coarse)."""
-        columns, weights = self.coarse["coarse_vertex"].values, self.coarse["coarse_weight"].values
-        rows = np.repeat(np.arange(len(columns)), columns.shape[1])
-        return sp.csr_matrix(
-            (weights.ravel(), (rows, columns.ravel())), (len(columns), self.coarse.sizes["vertex"])
-        )
-
-    @cached_property
-    def cell(self):
-        """The coarse vertex that weighs most in each original vertex (n,)."""
-        columns, weights = self.coarse["coarse_vertex"].values, self.coarse["coarse_weight"].values
-        return columns[np.arange(len(columns)), weights.argmax(1)]
-
-    @cached_property
-    def eigenvalue(self):
-        """Eigenvalues of the coarse mesh (k,)."""
-        return self.coarse["eigenvalue"].values
-
-    @cached_property
-    def low(self):
-        """The low-resolution :class:`s4a.method.joint.Surface`."""
-        X, T = as_arrays(self.coarse)
-        area = self.coarse["vertex_area"].values
-        center, size = self.frame
-        return joint.Surface(
-            (X - center) / size,
-            T,
-            area / area.sum(),
-            self.coarse["eigenfunction"].values,
-            eigenvalue=self.eigenvalue,
-        )
-
-    @cached_property
-    def dense(self):
-        """The full-resolution :class:`s4a.method.joint.Surface`, with the basis U Phi."""
-        X, T = as_arrays(self.original)
-        center, size = self.frame
-        X = (X - center) / size
-        return joint.Surface(X, T, vertex_areas(X, T), self.low.Phi, self.U, self.central)
-
-    @cached_property
-    def central(self):
-        """The N_CENTRAL original vertices with the largest weights of U.
-
-        Thus nearest to coarse ones; all of few.
-        """
-        weight = self.coarse["coarse_weight"].values.max(1)
-        if len(weight) <= N_CENTRAL:
-            return np.arange(len(weight))
-        return np.flatnonzero(weight >= np.partition(weight, -N_CENTRAL)[-N_CENTRAL])
+Functions = tuple[np.ndarray, np.ndarray]  # of source and target, rows of which are compared
 
 
-def intrinsic_match(source, target, F_source, F_target):
-    """Full-resolution match by nearest rows of U F.
+def match_latent(
+    source: Shape, target: Shape, bases: Functions, *, how: str = "ours"
+) -> tuple[np.ndarray, Functions]:
+    """Match at low resolution (eq. 6), and the functions whose rows full resolution compares.
 
-    Eq. 7 with F = Phi Y, eq. 4 with F = Phi C^T and Psi.
+    Parameters
+    ----------
+    source, target : Shape
+    bases : tuple of float ndarray (k, m)
+        Consistent latent bases Y of source and target.
+    how : {"ours", "standard"}
+        Functions Phi Y for eq. 7, or those of the functional map of the match for eq. 4.
+
+    Returns
+    -------
+    match : int ndarray (n_coarse_target,)
+    functions : tuple of float ndarray (n_coarse, m)
+    """
+    functions = latent_functions(source, target, bases)
+    if how == "standard":
+        functions = mapped_functions(source, target, functions, len(bases[0]))
+    F_source, F_target = functions
+    return nearest_rows(F_target, F_source), functions  # eq. 6, or eq. 2 of the map
+
+
+def latent_functions(source: Shape, target: Shape, bases: Functions) -> Functions:
+    """The latent functions Phi Y of both ``(n_coarse, m)``, whose rows eq. 6 and 7 compare."""
+    Y_source, Y_target = bases  # (k, m) each
+    k = len(Y_source)
+    return source.low.Phi[:, :k] @ Y_source, target.low.Phi[:, :k] @ Y_target
+
+
+def mapped_functions(source: Shape, target: Shape, functions: Functions, k: int) -> Functions:
+    """Phi C^T and Psi with the k x k map C of the match of eq. 3: the standard way's, for eq. 4."""
+    F_source, F_target = functions
+    match = nearest_rows(F_target, F_source)
+    Phi = source.low.Phi[:, :k]
+    Psi = target.low.Phi[:, :k]
+    C = fmap_from_match(Phi, Psi, target.low.mass, match)
+    return Phi @ C.T, Psi
+
+
+def match_functions(
+    source: Shape, target: Shape, F_source: np.ndarray, F_target: np.ndarray
+) -> tuple[np.ndarray, float, float]:
+    """Match at full resolution by nearest rows of U F: eq. 7 with F = Phi Y, eq. 4 with Phi C^T.
 
     Functions that have a row for every original vertex are taken as they are.
 
@@ -104,173 +77,98 @@ def intrinsic_match(source, target, F_source, F_target):
     compared, certified : float
         Shares of :func:`s4a.method.nearest.nearest_in_cells`.
     """
-    Q, D = (
-        F if len(F) == len(end.cell) else end.U @ F.astype(np.float32)
-        for end, F in ((target, F_target), (source, F_source))
-    )
-    return nearest_in_cells(Q, target.cell, D, source.cell)
+    queries = target.full.extend(F_target)  # (n_target, m)
+    rows = source.full.extend(F_source)  # (n_source, m)
+    return nearest_in_cells(queries, target.cell, rows, source.cell)
 
 
-def sharpened(C, B_source, Phi_target, area_target, cell_source):
-    """One more round of ZoomOut in which the target's coarse vertices look among all vertices of the source.
+def sharpen_map(
+    source: Shape, target: Shape, C: np.ndarray, B: np.ndarray | None = None
+) -> np.ndarray:
+    """One more round of ZoomOut: coarse target vertices look among all vertices of the source.
 
     ZoomOut on the coarse meshes can only match coarse vertices, half their spacing off; that noise
     is in its C.
 
     Parameters
     ----------
+    source, target : Shape
     C : float ndarray (k_target, k_source)
-    B_source : float ndarray (n_source, >= k_source)
-        The source's basis at all its vertices, as U Phi.
-    Phi_target : float ndarray (n_coarse_target, >= k_target)
-    area_target : float ndarray (n_coarse_target,), of sum 1
-    cell_source : int ndarray (n_source,)
+    B : float ndarray (n_source, >= k_source), optional
+        Functions of the source at all its vertices; U Phi by default.
 
     Returns
     -------
     C : float ndarray (k_target, k_source)
     """
     k_target, k_source = C.shape
-    B, Psi = B_source[:, :k_source], Phi_target[:, :k_target]
-    return fmap.fmap_from_match(
-        B, Psi, area_target, nearest_of_few(Psi, B @ C.T.astype(B.dtype), cell_source)
-    )
+    if B is None:
+        Phi = source.low.Phi[:, :k_source]
+        B = source.U.astype(np.float32) @ Phi.astype(np.float32)
+    B = B[:, :k_source]
+    Psi = target.low.Phi[:, :k_target]
+    match = nearest_of_few(Psi, B @ C.T.astype(B.dtype), source.cell)
+    return fmap_from_match(B, Psi, target.low.mass, match)
 
 
-def register(source, target, match_low, embeddings, *, k=100, refine="joint"):
-    """Registers the target (the template) to the source at full resolution.
+def from_latent(
+    source: Shape,
+    target: Shape,
+    bases: Functions,
+    motion: tuple[np.ndarray, np.ndarray],
+    *,
+    how: str = "ours",
+    refine: str = "joint",
+    scale: bool = False,
+) -> xr.Dataset:
+    """One shape registered by the latent bases of a network: eq. 6, then 7 (or 3 and 4), then 8.
 
     Parameters
     ----------
-    source, target : Scan
-    match_low : dict
-        Name -> match (n_target_coarse,): starts at low resolution; "intrinsic" must be among them.
-    embeddings : tuple (F_source, F_target)
-        Functions on both coarse meshes for the dense intrinsic match.
+    source, target : Shape
+        The shape and the template.
+    bases : tuple of float ndarray (k, m)
+        Their consistent latent bases Y.
+    motion : tuple (R, t)
+        Rigid motion of the shape onto the template, the start of one candidate.
+    how, refine, scale : see :func:`s4a.analyse`
+
+    Returns
+    -------
+    xarray.Dataset
+        As of :func:`register`.
+    """
+    match, functions = match_latent(source, target, bases, how=how)
+    near = nearest_after_motion(source.low, target.low, motion)
+    starts = {"intrinsic": match, "icp": near}
+    return register(source, target, starts, functions, k=len(bases[0]), refine=refine, scale=scale)
+
+
+def register(
+    source: Shape,
+    target: Shape,
+    starts: dict[str, np.ndarray],
+    functions: Functions,
+    *,
+    k: int = 100,
+    refine: str = "joint",
+    scale: bool = False,
+) -> xr.Dataset:
+    """One shape's file of ``/registration``: match, displacement, motion, confidence, way back.
+
+    Parameters
+    ----------
+    source, target : Shape
+        The shape and the template.
+    starts : dict
+        Name -> match (n_coarse_target,): starts at low resolution; "intrinsic" is among them.
+    functions : tuple (F_source, F_target)
+        Functions on both coarse meshes for the match at full resolution, see
+        :func:`match_functions`.
+    k : int
+        Functions in which the displacement lives.
     refine : {"joint", "intrinsic"}
-
-    Returns
-    -------
-    match : int ndarray (n_target,)
-    image : float ndarray (n_target, 3)
-        Registered template in the frame and unit of the source, smooth.
-    info : dict
-        ``method`` (the candidate kept), ``score`` (its badness at full resolution),
-        ``score_<candidate>`` of each at low resolution.
-    """
-    low = {} if refine == "intrinsic" else joint.candidates(source.low, target.low, match_low, k=k)
-    return at_full_resolution(source, target, low, embeddings)
-
-
-def at_full_resolution(source, target, low, embeddings):
-    """Second half of :func:`register`.
-
-    From the candidates `low` of :func:`s4a.method.joint.candidates`, or none.
-    """
-    info = {f"score_{name}": score for name, (score, *_) in low.items()}
-    M, N, dense = source.dense, target.dense, {}
-    for name in joint.finalists(low) if low else ["intrinsic"]:
-        if name == "intrinsic":
-            match, info["compared_share"], info["certified_share"] = intrinsic_match(
-                source, target, *embeddings
-            )
-            motion = joint.fitted(M, N, match[N.some])
-            dense[name] = joint.badness(M, N, match[N.some], motion), motion
-        else:
-            dense[name] = (
-                joint.badness(M, N, *(found := joint.dense_rounds(M, N, low[name][2]))),
-                found[1],
-            )
-    method = min(dense, key=lambda name: dense[name][0])
-    score, motion = dense[method]
-    X = joint.registered(N, motion)
-    if method != "intrinsic":
-        match = joint.search(M, N, X)
-    info |= {"method": method, "score": score}
-    center, size = source.frame
-    return match, X * size + center, info
-
-
-def way_back(source, target, image):
-    """For every vertex of the source the closest point of the registered template.
-
-    With agreeing normal.
-
-    The nearest template vertex in position and normal is looked up first, then the closest point on
-    the triangles around it.
-
-    Returns
-    -------
-    triangle : int ndarray (n_source,)
-    barycentric : float ndarray (n_source, 3)
-    """
-    center, size = source.frame
-    X, T = (image - center) / size, target.dense.T
-    nearest = feature_tree(X, T).query(source.dense.tree.data)[1]
-    return closest_point_in_star(source.dense.X, nearest, X, T)
-
-
-def round_trip(target, match, triangle, barycentric):
-    """Length of the way template -> shape -> template ``(n_target,)`` as a share of sqrt(area).
-
-    The cycle error.
-    """
-    X, T = target.dense.X, target.dense.T
-    back = np.einsum("nc,ncx->nx", barycentric[match], X[T[triangle[match]]])
-    return np.linalg.norm(back - X, axis=1)
-
-
-def confidence(source, target, match, image, triangle, barycentric):
-    """exp(-(r + g) / 0.02) for every template vertex ``(n_target,)``, in 0..1.
-
-    r is :func:`round_trip`, g the gap between the registered template and the matched vertex, both
-    as shares of sqrt(area).
-    """
-    center, size = source.frame
-    gap = np.linalg.norm((image - center) / size - source.dense.X[match], axis=1)
-    return np.exp(-(round_trip(target, match, triangle, barycentric) + gap) / CONFIDENCE_LENGTH)
-
-
-def distortion(image, X, T):
-    """log(a / A) for every vertex ``(n,)``.
-
-    Its share of the area on the registered template, by that on the template.
-
-    0 where nothing is stretched but the size as a whole.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from s4a.method.register import distortion
-    >>> X, T = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]])
-    >>> (distortion(2 * X, X, T) + 0.0).tolist()
-    [0.0, 0.0, 0.0]
-    """
-    share = [
-        np.maximum(a / a.sum(), np.finfo(np.float32).tiny)
-        for a in (vertex_areas(image, T), vertex_areas(X, T))
-    ]
-    return np.log(share[0]) - np.log(share[1])
-
-
-def common_unit(*meshes):
-    """The unit that all meshes say; "unit of the input" where they do not."""
-    units = {mesh.attrs.get("unit") or INPUT for mesh in meshes}
-    return units.pop() if len(units) == 1 else INPUT
-
-
-def registration(source, target, match_low, embeddings, *, k=100, refine="joint", scale=False):
-    """One shape's file of ``/registration``.
-
-    Match, displacement, motion, confidence and the way back.
-
-    Parameters
-    ----------
-    source : Scan
-        The shape.
-    target : Scan
-        The template.
-    match_low, embeddings, k, refine : see :func:`register`
+        Joint rounds, or the spectral match alone.
     scale : bool
         Whether size is taken out of the displacement.
 
@@ -278,25 +176,26 @@ def registration(source, target, match_low, embeddings, *, k=100, refine="joint"
     -------
     xarray.Dataset
         ``registered_match(vertex)``, ``displacement(vertex, xyz)``, ``displacement_raw``,
-        ``displacement_low(low_vertex, xyz)`` of the match of eq. 6 as it is, ``rotation``,
+        ``displacement_low(low_vertex, xyz)`` of the first start as it is (eq. 6), ``rotation``,
         ``translation``, ``scale``, ``confidence(vertex)``, ``round_trip``, ``distortion``,
         ``template_triangle(original_vertex)``, ``template_barycentric``; displacements in the unit
-        of the input, in the template's frame.
+        of the input, in the template's frame.  Attributes ``method``, the candidate that was kept,
+        ``score``, its score at full resolution, and ``score_<candidate>`` at low resolution.
     """
-    match, image, info = register(source, target, match_low, embeddings, k=k, refine=refine)
+    tried = {}
+    if refine == "joint":
+        tried = joint.candidates(source.low, target.low, starts, k=k)
+    match, image, attrs = register_surface(source, target, tried, functions)
     triangle, barycentric = way_back(source, target, image)
     X, T = as_arrays(target.original)
-    displacement, R, t, s = displacement_in_template(X, image, target.dense.area, scale=scale)
+    displacement, R, t, s = displacement_in_template(X, image, target.full.area, scale=scale)
     raw = s * source.original["position"].values[match] @ R.T + t - X
-    low = (
-        s * source.coarse["position"].values[match_low["intrinsic"]] @ R.T
-        + t
-        - target.coarse["position"].values
-    )
-    sure = confidence(source, target, match, image, triangle, barycentric)
+    X_low = target.coarse["position"].values
+    low = s * source.coarse["position"].values[starts["intrinsic"]] @ R.T + t - X_low
     trip = round_trip(target, match, triangle, barycentric)
-    found = dataset(
-        info,
+    sure = confidence(source, match, image, trip)
+    registration = dataset(
+        attrs,
         registered_match=match.astype(np.int32),
         displacement=displacement.astype(np.float32),
         displacement_raw=raw.astype(np.float32),
@@ -306,26 +205,127 @@ def registration(source, target, match_low, embeddings, *, k=100, refine="joint"
         scale=np.array(s),
         confidence=sure.astype(np.float32),
         round_trip=trip.astype(np.float32),
-        distortion=distortion(image, X, T).astype(np.float32),
+        distortion=log_area_ratio(image, X, T).astype(np.float32),
         template_triangle=triangle.astype(np.int32),
         template_barycentric=barycentric,
     )
-    return in_unit(found, common_unit(source.original, target.original))
+    return in_unit(registration, common_unit(source.original, target.original))
 
 
-def identity(target):
-    """The template's own file of ``/registration``: every vertex matches itself, nothing moves."""
-    X, T = as_arrays(target.original)
-    corner = np.argsort(T.ravel(), kind="stable")[
-        np.cumsum(np.bincount(T.ravel(), minlength=len(X))) - 1
-    ]
-    zero = np.zeros(X.shape, np.float32)
-    low = (
-        {}
-        if target.coarse is None
-        else {"displacement_low": np.zeros(target.coarse["position"].shape, np.float32)}
+def register_surface(
+    source: Shape, target: Shape, tried: dict[str, joint.Candidate], functions: Functions
+) -> tuple[np.ndarray, np.ndarray, dict]:
+    """The template registered at full resolution: the best of the finalists of low resolution.
+
+    Parameters
+    ----------
+    source, target : Shape
+    tried : dict
+        Of :func:`s4a.method.joint.candidates`; empty for the spectral match alone.
+    functions : see :func:`register`
+
+    Returns
+    -------
+    match : int ndarray (n_target,)
+    image : float ndarray (n_target, 3)
+        Registered template in the frame and unit of the source's file, smooth.
+    attrs : dict
+        See :func:`register`.
+    """
+    M = source.full
+    N = target.full
+    attrs = {f"score_{name}": candidate.score for name, candidate in tried.items()}
+    ends = {}
+    for name in joint.finalists(tried) if tried else ["intrinsic"]:
+        if name == "intrinsic":
+            match, compared, certified = match_functions(source, target, *functions)
+            attrs |= {"compared_share": compared, "certified_share": certified}
+            central = match[N.central]
+            motion = joint.fit_motion(M, N, central)
+        else:
+            central, motion = joint.dense_rounds(M, N, tried[name].motion)
+        score = joint.registration_score(M, N, central, motion)
+        ends[name] = joint.Candidate(score, central, motion)
+    method = min(ends, key=lambda name: ends[name].score)
+    X = joint.move(N, ends[method].motion)
+    if method != "intrinsic":
+        match = joint.nearest_vertices(M, N, X)
+    attrs |= {"method": method, "score": ends[method].score}
+    return match, source.from_frame(X), attrs
+
+
+def way_back(source: Shape, target: Shape, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """For every vertex of the source the closest point of the registered template.
+
+    The nearest template vertex in position and normal is looked up first, then the closest point on
+    the triangles around it, so that the normals agree.
+
+    Returns
+    -------
+    triangle : int ndarray (n_source,)
+    barycentric : float ndarray (n_source, 3)
+    """
+    X = source.to_frame(image)
+    T = target.full.T
+    nearest = feature_tree(X, T).query(source.full.tree.data)[1]
+    return closest_point_in_star(source.full.X, nearest, X, T)
+
+
+def round_trip(
+    target: Shape, match: np.ndarray, triangle: np.ndarray, barycentric: np.ndarray
+) -> np.ndarray:
+    """Length of the way template -> shape -> template ``(n_target,)``, as a share of sqrt(area)."""
+    X = target.full.X
+    corner = X[target.full.T[triangle[match]]]  # (n_target, 3 corners, 3)
+    back = np.einsum("nc,ncx->nx", barycentric[match], corner)
+    return np.linalg.norm(back - X, axis=1)
+
+
+def confidence(source: Shape, match: np.ndarray, image: np.ndarray, trip: np.ndarray) -> np.ndarray:
+    """exp(-(r + g) / 0.02) for every template vertex ``(n_target,)``, in 0..1.
+
+    r is :func:`round_trip`, g the gap between the registered template and the matched vertex, both
+    as shares of sqrt(area).
+    """
+    gap = np.linalg.norm(source.to_frame(image) - source.full.X[match], axis=1)
+    return np.exp(-(trip + gap) / CONFIDENCE_LENGTH)
+
+
+def log_area_ratio(image: np.ndarray, X: np.ndarray, T: np.ndarray) -> np.ndarray:
+    """log(a / A) for every vertex ``(n,)``: its share of the area after and before registration.
+
+    0 where nothing is stretched but the size as a whole.
+
+    Examples
+    --------
+    >>> X, T = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]])
+    >>> (log_area_ratio(2 * X, X, T) + 0.0).tolist()
+    [0.0, 0.0, 0.0]
+    """
+    after, before = (
+        np.maximum(area / area.sum(), np.finfo(np.float32).tiny)
+        for area in (vertex_areas(image, T), vertex_areas(X, T))
     )
-    found = dataset(
+    return np.log(after) - np.log(before)
+
+
+def common_unit(*meshes: xr.Dataset) -> str:
+    """The unit that all meshes say; "unit of the input" where they do not."""
+    units = {mesh.attrs.get("unit") or INPUT for mesh in meshes}
+    return units.pop() if len(units) == 1 else INPUT
+
+
+def identity(template: Shape) -> xr.Dataset:
+    """The template's own file of ``/registration``: every vertex matches itself, nothing moves."""
+    X, T = as_arrays(template.original)
+    # a corner of every vertex: the last in the order of the vertices
+    last = np.cumsum(np.bincount(T.ravel(), minlength=len(X))) - 1
+    corner = np.argsort(T.ravel(), kind="stable")[last]
+    zero = np.zeros(X.shape, np.float32)
+    low = {}
+    if template.coarse is not None:
+        low["displacement_low"] = np.zeros(template.coarse["position"].shape, np.float32)
+    registration = dataset(
         {"method": "template", "score": 0.0},
         registered_match=np.arange(len(X), dtype=np.int32),
         displacement=zero,
@@ -340,4 +340,4 @@ def identity(target):
         template_barycentric=np.eye(3)[corner % 3],
         **low,
     )
-    return in_unit(found, common_unit(target.original))
+    return in_unit(registration, common_unit(template.original))

@@ -8,11 +8,10 @@ columns of U, rows of sum 1.  The Laplacian is restricted to their span: U^T W U
 U phi, and functional maps live in these phi.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
+import xarray as xr
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
@@ -20,30 +19,11 @@ from s4a.geometry.align import farthest_points
 from s4a.geometry.mesh import as_arrays, edge_graph, stiffness, unique_edges, vertex_areas
 from s4a.geometry.voronoi import add_samples, farthest_of_each, voronoi_cells
 from s4a.method.remesh import laplacian, sample_surface
+from s4a.method.shape import Basis, Shape
 from s4a.schema import require
 
-RADIUS = (
-    3.0  # of the bumps, in radii of a disk of area/samples: about nine of them reach every vertex
-)
-GROUP = 64
-
-
-@dataclass(frozen=True)
-class Reduced:
-    """A shape in a space of few functions, scaled to unit area.
-
-    ``X (p, 3)`` samples; ``area (p,)`` of sum 1; ``mass``, in which ``Phi (p, k)`` is orthonormal
-    (areas, or U^T A U); ``eigenvalue (k,)``; ``U (n, p)`` sparse, so that the functions on the
-    dense mesh are U Phi; ``cell (n,)``, the sample of each dense vertex.
-    """
-
-    X: np.ndarray
-    area: np.ndarray
-    mass: np.ndarray | sp.csr_matrix
-    Phi: np.ndarray
-    eigenvalue: np.ndarray
-    U: sp.csr_matrix
-    cell: np.ndarray
+RADIUS = 3.0  # of the bumps, in radii of a disk of area / samples: about nine reach every vertex
+GROUP = 64  # samples whose paths are looked for together
 
 
 def bump(distance, radius):
@@ -149,7 +129,7 @@ def reduced_eigenpairs(U, W, area, k):
     return np.maximum(eigenvalue[order], 0.0), Phi * np.where(moment < 0, -1.0, 1.0), mass.tocsr()
 
 
-def reduce(mesh, *, n_samples=6000, k=100, seed=0):
+def reduce(mesh: xr.Dataset, *, n_samples: int = 6000, k: int = 100, seed: int = 0) -> Shape:
     """A clean mesh in the span of local functions around about `n_samples` of its vertices.
 
     Parameters
@@ -164,9 +144,10 @@ def reduce(mesh, *, n_samples=6000, k=100, seed=0):
 
     Returns
     -------
-    Reduced
-        Its eigenvalues are too large, by 5 % on a sphere and 12 to 15 % on a head: the bumps cannot
-        follow a linear function exactly.  The functions U Phi are what maps need.
+    Shape
+        ``low`` has the samples as its vertices and no triangles.  Its eigenvalues are too large, by
+        5 % on a sphere and 12 to 15 % on a head: the bumps cannot follow a linear function exactly.
+        The functions U Phi are what maps need.
 
     Raises
     ------
@@ -176,30 +157,37 @@ def reduce(mesh, *, n_samples=6000, k=100, seed=0):
     Examples
     --------
     >>> from s4a.datasets.synthetic import sphere
-    >>> space = reduce(sphere(2000), n_samples=300, k=4)
-    >>> bool(np.allclose(space.eigenvalue, 8 * np.pi * np.array([0, 1, 1, 1]), rtol=0.1))
+    >>> shape = reduce(sphere(2000), n_samples=300, k=4)
+    >>> bool(np.allclose(shape.low.eigenvalue, 8 * np.pi * np.array([0, 1, 1, 1]), rtol=0.1))
     True
     """
     require(mesh, "position", "corner_vertex", what="mesh")
-    return spectral_space(*local_space(mesh, n_samples, seed), k)
+    return spectral_space(mesh, *local_space(mesh, n_samples, seed), k)
 
 
-def local_space(mesh, n_samples=6000, seed=0):
-    """First half of :func:`reduce`: vertices and triangles for unit area, samples, cells and U."""
+def local_space(
+    mesh: xr.Dataset, n_samples: int = 6000, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray, sp.csr_matrix]:
+    """First half of :func:`reduce`: samples ``(p,)``, cells ``(n,)`` and U ``(n, p)``."""
     X, T = as_arrays(mesh)
-    area = vertex_areas(X, T)
-    X = (X - area @ X / area.sum()) / np.sqrt(area.sum())
+    X = Shape(mesh).to_frame(X)
     sample, cell, radius, G = spread(X, T, n_samples, seed)
-    return X, T, sample, cell, local_functions(X, G, sample, radius)
+    return sample, cell, local_functions(X, G, sample, radius)
 
 
-def spectral_space(X, T, sample, cell, U, k=100):
+def spectral_space(
+    mesh: xr.Dataset, sample: np.ndarray, cell: np.ndarray, U: sp.csr_matrix, k: int = 100
+) -> Shape:
     """Second half of :func:`reduce`: the eigenpairs in the span of U."""
     if not 1 <= k < len(sample):
         raise ValueError(
             f"k must be from 1 to below the number of samples, {len(sample)}; found {k!r}"
         )
+    X, T = as_arrays(mesh)
+    X = Shape(mesh).to_frame(X)
     E, w, area, _ = laplacian(X, T, vertex_areas(X, T))
     area = area / area.sum()
     eigenvalue, Phi, mass = reduced_eigenpairs(U, stiffness(E, w, len(X)), area, k)
-    return Reduced(X[sample], U.T @ area, mass, Phi, eigenvalue, U, cell)
+    low = Basis(X[sample], np.empty((0, 3), np.int32), U.T @ area, Phi, eigenvalue, mass)
+    full = Basis(X, T, area, Phi, eigenvalue, mass, U)
+    return Shape.of(mesh, low=low, full=full, U=U, cell=cell)

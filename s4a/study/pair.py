@@ -3,12 +3,14 @@
 import logging
 
 import numpy as np
+import xarray as xr
 
 from s4a.geometry.align import align
 from s4a.method import fmap
-from s4a.method.first_map import first_map_of
-from s4a.method.register import Scan, registration, sharpened
+from s4a.method.first_map import first_map
+from s4a.method.register import register, sharpen_map
 from s4a.method.remesh import coarsen
+from s4a.method.shape import Shape
 from s4a.method.spectral import spectrum
 from s4a.schema import dataset, require
 from s4a.study.options import checked
@@ -17,8 +19,16 @@ log = logging.getLogger(__name__)
 
 
 def match_pair(
-    source, target, *, k_init=20, k=100, init="dense", refine="joint", n_coarse=6000, seed=0
-):
+    source: xr.Dataset,
+    target: xr.Dataset,
+    *,
+    k_init: int = 20,
+    k: int = 100,
+    init: str = "dense",
+    refine: str = "joint",
+    n_coarse: int = 6000,
+    seed: int = 0,
+) -> xr.Dataset:
     """Correspondence of two shapes at full resolution (4.1).
 
     Parameters
@@ -47,7 +57,7 @@ def match_pair(
         ``confidence(vertex)``, ``round_trip``, ``distortion``; ``rotation``, ``translation``,
         ``scale`` of that alignment of the source; the way back,
         ``template_triangle(original_vertex)`` and ``template_barycentric``, from the source's
-        vertices to the target; attrs ``score`` (see :func:`s4a.method.joint.badness`), ``method``,
+        vertices to the target; attrs ``score`` (see :func:`s4a.method.joint.registration_score`), ``method``,
         ``first_map`` ("landmarks", "dense", or of far poses "icp", "hks" or "wks"), and ``note``
         where k had to be reduced.
 
@@ -67,7 +77,7 @@ def match_pair(
     >>> found["fmap"].shape, bool((abs(found["displacement"]) < 1e-6).all())
     ((10, 10), True)
     """
-    given = {
+    options = {
         "k_init": k_init,
         "k": k,
         "init": init,
@@ -75,40 +85,57 @@ def match_pair(
         "n_coarse": n_coarse,
         "seed": seed,
     }
-    given = checked(given)
-    scans = []
+    options = checked(options)
     for mesh, what in ((source, "source"), (target, "target")):
         require(mesh, "position", "corner_vertex", what=what)
-        scans.append(Scan(mesh, spectrum(coarsen(mesh, n_coarse=n_coarse, seed=seed), k=k)))
-    init, refine, least = given["init"], given["refine"], min(s.low.Phi.shape[1] for s in scans)
-    found, C, C0 = match_scans(*scans, k_init=min(k_init, least), k=k, init=init, refine=refine)
-    if least < k:
-        found.attrs["note"] = (
-            f"k = {k} reduced to {least}, the eigenfunctions that the smaller mesh has"
-        )
-        log.warning("%s", found.attrs["note"])
-    maps = dataset(fmap=C, fmap_initial=C0, match=found["registered_match"].values)
-    return maps.merge(found.drop_vars("registered_match")).assign_attrs(found.attrs)
-
-
-def match_scans(source, target, *, k_init=20, k=100, init="dense", refine="joint"):
-    """:func:`match_pair` for two :class:`Scan`.
-
-    What :func:`registration` gives, the final and the first map.
-    """
-    M, N = source, target
-    motion = align(M.low.X, M.low.area, N.low.X, N.low.area)[:2]
-    first, C0, near = first_map_of(M.low, N.low, motion, k_init=k_init, init=init)
-    k = min(k, M.low.Phi.shape[1], N.low.Phi.shape[1])
-    C, match_low = fmap.zoomout(C0, M.low.Phi, N.low.Phi, N.low.area, k)
-    C = sharpened(
-        C,
-        M.U.astype(np.float32) @ M.low.Phi[:, :k].astype(np.float32),
-        N.low.Phi,
-        N.low.area,
-        M.cell,
+    M, N = (
+        Shape(mesh, spectrum(coarsen(mesh, n_coarse=n_coarse, seed=seed), k=k))
+        for mesh in (source, target)
     )
-    starts = {"intrinsic": match_low, "icp": near}
-    embeddings = M.low.Phi[:, :k] @ C.T, N.low.Phi[:, :k]
-    found = registration(M, N, starts, embeddings, k=k, refine=refine)
-    return found.assign_attrs(first_map=first), C, C0
+    least = min(M.low.k, N.low.k)
+    registration, C, C_initial = match_shapes(
+        M,
+        N,
+        k_init=min(k_init, least),
+        k=k,
+        init=options["init"],
+        refine=options["refine"],
+    )
+    if least < k:
+        note = f"k = {k} reduced to {least}, the eigenfunctions that the smaller mesh has"
+        registration.attrs["note"] = note
+        log.warning("%s", note)
+    match = registration["registered_match"].values
+    maps = dataset(fmap=C, fmap_initial=C_initial, match=match)
+    return maps.merge(registration.drop_vars("registered_match")).assign_attrs(registration.attrs)
+
+
+def match_shapes(
+    source: Shape,
+    target: Shape,
+    *,
+    k_init: int = 20,
+    k: int = 100,
+    init: str = "dense",
+    refine: str = "joint",
+) -> tuple[xr.Dataset, np.ndarray, np.ndarray]:
+    """:func:`match_pair` for two shapes: steps 2 to 4 of 4.1, ZoomOut and eq. 4, joint rounds.
+
+    Returns
+    -------
+    registration : Dataset
+        As of :func:`s4a.method.register.register`.
+    C, C_initial : float ndarray
+        The final and the first functional map.
+    """
+    M = source.low
+    N = target.low
+    R, t, _ = align(M.X, M.area, N.X, N.area)
+    name, C_initial, near = first_map(M, N, (R, t), k_init=k_init, init=init)
+    k = min(k, M.k, N.k)
+    C, match = fmap.zoomout(M, N, C_initial, k)
+    C = sharpen_map(source, target, C)
+    starts = {"intrinsic": match, "icp": near}
+    functions = M.Phi[:, :k] @ C.T, N.Phi[:, :k]  # rows of both are compared (eq. 4)
+    registration = register(source, target, starts, functions, k=k, refine=refine)
+    return registration.assign_attrs(first_map=name), C, C_initial

@@ -99,7 +99,7 @@ def costs(run: Run) -> xr.Dataset:
 def doubtful(badness: dict[str, float]) -> tuple[dict[str, str], list[str]]:
     """Warnings for the shapes whose registration scores badly, or for all of them.
 
-    See :func:`s4a.method.joint.badness`.
+    See :func:`s4a.method.joint.registration_score`.
 
     Returns
     -------

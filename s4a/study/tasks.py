@@ -7,22 +7,23 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
-from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
-from s4a.geometry.align import align, cloud, farthest_points, motion_between, realign
+from s4a.geometry.align import align, cloud, motion_between, realign
 from s4a.geometry.mesh import as_arrays, triangle_areas
 from s4a.input import plausibility
 from s4a.input.clean import clean
 from s4a.input.collection import read_shape
-from s4a.method import fmap, joint, latent, median, network, register
-from s4a.method.first_map import first_map_of
+from s4a.method import fmap, latent, median, network
+from s4a.method.first_map import first_map, map_after_motion
+from s4a.method.register import from_latent, identity
 from s4a.method.remesh import coarsen
+from s4a.method.shape import Basis, Shape
 from s4a.method.spectral import spectrum
 from s4a.schema import dataset, in_unit, unit_of
 from s4a.study.options import Options
-from s4a.study.store import arrays, read
+from s4a.study.store import arrays, opened, read
 
 
 def clean_shape(source: str | xr.Dataset, cleaning: dict) -> xr.Dataset:
@@ -52,24 +53,21 @@ def remesh_shape(folder: Path, name: str, n_coarse: int, wrap: bool, seed: int, 
     return in_unit(low, unit_of(mesh["position"]))
 
 
-def scan(folder: Path, name: str) -> register.Scan:
-    """A shape of the study at both resolutions."""
-    return register.Scan(*(read(folder / stage / f"{name}.nc") for stage in ("original", "coarse")))
+def shape_of(folder: Path, name: str) -> Shape:
+    """A shape of the study at both resolutions; its arrays are read when they are used."""
+    return Shape(*(opened(folder / stage / f"{name}.nc") for stage in ("original", "coarse")))
 
 
-def low_shape(folder: Path, name: str) -> joint.Surface:
-    """The coarse mesh of a shape, centred and for unit area."""
-    variables = ("position", "corner_vertex", "vertex_area", "eigenfunction", "eigenvalue")
-    X, T, area, Phi, eigenvalue = arrays(folder / "coarse" / f"{name}.nc", *variables)
-    w = area / area.sum()
-    return joint.Surface((X - w @ X) / np.sqrt(area.sum()), T, w, Phi, eigenvalue=eigenvalue)
+def low_basis(folder: Path, name: str) -> Basis:
+    """The coarse mesh of a shape, centred and for unit area, and its eigenfunctions."""
+    return Shape(None, opened(folder / "coarse" / f"{name}.nc")).low
 
 
 def align_shape(folder: Path, name: str, reference: str) -> xr.Dataset:
     """Rigid motion of a shape onto the reference, both centred and for unit area (4.1, step 2)."""
     R, t = np.eye(3), np.zeros(3)
     if name != reference:
-        M, N = low_shape(folder, name), low_shape(folder, reference)
+        M, N = low_basis(folder, name), low_basis(folder, reference)
         R, t, _ = align(M.X, M.area, N.X, N.area)
     return dataset({"reference": reference}, rotation=R, translation=t)
 
@@ -83,7 +81,7 @@ def motion_to_reference(folder: Path, name: str) -> tuple[np.ndarray, np.ndarray
 def first_maps(folder: Path, pairs: list, k_init: int, init: str) -> xr.Dataset:
     """First maps of some pairs, in both directions (4.1, steps 3 and 4)."""
     names = sorted({name for pair in pairs for name in pair})
-    shapes = {name: low_shape(folder, name) for name in names}
+    shapes = {name: low_basis(folder, name) for name in names}
     motions = {name: motion_to_reference(folder, name) for name in names}
     clouds = {name: cloud(shape.X, 300) for name, shape in shapes.items()}
     source, target, maps = [], [], []
@@ -91,12 +89,11 @@ def first_maps(folder: Path, pairs: list, k_init: int, init: str) -> xr.Dataset:
         M, N = shapes[a], shapes[b]
         start = motion_between(motions[a], motions[b])
         R, t = realign(M.X, M.area, N.X, N.area, start, clouds=(clouds[a], clouds[b]))
-        kind, C, _ = first_map_of(M, N, (R, t), k_init=k_init, init=init)
+        kind, C, _ = first_map(M, N, (R, t), k_init=k_init, init=init)
         if kind == init:
-            ends = ((s.X, s.area, s.Phi, s.eigenvalue) for s in (N, M))
-            back = network.first_map(*ends, (R.T, -R.T @ t), k_init=k_init, init=init)
+            back = map_after_motion(N, M, (R.T, -R.T @ t), k_init=k_init, init=init)
         else:  # of far poses: the other direction must tell the same limbs apart
-            back = fmap.once_refined(C.T, N.Phi, M.Phi, M.area)
+            back = fmap.refine_once(N, M, C.T)
         source += [a, b]
         target += [b, a]
         maps += [C, back]
@@ -107,8 +104,8 @@ def consistent_maps(
     folder: Path, names: list[str], first: xr.Dataset, options: Options, n_jobs: int
 ) -> tuple[xr.Dataset, xr.Dataset]:
     """Consistent ZoomOut over the network and the median (4.2): ``/network`` and ``/latent``."""
-    shapes = [low_shape(folder, name) for name in names]
-    k = min([options.k, *(shape.Phi.shape[1] for shape in shapes)])
+    shapes = [low_basis(folder, name) for name in names]
+    k = min([options.k, *(shape.k for shape in shapes)])
     k_init = first.sizes["mode_source_initial"]
     source, target = (
         np.array([names.index(name) for name in first[end].values]) for end in ("source", "target")
@@ -117,16 +114,14 @@ def consistent_maps(
     C_initial = first["fmap_initial"].values  # (p, k_init, k_init)
     with threadpool_limits(1), tqdm(total=k - k_init, desc="consistent ZoomOut") as bar:
         C, weight, _, Y, latent_eigenvalue = latent.consistent_zoomout(
+            shapes,
             C_initial,
             source,
             target,
-            [shape.Phi for shape in shapes],
-            [shape.area for shape in shapes],
-            eigenvalues,
             k,
             step=options.step,
             n_latent=options.n_latent,
-            samples=[farthest_points(shape.X, latent.SAMPLES) for shape in shapes],
+            samples=[shape.spread for shape in shapes],
             n_jobs=n_jobs,
             progress=lambda size: bar.update(size - k_init - bar.n),
         )
@@ -146,26 +141,13 @@ def register_shape(
     folder: Path, name: str, template: str, how: str, refine: str, scale: bool
 ) -> xr.Dataset:
     """One shape registered to the template: eq. 6 at low resolution, then eq. 7 or eq. 3 and 4."""
-    target = scan(folder, template)
+    target = shape_of(folder, template)
     if name == template:
-        return register.identity(target)
-    source = scan(folder, name)
-    basis = read(folder / "latent.nc")["latent_basis"]
-    k = basis.sizes["mode"]
-    F_source, F_target = (
-        s.low.Phi[:, :k] @ basis.sel(shape=n).values
-        for s, n in ((source, name), (target, template))
-    )
-    match = fmap.nearest_rows(F_target, F_source)
-    if how == "standard":
-        C = fmap.fmap_from_match(
-            source.low.Phi[:, :k], target.low.Phi[:, :k], target.low.area, match
-        )
-        F_source, F_target = source.low.Phi[:, :k] @ C.T, target.low.Phi[:, :k]
-        match = fmap.nearest_rows(F_target, F_source)
-    motion = motion_between(*(motion_to_reference(folder, n) for n in (name, template)))
-    R, t = realign(source.low.X, source.low.area, target.low.X, target.low.area, motion)
-    starts = {"intrinsic": match, "icp": cKDTree(source.low.X @ R.T + t).query(target.low.X)[1]}
-    return register.registration(
-        source, target, starts, (F_source, F_target), k=k, refine=refine, scale=scale
-    )
+        return identity(target)
+    source = shape_of(folder, name)
+    Y = read(folder / "latent.nc")["latent_basis"]
+    bases = Y.sel(shape=name).values, Y.sel(shape=template).values
+    M, N = source.low, target.low
+    start = motion_between(*(motion_to_reference(folder, n) for n in (name, template)))
+    motion = realign(M.X, M.area, N.X, N.area, start)
+    return from_latent(source, target, bases, motion, how=how, refine=refine, scale=scale)

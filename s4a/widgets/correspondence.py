@@ -7,8 +7,8 @@ import ipywidgets
 import numpy as np
 import traitlets
 
-from s4a.method.fmap import nearest_rows
-from s4a.method.register import Scan, intrinsic_match
+from s4a.method.register import match_functions, match_latent
+from s4a.method.shape import Shape
 from s4a.show.draw import position_colors, ramp_colors
 from s4a.show.live import color_bar
 from s4a.show.pictures import carried_colors, has, mesh_of, names_of
@@ -92,18 +92,15 @@ class Correspondence(Panel):
             return self.study["registration"]["registered_match"].sel(shape=self.shape).values
         if key not in self.matches:
             names = self.shape, self.template
-            coarse = [self.study["coarse"][name].to_dataset() for name in names]
-            basis = self.study["latent"]["latent_basis"]
-            F = [c["eigenfunction"].values[:, : basis.sizes["mode"]] @ basis.sel(shape=n).values
-                 for n, c in zip(names, coarse, strict=True)]  # fmt: skip
-            if key[1] == "low":
-                self.matches[key] = nearest_rows(F[1], F[0])
-            else:
-                scans = [
-                    Scan(self.study["original"][n].to_dataset(), c)
-                    for n, c in zip(names, coarse, strict=True)
-                ]
-                self.matches[key] = intrinsic_match(*scans, *F)[0]
+            shapes = [
+                Shape(*(self.study[stage][n].to_dataset() for stage in ("original", "coarse")))
+                for n in names
+            ]
+            Y = self.study["latent"]["latent_basis"]
+            match, functions = match_latent(*shapes, [Y.sel(shape=n).values for n in names])
+            if key[1] != "low":
+                match = match_functions(*shapes, *functions)[0]
+            self.matches[key] = match
         return self.matches[key]
 
     def draw(self):

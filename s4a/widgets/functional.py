@@ -8,7 +8,7 @@ import numpy as np
 import traitlets
 
 from s4a.method.fmap import off_diagonal_mass, orthogonality_error, swapped_blocks, zoomout
-from s4a.method.spectral import unit_area
+from s4a.method.shape import Shape
 from s4a.show.draw import SIGNED, signed_colors
 from s4a.show.live import color_bar
 from s4a.widgets.chart import chart
@@ -121,13 +121,10 @@ class FunctionalMap(Panel):
         first = network["fmap_initial"].values
         size = max((done for done in self.cache if done <= k), default=len(first))
         C = self.cache.get(size, first)
-        (Phi, Psi), area = (
-            (mesh["eigenfunction"].values for mesh in self.meshes),
-            unit_area(self.meshes[1]),
-        )
+        M, N = (Shape(None, mesh).low for mesh in self.meshes)
         while size < k:
             size = min(size + STEP, k)
-            C, _ = zoomout(C, Phi[:, :size], Psi[:, :size], area, size, step=STEP)
+            C, _ = zoomout(M, N, C, size, step=STEP)
             self.cache[size] = C
         return C
 

@@ -28,8 +28,8 @@ from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.input.annotations import read_landmarks
 from s4a.method.deform import displacement_in_template
+from s4a.method.pca import project_scores
 from s4a.schema import dataset
-from s4a.study.insert import project_scores
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 

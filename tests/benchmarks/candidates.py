@@ -19,16 +19,16 @@ import s4a
 from s4a import synthetic
 from s4a.geometry.align import align
 from s4a.method import fmap, joint
-from s4a.method.first_map import first_map_of
-from s4a.method.register import Scan
+from s4a.method.first_map import first_map
+from s4a.method.shape import Shape
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 CORRESPONDING = {"faust15k": 6890}  # of these only the first vertices correspond
 SETS = ("faces", "faust15k", "cats", "kids")
 
 
-def scan(mesh):
-    return Scan(mesh, s4a.spectrum(s4a.coarsen(mesh)))
+def shape_of(mesh):
+    return Shape(mesh, s4a.spectrum(s4a.coarsen(mesh)))
 
 
 def errors(source, target, image):
@@ -37,10 +37,10 @@ def errors(source, target, image):
     NaN where unknown.
     """
     with threadpool_limits(1):
-        M, N = scan(source), scan(target)
-        _, C, near = first_map_of(M.low, N.low, align(M.low.X, M.low.area, N.low.X, N.low.area)[:2])
+        M, N = shape_of(source), shape_of(target)
+        _, C, near = first_map(M.low, N.low, align(M.low.X, M.low.area, N.low.X, N.low.area)[:2])
         starts = {
-            "intrinsic": fmap.zoomout(C, M.low.Phi, N.low.Phi, N.low.area, 100)[1],
+            "intrinsic": fmap.zoomout(M.low, N.low, C, 100)[1],
             "icp": near,
         }
         center, size = M.frame

@@ -22,6 +22,7 @@ import s4a
 from s4a import compare, metrics, synthetic
 from s4a.cli.tables import METRICS, block_table, collection_table, comparison_table, table
 from s4a.geometry.align import farthest_points
+from s4a.geometry.mesh import as_arrays
 from s4a.schema import variable
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
@@ -48,7 +49,7 @@ def peer(source, target, landmarks, truth, k_init=20, k=100, step=5):
     from pyFM.mesh import TriMesh
 
     begin = time.process_time()
-    meshes = [TriMesh(*compare.as_arrays(mesh)) for mesh in (source, target)]
+    meshes = [TriMesh(*as_arrays(mesh)) for mesh in (source, target)]
     model = FunctionalMapping(*(mesh.process(k=k, verbose=False) for mesh in meshes))
     marks = np.stack(landmarks, axis=1)
     model.preprocess(
@@ -209,16 +210,17 @@ def embedded(n_vertices=20_000):
 
 def heads():
     """One real head and five others; no truth.  Every pair is printed when it is done."""
-    options, rows = {"k_init": 20, "k": 100, "step": 5}, []
+    options = {"k_init": 20, "k": 100, "step": 5}
+    rows = []
     with tempfile.TemporaryDirectory() as folder, threadpool_limits(1):
         first, *others = unpacked("heads", folder)[:6]
-        mesh, load = compare.loaded(first, "source")
-        reference = compare.Shape(mesh)
+        mesh, load = compare.load_mesh(first, "source")
+        reference = compare.Spaces(mesh)
         for path in others:
-            mesh, seconds = compare.loaded(path, "target")
-            target, begin = compare.Shape(mesh), load + seconds
+            mesh, seconds = compare.load_mesh(path, "target")
+            target, begin = compare.Spaces(mesh), load + seconds
             rows.append(
-                compare.one_pair(
+                compare.metrics_of_pair(
                     reference, target, compare.METHODS, None, begin, None, 300, options
                 )
             )

@@ -27,10 +27,12 @@ from s4a import synthetic
 from s4a.geometry.align import align, farthest_points
 from s4a.geometry.mesh import as_arrays, triangle_areas
 from s4a.input.files import find_meshes
-from s4a.method import fmap, latent, network, register
-from s4a.method.fmap import nearest_rows
-from s4a.method.nearest import nearest_in_cells
+from s4a.method import fmap, latent
+from s4a.method.first_map import map_after_motion
+from s4a.method.nearest import nearest_in_cells, nearest_rows
 from s4a.method.pca import gram_pca
+from s4a.method.register import match_functions
+from s4a.method.shape import Shape
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 VERTICES, NETWORK, K_INIT, K = 100_000, 10, 20, 100
@@ -93,27 +95,16 @@ def our_spectrum(coarse):
 
 
 def our_first_map(a, b, motion):
-    return network.first_map(a, b, motion, k_init=K_INIT)
+    return map_after_motion(a, b, motion, k_init=K_INIT)
 
 
 def our_zoomout(C, a, b):
-    return fmap.zoomout(C, a[2], b[2], b[1], K)[0]
+    return fmap.zoomout(a, b, C, K)[0]
 
 
 def our_network(C, source, target, shapes):
-    samples = [farthest_points(s[0], 1000) for s in shapes]
-    eigenvalues = np.stack([s[3][:K] for s in shapes])
-    found = latent.consistent_zoomout(
-        C,
-        source,
-        target,
-        [s[2] for s in shapes],
-        [s[1] for s in shapes],
-        eigenvalues,
-        K,
-        samples=samples,
-    )
-    return found[3]
+    samples = [basis.spread for basis in shapes]
+    return latent.consistent_zoomout(shapes, C, source, target, K, samples=samples)[3]
 
 
 def our_nearest(Q, D, cell_q, cell_d):
@@ -214,7 +205,7 @@ def other_first_map(a, b, landmarks):
 def other_zoomout(C, a, b):
     from pyFM.refine.zoomout import zoomout_refine
 
-    return zoomout_refine(C, a[2], b[2], nit=(K - K_INIT) // 5, step=5, A2=b[1], n_jobs=1)
+    return zoomout_refine(C, a.Phi, b.Phi, nit=(K - K_INIT) // 5, step=5, A2=b.area, n_jobs=1)
 
 
 def other_network(C, source, target, shapes):
@@ -271,14 +262,6 @@ def collection(n, n_vertices, folder):
     return synthetic.write(tree, folder), tree["truth"]
 
 
-def pipeline_low(scan):
-    """Unit-area vertices, areas, eigenfunctions, eigenvalues of the coarse mesh.
-
-    As the pipeline holds them.
-    """
-    return scan.low.X, scan.low.area, scan.low.Phi, scan.eigenvalue
-
-
 def stages(folder):
     """The table of stages."""
     say(
@@ -315,20 +298,17 @@ def stages(folder):
     )
 
     second = s4a.read_shape(paths[1])
-    scans = [
-        register.Scan(mesh, spectra[0]),
-        register.Scan(second, s4a.spectrum(s4a.coarsen(second), k=K)),
-    ]
-    a, b = map(pipeline_low, scans)
-    meshes = [(s.low.X, s.low.T) for s in scans]
+    shapes = [Shape(mesh, spectra[0]), Shape(second, s4a.spectrum(s4a.coarsen(second), k=K))]
+    a, b = (shape.low for shape in shapes)
+    meshes = [(a.X, a.T), (b.X, b.T)]
     (R, t, _), _ = beside(
         "align, any start",
-        ("s4a.geometry.align", align, *a[:2], *b[:2]),
+        ("s4a.geometry.align", align, a.X, a.area, b.X, b.area),
         ("pymeshlab ICP, one start", other_icp, *meshes),
     )
-    few = [(s.low.X, s.low.T, s.low.Phi, s.eigenvalue) for s in scans]
-    landmark = farthest_points(a[0] @ R.T + t, 10)
-    near = nearest_rows(a[0][landmark] @ R.T + t, b[0])
+    few = [(end.X, end.T, end.Phi, end.eigenvalue) for end in (a, b)]
+    landmark = farthest_points(a.X @ R.T + t, 10)
+    near = nearest_rows(a.X[landmark] @ R.T + t, b.X)
     C, _ = beside(
         f"first map, k = {K_INIT}",
         ("s4a: dense, one round more", our_first_map, a, b, (R, t)),
@@ -339,10 +319,11 @@ def stages(folder):
         ("s4a.method.fmap.zoomout", our_zoomout, C, a, b),
         ("pyFM zoomout_refine", other_zoomout, C, a, b),
     )
-    Q, D = ((scans[1].U @ b[2]).astype(np.float32), (scans[0].U @ (a[2] @ C.T)).astype(np.float32))
+    Q = (shapes[1].U @ b.Phi).astype(np.float32)
+    D = (shapes[0].U @ (a.Phi @ C.T)).astype(np.float32)
     ours, *found = beside(
         f"nearest neighbours, {len(Q):,}, {K} dims",
-        ("s4a.nearest_in_cells", our_nearest, Q, D, scans[1].cell, scans[0].cell),
+        ("s4a.nearest_in_cells", our_nearest, Q, D, shapes[1].cell, shapes[0].cell),
         ("scipy KD-tree", scipy_nearest, Q, D),
         ("scikit-learn brute", sklearn_nearest, Q, D),
         ("pyFM knn_query", other_nearest, Q, D),
@@ -370,39 +351,42 @@ def network_table():
     tree = synthetic.brains(NETWORK, 20_000)
     names = list(tree["original"].children)
     meshes = [tree["original"][n].to_dataset() for n in names]
-    scans = [register.Scan(m, s4a.spectrum(s4a.coarsen(m), k=K)) for m in meshes]
-    shapes = [pipeline_low(s) for s in scans]
+    shapes = [Shape(m, s4a.spectrum(s4a.coarsen(m), k=K)) for m in meshes]
+    low = [shape.low for shape in shapes]
     source, target = np.array(list(itertools.permutations(range(NETWORK), 2))).T
     first = [
-        network.first_map(
-            shapes[i], shapes[j], align(*shapes[i][:2], *shapes[j][:2])[:2], k_init=K_INIT
+        map_after_motion(
+            low[i],
+            low[j],
+            align(low[i].X, low[i].area, low[j].X, low[j].area)[:2],
+            k_init=K_INIT,
         )
         for i, j in zip(source, target, strict=True)
     ]
     given = np.stack(first), source, target
     bases = beside(
         f"Consistent ZoomOut, {len(first)} maps",
-        ("s4a.method.latent.consistent_zoomout", our_network, *given, shapes),
+        ("s4a.method.latent.consistent_zoomout", our_network, *given, low),
         (
             "pyFM FMN.zoomout_refine",
             other_network,
             *given,
-            [(s.low.X, s.low.T, *p[2:]) for s, p in zip(scans, shapes, strict=True)],
+            [(basis.X, basis.T, basis.Phi, basis.eigenvalue) for basis in low],
         ),
     )
     here = [
         cKDTree(m["position"]).query(s.coarse["position"])[1]
-        for m, s in zip(meshes, scans, strict=True)
+        for m, s in zip(meshes, shapes, strict=True)
     ]
     for name, Y in zip(("s4a", "pyFM"), bases, strict=True):
-        F = [shape[2][:, :K] @ y for shape, y in zip(shapes, Y, strict=True)]
+        F = [basis.Phi[:, :K] @ y for basis, y in zip(low, Y, strict=True)]
         gaps = []
         for i in range(1, NETWORK):
             match = nearest_rows(F[0], F[i])
             u = tree[f"truth/{names[0]}/reference_point"].values[here[0]]
-            image = scans[i].coarse["position"].values[match]
+            image = shapes[i].coarse["position"].values[match]
             gaps.append(
-                error(synthetic.position(tree["truth"], names[i], u), image, scans[0].frame[1])
+                error(synthetic.position(tree["truth"], names[i], u), image, shapes[0].frame[1])
             )
         say(
             f"{'':36} {name}: low-resolution matches {np.mean(gaps):.2f} % of sqrt(area) from the truth"
@@ -546,15 +530,13 @@ def certificates(folder, n_checked=1000):
         if len(files) < 2:
             continue
         meshes = [s4a.read_shape(file) for file in files]
-        M, N = (register.Scan(mesh, s4a.spectrum(s4a.coarsen(mesh), k=K)) for mesh in meshes)
+        M, N = (Shape(mesh, s4a.spectrum(s4a.coarsen(mesh), k=K)) for mesh in meshes)
         motion = align(M.low.X, M.low.area, N.low.X, N.low.area)[:2]
-        C = network.first_map(pipeline_low(M), pipeline_low(N), motion, k_init=K_INIT)
-        C = fmap.zoomout(
-            C, M.low.Phi, N.low.Phi, N.low.area, min(K, M.low.Phi.shape[1], N.low.Phi.shape[1])
-        )[0]
+        C = map_after_motion(M.low, N.low, motion, k_init=K_INIT)
+        C = fmap.zoomout(M.low, N.low, C, min(K, M.low.k, N.low.k))[0]
         F = M.low.Phi[:, : C.shape[1]] @ C.T, N.low.Phi[:, : C.shape[0]]
         begin = time.process_time()
-        index, compared, certified = register.intrinsic_match(M, N, *F)
+        index, compared, certified = match_functions(M, N, *F)
         seconds = time.process_time() - begin
         D, some = M.U @ F[0], np.linspace(0, len(index) - 1, n_checked).astype(int)
         gap = np.linalg.norm(N.U[some] @ F[1] - D[index[some]], axis=1)

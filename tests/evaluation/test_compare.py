@@ -6,9 +6,9 @@ import xarray as xr
 
 from s4a import compare, synthetic
 from s4a.cli import main
+from s4a.evaluation.methods import Spaces
 from s4a.geometry.mesh import as_arrays
 from s4a.input.files import write_mesh
-from s4a.method.scalable import Reduced
 
 SMALL = {"n_coarse": 400, "k": 30, "n_geodesic": 100}
 
@@ -145,10 +145,9 @@ def test_both_ways_to_full_resolution_share_all_but_the_last_block(brains):
 
 
 def test_the_space_of_a_mesh_itself_has_no_projection():
-    dense = compare.Shape(synthetic.sphere(500), k=9).dense
-    assert isinstance(dense, Reduced)
+    dense = Spaces(synthetic.sphere(500), k=9).dense
     assert dense.U is None
-    np.testing.assert_allclose(dense.eigenvalue[1:4], 8 * np.pi, rtol=0.03)
+    np.testing.assert_allclose(dense.low.eigenvalue[1:4], 8 * np.pi, rtol=0.03)
 
 
 def test_the_command_writes_table_file_and_figure(tmp_path, capsys):

@@ -11,6 +11,7 @@ from s4a import coarsen, metrics, spectrum, synthetic
 from s4a.geometry.align import farthest_points
 from s4a.geometry.mesh import as_arrays, vertex_normals
 from s4a.method import descriptors, fmap, spectral
+from s4a.method.shape import Shape
 
 
 @pytest.fixture(scope="module")
@@ -229,13 +230,7 @@ def test_the_fit_on_descriptors_of_a_shape_and_itself_renumbered_is_the_map_betw
     other["eigenfunction"] = other["eigenfunction"] * sign
     for kind in ("wks", "hks"):
         C = fmap.fit_descriptors(mesh, other, kind=kind)["fmap"].values
-        match = fmap.zoomout(
-            C,
-            mesh["eigenfunction"].values,
-            other["eigenfunction"].values,
-            spectral.unit_area(other),
-            60,
-        )
+        match = fmap.zoomout(Shape(None, mesh).low, Shape(None, other).low, C, 60)
         assert (match[1] == order).all(), kind
 
 

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from s4a import analyse, insert, match_pair, synthetic
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.method import deform, first_map, joint
-from s4a.method.register import Scan
 from s4a.method.remesh import coarsen
+from s4a.method.shape import Shape
 from s4a.method.spectral import spectrum
 
 
@@ -45,8 +45,8 @@ def bent():
 
 
 @pytest.fixture(scope="module")
-def scans(bent):
-    return [Scan(mesh, spectrum(coarsen(mesh, n_coarse=1000), k=50)) for mesh in bent]
+def shapes(bent):
+    return [Shape(mesh, spectrum(coarsen(mesh, n_coarse=1000), k=50)) for mesh in bent]
 
 
 def test_a_far_pose_is_matched_where_nearest_neighbours_begin_wrong(bent, monkeypatch):
@@ -58,37 +58,37 @@ def test_a_far_pose_is_matched_where_nearest_neighbours_begin_wrong(bent, monkey
     assert error(match_pair(*bent, n_coarse=1000, k=50), bent[0]) > 0.05
 
 
-def test_one_motion_of_all_parts_is_that_of_the_whole(scans):
-    low = scans[0].low
+def test_one_motion_of_all_parts_is_that_of_the_whole(shapes):
+    low = shapes[0].low
     R = Rotation.from_rotvec([0.3, 2.0, -0.1]).as_matrix()
     found, t = deform.rigid_parts(low.X, low.X @ R.T + 0.2, low.area, low.Phi, low.eigenvalue)
     assert found == pytest.approx(np.broadcast_to(R, found.shape), abs=1e-6)
     assert t == pytest.approx(0.2, abs=1e-6)
 
 
-def test_parts_follow_a_bend_that_displacements_alone_cannot(scans):
-    straight = scans[0].low
-    true = scans[0].coarse["sample_vertex"].values
-    X = scans[1].original["position"].values[true]
-    X = (X - scans[1].frame[0]) / scans[1].frame[1]
+def test_parts_follow_a_bend_that_displacements_alone_cannot(shapes):
+    straight = shapes[0].low
+    true = shapes[0].coarse["sample_vertex"].values
+    X = shapes[1].original["position"].values[true]
+    X = (X - shapes[1].frame[0]) / shapes[1].frame[1]
     few = straight.Phi[:, :20]
 
     def gap(spectrum):
         R, t, c = deform.onto(
             straight.X, X, straight.area, lambda d: few.T @ (straight.area[:, None] * d), spectrum
         )
-        return np.linalg.norm(joint.registered(straight, (R, t, c)) - X, axis=1).mean()
+        return np.linalg.norm(joint.move(straight, (R, t, c)) - X, axis=1).mean()
 
     assert gap((few, straight.eigenvalue[:20])) < 0.25 * gap(None)
 
 
-def test_the_parts_of_the_full_resolution_are_those_of_its_coarse_vertices(scans):
-    low, dense = scans[0].low, scans[0].dense
+def test_the_parts_of_the_full_resolution_are_those_of_its_coarse_vertices(shapes):
+    low, full = shapes[0].low, shapes[0].full
     R, t = deform.rigid_parts(
         low.X, 2 * low.X[:, [1, 0, 2]] * [1, -1, 1], low.area, low.Phi, low.eigenvalue
     )
-    at = scans[0].coarse["sample_vertex"].values
-    assert joint.turned(dense, R, t)[at] == pytest.approx(joint.turned(low, R, t), abs=1e-6)
+    at = shapes[0].coarse["sample_vertex"].values
+    assert joint.turn(full, R, t)[at] == pytest.approx(joint.turn(low, R, t), abs=1e-6)
 
 
 def test_shapes_in_one_pose_pay_nothing_and_keep_their_first_map(monkeypatch):
@@ -102,14 +102,14 @@ def test_shapes_in_one_pose_pay_nothing_and_keep_their_first_map(monkeypatch):
     assert match_pair(source, target, n_coarse=600, k=40).attrs["first_map"] == "dense"
 
 
-def test_poses_are_far_apart_only_where_no_rigid_motion_brings_the_shapes_together(scans):
-    M, N = (s.low for s in scans)
+def test_poses_are_far_apart_only_where_no_rigid_motion_brings_the_shapes_together(shapes):
+    M, N = (s.low for s in shapes)
     assert not joint.far_apart(M, M, np.arange(len(M.X)))
     assert joint.far_apart(M, N, cKDTree(M.X).query(N.X)[1])
 
 
-def test_of_first_maps_the_one_that_fits_is_taken(scans):
-    low = scans[0].low
+def test_of_first_maps_the_one_that_fits_is_taken(shapes):
+    low = shapes[0].low
     name, C = first_map.best_first_map(low, low, np.diag((-1.0) ** np.arange(20)))
     assert name in ("hks", "wks")
     assert np.diag(C).min() > 0.9

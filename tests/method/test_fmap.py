@@ -9,6 +9,8 @@ from s4a import clean, coarsen, spectrum, synthetic
 from s4a.geometry.align import align, farthest_points
 from s4a.geometry.mesh import as_dataset
 from s4a.method import descriptors, fmap, spectral
+from s4a.method.nearest import nearest_rows
+from s4a.method.shape import Basis, Shape
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +36,11 @@ def permuted(shape):
     return Phi[order] * sign, area[order], eigenvalue, X[order], order, sign
 
 
+def basis(Phi, area, eigenvalue=None):
+    """Functions alone: the steps of this file ask for no surface."""
+    return Basis(None, None, area, Phi, eigenvalue)
+
+
 def test_identical_shapes_give_identity_maps(shape):
     Phi, area, _, X = shape
     C = fmap.fmap_from_match(Phi, Phi, area, np.arange(len(X)))
@@ -52,21 +59,22 @@ def test_the_map_of_a_permutation_is_orthogonal_and_carries_functions(shape, per
 
 
 def test_zoomout_recovers_a_permutation_exactly_from_a_small_noisy_map(shape, permuted):
-    Phi, _, _, _ = shape
+    Phi, area, _, _ = shape
     Psi, area_target, _, _, order, sign = permuted
     C0 = np.diag(sign[:8]) + np.random.default_rng(2).normal(0, 0.05, (8, 8))
-    C, match = fmap.zoomout(C0, Phi, Psi, area_target, 40, step=3)
+    C, match = fmap.zoomout(basis(Phi, area), basis(Psi, area_target), C0, 40, step=3)
     assert (match == order).all()
     assert pytest.approx(np.diag(sign), abs=1e-8) == C
 
 
 def test_zoomout_ends_at_k_whatever_the_step(shape):
     Phi, area, _, _ = shape
+    same = basis(Phi, area)
     for step in (1, 7, 100):
-        C, match = fmap.zoomout(np.eye(33), Phi, Phi, area, 40, step=step)
+        C, match = fmap.zoomout(same, same, np.eye(33), 40, step=step)
         assert pytest.approx(np.eye(40), abs=1e-9) == C
         assert (match == np.arange(len(Phi))).all()
-    assert (fmap.zoomout(np.eye(40), Phi, Phi, area, 40)[0] == np.eye(40)).all()
+    assert (fmap.zoomout(same, same, np.eye(40), 40)[0] == np.eye(40)).all()
 
 
 def test_a_map_between_different_sizes_has_the_dims_target_by_source(shape):
@@ -77,31 +85,31 @@ def test_a_map_between_different_sizes_has_the_dims_target_by_source(shape):
 
 
 def test_the_landmark_fit_of_identical_shapes_is_near_the_identity(shape):
-    Phi, _, eigenvalue, X = shape
+    Phi, area, eigenvalue, X = shape
     landmark = farthest_points(X, 10)
-    C = fmap.fit_landmarks(
-        Phi[:, :20], Phi[:, :20], eigenvalue[:20], eigenvalue[:20], landmark, landmark
-    )
+    same = basis(Phi, area, eigenvalue).first(20)
+    C = fmap.fmap_from_landmarks(same, same, landmark, landmark)
     assert pytest.approx(np.eye(20), abs=1e-6) == C
 
 
 def test_the_landmark_fit_finds_the_signs_of_the_eigenfunctions(shape, permuted):
-    Phi, _, eigenvalue, X = shape
-    Psi, _, _, _, order, sign = permuted
+    Phi, area, eigenvalue, X = shape
+    Psi, area_target, _, _, order, sign = permuted
     landmark = farthest_points(X, 10)
     same = np.argsort(order)[landmark]
-    C = fmap.fit_landmarks(
-        Phi[:, :20], Psi[:, :20], eigenvalue[:20], eigenvalue[:20], landmark, same
-    )
+    source = basis(Phi, area, eigenvalue).first(20)
+    target = basis(Psi, area_target, eigenvalue).first(20)
+    C = fmap.fmap_from_landmarks(source, target, landmark, same)
     assert pytest.approx(np.diag(sign[:20]), abs=1e-6) == C
 
 
 def test_the_landmark_fit_is_the_least_squares_solution_of_its_energy(shape):
-    Phi, _, eigenvalue, X = shape
+    Phi, area, eigenvalue, X = shape
     k, commute = 6, 1e-2
     landmark, other = farthest_points(X, 4), farthest_points(X, 9)[5:]
     ev, ev_target = eigenvalue[:k], 1.3 * eigenvalue[:k]
-    C = fmap.fit_landmarks(Phi[:, :k], Phi[:, :k], ev, ev_target, landmark, other, commute=commute)
+    source, target = (basis(Phi[:, :k], area, values) for values in (ev, ev_target))
+    C = fmap.fmap_from_landmarks(source, target, landmark, other, commute=commute)
     F = descriptors.landmark_coefficients(
         Phi[:, :k], descriptors.heat_filter(ev, ev_target, n=8), landmark
     )
@@ -122,7 +130,7 @@ def test_the_landmark_fit_is_the_least_squares_solution_of_its_energy(shape):
 def test_nearest_rows_are_those_of_a_float64_search(d):
     rng = np.random.default_rng(d)
     Q, D = rng.normal(size=(3000, d)), rng.normal(size=(2500, d))
-    assert (fmap.nearest_rows(Q, D, block=700) == cKDTree(D).query(Q)[1]).all()
+    assert (nearest_rows(Q, D, block=700) == cKDTree(D).query(Q)[1]).all()
 
 
 def test_rows_that_float32_cannot_tell_apart_are_told_apart():
@@ -131,18 +139,18 @@ def test_rows_that_float32_cannot_tell_apart_are_told_apart():
     D[::2] += 1e-9
     Q = D[rng.permutation(600)]
     assert (D.astype(np.float32)[::2] == D.astype(np.float32)[1::2]).mean() > 0.9
-    assert (D[fmap.nearest_rows(Q, D)] == Q).all()
+    assert (D[nearest_rows(Q, D)] == Q).all()
 
 
 def test_nearest_rows_does_not_depend_on_the_block():
     rng = np.random.default_rng(5)
     Q, D = rng.normal(size=(1000, 20)), rng.normal(size=(900, 20))
-    assert (fmap.nearest_rows(Q, D, block=64) == fmap.nearest_rows(Q, D)).all()
+    assert (nearest_rows(Q, D, block=64) == nearest_rows(Q, D)).all()
 
 
 def test_of_equal_rows_the_first_is_given():
     D = np.repeat(np.eye(4), 3, axis=0)
-    assert fmap.nearest_rows(np.eye(4), D).tolist() == [0, 3, 6, 9]
+    assert nearest_rows(np.eye(4), D).tolist() == [0, 3, 6, 9]
 
 
 def real_pairs():
@@ -175,6 +183,6 @@ def test_zoomout_is_that_of_pyfm_to_the_last_index(name):
     peer, their_match = refine.zoomout_refine(
         C, Phi, Psi, nit=8, step=5, A2=area, return_p2p=True, n_jobs=1
     )
-    ours, match = fmap.zoomout(C, Phi, Psi, area, 60, step=5)
+    ours, match = fmap.zoomout(*(Shape(None, mesh).low for mesh in (source, target)), C, 60, step=5)
     assert (match == their_match).all()
     assert ours == pytest.approx(peer, abs=1e-12)

@@ -1,5 +1,7 @@
 """Joint refinement and displacement (eq. 8): planted deformations, and the score of a match."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -7,7 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from s4a import coarsen, spectrum, synthetic
 from s4a.geometry.mesh import as_arrays, vertex_areas, vertex_normals
-from s4a.method import deform, joint, spectral
+from s4a.method import deform, joint
+from s4a.method.shape import Shape
 
 
 def bumps(X):
@@ -23,21 +26,18 @@ def surface():
     mesh = spectrum(
         coarsen(synthetic.brains(1, 6000)["original/brain_01"].to_dataset(), n_coarse=1500), k=60
     )
-    X, T = as_arrays(mesh)
-    area = spectral.unit_area(mesh)
-    size = np.sqrt(mesh["vertex_area"].values.sum())
-    return joint.Surface((X - area @ X) / size, T, area, mesh["eigenfunction"].values)
+    return Shape(None, mesh).low
 
 
 def moved(surface, X):
-    return joint.Surface(X, surface.T, surface.area, surface.Phi)
+    return replace(surface, X=X)
 
 
 def test_the_joint_rounds_leave_the_identity_alone(surface):
     every = np.arange(len(surface.X))
     match, motion = joint.low_rounds(surface, surface, every, k=60)
     assert (match == every).all()
-    assert joint.registered(surface, motion) == pytest.approx(surface.X, abs=1e-12)
+    assert joint.move(surface, motion) == pytest.approx(surface.X, abs=1e-12)
 
 
 @pytest.mark.parametrize("spectral_weight", [0.0, 0.1])
@@ -47,7 +47,7 @@ def test_a_planted_deformation_is_recovered_and_far_better_than_by_nearest_neigh
     source = moved(surface, surface.X + bumps(surface.X))
     start = cKDTree(source.X).query(surface.X)[1]
     match, motion = joint.low_rounds(source, surface, start, k=60, spectral=spectral_weight)
-    error = np.linalg.norm(joint.registered(surface, motion) - source.X, axis=1).mean()
+    error = np.linalg.norm(joint.move(surface, motion) - source.X, axis=1).mean()
     nearest = np.linalg.norm(source.X[start] - source.X, axis=1).mean()
     assert nearest > 0.015
     assert error < 0.005
@@ -70,7 +70,7 @@ def test_the_dense_rounds_keep_a_planted_deformation_of_the_span(surface):
     source = moved(surface, surface.X + surface.Phi @ c)
     match, motion = joint.dense_rounds(source, surface, (np.eye(3), np.zeros(3), 0.9 * c))
     assert (match == np.arange(len(match))).mean() > 0.95
-    assert np.linalg.norm(joint.registered(surface, motion) - source.X, axis=1).mean() < 2e-3
+    assert np.linalg.norm(joint.move(surface, motion) - source.X, axis=1).mean() < 2e-3
 
 
 def test_a_wrong_match_scores_worse_than_a_right_one(surface):
@@ -78,7 +78,7 @@ def test_a_wrong_match_scores_worse_than_a_right_one(surface):
     source = moved(surface, surface.X + bumps(surface.X))
 
     def score(match):
-        return joint.badness(
+        return joint.registration_score(
             source,
             surface,
             match,
@@ -103,7 +103,7 @@ def test_the_finalists_are_the_candidates_of_least_score(surface):
     assert score == min(s for s, *_ in found.values())
     assert all(found[other][0] <= 1.25 * score for other in others)
     assert "bad" not in others
-    assert np.linalg.norm(joint.registered(surface, motion) - source.X, axis=1).mean() < 0.005
+    assert np.linalg.norm(joint.move(surface, motion) - source.X, axis=1).mean() < 0.005
     assert len(match) == len(surface.X)
 
 

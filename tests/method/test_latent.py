@@ -10,7 +10,9 @@ import pytest
 import scipy.linalg
 
 from s4a import coarsen, spectrum, synthetic
-from s4a.method import latent, median, network, spectral
+from s4a.method import latent, median, network
+from s4a.method.first_map import map_after_motion
+from s4a.method.shape import Basis, Shape
 
 
 def complete(n):
@@ -127,23 +129,15 @@ def shapes():
 
 
 def zoomed(shapes, first, **options):
-    Phi = [s["eigenfunction"].values for s in shapes]
-    area = [spectral.unit_area(s) for s in shapes]
-    eigenvalues = np.stack([s["eigenvalue"].values for s in shapes])
-    return latent.consistent_zoomout(
-        first, *complete(len(shapes)), Phi, area, eigenvalues, 25, step=4, **options
-    )
+    bases = [Shape(None, mesh).low for mesh in shapes]
+    return latent.consistent_zoomout(bases, first, *complete(len(shapes)), 25, step=4, **options)
 
 
 @pytest.fixture(scope="module")
 def first(shapes):
-    low = []
-    for s in shapes:
-        X, area = s["position"].values, spectral.unit_area(s)
-        X = (X - area @ X) / np.sqrt(s["vertex_area"].values.sum())
-        low.append((X, area, s["eigenfunction"].values, s["eigenvalue"].values))
+    low = [Shape(None, mesh).low for mesh in shapes]
     still = (np.eye(3), np.zeros(3))
-    return np.stack([network.first_map(low[i], low[j], still, k_init=12) for i, j in complete(3).T])
+    return np.stack([map_after_motion(low[i], low[j], still, k_init=12) for i, j in complete(3).T])
 
 
 def test_consistent_zoomout_of_identical_shapes_is_the_identity(shapes):
@@ -182,7 +176,6 @@ def test_progress_is_told_the_size_of_every_round(shapes, first):
 
 def test_maps_that_have_their_size_stay_as_they_are(maps, eigenvalues):
     C, source, target, _ = maps
-    Phi, area = [np.random.default_rng(0).normal(size=(30, 8))] * 5, [np.full(30, 1 / 30)] * 5
-    assert np.array_equal(
-        latent.consistent_zoomout(C, source, target, Phi, area, eigenvalues, 8)[0], C
-    )
+    Phi = np.random.default_rng(0).normal(size=(30, 8))
+    bases = [Basis(None, None, np.full(30, 1 / 30), Phi, values) for values in eigenvalues]
+    assert np.array_equal(latent.consistent_zoomout(bases, C, source, target, 8)[0], C)

@@ -7,8 +7,8 @@ import s4a
 from s4a import synthetic
 from s4a.geometry.mesh import as_arrays, stiffness, vertex_areas
 from s4a.method import lift
-from s4a.method.register import Scan
 from s4a.method.remesh import laplacian
+from s4a.method.shape import Shape
 from s4a.method.spectral import eigenpairs
 
 K = 30
@@ -20,7 +20,7 @@ def shape():
     X, _ = as_arrays(mesh)
     X = X * (1 + 0.1 * np.cos(5 * X[:, :1]) * np.sin(4 * X[:, 1:2]))
     mesh = mesh.assign(position=(mesh["position"].dims, X))
-    return mesh, Scan(mesh, s4a.spectrum(s4a.coarsen(mesh, n_coarse=500), k=K + lift.SPARE))
+    return mesh, Shape(mesh, s4a.spectrum(s4a.coarsen(mesh, n_coarse=500), k=K + lift.SPARE))
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,9 @@ def test_lifted_functions_are_eigenfunctions_of_the_mesh_where_projected_ones_ar
     _, scan = shape
     projected = scan.U @ scan.coarse["eigenfunction"].values[:, :K]
     assert outside(B.astype(float), Phi, area) < 0.35 * outside(projected, Phi, area)
-    off, coarse_off = (np.abs(e[1:K] / eigenvalue[1:] - 1).max() for e in (found, scan.eigenvalue))
+    off, coarse_off = (
+        np.abs(e[1:K] / eigenvalue[1:] - 1).max() for e in (found, scan.low.eigenvalue)
+    )
     assert off < 0.1 * coarse_off
 
 
@@ -79,7 +81,7 @@ def test_the_smoother_damps_what_is_rough_and_enlarges_nothing():
 def test_a_mesh_of_obtuse_triangles_is_lifted_too(shape):
     mesh, _ = shape
     flat = mesh.assign(position=mesh["position"] * [1.0, 1.0, 0.15])
-    scan = Scan(flat, s4a.spectrum(s4a.coarsen(flat, n_coarse=500), k=K + lift.SPARE))
+    scan = Shape(flat, s4a.spectrum(s4a.coarsen(flat, n_coarse=500), k=K + lift.SPARE))
     X, T = as_arrays(flat)
     E, w, area, _ = laplacian(X, T, vertex_areas(X, T))
     assert (w < 0).mean() > 0.02
@@ -93,7 +95,7 @@ def test_every_piece_of_a_mesh_keeps_its_constant():
     ball = synthetic.sphere(1500)
     X, T = as_arrays(ball)
     two = s4a.geometry.mesh.as_dataset(np.r_[X, X + [3, 0, 0]], np.r_[T, T + len(X)])
-    scan = Scan(two, s4a.spectrum(s4a.coarsen(two, n_coarse=400), k=12))
+    scan = Shape(two, s4a.spectrum(s4a.coarsen(two, n_coarse=400), k=12))
     X, T = as_arrays(two)
     eigenvalue, B = lift.lift(X, T, vertex_areas(X, T), scan.U, scan.coarse, 6)
     assert np.allclose(eigenvalue[:2], 0, atol=1e-3)

@@ -1,13 +1,16 @@
 """The network of maps (3.4): which pairs, first maps, cycles."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.sparse.csgraph import connected_components
 
 from s4a import coarsen, spectrum, synthetic
-from s4a.method import network, spectral
+from s4a.method import network
+from s4a.method.first_map import map_after_motion
+from s4a.method.shape import Shape
 
 
 def distances(n, seed=0):
@@ -78,16 +81,13 @@ def low():
     mesh = spectrum(
         coarsen(synthetic.brains(1, 3000)["original/brain_01"].to_dataset(), n_coarse=700), k=20
     )
-    area = spectral.unit_area(mesh)
-    X = mesh["position"].values / np.sqrt(mesh["vertex_area"].values.sum())
-    return X - area @ X, area, mesh["eigenfunction"].values, mesh["eigenvalue"].values
+    return Shape(None, mesh).low
 
 
 @pytest.mark.parametrize("init", ["dense", "landmarks"])
 def test_the_first_map_of_a_shape_to_itself_moved_is_the_identity(low, init):
-    X, area, Phi, eigenvalue = low
     R, t = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 2, 3])
-    C = network.first_map(low, (X @ R.T + t, area, Phi, eigenvalue), (R, t), k_init=20, init=init)
+    C = map_after_motion(low, replace(low, X=low.X @ R.T + t), (R, t), k_init=20, init=init)
     assert pytest.approx(np.eye(20), abs=1e-9) == C
 
 

@@ -12,6 +12,7 @@ from s4a import clean, coarsen, match_pair, spectrum, synthetic
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.method import register
 from s4a.method.deform import displacement_in_template
+from s4a.method.shape import Shape
 
 OPTIONS = {"n_coarse": 2000, "k": 60}
 
@@ -142,31 +143,34 @@ def test_the_same_call_gives_the_same_bits(pair, template, deformed):
 
 
 @pytest.fixture(scope="module")
-def scans(template, deformed):
-    return [
-        register.Scan(m, spectrum(coarsen(m, n_coarse=800), k=30)) for m in (deformed, template)
-    ]
+def shapes(template, deformed):
+    return [Shape(m, spectrum(coarsen(m, n_coarse=800), k=30)) for m in (deformed, template)]
 
 
-def test_the_way_back_reproduces_the_positions(scans):
-    source, target = scans
+def test_the_way_back_reproduces_the_positions(shapes):
+    source, target = shapes
     image = source.original["position"].values  # the template deformed exactly
     triangle, weight = register.way_back(source, target, image)
     assert weight.sum(1) == pytest.approx(1)
     assert weight.min() >= 0
-    found = np.einsum("nc,ncx->nx", weight, image[target.dense.T[triangle]])
+    found = np.einsum("nc,ncx->nx", weight, image[target.full.T[triangle]])
     assert found == pytest.approx(image, abs=1e-6)
 
 
-def test_confidence_is_one_for_a_perfect_match_and_low_where_it_is_broken(scans):
-    source, target = scans
+def confidence(source, target, match, image, back):
+    trip = register.round_trip(target, match, *back)
+    return register.confidence(source, match, image, trip)
+
+
+def test_confidence_is_one_for_a_perfect_match_and_low_where_it_is_broken(shapes):
+    source, target = shapes
     image, every = source.original["position"].values, np.arange(5000)
     back = register.way_back(source, target, image)
-    assert register.confidence(source, target, every, image, *back) == pytest.approx(1, abs=1e-5)
+    assert confidence(source, target, every, image, back) == pytest.approx(1, abs=1e-5)
     broken = every.copy()
-    right = np.flatnonzero(target.dense.X[:, 0] > 0.15)
+    right = np.flatnonzero(target.full.X[:, 0] > 0.15)
     broken[right] = np.random.default_rng(0).permutation(right)
-    found = register.confidence(source, target, broken, image, *back)
+    found = confidence(source, target, broken, image, back)
     assert found.min() >= 0
     assert found.max() <= 1
     assert found[right].mean() < 0.2
@@ -174,23 +178,23 @@ def test_confidence_is_one_for_a_perfect_match_and_low_where_it_is_broken(scans)
 
 
 def test_the_template_is_registered_to_itself_by_definition(template):
-    own = register.identity(template_scan := register.Scan(template, template))
+    own = register.identity(shape := Shape(template, template))
     X, T = as_arrays(template)
     corner = X[T[own["template_triangle"].values]]
     assert np.einsum("nc,ncx->nx", own["template_barycentric"].values, corner) == pytest.approx(X)
     assert (own["registered_match"].values == np.arange(5000)).all()
-    assert template_scan.frame[1] == pytest.approx(np.sqrt(vertex_areas(X, T).sum()))
+    assert shape.frame[1] == pytest.approx(np.sqrt(vertex_areas(X, T).sum()))
 
 
-def test_size_can_be_taken_out_of_the_displacement(scans):
-    _, target = scans
+def test_size_can_be_taken_out_of_the_displacement(shapes):
+    _, target = shapes
     X, T = as_arrays(target.original)
     grown = clean(as_dataset(1.2 * X, T))
-    source = register.Scan(grown, spectrum(coarsen(grown, n_coarse=800), k=30))
+    source = Shape(grown, spectrum(coarsen(grown, n_coarse=800), k=30))
     start = {"intrinsic": cKDTree(source.low.X).query(target.low.X)[1]}
     functions = source.low.Phi, target.low.Phi
-    with_size = register.registration(source, target, start, functions, k=30)
-    without = register.registration(source, target, start, functions, k=30, scale=True)
+    with_size = register.register(source, target, start, functions, k=30)
+    without = register.register(source, target, start, functions, k=30, scale=True)
     assert without["scale"].item() == pytest.approx(1 / 1.2, rel=1e-3)
     radius = np.linalg.norm(X - X.mean(0), axis=1).mean()
     assert np.linalg.norm(without["displacement"].values, axis=1).mean() < 0.005 * radius
@@ -229,9 +233,9 @@ def test_a_mesh_without_triangles_is_refused_by_name(template):
 
 def test_distortion_is_the_log_of_the_areas_ratio_and_size_does_not_count():
     X, T = as_arrays(synthetic.sphere(2000))
-    assert register.distortion(3 * X, X, T) == pytest.approx(0)
+    assert register.log_area_ratio(3 * X, X, T) == pytest.approx(0)
     half = X * [1, 1, 2]  # an ellipsoid: a band around the equator grows twofold, the poles stay
-    found = register.distortion(half, X, T)
+    found = register.log_area_ratio(half, X, T)
     total = np.log(vertex_areas(half, T).sum() / vertex_areas(X, T).sum())
     height = np.abs(X[:, 2])
     assert np.median(found[height < 0.05]) == pytest.approx(np.log(2) - total, abs=0.02)

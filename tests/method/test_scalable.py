@@ -8,6 +8,7 @@ from s4a.geometry.mesh import edge_graph, edges, path_lengths
 from s4a.method import fmap
 from s4a.method.nearest import nearest_in_cells
 from s4a.method.scalable import local_functions, local_space, reduce, spread
+from s4a.method.shape import Shape
 
 
 @pytest.fixture(scope="module")
@@ -15,19 +16,28 @@ def ball():
     return reduce(synthetic.sphere(5000), n_samples=500, k=36)
 
 
+def unit_arrays(mesh):
+    """Vertices in the frame of the shape, and triangles."""
+    shape = Shape(mesh)
+    return shape.to_frame(mesh["position"].values), mesh["corner_vertex"].values
+
+
 def test_the_spectrum_of_a_sphere_is_0_3x2_5x6_7x12_within_a_tenth(ball):
     true = 4 * np.pi * np.concatenate([[l * (l + 1)] * (2 * l + 1) for l in range(6)])
-    assert ball.eigenvalue[0] < 1e-6
-    np.testing.assert_allclose(ball.eigenvalue[1:], true[1:], rtol=0.1)
+    assert ball.low.eigenvalue[0] < 1e-6
+    np.testing.assert_allclose(ball.low.eigenvalue[1:], true[1:], rtol=0.1)
 
 
 def test_the_eigenfunctions_are_orthonormal_on_the_dense_mesh(ball):
-    np.testing.assert_allclose(ball.Phi.T @ (ball.mass @ ball.Phi), np.eye(36), atol=1e-9)
-    np.testing.assert_allclose(ball.U @ ball.Phi[:, 0], 1, atol=1e-6)
+    Phi = ball.low.Phi
+    np.testing.assert_allclose(Phi.T @ (ball.low.mass @ Phi), np.eye(36), atol=1e-9)
+    np.testing.assert_allclose(ball.U @ Phi[:, 0], 1, atol=1e-6)
 
 
 def test_local_functions_sum_to_one_and_reach_as_far_as_the_radius_along_the_surface():
-    X, T, sample, _, U = local_space(synthetic.torus(60, 30), 150)
+    torus = synthetic.torus(60, 30)
+    sample, _, U = local_space(torus, 150)
+    X, T = unit_arrays(torus)
     _, _, radius, G = spread(X, T, 150)
     np.testing.assert_allclose(U.sum(axis=1), 1)
     i, j = U.nonzero()
@@ -47,24 +57,25 @@ def test_local_functions_do_not_cross_a_thin_wall():
 
 def test_every_vertex_is_well_inside_a_bump_on_a_surface_of_uneven_sampling():
     mesh = synthetic.ellipsoid(3000, (6.0, 1.0, 0.3))
-    X, T, sample, cell, _ = local_space(mesh, 200)
+    sample, cell, _ = local_space(mesh, 200)
+    X, T = unit_arrays(mesh)
     _, _, radius, G = spread(X, T, 200)
     assert path_lengths(G, sample[cell], np.arange(3000), 9.0).max() <= 0.75 * radius
 
 
 def test_identical_shapes_give_the_identity():
-    space = reduce(synthetic.ellipsoid(2000), n_samples=300, k=30)
-    C, match = fmap.zoomout(np.eye(10), space.Phi, space.Phi, space.mass, 30)
+    shape = reduce(synthetic.ellipsoid(2000), n_samples=300, k=30)
+    C, match = fmap.zoomout(shape.low, shape.low, np.eye(10), 30)
     np.testing.assert_allclose(C, np.eye(30), atol=1e-8)
     assert (match == np.arange(len(match))).all()
-    F = space.U @ space.Phi
-    assert (nearest_in_cells(F, space.cell, F @ C.T, space.cell)[0] == np.arange(2000)).all()
+    F = shape.U @ shape.low.Phi
+    assert (nearest_in_cells(F, shape.cell, F @ C.T, shape.cell)[0] == np.arange(2000)).all()
 
 
 def test_the_result_does_not_depend_on_place_and_size():
     mesh = synthetic.ellipsoid(1500)
     moved = mesh.assign(position=mesh["position"] * 7.0 + 3.0)
-    one, other = (reduce(m, n_samples=200, k=12) for m in (mesh, moved))
+    one, other = (reduce(m, n_samples=200, k=12).low for m in (mesh, moved))
     np.testing.assert_allclose(one.eigenvalue, other.eigenvalue, atol=1e-6)
     np.testing.assert_allclose(np.abs(one.Phi), np.abs(other.Phi), atol=1e-4)
 

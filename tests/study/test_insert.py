@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 
 from s4a import analyse, insert, synthetic, transfer_labels, transfer_landmarks
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
-from s4a.method.pca import gram_pca
-from s4a.study.insert import frozen_basis, project_scores
+from s4a.method.latent import frozen_basis
+from s4a.method.pca import gram_pca, project_scores
 
 OPTIONS = {"n_coarse": 1000, "k": 50, "seed": 0}
 

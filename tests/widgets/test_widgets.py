@@ -21,6 +21,7 @@ from ipywidgets.widgets import widget as registry  # the open widgets are counte
 
 import s4a
 from s4a.geometry.mesh import vertex_normals
+from s4a.method.shape import Shape
 from s4a.show.draw import position_colors
 from s4a.show.live import color_bytes
 from s4a.show.pictures import aligned, mesh_of
@@ -275,9 +276,8 @@ def test_zoomout_is_replayed_as_the_step_module_does_it(study, panel):
     fmap.kind.value = "zoomout"
     row = study["network"].dataset.isel(pair=1)
     source, target = (study["coarse"][row[key].item()] for key in ("source", "target"))
-    area = target["vertex_area"].values / target["vertex_area"].values.sum()
-    bases = source["eigenfunction"].values, target["eigenfunction"].values
-    C, _ = s4a.method.fmap.zoomout(row["fmap_initial"].values, *bases, area, 24)
+    bases = (Shape(None, mesh.to_dataset()).low for mesh in (source, target))
+    C, _ = s4a.method.fmap.zoomout(*bases, row["fmap_initial"].values, 24)
     np.testing.assert_allclose(fmap.C, C)
     fmap.k.value = 10
     np.testing.assert_array_equal(fmap.C, row["fmap_initial"].values)

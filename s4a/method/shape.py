@@ -1,0 +1,206 @@
+"""A shape (3.1, 3.3, 4.1): one surface at two resolutions, in one frame, with its functions and U.
+
+Every step of the method takes shapes, or the :class:`Basis` of one at one resolution.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse as sp
+import xarray as xr
+from scipy.spatial import cKDTree
+
+from s4a.geometry.align import farthest_points
+from s4a.geometry.closest import feature_tree
+from s4a.geometry.mesh import as_arrays, edge_graph, edges, vertex_areas
+from s4a.method.deform import smoother
+
+N_SPREAD = 1000  # spread vertices of a shape on which Consistent ZoomOut looks for matches
+N_CENTRAL = 25_000  # vertices by which dense rounds move a shape
+
+
+@dataclass(frozen=True)
+class Basis:
+    """A surface of unit area at one resolution, and the functions on it that maps are made of.
+
+    Parameters
+    ----------
+    X : float ndarray (n, 3)
+        Vertices, in the frame of the shape.
+    T : int ndarray (m, 3)
+        Triangles; none where the vertices are samples of :mod:`s4a.method.scalable`.
+    area : float ndarray (n,)
+        Vertex areas, of sum 1.
+    Phi : float ndarray (p, k)
+        Functions on the vertices, p = n; or on those of the low resolution, where there is U.
+    eigenvalue : float ndarray (k,)
+        Theirs, for unit area.
+    mass : float ndarray (p,) or sparse matrix (p, p), optional
+        What Phi is orthonormal in; the areas by default.
+    U : sparse matrix (n, p), optional
+        Takes functions from the low resolution to the n vertices.  U Phi is never formed.
+    central : int ndarray (s,), optional
+        Vertices that rounds of registration look at; all by default.
+    """
+
+    X: np.ndarray
+    T: np.ndarray
+    area: np.ndarray
+    Phi: np.ndarray
+    eigenvalue: np.ndarray | None = None
+    mass: np.ndarray | sp.sparray | sp.spmatrix | None = None
+    U: sp.csr_matrix | None = None
+    central: np.ndarray | slice | None = None
+
+    def __post_init__(self) -> None:
+        if self.mass is None:
+            object.__setattr__(self, "mass", self.area)
+        if self.central is None:
+            object.__setattr__(self, "central", slice(None))
+
+    @property
+    def k(self) -> int:
+        """How many functions there are."""
+        return self.Phi.shape[1]
+
+    def first(self, k: int) -> "Basis":
+        """The same surface with its first k functions."""
+        eigenvalue = None if self.eigenvalue is None else self.eigenvalue[:k]
+        return Basis(
+            self.X, self.T, self.area, self.Phi[:, :k], eigenvalue, self.mass, self.U, self.central
+        )
+
+    def extend(self, F: np.ndarray) -> np.ndarray:
+        """Functions of the low resolution at all vertices: U F ``(n, q)`` in single precision.
+
+        Those that have a value at every vertex stay as they are.
+        """
+        if self.U is None or len(F) == len(self.X):
+            return F
+        return self.U @ F.astype(np.float32)
+
+    def field(self, c: np.ndarray) -> np.ndarray:
+        """The field U Phi c ``(n, 3)`` with coefficients c ``(q, 3)`` of the first functions."""
+        low = self.Phi[:, : len(c)] @ c
+        return low if self.U is None else self.U @ low
+
+    @cached_property
+    def smooth(self):
+        """Coefficients of a field given at the central vertices, see :func:`smoother`."""
+        U = None if self.U is None else self.U[self.central]
+        return smoother(self.Phi, self.area[self.central], U)
+
+    @cached_property
+    def spread(self) -> np.ndarray:
+        """Some vertices ``(s,)`` spread over the surface."""
+        return farthest_points(self.X, N_SPREAD)
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """KD-tree over position and normal of the vertices, 6 dims."""
+        return feature_tree(self.X, self.T)
+
+    @cached_property
+    def graph(self) -> sp.csr_matrix:
+        """Lengths of the edges as a sparse matrix ``(n, n)``."""
+        return edge_graph(self.X, edges(self.T))
+
+    @cached_property
+    def outwards(self) -> np.ndarray:
+        """Rows of the central vertices by their distance from the centre.
+
+        An order that neither pose nor numbering changes.
+        """
+        from_center = self.X[self.central] - self.area @ self.X
+        return np.argsort((from_center**2).sum(1), kind="stable")
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A shape at both resolutions; what is not asked for is neither read nor computed.
+
+    Its frame is x -> (x - center) / size with the area centroid and the square root of the total
+    area of the original mesh; of the coarse mesh where the original is not given.
+
+    Parameters
+    ----------
+    original : xarray.Dataset or None
+        The clean mesh: ``position``, ``corner_vertex``.
+    coarse : xarray.Dataset or None
+        As :func:`s4a.coarsen` and :func:`s4a.spectrum` make it.
+    """
+
+    original: xr.Dataset | None
+    coarse: xr.Dataset | None = None
+
+    @classmethod
+    def of(cls, original: xr.Dataset, **parts) -> "Shape":
+        """A shape whose ``low``, ``full``, ``U`` and ``cell`` were made in another way."""
+        shape = cls(original)
+        vars(shape).update(parts)  # in the place of the cached properties
+        return shape
+
+    @cached_property
+    def frame(self) -> tuple[np.ndarray, float]:
+        """Center ``(3,)`` and size, in the unit of the input."""
+        if self.original is None:
+            area, X = self.coarse["vertex_area"].values, self.coarse["position"].values
+            return area / area.sum() @ X, np.sqrt(area.sum())
+        X, T = as_arrays(self.original)
+        area = vertex_areas(X, T)
+        return area @ X / area.sum(), np.sqrt(area.sum())
+
+    def to_frame(self, points: np.ndarray) -> np.ndarray:
+        """Points ``(p, 3)`` in the unit of the input, in the frame."""
+        center, size = self.frame
+        return (points - center) / size
+
+    def from_frame(self, points: np.ndarray) -> np.ndarray:
+        """Points ``(p, 3)`` of the frame, in the unit of the input."""
+        center, size = self.frame
+        return points * size + center
+
+    @cached_property
+    def U(self) -> sp.csr_matrix:
+        """The projection operator of 4.1 ``(n, n_coarse)``: three barycentric weights a row."""
+        columns = self.coarse["coarse_vertex"].values  # (n, 3)
+        weights = self.coarse["coarse_weight"].values  # (n, 3), rows of sum 1
+        n, corners = columns.shape
+        rows = np.repeat(np.arange(n), corners)
+        return sp.csr_matrix(
+            (weights.ravel(), (rows, columns.ravel())), (n, self.coarse.sizes["vertex"])
+        )
+
+    @cached_property
+    def cell(self) -> np.ndarray:
+        """The coarse vertex that weighs most at each original vertex ``(n,)``."""
+        columns = self.coarse["coarse_vertex"].values
+        heaviest = self.coarse["coarse_weight"].values.argmax(1)
+        return columns[np.arange(len(columns)), heaviest]
+
+    @cached_property
+    def low(self) -> Basis:
+        """The coarse mesh and its eigenfunctions."""
+        X, T = as_arrays(self.coarse)
+        area = self.coarse["vertex_area"].values
+        Phi = self.coarse["eigenfunction"].values
+        eigenvalue = self.coarse["eigenvalue"].values
+        return Basis(self.to_frame(X), T, area / area.sum(), Phi, eigenvalue)
+
+    @cached_property
+    def full(self) -> Basis:
+        """The original mesh and the functions U Phi; its areas are those of the mesh, scaled."""
+        X, T = as_arrays(self.original)
+        X = self.to_frame(X)
+        low = self.low
+        area = vertex_areas(X, T)
+        return Basis(X, T, area, low.Phi, low.eigenvalue, low.mass, self.U, self.central)
+
+    @cached_property
+    def central(self) -> np.ndarray:
+        """Original vertices nearest to coarse ones, by their weights in U; all of few."""
+        weight = self.coarse["coarse_weight"].values.max(1)
+        if len(weight) <= N_CENTRAL:
+            return np.arange(len(weight))
+        return np.flatnonzero(weight >= np.partition(weight, -N_CENTRAL)[-N_CENTRAL])
