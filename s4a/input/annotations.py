@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from s4a.input import bounded
-from s4a.input.gifti import parse_gifti
+from s4a.input.formats import gifti_arrays
 from s4a.schema import dataset, require
 
 LONGEST = 255  # characters of a name: an array of names has room for the longest in each place
@@ -98,7 +98,7 @@ def _npz_labels(data, file, name, n):
 
 
 def _gifti_labels(data):
-    arrays = parse_gifti(data)
+    arrays = gifti_arrays(data)
     found = [values for intent, values in arrays if intent == "LABEL"]
     found = found or [values for _, values in arrays if values.ndim == 1]
     if not found:

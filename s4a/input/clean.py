@@ -19,8 +19,14 @@ from s4a.geometry.mesh import (
     triangle_normals,
     unique_edges,
 )
-from s4a.input import holes
-from s4a.input.manifold import cheapest, manifold_mates, mates, split_double_edges, umbrellas
+from s4a.input.manifold import (
+    cheapest,
+    fill_holes,
+    manifold_mates,
+    mates,
+    split_double_edges,
+    umbrellas,
+)
 from s4a.schema import require
 
 RELATIVE_TOLERANCE = (
@@ -64,7 +70,7 @@ def clean(mesh, *, components="largest", strict=False, close_holes=False):
         Refuse vertices that are not finite instead of removing them with their triangles.
     close_holes : bool
         Close every hole by a fan of triangles around a new vertex, see
-        :func:`s4a.input.holes.close_holes`.
+        :func:`s4a.input.manifold.fill_holes`.
 
     Returns
     -------
@@ -141,7 +147,7 @@ def clean_arrays(points, triangles, *, components="largest", strict=False, close
     new[~kept] = -1
     T, file_vertex = new[T], file_vertex[kept]
     if close_holes:
-        X, T, nearby = holes.close_holes(X, T)
+        X, T, nearby = fill_holes(X, T)
         file_vertex = np.r_[file_vertex, file_vertex[nearby]]
         counts["closed_holes"] = len(nearby)
     _count_topology(T, counts)

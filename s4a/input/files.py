@@ -8,50 +8,22 @@ import re
 import unicodedata
 import zipfile
 from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
 from s4a.input import bounded
-from s4a.input.formats import NPZ_KEYS, READERS, WRITERS
+from s4a.input.formats import FORMATS, NPZ_KEYS, SURFER, format_of
 
-SURFER = (
-    ".pial",
-    ".white",
-    ".inflated",
-    ".orig",
-    ".smoothwm",
-    ".sphere",
-)  # FreeSurfer: the name is the suffix
-SUFFIXES = {
-    "PLY": (".ply",),
-    "OBJ": (".obj",),
-    "OFF": (".off",),
-    "STL": (".stl",),
-    "VTK": (".vtk",),
-    "VTP": (".vtp",),
-    "GIFTI": (".gii",),
-    "NPZ": (".npz",),
-    "FreeSurfer": SURFER,
-}
+SUFFIXES = {suffix: name for name, known in FORMATS.items() for suffix in known.suffixes.split()}
+WRITERS = {known.suffixes.split()[0]: known.write for known in FORMATS.values() if known.write}
+OTHERS = ".json .csv .txt .md .html .png .jpg .nc .npy .annot .nii".split()  # that a glob may match
+
+Paths = str | os.PathLike | Iterable[str | os.PathLike]
 
 
-OTHERS = (
-    ".json",
-    ".csv",
-    ".txt",
-    ".md",
-    ".html",
-    ".png",
-    ".jpg",
-    ".nc",
-    ".npy",
-    ".annot",
-    ".nii",
-)  # of a glob
-
-
-def read_mesh(path):
+def read_mesh(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray, dict[str, str]]:
     """Points and triangles of a mesh file; the format is told by the content, not by the name.
 
     Parameters
@@ -82,36 +54,35 @@ def read_mesh(path):
     >>> import tempfile
     >>> from pathlib import Path
     >>> import s4a
-    >>> folder = Path(tempfile.mkdtemp())
-    >>> path = s4a.write_mesh(folder / "one.off", [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
-    >>> points, triangles = s4a.read_mesh(folder / "one.off")[:2]
+    >>> path = Path(tempfile.mkdtemp()) / "one.off"
+    >>> s4a.write_mesh(path, [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+    >>> points, triangles, attrs = s4a.read_mesh(path)
     >>> points.shape, triangles.tolist()
     ((3, 3), [[0, 1, 2]])
     """
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"no file {path}")
-    found = "mesh"
+    name = "mesh"
     try:
         data = bounded.content(path).removeprefix(b"\xef\xbb\xbf")
-        found = _sniff(data)
+        name = format_of(data)
         with np.errstate(all="ignore"):  # nonsense in the file is refused, or left to the cleaning
-            points, triangles, attrs = READERS[found](data)
+            points, triangles, attrs = FORMATS[name].read(data)
             points, triangles = _checked(points, triangles)
     except Exception as error:  # whatever a file holds, it must not end the run over a collection
-        raise ValueError(
-            f"{path} cannot be read as {found}: {error or type(error).__name__}"
-        ) from error
+        why = error or type(error).__name__
+        raise ValueError(f"{path} cannot be read as {name}: {why}") from error
+    attrs = {"format": name, **attrs}
     space = re.search(rb"SPACE=(RAS|LPS)", data[:1000])  # as 3D Slicer writes it into any header
     if space:
         attrs["coordinate_system"] = space[1].decode()
-    promised = [name for name, suffixes in SUFFIXES.items() if suffix_of(path) in suffixes]
-    if promised and found not in promised:
-        attrs["note"] = f"named {path.suffix} but holds {found}, and was read as that; rename it"
-    return points, triangles, {"format": found, **attrs}
+    if SUFFIXES.get(suffix_of(path), name) != name:
+        attrs["note"] = f"named {path.suffix} but holds {name}, and was read as that; rename it"
+    return points, triangles, attrs
 
 
-def suffix_of(path):
+def suffix_of(path: str | os.PathLike) -> str:
     """What the name promises: the suffix in lower case, that before .gz where there is one.
 
     Examples
@@ -123,73 +94,42 @@ def suffix_of(path):
     return Path(Path(path).name.lower().removesuffix(".gz")).suffix
 
 
-def stem_of(path):
-    """The name without the suffix of its format, and without .gz.
+def stem_of(path: str | os.PathLike) -> str:
+    """The name without .gz and without the suffix of its format; FreeSurfer's suffixes are names.
 
-    FreeSurfer's suffixes are names.
+    Examples
+    --------
+    >>> from s4a.input.files import stem_of
+    >>> stem_of("scans/head.ply.gz"), stem_of("lh.pial")
+    ('head', 'lh.pial')
     """
     name = Path(path).name
     name = name[:-3] if name.lower().endswith(".gz") else name
-    return name if suffix_of(path) in SURFER else Path(name).stem
-
-
-def _sniff(data):
-    """The format that the first bytes show."""
-    head = data[:4096].lstrip()
-    starts = {
-        b"ply\n": "PLY",
-        b"ply\r": "PLY",
-        b"# vtk DataFile": "VTK",
-        b"PK\x03\x04": "NPZ",
-        b"\xff\xff\xfe": "FreeSurfer",
-    }
-    for start, name in starts.items():
-        if head.startswith(start):
-            return name
-    if head.startswith(b"<"):
-        for start, name in {b"<VTKFile": "VTP", b"<GIFTI": "GIFTI"}.items():
-            if start in head:
-                return name
-    if re.match(rb"(ST)?C?N?OFF", head):
-        return "OFF"
-    if len(data) >= 84 and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little"):
-        return "STL"
-    if re.match(rb"solid\b", head, re.I) and re.search(rb"\bfacet\b|\bendsolid\b", data, re.I):
-        return "STL"
-    if b"\0" not in head and re.search(rb"^[ \t]*v[ \t]+[-+.\dn]", data, re.M):
-        return "OBJ"
-    if b"\0" in head and len(data) >= 84:
-        return "STL"
-    formats = ", ".join(SUFFIXES)
-    raise ValueError(
-        f"one of {formats} expected, found {len(data)} bytes" + " of something else" * bool(data)
-    )
+    return name if suffix_of(path) in SURFER.split() else Path(name).stem
 
 
 def _checked(points, triangles):
+    """Points as float64, triangles as int32, or ValueError."""
     points, triangles = np.asarray(points, np.float64), np.asarray(triangles, np.int64)
     if points.ndim != 2 or points.shape[1] != 3 or triangles.ndim != 2 or triangles.shape[1] != 3:
         raise ValueError(
             f"points (n, 3) and triangles (m, 3) needed, found {points.shape} and {triangles.shape}"
         )
-    if len(points) and len(triangles) == 0:
-        raise ValueError(
-            f"no faces: a surface needs triangles, found {len(points)} points and nothing else"
-        )
-    if len(points) == 0:
-        raise ValueError(f"a surface needs vertices and triangles, found 0 and {len(triangles)}")
+    n, m = len(points), len(triangles)
+    if n and m == 0:
+        raise ValueError(f"no faces: a surface needs triangles, found {n} points and nothing else")
+    if n == 0:
+        raise ValueError(f"a surface needs vertices and triangles, found 0 and {m}")
     low, high = triangles.min(), triangles.max()
-    if low < 0 or high >= len(points):
-        raise ValueError(
-            f"face indices 0..{len(points) - 1} expected for {len(points)} vertices, found {low}..{high}"
-        )
+    if low < 0 or high >= n:
+        raise ValueError(f"face indices 0..{n - 1} expected for {n} vertices, found {low}..{high}")
     return points, triangles.astype(np.int32)
 
 
-def write_mesh(path, points, triangles, **vertex_scalars):
-    """Write a mesh in the format that the suffix names.
-
-    .ply (binary), .obj, .off, .stl, .vtk, .gii or .npz.
+def write_mesh(
+    path: str | os.PathLike, points: np.ndarray, triangles: np.ndarray, **vertex_scalars: np.ndarray
+) -> None:
+    """Write a mesh in the format of the suffix: .ply (binary), .obj, .off, .stl, .vtk, .gii, .npz.
 
     Parameters
     ----------
@@ -227,12 +167,15 @@ def write_mesh(path, points, triangles, **vertex_scalars):
     suffix = path.suffix.lower()
     if suffix not in WRITERS:
         raise ValueError(f"a name ending in {', '.join(WRITERS)} needed, found {path.name}")
-    if scalars and suffix in (".obj", ".off", ".stl"):
+    if scalars and not FORMATS[SUFFIXES[suffix]].scalars:
         raise ValueError(f"{suffix} holds no values per vertex; write .ply, .vtk, .gii or .npz")
     path.write_bytes(WRITERS[suffix](points, triangles, scalars))
 
 
-def find_meshes(paths, pattern=None):
+# the files of a collection
+
+
+def find_meshes(paths: Paths, pattern: str | None = None) -> list[tuple[Path, str]]:
     """The mesh files of a collection and a name for each.
 
     Parameters
@@ -256,24 +199,18 @@ def find_meshes(paths, pattern=None):
     ValueError
         When a path is missing or no mesh is found.
     """
-    files = [file for file, why in _files(paths) if not why]
+    files = [file for file, why_not in _files(paths) if not why_not]
     chosen = [file for file in files if pattern is None or _matches(file, pattern)]
     if not chosen:
-        suffixes = ", ".join(suffix for group in SUFFIXES.values() for suffix in group)
         where = ", ".join(map(str, _listed(paths))) or "an empty list"
-        filtered = (
-            f" of {len(files)} files matching {pattern!r}"
-            if pattern and files
-            else f" ({suffixes})"
-        )
-        raise ValueError(f"no mesh{filtered} in {where}")
+        if pattern and files:
+            raise ValueError(f"no mesh of {len(files)} files matching {pattern!r} in {where}")
+        raise ValueError(f"no mesh ({', '.join(SUFFIXES)}) in {where}")
     return list(zip(chosen, slugs(chosen), strict=True))
 
 
-def not_meshes(paths, pattern=None):
-    """The files of folders and globs that are named like meshes, or matched.
-
-    And hold something else.
+def not_meshes(paths: Paths, pattern: str | None = None) -> list[tuple[Path, str]]:
+    """The files that are named like meshes, or matched by a glob, and hold something else.
 
     Returns
     -------
@@ -281,9 +218,9 @@ def not_meshes(paths, pattern=None):
         Sorted by path, with what they are.
     """
     return [
-        (file, why)
-        for file, why in _files(paths)
-        if why and (pattern is None or _matches(file, pattern))
+        (file, why_not)
+        for file, why_not in _files(paths)
+        if why_not and (pattern is None or _matches(file, pattern))
     ]
 
 
@@ -292,17 +229,13 @@ def _listed(paths):
 
 
 def _files(paths):
-    """All files that are meant, once and sorted, with the reason why they are no meshes or ""."""
-    found = sorted(
-        (os.path.abspath(file), str(file), why)
-        for path in _listed(paths)
-        for file, why in _expand(path)
-    )
-    return [
-        (Path(file), why)
-        for i, (at, file, why) in enumerate(found)
-        if i == 0 or at != found[i - 1][0]
-    ]
+    """All files that are meant, once and sorted, each with why it is no mesh, or ""."""
+    by_place = {}
+    for path in _listed(paths):
+        for file, why_not in _expand(path):
+            place = os.path.abspath(file)
+            by_place[place] = min(by_place.get(place, (str(file), why_not)), (str(file), why_not))
+    return [(Path(file), why_not) for _, (file, why_not) in sorted(by_place.items())]
 
 
 def _matches(file, pattern):
@@ -310,79 +243,48 @@ def _matches(file, pattern):
 
 
 def _expand(path):
-    """The files that a folder, a file or a glob means.
-
-    With the reason why they are no meshes or "".
-    """
-    known = tuple(suffix for group in SUFFIXES.values() for suffix in group)
+    """The files that a folder, a file or a glob means, each with why it is no mesh, or ""."""
     path = Path(path).expanduser()
-    if path.is_file():
+    if path.is_file():  # named by itself, it is tried whatever it is
         return [(path, "")]
     if path.is_dir():
-        found = (Path(folder, name) for folder, _, names in os.walk(path) for name in names)
-        return [
-            (file, _other(file))
-            for file in found
-            if suffix_of(file) in known and file.name[0] != "."
-        ]
-    found = (
-        [Path(name) for name in glob.glob(str(path), recursive=True)]
-        if glob.has_magic(str(path))
-        else []
-    )
-    if not found:
+        files = (Path(folder, name) for folder, _, names in os.walk(path) for name in names)
+        meant = [file for file in files if suffix_of(file) in SUFFIXES and file.name[0] != "."]
+        return [(file, _why_not(file)) for file in meant]
+    matches = glob.glob(str(path), recursive=True) if glob.has_magic(str(path)) else []
+    if not matches:
         raise ValueError(f"no file, folder or match of {path}")
-    return [
-        one
-        for name in found
-        for one in ([(name, _other(name))] if name.is_file() else _expand(name))
-    ]
+    files = []
+    for match in map(Path, matches):
+        files += [(match, _why_not(match))] if match.is_file() else _expand(match)
+    return files
 
 
-def _other(file):
-    """What a file holds that may well lie beside the meshes of a collection and is none.
+def _why_not(file):
+    """What a file is that may well lie beside the meshes of a collection; "" where it may be one.
 
-    "" where it may be one.
+    Two formats hold other things as well as meshes, and are looked into.
     """
+    suffix = suffix_of(file)
+    if suffix in OTHERS:
+        return f"a {suffix} file"
     try:
-        if suffix_of(file) == ".npz":
+        if suffix == ".npz":
             with zipfile.ZipFile(file) as archive:
                 names = {name.removesuffix(".npy") for name in archive.namelist()}
-            return (
-                ""
-                if any(names.issuperset(keys) for keys in NPZ_KEYS)
-                else "an archive of other arrays"
-            )
-        if suffix_of(file) == ".gii":
+            if not any(names.issuperset(keys) for keys in NPZ_KEYS):
+                return "an archive of other arrays"
+        if suffix == ".gii":
             data = bounded.content(file)
-            return (
-                ""
-                if b"<GIFTI" not in data or b"NIFTI_INTENT_POINTSET" in data
-                else "a GIFTI file without points"
-            )
-        if suffix_of(file) in (
-            ".json",
-            ".csv",
-            ".txt",
-            ".md",
-            ".html",
-            ".png",
-            ".jpg",
-            ".nc",
-            ".npy",
-            ".annot",
-            ".nii",
-        ):
-            return f"a {suffix_of(file)} file"
+            if b"<GIFTI" in data and b"NIFTI_INTENT_POINTSET" not in data:
+                return "a GIFTI file without points"
     except (OSError, ValueError, zipfile.BadZipFile):  # it will be said when it is read
         pass
     return ""
 
 
-def slug(text):
-    """`text` in letters, digits, ``_`` and ``-``.
-
-    Accents are dropped, other characters outside ASCII escaped.
+def slug(text: str) -> str:
+    """`text` in letters, digits, ``_`` and ``-``: accents go, other letters become their code.
 
     Examples
     --------
@@ -390,22 +292,17 @@ def slug(text):
     >>> slug("Crâne 3.b"), slug("脳")
     ('Crane_3_b', 'u8133')
     """
-    kept = (c for c in unicodedata.normalize("NFKD", text) if not unicodedata.combining(c))
-    return (
-        "".join(
-            c if re.match(r"[A-Za-z0-9_-]", c) else "_" if c.isascii() else f"u{ord(c):x}"
-            for c in kept
-        )
-        or "_"
-    )
+    letters = [c for c in unicodedata.normalize("NFKD", text) if not unicodedata.combining(c)]
+    ascii_only = "".join(c if c.isascii() else f"u{ord(c):x}" for c in letters)
+    return re.sub(r"[^A-Za-z0-9_-]", "_", ascii_only) or "_"
 
 
-def slugs(files):
+def slugs(files: Iterable[str | os.PathLike]) -> list[str]:
     """A unique :func:`slug` for each path, also where upper and lower case are one."""
     files = [Path(os.path.abspath(file)) for file in files]
     base = os.path.commonpath([file.parent for file in files])
-    relative = [file.relative_to(base).as_posix() for file in files]
-    level = dict.fromkeys(relative, 0)
+    paths = [file.relative_to(base).as_posix() for file in files]
+    level = dict.fromkeys(paths, 0)  # how much of the path a name is made of
 
     def name(path):
         stem = Path(path).with_name(stem_of(path)).as_posix()
@@ -413,9 +310,10 @@ def slugs(files):
         return slug([Path(stem).name, stem, path, f"{path}_{digest}"][level[path]])
 
     while True:
-        names = {path: name(path).casefold() for path in relative}
-        taken = Counter(names.values())
-        double = [path for path in relative if taken[names[path]] > 1 and level[path] < 3]
-        if not double:
-            return [name(path) for path in relative]
-        level |= {path: level[path] + 1 for path in double}
+        names = {path: name(path).casefold() for path in paths}
+        count = Counter(names.values())
+        shared = [path for path in paths if count[names[path]] > 1 and level[path] < 3]
+        if not shared:
+            return [name(path) for path in paths]
+        for path in shared:
+            level[path] += 1
