@@ -41,6 +41,8 @@ def rigid_transform(
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.geometry.align import rigid_transform
     >>> P = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]])
     >>> R, t, s = rigid_transform(P, P + [1.0, 2, 3])
     >>> np.allclose(R, np.eye(3)), t.round(6).tolist()
@@ -80,6 +82,8 @@ def farthest_points(
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.geometry.align import farthest_points
     >>> farthest_points(np.array([[0.0, 0, 0], [1, 0, 0], [5, 0, 0]]), 2).tolist()
     [2, 0]
     """

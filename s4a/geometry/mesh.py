@@ -69,6 +69,8 @@ def edges(T: np.ndarray) -> np.ndarray:
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.geometry.mesh import edges
     >>> edges(np.array([[0, 1, 2], [2, 1, 3]])).tolist()
     [[0, 1], [0, 2], [1, 2], [1, 3], [2, 3]]
     """
@@ -126,6 +128,8 @@ def path_lengths(G: sp.csr_matrix, start: np.ndarray, end: np.ndarray, limit: fl
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.geometry.mesh import edge_graph, edges, path_lengths
     >>> X = np.array([[0.0, 0, 0], [1, 0, 0], [1, 2, 0], [0, 2, 0]])
     >>> G = edge_graph(X, edges(np.array([[0, 1, 2], [0, 2, 3]])))
     >>> path_lengths(G, np.array([0, 1, 1]), np.array([0, 3, 3]), 9.0).tolist()

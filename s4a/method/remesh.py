@@ -1,18 +1,26 @@
-"""Low-resolution mesh and projection operator U (4.1, step 1.
+r"""Low-resolution mesh and its projection operator U (4.1, step 1; U appears in eq. 4 and 7).
 
-In the spirit of ReMatching, Maggioli et al. 2024).
+In the spirit of ReMatching (Maggioli et al. 2024): well-spread samples, the manifold dual of their
+geodesic Voronoi cells (:mod:`s4a.geometry.voronoi`), and for every vertex of the original the
+closest point on the coarse triangles around its own cell.  A row of U holds the barycentric weights
+of that point::
 
-Well-spread samples, the manifold dual of their geodesic Voronoi cells
-(:mod:`s4a.geometry.voronoi`), and for every vertex of the original the closest point on the coarse
-triangles around its own cell.
+                 c            p: the point closest to x of all coarse triangles around a,
+                / \              the sample whose cell holds x
+               /   \
+      x . . . p     \         row of x in U: the weights u at a, v at b, w at c of p,
+             /       \        so that (U f)(x) = u f(a) + v f(b) + w f(c)
+            a---------b
 """
 
 import contextlib
 import os
+from collections.abc import Iterator
 
 import numpy as np
 import robust_laplacian
 import scipy.sparse as sp
+import xarray as xr
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
@@ -20,6 +28,7 @@ from s4a.geometry.align import farthest_points
 from s4a.geometry.closest import closest_point_in_star
 from s4a.geometry.mesh import (
     as_arrays,
+    components,
     directed_edges,
     edge_graph,
     edges,
@@ -33,7 +42,6 @@ from s4a.geometry.mesh import (
 )
 from s4a.geometry.voronoi import (
     between_rims,
-    components,
     cut_handles,
     dual,
     refine,
@@ -42,78 +50,103 @@ from s4a.geometry.voronoi import (
 )
 from s4a.schema import dataset, require
 
-FIRST, MOST = (
-    0.95,
-    1.1,
-)  # share of n_coarse that is sampled first, and with which cutting handles begins
+FIRST = 0.95  # share of n_coarse that is sampled first; mending faults needs the rest
+MOST = 1.1  # share of n_coarse from which on handles are cut, rather than more samples added
+CUTS = 3  # how often that is tried before samples are added without limit
 
 
-def sample_surface(X, T, G, rim, avoid, k, seed=0):
+def sample_surface(
+    X: np.ndarray,
+    T: np.ndarray,
+    G: sp.csr_matrix,
+    rim: np.ndarray,
+    avoid: np.ndarray,
+    k: int,
+    seed: int = 0,
+) -> np.ndarray:
     """About k vertices spread over the surface, its boundary edges `rim` at the same spacing.
 
     Farthest points of (position, spacing * normal): the two sides of a thin wall count as apart,
     and bends get more.
+
+    Parameters
+    ----------
+    X, T : the mesh
+    G : sparse matrix (n, n)
+        :func:`s4a.geometry.mesh.edge_graph`.
+    rim : int ndarray (r, 2)
+    avoid : bool ndarray (n,)
+        Vertices that are not taken.
+    k, seed : int
+
+    Returns
+    -------
+    int ndarray, sorted
     """
     area = vertex_areas(X, T)
-    spacing = np.sqrt(2 / np.sqrt(3) * area.sum() / k)
+    spacing = np.sqrt(2 / np.sqrt(3) * area.sum() / k)  # of equilateral triangles around k vertices
     N = vertex_normals(X, T)
     ring = G.astype(bool).astype(float)
-    for _ in range(2):
+    for _ in range(2):  # noise is smoothed away, bends of the size of the spacing stay
         N = N + ring @ N
         N /= np.maximum(np.linalg.norm(N, axis=1, keepdims=True), 1e-300)
     X = X - area @ X / area.sum()
-    P = np.c_[X / spacing, N]
-    origin = np.zeros(6)
-    length = np.linalg.norm(X[rim[:, 0]] - X[rim[:, 1]], axis=1).sum()
-    rim = np.unique(rim)
+    P = np.c_[X / spacing, N]  # (n, 6)
+    center = np.zeros(6)
     sample, free = np.empty(0, np.int64), np.flatnonzero(~avoid)
     if len(rim):
-        sample = rim[
-            farthest_points(
-                P[rim],
-                min(int(np.ceil(length / (0.8 * spacing))), k // 2),
-                center=origin,
-                seed=seed,
-            )
-        ]
+        length = np.linalg.norm(X[rim[:, 0]] - X[rim[:, 1]], axis=1).sum()
+        n_rim = min(int(np.ceil(length / (0.8 * spacing))), k // 2)
+        rim = np.unique(rim)
+        sample = rim[farthest_points(P[rim], n_rim, center=center, seed=seed)]
         near = dijkstra(G, indices=rim, min_only=True, limit=0.6 * spacing)
         free = np.setdiff1d(np.flatnonzero(np.isinf(near) & ~avoid), rim)
-    return np.sort(
-        np.r_[sample, free[farthest_points(P[free], k - len(sample), center=origin, seed=seed)]]
-    )
+    others = free[farthest_points(P[free], k - len(sample), center=center, seed=seed)]
+    return np.sort(np.r_[sample, others])
 
 
-def laplacian(X, T, area):
-    """Edges, cotan weights and vertex areas.
+def laplacian(
+    X: np.ndarray, T: np.ndarray, area: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, str]:
+    """Edges, cotan weights, vertex areas, and which Laplacian it is.
 
-    And "cotan", or "robust" where triangles are degenerate.
-
-    The areas are the given ones, raised to a thousandth of their mean so that none vanishes.
+    Returns
+    -------
+    E : int ndarray (e, 2)
+    w : float ndarray (e,)
+    area : float ndarray (n,)
+        As given, raised to a thousandth of their mean so that none vanishes.
+    kind : {"cotan", "robust"}
+        "robust" (Sharp & Crane 2020) where triangles are degenerate or edges not manifold.
     """
     area = np.maximum(area, 1e-3 * area.mean())
     E, edge_of, count = unique_edges(T, len(X))
     half = directed_edges(T)
-    longest = ((X[half[:, 0]] - X[half[:, 1]]) ** 2).sum(1).reshape(3, -1).max(0)
-    if (count > 2).any() or (triangle_areas(X, T) < 1e-6 * longest).any():
+    squared = ((X[half[:, 0]] - X[half[:, 1]]) ** 2).sum(1).reshape(3, -1)  # (3, m)
+    degenerate = triangle_areas(X, T) < 1e-6 * squared.max(0)
+    if (count > 2).any() or degenerate.any():
         L = sp.triu(robust_laplacian.mesh_laplacian(X, T)[0], 1).tocoo()
         return np.stack([L.row, L.col], axis=1), -L.data, area, "robust"
     return E, np.bincount(edge_of, half_cotangents(X, T), len(E)), area, "cotan"
 
 
-def sorted_mesh(X, T):
-    """The mesh with vertices and triangles in an order that the positions alone decide.
+def sorted_mesh(X: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The mesh in an order of vertices and triangles that positions alone decide, and that order.
 
-    And that vertex order.
+    The same surface gives the same coarse mesh, however its file numbers it.
     """
     order = np.lexsort(X.T[::-1])
     rank = np.empty(len(X), np.int64)
     rank[order] = np.arange(len(X))
     T = rank[T]
-    T = np.take_along_axis(T, (T.argmin(1)[:, None] + np.arange(3)) % 3, axis=1)
+    turn = (T.argmin(1)[:, None] + np.arange(3)) % 3  # the least corner first, the turn kept
+    T = np.take_along_axis(T, turn, axis=1)
     return X[order], T[np.lexsort((T[:, 2], T[:, 0] * len(X) + T[:, 1]))], order
 
 
-def coarse_surface(X, T, n_coarse, seed=0):
+def coarse_surface(
+    X: np.ndarray, T: np.ndarray, n_coarse: int, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, int]]:
     """Manifold dual of about `n_coarse` geodesic Voronoi cells.
 
     Returns
@@ -124,45 +157,47 @@ def coarse_surface(X, T, n_coarse, seed=0):
     cell : int ndarray (n,)
         Coarse vertex near each vertex of the mesh.
     attrs : dict
+        Counts of samples, rounds and vertices cut.
     """
-    V, F, origin = X, T, np.arange(len(X))
-    for most in (MOST, MOST, MOST, np.inf):
+    V, F = X, T  # the surface as far as handles have been cut
+    origin = np.arange(len(X))  # vertex of X that each of V is, -1 for the centre of a fan
+    for most in [MOST * n_coarse] * CUTS + [np.inf]:
         E, _, count = unique_edges(F, len(V))
         G = edge_graph(V, E)
-        first = sample_surface(
-            V, F, G, E[count == 1], origin < 0, max(4, round(FIRST * n_coarse)), seed
-        )
+        open_edge, centre = count == 1, origin < 0
+        n_first = max(4, round(FIRST * n_coarse))
+        first = sample_surface(V, F, G, E[open_edge], centre, n_first, seed)
         start = voronoi_cells(G, first)
-        state, rounds, left = refine(G, F, E, count == 1, start, most * n_coarse, origin < 0)
-        if not left:
+        state, rounds, faulty = refine(G, F, E, open_edge, start, most, centre)
+        if not faulty:
             break
-        region = thin_regions(F, E, count == 1, start[1], len(start[0]))
-        V, F, came_from = cut_handles(
-            V, F, between_rims(G, F, region), triangle_areas(V, F).sum() / n_coarse
-        )
+        region = thin_regions(F, E, open_edge, start.cell, len(start.sample))
+        crumb = triangle_areas(V, F).sum() / n_coarse  # the area of a cell
+        V, F, came_from = cut_handles(V, F, between_rims(G, F, region), crumb)
         origin = np.where(came_from >= 0, origin[came_from], -1)
-    sample, cell_of, _ = state
-    C = dual(F, cell_of)
+    cell = np.full(len(X), -1)
     kept = np.flatnonzero(origin >= 0)
+    cell[origin[kept]] = state.cell[kept]
     attrs = {
         "samples_first": len(first),
-        "samples_added": len(sample) - len(first),
+        "samples_added": len(state.sample) - len(first),
         "rounds": rounds,
+        "vertices_cut": int((cell < 0).sum()),
     }
-    cell = np.full(len(X), -1)
-    cell[origin[kept]] = cell_of[kept]
-    attrs["vertices_cut"] = int((cell < 0).sum())
     if attrs["vertices_cut"]:
-        known = np.flatnonzero(cell >= 0)
-        cell = cell[
-            dijkstra(
-                edge_graph(X, edges(T)), indices=known, min_only=True, return_predecessors=True
-            )[2]
-        ]
-    return V[sample], C, origin[sample], cell, attrs
+        cell = cell[nearest_along_edges(X, T, np.flatnonzero(cell >= 0))]
+    return V[state.sample], dual(F, state.cell), origin[state.sample], cell, attrs
 
 
-def alpha_wrap(X, T, alpha=1.0, offset=0.2):
+def nearest_along_edges(X: np.ndarray, T: np.ndarray, among: np.ndarray) -> np.ndarray:
+    """The vertex of `among` that is nearest to each vertex along edges ``(n,)``."""
+    G = edge_graph(X, edges(T))
+    return dijkstra(G, indices=among, min_only=True, return_predecessors=True)[2]
+
+
+def alpha_wrap(
+    X: np.ndarray, T: np.ndarray, alpha: float = 1.0, offset: float = 0.2
+) -> tuple[np.ndarray, np.ndarray]:
     """A closed surface wrapped around the mesh; `alpha` and `offset` in percent of its diagonal."""
     try:
         with silence():
@@ -175,7 +210,8 @@ def alpha_wrap(X, T, alpha=1.0, offset=0.2):
         meshes = pymeshlab.MeshSet(verbose=False)
         if not hasattr(meshes, "generate_alpha_wrap"):
             raise ValueError(
-                "pymeshlab came without its alpha wrap filter: install the system packages libgl1 and libopengl0"
+                "pymeshlab came without its alpha wrap filter: "
+                "install the system packages libgl1 and libopengl0"
             )
         meshes.add_mesh(pymeshlab.Mesh(X, T))
         percent = pymeshlab.PercentageValue
@@ -185,7 +221,7 @@ def alpha_wrap(X, T, alpha=1.0, offset=0.2):
 
 
 @contextlib.contextmanager
-def silence():
+def silence() -> Iterator[None]:
     """Nothing that native code writes reaches the terminal."""
     with open(os.devnull, "w") as null:
         kept = [(fd, os.dup(fd)) for fd in (1, 2)]
@@ -199,51 +235,53 @@ def silence():
                 os.close(copy)
 
 
-def nearest_with_normal(X, T, V, F):
-    """Vertex of the mesh (V, F) near each vertex of (X, T).
-
-    On a side of a wall that faces the same way.
-    """
+def nearest_with_normal(X: np.ndarray, T: np.ndarray, V: np.ndarray, F: np.ndarray) -> np.ndarray:
+    """Vertex of (V, F) near each vertex of (X, T), on a side of a wall that faces the same way."""
     reach = 0.02 * np.linalg.norm(np.ptp(V, axis=0))
     tree = cKDTree(np.c_[V, reach * vertex_normals(V, F)])
     return tree.query(np.c_[X, reach * vertex_normals(X, T)])[1]
 
 
-def topology(T):
+def topology(T: np.ndarray) -> dict[str, int]:
     """Euler characteristic, number of boundary loops, and of edges with three or more triangles."""
     E, _, count = unique_edges(T)
     rim, vertex = np.unique(E[count == 1], return_inverse=True)
-    loops = components(vertex.reshape(-1, 2), len(rim)).max(initial=-1) + 1
+    loop = components(vertex.reshape(-1, 2), len(rim))
     return {
         "euler_characteristic": euler_characteristic(T, E),
-        "boundary_loops": int(loops),
+        "boundary_loops": int(loop.max(initial=-1) + 1),
         "nonmanifold_edges": int((count > 2).sum()),
     }
 
 
-def check_clean(X, T):
-    """Topology of a mesh; ValueError unless positions are finite, indices valid.
+def check_clean(X: np.ndarray, T: np.ndarray) -> dict[str, int]:
+    """Topology of a mesh that :func:`coarsen` can take.
 
-    Vertices in use, edges manifold.
+    Raises
+    ------
+    ValueError
+        Unless positions are finite, indices valid, vertices in use and edges manifold.
     """
     if len(T) == 0 or T.min() < 0 or T.max() >= len(X) or not np.isfinite(X).all():
         raise ValueError(
-            "coarsen needs triangles of existing vertices at finite positions; found others: clean the mesh first"
+            "coarsen needs triangles of existing vertices at finite positions; found others: "
+            "clean the mesh first"
         )
-    idle, found = len(X) - n_used(T), topology(T)
-    knots = found["nonmanifold_edges"]
+    counts = topology(T)
+    idle, knots = len(X) - n_used(T), counts["nonmanifold_edges"]
     if idle or knots:
         raise ValueError(
-            f"coarsen needs a manifold mesh without idle vertices; found {knots} edges of three or more triangles and "
+            "coarsen needs a manifold mesh without idle vertices; "
+            f"found {knots} edges of three or more triangles and "
             f"{idle} vertices without triangle: clean the mesh first"
         )
-    return found
+    return counts
 
 
-def coarsen(mesh, *, n_coarse=6000, wrap=False, seed=0):
-    """Low-resolution mesh of about `n_coarse` vertices.
-
-    And the operator U that carries functions back (4.1).
+def coarsen(
+    mesh: xr.Dataset, *, n_coarse: int = 6000, wrap: bool = False, seed: int = 0
+) -> xr.Dataset:
+    """Low-resolution mesh of about `n_coarse` vertices, and U that carries functions back (4.1).
 
     Parameters
     ----------
@@ -264,7 +302,7 @@ def coarsen(mesh, *, n_coarse=6000, wrap=False, seed=0):
     -------
     xarray.Dataset
         ``position``, ``corner_vertex``: the coarse mesh, manifold, its vertices in
-        ``sample_vertex`` (-1 where they are no vertex of the mesh);  ``edge_vertex``,
+        ``sample_vertex`` (-1 where they are no vertex of the mesh); ``edge_vertex``,
         ``cotan_weight``: W;  ``vertex_area``: A, the area of the original surface carried by U, so
         that it sums to the original area (of the coarse mesh after wrapping); ``coarse_vertex``,
         ``coarse_weight (original_vertex, corner)``: U, rows non-negative of sum 1. The attributes
@@ -279,50 +317,58 @@ def coarsen(mesh, *, n_coarse=6000, wrap=False, seed=0):
 
     Notes
     -----
-    A vertex takes its weights from the coarse triangles around the sample of its own geodesic Voronoi cell: U never
-    looks across a thin wall.  Handles and holes inside one cell are lost; handles about a cell thin are cut only if
-    they would need more than 1.1 n_coarse samples.
+    A vertex takes its weights from the coarse triangles around the sample of its own geodesic
+    Voronoi cell: U never looks across a thin wall.  Handles and holes inside one cell are lost;
+    handles about a cell thin are cut only if they would need more than 1.1 n_coarse samples.
 
     Examples
     --------
     >>> import numpy as np
+    >>> import s4a
     >>> from s4a.geometry.mesh import as_dataset
     >>> x, y = np.meshgrid(np.arange(30.0), np.arange(30.0), indexing="ij")
     >>> i = np.arange(900).reshape(30, 30)[:-1, :-1].ravel()
-    >>> grid = as_dataset(
-    ...     np.c_[x.ravel(), y.ravel(), 0 * x.ravel()], np.r_[np.c_[i, i + 30, i + 31], np.c_[i, i + 31, i + 1]]
-    ... )
-    >>> coarse = coarsen(grid, n_coarse=100)
-    >>> coarse.attrs["euler_characteristic"], bool(np.allclose(coarse["coarse_weight"].sum("corner"), 1))
-    (1, True)
+    >>> T = np.r_[np.c_[i, i + 30, i + 31], np.c_[i, i + 31, i + 1]]
+    >>> grid = as_dataset(np.c_[x.ravel(), y.ravel(), 0 * x.ravel()], T)
+    >>> coarse = s4a.coarsen(grid, n_coarse=100)
+    >>> coarse.attrs["euler_characteristic"]
+    1
+    >>> bool(np.allclose(coarse["coarse_weight"].sum("corner"), 1))
+    True
     """
     require(mesh, "position", "corner_vertex", what="mesh")
     if int(n_coarse) != n_coarse or n_coarse < 4:
         raise ValueError(f"n_coarse must be an integer of at least 4, found {n_coarse!r}")
-    X0, T0 = as_arrays(mesh)
-    before = check_clean(X0, T0)
-    attrs = {
+    before = check_clean(*as_arrays(mesh))
+    attrs: dict[str, int | str] = {
         "n_coarse": int(n_coarse),
         "seed": int(seed),
         "wrapped": int(bool(wrap)),
         "kept_whole": 0,
     }
-    X, T, order = sorted_mesh(X0, T0)
-    V, F = sorted_mesh(*alpha_wrap(X, T))[:2] if wrap else (X, T)
+    X, T, order = sorted_mesh(*as_arrays(mesh))
+    V, F, _ = sorted_mesh(*alpha_wrap(X, T)) if wrap else (X, T, None)
     if len(V) <= n_coarse:
-        Y, C, sample, cell = V, F, np.arange(len(V)), np.arange(len(V))
+        Y, C = V, F
+        sample = cell = np.arange(len(V))
         attrs.update(kept_whole=1, samples_first=len(V), samples_added=0, rounds=0, vertices_cut=0)
     else:
         Y, C, sample, cell, counts = coarse_surface(V, F, n_coarse, seed)
-        attrs.update(counts)
+        attrs |= counts
     if wrap:
-        sample, cell = np.full(len(Y), -1), cell[nearest_with_normal(X, T, V, F)]
-    triangle, weight = closest_point_in_star(X, cell, Y, C)
-    corner = C[triangle]
-    carried = np.bincount(corner.ravel(), (weight * vertex_areas(X, T)[:, None]).ravel(), len(Y))
-    E, w, area, attrs["laplacian"] = laplacian(Y, C, vertex_areas(Y, C) if wrap else carried)
-    attrs |= topology(C) | {f"{name}_original": value for name, value in before.items()}
-    row = np.argsort(order)
+        sample = np.full(len(Y), -1)
+        cell = cell[nearest_with_normal(X, T, V, F)]
+    triangle, weight = closest_point_in_star(X, cell, Y, C)  # (n,), (n, 3)
+    corner = C[triangle]  # (n, 3)
+    if wrap:
+        area = vertex_areas(Y, C)
+    else:  # U^T a, so that integrals of functions carried by U are those on the original
+        carried = weight * vertex_areas(X, T)[:, None]
+        area = np.bincount(corner.ravel(), carried.ravel(), len(Y))
+    E, w, area, attrs["laplacian"] = laplacian(Y, C, area)
+    attrs |= topology(C)
+    attrs |= {f"{name}_original": count for name, count in before.items()}
+    rank = np.argsort(order)  # back to the numbering of the input
     return dataset(
         attrs,
         position=Y,
@@ -331,6 +377,6 @@ def coarsen(mesh, *, n_coarse=6000, wrap=False, seed=0):
         edge_vertex=E.astype(np.int32),
         cotan_weight=w,
         sample_vertex=np.where(sample >= 0, order[sample], -1).astype(np.int32),
-        coarse_vertex=corner[row].astype(np.int32),
-        coarse_weight=weight[row],
+        coarse_vertex=corner[rank].astype(np.int32),
+        coarse_weight=weight[rank],
     )
