@@ -1,25 +1,28 @@
-"""The network of functional maps (3.4).
+"""The network of functional maps (3.4): which pairs, how far their cycles close, weights from that.
 
-Which pairs are matched, their first maps, and how far cycles close.
+The maps C_ij of a 3-cycle i -> j -> k -> i close where C_ki C_jk C_ij = I.  What they lack is the
+cycle error e of each of them, averaged over its cycles (:func:`cycle_errors`), and gives its weight
+exp(-(e / s)^2 / 2) in the latent basis (:func:`cycle_weights`).
 """
-
-import itertools
 
 import numpy as np
 from joblib import Parallel, delayed
 from scipy.sparse.csgraph import connected_components, shortest_path
 
 
-def spectral_distance(eigenvalues):
-    """Distances of shapes by their spectra ``(n, n)``.
+def spectral_distance(eigenvalues: np.ndarray | list[np.ndarray]) -> np.ndarray:
+    """Distances of shapes by their spectra ``(n, n)``: RMS difference of log eigenvalues.
 
-    RMS difference of the logarithms of the eigenvalues.
+    Parameters
+    ----------
+    eigenvalues : float ndarray (n, k)
+        For unit area, the first of each 0.
     """
     x = np.log(np.maximum(np.asarray(eigenvalues, float)[:, 1:], 1e-12))
     return np.sqrt(((x[:, None] - x[None]) ** 2).mean(axis=2))
 
 
-def choose_pairs(distance, n_pairs):
+def choose_pairs(distance: np.ndarray, n_pairs: int) -> np.ndarray:
     """The unordered pairs of a network: connected, with as many triangles as the budget allows.
 
     First a minimum spanning tree (connectivity), then for every shape a second edge to a neighbour
@@ -55,35 +58,73 @@ def choose_pairs(distance, n_pairs):
         raise ValueError(f"a network needs at least 2 shapes, found {n}")
     if int(n_pairs) != n_pairs or n_pairs < n - 1:
         raise ValueError(
-            f"n_pairs = {n_pairs!r} cannot connect {n} shapes: give an integer from {n - 1} (a tree) "
-            f"to {n * (n - 1) // 2} (all pairs)"
+            f"n_pairs = {n_pairs!r} cannot connect {n} shapes: give an integer from {n - 1} "
+            f"(a tree) to {n * (n - 1) // 2} (all pairs)"
         )
+    wanted = np.concatenate([*tree_and_closing(distance), by_nearness(distance)])  # most first
+    key = wanted.min(axis=1) * n + wanted.max(axis=1)
+    _, first = np.unique(key, return_index=True)
+    chosen = key[np.sort(first)[: int(n_pairs)]]
+    return np.stack(np.divmod(np.sort(chosen), n), axis=1)
+
+
+def tree_and_closing(distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    r"""Edges of a minimum spanning tree, and one more for each new shape that closes a triangle.
+
+    Prim's algorithm from the most central shape.  A new shape is joined with its nearest shape in
+    the tree, the parent, and then with the nearest of the parent's neighbours::
+
+        parent --- neighbour
+             \     .
+              \   .   closing
+               new
+
+    Returns
+    -------
+    tree, closing : int ndarray (n - 1, 2), (n - 2, 2)
+    """
+    n = len(distance)
+    root = int(np.argmin(distance.sum(axis=1)))
+    parent = np.full(n, root)  # nearest shape in the tree, so far
+    gap = distance[:, root].copy()
+    gap[root] = np.inf
+    outside = np.arange(n) != root
+    adjacent = np.zeros((n, n), bool)
     tree, closing = [], []
-    inside, neighbours = [int(np.argmin(distance.sum(1)))], {i: [] for i in range(n)}
-    while len(inside) < n:
-        outside = [i for i in range(n) if i not in inside]
-        sub = distance[np.ix_(outside, inside)]
-        a, b = np.unravel_index(np.argmin(sub), sub.shape)
-        new, parent = outside[a], inside[b]
-        tree.append((new, parent))
-        if neighbours[parent]:
-            closing.append((new, min(neighbours[parent], key=lambda j: (distance[new, j], j))))
-        neighbours[parent].append(new)
-        neighbours[new].append(parent)
-        inside.append(new)
-    rank = np.argsort(np.argsort(distance + np.diag([np.inf] * n), axis=1, kind="stable"), axis=1)
-    rest = sorted(
-        itertools.combinations(range(n), 2),
-        key=lambda p: (min(rank[p], rank[p[::-1]]), distance[p]),
-    )
-    wanted = dict.fromkeys((min(p), max(p)) for p in [*tree, *closing, *rest])
-    return np.array(sorted(itertools.islice(wanted, int(n_pairs))))
+    for _ in range(n - 1):
+        left = np.flatnonzero(outside)
+        new = left[gap[left].argmin()]
+        near = np.flatnonzero(adjacent[parent[new]])
+        if len(near):
+            closing.append((new, near[distance[new, near].argmin()]))
+        tree.append((new, parent[new]))
+        adjacent[new, parent[new]] = adjacent[parent[new], new] = True
+        outside[new] = False
+        nearer = distance[:, new] < gap
+        gap[nearer] = distance[nearer, new]
+        parent[nearer & outside] = new
+    return np.array(tree), np.array(closing, int).reshape(-1, 2)
 
 
-def three_cycles(source, target):
-    """Rows of directed maps that close a 3-cycle ``(c, 3)``.
+def by_nearness(distance: np.ndarray) -> np.ndarray:
+    """All pairs ``(n (n-1) / 2, 2)``, first those that are nearest for one of their two shapes."""
+    apart = distance.copy()
+    np.fill_diagonal(apart, np.inf)
+    rank = np.argsort(np.argsort(apart, axis=1, kind="stable"), axis=1)  # j is i's rank[i, j]-th
+    i, j = np.triu_indices(len(distance), 1)
+    order = np.lexsort((distance[i, j], np.minimum(rank, rank.T)[i, j]))
+    return np.stack([i, j], axis=1)[order]
 
-    I -> j, j -> k, k -> i, each cycle once.
+
+def three_cycles(source: list[int], target: list[int]) -> np.ndarray:
+    """Rows of the directed maps i -> j, j -> k, k -> i that close a 3-cycle ``(c, 3)``.
+
+    Each cycle comes once.
+
+    Parameters
+    ----------
+    source, target : list of int
+        Shapes of each map, (p,) long.
 
     Examples
     --------
@@ -104,13 +145,22 @@ def three_cycles(source, target):
     return np.array(cycles, np.int64).reshape(-1, 3)
 
 
-def cycle_errors(C, cycles, k=None, *, n_jobs=1):
-    """How far each directed map is from closing its 3-cycles.
-
-    Mean |C_ki C_jk C_ij - I|_F / sqrt(k).
+def cycle_errors(
+    C: np.ndarray, cycles: np.ndarray, k: int | None = None, *, n_jobs: int | None = 1
+) -> np.ndarray:
+    """How far each map is from closing its 3-cycles: mean |C_ki C_jk C_ij - I|_F / sqrt(k).
 
     Of the product only the first `k` rows and columns are looked at, all by default; maps of
     different sizes can only be compared at one k.
+
+    Parameters
+    ----------
+    C : float ndarray (p, K, K)
+    cycles : int ndarray (c, 3)
+        Of :func:`three_cycles`.
+    k : int, optional
+    n_jobs : int
+        Threads; the result does not depend on it.
 
     Returns
     -------
@@ -119,22 +169,22 @@ def cycle_errors(C, cycles, k=None, *, n_jobs=1):
     """
     k = k or C.shape[1]
 
-    def of(some):
-        a, b, c = some.T
-        return np.linalg.norm(
-            C[c][:, :k] @ (C[b] @ C[a][:, :, :k]) - np.eye(k), axis=(1, 2)
-        ) / np.sqrt(k)
+    def errors_of(part):
+        ij, jk, ki = part.T
+        around = C[ki][:, :k] @ (C[jk] @ C[ij][:, :, :k])  # (c, k, k)
+        return np.linalg.norm(around - np.eye(k), axis=(1, 2)) / np.sqrt(k)
 
-    parts = np.array_split(cycles, len(cycles) // 32 + 1)
+    parts = np.array_split(cycles, len(cycles) // 32 + 1)  # few, so that products stay small
     error = np.concatenate(
-        Parallel(n_jobs=n_jobs, backend="threading")(delayed(of)(some) for some in parts)
+        Parallel(n_jobs=n_jobs, backend="threading")(delayed(errors_of)(part) for part in parts)
     )
-    total, count = (np.bincount(cycles.ravel(), w, len(C)) for w in (np.repeat(error, 3), None))
+    total = np.bincount(cycles.ravel(), np.repeat(error, 3), len(C))
+    count = np.bincount(cycles.ravel(), minlength=len(C))
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def cycle_weights(error):
-    """Weights exp(-(e / s)^2 / 2) of the maps from their cycle errors, s the median error.
+def cycle_weights(error: np.ndarray) -> np.ndarray:
+    """Weights exp(-(e / s)^2 / 2) of the maps from their cycle errors, s the median error ``(p,)``.
 
     Maps in no cycle get the median weight; a network without 3-cycles gets plain weights of 1.  No
     weight is under 0.01, so that a connected network stays connected.
@@ -146,7 +196,7 @@ def cycle_weights(error):
     return np.maximum(np.where(known, w, np.nanmedian(w)), 0.01)
 
 
-def connectivity(pairs, n):
+def connectivity(pairs: np.ndarray, n: int) -> dict[str, int]:
     """How well unordered pairs connect n shapes.
 
     Parameters
@@ -170,8 +220,9 @@ def connectivity(pairs, n):
     """
     A = np.zeros((n, n))
     pairs = np.asarray(pairs, int).reshape(-1, 2)
-    A[pairs[:, 0], pairs[:, 1]] = A[pairs[:, 1], pairs[:, 0]] = 1
-    through = np.diag(A @ A @ A) / 2
+    A[pairs[:, 0], pairs[:, 1]] = 1
+    A = np.maximum(A, A.T)
+    through = np.diag(A @ A @ A) / 2  # triangles through each shape: closed walks of three steps
     steps = shortest_path(A, unweighted=True)
     return {
         "components": int(connected_components(A)[0]),
