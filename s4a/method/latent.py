@@ -1,8 +1,8 @@
 """Consistent latent basis and Consistent ZoomOut (3.4, eq. 3; Huang, Ren, Wonka, Ovsjanikov 2020).
 
 The functions of all shapes live in one latent space: C_ij Y_i = Y_j for every map of the network,
-as far as it can be had.  Y_i is k x m; the functions themselves are Phi_i Y_i, at full resolution
-U_i Phi_i Y_i.
+as far as it can be had.  Y_i is k x m; the functions themselves are Phi_i Y_i, the Y_i of eq. 3 and
+6, at full resolution U_i Phi_i Y_i (eq. 7).
 """
 
 import logging
@@ -29,14 +29,45 @@ FINAL = 3  # shapes of a study in the last rounds of a new one, on all vertices
 WIDE = 4  # last rounds of Consistent ZoomOut, which look among all vertices
 ROUGH, FINE = 1e-4, 1e-6  # tolerances of the latent basis: on the way, and at the end
 
+Form = Callable[[np.ndarray], np.ndarray]  # the product of a quadratic form with vectors
 
-def consistency_form(C, source, target, weight, n, *, dtype=float, n_jobs=1):
-    """The quadratic form sum w |C_ij Y_i - Y_j|^2 of the stacked Y.
 
-    As its product with vectors ``(n k, q)``.
+def consistency_form(
+    C: np.ndarray,
+    source: np.ndarray,
+    target: np.ndarray,
+    weight: np.ndarray,
+    n: int,
+    *,
+    dtype: type = float,
+    n_jobs: int | None = 1,
+) -> Form:
+    """The quadratic form sum w |C_ij Y_i - Y_j|^2 of the stacked Y, as its product with vectors.
 
-    The form is never assembled: every shape has its rows of k x k blocks, one for itself and one
-    for each shape that a map joins it with, so that memory is linear in the maps.
+    A map C_ij adds four blocks of k x k::
+
+                 i          j
+        i    w C^T C    -w C^T
+        j     -w C        w I
+
+    The form is never assembled: every shape has its row of blocks, one for itself and one for each
+    shape that a map joins it with, so that memory is linear in the maps.
+
+    Parameters
+    ----------
+    C : float ndarray (p, k, k)
+    source, target, weight : ndarray (p,)
+    n : int
+        Number of shapes.
+    dtype : type
+        In which products are computed.
+    n_jobs : int
+        Threads; the result does not depend on it.
+
+    Returns
+    -------
+    callable
+        From vectors ``(n k, q)`` to vectors of the same shape.
     """
     k = C.shape[1]
     blocks = [{i: np.zeros((k, k))} for i in range(n)]
@@ -47,31 +78,31 @@ def consistency_form(C, source, target, weight, n, *, dtype=float, n_jobs=1):
         blocks[j][i] = blocks[j].get(i, 0) - w * c
     joined = [sorted(row) for row in blocks]
     rows = [
-        np.concatenate([row[j] for j in near], axis=1, dtype=dtype)
+        np.concatenate([row[j] for j in near], axis=1, dtype=dtype)  # (k, k len(near))
         for row, near in zip(blocks, joined, strict=True)
     ]
 
-    def product(some, V):
-        return [rows[i] @ V[joined[i]].reshape(-1, V.shape[2]) for i in some]
+    def product(shapes, V):
+        return [rows[i] @ V[joined[i]].reshape(-1, V.shape[2]) for i in shapes]
 
-    shares = np.array_split(np.arange(n), n_jobs)
+    shares = np.array_split(np.arange(n), n_jobs or 1)
 
     def apply(V):
         V = np.asarray(V, dtype).reshape(n, k, -1)
-        if V.shape[2] == 1:  # as long as it takes to start a thread
+        if V.shape[2] == 1:  # one vector takes as long as it takes to start a thread
             return np.concatenate(product(range(n), V))
         parts = Parallel(n_jobs=n_jobs, backend="threading")(
-            delayed(product)(some, V) for some in shares
+            delayed(product)(shapes, V) for shapes in shares
         )
         return np.concatenate([block for part in parts for block in part])
 
     return apply
 
 
-def spanning_start(C, source, target, n):
-    """Y_i = composition of the maps along a tree from the shape with most maps.
+def spanning_start(C: np.ndarray, source: np.ndarray, target: np.ndarray, n: int) -> np.ndarray:
+    """The first guess of all Y ``(n, k, k)``: maps composed along a tree.
 
-    The first guess ``(n, k, k)``.
+    Its root, where Y is the identity, is the shape from which most maps start.
     """
     k = C.shape[1]
     adjacency = np.zeros((n, n))
@@ -80,7 +111,8 @@ def spanning_start(C, source, target, n):
     order, parent = breadth_first_order(adjacency, root)
     if len(order) < n:
         raise ValueError(
-            f"the network is not connected: {len(order)} of {n} shapes are reached from shape {root}"
+            f"the network is not connected: {len(order)} of {n} shapes are reached "
+            f"from shape {root}"
         )
     row = {pair: r for r, pair in enumerate(zip(source.tolist(), target.tolist(), strict=True))}
     Y = np.zeros((n, k, k))
@@ -90,55 +122,76 @@ def spanning_start(C, source, target, n):
     return Y
 
 
-def smallest_eigenvectors(apply, start, *, tolerance=FINE, max_rounds=100):
-    """The eigenvectors of the smallest eigenvalues of a positive semi-definite form.
+def smallest_eigenvectors(
+    apply: Form, start: np.ndarray, *, tolerance: float = FINE, max_rounds: int = 100
+) -> np.ndarray:
+    """The eigenvectors of the smallest eigenvalues of a positive semi-definite form ``(n, m)``.
 
-    By Chebyshev-filtered subspaces.
+    Chebyshev-filtered subspaces (Zhou, Saad, Tiago, Chelikowsky 2006): each round damps all above
+    the largest Ritz value of the block by a Chebyshev polynomial of the form, and solves the small
+    eigenproblem within the block.  Nothing is assembled or factored: memory is linear in the maps,
+    and time is that of a Cholesky factor or less.
 
-    Each round damps all above the largest Ritz value of the block by a Chebyshev polynomial of the
-    form, and solves the small eigenproblem within the block (Zhou, Saad, Tiago, Chelikowsky 2006).
-    Nothing is assembled or factored: memory is linear in the maps.  As many vectors as `start` has
-    columns, with one tenth more carried along.
-
-    Against a Cholesky factor of the assembled form and inverse iteration, 51 shapes and 1,000 maps:
-    at k = 60 0.8 s of CPU for 0.7 s and the same subspace; at k = 80 2.6 s for 3.8 s, and a sum of
-    the eigenvalues that exceeds the least by 3e-10 instead of 2e-6.
+    Parameters
+    ----------
+    apply : callable
+        The form's product with vectors.
+    start : float ndarray (n, m)
+        As many vectors as are wanted, near the eigenvectors if possible.
+    tolerance : float
+        Largest residual of a vector, as a share of the largest eigenvalue.
+    max_rounds : int
     """
     n, m = start.shape
-    extra = min(n - m, max(4, m // 10))
-    seeds = np.cos(np.outer(np.arange(n) + 1.0, np.arange(extra) + 1.0) * 0.7)
-    V = np.linalg.qr(np.concatenate([start, seeds], axis=1))[0]
+    n_spare = min(n - m, max(4, m // 10))  # the last vectors of a block converge slowest
+    spare = np.cos(np.outer(np.arange(n) + 1.0, np.arange(n_spare) + 1.0) * 0.7)  # like random
+    V = np.linalg.qr(np.concatenate([start, spare], axis=1))[0]  # (n, m + n_spare)
     form = LinearOperator((n, n), lambda v: apply(v.reshape(n, 1)).ravel(), dtype=float)
-    top = 1.02 * eigsh(form, 1, which="LA", tol=1e-2, v0=seeds[:, 0], return_eigenvectors=False)[0]
+    largest = eigsh(form, 1, which="LA", tol=1e-2, v0=spare[:, 0], return_eigenvectors=False)[0]
+    top = 1.02 * largest  # above all eigenvalues, though `largest` is 1 % uncertain
     for _ in range(max_rounds):
         LV = apply(V)
         ritz, R = np.linalg.eigh(V.T @ LV)
         V = V @ R
-        if np.linalg.norm(LV @ R[:, :m] - V[:, :m] * ritz[:m], axis=0).max() <= tolerance * top:
+        residual = np.linalg.norm(LV @ R[:, :m] - V[:, :m] * ritz[:m], axis=0)  # (m,)
+        if residual.max() <= tolerance * top:
             return V[:, :m]
-        V = np.linalg.qr(filtered(apply, V, ritz[0], ritz[-1], top))[0]
+        V = np.linalg.qr(chebyshev_filter(apply, V, ritz[0], ritz[-1], top))[0]
     log.warning("the latent basis reached %d rounds before its tolerance", max_rounds)
     return V[:, :m]
 
 
-def filtered(apply, V, least, cut, top):
-    """T(L) V, T the Chebyshev polynomial small on [cut, top] and 1 at `least`.
+def chebyshev_filter(
+    apply: Form, V: np.ndarray, least: float, cut: float, top: float
+) -> np.ndarray:
+    """T(L) V, with T the Chebyshev polynomial that is small on [cut, top] and 1 at `least`.
 
-    Its degree grows with top / cut.
+    Of degree d it damps by about cosh(2 d sqrt(cut / top)): by ten with the degree taken here.
     """
     half, middle = (top - cut) / 2, (top + cut) / 2
     if half <= 1e-9 * top:  # nothing lies above the block
         return V
+    degree = int(np.clip(1.5 * np.sqrt(top / max(cut, 1e-4 * top)), 6, 40))
     ratio = first = half / (least - middle)
     new = (apply(V) - middle * V) * (first / half)
-    for _ in range(int(np.clip(1.5 * np.sqrt(top / max(cut, 1e-4 * top)), 6, 40)) - 1):
+    for _ in range(degree - 1):  # the recurrence of the T_d, scaled to be 1 at `least`
         following = 1 / (2 / first - ratio)
         V, new = new, (apply(new) - middle * new) * (2 * following / half) - ratio * following * V
         ratio = following
     return new
 
 
-def latent_basis(C, source, target, weight, eigenvalues, m=None, *, tolerance=FINE, n_jobs=1):
+def latent_basis(
+    C: np.ndarray,
+    source: np.ndarray,
+    target: np.ndarray,
+    weight: np.ndarray,
+    eigenvalues: np.ndarray,
+    m: int | None = None,
+    *,
+    tolerance: float = FINE,
+    n_jobs: int | None = 1,
+) -> tuple[np.ndarray, np.ndarray]:
     """Canonical consistent latent basis of a network of functional maps.
 
     Minimises sum w |C_ij Y_i - Y_j|^2 under sum Y_i^T Y_i = n I, then turns the latent space so
@@ -171,15 +224,16 @@ def latent_basis(C, source, target, weight, eigenvalues, m=None, *, tolerance=FI
     dtype = np.float32 if tolerance >= ROUGH else float
     form = consistency_form(C, source, target, weight, n, dtype=dtype, n_jobs=n_jobs)
     Y = smallest_eigenvectors(form, start, tolerance=tolerance).reshape(n, k, m) * np.sqrt(n)
-    mean = np.einsum("nkl,nk,nkm->lm", Y, eigenvalues[:, :k], Y) / n
+    mean = np.einsum("nkl,nk,nkm->lm", Y, eigenvalues[:, :k], Y) / n  # (m, m)
     latent_eigenvalue, turn = np.linalg.eigh(mean)
     Y = Y @ turn
-    total = Y.sum(0)
-    Y *= np.where(total[np.abs(total).argmax(0), np.arange(m)] < 0, -1.0, 1.0)
+    total = Y.sum(0)  # (k, m)
+    largest = total[np.abs(total).argmax(0), np.arange(m)]
+    Y *= np.where(largest < 0, -1.0, 1.0)  # eigenvectors have no sign: this one is a convention
     return Y, np.maximum(latent_eigenvalue, 0.0)
 
 
-def latent_size(n_latent, k, k_final):
+def latent_size(n_latent: int | None, k: int, k_final: int) -> int:
     """Latent dimension at size k: all of it, or the share of it that `n_latent` is of `k_final`."""
     return k if n_latent is None else max(1, round(k * n_latent / k_final))
 
