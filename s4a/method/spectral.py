@@ -1,6 +1,11 @@
-"""Spectrum (3.3): eigenpairs of the Laplace-Beltrami operator, projection and reconstruction."""
+"""Spectrum (3.3): the basis Phi of eigenfunctions, coefficients Phi^T A f, and functions from them.
+
+L phi = lambda phi with L = A^-1 W, W the cotan stiffness matrix and A the lumped vertex areas, all
+for the surface scaled to unit area.
+"""
 
 import logging
+from collections.abc import Callable
 
 import numpy as np
 import scipy.sparse as sp
@@ -13,7 +18,9 @@ from s4a.schema import dataset, require
 log = logging.getLogger(__name__)
 
 
-def eigenpairs(E, w, area, k):
+def eigenpairs(
+    E: np.ndarray, w: np.ndarray, area: np.ndarray, k: int
+) -> tuple[np.ndarray, np.ndarray]:
     """The k smallest eigenpairs of W phi = lambda A phi, for the surface scaled to unit area.
 
     Parameters
@@ -35,21 +42,16 @@ def eigenpairs(E, w, area, k):
     """
     n = len(area)
     a = area / area.sum()
-    # A^-1/2 W A^-1/2 is symmetric with the same eigenvalues; the tiny shift keeps its factor away from the null space
+    # S = A^-1/2 W A^-1/2 is symmetric and has the same eigenvalues; phi = A^-1/2 v
     root = sp.diags(1 / np.sqrt(a))
-    S = (root @ stiffness(E, w, n) @ root).tocsc()
-    shift = 1e-8 * S.diagonal().mean()
-    solve = spla.splu(
-        (S + shift * sp.identity(n)).tocsc(),
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    ).solve
-    inverse = spla.LinearOperator((n, n), matvec=solve, dtype=float)
-    start = np.sqrt(a) + 1e-3 * np.cos(np.arange(n))
+    S = (root @ stiffness(E, w, n) @ root).tocsc()  # (n, n)
+    shift = 1e-8 * S.diagonal().mean()  # keeps the factor away from the null space
+    inverse = spla.LinearOperator((n, n), matvec=factor(S + shift * sp.identity(n)), dtype=float)
+    start = np.sqrt(a) + 1e-3 * np.cos(np.arange(n))  # ARPACK's own differs from run to run
     eigenvalue, V = spla.eigsh(S, k=k, sigma=-shift, OPinv=inverse, v0=start, which="LM")
     order = np.argsort(eigenvalue)
-    eigenvalue, Phi = eigenvalue[order], V[:, order] / np.sqrt(a)[:, None]
+    eigenvalue = eigenvalue[order]
+    Phi = V[:, order] / np.sqrt(a)[:, None]  # (n, k)
     eigenvalue = np.where(np.abs(eigenvalue) < 1e-9 * max(eigenvalue[-1], 1.0), 0.0, eigenvalue)
     Phi *= np.where(a @ Phi**3 < 0, -1.0, 1.0)
     if (eigenvalue == 0).sum() == 1:
@@ -57,15 +59,31 @@ def eigenpairs(E, w, area, k):
     return eigenvalue, Phi
 
 
-def project(Phi, area, f):
-    """Coefficients Phi^T A f of functions `f` (n, ...) in an area-orthonormal basis.
+def factor(S: sp.spmatrix) -> Callable[[np.ndarray], np.ndarray]:
+    """The function that solves S x = b, for S sparse, symmetric and positive definite."""
+    return spla.splu(
+        S.tocsc(),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    ).solve
 
-    `area` of sum 1.
+
+def project(Phi: np.ndarray, area: np.ndarray, f: np.ndarray) -> np.ndarray:
+    """Coefficients a = Phi^T A f of a function ``(k,)`` or of several ``(k, d)``.
+
+    Parameters
+    ----------
+    Phi : float ndarray (n, k)
+        Orthonormal in the areas.
+    area : float ndarray (n,), of sum 1
+    f : float ndarray (n,) or (n, d)
     """
-    return Phi.T @ (area[:, None] * f.reshape(len(f), -1)) if f.ndim > 1 else Phi.T @ (area * f)
+    weighted = area * f if f.ndim == 1 else area[:, None] * f.reshape(len(f), -1)
+    return Phi.T @ weighted
 
 
-def spectrum(mesh, *, k=100):
+def spectrum(mesh: xr.Dataset, *, k: int = 100) -> xr.Dataset:
     """Area-orthonormal Laplace-Beltrami eigenpairs of a low-resolution mesh (3.3).
 
     Parameters
@@ -92,7 +110,8 @@ def spectrum(mesh, *, k=100):
 
     Examples
     --------
-    A sphere of radius 1, whose area is 4 pi, has the eigenvalues 0, 2 (three times), 6 (five times):
+    A sphere of radius 1, whose area is 4 pi, has the eigenvalues 0, 2 (three times) and 6 (five
+    times):
 
     >>> import numpy as np
     >>> import s4a
@@ -107,9 +126,9 @@ def spectrum(mesh, *, k=100):
     possible = min(int(k), n - 2)
     if possible < 1:
         raise ValueError(f"a spectrum needs at least 3 vertices, found {n}")
-    E, w, area = (mesh[name].values for name in ("edge_vertex", "cotan_weight", "vertex_area"))
+    E, w = mesh["edge_vertex"].values, mesh["cotan_weight"].values
     try:
-        eigenvalue, Phi = eigenpairs(E, w, area, possible)
+        eigenvalue, Phi = eigenpairs(E, w, mesh["vertex_area"].values, possible)
     except RuntimeError as error:  # of the factor or of ARPACK
         raise ValueError(
             f"no {possible} eigenpairs of a mesh with {n} vertices: {error}"
@@ -121,16 +140,13 @@ def spectrum(mesh, *, k=100):
     return xr.merge([mesh, dataset(eigenvalue=eigenvalue, eigenfunction=Phi)]).assign_attrs(attrs)
 
 
-def unit_area(mesh):
-    """Vertex areas of a mesh Dataset scaled to sum 1, ``(n,)``.
-
-    The A in which its eigenfunctions are orthonormal.
-    """
+def unit_area(mesh: xr.Dataset) -> np.ndarray:
+    """Vertex areas of a mesh scaled to sum 1 ``(n,)``: the A in which Phi is orthonormal."""
     area = mesh["vertex_area"].values
     return area / area.sum()
 
 
-def reconstruct(mesh, f, *, k=None):
+def reconstruct(mesh: xr.Dataset, f: np.ndarray, *, k: int | None = None) -> np.ndarray:
     """A function on the mesh from its first k coefficients: Phi Phi^T A f.
 
     Parameters
@@ -156,14 +172,12 @@ def reconstruct(mesh, f, *, k=None):
     True
     """
     require(mesh, "eigenfunction", "vertex_area", what="mesh")
-    Phi, f = mesh["eigenfunction"].values[:, :k], np.asarray(f, float)
-    return Phi @ project(Phi, unit_area(mesh), f)
+    Phi = mesh["eigenfunction"].values[:, :k]
+    return Phi @ project(Phi, unit_area(mesh), np.asarray(f, float))
 
 
-def weyl(k):
-    """Weyl's law for a closed surface of unit area, ``(k,)``.
-
-    The i-th eigenvalue grows like 4 pi i.
+def weyl(k: int) -> np.ndarray:
+    """Weyl's law for a closed surface of unit area: the i-th eigenvalue is about 4 pi i ``(k,)``.
 
     Examples
     --------
