@@ -5,8 +5,11 @@ everywhere, and checks its input through :func:`require`.  A variable that is no
 not exist.
 """
 
+from collections.abc import Mapping
+
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 
 INPUT = "unit of the input"
 INPUT2 = "squared unit of the input"
@@ -14,418 +17,230 @@ ONE = "1"
 SHARE = "share of sqrt(area)"
 UNIT_AREA = "1, for the surface scaled to unit area"
 
-# name: (dims, unit, long_name).  In the file of a single shape a leading dim `shape` is absent.
-TABLE = {
+# A new variable is a new row, with its step: name: (dims, unit, long_name).  In the file of a single
+# shape a leading dim `shape` is absent.
+# fmt: off
+ROWS = {
     # a mesh, original or coarse
-    "position": (("vertex", "xyz"), INPUT, "vertex position"),
-    "corner_vertex": (("triangle", "corner"), ONE, "vertex at each corner of a triangle"),
-    "file_vertex": (("vertex",), ONE, "index of the vertex in its file"),
-    "vertex_of_file": (
-        ("file_vertex_index",),
-        ONE,
-        "vertex that a vertex of the file became, -1 where dropped",
-    ),
-    "label": (("vertex",), ONE, "label of the vertex"),
-    "landmark_name": (("landmark",), ONE, "name of the landmark"),
-    "landmark_position": (("landmark", "xyz"), INPUT, "position of the landmark"),
-    "landmark_curve": (
-        ("landmark",),
-        ONE,
-        "curve of the point, in order along it; empty where it has none",
-    ),
-    "landmark_closed": (("landmark",), ONE, "whether that curve is closed"),
+    "position": ("vertex xyz", INPUT, "vertex position"),
+    "corner_vertex": ("triangle corner", ONE, "vertex at each corner of a triangle"),
+    "file_vertex": ("vertex", ONE, "index of the vertex in its file"),
+    "vertex_of_file": ("file_vertex_index", ONE,
+        "vertex that a vertex of the file became, -1 where dropped"),
+    "label": ("vertex", ONE, "label of the vertex"),
+    "landmark_name": ("landmark", ONE, "name of the landmark"),
+    "landmark_position": ("landmark xyz", INPUT, "position of the landmark"),
+    "landmark_curve": ("landmark", ONE,
+        "curve of the point, in order along it; empty where it has none"),
+    "landmark_closed": ("landmark", ONE, "whether that curve is closed"),
     # low resolution (4.1) and its spectrum (3.3)
-    "vertex_area": (("vertex",), INPUT2, "lumped area of the vertex, the diagonal of A"),
-    "edge_vertex": (("edge", "end"), ONE, "vertices at both ends of an edge"),
-    "cotan_weight": (("edge",), ONE, "cotan weight of the edge, so that the Laplacian is A^-1 W"),
-    "sample_vertex": (("vertex",), ONE, "vertex of the original mesh that the coarse vertex is"),
-    "coarse_vertex": (
-        ("original_vertex", "corner"),
-        ONE,
-        "coarse vertices that carry an original vertex: columns of U",
-    ),
-    "coarse_weight": (
-        ("original_vertex", "corner"),
-        ONE,
-        "their barycentric weights: entries of U",
-    ),
-    "eigenvalue": (("mode",), UNIT_AREA, "eigenvalue of the Laplace-Beltrami operator"),
-    "eigenfunction": (
-        ("vertex", "mode"),
-        UNIT_AREA,
-        "eigenfunction, orthonormal in the vertex areas",
-    ),
+    "vertex_area": ("vertex", INPUT2, "lumped area of the vertex, the diagonal of A"),
+    "edge_vertex": ("edge end", ONE, "vertices at both ends of an edge"),
+    "cotan_weight": ("edge", ONE, "cotan weight of the edge, so that the Laplacian is A^-1 W"),
+    "sample_vertex": ("vertex", ONE, "vertex of the original mesh that the coarse vertex is"),
+    "coarse_vertex": ("original_vertex corner", ONE,
+        "coarse vertices that carry an original vertex: columns of U"),
+    "coarse_weight": ("original_vertex corner", ONE, "their barycentric weights: entries of U"),
+    "eigenvalue": ("mode", UNIT_AREA, "eigenvalue of the Laplace-Beltrami operator"),
+    "eigenfunction": ("vertex mode", UNIT_AREA, "eigenfunction, orthonormal in the vertex areas"),
     # one pair (4.1)
-    "match": (("vertex",), ONE, "on each vertex of the target, the matched vertex of the source"),
+    "match": ("vertex", ONE, "on each vertex of the target, the matched vertex of the source"),
     # metrics of a pair (5.1, eq. 9 - 11)
-    "chamfer": ((), SHARE, "Chamfer distance of the source and the image of the target (eq. 9)"),
-    "hausdorff": ((), SHARE, "Hausdorff distance of the source and the image of the target"),
-    "hausdorff_paper": (
-        (),
-        SHARE,
-        "the same as eq. 10 prints it: a sum, with 1/n on the second term",
-    ),
-    "dirichlet": (
-        (),
-        ONE,
-        "Dirichlet energy of the image's coordinates, source of unit area; 2 if conformal (eq. 11)",
-    ),
-    "coverage": ((), ONE, "share of the source's area whose vertices are matched to"),
-    "bijectivity": ((), SHARE, "round trip target, source, target along edges, mean"),
-    "conformal_distortion": (
-        (),
-        ONE,
-        "log(s1 / s2) of the maps of triangles that do not collapse, median by area",
-    ),
-    "area_distortion": (
-        (),
-        ONE,
-        "|log(area of image / area)| of them, surfaces of unit area, median by area",
-    ),
-    "collapsed_share": ((), ONE, "share of the target's area in triangles whose image has no area"),
-    "geodesic_error": ((), SHARE, "distance along edges of matched and true vertices, mean"),
-    "straight_error": ((), SHARE, "distance in a straight line of image and true position, mean"),
-    "error_curve": (("threshold",), ONE, "share of the vertices whose geodesic error is no larger"),
-    "label_accuracy": ((), ONE, "share of the area that gets its own label"),
-    "label_dice": ((), ONE, "Dice's overlap by area, mean over the labels of the target"),
-    "landmark_error": (
-        (),
-        SHARE,
-        "distance in a straight line of carried and given landmarks, mean",
-    ),
+    "chamfer": ("", SHARE, "Chamfer distance of the source and the image of the target (eq. 9)"),
+    "hausdorff": ("", SHARE, "Hausdorff distance of the source and the image of the target"),
+    "hausdorff_paper": ("", SHARE,
+        "the same as eq. 10 prints it: a sum, with 1/n on the second term"),
+    "dirichlet": ("", ONE,
+        "Dirichlet energy of the image's coordinates, source of unit area; 2 if conformal "
+        "(eq. 11)"),
+    "coverage": ("", ONE, "share of the source's area whose vertices are matched to"),
+    "bijectivity": ("", SHARE, "round trip target, source, target along edges, mean"),
+    "conformal_distortion": ("", ONE,
+        "log(s1 / s2) of the maps of triangles that do not collapse, median by area"),
+    "area_distortion": ("", ONE,
+        "|log(area of image / area)| of them, surfaces of unit area, median by area"),
+    "collapsed_share": ("", ONE, "share of the target's area in triangles whose image has no area"),
+    "geodesic_error": ("", SHARE, "distance along edges of matched and true vertices, mean"),
+    "straight_error": ("", SHARE, "distance in a straight line of image and true position, mean"),
+    "error_curve": ("threshold", ONE, "share of the vertices whose geodesic error is no larger"),
+    "label_accuracy": ("", ONE, "share of the area that gets its own label"),
+    "label_dice": ("", ONE, "Dice's overlap by area, mean over the labels of the target"),
+    "landmark_error": ("", SHARE,
+        "distance in a straight line of carried and given landmarks, mean"),
     # the network of maps (3.4)
-    "source": (("pair",), ONE, "shape whose functions the map takes"),
-    "target": (("pair",), ONE, "shape on which the map gives functions"),
-    "fmap": (
-        ("pair", "mode_target", "mode_source"),
-        ONE,
-        "functional map, source functions to target functions",
-    ),
-    "fmap_initial": (
-        ("pair", "mode_target_initial", "mode_source_initial"),
-        ONE,
-        "functional map before Consistent ZoomOut",
-    ),
-    "weight": (("pair",), ONE, "weight of the map in the consistent latent basis"),
-    "cycle_error": (
-        ("pair",),
-        ONE,
-        "mean |C_cycle - I|_F over the 3-cycles through the pair, first k_init modes, by sqrt(k_init)",
-    ),
-    "cycle_error_initial": (("pair",), ONE, "the same before Consistent ZoomOut"),
+    "source": ("pair", ONE, "shape whose functions the map takes"),
+    "target": ("pair", ONE, "shape on which the map gives functions"),
+    "fmap": ("pair mode_target mode_source", ONE,
+        "functional map, source functions to target functions"),
+    "fmap_initial": ("pair mode_target_initial mode_source_initial", ONE,
+        "functional map before Consistent ZoomOut"),
+    "weight": ("pair", ONE, "weight of the map in the consistent latent basis"),
+    "cycle_error": ("pair", ONE,
+        "mean |C_cycle - I|_F over the 3-cycles through the pair, first k_init modes, by "
+        "sqrt(k_init)"),
+    "cycle_error_initial": ("pair", ONE, "the same before Consistent ZoomOut"),
     # latent basis and median (3.4 - 3.6, eq. 3 and 5)
-    "latent_basis": (("shape", "mode", "latent"), ONE, "consistent latent basis Y of each shape"),
-    "latent_eigenvalue": (("latent",), UNIT_AREA, "eigenvalue of the latent (limit) shape"),
-    "area_difference": (
-        ("shape", "latent", "latent_2"),
-        ONE,
-        "area-based shape difference D = Y^T Y",
-    ),
-    "conformal_difference": (("shape", "latent", "latent_2"), ONE, "conformal shape difference"),
-    "distance_to_median": (
-        ("shape",),
-        ONE,
-        "distance |D_i - I| of each shape to the limit shape (eq. 5)",
-    ),
-    "area_score": (
-        ("shape", "difference_component"),
-        ONE,
-        "PCA scores of the area-based shape differences",
-    ),
-    "conformal_score": (
-        ("shape", "difference_component"),
-        ONE,
-        "PCA scores of the conformal shape differences",
-    ),
-    "area_variance_ratio": (
-        ("difference_component",),
-        ONE,
-        "share of variance of the area-based differences",
-    ),
-    "conformal_variance_ratio": (
-        ("difference_component",),
-        ONE,
-        "share of variance of the conformal differences",
-    ),
+    "latent_basis": ("shape mode latent", ONE, "consistent latent basis Y of each shape"),
+    "latent_eigenvalue": ("latent", UNIT_AREA, "eigenvalue of the latent (limit) shape"),
+    "area_difference": ("shape latent latent_2", ONE, "area-based shape difference D = Y^T Y"),
+    "conformal_difference": ("shape latent latent_2", ONE, "conformal shape difference"),
+    "distance_to_median": ("shape", ONE,
+        "distance |D_i - I| of each shape to the limit shape (eq. 5)"),
+    "area_score": ("shape difference_component", ONE,
+        "PCA scores of the area-based shape differences"),
+    "conformal_score": ("shape difference_component", ONE,
+        "PCA scores of the conformal shape differences"),
+    "area_variance_ratio": ("difference_component", ONE,
+        "share of variance of the area-based differences"),
+    "conformal_variance_ratio": ("difference_component", ONE,
+        "share of variance of the conformal differences"),
     # registration (eq. 6 - 8)
-    "registered_match": (
-        ("shape", "vertex"),
-        ONE,
-        "on each template vertex, the matched vertex of the shape",
-    ),
-    "displacement": (("shape", "vertex", "xyz"), INPUT, "registered shape minus template, smooth"),
-    "displacement_raw": (
-        ("shape", "vertex", "xyz"),
-        INPUT,
-        "matched vertex of the aligned shape minus template",
-    ),
-    "rotation": (
-        ("shape", "xyz", "xyz_2"),
-        ONE,
-        "rotation R of the alignment x -> s R x + t onto the template",
-    ),
-    "translation": (("shape", "xyz"), INPUT, "translation t of the alignment onto the template"),
-    "scale": (("shape",), ONE, "scale s of the alignment onto the template"),
-    "displacement_low": (
-        ("shape", "low_vertex", "xyz"),
-        INPUT,
-        "matched vertex of the aligned coarse shape minus coarse template (eq. 6)",
-    ),
-    "confidence": (("shape", "vertex"), ONE, "confidence of the match, 0 to 1"),
-    "round_trip": (
-        ("shape", "vertex"),
-        "share of sqrt(area)",
-        "cycle error: way from the vertex to the shape and back",
-    ),
-    "distortion": (
-        ("shape", "vertex"),
-        ONE,
-        "log of the vertex's share of the area, on the shape over on the template",
-    ),
-    "method": (("shape",), ONE, "start of the match that was kept"),
-    "badness": (
-        ("shape",),
-        "share of sqrt(area)",
-        "round trip and gaps between the surfaces, mean",
-    ),
-    "template_triangle": (
-        ("original_vertex",),
-        ONE,
-        "template triangle on which the vertex of the shape lies",
-    ),
-    "template_barycentric": (
-        ("original_vertex", "corner"),
-        ONE,
-        "barycentric weights in that triangle",
-    ),
+    "registered_match": ("shape vertex", ONE,
+        "on each template vertex, the matched vertex of the shape"),
+    "displacement": ("shape vertex xyz", INPUT, "registered shape minus template, smooth"),
+    "displacement_raw": ("shape vertex xyz", INPUT,
+        "matched vertex of the aligned shape minus template"),
+    "rotation": ("shape xyz xyz_2", ONE,
+        "rotation R of the alignment x -> s R x + t onto the template"),
+    "translation": ("shape xyz", INPUT, "translation t of the alignment onto the template"),
+    "scale": ("shape", ONE, "scale s of the alignment onto the template"),
+    "displacement_low": ("shape low_vertex xyz", INPUT,
+        "matched vertex of the aligned coarse shape minus coarse template (eq. 6)"),
+    "confidence": ("shape vertex", ONE, "confidence of the match, 0 to 1"),
+    "round_trip": ("shape vertex", SHARE, "cycle error: way from the vertex to the shape and back"),
+    "distortion": ("shape vertex", ONE,
+        "log of the vertex's share of the area, on the shape over on the template"),
+    "method": ("shape", ONE, "start of the match that was kept"),
+    "badness": ("shape", SHARE, "round trip and gaps between the surfaces, mean"),
+    "template_triangle": ("original_vertex", ONE,
+        "template triangle on which the vertex of the shape lies"),
+    "template_barycentric": ("original_vertex corner", ONE, "barycentric weights in that triangle"),
     # what travels along a registration (6.2)
-    "label_share": (
-        ("vertex",),
-        ONE,
-        "share of the votes that the label of the vertex has, 0 to 1",
-    ),
-    "label_vote": (
-        ("vertex", "label_value"),
-        ONE,
-        "share of the votes for every label, rows sum to 1",
-    ),
-    "field": (("vertex",), ONE, "scalar field"),
-    "landmark_triangle": (("landmark",), ONE, "triangle of the mesh on which the landmark lies"),
-    "landmark_barycentric": (
-        ("landmark", "corner"),
-        ONE,
-        "barycentric weights of the landmark in that triangle",
-    ),
-    "landmark_confidence": (("landmark",), ONE, "confidence of the match at the landmark, 0 to 1"),
-    "landmark_distance": (
-        ("landmark",),
-        INPUT,
-        "distance of the given landmark from the surface it is marked on",
-    ),
-    "landmark_spread": (
-        ("landmark",),
-        INPUT,
-        "distance between the positions that different ways of transfer give",
-    ),
+    "label_share": ("vertex", ONE, "share of the votes that the label of the vertex has, 0 to 1"),
+    "label_vote": ("vertex label_value", ONE, "share of the votes for every label, rows sum to 1"),
+    "field": ("vertex", ONE, "scalar field"),
+    "landmark_triangle": ("landmark", ONE, "triangle of the mesh on which the landmark lies"),
+    "landmark_barycentric": ("landmark corner", ONE,
+        "barycentric weights of the landmark in that triangle"),
+    "landmark_confidence": ("landmark", ONE, "confidence of the match at the landmark, 0 to 1"),
+    "landmark_distance": ("landmark", INPUT,
+        "distance of the given landmark from the surface it is marked on"),
+    "landmark_spread": ("landmark", INPUT,
+        "distance between the positions that different ways of transfer give"),
     # modes (6.1)
-    "mean_displacement": (("vertex", "xyz"), INPUT, "mean of the displacements"),
-    "deformation": (
-        ("component", "vertex", "xyz"),
-        INPUT,
-        "deformation of one standard deviation along the component",
-    ),
-    "standard_deviation": (
-        ("component",),
-        INPUT,
-        "standard deviation of the component (area-weighted RMS)",
-    ),
-    "score": (("shape", "component"), ONE, "score of each shape, in standard deviations"),
-    "reconstruction_error": (
-        ("shape",),
-        INPUT,
-        "root mean square over the area of what the modes do not describe",
-    ),
-    "explained_variance_ratio": (("component",), ONE, "share of the variance at full resolution"),
-    "explained_variance_ratio_low": (
-        ("component",),
-        ONE,
-        "share of the variance at low resolution, of the matches as they are",
-    ),
+    "mean_displacement": ("vertex xyz", INPUT, "mean of the displacements"),
+    "deformation": ("component vertex xyz", INPUT,
+        "deformation of one standard deviation along the component"),
+    "standard_deviation": ("component", INPUT,
+        "standard deviation of the component (area-weighted RMS)"),
+    "score": ("shape component", ONE, "score of each shape, in standard deviations"),
+    "reconstruction_error": ("shape", INPUT,
+        "root mean square over the area of what the modes do not describe"),
+    "explained_variance_ratio": ("component", ONE, "share of the variance at full resolution"),
+    "explained_variance_ratio_low": ("component", ONE,
+        "share of the variance at low resolution, of the matches as they are"),
     # evaluation of the model, tests and outliers (6.1)
-    "compactness": (("component",), INPUT2, "variance of the first components together"),
-    "compactness_error": (("component",), INPUT2, "its standard error"),
-    "generalization": (
-        ("component",),
-        INPUT,
-        "distance of a left-out shape to its reconstruction, mean over shapes",
-    ),
-    "generalization_error": (("component",), INPUT, "its standard error"),
-    "generalization_surface": (
-        ("component",),
-        INPUT,
-        "the same from points to the surface, mean distance",
-    ),
-    "generalization_surface_error": (("component",), INPUT, "its standard error"),
-    "specificity": (
-        ("component",),
-        INPUT,
-        "distance of a random shape of the model to the nearest shape",
-    ),
-    "specificity_error": (("component",), INPUT, "its standard error"),
-    "specificity_surface": (
-        ("component",),
-        INPUT,
-        "the same from points to the surface, mean distance",
-    ),
-    "specificity_surface_error": (("component",), INPUT, "its standard error"),
-    "variance_ratio": (("component",), ONE, "share of the variance, in the basis of the baseline"),
-    "variance_ratio_null": (
-        ("component",),
-        ONE,
-        "the same when every coefficient is permuted, mean",
-    ),
-    "variance_ratio_null_95": (("component",), ONE, "the same, 95th percentile"),
-    "statistic": ((), ONE, "test statistic"),
-    "p_value": ((), ONE, "p value of the permutation test"),
-    "explained_share": (
-        ("vertex",),
-        ONE,
-        "share of the variation at the vertex that is explained (Pillai's trace)",
-    ),
-    "p_vertex": (("vertex",), ONE, "p value of the vertex alone"),
-    "p_family_wise": (
-        ("vertex",),
-        ONE,
-        "p value corrected for all vertices by the largest statistic",
-    ),
-    "p_false_discovery": (("vertex",), ONE, "p value adjusted for the false discovery rate"),
-    "effect_size": (("vertex",), ONE, "effect size"),
-    "effect": (
-        ("vertex", "xyz"),
-        INPUT,
-        "difference of the groups' means, or change per unit of the variable",
-    ),
-    "intercept": (("vertex", "xyz"), INPUT, "displacement where the variable is at its mean"),
-    "standard_score": (
-        ("shape",),
-        ONE,
-        "variable of the regression, less its mean, in standard deviations",
-    ),
-    "mahalanobis": (
-        ("shape",),
-        ONE,
-        "distance to the mean of all others, in their standard deviations",
-    ),
-    "outlier_p": (("shape",), ONE, "p value of that distance for a normal population"),
-    "left_out_error": (
-        ("shape",),
-        INPUT,
-        "distance of the shape to its reconstruction by the model of all others",
-    ),
-    "outlier": (("shape",), ONE, "whether one of both is beyond its threshold"),
-    "predicted": (("shape",), ONE, "class predicted while the shape was left out"),
-    "accuracy": (("fold",), ONE, "balanced accuracy on the left-out shapes"),
+    "compactness": ("component", INPUT2, "variance of the first components together"),
+    "compactness_error": ("component", INPUT2, "its standard error"),
+    "generalization": ("component", INPUT,
+        "distance of a left-out shape to its reconstruction, mean over shapes"),
+    "generalization_error": ("component", INPUT, "its standard error"),
+    "generalization_surface": ("component", INPUT,
+        "the same from points to the surface, mean distance"),
+    "generalization_surface_error": ("component", INPUT, "its standard error"),
+    "specificity": ("component", INPUT,
+        "distance of a random shape of the model to the nearest shape"),
+    "specificity_error": ("component", INPUT, "its standard error"),
+    "specificity_surface": ("component", INPUT,
+        "the same from points to the surface, mean distance"),
+    "specificity_surface_error": ("component", INPUT, "its standard error"),
+    "variance_ratio": ("component", ONE, "share of the variance, in the basis of the baseline"),
+    "variance_ratio_null": ("component", ONE, "the same when every coefficient is permuted, mean"),
+    "variance_ratio_null_95": ("component", ONE, "the same, 95th percentile"),
+    "statistic": ("", ONE, "test statistic"),
+    "p_value": ("", ONE, "p value of the permutation test"),
+    "explained_share": ("vertex", ONE,
+        "share of the variation at the vertex that is explained (Pillai's trace)"),
+    "p_vertex": ("vertex", ONE, "p value of the vertex alone"),
+    "p_family_wise": ("vertex", ONE, "p value corrected for all vertices by the largest statistic"),
+    "p_false_discovery": ("vertex", ONE, "p value adjusted for the false discovery rate"),
+    "effect_size": ("vertex", ONE, "effect size"),
+    "effect": ("vertex xyz", INPUT,
+        "difference of the groups' means, or change per unit of the variable"),
+    "intercept": ("vertex xyz", INPUT, "displacement where the variable is at its mean"),
+    "standard_score": ("shape", ONE,
+        "variable of the regression, less its mean, in standard deviations"),
+    "mahalanobis": ("shape", ONE,
+        "distance to the mean of all others, in their standard deviations"),
+    "outlier_p": ("shape", ONE, "p value of that distance for a normal population"),
+    "left_out_error": ("shape", INPUT,
+        "distance of the shape to its reconstruction by the model of all others"),
+    "outlier": ("shape", ONE, "whether one of both is beyond its threshold"),
+    "predicted": ("shape", ONE, "class predicted while the shape was left out"),
+    "accuracy": ("fold", ONE, "balanced accuracy on the left-out shapes"),
     # the truth of a synthetic collection
-    "reference_point": (
-        ("vertex", "xyz"),
-        ONE,
-        "point of the unit sphere that the vertex is the image of",
-    ),
-    "planted_score": (
-        ("shape", "planted_mode"),
-        ONE,
-        "planted score of each shape, in standard deviations",
-    ),
-    "planted_centre": (
-        ("planted_part", "xyz"),
-        "mm",
-        "centre of each localised field of the planted modes",
-    ),
-    "planted_width": (("planted_part",), "mm", "its width, the standard deviation of a Gaussian"),
-    "planted_push": (
-        ("planted_mode", "planted_part", "xyz"),
-        "mm",
-        "its translation in each planted mode",
-    ),
-    "planted_turn": (
-        ("planted_mode", "planted_part", "xyz"),
-        "rad",
-        "its rotation in each planted mode",
-    ),
-    "own_centre": (
-        ("shape", "own_part", "xyz"),
-        "mm",
-        "centres of the noise and, last, of the tumour of each shape",
-    ),
-    "own_width": (("shape", "own_part"), "mm", "their widths"),
-    "own_push": (("shape", "own_part", "xyz"), "mm", "their translations"),
-    "landmark_reference": (
-        ("landmark", "xyz"),
-        ONE,
-        "point of the unit sphere that the landmark is the image of",
-    ),
+    "reference_point": ("vertex xyz", ONE,
+        "point of the unit sphere that the vertex is the image of"),
+    "planted_score": ("shape planted_mode", ONE,
+        "planted score of each shape, in standard deviations"),
+    "planted_centre": ("planted_part xyz", "mm",
+        "centre of each localised field of the planted modes"),
+    "planted_width": ("planted_part", "mm", "its width, the standard deviation of a Gaussian"),
+    "planted_push": ("planted_mode planted_part xyz", "mm", "its translation in each planted mode"),
+    "planted_turn": ("planted_mode planted_part xyz", "rad", "its rotation in each planted mode"),
+    "own_centre": ("shape own_part xyz", "mm",
+        "centres of the noise and, last, of the tumour of each shape"),
+    "own_width": ("shape own_part", "mm", "their widths"),
+    "own_push": ("shape own_part xyz", "mm", "their translations"),
+    "landmark_reference": ("landmark xyz", ONE,
+        "point of the unit sphere that the landmark is the image of"),
     # the comparison (Table 1, Fig. 3, Table 2)
-    "block_seconds": (("way", "pair", "block"), "s", "CPU time of the block, of one core"),
-    "collection_chamfer": (
-        ("way", "how", "shape"),
-        SHARE,
-        "Chamfer distance of the shape and the image of the template (eq. 9)",
-    ),
-    "collection_seconds": (
-        ("way", "how", "block"),
-        "s",
-        "CPU time of the block for the whole collection, of one core",
-    ),
-    "median_shape": (("way",), ONE, "median shape (eq. 5)"),
+    "block_seconds": ("way pair block", "s", "CPU time of the block, of one core"),
+    "collection_chamfer": ("way how shape", SHARE,
+        "Chamfer distance of the shape and the image of the template (eq. 9)"),
+    "collection_seconds": ("way how block", "s",
+        "CPU time of the block for the whole collection, of one core"),
+    "median_shape": ("way", ONE, "median shape (eq. 5)"),
     # the report
-    "status": (("shape",), ONE, "ok, repaired or excluded"),
-    "reason": (("shape",), ONE, "what was found and done"),
-    "warning": (("shape",), ONE, "what looks wrong and was left as it is"),
-    "path": (("shape",), ONE, "file of the shape"),
-    "area": (("shape",), INPUT2, "area of the surface"),
-    "self_intersections": (
-        ("shape",),
-        ONE,
-        "triangles that pass through others, -1 where not counted",
-    ),
-    "file_vertices": (("shape",), ONE, "vertices in the file"),
-    "file_triangles": (("shape",), ONE, "triangles in the file"),
-    "nonfinite_vertices": (("shape",), ONE, "vertices that are not finite"),
-    "welded_vertices": (("shape",), ONE, "vertices welded to another"),
-    "degenerate_triangles": (("shape",), ONE, "triangles that repeat a corner"),
-    "duplicate_triangles": (
-        ("shape",),
-        ONE,
-        "triangles dropped because others have the same corners",
-    ),
-    "flipped_edges": (("shape",), ONE, "long edges of zero-area triangles flipped"),
-    "flat_triangles": (("shape",), ONE, "zero-area triangles dropped"),
-    "nonmanifold_edges": (("shape",), ONE, "edges with more than two triangles"),
-    "cut_edges": (("shape",), ONE, "sides of edges that were cut open"),
-    "split_vertices": (("shape",), ONE, "vertices added where a vertex was not manifold"),
-    "inserted_vertices": (
-        ("shape",),
-        ONE,
-        "vertices inserted on edges where two sheets share both ends",
-    ),
-    "reoriented_triangles": (("shape",), ONE, "triangles reoriented"),
-    "unreferenced_vertices": (("shape",), ONE, "vertices without triangles"),
-    "closed_holes": (("shape",), ONE, "holes closed"),
-    "components": (("shape",), ONE, "connected components found"),
-    "dropped_components": (("shape",), ONE, "connected components dropped"),
-    "area_dropped": (("shape",), ONE, "share of the area in the dropped components"),
-    "holes": (("shape",), ONE, "boundary loops"),
-    "genus": (("shape",), ONE, "genus, summed over the components"),
-    "seconds": (("stage",), "s", "wall time of the stage"),
-    "peak_memory": (
-        ("stage",),
-        "MiB",
-        "peak resident memory of this process and its workers in the stage",
-    ),
+    "status": ("shape", ONE, "ok, repaired or excluded"),
+    "reason": ("shape", ONE, "what was found and done"),
+    "warning": ("shape", ONE, "what looks wrong and was left as it is"),
+    "path": ("shape", ONE, "file of the shape"),
+    "area": ("shape", INPUT2, "area of the surface"),
+    "self_intersections": ("shape", ONE,
+        "triangles that pass through others, -1 where not counted"),
+    "file_vertices": ("shape", ONE, "vertices in the file"),
+    "file_triangles": ("shape", ONE, "triangles in the file"),
+    "nonfinite_vertices": ("shape", ONE, "vertices that are not finite"),
+    "welded_vertices": ("shape", ONE, "vertices welded to another"),
+    "degenerate_triangles": ("shape", ONE, "triangles that repeat a corner"),
+    "duplicate_triangles": ("shape", ONE, "triangles dropped because others have the same corners"),
+    "flipped_edges": ("shape", ONE, "long edges of zero-area triangles flipped"),
+    "flat_triangles": ("shape", ONE, "zero-area triangles dropped"),
+    "nonmanifold_edges": ("shape", ONE, "edges with more than two triangles"),
+    "cut_edges": ("shape", ONE, "sides of edges that were cut open"),
+    "split_vertices": ("shape", ONE, "vertices added where a vertex was not manifold"),
+    "inserted_vertices": ("shape", ONE,
+        "vertices inserted on edges where two sheets share both ends"),
+    "reoriented_triangles": ("shape", ONE, "triangles reoriented"),
+    "unreferenced_vertices": ("shape", ONE, "vertices without triangles"),
+    "closed_holes": ("shape", ONE, "holes closed"),
+    "components": ("shape", ONE, "connected components found"),
+    "dropped_components": ("shape", ONE, "connected components dropped"),
+    "area_dropped": ("shape", ONE, "share of the area in the dropped components"),
+    "holes": ("shape", ONE, "boundary loops"),
+    "genus": ("shape", ONE, "genus, summed over the components"),
+    "seconds": ("stage", "s", "wall time of the stage"),
+    "peak_memory": ("stage", "MiB",
+        "peak resident memory of this process and its workers in the stage"),
+}
+# fmt: on
+TABLE = {
+    name: (tuple(dims.split()), unit, long_name) for name, (dims, unit, long_name) in ROWS.items()
 }
 
 
-def variable(name, data, **attrs):
+def variable(name: str, data: ArrayLike, **attrs: str | float | list[str]) -> xr.Variable:
     """A variable of the table, with its dims, unit and meaning.
 
     Parameters
@@ -464,7 +279,7 @@ def variable(name, data, **attrs):
     return xr.Variable(dims, data, {"units": unit, "long_name": long_name, **attrs})
 
 
-def covariate(name, data):
+def covariate(name: str, data: ArrayLike) -> xr.Variable:
     """A column of the table of the shapes, the one kind of variable whose names users choose.
 
     Examples
@@ -480,18 +295,13 @@ def covariate(name, data):
     )
 
 
-def dataset(attrs=None, **variables):
-    """A Dataset of variables of the table: ``dataset(position=x, corner_vertex=t)``.
-
-    See :func:`variable`.
-    """
+def dataset(attrs: Mapping | None = None, **variables: ArrayLike) -> xr.Dataset:
+    """A Dataset of variables of the table, as ``dataset(position=X, corner_vertex=T)``."""
     return xr.Dataset({name: variable(name, data) for name, data in variables.items()}, attrs=attrs)
 
 
-def unit_of(values):
-    """The unit of a length, from the attributes of a variable or of a mesh.
-
-    "unit of the input" where none is known.
+def unit_of(values: xr.DataArray | xr.Dataset) -> str:
+    """The unit of a length, as a variable or a mesh says it; "unit of the input" where none does.
 
     Examples
     --------
@@ -502,8 +312,8 @@ def unit_of(values):
     return str(values.attrs.get("units") or values.attrs.get("unit") or INPUT)
 
 
-def in_unit(data, unit):
-    """A Dataset with the known unit in place of "unit of the input"; empty where it is not known.
+def in_unit(data: xr.Dataset, unit: str | None) -> xr.Dataset:
+    """A Dataset with the unit in place of "unit of the input", where the unit is known.
 
     Examples
     --------
@@ -516,14 +326,13 @@ def in_unit(data, unit):
     units = {INPUT: unit, INPUT2: f"{unit}^2"}
     data = data.copy()
     for values in data.data_vars.values():
-        values.attrs["units"] = units.get(values.attrs.get("units"), values.attrs.get("units", ONE))
+        before = values.attrs.get("units", ONE)
+        values.attrs["units"] = units.get(before, before)
     return data
 
 
-def require(data, *names, what="dataset"):
-    """Raise ValueError unless every variable of `names` is in the Dataset.
-
-    With the dims of the table.
+def require(data: xr.Dataset, *names: str, what: str = "dataset") -> None:
+    """ValueError unless the Dataset has all variables of these names, with the dims of the table.
 
     Examples
     --------
@@ -542,13 +351,13 @@ def require(data, *names, what="dataset"):
             raise ValueError(f"{name} of the {what} needs the dims {dims}, found {data[name].dims}")
 
 
-def check_switch(name, value):
+def check_switch(name: str, value: object) -> None:
     """ValueError unless an option is True or False."""
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name} must be True or False; found {value!r}")
 
 
-def check_text(name, value):
+def check_text(name: str, value: object) -> None:
     """ValueError unless an option is a text or None."""
     if not isinstance(value, str | None):
         raise ValueError(f"{name} must be a text or None; found {value!r}")
