@@ -1,10 +1,10 @@
-"""Links between a template and a shape (6.2).
-
-Where every vertex and point of one lies on the other.
+"""Links between a template and a shape (6.2): where every vertex and point of one is on the other.
 
 Down a link, from the template to the shape, every vertex of the shape takes the values at the
 closest point of the deformed template; up, every vertex of the template takes those at the closest
-point of the shape.  A route is a chain of links with their directions.
+point of the shape.  A route is a list of links with their directions:
+
+    source shape --up--> template --down--> target shape
 """
 
 from dataclasses import dataclass
@@ -12,19 +12,22 @@ from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
+import xarray as xr
 
 from s4a.geometry.closest import closest_facing_point, interpolate, interpolation_matrix
 from s4a.geometry.mesh import as_arrays, vertex_normals
 
+# Triangle (p,) and barycentric weights (p, 3) of points on a surface, and how sure they are (p,).
+Places = tuple[np.ndarray, np.ndarray, np.ndarray]
+
 
 @dataclass(frozen=True)
 class Link:
-    """One registration: template ``X, T``, shape ``Y, S``.
+    """One registration: a template ``X, T``, a shape ``Y, S``, and where one is on the other.
 
-    The registered template ``image`` in the shape's frame.
-
-    ``confidence (n,)`` on the template's vertices; ``triangle (p,)`` and ``weights (p, 3)`` of the
-    shape's vertices on the template.
+    ``image (n, 3)`` is the registered template in the shape's frame, ``confidence (n,)`` that of
+    its vertices; ``triangle (p,)`` and ``weights (p, 3)`` are the places of the shape's vertices on
+    the template.
     """
 
     X: np.ndarray
@@ -37,99 +40,91 @@ class Link:
     weights: np.ndarray
 
     @cached_property
-    def down(self):
-        """Matrix from the template's vertices to the shape's, and its confidence on the shape."""
+    def down(self) -> tuple[sp.csr_matrix, np.ndarray]:
+        """Matrix ``(p, n)`` of values from template to shape, and confidence on the shape."""
         W = interpolation_matrix(self.T, self.triangle, self.weights, len(self.X))
         return W, W @ self.confidence
 
     @cached_property
-    def up(self):
-        """Matrix from the shape's vertices to the template's.
+    def up(self) -> tuple[sp.csr_matrix, np.ndarray]:
+        """Matrix ``(n, p)`` of values from shape to template, and confidence on the template."""
+        normals = vertex_normals(self.image, self.T)
+        place = closest_facing_point(self.image, normals, self.Y, self.S)
+        return interpolation_matrix(self.S, *place, len(self.Y)), self.confidence
 
-        And its confidence on the template.
-        """
-        found = closest_facing_point(self.image, vertex_normals(self.image, self.T), self.Y, self.S)
-        return interpolation_matrix(self.S, *found, len(self.Y)), self.confidence
+    def carry_down(self, triangle: np.ndarray, weights: np.ndarray) -> Places:
+        """Places on the shape of points on the template."""
+        place = (self.T, triangle, weights)
+        P = interpolate(self.image, *place)
+        N = interpolate(vertex_normals(self.image, self.T), *place)
+        confidence = interpolate(self.confidence[:, None], *place)[:, 0]
+        return *closest_facing_point(P, N, self.Y, self.S), confidence
 
-    def point_down(self, triangle, weights):
-        """Points on the template -> triangle and weights of their places on the shape.
-
-        And confidence.
-        """
-        P, N, confidence = (
-            interpolate(values, self.T, triangle, weights)
-            for values in (self.image, vertex_normals(self.image, self.T), self.confidence[:, None])
-        )
-        return *closest_facing_point(P, N, self.Y, self.S), confidence[:, 0]
-
-    def point_up(self, triangle, weights):
-        """Points on the shape -> triangle and weights of their places on the template.
-
-        And confidence.
-        """
-        P, N = (
-            interpolate(values, self.S, triangle, weights)
-            for values in (self.Y, vertex_normals(self.Y, self.S))
-        )
-        found = closest_facing_point(P, N, self.image, self.T)
-        return *found, interpolate(self.confidence[:, None], self.T, *found)[:, 0]
+    def carry_up(self, triangle: np.ndarray, weights: np.ndarray) -> Places:
+        """Places on the template of points on the shape."""
+        P = interpolate(self.Y, self.S, triangle, weights)
+        N = interpolate(vertex_normals(self.Y, self.S), self.S, triangle, weights)
+        place = closest_facing_point(P, N, self.image, self.T)
+        return *place, interpolate(self.confidence[:, None], self.T, *place)[:, 0]
 
 
-def link(template, shape, registered):
-    """The :class:`Link` of a shape from the mesh of the template, its own.
+Route = list[tuple[Link, str]]  # ends with "down" or "up"
 
-    And its part of ``/registration``.
+
+def image_in_shape(X: np.ndarray, registered: xr.Dataset) -> np.ndarray:
+    """Positions ``(n, 3)`` of the registered template where the file of the shape has the shape.
+
+    `registered` is the shape's part of ``/registration``, x -> s R x + t its way to the template.
     """
-    (X, T), (Y, S) = as_arrays(template), as_arrays(shape)
     R, t, s = (registered[name].values for name in ("rotation", "translation", "scale"))
-    image = (X + registered["displacement"].values - t) @ R / s
-    return Link(
-        X,
-        T,
-        Y,
-        S,
-        image,
-        *(
-            registered[n].values
-            for n in ("confidence", "template_triangle", "template_barycentric")
-        ),
-    )
+    return (X + registered["displacement"].values - t) @ R / s
 
 
-def along(route):
-    """Matrix of a route from the values on its first mesh to those on its last.
+def link(template: xr.Dataset, shape: xr.Dataset, registered: xr.Dataset) -> Link:
+    """The :class:`Link` of two meshes, by the shape's part of ``/registration``."""
+    X, T = as_arrays(template)
+    Y, S = as_arrays(shape)
+    names = ("confidence", "template_triangle", "template_barycentric")
+    return Link(X, T, Y, S, image_in_shape(X, registered), *(registered[n].values for n in names))
+
+
+def matrix_along(route: Route, n: int) -> tuple[sp.csr_matrix, np.ndarray]:
+    """Matrix of a route from values on its first mesh, of n vertices, to those on its last.
 
     And the confidence on the last.
     """
-    W, confidence = None, None
-    for step, way in route:
-        V, c = getattr(step, way)
-        W, confidence = (V, c) if W is None else (V @ W, c * (V @ confidence))
+    if not route:
+        return sp.identity(n, format="csr"), np.ones(n)
+    steps = [getattr(step, way) for step, way in route]
+    W, confidence = steps[0]
+    for V, own in steps[1:]:
+        W = V @ W
+        confidence = own * (V @ confidence)
     return W, confidence
 
 
-def point_along(route, triangle, weights):
-    """Places on the last mesh of points on the first: triangle, weights and confidence."""
+def carry_along(route: Route, triangle: np.ndarray, weights: np.ndarray) -> Places:
+    """Places on the last mesh of points on the first."""
     confidence = np.ones(len(triangle))
     for step, way in route:
-        triangle, weights, c = getattr(step, f"point_{way}")(triangle, weights)
-        confidence = confidence * c
+        triangle, weights, own = getattr(step, f"carry_{way}")(triangle, weights)
+        confidence = confidence * own
     return triangle, weights, confidence
 
 
-def blended(routes):
+def blend_routes(routes: list[Route], n: int) -> tuple[sp.csr_matrix, np.ndarray]:
     """The mean of several routes, weighted by their confidence at every vertex.
 
-    Matrix, and mean confidence.
+    Matrix ``(p, n)``, and mean confidence ``(p,)``.
     """
-    parts = [along(route) for route in routes]
-    weight = np.stack([c for _, c in parts]) + 1e-9
+    matrices, confidences = zip(*(matrix_along(route, n) for route in routes), strict=True)
+    weight = np.stack(confidences) + 1e-9  # (routes, p), no zero in the sum below
     weight /= weight.sum(0)
-    W = sum(sp.diags(w) @ V for w, (V, _) in zip(weight, parts, strict=True))
-    return W.tocsr(), np.mean([c for _, c in parts], axis=0)
+    W = sum(sp.diags(w) @ V for w, V in zip(weight, matrices, strict=True))
+    return W.tocsr(), np.mean(confidences, axis=0)
 
 
-def elect(W, label):
+def elect(W: sp.csr_matrix, label: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Votes of the source's vertices for a label at every target vertex.
 
     Parameters
@@ -153,8 +148,6 @@ def elect(W, label):
     [4]
     """
     value, code = np.unique(label, return_inverse=True)
-    one_hot = sp.csr_matrix(
-        (np.ones(len(code), np.float32), (np.arange(len(code)), code)), (len(code), len(value))
-    )
+    one_hot = sp.csr_matrix((np.ones(len(code), np.float32), code, np.arange(len(code) + 1)))
     vote = (W @ one_hot).toarray().astype(np.float32)
-    return value[vote.round(6).argmax(1)], vote, value
+    return value[vote.round(6).argmax(1)], vote, value  # equal votes are equal to six digits

@@ -4,33 +4,35 @@ Routes go from the template to a shape, from a shape through the template to ano
 external mesh to the template of a study and on to every shape (:mod:`s4a.analysis.link`).
 """
 
+from collections.abc import Iterator
+
 import numpy as np
-import scipy.sparse as sp
 import xarray as xr
 from joblib import Parallel, delayed
 from threadpoolctl import threadpool_limits
 
+from s4a.analysis.inputs import registration_of
 from s4a.analysis.landmarks import FARTHEST_LANDMARK, NAMED, locate, traced
-from s4a.analysis.link import blended, elect, link, point_along
+from s4a.analysis.link import Route, blend_routes, carry_along, elect, link
 from s4a.geometry.closest import closest_point, interpolate
-from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
+from s4a.geometry.mesh import as_arrays
 from s4a.method.register import identity
 from s4a.method.remesh import coarsen
 from s4a.method.shape import Shape
 from s4a.method.spectral import spectrum
-from s4a.schema import dataset, in_unit, require
+from s4a.schema import dataset, require
 from s4a.study import store
 from s4a.study.pair import match_shapes
 
+N_COARSE = 6000  # of the paper (5.1)
 
-def pair_study(found, source, target):
-    """What :func:`s4a.match_pair` found as a registered study of two shapes.
 
-    ``source`` and ``target`` (the template).
+def pair_study(result: xr.Dataset, source: xr.Dataset, target: xr.Dataset) -> xr.DataTree:
+    """The result of :func:`s4a.match_pair` as a study of ``source`` and ``target``, the template.
 
     Parameters
     ----------
-    found, source, target : Dataset
+    result, source, target : Dataset
         The result, and the meshes it was made of.
 
     Returns
@@ -38,51 +40,46 @@ def pair_study(found, source, target):
     DataTree
         ``/original``, ``/registration``: what the functions of this module take.
     """
-    data = found.drop_vars(["fmap", "fmap_initial"]).rename(match="registered_match")
-    return _tree("target", target, {"source": source}, {"source": data}, {})
+    registered = result.drop_vars(["fmap", "fmap_initial"]).rename(match="registered_match")
+    return _study_of("target", target, {"source": source}, {"source": registered}, {})
 
 
-def _tree(name, template, shapes, forth, back):
-    """A registered study; `back` holds the registrations of the template to each shape as the template."""
+def _study_of(name, template, shapes, forth, back):
+    """A registered study; `forth` has the registrations of the shapes, `back` of the template."""
     meshes = {name: template, **shapes}
+    nodes = {f"original/{n}": mesh for n, mesh in meshes.items()}
     files = {name: identity(Shape(template)), **forth}
-    mesh = as_dataset(
-        *as_arrays(template), {"template": name}, vertex_area=vertex_areas(*as_arrays(template))
-    )
-    mesh = in_unit(mesh, template.attrs.get("unit"))
-    nodes = {f"original/{n}": m for n, m in meshes.items()} | store.stack_registration(
-        mesh, files, list(meshes)
-    )
+    nodes |= store.stack_registration(store.template_mesh(template, name), files, list(meshes))
     return xr.DataTree.from_dict(nodes | {f"reverse/{n}": data for n, data in back.items()})
 
 
-def _low(mesh, n_coarse, seed, k):
+def _shape_of(mesh, n_coarse, k, seed):
+    """The shape of a mesh, with its low resolution and spectrum."""
     with threadpool_limits(1):
         return Shape(mesh, spectrum(coarsen(mesh, n_coarse=n_coarse, seed=seed), k=k))
 
 
-def _both(shape, template, options, both):
+def _match_both(shape, template, options, both):
+    """The shape registered to the template and, with `both`, the template to the shape."""
     with threadpool_limits(1):
         forth = match_shapes(shape, template, **options)[0]
         return forth, match_shapes(template, shape, **options)[0] if both else None
 
 
 def register_pairs(
-    template,
-    shapes,
+    template: xr.Dataset,
+    shapes: dict[str, xr.Dataset],
     *,
-    name="template",
-    both=True,
-    n_coarse=6000,
-    k_init=20,
-    k=100,
-    init="dense",
-    n_jobs=None,
-    seed=0,
-):
-    """The template registered to each shape on its own (6.2, the first way).
-
-    A study for transfer, without statistics.
+    name: str = "template",
+    both: bool = True,
+    n_coarse: int = N_COARSE,
+    k_init: int = 20,
+    k: int = 100,
+    init: str = "dense",
+    n_jobs: int | None = None,
+    seed: int = 0,
+) -> xr.DataTree:
+    """The template registered to each shape on its own (6.2, the first way): a study for transfer.
 
     Parameters
     ----------
@@ -112,7 +109,8 @@ def register_pairs(
     --------
     >>> import s4a
     >>> brains = s4a.synthetic.brains(6, 200)
-    >>> source, target = (brains[f"original/{name}"].to_dataset() for name in ("brain_01", "brain_02"))
+    >>> source = brains["original/brain_01"].to_dataset()
+    >>> target = brains["original/brain_02"].to_dataset()
     >>> pairs = s4a.register_pairs(source, {"brain_02": target}, n_coarse=100, k_init=6, k=10)
     >>> s4a.transfer_labels(pairs, source["label"].values)["brain_02"]["label"].sizes["vertex"]
     200
@@ -121,47 +119,57 @@ def register_pairs(
         raise ValueError(
             f"shapes other than the template, {name!r}, needed; found {', '.join(shapes) or 'none'}"
         )
-    for what, mesh in {name: template, **shapes}.items():
+    meshes = {name: template, **shapes}
+    for what, mesh in meshes.items():
         require(mesh, "position", "corner_vertex", what=f"mesh {what}")
-    low = Parallel(n_jobs=n_jobs)(
-        delayed(_low)(m, n_coarse, seed, k) for m in (template, *shapes.values())
-    )
+    parallel = Parallel(n_jobs=n_jobs)
+    inside, *others = parallel(delayed(_shape_of)(mesh, n_coarse, k, seed) for mesh in meshes.values())
     options = {"k_init": k_init, "k": k, "init": init}
-    found = Parallel(n_jobs=n_jobs)(
-        delayed(_both)(shape, low[0], options, both) for shape in low[1:]
-    )
-    forth, back = ({n: pair[i] for n, pair in zip(shapes, found, strict=True)} for i in (0, 1))
-    return _tree(name, template, shapes, forth, back if both else {})
+    pairs = parallel(delayed(_match_both)(shape, inside, options, both) for shape in others)
+    forth = {n: pair[0] for n, pair in zip(shapes, pairs, strict=True)}
+    back = {n: pair[1] for n, pair in zip(shapes, pairs, strict=True)} if both else {}
+    return _study_of(name, template, shapes, forth, back)
 
 
-def _links(study, name):
-    """The template and a shape.
+def _routes(study: xr.DataTree, name: str) -> tuple[list[Route], list[Route]]:
+    """Routes from the template down to a shape, and from the shape up to it.
 
-    Steps down, and steps up, one of each or (matched both ways) two.
+    One each way, or two where the pair was matched both ways.
     """
-    template = study["registration"].attrs["template"]
-    meshes = [study["original"][n].to_dataset() for n in (template, name)]
-    registered = study["registration"].to_dataset().sel(shape=name)
-    forth = link(*meshes, registered.merge(study["registration"][name].to_dataset(inherit=False)))
-    down, up = [(forth, "down")], [(forth, "up")]
+    registration = study["registration"].to_dataset()
+    template = registration.attrs["template"]
+    if name == template:
+        return [[]], [[]]
+    mesh = study["original"][template].to_dataset()
+    shape = study["original"][name].to_dataset()
+    places = study["registration"][name].to_dataset(inherit=False)
+    forth = link(mesh, shape, registration.sel(shape=name).merge(places))
+    down: list[Route] = [[(forth, "down")]]
+    up: list[Route] = [[(forth, "up")]]
     if "reverse" in study.children and name in study["reverse"].children:
-        back = link(*meshes[::-1], study["reverse"][name].to_dataset())
-        down, up = [*down, (back, "up")], [*up, (back, "down")]
+        back = link(shape, mesh, study["reverse"][name].to_dataset())
+        down.append([(back, "up")])
+        up.append([(back, "down")])
     return down, up
 
 
-def _entrance(study, mesh):
-    """Steps from an external mesh to the study's template, matched both ways."""
-    template = study["registration"].attrs["template"]
-    coarse = study["coarse"][template].to_dataset().load()
-    low = Shape(study["original"][template].to_dataset().load(), coarse)
-    k = coarse.sizes["mode"]
-    outside = _low(mesh, 6000, 0, k)
-    forth, back = _both(low, outside, {"k_init": min(20, k), "k": k}, True)
-    return [(link(mesh, low.original, forth), "down"), (link(low.original, mesh, back), "up")]
+def _routes_from_outside(study: xr.DataTree, mesh: xr.Dataset) -> list[Route]:
+    """Routes from an external mesh to the study's template, matched both ways."""
+    name = study["registration"].attrs["template"]
+    template = study["original"][name].to_dataset().load()
+    inside = Shape(template, study["coarse"][name].to_dataset().load())
+    k = inside.low.k
+    outside = _shape_of(mesh, N_COARSE, k, 0)
+    forth, back = _match_both(inside, outside, {"k_init": min(20, k), "k": k}, True)
+    return [[(link(mesh, template, forth), "down")], [(link(template, mesh, back), "up")]]
 
 
-def plan(study, source, targets):
+Targets = Iterator[tuple[str, xr.Dataset, list[Route]]]
+
+
+def plan(
+    study: xr.DataTree, source: str | xr.Dataset | None, targets: list[str] | None
+) -> tuple[xr.Dataset, Targets]:
     """The mesh where the transfer begins, and an iterator of (target, its mesh, routes to it).
 
     Raises
@@ -169,40 +177,40 @@ def plan(study, source, targets):
     ValueError
         When the study has no registration, or a shape is not in it.
     """
-    if "registration" not in study:
-        raise ValueError(
-            f"a registered study is needed; this one has {', '.join(study.children) or 'no nodes'}"
-        )
-    template = study["registration"].attrs["template"]
-    names = study["registration"]["shape"].values.tolist()
+    registration = registration_of(study)
+    template = registration.attrs["template"]
+    names = registration["shape"].values.tolist()
     source = template if source is None else source
     external = isinstance(source, xr.Dataset)
     targets = [n for n in names if external or n != source] if targets is None else list(targets)
-    wrong = [
-        n
-        for n in [*targets, *([] if external or source == template else [source])]
-        if n not in names
-    ]
+    asked = targets if external or source == template else [*targets, source]
+    wrong = [n for n in asked if n not in names]
     if wrong:
         raise ValueError(
             f"no shape {', '.join(map(repr, wrong))} in the study; it has {', '.join(names)}"
         )
-    if external:
+    if isinstance(source, xr.Dataset):
         require(source, "position", "corner_vertex", what="source")
-        first = _entrance(study, source)
+        mesh, first = source, _routes_from_outside(study, source)
     else:
-        first = [] if source == template else _links(study, source)[1]
+        mesh, first = study["original"][source].to_dataset(), _routes(study, source)[1]
 
     def each():
         for name in targets:
-            last = [] if name == template else _links(study, name)[0]
-            routes = [[a, b] for a in first for b in last] or [[step] for step in (first or last)]
-            yield name, study["original"][name].to_dataset(), routes
+            last, _ = _routes(study, name)
+            yield name, study["original"][name].to_dataset(), [a + b for a in first for b in last]
 
-    return source if external else study["original"][source].to_dataset(), each()
+    return mesh, each()
 
 
-def transfer_labels(study, label, *, source=None, targets=None, votes=False):
+def transfer_labels(
+    study: xr.DataTree,
+    label: np.ndarray,
+    *,
+    source: str | xr.Dataset | None = None,
+    targets: list[str] | None = None,
+    votes: bool = False,
+) -> xr.DataTree:
     """Labels of one mesh on every shape of a registered study (6.2, Fig. 6).
 
     Parameters
@@ -238,30 +246,33 @@ def transfer_labels(study, label, *, source=None, targets=None, votes=False):
 
     >>> import s4a
     >>> study = s4a.synthetic.example_study()
-    >>> given, true = (study[f"original/{name}/label"].values for name in ("brain_01", "brain_02"))
-    >>> carried = s4a.transfer_labels(study, given, source="brain_01", targets=["brain_02"])
+    >>> label, true = (study[f"original/{name}/label"].values for name in ("brain_01", "brain_02"))
+    >>> carried = s4a.transfer_labels(study, label, source="brain_01", targets=["brain_02"])
     >>> bool((carried["brain_02/label"].values == true).mean() > 0.5)
     True
     """
     mesh, each = plan(study, source, targets)
     label = _per_vertex(label, mesh, "label")
-    found = {}
+    carried = {}
     for name, _, routes in each:
-        W, confidence = (
-            blended(routes) if routes else (sp.identity(len(label)), np.ones(len(label)))
-        )
+        W, confidence = blend_routes(routes, len(label))
         winner, vote, value = elect(W, label)
-        found[name] = dataset(
+        carried[name] = dataset(
             label=winner, label_share=vote.max(1), confidence=confidence.astype(np.float32)
         )
         if votes:
-            found[name] = (
-                found[name].merge(dataset(label_vote=vote)).assign_coords(label_value=value)
-            )
-    return xr.DataTree.from_dict(found)
+            shares = dataset(label_vote=vote)
+            carried[name] = carried[name].merge(shares).assign_coords(label_value=value)
+    return xr.DataTree.from_dict(carried)
 
 
-def transfer_scalars(study, field, *, source=None, targets=None):
+def transfer_scalars(
+    study: xr.DataTree,
+    field: np.ndarray,
+    *,
+    source: str | xr.Dataset | None = None,
+    targets: list[str] | None = None,
+) -> xr.DataTree:
     """A scalar field of one mesh on every shape of a registered study, linear inside triangles.
 
     Parameters
@@ -290,33 +301,35 @@ def transfer_scalars(study, field, *, source=None, targets=None):
     mesh, each = plan(study, source, targets)
     field = _per_vertex(field, mesh, "field").astype(float)
     known = np.isfinite(field).astype(float)
-    found = {}
+    carried = {}
     for name, _, routes in each:
-        W, confidence = (
-            blended(routes) if routes else (sp.identity(len(field)), np.ones(len(field)))
-        )
-        weight = W @ known
-        value = np.where(
-            weight >= 0.5, W @ np.nan_to_num(field) / np.maximum(weight, 1e-12), np.nan
-        )
-        found[name] = dataset(field=value, confidence=confidence.astype(np.float32))
-    return xr.DataTree.from_dict(found)
+        W, confidence = blend_routes(routes, len(field))
+        weight = W @ known  # of the corners that are not NaN
+        value = W @ np.nan_to_num(field) / np.maximum(weight, 1e-12)
+        value[weight < 0.5] = np.nan
+        carried[name] = dataset(field=value, confidence=confidence.astype(np.float32))
+    return xr.DataTree.from_dict(carried)
 
 
 def _per_vertex(values, mesh, what):
     values = np.asarray(values)
     if values.shape != (mesh.sizes["vertex"],):
         raise ValueError(
-            f"{what} needs one value for each of the {mesh.sizes['vertex']} vertices of the source, "
-            f"found shape {values.shape}"
+            f"{what} needs one value for each of the {mesh.sizes['vertex']} vertices of the "
+            f"source, found shape {values.shape}"
         )
     return values
 
 
-def transfer_landmarks(study, landmarks, *, source=None, targets=None, farthest=FARTHEST_LANDMARK):
-    """Landmarks of one mesh on every shape of a registered study.
-
-    At points inside triangles (6.2, Fig. 7).
+def transfer_landmarks(
+    study: xr.DataTree,
+    landmarks: xr.Dataset,
+    *,
+    source: str | xr.Dataset | None = None,
+    targets: list[str] | None = None,
+    farthest: float = FARTHEST_LANDMARK,
+) -> xr.DataTree:
+    """Landmarks of one mesh on every shape of a registered study, inside triangles (6.2, Fig. 7).
 
     Where the landmarks have curves (``landmark_curve``, see
     :func:`s4a.input.annotations.read_landmarks`), points in between are added along the surface of
@@ -357,26 +370,31 @@ def transfer_landmarks(study, landmarks, *, source=None, targets=None, farthest=
     marked = locate(landmarks, mesh, farthest=farthest)
     if "landmark_curve" in landmarks:
         marked = traced(marked, mesh)
-    start = marked["landmark_triangle"].values, marked["landmark_barycentric"].values
-    found = {}
+    names = {name: marked[name].values for name in NAMED if name in marked}
+    carried = {}
     for name, target, routes in each:
-        X, T = as_arrays(target)
-        ends = [point_along(route, *start) for route in routes or [[]]]
-        points = np.stack([interpolate(X, T, triangle, weights) for triangle, weights, _ in ends])
-        confidence = np.stack([c for *_, c in ends])
-        mean = (
-            np.einsum("rp,rpx->px", confidence + 1e-9, points) / (confidence + 1e-9).sum(0)[:, None]
-        )
-        triangle, weights = closest_point(mean, X, T) if len(ends) > 1 else ends[0][:2]
-        found[name] = dataset(
-            **{v: marked[v].values for v in NAMED if v in marked},
-            landmark_position=interpolate(X, T, triangle, weights),
-            landmark_triangle=triangle.astype(np.int32),
-            landmark_barycentric=weights,
-            landmark_confidence=confidence.mean(0),
-        )
-        if len(ends) > 1:
-            found[name] = found[name].merge(
-                dataset(landmark_spread=np.linalg.norm(points - mean, axis=2).max(0))
-            )
-    return xr.DataTree.from_dict(found)
+        carried[name] = _carry_landmarks(marked, target, routes).assign(dataset(**names))
+    return xr.DataTree.from_dict(carried)
+
+
+def _carry_landmarks(marked, target, routes):
+    """Landmarks at the mean of where the routes lead, weighted by confidence, on the surface."""
+    X, T = as_arrays(target)
+    start = marked["landmark_triangle"].values, marked["landmark_barycentric"].values
+    ends = [carry_along(route, *start) for route in routes]
+    confidence = np.stack([own for *_, own in ends])  # (routes, p)
+    triangle, weights, _ = ends[0]
+    spread = {}
+    if len(ends) > 1:
+        points = np.stack([interpolate(X, T, *place) for *place, _ in ends])  # (routes, p, 3)
+        share = confidence + 1e-9
+        mean = np.einsum("rp,rpx->px", share, points) / share.sum(0)[:, None]
+        triangle, weights = closest_point(mean, X, T)
+        spread["landmark_spread"] = np.linalg.norm(points - mean, axis=2).max(0)
+    return dataset(
+        landmark_position=interpolate(X, T, triangle, weights),
+        landmark_triangle=triangle.astype(np.int32),
+        landmark_barycentric=weights,
+        landmark_confidence=confidence.mean(0),
+        **spread,
+    )
