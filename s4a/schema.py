@@ -17,8 +17,8 @@ ONE = "1"
 SHARE = "share of sqrt(area)"
 UNIT_AREA = "1, for the surface scaled to unit area"
 
-# A new variable is a new row, with its step: name: (dims, unit, long_name).  In the file of a single
-# shape a leading dim `shape` is absent.
+# name: (dims, unit, long_name).  A new variable is a new row, beside those of its step.  In the
+# file of a single shape a leading dim `shape` is absent.
 # fmt: off
 ROWS = {
     # a mesh, original or coarse

@@ -1,14 +1,15 @@
-"""Registered collections for other programs.
-
-Meshes of one connectivity, tables, and training sets (4.3, 6.1, 6.2).
-"""
+"""Registered collections for other programs (4.3, 6.1, 6.2): meshes, tables and training sets."""
 
 import csv
 import json
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
+import xarray as xr
 
+from s4a.analysis.inputs import registration_of
+from s4a.analysis.link import image_in_shape
 from s4a.analysis.transfer import transfer_labels, transfer_landmarks
 from s4a.geometry.mesh import as_arrays
 from s4a.input.annotations import write_landmarks
@@ -18,20 +19,21 @@ from s4a.study import store
 FORMATS = {"ply": ".ply", "vtk": ".vtk", "obj": ".obj", "npz": ".npz", "gifti": ".gii"}
 
 
-def registered_positions(study, name, *, frame="template"):
-    """Vertices of the template's mesh on one shape ``(n, 3)``.
-
-    Aligned to the template or where the shape's file is.
-    """
-    one = study["registration"].to_dataset().sel(shape=name)
-    X = one["position"].values + one["displacement"].values
-    if frame == "template":
-        return X
-    R, t, s = (one[v].values for v in ("rotation", "translation", "scale"))
-    return (X - t) @ R / s
+def write_table(path: Path, head: Iterable, rows: Iterable) -> Path:
+    """Write a CSV; gives its path."""
+    with open(path, "w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows([list(head), *rows])
+    return path
 
 
-def write_registered(study, folder, *, format="ply", frame="template", n_modes=3):
+def write_registered(
+    study: xr.DataTree,
+    folder: Path | str,
+    *,
+    format: str = "ply",
+    frame: str = "template",
+    n_modes: int = 3,
+) -> list[Path]:
     """Write every shape with the template's triangles, and the scores and modes.
 
     Vertex i is the same place on every shape, as ShapeWorks, Scalismo and geomorph want it.
@@ -80,26 +82,25 @@ def write_registered(study, folder, *, format="ply", frame="template", n_modes=3
         raise ValueError(
             f"format must be one of {legal}, frame template or shape; found {format!r}, {frame!r}"
         )
-    if "registration" not in study:
-        raise ValueError(
-            f"a registered study is needed; this one has {', '.join(study.children) or 'no nodes'}"
-        )
-    data, folder = study["registration"].to_dataset(), Path(folder)
-    names = data["shape"].values.tolist()
+    registration = registration_of(study)
+    names = registration["shape"].values.tolist()
     if "template" in names:
         raise ValueError(
             "shapes need names other than 'template', which is the file of the template's mesh"
         )
+    folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    X, T = as_arrays(data)
+    suffix = FORMATS[format]
+    X, T = as_arrays(registration)
     paths = []
     for name in names:
-        paths.append(folder / f"{name}{FORMATS[format]}")
-        scalars = (
-            {} if format == "obj" else {"confidence": data["confidence"].sel(shape=name).values}
-        )
-        write_mesh(paths[-1], registered_positions(study, name, frame=frame), T, **scalars)
-    paths.append(folder / f"template{FORMATS[format]}")
+        own = registration.sel(shape=name)
+        in_template = X + own["displacement"].values
+        points = in_template if frame == "template" else image_in_shape(X, own)
+        scalars = {} if format == "obj" else {"confidence": own["confidence"].values}
+        paths.append(folder / f"{name}{suffix}")
+        write_mesh(paths[-1], points, T, **scalars)
+    paths.append(folder / f"template{suffix}")
     write_mesh(paths[-1], X, T)
     return paths + (
         _write_modes(study["pca"].to_dataset(), folder, n_modes) if "pca" in study else []
@@ -107,33 +108,41 @@ def write_registered(study, folder, *, format="ply", frame="template", n_modes=3
 
 
 def _write_modes(pca, folder, n_modes):
+    """The tables of scores, components and the first modes, and all modes as netCDF."""
     components = range(1, pca.sizes["component"] + 1)
-    pairs = zip(pca["shape"].values.tolist(), pca["score"].values.tolist(), strict=True)
-    score = [[name, *row] for name, row in pairs]
-    names = ["standard_deviation", "explained_variance_ratio"]
-    share = [
-        [c, *row]
-        for c, row in zip(components, np.stack([pca[n] for n in names], 1).tolist(), strict=True)
+    measures = ["standard_deviation", "explained_variance_ratio"]
+    scores = zip(pca["shape"].values.tolist(), pca["score"].values.tolist(), strict=True)
+    columns = (pca[name].values.tolist() for name in measures)
+    paths = [
+        write_table(
+            folder / "scores.csv",
+            ["shape", *(f"component_{c}" for c in components)],
+            ([name, *row] for name, row in scores),
+        ),
+        write_table(
+            folder / "components.csv",
+            ["component", *measures],
+            zip(components, *columns, strict=True),
+        ),
     ]
-    tables = {"scores": (["shape", *(f"component_{c}" for c in components)], score)}
-    tables["components"] = (["component", *names], share)
-    tables |= {
-        f"mode_{c}": ("xyz", pca["deformation"].values[c - 1].tolist())
-        for c in components[:n_modes]
-    }
-    for name, (head, rows) in tables.items():
-        with open(folder / f"{name}.csv", "w", newline="", encoding="utf-8") as file:
-            csv.writer(file).writerows([list(head), *rows])
+    for c in components[:n_modes]:
+        mode = pca["deformation"].values[c - 1].tolist()
+        paths.append(write_table(folder / f"mode_{c}.csv", "xyz", mode))
     store.write(pca.load(), folder / "modes.nc")
-    return [*(folder / f"{name}.csv" for name in tables), folder / "modes.nc"]
+    return [*paths, folder / "modes.nc"]
 
 
 def write_training_set(
-    study, folder, *, label=None, landmarks=None, source=None, test_share=0.2, seed=0
-):
-    """Write a training set for learners of segmentations and key-points.
-
-    Meshes, labels, landmarks, split.
+    study: xr.DataTree,
+    folder: Path | str,
+    *,
+    label: np.ndarray | None = None,
+    landmarks: xr.Dataset | None = None,
+    source: str | xr.Dataset | None = None,
+    test_share: float = 0.2,
+    seed: int = 0,
+) -> dict[str, list[str]]:
+    """Write a training set for learners of segmentations and key-points, with its split.
 
     Parameters
     ----------
@@ -180,30 +189,27 @@ def write_training_set(
     n_test = int(np.ceil(test_share * len(names)))
     if not 0 < n_test < len(names):
         raise ValueError(
-            f"test_share needs a share of {len(names)} shapes that leaves some on both sides: {test_share}"
+            f"test_share needs a share of {len(names)} shapes that leaves some on both sides: "
+            f"{test_share}"
         )
-    marked = None if label is None else transfer_labels(study, label, source=source, targets=names)
-    placed = (
-        None
-        if landmarks is None
-        else transfer_landmarks(study, landmarks, source=source, targets=names)
-    )
-    for part, wanted in (("meshes", True), ("labels", marked), ("landmarks", placed)):
-        if wanted is not None:
-            (folder / part).mkdir(parents=True, exist_ok=True)
+    where = {"source": source, "targets": names}
+    carried = {}  # before anything is written: it may fail
+    if label is not None:
+        carried["labels"] = transfer_labels(study, label, **where)
+    if landmarks is not None:
+        carried["landmarks"] = transfer_landmarks(study, landmarks, **where)
+    for part in ("meshes", *carried):
+        (folder / part).mkdir(parents=True, exist_ok=True)
     for name in names:
-        write_mesh(
-            folder / "meshes" / f"{name}.ply", *as_arrays(study["original"][name].to_dataset())
-        )
-        if marked is not None:
-            one = marked[name]
-            np.save(folder / "labels" / f"{name}.npy", one["label"].values)
-            np.save(
-                folder / "labels" / f"{name}.confidence.npy",
-                (one["label_share"] * one["confidence"]).values,
-            )
-        if placed is not None:
-            write_landmarks(folder / "landmarks" / f"{name}.csv", placed[name])
+        mesh = study["original"][name].to_dataset()
+        write_mesh(folder / "meshes" / f"{name}.ply", *as_arrays(mesh))
+        if "labels" in carried:
+            own = carried["labels"][name].to_dataset()
+            sure = own["label_share"] * own["confidence"]
+            np.save(folder / "labels" / f"{name}.npy", own["label"].values)
+            np.save(folder / "labels" / f"{name}.confidence.npy", sure.values)
+        if "landmarks" in carried:
+            write_landmarks(folder / "landmarks" / f"{name}.csv", carried["landmarks"][name])
     order = np.random.default_rng(seed).permutation(len(names))
     split = {
         "train": sorted(names[i] for i in order[n_test:]),
@@ -213,14 +219,12 @@ def write_training_set(
     return split
 
 
-def write_results(found, folder, name):
-    """Write a Dataset of :mod:`s4a.analysis.statistics` as netCDF.
-
-    And a CSV for each of its one-dimensional tables.
+def write_results(result: xr.Dataset, folder: Path | str, name: str) -> list[Path]:
+    """Write a Dataset of :mod:`s4a.analysis.statistics` as netCDF, and its columns as CSV.
 
     Parameters
     ----------
-    found : Dataset
+    result : Dataset
     folder : path
         Made where it is missing.
     name : str
@@ -237,28 +241,32 @@ def write_results(found, folder, name):
     >>> import tempfile
     >>> from s4a.analysis.export import write_results
     >>> from s4a.schema import dataset
-    >>> paths = write_results(dataset(p_value=0.5, outlier=[True, False]), tempfile.mkdtemp(), "test")
+    >>> result = dataset(p_value=0.5, outlier=[True, False])
+    >>> paths = write_results(result, tempfile.mkdtemp(), "test")
     >>> [path.name for path in paths], paths[2].read_text().split()
     (['test.nc', 'test.csv', 'test.shape.csv'], ['shape,outlier', '0,True', '1,False'])
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"{name}.nc"]
-    store.write(found, paths[0])
-    tables = {}
-    for variable, values in found.data_vars.items():
+    store.write(result, paths[0])
+    tables = {}  # dims -> columns
+    for variable, values in result.data_vars.items():
         if values.ndim < 2:
-            tables.setdefault(values.dims, {})[variable] = np.atleast_1d(values.values)
+            tables.setdefault(values.dims, {})[variable] = np.atleast_1d(values.values).tolist()
     for dims, columns in sorted(tables.items(), key=lambda item: item[0]):
-        paths.append(folder / f"{'.'.join([name, *dims])}.csv")
-        rows = list(zip(*(values.tolist() for values in columns.values()), strict=True))
+        rows = zip(*columns.values(), strict=True)
         if dims:
-            index = (
-                found[dims[0]].values.tolist()
-                if dims[0] in found.coords
-                else range(dims[0] == "component", len(rows) + 1)
-            )
-            rows = [(i, *row) for i, row in zip(index, rows, strict=False)]
-        with open(paths[-1], "w", newline="", encoding="utf-8") as file:
-            csv.writer(file).writerows([[*dims, *columns], *rows])
+            rows = zip(_index_of(result, dims[0]), *columns.values(), strict=True)
+        paths.append(
+            write_table(folder / f"{'.'.join([name, *dims])}.csv", [*dims, *columns], rows)
+        )
     return paths
+
+
+def _index_of(result, dim):
+    """Names along a dim, or numbers: components count from 1, all else from 0."""
+    if dim in result.coords:
+        return result[dim].values.tolist()
+    start = int(dim == "component")
+    return range(start, start + result.sizes[dim])

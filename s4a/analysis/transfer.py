@@ -12,7 +12,7 @@ from joblib import Parallel, delayed
 from threadpoolctl import threadpool_limits
 
 from s4a.analysis.inputs import registration_of
-from s4a.analysis.landmarks import FARTHEST_LANDMARK, NAMED, locate, traced
+from s4a.analysis.landmarks import FARTHEST_LANDMARK, NAMED, locate, trace_curves
 from s4a.analysis.link import Route, blend_routes, carry_along, elect, link
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays
@@ -123,7 +123,9 @@ def register_pairs(
     for what, mesh in meshes.items():
         require(mesh, "position", "corner_vertex", what=f"mesh {what}")
     parallel = Parallel(n_jobs=n_jobs)
-    inside, *others = parallel(delayed(_shape_of)(mesh, n_coarse, k, seed) for mesh in meshes.values())
+    inside, *others = parallel(
+        delayed(_shape_of)(mesh, n_coarse, k, seed) for mesh in meshes.values()
+    )
     options = {"k_init": k_init, "k": k, "init": init}
     pairs = parallel(delayed(_match_both)(shape, inside, options, both) for shape in others)
     forth = {n: pair[0] for n, pair in zip(shapes, pairs, strict=True)}
@@ -142,7 +144,7 @@ def _routes(study: xr.DataTree, name: str) -> tuple[list[Route], list[Route]]:
         return [[]], [[]]
     mesh = study["original"][template].to_dataset()
     shape = study["original"][name].to_dataset()
-    places = study["registration"][name].to_dataset(inherit=False)
+    places = study["registration"].children[name].to_dataset(inherit=False)
     forth = link(mesh, shape, registration.sel(shape=name).merge(places))
     down: list[Route] = [[(forth, "down")]]
     up: list[Route] = [[(forth, "up")]]
@@ -369,11 +371,11 @@ def transfer_landmarks(
     mesh, each = plan(study, source, targets)
     marked = locate(landmarks, mesh, farthest=farthest)
     if "landmark_curve" in landmarks:
-        marked = traced(marked, mesh)
-    names = {name: marked[name].values for name in NAMED if name in marked}
+        marked = trace_curves(marked, mesh)
+    named = marked[[name for name in NAMED if name in marked]]
     carried = {}
     for name, target, routes in each:
-        carried[name] = _carry_landmarks(marked, target, routes).assign(dataset(**names))
+        carried[name] = _carry_landmarks(marked, target, routes).merge(named)
     return xr.DataTree.from_dict(carried)
 
 
