@@ -3,25 +3,39 @@
 from pathlib import Path
 
 import numpy as np
+import xarray as xr
+from markupsafe import Markup
 
-from s4a.show import charts, markup
+from s4a.method.pca import color_limits
+from s4a.show import charts
+from s4a.show.browser import MODES, PARTS, TEMPLATES, look_state, mesh_state, webp_uri
 from s4a.show.draw import SIGNED, opposite, position_colors, ramp_colors, render
-from s4a.show.live import modes_html
-from s4a.show.pictures import (
-    N_MODES,
-    PANEL,
-    SIGMA,
-    aligned,
+from s4a.show.pictures import N_MODES, PANEL, SIGMA, mode_drawer, shared_frames
+from s4a.show.surfaces import (
+    attribute,
     carried_colors,
     has,
     mesh_of,
-    mode_drawer,
+    mode_arrays,
     names_of,
-    shared_frames,
+    network_places,
+    score_state,
+    surface,
+    template_coarse,
 )
 
+LARGE = 20_000  # vertices from which a page moves the low-resolution mesh
+N_CARRIED = 5  # shapes to which the template's colours are carried
 
-def write_page(study, path, *, title="Shape study", view="corner", up="z"):
+
+def write_page(
+    study: xr.DataTree,
+    path: Path | str,
+    *,
+    title: str = "Shape study",
+    view: str | tuple[float, float] = "corner",
+    up: str = "z",
+) -> Path:
     """Write a study as one HTML page, which needs no network and no other file.
 
     What the run has not computed is said in its place and the rest is shown.
@@ -50,28 +64,29 @@ def write_page(study, path, *, title="Shape study", view="corner", up="z"):
     'empty.html'
     """
     path = Path(path)
-    path.write_text(page(study, title=title, view=view, up=up), encoding="utf-8")
+    path.write_text(study_html(study, title=title, view=view, up=up), encoding="utf-8")
     return path
 
 
-def page(study, *, title="Shape study", view="corner", up="z"):
-    """The HTML of a study, as a str; see :func:`write_page`."""
-    look = {"view": view, "up": up}
+def study_html(
+    study: xr.DataTree,
+    *,
+    title: str = "Shape study",
+    view: str | tuple[float, float] = "corner",
+    up: str = "z",
+) -> str:
+    """The HTML of a study; see :func:`write_page`."""
     sections = []
-    for heading, needs, show in SECTIONS:
+    for heading, needs, section in SECTIONS:
         lacking = [name for name in needs if not has(study, name)]
-        reason = (
-            _attr(study, "report", "no_modes")
-            if any(name.startswith("pca/") for name in lacking)
-            else ""
-        )
-        body = markup.missing(lacking, reason) if lacking else show(study, look)
-        sections.append(f"<section><h2>{heading}</h2>\n{body}</section>")
-    return markup.document(title, _summary(study), sections)
-
-
-def _attr(study, node, name):
-    return str(study[node].attrs.get(name, "")) if node in study.children else ""
+        if lacking:
+            modes_lack = any(name.startswith("pca/") for name in lacking)
+            reason = attribute(study, "report", "no_modes") if modes_lack else ""
+            sections.append((heading, PARTS.missing(lacking, reason)))
+        else:
+            sections.append((heading, section(study, {"view": view, "up": up})))
+    template = TEMPLATES.get_template("study.html")
+    return template.render(title=title, summary=_summary(study), sections=sections)
 
 
 def _index(names, name):
@@ -82,193 +97,183 @@ def _index(names, name):
 
 
 def _summary(study):
-    parts = []
+    facts = []
     if has(study, "report/status"):
         status = study["report"]["status"].values.astype(str)
-        parts.append(
-            f"{len(status)} shapes, {(status == 'repaired').sum()} repaired, {(status == 'excluded').sum()} excluded"
-        )
-    parts += [
-        f"{key} {_attr(study, *where)}" for key, where in _MARKS.items() if _attr(study, *where)
-    ]
+        repaired, excluded = (status == "repaired").sum(), (status == "excluded").sum()
+        facts.append(f"{len(status)} shapes, {repaired} repaired, {excluded} excluded")
+    for node, key in (("latent", "median"), ("registration", "template")):
+        if name := attribute(study, node, key):
+            facts.append(f"{key} {name}")
     if has(study, "pca/explained_variance_ratio"):
         ratio = study["pca"]["explained_variance_ratio"].values[:N_MODES]
-        parts.append(f"the first {len(ratio)} components hold {ratio.sum():.0%} of the variance")
+        facts.append(f"the first {len(ratio)} components hold {ratio.sum():.0%} of the variance")
     if has(study, "report/seconds"):
-        parts.append(f"{study['report']['seconds'].values.sum():.0f} s of computing")
-    return "; ".join(parts) + "." if parts else "The study is empty."
-
-
-_MARKS = {"median": ("latent", "median"), "template": ("registration", "template")}
+        facts.append(f"{study['report']['seconds'].values.sum():.0f} s of computing")
+    return "; ".join(facts) + "." if facts else "The study is empty."
 
 
 def _shapes(study, look):
     report = study["report"].dataset
-    names = names_of(report)
     status = report["status"].values.astype(str)
-    columns = [
+    texts = [
         key
         for key in ("reason", "warning", "path")
         if key in report and (report[key].values != "").any()
     ]
+    meshes = study["original"].children if has(study, "original") else {}
     rows = []
-    for i, name in enumerate(names):
-        mesh = (
-            study["original"][name]
-            if has(study, "original") and name in study["original"].children
-            else None
-        )
-        size = [mesh.sizes["vertex"], mesh.sizes["triangle"]] if mesh is not None else ["", ""]
-        rows.append([name, status[i], *size, *(report[key].values[i] for key in columns)])
-    return markup.table(["shape", "status", "vertices", "triangles", *columns], rows, status)
+    for i, name in enumerate(names_of(report)):
+        size = ["", ""]
+        if name in meshes:
+            size = [meshes[name].sizes["vertex"], meshes[name].sizes["triangle"]]
+        rows.append([name, status[i], *size, *(report[key].values[i] for key in texts)])
+    return PARTS.table(["shape", "status", "vertices", "triangles", *texts], rows, status.tolist())
 
 
 def _gallery(study, look):
-    nodes = study["coarse"].children
-    meshes = {name: mesh_of(node) for name, node in nodes.items()}
-    meshes = {name: (aligned(study, name, X), T) for name, (X, T) in meshes.items()}
-    frames = shared_frames([X for X, _ in meshes.values()], look)
-    median = _attr(study, "latent", "median")
-    figures = [
-        markup.picture(
-            render(X, T, size=(150, 130), frame=frame, **look),
-            f"{name}, the median" if name == median else name,
-            marked=name == median,
-        )
-        for (name, (X, T)), frame in zip(meshes.items(), frames, strict=True)
-    ]
-    return markup.note("The low-resolution meshes, all at one scale.") + markup.grid(
-        figures, "gallery"
-    )
-
-
-def _stage(pairs, dim):
-    """When a map was made, and its size."""
-    when = "before" if dim.endswith("initial") else "after"
-    return f"{when} Consistent ZoomOut" + (
-        f", {pairs.sizes[dim]} modes" if dim in pairs.sizes else ""
-    )
+    names = list(study["coarse"].children)
+    meshes = [surface(study, name) for name in names]
+    frames = shared_frames([X for X, _ in meshes], look)
+    median = attribute(study, "latent", "median")
+    figures = []
+    for name, (X, T), frame in zip(names, meshes, frames, strict=True):
+        pixels = render(X, T, size=(150, 130), frame=frame, **look)
+        caption = f"{name}, the median" if name == median else name
+        figures.append(PARTS.picture(pixels, caption, name == median))
+    note = PARTS.note("The low-resolution meshes, all at one scale.")
+    return note + PARTS.grid(figures, "gallery")
 
 
 def _network(study, look):
     pairs = study["network"].dataset
     source, target = (pairs[key].values.astype(str) for key in ("source", "target"))
-    names = list(np.unique(np.r_[source, target]))
-    scores = study["latent"].dataset.get("area_score") if "latent" in study.children else None
-    usable = (
-        scores is not None
-        and scores.sizes["difference_component"] > 1
-        and set(names) <= set(names_of(scores))
-    )
-    places = scores.sel(shape=names).values[:, :2] if usable else charts.on_circle(len(names))
-    where = (
-        "placed by the first two components of their area-based shape differences"
-        if usable
-        else "on a circle"
-    )
-    kinds = {"cycle_error_initial": "before", "cycle_error": "after"}
-    errors = {
-        f"{when} Consistent ZoomOut": pairs[key].values
-        for key, when in kinds.items()
-        if key in pairs
-    }
-    figure = charts.network(
-        places,
-        names,
-        np.searchsorted(names, source),
-        np.searchsorted(names, target),
-        errors,
-        _index(names, _attr(study, "latent", "median")),
-    )
+    names = np.unique(np.r_[source, target]).tolist()
+    places = network_places(study, names)
+    where = "placed by the first two components of their area-based shape differences"
+    if places is None:
+        places, where = charts.on_circle(len(names)), "on a circle"
+    errors = {}
+    for key, when in (("cycle_error_initial", "before"), ("cycle_error", "after")):
+        if key in pairs:
+            errors[f"{when} Consistent ZoomOut"] = pairs[key].values
+    ends = np.searchsorted(names, source), np.searchsorted(names, target)
+    median = _index(names, attribute(study, "latent", "median"))
+    figure = charts.network(places, names, *ends, errors, median)
     note = f"{len(source)} maps among {len(names)} shapes, {where}; the median is circled. "
     note += "Both errors are of the first modes, as many as the maps had before."
-    return markup.note(note) + markup.chart(figure, "the network of maps, coloured by cycle error")
+    return PARTS.note(note) + PARTS.drawing(figure, "the network of maps, coloured by cycle error")
 
 
 def _maps(study, look):
     pairs = study["network"].dataset
-    order = (
-        np.argsort(pairs["cycle_error"].values)
-        if "cycle_error" in pairs
-        else np.arange(pairs.sizes["pair"])
-    )
+    order = np.arange(pairs.sizes["pair"])
+    if "cycle_error" in pairs:
+        order = np.argsort(pairs["cycle_error"].values)
     pair = pairs.isel(pair=order[len(order) // 2])
-    kinds = {"fmap_initial": "mode_source_initial", "fmap": "mode_source"}
-    figure = charts.matrices(
-        {_stage(pairs, dim): pair[key].values for key, dim in kinds.items() if key in pair}
-    )
+    matrices = {}
+    for key, when in (("fmap_initial", "before"), ("fmap", "after")):
+        if key in pair:
+            C = pair[key].values
+            matrices[f"{when} Consistent ZoomOut, {C.shape[1]} modes"] = C
     text = f"{pair['source'].item()} → {pair['target'].item()}, a pair of median cycle error"
-    return markup.note(text) + markup.chart(figure, text)
+    return PARTS.note(text) + PARTS.drawing(charts.matrices(matrices), text)
 
 
 def _distances(study, look):
-    distance = study["latent"]["distance_to_median"]
+    distance = study["latent"].dataset["distance_to_median"]
     names = names_of(distance)
-    median = _index(names, _attr(study, "latent", "median"))
+    median = _index(names, attribute(study, "latent", "median"))
     figure = charts.ranked(names, distance.values, "distance to the limit shape", median)
-    return markup.note(
-        "The median (eq. 5) is the shape nearest to the limit shape."
-    ) + markup.chart(figure, "the shapes ranked by their distance to the limit shape")
+    note = PARTS.note("The median (eq. 5) is the shape nearest to the limit shape.")
+    return note + PARTS.drawing(figure, "the shapes ranked by their distance to the limit shape")
 
 
 def _modes(study, look):
     draw, limit = mode_drawer(study, look)
     unit = study["pca"]["deformation"].attrs.get("units", "")
-    sigmas = np.linspace(-SIGMA, SIGMA, 13 if study["registration"].sizes["vertex"] < 50_000 else 7)
-    rows, sliders = [], []
+    n_frames = 13 if study["registration"].sizes["vertex"] < 50_000 else 7
+    sigmas = np.linspace(-SIGMA, SIGMA, n_frames)
+    pictures, sliders = [], []
     for mode, ratio in enumerate(study["pca"]["explained_variance_ratio"].values[:N_MODES]):
-        frames = [draw(mode, s) for s in sigmas]
         name = f"component {mode + 1}"
+        frames = [draw(mode, s) for s in sigmas]
         labels = [f"{name}, {s:+.3g} σ".replace("-", "−") if s else f"{name}, mean" for s in sigmas]
-        rows += [markup.picture(frames[i], labels[i]) for i in (0, len(frames) // 2, -1)]
+        pictures += [PARTS.picture(frames[i], labels[i]) for i in (0, n_frames // 2, -1)]
         behind = draw(mode, SIGMA, view=opposite(look["view"]))
-        rows.append(markup.picture(behind, f"{labels[-1]}, from behind"))
-        sliders.append(markup.slider(mode, frames, labels, f"{ratio:.1%} of the variance"))
+        pictures.append(PARTS.picture(behind, f"{labels[-1]}, from behind"))
+        share = f"{ratio:.1%} of the variance"
+        sliders.append(PARTS.slider(mode, list(map(webp_uri, frames)), labels, share))
+    note = "Blue is expansion, red is compression, against the mean; one colour scale for all."
     bar = charts.color_bar(SIGNED, -limit, limit, f"displacement along the normal ({unit})")
-    note = markup.note(
-        "Blue is expansion, red is compression, against the mean; one colour scale for all."
-    )
-    sliders = "<h3>Move along the components</h3>" + modes_html(study, markup.grid(sliders), **look)
-    return f"{note}{markup.grid(rows, 'row four')}{markup.chart(bar, 'colour bar')}\n{sliders}"
+    parts = [
+        PARTS.note(note),
+        PARTS.grid(pictures, "row four"),
+        PARTS.drawing(bar, "colour bar"),
+        Markup("<h3>Move along the components</h3>"),
+        _live_modes(study, PARTS.grid(sliders), look),
+    ]
+    return Markup("").join(parts)
+
+
+def _live_modes(study, instead, look):
+    """Sliders that move the mean shape in the browser, on low resolution where it is large."""
+    coarse = template_coarse(study)
+    if study["registration"].sizes["vertex"] <= LARGE:
+        coarse = None
+    mean, T, deformation = mode_arrays(study, coarse)
+    unit = study["pca"]["deformation"].attrs.get("units", "")
+    state = {
+        **mesh_state(mean, T, deformation),
+        **look_state(color_limits(mean, T, deformation), unit, **look),
+        **score_state(study),
+        "scores": [0.0] * len(deformation),
+        "colors": "normal",
+        "beside": False,
+        "sample": -1,
+        "group": "",
+        "height": 420,
+        "webgl": "",
+        "still": b"",
+    }
+    size = f"{len(mean):,} vertices" + ("" if coarse is None else ", low resolution")
+    return PARTS.modes(state, MODES, size, instead)
 
 
 def _variance(study, look):
     pca = study["pca"].dataset
-    low = (
-        pca["explained_variance_ratio_low"].values
-        if "explained_variance_ratio_low" in pca
-        else None
-    )
-    return markup.chart(
-        charts.variance(pca["explained_variance_ratio"].values, low),
-        "cumulative explained variance",
-    )
+    low = pca.get("explained_variance_ratio_low")
+    figure = charts.variance(pca["explained_variance_ratio"].values, low)
+    return PARTS.drawing(figure, "cumulative explained variance")
 
 
 def _scores(study, look):
-    score = study["pca"]["score"]
+    score = study["pca"].dataset["score"]
     names = names_of(score)
-    template = _index(names, _attr(study, "registration", "template"))
-    return markup.chart(
-        charts.scores(score.values, names, template), "scores of the shapes; the template is orange"
-    )
+    template = _index(names, attribute(study, "registration", "template"))
+    figure = charts.scores(score.values, names, template)
+    return PARTS.drawing(figure, "scores of the shapes; the template is orange")
 
 
 def _correspondence(study, look):
-    registration = study["registration"]
+    registration = study["registration"].dataset
     X, T = mesh_of(registration)
-    colors, template = position_colors(X), registration.attrs.get("template", "")
+    colors = position_colors(X)
+    template = registration.attrs.get("template", "")
     surfaces = {f"{template}, the template": (X, T, colors)}
-    for name in [name for name in names_of(registration) if name != template][:5]:
-        if (carried := carried_colors(study, name, colors)) is not None:
+    others = [name for name in names_of(registration) if name != template]
+    for name in others[:N_CARRIED]:
+        carried = carried_colors(study, name, colors)
+        if carried is not None:
             surfaces[name] = carried
-    frames = shared_frames([surface[0] for surface in surfaces.values()], look)
-    figures = [
-        markup.picture(render(X, T, colors=colors, size=PANEL, frame=frame, **look), name)
-        for (name, (X, T, colors)), frame in zip(surfaces.items(), frames, strict=True)
-    ]
-    note = "The template's coordinates as colours, carried to other shapes: the same colour is the same place."
-    return markup.note(note) + markup.grid(figures)
+    frames = shared_frames([X for X, _, _ in surfaces.values()], look)
+    figures = []
+    for (name, (X, T, colors)), frame in zip(surfaces.items(), frames, strict=True):
+        pixels = render(X, T, colors=colors, size=PANEL, frame=frame, **look)
+        figures.append(PARTS.picture(pixels, name))
+    note = "The template's coordinates as colours, carried to other shapes: "
+    note += "the same colour is the same place."
+    return PARTS.note(note) + PARTS.grid(figures)
 
 
 def _confidence(study, look):
@@ -276,49 +281,49 @@ def _confidence(study, look):
     X, T = mesh_of(registration)
     confidence = registration["confidence"]
     mean, names = confidence.mean("vertex").values, names_of(registration)
-    surfaces = {"mean over the shapes, on the template": (X, confidence.mean("shape").values)}
+
+    def painted(caption, X, values, high):
+        colors = ramp_colors(values, 0, high)
+        return PARTS.picture(render(X, T, colors=colors, size=PANEL, **look), caption)
+
+    caption = "mean over the shapes, on the template"
+    figures = [painted(caption, X, confidence.mean("shape").values, 1)]
     for i in np.argsort(mean)[:2]:
         moved = X + registration["displacement"].isel(shape=i).values
-        surfaces[f"{names[i]}: {mean[i]:.2f} on average"] = (moved, confidence.isel(shape=i).values)
-    figures = [
-        markup.picture(render(X, T, colors=ramp_colors(value, 0, 1), size=PANEL, **look), caption)
-        for caption, (X, value) in surfaces.items()
-    ]
-    bar = markup.chart(charts.color_bar("viridis", 0, 1, "confidence"), "colour bar")
-    for name, words in (
-        ("round_trip", "cycle error, shares of sqrt(area)"),
-        ("distortion", "distortion |log(area ratio)|"),
-    ):
-        if name in registration:
-            value = np.abs(registration[name]).mean("shape").values
+        caption = f"{names[i]}: {mean[i]:.2f} on average"
+        figures.append(painted(caption, moved, confidence.isel(shape=i).values, 1))
+    others = {
+        "round_trip": "cycle error, shares of sqrt(area)",
+        "distortion": "distortion |log(area ratio)|",
+    }
+    for key, words in others.items():
+        if key in registration:
+            value = np.abs(registration[key]).mean("shape").values
             limit = float(np.quantile(value, 0.95)) or 1.0
-            picture = render(X, T, colors=ramp_colors(value, 0, limit), size=PANEL, **look)
-            figures.append(
-                markup.picture(picture, f"{words}, from 0 to {limit:.2g}; mean over the shapes")
-            )
-    note = (
-        "Everywhere, and the shapes where it is lowest; what the registration does to the surface."
-    )
-    return markup.note(note) + markup.grid(figures) + bar
+            caption = f"{words}, from 0 to {limit:.2g}; mean over the shapes"
+            figures.append(painted(caption, X, value, limit))
+    note = "Everywhere, and the shapes where it is lowest; "
+    note += "what the registration does to the surface."
+    bar = charts.color_bar("viridis", 0, 1, "confidence")
+    return PARTS.note(note) + PARTS.grid(figures) + PARTS.drawing(bar, "colour bar")
 
 
 def _resources(study, look):
     report = study["report"].dataset
-    columns = {"seconds": "seconds", "peak_memory": "peak memory (MiB)"}
-    columns = {key: head for key, head in columns.items() if key in report}
-    stages = report["seconds"]["stage"].values
-    rows = [
-        [str(stage), *(float(report[key].values[i]) for key in columns)]
-        for i, stage in enumerate(stages)
-    ]
-    return markup.table(["stage", *columns.values()], rows)
+    heads = {"seconds": "seconds", "peak_memory": "peak memory (MiB)"}
+    heads = {key: head for key, head in heads.items() if key in report}
+    rows = []
+    for i, stage in enumerate(report["stage"].values):
+        rows.append([str(stage), *(float(report[key].values[i]) for key in heads)])
+    return PARTS.table(["stage", *heads.values()], rows)
 
 
 def _parameters(study, look):
     rows = [[key, value] for key, value in study["report"].attrs.items() if str(value)]
-    return markup.table(["parameter", "value"], rows) if rows else markup.missing(["parameters"])
+    return PARTS.table(["parameter", "value"], rows) if rows else PARTS.missing(["parameters"])
 
 
+# heading, what of the study it needs, and what writes it
 SECTIONS = (
     ("Shapes", ["report/status"], _shapes),
     ("Gallery", ["coarse"], _gallery),

@@ -1,80 +1,33 @@
-"""Pictures of the surfaces of a study."""
+"""Pictures of the modes of a study (6.1, Fig. 4): as files, and the renderer of one of them."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import xarray as xr
 from PIL import Image
 
 from s4a.geometry.mesh import vertex_normals
+from s4a.method.deform import normal_displacement
 from s4a.show.draw import image_bytes, on_white, plane_box, render, signed_colors
+from s4a.show.surfaces import mode_arrays
 
 SIGMA = 3  # the modes are shown from -3 to 3 standard deviations
 N_MODES = 3
 PANEL = (320, 270)  # pixels
 
 
-def has(study, name):
-    """Whether the study holds the node, or the variable ``node/variable``."""
-    node, _, variable = name.partition("/")
-    if node not in study.children:
-        return False
-    return variable in study[node].data_vars if variable else bool(study[node].children)
+def shared_frames(surfaces: list[np.ndarray], look: dict) -> list[np.ndarray]:
+    """Frames ``(2, 2)`` around each of some surfaces, all as large as the largest needs.
 
-
-def names_of(data):
-    """The shapes of a Dataset, as a list of str."""
-    return [str(name) for name in data["shape"].values]
-
-
-def mesh_of(node):
-    """Positions and triangles of a node."""
-    return node["position"].values, node["corner_vertex"].values
-
-
-def aligned(study, name, X):
-    """Positions of a shape moved onto the template, where the run has registered it."""
-    if not has(study, "registration/rotation") or name not in names_of(study["registration"]):
-        return X
-    one = study["registration"].dataset.sel(shape=name)
-    scale = one["scale"].item() if "scale" in one else 1.0
-    return scale * X @ one["rotation"].values.T + one["translation"].values
-
-
-def shared_frames(surfaces, look):
-    """For each surface a frame around itself, all of the size of the largest.
-
-    So that sizes can be compared.
+    So sizes can be compared.
     """
     boxes = [plane_box(X, **look) for X in surfaces]
     half = np.max([box[1] - box[0] for box in boxes], axis=0) / 2
     return [box.mean(0) + np.stack([-half, half]) for box in boxes]
 
 
-def carried_colors(study, name, colors):
-    """Aligned mesh of a shape, with the colours of the template's vertices carried to it.
-
-    None without its mesh.
-    """
-    if not has(study, "original") or name not in study["original"].children:
-        return None
-    X, T = mesh_of(study["original"][name])
-    registration = study["registration"]
-    if name in registration.children and "template_triangle" in registration[name].data_vars:
-        corners = registration["corner_vertex"].values[
-            registration[name]["template_triangle"].values
-        ]
-        painted = np.einsum(
-            "vc,vcx->vx", registration[name]["template_barycentric"].values, colors[corners]
-        )
-    else:
-        match = registration["registered_match"].sel(shape=name).values
-        count = np.bincount(match, minlength=len(X))[:, None]
-        painted = np.stack([np.bincount(match, channel, len(X)) for channel in colors.T], axis=1)
-        painted = np.where(count > 0, painted / np.maximum(count, 1), np.nan)
-    return aligned(study, name, X), T, painted
-
-
-def mode_drawer(study, look):
+def mode_drawer(study: xr.DataTree, look: dict) -> tuple[Callable[..., np.ndarray], float]:
     """What draws the first components, all on one colour scale.
 
     Returns
@@ -85,30 +38,31 @@ def mode_drawer(study, look):
     limit : float
         The displacement of the full colours, in the unit of the input.
     """
-    pca = study["pca"].dataset
-    X, T = mesh_of(study["registration"])
-    mean, steps = X + pca["mean_displacement"].values, pca["deformation"].values[:N_MODES]
-    along = (steps * vertex_normals(mean, T)).sum(2)
+    mean, T, steps = mode_arrays(study, n_modes=N_MODES)
+    along = normal_displacement(steps, vertex_normals(mean, T))
     limit = float(SIGMA * np.quantile(np.abs(along), 0.99)) or 1.0
     extremes = np.concatenate([mean + s * step for step in steps for s in (-SIGMA, SIGMA)])
 
     def draw(mode, s, size=PANEL, **other):
-        seen, colors = {**look, **other}, signed_colors(s * along[mode], limit)
-        return render(
-            mean + s * steps[mode],
-            T,
-            colors=colors,
-            size=size,
-            frame=plane_box(extremes, **seen),
-            **seen,
-        )
+        seen = {**look, **other}
+        colors = signed_colors(s * along[mode], limit)
+        frame = plane_box(extremes, **seen)
+        return render(mean + s * steps[mode], T, colors=colors, size=size, frame=frame, **seen)
 
     return draw, limit
 
 
 def write_animation(
-    study, path, *, mode=0, n_frames=24, seconds=4.0, view="corner", up="z", size=(400, 340)
-):
+    study: xr.DataTree,
+    path: Path | str,
+    *,
+    mode: int = 0,
+    n_frames: int = 24,
+    seconds: float = 4.0,
+    view: str | tuple[float, float] = "corner",
+    up: str = "z",
+    size: tuple[int, int] = (400, 340),
+) -> Path:
     """Write a component as an animated GIF, from -3 to 3 standard deviations and back.
 
     Parameters
@@ -133,24 +87,25 @@ def write_animation(
     pathlib.Path
     """
     draw, _ = mode_drawer(study, {"view": view, "up": up})
-    steps = -SIGMA * np.cos(2 * np.pi * np.arange(n_frames) / n_frames)
-    frames = [
-        Image.fromarray(on_white(draw(mode, s, size))).convert("P", palette=Image.Palette.ADAPTIVE)
-        for s in steps
-    ]
     path = Path(path)
-    frames[0].save(
-        path,
-        "GIF",
-        save_all=True,
-        append_images=frames[1:],
-        duration=round(1000 * seconds / n_frames),
-        loop=0,
-    )
+    frames = []
+    for s in -SIGMA * np.cos(2 * np.pi * np.arange(n_frames) / n_frames):
+        image = Image.fromarray(on_white(draw(mode, s, size)))
+        frames.append(image.convert("P", palette=Image.Palette.ADAPTIVE))
+    lasts = round(1000 * seconds / n_frames)  # milliseconds
+    rest = frames[1:]
+    frames[0].save(path, "GIF", save_all=True, append_images=rest, duration=lasts, loop=0)
     return path
 
 
-def write_picture(study, path, *, view="corner", up="z", size=(400, 340)):
+def write_picture(
+    study: xr.DataTree,
+    path: Path | str,
+    *,
+    view: str | tuple[float, float] = "corner",
+    up: str = "z",
+    size: tuple[int, int] = (400, 340),
+) -> Path:
     """Write the first components, from -3 to 3 standard deviations, as one PNG picture on white.
 
     Parameters
@@ -168,10 +123,9 @@ def write_picture(study, path, *, view="corner", up="z", size=(400, 340)):
     pathlib.Path
     """
     draw, _ = mode_drawer(study, {"view": view, "up": up})
-    components = range(min(N_MODES, study["pca"].sizes["component"]))
-    rows = [[draw(mode, s, size) for s in (-SIGMA, 0, SIGMA)] for mode in components]
     path = Path(path)
-    path.write_bytes(
-        image_bytes(on_white(np.concatenate([np.concatenate(row, axis=1) for row in rows])), "png")
-    )
+    rows = []
+    for mode in range(min(N_MODES, study["pca"].sizes["component"])):
+        rows.append(np.concatenate([draw(mode, s, size) for s in (-SIGMA, 0, SIGMA)], axis=1))
+    path.write_bytes(image_bytes(on_white(np.concatenate(rows)), "png"))
     return path

@@ -1,10 +1,12 @@
 """Panels of a study for notebooks: they show arrays, what is computed is in the step modules."""
 
 try:
+    import anywidget  # noqa: F401
     import ipywidgets  # noqa: F401
 except ImportError as error:
     raise ImportError(
-        "the panels need ipywidgets and anywidget, which are not installed; run: pip install s4a[notebook]"
+        "the panels need ipywidgets and anywidget, which are not installed; "
+        "run: pip install s4a[notebook]"
     ) from error
 
 from s4a.widgets.correspondence import Correspondence

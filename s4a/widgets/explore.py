@@ -1,10 +1,13 @@
 """All panels of a study as tabs; each is built when its tab is first opened."""
 
-from html import escape
+from typing import Any
 
 import ipywidgets
+import xarray as xr
 from IPython import get_ipython
+from IPython.core.interactiveshell import ExecutionInfo
 
+from s4a.show.browser import PARTS
 from s4a.widgets.correspondence import Correspondence
 from s4a.widgets.functional import FunctionalMap
 from s4a.widgets.median import Median
@@ -25,6 +28,12 @@ PANELS = {
 }
 
 
+def running_cell() -> str | None:
+    """The id of the notebook's cell that runs; None outside of a notebook."""
+    kernel = getattr(get_ipython(), "kernel", None)
+    return kernel.get_parent().get("metadata", {}).get("cellId") if kernel else None
+
+
 class Explore(ipywidgets.VBox):
     """Tabs over a study.
 
@@ -41,17 +50,27 @@ class Explore(ipywidgets.VBox):
         Title of the tab -> panel, of those that were opened.
     """
 
-    def __init__(self, study, **options):
+    def __init__(self, study: xr.DataTree, **options: Any):
         self.study, self.options, self.panels = study, options, {}
-        self.tabs = ipywidgets.Tab(
-            children=[ipywidgets.VBox() for _ in PANELS], titles=list(PANELS)
-        )
+        boxes = [ipywidgets.VBox() for _ in PANELS]
+        self.tabs = ipywidgets.Tab(children=boxes, titles=list(PANELS))
         self.tabs.add_class("s4a-tabs")  # in style.css
         super().__init__([self.tabs], layout=LAYOUT)
         self.tabs.observe(self.fill, "selected_index")
         self.fill()
+        self.cell = None  # at whose next run they close
 
-    def fill(self, change=None):
+    def close_with(self, cell: str) -> None:
+        """Close when the cell of the notebook is run again, so that nothing piles up."""
+        self.cell = cell
+        get_ipython().events.register("pre_run_cell", self.before_run)
+
+    def before_run(self, run: ExecutionInfo) -> None:
+        """Close if `run`, what IPython is about to do, is of the cell that made these tabs."""
+        if run.cell_id == self.cell:
+            self.close()
+
+    def fill(self, change: object = None) -> None:
         """Build the panel of the selected tab, or say why there is none."""
         title = list(PANELS)[self.tabs.selected_index or 0]
         box = self.tabs.children[self.tabs.selected_index or 0]
@@ -63,54 +82,37 @@ class Explore(ipywidgets.VBox):
             self.panels[title] = PANELS[title](self.study, **self.options)
             box.children = [self.panels[title]]
         except ValueError as error:
-            box.children = [ipywidgets.HTML(f'<p role="status">{escape(str(error))}</p>')]
+            box.children = [ipywidgets.HTML(PARTS.message(str(error)))]
 
-    def refresh(self, study):
+    def refresh(self, study: xr.DataTree) -> None:
         """Show a newer state of the study in all panels."""
         for panel in self.panels.values():
             panel.close()
         self.panels.clear()
         self.extend(study)
 
-    def extend(self, study):
+    def extend(self, study: xr.DataTree) -> None:
         """Show what a newer state of the study has more; panels that are open stay as they are."""
         self.study = study
         self.fill()
 
-    def __getitem__(self, title):
+    def __getitem__(self, title: str) -> ipywidgets.Widget:
         """The panel of a tab, which is opened for it."""
         self.tabs.selected_index = list(PANELS).index(title)
         return self.panels[title]
 
-    def close(self):
+    def close(self) -> None:
         """Close all panels."""
+        if self.cell:
+            get_ipython().events.unregister("pre_run_cell", self.before_run)
+            self.cell = None
         close_all(self)
 
 
-OPEN = {}  # cell of a notebook -> the run of it, and the tabs that this run opened
-
-
-def running_cell():
-    """The cell of a notebook that runs, and which run of it this is; None elsewhere."""
-    kernel = getattr(get_ipython(), "kernel", None)
-    message = {} if kernel is None else kernel.get_parent()
-    cell = message.get("metadata", {}).get("cellId")
-    return cell and (cell, message["header"]["msg_id"])
-
-
-def explore(study, **options):
-    """Tabs in place of those that an earlier run of the same cell opened, which are closed.
-
-    Nothing piles up.
-    """
-    found = running_cell()
-    if found is None:
-        return Explore(study, **options)
-    cell, run = found
-    before, opened = OPEN.get(cell, (run, []))
-    if before != run:
-        for tabs in opened:
-            tabs.close()
-        opened = []
-    OPEN[cell] = run, [*opened, Explore(study, **options)]
-    return OPEN[cell][1][-1]
+def explore(study: xr.DataTree, **options: Any) -> Explore:
+    """Tabs over a study that close when the cell of the notebook that made them is run again."""
+    tabs = Explore(study, **options)
+    cell = running_cell()
+    if cell:
+        tabs.close_with(cell)
+    return tabs

@@ -1,7 +1,4 @@
-"""Functional maps (3.3, 4.1, Fig. 2).
-
-The matrix, its modes on both meshes, and ZoomOut step by step.
-"""
+"""Functional maps (3.3, 4.1, Fig. 2): the matrix, its modes on both meshes, ZoomOut in steps."""
 
 import ipywidgets
 import numpy as np
@@ -9,18 +6,18 @@ import traitlets
 
 from s4a.method.fmap import off_diagonal_mass, orthogonality_error, swapped_blocks, zoomout
 from s4a.method.shape import Shape
-from s4a.show.draw import SIGNED, signed_colors
-from s4a.show.live import color_bar
-from s4a.widgets.chart import chart
-from s4a.widgets.meshes import camera_group, surface
-from s4a.widgets.panel import Panel, beside, paragraph, row
-from s4a.widgets.scene import scene
+from s4a.show.browser import PARTS
+from s4a.show.surfaces import surface
+from s4a.widgets.chart import Chart
+from s4a.widgets.panel import WIDE, Panel, beside, dropdown, int_slider, row
+from s4a.widgets.scene import Scene, camera_group
 
 STEP = 5
 KINDS = [
     ("consistent ZoomOut, as in the study", "study"),
     ("ZoomOut of this pair alone", "zoomout"),
 ]
+TOLD = 3  # exchanged runs of modes that are told in words
 
 
 class FunctionalMap(Panel):
@@ -46,45 +43,29 @@ class FunctionalMap(Panel):
         """Choices, matrix and the two surfaces."""
         network = self.study["network"].dataset
         self.source, self.target = (network[key].values.astype(str) for key in ("source", "target"))
-        sizes = network.sizes["mode_source_initial"], network.sizes["mode_source"]
-        options = [
-            (f"{s} → {t}", i) for i, (s, t) in enumerate(zip(self.source, self.target, strict=True))
-        ]
-        self.choice = ipywidgets.Dropdown(options=options, description="pair")
-        self.kind = ipywidgets.Dropdown(options=KINDS, description="map", layout={"width": "340px"})
-        steps = sorted({*range(sizes[0], sizes[1], STEP), sizes[1]})
+        first, last = network.sizes["mode_source_initial"], network.sizes["mode_source"]
+        ends = zip(self.source, self.target, strict=True)
+        options = [(f"{source} → {target}", i) for i, (source, target) in enumerate(ends)]
+        self.choice = dropdown("pair", options)
+        self.kind = dropdown("map", KINDS, layout=WIDE)
         self.k = ipywidgets.SelectionSlider(
-            options=steps,
-            value=sizes[1],
+            options=sorted({*range(first, last, STEP), last}),
+            value=last,
             description="modes k",
             continuous_update=False,
-            layout={"width": "340px"},
+            layout=WIDE,
         )
         self.block = ipywidgets.Checkbox(description="first ten modes only", indent=False)
-        wide = {"width": "300px"}
-        self.row, self.column = (
-            ipywidgets.IntSlider(
-                1, min=0, max=sizes[1] - 1, description=text, continuous_update=False, layout=wide
-            )
-            for text in ("target ψ", "source φ")
-        )
-        self.matrix, self.numbers = chart(), ipywidgets.HTML()
-        group = camera_group()
-        self.scenes = [scene(group=group, view=view, up=up, height=250) for _ in range(2)]
-        self.cache = {}
+        self.row = int_slider("target ψ", 1, 0, last - 1, "300px")
+        self.column = int_slider("source φ", 1, 0, last - 1, "300px")
+        self.matrix, self.numbers = Chart(), ipywidgets.HTML()
+        look = {"group": camera_group(), "view": view, "up": up, "height": 250}
+        self.scenes = [Scene(**look), Scene(**look)]
+        self.maps = {}  # size -> C, of ZoomOut of this pair alone
         self.on_change(self.choice, lambda value: self.set_trait("pair", value))
-        self.on_change(self.k, lambda _: self.draw())
-        self.on_change(self.kind, lambda _: self.draw())
-        self.on_change(self.block, lambda _: self.draw())
-        self.on_change(
-            self.matrix,
-            lambda mark: self.set_trait("cell", (mark["row"], mark["column"])),
-            "picked",
-        )
-        for slider in (self.row, self.column):
-            self.on_change(
-                slider, lambda _: self.set_trait("cell", (self.row.value, self.column.value))
-            )
+        self.redraw(self.draw, self.k, self.kind, self.block)
+        self.on_change(self.matrix, self.pick, "picked")
+        self.redraw(lambda: self.pick({}), self.row, self.column)
         self.on_change(self, self.take, "pair")
         self.on_change(self, self.show_cell, "cell")
         self.pair = pair
@@ -97,79 +78,72 @@ class FunctionalMap(Panel):
             beside(ipywidgets.VBox([self.matrix]), ipywidgets.VBox(self.scenes)),
         ]
 
-    def take(self, pair):
+    def names(self) -> tuple[str, str]:
+        """Source and target of the pair."""
+        return str(self.source[self.pair]), str(self.target[self.pair])
+
+    def pick(self, mark: dict) -> None:
+        """A cell that was clicked, or that the sliders name."""
+        self.cell = mark.get("row", self.row.value), mark.get("column", self.column.value)
+
+    def take(self, pair: int) -> None:
         """The two meshes of a pair and its first map."""
         self.choice.value = pair
-        self.meshes = [
-            self.study["coarse"][str(name)].to_dataset()
-            for name in (self.source[pair], self.target[pair])
-        ]
-        self.cache = {}
+        self.meshes = [self.study["coarse"][name].to_dataset() for name in self.names()]
+        self.maps = {}
         self.draw()
-        for view, name in zip(self.scenes, (self.source[pair], self.target[pair]), strict=True):
-            view.show(*surface(self.study, str(name)))
+        for scene, name in zip(self.scenes, self.names(), strict=True):
+            scene.show(*surface(self.study, name))
         self.show_cell(self.cell)
 
-    def map_of(self, k):
-        """C at the size k: cut out of the study's map.
-
-        Or by ZoomOut from the first map of the pair.
-        """
+    def map_of(self, k: int) -> np.ndarray:
+        """C ``(k, k)``: cut out of the study's map, or by ZoomOut from the pair's first map."""
         network = self.study["network"].dataset.isel(pair=self.pair)
         if self.kind.value == "study":
             return network["fmap"].values[:k, :k]
         first = network["fmap_initial"].values
-        size = max((done for done in self.cache if done <= k), default=len(first))
-        C = self.cache.get(size, first)
-        M, N = (Shape(None, mesh).low for mesh in self.meshes)
+        size = max((done for done in self.maps if done <= k), default=len(first))
+        C = self.maps.get(size, first)
+        source, target = (Shape(None, mesh).low for mesh in self.meshes)
         while size < k:
             size = min(size + STEP, k)
-            C, _ = zoomout(M, N, C, size, step=STEP)
-            self.cache[size] = C
+            C, _ = zoomout(source, target, C, size, step=STEP)
+            self.maps[size] = C
         return C
 
-    def draw(self):
+    def draw(self) -> None:
         """The matrix, its numbers, and frames around runs of modes that are exchanged."""
         k = self.k.value
         self.C = C = self.map_of(k)
         blocks = swapped_blocks(C)
-        shown = min(10, k) if self.block.value else k
+        size = min(10, k) if self.block.value else k
         self.matrix.matrix(
-            C[:shown, :shown],
-            title=f"{self.source[self.pair]} → {self.target[self.pair]}, {k} × {k}",
-            blocks=[block for block in blocks if block[1] < shown],
+            C[:size, :size],
+            title=f"{' → '.join(self.names())}, {k} × {k}",
+            blocks=[block for block in blocks if block[1] < size],
             row=self.cell[0],
             column=self.cell[1],
         )
         values = self.meshes[0]["eigenvalue"].values
-        told = [f"{a}–{b} (eigenvalues {values[a]:.1f}–{values[b]:.1f})" for a, b in blocks]
-        more = f" and {len(told) - 3} more" if len(told) > 3 else ""
-        swapped = (
-            f" Exchanged among each other, framed: modes {', '.join(told[:3])}{more}."
-            if told
-            else ""
-        )
-        self.numbers.value = paragraph(
+        runs = [f"{a}–{b} (eigenvalues {values[a]:.1f}–{values[b]:.1f})" for a, b in blocks]
+        more = f" and {len(runs) - TOLD} more" if len(runs) > TOLD else ""
+        swapped = "No swapped blocks."
+        if runs:
+            runs = ", ".join(runs[:TOLD])
+            swapped = f"Exchanged among each other, framed: modes {runs}{more}."
+        self.numbers.value = PARTS.paragraph(
             f"off the diagonal {off_diagonal_mass(C):.1%} of the squared entries; "
-            f"|CᵀC − I| / √k = {orthogonality_error(C):.3f}.{swapped or ' No swapped blocks.'} "
+            f"|CᵀC − I| / √k = {orthogonality_error(C):.3f}. {swapped} "
             "Blue is positive, red negative, −1 to 1."
         )
 
-    def show_cell(self, cell):
+    def show_cell(self, cell: tuple[int, int]) -> None:
         """The two eigenfunctions that a cell links, on one colour scale."""
         self.row.value, self.column.value = cell
         self.matrix.spec = self.matrix.spec | {"row": cell[0], "column": cell[1]}
-        for view, mesh, mode, role in zip(
-            self.scenes, self.meshes, cell[::-1], ("source φ", "target ψ"), strict=True
-        ):
-            function = mesh["eigenfunction"].values[:, mode]
-            limit = float(np.quantile(np.abs(function), 0.99))
-            value = mesh["eigenvalue"].values[mode]
-            view.title = f"{role}{mode} on {self.name_of(view)}, eigenvalue {value:.2f}"
-            view.paint(
-                signed_colors(function, limit), color_bar(SIGNED, -limit, limit, "eigenfunction")
-            )
-
-    def name_of(self, view):
-        """The shape that one of the two views shows."""
-        return (self.source if view is self.scenes[0] else self.target)[self.pair]
+        modes = (("source φ", cell[1]), ("target ψ", cell[0]))
+        shapes = zip(self.scenes, self.meshes, self.names(), strict=True)
+        for (role, mode), (scene, mesh, name) in zip(modes, shapes, strict=True):
+            eigenvalue = mesh["eigenvalue"].values[mode]
+            scene.title = f"{role}{mode} on {name}, eigenvalue {eigenvalue:.2f}"
+            scene.paint_function(mesh["eigenfunction"].values[:, mode], "eigenfunction")

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import ipywidgets
 import numpy as np
 import traitlets
 
@@ -10,12 +9,13 @@ from s4a.geometry.mesh import vertex_normals
 from s4a.input.files import write_mesh
 from s4a.method.deform import normal_displacement
 from s4a.method.pca import apply_scores, color_limits, mahalanobis, plausible_scores
-from s4a.show.live import mode_arrays, study_state, template_coarse
-from s4a.widgets.meshes import camera_group, unit_of
-from s4a.widgets.modes_view import modes_view
-from s4a.widgets.panel import Panel, row
+from s4a.show.surfaces import attribute, mode_arrays, score_state, template_coarse, unit_text
+from s4a.widgets.modes_view import ModesView
+from s4a.widgets.panel import Panel, dropdown, file_name, row
+from s4a.widgets.scene import camera_group
 
 LARGE = 40e6  # bytes of modes from which the low resolution is shown first
+BARE = (".obj", ".off", ".stl")  # formats without values at the vertices
 
 
 class Modes(Panel):
@@ -46,82 +46,69 @@ class Modes(Panel):
 
     def build(self, resolution=None, n_modes=None, view="corner", up="z"):
         """Sliders, shape and charts in the browser; below them resolution and export."""
-        pca, self.n_modes = self.study["pca"].dataset, n_modes
-        template = str(self.study["registration"].attrs.get("template", ""))
+        self.n_modes = n_modes
         self.coarse = template_coarse(self.study)
-        size = pca["deformation"].isel(component=slice(n_modes)).nbytes
-        small = self.coarse is not None and size > LARGE
-        resolution = resolution or ("coarse" if small else "full")
-        self.view = modes_view(
+        sizes = {"full": self.study["registration"].sizes["vertex"]}
+        if self.coarse is not None:
+            sizes["coarse"] = self.coarse.sizes["vertex"]
+        smallest = list(sizes)[-1]
+        if resolution is None:
+            deformation = self.study["pca"]["deformation"].isel(component=slice(n_modes))
+            resolution = smallest if deformation.nbytes > LARGE else "full"
+        self.view = ModesView(
             *self.arrays(resolution),
-            limits=color_limits(*self.arrays("full" if self.coarse is None else "coarse")),
-            unit=unit_of(self.study, template),
-            **study_state(self.study, n_modes),
+            limits=color_limits(*self.arrays(smallest)),
+            unit=unit_text(self.study, attribute(self.study, "registration", "template")),
+            **score_state(self.study, n_modes),
             group=camera_group(),
             view=view,
             up=up,
         )
         traitlets.link((self.view, "scores"), (self, "scores"))
-        sizes = [(f"full, {self.study['registration'].sizes['vertex']:,} vertices", "full")]
-        if self.coarse is not None:
-            sizes.append((f"coarse, {self.coarse.sizes['vertex']:,} vertices", "coarse"))
-        self.resolution = ipywidgets.Dropdown(
-            options=sizes, value=resolution, description="resolution"
-        )
-        self.path = ipywidgets.Text("shape.ply", description="file", layout={"width": "260px"})
-        self.ply = ipywidgets.Button(
-            description="Save mesh", tooltip="the shape as it stands, at full resolution"
-        )
-        self.html = ipywidgets.Button(
-            description="Save page", tooltip="one HTML file with these sliders, for offline"
-        )
-        self.on_change(self.resolution, lambda value: self.view.change_mesh(*self.arrays(value)))
-        self.ply.on_click(
-            self.guarded(lambda _: self.say(f"written: {self.save_mesh(self.path.value)}"))
-        )
-        self.html.on_click(
-            self.guarded(lambda _: self.say(f"written: {self.save_html(self.page_path())}"))
-        )
+        options = [(f"{name}, {size:,} vertices", name) for name, size in sizes.items()]
+        self.resolution = dropdown("resolution", options, value=resolution)
+        self.on_change(self.resolution, lambda name: self.view.change_mesh(*self.arrays(name)))
+        self.path = file_name("shape.ply")
+        mesh_help = "the shape as it stands, at full resolution"
+        self.ply = self.saving("Save mesh", lambda: self.save_mesh(self.path.value), mesh_help)
+        page_help = "one HTML file with these sliders, for offline"
+        self.html = self.saving("Save page", lambda: self.save_html(self.page_path()), page_help)
         return [self.view, row(self.resolution, self.path, self.ply, self.html)]
 
-    def arrays(self, resolution):
+    def arrays(self, resolution: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Mean shape, triangles and deformations at the resolution."""
         return mode_arrays(self.study, None if resolution == "full" else self.coarse, self.n_modes)
 
-    def page_path(self):
+    def page_path(self) -> Path:
         """The name of the page beside that of the mesh."""
         return Path(self.path.value).with_suffix(".html")
 
-    def vertices(self, resolution="full"):
+    def vertices(self, resolution: str = "full") -> np.ndarray:
         """Vertices ``(n, 3)`` of the shape as the sliders stand, in the unit of the input."""
         mean, _, deformation = self.arrays(resolution)
-        return apply_scores(mean, deformation, self.scores)
+        return apply_scores(mean, deformation, np.array(self.scores))
 
     @property
-    def distance(self):
+    def distance(self) -> float:
         """Mahalanobis distance of the shape from the mean."""
-        return mahalanobis(self.scores)
+        return mahalanobis(np.array(self.scores))
 
-    def random(self, seed=None):
+    def random(self, seed: int | None = None) -> list[float]:
         """A plausible shape: set scores drawn from the normal distribution, and give them."""
         self.scores = plausible_scores(len(self.scores), seed=seed).tolist()
         return self.scores
 
-    def save_mesh(self, path):
+    def save_mesh(self, path: Path | str) -> Path:
         """Write the shape as the sliders stand, at full resolution.
 
-        In any format of :func:`s4a.write_mesh`.
+        In any format of :func:`s4a.write_mesh`, with its displacement along the mean's normals
+        where the format has values at the vertices.
         """
+        path = Path(path)
         mean, T, _ = self.arrays("full")
-        X, path = self.vertices(), Path(path)
-        values = (
-            {}
-            if path.suffix.lower() in (".obj", ".off", ".stl")
-            else {
-                "normal_displacement": normal_displacement(
-                    X - mean, vertex_normals(mean, T)
-                ).astype(np.float32)
-            }
-        )
+        X, values = self.vertices(), {}
+        if path.suffix.lower() not in BARE:
+            along = normal_displacement(X - mean, vertex_normals(mean, T))
+            values["normal_displacement"] = along.astype(np.float32)
         write_mesh(path, X, T, **values)
         return path

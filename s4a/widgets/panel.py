@@ -1,22 +1,24 @@
-"""What all panels share.
-
-A line for messages, callbacks that show their errors, closing, and a page of their own.
-"""
+"""What all panels share: a line for messages, callbacks that show their errors, closing, a page."""
 
 import functools
 import logging
-from html import escape
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import ipywidgets
+import xarray as xr
 
-from s4a.widgets.page import page
+from s4a.show.browser import PARTS
+from s4a.show.panel_page import LIMIT, panel_html
+from s4a.show.surfaces import has
 
 log = logging.getLogger(__name__)
 LAYOUT = {"max_width": "1000px", "overflow": "hidden"}
+WIDE = {"width": "340px"}
 
 
-def close_all(widget):
+def close_all(widget: ipywidgets.Widget) -> None:
     """Close a widget, all widgets in it, and their layouts and styles.
 
     Nothing of them stays in the kernel.
@@ -30,25 +32,38 @@ def close_all(widget):
     ipywidgets.Widget.close(widget)
 
 
-def paragraph(text):
-    """A paragraph of HTML, with the usual distance of lines."""
-    return f'<div style="line-height:1.4">{text}</div>'
+def dropdown(description: str, options: list, **more: Any) -> ipywidgets.Dropdown:
+    """A list to choose from."""
+    return ipywidgets.Dropdown(options=options, description=description, **more)
 
 
-def row(*widgets):
+def int_slider(
+    description: str, value: int, low: int, high: int, width: str = "340px", **more: Any
+) -> ipywidgets.IntSlider:
+    """A slider of integers that tells its value when it is let go."""
+    more = {"continuous_update": False, "layout": {"width": width}} | more
+    return ipywidgets.IntSlider(value, min=low, max=high, description=description, **more)
+
+
+def file_name(name: str) -> ipywidgets.Text:
+    """The name of a file to write."""
+    return ipywidgets.Text(name, description="file", layout={"width": "260px"})
+
+
+def row(*widgets: ipywidgets.Widget) -> ipywidgets.HBox:
     """Widgets side by side, on several lines where it is narrow."""
     return ipywidgets.HBox(widgets, layout={"flex_flow": "row wrap", "align_items": "center"})
 
 
-def beside(*widgets, width="320px"):
+def beside(*widgets: ipywidgets.Widget) -> ipywidgets.HBox:
     """Large parts side by side, of equal width where there is room for it."""
     for widget in widgets:
-        widget.layout.flex, widget.layout.min_width = f"1 1 {width}", "0"
+        widget.layout.flex, widget.layout.min_width = "1 1 320px", "0"
     return ipywidgets.HBox(widgets, layout={"flex_flow": "row wrap", "align_items": "flex-start"})
 
 
 class Panel(ipywidgets.VBox):
-    """A panel: subclasses build their parts in ``build`` and give callbacks through :meth:`guarded`.
+    """A panel: subclasses build their parts in ``build``, and their callbacks are guarded.
 
     Parameters
     ----------
@@ -63,48 +78,43 @@ class Panel(ipywidgets.VBox):
 
     needs = ()
     title = "Panel"
-    live = ()  # groups of controls, by their names, whose values a saved page keeps; the last varies slowest
+    # for a saved page:
+    live = ()  # groups of controls, by name, whose values it keeps; the last varies slowest
     clicks = ()  # chart, part of the mark that is clicked, and the control that it sets
-    every = ()  # sliders of which a page keeps every value, and not only two dozen of them
+    every = ()  # sliders of which it keeps every value, and not only two dozen of them
     python = ()  # what else needs Python
 
-    def __init__(self, study, **options):
-        from s4a.show.pictures import has
-
+    def __init__(self, study: xr.DataTree, **options: Any):
         lacking = [name for name in self.needs if not has(study, name)]
         if lacking:
             raise ValueError(
-                f"the panel {self.title} needs {', '.join(lacking)}, which this study does not have (yet)"
+                f"the panel {self.title} needs {', '.join(lacking)}, "
+                "which this study does not have (yet)"
             )
         super().__init__(layout=LAYOUT)
         self.study = study
-        self.message = ipywidgets.HTML()
+        self.message, self.failed = ipywidgets.HTML(), False
         self.children = [*self.build(**options), self.message]
 
-    def build(self, **options):
-        """The parts of the panel, as a list of widgets."""
+    def build(self, **options: Any) -> list[ipywidgets.Widget]:
+        """The parts of the panel."""
         raise NotImplementedError
 
-    def control(self, name):
+    def control(self, name: str) -> ipywidgets.Widget:
         """The control of a name in `live`."""
         return getattr(self, name)
 
-    def say(self, text, error=False):
+    def say(self, text: str, error: bool = False) -> None:
         """Show a line below the panel."""
-        style = "color:#a40000;font-weight:bold" if error else "color:#444"
-        self.message.value = (
-            f'<div role="status" style="{style}">{escape(text)}</div>' if text else ""
-        )
+        self.failed = error
+        self.message.value = PARTS.message(text, error) if text else ""
 
-    def guarded(self, function):
-        """`function` as a callback whose errors are shown in the panel.
-
-        And logged with their place.
-        """
+    def guarded(self, function: Callable) -> Callable:
+        """`function` as a callback whose errors are shown in the panel, and logged."""
 
         @functools.wraps(function)
         def call(*arguments):
-            if "#a40000" in self.message.value:
+            if self.failed:
                 self.say("")
             try:
                 return function(*arguments)
@@ -115,25 +125,42 @@ class Panel(ipywidgets.VBox):
 
         return call
 
-    def on_change(self, widget, function, name="value"):
+    def on_change(self, widget: ipywidgets.Widget, function: Callable, name: str = "value") -> None:
         """Call `function` with the new value of a trait, guarded."""
         widget.observe(self.guarded(lambda change: function(change["new"])), name)
 
-    def save_html(self, path):
+    def redraw(self, function: Callable, *controls: ipywidgets.Widget) -> None:
+        """Call `function` without arguments when one of the controls has another value."""
+        for control in controls:
+            self.on_change(control, lambda _: function())
+
+    def button(
+        self, text: str, function: Callable, tooltip: str = "", **more: Any
+    ) -> ipywidgets.Button:
+        """A button that calls `function` without arguments, guarded."""
+        button = ipywidgets.Button(description=text, tooltip=tooltip, **more)
+        button.on_click(self.guarded(lambda _: function()))
+        return button
+
+    def saving(self, text: str, save: Callable, tooltip: str) -> ipywidgets.Button:
+        """A button that writes a file and says which; `save` gives its path."""
+        return self.button(text, lambda: self.say(f"written: {save()}"), tooltip)
+
+    def save_html(self, path: Path | str, *, limit: int = LIMIT) -> Path:
         """Write the panel, as it stands, as one HTML file that needs no kernel and no network.
 
         Surfaces turn, charts say their numbers, and controls show what Python showed for their
-        values, which are gone through one by one and kept, up to 24 MB of them; the page says what
-        needs Python.
+        values, which are gone through one by one and kept, up to `limit` characters of them; the
+        page says what needs Python.
 
         Returns
         -------
         pathlib.Path
         """
         path = Path(path)
-        path.write_text(page(self), encoding="utf-8")
+        path.write_text(panel_html(self, limit), encoding="utf-8")
         return path
 
-    def close(self):
+    def close(self) -> None:
         """Close the panel and everything in it."""
         close_all(self)

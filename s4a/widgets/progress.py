@@ -1,22 +1,24 @@
-"""An analysis in a process of its own.
+"""An analysis in a process of its own: how far each stage is, cancelled or opened while it runs."""
 
-Stage by stage how far it is, cancelled or opened while it runs.
-"""
-
+import contextlib
 import multiprocessing
 import os
 import signal
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import ipywidgets
+import xarray as xr
 
+from s4a.show.browser import PARTS
 from s4a.study.options import Options
 from s4a.study.pipeline import analyse, in_batches
 from s4a.study.sources import find_sources
 from s4a.study.store import open_study
-from s4a.widgets.panel import Panel, paragraph, row
+from s4a.widgets.explore import Explore
+from s4a.widgets.panel import Panel, row
 
 # stage: the files that it writes, and whether there is one for each shape
 STAGES = {
@@ -55,9 +57,7 @@ def clock(seconds):
 
 
 class Progress(Panel):
-    """Runs :func:`s4a.analyse` in a process of its own and shows how far it is.
-
-    While the notebook stays free.
+    """Runs :func:`s4a.analyse` in a process of its own, beside the notebook, and shows how far it is.
 
     Parameters
     ----------
@@ -77,17 +77,18 @@ class Progress(Panel):
 
     title = "Progress"
 
-    def __init__(self, shapes, store, **options):
+    def __init__(self, shapes: object, store: Path | str, **options: Any):
         self.folder, self.explored = Path(store), None
+        self.opened = []  # the stages that were ready when the panels were filled
         self.arguments = shapes, options | {"store": str(store)}
-        self.given = len(find_sources(shapes, options.get("pattern")))
-        super().__init__(None)
+        self.n_shapes = len(find_sources(shapes, options.get("pattern")))
+        super().__init__(xr.DataTree())  # there is no study yet
         self.start()
 
-    def start(self):
+    def start(self) -> None:
         """Run, from the beginning or where it stopped."""
         self.state, self.stopped, self.started = "running", threading.Event(), time.monotonic()
-        self.first = {}
+        self.clocks = {}  # stage -> when its first file was seen, how many there were, its end
         context = multiprocessing.get_context("spawn")
         self.answer, there = context.Pipe(duplex=False)
         self.process = context.Process(target=work, args=(there, *self.arguments))
@@ -98,89 +99,77 @@ class Progress(Panel):
 
     def build(self):
         """A bar for each stage, and the buttons."""
-        wide = {"description_width": "200px"}
-        self.bars = {
-            stage: ipywidgets.IntProgress(
-                description=stage, max=1, style=wide, layout={"width": "440px"}
-            )
-            for stage in STAGES
-        }
+        look = {"max": 1, "style": {"description_width": "200px"}, "layout": {"width": "440px"}}
+        self.bars = {stage: ipywidgets.IntProgress(description=stage, **look) for stage in STAGES}
         self.texts = {stage: ipywidgets.HTML() for stage in STAGES}
         self.total = ipywidgets.HTML()
-        self.stop = ipywidgets.Button(
-            description="Cancel", tooltip="what is finished stays and is used again"
-        )
-        self.view = ipywidgets.Button(description="Open", tooltip="the stages that are finished")
-        self.go_on = ipywidgets.Button(
-            description="Resume", tooltip="where it stopped", disabled=True
-        )
-        self.go_on.on_click(self.guarded(lambda _: self.start()))
-        self.stop.on_click(self.guarded(lambda _: self.cancel()))
-        self.view.on_click(self.guarded(lambda _: self.show()))
+        self.stop = self.button("Cancel", self.cancel, "what is finished stays and is used again")
+        self.go_on = self.button("Resume", self.start, "where it stopped", disabled=True)
+        self.view = self.button("Open", self.show, "the stages that are finished")
         lines = [row(self.bars[stage], self.texts[stage]) for stage in STAGES]
         return [*lines, row(self.stop, self.go_on, self.view, self.total)]
 
-    def watch(self, stopped):
+    def watch(self, stopped: threading.Event) -> None:
         """Look at the folder until the process ends, in a thread of its own."""
         while self.process.is_alive() and not stopped.wait(EVERY):
             self.guarded(self.look)()
         if not stopped.is_set():
             self.guarded(self.finish)()
 
-    def totals(self, shapes):
+    def totals(self, shapes: int) -> dict[str, int]:
         """How many files each stage writes when so many shapes are usable."""
         pairs = min(self.arguments[1].get("n_pairs", Options.n_pairs), shapes * (shapes - 1) // 2)
-        batches = len(in_batches(range(max(pairs, shapes - 1))))
-        each = {stage: shapes for stage, (_, one_each) in STAGES.items() if one_each}
-        return (
-            dict.fromkeys(STAGES, 1)
-            | each
-            | {"read and clean": self.given, "first maps, in batches": batches}
-        )
+        totals = {stage: shapes if each else 1 for stage, (_, each) in STAGES.items()}
+        totals["read and clean"] = self.n_shapes
+        totals["first maps, in batches"] = len(in_batches(range(max(pairs, shapes - 1))))
+        return totals
 
-    def look(self):
-        """Count the files of every stage.
-
-        What is left is told from the pace since the first file of the stage.
-        """
+    def look(self) -> None:
+        """Count the files of every stage, and show how far it is."""
         now = time.monotonic()
         counts = {
             stage: len(list(self.folder.glob(pattern))) for stage, (pattern, _) in STAGES.items()
         }
-        totals, after = self.totals(counts["read and clean"] or self.given), list(STAGES)
+        totals = self.totals(counts["read and clean"] or self.n_shapes)
+        reached = True  # the stage before has ended
         for i, stage in enumerate(STAGES):
             done, whole = counts[stage], totals[stage]
-            later = any(counts[name] for name in after[i + 1 :])
-            bar, text = self.bars[stage], f"{done} of {whole}"
+            later = any(list(counts.values())[i + 1 :])
+            ended = done >= whole or (done > 0 and later)
+            bar = self.bars[stage]
             bar.max, bar.value = whole, done
-            ended = done >= whole or (done and later)
             bar.bar_style = "success" if ended else "info"
-            begin, had, end = self.first.get(stage, (now, done, now))
-            before = i == 0 or self.bars[after[i - 1]].bar_style == "success"
-            if before and not (ended and stage not in self.first):
-                self.first[stage] = begin, had, end if ended and end > begin else now
-                text += f", {clock(self.first[stage][2] - begin)}"
-            if had < done < whole:
-                text += f", about {clock((now - begin) / (done - had) * (whole - done))} left"
-            self.texts[stage].value = text
-        self.total.value = paragraph(f"{self.state}, {clock(now - self.started)}")
-        ready = [stage for stage in STAGES if self.bars[stage].bar_style == "success"]
+            self.texts[stage].value = self.told(stage, done, whole, ended, reached, now)
+            reached = ended
+        self.total.value = PARTS.paragraph(f"{self.state}, {clock(now - self.started)}")
+        ready = self.ready()
         self.view.disabled = not ready
         if self.explored is not None and ready != self.opened:
             self.opened = ready
             self.explored.extend(open_study(self.folder))
 
-    def finish(self):
+    def told(self, stage, done, whole, ended, reached, now):
+        """How far a stage is, since when, and how long it takes by its pace so far."""
+        text = f"{done} of {whole}"
+        begin, had, end = self.clocks.get(stage, (now, done, now))
+        if reached and not (ended and stage not in self.clocks):
+            self.clocks[stage] = begin, had, end if ended and end > begin else now
+            text += f", {clock(self.clocks[stage][2] - begin)}"
+        if had < done < whole:
+            text += f", about {clock((now - begin) / (done - had) * (whole - done))} left"
+        return text
+
+    def ready(self) -> list[str]:
+        """The stages that have ended."""
+        return [stage for stage, bar in self.bars.items() if bar.bar_style == "success"]
+
+    def finish(self) -> None:
         """What the process said at its end."""
         self.process.join()
-        try:
-            said = (
-                self.answer.recv()
-                if self.answer.poll()
-                else f"the process ended with code {self.process.exitcode}"
-            )
-        except EOFError:
-            said = f"the process ended with code {self.process.exitcode}"
+        said = f"the process ended with code {self.process.exitcode}"
+        with contextlib.suppress(EOFError):
+            if self.answer.poll():
+                said = self.answer.recv()
         if self.state == "running":
             self.state = {"": "finished", "cancelled": "cancelled"}.get(said, "failed")
         self.look()
@@ -188,24 +177,19 @@ class Progress(Panel):
             self.say(said, error=True)
         self.stop.disabled, self.go_on.disabled = True, self.state == "finished"
 
-    def cancel(self):
+    def cancel(self) -> None:
         """End the process; the files that it wrote stay."""
         self.state = "cancelled"
-        if self.process.is_alive():
+        if self.process.pid and self.process.is_alive():
             os.kill(self.process.pid, signal.SIGINT)
             self.process.join(5)
             if self.process.is_alive():
                 self.process.terminate()
         self.say("cancelled; Resume, or the same store, goes on where it stopped")
 
-    def show(self):
-        """Open the panels of what is finished.
-
-        They fill as other stages end, or at another click.
-        """
-        from s4a.widgets.explore import Explore
-
-        self.opened = [stage for stage in STAGES if self.bars[stage].bar_style == "success"]
+    def show(self) -> None:
+        """Open the panels of what is finished; they fill as other stages end."""
+        self.opened = self.ready()
         study = open_study(self.folder)
         if self.explored is None:
             self.explored = Explore(study)
@@ -213,7 +197,7 @@ class Progress(Panel):
         else:
             self.explored.refresh(study)
 
-    def close(self):
+    def close(self) -> None:
         """Cancel a run that goes on, and close everything."""
         self.stopped.set()
         if self.process.is_alive():

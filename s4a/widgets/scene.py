@@ -1,20 +1,31 @@
-"""A surface in three dimensions.
+"""A surface in three dimensions: arrays in, a view that turns, is coloured and can be clicked out.
 
-Arrays in, a view that turns, is coloured and can be clicked out.
+Where the browser has no WebGL2 it says so, and is sent a still picture at every change.
 """
 
-import ipywidgets
+from uuid import uuid4
+
+import anywidget
 import numpy as np
 import traitlets
 
-from s4a.show.draw import checkerboard, image_bytes, on_white, render, rotation, with_balls
-from s4a.show.live import STYLE, as_bytes, color_bytes
-from s4a.widgets.browser import SCENE, anywidget
+from s4a.show.browser import SCENE, STYLE, color_bytes, color_scale, to_bytes
+from s4a.show.draw import (
+    SIGNED,
+    checkerboard,
+    image_bytes,
+    on_white,
+    render,
+    rotation,
+    signed_colors,
+    with_balls,
+)
 
 SIZE = (460, 360)  # pixels of a still picture
+MARK = (0.9, 0.6, 0.0)  # the colour of a marked point
 
 
-def extent(points):
+def extent(points: np.ndarray) -> float:
     """Length of the diagonal of the points' box.
 
     Examples
@@ -27,30 +38,139 @@ def extent(points):
     return float(np.linalg.norm(np.ptp(points, axis=0)))
 
 
-class Surfaces:
-    """What a view of a surface does, whoever draws it.
+def round_number(x: float) -> float:
+    """The next number below that is 1, 2 or 5 times a power of ten.
 
-    The arrays are kept, and a still picture can be made.
+    Examples
+    --------
+    >>> from s4a.widgets.scene import round_number
+    >>> round_number(17.3), round_number(0.6)
+    (10.0, 0.5)
+    """
+    power = 10.0 ** np.floor(np.log10(x))
+    return float(power * max(m for m in (1, 2, 5) if m * power <= x * (1 + 1e-9)))
+
+
+def camera_group() -> str:
+    """A name that no other panel has: the views of one panel turn together, those of two do not."""
+    return uuid4().hex
+
+
+class View(anywidget.AnyWidget):
+    """What views of surfaces share: from where they look, and pictures for want of WebGL2.
+
+    Attributes
+    ----------
+    turn : list of float
+        Rows of the rotation with which the view first stands.
+    group : str
+        Views of one group turn together.
+    webgl : {"", "yes", "no"}
+        Whether the browser has WebGL2; it says so once it draws.
     """
 
-    surface = painted = texture = None
-    points = ()
+    _css = STYLE
+    still = traitlets.Bytes().tag(sync=True)
+    webgl = traitlets.Unicode("").tag(sync=True)
+    group = traitlets.Unicode("").tag(sync=True)
+    turn = traitlets.List().tag(sync=True)
+    height = traitlets.Int(360).tag(sync=True)  # pixels
 
-    def show(self, points, triangles, colors=None, title=None):
-        """Show a surface ``(n, 3)``, ``(m, 3)`` with colours ``(n, 3)``.
+    def drawn(self) -> tuple | None:
+        """Points, triangles and colours of what is seen, None for nothing."""
+        raise NotImplementedError
 
-        What was marked is forgotten.
-        """
+    def picture(self) -> bytes:
+        """PNG bytes of what is seen from where the view first stands; empty for nothing."""
+        drawn = self.drawn()
+        if drawn is None:
+            return b""
+        points, triangles, colors = drawn
+        # the rotation is applied here, and the renderer then looks along z from the top
+        turned = points @ np.reshape(self.turn, (3, 3)).T
+        pixels = render(turned, triangles, colors=colors, view="top", size=SIZE)
+        return image_bytes(on_white(pixels), "png")
+
+    def draw_still(self, change: object = None) -> None:
+        """Send a still picture where the browser has no WebGL2."""
+        if self.webgl == "no":
+            self.still = self.picture()
+
+
+class Scene(View):
+    """A view of one surface.
+
+    Parameters
+    ----------
+    view, up
+        From where the surface is seen first; see :func:`s4a.show.draw.rotation`.
+    **options
+        Of the traits, such as ``title``, ``group``, ``height`` and ``clickable``.
+
+    Attributes
+    ----------
+    clickable : bool
+        Whether places can be picked: by a click, or with a cursor that the arrow keys move over
+        the surface.
+    picked, hovered : dict
+        The place that was clicked, or is under the pointer (where `hovering` is set): ``vertex``
+        (-1 beside the surface), ``face``, ``weights`` in that triangle, and ``point``.
+    """
+
+    _esm = SCENE
+    position = traitlets.Bytes().tag(sync=True)
+    corner = traitlets.Bytes().tag(sync=True)
+    color = traitlets.Bytes().tag(sync=True)
+    coordinate = traitlets.Bytes().tag(sync=True)  # in which the checkerboard is evaluated
+    cell = traitlets.Float(0.0).tag(sync=True)  # its side
+    ghost_position = traitlets.Bytes().tag(sync=True)
+    ghost_corner = traitlets.Bytes().tag(sync=True)
+    points = traitlets.List().tag(sync=True)  # [x, y, z, red, green, blue, radius] each
+    radius = traitlets.Float(0.0).tag(sync=True)
+    link = traitlets.Bytes().tag(sync=True)
+    link_values = traitlets.Bytes().tag(sync=True)
+    link_text = traitlets.Unicode("").tag(sync=True)
+    bar = traitlets.Dict().tag(sync=True)
+    title = traitlets.Unicode("").tag(sync=True)
+    caption = traitlets.Unicode("").tag(sync=True)
+    clickable = traitlets.Bool(False).tag(sync=True)
+    hovering = traitlets.Bool(False).tag(sync=True)
+    picked = traitlets.Dict().tag(sync=True)
+    hovered = traitlets.Dict().tag(sync=True)
+
+    surface = colors = coordinates = None  # what is seen, as arrays
+
+    def __init__(self, *, view="corner", up="z", **options):
+        super().__init__(turn=rotation(view, up).ravel().tolist(), **options)
+        self.observe(self.draw_still, ["webgl", "points"])
+
+    def show(
+        self,
+        points: np.ndarray,
+        triangles: np.ndarray,
+        colors: np.ndarray | None = None,
+        title: str | None = None,
+    ) -> None:
+        """Show a surface ``(n, 3)``, ``(m, 3)`` with colours ``(n, 3)``; marks are forgotten."""
         self.surface = np.asarray(points), np.asarray(triangles)
-        self.painted, self.texture = colors, None
-        self.radius = extent(self.surface[0]) / 100
-        self.unlink()
-        if title is not None:
-            self.title = title
-        self.points = []
-        self.draw_surface()
+        with self.hold_sync():
+            self._send_colors(colors, None, 0.0)
+            self.radius = extent(points) / 100
+            self.points = []
+            self.link = self.link_values = b""
+            if title is not None:
+                self.title = title
+            self.corner = to_bytes(triangles, "uint32")
+            self.position = to_bytes(points, "float32")
+        self.draw_still()
 
-    def paint(self, colors, bar=None, coordinates=None, cell=0.0):
+    def paint(
+        self,
+        colors: np.ndarray | None,
+        bar: dict | None = None,
+        coordinates: np.ndarray | None = None,
+        cell: float = 0.0,
+    ) -> None:
         """Colours of the vertices, and a checkerboard over them.
 
         Parameters
@@ -63,177 +183,63 @@ class Surfaces:
             Where the checkerboard is evaluated; cubes of the side `cell` are bright and dark in
             turn.
         """
-        self.painted, self.texture = (
-            colors,
-            None if coordinates is None else (np.asarray(coordinates), cell),
-        )
-        self.bar = bar or {}
-        self.draw_colors()
+        with self.hold_sync():
+            self.bar = bar or {}
+            self._send_colors(colors, coordinates, cell)
+        self.draw_still()
 
-    def mark(self, points, colors=((0.9, 0.6, 0.0),), radius=None):
-        """Spheres around some points ``(p, 3)``, in the unit of the data.
+    def paint_function(self, values: np.ndarray, label: str) -> None:
+        """A signed function ``(n,)`` as colours, full at the 99 % quantile of what it reaches."""
+        limit = float(np.quantile(np.abs(values), 0.99))
+        self.paint(signed_colors(values, limit), color_scale(SIGNED, -limit, limit, label))
 
-        One colour or one for each.
+    def _send_colors(self, colors, coordinates, cell):
+        self.colors, self.coordinates = colors, coordinates
+        self.color = b"" if colors is None else color_bytes(colors)
+        self.coordinate = b"" if coordinates is None else to_bytes(coordinates, "float32")
+        self.cell = 0.0 if coordinates is None else float(cell)
 
-        The radius is by default a hundredth of the surface's extent.
+    def mark(
+        self, points: np.ndarray, colors: np.ndarray | tuple = (MARK,), radius: float | None = None
+    ) -> None:
+        """Spheres around some points ``(p, 3)``, of one colour or one for each.
+
+        The radius, in the unit of the data, is by default a hundredth of the surface's extent.
         """
         points = np.asarray(points, float).reshape(-1, 3)
-        colors = np.broadcast_to(np.asarray(colors, float), (len(points), 3))
+        colors = np.broadcast_to(np.asarray(colors, float).reshape(-1, 3), points.shape)
         self.radius = self.radius if radius is None else float(radius)
-        self.points = [
-            [*p, *c, self.radius] for p, c in zip(points.tolist(), colors.tolist(), strict=True)
-        ]
+        places = np.concatenate([points, colors], axis=1).tolist()
+        self.points = [[*place, self.radius] for place in places]
 
-    def picture(self):
-        """PNG bytes of the surface from where the view first stands; empty without a surface."""
-        if self.surface is None:
-            return b""
-        turn = np.reshape(self.turn, (3, 3))
-        colors = self.painted
-        if self.texture is not None:
-            colors = np.asarray(colors) * checkerboard(*self.texture)[:, None]
-        points, triangles, colors = with_balls(*self.surface, colors, self.points)
-        # the rotation is applied here, and the renderer then looks along z from the top
-        drawn = render(points @ turn.T, triangles, colors=colors, view="top", size=SIZE)
-        return image_bytes(on_white(drawn), "png")
-
-
-if anywidget is not None:
-
-    class Scene(Surfaces, anywidget.AnyWidget):
-        """A view of one surface in the browser.
+    def connect(self, link: np.ndarray, text: str, values: np.ndarray | None = None) -> None:
+        """Let the browser mark on the other view of the group what is picked on this one.
 
         Parameters
         ----------
-        title : str
-        group : str
-            Views of one group turn together.
-        view, up
-            From where the surface is seen first; see :func:`s4a.show.draw.rotation`.
-        height : int
-            In pixels.
-
-        Attributes
-        ----------
-        clickable : bool
-            Whether places can be picked: by a click, or with a cursor that the arrow keys move over
-            the surface.
-        picked, hovered : dict
-            The place that was clicked, or is under the pointer (where `hovering` is set):
-            ``vertex`` (-1 beside the surface), ``face``, ``weights`` in that triangle, and
-            ``point``.
+        link : int ndarray (n,)
+            A vertex of the other view for each vertex, -1 for none.
+        text : str
+            What is said of them, with ``{here}`` and ``{there}`` for the two.
+        values : float ndarray (n,), optional
+            The confidence, from 0 to 1.
         """
+        percent = b"" if values is None else to_bytes(100 * np.asarray(values) + 0.5, "uint8")
+        with self.hold_sync():
+            self.link_text, self.link_values = text, percent
+            self.link = to_bytes(link, "int32")
 
-        _esm, _css = SCENE, STYLE
-        position, corner, color, coordinate, still = (
-            traitlets.Bytes().tag(sync=True) for _ in range(5)
-        )
-        cell, radius = (traitlets.Float(0.0).tag(sync=True) for _ in range(2))
-        link, link_values = (traitlets.Bytes().tag(sync=True) for _ in range(2))
-        link_text = traitlets.Unicode("").tag(sync=True)
-        clickable = traitlets.Bool(False).tag(sync=True)
-        ghost_position, ghost_corner = (traitlets.Bytes().tag(sync=True) for _ in range(2))
-        points = traitlets.List().tag(sync=True)
-        bar, picked, hovered = (traitlets.Dict().tag(sync=True) for _ in range(3))
-        hovering = traitlets.Bool(False).tag(sync=True)
-        title, caption, group = (traitlets.Unicode("").tag(sync=True) for _ in range(3))
-        webgl = traitlets.Unicode("").tag(sync=True)
-        turn = traitlets.List().tag(sync=True)
-        height = traitlets.Int(360).tag(sync=True)
+    def over(self, points: np.ndarray | None = None, triangles: np.ndarray | None = None) -> None:
+        """A second surface that shines through, None for none."""
+        with self.hold_sync():
+            self.ghost_corner = b"" if triangles is None else to_bytes(triangles, "uint32")
+            self.ghost_position = b"" if points is None else to_bytes(points, "float32")
 
-        def __init__(self, *, view="corner", up="z", **options):
-            super().__init__(turn=rotation(view, up).ravel().tolist(), **options)
-            self.observe(self.draw_still, ["webgl", "points"])
-
-        def draw_surface(self):
-            """Send the surface and its colours, in one message."""
-            with self.hold_sync():
-                self.corner = as_bytes(self.surface[1], "uint32")
-                self.send_colors()
-                self.position = as_bytes(self.surface[0], "float32")
-            self.draw_still()
-
-        def send_colors(self):
-            """Colours and checkerboard as bytes."""
-            self.color = b"" if self.painted is None else color_bytes(self.painted)
-            self.coordinate = b"" if self.texture is None else as_bytes(self.texture[0], "float32")
-            self.cell = 0.0 if self.texture is None else float(self.texture[1])
-
-        def connect(self, link, text, values=None):
-            """Let the browser mark on the other view of the group what is picked on this one.
-
-            `link` is a vertex of the other view for each vertex, -1 for none; `text` says so, with
-            ``{here}`` and ``{there}`` for the two; `values` from 0 to 1 are the confidence.
-            """
-            with self.hold_sync():
-                self.link, self.link_text = as_bytes(link, "int32"), text
-                self.link_values = (
-                    b"" if values is None else as_bytes(100 * np.asarray(values) + 0.5, "uint8")
-                )
-
-        def unlink(self):
-            """Nothing is marked on another view."""
-            with self.hold_sync():
-                self.link = self.link_values = b""
-
-        def draw_colors(self):
-            """Send the colours."""
-            with self.hold_sync():
-                self.send_colors()
-            self.draw_still()
-
-        def over(self, points=None, triangles=None):
-            """A second surface that shines through, None for none."""
-            with self.hold_sync():
-                self.ghost_corner = b"" if points is None else as_bytes(triangles, "uint32")
-                self.ghost_position = b"" if points is None else as_bytes(points, "float32")
-
-        def draw_still(self, change=None):
-            """Send a still picture where the browser has no WebGL2."""
-            if self.webgl == "no" and self.surface is not None:
-                self.still = self.picture()
-
-
-class StillScene(Surfaces, ipywidgets.VBox):
-    """The view where anywidget is not installed.
-
-    A picture that Python draws again at every change.
-    """
-
-    title, caption, radius = traitlets.Unicode(""), traitlets.Unicode(""), traitlets.Float(0.0)
-    points, turn = traitlets.List(), traitlets.List()
-    bar, picked, hovered = traitlets.Dict(), traitlets.Dict(), traitlets.Dict()
-    hovering = traitlets.Bool(False)
-
-    def __init__(self, *, view="corner", up="z", title="", **options):
-        self.image, self.text = ipywidgets.Image(format="png"), ipywidgets.HTML()
-        super().__init__([self.text, self.image], turn=rotation(view, up).ravel().tolist())
-        self.observe(self.write, ["title", "caption", "bar"])
-        self.title = title
-
-    def write(self, change=None):
-        """Title, caption and ends of the colour bar as text."""
-        from html import escape
-
-        bar = f" (colours from {self.bar['low']:.3g} to {self.bar['high']:.3g})" if self.bar else ""
-        self.text.value = f"<b>{escape(self.title)}</b>{bar}<br>{escape(self.caption)}"
-
-    def draw_surface(self):
-        """Draw the picture again."""
-        self.image.value = self.picture()
-
-    draw_colors = draw_surface
-
-    def connect(self, link, text, values=None):
-        """Nothing runs in the browser that could mark a point."""
-
-    def unlink(self):
-        """There is nothing to undo."""
-
-    def over(self, points=None, triangles=None):
-        """A second surface cannot shine through a picture: nothing is drawn."""
-
-
-def scene(**options):
-    """A view of a surface: :class:`Scene`, or pictures where anywidget is not installed."""
-    return StillScene(**options) if anywidget is None else Scene(**options)
+    def drawn(self):
+        """The surface with its checkerboard and its marked points."""
+        if self.surface is None:
+            return None
+        colors = self.colors
+        if self.coordinates is not None:
+            colors = np.asarray(colors) * checkerboard(self.coordinates, self.cell)[:, None]
+        return with_balls(*self.surface, colors, self.points)

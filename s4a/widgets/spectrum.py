@@ -1,27 +1,19 @@
-"""Spectra (3.3): the eigenvalues of all shapes, their eigenfunctions.
-
-And what a few of them can say of a shape.
-"""
+"""Spectra (3.3): eigenvalues of all shapes, eigenfunctions, what a few of them say of a shape."""
 
 import ipywidgets
 import numpy as np
 import traitlets
 
 from s4a.method.spectral import reconstruct, weyl
-from s4a.show.draw import SIGNED, signed_colors
-from s4a.show.live import color_bar
-from s4a.widgets.chart import chart
-from s4a.widgets.meshes import camera_group, surface, unit_of
-from s4a.widgets.panel import Panel, beside, row
-from s4a.widgets.scene import scene
-
-TITLES = ("Eigenvalues: click a curve", "The same, less Weyl's law")
+from s4a.show.charts import BLUE, GREY, ORANGE
+from s4a.show.surfaces import surface, unit_text
+from s4a.widgets.chart import Chart
+from s4a.widgets.panel import Panel, beside, dropdown, int_slider, row
+from s4a.widgets.scene import Scene, camera_group
 
 
 class Spectrum(Panel):
-    """Eigenvalues with Weyl's line; one eigenfunction on the surface.
-
-    The surface from its first k coefficients.
+    """Eigenvalues with Weyl's line, an eigenfunction, the surface from its first k coefficients.
 
     Attributes
     ----------
@@ -37,117 +29,102 @@ class Spectrum(Panel):
 
     def build(self, view="corner", up="z"):
         """Choices, curves and two surfaces."""
-        self.names = [
-            name
-            for name, node in self.study["coarse"].children.items()
-            if "eigenvalue" in node.data_vars
-        ]
-        self.values = [self.study["coarse"][name]["eigenvalue"].values for name in self.names]
-        k = min(len(values) for values in self.values)
-        self.choice = ipywidgets.Dropdown(options=self.names, description="shape")
-        wide = {"width": "340px"}
-        self.mode = ipywidgets.IntSlider(1, min=0, max=k - 1, description="mode", layout=wide)
-        self.k = ipywidgets.IntSlider(
-            min(20, k), min=1, max=k, description="first k", continuous_update=False, layout=wide
-        )
-        self.curves, self.gaps = chart(), chart()
-        group = camera_group()
-        self.function = scene(group=group, view=view, up=up, height=300)
-        self.rebuilt = scene(group=group, view=view, up=up, height=300)
+        nodes = self.study["coarse"].children.items()
+        self.eigenvalues = {
+            name: node["eigenvalue"].values for name, node in nodes if "eigenvalue" in node
+        }
+        self.names = list(self.eigenvalues)
+        k = min(len(values) for values in self.eigenvalues.values())
+        self.choice = dropdown("shape", self.names)
+        self.mode = int_slider("mode", 1, 0, k - 1, continuous_update=True)
+        self.k = int_slider("first k", min(20, k), 1, k)
+        self.curves, self.gaps = Chart(), Chart()
+        look = {"group": camera_group(), "view": view, "up": up, "height": 300}
+        self.function, self.rebuilt = Scene(**look), Scene(**look)
         self.on_change(self.choice, lambda value: self.set_trait("shape", value))
         self.on_change(self.curves, self.pick, "picked")
         self.on_change(self.gaps, self.pick, "picked")
-        self.on_change(self.mode, lambda _: self.show_mode())
-        self.on_change(self.k, lambda _: self.show_rebuilt())
+        self.redraw(self.show_mode, self.mode)
+        self.redraw(self.show_rebuilt, self.k)
         self.on_change(self, lambda _: self.take(), "shape")
         self.shape = self.names[0]
-        return [
-            row(self.choice),
-            beside(self.curves, self.gaps),
-            beside(
-                ipywidgets.VBox([self.mode, self.function]), ipywidgets.VBox([self.k, self.rebuilt])
-            ),
-        ]
+        modes = ipywidgets.VBox([self.mode, self.function])
+        rebuilt = ipywidgets.VBox([self.k, self.rebuilt])
+        return [row(self.choice), beside(self.curves, self.gaps), beside(modes, rebuilt)]
 
-    def pick(self, mark):
+    def pick(self, mark: dict) -> None:
         """The curve that was clicked."""
         if mark["series"] in self.names:
             self.shape = mark["series"]
 
-    def take(self):
+    def take(self) -> None:
         """Another shape."""
         self.choice.value = self.shape
         self.mesh = self.study["coarse"][self.shape].to_dataset()
         self.surface = surface(self.study, self.shape)
         self.function.show(*self.surface)
-        self.draw()
         self.show_mode()
         self.show_rebuilt()
 
-    def draw(self):
+    def draw(self) -> None:
         """The eigenvalues of all shapes, as they are and as they differ from Weyl's law."""
-        longest = max(len(values) for values in self.values)
+        law = weyl(max(map(len, self.eigenvalues.values())))
         line = {
             "name": "Weyl: 4 π k",
-            "x": np.arange(longest),
-            "color": "#777777",
+            "x": np.arange(len(law)),
+            "color": GREY,
             "dash": "6 4",
+            "wide": True,
             "legend": True,
         }
-        order = sorted(
-            range(len(self.names)), key=lambda i: self.names[i] == self.shape
-        )  # the chosen one on top
-        for view, away, label in (
-            (self.curves, False, "eigenvalue, unit area"),
-            (self.gaps, True, "eigenvalue − 4 π k"),
-        ):
-            series = [line | {"wide": True, "y": weyl(longest) * (not away)}]
-            series += [self.curve(i, away) for i in order]
-            view.draw(
-                "lines",
-                series=series,
-                marker=self.mode.value,
-                xlabel="mode k",
-                ylabel=label,
-                title=TITLES[away],
-                legend="left" if away else "bottom",
-            )
+        look = {"xlabel": "mode k", "marker": self.mode.value}
+        last = sorted(self.names, key=lambda name: name == self.shape)  # the chosen one on top
+        self.curves.draw(
+            "lines",
+            series=[line | {"y": law}, *(self.curve(name, 0 * law) for name in last)],
+            title="Eigenvalues: click a curve",
+            ylabel="eigenvalue, unit area",
+            legend="bottom",
+            **look,
+        )
+        self.gaps.draw(
+            "lines",
+            series=[line | {"y": 0 * law}, *(self.curve(name, law) for name in last)],
+            title="The same, less Weyl's law",
+            ylabel="eigenvalue − 4 π k",
+            legend="left",
+            **look,
+        )
 
-    def curve(self, i, away):
-        """The curve of a shape; from Weyl's law where it is drawn `away` from it."""
-        name, values, chosen = self.names[i], self.values[i], self.names[i] == self.shape
+    def curve(self, name: str, law: np.ndarray) -> dict:
+        """The curve of a shape's eigenvalues less `law`."""
+        values, chosen = self.eigenvalues[name], name == self.shape
+        last = f"number {len(values) - 1} is {values[-1]:.1f}"
         return {
             "name": name,
             "x": np.arange(len(values)),
-            "y": values - weyl(len(values)) * away,
-            "text": f"{name}: the second eigenvalue is {values[1]:.2f}, number {len(values) - 1} is {values[-1]:.1f}",
+            "y": values - law[: len(values)],
+            "text": f"{name}: the second eigenvalue is {values[1]:.2f}, {last}",
             "wide": chosen,
-            "color": "#d55e00" if chosen else "#0072b2",
+            "color": ORANGE if chosen else BLUE,
             "legend": chosen,
         }
 
-    def show_mode(self):
+    def show_mode(self) -> None:
         """One eigenfunction as colours."""
         mode = self.mode.value
-        function = self.mesh["eigenfunction"].values[:, mode]
-        limit = float(np.quantile(np.abs(function), 0.99))
-        self.function.title = (
-            f"φ{mode} of {self.shape}, eigenvalue {self.mesh['eigenvalue'].values[mode]:.2f}"
-        )
-        self.function.paint(
-            signed_colors(function, limit), color_bar(SIGNED, -limit, limit, "eigenfunction")
-        )
+        eigenvalue = self.eigenvalues[self.shape][mode]
+        self.function.title = f"φ{mode} of {self.shape}, eigenvalue {eigenvalue:.2f}"
+        self.function.paint_function(self.mesh["eigenfunction"].values[:, mode], "eigenfunction")
         self.draw()
 
-    def show_rebuilt(self):
+    def show_rebuilt(self) -> None:
         """The surface from the first k coefficients of its positions."""
         X, T = self.surface
-        rebuilt = reconstruct(self.mesh, X, k=self.k.value)
-        gap = np.linalg.norm(rebuilt - X, axis=1)
-        unit = unit_of(self.study, self.shape)
-        self.rebuilt.show(
-            rebuilt,
-            T,
-            title=f"from {self.k.value} of {len(self.mesh['eigenvalue'])} eigenfunctions",
-        )
-        self.rebuilt.caption = f"mean distance to the surface {gap.mean():.3g} ({unit})"
+        k = self.k.value
+        rebuilt = reconstruct(self.mesh, X, k=k)
+        gap = np.linalg.norm(rebuilt - X, axis=1).mean()
+        title = f"from {k} of {len(self.eigenvalues[self.shape])} eigenfunctions"
+        self.rebuilt.show(rebuilt, T, title=title)
+        unit = unit_text(self.study, self.shape)
+        self.rebuilt.caption = f"mean distance to the surface {gap:.3g} ({unit})"

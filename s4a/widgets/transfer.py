@@ -1,25 +1,23 @@
-"""Transfer (6.2, Fig. 6 and 7).
-
-Labels and landmarks of one shape, carried to another while they are placed.
-"""
+"""Transfer (6.2, Fig. 6 and 7): labels and landmarks of one shape, carried to another."""
 
 import itertools
-from html import escape
 from pathlib import Path
 
 import ipywidgets
 import numpy as np
 import traitlets
+import xarray as xr
+from matplotlib.colors import to_hex
 
 from s4a.analysis.transfer import transfer_labels, transfer_landmarks
 from s4a.geometry.mesh import as_arrays
 from s4a.input.annotations import write_landmarks
 from s4a.schema import dataset
+from s4a.show.browser import PARTS
 from s4a.show.draw import label_colors
-from s4a.show.pictures import aligned, names_of
-from s4a.widgets.meshes import camera_group, nice, unit_of
-from s4a.widgets.panel import Panel, beside, paragraph, row
-from s4a.widgets.scene import extent, scene
+from s4a.show.surfaces import aligned, names_of, unit_text
+from s4a.widgets.panel import Panel, beside, dropdown, file_name, row
+from s4a.widgets.scene import Scene, camera_group, extent, round_number
 
 COLUMNS = ["name", "x", "y", "z", "confidence"]
 LEGEND = 24  # labels that have colours of their own
@@ -28,10 +26,8 @@ LEGEND = 24  # labels that have colours of their own
 class Transfer(Panel):
     """Labels in colours and landmarks as spheres on two shapes.
 
-    A click on the source places or moves a landmark.
-
-    The keyboard does the same: C on the source starts a cursor, the arrow keys move it over the
-    surface, Enter places.
+    A click on the source places or moves a landmark.  The keyboard does the same: C on the source
+    starts a cursor, the arrow keys move it over the surface, Enter places.
 
     Attributes
     ----------
@@ -49,55 +45,45 @@ class Transfer(Panel):
 
     def build(self, view="corner", up="z"):
         """Choices, the two surfaces, legend and table."""
-        names, template = (
-            names_of(self.study["registration"].dataset),
-            self.study["registration"].attrs["template"],
-        )
+        registration = self.study["registration"].dataset
+        names, template = names_of(registration), str(registration.attrs["template"])
         self.choices = {
-            "source": ipywidgets.Dropdown(options=names, value=str(template), description="source"),
-            "target": ipywidgets.Dropdown(options=names, description="target"),
+            "source": dropdown("source", names, value=template),
+            "target": dropdown("target", names),
         }
         self.labels = ipywidgets.Checkbox(
             True, description="labels", indent=False, layout={"width": "auto"}
         )
         self.name = ipywidgets.Combobox(description="landmark", placeholder="a name, then click")
-        self.remove = ipywidgets.Button(description="Remove", tooltip="the landmark that is named")
-        self.path = ipywidgets.Text("landmarks.csv", description="file", layout={"width": "260px"})
-        self.csv = ipywidgets.Button(description="Save CSV", tooltip="the landmarks on the target")
+        self.remove = self.button(
+            "Remove", lambda: self.drop(self.landmark), "the landmark that is named"
+        )
         self.radius = ipywidgets.BoundedFloatText(
-            1,
+            round_number(extent(registration["position"].values) / 60),
             min=0,
             max=1e9,
             step=0.5,
-            description="radius",
+            description=f"radius ({unit_text(self.study, template)})",
+            style={"description_width": "initial"},
             tooltip="of the spheres",
             layout={"width": "180px"},
         )
+        self.path = file_name("landmarks.csv")
+        self.csv = self.saving(
+            "Save CSV", lambda: self.save_csv(self.path.value), "the landmarks on the target"
+        )
         self.legend, self.table = ipywidgets.HTML(), ipywidgets.HTML()
-        group = camera_group()
-        self.scenes = [
-            scene(group=group, view=view, up=up, height=380, clickable=not i) for i in range(2)
-        ]
+        look = {"group": camera_group(), "view": view, "up": up, "height": 380}
+        self.scenes = [Scene(**look, clickable=True), Scene(**look)]
         for role, choice in self.choices.items():
             self.on_change(choice, lambda value, role=role: self.set_trait(role, value))
             self.on_change(self, lambda _: self.draw(), role)
-        self.on_change(self.labels, lambda _: self.paint())
-        self.on_change(self.name, lambda value: self.set_trait("landmark", value))
-        self.on_change(self, lambda value: setattr(self.name, "value", value), "landmark")
+        self.redraw(self.paint, self.labels)
+        self.redraw(self.carry, self.radius)
+        traitlets.link((self.name, "value"), (self, "landmark"))
         self.on_change(self.scenes[0], self.place, "picked")
-        self.remove.on_click(self.guarded(lambda _: self.drop(self.landmark)))
-        self.csv.on_click(
-            self.guarded(lambda _: self.say(f"written: {self.save_csv(self.path.value)}"))
-        )
-        size = extent(self.study["registration"]["position"].values)
-        self.radius.value, self.radius.description = (
-            nice(size / 60),
-            f"radius ({unit_of(self.study, template)})",
-        )
-        self.radius.style.description_width = "initial"
-        self.on_change(self.radius, lambda _: self.carry())
         with self.hold_trait_notifications():
-            self.source = str(template)
+            self.source = template
             self.target = next(name for name in names if name != template)
         return [
             row(*self.choices.values(), self.labels),
@@ -107,68 +93,66 @@ class Transfer(Panel):
             self.table,
         ]
 
-    def control(self, name):
+    def control(self, name: str) -> ipywidgets.Widget:
         """The control of a name in `live`."""
         return self.choices.get(name) or super().control(name)
 
-    def mesh(self, name):
+    def mesh(self, name: str) -> xr.Dataset:
         """The mesh of a shape, in its own coordinates."""
         return self.study["original"][name].to_dataset()
 
-    def draw(self):
+    def draw(self) -> None:
         """Both surfaces; the landmarks that the source has in the study are placed on it."""
         if not self.source or not self.target:
             return
         self.choices["source"].value, self.choices["target"].value = self.source, self.target
         mesh = self.mesh(self.source)
-        self.marks = {}
+        self.marks = {}  # name -> position (3,) on the source, in its own coordinates
         if "landmark_position" in mesh:
-            names = mesh["landmark_name"].values.astype(str)
-            self.marks = dict(zip(names.tolist(), mesh["landmark_position"].values, strict=True))
-        for view, name, role in zip(
-            self.scenes, (self.source, self.target), ("source", "target"), strict=True
-        ):
+            names = mesh["landmark_name"].values.astype(str).tolist()
+            self.marks = dict(zip(names, mesh["landmark_position"].values, strict=True))
+        roles = {"source": self.source, "target": self.target}
+        for scene, (role, name) in zip(self.scenes, roles.items(), strict=True):
             X, T = as_arrays(self.mesh(name))
-            view.show(
-                aligned(self.study, name, X), T, title=f"{name}, the {role}, {len(X):,} vertices"
-            )
+            title = f"{name}, the {role}, {len(X):,} vertices"
+            scene.show(aligned(self.study, name, X), T, title=title)
         self.paint()
         self.carry()
 
-    def paint(self):
+    def paint(self) -> None:
         """The source's labels on both surfaces, and what their colours are."""
         mesh = self.mesh(self.source)
-        self.legend.value = (
-            "" if "label" in mesh else paragraph(f"{escape(self.source)} has no labels.")
-        )
+        self.legend.value = ""
+        if "label" not in mesh:
+            self.legend.value = PARTS.paragraph(f"{self.source} has no labels.")
         if "label" not in mesh or not self.labels.value:
-            for view in self.scenes:
-                view.paint(None)
+            for scene in self.scenes:
+                scene.paint(None)
             return
-        label = mesh["label"].values
-        self.carried = transfer_labels(
-            self.study, label, source=self.source, targets=[self.target]
-        )[self.target]
-        found, confidence = self.carried["label"].values, self.carried["confidence"].values.mean()
-        values = np.unique(label)
+        here = mesh["label"].values
+        on_target = transfer_labels(self.study, here, source=self.source, targets=[self.target])
+        self.carried = on_target[self.target]
+        there, confidence = (self.carried[key].values for key in ("label", "confidence"))
+        values = np.unique(here)
         colors = label_colors(values)  # in the order of the values, so that both surfaces agree
-        for view, one in zip(self.scenes, (label, found), strict=True):
-            view.paint(colors[np.searchsorted(values, one)])
-        self.scenes[
-            1
-        ].caption = f"labels carried from {self.source}, confidence {confidence:.2f} on average"
-        names = "".join(
-            f'<span style="white-space:nowrap;margin-right:1em"><span style="display:inline-block;width:1em;height:1em;'
-            f'background:rgb({",".join(str(round(255 * c)) for c in color)})"></span> {escape(str(value))}: '
-            f"{np.mean(label == value):.1%}, {np.mean(found == value):.1%}</span>"
+        for scene, label in zip(self.scenes, (here, there), strict=True):
+            scene.paint(colors[np.searchsorted(values, label)])
+        caption = (
+            f"labels carried from {self.source}, confidence {confidence.mean():.2f} on average"
+        )
+        self.scenes[1].caption = caption
+        labels = [
+            {
+                "name": value,
+                "color": to_hex(color),
+                "here": f"{np.mean(here == value):.1%}",
+                "there": f"{np.mean(there == value):.1%}",
+            }
             for value, color in zip(values, colors, strict=True)
-        )
-        more = " Colours repeat." if len(values) > LEGEND else ""
-        self.legend.value = paragraph(
-            f"Labels, shares of the vertices on source and target: {names}{more}"
-        )
+        ]
+        self.legend.value = PARTS.legend(labels, len(values) > LEGEND)
 
-    def place(self, place):
+    def place(self, place: dict) -> None:
         """A click on the source: the landmark that is named comes there; a new one gets a name."""
         if place.get("vertex", -1) < 0:
             return
@@ -178,64 +162,50 @@ class Transfer(Panel):
         self.marks[name] = np.asarray(place["weights"]) @ X[T[place["face"]]]
         self.carry()
 
-    def drop(self, name):
+    def drop(self, name: str) -> None:
         """Remove a landmark."""
         if self.marks.pop(name, None) is None:
             raise ValueError(f"no landmark {name!r}; there are {', '.join(self.marks) or 'none'}")
         self.landmark = ""
         self.carry()
 
-    def landmarks(self):
+    def landmarks(self) -> xr.Dataset | None:
         """The landmarks on the target, as :func:`s4a.transfer_landmarks` gives them.
 
         None without any.
         """
         if not self.marks:
             return None
-        marked = dataset(
-            landmark_name=list(self.marks), landmark_position=np.stack(list(self.marks.values()))
-        )
-        found = transfer_landmarks(self.study, marked, source=self.source, targets=[self.target])
-        return found[self.target].to_dataset()
+        positions = np.stack(list(self.marks.values()))
+        marked = dataset(landmark_name=list(self.marks), landmark_position=positions)
+        carried = transfer_landmarks(self.study, marked, source=self.source, targets=[self.target])
+        return carried[self.target].to_dataset()
 
-    def carry(self):
+    def carry(self) -> None:
         """Carry all landmarks over and show them on both surfaces, with their numbers."""
         self.name.options = tuple(self.marks)
-        found = self.landmarks()
-        here = np.stack(list(self.marks.values())) if self.marks else np.zeros((0, 3))
-        there = np.zeros((0, 3)) if found is None else found["landmark_position"].values
-        colors = label_colors(np.arange(len(here))) if len(here) else ()
-        for view, name, points in zip(
-            self.scenes, (self.source, self.target), (here, there), strict=True
-        ):
-            view.mark(aligned(self.study, name, points), colors, self.radius.value) if len(
-                points
-            ) else view.mark([])
-        if found is None:
-            self.table.value = paragraph("Click on the source to place a landmark.")
+        carried = self.landmarks()
+        if carried is None:
+            for scene in self.scenes:
+                scene.mark([])
+            self.table.value = PARTS.paragraph("Click on the source to place a landmark.")
             return
-        values = zip(self.marks, there, found["landmark_confidence"].values, strict=True)
-        rows = [[name, *(f"{x:.2f}" for x in point), f"{sure:.2f}"] for name, point, sure in values]
-        self.table.value = html_table(f"Landmarks on {self.target}", COLUMNS, rows)
+        here, there = np.stack(list(self.marks.values())), carried["landmark_position"].values
+        colors = label_colors(np.arange(len(here)))
+        ends = zip(self.scenes, (self.source, self.target), (here, there), strict=True)
+        for scene, name, points in ends:
+            scene.mark(aligned(self.study, name, points), colors, self.radius.value)
+        sure = carried["landmark_confidence"].values
+        numbers = np.column_stack([there, sure])
+        rows = [
+            [name, *(f"{number:.2f}" for number in numbers[i])] for i, name in enumerate(self.marks)
+        ]
+        self.table.value = PARTS.landmarks(f"Landmarks on {self.target}", COLUMNS, rows)
 
-    def save_csv(self, path):
+    def save_csv(self, path: Path | str) -> Path:
         """Write the landmarks on the target as CSV ``name,x,y,z``, in its coordinates."""
-        found = self.landmarks()
-        if found is None:
+        carried = self.landmarks()
+        if carried is None:
             raise ValueError("there are no landmarks to save; click on the source to place one")
-        write_landmarks(path, found)
+        write_landmarks(path, carried)
         return Path(path)
-
-
-def html_table(caption, columns, rows):
-    """A small table, escaped."""
-    head = "".join(
-        f"<th style='text-align:left;padding-right:1em'>{escape(c)}</th>" for c in columns
-    )
-    body = "".join(
-        "<tr>"
-        + "".join(f"<td style='padding-right:1em'>{escape(str(c))}</td>" for c in row)
-        + "</tr>"
-        for row in rows
-    )
-    return f"<table style='line-height:1.4'><caption>{escape(caption)}</caption><tr>{head}</tr>{body}</table>"

@@ -20,7 +20,6 @@ from comm import DummyComm
 
 import s4a
 from s4a import widgets
-from s4a.widgets import page
 
 CHROMIUM = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
@@ -121,7 +120,6 @@ def main():
     from playwright.sync_api import sync_playwright
 
     count = Count()
-    page.LIMIT = 0  # the pages hold what is shown and nothing else
     sys.stdout.write("| " + " | ".join(COLUMNS) + " |\n" + "|---" * len(COLUMNS) + "|\n")
     with sync_playwright() as driver, tempfile.TemporaryDirectory() as folder:
         browser = driver.chromium.launch(executable_path=CHROMIUM, args=SWITCHES)

@@ -15,7 +15,7 @@ from paths import TESTS
 
 from s4a import analyse, cli, insert, open_study, read_shapes
 from s4a.geometry.mesh import as_dataset, euler_characteristic
-from s4a.show.page import page
+from s4a.show.page import study_html
 from s4a.study.report import doubtful, tied
 
 SMALL = {"n_coarse": 100, "k_init": 6, "k": 10, "step": 4, "refine": "intrinsic"}
@@ -105,7 +105,7 @@ def test_a_run_over_all_faults_ends_with_ten_good_shapes(in_python, checked, ran
 
 
 def test_the_page_of_a_study_escapes_the_names_of_files(ran):
-    html = page(ran[2])
+    html = study_html(ran[2])
     assert "<img src=x" not in html
     assert "&lt;img src=x" in html
 

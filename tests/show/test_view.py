@@ -120,13 +120,13 @@ def study():
 
 @pytest.fixture(scope="module")
 def html(study):
-    return page.page(study, title="Seven <ellipsoids>")
+    return page.study_html(study, title="Seven <ellipsoids>")
 
 
 def test_a_sphere_is_drawn_as_a_disk_of_its_area():
     X, T = sphere(40)
     picture = draw.render(X, T, size=(200, 200))
-    assert pictures.shape == (200, 200, 4)
+    assert picture.shape == (200, 200, 4)
     assert picture[..., 3].sum() / 255 == pytest.approx(np.pi * (0.94 * 100) ** 2, rel=0.01)
     assert picture[100, 100, 3] == 255
     assert picture[0, 0, 3] == 0
@@ -245,7 +245,7 @@ def test_the_page_holds_the_modes_as_they_are(study, html):
 
 
 def test_the_page_is_the_same_every_time(study, html):
-    assert page.page(study, title="Seven <ellipsoids>") == html
+    assert page.study_html(study, title="Seven <ellipsoids>") == html
 
 
 @pytest.mark.parametrize(
@@ -264,7 +264,7 @@ def test_an_unfinished_study_shows_what_there_is(study, node, tmp_path, monkeypa
 
 
 def test_an_empty_study_gives_a_page_too():
-    text = page.page(xr.DataTree())
+    text = page.study_html(xr.DataTree())
     assert "The study is empty." in text
     assert text.count("Not there") == len(page.SECTIONS)
 
@@ -274,7 +274,7 @@ def test_modes_that_could_not_be_are_explained(study):
     del part["pca"]
     part["report"].attrs["no_modes"] = "three shapes are needed <found 2>"
     del part["coarse"], part["registration"]
-    assert "three shapes are needed &lt;found 2&gt;" in page.page(part)
+    assert "three shapes are needed &lt;found 2&gt;" in page.study_html(part)
 
 
 def test_the_picture_of_the_modes_is_blue_where_the_shape_grows(study, tmp_path):

@@ -20,7 +20,7 @@ import pytest
 from paths import NOTEBOOKS
 
 import s4a
-from s4a.show.pictures import aligned
+from s4a.show.surfaces import aligned
 
 playwright = pytest.importorskip("playwright.sync_api")
 pytest.importorskip("jupyterlab")

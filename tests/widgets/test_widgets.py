@@ -16,15 +16,16 @@ import pytest
 import xarray as xr
 
 pytest.importorskip("anywidget")
-from ipywidgets import Image
+from IPython.core.interactiveshell import ExecutionInfo, InteractiveShell
 from ipywidgets.widgets import widget as registry  # the open widgets are counted in it
 
 import s4a
 from s4a.geometry.mesh import vertex_normals
 from s4a.method.shape import Shape
+from s4a.show.browser import color_bytes
 from s4a.show.draw import position_colors
-from s4a.show.live import color_bytes
-from s4a.show.pictures import aligned, mesh_of
+from s4a.show.panel_page import widgets_in
+from s4a.show.surfaces import aligned, mesh_of
 from s4a.widgets import (
     Correspondence,
     Explore,
@@ -36,13 +37,9 @@ from s4a.widgets import (
     Spectrum,
     Transfer,
 )
-from s4a.widgets import chart as chart_module
 from s4a.widgets import explore as explore_module
-from s4a.widgets import modes_view as modes_module
-from s4a.widgets import page as page_module
-from s4a.widgets import scene as scene_module
-from s4a.widgets.modes_view import StillModes, painted
-from s4a.widgets.scene import StillScene, scene
+from s4a.widgets.modes_view import ModesView
+from s4a.widgets.scene import Scene, View
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +78,7 @@ def tetrahedron():
 
 def test_a_scene_holds_the_arrays_as_float32_and_uint32():
     X, T = tetrahedron()
-    view = scene(title="solid")
+    view = Scene(title="solid")
     view.show(X, T, position_colors(X))
     assert (floats(view.position) == X.astype(np.float32)).all()
     assert (np.frombuffer(view.corner, "<u4").reshape(-1, 3) == T).all()
@@ -96,7 +93,7 @@ def test_unknown_colours_are_grey():
 
 
 def test_without_webgl_a_still_picture_is_sent():
-    view = scene()
+    view = Scene()
     view.show(*tetrahedron())
     assert view.still == b""
     view.webgl = "no"
@@ -111,9 +108,9 @@ def test_a_still_picture_looks_from_where_the_view_stands():
     X, T = tetrahedron()
     pictures = []
     for direction in ("front", "top"):
-        view = StillScene(view=direction)
+        view = Scene(view=direction, webgl="no")
         view.show(X * [1, 2, 3], T)
-        pictures.append(view.image.value)
+        pictures.append(view.still)
         view.close()
     assert pictures[0] != pictures[1]
 
@@ -168,57 +165,28 @@ def test_fewer_modes_can_be_shown(panel):
     assert len(modes.scores) == len(modes.view.ratio) == 2
 
 
-@pytest.fixture
-def bare(monkeypatch):
-    """As it is where anywidget is not installed."""
-    for module in (scene_module, chart_module, modes_module):
-        monkeypatch.setattr(module, "anywidget", None)
-
-
-def test_without_anywidget_every_panel_shows_pictures(study, panel, bare):
-    for kind in (Modes, Network, FunctionalMap, Median, Correspondence, Transfer, Spectrum):
-        pictures = [part.value for part in parts_of(panel(kind)) if isinstance(part, Image)]
-        assert any(bytes(picture[1:4]) == b"PNG" for picture in pictures), kind
-
-
-def test_without_anywidget_a_page_says_that_its_controls_need_python(panel, bare, tmp_path):
-    text = panel(Spectrum).save_html(tmp_path / "page.html").read_text(encoding="utf-8")
-    assert "Needs Python, in a notebook: changing shape, mode, first k" in text
-    assert 'type="range"' not in text
-
-
-def parts_of(widget):
-    yield widget
-    for child in getattr(widget, "children", ()):
-        yield from parts_of(child)
-
-
-def test_without_anywidget_python_deforms(study, bare):
+def test_without_webgl_python_deforms(study):
     pca, (X, T) = study["pca"].dataset, mesh_of(study["registration"])
     mean = X + pca["mean_displacement"].values
-    samples = pca["score"].values.tolist()
-    view = StillModes(
-        mean,
-        T,
-        pca["deformation"].values,
-        limits=(1.0, 1.0),
-        ratio=pca["explained_variance_ratio"].values.tolist(),
-        samples=samples,
-        names=[str(name) for name in pca["shape"].values],
-        unit="mm",
-        view="corner",
-        up="z",
-    )
-    still = view.shape.image.value
-    view.sliders[1].value = 2.0
-    assert view.scores == [0, 2.0, 0, 0]
-    assert view.shape.image.value != still
-    (points, _), colors = painted(view)
+    view = ModesView(mean, T, pca["deformation"].values, limits=(1.0, 1.0), unit="mm")
+    view.webgl = "no"
+    still = view.still
+    assert still[1:4] == b"PNG"
+    view.scores = [0, 2.0, 0, 0]
+    assert view.still != still
+    points, _, colors = view.drawn()
     np.testing.assert_allclose(points, mean + 2 * pca["deformation"].values[1], atol=1e-5)
     along = ((points - mean) * vertex_normals(mean, T)).sum(1)
     assert colors[along.argmax()][2] > colors[along.argmax()][0], "blue is expansion"
-    view.choice.value = 0
-    assert view.scores == samples[0]
+    view.close()
+
+
+def test_without_webgl_panels_send_pictures(panel):
+    for kind in (Modes, Network, Correspondence):
+        views = [part for part in widgets_in(panel(kind)) if isinstance(part, View)]
+        for view in views:
+            view.webgl = "no"
+        assert any(view.still[1:4] == b"PNG" for view in views), kind
 
 
 # ---- network, maps
@@ -537,18 +505,33 @@ def test_the_number_of_batches_is_known_before_they_are_done(tmp_path):
 
 def test_a_cell_that_runs_again_closes_the_tabs_of_its_run_before(study, monkeypatch):
     before = len(registry._instances)
-    runs = iter([("cell", "run 1"), ("cell", "run 1"), ("cell", "run 2"), ("other", "run 3")])
-    monkeypatch.setattr(explore_module, "running_cell", lambda: next(runs))
-    one = s4a.explore(study)
-    count = len(registry._instances) - before
-    tabs = [s4a.explore(study) for _ in range(3)]
-    assert len(registry._instances) == before + 2 * count
-    assert one.comm is None
-    assert [t.comm is None for t in tabs] == [True, False, False]
-    for t in tabs[1:]:
-        t.close()
-    explore_module.OPEN.clear()
+    shell = InteractiveShell()
+    monkeypatch.setattr(explore_module, "get_ipython", lambda: shell)
+
+    def run(cell):
+        """What IPython does when a cell is run, and the tabs that it makes."""
+        shell.events.trigger("pre_run_cell", ExecutionInfo("", True, False, True, cell))
+        monkeypatch.setattr(explore_module, "running_cell", lambda: cell)
+        return s4a.explore(study)
+
+    first, other = run("cell"), run("other")
+    count = (len(registry._instances) - before) // 2
+    second = s4a.explore(study)  # a second of the same run
+    third = run("cell")
+    assert [tabs.comm is None for tabs in (first, other, second, third)] == [
+        True,
+        False,
+        False,
+        False,
+    ]
+    assert len(registry._instances) == before + 3 * count
+    for tabs in (other, second, third):
+        tabs.close()
     assert len(registry._instances) == before
+    assert not any(
+        isinstance(getattr(function, "__self__", None), Explore)
+        for function in shell.events.callbacks["pre_run_cell"]
+    )
 
 
 def test_no_cell_runs_outside_of_a_notebook():
@@ -620,10 +603,9 @@ def test_a_page_keeps_what_python_shows_for_every_value_of_its_controls(study, p
     assert base64.b64decode(json.loads(kept)["base64"]) == fmap.matrix.values
 
 
-def test_a_full_page_says_what_it_does_not_keep(panel, tmp_path, monkeypatch):
-    monkeypatch.setattr(page_module, "LIMIT", 60_000)
-    spectrum = panel(Spectrum)
-    text = spectrum.save_html(tmp_path / "page.html").read_text(encoding="utf-8")
+def test_a_full_page_says_what_it_does_not_keep(panel, tmp_path):
+    path = panel(Spectrum).save_html(tmp_path / "page.html", limit=60_000)
+    text = path.read_text(encoding="utf-8")
     data = recording(text)
     shapes = next(control for control in data["controls"] if control["id"] == "c-choice")
     assert shapes["open"] == [0]
@@ -640,9 +622,10 @@ def test_a_page_holds_stills_for_browsers_without_webgl(panel, tmp_path):
         assert all(base64.b64decode(still)[1:4] == b"PNG" for still in stills)
 
 
-def test_the_error_names_what_to_install(tmp_path):
+@pytest.mark.parametrize("missing", ["ipywidgets", "anywidget"])
+def test_the_error_names_what_to_install(missing):
     code = (
-        "import sys; sys.modules['ipywidgets'] = None\n"
+        f"import sys; sys.modules[{missing!r}] = None\n"
         "import s4a\n"
         "try: s4a.explore(None)\n"
         "except ImportError as error: sys.stdout.write(str(error))"

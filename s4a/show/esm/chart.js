@@ -186,9 +186,9 @@ function graph(parent, spec, pick) {
   reachable([...marks.slice(source.length), ...marks.slice(0, source.length)], line(parent), pick);
 }
 
-// A matrix as pixels: `values` row by row, coloured by a table of 256 colours from -limit to limit.
+// A matrix as pixels: `values` row by row, coloured by a palette of 256 colours from -limit to limit.
 function matrix(parent, spec, pick) {
-  const { rows, columns, values, table, limit, blocks = [], label, title, row = -1, column = -1, size = 380 } = spec;
+  const { rows, columns, values, palette, limit, blocks = [], label, title, row = -1, column = -1, size = 380 } = spec;
   html(parent, "div", { class: "s4a-title" }, title);
   const box = html(parent, "div", { class: "s4a-matrix", style: `width:${size}px;max-width:100%;aspect-ratio:${columns}/${rows}` });
   const inside = (at) => at.row >= 0 && at.row < rows && at.column < columns;
@@ -197,7 +197,7 @@ function matrix(parent, spec, pick) {
   const paint = canvas.getContext("2d"), image = paint.createImageData(columns, rows);
   values.forEach((v, i) => {
     const at = Math.round(255 * Math.min(1, Math.max(0, 0.5 + (0.5 * v) / limit)));
-    image.data.set([table[3 * at], table[3 * at + 1], table[3 * at + 2], 255], 4 * i);
+    image.data.set([...palette.subarray(3 * at, 3 * at + 3), 255], 4 * i);
   });
   paint.putImageData(image, 0, 0);
   const svg = node(box, "svg", { viewBox: `0 0 ${columns} ${rows}`, preserveAspectRatio: "none" });

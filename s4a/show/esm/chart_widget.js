@@ -9,7 +9,7 @@ export default {
       if (spec.kind === "matrix") {
         spec.values = numbers(Float32Array, model.get("values"));
         if (spec.values.length !== spec.rows * spec.columns) return; // the other half of the message is on its way
-        spec.table = numbers(Uint8Array, model.get("table"));
+        spec.palette = numbers(Uint8Array, model.get("palette"));
         spec.label = ({ row, column }) => `source mode ${column} to target mode ${row}`;
       }
       CHARTS[spec.kind](el, spec, (mark) => {

@@ -10,7 +10,7 @@ class Modes {
     this.corner = numbers(Uint32Array, get("corner"));
     this.deformation = numbers(Float32Array, get("deformation"));
     this.normal = normalsOf(this.mean, this.corner);
-    this.tables = { normal: numbers(Uint8Array, get("signed_table")), magnitude: numbers(Uint8Array, get("ramp_table")) };
+    this.palettes = { normal: numbers(Uint8Array, get("signed_palette")), magnitude: numbers(Uint8Array, get("ramp_palette")) };
     this.limits = { normal: get("limit"), magnitude: get("limit_magnitude") };
   }
   positions(scores, out = new Float32Array(this.mean.length)) {
@@ -23,14 +23,14 @@ class Modes {
     return out;
   }
   colors(P, kind, out) {
-    const table = this.tables[kind];
-    if (!table) return null;
+    const palette = this.palettes[kind];
+    if (!palette) return null;
     const M = this.mean, N = this.normal, limit = this.limits[kind];
     for (let i = 0; i < P.length; i += 3) {
       const x = P[i] - M[i], y = P[i + 1] - M[i + 1], z = P[i + 2] - M[i + 2];
       const value = kind === "normal" ? 0.5 + (0.5 * (x * N[i] + y * N[i + 1] + z * N[i + 2])) / limit : Math.hypot(x, y, z) / limit;
       const at = 3 * Math.round(255 * Math.min(1, Math.max(0, value)));
-      out[i] = table[at]; out[i + 1] = table[at + 1]; out[i + 2] = table[at + 2];
+      out[i] = palette[at]; out[i + 1] = palette[at + 1]; out[i + 2] = palette[at + 2];
     }
     return out;
   }

@@ -1,0 +1,174 @@
+"""The surfaces of a study, and what stands beside them, as pictures, pages and panels show them."""
+
+import numpy as np
+import xarray as xr
+
+from s4a.method.pca import low_vertices
+from s4a.method.register import match_functions, match_latent
+from s4a.method.shape import Shape
+
+RESOLUTIONS = [("low resolution", "coarse"), ("full resolution", "original")]
+
+
+def has(study: xr.DataTree, name: str) -> bool:
+    """Whether the study holds the node, or the variable ``node/variable``."""
+    node, _, variable = name.partition("/")
+    if node not in study.children:
+        return False
+    return variable in study[node].data_vars if variable else bool(study[node].children)
+
+
+def attribute(study: xr.DataTree, node: str, name: str) -> str:
+    """An attribute of a node as text; empty where there is none."""
+    return str(study[node].attrs.get(name, "")) if node in study.children else ""
+
+
+def names_of(data: xr.Dataset | xr.DataArray) -> list[str]:
+    """The shapes of a Dataset or one of its variables."""
+    return [str(name) for name in data["shape"].values]
+
+
+def mesh_of(mesh: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and triangles of a mesh."""
+    return mesh["position"].values, mesh["corner_vertex"].values
+
+
+def aligned(study: xr.DataTree, name: str, X: np.ndarray) -> np.ndarray:
+    """Points ``(n, 3)`` of a shape moved onto the template, where the run has registered it."""
+    registration = study["registration"].dataset if has(study, "registration/rotation") else None
+    if registration is None or name not in names_of(registration):
+        return X
+    motion = registration.sel(shape=name)
+    scale = motion["scale"].item() if "scale" in motion else 1.0
+    return scale * X @ motion["rotation"].values.T + motion["translation"].values
+
+
+def surface(study: xr.DataTree, name: str, stage: str = "coarse") -> tuple[np.ndarray, np.ndarray]:
+    """Aligned positions and triangles of a shape at the stage ``coarse`` or ``original``."""
+    X, T = mesh_of(study[stage][name].dataset)
+    return aligned(study, name, X), T
+
+
+def resolutions(study: xr.DataTree) -> list[tuple[str, str]]:
+    """The resolutions that the study holds, as the options of a switch: text and stage."""
+    return [(text, stage) for text, stage in RESOLUTIONS if has(study, stage)]
+
+
+def unit_text(study: xr.DataTree, name: str) -> str:
+    """The unit of a shape's positions where its file says it, or that it is the input's."""
+    node = study["original"].children.get(name) if "original" in study.children else None
+    return str((node is not None and node.attrs.get("unit")) or "unit of the input")
+
+
+def barycentric_place(study: xr.DataTree, name: str) -> tuple[np.ndarray, np.ndarray] | None:
+    """Where each vertex of a shape lies on the template: corners ``(v, 3)`` and weights ``(v, 3)``.
+
+    None where the study does not say it.
+    """
+    registration = study["registration"]
+    node = registration.children.get(name)
+    if node is None or "template_triangle" not in node.data_vars:
+        return None
+    place = node.dataset
+    corners = registration.dataset["corner_vertex"].values[place["template_triangle"].values]
+    return corners, place["template_barycentric"].values
+
+
+def carried_colors(
+    study: xr.DataTree, name: str, colors: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Aligned mesh of a shape, with the colours of the template's vertices carried to it.
+
+    None without its mesh; a vertex to which nothing is carried is NaN.
+    """
+    if not has(study, "original") or name not in study["original"].children:
+        return None
+    X, T = mesh_of(study["original"][name].dataset)
+    place = barycentric_place(study, name)
+    if place is not None:
+        corners, weights = place
+        carried = np.einsum("vc,vcx->vx", weights, colors[corners])
+    else:  # the mean of the template's vertices that are matched to the vertex
+        match = study["registration"].dataset["registered_match"].sel(shape=name).values
+        count = np.bincount(match, minlength=len(X))[:, None]
+        sums = np.stack([np.bincount(match, channel, len(X)) for channel in colors.T], axis=1)
+        carried = np.where(count > 0, sums / np.maximum(count, 1), np.nan)
+    return aligned(study, name, X), T, carried
+
+
+def template_vertices(study: xr.DataTree, name: str) -> np.ndarray | None:
+    """For each vertex of a shape the template's vertex nearest to where it lies.
+
+    None where the study does not say it.
+    """
+    place = barycentric_place(study, name)
+    if place is None:
+        return None
+    corners, weights = place
+    return np.take_along_axis(corners, weights.argmax(1)[:, None], axis=1)[:, 0]
+
+
+def template_coarse(study: xr.DataTree) -> xr.Dataset | None:
+    """The low-resolution mesh of the template; None where the study has none with its vertices."""
+    template = attribute(study, "registration", "template")
+    if not has(study, "coarse") or template not in study["coarse"].children:
+        return None
+    coarse = study["coarse"][template].to_dataset()
+    return coarse if "coarse_vertex" in coarse else None
+
+
+def mode_arrays(
+    study: xr.DataTree, coarse: xr.Dataset | None = None, n_modes: int | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean shape ``(n, 3)``, triangles and deformations ``(c, n, 3)``.
+
+    On the vertices of the low-resolution mesh `coarse` where it is given.
+    """
+    X, T = mesh_of(study["registration"].dataset)
+    pca = study["pca"].dataset.isel(component=slice(n_modes))
+    mean, deformation = X + pca["mean_displacement"].values, pca["deformation"].values
+    if coarse is None:
+        return mean, T, deformation
+    vertex = low_vertices(coarse)
+    return mean[vertex], coarse["corner_vertex"].values, deformation[:, vertex]
+
+
+def score_state(study: xr.DataTree, n_modes: int | None = None) -> dict:
+    """Shares of variance, scores and names of a study's modes, as the browser shows them."""
+    pca = study["pca"].dataset.isel(component=slice(n_modes))
+    low = pca.get("explained_variance_ratio_low")
+    return {
+        "ratio": pca["explained_variance_ratio"].values.tolist(),
+        "ratio_low": [] if low is None else low.values.tolist(),
+        "samples": pca["score"].values.tolist(),
+        "names": names_of(pca),
+    }
+
+
+def network_places(study: xr.DataTree, names: list[str]) -> np.ndarray | None:
+    """Places ``(n, 2)`` of shapes: the first two components of their area-based differences.
+
+    None where the study has not both for each of them.
+    """
+    if not has(study, "latent/area_score"):
+        return None
+    scores = study["latent"].dataset["area_score"]
+    if scores.sizes["difference_component"] < 2 or not set(names) <= set(names_of(scores)):
+        return None
+    return scores.sel(shape=names).values[:, :2]
+
+
+def latent_match(study: xr.DataTree, source: str, target: str, *, dense: bool) -> np.ndarray:
+    """On each vertex of `target` the vertex of `source` that the latent basis matches to it.
+
+    By nearest rows of Phi Y on the coarse meshes (eq. 3), or of U Phi Y on all vertices where
+    `dense` (eq. 7).
+    """
+    Y = study["latent"].dataset["latent_basis"]
+    M, N = (
+        Shape(study["original"][name].to_dataset(), study["coarse"][name].to_dataset())
+        for name in (source, target)
+    )
+    bases = Y.sel(shape=source).values, Y.sel(shape=target).values
+    match, (F_source, F_target) = match_latent(M, N, bases)
+    return match_functions(M, N, F_source, F_target)[0] if dense else match
