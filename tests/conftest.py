@@ -1,4 +1,65 @@
-"""What the tests tell at the end."""
+"""Shapes and studies that several files of tests share, and what the tests tell at the end.
+
+Each worker makes them once, when first needed. Tests copy what they change.
+"""
+
+import pytest
+from small import OPTIONS
+
+from s4a import analyse, coarsen, open_study, spectrum, synthetic
+
+
+@pytest.fixture(scope="session")
+def brains():
+    """Four small brains with labels, landmarks and the truth."""
+    return synthetic.brains(4, 1500, seed=1)
+
+
+@pytest.fixture(scope="session")
+def meshes(brains):
+    """The brains as Datasets by name."""
+    return {name: node.to_dataset() for name, node in brains["original"].children.items()}
+
+
+@pytest.fixture(scope="session")
+def brain_files(brains, tmp_path_factory):
+    """The brains as PLY files."""
+    paths = synthetic.write(brains, tmp_path_factory.mktemp("brains"))
+    paths[0].with_name("truth.nc").unlink()
+    return paths
+
+
+@pytest.fixture(scope="session")
+def study_folder(brains, tmp_path_factory):
+    """The folder of the finished study of the brains."""
+    folder = tmp_path_factory.mktemp("study") / "brains"
+    analyse(brains, store=folder, **OPTIONS).close()
+    return folder
+
+
+@pytest.fixture(scope="session")
+def study(study_folder):
+    """The study of the brains, in memory."""
+    with open_study(study_folder) as tree:
+        return tree.load()
+
+
+@pytest.fixture(scope="session")
+def study_of_files(brain_files):
+    """The study of the files, whose positions are rounded to single precision."""
+    return analyse(brain_files, **OPTIONS)
+
+
+@pytest.fixture(scope="session")
+def brain():
+    """One brain of 4,000 vertices."""
+    return synthetic.brains(1, 4000)["original/brain_01"].to_dataset()
+
+
+@pytest.fixture(scope="session")
+def low_brain(brain):
+    """That brain at low resolution, with 40 eigenfunctions."""
+    return spectrum(coarsen(brain, n_coarse=900), k=40)
 
 
 def pytest_terminal_summary(terminalreporter):

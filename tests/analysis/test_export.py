@@ -7,20 +7,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from s4a import analyse, read_mesh, synthetic, write_registered, write_training_set
+from s4a import read_mesh, write_registered, write_training_set
 from s4a.geometry.mesh import as_arrays
-
-
-@pytest.fixture(scope="module")
-def meshes():
-    return {
-        n: m.to_dataset() for n, m in synthetic.brains(4, 1500, seed=6)["original"].children.items()
-    }
-
-
-@pytest.fixture(scope="module")
-def study(meshes):
-    return analyse(meshes, n_coarse=400, k_init=10, k=20)
 
 
 @pytest.mark.parametrize(

@@ -7,28 +7,24 @@ from importlib.metadata import version
 
 import numpy as np
 import pytest
+from small import FLAGS
 
 from s4a import analyse, cli, synthetic, write_mesh
 from s4a.cli import commands, tables
 from s4a.geometry.mesh import as_arrays
 
-SMALL = ["--n-coarse", "400", "--k-init", "10", "--k", "20", "--n-jobs", "1"]
-
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """Three small brains as files."""
-    folder = tmp_path_factory.mktemp("meshes")
-    synthetic.write(synthetic.brains(3, 1500, seed=4), folder)
-    (folder / "truth.nc").unlink()
-    return folder
+def folder(brain_files):
+    """The folder of four small brains."""
+    return brain_files[0].parent
 
 
 @pytest.fixture(scope="module")
 def ran(folder, tmp_path_factory):
     """The folder of a study, and what the run wrote."""
     study = tmp_path_factory.mktemp("out") / "study"
-    arguments = [sys.executable, "-m", "s4a", "run", str(folder), "--out", str(study), *SMALL]
+    arguments = [sys.executable, "-m", "s4a", "run", str(folder), "--out", str(study), *FLAGS]
     result = subprocess.run(arguments, capture_output=True, text=True, check=False)
     return study, result
 
@@ -38,7 +34,7 @@ def test_run_ends_well_and_says_what_it_found(ran):
     assert result.returncode == 0, result.stderr
     assert (study / "pca.nc").exists()
     for words in (
-        "3 shapes: 3 ok, 0 repaired, 0 excluded",
+        "4 shapes: 4 ok, 0 repaired, 0 excluded",
         "median shape: brain_",
         "variance explained:",
         "peak MiB",
@@ -50,9 +46,9 @@ def test_run_ends_well_and_says_what_it_found(ran):
 def test_run_again_does_nothing_again(ran, folder, capsys):
     study, _ = ran
     before = (study / "latent.nc").stat().st_mtime_ns
-    assert cli.main(["run", str(folder), "--out", str(study), *SMALL]) == 0
+    assert cli.main(["run", str(folder), "--out", str(study), *FLAGS]) == 0
     assert (study / "latent.nc").stat().st_mtime_ns == before
-    assert "3 ok" in capsys.readouterr().out
+    assert "4 ok" in capsys.readouterr().out
 
 
 def test_view_writes_a_page_into_the_study_or_where_it_is_told(ran, tmp_path, monkeypatch, capsys):
@@ -65,7 +61,7 @@ def test_view_writes_a_page_into_the_study_or_where_it_is_told(ran, tmp_path, mo
     )
     assert cli.main(["view", str(study)]) == 0
     assert cli.main(["view", str(study), "--out", str(page)]) == 0
-    assert (study / "study.html").read_text() == page.read_text() == "3 shapes"
+    assert (study / "study.html").read_text() == page.read_text() == "4 shapes"
     assert f"wrote {page}" in capsys.readouterr().out
 
 
@@ -73,7 +69,8 @@ def test_check_lists_every_shape(folder, capsys):
     assert cli.main(["check", str(folder)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].split()[:3] == ["shape", "vertices", "components"]
-    assert [line.split()[0] for line in lines[1:]] == ["brain_01", "brain_02", "brain_03"]
+    names = ["brain_01", "brain_02", "brain_03", "brain_04"]
+    assert [line.split()[0] for line in lines[1:]] == names
     assert all(" 1500 " in line and " ok" in line for line in lines[1:])
 
 
@@ -164,7 +161,7 @@ def test_every_command_has_help(command, capsys):
 
 def test_two_shapes_end_well_without_modes_and_the_reason_is_told(folder, tmp_path, capsys):
     paths = [str(folder / f"brain_0{i}.ply") for i in (1, 2)]
-    assert cli.main(["run", *paths, "--out", str(tmp_path / "study"), *SMALL]) == 0
+    assert cli.main(["run", *paths, "--out", str(tmp_path / "study"), *FLAGS]) == 0
     assert "no modes: PCA needs at least 3 shapes, found 2" in capsys.readouterr().out
 
 

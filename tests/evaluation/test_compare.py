@@ -14,20 +14,21 @@ SMALL = {"n_coarse": 400, "k": 30, "n_geodesic": 100}
 
 
 @pytest.fixture(scope="module")
-def brains():
-    tree = synthetic.brains(3, 1500)
-    meshes = {name: node.to_dataset() for name, node in tree["original"].children.items()}
-    (reference, source), *others = meshes.items()
+def three_brains(brains, meshes):
+    """A source, two targets by name, and where the vertices of the targets truly lie on it."""
+    (reference, source), *targets = list(meshes.items())[:3]
     truth = {
-        n: synthetic.position(tree["truth"], reference, tree["truth"][n]["reference_point"])
-        for n, _ in others
+        name: np.asarray(
+            synthetic.position(brains["truth"], reference, brains["truth"][name]["reference_point"])
+        )
+        for name, _ in targets
     }
-    return source, dict(others), {n: np.asarray(t) for n, t in truth.items()}
+    return source, dict(targets), truth
 
 
 @pytest.fixture(scope="module")
-def found(brains):
-    source, targets, truth = brains
+def found(three_brains):
+    source, targets, truth = three_brains
     return compare.pairs(source, targets, truth=truth, **SMALL)
 
 
@@ -61,8 +62,8 @@ def test_joint_rounds_are_nearer_to_the_truth_than_every_other_method(found):
     assert error.sel(way="RE-MATCH joint") < 0.9 * error.drop_sel(way="RE-MATCH joint").min()
 
 
-def test_every_method_finds_a_shape_in_itself():
-    mesh = synthetic.brains(2, 1500)["original/brain_01"].to_dataset()
+def test_every_method_finds_a_shape_in_itself(meshes):
+    mesh = meshes["brain_01"]
     same = np.arange(mesh.sizes["vertex"])
     found = compare.pair(mesh, mesh, truth=same, **SMALL)
     exact = [way for way in compare.METHODS if way not in ("RE-MATCH", "SCALABLE")]
@@ -71,8 +72,8 @@ def test_every_method_finds_a_shape_in_itself():
     assert (found["bijectivity"].sel(way=exact) == 0).all()
 
 
-def test_an_alignment_that_given_landmarks_make_needless_is_not_charged(brains):
-    source, targets, _ = brains
+def test_an_alignment_that_given_landmarks_make_needless_is_not_charged(three_brains):
+    source, targets, _ = three_brains
     target = next(iter(targets.values()))
     marks = np.arange(0, 50, 10), np.arange(0, 50, 10)
     found = compare.pair(
@@ -115,8 +116,8 @@ def test_truth_and_landmarks_of_files_count_the_rows_of_the_files(tmp_path):
     assert found["block_seconds"].sel(block="load and clean").item() > 0
 
 
-def test_what_is_wrong_is_said(brains):
-    source, targets, _ = brains
+def test_what_is_wrong_is_said(three_brains):
+    source, targets, _ = three_brains
     target = next(iter(targets.values()))
     with pytest.raises(ValueError, match="methods must be some of kNN"):
         compare.pair(source, target, methods=["ICP"])
@@ -130,8 +131,8 @@ def test_what_is_wrong_is_said(brains):
         compare.collection({"a": source, "b": target}, methods=["kNN"])
 
 
-def test_both_ways_to_full_resolution_share_all_but_the_last_block(brains):
-    source, targets, _ = brains
+def test_both_ways_to_full_resolution_share_all_but_the_last_block(three_brains):
+    source, targets, _ = three_brains
     found = compare.collection({"brain_01": source, **targets}, n_coarse=400, k=30)
     assert found["collection_chamfer"].dims == ("way", "how", "shape")
     seconds = found["collection_seconds"]

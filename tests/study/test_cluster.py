@@ -8,19 +8,10 @@ import time
 
 import numpy as np
 import pytest
+from small import FLAGS
 
 import s4a
-from s4a import cli, synthetic
-
-SMALL = {"n_coarse": 400, "k": 30, "k_init": 12}
-
-
-@pytest.fixture(scope="module")
-def brains(tmp_path_factory):
-    """A folder of meshes, and the study of a local run."""
-    folder = tmp_path_factory.mktemp("collection") / "brains"
-    synthetic.write(synthetic.brains(4, 1500, 5), folder)
-    return folder, s4a.analyse(folder, **SMALL)
+from s4a import cli
 
 
 def command(*words):
@@ -28,10 +19,7 @@ def command(*words):
 
 
 def run(folder, out, cluster):
-    flags = [
-        text for name, value in SMALL.items() for text in (f"--{name.replace('_', '-')}", value)
-    ]
-    return command("s4a", "run", folder, "--out", out, "--cluster", cluster, *flags)
+    return command("s4a", "run", folder, "--out", out, "--cluster", cluster, *FLAGS)
 
 
 def assert_the_same(out, local):
@@ -46,13 +34,13 @@ def assert_the_same(out, local):
     study.close()
 
 
-def test_two_dask_workers_give_the_bits_of_a_local_run(brains, tmp_path):
+def test_two_dask_workers_give_the_bits_of_a_local_run(brain_files, study_of_files, tmp_path):
     pytest.importorskip("distributed")
-    folder, local = brains
+    folder = brain_files[0].parent
     subprocess.run(
         run(folder, tmp_path / "study", "local:2"), check=True, capture_output=True, timeout=300
     )
-    assert_the_same(tmp_path / "study", local)
+    assert_the_same(tmp_path / "study", study_of_files)
 
 
 def wait_for(found, what, seconds=120):
@@ -62,9 +50,9 @@ def wait_for(found, what, seconds=120):
         time.sleep(0.02)
 
 
-def test_a_worker_killed_in_the_middle_costs_only_its_task(brains, tmp_path):
+def test_a_worker_killed_in_the_middle_costs_only_its_task(brain_files, study_of_files, tmp_path):
     pytest.importorskip("distributed")
-    folder, local = brains
+    folder = brain_files[0].parent
     where, out = tmp_path / "scheduler.json", tmp_path / "study"
     with contextlib.ExitStack() as stack:
 
@@ -107,7 +95,7 @@ def test_a_worker_killed_in_the_middle_costs_only_its_task(brains, tmp_path):
         workers[0].kill()
         assert process.wait(timeout=300) == 0
         assert workers[1].poll() is None
-    assert_the_same(out, local)
+    assert_the_same(out, study_of_files)
     again = [path for path, time in done.items() if path.stat().st_mtime_ns != time]
     assert (
         len(again) <= 1

@@ -42,13 +42,6 @@ from s4a.widgets.modes_view import ModesView
 from s4a.widgets.scene import Scene, View
 
 
-@pytest.fixture(scope="module")
-def study():
-    return s4a.analyse(
-        s4a.synthetic.brains(5, 1500, seed=1), n_coarse=400, k=24, k_init=10, n_jobs=1
-    )
-
-
 @pytest.fixture
 def panel(study):
     """Make a panel that is closed after the test, when nothing of it may be left."""
@@ -120,10 +113,10 @@ def test_a_still_picture_looks_from_where_the_view_stands():
 
 def test_the_vertices_are_the_mean_plus_the_sum_of_scores_times_modes(study, panel):
     modes = panel(Modes)
-    modes.scores = [1.5, -2.0, 0.0, 0.25]
+    modes.scores = [1.5, -2.0, 0.25]
     expected = s4a.synthesize(study, modes.scores)["position"].values
     np.testing.assert_allclose(modes.vertices(), expected, atol=1e-4)
-    assert modes.view.scores == [1.5, -2.0, 0.0, 0.25]
+    assert modes.view.scores == [1.5, -2.0, 0.25]
     assert modes.distance == pytest.approx(np.hypot(np.hypot(1.5, 2), 0.25))
 
 
@@ -139,7 +132,7 @@ def test_the_browser_gets_mean_and_modes_as_they_are(study, panel):
         len(floats(modes.view.mean))
         == study["coarse"][study["registration"].attrs["template"]].sizes["vertex"]
     )
-    assert len(floats(modes.view.deformation)) == 4 * len(floats(modes.view.mean))
+    assert len(floats(modes.view.deformation)) == 3 * len(floats(modes.view.mean))
 
 
 def test_a_random_shape_is_repeatable_and_within_three_standard_deviations(panel):
@@ -150,7 +143,7 @@ def test_a_random_shape_is_repeatable_and_within_three_standard_deviations(panel
 
 def test_the_mesh_is_saved_with_its_displacement_along_the_normal(study, panel, tmp_path):
     modes = panel(Modes)
-    modes.scores = [2.0, 0, 0, 0]
+    modes.scores = [2.0, 0, 0]
     modes.save_mesh(tmp_path / "shape.ply")
     np.testing.assert_allclose(
         s4a.read_mesh(tmp_path / "shape.ply")[0], modes.vertices(), atol=1e-3
@@ -221,10 +214,10 @@ def test_a_clicked_node_shows_its_mesh_alone(study, panel):
 
 def test_the_edge_budget_tells_how_the_network_hangs_together(panel):
     network = panel(Network)
-    assert "10 pairs" in network.facts.value
-    network.budget.value = 4
-    assert re.search(r"4 pairs.*: connected, 0 triangles, 5 shapes in none", network.facts.value)
-    assert len(network.graph.spec["source"]) == 8
+    assert "6 pairs" in network.facts.value
+    network.budget.value = 3
+    assert re.search(r"3 pairs.*: connected, 0 triangles, 4 shapes in none", network.facts.value)
+    assert len(network.graph.spec["source"]) == 6
     assert network.graph.spec["edges"] == network.shown
 
 
@@ -275,7 +268,7 @@ def test_bars_are_the_stored_distances_in_rising_order(study, panel):
     median.bars.picked = {"index": 2, "count": 1}
     assert median.selected == median.bars.spec["names"][2]
     assert len(median.scene.ghost_position) > 0
-    assert "rank 3 of 5" in median.scene.caption
+    assert "rank 3 of 4" in median.scene.caption
 
 
 def test_the_median_can_be_ranked_by_other_operators_norms_and_modes(study, panel):
@@ -560,7 +553,7 @@ def test_an_unfinished_study_says_what_is_missing(study):
     with pytest.raises(ValueError, match="network/source"):
         Network(started)
     tabs.refresh(study)
-    assert tabs["Modes"].scores == [0.0] * 4
+    assert tabs["Modes"].scores == [0.0] * 3
     tabs.close()
 
 
