@@ -93,7 +93,8 @@ def collection(folder=FOLDER, *, n=51, n_vertices=2000, n_coarse=600, n_pairs=15
         reduce(whole, small)
         if (size := size_of(small)) > LIMIT:
             raise ValueError(
-                f"the study needs at most {LIMIT / 1e6:.0f} MB, found {size / 1e6:.1f}; lower n_vertices"
+                f"the study needs at most {LIMIT / 1e6:.0f} MB, found {size / 1e6:.1f}; "
+                "lower n_vertices"
             )
         shutil.move(small, folder)
     return folder

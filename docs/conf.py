@@ -58,7 +58,8 @@ html_css_files = ["s4a.css"]
 html_show_sphinx = False
 html_copy_source = False
 
-# Run first in every notebook: what needs a kernel is shown as a page of its own, or for some values of its slider.
+# Run first in every notebook: what needs a kernel is shown as a page of its own, or for some
+# values of its slider.
 WITHOUT_KERNEL = (HERE / "without_kernel.py").read_text(encoding="utf-8")
 
 

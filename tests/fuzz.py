@@ -33,20 +33,22 @@ SECONDS = 5  # of processor time for one file
 PATIENCE = 60  # of the clock, for a process that waits
 MEMORY = 2 << 30  # above what the process has before it reads
 WORDS = [
-    b"nan", b"-nan", b"inf", b"-inf", b"-1", b"0", b"1e999", b"1e308", b"-1e308", b"1e-320", b"2147483647",
-    b"2147483648", b"-2147483649", b"4294967296", b"9223372036854775807", b"-9223372036854775808",
-    b"18446744073709551616", b"1e15", b"1000000000", b"0x10", b"1_0", b"1.5", b"", b"abc", b"7" * 400,
-    b"1" * 5000, "٣".encode(), b"\0", b"3.", b"--1",
+    b"nan", b"-nan", b"inf", b"-inf", b"-1", b"0", b"1e999", b"1e308", b"-1e308", b"1e-320",
+    b"2147483647", b"2147483648", b"-2147483649", b"4294967296", b"9223372036854775807",
+    b"-9223372036854775808", b"18446744073709551616", b"1e15", b"1000000000", b"0x10", b"1_0",
+    b"1.5", b"", b"abc",
+    b"7" * 400, b"1" * 5000, "٣".encode(), b"\0", b"3.", b"--1",
 ]  # fmt: skip
 INTEGERS = [
-    0, 1, -1, 2, 3, 127, 128, 255, 256, 32767, 65535, 10**6, 10**8, 2**31 - 1, -(2**31), 2**32 - 1, 2**62,
-    -(2**63),
+    0, 1, -1, 2, 3, 127, 128, 255, 256, 32767, 65535, 10**6, 10**8, 2**31 - 1, -(2**31), 2**32 - 1,
+    2**62, -(2**63),
 ]  # fmt: skip
 TOKENS = [
-    b"<", b">", b"&x;", b"&#0;", b"<![CDATA[", b"<!--", b"]]>", b"\"", b"'", b"\n", b"\r", b"\n\n", b"\\\n",
-    b"#", b",", b"[", b"{", b"}", b":", b"null", b"\xff\xfe", b"\xef\xbb\xbf", b"PK\x03\x04", b"\x1f\x8b",
-    b"solid ", b"\nf 1 2 3\n", b"\nend_header\n", b"<Data>", b"</DataArray>", b"\nPOLYGONS 1 4\n",
-    b"\nMETADATA\n", b"\nFIELD a 1\n", b"=", b"==", b"object", b"(),",
+    b"<", b">", b"&x;", b"&#0;", b"<![CDATA[", b"<!--", b"]]>", b"\"", b"'", b"\n", b"\r", b"\n\n",
+    b"\\\n", b"#", b",", b"[", b"{", b"}", b":", b"null", b"\xff\xfe", b"\xef\xbb\xbf",
+    b"PK\x03\x04", b"\x1f\x8b", b"solid ", b"\nf 1 2 3\n", b"\nend_header\n", b"<Data>",
+    b"</DataArray>", b"\nPOLYGONS 1 4\n", b"\nMETADATA\n", b"\nFIELD a 1\n", b"=", b"==",
+    b"object", b"(),",
 ]  # fmt: skip
 
 
@@ -117,8 +119,14 @@ def seeds():
     label = np.arange(len(X)) % 3
 
     def ply(order):
-        head = f"ply\nformat {order} 1.0\nelement vertex {len(X)}\nproperty float x\nproperty float y\nproperty float z\n"
-        head += f"property uchar red\nelement face {len(T)}\nproperty list uchar int vertex_indices\nend_header\n"
+        head = (
+            f"ply\nformat {order} 1.0\nelement vertex {len(X)}\nproperty float x\n"
+            "property float y\nproperty float z\n"
+        )
+        head += (
+            f"property uchar red\nelement face {len(T)}\nproperty list uchar int vertex_indices\n"
+            "end_header\n"
+        )
         if order == "ascii":
             rows = [
                 *(f"{x} {y} {z} 7" for x, y, z in X),
@@ -143,7 +151,8 @@ def seeds():
     field = "METADATA\nINFORMATION 0\n\nFIELD a 1\nb 1 2 float\n1 2\n"
     vtk4 = vtk(
         "ASCII",
-        f"{field}POINTS {len(X)} float\n{numbers}\nPOLYGONS {len(T)} {4 * len(T)}\n{corners}\nPOINT_DATA {len(X)}\n",
+        f"{field}POINTS {len(X)} float\n{numbers}\nPOLYGONS {len(T)} {4 * len(T)}\n{corners}\n"
+        f"POINT_DATA {len(X)}\n",
     )
     vtk5 = vtk(
         "ASCII",
@@ -184,7 +193,8 @@ def seeds():
             if how == "ascii":
                 return f'{tag}"ascii">{" ".join(map(str, values.ravel()))}</DataArray>'
             if how == "binary":
-                return f'{tag}"binary">{b"".join(map(base64.b64encode, encoded(values))).decode()}</DataArray>'
+                content = b"".join(map(base64.b64encode, encoded(values))).decode()
+                return f'{tag}"binary">{content}</DataArray>'
             offset = len(blob)
             blob += b"".join(
                 encoded(values) if how == "raw" else map(base64.b64encode, encoded(values))
@@ -193,10 +203,16 @@ def seeds():
 
         attributes = ' compressor="vtkZLibDataCompressor"' if compressed else ""
         attributes += ' header_type="UInt64"' if size == "u8" else ""
-        text = f'<?xml version="1.0"?>\n<VTKFile type="PolyData" byte_order="LittleEndian"{attributes}><PolyData>'
+        text = (
+            '<?xml version="1.0"?>\n'
+            f'<VTKFile type="PolyData" byte_order="LittleEndian"{attributes}><PolyData>'
+        )
         points, corners = X.astype("<f4"), T.astype("<i4")
         text += f'<Piece NumberOfPoints="{len(X)}" NumberOfPolys="{len(T)}">'
-        text += f"<Points>{array('Points', points, 'Float32')}</Points><Polys>{array('connectivity', corners, 'Int32')}"
+        text += (
+            f"<Points>{array('Points', points, 'Float32')}</Points>"
+            f"<Polys>{array('connectivity', corners, 'Int32')}"
+        )
         text += array("offsets", np.arange(3, T.size + 1, 3, dtype="<i8"), "Int64")
         text += "</Polys></Piece></PolyData>"
         if blob:
@@ -292,12 +308,17 @@ def seeds():
         "GIFTI labels": (".gii", "labels", [gifti(how, *marked) for how in encodings]),
         "annot": (".annot", "labels", [annot, old, (annot, zipped)]),
         "NPY": (".npy", "labels", [npy(label), npy(np.array(list("abc"))[label])]),
-        "NPZ labels": (".npz", "labels", [packed({"a.npy": npy(label)}), (npy(label), lambda d: packed({"a.npy": d}))]),
+        "NPZ labels": (
+            ".npz", "labels",
+            [packed({"a.npy": npy(label)}), (npy(label), lambda d: packed({"a.npy": d}))],
+        ),
         "CSV labels": (".csv", "labels", [named, "\n".join(map(str, label)).encode()]),
         "Slicer": (".mrk.json", "landmarks", [json.dumps(slicer, indent=1).encode()]),
         "MeshLab": (".pp", "landmarks", [picked.encode()]),
         "CSV landmarks": (".csv", "landmarks", [marks.encode(), bare]),
-        "CSV subjects": (".csv", "subjects", [covariates.encode(), covariates.replace(",", ";").encode()]),
+        "CSV subjects": (
+            ".csv", "subjects", [covariates.encode(), covariates.replace(",", ";").encode()],
+        ),
     }  # fmt: skip
     return {
         name: (suffix, reader, [one if isinstance(one, tuple) else (one, whole) for one in given])
@@ -380,8 +401,8 @@ def noise(data, rng, _):
 
 
 DAMAGES = [
-    flip, flip, overwrite, cut, number, number, number, integer, integer, delete, duplicate, swap, lines, token,
-    header, noise,
+    flip, flip, overwrite, cut, number, number, number, integer, integer, delete, duplicate, swap,
+    lines, token, header, noise,
 ]  # fmt: skip
 
 
@@ -485,7 +506,10 @@ def work(task):
                 except BaseException as error:
                     outcome = "failed"
                     at = traceback.extract_tb(error.__traceback__)[-1]
-                    why = f"{type(error).__name__}: {str(error)[:200]} ({Path(at.filename).name}:{at.lineno})"
+                    why = (
+                        f"{type(error).__name__}: {str(error)[:200]} "
+                        f"({Path(at.filename).name}:{at.lineno})"
+                    )
                     tell({"failed": [name, i, why]})
             signal.setitimer(signal.ITIMER_PROF, 0)
             slowest = max(slowest, time.process_time() - start)

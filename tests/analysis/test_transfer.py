@@ -319,7 +319,8 @@ def test_every_landmark_file_gives_the_same_points(tmp_path):
     (tmp_path / "plain.csv").write_text("a 1.5 2 3\nb -4 5.25 6\n")
     (tmp_path / "a.pp").write_text(
         '<!DOCTYPE PickedPoints><PickedPoints><point name="a" x="1.5" y="2" z="3" active="1"/>'
-        '<point x="-4" y="5.25" z="6" name="b"/><point x="0" y="0" z="0" name="c" active="0"/></PickedPoints>'
+        '<point x="-4" y="5.25" z="6" name="b"/><point x="0" y="0" z="0" name="c" active="0"/>'
+        "</PickedPoints>"
     )
     (tmp_path / "packed.csv.gz").write_bytes(gzip.compress((tmp_path / "a.csv").read_bytes()))
     for name in ("a.mrk.json", "a.csv", "plain.csv", "a.pp", "packed.csv.gz"):

@@ -71,7 +71,8 @@ def brains(folder):
             for v in np.unique(true)
         ]
         say(
-            f"{name}: {100 * (label == true).mean():.1f} % of vertices right, mean Dice {np.mean(dice):.3f}"
+            f"{name}: {100 * (label == true).mean():.1f} % of vertices right, "
+            f"mean Dice {np.mean(dice):.3f}"
         )
 
 
@@ -95,7 +96,8 @@ def skulls(folder):
     for name, values in error.items():
         values = np.stack(values)
         say(
-            f"{name}: mean {values.mean():.3f} mm, median {np.median(values):.3f}, {values.shape[0]} ordered pairs"
+            f"{name}: mean {values.mean():.3f} mm, median {np.median(values):.3f}, "
+            f"{values.shape[0]} ordered pairs"
         )
 
 
@@ -117,7 +119,8 @@ def faces(folder):
     size = [np.sqrt(np.einsum("nx,nx,n->", d, d, w)) for d in (*ours, *true)]
     cosine = np.array(inner) / size[: len(names)] / size[len(names) :]
     say(
-        f"cosines of displacements: mean {cosine.mean():.4f}, median {np.median(cosine):.4f}, least {cosine.min():.4f}"
+        f"cosines of displacements: mean {cosine.mean():.4f}, median {np.median(cosine):.4f}, "
+        f"least {cosine.min():.4f}"
     )
     for c in (3, 5, 10):
         bases = []
@@ -147,20 +150,23 @@ def heads(folder):
     name, new = files[-1].stem, found["registration"]["displacement"][0].values
     n = found["original"][name].sizes["vertex"]
     say(
-        f"{n} vertices inserted in {seconds:.1f} s of CPU; to the recomputation {gap(new, d.sel(shape=name).values)}"
+        f"{n} vertices inserted in {seconds:.1f} s of CPU; "
+        f"to the recomputation {gap(new, d.sel(shape=name).values)}"
     )
     sure, trip, stretch = (
         found["registration"][v].values for v in ("confidence", "round_trip", "distortion")
     )
     say(
-        f"confidence {sure.mean():.2f}, round trip {trip.mean():.4f}, median |distortion| {np.median(abs(stretch)):.3f}"
+        f"confidence {sure.mean():.2f}, round trip {trip.mean():.4f}, "
+        f"median |distortion| {np.median(abs(stretch)):.3f}"
     )
     modes = [
         nine["pca"][v].values for v in ("mean_displacement", "deformation", "standard_deviation")
     ]
     again = project_scores(d.sel(shape=[name]).values, *modes, area)[0][0]
     say(
-        f"scores {found['pca']['score'].values[0].round(2)}, from the recomputation {again.round(2)}"
+        f"scores {found['pca']['score'].values[0].round(2)}, "
+        f"from the recomputation {again.round(2)}"
     )
     for other in before["shape"].values.tolist():
         say(f"  {other} in both: {gap(before.sel(shape=other).values, d.sel(shape=other).values)}")
@@ -227,11 +233,13 @@ def groups():
         np.cumsum(study["pca"][f"explained_variance_ratio{r}"].values) for r in ("_low", "")
     )
     say(
-        f"variance explained by ten: {100 * full[9]:.1f} % at full, {100 * low[9]:.1f} % at low resolution"
+        f"variance explained by ten: {100 * full[9]:.1f} % at full, "
+        f"{100 * low[9]:.1f} % at low resolution"
     )
     whole = statistics.group_test(study, group)
     say(
-        f"planted groups: p = {whole['p_value'].item():.4f}, least possible {whole.attrs['smallest_p']:.4f}"
+        f"planted groups: p = {whole['p_value'].item():.4f}, "
+        f"least possible {whole.attrs['smallest_p']:.4f}"
     )
     where = statistics.group_map(study, group)
     u = truth[study["registration"].attrs["template"]]["reference_point"].values
@@ -242,7 +250,8 @@ def groups():
     for name in ("p_family_wise", "p_false_discovery"):
         marked = where[name].values < 0.05
         say(
-            f"{name} < 0.05 and the region: Dice {2 * (marked & region).sum() / (marked.sum() + region.sum()):.2f}"
+            f"{name} < 0.05 and the region: Dice "
+            f"{2 * (marked & region).sum() / (marked.sum() + region.sum()):.2f}"
         )
     effect = where["effect"].values
     cosine = abs(np.vdot(effect, field)) / np.linalg.norm(effect) / np.linalg.norm(field)
@@ -254,7 +263,8 @@ def groups():
     tenths = np.histogram(p, np.linspace(0, 1, 11))[0]
     uniform = stats.kstest(p, "uniform").pvalue
     say(
-        f"p values of 100 seeds without a difference, by tenths: {tenths}, Kolmogorov-Smirnov p {uniform:.2f}"
+        f"p values of 100 seeds without a difference, by tenths: {tenths}, "
+        f"Kolmogorov-Smirnov p {uniform:.2f}"
     )
 
 

@@ -107,7 +107,8 @@ def registered(name, n_pairs):
         rows.append(found)
     found, n = xr.concat(rows, "pair"), source.sizes["vertex"]
     say(
-        f"\nTable 1 on registered shapes, {name}: {n_pairs} pairs of {n} vertices, {N_LANDMARKS} true landmarks"
+        f"\nTable 1 on registered shapes, {name}: {n_pairs} pairs of {n} vertices, "
+        f"{N_LANDMARKS} true landmarks"
     )
     say(comparison_table(found))
     figure_3(found)
@@ -201,7 +202,8 @@ def embedded(n_vertices=20_000):
     }
     found = compare.pairs(source, dict(others), truth={n: np.asarray(t) for n, t in truth.items()})
     say(
-        f"\nTable 1 on the embedded collection: 5 pairs of {n_vertices} vertices, landmarks as in 4.1"
+        f"\nTable 1 on the embedded collection: 5 pairs of {n_vertices} vertices, "
+        "landmarks as in 4.1"
     )
     say(comparison_table(found))
     figure_3(found)

@@ -75,7 +75,7 @@ def beside(stage, ours, *others):
     return results
 
 
-# ours -----------------------------------------------------------------------------------------------------------------
+# ours ---------------------------------------------------------------------------------------------
 
 
 def our_read(path):
@@ -115,7 +115,7 @@ def our_modes(d, area):
     return gram_pca(d, area)[2]
 
 
-# the others -----------------------------------------------------------------------------------------------------------
+# the others ---------------------------------------------------------------------------------------
 
 
 def meshlab(path):
@@ -250,7 +250,7 @@ def other_modes(d, area):
     return PCA().fit((d * np.sqrt(area)[:, None]).reshape(len(d), -1)).explained_variance_
 
 
-# the tables -----------------------------------------------------------------------------------------------------------
+# the tables ---------------------------------------------------------------------------------------
 
 
 def collection(n, n_vertices, folder):
@@ -265,7 +265,8 @@ def collection(n, n_vertices, folder):
 def stages(folder):
     """The table of stages."""
     say(
-        f"\nStages: shapes of {VERTICES:,} vertices; the network has {NETWORK} shapes, all pairs\n\n{HEAD}"
+        f"\nStages: shapes of {VERTICES:,} vertices; the network has {NETWORK} shapes, all pairs\n"
+        f"\n{HEAD}"
     )
     paths, _ = collection(2, VERTICES, folder / "two")
 
@@ -389,7 +390,8 @@ def network_table():
                 error(synthetic.position(tree["truth"], names[i], u), image, shapes[0].frame[1])
             )
         say(
-            f"{'':36} {name}: low-resolution matches {np.mean(gaps):.2f} % of sqrt(area) from the truth"
+            f"{'':36} {name}: low-resolution matches {np.mean(gaps):.2f} % of sqrt(area) from the "
+            "truth"
         )
 
 
@@ -456,7 +458,8 @@ def other_pipeline(paths, template):
 def pipelines(folder, n=6, n_vertices=50_000):
     """The whole pipeline, ours and the one from pyFM, with errors against the truth."""
     say(
-        f"\nPipelines: {n} shapes of {n_vertices:,} vertices, all pairs, the first is the template\n\n{HEAD}"
+        f"\nPipelines: {n} shapes of {n_vertices:,} vertices, all pairs, "
+        f"the first is the template\n\n{HEAD}"
     )
     paths, truth = collection(n, n_vertices, folder / "files")
     paths, template = [str(p) for p in paths], Path(paths[0]).stem
@@ -478,7 +481,8 @@ def pipelines(folder, n=6, n_vertices=50_000):
             if s != template
         ]
         say(
-            f"{'':36} {name}: {np.mean(gaps):.2f} % of sqrt(area) from the truth, worst shape {np.max(gaps):.2f}"
+            f"{'':36} {name}: {np.mean(gaps):.2f} % of sqrt(area) from the truth, "
+            f"worst shape {np.max(gaps):.2f}"
         )
 
 
@@ -520,7 +524,8 @@ def certificates(folder, n_checked=1000):
     if not DATA.is_dir():
         return
     say(
-        f"\nNearest neighbours on real shapes: {K} dims, first shape -> second; {n_checked} checked in float64\n"
+        f"\nNearest neighbours on real shapes: {K} dims, first shape -> second; "
+        f"{n_checked} checked in float64\n"
     )
     subprocess.run(
         [sys.executable, DATA / "unpack.py", folder], check=True, stdout=subprocess.DEVNULL
@@ -542,8 +547,10 @@ def certificates(folder, n_checked=1000):
         gap = np.linalg.norm(N.U[some] @ F[1] - D[index[some]], axis=1)
         least = cKDTree(D).query(N.U[some] @ F[1])[0]
         say(
-            f"{one.name:10} {len(D):8,} x {len(index):8,}  {seconds:6.2f} s  compared {100 * compared:6.3f} %  "
-            f"certified at once {100 * certified:6.2f} %  farther than the nearest by at most {(gap - least).max():.1e}"
+            f"{one.name:10} {len(D):8,} x {len(index):8,}  {seconds:6.2f} s  "
+            f"compared {100 * compared:6.3f} %  "
+            f"certified at once {100 * certified:6.2f} %  farther than the nearest by at most "
+            f"{(gap - least).max():.1e}"
         )
 
 
@@ -555,7 +562,8 @@ def whole(folder, n=51, n_vertices=VERTICES):
     wall = time.perf_counter() - begin
     report = s4a.open_study(folder / "study")["report"]
     say(
-        f"\n{n} shapes of {n_vertices:,} vertices, all defaults: {wall:.0f} s on {os.cpu_count()} cores\n"
+        f"\n{n} shapes of {n_vertices:,} vertices, "
+        f"all defaults: {wall:.0f} s on {os.cpu_count()} cores\n"
     )
     for stage, seconds, memory in zip(
         *(report[v].values for v in ("stage", "seconds", "peak_memory")), strict=True

@@ -24,10 +24,19 @@ from s4a import widgets
 CHROMIUM = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
 )
-SWITCHES = "--no-sandbox --disable-gpu --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader".split()
+SWITCHES = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+]
 SIZES = (6_000, 30_000, 100_000)
 STEPS = 6
-VIEWS = "[...document.querySelectorAll('canvas.s4a-view')].filter((c) => c.offsetParent).map((c) => c.view)"
+VIEWS = (
+    "[...document.querySelectorAll('canvas.s4a-view')]"
+    ".filter((c) => c.offsetParent).map((c) => c.view)"
+)
 FRAME = f"""() => {{
   const views = {VIEWS}, start = performance.now();
   views.forEach((view) => {{

@@ -133,7 +133,8 @@ def test_every_option_of_analyse_is_a_flag_of_run_with_the_same_default():
 
 
 def test_flags_give_the_options_their_values():
-    flags = "--n-coarse 500 --n-latent 40 --init landmarks --scale --no-strict --components 2 --template x --seed 7"
+    flags = "--n-coarse 500 --n-latent 40 --init landmarks --scale --no-strict"
+    flags += " --components 2 --template x --seed 7"
     found = commands.options_of(
         cli.parser().parse_args(["run", "a", "--out", "study", *flags.split()])
     )

@@ -433,7 +433,8 @@ def metres(path):
     "mirrored.ply",
     "ok",
     "fits as a mirror image",
-    "warned with both ICP residuals; kept as it is; one of a nearly symmetric kind cannot be told from the others",
+    "warned with both ICP residuals; kept as it is; "
+    "one of a nearly symmetric kind cannot be told from the others",
     "mirror the file, or leave it out",
     where="warning",
 )

@@ -55,7 +55,8 @@ PROOFS = [
     ),
     (
         "two identical shapes, among others or alone; all shapes identical",
-        "maps and median; all distances zero, no NaN; modes only where shapes differ, else the reason; tests refuse",
+        "maps and median; all distances zero, no NaN; modes only where shapes differ, "
+        "else the reason; tests refuse",
         PIPELINE,
         "test_identical_shapes_give_finite_results_and_modes_only_beside_a_shape_that_differs",
     ),
@@ -84,7 +85,8 @@ PROOFS = [
         "test_landmarks_off_the_surface_are_brought_onto_it_and_the_distance_is_told",
     ),
     (
-        "options out of range, k > K, too few pairs, a template that is none, a preset contradicted",
+        "options out of range, k > K, too few pairs, a template that is none, "
+        "a preset contradicted",
         "error with the legal range before a shape is read",
         PIPELINE,
         "test_an_option_out_of_range_is_refused_with_the_legal_range_before_a_shape_is_read",

@@ -39,7 +39,7 @@ FRONT_DOOR = (
 
 
 def name_of(path):
-    """The dotted name of a module below s4a: ``method.latent``, or ``method`` for its ``__init__``."""
+    """The dotted name of a module below s4a: ``method.latent``; ``method`` for an ``__init__``."""
     parts = path.relative_to(FOLDER).with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" and len(parts) > 1 else parts)
 

@@ -89,7 +89,8 @@ def test_cleaning_a_dirty_surface(brains, motion, unit, seed):
         )
         > 0
     )
-    # to turn most of the faces, or the few others, depends on which the file has first; all else is the same
+    # to turn most of the faces, or the few others, depends on which the file has first;
+    # all else is the same
     for key in set(counts) - {"reoriented_triangles"}:
         assert other.attrs[key] == one.attrs[key], key
     # coordinates of 1e2 to 1e3 keep 13 digits through a rotation, areas of sides of 1e-1 about 10
@@ -104,7 +105,8 @@ def test_the_spectrum_at_low_resolution(brains, motion, unit, seed):
     Y, S, _ = renumbered(moved(X, motion, unit), T, seed)
     other = spectrum(coarsen(as_dataset(Y, S), n_coarse=300), k=12)
     assert other.sizes["vertex"] == pytest.approx(one.sizes["vertex"], rel=0.02)
-    # among samples equally far from the others rounding decides, which changes a few of the 300 cells
+    # among samples equally far from the others rounding decides,
+    # which changes a few of the 300 cells
     np.testing.assert_allclose(other["eigenvalue"], one["eigenvalue"], rtol=0.02, atol=1e-6)
 
 

@@ -53,16 +53,21 @@ def bombs():
     block = zlib.compress(zeros)
     head = np.array([1, len(zeros), 0, len(block)], "<u4").tobytes()
     vtp = (
-        b'<VTKFile type="PolyData" byte_order="LittleEndian" compressor="vtkZLibDataCompressor"><PolyData>'
-        b'<Piece NumberOfPoints="9" NumberOfPolys="0"><Points><DataArray type="Float32" format="binary">'
+        b'<VTKFile type="PolyData" byte_order="LittleEndian" compressor="vtkZLibDataCompressor">'
+        b"<PolyData>"
+        b'<Piece NumberOfPoints="9" NumberOfPolys="0"><Points>'
+        b'<DataArray type="Float32" format="binary">'
         + b64encode(head)
         + b64encode(block)
         + b"</DataArray></Points></Piece></PolyData></VTKFile>"
     )
     gifti = (
-        b'<?xml version="1.0"?><GIFTI Version="1.0" NumberOfDataArrays="1"><DataArray Intent="NIFTI_INTENT_POINTSET" '
-        b'DataType="NIFTI_TYPE_FLOAT32" Dimensionality="1" Dim0="20000000" Encoding="GZipBase64Binary" '
-        b'Endian="LittleEndian" ArrayIndexingOrder="RowMajorOrder" ExternalFileName="" ExternalFileOffset="">'
+        b'<?xml version="1.0"?><GIFTI Version="1.0" NumberOfDataArrays="1">'
+        b'<DataArray Intent="NIFTI_INTENT_POINTSET" '
+        b'DataType="NIFTI_TYPE_FLOAT32" Dimensionality="1" Dim0="20000000" '
+        b'Encoding="GZipBase64Binary" '
+        b'Endian="LittleEndian" ArrayIndexingOrder="RowMajorOrder" ExternalFileName="" '
+        b'ExternalFileOffset="">'
         b"<Data>" + b64encode(block) + b"</Data></DataArray></GIFTI>"
     )
     npz = BytesIO()

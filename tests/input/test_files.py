@@ -60,7 +60,10 @@ def ply(order, quads=False):
     Faces of mixed size.
     """
     head = f"ply\nformat {order} 1.0\ncomment SPACE=LPS\nelement camera 1\nproperty float view\n"
-    head += f"element vertex {len(X)}\nproperty uchar red\nproperty double x\nproperty double y\nproperty double z\n"
+    head += (
+        f"element vertex {len(X)}\nproperty uchar red\nproperty double x\nproperty double y\n"
+        "property double z\n"
+    )
     faces = [[0, 3, 2, 1], *T[2:].tolist()] if quads else T.tolist()
     head += (
         f"element face {len(faces)}\nproperty uchar flag\nproperty list uchar int vertex_index\n"
@@ -134,7 +137,10 @@ VTK_HEAD = "# vtk DataFile Version {}\n3D Slicer output. SPACE=RAS\n{}\nDATASET 
 def test_vtk_is_read_as_text_with_quads_and_metadata(tmp_path):
     text = VTK_HEAD.format("4.2", "ASCII") + "POINTS 5 float\n" + " ".join(map(str, X.ravel()))
     text += "\nMETADATA\nINFORMATION 1\nNAME L2_NORM LOCATION vtkDataArray\nDATA 2 0 1\n\n"
-    text += "VERTICES 1 2\n1 0\nPOLYGONS 5 21\n4 0 3 2 1\n3 0 1 4\n3 1 2 4\n3 2 3 4\n3 3 0 4\n\nPOINT_DATA 5\n"
+    text += (
+        "VERTICES 1 2\n1 0\nPOLYGONS 5 21\n4 0 3 2 1\n3 0 1 4\n3 1 2 4\n3 2 3 4\n3 3 0 4\n\n"
+        "POINT_DATA 5\n"
+    )
     attrs = same_surface(
         file(tmp_path, "m.vtk", text), X, np.vstack([[[0, 3, 2], [0, 2, 1]], T[2:]])
     )
@@ -182,8 +188,14 @@ def vtp(how, compressed, header="UInt32"):
         return f'{tag}"appended" offset="{offset}"/>'
 
     zlib_attr = ' compressor="vtkZLibDataCompressor"' if compressed else ""
-    text = f'<?xml version="1.0"?>\n<VTKFile type="PolyData" byte_order="LittleEndian" header_type="{header}"{zlib_attr}>'
-    text += '<PolyData><Piece NumberOfPoints="5" NumberOfVerts="0" NumberOfStrips="0" NumberOfPolys="6"><Points>'
+    text = (
+        '<?xml version="1.0"?>\n'
+        f'<VTKFile type="PolyData" byte_order="LittleEndian" header_type="{header}"{zlib_attr}>'
+    )
+    text += (
+        '<PolyData><Piece NumberOfPoints="5" NumberOfVerts="0" NumberOfStrips="0" '
+        'NumberOfPolys="6"><Points>'
+    )
     text += array("Points", X.astype("<f8"), "Float64", 3) + "</Points><Polys>"
     text += array("connectivity", T.astype("<i8"), "Int64") + array(
         "offsets", np.arange(3, 19, 3), "Int64"
@@ -308,7 +320,10 @@ def test_counts_beyond_the_file_are_named(tmp_path):
     ],
 )
 def test_a_ply_says_what_its_header_lacks(tmp_path, before, after, found):
-    head = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    head = (
+        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\n"
+        "property float z\n"
+    )
     head += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
     (tmp_path / "m.ply").write_text(head.replace(before, after) + "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
     with pytest.raises(ValueError, match=f"m.ply cannot be read as PLY: {found}"):

@@ -94,7 +94,8 @@ def test_a_gifti_file_opens_no_other_file(tmp_path):
     file(tmp_path / "secret", bytes(12))
     text = (
         '<GIFTI Version="1.0"><DataArray Intent="NIFTI_INTENT_LABEL" DataType="NIFTI_TYPE_INT32" '
-        'Dimensionality="1" Dim0="3" Encoding="ExternalFileBinary" ExternalFileName="secret" ExternalFileOffset="0" '
+        'Dimensionality="1" Dim0="3" Encoding="ExternalFileBinary" ExternalFileName="secret" '
+        'ExternalFileOffset="0" '
         'ArrayIndexingOrder="RowMajorOrder" Endian="LittleEndian"><Data/></DataArray></GIFTI>'
     )
     with pytest.raises(
@@ -121,7 +122,8 @@ def test_label_files_that_unpack_to_more_than_64_mib_and_200_times_their_size_ar
     packed = base64.b64encode(zlib.compress(zeros)).decode()
     gifti = (
         '<GIFTI Version="1.0"><DataArray Intent="NIFTI_INTENT_LABEL" DataType="NIFTI_TYPE_INT32" '
-        'Dimensionality="1" Dim0="20000000" Encoding="GZipBase64Binary" ArrayIndexingOrder="RowMajorOrder" '
+        'Dimensionality="1" Dim0="20000000" Encoding="GZipBase64Binary" '
+        'ArrayIndexingOrder="RowMajorOrder" '
         f'Endian="LittleEndian"><Data>{packed}</Data></DataArray></GIFTI>'
     )
     bombs = {"a.npz": npz(label=array((20_000_000,), zeros)), "b.gii": gifti.encode()}
@@ -159,15 +161,22 @@ def test_many_arrays_at_one_place_of_a_file_count_each(tmp_path):
 
 
 def test_offsets_of_polygons_whose_differences_overflow_are_refused(tmp_path):
-    offsets = f"{2**63 - 1} -2 9"  # in 64 bits each is above the one before by a positive number, and few in all
+    # in 64 bits each is above the one before by a positive number, and few in all
+    offsets = f"{2**63 - 1} -2 9"
     arrays = {"connectivity": "0 1 2 0 1 2 0 1 2", "offsets": offsets}
     polys = "".join(
         f'<DataArray type="Int64" Name="{n}" format="ascii">{v}</DataArray>'
         for n, v in arrays.items()
     )
     points = '<DataArray type="Float32" format="ascii">0 0 0 1 0 0 0 1 0</DataArray>'
-    xml = f"<Piece NumberOfPoints='3' NumberOfPolys='3'><Points>{points}</Points><Polys>{polys}</Polys></Piece>"
-    legacy = "# vtk DataFile Version 5.1\na\nASCII\nDATASET POLYDATA\nPOINTS 3 float\n0 0 0 1 0 0 0 1 0\nPOLYGONS 4 9\n"
+    xml = (
+        f"<Piece NumberOfPoints='3' NumberOfPolys='3'><Points>{points}</Points>"
+        f"<Polys>{polys}</Polys></Piece>"
+    )
+    legacy = (
+        "# vtk DataFile Version 5.1\na\nASCII\nDATASET POLYDATA\nPOINTS 3 float\n"
+        "0 0 0 1 0 0 0 1 0\nPOLYGONS 4 9\n"
+    )
     legacy += (
         f"OFFSETS vtktypeint64\n0 {offsets}\nCONNECTIVITY vtktypeint64\n{arrays['connectivity']}\n"
     )

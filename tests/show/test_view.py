@@ -178,7 +178,8 @@ def test_labels_are_not_mixed():
     picture = draw.render(X, T, colors=colors, flat=True, view="top", size=(100, 100))
     inner = picture[10:90, 10:90, :3][picture[10:90, 10:90, 3] == 255].astype(float)
     hue = inner[:, 2] / inner.sum(1)
-    # orange has no blue and sky blue is mostly blue: only antialiased samples of the border lie in between
+    # orange has no blue and sky blue is mostly blue:
+    # only antialiased samples of the border lie in between
     assert ((hue > 0.15) & (hue < 0.35)).mean() < 0.05
 
 
@@ -224,7 +225,8 @@ def test_text_of_the_study_is_escaped(html):
 
 
 def test_the_page_says_what_the_study_says(html):
-    summary = "7 shapes, 1 repaired, 1 excluded; median shape-2; template shape-2; the first 3 components hold 100%"
+    summary = "7 shapes, 1 repaired, 1 excluded; median shape-2; template shape-2; "
+    summary += "the first 3 components hold 100%"
     for text in (
         summary,
         "shape-2, the median",

@@ -24,7 +24,8 @@ import signal, sys, time
 from s4a import analyse
 from s4a.study import tasks
 
-signal.signal(signal.SIGINT, signal.default_int_handler)  # it is ignored below a background job of a shell
+# it is ignored below a background job of a shell
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 def slow(*arguments, task=tasks.remesh_shape):
     time.sleep(2)
@@ -103,7 +104,8 @@ def renamed(temporary, path):
     rename(temporary, path)
 
 log.write_text("")
-store.write(synthetic.sphere(9), log.with_suffix(".nc"))  # imports all that the runs below need, once
+# imports all that the runs below need, once
+store.write(synthetic.sphere(9), log.with_suffix(".nc"))
 store.attributes(log.with_suffix(".nc"))
 os.replace = renamed
 code = -signal.SIGKILL
@@ -238,7 +240,8 @@ FULL = """
 import resource, sys
 from s4a import cli
 resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, 60_000))
-small = ["--n-coarse", "150", "--k-init", "8", "--k", "12", "--n-jobs", sys.argv[1], "--no-intersections"]
+small = ["--n-coarse", "150", "--k-init", "8", "--k", "12", "--no-intersections"]
+small += ["--n-jobs", sys.argv[1]]
 sys.exit(cli.main(["run", *sys.argv[3:], "--out", sys.argv[2], *small]))
 """
 

@@ -339,7 +339,8 @@ def test_one_usable_shape_is_not_enough_and_the_reasons_are_named(arrays):
         ({"n_coarse": 99}, r"n_coarse must be an integer of at least 100; found 99"),
         (
             {"n_pairs": 2},
-            r"n_pairs = 2 cannot connect 4 shapes: give an integer from 3 \(a tree\) to 6 \(all pairs\)",
+            r"n_pairs = 2 cannot connect 4 shapes: "
+            r"give an integer from 3 \(a tree\) to 6 \(all pairs\)",
         ),
         ({"k_init": 3}, r"k_init must be an integer of at least 4; found 3"),
         ({"k": 9}, r"k must be at least k_init = 10; found 9"),

@@ -31,14 +31,21 @@ CHROMIUM = next(
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium")
 NOTEBOOK = NOTEBOOKS / "00_explore.ipynb"
 SWITCHES = (
-    "--no-sandbox --disable-gpu --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader --disable-quic "
+    "--no-sandbox --disable-gpu --use-gl=angle --use-angle=swiftshader "
+    "--enable-unsafe-swiftshader --disable-quic "
     "--disable-background-networking --no-first-run --disable-component-update --disable-sync"
 ).split()
 HARMLESS = ("t.on is not a function", "Unsatisfied version")  # both are JupyterLab's own
 VIEW = "canvas.s4a-view"
 DRAWN = f"[...document.querySelectorAll('{VIEW}')].some((c) => c.offsetParent && c.view.frames > 0)"
-SEEN = "[...document.querySelectorAll('canvas.s4a-view')].filter((c) => c.offsetParent).map((c) => c.view)"
-STILLS = "[...document.querySelectorAll('img.s4a-still')].filter((i) => i.offsetParent && i.naturalWidth > 100)"
+SEEN = (
+    "[...document.querySelectorAll('canvas.s4a-view')]"
+    ".filter((c) => c.offsetParent).map((c) => c.view)"
+)
+STILLS = (
+    "[...document.querySelectorAll('img.s4a-still')]"
+    ".filter((i) => i.offsetParent && i.naturalWidth > 100)"
+)
 IDLE = (
     "[...document.querySelectorAll('.jp-InputPrompt')].every((p) => !p.textContent.includes('*'))"
 )
@@ -384,8 +391,10 @@ def test_whatever_can_be_clicked_has_a_name_and_is_reached_by_the_keyboard(page)
             assert canvas.get_attribute("tabindex") == "0"
             assert "arrow keys turn" in canvas.get_attribute("aria-label")
         unnamed = page.evaluate(
-            "[...document.querySelectorAll('.s4a input, .s4a select, .s4a button, .s4a [role=button]')]"
-            ".filter((e) => e.offsetParent && !(e.ariaLabel || e.textContent.trim() || e.labels?.length)).length"
+            "[...document.querySelectorAll("
+            "'.s4a input, .s4a select, .s4a button, .s4a [role=button]')]"
+            ".filter((e) => e.offsetParent)"
+            ".filter((e) => !(e.ariaLabel || e.textContent.trim() || e.labels?.length)).length"
         )
         assert unnamed == 0
     visible(page, ".s4a-slider input").first.focus()
