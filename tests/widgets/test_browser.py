@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 import urllib.request
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -60,7 +61,15 @@ Progress(s4a.synthetic.brains(3, 8000, seed=1), {store!r}, n_coarse=300, k=12, k
 
 
 @pytest.fixture(scope="module")
-def folder(study_folder, tmp_path_factory):
+def study(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("study")
+    return s4a.analyse(
+        s4a.synthetic.brains(5, 2000, seed=1), n_coarse=500, k=24, k_init=10, store=folder, n_jobs=1
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(study, tmp_path_factory):
     """A folder with the main notebook.
 
     In which the study of this test takes the place of the analysis.
@@ -68,7 +77,8 @@ def folder(study_folder, tmp_path_factory):
     folder = tmp_path_factory.mktemp("lab")
     notebook = json.loads(NOTEBOOK.read_text(encoding="utf-8"))
     cell = next(c for c in notebook["cells"] if "s4a.analyse" in "".join(c["source"]))
-    opened = f"import s4a\n\nstudy = s4a.open_study({str(study_folder)!r})"
+    store = Path(study["coarse/brain_01"].to_dataset().encoding["source"]).parent.parent
+    opened = f"import s4a\n\nstudy = s4a.open_study({str(store)!r})"
     cell["source"] = opened
     (folder / NOTEBOOK.name).write_text(json.dumps(notebook), encoding="utf-8")
     notebook["cells"] = [cell | {"source": f"{opened}\nstudy.s4a.explore()", "id": "small"}]
@@ -629,9 +639,9 @@ def test_the_page_of_a_transfer_says_what_needs_python(offline, study, tmp_path)
     page, errors = opened(offline, saved(widgets.Transfer(study), tmp_path / "transfer.html"))
     page.wait_for_function(DRAWN)
     assert "placing landmarks" in page.locator(".note").inner_text()
-    chosen(page, "target", "brain_04")
-    visible(page, ".s4a-title").filter(has_text="brain_04, the target").wait_for()
-    page.wait_for_selector("text=Landmarks on brain_04")
+    chosen(page, "target", "brain_05")
+    visible(page, ".s4a-title").filter(has_text="brain_05, the target").wait_for()
+    page.wait_for_selector("text=Landmarks on brain_05")
     assert errors == []
     page.close()
 

@@ -165,7 +165,7 @@ def test_without_webgl_python_deforms(study):
     view.webgl = "no"
     still = view.still
     assert still[1:4] == b"PNG"
-    view.scores = [0, 2.0, 0, 0]
+    view.scores = [0, 2.0, 0]
     assert view.still != still
     points, _, colors = view.drawn()
     np.testing.assert_allclose(points, mean + 2 * pca["deformation"].values[1], atol=1e-5)
