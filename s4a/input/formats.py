@@ -74,6 +74,7 @@ def format_of(data: bytes) -> str:
 
     Examples
     --------
+    >>> from s4a.input.formats import format_of
     >>> format_of(b"OFF 3 1 0"), format_of(b"# made by hand\\nv 0 0 0")
     ('OFF', 'OBJ')
     """

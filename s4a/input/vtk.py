@@ -27,6 +27,8 @@ def fans(corners: np.ndarray, offsets: np.ndarray) -> np.ndarray:
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.input.vtk import fans
     >>> fans(np.array([0, 1, 2, 4, 5, 6, 7]), np.array([0, 3, 7])).tolist()
     [[0, 1, 2], [4, 5, 6], [4, 6, 7]]
     """

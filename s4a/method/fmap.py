@@ -147,6 +147,8 @@ def fit(
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.method.fmap import fit
     >>> F = np.random.default_rng(0).normal(size=(3, 5))
     >>> np.allclose(fit(F, F), np.eye(3))
     True
@@ -377,6 +379,8 @@ def off_diagonal_mass(C):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.method.fmap import off_diagonal_mass
     >>> off_diagonal_mass(np.eye(3)), off_diagonal_mass(np.eye(2)[::-1])
     (0.0, 1.0)
     """
@@ -405,6 +409,8 @@ def swapped_blocks(C, *, longest=6, inside=0.75, diagonal=0.5):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.method.fmap import swapped_blocks
     >>> swapped_blocks(np.eye(5)[[0, 2, 1, 3, 4]])
     [(1, 2)]
     """

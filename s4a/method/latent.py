@@ -371,6 +371,8 @@ def frozen_basis(C_out: np.ndarray, C_in: np.ndarray, Y: np.ndarray) -> np.ndarr
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.method.latent import frozen_basis
     >>> Y = np.array([[[1.0], [2.0]]])
     >>> frozen_basis(np.eye(2)[None], np.eye(2)[None], Y).tolist()
     [[1.0], [2.0]]

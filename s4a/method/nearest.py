@@ -33,6 +33,8 @@ def nearest_rows(Q: np.ndarray, D: np.ndarray, *, block: int = 256) -> np.ndarra
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.method.nearest import nearest_rows
     >>> nearest_rows(np.array([[0.1], [4.0]]), np.array([[0.0], [5.0]])).tolist()
     [0, 1]
     """

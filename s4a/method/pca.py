@@ -180,9 +180,8 @@ def synthesize(study: xr.DataTree, scores: np.ndarray) -> xr.Dataset:
     With the ``study`` of six small brains; scores of 0 give the mean shape:
 
     >>> import s4a
-    >>> from s4a.method.pca import synthesize
     >>> study = s4a.synthetic.example_study()
-    >>> mean, larger = synthesize(study, [0.0]), synthesize(study, [2.0])
+    >>> mean, larger = s4a.synthesize(study, [0.0]), s4a.synthesize(study, [2.0])
     >>> moved = (larger["position"] - mean["position"]) / 2
     >>> bool(abs(moved - study["pca"]["deformation"][0].values).max() < 1e-4)
     True

@@ -298,6 +298,8 @@ def log_area_ratio(image: np.ndarray, X: np.ndarray, T: np.ndarray) -> np.ndarra
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.method.register import log_area_ratio
     >>> X, T = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]])
     >>> (log_area_ratio(2 * X, X, T) + 0.0).tolist()
     [0.0, 0.0, 0.0]

@@ -33,6 +33,8 @@ def bump(distance, radius):
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from s4a.method.scalable import bump
     >>> bump(np.array([0.0, 1.0, 2.0, 3.0]), 2.0).tolist()
     [1.0, 0.5, 0.0, 0.0]
     """
@@ -156,8 +158,10 @@ def reduce(mesh: xr.Dataset, *, n_samples: int = 6000, k: int = 100, seed: int =
 
     Examples
     --------
-    >>> from s4a.datasets.synthetic import sphere
-    >>> shape = reduce(sphere(2000), n_samples=300, k=4)
+    >>> import numpy as np
+    >>> import s4a
+    >>> from s4a.method.scalable import reduce
+    >>> shape = reduce(s4a.synthetic.sphere(2000), n_samples=300, k=4)
     >>> bool(np.allclose(shape.low.eigenvalue, 8 * np.pi * np.array([0, 1, 1, 1]), rtol=0.1))
     True
     """

@@ -92,12 +92,12 @@ def insert(
 
     Examples
     --------
-    >>> from s4a import analyse, synthetic
-    >>> brains = synthetic.brains(4, 1500)["original"]
+    >>> import s4a
+    >>> brains = s4a.synthetic.brains(4, 1500)["original"]
     >>> brains = {name: mesh.to_dataset() for name, mesh in brains.children.items()}
     >>> last = brains.pop("brain_04")
-    >>> study = analyse(brains, n_coarse=300, k_init=8, k=12)
-    >>> insert(study, {"brain_04": last})["pca"]["score"].sizes["component"]
+    >>> study = s4a.analyse(brains, n_coarse=300, k_init=8, k=12)
+    >>> s4a.insert(study, {"brain_04": last})["pca"]["score"].sizes["component"]
     2
     """
     needed = ("original", "coarse", "latent", "registration")

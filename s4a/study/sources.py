@@ -26,9 +26,9 @@ def find_sources(shapes, pattern: str | None = None) -> dict[str, tuple[str | xr
 
     Examples
     --------
-    >>> from s4a.datasets.synthetic import sphere
+    >>> import s4a
     >>> from s4a.study.sources import find_sources
-    >>> list(find_sources({"b": sphere(9), "a": sphere(12)}))
+    >>> list(find_sources({"b": s4a.synthetic.sphere(9), "a": s4a.synthetic.sphere(12)}))
     ['a', 'b']
     """
     if isinstance(shapes, xr.DataTree):
