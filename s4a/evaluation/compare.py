@@ -389,7 +389,7 @@ def one_collection(
     for row, how in enumerate(HOW):
         chamfer[row], full_seconds = chamfer_to_template(spaces, shapes, Y, template, how)
         seconds.append([load, network_seconds, zoomout_seconds, full_seconds])
-    row = xr.Dataset(
+    measures = xr.Dataset(
         {
             "collection_chamfer": variable("collection_chamfer", chamfer[None]).isel(way=0),
             "collection_seconds": variable("collection_seconds", np.array(seconds)[None]).isel(
@@ -399,7 +399,7 @@ def one_collection(
             "distance_to_median": found["distance_to_median"].variable,
         }
     )
-    return row.assign_coords(how=list(HOW), block=list(COLLECTION_BLOCKS), shape=names)
+    return measures.assign_coords(how=list(HOW), block=list(COLLECTION_BLOCKS), shape=names)
 
 
 def first_maps(

@@ -16,7 +16,7 @@ import numpy as np
 import xarray as xr
 from scipy.spatial import cKDTree
 
-from s4a.geometry.align import align, farthest_points
+from s4a.geometry.align import Motion, align, farthest_points
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.method import fmap, joint
 from s4a.method.first_map import N_LANDMARKS, nearest_after_motion
@@ -56,7 +56,7 @@ class Clock:
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
 
-    def __call__(self, block: str, function: Callable, *arguments, **options) -> Any:
+    def __call__(self, block: str, function: Callable, *arguments: Any, **options: Any) -> Any:
         """What a function gives; its seconds go to the block."""
         begin = time.process_time()
         result = function(*arguments, **options)
@@ -192,12 +192,12 @@ def match_in_space(
 
 def fit_map(M: Shape, N: Shape, landmarks: Matches, k: int) -> np.ndarray:
     """First map ``(k, k)`` from landmarks and wave kernels, see `fmap.fit_descriptors`."""
-    at = [
+    at_source, at_target = (
         mark if shape.U is None else shape.cell[mark]
         for shape, mark in zip((M, N), landmarks, strict=True)
-    ]
+    )
     bases = [replace(shape.low, area=shape.low.area / shape.low.area.sum()) for shape in (M, N)]
-    return fmap.fmap_from_descriptors(*bases, k=k, landmarks=at, oriented=0)
+    return fmap.fmap_from_descriptors(*bases, k=k, landmarks=(at_source, at_target), oriented=0)
 
 
 class SpectralMatch(NamedTuple):
@@ -294,7 +294,7 @@ class Pair:
             landmarks = clock("align", default_landmarks, self.source, self.target, (R, t))
         return (R, t), landmarks, clock.seconds["align"]
 
-    def match_spectrally(self, method: str, motion, landmarks: Matches) -> SpectralMatch:
+    def match_spectrally(self, method: str, motion: Motion, landmarks: Matches) -> SpectralMatch:
         """ZO, FMAP+ZO, SCALABLE or RE-MATCH: first map, ZoomOut and match at full resolution."""
         if method not in self.spectral:
             self.spectral[method] = self._match_spectrally(method, motion, landmarks)
@@ -332,7 +332,7 @@ class Pair:
             match, *_ = clock("full resolution", nearest_in_cells, G, N.cell, F, M.cell)
         return SpectralMatch(match, (F, G), low_match, clock.seconds)
 
-    def refine_jointly(self, spectral: SpectralMatch, motion, clock: Clock) -> Matches:
+    def refine_jointly(self, spectral: SpectralMatch, motion: Motion, clock: Clock) -> Matches:
         """RE-MATCH with joint rounds: match and registered surface at full resolution."""
         M, N = self.source.coarse, self.target.coarse
         starts = {

@@ -49,7 +49,7 @@ def number_type(name: str | None, order: str) -> np.dtype:
     known = re.fullmatch(r"(?:NIFTI_TYPE_)?(u?int(8|16|32|64)|float(32|64))", name or "", re.I)
     if not known:
         raise ValueError(f"integers or floats expected, found {str(name)[:40]}")
-    return np.dtype(known[1].lower()).newbyteorder(order)
+    return np.dtype(order + np.dtype(known[1].lower()).str[1:])
 
 
 # legacy files

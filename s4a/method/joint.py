@@ -52,7 +52,9 @@ def move(target: Basis, motion: Motion) -> np.ndarray:
     return turn(target, R, t) + target.field(c)
 
 
-def nearest_vertices(source: Basis, target: Basis, X: np.ndarray, rows=slice(None)) -> np.ndarray:
+def nearest_vertices(
+    source: Basis, target: Basis, X: np.ndarray, rows: slice | np.ndarray = slice(None)
+) -> np.ndarray:
     """The vertices of the source nearest in position and normal to rows of the target at X."""
     return source.tree.query(features(X, vertex_normals(X, target.T))[rows])[1]
 
@@ -239,8 +241,10 @@ def candidates(
         enter(f"{name}+joint", *low_rounds(source, target, match, k=k))
     best = min(starts, key=lambda name: tried[f"{name}+joint"].score)
     if all(far_apart(source, target, match) for match in starts.values()):
-        options = {"k_first": 20, "k": k, "rounds": 1, "spectral": 0.2, "by_parts": True}
-        enter(f"{best}+parts", *low_rounds(source, target, starts[best], **options))
+        end = low_rounds(
+            source, target, starts[best], k_first=20, k=k, rounds=1, spectral=0.2, by_parts=True
+        )
+        enter(f"{best}+parts", *end)
     elif min(candidate.score for candidate in tried.values()) > far:
         end = low_rounds(source, target, starts[best], k=k, spectral=0.1)
         enter(f"{best}+joint+spectral", *end)

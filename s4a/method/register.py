@@ -234,7 +234,9 @@ def register_surface(
     """
     M = source.full
     N = target.full
-    attrs = {f"score_{name}": candidate.score for name, candidate in tried.items()}
+    attrs: dict[str, float | str] = {
+        f"score_{name}": candidate.score for name, candidate in tried.items()
+    }
     ends = {}
     for name in joint.finalists(tried) if tried else ["intrinsic"]:
         if name == "intrinsic":

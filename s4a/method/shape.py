@@ -5,6 +5,7 @@ Every step of the method takes shapes, or the :class:`Basis` of one at one resol
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -135,7 +136,7 @@ class Shape:
     coarse: xr.Dataset | None = None
 
     @classmethod
-    def of(cls, original: xr.Dataset, **parts) -> "Shape":
+    def of(cls, original: xr.Dataset, **parts: Any) -> "Shape":
         """A shape whose ``low``, ``full``, ``U`` and ``cell`` were made in another way."""
         shape = cls(original)
         vars(shape).update(parts)  # in the place of the cached properties

@@ -172,7 +172,7 @@ def freeze(study: xr.DataTree) -> Frozen:
     """What new shapes need of a study, the template first; shapes that failed are left out."""
     latent = study["latent"].to_dataset()
     require(latent, "latent_basis", "latent_eigenvalue", what="latent dataset")
-    rotation = study["registration"]["rotation"]
+    rotation = study["registration"].dataset["rotation"]
     template = study["registration"].attrs["template"]
     registered = set(rotation["shape"].values.tolist())
     others = [n for n in latent["shape"].values.tolist() if n in registered and n != template]
@@ -182,7 +182,7 @@ def freeze(study: xr.DataTree) -> Frozen:
         Shape(study["original"][template].to_dataset().load(), coarse[0].load()),
         [Shape(None, mesh).low for mesh in coarse],
         latent["latent_basis"].sel(shape=names).values,
-        [rotation.sel(shape=name).values for name in names],
+        list(rotation.sel(shape=names).values),
     )
 
 
@@ -244,7 +244,7 @@ def nearest_spectra(new: Basis, shapes: list[Basis], k: int) -> list[int]:
 
 def report_beside(study: xr.DataTree, attrs: dict, looks: dict) -> xr.Dataset:
     """The report on the new shapes, each beside those of the study, as they lie when registered."""
-    rotation = study["registration"]["rotation"]
+    rotation = study["registration"].dataset["rotation"]
     known = {name: study["original"][name].attrs for name in rotation["shape"].values.tolist()}
     # the hand of the study is the right one, and its own intersections are told already
     usual = {"residual": 0.0, "mirrored": 1.0, "self_intersections": -1}

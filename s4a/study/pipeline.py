@@ -7,6 +7,7 @@ in the folder of the run, and what computes one of them is in :mod:`s4a.study.ta
 import logging
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -21,7 +22,7 @@ from s4a.study import tasks
 from s4a.study.options import Options, takes_options
 from s4a.study.report import write_report
 from s4a.study.runner import Run, Task
-from s4a.study.sources import find_sources
+from s4a.study.sources import Collection, find_sources
 from s4a.study.store import (
     arrays,
     attributes,
@@ -38,7 +39,13 @@ log = logging.getLogger(__name__)
 
 
 @takes_options
-def analyse(shapes, *, store: Path | str | None = None, n_jobs: int | None = None, **options):
+def analyse(
+    shapes: Collection,
+    *,
+    store: Path | str | None = None,
+    n_jobs: int | None = None,
+    **options: Any,
+) -> xr.DataTree:
     """From a collection of meshes to a median shape, dense correspondences and modes.
 
     The whole of S4A.
@@ -113,16 +120,16 @@ def analyse(shapes, *, store: Path | str | None = None, n_jobs: int | None = Non
             study = analyse(shapes, store=folder, n_jobs=n_jobs, **options)
             loaded = {n.path: n.to_dataset(inherit=False).load() for n in study.subtree}
             return xr.DataTree.from_dict(loaded)
-    options = Options(**options)
-    sources = find_sources(shapes, options.pattern)
-    remarks = passed_over(shapes, options.pattern)
-    options.check_against(list(sources))
-    subjects = None if options.table is None else read_table(options.table, list(sources))
+    checked = Options(**options)
+    sources = find_sources(shapes, checked.pattern)
+    remarks = passed_over(shapes, checked.pattern)
+    checked.check_against(list(sources))
+    subjects = None if checked.table is None else read_table(checked.table, list(sources))
     with lock(store) as claim:
         run = Run(claim, n_jobs)
         if subjects is not None:
             write(subjects, run.folder / "subjects.nc")
-        run_stages(run, sources, options, remarks)
+        run_stages(run, sources, checked, remarks)
     return open_study(store)
 
 

@@ -70,8 +70,8 @@ class Run:
     ----------
     failures : dict of str to str
         Name of a shape that is left out -> why.
-    costs : dict of str to (seconds, MiB)
-        Of every stage, those of earlier runs over the folder included.
+    costs : dict of str to tuple
+        Seconds and MiB of every stage, those of earlier runs over the folder included.
     """
 
     def __init__(self, claim: Claim, n_jobs: int | None):

@@ -1,6 +1,7 @@
 """The shapes that an analysis is given (5.1, the data), each with the key of its content."""
 
 from pathlib import Path
+from typing import Any
 
 import xarray as xr
 
@@ -9,8 +10,13 @@ from s4a.input.files import find_meshes, slug
 from s4a.schema import require
 from s4a.study.store import task_key
 
+# files; or meshes in memory by name, Datasets or (points, triangles); or what read_shapes gives
+Collection = Path | str | list[Path | str] | dict[str, Any] | xr.DataTree
 
-def find_sources(shapes, pattern: str | None = None) -> dict[str, tuple[str | xr.Dataset, str]]:
+
+def find_sources(
+    shapes: Collection, pattern: str | None = None
+) -> dict[str, tuple[str | xr.Dataset, str]]:
     """What the user gave, in the order of the names: path or Dataset, and the key of its content.
 
     Parameters

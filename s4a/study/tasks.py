@@ -46,7 +46,9 @@ def compare_shape(folder: Path, name: str, reference: str, intersections: bool) 
     return dataset(look, rotation=rotation)
 
 
-def remesh_shape(folder: Path, name: str, n_coarse: int, wrap: bool, seed: int, k: int):
+def remesh_shape(
+    folder: Path, name: str, n_coarse: int, wrap: bool, seed: int, k: int
+) -> xr.Dataset:
     """The low-resolution mesh of a shape of the study, its U (4.1) and its spectrum (3.3)."""
     mesh = read(folder / "original" / f"{name}.nc")
     low = spectrum(coarsen(mesh, n_coarse=n_coarse, wrap=wrap, seed=seed), k=k)
