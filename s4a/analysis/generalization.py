@@ -1,7 +1,5 @@
 """True generalization (6.1): each shape left out, and found anew by the study of the others."""
 
-import logging
-
 import numpy as np
 import xarray as xr
 from joblib import Parallel, delayed
@@ -20,58 +18,63 @@ from s4a.study import store
 from s4a.study.insert import insert
 from s4a.study.options import Options
 
-log = logging.getLogger(__name__)
-
 RECOMPUTED = "recomputed for every left-out shape, as a new one in the study of the others"
 
 
-def _onto(shape, template, bases, start, options):
-    """One registration of a shape of a study to another template, its latent basis as it is."""
-    with threadpool_limits(1):
-        M = shape.low
-        N = template.low
-        motion = realign(M.X, M.area, N.X, N.area, start)
-        return from_latent(
-            shape, template, bases, motion, refine=options.refine, scale=options.scale
-        )
-
-
-def without(study, name, *, n_jobs=None):
-    """The study of all other shapes.
-
-    That of `name` leaves the latent space, the registration and the modes.
+def without(study: xr.DataTree, name: str, *, n_jobs: int | None = None) -> xr.DataTree:
+    """The study of all shapes but `name`, which leaves latent space, registration and modes.
 
     Where it is the template, the shape next nearest to the limit shape (eq. 5) takes its place, and
     all others are registered to that.  The other shapes' latent bases stay: they came out of a
     network that had the shape.
     """
-    data = study["registration"].to_dataset()
-    latent = study["latent"].to_dataset()
-    kept = [n for n in data["shape"].values.tolist() if n != name]
-    nodes = {f"{s}/{n}": study[s][n].to_dataset() for s in ("original", "coarse") for n in kept}
-    nodes |= {"latent": latent.sel(shape=kept), "report": study["report"].to_dataset()}
-    if data.attrs["template"] != name:
-        nodes |= {"registration": data.sel(shape=kept)}
+    registration = study["registration"].to_dataset()
+    names = [n for n in registration["shape"].values.tolist() if n != name]
+    latent = study["latent"].to_dataset().sel(shape=names)
+    nodes = {f"{s}/{n}": study[s][n].to_dataset() for s in ("original", "coarse") for n in names}
+    nodes |= {"latent": latent, "report": study["report"].to_dataset()}
+    if registration.attrs["template"] != name:
+        nodes["registration"] = registration.sel(shape=names)
         return xr.DataTree.from_dict(nodes)
-    template = str(latent["distance_to_median"].sel(shape=kept).idxmin().item())
-    shapes = {n: Shape(nodes[f"original/{n}"].load(), nodes[f"coarse/{n}"].load()) for n in kept}
-    bases = {n: latent["latent_basis"].sel(shape=n).values for n in kept}
-    turn = {n: data["rotation"].sel(shape=n).values for n in kept}
-    options = Options.from_report(study)
-    others = [n for n in kept if n != template]
-    found = Parallel(n_jobs=n_jobs)(
-        delayed(_onto)(
+    rotation = {n: registration["rotation"].sel(shape=n).values for n in names}
+    return xr.DataTree.from_dict(
+        nodes | _register_anew(nodes, latent, rotation, Options.from_report(study), n_jobs)
+    )
+
+
+def _register_anew(nodes, latent, rotation, options, n_jobs):
+    """Nodes of ``/registration`` onto the shape nearest to the limit shape (eq. 5)."""
+    names = latent["shape"].values.tolist()
+    median = str(latent["distance_to_median"].idxmin().item())
+    shapes = {n: Shape(nodes[f"original/{n}"].load(), nodes[f"coarse/{n}"].load()) for n in names}
+    template = shapes[median]
+    Y = {n: latent["latent_basis"].sel(shape=n).values for n in names}
+    others = [n for n in names if n != median]
+    # R_i turns shape i to the old template, so that R_median^T R_i turns it to the new one
+    registered = Parallel(n_jobs=n_jobs)(
+        delayed(_register)(
             shapes[n],
-            shapes[template],
-            (bases[n], bases[template]),
-            (turn[template].T @ turn[n], np.zeros(3)),
+            template,
+            (Y[n], Y[median]),
+            rotation[median].T @ rotation[n],
             options,
         )
         for n in others
     )
-    files = dict(zip(others, found, strict=True)) | {template: identity(shapes[template])}
-    mesh = store.template_mesh(shapes[template].original, template)
-    return xr.DataTree.from_dict(nodes | store.stack_registration(mesh, files, kept))
+    files = dict(zip(others, registered, strict=True)) | {median: identity(template)}
+    mesh = store.template_mesh(template.original, median)
+    return store.stack_registration(mesh, files, names)
+
+
+def _register(shape, template, bases, rotation, options):
+    """One registration of a shape of a study to another template, its latent basis as it is."""
+    with threadpool_limits(1):
+        M = shape.low
+        N = template.low
+        motion = realign(M.X, M.area, N.X, N.area, (rotation, np.zeros(3)))
+        return from_latent(
+            shape, template, bases, motion, refine=options.refine, scale=options.scale
+        )
 
 
 def _errors_of(study, name, n_points, seed, n_jobs):
@@ -154,10 +157,9 @@ def generalization(
         raise ValueError(f"at least 5 shapes needed to leave one out, found {len(names)}")
     # first the template, alone: to leave it out is the one turn with work to share out
     template = registration.attrs["template"]
-    others = [name for name in names if name != template]
     first = _errors_of(study, template, n_points, seed, n_jobs)
     rest = Parallel(n_jobs=n_jobs, return_as="generator")(
-        delayed(_errors_of)(study, name, n_points, seed, 1) for name in others
+        delayed(_errors_of)(study, name, n_points, seed, 1) for name in names if name != template
     )
     errors = [first, *tqdm(rest, total=len(names) - 1, desc="shapes left out")]
     error, surface = (np.stack(values) for values in zip(*errors, strict=True))  # (s, s - 1) each

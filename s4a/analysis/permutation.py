@@ -1,6 +1,4 @@
-"""Permutation tests on plain arrays.
-
-Hotelling's T^2 with shrinkage, covariates after Freedman and Lane, maps (6.1).
+"""Permutation tests on plain arrays (6.1): of a whole shape by its scores, and of every vertex.
 
 The general linear model is Y = Z G + X B + E: Z the intercept and the covariates, X what is tested
 (a variable, or the indicators of groups).  After Freedman & Lane (1983) the residuals of Y on Z are
@@ -13,7 +11,7 @@ import numpy as np
 from sklearn.covariance import ledoit_wolf
 
 
-def design(x, covariates=None):
+def design(x: np.ndarray, covariates: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Orthonormal bases of Z, ``(n, r)``, and of the part of X orthogonal to it, ``(n, q)``.
 
     Parameters
@@ -30,10 +28,9 @@ def design(x, covariates=None):
     x = np.asarray(x, float).reshape(n, -1)
     Z = np.ones((n, 1)) if covariates is None else np.column_stack([np.ones(n), covariates])
     U, S, _ = np.linalg.svd(Z, full_matrices=False)
-    Z = U[:, S > 1e-10 * S[0]]
-    rest = x - Z @ (Z.T @ x)
-    U, S, _ = np.linalg.svd(rest, full_matrices=False)
-    Q = U[:, S > 1e-8 * max(np.linalg.norm(x - x.mean(0)), 1e-300)]
+    Z = U[:, S > 1e-10 * S[0]]  # (n, r)
+    U, S, _ = np.linalg.svd(x - Z @ (Z.T @ x), full_matrices=False)
+    Q = U[:, S > 1e-8 * max(float(np.linalg.norm(x - x.mean(0))), 1e-300)]  # (n, q)
     if Q.shape[1] < max(1, np.linalg.matrix_rank(x - x.mean(0))):
         raise ValueError(
             "what is tested is constant or a combination of the covariates; leave one of them out"
@@ -45,19 +42,16 @@ def design(x, covariates=None):
     return Z, Q
 
 
-def indicators(group):
-    """Names of the groups, sorted.
-
-    And their indicator columns but for the first, ``(n, g - 1)``.
-    """
+def indicators(group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Names of the groups, sorted, and indicator columns of all but the first ``(n, g - 1)``."""
     names, code = np.unique(group, return_inverse=True)
     return names, (code[:, None] == np.arange(1, len(names))).astype(float)
 
 
-def hotelling(E, Q, dof):
-    """Hotelling's T^2 (Lawley and Hotelling's trace for several columns).
+def hotelling(E: np.ndarray, Q: np.ndarray, dof: int) -> float:
+    """Hotelling's T^2 (Lawley and Hotelling's trace for several columns of X).
 
-    Covariance after Ledoit & Wolf (2004).
+    The covariance is shrunk after Ledoit & Wolf (2004).
 
     Parameters
     ----------
@@ -72,14 +66,13 @@ def hotelling(E, Q, dof):
     -------
     float
     """
-    H = Q.T @ E
-    left = E - Q @ H
-    S = ledoit_wolf(left, assume_centered=True)[0] * len(E) / dof
+    H = Q.T @ E  # (q, p)
+    S = ledoit_wolf(E - Q @ H, assume_centered=True)[0] * len(E) / dof  # (p, p)
     return float(np.einsum("qp,pq->", H, np.linalg.solve(S, H.T)))
 
 
-def smallest_p(n_permutations, group=None, n=None):
-    """The smallest p that a permutation test can reach.
+def smallest_p(n_permutations: int, group: np.ndarray | None = None, n: int | None = None) -> float:
+    """The smallest p that a permutation test of groups, or of a variable of n shapes, can reach.
 
     Bound by the number of permutations drawn, and by how many are different: two that only exchange
     shapes within groups, or groups of equal size, give the same statistic.
@@ -92,17 +85,22 @@ def smallest_p(n_permutations, group=None, n=None):
     """
     drawn = 1 / (n_permutations + 1)
     if group is None:
-        return max(drawn, 1 / math.factorial(n)) if n is not None and n < 20 else drawn
+        return drawn if n is None else max(drawn, 1 / math.factorial(min(n, 20)))
     sizes = np.unique(group, return_counts=True)[1].tolist()
     same = math.prod(math.factorial(sizes.count(s)) for s in set(sizes))
     different = math.factorial(sum(sizes)) // math.prod(map(math.factorial, sizes))
     return max(drawn, same / different)
 
 
-def permutation_test(scores, x, *, covariates=None, n_permutations=9999, seed=0):
+def permutation_test(
+    scores: np.ndarray,
+    x: np.ndarray,
+    *,
+    covariates: np.ndarray | None = None,
+    n_permutations: int = 9999,
+    seed: int = 0,
+) -> tuple[float, float]:
     """Permutation test of Hotelling's T^2 of scores on a variable or on groups.
-
-    With covariates after Freedman-Lane.
 
     Parameters
     ----------
@@ -140,24 +138,24 @@ def permutation_test(scores, x, *, covariates=None, n_permutations=9999, seed=0)
     return statistic, (1 + reached) / (1 + n_permutations)
 
 
-def whitened(E):
-    """Residual vectors per vertex (n, v, d) in the metric of their own scatter, W^-1/2 e.
-
-    0 where there is none.
-    """
-    W = np.einsum("nvd,nve->vde", E, E)
-    value, V = np.linalg.eigh(W)
-    top = value[:, -1:]
-    inverse = np.where(
-        value > 1e-10 * np.where(top > 0, top, 1), 1 / np.sqrt(np.where(value > 0, value, 1)), 0.0
-    )
-    return np.einsum("nvd,vde,ve->nve", E, V, inverse, optimize=True)
+def whiten(E: np.ndarray) -> np.ndarray:
+    """Residual vectors ``(n, v, d)`` in units of their scatter W at each vertex, W^-1/2 e, or 0."""
+    value, V = np.linalg.eigh(np.einsum("nvd,nve->vde", E, E))  # (v, d), (v, d, d)
+    largest = value[:, -1:]
+    is_zero = value <= 1e-10 * np.where(largest > 0, largest, 1)
+    root = np.sqrt(np.where(is_zero, 1, value))
+    return np.einsum("nvd,vde,ve->nve", E, V, np.where(is_zero, 0, 1 / root), optimize=True)
 
 
-def vertex_test(d, x, *, covariates=None, n_permutations=999, seed=0):
-    """Permutation test at every vertex.
-
-    With p values corrected for all of them by the largest statistic (max-T).
+def vertex_test(
+    d: np.ndarray,
+    x: np.ndarray,
+    *,
+    covariates: np.ndarray | None = None,
+    n_permutations: int = 999,
+    seed: int = 0,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Permutation test at every vertex, with p values corrected for all by the largest (max-T).
 
     The statistic is Pillai's trace, the share 0..1 of the vectors' scatter that X explains; for one
     column of X, T^2 = dof V / (1 - V).  The scatter is that of the residuals on Z, which
@@ -177,23 +175,24 @@ def vertex_test(d, x, *, covariates=None, n_permutations=999, seed=0):
     """
     Z, Q = design(x, covariates)
     n, v, k = d.shape
-    E = np.asarray(d, float).reshape(n, -1)
-    E = whitened((E - Z @ (Z.T @ E)).reshape(n, v, k)).reshape(n, -1).astype(np.float32)
     q = Q.shape[1]
+    E = np.asarray(d, float).reshape(n, -1)  # (n, v k)
+    E = whiten((E - Z @ (Z.T @ E)).reshape(n, v, k)).reshape(n, -1).astype(np.float32)
 
-    def shares(columns):
+    def explain(columns):
+        """Shares ``(b, v)`` that b times q columns ``(n, b q)`` explain."""
         return ((columns.T.astype(np.float32) @ E) ** 2).reshape(-1, q, v, k).sum(axis=(1, 3))
 
     rng = np.random.default_rng(seed)
-    share = shares(Q)[0]
-    reached, largest = np.zeros(v, np.int64), []
-    block = max(1, int(2e7 // (v * k * q)))
+    share = explain(Q)[0]
+    reached = np.zeros(v, np.int64)
+    largest = np.empty(0, np.float32)
+    block = max(1, int(2e7 // (v * k * q)))  # permutations at once: 80 MB of shares
     for first in range(0, n_permutations, block):
         orders = [rng.permutation(n) for _ in range(min(block, n_permutations - first))]
         # Q^T (I - Z Z^T) P E = (P^T Q)^T E, as Q is orthogonal to Z
-        permuted = shares(np.concatenate([Q[np.argsort(order)] for order in orders], axis=1))
+        permuted = explain(np.concatenate([Q[np.argsort(order)] for order in orders], axis=1))
         reached += (permuted >= share * (1 - 1e-6)).sum(0)
-        largest.append(permuted.max(1))
-    largest = np.sort(np.concatenate(largest)) if largest else np.empty(0)
-    beyond = len(largest) - np.searchsorted(largest, share * (1 - 1e-6), side="left")
+        largest = np.append(largest, permuted.max(1))
+    beyond = n_permutations - np.searchsorted(np.sort(largest), share * (1 - 1e-6), side="left")
     return share, (1 + reached) / (1 + n_permutations), (1 + beyond) / (1 + n_permutations)
