@@ -1,7 +1,4 @@
-"""The artefacts of scanned surfaces, put into a clean mesh.
-
-What cleaning has to deal with (5.1, the data set).
-"""
+"""The artefacts of scanned surfaces, put into a clean mesh: what cleaning deals with (5.1)."""
 
 import numpy as np
 from scipy.spatial import ConvexHull, cKDTree
@@ -46,9 +43,9 @@ def soil(
 
 
 def _tear(T, u, few, rng):
-    """The triangles without those of holes, and without two that touch at a vertex alone.
+    """The triangles but for holes, and but for pairs at a vertex, whose star is a bow-tie then.
 
-    What is left is a bow-tie.
+    The two have that vertex alone in common.
     """
     keep = np.ones(len(T), bool)
     middles = cKDTree(u[T].mean(1))

@@ -1,6 +1,4 @@
-"""Brain-like collections with planted modes and exact correspondences.
-
-And small surfaces with known answers.
+"""Brain-like collections of known correspondences and modes; small surfaces with known answers.
 
 One reference brain is a smooth embedding of the unit sphere; the folds are part of it.  Every shape
 is that brain moved by a smooth diffeomorphism of space, x -> x + sum_m s_m w_m(x) + individual
@@ -34,8 +32,8 @@ TUMOUR = (4.0, 7.0)  # mm, least and largest height, on a third of the shapes; 1
 POSE = (10.0, 8.0)  # largest rotation in degrees, standard deviation of the translation in mm
 SEMI_AXES = np.array([64.0, 86.0, 61.0])
 
-# centre, width, push, turn of the slides and turns of each mode on the right; `mirror` 1 repeats it on the left as in
-# a mirror, -1 with the opposite sign, 0 not at all
+# Centre, width, push, turn and mirror of the slides and turns of each mode, on the right side; a
+# mirror of 1 repeats it on the left as in a mirror, -1 with the opposite sign, 0 not at all.
 MODES = [
     [((62, 0, 5), 44, (0, 0, 0), (1, 0, 0), 1)],
     [((0, 60, 10), 38, (0, 0, 0), (0, 1, 0), 0), ((0, -60, 10), 38, (0, 0, 0), (0, -1, 0), 0)],
@@ -80,18 +78,20 @@ def _bump(u, centre, sharpness):
 
 
 def _step(x, width):
+    """From 0 to 1 around x = 0."""
     return 0.5 * (1 + np.tanh(x / width))
 
 
 def _fold_noise(p, wavelength=30.0, waves=48):
-    """A random field of one wavelength, nearly mirror-symmetric in x, unit variance.
+    """A random field of one wavelength whose zeros are the sulci, of unit variance.
 
-    Its zeros are the sulci.
+    It is nearly mirror-symmetric in x.
     """
     rng = np.random.default_rng(20)
     k = rng.normal(size=(waves, 3))
     k *= 2 * np.pi / wavelength / np.linalg.norm(k, axis=1, keepdims=True)
-    phase, tilt = rng.uniform(0, 2 * np.pi, waves), rng.normal(0, 0.35, waves)
+    phase = rng.uniform(0, 2 * np.pi, waves)
+    tilt = rng.normal(0, 0.35, waves)  # without it the field would be symmetric
     total = np.zeros(len(p))
     for (kx, ky, kz), a, b in zip(k, phase, tilt, strict=True):
         total += np.cos(kx * p[:, 0] + b) * np.cos(ky * p[:, 1] + kz * p[:, 2] + a)
@@ -155,29 +155,39 @@ def _fields(x, centre, width, push, turn):
     return total
 
 
+def _generators(n_modes):
+    """Centres and widths of all parts, and their push and turn by each generator ``(g, parts, 6)``.
+
+    The generators are the six rigid motions, of one part of infinite width, and the modes as they
+    are designed.
+    """
+    centre, width = [np.zeros(3)], [np.inf]
+    moves = []  # mode, push and turn of each part after the first
+    for m, mode in enumerate(MODES[:n_modes]):
+        for c, w, push, turn, mirror in mode:
+            for side in (1,) if mirror == 0 else (1, -1):
+                flip = np.array([side, 1, 1])
+                sign = 1 if side == 1 else mirror
+                centre.append(flip * c)
+                width.append(w)
+                # a turn is mirrored as an axial vector: what flips it also changes its sense
+                moves.append((m, sign * np.r_[flip * push, side * flip * turn]))
+    rows = np.zeros((6 + n_modes, len(centre), 6))
+    rows[:6, 0] = np.eye(6)
+    for part, (m, move) in enumerate(moves, start=1):
+        rows[6 + m, part] = move
+    return np.array(centre), np.array(width), rows
+
+
 def _planted_modes(n_modes):
     """Centres and widths of all parts, and each mode's push and turn of them.
 
-    On the reference brain the modes are orthogonal to rigid motions and to each other.  `rows` are
-    generators: the six rigid motions (one part of infinite width), then the designed modes; their
-    Cholesky factor is Gram-Schmidt's.
+    On the reference brain the modes are orthogonal to rigid motions and to each other: the Cholesky
+    factor of the generators' Gram matrix is that of Gram and Schmidt.
     """
     if not 0 <= n_modes <= len(MODES):
         raise ValueError(f"n_modes needs a number from 0 to {len(MODES)}, found {n_modes}")
-    centre, width, rows = [np.zeros(3)], [np.inf], list(np.eye(6))
-    for mode in MODES[:n_modes]:
-        row = np.zeros(6 * len(centre))
-        for c, w, push, turn, mirror in mode:
-            for sign in (1,) if mirror == 0 else (1, -1):
-                flip = np.array([sign, 1, 1])
-                centre.append(flip * c)
-                width.append(w)
-                row = np.r_[
-                    row, (1 if sign == 1 else mirror) * np.r_[flip * push, sign * flip * turn]
-                ]
-        rows.append(row)
-    rows = np.stack([np.pad(row, (0, 6 * len(centre) - len(row))) for row in rows])
-    rows = rows.reshape(len(rows), len(centre), 6)
+    centre, width, rows = _generators(n_modes)
     u, T = _sphere(4000)
     x = reference_brain(u)
     area = vertex_areas(x, T)
@@ -185,14 +195,11 @@ def _planted_modes(n_modes):
     gram = np.einsum("apx,bpx,p->ab", values, values, area / area.sum())
     rows = np.tensordot(np.linalg.inv(np.linalg.cholesky(gram)), rows, 1)[6:]
     rows *= MODE_RMS * MODE_RATIO ** np.arange(n_modes)[:, None, None]
-    return np.array(centre), np.array(width), rows[..., :3], rows[..., 3:]
+    return centre, width, rows[..., :3], rows[..., 3:]
 
 
 def _planted_scores(n, n_modes, rng):
-    """Truncated normal scores (n, n_modes), standardised.
-
-    Uncorrelated when there are shapes enough.
-    """
+    """Truncated normal scores ``(n, n_modes)``; standard and uncorrelated of shapes enough."""
     while True:
         score = ndtri(rng.uniform(ndtr(-2.5), ndtr(2.5), (n, n_modes)))
         if n <= n_modes + 1:
@@ -203,10 +210,24 @@ def _planted_scores(n, n_modes, rng):
             return score
 
 
-def plant(n: int = 12, seed: int = 0, *, n_modes: int = 3) -> xr.Dataset:
-    """The planted parameters of a population.
+def _own_parts(n, rng):
+    """Centres, widths and pushes ``(n, 9, ...)`` of each shape's noise and, last, of its tumour."""
+    centre = reference_brain(_random_directions(rng, n * 9)).reshape(n, 9, 3)
+    width = np.concatenate([rng.uniform(16, 28, (n, 8)), rng.uniform(10, 14, (n, 1))], axis=1)
+    push = rng.normal(size=(n, 9, 3))
+    outwards = _random_directions(rng, n)
+    outwards[:, 2] = np.abs(outwards[:, 2])  # a tumour is on the upper half
+    centre[:, 8] = reference_brain(outwards)
+    height = rng.uniform(*TUMOUR, n) * (rng.permutation(n) < n // 3)
+    push[:, 8] = outwards * height[:, None]
+    x = reference_brain(_sphere(4000)[0])
+    for c, w, a in zip(centre[:, :8], width[:, :8], push[:, :8], strict=True):
+        a *= NOISE_RMS / np.sqrt((_fields(x, c, w, a, 0 * a) ** 2).sum(1).mean())  # in push itself
+    return centre, width, push
 
-    Everything that :func:`position` needs, without any mesh.
+
+def plant(n: int = 12, seed: int = 0, *, n_modes: int = 3) -> xr.Dataset:
+    """The planted parameters of a population: all that :func:`position` needs, without any mesh.
 
     Parameters
     ----------
@@ -240,17 +261,7 @@ def plant(n: int = 12, seed: int = 0, *, n_modes: int = 3) -> xr.Dataset:
     rng = np.random.default_rng([seed, 0])
     centre, width, push, turn = _planted_modes(n_modes)
     score = _planted_scores(n, n_modes, rng)
-    own_centre = reference_brain(_random_directions(rng, n * 9)).reshape(n, 9, 3)
-    own_width = np.concatenate([rng.uniform(16, 28, (n, 8)), rng.uniform(10, 14, (n, 1))], axis=1)
-    own_push = rng.normal(size=(n, 9, 3))
-    spread = _random_directions(rng, n)
-    spread[:, 2] = np.abs(spread[:, 2])  # a tumour is on the upper half
-    own_centre[:, 8] = reference_brain(spread)
-    height = rng.uniform(*TUMOUR, n) * (rng.permutation(n) < n // 3)
-    own_push[:, 8] = spread * height[:, None]
-    x = reference_brain(_sphere(4000)[0])
-    for c, w, a in zip(own_centre[:, :8], own_width[:, :8], own_push[:, :8], strict=True):
-        a *= NOISE_RMS / np.sqrt((_fields(x, c, w, a, 0 * a) ** 2).sum(1).mean())
+    own_centre, own_width, own_push = _own_parts(n, rng)
     pose = Rotation.from_rotvec(
         _random_directions(rng, n) * np.deg2rad(rng.uniform(0, POSE[0], (n, 1)))
     )
@@ -302,16 +313,12 @@ def position(truth: xr.Dataset | xr.DataTree, shape: str, reference_point: Array
     >>> s4a.synthetic.position(s4a.synthetic.plant(4), "brain_02", [[0, 1, 0], [0, -1, 0]]).shape
     (2, 3)
     """
-    i = _index(truth, shape)
-    value = {
-        name: v.values[i] if v.dims[0] == "shape" else v.values
-        for name, v in truth.data_vars.items()
-    }
+    truth = truth.to_dataset() if isinstance(truth, xr.DataTree) else truth
+    own = truth.isel(shape=_index(truth, shape))
+    value = {name: v.values for name, v in own.data_vars.items()}
     x = reference_brain(reference_point)
-    push, turn = (
-        np.tensordot(value["planted_score"], value[f"planted_{name}"], 1)
-        for name in ("push", "turn")
-    )
+    push = np.tensordot(value["planted_score"], value["planted_push"], 1)  # (parts, 3)
+    turn = np.tensordot(value["planted_score"], value["planted_turn"], 1)
     own_push = value["own_push"]
     moved = x + _fields(x, value["planted_centre"], value["planted_width"], push, turn)
     moved += _fields(x, value["own_centre"], value["own_width"], own_push, 0 * own_push)
@@ -340,7 +347,8 @@ def _random_directions(rng, n):
 def _fibonacci(n):
     """Points spread evenly over the unit sphere along a spiral, n of them."""
     i = np.arange(n) + 0.5
-    z, angle = 1 - 2 * i / n, np.pi * (1 + np.sqrt(5)) * i
+    z = 1 - 2 * i / n
+    angle = np.pi * (1 + np.sqrt(5)) * i  # by the golden section
     r = np.sqrt(1 - z * z)
     return np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
 
@@ -354,15 +362,13 @@ def _delaunay(u):
 
 
 def _sphere(n):
+    """Points ``(n, 3)`` and triangles of the unit sphere."""
     u = _fibonacci(n)
     return u, _delaunay(u)
 
 
 def _mesh(truth, shape, n_vertices, rng):
-    """Reference points, the farthest of five times as many on the shape.
-
-    And their Delaunay triangles.
-    """
+    """Reference points and their triangles, the farthest on the shape of five times as many."""
     if n_vertices < 4:
         raise ValueError(f"a closed mesh needs n_vertices of 4 or more, found {n_vertices}")
     u = _fibonacci(5 * n_vertices) @ Rotation.random(random_state=rng).as_matrix().T
@@ -375,9 +381,7 @@ def _mesh(truth, shape, n_vertices, rng):
 
 
 def labels(reference_point: ArrayLike) -> np.ndarray:
-    """Labels of reference points, the index in :data:`LABELS` of the nearest region seed.
-
-    0 where NaN.
+    """Labels of reference points: the index in :data:`LABELS` of the nearest seed, 0 where NaN.
 
     Examples
     --------
@@ -395,7 +399,7 @@ def labels(reference_point: ArrayLike) -> np.ndarray:
     return np.where(np.isnan(u).any(axis=1), 0, nearest).astype(np.int32)
 
 
-def _annotated(mesh, truth, shape, reference_point):
+def _annotate(mesh, truth, shape, reference_point):
     """The mesh with labels and landmarks."""
     extra = dataset(
         label=labels(reference_point),
@@ -439,11 +443,8 @@ def raw_brain(
     return soil(position(truth, shape, u), T, u, np.random.default_rng([seed, 2, i]))
 
 
-def _cleaned_reference(mesh, raw, reference_point):
-    """Reference points of the cleaned vertices.
-
-    Of one that cleaning put on an edge, about its neighbours' mean.
-    """
+def _reference_after_cleaning(mesh, raw, reference_point):
+    """Reference points of the cleaned vertices; its neighbours' mean where a vertex was moved."""
     X, T = as_arrays(mesh)
     file_vertex = mesh["file_vertex"].values
     u = reference_point[file_vertex]
@@ -481,8 +482,9 @@ def brains(
 
     Notes
     -----
-    Modes slide material along the surface, so that the nearest vertex after a rigid alignment is wrong by 2.5 % of
-    sqrt(area) in the mean over the pairs of 12 shapes; the folds move along, and give the truth away.
+    Modes slide material along the surface, so that the nearest vertex after a rigid alignment is
+    wrong by 2.5 % of sqrt(area) in the mean over the pairs of 12 shapes; the folds move along, and
+    give the truth away.
 
     Examples
     --------
@@ -507,11 +509,9 @@ def brains(
     for shape, (X, T, u) in raw.items():
         mesh = shapes[f"original/{shape}"].to_dataset()
         if dirty:
-            nodes[f"/raw/{shape}"] = _annotated(
-                as_dataset(X, T, reference_point=u), truth, shape, u
-            )
-        u = _cleaned_reference(mesh, X, u)
-        nodes[f"/original/{shape}"] = _annotated(mesh, truth, shape, u)
+            nodes[f"/raw/{shape}"] = _annotate(as_dataset(X, T, reference_point=u), truth, shape, u)
+        u = _reference_after_cleaning(mesh, X, u)
+        nodes[f"/original/{shape}"] = _annotate(mesh, truth, shape, u)
         nodes[f"/truth/{shape}"] = dataset(reference_point=u)
     return xr.DataTree.from_dict(nodes)
 
