@@ -10,6 +10,8 @@ reading and cleaning      :func:`read_shapes`, :func:`read_shape`, :func:`clean`
 4.1 pairs                 :func:`match_pair`
 5.1 metrics               :mod:`s4a.metrics`
 5.2, 5.3 comparison       :mod:`s4a.compare`
+4.1, 4.2 step by step     :func:`align_pair`, :func:`build_network`, :func:`refine_network`,
+                          :func:`latent_match`, :func:`register_shape`
 4.2, 6.1 collections      :func:`analyse`, :func:`open_study`, :func:`synthesize`
 notebooks, pages          :func:`explore`, :func:`write_page`
 new shapes                :func:`insert`
@@ -41,6 +43,13 @@ from s4a.input.files import read_mesh, write_mesh
 from s4a.method.pca import synthesize
 from s4a.method.remesh import coarsen
 from s4a.method.spectral import reconstruct, spectrum
+from s4a.method.steps import (
+    align_pair,
+    build_network,
+    latent_match,
+    refine_network,
+    register_shape,
+)
 from s4a.show.page import write_page
 from s4a.study.insert import insert
 from s4a.study.pair import match_pair
@@ -50,12 +59,15 @@ from s4a.study.store import open_study
 install()
 __version__ = version("s4a")
 __all__ = [
+    "align_pair",
     "analyse",
+    "build_network",
     "clean",
     "coarsen",
     "compare",
     "explore",
     "insert",
+    "latent_match",
     "match_pair",
     "metrics",
     "open_study",
@@ -63,7 +75,9 @@ __all__ = [
     "read_shape",
     "read_shapes",
     "reconstruct",
+    "refine_network",
     "register_pairs",
+    "register_shape",
     "spectrum",
     "statistics",
     "synthesize",

@@ -7,16 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
-from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
-from s4a.geometry.align import align, cloud, motion_between, realign
+from s4a.geometry.align import align, motion_between, realign
 from s4a.geometry.mesh import as_arrays, triangle_areas
 from s4a.input import plausibility
 from s4a.input.clean import clean
 from s4a.input.collection import read_shape
-from s4a.method import fmap, latent, median, network
-from s4a.method.first_map import first_map, map_after_motion
+from s4a.method import steps
 from s4a.method.register import from_latent, identity
 from s4a.method.remesh import coarsen
 from s4a.method.shape import Basis, Shape
@@ -83,60 +81,30 @@ def motion_to_reference(folder: Path, name: str) -> tuple[np.ndarray, np.ndarray
 def first_maps(folder: Path, pairs: list, k_init: int, init: str) -> xr.Dataset:
     """First maps of some pairs, in both directions (4.1, steps 3 and 4)."""
     names = sorted({name for pair in pairs for name in pair})
-    shapes = {name: low_basis(folder, name) for name in names}
+    bases = {name: low_basis(folder, name) for name in names}
     motions = {name: motion_to_reference(folder, name) for name in names}
-    clouds = {name: cloud(shape.X, 300) for name, shape in shapes.items()}
-    source, target, maps = [], [], []
-    for a, b in pairs:
-        M, N = shapes[a], shapes[b]
-        start = motion_between(motions[a], motions[b])
-        R, t = realign(M.X, M.area, N.X, N.area, start, clouds=(clouds[a], clouds[b]))
-        kind, C, _ = first_map(M, N, (R, t), k_init=k_init, init=init)
-        if kind == init:
-            back = map_after_motion(N, M, (R.T, -R.T @ t), k_init=k_init, init=init)
-        else:  # of far poses: the other direction must tell the same limbs apart
-            back = fmap.refine_once(N, M, C.T)
-        source += [a, b]
-        target += [b, a]
-        maps += [C, back]
-    return dataset(source=np.array(source), target=np.array(target), fmap_initial=np.stack(maps))
+    return steps.map_pairs(bases, motions, pairs, k_init=k_init, init=init)
 
 
 def consistent_maps(
     folder: Path, names: list[str], first: xr.Dataset, options: Options, n_jobs: int
 ) -> tuple[xr.Dataset, xr.Dataset]:
     """Consistent ZoomOut over the network and the median (4.2): ``/network`` and ``/latent``."""
-    shapes = [low_basis(folder, name) for name in names]
-    k = min([options.k, *(shape.k for shape in shapes)])
+    coarse = {name: opened(folder / "coarse" / f"{name}.nc") for name in names}
     k_init = first.sizes["mode_source_initial"]
-    source, target = (
-        np.array([names.index(name) for name in first[end].values]) for end in ("source", "target")
-    )
-    eigenvalues = np.stack([shape.eigenvalue[:k] for shape in shapes])  # (n, k)
-    C_initial = first["fmap_initial"].values  # (p, k_init, k_init)
-    with threadpool_limits(1), tqdm(total=k - k_init, desc="consistent ZoomOut") as bar:
-        C, weight, _, Y, latent_eigenvalue = latent.consistent_zoomout(
-            shapes,
-            C_initial,
-            source,
-            target,
-            k,
+    with tqdm(total=options.k - k_init, desc="consistent ZoomOut") as bar:
+        tree = steps.refine_network(
+            coarse,
+            first,
+            k=options.k,
             step=options.step,
             n_latent=options.n_latent,
-            samples=[shape.spread for shape in shapes],
+            norm=options.norm,
             n_jobs=n_jobs,
             progress=lambda size: bar.update(size - k_init - bar.n),
         )
-    cycles = network.three_cycles(source.tolist(), target.tolist())
-    refined = dataset(
-        fmap=C.astype(np.float32),
-        weight=weight,
-        cycle_error=network.cycle_errors(C, cycles, k=k_init),
-        cycle_error_initial=network.cycle_errors(C_initial, cycles),
-    )
-    basis = dataset(latent_basis=Y, latent_eigenvalue=latent_eigenvalue)
-    basis = basis.assign_coords(shape=names)
-    return first.merge(refined), median.median_shape(basis, eigenvalues, norm=options.norm)
+        bar.total = bar.n  # k may be less than was asked for
+    return tree["network"].to_dataset(), tree["latent"].to_dataset()
 
 
 def register_shape(
