@@ -14,12 +14,10 @@ from s4a.method.shape import Basis, Shape
 
 
 @pytest.fixture(scope="module")
-def shape():
+def shape(low_brain):
     """Eigenfunctions, areas, eigenvalues and vertices of a shape without symmetry."""
-    mesh = spectrum(
-        coarsen(synthetic.brains(1, 4000)["original/brain_01"].to_dataset(), n_coarse=900), k=40
-    )
-    values = mesh["eigenfunction"], spectral.unit_area(mesh), mesh["eigenvalue"], mesh["position"]
+    area = spectral.unit_area(low_brain)
+    values = low_brain["eigenfunction"], area, low_brain["eigenvalue"], low_brain["position"]
     return [np.asarray(v) for v in values]
 
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy.sparse.csgraph import connected_components
 
-from s4a import coarsen, spectrum, synthetic
 from s4a.method import network
 from s4a.method.first_map import map_after_motion
 from s4a.method.shape import Shape
@@ -77,11 +76,8 @@ def test_the_spectral_distance_of_scaled_spectra_is_the_logarithm_of_the_scale()
 
 
 @pytest.fixture(scope="module")
-def low():
-    mesh = spectrum(
-        coarsen(synthetic.brains(1, 3000)["original/brain_01"].to_dataset(), n_coarse=700), k=20
-    )
-    return Shape(None, mesh).low
+def low(low_brain):
+    return Shape(None, low_brain).low
 
 
 @pytest.mark.parametrize("init", ["dense", "landmarks"])
