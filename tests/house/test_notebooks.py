@@ -6,9 +6,10 @@ Its exercises without an answer and with the one of the book.
 import asyncio
 import json
 import re
+import subprocess
 
 import pytest
-from paths import NOTEBOOKS
+from paths import NOTEBOOKS, ROOT
 
 nbformat = pytest.importorskip("nbformat")
 nbclient = pytest.importorskip("nbclient")
@@ -83,6 +84,23 @@ async def played(path, folder):
         return json.loads((await added(client, SPENT)).strip("'"))
 
 
+def untracked(folder):
+    """Which files that a lesson wrote git would see, had it run in its own folder."""
+    names = [
+        f"notebooks/{file.relative_to(folder)}" for file in folder.rglob("*") if file.is_file()
+    ]
+    if not names or not (ROOT / ".git").exists():
+        return []
+    ignored = subprocess.run(
+        ["git", "check-ignore", "--no-index", *names],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return sorted({*names} - {*ignored.stdout.splitlines()})
+
+
 @each_notebook
 def test_it_runs_and_its_exercises_fail_open_and_pass_solved(path, tmp_path, record_property):
     for tries_left in (2, 1, 0):
@@ -96,6 +114,7 @@ def test_it_runs_and_its_exercises_fail_open_and_pass_solved(path, tmp_path, rec
                 raise
     record_property("notebook", (path.stem, spent["seconds"], spent["MiB"]))
     assert spent["MiB"] < MEMORY
+    assert untracked(tmp_path) == []
 
 
 @each_notebook
