@@ -209,7 +209,9 @@ def write_training_set(
             np.save(folder / "labels" / f"{name}.npy", own["label"].values)
             np.save(folder / "labels" / f"{name}.confidence.npy", sure.values)
         if "landmarks" in carried:
-            write_landmarks(folder / "landmarks" / f"{name}.csv", carried["landmarks"][name])
+            write_landmarks(
+                folder / "landmarks" / f"{name}.csv", carried["landmarks"][name].to_dataset()
+            )
     order = np.random.default_rng(seed).permutation(len(names))
     split = {
         "train": sorted(names[i] for i in order[n_test:]),

@@ -3,6 +3,8 @@
 Beside two simpler ways to the same correspondence.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 import xarray as xr
 from joblib import Parallel, delayed
@@ -24,7 +26,7 @@ ICP, ZOOMOUT, MATCH, SURFACE = (
 )
 
 
-def simple_matches(source, target, *, k_init=20):
+def simple_matches(source: Shape, target: Shape, *, k_init: int = 20) -> dict[str, np.ndarray]:
     """Matches without the collection: nearest neighbour after ICP, and ZoomOut with eq. 4 (4.1).
 
     Parameters
@@ -74,7 +76,13 @@ def _errors(source, target, registered, image, n_geodesic):
         return straight, geodesic
 
 
-def accuracy(study, image, *, n_geodesic=0, n_jobs=None):
+def accuracy(
+    study: xr.DataTree,
+    image: Callable[[str, str], np.ndarray],
+    *,
+    n_geodesic: int = 0,
+    n_jobs: int | None = None,
+) -> xr.Dataset:
     """Mean error of a study's registrations against the truth.
 
     Beside two baselines on the same shapes.

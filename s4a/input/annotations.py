@@ -11,6 +11,8 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from s4a.input import bounded
@@ -21,7 +23,7 @@ LONGEST = 255  # characters of a name: an array of names has room for the longes
 MIRROR = np.array([-1.0, -1.0, 1.0])  # between RAS and LPS
 
 
-def read_labels(path, n=None):
+def read_labels(path: Path | str, n: int | None = None) -> np.ndarray:
     """One label per vertex from a file.
 
     Parameters
@@ -44,8 +46,8 @@ def read_labels(path, n=None):
     ValueError
         When the file is missing, is no label file, or has not `n` values.
     """
-    file, _, name = str(path).partition(".npz:")
-    file = Path(f"{file}.npz" if name else file)
+    before, _, name = str(path).partition(".npz:")
+    file = Path(f"{before}.npz" if name else before)
     if not file.is_file():
         raise ValueError(f"no file {file}")
     kind = Path(file.name.lower().removesuffix(".gz")).suffix
@@ -165,7 +167,7 @@ def _annot_labels(data):
     return labels
 
 
-def table_rows(data):
+def table_rows(data: bytes) -> list[list[str]]:
     """Rows of a table separated by commas, semicolons, tabs or spaces.
 
     Comments and empty lines are left out.
@@ -182,7 +184,7 @@ def table_rows(data):
     ]
 
 
-def short(texts):
+def short(texts: list[str]) -> list[str]:
     """`texts`, none of which is so long that an array of them would fill the memory."""
     longest = max(map(len, texts), default=0)
     if longest > LONGEST:
@@ -190,7 +192,7 @@ def short(texts):
     return texts
 
 
-def is_number(text):
+def is_number(text: str) -> bool:
     """Whether a text is that of a number."""
     try:
         float(text)
@@ -223,7 +225,7 @@ def _text_labels(data):
     return labels
 
 
-def read_landmarks(path):
+def read_landmarks(path: Path | str) -> xr.Dataset:
     """Named points from a file.
 
     Parameters
@@ -338,7 +340,7 @@ def _table_points(data):
     )
 
 
-def write_landmarks(path, landmarks):
+def write_landmarks(path: Path | str, landmarks: xr.Dataset) -> None:
     """Write ``landmark_name`` and ``landmark_position`` as CSV ``name,x,y,z``.
 
     With curves also ``curve,closed``.
@@ -360,7 +362,7 @@ def write_landmarks(path, landmarks):
         table.writerows([name, *(repr(float(v)) for v in x), *more] for name, x, more in rows)
 
 
-def labels_of_mesh(labels, mesh):
+def labels_of_mesh(labels: ArrayLike, mesh: xr.Dataset) -> np.ndarray:
     """Labels numbered as in the file of a mesh, for the vertices of the cleaned mesh.
 
     Raises
@@ -386,7 +388,9 @@ def labels_of_mesh(labels, mesh):
     return np.asarray(labels)[mesh["file_vertex"].values]
 
 
-def labels_of_file(labels, mesh, points):
+def labels_of_file(
+    labels: np.ndarray, mesh: xr.Dataset, points: np.ndarray
+) -> tuple[np.ndarray, int]:
     """Labels of a cleaned mesh, for the vertices as numbered in its file.
 
     Parameters

@@ -8,7 +8,10 @@ import re
 import xml.etree.ElementTree as ElementTree
 import zipfile
 import zlib
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import Any
 from xml.parsers import expat
 
 import numpy as np
@@ -21,7 +24,7 @@ LEAST, RATIO = (
 GZIP = b"\x1f\x8b"
 
 
-def limit_of(size):
+def limit_of(size: int) -> int:
     """Most bytes that a file of `size` bytes may unpack to.
 
     Examples
@@ -33,7 +36,7 @@ def limit_of(size):
     return min(LARGEST, max(LEAST, RATIO * size))
 
 
-def check(unpacked, size):
+def check(unpacked: int, size: int) -> None:
     """ValueError when `unpacked` bytes are more than a file of `size` bytes may hold."""
     if unpacked > limit_of(size):
         raise ValueError(
@@ -42,7 +45,7 @@ def check(unpacked, size):
         )
 
 
-def gunzip(data):
+def gunzip(data: bytes) -> bytes:
     """The bytes of a gzip file (several members too).
 
     Or ValueError where they are too many or end early.
@@ -64,25 +67,25 @@ def gunzip(data):
     return found
 
 
-def content(path):
+def content(path: Path | str) -> bytes:
     """The bytes of a file, unpacked where it is compressed by gzip."""
     data = Path(path).read_bytes()
     return gunzip(data) if data.startswith(GZIP) else data
 
 
-def unpack(data, compressor, limit):
+def unpack(data: bytes, compressor: str, limit: int) -> bytes:
     """The bytes of one stream, `limit` at most: of ``"zlib"`` or ``"lzma"``."""
-    makers = {"zlib": zlib.decompressobj, "lzma": lambda: lzma.LZMADecompressor(memlimit=2**28)}
-    stream = makers[compressor]()
-    found = stream.decompress(data, max(limit, 0) + 1)
-    if len(found) > limit:
+    by_lzma = compressor == "lzma"
+    stream: Any = lzma.LZMADecompressor(memlimit=2**28) if by_lzma else zlib.decompressobj()
+    unpacked = stream.decompress(data, max(limit, 0) + 1)
+    if len(unpacked) > limit:
         raise ValueError(f"at most {limit} bytes expected in a compressed block, found more")
     if not stream.eof:
         raise ValueError(f"a compressed block ends early: found {len(data)} bytes")
-    return found
+    return unpacked
 
 
-def xml(text):
+def xml(text: bytes | str) -> ElementTree.Element:
     """The root of an XML file.
 
     ValueError where it declares entities, which could grow or name other files.
@@ -108,7 +111,7 @@ def xml(text):
     return ElementTree.fromstring(text)
 
 
-def npz(data):
+def npz(data: bytes) -> dict[str, Callable[[], np.ndarray]]:
     """The arrays of an NPZ archive: their names, and for each a function that reads it.
 
     ValueError where it holds too much.
@@ -116,9 +119,11 @@ def npz(data):
     archive = zipfile.ZipFile(io.BytesIO(data))
     members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
     check(sum(member.file_size for member in members.values()), len(data))
-    return {
-        name: lambda member=member: npy(archive.read(member)) for name, member in members.items()
-    }
+    return {name: partial(_read_member, archive, member) for name, member in members.items()}
+
+
+def _read_member(archive, member):
+    return npy(archive.read(member))
 
 
 NPY = re.compile(
@@ -127,7 +132,7 @@ NPY = re.compile(
 )
 
 
-def npy(data):
+def npy(data: bytes) -> np.ndarray:
     """The array of a NPY file of numbers or text; nothing in the file is evaluated or unpickled.
 
     Examples
@@ -146,16 +151,15 @@ def npy(data):
     start = 8 + width + int.from_bytes(data[8 : 8 + width], "little")
     header = NPY.fullmatch(data, 8 + width, start)
     if not header:
-        found = data[8 + width : start].strip()[:100]
+        text = data[8 + width : start].strip()[:100]
         raise ValueError(
-            f"an array of numbers or text expected, and no pickled objects; found the header {found!r}"
+            "an array of numbers or text expected, and no pickled objects; "
+            f"found the header {text!r}"
         )
     dtype = np.dtype(header[1].decode())
     shape = tuple(int(size) for size in header[3].split(b",") if size.strip())
-    expected, found = math.prod(shape) * dtype.itemsize, len(data) - start
-    if dtype.itemsize == 0 or expected > found:
-        raise ValueError(
-            f"{expected} bytes of {dtype} expected for the shape {shape}, found {found}"
-        )
+    needed, left = math.prod(shape) * dtype.itemsize, len(data) - start
+    if dtype.itemsize == 0 or needed > left:
+        raise ValueError(f"{needed} bytes of {dtype} expected for the shape {shape}, found {left}")
     values = np.frombuffer(data, dtype, math.prod(shape), start)
     return values.reshape(shape, order="F" if header[2] == b"True" else "C").copy()

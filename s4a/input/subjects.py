@@ -4,10 +4,12 @@ A table beside the meshes, on which nothing but the statistics depends.
 """
 
 import csv
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 
 from s4a.input.annotations import is_number, table_rows
 from s4a.input.bounded import content
@@ -42,7 +44,7 @@ def _shape_of(cell, names):
     return next((n for n in (cell, slug(cell), slug(Path(cell).stem)) if n in names), cell)
 
 
-def read_table(path, names):
+def read_table(path: Path | str, names: list[str]) -> xr.Dataset:
     """Covariates and groups from a file.
 
     Parameters
@@ -92,10 +94,13 @@ def read_table(path, names):
         raise ValueError(
             f"{path}: a row for every shape and no other needed in the column 'shape'; {'; '.join(said)}"
         )
-    columns = {n: [found[name][i] for name in names] for i, n in enumerate(head) if n != "shape"}
+    columns = {
+        column: _values([found[name][i] for name in names])
+        for i, column in enumerate(head)
+        if column != "shape"
+    }
     if not columns:
         raise ValueError(f"{path}: a column beside 'shape' needed, found none")
-    columns = {name: _values(cells) for name, cells in columns.items()}
     for name, values in columns.items():
         if values.dtype.kind == "f" and np.isinf(values).any():
             raise ValueError(
@@ -118,7 +123,9 @@ def _values(cells):
     return numbers.astype(np.int64) if whole else numbers
 
 
-def subjects(columns, names, path=""):
+def subjects(
+    columns: Mapping[str, ArrayLike], names: Sequence[str], path: Path | str = ""
+) -> xr.Dataset:
     """The Dataset ``/subjects`` of columns, a dict of name to values in the order of the shapes."""
     wrong = [n for n, values in columns.items() if np.shape(values) != (len(names),)]
     if wrong:
@@ -127,7 +134,7 @@ def subjects(columns, names, path=""):
     return xr.Dataset(data, {"shape": list(names)}, {"path": str(path)})
 
 
-def with_table(study, path):
+def with_table(study: xr.DataTree, path: Path | str) -> xr.DataTree:
     """A study with ``/subjects`` read from a file.
 
     The tables are shared, the study given stays as it is.
