@@ -16,7 +16,7 @@ from matplotlib import colormaps
 from matplotlib.colors import Colormap, to_hex
 
 from s4a.show import charts
-from s4a.show.draw import SIGNED, UNKNOWN, data_uri, image_bytes, rotation
+from s4a.show.draw import SIGNED, UNKNOWN, Viewpoint, data_uri, image_bytes, rotation
 
 FOLDER = Path(__file__).parent
 
@@ -80,7 +80,7 @@ def mesh_state(mean: np.ndarray, triangles: np.ndarray, deformation: np.ndarray)
     }
 
 
-def look_state(limits: tuple[float, float], unit: str, view: str, up: str) -> dict:
+def look_state(limits: tuple[float, float], unit: str, view: Viewpoint, up: str) -> dict:
     """Colours of the modes, full at the two `limits`, and from where they are seen first."""
     along, distance = limits
     signed = f"compression · normal displacement ({unit}) · expansion"

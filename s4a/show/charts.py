@@ -2,21 +2,23 @@
 
 import io
 import re
+from typing import Any
 
 import numpy as np
+import xarray as xr
 from matplotlib import rc_context
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
-from matplotlib.colors import Normalize
+from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 
 from s4a.geometry.mesh import as_arrays
-from s4a.show.draw import SIGNED, render, signed_colors
+from s4a.show.draw import SIGNED, Viewpoint, render, signed_colors
 
 BLUE, ORANGE, GREY = "#0072b2", "#d55e00", "#777777"
-PARTS = ("#bbbbbb", "#e69f00", "#009e73", BLUE, "#cc79a7", ORANGE, "#56b4e9", "#f0e442")
-LOOK = {
+PART_COLORS = ("#bbbbbb", "#e69f00", "#009e73", BLUE, "#cc79a7", ORANGE, "#56b4e9", "#f0e442")
+LOOK: dict[Any, Any] = {
     "font.size": 9,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -26,7 +28,7 @@ LOOK = {
 }
 
 
-def svg(figure):
+def svg(figure: Figure) -> bytes:
     """The bytes of an SVG file of a Figure, the same for the same figure.
 
     Examples
@@ -41,21 +43,30 @@ def svg(figure):
     return file.getvalue()
 
 
-def _figure(width, height, columns=1, **options):
+def _figure(width, height, columns=1, rows=1):
+    """A Figure of that many inches, and its axes ``(rows, columns)``."""
     with rc_context(LOOK):
         figure = Figure(figsize=(width, height), layout="constrained")
-        return figure, figure.subplots(1, columns, squeeze=False, **options)[0]
+        return figure, figure.subplots(rows, columns, squeeze=False)
 
 
-def on_circle(n):
+def on_circle(n: int) -> np.ndarray:
     """Places ``(n, 2)`` spread evenly over the unit circle."""
     angle = 2 * np.pi * np.arange(n) / max(n, 1)
     return np.stack([np.sin(angle), np.cos(angle)], axis=1)
 
 
 def surfaces(
-    meshes, values=None, *, limit=None, label="", columns=4, flat=False, view="corner", up="z"
-):
+    meshes: dict[str, xr.Dataset],
+    values: dict[str, np.ndarray] | None = None,
+    *,
+    limit: float | None = None,
+    label: str = "",
+    columns: int = 4,
+    flat: bool = False,
+    view: Viewpoint = "corner",
+    up: str = "z",
+) -> Figure:
     """Pictures of surfaces side by side.
 
     Parameters
@@ -85,29 +96,26 @@ def surfaces(
     >>> import s4a
     >>> from s4a.show.charts import surfaces
     >>> mesh = s4a.synthetic.sphere(100)
-    >>> [ax.get_title() for ax in surfaces({"height": mesh}, {"height": mesh["position"].values[:, 2]}).axes]
+    >>> height = mesh["position"].values[:, 2]
+    >>> [ax.get_title() for ax in surfaces({"height": mesh}, {"height": height}).axes]
     ['height', '']
     """
-    values = {} if values is None else {title: np.asarray(v) for title, v in values.items()}
-    signed = [v for v in values.values() if v.ndim == 1]
+    values = {title: np.asarray(array) for title, array in (values or {}).items()}
+    signed = [array for array in values.values() if array.ndim == 1]
     if limit is None:
-        limit = max((float(np.quantile(np.abs(v), 0.99)) for v in signed), default=1.0) or 1.0
-    rows = -(-len(meshes) // columns)
-    wide = min(columns, len(meshes))
-    with rc_context(LOOK):
-        figure = Figure(
-            figsize=(2.5 * wide + 0.7 * bool(signed), 2.35 * rows), layout="constrained"
-        )
-        axes = figure.subplots(rows, wide, squeeze=False)
+        reach = [float(np.quantile(np.abs(array), 0.99)) for array in signed]
+        limit = max(reach, default=1.0) or 1.0
+    rows, wide = -(-len(meshes) // columns), min(columns, len(meshes))
+    figure, axes = _figure(2.5 * wide + 0.7 * bool(signed), 2.35 * rows, wide, rows)
     for ax in axes.flat:
         ax.set_axis_off()
     for ax, (title, mesh) in zip(axes.flat, meshes.items(), strict=False):
         colors = values.get(title)
         if colors is not None and colors.ndim == 1:
             colors = signed_colors(colors, limit)
-        ax.imshow(
-            render(*as_arrays(mesh), colors=colors, flat=flat, view=view, up=up, size=(360, 300))
-        )
+        X, T = as_arrays(mesh)
+        size = (360, 300)
+        ax.imshow(render(X, T, colors=colors, flat=flat, view=view, up=up, size=size))
         ax.set_title(title, parse_math=False)
     if signed:
         scale = ScalarMappable(Normalize(-limit, limit), SIGNED)
@@ -115,7 +123,7 @@ def surfaces(
     return figure
 
 
-def brief(names, room=16):
+def brief(names: list[str], room: int = 16) -> list[str]:
     """Names as short as they can be told apart.
 
     What all share at both ends is left out where one is long.
@@ -123,61 +131,86 @@ def brief(names, room=16):
     Examples
     --------
     >>> from s4a.show.charts import brief
-    >>> brief(["brain_01", "brain_02"]), brief(["subject_0001_left_hippocampus", "subject_0020_left_hippocampus"])
-    (['brain_01', 'brain_02'], ['…0001…', '…0020…'])
+    >>> brief(["brain_01", "brain_02"])
+    ['brain_01', 'brain_02']
+    >>> brief(["subject_0001_left_hippocampus", "subject_0020_left_hippocampus"])
+    ['…0001…', '…0020…']
     """
     if max(map(len, names), default=0) <= room:
         return list(names)
 
     def shared(texts):
-        low, high = min(texts), max(texts)
-        n = next((i for i, (a, b) in enumerate(zip(low, high, strict=False)) if a != b), len(low))
-        return len(re.match(r"(.*[_\W])?", low[:n], re.DOTALL)[0])  # up to a separator
+        """Length of what all texts begin with, up to a separator."""
+        first, last = min(texts), max(texts)
+        same = (i for i, (a, b) in enumerate(zip(first, last, strict=False)) if a != b)
+        return len(re.match(r"(.*[_\W])?", first[: next(same, len(first))], re.DOTALL)[0])
 
     start = shared(names)
     stop = shared([name[start:][::-1] for name in names])
-    found = [
-        "…" * (start > 0) + name[start : len(name) - stop] + "…" * (stop > 0) for name in names
-    ]
-    return [
-        name if len(name) <= room else f"{name[: room // 2 - 1]}…{name[-room // 2 :]}"
-        for name in found
-    ]
+    left, right = "…" * (start > 0), "…" * (stop > 0)
+    told = [left + name[start : len(name) - stop] + right for name in names]
+    half = room // 2
+    return [name if len(name) <= room else f"{name[: half - 1]}…{name[-half:]}" for name in told]
+
+
+def _free_corner(box, size, room, taken):
+    """Where a name of a `size` in points is written beside its point: offsets right and up.
+
+    Four corners are tried::
+
+        2 | 1     None if each leaves the `room` from left to right, or lies over a box that
+        --+--     is taken.
+        4 | 3
+    """
+    x, y = box
+    wide, high = size
+    for right, up in ((3, 3), (-3 - wide, 3), (3, -3 - high), (-3 - wide, -3 - high)):
+        low, bottom = x + right, y + up
+        clear = (taken[:, 2] < low) | (low + wide < taken[:, 0])
+        clear |= (taken[:, 3] < bottom) | (bottom + high < taken[:, 1])
+        if room[0] <= low and low + wide <= room[1] and clear.all():
+            return right, up
+    return None
 
 
 def _names(ax, places, names, size=6):
-    """Names beside their points, each where it hides no other.
-
-    One that finds no place is left out.
-    """
-    figure = ax.figure.get_size_inches() * 72 / [len(ax.figure.axes), 1]  # in points, as fonts are
+    """Names beside their points, each where it hides no other, or not at all."""
+    inches = ax.figure.get_size_inches() / [len(ax.figure.axes), 1]
+    width, height = 72 * inches  # in points, as fonts are
     span = np.ptp(places, axis=0)
-    at = (places - places.min(0)) / np.where(span > 0, span, 1) * 0.68 * figure
-    room = (-0.06 * figure[0], 0.74 * figure[0])
-    taken = [(x - 3, y - 3, x + 3, y + 3) for x, y in at]
-    for i, (name, (x, y)) in enumerate(zip(brief(names), at, strict=True)):
+    at = (places - places.min(0)) / np.where(span > 0, span, 1) * 0.68 * [width, height]
+    room = -0.06 * width, 0.74 * width
+    taken = np.concatenate([at - 3, at + 3], axis=1)  # left, bottom, right, top
+    for i, name in enumerate(brief(names)):
         wide = 0.58 * size * len(name)
-        for left, down in ((3, 3), (-3 - wide, 3), (3, -3 - size), (-3 - wide, -3 - size)):
-            a, b, c, d = x + left, y + down, x + left + wide, y + down + size
-            inside = room[0] <= a and c <= room[1]
-            if inside and all(
-                j == i or c < p or r < a or d < q or s < b for j, (p, q, r, s) in enumerate(taken)
-            ):
-                taken.append((a, b, c, d))
-                look = {"fontsize": size, "color": "#333333", "zorder": 4, "parse_math": False}
-                side = "left" if left > 0 else "right"
-                ax.annotate(
-                    name,
-                    places[i],
-                    (np.copysign(3, left), down),
-                    textcoords="offset points",
-                    ha=side,
-                    **look,
-                )
-                break
+        others = np.delete(taken, i, axis=0)  # its own point may touch it
+        offset = _free_corner(at[i], (wide, size), room, others)
+        if offset is None:
+            continue
+        corner = at[i] + offset
+        taken = np.vstack([taken, [*corner, *(corner + [wide, size])]])
+        right, up = offset
+        ax.annotate(
+            name,
+            places[i],
+            (np.copysign(3, right), up),
+            textcoords="offset points",
+            ha="left" if right > 0 else "right",
+            fontsize=size,
+            color="#333333",
+            zorder=4,
+            parse_math=False,
+        )
 
 
-def network(places, names, source, target, errors, highlight=None):
+def network(
+    places: np.ndarray,
+    names: list[str],
+    source: np.ndarray,
+    target: np.ndarray,
+    errors: dict[str, np.ndarray],
+    highlight: int | None = None,
+) -> Figure:
     """The graph of maps, once for each named array of edge errors, on one colour scale.
 
     Parameters
@@ -195,33 +228,33 @@ def network(places, names, source, target, errors, highlight=None):
     -------
     matplotlib.figure.Figure
     """
-    figure, axes = _figure(4.6 * len(errors) + 0.6, 4.2, len(errors))
+    figure, (axes,) = _figure(4.6 * len(errors) + 0.6, 4.2, len(errors))
     finite = np.concatenate([value[np.isfinite(value)] for value in errors.values()])
     scale = ScalarMappable(Normalize(0, finite.max(initial=0) or 1), "viridis_r")
+    lines = np.stack([places[source], places[target]], axis=1)  # (pair, 2, 2)
     for ax, (title, value) in zip(axes, errors.items(), strict=True):
         order = np.argsort(value)  # the worst on top
-        lines = np.stack([places[source], places[target]], axis=1)[order]
+        colors = scale.to_rgba(value[order])
         ax.add_collection(
-            LineCollection(lines, colors=scale.to_rgba(value[order]), linewidths=1, alpha=0.8)
+            LineCollection(list(lines[order]), colors=colors, linewidths=1, alpha=0.8)
         )
         ax.scatter(*places.T, s=22, color="#333333", zorder=2)
         if highlight is not None:
-            ax.scatter(
-                *places[highlight], s=90, facecolor="none", edgecolor=ORANGE, linewidth=2, zorder=3
-            )
+            ring = {"facecolor": "none", "edgecolor": ORANGE, "linewidth": 2}
+            ax.scatter(*places[highlight], s=90, zorder=3, **ring)
         _names(ax, places, names)
-        ax.set_title(
-            f"{title}, median {np.nanmedian(value):.3g}" if np.isfinite(value).any() else title
-        )
+        if np.isfinite(value).any():
+            title = f"{title}, median {np.nanmedian(value):.3g}"
+        ax.set_title(title)
         ax.margins(0.12)
         ax.set_axis_off()
     figure.colorbar(scale, ax=list(axes), shrink=0.7, label="cycle error", pad=0.01)
     return figure
 
 
-def matrices(named, limit=1.0):
+def matrices(named: dict[str, np.ndarray], limit: float = 1.0) -> Figure:
     """Matrices side by side with signed colours, blue positive; `named` maps titles to arrays."""
-    figure, axes = _figure(3.4 * len(named) + 0.7, 3.3, len(named))
+    figure, (axes,) = _figure(3.4 * len(named) + 0.7, 3.3, len(named))
     for ax, (title, values) in zip(axes, named.items(), strict=True):
         image = ax.imshow(values, cmap=SIGNED, vmin=-limit, vmax=limit, interpolation="nearest")
         ax.set(title=title, xlabel="mode of the source", ylabel="mode of the target")
@@ -231,14 +264,15 @@ def matrices(named, limit=1.0):
     return figure
 
 
-def ranked(names, values, label, highlight=None):
+def ranked(
+    names: list[str], values: np.ndarray, label: str, highlight: int | None = None
+) -> Figure:
     """Bars in rising order; `highlight` is the index of a shape to mark."""
     order = np.argsort(values)
-    figure, (ax,) = _figure(7.5, max(1.4, 0.5 + 0.17 * len(values)))
+    figure, ((ax,),) = _figure(7.5, max(1.4, 0.5 + 0.17 * len(values)))
     place = np.arange(len(order))
-    ax.barh(
-        place, values[order], color=[ORANGE if i == highlight else BLUE for i in order], height=0.75
-    )
+    colors = np.where(order == highlight, ORANGE, BLUE)
+    ax.barh(place, values[order], color=colors, height=0.75)
     ax.set_yticks(place, np.array(brief(names), object)[order], fontsize=7, parse_math=False)
     ax.invert_yaxis()
     ax.margins(y=0.01)
@@ -246,7 +280,7 @@ def ranked(names, values, label, highlight=None):
     return figure
 
 
-def stacked(names, parts, seconds):
+def stacked(names: list[str], parts: list[str], seconds: np.ndarray) -> Figure:
     """Bars of seconds stacked by part, one for each name, the total at their end (Fig. 3).
 
     Parameters
@@ -254,55 +288,34 @@ def stacked(names, parts, seconds):
     names, parts : sequence of str
     seconds : float ndarray (name, part)
     """
-    figure, (ax,) = _figure(8, 0.45 * len(names) + 1.4)
-    left = np.zeros(len(names))
+    figure, ((ax,),) = _figure(8, 0.45 * len(names) + 1.4)
+    places, left = np.arange(len(names)), np.zeros(len(names))
     for i, (part, length) in enumerate(zip(parts, np.transpose(seconds), strict=True)):
-        ax.barh(
-            np.arange(len(names)),
-            length,
-            left=left,
-            height=0.65,
-            label=part,
-            color=PARTS[i % len(PARTS)],
-        )
+        color = PART_COLORS[i % len(PART_COLORS)]
+        ax.barh(places, length, left=left, height=0.65, label=part, color=color)
         left = left + length
+    beside = {"textcoords": "offset points", "va": "center", "fontsize": 8}
     for place, total in enumerate(left):
-        ax.annotate(
-            f"{total:.3g} s",
-            (total, place),
-            (4, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize=8,
-        )
-    ax.set_yticks(np.arange(len(names)), names, parse_math=False)
+        ax.annotate(f"{total:.3g} s", (total, place), (4, 0), **beside)
+    ax.set_yticks(places, names, parse_math=False)
     ax.invert_yaxis()
     ax.set(xlabel="CPU time (s)", xlim=(0, 1.12 * left.max(initial=0) or 1))
     figure.legend(loc="outside lower center", ncols=4, frameon=False)
     return figure
 
 
-def variance(high, low=None):
-    """Cumulative share of variance over the number of components.
-
-    At high and low resolution (Fig. 5).
-    """
-    figure, (ax,) = _figure(5.2, 3.2)
-    curves = (
+def variance(high: np.ndarray | list, low: np.ndarray | list | None = None) -> Figure:
+    """Cumulative share of variance over the number of components, at both resolutions (Fig. 5)."""
+    figure, ((ax,),) = _figure(5.2, 3.2)
+    curves = (  # rings around dots: both are seen where they agree
         (low, "low resolution", ORANGE, {"ms": 8, "mfc": "none"}),
         (high, "high resolution", BLUE, {"ms": 4}),
     )
-    for values, label, color, marker in curves:  # rings around dots: both are seen where they agree
+    for values, label, color, marker in curves:
         if values is not None:
-            ratio = np.asarray(values)[:20]
-            ax.plot(
-                np.arange(1, len(ratio) + 1),
-                np.cumsum(ratio),
-                "o-",
-                color=color,
-                label=label,
-                **marker,
-            )
+            share = np.cumsum(np.asarray(values)[:20])
+            count = np.arange(1, len(share) + 1)
+            ax.plot(count, share, "o-", color=color, label=label, **marker)
     ax.set(xlabel="number of components", ylabel="explained variance", ylim=(0, 1.03))
     ax.yaxis.set_major_formatter(PercentFormatter(1))
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -311,14 +324,14 @@ def variance(high, low=None):
     return figure
 
 
-def scores(score, names, highlight=None):
+def scores(score: np.ndarray, names: list[str], highlight: int | None = None) -> Figure:
     """Scores of the shapes on the first components, two by two, in standard deviations."""
     planes = [(a, b) for a, b in ((0, 1), (0, 2)) if b < score.shape[1]] or [(0, 0)]
-    figure, axes = _figure(4.2 * len(planes), 3.8, len(planes))
+    figure, (axes,) = _figure(4.2 * len(planes), 3.8, len(planes))
+    colors = np.where(np.arange(len(score)) == highlight, ORANGE, BLUE)
     for ax, (a, b) in zip(axes, planes, strict=True):
         ax.axhline(0, color="#dddddd", lw=1)
         ax.axvline(0, color="#dddddd", lw=1)
-        colors = [ORANGE if i == highlight else BLUE for i in range(len(score))]
         ax.scatter(score[:, a], score[:, b], color=colors, s=20, zorder=2)
         _names(ax, score[:, [a, b]], names)
         ax.set(xlabel=f"component {a + 1} (sd)", ylabel=f"component {b + 1} (sd)")
@@ -326,55 +339,9 @@ def scores(score, names, highlight=None):
     return figure
 
 
-def color_bar(colormap, low, high, label):
+def color_bar(colormap: str | Colormap, low: float, high: float, label: str) -> Figure:
     """A horizontal colour bar."""
-    figure, (ax,) = _figure(4.2, 0.62)
-    figure.colorbar(
-        ScalarMappable(Normalize(low, high), colormap),
-        cax=ax,
-        orientation="horizontal",
-        label=label,
-    )
-    return figure
-
-
-def from_spec(spec, values=()):
-    """A chart of a notebook panel as a Figure.
-
-    ``scatter``, ``bars``, ``lines``, ``graph`` or ``matrix``.
-
-    Parameters
-    ----------
-    spec : dict
-        ``kind`` and its numbers, as :class:`s4a.widgets.chart.Chart` sends them to the browser.
-    values : float ndarray
-        The entries of a matrix, row by row.
-    """
-    kind = spec["kind"]
-    if kind == "matrix":
-        return matrices(
-            {spec["title"]: np.reshape(values, (spec["rows"], spec["columns"]))}, spec["limit"]
-        )
-    figure, (ax,) = _figure(5, 3.6)
-    if kind == "bars":
-        place = np.arange(len(spec["names"]))
-        ax.barh(place, spec["values"], color=BLUE)
-        ax.set_yticks(place, brief(spec["names"]), parse_math=False)
-        ax.invert_yaxis()
-    if kind == "lines":
-        for one in spec["series"]:
-            ax.plot(one["x"], one["y"], color=one.get("color", BLUE), lw=1)
-    if kind == "graph":
-        places = np.stack([spec["x"], spec["y"]], axis=1)
-        lines = np.stack([places[spec["source"]], places[spec["target"]]], axis=1)
-        ax.add_collection(LineCollection(lines, colors=spec["colors"]))
-        ax.set_axis_off()
-    if kind in ("graph", "scatter"):
-        ax.scatter(spec["x"], spec["y"], color=BLUE, zorder=2)
-        _names(ax, np.stack([spec["x"], spec["y"]], axis=1), spec["names"])
-    ax.set(
-        title=spec.get("title", ""),
-        xlabel=spec.get("xlabel", spec.get("label", "")),
-        ylabel=spec.get("ylabel", ""),
-    )
+    figure, ((ax,),) = _figure(4.2, 0.62)
+    scale = ScalarMappable(Normalize(low, high), colormap)
+    figure.colorbar(scale, cax=ax, orientation="horizontal", label=label)
     return figure

@@ -8,12 +8,13 @@ import io
 
 import numpy as np
 from matplotlib import colormaps
-from matplotlib.colors import ListedColormap
+from matplotlib.colors import Colormap, ListedColormap, to_rgb
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from s4a.geometry.mesh import triangle_normals, vertex_normals
 
+Viewpoint = str | tuple[float, float]  # a name of VIEWS, or azimuth and elevation in degrees
 VIEWS = {
     "front": (-90, 0),
     "back": (90, 0),
@@ -32,7 +33,7 @@ SIGNED = ListedColormap(colormaps["RdBu"](np.linspace(0.06, 0.94, 255)), "signed
 CHUNK = 2_000_000  # candidate samples at a time, some 100 MB
 
 
-def rotation(view="corner", up="z"):
+def rotation(view: Viewpoint = "corner", up: str = "z") -> np.ndarray:
     """Rotation ``(3, 3)`` into the picture: rows right, up and towards the viewer.
 
     Parameters
@@ -58,7 +59,7 @@ def rotation(view="corner", up="z"):
     return np.roll(R, "zxy".index(up), axis=1)
 
 
-def opposite(view):
+def opposite(view: Viewpoint) -> tuple[float, float]:
     """The view from the other side, as azimuth and elevation.
 
     The two together show all that can be seen.
@@ -81,7 +82,9 @@ def _angles(view):
     return VIEWS[view] if isinstance(view, str) else view
 
 
-def rasterise(P, T, width, height):
+def rasterise(
+    P: np.ndarray, T: np.ndarray, width: int, height: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Which triangle each sample of the picture sees, by a z-buffer.
 
     Parameters
@@ -100,38 +103,25 @@ def rasterise(P, T, width, height):
         Barycentric weights in that triangle.
     depth : float32 ndarray (s,)
     """
-    A, B, C = (P[T[:, i]] for i in range(3))
-    low = np.minimum(np.minimum(A, B), C)[:, :2]
-    high = np.maximum(np.maximum(A, B), C)[:, :2]
-    low = np.maximum(np.ceil(low - 0.5), 0).astype(np.int64)
-    high = np.minimum(np.floor(high - 0.5), (width - 1, height - 1)).astype(np.int64)
+    corners = P[T][..., :2]  # (m, 3, 2)
+    # the box of the samples whose middles may lie in the triangle
+    low = np.maximum(np.ceil(corners.min(1) - 0.5), 0).astype(np.int64)
+    high = np.floor(corners.max(1) - 0.5)
+    high = np.minimum(high, (width - 1, height - 1)).astype(np.int64)
     box = np.maximum(high - low + 1, 0)
     samples = box[:, 0] * box[:, 1]
-    (ax, ay), (bx, by), (cx, cy) = (corner[:, :2].T for corner in (A, B, C))
-    double_area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
-    drawn = np.flatnonzero((samples > 0) & (np.abs(double_area) > 1e-9))
-    scale = 1 / np.where(double_area == 0, 1, double_area)
-    # the weights of corners b and c are linear in the sample's place: slope x, slope y, value at the box's first sample
-    slopes = np.stack([cy - ay, ax - cx, ay - by, bx - ax], axis=1) * scale[:, None]
-    x, y = low[:, 0] + 0.5 - ax, low[:, 1] + 0.5 - ay
-    start = np.stack(
-        [slopes[:, 0] * x + slopes[:, 1] * y, slopes[:, 2] * x + slopes[:, 3] * y], axis=1
-    )
-    slopes, start, z = (
-        slopes.astype(np.float32),
-        start.astype(np.float32),
-        P[:, 2].astype(np.float32)[T],
-    )
+    double_area, slopes, start = _weight_planes(corners, low)
+    z = P[:, 2].astype(np.float32)[T]
 
     nearest = np.full(width * height, -np.inf, np.float32)
     seen = np.full(width * height, -1, np.int64)
     weights = np.zeros((width * height, 3), np.float32)
+    drawn = np.flatnonzero((samples > 0) & (np.abs(double_area) > 1e-9))
     total = np.cumsum(samples[drawn])
-    for part in np.split(
-        drawn, np.searchsorted(total, np.arange(CHUNK, total[-1] if len(total) else 0, CHUNK))
-    ):
+    ends = np.arange(CHUNK, total[-1] if len(total) else 0, CHUNK)
+    for part in np.split(drawn, np.searchsorted(total, ends)):
         count = samples[part]
-        owner = np.repeat(part, count)
+        owner = np.repeat(part, count)  # the triangle of each sample of its box
         place = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
         dy, dx = np.divmod(place, box[owner, 0])
         wb = start[owner, 0] + slopes[owner, 0] * dx + slopes[owner, 1] * dy
@@ -148,7 +138,29 @@ def rasterise(P, T, width, height):
     return sample, seen[sample], weights[sample], nearest[sample]
 
 
-def plane_box(points, view="corner", up="z"):
+def _weight_planes(corners, low):
+    """The weights of corners b and c, which are linear in the sample's place.
+
+    Returns
+    -------
+    double_area : float ndarray (m,), signed
+    slopes : float32 ndarray (m, 4)
+        Of the weight of b along x and y, and of that of c.
+    start : float32 ndarray (m, 2)
+        Both weights at the first sample of the box.
+    """
+    ax, ay, bx, by, cx, cy = corners.reshape(-1, 6).T
+    double_area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
+    scale = 1 / np.where(double_area == 0, 1, double_area)
+    slopes = np.stack([cy - ay, ax - cx, ay - by, bx - ax], axis=1) * scale[:, None]
+    x, y = low[:, 0] + 0.5 - ax, low[:, 1] + 0.5 - ay
+    wb = slopes[:, 0] * x + slopes[:, 1] * y
+    wc = slopes[:, 2] * x + slopes[:, 3] * y
+    start = np.stack([wb, wc], axis=1)
+    return double_area, slopes.astype(np.float32), start.astype(np.float32)
+
+
+def plane_box(points: np.ndarray, view: Viewpoint = "corner", up: str = "z") -> np.ndarray:
     """The box ``(2, 2)`` of the points in the picture's plane, lowest and highest corner.
 
     A `frame` for render.
@@ -158,16 +170,16 @@ def plane_box(points, view="corner", up="z"):
 
 
 def render(
-    points,
-    triangles,
+    points: np.ndarray,
+    triangles: np.ndarray,
     *,
-    colors=None,
-    flat=False,
-    view="corner",
-    up="z",
-    size=(500, 400),
-    frame=None,
-):
+    colors: np.ndarray | None = None,
+    flat: bool = False,
+    view: Viewpoint = "corner",
+    up: str = "z",
+    size: tuple[int, int] = (500, 400),
+    frame: np.ndarray | None = None,
+) -> np.ndarray:
     """A picture of a surface: orthographic, softly lit, antialiased, on a transparent background.
 
     Parameters
@@ -202,31 +214,34 @@ def render(
     >>> import numpy as np
     >>> from s4a.show.draw import render
     >>> tetrahedron = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
-    >>> picture = render(tetrahedron, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]), size=(60, 40))
+    >>> triangles = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    >>> picture = render(tetrahedron, triangles, size=(60, 40))
     >>> picture.shape, picture[0, 0, 3].item(), picture[20, 30, 3].item()
     ((40, 60, 4), 0, 255)
     """
     X, T = np.asarray(points, float), np.asarray(triangles, np.int64)
     if not len(T) or not np.isfinite(X).all():
         raise ValueError(
-            f"render needs triangles and finite positions, found {len(T)} triangles; clean the mesh first"
+            f"render needs triangles and finite positions, found {len(T)} triangles; "
+            "clean the mesh first"
         )
     X = X @ rotation(view, up).T
     width, height = 2 * size[0], 2 * size[1]  # two by two samples a pixel
-    frame = np.stack([X[:, :2].min(0), X[:, :2].max(0)]) if frame is None else np.asarray(frame)
+    if frame is None:
+        frame = np.stack([X[:, :2].min(0), X[:, :2].max(0)])
+    frame = np.asarray(frame)
     extent = np.maximum(frame[1] - frame[0], np.finfo(float).tiny)
     scale = 0.94 * min(width / extent[0], height / extent[1])
     P = (X - [*frame.mean(0), 0]) * [scale, -scale, scale] + [width / 2, height / 2, 0]
     sample, triangle, weights, depth = rasterise(P, T, width, height)
-    corners = T[triangle]
+    corners = T[triangle]  # (s, 3)
     N = np.einsum("sc,scx->sx", weights, vertex_normals(X, T).astype(np.float32)[corners])
-    N *= np.where(
-        triangle_normals(X, T)[triangle, 2:] < 0, -1, 1
-    )  # a surface seen from behind is lit all the same
+    # a surface seen from behind is lit all the same
+    N *= np.where(triangle_normals(X, T)[triangle, 2:] < 0, -1, 1)
     N /= np.maximum(np.linalg.norm(N, axis=1, keepdims=True), 1e-6)
-    base = (
-        np.asarray(CLAY, np.float32) if colors is None else _sampled(colors, corners, weights, flat)
-    )
+    base = np.asarray(CLAY, np.float32)
+    if colors is not None:
+        base = _sampled(colors, corners, weights, flat)
     shade = np.zeros((height, width, 4), np.float32)
     shade.reshape(-1, 4)[sample, :3] = _light(N, base, _creases(sample, depth, width, height))
     shade.reshape(-1, 4)[sample, 3] = 1
@@ -245,13 +260,15 @@ def _sampled(colors, corners, weights, flat):
 
 
 def _creases(sample, depth, width, height):
-    """Darkness ``(s,)`` of samples that lie deeper than what is around them (unsharp masking of the depth)."""
+    """Darkness ``(s,)`` of samples that lie deeper than what is around them.
+
+    An unsharp mask of the depth.
+    """
     flat = np.zeros((2, height * width), np.float32)
     flat[0, sample], flat[1, sample] = depth, 1
     sigma = 0.004 * (width + height)
-    total, cover = (
-        gaussian_filter(_halved(a.reshape(height, width)), sigma, truncate=2.5) for a in flat
-    )
+    layers = [_halved(layer.reshape(height, width)) for layer in flat]
+    total, cover = (gaussian_filter(layer, sigma, truncate=2.5) for layer in layers)
     around = total / np.maximum(cover, 1e-3)
     y, x = np.divmod(sample, width)
     return np.clip((around[y // 2, x // 2] - depth) / (5 * sigma), 0, 1)
@@ -276,7 +293,7 @@ def _light(N, base, crease):
     return np.clip(base * light[:, None] + shine[:, None], 0, 1)
 
 
-def signed_colors(values, limit):
+def signed_colors(values: np.ndarray, limit: float) -> np.ndarray:
     """Colours ``(n, 3)`` of signed values, white at 0.
 
     Blue is positive (expansion), red is negative (compression).
@@ -298,7 +315,12 @@ def signed_colors(values, limit):
     return ramp_colors(values, -limit, limit, SIGNED)
 
 
-def ramp_colors(values, low=None, high=None, colormap="viridis"):
+def ramp_colors(
+    values: np.ndarray,
+    low: float | None = None,
+    high: float | None = None,
+    colormap: str | Colormap = "viridis",
+) -> np.ndarray:
     """Colours ``(n, 3)`` of values from `low` to `high` (by default their range); NaN stays NaN."""
     values = np.asarray(values, float)
     low = np.nanmin(values) if low is None else low
@@ -308,7 +330,7 @@ def ramp_colors(values, low=None, high=None, colormap="viridis"):
     return np.where(np.isnan(values)[..., None], np.nan, colors)
 
 
-def label_colors(labels):
+def label_colors(labels: np.ndarray) -> np.ndarray:
     """Colours ``(n, 3)`` of integer labels.
 
     Eight that everybody tells apart, then darker and lighter ones of them.
@@ -320,21 +342,20 @@ def label_colors(labels):
     >>> len(np.unique(label_colors(np.arange(24)), axis=0))
     24
     """
-    palette = np.array([[int(c[i : i + 2], 16) / 255 for i in (1, 3, 5)] for c in OKABE_ITO])
+    palette = np.array([to_rgb(color) for color in OKABE_ITO])
     palette = np.concatenate([palette, 0.55 * palette, 0.45 + 0.55 * palette])
-    return palette[
-        np.unique(labels, return_inverse=True)[1].reshape(np.shape(labels)) % len(palette)
-    ]
+    _, place = np.unique(labels, return_inverse=True)
+    return palette[place.reshape(np.shape(labels)) % len(palette)]
 
 
-def position_colors(points):
+def position_colors(points: np.ndarray) -> np.ndarray:
     """Colours ``(n, 3)`` that tell places apart: the coordinates as red, green and blue."""
     points = np.asarray(points, float)
     low, high = points.min(0), points.max(0)
     return 0.12 + 0.83 * (points - low) / np.maximum(high - low, np.finfo(float).tiny)
 
 
-def checkerboard(coordinates, cell):
+def checkerboard(coordinates: np.ndarray, cell: float) -> np.ndarray:
     """Brightness ``(n,)`` of a checkerboard of cubes of the side `cell`: 1 and 0.5 in turn.
 
     NaN stays NaN.
@@ -349,7 +370,9 @@ def checkerboard(coordinates, cell):
     return 1 - 0.5 * (np.floor(np.asarray(coordinates) / cell).sum(1) % 2)
 
 
-def with_balls(points, triangles, colors, balls):
+def with_balls(
+    points: np.ndarray, triangles: np.ndarray, colors: np.ndarray | None, balls: list[list[float]]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """A surface with spheres: points, triangles and colours of all.
 
     Each ball is x, y, z, red, green, blue, radius.
@@ -358,32 +381,36 @@ def with_balls(points, triangles, colors, balls):
     --------
     >>> import numpy as np
     >>> from s4a.show.draw import with_balls
-    >>> X, T, colors = with_balls(np.zeros((3, 3)), np.array([[0, 1, 2]]), None, [[5, 0, 0, 1, 0, 0, 2.0]])
+    >>> ball = [5, 0, 0, 1, 0, 0, 2.0]
+    >>> X, T, colors = with_balls(np.zeros((3, 3)), np.array([[0, 1, 2]]), None, [ball])
     >>> float(X[:, 0].min()), float(X[:, 0].max()), colors[-1].tolist()
     (0.0, 7.0, [1.0, 0.0, 0.0])
     """
     if not len(balls):
         return points, triangles, colors
     rings, around = 10, 16
-    a, b = np.meshgrid(
-        np.linspace(0, np.pi, rings + 1), np.linspace(0, 2 * np.pi, around + 1), indexing="ij"
-    )
+    polar, azimuth = np.linspace(0, np.pi, rings + 1), np.linspace(0, 2 * np.pi, around + 1)
+    a, b = np.meshgrid(polar, azimuth, indexing="ij")
     unit = np.stack([np.sin(a) * np.cos(b), np.sin(a) * np.sin(b), np.cos(a)], -1).reshape(-1, 3)
+    # two triangles of each patch between two rings
     here = (np.arange(rings)[:, None] * (around + 1) + np.arange(around)).ravel()
     below = here + around + 1
-    T = np.concatenate(
-        [np.stack([here, below, here + 1], 1), np.stack([here + 1, below, below + 1], 1)]
+    T = np.concatenate([
+        np.stack([here, below, here + 1], 1), np.stack([here + 1, below, below + 1], 1)
+    ])  # fmt: skip
+    table = np.asarray(balls, float)  # (ball, 7)
+    centre, color, radius = table[:, None, :3], table[:, 3:6], table[:, 6, None, None]
+    first = len(points) + len(unit) * np.arange(len(balls))
+    if colors is None:
+        colors = np.tile(CLAY, (len(points), 1))
+    return (
+        np.concatenate([points, (centre + radius * unit).reshape(-1, 3)]),
+        np.concatenate([triangles, (T + first[:, None, None]).reshape(-1, 3)]),
+        np.concatenate([colors, np.repeat(color, len(unit), axis=0)]),
     )
-    colors = np.tile(CLAY, (len(points), 1)) if colors is None else np.asarray(colors)
-    parts = [np.asarray(points)], [np.asarray(triangles)], [colors]
-    for i, (*centre, red, green, blue, radius) in enumerate(balls):
-        parts[0].append(np.array(centre) + radius * unit)
-        parts[1].append(T + len(points) + i * len(unit))
-        parts[2].append(np.tile([red, green, blue], (len(unit), 1)))
-    return tuple(np.concatenate(part) for part in parts)
 
 
-def image_bytes(picture, kind="webp"):
+def image_bytes(picture: np.ndarray, kind: str = "webp") -> bytes:
     """The bytes of an image file of a picture ``(height, width, 4)``.
 
     ``webp``, a tenth of the size, or exact ``png``.
@@ -400,12 +427,12 @@ def image_bytes(picture, kind="webp"):
     return file.getvalue()
 
 
-def on_white(picture):
+def on_white(picture: np.ndarray) -> np.ndarray:
     """A picture ``(height, width, 4)`` laid on white: ``(height, width, 3)``."""
     opacity = picture[..., 3:] / 255
     return (picture[..., :3] * opacity + 255 * (1 - opacity) + 0.5).astype(np.uint8)
 
 
-def data_uri(content, kind="image/webp"):
+def data_uri(content: bytes, kind: str = "image/webp") -> str:
     """Bytes as the address of an image inside a page."""
     return f"data:{kind};base64,{base64.b64encode(content).decode()}"

@@ -9,7 +9,7 @@ from markupsafe import Markup
 from s4a.method.pca import color_limits
 from s4a.show import charts
 from s4a.show.browser import MODES, PARTS, TEMPLATES, look_state, mesh_state, webp_uri
-from s4a.show.draw import SIGNED, opposite, position_colors, ramp_colors, render
+from s4a.show.draw import SIGNED, Viewpoint, opposite, position_colors, ramp_colors, render
 from s4a.show.pictures import N_MODES, PANEL, SIGMA, mode_drawer, shared_frames
 from s4a.show.surfaces import (
     attribute,
@@ -33,7 +33,7 @@ def write_page(
     path: Path | str,
     *,
     title: str = "Shape study",
-    view: str | tuple[float, float] = "corner",
+    view: Viewpoint = "corner",
     up: str = "z",
 ) -> Path:
     """Write a study as one HTML page, which needs no network and no other file.
@@ -72,7 +72,7 @@ def study_html(
     study: xr.DataTree,
     *,
     title: str = "Shape study",
-    view: str | tuple[float, float] = "corner",
+    view: Viewpoint = "corner",
     up: str = "z",
 ) -> str:
     """The HTML of a study; see :func:`write_page`."""

@@ -9,7 +9,7 @@ from PIL import Image
 
 from s4a.geometry.mesh import vertex_normals
 from s4a.method.deform import normal_displacement
-from s4a.show.draw import image_bytes, on_white, plane_box, render, signed_colors
+from s4a.show.draw import Viewpoint, image_bytes, on_white, plane_box, render, signed_colors
 from s4a.show.surfaces import mode_arrays
 
 SIGMA = 3  # the modes are shown from -3 to 3 standard deviations
@@ -59,7 +59,7 @@ def write_animation(
     mode: int = 0,
     n_frames: int = 24,
     seconds: float = 4.0,
-    view: str | tuple[float, float] = "corner",
+    view: Viewpoint = "corner",
     up: str = "z",
     size: tuple[int, int] = (400, 340),
 ) -> Path:
@@ -102,7 +102,7 @@ def write_picture(
     study: xr.DataTree,
     path: Path | str,
     *,
-    view: str | tuple[float, float] = "corner",
+    view: Viewpoint = "corner",
     up: str = "z",
     size: tuple[int, int] = (400, 340),
 ) -> Path:

@@ -85,7 +85,7 @@ class Network(Panel):
         ]
 
     def places(self) -> np.ndarray:
-        """Places ``(n, 2)`` of the shapes: by their differences where that is chosen, or a circle."""
+        """Places ``(n, 2)`` of the shapes, by their differences or on a circle."""
         places = None
         if self.where.value == "shape differences":
             places = network_places(self.study, self.names)

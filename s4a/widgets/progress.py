@@ -57,7 +57,7 @@ def clock(seconds):
 
 
 class Progress(Panel):
-    """Runs :func:`s4a.analyse` in a process of its own, beside the notebook, and shows how far it is.
+    """Runs :func:`s4a.analyse` in a process of its own and shows how far it is.
 
     Parameters
     ----------

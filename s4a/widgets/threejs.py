@@ -7,12 +7,13 @@ takes a surface from here.
 
 import numpy as np
 import pythreejs as three
+import xarray as xr
 
 from s4a.geometry.mesh import as_arrays, vertex_normals
 from s4a.schema import require
 
 
-def surface(mesh, colors=None):
+def surface(mesh: xr.Dataset, colors: np.ndarray | None = None) -> three.Mesh:
     """A mesh Dataset as a smooth pythreejs surface.
 
     Parameters
@@ -36,7 +37,8 @@ def surface(mesh, colors=None):
     if not np.isfinite(X).all():
         wrong = (~np.isfinite(X)).any(1).sum()
         raise ValueError(
-            f"finite positions needed, found {wrong} vertices that are not; s4a.clean repairs the mesh"
+            f"finite positions needed, found {wrong} vertices that are not; "
+            "s4a.clean repairs the mesh"
         )
     attributes = {
         "position": X.astype(np.float32),
@@ -61,7 +63,7 @@ def surface(mesh, colors=None):
     return three.Mesh(geometry, material)
 
 
-def renderer(*objects, size=(600, 450)):
+def renderer(*objects: three.Object3D, size: tuple[int, int] = (600, 450)) -> three.Renderer:
     """A pythreejs renderer around objects, lit from the viewer, with controls to turn and zoom.
 
     Parameters
@@ -71,14 +73,12 @@ def renderer(*objects, size=(600, 450)):
     size : (int, int)
         Width and height in pixels.
     """
-    points = [o.geometry.attributes["position"].array for o in objects if isinstance(o, three.Mesh)]
-    if not points:
+    surfaces = [item.geometry for item in objects if isinstance(item, three.Mesh)]
+    if not surfaces:
         raise ValueError("a renderer needs at least one surface to look at")
-    points = np.concatenate(points)
-    middle, radius = (
-        (points.max(0) + points.min(0)) / 2,
-        float(np.linalg.norm(np.ptp(points, axis=0))) / 2,
-    )
+    points = np.concatenate([geometry.attributes["position"].array for geometry in surfaces])
+    middle = (points.max(0) + points.min(0)) / 2
+    radius = float(np.linalg.norm(np.ptp(points, axis=0))) / 2
     camera = three.PerspectiveCamera(
         position=(middle + radius * np.array([1.5, -2.0, 0.8])).tolist(),
         up=[0, 0, 1],

@@ -131,7 +131,7 @@ class Transfer(Panel):
             return
         here = mesh["label"].values
         on_target = transfer_labels(self.study, here, source=self.source, targets=[self.target])
-        self.carried = on_target[self.target]
+        self.carried = on_target[self.target].dataset
         there, confidence = (self.carried[key].values for key in ("label", "confidence"))
         values = np.unique(here)
         colors = label_colors(values)  # in the order of the values, so that both surfaces agree
