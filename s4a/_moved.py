@@ -19,8 +19,8 @@ PUBLIC = {
 ROOMS = {
     "geometry": "align mesh voronoi",
     "input": "annotations bounded formats manifold subjects",
-    "method": "deform descriptors fmap joint latent lift median nearest network pca register remesh "
-    "scalable spectral",
+    "method": "deform descriptors fmap joint latent lift median nearest network pca register "
+    "remesh scalable spectral",
     "study": "options pipeline",
     "analysis": "export landmarks link model permutation transfer",
     "evaluation": "accuracy",

@@ -1,9 +1,9 @@
 """The methods that 5.2 and 5.3 compare, each as a shape of its own functions, timed by block.
 
 Every method works on a :class:`s4a.method.shape.Shape`: ZO and FMAP+ZO on one whose functions are
-the eigenfunctions of the dense mesh, SCALABLE on that of :mod:`s4a.method.scalable`, RE-MATCH on the
-coarse mesh with functions of :mod:`s4a.method.lift`.  Times are CPU seconds of one core, so that a
-busy machine does not change them.
+the eigenfunctions of the dense mesh, SCALABLE on that of :mod:`s4a.method.scalable`, RE-MATCH on
+the coarse mesh with functions of :mod:`s4a.method.lift`.  Times are CPU seconds of one core, so
+that a busy machine does not change them.
 """
 
 import time
@@ -135,7 +135,7 @@ class Spaces:
 
 
 def lifted_shape(shape: Shape, low: xr.Dataset, k: int) -> Shape:
-    """A shape whose functions are those of :mod:`s4a.method.lift`, at all vertices and at coarse ones.
+    """A shape with the functions of :mod:`s4a.method.lift`, at all vertices and at coarse ones.
 
     They are orthonormal for the areas of the low-resolution mesh, as ZoomOut needs it.
 

@@ -168,7 +168,8 @@ def geodesic_error(
 
     >>> import numpy as np
     >>> import s4a
-    >>> X, T = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
+    >>> X = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])  # a square
+    >>> T = np.array([[0, 1, 2], [0, 2, 3]])
     >>> s4a.metrics.geodesic_error(X, T, np.array([0, 1, 2, 0]), np.arange(4)).tolist()
     [0.0, 0.0, 0.0, 1.0]
     """
@@ -246,7 +247,8 @@ def cycle_error(
     --------
     >>> import numpy as np
     >>> import s4a
-    >>> X, T = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
+    >>> X = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])  # a square
+    >>> T = np.array([[0, 1, 2], [0, 2, 3]])
     >>> turn = np.array([1, 2, 3, 0])
     >>> s4a.metrics.cycle_error(X, T, turn, turn, turn, turn).tolist()
     [0.0, 0.0, 0.0, 0.0]
@@ -289,7 +291,8 @@ def bijectivity(
     --------
     >>> import numpy as np
     >>> import s4a
-    >>> X, T = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
+    >>> X = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])  # a square
+    >>> T = np.array([[0, 1, 2], [0, 2, 3]])
     >>> turn = np.array([1, 2, 3, 0])
     >>> s4a.metrics.bijectivity(X, T, turn, np.argsort(turn)).tolist()
     [0.0, 0.0, 0.0, 0.0]
@@ -337,7 +340,8 @@ def distortion(X: np.ndarray, image: np.ndarray, T: np.ndarray) -> tuple[np.ndar
     G, H = gram(X), gram(image)
     before, after = 2 * triangle_areas(X, T), 2 * triangle_areas(image, T)
     with np.errstate(divide="ignore", invalid="ignore"):
-        # trace(G^-1 H) = s1^2 + s2^2 and det = (s1 s2)^2, so that their ratio is 2 cosh(log(s1 / s2))
+        # trace(G^-1 H) = s1^2 + s2^2 and det = (s1 s2)^2,
+        # so that their ratio is 2 cosh(log(s1 / s2))
         trace = (
             G[:, 1, 1] * H[:, 0, 0] + G[:, 0, 0] * H[:, 1, 1] - 2 * G[:, 0, 1] * H[:, 0, 1]
         ) / before**2
@@ -364,7 +368,8 @@ def label_accuracy(found: ArrayLike, true: ArrayLike, area: np.ndarray | None = 
     --------
     >>> import numpy as np
     >>> import s4a
-    >>> s4a.metrics.label_accuracy(np.array([1, 1, 2]), np.array([1, 2, 2]), np.array([1.0, 1.0, 2.0]))
+    >>> label, truth, area = np.array([1, 1, 2]), np.array([1, 2, 2]), np.array([1.0, 1.0, 2.0])
+    >>> s4a.metrics.label_accuracy(label, truth, area)
     0.75
     """
     return float(np.average(np.asarray(found) == np.asarray(true), weights=area))
@@ -439,8 +444,9 @@ def _true_vertices(truth, X, n):
         return np.where(truth[:, None] >= 0, X[truth], np.nan), truth
     if truth.shape != (n, 3):
         raise ValueError(
-            f"truth needs, for each of the {n} vertices of the target, a vertex of the source (integers, -1 where "
-            f"unknown) or a position (n, 3); found {truth.dtype} of shape {truth.shape}"
+            f"truth needs, for each of the {n} vertices of the target, a vertex of the source "
+            f"(integers, -1 where unknown) or a position (n, 3); "
+            f"found {truth.dtype} of shape {truth.shape}"
         )
     known = np.isfinite(truth).all(axis=1)
     vertex = np.full(n, -1)
@@ -459,7 +465,8 @@ def _match_of(match, mesh, other, what):
     ):
         raise ValueError(
             f"{what} needs {n} integers from 0 to {p - 1}, one for each vertex; "
-            f"found {match.dtype} of shape {match.shape} from {match.min(initial=0)} to {match.max(initial=0)}"
+            f"found {match.dtype} of shape {match.shape} "
+            f"from {match.min(initial=0)} to {match.max(initial=0)}"
         )
     return match
 

@@ -179,7 +179,7 @@ def fit(
 
 
 def commutator(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """(mu_i - lambda_j)^2 / lambda_max^2 ``(k_target, k_source)``: C commutes with the Laplacians."""
+    """Penalty (mu_i - lambda_j)^2 / lambda_max^2 ``(k_target, k_source)`` of each entry of C."""
     return ((target[:, None] - source) / max(source[-1], target[-1])) ** 2
 
 
