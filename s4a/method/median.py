@@ -3,6 +3,7 @@
 import numpy as np
 import xarray as xr
 
+from s4a.method.pca import gram_pca
 from s4a.schema import dataset, require
 
 # Power of the latent eigenvalues by which each norm of eq. 5 weighs fine detail less.
@@ -67,12 +68,12 @@ def difference_pca(D: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     Scores ``(n, n - 1)`` in the unit of the operators and shares of variance ``(n - 1,)``.
     """
-    X = D.reshape(len(D), -1)
-    U, S, _ = np.linalg.svd(X - X.mean(0), full_matrices=False)
-    U, S = U[:, :-1], S[:-1]
-    U = U * np.where((U**3).sum(0) < 0, -1.0, 1.0)
-    total = (S**2).sum()
-    return U * S, S**2 / (total if total > 0 else 1.0)
+    n, m = D.shape[:2]
+    modes = gram_pca(D, np.ones(m))
+    # gram_pca measures by the mean over the m rows, the operators' norm by their sum
+    score = modes.score * modes.standard_deviation * np.sqrt(m)  # (n, c)
+    empty = n - 1 - len(modes.ratio)  # components without variance
+    return np.pad(score, ((0, 0), (0, empty))), np.pad(modes.ratio, (0, empty))
 
 
 def median_shape(latent: xr.Dataset, eigenvalues: np.ndarray, *, norm: str = "h2") -> xr.Dataset:

@@ -77,16 +77,11 @@ def gram_pca(fields: np.ndarray, area: np.ndarray) -> PrincipalModes:
     """
     s = len(fields)
     mean = fields.mean(axis=0)
-    eigenvalue, V = np.linalg.eigh(gram(fields - mean, area))
-    eigenvalue, V = np.maximum(eigenvalue[::-1], 0), V[:, ::-1]
-    keep = eigenvalue > 1e-12 * max(eigenvalue[0], np.finfo(float).tiny)
-    keep &= np.arange(s) < s - 1
-    eigenvalue, V = eigenvalue[keep], V[:, keep]
+    variance, V = principal_components(gram(fields - mean, area))
     V = V * np.where((V**3).sum(0) < 0, -1.0, 1.0)  # (s, c)
     deformation = np.einsum("sc,snd->cnd", V, fields - mean, optimize=True) / np.sqrt(s - 1)
-    ratio = eigenvalue / eigenvalue.sum()
-    deviation = np.sqrt(eigenvalue / (s - 1))
-    return PrincipalModes(mean, deformation, deviation, V * np.sqrt(s - 1), ratio)
+    ratio = variance / variance.sum()
+    return PrincipalModes(mean, deformation, np.sqrt(variance), V * np.sqrt(s - 1), ratio)
 
 
 def low_vertices(coarse: xr.Dataset) -> np.ndarray:
