@@ -71,7 +71,7 @@ def _register(shape, template, bases, rotation, options):
     with threadpool_limits(1):
         M = shape.low
         N = template.low
-        motion = realign(M.X, M.area, N.X, N.area, (rotation, np.zeros(3)))
+        motion = realign(M.cloud, N.cloud, (rotation, np.zeros(3)))
         return from_latent(
             shape, template, bases, motion, refine=options.refine, scale=options.scale
         )

@@ -418,7 +418,7 @@ def first_maps(
     for i, j in network.choose_pairs(distance, n_pairs):
         M, N = bases[i], bases[j]
         start = motion_between(motions[i], motions[j])
-        R, t = realign(M.X, M.area, N.X, N.area, start)
+        R, t = realign(M.cloud, N.cloud, start)
         maps.append(map_after_motion(M, N, (R, t), k_init=k_init))
         maps.append(map_after_motion(N, M, (R.T, -R.T @ t), k_init=k_init))
         source += [i, j]

@@ -4,6 +4,7 @@ A motion ``R, t`` carries x to R x + t, rows of X to ``X @ R.T + t``.
 """
 
 import itertools
+from dataclasses import dataclass
 from typing import Any
 
 import fpsample
@@ -13,9 +14,18 @@ from scipy.spatial.transform import Rotation
 
 Motion = tuple[np.ndarray, np.ndarray]  # R (3, 3), t (3,)
 End = tuple[np.ndarray, np.ndarray, float]  # of an ICP: R, t and the residual
-Cloud = tuple[cKDTree, np.ndarray]  # of all vertices, and the indices of spread ones
 
 ROUGH = 2e-5  # tolerance where few points are paired, or ends are only compared: twice icp's own
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """The vertices of a shape as ICP takes them; see :func:`cloud`."""
+
+    X: np.ndarray  # (n, 3)
+    area: np.ndarray  # (n,)
+    tree: cKDTree  # of all vertices
+    paired: np.ndarray  # indices of those that are paired with the other shape's nearest
 
 
 def rigid_transform(
@@ -122,42 +132,35 @@ def principal_axes(X: np.ndarray, area: np.ndarray) -> tuple[np.ndarray, np.ndar
     return c, V * np.array([1, 1, np.sign(np.linalg.det(V))])
 
 
-def cloud(X: np.ndarray, n_points: int | None = None) -> Cloud:
-    """What ICP needs of a shape: a KD-tree of all vertices, and `n_points` spread ones (or all)."""
-    return cKDTree(X), np.arange(len(X)) if n_points is None else farthest_points(X, n_points)
+def cloud(X: np.ndarray, area: np.ndarray, n_points: int | None = None) -> Cloud:
+    """A shape's vertices and areas for ICP, which pairs `n_points` spread ones of it (or all)."""
+    paired = np.arange(len(X)) if n_points is None else farthest_points(X, n_points)
+    return Cloud(X, area, cKDTree(X), paired)
 
 
 def icp(
-    X: np.ndarray,
-    area: np.ndarray,
-    Y: np.ndarray,
-    area_y: np.ndarray,
+    source: Cloud,
+    target: Cloud,
     R: np.ndarray,
     t: np.ndarray,
     *,
-    n_points: int | None = None,
-    clouds: tuple[Cloud, Cloud] | None = None,
     rounds: int = 60,
     tolerance: float = 1e-5,
     trim: float = 0.1,
 ) -> End:
-    """Iterative closest points (Besl & McKay 1992) from a given start: moves X onto Y.
+    """Iterative closest points (Besl & McKay 1992) from a given start: moves the source.
 
-    Each round pairs vertices of X with the nearest of all of Y and vertices of Y with the nearest
-    of all of X, leaves out the `trim` farthest pairs, and solves for the motion, weighted by area.
+    Each round pairs vertices of the source with the nearest of all of the target and vertices of
+    the target with the nearest of all of the source, leaves out the `trim` farthest pairs, and
+    solves for the motion, weighted by area.
 
     Parameters
     ----------
-    X, Y : float ndarray (n, 3), (p, 3)
-    area, area_y : float ndarray (n,), (p,)
+    source, target : Cloud
     R, t : start, R x + t
-    n_points : int, optional
-        How many vertices of each, spread over it, are paired; all by default.
-    clouds : tuple, optional
-        :func:`cloud` of X and of Y, where they are at hand.
     rounds : int
     tolerance : float
-        The end comes when the residual falls by less, as a share of sqrt(area of X).
+        The end comes when the residual falls by less, as a share of sqrt(area of the source).
     trim : float
 
     Returns
@@ -167,15 +170,16 @@ def icp(
     residual : float
         Trimmed root mean square distance of the pairs, both ways.
     """
-    (tree_x, i), (tree_y, j) = clouds or (cloud(X, n_points), cloud(Y, n_points))
-    weight = np.concatenate([area[i] / area[i].sum(), area_y[j] / area_y[j].sum()])
-    size = np.sqrt(area.sum())
+    X, Y = source.X[source.paired], target.X[target.paired]
+    area, area_y = source.area[source.paired], target.area[target.paired]
+    weight = np.concatenate([area / area.sum(), area_y / area_y.sum()])
+    size = np.sqrt(source.area.sum())
     last = np.inf
     for _ in range(rounds):
-        forth_gap, forth = tree_y.query(X[i] @ R.T + t)
-        back_gap, back = tree_x.query((Y[j] - t) @ R)
-        P = np.concatenate([X[i], X[back]])  # (pairs, 3)
-        Q = np.concatenate([Y[forth], Y[j]])
+        forth_gap, forth = target.tree.query(X @ R.T + t)
+        back_gap, back = source.tree.query((Y - t) @ R)
+        P = np.concatenate([X, source.X[back]])  # (pairs, 3)
+        Q = np.concatenate([target.X[forth], Y])
         gap = np.concatenate([forth_gap, back_gap])
         # two that are each other's nearest stay or go together, whatever the rounding
         keep = gap <= (1 + 1e-9) * np.quantile(gap, 1 - trim)
@@ -193,26 +197,20 @@ def residual_of(end: End) -> float:
 
 
 def try_tilts(
-    X: np.ndarray,
-    area: np.ndarray,
-    Y: np.ndarray,
-    area_y: np.ndarray,
-    start: End,
-    *,
-    degrees: float = 15.0,
-    **options: Any,
+    source: Cloud, target: Cloud, start: End, *, degrees: float = 15.0, **options: Any
 ) -> End:
-    """ICP again from its end tilted about each axis of Y both ways, as long as that ends nearer.
+    """ICP again from its end tilted about each axis of the target, as long as that ends nearer.
 
     ICP alone ends wherever no pair changes: on folded surfaces up to 20 degrees from the best
     rotation.  The axes are the principal ones, so that the end does not depend on how both lie.
 
     Parameters
     ----------
-    X, area, Y, area_y : as of :func:`icp`
+    source, target : Cloud
     start : tuple (R, t, residual)
         The end of an ICP with the same `options`.
     degrees : float
+        Of a tilt, tried both ways.
     **options
         Of :func:`icp`.
 
@@ -220,20 +218,19 @@ def try_tilts(
     -------
     R, t, residual
     """
-    _, axes = principal_axes(Y, area_y)
+    _, axes = principal_axes(target.X, target.area)
     tilts = [
         axes @ Rotation.from_euler(axis, sign * degrees, degrees=True).as_matrix() @ axes.T
         for axis in "xyz"
         for sign in (1, -1)
     ]
-    center = area @ X / area.sum()
+    center = source.area @ source.X / source.area.sum()
     best = start
     for _ in range(5):
         R, t, residual = best
         middle = R @ center + t  # the tilts turn X about where its centre has come to lie
         ends = [
-            icp(X, area, Y, area_y, tilt @ R, tilt @ (t - middle) + middle, **options)
-            for tilt in tilts
+            icp(source, target, tilt @ R, tilt @ (t - middle) + middle, **options) for tilt in tilts
         ]
         end = min(ends, key=residual_of)
         if residual_of(end) > 0.999 * residual:
@@ -278,17 +275,16 @@ def align(
     center_y, B = principal_axes(Y, area_y)
     flips = [np.diag(d) for d in itertools.product((1, -1), repeat=3) if np.prod(d) == 1]
     starts = [np.eye(3)] + [B @ flip @ A.T for flip in flips]
-    options: dict[str, Any] = {
-        "clouds": (cloud(X, n_points), cloud(Y, n_points)),
-        "tolerance": ROUGH,
-    }
-    posed, *turned = [icp(X, area, Y, area_y, R, center_y - R @ center, **options) for R in starts]
+    source, target = cloud(X, area, n_points), cloud(Y, area_y, n_points)
+    posed, *turned = [
+        icp(source, target, R, center_y - R @ center, tolerance=ROUGH) for R in starts
+    ]
     # the trace of a rotation is 1 + 2 cos(angle): 1 at 90 degrees
     upright = [end for end in turned if np.trace(end[0].T @ posed[0]) >= 1]
     upside_down = [end for end in turned if np.trace(end[0].T @ posed[0]) < 1]
 
     def tilt(start: End) -> End:
-        return try_tilts(X, area, Y, area_y, start, **options)
+        return try_tilts(source, target, start, tolerance=ROUGH)
 
     best = tilt(min(upright, key=residual_of)) if upright else None
     if best is None or clearly * residual_of(best) > residual_of(posed):
@@ -298,38 +294,16 @@ def align(
         if residual_of(other) < prefer * residual_of(best):
             best = other
     R, t, _ = best
-    return icp(X, area, Y, area_y, R, t)
+    return icp(cloud(X, area), cloud(Y, area_y), R, t)
 
 
-def realign(
-    X: np.ndarray,
-    area: np.ndarray,
-    Y: np.ndarray,
-    area_y: np.ndarray,
-    start: Motion,
-    *,
-    n_points: int = 300,
-    clouds: tuple[Cloud, Cloud] | None = None,
-) -> Motion:
-    """Rigid motion of X onto Y by ICP from a start, `n_points` spread vertices of each paired.
-
-    Parameters
-    ----------
-    X, area, Y, area_y, clouds : as of :func:`icp`
-    start : tuple (R, t)
-    n_points : int
-
-    Returns
-    -------
-    R, t
-    """
-    R, t, _ = icp(X, area, Y, area_y, *start, n_points=n_points, clouds=clouds, tolerance=ROUGH)
+def realign(source: Cloud, target: Cloud, start: Motion) -> Motion:
+    """Rigid motion (R, t) of the source onto the target by ICP from a start (R, t) near it."""
+    R, t, _ = icp(source, target, *start, tolerance=ROUGH)
     return R, t
 
 
-def motion_between(
-    source: tuple[np.ndarray, np.ndarray], target: tuple[np.ndarray, np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
+def motion_between(source: Motion, target: Motion) -> Motion:
     """The motion source -> target from the motions (R, t) of both onto a common reference.
 
     Examples

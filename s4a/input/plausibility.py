@@ -37,7 +37,7 @@ def pose(shape, reference):
         Least residual of ICP of the shape and of its mirror image, as shares of sqrt(area).
     """
     (P, p), (Q, q) = _unit(*shape), _unit(*reference)
-    options, cloud_q = {"tolerance": 1e-4, "rounds": 30}, cloud(Q, N_PAIRED)
+    options, cloud_q = {"tolerance": 1e-4, "rounds": 30}, cloud(Q, q, N_PAIRED)
     halves = [
         np.diag(d).astype(float) for d in itertools.product((1, -1), repeat=3) if np.prod(d) == 1
     ]
@@ -45,8 +45,8 @@ def pose(shape, reference):
     def ends(X):
         A, B = principal_axes(X, p)[1], principal_axes(Q, q)[1]
         starts = halves + [B @ half @ A.T for half in halves]
-        clouds = cloud(X, N_PAIRED), cloud_q
-        return [icp(X, p, Q, q, R, np.zeros(3), clouds=clouds, **options) for R in starts]
+        cloud_x = cloud(X, p, N_PAIRED)
+        return [icp(cloud_x, cloud_q, R, np.zeros(3), **options) for R in starts]
 
     found, mirrored = ends(P), ends(P * [-1, 1, 1])
     as_it_is, best, reflected = (

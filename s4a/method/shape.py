@@ -12,12 +12,13 @@ import scipy.sparse as sp
 import xarray as xr
 from scipy.spatial import cKDTree
 
-from s4a.geometry.align import farthest_points
+from s4a.geometry.align import Cloud, cloud, farthest_points
 from s4a.geometry.closest import feature_tree
 from s4a.geometry.mesh import as_arrays, edge_graph, edges, vertex_areas
 from s4a.method.deform import smoother
 
 N_SPREAD = 1000  # spread vertices of a shape on which Consistent ZoomOut looks for matches
+N_PAIRED = 300  # spread vertices of a shape that rigid alignment pairs
 N_CENTRAL = 25_000  # vertices by which dense rounds move a shape
 
 
@@ -96,6 +97,11 @@ class Basis:
     def spread(self) -> np.ndarray:
         """Some vertices ``(s,)`` spread over the surface."""
         return farthest_points(self.X, N_SPREAD)
+
+    @cached_property
+    def cloud(self) -> Cloud:
+        """The vertices as rigid alignment takes them."""
+        return cloud(self.X, self.area, N_PAIRED)
 
     @cached_property
     def tree(self) -> cKDTree:

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from threadpoolctl import threadpool_limits
 
-from s4a.geometry.align import align, cloud, motion_between, realign
+from s4a.geometry.align import align, motion_between, realign
 from s4a.method import fmap, network
 from s4a.method.first_map import first_map, map_after_motion
 from s4a.method.latent import consistent_zoomout
@@ -22,7 +22,6 @@ from s4a.schema import dataset, require
 Motion = tuple[np.ndarray, np.ndarray]
 
 LOW = ("position", "corner_vertex", "vertex_area", "eigenvalue", "eigenfunction")
-N_PAIRED = 300  # spread vertices of each shape that ICP pairs, from a start that is known
 
 
 def bases_of(coarse: dict[str, xr.Dataset]) -> dict[str, Basis]:
@@ -89,12 +88,11 @@ def map_pairs(
     xarray.Dataset
         ``source(pair)``, ``target(pair)`` and ``fmap_initial``.
     """
-    clouds = {name: cloud(basis.X, N_PAIRED) for name, basis in bases.items()}
     source, target, maps = [], [], []
     for a, b in pairs:
         M, N = bases[a], bases[b]
         start = motion_between(motions[a], motions[b])
-        R, t = realign(M.X, M.area, N.X, N.area, start, clouds=(clouds[a], clouds[b]))
+        R, t = realign(M.cloud, N.cloud, start)
         kind, C, _ = first_map(M, N, (R, t), k_init=k_init, init=init)
         if kind == init:
             back = map_after_motion(N, M, (R.T, -R.T @ t), k_init=k_init, init=init)
@@ -346,6 +344,6 @@ def register_shape(
     if start is None:
         motion = align(M.X, M.area, N.X, N.area)[:2]
     else:
-        motion = realign(M.X, M.area, N.X, N.area, start)
+        motion = realign(M.cloud, N.cloud, start)
     bases = latent_bases(study, name, template)
     return from_latent(source, target, bases, motion, how=how, refine=refine, scale=scale)

@@ -215,7 +215,7 @@ def _insert_one(mesh, frozen, options, compare):
     for j in chosen:
         other = frozen.low[j]
         start = frozen.turn[j].T @ R, np.zeros(3)
-        S, u = realign(new.X, new.area, other.X, other.area, start)
+        S, u = realign(new.cloud, other.cloud, start)
         to_new = S.T, -S.T @ u
         maps.append(first_map(other, new, to_new, k_init=k_init, init=options.init)[1])
     others = [frozen.low[j] for j in chosen]

@@ -119,5 +119,5 @@ def register_shape(
     bases = Y.sel(shape=name).values, Y.sel(shape=template).values
     M, N = source.low, target.low
     start = motion_between(*(motion_to_reference(folder, n) for n in (name, template)))
-    motion = realign(M.X, M.area, N.X, N.area, start)
+    motion = realign(M.cloud, N.cloud, start)
     return from_latent(source, target, bases, motion, how=how, refine=refine, scale=scale)

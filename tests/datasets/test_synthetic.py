@@ -159,7 +159,12 @@ def test_nearest_neighbours_after_icp_are_wrong_by_two_to_four_percent():
         (X, T), (Y, T_b) = (mesh.as_arrays(tree[f"original/{s}"]) for s in (a, b))
         area, area_b = mesh.vertex_areas(X, T), mesh.vertex_areas(Y, T_b)
         exact = synthetic.position(truth, b, truth[f"{a}/reference_point"])
-        R, t, _ = align.icp(X, area, Y, area_b, *align.rigid_transform(X, exact)[:2], rounds=3)
+        R, t, _ = align.icp(
+            align.cloud(X, area),
+            align.cloud(Y, area_b),
+            *align.rigid_transform(X, exact)[:2],
+            rounds=3,
+        )
         nearest = cKDTree(Y).query(X @ R.T + t)[1]
         error.append(
             area @ np.linalg.norm(Y[nearest] - exact, axis=1) / area.sum() / np.sqrt(area_b.sum())

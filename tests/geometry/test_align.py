@@ -67,7 +67,8 @@ def test_points_of_no_weight_do_not_count():
 @pytest.mark.parametrize("degrees", [2, 5, -5])
 def test_icp_recovers_a_small_rotation_exactly(brain, degrees):
     X, area = brain
-    R, t, residual = align.icp(X, area, X @ turned(degrees).T + 0.05, area, np.eye(3), np.zeros(3))
+    clouds = align.cloud(X, area), align.cloud(X @ turned(degrees).T + 0.05, area)
+    R, t, residual = align.icp(*clouds, np.eye(3), np.zeros(3))
     assert turned(degrees) == pytest.approx(R, abs=1e-9)
     assert t == pytest.approx([0.05] * 3, abs=1e-9)
     assert residual == pytest.approx(0, abs=1e-9)
@@ -111,7 +112,8 @@ def test_alignment_does_not_depend_on_vertex_order(brain):
 
 def test_realign_ends_at_the_motion_from_near_it(brain):
     X, area = brain
-    R, t = align.realign(X, area, X @ turned(40).T, area, (turned(36), np.zeros(3)))
+    clouds = align.cloud(X, area, 300), align.cloud(X @ turned(40).T, area, 300)
+    R, t = align.realign(*clouds, (turned(36), np.zeros(3)))
     assert turned(40) == pytest.approx(R, abs=0.01)
     assert t == pytest.approx(np.zeros(3), abs=0.005)
 
