@@ -69,9 +69,7 @@ def _register_anew(nodes, latent, rotation, options, n_jobs):
 def _register(shape, template, bases, rotation, options):
     """One registration of a shape of a study to another template, its latent basis as it is."""
     with threadpool_limits(1):
-        M = shape.low
-        N = template.low
-        motion = realign(M.cloud, N.cloud, (rotation, np.zeros(3)))
+        motion = realign(shape.low.cloud, template.low.cloud, (rotation, np.zeros(3)))
         return from_latent(
             shape, template, bases, motion, refine=options.refine, scale=options.scale
         )

@@ -15,7 +15,22 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from s4a.geometry.mesh import components, directed_edges, triangle_areas, unique_edges
+from s4a.geometry.mesh import (
+    components,
+    directed_edges,
+    edge_graph,
+    triangle_areas,
+    unique_edges,
+)
+
+
+class MeshGraph(NamedTuple):
+    """Triangles and edges of a mesh; see :func:`mesh_graph`."""
+
+    T: np.ndarray  # (m, 3)
+    E: np.ndarray  # (e, 2)
+    is_open: np.ndarray  # (e,) whether the edge lies on the boundary
+    G: sp.csr_matrix  # (n, n) lengths of the edges
 
 
 class Voronoi(NamedTuple):
@@ -34,6 +49,12 @@ class Faults(NamedTuple):
     edge: np.ndarray
     edge_pair: np.ndarray
     triangle: np.ndarray
+
+
+def mesh_graph(X: np.ndarray, T: np.ndarray) -> MeshGraph:
+    """The edges of a mesh, which of them are open, and the graph of their lengths."""
+    E, _, count = unique_edges(T, len(X))
+    return MeshGraph(T, E, count == 1, edge_graph(X, E))
 
 
 def farthest_of_each(group: np.ndarray, vertex: np.ndarray, distance: np.ndarray) -> np.ndarray:
@@ -127,14 +148,7 @@ def rims(
     return np.repeat(step[:, 0], 2), step[:, 1:].ravel() // n, rim[link.ravel()], owner
 
 
-def faults(
-    T: np.ndarray,
-    E: np.ndarray,
-    open_edge: np.ndarray,
-    cell: np.ndarray,
-    n: int,
-    among: np.ndarray | None = None,
-) -> Faults:
+def faults(graph: MeshGraph, cell: np.ndarray, n: int, among: np.ndarray | None = None) -> Faults:
     r"""Cells, pairs of cells and triangles that keep the dual from being a manifold.
 
     ::
@@ -150,8 +164,7 @@ def faults(
 
     Parameters
     ----------
-    T, E, open_edge
-        Triangles, edges and which of these lie on the boundary.
+    graph : MeshGraph
     cell : int ndarray (vertices,)
     n : int
         Number of cells.
@@ -170,30 +183,26 @@ def faults(
     triangle : int ndarray
         Triangles of the mesh whose three cells meet elsewhere, too.
     """
+    T, E, is_open, _ = graph
     among = np.ones(n, bool) if among is None else among
     near = among[cell]
     triangle = np.flatnonzero(near[T[:, 0]] | near[T[:, 1]] | near[T[:, 2]])
     edge = np.flatnonzero(near[E[:, 0]] | near[E[:, 1]])
-    T_near, ends, open_edge = T[triangle], cell[E[edge]], open_edge[edge]
+    T_near, ends, is_open = T[triangle], cell[E[edge]], is_open[edge]
     L = cell[T_near]
     corner = np.flatnonzero((L[:, 0] != L[:, 1]) & (L[:, 1] != L[:, 2]) & (L[:, 2] != L[:, 0]))
     C = L[corner]  # (corners, 3) cells that meet in each corner
 
-    bad = faulty_cells(T_near, ends, open_edge, cell, C, among)
+    bad = faulty_cells(T_near, ends, is_open, cell, among)
     lone = (np.bincount(ends.ravel(), minlength=n) > 0) & (np.bincount(C.ravel(), minlength=n) == 0)
     if (lone & ~among).any():  # of neighbours not all triangles were looked at
         lone[dual(T, cell)] = False
-    pair, across, row = faulty_borders(ends, open_edge, C, among)
+    pair, across, row = faulty_borders(ends, is_open, C, among)
     return Faults(bad | lone, pair, edge[across], row, triangle[corner[is_repeated(C, n)]])
 
 
 def faulty_cells(
-    T: np.ndarray,
-    ends: np.ndarray,
-    open_edge: np.ndarray,
-    cell: np.ndarray,
-    C: np.ndarray,
-    among: np.ndarray,
+    T: np.ndarray, ends: np.ndarray, is_open: np.ndarray, cell: np.ndarray, among: np.ndarray
 ) -> np.ndarray:
     """Which cells have no rim, several rims, or several stretches of boundary ``(n,)``.
 
@@ -208,12 +217,12 @@ def faulty_cells(
     euler += np.bincount(L[whole, 0], minlength=n)
     suspect = among & (euler != 1)  # only these can have another number of rims than one
     *_, owner = rims(T, np.where(suspect[cell], cell, -1))
-    stretch_ends = np.bincount(ends[open_edge & ~inner].ravel(), minlength=n)
+    stretch_ends = np.bincount(ends[is_open & ~inner].ravel(), minlength=n)
     return (suspect & (np.bincount(owner, minlength=n) != 1)) | (among & (stretch_ends > 2))
 
 
 def faulty_borders(
-    ends: np.ndarray, open_edge: np.ndarray, C: np.ndarray, among: np.ndarray
+    ends: np.ndarray, is_open: np.ndarray, C: np.ndarray, among: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pairs of cells ``(p, 2)`` whose border is not one strip, edges across, and their rows.
 
@@ -225,7 +234,7 @@ def faulty_borders(
     sides = directed_edges(C)  # (3 corners, 2): the three borders that end in each corner
     sides = np.sort(sides[among[sides].any(1)], axis=1) @ [n, 1]
     n_ends = np.bincount(np.searchsorted(key, sides), minlength=len(key))
-    n_ends += np.bincount(border[open_edge[across]], minlength=len(key))
+    n_ends += np.bincount(border[is_open[across]], minlength=len(key))
     bad = n_ends != 2
     at = bad[border]
     row = np.cumsum(bad) - 1
@@ -240,13 +249,7 @@ def is_repeated(C: np.ndarray, n: int) -> np.ndarray:
 
 
 def refine(
-    G: sp.csr_matrix,
-    T: np.ndarray,
-    E: np.ndarray,
-    open_edge: np.ndarray,
-    state: Voronoi,
-    most: float,
-    avoid: np.ndarray,
+    graph: MeshGraph, state: Voronoi, most: float, avoid: np.ndarray
 ) -> tuple[Voronoi, int, bool]:
     """Add samples where the dual is no manifold, until it is or there are more than `most`.
 
@@ -264,9 +267,9 @@ def refine(
     while True:
         sample, cell, distance = state
         distance = np.where(avoid, 1e-9, 1) * distance
-        fault = faults(T, E, open_edge, cell, len(sample), changed)
+        fault = faults(graph, cell, len(sample), changed)
         inside = np.flatnonzero(fault.cell[cell])
-        across, corners = E[fault.edge].ravel(), T[fault.triangle].ravel()
+        across, corners = graph.E[fault.edge].ravel(), graph.T[fault.triangle].ravel()
         new = np.concatenate(
             [
                 farthest_of_each(cell[inside], inside, distance),
@@ -278,7 +281,7 @@ def refine(
         if len(new) == 0 or len(sample) > most:
             return state, rounds, len(new) > 0
         new = farthest_of_each(cell[new], new, distance)  # one in each cell
-        state = add_samples(G, new, *state)
+        state = add_samples(graph.G, new, *state)
         moved = state.cell != cell
         # every fault had a new sample in one of its cells, so others than these have no faults
         changed = np.zeros(len(state.sample), bool)
@@ -287,11 +290,10 @@ def refine(
         rounds += 1
 
 
-def thin_regions(
-    T: np.ndarray, E: np.ndarray, open_edge: np.ndarray, cell: np.ndarray, n: int
-) -> np.ndarray:
+def thin_regions(graph: MeshGraph, state: Voronoi) -> np.ndarray:
     """Cells that are no disk, and pairs of cells that are none together, as disjoint regions."""
-    fault = faults(T, E, open_edge, cell, n)
+    n = len(state.sample)
+    fault = faults(graph, state.cell, n)
     pair = fault.pair[~fault.cell[fault.pair].any(1)]
     number = np.arange(len(pair))
     first = np.full(n, len(pair))  # pair of lowest number in which a cell takes part
@@ -299,7 +301,7 @@ def thin_regions(
     pair = pair[(first[pair] == number[:, None]).all(1)]
     region = np.where(fault.cell, np.arange(n), -1)
     region[pair] = pair[:, :1]
-    return region[cell]
+    return region[state.cell]
 
 
 def between_rims(G: sp.csr_matrix, T: np.ndarray, region: np.ndarray) -> np.ndarray:

@@ -44,6 +44,7 @@ from s4a.geometry.voronoi import (
     between_rims,
     cut_handles,
     dual,
+    mesh_graph,
     refine,
     thin_regions,
     voronoi_cells,
@@ -162,18 +163,17 @@ def coarse_surface(
     V, F = X, T  # the surface as far as handles have been cut
     origin = np.arange(len(X))  # vertex of X that each of V is, -1 for the centre of a fan
     for most in [MOST * n_coarse] * CUTS + [np.inf]:
-        E, _, count = unique_edges(F, len(V))
-        G = edge_graph(V, E)
-        open_edge, centre = count == 1, origin < 0
+        graph = mesh_graph(V, F)
+        centre = origin < 0
         n_first = max(4, round(FIRST * n_coarse))
-        first = sample_surface(V, F, G, E[open_edge], centre, n_first, seed)
-        start = voronoi_cells(G, first)
-        state, rounds, faulty = refine(G, F, E, open_edge, start, most, centre)
+        first = sample_surface(V, F, graph.G, graph.E[graph.is_open], centre, n_first, seed)
+        start = voronoi_cells(graph.G, first)
+        state, rounds, faulty = refine(graph, start, most, centre)
         if not faulty:
             break
-        region = thin_regions(F, E, open_edge, start.cell, len(start.sample))
+        region = thin_regions(graph, start)
         crumb = triangle_areas(V, F).sum() / n_coarse  # the area of a cell
-        V, F, came_from = cut_handles(V, F, between_rims(G, F, region), crumb)
+        V, F, came_from = cut_handles(V, F, between_rims(graph.G, F, region), crumb)
         origin = np.where(came_from >= 0, origin[came_from], -1)
     cell = np.full(len(X), -1)
     kept = np.flatnonzero(origin >= 0)

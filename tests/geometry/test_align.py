@@ -141,3 +141,28 @@ def test_farthest_points_are_spread_and_follow_the_shape_not_its_numbering(brain
 def test_all_points_are_given_where_more_are_wanted_than_there_are(n):
     X = np.random.default_rng(5).normal(size=(n, 3))
     assert (align.farthest_points(X, 20) == np.arange(n)).all()
+
+
+@pytest.mark.parametrize("n, k", [(2, 1), (7, 5), (300, 40), (2000, 300)])
+def test_farthest_points_are_those_of_the_exhaustive_search(n, k):
+    X = np.random.default_rng(n).normal(size=(n, 3))
+    found = [int(((X - X.mean(0)) ** 2).sum(1).argmax())]
+    gap = np.full(n, np.inf)
+    while len(found) < k:
+        gap = np.minimum(gap, ((X - X[found[-1]]) ** 2).sum(1))
+        found.append(int(gap.argmax()))
+    assert align.farthest_points(X, k).tolist() == found
+
+
+def test_another_seed_or_centre_starts_elsewhere():
+    X = np.random.default_rng(7).normal(size=(500, 3))
+    first = {int(align.farthest_points(X, 5, seed=seed)[0]) for seed in range(4)}
+    assert len(first) > 1
+    center = np.array([9.0, 0, 0])
+    outermost = ((X - center) ** 2).sum(1).argmax()
+    assert align.farthest_points(X, 5, center=center)[0] == outermost
+
+
+def test_points_that_coincide_are_taken_once():
+    X = np.repeat(np.eye(3), 10, axis=0)
+    assert sorted(align.farthest_points(X, 8) // 10) == [0, 1, 2]

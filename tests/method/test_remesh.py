@@ -12,7 +12,6 @@ from s4a.geometry.mesh import (
     unique_edges,
     vertex_areas,
 )
-from s4a.geometry.voronoi import faults
 from s4a.input.clean import clean
 from s4a.method.remesh import coarsen
 from s4a.method.spectral import spectrum
@@ -235,15 +234,6 @@ def test_every_component_gets_samples_by_its_area():
     assert_manifold(coarse, pieces=3, euler=6)
     assert 3 < share[0] / share[1] < 5
     assert share[2] >= 4
-
-
-def test_a_cell_that_a_changed_neighbour_leaves_without_triangle_is_a_fault():
-    T = grid(4, 2)  # cells 0 and 1 lie across the strip, cells 2 and 3 along it
-    E, _, count = unique_edges(T, 8)
-    cell = np.array([0, 0, 1, 1, 2, 3, 2, 3])
-    bad = faults(T, E, count == 1, cell, 4, among=np.array([False, True, False, False]))[0]
-    assert bad[0]
-    assert (bad == faults(T, E, count == 1, cell, 4)[0]).all()
 
 
 def test_numbering_does_not_matter():
