@@ -171,7 +171,7 @@ def _count_places(values, n):
     return np.array(places, np.int64)
 
 
-def vtk_bytes(X, T, scalars):
+def vtk_bytes(X: np.ndarray, T: np.ndarray, scalars: dict[str, np.ndarray]) -> bytes:
     """A binary legacy file."""
     cells = np.column_stack([np.full(len(T), 3), T]).astype(">i4")
     parts = [

@@ -26,7 +26,7 @@ RADIUS = 3.0  # of the bumps, in radii of a disk of area / samples: about nine r
 GROUP = 64  # samples whose paths are looked for together
 
 
-def bump(distance, radius):
+def bump(distance: np.ndarray, radius: float | np.ndarray) -> np.ndarray:
     """1 - 3 s^2 + 2 s^3 of s = distance / radius.
 
     1 and flat at the centre, 0 and flat at the radius.
@@ -42,7 +42,9 @@ def bump(distance, radius):
     return 1 - 3 * s**2 + 2 * s**3
 
 
-def spread(X, T, p, seed=0):
+def spread(
+    X: np.ndarray, T: np.ndarray, p: int, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray, float, sp.csr_array]:
     """Samples on a mesh such that every vertex lies well inside a bump.
 
     Farthest points of position and normal, and where these leave a vertex out along the surface, as
@@ -70,7 +72,9 @@ def spread(X, T, p, seed=0):
     return sample, cell, radius, G
 
 
-def local_functions(X, G, sample, radius):
+def local_functions(
+    X: np.ndarray, G: sp.csr_array, sample: np.ndarray, radius: float
+) -> sp.csr_array:
     """U: bumps of the distance along edges to each sample.
 
     Scaled so that they sum to 1 at every vertex ``(n, p)``.
@@ -100,7 +104,9 @@ def local_functions(X, G, sample, radius):
     return sp.csr_matrix(sp.diags(1 / np.asarray(U.sum(axis=1)).ravel()) @ U)
 
 
-def reduced_eigenpairs(U, W, area, k):
+def reduced_eigenpairs(
+    U: sp.csr_array, W: sp.csr_array, area: np.ndarray, k: int
+) -> tuple[np.ndarray, np.ndarray, sp.csc_array]:
     """The k smallest eigenpairs of U^T W U phi = lambda U^T A U phi, for areas of sum 1.
 
     Returns

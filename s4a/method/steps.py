@@ -244,10 +244,10 @@ def shape_in(study: xr.DataTree, name: str) -> Shape:
     return Shape(*(study[stage][name].to_dataset() for stage in ("original", "coarse")))
 
 
-def latent_bases(study: xr.DataTree, *names: str) -> tuple[np.ndarray, ...]:
+def latent_bases(study: xr.DataTree, *names: str) -> tuple:
     """The latent bases Y ``(k, m)`` of some shapes of a study."""
     require(study["latent"].to_dataset(), "latent_basis", what="latent dataset")
-    Y = study["latent"]["latent_basis"]
+    Y = study["latent"].dataset["latent_basis"]
     return tuple(Y.sel(shape=name).values for name in names)
 
 

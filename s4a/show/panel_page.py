@@ -7,7 +7,9 @@ kept; the page shows it again when a control is moved.
 import itertools
 import json
 import math
+from collections.abc import Iterator
 from contextlib import ExitStack
+from typing import Any
 
 import ipywidgets
 from markupsafe import Markup
@@ -33,20 +35,20 @@ def panel_html(panel: ipywidgets.Box, limit: int = LIMIT) -> str:
     )
 
 
-def widgets_in(widget):
+def widgets_in(widget: ipywidgets.Widget) -> Iterator[ipywidgets.Widget]:
     """A widget and all that is in it."""
     yield widget
     for child in getattr(widget, "children", ()):
         yield from widgets_in(child)
 
 
-def synced(widget):
+def synced(widget: ipywidgets.Widget) -> list[str]:
     """The names of the traits of a widget that its script reads."""
     names = widget.trait_names(sync=True)
     return [name for name in names if not name.startswith("_") and name != "layout"]
 
 
-def state_of(widget):
+def state_of(widget: ipywidgets.Widget) -> dict[str, Any]:
     """The state that the script of a widget reads."""
     values = {name: getattr(widget, name) for name in synced(widget)}
     if "still" in values:  # for a browser without WebGL2: nobody will be there to draw it
@@ -55,9 +57,9 @@ def state_of(widget):
     return {name: value for name, value in values.items() if isinstance(value, kinds)}
 
 
-def shown(widget):
+def shown(widget: ipywidgets.Widget) -> dict[tuple[str, str | None], Any]:
     """What of a widget a recording keeps: name and key -> value."""
-    values = {("display", None): widget.layout.display or ""}
+    values: dict[tuple[str, str | None], Any] = {("display", None): widget.layout.display or ""}
     if isinstance(widget, ipywidgets.HTML):
         values["html", None] = widget.value
     if hasattr(widget, "_esm"):
@@ -90,11 +92,11 @@ class Control:
         self.at = self.values.index(self.now)
         self.open = []  # places of the values that were kept
 
-    def order(self):
+    def order(self) -> list[int]:
         """Places of the values, beginning with the one that is shown."""
         return [self.at, *(i for i in range(len(self.values)) if i != self.at)]
 
-    def html(self):
+    def html(self) -> str:
         """The control in a page."""
         if len(self.open) < 2:
             kind = "text"

@@ -47,7 +47,7 @@ class Correspondence(Panel):
     vertex, image = traitlets.Int(-1), traitlets.Int(-1)
     live = (("colors", "choice"), ("hover",))
 
-    def build(self, view="corner", up="z"):
+    def build(self, view: str = "corner", up: str = "z") -> list[ipywidgets.Widget]:
         """Choices and the two surfaces."""
         registration = self.study["registration"].dataset
         self.template = str(registration.attrs["template"])

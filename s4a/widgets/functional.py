@@ -39,7 +39,7 @@ class FunctionalMap(Panel):
     every = ("row", "column")
     clicks = (("matrix", "row", "row"), ("matrix", "column", "column"))
 
-    def build(self, pair=0, view="corner", up="z"):
+    def build(self, pair: int = 0, view: str = "corner", up: str = "z") -> list[ipywidgets.Widget]:
         """Choices, matrix and the two surfaces."""
         network = self.study["network"].dataset
         self.source, self.target = (network[key].values.astype(str) for key in ("source", "target"))

@@ -29,7 +29,7 @@ class Median(Panel):
     live = (("operator", "norm", "modes", "shape"),)
     clicks = (("bars", "name", "shape"),)
 
-    def build(self, view="corner", up="z"):
+    def build(self, view: str = "corner", up: str = "z") -> list[ipywidgets.Widget]:
         """Choices, bars and the surface."""
         latent = self.study["latent"].dataset
         self.names, n_modes = names_of(latent), latent.sizes["latent"]

@@ -44,7 +44,13 @@ class Modes(Panel):
     scores = traitlets.List(traitlets.Float())
     python = ("saving the mesh",)
 
-    def build(self, resolution=None, n_modes=None, view="corner", up="z"):
+    def build(
+        self,
+        resolution: str | None = None,
+        n_modes: int | None = None,
+        view: str = "corner",
+        up: str = "z",
+    ) -> list:
         """Sliders, shape and charts in the browser; below them resolution and export."""
         self.n_modes = n_modes
         self.coarse = template_coarse(self.study)

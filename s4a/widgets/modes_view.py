@@ -64,7 +64,7 @@ class ModesView(View):
                 self.set_trait(name, value)
         self.draw_still()
 
-    def drawn(self):
+    def drawn(self) -> tuple | None:
         """The shape as the sliders stand, coloured by how far it moved along the mean's normals."""
         mean, triangles, deformation = self.arrays
         moved = apply_scores(mean, deformation, self.scores)

@@ -43,7 +43,7 @@ class Network(Panel):
     live = (("stage", "budget", "where"), ("stage", "choice"))
     clicks = (("graph", "edge", "choice"), ("graph", "node", "choice"))
 
-    def build(self, view="corner", up="z"):
+    def build(self, view: str = "corner", up: str = "z") -> list[ipywidgets.Widget]:
         """Choices, graph, matrix and two surfaces."""
         network = self.study["network"].dataset
         self.source, self.target = (network[key].values.astype(str) for key in ("source", "target"))

@@ -235,7 +235,7 @@ class Scene(View):
             self.ghost_corner = b"" if triangles is None else to_bytes(triangles, "uint32")
             self.ghost_position = b"" if points is None else to_bytes(points, "float32")
 
-    def drawn(self):
+    def drawn(self) -> tuple | None:
         """The surface with its checkerboard and its marked points."""
         if self.surface is None:
             return None

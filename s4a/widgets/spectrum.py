@@ -27,7 +27,7 @@ class Spectrum(Panel):
     every = ("mode",)
     clicks = (("curves", "series", "choice"), ("gaps", "series", "choice"))
 
-    def build(self, view="corner", up="z"):
+    def build(self, view: str = "corner", up: str = "z") -> list[ipywidgets.Widget]:
         """Choices, curves and two surfaces."""
         nodes = self.study["coarse"].children.items()
         self.eigenvalues = {

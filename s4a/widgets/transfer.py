@@ -43,7 +43,7 @@ class Transfer(Panel):
     live = (("labels", "target"),)
     python = ("placing landmarks",)
 
-    def build(self, view="corner", up="z"):
+    def build(self, view: str = "corner", up: str = "z") -> list[ipywidgets.Widget]:
         """Choices, the two surfaces, legend and table."""
         registration = self.study["registration"].dataset
         names, template = names_of(registration), str(registration.attrs["template"])
