@@ -16,8 +16,8 @@ reading and cleaning      :func:`read_shapes`, :func:`read_shape`, :func:`clean`
 notebooks, pages          :func:`explore`, :func:`write_page`
 new shapes                :func:`insert`
 6.1 statistics            :mod:`s4a.statistics`
-6.2 transfer              :func:`transfer_labels`, :func:`transfer_landmarks`, :func:`transfer_scalars`,
-                          :func:`register_pairs`
+6.2 transfer              :func:`transfer_labels`, :func:`transfer_landmarks`,
+                          :func:`transfer_scalars`, :func:`register_pairs`
 for other programs        :func:`write_registered`, :func:`write_training_set`
 the embedded collection   :mod:`s4a.synthetic`
 ========================  ====================================================================

@@ -80,8 +80,9 @@ def truth_in_meshes(truth, source, target):
     truth, n = np.asarray(truth), target.sizes["file_vertex_index"]
     if truth.shape not in ((n,), (n, 3)) or (truth.ndim == 1 and truth.dtype.kind not in "iu"):
         raise ValueError(
-            f"truth needs a row of the source's file (integer, -1 where there is none) or a position for each of the "
-            f"{n} vertices of the target's file; found {truth.dtype} of shape {truth.shape}"
+            f"truth needs a row of the source's file (integer, -1 where there is none) or a "
+            f"position for each of the {n} vertices of the target's "
+            f"file; found {truth.dtype} of shape {truth.shape}"
         )
     truth = truth[target["file_vertex"].values]
     return truth if truth.ndim == 2 else in_mesh(truth, source)
@@ -262,8 +263,8 @@ def check_landmarks(at_source, at_target, source, target):
         or any(v.max() >= len(s.X) for v, s in ends)
     ):
         raise ValueError(
-            "landmarks need two arrays of at least 3 vertices that the clean meshes have, of the source and of the "
-            f"target; found {at_source.tolist()} and {at_target.tolist()}"
+            "landmarks need two arrays of at least 3 vertices that the clean meshes have, of the "
+            f"source and of the target; found {at_source.tolist()} and {at_target.tolist()}"
         )
 
 

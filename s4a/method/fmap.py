@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
+import xarray as xr
 
 from s4a.method.descriptors import (
     heat_filter,
@@ -179,7 +180,10 @@ def fit(
 
 
 def commutator(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Penalty (mu_i - lambda_j)^2 / lambda_max^2 ``(k_target, k_source)`` of each entry of C."""
+    """(mu_i - lambda_j)^2 / lambda_max^2 ``(k_target, k_source)``, small where C may be large.
+
+    Weighted by it, the squared entries of C say how far C is from commuting with the Laplacians.
+    """
     return ((target[:, None] - source) / max(source[-1], target[-1])) ** 2
 
 
@@ -275,18 +279,18 @@ def fmap_from_descriptors(
 
 
 def fit_descriptors(
-    source,
-    target,
+    source: xr.Dataset,
+    target: xr.Dataset,
     *,
-    k=20,
-    landmarks=None,
-    kind="wks",
-    n=100,
-    every=5,
-    laplacian=1e-3,
-    commute=1.0,
-    oriented=1.0,
-):
+    k: int = 20,
+    landmarks: tuple | None = None,
+    kind: str = "wks",
+    n: int = 100,
+    every: int = 5,
+    laplacian: float = 1e-3,
+    commute: float = 1.0,
+    oriented: float = 1.0,
+) -> xr.Dataset:
     """Fit of a functional map on descriptors, with or without landmarks (step 4 of 4.1).
 
     :func:`fit` of E(C) = |C F - G|^2 / |F|^2 + laplacian sum (mu_i - lambda_j)^2 C_ij^2 /
@@ -294,21 +298,6 @@ def fit_descriptors(
     descriptors, P and Q the products with them, and the same once more with `oriented` for the
     operators that a mirror image turns over.  Descriptors are taken with all eigenfunctions that
     the meshes have, less their mean, scaled to norm 1.
-
-    Mean geodesic error after ZoomOut to 100, in % of sqrt(area), at 5,700 vertices (three pairs of
-    poses of a child, two of a cat, two faces):
-
-    ======================================  ==================  ============  ============
-    first map, 20 x 20                      child               cat           face
-    ======================================  ==================  ============  ============
-    nearest neighbours after ICP            0.96, 10.1, 64.9    4.73, 1.33    0.12, 0.15
-    10 landmarks found by ICP               2.28, 21.2, 64.1    6.08, 4.67    0.12, 0.15
-    10 true landmarks                       0.89, 1.41, 4.46    2.20, 1.14    0.12, 0.15
-    wave kernels                            0.84, 10.5, 4.52    2.38, 1.11    0.12, 0.15
-    wave kernels, ``oriented=0``            0.84, 35.8, 4.48    18.3, 3.14    0.12, 22.2
-    heat kernels                            0.83, 1.49, 4.51    2.48, 1.14    0.12, 0.15
-    wave kernels and 10 true landmarks      0.85, 1.49, 4.50    2.22, 1.12    0.12, 0.15
-    ======================================  ==================  ============  ============
 
     Parameters
     ----------
@@ -367,12 +356,12 @@ def fit_descriptors(
     return dataset(fmap=C)
 
 
-def orthogonality_error(C):
+def orthogonality_error(C: np.ndarray) -> float:
     """|C^T C - I|_F / sqrt(k): 0 for a map that preserves areas."""
     return float(np.linalg.norm(C.T @ C - np.eye(C.shape[1])) / np.sqrt(C.shape[1]))
 
 
-def off_diagonal_mass(C):
+def off_diagonal_mass(C: np.ndarray) -> float:
     """Share of the squared entries of C that is not on its diagonal.
 
     0 for a map between equal spectra.
@@ -387,7 +376,9 @@ def off_diagonal_mass(C):
     return float(1 - (np.diag(C) ** 2).sum() / (C**2).sum())
 
 
-def swapped_blocks(C, *, longest=6, inside=0.75, diagonal=0.5):
+def swapped_blocks(
+    C: np.ndarray, *, longest: int = 6, inside: float = 0.75, diagonal: float = 0.5
+) -> list[tuple[int, int]]:
     """Runs of modes that the map exchanges among each other.
 
     As near-equal eigenvalues of symmetric shapes do (Fig. 2).
@@ -414,17 +405,18 @@ def swapped_blocks(C, *, longest=6, inside=0.75, diagonal=0.5):
     >>> swapped_blocks(np.eye(5)[[0, 2, 1, 3, 4]])
     [(1, 2)]
     """
-    S, taken, found = np.asarray(C, float) ** 2, set(), []
+    S = np.asarray(C, float) ** 2
+    runs = []
+    taken = set()
     for length in range(2, longest + 1):
-        for a in range(min(S.shape) - length + 1):
-            run = slice(a, a + length)
-            block, around = S[run, run], (S[run].sum() + S[:, run].sum()) / 2
+        for first in range(min(S.shape) - length + 1):
+            run = slice(first, first + length)
+            block = S[run, run]
+            around = (S[run].sum() + S[:, run].sum()) / 2
             closed = around > 0 and block.sum() >= inside * around
-            if (
-                closed
-                and np.trace(block) < diagonal * block.sum()
-                and taken.isdisjoint(range(a, a + length))
-            ):
-                found.append((a, a + length - 1))
-                taken.update(range(a, a + length))
-    return sorted(found)
+            exchanged = np.trace(block) < diagonal * block.sum()
+            modes = range(first, first + length)
+            if closed and exchanged and taken.isdisjoint(modes):
+                runs.append((first, first + length - 1))
+                taken.update(modes)
+    return sorted(runs)

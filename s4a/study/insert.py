@@ -189,7 +189,10 @@ def freeze(study: xr.DataTree) -> Frozen:
 def insert_one(
     mesh: xr.Dataset, frozen: Frozen, options: Options, compare: bool
 ) -> Inserted | ValueError:
-    """One new shape: coarse mesh, latent basis, registration, plausibility; or why there is none."""
+    """One new shape: coarse mesh, latent basis, registration, plausibility; or why there is none.
+
+    An error is given back and not raised, as it costs this shape alone.
+    """
     try:
         with threadpool_limits(1):
             return _insert_one(mesh, frozen, options, compare)

@@ -57,9 +57,9 @@ def match_pair(
         ``confidence(vertex)``, ``round_trip``, ``distortion``; ``rotation``, ``translation``,
         ``scale`` of that alignment of the source; the way back,
         ``template_triangle(original_vertex)`` and ``template_barycentric``, from the source's
-        vertices to the target; attrs ``score`` (see :func:`s4a.method.joint.registration_score`), ``method``,
-        ``first_map`` ("landmarks", "dense", or of far poses "icp", "hks" or "wks"), and ``note``
-        where k had to be reduced.
+        vertices to the target; attrs ``score`` (:func:`s4a.method.joint.registration_score`),
+        ``method``, ``first_map`` ("landmarks", "dense", or of far poses "icp", "hks" or "wks"), and
+        ``note`` where k had to be reduced.
 
     Raises
     ------
