@@ -277,29 +277,12 @@ def evaluate(
     )
     if n_points:
         points = draw_points(area, n_points, rng)
-        kept = _surface_errors(registration, d, points, steps)
-        random = _surface_specificity(
-            registration, d, K, points, score[:n_surface], nearest[:, :n_surface]
-        )
-        quality = quality.merge(
-            dataset(
-                generalization_surface=_per_component(kept[:, 1:].mean(0), c),
-                generalization_surface_error=_per_component(stats.sem(kept[:, 1:]), c),
-                specificity_surface=random.mean(1),
-                specificity_surface_error=stats.sem(random, axis=1),
-            )
-        )
+        P = registration["position"].values[points] + d[:, points]  # (s, p, 3)
+        few = score[:n_surface], nearest[:, :n_surface]
+        quality = quality.merge(_measure_surfaces(registration, d, K, P, steps, *few))
     quality = in_unit(quality, unit_of(registration["displacement"]))
     features = _coefficients(study, d, area)
-    ratio = np.linalg.svd(features - features.mean(0), compute_uv=False)[:c] ** 2
-    null = variance_baseline(features, n_permutations, rng)[:, :c]
-    return quality.merge(
-        dataset(
-            variance_ratio=ratio / ratio.sum(),
-            variance_ratio_null=null.mean(0),
-            variance_ratio_null_95=np.quantile(null, 0.95, axis=0),
-        )
-    )
+    return quality.merge(_compare_with_chance(features, c, n_permutations, rng))
 
 
 def _per_component(values, c):
@@ -307,27 +290,37 @@ def _per_component(values, c):
     return np.pad(values, (0, c), constant_values=np.nan)[:c]
 
 
-def _surface_errors(registration, d, points, steps):
-    """:func:`surface_error` of every shape, left out of the model ``(s, s - 1)``."""
+def _measure_surfaces(registration, d, K, P, steps, score, nearest):
+    """Generalization and specificity as mean distances of points P ``(s, p, 3)`` to surfaces."""
     X, T = as_arrays(registration)
-    P = X[points] + d[:, points]  # (s, p, 3)
-    return np.stack(
+    _, V = principal_components(center_gram(K))
+    c = V.shape[1]
+    kept = np.stack(
         [surface_error(np.delete(P, i, axis=0), steps[i], X + d[i], T) for i in range(len(d))]
+    )  # (s, s - 1)
+    modes = np.einsum("sc,spx->cpx", V, P - P.mean(0)) / np.sqrt(len(d) - 1)
+    samples = P.mean(0) + np.cumsum(score[:, :, None, None] * modes, axis=1)  # (n_samples, c, p, 3)
+    random = np.zeros(nearest.shape)  # (c, n_samples)
+    for i in np.unique(nearest):
+        component, sample = np.nonzero(nearest == i)
+        random[component, sample] = mean_distance(samples[sample, component], X + d[i], T)
+    return dataset(
+        generalization_surface=_per_component(kept[:, 1:].mean(0), c),
+        generalization_surface_error=_per_component(stats.sem(kept[:, 1:]), c),
+        specificity_surface=random.mean(1),
+        specificity_surface_error=stats.sem(random, axis=1),
     )
 
 
-def _surface_specificity(registration, d, K, points, score, nearest):
-    """Mean distances of random shapes to the surface of the nearest shape ``(c, n_samples)``."""
-    X, T = as_arrays(registration)
-    P = X[points] + d[:, points]  # (s, p, 3)
-    _, V = principal_components(center_gram(K))
-    modes = np.einsum("sc,spx->cpx", V, P - P.mean(0)) / np.sqrt(len(d) - 1)
-    samples = P.mean(0) + np.cumsum(score[:, :, None, None] * modes, axis=1)  # (n_samples, c, p, 3)
-    distance = np.zeros(nearest.shape)
-    for i in np.unique(nearest):
-        component, sample = np.nonzero(nearest == i)
-        distance[component, sample] = mean_distance(samples[sample, component], X + d[i], T)
-    return distance
+def _compare_with_chance(features, c, n_permutations, rng):
+    """Shares of variance of the first c components, and those of permuted features."""
+    ratio = np.linalg.svd(features - features.mean(0), compute_uv=False)[:c] ** 2
+    null = variance_baseline(features, n_permutations, rng)[:, :c]
+    return dataset(
+        variance_ratio=ratio / ratio.sum(),
+        variance_ratio_null=null.mean(0),
+        variance_ratio_null_95=np.quantile(null, 0.95, axis=0),
+    )
 
 
 def _coefficients(study, d, area):

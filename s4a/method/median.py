@@ -57,10 +57,9 @@ def distance_to_identity(
     """
     if norm not in NORMS:
         raise ValueError(f"norm must be one of {', '.join(NORMS)}, found {norm!r}")
-    m = D.shape[1]
-    w = inverse(latent_eigenvalue, NORMS[norm])
+    weighted = (D - np.eye(D.shape[1])) * inverse(latent_eigenvalue, NORMS[norm])  # (n, m, m)
     varying = ~constant_modes(latent_eigenvalue)
-    return np.linalg.norm(((D - np.eye(m)) * w)[:, varying][:, :, varying], axis=(1, 2))
+    return np.linalg.norm(weighted[:, varying][:, :, varying], axis=(1, 2))
 
 
 def difference_pca(D: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
