@@ -150,7 +150,7 @@ class Recording:
             for chart, part, name in panel.clicks
         ]
 
-    def keep(self, value):
+    def keep(self, value: Any) -> int:
         """Keep a value, if it is not; its place among those that are kept."""
         key = value if isinstance(value, bytes) else json.dumps(value)
         if key not in self.place:
@@ -161,7 +161,7 @@ class Recording:
             self.size += len(value) if isinstance(value, str) else len(key)
         return self.place[key]
 
-    def run(self, names, limit):
+    def run(self, names: list[str], limit: int) -> tuple[list[str], dict[tuple, dict]]:
         """Go through the values of some controls, until `limit` characters are kept.
 
         Gives the names, and for the places of the controls' values where each value that is
@@ -186,7 +186,7 @@ class Recording:
             control.widget.value = control.now
         return names, states
 
-    def group(self, names, states, own, depends):
+    def group(self, names: list[str], states: dict, own: dict, depends: list) -> dict[str, Any]:
         """One group for the page: its slots and their values.
 
         Less the slots that another group knows in more detail.
@@ -201,7 +201,7 @@ class Recording:
         order = list(self.controls)
         return {"controls": [order.index(name) for name in names], "slots": slots, "rows": rows}
 
-    def data(self, ids):
+    def data(self, ids: dict[ipywidgets.Widget, str]) -> dict[str, Any]:
         """What the page's script reads, less values that no group uses; `ids` of the widgets."""
         used = sorted({i for group in self.groups for row in group["rows"].values() for i in row})
         place = {old: new for new, old in enumerate(used)}
@@ -228,7 +228,7 @@ class Recording:
         }
 
 
-def differing(names, states):
+def differing(names: list[str], states: dict[tuple, dict]) -> dict[tuple, set[str]]:
     """The slots that differ over the states of a group, and the controls on which each depends."""
     depends = {}
     for slot in dict.fromkeys(slot for state in states.values() for slot in state):
@@ -254,7 +254,7 @@ class PanelPage:
         self.scripts, self.ids = {}, {}
         self.body = self.element(panel)
 
-    def element(self, widget):
+    def element(self, widget: ipywidgets.Widget) -> str:
         """The HTML of a widget and what is in it."""
         name = self.ids[widget] = f"w{len(self.ids)}"
         hidden = widget.layout.display == "none"
@@ -274,7 +274,7 @@ class PanelPage:
             return PARTS.value(widget.description, "yes" if widget.value else "no")
         return PARTS.value(widget.description, getattr(widget, "label", None) or widget.value)
 
-    def lacking(self, panel):
+    def lacking(self, panel: ipywidgets.Box) -> list[str]:
         """What of the panel this page cannot do, as it needs Python."""
         silent = ipywidgets.Button | ipywidgets.Text | ipywidgets.HTML | ipywidgets.IntProgress
         fixed, partly = [], []

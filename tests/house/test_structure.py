@@ -24,6 +24,24 @@ WORDS = [
     ROOT / "README.md",
     ROOT / "CONTRIBUTING.md",
 ]
+# modules in which some public function has no types yet: the list may only shrink
+WITHOUT_TYPES = {
+    "cli.commands",
+    "cli.flags",
+    "cli.tables",
+    "evaluation.compare",
+    "evaluation.methods",
+    "input.clean",
+    "input.collection",
+    "input.manifold",
+    "input.plausibility",
+    "method.fmap",
+    "method.shape",
+    "study.options",
+    "study.pipeline",
+    "study.store",
+    "widgets.progress",
+}
 each_page = pytest.mark.parametrize("path", WORDS, ids=lambda path: path.name)
 
 
@@ -32,6 +50,18 @@ def test_what_is_made_from_the_code_is_as_the_code_is(name):
     (text,) = (text for path, text in structure.pages().items() if path.name == name)
     (path,) = (path for path in structure.pages() if path.name == name)
     assert path.read_text(encoding="utf-8") == text, "make structure"
+
+
+def test_public_functions_have_types():
+    modules = structure.read_package(ROOT / "s4a")
+    lacking = {
+        f"{name}.{function.name}"
+        for name, module in modules.items()
+        if name not in WITHOUT_TYPES
+        for function in structure.public_functions(module)
+        if not structure.is_annotated(function)
+    }
+    assert lacking == set()
 
 
 @each_page
