@@ -160,6 +160,5 @@ TEMPLATES.filters |= {
     function.__name__: function for function in (for_page, numeral, svg_uri, to_json, webp_uri)
 }
 TEMPLATES.globals |= {"script": lambda *names: Markup(script(*names)), "style": Markup(STYLE)}
-PARTS: Any = TEMPLATES.get_template(
-    "parts.html"
-).module  # its macros are functions that give Markup
+# its macros are functions that give Markup
+PARTS: Any = TEMPLATES.get_template("parts.html").module

@@ -30,6 +30,7 @@ STAGES = {
     "modes": ("pca.nc", False),
 }
 EVERY = 0.5  # seconds
+Shapes = Path | str | list[Path | str] | dict[str, Any] | xr.DataTree
 
 
 def work(answer, shapes, options):
@@ -77,7 +78,7 @@ class Progress(Panel):
 
     title = "Progress"
 
-    def __init__(self, shapes: object, store: Path | str, **options: Any):
+    def __init__(self, shapes: Shapes, store: Path | str, **options: Any):
         self.folder, self.explored = Path(store), None
         self.opened = []  # the stages that were ready when the panels were filled
         self.arguments = shapes, options | {"store": str(store)}
