@@ -1,24 +1,25 @@
-"""What the commands print: results as tables and sentences.
+"""What the commands print: results as tables and sentences, Tables 1 and 2 and Fig. 3 as text.
 
-Tables 1 and 2 and Fig. 3 of the paper as text.
-
-Every function gives a text; nothing is printed or written here.
+Every function gives a text, or the cells of a row; nothing is printed or written here.
 """
 
 import textwrap
+from collections.abc import Iterable, Sequence
 
 import numpy as np
+import xarray as xr
 
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.method.pca import mahalanobis
 
-FOUND = {
+COUNTS = {
     "file_vertices": "vertices",
     "components": "components",
     "genus": "genus",
     "holes": "holes",
     "nonmanifold_edges": "non-manifold",
 }
+# metric: (head of its column, factor, digits)
 METRICS = {
     "geodesic_error": ("error %", 100, 3),
     "straight_error": ("straight %", 100, 3),
@@ -32,9 +33,19 @@ METRICS = {
     "label_accuracy": ("labels", 1, 3),
     "landmark_error": ("landmarks %", 100, 2),
 }
+TRANSFERRED = [
+    "target",
+    "cycle error",
+    "|distortion|",
+    "confidence",
+    "share of votes",
+    "labels of dropped vertices",
+    "landmarks",
+    "spread",
+]
 
 
-def table(rows, head, width=120):
+def table(rows: Iterable[Sequence], head: Sequence[str], width: int = 120) -> str:
     """Rows of text as aligned columns.
 
     Numbers to the right, a long last column wrapped at `width` characters.
@@ -47,210 +58,261 @@ def table(rows, head, width=120):
     a      1
     b     20
     """
-    rows = [[str(x) for x in row] for row in [head, *rows]]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(head))]
-    numeric = [
-        all(x.replace(".", "", 1).isdigit() or x == "-" for x in column)
-        for column in zip(*rows[1:], strict=True)
-    ]
+    rows = [[str(cell) for cell in row] for row in [head, *rows]]
+    columns = list(zip(*rows, strict=True))
+    widths = [max(map(len, column)) for column in columns]
+    numeric = [all(map(is_number, column[1:])) for column in columns]
     margin = sum(widths[:-1]) + 2 * (len(head) - 1)
     lines = []
-    for row in rows:
-        last = textwrap.wrap(row[-1], max(width - margin, 40)) or [""]
-        columns = zip([*row[:-1], last[0]], widths, numeric, strict=True)
-        lines.append(
-            "  ".join(x.rjust(w) if right else x.ljust(w) for x, w, right in columns).rstrip()
-        )
-        lines += [" " * margin + line for line in last[1:]]
+    for *cells, long in rows:
+        first, *rest = textwrap.wrap(long, max(width - margin, 40)) or [""]
+        layout = zip([*cells, first], widths, numeric, strict=True)
+        lines.append("  ".join(c.rjust(w) if n else c.ljust(w) for c, w, n in layout).rstrip())
+        lines += [" " * margin + line for line in rest]
     return "\n".join(lines)
 
 
-def report_table(report):
+def is_number(cell: str) -> bool:
+    """Whether a cell stands to the right."""
+    return cell == "-" or cell.replace(".", "", 1).isdigit()
+
+
+def report_table(report: xr.Dataset) -> str:
     """What was found in every shape and done about it, and what looks wrong."""
     rows = []
     for name in report["shape"].values:
-        one = report.sel(shape=name)
-        counts = ["-" if v not in one or int(one[v]) < 0 else int(one[v]) for v in FOUND]
-        rows.append([name, *counts, one["status"].item(), one["reason"].item()])
-    return "\n".join(
-        [table(rows, ["shape", *FOUND.values(), "status", "found and done"]), *doubts(report)]
-    )
+        shape = report.sel(shape=name)
+        counts = [int(shape[count]) if count in shape else -1 for count in COUNTS]
+        cells = ["-" if count < 0 else count for count in counts]
+        rows.append([name, *cells, shape["status"].item(), shape["reason"].item()])
+    head = ["shape", *COUNTS.values(), "status", "found and done"]
+    return "\n".join([table(rows, head), *doubts(report)])
 
 
-def doubts(report):
+def doubts(report: xr.Dataset) -> list[str]:
     """Lines: what looks wrong with shapes, and what concerns the collection."""
-    doubtful = report["shape"].values[report["warning"].values != ""]
-    lines = [f"{name}, warning: {report['warning'].sel(shape=name).item()}" for name in doubtful]
+    warnings = zip(report["shape"].values, report["warning"].values, strict=True)
+    lines = [f"{name}, warning: {warning}" for name, warning in warnings if warning]
     return [f"  {line}" for line in [*lines, *report.attrs["remarks"].splitlines()]]
 
 
-def run_summary(study, seconds):
-    """The end of a run: time and memory of the stages, the shapes, the median, the registration.
+def run_summary(study: xr.DataTree, seconds: float) -> str:
+    """The end of a run: costs of the stages, the shapes, the median, the registration, the modes.
 
-    The modes.
+    Parameters
+    ----------
+    study : DataTree
+    seconds : float
+        Of the whole run.
     """
     report = study["report"].to_dataset()
-    stages = zip(
-        *(report[name].values for name in ("stage", "seconds", "peak_memory")), strict=True
-    )
-    rows = [[stage, f"{s:.1f}", f"{m:.0f}"] for stage, s, m in stages]
-    rows.append(["all", f"{seconds:.1f}", f"{report['peak_memory'].values.max():.0f}"])
-    status, names, reason = (report[name].values for name in ("status", "shape", "reason"))
-    counts = ", ".join(f"{(status == one).sum()} {one}" for one in ("ok", "repaired", "excluded"))
-    lines = [
-        "",
-        table(rows, ["stage", "seconds", "peak MiB"]),
-        "",
-        f"{len(status)} shapes: {counts}",
-    ]
-    out = status == "excluded"
-    lines += [
-        f"  {name} excluded: {why}" for name, why in zip(names[out], reason[out], strict=True)
-    ]
-    done = ~out & (reason != "")
-    lines += [f"  {name}: {why}" for name, why in zip(names[done], reason[done], strict=True)]
-    lines += doubts(report)
-    latent = study["latent"].to_dataset()
-    nearest = latent.isel(shape=latent["distance_to_median"].argsort().values[:3])
-    pairs = zip(nearest["shape"].values, nearest["distance_to_median"].values, strict=True)
-    near = ", ".join(f"{name} {distance:.4f}" for name, distance in pairs)
-    lines.append(
-        f"median shape: {latent.attrs['median']}; nearest to the limit shape (eq. 5): {near}"
-    )
+    lines = ["", cost_table(report, seconds), "", *shape_lines(report), *doubts(report)]
+    lines += [median_line(study["latent"].to_dataset())]
     registration = study["registration"].to_dataset()
-    confidence, trip = (registration[name].mean().item() for name in ("confidence", "round_trip"))
+    confidence, round_trip, distortion = registration_cells(registration)
     lines.append(
-        f"registered to {registration.attrs['template']}; mean confidence {confidence:.2f}, cycle error {trip:.4f} of "
-        f"sqrt(area), median |distortion| {np.median(np.abs(registration['distortion'])):.3f}"
+        f"registered to {registration.attrs['template']}; mean confidence {confidence}, "
+        f"cycle error {round_trip} of sqrt(area), median |distortion| {distortion}"
     )
     if "pca" in study:
-        ratio = np.cumsum(study["pca"]["explained_variance_ratio"].values)
-        few = [c for c in (1, 3, 10) if c <= len(ratio)]
-        lines.append(
-            "variance explained: " + ", ".join(f"{100 * ratio[c - 1]:.1f} % by {c}" for c in few)
-        )
+        ratio = 100 * study["pca"].to_dataset()["explained_variance_ratio"].cumsum().values
+        shares = [f"{ratio[c - 1]:.1f} % by {c}" for c in (1, 3, 10) if c <= len(ratio)]
+        lines.append(f"variance explained: {', '.join(shares)}")
     else:
         lines.append(f"no modes: {report.attrs['no_modes']}")
     return "\n".join(lines)
 
 
-def error_table(errors):
+def cost_table(report: xr.Dataset, seconds: float) -> str:
+    """Seconds and memory of every stage, and of the whole run."""
+    memory = report["peak_memory"].values
+    costs = zip(report["stage"].values, report["seconds"].values, memory, strict=True)
+    rows = [[stage, f"{s:.1f}", f"{m:.0f}"] for stage, s, m in costs]
+    rows.append(["all", f"{seconds:.1f}", f"{memory.max():.0f}"])
+    return table(rows, ["stage", "seconds", "peak MiB"])
+
+
+def shape_lines(report: xr.Dataset) -> list[str]:
+    """How many shapes could be used, why others could not, and what was done to them."""
+    status, names, reason = (report[v].values for v in ("status", "shape", "reason"))
+    counts = ", ".join(
+        f"{(status == kind).sum()} {kind}" for kind in ("ok", "repaired", "excluded")
+    )
+    out = status == "excluded"
+    excluded = zip(names[out], reason[out], strict=True)
+    used = zip(names[~out], reason[~out], strict=True)
+    return [
+        f"{len(status)} shapes: {counts}",
+        *(f"  {name} excluded: {why}" for name, why in excluded),
+        *(f"  {name}: {done}" for name, done in used if done),
+    ]
+
+
+def median_line(latent: xr.Dataset) -> str:
+    """The median shape, and the three shapes that are nearest to the limit shape."""
+    distance = latent["distance_to_median"]
+    nearest = distance.isel(shape=distance.argsort().values[:3])
+    near = ", ".join(f"{d['shape'].item()} {d.item():.4f}" for d in nearest)
+    return f"median shape: {latent.attrs['median']}; nearest to the limit shape (eq. 5): {near}"
+
+
+def registration_cells(registration: xr.Dataset) -> list[str]:
+    """Mean confidence, mean cycle error and median distortion of registrations."""
+    confidence, round_trip = (registration[v].mean().item() for v in ("confidence", "round_trip"))
+    distortion = np.median(np.abs(registration["distortion"]))
+    return [f"{confidence:.2f}", f"{round_trip:.4f}", f"{distortion:.3f}"]
+
+
+def landmark_cells(landmarks: xr.Dataset) -> list[str]:
+    """Mean confidence and spread of landmarks that were carried over."""
+    cells = [f"{landmarks['landmark_confidence'].mean().item():.2f}", "-"]
+    if "landmark_spread" in landmarks:
+        cells[1] = f"{landmarks['landmark_spread'].mean().item():.3g}"
+    return cells
+
+
+def planted_line(modes: xr.Dataset, truth: xr.Dataset) -> str:
+    """How well the scores of the modes follow those that made synthetic shapes."""
+    planted = truth["planted_score"].sel(shape=modes["shape"]).values  # (s, q)
+    score = modes["score"].values  # (s, c)
+    n = min(planted.shape[1], score.shape[1])
+    correlation = np.abs(np.corrcoef(planted[:, :n].T, score[:, :n].T)).diagonal(n)  # (n,)
+    words = ", ".join(f"{r:.3f}" for r in correlation)
+    return f"correlation of planted and recovered scores: {words}"
+
+
+def error_table(errors: xr.Dataset) -> str:
     """Mean errors of :func:`s4a.evaluation.accuracy.accuracy` over the shapes, a row per method."""
-    mean = 100 * errors.mean("shape")
+    mean = 100 * errors[["error", "geodesic_error"]].mean("shape")
     rows = []
     for method in mean["way"].values:
-        pair = [mean[name].sel(way=method).item() for name in ("error", "geodesic_error")]
-        rows.append([method, *("-" if np.isnan(e) else f"{e:.3f}" for e in pair)])
+        pair = [variable.item() for variable in mean.sel(way=method).data_vars.values()]
+        rows.append([method, *("-" if np.isnan(error) else f"{error:.3f}" for error in pair)])
     return table(rows, ["mean error, % of sqrt(area)", "straight line", "along edges"])
 
 
-def evaluation_table(kept, anew):
-    """Measures by number of components, with their standard errors."""
-    unit = kept["generalization"].attrs["units"]
-    columns = [
-        ("compactness", kept),
-        ("generalization, kept: optimistic", kept),
-        ("specificity", kept),
-    ]
-    columns[2:2] = [("generalization, recomputed", anew)] if anew is not None else []
+def evaluation_table(evaluation: xr.Dataset, recomputed: xr.Dataset | None) -> str:
+    """Measures by number of components, with their standard errors.
+
+    Parameters
+    ----------
+    evaluation : Dataset
+        See :func:`s4a.analysis.statistics.evaluate`.
+    recomputed : Dataset or None
+        See :func:`s4a.analysis.statistics.generalization`.
+    """
+    columns = {"compactness": evaluation, "generalization, kept: optimistic": evaluation}
+    if recomputed is not None:
+        columns["generalization, recomputed"] = recomputed
+    columns["specificity"] = evaluation
     rows = []
-    for c in range(min(10, kept.sizes["component"])):
-        row = [c + 1]
-        for head, found in columns:
-            name = head.partition(",")[0]
-            value, error = (
-                found[n].values[c] if c < found.sizes["component"] else np.nan
-                for n in (name, f"{name}_error")
-            )
-            row.append("-" if np.isnan(value) else f"{value:.4g} ± {error:.2g}")
-        rows.append(row)
-    return f"lengths in {unit}, ± standard error\n" + table(
-        rows, ["components", *(head for head, _ in columns)]
-    )
+    for c in range(min(10, evaluation.sizes["component"])):
+        cells = [measure_cell(data, head.partition(",")[0], c) for head, data in columns.items()]
+        rows.append([c + 1, *cells])
+    unit = evaluation["generalization"].attrs["units"]
+    return f"lengths in {unit}, ± standard error\n{table(rows, ['components', *columns])}"
 
 
-def significance(whole, where, name, study):
+def measure_cell(data: xr.Dataset, name: str, c: int) -> str:
+    """A measure of so many components and its standard error."""
+    if c >= data.sizes["component"]:
+        return "-"
+    value, error = data[name].values[c], data[f"{name}_error"].values[c]
+    return "-" if np.isnan(value) else f"{value:.4g} ± {error:.2g}"
+
+
+def significance(whole: xr.Dataset, where: xr.Dataset, name: str, study: xr.DataTree) -> str:
     """What a test and its map found, in words."""
     area = vertex_areas(*as_arrays(study["registration"].to_dataset()))
     p, least = whole["p_value"].item(), whole.attrs["smallest_p"]
-    text = f"{name} ({whole.attrs['groups']})" if "groups" in whole.attrs else name
-    text += f": p = {p:.3g} over the whole shape, the smallest that can be reached is {least:.2g}"
-    for key, words in (
-        ("p_family_wise", "family-wise"),
-        ("p_false_discovery", "false discovery rate"),
-    ):
-        share = area @ (where[key].values < 0.05) / area.sum()
-        text += f"\n  {100 * share:.1f} % of the area under 0.05 ({words}), smallest {where[key].values.min():.3g}"
-    return text
+    groups = f" ({whole.attrs['groups']})" if "groups" in whole.attrs else ""
+    lines = [
+        f"{name}{groups}: p = {p:.3g} over the whole shape, "
+        f"the smallest that can be reached is {least:.2g}"
+    ]
+    corrections = {"p_family_wise": "family-wise", "p_false_discovery": "false discovery rate"}
+    for variable, words in corrections.items():
+        p_vertex = where[variable].values  # (n,)
+        share = 100 * (area @ (p_vertex < 0.05)) / area.sum()
+        lines.append(
+            f"  {share:.1f} % of the area under 0.05 ({words}), smallest {p_vertex.min():.3g}"
+        )
+    return "\n".join(lines)
 
 
-def inserted_table(found):
+def classification_line(result: xr.Dataset) -> str:
+    """How well groups are told apart by the scores, in words."""
+    share, chance = 100 * result.attrs["balanced_accuracy"], 100 * result.attrs["chance"]
+    p = result["p_value"].item()
+    return f"classified {share:.0f} % right, chance {chance:.0f} %, p = {p:.3g}"
+
+
+def inserted_table(inserted: xr.DataTree) -> str:
     """Where new shapes of :func:`s4a.insert` lie in their study, and what looks wrong with them."""
-    report, data, latent = (found[n].to_dataset() for n in ("report", "registration", "latent"))
+    report, registration = inserted["report"].to_dataset(), inserted["registration"].to_dataset()
     rows = []
     for name in report["shape"].values.tolist():
-        if report["status"].sel(shape=name).item() == "excluded":
-            rows.append([name, *["-"] * 6, f"excluded: {report['reason'].sel(shape=name).item()}"])
-            continue
-        one = data.sel(shape=name)
-        row = [
-            name,
-            f"{one['confidence'].mean().item():.2f}",
-            f"{one['round_trip'].mean().item():.4f}",
-        ]
-        row.append(f"{np.median(np.abs(one['distortion'])):.3f}")
-        row.append(f"{latent['distance_to_median'].sel(shape=name).item():.4f}")
-        if "pca" in found:
-            scores = found["pca"].sel(shape=name)
-            row += [
-                f"{scores['reconstruction_error'].item():.4g}",
-                f"{mahalanobis(scores['score']):.1f}",
-            ]
-            row += [" ".join(f"{s:+.2f}" for s in scores["score"].values[:5])]
-        rows.append(row + ["-"] * (8 - len(row)))
+        shape = report.sel(shape=name)
+        if shape["status"].item() == "excluded":
+            cells = ["-"] * 6 + [f"excluded: {shape['reason'].item()}"]
+        else:
+            distance = inserted["latent"]["distance_to_median"].sel(shape=name).item()
+            cells = [*registration_cells(registration.sel(shape=name)), f"{distance:.4f}"]
+            cells += ["-"] * 3
+            if "pca" in inserted:
+                cells[-3:] = score_cells(inserted["pca"].to_dataset().sel(shape=name))
+        rows.append([name, *cells])
+    unit = registration["displacement"].attrs["units"]
     head = ["shape", "confidence", "round trip", "|distortion|", "to limit shape"]
-    head += [f"left ({data['displacement'].attrs['units']})", "Mahalanobis", "scores"]
+    head += [f"left ({unit})", "Mahalanobis", "scores"]
     return "\n".join([table(rows, head), *doubts(report)])
 
 
-def comparison_table(found):
+def score_cells(modes: xr.Dataset) -> list[str]:
+    """What the modes leave of one shape, how far it lies from the mean, and its first scores."""
+    return [
+        f"{modes['reconstruction_error'].item():.4g}",
+        f"{mahalanobis(modes['score']):.1f}",
+        " ".join(f"{score:+.2f}" for score in modes["score"].values[:5]),
+    ]
+
+
+def comparison_table(pairs: xr.Dataset) -> str:
     """Table 1: mean over the pairs of every metric, and the CPU seconds.
 
     Lengths in % of sqrt(area).
     """
-    mean = found.mean("pair")
+    mean = pairs.mean("pair")
     columns = {name: column for name, column in METRICS.items() if name in mean}
     rows = []
-    for way in mean["way"].values:
-        one = mean.sel(way=way)
-        row = [
-            f"{scale * one[name].item():.{digits}f}" for name, (_, scale, digits) in columns.items()
+    for name in mean["way"].values:
+        method = mean.sel(way=name)
+        cells = [
+            f"{factor * method[metric].item():.{digits}f}"
+            for metric, (_, factor, digits) in columns.items()
         ]
-        rows.append([way, f"{one['block_seconds'].sum().item():.1f}", *row])
+        rows.append([name, f"{method['block_seconds'].sum().item():.1f}", *cells])
     return table(rows, ["method", "CPU s", *(title for title, *_ in columns.values())])
 
 
-def block_table(ways, blocks, seconds):
-    """CPU seconds of every method by block (Fig. 3)."""
+def block_table(methods: Sequence[str], blocks: Sequence[str], seconds: np.ndarray) -> str:
+    """CPU seconds (m, b) of every method by block (Fig. 3)."""
     rows = [
-        [way, *(f"{s:.1f}" for s in row), f"{row.sum():.1f}"]
-        for way, row in zip(ways, np.asarray(seconds), strict=True)
+        [method, *(f"{s:.1f}" for s in of_blocks), f"{of_blocks.sum():.1f}"]
+        for method, of_blocks in zip(methods, seconds, strict=True)
     ]
     return table(rows, ["CPU s", *blocks, "all"])
 
 
-def collection_table(found):
-    """Table 2: mean Chamfer distance to the template, CPU seconds by block.
-
-    And the median shape.
-    """
+def collection_table(result: xr.Dataset) -> str:
+    """Table 2: mean Chamfer distance to the template, CPU seconds by block, the median shape."""
     rows = []
-    for way in found["way"].values:
-        for how in found["how"].values:
-            one = found.sel(way=way, how=how)
-            seconds = one["collection_seconds"].values
-            chamfer = f"{100 * one['collection_chamfer'].mean().item():.4f}"
-            rows.append([way, how, chamfer, *(f"{s:.1f}" for s in seconds), f"{seconds.sum():.1f}"])
-            rows[-1].append(one["median_shape"].item())
-    blocks = [f"{block}, s" for block in found["block"].values]
+    for way in result["way"].values:
+        for how in result["how"].values:
+            method = result.sel(way=way, how=how)
+            seconds = method["collection_seconds"].values
+            chamfer = 100 * method["collection_chamfer"].mean().item()
+            costs = [f"{s:.1f}" for s in (*seconds, seconds.sum())]
+            rows.append([way, how, f"{chamfer:.4f}", *costs, method["median_shape"].item()])
+    blocks = [f"{block}, s" for block in result["block"].values]
     return table(rows, ["method", "way up", "Chamfer %", *blocks, "all, s", "median shape"])

@@ -1,11 +1,12 @@
 """The whole analysis (4, 6.1): the steps of the paper, one after the other, over a collection.
 
-Every step takes the keys of the files that it is made from and gives those of its own; the files are
-in the folder of the run, and what computes one of them is in :mod:`s4a.study.tasks`.
+Every step takes the keys of the files that it is made from and gives those of its own; the files
+are in the folder of the run, and what computes one of them is in :mod:`s4a.study.tasks`.
 """
 
 import logging
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,24 +19,35 @@ from s4a.input.plausibility import median_size
 from s4a.input.subjects import read_table
 from s4a.method.network import choose_pairs, spectral_distance
 from s4a.method.pca import pca
-from s4a.study import tasks
 from s4a.study.options import Options, takes_options
 from s4a.study.report import write_report
 from s4a.study.runner import Run, Task
-from s4a.study.sources import Collection, find_sources
+from s4a.study.sources import Collection, Sources, find_sources
 from s4a.study.store import (
     arrays,
     attributes,
     is_done,
     lock,
     open_study,
+    read,
     stack_registration,
     task_key,
     template_mesh,
     write,
 )
+from s4a.study.tasks import (
+    align_shape,
+    clean_shape,
+    compare_shape,
+    consistent_maps,
+    map_pairs,
+    register_shape,
+    remesh_shape,
+)
 
 log = logging.getLogger(__name__)
+
+Keys = dict[str, str]  # name of a shape, or file of several -> key of what was computed
 
 
 @takes_options
@@ -129,12 +141,12 @@ def analyse(
         run = Run(claim, n_jobs)
         if subjects is not None:
             write(subjects, run.folder / "subjects.nc")
-        run_stages(run, sources, checked, remarks)
+        run_steps(run, sources, checked, remarks)
     return open_study(store)
 
 
-def run_stages(run: Run, sources: dict, options: Options, remarks: list[str]) -> None:
-    """All steps in turn; each looks up which of its files are done."""
+def run_steps(run: Run, sources: Sources, options: Options, remarks: list[str]) -> None:
+    """All steps of the paper in turn; each looks up which of its files are done."""
     original = read_and_clean(run, sources, options)
     compare(run, original, options)
     coarse = remesh(run, original, options)
@@ -147,59 +159,39 @@ def run_stages(run: Run, sources: dict, options: Options, remarks: list[str]) ->
     write_report(run, sources, options, remarks, no_modes, registered)
 
 
-def read_and_clean(run: Run, sources: dict, options: Options) -> dict[str, str]:
+def read_and_clean(run: Run, sources: Sources, options: Options) -> Keys:
     """The shapes, cleaned (5.1): ``/original``."""
     cleaning = {name: getattr(options, name) for name in ("components", "strict", "close_holes")}
-    return run.do(
-        "read and clean",
-        [
-            Task(n, f"original/{n}.nc", tasks.clean_shape, (source, cleaning), (content, cleaning))
-            for n, (source, content) in sources.items()
-        ],
-    )
+    todo = [
+        Task(n, f"original/{n}.nc", clean_shape, (source, cleaning), (content, cleaning))
+        for n, (source, content) in sources.items()
+    ]
+    return run.do("read and clean", todo)
 
 
-def compare(run: Run, original: dict[str, str], options: Options) -> None:
-    """Each shape beside the one of median size: what is not plausible is said in the report."""
+def compare(run: Run, original: Keys, options: Options) -> None:
+    """Each shape beside that of median size; the report says what is not plausible."""
     if len(original) < 2:
         return
-    areas = {n: attributes(run.folder / "original" / f"{n}.nc")["area"] for n in original}
+    areas = {n: attributes(run.folder / f"original/{n}.nc")["area"] for n in original}
     reference = median_size(areas)
-    beside = task_key(original[reference], reference, options.intersections)
-    arguments = (reference, options.intersections)
-    run.do(
-        "compare",
-        [
-            Task(
-                name,
-                f"network/look_{name}.nc",
-                tasks.compare_shape,
-                (run.folder, name, *arguments),
-                (beside, key),
-            )
-            for name, key in original.items()
-        ],
-        each=False,
-    )
+    settings = (reference, options.intersections)
+    beside = task_key(original[reference], *settings)
+    todo = [
+        Task(n, f"network/look_{n}.nc", compare_shape, (run.folder, n, *settings), (beside, key))
+        for n, key in original.items()
+    ]
+    run.do("compare", todo, each=False)
 
 
-def remesh(run: Run, original: dict[str, str], options: Options) -> dict[str, str]:
+def remesh(run: Run, original: Keys, options: Options) -> Keys:
     """Low-resolution meshes and their spectra (4.1, step 1): ``/coarse``."""
     settings = (options.n_coarse, options.wrap, options.seed, options.k)
-    coarse = run.do(
-        "remesh and spectrum",
-        [
-            Task(
-                name,
-                f"coarse/{name}.nc",
-                tasks.remesh_shape,
-                (run.folder, name, *settings),
-                (key, settings),
-                made_from=(key,),
-            )
-            for name, key in original.items()
-        ],
-    )
+    todo = [
+        Task(n, f"coarse/{n}.nc", remesh_shape, (run.folder, n, *settings), (key, settings), (key,))
+        for n, key in original.items()
+    ]
+    coarse = run.do("remesh and spectrum", todo)
     if len(coarse) < 2:
         reasons = "; ".join(f"{name}: {why}" for name, why in run.failures.items())
         raise ValueError(
@@ -212,15 +204,15 @@ def remesh(run: Run, original: dict[str, str], options: Options) -> dict[str, st
     return coarse
 
 
-def lowest_eigenvalues(run: Run, coarse: dict[str, str], k_init: int) -> np.ndarray:
-    """The `k_init` lowest eigenvalues of every shape: (n, k_init), fewer where a shape has fewer."""
-    spectra = [arrays(run.folder / "coarse" / f"{name}.nc", "eigenvalue")[0] for name in coarse]
+def lowest_eigenvalues(run: Run, coarse: Keys, k_init: int) -> np.ndarray:
+    """The `k_init` lowest eigenvalues of every shape (n, k_init); fewer where a shape has fewer."""
+    spectra = [arrays(run.folder / f"coarse/{name}.nc", "eigenvalue")[0] for name in coarse]
     k_init = min(k_init, *map(len, spectra))
     return np.stack([spectrum[:k_init] for spectrum in spectra])
 
 
-def align(run: Run, coarse: dict[str, str], spectra: np.ndarray) -> str:
-    """All shapes aligned to the one whose spectrum is nearest to all others (4.1, step 2).
+def align(run: Run, coarse: Keys, spectra: np.ndarray) -> str:
+    """All shapes moved onto the one whose spectrum is nearest to all others (4.1, step 2).
 
     Returns
     -------
@@ -230,54 +222,29 @@ def align(run: Run, coarse: dict[str, str], spectra: np.ndarray) -> str:
     names = list(coarse)
     reference = names[int(np.argmin(spectral_distance(spectra).sum(1)))]
     aligned = task_key(list(coarse.values()), names, reference)
-    run.do(
-        "align",
-        [
-            Task(
-                name,
-                f"network/motion_{name}.nc",
-                tasks.align_shape,
-                (run.folder, name, reference),
-                (aligned, name),
-            )
-            for name in names
-        ],
-        each=False,
-    )
+    todo = [
+        Task(n, f"network/motion_{n}.nc", align_shape, (run.folder, n, reference), (aligned, n))
+        for n in names
+    ]
+    run.do("align", todo, each=False)
     return aligned
 
 
-def first_maps(
-    run: Run, coarse: dict[str, str], spectra: np.ndarray, aligned: str, options: Options
-) -> dict[str, str]:
-    """The pairs of the network, those of like spectra, and their first maps (4.1, steps 3 and 4).
-
-    Returns
-    -------
-    dict of str to str
-        File of a batch of maps -> its key.
-    """
+def first_maps(run: Run, coarse: Keys, spectra: np.ndarray, aligned: str, options: Options) -> Keys:
+    """The pairs of the network, of like spectra, and their first maps (4.1, steps 3 and 4)."""
     names, k_init = list(coarse), spectra.shape[1]
     pairs = choose_pairs(spectral_distance(spectra), options.n_pairs)
     batches = in_batches([[names[i], names[j]] for i, j in pairs])
-    files = [f"network/first_{i:03d}.nc" for i in range(len(batches))]
-    return run.do(
-        "first maps",
-        [
-            Task(
-                file,
-                file,
-                tasks.first_maps,
-                (run.folder, batch, k_init, options.init),
-                (aligned, batch, k_init, options.init),
-            )
-            for file, batch in zip(files, batches, strict=True)
-        ],
-        each=False,
-    )
+    settings = (k_init, options.init)
+    files = {f"network/first_{i:03d}.nc": batch for i, batch in enumerate(batches)}
+    todo = [
+        Task(f, f, map_pairs, (run.folder, batch, *settings), (aligned, batch, *settings))
+        for f, batch in files.items()
+    ]
+    return run.do("first maps", todo, each=False)
 
 
-def in_batches(pairs):
+def in_batches(pairs: Sequence) -> list:
     """The pairs in batches for the tasks of the first maps: four in each, or 64 batches.
 
     Examples
@@ -290,9 +257,7 @@ def in_batches(pairs):
     return [pairs[i : i + size] for i in range(0, len(pairs), size)]
 
 
-def consistent_zoomout(
-    run: Run, coarse: dict[str, str], first: dict[str, str], options: Options
-) -> str:
+def consistent_zoomout(run: Run, coarse: Keys, first: Keys, options: Options) -> str:
     """Consistent ZoomOut and the median shape (4.2, eq. 5): ``/network`` and ``/latent``.
 
     Returns
@@ -302,54 +267,45 @@ def consistent_zoomout(
     """
     settings = (options.k, options.step, options.n_latent, options.norm)
     key = task_key(list(first.values()), *settings)
-    paths = [run.folder / "network.nc", run.folder / "latent.nc"]
-    if all(is_done(path, key) for path in paths):
+    if is_done(run.folder / "network.nc", key) and is_done(run.folder / "latent.nc", key):
         return key
     with run.stage("consistent ZoomOut and median"):
-        maps = xr.concat([run.read(file) for file in first], dim="pair")
+        maps = xr.concat([read(run.folder / file) for file in first], dim="pair")
         with parallel_config(backend="threading"):  # here, whatever backend the tasks run on
             n_threads = effective_n_jobs(run.n_jobs)
-        stages = tasks.consistent_maps(run.folder, list(coarse), maps, options, n_threads)
-        for data, path in zip(stages, paths, strict=True):
-            write(data, path, key, coarse.values())
+        net, latent = consistent_maps(run.folder, list(coarse), maps, options, n_threads)
+        write(net, run.folder / "network.nc", key, coarse.values())
+        write(latent, run.folder / "latent.nc", key, coarse.values())
     return key
 
 
-def register(run: Run, coarse: dict[str, str], latent: str, options: Options) -> dict[str, str]:
+def register(run: Run, coarse: Keys, latent: str, options: Options) -> Keys:
     """Every shape registered to the template, the median shape by default (4.2, eq. 6 to 8)."""
     template = options.template or attributes(run.folder / "latent.nc")["median"]
-    settings = (template, options.how, options.refine, options.scale)
-    onto = task_key(latent, settings)
-    mesh = template_mesh(run.read(f"original/{template}.nc"), template)
+    way = (template, options.how, options.refine, options.scale)
+    onto = task_key(latent, way)
+    mesh = template_mesh(read(run.folder / f"original/{template}.nc"), template)
     write(mesh, run.folder / "registration.nc", onto, [latent])
-    return run.do(
-        "registration",
-        [
-            Task(
-                name,
-                f"registration/{name}.nc",
-                tasks.register_shape,
-                (run.folder, name, *settings),
-                (onto, key),
-                made_from=(onto,),
-            )
-            for name, key in coarse.items()
-        ],
-    )
+    todo = [
+        Task(n, f"registration/{n}.nc", register_shape, (run.folder, n, *way), (onto, key), (onto,))
+        for n, key in coarse.items()
+    ]
+    return run.do("registration", todo)
 
 
-def modes(run: Run, registered: dict[str, str]) -> str:
+def modes(run: Run, registered: Keys) -> str:
     """The modes of the displacements (6.1): ``/pca``; the reason where there can be none."""
     with run.stage("modes"):
-        mesh = run.read("registration.nc")
-        files = {name: run.read(f"registration/{name}.nc") for name in registered}
+        mesh = read(run.folder / "registration.nc")
+        files = {name: read(run.folder / f"registration/{name}.nc") for name in registered}
         data = stack_registration(mesh, files, list(files))["registration"]
-        coarse = run.read(f"coarse/{mesh.attrs['template']}.nc")
-        path, keys = run.folder / "pca.nc", list(registered.values())
+        coarse = read(run.folder / f"coarse/{mesh.attrs['template']}.nc")
+        keys = list(registered.values())
         try:
-            write(pca(data, mesh["vertex_area"].values, coarse=coarse), path, task_key(keys), keys)
+            result = pca(data, mesh["vertex_area"].values, coarse=coarse)
         except ValueError as error:
             log.warning("no modes: %s", error)
-            path.unlink(missing_ok=True)
+            (run.folder / "pca.nc").unlink(missing_ok=True)
             return str(error)
+        write(result, run.folder / "pca.nc", task_key(keys), keys)
     return ""

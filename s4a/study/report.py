@@ -10,7 +10,8 @@ from s4a.input.collection import shape_report
 from s4a.schema import dataset
 from s4a.study.options import Options
 from s4a.study.runner import Run
-from s4a.study.store import arrays, attributes, write
+from s4a.study.sources import Sources
+from s4a.study.store import arrays, attributes, read, write
 
 # badness: of one kind 0.02 to 0.03, in far poses 0.01 to 0.03, of a cat and a man 0.14 to 0.16
 DOUBTFUL = 0.06
@@ -18,7 +19,7 @@ DOUBTFUL = 0.06
 
 def write_report(
     run: Run,
-    sources: dict,
+    sources: Sources,
     options: Options,
     remarks: list[str],
     no_modes: str,
@@ -30,7 +31,7 @@ def write_report(
     ----------
     run : Run
     sources : dict
-        Of all shapes that were given, see :func:`s4a.study.sources.collection`.
+        Of all shapes that were given, see :func:`s4a.study.sources.find_sources`.
     options : Options
     remarks : list of str
         On the collection, from earlier steps.
@@ -41,7 +42,7 @@ def write_report(
     """
     names = list(registered)
     template = attributes(run.folder / "registration.nc")["template"]
-    network, latent = run.read("network.nc"), run.read("latent.nc")
+    network, latent = read(run.folder / "network.nc"), read(run.folder / "latent.nc")
     badness = {n: attributes(run.folder / f"registration/{n}.nc")["score"] for n in names}
     spectra = {n: arrays(run.folder / f"coarse/{n}.nc", "eigenvalue")[0] for n in names}
     of_shapes, of_all = doubtful(badness)
@@ -86,7 +87,7 @@ def of_shape(run: Run, name: str, source: str | xr.Dataset, options: Options) ->
 
 def of_look(run: Run, name: str) -> dict:
     """What :func:`s4a.input.plausibility.look` saw in a shape."""
-    look = run.read(f"network/look_{name}.nc")
+    look = read(run.folder / f"network/look_{name}.nc")
     return look.attrs | {"rotation": look["rotation"].values}
 
 

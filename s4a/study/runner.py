@@ -19,7 +19,7 @@ from joblib import Parallel, delayed
 from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
-from s4a.study.store import Claim, is_done, read, task_key, write
+from s4a.study.store import Claim, is_done, task_key, write
 
 log = logging.getLogger(__name__)
 
@@ -85,10 +85,6 @@ class Run:
     def costs_file(self) -> Path:
         """Where the costs are kept for the next run."""
         return self.folder / ".costs.json"
-
-    def read(self, file: str) -> xr.Dataset:
-        """A file of the folder, in memory."""
-        return read(self.folder / file)
 
     @contextlib.contextmanager
     def stage(self, name: str, share: float = 1.0) -> Iterator[None]:

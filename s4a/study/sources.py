@@ -12,11 +12,10 @@ from s4a.study.store import task_key
 
 # files; or meshes in memory by name, Datasets or (points, triangles); or what read_shapes gives
 Collection = Path | str | list[Path | str] | dict[str, Any] | xr.DataTree
+Sources = dict[str, tuple[str | xr.Dataset, str]]  # name -> path or mesh, key of its content
 
 
-def find_sources(
-    shapes: Collection, pattern: str | None = None
-) -> dict[str, tuple[str | xr.Dataset, str]]:
+def find_sources(shapes: Collection, pattern: str | None = None) -> Sources:
     """What the user gave, in the order of the names: path or Dataset, and the key of its content.
 
     Parameters

@@ -16,6 +16,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import Final
 
 import h5py
 import numpy as np
@@ -29,7 +30,7 @@ from s4a.schema import INPUT, in_unit, unit_of, variable
 
 log = logging.getLogger(__name__)
 
-ENGINE = "h5netcdf"
+ENGINE: Final = "h5netcdf"
 VERSION = version("s4a")
 STACKED = (
     "registered_match",

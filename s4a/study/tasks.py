@@ -78,7 +78,7 @@ def motion_to_reference(folder: Path, name: str) -> tuple[np.ndarray, np.ndarray
     return R, t
 
 
-def first_maps(folder: Path, pairs: list, k_init: int, init: str) -> xr.Dataset:
+def map_pairs(folder: Path, pairs: list, k_init: int, init: str) -> xr.Dataset:
     """First maps of some pairs, in both directions (4.1, steps 3 and 4)."""
     names = sorted({name for pair in pairs for name in pair})
     bases = {name: low_basis(folder, name) for name in names}

@@ -22,17 +22,17 @@ OPTIONS = {"n_coarse": 150, "k_init": 8, "k": 12}
 RUN = """
 import signal, sys, time
 from s4a import analyse
-from s4a.study import tasks
+from s4a.study import pipeline
 
 # it is ignored below a background job of a shell
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-def slow(*arguments, task=tasks.remesh_shape):
+def slow(*arguments, task=pipeline.remesh_shape):
     time.sleep(2)
     return task(*arguments)
 
 if __name__ == "__main__":
-    tasks.remesh_shape = slow
+    pipeline.remesh_shape = slow
     analyse(sys.argv[2:], store=sys.argv[1], n_coarse=150, k_init=8, k=12, n_jobs=2)
 """
 
