@@ -54,7 +54,7 @@ from s4a.show.page import write_page
 from s4a.study.insert import insert
 from s4a.study.pair import match_pair
 from s4a.study.pipeline import analyse
-from s4a.study.store import open_study
+from s4a.study.tree import open_study
 
 install()
 __version__ = version("s4a")

@@ -14,9 +14,9 @@ from s4a.method.pca import gram
 from s4a.method.register import from_latent, identity
 from s4a.method.shape import Shape
 from s4a.schema import dataset, in_unit, unit_of
-from s4a.study import store
 from s4a.study.insert import insert
 from s4a.study.options import Options
+from s4a.study.tree import stack_registration, template_mesh
 
 RECOMPUTED = "recomputed for every left-out shape, as a new one in the study of the others"
 
@@ -62,8 +62,8 @@ def _register_anew(nodes, latent, rotation, options, n_jobs):
         for n in others
     )
     files = dict(zip(others, registered, strict=True)) | {median: identity(template)}
-    mesh = store.template_mesh(template.original, median)
-    return store.stack_registration(mesh, files, names)
+    mesh = template_mesh(template.original, median)
+    return stack_registration(mesh, files, names)
 
 
 def _register(shape, template, bases, rotation, options):

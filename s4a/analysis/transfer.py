@@ -21,8 +21,8 @@ from s4a.method.remesh import coarsen
 from s4a.method.shape import Shape
 from s4a.method.spectral import spectrum
 from s4a.schema import dataset, require
-from s4a.study import store
 from s4a.study.pair import match_shapes
+from s4a.study.tree import stack_registration, template_mesh
 
 N_COARSE = 6000  # of the paper (5.1)
 
@@ -49,7 +49,7 @@ def _study_of(name, template, shapes, forth, back):
     meshes = {name: template, **shapes}
     nodes = {f"original/{n}": mesh for n, mesh in meshes.items()}
     files = {name: identity(Shape(template)), **forth}
-    nodes |= store.stack_registration(store.template_mesh(template, name), files, list(meshes))
+    nodes |= stack_registration(template_mesh(template, name), files, list(meshes))
     return xr.DataTree.from_dict(nodes | {f"reverse/{n}": data for n, data in back.items()})
 
 

@@ -40,7 +40,8 @@ from s4a.show.pictures import write_animation, write_picture
 from s4a.study.insert import insert as place
 from s4a.study.options import Options
 from s4a.study.pipeline import analyse
-from s4a.study.store import ENGINE, open_study
+from s4a.study.store import ENGINE
+from s4a.study.tree import open_study
 
 
 def check(args: Namespace) -> int:

@@ -272,7 +272,7 @@ def score_cells(modes: xr.Dataset) -> list[str]:
     """What the modes leave of one shape, how far it lies from the mean, and its first scores."""
     return [
         f"{modes['reconstruction_error'].item():.4g}",
-        f"{mahalanobis(modes['score']):.1f}",
+        f"{mahalanobis(modes['score'].values):.1f}",
         " ".join(f"{score:+.2f}" for score in modes["score"].values[:5]),
     ]
 

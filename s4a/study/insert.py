@@ -25,8 +25,8 @@ from s4a.method.remesh import coarsen
 from s4a.method.shape import Basis, Shape
 from s4a.method.spectral import spectrum
 from s4a.schema import dataset, in_unit, require, unit_of
-from s4a.study import store
 from s4a.study.options import Options
+from s4a.study.tree import stack_registration, template_mesh
 
 NEIGHBOURS = 6  # shapes of the study, the template among them, whose maps a new one has
 
@@ -128,8 +128,8 @@ def insert(
     nodes[f"original/{template}"] = frozen.template.original
     nodes |= {f"coarse/{name}": new.coarse for name, new in inserted.items()}
     nodes["latent"] = latent_of_new(inserted, study["latent"].to_dataset(), options.norm)
-    nodes |= store.stack_registration(
-        store.template_mesh(frozen.template.original, template),
+    nodes |= stack_registration(
+        template_mesh(frozen.template.original, template),
         {name: new.registration for name, new in inserted.items()},
         list(inserted),
     )

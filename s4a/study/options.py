@@ -56,9 +56,10 @@ class Options:
     k: int = 100
     n_latent: int | None = None
     step: int = 5
-    init: str | None = None
-    refine: str | None = None
-    how: str | None = None
+    # of these three the preset sets what is None
+    init: str = None  # type: ignore[assignment]
+    refine: str = None  # type: ignore[assignment]
+    how: str = None  # type: ignore[assignment]
     norm: str = "h2"
     scale: bool = False
     components: str | int = "largest"
@@ -175,14 +176,3 @@ def takes_options(function: Callable) -> Callable:
     shown = signature.replace(parameters=[*own, *options])
     function.__signature__ = shown  # type: ignore[attr-defined]
     return function
-
-
-def checked(options):
-    """The options of a dict, checked, with those of the preset."""
-    whole = Options(**options)
-    return {name: getattr(whole, name) for name in options}
-
-
-def check_against(options, names):
-    """See :meth:`Options.check_against`."""
-    Options(**options).check_against(names)

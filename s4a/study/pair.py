@@ -13,7 +13,7 @@ from s4a.method.remesh import coarsen
 from s4a.method.shape import Shape
 from s4a.method.spectral import spectrum
 from s4a.schema import dataset, require
-from s4a.study.options import checked
+from s4a.study.options import Options
 
 log = logging.getLogger(__name__)
 
@@ -77,15 +77,7 @@ def match_pair(
     >>> found["fmap"].shape, bool((abs(found["displacement"]) < 1e-6).all())
     ((10, 10), True)
     """
-    options = {
-        "k_init": k_init,
-        "k": k,
-        "init": init,
-        "refine": refine,
-        "n_coarse": n_coarse,
-        "seed": seed,
-    }
-    options = checked(options)
+    options = Options(k_init=k_init, k=k, init=init, refine=refine, n_coarse=n_coarse, seed=seed)
     for mesh, what in ((source, "source"), (target, "target")):
         require(mesh, "position", "corner_vertex", what=what)
     M, N = (
@@ -98,8 +90,8 @@ def match_pair(
         N,
         k_init=min(k_init, least),
         k=k,
-        init=options["init"],
-        refine=options["refine"],
+        init=options.init,
+        refine=options.refine,
     )
     if least < k:
         note = f"k = {k} reduced to {least}, the eigenfunctions that the smaller mesh has"

@@ -28,11 +28,8 @@ from s4a.study.store import (
     attributes,
     is_done,
     lock,
-    open_study,
     read,
-    stack_registration,
     task_key,
-    template_mesh,
     write,
 )
 from s4a.study.tasks import (
@@ -44,6 +41,7 @@ from s4a.study.tasks import (
     register_shape,
     remesh_shape,
 )
+from s4a.study.tree import open_study, stack_registration, template_mesh
 
 log = logging.getLogger(__name__)
 

@@ -24,26 +24,10 @@ import xarray as xr
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
-from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
-from s4a.input.files import slug
-from s4a.schema import INPUT, in_unit, unit_of, variable
-
 log = logging.getLogger(__name__)
 
 ENGINE: Final = "h5netcdf"
 VERSION = version("s4a")
-STACKED = (
-    "registered_match",
-    "displacement",
-    "displacement_raw",
-    "displacement_low",
-    "rotation",
-    "translation",
-    "scale",
-    "confidence",
-    "round_trip",
-    "distortion",
-)
 
 
 def task_key(*parts):
@@ -116,8 +100,8 @@ def write(data, path, key="", made_from=(), claim=None):
         os.replace(temporary, path)
     except OSError as error:
         raise OSError(
-            f"{path} cannot be written ({error}): is the disk full, or the folder read-only? Finished files are whole; "
-            "the same command goes on where it stopped"
+            f"{path} cannot be written ({error}): is the disk full, or the folder read-only? "
+            "Finished files are whole; the same command goes on where it stopped"
         ) from error
     finally:
         with suppress(OSError):
@@ -283,8 +267,9 @@ def lock(folder):
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             handle.seek(0)
+            owner, *_ = handle.read().split() or ["unknown"]
             raise ValueError(
-                f"another run (process {(handle.read().split() or ['unknown'])[0]}) is working on {folder}; "
+                f"another run (process {owner}) is working on {folder}; "
                 "wait for it to end or give another folder"
             ) from None
         token = f"{os.getpid()} {uuid.uuid4().hex}"
@@ -294,145 +279,3 @@ def lock(folder):
         for left in Path(folder).rglob(".*.tmp"):
             left.unlink(missing_ok=True)
         yield Claim(Path(folder), token)
-
-
-def template_mesh(original, name):
-    """The mesh of ``/registration`` from the original mesh of the template of that name."""
-    X, T = as_arrays(original)
-    mesh = as_dataset(X, T, {"template": name}, vertex_area=vertex_areas(X, T))
-    return in_unit(mesh, unit_of(original["position"]))
-
-
-def stack_registration(template, files, names):
-    """The rectangular ``/registration`` from the files of its shapes.
-
-    And the nodes of the way back.
-
-    Its lengths have a unit where all shapes say the same.
-    """
-    parts = [files[name] for name in names]
-    own = [name for name in ("position", "corner_vertex", "vertex_area") if name in template]
-    data = template[own].assign_attrs(template=template.attrs["template"])
-    held = [name for name in STACKED if all(name in p for p in parts)]
-    stacked = {name: variable(name, np.stack([p[name].values for p in parts])) for name in held}
-    stacked["method"] = variable("method", [p.attrs.get("method", "") for p in parts])
-    stacked["badness"] = variable("badness", [p.attrs.get("score", np.nan) for p in parts])
-    units = {unit_of(p["displacement"]) for p in parts}
-    data = in_unit(data.assign(stacked), units.pop() if len(units) == 1 else INPUT).assign_coords(
-        shape=list(names)
-    )
-    nodes = {
-        f"registration/{name}": files[name][
-            ["template_triangle", "template_barycentric"]
-        ].assign_attrs(files[name].attrs)
-        for name in names
-    }
-    return {"registration": data, **nodes}
-
-
-def open_study(folder):
-    """Open a study folder, finished or not.
-
-    Per-shape nodes are read when they are used; the stages that are there are in the tree, those
-    that are not yet computed are absent, as are files that cannot be read or were made from others
-    than those now in the folder (both are said in a warning of the log).  ``/registration`` is put
-    together in memory.
-
-    Parameters
-    ----------
-    folder : path
-        As given to ``store=`` or ``s4a run --out``.
-
-    Returns
-    -------
-    xarray.DataTree
-
-    Raises
-    ------
-    ValueError
-        When the folder is not a study.
-
-    Examples
-    --------
-    With ``store``, the folder of six small brains:
-
-    >>> import tempfile
-    >>> import s4a
-    >>> store = tempfile.mkdtemp()
-    >>> study = s4a.analyse(
-    ...     s4a.synthetic.brains(3, 200), n_coarse=100, k=10, k_init=6, n_pairs=3, store=store
-    ... )
-    >>> sorted(s4a.open_study(store).children)
-    ['coarse', 'latent', 'network', 'original', 'pca', 'registration', 'report']
-    """
-    folder = Path(folder)
-    if not (folder / "original").is_dir():
-        raise ValueError(
-            f"{folder} is not a study folder: it has no folder 'original'; run `s4a run ... --out {folder}`"
-        )
-    known = set()
-
-    def part(name, open_file=opened):
-        """The file of that name, or None."""
-        path = folder / f"{name}.nc"
-        try:
-            data = open_file(path)
-        except FileNotFoundError:
-            return None
-        except OSError as error:
-            log.warning("%s; it is left out", error)
-            return None
-        if not known.issuperset(data.attrs.get("made_from", "").split()):
-            log.warning(
-                "%s belongs to an earlier run and is left out; run the analysis again", path
-            )
-            return None
-        names = data["shape"].values.tolist() if "shape" in data.coords else []
-        names += [data.attrs[name] for name in ("template", "median") if name in data.attrs]
-        wrong = [name for name in names if slug(str(name)) != name]
-        if wrong:  # they become names of files
-            log.warning(
-                "%s is left out: shapes need names of letters, digits, _ and -; found %s",
-                path,
-                wrong,
-            )
-            return None
-        known.add(data.attrs.get("task_key"))
-        return data
-
-    names = sorted(path.stem for path in (folder / "original").glob("[!.]*.nc"))
-    nodes = {
-        f"{stage}/{name}": part(f"{stage}/{name}")
-        for stage in ("original", "coarse")
-        for name in names
-    }
-    nodes |= {stage: part(stage) for stage in ("network", "latent")}
-    template = part("registration", read)
-    if template is not None and nodes["latent"] is not None:
-        files = {
-            name: part(f"registration/{name}", read)
-            for name in nodes["latent"]["shape"].values.tolist()
-        }
-        files = {name: data for name, data in files.items() if data is not None}
-        if files:
-            nodes |= stack_registration(template, files, list(files))
-    nodes |= {stage: part(stage) for stage in ("pca", "subjects", "report")}
-    if nodes["report"] is not None:
-        report = nodes["report"]
-        used = set(report["shape"].values[report["status"].values != "excluded"].tolist())
-        nodes = {
-            name: data
-            for name, data in nodes.items()
-            if "/" not in name or name.rpartition("/")[2] in used
-        }
-        paths = dict(
-            zip(report["shape"].values.tolist(), report["path"].values.tolist(), strict=True)
-        )
-        for name in used & {
-            n.removeprefix("original/") for n, data in nodes.items() if data is not None
-        }:
-            if paths[name]:  # the file may have moved since it was read
-                nodes[f"original/{name}"] = nodes[f"original/{name}"].assign_attrs(path=paths[name])
-    return xr.DataTree.from_dict(
-        {n: data for n, data in nodes.items() if data is not None}, name=folder.name
-    )

@@ -1,4 +1,4 @@
-"""What a worker computes, one file of a study at a time: the steps of 4 for one shape or some pairs.
+"""What a worker computes, one file of a study at a time: the steps of 4 for a shape or some pairs.
 
 A task gets paths and names, reads the files of earlier tasks, and returns the Dataset of its own.
 """

@@ -16,7 +16,7 @@ from s4a.show.browser import PARTS
 from s4a.study.options import Options
 from s4a.study.pipeline import analyse, in_batches
 from s4a.study.sources import find_sources
-from s4a.study.store import open_study
+from s4a.study.tree import open_study
 from s4a.widgets.explore import Explore
 from s4a.widgets.panel import Panel, row
 

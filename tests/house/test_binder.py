@@ -14,7 +14,7 @@ import pytest
 from paths import ROOT
 
 import s4a
-from s4a.study.store import open_study
+from s4a.study.tree import open_study
 
 BINDER = ROOT / "binder"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]

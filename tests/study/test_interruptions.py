@@ -13,7 +13,7 @@ import time
 import psutil
 import pytest
 
-from s4a import analyse, synthetic
+from s4a import analyse, open_study, synthetic
 from s4a.schema import dataset
 from s4a.study import store
 from s4a.study.runner import Run
@@ -289,6 +289,6 @@ def test_names_that_lead_out_of_a_study_are_left_out(tmp_path, caplog):
     )
     store.write(mesh.assign_attrs(template="../../outside"), folder / "registration.nc")
     store.write(mesh, outside)
-    with store.open_study(folder) as tree:
+    with open_study(folder) as tree:
         assert list(tree.children) == ["original"]
     assert "shapes need names of letters, digits, _ and -; found ['../../outside']" in caplog.text

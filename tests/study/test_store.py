@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from s4a import synthetic
+from s4a import open_study, synthetic
 from s4a.schema import dataset
 from s4a.study import store
 
@@ -159,7 +159,7 @@ def test_what_is_not_a_study_is_refused(tmp_path, make):
     if make == "file":
         folder.write_text("no")
     with pytest.raises(ValueError, match="is not a study folder"):
-        store.open_study(folder)
+        open_study(folder)
 
 
 def write_tree(folder, names, template):
@@ -195,7 +195,7 @@ def test_a_damaged_file_is_left_out_of_the_study_and_said(tmp_path, caplog, name
     write_tree(tmp_path, ["a", "b", "c"], "a")
     with h5py.File(tmp_path / f"{name}.nc", "a") as inside:
         lose_a_variable(inside)
-    groups = store.open_study(tmp_path).groups
+    groups = open_study(tmp_path).groups
     assert f"/{name}" not in groups
     assert "/original/b" in groups
     assert f"{name}.nc cannot be read" in caplog.text
@@ -204,7 +204,7 @@ def test_a_damaged_file_is_left_out_of_the_study_and_said(tmp_path, caplog, name
 def test_a_tree_survives_the_round_trip(tmp_path):
     names = ["b", "a", "c"]
     write_tree(tmp_path, names, "a")
-    tree = store.open_study(tmp_path)
+    tree = open_study(tmp_path)
     assert list(tree["original"].children) == ["a", "b", "c"]
     registration = tree["registration"].to_dataset()
     assert registration["shape"].values.tolist() == names  # the order of the latent basis
@@ -230,7 +230,7 @@ def test_an_unfinished_study_opens_with_what_is_there(tmp_path):
     (tmp_path / "registration" / "b.nc").unlink()
     (tmp_path / "coarse" / "b.nc").unlink()
     (tmp_path / "original" / ".c.nc.77.tmp").write_bytes(b"half")
-    tree = store.open_study(tmp_path)
+    tree = open_study(tmp_path)
     assert tree["registration"]["shape"].values.tolist() == ["a"]
     assert list(tree["coarse"].children) == ["a"]
     assert list(tree["original"].children) == ["a", "b"]
