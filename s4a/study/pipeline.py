@@ -145,6 +145,13 @@ def analyse(
 
 def run_steps(run: Run, sources: Sources, options: Options, remarks: list[str]) -> None:
     """All steps of the paper in turn; each looks up which of its files are done."""
+    # what each file is made from; a key holds the keys of all before it:
+    #
+    #   original/* -> coarse/* -> network/motion_* -> network/first_* -> network, latent
+    #       |                                                                  |
+    #   network/look_*                               registration/* <- registration
+    #                                                     |
+    #                                                pca, report
     original = read_and_clean(run, sources, options)
     compare(run, original, options)
     coarse = remesh(run, original, options)

@@ -1,4 +1,4 @@
-"""A study: one xarray DataTree in memory, one folder of netCDF files on disk, one file per task.
+"""Files of a study, one netCDF file per task; keys, and the lock of its folder.
 
 Every file is written under a temporary name and renamed, so that a killed run leaves only whole
 files; the key of its task (content, parameters, version) stands in its attributes and says whether
@@ -12,11 +12,12 @@ import logging
 import os
 import sys
 import uuid
-from contextlib import contextmanager, nullcontext, suppress
+from collections.abc import Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import h5py
 import numpy as np
@@ -28,12 +29,33 @@ log = logging.getLogger(__name__)
 
 ENGINE: Final = "h5netcdf"
 VERSION = version("s4a")
+SMALL = 1000  # entries up to which a variable is read when its file is opened
+# attributes with which HDF5 and netCDF keep account of dimensions
+HIDDEN = {
+    "CLASS",
+    "NAME",
+    "DIMENSION_LIST",
+    "REFERENCE_LIST",
+    "_NCProperties",
+    "_Netcdf4Coordinates",
+    "_Netcdf4Dimid",
+}
+# HDF5's name of a dimension that has no coordinate
+NO_COORDINATE = b"This is a netCDF dimension but not a netCDF variable"
 
 
-def task_key(*parts):
-    """A hash of all that a result depends on: strings, numbers, lists, dicts, arrays, bytes.
+def task_key(*parts: Any) -> str:
+    """A hash of all that a result depends on, and of the version of S4A.
 
-    And the version of S4A.
+    Parameters
+    ----------
+    *parts : str, number, list, dict, ndarray or bytes
+
+    Examples
+    --------
+    >>> from s4a.study.store import task_key
+    >>> task_key("content", {"k": 20}) == task_key("content", {"k": 30})
+    False
     """
     digest = hashlib.sha256(f"s4a {VERSION}".encode())
     for part in parts:
@@ -41,11 +63,10 @@ def task_key(*parts):
             kind, data = f"{part.dtype.str}{part.shape}", np.ascontiguousarray(part).tobytes()
         elif isinstance(part, bytes):
             kind, data = "bytes", part
-        else:
-            kind, data = (
-                "json",
-                json.dumps(part, sort_keys=True, default=lambda number: number.item()).encode(),
-            )
+        else:  # numbers of NumPy as those of Python
+            text = json.dumps(part, sort_keys=True, default=lambda number: number.item())
+            kind, data = "json", text.encode()
+        # kind and length before it: "ab" is not "a", "b", and no array is the text of its bytes
         digest.update(f"{kind} {len(data)}:".encode() + data)
     return digest.hexdigest()[:32]
 
@@ -58,46 +79,56 @@ class Claim:
     """
 
     folder: Path
-    token: str
+    token: str  # number of the process, and a word that no other run has
 
     @property
-    def owner(self):
+    def owner(self) -> int:
         """Number of the process of the run."""
         return int(self.token.split()[0])
 
-    def check(self):
-        """ValueError when the folder has been taken over.
-
-        As by the run that follows one that was killed.
-        """
+    def check(self) -> None:
+        """Raise ValueError when another run has taken over the folder, as after one was killed."""
         try:
-            held = (self.folder / ".lock").read_text()
+            token = (self.folder / ".lock").read_text()
         except OSError:
-            held = ""
-        if held != self.token:
+            token = ""
+        if token != self.token:
             raise ValueError(f"the run of process {self.owner} no longer holds {self.folder}")
 
 
-def write(data, path, key="", made_from=(), claim=None):
+def write(
+    data: xr.Dataset,
+    path: Path | str,
+    key: str = "",
+    made_from: Iterable[str] = (),
+    claim: Claim | None = None,
+) -> None:
     """Write a Dataset to `path` at once: under a temporary name in the same folder, then renamed.
 
-    `made_from` are the keys of the files that it was computed from; :func:`open_study` leaves a
-    file out when one of them is no longer there, as after a run with other options was stopped
-    half-way.  With a `claim` nothing is written when it no longer holds.
+    Parameters
+    ----------
+    data : Dataset
+    path : Path or str
+    key : str
+        Of :func:`task_key`.
+    made_from : iterable of str
+        Keys of the files that it was computed from; :func:`s4a.open_study` leaves a file out when
+        one of them is no longer there, as after a run with other options was stopped half-way.
+    claim : Claim, optional
+        Nothing is written when it no longer holds.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    data = data.assign_attrs(task_key=key, made_from=" ".join(made_from))
     whole = io.BytesIO()  # HDF5 brings the process down when the disk is full
-    with alone():
-        data.assign_attrs(task_key=key, made_from=" ".join(made_from)).to_netcdf(
-            whole, engine=ENGINE
-        )
+    with without_dask():
+        data.to_netcdf(whole, engine=ENGINE)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary.write_bytes(whole.getbuffer())
         if claim is not None:
             claim.check()
-        os.replace(temporary, path)
+        os.replace(temporary, path)  # at once, or not at all
     except OSError as error:
         raise OSError(
             f"{path} cannot be written ({error}): is the disk full, or the folder read-only? "
@@ -108,33 +139,18 @@ def write(data, path, key="", made_from=(), claim=None):
             temporary.unlink(missing_ok=True)
 
 
-def alone():
-    """Keeps xarray from asking a dask scheduler, where there is one.
-
-    For a lock on a buffer that only we have.
-    """
+def without_dask() -> AbstractContextManager:
+    """Keeps xarray from asking a dask scheduler for a lock on a buffer that only we have."""
     dask = sys.modules.get("dask")
     return dask.config.set(scheduler="synchronous") if dask else nullcontext()
-
-
-HIDDEN = {
-    "CLASS",
-    "NAME",
-    "DIMENSION_LIST",
-    "REFERENCE_LIST",
-    "_NCProperties",
-    "_Netcdf4Coordinates",
-    "_Netcdf4Dimid",
-}
-SMALL = 1000  # entries up to which a variable is read when its file is opened
 
 
 class Stored(BackendArray):
     """A variable of a file that is read when it is asked for; it holds no file open."""
 
-    def __init__(self, path, stored, key):
-        self.path, self.name, self.key = path, stored.name, key
-        self.shape, self.dtype = stored.shape, stored.dtype
+    def __init__(self, path: Path, variable: h5py.Dataset, key: str):
+        self.path, self.name, self.key = path, variable.name, key
+        self.shape, self.dtype = variable.shape, variable.dtype
 
     def __getitem__(self, key):
         return indexing.explicit_indexing_adapter(
@@ -152,7 +168,7 @@ class Stored(BackendArray):
 
 
 @contextmanager
-def readable(path):
+def readable(path: Path | str) -> Iterator[h5py.File]:
     """An open file of a study.
 
     Whatever comes of damage in it is one OSError that names the file.
@@ -168,7 +184,7 @@ def readable(path):
         ) from error
 
 
-def opened(path):
+def open_file(path: Path | str) -> xr.Dataset:
     """The Dataset of one file; its larger variables are read when they are used.
 
     What :func:`xarray.open_dataset` gives, in less than half of the time: h5netcdf asks HDF5 for
@@ -177,55 +193,60 @@ def opened(path):
     """
     path = Path(path).absolute()  # what is read later does not follow the working directory
     with readable(path) as file:
-        attrs = _attributes(file)
+        attrs = plain_attributes(file)
         variables = {}
-        for name, stored in file.items():
-            own = stored.attrs
-            if "DIMENSION_LIST" in own:
-                dims = [file[ref[0]].name.lstrip("/") for ref in own["DIMENSION_LIST"]]
-            elif own.get("CLASS") == b"DIMENSION_SCALE":
-                if own["NAME"].startswith(b"This is a netCDF dimension but not a netCDF variable"):
-                    continue
-                dims = [name]
+        for name, variable in file.items():
+            if variable.attrs.get("NAME", b"").startswith(NO_COORDINATE):
+                continue
+            if h5py.check_string_dtype(variable.dtype):
+                values = np.array(variable.asstr()[()], str)
+            elif variable.size <= SMALL:
+                values = variable[()]
             else:
-                dims = ()
-            if h5py.check_string_dtype(stored.dtype):
-                values = np.array(stored.asstr()[()], str)
-            elif stored.size <= SMALL:
-                values = stored[()]
-            else:
-                values = indexing.LazilyIndexedArray(Stored(path, stored, attrs.get("task_key")))
-            variables[name] = xr.Variable(dims, values, _attributes(stored))
+                lazy = Stored(path, variable, attrs.get("task_key"))
+                values = indexing.LazilyIndexedArray(lazy)
+            dims = dims_of(file, name, variable)
+            variables[name] = xr.Variable(dims, values, plain_attributes(variable))
         data = xr.decode_cf(xr.Dataset(variables, attrs=attrs), decode_times=False)
     data.encoding["source"] = str(path)
     return data
 
 
-def _attributes(stored):
-    found = {name: stored.attrs[name] for name in stored.attrs if name not in HIDDEN}
+def dims_of(file: h5py.File, name: str, variable: h5py.Dataset) -> list[str]:
+    """Names of the dims of a variable."""
+    if "DIMENSION_LIST" in variable.attrs:  # references to the dimensions, one list for each axis
+        return [file[ref[0]].name.lstrip("/") for ref in variable.attrs["DIMENSION_LIST"]]
+    is_dimension = variable.attrs.get("CLASS") == b"DIMENSION_SCALE"
+    return [name] if is_dimension else []
+
+
+def plain_attributes(stored: h5py.File | h5py.Dataset) -> dict[str, Any]:
+    """The attributes as they were before they were written: HDF5 makes arrays of single numbers."""
+    attrs = {name: stored.attrs[name] for name in stored.attrs if name not in HIDDEN}
     return {
-        n: v[0] if isinstance(v, np.ndarray) and v.shape == (1,) else v for n, v in found.items()
+        name: value[0] if isinstance(value, np.ndarray) and value.shape == (1,) else value
+        for name, value in attrs.items()
     }
 
 
-def read(path):
+def read(path: Path | str) -> xr.Dataset:
     """The Dataset of one file, in memory."""
-    return opened(path).load()
+    return open_file(path).load()
 
 
-def arrays(path, *names):
+def arrays(path: Path | str, *names: str) -> list[np.ndarray]:
     """The values of some variables of one file, without a Dataset."""
     with readable(path) as file:
         return [file[name][()] for name in names]
 
 
-def attributes(path):
+def attributes(path: Path | str) -> dict[str, Any]:
     """The attributes of one file."""
     with readable(path) as file:
-        return _attributes(file)
+        return plain_attributes(file)
 
 
-def is_done(path, key):
+def is_done(path: Path | str, key: str) -> bool:
     """Whether the file of a task is there, whole, and of this key."""
     try:
         with readable(path) as file:
@@ -235,7 +256,7 @@ def is_done(path, key):
 
 
 @contextmanager
-def lock(folder):
+def lock(folder: Path | str) -> Iterator[Claim]:
     """Hold a study folder against a second run.
 
     Released by the system when the process ends in whatever way.
@@ -276,6 +297,6 @@ def lock(folder):
         handle.truncate(0)
         handle.write(token)
         handle.flush()
-        for left in Path(folder).rglob(".*.tmp"):
-            left.unlink(missing_ok=True)
+        for temporary in Path(folder).rglob(".*.tmp"):
+            temporary.unlink(missing_ok=True)
         yield Claim(Path(folder), token)

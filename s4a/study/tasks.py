@@ -21,7 +21,7 @@ from s4a.method.shape import Basis, Shape
 from s4a.method.spectral import spectrum
 from s4a.schema import dataset, in_unit, unit_of
 from s4a.study.options import Options
-from s4a.study.store import arrays, opened, read
+from s4a.study.store import arrays, open_file, read
 
 
 def clean_shape(source: str | xr.Dataset, cleaning: dict) -> xr.Dataset:
@@ -55,12 +55,12 @@ def remesh_shape(
 
 def shape_of(folder: Path, name: str) -> Shape:
     """A shape of the study at both resolutions; its arrays are read when they are used."""
-    return Shape(*(opened(folder / stage / f"{name}.nc") for stage in ("original", "coarse")))
+    return Shape(*(open_file(folder / stage / f"{name}.nc") for stage in ("original", "coarse")))
 
 
 def low_basis(folder: Path, name: str) -> Basis:
     """The coarse mesh of a shape, centred and for unit area, and its eigenfunctions."""
-    return Shape(None, opened(folder / "coarse" / f"{name}.nc")).low
+    return Shape(None, open_file(folder / "coarse" / f"{name}.nc")).low
 
 
 def align_shape(folder: Path, name: str, reference: str) -> xr.Dataset:

@@ -10,7 +10,7 @@ import xarray as xr
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.input.files import slug
 from s4a.schema import INPUT, in_unit, unit_of, variable
-from s4a.study.store import opened, read
+from s4a.study.store import open_file, read
 
 log = logging.getLogger(__name__)
 
@@ -76,14 +76,14 @@ class Reader:
         self.keys: set[str] = set()  # of the files that were read
 
     def read(
-        self, names: Iterable[str], open_file: Callable[[Path], xr.Dataset] = opened
+        self, names: Iterable[str], open_with: Callable[[Path], xr.Dataset] = open_file
     ) -> dict[str, xr.Dataset]:
         """The files of these names that are there, whole and made from files read before."""
         files = {}
         for name in names:
             path = self.folder / f"{name}.nc"
             try:
-                data = open_file(path)
+                data = open_with(path)
             except FileNotFoundError:
                 continue
             except OSError as error:

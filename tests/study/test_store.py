@@ -243,7 +243,7 @@ def test_every_file_of_a_study_is_read_as_xarray_reads_it(small_store):
     assert len(files) > 20
     for file in files:
         with xr.open_dataset(file, engine=store.ENGINE) as there:
-            here = store.opened(file)
+            here = store.open_file(file)
             xr.testing.assert_identical(here, there)
             kinds = [
                 {n: v.dtype.str.split("U")[0] for n, v in data.variables.items()}
@@ -256,7 +256,7 @@ def test_every_file_of_a_study_is_read_as_xarray_reads_it(small_store):
 def test_parts_of_a_stored_variable_are_parts_of_the_whole(tmp_path):
     whole = np.random.default_rng(0).normal(size=(700, 3))
     store.write(dataset(position=whole), tmp_path / "a.nc", "k")
-    position = store.opened(tmp_path / "a.nc")["position"]
+    position = store.open_file(tmp_path / "a.nc")["position"]
     assert (position[::-2].values == whole[::-2]).all()
     assert (position[[5, 3], 1].values == whole[[5, 3], 1]).all()
     assert (position.values == whole).all()
@@ -264,7 +264,7 @@ def test_parts_of_a_stored_variable_are_parts_of_the_whole(tmp_path):
 
 def test_a_file_written_anew_after_it_was_opened_is_refused(tmp_path):
     store.write(dataset(position=np.zeros((700, 3))), tmp_path / "a.nc", "k")
-    found = store.opened(tmp_path / "a.nc")
+    found = store.open_file(tmp_path / "a.nc")
     store.write(dataset(position=np.ones((700, 3))), tmp_path / "a.nc", "other")
     with pytest.raises(ValueError, match="written anew since it was opened; open the study again"):
         found.load()
