@@ -222,7 +222,8 @@ def transfer(args: Namespace) -> int:
         study, excluded = registered_pairs(source, args)
         source = None  # it is the template now
     out = new_folder(args.out)
-    labels, points = {}, {}  # name of a target -> node
+    labels: Mapping = {}  # name of a target -> node
+    points: Mapping = {}
     if label is not None:
         labels = travel.transfer_labels(study, label, source=source).children
     if landmarks is not None:

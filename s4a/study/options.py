@@ -57,9 +57,9 @@ class Options:
     n_latent: int | None = None
     step: int = 5
     # of these three the preset sets what is None
-    init: str = None  # type: ignore[assignment]
-    refine: str = None  # type: ignore[assignment]
-    how: str = None  # type: ignore[assignment]
+    init: str | None = None
+    refine: str | None = None
+    how: str | None = None
     norm: str = "h2"
     scale: bool = False
     components: str | int = "largest"

@@ -195,6 +195,7 @@ def open_file(path: Path | str) -> xr.Dataset:
     with readable(path) as file:
         attrs = plain_attributes(file)
         variables = {}
+        values: Any
         for name, variable in file.items():
             if variable.attrs.get("NAME", b"").startswith(NO_COORDINATE):
                 continue
@@ -203,8 +204,8 @@ def open_file(path: Path | str) -> xr.Dataset:
             elif variable.size <= SMALL:
                 values = variable[()]
             else:
-                lazy = Stored(path, variable, attrs.get("task_key"))
-                values = indexing.LazilyIndexedArray(lazy)
+                stored = Stored(path, variable, attrs.get("task_key"))
+                values = indexing.LazilyIndexedArray(stored)
             dims = dims_of(file, name, variable)
             variables[name] = xr.Variable(dims, values, plain_attributes(variable))
         data = xr.decode_cf(xr.Dataset(variables, attrs=attrs), decode_times=False)
