@@ -90,7 +90,7 @@ def consistent_maps(
     folder: Path, names: list[str], first: xr.Dataset, options: Options, n_jobs: int
 ) -> tuple[xr.Dataset, xr.Dataset]:
     """Consistent ZoomOut over the network and the median (4.2): ``/network`` and ``/latent``."""
-    coarse = {name: opened(folder / "coarse" / f"{name}.nc") for name in names}
+    coarse = {name: open_file(folder / "coarse" / f"{name}.nc") for name in names}
     k_init = first.sizes["mode_source_initial"]
     with tqdm(total=options.k - k_init, desc="consistent ZoomOut") as bar:
         tree = steps.refine_network(
