@@ -1,12 +1,11 @@
-"""Cleaning: from the triangles of a file to an oriented manifold surface.
-
-Before everything else (4.1).
+"""Cleaning (4.1, before step 1): from the triangles of a file to an oriented manifold surface.
 
 What makes the triangles a manifold, edge by edge, is in :mod:`s4a.input.manifold`, which says how
 half-edges are counted.
 """
 
 import numpy as np
+import xarray as xr
 from scipy.spatial import cKDTree
 
 from s4a.geometry.mesh import (
@@ -21,17 +20,18 @@ from s4a.geometry.mesh import (
 )
 from s4a.input.manifold import (
     cheapest,
+    equal_rows,
     fill_holes,
+    join_corners,
+    join_triangles,
     manifold_mates,
-    mates,
     split_double_edges,
-    umbrellas,
 )
 from s4a.schema import require
 
-RELATIVE_TOLERANCE = (
-    1e-7  # of the diagonal of the bounding box: nearer vertices are one, lower triangles are flat
-)
+# of the diagonal of the bounding box: nearer vertices are one, lower triangles are flat
+RELATIVE_TOLERANCE = 1e-7
+LARGEST = 1e60  # a coordinate from here on is not finite: its squared areas would overflow
 
 REPAIRS = {
     "nonfinite_vertices": "non-finite vertices removed",
@@ -51,8 +51,14 @@ REPAIRS = {
 }
 
 
-def clean(mesh, *, components="largest", strict=False, close_holes=False):
-    """A mesh made an oriented edge- and vertex-manifold surface.
+def clean(
+    mesh: xr.Dataset,
+    *,
+    components: str | int = "largest",
+    strict: bool = False,
+    close_holes: bool = False,
+) -> xr.Dataset:
+    """Make a mesh an oriented edge- and vertex-manifold surface.
 
     Vertices nearer than 1e-7 of the bounding-box diagonal are welded, degenerate and duplicate
     triangles dropped, zero-area triangles removed by flipping their long edge (collapsed where two
@@ -89,7 +95,7 @@ def clean(mesh, *, components="largest", strict=False, close_holes=False):
     --------
     >>> import s4a
     >>> from s4a.geometry.mesh import as_dataset
-    >>> tetrahedron = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3], [0, 1, 3]]  # the last triangle is there twice
+    >>> tetrahedron = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3], [0, 1, 3]]  # one twice
     >>> mesh = s4a.clean(as_dataset([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], tetrahedron))
     >>> mesh.sizes["triangle"], mesh.attrs["duplicate_triangles"], mesh.attrs["genus"]
     (4, 1, 0)
@@ -101,16 +107,21 @@ def clean(mesh, *, components="largest", strict=False, close_holes=False):
     reason = repairs(counts)
     status = "repaired" if reason else "ok"
     if counts["holes"]:
-        reason = (
-            f"{reason}; " * bool(reason)
-            + f"{counts['holes']} holes kept as boundary (close_holes=True closes them)"
-        )
+        kept = f"{counts['holes']} holes kept as boundary (close_holes=True closes them)"
+        reason = "; ".join(filter(None, [reason, kept]))
     attrs = {**mesh.attrs, **counts, "status": status, "reason": reason}
     return as_dataset(X, T, attrs, file_vertex=file_vertex, vertex_of_file=vertex_of_file)
 
 
-def clean_arrays(points, triangles, *, components="largest", strict=False, close_holes=False):
-    """:func:`clean` on arrays.
+def clean_arrays(
+    points: np.ndarray,
+    triangles: np.ndarray,
+    *,
+    components: str | int = "largest",
+    strict: bool = False,
+    close_holes: bool = False,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, int | float]]:
+    """Clean a surface of arrays as :func:`clean` does a Dataset.
 
     Returns
     -------
@@ -121,11 +132,11 @@ def clean_arrays(points, triangles, *, components="largest", strict=False, close
         in a hole that of a vertex around it.
     vertex_of_file : int32 ndarray (len(points),)
         A vertex that each row of `points` became, -1 where it was dropped.
-    counts : dict of str to int; and ``area``, and ``area_dropped``, the share of it in the dropped
-    components
+    counts : dict of str to int
         The keys of :data:`REPAIRS`, sizes of the input (``file_vertices``, ``file_triangles``),
         ``components`` found, and of the result ``holes`` (boundary loops), ``euler_characteristic``
-        and ``genus`` (sum over components).
+        and ``genus`` (sum over components); and ``area`` and ``area_dropped``, the share of it in
+        the dropped components.
     """
     P, F = _validated(points, triangles, components)
     counts = {"file_vertices": len(P), "file_triangles": len(F), **dict.fromkeys(REPAIRS, 0)}
@@ -138,13 +149,12 @@ def clean_arrays(points, triangles, *, components="largest", strict=False, close
         raise ValueError(
             f"a surface needs triangles with area; none of the {counts['file_triangles']} has any"
         )
-    F, mate = mates(P, F, group, counts)
-    V, file_vertex = umbrellas(F, mate)
+    F, mate = join_triangles(P, F, group, counts)
+    V, file_vertex = join_corners(F, mate)
     counts["split_vertices"] = len(file_vertex) - n_used(group[F])
     X, T, file_vertex = split_double_edges(P[file_vertex], V, file_vertex, mate, counts)
-    X, T, kept = _largest_components(X, T, components, counts)
-    new = np.cumsum(kept) - 1
-    new[~kept] = -1
+    X, T, kept = _keep_components(X, T, components, counts)
+    new = np.where(kept, np.cumsum(kept) - 1, -1)
     T, file_vertex = new[T], file_vertex[kept]
     if close_holes:
         X, T, nearby = fill_holes(X, T)
@@ -156,25 +166,25 @@ def clean_arrays(points, triangles, *, components="largest", strict=False, close
     return X, T.astype(np.int32), file_vertex.astype(np.int32), vertex_of_file, counts
 
 
-def repairs(counts):
+def repairs(counts: dict[str, int | float]) -> str:
     """What was repaired, in words; empty when the file was a clean surface.
 
     Examples
     --------
     >>> from s4a.input.clean import repairs
-    >>> repairs({"welded_vertices": 2, "cut_edges": 0, "dropped_components": 3, "area_dropped": 0.0214})
+    >>> repairs({"welded_vertices": 2, "dropped_components": 3, "area_dropped": 0.0214})
     '2 vertices welded; 3 components dropped (2.1 % of the area)'
     """
-    parts = [f"{counts[name]} {text}" for name, text in REPAIRS.items() if counts.get(name)]
-    return "; ".join(
-        f"{part} ({100 * counts['area_dropped']:.2g} % of the area)"
-        if part.endswith("components dropped")
-        else part
-        for part in parts
-    )
+    parts = []
+    for name, text in REPAIRS.items():
+        if counts.get(name):
+            parts.append(f"{counts[name]} {text}")
+            if name == "dropped_components":
+                parts[-1] += f" ({100 * counts['area_dropped']:.2g} % of the area)"
+    return "; ".join(parts)
 
 
-def check_components(components):
+def check_components(components: str | int) -> None:
     """ValueError unless `components` is "largest", "all" or a number from 1."""
     number = isinstance(components, int | np.integer) and not isinstance(components, bool)
     if components not in ("largest", "all") and not (number and components >= 1):
@@ -193,33 +203,29 @@ def _validated(points, triangles, components):
     if not np.issubdtype(F.dtype, np.integer):
         raise ValueError(f"triangles need integer vertex indices; found {F.dtype}")
     if F.min() < 0 or F.max() >= len(P):
+        wrong = ((F < 0) | (F >= len(P))).any(axis=1).sum()
         raise ValueError(
             f"triangles need vertex indices 0..{len(P) - 1}, as there are {len(P)} vertices; "
-            f"found {F.min()}..{F.max()}, {((F < 0) | (F >= len(P))).any(axis=1).sum()} triangles out of range"
+            f"found {F.min()}..{F.max()}, {wrong} triangles out of range"
         )
     check_components(components)
     return P, F.astype(np.int64)
 
 
 def _drop_nonfinite(P, F, strict, counts):
-    bad = ~(np.abs(P) < 1e60).all(
-        axis=1
-    )  # so that no squared area overflows; false for nan as well
+    bad = ~(np.abs(P) < LARGEST).all(axis=1)  # true for NaN as well
     counts["nonfinite_vertices"] = int(bad.sum())
+    which = f"{bad.sum()} of {len(P)} vertices are not finite"
     if strict and bad.any():
-        raise ValueError(
-            f"{bad.sum()} of {len(P)} vertices are not finite; strict=False removes them"
-        )
+        raise ValueError(f"{which}; strict=False removes them")
     F = F[~bad[F].any(axis=1)]
     if len(F) == 0:
-        raise ValueError(
-            f"no triangle with finite vertices; {bad.sum()} of {len(P)} vertices are not finite"
-        )
+        raise ValueError(f"no triangle with finite vertices; {which}")
     return F
 
 
 def _weld(P, F, counts):
-    """For each row of P the number of its group of coincident vertices (-1 where no triangle uses it)."""
+    """The group of coincident vertices of each row of P, -1 where no triangle uses it."""
     used = np.flatnonzero(np.bincount(F.ravel()))
     X = P[used]
     side = _sides(P, F)
@@ -228,35 +234,29 @@ def _weld(P, F, counts):
     # the median side guards against a far outlier, whose bounding box would weld the whole shape
     diagonal = np.linalg.norm(np.ptp(X, axis=0))
     tolerance = min(RELATIVE_TOLERANCE * diagonal, 1e-3 * np.median(side[side > 0]))
-    order = np.lexsort(X.T)
-    first = np.r_[True, (X[order[1:]] != X[order[:-1]]).any(axis=1)]
-    exact = np.empty(len(X), np.int64)
-    exact[order] = np.cumsum(first) - 1
-    near = _near_pairs(X[order[first]], tolerance)
-    label = components(near, first.sum())
+    first, place = equal_rows(X)
+    label = components(_near_pairs(X[first], tolerance), len(first))
     group = np.full(len(P), -1)
-    group[used] = label[exact]
+    group[used] = label[place]
     counts["welded_vertices"] = int(len(used) - label.max() - 1)
     return group, tolerance
 
 
 def _near_pairs(X, tolerance):
-    """Pairs of points within the tolerance ``(p, 2)``.
-
-    Sought among those that have another so near in x, y and z.
-    """
-    some = np.arange(len(X))
+    """Pairs of points within the tolerance ``(p, 2)``."""
+    near = np.arange(len(X))  # candidates: those that have another so near in x, y and z
     for x in X.T:
-        some = some[np.argsort(x[some])]
-        close = np.flatnonzero(np.diff(x[some]) <= tolerance)
-        some = some[np.union1d(close, close + 1)]
-    tree = cKDTree(X[some], balanced_tree=False, compact_nodes=False)
+        near = near[np.argsort(x[near])]
+        close = np.flatnonzero(np.diff(x[near]) <= tolerance)
+        near = near[np.union1d(close, close + 1)]
+    tree = cKDTree(X[near], balanced_tree=False, compact_nodes=False)
     crowd = tree.count_neighbors(tree, tolerance) / len(X)
-    if crowd > 100:
+    if crowd > 100:  # the pairs would fill the memory
         raise ValueError(
-            f"vertices crowd: each has {crowd:.0f} others within 1e-7 of the extent ({tolerance:.1e})"
+            f"vertices crowd: each has {crowd:.0f} others within 1e-7 of the extent "
+            f"({tolerance:.1e})"
         )
-    return some[tree.query_pairs(tolerance, output_type="ndarray").astype(np.int64)]
+    return near[tree.query_pairs(tolerance, output_type="ndarray").astype(np.int64)]
 
 
 def _drop_repeated(F, group, counts):
@@ -265,40 +265,34 @@ def _drop_repeated(F, group, counts):
     good = (T[:, 0] != T[:, 1]) & (T[:, 1] != T[:, 2])
     counts["degenerate_triangles"] = int((~good).sum())
     F, T = F[good], T[good]
-    order = np.lexsort(T.T)
-    new = np.r_[True, (T[order[1:]] != T[order[:-1]]).any(axis=1)][: len(T)]
-    counts["duplicate_triangles"] = int((~new).sum())
-    if new.all():
+    first, place = equal_rows(T)
+    counts["duplicate_triangles"] = len(T) - len(first)
+    if len(first) == len(T):
         return F
-    copies = np.bincount(np.cumsum(new) - 1)
-    kept = order[new]
-    cancel = _touching_sheets(T[kept], copies % 2 == 0)
+    copies = np.bincount(place)
+    cancel = _touching_sheets(T[first], copies % 2 == 0)
     counts["duplicate_triangles"] += int(cancel.sum())
-    return F[np.sort(kept[~cancel])]
+    return F[np.sort(first[~cancel])]
 
 
 def _touching_sheets(T, even):
-    """Of the triangles that lie there an even number of times.
-
-    Those where two sheets of a surface touch.
+    """Where two sheets touch, among the triangles that lie there an even number of times.
 
     Around a patch of them the other triangles meet in pairs, so that to keep one copy would leave a
     fin; around a superfluous copy they are single.  Decided patch by patch, by most of the edges
     around it that have others.
     """
     E, edge_of, count = unique_edges(T)
-    triangle = np.tile(np.arange(len(T)), 3)
+    triangle = np.tile(np.arange(len(T)), 3)  # of each half-edge
     inside = even[triangle]
     n_inside = np.bincount(edge_of, inside, len(E)).astype(int)
-    patch = components(
-        np.stack([triangle[inside], len(T) + edge_of[inside]], axis=1), len(T) + len(E)
-    )
+    links = np.stack([triangle[inside], len(T) + edge_of[inside]], axis=1)
+    patch = components(links, len(T) + len(E))
     around = inside & (n_inside[edge_of] % 2 == 1)
     outside = (count - n_inside)[edge_of[around]]
     votes = np.where(outside == 0, 0, np.where(outside % 2 == 0, 1, -1))
-    return even & (
-        np.bincount(patch[triangle[around]], votes, len(T) + len(E))[patch[: len(T)]] > 0
-    )
+    total = np.bincount(patch[triangle[around]], votes, len(T) + len(E))
+    return even & (total[patch[: len(T)]] > 0)
 
 
 def _flip_flat(P, F, group, tolerance, counts, rounds=50):
@@ -308,22 +302,22 @@ def _flip_flat(P, F, group, tolerance, counts, rounds=50):
     are those whose long edge is a boundary, where nothing opens, and those that no flip helps and
     that have no height at all.
     """
-    F, alive, suspect = F.copy(), np.ones(len(F), bool), np.arange(len(F))
+    F, alive = F.copy(), np.ones(len(F), bool)
+    suspects = np.arange(len(F))
     for _ in range(rounds):
-        flat = suspect = suspect[alive[suspect] & (_heights(P, F[suspect])[0] <= tolerance)]
-        if len(flat) == 0:
+        suspects = suspects[alive[suspects] & (_heights(P, F[suspects])[0] <= tolerance)]
+        if len(suspects) == 0:
             break
-        ring = np.flatnonzero(alive & np.isin(group[F], group[F[flat]]).any(axis=1))
-        flipped, pairs, at_boundary = _flips(
-            P, F[ring], group, np.searchsorted(ring, flat), tolerance
-        )
+        ring = np.flatnonzero(alive & np.isin(group[F], group[F[suspects]]).any(axis=1))
+        flat = np.searchsorted(ring, suspects)
+        pairs, flipped, at_boundary = _flips(P, F[ring], group, flat, tolerance)
         if len(pairs) == 0 and len(at_boundary) == 0:
             break
         F[ring[pairs]] = flipped
         alive[ring[np.setdiff1d(at_boundary, pairs)]] = False
-        suspect = np.union1d(flat, ring[pairs])
+        suspects = np.union1d(suspects, ring[pairs])
         counts["flipped_edges"] += len(pairs)
-    alive[suspect[_heights(P, F[suspect])[0] <= 1e-3 * tolerance]] = False
+    alive[suspects[_heights(P, F[suspects])[0] <= 1e-3 * tolerance]] = False
     counts["flat_triangles"] = int((~alive).sum())
     return F[alive]
 
@@ -331,126 +325,132 @@ def _flip_flat(P, F, group, tolerance, counts, rounds=50):
 def _flips(P, F, group, flat, tolerance):
     """Flips of the long edges of flat triangles, each triangle in one at most.
 
-    Returns the new triangles ``(c, 2, 3)``, the pairs of triangles they replace ``(c, 2)``, and the
-    flat triangles whose long edge is a boundary.
+    Returns
+    -------
+    pairs : int ndarray (c, 2)
+        The triangles to be replaced: a flat one and its neighbour across the long edge.
+    flipped : int ndarray (c, 2, 3)
+        What replaces them.
+    at_boundary : int ndarray
+        The flat triangles whose long edge is a boundary.
     """
-    m, f = len(F), F.T.ravel()
+    #      d                   d
+    #    /   \               / | \       q p b is flat: b lies on the long edge, and may lie beyond;
+    #   p-----q     ->      p  |  q      p q d keeps its orientation, as it has the area
+    #    \.b./               \.b./
+    m, corner = len(F), F.T.ravel()  # corner h starts half-edge h, see s4a.input.manifold
     E, edge_of, count = unique_edges(group[F], len(P))
     half = flat + m * _heights(P, F[flat])[1]
     at_boundary = flat[count[edge_of[half]] == 1]
     mate = manifold_mates(edge_of, count)[half]
     half, mate = half[mate >= 0], mate[mate >= 0]
-    # the neighbour across keeps its orientation: it has the area
-    p, q, d, b = (
-        f[mate],
-        f[(mate + m) % (3 * m)],
-        f[(mate + 2 * m) % (3 * m)],
-        f[(half + 2 * m) % (3 * m)],
-    )
-    pairs, key = (
-        np.stack([half, mate], axis=1) % m,
-        np.sort(group[np.stack([b, d], axis=1)], axis=1) @ [len(P), 1],
-    )
+    p = corner[mate]
+    q = corner[(mate + m) % (3 * m)]
+    d = corner[(mate + 2 * m) % (3 * m)]
+    b = corner[(half + 2 * m) % (3 * m)]
+    pairs = np.stack([half, mate], axis=1) % m
     flipped = np.stack([np.stack([p, b, d], axis=1), np.stack([b, q, d], axis=1)], axis=1)
-    old, new = np.linalg.norm(P[p] - P[q], axis=1), np.linalg.norm(P[b] - P[d], axis=1)
+    # an edge b-d must not be there already, nor arise twice
+    new_edge = np.sort(group[np.stack([b, d], axis=1)], axis=1) @ [len(P), 1]
+    is_new = (group[b] != group[d]) & ~np.isin(new_edge, E @ [len(P), 1])
+    # it helps if neither is flat then, or if the edge gets shorter: no endless turns
+    before = np.linalg.norm(P[p] - P[q], axis=1)
+    after = np.linalg.norm(P[b] - P[d], axis=1)
     height = _heights(P, flipped.reshape(-1, 3))[0].reshape(-1, 2).min(axis=1)
-    good = (
-        (group[b] != group[d])
-        & ~np.isin(key, E @ [len(P), 1])
-        & ((height > tolerance) | (new < old))
-    )
-    good = np.flatnonzero(good)
-    good = good[cheapest(-old[good], pairs[good])]
-    good = good[np.unique(key[good], return_index=True)[1]]
-    return flipped[good], pairs[good], at_boundary
+    good = np.flatnonzero(is_new & ((height > tolerance) | (after < before)))
+    good = good[cheapest(-before[good], pairs[good])]
+    good = good[np.unique(new_edge[good], return_index=True)[1]]
+    return pairs[good], flipped[good], at_boundary
 
 
 def _heights(P, F):
     """Height of each triangle over its longest side, and the first corner of that side."""
     side = _sides(P, F)
-    return np.linalg.norm(triangle_normals(P, F), axis=1) / np.maximum(
-        side.max(axis=1), 1e-300
-    ), side.argmax(axis=1)
+    double_area = np.linalg.norm(triangle_normals(P, F), axis=1)
+    return double_area / np.maximum(side.max(axis=1), 1e-300), side.argmax(axis=1)
 
 
 def _sides(P, F):
     """Lengths of the sides 0-1, 1-2 and 2-0 of each triangle ``(m, 3)``."""
-    X = [P.take(corner, axis=0) for corner in F.T]
-    gaps = (X[0] - X[1], X[1] - X[2], X[2] - X[0])
-    return np.stack([np.sqrt(np.einsum("ij,ij->i", d, d)) for d in gaps], axis=1)
+    a, b, c = (P.take(corner, axis=0) for corner in F.T)
+    return np.stack([np.sqrt(np.einsum("ij,ij->i", v, v)) for v in (a - b, b - c, c - a)], axis=1)
 
 
-def _largest_components(X, T, wanted, counts):
+def _keep_components(X, T, wanted, counts):
     """The components asked for, outwards, in the old numbering; and the mask of their vertices."""
     label = components(np.concatenate([T[:, :2], T[:, 1:]]), len(X))
     n = label.max() + 1
-    areas = triangle_areas(X, T)
-    area = np.bincount(label[T[:, 0]], areas, n)
+    area = np.bincount(label[T[:, 0]], triangle_areas(X, T), n)
     order = np.argsort(-area, kind="stable")
     share = area[order[0]] / area.sum()
     if wanted == "largest" and share < 0.5:
+        enough = int(np.searchsorted(np.cumsum(area[order]), 0.9 * area.sum())) + 1
         raise ValueError(
-            f"the largest of {n} components has {100 * share:.1f} % of the area, under half; say how many belong to "
-            f"the shape: components={int(np.searchsorted(np.cumsum(area[order]), 0.9 * area.sum())) + 1} "
-            f'holds 90 %, components="all" keeps all'
+            f"the largest of {n} components has {100 * share:.1f} % of the area, under half; "
+            f"say how many belong to the shape: components={enough} holds 90 %, "
+            f'components="all" keeps all'
         )
-    number = {"largest": 1, "all": n}.get(wanted, wanted)
     keep = np.zeros(n, bool)
-    keep[order[:number]] = True
-    counts["components"], counts["dropped_components"] = int(n), int(n - keep.sum())
+    keep[order[: {"largest": 1, "all": n}.get(wanted, wanted)]] = True
+    counts["components"] = int(n)
+    counts["dropped_components"] = int(n - keep.sum())
     counts["area_dropped"] = float(area[~keep].sum() / area.sum())
     T = T[keep[label[T[:, 0]]]]
-    T, turned = _outwards(X, T, label, n)
-    counts["reoriented_triangles"] += turned
+    T, n_turned = _turn_outwards(X, T, label, n)
+    counts["reoriented_triangles"] += n_turned
     return X[keep[label]], T, keep[label]
 
 
-def _outwards(X, T, label, n):
-    """Components turned so that they enclose a positive volume.
+def _turn_outwards(X, T, label, n):
+    """Turn components so that they enclose a positive volume; say how many triangles were turned.
 
-    An open one as if its boundary were closed.
+    An open one is seen from the middle of its boundary, a closed one from that of its vertices.
     """
     E, _, count = unique_edges(T, len(X))
-    rim = np.unique(E[count == 1])
     weight = np.zeros(len(X))
-    weight[rim] = 1
-    closed = np.bincount(label[rim], minlength=n) == 0
+    weight[E[count == 1]] = 1  # on the boundary
+    closed = np.bincount(label, weight, n) == 0
     weight[closed[label]] = 1
     total = np.maximum(np.bincount(label, weight, n), 1)
-    centre = np.stack([np.bincount(label, weight * X[:, i], n) / total for i in range(3)], axis=1)
-    of = label[T[:, 0]]
-    a, b, c = (X[T[:, i]] - centre[of] for i in range(3))
-    volume = np.bincount(of, np.einsum("ij,ij->i", a, np.cross(b, c)) / 6, n)
-    area = np.bincount(of, triangle_areas(X, T), n)
+    centre = np.stack([np.bincount(label, weight * x, n) / total for x in X.T], axis=1)  # (n, 3)
+    component = label[T[:, 0]]
+    a, b, c = (X[T[:, i]] - centre[component] for i in range(3))
+    volume = np.bincount(component, np.einsum("ij,ij->i", a, np.cross(b, c)) / 6, n)
+    area = np.bincount(component, triangle_areas(X, T), n)
     inwards = volume < np.where(closed, 0, -1e-3 * area**1.5)  # a flat open patch has no outside
-    return np.where(inwards[of][:, None], T[:, ::-1], T), int(inwards[of].sum())
+    turned = inwards[component]
+    return np.where(turned[:, None], T[:, ::-1], T), int(turned.sum())
 
 
 def _count_topology(T, counts):
     E, _, count = unique_edges(T)
-    rim = E[count == 1]
-    vertex, rim_ends = np.unique(rim, return_inverse=True)
-    holes = components(rim_ends.reshape(-1, 2), len(vertex)).max(initial=-1) + 1
-    chi = euler_characteristic(T, E)
+    rim, ends = np.unique(E[count == 1], return_inverse=True)
+    holes = int(components(ends.reshape(-1, 2), len(rim)).max(initial=-1) + 1)
+    chi = int(euler_characteristic(T, E))
     kept = counts["components"] - counts["dropped_components"]
-    counts |= {
-        "holes": int(holes),
-        "euler_characteristic": int(chi),
-        "genus": int(2 * kept - holes - chi) // 2,
-    }
+    # chi = 2 - 2 genus - holes, of each component
+    counts |= {"holes": holes, "euler_characteristic": chi, "genus": (2 * kept - holes - chi) // 2}
 
 
 def _vertex_of_file(group, new, file_vertex):
-    """The first new vertex at a corner of the file vertex.
+    """The vertex that each row of the file became, -1 where it was dropped.
 
-    Else of a vertex that was welded to it, else -1.
+    It is the first new vertex at a corner of the file's vertex, else of one welded to it.
+
+    Parameters
+    ----------
+    group : int ndarray (p,)
+        Of each row of the file.
+    new, file_vertex : int ndarray (c,)
+        Of each corner of the triangles.
     """
+    nothing = np.iinfo(np.int64).max
 
     def first(key, n):
-        result = np.full(n, np.iinfo(np.int64).max)
-        np.minimum.at(result, key[new >= 0], new[new >= 0])
-        return np.where(result < np.iinfo(np.int64).max, result, -1)
+        vertex = np.full(n, nothing)
+        np.minimum.at(vertex, key[new >= 0], new[new >= 0])
+        return np.where(vertex < nothing, vertex, -1)
 
     own = first(file_vertex, len(group))
-    welded = np.r_[first(group[file_vertex], group.max() + 1), -1]
+    welded = np.r_[first(group[file_vertex], group.max() + 1), -1]  # the last for group -1
     return np.where(own >= 0, own, welded[group]).astype(np.int32)

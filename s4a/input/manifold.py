@@ -1,12 +1,19 @@
-"""Manifold surfaces from triangles, as part of the cleaning.
-
-Which triangles continue each other, and which way (4.1).
+r"""Manifold surfaces from triangles (4.1): which continue each other, and which way.
 
 A triangle corner is counted as half-edges are: corner h = i m + t is corner i of triangle t, and
 half-edge h runs from it to the next corner of the triangle
 (:func:`s4a.geometry.mesh.directed_edges`).  Two half-edges that the surface joins are mates; the
 rest of the topology follows from the mates.  Vertices that lie in one place are a `group`; what is
 repaired is added to `counts`, see :data:`s4a.input.clean.REPAIRS`.
+
+::
+
+               2
+             /   \             triangle t
+    h + 2m  /     \  h + m     h = t runs from corner 0 to 1,
+           /   t   \           h + m from 1 to 2, h + 2m from 2 to 0;
+          0---------1          modulo 3m, h + m is always the next
+               h               and h + 2m starts at the corner opposite to h
 """
 
 import numpy as np
@@ -19,24 +26,33 @@ from s4a.geometry.mesh import (
     unique_edges,
 )
 
-MOST_AROUND_EDGE = (
-    16  # an edge with more triangles is cut; pairing them would need their number squared
-)
+MOST_AROUND_EDGE = 16  # an edge with more triangles is cut: pairing takes their number squared
 
 
-def manifold_mates(edge_of, count):
-    """The mate of each half-edge on edges with two triangles, else -1."""
+def manifold_mates(edge_of: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """The mate of each half-edge ``(3 m,)`` on edges with two triangles, else -1.
+
+    `edge_of` and `count` are those of :func:`s4a.geometry.mesh.unique_edges`.
+    """
     order = np.argsort(edge_of, kind="stable")
     first = (np.cumsum(count) - count)[count == 2]
+    one, other = order[first], order[first + 1]
     mate = np.full(len(edge_of), -1)
-    mate[order[first]], mate[order[first + 1]] = order[first + 1], order[first]
+    mate[one], mate[other] = other, one
     return mate
 
 
-def mates(P, F, group, counts):
-    """The triangles oriented consistently.
+def join_triangles(
+    P: np.ndarray, F: np.ndarray, group: np.ndarray, counts: dict
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find the mates of all half-edges, and orient the triangles consistently.
 
-    And the mate of each half-edge, -1 at boundaries and cuts.
+    Returns
+    -------
+    F : int ndarray (m, 3)
+        The triangles, some turned.
+    mate : int ndarray (3 m,)
+        Of each half-edge, -1 at boundaries and cuts.
     """
     _, edge_of, count = unique_edges(group[F], len(P))
     F, mate = _orient(P, F, group, manifold_mates(edge_of, count), counts)
@@ -44,46 +60,47 @@ def mates(P, F, group, counts):
         _, edge_of, count = unique_edges(group[F], len(P))
         counts["nonmanifold_edges"] = int((count > 2).sum())
         pairs, cost = _pairs_around_edges(P, F, group, edge_of, count)
-        pairs = pairs[cheapest(cost, pairs)]
-        mate[pairs], mate[pairs[:, ::-1]] = pairs[:, ::-1], pairs
+        one, other = pairs[cheapest(cost, pairs)].T
+        mate[one], mate[other] = other, one
         F, mate = _orient(P, F, group, mate, counts)
     counts["cut_edges"] = int((mate < 0).sum() - (count == 1).sum())
     return F, mate
 
 
 def _pairs_around_edges(P, F, group, edge_of, count):
-    """All pairs of half-edges on each non-manifold edge ``(c, 2)``.
+    """All pairs of half-edges on each non-manifold edge, and how badly each continues the surface.
 
-    And how badly each continues the surface ``(c,)``.
-
-    The cost is 1 - cos of the bend, more for a pair that disagrees in orientation; between equal
-    bends the pair that encloses less of the inside goes first, so that solids that touch in an edge
-    come apart.
+    Returns
+    -------
+    pairs : int ndarray (c, 2)
+    cost : float ndarray (c,)
+        1 - cos of the bend, more for a pair that disagrees in orientation; between equal bends the
+        pair that encloses less of the inside goes first, so that solids that touch in an edge come
+        apart.
     """
-    order, first = np.argsort(edge_of, kind="stable"), np.cumsum(count) - count
+    order = np.argsort(edge_of, kind="stable")
+    first = np.cumsum(count) - count
     pairs = [np.empty((0, 2), np.int64)]
     for k in range(3, MOST_AROUND_EDGE + 1):
-        around = order[first[count == k][:, None] + np.arange(k)]
+        around = order[first[count == k][:, None] + np.arange(k)]  # (edges, k) half-edges
         pairs += [around[:, [i, j]] for i in range(k) for j in range(i + 1, k)]
     pairs = np.concatenate(pairs)
-    m, start = len(F), group[F].T.ravel()
-    N = triangle_normals(P, F)
-    N /= np.maximum(
-        np.linalg.norm(N, axis=1, keepdims=True), np.finfo(float).tiny
-    )  # some have lost theirs to rounding
-    one, other = N[pairs[:, 0] % m], N[pairs[:, 1] % m]
-    twisted = start[pairs[:, 0]] == start[pairs[:, 1]]
-    cos = np.einsum("ij,ij->i", one, other) * np.where(twisted, -1, 1)
-    file_vertex = F.T.ravel()
-    towards = P[file_vertex[(pairs[:, 1] + 2 * m) % (3 * m)]] - P[file_vertex[pairs[:, 0]]]
-    convex = np.einsum("ij,ij->i", one, towards) < 0
+    h, g = pairs.T
+    m = len(F)
+    normal = triangle_normals(P, F)
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    normal /= np.maximum(length, np.finfo(float).tiny)  # some have lost theirs to rounding
+    start = group[F].T.ravel()
+    twisted = start[h] == start[g]
+    cos = np.einsum("ij,ij->i", normal[h % m], normal[g % m]) * np.where(twisted, -1, 1)
+    corner = F.T.ravel()
+    towards = P[corner[(g + 2 * m) % (3 * m)]] - P[corner[h]]  # to the other one's third corner
+    convex = np.einsum("ij,ij->i", normal[h % m], towards) < 0
     return pairs, np.round(1 - cos, 6) + 4 * twisted - 1e-7 * convex
 
 
 def _orient(P, F, group, mate, counts):
-    """Triangles turned so that mates run against each other.
-
-    Most of the area of each patch as it was.
+    """Turn triangles so that mates run against each other, most of each patch's area as it was.
 
     A triangle stands for two nodes, as it is and reversed; a patch whose two copies are connected
     cannot be oriented (a Moebius strip), and is cut where the file's orientation changes.
@@ -96,100 +113,122 @@ def _orient(P, F, group, mate, counts):
     if not twisted.any():
         return F, mate
     t, u = h % m, g % m
-    ends = np.stack([np.r_[t, t + m], np.r_[u + m * twisted, u + m * ~twisted]], axis=1)
-    label = components(ends, 2 * m)
-    same, turned = label[:m], label[m:]
-    area = np.bincount(same, triangle_areas(P, F), label.max() + 1)
-    flip = (area[turned] > area[same]) | ((area[turned] == area[same]) & (turned < same))
-    cut = twisted & (same == turned)[t]
+    links = np.stack([np.r_[t, t + m], np.r_[u + m * twisted, u + m * ~twisted]], axis=1)
+    label = components(links, 2 * m)
+    as_is, turned = label[:m], label[m:]
+    area = np.bincount(as_is, triangle_areas(P, F), label.max() + 1)
+    tie = (area[turned] == area[as_is]) & (turned < as_is)
+    flip = (area[turned] > area[as_is]) | tie
+    cut = twisted & (as_is == turned)[t]
     mate[h[cut]] = mate[g[cut]] = -1
     counts["reoriented_triangles"] += int(flip.sum())
     return _reverse(F, mate, np.flatnonzero(flip))
 
 
 def _reverse(F, mate, t):
-    """Triangles t with corners 0 and 1 exchanged.
-
-    So that their half-edge 0 stays and 1 and 2 trade places.
-    """
+    """Exchange corners 0 and 1 of triangles t: half-edge 0 stays, 1 and 2 trade places."""
     m, F = len(F), F.copy()
     F[t] = F[t][:, [1, 0, 2]]
     moved = np.arange(3 * m)
-    moved[t + m], moved[t + 2 * m] = t + 2 * m, t + m
+    moved[t + m] = t + 2 * m
+    moved[t + 2 * m] = t + m
     mate = mate[moved]
     return F, np.where(mate >= 0, moved[mate], -1)
 
 
-def umbrellas(F, mate):
-    """Vertices as the sets of corners that mates join.
+def join_corners(F: np.ndarray, mate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices as the sets of corners that mates join: one for each umbrella of triangles.
 
-    ``(m, 3)``, and the smallest file vertex of each.
+    A bow-tie or the end of a separated edge falls apart into several.
 
-    A bow-tie or the end of a separated edge falls apart into one vertex per umbrella.
+    Returns
+    -------
+    V : int ndarray (m, 3)
+        The triangles' corners as such vertices.
+    file_vertex : int ndarray (n,)
+        The smallest file vertex of each.
     """
     m = len(F)
     h = np.flatnonzero(mate > np.arange(3 * m))
     g = mate[h]
-    ends = np.stack([np.r_[h, (h + m) % (3 * m)], np.r_[(g + m) % (3 * m), g]], axis=1)
-    label = components(ends, 3 * m)
+    # the start of one is the end of the other
+    links = np.stack([np.r_[h, (h + m) % (3 * m)], np.r_[(g + m) % (3 * m), g]], axis=1)
+    label = components(links, 3 * m)
     file_vertex = np.full(label.max() + 1, np.iinfo(np.int64).max)
     np.minimum.at(file_vertex, label, F.T.ravel())
     order = np.argsort(file_vertex, kind="stable")
     return np.argsort(order)[label].reshape(3, m).T, file_vertex[order]
 
 
-def split_double_edges(X, V, file_vertex, mate, counts):
-    """Two sheets may share both ends of an edge and still be apart.
+def split_double_edges(
+    X: np.ndarray, V: np.ndarray, file_vertex: np.ndarray, mate: np.ndarray, counts: dict
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Give each of two sheets its own midpoint where they share both ends of an edge.
 
-    Each gets its own midpoint there.
+    Returns
+    -------
+    X : float ndarray (n + s, 3)
+        The midpoints appended.
+    V : int ndarray (m', 3)
+        A triangle with midpoints is replaced by those around them.
+    file_vertex : int ndarray (n + s,)
     """
     m, n = len(V), len(X)
     E, edge_of, count = unique_edges(V, n)
     start = V.T.ravel()
     turn = np.bincount(edge_of, np.where(start < np.roll(start, -m), 1, -1))
-    half = np.flatnonzero(((count > 2) | ((count == 2) & (turn != 0)))[edge_of])
+    double = (count > 2) | ((count == 2) & (turn != 0))
+    half = np.flatnonzero(double[edge_of])
     if len(half) == 0:
         return X, V, file_vertex
     sheet = np.where(mate[half] >= 0, np.minimum(mate[half], half), half)
     sheets, middle = np.unique(sheet, return_inverse=True)
     M = np.full(3 * m, -1)
     M[half] = n + middle
-    M = M.reshape(3, m).T
+    M = M.reshape(3, m).T  # (m, 3) the midpoint of each side, or -1
+    #        r             a is there: the sides are turned until it is;
+    #      / | \           without c the triangle a-c-p is none, without b it is a-q-b
+    #    c   |   b
+    #   /  \ | /  \
+    #  p-----a-----q
     t = np.flatnonzero((M >= 0).any(axis=1))
     turn = ((M[t] >= 0).argmax(axis=1)[:, None] + np.arange(3)) % 3
-    (p, q, r), (a, b, c) = np.take_along_axis(V[t], turn, 1).T, np.take_along_axis(M[t], turn, 1).T
-    b, c = np.where(b < 0, r, b), np.where(c < 0, p, c)
-    fan = np.concatenate(
-        [np.stack(x, axis=1) for x in ((a, q, b), (a, b, r), (a, r, c), (a, c, p))]
-    )
+    p, q, r = np.take_along_axis(V[t], turn, 1).T
+    a, b, c = np.take_along_axis(M[t], turn, 1).T
+    b = np.where(b < 0, r, b)
+    c = np.where(c < 0, p, c)
+    parts = [(a, q, b), (a, b, r), (a, r, c), (a, c, p)]
+    fan = np.concatenate([np.stack(part, axis=1) for part in parts])
     fan = fan[(fan[:, 0] != fan[:, 2]) & (fan[:, 1] != fan[:, 2])]
     ends = E[edge_of[sheets]]
     counts["inserted_vertices"] = len(sheets)
     X = np.concatenate([X, X[ends].mean(axis=1)])
-    return (
-        X,
-        np.concatenate([np.delete(V, t, axis=0), fan]),
-        np.r_[file_vertex, file_vertex[ends].min(axis=1)],
-    )
+    V = np.concatenate([np.delete(V, t, axis=0), fan])
+    return X, V, np.r_[file_vertex, file_vertex[ends].min(axis=1)]
 
 
-def cheapest(cost, ends):
-    """Greedy matching: mask of the pairs taken in order of cost, each end once.
+def cheapest(cost: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Greedy matching: the mask of the pairs taken in order of cost, each end once.
 
-    Ends ``(c, 2)`` int.
+    Parameters
+    ----------
+    cost : float ndarray (c,)
+    ends : int ndarray (c, 2)
     """
     if len(cost) == 0:
         return np.zeros(0, bool)
     rank = np.argsort(np.argsort(cost, kind="stable"))
     items, ends = np.unique(ends, return_inverse=True)
     ends = ends.reshape(-1, 2)
-    taken, used, open_ = np.zeros(len(cost), bool), np.zeros(len(items), bool), np.arange(len(cost))
-    while len(open_):
+    taken, used = np.zeros(len(cost), bool), np.zeros(len(items), bool)
+    left = np.arange(len(cost))
+    while len(left):  # all pairs at once that are the best of both their ends
         best = np.full(len(items), len(cost))
-        np.minimum.at(best, ends[open_], rank[open_, None])
-        win = open_[(best[ends[open_]] == rank[open_, None]).all(axis=1)]
-        taken[win], used[ends[win]] = True, True
-        open_ = open_[~used[ends[open_]].any(axis=1)]
+        np.minimum.at(best, ends[left], rank[left, None])
+        win = left[(best[ends[left]] == rank[left, None]).all(axis=1)]
+        taken[win] = True
+        used[ends[win]] = True
+        left = left[~used[ends[left]].any(axis=1)]
     return taken
 
 
