@@ -1,7 +1,4 @@
-"""Files of labels and landmarks (6.2).
-
-Read and write what experts marked on a mesh, in the order of its file.
-"""
+"""Files of labels and landmarks (6.2): what experts marked on a mesh, in the order of its file."""
 
 import csv
 import io
@@ -108,80 +105,86 @@ def _gifti_labels(data):
     return found[0]
 
 
+class _Numbers:
+    """Big-endian integers, and texts of a length that stands before them, one after the other."""
+
+    def __init__(self, data):
+        self.data, self.at = data, 0
+
+    def take(self, count):
+        """The next integers."""
+        left = (len(self.data) - self.at) // 4
+        if not 0 <= count <= left:
+            raise ValueError(f"expected {count} numbers, found {left}: the file is cut short")
+        start, self.at = self.at, self.at + 4 * count
+        return np.frombuffer(self.data, ">i4", count, start).astype(np.int64)
+
+    def take_one(self):
+        return int(self.take(1)[0])
+
+    def skip_text(self):
+        length, left = self.take_one(), len(self.data) - self.at
+        if not 0 <= length <= left:
+            raise ValueError(
+                f"expected a text of {length} bytes, found {left}: the file is cut short"
+            )
+        self.at += length
+
+
 def _annot_labels(data):
     """Rows of the colour table.
 
-    Nibabel's reader gives some row to an annotation that is not in the table.
+    nibabel's reader gives some row to an annotation that is not in the table.
     """
-    at = 0
-
-    def take(count):
-        """The next big-endian integers."""
-        nonlocal at
-        if not 0 <= 4 * count <= len(data) - at:
-            raise ValueError(
-                f"expected {count} numbers, found {(len(data) - at) // 4}: the file is cut short"
-            )
-        at += 4 * count
-        return np.frombuffer(data, ">i4", count, at - 4 * count).astype(np.int64)
-
-    def skip_text():
-        nonlocal at
-        length = take(1)[0]
-        if not 0 <= length <= len(data) - at:
-            raise ValueError(
-                f"expected a text of {length} bytes, found {len(data) - at}: the file is cut short"
-            )
-        at += int(length)
-
-    vertex, annotation = take(2 * int(take(1)[0])).reshape(-1, 2).T
+    file = _Numbers(data)
+    vertex, annotation = file.take(2 * file.take_one()).reshape(-1, 2).T
     if not np.array_equal(np.sort(vertex), np.arange(len(vertex))):
         raise ValueError(f"every vertex from 0 to {len(vertex) - 1} expected once")
-    if not take(1)[0]:
+    if not file.take_one():
         raise ValueError("a colour table expected, found none")
-    count, rows = int(take(1)[0]), {}
-    if count < 0:
-        if count != -2:
-            raise ValueError(f"a colour table of version 2 expected, found {-count}")
-        take(1)
-        skip_text()
-        count = int(take(1)[0])
-        numbered = True
-    else:
-        skip_text()
-        numbered = False
-    for i in range(count):
-        row = int(take(1)[0]) if numbered else i
-        skip_text()
-        r, g, b, _ = take(4)
-        rows.setdefault(int(r + 256 * g + 65536 * b), row)
-    rows[0] = -1
-    values, of_value = np.unique(annotation, return_inverse=True)
-    unknown = [value for value in values.tolist() if value not in rows]
+    row_of_colour = _colour_table(file)
+    values, place = np.unique(annotation, return_inverse=True)
+    unknown = [value for value in values.tolist() if value not in row_of_colour]
     if unknown:
         raise ValueError(
             f"annotations of the colour table expected, found {unknown[:3]}, which are not in it"
         )
+    rows = np.array([row_of_colour[value] for value in values.tolist()], np.int64)
     labels = np.empty(len(vertex), np.int64)
-    labels[vertex] = np.array([rows[value] for value in values.tolist()], np.int64)[of_value]
+    labels[vertex] = rows[place]
     return labels
 
 
-def table_rows(data: bytes) -> list[list[str]]:
-    """Rows of a table separated by commas, semicolons, tabs or spaces.
+def _colour_table(file):
+    """The row of each colour, -1 for none; in version 2, rows are numbered in the file."""
+    count = file.take_one()
+    numbered = count < 0
+    if numbered:
+        if count != -2:
+            raise ValueError(f"a colour table of version 2 expected, found {-count}")
+        file.take_one()
+    file.skip_text()
+    if numbered:
+        count = file.take_one()
+    row_of_colour = {}
+    for i in range(count):
+        row = file.take_one() if numbered else i
+        file.skip_text()
+        red, green, blue, _ = file.take(4).tolist()
+        row_of_colour.setdefault(red + 256 * green + 65536 * blue, row)
+    row_of_colour[0] = -1
+    return row_of_colour
 
-    Comments and empty lines are left out.
-    """
-    lines = [
-        s for s in data.decode("utf-8-sig").splitlines() if s.strip() and not s.startswith("#")
-    ]
+
+def table_rows(data: bytes) -> list[list[str]]:
+    """Rows of a table separated by commas, semicolons, tabs or spaces, without comments."""
+    text = data.decode("utf-8-sig")
+    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     if not lines:
         raise ValueError("the file is empty")
-    mark = next((m for m in ",;\t" if m in lines[0]), " ")
-    return [
-        [cell.strip() for cell in row]
-        for row in csv.reader(lines, delimiter=mark, skipinitialspace=True)
-    ]
+    mark = next((mark for mark in ",;\t" if mark in lines[0]), " ")
+    rows = csv.reader(lines, delimiter=mark, skipinitialspace=True)
+    return [[cell.strip() for cell in row] for row in rows]
 
 
 def short(texts: list[str]) -> list[str]:
@@ -284,9 +287,8 @@ def _slicer_points(data):
     lists = json.loads(data.decode("utf-8-sig"))["markups"]
     systems = {str(m.get("coordinateSystem", "LPS")).upper() for m in lists}
     if len(systems) != 1 or not systems <= {"LPS", "RAS"}:
-        raise ValueError(
-            f"one coordinateSystem, LPS or RAS, needed, found {', '.join(sorted(systems)) or 'no markups'}"
-        )
+        names = ", ".join(sorted(systems)) or "no markups"
+        raise ValueError(f"one coordinateSystem, LPS or RAS, needed, found {names}")
     rows, taken = [], set()
     for i, m in enumerate(lists, 1):
         curve = ""
@@ -341,25 +343,18 @@ def _table_points(data):
 
 
 def write_landmarks(path: Path | str, landmarks: xr.Dataset) -> None:
-    """Write ``landmark_name`` and ``landmark_position`` as CSV ``name,x,y,z``.
-
-    With curves also ``curve,closed``.
-    """
+    """Write landmarks as CSV ``name,x,y,z``, and ``curve,closed`` where there are curves."""
     require(landmarks, "landmark_name", "landmark_position", what="landmarks")
+    columns = [landmarks["landmark_name"].values]
+    columns += list(landmarks["landmark_position"].values.astype(float).T)
+    head = ["name", "x", "y", "z"]
+    if "landmark_curve" in landmarks:
+        head += ["curve", "closed"]
+        columns += [landmarks["landmark_curve"].values, landmarks["landmark_closed"].values]
     with open(path, "w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
-        curves = ["landmark_curve", "landmark_closed"] if "landmark_curve" in landmarks else []
-        table.writerow(
-            ["name", "x", "y", "z", *(name.removeprefix("landmark_") for name in curves)]
-        )
-        names, points = landmarks["landmark_name"].values, landmarks["landmark_position"].values
-        further = (
-            zip(*(landmarks[name].values.tolist() for name in curves), strict=True)
-            if curves
-            else [()] * len(names)
-        )
-        rows = zip(names, points, further, strict=True)
-        table.writerows([name, *(repr(float(v)) for v in x), *more] for name, x, more in rows)
+        table.writerow(head)
+        table.writerows(zip(*(column.tolist() for column in columns), strict=True))
 
 
 def labels_of_mesh(labels: ArrayLike, mesh: xr.Dataset) -> np.ndarray:
@@ -383,7 +378,8 @@ def labels_of_mesh(labels: ArrayLike, mesh: xr.Dataset) -> np.ndarray:
     n = mesh.sizes["file_vertex_index"]
     if np.shape(labels) != (n,):
         raise ValueError(
-            f"{n} labels, one per vertex of the file of the mesh, needed, found shape {np.shape(labels)}"
+            f"{n} labels, one per vertex of the file of the mesh, needed, "
+            f"found shape {np.shape(labels)}"
         )
     return np.asarray(labels)[mesh["file_vertex"].values]
 

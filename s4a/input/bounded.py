@@ -17,10 +17,8 @@ from xml.parsers import expat
 import numpy as np
 
 LARGEST = 2**30  # bytes that a file may unpack to: 30 million vertices and their triangles
-LEAST, RATIO = (
-    2**26,
-    200,
-)  # unpacked size that is never refused, and how many times the size of the file beyond it
+LEAST = 2**26  # unpacked size that is never refused
+RATIO = 200  # times the size of the file that it may unpack to beyond that
 GZIP = b"\x1f\x8b"
 
 
@@ -40,15 +38,13 @@ def check(unpacked: int, size: int) -> None:
     """ValueError when `unpacked` bytes are more than a file of `size` bytes may hold."""
     if unpacked > limit_of(size):
         raise ValueError(
-            f"at most {limit_of(size) / 2**20:.0f} MiB expected in {size} compressed bytes, found more: "
-            "unpack the file yourself if you trust it"
+            f"at most {limit_of(size) / 2**20:.0f} MiB expected in {size} compressed bytes, "
+            "found more: unpack the file yourself if you trust it"
         )
 
 
 def gunzip(data: bytes) -> bytes:
-    """The bytes of a gzip file (several members too).
-
-    Or ValueError where they are too many or end early.
+    """The bytes of a gzip file (several members too); ValueError if too many, or it ends early.
 
     Examples
     --------
@@ -86,9 +82,7 @@ def unpack(data: bytes, compressor: str, limit: int) -> bytes:
 
 
 def xml(text: bytes | str) -> ElementTree.Element:
-    """The root of an XML file.
-
-    ValueError where it declares entities, which could grow or name other files.
+    """The root of an XML file; ValueError for entities, which could grow or name other files.
 
     Examples
     --------

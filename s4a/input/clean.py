@@ -139,7 +139,8 @@ def clean_arrays(
         the dropped components.
     """
     P, F = _validated(points, triangles, components)
-    counts = {"file_vertices": len(P), "file_triangles": len(F), **dict.fromkeys(REPAIRS, 0)}
+    counts: dict[str, int | float] = {"file_vertices": len(P), "file_triangles": len(F)}
+    counts |= dict.fromkeys(REPAIRS, 0)
     counts["unreferenced_vertices"] = len(P) - n_used(F)
     F = _drop_nonfinite(P, F, strict, counts)
     group, tolerance = _weld(P, F, counts)
@@ -186,8 +187,11 @@ def repairs(counts: dict[str, int | float]) -> str:
 
 def check_components(components: str | int) -> None:
     """ValueError unless `components` is "largest", "all" or a number from 1."""
-    number = isinstance(components, int | np.integer) and not isinstance(components, bool)
-    if components not in ("largest", "all") and not (number and components >= 1):
+    if isinstance(components, int | np.integer) and not isinstance(components, bool):
+        known = components >= 1
+    else:
+        known = components in ("largest", "all")
+    if not known:
         raise ValueError(
             f'components needs to be "largest", "all" or a number from 1; found {components!r}'
         )

@@ -1,9 +1,7 @@
-"""A collection of shapes.
-
-Every file read and cleaned, and a report of what was found (4.1, the input).
-"""
+"""A collection of shapes (5.1, the data): every file read and cleaned, and a report on all."""
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -12,23 +10,26 @@ import xarray as xr
 from s4a.geometry.mesh import as_dataset
 from s4a.input import plausibility
 from s4a.input.clean import REPAIRS, check_components, clean
-from s4a.input.files import find_meshes, not_meshes, read_mesh, slug
+from s4a.input.files import Paths, find_meshes, not_meshes, read_mesh, slug
 from s4a.schema import check_switch, check_text, dataset, in_unit
 
-COUNTS = (
+# columns of the report
+COUNTS = [
     *REPAIRS,
-    "file_vertices",
-    "file_triangles",
-    "components",
-    "holes",
-    "genus",
-    "self_intersections",
-)
+    *"file_vertices file_triangles components holes genus self_intersections".split(),
+]
 TEXTS = ("status", "reason", "warning", "path")
+AREAS = ("area", "area_dropped")
 
 
-def read_shape(path, *, components="largest", strict=False, close_holes=False):
-    """One mesh file, cleaned.
+def read_shape(
+    path: str | os.PathLike,
+    *,
+    components: str | int = "largest",
+    strict: bool = False,
+    close_holes: bool = False,
+) -> xr.Dataset:
+    """Read one mesh file and clean it.
 
     Parameters
     ----------
@@ -67,23 +68,22 @@ def read_shape(path, *, components="largest", strict=False, close_holes=False):
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     if "note" in attrs:
-        mesh.attrs["reason"] = "; ".join(
-            filter(None, [mesh.attrs.pop("note"), mesh.attrs["reason"]])
-        )
+        reasons = [mesh.attrs.pop("note"), mesh.attrs["reason"]]
+        mesh.attrs["reason"] = "; ".join(filter(None, reasons))
     return in_unit(mesh, mesh.attrs.get("unit"))
 
 
 def read_shapes(
-    paths,
+    paths: Paths | dict,
     *,
-    components="largest",
-    strict=False,
-    close_holes=False,
-    pattern=None,
-    compare=True,
-    intersections=True,
-):
-    """A collection of shapes, cleaned, and a report.
+    components: str | int = "largest",
+    strict: bool = False,
+    close_holes: bool = False,
+    pattern: str | None = None,
+    compare: bool = True,
+    intersections: bool = True,
+) -> xr.DataTree:
+    """Read a collection of shapes, clean each, and report on all.
 
     Parameters
     ----------
@@ -126,32 +126,30 @@ def read_shapes(
     check_switch("strict", strict)
     check_switch("close_holes", close_holes)
     check_text("pattern", pattern)
+    options = {"components": components, "strict": strict, "close_holes": close_holes}
     meshes, attrs = {}, {}
     for name, source in _sources(paths, pattern).items():
         try:
-            meshes[name] = _cleaned(
-                source, components=components, strict=strict, close_holes=close_holes
-            )
+            meshes[name] = _cleaned(source, **options)
             attrs[name] = meshes[name].attrs
         except ValueError as error:
             path = str(source) if isinstance(source, Path) else ""
             attrs[name] = {"status": "excluded", "reason": str(error), "path": path}
     if not meshes:
-        reasons = "; ".join(f"{name}: {given['reason']}" for name, given in attrs.items())
+        reasons = "; ".join(f"{name}: {said['reason']}" for name, said in attrs.items())
         raise ValueError(f"none of {len(attrs)} shapes can be used ({reasons})")
-    looks, remarks = {}, passed_over(paths, pattern)
+    evidence = {}
     if compare and len(meshes) > 1:
-        reference = plausibility.sample(
-            meshes[plausibility.median_size({n: m.attrs["area"] for n, m in meshes.items()})]
-        )
-        looks = {
-            name: plausibility.look(mesh, reference, intersections) for name, mesh in meshes.items()
-        }
+        areas = {name: mesh.attrs["area"] for name, mesh in meshes.items()}
+        reference = plausibility.sample_vertices(meshes[plausibility.median_size(areas)])
+        for name, mesh in meshes.items():
+            evidence[name] = plausibility.examine(mesh, reference, intersections)
     nodes = {f"/original/{name}": mesh for name, mesh in meshes.items()}
-    return xr.DataTree.from_dict({**nodes, "/report": shape_report(attrs, looks, remarks)})
+    nodes["/report"] = shape_report(attrs, evidence, passed_over(paths, pattern))
+    return xr.DataTree.from_dict(nodes)
 
 
-def passed_over(paths, pattern=None):
+def passed_over(paths: Paths | dict | xr.DataTree, pattern: str | None = None) -> list[str]:
     """The files among `paths` that are no meshes, in words."""
     if isinstance(paths, dict | xr.DataTree):
         return []
@@ -161,32 +159,42 @@ def passed_over(paths, pattern=None):
     ]
 
 
-def shape_report(attrs, looks=None, remarks=(), doubts=None):
-    """The report on shapes from the attributes of each.
+def shape_report(
+    attrs: dict[str, dict],
+    evidence: dict[str, dict] | None = None,
+    remarks: Iterable[str] = (),
+    doubts: dict[str, str] | None = None,
+) -> xr.Dataset:
+    """Make the report on the shapes of a collection.
 
-    A dict of name to ``status``, ``reason``, ``path``, counts.
-
-    Counts are -1 where a shape was excluded.  `looks` are of :func:`s4a.input.plausibility.look`;
-    `remarks` are kept as they are, with those on the collection; `doubts` are further warnings, a
-    dict of name to str.
+    Parameters
+    ----------
+    attrs : dict
+        Name of each shape -> ``status``, ``reason``, ``path`` and counts; where one was excluded,
+        counts are -1 in the report.
+    evidence : dict, optional
+        Name -> :func:`s4a.input.plausibility.examine`.
+    remarks : list of str
+        Kept as they are, before those on the collection.
+    doubts : dict of str to str, optional
+        Further warnings.
     """
-    used = {name: given for name, given in attrs.items() if given["status"] != "excluded"}
-    warning, of_all = plausibility.warnings(used, looks or {})
-    counted = {
-        n: {"self_intersections": look["self_intersections"]} for n, look in (looks or {}).items()
+    evidence, doubts = evidence or {}, doubts or {}
+    used = {name: said for name, said in attrs.items() if said["status"] != "excluded"}
+    warnings, of_all = plausibility.find_warnings(used, evidence)
+    rows = []
+    for name, said in attrs.items():
+        parts = [warnings.get(name), doubts.get(name)]
+        rows.append({**said, "warning": "; ".join(filter(None, parts))})
+        if name in evidence:
+            rows[-1]["self_intersections"] = evidence[name]["self_intersections"]
+    columns: dict[str, list | np.ndarray] = {
+        key: [str(row.get(key, "")) for row in rows] for key in TEXTS
     }
-    said = {n: "; ".join(filter(None, [warning.get(n), (doubts or {}).get(n)])) for n in attrs}
-    attrs = {n: given | counted.get(n, {}) | {"warning": said[n]} for n, given in attrs.items()}
-    columns = {name: [str(given.get(name, "")) for given in attrs.values()] for name in TEXTS}
-    columns |= {
-        name: np.array([given.get(name, -1) for given in attrs.values()], np.int64)
-        for name in COUNTS
-    }
-    for name in ("area", "area_dropped"):
-        columns[name] = [float(given.get(name, np.nan)) for given in attrs.values()]
-    return dataset({"remarks": "\n".join([*remarks, *of_all])}, **columns).assign_coords(
-        shape=list(attrs)
-    )
+    columns |= {key: np.array([row.get(key, -1) for row in rows], np.int64) for key in COUNTS}
+    columns |= {key: [float(row.get(key, np.nan)) for row in rows] for key in AREAS}
+    report = dataset({"remarks": "\n".join([*remarks, *of_all])}, **columns)
+    return report.assign_coords(shape=list(attrs))
 
 
 def _sources(paths, pattern):
@@ -200,6 +208,7 @@ def _sources(paths, pattern):
 
 
 def _cleaned(source, **options):
+    """A file, a Dataset or a pair of arrays, cleaned."""
     if isinstance(source, Path):
         return read_shape(source, **options)
     if isinstance(source, xr.Dataset):

@@ -183,9 +183,9 @@ def split_double_edges(
         return X, V, file_vertex
     sheet = np.where(mate[half] >= 0, np.minimum(mate[half], half), half)
     sheets, middle = np.unique(sheet, return_inverse=True)
-    M = np.full(3 * m, -1)
-    M[half] = n + middle
-    M = M.reshape(3, m).T  # (m, 3) the midpoint of each side, or -1
+    of_half = np.full(3 * m, -1)
+    of_half[half] = n + middle
+    M = of_half.reshape(3, m).T  # (m, 3) the midpoint of each side, or -1
     #        r             a is there: the sides are turned until it is;
     #      / | \           without c the triangle a-c-p is none, without b it is a-q-b
     #    c   |   b

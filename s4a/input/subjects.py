@@ -1,7 +1,4 @@
-"""Covariates and groups of the shapes (6.1).
-
-A table beside the meshes, on which nothing but the statistics depends.
-"""
+"""Covariates and groups of the shapes (6.1): a table on which only the statistics depend."""
 
 import csv
 from collections.abc import Mapping, Sequence
@@ -33,8 +30,9 @@ def _head_and_rows(path):
         )
     ragged = [(i, row) for i, row in enumerate(rows, 2) if len(row) != len(head)]
     if ragged:
+        number, row = ragged[0]
         raise ValueError(
-            f"{path}: {len(head)} cells in every row needed; row {ragged[0][0]} has {len(ragged[0][1])}"
+            f"{path}: {len(head)} cells in every row needed; row {number} has {len(row)}"
         )
     return head, rows
 
@@ -75,27 +73,29 @@ def read_table(path: Path | str, names: list[str]) -> xr.Dataset:
     >>> from s4a.input.subjects import read_table
     >>> file = Path(tempfile.mkdtemp()) / "subjects.csv"
     >>> _ = file.write_text("shape,sex,age\\nb.ply,f,31\\na,m,NA\\n")
-    >>> read_table(file, ["a", "b"])["age"].values.tolist(), read_table(file, ["a", "b"])["sex"].values.tolist()
+    >>> table = read_table(file, ["a", "b"])
+    >>> table["age"].values.tolist(), table["sex"].values.tolist()
     ([nan, 31.0], ['m', 'f'])
     """
     path = Path(path)
     head, rows = _head_and_rows(path)
-    found = {}
+    row_of = {}
     for row in rows:
         name = _shape_of(row[head.index("shape")], names)
-        if name in found:
+        if name in row_of:
             raise ValueError(f"{path}: one row for each shape needed; found two for {name!r}")
-        found[name] = row
-    unknown = [name for name in found if name not in names]
-    missing = [name for name in names if name not in found]
+        row_of[name] = row
+    unknown = [name for name in row_of if name not in names]
+    missing = [name for name in names if name not in row_of]
     if unknown or missing:
         said = [f"no shape is called {', '.join(map(repr, unknown))}"] if unknown else []
         said += [f"no row for {', '.join(missing)}"] if missing else []
         raise ValueError(
-            f"{path}: a row for every shape and no other needed in the column 'shape'; {'; '.join(said)}"
+            f"{path}: a row for every shape and no other needed in the column 'shape'; "
+            + "; ".join(said)
         )
     columns = {
-        column: _values([found[name][i] for name in names])
+        column: _values([row_of[name][i] for name in names])
         for i, column in enumerate(head)
         if column != "shape"
     }

@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 from s4a.geometry.align import align, realign
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.input.collection import read_shapes, shape_report
-from s4a.input.plausibility import look, sample, warnings
+from s4a.input.plausibility import examine, find_warnings, sample_vertices
 from s4a.method.first_map import first_map
 from s4a.method.latent import latent_basis_of_new
 from s4a.method.median import area_differences, conformal_differences, distance_to_identity
@@ -234,7 +234,7 @@ def _insert_one(mesh, frozen, options, compare):
     )
     seen = {}
     if compare:
-        seen = look(mesh, sample(frozen.template.original), options.intersections)
+        seen = examine(mesh, sample_vertices(frozen.template.original), options.intersections)
     return Inserted(coarse, Y, registration, seen)
 
 
@@ -252,7 +252,7 @@ def report_beside(study: xr.DataTree, attrs: dict, looks: dict) -> xr.Dataset:
     # the hand of the study is the right one, and its own intersections are told already
     usual = {"residual": 0.0, "mirrored": 1.0, "self_intersections": -1}
     known_looks = {name: usual | {"rotation": rotation.sel(shape=name).values} for name in known}
-    told_before = warnings(known, known_looks)[1]
+    told_before = find_warnings(known, known_looks)[1]
     reports, remarks = [], {}
     for name, said in attrs.items():
         own_look = {name: looks[name]} if name in looks else {}

@@ -86,7 +86,7 @@ def of_shape(run: Run, name: str, source: str | xr.Dataset, options: Options) ->
 
 
 def of_look(run: Run, name: str) -> dict:
-    """What :func:`s4a.input.plausibility.look` saw in a shape."""
+    """What :func:`s4a.input.plausibility.examine` saw in a shape."""
     look = read(run.folder / f"network/look_{name}.nc")
     return look.attrs | {"rotation": look["rotation"].values}
 

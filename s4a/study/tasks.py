@@ -37,9 +37,9 @@ def clean_shape(source: str | xr.Dataset, cleaning: dict) -> xr.Dataset:
 
 
 def compare_shape(folder: Path, name: str, reference: str, intersections: bool) -> xr.Dataset:
-    """What :func:`s4a.input.plausibility.look` sees in a shape beside the reference."""
+    """What :func:`s4a.input.plausibility.examine` sees in a shape beside the reference."""
     mesh, other = (read(folder / "original" / f"{n}.nc") for n in (name, reference))
-    look = plausibility.look(mesh, plausibility.sample(other), intersections)
+    look = plausibility.examine(mesh, plausibility.sample_vertices(other), intersections)
     rotation = look.pop("rotation")
     return dataset(look, rotation=rotation)
 
