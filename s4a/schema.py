@@ -74,7 +74,8 @@ ROWS = {
         "functional map, source functions to target functions"),
     "fmap_initial": ("pair mode_target_initial mode_source_initial", ONE,
         "functional map before Consistent ZoomOut"),
-    "weight": ("pair", ONE, "weight of the map in the consistent latent basis"),
+    "weight": ("pair", ONE,
+        "weight of the map in the consistent latent basis, by its cycle error over all modes"),
     "cycle_error": ("pair", ONE,
         "mean |C_cycle - I|_F over the 3-cycles through the pair, first k_init modes, by "
         "sqrt(k_init)"),
@@ -97,7 +98,8 @@ ROWS = {
     # registration (eq. 6 - 8)
     "registered_match": ("shape vertex", ONE,
         "on each template vertex, the matched vertex of the shape"),
-    "displacement": ("shape vertex xyz", INPUT, "registered shape minus template, smooth"),
+    "displacement": ("shape vertex xyz", INPUT,
+        "registered shape minus template, smooth (eq. 8 with the other sign)"),
     "displacement_raw": ("shape vertex xyz", INPUT,
         "matched vertex of the aligned shape minus template"),
     "rotation": ("shape xyz xyz_2", ONE,

@@ -378,7 +378,13 @@ def one_collection(
 
     begin = time.process_time()
     _, _, _, Y, latent_eigenvalue = latent.consistent_zoomout(
-        bases, maps, source, target, k, step=step, samples=[basis.spread for basis in bases]
+        bases,
+        maps,
+        source,
+        target,
+        k,
+        step=step,
+        samples=[basis.spread_vertices for basis in bases],
     )
     found = dataset(latent_basis=Y, latent_eigenvalue=latent_eigenvalue).assign_coords(shape=names)
     found = median.median_shape(found, np.stack([basis.eigenvalue for basis in bases]))

@@ -22,11 +22,11 @@ from s4a.method import fmap, joint
 from s4a.method.first_map import N_LANDMARKS, nearest_after_motion
 from s4a.method.lift import SPARE, lift
 from s4a.method.nearest import (
-    columns_with_norm,
+    as_candidates,
+    as_queries,
+    nearest_float32,
     nearest_in_cells,
-    nearest_in_single,
     nearest_rows,
-    rows_with_minus_one,
 )
 from s4a.method.register import register_surface, sharpen_map
 from s4a.method.remesh import coarsen, laplacian
@@ -317,7 +317,7 @@ class Pair:
             "dense": lambda Q, D: nearest_in_cells(Q, N.cell, D, M.cell)[0],
             "local": nearest_rows,
             # other searches follow, so that near ties do not matter
-            "lifted": lambda Q, D: nearest_in_single(rows_with_minus_one(Q), columns_with_norm(D)),
+            "lifted": lambda Q, D: nearest_float32(as_queries(Q), as_candidates(D)),
         }[kind]
         C, low_match = clock(
             "refine", fmap.zoomout, M.low, N.low, C, self.k, step=self.step, nearest=nearest

@@ -1,4 +1,4 @@
-"""Rigid alignment by iterative closest points, and spread landmarks (4.1, steps 2 and 3).
+"""Rigid alignment by iterative closest points (4.1, step 2), and spread points.
 
 A motion ``R, t`` carries x to R x + t, rows of X to ``X @ R.T + t``.
 """

@@ -126,7 +126,10 @@ def rigid_parts(
 def displacement_in_template(
     X: np.ndarray, registered: np.ndarray, area: np.ndarray, *, scale: bool = False
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Displacement of the template, image minus template (eq. 8), in the template's frame.
+    """Displacement of the template (eq. 8), in the template's frame.
+
+    Image minus template: the paper's with the other sign, so that template + displacement is the
+    shape.
 
     The shape is moved rigidly onto the template before.
 

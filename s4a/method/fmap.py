@@ -1,4 +1,4 @@
-"""Functional maps (3.3, 4.1): fit, map <-> match (eq. 1, 2 and 4), ZoomOut.
+"""Functional maps (3.3, 4.1): fit, map <-> match (eq. 1 and 2), ZoomOut.
 
 The source is the paper's M with basis Phi, the target its N with basis Psi.  C carries functions
 source -> target; a match holds, for every vertex of the target, a vertex of the source.
@@ -21,10 +21,10 @@ from s4a.method.descriptors import (
     wave_filter,
 )
 from s4a.method.nearest import (
-    columns_with_norm,
-    nearest_in_single,
+    as_candidates,
+    as_queries,
+    nearest_float32,
     nearest_rows,
-    rows_with_minus_one,
 )
 from s4a.method.shape import Basis, Shape
 from s4a.schema import dataset, require
@@ -109,7 +109,7 @@ def refine_once(source: Basis, target: Basis, C: np.ndarray) -> np.ndarray:
     """One step of ZoomOut without growth (4.2): C -> match -> C of the same size."""
     Phi = source.Phi[:, : C.shape[1]]
     Psi = target.Phi[:, : len(C)]
-    match = nearest_in_single(rows_with_minus_one(Psi), columns_with_norm(Phi @ C.T))
+    match = nearest_float32(as_queries(Psi), as_candidates(Phi @ C.T))
     return fmap_from_match(Phi, Psi, target.mass, match)
 
 
@@ -334,7 +334,7 @@ def fit_descriptors(
             raise ValueError(
                 f"the {what} needs {k} eigenfunctions, found {mesh.sizes['mode']}: give a smaller k"
             )
-    vertices = [None, None] if landmarks is None else [np.asarray(v) for v in landmarks]
+    vertices = (None, None) if landmarks is None else tuple(np.asarray(v) for v in landmarks)
     if landmarks is not None and (
         len(vertices) != 2 or vertices[0].shape != vertices[1].shape or vertices[0].ndim != 1
     ):

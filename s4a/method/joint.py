@@ -60,9 +60,9 @@ def nearest_vertices(
 
 
 def fit_motion(source: Basis, target: Basis, match: np.ndarray) -> Motion:
-    """The motion that brings the central vertices of the target onto their matches ``(s,)``."""
-    central = target.central
-    return onto(target.X[central], source.X[match], target.area[central], target.smooth)
+    """The motion that brings the target's vertices near coarse ones onto their matches ``(s,)``."""
+    rows = target.near_coarse
+    return onto(target.X[rows], source.X[match], target.area[rows], target.coefficients)
 
 
 def low_rounds(
@@ -124,7 +124,7 @@ def low_rounds(
 def dense_rounds(
     source: Basis, target: Basis, motion: Motion, *, rounds: int = 3
 ) -> tuple[np.ndarray, Motion]:
-    """Joint rounds at full resolution, on the central vertices; motions of parts stay as they are.
+    """Joint rounds at full resolution, on vertices near coarse ones; motions of parts stay.
 
     Parameters
     ----------
@@ -138,14 +138,18 @@ def dense_rounds(
     match : int ndarray (s,)
     motion : tuple (R, t, c)
     """
-    match = nearest_vertices(source, target, move(target, motion), target.central)
+    match = nearest_vertices(source, target, move(target, motion), target.near_coarse)
     R, t, _ = motion
     for _ in range(rounds):
         if R.ndim == 2:
             motion = fit_motion(source, target, match)
         else:
-            motion = R, t, target.smooth(source.X[match] - turn(target, R, t)[target.central])
-        match = nearest_vertices(source, target, move(target, motion), target.central)
+            motion = (
+                R,
+                t,
+                target.coefficients(source.X[match] - turn(target, R, t)[target.near_coarse]),
+            )
+        match = nearest_vertices(source, target, move(target, motion), target.near_coarse)
     return match, motion
 
 
@@ -163,7 +167,7 @@ def registration_score(
     The round trip goes from a vertex of the target to its match and back to the vertex whose
     registered position (in position and normal) is nearest, measured along the edges of the target
     and cut at `limit`; the gaps are the mean distances of the registered target and the source, at
-    the central vertices of each.  Lengths are for unit area.
+    the vertices near coarse ones of each.  Lengths are for unit area.
 
     Stretch of edges is left out: on heads and brains with known warps it prefers maps that move
     nothing.
@@ -173,19 +177,19 @@ def registration_score(
     source, target : Basis
         At one resolution.
     match : int ndarray (s,)
-        For the central vertices of the target.
+        For the target's vertices near coarse ones.
     motion : tuple (R, t, c)
     """
     X = move(target, motion)
     tree = feature_tree(X, target.T)
-    central = np.arange(len(X))[target.central]
-    back = X[tree.query(source.tree.data[source.central])[1]]
-    back_gap = np.linalg.norm(source.X[source.central] - back, axis=1)
-    gap = np.linalg.norm(X[central] - source.X[match], axis=1)
+    rows = np.arange(len(X))[target.near_coarse]
+    back = X[tree.query(source.tree.data[source.near_coarse])[1]]
+    back_gap = np.linalg.norm(source.X[source.near_coarse] - back, axis=1)
+    gap = np.linalg.norm(X[rows] - source.X[match], axis=1)
     n_samples = min(n_samples, len(match))
     sample = target.outwards[np.linspace(0, len(match) - 1, n_samples).astype(int)]
     end = tree.query(source.tree.data[match[sample]])[1]
-    trip = path_lengths(target.graph, central[sample], end, limit)
+    trip = path_lengths(target.graph, rows[sample], end, limit)
     return float(trip.mean() + gap.mean() + back_gap.mean())
 
 

@@ -15,10 +15,10 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 
 from s4a.method.fmap import fmap_from_match
 from s4a.method.nearest import (
-    columns_with_norm,
-    nearest_in_single,
+    as_candidates,
+    as_queries,
+    nearest_float32,
     nearest_rows,
-    rows_with_minus_one,
 )
 from s4a.method.network import cycle_errors, cycle_weights, three_cycles
 from s4a.method.shape import Basis
@@ -255,7 +255,8 @@ def consistent_zoomout(
 
     Each round embeds every shape in the latent space (rows of Phi_i Y_i), matches nearest
     neighbours for every map (eq. 3) and solves for the next larger maps in the least-squares sense,
-    on `samples` only; the factor of the least squares is made once per shape.  In the last rounds
+    on `samples` only, whose least squares are factored once a round and target shape; on
+    samples Phi^T A of eq. 1 is no inverse of Phi.  In the last rounds
     (``WIDE``) the samples look among all vertices of the source: among its samples they are off by
     the spacing of these.  The latent basis is found to ``ROUGH`` on the way and to ``FINE`` at the
     end.
@@ -290,21 +291,24 @@ def consistent_zoomout(
     cycles = three_cycles(source.tolist(), target.tolist())
     eigenvalues = np.stack([basis.eigenvalue[:k] for basis in bases])
     sizes = [*range(C.shape[1], k, step), k]
-    everything = [np.arange(len(basis.area)) for basis in bases]
-    samples = everything if samples is None else samples
-    for size, larger in zip(sizes, [*sizes[1:], None], strict=True):
+    all_vertices = [np.arange(len(basis.area)) for basis in bases]
+    samples = all_vertices if samples is None else samples
+    wide = sizes[:-1][-WIDE:]
+    for size, next_size in zip(
+        sizes, [*sizes[1:], None], strict=True
+    ):  # the last only solves for Y
         error = cycle_errors(C, cycles, n_jobs=n_jobs)
         weight = cycle_weights(error)
         m = latent_size(n_latent, size, k)
-        tolerance = ROUGH if larger else FINE
+        tolerance = ROUGH if next_size else FINE
         Y, latent_eigenvalue = latent_basis(
             C, source, target, weight, eigenvalues, m, tolerance=tolerance, n_jobs=n_jobs
         )
         if progress:
             progress(size)
-        if larger:
-            among = everything if size in sizes[:-1][-WIDE:] else samples
-            C = larger_maps(bases, Y, source, target, larger, samples, among, n_jobs)
+        if next_size:
+            among = all_vertices if size in wide else samples
+            C = larger_maps(bases, Y, source, target, next_size, samples, among, n_jobs)
     return C, weight, error, Y, latent_eigenvalue
 
 
@@ -330,26 +334,26 @@ def larger_maps(
     size = Y.shape[1]
 
     def latent_rows(basis, vertices, y):
-        return columns_with_norm(basis.Phi[vertices, :size] @ y)
+        return as_candidates(basis.Phi[vertices, :size] @ y)
 
     def maps_into(j):
         """The maps into shape j: its least squares are factored once."""
         F = bases[j].Phi[samples[j], :k]
         root = np.sqrt(bases[j].area[samples[j]])
         solve = np.linalg.pinv(F * root[:, None]) * root  # (k, s)
-        query = rows_with_minus_one(F[:, :size] @ Y[j])
+        query = as_queries(F[:, :size] @ Y[j])
         maps = []
         for i in source[target == j]:
-            match = among[i][nearest_in_single(query, rows[i])]
+            match = among[i][nearest_float32(query, rows[i])]
             maps.append(solve @ bases[i].Phi.take(match, axis=0)[:, :k])
         return maps
 
     threads = Parallel(n_jobs=n_jobs, backend="threading")
     rows = threads(map(delayed(latent_rows), bases, among, Y))
     by_target = threads(delayed(maps_into)(j) for j in range(len(bases)))
-    C = np.stack([map_ for maps in by_target for map_ in maps])
-    given_order = np.argsort(np.argsort(target, kind="stable"), kind="stable")
-    return C[given_order]
+    C = np.empty((len(target), k, k))
+    C[np.argsort(target, kind="stable")] = [map_ for maps in by_target for map_ in maps]
+    return C
 
 
 def frozen_basis(C_out: np.ndarray, C_in: np.ndarray, Y: np.ndarray) -> np.ndarray:
@@ -421,14 +425,14 @@ def latent_basis_of_new(
     y = np.mean(
         [c @ y[:k_init, : min(k_init, m)] for c, y in zip(C, Y, strict=True)], axis=0
     )  # (k_init, <= m)
-    root = np.sqrt(new.area[new.spread])
+    root = np.sqrt(new.area[new.spread_vertices])
     while len(y) < k:
         size = min(len(y) + step, k)
-        query = new.Phi[new.spread, : len(y)] @ y
-        solve = np.linalg.pinv(new.Phi[new.spread, :size] * root[:, None]) * root
+        query = new.Phi[new.spread_vertices, : len(y)] @ y
+        solve = np.linalg.pinv(new.Phi[new.spread_vertices, :size] * root[:, None]) * root
         carried = 0
         for other, functions in zip(others, F, strict=True):
-            rows = functions[other.spread]
+            rows = functions[other.spread_vertices]
             match = nearest_rows(query, rows[:, : query.shape[1]])
             carried = carried + rows[match, : min(size, m)]
         y = solve @ carried / len(others)

@@ -38,8 +38,8 @@ def nearest_rows(Q: np.ndarray, D: np.ndarray, *, block: int = 256) -> np.ndarra
     >>> nearest_rows(np.array([[0.1], [4.0]]), np.array([[0.0], [5.0]])).tolist()
     [0, 1]
     """
-    q = rows_with_minus_one(Q)
-    d = columns_with_norm(D)
+    q = as_queries(Q)
+    d = as_candidates(D)
     longest = np.sqrt(2 * d[-1].max())
     length = np.linalg.norm(q[:, :-1], axis=1)
     rounding = 16 * np.finfo(np.float32).eps * longest * (length + longest)
@@ -58,12 +58,12 @@ def nearest_rows(Q: np.ndarray, D: np.ndarray, *, block: int = 256) -> np.ndarra
     return nearest
 
 
-def rows_with_minus_one(Q: np.ndarray) -> np.ndarray:
+def as_queries(Q: np.ndarray) -> np.ndarray:
     """(q, -1) for the rows of Q ``(n, d + 1)`` in single precision."""
     return np.column_stack([Q, np.full(len(Q), -1)]).astype(np.float32)
 
 
-def columns_with_norm(D: np.ndarray) -> np.ndarray:
+def as_candidates(D: np.ndarray) -> np.ndarray:
     """(d, |d|^2 / 2) for the rows of D, as columns ``(d + 1, p)`` in single precision."""
     d = np.asarray(D, np.float32)
     return np.ascontiguousarray(np.column_stack([d, np.einsum("ij,ij->i", d, d) / 2]).T)
@@ -79,10 +79,10 @@ def scores_in_blocks(
         yield start, np.matmul(part, d, out=scores[: len(part)])
 
 
-def nearest_in_single(q: np.ndarray, d: np.ndarray) -> np.ndarray:
+def nearest_float32(q: np.ndarray, d: np.ndarray) -> np.ndarray:
     """:func:`nearest_rows` up to the rounding of single precision, for matrices made once.
 
-    They are those of :func:`rows_with_minus_one` and :func:`columns_with_norm`.
+    They are those of :func:`as_queries` and :func:`as_candidates`.
     """
     return np.concatenate([score.argmax(axis=1) for _, score in scores_in_blocks(q, d)])
 

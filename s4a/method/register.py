@@ -1,7 +1,7 @@
 """Registration (4.2; eq. 3, 4, 6, 7, 8): one shape onto the template at full resolution, and back.
 
-The source is the shape, the target the template: a match holds, on every vertex of the template, a
-vertex of the shape.
+The source is the shape M_i, the target the template, the paper's median shape: a match holds, on
+every vertex of the template, a vertex of the shape.
 """
 
 import numpy as np
@@ -22,7 +22,7 @@ CONFIDENCE_LENGTH = 0.02  # share of sqrt(area) at which the confidence has fall
 Functions = tuple[np.ndarray, np.ndarray]  # of source and target, rows of which are compared
 
 
-def match_latent(
+def match_low(
     source: Shape, target: Shape, bases: Functions, *, how: str = "ours"
 ) -> tuple[np.ndarray, Functions]:
     """Match at low resolution (eq. 6), and the functions whose rows full resolution compares.
@@ -121,7 +121,11 @@ def from_latent(
     refine: str = "joint",
     scale: bool = False,
 ) -> xr.Dataset:
-    """One shape registered by the latent bases of a network: eq. 6, then 7 (or 3 and 4), then 8.
+    """One shape registered by the latent bases of a network (eq. 6, 7 and 8).
+
+    Eq. 6 gives one start and ICP another; joint rounds refine both, and the best is kept.  Eq. 7,
+    or eq. 3 and 4, is the match at full resolution with ``refine="intrinsic"``, as in the paper, or
+    where that candidate is the best; eq. 8 follows.
 
     Parameters
     ----------
@@ -138,7 +142,7 @@ def from_latent(
     xarray.Dataset
         As of :func:`register`.
     """
-    match, functions = match_latent(source, target, bases, how=how)
+    match, functions = match_low(source, target, bases, how=how)
     near = nearest_after_motion(source.low, target.low, motion)
     starts = {"intrinsic": match, "icp": near}
     return register(source, target, starts, functions, k=len(bases[0]), refine=refine, scale=scale)
@@ -154,7 +158,7 @@ def register(
     refine: str = "joint",
     scale: bool = False,
 ) -> xr.Dataset:
-    """One shape's file of ``/registration``: match, displacement, motion, confidence, way back.
+    """The registration of one shape: match, displacement, motion, confidence and the way back.
 
     Parameters
     ----------
@@ -176,16 +180,18 @@ def register(
     -------
     xarray.Dataset
         ``registered_match(vertex)``, ``displacement(vertex, xyz)``, ``displacement_raw``,
-        ``displacement_low(low_vertex, xyz)`` of the first start as it is (eq. 6), ``rotation``,
+        ``displacement_low(low_vertex, xyz)`` of the start "intrinsic" as it is (of eq. 6, or of
+        ZoomOut where a pair is matched on its own), ``rotation``,
         ``translation``, ``scale``, ``confidence(vertex)``, ``round_trip``, ``distortion``,
         ``template_triangle(original_vertex)``, ``template_barycentric``; displacements in the unit
         of the input, in the template's frame.  Attributes ``method``, the candidate that was kept,
         ``score``, its score at full resolution, and ``score_<candidate>`` at low resolution.
     """
-    tried = {}
+    candidates = {}  # none: the spectral match alone
     if refine == "joint":
-        tried = joint.candidates(source.low, target.low, starts, k=k)
-    match, image, attrs = register_surface(source, target, tried, functions)
+        candidates = joint.candidates(source.low, target.low, starts, k=k)
+    # image = R x + t + U Phi c, smooth already: the line after eq. 8
+    match, image, attrs = register_surface(source, target, candidates, functions)
     triangle, barycentric = way_back(source, target, image)
     X, T = as_arrays(target.original)
     displacement, R, t, s = displacement_in_template(X, image, target.full.area, scale=scale)
@@ -213,14 +219,14 @@ def register(
 
 
 def register_surface(
-    source: Shape, target: Shape, tried: dict[str, joint.Candidate], functions: Functions
+    source: Shape, target: Shape, candidates: dict[str, joint.Candidate], functions: Functions
 ) -> tuple[np.ndarray, np.ndarray, dict]:
     """The template registered at full resolution: the best of the finalists of low resolution.
 
     Parameters
     ----------
     source, target : Shape
-    tried : dict
+    candidates : dict
         Of :func:`s4a.method.joint.candidates`; empty for the spectral match alone.
     functions : see :func:`register`
 
@@ -235,19 +241,19 @@ def register_surface(
     M = source.full
     N = target.full
     attrs: dict[str, float | str] = {
-        f"score_{name}": candidate.score for name, candidate in tried.items()
+        f"score_{name}": candidate.score for name, candidate in candidates.items()
     }
     ends = {}
-    for name in joint.finalists(tried) if tried else ["intrinsic"]:
+    for name in joint.finalists(candidates) if candidates else ["intrinsic"]:
         if name == "intrinsic":
             match, compared, certified = match_functions(source, target, *functions)
             attrs |= {"compared_share": compared, "certified_share": certified}
-            central = match[N.central]
-            motion = joint.fit_motion(M, N, central)
+            part = match[N.near_coarse]
+            motion = joint.fit_motion(M, N, part)
         else:
-            central, motion = joint.dense_rounds(M, N, tried[name].motion)
-        score = joint.registration_score(M, N, central, motion)
-        ends[name] = joint.Candidate(score, central, motion)
+            part, motion = joint.dense_rounds(M, N, candidates[name].motion)
+        score = joint.registration_score(M, N, part, motion)
+        ends[name] = joint.Candidate(score, part, motion)
     method = min(ends, key=lambda name: ends[name].score)
     X = joint.move(N, ends[method].motion)
     if method != "intrinsic":

@@ -42,7 +42,7 @@ class Basis:
         What Phi is orthonormal in; the areas by default.
     U : sparse matrix (n, p), optional
         Takes functions from the low resolution to the n vertices.  U Phi is never formed.
-    central : int ndarray (s,), optional
+    near_coarse : int ndarray (s,), optional
         Vertices that rounds of registration look at; all by default.
     """
 
@@ -53,13 +53,13 @@ class Basis:
     eigenvalue: np.ndarray | None = None
     mass: np.ndarray | sp.sparray | sp.spmatrix | None = None
     U: sp.csr_matrix | None = None
-    central: np.ndarray | slice | None = None
+    near_coarse: np.ndarray | slice | None = None
 
     def __post_init__(self) -> None:
         if self.mass is None:
             object.__setattr__(self, "mass", self.area)
-        if self.central is None:
-            object.__setattr__(self, "central", slice(None))
+        if self.near_coarse is None:
+            object.__setattr__(self, "near_coarse", slice(None))
 
     @property
     def k(self) -> int:
@@ -70,7 +70,14 @@ class Basis:
         """The same surface with its first k functions."""
         eigenvalue = None if self.eigenvalue is None else self.eigenvalue[:k]
         return Basis(
-            self.X, self.T, self.area, self.Phi[:, :k], eigenvalue, self.mass, self.U, self.central
+            self.X,
+            self.T,
+            self.area,
+            self.Phi[:, :k],
+            eigenvalue,
+            self.mass,
+            self.U,
+            self.near_coarse,
         )
 
     def extend(self, F: np.ndarray) -> np.ndarray:
@@ -88,13 +95,13 @@ class Basis:
         return low if self.U is None else self.U @ low
 
     @cached_property
-    def smooth(self):
-        """Coefficients of a field given at the central vertices, see :func:`smoother`."""
-        U = None if self.U is None else self.U[self.central]
-        return smoother(self.Phi, self.area[self.central], U)
+    def coefficients(self):
+        """Coefficients of a field given at the vertices near coarse ones, see :func:`smoother`."""
+        U = None if self.U is None else self.U[self.near_coarse]
+        return smoother(self.Phi, self.area[self.near_coarse], U)
 
     @cached_property
-    def spread(self) -> np.ndarray:
+    def spread_vertices(self) -> np.ndarray:
         """Some vertices ``(s,)`` spread over the surface."""
         return farthest_points(self.X, N_SPREAD)
 
@@ -115,11 +122,11 @@ class Basis:
 
     @cached_property
     def outwards(self) -> np.ndarray:
-        """Rows of the central vertices by their distance from the centre.
+        """Rows of the vertices near coarse ones by their distance from the centre.
 
         An order that neither pose nor numbering changes.
         """
-        from_center = self.X[self.central] - self.area @ self.X
+        from_center = self.X[self.near_coarse] - self.area @ self.X
         return np.argsort((from_center**2).sum(1), kind="stable")
 
 
@@ -202,10 +209,10 @@ class Shape:
         X = self.to_frame(X)
         low = self.low
         area = vertex_areas(X, T)
-        return Basis(X, T, area, low.Phi, low.eigenvalue, low.mass, self.U, self.central)
+        return Basis(X, T, area, low.Phi, low.eigenvalue, low.mass, self.U, self.near_coarse)
 
     @cached_property
-    def central(self) -> np.ndarray:
+    def near_coarse(self) -> np.ndarray:
         """Original vertices nearest to coarse ones, by their weights in U; all of few."""
         weight = self.coarse["coarse_weight"].values.max(1)
         if len(weight) <= N_CENTRAL:

@@ -15,7 +15,7 @@ from s4a.method import fmap, network
 from s4a.method.first_map import first_map, map_after_motion
 from s4a.method.latent import consistent_zoomout
 from s4a.method.median import median_shape
-from s4a.method.register import from_latent, identity, match_functions, match_latent
+from s4a.method.register import from_latent, identity, match_functions, match_low
 from s4a.method.shape import Basis, Shape
 from s4a.schema import dataset, require
 
@@ -213,7 +213,7 @@ def refine_network(
             k,
             step=step,
             n_latent=n_latent,
-            samples=[basis.spread for basis in bases.values()],
+            samples=[basis.spread_vertices for basis in bases.values()],
             n_jobs=n_jobs,
             progress=progress,
         )
@@ -288,7 +288,7 @@ def latent_match(
     if how not in ("ours", "standard"):
         raise ValueError(f"how must be 'ours' or 'standard', found {how!r}")
     shapes = shape_in(study, source), shape_in(study, target)
-    match, functions = match_latent(*shapes, latent_bases(study, source, target), how=how)
+    match, functions = match_low(*shapes, latent_bases(study, source, target), how=how)
     if full:
         match, *_ = match_functions(*shapes, *functions)
     return dataset(match=match)

@@ -4,7 +4,7 @@ import numpy as np
 import xarray as xr
 
 from s4a.method.pca import low_vertices
-from s4a.method.register import match_functions, match_latent
+from s4a.method.register import match_functions, match_low
 from s4a.method.shape import Shape
 
 RESOLUTIONS = [("low resolution", "coarse"), ("full resolution", "original")]
@@ -170,5 +170,5 @@ def latent_match(study: xr.DataTree, source: str, target: str, *, dense: bool) -
         for name in (source, target)
     )
     bases = Y.sel(shape=source).values, Y.sel(shape=target).values
-    match, (F_source, F_target) = match_latent(M, N, bases)
+    match, (F_source, F_target) = match_low(M, N, bases)
     return match_functions(M, N, F_source, F_target)[0] if dense else match

@@ -103,7 +103,7 @@ def our_zoomout(C, a, b):
 
 
 def our_network(C, source, target, shapes):
-    samples = [basis.spread for basis in shapes]
+    samples = [basis.spread_vertices for basis in shapes]
     return latent.consistent_zoomout(shapes, C, source, target, K, samples=samples)[3]
 
 

@@ -82,7 +82,7 @@ def test_a_wrong_match_scores_worse_than_a_right_one(surface):
             source,
             surface,
             match,
-            deform.onto(surface.X, source.X[match], surface.area, surface.smooth),
+            deform.onto(surface.X, source.X[match], surface.area, surface.coefficients),
         )
 
     right = score(every)
