@@ -346,7 +346,7 @@ def compare_pairs(args: Namespace) -> tuple[xr.Dataset, list[str], np.ndarray, s
         seed=args.seed,
     )
     names, seconds = result["way"].values.tolist(), result["block_seconds"].mean("pair").values
-    blocks = tables.block_table(names, result["block"].values, seconds)
+    blocks = tables.block_table(names, result["block"].values.tolist(), seconds)
     return result, names, seconds, f"{tables.comparison_table(result)}\n\n{blocks}"
 
 

@@ -4,6 +4,9 @@ All work on one cleaned input.  What the methods are is in :mod:`s4a.evaluation.
 """
 
 import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -12,7 +15,7 @@ from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
 from s4a.evaluation import metrics
-from s4a.evaluation.methods import BLOCKS, METHODS, Pair, Spaces
+from s4a.evaluation.methods import BLOCKS, METHODS, Matches, Pair, Spaces
 from s4a.geometry.align import align, motion_between, realign
 from s4a.input.collection import read_shape, read_shapes
 from s4a.method import latent, median, network
@@ -33,7 +36,7 @@ COLLECTION_BLOCKS = (
 HOW = ("standard", "ours")
 
 
-def checked_methods(methods):
+def checked_methods(methods: Sequence[str]) -> None:
     """ValueError unless all are some of :data:`METHODS`."""
     wrong = [m for m in methods if m not in METHODS]
     if wrong or not len(methods) or isinstance(methods, str):
@@ -42,7 +45,7 @@ def checked_methods(methods):
         )
 
 
-def load_mesh(shape, what):
+def load_mesh(shape: Path | str | xr.Dataset, what: str) -> tuple[xr.Dataset, float]:
     """A mesh and the seconds it took to read and clean it.
 
     None for a Dataset, which is taken as clean.
@@ -55,7 +58,7 @@ def load_mesh(shape, what):
     return mesh, time.process_time() - begin
 
 
-def in_mesh(vertices, mesh):
+def in_mesh(vertices: np.ndarray, mesh: xr.Dataset) -> np.ndarray:
     """Vertices of the mesh that rows of its file became ``(n,)``.
 
     -1 where they are -1 or were dropped.
@@ -66,7 +69,7 @@ def in_mesh(vertices, mesh):
     return np.where(vertices >= 0, became[np.maximum(vertices, 0)], -1)
 
 
-def truth_in_meshes(truth, source, target):
+def truth_in_meshes(truth: np.ndarray, source: xr.Dataset, target: xr.Dataset) -> np.ndarray:
     """Truth over the rows of the target's file.
 
     Which are rows of the source's file or positions, for the meshes.
@@ -88,7 +91,7 @@ def truth_in_meshes(truth, source, target):
     return truth if truth.ndim == 2 else in_mesh(truth, source)
 
 
-def read_truth(path):
+def read_truth(path: Path | str) -> np.ndarray:
     """Truth from a file: NPY, or text with a number or three in each row.
 
     For the vertices of the target's file.
@@ -109,7 +112,14 @@ def _delimiter(path):
     return "," if str(path).endswith(".csv") else None
 
 
-def pair(source, target, *, truth=None, landmarks=None, **options):
+def pair(
+    source: Path | str | xr.Dataset,
+    target: Path | str | xr.Dataset,
+    *,
+    truth: Any = None,
+    landmarks: Any = None,
+    **options: Any,
+) -> xr.Dataset:
     """Table 1 for one pair: see :func:`pairs`.
 
     Parameters
@@ -140,19 +150,19 @@ def pair(source, target, *, truth=None, landmarks=None, **options):
 
 
 def pairs(
-    source,
-    targets,
+    source: Path | str | xr.Dataset,
+    targets: Mapping[str, Path | str | xr.Dataset],
     *,
-    methods=METHODS,
-    truth=None,
-    landmarks=None,
-    n_coarse=6000,
-    k_init=20,
-    k=100,
-    step=5,
-    n_geodesic=1000,
-    seed=0,
-):
+    methods: Sequence[str] = METHODS,
+    truth: Any = None,
+    landmarks: Any = None,
+    n_coarse: int = 6000,
+    k_init: int = 20,
+    k: int = 100,
+    step: int = 5,
+    n_geodesic: int = 1000,
+    seed: int = 0,
+) -> xr.Dataset:
     """The five pair methods of Table 1, and joint rounds after the last, on the same cleaned input.
 
     kNN: nearest neighbour in space after rigid alignment.  ZO: from that match, ZoomOut at full
@@ -227,11 +237,12 @@ def pairs(
             N = Spaces(mesh, n_coarse, k, seed)
             vertices = None
             if landmarks is not None:
-                vertices = [
+                at_source, at_target = (
                     landmark_vertices(np.asarray(marks), end.mesh, in_memory)
                     for marks, end in zip(landmarks[name], (M, N), strict=True)
-                ]
-                check_landmarks(*vertices, M, N)
+                )
+                check_landmarks(at_source, at_target, M, N)
+                vertices = at_source, at_target
             true = None if truth is None else truth[name]
             if truth is not None and not in_memory:
                 true = truth_in_meshes(true, M.mesh, N.mesh)
@@ -242,7 +253,7 @@ def pairs(
     return table.assign_coords(pair=list(targets)).transpose("way", "pair", ...).assign_attrs(attrs)
 
 
-def landmark_vertices(given, mesh, clean):
+def landmark_vertices(given: np.ndarray, mesh: xr.Dataset, clean: bool) -> np.ndarray:
     """Vertices of the mesh: the nearest ones to positions ``(p, 3)``.
 
     Or those that rows of its file became.
@@ -252,7 +263,9 @@ def landmark_vertices(given, mesh, clean):
     return given if clean or given.dtype.kind not in "iu" else in_mesh(given, mesh)
 
 
-def check_landmarks(at_source, at_target, source, target):
+def check_landmarks(
+    at_source: np.ndarray, at_target: np.ndarray, source: Spaces, target: Spaces
+) -> None:
     """ValueError unless they are pairs of vertices of both shapes."""
     ends = ((at_source, source), (at_target, target))
     good = all(v.ndim == 1 and v.dtype.kind in "iu" and v.min(initial=0) >= 0 for v, _ in ends)
@@ -268,7 +281,16 @@ def check_landmarks(at_source, at_target, source, target):
         )
 
 
-def metrics_of_pair(source, target, methods, landmarks, load, truth, n_geodesic, options):
+def metrics_of_pair(
+    source: Spaces,
+    target: Spaces,
+    methods: Sequence[str],
+    landmarks: Matches | None,
+    load: float,
+    truth: np.ndarray | None,
+    n_geodesic: int,
+    options: dict[str, Any],
+) -> xr.Dataset:
     """All methods on one pair: metrics and times over ``way``."""
     both = Pair(source, target, landmarks, **options)
     rows, seconds = [], []
@@ -292,16 +314,16 @@ def metrics_of_pair(source, target, methods, landmarks, load, truth, n_geodesic,
 
 
 def collection(
-    shapes,
+    shapes: Any,
     *,
-    methods=COLLECTION_METHODS,
-    n_coarse=6000,
-    n_pairs=500,
-    k_init=20,
-    k=100,
-    step=5,
-    seed=0,
-):
+    methods: Sequence[str] = COLLECTION_METHODS,
+    n_coarse: int = 6000,
+    n_pairs: int = 500,
+    k_init: int = 20,
+    k: int = 100,
+    step: int = 5,
+    seed: int = 0,
+) -> xr.Dataset:
     """Table 2: the collection in the space of SCALABLE and of RE-MATCH.
 
     To full resolution the standard way and ours.

@@ -275,13 +275,13 @@ class Pair:
         return getattr(self.source, kind), getattr(self.target, kind)
 
     @cached_property
-    def align_spread(self):
+    def align_spread(self) -> tuple[Motion, Matches, float]:
         """Motion and landmarks by spread points of both, and the seconds that they took."""
         (X, area, _), (Y, area_target, _) = self.source.spread, self.target.spread
         return self._align(X, area, Y, area_target)
 
     @cached_property
-    def align_remeshed(self):
+    def align_remeshed(self) -> tuple[Motion, Matches, float]:
         """The same by the low-resolution meshes."""
         M, N = self.source.coarse.low, self.target.coarse.low
         return self._align(M.X, M.area, N.X, N.area)

@@ -234,7 +234,7 @@ def fmap_from_descriptors(
     target: Basis,
     *,
     k: int = 20,
-    landmarks: tuple[np.ndarray, np.ndarray] | tuple[None, None] = (None, None),
+    landmarks: Sequence[np.ndarray] | tuple[None, None] = (None, None),
     kind: str = "wks",
     n: int = 100,
     every: int = 5,

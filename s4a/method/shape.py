@@ -3,6 +3,7 @@
 Every step of the method takes shapes, or the :class:`Basis` of one at one resolution.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -95,7 +96,7 @@ class Basis:
         return low if self.U is None else self.U @ low
 
     @cached_property
-    def coefficients(self):
+    def coefficients(self) -> Callable:
         """Coefficients of a field given at the vertices near coarse ones, see :func:`smoother`."""
         U = None if self.U is None else self.U[self.near_coarse]
         return smoother(self.Phi, self.area[self.near_coarse], U)

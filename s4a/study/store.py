@@ -157,7 +157,7 @@ class Stored(BackendArray):
             key, self.shape, indexing.IndexingSupport.BASIC, self.part
         )
 
-    def part(self, key):
+    def part(self, key: Any) -> np.ndarray:
         """Read the selection from the file; ValueError where it was written anew."""
         with h5py.File(self.path) as file:
             if file.attrs.get("task_key") != self.key:

@@ -33,7 +33,7 @@ EVERY = 0.5  # seconds
 Shapes = Path | str | list[Path | str] | dict[str, Any] | xr.DataTree
 
 
-def work(answer, shapes, options):
+def work(answer: Any, shapes: Any, options: dict[str, Any]) -> None:
     """Analyse, in the process of its own; the answer is the error's text, empty without one."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # its own bars would be written below the panel
     try:
@@ -45,7 +45,7 @@ def work(answer, shapes, options):
         answer.send(f"{type(error).__name__}: {error}")
 
 
-def clock(seconds):
+def clock(seconds: float) -> str:
     """Minutes and seconds.
 
     Examples
@@ -98,7 +98,7 @@ class Progress(Panel):
         self.stop.disabled, self.go_on.disabled = False, True
         threading.Thread(target=self.watch, args=(self.stopped,), daemon=True).start()
 
-    def build(self):
+    def build(self) -> list[ipywidgets.Widget]:
         """A bar for each stage, and the buttons."""
         look = {"max": 1, "style": {"description_width": "200px"}, "layout": {"width": "440px"}}
         self.bars = {stage: ipywidgets.IntProgress(description=stage, **look) for stage in STAGES}
@@ -149,7 +149,9 @@ class Progress(Panel):
             self.opened = ready
             self.explored.extend(open_study(self.folder))
 
-    def told(self, stage, done, whole, ended, reached, now):
+    def told(
+        self, stage: str, done: int, whole: int, ended: bool, reached: bool, now: float
+    ) -> str:
         """How far a stage is, since when, and how long it takes by its pace so far."""
         text = f"{done} of {whole}"
         begin, had, end = self.clocks.get(stage, (now, done, now))

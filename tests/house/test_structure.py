@@ -24,24 +24,6 @@ WORDS = [
     ROOT / "README.md",
     ROOT / "CONTRIBUTING.md",
 ]
-# modules in which some public function has no types yet: the list may only shrink
-WITHOUT_TYPES = {
-    "cli.commands",
-    "cli.flags",
-    "cli.tables",
-    "evaluation.compare",
-    "evaluation.methods",
-    "input.clean",
-    "input.collection",
-    "input.manifold",
-    "input.plausibility",
-    "method.fmap",
-    "method.shape",
-    "study.options",
-    "study.pipeline",
-    "study.store",
-    "widgets.progress",
-}
 each_page = pytest.mark.parametrize("path", WORDS, ids=lambda path: path.name)
 
 
@@ -57,7 +39,6 @@ def test_public_functions_have_types():
     lacking = {
         f"{name}.{function.name}"
         for name, module in modules.items()
-        if name not in WITHOUT_TYPES
         for function in structure.public_functions(module)
         if not structure.is_annotated(function)
     }
