@@ -94,3 +94,13 @@ def test_an_import_against_the_data_and_a_circle_are_counted(tmp_path):
     arrows = structure.arrows_between_rooms(modules, graph)
     assert arrows == {("geometry", "study"): 1, ("study", "geometry"): 1, ("input", "geometry"): 1}
     assert structure.circles(graph) == 2
+
+
+def test_the_names_in_how_to_add_are_in_the_code():
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    recipes = text[text.index("## How to add") : text.index("## The rules of the house")]
+    code = "".join(path.read_text("utf-8") for path in (ROOT / "s4a").rglob("*.py"))
+    code += (ROOT / "tests" / "fuzz.py").read_text(encoding="utf-8")
+    names = set(re.findall(r"`([A-Za-z]\w+)`", recipes)) - {"_read_x", "_x_bytes"}
+    assert len(names) > 20
+    assert [name for name in sorted(names) if not re.search(rf"\b{name}\b", code)] == []
