@@ -334,7 +334,7 @@ def fit_descriptors(
             raise ValueError(
                 f"the {what} needs {k} eigenfunctions, found {mesh.sizes['mode']}: give a smaller k"
             )
-    vertices = (None, None) if landmarks is None else tuple(np.asarray(v) for v in landmarks)
+    vertices: tuple = (None, None) if landmarks is None else tuple(np.asarray(v) for v in landmarks)
     if landmarks is not None and (
         len(vertices) != 2 or vertices[0].shape != vertices[1].shape or vertices[0].ndim != 1
     ):

@@ -1,7 +1,8 @@
 """The whole analysis (4, 6.1): the steps of the paper, one after the other, over a collection.
 
-Every step takes the keys of the files that it is made from and gives those of its own; the files
-are in the folder of the run, and what computes one of them is in :mod:`s4a.study.tasks`.
+Every step takes the keys of the files that it is made from and gives those of its own.  A key is
+a hash of all that a file depends on; the files are in the folder of the run, and what computes one
+of them is in :mod:`s4a.study.tasks`.
 """
 
 import logging
@@ -130,16 +131,16 @@ def analyse(
             study = analyse(shapes, store=folder, n_jobs=n_jobs, **options)
             loaded = {n.path: n.to_dataset(inherit=False).load() for n in study.subtree}
             return xr.DataTree.from_dict(loaded)
-    checked = Options(**options)
-    sources = find_sources(shapes, checked.pattern)
-    remarks = passed_over(shapes, checked.pattern)
-    checked.check_against(list(sources))
-    subjects = None if checked.table is None else read_table(checked.table, list(sources))
+    settings = Options(**options)
+    sources = find_sources(shapes, settings.pattern)
+    remarks = passed_over(shapes, settings.pattern)
+    settings.check_against(list(sources))
+    subjects = None if settings.table is None else read_table(settings.table, list(sources))
     with lock(store) as claim:
         run = Run(claim, n_jobs)
         if subjects is not None:
             write(subjects, run.folder / "subjects.nc")
-        run_steps(run, sources, checked, remarks)
+        run_steps(run, sources, settings, remarks)
     return open_study(store)
 
 
@@ -153,15 +154,15 @@ def run_steps(run: Run, sources: Sources, options: Options, remarks: list[str]) 
     #                                                     |
     #                                                pca, report
     original = read_and_clean(run, sources, options)
-    compare(run, original, options)
+    check_plausibility(run, original, options)
     coarse = remesh(run, original, options)
     spectra = lowest_eigenvalues(run, coarse, options.k_init)
     aligned = align(run, coarse, spectra)
     first = first_maps(run, coarse, spectra, aligned, options)
     latent = consistent_zoomout(run, coarse, first, options)
     registered = register(run, coarse, latent, options)
-    no_modes = modes(run, registered)
-    write_report(run, sources, options, remarks, no_modes, registered)
+    why_no_modes = modes(run, registered)
+    write_report(run, sources, options, remarks, why_no_modes, registered)
 
 
 def read_and_clean(run: Run, sources: Sources, options: Options) -> Keys:
@@ -174,16 +175,22 @@ def read_and_clean(run: Run, sources: Sources, options: Options) -> Keys:
     return run.do("read and clean", todo)
 
 
-def compare(run: Run, original: Keys, options: Options) -> None:
+def check_plausibility(run: Run, original: Keys, options: Options) -> None:
     """Each shape beside that of median size; the report says what is not plausible."""
     if len(original) < 2:
         return
     areas = {n: attributes(run.folder / f"original/{n}.nc")["area"] for n in original}
     reference = median_size(areas)
     settings = (reference, options.intersections)
-    beside = task_key(original[reference], *settings)
+    reference_key = task_key(original[reference], *settings)
     todo = [
-        Task(n, f"network/look_{n}.nc", compare_shape, (run.folder, n, *settings), (beside, key))
+        Task(
+            n,
+            f"network/look_{n}.nc",
+            compare_shape,
+            (run.folder, n, *settings),
+            (reference_key, key),
+        )
         for n, key in original.items()
     ]
     run.do("compare", todo, each=False)
@@ -288,11 +295,18 @@ def register(run: Run, coarse: Keys, latent: str, options: Options) -> Keys:
     """Every shape registered to the template, the median shape by default (4.2, eq. 6 to 8)."""
     template = options.template or attributes(run.folder / "latent.nc")["median"]
     way = (template, options.how, options.refine, options.scale)
-    onto = task_key(latent, way)
+    template_key = task_key(latent, way)
     mesh = template_mesh(read(run.folder / f"original/{template}.nc"), template)
-    write(mesh, run.folder / "registration.nc", onto, [latent])
+    write(mesh, run.folder / "registration.nc", template_key, [latent])
     todo = [
-        Task(n, f"registration/{n}.nc", register_shape, (run.folder, n, *way), (onto, key), (onto,))
+        Task(
+            n,
+            f"registration/{n}.nc",
+            register_shape,
+            (run.folder, n, *way),
+            (template_key, key),
+            (template_key,),
+        )
         for n, key in coarse.items()
     ]
     return run.do("registration", todo)
