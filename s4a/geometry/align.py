@@ -68,27 +68,21 @@ def rigid_transform(
     return R, q - s * R @ p, s
 
 
-def farthest_points(
-    P: np.ndarray, k: int, *, center: np.ndarray | None = None, seed: int = 0
-) -> np.ndarray:
+def farthest_points(P: np.ndarray, k: int) -> np.ndarray:
     """Indices of k points, each as far as possible from those before it (Euclidean).
 
-    The first is the point farthest from the centre, so that the choice follows the shape and not
-    its numbering.  Where there are no more than k points, all are given in their own order.
+    The first is the point farthest from the mean, so that the choice follows the shape and not its
+    numbering.  Where there are no more than k points, all are given in their own order.
 
     Parameters
     ----------
     P : float ndarray (n, d)
     k : int
-    center : float ndarray (d,), optional
-        The mean of the points by default.
-    seed : int
-        Another seed starts elsewhere, near the seed-th farthest point.
 
     Returns
     -------
     int ndarray (k,)
-        In the order of sampling; fewer where the points are fewer, or coincide.
+        In the order of sampling.
 
     Examples
     --------
@@ -99,9 +93,32 @@ def farthest_points(
     """
     if k >= len(P):
         return np.arange(len(P))
+    start = int(np.argmax(((P - P.mean(0)) ** 2).sum(1)))
+    return fpsample.fps_sampling(P, k, start_idx=start).astype(np.int64)
+
+
+def many_farthest_points(P: np.ndarray, k: int, *, center: np.ndarray, seed: int = 0) -> np.ndarray:
+    """:func:`farthest_points` for thousands of points, by buckets; near ties may fall otherwise.
+
+    Parameters
+    ----------
+    P : float ndarray (n, d)
+    k : int
+    center : float ndarray (d,)
+        The first point is the farthest from it.
+    seed : int
+        Another seed starts elsewhere, near the seed-th farthest point.
+
+    Returns
+    -------
+    int ndarray (k,)
+        In the order of sampling; fewer where the points are fewer, or coincide.
+    """
+    if k >= len(P):
+        return np.arange(len(P))
     if k < 1:
         return np.arange(0)
-    P = P - (P.mean(0) if center is None else center)
+    P = P - center
     radius = np.linalg.norm(P, axis=1)
     # fpsample starts at a place in a tree of its own.  So a beacon is added, far away in one more
     # dimension; it may be taken again when all others coincide with samples, but goes in any case.

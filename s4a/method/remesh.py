@@ -24,7 +24,7 @@ import xarray as xr
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
-from s4a.geometry.align import farthest_points
+from s4a.geometry.align import many_farthest_points
 from s4a.geometry.closest import closest_point_in_star
 from s4a.geometry.mesh import (
     as_arrays,
@@ -99,10 +99,10 @@ def sample_surface(
         length = np.linalg.norm(X[rim[:, 0]] - X[rim[:, 1]], axis=1).sum()
         n_rim = min(int(np.ceil(length / (0.8 * spacing))), k // 2)
         rim = np.unique(rim)
-        sample = rim[farthest_points(P[rim], n_rim, center=center, seed=seed)]
+        sample = rim[many_farthest_points(P[rim], n_rim, center=center, seed=seed)]
         near = dijkstra(G, indices=rim, min_only=True, limit=0.6 * spacing)
         free = np.setdiff1d(np.flatnonzero(np.isinf(near) & ~avoid), rim)
-    others = free[farthest_points(P[free], k - len(sample), center=center, seed=seed)]
+    others = free[many_farthest_points(P[free], k - len(sample), center=center, seed=seed)]
     return np.sort(np.r_[sample, others])
 
 

@@ -152,17 +152,21 @@ def test_farthest_points_are_those_of_the_exhaustive_search(n, k):
         gap = np.minimum(gap, ((X - X[found[-1]]) ** 2).sum(1))
         found.append(int(gap.argmax()))
     assert align.farthest_points(X, k).tolist() == found
+    assert align.many_farthest_points(X, k, center=X.mean(0)).tolist() == found
 
 
 def test_another_seed_or_centre_starts_elsewhere():
     X = np.random.default_rng(7).normal(size=(500, 3))
-    first = {int(align.farthest_points(X, 5, seed=seed)[0]) for seed in range(4)}
+    center = np.zeros(3)
+    first = {
+        int(align.many_farthest_points(X, 5, center=center, seed=seed)[0]) for seed in range(4)
+    }
     assert len(first) > 1
     center = np.array([9.0, 0, 0])
     outermost = ((X - center) ** 2).sum(1).argmax()
-    assert align.farthest_points(X, 5, center=center)[0] == outermost
+    assert align.many_farthest_points(X, 5, center=center)[0] == outermost
 
 
 def test_points_that_coincide_are_taken_once():
     X = np.repeat(np.eye(3), 10, axis=0)
-    assert sorted(align.farthest_points(X, 8) // 10) == [0, 1, 2]
+    assert sorted(align.many_farthest_points(X, 8, center=np.zeros(3)) // 10) == [0, 1, 2]
