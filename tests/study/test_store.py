@@ -238,8 +238,8 @@ def test_an_unfinished_study_opens_with_what_is_there(tmp_path):
     tree.close()
 
 
-def test_every_file_of_a_study_is_read_as_xarray_reads_it(small_store):
-    files = sorted(small_store.rglob("*.nc"))
+def test_every_file_of_a_study_is_read_as_xarray_reads_it(study_folder):
+    files = sorted(study_folder.rglob("*.nc"))
     assert len(files) > 20
     for file in files:
         with xr.open_dataset(file, engine=store.ENGINE) as there:
