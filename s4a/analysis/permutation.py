@@ -158,8 +158,9 @@ def vertex_test(
     """Permutation test at every vertex, with p values corrected for all by the largest (max-T).
 
     The statistic is Pillai's trace, the share 0..1 of the vectors' scatter that X explains; for one
-    column of X, T^2 = dof V / (1 - V).  The scatter is that of the residuals on Z, which
-    permutations without covariates leave as it is, and with covariates nearly.
+    column of X, T^2 = dof V / (1 - V).  The scatter is that of the residuals on Z, for every
+    permutation its own: with covariates those of permuted residuals scatter less, and beside the
+    first scatter their shares would be too small.
 
     Parameters
     ----------
@@ -175,24 +176,60 @@ def vertex_test(
     """
     Z, Q = design(x, covariates)
     n, v, k = d.shape
-    q = Q.shape[1]
+    r, q = Z.shape[1], Q.shape[1]
     E = np.asarray(d, float).reshape(n, -1)  # (n, v k)
-    E = whiten((E - Z @ (Z.T @ E)).reshape(n, v, k)).reshape(n, -1).astype(np.float32)
+    E = whiten((E - Z @ (Z.T @ E)).reshape(n, v, k))
+    E = E.transpose(0, 2, 1).reshape(n, -1).astype(np.float32)  # (n, k v)
 
-    def explain(columns):
-        """Shares ``(b, v)`` that b times q columns ``(n, b q)`` explain."""
-        return ((columns.T.astype(np.float32) @ E) ** 2).reshape(-1, q, v, k).sum(axis=(1, 3))
+    def project(columns, per):
+        """Products of b times `per` columns ``(n, b per)`` with the residuals: (b, per, k, v)."""
+        return (columns.T.astype(np.float32) @ E).reshape(-1, per, k, v)
 
     rng = np.random.default_rng(seed)
-    share = explain(Q)[0]
+    share = (project(Q, q)[0] ** 2).sum(axis=(0, 1))
     reached = np.zeros(v, np.int64)
     largest = np.empty(0, np.float32)
-    block = max(1, int(2e7 // (v * k * q)))  # permutations at once: 80 MB of shares
+    block = max(1, int(2e7 // (v * k * (q + r))))  # permutations at once: 80 MB of products
     for first in range(0, n_permutations, block):
         orders = [rng.permutation(n) for _ in range(min(block, n_permutations - first))]
+        back = [np.argsort(order) for order in orders]
         # Q^T (I - Z Z^T) P E = (P^T Q)^T E, as Q is orthogonal to Z
-        permuted = explain(np.concatenate([Q[np.argsort(order)] for order in orders], axis=1))
+        B = project(np.concatenate([Q[order] for order in back], axis=1), q)
+        if r == 1:  # Z is the intercept alone, which no permutation moves: the scatter stays 1
+            permuted = (B**2).sum(axis=(1, 2))  # (b, v)
+        else:
+            A = project(np.concatenate([Z[order] for order in back], axis=1), r)
+            permuted = explained_share(A, B)
         reached += (permuted >= share * (1 - 1e-6)).sum(0)
         largest = np.append(largest, permuted.max(1))
     beyond = n_permutations - np.searchsorted(np.sort(largest), share * (1 - 1e-6), side="left")
     return share, (1 + reached) / (1 + n_permutations), (1 + beyond) / (1 + n_permutations)
+
+
+def explained_share(A: np.ndarray, B: np.ndarray) -> np.ndarray:
+    """Pillai's trace of whitened residuals once permuted: tr(B^T B (I - A^T A)^-1), ``(b, v)``.
+
+    Parameters
+    ----------
+    A : float ndarray (b, r, k, v)
+        Z^T P E: what the covariates take of permuted residuals, whose scatter was I.
+    B : float ndarray (b, q, k, v)
+        Q^T P E.
+    """
+    k = A.shape[2]
+    scatter = {  # of what is left: I - A^T A, its upper triangle
+        (i, j): (i == j) - np.einsum("brv,brv->bv", A[:, :, i], A[:, :, j], dtype=float)
+        for i in range(k)
+        for j in range(i, k)
+    }
+    B = B.astype(float)
+    share = np.zeros(scatter[0, 0].shape)
+    for i in range(k):  # elimination: scatter = L D L^T, and B becomes B L^-T
+        pivot = np.maximum(scatter[i, i], 1e-9)
+        share += (B[:, :, i] ** 2).sum(1) / pivot
+        for j in range(i + 1, k):
+            factor = scatter[i, j] / pivot  # (b, v)
+            B[:, :, j] -= B[:, :, i] * factor[:, None]
+            for m in range(j, k):
+                scatter[j, m] = scatter[j, m] - factor * scatter[i, m]
+    return share

@@ -253,6 +253,34 @@ def test_family_wise_p_values_keep_their_level():
     assert 0.03 < np.mean([(p <= 0.05).mean() for _, p, _ in found]) < 0.07
 
 
+@pytest.mark.parametrize("n, c", [(12, 5), (20, 8)])
+def test_covariates_do_not_raise_the_family_wise_error(n, c):
+    smallest = []
+    for seed in range(80):
+        rng = np.random.default_rng(seed)
+        d, x, Z = rng.normal(size=(n, 30, 3)), rng.normal(size=n), rng.normal(size=(n, c))
+        p_max = permutation.vertex_test(d, x, covariates=Z, n_permutations=99, seed=seed)[2]
+        smallest.append(p_max.min())
+    assert np.mean(np.array(smallest) <= 0.05) < 0.16  # four standard errors above 0.05
+
+
+def test_the_share_of_permuted_residuals_has_the_scatter_of_that_permutation():
+    rng = np.random.default_rng(5)
+    n, v, k = 15, 4, 3
+    Z, Q = permutation.design(rng.normal(size=(n, 2)), rng.normal(size=(n, 3)))
+    E = rng.normal(size=(n, v, k))
+    E -= np.einsum("nr,mr,mvk->nvk", Z, Z, E)
+    P = rng.permutation(n)
+    R = E[P] - np.einsum("nr,mr,mvk->nvk", Z, Z, E[P])  # residuals of the permuted
+    expected = []
+    for vertex in range(v):
+        H = Q.T @ R[:, vertex]
+        expected.append(np.trace(H @ np.linalg.inv(R[:, vertex].T @ R[:, vertex]) @ H.T))
+    white = permutation.whiten(E)[P]
+    A, B = (np.einsum("nr,nvk->rkv", M, white)[None] for M in (Z, Q))
+    assert permutation.explained_share(A, B)[0] == pytest.approx(np.array(expected))
+
+
 def test_the_statistics_are_those_of_the_textbook():
     rng = np.random.default_rng(4)
     d, x = rng.normal(size=(14, 5, 3)), np.repeat([0.0, 1.0], [6, 8])
