@@ -10,6 +10,7 @@ import io
 import json
 import logging
 import os
+import re
 import sys
 import uuid
 from collections.abc import Iterable, Iterator
@@ -26,6 +27,10 @@ from xarray.backends import BackendArray
 from xarray.core import indexing
 
 log = logging.getLogger(__name__)
+
+LOCK = ".lock"
+STAGES = ("original", "coarse", "network", "registration")  # folders of a study
+TEMPORARY = re.compile(r"\.[\w-]+\.nc\.\d+\.tmp")  # as `write` names them
 
 ENGINE: Final = "h5netcdf"
 VERSION = version("s4a")
@@ -89,7 +94,7 @@ class Claim:
     def check(self) -> None:
         """Raise ValueError when another run has taken over the folder, as after one was killed."""
         try:
-            token = (self.folder / ".lock").read_text()
+            token = (self.folder / LOCK).read_text()
         except OSError:
             token = ""
         if token != self.token:
@@ -256,13 +261,41 @@ def is_done(path: Path | str, key: str) -> bool:
         return False
 
 
+def check_own(folder: Path) -> None:
+    """ValueError where a folder holds files and is no study: a run would write among them.
+
+    A study has its lock, or files with the key of a task.
+    """
+    if not folder.is_dir() or (folder / LOCK).is_file():
+        return
+    names = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
+    files = [*folder.glob("[!.]*.nc"), *(folder / STAGES[0]).glob("[!.]*.nc")]
+    if names and not any(is_keyed(path) for path in files):
+        shown = ", ".join(names[:3]) + ", ..." * (len(names) > 3)
+        raise ValueError(
+            f"{folder} is no study and is not empty (it has {shown}): give a new or an empty folder"
+        )
+
+
+def is_keyed(path: Path) -> bool:
+    """Whether a file was written by :func:`write`."""
+    try:
+        return "task_key" in attributes(path)
+    except OSError:
+        return False
+
+
+def open_without_following(path: str, flags: int) -> int:
+    """Open a file of our own: where a symbolic link lies in its place, that is an OSError."""
+    return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
+
+
 @contextmanager
 def lock(folder: Path | str) -> Iterator[Claim]:
     """Hold a study folder against a second run.
 
-    Released by the system when the process ends in whatever way.
-
-    Temporary files of a run that was killed are removed.
+    Released by the system when the process ends in whatever way.  Temporary files of a run that was
+    killed are removed; a folder with files of somebody else is not touched.
 
     Yields
     ------
@@ -271,8 +304,10 @@ def lock(folder: Path | str) -> Iterator[Claim]:
     Raises
     ------
     ValueError
-        When another process holds the folder; its number is named.
+        When another process holds the folder; its number is named.  When it is no study, and not
+        empty.
     """
+    check_own(Path(folder))
     try:
         import fcntl
     except ImportError:  # on Windows
@@ -280,7 +315,7 @@ def lock(folder: Path | str) -> Iterator[Claim]:
         log.warning("this system cannot lock %s; start no second run in it", folder)
     try:
         Path(folder).mkdir(parents=True, exist_ok=True)
-        handle = open(Path(folder) / ".lock", "a+")
+        handle = open(Path(folder) / LOCK, "a+", opener=open_without_following)
     except OSError as error:
         raise OSError(f"{folder} cannot be written ({error}): give another folder") from error
     with handle:
@@ -298,6 +333,8 @@ def lock(folder: Path | str) -> Iterator[Claim]:
         handle.truncate(0)
         handle.write(token)
         handle.flush()
-        for temporary in Path(folder).rglob(".*.tmp"):
-            temporary.unlink(missing_ok=True)
+        for stage in ("", *STAGES):
+            for temporary in (Path(folder) / stage).glob(".*.nc.*.tmp"):
+                if TEMPORARY.fullmatch(temporary.name):
+                    temporary.unlink(missing_ok=True)
         yield Claim(Path(folder), token)

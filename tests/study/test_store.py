@@ -268,3 +268,34 @@ def test_a_file_written_anew_after_it_was_opened_is_refused(tmp_path):
     store.write(dataset(position=np.ones((700, 3))), tmp_path / "a.nc", "other")
     with pytest.raises(ValueError, match="written anew since it was opened; open the study again"):
         found.load()
+
+
+def test_a_folder_with_files_of_somebody_else_is_refused_and_not_touched(tmp_path):
+    (tmp_path / "original").mkdir()
+    (tmp_path / "pca.nc").write_bytes(b"mine")
+    synthetic.sphere(50).to_netcdf(tmp_path / "original" / "mine.nc", engine="h5netcdf")
+    (tmp_path / "original" / ".draft.tmp").write_bytes(b"mine")
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    message = r"is no study and is not empty \(it has original, pca.nc\): give a new or an empty"
+    with pytest.raises(ValueError, match=message), store.lock(tmp_path):
+        pass
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+def test_a_study_that_was_copied_without_its_lock_is_still_a_study(tmp_path):
+    mine = tmp_path / "original" / ".draft.tmp"
+    store.write(synthetic.sphere(50), tmp_path / "original" / "a.nc", "key")
+    mine.write_bytes(b"mine")
+    with store.lock(tmp_path):
+        assert mine.exists()  # only temporary files of our own go
+
+
+def test_a_lock_that_is_a_symbolic_link_is_not_followed(tmp_path):
+    diary = tmp_path / "diary"
+    diary.write_text("mine")
+    folder = tmp_path / "study"
+    folder.mkdir()
+    (folder / ".lock").symlink_to(diary)
+    with pytest.raises(OSError, match="cannot be written"), store.lock(folder):
+        pass
+    assert diary.read_text() == "mine"
