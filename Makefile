@@ -4,16 +4,13 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test coverage check fuzz format bench structure lab docs clean
+.PHONY: demo test check fuzz format bench structure lab docs clean
 
 demo: $(VENV)/.core
 	$(BIN)/s4a demo
 
+# one process a core, one thread a process; then which lines of s4a no test has run
 test: check
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --dist loadfile  # one process a core, one thread a process
-
-# lines and branches of s4a that the tests run; counting takes half as much time again
-coverage: $(VENV)/.test
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --dist loadfile --cov --cov-report=term:skip-covered
 
 check: $(VENV)/.test
