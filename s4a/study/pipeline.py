@@ -82,7 +82,8 @@ def analyse(
     refine : {"joint", "intrinsic"}, optional
         Registration with joint rounds (default), or the paper's spectral match alone.
     how : {"ours", "standard"}, optional
-        Full resolution by eq. 7 (default), or by eq. 3 and 4.
+        Full resolution by eq. 7 (default), or by eq. 3 and 4; with joint rounds that match is one
+        candidate among others.
     norm : {"h2", "h1", "frobenius"}
         Norm of eq. 5, see :func:`s4a.method.median.distance_to_identity`.
     scale : bool
