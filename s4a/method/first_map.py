@@ -7,7 +7,7 @@ poses are far apart these are wrong: then the best of several maps is taken.
 import numpy as np
 from scipy.spatial import cKDTree
 
-from s4a.geometry.align import farthest_points
+from s4a.geometry.align import Motion, farthest_points
 from s4a.geometry.mesh import edges
 from s4a.method import fmap, joint
 from s4a.method.shape import Basis
@@ -15,16 +15,14 @@ from s4a.method.shape import Basis
 N_LANDMARKS = 10  # of step 3
 
 
-def nearest_after_motion(
-    source: Basis, target: Basis, motion: tuple[np.ndarray, np.ndarray]
-) -> np.ndarray:
+def nearest_after_motion(source: Basis, target: Basis, motion: Motion) -> np.ndarray:
     """The vertex of the moved source nearest to every vertex of the target ``(n_target,)``."""
     R, t = motion
     return cKDTree(source.X @ R.T + t).query(target.X)[1]
 
 
 def landmarks_after_motion(
-    source: Basis, target: Basis, motion: tuple[np.ndarray, np.ndarray], n: int = N_LANDMARKS
+    source: Basis, target: Basis, motion: Motion, n: int = N_LANDMARKS
 ) -> tuple[np.ndarray, np.ndarray]:
     """Step 3: n spread vertices of the source, and the vertices of the target nearest to them."""
     R, t = motion
@@ -35,7 +33,7 @@ def landmarks_after_motion(
 def map_after_motion(
     source: Basis,
     target: Basis,
-    motion: tuple[np.ndarray, np.ndarray],
+    motion: Motion,
     *,
     k_init: int = 20,
     init: str = "dense",
@@ -70,12 +68,12 @@ def map_after_motion(
     return fmap.refine_once(source, target, C)
 
 
-def stretch(target: Basis, motion: joint.Motion) -> float:
+def stretch(target: Basis, warp: joint.Warp) -> float:
     """Median |log| of the lengths of the registered edges by those of the target."""
     ends = edges(target.T).T  # (2, e)
     after, before = (
         np.maximum(np.linalg.norm(np.subtract(*X[ends]), axis=1), 1e-12)
-        for X in (joint.move(target, motion), target.X)
+        for X in (joint.move(target, warp), target.X)
     )
     return float(np.median(np.abs(np.log(after / before))))
 
@@ -132,7 +130,7 @@ def have_signatures(source: Basis, target: Basis, k: int) -> bool:
 def first_map(
     source: Basis,
     target: Basis,
-    motion: tuple[np.ndarray, np.ndarray],
+    motion: Motion,
     *,
     k_init: int = 20,
     init: str = "dense",

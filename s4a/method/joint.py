@@ -6,7 +6,7 @@ position, normal and, with ``spectral > 0``, spectrum together; K grows as in Zo
 coupling both is that of Smooth Shells (Eisenberger, Laehner, Cremers, CVPR 2020).  Where poses are
 far apart, every part of N turns on its own before.  All lengths are for surfaces of unit area.
 
-A *motion* (R, t, c) takes N to R x + t + Phi c, with one R (3, 3) and t (3,) for all of N, or one
+A *warp* (R, t, c) takes N to R x + t + Phi c, with one R (3, 3) and t (3,) for all of N, or one
 for each vertex of low resolution.
 """
 
@@ -24,7 +24,7 @@ from s4a.method.shape import Basis
 
 FAR = 0.035  # between shapes of one pose the tenth that is farthest lies nearer, see `far_apart`
 
-Motion = tuple[np.ndarray, np.ndarray, np.ndarray]
+Warp = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 class Candidate(NamedTuple):
@@ -32,7 +32,7 @@ class Candidate(NamedTuple):
 
     score: float
     match: np.ndarray
-    motion: Motion
+    warp: Warp
 
 
 def turn(target: Basis, R: np.ndarray, t: np.ndarray) -> np.ndarray:
@@ -46,9 +46,9 @@ def turn(target: Basis, R: np.ndarray, t: np.ndarray) -> np.ndarray:
     return np.einsum("nij,nj->ni", R.reshape(-1, 3, 3), target.X) + t
 
 
-def move(target: Basis, motion: Motion) -> np.ndarray:
+def move(target: Basis, warp: Warp) -> np.ndarray:
     """The registered target R x + t + Phi c ``(n, 3)``."""
-    R, t, c = motion
+    R, t, c = warp
     return turn(target, R, t) + target.field(c)
 
 
@@ -59,8 +59,8 @@ def nearest_vertices(
     return source.tree.query(features(X, vertex_normals(X, target.T))[rows])[1]
 
 
-def fit_motion(source: Basis, target: Basis, match: np.ndarray) -> Motion:
-    """The motion that brings the target's vertices near coarse ones onto their matches ``(s,)``."""
+def fit_warp(source: Basis, target: Basis, match: np.ndarray) -> Warp:
+    """The warp that brings the target's vertices near coarse ones onto their matches ``(s,)``."""
     rows = target.near_coarse
     return onto(target.X[rows], source.X[match], target.area[rows], target.coefficients)
 
@@ -76,7 +76,7 @@ def low_rounds(
     rounds: int = 2,
     spectral: float = 0.0,
     by_parts: bool = False,
-) -> tuple[np.ndarray, Motion]:
+) -> tuple[np.ndarray, Warp]:
     """Joint rounds on low-resolution meshes, for K = k_first, k_first + step, ..., k.
 
     Parameters
@@ -95,7 +95,7 @@ def low_rounds(
     Returns
     -------
     match : int ndarray (n_target,)
-    motion : tuple (R, t, c)
+    warp : tuple (R, t, c)
     """
     k = min(k, target.k, source.k)
     normals = vertex_normals(source.X, source.T) if spectral else None
@@ -107,8 +107,8 @@ def low_rounds(
             return Phi.T @ (target.area[:, None] * d)  # (K, 3)
 
         for _ in range(rounds):
-            motion = onto(target.X, source.X[match], target.area, coefficients, spectrum)
-            X = move(target, motion)
+            warp = onto(target.X, source.X[match], target.area, coefficients, spectrum)
+            X = move(target, warp)
             if not spectral:
                 match = nearest_vertices(source, target, X)
                 continue
@@ -118,46 +118,46 @@ def low_rounds(
                 features(X, vertex_normals(X, target.T), weight * Phi),
                 features(source.X, normals, weight * source.Phi[:, :K] @ C.T),
             )
-    return match, motion
+    return match, warp
 
 
 def dense_rounds(
-    source: Basis, target: Basis, motion: Motion, *, rounds: int = 3
-) -> tuple[np.ndarray, Motion]:
+    source: Basis, target: Basis, warp: Warp, *, rounds: int = 3
+) -> tuple[np.ndarray, Warp]:
     """Joint rounds at full resolution, on vertices near coarse ones; motions of parts stay.
 
     Parameters
     ----------
     source, target : Basis
         At full resolution.
-    motion : tuple (R, t, c)
+    warp : tuple (R, t, c)
         The end of the low rounds.
 
     Returns
     -------
     match : int ndarray (s,)
-    motion : tuple (R, t, c)
+    warp : tuple (R, t, c)
     """
-    match = nearest_vertices(source, target, move(target, motion), target.near_coarse)
-    R, t, _ = motion
+    match = nearest_vertices(source, target, move(target, warp), target.near_coarse)
+    R, t, _ = warp
     for _ in range(rounds):
         if R.ndim == 2:
-            motion = fit_motion(source, target, match)
+            warp = fit_warp(source, target, match)
         else:
-            motion = (
+            warp = (
                 R,
                 t,
                 target.coefficients(source.X[match] - turn(target, R, t)[target.near_coarse]),
             )
-        match = nearest_vertices(source, target, move(target, motion), target.near_coarse)
-    return match, motion
+        match = nearest_vertices(source, target, move(target, warp), target.near_coarse)
+    return match, warp
 
 
 def registration_score(
     source: Basis,
     target: Basis,
     match: np.ndarray,
-    motion: Motion,
+    warp: Warp,
     *,
     n_samples: int = 300,
     limit: float = 0.5,
@@ -178,9 +178,9 @@ def registration_score(
         At one resolution.
     match : int ndarray (s,)
         For the target's vertices near coarse ones.
-    motion : tuple (R, t, c)
+    warp : tuple (R, t, c)
     """
-    X = move(target, motion)
+    X = move(target, warp)
     tree = feature_tree(X, target.T)
     rows = np.arange(len(X))[target.near_coarse]
     back = X[tree.query(source.tree.data[source.near_coarse])[1]]
@@ -235,12 +235,12 @@ def candidates(
     """
     tried = {}
 
-    def enter(name, match, motion):
-        score = registration_score(source, target, match, motion)
-        tried[name] = Candidate(score, match, motion)
+    def enter(name, match, warp):
+        score = registration_score(source, target, match, warp)
+        tried[name] = Candidate(score, match, warp)
 
     for name, match in starts.items():
-        enter(name, match, fit_motion(source, target, match))
+        enter(name, match, fit_warp(source, target, match))
     for name, match in starts.items():
         enter(f"{name}+joint", *low_rounds(source, target, match, k=k))
     best = min(starts, key=lambda name: tried[f"{name}+joint"].score)

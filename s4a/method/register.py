@@ -7,6 +7,7 @@ every vertex of the template, a vertex of the shape.
 import numpy as np
 import xarray as xr
 
+from s4a.geometry.align import Motion
 from s4a.geometry.closest import closest_point_in_star, feature_tree
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.method import joint
@@ -115,7 +116,7 @@ def from_latent(
     source: Shape,
     target: Shape,
     bases: Functions,
-    motion: tuple[np.ndarray, np.ndarray],
+    motion: Motion,
     *,
     how: str = "ours",
     refine: str = "joint",
@@ -249,13 +250,13 @@ def register_surface(
             match, compared, certified = match_functions(source, target, *functions)
             attrs |= {"compared_share": compared, "certified_share": certified}
             part = match[N.near_coarse]
-            motion = joint.fit_motion(M, N, part)
+            warp = joint.fit_warp(M, N, part)
         else:
-            part, motion = joint.dense_rounds(M, N, candidates[name].motion)
-        score = joint.registration_score(M, N, part, motion)
-        ends[name] = joint.Candidate(score, part, motion)
+            part, warp = joint.dense_rounds(M, N, candidates[name].warp)
+        score = joint.registration_score(M, N, part, warp)
+        ends[name] = joint.Candidate(score, part, warp)
     method = min(ends, key=lambda name: ends[name].score)
-    X = joint.move(N, ends[method].motion)
+    X = joint.move(N, ends[method].warp)
     if method != "intrinsic":
         match = joint.nearest_vertices(M, N, X)
     attrs |= {"method": method, "score": ends[method].score}

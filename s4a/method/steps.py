@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from threadpoolctl import threadpool_limits
 
-from s4a.geometry.align import align, motion_between, realign
+from s4a.geometry.align import Motion, align, motion_between, realign
 from s4a.method import fmap, network
 from s4a.method.first_map import first_map, map_after_motion
 from s4a.method.latent import consistent_zoomout
@@ -18,8 +18,6 @@ from s4a.method.median import median_shape
 from s4a.method.register import from_latent, identity, match_functions, match_low
 from s4a.method.shape import Basis, Shape
 from s4a.schema import dataset, require
-
-Motion = tuple[np.ndarray, np.ndarray]
 
 LOW = ("position", "corner_vertex", "vertex_area", "eigenvalue", "eigenfunction")
 
