@@ -33,9 +33,9 @@ NOT_SHOWN = (
 
 
 def reduced(data):
-    """A Dataset of a study without what no panel shows, rounded to about four digits.
+    """A Dataset of a study without what no panel shows.
 
-    To be compressed on disk.
+    It is rounded to about four digits, to be compressed on disk.
     """
     data = data.drop_vars(NOT_SHOWN, errors="ignore")
     for name, values in data.data_vars.items():

@@ -89,9 +89,10 @@ def link(template: xr.Dataset, shape: xr.Dataset, registered: xr.Dataset) -> Lin
 
 
 def matrix_along(route: Route, n: int) -> tuple[sp.csr_matrix, np.ndarray]:
-    """Matrix of a route from values on its first mesh, of n vertices, to those on its last.
+    """Matrix and confidence of a route.
 
-    And the confidence on the last.
+    The matrix goes from values on its first mesh, of n vertices, to those on its last, where the
+    confidence is.
     """
     if not route:
         return sp.identity(n, format="csr"), np.ones(n)

@@ -326,7 +326,7 @@ def _compare_with_chance(features, c, n_permutations, rng):
 def _coefficients(study, d, area):
     """Displacements in an orthonormal basis of the template's smooth functions ``(s, f)``.
 
-    In all vertices where the study has no eigenfunctions.
+    Where the study has no eigenfunctions, the basis is that of the vertices.
     """
     template = study["registration"].attrs["template"]
     if "coarse" not in study or template not in study["coarse"].children:

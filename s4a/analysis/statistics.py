@@ -401,9 +401,9 @@ def classify(
     n_permutations: int = 99,
     seed: int = 0,
 ) -> xr.Dataset:
-    """Can the groups be told from the shapes?  Cross-validated.
+    """Can the groups be told from the shapes?
 
-    With the modes made inside every fold.
+    Cross-validated, with the modes made inside every fold.
 
     The coordinates of all shapes on all components are an isometric image of the displacements, so
     that PCA of the training shapes' coordinates is PCA of their displacements; nothing of a

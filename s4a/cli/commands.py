@@ -101,9 +101,9 @@ def cluster(address: str | None) -> Iterator[None]:
 
 
 def demo(args: Namespace) -> int:
-    """The whole analysis on the embedded collection, with its accuracy against the truth.
+    """The whole analysis on the embedded collection, as a page.
 
-    As a page.
+    Its accuracy against the truth is printed.
     """
     begin, out = time.perf_counter(), Path(args.out)
     collection = synthetic.brains(args.shapes, args.vertices, args.seed, dirty=args.dirty)
@@ -364,7 +364,7 @@ def truth_of(files: list[str] | None, targets: dict) -> dict[str, np.ndarray] | 
 def landmark_pairs(files: list[str] | None, targets: dict) -> dict[str, list[np.ndarray]] | None:
     """Positions of the landmarks that source and target both have by name, for every target.
 
-    Or none.
+    None where they share none.
     """
     if not files:
         return None

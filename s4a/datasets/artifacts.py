@@ -79,9 +79,9 @@ def _duplicate_vertices(X, T, u, few, rng):
 
 
 def _disorder(T, u, few, rng):
-    """Triangles of which some are there twice, some flipped.
+    """Triangles of which some are there twice, and some flipped.
 
-    And some edges have a third triangle.
+    Some edges have a third triangle then.
     """
     third, twice, flipped = rng.choice(len(T), (3, few), replace=False)
     beyond = cKDTree(u).query(u[T[third]].mean(1), 15)[1][:, -1]

@@ -1,6 +1,6 @@
-"""How far a registration is from a known truth.
+"""Accuracy (5.2): how far a registration is from a known truth.
 
-Beside two simpler ways to the same correspondence.
+Two simpler ways to the same correspondence stand beside it.
 """
 
 from collections.abc import Callable
@@ -83,9 +83,7 @@ def accuracy(
     n_geodesic: int = 0,
     n_jobs: int | None = None,
 ) -> xr.Dataset:
-    """Mean error of a study's registrations against the truth.
-
-    Beside two baselines on the same shapes.
+    """Mean error of a study's registrations against the truth, beside two baselines.
 
     Parameters
     ----------

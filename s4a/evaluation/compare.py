@@ -48,7 +48,7 @@ def checked_methods(methods: Sequence[str]) -> None:
 def load_mesh(shape: Path | str | xr.Dataset, what: str) -> tuple[xr.Dataset, float]:
     """A mesh and the seconds it took to read and clean it.
 
-    None for a Dataset, which is taken as clean.
+    A Dataset is taken as clean and costs none.
     """
     if isinstance(shape, xr.Dataset):
         require(shape, "position", "corner_vertex", what=what)
@@ -61,7 +61,7 @@ def load_mesh(shape: Path | str | xr.Dataset, what: str) -> tuple[xr.Dataset, fl
 def in_mesh(vertices: np.ndarray, mesh: xr.Dataset) -> np.ndarray:
     """Vertices of the mesh that rows of its file became ``(n,)``.
 
-    -1 where they are -1 or were dropped.
+    Rows that are -1, or were dropped, become -1.
     """
     became = mesh["vertex_of_file"].values
     if vertices.max(initial=-1) >= len(became):
@@ -92,9 +92,9 @@ def truth_in_meshes(truth: np.ndarray, source: xr.Dataset, target: xr.Dataset) -
 
 
 def read_truth(path: Path | str) -> np.ndarray:
-    """Truth from a file: NPY, or text with a number or three in each row.
+    """Truth from a file, for the vertices of the target's file.
 
-    For the vertices of the target's file.
+    NPY, or text with a number or three in each row.
     """
     try:
         found = (
@@ -254,9 +254,9 @@ def pairs(
 
 
 def landmark_vertices(given: np.ndarray, mesh: xr.Dataset, clean: bool) -> np.ndarray:
-    """Vertices of the mesh: the nearest ones to positions ``(p, 3)``.
+    """Vertices of the mesh that landmarks mean.
 
-    Or those that rows of its file became.
+    The nearest ones to positions ``(p, 3)``, or those that rows of its file became.
     """
     if given.ndim == 2 and given.shape[1] == 3:
         return cKDTree(mesh["position"].values).query(given)[1]
@@ -326,7 +326,7 @@ def collection(
 ) -> xr.Dataset:
     """Table 2: the collection in the space of SCALABLE and of RE-MATCH.
 
-    To full resolution the standard way and ours.
+    Full resolution is reached the standard way and ours.
 
     Parameters
     ----------

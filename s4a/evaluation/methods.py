@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from s4a.geometry.align import Motion, align, farthest_points
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.method import fmap, joint
-from s4a.method.first_map import N_LANDMARKS, nearest_after_motion
+from s4a.method.first_map import landmarks_after_motion, nearest_after_motion
 from s4a.method.lift import SPARE, lift
 from s4a.method.nearest import (
     as_candidates,
@@ -172,15 +172,6 @@ def functions_at_all_vertices(shape: Shape, C: np.ndarray | None = None) -> np.n
     return shape.full.extend(F)
 
 
-def default_landmarks(
-    source: Spaces, target: Spaces, motion: tuple[np.ndarray, np.ndarray]
-) -> Matches:
-    """Steps 2 and 3 of 4.1: spread vertices of the source and the nearest ones of the target."""
-    R, t = motion
-    landmark = farthest_points(source.X, N_LANDMARKS)
-    return landmark, cKDTree(target.X).query(source.X[landmark] @ R.T + t)[1]
-
-
 def match_in_space(
     source: Spaces, target: Spaces, motion: tuple[np.ndarray, np.ndarray]
 ) -> Matches:
@@ -291,7 +282,7 @@ class Pair:
         R, t, _ = clock("align", align, X, area, Y, area_target)
         landmarks = self.landmarks
         if landmarks is None:
-            landmarks = clock("align", default_landmarks, self.source, self.target, (R, t))
+            landmarks = clock("align", landmarks_after_motion, self.source.X, self.target.X, (R, t))
         return (R, t), landmarks, clock.seconds["align"]
 
     def match_spectrally(self, method: str, motion: Motion, landmarks: Matches) -> SpectralMatch:

@@ -29,10 +29,7 @@ THRESHOLDS = np.linspace(0, 0.25, 101)  # of the error curve, as in Kim et al. (
 
 
 def gaps(X: np.ndarray, Y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distances of every point of X to the nearest of Y ``(n,)``.
-
-    And of every point of Y to the nearest of X.
-    """
+    """Distances to the nearest point, both ways: ``(n,)`` from X to Y, ``(p,)`` from Y to X."""
     return cKDTree(Y).query(X)[0], cKDTree(X).query(Y)[0]
 
 
@@ -181,7 +178,7 @@ def geodesic_error(
 def error_curve(error: np.ndarray, thresholds: ArrayLike = THRESHOLDS) -> np.ndarray:
     """Share of the errors that are no larger than each threshold, ``(t,)``.
 
-    The cumulative curve of the protocol.
+    It is the cumulative curve of the Princeton protocol.
 
     It sees what a mean hides: few gross errors or many small ones.
 

@@ -149,7 +149,7 @@ def path_lengths(G: sp.csr_matrix, start: np.ndarray, end: np.ndarray, limit: fl
 def half_cotangents(X: np.ndarray, T: np.ndarray) -> np.ndarray:
     """Half the cotangent of the angle opposite to each half-edge ``(3 m,)``.
 
-    In the order of :func:`directed_edges`.
+    Half-edges are in the order of :func:`directed_edges`.
     """
     #        o          cot(angle at o) = u.v / |u x v|,
     #      u/ \v        and |u x v| is twice the area of the triangle

@@ -137,7 +137,7 @@ def wks(
 def multiplication(Phi: np.ndarray, area: np.ndarray, f: np.ndarray) -> np.ndarray:
     """Operators g -> f g in the basis: Phi^T A diag(f) Phi for d functions ``(d, k, k)``.
 
-    Of Nogneng and Ovsjanikov (2017).
+    After Nogneng and Ovsjanikov (2017).
 
     Parameters
     ----------

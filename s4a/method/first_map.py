@@ -22,12 +22,21 @@ def nearest_after_motion(source: Basis, target: Basis, motion: Motion) -> np.nda
 
 
 def landmarks_after_motion(
-    source: Basis, target: Basis, motion: Motion, n: int = N_LANDMARKS
+    X: np.ndarray, Y: np.ndarray, motion: Motion, n: int = N_LANDMARKS
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Step 3: n spread vertices of the source, and the vertices of the target nearest to them."""
+    """Step 3: n spread vertices of the source, and the vertices of the target nearest to them.
+
+    Parameters
+    ----------
+    X, Y : float ndarray (n_source, 3), (n_target, 3)
+        Vertices of source and target.
+    motion : tuple (R, t)
+        Rigid motion of the source onto the target.
+    n : int
+    """
     R, t = motion
-    landmark = farthest_points(source.X, n)
-    return landmark, cKDTree(target.X).query(source.X[landmark] @ R.T + t)[1]
+    landmark = farthest_points(X, n)
+    return landmark, cKDTree(Y).query(X[landmark] @ R.T + t)[1]
 
 
 def map_after_motion(
@@ -60,7 +69,7 @@ def map_after_motion(
     target = target.first(k_init)
     if init == "landmarks":
         C = fmap.fmap_from_landmarks(
-            source, target, *landmarks_after_motion(source, target, motion)
+            source, target, *landmarks_after_motion(source.X, target.X, motion)
         )
     else:
         near = nearest_after_motion(source, target, motion) if near is None else near

@@ -379,9 +379,9 @@ def off_diagonal_mass(C: np.ndarray) -> float:
 def swapped_blocks(
     C: np.ndarray, *, longest: int = 6, inside: float = 0.75, diagonal: float = 0.5
 ) -> list[tuple[int, int]]:
-    """Runs of modes that the map exchanges among each other.
+    """Runs of modes that the map exchanges among each other (Fig. 2).
 
-    As near-equal eigenvalues of symmetric shapes do (Fig. 2).
+    Those of symmetric shapes do so, whose eigenvalues are nearly equal.
 
     A run counts when at least the share `inside` of the squared entries of its rows and columns
     lies in its diagonal block, and less than the share `diagonal` of that on the diagonal itself;

@@ -59,8 +59,6 @@ def analyse(
 ) -> xr.DataTree:
     """From a collection of meshes to a median shape, dense correspondences and modes.
 
-    The whole of S4A.
-
     Parameters
     ----------
     shapes : path, list of paths, dict or xarray.DataTree

@@ -135,9 +135,9 @@ class Correspondence(Panel):
         self.connect()
 
     def latent_look(self) -> tuple:
-        """Of both surfaces colours and coordinates, the colour bar, and what they are.
+        """Colours and coordinates of both surfaces, the colour bar, and what they are.
 
-        The shape's, pulled to the template.
+        Those of the shape are pulled to the template.
         """
         Y, match = self.pair[1][0], self.match()
         caption = "the shape's coordinates, pulled to the template"
