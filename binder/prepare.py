@@ -25,10 +25,9 @@ NOT_SHOWN = (
         "displacement_low",
         "round_trip",
         "distortion",
-        "file_vertex",
         "vertex_of_file",
     ),
-    *("sample_vertex", "edge_vertex", "cotan_weight"),
+    *("edge_vertex", "cotan_weight"),
 )
 
 

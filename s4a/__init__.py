@@ -11,8 +11,8 @@ reading and cleaning      :func:`read_shapes`, :func:`read_shape`, :func:`clean`
 5.1 metrics               :mod:`s4a.metrics`
 5.2, 5.3 comparison       :mod:`s4a.compare`
 4.1, 4.2 step by step     :func:`align_pair`, :func:`build_network`, :func:`refine_network`,
-                          :func:`latent_match`, :func:`register_shape`
-4.2, 6.1 collections      :func:`analyse`, :func:`open_study`, :func:`synthesize`
+                          :func:`latent_match`, :func:`latent_map`, :func:`register_shape`
+4.2, 6.1 collections      :func:`analyse`, :func:`open_study`, :func:`verify`, :func:`synthesize`
 notebooks, pages          :func:`explore`, :func:`write_page`
 new shapes                :func:`insert`
 6.1 statistics            :mod:`s4a.statistics`
@@ -46,6 +46,7 @@ from s4a.method.spectral import reconstruct, spectrum
 from s4a.method.steps import (
     align_pair,
     build_network,
+    latent_map,
     latent_match,
     refine_network,
     register_shape,
@@ -55,6 +56,7 @@ from s4a.study.insert import insert
 from s4a.study.pair import match_pair
 from s4a.study.pipeline import analyse
 from s4a.study.tree import open_study
+from s4a.study.verify import verify
 
 install()
 __version__ = version("s4a")
@@ -67,6 +69,7 @@ __all__ = [
     "compare",
     "explore",
     "insert",
+    "latent_map",
     "latent_match",
     "match_pair",
     "metrics",
@@ -85,6 +88,7 @@ __all__ = [
     "transfer_labels",
     "transfer_landmarks",
     "transfer_scalars",
+    "verify",
     "write_mesh",
     "write_page",
     "write_registered",

@@ -16,6 +16,7 @@ INPUT2 = "squared unit of the input"
 ONE = "1"
 SHARE = "share of sqrt(area)"
 UNIT_AREA = "1, for the surface scaled to unit area"
+LARGEST_COUNT = 2**31 - 1  # of options that count, and of seeds: what every library takes
 
 # name: (dims, unit, long_name).  A new variable is a new row, beside those of its step.  In the
 # file of a single shape a leading dim `shape` is absent.
@@ -43,6 +44,8 @@ ROWS = {
     "coarse_weight": ("original_vertex corner", ONE, "their barycentric weights: entries of U"),
     "eigenvalue": ("mode", UNIT_AREA, "eigenvalue of the Laplace-Beltrami operator"),
     "eigenfunction": ("vertex mode", UNIT_AREA, "eigenfunction, orthonormal in the vertex areas"),
+    "lifted_eigenfunction": ("original_vertex mode", UNIT_AREA,
+        "eigenfunction of the original mesh, nearly, by a step of inverse iteration"),
     # one pair (4.1)
     "match": ("vertex", ONE, "on each vertex of the target, the matched vertex of the source"),
     # metrics of a pair (5.1, eq. 9 - 11)
@@ -74,6 +77,15 @@ ROWS = {
         "functional map, source functions to target functions"),
     "fmap_initial": ("pair mode_target_initial mode_source_initial", ONE,
         "functional map before Consistent ZoomOut"),
+    "fmap_fitted": ("pair mode_target_initial mode_source_initial", ONE,
+        "that map before the step of ZoomOut ahead (4.2)"),
+    "pair_rotation": ("pair xyz xyz_2", ONE,
+        "rotation R of ICP, source to target, between their frames (4.1, step 2)"),
+    "pair_translation": ("pair xyz", SHARE, "translation t of ICP, source to target"),
+    "landmark_of_source": ("pair landmark", ONE,
+        "landmarks of the first map: coarse vertices of the source (4.1, step 3)"),
+    "landmark_of_target": ("pair landmark", ONE,
+        "the coarse vertices of the target that are nearest to them after ICP"),
     "weight": ("pair", ONE,
         "weight of the map in the consistent latent basis, by its cycle error over all modes"),
     "cycle_error": ("pair", ONE,
@@ -106,8 +118,15 @@ ROWS = {
         "rotation R of the alignment x -> s R x + t onto the template"),
     "translation": ("shape xyz", INPUT, "translation t of the alignment onto the template"),
     "scale": ("shape", ONE, "scale s of the alignment onto the template"),
+    "registered_match_low": ("shape low_vertex", ONE,
+        "on each coarse vertex of the template, the matched coarse vertex of the shape (eq. 6)"),
     "displacement_low": ("shape low_vertex xyz", INPUT,
         "matched vertex of the aligned coarse shape minus coarse template (eq. 6)"),
+    "displacement_coefficient": ("shape mode xyz", INPUT,
+        "coefficients of the displacement in the functions U Phi of the template (6.1)"),
+    "icp_rotation": ("shape xyz xyz_2", ONE,
+        "rotation R of ICP, shape to template or reference, between their frames (4.1, step 2)"),
+    "icp_translation": ("shape xyz", SHARE, "translation t of that motion"),
     "confidence": ("shape vertex", ONE, "confidence of the match, 0 to 1"),
     "round_trip": ("shape vertex", SHARE, "cycle error: way from the vertex to the shape and back"),
     "distortion": ("shape vertex", ONE,
@@ -138,6 +157,8 @@ ROWS = {
     "score": ("shape component", ONE, "score of each shape, in standard deviations"),
     "reconstruction_error": ("shape", INPUT,
         "root mean square over the area of what the modes do not describe"),
+    "score_apart": ("shape_apart component", ONE,
+        "score, in standard deviations, of each doubtful shape that the modes are made without"),
     "explained_variance_ratio": ("component", ONE, "share of the variance at full resolution"),
     "explained_variance_ratio_low": ("component", ONE,
         "share of the variance at low resolution, of the matches as they are"),
@@ -203,10 +224,28 @@ ROWS = {
     "collection_seconds": ("way how block", "s",
         "CPU time of the block for the whole collection, of one core"),
     "median_shape": ("way", ONE, "median shape (eq. 5)"),
+    # what holds of a study's files
+    "state": ("file", ONE,
+        "whole, unsealed, damaged, missing, stale, left over or foreign, see s4a.verify"),
+    "fault": ("file", ONE, "what is wrong with the file; empty where nothing is"),
+    # plausibility (5.1): a shape on its own and beside others of its collection
+    "sketch_position": ("point xyz", ONE,
+        "some vertices of the shape, centred, of unit root mean square radius"),
+    "sketch_area": ("point", ONE, "their shares of the area"),
+    "sketch_normal": ("point xyz", ONE, "their normals"),
+    "sketch_asymmetry": ("point", ONE, "how far the shape's mirror image lies above the vertex"),
+    "moment": ("axis", ONE, "share of the second moment along each principal axis"),
+    "fit": ("reference", ONE,
+        "residual of ICP onto the reference, both of unit root mean square radius"),
+    "fit_mirrored": ("reference", ONE, "the same of the shape's mirror image"),
+    "hand": ("reference", ONE,
+        "positive where the shape is of the reference's hand, negative where its mirror image is"),
     # the report
-    "status": ("shape", ONE, "ok, repaired or excluded"),
+    "status": ("shape", ONE, "ok, repaired, doubtful or excluded"),
     "reason": ("shape", ONE, "what was found and done"),
     "warning": ("shape", ONE, "what looks wrong and was left as it is"),
+    "doubtful_kinds": ("shape", ONE, "what makes the shape doubtful, a word for each"),
+    "warning_kinds": ("shape", ONE, "what else was warned of, a word for each"),
     "path": ("shape", ONE, "file of the shape"),
     "area": ("shape", INPUT2, "area of the surface"),
     "self_intersections": ("shape", ONE,
@@ -240,6 +279,19 @@ ROWS = {
 TABLE = {
     name: (tuple(dims.split()), unit, long_name) for name, (dims, unit, long_name) in ROWS.items()
 }
+
+# variables of indices: the dim that they point into; -1 points nowhere
+POINTS_INTO = {
+    "corner_vertex": "vertex",
+    "edge_vertex": "vertex",
+    "file_vertex": "file_vertex_index",
+    "vertex_of_file": "vertex",
+    "sample_vertex": "original_vertex",
+    "coarse_vertex": "vertex",
+    "registered_match": "original_vertex",
+    "template_triangle": "triangle",
+}
+NOWHERE = {"vertex_of_file"}
 
 
 def variable(name: str, data: ArrayLike, **attrs: str | float | list[str]) -> xr.Variable:
@@ -353,10 +405,53 @@ def require(data: xr.Dataset, *names: str, what: str = "dataset") -> None:
             raise ValueError(f"{name} of the {what} needs the dims {dims}, found {data[name].dims}")
 
 
+def check_indices(name: str, values: np.ndarray, sizes: Mapping[str, int]) -> None:
+    """ValueError where a variable of :data:`POINTS_INTO` points outside of its dim.
+
+    Parameters
+    ----------
+    name : str
+    values : ndarray
+    sizes : dict of str to int
+        Of the dims; one that is not among them has no end.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.schema import check_indices
+    >>> check_indices("corner_vertex", np.array([[0, 1, 2]]), {"vertex": 3})
+    """
+    if name not in POINTS_INTO or not values.size:
+        return
+    dim, least = POINTS_INTO[name], -1 if name in NOWHERE else 0
+    low, high, size = int(values.min()), int(values.max()), sizes.get(dim)
+    if low < least or (size is not None and high >= size):
+        end = "" if size is None else size - 1
+        raise ValueError(f"{name} needs indices {least}..{end} of {dim}, found {low}..{high}")
+
+
 def check_switch(name: str, value: object) -> None:
     """ValueError unless an option is True or False."""
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name} must be True or False; found {value!r}")
+
+
+def check_count(name: str, value: object, least: int = 0) -> None:
+    """ValueError unless an option is an integer from `least` to :data:`LARGEST_COUNT`.
+
+    Examples
+    --------
+    >>> from s4a.schema import check_count
+    >>> check_count("n_pairs", 10**22)
+    Traceback (most recent call last):
+    ValueError: n_pairs must be an integer of at most 2147483647; found a larger one
+    """
+    if isinstance(value, int | np.integer) and value > LARGEST_COUNT:
+        raise ValueError(
+            f"{name} must be an integer of at most {LARGEST_COUNT}; found a larger one"
+        )
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise ValueError(f"{name} must be an integer of at least {least}; found {value!r}")
 
 
 def check_text(name: str, value: object) -> None:

@@ -1,10 +1,10 @@
 """Damaged files for every reader, 20,000 a format: ``python tests/fuzz.py --files 20000``.
 
-Files are read, and meshes cleaned, in a child process with a limit of memory and of processor time.
-A failure is: the process dies, a file takes over 5 s or more memory than the limit, another
-exception than a ValueError that names the file leaves the reader, or a warning does.  File i of a
-format is always the same: ``--only FORMAT --first i --files 1`` reads it again, ``--keep FOLDER``
-keeps the failing ones.
+Files are read, meshes cleaned and surfaces that are none remeshed, in a child process with a limit
+of memory and of processor time.  A failure is: the process dies, a file takes over 5 s or more
+memory than the limit, another exception than a ValueError that names the file leaves the reader, or
+a warning does.  File i of a format is always the same: ``--only FORMAT --first i --files 1`` reads
+it again, ``--keep FOLDER`` keeps the failing ones.
 """
 
 import argparse
@@ -13,6 +13,7 @@ import functools
 import gzip
 import io
 import json
+import logging
 import os
 import random
 import re
@@ -316,6 +317,7 @@ def seeds():
         "Slicer": (".mrk.json", "landmarks", [json.dumps(slicer, indent=1).encode()]),
         "MeshLab": (".pp", "landmarks", [picked.encode()]),
         "CSV landmarks": (".csv", "landmarks", [marks.encode(), bare]),
+        "surfaces": (".npz", "surface", []),  # whole files, of surfaces that are none
         "CSV subjects": (
             ".csv", "subjects", [covariates.encode(), covariates.replace(",", ";").encode()],
         ),
@@ -324,6 +326,74 @@ def seeds():
         name: (suffix, reader, [one if isinstance(one, tuple) else (one, whole) for one in given])
         for name, (suffix, reader, given) in table.items()
     }
+
+
+# surfaces that are none
+
+
+def part(rng):
+    """A sphere, torus, square, heap of triangles, hull or single triangle."""
+    import numpy as np
+    from scipy.spatial import ConvexHull
+
+    from s4a import synthetic
+    from s4a.geometry.mesh import as_arrays
+
+    n = int(rng.choice([4, 5, 8, 20, 60]))
+    X = rng.normal(size=(n, 3))
+    k = int(rng.integers(2, 8))
+    x, y = np.divmod(np.arange(k * k), k)
+    a = np.flatnonzero((x < k - 1) & (y < k - 1))
+    square = np.r_[np.stack([a, a + k, a + k + 1], axis=1), np.stack([a, a + k + 1, a + 1], axis=1)]
+    makers = [
+        lambda: as_arrays(synthetic.sphere(max(n, 8))),
+        lambda: as_arrays(synthetic.torus(1, rng.uniform(0.05, 0.6), 3 + 2 * k, 2 + k)),
+        lambda: (np.stack([x, y, 0 * x], axis=1) * 1.0, square),
+        lambda: (X, rng.integers(0, n, (int(rng.integers(1, 3 * n)), 3))),
+        lambda: (X, ConvexHull(X).simplices),
+        lambda: (X[:3], np.array([[0, 1, 2]])),
+    ]
+    return makers[rng.integers(len(makers))]()
+
+
+def spoilt(rng, X, T):
+    """One thing done to a surface."""
+    import numpy as np
+
+    size = np.ptp(X, axis=0).max() or 1.0
+    jitter = size * 10 ** rng.uniform(-9, -1)
+    m = len(T)
+    soup = X[T[:80]].reshape(-1, 3)
+    ways = [
+        lambda: (soup + jitter * rng.normal(size=soup.shape), np.arange(len(soup)).reshape(-1, 3)),
+        lambda: (X + jitter * rng.normal(size=X.shape), T),
+        lambda: (X * 10 ** rng.uniform(-6, 6, 3), T),  # slivers
+        lambda: (X, T[rng.permutation(m)[: max(1, int(m * rng.uniform(0.2, 1)))]]),
+        lambda: (X, np.r_[T, rng.integers(0, len(X), (3, 3))]),
+        lambda: (np.round(X / size * rng.choice([1, 3, 10])) * size, T),
+        lambda: (X, np.where(rng.random((m, 1)) < 0.5, T[:, ::-1], T)),
+        lambda: (np.r_[X[:-1], [[rng.choice([np.nan, np.inf, 1e8 * size, 0])] * 3]], T),
+        lambda: (X[rng.integers(0, len(X), len(X))], T),
+        lambda: (X * 10 ** rng.uniform(-18, 18), T),
+        lambda: (X + size * 10 ** rng.uniform(0, 14), T),
+    ]
+    return ways[rng.integers(len(ways))]()
+
+
+def surface_that_is_none(seed):
+    """An archive of parts, each moved and scaled, to which a few things were done."""
+    import numpy as np
+
+    rng = np.random.default_rng(seed)
+    X, T = part(rng)
+    for _ in range(rng.choice([0, 0, 0, 1, 4])):
+        Y, S = part(rng)
+        T = np.r_[T, S + len(X)]
+        X = np.r_[X, Y * 10 ** rng.uniform(-2, 2) + rng.choice([0, 1, 10]) * rng.normal(size=3)]
+    with np.errstate(all="ignore"):
+        for _ in range(rng.integers(4)):
+            X, T = spoilt(rng, X, T)
+    return packed({"V.npy": npy(X), "F.npy": npy(T.astype(np.int32))})
 
 
 # damage
@@ -409,6 +479,8 @@ DAMAGES = [
 def damaged(seed, name, i, table):
     """File i of a format."""
     rng = random.Random(f"{seed}/{name}/{i}")
+    if name == "surfaces":
+        return surface_that_is_none(rng.getrandbits(64))
     given = table[name][2]
     content, finish = given[i % len(given)]
     data = bytearray(content)
@@ -429,11 +501,13 @@ def read(path, kind):
     """
     from s4a.input.annotations import read_labels, read_landmarks
     from s4a.input.clean import clean_arrays
+    from s4a.input.collection import read_shape
     from s4a.input.files import read_mesh
     from s4a.input.subjects import read_table
 
     readers = {"mesh": read_mesh, "labels": read_labels, "landmarks": read_landmarks}
     readers["subjects"] = lambda path: read_table(path, ["left", "middle", "right"])
+    readers["surface"] = lambda path: read_shape(path, components="all", close_holes=odd(path))
     try:
         found = readers[kind](path)
     except ValueError as error:
@@ -444,12 +518,34 @@ def read(path, kind):
                 raise AssertionError(f"more memory than the limit: {error!r}") from error
             error = error.__cause__
         return "refused"
+    if kind == "surface":
+        try:
+            remeshed(found)
+        except ValueError:
+            return "parsed, not cleaned"
     if kind == "mesh":
         try:
             clean_arrays(*found[:2])
         except ValueError:
             return "parsed, not cleaned"
     return "parsed"
+
+
+def odd(path):
+    return bool(sum(path.read_bytes()) % 2)
+
+
+def remeshed(mesh):
+    """What comes after the cleaning of a shape; AssertionError where it is not finite."""
+    import numpy as np
+
+    from s4a.method.remesh import coarsen
+    from s4a.method.spectral import spectrum
+
+    low = spectrum(coarsen(mesh, n_coarse=30), k=8)
+    for name, values in low.variables.items():
+        if values.dtype.kind == "f" and not np.isfinite(values).all():
+            raise AssertionError(f"{name} is not finite")
 
 
 def memory(key):
@@ -468,9 +564,15 @@ def work(task):
 
     What happens goes to standard output, line by line.
     """
+    logging.disable(logging.WARNING)  # of tiny surfaces that have few eigenfunctions
     table = seeds()
     path = Path(task["folder"]) / "none"
-    read_all = {"mesh": b"OFF", "labels": b"1", "landmarks": b"0 0 0", "subjects": b"shape"}
+    read_all = {
+        "mesh": b"OFF",
+        "labels": b"1",
+        "landmarks": b"0 0 0",
+        "subjects": b"shape",
+    }
     for kind, data in read_all.items():  # so that nothing is imported under the limit
         path.write_bytes(data)
         try:
@@ -481,6 +583,8 @@ def work(task):
     from s4a.input.clean import clean_arrays
 
     clean_arrays(X, T)
+    path.write_bytes(packed({"V.npy": npy(X), "F.npy": npy(T)}))
+    read(path, "surface")  # these too
     most = int(memory("VmSize") * 2**20) + MEMORY
     resource.setrlimit(resource.RLIMIT_AS, (most, most))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

@@ -185,7 +185,7 @@ def write_training_set(
     if label is None and landmarks is None:
         raise ValueError("a training set needs labels, landmarks or both; found neither")
     folder = Path(folder)
-    names = study["registration"]["shape"].values.tolist()
+    names = registration_of(study)["shape"].values.tolist()
     n_test = int(np.ceil(test_share * len(names)))
     if not 0 < n_test < len(names):
         raise ValueError(

@@ -2,20 +2,21 @@
 
 import numpy as np
 import xarray as xr
-from joblib import Parallel, delayed
+from joblib import delayed
 from scipy import stats
 from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
+from s4a.analysis.inputs import registration_of
 from s4a.analysis.model import describe_by_others, draw_points, surface_error
 from s4a.geometry.align import realign
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.method.pca import gram
 from s4a.method.register import from_latent, identity
-from s4a.method.shape import Shape
 from s4a.schema import dataset, in_unit, unit_of
 from s4a.study.insert import insert
 from s4a.study.options import Options
+from s4a.study.processes import workers
 from s4a.study.tree import stack_registration, template_mesh
 
 RECOMPUTED = "recomputed for every left-out shape, as a new one in the study of the others"
@@ -28,9 +29,9 @@ def without(study: xr.DataTree, name: str, *, n_jobs: int | None = None) -> xr.D
     all others are registered to that.  The other shapes' latent bases stay: they came out of a
     network that had the shape.
     """
-    registration = study["registration"].to_dataset()
+    registration = registration_of(study)
     names = [n for n in registration["shape"].values.tolist() if n != name]
-    latent = study["latent"].to_dataset().sel(shape=names)
+    latent = latent_of(study, names)
     nodes = {f"{s}/{n}": study[s][n].to_dataset() for s in ("original", "coarse") for n in names}
     nodes |= {"latent": latent, "report": study["report"].to_dataset()}
     if registration.attrs["template"] != name:
@@ -42,16 +43,41 @@ def without(study: xr.DataTree, name: str, *, n_jobs: int | None = None) -> xr.D
     )
 
 
+def latent_of(study: xr.DataTree, names: list[str]) -> xr.Dataset:
+    """``/latent`` of some shapes, of those that stand apart from the network too."""
+    apart = study["latent"].children
+    latent = study["latent"].to_dataset()
+    if not apart.keys() & set(names):
+        return latent.sel(shape=names)
+    parts = [
+        apart[name].to_dataset(inherit=False) if name in apart else latent.sel(shape=name)
+        for name in names
+    ]
+
+    def stacked(variable):
+        return np.stack([part[variable].values for part in parts])
+
+    return dataset(
+        latent_basis=stacked("latent_basis"),
+        latent_eigenvalue=latent["latent_eigenvalue"].values,
+        area_difference=stacked("area_difference"),
+        conformal_difference=stacked("conformal_difference"),
+        distance_to_median=stacked("distance_to_median"),
+    ).assign_coords(shape=names)
+
+
 def _register_anew(nodes, latent, rotation, options, n_jobs):
     """Nodes of ``/registration`` onto the shape nearest to the limit shape (eq. 5)."""
     names = latent["shape"].values.tolist()
     median = str(latent["distance_to_median"].idxmin().item())
-    shapes = {n: Shape(nodes[f"original/{n}"].load(), nodes[f"coarse/{n}"].load()) for n in names}
+    shapes = {
+        n: options.shape(nodes[f"original/{n}"].load(), nodes[f"coarse/{n}"].load()) for n in names
+    }
     template = shapes[median]
     Y = {n: latent["latent_basis"].sel(shape=n).values for n in names}
     others = [n for n in names if n != median]
     # R_i turns shape i to the old template, so that R_median^T R_i turns it to the new one
-    registered = Parallel(n_jobs=n_jobs)(
+    registered = workers(n_jobs)(
         delayed(_register)(
             shapes[n],
             template,
@@ -70,9 +96,8 @@ def _register(shape, template, bases, rotation, options):
     """One registration of a shape of a study to another template, its latent basis as it is."""
     with threadpool_limits(1):
         motion = realign(shape.low.cloud, template.low.cloud, (rotation, np.zeros(3)))
-        return from_latent(
-            shape, template, bases, motion, refine=options.refine, scale=options.scale
-        )
+        how = options.how
+        return from_latent(shape, template, bases, motion, how=how, **options.of_registration)
 
 
 def _errors_of(study, name, n_points, seed, n_jobs):
@@ -149,14 +174,14 @@ def generalization(
     missing = [node for node in nodes if node not in study.children]
     if missing:
         raise ValueError(f"a finished study is needed; this one lacks {', '.join(missing)}")
-    registration = study["registration"].to_dataset()
+    registration = registration_of(study)
     names = registration["shape"].values.tolist()
     if len(names) < 5:
         raise ValueError(f"at least 5 shapes needed to leave one out, found {len(names)}")
     # first the template, alone: to leave it out is the one turn with work to share out
     template = registration.attrs["template"]
     first = _errors_of(study, template, n_points, seed, n_jobs)
-    rest = Parallel(n_jobs=n_jobs, return_as="generator")(
+    rest = workers(n_jobs, return_as="generator")(
         delayed(_errors_of)(study, name, n_points, seed, 1) for name in names if name != template
     )
     errors = [first, *tqdm(rest, total=len(names) - 1, desc="shapes left out")]

@@ -40,13 +40,21 @@ def locate(
     Raises
     ------
     ValueError
-        When a landmark is farther from the surface than `farthest`; it names the worst.
+        When a landmark is not finite or farther from the surface than `farthest`; it names the
+        worst.
     """
     require(landmarks, "landmark_name", "landmark_position", what="landmarks")
     require(mesh, "position", "corner_vertex", what="mesh")
     X, T = as_arrays(mesh)
     limit = farthest * np.sqrt(triangle_areas(X, T).sum())
     P = landmarks["landmark_position"].values.astype(float)
+    away = ~(abs(P - X.mean(0)).max(1) < 1e9 * np.sqrt(triangle_areas(X, T).sum()))  # or NaN
+    if away.any():
+        first = int(away.argmax())
+        raise ValueError(
+            "landmarks need finite positions near the surface; "
+            f"{str(landmarks['landmark_name'].values[first])!r} is at {P[first].tolist()}"
+        )
     theirs = landmarks.attrs.get("coordinate_system", "")
     ours = mesh.attrs.get("coordinate_system", "")
     place, point, distance = _project(P * MIRROR if theirs and ours and theirs != ours else P, X, T)

@@ -164,7 +164,7 @@ def count_components(
     if n_components is None:
         explained = np.cumsum(variance / variance.sum())
         enough = int(np.searchsorted(explained, share - 1e-9)) + 1
-        n_components = max(1, min(enough, s // 2, len(variance)))
+        n_components = max(1, min(enough, s // 2, len(variance), most))
     c = int(n_components)
     if not 1 <= c <= most:
         raise ValueError(f"n_components needs a number from 1 to {most}, found {c}")

@@ -2,17 +2,48 @@
 
 The general linear model is Y = Z G + X B + E: Z the intercept and the covariates, X what is tested
 (a variable, or the indicators of groups).  After Freedman & Lane (1983) the residuals of Y on Z are
-permuted; only the part of X that is orthogonal to Z counts.
+permuted; only the part of X that is orthogonal to Z counts.  Permutations take all shapes as drawn
+with one variance.  Where it differs, between groups or with the variable, the signs of the
+residuals are changed at random instead (the wild bootstrap: Liu 1988; Winkler et al. 2014): every
+shape keeps its own variance, and errors need to be symmetric.
 """
 
+import itertools
 import math
+from collections.abc import Iterator
 
 import numpy as np
-from sklearn.covariance import ledoit_wolf
+from scipy import stats
+
+
+def standardize(columns: np.ndarray) -> tuple[np.ndarray, float]:
+    """Columns ``(n, c)`` less their mean and of length 1, or 0, and what of them may be rounding.
+
+    A column is 0 when it varies by no more than rounding does at its size: 0.1 added up ten times
+    is not always 1, and 1e9 + 1e-7 is no other number than 1e9.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.analysis.permutation import standardize
+    >>> standardize(np.array([[0.1, 1e9], [0.1, 1e9 + 2]]))[0].round(3).tolist()
+    [[0.0, -0.707], [0.0, 0.707]]
+    """
+    columns = np.asarray(columns, float)
+    scale = np.abs(columns).max(0)
+    columns = columns / np.where(scale > 0, scale, 1)
+    columns = columns - columns.mean(0)
+    length = np.linalg.norm(columns, axis=0)
+    rounding = 4 * len(columns) * np.finfo(float).eps
+    varies = length > rounding
+    least = length[varies].min(initial=1.0)
+    return np.where(varies, columns / np.where(varies, length, 1), 0), rounding / least
 
 
 def design(x: np.ndarray, covariates: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Orthonormal bases of Z, ``(n, r)``, and of the part of X orthogonal to it, ``(n, q)``.
+
+    Neither the unit nor the origin of a column changes them.
 
     Parameters
     ----------
@@ -22,23 +53,29 @@ def design(x: np.ndarray, covariates: np.ndarray | None = None) -> tuple[np.ndar
     Raises
     ------
     ValueError
-        When X is a combination of the covariates, or too few shapes are left to estimate anything.
+        When X is constant or a combination of the covariates, or too few shapes are left to
+        estimate anything.
     """
     n = len(x)
-    x = np.asarray(x, float).reshape(n, -1)
-    Z = np.ones((n, 1)) if covariates is None else np.column_stack([np.ones(n), covariates])
-    U, S, _ = np.linalg.svd(Z, full_matrices=False)
-    Z = U[:, S > 1e-10 * S[0]]  # (n, r)
-    U, S, _ = np.linalg.svd(x - Z @ (Z.T @ x), full_matrices=False)
-    Q = U[:, S > 1e-8 * max(float(np.linalg.norm(x - x.mean(0))), 1e-300)]  # (n, q)
-    if Q.shape[1] < max(1, np.linalg.matrix_rank(x - x.mean(0))):
+    X, rounding = standardize(np.reshape(x, (n, -1)))
+    Z = np.full((n, 1), 1 / np.sqrt(n))
+    if covariates is not None:
+        columns, noise = standardize(np.reshape(covariates, (n, -1)))
+        rounding = max(rounding, noise)
+        U, S, _ = np.linalg.svd(columns, full_matrices=False)
+        Z = np.column_stack([Z, U[:, S > max(1e-8, rounding)]])  # (n, r)
+    if not X.any(axis=0).all():
+        raise ValueError("what is tested is constant; a test needs values that differ")
+    U, S, _ = np.linalg.svd(X - Z @ (Z.T @ X), full_matrices=False)
+    Q = U[:, S > max(1e-8, rounding)]  # (n, q)
+    r, q = Z.shape[1], Q.shape[1]
+    if n - r - q < 2:
         raise ValueError(
-            "what is tested is constant or a combination of the covariates; leave one of them out"
+            f"{n} shapes are too few for a model of {r + q} columns (the mean, {r - 1} of the "
+            f"covariates, {q} of what is tested): {r + q + 2} shapes needed, or fewer covariates"
         )
-    if n - Z.shape[1] - Q.shape[1] < 2:
-        raise ValueError(
-            f"{n} shapes are too few for {Z.shape[1]} + {Q.shape[1]} columns of the model"
-        )
+    if q < np.linalg.matrix_rank(X):
+        raise ValueError("what is tested is a combination of the covariates; leave one of them out")
     return Z, Q
 
 
@@ -48,48 +85,179 @@ def indicators(group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return names, (code[:, None] == np.arange(1, len(names))).astype(float)
 
 
-def hotelling(E: np.ndarray, Q: np.ndarray, dof: int) -> float:
-    """Hotelling's T^2 (Lawley and Hotelling's trace for several columns of X).
+def shrunk_covariance(R: np.ndarray) -> np.ndarray:
+    """Covariances ``(..., p, p)`` of centred samples ``(..., n, p)``, after Ledoit & Wolf (2004).
 
-    The covariance is shrunk after Ledoit & Wolf (2004).
+    As :func:`sklearn.covariance.ledoit_wolf`, of many samples at once.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sklearn.covariance import ledoit_wolf
+    >>> from s4a.analysis.permutation import shrunk_covariance
+    >>> R = np.random.default_rng(0).normal(size=(9, 3))
+    >>> bool(np.allclose(shrunk_covariance(R), ledoit_wolf(R, assume_centered=True)[0]))
+    True
+    """
+    n, p = R.shape[-2:]
+    S = R.swapaxes(-1, -2) @ R / n
+    size = np.trace(S, axis1=-2, axis2=-1) / p
+    squared = (S**2).sum((-2, -1))
+    far = squared / p - size**2  # squared distance to the sphere of the same size
+    fourth = ((R**2).sum(-1) ** 2).sum(-1)
+    uncertain = (fourth / n - squared) / (p * n)
+    share = np.clip(uncertain / np.where(far > 0, far, 1), 0, 1) * (far > 0)
+    share, size = share[..., None, None], size[..., None, None]
+    return (1 - share) * S + share * size * np.eye(p)
+
+
+def hotelling(E: np.ndarray, Q: np.ndarray, dof: int) -> np.ndarray:
+    """Hotelling's T^2 (Lawley and Hotelling's trace for several columns of X), ``(...,)``.
 
     Parameters
     ----------
-    E : float ndarray (n, p)
+    E : float ndarray (..., n, p)
         Residuals of the scores on the covariates.
     Q : float ndarray (n, q)
         As of :func:`design`.
     dof : int
         Degrees of freedom of the error, n - r - q.
-
-    Returns
-    -------
-    float
     """
-    H = Q.T @ E  # (q, p)
-    S = ledoit_wolf(E - Q @ H, assume_centered=True)[0] * len(E) / dof  # (p, p)
-    return float(np.einsum("qp,pq->", H, np.linalg.solve(S, H.T)))
+    n, p = E.shape[-2:]
+    H = Q.T @ E  # (..., q, p)
+    S = shrunk_covariance(E - Q @ H) * n / dof  # (..., p, p)
+    # where nothing is left unexplained the statistic is large, and a number
+    least = 1e-12 * (E**2).mean((-2, -1)) + np.finfo(float).tiny
+    S = S + least[..., None, None] * np.eye(p)
+    return np.einsum("...qp,...pq->...", H, np.linalg.solve(S, H.swapaxes(-1, -2)))
 
 
-def smallest_p(n_permutations: int, group: np.ndarray | None = None, n: int | None = None) -> float:
-    """The smallest p that a permutation test of groups, or of a variable of n shapes, can reach.
+def count_rearrangements(
+    x: np.ndarray, covariates: np.ndarray | None = None, variances: str = "equal"
+) -> int:
+    """How many orders of the shapes differ, or signs of their residuals; what is given is one.
 
-    Bound by the number of permutations drawn, and by how many are different: two that only exchange
-    shapes within groups, or groups of equal size, give the same statistic.
+    Shapes of equal values of all columns take each other's place without a difference.
 
     Examples
     --------
-    >>> from s4a.analysis.permutation import smallest_p
-    >>> smallest_p(999), smallest_p(9999, group=list("aaabbb"))
-    (0.001, 0.1)
+    >>> from s4a.analysis.permutation import count_rearrangements
+    >>> count_rearrangements([0, 0, 0, 1, 1, 1]), count_rearrangements(range(6), None, "unequal")
+    (20, 32)
     """
-    drawn = 1 / (n_permutations + 1)
-    if group is None:
-        return drawn if n is None else max(drawn, 1 / math.factorial(min(n, 20)))
-    sizes = np.unique(group, return_counts=True)[1].tolist()
-    same = math.prod(math.factorial(sizes.count(s)) for s in set(sizes))
-    different = math.factorial(sum(sizes)) // math.prod(map(math.factorial, sizes))
-    return max(drawn, same / different)
+    if variances == "unequal":
+        return 2 ** (len(x) - 1)  # the same signs but turned give the same statistic
+    same = np.unique(_rows(x, covariates), axis=0, return_counts=True)[1].tolist()
+    return math.factorial(len(x)) // math.prod(map(math.factorial, same))
+
+
+def smallest_p(
+    n_permutations: int,
+    x: np.ndarray,
+    covariates: np.ndarray | None = None,
+    variances: str = "equal",
+) -> float:
+    """The smallest p that a permutation test of x, a variable or indicators, can reach.
+
+    Bound by the number of permutations drawn, and by how many are different: two that only exchange
+    shapes of equal values, or groups of equal size, give the same statistic.
+
+    Parameters
+    ----------
+    n_permutations : int
+    x, covariates, variances : see :func:`permutation_test`
+
+    Examples
+    --------
+    >>> from s4a.analysis.permutation import indicators, smallest_p
+    >>> x = indicators(list("aaabbb"))[1]
+    >>> smallest_p(99, range(20)), smallest_p(9999, x)
+    (0.01, 0.1)
+    """
+    rows = _rows(x, covariates)
+    same = 1
+    if covariates is None and variances == "equal":
+        code = np.unique(rows, axis=0, return_inverse=True)[1].ravel()
+        sizes = np.bincount(code).tolist()
+        is_grouping = len(sizes) == rows.shape[1] + 1
+        if is_grouping:  # groups of equal size may change places
+            same = math.prod(math.factorial(sizes.count(s)) for s in set(sizes))
+    return max(1 / (n_permutations + 1), same / count_rearrangements(x, covariates, variances))
+
+
+def rearrangements(
+    x: np.ndarray,
+    covariates: np.ndarray | None,
+    n_permutations: int,
+    seed: int,
+    variances: str = "equal",
+) -> tuple[Iterator[np.ndarray], int]:
+    """What is done to the residuals: orders, or signs; all others where there are no more.
+
+    Parameters
+    ----------
+    x, covariates, n_permutations, seed, variances : see :func:`permutation_test`
+
+    Returns
+    -------
+    rearrangements : iterator of ndarray (n,)
+        Integers, the residual that comes to each place; or with unequal variances 1.0 and -1.0.
+    n_rearrangements : int
+        `n_permutations`, or the number of all that differ from what is given and each other.
+
+    Examples
+    --------
+    >>> from s4a.analysis.permutation import rearrangements
+    >>> others, n = rearrangements([0, 0, 0, 1, 1, 1], None, 999, seed=0)
+    >>> n, next(others).tolist()
+    (19, [0, 1, 3, 2, 4, 5])
+    """
+    n = len(x)
+    rng = np.random.default_rng(seed)
+    n_others = count_rearrangements(x, covariates, variances) - 1
+    is_exact = n_others <= n_permutations
+    if variances == "unequal":
+        every = itertools.product([1.0, -1.0], repeat=n - 1)
+        signs = (np.array([1.0, *row]) for row in itertools.islice(every, 1, None))
+        drawn = (rng.choice([-1.0, 1.0], n) for _ in range(n_permutations))
+        return (signs, n_others) if is_exact else (drawn, n_permutations)
+    if is_exact:
+        return itertools.islice(_all_orders(_rows(x, covariates)), 1, None), n_others
+    return (rng.permutation(n) for _ in range(n_permutations)), n_permutations
+
+
+def _all_orders(rows):
+    """Every order once in which other residuals come to the places of some row, as is first."""
+    code = np.unique(rows, axis=0, return_inverse=True)[1].ravel()
+    places = np.argsort(code, kind="stable")  # the places of one row after those of another
+
+    def fill(left, counts):
+        """All ways to put what is left, in order, into the places of each row."""
+        if not counts:
+            yield []
+            return
+        for chosen in itertools.combinations(left, counts[0]):
+            rest = [i for i in left if i not in chosen]
+            for others in fill(rest, counts[1:]):
+                yield [*chosen, *others]
+
+    for residuals in fill(places.tolist(), np.bincount(code).tolist()):
+        order = np.empty(len(rows), int)
+        order[places] = residuals
+        yield order
+
+
+def rearranged(rows: np.ndarray, by: np.ndarray) -> np.ndarray:
+    """Rows ``(n, ...)`` in another order, or with other signs."""
+    if by.dtype.kind == "i":
+        return rows[by]
+    return rows * by.reshape(-1, *[1] * (rows.ndim - 1))
+
+
+def _rows(x, covariates):
+    """The model of each shape: what is tested, and the covariates ``(n, q + c)``."""
+    x = np.reshape(x, (len(x), -1))
+    return x if covariates is None else np.column_stack([x, covariates])
 
 
 def permutation_test(
@@ -99,6 +267,7 @@ def permutation_test(
     covariates: np.ndarray | None = None,
     n_permutations: int = 9999,
     seed: int = 0,
+    variances: str = "equal",
 ) -> tuple[float, float]:
     """Permutation test of Hotelling's T^2 of scores on a variable or on groups.
 
@@ -110,12 +279,15 @@ def permutation_test(
     covariates : float ndarray (n, c), optional
     n_permutations : int
     seed : int
+    variances : {"equal", "unequal"}
+        Residuals are permuted, or have their signs changed.
 
     Returns
     -------
     statistic : float
     p : float
-        (1 + number of permutations that reach the statistic) / (1 + n_permutations).
+        (1 + number of permutations that reach the statistic) / (1 + number of permutations); exact
+        where no more than `n_permutations` are different, as all are gone through then.
 
     Examples
     --------
@@ -129,13 +301,56 @@ def permutation_test(
     Z, Q = design(x, covariates)
     E = scores - Z @ (Z.T @ scores)
     dof = len(E) - Z.shape[1] - Q.shape[1]
-    rng = np.random.default_rng(seed)
-    statistic = hotelling(E, Q, dof)
+    statistic = float(hotelling(E, Q, dof))
+    others, n_others = rearrangements(x, covariates, n_permutations, seed, variances)
     reached = 0
-    for _ in range(n_permutations):
-        permuted = E[rng.permutation(len(E))]
-        reached += hotelling(permuted - Z @ (Z.T @ permuted), Q, dof) >= statistic * (1 - 1e-12)
-    return statistic, (1 + reached) / (1 + n_permutations)
+    for batch in batched(others, max(1, 1_000_000 // E.size)):
+        permuted = np.stack([rearranged(E, by) for by in batch])  # (b, n, p)
+        found = hotelling(permuted - Z @ (Z.T @ permuted), Q, dof)
+        reached += int((found >= statistic * (1 - 1e-9)).sum())
+    return statistic, (1 + reached) / (1 + n_others)
+
+
+def scatter_test(
+    coordinates: np.ndarray, x: np.ndarray, *, covariates: np.ndarray | None = None
+) -> tuple[np.ndarray, float]:
+    """Whether shapes scatter differently with x: a test of Levene's kind (Anderson 2006).
+
+    Parameters
+    ----------
+    coordinates : float ndarray (n, p)
+        Of the shapes on all components, in the unit of the input.
+    x, covariates : see :func:`permutation_test`
+
+    Returns
+    -------
+    distance : float ndarray (n,)
+        Of each shape from what the model expects of it, as if the model did not know the shape.
+    p : float
+        Of the F test of these distances on x; 1 where the model leaves nothing to compare.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.analysis.permutation import scatter_test
+    >>> x = np.repeat([0.0, 1.0], 10)
+    >>> scores = np.random.default_rng(0).normal(size=(20, 3))
+    >>> scatter_test(scores, x)[1] > 0.05, scatter_test(scores * (1 + 2 * x[:, None]), x)[1] < 0.01
+    (True, True)
+    """
+    model = np.column_stack(design(x, covariates))  # (n, r + q)
+    leverage = np.minimum((model**2).sum(1), 1 - 1e-9)
+    left = coordinates - model @ (model.T @ coordinates)
+    distance = np.linalg.norm(left, axis=1) / np.sqrt(1 - leverage)
+    if distance.max() < 1e-9 * np.linalg.norm(coordinates, axis=1).max():
+        return distance, 1.0
+    _, Q = design(x)
+    q = Q.shape[1]
+    around = distance - distance.mean()
+    explained = ((Q.T @ around) ** 2).sum()
+    rest = max(around @ around - explained, 1e-12 * (distance @ distance))
+    dof = len(around) - 1 - q
+    return distance, float(stats.f.sf(explained / q / (rest / dof), q, dof))
 
 
 def whiten(E: np.ndarray) -> np.ndarray:
@@ -154,6 +369,7 @@ def vertex_test(
     covariates: np.ndarray | None = None,
     n_permutations: int = 999,
     seed: int = 0,
+    variances: str = "equal",
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Permutation test at every vertex, with p values corrected for all by the largest (max-T).
 
@@ -166,17 +382,27 @@ def vertex_test(
     ----------
     d : float ndarray (n, v, k)
         Fields of vectors, or with k = 1 of numbers.
-    x, covariates, n_permutations, seed : see :func:`permutation_test`
+    x, covariates, n_permutations, seed, variances : see :func:`permutation_test`
 
     Returns
     -------
     share : float ndarray (v,)
     p : float ndarray (v,), of each vertex alone
     p_max : float ndarray (v,), family-wise (Westfall & Young 1993, single step)
+
+    Raises
+    ------
+    ValueError
+        When X explains nothing that the covariates leave, or there are too few shapes.
     """
     Z, Q = design(x, covariates)
     n, v, k = d.shape
     r, q = Z.shape[1], Q.shape[1]
+    if n - r <= k:  # the residuals fill all dimensions: whatever is tested explains all of them
+        raise ValueError(
+            f"{n} shapes are too few for a test of {k} coordinates at a vertex with {r} columns of "
+            f"mean and covariates: {r + k + 1} needed, or fewer covariates, or of='normal'"
+        )
     E = np.asarray(d, float).reshape(n, -1)  # (n, v k)
     E = whiten((E - Z @ (Z.T @ E)).reshape(n, v, k))
     E = E.transpose(0, 2, 1).reshape(n, -1).astype(np.float32)  # (n, k v)
@@ -185,25 +411,32 @@ def vertex_test(
         """Products of b times `per` columns ``(n, b per)`` with the residuals: (b, per, k, v)."""
         return (columns.T.astype(np.float32) @ E).reshape(-1, per, k, v)
 
-    rng = np.random.default_rng(seed)
+    others, n_others = rearrangements(x, covariates, n_permutations, seed, variances)
     share = (project(Q, q)[0] ** 2).sum(axis=(0, 1))
     reached = np.zeros(v, np.int64)
     largest = np.empty(0, np.float32)
     block = max(1, int(2e7 // (v * k * (q + r))))  # permutations at once: 80 MB of products
-    for first in range(0, n_permutations, block):
-        orders = [rng.permutation(n) for _ in range(min(block, n_permutations - first))]
-        back = [np.argsort(order) for order in orders]
-        # Q^T (I - Z Z^T) P E = (P^T Q)^T E, as Q is orthogonal to Z
-        B = project(np.concatenate([Q[order] for order in back], axis=1), q)
-        if r == 1:  # Z is the intercept alone, which no permutation moves: the scatter stays 1
+    for batch in batched(others, block):
+        # Q^T (I - Z Z^T) P E = (P^T Q)^T E, as Q is orthogonal to Z; P^T is the order back, or the
+        # same signs again
+        back = [np.argsort(by) if by.dtype.kind == "i" else by for by in batch]
+        B = project(np.concatenate([rearranged(Q, by) for by in back], axis=1), q)
+        if r == 1 and variances == "equal":
+            # Z is the intercept alone, which no permutation moves: the scatter stays 1
             permuted = (B**2).sum(axis=(1, 2))  # (b, v)
         else:
-            A = project(np.concatenate([Z[order] for order in back], axis=1), r)
+            A = project(np.concatenate([rearranged(Z, by) for by in back], axis=1), r)
             permuted = explained_share(A, B)
         reached += (permuted >= share * (1 - 1e-6)).sum(0)
         largest = np.append(largest, permuted.max(1))
-    beyond = n_permutations - np.searchsorted(np.sort(largest), share * (1 - 1e-6), side="left")
-    return share, (1 + reached) / (1 + n_permutations), (1 + beyond) / (1 + n_permutations)
+    beyond = n_others - np.searchsorted(np.sort(largest), share * (1 - 1e-6), side="left")
+    return share, (1 + reached) / (1 + n_others), (1 + beyond) / (1 + n_others)
+
+
+def batched(items: Iterator, size: int) -> Iterator[list]:
+    """The items in lists of at most `size`."""
+    while batch := list(itertools.islice(items, size)):
+        yield batch
 
 
 def explained_share(A: np.ndarray, B: np.ndarray) -> np.ndarray:

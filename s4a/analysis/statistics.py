@@ -5,14 +5,17 @@ All take a study and give a Dataset.  What works on plain arrays is in
 
 To add a statistic:
 
-1. ``registration, d, area = displacements_of(study)``: d are the displacements (shape, vertex,
-   xyz), area that of the vertices; ``values_of``, ``groups_of`` and ``covariates_of`` take arrays,
-   dicts and columns of ``/subjects`` alike (:mod:`s4a.analysis.inputs`);
+1. ``sample_of(study, values, "group", covariates)`` takes arrays, dicts and columns of
+   ``/subjects`` alike, and gives the displacements ``d (shape, vertex, xyz)`` of the shapes that
+   have all values, the areas of the vertices and the columns of the covariates; without values,
+   ``displacements_of(study)`` (:mod:`s4a.analysis.inputs`);
 2. its arithmetic is a function of plain arrays, tested on a known answer;
 3. its variables are in :data:`s4a.schema.TABLE`; give them as ``in_unit(dataset(...), unit)``;
 4. its name is in ``__all__`` below, its command in :mod:`s4a.cli.commands`;
 5. a test plants an effect, which is found, and none, which is not.
 """
+
+import logging
 
 import numpy as np
 import xarray as xr
@@ -26,13 +29,35 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from s4a.analysis.generalization import generalization
-from s4a.analysis.inputs import Values, covariates_of, displacements_of, groups_of, values_of
+from s4a.analysis.inputs import (
+    Values,
+    displacements_of,
+    group_sizes,
+    sample_of,
+    with_doubtful,
+)
 from s4a.analysis.model import KEPT, count_components, evaluate, leave_one_out, sample
-from s4a.analysis.permutation import indicators, permutation_test, smallest_p, vertex_test
+from s4a.analysis.permutation import (
+    count_rearrangements,
+    design,
+    indicators,
+    permutation_test,
+    scatter_test,
+    smallest_p,
+    vertex_test,
+)
 from s4a.geometry.mesh import as_arrays, vertex_normals
 from s4a.method.deform import normal_displacement
 from s4a.method.pca import center_gram, gram, principal_components
 from s4a.schema import dataset, in_unit, unit_of
+
+log = logging.getLogger(__name__)
+
+# p of the test of equal scatter under which it is told: 2 of 100 times in vain, and 75 to 90 times
+# where groups of 10 and 10, or 15 and 5, have 1 and 2 standard deviations
+UNEQUAL = 0.02
+MOST_PERMUTATIONS = 10_000_000
+VARIANCES = ("equal", "unequal")
 
 __all__ = [
     "classify",
@@ -45,6 +70,7 @@ __all__ = [
     "regression",
     "regression_modes",
     "sample",
+    "with_doubtful",
 ]
 
 
@@ -55,6 +81,7 @@ def group_test(
     covariates: Values | None = None,
     n_components: int | None = None,
     n_permutations: int = 9999,
+    variances: str = "equal",
     seed: int = 0,
 ) -> xr.Dataset:
     """Do groups of shapes differ?  Permutation Hotelling T^2 on the scores.
@@ -67,22 +94,29 @@ def group_test(
     group : array_like (shape,), dict of shape to value, or name in /subjects
     covariates : as `group`, a dict of name to these, or an array_like (shape, covariate)
         Or a list of names in /subjects.  Accounted for after Freedman and Lane (1983); text as
-        indicators of its values.
+        indicators of its values.  A shape without a value is left out, with a warning.
     n_components : int, optional
         As many as hold 90 % of the variance by default, at most half of the number of shapes.
     n_permutations : int
+        Where fewer are different, each of these is taken once, and p is exact.
+    variances : {"equal", "unequal"}
+        Whether shapes are permuted, which is exact where they scatter alike in all groups; or the
+        signs of their residuals are changed, which holds where the groups scatter differently, and
+        takes errors as symmetric.
     seed : int
 
     Returns
     -------
     Dataset
-        ``statistic``, ``p_value``; attributes ``groups`` (sizes), ``components`` and ``smallest_p``
-        that the permutations can reach.
+        ``statistic``, ``p_value``; attributes ``groups`` (sizes), ``components``, ``smallest_p``
+        that the permutations can reach, how many these are, ``covariates`` in words, and the shapes
+        ``left_out``.
 
     Raises
     ------
     ValueError
-        When a group has fewer than 3 shapes.
+        When a group has fewer than 3 shapes, or a covariate is of no use: dates, names of shapes,
+        numbers mixed with text.
 
     Examples
     --------
@@ -94,13 +128,12 @@ def group_test(
     >>> test.attrs["groups"], bool(test["p_value"] > 0.05)
     ('a: 3, b: 3', True)
     """
-    group, sizes = groups_of(study, group)
-    options = {"n_permutations": n_permutations, "seed": seed}
-    _, x = indicators(group)
-    test = _test_scores(study, x, covariates_of(study, covariates), n_components, options)
-    return test.assign_attrs(
-        groups=sizes, smallest_p=smallest_p(n_permutations, group), permutations=n_permutations
-    )
+    options = _options(n_permutations, variances, seed)
+    sample = sample_of(study, group, "group", covariates)
+    sizes = group_sizes(sample.values)
+    _, x = indicators(sample.values)
+    test = _test_scores(sample, x, n_components, options)
+    return test.assign_attrs(groups=sizes, **_said(sample, x, options))
 
 
 def group_map(
@@ -110,16 +143,16 @@ def group_map(
     covariates: Values | None = None,
     of: str = "vector",
     n_permutations: int = 999,
+    variances: str = "equal",
     seed: int = 0,
 ) -> xr.Dataset:
     """Where do groups of shapes differ?  A permutation test at every vertex of the template.
 
     Parameters
     ----------
-    study, group, covariates, seed : see :func:`group_test`
+    study, group, covariates, n_permutations, variances, seed : see :func:`group_test`
     of : {"vector", "normal"}
         The displacements, or their part along the normals.
-    n_permutations : int
 
     Returns
     -------
@@ -144,20 +177,17 @@ def group_map(
     >>> where["effect"].dims, bool((where["p_family_wise"] > 0.05).all())
     (('vertex', 'xyz'), True)
     """
-    group, sizes = groups_of(study, group)
-    names, x = indicators(group)
-    Z = covariates_of(study, covariates)
-    options = {"n_permutations": n_permutations, "seed": seed}
-    effect_map = _test_vertices(study, x, Z, of, options)
+    options = _options(n_permutations, variances, seed)
+    sample = sample_of(study, group, "group", covariates)
+    sizes = group_sizes(sample.values)
+    names, x = indicators(sample.values)
+    effect_map = _test_vertices(sample, x, of, options)
     squared = _squared_cohen_f(effect_map)
     if len(names) == 2:  # Mahalanobis distance of the means: T^2 (1 / n_1 + 1 / n_2)
-        dof = len(group) - 2 - (0 if Z is None else Z.shape[1])
-        squared = squared * dof * (1 / np.unique(group, return_counts=True)[1]).sum()
+        dof = len(x) - sum(basis.shape[1] for basis in design(x, sample.Z))
+        squared = squared * dof * (1 / np.unique(sample.values, return_counts=True)[1]).sum()
     return effect_map.merge(dataset(effect_size=np.sqrt(squared))).assign_attrs(
-        groups=sizes,
-        smallest_p=smallest_p(n_permutations, group),
-        permutations=n_permutations,
-        of=of,
+        groups=sizes, of=of, **_said(sample, x, options)
     )
 
 
@@ -169,6 +199,7 @@ def regression(
     of: str = "vector",
     n_components: int | None = None,
     n_permutations: int = 999,
+    variances: str = "equal",
     seed: int = 0,
 ) -> xr.Dataset:
     """How does shape change with a continuous variable, such as age?
@@ -177,7 +208,7 @@ def regression(
     ----------
     study : DataTree
     variable : array_like (shape,), dict of shape to value, or name in /subjects
-    covariates, n_components, n_permutations, seed : see :func:`group_test`
+    covariates, n_components, n_permutations, variances, seed : see :func:`group_test`
     of : see :func:`group_map`
 
     Returns
@@ -187,12 +218,12 @@ def regression(
         vertex as of :func:`group_map`, ``effect(vertex, xyz)`` per unit of the variable,
         ``effect_size`` = Cohen's f, and ``intercept(vertex, xyz)``; ``standard_score(shape)`` of
         the variable.  Attributes ``mean``, ``standard_deviation``, ``lowest`` and ``highest`` of
-        the variable, ``smallest_p``.
+        the variable, and those of :func:`group_test`.
 
     Raises
     ------
     ValueError
-        When the variable is constant, not finite, or a combination of the covariates.
+        When the variable is text, constant, infinite, or a combination of the covariates.
 
     Examples
     --------
@@ -206,21 +237,16 @@ def regression(
     >>> bool(abs(predicted - s4a.synthesize(study, [2.0])["position"]).max() < 1e-2)
     True
     """
-    x = values_of(study, variable, "variable")
-    if x.dtype.kind not in "iufb":
-        raise ValueError(
-            f"a regression needs a variable of numbers, found {x.dtype}; a group test takes text"
-        )
-    x = x.astype(float)
-    Z = covariates_of(study, covariates)
-    options = {"n_permutations": n_permutations, "seed": seed}
-    test = _test_scores(study, x, Z, n_components, options)
-    effect_map = _test_vertices(study, x, Z, of, options)
+    options = _options(n_permutations, variances, seed)
+    sample = sample_of(study, variable, "variable", covariates)
+    x = _numbers(sample.values)
+    test = _test_scores(sample, x, n_components, options)
+    effect_map = _test_vertices(sample, x, of, options)
     mean = float(x.mean())
     deviation = float(x.std(ddof=1))
     sizes = dataset(
         effect_size=np.sqrt(_squared_cohen_f(effect_map)), standard_score=(x - mean) / deviation
-    ).assign_coords(shape=study["registration"]["shape"].values)
+    ).assign_coords(shape=sample.registration["shape"].values)
     return (
         effect_map.merge(test)
         .merge(sizes)
@@ -231,10 +257,27 @@ def regression(
             of=of,
             standard_deviation=deviation,
             components=test.attrs["components"],
-            smallest_p=smallest_p(n_permutations, n=len(x)),
-            permutations=n_permutations,
+            **_said(sample, x, options),
         )
     )
+
+
+def _numbers(values):
+    """The variable of a regression as floats ``(s,)``, or what else to do."""
+    if values.dtype.kind == "U":
+        raise ValueError(
+            f"a regression needs a variable of numbers, found text such as {values[0]!r}; a group "
+            "test takes text"
+        )
+    if values.ndim > 1:
+        raise ValueError(f"a regression needs one number for each shape, found {values.shape}")
+    x = values.astype(float)
+    if not 1e-30 < abs(x).max() < 1e30 and x.any():
+        raise ValueError(
+            f"a regression needs a variable of a size between 1e-30 and 1e30, found {x.max():.3g}; "
+            "give it in another unit"
+        )
+    return x
 
 
 def predict(study: xr.DataTree, fit: xr.Dataset, value: float) -> xr.Dataset:
@@ -311,6 +354,8 @@ def regression_modes(study: xr.DataTree, fit: xr.Dataset, name: str = "variable"
     1
     """
     registration, d, area = displacements_of(study)
+    is_fitted = registration["shape"].isin(fit["shape"]).values
+    registration, d = registration.isel(shape=is_fitted), d[is_fitted]
     step = fit["effect"].values * fit.attrs["standard_deviation"]  # (n, 3)
     size = np.sqrt(np.einsum("nx,nx,n->", step, step, area))
     total = gram(d - d.mean(0), area).trace() / (len(d) - 1)
@@ -429,6 +474,11 @@ def classify(
         ``predicted(shape)``, ``accuracy(fold)`` (balanced), ``p_value``; attributes
         ``balanced_accuracy`` of all predictions, ``chance``, ``smallest_p``, ``correspondence``.
 
+    Raises
+    ------
+    ValueError
+        When a group has fewer than 3 shapes, or an option is out of range.
+
     Examples
     --------
     With the ``study`` of six small brains, split at random:
@@ -439,11 +489,18 @@ def classify(
     >>> classes["predicted"].sizes["shape"], classes.attrs["chance"]
     (6, 0.5)
     """
-    group, sizes = groups_of(study, group)
+    if not 0 <= n_permutations <= MOST_PERMUTATIONS:
+        raise ValueError(
+            f"n_permutations needs a number from 0 to {MOST_PERMUTATIONS}, found {n_permutations}"
+        )
+    if n_folds < 2:
+        raise ValueError(f"n_folds needs a number from 2, found {n_folds}")
+    sample = sample_of(study, group, "group")
+    group, sizes = sample.values, group_sizes(sample.values)
     names, count = np.unique(group, return_counts=True)
     n_folds = min(n_folds, int(count.min()))
     folds = StratifiedKFold(n_folds, shuffle=True, random_state=seed)
-    scores, coordinates = _scores_of(study, n_components)
+    scores, coordinates = _scores_of(sample, n_components)
     n_training = len(group) - int(np.ceil(len(group) / n_folds))
     c = min(scores.shape[1], n_training - 2)
     steps = make_pipeline(
@@ -462,24 +519,54 @@ def classify(
         *_, p = permutation_test_score(steps, coordinates, group, random_state=seed, **options)
     attrs = {
         "permutations": n_permutations,
-        "smallest_p": smallest_p(n_permutations, group),
+        "smallest_p": smallest_p(n_permutations, indicators(group)[1]),
         "groups": sizes,
+        "left_out": sample.said["left_out"],
         "balanced_accuracy": float(balanced_accuracy_score(group, predicted)),
         "chance": 1 / len(names),
         "components": c,
         "correspondence": KEPT,
     }
     result = dataset(attrs, predicted=predicted, accuracy=np.array(accuracy), p_value=p)
-    return result.assign_coords(shape=study["registration"]["shape"].values)
+    return result.assign_coords(shape=sample.registration["shape"].values)
 
 
 # what several of them share
 
 
-def _scores_of(study, n_components):
+def _options(n_permutations, variances, seed):
+    """The options of the permutation tests, checked before anything is computed."""
+    if not 1 <= n_permutations <= MOST_PERMUTATIONS:
+        raise ValueError(
+            f"n_permutations needs a number from 1 to {MOST_PERMUTATIONS}, found {n_permutations}"
+        )
+    if variances not in VARIANCES:
+        raise ValueError(f"variances must be 'equal' or 'unequal', found {variances!r}")
+    return {"n_permutations": n_permutations, "variances": variances, "seed": seed}
+
+
+def _said(sample, x, options):
+    """Attributes of a result: what it rests on, and the smallest p that it can reach."""
+    least = smallest_p(options["n_permutations"], x, sample.Z, options["variances"])
+    if least > 0.05:
+        log.warning(
+            "%d shapes allow no p value below %.2g, whatever they are like: more are needed, or "
+            "more permutations",
+            len(x),
+            least,
+        )
+    n = count_rearrangements(x, sample.Z, options["variances"]) - 1
+    return sample.said | {
+        "variances": options["variances"],
+        "permutations": min(n, options["n_permutations"]),
+        "smallest_p": least,
+    }
+
+
+def _scores_of(sample, n_components):
     """Scores on the first components ``(s, c)``, and all coordinates in the unit of the input."""
-    _, d, area = displacements_of(study)
-    variance, V = principal_components(center_gram(gram(d - d.mean(0), area)))
+    d = sample.d
+    variance, V = principal_components(center_gram(gram(d - d.mean(0), sample.area)))
     if not len(variance):
         raise ValueError("a test needs shapes that differ; all displacements are equal")
     c = count_components(variance, len(d), n_components, most=len(variance))
@@ -487,16 +574,42 @@ def _scores_of(study, n_components):
     return V[:, :c] * root, V * np.sqrt(variance) * root
 
 
-def _test_scores(study, x, Z, n_components, options):
+def _test_scores(sample, x, n_components, options):
     """One test for the whole shape: Hotelling's T^2 of the scores on x, Z accounted for."""
-    scores, _ = _scores_of(study, n_components)
-    statistic, p = permutation_test(scores, x, covariates=Z, **options)
+    scores, coordinates = _scores_of(sample, n_components)
+    statistic, p = permutation_test(scores, x, covariates=sample.Z, **options)
+    if options["variances"] == "equal":
+        _tell_unequal_variances(coordinates, x, sample)
     return dataset({"components": scores.shape[1]}, statistic=statistic, p_value=p)
 
 
-def _test_vertices(study, x, Z, of, options):
+def _tell_unequal_variances(coordinates, x, sample):
+    """Say where shapes scatter differently between the groups, or with the variable."""
+    distance, p = scatter_test(coordinates, x, covariates=sample.Z)
+    if p >= UNEQUAL:
+        return
+    unit = unit_of(sample.registration["displacement"])
+    where = "with the variable"
+    which = "too small or too large"
+    groups = np.unique(sample.values)
+    if len(groups) == len(np.unique(x, axis=0)) and len(groups) < len(x) / 2:
+        where = ", ".join(
+            f"{group}: {np.sqrt((distance[sample.values == group] ** 2).mean()):.3g} {unit}"
+            for group in groups
+        )
+        which = "too small where a small group scatters more, too large where a large one does"
+    log.warning(
+        "the shapes scatter differently (%s; p = %.2g), but p values take variances as equal and "
+        "are %s: variances='unequal' (--variances unequal) does without that",
+        where,
+        p,
+        which,
+    )
+
+
+def _test_vertices(sample, x, of, options):
     """A test at every vertex, and the effect of the first column of x on the displacement."""
-    registration, d, _ = displacements_of(study)
+    registration, d, Z = sample.registration, sample.d, sample.Z
     if of not in ("vector", "normal"):
         raise ValueError(f"of must be 'vector' or 'normal', found {of!r}")
     fields = d  # (s, n, 3), or (s, n, 1) along the normals
@@ -505,7 +618,10 @@ def _test_vertices(study, x, Z, of, options):
     share, p, p_max = vertex_test(fields, x, covariates=Z, **options)
     columns = np.column_stack([np.ones(len(d)), x] if Z is None else [np.ones(len(d)), x, Z])
     columns[:, 1:] -= columns[:, 1:].mean(0)  # so that the intercept is where x is at its mean
-    B = np.linalg.pinv(columns) @ d.reshape(len(d), -1).astype(float)  # (columns, 3 n)
+    size = np.linalg.norm(columns, axis=0)
+    size[size == 0] = 1
+    B = np.linalg.pinv(columns / size, rcond=1e-10) @ d.reshape(len(d), -1).astype(float)
+    B = B / size[:, None]  # (columns, 3 n)
     effect_map = dataset(
         explained_share=share,
         p_vertex=p,

@@ -5,26 +5,25 @@ external mesh to the template of a study and on to every shape (:mod:`s4a.analys
 """
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import xarray as xr
-from joblib import Parallel, delayed
+from joblib import delayed
 from threadpoolctl import threadpool_limits
 
-from s4a.analysis.inputs import registration_of
+from s4a.analysis.inputs import all_registered
 from s4a.analysis.landmarks import FARTHEST_LANDMARK, NAMED, locate, trace_curves
 from s4a.analysis.link import Route, blend_routes, carry_along, elect, link
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays
 from s4a.method.register import identity
-from s4a.method.remesh import coarsen
 from s4a.method.shape import Shape
-from s4a.method.spectral import spectrum
 from s4a.schema import dataset, require
-from s4a.study.pair import match_shapes
+from s4a.study.options import PAIR, Options, pair_options, takes_options
+from s4a.study.pair import match_shapes, shape_of
+from s4a.study.processes import workers
 from s4a.study.tree import stack_registration, template_mesh
-
-N_COARSE = 6000  # of the paper (5.1)
 
 
 def pair_study(result: xr.Dataset, source: xr.Dataset, target: xr.Dataset) -> xr.DataTree:
@@ -40,7 +39,7 @@ def pair_study(result: xr.Dataset, source: xr.Dataset, target: xr.Dataset) -> xr
     DataTree
         ``/original``, ``/registration``: what the functions of this module take.
     """
-    registered = result.drop_vars(["fmap", "fmap_initial"]).rename(match="registered_match")
+    registered = result.rename(match="registered_match")
     return _study_of("target", target, {"source": source}, {"source": registered}, {})
 
 
@@ -53,31 +52,27 @@ def _study_of(name, template, shapes, forth, back):
     return xr.DataTree.from_dict(nodes | {f"reverse/{n}": data for n, data in back.items()})
 
 
-def _shape_of(mesh, n_coarse, k, seed):
+def _shape_of(mesh, options):
     """The shape of a mesh, with its low resolution and spectrum."""
     with threadpool_limits(1):
-        return Shape(mesh, spectrum(coarsen(mesh, n_coarse=n_coarse, seed=seed), k=k))
+        return shape_of(mesh, options)
 
 
-def _match_both(shape, template, options, both):
+def _match_both(shape, template, options):
     """The shape registered to the template and, with `both`, the template to the shape."""
     with threadpool_limits(1):
-        forth = match_shapes(shape, template, **options)[0]
-        return forth, match_shapes(template, shape, **options)[0] if both else None
+        forth = match_shapes(shape, template, options)[0]
+        return forth, match_shapes(template, shape, options)[0] if options.both else None
 
 
+@takes_options("both", *PAIR)
 def register_pairs(
     template: xr.Dataset,
     shapes: dict[str, xr.Dataset],
     *,
     name: str = "template",
-    both: bool = True,
-    n_coarse: int = N_COARSE,
-    k_init: int = 20,
-    k: int = 100,
-    init: str = "dense",
     n_jobs: int | None = None,
-    seed: int = 0,
+    **options: Any,
 ) -> xr.DataTree:
     """The template registered to each shape on its own (6.2, the first way): a study for transfer.
 
@@ -88,12 +83,14 @@ def register_pairs(
     shapes : dict of str to Dataset
     name : str
         Of the template among the shapes.
-    both : bool
-        Whether each pair is matched both ways; transfer then takes the mean of both.
-    n_coarse, k_init, k, init, seed
-        See :func:`s4a.match_pair`.
+    both : bool, optional
+        Whether each pair is matched both ways, as by default; transfer then takes the mean of both.
     n_jobs : int, optional
         As in joblib; the result does not depend on it.
+    k_init, k, step, lift, init, ahead, sharpen, refine, parts, alignment
+        See :func:`s4a.match_pair`.
+    area_weighted, n_projected, n_coarse, preset, seed
+        See :func:`s4a.match_pair`; ``preset="paper"`` sets both=False, too.
 
     Returns
     -------
@@ -103,7 +100,8 @@ def register_pairs(
     Raises
     ------
     ValueError
-        When a shape has the name of the template, or a mesh lacks its variables.
+        When a shape has the name of the template, a mesh lacks its variables, or an option is
+        outside its range or contradicts the preset.
 
     Examples
     --------
@@ -122,14 +120,12 @@ def register_pairs(
     meshes = {name: template, **shapes}
     for what, mesh in meshes.items():
         require(mesh, "position", "corner_vertex", what=f"mesh {what}")
-    parallel = Parallel(n_jobs=n_jobs)
-    inside, *others = parallel(
-        delayed(_shape_of)(mesh, n_coarse, k, seed) for mesh in meshes.values()
-    )
-    options = {"k_init": k_init, "k": k, "init": init}
-    pairs = parallel(delayed(_match_both)(shape, inside, options, both) for shape in others)
+    settings = pair_options(options)
+    parallel = workers(n_jobs)
+    inside, *others = parallel(delayed(_shape_of)(mesh, settings) for mesh in meshes.values())
+    pairs = parallel(delayed(_match_both)(shape, inside, settings) for shape in others)
     forth = {n: pair[0] for n, pair in zip(shapes, pairs, strict=True)}
-    back = {n: pair[1] for n, pair in zip(shapes, pairs, strict=True)} if both else {}
+    back = {n: pair[1] for n, pair in zip(shapes, pairs, strict=True)} if settings.both else {}
     return _study_of(name, template, shapes, forth, back)
 
 
@@ -156,14 +152,22 @@ def _routes(study: xr.DataTree, name: str) -> tuple[list[Route], list[Route]]:
 
 
 def _routes_from_outside(study: xr.DataTree, mesh: xr.Dataset) -> list[Route]:
-    """Routes from an external mesh to the study's template, matched both ways."""
+    """Routes from an external mesh to the study's template, by the options of the study."""
     name = study["registration"].attrs["template"]
+    if "coarse" not in study.children:
+        raise ValueError(
+            f"a source that is none of the shapes is matched to the template {name!r}, which needs "
+            "/coarse; this study of pairs has none: give one of its shapes"
+        )
     template = study["original"][name].to_dataset().load()
-    inside = Shape(template, study["coarse"][name].to_dataset().load())
-    k = inside.low.k
-    outside = _shape_of(mesh, N_COARSE, k, 0)
-    forth, back = _match_both(inside, outside, {"k_init": min(20, k), "k": k}, True)
-    return [[(link(mesh, template, forth), "down")], [(link(template, mesh, back), "up")]]
+    options = Options.from_report(study)
+    inside = options.shape(template, study["coarse"][name].to_dataset().load())
+    outside = _shape_of(mesh, options)
+    forth, back = _match_both(inside, outside, options)
+    routes: list[Route] = [[(link(mesh, template, forth), "down")]]
+    if back is not None:
+        routes.append([(link(template, mesh, back), "up")])
+    return routes
 
 
 Targets = Iterator[tuple[str, xr.Dataset, list[Route]]]
@@ -179,7 +183,7 @@ def plan(
     ValueError
         When the study has no registration, or a shape is not in it.
     """
-    registration = registration_of(study)
+    registration = all_registered(study)
     template = registration.attrs["template"]
     names = registration["shape"].values.tolist()
     source = template if source is None else source
@@ -224,7 +228,7 @@ def transfer_labels(
         :func:`s4a.input.annotations.labels_of_mesh`); numbers or names.
     source : str or Dataset, optional
         A shape of the study, by default its template; or an external mesh, which is matched to the
-        template first (template -> median -> every shape).
+        template first (template -> median -> every shape), by the options of the study.
     targets : list of str, optional
         All other shapes by default.
     votes : bool

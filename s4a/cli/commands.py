@@ -4,6 +4,8 @@ The flags are in :mod:`s4a.cli.flags`; what is shown is put into words in :mod:`
 """
 
 import contextlib
+import re
+import shlex
 import sys
 import time
 import webbrowser
@@ -32,16 +34,21 @@ from s4a.input.annotations import (
     write_landmarks,
 )
 from s4a.input.collection import read_shape, read_shapes
+from s4a.input.decisions import listed
 from s4a.input.files import find_meshes, read_mesh, stem_of
+from s4a.input.raw import shown
 from s4a.input.subjects import with_table
 from s4a.show import charts
 from s4a.show.page import write_page
 from s4a.show.pictures import write_animation, write_picture
 from s4a.study.insert import insert as place
-from s4a.study.options import Options
+from s4a.study.options import PAIR, Options
 from s4a.study.pipeline import analyse
 from s4a.study.store import ENGINE
-from s4a.study.tree import open_study
+from s4a.study.tree import left_out, open_study
+from s4a.study.verify import verify as look_through
+
+PAIRS = (*PAIR, "both")  # options of `s4a transfer` between files
 
 
 def check(args: Namespace) -> int:
@@ -54,7 +61,7 @@ def check(args: Namespace) -> int:
         pattern=args.pattern,
         intersections=args.intersections,
     )["report"].to_dataset()
-    write(tables.report_table(report))
+    write("\n".join([*tables.decision_lines(report), tables.report_table(report)]))
     return 0 if (report["status"] != "excluded").all() else 1
 
 
@@ -63,9 +70,12 @@ def run(args: Namespace) -> int:
     begin = time.perf_counter()
     with cluster(args.cluster):
         study = analyse(args.paths, store=args.out, **options_of(args))
-    write(tables.run_summary(study, time.perf_counter() - begin))
-    write(f"\nstudy: {args.out}; pictures: s4a view {args.out}")
-    return 0
+    again = shlex.join(["s4a", *(word for word in args.words if word != "--keep-doubtful")])
+    full = Path(args.out) / "report.txt"
+    full.write_text(tables.report_table(study["report"].to_dataset()) + "\n", encoding="utf-8")
+    write(tables.run_summary(study, time.perf_counter() - begin, again=again))
+    write(f"study: {args.out}; pictures: s4a view {args.out}; every shape: {full}")
+    return 1 if study["report"].attrs["unforeseen"] else 0
 
 
 def options_of(args: Namespace) -> dict:
@@ -83,14 +93,16 @@ def cluster(address: str | None) -> Iterator[None]:
     if address is None:
         yield
         return
+    known = re.fullmatch(r"local:([1-9][0-9]{0,2})|tcp://\S+:[0-9]{1,5}", address)
+    if not known:
+        raise ValueError(
+            f"--cluster needs tcp://host:port, or local:N with N from 1 to 999; found {address!r}"
+        )
     try:
         from dask.distributed import Client, LocalCluster
     except ImportError as error:
         raise ValueError("--cluster needs dask.distributed: pip install 's4a[cluster]'") from error
-    kind, _, number = address.partition(":")
-    n_workers = int(number) if kind == "local" and number.isdigit() else 0
-    if not n_workers and not address.startswith("tcp://"):
-        raise ValueError(f"--cluster needs tcp://host:port or local:N, found {address!r}")
+    n_workers = int(known[1] or 0)
     with contextlib.ExitStack() as stack:
         if n_workers:
             local = LocalCluster(n_workers=n_workers, threads_per_worker=1, dashboard_address=None)
@@ -107,7 +119,7 @@ def demo(args: Namespace) -> int:
     """
     begin, out = time.perf_counter(), Path(args.out)
     collection = synthetic.brains(args.shapes, args.vertices, args.seed, dirty=args.dirty)
-    study = analyse(collection, store=out, n_jobs=args.n_jobs, seed=args.seed)
+    study = analyse(collection, store=out, preset=args.preset, n_jobs=args.n_jobs, seed=args.seed)
     truth = collection["truth"]
 
     def image(shape, template):
@@ -128,9 +140,16 @@ def demo(args: Namespace) -> int:
     return 0
 
 
+def verify(args: Namespace) -> int:
+    """Whether every file of a study is as it was written, and they belong together."""
+    found = look_through(args.study)
+    write(tables.verify_lines(found))
+    return 1 if tables.count_faults(found) else 0
+
+
 def view(args: Namespace) -> int:
     """One self-contained page of a study."""
-    page = Path(args.out) if args.out else Path(args.study) / "study.html"
+    page = Path(args.out) if args.out else within(args.study, "study.html")
     title = args.title or Path(args.study).name
     write_page(open_study(args.study), page, title=title, view=args.view, up=args.up)
     write(f"wrote {page} ({page.stat().st_size / 1e6:.1f} MB)")
@@ -142,13 +161,19 @@ def statistics(args: Namespace) -> int:
 
     Tests of groups and variables of its table.
     """
-    study, out = open_study(args.study), args.out or str(Path(args.study) / "statistics")
+    study, out = open_study(args.study), args.out or str(within(args.study, "statistics"))
     study = with_table(study, args.table) if args.table else study
-    results = {"evaluation": tests.evaluate(study, seed=args.seed)}
+    study = tests.with_doubtful(study) if args.keep_doubtful else study
+    if doubtful := left_out(study):
+        write(
+            f"{len(doubtful)} doubtful shapes are left out, --keep-doubtful takes them in: "
+            f"{listed(doubtful, 200)}\n"
+        )
+    results = tests_of(study, args)  # first, as options and columns may be refused
+    results["evaluation"] = tests.evaluate(study, seed=args.seed)
     results["outliers"] = tests.outliers(study)
     if args.recompute:
         results["generalization"] = tests.generalization(study, n_jobs=args.n_jobs, seed=args.seed)
-    results |= tests_of(study, args)
     for name, result in results.items():
         write_results(result, out, name)
     write(tables.evaluation_table(results["evaluation"], results.get("generalization")))
@@ -171,7 +196,11 @@ def statistics(args: Namespace) -> int:
 
 def tests_of(study: xr.DataTree, args: Namespace) -> dict[str, xr.Dataset]:
     """The tests of the group and the variable that are asked for."""
-    options = {"covariates": args.covariates or None, "seed": args.seed}
+    options = {
+        "covariates": args.covariates or None,
+        "seed": args.seed,
+        "variances": args.variances,
+    }
     n_classified = {}
     if args.permutations is not None:
         options["n_permutations"] = args.permutations
@@ -216,10 +245,14 @@ def transfer(args: Namespace) -> int:
             f"{args.source}"
         )
     excluded = []
+    given = {name: getattr(args, name) for name in PAIRS if getattr(args, name) is not None}
     if len(args.targets) == 1 and (Path(args.targets[0]) / "registration.nc").is_file():
+        if given:
+            flags = ", ".join("--" + name.replace("_", "-") for name in given)
+            raise ValueError(f"{args.targets[0]} is a study, whose options are taken: no {flags}")
         study = open_study(args.targets[0])
     else:
-        study, excluded = registered_pairs(source, args)
+        study, excluded = registered_pairs(source, args, given)
         source = None  # it is the template now
     out = new_folder(args.out)
     labels: Mapping = {}  # name of a target -> node
@@ -232,7 +265,9 @@ def transfer(args: Namespace) -> int:
     return 1 if excluded else 0
 
 
-def registered_pairs(source: xr.Dataset, args: Namespace) -> tuple[xr.DataTree, list[str]]:
+def registered_pairs(
+    source: xr.Dataset, args: Namespace, options: dict
+) -> tuple[xr.DataTree, list[str]]:
     """The source registered as the template of every target, and the targets that are left out."""
     shapes = read_shapes(args.targets, compare=False)
     report = shapes["report"].to_dataset()
@@ -244,11 +279,8 @@ def registered_pairs(source: xr.Dataset, args: Namespace) -> tuple[xr.DataTree, 
         source,
         meshes,
         name=next(n for n in ("template", "template_", "template__") if n not in meshes),
-        n_coarse=args.n_coarse,
-        k=args.k,
-        k_init=min(Options.k_init, args.k),
         n_jobs=args.n_jobs,
-        seed=args.seed,
+        **{"k_init": min(Options.k_init, options.get("k", Options.k))} | options,
     )
     return study, excluded
 
@@ -321,7 +353,9 @@ def compare_collection(args: Namespace) -> tuple[xr.Dataset, list[str], np.ndarr
         methods=args.methods or list(comparison.COLLECTION_METHODS),
         n_coarse=args.n_coarse,
         n_pairs=args.n_pairs,
+        k_init=min(Options.k_init, args.k),
         k=args.k,
+        preset=args.preset,
         seed=args.seed,
     )
     names = [f"{method}, {how}" for method in result["way"].values for how in result["how"].values]
@@ -338,11 +372,12 @@ def compare_pairs(args: Namespace) -> tuple[xr.Dataset, list[str], np.ndarray, s
     result = comparison.pairs(
         source,
         targets,
-        methods=args.methods or comparison.METHODS,
+        methods=args.methods,
         truth=truth_of(args.truth, targets),
         landmarks=landmark_pairs(args.landmarks, targets),
         n_coarse=args.n_coarse,
         k=args.k,
+        preset=args.preset,
         seed=args.seed,
     )
     names, seconds = result["way"].values.tolist(), result["block_seconds"].mean("pair").values
@@ -393,6 +428,14 @@ def positions_by_name(file: str) -> dict[str, np.ndarray]:
     return dict(zip(names, landmarks["landmark_position"].values, strict=True))
 
 
+def within(study: str, name: str) -> Path:
+    """A place in the folder of a study, which may be of a stranger: it must be no link."""
+    place = Path(study) / name
+    if place.is_symlink():
+        raise ValueError(f"{place} is a symbolic link, and is not written through: give --out")
+    return place
+
+
 def new_folder(path: str) -> Path:
     """A folder for results, made where it is not there."""
     folder = Path(path)
@@ -401,5 +444,5 @@ def new_folder(path: str) -> Path:
 
 
 def write(text: str) -> None:
-    """One text to the output, and a new line."""
-    sys.stdout.write(text + "\n")
+    """One text to the output, and a new line; of what a file says, nothing moves the cursor."""
+    sys.stdout.write("\n".join(map(shown, text.split("\n"))) + "\n")

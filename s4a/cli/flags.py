@@ -1,21 +1,27 @@
-"""Command line: ``s4a check | run | statistics | insert | transfer | compare | view | demo``.
+"""Command line: ``s4a check | run | verify | view | statistics | insert | transfer | ...``.
 
 Here are the flags and the exit codes; what the commands do is in :mod:`s4a.cli.commands`.  Every
 option of :func:`s4a.analyse` is a flag of run.
 """
 
 import argparse
+import io
 import logging
+import re
 import sys
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from s4a.analysis.statistics import VARIANCES
 from s4a.cli import commands
 from s4a.evaluation.compare import METHODS
+from s4a.input.raw import shown
 from s4a.show.draw import VIEWS
 from s4a.study.options import CHOICES, DEFAULTS, Options
+from s4a.study.runner import StageError
 from s4a.study.store import VERSION
 
+MOST_PROCESSES = 1000  # so that a slip of the key starts no million of them
 HELP = {
     "n_coarse": "vertices of the low-resolution meshes",
     "n_pairs": "pairs of the network",
@@ -23,10 +29,22 @@ HELP = {
     "k": "size of the refined functional maps",
     "n_latent": "dimension of the latent space (default: k)",
     "step": "growth of the maps per round of Consistent ZoomOut",
+    "weights": "of the maps in eq. 3: by how far their cycles close, or 1",
+    "lift": "eigenfunctions of the original meshes, nearly, instead of U Phi",
     "init": "first maps from all nearest neighbours, or the paper's fit on 10 landmarks",
+    "ahead": "a step of ZoomOut for all first maps, for those of the network alone, or none",
+    "n_spread": "vertices on which Consistent ZoomOut looks for matches; 0 for all",
+    "wide": "its last rounds in which these look among all vertices",
+    "sharpen": "rounds of ZoomOut of a single pair that look among all vertices of the source",
     "refine": "joint rounds, or the paper's spectral match alone",
+    "parts": "in far poses joint rounds turn every part on its own",
+    "alignment": "displacements after the motion that fits best, or after that of ICP",
+    "area_weighted": "weigh vertices by area in the projection after eq. 8",
+    "n_projected": "vertices by which that projection is computed; 0 for all",
+    "both": "match single pairs both ways and transfer along both",
     "how": "full resolution by eq. 7, or by eq. 3 and 4",
     "norm": "norm of eq. 5",
+    "keep_rounds": "keep the maps and latent bases of every round of Consistent ZoomOut",
     "scale": "take size out of the displacements",
     "components": "'largest', 'all' or how many to keep",
     "strict": "exclude shapes with vertices that are not finite instead of repairing them",
@@ -34,9 +52,11 @@ HELP = {
     "wrap": "wrap the shapes watertight before they are remeshed",
     "intersections": "count triangles that pass through others",
     "pattern": "only files whose name fits, for example '*brain*'",
-    "preset": "'paper' sets init, refine and how to the paper's",
+    "preset": "'paper' leaves out all that is added to the paper",
     "template": "name of the shape to register to (default: the median shape)",
     "table": "CSV with a column 'shape', covariates and groups, for the statistics",
+    "doubtful": "what becomes of doubtful shapes: they stay apart, or the run stops",
+    "keep_doubtful": "take doubtful shapes into modes and statistics",
     "n_jobs": "processes; -1 for all cores",
     "seed": "seed of all randomness",
 }
@@ -57,27 +77,52 @@ def parser() -> argparse.ArgumentParser:
     return top
 
 
-def add_options(add: Callable, names: Iterable[str]) -> None:
-    """A flag for each of these options of :func:`s4a.analyse`, and for ``n_jobs``."""
+def add_options(add: Callable, names: Iterable[str], *, unset: bool = False) -> None:
+    """A flag for each of these options of :func:`s4a.analyse`, and for ``n_jobs``.
+
+    With `unset` those that are not given are None.
+    """
     for name in names:
         default = -1 if name == "n_jobs" else getattr(Options, name)
+        shown = DEFAULTS.get(name, default)
         text = HELP[name]
         if name in CHOICES:
             kind: dict[str, Any] = {"choices": [choice for choice in CHOICES[name] if choice]}
-            text += f" (default: {DEFAULTS.get(name, default)})"
-        elif isinstance(default, bool):
+            text += f" (default: {shown})"
+        elif isinstance(shown, bool):
             kind = {"action": argparse.BooleanOptionalAction}
         elif name == "components":
             kind = {"type": components}
         else:
-            kind = {"type": int if isinstance(default, int) or name == "n_latent" else str}
-            text += "" if default is None else f" (default: {default})"
-        add("--" + name.replace("_", "-"), default=default, help=text, **kind)
+            kind = {"type": whole if isinstance(shown, int) or name == "n_latent" else str}
+            kind = {"type": processes} if name == "n_jobs" else kind
+            text += "" if shown is None else f" (default: {shown})"
+        value = None if unset and name != "n_jobs" else default
+        add("--" + name.replace("_", "-"), default=value, help=text, **kind)
 
 
 def components(text: str) -> int | str:
     """A number of components, or the word as it is."""
-    return int(text) if text.isdigit() else text
+    return whole(text) if text.isdecimal() else text
+
+
+def whole(text: str) -> int:
+    """A whole number; what it may be is said by what takes it."""
+    if not re.fullmatch(r"[+-]?[0-9]{1,18}", text):
+        raise argparse.ArgumentTypeError(
+            f"a whole number of at most 18 digits needed, found {text[:40]!r}"
+        )
+    return int(text)
+
+
+def processes(text: str) -> int:
+    """A number of processes, as in joblib."""
+    number = whole(text)
+    if number == 0 or abs(number) > MOST_PROCESSES:
+        raise argparse.ArgumentTypeError(
+            f"a number from 1 to {MOST_PROCESSES} needed, or -1 for all cores, found {number}"
+        )
+    return number
 
 
 def _check(add):
@@ -96,11 +141,15 @@ def _run(add):
 
 def _demo(add):
     add("--out", default="demo", metavar="STUDY", help="folder of the study (default: demo)")
-    add("--shapes", type=int, default=12, help="number of shapes (default: 12)")
-    add("--vertices", type=int, default=40_000, help="vertices of each (default: 40000)")
+    add("--shapes", type=whole, default=12, help="number of shapes (default: 12)")
+    add("--vertices", type=whole, default=40_000, help="vertices of each (default: 40000)")
     add("--dirty", action="store_true", help="with loose parts, holes and non-manifold places")
     add("--open", action="store_true", help="open the page in a browser")
-    add_options(add, ["n_jobs", "seed"])
+    add_options(add, ["preset", "n_jobs", "seed"])
+
+
+def _verify(add):
+    add("study", metavar="STUDY")
 
 
 def _view(add):
@@ -119,10 +168,16 @@ def _statistics(add):
     add("--variable", metavar="COLUMN", help=text)
     add("--covariates", nargs="+", metavar="COLUMN", help="accounted for in both")
     add("--table", metavar="FILE", help="in place of the table of the study")
+    text = (
+        "of the shapes around what is tested; unequal where groups scatter differently "
+        "(default: equal)"
+    )
+    add("--variances", choices=VARIANCES, default="equal", help=text)
     text = "generalization with correspondences found anew (slow)"
     add("--recompute", action="store_true", help=text)
+    add("--keep-doubtful", action="store_true", help="take doubtful shapes in")
     text = "of every test (default: 9999, at every vertex 999, of classes 99)"
-    add("--permutations", type=int, help=text)
+    add("--permutations", type=whole, help=text)
     add("--out", metavar="DIR", help="for netCDF and CSV (default: STUDY/statistics)")
     add_options(add, ["n_jobs", "seed"])
 
@@ -137,7 +192,7 @@ def _insert(add):
 
 def _transfer(add):
     add("source", metavar="SOURCE", help="mesh file that the labels and landmarks belong to")
-    text = "mesh files, folders or globs; or one study folder"
+    text = "mesh files, folders or globs; or one study folder, whose options are taken"
     add("targets", nargs="+", metavar="TARGET", help=text)
     text = "NPY, NPZ (FILE:NAME), CSV, GIFTI label or FreeSurfer annot, also .gz"
     add("--labels", metavar="FILE", help=text)
@@ -145,7 +200,8 @@ def _transfer(add):
     add("--landmarks", metavar="FILE", help=text)
     text = "for <target>.labels.npy, .confidence.npy, .landmarks.csv"
     add("--out", required=True, metavar="DIR", help=text)
-    add_options(add, ["n_coarse", "k", "n_jobs", "seed"])
+    add_options(add, ["n_jobs"])
+    add_options(add, commands.PAIRS, unset=True)
 
 
 def _compare(add):
@@ -165,12 +221,13 @@ def _compare(add):
     )
     add("--landmarks", nargs="+", metavar="FILE", help=text)
     add("--out", default="compare", metavar="DIR", help="for compare.nc and compare.png")
-    add_options(add, ["n_coarse", "n_pairs", "k", "seed"])
+    add_options(add, ["n_coarse", "n_pairs", "k", "preset", "seed"])
 
 
 FLAGS = {
     commands.check: _check,
     commands.run: _run,
+    commands.verify: _verify,
     commands.demo: _demo,
     commands.view: _view,
     commands.statistics: _statistics,
@@ -180,21 +237,48 @@ FLAGS = {
 }
 
 
+class Once(logging.Filter):
+    """Lets every message through once: several steps of a command may find the same."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.said: set[str] = set()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether the message is new."""
+        message = record.getMessage()
+        is_new = message not in self.said
+        self.said.add(message)
+        return is_new
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Entry point; returns the exit code.
 
-    A ValueError or OSError becomes one line on the error stream.
+    A ValueError, OSError or StageError becomes one line on the error stream, a lack of memory too.
     """
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
-    args = parser().parse_args(arguments)
+    filters = [(handler, Once()) for handler in logging.getLogger().handlers]
+    for handler, once in filters:
+        handler.addFilter(once)
+    words = sys.argv[1:] if arguments is None else arguments
+    args = parser().parse_args(words, argparse.Namespace(words=words))
+    if isinstance(sys.stdout, io.TextIOWrapper):  # letters that the terminal does not know
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         return args.function(args)
-    except (ValueError, OSError) as error:
-        sys.stderr.write(f"s4a: {error}\n")
+    except (ValueError, OSError, StageError) as error:
+        sys.stderr.write(f"s4a: {shown(error)}\n")
+        return 2
+    except MemoryError as error:
+        sys.stderr.write(f"s4a: more memory needed than there is: {error}\n")
         return 2
     except KeyboardInterrupt:
         sys.stderr.write("s4a: interrupted; the same command goes on where it stopped\n")
         return 130
+    finally:
+        for handler, once in filters:
+            handler.removeFilter(once)
 
 
 if __name__ == "__main__":

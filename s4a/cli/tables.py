@@ -9,7 +9,9 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 import xarray as xr
 
+from s4a.analysis.inputs import registration_of
 from s4a.geometry.mesh import as_arrays, vertex_areas
+from s4a.input.decisions import Decision, decisions, listed, notices, shortened
 from s4a.method.pca import mahalanobis
 
 COUNTS = {
@@ -33,6 +35,8 @@ METRICS = {
     "label_accuracy": ("labels", 1, 3),
     "landmark_error": ("landmarks %", 100, 2),
 }
+SCREEN = 100  # columns of a summary
+MOST, MOST_REMARKS = 15, 6  # excluded shapes, and remarks, that a summary gives a line each
 TRANSFERRED = [
     "target",
     "cycle error",
@@ -89,6 +93,44 @@ def report_table(report: xr.Dataset) -> str:
     return "\n".join([table(rows, head), *doubts(report)])
 
 
+FAULTS = ("damaged", "missing", "stale")  # states of files without which a study does not hold
+
+
+def count_faults(found: xr.Dataset) -> int:
+    """How many files of :func:`s4a.verify` make that the study does not hold."""
+    return int(np.isin(found["state"].values, FAULTS).sum())
+
+
+def verify_lines(found: xr.Dataset) -> str:
+    """What :func:`s4a.verify` has found, in one line, and one for each file that is not whole.
+
+    Examples
+    --------
+    >>> from s4a.cli.tables import verify_lines
+    >>> from s4a.schema import dataset
+    >>> found = dataset(state=["whole", "whole"], fault=["", ""])
+    >>> print(verify_lines(found.assign_coords(file=["latent.nc", "pca.nc"])))
+    2 files, all whole and made from each other
+    """
+    states = found["state"].values.tolist()
+    counts = {state: states.count(state) for state in dict.fromkeys(states)}
+    n = sum(count for state, count in counts.items() if state not in ("foreign", "left over"))
+    others = [f"{count} {state}" for state, count in counts.items() if state != "whole"]
+    if not count_faults(found) and not counts.get("unsealed"):
+        line = f"{n} files, all whole and made from each other"
+        line += f"; beside them {', '.join(others)}" if others else ""
+    else:
+        line = f"{n} files: {counts.get('whole', 0)} whole, {', '.join(others)}"
+    if counts.get("unsealed"):
+        line += "; unsealed ones were written before files had checksums: damage is not seen"
+    if count_faults(found):
+        line += "; the same `s4a run` again makes what is wrong anew, and nothing else"
+    rows = zip(found["file"].values, states, found["fault"].values, strict=True)
+    return "\n".join(
+        [line, *(f"  {file}, {state}: {fault}" for file, state, fault in rows if fault)]
+    )
+
+
 def doubts(report: xr.Dataset) -> list[str]:
     """Lines: what looks wrong with shapes, and what concerns the collection."""
     warnings = zip(report["shape"].values, report["warning"].values, strict=True)
@@ -96,19 +138,24 @@ def doubts(report: xr.Dataset) -> list[str]:
     return [f"  {line}" for line in [*lines, *report.attrs["remarks"].splitlines()]]
 
 
-def run_summary(study: xr.DataTree, seconds: float) -> str:
-    """The end of a run: costs of the stages, the shapes, the median, the registration, the modes.
+def run_summary(
+    study: xr.DataTree, seconds: float, *, again: str = "s4a run FOLDER --out STUDY"
+) -> str:
+    """The end of a run, on one screen: what to decide first, then the shapes and the results.
 
     Parameters
     ----------
     study : DataTree
     seconds : float
         Of the whole run.
+    again : str
+        The command of the run, to which flags can be added.
     """
     report = study["report"].to_dataset()
-    lines = ["", cost_table(report, seconds), "", *shape_lines(report), *doubts(report)]
+    lines = ["", *decision_lines(report, again), *remark_lines(report)]
+    lines += [*excluded_lines(report), *shape_lines(report), ""]
     lines += [median_line(study["latent"].to_dataset())]
-    registration = study["registration"].to_dataset()
+    registration = registration_of(study)
     confidence, round_trip, distortion = registration_cells(registration)
     lines.append(
         f"registered to {registration.attrs['template']}; mean confidence {confidence}, "
@@ -120,32 +167,103 @@ def run_summary(study: xr.DataTree, seconds: float) -> str:
         lines.append(f"variance explained: {', '.join(shares)}")
     else:
         lines.append(f"no modes: {report.attrs['no_modes']}")
-    return "\n".join(lines)
+    return "\n".join([*lines, "", *cost_lines(report, seconds)])
 
 
-def cost_table(report: xr.Dataset, seconds: float) -> str:
-    """Seconds and memory of every stage, and of the whole run."""
-    memory = report["peak_memory"].values
-    costs = zip(report["stage"].values, report["seconds"].values, memory, strict=True)
-    rows = [[stage, f"{s:.1f}", f"{m:.0f}"] for stage, s, m in costs]
-    rows.append(["all", f"{seconds:.1f}", f"{memory.max():.0f}"])
-    return table(rows, ["stage", "seconds", "peak MiB"])
+def cost_lines(report: xr.Dataset, seconds: float) -> list[str]:
+    """Seconds of every stage and of the whole run, and the most memory."""
+    costs = zip(report["stage"].values, report["seconds"].values, strict=True)
+    parts = ", ".join(f"{stage} {s:.1f}" for stage, s in costs)
+    memory = report["peak_memory"].values.max()
+    return textwrap.wrap(f"seconds: {parts}; all {seconds:.1f}; at most {memory:.0f} MiB", SCREEN)
+
+
+def decision_lines(report: xr.Dataset, again: str = "s4a run FOLDER --out STUDY") -> list[str]:
+    """Doubtful shapes by what is doubtful, what to do about it, and the commands that do it."""
+    n = int((report["status"] == "doubtful").sum())
+    if not n:
+        return []
+    kept = report.attrs.get("keep_doubtful") == "True"
+    become = "taken in as they are" if kept else "kept apart: in no modes, no statistics, no median"
+    lines = [f"TO DECIDE: {n} of {report.sizes['shape']} shapes are doubtful, and {become}"]
+    lines += kind_lines(decisions(report))
+    if kept:
+        return [*lines, f"  to keep them apart:     {again}", ""]
+    return [
+        *lines,
+        f"  to take all of them in: {again} --keep-doubtful",
+        "  to leave one out:       take its file away and run again; nothing else changes",
+        "",
+    ]
+
+
+def kind_lines(found: list[Decision]) -> list[str]:
+    """A line for each kind: how many shapes, which ones as there is room, what to do."""
+    heads = [f"{len(one.names):3} {one.kind}" for one in found]
+    first = max(map(len, heads), default=0)
+    room = SCREEN - first - 6 - max((len(one.remedy) for one in found), default=0)
+    names = [listed(one.names, max(room, 26)) for one in found]
+    second = max(map(len, names), default=0)
+    return [
+        f"{head.ljust(first)}  {few.ljust(second)}  -> {one.remedy}"
+        for head, few, one in zip(heads, names, found, strict=True)
+    ]
+
+
+def excluded_lines(report: xr.Dataset) -> list[str]:
+    """The shapes that could not be used, each with its reason, as many as there is room for."""
+    out = report.sel(shape=report["status"].values == "excluded")
+    names = out["shape"].values.tolist()
+    if not names:
+        return []
+    reasons = [
+        short_reason(*texts)
+        for texts in zip(out["reason"].values.tolist(), out["path"].values.tolist(), strict=True)
+    ]
+    shown = list(zip(shortened(names, 20), reasons, strict=True))[:MOST]
+    width = max(len(name) for name, _ in shown)
+    lines = [f"{len(names)} of {report.sizes['shape']} shapes cannot be used:"]
+    for name, reason in shown:
+        head = f"  {name.ljust(width)}  "
+        lines += [head + text for text in shortened([reason], SCREEN - len(head))]
+    if len(names) > MOST:
+        lines.append(f"  and {len(names) - MOST} more: {listed(names[MOST:], 60)}")
+    return [*lines, ""]
+
+
+def short_reason(reason: str, path: str) -> str:
+    """Why a shape is excluded, without the stage and the path, which are said elsewhere.
+
+    Examples
+    --------
+    >>> from s4a.cli.tables import short_reason
+    >>> short_reason("read and clean: d/a.ply: d/a.ply cannot be read: found 0 bytes", "d/a.ply")
+    'cannot be read: found 0 bytes'
+    """
+    reason = reason.removeprefix("read and clean: ")
+    if not path:
+        return reason
+    reason = reason.removeprefix(f"{path}: ").removeprefix(f"{path} ")
+    folder, slash, file = path.rpartition("/")
+    return reason.replace(folder + slash, "").removeprefix(f"{file} ")
+
+
+def remark_lines(report: xr.Dataset) -> list[str]:
+    """What concerns the collection, shortened, and what else looks wrong with shapes, by kind."""
+    remarks = report.attrs["remarks"].splitlines()
+    lines = [f"  {line}" for line in shortened(remarks, SCREEN - 2)]
+    if len(lines) > MOST_REMARKS:
+        lines = [*lines[:MOST_REMARKS], f"  and {len(remarks) - MOST_REMARKS} more remarks"]
+    lines += kind_lines(notices(report))
+    return ["to know:", *lines, ""] if lines else []
 
 
 def shape_lines(report: xr.Dataset) -> list[str]:
-    """How many shapes could be used, why others could not, and what was done to them."""
-    status, names, reason = (report[v].values for v in ("status", "shape", "reason"))
-    counts = ", ".join(
-        f"{(status == kind).sum()} {kind}" for kind in ("ok", "repaired", "excluded")
-    )
-    out = status == "excluded"
-    excluded = zip(names[out], reason[out], strict=True)
-    used = zip(names[~out], reason[~out], strict=True)
-    return [
-        f"{len(status)} shapes: {counts}",
-        *(f"  {name} excluded: {why}" for name, why in excluded),
-        *(f"  {name}: {done}" for name, done in used if done),
-    ]
+    """How many shapes there are of each status."""
+    status = report["status"].values
+    kinds = ("ok", "repaired", "doubtful", "excluded")
+    counts = ", ".join(f"{(status == kind).sum()} {kind}" for kind in kinds)
+    return [f"{len(status)} shapes: {counts}"]
 
 
 def median_line(latent: xr.Dataset) -> str:
@@ -230,6 +348,10 @@ def significance(whole: xr.Dataset, where: xr.Dataset, name: str, study: xr.Data
         f"{name}{groups}: p = {p:.3g} over the whole shape, "
         f"the smallest that can be reached is {least:.2g}"
     ]
+    if whole.attrs["covariates"]:
+        lines.append(f"  accounted for: {whole.attrs['covariates']}")
+    if whole.attrs["left_out"]:
+        lines.append(f"  left out, doubtful or without a value: {whole.attrs['left_out']}")
     corrections = {"p_family_wise": "family-wise", "p_false_discovery": "false discovery rate"}
     for variable, words in corrections.items():
         p_vertex = where[variable].values  # (n,)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 import xarray as xr
-from joblib import Parallel, delayed
+from joblib import delayed
 from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 
@@ -17,6 +17,7 @@ from s4a.method import fmap
 from s4a.method.first_map import map_after_motion, nearest_after_motion
 from s4a.method.register import match_functions
 from s4a.method.shape import Shape
+from s4a.study.processes import workers
 
 ICP, ZOOMOUT, MATCH, SURFACE = (
     "nearest neighbour after ICP",
@@ -114,7 +115,7 @@ def accuracy(
 
     keep = ["registered_match", "displacement", "rotation", "translation", "scale"]
     target = shape(template)
-    found = Parallel(n_jobs=n_jobs)(
+    found = workers(n_jobs)(
         delayed(_errors)(
             shape(s),
             target,

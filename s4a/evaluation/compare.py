@@ -3,6 +3,7 @@
 All work on one cleaned input.  What the methods are is in :mod:`s4a.evaluation.methods`.
 """
 
+import io
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,14 +16,26 @@ from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
 from s4a.evaluation import metrics
-from s4a.evaluation.methods import BLOCKS, METHODS, Matches, Pair, Spaces
+from s4a.evaluation.methods import (
+    BLOCKS,
+    METHODS,
+    PAPER_METHODS,
+    PRESETS,
+    Matches,
+    Pair,
+    Spaces,
+)
 from s4a.geometry.align import align, motion_between, realign
+from s4a.input.bounded import content, npy
 from s4a.input.collection import read_shape, read_shapes
+from s4a.input.raw import shown, text_of
 from s4a.method import latent, median, network
 from s4a.method.first_map import map_after_motion
-from s4a.method.register import latent_functions, mapped_functions, match_functions
+from s4a.method.register import latent_functions, match_functions, match_low
 from s4a.method.shape import Basis, Shape
-from s4a.schema import dataset, require, variable
+from s4a.schema import check_count, check_switch, dataset, require, variable
+from s4a.study.options import PRESETS as STUDY_PRESETS
+from s4a.study.options import Options, apply_preset
 
 __all__ = ["COLLECTION_METHODS", "METHODS", "collection", "pair", "pairs"]
 
@@ -97,13 +110,13 @@ def read_truth(path: Path | str) -> np.ndarray:
     NPY, or text with a number or three in each row.
     """
     try:
-        found = (
-            np.load(path)
-            if str(path).endswith(".npy")
-            else np.loadtxt(path, delimiter=_delimiter(path))
-        )
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{path} cannot be read as truth: {error}") from error
+        data = content(path)
+        if str(path).endswith(".npy"):
+            found = npy(data)
+        else:
+            found = np.loadtxt(io.StringIO(text_of(data)), delimiter=_delimiter(path))
+    except ValueError as error:
+        raise ValueError(f"{shown(path)} cannot be read as truth: {shown(error)}") from error
     whole = found.ndim == 1 and np.array_equal(found, np.round(found))
     return found.astype(np.int64) if whole else found
 
@@ -153,13 +166,17 @@ def pairs(
     source: Path | str | xr.Dataset,
     targets: Mapping[str, Path | str | xr.Dataset],
     *,
-    methods: Sequence[str] = METHODS,
+    methods: Sequence[str] | None = None,
     truth: Any = None,
     landmarks: Any = None,
     n_coarse: int = 6000,
     k_init: int = 20,
     k: int = 100,
     step: int = 5,
+    preset: str | None = None,
+    lift: bool | None = None,
+    sharpen: int | None = None,
+    init: str | None = None,
     n_geodesic: int = 1000,
     seed: int = 0,
 ) -> xr.Dataset:
@@ -170,7 +187,8 @@ def pairs(
     then ZoomOut.  SCALABLE: the same in the space of :mod:`s4a.method.scalable`.  RE-MATCH: the
     same on the low-resolution mesh, with the eigenfunctions of :mod:`s4a.method.lift` at its
     vertices, and eq. 4; the last two rounds of ZoomOut look among all vertices of the source.
-    RE-MATCH joint: joint rounds after that.
+    RE-MATCH joint: joint rounds after that.  With ``preset="paper"`` RE-MATCH is the paper's, and
+    the same as ``s4a.match_pair(..., preset="paper")``.
 
     Parameters
     ----------
@@ -178,8 +196,8 @@ def pairs(
         The reference; every match holds its vertices.
     targets : dict
         Name of the pair -> path or Dataset.
-    methods : sequence of str
-        Some of :data:`METHODS`.
+    methods : sequence of str, optional
+        Some of :data:`METHODS`; all by default, but for the joint rounds with the preset.
     truth : dict, optional
         Name of the pair -> true vertices or positions, as of
         :func:`s4a.evaluation.metrics.evaluate`; for shapes given as paths all vertices, here and in
@@ -196,6 +214,16 @@ def pairs(
         Growth of the map per round of ZoomOut, as in :func:`s4a.analyse`.  Steps of 10 take half
         the time of that block of ZO and FMAP+ZO; on a child of 60,000 vertices in two poses they
         end 7 to 9 % farther from the truth.
+    preset : {None, "paper"}
+        ``"paper"`` sets lift=False, sharpen=0 and init="landmarks"; another value of these is
+        refused.
+    lift : bool, optional
+        Whether RE-MATCH has lifted eigenfunctions (default), or U Phi of eq. 4.
+    sharpen : int, optional
+        Rounds of ZoomOut of RE-MATCH that look among all vertices of the source, 2 by default.
+    init : {"descriptors", "landmarks"}, optional
+        First maps of all methods but ZO from wave kernels of the shapes and around landmarks
+        (default), or from heat kernels around landmarks alone, as in :func:`s4a.match_pair`.
     n_geodesic : int
         See :func:`s4a.evaluation.metrics.evaluate`.
     seed : int
@@ -223,18 +251,31 @@ def pairs(
     >>> found["chamfer"].sel(pair="itself", way="kNN").item()
     0.0
     """
+    given = {"lift": lift, "sharpen": sharpen, "init": init}
+    settings = apply_preset(preset, given, PRESETS)
+    check_switch("lift", settings["lift"])
+    check_count("sharpen", settings["sharpen"])
+    if settings["init"] not in ("descriptors", "landmarks"):
+        raise ValueError(f"init must be 'descriptors' or 'landmarks'; found {init!r}")
+    if methods is None:
+        methods = PAPER_METHODS if preset == "paper" else METHODS
     checked_methods(methods)
+    if preset == "paper" and "RE-MATCH joint" in methods:
+        raise ValueError(
+            "preset 'paper' has no joint rounds; found the method 'RE-MATCH joint': "
+            "leave out one of both"
+        )
     in_memory = isinstance(source, xr.Dataset)
     if any(isinstance(target, xr.Dataset) != in_memory for target in targets.values()):
         raise ValueError("source and targets need to be all paths or all Datasets")
-    options = {"k_init": k_init, "k": k, "step": step}
+    options = {"k_init": k_init, "k": k, "step": step} | settings
     rows = []
     with threadpool_limits(1):
         mesh, load_source = load_mesh(source, "source")
-        M = Spaces(mesh, n_coarse, k, seed)
+        M = Spaces(mesh, n_coarse, k, seed, settings["lift"])
         for name, target in tqdm(targets.items(), desc="pairs", disable=len(targets) < 2):
             mesh, load_target = load_mesh(target, f"target {name}")
-            N = Spaces(mesh, n_coarse, k, seed)
+            N = Spaces(mesh, n_coarse, k, seed, settings["lift"])
             vertices = None
             if landmarks is not None:
                 at_source, at_target = (
@@ -249,7 +290,7 @@ def pairs(
             load = load_source + load_target
             rows.append(metrics_of_pair(M, N, methods, vertices, load, true, n_geodesic, options))
     table = xr.concat(rows, "pair", combine_attrs="drop_conflicts")
-    attrs = options | {"n_coarse": n_coarse, "seed": seed}
+    attrs = options | {"lift": int(settings["lift"]), "n_coarse": n_coarse, "seed": seed}
     return table.assign_coords(pair=list(targets)).transpose("way", "pair", ...).assign_attrs(attrs)
 
 
@@ -322,6 +363,10 @@ def collection(
     k_init: int = 20,
     k: int = 100,
     step: int = 5,
+    preset: str | None = None,
+    init: str | None = None,
+    n_spread: int | None = None,
+    wide: int | None = None,
     seed: int = 0,
 ) -> xr.Dataset:
     """Table 2: the collection in the space of SCALABLE and of RE-MATCH.
@@ -335,7 +380,12 @@ def collection(
     methods : sequence of str
         Some of :data:`COLLECTION_METHODS`.
     n_coarse, n_pairs, k_init, k, step, seed
-        See :func:`s4a.analyse`; first maps are those of nearest neighbours after alignment.
+        See :func:`s4a.analyse`.
+    preset : {None, "paper"}
+        ``"paper"`` sets init="landmarks", n_spread=0 and wide=0; another value of these is refused.
+    init, n_spread, wide
+        First maps, those of nearest neighbours after alignment by default, and Consistent ZoomOut,
+        see :func:`s4a.analyse`.
 
     Returns
     -------
@@ -364,6 +414,17 @@ def collection(
         raise ValueError(
             f"methods must be some of {', '.join(COLLECTION_METHODS)}; found {wrong or methods!r}"
         )
+    given = {"init": init, "n_spread": n_spread, "wide": wide}
+    presets = {name: {key: values[key] for key in given} for name, values in STUDY_PRESETS.items()}
+    options = Options(
+        n_coarse=n_coarse,
+        n_pairs=n_pairs,
+        k_init=k_init,
+        k=k,
+        step=step,
+        seed=seed,
+        **apply_preset(preset, given, presets),
+    )
     begin = time.process_time()
     tree = shapes if isinstance(shapes, xr.DataTree) else read_shapes(shapes)
     load = time.process_time() - begin
@@ -372,8 +433,7 @@ def collection(
         raise ValueError(f"a collection needs at least 2 shapes, found {len(meshes)}")
     with threadpool_limits(1):
         rows = [
-            one_collection(meshes, way, load, n_coarse, n_pairs, k_init, k, step, seed)
-            for way in tqdm(methods, desc="collection")
+            one_collection(meshes, way, load, options) for way in tqdm(methods, desc="collection")
         ]
     return xr.concat(rows, "way").assign_coords(way=list(methods))
 
@@ -382,20 +442,15 @@ def one_collection(
     meshes: dict[str, xr.Dataset],
     way: str,
     load: float,
-    n_coarse: int,
-    n_pairs: int,
-    k_init: int,
-    k: int,
-    step: int,
-    seed: int,
+    options: Options,
 ) -> xr.Dataset:
     """One row of Table 2."""
     names = list(meshes)
     begin = time.process_time()
-    spaces = [Spaces(mesh, n_coarse, k, seed) for mesh in meshes.values()]
+    spaces = [Spaces(mesh, options.n_coarse, options.k, options.seed) for mesh in meshes.values()]
     shapes = [space.local if way == "SCALABLE" else space.coarse for space in spaces]
     bases = [shape.low for shape in shapes]
-    source, target, maps = first_maps(bases, n_pairs, k_init)
+    source, target, maps = first_maps(bases, options)
     network_seconds = time.process_time() - begin
 
     begin = time.process_time()
@@ -404,9 +459,10 @@ def one_collection(
         maps,
         source,
         target,
-        k,
-        step=step,
-        samples=[basis.spread_vertices for basis in bases],
+        options.k,
+        step=options.step,
+        samples=[basis.spread_vertices(options.n_spread) for basis in bases],
+        wide=options.wide,
     )
     found = dataset(latent_basis=Y, latent_eigenvalue=latent_eigenvalue).assign_coords(shape=names)
     found = median.median_shape(found, np.stack([basis.eigenvalue for basis in bases]))
@@ -431,10 +487,9 @@ def one_collection(
     return measures.assign_coords(how=list(HOW), block=list(COLLECTION_BLOCKS), shape=names)
 
 
-def first_maps(
-    bases: list[Basis], n_pairs: int, k_init: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def first_maps(bases: list[Basis], options: Options) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """First maps of a network, both ways: sources and targets ``(p,)``, maps ``(p, k, k)``."""
+    k_init = options.k_init
     distance = network.spectral_distance([basis.eigenvalue[:k_init] for basis in bases])
     reference = bases[int(np.argmin(distance.sum(1)))]
     motions = []
@@ -444,12 +499,12 @@ def first_maps(
             motion = align(basis.X, basis.area, reference.X, reference.area)[:2]
         motions.append(motion)
     source, target, maps = [], [], []
-    for i, j in network.choose_pairs(distance, n_pairs):
+    for i, j in network.choose_pairs(distance, options.n_pairs):
         M, N = bases[i], bases[j]
         start = motion_between(motions[i], motions[j])
         R, t = realign(M.cloud, N.cloud, start)
-        maps.append(map_after_motion(M, N, (R, t), k_init=k_init))
-        maps.append(map_after_motion(N, M, (R.T, -R.T @ t), k_init=k_init))
+        maps.append(map_after_motion(M, N, (R, t), k_init=k_init, init=options.init))
+        maps.append(map_after_motion(N, M, (R.T, -R.T @ t), k_init=k_init, init=options.init))
         source += [i, j]
         target += [j, i]
     return np.array(source), np.array(target), np.stack(maps)
@@ -465,9 +520,11 @@ def chamfer_to_template(
         if i == template:
             continue
         begin = time.process_time()
-        functions = latent_functions(shape, shapes[template], (Y[i], Y[template]))
+        bases = Y[i], Y[template]
         if how == "standard":
-            functions = mapped_functions(shape, shapes[template], functions, shape.low.k)
+            _, functions = match_low(shape, shapes[template], bases, how=how)
+        else:
+            functions = latent_functions(shape, shapes[template], bases)
         match, *_ = match_functions(shape, shapes[template], *functions)
         seconds += time.process_time() - begin
         chamfer[i] = metrics.chamfer(space.X, space.X[match])

@@ -2,8 +2,8 @@
 
 Every method works on a :class:`s4a.method.shape.Shape`: ZO and FMAP+ZO on one whose functions are
 the eigenfunctions of the dense mesh, SCALABLE on that of :mod:`s4a.method.scalable`, RE-MATCH on
-the coarse mesh with functions of :mod:`s4a.method.lift`.  Times are CPU seconds of one core, so
-that a busy machine does not change them.
+the coarse mesh with functions of :mod:`s4a.method.lift`, or with U Phi as in the paper.  Times are
+CPU seconds of one core, so that a busy machine does not change them.
 """
 
 import time
@@ -20,7 +20,7 @@ from s4a.geometry.align import Motion, align, farthest_points
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.method import fmap, joint
 from s4a.method.first_map import landmarks_after_motion, nearest_after_motion
-from s4a.method.lift import SPARE, lift
+from s4a.method.lift import SPARE, lifted
 from s4a.method.nearest import (
     as_candidates,
     as_queries,
@@ -34,7 +34,8 @@ from s4a.method.scalable import local_space, spectral_space
 from s4a.method.shape import Basis, Shape
 from s4a.method.spectral import eigenpairs, spectrum
 
-METHODS = ("kNN", "ZO", "FMAP+ZO", "SCALABLE", "RE-MATCH", "RE-MATCH joint")
+PAPER_METHODS = ("kNN", "ZO", "FMAP+ZO", "SCALABLE", "RE-MATCH")
+METHODS = (*PAPER_METHODS, "RE-MATCH joint")
 BLOCKS = (
     "load and clean",
     "align",
@@ -45,7 +46,11 @@ BLOCKS = (
     "full resolution",
 )  # of Fig. 3
 N_SPREAD = 3000  # points of each shape by which it is aligned, and that group dense searches
-SHARPEN = 2  # last rounds of RE-MATCH that look among all vertices of the source
+# what is added to the paper's RE-MATCH and to the fit of all first maps; nothing in the paper's
+PRESETS: dict[str | None, dict] = {
+    None: {"lift": True, "sharpen": 2, "init": "descriptors"},
+    "paper": {"lift": False, "sharpen": 0, "init": "landmarks"},
+}
 
 Matches = tuple[np.ndarray, np.ndarray]
 
@@ -79,6 +84,7 @@ class Spaces:
     n_coarse: int = 6000
     k: int = 100
     seed: int = 0
+    lift: bool = True
     clock: Clock = field(default_factory=Clock)
 
     @cached_property
@@ -118,10 +124,10 @@ class Spaces:
 
     @cached_property
     def low(self) -> xr.Dataset:
-        """The low-resolution mesh, with a few eigenfunctions more than are used."""
+        """The low-resolution mesh, with a few eigenfunctions more where they are to be lifted."""
         options = {"n_coarse": self.n_coarse, "seed": self.seed}
-        coarse = self.clock("lifted sample", coarsen, self.mesh, **options)
-        return self.clock("lifted basis", spectrum, coarse, k=self.k + SPARE)
+        coarse = self.clock("coarse sample", coarsen, self.mesh, **options)
+        return self.clock("coarse basis", spectrum, coarse, k=self.k + SPARE * self.lift)
 
     @cached_property
     def coarse(self) -> Shape:
@@ -131,38 +137,7 @@ class Spaces:
     @cached_property
     def lifted(self) -> Shape:
         """The low-resolution mesh with functions that were brought to all vertices and back."""
-        return self.clock("lifted basis", lifted_shape, self.coarse, self.low, self.k)
-
-
-def lifted_shape(shape: Shape, low: xr.Dataset, k: int) -> Shape:
-    """A shape with the functions of :mod:`s4a.method.lift`, at all vertices and at coarse ones.
-
-    They are orthonormal for the areas of the low-resolution mesh, as ZoomOut needs it.
-
-    Parameters
-    ----------
-    shape : Shape
-    low : Dataset
-        The low-resolution mesh with some eigenfunctions more than k.
-    """
-    X, T = as_arrays(shape.original)
-    area_full = vertex_areas(X, T)
-    eigenvalue, B = lift(X, T, area_full, shape.U, low, k)  # (n, k)
-    vertex = low["sample_vertex"].values.copy()
-    cell, nearest = np.unique(shape.cell, return_index=True)
-    # the centres of closed openings are no vertices: the first of their cells stands for them
-    vertex[cell] = np.where(vertex[cell] < 0, nearest, vertex[cell])
-    area = shape.low.area
-    Phi = B[vertex].astype(float)
-    turn = np.linalg.inv(np.linalg.cholesky(Phi.T @ (area[:, None] * Phi))).T
-    B = B @ turn.astype(B.dtype)
-    return Shape.of(
-        shape.original,
-        low=replace(shape.low, Phi=B[vertex].astype(float), eigenvalue=eigenvalue),
-        full=Basis(shape.to_frame(X), T, area_full / area_full.sum(), B, eigenvalue),
-        U=shape.U,
-        cell=shape.cell,
-    )
+        return Shape(self.mesh, self.clock("lifted basis", lifted, self.mesh, self.low, self.k))
 
 
 def functions_at_all_vertices(shape: Shape, C: np.ndarray | None = None) -> np.ndarray:
@@ -181,12 +156,17 @@ def match_in_space(
     return cKDTree(moved).query(target.X)[1], cKDTree(target.X).query(moved)[1]
 
 
-def fit_map(M: Shape, N: Shape, landmarks: Matches, k: int) -> np.ndarray:
-    """First map ``(k, k)`` from landmarks and wave kernels, see `fmap.fit_descriptors`."""
-    at_source, at_target = (
+def at_low_resolution(M: Shape, N: Shape, landmarks: Matches) -> list[np.ndarray]:
+    """Landmarks as vertices of low resolution, where there is one."""
+    return [
         mark if shape.U is None else shape.cell[mark]
         for shape, mark in zip((M, N), landmarks, strict=True)
-    )
+    ]
+
+
+def fit_map(M: Shape, N: Shape, landmarks: Matches, k: int) -> np.ndarray:
+    """First map ``(k, k)`` from landmarks and wave kernels, see `fmap.fit_descriptors`."""
+    at_source, at_target = at_low_resolution(M, N, landmarks)
     bases = [replace(shape.low, area=shape.low.area / shape.low.area.sum()) for shape in (M, N)]
     return fmap.fmap_from_descriptors(*bases, k=k, landmarks=(at_source, at_target), oriented=0)
 
@@ -220,6 +200,11 @@ class Pair:
         Corresponding vertices; by default those of 4.1, step 3.
     k_init, k, step : int
         Of the maps.
+    lift, sharpen : bool, int
+        Whether RE-MATCH has lifted functions, and its last rounds that look among all vertices.
+    init : {"descriptors", "landmarks"}
+        First maps from wave kernels of the shapes and around landmarks, or as
+        :func:`s4a.method.fmap.fmap_from_landmarks`.
     """
 
     source: Spaces
@@ -228,6 +213,9 @@ class Pair:
     k_init: int = 20
     k: int = 100
     step: int = 5
+    lift: bool = True
+    sharpen: int = 2
+    init: str = "descriptors"
     spectral: dict[str, SpectralMatch] = field(default_factory=dict)
 
     def run(self, method: str) -> Outcome:
@@ -262,8 +250,13 @@ class Pair:
 
     def shapes(self, method: str) -> tuple[Shape, Shape]:
         """Source and target in the functions of a method."""
-        kind = {"ZO": "dense", "FMAP+ZO": "dense", "SCALABLE": "local"}.get(method, "lifted")
+        kind = self.kind(method)
         return getattr(self.source, kind), getattr(self.target, kind)
+
+    def kind(self, method: str) -> str:
+        """Which shapes of :class:`Spaces` a method works on."""
+        of_remeshed = "lifted" if self.lift else "coarse"
+        return {"ZO": "dense", "FMAP+ZO": "dense", "SCALABLE": "local"}.get(method, of_remeshed)
 
     @cached_property
     def align_spread(self) -> tuple[Motion, Matches, float]:
@@ -294,28 +287,38 @@ class Pair:
     def _match_spectrally(self, method, motion, landmarks):
         clock = Clock()
         M, N = self.shapes(method)
-        kind = {"ZO": "dense", "FMAP+ZO": "dense", "SCALABLE": "local"}.get(method, "lifted")
+        kind = self.kind(method)
+        parts = ("coarse", "lifted") if kind == "lifted" else (kind,)
         for block in ("sample", "basis"):
             for end in (self.source, self.target):
-                clock.add(block, end.clock.seconds.get(f"{kind} {block}", 0.0))
+                spent = [end.clock.seconds.get(f"{part} {block}", 0.0) for part in parts]
+                clock.add(block, sum(spent))
         if method == "ZO":
             match, _ = clock("map", match_in_space, self.source, self.target, motion)
             Phi, Psi = M.low.Phi[:, : self.k_init], N.low.Phi[:, : self.k_init]
             C = clock("map", fmap.fmap_from_match, Phi, Psi, N.low.mass, match)
+        elif self.init == "landmarks":
+            if self.landmarks is None:  # of the meshes that the map is computed on
+                landmarks = clock("map", landmarks_after_motion, M.low.X, N.low.X, motion)
+            else:
+                landmarks = at_low_resolution(M, N, landmarks)
+            ends = M.low.first(self.k_init), N.low.first(self.k_init)
+            C = clock("map", fmap.fmap_from_landmarks, *ends, *landmarks)
         else:
             C = clock("map", fit_map, M, N, landmarks, self.k_init)
         nearest = {
             "dense": lambda Q, D: nearest_in_cells(Q, N.cell, D, M.cell)[0],
             "local": nearest_rows,
+            "coarse": nearest_rows,
             # other searches follow, so that near ties do not matter
             "lifted": lambda Q, D: nearest_float32(as_queries(Q), as_candidates(D)),
         }[kind]
         C, low_match = clock(
             "refine", fmap.zoomout, M.low, N.low, C, self.k, step=self.step, nearest=nearest
         )
-        if kind == "lifted":
-            for _ in range(SHARPEN):
-                C = clock("refine", sharpen_map, M, N, C, M.full.Phi)
+        if method == "RE-MATCH":
+            for _ in range(self.sharpen):
+                C = clock("refine", sharpen_map, M, N, C, M.full.Phi if self.lift else None)
         F = clock("full resolution", functions_at_all_vertices, M, C)
         G = functions_at_all_vertices(N)
         match = low_match

@@ -316,7 +316,8 @@ def between_rims(G: sp.csr_matrix, T: np.ndarray, region: np.ndarray) -> np.ndar
     seeds = np.flatnonzero(rim_of[inside] >= 0)
     _, _, nearest = dijkstra(local, indices=seeds, min_only=True, return_predecessors=True)
     part = np.full(len(region), -1)  # the rim that is nearest within the region
-    part[inside] = np.where(nearest >= 0, rim_of[inside[nearest]], -1)
+    reached = nearest >= 0  # a piece of a region that no rim bounds has no nearest one
+    part[inside[reached]] = rim_of[inside[nearest[reached]]]
     P, R = part[T], region[T]  # (m, 3)
     P_next, R_next = part[T[:, [1, 2, 0]]], region[T[:, [1, 2, 0]]]
     removed = ((R == R_next) & (R >= 0) & (P != P_next)).any(1)

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from s4a.input import bounded
 from s4a.input.formats import gifti_arrays
+from s4a.input.raw import check_there, shown, text_of
 from s4a.schema import dataset, require
 
 LONGEST = 255  # characters of a name: an array of names has room for the longest in each place
@@ -45,8 +46,7 @@ def read_labels(path: Path | str, n: int | None = None) -> np.ndarray:
     """
     before, _, name = str(path).partition(".npz:")
     file = Path(f"{before}.npz" if name else before)
-    if not file.is_file():
-        raise ValueError(f"no file {file}")
+    check_there(file)
     kind = Path(file.name.lower().removesuffix(".gz")).suffix
     readers = {".npy": bounded.npy, ".gii": _gifti_labels, ".annot": _annot_labels}
     try:
@@ -57,7 +57,7 @@ def read_labels(path: Path | str, n: int | None = None) -> np.ndarray:
             labels = np.asarray(readers.get(kind, _text_labels)(data))
     except Exception as error:  # whatever the file holds, the message must name it
         raise ValueError(
-            f"{path} cannot be read as labels: {error or type(error).__name__}"
+            f"{shown(path)} cannot be read as labels: {shown(error) or type(error).__name__}"
         ) from error
     labels = labels[:, 0] if labels.ndim == 2 and labels.shape[1] == 1 else labels
     if labels.ndim != 1 or (n is not None and len(labels) != n):
@@ -66,16 +66,16 @@ def read_labels(path: Path | str, n: int | None = None) -> np.ndarray:
             if n is None
             else f"{n} labels, one per vertex of the file of the mesh,"
         )
-        raise ValueError(f"{path}: {wanted} needed, found an array of shape {labels.shape}")
+        raise ValueError(f"{shown(path)}: {wanted} needed, found an array of shape {labels.shape}")
     if labels.dtype.kind == "f":
         wrong = (np.round(labels) != labels) | ~(np.abs(labels) < 2**53)
         if wrong.any():
             raise ValueError(
-                f"{path}: labels need whole numbers or names, found {labels[wrong][0]}"
+                f"{shown(path)}: labels need whole numbers or names, found {labels[wrong][0]}"
             )
         labels = labels.astype(np.int64)
     if labels.dtype.kind not in "iubU":
-        raise ValueError(f"{path}: labels need whole numbers or names, found {labels.dtype}")
+        raise ValueError(f"{shown(path)}: labels need whole numbers or names, found {labels.dtype}")
     return labels
 
 
@@ -176,9 +176,8 @@ def _colour_table(file):
     return row_of_colour
 
 
-def table_rows(data: bytes) -> list[list[str]]:
+def table_rows(text: str) -> list[list[str]]:
     """Rows of a table separated by commas, semicolons, tabs or spaces, without comments."""
-    text = data.decode("utf-8-sig")
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     if not lines:
         raise ValueError("the file is empty")
@@ -205,7 +204,7 @@ def is_number(text: str) -> bool:
 
 
 def _text_labels(data):
-    rows = table_rows(data)
+    rows = table_rows(text_of(data))
     head = [cell.lower() for cell in rows[0]]
     if "label" in head:
         values = [row[head.index("label")] for row in rows[1:]]
@@ -251,13 +250,11 @@ def read_landmarks(path: Path | str) -> xr.Dataset:
         When the file is missing or holds no points, or a curve has one point only.
     """
     path = Path(path)
-    if not path.is_file():
-        raise ValueError(f"no file {path}")
+    check_there(path)
     try:
-        data = bounded.content(path)
-        head = data.decode("utf-8-sig").lstrip()[:1]
-        reader = {"{": _slicer_points, "<": _meshlab_points}.get(head, _table_points)
-        names, points, system, curve, closed = reader(data)
+        text = text_of(bounded.content(path))
+        reader = {"{": _slicer_points, "<": _meshlab_points}.get(text.lstrip()[:1], _table_points)
+        names, points, system, curve, closed = reader(text)
         points = np.array(points, float).reshape(-1, 3)
         if len(points) == 0 or not np.isfinite(points).all():
             raise ValueError(f"points with finite coordinates needed, found {len(points)}")
@@ -268,7 +265,7 @@ def read_landmarks(path: Path | str) -> xr.Dataset:
         curve = short([str(name) for name in curve])
     except Exception as error:
         raise ValueError(
-            f"{path} cannot be read as landmarks: {error or type(error).__name__}"
+            f"{shown(path)} cannot be read as landmarks: {shown(error) or type(error).__name__}"
         ) from error
     curves = (
         {"landmark_curve": np.array(curve), "landmark_closed": np.array(closed, bool)}
@@ -283,8 +280,8 @@ def read_landmarks(path: Path | str) -> xr.Dataset:
     )
 
 
-def _slicer_points(data):
-    lists = json.loads(data.decode("utf-8-sig"))["markups"]
+def _slicer_points(text):
+    lists = json.loads(text)["markups"]
     systems = {str(m.get("coordinateSystem", "LPS")).upper() for m in lists}
     if len(systems) != 1 or not systems <= {"LPS", "RAS"}:
         names = ", ".join(sorted(systems)) or "no markups"
@@ -305,16 +302,14 @@ def _slicer_points(data):
     return names, points, systems.pop(), curve, closed
 
 
-def _meshlab_points(data):
-    points = [
-        p for p in bounded.xml(data.decode("utf-8-sig")).iter("point") if p.get("active") != "0"
-    ]
+def _meshlab_points(text):
+    points = [p for p in bounded.xml(text).iter("point") if p.get("active") != "0"]
     names = [p.get("name", "") for p in points]
     return names, [[p.get(axis) for axis in "xyz"] for p in points], "", [""] * len(names), []
 
 
-def _table_points(data):
-    rows = table_rows(data)
+def _table_points(text):
+    rows = table_rows(text)
     head = [cell.lower() for cell in rows[0]]
     if all(axis in head for axis in "xyz"):
         x = [head.index(axis) for axis in "xyz"]

@@ -11,10 +11,12 @@ import zlib
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 from xml.parsers import expat
 
 import numpy as np
+
+from s4a.input.raw import CHUNK, read_all, regular_file
 
 LARGEST = 2**30  # bytes that a file may unpack to: 30 million vertices and their triangles
 LEAST = 2**26  # unpacked size that is never refused
@@ -43,42 +45,59 @@ def check(unpacked: int, size: int) -> None:
         )
 
 
-def gunzip(data: bytes) -> bytes:
+def gunzip(file: BinaryIO) -> bytes:
     """The bytes of a gzip file (several members too); ValueError if too many, or it ends early.
+
+    What was unpacked is held against what was read for it so far, so that little memory is taken
+    before too much is refused.
 
     Examples
     --------
     >>> import gzip
+    >>> import io
     >>> from s4a.input.bounded import gunzip
-    >>> gunzip(gzip.compress(b"ply") + gzip.compress(b" format"))
+    >>> gunzip(io.BytesIO(gzip.compress(b"ply") + gzip.compress(b" format")))
     b'ply format'
     """
+    unpacked = io.BytesIO()
     try:
-        found = gzip.GzipFile(fileobj=io.BytesIO(data)).read(limit_of(len(data)) + 1)
+        with gzip.GzipFile(fileobj=file) as stream:
+            while part := stream.read(CHUNK):
+                unpacked.write(part)
+                check(unpacked.tell(), file.tell())
     except EOFError as error:
-        raise ValueError(f"the gzip data ends early: found {len(data)} bytes") from error
+        raise ValueError(f"the gzip data ends early: found {file.tell()} bytes") from error
     except (OSError, zlib.error) as error:
         raise ValueError(f"damaged gzip data ({error})") from error
-    check(len(found), len(data))
-    return found
+    return unpacked.getvalue()
 
 
 def content(path: Path | str) -> bytes:
-    """The bytes of a file, unpacked where it is compressed by gzip."""
-    data = Path(path).read_bytes()
-    return gunzip(data) if data.startswith(GZIP) else data
+    """The bytes of a regular file, unpacked where it is compressed by gzip."""
+    with regular_file(path) as file:
+        is_packed = file.read(len(GZIP)) == GZIP
+        file.seek(0)
+        return gunzip(file) if is_packed else read_all(file)
 
 
 def unpack(data: bytes, compressor: str, limit: int) -> bytes:
     """The bytes of one stream, `limit` at most: of ``"zlib"`` or ``"lzma"``."""
     by_lzma = compressor == "lzma"
     stream: Any = lzma.LZMADecompressor(memlimit=2**28) if by_lzma else zlib.decompressobj()
-    unpacked = stream.decompress(data, max(limit, 0) + 1)
-    if len(unpacked) > limit:
-        raise ValueError(f"at most {limit} bytes expected in a compressed block, found more")
-    if not stream.eof:
-        raise ValueError(f"a compressed block ends early: found {len(data)} bytes")
-    return unpacked
+    unpacked = io.BytesIO()
+    step = 2**16  # bytes that are taken in at a time
+    for start in range(0, len(data), step):
+        part, packed = b"", data[start : start + step]
+        while packed or len(part) == CHUNK:  # there may be more of what was taken in
+            part = stream.decompress(packed, CHUNK)
+            packed = b"" if by_lzma else stream.unconsumed_tail
+            unpacked.write(part)
+            most = min(limit, limit_of(min(start + step, len(data))))
+            if unpacked.tell() > most:
+                raise ValueError(f"at most {most} bytes expected in a compressed block, found more")
+            if stream.eof:
+                return unpacked.getvalue()
+    raise ValueError(f"a compressed block ends early: found {len(data)} bytes")
 
 
 def xml(text: bytes | str) -> ElementTree.Element:
@@ -117,7 +136,10 @@ def npz(data: bytes) -> dict[str, Callable[[], np.ndarray]]:
 
 
 def _read_member(archive, member):
-    return npy(archive.read(member))
+    if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError("arrays expected that are stored or deflated, as NumPy writes them")
+    with archive.open(member) as stream:
+        return npy(stream.read(member.file_size))  # no more, even where the archive lies about it
 
 
 NPY = re.compile(

@@ -31,7 +31,12 @@ from s4a.schema import require
 
 # of the diagonal of the bounding box: nearer vertices are one, lower triangles are flat
 RELATIVE_TOLERANCE = 1e-7
-LARGEST = 1e60  # a coordinate from here on is not finite: its squared areas would overflow
+# largest coordinate, and one over the least extent: sums of squares stay in float32, which holds
+# the displacements (1e-38 to 3e38)
+LARGEST = 1e15
+# largest coordinate beside the extent: from here on rounding is over 1 % of the extent in float32;
+# in float64 the frame of a shape is 1e-4 of its extent off (measured for offsets of 1e13 and 1e14)
+FARTHEST = {"float32": 1e5, "float64": 1e11}
 
 REPAIRS = {
     "nonfinite_vertices": "non-finite vertices removed",
@@ -88,8 +93,8 @@ def clean(
     Raises
     ------
     ValueError
-        When indices are out of range, nothing is left, or the largest component has under half of
-        the area.
+        When indices are out of range, coordinates are too large or too near to each other to
+        compute with, nothing is left, or the largest component has under half of the area.
 
     Examples
     --------
@@ -143,6 +148,7 @@ def clean_arrays(
     counts |= dict.fromkeys(REPAIRS, 0)
     counts["unreferenced_vertices"] = len(P) - n_used(F)
     F = _drop_nonfinite(P, F, strict, counts)
+    check_range(P, F)
     group, tolerance = _weld(P, F, counts)
     F = _drop_repeated(F, group, counts)
     F = _flip_flat(P, F, group, tolerance, counts)
@@ -217,7 +223,7 @@ def _validated(points, triangles, components):
 
 
 def _drop_nonfinite(P, F, strict, counts):
-    bad = ~(np.abs(P) < LARGEST).all(axis=1)  # true for NaN as well
+    bad = ~np.isfinite(P).all(axis=1)
     counts["nonfinite_vertices"] = int(bad.sum())
     which = f"{bad.sum()} of {len(P)} vertices are not finite"
     if strict and bad.any():
@@ -226,6 +232,42 @@ def _drop_nonfinite(P, F, strict, counts):
     if len(F) == 0:
         raise ValueError(f"no triangle with finite vertices; {which}")
     return F
+
+
+def check_range(P: np.ndarray, F: np.ndarray) -> None:
+    """ValueError where coordinates are too large, or too near to each other, to compute with.
+
+    Parameters
+    ----------
+    P : float ndarray (p, 3)
+    F : int ndarray (m, 3)
+        Vertices in none of these triangles are not looked at.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.input.clean import check_range
+    >>> check_range(1e20 * np.eye(3), np.array([[0, 1, 2]]))
+    Traceback (most recent call last):
+    ValueError: coordinates of at most 1e+15 needed, found 1.0e+20: scale the file
+    """
+    X = P[np.bincount(F.ravel(), minlength=len(P)) > 0]
+    size = np.abs(X).max()
+    if size > LARGEST:
+        raise ValueError(
+            f"coordinates of at most {LARGEST:.0e} needed, found {size:.1e}: scale the file"
+        )
+    extent = np.ptp(X, axis=0).max()  # a norm would underflow
+    if 0 < extent < 1 / LARGEST:
+        raise ValueError(
+            f"an extent of at least {1 / LARGEST:.0e} needed, found {extent:.1e}: scale the file"
+        )
+    precision = "float32" if np.array_equal(X, X.astype(np.float32)) else "float64"
+    if size > FARTHEST[precision] * extent > 0:
+        raise ValueError(
+            f"the shape is lost in rounding: its extent is {extent:.2g}, its coordinates, which "
+            f"are of {precision}, reach {size:.1e}; subtract the offset before it is written"
+        )
 
 
 def _weld(P, F, counts):

@@ -10,7 +10,17 @@ import xarray as xr
 from s4a.geometry.mesh import as_dataset
 from s4a.input import plausibility
 from s4a.input.clean import REPAIRS, check_components, clean
-from s4a.input.files import Paths, find_meshes, not_meshes, read_mesh, slug
+from s4a.input.evidence import examine
+from s4a.input.files import (
+    LONGEST_NAME,
+    Paths,
+    check_names,
+    find_meshes,
+    not_meshes,
+    read_mesh,
+    with_long_names,
+)
+from s4a.input.raw import shown
 from s4a.schema import check_switch, check_text, dataset, in_unit
 
 # columns of the report
@@ -18,7 +28,7 @@ COUNTS = [
     *REPAIRS,
     *"file_vertices file_triangles components holes genus self_intersections".split(),
 ]
-TEXTS = ("status", "reason", "warning", "path")
+TEXTS = ("status", "reason", "warning", "doubtful_kinds", "warning_kinds", "path")
 AREAS = ("area", "area_dropped")
 
 
@@ -66,7 +76,7 @@ def read_shape(
         mesh = as_dataset(points, triangles, {"path": name, **attrs})
         mesh = clean(mesh, components=components, strict=strict, close_holes=close_holes)
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+        raise ValueError(f"{shown(path)}: {error}") from error
     if "note" in attrs:
         reasons = [mesh.attrs.pop("note"), mesh.attrs["reason"]]
         mesh.attrs["reason"] = "; ".join(filter(None, reasons))
@@ -104,7 +114,7 @@ def read_shapes(
     -------
     DataTree
         ``/original/<shape>`` for every shape that could be used, and ``/report`` over all shapes
-        with ``status`` (ok, repaired or excluded), ``reason`` (what was found and done),
+        with ``status`` (ok, repaired, doubtful or excluded), ``reason`` (what was found and done),
         ``warning`` (what looks wrong and was left as it is), ``path`` and counts; the attribute
         ``remarks`` has what concerns several shapes or none, one a line.
 
@@ -140,30 +150,35 @@ def read_shapes(
         raise ValueError(f"none of {len(attrs)} shapes can be used ({reasons})")
     evidence = {}
     if compare and len(meshes) > 1:
-        areas = {name: mesh.attrs["area"] for name, mesh in meshes.items()}
-        reference = plausibility.sample_vertices(meshes[plausibility.median_size(areas)])
-        for name, mesh in meshes.items():
-            evidence[name] = plausibility.examine(mesh, reference, intersections)
+        evidence = examine(meshes, intersections=intersections)
+    used = {name: said for name, said in attrs.items() if said["status"] != "excluded"}
+    doubts, remarks = plausibility.find_warnings(used, evidence)
     nodes = {f"/original/{name}": mesh for name, mesh in meshes.items()}
-    nodes["/report"] = shape_report(attrs, evidence, passed_over(paths, pattern))
+    remarks = [*remarks, *remarks_on_files(paths, pattern)]
+    nodes["/report"] = shape_report(attrs, doubts, remarks, evidence)
     return xr.DataTree.from_dict(nodes)
 
 
-def passed_over(paths: Paths | dict | xr.DataTree, pattern: str | None = None) -> list[str]:
-    """The files among `paths` that are no meshes, in words."""
+def remarks_on_files(paths: Paths | dict | xr.DataTree, pattern: str | None = None) -> list[str]:
+    """In words: the files among `paths` that are no meshes, and those whose names are too long."""
     if isinstance(paths, dict | xr.DataTree):
         return []
-    return [
-        f"{file} is not a mesh ({why}) and was passed over"
+    others = [
+        f"{shown(file)} is not a mesh ({why}) and was passed over"
         for file, why in not_meshes(paths, pattern)
     ]
+    shortened = [
+        f"{shown(file)} is called {name}: names of shapes have at most {LONGEST_NAME} letters"
+        for file, name in with_long_names(paths, pattern)
+    ]
+    return others + shortened
 
 
 def shape_report(
     attrs: dict[str, dict],
-    evidence: dict[str, dict] | None = None,
+    doubts: plausibility.Doubts | None = None,
     remarks: Iterable[str] = (),
-    doubts: dict[str, str] | None = None,
+    evidence: dict[str, xr.Dataset] | None = None,
 ) -> xr.Dataset:
     """Make the report on the shapes of a collection.
 
@@ -172,38 +187,47 @@ def shape_report(
     attrs : dict
         Name of each shape -> ``status``, ``reason``, ``path`` and counts; where one was excluded,
         counts are -1 in the report.
-    evidence : dict, optional
-        Name -> :func:`s4a.input.plausibility.examine`.
+    doubts : dict of str to list of Doubt, optional
+        What looks wrong, as of :func:`s4a.input.plausibility.find_warnings`; a shape that is not
+        excluded is doubtful where one of them says so.
     remarks : list of str
-        Kept as they are, before those on the collection.
-    doubts : dict of str to str, optional
-        Further warnings.
+        On the collection, the most important first.
+    evidence : dict, optional
+        Name -> :func:`s4a.input.evidence.compare`, whose counts are columns.
     """
     evidence, doubts = evidence or {}, doubts or {}
-    used = {name: said for name, said in attrs.items() if said["status"] != "excluded"}
-    warnings, of_all = plausibility.find_warnings(used, evidence)
     rows = []
     for name, said in attrs.items():
-        parts = [warnings.get(name), doubts.get(name)]
-        rows.append({**said, "warning": "; ".join(filter(None, parts))})
+        of_shape = [] if said["status"] == "excluded" else doubts.get(name, [])
+        rows.append({**said, **_doubtful_columns(of_shape)})
         if name in evidence:
-            rows[-1]["self_intersections"] = evidence[name]["self_intersections"]
+            rows[-1]["self_intersections"] = evidence[name].attrs["self_intersections"]
     columns: dict[str, list | np.ndarray] = {
-        key: [str(row.get(key, "")) for row in rows] for key in TEXTS
+        key: [shown(row.get(key, "")) for row in rows] for key in TEXTS
     }
     columns |= {key: np.array([row.get(key, -1) for row in rows], np.int64) for key in COUNTS}
     columns |= {key: [float(row.get(key, np.nan)) for row in rows] for key in AREAS}
-    report = dataset({"remarks": "\n".join([*remarks, *of_all])}, **columns)
+    report = dataset({"remarks": "\n".join(remarks)}, **columns)
     return report.assign_coords(shape=list(attrs))
+
+
+def _doubtful_columns(doubts):
+    """What the report says of a shape's doubts; the status only where they make it doubtful."""
+    serious = dict.fromkeys(one.kind for one in doubts if one.doubtful)
+    others = dict.fromkeys(one.kind for one in doubts if not one.doubtful)
+    columns = {
+        "warning": plausibility.in_words(doubts),
+        "doubtful_kinds": " ".join(serious),
+        "warning_kinds": " ".join(others),
+    }
+    return columns | ({"status": "doubtful"} if serious else {})
 
 
 def _sources(paths, pattern):
     """Name to path, arrays or Dataset, in the order of the names."""
     if not isinstance(paths, dict):
         return dict(sorted((name, path) for path, name in find_meshes(paths, pattern)))
-    wrong = [name for name in paths if not isinstance(name, str) or slug(name) != name]
-    if wrong or not paths:
-        raise ValueError(f"shapes need names of letters, digits, _ and -, found {wrong or 'none'}")
+    check_names(paths)
     return dict(sorted(paths.items()))
 
 

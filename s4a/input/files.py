@@ -15,9 +15,11 @@ import numpy as np
 
 from s4a.input import bounded
 from s4a.input.formats import FORMATS, NPZ_KEYS, SURFER, format_of
+from s4a.input.raw import check_there, regular_file, shown
 
 SUFFIXES = {suffix: name for name, known in FORMATS.items() for suffix in known.suffixes.split()}
 WRITERS = {known.suffixes.split()[0]: known.write for known in FORMATS.values() if known.write}
+LONGEST_NAME = 100  # letters of a shape's name, so that files of a study can be named after it
 OTHERS = ".json .csv .txt .md .html .png .jpg .nc .npy .annot .nii".split()  # that a glob may match
 
 Paths = str | os.PathLike | Iterable[str | os.PathLike]
@@ -31,8 +33,8 @@ def read_mesh(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray, dict[str
     path : str or Path
         PLY, OBJ, OFF, STL, VTK legacy polydata, VTP, GIFTI, FreeSurfer surface, or NPZ with the
         keys V and F, vertices and faces, points and triangles, position and corner_vertex, or X and
-        T; each of them compressed by gzip too (.ply.gz), which may unpack to 1 GiB.  Polygons
-        become fans of triangles.
+        T; each of them compressed by gzip too (.ply.gz), which may unpack to 1 GiB.  A regular
+        file of 2 GiB at most.  Polygons become fans of triangles.
 
     Returns
     -------
@@ -61,8 +63,7 @@ def read_mesh(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray, dict[str
     ((3, 3), [[0, 1, 2]])
     """
     path = Path(path)
-    if not path.is_file():
-        raise ValueError(f"no file {path}")
+    check_there(path)
     name = "mesh"
     try:
         data = bounded.content(path).removeprefix(b"\xef\xbb\xbf")
@@ -71,8 +72,8 @@ def read_mesh(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray, dict[str
             points, triangles, attrs = FORMATS[name].read(data)
             points, triangles = _checked(points, triangles)
     except Exception as error:  # whatever a file holds, it must not end the run over a collection
-        why = error or type(error).__name__
-        raise ValueError(f"{path} cannot be read as {name}: {why}") from error
+        why = shown(error) or type(error).__name__
+        raise ValueError(f"{shown(path)} cannot be read as {name}: {why}") from error
     attrs = {"format": name, **attrs}
     space = re.search(rb"SPACE=(RAS|LPS)", data[:1000])  # as 3D Slicer writes it into any header
     if space:
@@ -192,25 +193,29 @@ def find_meshes(paths: Paths, pattern: str | None = None) -> list[tuple[Path, st
     list of (Path, str)
         Sorted by path.  The name has letters, digits, ``_`` and ``-`` only and is made of the
         file's name; where two would be the same, of the folders too, and of the suffix, and of a
-        hash when nothing else tells them apart.
+        hash when nothing else tells them apart.  It has 100 letters at most, see :func:`slug`.
 
     Raises
     ------
     ValueError
         When a path is missing or no mesh is found.
     """
-    files = [file for file, why_not in _files(paths) if not why_not]
+    found = _files(paths)
+    files = [file for file, why_not in found if not why_not]
     chosen = [file for file in files if pattern is None or _matches(file, pattern)]
     if not chosen:
-        where = ", ".join(map(str, _listed(paths))) or "an empty list"
+        where = ", ".join(map(shown, _listed(paths))) or "an empty list"
         if pattern and files:
             raise ValueError(f"no mesh of {len(files)} files matching {pattern!r} in {where}")
-        raise ValueError(f"no mesh ({', '.join(SUFFIXES)}) in {where}")
+        others = "".join(f"; {shown(file)} is {why_not}" for file, why_not in found[:3])
+        raise ValueError(f"no mesh ({', '.join(SUFFIXES)}) in {where}{others}")
     return list(zip(chosen, slugs(chosen), strict=True))
 
 
 def not_meshes(paths: Paths, pattern: str | None = None) -> list[tuple[Path, str]]:
-    """The files that are named like meshes, or matched by a glob, and hold something else.
+    """What is named like meshes, or matched by a glob, and holds something else.
+
+    Folders that cannot be searched are among them, and links to folders, which are not followed.
 
     Returns
     -------
@@ -220,7 +225,16 @@ def not_meshes(paths: Paths, pattern: str | None = None) -> list[tuple[Path, str
     return [
         (file, why_not)
         for file, why_not in _files(paths)
-        if why_not and (pattern is None or _matches(file, pattern))
+        if why_not and (pattern is None or _matches(file, pattern) or os.path.isdir(file))
+    ]
+
+
+def with_long_names(paths: Paths, pattern: str | None = None) -> list[tuple[Path, str]]:
+    """The files of :func:`find_meshes` whose names were cut, and what they became."""
+    return [
+        (file, name)
+        for file, name in find_meshes(paths, pattern)
+        if len(name) == LONGEST_NAME and name not in _plain(str(file))
     ]
 
 
@@ -244,20 +258,37 @@ def _matches(file, pattern):
 
 def _expand(path):
     """The files that a folder, a file or a glob means, each with why it is no mesh, or ""."""
-    path = Path(path).expanduser()
-    if path.is_file():  # named by itself, it is tried whatever it is
+    path = Path(os.path.expanduser(path))
+    if os.path.isdir(path):
+        return _search(path)
+    if os.path.lexists(path):  # named by itself, it is tried whatever it is
         return [(path, "")]
-    if path.is_dir():
-        files = (Path(folder, name) for folder, _, names in os.walk(path) for name in names)
-        meant = [file for file in files if suffix_of(file) in SUFFIXES and file.name[0] != "."]
-        return [(file, _why_not(file)) for file in meant]
     matches = glob.glob(str(path), recursive=True) if glob.has_magic(str(path)) else []
     if not matches:
-        raise ValueError(f"no file, folder or match of {path}")
+        raise ValueError(f"no file, folder or match of {shown(path)}")
     files = []
     for match in map(Path, matches):
-        files += [(match, _why_not(match))] if match.is_file() else _expand(match)
+        files += _search(match) if os.path.isdir(match) else [(match, _why_not(match))]
     return files
+
+
+def _search(folder):
+    """The files in a folder, to any depth, that are named like meshes, each with why it is none."""
+    unread: list[OSError] = []
+    files, others = [], []
+    for place, folders, names in os.walk(folder, onerror=unread.append):
+        inside = [Path(place, name) for name in folders if name[0] != "."]
+        meant = [Path(place, name) for name in names if name[0] != "."]
+        links = [path for path in inside if path.is_symlink()]
+        others += [(path, "a link to a folder, which is not followed") for path in links]
+        files += [(path, _why_not(path)) for path in meant if suffix_of(path) in SUFFIXES]
+        named_so = [path for path in inside if suffix_of(path) in SUFFIXES and path not in links]
+        others += [(path, "a folder, and its files were searched") for path in named_so]
+    others += [
+        (Path(error.filename), f"a folder that cannot be searched: {error.strerror}")
+        for error in unread
+    ]
+    return files + others
 
 
 def _why_not(file):
@@ -270,7 +301,7 @@ def _why_not(file):
         return f"a {suffix} file"
     try:
         if suffix == ".npz":
-            with zipfile.ZipFile(file) as archive:
+            with regular_file(file) as opened, zipfile.ZipFile(opened) as archive:
                 names = {name.removesuffix(".npy") for name in archive.namelist()}
             if not any(names.issuperset(keys) for keys in NPZ_KEYS):
                 return "an archive of other arrays"
@@ -278,7 +309,7 @@ def _why_not(file):
             data = bounded.content(file)
             if b"<GIFTI" in data and b"NIFTI_INTENT_POINTSET" not in data:
                 return "a GIFTI file without points"
-    except (OSError, ValueError, zipfile.BadZipFile):  # it will be said when it is read
+    except (ValueError, zipfile.BadZipFile):  # it will be said when it is read
         pass
     return ""
 
@@ -286,15 +317,39 @@ def _why_not(file):
 def slug(text: str) -> str:
     """`text` in letters, digits, ``_`` and ``-``: accents go, other letters become their code.
 
+    What would have more than 100 letters is cut to 100, the last of which are a hash of `text`.
+
     Examples
     --------
     >>> from s4a.input.files import slug
     >>> slug("Crâne 3.b"), slug("脳")
     ('Crane_3_b', 'u8133')
+    >>> slug("a" * 250)[80:]
+    'aaaaaaaaaaa_3f3e35e0'
     """
+    plain = _plain(text) or "_"
+    return plain if len(plain) <= LONGEST_NAME else f"{plain[: LONGEST_NAME - 9]}_{_digest(text)}"
+
+
+def _plain(text):
     letters = [c for c in unicodedata.normalize("NFKD", text) if not unicodedata.combining(c)]
     ascii_only = "".join(c if c.isascii() else f"u{ord(c):x}" for c in letters)
-    return re.sub(r"[^A-Za-z0-9_-]", "_", ascii_only) or "_"
+    return re.sub(r"[^A-Za-z0-9_-]", "_", ascii_only)
+
+
+def _digest(text):
+    return hashlib.sha256(os.fsencode(text)).hexdigest()[:8]
+
+
+def check_names(names: Iterable) -> None:
+    """ValueError unless there are names, and each is one that :func:`slug` leaves as it is."""
+    names = list(names)
+    wrong = [name for name in names if not isinstance(name, str) or slug(name) != name]
+    if wrong or not names:
+        raise ValueError(
+            f"shapes need names of letters, digits, _ and -, at most {LONGEST_NAME} of them; "
+            f"found {wrong or 'none'}"
+        )
 
 
 def slugs(files: Iterable[str | os.PathLike]) -> list[str]:
@@ -306,8 +361,7 @@ def slugs(files: Iterable[str | os.PathLike]) -> list[str]:
 
     def name(path):
         stem = Path(path).with_name(stem_of(path)).as_posix()
-        digest = hashlib.sha256(os.fsencode(path)).hexdigest()[:8]
-        return slug([Path(stem).name, stem, path, f"{path}_{digest}"][level[path]])
+        return slug([Path(stem).name, stem, path, f"{path}_{_digest(path)}"][level[path]])
 
     while True:
         names = {path: name(path).casefold() for path in paths}

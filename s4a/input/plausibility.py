@@ -3,179 +3,170 @@
 It is named and never changed.
 """
 
-import itertools
 from collections import Counter
+from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
+from scipy.spatial import cKDTree
 
-from s4a.geometry.align import cloud, icp, principal_axes
-from s4a.geometry.mesh import as_arrays, vertex_areas
+from s4a.input.evidence import COMPACTNESS, ENOUGH, MOMENT, SIZE, excess, in_numbers
 
-N_POINTS = 3000  # vertices of each shape that are looked at
-N_PAIRED = 300  # of them, those that ICP pairs
-CLEARLY = 0.8  # a residual below this share of another is clearly better
 AREA_DROPPED = 0.1
 UNITS = {10.0**e: f"10^{e}" for e in (-9, -6, -4, -3, -2, -1, 1, 2, 3, 4, 6, 9)}
-UNITS |= {25.4: "25.4", 1 / 25.4: "1/25.4"}  # inches
+UNITS |= {25.4: "25.4", 1 / 25.4: "1/25.4", 2.54: "2.54", 1 / 2.54: "1/2.54"}  # inches
+# of these nobody but the user knows what is meant; an honest outlier is only named
+DOUBTFUL = ("mirrored", "unit", "partial", "duplicate", "registration")
+
+# Thresholds, chosen on synthetic brains, cats, faces and ten bodies (docs/plausibility.md)
+ODD_SIZE = 1.8  # times the size of the others, or less than one over it
+OTHER_SIZE = 3.0  # the same, that no anatomy has
+SPREADS = 5.0  # times the usual spread of a size, a boundary or a form: a warning
+EXTENT_SPREADS = 7.0  # the same of extents, which poses change
+FAR = 8.0  # the same: doubtful
+FIT = 0.12  # least spread of the logarithm of the residual
+BOUNDARY = 0.12  # least spread of lengths over sqrt(area)
+SAME = 1e-4  # largest difference of two files of one scan, of every number below
+CROSSING = 0.01  # share of the triangles that pass through others
+LATTICE = 0.2  # step of rounded coordinates, of the median edge
+MUCH_MORE = 10.0  # times the others' share of crossing triangles, or step
+CLOSE = 2.0  # times the usual residual; a part is no mirror image
+COMMON_HAND, OTHER_HAND = 0.8, 0.5  # of the mean of `hand` over the references
 
 
-def best_pose(
-    shape: tuple[np.ndarray, np.ndarray], reference: tuple[np.ndarray, np.ndarray]
-) -> tuple[np.ndarray, float, float]:
-    """How a shape lies beside a reference, and its mirror image: ICP from eight turns of each.
-
-    Parameters
-    ----------
-    shape, reference : tuple (X, area)
-        Vertices (n, 3) and their areas, as :func:`sample_vertices` gives them.
-
-    Returns
-    -------
-    R : float ndarray (3, 3)
-        Rotation onto the reference; of the pose as it is, unless a turn is clearly better, and no
-        mirror image is.
-    residual, mirrored : float
-        Least residual of ICP of the shape and of its mirror image, as shares of sqrt(area).
-    """
-    X, area = _normalized(*shape)
-    Y, reference_area = _normalized(*reference)
-    Y_axes, Y_cloud = principal_axes(Y, reference_area)[1], cloud(Y, reference_area, N_PAIRED)
-    signs = [d for d in itertools.product((1, -1), repeat=3) if np.prod(d) == 1]
-    half_turns = [np.diag(d).astype(float) for d in signs]  # as it is, and about each axis
-
-    def fits(X):
-        """(R, t, residual) from each start, the first from the pose as it is."""
-        axes, X_cloud = principal_axes(X, area)[1], cloud(X, area, N_PAIRED)
-        starts = half_turns + [Y_axes @ half_turn @ axes.T for half_turn in half_turns]
-        return [icp(X_cloud, Y_cloud, R, np.zeros(3), tolerance=1e-4, rounds=30) for R in starts]
-
-    straight = fits(X)
-    as_it_is, best = straight[0], min(straight, key=lambda fit: fit[2])
-    mirrored = min(residual for _, _, residual in fits(X * [-1, 1, 1]))
-    turned = best[2] < CLEARLY * as_it_is[2] and mirrored >= CLEARLY * best[2]
-    return (best if turned else as_it_is)[0], best[2], mirrored
-
-
-def sample_vertices(mesh: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices ``(3000, 3)`` of a mesh and their areas, evenly from the order of the file."""
-    X, T = as_arrays(mesh)
-    vertex = np.linspace(0, len(X) - 1, min(len(X), N_POINTS)).astype(int)
-    return X[vertex], vertex_areas(X, T)[vertex]
-
-
-def _normalized(X, area):
-    X = X - area @ X / area.sum()
-    size = np.sqrt(area @ (X**2).sum(1) / area.sum())
-    return X / size, area / area.sum()
-
-
-def count_intersections(mesh: xr.Dataset) -> int:
-    """Triangles of a mesh that pass through others; -1 where PyMeshLab lacks its filter."""
-    import pymeshlab
-
-    X, T = as_arrays(mesh)
-    unit_box = (X - X.min(0)) / max(np.ptp(X), 1e-300)  # its arithmetic is in single precision
-    meshes = pymeshlab.MeshSet(verbose=False)
-    meshes.add_mesh(pymeshlab.Mesh(unit_box, T))
-    try:
-        meshes.compute_selection_by_self_intersections_per_face()
-    except (AttributeError, pymeshlab.PyMeshLabException):
-        return -1
-    return int(meshes.current_mesh().selected_face_number())
-
-
-def examine(
-    mesh: xr.Dataset, reference: tuple[np.ndarray, np.ndarray], intersections: bool = True
-) -> dict:
-    """What :func:`find_warnings` needs of a shape: its pose beside the reference, and counts.
+class Doubt(NamedTuple):
+    """What looks wrong with a shape, and whether the shape is doubtful for it.
 
     Parameters
     ----------
-    mesh : Dataset
-    reference : tuple (X, area)
-        Of :func:`sample_vertices`.
-    intersections : bool
-        Whether triangles that pass through others are counted.
-
-    Returns
-    -------
-    dict
-        ``rotation``, ``residual`` and ``mirrored`` of :func:`best_pose`, and
-        ``self_intersections``, -1 where they were not counted.
+    kind : str
+        One word: ``mirrored``, ``unit``, ``size``, ``duplicate``, ``partial``, ``kind``,
+        ``spacing``, ``genus``, ``dropped``, ``intersections`` or ``registration``.
+    words : str
+        What was found, beside what, and what to do.
+    doubtful : bool
+        Whether it makes the shape doubtful; else it is a warning only.
     """
-    R, residual, mirrored = best_pose(sample_vertices(mesh), reference)
-    number = count_intersections(mesh) if intersections else -1
-    return {
-        "rotation": R,
-        "residual": residual,
-        "mirrored": mirrored,
-        "self_intersections": number,
-    }
+
+    kind: str
+    words: str
+    doubtful: bool
 
 
-def median_size(areas: dict[str, float]) -> str:
-    """Name of the shape of median area, the reference; the first name among equals.
+Doubts = dict[str, list[Doubt]]  # name of a shape -> what looks wrong with it
+
+
+def doubt(kind: str, words: str, doubtful: bool | None = None) -> Doubt:
+    """A doubt of a kind; the kind says whether it makes the shape doubtful, unless it is given.
 
     Examples
     --------
-    >>> from s4a.input.plausibility import median_size
-    >>> median_size({"a": 1.0, "b": 5.0, "c": 2.0})
-    'c'
+    >>> from s4a.input.plausibility import doubt
+    >>> doubt("genus", "genus 1, but 0 in 5 of 6 shapes").doubtful
+    False
     """
-    return sorted(areas, key=lambda name: (areas[name], name))[(len(areas) - 1) // 2]
+    return Doubt(kind, words, kind in DOUBTFUL if doubtful is None else bool(doubtful))
+
+
+def in_words(doubts: list[Doubt]) -> str:
+    """The sentences of all doubts about a shape, as they stand in the report's ``warning``."""
+    return "; ".join(one.words for one in doubts)
 
 
 def find_warnings(
-    attrs: dict[str, dict], evidence: dict[str, dict]
-) -> tuple[dict[str, str], list[str]]:
-    """What looks wrong, in words: with each shape, and with the collection.
+    attrs: dict[str, dict], evidence: Mapping[str, xr.Dataset]
+) -> tuple[Doubts, list[str]]:
+    """What looks wrong with each shape, and, in words, with the collection.
 
     Parameters
     ----------
     attrs : dict
         Name of every shape that is used -> attributes, as of :func:`s4a.clean`.
     evidence : dict
-        Name -> :func:`examine`; may be empty.
+        Name -> :func:`s4a.input.evidence.compare`; may be empty.
 
     Returns
     -------
-    of_shape : dict of str to str
+    of_shape : dict of str to list of Doubt
+        Every name; an empty list where nothing looks wrong.
     of_all : list of str
     """
-    told, of_all = {name: [] for name in attrs}, []
+    told: Doubts = {name: [] for name in attrs}
+    of_all: list[str] = []
+    evidence = {name: evidence[name] for name in attrs if name in evidence}
     for name, said in attrs.items():
         if said.get("area_dropped", 0) > AREA_DROPPED:
-            told[name].append(
+            words = (
                 f"{100 * said['area_dropped']:.0f} % of the area was in dropped components; "
                 'components=N or "all" keeps more'
             )
-        number = evidence.get(name, {}).get("self_intersections", -1)
-        if number > 0:
-            told[name].append(
-                f"{number} triangles pass through others; wrap=True makes a surface that does not"
-            )
-    _compare_sizes(attrs, told)
+            told[name].append(doubt("dropped", words))
+    _compare_sizes(attrs, told, of_all)
     _compare_units(attrs, of_all)
     _compare_genus(attrs, told, of_all)
-    if evidence:
-        _compare_handedness(evidence, told, of_all)
-        _compare_rotations(evidence, told)
-    return {name: "; ".join(parts) for name, parts in told.items()}, of_all
+    if len(evidence) > 1:
+        _compare_intersections(evidence, told)
+        _compare_duplicates(evidence, told)
+        _compare_hands(evidence, told, of_all)
+    if len(evidence) >= ENOUGH:
+        _compare_boundaries(evidence, told)
+        _compare_lattices(evidence, told)
+        _compare_forms(evidence, told)
+    return told, of_all
 
 
-def _compare_sizes(attrs, told):
-    size = {n: np.log10(said["area"]) / 2 for n, said in attrs.items() if said.get("area", 0) > 0}
-    for name in size if len(size) > 1 else ():
-        ratio = 10 ** (size[name] - np.median([size[other] for other in size if other != name]))
-        if 1 / 3 < ratio < 3:
+def _compare_sizes(attrs, told, of_all):
+    size = {n: np.log(said["area"]) / 2 for n, said in attrs.items() if said.get("area", 0) > 0}
+    names, values = list(size), np.array(list(size.values()))
+    if len(names) < 2:
+        return
+    group = _two_sizes(values)
+    if group.any():
+        others = np.median(values[~group])
+        of_all.append(
+            f"two sizes, {np.exp(abs(others - np.median(values[group]))):.3g} times apart: "
+            f"{_listed([n for n, odd in zip(names, group, strict=True) if odd])}, and the others; "
+            "no size was changed: scale the files of one of them if their units differ"
+        )
+    far = np.abs(excess(values, SIZE)) if len(names) >= ENOUGH else np.zeros(len(names))
+    for i, name in enumerate(names):
+        usual = np.median(values[~group] if len(names) > 2 else np.delete(values, i))
+        ratio = np.exp(values[i] - usual)
+        off = max(ratio, 1 / ratio)
+        if group.any() and not group[i]:
             continue
-        unit = next((text for factor, text in UNITS.items() if 0.7 < ratio / factor < 1.4), None)
+        if off < OTHER_SIZE and not (off > ODD_SIZE and (far[i] > SPREADS or group[i])):
+            continue
+        unit = next((text for factor, text in UNITS.items() if _near(ratio, factor)), None)
         guess = f", near {unit}: another unit, such as mm for m?" if unit else ";"
-        told[name].append(
+        words = (
             f"{ratio:.3g} times the size of the others{guess}"
             " its size was kept; scale the file if that is wrong"
         )
+        told[name].append(doubt("unit" if unit else "size", words, off > OTHER_SIZE or bool(unit)))
+
+
+def _near(ratio, factor):
+    within = 1.4 if max(factor, 1 / factor) > 5 else 1.15  # 2.54 is near what anatomies differ by
+    return 1 / within < ratio / factor < within
+
+
+def _two_sizes(values):
+    """Those of the smaller of two groups of sizes far apart, of two shapes or more each, (n,)."""
+    order = np.argsort(values, kind="stable")
+    step = np.diff(values[order])
+    none = np.zeros(len(values), bool)
+    if len(values) < 4:
+        return none
+    cut = 1 + int(np.argmax(step))
+    low, high = order[:cut], order[cut:]
+    within = max(np.ptp(values[low]), np.ptp(values[high]))
+    if min(len(low), len(high)) < 2 or step[cut - 1] < max(np.log(ODD_SIZE), 2 * within):
+        return none
+    odd = low if (len(low), 0 in low) < (len(high), 0 in high) else high  # the first name stays
+    none[odd] = True
+    return none
 
 
 def _compare_units(attrs, of_all):
@@ -197,51 +188,142 @@ def _compare_genus(attrs, told, of_all):
     usual, number = count.most_common(1)[0]
     for name, g in genus.items():
         if g != usual and number > len(genus) / 2:
-            told[name].append(
+            words = (
                 f"genus {g}, but {usual} in {number} of {len(genus)} shapes; "
                 "wrap=True closes tunnels"
             )
+            told[name].append(doubt("genus", words))
 
 
-def _compare_handedness(evidence, told, of_all):
-    """The minority of those that fit their reference clearly better, or worse, when reflected."""
-    straight, reflected = [], []
-    for name, seen in evidence.items():
-        if seen["residual"] < CLEARLY * seen["mirrored"]:
-            straight.append(name)
-        if seen["mirrored"] < CLEARLY * seen["residual"]:
-            reflected.append(name)
-    if not straight or not reflected:
+def _compare_intersections(evidence, told):
+    share = np.array([seen.attrs["intersecting"] for seen in evidence.values()])
+    for i, (name, seen) in enumerate(evidence.items()):
+        usual = max(float(np.median(np.delete(share, i))), 0.0)
+        if share[i] > max(CROSSING, MUCH_MORE * usual):
+            words = (
+                f"{seen.attrs['self_intersections']} triangles pass through others, "
+                f"{100 * share[i]:.1f} % (in the others {100 * usual:.1f} %); "
+                "wrap=True makes a surface that does not"
+            )
+            told[name].append(doubt("intersections", words))
+
+
+def _compare_duplicates(evidence, told):
+    """Shapes with the same numbers, which no motion, no order of vertices and no format changes."""
+    chirality = [seen.attrs["chirality"] for seen in evidence.values()]
+    numbers = np.column_stack([in_numbers(list(evidence.values())), chirality])
+    names = list(evidence)
+    first: dict[int, int] = {}
+    for i, j in sorted(cKDTree(numbers).query_pairs(SAME, p=np.inf)):
+        first.setdefault(j, i)
+    for j, i in first.items():
+        words = (
+            f"the same surface as {names[i]}, under two names; leave one of them out, "
+            "or it counts twice"
+        )
+        told[names[j]].append(doubt("duplicate", words))
+
+
+def _compare_hands(evidence, told, of_all):
+    """Those of the rarer hand, where the collection has a hand."""
+    names = list(evidence)
+    mean = _hands(evidence)
+    fit, fit_mirrored = (
+        np.array([np.nanmedian(seen[which]) for seen in evidence.values()])
+        for which in ("fit", "fit_mirrored")
+    )
+    usual = np.median(np.minimum(fit, fit_mirrored))
+    close = (fit_mirrored < CLOSE * usual) | (fit_mirrored < fit / CLOSE)
+    other = (mean < -OTHER_HAND) & close
+    if np.median(np.abs(mean)) < COMMON_HAND or not other.any():
         return
-    if len(straight) == len(reflected):
+    minority = [name for name, odd in zip(names, other, strict=True) if odd]
+    majority = [name for name, odd in zip(names, other, strict=True) if not odd]
+    if len(minority) == len(majority):
         of_all.append(
-            f"mirror images of each other, by ICP: {_listed(straight)} and {_listed(reflected)}; "
+            f"mirror images of each other, by ICP: {_listed(majority)} and {_listed(minority)}; "
             "kept as they are"
         )
+    if len(names) == 2:
         return
-    for name in min(straight, reflected, key=len):
+    for name in minority:
         seen = evidence[name]
-        told[name].append(
-            f"fits as a mirror image (ICP residual {seen['residual']:.3f} as it is, "
-            f"{seen['mirrored']:.3f} reflected): left for right? "
-            "It was kept; mirror the file if that is wrong"
+        words = (
+            "fits as a mirror image (ICP residual beside most others "
+            f"{np.nanmedian(seen['fit']):.3f} as it is, {np.nanmedian(seen['fit_mirrored']):.3f} "
+            "reflected): left for right? It was kept; mirror the file if that is wrong"
         )
+        told[name].append(doubt("mirrored", words))
 
 
-def _compare_rotations(evidence, told):
-    """Those turned by about 180 degrees, where most of the shapes lie alike."""
-    R = np.stack([seen["rotation"] for seen in evidence.values()])  # (n, 3, 3)
-    cos = (np.einsum("aij,bij->ab", R, R) - 1) / 2  # of the angle between each two, by the trace
-    angle = np.degrees(np.arccos(np.clip(cos, -1, 1)))
-    from_middle = angle[np.argmin(np.median(angle, axis=1))]
-    if (from_middle < 45).mean() <= 0.5:
-        return
-    for name, a in zip(evidence, from_middle, strict=True):
-        if a > 135:
-            told[name].append(
-                f"turned by {a:.0f} degrees against most others: upside down or back to front? "
-                "The alignment tries several turns; turn the file if modes or pictures look wrong"
+def _hands(evidence):
+    """Mean over the references of the hand of each shape, positive for the commoner one (n,)."""
+    names = list(evidence)
+    references = next(iter(evidence.values()))["reference"].values.tolist()
+    hand = np.array([seen["hand"].values for seen in evidence.values()])  # (n, references)
+    known = np.nan_to_num(hand)
+    beside = np.array([known[names.index(r)] if r in names else 0 * known[0] for r in references])
+    # two references are alike where each sees the other so, and where all shapes see them alike
+    alike = [beside + beside.T, known.T @ known]  # (references, references) each
+    alike = sum(one / max(np.linalg.norm(one), 1e-9) for one in alike)
+    sign = np.where(np.linalg.eigh(alike)[1][:, -1] < 0, -1, 1)
+    mean = _mean(hand * sign)
+    other, this = (mean < 0).sum(), (mean > 0).sum()
+    return -mean if (other, mean[0] < 0) > (this, mean[0] > 0) else mean
+
+
+def _mean(hand):
+    known = np.isfinite(hand)
+    return np.where(known, hand, 0).sum(1) / np.maximum(known.sum(1), 1)
+
+
+def _compare_boundaries(evidence, told):
+    length = np.array([seen.attrs["open_boundary"] for seen in evidence.values()])
+    for i, (name, more) in enumerate(zip(evidence, excess(length, BOUNDARY), strict=True)):
+        if more > SPREADS:
+            words = (
+                f"its holes are {length[i]:.2g} of sqrt(area) long, of the others "
+                f"{np.median(np.delete(length, i)):.2g}: is a part cut off? Complete the scan, "
+                "leave it out, or close_holes=True where it only has holes"
             )
+            told[name].append(doubt("partial", words))
+
+
+def _compare_lattices(evidence, told):
+    step = np.array([seen.attrs["lattice"] for seen in evidence.values()])
+    for i, name in enumerate(evidence):
+        if step[i] > max(LATTICE, MUCH_MORE * np.median(np.delete(step, i))):
+            words = (
+                f"its coordinates are rounded, to {step[i]:.2f} of an edge (in the others "
+                f"{np.median(np.delete(step, i)):.2f}); export it with more digits"
+            )
+            told[name].append(doubt("spacing", words))
+
+
+def _compare_forms(evidence, told):
+    """Those unlike the others; where something is told already, that may be the reason."""
+    seen = list(evidence.values())
+    fit = np.log([max(float(np.nanmedian(one["fit"])), 1e-9) for one in seen])
+    _, compactness, *moment = in_numbers(seen).T
+    # of extents: poses change them most, so that they need more
+    extents = np.abs(excess(np.array(moment).T, MOMENT)).max(1) * SPREADS / EXTENT_SPREADS
+    far = {
+        "its distance from them after alignment": excess(fit, FIT),
+        "its volume for its area": np.abs(excess(compactness, COMPACTNESS)),
+        "its extents": extents,
+    }
+    for i, name in enumerate(evidence):
+        if any(one.kind in ("partial", "duplicate") for one in told[name]):
+            continue
+        odd = {what: values[i] for what, values in far.items() if values[i] > SPREADS}
+        if odd:
+            most = max(odd, key=lambda what: odd[what])
+            words = (
+                f"unlike the others: {most} {'are' if most.endswith('s') else 'is'} "
+                f"{odd[most]:.0f} times the usual spread away; another kind of shape, stretched, "
+                "or a part? Look at it, and leave it out if it does not belong"
+            )
+            told[name].append(doubt("kind", words, odd[most] > FAR))
 
 
 def _names_by(values, prefix=""):

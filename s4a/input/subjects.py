@@ -1,6 +1,8 @@
 """Covariates and groups of the shapes (6.1): a table on which only the statistics depend."""
 
 import csv
+import logging
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -11,14 +13,20 @@ from numpy.typing import ArrayLike
 from s4a.input.annotations import is_number, table_rows
 from s4a.input.bounded import content
 from s4a.input.files import slug
+from s4a.input.raw import shown, text_of
 from s4a.schema import covariate
+
+log = logging.getLogger(__name__)
+
+MISSING = ("", "-", "na", "n/a", "nan", "#n/a", "null")  # cells without a value, in lower case
+PERSON = re.compile(r"(subject|participant|patient|person)([ _-]?(id|nr|no))?", re.IGNORECASE)
 
 
 def _head_and_rows(path):
     try:
-        head, *rows = table_rows(content(path))
-    except (OSError, ValueError, csv.Error) as error:
-        raise ValueError(f"{path} cannot be read as a table: {error}") from error
+        head, *rows = table_rows(text_of(content(path)))
+    except (ValueError, csv.Error) as error:
+        raise ValueError(f"{shown(path)} cannot be read as a table: {shown(error)}") from error
     if "shape" not in head:
         raise ValueError(
             f"{path}: a column 'shape' with the names or files of the shapes needed; found {head}"
@@ -56,9 +64,11 @@ def read_table(path: Path | str, names: list[str]) -> xr.Dataset:
     Returns
     -------
     Dataset
-        A variable over ``shape`` for every other column, in the order of `names`: whole numbers,
-        numbers (NaN where the cell is empty, ``NA`` or ``nan``), or text where one cell is no
-        number.
+        A variable over ``shape`` for every other column, in the order of `names`: whole numbers;
+        numbers, NaN where a value is missing; or text, empty where one is missing.  Missing is an
+        empty cell, ``NA``, ``n/a``, ``NaN``, ``-`` or ``null``, in letters of any size.  A column
+        that is mostly numbers but not all, as with ``?`` or decimal commas, is kept as text with a
+        warning, and no test takes it.
 
     Raises
     ------
@@ -106,21 +116,100 @@ def read_table(path: Path | str, names: list[str]) -> xr.Dataset:
             raise ValueError(
                 f"{path}: finite numbers, or nothing, needed in the column {name!r}; found {np.inf}"
             )
+        if odd := odd_cells(values.tolist()) if values.dtype.kind == "U" else []:
+            log.warning("%s: the column %r %s", path, name, odd_words(odd, names, values))
+        if PERSON.fullmatch(name):
+            _tell_repeated(path, name, values, names)
     return subjects(columns, names, str(path))
 
 
 def _values(cells):
     """Integers, floats or strings, whatever all cells are."""
-    known = [c for c in cells if c.lower() not in ("", "na", "nan")]
-    if not known or not all(map(is_number, known)):
-        return np.array(cells)
-    numbers = np.array([float(c) if c in known else np.nan for c in cells])
+    known = [c for c in cells if not is_missing(c)]
+    if not known or not all(map(is_plain_number, known)):
+        return np.array(["" if is_missing(c) else c for c in cells])
+    numbers = np.array([np.nan if is_missing(c) else float(c) for c in cells])
     whole = (
         len(known) == len(cells)
         and all(c.lstrip("+-").isdigit() for c in cells)
         and (abs(numbers) < 2**53).all()
     )
     return numbers.astype(np.int64) if whole else numbers
+
+
+def _tell_repeated(path, column, values, names):
+    """Say which shapes are of one person: the tests take all shapes as independent."""
+    shapes_of = {}
+    for name, value in zip(names, values.tolist(), strict=True):
+        if not is_missing(str(value)):
+            shapes_of.setdefault(value, []).append(name)
+    again = [f"{value}: {', '.join(of)}" for value, of in shapes_of.items() if len(of) > 1]
+    if again:
+        log.warning(
+            "%s: %d values of the column %r stand for several shapes (%s); the tests take all "
+            "shapes as independent, so keep one of each, or their mean",
+            path,
+            len(again),
+            column,
+            listed(again, "; "),
+        )
+
+
+def is_missing(cell: str) -> bool:
+    """Whether a cell says that a value is not known.
+
+    Examples
+    --------
+    >>> from s4a.input.subjects import is_missing
+    >>> [is_missing(cell) for cell in ("NA", " n/a", "-", "none", "0")]
+    [True, True, True, False, False]
+    """
+    return cell.strip().lower() in MISSING
+
+
+def is_plain_number(cell: str) -> bool:
+    """Whether a cell is a number as tables write it: Python's 1_000 is none."""
+    return is_number(cell) and "_" not in cell
+
+
+def odd_cells(cells: Sequence[str]) -> list[int]:
+    """Places of what is no number in a column that is mostly numbers; none in other columns.
+
+    Numbers with a decimal comma count as meant as numbers, and are odd.
+
+    Examples
+    --------
+    >>> from s4a.input.subjects import odd_cells
+    >>> odd_cells(["31", "?", "NA", "42"]), odd_cells(["60,5", "61,0"]), odd_cells(["a1", "b2"])
+    ([1], [0, 1], [])
+    """
+    known = [i for i, cell in enumerate(cells) if not is_missing(cell)]
+    meant = [i for i in known if is_plain_number(cells[i].replace(",", "."))]
+    odd = [i for i in known if not is_plain_number(cells[i])]
+    return odd if 2 * len(meant) > len(known) else []
+
+
+def odd_words(odd: Sequence[int], names: Sequence[str], cells: Sequence[str]) -> str:
+    """What is wrong with a column that has :func:`odd_cells`, and what to do."""
+    found = listed([f"{names[i]}: {str(cells[i])!r}" for i in odd])
+    return (
+        f"is mostly numbers, but {len(odd)} of its {len(cells)} cells are none ({found}): write "
+        "numbers with a decimal point and without unit, and NA where one is not known; or words in "
+        "every cell, where they are names of groups"
+    )
+
+
+def listed(texts: Sequence[str], mark: str = ", ", most: int = 5) -> str:
+    """The first of them, and how many more there are.
+
+    Examples
+    --------
+    >>> from s4a.input.subjects import listed
+    >>> listed(["a", "b", "c"], most=2)
+    'a, b and 1 more'
+    """
+    more = f" and {len(texts) - most} more" if len(texts) > most else ""
+    return mark.join(texts[:most]) + more
 
 
 def subjects(

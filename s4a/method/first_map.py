@@ -4,6 +4,8 @@ The paper's way is from nearest neighbours after ICP, of all vertices or of 10 l
 poses are far apart these are wrong: then the best of several maps is taken.
 """
 
+from typing import Any, NamedTuple
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -13,6 +15,16 @@ from s4a.method import fmap, joint
 from s4a.method.shape import Basis
 
 N_LANDMARKS = 10  # of step 3
+
+
+class FirstMap(NamedTuple):
+    """A first map of a directed pair, and what it was made of."""
+
+    name: str  # "dense", "landmarks", or of far poses "icp", "hks" or "wks"
+    C: np.ndarray  # (k_init, k_init)
+    fitted: np.ndarray  # (k_init, k_init), before the step of ZoomOut ahead
+    near: np.ndarray  # (n_target,), nearest neighbours in space after the motion
+    landmarks: tuple[np.ndarray, np.ndarray] | None  # of source and target, where it was fitted so
 
 
 def nearest_after_motion(source: Basis, target: Basis, motion: Motion) -> np.ndarray:
@@ -39,7 +51,7 @@ def landmarks_after_motion(
     return landmark, cKDTree(Y).query(X[landmark] @ R.T + t)[1]
 
 
-def map_after_motion(
+def fit_after_motion(
     source: Basis,
     target: Basis,
     motion: Motion,
@@ -47,8 +59,8 @@ def map_after_motion(
     k_init: int = 20,
     init: str = "dense",
     near: np.ndarray | None = None,
-) -> np.ndarray:
-    """First functional map of a directed pair (4.1, steps 3 and 4), with one ZoomOut step ahead.
+) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray] | None]:
+    """First functional map of a directed pair as it is fitted (4.1, steps 3 and 4).
 
     Parameters
     ----------
@@ -64,17 +76,29 @@ def map_after_motion(
     Returns
     -------
     C : float ndarray (k_init, k_init)
+    landmarks : tuple of int ndarray (10,), or None
+        Of source and target, where it was fitted on them.
     """
     source = source.first(k_init)
     target = target.first(k_init)
     if init == "landmarks":
-        C = fmap.fmap_from_landmarks(
-            source, target, *landmarks_after_motion(source.X, target.X, motion)
-        )
-    else:
-        near = nearest_after_motion(source, target, motion) if near is None else near
-        C = fmap.fmap_from_match(source.Phi, target.Phi, target.mass, near)
-    return fmap.refine_once(source, target, C)
+        landmarks = landmarks_after_motion(source.X, target.X, motion)
+        return fmap.fmap_from_landmarks(source, target, *landmarks), landmarks
+    near = nearest_after_motion(source, target, motion) if near is None else near
+    return fmap.fmap_from_match(source.Phi, target.Phi, target.mass, near), None
+
+
+def map_after_motion(
+    source: Basis, target: Basis, motion: Motion, *, ahead: bool = True, **options: Any
+) -> np.ndarray:
+    """:func:`fit_after_motion` of these options, and `ahead` one step of ZoomOut (4.2).
+
+    Returns
+    -------
+    C : float ndarray (k_init, k_init)
+    """
+    C, _ = fit_after_motion(source, target, motion, **options)
+    return fmap.refine_once(source, target, C) if ahead else C
 
 
 def stretch(target: Basis, warp: joint.Warp) -> float:
@@ -88,8 +112,14 @@ def stretch(target: Basis, warp: joint.Warp) -> float:
 
 
 def best_first_map(
-    source: Basis, target: Basis, C: np.ndarray, *, k: int = 60, step: int = 10
-) -> tuple[str, np.ndarray]:
+    source: Basis,
+    target: Basis,
+    C: np.ndarray,
+    fitted: np.ndarray | None = None,
+    *,
+    k: int = 60,
+    step: int = 10,
+) -> tuple[str, np.ndarray, np.ndarray]:
     """The best of a first map and of those from heat and from wave kernels, which no pose changes.
 
     Either kind alone fails on some pairs: shapes that nearly are their own mirror image are turned
@@ -104,18 +134,22 @@ def best_first_map(
         At low resolution.
     C : float ndarray (k_init, k_init)
         First map from ICP.
+    fitted : float ndarray (k_init, k_init), optional
+        That map before its step of ZoomOut; C where there was none.
     k, step : int
         Of the short ZoomOut.
 
     Returns
     -------
     name : {"icp", "hks", "wks"}
-    C : float ndarray (k_init, k_init)
+    C, fitted : float ndarray (k_init, k_init)
+        The map, and as it was before its step of ZoomOut.
     """
     maps = {"icp": C}
+    fits = {"icp": C if fitted is None else fitted}
     for kind in ("hks", "wks"):
-        fit = fmap.fmap_from_descriptors(source, target, k=len(C), kind=kind)
-        maps[kind] = fmap.refine_once(source, target, fit)
+        fits[kind] = fmap.fmap_from_descriptors(source, target, k=len(C), kind=kind)
+        maps[kind] = fmap.refine_once(source, target, fits[kind])
     k = min(k, source.k, target.k)
     score = {}
     for name, first in maps.items():
@@ -123,7 +157,7 @@ def best_first_map(
         end = joint.low_rounds(source, target, match, k_first=20, step=20, rounds=1, by_parts=True)
         score[name] = joint.registration_score(source, target, *end) + stretch(target, end[1])
     best = min(score, key=score.get)
-    return best, maps[best]
+    return best, maps[best], fits[best]
 
 
 def have_signatures(source: Basis, target: Basis, k: int) -> bool:
@@ -143,7 +177,8 @@ def first_map(
     *,
     k_init: int = 20,
     init: str = "dense",
-) -> tuple[str, np.ndarray, np.ndarray]:
+    ahead: bool = True,
+) -> FirstMap:
     """:func:`map_after_motion`, or :func:`best_first_map` where poses are far apart.
 
     The latter only where `init` is dense and there are signatures, :func:`have_signatures`.
@@ -154,20 +189,15 @@ def first_map(
         At low resolution.
     motion : tuple (R, t)
         Rigid motion of the source onto the target.
-    k_init, init : see :func:`map_after_motion`
-
-    Returns
-    -------
-    name : str
-        `init`, or what :func:`best_first_map` chose.
-    C : float ndarray (k_init, k_init)
-    near : int ndarray (n_target,)
-        Nearest neighbours in space after the motion.
+    k_init, init, ahead : see :func:`map_after_motion`
     """
     near = nearest_after_motion(source, target, motion)
-    C = map_after_motion(source, target, motion, k_init=k_init, init=init, near=near)
+    fitted, landmarks = fit_after_motion(
+        source, target, motion, k_init=k_init, init=init, near=near
+    )
+    C = fmap.refine_once(source, target, fitted) if ahead else fitted
     far = init == "dense" and joint.far_apart(source, target, near)
     if far and have_signatures(source, target, k_init):
-        name, C = best_first_map(source, target, C)
-        return name, C, near
-    return init, C, near
+        name, C, fitted = best_first_map(source, target, C, fitted)
+        return FirstMap(name, C, fitted, near, None)
+    return FirstMap(init, C, fitted, near, landmarks)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from s4a.geometry.align import rigid_transform
+from s4a.geometry.align import Motion, rigid_transform
 from s4a.geometry.closest import feature_tree, features
 from s4a.geometry.mesh import path_lengths, vertex_normals
 from s4a.method.deform import onto
@@ -63,6 +63,29 @@ def fit_warp(source: Basis, target: Basis, match: np.ndarray) -> Warp:
     """The warp that brings the target's vertices near coarse ones onto their matches ``(s,)``."""
     rows = target.near_coarse
     return onto(target.X[rows], source.X[match], target.area[rows], target.coefficients)
+
+
+def warp_after(
+    source: Basis, target: Basis, match: np.ndarray, motion: Motion, ratio: float
+) -> Warp:
+    """The warp after a given motion instead of a fitted one: eq. 8 and the line after it.
+
+    The source moves by ``ratio R x + t``; what is left to its vertices, matched by the target's
+    vertices near coarse ones ``(s,)``, is smoothed.  The warp is that of the target, backwards.
+
+    Parameters
+    ----------
+    source, target : Basis
+    match : int ndarray (s,)
+    motion : tuple (R, t)
+        Rigid motion of the source onto the target, between their frames.
+    ratio : float
+        Size of the source by that of the target; 1 where it is to be taken out.
+    """
+    R, t = motion
+    moved = ratio * source.X[match] @ R.T + t
+    c = target.coefficients(moved - target.X[target.near_coarse])  # (k, 3)
+    return R.T / ratio, -R.T @ t / ratio, c @ R / ratio
 
 
 def low_rounds(
@@ -213,6 +236,7 @@ def candidates(
     *,
     k: int = 100,
     far: float = 0.03,
+    parts: bool = True,
 ) -> dict[str, Candidate]:
     """Registrations at low resolution: every start as it is, and after joint rounds.
 
@@ -226,6 +250,8 @@ def candidates(
         At low resolution.
     starts : dict
         Name -> match (n_target,).
+    parts : bool
+        Whether to try rounds by parts.
 
     Returns
     -------
@@ -244,7 +270,7 @@ def candidates(
     for name, match in starts.items():
         enter(f"{name}+joint", *low_rounds(source, target, match, k=k))
     best = min(starts, key=lambda name: tried[f"{name}+joint"].score)
-    if all(far_apart(source, target, match) for match in starts.values()):
+    if parts and all(far_apart(source, target, match) for match in starts.values()):
         end = low_rounds(
             source, target, starts[best], k_first=20, k=k, rounds=1, spectral=0.2, by_parts=True
         )

@@ -21,7 +21,7 @@ from s4a.method.nearest import (
     nearest_rows,
 )
 from s4a.method.network import cycle_errors, cycle_weights, three_cycles
-from s4a.method.shape import Basis
+from s4a.method.shape import N_SPREAD, Basis
 
 log = logging.getLogger(__name__)
 
@@ -247,19 +247,22 @@ def consistent_zoomout(
     *,
     step: int = 5,
     n_latent: int | None = None,
+    weights: str = "cycles",
     samples: list[np.ndarray] | None = None,
+    wide: int = WIDE,
     n_jobs: int | None = 1,
     progress: Callable | None = None,
+    keep: Callable | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Consistent ZoomOut (4.2): latent basis -> matches -> larger maps, until all are k x k.
 
     Each round embeds every shape in the latent space (rows of Phi_i Y_i), matches nearest
     neighbours for every map (eq. 3) and solves for the next larger maps in the least-squares sense,
     on `samples` only, whose least squares are factored once a round and target shape; on
-    samples Phi^T A of eq. 1 is no inverse of Phi.  In the last rounds
-    (``WIDE``) the samples look among all vertices of the source: among its samples they are off by
-    the spacing of these.  The latent basis is found to ``ROUGH`` on the way and to ``FINE`` at the
-    end.
+    samples Phi^T A of eq. 1 is no inverse of Phi.  In the `wide` last rounds the samples look among
+    all vertices of the source: among its samples they are off by the spacing of these.  With all
+    vertices as samples it is the paper's.  The latent basis is found to ``ROUGH`` on the way and to
+    ``FINE`` at the end.
 
     Parameters
     ----------
@@ -274,12 +277,18 @@ def consistent_zoomout(
         Growth per round.
     n_latent : int, optional
         Latent dimension at the end; k by default.
+    weights : {"cycles", "equal"}
+        Of the maps, by their cycle errors, or 1 for all.
     samples : list of int ndarray, optional
         Spread vertices of every shape; all vertices by default.
+    wide : int
+        Last rounds that look among all vertices.
     n_jobs : int
         Threads; the result does not depend on it.
     progress : callable, optional
         Called with the size reached after each round.
+    keep : callable, optional
+        Called with C, Y and the latent eigenvalues of each round.
 
     Returns
     -------
@@ -293,12 +302,12 @@ def consistent_zoomout(
     sizes = [*range(C.shape[1], k, step), k]
     all_vertices = [np.arange(len(basis.area)) for basis in bases]
     samples = all_vertices if samples is None else samples
-    wide = sizes[:-1][-WIDE:]
+    wide_sizes = sizes[:-1][max(len(sizes) - 1 - wide, 0) :]
     for size, next_size in zip(
         sizes, [*sizes[1:], None], strict=True
     ):  # the last only solves for Y
         error = cycle_errors(C, cycles, n_jobs=n_jobs)
-        weight = cycle_weights(error)
+        weight = cycle_weights(error) if weights == "cycles" else np.ones(len(C))
         m = latent_size(n_latent, size, k)
         tolerance = ROUGH if next_size else FINE
         Y, latent_eigenvalue = latent_basis(
@@ -306,8 +315,10 @@ def consistent_zoomout(
         )
         if progress:
             progress(size)
+        if keep:
+            keep(C, Y, latent_eigenvalue)
         if next_size:
-            among = all_vertices if size in wide else samples
+            among = all_vertices if size in wide_sizes else samples
             C = larger_maps(bases, Y, source, target, next_size, samples, among, n_jobs)
     return C, weight, error, Y, latent_eigenvalue
 
@@ -394,6 +405,7 @@ def latent_basis_of_new(
     C: list[np.ndarray],
     *,
     step: int = 5,
+    n_spread: int = N_SPREAD,
     rounds: int = 2,
 ) -> np.ndarray:
     """Latent basis of a new shape, those of all others frozen: Consistent ZoomOut of one shape.
@@ -412,6 +424,8 @@ def latent_basis_of_new(
         First maps from each of the others to the new shape.
     step : int
         Growth per round.
+    n_spread : int
+        Spread vertices that are the samples; 0 for all.
     rounds : int
         Of :func:`frozen_basis`, with the first ``FINAL`` of the others.
 
@@ -425,14 +439,16 @@ def latent_basis_of_new(
     y = np.mean(
         [c @ y[:k_init, : min(k_init, m)] for c, y in zip(C, Y, strict=True)], axis=0
     )  # (k_init, <= m)
-    root = np.sqrt(new.area[new.spread_vertices])
+    samples = new.spread_vertices(n_spread)
+    among = [other.spread_vertices(n_spread) for other in others]
+    root = np.sqrt(new.area[samples])
     while len(y) < k:
         size = min(len(y) + step, k)
-        query = new.Phi[new.spread_vertices, : len(y)] @ y
-        solve = np.linalg.pinv(new.Phi[new.spread_vertices, :size] * root[:, None]) * root
+        query = new.Phi[samples, : len(y)] @ y
+        solve = np.linalg.pinv(new.Phi[samples, :size] * root[:, None]) * root
         carried = 0
-        for other, functions in zip(others, F, strict=True):
-            rows = functions[other.spread_vertices]
+        for vertices, functions in zip(among, F, strict=True):
+            rows = functions[vertices]
             match = nearest_rows(query, rows[:, : query.shape[1]])
             carried = carried + rows[match, : min(size, m)]
         y = solve @ carried / len(others)

@@ -12,9 +12,11 @@ import scipy.linalg
 import scipy.sparse as sp
 import xarray as xr
 
-from s4a.geometry.mesh import stiffness
-from s4a.method.remesh import laplacian
-from s4a.method.spectral import factor
+from s4a.geometry.mesh import as_arrays, stiffness, vertex_areas
+from s4a.method.remesh import coarsen, laplacian
+from s4a.method.shape import Shape
+from s4a.method.spectral import factor, spectrum
+from s4a.schema import dataset
 
 SPARE = 10  # functions more than are asked for: the last ones of a span are the least exact
 ROUNDS = 4  # of the smoother
@@ -165,3 +167,62 @@ def lift(
     third = np.einsum("n,nk,nk,nk->k", area.astype(B.dtype), B, B, B)  # moments: as in eigenpairs
     B *= np.where(third < 0, -1, 1).astype(B.dtype)
     return np.maximum(eigenvalue, 0.0), B
+
+
+def lifted(mesh: xr.Dataset, low: xr.Dataset, k: int) -> xr.Dataset:
+    """A low-resolution mesh with k functions of :func:`lift`, at coarse vertices and at all.
+
+    They are orthonormal for the areas of the low-resolution mesh, as ZoomOut needs it.
+
+    Parameters
+    ----------
+    mesh : Dataset
+        The mesh itself.
+    low : Dataset
+        Of :func:`s4a.spectrum`, best with k + :data:`SPARE` eigenfunctions.
+    k : int
+
+    Returns
+    -------
+    Dataset
+        `low` with ``eigenvalue(mode)`` and ``eigenfunction(vertex, mode)`` in the place of its own,
+        and ``lifted_eigenfunction(original_vertex, mode)``.
+    """
+    shape = Shape(mesh, low)
+    X, T = as_arrays(mesh)
+    eigenvalue, B = lift(X, T, vertex_areas(X, T), shape.U, low, k)  # (n, k)
+    vertex = low["sample_vertex"].values.copy()
+    cell, nearest = np.unique(shape.cell, return_index=True)
+    # the centres of closed openings are no vertices: the first of their cells stands for them
+    vertex[cell] = np.where(vertex[cell] < 0, nearest, vertex[cell])
+    area = low["vertex_area"].values
+    area = area / area.sum()
+    Phi = B[vertex].astype(float)
+    turn = np.linalg.inv(np.linalg.cholesky(Phi.T @ (area[:, None] * Phi))).T
+    B = B @ turn.astype(B.dtype)
+    functions = dataset(
+        eigenvalue=eigenvalue,
+        eigenfunction=B[vertex].astype(float),
+        lifted_eigenfunction=B,
+    )
+    mesh_alone = low.drop_vars(["eigenvalue", "eigenfunction"])
+    return mesh_alone.merge(functions).assign_attrs(low.attrs)
+
+
+def low_resolution(
+    mesh: xr.Dataset,
+    *,
+    n_coarse: int = 6000,
+    k: int = 100,
+    lift: bool = False,
+    wrap: bool = False,
+    seed: int = 0,
+) -> xr.Dataset:
+    """The low-resolution mesh with its functions: :func:`s4a.coarsen`, :func:`s4a.spectrum`.
+
+    With `lift` also :func:`lifted`.
+    """
+    coarse = coarsen(mesh, n_coarse=n_coarse, wrap=wrap, seed=seed)
+    if not lift:
+        return spectrum(coarse, k=k)
+    return lifted(mesh, spectrum(coarse, k=k + SPARE), k)

@@ -120,13 +120,17 @@ def pca(
     Raises
     ------
     ValueError
-        With fewer than 3 shapes, or when all displacements are equal: there is no variation to
-        analyse.
+        With fewer than 3 shapes, when a displacement is not finite, or when all are equal: there
+        is no variation to analyse.
     """
     require(registration, "displacement", what="registration")
     d = registration["displacement"].transpose("shape", "vertex", "xyz").values
     if len(d) < 3:
         raise ValueError(f"PCA needs at least 3 shapes, found {len(d)}")
+    broken = ~np.isfinite(d).all(axis=(1, 2))
+    if broken.any():
+        which = ", ".join(map(str, registration["shape"].values[broken]))
+        raise ValueError(f"PCA needs displacements that are finite; leave out {which}")
     modes = gram_pca(d, area)
     size = 1.0
     if "position" in registration:
@@ -294,3 +298,48 @@ def project_scores(
         scores.append(score)
         residuals.append(np.sqrt(max(left, 0.0)))
     return np.array(scores), np.array(residuals)
+
+
+def pca_without(
+    registration: xr.Dataset, apart: list[str], coarse: xr.Dataset | None
+) -> xr.Dataset:
+    """Principal modes of all but some shapes, and the scores of these on them.
+
+    Parameters
+    ----------
+    registration : xarray.Dataset
+        With ``vertex_area`` and what :func:`pca` needs.
+    apart : list of str
+        Shapes of which the modes know nothing.
+    coarse : see :func:`pca`
+
+    Returns
+    -------
+    xarray.Dataset
+        Of :func:`pca`; where there are shapes apart, also ``score_apart(shape_apart, component)``.
+
+    Raises
+    ------
+    ValueError
+        As of :func:`pca`.
+    """
+    area = registration["vertex_area"].values
+    names = [name for name in registration["shape"].values.tolist() if name not in apart]
+    try:
+        result = pca(registration.sel(shape=names), area, coarse=coarse)
+    except ValueError as error:
+        if not apart:
+            raise
+        raise ValueError(
+            f"{error}; {len(apart)} doubtful shapes are left out, keep_doubtful=True takes them in"
+        ) from error
+    if not apart:
+        return result
+    score, _ = project_scores(
+        registration["displacement"].sel(shape=apart).values,
+        result["mean_displacement"].values,
+        result["deformation"].values,
+        result["standard_deviation"].values,
+        area,
+    )
+    return result.merge(dataset(score_apart=score)).assign_coords(shape_apart=apart)

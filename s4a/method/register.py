@@ -4,6 +4,8 @@ The source is the shape M_i, the target the template, the paper's median shape: 
 every vertex of the template, a vertex of the shape.
 """
 
+from typing import Any, NamedTuple
+
 import numpy as np
 import xarray as xr
 
@@ -40,29 +42,29 @@ def match_low(
     -------
     match : int ndarray (n_coarse_target,)
     functions : tuple of float ndarray (n_coarse, m)
+        At all vertices where they are lifted.
     """
-    functions = latent_functions(source, target, bases)
+    Y_source, Y_target = bases  # (k, m) each
+    k = len(Y_source)
+    Phi = source.low.Phi[:, :k]
+    Psi = target.low.Phi[:, :k]
+    match = nearest_rows(Psi @ Y_target, Phi @ Y_source)  # eq. 6
     if how == "standard":
-        functions = mapped_functions(source, target, functions, len(bases[0]))
-    F_source, F_target = functions
-    return nearest_rows(F_target, F_source), functions  # eq. 6, or eq. 2 of the map
+        return match, mapped_functions(source, target, match, k)
+    return match, latent_functions(source, target, bases)
 
 
 def latent_functions(source: Shape, target: Shape, bases: Functions) -> Functions:
-    """The latent functions Phi Y of both ``(n_coarse, m)``, whose rows eq. 6 and 7 compare."""
-    Y_source, Y_target = bases  # (k, m) each
-    k = len(Y_source)
-    return source.low.Phi[:, :k] @ Y_source, target.low.Phi[:, :k] @ Y_target
+    """The latent functions Phi Y of both, whose rows eq. 7 compares."""
+    Y_source, Y_target = bases
+    return source.functions(Y_source), target.functions(Y_target)
 
 
-def mapped_functions(source: Shape, target: Shape, functions: Functions, k: int) -> Functions:
+def mapped_functions(source: Shape, target: Shape, match: np.ndarray, k: int) -> Functions:
     """Phi C^T and Psi with the k x k map C of the match of eq. 3: the standard way's, for eq. 4."""
-    F_source, F_target = functions
-    match = nearest_rows(F_target, F_source)
     Phi = source.low.Phi[:, :k]
-    Psi = target.low.Phi[:, :k]
-    C = fmap_from_match(Phi, Psi, target.low.mass, match)
-    return Phi @ C.T, Psi
+    C = fmap_from_match(Phi, target.low.Phi[:, :k], target.low.mass, match)
+    return source.functions(C.T), target.functions(np.eye(k))
 
 
 def match_functions(
@@ -119,8 +121,7 @@ def from_latent(
     motion: Motion,
     *,
     how: str = "ours",
-    refine: str = "joint",
-    scale: bool = False,
+    **options: Any,
 ) -> xr.Dataset:
     """One shape registered by the latent bases of a network (eq. 6, 7 and 8).
 
@@ -135,8 +136,11 @@ def from_latent(
     bases : tuple of float ndarray (k, m)
         Their consistent latent bases Y.
     motion : tuple (R, t)
-        Rigid motion of the shape onto the template, the start of one candidate.
-    how, refine, scale : see :func:`s4a.analyse`
+        Rigid motion of the shape onto the template (4.1, step 2), between their frames.
+    how : {"ours", "standard"}
+        Eq. 7, or eq. 3 and 4.
+    **options
+        Of :func:`register`.
 
     Returns
     -------
@@ -146,7 +150,7 @@ def from_latent(
     match, functions = match_low(source, target, bases, how=how)
     near = nearest_after_motion(source.low, target.low, motion)
     starts = {"intrinsic": match, "icp": near}
-    return register(source, target, starts, functions, k=len(bases[0]), refine=refine, scale=scale)
+    return register(source, target, starts, functions, motion, k=len(bases[0]), **options)
 
 
 def register(
@@ -154,10 +158,13 @@ def register(
     target: Shape,
     starts: dict[str, np.ndarray],
     functions: Functions,
+    motion: Motion,
     *,
     k: int = 100,
     refine: str = "joint",
     scale: bool = False,
+    parts: bool = True,
+    alignment: str = "fitted",
 ) -> xr.Dataset:
     """The registration of one shape: match, displacement, motion, confidence and the way back.
 
@@ -170,35 +177,52 @@ def register(
     functions : tuple (F_source, F_target)
         Functions on both coarse meshes for the match at full resolution, see
         :func:`match_functions`.
+    motion : tuple (R, t)
+        Rigid motion of the shape onto the template found by ICP, between their frames.
     k : int
         Functions in which the displacement lives.
     refine : {"joint", "intrinsic"}
         Joint rounds, or the spectral match alone.
     scale : bool
         Whether size is taken out of the displacement.
+    parts : bool
+        Whether joint rounds may turn the parts of a shape on their own.
+    alignment : {"fitted", "icp"}
+        The displacement is measured after the motion that fits the registered surface best, or
+        after that of ICP, as the paper has it: then eq. 8 and (U Phi)(U Phi)^+ are as printed.
 
     Returns
     -------
     xarray.Dataset
         ``registered_match(vertex)``, ``displacement(vertex, xyz)``, ``displacement_raw``,
-        ``displacement_low(low_vertex, xyz)`` of the start "intrinsic" as it is (of eq. 6, or of
-        ZoomOut where a pair is matched on its own), ``rotation``,
-        ``translation``, ``scale``, ``confidence(vertex)``, ``round_trip``, ``distortion``,
+        ``registered_match_low(low_vertex)``, the start "intrinsic" (of eq. 6, or of ZoomOut where a
+        pair is matched on its own), and ``displacement_low(low_vertex, xyz)`` of it;
+        ``displacement_coefficient(mode, xyz)`` of the displacement in U Phi of the template;
+        ``icp_rotation``, ``icp_translation`` as given; ``rotation``, ``translation``, ``scale``,
+        ``confidence(vertex)``, ``round_trip``, ``distortion``,
         ``template_triangle(original_vertex)``, ``template_barycentric``; displacements in the unit
         of the input, in the template's frame.  Attributes ``method``, the candidate that was kept,
         ``score``, its score at full resolution, and ``score_<candidate>`` at low resolution.
     """
     candidates = {}  # none: the spectral match alone
     if refine == "joint":
-        candidates = joint.candidates(source.low, target.low, starts, k=k)
+        candidates = joint.candidates(source.low, target.low, starts, k=k, parts=parts)
+    by_icp = motion_in_unit(source, target, motion, scale) if alignment == "icp" else None
     # image = R x + t + U Phi c, smooth already: the line after eq. 8
-    match, image, attrs = register_surface(source, target, candidates, functions)
+    match, image, attrs = register_surface(
+        source, target, candidates, functions, by_icp and (motion, by_icp.ratio)
+    )
     triangle, barycentric = way_back(source, target, image)
     X, T = as_arrays(target.original)
-    displacement, R, t, s = displacement_in_template(X, image, target.full.area, scale=scale)
+    if by_icp:
+        R, t, s, _ = by_icp
+        displacement = s * image @ R.T + t - X
+    else:
+        displacement, R, t, s = displacement_in_template(X, image, target.full.area, scale=scale)
     raw = s * source.original["position"].values[match] @ R.T + t - X
     X_low = target.coarse["position"].values
     low = s * source.coarse["position"].values[starts["intrinsic"]] @ R.T + t - X_low
+    coefficient = target.full.coefficients(displacement[target.near_coarse])  # (k, 3)
     trip = round_trip(target, match, triangle, barycentric)
     sure = confidence(source, match, image, trip)
     registration = dataset(
@@ -206,21 +230,52 @@ def register(
         registered_match=match.astype(np.int32),
         displacement=displacement.astype(np.float32),
         displacement_raw=raw.astype(np.float32),
+        registered_match_low=starts["intrinsic"].astype(np.int32),
         displacement_low=low.astype(np.float32),
+        displacement_coefficient=coefficient,
         rotation=R,
         translation=t,
         scale=np.array(s),
+        icp_rotation=motion[0],
+        icp_translation=motion[1],
         confidence=sure.astype(np.float32),
         round_trip=trip.astype(np.float32),
         distortion=log_area_ratio(image, X, T).astype(np.float32),
         template_triangle=triangle.astype(np.int32),
         template_barycentric=barycentric,
     )
+    if not np.isfinite(registration["displacement"]).all():
+        raise ValueError("the displacement is not finite: look at the shape's coordinates")
     return in_unit(registration, common_unit(source.original, target.original))
 
 
+class Placed(NamedTuple):
+    """A motion s R x + t in the unit of the input, and the ratio of sizes that it leaves."""
+
+    R: np.ndarray
+    t: np.ndarray
+    s: float
+    ratio: float
+
+
+def motion_in_unit(source: Shape, target: Shape, motion: Motion, scale: bool) -> Placed:
+    """A rigid motion between the frames of two shapes as one between their files.
+
+    Without `scale` each keeps its size: the motion turns the source about its centre and carries
+    that to where it belongs.
+    """
+    (center, size), (center_target, size_target) = source.frame, target.frame
+    R, t = motion
+    s = size_target / size if scale else 1.0
+    return Placed(R, center_target + size_target * t - s * R @ center, s, s * size / size_target)
+
+
 def register_surface(
-    source: Shape, target: Shape, candidates: dict[str, joint.Candidate], functions: Functions
+    source: Shape,
+    target: Shape,
+    candidates: dict[str, joint.Candidate],
+    functions: Functions,
+    placed: tuple[Motion, float] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, dict]:
     """The template registered at full resolution: the best of the finalists of low resolution.
 
@@ -230,6 +285,9 @@ def register_surface(
     candidates : dict
         Of :func:`s4a.method.joint.candidates`; empty for the spectral match alone.
     functions : see :func:`register`
+    placed : tuple (motion, ratio), optional
+        After which the displacement of the spectral match is smoothed, see
+        :func:`s4a.method.joint.warp_after`; by default after the motion that fits it best.
 
     Returns
     -------
@@ -250,7 +308,7 @@ def register_surface(
             match, compared, certified = match_functions(source, target, *functions)
             attrs |= {"compared_share": compared, "certified_share": certified}
             part = match[N.near_coarse]
-            warp = joint.fit_warp(M, N, part)
+            warp = joint.warp_after(M, N, part, *placed) if placed else joint.fit_warp(M, N, part)
         else:
             part, warp = joint.dense_rounds(M, N, candidates[name].warp)
         score = joint.registration_score(M, N, part, warp)
@@ -333,9 +391,13 @@ def identity(template: Shape) -> xr.Dataset:
     last = np.cumsum(np.bincount(T.ravel(), minlength=len(X))) - 1
     corner = np.argsort(T.ravel(), kind="stable")[last]
     zero = np.zeros(X.shape, np.float32)
-    low = {}
+    low: dict[str, np.ndarray] = {}
     if template.coarse is not None:
-        low["displacement_low"] = np.zeros(template.coarse["position"].shape, np.float32)
+        n_low = template.coarse.sizes["vertex"]
+        low["displacement_low"] = np.zeros((n_low, 3), np.float32)
+        low["registered_match_low"] = np.arange(n_low, dtype=np.int32)
+        if "mode" in template.coarse.sizes:
+            low["displacement_coefficient"] = np.zeros((template.coarse.sizes["mode"], 3))
     registration = dataset(
         {"method": "template", "score": 0.0},
         registered_match=np.arange(len(X), dtype=np.int32),
@@ -344,6 +406,8 @@ def identity(template: Shape) -> xr.Dataset:
         rotation=np.eye(3),
         translation=np.zeros(3),
         scale=np.array(1.0),
+        icp_rotation=np.eye(3),
+        icp_translation=np.zeros(3),
         confidence=np.ones(len(X), np.float32),
         round_trip=zero[:, 0],
         distortion=zero[:, 0],

@@ -4,7 +4,7 @@ Every step of the method takes shapes, or the :class:`Basis` of one at one resol
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -20,7 +20,7 @@ from s4a.method.deform import smoother
 
 N_SPREAD = 1000  # spread vertices of a shape on which Consistent ZoomOut looks for matches
 N_PAIRED = 300  # spread vertices of a shape that rigid alignment pairs
-N_CENTRAL = 25_000  # vertices by which dense rounds move a shape
+N_CENTRAL = 25_000  # vertices by which a field on a shape is projected
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,12 @@ class Basis:
     U : sparse matrix (n, p), optional
         Takes functions from the low resolution to the n vertices.  U Phi is never formed.
     near_coarse : int ndarray (s,), optional
-        Vertices that rounds of registration look at; all by default.
+        Vertices by which fields are projected, and that rounds of registration look at; all by
+        default.
+    area_weighted : bool
+        Whether these vertices weigh by their areas when a field is projected.
+    lifted : bool
+        Whether Phi has a row for each of the n vertices although there is U.
     """
 
     X: np.ndarray
@@ -55,6 +60,8 @@ class Basis:
     mass: np.ndarray | sp.sparray | sp.spmatrix | None = None
     U: sp.csr_matrix | None = None
     near_coarse: np.ndarray | slice | None = None
+    area_weighted: bool = True
+    lifted: bool = False
 
     def __post_init__(self) -> None:
         if self.mass is None:
@@ -70,16 +77,7 @@ class Basis:
     def first(self, k: int) -> "Basis":
         """The same surface with its first k functions."""
         eigenvalue = None if self.eigenvalue is None else self.eigenvalue[:k]
-        return Basis(
-            self.X,
-            self.T,
-            self.area,
-            self.Phi[:, :k],
-            eigenvalue,
-            self.mass,
-            self.U,
-            self.near_coarse,
-        )
+        return replace(self, Phi=self.Phi[:, :k], eigenvalue=eigenvalue)
 
     def extend(self, F: np.ndarray) -> np.ndarray:
         """Functions of the low resolution at all vertices: U F ``(n, q)`` in single precision.
@@ -93,18 +91,20 @@ class Basis:
     def field(self, c: np.ndarray) -> np.ndarray:
         """The field U Phi c ``(n, 3)`` with coefficients c ``(q, 3)`` of the first functions."""
         low = self.Phi[:, : len(c)] @ c
-        return low if self.U is None else self.U @ low
+        return low if self.U is None or self.lifted else self.U @ low
 
     @cached_property
     def coefficients(self) -> Callable:
         """Coefficients of a field given at the vertices near coarse ones, see :func:`smoother`."""
-        U = None if self.U is None else self.U[self.near_coarse]
-        return smoother(self.Phi, self.area[self.near_coarse], U)
+        area = self.area[self.near_coarse]
+        weight = area if self.area_weighted else np.ones_like(area)
+        if self.U is None or self.lifted:
+            return smoother(self.Phi[self.near_coarse], weight)
+        return smoother(self.Phi, weight, self.U[self.near_coarse])
 
-    @cached_property
-    def spread_vertices(self) -> np.ndarray:
-        """Some vertices ``(s,)`` spread over the surface."""
-        return farthest_points(self.X, N_SPREAD)
+    def spread_vertices(self, n: int = N_SPREAD) -> np.ndarray:
+        """Vertices ``(<= n,)`` spread over the surface; all in their order where n is 0."""
+        return farthest_points(self.X, n or len(self.X))
 
     @cached_property
     def cloud(self) -> Cloud:
@@ -143,11 +143,17 @@ class Shape:
     original : xarray.Dataset or None
         The clean mesh: ``position``, ``corner_vertex``.
     coarse : xarray.Dataset or None
-        As :func:`s4a.coarsen` and :func:`s4a.spectrum` make it.
+        As :func:`s4a.coarsen` and :func:`s4a.spectrum` make it, or :func:`s4a.method.lift.lifted`.
+    n_projected : int
+        Vertices of ``full`` by which fields are projected, those nearest to coarse ones; 0 for all.
+    area_weighted : bool
+        Whether they weigh by their areas then.
     """
 
     original: xr.Dataset | None
     coarse: xr.Dataset | None = None
+    n_projected: int = N_CENTRAL
+    area_weighted: bool = True
 
     @classmethod
     def of(cls, original: xr.Dataset, **parts: Any) -> "Shape":
@@ -205,17 +211,44 @@ class Shape:
 
     @cached_property
     def full(self) -> Basis:
-        """The original mesh and the functions U Phi; its areas are those of the mesh, scaled."""
+        """The original mesh and the functions U Phi, or lifted ones; its areas, of sum 1."""
         X, T = as_arrays(self.original)
         X = self.to_frame(X)
         low = self.low
         area = vertex_areas(X, T)
-        return Basis(X, T, area, low.Phi, low.eigenvalue, low.mass, self.U, self.near_coarse)
+        lifted = self.is_lifted
+        Phi = self.coarse["lifted_eigenfunction"].values if lifted else low.Phi
+        return Basis(
+            X,
+            T,
+            area,
+            Phi,
+            low.eigenvalue,
+            low.mass,
+            self.U,
+            self.near_coarse,
+            self.area_weighted,
+            lifted,
+        )
+
+    @property
+    def is_lifted(self) -> bool:
+        """Whether the functions of ``full`` are lifted ones, and not U Phi."""
+        return self.coarse is not None and "lifted_eigenfunction" in self.coarse
+
+    def functions(self, A: np.ndarray) -> np.ndarray:
+        """The functions Phi A that full resolution compares, A ``(k, m)``.
+
+        At coarse vertices, as U takes them from there; lifted ones at all.
+        """
+        basis = self.full if self.is_lifted else self.low
+        return basis.Phi[:, : len(A)] @ A.astype(basis.Phi.dtype)
 
     @cached_property
     def near_coarse(self) -> np.ndarray:
         """Original vertices nearest to coarse ones, by their weights in U; all of few."""
         weight = self.coarse["coarse_weight"].values.max(1)
-        if len(weight) <= N_CENTRAL:
+        n = self.n_projected
+        if n == 0 or len(weight) <= n:
             return np.arange(len(weight))
-        return np.flatnonzero(weight >= np.partition(weight, -N_CENTRAL)[-N_CENTRAL])
+        return np.flatnonzero(weight >= np.partition(weight, -n)[-n])

@@ -127,6 +127,8 @@ def spectrum(mesh: xr.Dataset, *, k: int = 100) -> xr.Dataset:
     if possible < 1:
         raise ValueError(f"a spectrum needs at least 3 vertices, found {n}")
     E, w = mesh["edge_vertex"].values, mesh["cotan_weight"].values
+    if not np.isfinite(w).all():
+        raise ValueError("finite cotan weights needed; triangles are too thin to have them")
     try:
         eigenvalue, Phi = eigenpairs(E, w, mesh["vertex_area"].values, possible)
     except RuntimeError as error:  # of the factor or of ARPACK

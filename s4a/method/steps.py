@@ -5,6 +5,7 @@
 """
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -12,11 +13,11 @@ from threadpoolctl import threadpool_limits
 
 from s4a.geometry.align import Motion, align, motion_between, realign
 from s4a.method import fmap, network
-from s4a.method.first_map import first_map, map_after_motion
-from s4a.method.latent import consistent_zoomout
+from s4a.method.first_map import first_map, fit_after_motion
+from s4a.method.latent import WIDE, consistent_zoomout
 from s4a.method.median import median_shape
 from s4a.method.register import from_latent, identity, match_functions, match_low
-from s4a.method.shape import Basis, Shape
+from s4a.method.shape import N_SPREAD, Basis, Shape
 from s4a.schema import dataset, require
 
 LOW = ("position", "corner_vertex", "vertex_area", "eigenvalue", "eigenfunction")
@@ -69,6 +70,7 @@ def map_pairs(
     *,
     k_init: int = 20,
     init: str = "dense",
+    ahead: bool = True,
 ) -> xr.Dataset:
     """First maps of some pairs, in both directions (4.1, steps 3 and 4).
 
@@ -80,30 +82,57 @@ def map_pairs(
         Name -> motion (R, t) onto a common reference.
     pairs : sequence of (str, str)
     k_init, init : see :func:`s4a.analyse`
+    ahead : bool
+        Whether a step of ZoomOut is done ahead (4.2).
 
     Returns
     -------
     xarray.Dataset
-        ``source(pair)``, ``target(pair)`` and ``fmap_initial``.
+        ``source(pair)``, ``target(pair)`` and ``fmap_initial``; ``fmap_fitted``, the same before
+        the step ahead; ``pair_rotation``, ``pair_translation``, the motion of ICP; with landmarks
+        ``landmark_of_source(pair, landmark)`` and ``landmark_of_target``.
     """
-    source, target, maps = [], [], []
+    source, target, maps, fits, turns, shifts, marks = [], [], [], [], [], [], []
     for a, b in pairs:
         M, N = bases[a], bases[b]
         start = motion_between(motions[a], motions[b])
         R, t = realign(M.cloud, N.cloud, start)
-        kind, C, _ = first_map(M, N, (R, t), k_init=k_init, init=init)
-        if kind == init:
-            back = map_after_motion(N, M, (R.T, -R.T @ t), k_init=k_init, init=init)
+        back_motion = R.T, -R.T @ t
+        first = first_map(M, N, (R, t), k_init=k_init, init=init, ahead=ahead)
+        if first.name == init:
+            fitted, landmarks = fit_after_motion(N, M, back_motion, k_init=k_init, init=init)
+            back = fmap.refine_once(N, M, fitted) if ahead else fitted
         else:  # of far poses: the other direction must tell the same limbs apart
-            back = fmap.refine_once(N, M, C.T)
+            fitted, landmarks = first.C.T, None
+            back = fmap.refine_once(N, M, fitted)
         source += [a, b]
         target += [b, a]
-        maps += [C, back]
-    return dataset(source=np.array(source), target=np.array(target), fmap_initial=np.stack(maps))
+        maps += [first.C, back]
+        fits += [first.fitted, fitted]
+        turns += [R, R.T]
+        shifts += [t, back_motion[1]]
+        marks += [first.landmarks, landmarks]
+    found = dataset(
+        source=np.array(source),
+        target=np.array(target),
+        fmap_initial=np.stack(maps),
+        fmap_fitted=np.stack(fits),
+        pair_rotation=np.stack(turns),
+        pair_translation=np.stack(shifts),
+    )
+    if init != "landmarks":
+        return found
+    ends = np.array(marks)  # (p, 2, landmarks)
+    return found.merge(dataset(landmark_of_source=ends[:, 0], landmark_of_target=ends[:, 1]))
 
 
 def build_network(
-    coarse: dict[str, xr.Dataset], *, n_pairs: int = 500, k_init: int = 20, init: str = "dense"
+    coarse: dict[str, xr.Dataset],
+    *,
+    n_pairs: int = 500,
+    k_init: int = 20,
+    init: str = "dense",
+    ahead: bool = True,
 ) -> xr.Dataset:
     """The network of first maps of a collection (3.4, 4.1): its pairs, and a map each way.
 
@@ -111,13 +140,15 @@ def build_network(
     ----------
     coarse : dict of str to xarray.Dataset
         Name -> low-resolution mesh with its spectrum.
-    n_pairs, k_init, init : see :func:`s4a.analyse`
+    n_pairs, k_init, init, ahead : see :func:`map_pairs`
 
     Returns
     -------
     xarray.Dataset
         ``source(pair)``, ``target(pair)`` and ``fmap_initial(pair, mode_target_initial,
-        mode_source_initial)``; the attribute ``reference`` is the shape that all are aligned to.
+        mode_source_initial)``; what else :func:`map_pairs` gives; ``icp_rotation(shape, xyz,
+        xyz_2)`` and ``icp_translation(shape, xyz)`` onto the shape that all are aligned to, the
+        attribute ``reference``.
 
     Raises
     ------
@@ -144,8 +175,15 @@ def build_network(
     }
     motions[reference] = np.eye(3), np.zeros(3)
     pairs = [(names[i], names[j]) for i, j in network.choose_pairs(distance, n_pairs)]
-    maps = map_pairs(bases, motions, pairs, k_init=k_init, init=init)
-    return maps.assign_attrs(reference=reference)
+    maps = map_pairs(bases, motions, pairs, k_init=k_init, init=init, ahead=ahead)
+    return with_motions(maps, {name: motions[name] for name in names}, reference)
+
+
+def with_motions(maps: xr.Dataset, motions: dict[str, Motion], reference: str) -> xr.Dataset:
+    """A network with the motions of its shapes onto the `reference`."""
+    R, t = (np.stack(values) for values in zip(*motions.values(), strict=True))
+    placed = dataset(icp_rotation=R, icp_translation=t).assign_coords(shape=list(motions))
+    return maps.merge(placed).assign_attrs(reference=reference)
 
 
 def refine_network(
@@ -155,7 +193,11 @@ def refine_network(
     k: int = 100,
     step: int = 5,
     n_latent: int | None = None,
+    weights: str = "cycles",
+    n_spread: int = N_SPREAD,
+    wide: int = WIDE,
     norm: str = "h2",
+    keep_rounds: bool = False,
     n_jobs: int | None = 1,
     progress: Callable | None = None,
 ) -> xr.DataTree:
@@ -167,7 +209,7 @@ def refine_network(
         Name -> low-resolution mesh with its spectrum.
     first : xarray.Dataset
         As of :func:`build_network`.
-    k, step, n_latent, norm : see :func:`s4a.analyse`
+    k, step, n_latent, weights, n_spread, wide, norm, keep_rounds : see :func:`s4a.analyse`
     n_jobs : int
         Threads; the result does not depend on it.
     progress : callable, optional
@@ -178,7 +220,9 @@ def refine_network(
     xarray.DataTree
         ``/network`` with ``fmap``, ``weight``, ``cycle_error`` and ``cycle_error_initial``;
         ``/latent`` with ``latent_basis``, ``latent_eigenvalue`` and what
-        :func:`s4a.method.median.median_shape` adds, the attribute ``median`` among it.
+        :func:`s4a.method.median.median_shape` adds, the attribute ``median`` among it; with
+        `keep_rounds` ``/rounds/k_020`` and so on, ``fmap``, ``latent_basis`` and
+        ``latent_eigenvalue`` of every size.
 
     Raises
     ------
@@ -202,6 +246,14 @@ def refine_network(
     source = np.array([names.index(name) for name in first["source"].values])
     target = np.array([names.index(name) for name in first["target"].values])
     C_initial = first["fmap_initial"].values  # (p, k_init, k_init)
+    rounds = {}
+
+    def keep(C, Y, latent_eigenvalue):
+        found = dataset(
+            fmap=C.astype(np.float32), latent_basis=Y, latent_eigenvalue=latent_eigenvalue
+        )
+        rounds[f"rounds/k_{len(Y[0]):03d}"] = found.assign_coords(shape=names)
+
     with threadpool_limits(1):
         C, weight, _, Y, latent_eigenvalue = consistent_zoomout(
             list(bases.values()),
@@ -211,9 +263,12 @@ def refine_network(
             k,
             step=step,
             n_latent=n_latent,
-            samples=[basis.spread_vertices for basis in bases.values()],
+            weights=weights,
+            samples=[basis.spread_vertices(n_spread) for basis in bases.values()],
+            wide=wide,
             n_jobs=n_jobs,
             progress=progress,
+            keep=keep if keep_rounds else None,
         )
     cycles = network.three_cycles(source.tolist(), target.tolist())
     refined = dataset(
@@ -229,6 +284,7 @@ def refine_network(
         {
             "network": first.merge(refined),
             "latent": median_shape(latent, eigenvalues, norm=norm),
+            **rounds,
         }
     )
 
@@ -239,14 +295,27 @@ def shape_in(study: xr.DataTree, name: str) -> Shape:
         if stage not in study.children or name not in study[stage].children:
             known = ", ".join(study[stage].children) if stage in study.children else "no such node"
             raise ValueError(f"a study with /{stage}/{name} is needed; this one has {known}")
-    return Shape(*(study[stage][name].to_dataset() for stage in ("original", "coarse")))
+    return Shape(study["original"][name].to_dataset(), study["coarse"][name].to_dataset())
 
 
 def latent_bases(study: xr.DataTree, *names: str) -> tuple:
-    """The latent bases Y ``(k, m)`` of some shapes of a study."""
+    """The latent bases Y ``(k, m)`` of some shapes of a study.
+
+    Those of the network are in ``/latent``, those of a shape apart in ``/latent/<shape>``.
+    """
     require(study["latent"].to_dataset(), "latent_basis", what="latent dataset")
     Y = study["latent"].dataset["latent_basis"]
-    return tuple(Y.sel(shape=name).values for name in names)
+    apart = study["latent"].children
+    known = [*Y["shape"].values.tolist(), *apart]
+    wrong = [name for name in names if name not in known]
+    if wrong:
+        raise ValueError(
+            f"no shape {', '.join(map(repr, wrong))} in the network; it has {', '.join(known)}"
+        )
+    return tuple(
+        (apart[name]["latent_basis"] if name in apart else Y.sel(shape=name)).values
+        for name in names
+    )
 
 
 def latent_match(
@@ -263,7 +332,7 @@ def latent_match(
     how : {"ours", "standard"}
         At full resolution eq. 7, or eq. 4 with the functional map of the match of eq. 3.
     full : bool
-        Whether original vertices are matched, or those of low resolution.
+        Whether original vertices are matched, or those of low resolution by eq. 3.
 
     Returns
     -------
@@ -292,6 +361,41 @@ def latent_match(
     return dataset(match=match)
 
 
+def latent_map(study: xr.DataTree, source: str, target: str) -> xr.Dataset:
+    """Functional map of any two shapes of a network by their latent bases: C_ij = Y_j Y_i^+ (3.4).
+
+    It need not be a map of the network itself, and closes every cycle with others of its kind.
+
+    Parameters
+    ----------
+    study : xarray.DataTree
+        With ``/latent``.
+    source, target : str
+        Names of shapes.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``fmap(mode_target, mode_source)``.
+
+    Raises
+    ------
+    ValueError
+        When a shape is not in the study.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import s4a
+    >>> study = s4a.synthetic.example_study()
+    >>> C = s4a.latent_map(study, "brain_01", "brain_01")["fmap"].values
+    >>> np.allclose(C, np.eye(len(C)))
+    True
+    """
+    Y_source, Y_target = latent_bases(study, source, target)
+    return dataset(fmap=Y_target @ np.linalg.pinv(Y_source))
+
+
 def register_shape(
     study: xr.DataTree,
     name: str,
@@ -299,8 +403,7 @@ def register_shape(
     *,
     start: Motion | None = None,
     how: str = "ours",
-    refine: str = "joint",
-    scale: bool = False,
+    **options: Any,
 ) -> xr.Dataset:
     """One shape of a study registered to the template (4.2; eq. 6, 7 and 8).
 
@@ -313,7 +416,10 @@ def register_shape(
     start : tuple (R, t), optional
         About the rigid motion of the shape onto the template, between their frames; found by ICP
         from the principal axes by default.
-    how, refine, scale : see :func:`s4a.analyse`
+    how : {"ours", "standard"}
+        Eq. 7, or eq. 3 and 4.
+    **options
+        Of :func:`s4a.method.register.register`: ``refine``, ``scale``, ``parts``, ``alignment``.
 
     Returns
     -------
@@ -344,4 +450,4 @@ def register_shape(
     else:
         motion = realign(M.cloud, N.cloud, start)
     bases = latent_bases(study, name, template)
-    return from_latent(source, target, bases, motion, how=how, refine=refine, scale=scale)
+    return from_latent(source, target, bases, motion, how=how, **options)

@@ -2,6 +2,7 @@
 
 import io
 import re
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from s4a.geometry.mesh import as_arrays
 from s4a.show.draw import SIGNED, Viewpoint, render, signed_colors
 
 BLUE, ORANGE, GREY = "#0072b2", "#d55e00", "#777777"
+PALE = "#bbbbbb"
 PART_COLORS = ("#bbbbbb", "#e69f00", "#009e73", BLUE, "#cc79a7", ORANGE, "#56b4e9", "#f0e442")
 LOOK: dict[Any, Any] = {
     "font.size": 9,
@@ -324,11 +326,20 @@ def variance(high: np.ndarray | list, low: np.ndarray | list | None = None) -> F
     return figure
 
 
-def scores(score: np.ndarray, names: list[str], highlight: int | None = None) -> Figure:
-    """Scores of the shapes on the first components, two by two, in standard deviations."""
+def scores(
+    score: np.ndarray,
+    names: list[str],
+    highlight: int | None = None,
+    faint: Sequence[bool] | None = None,
+) -> Figure:
+    """Scores of the shapes on the first components, two by two, in standard deviations.
+
+    Those that are `faint` are grey.
+    """
     planes = [(a, b) for a, b in ((0, 1), (0, 2)) if b < score.shape[1]] or [(0, 0)]
     figure, (axes,) = _figure(4.2 * len(planes), 3.8, len(planes))
     colors = np.where(np.arange(len(score)) == highlight, ORANGE, BLUE)
+    colors = np.where(np.zeros(len(score), bool) if faint is None else faint, PALE, colors)
     for ax, (a, b) in zip(axes, planes, strict=True):
         ax.axhline(0, color="#dddddd", lw=1)
         ax.axvline(0, color="#dddddd", lw=1)

@@ -6,6 +6,7 @@ import numpy as np
 import xarray as xr
 from markupsafe import Markup
 
+from s4a.input.decisions import decisions
 from s4a.method.pca import color_limits
 from s4a.show import charts
 from s4a.show.browser import MODES, PARTS, TEMPLATES, look_state, mesh_state, webp_uri
@@ -15,6 +16,7 @@ from s4a.show.surfaces import (
     attribute,
     carried_colors,
     has,
+    labelled,
     mesh_of,
     mode_arrays,
     names_of,
@@ -23,6 +25,7 @@ from s4a.show.surfaces import (
     surface,
     template_coarse,
 )
+from s4a.study.tree import left_out
 
 LARGE = 20_000  # vertices from which a page moves the low-resolution mesh
 N_CARRIED = 5  # shapes to which the template's colours are carried
@@ -100,8 +103,9 @@ def _summary(study):
     facts = []
     if has(study, "report/status"):
         status = study["report"]["status"].values.astype(str)
-        repaired, excluded = (status == "repaired").sum(), (status == "excluded").sum()
-        facts.append(f"{len(status)} shapes, {repaired} repaired, {excluded} excluded")
+        count = {kind: (status == kind).sum() for kind in ("repaired", "doubtful", "excluded")}
+        counts = [f"{number} {kind}" for kind, number in count.items()]
+        facts.append(f"{len(status)} shapes, {', '.join(counts)}")
     for node, key in (("latent", "median"), ("registration", "template")):
         if name := attribute(study, node, key):
             facts.append(f"{key} {name}")
@@ -111,6 +115,18 @@ def _summary(study):
     if has(study, "report/seconds"):
         facts.append(f"{study['report']['seconds'].values.sum():.0f} s of computing")
     return "; ".join(facts) + "." if facts else "The study is empty."
+
+
+def _decisions(report):
+    """What is to decide on doubtful shapes, kind by kind; nothing where there are none."""
+    rows = [[one.kind, ", ".join(one.names), one.remedy] for one in decisions(report)]
+    if not rows:
+        return Markup("")
+    become = "Doubtful shapes are registered, and in no modes, no statistics and no median; "
+    become += "s4a run ... --keep-doubtful takes all of them in."
+    if report.attrs.get("keep_doubtful") == "True":
+        become = "Doubtful shapes were taken into modes and statistics by keep_doubtful."
+    return PARTS.note(become) + PARTS.table(["to decide", "shapes", "what to do"], rows)
 
 
 def _shapes(study, look):
@@ -128,18 +144,20 @@ def _shapes(study, look):
         if name in meshes:
             size = [meshes[name].sizes["vertex"], meshes[name].sizes["triangle"]]
         rows.append([name, status[i], *size, *(report[key].values[i] for key in texts)])
-    return PARTS.table(["shape", "status", "vertices", "triangles", *texts], rows, status.tolist())
+    head = ["shape", "status", "vertices", "triangles", *texts]
+    return _decisions(report) + PARTS.table(head, rows, status.tolist())
 
 
 def _gallery(study, look):
     names = list(study["coarse"].children)
+    texts = {name: text for text, name in labelled(study, names)}
     meshes = [surface(study, name) for name in names]
     frames = shared_frames([X for X, _ in meshes], look)
     median = attribute(study, "latent", "median")
     figures = []
     for name, (X, T), frame in zip(names, meshes, frames, strict=True):
         pixels = render(X, T, size=(150, 130), frame=frame, **look)
-        caption = f"{name}, the median" if name == median else name
+        caption = f"{texts[name]}, the median" if name == median else texts[name]
         figures.append(PARTS.picture(pixels, caption, name == median))
     note = PARTS.note("The low-resolution meshes, all at one scale.")
     return note + PARTS.grid(figures, "gallery")
@@ -248,11 +266,19 @@ def _variance(study, look):
 
 
 def _scores(study, look):
-    score = study["pca"].dataset["score"]
-    names = names_of(score)
+    pca = study["pca"].dataset
+    state = score_state(study)
+    names, faint = state["names"], state["faint"]
     template = _index(names, attribute(study, "registration", "template"))
-    figure = charts.scores(score.values, names, template)
-    return PARTS.drawing(figure, "scores of the shapes; the template is orange")
+    figure = charts.scores(np.array(state["samples"]), names, template, faint)
+    text = "scores of the shapes; the template is orange"
+    if any(faint):
+        text += ", doubtful shapes are grey"
+    beyond = pca.sizes.get("shape_apart", 0) - sum(name not in names_of(pca) for name in names)
+    note = ""
+    if beyond:
+        note = PARTS.note(f"{beyond} doubtful shapes lie too far away to be drawn.")
+    return Markup(note) + PARTS.drawing(figure, text)
 
 
 def _correspondence(study, look):
@@ -279,6 +305,9 @@ def _correspondence(study, look):
 def _confidence(study, look):
     registration = study["registration"].dataset
     X, T = mesh_of(registration)
+    apart = left_out(study)
+    names = [name for name in names_of(registration) if name not in apart]
+    registration = registration.sel(shape=names)
     confidence = registration["confidence"]
     mean, names = confidence.mean("vertex").values, names_of(registration)
 

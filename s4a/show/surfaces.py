@@ -6,7 +6,9 @@ import xarray as xr
 from s4a.method.pca import low_vertices
 from s4a.method.register import match_functions, match_low
 from s4a.method.shape import Shape
+from s4a.method.steps import latent_bases
 
+FAR = 8  # standard deviations beyond which charts of scores leave a doubtful shape out
 RESOLUTIONS = [("low resolution", "coarse"), ("full resolution", "original")]
 
 
@@ -26,6 +28,20 @@ def attribute(study: xr.DataTree, node: str, name: str) -> str:
 def names_of(data: xr.Dataset | xr.DataArray) -> list[str]:
     """The shapes of a Dataset or one of its variables."""
     return [str(name) for name in data["shape"].values]
+
+
+def doubtful_names(study: xr.DataTree) -> list[str]:
+    """The shapes that the report calls doubtful."""
+    if not has(study, "report/status"):
+        return []
+    report = study["report"].dataset
+    return names_of(report.sel(shape=report["status"].values == "doubtful"))
+
+
+def labelled(study: xr.DataTree, names: list[str]) -> list[tuple[str, str]]:
+    """Shapes as options of a list: what is shown, which marks doubtful ones, and the name."""
+    doubtful = set(doubtful_names(study))
+    return [(f"{name} (doubtful)" if name in doubtful else name, name) for name in names]
 
 
 def mesh_of(mesh: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
@@ -137,12 +153,24 @@ def score_state(study: xr.DataTree, n_modes: int | None = None) -> dict:
     """Shares of variance, scores and names of a study's modes, as the browser shows them."""
     pca = study["pca"].dataset.isel(component=slice(n_modes))
     low = pca.get("explained_variance_ratio_low")
+    scores = dict(zip(names_of(pca), pca["score"].values.tolist(), strict=True))
+    scores |= near_apart(pca)
     return {
         "ratio": pca["explained_variance_ratio"].values.tolist(),
         "ratio_low": [] if low is None else low.values.tolist(),
-        "samples": pca["score"].values.tolist(),
-        "names": names_of(pca),
+        "samples": list(scores.values()),
+        "names": list(scores),
+        "faint": [name in doubtful_names(study) for name in scores],
     }
+
+
+def near_apart(pca: xr.Dataset) -> dict[str, list[float]]:
+    """Scores of the shapes that the modes are made without, where a chart can show them."""
+    if "score_apart" not in pca:
+        return {}
+    near = pca.sel(shape_apart=(np.abs(pca["score_apart"][:, :3].values) < FAR).all(axis=1))
+    names = [str(name) for name in near["shape_apart"].values]
+    return dict(zip(names, near["score_apart"].values.tolist(), strict=True))
 
 
 def network_places(study: xr.DataTree, names: list[str]) -> np.ndarray | None:
@@ -164,11 +192,10 @@ def latent_match(study: xr.DataTree, source: str, target: str, *, dense: bool) -
     By nearest rows of Phi Y on the coarse meshes (eq. 3), or of U Phi Y on all vertices where
     `dense` (eq. 7).
     """
-    Y = study["latent"].dataset["latent_basis"]
     M, N = (
         Shape(study["original"][name].to_dataset(), study["coarse"][name].to_dataset())
         for name in (source, target)
     )
-    bases = Y.sel(shape=source).values, Y.sel(shape=target).values
+    bases = latent_bases(study, source, target)
     match, (F_source, F_target) = match_low(M, N, bases)
     return match_functions(M, N, F_source, F_target)[0] if dense else match

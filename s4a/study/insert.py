@@ -8,31 +8,27 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
-from joblib import Parallel, delayed
+from joblib import delayed
 from threadpoolctl import threadpool_limits
 
-from s4a.geometry.align import align, realign
+from s4a.geometry.align import align
 from s4a.geometry.mesh import as_arrays, vertex_areas
+from s4a.input import evidence
 from s4a.input.collection import read_shapes, shape_report
-from s4a.input.plausibility import examine, find_warnings, sample_vertices
-from s4a.method.first_map import first_map
-from s4a.method.latent import latent_basis_of_new
-from s4a.method.median import area_differences, conformal_differences, distance_to_identity
-from s4a.method.network import spectral_distance
+from s4a.input.plausibility import find_warnings
+from s4a.method.lift import low_resolution
 from s4a.method.pca import project_scores
+from s4a.method.place import latent_of_new, nearest_spectra, place
 from s4a.method.register import from_latent
-from s4a.method.remesh import coarsen
 from s4a.method.shape import Basis, Shape
-from s4a.method.spectral import spectrum
 from s4a.schema import dataset, in_unit, require, unit_of
 from s4a.study.options import Options
-from s4a.study.tree import stack_registration, template_mesh
-
-NEIGHBOURS = 6  # shapes of the study, the template among them, whose maps a new one has
+from s4a.study.processes import workers
+from s4a.study.tree import left_out, stack_registration, template_mesh
 
 
 class Frozen(NamedTuple):
-    """The study that new shapes come into: the template, and all shapes, the template first."""
+    """The study that new shapes come into: the template, and its network, the template first."""
 
     template: Shape
     low: list[Basis]
@@ -46,7 +42,7 @@ class Inserted(NamedTuple):
     coarse: xr.Dataset
     Y: np.ndarray  # (k, m), latent basis
     registration: xr.Dataset
-    look: dict
+    look: xr.Dataset | None  # None where it was not compared
 
 
 def insert(
@@ -56,7 +52,7 @@ def insert(
     compare: bool = True,
     n_jobs: int | None = None,
 ) -> xr.DataTree:
-    """New shapes placed into a finished study, which stays as it is.
+    """New shapes placed into a finished study, which stays as it is, with its options.
 
     Each new shape is remeshed, aligned and mapped to the template and the five shapes of the study
     with the most alike spectra; its latent basis solves eq. 3 with theirs frozen; it is registered
@@ -110,9 +106,10 @@ def insert(
     meshes, attrs = read_new(shapes, options)
     if template in meshes:
         raise ValueError(f"new shapes need other names than the template, {template!r}; rename it")
-    frozen = freeze(study)
-    results = Parallel(n_jobs=n_jobs)(
-        delayed(insert_one)(mesh, frozen, options, compare) for mesh in meshes.values()
+    frozen = freeze(study, options)
+    references = portraits_of(study) if compare else None
+    results = workers(n_jobs)(
+        delayed(insert_one)(mesh, frozen, options, references) for mesh in meshes.values()
     )
     inserted = {}
     for name, result in zip(meshes, results, strict=True):
@@ -127,7 +124,12 @@ def insert(
     nodes = {f"original/{name}": meshes[name] for name in inserted}
     nodes[f"original/{template}"] = frozen.template.original
     nodes |= {f"coarse/{name}": new.coarse for name, new in inserted.items()}
-    nodes["latent"] = latent_of_new(inserted, study["latent"].to_dataset(), options.norm)
+    nodes["latent"] = latent_of_new(
+        np.stack([new.Y for new in inserted.values()]),
+        np.stack([new.coarse["eigenvalue"].values for new in inserted.values()]),
+        study["latent"].dataset["latent_eigenvalue"].values,
+        options.norm,
+    ).assign_coords(shape=list(inserted))
     nodes |= stack_registration(
         template_mesh(frozen.template.original, template),
         {name: new.registration for name, new in inserted.items()},
@@ -135,11 +137,12 @@ def insert(
     )
     if "pca" in study:
         nodes["pca"] = scores_of_new(study["pca"].to_dataset(), nodes["registration"])
-    if compare:
-        looks = {name: new.look for name, new in inserted.items()}
-        nodes["report"] = report_beside(study, attrs, looks)
-    else:
+    if references is None:
         nodes["report"] = shape_report(attrs)
+    else:
+        looks = {name: new.look for name, new in inserted.items() if new.look is not None}
+        nodes["report"] = report_beside(study, attrs, looks, references)
+    nodes["report"].attrs["keep_doubtful"] = "True"  # all that were given are in the result
     return xr.DataTree.from_dict(nodes)
 
 
@@ -156,7 +159,8 @@ def read_new(
     attrs = {name: {"status": "ok", "reason": ""} | mesh.attrs for name, mesh in meshes.items()}
     if isinstance(shapes, dict) and not shapes:
         return meshes, attrs
-    tree = read_shapes(shapes, components=options.components, strict=options.strict, compare=False)
+    cleaning = {name: getattr(options, name) for name in ("components", "strict", "close_holes")}
+    tree = read_shapes(shapes, compare=False, **cleaning)
     report = tree["report"].to_dataset()
     for name in report["shape"].values.tolist():
         if name in tree["original"].children:
@@ -168,18 +172,21 @@ def read_new(
     return meshes, attrs
 
 
-def freeze(study: xr.DataTree) -> Frozen:
-    """What new shapes need of a study, the template first; shapes that failed are left out."""
+def freeze(study: xr.DataTree, options: Options) -> Frozen:
+    """What new shapes need of a study, the template first.
+
+    Shapes that failed, and those that the study leaves out as doubtful, are not among them.
+    """
     latent = study["latent"].to_dataset()
     require(latent, "latent_basis", "latent_eigenvalue", what="latent dataset")
     rotation = study["registration"].dataset["rotation"]
     template = study["registration"].attrs["template"]
-    registered = set(rotation["shape"].values.tolist())
+    registered = set(rotation["shape"].values.tolist()) - set(left_out(study))
     others = [n for n in latent["shape"].values.tolist() if n in registered and n != template]
     names = [template, *others]
     coarse = [study["coarse"][name].to_dataset() for name in names]
     return Frozen(
-        Shape(study["original"][template].to_dataset().load(), coarse[0].load()),
+        options.shape(study["original"][template].to_dataset().load(), coarse[0].load()),
         [Shape(None, mesh).low for mesh in coarse],
         latent["latent_basis"].sel(shape=names).values,
         list(rotation.sel(shape=names).values),
@@ -187,7 +194,10 @@ def freeze(study: xr.DataTree) -> Frozen:
 
 
 def insert_one(
-    mesh: xr.Dataset, frozen: Frozen, options: Options, compare: bool
+    mesh: xr.Dataset,
+    frozen: Frozen,
+    options: Options,
+    references: dict[str, xr.Dataset] | None,
 ) -> Inserted | ValueError:
     """One new shape: coarse mesh, latent basis, registration, plausibility; or why there is none.
 
@@ -195,87 +205,95 @@ def insert_one(
     """
     try:
         with threadpool_limits(1):
-            return _insert_one(mesh, frozen, options, compare)
+            return _insert_one(mesh, frozen, options, references)
     except ValueError as error:
         return error
 
 
-def _insert_one(mesh, frozen, options, compare):
+def _insert_one(mesh, frozen, options, references):
     _, k, _ = frozen.Y.shape
-    coarse = coarsen(mesh, n_coarse=options.n_coarse, wrap=options.wrap, seed=options.seed)
-    coarse = spectrum(coarse, k=k)
+    coarse = low_resolution(mesh, **options.of_low_resolution | {"k": k})
     if coarse.sizes["mode"] < k:
         raise ValueError(
             f"the study needs {k} eigenfunctions, this shape has only {coarse.sizes['mode']}"
         )
-    shape = Shape(mesh, coarse)
+    shape = options.shape(mesh, coarse)
     new = Shape(None, coarse).low
     template = frozen.template.low
     k_init = min(options.k_init, k)
-    chosen = nearest_spectra(new, frozen.low, k_init)
+    chosen = nearest_spectra(new.eigenvalue, [other.eigenvalue for other in frozen.low], k_init)
     R, t, _ = align(shape.low.X, shape.low.area, template.X, template.area)
-    maps = []
-    for j in chosen:
-        other = frozen.low[j]
-        start = frozen.turn[j].T @ R, np.zeros(3)
-        S, u = realign(new.cloud, other.cloud, start)
-        to_new = S.T, -S.T @ u
-        maps.append(first_map(other, new, to_new, k_init=k_init, init=options.init)[1])
     others = [frozen.low[j] for j in chosen]
-    Y = latent_basis_of_new(new, others, frozen.Y[chosen], maps, step=options.step)
+    starts = [(frozen.turn[j].T @ R, np.zeros(3)) for j in chosen]
+    Y = place(
+        new,
+        others,
+        frozen.Y[chosen],
+        starts,
+        k_init=k_init,
+        step=options.step,
+        n_spread=options.n_spread,
+        **options.of_first_maps,
+    )
     registration = from_latent(
         shape,
         frozen.template,
         (Y, frozen.Y[0]),
         (R, t),
         how=options.how,
-        refine=options.refine,
-        scale=options.scale,
+        **options.of_registration,
     )
-    seen = {}
-    if compare:
-        seen = examine(mesh, sample_vertices(frozen.template.original), options.intersections)
+    seen = None
+    if references is not None:
+        portrait = evidence.portray(mesh, intersections=options.intersections)
+        seen = evidence.compare("", portrait, references)
     return Inserted(coarse, Y, registration, seen)
 
 
-def nearest_spectra(new: Basis, shapes: list[Basis], k: int) -> list[int]:
-    """The template, first of the shapes, and those whose first k eigenvalues are most alike."""
-    distance = spectral_distance([basis.eigenvalue[:k] for basis in (new, *shapes)])[0]
-    order = np.argsort(distance[2:], kind="stable")  # without itself and the template
-    return [0, *(1 + order[: NEIGHBOURS - 1]).tolist()]
+def known_to(study: xr.DataTree) -> dict[str, dict]:
+    """Attributes of the registered shapes of a study that are in its modes."""
+    doubted = left_out(study)
+    names = study["registration"].dataset["shape"].values.tolist()
+    return {name: study["original"][name].attrs for name in names if name not in doubted}
 
 
-def report_beside(study: xr.DataTree, attrs: dict, looks: dict) -> xr.Dataset:
-    """The report on the new shapes, each beside those of the study, as they lie when registered."""
-    rotation = study["registration"].dataset["rotation"]
-    known = {name: study["original"][name].attrs for name in rotation["shape"].values.tolist()}
-    # the hand of the study is the right one, and its own intersections are told already
-    usual = {"residual": 0.0, "mirrored": 1.0, "self_intersections": -1}
-    known_looks = {name: usual | {"rotation": rotation.sel(shape=name).values} for name in known}
+def portraits_of(study: xr.DataTree) -> dict[str, xr.Dataset]:
+    """Portraits of the shapes of a study beside which new ones are seen."""
+    portraits = {}
+    known = known_to(study)
+    by_size = sorted(known, key=lambda name: known[name]["area"])
+    for name in evidence.spread(by_size, 2 * evidence.N_REFERENCES):
+        mesh = study["original"][name].to_dataset()
+        seen = evidence.portray(mesh, intersections=False)
+        if "report" in study:  # where they were counted
+            number = int(study["report"]["self_intersections"].sel(shape=name))
+            share = number / mesh.sizes["triangle"] if number >= 0 else -1.0
+            seen = seen.assign_attrs(self_intersections=number, intersecting=share)
+        portraits[name] = seen
+    return {name: portraits[name] for name in evidence.pick_references(portraits)}
+
+
+def report_beside(
+    study: xr.DataTree,
+    attrs: dict,
+    looks: dict[str, xr.Dataset],
+    references: dict[str, xr.Dataset],
+) -> xr.Dataset:
+    """The report on the new shapes, each beside those of the study."""
+    known = known_to(study)
+    known_looks = {
+        name: evidence.compare(name, seen, references) for name, seen in references.items()
+    }
     told_before = find_warnings(known, known_looks)[1]
     reports, remarks = [], {}
     for name, said in attrs.items():
-        own_look = {name: looks[name]} if name in looks else {}
-        report = shape_report(known | {name: said}, known_looks | own_look)
-        reports.append(report.sel(shape=[name]))
-        lines = report.attrs["remarks"].splitlines()
-        remarks |= dict.fromkeys(line for line in lines if line not in told_before)
+        if name not in looks:  # it could not be used
+            reports.append(shape_report({name: said}))
+            continue
+        doubts, told = find_warnings(known | {name: said}, known_looks | {name: looks[name]})
+        reports.append(shape_report({name: said}, doubts, evidence={name: looks[name]}))
+        remarks |= dict.fromkeys(line for line in told if line not in told_before)
     return xr.concat(reports, dim="shape").assign_attrs(remarks="\n".join(remarks))
-
-
-def latent_of_new(inserted: dict[str, Inserted], latent: xr.Dataset, norm: str) -> xr.Dataset:
-    """``/latent`` of the new shapes: bases, shape differences, distances to the limit shape."""
-    Y = np.stack([new.Y for new in inserted.values()])
-    eigenvalues = np.stack([new.coarse["eigenvalue"].values for new in inserted.values()])
-    latent_eigenvalue = latent["latent_eigenvalue"].values
-    D = area_differences(Y)
-    return dataset(
-        latent_basis=Y,
-        latent_eigenvalue=latent_eigenvalue,
-        area_difference=D,
-        conformal_difference=conformal_differences(Y, eigenvalues, latent_eigenvalue),
-        distance_to_median=distance_to_identity(D, latent_eigenvalue, norm),
-    ).assign_coords(shape=list(inserted))
 
 
 def scores_of_new(modes: xr.Dataset, registration: xr.Dataset) -> xr.Dataset:
@@ -288,5 +306,5 @@ def scores_of_new(modes: xr.Dataset, registration: xr.Dataset) -> xr.Dataset:
         vertex_areas(*as_arrays(registration)),
     )
     new = in_unit(dataset(score=score, reconstruction_error=left), unit_of(modes["deformation"]))
-    frozen = modes.drop_vars(["score", "shape"])
+    frozen = modes.drop_vars(["score", "shape", "score_apart", "shape_apart"], errors="ignore")
     return frozen.merge(new).assign_coords(shape=registration["shape"])

@@ -10,24 +10,114 @@ from pathlib import Path
 from types import NoneType
 from typing import Self, get_args
 
-import numpy as np
 import xarray as xr
 
 from s4a.input.clean import check_components
 from s4a.method.median import NORMS
-from s4a.schema import check_switch, check_text
+from s4a.method.shape import N_CENTRAL, N_SPREAD, Shape
+from s4a.schema import check_count, check_switch, check_text
 
 CHOICES = {
     "init": ("dense", "landmarks"),
+    "ahead": ("always", "network", "never"),
+    "weights": ("cycles", "equal"),
     "refine": ("joint", "intrinsic"),
+    "alignment": ("fitted", "icp"),
     "how": ("ours", "standard"),
     "norm": tuple(NORMS),
     "preset": (None, "paper"),
+    "doubtful": ("apart", "stop"),
 }
-# what a preset sets; one of these options that is not given is None until then
-DEFAULTS = {"init": "dense", "refine": "joint", "how": "ours"}
-PRESETS = {None: DEFAULTS, "paper": {"init": "landmarks", "refine": "intrinsic", "how": "ours"}}
-LOWEST = {"n_coarse": 100, "n_pairs": 1, "k_init": 4, "k": 4, "step": 1, "seed": 0, "n_latent": 2}
+# what is added to the paper, each with its switch; in PAPER none of it.  These are the options that
+# a preset sets: one that is not given is None until then
+DEFAULTS = {
+    "lift": False,
+    "init": "dense",
+    "ahead": "always",
+    "n_spread": N_SPREAD,
+    "wide": 4,
+    "sharpen": 1,
+    "refine": "joint",
+    "parts": True,
+    "alignment": "fitted",
+    "area_weighted": True,
+    "n_projected": N_CENTRAL,
+    "both": True,
+}
+PAPER = {
+    "lift": False,
+    "init": "landmarks",
+    "ahead": "network",
+    "n_spread": 0,
+    "wide": 0,
+    "sharpen": 0,
+    "refine": "intrinsic",
+    "parts": False,
+    "alignment": "icp",
+    "area_weighted": False,
+    "n_projected": 0,
+    "both": False,
+}
+PRESETS: dict[str | None, dict] = {None: DEFAULTS, "paper": PAPER}
+LOWEST = {
+    "n_coarse": 100,
+    "n_pairs": 1,
+    "k_init": 4,
+    "k": 4,
+    "n_latent": 2,
+    "step": 1,
+    "n_spread": 0,
+    "wide": 0,
+    "sharpen": 0,
+    "n_projected": 0,
+    "seed": 0,
+}
+# of a pair that is matched on its own
+PAIR = (
+    "k_init",
+    "k",
+    "step",
+    "lift",
+    "init",
+    "ahead",
+    "sharpen",
+    "refine",
+    "parts",
+    "alignment",
+    "area_weighted",
+    "n_projected",
+    "n_coarse",
+    "preset",
+    "seed",
+)
+
+
+def apply_preset(preset: str | None, given: dict, presets: dict[str | None, dict]) -> dict:
+    """The options that a preset sets, where those that are `given` are None; theirs where not.
+
+    Raises
+    ------
+    ValueError
+        When a preset that is not None sets an option that is given otherwise.
+
+    Examples
+    --------
+    >>> from s4a.study.options import PRESETS, apply_preset
+    >>> apply_preset("paper", {"sharpen": None}, PRESETS)["sharpen"]
+    0
+    """
+    if preset not in presets:
+        raise ValueError(f"preset must be one of None, 'paper'; found {preset!r}")
+    settings = {}
+    for name, value in presets[preset].items():
+        own = given.get(name)
+        if preset and own is not None and own != value:
+            raise ValueError(
+                f"preset {preset!r} sets {name}={value!r}; found {name}={own!r}: "
+                "leave out one of both"
+            )
+        settings[name] = value if own is None else own
+    return settings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,11 +146,23 @@ class Options:
     k: int = 100
     n_latent: int | None = None
     step: int = 5
-    # of these three the preset sets what is None
+    weights: str = "cycles"
+    # of these the preset sets what is None
+    lift: bool | None = None
     init: str | None = None
+    ahead: str | None = None
+    n_spread: int | None = None
+    wide: int | None = None
+    sharpen: int | None = None
     refine: str | None = None
-    how: str | None = None
+    parts: bool | None = None
+    alignment: str | None = None
+    area_weighted: bool | None = None
+    n_projected: int | None = None
+    both: bool | None = None
+    how: str = "ours"
     norm: str = "h2"
+    keep_rounds: bool = False
     scale: bool = False
     components: str | int = "largest"
     strict: bool = False
@@ -71,18 +173,26 @@ class Options:
     preset: str | None = None
     template: str | None = None
     table: Path | str | None = None
+    doubtful: str = "apart"
+    keep_doubtful: bool = False
     seed: int = 0
 
     def __post_init__(self):
         self._check_choices()
-        self._apply_preset()
+        for name, value in apply_preset(self.preset, vars(self), PRESETS).items():
+            object.__setattr__(self, name, value)
         self._check_numbers()
         for field in fields(self):
-            if field.type is bool:
+            if bool in (field.type, *get_args(field.type)):
                 check_switch(field.name, getattr(self, field.name))
         check_components(self.components)
         check_text("pattern", self.pattern)
         check_text("template", self.template)
+        if self.keep_doubtful and self.doubtful == "stop":
+            raise ValueError(
+                "keep_doubtful=True takes doubtful shapes in and doubtful='stop' ends the run "
+                "where there are any: leave out one of both"
+            )
 
     def _check_choices(self):
         for name, legal in CHOICES.items():
@@ -91,27 +201,38 @@ class Options:
                 choices = ", ".join(map(repr, legal))
                 raise ValueError(f"{name} must be one of {choices}; found {value!r}")
 
-    def _apply_preset(self):
-        for name, value in PRESETS[self.preset].items():
-            own = getattr(self, name)
-            if self.preset and own not in (None, value):
-                raise ValueError(
-                    f"preset {self.preset!r} sets {name}={value!r}; found {name}={own!r}: "
-                    "leave out one of both"
-                )
-            object.__setattr__(self, name, own or value)
-
     def _check_numbers(self):
         for name, least in LOWEST.items():
             value = getattr(self, name)
             if name == "n_latent" and value is None:
                 continue
-            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-                raise ValueError(f"{name} must be an integer of at least {least}; found {value!r}")
+            check_count(name, value, least)
         if self.k < self.k_init:
             raise ValueError(f"k must be at least k_init = {self.k_init}; found {self.k}")
         if self.n_latent is not None and self.n_latent > self.k:
             raise ValueError(f"n_latent must be at most k = {self.k}; found {self.n_latent}")
+
+    @property
+    def of_low_resolution(self) -> dict:
+        """The options of :func:`s4a.method.lift.low_resolution`."""
+        names = ("n_coarse", "k", "lift", "wrap", "seed")
+        return {name: getattr(self, name) for name in names}
+
+    @property
+    def of_first_maps(self) -> dict:
+        """The options of :func:`s4a.method.first_map.first_map` in a network, but its size."""
+        return {"init": self.init, "ahead": self.ahead != "never"}
+
+    @property
+    def of_registration(self) -> dict:
+        """The options of :func:`s4a.method.register.register`."""
+        names = ("refine", "scale", "parts", "alignment")
+        return {name: getattr(self, name) for name in names}
+
+    def shape(self, original: xr.Dataset | None, coarse: xr.Dataset | None) -> Shape:
+        """A shape whose fields are projected as these options say."""
+        projection = {name: getattr(self, name) for name in ("n_projected", "area_weighted")}
+        return Shape(original, coarse, **projection)
 
     def check_against(self, names: list[str]) -> None:
         """Raise ValueError where the options do not fit the shapes of these names.
@@ -162,17 +283,32 @@ def _in_kind(word, kinds):
         return None
     if bool in kinds:
         return word == "True"
-    return int(word) if int in kinds and word.isdigit() else word
+    return int(word) if int in kinds and word.isdecimal() else word
 
 
-def takes_options(function: Callable) -> Callable:
+def takes_options(*names: str) -> Callable:
     """Decorate a function of ``**options`` so that its signature shows those of :class:`Options`.
 
-    Each option and its default stand in :class:`Options` alone.
+    Those of these names, all by default.  Each option and its default stand in :class:`Options`
+    alone.
     """
-    signature = inspect.signature(function)
-    own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
-    options = inspect.signature(Options).parameters.values()
-    shown = signature.replace(parameters=[*own, *options])
-    function.__signature__ = shown  # type: ignore[attr-defined]
-    return function
+
+    def decorate(function):
+        signature = inspect.signature(function)
+        own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
+        options = inspect.signature(Options).parameters
+        chosen = [options[name] for name in names or options]
+        function.__signature__ = signature.replace(parameters=[*own, *chosen])
+        return function
+
+    return decorate
+
+
+def pair_options(given: dict) -> Options:
+    """The :class:`Options` of a pair; TypeError where one is given that is none of a pair's."""
+    wrong = [name for name in given if name not in (*PAIR, "both")]
+    if wrong:
+        raise TypeError(
+            f"unexpected options {', '.join(wrong)}; those of a pair are {', '.join(PAIR)}"
+        )
+    return Options(**given)

@@ -1,6 +1,7 @@
 """One pair of shapes registered on its own (4.1): the steps from two meshes to a correspondence."""
 
 import logging
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -8,27 +9,17 @@ import xarray as xr
 from s4a.geometry.align import align
 from s4a.method import fmap
 from s4a.method.first_map import first_map
+from s4a.method.lift import low_resolution
 from s4a.method.register import register, sharpen_map
-from s4a.method.remesh import coarsen
 from s4a.method.shape import Shape
-from s4a.method.spectral import spectrum
 from s4a.schema import dataset, require
-from s4a.study.options import Options
+from s4a.study.options import PAIR, Options, pair_options, takes_options
 
 log = logging.getLogger(__name__)
 
 
-def match_pair(
-    source: xr.Dataset,
-    target: xr.Dataset,
-    *,
-    k_init: int = 20,
-    k: int = 100,
-    init: str = "dense",
-    refine: str = "joint",
-    n_coarse: int = 6000,
-    seed: int = 0,
-) -> xr.Dataset:
+@takes_options(*PAIR)
+def match_pair(source: xr.Dataset, target: xr.Dataset, **options: Any) -> xr.Dataset:
     """Correspondence of two shapes at full resolution (4.1).
 
     Parameters
@@ -36,16 +27,25 @@ def match_pair(
     source, target : xarray.Dataset
         Clean meshes (``position``, ``corner_vertex``), as of :func:`s4a.read_shapes` or
         :func:`s4a.clean`.
-    k_init, k : int
-        Sizes of the first and of the refined functional map.
+    k_init, k, step : int
+        Sizes of the first and of the refined functional map; growth per round of ZoomOut.
     init : {"dense", "landmarks"}
-        First map from all nearest neighbours after ICP, or the paper's fit on 10 landmarks.  Where
-        the former say that poses are far apart, :func:`s4a.method.first_map.best_first_map` is
-        taken, which costs about 2 s more.
+        First map from all nearest neighbours after ICP (default), or the paper's fit on 10
+        landmarks.  Where the former say that poses are far apart,
+        :func:`s4a.method.first_map.best_first_map` is taken, which costs about 2 s more.
+    ahead : {"always", "network", "never"}
+        Whether the first map gets a step of ZoomOut without growth; "network" says not here (4.2).
+    sharpen : int
+        Rounds of ZoomOut after the last in which coarse vertices of the target look among all of
+        the source.
     refine : {"joint", "intrinsic"}
         Joint rounds after ZoomOut (default), or the paper's ZoomOut alone and eq. 4.
+    lift, parts, alignment, area_weighted, n_projected
+        See :func:`s4a.analyse`.
     n_coarse : int
         Vertices of the low-resolution meshes.
+    preset : {None, "paper"}
+        ``"paper"`` leaves out all that is added to 4.1, see :func:`s4a.analyse`.
     seed : int
 
     Returns
@@ -53,9 +53,10 @@ def match_pair(
     xarray.Dataset
         ``fmap(mode_target, mode_source)`` after ZoomOut, ``fmap_initial``, ``match(vertex)`` = on
         each vertex of the target the matched vertex of the source, ``displacement(vertex, xyz)``
-        from the target to the source after rigid alignment (unit of the input),
-        ``confidence(vertex)``, ``round_trip``, ``distortion``; ``rotation``, ``translation``,
-        ``scale`` of that alignment of the source; the way back,
+        from the target to the source after rigid alignment (unit of the input), and what else
+        :func:`s4a.method.register.register` gives; ``fmap_fitted``, the first map before its step
+        of ZoomOut, and with landmarks ``landmark_of_source(landmark)``, ``landmark_of_target``; the
+        way back,
         ``template_triangle(original_vertex)`` and ``template_barycentric``, from the source's
         vertices to the target; attrs ``score`` (:func:`s4a.method.joint.registration_score`),
         ``method``, ``first_map`` ("landmarks", "dense", or of far poses "icp", "hks" or "wks"), and
@@ -77,57 +78,52 @@ def match_pair(
     >>> found["fmap"].shape, bool((abs(found["displacement"]) < 1e-6).all())
     ((10, 10), True)
     """
-    options = Options(k_init=k_init, k=k, init=init, refine=refine, n_coarse=n_coarse, seed=seed)
+    settings = pair_options(options)
     for mesh, what in ((source, "source"), (target, "target")):
         require(mesh, "position", "corner_vertex", what=what)
-    M, N = (
-        Shape(mesh, spectrum(coarsen(mesh, n_coarse=n_coarse, seed=seed), k=k))
-        for mesh in (source, target)
-    )
+    M, N = (shape_of(mesh, settings) for mesh in (source, target))
     least = min(M.low.k, N.low.k)
-    registration, C, C_initial = match_shapes(
-        M,
-        N,
-        k_init=min(k_init, least),
-        k=k,
-        init=options.init,
-        refine=options.refine,
-    )
-    if least < k:
-        note = f"k = {k} reduced to {least}, the eigenfunctions that the smaller mesh has"
+    registration, maps = match_shapes(M, N, settings)
+    if least < settings.k:
+        note = f"k = {settings.k} reduced to {least}, the eigenfunctions that the smaller mesh has"
         registration.attrs["note"] = note
         log.warning("%s", note)
-    match = registration["registered_match"].values
-    maps = dataset(fmap=C, fmap_initial=C_initial, match=match)
+    maps["match"] = registration["registered_match"].variable
     return maps.merge(registration.drop_vars("registered_match")).assign_attrs(registration.attrs)
 
 
-def match_shapes(
-    source: Shape,
-    target: Shape,
-    *,
-    k_init: int = 20,
-    k: int = 100,
-    init: str = "dense",
-    refine: str = "joint",
-) -> tuple[xr.Dataset, np.ndarray, np.ndarray]:
+def shape_of(mesh: xr.Dataset, options: Options) -> Shape:
+    """The shape of a mesh, with its low resolution and functions."""
+    return options.shape(mesh, low_resolution(mesh, **options.of_low_resolution))
+
+
+def match_shapes(source: Shape, target: Shape, options: Options) -> tuple[xr.Dataset, xr.Dataset]:
     """:func:`match_pair` for two shapes: steps 2 to 4 of 4.1, ZoomOut and eq. 4, joint rounds.
 
     Returns
     -------
     registration : Dataset
         As of :func:`s4a.method.register.register`.
-    C, C_initial : float ndarray
-        The final and the first functional map.
+    maps : Dataset
+        ``fmap``, ``fmap_initial``, ``fmap_fitted`` and the landmarks, where there are any.
     """
     M = source.low
     N = target.low
+    k = min(options.k, M.k, N.k)
+    k_init = min(options.k_init, k)
     R, t, _ = align(M.X, M.area, N.X, N.area)
-    name, C_initial, near = first_map(M, N, (R, t), k_init=k_init, init=init)
-    k = min(k, M.k, N.k)
-    C, match = fmap.zoomout(M, N, C_initial, k)
-    C = sharpen_map(source, target, C)
-    starts = {"intrinsic": match, "icp": near}
-    functions = M.Phi[:, :k] @ C.T, N.Phi[:, :k]  # rows of both are compared (eq. 4)
-    registration = register(source, target, starts, functions, k=k, refine=refine)
-    return registration.assign_attrs(first_map=name), C, C_initial
+    ahead = options.ahead == "always"
+    first = first_map(M, N, (R, t), k_init=k_init, init=options.init, ahead=ahead)
+    C, match = fmap.zoomout(M, N, first.C, k, step=options.step)
+    for _ in range(options.sharpen):
+        C = sharpen_map(source, target, C, source.full.Phi if source.is_lifted else None)
+    starts = {"intrinsic": match, "icp": first.near}
+    functions = source.functions(C.T), target.functions(np.eye(k))  # eq. 4 compares rows of both
+    registration = register(
+        source, target, starts, functions, (R, t), k=k, **options.of_registration
+    )
+    maps = dataset(fmap=C, fmap_initial=first.C, fmap_fitted=first.fitted)
+    if first.landmarks is not None:
+        at_source, at_target = first.landmarks
+        maps = maps.merge(dataset(landmark_of_source=at_source, landmark_of_target=at_target))
+    return registration.assign_attrs(first_map=first.name), maps

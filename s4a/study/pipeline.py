@@ -6,7 +6,6 @@ of them is in :mod:`s4a.study.tasks`.
 """
 
 import logging
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,20 +14,24 @@ import numpy as np
 import xarray as xr
 from joblib import effective_n_jobs, parallel_config
 
-from s4a.input.collection import passed_over
-from s4a.input.plausibility import median_size
+from s4a.input.collection import remarks_on_files
+from s4a.input.decisions import doubtful_lines
+from s4a.input.evidence import pick_references
+from s4a.input.plausibility import Doubts, find_warnings
 from s4a.input.subjects import read_table
 from s4a.method.network import choose_pairs, spectral_distance
-from s4a.method.pca import pca
+from s4a.method.pca import pca_without
 from s4a.study.options import Options, takes_options
-from s4a.study.report import write_report
-from s4a.study.runner import Run, Task
-from s4a.study.sources import Collection, Sources, find_sources
+from s4a.study.processes import temporary_folder
+from s4a.study.report import doubtful, of_look, write_report
+from s4a.study.runner import Keys, Run, Task
+from s4a.study.sources import Collection, Sources, find_sources, kept_table, of_contents
 from s4a.study.store import (
     arrays,
     attributes,
     is_done,
     lock,
+    open_file,
     read,
     task_key,
     write,
@@ -39,6 +42,8 @@ from s4a.study.tasks import (
     compare_shape,
     consistent_maps,
     map_pairs,
+    place_shape,
+    portray_shape,
     register_shape,
     remesh_shape,
 )
@@ -46,10 +51,8 @@ from s4a.study.tree import open_study, stack_registration, template_mesh
 
 log = logging.getLogger(__name__)
 
-Keys = dict[str, str]  # name of a shape, or file of several -> key of what was computed
 
-
-@takes_options
+@takes_options()
 def analyse(
     shapes: Collection,
     *,
@@ -74,16 +77,48 @@ def analyse(
         Dimension of the latent space; k by default.
     step : int
         Growth of the maps per round of Consistent ZoomOut.
+    weights : {"cycles", "equal"}
+        Of the maps in eq. 3: by how far their cycles close, see :mod:`s4a.method.network`, or 1.
+    lift : bool, optional
+        Whether the functions are eigenfunctions of the original meshes, nearly
+        (:mod:`s4a.method.lift`), instead of U Phi in eq. 4, 7 and the smoothing of eq. 8.  They are
+        kept in ``/coarse``: 40 MB for 100,000 vertices.  Not by default.
     init : {"dense", "landmarks"}, optional
         First maps from all nearest neighbours after ICP (default), or the paper's fit on 10
-        landmarks.  Of pairs in far poses the former are replaced, see :func:`s4a.match_pair`.
+        landmarks (4.1, steps 3 and 4).  Of pairs in far poses the former are replaced, see
+        :func:`s4a.match_pair`.
+    ahead : {"always", "network", "never"}, optional
+        Whether first maps get a step of ZoomOut without growth ahead (4.2): also those of a pair
+        that is matched on its own (default), those of the network alone, as in the paper, or none.
+    n_spread : int, optional
+        Vertices on which Consistent ZoomOut looks for matches (eq. 3), 1000 by default; 0 for all.
+    wide : int, optional
+        Its last rounds in which these look among all vertices, 4 by default.
+    sharpen : int, optional
+        Of pairs that are matched on their own, see :func:`s4a.match_pair`, as external meshes of a
+        transfer are.
     refine : {"joint", "intrinsic"}, optional
-        Registration with joint rounds (default), or the paper's spectral match alone.
-    how : {"ours", "standard"}, optional
+        Registration with joint rounds (default), or the paper's spectral match alone (eq. 7 or 4).
+    parts : bool, optional
+        Whether in far poses joint rounds turn every part on its own (default).
+    alignment : {"fitted", "icp"}, optional
+        Displacements (eq. 8) are measured after the rigid motion that fits the registered surface
+        best (default), or after that of ICP (4.1, step 2).
+    area_weighted : bool, optional
+        Whether vertices weigh by their areas in the projection after eq. 8 (default), or the pseudo
+        inverse (U Phi)^+ is as printed.
+    n_projected : int, optional
+        Vertices by which that projection is computed, 25,000 by default; 0 for all.
+    both : bool, optional
+        Of transfer: whether a pair that is matched on its own is matched both ways (default), see
+        :func:`s4a.register_pairs`.
+    how : {"ours", "standard"}
         Full resolution by eq. 7 (default), or by eq. 3 and 4; with joint rounds that match is one
         candidate among others.
     norm : {"h2", "h1", "frobenius"}
         Norm of eq. 5, see :func:`s4a.method.median.distance_to_identity`.
+    keep_rounds : bool
+        Whether maps and latent bases of every round of Consistent ZoomOut are kept: ``/rounds``.
     scale : bool
         Whether size is taken out of the displacements.
     components, strict, close_holes, intersections, pattern
@@ -91,8 +126,10 @@ def analyse(
     wrap : bool
         Whether shapes are wrapped watertight before they are remeshed.
     preset : {None, "paper"}
-        ``"paper"`` sets init="landmarks", refine="intrinsic", how="ours"; another value of these is
-        refused.
+        ``"paper"`` leaves out all that is added to the paper: lift=False, init="landmarks",
+        ahead="network", n_spread=0, wide=0, sharpen=0, refine="intrinsic", parts=False,
+        alignment="icp", area_weighted=False, n_projected=0, both=False.  Another value of these is
+        refused; to add them one at a time, give ``s4a.study.options.PAPER`` with one changed.
     template : str, optional
         Name of the shape to register to; the median shape by default.
     table : path, optional
@@ -100,6 +137,12 @@ def analyse(
         :func:`s4a.input.subjects.read_table`; they become ``/subjects``, so that
         :mod:`s4a.analysis.statistics` takes their names.  Nothing else depends on it.  Without one,
         a table given to an earlier run stays.
+    doubtful : {"apart", "stop"}
+        Doubtful shapes, such as one mirrored or of another unit, stay apart by default: they are
+        placed beside the network of all others and registered, so that nothing changes for these.
+        ``"stop"`` ends the run with a ValueError before the long stages, where there are any.
+    keep_doubtful : bool
+        Whether they enter modes and statistics.
     store : path, optional
         Folder of the study.  A run that was killed goes on at the first missing file.
     n_jobs : int, optional
@@ -117,6 +160,7 @@ def analyse(
     ------
     ValueError
         When an option is out of range, or fewer than 2 shapes can be used; the reasons are named.
+        With ``doubtful="stop"``, when a shape is doubtful.
 
     Examples
     --------
@@ -124,22 +168,33 @@ def analyse(
     >>> study = s4a.analyse(s4a.synthetic.brains(3, 200), n_coarse=100, k=10, k_init=6, n_pairs=3)
     >>> list(study["pca"]["score"].dims), study["registration"].sizes["vertex"]
     (['shape', 'component'], 200)
+
+    The paper, and joint rounds alone added to it:
+
+    >>> from s4a.study.options import PAPER
+    >>> small = {"n_coarse": 100, "k": 10, "k_init": 6, "n_pairs": 3}
+    >>> brains = s4a.synthetic.brains(3, 200)
+    >>> paper = s4a.analyse(brains, preset="paper", **small)
+    >>> joint = s4a.analyse(brains, **PAPER | {"refine": "joint"}, **small)
     """
     if store is None:
-        with tempfile.TemporaryDirectory(prefix="s4a-") as folder:
+        with temporary_folder() as folder:
             study = analyse(shapes, store=folder, n_jobs=n_jobs, **options)
             loaded = {n.path: n.to_dataset(inherit=False).load() for n in study.subtree}
             return xr.DataTree.from_dict(loaded)
     settings = Options(**options)
     sources = find_sources(shapes, settings.pattern)
-    remarks = passed_over(shapes, settings.pattern)
+    remarks = remarks_on_files(shapes, settings.pattern)
     settings.check_against(list(sources))
     subjects = None if settings.table is None else read_table(settings.table, list(sources))
     with lock(store) as claim:
         run = Run(claim, n_jobs)
         if subjects is not None:
-            write(subjects, run.folder / "subjects.nc")
-        run_steps(run, sources, settings, remarks)
+            write(of_contents(subjects, sources), run.folder / "subjects.nc")
+        else:
+            remarks += kept_table(run.folder / "subjects.nc", sources)
+        with run.unforeseen_told():
+            run_steps(run, sources, settings, remarks)
     return open_study(store)
 
 
@@ -149,60 +204,120 @@ def run_steps(run: Run, sources: Sources, options: Options, remarks: list[str]) 
     #
     #   original/* -> coarse/* -> network/motion_* -> network/first_* -> network, latent
     #       |                                                                  |
-    #   network/look_*                               registration/* <- registration
+    #   network/sketch_*, look_*  latent/* of those apart -> registration/* <- registration
     #                                                     |
     #                                                pca, report
     original = read_and_clean(run, sources, options)
-    check_plausibility(run, original, options)
+    original, doubts, told = check_plausibility(run, original, options)
+    stop_at_doubts(doubts, options)
     coarse = remesh(run, original, options)
-    spectra = lowest_eigenvalues(run, coarse, options.k_init)
-    aligned = align(run, coarse, spectra)
-    first = first_maps(run, coarse, spectra, aligned, options)
+    doubts, coarse, apart, alone = set_apart(run, coarse, doubts, options)
+    coarse, reference, aligned = align(run, coarse, options)
+    first = first_maps(run, coarse, aligned, options)
     latent = consistent_zoomout(run, coarse, first, options)
-    registered = register(run, coarse, latent, options)
-    why_no_modes = modes(run, registered)
-    write_report(run, sources, options, remarks, why_no_modes, registered)
+    placed = place(run, apart, reference, latent, options)
+    registered = register(run, coarse | apart, placed, latent, options)
+    failed, of_all = doubt_registrations(run, registered, placed)
+    doubts = {name: [*doubts.get(name, []), *failed.get(name, [])] for name in registered}
+    why_no_modes = modes(run, registered, doubts, options)
+    remarks = [*alone, *told, *of_all, *remarks]
+    write_report(run, sources, options, remarks, why_no_modes, registered, doubts)
 
 
 def read_and_clean(run: Run, sources: Sources, options: Options) -> Keys:
     """The shapes, cleaned (5.1): ``/original``."""
     cleaning = {name: getattr(options, name) for name in ("components", "strict", "close_holes")}
     todo = [
-        Task(n, f"original/{n}.nc", clean_shape, (source, cleaning), (content, cleaning))
+        Task(n, f"original/{n}.nc", clean_shape, (source, content, cleaning), (content, cleaning))
         for n, (source, content) in sources.items()
     ]
     return run.do("read and clean", todo)
 
 
-def check_plausibility(run: Run, original: Keys, options: Options) -> None:
-    """Each shape beside that of median size; the report says what is not plausible."""
+def check_plausibility(
+    run: Run, original: Keys, options: Options
+) -> tuple[Keys, Doubts, list[str]]:
+    """What looks wrong with each shape beside the others, and with all of them.
+
+    Returns
+    -------
+    original : dict of str to str
+        Keys of the shapes that could be compared.
+    doubts : dict of str to list of Doubt
+    remarks : list of str
+    """
     if len(original) < 2:
-        return
-    areas = {n: attributes(run.folder / f"original/{n}.nc")["area"] for n in original}
-    reference = median_size(areas)
-    settings = (reference, options.intersections)
-    reference_key = task_key(original[reference], *settings)
+        return original, {}, []
+    attrs = {n: attributes(run.folder / f"original/{n}.nc") for n in original}
+    settings = (options.intersections,)
+    todo = [
+        Task(
+            n, f"network/sketch_{n}.nc", portray_shape, (run.folder, n, *settings), (key, settings)
+        )
+        for n, key in original.items()
+    ]
+    sketches = run.do("sketch", todo)
+    references = references_of(run, sketches, options.k)
+    reference_key = task_key(*(sketches[n] for n in references))
     todo = [
         Task(
             n,
             f"network/look_{n}.nc",
             compare_shape,
-            (run.folder, n, *settings),
+            (run.folder, n, references),
             (reference_key, key),
         )
-        for n, key in original.items()
+        for n, key in sketches.items()
     ]
-    run.do("compare", todo, each=False)
+    compared = run.do("compare", todo)
+    looks = {name: of_look(run, name) for name in compared}
+    return {n: original[n] for n in compared}, *find_warnings({n: attrs[n] for n in looks}, looks)
+
+
+def references_of(run: Run, sketches: Keys, k: int) -> list[str]:
+    """The shapes beside which all are seen: of usual form, fine enough for k."""
+    vertices = {n: open_file(run.folder / f"original/{n}.nc").sizes["vertex"] for n in sketches}
+    least = usable_k(list(vertices.values()), k)
+    fine = [name for name in sketches if vertices[name] >= least]
+    portraits = {n: read(run.folder / f"network/sketch_{n}.nc") for n in fine or sketches}
+    return pick_references(portraits)
+
+
+def stop_at_doubts(doubts: Doubts, options: Options) -> None:
+    """ValueError where a shape is doubtful and the run shall stop at that."""
+    if options.doubtful != "stop":
+        return
+    kinds = {
+        name: " ".join(dict.fromkeys(doubt.kind for doubt in of_shape if doubt.doubtful))
+        for name, of_shape in doubts.items()
+        if name != options.template
+    }
+    kinds = {name: words for name, words in kinds.items() if words}
+    if kinds:
+        lines = "\n".join(f"  {line}" for line in doubtful_lines(kinds))
+        raise ValueError(
+            f"{len(kinds)} of {len(doubts)} shapes are doubtful, and doubtful='stop' ends the run "
+            f"before its long stages:\n{lines}\nmend these files or take them away, "
+            "or give doubtful='apart' to go on with these shapes beside the others"
+        )
 
 
 def remesh(run: Run, original: Keys, options: Options) -> Keys:
     """Low-resolution meshes and their spectra (4.1, step 1): ``/coarse``."""
-    settings = (options.n_coarse, options.wrap, options.seed, options.k)
+    settings: tuple = (options.n_coarse, options.wrap, options.seed, options.k)
+    if options.lift:
+        settings = (*settings, "lift")
     todo = [
-        Task(n, f"coarse/{n}.nc", remesh_shape, (run.folder, n, *settings), (key, settings), (key,))
+        Task(n, f"coarse/{n}.nc", remesh_shape, (run.folder, n, options), (key, settings), (key,))
         for n, key in original.items()
     ]
     coarse = run.do("remesh and spectrum", todo)
+    check_usable(run, coarse, options)
+    return coarse
+
+
+def check_usable(run: Run, coarse: Keys, options: Options) -> None:
+    """ValueError where too few shapes are left, or the template is not among them."""
     if len(coarse) < 2:
         reasons = "; ".join(f"{name}: {why}" for name, why in run.failures.items())
         raise ValueError(
@@ -212,7 +327,68 @@ def remesh(run: Run, original: Keys, options: Options) -> Keys:
     if options.template in run.failures:
         why = run.failures[options.template]
         raise ValueError(f"template {options.template!r} cannot be used: {why}")
-    return coarse
+
+
+def set_apart(
+    run: Run, coarse: Keys, doubts: Doubts, options: Options
+) -> tuple[Doubts, Keys, Keys, list[str]]:
+    """The shapes that make the network, and the doubtful ones, which stand apart from it.
+
+    Those with fewer eigenfunctions than most others are left out.  Where fewer than two are beyond
+    doubt, none is doubtful: there is nothing to hold them against.
+
+    Returns
+    -------
+    doubts : dict of str to list of Doubt
+    coarse, apart : dict of str to str
+        Keys of the low-resolution meshes of both.
+    remarks : list of str
+    """
+    count = {n: len(arrays(run.folder / f"coarse/{n}.nc", "eigenvalue")[0]) for n in coarse}
+    named = options.template  # who names a template trusts it
+    is_doubtful = {n: any(doubt.doubtful for doubt in doubts.get(n, [])) for n in coarse}
+    sure = [n for n in coarse if n == named or not is_doubtful[n]]
+    remarks = []
+    if len(sure) < 2:
+        doubts = {
+            n: [doubt._replace(doubtful=False) for doubt in doubts.get(n, [])] for n in doubts
+        }
+        if len(coarse) > 1:
+            remarks = [
+                f"{len(coarse) - len(sure)} of {len(coarse)} shapes are doubtful, and fewer than "
+                "two are not: all are treated alike"
+            ]
+        sure = list(coarse)
+    k = usable_k([count[n] for n in sure], options.k)
+    enough = sum(count[n] >= k for n in sure)
+    for n in coarse:
+        if count[n] < k:
+            run.failures[n] = (
+                f"only {count[n]} eigenfunctions, where {enough} of {len(sure)} shapes have "
+                f"{k} or more: give a finer mesh, or a smaller k"
+            )
+    network = {n: coarse[n] for n in sure if count[n] >= k}
+    apart = {n: coarse[n] for n in coarse if n not in sure and count[n] >= k}
+    check_usable(run, network, options)
+    return doubts, network, apart, remarks
+
+
+def usable_k(counts: Sequence[int], k: int) -> int:
+    """The size of maps that most shapes allow, by their numbers of eigenfunctions.
+
+    It is k where most have as many.  Else it is the least number of those shapes that have at least
+    half of what is usual: few eigenfunctions of one shape are no reason to take them from all.
+
+    Examples
+    --------
+    >>> from s4a.study.pipeline import usable_k
+    >>> usable_k([100, 100, 2], 100), usable_k([58, 2, 48, 62], 100)
+    (100, 48)
+    """
+    if 2 * sum(count >= k for count in counts) > len(counts):
+        return k
+    usual = np.median(counts)
+    return min(count for count in counts if 2 * count >= usual)
 
 
 def lowest_eigenvalues(run: Run, coarse: Keys, k_init: int) -> np.ndarray:
@@ -222,31 +398,38 @@ def lowest_eigenvalues(run: Run, coarse: Keys, k_init: int) -> np.ndarray:
     return np.stack([spectrum[:k_init] for spectrum in spectra])
 
 
-def align(run: Run, coarse: Keys, spectra: np.ndarray) -> str:
+def align(run: Run, coarse: Keys, options: Options) -> tuple[Keys, tuple[str, str], str]:
     """All shapes moved onto the one whose spectrum is nearest to all others (4.1, step 2).
 
     Returns
     -------
-    str
+    coarse : dict of str to str
+        Keys of the shapes that could be moved.
+    reference : tuple (name, key)
+        The shape that they were moved onto.
+    aligned : str
         The key that all motions depend on.
     """
     names = list(coarse)
+    spectra = lowest_eigenvalues(run, coarse, options.k_init)
     reference = names[int(np.argmin(spectral_distance(spectra).sum(1)))]
     aligned = task_key(list(coarse.values()), names, reference)
     todo = [
         Task(n, f"network/motion_{n}.nc", align_shape, (run.folder, n, reference), (aligned, n))
         for n in names
     ]
-    run.do("align", todo, each=False)
-    return aligned
+    moved = {name: coarse[name] for name in run.do("align", todo)}
+    check_usable(run, moved, options)
+    return moved, (reference, coarse[reference]), aligned
 
 
-def first_maps(run: Run, coarse: Keys, spectra: np.ndarray, aligned: str, options: Options) -> Keys:
+def first_maps(run: Run, coarse: Keys, aligned: str, options: Options) -> Keys:
     """The pairs of the network, of like spectra, and their first maps (4.1, steps 3 and 4)."""
+    spectra = lowest_eigenvalues(run, coarse, options.k_init)
     names, k_init = list(coarse), spectra.shape[1]
     pairs = choose_pairs(spectral_distance(spectra), options.n_pairs)
     batches = in_batches([[names[i], names[j]] for i, j in pairs])
-    settings = (k_init, options.init)
+    settings = (k_init, options.of_first_maps)
     files = {f"network/first_{i:03d}.nc": batch for i, batch in enumerate(batches)}
     todo = [
         Task(f, f, map_pairs, (run.folder, batch, *settings), (aligned, batch, *settings))
@@ -277,50 +460,117 @@ def consistent_zoomout(run: Run, coarse: Keys, first: Keys, options: Options) ->
         The key of both.
     """
     settings = (options.k, options.step, options.n_latent, options.norm)
-    key = task_key(list(first.values()), *settings)
-    if is_done(run.folder / "network.nc", key) and is_done(run.folder / "latent.nc", key):
+    rounds_of = (options.weights, options.n_spread, options.wide, options.keep_rounds)
+    key = task_key(list(first.values()), *settings, *rounds_of)
+    kept = list((run.folder / "rounds").glob("k_*.nc")) if options.keep_rounds else []
+    files = [run.folder / "network.nc", run.folder / "latent.nc", *kept]
+    if bool(kept) == options.keep_rounds and all(is_done(file, key) for file in files):
         return key
     with run.stage("consistent ZoomOut and median"):
         maps = xr.concat([read(run.folder / file) for file in first], dim="pair")
         with parallel_config(backend="threading"):  # here, whatever backend the tasks run on
             n_threads = effective_n_jobs(run.n_jobs)
-        net, latent = consistent_maps(run.folder, list(coarse), maps, options, n_threads)
-        write(net, run.folder / "network.nc", key, coarse.values())
-        write(latent, run.folder / "latent.nc", key, coarse.values())
+        tree = consistent_maps(run.folder, list(coarse), maps, options, n_threads)
+        for old in (run.folder / "rounds").glob("k_*.nc"):  # of other maps
+            old.unlink()
+        rounds = [f"rounds/{name}" for name in tree["rounds"].children] if "rounds" in tree else []
+        for node in [*rounds, "network", "latent"]:
+            write(tree[node].to_dataset(), run.folder / f"{node}.nc", key, coarse.values())
     return key
 
 
-def register(run: Run, coarse: Keys, latent: str, options: Options) -> Keys:
-    """Every shape registered to the template, the median shape by default (4.2, eq. 6 to 8)."""
-    template = options.template or attributes(run.folder / "latent.nc")["median"]
-    way = (template, options.how, options.refine, options.scale)
-    template_key = task_key(latent, way)
-    mesh = template_mesh(read(run.folder / f"original/{template}.nc"), template)
-    write(mesh, run.folder / "registration.nc", template_key, [latent])
+def place(run: Run, apart: Keys, reference: tuple[str, str], latent: str, options: Options) -> Keys:
+    """The shapes that stand apart, beside the network as it is (eq. 3): ``/latent/<shape>``.
+
+    Each is aligned to the reference of the network, and its latent basis solves for its maps to
+    some shapes of the network, whose bases stay.
+
+    Parameters
+    ----------
+    apart : dict of str to str
+        Keys of their low-resolution meshes.
+    reference : tuple (name, key)
+    """
+    name, reference_key = reference
+    todo = [
+        Task(n, f"network/motion_{n}.nc", align_shape, (run.folder, n, name), (reference_key, key))
+        for n, key in apart.items()
+    ]
+    aligned = run.do("align doubtful shapes", todo) if apart else {}
+    settings = (options.k_init, options.of_first_maps, options.step, options.n_spread, options.norm)
     todo = [
         Task(
             n,
-            f"registration/{n}.nc",
-            register_shape,
-            (run.folder, n, *way),
-            (template_key, key),
-            (template_key,),
+            f"latent/{n}.nc",
+            place_shape,
+            (run.folder, n, options),
+            (latent, apart[n], key, settings),
+            (latent, apart[n]),
         )
-        for n, key in coarse.items()
+        for n, key in aligned.items()
     ]
+    return run.do("place doubtful shapes", todo) if aligned else {}
+
+
+def register(run: Run, coarse: Keys, placed: Keys, latent: str, options: Options) -> Keys:
+    """Every shape registered to the template, the median shape by default (4.2, eq. 6 to 8)."""
+    template = options.template or attributes(run.folder / "latent.nc")["median"]
+    projection = (options.area_weighted, options.n_projected)
+    way = (template, options.how, options.of_registration, projection)
+    template_key = task_key(latent, way)
+    mesh = template_mesh(read(run.folder / f"original/{template}.nc"), template)
+    if placed:
+        mesh.attrs["apart"] = " ".join(placed)
+    write(mesh, run.folder / "registration.nc", template_key, [latent])
+    todo = []
+    for n, key in sorted(coarse.items()):
+        if n in run.failures:
+            continue
+        own = (placed[n],) if n in placed else ()
+        todo.append(
+            Task(
+                n,
+                f"registration/{n}.nc",
+                register_shape,
+                (run.folder, n, template, options),
+                (template_key, key, *own),
+                (template_key, *own),
+            )
+        )
     return run.do("registration", todo)
 
 
-def modes(run: Run, registered: Keys) -> str:
-    """The modes of the displacements (6.1): ``/pca``; the reason where there can be none."""
+def doubt_registrations(run: Run, registered: Keys, placed: Keys) -> tuple[Doubts, list[str]]:
+    """What is doubtful of the registrations within the network."""
+    names = [name for name in registered if name not in placed]
+    files = {name: run.folder / f"registration/{name}.nc" for name in names}
+    badness = {name: attributes(file)["score"] for name, file in files.items()}
+    distortion = {
+        name: float(np.abs(arrays(file, "distortion")[0]).mean()) for name, file in files.items()
+    }
+    return doubtful(badness, distortion)
+
+
+def modes(run: Run, registered: Keys, doubts: Doubts, options: Options) -> str:
+    """The modes of the displacements (6.1): ``/pca``; the reason where there can be none.
+
+    They are made without the doubtful shapes, whose scores are measured along them.
+    """
     with run.stage("modes"):
         mesh = read(run.folder / "registration.nc")
+        template = mesh.attrs["template"]
         files = {name: read(run.folder / f"registration/{name}.nc") for name in registered}
         data = stack_registration(mesh, files, list(files))["registration"]
-        coarse = read(run.folder / f"coarse/{mesh.attrs['template']}.nc")
+        apart = [
+            name
+            for name in registered
+            if name != template and any(doubt.doubtful for doubt in doubts[name])
+        ]
+        apart = [] if options.keep_doubtful else apart
+        coarse = read(run.folder / f"coarse/{template}.nc")
         keys = list(registered.values())
         try:
-            result = pca(data, mesh["vertex_area"].values, coarse=coarse)
+            result = pca_without(data, apart, coarse)
         except ValueError as error:
             log.warning("no modes: %s", error)
             (run.folder / "pca.nc").unlink(missing_ok=True)

@@ -7,6 +7,7 @@ import numpy as np
 import xarray as xr
 
 from s4a.input.collection import shape_report
+from s4a.input.plausibility import Doubts, doubt
 from s4a.schema import dataset
 from s4a.study.options import Options
 from s4a.study.runner import Run
@@ -15,6 +16,11 @@ from s4a.study.store import arrays, attributes, read, write
 
 # badness: of one kind 0.02 to 0.03, in far poses 0.01 to 0.03, of a cat and a man 0.14 to 0.16
 DOUBTFUL = 0.06
+# badness times mean |distortion|: of pairs of bodies and cats that are right 0.0002 to 0.005, of
+# those that failed 0.0033 to 0.08 (docs/plausibility.md)
+WRONG, UNSURE = 0.0065, 0.004
+# and times the median of the collection, as coarse meshes raise the product of all shapes
+WRONG_BESIDE, UNSURE_BESIDE = 2.0, 1.5
 
 
 def write_report(
@@ -24,6 +30,7 @@ def write_report(
     remarks: list[str],
     no_modes: str,
     registered: dict[str, str],
+    doubts: Doubts,
 ) -> None:
     """Write ``/report``: every shape, what looks wrong, what was reduced, costs and options.
 
@@ -39,30 +46,33 @@ def write_report(
         Why there are no modes; empty where there are.
     registered : dict of str to str
         Keys of the registrations.
+    doubts : dict of str to list of Doubt
+        About the registered shapes.
     """
     names = list(registered)
     template = attributes(run.folder / "registration.nc")["template"]
     network, latent = read(run.folder / "network.nc"), read(run.folder / "latent.nc")
-    badness = {n: attributes(run.folder / f"registration/{n}.nc")["score"] for n in names}
-    spectra = {n: arrays(run.folder / f"coarse/{n}.nc", "eigenvalue")[0] for n in names}
-    of_shapes, of_all = doubtful(badness)
+    together = latent["shape"].values.tolist()
+    spectra = {n: arrays(run.folder / f"coarse/{n}.nc", "eigenvalue")[0] for n in together}
     report = shape_report(
         {name: of_shape(run, name, source, options) for name, (source, _) in sources.items()},
-        {name: of_look(run, name) for name in names},
+        doubts,
         [
+            *reduced_k(options.k, latent.sizes["mode"], spectra),
             *remarks,
-            *of_all,
-            *reductions(options, network.sizes["pair"] // 2, latent.sizes["mode"], spectra),
-            *tied(latent["shape"].values.tolist(), latent["distance_to_median"].values),
+            *reduced_pairs(options.n_pairs, network.sizes["pair"] // 2, len(spectra)),
+            *tied(together, latent["distance_to_median"].values),
         ],
-        of_shapes,
+        {name: of_look(run, name) for name in names},
     )
     report = report.assign(costs(run).variables)
     report = report.assign_attrs(options.to_report() | {"template": template, "no_modes": no_modes})
-    warning = report["warning"].sel(shape=template).item()
-    if warning:
+    report.attrs["unforeseen"] = " ".join(run.unforeseen)  # names of shapes, which have no blanks
+    of_template = report.sel(shape=template)
+    if of_template["status"].item() == "doubtful":
         report.attrs["remarks"] += (
-            f"\nthe template {template} is itself doubtful ({warning}): give template=NAME"
+            f"\nthe template {template}, which was named, is itself doubtful "
+            f"({of_template['warning'].item()})"
         )
     write(report, run.folder / "report.nc", made_from=registered.values())
 
@@ -85,10 +95,9 @@ def of_shape(run: Run, name: str, source: str | xr.Dataset, options: Options) ->
     return mesh | {"reason": "; ".join(done)} | path
 
 
-def of_look(run: Run, name: str) -> dict:
-    """What :func:`s4a.input.plausibility.examine` saw in a shape."""
-    look = read(run.folder / f"network/look_{name}.nc")
-    return look.attrs | {"rotation": look["rotation"].values}
+def of_look(run: Run, name: str) -> xr.Dataset:
+    """What :func:`s4a.input.evidence.compare` saw in a shape."""
+    return read(run.folder / f"network/look_{name}.nc")
 
 
 def costs(run: Run) -> xr.Dataset:
@@ -97,14 +106,23 @@ def costs(run: Run) -> xr.Dataset:
     return dataset(seconds=seconds, peak_memory=memory).assign_coords(stage=list(run.costs))
 
 
-def doubtful(badness: dict[str, float]) -> tuple[dict[str, str], list[str]]:
-    """Warnings for the shapes whose registration scores badly, or for all of them.
+def doubtful(
+    badness: dict[str, float], distortion: dict[str, float] | None = None
+) -> tuple[Doubts, list[str]]:
+    """Doubts about the shapes whose registration scores badly, or for all of them.
 
-    See :func:`s4a.method.joint.registration_score`.
+    Parameters
+    ----------
+    badness : dict of str to float
+        See :func:`s4a.method.joint.registration_score`.
+    distortion : dict of str to float, optional
+        Mean size of the distortion.  A wrong map both misses the surface and distorts: the product
+        is told where neither number alone is.
 
     Returns
     -------
-    of_shapes : dict of str to str
+    of_shapes : dict of str to list of Doubt
+        Of the kind ``registration``; only names that have one.
     of_all : list of str
         In place of the former where most shapes are doubtful: then the template or the options are.
 
@@ -115,50 +133,69 @@ def doubtful(badness: dict[str, float]) -> tuple[dict[str, str], list[str]]:
     >>> list(of_shapes), of_all
     (['wrong'], [])
     """
-    wrong = {name: score for name, score in badness.items() if score > DOUBTFUL}
+    distortion = distortion or {}
+    product = {name: score * distortion.get(name, 0.0) for name, score in badness.items()}
+    usual = float(np.median([one for one in product.values() if one > 0] or [0.0]))
+    far, near = max(WRONG, WRONG_BESIDE * usual), max(UNSURE, UNSURE_BESIDE * usual)
+    wrong = {n: score for n, score in badness.items() if score > DOUBTFUL or product[n] > far}
     if len(badness) > 2 and len(wrong) > len(badness) / 2:
         return {}, [
             f"{len(wrong)} of {len(badness)} registrations are doubtful "
-            f"(badness {min(wrong.values()):.3f} to {max(wrong.values()):.3f}, above {DOUBTFUL}): "
+            f"(badness {min(wrong.values()):.3f} to {max(wrong.values()):.3f}): "
             "try another template, a larger n_coarse or k"
         ]
-    return {
-        name: f"probably registered wrongly (badness {score:.3f}, above {DOUBTFUL}): "
-        "look at it in s4a view, compare its file with the template's, or leave it out"
-        for name, score in wrong.items()
-    }, []
+    found: Doubts = {}
+    for name, score in badness.items():
+        if name not in wrong and product[name] <= near:
+            continue
+        sure = "probably" if name in wrong else "maybe, in places,"
+        also = f", mean |distortion| {distortion[name]:.2f}" if name in distortion else ""
+        words = (
+            f"{sure} registered wrongly (badness {score:.3f}{also}): "
+            "look at it in s4a view, compare its file with the template's, or leave it out"
+        )
+        found[name] = [doubt("registration", words, name in wrong)]
+    return found, []
 
 
-def reductions(options: Options, n_pairs: int, k: int, spectra: dict) -> list[str]:
-    """What of the options was reduced to what the shapes allow, in words.
+def reduced_k(asked: int, k: int, spectra: dict) -> list[str]:
+    """Whether the maps are smaller than was asked for, in words.
 
     Parameters
     ----------
-    options : Options
-    n_pairs, k : int
-        Pairs and size of the maps that were used.
+    asked, k : int
+        Size of the maps that was asked for, and that was used.
     spectra : dict of str to sequence
         The eigenvalues of every shape.
 
     Examples
     --------
-    >>> from s4a.study.options import Options
-    >>> from s4a.study.report import reductions
-    >>> spectra = {"a": range(100), "b": range(57), "c": range(100)}
-    >>> for words in reductions(Options(n_pairs=500, k=100), 3, 57, spectra):
-    ...     print(words)
-    all 3 pairs of 3 shapes are used (n_pairs = 500)
-    k = 100 reduced to 57, the eigenfunctions of b
+    >>> from s4a.study.report import reduced_k
+    >>> reduced_k(100, 57, {"a": range(80), "b": range(57), "c": range(100)})
+    ['k = 100 reduced to 57, the eigenfunctions of b: 2 of 3 shapes have fewer than 100']
     """
-    words = []
-    if n_pairs < options.n_pairs:
-        words.append(
-            f"all {n_pairs} pairs of {len(spectra)} shapes are used (n_pairs = {options.n_pairs})"
-        )
-    if k < options.k:
-        shortest = min(spectra, key=lambda name: len(spectra[name]))
-        words.append(f"k = {options.k} reduced to {k}, the eigenfunctions of {shortest}")
-    return words
+    if k >= asked:
+        return []
+    shortest = min(spectra, key=lambda name: len(spectra[name]))
+    fewer = sum(len(values) < asked for values in spectra.values())
+    return [
+        f"k = {asked} reduced to {k}, the eigenfunctions of {shortest}: {fewer} of "
+        f"{len(spectra)} shapes have fewer than {asked}"
+    ]
+
+
+def reduced_pairs(asked: int, n_pairs: int, n: int) -> list[str]:
+    """Whether n shapes have fewer pairs than was asked for, in words.
+
+    Examples
+    --------
+    >>> from s4a.study.report import reduced_pairs
+    >>> reduced_pairs(500, 3, 3)
+    ['all 3 pairs of 3 shapes are used (n_pairs = 500)']
+    """
+    if n_pairs >= asked:
+        return []
+    return [f"all {n_pairs} pairs of {n} shapes are used (n_pairs = {asked})"]
 
 
 def tied(names: list[str], distance: np.ndarray, relative: float = 1e-6) -> list[str]:

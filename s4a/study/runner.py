@@ -1,27 +1,32 @@
 """Tasks of a run over a study folder (4): what is done already, processes, costs, failures."""
 
 import contextlib
+import faulthandler
 import json
 import logging
 import os
 import sys
-import threading
 import time
+import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 import psutil
 import xarray as xr
-from joblib import Parallel, delayed
+from joblib import delayed, effective_n_jobs
 from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
-from s4a.study.store import Claim, is_done, task_key, write
+from s4a.study.processes import died, workers
+from s4a.study.seal import open_regular
+from s4a.study.store import LOGS, Claim, is_done, open_without_following, task_key, write
 
 log = logging.getLogger(__name__)
+
+Keys = dict[str, str]  # name of a shape, or file of several -> key of what was computed
+BEGUN = "begun"
 
 
 @dataclass(frozen=True)
@@ -63,6 +68,34 @@ class Task:
         return task_key(*self.inputs)
 
 
+class StageError(RuntimeError):
+    """A stage that needs all shapes cannot be done, for a reason that is not in the input."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a task.
+
+    Parameters
+    ----------
+    name : str
+        Of the task.
+    failure : str
+        Why there is no file; empty where it was written.
+    unforeseen : bool
+        Whether that is none of the errors with which S4A refuses its input.
+    pid : int
+    memory : float
+        Peak of that process in MiB.
+    """
+
+    name: str
+    failure: str = ""
+    unforeseen: bool = False
+    pid: int = 0
+    memory: float = 0.0
+
+
 class Run:
     """One run over a study folder: does what is not done yet, keeps time, memory and failures.
 
@@ -70,16 +103,17 @@ class Run:
     ----------
     failures : dict of str to str
         Name of a shape that is left out -> why.
+    unforeseen : list of str
+        Those of them whose files are not the reason.
     costs : dict of str to tuple
         Seconds and MiB of every stage, those of earlier runs over the folder included.
     """
 
     def __init__(self, claim: Claim, n_jobs: int | None):
         self.folder, self.n_jobs, self.claim = claim.folder, n_jobs, claim
-        self.failures, self.costs = {}, {}
-        with contextlib.suppress(OSError, ValueError):
-            costs = json.loads(self.costs_file.read_text())
-            self.costs = {stage: [float(x) for x in cost] for stage, cost in costs.items()}
+        self.failures, self.unforeseen = {}, []
+        self.costs = read_costs(self.costs_file)
+        self.doing = "begin"
 
     @property
     def costs_file(self) -> Path:
@@ -94,7 +128,7 @@ class Run:
         to do, and take their place where all of it is.
         """
         begin = time.perf_counter()
-        self.workers = {}
+        self.doing, self.workers = name, {}
         seconds, memory = self.costs.get(name, (0.0, 0.0)) if share < 1 else (0.0, 0.0)
         try:
             yield
@@ -104,68 +138,213 @@ class Run:
                 memory = np.fmax(memory, sum((self.workers | own).values()))
                 self.costs[name] = [seconds + time.perf_counter() - begin, float(memory)]
                 with contextlib.suppress(OSError):
-                    self.costs_file.write_text(json.dumps(self.costs))
+                    new = self.costs_file.with_name(".costs.json.tmp")
+                    new.unlink(missing_ok=True)
+                    new.write_text(json.dumps(self.costs))
+                    os.replace(new, self.costs_file)  # a link in its place is not followed
 
-    def do(self, stage: str, tasks: list[Task], *, each: bool = True) -> dict[str, str]:
+    def do(self, stage: str, tasks: list[Task], *, each: bool = True) -> Keys:
         """Do the tasks whose file is not done; name -> key of all that are done then.
 
-        A ValueError is kept as a failure where the tasks are one for `each` shape, and raised where
-        all need all.
+        An error in a task is kept as a failure where the tasks are one for `each` shape, and raised
+        where all need all.  One of files (no room, no such file) is always raised: it is not of the
+        shape, and what is finished is kept.
         """
-        missing = [task for task in tasks if not is_done(self.folder / task.file, task.key)]
+        missing = [task for task in tasks if not self.has(task)]
         with self.stage(stage, len(missing) / max(len(tasks), 1)):
             log.info("%s: %d of %d to do", stage, len(missing), len(tasks))
-            jobs = (delayed(do_task)(task, self.claim) for task in missing)
-            results = Parallel(n_jobs=self.n_jobs, return_as="generator_unordered")(jobs)
-            bar = tqdm(results, total=len(missing), desc=stage, disable=not missing)
-            for name, failure, pid, memory in bar:
-                self.workers[pid] = max(memory, self.workers.get(pid, 0))
-                if failure and not each:
-                    raise ValueError(f"{stage}: {failure}")
-                if failure:
-                    self.failures[name] = f"{stage}: {failure}"
+            outcomes = self.outcomes(missing)
+            for done in tqdm(outcomes, total=len(missing), desc=stage, disable=not missing):
+                self.workers[done.pid] = max(done.memory, self.workers.get(done.pid, 0))
+                if done.failure and not each:
+                    raise (StageError if done.unforeseen else ValueError)(
+                        f"{stage}: {done.failure}; what is finished is kept"
+                    )
+                if done.unforeseen:
+                    log.warning("%s is left out: %s: %s", done.name, stage, done.failure)
+                    self.unforeseen.append(done.name)
+                if done.failure:
+                    self.failures[done.name] = f"{stage}: {done.failure}"
         return {task.name: task.key for task in tasks if task.name not in self.failures}
 
+    def outcomes(self, tasks: list[Task]) -> Iterator[Outcome]:
+        """Do the tasks side by side, each in a process of its own where two processes died of it.
 
-def do_task(task: Task, claim: Claim) -> tuple[str, str, int, float]:
-    """Compute one Dataset and write its file; with one BLAS thread, as tasks run side by side.
+        When a worker dies, joblib ends the others too.  Those that were at work then come one at a
+        time, until one dies alone: that one has failed, and the rest go on side by side.
+        """
+        todo = {task.name: task for task in tasks}
+        suspects = [name for name, task in todo.items() if deaths(self.claim, task) > 1]
+        while todo:
+            alone = suspects[:1]
+            begun = []
 
-    Returns
-    -------
-    name, failure : str
-        Why there is no file; empty where it was written.
-    pid : int
-    memory : float
-        Peak of this process in MiB.
+            def jobs(names=alone or list(todo), begun=begun):
+                for name in names:
+                    begun.append(name)
+                    yield delayed(do_task)(todo[name], self.claim)
+
+            n_jobs = max(2, effective_n_jobs(self.n_jobs)) if alone else self.n_jobs
+            # meshes in memory go through the pipe: files to share them would outlive a killed run
+            parallel = workers(n_jobs, return_as="generator_unordered", max_nbytes=None)
+            try:
+                for outcome in parallel(jobs()):
+                    yield outcome
+                    del todo[outcome.name]
+                suspects = suspects[1:]
+            except Exception as error:
+                how = died(error)
+                if not how:
+                    raise
+                finished = [name for name in begun if name in todo and self.has(todo[name])]
+                for name in finished:  # and its process died before it could say so
+                    yield Outcome(todo.pop(name).name)
+                if alone and alone[0] in todo:
+                    task, suspects = todo.pop(alone[0]), []
+                    yield Outcome(task.name, f"its process died ({how}); {see(task)}", True)
+                elif begun:
+                    suspects = [name for name in begun if name in todo]
+                    suspects = [n for n in suspects if deaths(self.claim, todo[n])] or suspects
+                else:
+                    raise StageError(f"processes die before they begin ({how})") from error
+
+    def has(self, task: Task) -> bool:
+        """Whether the file of a task is there, whole and of this key."""
+        return is_done(self.folder / task.file, task.key)
+
+    @contextlib.contextmanager
+    def unforeseen_told(self) -> Iterator[None]:
+        """An error that nobody foresaw becomes a StageError, its traceback a file of the study."""
+        file = self.folder / LOGS / "run.txt"
+        file.unlink(missing_ok=True)
+        try:
+            yield
+        except (ValueError, OSError, StageError):
+            raise
+        except Exception as error:
+            note(file, traceback.format_exc())
+            raise StageError(
+                f"{self.doing}: {in_a_line(error)}: a fault of S4A or of its installation, not of "
+                f"a shape; its traceback is in {file}; finished files are kept"
+            ) from error
+
+
+def read_costs(path: Path) -> dict[str, list[float]]:
+    """Seconds and MiB of every stage from the file of an earlier run.
+
+    They are only told: a file of any other form is told and counts as none.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from s4a.study.runner import read_costs
+    >>> read_costs(Path("absent.json"))
+    {}
     """
-    end_with(claim.owner)
-    claim.check()
-    failure = ""
     try:
-        with threadpool_limits(1):
-            data = task.function(*task.arguments)
-    except ValueError as error:
-        failure = str(error)
-    else:
-        write(data, claim.folder / task.file, task.key, task.made_from, claim)
-    return task.name, failure, os.getpid(), peak_memory()
+        with open_regular(path) as file:
+            stages = json.loads(file.read(2**20).decode()).items()
+        costs = {stage: [float(seconds), float(memory)] for stage, (seconds, memory) in stages}
+        for seconds, memory in costs.values():  # memory is nan where the system does not say it
+            if not 0 <= seconds < 1e12 or memory < 0 or memory > 1e12:
+                raise ValueError(f"{seconds} s and {memory} MiB are none")
+    except FileNotFoundError:
+        return {}
+    except Exception as error:  # whatever it holds, the run goes on
+        log.warning("%s cannot be read (%s): times of earlier runs are not counted", path, error)
+        return {}
+    return costs
 
 
-@cache
-def end_with(owner: int) -> None:
-    """Let a worker process that process `owner` started end within a second of it.
+def do_task(task: Task, claim: Claim) -> Outcome:
+    """Compute one Dataset and write its file; with one BLAS thread, as tasks run side by side."""
+    claim.check()
+    file = log_file(claim, task)
+    failure, unforeseen = "", False
+    with at_work(file, claim):
+        try:
+            with threadpool_limits(1):
+                data = task.function(*task.arguments)
+            write(data, claim.folder / task.file, task.key, task.made_from, claim)
+        except OSError:  # of the folder or of the disk, not of the shape
+            raise
+        except (Exception, SystemExit) as error:  # whatever it is, it costs this task only
+            claim.check()
+            text, unforeseen = traceback.format_exc(), not isinstance(error, ValueError)
+            failure = f"{in_a_line(error)}; {see(task)}" if unforeseen else str(error)
+    if failure:
+        note(file, text)
+    return Outcome(task.name, failure, unforeseen, os.getpid(), peak_memory())
 
-    However that ended: a killed run tells its workers nothing.
+
+def log_file(claim: Claim, task: Task) -> Path:
+    """Where a task that is at work, or failed, is recorded."""
+    return claim.folder / log_name(task)
+
+
+def log_name(task: Task) -> str:
+    """The name of that file in the folder of the study."""
+    return f"{LOGS}/{task.file.replace('/', '-').removesuffix('.nc')}.txt"
+
+
+def see(task: Task) -> str:
+    """Where the traceback of a task is, in words."""
+    return f"see {log_name(task)} in the folder of the study"
+
+
+def in_a_line(error: BaseException) -> str:
+    """Kind and text of an error.
+
+    Examples
+    --------
+    >>> from s4a.study.runner import in_a_line
+    >>> in_a_line(IndexError("too\\nlarge"))
+    'IndexError: too large'
     """
-    if os.getppid() != owner:
-        return
+    text = " ".join(str(error).split())
+    return type(error).__name__ + (f": {text[:300]}" if text else "")
 
-    def watch():
-        while os.getppid() == owner:
-            time.sleep(0.5)
-        os._exit(1)
 
-    threading.Thread(target=watch, daemon=True).start()
+def note(file: Path, text: str) -> None:
+    """Write a file of the log, in place of what it said before."""
+    with contextlib.suppress(OSError):  # the disk may be what the error is about
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with open(file, "w", encoding="utf-8", opener=open_without_following) as log_of_task:
+            log_of_task.write(text)
+
+
+@contextlib.contextmanager
+def at_work(file: Path, claim: Claim) -> Iterator[None]:
+    """Record a task while it is at work; the record stays where its process dies.
+
+    In a worker of the run it then says where, if the system let it: that of a segmentation fault.
+    """
+    record, of_worker = None, os.getppid() == claim.owner
+    with contextlib.suppress(OSError):  # what the task writes will tell
+        file.parent.mkdir(parents=True, exist_ok=True)
+        record = open(file, "a", encoding="utf-8", opener=open_without_following)
+        record.write(f"{BEGUN} by process {os.getpid()}, {time.strftime('%Y-%m-%d %H:%M:%S')}\n")
+        record.flush()
+    try:
+        if record and of_worker:
+            faulthandler.enable(record)
+        yield
+    finally:
+        if record and of_worker:
+            faulthandler.enable()  # on the error stream, as joblib has it
+        with contextlib.suppress(OSError):
+            if record:
+                record.close()
+            file.unlink(missing_ok=True)
+
+
+def deaths(claim: Claim, task: Task) -> int:
+    """How often a task was begun by a process that died before it ended."""
+    try:
+        lines = log_file(claim, task).read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        return 0
+    return sum(line.startswith(BEGUN) for line in lines)
 
 
 def peak_memory() -> float:

@@ -6,9 +6,11 @@ from typing import Any
 import xarray as xr
 
 from s4a.geometry.mesh import as_dataset
-from s4a.input.files import find_meshes, slug
+from s4a.input.files import check_names, find_meshes
+from s4a.input.raw import read_bytes
+from s4a.input.subjects import listed
 from s4a.schema import require
-from s4a.study.store import task_key
+from s4a.study.store import read, task_key
 
 # files; or meshes in memory by name, Datasets or (points, triangles); or what read_shapes gives
 Collection = Path | str | list[Path | str] | dict[str, Any] | xr.DataTree
@@ -44,10 +46,8 @@ def find_sources(shapes: Collection, pattern: str | None = None) -> Sources:
         shapes = {name: node.to_dataset() for name, node in shapes["original"].children.items()}
     if not isinstance(shapes, dict):
         files = sorted((name, path) for path, name in find_meshes(shapes, pattern))
-        return {name: (str(path), task_key(Path(path).read_bytes())) for name, path in files}
-    wrong = [name for name in shapes if not isinstance(name, str) or slug(name) != name]
-    if wrong or not shapes:
-        raise ValueError(f"shapes need names of letters, digits, _ and -; found {wrong or 'none'}")
+        return {name: (str(path), content_of_file(path)) for name, path in files}
+    check_names(shapes)
     meshes = {
         name: mesh if isinstance(mesh, xr.Dataset) else as_dataset(*mesh)
         for name, mesh in sorted(shapes.items())
@@ -57,8 +57,45 @@ def find_sources(shapes: Collection, pattern: str | None = None) -> Sources:
     return {name: (mesh, content_key(mesh)) for name, mesh in meshes.items()}
 
 
+def content_of_file(path: Path | str) -> str:
+    """The key of the bytes of a file, or of why it cannot be read, which its task will say."""
+    try:
+        return task_key(read_bytes(path))
+    except ValueError as error:
+        return task_key(str(error))
+
+
 def content_key(mesh: xr.Dataset) -> str:
     """The key of everything that a mesh in memory holds, labels and landmarks too."""
     variables = {str(name): variable.values for name, variable in sorted(mesh.variables.items())}
     parts = [v.tolist() if v.dtype.hasobject else v for v in variables.values()]
     return task_key(list(variables), *parts)
+
+
+def of_contents(subjects: xr.Dataset, sources: Sources) -> xr.Dataset:
+    """A table of the shapes that knows the contents it was given for, for :func:`kept_table`."""
+    keys = [sources[name][1] for name in subjects["shape"].values.tolist()]
+    return subjects.assign_attrs(contents=" ".join(keys))
+
+
+def kept_table(file: Path, sources: Sources) -> list[str]:
+    """What of a table of an earlier run, which stays until another is given, holds no longer."""
+    if not file.is_file():
+        return []
+    table = read(file)
+    names = table["shape"].values.tolist()
+    given_for = dict(zip(names, table.attrs.get("contents", "").split(), strict=False))
+    found = {
+        "it has no row for": [name for name in sources if name not in names],
+        "it has rows for what is no shape now:": [name for name in names if name not in sources],
+        "other meshes have taken the names": [
+            name for name, key in given_for.items() if sources.get(name, ("", key))[1] != key
+        ],
+    }
+    said = [f"{words} {listed(of)}" for words, of in found.items() if of]
+    if not said:
+        return []
+    return [
+        f"the table of an earlier run, {table.attrs['path']}, is kept, but {'; '.join(said)}: give "
+        "it again if it holds, or another (--table FILE)"
+    ]

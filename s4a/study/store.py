@@ -2,7 +2,7 @@
 
 Every file is written under a temporary name and renamed, so that a killed run leaves only whole
 files; the key of its task (content, parameters, version) stands in its attributes and says whether
-it is still valid.
+it is still valid.  Checksums (:mod:`s4a.study.seal`) say whether it is still what was written.
 """
 
 import hashlib
@@ -26,27 +26,33 @@ import xarray as xr
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
+from s4a.schema import check_indices
+from s4a.study.hdf5 import Place, StudyFile
+from s4a.study.processes import remove_remains
+from s4a.study.seal import (
+    BEHIND,
+    SEALED,
+    Seal,
+    add_seal,
+    check_parts,
+    check_rest,
+    is_larger,
+    open_regular,
+    read_part,
+    read_seal,
+)
+
 log = logging.getLogger(__name__)
 
 LOCK = ".lock"
-STAGES = ("original", "coarse", "network", "registration")  # folders of a study
+# folders of a study
+STAGES = ("original", "coarse", "network", "latent", "rounds", "registration")
+OF_ALL = ("network", "latent", "registration", "pca", "subjects", "report")  # files beside them
+LOGS = ".log"  # folder in that of a study: a file for each task that is at work or failed
 TEMPORARY = re.compile(r"\.[\w-]+\.nc\.\d+\.tmp")  # as `write` names them
 
 ENGINE: Final = "h5netcdf"
 VERSION = version("s4a")
-SMALL = 1000  # entries up to which a variable is read when its file is opened
-# attributes with which HDF5 and netCDF keep account of dimensions
-HIDDEN = {
-    "CLASS",
-    "NAME",
-    "DIMENSION_LIST",
-    "REFERENCE_LIST",
-    "_NCProperties",
-    "_Netcdf4Coordinates",
-    "_Netcdf4Dimid",
-}
-# HDF5's name of a dimension that has no coordinate
-NO_COORDINATE = b"This is a netCDF dimension but not a netCDF variable"
 
 
 def task_key(*parts: Any) -> str:
@@ -124,13 +130,18 @@ def write(
     """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    data = data.assign_attrs(task_key=key, made_from=" ".join(made_from))
+    data = data.assign_attrs({"task_key": key, "made_from": " ".join(made_from), SEALED: BEHIND})
+    data = data.drop_encoding()  # names put together keep the length of the first file's else
     whole = io.BytesIO()  # HDF5 brings the process down when the disk is full
     with without_dask():
         data.to_netcdf(whole, engine=ENGINE)
+    add_seal(whole)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary.write_bytes(whole.getbuffer())
+        with temporary.open("wb") as file:
+            file.write(whole.getbuffer())
+            file.flush()
+            os.fsync(file.fileno())  # or a power cut leaves its name and not its content
         if claim is not None:
             claim.check()
         os.replace(temporary, path)  # at once, or not at all
@@ -153,9 +164,10 @@ def without_dask() -> AbstractContextManager:
 class Stored(BackendArray):
     """A variable of a file that is read when it is asked for; it holds no file open."""
 
-    def __init__(self, path: Path, variable: h5py.Dataset, key: str):
-        self.path, self.name, self.key = path, variable.name, key
-        self.shape, self.dtype = variable.shape, variable.dtype
+    def __init__(self, path: Path, name: str, place: Place, stamp: Seal | str, sizes: dict):
+        self.path, self.name, self.place = path, name, place
+        self.shape, self.dtype = place.shape, place.dtype
+        self.stamp, self.sizes = stamp, sizes  # of the file, and of its dims
 
     def __getitem__(self, key):
         return indexing.explicit_indexing_adapter(
@@ -164,75 +176,78 @@ class Stored(BackendArray):
 
     def part(self, key: Any) -> np.ndarray:
         """Read the selection from the file; ValueError where it was written anew."""
-        with h5py.File(self.path) as file:
-            if file.attrs.get("task_key") != self.key:
-                raise ValueError(
-                    f"{self.path} was written anew since it was opened; open the study again"
-                )
-            return file[self.name][()][key]
+        with damage_named(self.path), open_regular(self.path) as raw:
+            seal = read_seal(raw)
+            if same := self.stamp == (seal or attributes(self.path).get("task_key")):
+                values = read_part(raw, seal, self.name, self.place)
+                check_indices(self.name, values, self.sizes)
+        if not same:
+            raise ValueError(
+                f"{self.path} was written anew since it was opened; open the study again"
+            )
+        return values[key]
+
+
+class DamagedError(OSError):
+    """A file of a study that is not, or no longer, what a run wrote."""
 
 
 @contextmanager
-def readable(path: Path | str) -> Iterator[h5py.File]:
-    """An open file of a study.
-
-    Whatever comes of damage in it is one OSError that names the file.
-    """
+def damage_named(path: Path | str) -> Iterator[None]:
+    """Whatever comes of damage in a file is one OSError that names it, and what mends it."""
     try:
-        with h5py.File(path) as file:
-            yield file
-    except (FileNotFoundError, PermissionError, MemoryError):
+        yield
+    except (FileNotFoundError, PermissionError, MemoryError, DamagedError):
         raise
     except Exception as error:  # HDF5, h5py and NumPy each have their own ways with damage
-        raise OSError(
-            f"{path} cannot be read ({error}): remove it and run the analysis again"
+        raise DamagedError(
+            f"{path} cannot be read ({error}): remove it and run the analysis again, "
+            "which makes it anew and nothing else"
         ) from error
+
+
+@contextmanager
+def readable(path: Path | str) -> Iterator[tuple[StudyFile, Seal | None]]:
+    """An open file of a study, whose seal holds for all that is read here, and its seal."""
+    with damage_named(path), open_regular(path) as raw:
+        seal = read_seal(raw)
+        if seal:
+            check_rest(raw, seal)  # before HDF5 is asked
+        with h5py.File(raw) as file:
+            found = StudyFile(file, raw)
+            if not seal and SEALED in file.attrs:
+                raise OSError("its seal was cut off")
+            yield found, seal
 
 
 def open_file(path: Path | str) -> xr.Dataset:
     """The Dataset of one file; its larger variables are read when they are used.
 
-    What :func:`xarray.open_dataset` gives, in less than half of the time: h5netcdf asks HDF5 for
-    everything about each dimension of each variable.  Only files as :func:`write` writes them can
-    be read: no groups, no chunks.
+    What :func:`xarray.open_dataset` gives, in a third of the time.  Only files as :func:`write`
+    writes them can be read, see :mod:`s4a.study.hdf5`.
     """
     path = Path(path).absolute()  # what is read later does not follow the working directory
-    with readable(path) as file:
-        attrs = plain_attributes(file)
-        variables = {}
-        values: Any
-        for name, variable in file.items():
-            if variable.attrs.get("NAME", b"").startswith(NO_COORDINATE):
-                continue
-            if h5py.check_string_dtype(variable.dtype):
-                values = np.array(variable.asstr()[()], str)
-            elif variable.size <= SMALL:
-                values = variable[()]
+    with readable(path) as (file, seal):
+        attrs = file.attributes()
+        attrs.pop(SEALED, None)
+        variables: dict[str, xr.Variable] = {}
+        sizes: dict[str, int] = {}
+        for name, place in file.places.items():
+            dims = file.dims(name)
+            sizes |= dict(zip(dims, place.shape, strict=True))
+            values: Any
+            if is_larger(place):
+                stamp = seal or attrs.get("task_key", "")
+                values = indexing.LazilyIndexedArray(Stored(path, name, place, stamp, sizes))
             else:
-                stored = Stored(path, variable, attrs.get("task_key"))
-                values = indexing.LazilyIndexedArray(stored)
-            dims = dims_of(file, name, variable)
-            variables[name] = xr.Variable(dims, values, plain_attributes(variable))
+                values = file.values(name)
+            variables[name] = xr.Variable(dims, values, file.attributes(name))
+        for name, variable in variables.items():
+            if not is_larger(file.places[name]):
+                check_indices(name, variable.values, sizes)
         data = xr.decode_cf(xr.Dataset(variables, attrs=attrs), decode_times=False)
     data.encoding["source"] = str(path)
     return data
-
-
-def dims_of(file: h5py.File, name: str, variable: h5py.Dataset) -> list[str]:
-    """Names of the dims of a variable."""
-    if "DIMENSION_LIST" in variable.attrs:  # references to the dimensions, one list for each axis
-        return [file[ref[0]].name.lstrip("/") for ref in variable.attrs["DIMENSION_LIST"]]
-    is_dimension = variable.attrs.get("CLASS") == b"DIMENSION_SCALE"
-    return [name] if is_dimension else []
-
-
-def plain_attributes(stored: h5py.File | h5py.Dataset) -> dict[str, Any]:
-    """The attributes as they were before they were written: HDF5 makes arrays of single numbers."""
-    attrs = {name: stored.attrs[name] for name in stored.attrs if name not in HIDDEN}
-    return {
-        name: value[0] if isinstance(value, np.ndarray) and value.shape == (1,) else value
-        for name, value in attrs.items()
-    }
 
 
 def read(path: Path | str) -> xr.Dataset:
@@ -242,23 +257,51 @@ def read(path: Path | str) -> xr.Dataset:
 
 def arrays(path: Path | str, *names: str) -> list[np.ndarray]:
     """The values of some variables of one file, without a Dataset."""
-    with readable(path) as file:
-        return [file[name][()] for name in names]
+    with readable(path) as (file, seal):
+        if seal:
+            check_parts(file.raw, seal, names)
+        return [file.values(name) for name in names]
 
 
 def attributes(path: Path | str) -> dict[str, Any]:
     """The attributes of one file."""
-    with readable(path) as file:
-        return plain_attributes(file)
+    with readable(path) as (file, _):
+        attrs = file.attributes()
+    attrs.pop(SEALED, None)
+    return attrs
 
 
 def is_done(path: Path | str, key: str) -> bool:
-    """Whether the file of a task is there, whole, and of this key."""
+    """Whether the file of a task is there, of this key, and every byte of it as it was written."""
     try:
-        with readable(path) as file:
-            return bool(file.attrs.get("task_key") == key)
-    except OSError:  # absent, truncated, foreign: computed again
+        with readable(path) as (file, seal):
+            if file.attributes().get("task_key") != key:
+                return False
+            if seal:
+                check_parts(file.raw, seal, seal.parts)
+    except OSError:  # absent, damaged, foreign: computed again
         return False
+    return True
+
+
+def refuse_links(folder: Path) -> None:
+    """ValueError where a folder within a study is a symbolic link; the study itself may be one."""
+    for name in (*STAGES, LOGS, *(f"{LOGS}/{stage}" for stage in STAGES)):
+        if (folder / name).is_symlink():
+            raise ValueError(
+                f"{folder / name} is a symbolic link, which is not followed within a study: "
+                "put the folder itself in its place"
+            )
+
+
+def check_is_study(folder: Path) -> None:
+    """ValueError unless a folder is a study, and none within it is a link."""
+    if not (folder / STAGES[0]).is_dir():
+        raise ValueError(
+            f"{folder} is not a study folder: it has no folder {STAGES[0]!r}; "
+            f"run `s4a run ... --out {folder}`"
+        )
+    refuse_links(folder)
 
 
 def check_own(folder: Path) -> None:
@@ -266,6 +309,13 @@ def check_own(folder: Path) -> None:
 
     A study has its lock, or files with the key of a task.
     """
+    refuse_links(folder)
+    for name in OF_ALL:
+        if is_of_another(folder / f"{name}.nc"):
+            raise ValueError(
+                f"{folder / name}.nc was not made by s4a, and a run would write in its place: "
+                "move it away, or give another folder"
+            )
     if not folder.is_dir() or (folder / LOCK).is_file():
         return
     names = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
@@ -275,6 +325,14 @@ def check_own(folder: Path) -> None:
         raise ValueError(
             f"{folder} is no study and is not empty (it has {shown}): give a new or an empty folder"
         )
+
+
+def is_of_another(path: Path) -> bool:
+    """Whether a file can be read, and :func:`write` has not written it."""
+    try:
+        return "task_key" not in attributes(path)
+    except OSError:  # absent, or damaged and to be made anew
+        return False
 
 
 def is_keyed(path: Path) -> bool:
@@ -315,7 +373,7 @@ def lock(folder: Path | str) -> Iterator[Claim]:
         log.warning("this system cannot lock %s; start no second run in it", folder)
     try:
         Path(folder).mkdir(parents=True, exist_ok=True)
-        handle = open(Path(folder) / LOCK, "a+", opener=open_without_following)
+        handle = open(Path(folder) / LOCK, "a+", errors="replace", opener=open_without_following)
     except OSError as error:
         raise OSError(f"{folder} cannot be written ({error}): give another folder") from error
     with handle:
@@ -329,10 +387,13 @@ def lock(folder: Path | str) -> Iterator[Claim]:
                 f"another run (process {owner}) is working on {folder}; "
                 "wait for it to end or give another folder"
             ) from None
+        handle.seek(0)
+        remove_remains(handle.read())
         token = f"{os.getpid()} {uuid.uuid4().hex}"
         handle.truncate(0)
         handle.write(token)
         handle.flush()
+        os.fsync(handle.fileno())  # it says that the folder is a study, after a power cut too
         for stage in ("", *STAGES):
             for temporary in (Path(folder) / stage).glob(".*.nc.*.tmp"):
                 if TEMPORARY.fullmatch(temporary.name):

@@ -11,24 +11,33 @@ from tqdm.auto import tqdm
 
 from s4a.geometry.align import align, motion_between, realign
 from s4a.geometry.mesh import as_arrays, triangle_areas
-from s4a.input import plausibility
-from s4a.input.clean import clean
+from s4a.input import evidence
+from s4a.input.clean import check_range, clean
 from s4a.input.collection import read_shape
 from s4a.method import steps
+from s4a.method.lift import low_resolution
+from s4a.method.place import latent_of_new, nearest_spectra, place
 from s4a.method.register import from_latent, identity
-from s4a.method.remesh import coarsen
 from s4a.method.shape import Basis, Shape
-from s4a.method.spectral import spectrum
 from s4a.schema import dataset, in_unit, unit_of
 from s4a.study.options import Options
-from s4a.study.store import arrays, open_file, read
+from s4a.study.sources import content_of_file
+from s4a.study.store import arrays, attributes, open_file, read
 
 
-def clean_shape(source: str | xr.Dataset, cleaning: dict) -> xr.Dataset:
-    """A file read and cleaned, or a mesh in memory cleaned where it is not yet."""
+def clean_shape(source: str | xr.Dataset, content: str, cleaning: dict) -> xr.Dataset:
+    """A file read and cleaned, or a mesh in memory cleaned where it is not yet.
+
+    OSError where the file no longer has the content of that key, which the result would bear.
+    """
     if isinstance(source, str):
-        return read_shape(source, **cleaning)
+        try:
+            return read_shape(source, **cleaning)
+        finally:
+            if content_of_file(source) != content:
+                raise OSError(f"{source} has changed or gone since the run began: start it again")
     if "file_vertex" in source:
+        check_range(*as_arrays(source))
         area = float(triangle_areas(*as_arrays(source)).sum())
         mesh = source.assign_attrs({"status": "ok", "reason": "", "area": area} | source.attrs)
     else:
@@ -36,26 +45,29 @@ def clean_shape(source: str | xr.Dataset, cleaning: dict) -> xr.Dataset:
     return in_unit(mesh, source.attrs.get("unit"))
 
 
-def compare_shape(folder: Path, name: str, reference: str, intersections: bool) -> xr.Dataset:
-    """What :func:`s4a.input.plausibility.examine` sees in a shape beside the reference."""
-    mesh, other = (read(folder / "original" / f"{n}.nc") for n in (name, reference))
-    look = plausibility.examine(mesh, plausibility.sample_vertices(other), intersections)
-    rotation = look.pop("rotation")
-    return dataset(look, rotation=rotation)
+def portray_shape(folder: Path, name: str, intersections: bool) -> xr.Dataset:
+    """What :func:`s4a.input.evidence.portray` sees in a shape."""
+    return evidence.portray(read(folder / f"original/{name}.nc"), intersections=intersections)
 
 
-def remesh_shape(
-    folder: Path, name: str, n_coarse: int, wrap: bool, seed: int, k: int
-) -> xr.Dataset:
+def compare_shape(folder: Path, name: str, references: list[str]) -> xr.Dataset:
+    """What :func:`s4a.input.evidence.compare` sees in a shape beside the references."""
+    portraits = {n: read(folder / f"network/sketch_{n}.nc") for n in {*references, name}}
+    return evidence.compare(name, portraits[name], {n: portraits[n] for n in references})
+
+
+def remesh_shape(folder: Path, name: str, options: Options) -> xr.Dataset:
     """The low-resolution mesh of a shape of the study, its U (4.1) and its spectrum (3.3)."""
     mesh = read(folder / "original" / f"{name}.nc")
-    low = spectrum(coarsen(mesh, n_coarse=n_coarse, wrap=wrap, seed=seed), k=k)
+    low = low_resolution(mesh, **options.of_low_resolution)
     return in_unit(low, unit_of(mesh["position"]))
 
 
-def shape_of(folder: Path, name: str) -> Shape:
+def shape_of(folder: Path, name: str, options: Options) -> Shape:
     """A shape of the study at both resolutions; its arrays are read when they are used."""
-    return Shape(*(open_file(folder / stage / f"{name}.nc") for stage in ("original", "coarse")))
+    return options.shape(
+        *(open_file(folder / stage / f"{name}.nc") for stage in ("original", "coarse"))
+    )
 
 
 def low_basis(folder: Path, name: str) -> Basis:
@@ -78,18 +90,21 @@ def motion_to_reference(folder: Path, name: str) -> tuple[np.ndarray, np.ndarray
     return R, t
 
 
-def map_pairs(folder: Path, pairs: list, k_init: int, init: str) -> xr.Dataset:
+def map_pairs(folder: Path, pairs: list, k_init: int, options: dict) -> xr.Dataset:
     """First maps of some pairs, in both directions (4.1, steps 3 and 4)."""
     names = sorted({name for pair in pairs for name in pair})
     bases = {name: low_basis(folder, name) for name in names}
     motions = {name: motion_to_reference(folder, name) for name in names}
-    return steps.map_pairs(bases, motions, pairs, k_init=k_init, init=init)
+    return steps.map_pairs(bases, motions, pairs, k_init=k_init, **options)
 
 
 def consistent_maps(
     folder: Path, names: list[str], first: xr.Dataset, options: Options, n_jobs: int
-) -> tuple[xr.Dataset, xr.Dataset]:
+) -> xr.DataTree:
     """Consistent ZoomOut over the network and the median (4.2): ``/network`` and ``/latent``."""
+    motions = {name: motion_to_reference(folder, name) for name in names}
+    reference = attributes(folder / "network" / f"motion_{names[0]}.nc")["reference"]
+    first = steps.with_motions(first, motions, reference)
     coarse = {name: open_file(folder / "coarse" / f"{name}.nc") for name in names}
     k_init = first.sizes["mode_source_initial"]
     with tqdm(total=options.k - k_init, desc="consistent ZoomOut") as bar:
@@ -99,25 +114,59 @@ def consistent_maps(
             k=options.k,
             step=options.step,
             n_latent=options.n_latent,
+            weights=options.weights,
+            n_spread=options.n_spread,
+            wide=options.wide,
             norm=options.norm,
+            keep_rounds=options.keep_rounds,
             n_jobs=n_jobs,
             progress=lambda size: bar.update(size - k_init - bar.n),
         )
         bar.total = bar.n  # k may be less than was asked for
-    return tree["network"].to_dataset(), tree["latent"].to_dataset()
+    return tree
 
 
-def register_shape(
-    folder: Path, name: str, template: str, how: str, refine: str, scale: bool
-) -> xr.Dataset:
+def place_shape(folder: Path, name: str, options: Options) -> xr.Dataset:
+    """The latent basis of a shape that stands apart from the network, which stays as it is."""
+    latent = read(folder / "latent.nc")
+    k, median = latent.sizes["mode"], latent.attrs["median"]
+    k_init = min(options.k_init, k)
+    names = [median, *(n for n in latent["shape"].values.tolist() if n != median)]
+    own, *spectra = (arrays(folder / "coarse" / f"{n}.nc", "eigenvalue")[0] for n in (name, *names))
+    near = [names[i] for i in nearest_spectra(own, spectra, k_init)]
+    motion = motion_to_reference(folder, name)
+    Y = place(
+        low_basis(folder, name),
+        [low_basis(folder, n) for n in near],
+        latent["latent_basis"].sel(shape=near).values,
+        [motion_between(motion, motion_to_reference(folder, n)) for n in near],
+        k_init=k_init,
+        step=options.step,
+        n_spread=options.n_spread,
+        **options.of_first_maps,
+    )
+    latent_eigenvalue = latent["latent_eigenvalue"].values
+    found = latent_of_new(Y[None], own[None], latent_eigenvalue, options.norm)
+    return found.drop_vars("latent_eigenvalue").isel(shape=0)
+
+
+def latent_basis_of(folder: Path, name: str) -> np.ndarray:
+    """The latent basis Y ``(k, m)`` of a shape of the network, or of one that stands apart."""
+    Y = read(folder / "latent.nc")["latent_basis"]
+    if name in Y["shape"]:
+        return Y.sel(shape=name).values
+    return arrays(folder / "latent" / f"{name}.nc", "latent_basis")[0]
+
+
+def register_shape(folder: Path, name: str, template: str, options: Options) -> xr.Dataset:
     """One shape registered to the template: eq. 6 at low resolution, then eq. 7 or eq. 3 and 4."""
-    target = shape_of(folder, template)
+    target = shape_of(folder, template, options)
     if name == template:
         return identity(target)
-    source = shape_of(folder, name)
-    Y = read(folder / "latent.nc")["latent_basis"]
-    bases = Y.sel(shape=name).values, Y.sel(shape=template).values
+    source = shape_of(folder, name, options)
+    bases = latent_basis_of(folder, name), latent_basis_of(folder, template)
     M, N = source.low, target.low
     start = motion_between(*(motion_to_reference(folder, n) for n in (name, template)))
     motion = realign(M.cloud, N.cloud, start)
-    return from_latent(source, target, bases, motion, how=how, refine=refine, scale=scale)
+    how = options.how
+    return from_latent(source, target, bases, motion, how=how, **options.of_registration)

@@ -8,9 +8,9 @@ import numpy as np
 import xarray as xr
 
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
-from s4a.input.files import slug
 from s4a.schema import INPUT, in_unit, unit_of, variable
-from s4a.study.store import open_file, read
+from s4a.study.contents import check_contents, check_fit
+from s4a.study.store import DamagedError, check_is_study, damage_named, open_file, read
 
 log = logging.getLogger(__name__)
 
@@ -18,10 +18,14 @@ STACKED = (
     "registered_match",
     "displacement",
     "displacement_raw",
+    "registered_match_low",
     "displacement_low",
+    "displacement_coefficient",
     "rotation",
     "translation",
     "scale",
+    "icp_rotation",
+    "icp_translation",
     "confidence",
     "round_trip",
     "distortion",
@@ -53,7 +57,9 @@ def stack_registration(
     """
     shapes = [files[name] for name in names]
     mesh = template[[v for v in ("position", "corner_vertex", "vertex_area") if v in template]]
-    data = mesh.assign_attrs(template=template.attrs["template"])
+    kept = ("template", "apart")
+    attrs = {key: template.attrs[key] for key in kept if key in template.attrs}
+    data = mesh.assign_attrs(attrs)
     for name in STACKED:
         if all(name in shape for shape in shapes):
             data[name] = variable(name, np.stack([shape[name].values for shape in shapes]))
@@ -69,43 +75,74 @@ def stack_registration(
 
 
 class Reader:
-    """Reads the files of a folder that belong together, and says which ones it leaves out."""
+    """Reads the files of a folder that belong together, and says which ones it leaves out.
 
-    def __init__(self, folder: Path):
-        self.folder = folder
-        self.keys: set[str] = set()  # of the files that were read
+    Parameters
+    ----------
+    folder : Path
+    reported : set of str, optional
+        Shapes of the last run.  A damaged file of another shape is left out, as one that an earlier
+        run has left; any other is an error.
+    """
+
+    def __init__(self, folder: Path, reported: set[str] | None = None):
+        self.folder, self.reported = folder, reported
+        # of the files that were read; None where that is not to be asked
+        self.keys: set[str] | None = set()
+        self.files: dict[str, xr.Dataset] = {}
 
     def read(
         self, names: Iterable[str], open_with: Callable[[Path], xr.Dataset] = open_file
     ) -> dict[str, xr.Dataset]:
-        """The files of these names that are there, whole and made from files read before."""
+        """The files of these names that are there and made from files read before.
+
+        Raises
+        ------
+        DamagedError
+            Where one is not what a run wrote, or does not fit to the others.
+        """
         files = {}
         for name in names:
-            path = self.folder / f"{name}.nc"
             try:
-                data = open_with(path)
+                data, fault = self.open(name, open_with)
             except FileNotFoundError:
                 continue
-            except OSError as error:
+            except DamagedError as error:
+                shape = name.partition("/")[2]
+                if not shape or self.reported is None or shape in self.reported:
+                    raise
                 log.warning("%s; it is left out", error)
                 continue
-            fault = self.fault(data)
             if fault:
-                log.warning("%s %s", path, fault)
+                log.warning("%s %s", self.path(name), fault)
             else:
-                self.keys.add(data.attrs.get("task_key", ""))
                 files[name] = data
         return files
 
+    def path(self, name: str) -> Path:
+        """The file of that name, as ``coarse/brain_01``."""
+        return self.folder / f"{name}.nc"
+
+    def open(self, name: str, open_with: Callable[[Path], xr.Dataset]) -> tuple[xr.Dataset, str]:
+        """A file, whose contents are checked, and why it has no place in the study if so."""
+        path = self.path(name)
+        data = open_with(path)
+        with damage_named(path):
+            check_contents(name, data)
+        fault = self.fault(data)
+        if not fault:
+            with damage_named(path):
+                check_fit(name, data, self.files)
+            if self.keys is not None:
+                self.keys.add(data.attrs.get("task_key", ""))
+            self.files[name] = data
+        return data, fault
+
     def fault(self, data: xr.Dataset) -> str:
         """Why a file has no place in the study; empty where it has."""
-        if not self.keys.issuperset(data.attrs.get("made_from", "").split()):
+        made_from = data.attrs.get("made_from", "").split()
+        if self.keys is not None and not self.keys.issuperset(made_from):
             return "belongs to an earlier run and is left out; run the analysis again"
-        names = data["shape"].values.tolist() if "shape" in data.coords else []
-        names += [data.attrs[attr] for attr in ("template", "median") if attr in data.attrs]
-        wrong = [name for name in names if slug(str(name)) != name]
-        if wrong:  # they become names of files
-            return f"is left out: shapes need names of letters, digits, _ and -; found {wrong}"
         return ""
 
 
@@ -113,9 +150,12 @@ def open_study(folder: Path | str) -> xr.DataTree:
     """Open a study folder, finished or not.
 
     Per-shape nodes are read when they are used; the stages that are there are in the tree, those
-    that are not yet computed are absent, as are files that cannot be read or were made from others
-    than those now in the folder (both are said in a warning of the log).  ``/registration`` is put
-    together in memory.
+    that are not yet computed are absent, as are files that were made from others than those now in
+    the folder (that is said in a warning of the log).  ``/registration`` is put together in memory.
+
+    Every file is checked: its bytes by their checksums, see :mod:`s4a.study.seal`, its variables by
+    what a file of its name holds, see :mod:`s4a.study.contents`.  Nothing leads out of the folder:
+    links in it, and what HDF5 would take from other files, are refused.
 
     Parameters
     ----------
@@ -130,6 +170,9 @@ def open_study(folder: Path | str) -> xr.DataTree:
     ------
     ValueError
         When the folder is not a study.
+    DamagedError
+        An OSError, when a file is not what a run wrote; it is named, with what mends it.  So is one
+        of a larger variable that is read later.
 
     Examples
     --------
@@ -145,18 +188,17 @@ def open_study(folder: Path | str) -> xr.DataTree:
     ['coarse', 'latent', 'network', 'original', 'pca', 'registration', 'report']
     """
     folder = Path(folder)
-    if not (folder / "original").is_dir():
-        raise ValueError(
-            f"{folder} is not a study folder: it has no folder 'original'; "
-            f"run `s4a run ... --out {folder}`"
-        )
-    reader = Reader(folder)
+    check_is_study(folder)
+    reader = Reader(folder, reported(folder))
     names = sorted(path.stem for path in (folder / "original").glob("[!.]*.nc"))
     nodes = reader.read(f"{stage}/{name}" for stage in ("original", "coarse") for name in names)
     nodes |= reader.read(["network", "latent"])
+    nodes |= reader.read(f"rounds/{path.stem}" for path in sorted(folder.glob("rounds/k_*.nc")))
     template = reader.read(["registration"], read)
     if template and "latent" in nodes:
-        names = nodes["latent"]["shape"].values.tolist()
+        apart = apart_of(template["registration"])
+        nodes |= reader.read(f"latent/{name}" for name in apart)
+        names = sorted([*nodes["latent"]["shape"].values.tolist(), *apart])
         files = reader.read((f"registration/{name}" for name in names), read)
         files = {path.removeprefix("registration/"): data for path, data in files.items()}
         if files:
@@ -167,6 +209,37 @@ def open_study(folder: Path | str) -> xr.DataTree:
     return xr.DataTree.from_dict(nodes, name=folder.name)
 
 
+def apart_of(registration: xr.Dataset) -> list[str]:
+    """The shapes that are registered and stand apart from the network, as they are doubtful."""
+    return str(registration.attrs.get("apart", "")).split()
+
+
+def left_out(study: xr.DataTree) -> list[str]:
+    """The doubtful shapes of a study, which modes and statistics are made without.
+
+    None where ``keep_doubtful`` was given; a template that was named is trusted.
+    """
+    if "report" not in study.children or "registration" not in study.children:
+        return []
+    report = study["report"].dataset
+    if "status" not in report or report.attrs.get("keep_doubtful") == "True":
+        return []
+    template = study["registration"].attrs.get("template")
+    doubtful = report["shape"].values[report["status"].values == "doubtful"].tolist()
+    return [name for name in doubtful if name != template]
+
+
+def reported(folder: Path) -> set[str] | None:
+    """The shapes of the last run; None where it has no report."""
+    path = folder / "report.nc"
+    if not path.exists():
+        return None
+    report = open_file(path)
+    with damage_named(path):
+        check_contents("report", report)
+    return set(report["shape"].values.tolist())
+
+
 def as_reported(nodes: dict[str, xr.Dataset]) -> dict[str, xr.Dataset]:
     """The nodes of the shapes that the last run used, with the paths that it read them from."""
     report = nodes["report"]
@@ -175,7 +248,7 @@ def as_reported(nodes: dict[str, xr.Dataset]) -> dict[str, xr.Dataset]:
     reported = {}
     for node, data in nodes.items():
         stage, _, name = node.rpartition("/")
-        if stage and name not in paths:
+        if stage in ("original", "coarse", "registration") and name not in paths:
             continue
         if stage == "original" and paths[name]:  # the file may have moved since it was read
             data = data.assign_attrs(path=paths[name])

@@ -9,6 +9,7 @@ from s4a.show.draw import position_colors, ramp_colors
 from s4a.show.surfaces import (
     carried_colors,
     has,
+    labelled,
     latent_match,
     mesh_of,
     names_of,
@@ -53,7 +54,7 @@ class Correspondence(Panel):
         self.template = str(registration.attrs["template"])
         names = [name for name in names_of(registration) if name != self.template]
         latent = has(self.study, "latent/latent_basis") and "coarse" in self.study.children
-        self.choice = dropdown("shape", names)
+        self.choice = dropdown("shape", labelled(self.study, names))
         self.map = dropdown("map", MAPS if latent else MAPS[:1], layout={"width": "360px"})
         self.colors = dropdown("colours", SHOWN, layout={"width": "320px"})
         self.hover = ipywidgets.Checkbox(True, description="follow the pointer", indent=False)

@@ -6,7 +6,7 @@ import traitlets
 
 from s4a.method.median import NORMS, distance_to_identity, near_ties
 from s4a.show.browser import PARTS
-from s4a.show.surfaces import names_of, resolutions, surface
+from s4a.show.surfaces import labelled, names_of, resolutions, surface
 from s4a.widgets.chart import Chart
 from s4a.widgets.panel import Panel, beside, dropdown, int_slider, row
 from s4a.widgets.scene import Scene, camera_group
@@ -37,7 +37,7 @@ class Median(Panel):
         self.norm = dropdown("norm", list(NORMS), value=str(latent.attrs.get("norm", "h2")))
         self.modes = int_slider("modes K", n_modes, 2, n_modes, "330px")
         self.stage = dropdown("surfaces", resolutions(self.study))
-        self.shape = dropdown("shape", self.names)
+        self.shape = dropdown("shape", labelled(self.study, self.names))
         self.bars = Chart()
         self.scene = Scene(group=camera_group(), view=view, up=up, height=420)
         self.ties = ipywidgets.HTML()

@@ -39,6 +39,7 @@ class ModesView(View):
     ratio_low = traitlets.List().tag(sync=True)
     samples = traitlets.List().tag(sync=True)
     names = traitlets.List().tag(sync=True)
+    faint = traitlets.List().tag(sync=True)
     colors = traitlets.Enum(["normal", "magnitude", "none"], "normal").tag(sync=True)
     beside = traitlets.Bool(False).tag(sync=True)
     sample = traitlets.Int(-1).tag(sync=True)

@@ -11,7 +11,8 @@ from s4a.method.network import choose_pairs, connectivity, spectral_distance
 from s4a.show import charts
 from s4a.show.browser import PARTS, color_scale
 from s4a.show.draw import position_colors
-from s4a.show.surfaces import attribute, network_places, surface
+from s4a.show.surfaces import attribute, doubtful_names, labelled, network_places, surface
+from s4a.study.tree import apart_of
 from s4a.widgets.chart import Chart
 from s4a.widgets.panel import Panel, beside, dropdown, int_slider, row
 from s4a.widgets.scene import Scene, camera_group
@@ -61,7 +62,7 @@ class Network(Panel):
             "pairs", used, n - 1, max(n - 1, n * (n - 1) // 2), continuous_update=True
         )
         maps = zip(self.source, self.target, strict=True)
-        options = [(name, name) for name in self.names]
+        options: list = labelled(self.study, self.names)
         options += [(f"{source} → {target}", i) for i, (source, target) in enumerate(maps)]
         self.choice = dropdown("show", options)
         self.where = dropdown("places", ["circle", "shape differences"])
@@ -113,6 +114,7 @@ class Network(Panel):
             weights=network["weight"].values[self.shown],
             label="cycle error",
             title="Click a shape or a map",
+            faint=[name in doubtful_names(self.study) for name in self.names],
             highlight=self.names.index(self.median) if self.median in self.names else -1,
             node=self.names.index(self.node) if self.node in self.names else -1,
             edge=self.edge,
@@ -129,13 +131,15 @@ class Network(Panel):
         stored = ""
         if len(self.shown) < 2 * len(pairs):
             stored = f", {len(self.shown)} maps of them in the study"
+        apart = apart_of(self.study["registration"]) if "registration" in self.study else []
+        others = f"; beside it, doubtful: {', '.join(apart)}" if apart else ""
         middle = f"; median cycle error {np.median(known):.3f}" if len(known) else ""
         self.facts.value = PARTS.paragraph(
             f"{len(pairs)} pairs{stored}: "
             f"{'connected' if facts['components'] == 1 else 'NOT connected'}, "
             f"{facts['triangles']} triangles, {facts['in_no_triangle']} shapes in none, "
             f"smallest degree {facts['smallest_degree']}, "
-            f"at most {facts['diameter']} maps apart{middle}"
+            f"at most {facts['diameter']} maps apart{middle}{others}"
         )
 
     def change_stage(self) -> None:

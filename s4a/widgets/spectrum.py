@@ -6,7 +6,7 @@ import traitlets
 
 from s4a.method.spectral import reconstruct, weyl
 from s4a.show.charts import BLUE, GREY, ORANGE
-from s4a.show.surfaces import surface, unit_text
+from s4a.show.surfaces import labelled, surface, unit_text
 from s4a.widgets.chart import Chart
 from s4a.widgets.panel import Panel, beside, dropdown, int_slider, row
 from s4a.widgets.scene import Scene, camera_group
@@ -35,7 +35,7 @@ class Spectrum(Panel):
         }
         self.names = list(self.eigenvalues)
         k = min(len(values) for values in self.eigenvalues.values())
-        self.choice = dropdown("shape", self.names)
+        self.choice = dropdown("shape", labelled(self.study, self.names))
         self.mode = int_slider("mode", 1, 0, k - 1, continuous_update=True)
         self.k = int_slider("first k", min(20, k), 1, k)
         self.curves, self.gaps = Chart(), Chart()

@@ -15,7 +15,7 @@ from s4a.input.annotations import write_landmarks
 from s4a.schema import dataset
 from s4a.show.browser import PARTS
 from s4a.show.draw import label_colors
-from s4a.show.surfaces import aligned, names_of, unit_text
+from s4a.show.surfaces import aligned, labelled, names_of, unit_text
 from s4a.widgets.panel import Panel, beside, dropdown, file_name, row
 from s4a.widgets.scene import Scene, camera_group, extent, round_number
 
@@ -47,9 +47,10 @@ class Transfer(Panel):
         """Choices, the two surfaces, legend and table."""
         registration = self.study["registration"].dataset
         names, template = names_of(registration), str(registration.attrs["template"])
+        options = labelled(self.study, names)
         self.choices = {
-            "source": dropdown("source", names, value=template),
-            "target": dropdown("target", names),
+            "source": dropdown("source", options, value=template),
+            "target": dropdown("target", options),
         }
         self.labels = ipywidgets.Checkbox(
             True, description="labels", indent=False, layout={"width": "auto"}

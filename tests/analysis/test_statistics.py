@@ -317,12 +317,157 @@ def test_small_groups_are_refused_or_warned_of_and_the_smallest_p_is_told(caplog
         statistics.group_test(study, {f"shape_{i:02d}": "a" for i in range(7) if i != 3})
     with pytest.raises(ValueError, match="needs one value for each of 7 shapes"):
         statistics.regression(study, np.arange(6))
-    with pytest.raises(ValueError, match="constant or a combination of the covariates"):
+    with pytest.raises(ValueError, match="what is tested is a combination of the covariates"):
         statistics.regression(study, np.arange(7), covariates=2 * np.arange(7) + 1)
     with pytest.raises(ValueError, match="'age' needs a column of that name in /subjects"):
         statistics.regression(study, "age")
     with pytest.raises(ValueError, match="at least 4 shapes, found 3"):
         statistics.outliers(study_of(u, T, smooth_noise(rng, u, 3)))
+
+
+@pytest.fixture(scope="module")
+def twelve():
+    """Twelve spheres with noise, and two groups of six."""
+    u, T = as_arrays(synthetic.sphere(100))
+    return study_of(u, T, smooth_noise(np.random.default_rng(1), u, 12)), list("ab" * 6)
+
+
+@pytest.mark.parametrize(
+    "variable, words",
+    [
+        (np.full(12, 0.1), "what is tested is constant"),
+        (1e9 + 1e-7 * np.arange(12), "what is tested is constant"),
+        (1e-300 * np.arange(1, 13), "of a size between 1e-30 and 1e30, found 1.2e-299"),
+        ([np.inf] + [1.0] * 11, "variable needs finite numbers; found infinite ones for shape_00"),
+        ([np.nan] * 12, "at least 4 shapes with all values, found 0 of 12"),
+        (np.array(["2020-01-01"] * 12, "M8[D]"), "found dates; a date can be given as a number"),
+        (np.arange(12) * 1j, "found complex numbers"),
+        (np.zeros((12, 2)), "one number for each shape"),
+        (["31", "?", *map(str, range(10))], "1 of its 12 cells are none .shape_01: '\\?'"),
+    ],
+)
+def test_a_variable_of_no_use_is_refused_with_what_to_do(variable, words, twelve):
+    with pytest.raises(ValueError, match=words):
+        statistics.regression(twelve[0], variable, n_permutations=9)
+
+
+def test_neither_unit_nor_origin_of_a_variable_changes_its_test(twelve):
+    age = np.random.default_rng(2).uniform(20, 80, 12)
+    one, other = (
+        statistics.regression(twelve[0], x, covariates=1e-200 * age**2, n_permutations=19)
+        for x in (age, 1e9 + 1e-3 * age)
+    )
+    assert other["statistic"].item() == pytest.approx(one["statistic"].item(), rel=1e-4)
+    assert other["p_family_wise"].values == pytest.approx(one["p_family_wise"].values)
+    assert 1e-3 * other["effect"].values == pytest.approx(one["effect"].values, rel=1e-3, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "covariate, words",
+    [
+        (["31,5", *(f"4{i},1" for i in range(11))], "a decimal point and without unit, and NA"),
+        ([f"s{i}" for i in range(12)], "it names shapes, not groups of them"),
+        ([f"2020-01-0{1 + i % 3}" for i in range(12)], "holds dates, such as 2020-01-01"),
+        ([0, 1] * 6, "what is tested is a combination of the covariates"),
+        (np.random.default_rng(0).normal(size=(12, 11)), "11 of the covariates.*14 shapes needed"),
+    ],
+)
+def test_a_covariate_of_no_use_is_refused_with_what_to_do(covariate, words, twelve):
+    with pytest.raises(ValueError, match=words):
+        statistics.group_test(*twelve, covariates={"it": covariate}, n_permutations=9)
+
+
+def test_what_becomes_of_the_covariates_is_told(twelve, caplog):
+    study, group = twelve
+    size = np.arange(12) ** 2
+    given = {"sex": [0, 0, 1, 1] * 3, "site": list("xxyyzz") * 2, "size": size}
+    found = statistics.group_test(
+        study, group, covariates=given | {"double": 2 * size + 1, "one": [1.0] * 12}
+    )
+    assert "'double' is a linear combination of covariate 'size'" in caplog.text
+    assert "covariate 'one' is constant and changes nothing" in caplog.text
+    alone = statistics.group_test(study, group, covariates=given)
+    assert found["p_value"] == alone["p_value"]
+    assert alone.attrs["covariates"] == (
+        "covariate 'sex', covariate 'site' as indicators of y, z against x, covariate 'size'"
+    )
+
+
+@pytest.mark.parametrize("gap", ["NA", "n/a", "-", "", "nan", None, float("nan")])
+def test_a_missing_text_is_no_group(gap, twelve, caplog):
+    study, group = twelve
+    found = statistics.group_test(study, [gap, *group[1:11], gap], n_permutations=9)
+    assert found.attrs["groups"] == "a: 5, b: 5"
+    assert found.attrs["left_out"] == "shape_00, shape_11"
+    assert "no value for 2 of 12 shapes" in caplog.text
+
+
+def test_where_few_permutations_are_different_p_is_exact():
+    rng = np.random.default_rng(0)
+    x = np.repeat([0.0, 1.0], 3)
+    d = rng.normal(size=(6, 4, 1)) + 9 * x[:, None, None]
+    t = abs(stats.ttest_ind(d[:3], d[3:]).statistic[:, 0])
+    splits = [[i, j, k] for i in range(6) for j in range(i) for k in range(j)]
+    others = [abs(stats.ttest_ind(d[s], np.delete(d, s, axis=0)).statistic[:, 0]) for s in splits]
+    _, p, _ = permutation.vertex_test(d, x, n_permutations=999)
+    assert p == pytest.approx((np.array(others) >= t - 1e-6).mean(0))
+    assert p.min() == permutation.smallest_p(999, x) == pytest.approx(0.1)
+    assert permutation.permutation_test(d[:, :, 0], x)[1] == pytest.approx(0.1)
+    many, n = permutation.rearrangements(x, np.array([0, 1, 0, 1, 0, 1.0]), 9999, seed=0)
+    assert len({tuple(order) for order in many}) == n == 720 / 4 - 1
+
+
+def test_a_test_that_can_find_nothing_says_so(twelve, caplog):
+    study = twelve[0].isel(shape=slice(6))
+    found = statistics.group_test(study, list("aaabbb"))
+    assert (found.attrs["permutations"], found.attrs["smallest_p"]) == (19, 0.1)
+    assert "6 shapes allow no p value below 0.1" in caplog.text
+    with pytest.raises(ValueError, match=r"4 shapes are too few .* of='normal'"):
+        statistics.regression(study.isel(shape=slice(4)), [1, 2, 4, 8])
+
+
+@pytest.mark.parametrize("n", [-1, 0, 10**22])
+def test_a_number_of_permutations_that_makes_no_test_is_refused(n, twelve):
+    for test in (statistics.group_test, statistics.group_map):
+        with pytest.raises(ValueError, match=f"a number from 1 to 10000000, found {n}"):
+            test(*twelve, n_permutations=n)
+
+
+def test_statistics_of_shapes_that_are_equal_or_not_finite_say_so(twelve):
+    study = twelve[0]
+    d = study["registration"]["displacement"]
+    for values, words in (
+        (0 * d, "shapes that differ; all displacements are equal"),
+        (d.where(d["shape"] != "shape_04"), "finite displacements; .*: shape_04"),
+    ):
+        registration = study["registration"].to_dataset().assign(displacement=values)
+        other = xr.DataTree.from_dict({"registration": registration})
+        for function in (statistics.evaluate, statistics.outliers):
+            with pytest.raises(ValueError, match=words):
+                function(other)
+        with pytest.raises(ValueError, match=words):
+            statistics.group_map(other, twelve[1])
+
+
+def test_groups_of_unequal_scatter_are_told_and_signs_hold_the_level(caplog):
+    x = np.repeat([0.0, 1.0], [15, 5])
+    found = {"equal": [], "unequal": []}
+    for seed in range(60):
+        d = np.random.default_rng(seed).normal(size=(20, 30, 3)) * (1 + x)[:, None, None]
+        for variances, smallest in found.items():
+            options = {"n_permutations": 99, "seed": seed, "variances": variances}
+            smallest.append(permutation.vertex_test(d, x, **options)[2].min())
+    assert np.mean(np.array(found["equal"]) <= 0.05) > 0.3
+    assert np.mean(np.array(found["unequal"]) <= 0.05) < 0.16
+    u, T = as_arrays(synthetic.sphere(100))
+    noise = smooth_noise(np.random.default_rng(1), u, 20)
+    study = study_of(u, T, noise * (1 + 2 * x)[:, None, None])
+    statistics.group_test(study, x, n_permutations=19, variances="unequal")
+    assert "scatter differently" not in caplog.text
+    statistics.group_test(study, x, n_permutations=19)
+    assert "scatter differently (0.0: " in caplog.text
+    with pytest.raises(ValueError, match="variances must be 'equal' or 'unequal'"):
+        statistics.group_test(study, x, variances="welch")
 
 
 # outliers and classes

@@ -396,6 +396,13 @@ def test_landmarks_off_the_surface_are_brought_onto_it_and_the_distance_is_told(
     assert np.linalg.norm(found["landmark_position"].values) == pytest.approx(1, abs=2e-3)
 
 
+@pytest.mark.parametrize("x", [np.nan, np.inf, 1e300, 1e160])
+def test_a_landmark_at_no_place_is_named(x):
+    given = dataset(landmark_name=["a", "b"], landmark_position=[[0, 0, 1], [0, x, 0]])
+    with pytest.raises(ValueError, match="finite positions near the surface; 'b' is at"):
+        locate(given, synthetic.sphere(100))
+
+
 def test_labels_are_numbered_as_in_the_file_and_dropped_vertices_have_the_nearest_label():
     X, T = as_arrays(synthetic.sphere(300))
     small, S = as_arrays(synthetic.sphere(20, radius=0.05))

@@ -38,10 +38,10 @@ def errors(source, target, image):
     """
     with threadpool_limits(1):
         M, N = shape_of(source), shape_of(target)
-        _, C, near = first_map(M.low, N.low, align(M.low.X, M.low.area, N.low.X, N.low.area)[:2])
+        first = first_map(M.low, N.low, align(M.low.X, M.low.area, N.low.X, N.low.area)[:2])
         starts = {
-            "intrinsic": fmap.zoomout(M.low, N.low, C, 100)[1],
-            "icp": near,
+            "intrinsic": fmap.zoomout(M.low, N.low, first.C, 100)[1],
+            "icp": first.near,
         }
         center, size = M.frame
         sample = N.coarse["sample_vertex"].values

@@ -3,14 +3,15 @@
 Every row runs in a process of its own with one BLAS thread, ours and the other in turn, on the same
 input: seconds of CPU, of the clock, and the peak of memory above what the process holds before.
 pyFM is on PyPI as ``pyfmaps`` (the extra ``bench``).  ``speed.py stages``, ``pipelines``,
-``growth`` or ``nearest`` runs one part, ``speed.py whole 51 100000`` the whole analysis of so many
-synthetic shapes of so many vertices.
+``growth``, ``pairs``, ``nearest`` or ``seals`` runs one part, ``speed.py whole 51 100000`` the
+whole analysis of so many synthetic shapes of so many vertices.
 """
 
 import itertools
 import multiprocessing
 import os
 import resource
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -19,6 +20,7 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
+import xarray as xr
 from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 
@@ -33,6 +35,8 @@ from s4a.method.nearest import nearest_in_cells, nearest_rows
 from s4a.method.pca import gram_pca
 from s4a.method.register import match_functions
 from s4a.method.shape import Shape
+from s4a.study import seal, store
+from s4a.study.options import Options
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 VERTICES, NETWORK, K_INIT, K = 100_000, 10, 20, 100
@@ -103,7 +107,7 @@ def our_zoomout(C, a, b):
 
 
 def our_network(C, source, target, shapes):
-    samples = [basis.spread_vertices for basis in shapes]
+    samples = [basis.spread_vertices() for basis in shapes]
     return latent.consistent_zoomout(shapes, C, source, target, K, samples=samples)[3]
 
 
@@ -503,7 +507,6 @@ def growth(folder):
     for what, sizes in (
         ("vertices", [(4, v, 500) for v in (25_000, 50_000, 100_000)]),
         ("shapes", [(n, 10_000, 4 * n) for n in (8, 16, 32)]),
-        ("pairs", [(24, 10_000, p) for p in (60, 120, 240)]),
     ):
         say(f"\n{what} x1 x2 x4 (shapes, vertices, pairs): {sizes}; seconds with one process\n")
         found = [
@@ -514,6 +517,44 @@ def growth(folder):
             seconds = np.array([max(f[stage], 1e-3) for f in found])
             slope = np.polyfit(np.log([1, 2, 4]), np.log(seconds), 1)[0]
             say(f"{stage:36} {'  '.join(f'{t:8.2f}' for t in seconds)}   exponent {slope:5.2f}")
+
+
+def seconds_of_pairs(coarse, n_pairs, options):
+    """CPU seconds of the stages that look at pairs, on low-resolution meshes that are there."""
+    begin = time.process_time()
+    first = s4a.build_network(coarse, n_pairs=n_pairs, **options.of_first_maps)
+    between = time.process_time()
+    names = ("weights", "n_spread", "wide")
+    s4a.refine_network(coarse, first, k=K, **{name: getattr(options, name) for name in names})
+    return {
+        "alignment and first maps": between - begin,
+        "Consistent ZoomOut and median": time.process_time() - between,
+    }
+
+
+def pairs(folder, n=12, n_coarse=2000):
+    """How CPU seconds grow with the pairs (5.3: linearly), by default and as in the paper."""
+    paths, _ = collection(n, 5_000, folder / "files")
+    coarse = {
+        Path(path).stem: s4a.spectrum(s4a.coarsen(s4a.read_shape(path), n_coarse=n_coarse), k=K)
+        for path in paths
+    }
+    sizes = (15, 30, 60)
+    for preset in (None, "paper"):
+        say(
+            f"\n{n} shapes, {n_coarse:,} vertices at low resolution, {sizes} pairs, "
+            f"preset {preset}: CPU seconds\n"
+        )
+        options = Options(preset=preset)
+        found = [measured(seconds_of_pairs, coarse, p, options)[0] for p in sizes]
+        for stage in found[0]:
+            seconds = np.array([f[stage] for f in found])
+            slope = np.polyfit(np.log(sizes), np.log(seconds), 1)[0]
+            more = np.polyfit(sizes, seconds, 1)[0]
+            say(
+                f"{stage:36} {'  '.join(f'{t:8.2f}' for t in seconds)}   exponent {slope:5.2f}, "
+                f"{more:.3f} a pair more"
+            )
 
 
 def certificates(folder, n_checked=1000):
@@ -571,16 +612,57 @@ def whole(folder, n=51, n_vertices=VERTICES):
         say(f"{stage:36} {seconds:8.1f} s {memory:8.0f} MiB")
 
 
+def cpu_of(function, times=20):
+    """Milliseconds of CPU of a call, the least of five."""
+    spent = []
+    for _ in range(5):
+        begin = time.process_time()
+        for _ in range(times):
+            function()
+        spent.append(1000 * (time.process_time() - begin) / times)
+    return min(spent)
+
+
+def seals(folder):
+    """What the checksums of a study's files cost: one mesh, and the files of 1,000 small ones."""
+    file, plain = folder / "sealed.nc", folder / "plain.nc"
+    say(f"{'ms of CPU':24} {'open':>8} {'read':>8} {'is done':>8} {'write':>8}")
+    for n_vertices in (1500, VERTICES):
+        mesh = synthetic.brains(1, n_vertices)["original/brain_01"].to_dataset()
+        add_seal = store.add_seal
+        for name, path in (("checked", file), ("not checked", plain)):
+            store.add_seal = add_seal if path == file else lambda whole: None
+            store.SEALED = seal.SEALED if path == file else "no_checksums"
+            write = cpu_of(lambda path=path, mesh=mesh: store.write(mesh, path, "key"), 5)
+            store.SEALED = seal.SEALED
+            steps = store.open_file, store.read, lambda path: store.is_done(path, "key")
+            costs = [cpu_of(lambda step=step, path=path: step(path)) for step in steps]
+            row = " ".join(f"{cost:8.1f}" for cost in [*costs, write])
+            say(f"{f'{n_vertices:,} vertices, {name}':24} {row}")
+        store.add_seal = add_seal
+        with xr.open_dataset(plain, engine=store.ENGINE):
+            other = cpu_of(lambda: xr.open_dataset(plain, engine=store.ENGINE).close())
+        say(f"{'  xarray.open_dataset':24} {other:8.1f}")
+    store.write(synthetic.brains(1, 1500)["original/brain_01"].to_dataset(), file, "key")
+    names = [shutil.copy(file, folder / f"{i}.nc") for i in range(1000)]
+    begin = time.process_time()
+    for name in names:
+        store.open_file(name)
+    say(f"1,000 files of 1,500 vertices opened: {time.process_time() - begin:.1f} s of CPU")
+
+
 PARTS = {
+    "seals": seals,
     "stages": stages,
     "pipelines": pipelines,
     "growth": growth,
+    "pairs": pairs,
     "nearest": certificates,
     "whole": whole,
 }
 
 if __name__ == "__main__":
     part, *numbers = sys.argv[1:] or [""]
-    for run in [PARTS[part]] if part else [stages, pipelines, growth, certificates]:
+    for run in [PARTS[part]] if part else [stages, pipelines, growth, pairs, certificates]:
         with tempfile.TemporaryDirectory() as folder:
             run(Path(folder), *map(int, numbers))

@@ -1,6 +1,8 @@
 """The command line: what it prints, how it ends, and that its options are those of `analyse`."""
 
 import inspect
+import os
+import re
 import subprocess
 import sys
 from importlib.metadata import version
@@ -34,10 +36,10 @@ def test_run_ends_well_and_says_what_it_found(ran):
     assert result.returncode == 0, result.stderr
     assert (study / "pca.nc").exists()
     for words in (
-        "4 shapes: 4 ok, 0 repaired, 0 excluded",
+        "4 shapes: 4 ok, 0 repaired, 0 doubtful, 0 excluded",
         "median shape: brain_",
         "variance explained:",
-        "peak MiB",
+        " MiB",
     ):
         assert words in result.stdout
     assert f"s4a view {study}" in result.stdout
@@ -214,3 +216,41 @@ def test_a_mesh_written_by_the_library_passes_the_check(tmp_path, capsys):
     write_mesh(tmp_path / "ball.obj", *as_arrays(synthetic.sphere(200)))
     assert cli.main(["check", str(tmp_path)]) == 0
     assert np.isin(["ball", "200"], capsys.readouterr().out.split()).all()
+
+
+@pytest.mark.parametrize(
+    "flags, said",
+    [
+        (["--n-pairs", "10^22"], "a whole number of at most 18 digits needed, found '10^22'"),
+        (["--n-pairs", "9" * 5000], "a whole number of at most 18 digits needed, found '999"),
+        (["--n-pairs", "99999999999"], "n_pairs must be an integer of at most 2147483647"),
+        (["--k", "NaN"], "a whole number of at most 18 digits needed, found 'NaN'"),
+        (["--seed", "1e3"], "a whole number of at most 18 digits needed, found '1e3'"),
+        (["--n-coarse", "²"], "a whole number of at most 18 digits needed, found '²'"),
+        (["--components", "²"], "found '²'"),
+        (["--n-jobs", "0"], "a number from 1 to 1000 needed, or -1 for all cores, found 0"),
+        (["--n-jobs", "1000000"], "a number from 1 to 1000 needed"),
+        (["--cluster", "local:²"], "local:N with N from 1 to 999; found 'local:²'"),
+        (["--cluster", "local:99999"], "local:N with N from 1 to 999; found 'local:99999'"),
+        (["--cluster", "tcp://host"], "--cluster needs tcp://host:port"),
+    ],
+)
+def test_numbers_that_are_none_are_refused_in_a_sentence(tmp_path, capsys, flags, said):
+    try:
+        code = cli.main(["run", str(tmp_path), "--out", str(tmp_path / "study"), *flags])
+    except SystemExit as error:
+        code = error.code
+    assert code == 2
+    assert said in capsys.readouterr().err.splitlines()[-1]
+    assert not (tmp_path / "study").exists()
+
+
+def test_letters_that_the_terminal_does_not_know_are_written_as_escapes(tmp_path):
+    (tmp_path / "脳.ply").write_bytes(b"")
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    write_mesh(tmp_path / "good.ply", *as_arrays(synthetic.sphere(100)))
+    command = [sys.executable, "-m", "s4a", "check", str(tmp_path)]
+    ran = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    assert ran.returncode == 1
+    assert ran.stderr == ""
+    assert r"\u8133.ply cannot be" in re.sub(r"\s+", " ", ran.stdout)

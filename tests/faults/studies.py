@@ -1,5 +1,6 @@
 """Faults that are not of one mesh file: what is promised, and the test that proves it."""
 
+DOUBTFUL = "test_doubtful.py"
 PIPELINE, CLEAN, TRANSFER = "test_pipeline.py", "test_clean.py", "test_transfer.py"
 STUDY, ENDS, FAULTS, BOUNDED = (
     "test_store.py",
@@ -7,6 +8,11 @@ STUDY, ENDS, FAULTS, BOUNDED = (
     "test_faults.py",
     "test_bounded.py",
 )
+RAW = "test_raw.py"
+
+STATISTICS, SUBJECTS = "test_statistics.py", "test_subjects.py"
+
+SEAL = "test_seal.py"
 
 # input, outcome, file and name of the test
 PROOFS = [
@@ -42,6 +48,76 @@ PROOFS = [
         "test_of_two_mirror_images_none_is_the_right_one",
     ),
     (
+        "a named pipe, a socket, a device, a link that leads nowhere or to itself, a file of over "
+        "2 GiB, in the folder",
+        "excluded with the reason, at once; the others have the results that they have alone",
+        RAW,
+        "test_a_run_over_them_has_the_results_of_the_good_ones_alone",
+    ),
+    (
+        "a file that may not be read, or fails while it is read",
+        "excluded with the reason",
+        RAW,
+        "test_a_file_that_may_not_be_read_is_named",
+    ),
+    (
+        "a folder that cannot be searched, a link to a folder, a folder named like a mesh",
+        "told in the remarks",
+        RAW,
+        "test_a_folder_that_cannot_be_searched_is_told",
+    ),
+    (
+        "names of 250 letters, of 80 letters of five codes each, not of UTF-8, or that differ "
+        "in case only",
+        "works; names of shapes are unique and have at most 100 letters, of longer ones a hash is "
+        "the end, and it is told",
+        RAW,
+        "test_names_of_shapes_are_unique_and_short_enough_for_the_files_of_a_study",
+    ),
+    (
+        "line ends, colours of a terminal or marks of direction in the name of a file",
+        "written as escapes wherever the name is shown",
+        RAW,
+        "test_a_name_writes_no_line_of_its_own",
+    ),
+    (
+        "a single triangle, a tetrahedron, among good shapes",
+        "the run goes on with the others",
+        FAULTS,
+        "test_a_triangle_and_a_tetrahedron_end_no_run",
+    ),
+    (
+        "surfaces that are none: soup whose corners do not meet, slivers, heaps of triangles, many "
+        "or tiny pieces, any scale and offset",
+        "cleaned and remeshed, or excluded by name; no other exception in 5 s each",
+        "test_fuzz.py",
+        "test_damaged_files_are_read_or_refused_by_name_in_bounded_time_and_memory",
+    ),
+    (
+        "numbers of the command line that are none or too large (10^22, NaN, 1e3, ², 5,000 digits)",
+        "one sentence, exit code 2",
+        "test_cli.py",
+        "test_numbers_that_are_none_are_refused_in_a_sentence",
+    ),
+    (
+        "100 GiB in a .gz of 100 MB",
+        "refused at 64 MiB of it, as is a block of VTP or GIFTI",
+        BOUNDED,
+        "test_what_unpacks_to_too_much_is_refused_before_it_fills_the_memory",
+    ),
+    (
+        "an archive (NPZ) that lies about its sizes",
+        "read no further than it says",
+        BOUNDED,
+        "test_an_archive_that_lies_about_its_sizes_is_read_no_further_than_it_says",
+    ),
+    (
+        "a table in UTF-16, Latin-1, with NUL bytes, or a workbook",
+        "error that says what it seems to be and how to save it",
+        "test_subjects.py",
+        "test_a_table_in_another_encoding_is_told_with_what_it_seems_to_be",
+    ),
+    (
         "one shape only",
         "one error with the reason",
         PIPELINE,
@@ -61,10 +137,42 @@ PROOFS = [
         "test_identical_shapes_give_finite_results_and_modes_only_beside_a_shape_that_differs",
     ),
     (
-        "fewer than k eigenfunctions",
-        "k reduced and said",
-        FAULTS,
-        "test_reduced_numbers_are_told",
+        "fewer eigenfunctions than most others",
+        "excluded with both numbers; k stays; it falls only where at least half lack them, "
+        "said first",
+        DOUBTFUL,
+        "test_a_shape_with_too_few_eigenfunctions_is_excluded_and_takes_no_k_from_the_others",
+    ),
+    (
+        "doubtful shapes among good ones",
+        "these have the same results, to the bit, as without; those are registered, "
+        "in no modes or statistics, never the template",
+        DOUBTFUL,
+        "test_the_results_of_the_others_are_the_same_to_the_bit_as_without",
+    ),
+    (
+        "doubtful shapes with `keep_doubtful`",
+        "they enter modes and statistics",
+        DOUBTFUL,
+        "test_they_enter_modes_and_statistics_on_demand",
+    ),
+    (
+        'doubtful shapes with `doubtful="stop"`',
+        "one error that names them by kind, before the long stages",
+        DOUBTFUL,
+        "test_a_run_can_stop_at_them_before_its_long_stages",
+    ),
+    (
+        "a doubtful shape that `template` names",
+        "it is the template, and said",
+        DOUBTFUL,
+        "test_a_doubtful_shape_is_the_template_where_it_is_named",
+    ),
+    (
+        "fewer than two shapes beyond doubt",
+        "all are treated alike, and said",
+        DOUBTFUL,
+        "test_where_fewer_than_two_are_beyond_doubt_all_are_treated_alike",
     ),
     (
         "a registration that went wrong",
@@ -91,6 +199,24 @@ PROOFS = [
         PIPELINE,
         "test_an_option_out_of_range_is_refused_with_the_legal_range_before_a_shape_is_read",
     ),
+    (
+        "an option that the preset fixes, given otherwise, for an analysis or pairs",
+        "refused by name, with the preset's value",
+        "test_preset.py",
+        "test_an_option_that_the_preset_fixes_is_refused_by_name",
+    ),
+    (
+        "options of pairs for `s4a transfer` beside a study, which has its own",
+        "refused by name",
+        "test_preset.py",
+        "test_the_commands_take_the_preset_and_refuse_options_beside_a_study",
+    ),
+    (
+        "labels of an external mesh for a study of pairs, which has no low resolution",
+        "refused, with what to give",
+        "test_preset.py",
+        "test_an_external_mesh_needs_more_than_a_study_of_pairs",
+    ),
     ("more pairs than the clique has", "the clique, said", FAULTS, "test_reduced_numbers_are_told"),
     (
         "a study with lost, truncated or zero-byte files",
@@ -107,22 +233,70 @@ PROOFS = [
         "test_a_disk_that_takes_no_more_ends_in_one_error_and_leaves_whole_files",
     ),
     (
+        "a disk that is full in whatever stage",
+        "one clear error; with room again, the next run goes on there and ends with the same study",
+        ENDS,
+        "test_a_disk_that_is_full_in_every_stage_keeps_what_is_finished",
+    ),
+    (
+        "a mesh that changes or vanishes while the run reads it",
+        "one error that names it; with the file back, the next run ends with the same study",
+        ENDS,
+        "test_files_that_vanish_or_change_while_they_are_read_end_the_run_which_then_goes_on",
+    ),
+    (
+        "an error that nobody foresaw, or no memory, in the task of one shape",
+        "the shape is excluded with one line, exit code 1; the traceback is in `.log` of the study",
+        ENDS,
+        "test_an_error_in_the_task_of_one_shape_costs_that_shape_and_is_told",
+    ),
+    (
+        "such an error where all shapes are needed",
+        "one line with the file of the traceback, exit code 2; finished files stay and are used",
+        ENDS,
+        "test_an_error_in_a_stage_of_all_shapes_ends_the_run_in_one_line_and_keeps_what_is_finished",
+    ),
+    (
+        "a worker that crashes or is killed, for want of memory for example",
+        "its task is done again, alone; a shape of which two died is excluded, no other is touched",
+        ENDS,
+        "test_a_crash_costs_the_shape_whose_processes_die_twice_and_nobody_else",
+    ),
+    (
+        "a crash in a run of one process, which it ends",
+        "the third run does that task in a process of its own, and goes on",
+        ENDS,
+        "test_a_task_of_which_two_processes_died_comes_in_a_process_of_its_own",
+    ),
+    (
         "kill -9 at any stage",
         "the next run goes on there and ends with the same study; files of finished tasks stay",
         ENDS,
         "test_a_run_killed_in_every_stage_ends_with_the_same_study",
     ),
     (
-        "kill -9 of a run with workers",
-        "resumes; its workers are gone within seconds and write nothing",
+        "Ctrl-C, SIGTERM, kill -9, a closed terminal; while workers start, or in native code",
+        "workers are gone within seconds and write nothing; no semaphore is left",
         ENDS,
-        "test_workers_are_gone_within_seconds_of_the_end_of_a_run_and_the_study_is_resumable",
+        "test_workers_are_gone_within_seconds_of_the_end_of_a_run_and_leave_nothing",
     ),
     (
-        "Ctrl-C",
-        "stops within seconds, workers gone, resumable",
+        "kill -9 of a run and all of its workers at once",
+        "resumes; the next run removes the semaphores and memory maps that they left",
         ENDS,
-        "test_workers_are_gone_within_seconds_of_the_end_of_a_run_and_the_study_is_resumable",
+        "test_a_run_killed_with_its_workers_goes_on_and_the_next_one_removes_what_they_left",
+    ),
+    (
+        "kill -9 of a run that keeps no study",
+        "the next one removes its temporary folder",
+        ENDS,
+        "test_temporary_studies_of_killed_runs_are_removed_and_those_of_others_stay",
+    ),
+    (
+        "a power cut",
+        "a file is on the disk before it has its name; the next run goes on",
+        ENDS,
+        "test_a_file_is_on_the_disk_before_it_has_its_name",
     ),
     (
         "two runs on one folder",
@@ -132,9 +306,138 @@ PROOFS = [
     ),
     (
         "a study whose names lead out of its folder",
-        "left out and said, nothing outside is read or written",
+        "refused, nothing outside is read or written",
         ENDS,
-        "test_names_that_lead_out_of_a_study_are_left_out",
+        "test_names_that_lead_out_of_a_study_are_refused",
+    ),
+    (
+        "a column of the table with one `?`, or with decimal commas",
+        "a warning with its cells when it is read; no test takes it",
+        SUBJECTS,
+        "test_a_column_that_is_mostly_numbers_is_named_with_its_cells",
+    ),
+    (
+        "`NA`, `n/a`, `-` or nothing in a column of text",
+        "missing, and no group; the shapes are left out of the test and named",
+        STATISTICS,
+        "test_a_missing_text_is_no_group",
+    ),
+    (
+        "shapes without a value of a number",
+        "left out of the test and named",
+        SUBJECTS,
+        "test_shapes_without_a_value_are_left_out_of_the_test_and_named",
+    ),
+    (
+        "a covariate of dates, names of shapes, or more columns than shapes",
+        "error with what was found and what to give",
+        STATISTICS,
+        "test_a_covariate_of_no_use_is_refused_with_what_to_do",
+    ),
+    (
+        "covariates that are constant or a linear combination of others",
+        "the same test as without them; warned, with the names",
+        STATISTICS,
+        "test_what_becomes_of_the_covariates_is_told",
+    ),
+    (
+        "a variable that is constant up to rounding, infinite, of 1e-300, of dates",
+        "error with what was found and what to give",
+        STATISTICS,
+        "test_a_variable_of_no_use_is_refused_with_what_to_do",
+    ),
+    (
+        "groups of fewer than 3 shapes, fewer than 4 shapes",
+        "error with the sizes",
+        STATISTICS,
+        "test_small_groups_are_refused_or_warned_of_and_the_smallest_p_is_told",
+    ),
+    (
+        "so few shapes that no p value can be under 0.05",
+        "exact p values, warned with the smallest that can be",
+        STATISTICS,
+        "test_a_test_that_can_find_nothing_says_so",
+    ),
+    (
+        "groups that scatter differently",
+        'warned with the scatter of each; `variances="unequal"` holds the level',
+        STATISTICS,
+        "test_groups_of_unequal_scatter_are_told_and_signs_hold_the_level",
+    ),
+    (
+        "-1, 0 or 10^22 permutations",
+        "error with the legal range",
+        STATISTICS,
+        "test_a_number_of_permutations_that_makes_no_test_is_refused",
+    ),
+    (
+        "statistics of equal shapes, or with displacements that are not finite",
+        "error with the names",
+        STATISTICS,
+        "test_statistics_of_shapes_that_are_equal_or_not_finite_say_so",
+    ),
+    (
+        "one person with several shapes in the table",
+        "warned, with the shapes",
+        SUBJECTS,
+        "test_a_person_of_several_shapes_is_named",
+    ),
+    (
+        "a table of an earlier run, and other meshes now",
+        "kept, and said which rows and names it is about",
+        SUBJECTS,
+        "test_a_table_of_other_meshes_is_named",
+    ),
+    (
+        "a landmark at NaN or 1e300",
+        "error with its name",
+        TRANSFER,
+        "test_a_landmark_at_no_place_is_named",
+    ),
+    (
+        "a study with a flipped bit, anywhere in any file",
+        "an error that names the file when it is opened, or the variable when it is read; the same "
+        "run makes that file anew, bit for bit, and no other",
+        SEAL,
+        "test_a_run_makes_damaged_files_anew_and_no_others_and_the_same_bytes",
+    ),
+    (
+        "bytes lost, zeroed or cut off",
+        "the same",
+        SEAL,
+        "test_bytes_lost_or_zeroed_anywhere_are_seen",
+    ),
+    (
+        "`.costs.json` of another form",
+        "told; times of earlier runs are not counted",
+        SEAL,
+        "test_costs_of_another_form_are_told_and_counted_as_none",
+    ),
+    (
+        "a study of a stranger: external storage, external and soft links, virtual datasets, "
+        "filters, groups, texts that repeat themselves",
+        "refused with the file and what it has, before a value is read",
+        SEAL,
+        "test_what_leads_out_of_a_file_or_unpacks_is_refused_before_it_is_read",
+    ),
+    (
+        "a symbolic link or a pipe in a study",
+        "refused; the folder of the study itself may be a link",
+        SEAL,
+        "test_symbolic_links_within_a_study_are_not_followed",
+    ),
+    (
+        "a file without a variable, an attribute or a name, with an index out of range, of another "
+        "kind or size",
+        "refused with the file and what it should hold",
+        SEAL,
+        "test_a_file_that_does_not_hold_what_it_should_is_named_with_what",
+    ),
+    (
+        "files damaged, missing, left over, foreign or of an earlier run",
+        "`s4a verify` names them in one line each; exit code 1 where the study does not hold",
+        SEAL,
+        "test_verify_says_in_one_line_what_holds_and_its_exit_code_whether",
     ),
     (
         "archives (NPZ, VTP, GIFTI) that unpack to too much",

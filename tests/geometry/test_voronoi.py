@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 
 from s4a.geometry.mesh import directed_edges
-from s4a.geometry.voronoi import cut_handles, dual, faults, mesh_graph, refine, rims, voronoi_cells
+from s4a.geometry.voronoi import (
+    between_rims,
+    cut_handles,
+    dual,
+    faults,
+    mesh_graph,
+    refine,
+    rims,
+    voronoi_cells,
+)
 
 
 def sheet(*rows):
@@ -129,3 +138,14 @@ def test_what_would_cut_off_more_than_a_crumb_stays():
     assert len(Y) == len(X)
     assert len(F) == len(T)
     assert (origin >= 0).all()
+
+
+def test_a_piece_of_a_region_that_no_rim_bounds_is_not_cut():
+    X, T, _ = ball()
+    n = len(X)
+    assert not between_rims(mesh_graph(X, T).G, T, np.zeros(n, int)).any()  # closed, all one region
+    two = mesh_graph(np.r_[X, X + 9], np.r_[T, T + n])  # beside one that has two rims
+    height = np.r_[X[:, 2], np.full(n, 0.0)]
+    removed = between_rims(two.G, two.T, np.where(np.abs(height) < 0.5, 0, -1))
+    assert removed[: len(T)].any()
+    assert not removed[len(T) :].any()

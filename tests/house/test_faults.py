@@ -53,10 +53,11 @@ def checked(folder):
 def ran(folder, tmp_path_factory):
     """What a run over all wrote, and its study."""
     out = tmp_path_factory.mktemp("out") / "study"
-    more = ["--n-pairs", "49", "--template", "good_0", "--n-jobs", "1"]
+    more = ["--n-pairs", "150", "--template", "good_0", "--n-jobs", "1"]
     code, text = printed("run", str(folder), "--out", str(out), *FLAGS, *more)
+    full = re.sub(r"\s+", " ", (out / "report.txt").read_text(encoding="utf-8"))
     with open_study(out) as study:
-        yield code, text, study
+        yield code, text + re.sub(r"(?<=\w)- (?=\w)", "-", full), study
 
 
 def said(report, one):
@@ -75,10 +76,14 @@ def test_every_fault_has_its_outcome(name, in_python, checked, ran):
         if one.where == "remarks":
             assert name not in report["shape"].values
         else:
-            assert report["status"].sel(shape=name).item() == one.status
+            row = report.sel(shape=name)
+            # ten functions on 100 vertices register some shapes wrongly, which a run says
+            wrong = report is in_run and "registration" in row["doubtful_kinds"].item()
+            assert row["status"].item() == ("doubtful" if wrong else one.status)
         if not (silent and report is in_run):  # a run has other things to say of them
             assert re.search(one.said, said(report, one))
-    assert (name in ran[2]["registration"]["shape"].values) == (one.status in ("ok", "repaired"))
+    used = one.status in ("ok", "repaired", "doubtful")
+    assert (name in ran[2]["registration"]["shape"].values) == used
     for _, text, *_ in (checked, ran):
         assert name in text or silent
         assert silent or re.search(one.said, text)
@@ -190,8 +195,8 @@ def test_what_looks_wrong_with_a_new_shape_beside_a_study_is_told(reference):
     assert warning["good"] == ""
     assert "near 10^-3: another unit" in warning["metres"]
     assert "fits as a mirror image" in warning["mirrored"]
-    assert "degrees against most others: upside down" in warning["upside_down"]
-    assert "near 10" not in warning["mirrored"] + warning["upside_down"]
+    assert warning["upside_down"] == ""  # the alignment turns it
+    assert "near 10" not in warning["mirrored"]
     assert np.ptp(found["original/metres"]["position"].values) == pytest.approx(np.ptp(X) / 1000)
     assert (
         insert(reference, {"mirrored": (given["mirrored"], T)}, compare=False)["report"]["warning"]
@@ -243,18 +248,30 @@ def test_reduced_numbers_are_told():
         name: faulty.shape(i, n) for i, (name, n) in enumerate({"a": 60, "b": 20, "c": 60}.items())
     }
     report = analyse(meshes, **SMALL | {"k": 40}, n_jobs=1, intersections=False)["report"]
-    assert "all 3 pairs of 3 shapes are used (n_pairs = 500)" in report.attrs["remarks"]
-    assert re.search(r"k = 40 reduced to 1\d, the eigenfunctions of b", report.attrs["remarks"])
+    assert "all 1 pairs of 2 shapes are used (n_pairs = 500)" in report.attrs["remarks"]
+    assert report["status"].sel(shape="b").item() == "excluded"
+    why = report["reason"].sel(shape="b").item()
+    assert re.search(r"only 1\d eigenfunctions, where 2 of 3 shapes have 40 or more", why)
     assert (
         "all vertices are used, as there are fewer than n_coarse = 100"
         in report["reason"].sel(shape="a").item()
     )
 
 
+def test_a_triangle_and_a_tetrahedron_end_no_run():
+    X = np.array([[0.0, 0, 0], [9, 0, 0], [0, 9, 0], [0, 0, 9]])
+    solid = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]
+    tiny = {"triangle": (X[:3], [[0, 1, 2]]), "tetrahedron": (X, solid)}
+    study = analyse(collection() | tiny, **OPTIONS)
+    assert set(collection()) <= set(study["registration"]["shape"].values.tolist())
+    assert np.isfinite(study["pca"]["score"]).all()
+
+
 def test_a_wrong_registration_is_told():
     wrong, remarks = doubtful({"a": 0.0, "b": 0.02, "c": 0.1})
     assert list(wrong) == ["c"]
-    assert "badness 0.100" in wrong["c"]
+    assert [(one.kind, one.doubtful) for one in wrong["c"]] == [("registration", True)]
+    assert "badness 0.100" in wrong["c"][0].words
     assert remarks == []
     assert doubtful({"a": 0.0, "b": 0.12, "c": 0.1})[0] == {}
 

@@ -1,6 +1,7 @@
 """Compressed files: read as what they hold, and never more than the memory holds."""
 
 import gzip
+import tracemalloc
 import zlib
 from base64 import b64encode
 from io import BytesIO
@@ -73,6 +74,33 @@ def bombs():
     npz = BytesIO()
     np.savez_compressed(npz, V=np.zeros(10_000_000), F=np.array([[0, 1, 2]]))
     return {"gz": gzip.compress(zeros), "vtp": vtp, "gii": gifti, "npz": npz.getvalue()}
+
+
+def test_an_archive_that_lies_about_its_sizes_is_read_no_further_than_it_says(tmp_path):
+    packed = BytesIO()
+    np.savez_compressed(packed, V=np.zeros(10_000_000), F=np.array([[0, 1, 2]]))
+    true = (80_000_128).to_bytes(4, "little")
+    assert packed.getvalue().count(true) == 2
+    lying = packed.getvalue().replace(true, (1000).to_bytes(4, "little"))
+    with pytest.raises(ValueError, match=r"m.npz cannot be read as NPZ"):
+        read_mesh(file(tmp_path / "m.npz", lying))
+    tracemalloc.start()
+    with pytest.raises(ValueError):
+        read_mesh(tmp_path / "m.npz")
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 10e6
+
+
+def test_what_unpacks_to_too_much_is_refused_before_it_fills_the_memory(tmp_path):
+    part = gzip.compress(bytes(2**26), 9)
+    path = file(tmp_path / "m.ply.gz", 200 * part)  # 12.5 GiB in 13 MB
+    tracemalloc.start()
+    with pytest.raises(ValueError, match=r"at most 64 MiB expected in \d+ compressed bytes"):
+        read_mesh(path)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 2**27
 
 
 def test_what_unpacks_to_too_much_is_refused(tmp_path):

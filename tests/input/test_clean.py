@@ -7,7 +7,8 @@ import xarray as xr
 from paths import DATA
 from scipy.spatial import ConvexHull
 
-from s4a.geometry.mesh import as_dataset, triangle_areas, volume
+from s4a import synthetic
+from s4a.geometry.mesh import as_arrays, as_dataset, triangle_areas, volume
 from s4a.input.clean import clean, clean_arrays
 from s4a.input.collection import read_shape, read_shapes
 from s4a.input.files import write_mesh
@@ -459,7 +460,7 @@ def test_a_template_brain_is_repaired_in_any_order():
 def test_a_bad_file_is_excluded_with_its_reason_and_the_rest_goes_on(tmp_path):
     X, T = sphere()
     write_mesh(tmp_path / "good.ply", X, T)
-    write_mesh(tmp_path / "twice.stl", X, np.concatenate([T, T[:1]]))
+    write_mesh(tmp_path / "twice.stl", X * [1, 1, 1.2], np.concatenate([T, T[:1]]))
     (tmp_path / "cut.ply").write_bytes((tmp_path / "good.ply").read_bytes()[:-100])
     (tmp_path / "good.ply").rename(tmp_path / "named.obj")
     shapes = read_shapes(tmp_path)
@@ -495,3 +496,35 @@ def test_nothing_usable_is_an_error_with_every_reason(tmp_path):
         read_shapes(tmp_path)
     with pytest.raises(ValueError, match=r"names of letters"):
         read_shapes({"a/b": sphere()})
+
+
+def ball(factor=1.0, offset=0.0, kind=float):
+    X, T = as_arrays(synthetic.sphere(100))
+    return (factor * X + offset).astype(kind).astype(float), T
+
+
+@pytest.mark.parametrize("factor", [1e16, 1e37, 1e60, 1e300])
+def test_coordinates_too_large_to_compute_with_are_refused(factor):
+    X, T = ball(factor)
+    with pytest.raises(
+        ValueError, match=r"coordinates of at most 1e\+15 needed, found \d.*: scale the file"
+    ):
+        clean_arrays(X, T)
+    X, T = ball()
+    X[0] *= factor  # one is enough
+    with pytest.raises(ValueError, match=r"coordinates of at most 1e\+15 needed"):
+        clean_arrays(X, T)
+
+
+@pytest.mark.parametrize("factor", [1e-16, 1e-60, 1e-300, 5e-324])
+def test_shapes_too_small_to_compute_with_are_refused(factor):
+    with pytest.raises(ValueError, match=r"an extent of at least 1e-15 needed, found"):
+        clean_arrays(*ball(factor))
+
+
+def test_shapes_lost_in_the_rounding_of_their_offset_are_refused():
+    for offset, kind in ((1e6, np.float32), (1e12, float)):
+        with pytest.raises(ValueError, match=r"lost in rounding: .*subtract the offset"):
+            clean_arrays(*ball(1.0, offset, kind))
+    for offset, kind in ((1e4, np.float32), (1e10, float)):
+        assert clean_arrays(*ball(1.0, offset, kind))[-1]["genus"] == 0

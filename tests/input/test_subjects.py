@@ -9,6 +9,7 @@ import xarray as xr
 
 from s4a import analyse, cli, insert, open_study, statistics, synthetic
 from s4a.cli import commands
+from s4a.input.annotations import read_labels, read_landmarks
 from s4a.input.subjects import read_table, with_table
 
 OPTIONS = {"n_coarse": 300, "k_init": 8, "k": 12, "n_jobs": 1}
@@ -50,6 +51,31 @@ def test_whole_numbers_that_no_integer_holds_are_numbers(tmp_path):
     file = tmp_path / "table.csv"
     file.write_text(f"shape,size\na,1{30 * '0'}\nb,-1\n")
     assert read_table(file, ["a", "b"])["size"].values.tolist() == [1e30, -1.0]
+
+
+def test_what_says_that_a_value_is_missing_is_neither_number_nor_text(tmp_path):
+    file = tmp_path / "table.csv"
+    file.write_text("shape,age,site\na,NA,n/a\nb,31,Bern\nc,-,-\nd,,NaN\n")
+    found = read_table(file, list("abcd"))
+    assert found["site"].values.tolist() == ["", "Bern", "", ""]
+    assert found["age"].values == pytest.approx([np.nan, 31, np.nan, np.nan], nan_ok=True)
+
+
+def test_a_column_that_is_mostly_numbers_is_named_with_its_cells(tmp_path, caplog):
+    file = tmp_path / "table.csv"
+    file.write_text("shape;age;size;code\na;31;60,5;1a\nb;?;61,0;2a\nc;40;62,5;3\n")
+    found = read_table(file, list("abc"))
+    assert [found[name].dtype.kind for name in ("age", "size", "code")] == ["U"] * 3
+    assert "'age' is mostly numbers, but 1 of its 3 cells are none (b: '?')" in caplog.text
+    assert "'size' is mostly numbers, but 3 of its 3 cells are none (a: '60,5'" in caplog.text
+    assert "'code'" not in caplog.text
+
+
+def test_a_person_of_several_shapes_is_named(tmp_path, caplog):
+    file = tmp_path / "table.csv"
+    file.write_text("shape,subject,age\na,p1,31\nb,p1,32\nc,p2,NA\n")
+    read_table(file, list("abc"))
+    assert "1 values of the column 'subject' stand for several shapes (p1: a, b)" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -100,34 +126,57 @@ def test_a_study_has_the_table_and_nothing_else_depends_on_it(folder, brains):
     assert {p: p.stat().st_mtime_ns for p in before} == before
 
 
+def test_a_table_of_other_meshes_is_named(folder, brains, tmp_path):
+    given = {n: m for n, m in brains.items() if n in NAMES[:3]}
+    rows = [line for line in TABLE.splitlines() if line.split(";")[0] in ("shape", *NAMES[:3])]
+    (tmp_path / "three.csv").write_text("\n".join(rows))
+    work = tmp_path / "study"
+    first = analyse(given, store=work, table=tmp_path / "three.csv", **OPTIONS)
+    same = analyse(given, store=work, **OPTIONS)
+    assert "table" not in first["report"].attrs["remarks"] + same["report"].attrs["remarks"]
+    first.close()
+    same.close()
+    given = {NAMES[0]: given[NAMES[1]], NAMES[1]: given[NAMES[1]], NAMES[5]: brains[NAMES[5]]}
+    with analyse(given, store=work, **OPTIONS) as other:
+        remarks = other["report"].attrs["remarks"]
+    assert "three.csv, is kept, but it has no row for brain_06; it has rows for what is" in remarks
+    assert "no shape now: brain_03; other meshes have taken the names brain_01: give" in remarks
+
+
 def test_statistics_take_columns_and_say_which_values_are_missing(folder):
     with open_study(folder / "study") as study:
         by_name = statistics.group_test(study, "sex", covariates=["age"], n_permutations=19)
         age = study["subjects"]["age"].values
-        assert by_name.identical(
-            statistics.group_test(study, list("fmfmfm"), covariates=age, n_permutations=19)
-        )
-        assert (
-            statistics.regression(study, "age", covariates=["sex"], n_permutations=9).attrs[
-                "highest"
-            ]
-            == age.max()
-        )
+        given = statistics.group_test(study, list("fmfmfm"), covariates=age, n_permutations=19)
+        assert by_name.drop_attrs().identical(given.drop_attrs())
+        assert by_name.attrs["covariates"] == "covariate 'age'"
+        by_sex = statistics.regression(study, "age", covariates=["sex"], n_permutations=9)
+        assert by_sex.attrs["highest"] == age.max()
+        assert by_sex.attrs["covariates"] == "covariate 'sex' as indicators of m against f"
         with pytest.raises(
             ValueError, match=r"group 'size' needs a column of that name .* has sex, age, score"
         ):
             statistics.group_test(study, "size")
         with pytest.raises(ValueError, match="a regression needs a variable of numbers"):
             statistics.regression(study, "sex")
-        table = study["subjects"].to_dataset()
-        holes = xr.DataTree.from_dict(
-            {
-                "registration": study["registration"].to_dataset(),
-                "subjects": table.where(table["age"] < 50),
-            }
-        )
-        with pytest.raises(ValueError, match=r"variable 'age' needs a finite value .*: brain_06"):
-            statistics.regression(holes, "age")
+
+
+def test_shapes_without_a_value_are_left_out_of_the_test_and_named(folder, caplog):
+    with open_study(folder / "study") as study:
+        registration = study["registration"].to_dataset().load()
+        table = study["subjects"].to_dataset().load()
+    holes = xr.DataTree.from_dict(
+        {"registration": registration, "subjects": table.where(table["age"] < 50)}
+    )
+    found = statistics.regression(holes, "age", n_permutations=9)
+    assert "no value for 1 of 6 shapes, which are left out of the test: brain_06" in caplog.text
+    five = registration.isel(shape=slice(5))
+    alone = statistics.regression(
+        xr.DataTree.from_dict({"registration": five}), table["age"].values[:5], n_permutations=9
+    )
+    assert found.attrs["left_out"] == "brain_06"
+    assert found.drop_attrs().identical(alone.drop_attrs())
+    assert statistics.regression_modes(holes, found)["pca"]["shape"].size == 5
 
 
 def test_a_table_can_take_the_place_of_the_first(folder):
@@ -177,6 +226,18 @@ def test_the_command_prints_tables_and_writes_files(folder, capsys, monkeypatch)
         assert (out / f"{name}.nc").is_file(), name
     assert cli.main(["statistics", str(folder / "study"), "--group", "site"]) == 2
     assert "group 'site' needs a column of that name" in capsys.readouterr().err
+
+
+def test_the_command_refuses_what_makes_no_test_and_says_a_warning_once(folder, capsys, caplog):
+    command = ["statistics", str(folder / "study"), "--out", str(folder / "few")]
+    for n in ("-1", "0", str(10**9)):
+        assert cli.main([*command, "--group", "sex", "--permutations", n]) == 2
+        assert f"a number from 1 to 10000000, found {n}" in capsys.readouterr().err
+    caplog.clear()
+    flags = ["--group", "sex", "--covariates", "score", "--permutations", "9"]
+    assert cli.main([*command, *flags, "--variances", "unequal"]) == 0
+    assert caplog.text.count("groups under 10 shapes (f: 3, m: 3)") == 1
+    assert "accounted for: covariate 'score'" in capsys.readouterr().out
 
 
 def test_the_command_inserts_shapes(folder, brains, tmp_path, capsys):
@@ -245,3 +306,36 @@ def test_without_its_template_a_study_is_registered_to_the_next(folder):
         kept = next(n for n in NAMES[:6] if n not in (template, near))
         same = without(study, kept)["registration"].to_dataset()
         assert same.identical(study["registration"].to_dataset().drop_sel(shape=kept))
+
+
+@pytest.mark.parametrize(
+    "data, said",
+    [
+        ("shape,âge\na,1\n".encode("utf-16"), "found UTF-16: save it as CSV UTF-8"),
+        ("shape,age\na,1\n".encode("utf-16-le"), "found UTF-16: save it as CSV UTF-8"),
+        (
+            "shape,age\nà,1\n".encode("latin-1"),
+            "byte 0xe0 in line 2: .* Latin-1 .* 'à'",
+        ),
+        (b"shape,age\na,1\0\n", "the byte 0 in line 2: it seems to be a binary or a damaged file"),
+        (b"PK\x03\x04\x14\0", "found a workbook or an archive: export it as CSV UTF-8"),
+        (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "found a workbook or an archive"),
+        (b"", "the file is empty"),
+        (b"\xef\xbb\xbf", "the file is empty"),
+    ],
+)
+def test_a_table_in_another_encoding_is_told_with_what_it_seems_to_be(tmp_path, data, said):
+    file = tmp_path / "table.csv"
+    file.write_bytes(data)
+    with pytest.raises(ValueError, match=rf"table.csv cannot be read as a table: .*{said}"):
+        read_table(file, ["a"])
+    with pytest.raises(ValueError, match=rf"table.csv cannot be read as labels: .*{said}"):
+        read_labels(file.rename(tmp_path / "labels_table.csv"))
+    if not data.startswith(b"PK"):
+        with pytest.raises(ValueError, match=rf"table.csv cannot be read as landmarks: .*{said}"):
+            read_landmarks(tmp_path / "labels_table.csv")
+
+
+def test_a_table_with_the_mark_of_utf_8_is_read(tmp_path):
+    (tmp_path / "table.csv").write_text("shape,age\na,1\n", encoding="utf-8-sig")
+    assert read_table(tmp_path / "table.csv", ["a"])["age"].values.tolist() == [1]

@@ -15,6 +15,7 @@ from s4a.method.deform import displacement_in_template
 from s4a.method.shape import Shape
 
 OPTIONS = {"n_coarse": 2000, "k": 60}
+STILL = np.eye(3), np.zeros(3)  # no motion
 
 
 def bumps(X, size):
@@ -193,8 +194,8 @@ def test_size_can_be_taken_out_of_the_displacement(shapes):
     source = Shape(grown, spectrum(coarsen(grown, n_coarse=800), k=30))
     start = {"intrinsic": cKDTree(source.low.X).query(target.low.X)[1]}
     functions = source.low.Phi, target.low.Phi
-    with_size = register.register(source, target, start, functions, k=30)
-    without = register.register(source, target, start, functions, k=30, scale=True)
+    with_size = register.register(source, target, start, functions, STILL, k=30)
+    without = register.register(source, target, start, functions, STILL, k=30, scale=True)
     assert without["scale"].item() == pytest.approx(1 / 1.2, rel=1e-3)
     radius = np.linalg.norm(X - X.mean(0), axis=1).mean()
     assert np.linalg.norm(without["displacement"].values, axis=1).mean() < 0.005 * radius

@@ -225,7 +225,7 @@ def test_text_of_the_study_is_escaped(html):
 
 
 def test_the_page_says_what_the_study_says(html):
-    summary = "7 shapes, 1 repaired, 1 excluded; median shape-2; template shape-2; "
+    summary = "7 shapes, 1 repaired, 0 doubtful, 1 excluded; median shape-2; template shape-2; "
     summary += "the first 3 components hold 100%"
     for text in (
         summary,

@@ -109,4 +109,4 @@ def test_an_address_that_is_none_says_what_is_needed(address, capsys, tmp_path):
         cli.main(["run", str(tmp_path), "--out", str(tmp_path / "study"), "--cluster", address])
         == 2
     )
-    assert "tcp://host:port or local:N" in capsys.readouterr().err
+    assert "tcp://host:port, or local:N" in capsys.readouterr().err

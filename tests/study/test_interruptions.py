@@ -4,32 +4,39 @@ Nothing goes on behind them, nothing is damaged, the next one goes on.
 """
 
 import contextlib
+import errno
 import os
+import re
 import signal
 import subprocess
 import sys
+import tempfile
 import time
+from pathlib import Path
 
 import psutil
 import pytest
 
-from s4a import analyse, open_study, synthetic
+from s4a import analyse, cli, open_study, synthetic
 from s4a.schema import dataset
-from s4a.study import store
+from s4a.study import pipeline, processes, store, tasks
 from s4a.study.runner import Run
 
-OPTIONS = {"n_coarse": 150, "k_init": 8, "k": 12}
+# of meshes as coarse as these, some registrations are doubtful; so there are modes all the same
+OPTIONS = {"n_coarse": 150, "k_init": 8, "k": 12, "keep_doubtful": True}
+FLAGS = "--n-coarse 150 --k-init 8 --k 12 --keep-doubtful --n-jobs 1".split()
+# a task that holds Python's lock in native code
 RUN = """
-import signal, sys, time
+import ctypes, signal, sys
 from s4a import analyse
 from s4a.study import pipeline
 
-# it is ignored below a background job of a shell
+# they are ignored below a background job of a shell, and below nohup
 signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
-def slow(*arguments, task=pipeline.remesh_shape):
-    time.sleep(2)
-    return task(*arguments)
+def slow(*arguments):
+    ctypes.PyDLL(None).sleep(600)
 
 if __name__ == "__main__":
     pipeline.remesh_shape = slow
@@ -43,46 +50,90 @@ def files(tmp_path_factory):
 
 
 @contextlib.contextmanager
-def running(folder, files):
-    """A run in a session of its own, with two workers in the middle of their tasks.
+def running(folder, files, n_files):
+    """A run in a session of its own, as soon as it has two workers and has written so many files.
 
-    Gives it and their processes.
+    Gives it and the processes that it started.
     """
     arguments = [sys.executable, "-c", RUN, str(folder), *map(str, files)]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
     with subprocess.Popen(arguments, start_new_session=True, **quiet) as run:
         try:
-            deadline = time.monotonic() + 120
-            while len(list(folder.glob("original/[!.]*.nc"))) < len(files):
+            deadline, started = time.monotonic() + 120, []
+            while len(started) < 4 or len(list(folder.glob("*/[!.]*.nc"))) < n_files:
                 assert run.poll() is None, run.stderr.read().decode()
                 assert time.monotonic() < deadline
-                time.sleep(0.05)
-            time.sleep(1)
-            yield run, psutil.Process(run.pid).children(recursive=True)
+                time.sleep(0.01)
+                started = psutil.Process(run.pid).children(recursive=True)
+            if n_files:
+                time.sleep(1)
+            yield run, started
         finally:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(run.pid, signal.SIGKILL)
 
 
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
-def test_workers_are_gone_within_seconds_of_the_end_of_a_run_and_the_study_is_resumable(
-    files, tmp_path, how
+def remains(pid):
+    """What the workers of a process have in memory that all processes share."""
+    return [
+        p.name for p in Path("/dev/shm").glob("*") if re.search(rf"loky-{pid}-|_{pid}_", p.name)
+    ]
+
+
+@pytest.mark.parametrize("n_files", [0, 4], ids=["while they start", "in native code"])
+@pytest.mark.parametrize(
+    "how, who",
+    [
+        (signal.SIGINT, os.kill),  # as from a notebook: the workers do not get it
+        (signal.SIGTERM, os.kill),
+        (signal.SIGKILL, os.kill),
+        (signal.SIGHUP, os.killpg),  # as when a terminal is closed
+    ],
+)
+def test_workers_are_gone_within_seconds_of_the_end_of_a_run_and_leave_nothing(
+    files, tmp_path, how, who, n_files
 ):
-    folder, files = tmp_path / "study", files[:2]
-    with running(folder, files) as (run, workers):
-        assert len(workers) >= 2
-        os.kill(run.pid, how)  # as from a notebook: the workers do not get it
+    with running(tmp_path / "study", files[:2], n_files) as (run, started):
+        who(run.pid, how)
         run.wait(timeout=20)
-        _, alive = psutil.wait_procs(workers, timeout=20)
+        _, alive = psutil.wait_procs(started, timeout=20)
         assert not [p for p in alive if p.status() != psutil.STATUS_ZOMBIE]
         assert run.returncode != 0
+    assert not remains(run.pid)
+
+
+def test_a_run_killed_with_its_workers_goes_on_and_the_next_one_removes_what_they_left(
+    files, tmp_path
+):
+    folder, files = tmp_path / "study", files[:2]
+    with running(folder, files, 4) as (run, _):
+        os.killpg(run.pid, signal.SIGKILL)
+        run.wait(timeout=20)
     assert not (folder / "report.nc").exists()
+    assert remains(run.pid) or sys.platform != "linux"
     before = {p: p.stat().st_mtime_ns for p in folder.rglob("[!.]*.nc")}
-    assert len(before) >= len(files)
+    assert len(before) >= 4
     with analyse(files, store=folder, n_jobs=1, **OPTIONS) as tree:
         assert tree["registration"].sizes["shape"] == 2
     assert {p: p.stat().st_mtime_ns for p in before} == before
+    assert not remains(run.pid)
     assert not list(folder.rglob(".*.tmp"))
+    assert not list(folder.glob(".log/**/*.txt"))
+
+
+def test_temporary_studies_of_killed_runs_are_removed_and_those_of_others_stay(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    for name in ("s4a-abandond", "s4a-of_other", "s4a-begin_ng", "s4a-thoughts"):
+        (tmp_path / name).mkdir()
+    for name in ("s4a-abandond", "s4a-of_other"):
+        (tmp_path / name / ".lock").write_text("")
+    with processes.held(tmp_path / "s4a-of_other"), processes.temporary_folder() as folder:
+        assert folder.parent == tmp_path
+        left = {path.name for path in tmp_path.iterdir()}
+        assert left == {"s4a-of_other", "s4a-begin_ng", "s4a-thoughts", folder.name}
+    assert not folder.exists()
 
 
 KILLED = """
@@ -132,18 +183,8 @@ KILLS = [
 ]
 
 
-def test_a_run_killed_in_every_stage_ends_with_the_same_study(files, tmp_path):
-    flags = [
-        "--n-coarse",
-        "150",
-        "--k-init",
-        "8",
-        "--k",
-        "12",
-        "--n-jobs",
-        "1",
-        "--no-intersections",
-    ]
+def test_a_run_killed_in_every_stage_ends_with_the_same_study(files, whole, tmp_path):
+    flags = [*FLAGS, "--no-intersections"]
     script = [
         sys.executable,
         "-c",
@@ -166,11 +207,7 @@ def test_a_run_killed_in_every_stage_ends_with_the_same_study(files, tmp_path):
     for file in set(found) - shared:
         assert told.count(f"written {file}") == 1, file
     assert not list((tmp_path / "study").rglob(".*.tmp"))
-    analyse(files, store=tmp_path / "whole", intersections=False, **OPTIONS).close()
-    whole = contents(tmp_path / "whole")
-    assert sorted(found) == sorted(whole)
-    for file, data in whole.items():
-        assert data.identical(found[file]), file
+    assert_the_same(tmp_path / "study", whole)
 
 
 def contents(folder):
@@ -182,6 +219,206 @@ def contents(folder):
     return {
         file: data.drop_vars(times) if file == "report.nc" else data for file, data in files.items()
     }
+
+
+@pytest.fixture(scope="module")
+def whole(files, tmp_path_factory):
+    """The files of an undisturbed run."""
+    folder = tmp_path_factory.mktemp("whole") / "study"
+    analyse(files, store=folder, intersections=False, **OPTIONS).close()
+    return contents(folder)
+
+
+def assert_the_same(folder, whole):
+    found = contents(folder)
+    assert sorted(found) == sorted(whole)
+    for file, data in whole.items():
+        assert data.identical(found[file]), file
+
+
+def test_a_disk_that_is_full_in_every_stage_keeps_what_is_finished(
+    files, whole, tmp_path, monkeypatch
+):
+    folder, replace, full = tmp_path / "study", os.replace, list(KILLS)
+
+    def renamed(temporary, path):
+        if full and Path(path) == folder / full[0]:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        replace(temporary, path)
+
+    monkeypatch.setattr(os, "replace", renamed)
+    while full:
+        with pytest.raises(OSError, match=f"{full[0]} cannot be written .*No space left.*goes on"):
+            analyse(files, store=folder, intersections=False, **OPTIONS)
+        full.pop(0)
+    analyse(files, store=folder, intersections=False, **OPTIONS).close()
+    assert_the_same(folder, whole)
+    assert not list(folder.rglob(".*.tmp"))
+    assert not list(folder.glob(".log/**/*.txt"))
+
+
+def test_files_that_vanish_or_change_while_they_are_read_end_the_run_which_then_goes_on(
+    files, whole, tmp_path, monkeypatch
+):
+    folder, meshes = tmp_path / "study", tmp_path / "meshes"
+    meshes.mkdir()
+    kept = {meshes / file.name: file.read_bytes() for file in files}
+    read = tasks.read_shape
+
+    def restore():
+        for path, data in kept.items():
+            path.write_bytes(data)
+
+    def change(path, **options):
+        mesh = read(path, **options)
+        if "02" in path:
+            Path(path).write_bytes(kept[meshes / files[0].name])
+        return mesh
+
+    def remove(path, **options):
+        if "02" in path:
+            Path(path).unlink()
+        return read(path, **options)
+
+    for happens in (change, remove):
+        restore()
+        monkeypatch.setattr(tasks, "read_shape", happens)
+        with pytest.raises(OSError, match=r"brain_02\.ply has changed or gone since the run began"):
+            analyse(meshes / "*.ply", store=folder, intersections=False, **OPTIONS)
+        assert not (folder / "original" / "brain_02.nc").exists()
+    restore()
+    monkeypatch.setattr(tasks, "read_shape", read)
+    analyse(meshes / "*.ply", store=folder, intersections=False, **OPTIONS).close()
+    found = contents(folder)
+    for file in set(whole) - {"report.nc"}:
+        assert found[file].equals(whole[file]), file  # the attributes have other paths
+
+
+@pytest.mark.parametrize(
+    "error, stage",
+    [
+        (IndexError("list index\nout of range"), "clean_shape"),
+        (MemoryError(), "compare_shape"),
+        (RecursionError(), "remesh_shape"),
+        (SystemExit(0), "align_shape"),
+        (KeyError("k"), "register_shape"),
+    ],
+)
+def test_an_error_in_the_task_of_one_shape_costs_that_shape_and_is_told(
+    files, tmp_path, monkeypatch, capsys, error, stage
+):
+    task = getattr(pipeline, stage)
+
+    def wrong(*arguments):
+        if any("brain_02" in str(argument)[-20:] for argument in arguments[:2]):
+            raise error
+        return task(*arguments)
+
+    monkeypatch.setattr(pipeline, stage, wrong)
+    folder = tmp_path / "study"
+    assert cli.main(["run", *map(str, files), "--out", str(folder), *FLAGS]) == 1
+    said = capsys.readouterr().out
+    with open_study(folder) as tree:
+        report = tree["report"].to_dataset()
+        assert report["status"].values.tolist()[1] == "excluded"
+        reason = report["reason"].values[1]
+        assert type(error).__name__ in reason
+        assert "\n" not in reason
+        assert tree["registration"]["shape"].values.tolist() == ["brain_01", "brain_03"]
+    assert type(error).__name__ in said
+    log = folder / re.search(r"see (\S+\.txt) in the folder of the study", reason)[1]
+    assert log.read_text().startswith("Traceback")
+    assert "in wrong" in log.read_text()
+    monkeypatch.setattr(pipeline, stage, task)
+    assert cli.main(["run", *map(str, files), "--out", str(folder), *FLAGS]) == 0
+    assert not log.exists()
+
+
+@pytest.mark.parametrize("stage", ["map_pairs", "consistent_maps", "pca_without"])
+def test_an_error_in_a_stage_of_all_shapes_ends_the_run_in_one_line_and_keeps_what_is_finished(
+    files, whole, tmp_path, monkeypatch, capsys, stage
+):
+    step = getattr(pipeline, stage)
+
+    def wrong(*_, **__):
+        raise TypeError("of the program")
+
+    monkeypatch.setattr(pipeline, stage, wrong)
+    folder = tmp_path / "study"
+    arguments = ["run", *map(str, files), "--out", str(folder), *FLAGS, "--no-intersections"]
+    assert cli.main(arguments) == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("s4a: ")]
+    assert len(lines) == 1
+    assert "TypeError: of the program" in lines[0]
+    logs = [path for path in (folder / ".log").rglob("*.txt") if path.name in lines[0]]
+    assert "in wrong" in logs[0].read_text()
+    monkeypatch.setattr(pipeline, stage, step)
+    assert cli.main(arguments) == 0
+    assert_the_same(folder, whole)
+    assert not list(folder.glob(".log/**/*.txt"))
+
+
+def test_a_crash_costs_the_shape_whose_processes_die_twice_and_nobody_else(files, whole, tmp_path):
+    folder = tmp_path / "study"
+    found = subprocess.run(
+        [sys.executable, "-c", CRASH, str(folder), *map(str, files)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert found.returncode == 0, found.stderr
+    with open_study(folder) as tree:
+        report = tree["report"].to_dataset()
+        assert (report["status"] == "excluded").values.tolist() == [False, True, False]
+        reason = report["reason"].values[1]
+        assert reason.startswith("registration: its process died (SIGSEGV: a fault in native code)")
+        assert tree["report"].attrs["unforeseen"] == "brain_02"
+    told = (folder / ".log" / "registration-brain_02.txt").read_text()
+    assert told.count("begun by process") == 2
+    assert "in crash" in told
+    kept = {file for file in whole if "registration" not in file and "/" in file}
+    assert all(store.read(folder / file).identical(whole[file]) for file in kept)
+
+
+CRASH = """
+import ctypes, os, signal, sys
+from pathlib import Path
+from s4a import analyse
+from s4a.study import pipeline
+
+def killed_once(folder, name, *arguments, task=pipeline.remesh_shape):
+    mark = folder / ".killed"
+    if name == "brain_03" and not mark.exists():
+        mark.write_text("")
+        os.kill(os.getpid(), signal.SIGKILL)
+    return task(folder, name, *arguments)
+
+def crash(folder, name, *arguments, task=pipeline.register_shape):
+    if name == "brain_02":
+        ctypes.string_at(0)
+    return task(folder, name, *arguments)
+
+if __name__ == "__main__":
+    pipeline.remesh_shape, pipeline.register_shape = killed_once, crash
+    options = {"n_coarse": 150, "k_init": 8, "k": 12, "n_jobs": 2, "intersections": False}
+    options |= {"template": "brain_01", "keep_doubtful": True}
+    analyse(sys.argv[2:], store=sys.argv[1], **options)
+"""
+
+
+def test_a_task_of_which_two_processes_died_comes_in_a_process_of_its_own(files, tmp_path):
+    """As with one process, which a crash ends: the third run goes past it."""
+    folder = tmp_path / "study"
+    script = CRASH.replace('"n_jobs": 2', '"n_jobs": 1')
+    command = [sys.executable, "-c", script, str(folder), *map(str, files)]
+    (folder / "coarse").mkdir(parents=True)
+    (folder / ".lock").write_text("")
+    (folder / ".killed").write_text("")
+    codes = [subprocess.run(command, capture_output=True, check=False).returncode for _ in range(3)]
+    assert codes == [-signal.SIGSEGV, -signal.SIGSEGV, 0]
+    with open_study(folder) as tree:
+        excluded = (tree["report"]["status"] == "excluded").values.tolist()
+        assert excluded == [False, True, False]
 
 
 def test_a_worker_of_a_run_that_is_over_writes_nothing(tmp_path):
@@ -264,6 +501,14 @@ def test_a_disk_that_takes_no_more_ends_in_one_error_and_leaves_whole_files(
     assert not list(folder.rglob(".*.tmp"))
 
 
+def test_a_file_is_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
+    order, fsync, replace = [], os.fsync, os.replace
+    monkeypatch.setattr(os, "fsync", lambda handle: order.append("fsync") or fsync(handle))
+    monkeypatch.setattr(os, "replace", lambda *paths: order.append("rename") or replace(*paths))
+    store.write(synthetic.sphere(50), tmp_path / "a.nc", "key")
+    assert order == ["fsync", "rename"]
+
+
 def test_a_folder_that_cannot_be_written_is_one_error(tmp_path, monkeypatch):
     store.write(synthetic.sphere(50), tmp_path / "a.nc", "key")
 
@@ -279,16 +524,11 @@ def test_a_folder_that_cannot_be_written_is_one_error(tmp_path, monkeypatch):
     assert [p.name for p in tmp_path.iterdir()] == ["a.nc"]
 
 
-def test_names_that_lead_out_of_a_study_are_left_out(tmp_path, caplog):
-    folder, outside = tmp_path / "study", tmp_path / "outside.nc"
-    mesh = synthetic.sphere(50)
-    store.write(mesh, folder / "original" / "a.nc")
-    store.write(
-        dataset(latent_eigenvalue=[0.0, 1.0]).assign_coords(shape=["a", "../../outside"]),
-        folder / "latent.nc",
-    )
-    store.write(mesh.assign_attrs(template="../../outside"), folder / "registration.nc")
-    store.write(mesh, outside)
-    with open_study(folder) as tree:
-        assert list(tree.children) == ["original"]
-    assert "shapes need names of letters, digits, _ and -; found ['../../outside']" in caplog.text
+def test_names_that_lead_out_of_a_study_are_refused(tmp_path):
+    folder = tmp_path / "study"
+    (folder / "original").mkdir(parents=True)
+    found = dataset(latent_eigenvalue=[0.0, 1.0]).assign_coords(shape=["a", "../../outside"])
+    store.write(found.assign_attrs(median="a"), folder / "latent.nc")
+    message = r"latent.nc cannot be read \(shapes need names of letters.*'../../outside'"
+    with pytest.raises(OSError, match=message):
+        open_study(folder)

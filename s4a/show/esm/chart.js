@@ -1,7 +1,7 @@
 // Charts in SVG whose marks can be hovered, clicked and reached with the arrow keys. Every function takes a parent
 // element, a spec (plain numbers and names) and `pick`, which is called with the mark that was chosen.
 
-const BLUE = "#0072b2", ORANGE = "#d55e00", INK = "#333", FAINT = "#ddd";
+const BLUE = "#0072b2", ORANGE = "#d55e00", INK = "#333", FAINT = "#ddd", PALE = "#bbb";
 
 function ticks(low, high, count = 5) {
   const span = high - low || 1, raw = span / count, power = 10 ** Math.floor(Math.log10(raw));
@@ -99,11 +99,11 @@ function reachable(marks, readout, pick) {
 const line = (parent) => html(parent, "div", { class: "s4a-readout", "aria-live": "polite" }, " ");
 
 function scatter(parent, spec, pick) {
-  const { x, y, names, xlabel, ylabel, title, selected = -1, width = 360, height = 300 } = spec;
+  const { x, y, names, xlabel, ylabel, title, selected = -1, faint = [], width = 360, height = 300 } = spec;
   const frame = plot(parent, { width, height, x: bounds([...x, ...(spec.reach || [0])]), y: bounds([...y, ...(spec.reach || [0])]), xlabel, ylabel, title });
   const marks = x.map((_, i) => {
-    const at = node(frame.svg, "circle", { cx: frame.X(x[i]), cy: frame.Y(y[i]), r: i === selected ? 7 : 5, fill: i === selected ? ORANGE : BLUE, stroke: "#fff" });
-    return { at, value: { index: i, name: names[i] }, text: `${names[i]}: ${short(x[i])}, ${short(y[i])}` };
+    const at = node(frame.svg, "circle", { cx: frame.X(x[i]), cy: frame.Y(y[i]), r: i === selected ? 7 : 5, fill: i === selected ? ORANGE : faint[i] ? PALE : BLUE, stroke: "#fff" });
+    return { at, value: { index: i, name: names[i] }, text: `${names[i]}${faint[i] ? " (doubtful)" : ""}: ${short(x[i])}, ${short(y[i])}` };
   });
   labels(frame.svg, { x: x.map(frame.X), y: y.map(frame.Y), names, width, height: frame.bottom, class: "s4a-small" });
   const cross = node(frame.svg, "path", { d: "M-7 0H7M0 -7V7", stroke: ORANGE, "stroke-width": 2, visibility: "hidden", class: "s4a-cross" });
@@ -153,7 +153,7 @@ function lines(parent, spec, pick) {
 }
 
 function graph(parent, spec, pick) {
-  const { x, y, names, source, target, colors, values, weights, title, edges, highlight = -1, node: chosen = -1, edge = -1, width = 460, height = 400 } = spec;
+  const { x, y, names, source, target, colors, values, weights, title, edges, highlight = -1, faint = [], node: chosen = -1, edge = -1, width = 460, height = 400 } = spec;
   const svg = node(parent, "svg", { viewBox: `0 0 ${width} ${height}`, class: "s4a-chart", role: "group", "aria-label": title });
   svg.style.maxWidth = `${width}px`;
   node(svg, "text", { x: 8, y: 14, "font-weight": "bold" }, title);
@@ -175,8 +175,8 @@ function graph(parent, spec, pick) {
   marks.push(...names.map((name, i) => {
     const at = node(svg, "g", { "data-node": i });
     if (i === highlight) node(at, "circle", { cx: X[i], cy: Y[i], r: 12, fill: "none", stroke: ORANGE, "stroke-width": 3 });
-    node(at, "circle", { cx: X[i], cy: Y[i], r: 8, fill: i === chosen ? ORANGE : INK, stroke: "#fff" });
-    return { at, value: { node: name }, text: i === highlight ? `${name}, the median` : name };
+    node(at, "circle", { cx: X[i], cy: Y[i], r: 8, fill: i === chosen ? ORANGE : faint[i] ? PALE : INK, stroke: "#fff" });
+    return { at, value: { node: name }, text: `${name}${i === highlight ? ", the median" : ""}${faint[i] ? " (doubtful)" : ""}` };
   }));
   const sides = (i) => { // names stand outside of the ring
     const out = X[i] < width / 2 - 20 ? -1 : 1, down = Y[i] < height / 2 ? -5 : 13;

@@ -158,7 +158,7 @@ function modesWidget({ model, el }) {
     lines(variancePart, { series, title: "Cumulative variance", xlabel: "number of components", ylabel: "%", ymin: 0, width: 400, legend: "bottom" }, () => {});
     crosshair = scatter(scorePart, {
       x: samples.map((s) => s[0]), y: samples.map((s) => s[1] ?? 0), names, title: "Scores: click a shape to see it",
-      xlabel: "PC1 (σ)", ylabel: count > 1 ? "PC2 (σ)" : "", width: 400, reach: [-range, range],
+      faint: model.get("faint"), xlabel: "PC1 (σ)", ylabel: count > 1 ? "PC2 (σ)" : "", width: 400, reach: [-range, range],
     }, ({ index }) => { tell("sample", index); set(samples[index]); });
   };
   const picture = () => {

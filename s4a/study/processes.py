@@ -1,0 +1,188 @@
+"""Worker processes of a run (4): they end with the process that started them, leaving nothing."""
+
+import contextlib
+import inspect
+import os
+import re
+import shutil
+import signal
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+from joblib import Parallel
+from joblib.externals.loky.backend import resource_tracker
+from joblib.parallel import LokyBackend, get_active_backend
+
+try:
+    import fcntl
+except ImportError:  # on Windows, where nobody can tell who holds what
+    fcntl = None
+
+TEMPORARY = "s4a-"  # how the folder of a study that nobody keeps begins
+
+
+def workers(n_jobs: int | None, **options: Any) -> Parallel:
+    """:class:`joblib.Parallel` whose processes end within a second of this one, however it ends.
+
+    Parameters
+    ----------
+    n_jobs : int, optional
+        As in joblib.
+    **options
+        Of :class:`joblib.Parallel`.
+
+    Examples
+    --------
+    >>> from joblib import delayed
+    >>> from s4a.study.processes import workers
+    >>> workers(1)(delayed(abs)(x) for x in (-1, 2))
+    [1, 2]
+    """
+    backend, _ = get_active_backend()
+    if isinstance(backend, LokyBackend) and backend.effective_n_jobs(n_jobs) > 1:
+        with closed_terminal_waits():
+            resource_tracker.ensure_running()
+        # as text: a worker is to know it before it imports NumPy and this package, which takes long
+        at_once = threading.current_thread() is threading.main_thread()
+        text = f"{inspect.getsource(end_with)}\nend_with({os.getpid()}, {at_once})"
+        options |= {"initializer": exec, "initargs": (text, {})}
+    return Parallel(n_jobs=n_jobs, **options)
+
+
+def end_with(owner: int, at_once: bool, *, interruptible: bool = False) -> None:
+    """Let this process end within a second of process `owner`, which started it.
+
+    Parameters
+    ----------
+    owner : int
+    at_once : bool
+        Whether the system may end it, in the midst of native code too: that looks at the thread
+        that started this process, which then must be one that lives as long as the owner.
+    interruptible : bool
+        Whether Ctrl-C ends this process too, or is left to the owner.
+    """
+    import ctypes
+    import os
+    import signal
+    import sys
+    import threading
+    import time
+
+    if not interruptible:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if at_once and sys.platform == "linux":
+        pr_set_pdeathsig = 1
+        ctypes.CDLL(None).prctl(pr_set_pdeathsig, signal.SIGKILL)
+
+    def watch():
+        while os.getppid() == owner:
+            time.sleep(0.25)
+        os._exit(1)
+
+    if os.getppid() != owner:  # it ended before this line
+        os._exit(1)
+    threading.Thread(target=watch, daemon=True).start()
+
+
+@contextlib.contextmanager
+def closed_terminal_waits() -> Iterator[None]:
+    """A process that is started meanwhile is not ended by its terminal.
+
+    That of joblib removes the semaphores of a run that was killed.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # on Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def remove_remains(token: str) -> None:
+    """Remove what the workers of a process that is no more left behind: semaphores, memory maps.
+
+    They stay when all processes of a run are killed at the same time; Linux has both as files.
+
+    Parameters
+    ----------
+    token : str
+        Of :class:`s4a.study.store.Claim`, as it was found in a lock that nobody held.
+    """
+    owner = re.match(r"\d{1,9}\b", token)
+    if not owner or psutil.pid_exists(int(owner[0])):
+        return
+    shared = Path("/dev/shm")
+    for path in shared.glob(f"sem.loky-{owner[0]}-*"):
+        with contextlib.suppress(OSError):
+            path.unlink()
+    for parent in (shared, Path(tempfile.gettempdir())):
+        for folder in parent.glob(f"joblib_memmapping_folder_{owner[0]}_*"):
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def died(error: Exception) -> str:
+    """How a worker died, when the error of joblib or dask says that one did; empty otherwise.
+
+    Examples
+    --------
+    >>> from concurrent.futures.process import BrokenProcessPool
+    >>> from s4a.study.processes import died
+    >>> died(BrokenProcessPool("The exit codes of the workers are {SIGKILL(-9)}"))
+    'SIGKILL: out of memory?'
+    >>> died(IndexError("list index out of range"))
+    ''
+    """
+    names = {kind.__name__ for kind in type(error).__mro__}
+    if not names & {"BrokenProcessPool", "KilledWorker"}:
+        return ""
+    # those of the others are SIGTERM: joblib ends them when it has seen the first
+    codes = re.findall(r"(\w+)\((-?\d+)\)", str(error))
+    signals = [name for name, code in codes if int(code) < 0] or [f"exit {c}" for _, c in codes]
+    known = {"SIGKILL": "out of memory?", "SIGSEGV": "a fault in native code"}
+    return ", ".join(f"{name}: {known[name]}" if name in known else name for name in signals) or (
+        "out of memory?" if "KilledWorker" in names else str(error).splitlines()[0]
+    )
+
+
+@contextlib.contextmanager
+def temporary_folder() -> Iterator[Path]:
+    """A folder for a study that nobody keeps, removed at the end; those of killed runs as well."""
+    remove_abandoned(Path(tempfile.gettempdir()))
+    with tempfile.TemporaryDirectory(prefix=TEMPORARY) as name, held(Path(name)):
+        yield Path(name)
+
+
+def remove_abandoned(parent: Path) -> None:
+    """Remove the temporary studies that no process holds any more."""
+    if fcntl is None:
+        return
+    for folder in parent.glob(f"{TEMPORARY}????????"):
+        with contextlib.suppress(OSError), held(folder):
+            # one that is just being made is held before it has a file
+            old = time.time() - folder.stat().st_mtime > 3600
+            lock = folder / ".lock"
+            if folder.stat().st_uid == os.getuid() and (old or lock.is_file()):
+                token = lock.read_text() if lock.is_file() else ""
+                shutil.rmtree(folder, ignore_errors=True)
+                remove_remains(token)
+
+
+@contextlib.contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Hold a folder until this process ends in whatever way; OSError when another one does."""
+    if fcntl is None:
+        yield
+        return
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(handle)

@@ -1,0 +1,236 @@
+"""What is told of an odd shape, and what cannot be: oddities planted in collections, one at a time.
+
+Synthetic brains, and real collections where the shared data are beside the checkout; the first
+four, on which the thresholds were chosen, and others. ``plausibility.py [COLLECTION ...]``.
+"""
+
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+import s4a
+from s4a.geometry.mesh import as_arrays, as_dataset, triangle_areas, vertex_areas
+from s4a.input import evidence, plausibility
+
+DATA = Path(__file__).parents[3] / "shared" / "data"
+CHOSEN_ON = ("brains", "cats", "faces", "bodies 0-9")
+FILES = {  # collection: folder, those of its sorted files
+    "cats": ("cats", slice(None)),
+    "faces": ("faces", slice(1, 13)),
+    "bodies 0-9": ("faust", slice(10)),
+    "bodies 10-19": ("faust", slice(10, 20)),
+    "kids": ("kids", slice(None)),
+    "heads": ("heads", slice(None)),
+    "femurs": ("femurs", slice(None)),
+    "vertebrae": ("vertebrae", slice(None)),
+    "skulls": ("skulls", slice(None)),
+}
+KINDS = ("brains", "cats", "femurs", "vertebrae")  # planted in the others
+BASES = 1  # shapes of each collection that every oddity is planted in
+
+
+def hippocampi(most=12):
+    """Surfaces around segmented hippocampi, smoothed by a voxel."""
+    import nibabel
+    from scipy.ndimage import gaussian_filter
+    from skimage.measure import marching_cubes
+
+    for file in sorted((DATA / "hippocampi_msd").glob("*.nii.gz"))[:most]:
+        image = nibabel.load(file)
+        inside = np.pad(np.asarray(image.dataobj) > 0, 3).astype(float)
+        step = np.abs(np.diag(image.affine)[:3]).astype(float)
+        X, T, _, _ = marching_cubes(gaussian_filter(inside, 1.0), 0.5, spacing=step)
+        yield file.name.split(".")[0], (X, T)
+
+
+def collection(name, folder, most=None):
+    """Name -> (X, T) of clean shapes, all or the first; femurs all of the right side."""
+    if name == "brains":
+        tree = s4a.synthetic.brains(12, 2500)
+        return {n: as_arrays(m.to_dataset()) for n, m in tree["original"].children.items()}
+    if name == "hippocampi":
+        return {n: as_arrays(s4a.clean(as_dataset(*m))) for n, m in hippocampi()}
+    part, chosen = FILES[name]
+    files = sorted((folder / part).glob("*.ply"))[chosen][:most]
+    shapes = {file.stem: as_arrays(s4a.read_shape(file)) for file in files}
+    return {n: mirrored(*m) if n.endswith("femur_l") else m for n, m in shapes.items()}
+
+
+def mirrored(X, T):
+    return X * [-1, 1, 1], T[:, ::-1]
+
+
+def scaled(X, T, factor):
+    return X * factor, T
+
+
+def cut(X, T, share):
+    """Without the share of the area that lies farthest along the longest axis."""
+    area = vertex_areas(X, T)
+    axis = np.linalg.eigh(np.cov(X.T, aweights=area))[1][:, 2]
+    height = X @ axis
+    order = np.argsort(height)
+    covered = np.cumsum(area[order]) / area.sum()
+    keep = height <= height[order][np.searchsorted(covered, 1 - share)]
+    return as_arrays(s4a.clean(as_dataset(X, T[keep[T].all(1)])))
+
+
+def saved_again(X, T, seed=0):
+    """Vertices and triangles in another order, five digits, moved."""
+    order = np.random.default_rng(seed).permutation(len(X))
+    size = np.ptp(X)
+    place = np.argsort(order)
+    return np.round(X[order] / size, 5) * size + size, np.roll(place[T][::-1], 1, axis=1)
+
+
+def oddities(X, T, others):
+    """What is planted: (row of the table, the shape in place of the one that was there)."""
+    size = np.ptp(X, axis=0).max()
+    yield "mirrored", mirrored(X, T)
+    yield "turned by 180 degrees", (X * [1, -1, -1], T)
+    yield "scaled by 2.54", scaled(X, T, 2.54)
+    yield "scaled by 10, 25.4 or 1000", scaled(X, T, 10)
+    yield "scaled by 10, 25.4 or 1000", scaled(X, T, 25.4)
+    yield "scaled by 10, 25.4 or 1000", scaled(X, T, 1000)
+    for axis in np.eye(3):
+        yield "stretched by 2", (X * (1 + axis), T)
+        yield "stretched by 1.5", (X * (1 + axis / 2), T)
+    for share in (0.1, 0.3, 0.5):
+        yield f"{100 * share:.0f} % cut off", cut(X, T, share)
+    area = triangle_areas(X, T).sum()
+    for what, other in others.items():
+        row = what if what == "a sphere" else "another kind, of the same size"
+        yield row, scaled(*other, np.sqrt(area / triangle_areas(*other).sum()))
+    yield "rounded to 1/40 of the extent", (np.round(X / size * 40) / 40 * size, T)
+
+
+class Collection:
+    """Portraits of shapes, and what is told with one or some of them replaced."""
+
+    def __init__(self, shapes):
+        self.pairs = {}
+        self.seconds = 0.0
+        self.shapes = shapes
+        self.portraits = {name: self.portray(mesh) for name, mesh in shapes.items()}
+
+    def portray(self, mesh):
+        mesh = s4a.clean(as_dataset(*mesh))
+        start = time.process_time()
+        portrait = evidence.portray(mesh, intersections=False)
+        self.seconds += time.process_time() - start
+        return portrait
+
+    def compare(self, name, portraits, references):
+        """:func:`evidence.compare`, with each pair of portraits compared once."""
+        seen = []
+        for other in references:
+            a, b = portraits[name], portraits[other]
+            if (id(a), id(b)) not in self.pairs:
+                start = time.process_time()
+                found = evidence.compare("" if a is not b else other, a, {other: b})
+                self.seconds += time.process_time() - start
+                self.pairs[id(a), id(b)] = found, a, b  # held, so that their ids stay theirs
+            seen.append(self.pairs[id(a), id(b)][0].assign_coords(reference=[other]))
+        both = ["fit", "fit_mirrored", "hand"]
+        return (
+            seen[0]
+            .drop_dims("reference")
+            .assign_attrs(seen[0].attrs)
+            .merge(xr.concat([one[both] for one in seen], dim="reference"))
+            .assign_attrs(seen[0].attrs)
+        )
+
+    def told(self, **planted):
+        """Name -> kinds of doubts, those that make it doubtful with an exclamation mark."""
+        portraits = self.portraits | {name: self.portray(m) for name, m in planted.items()}
+        attrs = {name: {"area": one.attrs["surface"]} for name, one in portraits.items()}
+        references = evidence.pick_references(portraits)
+        seen = {name: self.compare(name, portraits, references) for name in portraits}
+        doubts, _ = plausibility.find_warnings(attrs, seen)
+        return {
+            name: {one.kind + "!" * one.doubtful for one in found}
+            for name, found in doubts.items()
+            if found
+        }
+
+
+def rows_of(name, shapes, others):
+    """Row of the table -> its cell for this collection."""
+    whole = Collection(shapes)
+    clean = whole.told()
+    rows = {"clean: told, though nothing is wrong": f"{len(clean)}/{len(shapes)}"}
+    rows["CPU seconds a shape"] = f"{whole.seconds / len(shapes):.2f}"
+    names = list(shapes)
+    found, false = {}, 0
+    for base in names[1 :: max(1, len(names) // BASES)][:BASES]:
+        for row, mesh in oddities(*shapes[base], others):
+            told = whole.told(**{base: mesh})
+            before = clean.get(base, set())
+            found.setdefault(row, []).append(told.pop(base, set()) - before)
+            false += len(set(told) - set(clean))
+        told = whole.told(zz=saved_again(*shapes[base]))
+        found.setdefault("the same scan, saved again", []).append(told.pop("zz", set()))
+        false += len(set(told) - set(clean))
+    half = names[1::2]
+    for row, change in (
+        ("half mirrored", mirrored),
+        ("half scaled by 10", lambda *m: scaled(*m, 10)),
+    ):
+        told = whole.told(**{one: change(*shapes[one]) for one in half})
+        planted = [told.get(one, set()) for one in half]
+        others_told = [told.get(one, set()) for one in names if one not in half]
+        # which half is the odd one, nobody knows where both are as many
+        found[row] = max(planted, others_told, key=lambda side: sum(map(bool, side)))
+    for row, kinds in found.items():
+        doubtful = sum(any(kind.endswith("!") for kind in one) for one in kinds)
+        rows[row] = f"{sum(map(bool, kinds))}/{len(kinds)}" + f" ({doubtful})" * (doubtful > 0)
+    rows["others told beside a planted one"] = str(false)
+    sys.stdout.write(f"{name}: clean {clean}\n")
+    for row, kinds in found.items():
+        sys.stdout.write(f"    {row}: {[sorted(one) for one in kinds]}\n")
+    sys.stdout.flush()
+    return rows
+
+
+def clean_brains():
+    """How many shapes of eight clean collections, of different seeds and modes, are told."""
+    sizes = [(7, 2), (7, 6), (7, 6), (9, 6), (7, 2), (8, 3), (20, 6), (6, 4)]  # shapes, modes
+    told = {}
+    for seed, (n, n_modes) in enumerate(sizes, 20):
+        tree = s4a.synthetic.brains(n, 3500, seed, n_modes=n_modes)["original"]
+        shapes = {name: as_arrays(mesh.to_dataset()) for name, mesh in tree.children.items()}
+        told |= {f"{seed}/{name}": kinds for name, kinds in Collection(shapes).told().items()}
+    sys.stdout.write(f"told of {sum(n for n, _ in sizes)} brains of other seeds: {told}\n")
+
+
+def main(names):
+    warnings.simplefilter("ignore")
+    with tempfile.TemporaryDirectory() as folder:
+        names = names or (["brains", *FILES, "hippocampi"] if DATA.is_dir() else ["brains"])
+        if DATA.is_dir():
+            parts = sorted({FILES[name][0] for name in {*names, *KINDS} if name in FILES})
+            command = [sys.executable, DATA / "unpack.py", folder, *parts]
+            subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        others = {"a sphere": as_arrays(s4a.synthetic.sphere(2000))}
+        for kind in KINDS if DATA.is_dir() else KINDS[:1]:
+            (others[kind],) = list(collection(kind, Path(folder), 1).values())[:1]
+        table = {}
+        if "brains" in names:
+            clean_brains()
+        for name in names:
+            mine = {kind: mesh for kind, mesh in others.items() if kind != name}
+            table[name] = rows_of(name, collection(name, Path(folder)), mine)
+    sys.stdout.write(f"\nplanted | {' | '.join(table)}\n")
+    for row in dict.fromkeys(row for rows in table.values() for row in rows):
+        cells = " | ".join(rows.get(row, "") for rows in table.values())
+        sys.stdout.write(f"{row} | {cells}\n")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

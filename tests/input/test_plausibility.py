@@ -1,0 +1,116 @@
+"""What looks wrong with a shape beside its collection is told, and nothing else."""
+
+import numpy as np
+import pytest
+from faults import shapes as faulty
+
+from s4a.geometry.mesh import as_dataset
+from s4a.input import evidence, plausibility
+from s4a.input.clean import clean
+from s4a.study.report import doubtful
+
+SHAPES = {f"s{i}": faulty.shape(200 + i) for i in range(8)}
+
+
+@pytest.fixture(scope="module")
+def portraits():
+    return {name: portrait(*mesh) for name, mesh in SHAPES.items()}
+
+
+def portrait(X, T):
+    return evidence.portray(clean(as_dataset(X, T)), intersections=False)
+
+
+def told(portraits):
+    """Name -> kinds, doubtful ones with an exclamation mark, and the remarks."""
+    chosen = {name: portraits[name] for name in evidence.pick_references(portraits)}
+    seen = {name: evidence.compare(name, one, chosen) for name, one in portraits.items()}
+    attrs = {name: {"area": one.attrs["surface"]} for name, one in portraits.items()}
+    found, remarks = plausibility.find_warnings(attrs, seen)
+    kinds = {n: [one.kind + "!" * one.doubtful for one in doubts] for n, doubts in found.items()}
+    return {name: words for name, words in kinds.items() if words}, remarks
+
+
+def mirrored(X, T):
+    return X * [-1, 1, 1], T[:, ::-1]
+
+
+def test_nothing_is_told_of_a_clean_collection(portraits):
+    assert told(portraits) == ({}, [])
+
+
+@pytest.mark.parametrize("kind", ["mirrored!", "unit!", "kind!", "partial!", "duplicate!"])
+def test_each_oddity_is_told_of_the_shape_that_has_it_and_of_no_other(portraits, kind):
+    X, T = SHAPES["s3"]
+    odd = {
+        "mirrored!": lambda: mirrored(X, T),
+        "unit!": lambda: (X / 2.54, T),
+        "kind!": lambda: (faulty.SPHERE[0] * [120, 25, 25], faulty.SPHERE[1]),
+        "partial!": lambda: (X, T[(X[T, 2] < np.quantile(X[:, 2], 0.7)).all(axis=1)]),
+        "duplicate!": lambda: (SHAPES["s1"][0][:, [1, 2, 0]] + 50, SHAPES["s1"][1]),
+    }[kind]
+    assert told(portraits | {"s3": portrait(*odd())}) == ({"s3": [kind]}, [])
+
+
+def test_a_turned_shape_is_not_told_as_the_alignment_turns_it(portraits):
+    X, T = SHAPES["s3"]
+    assert told(portraits | {"s3": portrait(X * [1, -1, -1], T)}) == ({}, [])
+
+
+def test_of_half_a_collection_of_the_other_hand_the_half_without_the_first_name_is_told(portraits):
+    odd = {name: portrait(*mirrored(*SHAPES[name])) for name in ("s1", "s3", "s5", "s7")}
+    found, (remark,) = told(portraits | odd)
+    assert found == {name: ["mirrored!"] for name in odd}
+    assert remark.startswith("mirror images of each other, by ICP: s0, s2, s4, s6 and s1, s3")
+
+
+def test_of_half_a_collection_in_another_unit_the_half_without_the_first_name_is_told(portraits):
+    odd = {name: portrait(SHAPES[name][0] * 10, SHAPES[name][1]) for name in ("s1", "s3", "s5")}
+    four = {name: one for name, one in portraits.items() if name not in ("s6", "s7")}
+    found, (remark,) = told(four | odd)
+    assert found == {name: ["unit!"] for name in odd}
+    assert "times apart: s1, s3, s5, and the others" in remark
+
+
+def test_of_few_shapes_only_what_needs_no_spread_is_told(portraits):
+    X, T = SHAPES["s2"]
+    three = {name: portraits[name] for name in ("s0", "s1", "s2")}
+    assert told(three | {"s2": portrait(1000 * X, T)})[0] == {"s2": ["unit!"]}
+    assert told(three | {"s2": portrait(*SHAPES["s0"])})[0] == {"s2": ["duplicate!"]}
+    assert told(three | {"s2": portrait(X, T[(X[T, 2] < 0).all(axis=1)])})[0] == {}
+
+
+def test_crossing_triangles_are_told_only_where_the_others_have_far_fewer(portraits):
+    def with_shares(*shares):
+        seen = {
+            n: one.assign_attrs(intersecting=s, self_intersections=int(1000 * s))
+            for (n, one), s in zip(portraits.items(), shares, strict=False)
+        }
+        return told(seen)[0]
+
+    assert with_shares(0.02, 0.01, 0.011, 0.004) == {}
+    assert with_shares(0.02, 0.0, 0.001, 0.0) == {"s0": ["intersections"]}
+
+
+def test_a_registration_that_misses_and_distorts_is_told_where_neither_number_alone_is_odd():
+    badness = {
+        "template": 0.0,
+        "good": 0.03,
+        "far": 0.038,
+        "odd": 0.025,
+        "stretched": 0.01,
+        "fine": 0.02,
+    }
+    distortion = {
+        "template": 0.0,
+        "good": 0.1,
+        "far": 0.21,
+        "odd": 0.19,
+        "stretched": 0.3,
+        "fine": 0.1,
+    }
+    found, _ = doubtful(badness, distortion)
+    assert {n: [one.doubtful for one in doubts] for n, doubts in found.items()} == {
+        "far": [True],
+        "odd": [False],
+    }

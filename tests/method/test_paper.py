@@ -1,0 +1,273 @@
+"""The paper (3.4 to 4.2) from the arrays of a study: equations 3 to 8 again, by brute force.
+
+Nothing here is computed by the functions of the method: matrices are dense, nearest neighbours come
+from all distances.
+"""
+
+import itertools
+
+import numpy as np
+import pytest
+import scipy.linalg
+from pyFM.FMN import FMN
+from pyFM.mesh import TriMesh
+from scipy.sparse import diags
+from scipy.spatial.distance import cdist
+from small import OPTIONS
+
+import s4a
+from s4a.evaluation.methods import Pair, Spaces
+from s4a.method import latent
+from s4a.method.shape import Shape
+
+
+@pytest.fixture(scope="module")
+def paper(brains):
+    """The study of the paper, eq. 7, with the rounds of Consistent ZoomOut."""
+    return s4a.analyse(brains, preset="paper", keep_rounds=True, **OPTIONS)
+
+
+@pytest.fixture(scope="module")
+def standard(brains):
+    """The study of the paper by the standard way, eq. 3 and 4, and the size taken out."""
+    return s4a.analyse(brains, preset="paper", how="standard", scale=True, **OPTIONS)
+
+
+def others(study):
+    """The template, and every other shape."""
+    template = study["registration"].attrs["template"]
+    return template, [n for n in study["registration"]["shape"].values.tolist() if n != template]
+
+
+def low(study, name):
+    """Phi, A (of trace 1) and Y of a shape."""
+    coarse = study["coarse"][name]
+    area = coarse["vertex_area"].values
+    Y = study["latent"]["latent_basis"].sel(shape=name).values
+    return coarse["eigenfunction"].values, np.diag(area / area.sum()), Y
+
+
+def projection(study, name):
+    """U as a dense matrix."""
+    column = study["coarse"][name]["coarse_vertex"].values
+    U = np.zeros((len(column), study["coarse"][name].sizes["vertex"]))
+    np.add.at(
+        U, (np.arange(len(U))[:, None], column), study["coarse"][name]["coarse_weight"].values
+    )
+    return U
+
+
+def frame(study, name):
+    """Area centroid and square root of the area of the original mesh."""
+    X = study["original"][name]["position"].values
+    corners = X[study["original"][name]["corner_vertex"].values]  # (m, 3 corners, 3)
+    area = np.linalg.norm(np.cross(*(corners[:, [1, 2]] - corners[:, :1]).swapaxes(0, 1)), axis=1)
+    return area @ corners.mean(1) / area.sum(), np.sqrt(area.sum() / 2)
+
+
+def stored(study, variable, name):
+    return study["registration"][variable].sel(shape=name).values
+
+
+def are_nearest(match, query, among):
+    """Whether no row is nearer than the matched one, but for the rounding of single precision."""
+    distance = cdist(query, among)
+    return np.allclose(distance[np.arange(len(match)), match], distance.min(1), rtol=1e-4)
+
+
+def test_the_landmarks_are_ten_and_their_partners_the_nearest_after_icp(paper):
+    network = paper["network"]
+    assert network.sizes["landmark"] == 10
+    for p in range(network.sizes["pair"]):
+        M, N = (
+            Shape(None, paper["coarse"][network[end].values[p]].to_dataset()).low.X
+            for end in ("source", "target")
+        )
+        R, t = network["pair_rotation"].values[p], network["pair_translation"].values[p]
+        moved = M[network["landmark_of_source"].values[p]] @ R.T + t
+        assert are_nearest(network["landmark_of_target"].values[p], moved, N)
+
+
+def test_the_step_ahead_is_one_match_and_back(paper):
+    network = paper["network"]
+    for p, (i, j) in enumerate(
+        zip(network["source"].values, network["target"].values, strict=True)
+    ):
+        C = network["fmap_fitted"].values[p]
+        (Phi, _, _), (Psi, A, _) = low(paper, i), low(paper, j)
+        Phi, Psi = Phi[:, : len(C)], Psi[:, : len(C)]
+        match = cdist(Psi, Phi @ C.T).argmin(1)  # eq. 2
+        assert network["fmap_initial"].values[p] == pytest.approx(Psi.T @ A @ Phi[match], abs=1e-3)
+
+
+def test_every_round_of_consistent_zoomout_is_equation_3_and_a_larger_map(paper):
+    rounds = list(paper["rounds"].children.values())
+    assert [node.sizes["mode"] for node in rounds] == [10, 15, 20, 24]
+    network = paper["network"]
+    for now, following in itertools.pairwise(rounds):
+        size, larger = now.sizes["mode"], following.sizes["mode"]
+        for p, (i, j) in enumerate(
+            zip(network["source"].values, network["target"].values, strict=True)
+        ):
+            (Phi, _, _), (Psi, A, _) = low(paper, i), low(paper, j)
+            Y_i, Y_j = (now["latent_basis"].sel(shape=name).values for name in (i, j))
+            match = cdist(Psi[:, :size] @ Y_j, Phi[:, :size] @ Y_i).argmin(1)  # eq. 3
+            C = Psi[:, :larger].T @ A @ Phi[match, :larger]
+            assert following["fmap"].values[p] == pytest.approx(C, abs=1e-3)
+    assert np.array_equal(rounds[-1]["fmap"], network["fmap"])
+    assert np.array_equal(rounds[-1]["latent_basis"], paper["latent"]["latent_basis"])
+
+
+def test_the_latent_bases_span_the_least_inconsistency(paper):
+    network, latent_node = paper["network"], paper["latent"]
+    names = latent_node["shape"].values.tolist()
+    Y = latent_node["latent_basis"].values  # (n, k, m)
+    n, k, m = Y.shape
+    W = np.zeros((n, k, n, k))
+    for p, (C, w) in enumerate(zip(network["fmap"].values, network["weight"].values, strict=True)):
+        i, j = (names.index(network[end].values[p]) for end in ("source", "target"))
+        W[i, :, i] += w * C.T @ C
+        W[j, :, j] += w * np.eye(k)
+        W[i, :, j] -= w * C.T
+        W[j, :, i] -= w * C
+    least = scipy.linalg.eigh(W.reshape(n * k, n * k))[1][:, :m]
+    stacked = Y.reshape(n * k, m) / np.sqrt(n)
+    assert stacked.T @ stacked == pytest.approx(np.eye(m), abs=1e-6)
+    assert scipy.linalg.subspace_angles(least, stacked).max() < 1e-2
+
+
+def test_the_median_has_the_least_energy_of_equation_5(paper):
+    node = paper["latent"]
+    inverse = np.r_[0, 1 / node["latent_eigenvalue"].values[1:]]
+    energy = []
+    for Y in node["latent_basis"].values:
+        D = Y.T @ Y
+        energy.append(np.linalg.norm(((D - np.eye(len(D))) * inverse)[1:, 1:]))
+    assert node["distance_to_median"].values == pytest.approx(energy)
+    assert node.attrs["median"] == node["shape"].values[np.argmin(energy)]
+
+
+def test_equation_3_holds_between_any_two_shapes_and_gives_their_map(paper):
+    names = paper["latent"]["shape"].values.tolist()
+    (Phi, _, Y_i), (Psi, _, Y_j) = (low(paper, name) for name in names[1:3])
+    match = s4a.latent_match(paper, *names[1:3], full=False)["match"].values
+    assert are_nearest(match, Psi @ Y_j, Phi @ Y_i)
+    C = s4a.latent_map(paper, *names[1:3])["fmap"].values
+    assert C == pytest.approx(np.linalg.lstsq(Y_i.T, Y_j.T)[0].T)
+
+
+@pytest.mark.parametrize("way", ["paper", "standard"])
+def test_the_match_of_equation_6_is_kept_however_full_resolution_is_reached(way, request):
+    study = request.getfixturevalue(way)
+    template, names = others(study)
+    Psi, _, Y_template = low(study, template)
+    for name in names:
+        Phi, _, Y = low(study, name)
+        match = stored(study, "registered_match_low", name)
+        assert are_nearest(match, Psi @ Y_template, Phi @ Y)
+        assert not are_nearest(match, Psi @ Y, Phi @ Y_template)  # bases exchanged
+
+
+def test_the_match_is_that_of_equation_7(paper):
+    template, names = others(paper)
+    Psi, _, Y_template = low(paper, template)
+    U_template = projection(paper, template)
+    for name in names:
+        Phi, _, Y = low(paper, name)
+        U = projection(paper, name)
+        match = stored(paper, "registered_match", name)
+        assert are_nearest(match, U_template @ Psi @ Y_template, U @ Phi @ Y)
+        assert not are_nearest(match, U_template @ Psi @ Y, U @ Phi @ Y_template)
+
+
+def test_the_standard_match_is_that_of_equation_4(standard):
+    template, names = others(standard)
+    Psi, A, _ = low(standard, template)
+    for name in names:
+        Phi, _, _ = low(standard, name)
+        C = Psi.T @ A @ Phi[stored(standard, "registered_match_low", name)]
+        match = stored(standard, "registered_match", name)
+        query = projection(standard, template) @ Psi
+        assert are_nearest(match, query, projection(standard, name) @ (Phi @ C.T))
+        assert not are_nearest(match, query, projection(standard, name) @ (Phi @ C))
+
+
+@pytest.mark.parametrize("way", ["paper", "standard"])
+def test_the_displacement_is_that_of_equation_8_after_icp_alone(way, request):
+    study = request.getfixturevalue(way)
+    template, names = others(study)
+    X = study["original"][template]["position"].values
+    center, size = frame(study, template)
+    for name in names:
+        own_center, own_size = frame(study, name)
+        s = size / own_size if way == "standard" else 1.0
+        R = stored(study, "icp_rotation", name)
+        image = study["original"][name]["position"].values[stored(study, "registered_match", name)]
+        placed = s * (image - own_center) @ R.T + size * stored(study, "icp_translation", name)
+        raw = placed + center - X  # minus d of the paper
+        assert stored(study, "displacement_raw", name) == pytest.approx(raw, abs=1e-4)
+        assert np.array_equal(stored(study, "rotation", name), R)
+        assert stored(study, "scale", name) == pytest.approx(s)
+
+
+@pytest.mark.parametrize("way", ["paper", "standard"])
+def test_the_smooth_displacement_is_the_projection_as_printed(way, request):
+    study = request.getfixturevalue(way)
+    template, names = others(study)
+    B = projection(study, template) @ low(study, template)[0]
+    for name in names:
+        raw = stored(study, "displacement_raw", name)
+        coefficient = np.linalg.pinv(B) @ raw
+        assert stored(study, "displacement_coefficient", name) == pytest.approx(
+            coefficient, abs=1e-3
+        )
+        assert stored(study, "displacement", name) == pytest.approx(B @ coefficient, abs=1e-3)
+
+
+def test_consistent_zoomout_is_that_of_pyfm_where_weights_are_equal(paper):
+    """Same subspaces, same matches from the same maps; other weights of pyFM's are by cycles."""
+    names = paper["latent"]["shape"].values.tolist()
+    bases = [Shape(None, paper["coarse"][name].to_dataset()).low for name in names]
+    source, target = (
+        np.array([names.index(name) for name in paper["network"][end].values])
+        for end in ("source", "target")
+    )
+    first = paper["network"]["fmap_initial"].values  # (p, 10, 10)
+
+    meshes = []
+    for basis in bases:
+        mesh = TriMesh(basis.X, basis.T)
+        mesh.eigenvalues, mesh.eigenvectors = basis.eigenvalue, basis.Phi
+        mesh.A = diags(basis.area)
+        meshes.append(mesh)
+    edges = list(zip(source.tolist(), target.tolist(), strict=True))
+    other = FMN(meshes, dict(zip(edges, first, strict=True)))
+    other.zoomout_refine(
+        nit=2, step=5, subsample=None, isometric=False, weight_type="adjacency", cclb_ratio=1.0
+    )
+    C, _, _, Y, eigenvalue = latent.consistent_zoomout(
+        bases, first, source, target, 20, step=5, weights="equal"
+    )
+    assert np.stack([other.maps[edge] for edge in edges]) == pytest.approx(C, abs=1e-3)
+
+    other.compute_W(M=20)
+    other.compute_CLB()
+    other.compute_CCLB(20, verbose=False)
+    other.compute_p2p()
+    n, k, m = Y.shape
+    angles = scipy.linalg.subspace_angles(other.CCLB.reshape(n * k, m), Y.reshape(n * k, m))
+    assert angles.max() < 1e-2
+    assert other.cclb_eigenvalues[1:] == pytest.approx(eigenvalue[1:], rel=1e-3)
+    for i, j in edges:
+        match = cdist(bases[j].Phi[:, :20] @ Y[j], bases[i].Phi[:, :20] @ Y[i]).argmin(1)
+        assert (other.p2p[i, j] == match).mean() > 0.99
+
+
+def test_table_1_and_a_pair_have_the_same_rematch(meshes):
+    source, target, *_ = meshes.values()
+    small = {"n_coarse": 400, "k": 24, "k_init": 10}
+    ends = (Spaces(mesh, 400, 24, 0, lift=False) for mesh in (source, target))
+    row = Pair(*ends, k_init=10, k=24, lift=False, sharpen=0, init="landmarks").run("RE-MATCH")
+    found = s4a.match_pair(source, target, preset="paper", **small)
+    assert np.array_equal(found["match"], row.match)
+    assert np.array_equal(found["fmap_fitted"], found["fmap_initial"])  # no step ahead in 4.1

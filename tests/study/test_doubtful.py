@@ -1,0 +1,174 @@
+"""Doubtful shapes stay apart (5.1): registered and told, and the others know nothing of them."""
+
+import numpy as np
+import pytest
+
+from s4a import analyse, explore, insert, latent_match, open_study, statistics, synthetic
+from s4a.cli import tables
+from s4a.geometry.mesh import as_arrays
+from s4a.show.page import study_html
+from s4a.study.tree import apart_of, left_out
+
+OPTIONS = {"n_coarse": 200, "k_init": 8, "k": 20, "n_jobs": 1, "intersections": False}
+TETRAHEDRON = 60 * np.eye(4, 3), np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
+DOUBTFUL = ["a_metre", "z_inch"]
+
+
+@pytest.fixture(scope="module")
+def good():
+    """Five brains as points and triangles."""
+    tree = synthetic.brains(5, 600, seed=2)["original"]
+    return {name: as_arrays(node.to_dataset()) for name, node in tree.children.items()}
+
+
+@pytest.fixture(scope="module")
+def mixed(good):
+    """The brains, two of them in other units, and a tetrahedron."""
+    (X, T), (Y, S) = good["brain_01"], good["brain_02"]
+    return good | {"a_metre": (X / 1000, T), "z_inch": (Y / 25.4, S), "corner": TETRAHEDRON}
+
+
+@pytest.fixture(scope="module")
+def alone(good):
+    """The study of the brains."""
+    return analyse(good, **OPTIONS)
+
+
+@pytest.fixture(scope="module")
+def folder(mixed, tmp_path_factory):
+    """The folder of the study of all."""
+    folder = tmp_path_factory.mktemp("doubtful") / "study"
+    analyse(mixed, store=folder, **OPTIONS).close()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def study(folder):
+    """The study of all, in memory."""
+    with open_study(folder) as tree:
+        return tree.load()
+
+
+def results(study, stage):
+    """A stage without what is said of doubtful shapes."""
+    data = study[stage].to_dataset().drop_attrs(deep=False)
+    return data.drop_vars(["score_apart", "shape_apart"], errors="ignore")
+
+
+def test_the_results_of_the_others_are_the_same_to_the_bit_as_without(alone, study):
+    for stage in ("network", "latent", "pca"):
+        assert results(study, stage).identical(results(alone, stage)), stage
+    names = alone["registration"]["shape"].values
+    registered = results(study, "registration").sel(shape=names)
+    assert registered.identical(results(alone, "registration"))
+    assert study["latent"].attrs["median"] == alone["latent"].attrs["median"]
+
+
+def test_a_shape_with_too_few_eigenfunctions_is_excluded_and_takes_no_k_from_the_others(study):
+    report = study["report"].to_dataset().sel(shape="corner")
+    assert report["status"].item() == "excluded"
+    assert "only 2 eigenfunctions, where 5 of 5 shapes have 20 or more" in report["reason"].item()
+    assert study["network"]["fmap"].shape[1:] == (20, 20)
+
+
+def test_doubtful_shapes_are_registered_and_named(study):
+    report = study["report"].to_dataset().sel(shape=DOUBTFUL)
+    assert report["status"].values.tolist() == ["doubtful"] * 2
+    assert report["doubtful_kinds"].values.tolist() == ["unit"] * 2
+    assert apart_of(study["registration"].to_dataset()) == left_out(study) == DOUBTFUL
+    registration = study["registration"].to_dataset().sel(shape=DOUBTFUL)
+    assert np.isfinite(registration["displacement"]).all()
+    assert (registration["badness"] < 0.06).all()
+    assert list(study["latent"].children) == DOUBTFUL
+    assert study["pca"]["score_apart"].dims == ("shape_apart", "component")
+    match = latent_match(study, "a_metre", "brain_01", full=False)["match"]
+    assert (match.values == np.arange(match.size)).mean() > 0.9  # the same surface, smaller
+
+
+def test_a_finished_study_with_doubtful_shapes_is_not_computed_again(folder, mixed):
+    kept = [path for stage in ("latent", "registration") for path in (folder / stage).glob("*.nc")]
+    before = {path: path.stat().st_mtime_ns for path in kept}
+    analyse(mixed, store=folder, **OPTIONS).close()
+    assert {path: path.stat().st_mtime_ns for path in kept} == before
+    assert len(before) == len(DOUBTFUL) + 7
+
+
+def test_statistics_leave_them_out_and_say_whom(alone, study, caplog):
+    found = statistics.outliers(study)
+    assert found.identical(statistics.outliers(alone))
+    assert "doubtful and left out: a_metre, z_inch" in caplog.text
+    values = dict(zip(study["registration"]["shape"].values.tolist(), range(7), strict=True))
+    test = statistics.regression(study, values, n_permutations=9)
+    assert test.sizes["shape"] == 5
+    assert test.attrs["left_out"] == "a_metre, z_inch"
+    as_array = statistics.regression(study, list(values.values()), n_permutations=9)
+    assert as_array["standard_score"].equals(test["standard_score"])
+    assert statistics.generalization(study).identical(statistics.generalization(alone))
+
+
+def test_they_enter_modes_and_statistics_on_demand(folder, mixed, study):
+    kept = statistics.with_doubtful(study)
+    assert kept["pca"].sizes["shape"] == statistics.outliers(kept).sizes["shape"] == 7
+    assert left_out(kept) == []
+    assert statistics.generalization(kept, n_points=0).attrs["shapes"] == 7
+    with analyse(mixed, store=folder, keep_doubtful=True, **OPTIONS) as again:
+        assert results(again, "pca").identical(results(kept, "pca"))
+        assert results(again, "latent").identical(results(study, "latent"))
+    analyse(mixed, store=folder, **OPTIONS).close()
+
+
+def test_a_run_can_stop_at_them_before_its_long_stages(mixed, tmp_path):
+    with pytest.raises(
+        ValueError, match=r"(?s)3 of 8 shapes are doubtful.*3 unit: a_metre, corner, z_inch"
+    ):
+        analyse(mixed, store=tmp_path / "study", doubtful="stop", **OPTIONS)
+    assert not (tmp_path / "study" / "coarse").exists()
+    with pytest.raises(ValueError, match="leave out one of both"):
+        analyse(mixed, doubtful="stop", keep_doubtful=True, **OPTIONS)
+
+
+def test_a_doubtful_shape_is_the_template_where_it_is_named(mixed):
+    study = analyse(mixed, template="a_metre", **OPTIONS)
+    assert study["registration"].attrs["template"] == "a_metre"
+    assert left_out(study) == ["z_inch"]
+    assert "a_metre, which was named, is itself doubtful" in study["report"].attrs["remarks"]
+
+
+def test_where_fewer_than_two_are_beyond_doubt_all_are_treated_alike(good):
+    (X, T), (Y, S), (Z, U) = list(good.values())[:3]
+    study = analyse({"mm": (X, T), "m": (Y / 1000, S), "km": (Z / 1e6, U)}, **OPTIONS)
+    assert study["latent"].sizes["shape"] == 3
+    assert "doubtful" not in study["report"]["status"].values
+
+
+def test_a_new_shape_is_placed_as_in_the_study_of_the_others(alone, study, good):
+    new = {"new": good["brain_03"]}
+    a, b = (insert(one, new) for one in (alone, study))
+    assert a["pca"]["score"].equals(b["pca"]["score"])
+    X, T = good["brain_03"]
+    assert insert(study, {"new": (X / 1000, T)})["report"]["status"].item() == "doubtful"
+
+
+def test_panels_and_page_mark_them(study):
+    tabs = explore(study)
+    for title in tabs.tabs.titles:
+        tabs[title]
+    texts = [text for text, _ in tabs["Correspondence"].choice.options]
+    assert {"a_metre (doubtful)", "brain_02"} <= set(texts)
+    assert "beside it, doubtful: a_metre, z_inch" in tabs["Network"].facts.value
+    tabs["Correspondence"].map.value = "low"
+    tabs["Correspondence"].shape = "z_inch"
+    assert not tabs["Correspondence"].failed
+    tabs.close()
+    html = study_html(study)
+    assert "scale the files to the unit of the others" in html
+    assert "z_inch (doubtful)" in html
+
+
+def test_the_summary_begins_with_what_to_decide_and_fits_on_a_screen(study):
+    lines = tables.run_summary(study, 1.0, again="s4a run d --out s").splitlines()
+    assert lines[1].startswith("TO DECIDE: 2 of 8 shapes are doubtful")
+    assert lines[2].startswith("  2 unit  a_metre, z_inch  -> scale the files")
+    assert any("s4a run d --out s --keep-doubtful" in line for line in lines)
+    assert len(lines) <= 50
+    assert max(map(len, lines)) <= 110

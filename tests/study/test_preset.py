@@ -1,0 +1,203 @@
+"""The preset of the paper and the switches of what is added, wherever shapes are registered."""
+
+import shutil
+
+import numpy as np
+import pytest
+from paths import DOCS
+from scipy.spatial.distance import cdist
+from small import FLAGS, OPTIONS
+
+import s4a
+from s4a.analysis import transfer
+from s4a.cli import main
+from s4a.study.options import DEFAULTS, PAPER, Options
+from s4a.study.store import attributes, read, write
+
+PAIR = {name: OPTIONS[name] for name in ("n_coarse", "k_init", "k")}
+NEW = (
+    "registered_match_low",
+    "displacement_coefficient",
+    "icp_rotation",
+    "icp_translation",
+)
+
+
+@pytest.fixture(scope="module")
+def three(meshes):
+    """Three of the four brains."""
+    return dict(list(meshes.items())[:3])
+
+
+@pytest.fixture(scope="module")
+def paper(three, tmp_path_factory):
+    """The folder of their study, as in the paper, with holes closed and rounds kept."""
+    folder = tmp_path_factory.mktemp("paper") / "study"
+    options = {"preset": "paper", "close_holes": True, "keep_rounds": True}
+    s4a.analyse(three, store=folder, **options, **OPTIONS).close()
+    return folder
+
+
+def test_the_preset_sets_every_option_that_has_a_default_of_ours():
+    assert PAPER.keys() == DEFAULTS.keys()
+    options = Options(preset="paper")
+    assert {name: getattr(options, name) for name in PAPER} == PAPER
+
+
+def test_every_addition_and_the_papers_choice_are_in_the_documentation():
+    table = (DOCS / "api/study.md").read_text(encoding="utf-8")
+    said = " ".join(s4a.analyse.__doc__.split())
+    for name, value in PAPER.items():
+        assert f"| `{name}`: " in table
+        assert f"{name}={value!r}".replace("'", '"') in said
+
+
+@pytest.mark.parametrize("name", [name for name in PAPER if PAPER[name] != DEFAULTS[name]])
+def test_an_option_that_the_preset_fixes_is_refused_by_name(name, meshes):
+    source, target, *_ = meshes.values()
+    message = f"preset 'paper' sets {name}={PAPER[name]!r}; found {name}={DEFAULTS[name]!r}"
+    with pytest.raises(ValueError, match=message):
+        Options(preset="paper", **{name: DEFAULTS[name]})
+    if name not in ("n_spread", "wide", "both"):
+        with pytest.raises(ValueError, match=message):
+            s4a.match_pair(source, target, preset="paper", **{name: DEFAULTS[name]})
+    if name not in ("n_spread", "wide"):
+        with pytest.raises(ValueError, match=message):
+            s4a.register_pairs(source, {"a": target}, preset="paper", **{name: DEFAULTS[name]})
+
+
+def test_a_pair_has_no_options_of_a_collection(meshes):
+    source, target, *_ = meshes.values()
+    with pytest.raises(TypeError, match="unexpected options n_pairs; those of a pair are k_init"):
+        s4a.match_pair(source, target, n_pairs=3)
+
+
+def test_pairs_of_the_paper_are_matched_one_way_after_icp_alone(three):
+    (name, template), (other, shape), _ = three.items()
+    study = s4a.register_pairs(template, {other: shape}, name=name, preset="paper", **PAIR)
+    assert "reverse" not in study.children
+    one = study["registration"].to_dataset().sel(shape=other)
+    assert one["method"] == "intrinsic"
+    assert np.array_equal(one["rotation"], one["icp_rotation"])
+    fitted = s4a.match_pair(shape, template, refine="intrinsic", **PAIR)
+    assert not np.allclose(fitted["rotation"], fitted["icp_rotation"])
+
+
+def test_lifted_functions_are_orthonormal_on_the_original_mesh_and_are_what_is_compared(three):
+    study = s4a.analyse(three, lift=True, refine="intrinsic", **OPTIONS)
+    name = study["registration"].attrs["template"]
+    B = study["coarse"][name]["lifted_eigenfunction"].values
+    area = study["registration"]["vertex_area"].values
+    assert B.T @ (area[:, None] / area.sum() * B) == pytest.approx(np.eye(B.shape[1]), abs=0.05)
+    Y = study["latent"]["latent_basis"]
+    for other in set(three) - {name}:
+        F = study["coarse"][other]["lifted_eigenfunction"].values @ Y.sel(shape=other).values
+        distance = cdist(B @ Y.sel(shape=name).values, F)
+        match = study["registration"]["registered_match"].sel(shape=other).values
+        assert np.allclose(distance[np.arange(len(B)), match], distance.min(1), rtol=1e-3)
+
+
+def test_rounds_are_opened_and_go_when_they_are_not_asked_for(three, paper, tmp_path):
+    with s4a.open_study(paper) as study:
+        assert sorted(study["rounds"].children) == ["k_010", "k_015", "k_020", "k_024"]
+        assert study["rounds/k_015/fmap"].shape == (6, 15, 15)
+    again = shutil.copytree(paper, tmp_path / "again")
+    with s4a.analyse(three, store=again, preset="paper", close_holes=True, **OPTIONS) as study:
+        assert "rounds" not in study.children
+    assert not list(again.glob("rounds/*"))
+
+
+def test_a_study_of_before_opens_and_takes_new_shapes(study_folder, meshes, tmp_path):
+    old = shutil.copytree(study_folder, tmp_path / "old")
+    for path in old.glob("registration/*.nc"):
+        said = attributes(path)
+        data = read(path).drop_vars(NEW)
+        write(data, path, said["task_key"], said["made_from"].split())
+    with s4a.open_study(old) as study:
+        assert not set(NEW) & set(study["registration"].data_vars)
+        assert study["registration"].sizes["shape"] == 4
+        new = s4a.insert(study, {"new": meshes["brain_01"]}, compare=False)
+    assert new["registration"].sizes["shape"] == 1
+
+
+def test_a_new_shape_is_cleaned_and_registered_by_the_options_of_the_study(paper, meshes):
+    mesh = meshes["brain_04"]
+    X, T = mesh["position"].values, mesh["corner_vertex"].values
+    with_hole = X, T[~(T == T[0, 0]).any(axis=1)]
+    with s4a.open_study(paper) as study:
+        new = s4a.insert(study, {"new": with_hole})
+    assert new["original/new"].attrs["closed_holes"] == 1
+    one = new["registration"].to_dataset().sel(shape="new")
+    assert one["method"] == "intrinsic"
+    assert np.array_equal(one["rotation"], one["icp_rotation"])
+
+
+def test_an_external_mesh_is_matched_by_the_options_of_the_study(paper, meshes, monkeypatch):
+    seen = []
+    match = transfer.match_shapes
+
+    def watched(source, target, options):
+        seen.append(options)
+        return match(source, target, options)
+
+    monkeypatch.setattr(transfer, "match_shapes", watched)
+    external = meshes["brain_04"]
+    with s4a.open_study(paper) as study:
+        found = s4a.transfer_labels(
+            study, external["label"].values, source=external, targets=["brain_01"]
+        )
+        assert seen == [Options.from_report(study)]  # one way
+    assert seen[0].preset == "paper"
+    assert seen[0].n_coarse == OPTIONS["n_coarse"]
+    assert found["brain_01"].sizes["vertex"] == 1500
+
+
+def test_an_external_mesh_needs_more_than_a_study_of_pairs(three):
+    (name, template), (other, shape), (_, external) = three.items()
+    study = s4a.register_pairs(template, {other: shape}, name=name, both=False, **PAIR)
+    with pytest.raises(ValueError, match="needs /coarse; this study of pairs has none"):
+        s4a.transfer_labels(study, external["label"].values, source=external)
+
+
+def test_the_commands_take_the_preset_and_refuse_options_beside_a_study(
+    paper, brain_files, tmp_path, monkeypatch, capsys
+):
+    seen = []
+    register = transfer.register_pairs
+
+    def watched(*arguments, **options):
+        seen.append(options)
+        return register(*arguments, **options)
+
+    monkeypatch.setattr(transfer, "register_pairs", watched)
+    source, target, *_ = map(str, brain_files)
+    labels = tmp_path / "labels.npy"
+    np.save(labels, np.zeros(1500, int))
+    to = ["transfer", source, "--labels", str(labels), "--out", str(tmp_path)]
+    assert main([*to[:2], target, *to[2:], "--preset", "paper", *FLAGS]) == 0
+    assert (seen[0]["preset"], seen[0]["k"]) == ("paper", OPTIONS["k"])
+    assert main([*to[:2], str(paper), *to[2:], "--k", "24", "--preset", "paper"]) == 2
+    assert "is a study, whose options are taken: no --k, --preset" in capsys.readouterr().err
+    assert main([*to[:2], target, *to[2:], "--preset", "paper", "--sharpen", "1"]) == 2
+    assert "preset 'paper' sets sharpen=0; found sharpen=1" in capsys.readouterr().err
+    assert (
+        main(["compare", source, target, "--preset", "paper", "--methods", "RE-MATCH joint"]) == 2
+    )
+    assert "preset 'paper' has no joint rounds" in capsys.readouterr().err
+
+
+def test_table_2_with_the_preset_has_the_first_maps_of_landmarks(brains, monkeypatch):
+    seen = []
+    fit = s4a.compare.map_after_motion
+
+    def watched(*arguments, **options):
+        seen.append(options["init"])
+        return fit(*arguments, **options)
+
+    monkeypatch.setattr(s4a.compare, "map_after_motion", watched)
+    small = {"n_coarse": 200, "k_init": 8, "k": 12, "n_pairs": 3, "methods": ["RE-MATCH"]}
+    found = s4a.compare.collection(brains, preset="paper", **small)
+    assert set(seen) == {"landmarks"}
+    assert found["collection_chamfer"].notnull().sum() == 2 * 3
+    with pytest.raises(ValueError, match="preset 'paper' sets wide=0; found wide=4"):
+        s4a.compare.collection(brains, preset="paper", wide=4, **small)
