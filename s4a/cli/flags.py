@@ -258,14 +258,14 @@ def main(arguments: list[str] | None = None) -> int:
     A ValueError, OSError or StageError becomes one line on the error stream, a lack of memory too.
     """
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
+    words = sys.argv[1:] if arguments is None else arguments
+    args = parser().parse_args(words, argparse.Namespace(words=words))  # ends here where they err
     filters = [(handler, Once()) for handler in logging.getLogger().handlers]
     for handler, once in filters:
         handler.addFilter(once)
-    words = sys.argv[1:] if arguments is None else arguments
-    args = parser().parse_args(words, argparse.Namespace(words=words))
-    if isinstance(sys.stdout, io.TextIOWrapper):  # letters that the terminal does not know
-        sys.stdout.reconfigure(errors="backslashreplace")
     try:
+        if isinstance(sys.stdout, io.TextIOWrapper):  # letters that the terminal does not know
+            sys.stdout.reconfigure(errors="backslashreplace")
         return args.function(args)
     except (ValueError, OSError, StageError) as error:
         sys.stderr.write(f"s4a: {shown(error)}\n")

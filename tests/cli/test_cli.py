@@ -116,10 +116,12 @@ def test_an_error_is_one_line_and_the_exit_code_2(arguments, words, tmp_path, mo
 @pytest.mark.parametrize(
     "arguments", [[], ["dance"], ["run", "x"], ["run", "x", "--out", "y", "--init", "random"]]
 )
-def test_wrong_usage_ends_with_2_and_says_how(arguments, capsys):
+def test_wrong_usage_ends_with_2_says_how_and_leaves_the_log_as_it_was(arguments, capsys, caplog):
+    filters = list(caplog.handler.filters)
     with pytest.raises(SystemExit) as end:
         cli.main(arguments)
     assert end.value.code == 2
+    assert caplog.handler.filters == filters
     assert "usage: s4a" in capsys.readouterr().err
 
 
