@@ -15,15 +15,20 @@ import xarray as xr
 from joblib import effective_n_jobs, parallel_config
 
 from s4a.input.collection import remarks_on_files
-from s4a.input.decisions import doubtful_lines
-from s4a.input.evidence import pick_references
-from s4a.input.plausibility import Doubts, find_warnings
+from s4a.input.plausibility import Doubts
 from s4a.input.subjects import read_table
 from s4a.method.network import choose_pairs, spectral_distance
 from s4a.method.pca import pca_without
+from s4a.study.doubts import (
+    check_plausibility,
+    check_usable,
+    doubt_registrations,
+    set_apart,
+    stop_at_doubts,
+)
 from s4a.study.options import Options, takes_options
 from s4a.study.processes import temporary_folder
-from s4a.study.report import doubtful, of_look, write_report
+from s4a.study.report import write_report
 from s4a.study.runner import Keys, Run, Task
 from s4a.study.sources import Collection, Sources, find_sources, kept_table, of_contents
 from s4a.study.store import (
@@ -31,7 +36,6 @@ from s4a.study.store import (
     attributes,
     is_done,
     lock,
-    open_file,
     read,
     task_key,
     write,
@@ -39,11 +43,9 @@ from s4a.study.store import (
 from s4a.study.tasks import (
     align_shape,
     clean_shape,
-    compare_shape,
     consistent_maps,
     map_pairs,
     place_shape,
-    portray_shape,
     register_shape,
     remesh_shape,
 )
@@ -234,74 +236,6 @@ def read_and_clean(run: Run, sources: Sources, options: Options) -> Keys:
     return run.do("read and clean", todo)
 
 
-def check_plausibility(
-    run: Run, original: Keys, options: Options
-) -> tuple[Keys, Doubts, list[str]]:
-    """What looks wrong with each shape beside the others, and with all of them.
-
-    Returns
-    -------
-    original : dict of str to str
-        Keys of the shapes that could be compared.
-    doubts : dict of str to list of Doubt
-    remarks : list of str
-    """
-    if len(original) < 2:
-        return original, {}, []
-    attrs = {n: attributes(run.folder / f"original/{n}.nc") for n in original}
-    settings = (options.intersections,)
-    todo = [
-        Task(
-            n, f"network/sketch_{n}.nc", portray_shape, (run.folder, n, *settings), (key, settings)
-        )
-        for n, key in original.items()
-    ]
-    sketches = run.do("sketch", todo)
-    references = references_of(run, sketches, options.k)
-    reference_key = task_key(*(sketches[n] for n in references))
-    todo = [
-        Task(
-            n,
-            f"network/look_{n}.nc",
-            compare_shape,
-            (run.folder, n, references),
-            (reference_key, key),
-        )
-        for n, key in sketches.items()
-    ]
-    compared = run.do("compare", todo)
-    looks = {name: of_look(run, name) for name in compared}
-    return {n: original[n] for n in compared}, *find_warnings({n: attrs[n] for n in looks}, looks)
-
-
-def references_of(run: Run, sketches: Keys, k: int) -> list[str]:
-    """The shapes beside which all are seen: of usual form, fine enough for k."""
-    vertices = {n: open_file(run.folder / f"original/{n}.nc").sizes["vertex"] for n in sketches}
-    least = usable_k(list(vertices.values()), k)
-    fine = [name for name in sketches if vertices[name] >= least]
-    portraits = {n: read(run.folder / f"network/sketch_{n}.nc") for n in fine or sketches}
-    return pick_references(portraits)
-
-
-def stop_at_doubts(doubts: Doubts, options: Options) -> None:
-    """ValueError where a shape is doubtful and the run shall stop at that."""
-    if options.doubtful != "stop":
-        return
-    kinds = {
-        name: " ".join(dict.fromkeys(doubt.kind for doubt in of_shape if doubt.doubtful))
-        for name, of_shape in doubts.items()
-        if name != options.template
-    }
-    kinds = {name: words for name, words in kinds.items() if words}
-    if kinds:
-        lines = "\n".join(f"  {line}" for line in doubtful_lines(kinds))
-        raise ValueError(
-            f"{len(kinds)} of {len(doubts)} shapes are doubtful, and doubtful='stop' ends the run "
-            f"before its long stages:\n{lines}\nmend these files or take them away, "
-            "or give doubtful='apart' to go on with these shapes beside the others"
-        )
-
-
 def remesh(run: Run, original: Keys, options: Options) -> Keys:
     """Low-resolution meshes and their spectra (4.1, step 1): ``/coarse``."""
     settings: tuple = (options.n_coarse, options.wrap, options.seed, options.k)
@@ -314,81 +248,6 @@ def remesh(run: Run, original: Keys, options: Options) -> Keys:
     coarse = run.do("remesh and spectrum", todo)
     check_usable(run, coarse, options)
     return coarse
-
-
-def check_usable(run: Run, coarse: Keys, options: Options) -> None:
-    """ValueError where too few shapes are left, or the template is not among them."""
-    if len(coarse) < 2:
-        reasons = "; ".join(f"{name}: {why}" for name, why in run.failures.items())
-        raise ValueError(
-            f"an analysis needs at least 2 usable shapes, found {len(coarse)} "
-            f"({reasons or 'only one was given'})"
-        )
-    if options.template in run.failures:
-        why = run.failures[options.template]
-        raise ValueError(f"template {options.template!r} cannot be used: {why}")
-
-
-def set_apart(
-    run: Run, coarse: Keys, doubts: Doubts, options: Options
-) -> tuple[Doubts, Keys, Keys, list[str]]:
-    """The shapes that make the network, and the doubtful ones, which stand apart from it.
-
-    Those with fewer eigenfunctions than most others are left out.  Where fewer than two are beyond
-    doubt, none is doubtful: there is nothing to hold them against.
-
-    Returns
-    -------
-    doubts : dict of str to list of Doubt
-    coarse, apart : dict of str to str
-        Keys of the low-resolution meshes of both.
-    remarks : list of str
-    """
-    count = {n: len(arrays(run.folder / f"coarse/{n}.nc", "eigenvalue")[0]) for n in coarse}
-    named = options.template  # who names a template trusts it
-    is_doubtful = {n: any(doubt.doubtful for doubt in doubts.get(n, [])) for n in coarse}
-    sure = [n for n in coarse if n == named or not is_doubtful[n]]
-    remarks = []
-    if len(sure) < 2:
-        doubts = {
-            n: [doubt._replace(doubtful=False) for doubt in doubts.get(n, [])] for n in doubts
-        }
-        if len(coarse) > 1:
-            remarks = [
-                f"{len(coarse) - len(sure)} of {len(coarse)} shapes are doubtful, and fewer than "
-                "two are not: all are treated alike"
-            ]
-        sure = list(coarse)
-    k = usable_k([count[n] for n in sure], options.k)
-    enough = sum(count[n] >= k for n in sure)
-    for n in coarse:
-        if count[n] < k:
-            run.failures[n] = (
-                f"only {count[n]} eigenfunctions, where {enough} of {len(sure)} shapes have "
-                f"{k} or more: give a finer mesh, or a smaller k"
-            )
-    network = {n: coarse[n] for n in sure if count[n] >= k}
-    apart = {n: coarse[n] for n in coarse if n not in sure and count[n] >= k}
-    check_usable(run, network, options)
-    return doubts, network, apart, remarks
-
-
-def usable_k(counts: Sequence[int], k: int) -> int:
-    """The size of maps that most shapes allow, by their numbers of eigenfunctions.
-
-    It is k where most have as many.  Else it is the least number of those shapes that have at least
-    half of what is usual: few eigenfunctions of one shape are no reason to take them from all.
-
-    Examples
-    --------
-    >>> from s4a.study.pipeline import usable_k
-    >>> usable_k([100, 100, 2], 100), usable_k([58, 2, 48, 62], 100)
-    (100, 48)
-    """
-    if 2 * sum(count >= k for count in counts) > len(counts):
-        return k
-    usual = np.median(counts)
-    return min(count for count in counts if 2 * count >= usual)
 
 
 def lowest_eigenvalues(run: Run, coarse: Keys, k_init: int) -> np.ndarray:
@@ -538,17 +397,6 @@ def register(run: Run, coarse: Keys, placed: Keys, latent: str, options: Options
             )
         )
     return run.do("registration", todo)
-
-
-def doubt_registrations(run: Run, registered: Keys, placed: Keys) -> tuple[Doubts, list[str]]:
-    """What is doubtful of the registrations within the network."""
-    names = [name for name in registered if name not in placed]
-    files = {name: run.folder / f"registration/{name}.nc" for name in names}
-    badness = {name: attributes(file)["score"] for name, file in files.items()}
-    distortion = {
-        name: float(np.abs(arrays(file, "distortion")[0]).mean()) for name, file in files.items()
-    }
-    return doubtful(badness, distortion)
 
 
 def modes(run: Run, registered: Keys, doubts: Doubts, options: Options) -> str:

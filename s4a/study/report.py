@@ -7,20 +7,13 @@ import numpy as np
 import xarray as xr
 
 from s4a.input.collection import shape_report
-from s4a.input.plausibility import Doubts, doubt
+from s4a.input.plausibility import Doubts
 from s4a.schema import dataset
+from s4a.study.doubts import of_look
 from s4a.study.options import Options
 from s4a.study.runner import Run
 from s4a.study.sources import Sources
 from s4a.study.store import arrays, attributes, read, write
-
-# badness: of one kind 0.02 to 0.03, in far poses 0.01 to 0.03, of a cat and a man 0.14 to 0.16
-DOUBTFUL = 0.06
-# badness times mean |distortion|: of pairs of bodies and cats that are right 0.0002 to 0.005, of
-# those that failed 0.0033 to 0.08 (docs/plausibility.md)
-WRONG, UNSURE = 0.0065, 0.004
-# and times the median of the collection, as coarse meshes raise the product of all shapes
-WRONG_BESIDE, UNSURE_BESIDE = 2.0, 1.5
 
 
 def write_report(
@@ -95,67 +88,10 @@ def of_shape(run: Run, name: str, source: str | xr.Dataset, options: Options) ->
     return mesh | {"reason": "; ".join(done)} | path
 
 
-def of_look(run: Run, name: str) -> xr.Dataset:
-    """What :func:`s4a.input.evidence.compare` saw in a shape."""
-    return read(run.folder / f"network/look_{name}.nc")
-
-
 def costs(run: Run) -> xr.Dataset:
     """Seconds and peak memory of every stage."""
     seconds, memory = np.array(list(run.costs.values())).T
     return dataset(seconds=seconds, peak_memory=memory).assign_coords(stage=list(run.costs))
-
-
-def doubtful(
-    badness: dict[str, float], distortion: dict[str, float] | None = None
-) -> tuple[Doubts, list[str]]:
-    """Doubts about the shapes whose registration scores badly, or for all of them.
-
-    Parameters
-    ----------
-    badness : dict of str to float
-        See :func:`s4a.method.joint.registration_score`.
-    distortion : dict of str to float, optional
-        Mean size of the distortion.  A wrong map both misses the surface and distorts: the product
-        is told where neither number alone is.
-
-    Returns
-    -------
-    of_shapes : dict of str to list of Doubt
-        Of the kind ``registration``; only names that have one.
-    of_all : list of str
-        In place of the former where most shapes are doubtful: then the template or the options are.
-
-    Examples
-    --------
-    >>> from s4a.study.report import doubtful
-    >>> of_shapes, of_all = doubtful({"template": 0.0, "good": 0.02, "wrong": 0.12})
-    >>> list(of_shapes), of_all
-    (['wrong'], [])
-    """
-    distortion = distortion or {}
-    product = {name: score * distortion.get(name, 0.0) for name, score in badness.items()}
-    usual = float(np.median([one for one in product.values() if one > 0] or [0.0]))
-    far, near = max(WRONG, WRONG_BESIDE * usual), max(UNSURE, UNSURE_BESIDE * usual)
-    wrong = {n: score for n, score in badness.items() if score > DOUBTFUL or product[n] > far}
-    if len(badness) > 2 and len(wrong) > len(badness) / 2:
-        return {}, [
-            f"{len(wrong)} of {len(badness)} registrations are doubtful "
-            f"(badness {min(wrong.values()):.3f} to {max(wrong.values()):.3f}): "
-            "try another template, a larger n_coarse or k"
-        ]
-    found: Doubts = {}
-    for name, score in badness.items():
-        if name not in wrong and product[name] <= near:
-            continue
-        sure = "probably" if name in wrong else "maybe, in places,"
-        also = f", mean |distortion| {distortion[name]:.2f}" if name in distortion else ""
-        words = (
-            f"{sure} registered wrongly (badness {score:.3f}{also}): "
-            "look at it in s4a view, compare its file with the template's, or leave it out"
-        )
-        found[name] = [doubt("registration", words, name in wrong)]
-    return found, []
 
 
 def reduced_k(asked: int, k: int, spectra: dict) -> list[str]:

@@ -16,7 +16,8 @@ from paths import TESTS
 from s4a import analyse, cli, insert, open_study, read_shapes
 from s4a.geometry.mesh import as_dataset, euler_characteristic
 from s4a.show.page import study_html
-from s4a.study.report import doubtful, tied
+from s4a.study.doubts import doubtful
+from s4a.study.report import tied
 
 SMALL = {"n_coarse": 100, "k_init": 6, "k": 10, "step": 4, "refine": "intrinsic"}
 FLAGS = [

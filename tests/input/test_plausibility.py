@@ -7,7 +7,7 @@ from faults import shapes as faulty
 from s4a.geometry.mesh import as_dataset
 from s4a.input import evidence, plausibility
 from s4a.input.clean import clean
-from s4a.study.report import doubtful
+from s4a.study.doubts import doubtful
 
 SHAPES = {f"s{i}": faulty.shape(200 + i) for i in range(8)}
 
