@@ -38,7 +38,8 @@ ROWS = {
     "vertex_area": ("vertex", INPUT2, "lumped area of the vertex, the diagonal of A"),
     "edge_vertex": ("edge end", ONE, "vertices at both ends of an edge"),
     "cotan_weight": ("edge", ONE, "cotan weight of the edge, so that the Laplacian is A^-1 W"),
-    "sample_vertex": ("vertex", ONE, "vertex of the original mesh that the coarse vertex is"),
+    "sample_vertex": ("vertex", ONE,
+        "vertex of the original mesh that the coarse vertex is, -1 where it is none"),
     "coarse_vertex": ("original_vertex corner", ONE,
         "coarse vertices that carry an original vertex: columns of U"),
     "coarse_weight": ("original_vertex corner", ONE, "their barycentric weights: entries of U"),
@@ -291,7 +292,7 @@ POINTS_INTO = {
     "registered_match": "original_vertex",
     "template_triangle": "triangle",
 }
-NOWHERE = {"vertex_of_file"}
+NOWHERE = {"vertex_of_file", "sample_vertex"}
 
 
 def variable(name: str, data: ArrayLike, **attrs: str | float | list[str]) -> xr.Variable:

@@ -132,9 +132,13 @@ def reduced_eigenpairs(
         stiff, k=k, M=mass, sigma=-shift, OPinv=inverse, v0=start, which="LM"
     )
     order = np.argsort(eigenvalue)
-    Phi = Phi[:, order]
-    moment = area @ (U @ Phi) ** 3
-    return np.maximum(eigenvalue[order], 0.0), Phi * np.where(moment < 0, -1.0, 1.0), mass.tocsr()
+    eigenvalue, Phi = eigenvalue[order], Phi[:, order]
+    zero = np.abs(eigenvalue) < 1e-9 * max(eigenvalue[-1], 1.0)
+    eigenvalue = np.where(zero, 0.0, eigenvalue)  # kernels would take rounding for a frequency
+    Phi = Phi * np.where(area @ (U @ Phi) ** 3 < 0, -1.0, 1.0)
+    if zero.sum() == 1:
+        Phi[:, 0] = 1.0  # exactly, as in eigenpairs
+    return eigenvalue, Phi, mass.tocsr()
 
 
 def reduce(mesh: xr.Dataset, *, n_samples: int = 6000, k: int = 100, seed: int = 0) -> Shape:

@@ -1,5 +1,6 @@
 """A study on disk: keys, whole files, one run at a time, and what is read is what was written."""
 
+import shutil
 import subprocess
 import sys
 
@@ -53,6 +54,18 @@ def test_a_written_file_is_done_for_its_key_and_no_other(file):
     assert store.is_done(file, "key")
     assert not store.is_done(file, "other")
     assert not store.is_done(file.with_name("absent.nc"), "key")
+
+
+def test_a_coarse_vertex_may_be_no_vertex_of_its_mesh_as_after_wrapping(study_folder, tmp_path):
+    folder = shutil.copytree(study_folder, tmp_path / "wrapped")
+    path = folder / "coarse/brain_01.nc"
+    said, data = store.attributes(path), store.read(path)
+    data["sample_vertex"].values[:5] = -1
+    store.write(data, path, said["task_key"], said["made_from"].split())
+    with open_study(folder) as study:
+        assert (study["coarse/brain_01/sample_vertex"].values[:6] >= 0).tolist() == [False] * 5 + [
+            True
+        ]
 
 
 def test_what_is_read_is_what_was_written(file):
