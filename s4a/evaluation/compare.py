@@ -5,6 +5,7 @@ All work on one cleaned input.  What the methods are is in :mod:`s4a.evaluation.
 
 import io
 import time
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,9 +19,11 @@ from tqdm.auto import tqdm
 from s4a.evaluation import metrics
 from s4a.evaluation.methods import (
     BLOCKS,
+    INITS,
     METHODS,
+    OLD_NAMES,
+    OUR_METHODS,
     PAPER_METHODS,
-    PRESETS,
     Matches,
     Pair,
     Spaces,
@@ -33,7 +36,7 @@ from s4a.method import latent, median, network
 from s4a.method.first_map import map_after_motion
 from s4a.method.register import latent_functions, match_functions, match_low
 from s4a.method.shape import Basis, Shape
-from s4a.schema import check_count, check_switch, dataset, require, variable
+from s4a.schema import check_count, dataset, require, variable
 from s4a.study.options import PRESETS as STUDY_PRESETS
 from s4a.study.options import Options, apply_preset
 
@@ -47,15 +50,45 @@ COLLECTION_BLOCKS = (
     "full resolution",
 )
 HOW = ("standard", "ours")
+# first maps of all methods, and rounds of RE-MATCH lifted
+PRESETS: dict[str | None, dict] = {
+    None: {"sharpen": 2, "init": "landmarks"},
+    "paper": {"sharpen": 0, "init": "landmarks"},
+}
 
 
-def checked_methods(methods: Sequence[str]) -> None:
-    """ValueError unless all are some of :data:`METHODS`."""
-    wrong = [m for m in methods if m not in METHODS]
+def by_new_names(methods: Sequence[str] | None) -> Sequence[str] | None:
+    """The methods by their names of today; DeprecationWarning where one has an old name."""
+    if methods is None or isinstance(methods, str):
+        return methods
+    for old in OLD_NAMES.keys() & set(methods):
+        text = f"the method {old!r} is now {OLD_NAMES[old]!r}"
+        warnings.warn(text, DeprecationWarning, stacklevel=3)
+    return [OLD_NAMES.get(method, method) for method in methods]
+
+
+def checked_methods(methods: Sequence[str] | None, preset: str | None) -> Sequence[str]:
+    """The methods; all by default, of the paper alone with its preset.
+
+    Raises
+    ------
+    ValueError
+        Unless all are some of :data:`METHODS`, and of the paper's with its preset.
+    """
+    if methods is None:
+        return PAPER_METHODS if preset == "paper" else METHODS
+    wrong = [method for method in methods if method not in METHODS]
     if wrong or not len(methods) or isinstance(methods, str):
         raise ValueError(
             f"methods must be some of {', '.join(METHODS)}; found {wrong or methods!r}"
         )
+    added = [method for method in methods if method in OUR_METHODS]
+    if preset == "paper" and added:
+        raise ValueError(
+            f"preset 'paper' has the methods {', '.join(PAPER_METHODS)}; "
+            f"found {', '.join(added)}: leave out one of both"
+        )
+    return methods
 
 
 def load_mesh(shape: Path | str | xr.Dataset, what: str) -> tuple[xr.Dataset, float]:
@@ -129,6 +162,7 @@ def pair(
     source: Path | str | xr.Dataset,
     target: Path | str | xr.Dataset,
     *,
+    methods: Sequence[str] | None = None,
     truth: Any = None,
     landmarks: Any = None,
     **options: Any,
@@ -138,8 +172,8 @@ def pair(
     Parameters
     ----------
     source, target : path or Dataset
-    truth, landmarks, **options
-        As the values of :func:`pairs`, and its other options.
+    methods, truth, landmarks, **options
+        As of :func:`pairs`; truth and landmarks as its values.
 
     Returns
     -------
@@ -159,7 +193,8 @@ def pair(
     def one(value):
         return None if value is None else {"pair": value}
 
-    return pairs(source, {"pair": target}, truth=one(truth), landmarks=one(landmarks), **options)
+    options |= {"methods": by_new_names(methods), "truth": one(truth), "landmarks": one(landmarks)}
+    return pairs(source, {"pair": target}, **options)
 
 
 def pairs(
@@ -174,21 +209,21 @@ def pairs(
     k: int = 100,
     step: int = 5,
     preset: str | None = None,
-    lift: bool | None = None,
     sharpen: int | None = None,
     init: str | None = None,
     n_geodesic: int = 1000,
     seed: int = 0,
 ) -> xr.Dataset:
-    """The five pair methods of Table 1, and joint rounds after the last, on the same cleaned input.
+    """The five pair methods of Table 1, and two of ours, on the same cleaned input.
 
     kNN: nearest neighbour in space after rigid alignment.  ZO: from that match, ZoomOut at full
-    resolution.  FMAP+ZO: functional map fitted on landmarks and descriptors at full resolution,
-    then ZoomOut.  SCALABLE: the same in the space of :mod:`s4a.method.scalable`.  RE-MATCH: the
-    same on the low-resolution mesh, with the eigenfunctions of :mod:`s4a.method.lift` at its
-    vertices, and eq. 4; the last two rounds of ZoomOut look among all vertices of the source.
-    RE-MATCH joint: joint rounds after that.  With ``preset="paper"`` RE-MATCH is the paper's, and
-    the same as ``s4a.match_pair(..., preset="paper")``.
+    resolution.  FMAP+ZO: functional map fitted on landmarks at full resolution, then ZoomOut.
+    SCALABLE: the same in the space of :mod:`s4a.method.scalable`.  RE-MATCH: the same on the
+    low-resolution mesh, and eq. 4 with U Phi, as ``s4a.match_pair(..., preset="paper")``.
+
+    Ours are RE-MATCH lifted: with the eigenfunctions of :mod:`s4a.method.lift` in the place of
+    U Phi, and the last two rounds of ZoomOut look among all vertices of the source; and joint:
+    joint rounds after RE-MATCH.
 
     Parameters
     ----------
@@ -197,7 +232,7 @@ def pairs(
     targets : dict
         Name of the pair -> path or Dataset.
     methods : sequence of str, optional
-        Some of :data:`METHODS`; all by default, but for the joint rounds with the preset.
+        Some of :data:`METHODS`; all by default, the paper's five with the preset.
     truth : dict, optional
         Name of the pair -> true vertices or positions, as of
         :func:`s4a.evaluation.metrics.evaluate`; for shapes given as paths all vertices, here and in
@@ -215,15 +250,15 @@ def pairs(
         the time of that block of ZO and FMAP+ZO; on a child of 60,000 vertices in two poses they
         end 7 to 9 % farther from the truth.
     preset : {None, "paper"}
-        ``"paper"`` sets lift=False, sharpen=0 and init="landmarks"; another value of these is
-        refused.
-    lift : bool, optional
-        Whether RE-MATCH has lifted eigenfunctions (default), or U Phi of eq. 4.
+        ``"paper"`` leaves out our methods and sets sharpen=0 and init="landmarks"; another value
+        of these is refused.
     sharpen : int, optional
-        Rounds of ZoomOut of RE-MATCH that look among all vertices of the source, 2 by default.
-    init : {"descriptors", "landmarks"}, optional
-        First maps of all methods but ZO from wave kernels of the shapes and around landmarks
-        (default), or from heat kernels around landmarks alone, as in :func:`s4a.match_pair`.
+        Rounds of ZoomOut of RE-MATCH lifted that look among all vertices of the source, 2 by
+        default.
+    init : {"landmarks", "descriptors"}, optional
+        First maps of all methods but kNN and ZO from heat kernels around landmarks (default), as in
+        :func:`s4a.match_pair` with the preset, or from wave kernels of the shapes and around
+        landmarks, as pyFM has them.
     n_geodesic : int
         See :func:`s4a.evaluation.metrics.evaluate`.
     seed : int
@@ -251,20 +286,11 @@ def pairs(
     >>> found["chamfer"].sel(pair="itself", way="kNN").item()
     0.0
     """
-    given = {"lift": lift, "sharpen": sharpen, "init": init}
-    settings = apply_preset(preset, given, PRESETS)
-    check_switch("lift", settings["lift"])
+    settings = apply_preset(preset, {"sharpen": sharpen, "init": init}, PRESETS)
     check_count("sharpen", settings["sharpen"])
-    if settings["init"] not in ("descriptors", "landmarks"):
-        raise ValueError(f"init must be 'descriptors' or 'landmarks'; found {init!r}")
-    if methods is None:
-        methods = PAPER_METHODS if preset == "paper" else METHODS
-    checked_methods(methods)
-    if preset == "paper" and "RE-MATCH joint" in methods:
-        raise ValueError(
-            "preset 'paper' has no joint rounds; found the method 'RE-MATCH joint': "
-            "leave out one of both"
-        )
+    if settings["init"] not in INITS:
+        raise ValueError(f"init must be {' or '.join(map(repr, INITS))}; found {init!r}")
+    methods = checked_methods(by_new_names(methods), preset)
     in_memory = isinstance(source, xr.Dataset)
     if any(isinstance(target, xr.Dataset) != in_memory for target in targets.values()):
         raise ValueError("source and targets need to be all paths or all Datasets")
@@ -272,10 +298,10 @@ def pairs(
     rows = []
     with threadpool_limits(1):
         mesh, load_source = load_mesh(source, "source")
-        M = Spaces(mesh, n_coarse, k, seed, settings["lift"])
+        M = Spaces(mesh, n_coarse, k, seed)
         for name, target in tqdm(targets.items(), desc="pairs", disable=len(targets) < 2):
             mesh, load_target = load_mesh(target, f"target {name}")
-            N = Spaces(mesh, n_coarse, k, seed, settings["lift"])
+            N = Spaces(mesh, n_coarse, k, seed)
             vertices = None
             if landmarks is not None:
                 at_source, at_target = (
@@ -290,7 +316,7 @@ def pairs(
             load = load_source + load_target
             rows.append(metrics_of_pair(M, N, methods, vertices, load, true, n_geodesic, options))
     table = xr.concat(rows, "pair", combine_attrs="drop_conflicts")
-    attrs = options | {"lift": int(settings["lift"]), "n_coarse": n_coarse, "seed": seed}
+    attrs = options | {"n_coarse": n_coarse, "seed": seed}
     return table.assign_coords(pair=list(targets)).transpose("way", "pair", ...).assign_attrs(attrs)
 
 

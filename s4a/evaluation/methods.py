@@ -2,8 +2,9 @@
 
 Every method works on a :class:`s4a.method.shape.Shape`: ZO and FMAP+ZO on one whose functions are
 the eigenfunctions of the dense mesh, SCALABLE on that of :mod:`s4a.method.scalable`, RE-MATCH on
-the coarse mesh with functions of :mod:`s4a.method.lift`, or with U Phi as in the paper.  Times are
-CPU seconds of one core, so that a busy machine does not change them.
+the coarse mesh with U Phi, as in the paper.  Ours are RE-MATCH lifted, with functions of
+:mod:`s4a.method.lift`, and joint, which is RE-MATCH and :mod:`s4a.method.joint` after it.  Times
+are CPU seconds of one core, so that a busy machine changes them little.
 """
 
 import time
@@ -35,7 +36,18 @@ from s4a.method.shape import Basis, Shape
 from s4a.method.spectral import eigenpairs, spectrum
 
 PAPER_METHODS = ("kNN", "ZO", "FMAP+ZO", "SCALABLE", "RE-MATCH")
-METHODS = (*PAPER_METHODS, "RE-MATCH joint")
+OUR_METHODS = ("RE-MATCH lifted", "joint")
+METHODS = (*PAPER_METHODS, *OUR_METHODS)
+OLD_NAMES = {"RE-MATCH joint": "joint"}
+# the shape of Spaces whose functions a method compares; joint rounds begin with RE-MATCH's match
+KINDS = {
+    "ZO": "dense",
+    "FMAP+ZO": "dense",
+    "SCALABLE": "local",
+    "RE-MATCH": "coarse",
+    "RE-MATCH lifted": "lifted",
+    "joint": "coarse",
+}
 BLOCKS = (
     "load and clean",
     "align",
@@ -46,11 +58,7 @@ BLOCKS = (
     "full resolution",
 )  # of Fig. 3
 N_SPREAD = 3000  # points of each shape by which it is aligned, and that group dense searches
-# what is added to the paper's RE-MATCH and to the fit of all first maps; nothing in the paper's
-PRESETS: dict[str | None, dict] = {
-    None: {"lift": True, "sharpen": 2, "init": "descriptors"},
-    "paper": {"lift": False, "sharpen": 0, "init": "landmarks"},
-}
+INITS = ("landmarks", "descriptors")  # fits of first maps
 
 Matches = tuple[np.ndarray, np.ndarray]
 
@@ -84,7 +92,6 @@ class Spaces:
     n_coarse: int = 6000
     k: int = 100
     seed: int = 0
-    lift: bool = True
     clock: Clock = field(default_factory=Clock)
 
     @cached_property
@@ -123,21 +130,23 @@ class Spaces:
         return self.clock("local basis", spectral_space, self.mesh, *parts, self.k)
 
     @cached_property
-    def low(self) -> xr.Dataset:
-        """The low-resolution mesh, with a few eigenfunctions more where they are to be lifted."""
+    def sampled(self) -> xr.Dataset:
+        """The low-resolution mesh."""
         options = {"n_coarse": self.n_coarse, "seed": self.seed}
-        coarse = self.clock("coarse sample", coarsen, self.mesh, **options)
-        return self.clock("coarse basis", spectrum, coarse, k=self.k + SPARE * self.lift)
+        return self.clock("remeshed sample", coarsen, self.mesh, **options)
 
     @cached_property
     def coarse(self) -> Shape:
-        """The low-resolution mesh and its own eigenfunctions."""
-        return Shape(self.mesh, self.low.isel(mode=slice(self.k)))
+        """The low-resolution mesh and its own eigenfunctions: U Phi at all vertices."""
+        return Shape(self.mesh, self.clock("coarse basis", spectrum, self.sampled, k=self.k))
 
     @cached_property
     def lifted(self) -> Shape:
         """The low-resolution mesh with functions that were brought to all vertices and back."""
-        return Shape(self.mesh, self.clock("lifted basis", lifted, self.mesh, self.low, self.k))
+        return Shape(self.mesh, self.clock("lifted basis", self._lifted))
+
+    def _lifted(self):
+        return lifted(self.mesh, spectrum(self.sampled, k=self.k + SPARE), self.k)
 
 
 def functions_at_all_vertices(shape: Shape, C: np.ndarray | None = None) -> np.ndarray:
@@ -200,11 +209,11 @@ class Pair:
         Corresponding vertices; by default those of 4.1, step 3.
     k_init, k, step : int
         Of the maps.
-    lift, sharpen : bool, int
-        Whether RE-MATCH has lifted functions, and its last rounds that look among all vertices.
-    init : {"descriptors", "landmarks"}
-        First maps from wave kernels of the shapes and around landmarks, or as
-        :func:`s4a.method.fmap.fmap_from_landmarks`.
+    sharpen : int
+        Last rounds of RE-MATCH lifted that look among all vertices.
+    init : {"landmarks", "descriptors"}
+        First maps as :func:`s4a.method.fmap.fmap_from_landmarks`, or from wave kernels of the
+        shapes and around landmarks.
     """
 
     source: Spaces
@@ -213,17 +222,16 @@ class Pair:
     k_init: int = 20
     k: int = 100
     step: int = 5
-    lift: bool = True
     sharpen: int = 2
-    init: str = "descriptors"
+    init: str = "landmarks"
     spectral: dict[str, SpectralMatch] = field(default_factory=dict)
 
     def run(self, method: str) -> Outcome:
         """A method of :data:`METHODS`."""
         clock = Clock()
-        remeshed = method.startswith("RE-MATCH")
+        remeshed = KINDS.get(method) in ("coarse", "lifted")
         motion, landmarks, align_seconds = self.align_remeshed if remeshed else self.align_spread
-        aligned = self.landmarks is None or method in ("kNN", "ZO", "RE-MATCH joint")
+        aligned = self.landmarks is None or method in ("kNN", "ZO", "joint")
         if aligned:
             clock.add("align", align_seconds)
         if not remeshed and (aligned or method == "FMAP+ZO"):
@@ -236,10 +244,11 @@ class Pair:
             )
             return Outcome(match, None, reverse, clock.seconds)
 
-        spectral = self.match_spectrally(method.removesuffix(" joint"), motion, landmarks)
+        start = "RE-MATCH" if method == "joint" else method
+        spectral = self.match_spectrally(start, motion, landmarks)
         for block, seconds in spectral.seconds.items():
             clock.add(block, seconds)
-        if method == "RE-MATCH joint":
+        if method == "joint":
             match, image = self.refine_jointly(spectral, motion, clock)
             reverse = cKDTree(image).query(self.source.mesh["position"].values)[1]
             return Outcome(match, image, reverse, clock.seconds)
@@ -250,13 +259,8 @@ class Pair:
 
     def shapes(self, method: str) -> tuple[Shape, Shape]:
         """Source and target in the functions of a method."""
-        kind = self.kind(method)
+        kind = KINDS[method]
         return getattr(self.source, kind), getattr(self.target, kind)
-
-    def kind(self, method: str) -> str:
-        """Which shapes of :class:`Spaces` a method works on."""
-        of_remeshed = "lifted" if self.lift else "coarse"
-        return {"ZO": "dense", "FMAP+ZO": "dense", "SCALABLE": "local"}.get(method, of_remeshed)
 
     @cached_property
     def align_spread(self) -> tuple[Motion, Matches, float]:
@@ -279,7 +283,7 @@ class Pair:
         return (R, t), landmarks, clock.seconds["align"]
 
     def match_spectrally(self, method: str, motion: Motion, landmarks: Matches) -> SpectralMatch:
-        """ZO, FMAP+ZO, SCALABLE or RE-MATCH: first map, ZoomOut and match at full resolution."""
+        """A method of functions: first map, ZoomOut and match at full resolution."""
         if method not in self.spectral:
             self.spectral[method] = self._match_spectrally(method, motion, landmarks)
         return self.spectral[method]
@@ -287,8 +291,8 @@ class Pair:
     def _match_spectrally(self, method, motion, landmarks):
         clock = Clock()
         M, N = self.shapes(method)
-        kind = self.kind(method)
-        parts = ("coarse", "lifted") if kind == "lifted" else (kind,)
+        kind = KINDS[method]
+        parts = ("remeshed", kind) if kind in ("coarse", "lifted") else (kind,)
         for block in ("sample", "basis"):
             for end in (self.source, self.target):
                 spent = [end.clock.seconds.get(f"{part} {block}", 0.0) for part in parts]
@@ -316,9 +320,9 @@ class Pair:
         C, low_match = clock(
             "refine", fmap.zoomout, M.low, N.low, C, self.k, step=self.step, nearest=nearest
         )
-        if method == "RE-MATCH":
+        if kind == "lifted":
             for _ in range(self.sharpen):
-                C = clock("refine", sharpen_map, M, N, C, M.full.Phi if self.lift else None)
+                C = clock("refine", sharpen_map, M, N, C, M.full.Phi)
         F = clock("full resolution", functions_at_all_vertices, M, C)
         G = functions_at_all_vertices(N)
         match = low_match
@@ -327,8 +331,8 @@ class Pair:
         return SpectralMatch(match, (F, G), low_match, clock.seconds)
 
     def refine_jointly(self, spectral: SpectralMatch, motion: Motion, clock: Clock) -> Matches:
-        """RE-MATCH with joint rounds: match and registered surface at full resolution."""
-        M, N = self.source.coarse, self.target.coarse
+        """Joint rounds after RE-MATCH: match and registered surface at full resolution."""
+        M, N = self.shapes("joint")
         starts = {
             "intrinsic": spectral.low_match,
             "icp": nearest_after_motion(M.low, N.low, motion),

@@ -1,11 +1,14 @@
-"""The paper's Table 1 and Table 2 on real and on synthetic shapes.
+"""The paper's Table 1 and Table 2 on real and on synthetic shapes: docs/comparison.md's figures.
 
-With truth where there is any, beside pyFM.
+With truth where there is any, beside pyFM.  Tables are printed as they stand in the page.
 
-The real shapes are those of the shared data beside the checkout; what is absent is skipped.  Times
-are CPU seconds of one core.  Arguments pick parts: registered, both, embedded, heads, collection.
+The real shapes are those of the shared data beside the checkout, or in a folder that
+``--data FOLDER`` names, a folder of PLY files for each set; what is absent is skipped.  Times are
+CPU seconds of one core.  Arguments pick parts: registered, more, embedded, heads, collection, and
+of the first two the sets: ``compare.py registered faces cats``.
 """
 
+import argparse
 import importlib.util
 import subprocess
 import sys
@@ -20,7 +23,7 @@ from threadpoolctl import threadpool_limits
 
 import s4a
 from s4a import compare, metrics, synthetic
-from s4a.cli.tables import METRICS, block_table, collection_table, comparison_table, table
+from s4a.cli.tables import METRICS
 from s4a.geometry.align import farthest_points
 from s4a.geometry.mesh import as_arrays
 from s4a.schema import variable
@@ -28,6 +31,8 @@ from s4a.schema import variable
 DATA = Path(__file__).parents[3] / "shared" / "data"
 CORRESPONDING = {"faust15k": 6890}  # of these only the first vertices correspond
 SETS = {"faces": 2, "faust15k": 2, "cats": 2, "kids": 1}  # pairs
+SHOWN = ("geodesic_error", "chamfer", "hausdorff", "dirichlet", "coverage", "bijectivity")
+COMPARED = ("FMAP+ZO", "RE-MATCH", "RE-MATCH lifted", "joint")  # on more pairs
 N_LANDMARKS = 10
 
 
@@ -66,13 +71,20 @@ def peer(source, target, landmarks, truth, k_init=20, k=100, step=5):
     return found
 
 
-def registered_pairs(name, n_pairs):
-    """Source, target, true source vertex of each target vertex (-1.
+def files_of(name, folder, given=None):
+    """The mesh files of a set: of the folder that was given, or unpacked into another."""
+    return sorted((given / name).glob("*.ply")) if given else unpacked(name, folder)
 
-    None), and ten true pairs as landmarks.
+
+def registered_pairs(name, n_pairs, given=None):
+    """Registered shapes, pair by pair, with their truth and landmarks.
+
+    Source, target, true source vertex of each target vertex (-1: none), and ten true pairs as
+    landmarks.
     """
     with tempfile.TemporaryDirectory() as folder:
-        meshes = [s4a.read_shape(path) for path in unpacked(name, folder)[: n_pairs + 1]]
+        files = files_of(name, folder, given)[: n_pairs + 1]
+        meshes = [s4a.read_shape(path) for path in files]
     for source, target in pairwise(meshes):
         became, row = source["vertex_of_file"].values, target["file_vertex"].values
         known = row < CORRESPONDING.get(name, len(became))
@@ -94,53 +106,82 @@ def embedded_pairs(n_vertices, n_pairs):
         yield source, target, truth, (truth[marks], target["position"].values[marks])
 
 
-def registered(name, n_pairs):
+def markdown(rows, head):
+    """Say a table as documentation has it."""
+    lines = [head, ["---"] * len(head), *rows]
+    say("\n".join(f"| {' | '.join(map(str, line))} |" for line in lines))
+
+
+def table_1(found, names=None):
+    """Say the means over pairs of the metrics of these names, or all."""
+    mean = found.mean("pair")
+    columns = {name: METRICS[name] for name in names or METRICS if name in mean}
+    rows = []
+    for way in mean["way"].values:
+        one = mean.sel(way=way)
+        cells = [
+            "" if np.isnan(one[name].item()) else f"{factor * one[name].item():.{digits}f}"
+            for name, (_, factor, digits) in columns.items()
+        ]
+        rows.append([way, f"{one['block_seconds'].sum().item():.1f}", *cells])
+    heads = [head.removesuffix(" %") for head, *_ in columns.values()]
+    markdown(rows, ["", "CPU s", *heads])
+
+
+def registered(name, n_pairs, given=None):
     """All methods and the peer on registered shapes."""
     rows = []
-    for source, target, truth, marks in registered_pairs(name, n_pairs):
+    for source, target, truth, marks in registered_pairs(name, n_pairs, given):
         found = compare.pair(source, target, truth=truth, landmarks=marks)
         if importlib.util.find_spec("pyFM"):
             with threadpool_limits(1):
                 line = peer(source, target, marks, truth)
-            line = line.expand_dims(pair=1).assign_coords(way="pyFM", block=list(compare.BLOCKS))
+            line = line.expand_dims(pair=1)
+            line = line.assign_coords(way="pyFM (FMAP+ZO)", block=list(compare.BLOCKS))
             found = xr.concat([found, line.assign_coords(pair=found["pair"])], "way")
         rows.append(found)
     found, n = xr.concat(rows, "pair"), source.sizes["vertex"]
     say(
         f"\nTable 1 on registered shapes, {name}: {n_pairs} pairs of {n} vertices, "
-        f"{N_LANDMARKS} true landmarks"
+        f"{N_LANDMARKS} true landmarks\n"
     )
-    say(comparison_table(found))
+    table_1(found, SHOWN)
     figure_3(found)
     verdict(found)
 
 
-def both(pairs, what):
-    """FMAP+ZO at full resolution and RE-MATCH on more pairs.
-
-    Errors, CPU seconds, and the ratios of their means.
-    """
-    rows, found = [], []
+def more(pairs, what):
+    """FMAP+ZO and the three of RE-MATCH on more pairs: errors and seconds, by that of FMAP+ZO."""
+    found = []
     for source, target, truth, marks in pairs:
-        one = compare.pair(
-            source, target, methods=["FMAP+ZO", "RE-MATCH"], truth=truth, landmarks=marks
-        )
-        error, seconds = (
-            100 * one["geodesic_error"].values[:, 0],
-            one["block_seconds"].sum("block").values[:, 0],
-        )
-        found.append([*error, *seconds])
+        one = compare.pair(source, target, methods=COMPARED, truth=truth, landmarks=marks)
+        found.append(one)
+        one = one.isel(pair=0)
+        cells = zip(COMPARED, one["geodesic_error"].values, seconds_of(one).values, strict=True)
+        say("; ".join(f"{way} {100 * error:.3f} % in {s:.1f} s" for way, error, s in cells))
+    found = xr.concat(found, "pair")
+    error, seconds = 100 * found["geodesic_error"], seconds_of(found)
+    say(f"\n{what}: {found.sizes['pair']} pairs of {target.sizes['vertex']} vertices\n")
+    first, rows = COMPARED[0], []
+    for way in COMPARED:
+        one, spent = error.sel(way=way), seconds.sel(way=way)
+        by_pair = one / error.sel(way=first)
         rows.append(
             [
-                str(source.sizes["vertex"]),
-                *(f"{e:.3f}" for e in error),
-                *(f"{s:.1f}" for s in seconds),
+                way,
+                f"{one.mean():.3f}",
+                f"{one.mean() / error.sel(way=first).mean():.3f}",
+                f"{by_pair.min():.2f} to {by_pair.max():.2f}",
+                f"{spent.mean():.1f}",
+                f"{spent.mean() / seconds.sel(way=first).mean():.3f}",
             ]
         )
-    error, other, seconds, others = np.mean(found, axis=0)
-    say(f"\n{what}: error in % of sqrt(area), CPU seconds")
-    say(table(rows, ["vertices", "FMAP+ZO %", "RE-MATCH %", "FMAP+ZO s", "RE-MATCH s"]))
-    say(f"RE-MATCH / FMAP+ZO: {other / error:.3f} of the error, {others / seconds:.3f} of the time")
+    markdown(rows, ["", "error", f"by {first}", "by pair", "CPU s", f"by {first}"])
+
+
+def seconds_of(found):
+    """CPU seconds of all blocks."""
+    return found["block_seconds"].sum("block")
 
 
 def verdict(found):
@@ -151,43 +192,65 @@ def verdict(found):
         for name in METRICS
         if name in mean
     }
-    time_of = dict(zip(mean["way"].values, mean["block_seconds"].sum("block").values, strict=True))
-    five = [way for way in compare.METHODS if way != "RE-MATCH joint"]
+    time_of = dict(zip(mean["way"].values, seconds_of(mean).values, strict=True))
+    five = compare.PAPER_METHODS
     spectral = [way for way in five if way != "kNN"]
-    chamfer, hausdorff = of["chamfer"], of["hausdorff"]
+    low = {name: min(five, key=of[name].get) for name in ("chamfer", "hausdorff")}
+    fastest = min(spectral, key=time_of.get)
     share = time_of["RE-MATCH"] / time_of["FMAP+ZO"]
+    dense = min(time_of["ZO"], time_of["FMAP+ZO"])
     claims = {
-        "kNN has the largest Chamfer distance of the five": max(five, key=chamfer.get) == "kNN",
-        "RE-MATCH has the smallest Chamfer distance of the five": min(five, key=chamfer.get)
+        "kNN has the largest Chamfer distance of the five": max(five, key=of["chamfer"].get)
+        == "kNN",
+        f"RE-MATCH has the smallest Chamfer distance of the five ({low['chamfer']} has)": low[
+            "chamfer"
+        ]
         == "RE-MATCH",
-        "RE-MATCH has the smallest Hausdorff distance of the five": min(five, key=hausdorff.get)
+        f"RE-MATCH has the smallest Hausdorff distance of the five ({low['hausdorff']} has)": low[
+            "hausdorff"
+        ]
         == "RE-MATCH",
-        "RE-MATCH is the fastest of the spectral methods": min(spectral, key=time_of.get)
-        == "RE-MATCH",
+        f"RE-MATCH is the fastest of the spectral methods ({fastest} is)": fastest == "RE-MATCH",
         f"RE-MATCH takes a tenth of the time of FMAP+ZO or less ({share:.2f})": share <= 0.1,
-        "SCALABLE is faster than ZO and FMAP+ZO": time_of["SCALABLE"]
-        < min(time_of["ZO"], time_of["FMAP+ZO"]),
+        "SCALABLE is faster than ZO and FMAP+ZO": time_of["SCALABLE"] < dense,
     }
     if "geodesic_error" in of:
         error = of["geodesic_error"]
-        worse = error["RE-MATCH"] / error["FMAP+ZO"]
+        worse = {way: error[way] / error["FMAP+ZO"] for way in ("RE-MATCH", "RE-MATCH lifted")}
+        by_error = sorted(five, key=error.get)
+        claims["kNN is the farthest from the truth of the five"] = by_error[-1] == "kNN"
+        for way, times in worse.items():
+            claims[f"{way} is as near to the truth as FMAP+ZO, within 5 % ({times:.2f})"] = (
+                times <= 1.05
+            )
         claims |= {
-            "kNN is the farthest from the truth of the five": max(five, key=error.get) == "kNN",
-            f"RE-MATCH is as near to the truth as FMAP+ZO, within 5 % ({worse:.2f})": worse <= 1.05,
-            "joint rounds are nearer to the truth than all five": error["RE-MATCH joint"]
-            < min(error[w] for w in five),
-            "the order by Chamfer distance is the order by the truth": sorted(five, key=chamfer.get)
-            == sorted(five, key=error.get),
+            f"RE-MATCH is the nearest to the truth of the five ({by_error[0]} is)": by_error[0]
+            == "RE-MATCH",
+            "joint rounds are nearer to the truth than all five": error["joint"]
+            < error[by_error[0]],
+            "the order by Chamfer distance is the order by the truth": sorted(
+                five, key=of["chamfer"].get
+            )
+            == by_error,
         }
+    say("")
     for claim, holds in claims.items():
-        say(f"  {'holds' if holds else 'does not hold'}: {claim}")
+        say(f"- {'holds' if holds else 'does not hold'}: {claim}")
+
+
+def blocks_table(names, blocks, seconds):
+    """Say CPU seconds by block, and all."""
+    rows = [
+        [n, *(f"{s:.1f}" for s in (*one, sum(one)))] for n, one in zip(names, seconds, strict=True)
+    ]
+    markdown(rows, ["", *blocks, "all"])
 
 
 def figure_3(found):
-    say(
-        block_table(
-            found["way"].values, found["block"].values, found["block_seconds"].mean("pair").values
-        )
+    """Say the CPU seconds by block."""
+    say("\nCPU seconds by block (Fig. 3):\n")
+    blocks_table(
+        found["way"].values, found["block"].values, found["block_seconds"].mean("pair").values
     )
 
 
@@ -203,19 +266,19 @@ def embedded(n_vertices=20_000):
     found = compare.pairs(source, dict(others), truth={n: np.asarray(t) for n, t in truth.items()})
     say(
         f"\nTable 1 on the embedded collection: 5 pairs of {n_vertices} vertices, "
-        "landmarks as in 4.1"
+        "landmarks as in 4.1\n"
     )
-    say(comparison_table(found))
+    table_1(found)
     figure_3(found)
     verdict(found)
 
 
-def heads():
+def heads(given=None):
     """One real head and five others; no truth.  Every pair is printed when it is done."""
     options = {"k_init": 20, "k": 100, "step": 5}
     rows = []
     with tempfile.TemporaryDirectory() as folder, threadpool_limits(1):
-        first, *others = unpacked("heads", folder)[:6]
+        first, *others = files_of("heads", folder, given)[:6]
         mesh, load = compare.load_mesh(first, "source")
         reference = compare.Spaces(mesh)
         for path in others:
@@ -226,34 +289,58 @@ def heads():
                     reference, target, compare.METHODS, None, begin, None, 300, options
                 )
             )
-            say(f"\nTable 1, {first.stem} and {path.stem}")
-            say(comparison_table(xr.concat(rows[-1:], "pair")))
+            say(f"\nTable 1, {first.stem} and {path.stem}\n")
+            table_1(xr.concat(rows[-1:], "pair"))
             figure_3(xr.concat(rows[-1:], "pair"))
     found = xr.concat(rows, "pair", combine_attrs="drop_conflicts")
-    say("\nTable 1 on real heads: 5 pairs of 130,000 to 160,000 vertices, no truth")
-    say(comparison_table(found))
+    say("\nTable 1 on real heads: 5 pairs of 130,000 to 160,000 vertices, no truth\n")
+    table_1(found)
     figure_3(found)
     verdict(found)
 
 
-def table_2():
-    """Ten real heads."""
-    with tempfile.TemporaryDirectory() as folder:
-        found = compare.collection(unpacked("heads", folder))
+# first maps and Consistent ZoomOut of Table 2
+FIRST = {
+    "landmarks (the paper)": {"preset": "paper"},
+    "landmarks, our rounds": {"init": "landmarks"},
+    "nearest neighbours, our rounds": {},
+}
+
+
+def table_2(given=None):
+    """Ten real heads, with the paper's first maps and with ours."""
     say("\nTable 2 on ten real heads")
-    say(collection_table(found))
-    names = found["shape"].values
-    rows = [
-        [way, *(f"{d:.4f}" for d in found["distance_to_median"].sel(way=way).values)]
-        for way in found["way"].values
-    ]
-    seconds, chamfer = (
-        found["collection_seconds"].sum("block"),
-        found["collection_chamfer"].mean("shape"),
-    )
+    with tempfile.TemporaryDirectory() as folder:
+        shapes = s4a.read_shapes(files_of("heads", folder, given))
+    all_rows, distances, kept = [], [], {}
+    for what, options in FIRST.items():
+        found = kept[what] = compare.collection(shapes, **options)
+        seconds, chamfer = found["collection_seconds"], found["collection_chamfer"].mean("shape")
+        for way in found["way"].values:
+            for how in found["how"].values:
+                spent = seconds.sel(way=way, how=how).drop_sel(block="load and clean").values
+                cells = [f"{s:.1f}" for s in (*spent, spent.sum())]
+                gap = f"{100 * chamfer.sel(way=way, how=how).item():.4f}"
+                shape = found["median_shape"].sel(way=way).item()
+                all_rows.append([way, what, how, gap, *cells, shape])
+            distance = found["distance_to_median"].sel(way=way).values
+            distances.append([way, what, *(f"{d:.4f}" for d in distance)])
+        say(f"\nfirst maps: {what}")
+        verdict_2(found)
+    blocks = [block for block in found["block"].values if block != "load and clean"]
+    say("")
+    head = ["", "first maps", "way up", "Chamfer to the template", *blocks, "all", "median shape"]
+    markdown(all_rows, head)
+    say("\nDistance to the limit shape (eq. 5):\n")
+    markdown(distances, ["", "first maps", *found["shape"].values])
+
+
+def verdict_2(found):
+    """What holds of the paper's claims (5.3)."""
+    seconds = found["collection_seconds"].sum("block")
+    chamfer = found["collection_chamfer"].mean("shape")
     claims = {
-        "both methods have the same median shape": len(set(found["median_shape"].values.tolist()))
-        == 1,
+        "both methods have the same median shape": len(set(found["median_shape"].values)) == 1,
         "ours takes less time than the standard way": bool(
             (seconds.sel(how="ours") < seconds.sel(how="standard")).all()
         ),
@@ -265,23 +352,34 @@ def table_2():
         ),
     }
     for claim, holds in claims.items():
-        say(f"  {'holds' if holds else 'does not hold'}: {claim}")
-    say("\ndistance to the limit shape (eq. 5)\n" + table(rows, ["method", *names]))
+        say(f"- {'holds' if holds else 'does not hold'}: {claim}")
 
+
+PARTS = ("registered", "more", "embedded", "collection", "heads")
 
 if __name__ == "__main__":
-    parts = sys.argv[1:] or ["registered", "both", "embedded", "collection", "heads"]
-    if "registered" in parts and DATA.is_dir():
-        for one, count in SETS.items():
-            registered(one, count)
-    if "both" in parts:
-        if DATA.is_dir():
-            for one in SETS:
-                both(registered_pairs(one, 5), one)
-        both(embedded_pairs(100_000, 2), "embedded collection")
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("parts", nargs="*", metavar="PART", help=", ".join([*PARTS, *SETS]))
+    parser.add_argument("--data", type=Path, help="a folder of meshes for each set")
+    args = parser.parse_args()
+    wrong = set(args.parts) - {*PARTS, *SETS}
+    if wrong:
+        parser.error(f"unknown parts {', '.join(wrong)}")
+    parts = [part for part in args.parts if part in PARTS] or PARTS
+    sets = [name for name in args.parts if name in SETS] or SETS
+    real = args.data is not None or DATA.is_dir()
+    if "registered" in parts and real:
+        for one in sets:
+            registered(one, SETS[one], args.data)
+    if "more" in parts:
+        if real:
+            for one in sets:
+                more(registered_pairs(one, 5, args.data), one)
+        if len(sets) == len(SETS):
+            more(embedded_pairs(100_000, 2), "synthetic brains")
     if "embedded" in parts:
         embedded()
-    if "collection" in parts and DATA.is_dir():
-        table_2()
-    if "heads" in parts and DATA.is_dir():
-        heads()
+    if "collection" in parts and real:
+        table_2(args.data)
+    if "heads" in parts and real:
+        heads(args.data)

@@ -54,19 +54,38 @@ def test_every_method_has_every_metric_and_its_time_by_block(found):
     assert (spent.sel(block="sample").sel(way=["SCALABLE", "RE-MATCH"]) > 0).all()
     assert (spent.sel(block=["basis", "map", "refine"]).sel(way="FMAP+ZO") > 0).all()
     assert (spent.sel(block="align") > 0).all()
-    assert spent.sel(way="RE-MATCH joint").sum() > spent.sel(way="RE-MATCH").sum()
+    assert spent.sel(way="joint").sum() > spent.sel(way="RE-MATCH").sum()
 
 
 def test_joint_rounds_are_nearer_to_the_truth_than_every_other_method(found):
     error = found["straight_error"].mean("pair")
-    assert error.sel(way="RE-MATCH joint") < 0.9 * error.drop_sel(way="RE-MATCH joint").min()
+    assert error.sel(way="joint") < 0.9 * error.drop_sel(way="joint").min()
+
+
+def test_rematch_is_the_papers_with_and_without_the_preset(three_brains):
+    source, targets, _ = three_brains
+    target = next(iter(targets.values()))
+    two = {"methods": ["RE-MATCH", "RE-MATCH lifted"]}
+    ours = compare.pair(source, target, **two, **SMALL)
+    paper = compare.pair(source, target, preset="paper", methods=["RE-MATCH"], **SMALL)
+    assert paper["chamfer"].item() == ours["chamfer"].sel(way="RE-MATCH").item()
+    assert paper["chamfer"].item() != ours["chamfer"].sel(way="RE-MATCH lifted").item()
+
+
+def test_a_method_by_its_old_name_is_the_method_and_a_warning(three_brains):
+    source, targets, _ = three_brains
+    small = SMALL | {"n_coarse": 200, "k": 20}
+    with pytest.warns(DeprecationWarning, match="'RE-MATCH joint' is now 'joint'") as told:
+        found = compare.pairs(source, targets, methods=["RE-MATCH joint"], **small)
+    assert found["way"].values.tolist() == ["joint"]
+    assert told[0].filename == __file__
 
 
 def test_every_method_finds_a_shape_in_itself(meshes):
     mesh = meshes["brain_01"]
     same = np.arange(mesh.sizes["vertex"])
     found = compare.pair(mesh, mesh, truth=same, **SMALL)
-    exact = [way for way in compare.METHODS if way not in ("RE-MATCH", "SCALABLE")]
+    exact = [way for way in compare.METHODS if way not in ("RE-MATCH lifted", "SCALABLE")]
     assert (found["geodesic_error"].sel(way=exact) == 0).all()
     assert (found["geodesic_error"] < 0.005).all()
     assert (found["bijectivity"].sel(way=exact) == 0).all()
@@ -121,6 +140,12 @@ def test_what_is_wrong_is_said(three_brains):
     target = next(iter(targets.values()))
     with pytest.raises(ValueError, match="methods must be some of kNN"):
         compare.pair(source, target, methods=["ICP"])
+    with pytest.raises(ValueError, match=r"the methods kNN.*found RE-MATCH lifted, joint"):
+        compare.pair(source, target, methods=["kNN", *compare.METHODS[-2:]], preset="paper")
+    with pytest.raises(ValueError, match="preset 'paper' sets sharpen=0; found sharpen=1"):
+        compare.pair(source, target, preset="paper", sharpen=1)
+    with pytest.raises(ValueError, match="init must be 'landmarks' or 'descriptors'"):
+        compare.pair(source, target, init="dense")
     with pytest.raises(ValueError, match="landmarks need two arrays"):
         compare.pair(source, target, landmarks=(np.arange(4), np.arange(5)), methods=["kNN"])
     with pytest.raises(ValueError, match="all paths or all Datasets"):

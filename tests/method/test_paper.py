@@ -266,8 +266,8 @@ def test_consistent_zoomout_is_that_of_pyfm_where_weights_are_equal(paper):
 def test_table_1_and_a_pair_have_the_same_rematch(meshes):
     source, target, *_ = meshes.values()
     small = {"n_coarse": 400, "k": 24, "k_init": 10}
-    ends = (Spaces(mesh, 400, 24, 0, lift=False) for mesh in (source, target))
-    row = Pair(*ends, k_init=10, k=24, lift=False, sharpen=0, init="landmarks").run("RE-MATCH")
+    row = Pair(*(Spaces(mesh, 400, 24) for mesh in (source, target)), k_init=10, k=24)
+    row = row.run("RE-MATCH")
     found = s4a.match_pair(source, target, preset="paper", **small)
     assert np.array_equal(found["match"], row.match)
     assert np.array_equal(found["fmap_fitted"], found["fmap_initial"])  # no step ahead in 4.1

@@ -180,10 +180,8 @@ def test_the_commands_take_the_preset_and_refuse_options_beside_a_study(
     assert "is a study, whose options are taken: no --k, --preset" in capsys.readouterr().err
     assert main([*to[:2], target, *to[2:], "--preset", "paper", "--sharpen", "1"]) == 2
     assert "preset 'paper' sets sharpen=0; found sharpen=1" in capsys.readouterr().err
-    assert (
-        main(["compare", source, target, "--preset", "paper", "--methods", "RE-MATCH joint"]) == 2
-    )
-    assert "preset 'paper' has no joint rounds" in capsys.readouterr().err
+    assert main(["compare", source, target, "--preset", "paper", "--methods", "joint"]) == 2
+    assert "preset 'paper' has the methods kNN, ZO, FMAP+ZO" in capsys.readouterr().err
 
 
 def test_table_2_with_the_preset_has_the_first_maps_of_landmarks(brains, monkeypatch):
