@@ -3,6 +3,7 @@
 import os
 import random
 import shutil
+import zlib
 
 import h5py
 import numpy as np
@@ -137,6 +138,77 @@ def test_costs_of_another_form_are_told_and_counted_as_none(tmp_path, caplog, co
     (tmp_path / "costs.json").write_bytes(content)
     assert read_costs(tmp_path / "costs.json") == {}
     assert "times of earlier runs are not counted" in caplog.text
+
+
+# ---- variables that are packed as one whole
+
+
+def pack(data, path, **how):
+    """Write a Dataset as xarray packs: every variable that has numbers in one chunk."""
+    encoding = {
+        name: {"zlib": True, "complevel": 9, "chunksizes": data[name].shape} | how
+        for name in data.variables
+        if data[name].dtype.kind in "iuf"
+    }
+    data.to_netcdf(path, engine=store.ENGINE, encoding=encoding)
+
+
+def own_bytes(path, name, change):
+    """Put other bytes, of the same number, in the place of those of a packed variable."""
+    with h5py.File(path) as file:
+        chunk = file[name].id.get_chunk_info(0)
+    data = bytearray(path.read_bytes())
+    place = slice(chunk.byte_offset, chunk.byte_offset + chunk.size)
+    changed = change(bytes(data[place]))
+    data[place] = changed.ljust(chunk.size, b"\0")
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("shuffle", [True, False])
+def test_variables_packed_as_one_whole_are_read_as_they_were(file, tmp_path, shuffle):
+    whole, path = store.read(file), tmp_path / "packed.nc"
+    pack(whole, path, shuffle=shuffle)
+    with h5py.File(path) as inside:
+        assert inside["position"].compression == "gzip"
+        assert inside["position"].shuffle == shuffle
+        assert inside["position"].id.get_chunk_info(0).size < whole["position"].nbytes
+    xr.testing.assert_identical(store.read(path), whole)
+    position, corners = store.arrays(path, "position", "corner_vertex")
+    np.testing.assert_array_equal(position, whole["position"])
+    np.testing.assert_array_equal(corners, whole["corner_vertex"])
+
+
+def test_a_variable_that_says_it_unpacks_to_more_than_deflate_can_is_refused(tmp_path):
+    path = tmp_path / "a.nc"
+    for n, refused in ((1_000_000, False), (2_000_000, True)):
+        with h5py.File(path, "w") as file:
+            stored = file.create_dataset("zeros", (n,), "u1", chunks=(n,), compression="gzip")
+            stored.id.write_direct_chunk((0,), zlib.compress(bytes(1_000_000), 9))
+            assert (n > 1032 * stored.id.get_chunk_info(0).size) == refused
+        if not refused:
+            assert store.arrays(path, "zeros")[0].shape == (n,)
+            continue
+        for read in (store.open_file, store.read, lambda path: store.arrays(path, "zeros")):
+            with pytest.raises(OSError, match=r"a\.nc cannot be read \(zeros has not all values"):
+                read(path)
+
+
+@pytest.mark.parametrize("n", [499, 501, 0], ids=["less", "more", "none"])
+@pytest.mark.parametrize("shuffle", [True, False])
+def test_a_variable_that_unpacks_to_another_size_is_refused(file, tmp_path, n, shuffle):
+    path = tmp_path / "packed.nc"
+    pack(store.read(file), path, shuffle=shuffle)
+    own_bytes(path, "position", lambda _: zlib.compress(bytes(n * 3 * 8)))
+    with pytest.raises(OSError, match=r"packed\.nc cannot be read \(it unpacks to another size"):
+        store.read(path)
+
+
+def test_a_packed_variable_of_bytes_that_cannot_be_unpacked_is_refused(file, tmp_path):
+    path = tmp_path / "packed.nc"
+    pack(store.read(file), path)
+    own_bytes(path, "position", lambda stored: bytes(len(stored)))
+    with pytest.raises(OSError, match=r"packed\.nc cannot be read .*decompressing"):
+        store.read(path)
 
 
 # ---- files of strangers
