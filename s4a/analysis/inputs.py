@@ -21,6 +21,7 @@ log = logging.getLogger(__name__)
 Values = np.ndarray | Sequence | dict | str
 
 DATE = re.compile(r"\d{4}-\d\d?-\d\d?.*|\d{4}/\d\d?/\d\d?|\d\d?[./-]\d\d?[./-](\d\d){1,2}")
+IDENTIFIER = re.compile(r"(\b|_)(id|nr|code)'?$", re.IGNORECASE)  # how names of columns end
 
 
 class Sample(NamedTuple):
@@ -317,14 +318,15 @@ def columns_of(covariates: dict[str, np.ndarray]) -> tuple[np.ndarray | None, st
     """Columns of numbers ``(s, c)`` of covariates, text as indicators, and the same in words.
 
     A column that is constant, or a combination of others, changes no test and is named in a
-    warning.
+    warning; so is one that numbers the shapes.
 
     Examples
     --------
     >>> import numpy as np
     >>> from s4a.analysis.inputs import columns_of
     >>> site = np.array(["Bern", "Basel", "Chur", "Chur", "Bern", "Basel"])
-    >>> Z, words = columns_of({"covariate 'age'": np.arange(6), "covariate 'site'": site})
+    >>> age = np.array([31, 40, 22, 35, 31, 58])
+    >>> Z, words = columns_of({"covariate 'age'": age, "covariate 'site'": site})
     >>> Z.shape, words
     ((6, 3), "covariate 'age', covariate 'site' as indicators of Bern, Chur against Basel")
     """
@@ -346,7 +348,33 @@ def columns_of(covariates: dict[str, np.ndarray]) -> tuple[np.ndarray | None, st
     Z = np.column_stack(columns)
     for line in redundant(Z, names):
         log.warning("%s", line)
+    for name, values in zip(names, Z.T, strict=True):
+        if numbers_shapes(name, values):
+            log.warning(
+                "%s has another whole number for each shape, %.0f to %.0f: leave it out if it "
+                "numbers the shapes, as it then measures nothing of them",
+                name,
+                values.min(),
+                values.max(),
+            )
     return Z, ", ".join(words)
+
+
+def numbers_shapes(name: str, values: np.ndarray) -> bool:
+    """Whether a column seems to number the shapes, and to measure nothing of them.
+
+    Its whole numbers all differ, and have no gaps or the name of identifiers.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.analysis.inputs import numbers_shapes
+    >>> numbers_shapes("order", np.array([3, 1, 2, 4])), numbers_shapes("age", np.array([31, 40]))
+    (True, False)
+    """
+    if (values % 1).any() or len(np.unique(values)) < len(values):
+        return False
+    return bool(np.ptp(values) == len(values) - 1 or IDENTIFIER.search(name))
 
 
 def _indicators_of(values, name):

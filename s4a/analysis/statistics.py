@@ -489,10 +489,7 @@ def classify(
     >>> classes["predicted"].sizes["shape"], classes.attrs["chance"]
     (6, 0.5)
     """
-    if not 0 <= n_permutations <= MOST_PERMUTATIONS:
-        raise ValueError(
-            f"n_permutations needs a number from 0 to {MOST_PERMUTATIONS}, found {n_permutations}"
-        )
+    _check_permutations(n_permutations)
     if n_folds < 2:
         raise ValueError(f"n_folds needs a number from 2, found {n_folds}")
     sample = sample_of(study, group, "group")
@@ -513,10 +510,8 @@ def classify(
         balanced_accuracy_score(group[left_out], predicted[left_out])
         for _, left_out in folds.split(coordinates, group)
     ]
-    p = 1.0
-    if n_permutations:
-        options = {"cv": folds, "scoring": "balanced_accuracy", "n_permutations": n_permutations}
-        *_, p = permutation_test_score(steps, coordinates, group, random_state=seed, **options)
+    options = {"cv": folds, "scoring": "balanced_accuracy", "n_permutations": n_permutations}
+    *_, p = permutation_test_score(steps, coordinates, group, random_state=seed, **options)
     attrs = {
         "permutations": n_permutations,
         "smallest_p": smallest_p(n_permutations, indicators(group)[1]),
@@ -534,12 +529,14 @@ def classify(
 # what several of them share
 
 
+def _check_permutations(n):
+    if not 1 <= n <= MOST_PERMUTATIONS:
+        raise ValueError(f"n_permutations needs a number from 1 to {MOST_PERMUTATIONS}, found {n}")
+
+
 def _options(n_permutations, variances, seed):
     """The options of the permutation tests, checked before anything is computed."""
-    if not 1 <= n_permutations <= MOST_PERMUTATIONS:
-        raise ValueError(
-            f"n_permutations needs a number from 1 to {MOST_PERMUTATIONS}, found {n_permutations}"
-        )
+    _check_permutations(n_permutations)
     if variances not in VARIANCES:
         raise ValueError(f"variances must be 'equal' or 'unequal', found {variances!r}")
     return {"n_permutations": n_permutations, "variances": variances, "seed": seed}

@@ -176,14 +176,47 @@ def _colour_table(file):
     return row_of_colour
 
 
-def table_rows(text: str) -> list[list[str]]:
-    """Rows of a table separated by commas, semicolons, tabs or spaces, without comments."""
-    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
+def table_rows(text: str) -> dict[int, list[str]]:
+    """Rows of a table separated by commas, semicolons, tabs or spaces, by the lines they end in.
+
+    Empty lines and comments, which begin with ``#``, are none.
+
+    Examples
+    --------
+    >>> from s4a.input.annotations import table_rows
+    >>> table_rows("name;x\\n# a comment\\na;1")
+    {1: ['name', 'x'], 3: ['a', '1']}
+    """
+    lines = {
+        number: line
+        for number, line in enumerate(text.splitlines(), 1)
+        if line.strip() and not line.startswith("#")
+    }
     if not lines:
         raise ValueError("the file is empty")
-    mark = next((mark for mark in ",;\t" if mark in lines[0]), " ")
-    rows = csv.reader(lines, delimiter=mark, skipinitialspace=True)
-    return [[cell.strip() for cell in row] for row in rows]
+    numbers, texts = list(lines), list(lines.values())
+    mark = next((mark for mark in ",;\t" if mark in texts[0]), " ")
+    rows = {}
+    for row in (reader := csv.reader(texts, delimiter=mark, skipinitialspace=True)):
+        rows[numbers[reader.line_num - 1]] = [cell.strip() for cell in row]
+    return rows
+
+
+def check_cells(rows: dict[int, list[str]], n: int, least: int) -> None:
+    """ValueError unless every row has from `least` to `n` cells; more, where those are empty."""
+    for line, row in rows.items():
+        if len(row) < least or any(row[n:]):
+            raise ValueError(
+                f"line {line} needs {n} cells as the first row has, found {len(row)}: "
+                f"{', '.join(row)[:60]!r}"
+            )
+
+
+def number_of(cell: str, line: int) -> float:
+    """The number in a cell; ValueError with its line where there is none."""
+    if not is_number(cell):
+        raise ValueError(f"line {line} needs a number where it has {cell[:40]!r}")
+    return float(cell)
 
 
 def short(texts: list[str]) -> list[str]:
@@ -205,20 +238,23 @@ def is_number(text: str) -> bool:
 
 def _text_labels(data):
     rows = table_rows(text_of(data))
-    head = [cell.lower() for cell in rows[0]]
+    first = next(iter(rows.values()))
+    head = [cell.lower() for cell in first]
     if "label" in head:
-        values = [row[head.index("label")] for row in rows[1:]]
-    elif len(head) == 1:
-        values = [row[0] for row in rows]
-    else:
-        raise ValueError(f"a column 'label' needed, found {', '.join(rows[0])}")
+        del rows[next(iter(rows))]
+    elif len(head) > 1:
+        raise ValueError(f"a column 'label' needed, found {', '.join(first)}")
+    at = head.index("label") if "label" in head else 0
+    of_vertex = head.index("vertex") if "label" in head and "vertex" in head else None
+    check_cells(rows, len(head), 1 + max(at, of_vertex or 0))
+    values = [row[at] for row in rows.values()]
     labels = (
         np.array([float(v) for v in values])
         if all(map(is_number, values))
         else np.array(short(values))
     )
-    if "label" in head and "vertex" in head:
-        vertex = np.array([row[head.index("vertex")] for row in rows[1:]]).astype(int)
+    if of_vertex is not None:
+        vertex = np.array([number_of(row[of_vertex], line) for line, row in rows.items()])
         if not np.array_equal(np.sort(vertex), np.arange(len(vertex))):
             raise ValueError(
                 f"the column 'vertex' needs every index from 0 to {len(vertex) - 1} once"
@@ -310,27 +346,27 @@ def _meshlab_points(text):
 
 def _table_points(text):
     rows = table_rows(text)
-    head = [cell.lower() for cell in rows[0]]
+    first = next(iter(rows.values()))
+    head = [cell.lower() for cell in first]
+    name, curve, closed = None, None, None
     if all(axis in head for axis in "xyz"):
         x = [head.index(axis) for axis in "xyz"]
         name = next((head.index(n) for n in ("name", "label", "landmark") if n in head), None)
         curve, closed = (head.index(n) if n in head else None for n in ("curve", "closed"))
-        rows = rows[1:]
-    elif len(head) in (3, 4) and all(map(is_number, rows[0][-3:])):
-        x, name, curve, closed = (
-            range(len(head) - 3, len(head)),
-            0 if len(head) == 4 else None,
-            None,
-            None,
-        )
+        del rows[next(iter(rows))]
+    elif len(head) in (3, 4) and all(map(is_number, first[-3:])):
+        x = list(range(len(head) - 3, len(head)))
+        name = 0 if len(head) == 4 else None
     else:
-        raise ValueError(f"the columns name, x, y and z needed, found {', '.join(rows[0])}")
+        raise ValueError(f"the columns name, x, y and z needed, found {', '.join(first)}")
+    used = [i for i in (*x, name, curve, closed) if i is not None]
+    check_cells(rows, len(head), 1 + max(used))
     names, curves, rings = (
-        ["" if i is None else row[i] for row in rows] for i in (name, curve, closed)
+        ["" if i is None else row[i] for row in rows.values()] for i in (name, curve, closed)
     )
     return (
         names,
-        [[row[i] for i in x] for row in rows],
+        [[number_of(row[i], line) for i in x] for line, row in rows.items()],
         "",
         curves,
         [c.lower() in ("1", "true", "yes") for c in rings],

@@ -24,9 +24,10 @@ PERSON = re.compile(r"(subject|participant|patient|person)([ _-]?(id|nr|no))?", 
 
 def _head_and_rows(path):
     try:
-        head, *rows = table_rows(text_of(content(path)))
+        rows = table_rows(text_of(content(path)))
     except (ValueError, csv.Error) as error:
         raise ValueError(f"{shown(path)} cannot be read as a table: {shown(error)}") from error
+    head = rows.pop(next(iter(rows)))
     if "shape" not in head:
         raise ValueError(
             f"{path}: a column 'shape' with the names or files of the shapes needed; found {head}"
@@ -36,13 +37,13 @@ def _head_and_rows(path):
         raise ValueError(
             f"{path}: columns need names of their own without '/'; found {wrong[0]!r} in {head}"
         )
-    ragged = [(i, row) for i, row in enumerate(rows, 2) if len(row) != len(head)]
+    ragged = [(line, row) for line, row in rows.items() if len(row) != len(head)]
     if ragged:
-        number, row = ragged[0]
+        line, row = ragged[0]
         raise ValueError(
-            f"{path}: {len(head)} cells in every row needed; row {number} has {len(row)}"
+            f"{path}: {len(head)} cells in every row needed; line {line} has {len(row)}"
         )
-    return head, rows
+    return head, list(rows.values())
 
 
 def _shape_of(cell, names):

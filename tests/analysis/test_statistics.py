@@ -393,6 +393,23 @@ def test_what_becomes_of_the_covariates_is_told(twelve, caplog):
     )
 
 
+def test_a_covariate_that_numbers_the_shapes_is_told(twelve, caplog):
+    study, group = twelve
+    rng = np.random.default_rng(0)
+    given = {
+        "order": 1 + rng.permutation(12),
+        "Subject_ID": 1000 + 7 * np.arange(12),
+        "age": [31, 44, 52, 23, 38, 61, 47, 35, 29, 58, 42, 66],
+        "score": np.arange(12) ** 2 / 7,
+        "site id": [1, 2, 3] * 4,
+    }
+    statistics.group_test(study, group, covariates=given, n_permutations=9)
+    words = " has another whole number"
+    told = [line.partition(words)[0] for line in caplog.messages if words in line]
+    assert told == ["covariate 'order'", "covariate 'Subject_ID'"]
+    assert "for each shape, 1000 to 1077: leave it out if it numbers the shapes" in caplog.text
+
+
 @pytest.mark.parametrize("gap", ["NA", "n/a", "-", "", "nan", None, float("nan")])
 def test_a_missing_text_is_no_group(gap, twelve, caplog):
     study, group = twelve
@@ -428,7 +445,7 @@ def test_a_test_that_can_find_nothing_says_so(twelve, caplog):
 
 @pytest.mark.parametrize("n", [-1, 0, 10**22])
 def test_a_number_of_permutations_that_makes_no_test_is_refused(n, twelve):
-    for test in (statistics.group_test, statistics.group_map):
+    for test in (statistics.group_test, statistics.group_map, statistics.classify):
         with pytest.raises(ValueError, match=f"a number from 1 to 10000000, found {n}"):
             test(*twelve, n_permutations=n)
 
@@ -512,12 +529,12 @@ def test_planted_groups_are_classified_and_shuffled_ones_are_not(planted):
     found = statistics.classify(study, group, n_permutations=19)
     assert found.attrs["balanced_accuracy"] > 0.85
     assert found["p_value"] == pytest.approx(0.05)
-    svm = statistics.classify(study, "group", SVC(), n_folds=3, n_permutations=0)
+    svm = statistics.classify(study, "group", SVC(), n_folds=3, n_permutations=1)
     assert svm.sizes["fold"] == 3
     assert svm.attrs["balanced_accuracy"] > 0.8
     shuffled = [np.random.default_rng(seed).permutation(group) for seed in range(10)]
     by_chance = [
-        statistics.classify(study, g, n_permutations=0).attrs["balanced_accuracy"] for g in shuffled
+        statistics.classify(study, g, n_permutations=1).attrs["balanced_accuracy"] for g in shuffled
     ]
     assert 0.35 < np.mean(by_chance) < 0.6
 

@@ -335,6 +335,25 @@ PROOFS = [
         "test_a_covariate_of_no_use_is_refused_with_what_to_do",
     ),
     (
+        "a covariate that numbers the shapes: whole numbers that all differ and have no gaps, or "
+        "the name of identifiers",
+        "used as it is, with a warning",
+        STATISTICS,
+        "test_a_covariate_that_numbers_the_shapes_is_told",
+    ),
+    (
+        "a row of labels or landmarks with too few cells, too many, or a word for a number",
+        "error with file and line",
+        TRANSFER,
+        "test_a_row_of_landmarks_that_is_none_is_named_with_its_line",
+    ),
+    (
+        "a packed variable of a study that unpacks to more or less than it says",
+        "refused with the file, before memory is asked for",
+        SEAL,
+        "test_a_variable_that_says_it_unpacks_to_more_than_deflate_can_is_refused",
+    ),
+    (
         "covariates that are constant or a linear combination of others",
         "the same test as without them; warned, with the names",
         STATISTICS,

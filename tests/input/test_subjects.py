@@ -86,7 +86,7 @@ def test_a_person_of_several_shapes_is_named(tmp_path, caplog):
         ("shape,age\na,1\nb,2\nc.ply,3\n", "no shape is called 'c.ply'"),
         ("shape,age\na,1\nA,2\n", "no shape is called 'A'; no row for b"),
         ("shape,age\na,1\nb,2\na,3\n", "found two for 'a'"),
-        ("shape,age\na,1\nb\n", "2 cells in every row needed; row 3 has 1"),
+        ("shape,age\n# b is odd\n\na,1\nb\n", "2 cells in every row needed; line 5 has 1"),
         ("shape,a/b\na,1\nb,2\n", "without '/'; found 'a/b'"),
         ("shape,age,age\na,1,2\nb,1,2\n", "found 'age'"),
         ("shape\na\nb\n", "a column beside 'shape' needed"),
