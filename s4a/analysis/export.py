@@ -4,6 +4,7 @@ import csv
 import json
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -141,6 +142,7 @@ def write_training_set(
     source: str | xr.Dataset | None = None,
     test_share: float = 0.2,
     seed: int = 0,
+    **options: Any,
 ) -> dict[str, list[str]]:
     """Write a training set for learners of segmentations and key-points, with its split.
 
@@ -158,6 +160,8 @@ def write_training_set(
         Of the shapes, rounded up.
     seed : int
         Of the split.
+    **options
+        By which an external source is matched, see :func:`s4a.transfer_labels`.
 
     Returns
     -------
@@ -192,7 +196,7 @@ def write_training_set(
             f"test_share needs a share of {len(names)} shapes that leaves some on both sides: "
             f"{test_share}"
         )
-    where = {"source": source, "targets": names}
+    where = {"source": source, "targets": names} | options
     carried = {}  # before anything is written: it may fail
     if label is not None:
         carried["labels"] = transfer_labels(study, label, **where)

@@ -151,8 +151,8 @@ def _routes(study: xr.DataTree, name: str) -> tuple[list[Route], list[Route]]:
     return down, up
 
 
-def _routes_from_outside(study: xr.DataTree, mesh: xr.Dataset) -> list[Route]:
-    """Routes from an external mesh to the study's template, by the options of the study."""
+def _routes_from_outside(study: xr.DataTree, mesh: xr.Dataset, given: dict) -> list[Route]:
+    """Routes from an external mesh to the study's template, by its options and those given."""
     name = study["registration"].attrs["template"]
     if "coarse" not in study.children:
         raise ValueError(
@@ -160,8 +160,12 @@ def _routes_from_outside(study: xr.DataTree, mesh: xr.Dataset) -> list[Route]:
             "/coarse; this study of pairs has none: give one of its shapes"
         )
     template = study["original"][name].to_dataset().load()
-    options = Options.from_report(study)
-    inside = options.shape(template, study["coarse"][name].to_dataset().load())
+    own = Options.from_report(study)
+    options = pair_options(given, own)
+    if options.of_low_resolution == own.of_low_resolution:
+        inside = options.shape(template, study["coarse"][name].to_dataset().load())
+    else:
+        inside = _shape_of(template, options)
     outside = _shape_of(mesh, options)
     forth, back = _match_both(inside, outside, options)
     routes: list[Route] = [[(link(mesh, template, forth), "down")]]
@@ -174,14 +178,24 @@ Targets = Iterator[tuple[str, xr.Dataset, list[Route]]]
 
 
 def plan(
-    study: xr.DataTree, source: str | xr.Dataset | None, targets: list[str] | None
+    study: xr.DataTree,
+    source: str | xr.Dataset | None,
+    targets: list[str] | None,
+    options: dict[str, Any] | None = None,
 ) -> tuple[xr.Dataset, Targets]:
     """The mesh where the transfer begins, and an iterator of (target, its mesh, routes to it).
+
+    Parameters
+    ----------
+    study, source, targets : see :func:`transfer_labels`
+    options : dict, optional
+        Of a pair, by which an external source is matched, beside those of the study.
 
     Raises
     ------
     ValueError
-        When the study has no registration, or a shape is not in it.
+        When the study has no registration, a shape is not in it, or there are options and nothing
+        is matched.
     """
     registration = all_registered(study)
     template = registration.attrs["template"]
@@ -197,7 +211,13 @@ def plan(
         )
     if isinstance(source, xr.Dataset):
         require(source, "position", "corner_vertex", what="source")
-        mesh, first = source, _routes_from_outside(study, source)
+        mesh, first = source, _routes_from_outside(study, source, options or {})
+    elif options:
+        raise ValueError(
+            f"options {', '.join(options)} need a source that is none of the shapes, which is "
+            f"matched to the template; found the shape {source!r}, which is registered: leave "
+            "them out"
+        )
     else:
         mesh, first = study["original"][source].to_dataset(), _routes(study, source)[1]
 
@@ -216,6 +236,7 @@ def transfer_labels(
     source: str | xr.Dataset | None = None,
     targets: list[str] | None = None,
     votes: bool = False,
+    **options: Any,
 ) -> xr.DataTree:
     """Labels of one mesh on every shape of a registered study (6.2, Fig. 6).
 
@@ -233,6 +254,9 @@ def transfer_labels(
         All other shapes by default.
     votes : bool
         Whether the share of every label is given too.
+    **options
+        Of an external source alone: those of :func:`register_pairs`, ``preset`` among them, in the
+        place of the study's.
 
     Returns
     -------
@@ -244,7 +268,8 @@ def transfer_labels(
     Raises
     ------
     ValueError
-        When the labels do not fit the source, or a shape is not in the study.
+        When the labels do not fit the source, a shape is not in the study, or an option is given
+        where nothing is matched, is outside its range or contradicts the preset.
 
     Examples
     --------
@@ -257,7 +282,7 @@ def transfer_labels(
     >>> bool((carried["brain_02/label"].values == true).mean() > 0.5)
     True
     """
-    mesh, each = plan(study, source, targets)
+    mesh, each = plan(study, source, targets, options)
     label = _per_vertex(label, mesh, "label")
     carried = {}
     for name, _, routes in each:
@@ -278,12 +303,13 @@ def transfer_scalars(
     *,
     source: str | xr.Dataset | None = None,
     targets: list[str] | None = None,
+    **options: Any,
 ) -> xr.DataTree:
     """A scalar field of one mesh on every shape of a registered study, linear inside triangles.
 
     Parameters
     ----------
-    study, source, targets : see :func:`transfer_labels`
+    study, source, targets, **options : see :func:`transfer_labels`
     field : array_like (vertex,)
         In any unit; where it is NaN only the other corners of a triangle count.
 
@@ -304,7 +330,7 @@ def transfer_scalars(
     >>> bool(np.allclose(carried["brain_02/field"], 1))
     True
     """
-    mesh, each = plan(study, source, targets)
+    mesh, each = plan(study, source, targets, options)
     field = _per_vertex(field, mesh, "field").astype(float)
     known = np.isfinite(field).astype(float)
     carried = {}
@@ -334,6 +360,7 @@ def transfer_landmarks(
     source: str | xr.Dataset | None = None,
     targets: list[str] | None = None,
     farthest: float = FARTHEST_LANDMARK,
+    **options: Any,
 ) -> xr.DataTree:
     """Landmarks of one mesh on every shape of a registered study, inside triangles (6.2, Fig. 7).
 
@@ -343,7 +370,7 @@ def transfer_landmarks(
 
     Parameters
     ----------
-    study, source, targets : see :func:`transfer_labels`
+    study, source, targets, **options : see :func:`transfer_labels`
     landmarks, farthest : see :func:`s4a.analysis.landmarks.locate`
 
     Returns
@@ -358,7 +385,8 @@ def transfer_landmarks(
     Raises
     ------
     ValueError
-        When a landmark is not on the source, or a shape is not in the study.
+        When a landmark is not on the source, a shape is not in the study, or an option does not
+        fit, as in :func:`transfer_labels`.
 
     Examples
     --------
@@ -372,7 +400,7 @@ def transfer_landmarks(
     >>> carried["brain_02/landmark_position"].dims
     ('landmark', 'xyz')
     """
-    mesh, each = plan(study, source, targets)
+    mesh, each = plan(study, source, targets, options)
     marked = locate(landmarks, mesh, farthest=farthest)
     if "landmark_curve" in landmarks:
         marked = trace_curves(marked, mesh)

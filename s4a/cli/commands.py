@@ -48,7 +48,7 @@ from s4a.study.store import ENGINE
 from s4a.study.tree import left_out, open_study
 from s4a.study.verify import verify as look_through
 
-PAIRS = (*PAIR, "both")  # options of `s4a transfer` between files
+PAIRS = (*PAIR, "both")  # options of `s4a transfer`
 
 
 def check(args: Namespace) -> int:
@@ -247,20 +247,17 @@ def transfer(args: Namespace) -> int:
     excluded = []
     given = {name: getattr(args, name) for name in PAIRS if getattr(args, name) is not None}
     if len(args.targets) == 1 and (Path(args.targets[0]) / "registration.nc").is_file():
-        if given:
-            flags = ", ".join("--" + name.replace("_", "-") for name in given)
-            raise ValueError(f"{args.targets[0]} is a study, whose options are taken: no {flags}")
         study = open_study(args.targets[0])
     else:
         study, excluded = registered_pairs(source, args, given)
-        source = None  # it is the template now
+        source, given = None, {}  # it is the template now, and matched
     out = new_folder(args.out)
     labels: Mapping = {}  # name of a target -> node
     points: Mapping = {}
     if label is not None:
-        labels = travel.transfer_labels(study, label, source=source).children
+        labels = travel.transfer_labels(study, label, source=source, **given).children
     if landmarks is not None:
-        points = travel.transfer_landmarks(study, landmarks, source=source).children
+        points = travel.transfer_landmarks(study, landmarks, source=source, **given).children
     write(tables.table(transferred_rows(study, labels, points, out), tables.TRANSFERRED))
     return 1 if excluded else 0
 

@@ -192,7 +192,7 @@ def _insert(add):
 
 def _transfer(add):
     add("source", metavar="SOURCE", help="mesh file that the labels and landmarks belong to")
-    text = "mesh files, folders or globs; or one study folder, whose options are taken"
+    text = "mesh files, folders or globs; or one study folder, whose options hold unless given"
     add("targets", nargs="+", metavar="TARGET", help=text)
     text = "NPY, NPZ (FILE:NAME), CSV, GIFTI label or FreeSurfer annot, also .gz"
     add("--labels", metavar="FILE", help=text)

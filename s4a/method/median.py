@@ -6,8 +6,14 @@ import xarray as xr
 from s4a.method.pca import gram_pca
 from s4a.schema import dataset, require
 
-# Power of the latent eigenvalues by which each norm of eq. 5 weighs fine detail less.
-NORMS = {"h2": 1.0, "h1": 0.5, "frobenius": 0.0}
+# |(Lambda^0)^a (D - I) (Lambda^0)^-b|_F: the powers a and b of each reading of eq. 5's norm
+NORMS = {
+    "h2": (0.0, 1.0),
+    "h1": (0.0, 0.5),
+    "frobenius": (0.0, 0.0),
+    "h2_image": (1.0, 0.0),
+    "h2_both": (1.0, 1.0),
+}
 
 
 def area_differences(Y: np.ndarray) -> np.ndarray:
@@ -33,7 +39,10 @@ def conformal_differences(
 
 
 def inverse(latent_eigenvalue: np.ndarray, power: float = 1.0) -> np.ndarray:
-    """Diagonal ``(m,)`` of ((Lambda^0)^+)^power; constant modes map to 0."""
+    """Diagonal ``(m,)`` of ((Lambda^0)^+)^power, whose powers may be negative.
+
+    Constant modes map to 0.
+    """
     constant = constant_modes(latent_eigenvalue)
     return np.where(constant, 0.0, np.where(constant, 1.0, latent_eigenvalue) ** -power)
 
@@ -50,14 +59,19 @@ def distance_to_identity(
 ) -> np.ndarray:
     """E(M_i) = |D_i - I| of eq. 5 ``(n,)``.
 
-    The paper writes the norm of H_0^2 and does not define it.  ``"h2"`` is our reading: the
-    Hilbert-Schmidt norm of D - I as an operator H^2 -> L^2, |(D - I) (Lambda^0)^+|_F, in which fine
-    detail weighs less.  ``"h1"`` takes the square root of the inverse, ``"frobenius"`` none.
-    Constant modes, one for each component of the surface, are left out.
+    The paper writes the norm of H_0^2, in which |f| = |Lambda^0 f|, and does not say of what D - I
+    is an operator.  ``"h2"`` is our reading: the Hilbert-Schmidt norm of D - I from H_0^2 to L^2,
+    |(D - I) (Lambda^0)^+|_F, in which fine detail weighs less.  ``"h1"`` takes the square root of
+    the inverse, ``"frobenius"`` none.  ``"h2_image"`` goes from L^2 to H_0^2, |Lambda^0 (D - I)|_F,
+    in which fine detail weighs more, and ``"h2_both"`` from H_0^2 to itself,
+    |Lambda^0 (D - I) (Lambda^0)^+|_F.  Constant modes, one for each component of the surface, are
+    left out.
     """
     if norm not in NORMS:
         raise ValueError(f"norm must be one of {', '.join(NORMS)}, found {norm!r}")
-    weighted = (D - np.eye(D.shape[1])) * inverse(latent_eigenvalue, NORMS[norm])  # (n, m, m)
+    of_image, of_argument = NORMS[norm]
+    weighted = (D - np.eye(D.shape[1])) * inverse(latent_eigenvalue, of_argument)  # (n, m, m)
+    weighted = inverse(latent_eigenvalue, -of_image)[:, None] * weighted
     varying = ~constant_modes(latent_eigenvalue)
     return np.linalg.norm(weighted[:, varying][:, :, varying], axis=(1, 2))
 
@@ -84,7 +98,7 @@ def median_shape(latent: xr.Dataset, eigenvalues: np.ndarray, *, norm: str = "h2
         With ``latent_basis(shape, mode, latent)`` and ``latent_eigenvalue(latent)``.
     eigenvalues : float ndarray (shape, mode)
         Laplacian eigenvalues of the shapes, for unit area.
-    norm : {"h2", "h1", "frobenius"}
+    norm : {"h2", "h1", "frobenius", "h2_image", "h2_both"}
         See :func:`distance_to_identity`.
 
     Returns

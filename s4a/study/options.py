@@ -5,7 +5,7 @@ Checked when they are made, before anything is read or computed.
 
 import inspect
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import NoneType
 from typing import Self, get_args
@@ -250,6 +250,28 @@ class Options:
                 f"{n - 1} (a tree) to {n * (n - 1) // 2} (all pairs)"
             )
 
+    def changed(self, given: dict) -> Self:
+        """These options with some given otherwise; a `preset` that is given sets its own anew.
+
+        Raises
+        ------
+        ValueError
+            When one is outside its range, or contradicts the preset, the given or the own.
+
+        Examples
+        --------
+        >>> from s4a.study.options import Options
+        >>> options = Options(k=50).changed({"preset": "paper"})
+        >>> options.k, options.refine
+        (50, 'intrinsic')
+        >>> options.changed({"refine": "joint"})
+        Traceback (most recent call last):
+        ValueError: preset 'paper' sets refine='intrinsic'; found refine='joint': leave out one of \
+both
+        """
+        unset = dict.fromkeys(DEFAULTS) if "preset" in given else {}
+        return replace(self, **unset | given)
+
     def to_report(self) -> dict[str, str]:
         """The options in words, as the attributes of ``/report``."""
         return {field.name: str(getattr(self, field.name)) for field in fields(self)}
@@ -304,11 +326,19 @@ def takes_options(*names: str) -> Callable:
     return decorate
 
 
-def pair_options(given: dict) -> Options:
-    """The :class:`Options` of a pair; TypeError where one is given that is none of a pair's."""
+def pair_options(given: dict, of_study: Options | None = None) -> Options:
+    """The :class:`Options` of a pair, beside those of a study where there is one.
+
+    Raises
+    ------
+    TypeError
+        When one is given that is none of a pair's.
+    ValueError
+        When one is outside its range, or contradicts the preset.
+    """
     wrong = [name for name in given if name not in (*PAIR, "both")]
     if wrong:
         raise TypeError(
             f"unexpected options {', '.join(wrong)}; those of a pair are {', '.join(PAIR)}"
         )
-    return Options(**given)
+    return Options(**given) if of_study is None else of_study.changed(given)

@@ -117,7 +117,7 @@ def analyse(
     how : {"ours", "standard"}
         Full resolution by eq. 7 (default), or by eq. 3 and 4; with joint rounds that match is one
         candidate among others.
-    norm : {"h2", "h1", "frobenius"}
+    norm : {"h2", "h1", "frobenius", "h2_image", "h2_both"}
         Norm of eq. 5, see :func:`s4a.method.median.distance_to_identity`.
     keep_rounds : bool
         Whether maps and latent bases of every round of Consistent ZoomOut are kept: ``/rounds``.

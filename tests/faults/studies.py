@@ -206,10 +206,16 @@ PROOFS = [
         "test_an_option_that_the_preset_fixes_is_refused_by_name",
     ),
     (
-        "options of pairs for `s4a transfer` beside a study, which has its own",
-        "refused by name",
+        "an option that the preset of a study fixes, given otherwise for a transfer to it",
+        "refused by name; with another preset, it is taken",
         "test_preset.py",
-        "test_the_commands_take_the_preset_and_refuse_options_beside_a_study",
+        "test_a_transfer_refuses_by_name_what_its_preset_fixes",
+    ),
+    (
+        "options of pairs for a transfer from a shape that is registered",
+        "refused by name, with the shape",
+        "test_preset.py",
+        "test_options_are_refused_where_nothing_is_matched",
     ),
     (
         "labels of an external mesh for a study of pairs, which has no low resolution",

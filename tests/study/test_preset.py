@@ -132,15 +132,21 @@ def test_a_new_shape_is_cleaned_and_registered_by_the_options_of_the_study(paper
     assert np.array_equal(one["rotation"], one["icp_rotation"])
 
 
-def test_an_external_mesh_is_matched_by_the_options_of_the_study(paper, meshes, monkeypatch):
-    seen = []
+@pytest.fixture
+def seen(monkeypatch):
+    """The options by which a transfer matches pairs, one after the other."""
+    options = []
     match = transfer.match_shapes
 
-    def watched(source, target, options):
-        seen.append(options)
-        return match(source, target, options)
+    def watched(source, target, given):
+        options.append(given)
+        return match(source, target, given)
 
     monkeypatch.setattr(transfer, "match_shapes", watched)
+    return options
+
+
+def test_an_external_mesh_is_matched_by_the_options_of_the_study(paper, meshes, seen):
     external = meshes["brain_04"]
     with s4a.open_study(paper) as study:
         found = s4a.transfer_labels(
@@ -152,6 +158,75 @@ def test_an_external_mesh_is_matched_by_the_options_of_the_study(paper, meshes, 
     assert found["brain_01"].sizes["vertex"] == 1500
 
 
+def transfers(external):
+    """Every function of a transfer, of a study and options."""
+    label = external["label"].values
+    landmarks = external[["landmark_name", "landmark_position"]]
+    return {
+        "labels": lambda study, **options: s4a.transfer_labels(study, label, **options),
+        "scalars": lambda study, **options: s4a.transfer_scalars(study, label, **options),
+        "landmarks": lambda study, **options: s4a.transfer_landmarks(study, landmarks, **options),
+    }
+
+
+@pytest.mark.parametrize("what", ["labels", "scalars", "landmarks"])
+def test_every_transfer_takes_a_preset_in_the_place_of_the_options_of_a_study(
+    what, study, meshes, seen
+):
+    external = meshes["brain_04"]
+    carry = transfers(external)[what]
+    carry(study, source=external, targets=["brain_01"], preset="paper", k=20)
+    assert len(seen) == 1  # one way
+    assert {name: getattr(seen[0], name) for name in PAPER} == PAPER
+    assert (seen[0].k, seen[0].n_coarse) == (20, OPTIONS["n_coarse"])
+
+
+@pytest.mark.parametrize("what", ["labels", "scalars", "landmarks"])
+def test_a_transfer_refuses_by_name_what_its_preset_fixes(what, study, paper, meshes, seen):
+    external = meshes["brain_04"]
+    carry = transfers(external)[what]
+    message = "preset 'paper' sets both=False; found both=True: leave out one of both"
+    with pytest.raises(ValueError, match=message):
+        carry(study, source=external, preset="paper", both=True)
+    with s4a.open_study(paper) as fixed:
+        with pytest.raises(ValueError, match=message):
+            carry(fixed, source=external, both=True)
+        assert seen == []
+        carry(fixed, source=external, targets=["brain_01"], preset=None, both=False, sharpen=0)
+    assert {name: getattr(seen[0], name) for name in DEFAULTS} == DEFAULTS | {
+        "both": False,
+        "sharpen": 0,
+    }
+
+
+@pytest.mark.parametrize("what", ["labels", "scalars", "landmarks"])
+def test_options_are_refused_where_nothing_is_matched(what, study, meshes):
+    external = meshes["brain_04"]
+    message = "options preset need a source that is none of the shapes.*the shape 'brain_04'"
+    with pytest.raises(ValueError, match=message):
+        transfers(external)[what](study, source="brain_04", preset="paper")
+    with pytest.raises(TypeError, match="unexpected options n_pairs; those of a pair are"):
+        transfers(external)[what](study, source=external, n_pairs=3)
+
+
+def test_another_low_resolution_than_that_of_the_study_is_made_for_its_template(
+    study, meshes, monkeypatch
+):
+    made = []
+    low = transfer.shape_of
+    monkeypatch.setattr(transfer, "shape_of", lambda *given: made.append(given) or low(*given))
+    external = meshes["brain_04"]
+    carry = transfers(external)["scalars"]
+    same = carry(study, source=external, targets=["brain_01"], refine="intrinsic", both=False)
+    assert len(made) == 1
+    coarser = carry(
+        study, source=external, targets=["brain_01"], refine="intrinsic", both=False, n_coarse=150
+    )
+    assert len(made) == 3
+    assert made[1][1].n_coarse == made[2][1].n_coarse == 150
+    assert not np.allclose(same["brain_01"]["field"], coarser["brain_01"]["field"])
+
+
 def test_an_external_mesh_needs_more_than_a_study_of_pairs(three):
     (name, template), (other, shape), (_, external) = three.items()
     study = s4a.register_pairs(template, {other: shape}, name=name, both=False, **PAIR)
@@ -159,25 +234,19 @@ def test_an_external_mesh_needs_more_than_a_study_of_pairs(three):
         s4a.transfer_labels(study, external["label"].values, source=external)
 
 
-def test_the_commands_take_the_preset_and_refuse_options_beside_a_study(
-    paper, brain_files, tmp_path, monkeypatch, capsys
+def test_the_commands_take_the_preset_between_files_and_to_a_study(
+    paper, brain_files, tmp_path, monkeypatch, seen, capsys
 ):
-    seen = []
-    register = transfer.register_pairs
-
-    def watched(*arguments, **options):
-        seen.append(options)
-        return register(*arguments, **options)
-
-    monkeypatch.setattr(transfer, "register_pairs", watched)
     source, target, *_ = map(str, brain_files)
     labels = tmp_path / "labels.npy"
     np.save(labels, np.zeros(1500, int))
     to = ["transfer", source, "--labels", str(labels), "--out", str(tmp_path)]
     assert main([*to[:2], target, *to[2:], "--preset", "paper", *FLAGS]) == 0
-    assert (seen[0]["preset"], seen[0]["k"]) == ("paper", OPTIONS["k"])
-    assert main([*to[:2], str(paper), *to[2:], "--k", "24", "--preset", "paper"]) == 2
-    assert "is a study, whose options are taken: no --k, --preset" in capsys.readouterr().err
+    assert (seen[0].preset, seen[0].k) == ("paper", OPTIONS["k"])
+    assert main([*to[:2], str(paper), *to[2:], "--k", "20", "--preset", "paper"]) == 0
+    assert (seen[1].preset, seen[1].k) == ("paper", 20)
+    assert main([*to[:2], str(paper), *to[2:], "--sharpen", "1"]) == 2
+    assert "preset 'paper' sets sharpen=0; found sharpen=1" in capsys.readouterr().err
     assert main([*to[:2], target, *to[2:], "--preset", "paper", "--sharpen", "1"]) == 2
     assert "preset 'paper' sets sharpen=0; found sharpen=1" in capsys.readouterr().err
     assert main(["compare", source, target, "--preset", "paper", "--methods", "joint"]) == 2
