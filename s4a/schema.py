@@ -43,6 +43,16 @@ ROWS = {
     "coarse_vertex": ("original_vertex corner", ONE,
         "coarse vertices that carry an original vertex: columns of U"),
     "coarse_weight": ("original_vertex corner", ONE, "their barycentric weights: entries of U"),
+    # the same of SCALABLE (s4a.method.scalable), whose coarse vertices are samples
+    "sample_cell": ("original_vertex", ONE,
+        "sample that is nearest to the original vertex along edges: its Voronoi cell"),
+    "local_vertex": ("entry", ONE,
+        "original vertex that a local function reaches: row of an entry of U"),
+    "local_sample": ("entry", ONE, "sample that it lives around: column of that entry"),
+    "local_weight": ("entry", ONE, "its value there: the entry, rows of U sum to 1"),
+    "edge_mass": ("edge", INPUT2,
+        "integral of the product of two local functions: entry of U^T A U, whose rows sum to the "
+        "vertex areas"),
     "eigenvalue": ("mode", UNIT_AREA, "eigenvalue of the Laplace-Beltrami operator"),
     "eigenfunction": ("vertex mode", UNIT_AREA, "eigenfunction, orthonormal in the vertex areas"),
     "lifted_eigenfunction": ("original_vertex mode", UNIT_AREA,
@@ -289,6 +299,9 @@ POINTS_INTO = {
     "vertex_of_file": "vertex",
     "sample_vertex": "original_vertex",
     "coarse_vertex": "vertex",
+    "sample_cell": "vertex",
+    "local_vertex": "original_vertex",
+    "local_sample": "vertex",
     "registered_match": "original_vertex",
     "template_triangle": "triangle",
 }

@@ -87,7 +87,7 @@ def register_pairs(
         Whether each pair is matched both ways, as by default; transfer then takes the mean of both.
     n_jobs : int, optional
         As in joblib; the result does not depend on it.
-    k_init, k, step, lift, init, ahead, sharpen, refine, parts, alignment
+    method, k_init, k, step, lift, init, ahead, sharpen, refine, parts, alignment
         See :func:`s4a.match_pair`.
     area_weighted, n_projected, n_coarse, preset, seed
         See :func:`s4a.match_pair`; ``preset="paper"`` sets both=False, too.

@@ -23,6 +23,7 @@ from s4a.study.store import VERSION
 
 MOST_PROCESSES = 1000  # so that a slip of the key starts no million of them
 HELP = {
+    "method": "low resolution by remeshing, or by the local functions of SCALABLE",
     "n_coarse": "vertices of the low-resolution meshes",
     "n_pairs": "pairs of the network",
     "k_init": "size of the first functional maps",

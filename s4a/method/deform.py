@@ -10,6 +10,7 @@ import scipy.linalg
 import scipy.sparse as sp
 
 from s4a.geometry.align import rigid_transform
+from s4a.method.spectral import project
 
 
 def smoother(Phi: np.ndarray, area: np.ndarray, U: sp.spmatrix | None = None) -> Callable:
@@ -49,7 +50,7 @@ def onto(
     image: np.ndarray,
     area: np.ndarray,
     coefficients: Callable,
-    spectrum: tuple[np.ndarray, np.ndarray] | None = None,
+    spectrum: tuple[np.ndarray | sp.spmatrix, np.ndarray, np.ndarray] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The motion that brings X onto its image, and the displacement that it leaves, smoothed.
 
@@ -59,7 +60,7 @@ def onto(
     area : float ndarray (n,)
     coefficients : callable
         Of a field (n, 3), as of :func:`smoother`.
-    spectrum : tuple (Phi, eigenvalue), optional
+    spectrum : tuple (mass, Phi, eigenvalue), optional
         Where it is given, the motion is not one but that of :func:`rigid_parts`.
 
     Returns
@@ -71,14 +72,14 @@ def onto(
     if spectrum is None:
         R, t, _ = rigid_transform(X, image, area)
         return R, t, coefficients(image - X @ R.T - t)
-    R, t = rigid_parts(X, image, area, *spectrum)
+    R, t = rigid_parts(X, image, *spectrum)
     return R, t, coefficients(image - np.einsum("nij,nj->ni", R, X) - t)
 
 
 def rigid_parts(
     X: np.ndarray,
     image: np.ndarray,
-    area: np.ndarray,
+    mass: np.ndarray | sp.spmatrix,
     Phi: np.ndarray,
     eigenvalue: np.ndarray,
     *,
@@ -93,7 +94,8 @@ def rigid_parts(
     Parameters
     ----------
     X, image : float ndarray (n, 3)
-    area : float ndarray (n,), of sum 1
+    mass : float ndarray (n,), of sum 1, or sparse matrix (n, n)
+        What Phi is orthonormal in.
     Phi, eigenvalue : float ndarray (n, K), (K,)
         Orthonormal eigenfunctions.  Where all eigenvalues are 0, each piece of a surface moves as a
         whole.
@@ -111,7 +113,7 @@ def rigid_parts(
 
     def around(f):
         """Mean of a function around every vertex, weighted by the heat kernel."""
-        return Phi @ (heat * (Phi.T @ (area[:, None] * f)))
+        return Phi @ (heat * project(Phi, mass, f))
 
     p = around(X)  # (n, 3)
     q = around(image)  # (n, 3)

@@ -21,6 +21,7 @@ from s4a.method.deform import onto
 from s4a.method.fmap import fmap_from_match
 from s4a.method.nearest import nearest_rows
 from s4a.method.shape import Basis
+from s4a.method.spectral import project
 
 FAR = 0.035  # between shapes of one pose the tenth that is farthest lies nearer, see `far_apart`
 
@@ -124,10 +125,10 @@ def low_rounds(
     normals = vertex_normals(source.X, source.T) if spectral else None
     for K in [*range(min(k_first, k), k, step), k]:
         Phi = target.Phi[:, :K]
-        spectrum = (Phi, target.eigenvalue[:K]) if by_parts else None
+        spectrum = (target.mass, Phi, target.eigenvalue[:K]) if by_parts else None
 
         def coefficients(d, Phi=Phi):
-            return Phi.T @ (target.area[:, None] * d)  # (K, 3)
+            return project(Phi, target.mass, d)  # (K, 3)
 
         for _ in range(rounds):
             warp = onto(target.X, source.X[match], target.area, coefficients, spectrum)
@@ -136,7 +137,7 @@ def low_rounds(
                 match = nearest_vertices(source, target, X)
                 continue
             weight = spectral / np.sqrt(K)
-            C = fmap_from_match(source.Phi[:, :K], Phi, target.area, match)
+            C = fmap_from_match(source.Phi[:, :K], Phi, target.mass, match)
             match = nearest_rows(
                 features(X, vertex_normals(X, target.T), weight * Phi),
                 features(source.X, normals, weight * source.Phi[:, :K] @ C.T),

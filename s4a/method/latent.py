@@ -458,7 +458,7 @@ def latent_basis_of_new(
         C_out, C_in = [], []
         for other, functions in zip(others[:FINAL], F, strict=False):
             Psi = other.Phi[:, :k]
-            C_out.append(fmap_from_match(Phi, Psi, other.area, nearest_rows(functions, query)))
-            C_in.append(fmap_from_match(Psi, Phi, new.area, nearest_rows(query, functions)))
+            C_out.append(fmap_from_match(Phi, Psi, other.mass, nearest_rows(functions, query)))
+            C_in.append(fmap_from_match(Psi, Phi, new.mass, nearest_rows(query, functions)))
         y = frozen_basis(np.stack(C_out), np.stack(C_in), Y[:FINAL])
     return y

@@ -14,6 +14,7 @@ import xarray as xr
 
 from s4a.geometry.mesh import as_arrays, stiffness, vertex_areas
 from s4a.method.remesh import coarsen, laplacian
+from s4a.method.scalable import reduced
 from s4a.method.shape import Shape
 from s4a.method.spectral import factor, spectrum
 from s4a.schema import dataset
@@ -212,6 +213,7 @@ def lifted(mesh: xr.Dataset, low: xr.Dataset, k: int) -> xr.Dataset:
 def low_resolution(
     mesh: xr.Dataset,
     *,
+    method: str = "rematch",
     n_coarse: int = 6000,
     k: int = 100,
     lift: bool = False,
@@ -220,8 +222,11 @@ def low_resolution(
 ) -> xr.Dataset:
     """The low-resolution mesh with its functions: :func:`s4a.coarsen`, :func:`s4a.spectrum`.
 
-    With `lift` also :func:`lifted`.
+    With `lift` also :func:`lifted`.  With ``method="scalable"`` :func:`s4a.method.scalable.reduced`
+    is in their place, which can neither be lifted nor wrapped.
     """
+    if method == "scalable":
+        return reduced(mesh, n_coarse=n_coarse, k=k, seed=seed)
     coarse = coarsen(mesh, n_coarse=n_coarse, wrap=wrap, seed=seed)
     if not lift:
         return spectrum(coarse, k=k)

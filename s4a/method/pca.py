@@ -85,7 +85,12 @@ def gram_pca(fields: np.ndarray, area: np.ndarray) -> PrincipalModes:
 
 
 def low_vertices(coarse: xr.Dataset) -> np.ndarray:
-    """For every coarse vertex the original vertex in which U weighs it most ``(n_coarse,)``."""
+    """For every coarse vertex the original vertex in which U weighs it most ``(n_coarse,)``.
+
+    Of SCALABLE the vertex that the sample is.
+    """
+    if "local_weight" in coarse:
+        return coarse["sample_vertex"].values
     vertex = coarse["coarse_vertex"].values  # (n, 3)
     order = np.argsort(coarse["coarse_weight"].values.ravel(), kind="stable")
     heaviest = np.zeros(coarse.sizes["vertex"], np.int64)

@@ -6,7 +6,12 @@ Magnet & Ovsjanikov, "Scalable and Efficient Functional Map Computations on Dens
 Around every sample of the dense mesh lives a smooth bump of compact support; their values are the
 columns of U, rows of sum 1.  The Laplacian is restricted to their span: U^T W U phi = lambda U^T A
 U phi, and functional maps live in these phi.
+
+:func:`reduce` gives them as a :class:`s4a.method.shape.Shape`, :func:`reduced` as the Dataset that
+is the ``/coarse`` of a study with ``method="scalable"``, of which that shape is made.
 """
+
+import logging
 
 import numpy as np
 import scipy.sparse as sp
@@ -17,13 +22,26 @@ from scipy.spatial import cKDTree
 
 from s4a.geometry.align import farthest_points
 from s4a.geometry.mesh import as_arrays, edge_graph, stiffness, unique_edges, vertex_areas
-from s4a.geometry.voronoi import add_samples, farthest_of_each, voronoi_cells
-from s4a.method.remesh import laplacian, sample_surface
+from s4a.geometry.voronoi import add_samples, dual, farthest_of_each, voronoi_cells
+from s4a.method.remesh import check_clean, laplacian, sample_surface
 from s4a.method.shape import Basis, Shape
-from s4a.schema import require
+from s4a.schema import dataset, in_unit, require, unit_of
+
+log = logging.getLogger(__name__)
 
 RADIUS = 3.0  # of the bumps, in radii of a disk of area / samples: about nine reach every vertex
 GROUP = 64  # samples whose paths are looked for together
+# what variables of /coarse are here, where there is no coarse mesh
+MEANING = {
+    "position": "position of the sample",
+    "corner_vertex": "samples whose cells meet: the dual of the cells, for pictures and normals",
+    "vertex_area": "integral of the local function: row sum of U^T A U",
+    "edge_vertex": "samples whose local functions, or edges between them, overlap",
+    "cotan_weight": "entry of -U^T W U, whose rows sum to 0",
+    "sample_vertex": "vertex of the original mesh that the sample is",
+    "eigenvalue": "eigenvalue of U^T W U phi = lambda U^T A U phi",
+    "eigenfunction": "coefficients phi of the eigenfunction U phi, orthonormal in U^T A U",
+}
 
 
 def bump(distance: np.ndarray, radius: float | np.ndarray) -> np.ndarray:
@@ -205,3 +223,105 @@ def spectral_space(
     low = Basis(X[sample], np.empty((0, 3), np.int32), U.T @ area, Phi, eigenvalue, mass)
     full = Basis(X, T, area, Phi, eigenvalue, mass, U)
     return Shape.of(mesh, low=low, full=full, U=U, cell=cell)
+
+
+def reduced(mesh: xr.Dataset, *, n_coarse: int = 6000, k: int = 100, seed: int = 0) -> xr.Dataset:
+    """A clean mesh in the span of local functions, in the place of a low-resolution mesh (4.1).
+
+    It has the variables of :func:`s4a.coarsen` and :func:`s4a.spectrum`, so that all later steps
+    take it.  There is no coarse mesh: the vertices are samples of the original, and the triangles
+    join samples whose geodesic Voronoi cells meet.  They are for pictures and normals, no function
+    depends on them, and they need not be manifold, as behind thin walls.
+
+    Parameters
+    ----------
+    mesh : xarray.Dataset
+        As of :func:`s4a.coarsen`.
+    n_coarse : int
+        Samples to aim at, see :func:`reduce`.
+    k : int
+        Number of eigenpairs, as of :func:`s4a.spectrum`.
+    seed : int
+
+    Returns
+    -------
+    xarray.Dataset
+        ``position``, ``corner_vertex``, ``sample_vertex``: the samples and the dual of their cells;
+        ``sample_cell(original_vertex)``: these cells; ``local_vertex``, ``local_sample``,
+        ``local_weight(entry)``: U, in the place of ``coarse_vertex`` and ``coarse_weight``, as its
+        rows have not three entries but eight to twelve in the mean; ``vertex_area``: its row sums
+        of U^T A U; ``edge_vertex`` and ``cotan_weight``: U^T W U; ``edge_mass``: U^T A U, see
+        :func:`s4a.method.spectral.unit_mass`; ``eigenvalue``, ``eigenfunction``: phi, which U takes
+        to all vertices.  The attribute ``method`` is "scalable"; the others are as of
+        :func:`s4a.coarsen`.
+
+    Raises
+    ------
+    ValueError
+        When the mesh is not clean, an option out of range, or the solver finds no eigenpairs.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import s4a
+    >>> from s4a.method.scalable import reduced
+    >>> ball = s4a.synthetic.sphere(2000)
+    >>> low = reduced(ball, n_coarse=300, k=4)
+    >>> bool(np.isclose(low["vertex_area"].sum(), 4 * np.pi, rtol=0.01))
+    True
+    >>> bool(np.allclose(low["eigenvalue"] / (4 * np.pi), [0, 2, 2, 2], rtol=0.1))
+    True
+    """
+    require(mesh, "position", "corner_vertex", what="mesh")
+    for name, value, least in (("n_coarse", n_coarse, 4), ("k", k, 1)):
+        if int(value) != value or value < least:
+            raise ValueError(f"{name} must be an integer of at least {least}, found {value!r}")
+    X, T = as_arrays(mesh)
+    check_clean(X, T)
+    sample, cell, U = local_space(mesh, n_coarse, seed)
+    p = len(sample)
+    possible = min(int(k), p - 2)
+    if possible < 1:
+        raise ValueError(f"a spectrum needs at least 3 samples, found {p}")
+    E, w, area, kind = laplacian(X, T, vertex_areas(X, T))
+    total, W = area.sum(), stiffness(E, w, len(X))
+    if not np.isfinite(w).all():
+        raise ValueError("finite cotan weights needed; triangles are too thin to have them")
+    try:
+        eigenvalue, Phi, mass = reduced_eigenpairs(U, W, area / total, possible)
+    except RuntimeError as error:  # of the factor or of ARPACK
+        raise ValueError(f"no {possible} eigenpairs of {p} local functions: {error}") from error
+    attrs: dict[str, int | str] = {
+        "method": "scalable",
+        "n_coarse": int(n_coarse),
+        "seed": int(seed),
+        "wrapped": 0,
+        "kept_whole": int(p == len(X)),
+        "laplacian": kind,
+        "zero_eigenvalues": int((eigenvalue == 0).sum()),
+    }
+    if possible < k:
+        log.warning("k reduced from %d to %d: the mesh has only %d samples", k, possible, p)
+        attrs["k_reduced_from"] = int(k)
+    stiff = sp.csr_matrix(U.T @ W @ U)
+    i, j = sp.triu(abs(stiff) + abs(mass), 1).nonzero()
+    entries = U.tocoo()
+    data = dataset(
+        attrs,
+        position=X[sample],
+        corner_vertex=dual(T, cell).astype(np.int32),
+        vertex_area=U.T @ area,
+        edge_vertex=np.stack([i, j], axis=1).astype(np.int32),
+        cotan_weight=-np.asarray(stiff[i, j]).ravel(),
+        edge_mass=total * np.asarray(mass[i, j]).ravel(),
+        sample_vertex=sample.astype(np.int32),
+        sample_cell=cell.astype(np.int32),
+        local_vertex=entries.row.astype(np.int32),
+        local_sample=entries.col.astype(np.int32),
+        local_weight=entries.data,
+        eigenvalue=eigenvalue,
+        eigenfunction=Phi,
+    )
+    for name, meaning in MEANING.items():
+        data[name].attrs["long_name"] = meaning
+    return in_unit(data, unit_of(mesh["position"]))

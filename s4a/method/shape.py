@@ -17,6 +17,7 @@ from s4a.geometry.align import Cloud, cloud, farthest_points
 from s4a.geometry.closest import feature_tree
 from s4a.geometry.mesh import as_arrays, edge_graph, edges, vertex_areas
 from s4a.method.deform import smoother
+from s4a.method.spectral import unit_mass
 
 N_SPREAD = 1000  # spread vertices of a shape on which Consistent ZoomOut looks for matches
 N_PAIRED = 300  # spread vertices of a shape that rigid alignment pairs
@@ -32,7 +33,7 @@ class Basis:
     X : float ndarray (n, 3)
         Vertices, in the frame of the shape.
     T : int ndarray (m, 3)
-        Triangles; none where the vertices are samples of :mod:`s4a.method.scalable`.
+        Triangles; none where the vertices are samples of :func:`s4a.method.scalable.reduce`.
     area : float ndarray (n,)
         Vertex areas, of sum 1.
     Phi : float ndarray (p, k)
@@ -143,7 +144,8 @@ class Shape:
     original : xarray.Dataset or None
         The clean mesh: ``position``, ``corner_vertex``.
     coarse : xarray.Dataset or None
-        As :func:`s4a.coarsen` and :func:`s4a.spectrum` make it, or :func:`s4a.method.lift.lifted`.
+        As :func:`s4a.coarsen` and :func:`s4a.spectrum` make it, or :func:`s4a.method.lift.lifted`,
+        or :func:`s4a.method.scalable.reduced`: then what is called coarse are samples.
     n_projected : int
         Vertices of ``full`` by which fields are projected, those nearest to coarse ones; 0 for all.
     area_weighted : bool
@@ -184,7 +186,16 @@ class Shape:
 
     @cached_property
     def U(self) -> sp.csr_matrix:
-        """The projection operator of 4.1 ``(n, n_coarse)``: three barycentric weights a row."""
+        """The projection operator of 4.1 ``(n, n_coarse)``: three barycentric weights a row.
+
+        Of SCALABLE the local functions, rows of sum 1.
+        """
+        if self.is_sampled:
+            row, column, weight = (
+                self.coarse[f"local_{part}"].values for part in ("vertex", "sample", "weight")
+            )
+            shape = self.coarse.sizes["original_vertex"], self.coarse.sizes["vertex"]
+            return sp.csr_matrix((weight, (row, column)), shape)
         columns = self.coarse["coarse_vertex"].values  # (n, 3)
         weights = self.coarse["coarse_weight"].values  # (n, 3), rows of sum 1
         n, corners = columns.shape
@@ -195,7 +206,12 @@ class Shape:
 
     @cached_property
     def cell(self) -> np.ndarray:
-        """The coarse vertex that weighs most at each original vertex ``(n,)``."""
+        """The coarse vertex that weighs most at each original vertex ``(n,)``.
+
+        Of SCALABLE the sample that is nearest along edges.
+        """
+        if self.is_sampled:
+            return self.coarse["sample_cell"].values
         columns = self.coarse["coarse_vertex"].values
         heaviest = self.coarse["coarse_weight"].values.argmax(1)
         return columns[np.arange(len(columns)), heaviest]
@@ -207,7 +223,8 @@ class Shape:
         area = self.coarse["vertex_area"].values
         Phi = self.coarse["eigenfunction"].values
         eigenvalue = self.coarse["eigenvalue"].values
-        return Basis(self.to_frame(X), T, area / area.sum(), Phi, eigenvalue)
+        mass = unit_mass(self.coarse) if self.is_sampled else None
+        return Basis(self.to_frame(X), T, area / area.sum(), Phi, eigenvalue, mass)
 
     @cached_property
     def full(self) -> Basis:
@@ -232,6 +249,11 @@ class Shape:
         )
 
     @property
+    def is_sampled(self) -> bool:
+        """Whether the low resolution is that of :mod:`s4a.method.scalable`."""
+        return self.coarse is not None and "local_weight" in self.coarse
+
+    @property
     def is_lifted(self) -> bool:
         """Whether the functions of ``full`` are lifted ones, and not U Phi."""
         return self.coarse is not None and "lifted_eigenfunction" in self.coarse
@@ -246,9 +268,16 @@ class Shape:
 
     @cached_property
     def near_coarse(self) -> np.ndarray:
-        """Original vertices nearest to coarse ones, by their weights in U; all of few."""
-        weight = self.coarse["coarse_weight"].values.max(1)
+        """Original vertices nearest to coarse ones, by their weights in U; all of few.
+
+        Of SCALABLE, whose weights also say how dense its samples are, by their distance.
+        """
         n = self.n_projected
-        if n == 0 or len(weight) <= n:
-            return np.arange(len(weight))
-        return np.flatnonzero(weight >= np.partition(weight, -n)[-n])
+        if n == 0 or self.coarse.sizes["original_vertex"] <= n:
+            return np.arange(self.coarse.sizes["original_vertex"])
+        if self.is_sampled:
+            X = self.original["position"].values
+            near = -np.linalg.norm(X - self.coarse["position"].values[self.cell], axis=1)
+        else:
+            near = self.coarse["coarse_weight"].values.max(1)
+        return np.flatnonzero(near >= np.partition(near, -n)[-n])

@@ -69,18 +69,22 @@ def factor(S: sp.spmatrix) -> Callable[[np.ndarray], np.ndarray]:
     ).solve
 
 
-def project(Phi: np.ndarray, area: np.ndarray, f: np.ndarray) -> np.ndarray:
+def project(Phi: np.ndarray, area: np.ndarray | sp.spmatrix, f: np.ndarray) -> np.ndarray:
     """Coefficients a = Phi^T A f of a function ``(k,)`` or of several ``(k, d)``.
 
     Parameters
     ----------
     Phi : float ndarray (n, k)
         Orthonormal in the areas.
-    area : float ndarray (n,), of sum 1
+    area : float ndarray (n,), of sum 1, or sparse matrix (n, n)
+        A, where it is not diagonal: :func:`unit_mass`.
     f : float ndarray (n,) or (n, d)
     """
-    weighted = area * f if f.ndim == 1 else area[:, None] * f.reshape(len(f), -1)
-    return Phi.T @ weighted
+    if f.ndim > 1:
+        f = f.reshape(len(f), -1)
+    if sp.issparse(area):
+        return Phi.T @ (area @ f)
+    return Phi.T @ (area * f if f.ndim == 1 else area[:, None] * f)
 
 
 def spectrum(mesh: xr.Dataset, *, k: int = 100) -> xr.Dataset:
@@ -148,8 +152,26 @@ def unit_area(mesh: xr.Dataset) -> np.ndarray:
     return area / area.sum()
 
 
+def unit_mass(mesh: xr.Dataset) -> np.ndarray | sp.csr_matrix:
+    """The A in which Phi is orthonormal: :func:`unit_area`, or of SCALABLE U^T A U ``(n, n)``.
+
+    That has the vertex areas as its row sums, so that the entries off the diagonal,
+    ``edge_mass``, say it all.
+    """
+    if "edge_mass" not in mesh:
+        return unit_area(mesh)
+    total = mesh["vertex_area"].values.sum()
+    off_diagonal = stiffness(
+        mesh["edge_vertex"].values, mesh["edge_mass"].values / total, mesh.sizes["vertex"]
+    )
+    return sp.csr_matrix(sp.diags(unit_area(mesh)) - off_diagonal)
+
+
 def reconstruct(mesh: xr.Dataset, f: np.ndarray, *, k: int | None = None) -> np.ndarray:
     """A function on the mesh from its first k coefficients: Phi Phi^T A f.
+
+    On the samples of SCALABLE, whose eigenfunctions are coefficients in local functions, `f` is one
+    by its own: with as many eigenfunctions as samples it would come back as it is.
 
     Parameters
     ----------
@@ -175,7 +197,7 @@ def reconstruct(mesh: xr.Dataset, f: np.ndarray, *, k: int | None = None) -> np.
     """
     require(mesh, "eigenfunction", "vertex_area", what="mesh")
     Phi = mesh["eigenfunction"].values[:, :k]
-    return Phi @ project(Phi, unit_area(mesh), np.asarray(f, float))
+    return Phi @ project(Phi, unit_mass(mesh), np.asarray(f, float))
 
 
 def weyl(k: int) -> np.ndarray:

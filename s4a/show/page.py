@@ -17,6 +17,7 @@ from s4a.show.surfaces import (
     carried_colors,
     has,
     labelled,
+    low_text,
     mesh_of,
     mode_arrays,
     names_of,
@@ -159,7 +160,8 @@ def _gallery(study, look):
         pixels = render(X, T, size=(150, 130), frame=frame, **look)
         caption = f"{texts[name]}, the median" if name == median else texts[name]
         figures.append(PARTS.picture(pixels, caption, name == median))
-    note = PARTS.note("The low-resolution meshes, all at one scale.")
+    kinds = {low_text(study["coarse"][name].dataset) or "low-resolution meshes" for name in names}
+    note = PARTS.note(f"The {' and '.join(sorted(kinds))}, all at one scale.")
     return note + PARTS.grid(figures, "gallery")
 
 

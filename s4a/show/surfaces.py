@@ -10,6 +10,7 @@ from s4a.method.steps import latent_bases
 
 FAR = 8  # standard deviations beyond which charts of scores leave a doubtful shape out
 RESOLUTIONS = [("low resolution", "coarse"), ("full resolution", "original")]
+SAMPLES = "samples of SCALABLE, joined where their cells meet"
 
 
 def has(study: xr.DataTree, name: str) -> bool:
@@ -57,6 +58,11 @@ def aligned(study: xr.DataTree, name: str, X: np.ndarray) -> np.ndarray:
     motion = registration.sel(shape=name)
     scale = motion["scale"].item() if "scale" in motion else 1.0
     return scale * X @ motion["rotation"].values.T + motion["translation"].values
+
+
+def low_text(mesh: xr.Dataset) -> str:
+    """What stands for a low-resolution mesh where there is none, with SCALABLE; empty elsewhere."""
+    return SAMPLES if "local_weight" in mesh else ""
 
 
 def surface(study: xr.DataTree, name: str, stage: str = "coarse") -> tuple[np.ndarray, np.ndarray]:
@@ -130,7 +136,7 @@ def template_coarse(study: xr.DataTree) -> xr.Dataset | None:
     if not has(study, "coarse") or template not in study["coarse"].children:
         return None
     coarse = study["coarse"][template].to_dataset()
-    return coarse if "coarse_vertex" in coarse else None
+    return coarse if "coarse_vertex" in coarse or "local_weight" in coarse else None
 
 
 def mode_arrays(

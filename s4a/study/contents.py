@@ -22,6 +22,11 @@ REQUIRED: dict[str, tuple[str, dict[str, type]]] = {
         "eigenfunction",
         {"wrapped": int, "kept_whole": int, "laplacian": str},
     ),
+    "coarse/scalable": (
+        "position corner_vertex vertex_area sample_vertex edge_vertex edge_mass sample_cell "
+        "local_vertex local_sample local_weight eigenvalue eigenfunction",
+        {"method": str, "wrapped": int, "kept_whole": int, "laplacian": str},
+    ),
     "network/sketch": (
         "sketch_position sketch_area sketch_normal sketch_asymmetry moment",
         dict.fromkeys(SEEN, int),
@@ -99,6 +104,8 @@ def check_contents(name: str, data: xr.Dataset) -> None:
     kind = kind_of(name)
     if kind not in REQUIRED:
         raise ValueError("no file of a study has this name")
+    if kind == "coarse" and data.attrs.get("method") == "scalable":
+        kind = "coarse/scalable"
     words, attrs = REQUIRED[kind]
     needed = words.split()
     missing = [one for one in needed if one not in data.variables]

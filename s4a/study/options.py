@@ -18,6 +18,7 @@ from s4a.method.shape import N_CENTRAL, N_SPREAD, Shape
 from s4a.schema import check_count, check_switch, check_text
 
 CHOICES = {
+    "method": ("rematch", "scalable"),
     "init": ("dense", "landmarks"),
     "ahead": ("always", "network", "never"),
     "weights": ("cycles", "equal"),
@@ -59,6 +60,11 @@ PAPER = {
     "both": False,
 }
 PRESETS: dict[str | None, dict] = {None: DEFAULTS, "paper": PAPER}
+# switches that method="scalable" does not have, and what each would need
+WITHOUT_MESH = {
+    "lift": "lifts the eigenfunctions of one",
+    "wrap": "makes one of a wrapped surface, on which its functions do not live",
+}
 LOWEST = {
     "n_coarse": 100,
     "n_pairs": 1,
@@ -87,6 +93,7 @@ PAIR = (
     "area_weighted",
     "n_projected",
     "n_coarse",
+    "method",
     "preset",
     "seed",
 )
@@ -140,6 +147,7 @@ class Options:
     ValueError: preset 'paper' sets refine='intrinsic'; found refine='joint': leave out one of both
     """
 
+    method: str = "rematch"
     n_coarse: int = 6000
     n_pairs: int = 500
     k_init: int = 20
@@ -188,6 +196,13 @@ class Options:
         check_components(self.components)
         check_text("pattern", self.pattern)
         check_text("template", self.template)
+        if self.method == "scalable":
+            for name, why in WITHOUT_MESH.items():
+                if getattr(self, name):
+                    raise ValueError(
+                        f"method='scalable' has no coarse mesh, and {name}=True {why}: "
+                        "leave out one of both"
+                    )
         if self.keep_doubtful and self.doubtful == "stop":
             raise ValueError(
                 "keep_doubtful=True takes doubtful shapes in and doubtful='stop' ends the run "
@@ -215,7 +230,7 @@ class Options:
     @property
     def of_low_resolution(self) -> dict:
         """The options of :func:`s4a.method.lift.low_resolution`."""
-        names = ("n_coarse", "k", "lift", "wrap", "seed")
+        names = ("method", "n_coarse", "k", "lift", "wrap", "seed")
         return {name: getattr(self, name) for name in names}
 
     @property

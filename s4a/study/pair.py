@@ -27,6 +27,8 @@ def match_pair(source: xr.Dataset, target: xr.Dataset, **options: Any) -> xr.Dat
     source, target : xarray.Dataset
         Clean meshes (``position``, ``corner_vertex``), as of :func:`s4a.read_shapes` or
         :func:`s4a.clean`.
+    method : {"rematch", "scalable"}
+        The low resolution, see :func:`s4a.analyse`.
     k_init, k, step : int
         Sizes of the first and of the refined functional map; growth per round of ZoomOut.
     init : {"dense", "landmarks"}

@@ -69,8 +69,13 @@ def analyse(
     shapes : path, list of paths, dict or xarray.DataTree
         A folder, a glob, files, or meshes in memory: name -> Dataset or (points, triangles), or
         what :func:`s4a.read_shapes` gives.
+    method : {"rematch", "scalable"}
+        The low resolution (4.1): remeshed (default), or the local functions of SCALABLE, see
+        :func:`s4a.method.scalable.reduced`.  The study has the same nodes and variables but for U,
+        and all that takes one takes it; what is called a coarse mesh are then samples, joined
+        where their cells meet.  ``lift`` and ``wrap`` need a coarse mesh and are refused.
     n_coarse : int
-        Vertices of the low-resolution meshes (4.1).
+        Vertices of the low-resolution meshes (4.1); or samples.
     n_pairs : int
         Pairs of the network, each with maps both ways; all pairs where there are fewer (5.1).
     k_init, k : int
@@ -241,6 +246,8 @@ def remesh(run: Run, original: Keys, options: Options) -> Keys:
     settings: tuple = (options.n_coarse, options.wrap, options.seed, options.k)
     if options.lift:
         settings = (*settings, "lift")
+    if options.method != "rematch":
+        settings = (*settings, options.method)
     todo = [
         Task(n, f"coarse/{n}.nc", remesh_shape, (run.folder, n, options), (key, settings), (key,))
         for n, key in original.items()

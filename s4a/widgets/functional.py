@@ -7,7 +7,7 @@ import traitlets
 from s4a.method.fmap import off_diagonal_mass, orthogonality_error, swapped_blocks, zoomout
 from s4a.method.shape import Shape
 from s4a.show.browser import PARTS
-from s4a.show.surfaces import surface
+from s4a.show.surfaces import low_text, surface
 from s4a.widgets.chart import Chart
 from s4a.widgets.panel import WIDE, Panel, beside, dropdown, int_slider, row
 from s4a.widgets.scene import Scene, camera_group
@@ -92,8 +92,10 @@ class FunctionalMap(Panel):
         self.meshes = [self.study["coarse"][name].to_dataset() for name in self.names()]
         self.maps = {}
         self.draw()
-        for scene, name in zip(self.scenes, self.names(), strict=True):
+        shapes = zip(self.scenes, self.names(), self.meshes, strict=True)
+        for scene, name, mesh in shapes:
             scene.show(*surface(self.study, name))
+            scene.caption = low_text(mesh)
         self.show_cell(self.cell)
 
     def map_of(self, k: int) -> np.ndarray:

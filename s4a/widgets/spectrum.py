@@ -6,7 +6,7 @@ import traitlets
 
 from s4a.method.spectral import reconstruct, weyl
 from s4a.show.charts import BLUE, GREY, ORANGE
-from s4a.show.surfaces import labelled, surface, unit_text
+from s4a.show.surfaces import labelled, low_text, surface, unit_text
 from s4a.widgets.chart import Chart
 from s4a.widgets.panel import Panel, beside, dropdown, int_slider, row
 from s4a.widgets.scene import Scene, camera_group
@@ -63,6 +63,7 @@ class Spectrum(Panel):
         self.mesh = self.study["coarse"][self.shape].to_dataset()
         self.surface = surface(self.study, self.shape)
         self.function.show(*self.surface)
+        self.function.caption = low_text(self.mesh)
         self.show_mode()
         self.show_rebuilt()
 

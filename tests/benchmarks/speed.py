@@ -3,8 +3,9 @@
 Every row runs in a process of its own with one BLAS thread, ours and the other in turn, on the same
 input: seconds of CPU, of the clock, and the peak of memory above what the process holds before.
 pyFM is on PyPI as ``pyfmaps`` (the extra ``bench``).  ``speed.py stages``, ``pipelines``,
-``growth``, ``pairs``, ``nearest`` or ``seals`` runs one part, ``speed.py whole 51 100000`` the
-whole analysis of so many synthetic shapes of so many vertices.
+``growth``, ``pairs``, ``nearest`` or ``seals`` runs one part, ``speed.py methods faces heads`` an
+analysis by RE-MATCH and by SCALABLE of ten shapes of each, ``speed.py whole 51 100000`` the whole
+analysis of so many synthetic shapes of so many vertices.
 """
 
 import itertools
@@ -25,7 +26,8 @@ from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 
 import s4a
-from s4a import synthetic
+from s4a import metrics, synthetic
+from s4a.evaluation import accuracy
 from s4a.geometry.align import align, farthest_points
 from s4a.geometry.mesh import as_arrays, triangle_areas
 from s4a.input.files import find_meshes
@@ -557,6 +559,73 @@ def pairs(folder, n=12, n_coarse=2000):
             )
 
 
+def analysed(paths, store, method, preset):
+    s4a.analyse(paths, store=store, n_jobs=1, method=method, preset=preset).close()
+
+
+def one_numbering(study):
+    """The true image of the template's vertices on a shape: vertex i of the file is vertex i."""
+
+    def image(shape, template):
+        became = study["original"][shape]["vertex_of_file"].values
+        vertex = became[study["original"][template]["file_vertex"].values]
+        X = study["original"][shape]["position"].values[vertex]
+        return np.where(vertex[:, None] >= 0, X, np.nan)
+
+    return image
+
+
+def methods(folder, *sets, n=10):
+    """A whole study by RE-MATCH and by SCALABLE, by default and as in the paper, on real shapes.
+
+    Errors are in % of sqrt(area): where vertex i is vertex i, the mean distance of matches and of
+    the registered surface from the truth; Chamfer (eq. 9) of the shape and the image of the
+    template.
+    """
+    for name in sets or ("faces", "heads"):
+        subprocess.run(
+            [sys.executable, DATA / "unpack.py", folder, name],
+            check=True,
+            stdout=subprocess.DEVNULL,
+        )
+        paths = [str(path) for path in sorted((folder / name).glob("*.ply"))[:n]]
+        say(f"\nA study of {len(paths)} {name}, one process\n")
+        say(
+            f"{'preset':8} {'method':10} {'CPU s':>7} {'MiB':>6} {'disk':>6} {'match %':>8} "
+            f"{'surface %':>9} {'Chamfer %':>9} {'trip %':>7}  median, variance of three modes"
+        )
+        for preset, method in itertools.product((None, "paper"), ("rematch", "scalable")):
+            out = folder / f"{name}_{preset}_{method}"
+            _, cpu, _, memory = measured(analysed, paths, out, method, preset)
+            disk = sum(path.stat().st_size for path in out.rglob("*.nc")) / 2**20
+            with s4a.open_study(out) as study:
+                widths = zip(study_errors(study, name), (8, 9, 9, 7), strict=True)
+                errors = [f"{error:>{width}}" for error, width in widths]
+                ratio = study["pca"]["explained_variance_ratio"].values[:3].sum()
+                say(
+                    f"{preset or 'none':8} {method:10} {cpu:7.0f} {memory:6.0f} {disk:6.0f} "
+                    f"{' '.join(errors)}  {study['latent'].attrs['median']}, {100 * ratio:.1f} %"
+                )
+
+
+def study_errors(study, name):
+    """Errors of the matches and of the surfaces, Chamfer distance, round trip, as texts."""
+    data = study["registration"].to_dataset()
+    template = data.attrs["template"]
+    chamfer = []
+    for shape in set(data["shape"].values.tolist()) - {template}:
+        end = Shape(study["original"][shape].to_dataset())
+        X = end.to_frame(end.original["position"].values)
+        match = data["registered_match"].sel(shape=shape).values
+        chamfer.append(metrics.chamfer(X, X[match]))
+    far = ["", ""]
+    if name == "faces":
+        error = accuracy.accuracy(study, one_numbering(study))["error"].mean("shape")
+        far = [f"{100 * error.sel(way=way):.3f}" for way in (accuracy.MATCH, accuracy.SURFACE)]
+    trip = data["round_trip"].values.mean(1).sum() / (data.sizes["shape"] - 1)
+    return [*far, f"{100 * np.mean(chamfer):.4f}", f"{100 * trip:.3f}"]
+
+
 def certificates(folder, n_checked=1000):
     """The dense search of eq. 4 on two shapes of every real collection.
 
@@ -658,11 +727,12 @@ PARTS = {
     "growth": growth,
     "pairs": pairs,
     "nearest": certificates,
+    "methods": methods,
     "whole": whole,
 }
 
 if __name__ == "__main__":
-    part, *numbers = sys.argv[1:] or [""]
+    part, *words = sys.argv[1:] or [""]
     for run in [PARTS[part]] if part else [stages, pipelines, growth, pairs, certificates]:
         with tempfile.TemporaryDirectory() as folder:
-            run(Path(folder), *map(int, numbers))
+            run(Path(folder), *(int(word) if word.isdecimal() else word for word in words))

@@ -79,7 +79,7 @@ def test_parts_follow_a_bend_that_displacements_alone_cannot(shapes):
         )
         return np.linalg.norm(joint.move(straight, (R, t, c)) - X, axis=1).mean()
 
-    assert gap((few, straight.eigenvalue[:20])) < 0.25 * gap(None)
+    assert gap((straight.area, few, straight.eigenvalue[:20])) < 0.25 * gap(None)
 
 
 def test_the_parts_of_the_full_resolution_are_those_of_its_coarse_vertices(shapes):

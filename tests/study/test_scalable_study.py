@@ -1,0 +1,283 @@
+"""A study of SCALABLE: the same tree on local functions, taken by all that takes a study."""
+
+import shutil
+
+import numpy as np
+import pytest
+from scipy.spatial.distance import cdist
+from small import FLAGS, OPTIONS
+
+import s4a
+from s4a.analysis import transfer
+from s4a.cli import main
+from s4a.evaluation import accuracy, metrics
+from s4a.geometry.mesh import stiffness
+from s4a.method.pca import low_vertices
+from s4a.method.scalable import reduce, reduced
+from s4a.method.shape import Shape
+from s4a.method.spectral import unit_mass
+from s4a.show.surfaces import SAMPLES
+from s4a.study import pipeline
+from s4a.study.options import Options
+from s4a.study.store import DamagedError, is_done, read, task_key, write
+
+U = {"coarse_vertex", "coarse_weight"}
+LOCAL = {"local_vertex", "local_sample", "local_weight", "sample_cell", "edge_mass"}
+
+
+@pytest.fixture(scope="module")
+def folder(brain_files, tmp_path_factory):
+    """The folder of a study of four brains, from the command line."""
+    out = tmp_path_factory.mktemp("scalable") / "study"
+    assert (
+        main(["run", *map(str, brain_files), "--out", str(out), "--method", "scalable", *FLAGS])
+        == 0
+    )
+    return out
+
+
+@pytest.fixture(scope="module")
+def sampled(folder):
+    """That study."""
+    with s4a.open_study(folder) as tree:
+        return tree.load()
+
+
+@pytest.fixture(scope="module")
+def paper(brains):
+    """The same as in the paper: nothing is added to it."""
+    return s4a.analyse(brains, method="scalable", preset="paper", **OPTIONS)
+
+
+def contents_of(study):
+    """What a study holds: node, variable, dims and unit."""
+    return {
+        (node.path, name, values.dims, values.attrs["units"])
+        for node in study.subtree
+        for name, values in node.dataset.data_vars.items()
+    }
+
+
+def test_the_tree_is_that_of_a_study_of_rematch_but_for_the_entries_of_u(
+    folder, sampled, study_of_files
+):
+    assert set(s4a.verify(folder)["state"].values) == {"whole"}
+    ours, theirs = contents_of(sampled), contents_of(study_of_files)
+    assert {(path.split("/")[1], name) for path, name, *_ in theirs - ours} == {
+        ("coarse", name) for name in U
+    }
+    assert {(path.split("/")[1], name) for path, name, *_ in ours - theirs} == {
+        ("coarse", name) for name in LOCAL
+    }
+    assert sampled["report"].attrs["method"] == "scalable"
+
+
+def test_the_low_resolution_is_the_reduced_basis_of_scalable(sampled):
+    name = "brain_02"
+    mesh, coarse = (sampled[stage][name].to_dataset() for stage in ("original", "coarse"))
+    shape, true = Shape(mesh, coarse), reduce(mesh, n_samples=400, k=24)
+    assert (shape.cell == true.cell).all()
+    assert abs(shape.U - true.U).max() < 1e-12
+    assert abs(shape.low.mass - true.low.mass).max() < 1e-12
+    assert shape.full.mass is shape.low.mass
+    np.testing.assert_allclose(shape.low.X, true.low.X, atol=1e-9)
+    np.testing.assert_allclose(shape.low.area, true.low.area, atol=1e-12)
+    np.testing.assert_allclose(shape.low.eigenvalue, true.low.eigenvalue, rtol=1e-9)
+    np.testing.assert_allclose(shape.low.Phi, true.low.Phi, atol=1e-7)
+    X = mesh["position"].values[coarse["sample_vertex"].values]
+    assert coarse["position"].values == pytest.approx(X)
+
+
+def test_the_node_alone_holds_the_reduced_eigenproblem(sampled):
+    low = sampled["coarse/brain_01"].to_dataset()
+    E, w, p = low["edge_vertex"].values, low["cotan_weight"].values, low.sizes["vertex"]
+    W, A = stiffness(E, w, p), unit_mass(low)
+    Phi, eigenvalue = low["eigenfunction"].values, low["eigenvalue"].values
+    np.testing.assert_allclose(W @ Phi, (A @ Phi) * eigenvalue, atol=1e-9 * eigenvalue[-1])
+    np.testing.assert_allclose(Phi.T @ (A @ Phi), np.eye(24), atol=1e-9)
+    area = low["vertex_area"].values
+    assert area.sum() == pytest.approx(sampled["original/brain_01"].attrs["area"])
+    # as many functions as samples give any function back; these, its part in their span
+    f = low["position"].values
+    np.testing.assert_allclose(s4a.reconstruct(low, f), Phi @ (Phi.T @ (A @ f)), atol=1e-9)
+
+
+def test_the_paper_on_scalable_is_what_table_2_compares(brains, paper):
+    names = {"n_coarse": 400, "k_init": 10, "k": 24, "methods": ["SCALABLE"]}
+    found = s4a.compare.collection(brains, preset="paper", **names).isel(way=0)
+    assert paper["latent"].attrs["median"] == found["median_shape"].item()
+    assert found["distance_to_median"].values == pytest.approx(
+        paper["latent/distance_to_median"].values, rel=1e-3
+    )
+    registration = paper["registration"].to_dataset()
+    for name in set(registration["shape"].values.tolist()) - {registration.attrs["template"]}:
+        X = Shape(paper["original"][name].to_dataset())
+        X = X.to_frame(X.original["position"].values)
+        match = registration["registered_match"].sel(shape=name).values
+        theirs = found["collection_chamfer"].sel(how="ours", shape=name).item()
+        assert metrics.chamfer(X, X[match]) == pytest.approx(theirs, rel=0.01)
+
+
+def test_full_resolution_matches_the_nearest_rows_of_u_phi_y(paper):
+    registration = paper["registration"].to_dataset()
+    template = registration.attrs["template"]
+    rows = {}
+    for name in registration["shape"].values.tolist():
+        low = paper["coarse"][name].to_dataset()
+        entries = low["local_vertex"].values, low["local_sample"].values
+        dense = np.zeros((1500, low.sizes["vertex"]))
+        dense[entries] = low["local_weight"].values
+        Y = paper["latent/latent_basis"].sel(shape=name).values
+        rows[name] = dense @ low["eigenfunction"].values @ Y
+    for name in set(rows) - {template}:
+        distance = cdist(rows[template], rows[name])
+        match = registration["registered_match"].sel(shape=name).values
+        assert np.allclose(distance[np.arange(1500), match], distance.min(1), rtol=1e-3)
+
+
+def test_the_result_does_not_depend_on_the_number_of_processes():
+    small = {"method": "scalable", "n_coarse": 100, "k_init": 6, "k": 10}
+    one, two = (s4a.analyse(s4a.synthetic.brains(3, 200), n_jobs=n, **small) for n in (1, 2))
+    for path in ("coarse/brain_01", "latent", "registration", "pca"):
+        a, b = (tree[path].to_dataset(inherit=False).drop_attrs() for tree in (one, two))
+        assert a.identical(b)
+
+
+def test_it_is_as_near_to_the_truth_as_a_study_of_rematch(sampled, study_of_files, brains):
+    truth = brains["truth"]
+
+    def image(shape, template):
+        return s4a.synthetic.position(truth, shape, truth[template]["reference_point"].values)
+
+    errors = [accuracy.accuracy(tree, image)["error"] for tree in (sampled, study_of_files)]
+    ours, theirs = (error.sel(way=accuracy.SURFACE).mean().item() for error in errors)
+    assert ours < 1.25 * theirs
+    assert ours < 0.7 * errors[0].sel(way=accuracy.ICP).mean()
+
+
+def test_every_panel_is_built_on_it_and_says_that_its_meshes_are_samples(sampled):
+    pytest.importorskip("anywidget")
+    from s4a.widgets import explore
+
+    for kind in explore.PANELS.values():
+        panel = kind(sampled)
+        assert panel.children
+        panel.close()
+    panel = explore.Spectrum(sampled)
+    assert panel.function.caption == SAMPLES
+    panel.close()
+
+
+def test_the_commands_take_it(folder, brain_files, tmp_path, capsys):
+    assert main(["view", str(folder), "--out", str(tmp_path / "page.html")]) == 0
+    assert SAMPLES in (tmp_path / "page.html").read_text(encoding="utf-8")
+    few = ["--permutations", "9", "--n-jobs", "1", "--out", str(tmp_path / "statistics")]
+    assert main(["statistics", str(folder), *few]) == 0
+    new = shutil.copy(brain_files[3], tmp_path / "new.ply")
+    out = ["--out", str(tmp_path / "inserted"), "--n-jobs", "1"]
+    assert main(["insert", str(folder), str(new), *out]) == 0
+    np.save(tmp_path / "labels.npy", np.arange(1500) % 5)
+    labels = ["--labels", str(tmp_path / "labels.npy"), "--out", str(tmp_path), "--n-jobs", "1"]
+    assert main(["transfer", str(new), str(folder), *labels]) == 0
+    assert main(["transfer", str(new), str(folder), *labels, "--method", "scalable"]) == 2
+    assert "is a study, whose options are taken: no --method" in capsys.readouterr().err
+
+
+def test_a_new_shape_comes_in_by_local_functions_too(paper, meshes):
+    new = s4a.insert(paper, {"new": meshes["brain_04"]}, compare=False)
+    assert new["coarse/new"].attrs["method"] == "scalable"
+    Y = paper["latent/latent_basis"].sel(shape="brain_04").values
+    own = new["latent/latent_basis"].values[0]
+    assert np.linalg.norm(own - Y) < 0.4 * np.linalg.norm(Y)
+
+
+def test_pairs_are_matched_by_it(meshes):
+    source, target, *_ = meshes.values()
+    small = {name: OPTIONS[name] for name in ("n_coarse", "k_init", "k")}
+    found = s4a.match_pair(source, source, method="scalable", **small)
+    assert (found["match"].values == np.arange(1500)).all()
+    study = s4a.register_pairs(source, {"other": target}, method="scalable", both=False, **small)
+    assert study["registration"].sizes["shape"] == 2
+
+
+def test_an_external_mesh_is_matched_by_it(paper, meshes, monkeypatch):
+    seen = []
+    match = transfer.match_shapes
+
+    def watched(source, target, options):
+        seen.append((source.is_sampled, target.is_sampled, options.method))
+        return match(source, target, options)
+
+    monkeypatch.setattr(transfer, "match_shapes", watched)
+    external = meshes["brain_03"]
+    s4a.transfer_labels(paper, external["label"].values, source=external, targets=["brain_01"])
+    assert seen == [(True, True, "scalable")]
+
+
+def test_keys_of_studies_of_before_stay_and_another_method_is_another_file(monkeypatch):
+    class Asked:
+        folder = None
+
+        def do(self, stage, tasks):
+            self.key = tasks[0].key
+            return {}
+
+    monkeypatch.setattr(pipeline, "check_usable", lambda *_: None)
+
+    def key(**options):
+        run = Asked()
+        pipeline.remesh(run, {"a": "key of a"}, Options(**options))
+        return run.key
+
+    assert key() == key(method="rematch") == task_key("key of a", (6000, False, 0, 100))
+    assert key(lift=True) == task_key("key of a", (6000, False, 0, 100, "lift"))
+    assert key(method="scalable") == task_key("key of a", (6000, False, 0, 100, "scalable"))
+
+
+def test_what_it_cannot_have_is_refused_by_name(brain_files, tmp_path, capsys):
+    with pytest.raises(ValueError, match="method must be one of 'rematch', 'scalable'; found 'zo'"):
+        Options(method="zo")
+    with pytest.raises(ValueError, match="no coarse mesh, and lift=True lifts the eigenfunctions"):
+        Options(method="scalable", lift=True)
+    words = ["run", str(brain_files[0]), "--out", str(tmp_path / "no"), "--method", "scalable"]
+    assert main([*words, "--wrap"]) == 2
+    assert (
+        "method='scalable' has no coarse mesh, and wrap=True makes one" in capsys.readouterr().err
+    )
+    with pytest.raises(SystemExit):
+        main([*words[:-1], "zo"])
+    assert Options(method="scalable", preset="paper").refine == "intrinsic"
+
+
+def test_a_file_without_the_entries_of_u_is_named(folder, tmp_path):
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    path = copy / "coarse/brain_02.nc"
+    data = read(path)
+    write(
+        data.drop_vars("local_weight"),
+        path,
+        data.attrs["task_key"],
+        data.attrs["made_from"].split(),
+    )
+    with pytest.raises(DamagedError, match=r"brain_02.nc .*it lacks local_weight"):
+        s4a.open_study(copy)
+    assert is_done(path, data.attrs["task_key"])
+
+
+def test_fields_are_projected_by_the_vertices_nearest_to_samples(brain):
+    low = reduced(brain, n_coarse=300, k=8)
+    near = Shape(brain, low, n_projected=600).near_coarse
+    X = brain["position"].values
+    gap = np.linalg.norm(X - X[low["sample_vertex"].values[low["sample_cell"].values]], axis=1)
+    assert len(near) == 600
+    assert set(np.argsort(gap)[:300]) <= set(near)
+    assert gap[near].max() <= np.sort(gap)[600]
+    assert (low_vertices(low) == low["sample_vertex"].values).all()
+
+
+def test_fewer_functions_than_asked_for_are_told_as_of_a_spectrum(caplog):
+    ball = s4a.synthetic.sphere(60)
+    low = reduced(ball, n_coarse=100, k=80)
+    assert low.sizes["mode"] == 58
+    assert low.attrs["k_reduced_from"] == 80
+    assert "k reduced from 80 to 58: the mesh has only 60 samples" in caplog.text
