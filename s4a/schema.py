@@ -172,6 +172,8 @@ ROWS = {
         "score, in standard deviations, of each doubtful shape that the modes are made without"),
     "explained_variance_ratio": ("component", ONE, "share of the variance at full resolution"),
     "explained_variance_ratio_low": ("component", ONE,
+        "share of the variance at low resolution, of the matches of eq. 6, as smooth as at full"),
+    "explained_variance_ratio_raw": ("component", ONE,
         "share of the variance at low resolution, of the matches as they are"),
     # evaluation of the model, tests and outliers (6.1)
     "compactness": ("component", INPUT2, "variance of the first components together"),

@@ -13,6 +13,7 @@ from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.input.subjects import is_missing, is_plain_number, listed, odd_cells, odd_words
 from s4a.method.pca import pca_without
 from s4a.schema import require
+from s4a.study.options import Options
 from s4a.study.tree import left_out
 
 log = logging.getLogger(__name__)
@@ -143,7 +144,8 @@ def with_doubtful(study: xr.DataTree) -> xr.DataTree:
     registration = all_registered(study)
     template = registration.attrs["template"]
     coarse = nodes.get(f"/coarse/{template}")
-    nodes["/pca"] = pca_without(registration, [], coarse)
+    area_weighted = Options.from_report(study).area_weighted
+    nodes["/pca"] = pca_without(registration, [], coarse, area_weighted=area_weighted)
     return xr.DataTree.from_dict(nodes, name=study.name)
 
 

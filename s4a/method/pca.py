@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from s4a.geometry.mesh import vertex_normals
-from s4a.method.deform import normal_displacement
+from s4a.method.deform import normal_displacement, smoother
 from s4a.schema import dataset, in_unit, require, unit_of
 
 
@@ -98,8 +98,31 @@ def low_vertices(coarse: xr.Dataset) -> np.ndarray:
     return heaviest
 
 
+def smooth_low(d: np.ndarray, coarse: xr.Dataset, *, area_weighted: bool = True) -> np.ndarray:
+    """Displacements at low resolution ``(s, n_coarse, 3)``, smoothed as those at full: Phi Phi^+ d.
+
+    The line after eq. 8 without U, in the eigenfunctions of the coarse mesh, so that Fig. 5
+    compares resolutions and not smoothings.
+
+    Parameters
+    ----------
+    d : float ndarray (s, n_coarse, 3)
+    coarse : xarray.Dataset
+        With ``eigenfunction`` and ``vertex_area``.
+    area_weighted : bool
+        Whether vertices weigh by their areas, see :func:`s4a.analyse`.
+    """
+    Phi, area = coarse["eigenfunction"].values, coarse["vertex_area"].values
+    coefficients = smoother(Phi, area / area.sum() if area_weighted else np.ones(len(area)))
+    return np.stack([Phi @ coefficients(one) for one in d.astype(float)])
+
+
 def pca(
-    registration: xr.Dataset, area: np.ndarray, *, coarse: xr.Dataset | None = None
+    registration: xr.Dataset,
+    area: np.ndarray,
+    *,
+    coarse: xr.Dataset | None = None,
+    area_weighted: bool = True,
 ) -> xr.Dataset:
     """Principal modes of a registered collection (6.1, Fig. 4 and 5).
 
@@ -111,16 +134,17 @@ def pca(
         Template vertex areas, the weights of the Gram matrix.
     coarse : xarray.Dataset, optional
         The template's low-resolution mesh; gives the shares of variance at low resolution as well,
-        where the registration has ``displacement_low``.  They are of the matches of eq. 6 as they
-        are: the smooth displacement, looked at on fewer vertices, would have the shares of the full
-        resolution.
+        where the registration has ``displacement_low``.  They are of the matches of eq. 6, smoothed
+        by :func:`smooth_low` as those at full resolution are, and beside them of the matches as
+        they are.
+    area_weighted : see :func:`smooth_low`
 
     Returns
     -------
     xarray.Dataset
         ``mean_displacement``, ``deformation(component, vertex, xyz)`` of one standard deviation,
         ``standard_deviation(component)``, ``score(shape, component)``, ``explained_variance_ratio``
-        and ``explained_variance_ratio_low``.
+        and with `coarse` ``explained_variance_ratio_low`` and ``explained_variance_ratio_raw``.
 
     Raises
     ------
@@ -151,9 +175,17 @@ def pca(
     )
     if coarse is not None and "displacement_low" in registration:
         low = registration["displacement_low"].transpose("shape", "low_vertex", "xyz").values
-        ratio_low = gram_pca(low, coarse["vertex_area"].values).ratio
-        ratio_low = np.pad(ratio_low, (0, len(d)))[: len(modes.ratio)]  # as many as at full
-        result = result.merge(dataset(explained_variance_ratio_low=ratio_low))
+        smooth = smooth_low(low, coarse, area_weighted=area_weighted)
+        smooth_ratio, raw_ratio = (
+            np.pad(gram_pca(fields, coarse["vertex_area"].values).ratio, (0, len(d)))
+            for fields in (smooth, low)
+        )
+        c = len(modes.ratio)  # as many as at full
+        low_ratios = dataset(
+            explained_variance_ratio_low=smooth_ratio[:c],
+            explained_variance_ratio_raw=raw_ratio[:c],
+        )
+        result = result.merge(low_ratios)
     result = in_unit(result, unit_of(registration["displacement"]))
     return result.assign_coords(shape=registration["shape"])
 
@@ -306,7 +338,11 @@ def project_scores(
 
 
 def pca_without(
-    registration: xr.Dataset, apart: list[str], coarse: xr.Dataset | None
+    registration: xr.Dataset,
+    apart: list[str],
+    coarse: xr.Dataset | None,
+    *,
+    area_weighted: bool = True,
 ) -> xr.Dataset:
     """Principal modes of all but some shapes, and the scores of these on them.
 
@@ -316,7 +352,7 @@ def pca_without(
         With ``vertex_area`` and what :func:`pca` needs.
     apart : list of str
         Shapes of which the modes know nothing.
-    coarse : see :func:`pca`
+    coarse, area_weighted : see :func:`pca`
 
     Returns
     -------
@@ -331,7 +367,8 @@ def pca_without(
     area = registration["vertex_area"].values
     names = [name for name in registration["shape"].values.tolist() if name not in apart]
     try:
-        result = pca(registration.sel(shape=names), area, coarse=coarse)
+        chosen = registration.sel(shape=names)
+        result = pca(chosen, area, coarse=coarse, area_weighted=area_weighted)
     except ValueError as error:
         if not apart:
             raise

@@ -425,7 +425,7 @@ def modes(run: Run, registered: Keys, doubts: Doubts, options: Options) -> str:
         coarse = read(run.folder / f"coarse/{template}.nc")
         keys = list(registered.values())
         try:
-            result = pca_without(data, apart, coarse)
+            result = pca_without(data, apart, coarse, area_weighted=options.area_weighted)
         except ValueError as error:
             log.warning("no modes: %s", error)
             (run.folder / "pca.nc").unlink(missing_ok=True)

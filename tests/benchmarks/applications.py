@@ -1,10 +1,12 @@
 """What correspondences are good for.
 
-``applications.py [ellipsoids groups brains skulls faces heads]``.
+``applications.py [ellipsoids groups variance brains skulls faces heads template points]``.
 
-A one-mode family against the closed form, planted groups, transfer between two brain templates and
-between skulls, displacements and modes of faces against the published ones, a tenth head inserted
-into a study of nine.  All but the first two need the shared data beside the checkout.
+A one-mode family against the closed form, planted groups, the variance explained at both
+resolutions (Fig. 5), transfer between two brain templates and between skulls, displacements and
+modes of faces against the published ones, a tenth head inserted into a study of nine, labels and
+landmarks of a template that is none of the collection (Fig. 6 and 7).  What is not synthetic needs
+the shared data beside the checkout.
 """
 
 import itertools
@@ -21,12 +23,12 @@ from scipy.integrate import quad
 from scipy.spatial import cKDTree
 
 import s4a
-from s4a import statistics, synthetic
+from s4a import metrics, statistics, synthetic
 from s4a.analysis import permutation, transfer
 from s4a.geometry.align import align
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
-from s4a.input.annotations import read_landmarks
+from s4a.input.annotations import labels_of_mesh, read_landmarks
 from s4a.method.deform import displacement_in_template
 from s4a.method.pca import project_scores
 from s4a.schema import dataset
@@ -47,6 +49,24 @@ def icp_motion(source, target):
         every = slice(None, None, max(1, len(X) // 6000))
         low += [X[every], vertex_areas(X, T)[every]]
     return align(*low)[:2]
+
+
+def variance(folder=None):
+    """Fig. 5: variance explained by the first components at both resolutions, equally smooth."""
+    collections = {"12 synthetic brains": synthetic.brains(12, 20_000)}
+    if folder is not None:
+        collections["25 faces"] = folder / "faces"
+    for what, shapes in collections.items():
+        for preset in ("paper", None):
+            study = s4a.analyse(shapes, preset=preset, n_jobs=-1)
+            for resolution, ratio in (
+                ("high, eq. 7" if preset else "high, joint rounds", "explained_variance_ratio"),
+                ("low, eq. 6, as smooth", "explained_variance_ratio_low"),
+                ("low, eq. 6, as it is", "explained_variance_ratio_raw"),
+            ):
+                share = 100 * np.cumsum(study["pca"][ratio].values)
+                row = ", ".join(f"{share[c - 1]:.1f} % by {c}" for c in (1, 3, 5, 10))
+                say(f"{what}, preset {preset}, {resolution}: {row}")
 
 
 def brains(folder):
@@ -172,6 +192,127 @@ def heads(folder):
         say(f"  {other} in both: {gap(before.sel(shape=other).values, d.sel(shape=other).values)}")
 
 
+def cortex(X, T, mirror=False):
+    """A hemisphere as a clean mesh; a right one mirrored, so that it is like the left ones."""
+    if mirror:
+        X, T = X * [-1, 1, 1], T[:, ::-1]
+    return s4a.clean(as_dataset(X, T, {"unit": "mm"}))
+
+
+def hemispheres(folder):
+    """Left and mirrored right hemispheres: meshes, and labels of the left numbers, by atlas."""
+    meshes, labels = {}, {"aparc": {}, "aal": {}}
+    for name, file in (("fsa5", "fsa5"), ("conte69", "conte69_32k")):
+        with np.load(folder / "brains" / f"labels_{name}_lh_then_rh.npz") as arrays:
+            aparc = arrays["aparc"]
+        for side, mirror in (("lh", False), ("rh", True)):
+            X, T = s4a.read_mesh(folder / "brains" / f"{file}_{side}.gii")
+            meshes[f"{name}_{side}"] = cortex(X, T, mirror)
+            own = aparc[len(X) :] - 35 * (aparc[len(X) :] > 0) if mirror else aparc[: len(X)]
+            labels["aparc"][f"{name}_{side}"] = own
+    X, T = s4a.read_mesh(folder / "brains" / "civet.ply")
+    aal, n = np.load(folder / "brains" / "civet_labels.npy"), len(X) // 2
+    for side, part in (("lh", slice(0, n)), ("rh", slice(n, None))):
+        inside = (T >= n).all(axis=1) if side == "rh" else (T < n).all(axis=1)
+        meshes[f"civet_{side}"] = cortex(X[part], T[inside] - (part.start), side == "rh")
+        labels["aal"][f"civet_{side}"] = aal[part] - (aal[part] > 0) * (side == "rh")
+    X, T = s4a.read_mesh(DATA / "brain_individuals" / "pycortex_S1" / "pia_lh.gii")
+    meshes["S1_lh"] = cortex(X, T)
+    for of_atlas in labels.values():
+        for name, label in of_atlas.items():
+            of_atlas[name] = labels_of_mesh(label, meshes[name])
+    return meshes, labels
+
+
+def template(folder):
+    """Fig. 6: a template with 35 or 39 labels, none of the collection, carried by both ways of 6.2.
+
+    The collection are the other hemispheres; of those that have the same atlas the labels are
+    known.
+    """
+    meshes, labels = hemispheres(folder)
+    for name, atlas in (("conte69_lh", "aparc"), ("civet_lh", "aal")):
+        others = {other: mesh for other, mesh in meshes.items() if other != name}
+        known = [other for other in others if other in labels[atlas]]
+        source, label = meshes[name], labels[atlas][name]
+        say(
+            f"{name}, {source.sizes['vertex']} vertices, {len(np.unique(label)) - 1} labels; "
+            f"collection: {', '.join(others)}"
+        )
+        found = {"nearest vertex after ICP": {}}
+        for other in known:
+            R, t = icp_motion(source, others[other])
+            tree = cKDTree(source["position"].values @ R.T + t)
+            near = tree.query(others[other]["position"].values)[1]
+            found["nearest vertex after ICP"][other] = label[near]
+        for preset in (None, "paper"):
+            begin = time.process_time()
+            pairs = s4a.register_pairs(
+                source, {n: others[n] for n in known}, name=name, preset=preset
+            )
+            pairwise = s4a.transfer_labels(pairs, label)
+            between = time.process_time()
+            study = s4a.analyse(others, n_jobs=1, preset=preset)
+            made = time.process_time()
+            through = s4a.transfer_labels(study, label, source=source, targets=known)
+            end = time.process_time()
+            median = study["latent"].attrs["median"]
+            for way, tree in (("pairwise", pairwise), (f"through {median}", through)):
+                found[f"{way}, preset {preset}"] = {n: tree[n]["label"].values for n in known}
+            say(
+                f"preset {preset}: CPU s pairwise {between - begin:.0f} for {len(known)} shapes, "
+                f"the study {made - between:.0f}, through its median {end - made:.0f}"
+            )
+        for way, carried in found.items():
+            rows = []
+            for other in known:
+                own, area = labels[atlas][other], vertex_areas(*as_arrays(others[other]))
+                right = metrics.label_accuracy(carried[other], own, area)
+                rows.append(
+                    (right, np.mean(list(metrics.dice(carried[other], own, area).values())))
+                )
+            each = ", ".join(
+                f"{n} {100 * right:.1f} %" for n, (right, _) in zip(known, rows, strict=True)
+            )
+            say(f"  {way}: right on {each}; mean Dice {np.mean(rows, axis=0)[1]:.3f}")
+
+
+def points(folder):
+    """Fig. 7: 51 expert landmarks of a skull that is none of the collection, by both ways of 6.2.
+
+    Each of five skulls in turn is the template of the four others.
+    """
+    files = sorted((folder / "skulls").glob("*.ply"))
+    meshes = {f.stem: s4a.read_shape(f) for f in files}
+    marks = {f.stem: read_landmarks(f.with_suffix(".mrk.json")) for f in files}
+    error = {"nearest surface point after ICP": [], "pairwise": [], "through the median": []}
+    for name, source in meshes.items():
+        others = {other: mesh for other, mesh in meshes.items() if other != name}
+        study = s4a.analyse(others, n_jobs=1)
+        pairs = s4a.register_pairs(source, others, name=name)
+        ways = {
+            "pairwise": s4a.transfer_landmarks(pairs, marks[name]),
+            "through the median": s4a.transfer_landmarks(study, marks[name], source=source),
+        }
+        for other, mesh in others.items():
+            true = marks[other]["landmark_position"].values
+            R, t = icp_motion(source, mesh)
+            X, T = as_arrays(mesh)
+            moved = marks[name]["landmark_position"].values @ R.T + t
+            found = {
+                "nearest surface point after ICP": interpolate(X, T, *closest_point(moved, X, T))
+            }
+            found |= {way: tree[other]["landmark_position"].values for way, tree in ways.items()}
+            for way, places in found.items():
+                error[way].append(np.linalg.norm(places - true, axis=1))
+    for way, values in error.items():
+        values = np.stack(values)
+        say(
+            f"{way}: mean {values.mean():.3f} mm, median {np.median(values):.3f}, "
+            f"{values.shape[0]} ordered pairs"
+        )
+
+
 def ellipsoids():
     X, T = as_arrays(synthetic.ellipsoid(900))
     score = np.array([-1.9, -1.1, -0.6, -0.2, 0.1, 0.4, 0.9, 1.2, 1.2])
@@ -268,20 +409,23 @@ def groups():
     )
 
 
+OF = {"template": "brains", "points": "skulls", "variance": "faces"}  # collections of these parts
+
 if __name__ == "__main__":
     chosen = sys.argv[1:] or [
         "ellipsoids",
         "groups",
-        *(["brains", "skulls", "faces", "heads"] if DATA.is_dir() else []),
+        "variance",
+        *(["brains", "skulls", "faces", "heads", "template", "points"] if DATA.is_dir() else []),
     ]
     for name in chosen:
         say(f"\n{name}")
-        if name in ("ellipsoids", "groups"):
+        if name in ("ellipsoids", "groups") or not DATA.is_dir():
             globals()[name]()
             continue
         with tempfile.TemporaryDirectory() as folder:
             subprocess.run(
-                [sys.executable, DATA / "unpack.py", folder, name],
+                [sys.executable, DATA / "unpack.py", folder, OF.get(name, name)],
                 check=True,
                 stdout=subprocess.DEVNULL,
             )
