@@ -231,6 +231,20 @@ ROWS = {
     "landmark_reference": ("landmark xyz", ONE,
         "point of the unit sphere that the landmark is the image of"),
     # the comparison (Table 1, Fig. 3, Table 2)
+    "way_match": ("way vertex", ONE,
+        "on each vertex of the target, the vertex of the source that the method matches"),
+    "way_reverse": ("way source_vertex", ONE,
+        "on each vertex of the source, the vertex of the target that the method matches"),
+    "way_image": ("way vertex xyz", INPUT, "where the method puts a vertex of the target"),
+    "way_area": ("way vertex", ONE,
+        "log of the vertex's share of the area after and before the method moves it"),
+    "way_fmap": ("way mode_target mode_source", ONE,
+        "refined functional map of the method, source functions to target functions"),
+    "way_fmap_initial": ("way mode_target_initial mode_source_initial", ONE,
+        "first functional map of the method"),
+    "way_error": ("way vertex", SHARE, "distance in a straight line of image and true position"),
+    "true_position": ("vertex xyz", INPUT, "where the vertex truly lies on the source"),
+    "true_match": ("vertex", ONE, "vertex of the source nearest to there, -1 where unknown"),
     "block_seconds": ("way pair block", "s", "CPU time of the block, of one core"),
     "collection_chamfer": ("way how shape", SHARE,
         "Chamfer distance of the shape and the image of the template (eq. 9)"),
@@ -306,8 +320,11 @@ POINTS_INTO = {
     "local_sample": "vertex",
     "registered_match": "original_vertex",
     "template_triangle": "triangle",
+    "way_match": "source_vertex",
+    "way_reverse": "vertex",
+    "true_match": "source_vertex",
 }
-NOWHERE = {"vertex_of_file", "sample_vertex"}
+NOWHERE = {"vertex_of_file", "sample_vertex", "true_match"}
 
 
 def variable(name: str, data: ArrayLike, **attrs: str | float | list[str]) -> xr.Variable:

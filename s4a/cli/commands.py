@@ -341,9 +341,9 @@ def compare(args: Namespace) -> int:
 
 def compare_collection(args: Namespace) -> tuple[xr.Dataset, list[str], np.ndarray, str]:
     """Table 2: the result, names of the bars of Fig. 3, their seconds by block, and a text."""
-    if args.paths or args.truth or args.landmarks:
+    if args.paths or args.truth or args.landmarks or args.keep:
         raise ValueError(
-            "--collection takes the shapes alone: no SOURCE, TARGET, --truth or --landmarks"
+            "--collection takes the shapes alone: no SOURCE, TARGET, --truth, --landmarks or --keep"
         )
     result = comparison.collection(
         args.collection,
@@ -360,7 +360,9 @@ def compare_collection(args: Namespace) -> tuple[xr.Dataset, list[str], np.ndarr
     return result, names, seconds, tables.collection_table(result)
 
 
-def compare_pairs(args: Namespace) -> tuple[xr.Dataset, list[str], np.ndarray, str]:
+def compare_pairs(
+    args: Namespace,
+) -> tuple[xr.Dataset | xr.DataTree, list[str], np.ndarray, str]:
     """Table 1: as :func:`compare_collection`."""
     if len(args.paths) < 2:
         raise ValueError("compare needs SOURCE and TARGET, or --collection PATH...")
@@ -375,11 +377,13 @@ def compare_pairs(args: Namespace) -> tuple[xr.Dataset, list[str], np.ndarray, s
         n_coarse=args.n_coarse,
         k=args.k,
         preset=args.preset,
+        keep=args.keep,
         seed=args.seed,
     )
-    names, seconds = result["way"].values.tolist(), result["block_seconds"].mean("pair").values
-    blocks = tables.block_table(names, result["block"].values.tolist(), seconds)
-    return result, names, seconds, f"{tables.comparison_table(result)}\n\n{blocks}"
+    found = result["metrics"].to_dataset() if isinstance(result, xr.DataTree) else result
+    names, seconds = found["way"].values.tolist(), found["block_seconds"].mean("pair").values
+    blocks = tables.block_table(names, found["block"].values.tolist(), seconds)
+    return result, names, seconds, f"{tables.comparison_table(found)}\n\n{blocks}"
 
 
 def truth_of(files: list[str] | None, targets: dict) -> dict[str, np.ndarray] | None:

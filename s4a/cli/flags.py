@@ -221,6 +221,8 @@ def _compare(add):
         "Slicer .mrk.json, CSV or MeshLab .pp"
     )
     add("--landmarks", nargs="+", metavar="FILE", help=text)
+    text = "meshes, matches and maps are in compare.nc, too, for the panel that shows them"
+    add("--keep", action="store_true", help=text)
     add("--out", default="compare", metavar="DIR", help="for compare.nc and compare.png")
     add_options(add, ["n_coarse", "n_pairs", "k", "preset", "seed"])
 

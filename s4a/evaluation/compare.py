@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
@@ -25,18 +26,20 @@ from s4a.evaluation.methods import (
     OUR_METHODS,
     PAPER_METHODS,
     Matches,
+    Outcome,
     Pair,
     Spaces,
 )
 from s4a.geometry.align import align, motion_between, realign
+from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.input.bounded import content, npy
 from s4a.input.collection import read_shape, read_shapes
 from s4a.input.raw import shown, text_of
 from s4a.method import latent, median, network
 from s4a.method.first_map import map_after_motion
-from s4a.method.register import latent_functions, match_functions, match_low
+from s4a.method.register import latent_functions, log_area_ratio, match_functions, match_low
 from s4a.method.shape import Basis, Shape
-from s4a.schema import check_count, dataset, require, variable
+from s4a.schema import check_count, check_switch, dataset, require, variable
 from s4a.study.options import PRESETS as STUDY_PRESETS
 from s4a.study.options import Options, apply_preset
 
@@ -212,9 +215,10 @@ def pairs(
     sharpen: int | None = None,
     init: str | None = None,
     n_geodesic: int = 1000,
+    keep: bool = False,
     seed: int = 0,
-) -> xr.Dataset:
-    """The five pair methods of Table 1, and two of ours, on the same cleaned input.
+) -> xr.Dataset | xr.DataTree:
+    """The five pair methods of Table 1, and three of ours, on the same cleaned input.
 
     kNN: nearest neighbour in space after rigid alignment.  ZO: from that match, ZoomOut at full
     resolution.  FMAP+ZO: functional map fitted on landmarks at full resolution, then ZoomOut.
@@ -222,8 +226,9 @@ def pairs(
     low-resolution mesh, and eq. 4 with U Phi, as ``s4a.match_pair(..., preset="paper")``.
 
     Ours are RE-MATCH lifted: with the eigenfunctions of :mod:`s4a.method.lift` in the place of
-    U Phi, and the last two rounds of ZoomOut look among all vertices of the source; and joint:
-    joint rounds after RE-MATCH.
+    U Phi, and the last two rounds of ZoomOut look among all vertices of the source; joint: joint
+    rounds after RE-MATCH, of which the matched vertices are compared, as of all others; and joint
+    surface: the same, of which the registered surface is.
 
     Parameters
     ----------
@@ -261,16 +266,22 @@ def pairs(
         landmarks, as pyFM has them.
     n_geodesic : int
         See :func:`s4a.evaluation.metrics.evaluate`.
+    keep : bool
+        Whether the meshes, matches and maps are returned, too, as
+        :class:`s4a.widgets.Comparison` shows them: some 30 bytes a vertex and method.
     seed : int
 
     Returns
     -------
-    Dataset
+    Dataset, or DataTree with `keep`
         Every metric of :func:`s4a.evaluation.metrics.evaluate` over ``(way, pair)``, ``way`` the
         method, and ``block_seconds(way, pair, block)``, the blocks of Fig. 3, in CPU seconds of one
         core.  What two methods share, as the alignment or a basis, is made once and charged to
         both; the alignment only to those that use it, which with given landmarks are kNN, ZO and
         the joint rounds.
+
+        With `keep` this is ``/metrics`` of a tree, whose ``/source`` is the source's mesh and
+        ``/pairs/<pair>`` the target's, with what :func:`kept` says.
 
     Raises
     ------
@@ -294,8 +305,11 @@ def pairs(
     in_memory = isinstance(source, xr.Dataset)
     if any(isinstance(target, xr.Dataset) != in_memory for target in targets.values()):
         raise ValueError("source and targets need to be all paths or all Datasets")
+    check_switch("keep", keep)
+    if keep and any("/" in str(name) for name in targets):
+        raise ValueError(f"with keep=True names of pairs hold no '/'; found {', '.join(targets)}")
     options = {"k_init": k_init, "k": k, "step": step} | settings
-    rows = []
+    rows, nodes = [], {}
     with threadpool_limits(1):
         mesh, load_source = load_mesh(source, "source")
         M = Spaces(mesh, n_coarse, k, seed)
@@ -314,10 +328,79 @@ def pairs(
             if truth is not None and not in_memory:
                 true = truth_in_meshes(true, M.mesh, N.mesh)
             load = load_source + load_target
-            rows.append(metrics_of_pair(M, N, methods, vertices, load, true, n_geodesic, options))
+            row, outcomes = metrics_of_pair(
+                M, N, methods, vertices, load, true, n_geodesic, options
+            )
+            rows.append(row)
+            if keep:
+                nodes[f"pairs/{name}"] = kept(M.mesh, N.mesh, outcomes, true)
     table = xr.concat(rows, "pair", combine_attrs="drop_conflicts")
     attrs = options | {"n_coarse": n_coarse, "seed": seed}
-    return table.assign_coords(pair=list(targets)).transpose("way", "pair", ...).assign_attrs(attrs)
+    table = table.assign_coords(pair=list(targets)).transpose("way", "pair", ...)
+    table = table.assign_attrs(attrs)
+    if not keep:
+        return table
+    return xr.DataTree.from_dict({"metrics": table, "source": without_coords(M.mesh), **nodes})
+
+
+def without_coords(mesh: xr.Dataset) -> xr.Dataset:
+    """A mesh without the coordinates that it has of a tree, which may not be those of another."""
+    return mesh.drop_vars(list(mesh.coords))
+
+
+def kept(
+    source: xr.Dataset, target: xr.Dataset, outcomes: dict[str, Outcome], truth: ArrayLike | None
+) -> xr.Dataset:
+    """The target's mesh, and what every method found on it.
+
+    Returns
+    -------
+    Dataset
+        ``way_match(way, vertex)``, ``way_image(way, vertex, xyz)``, where the vertices of the
+        target lie on the source, in its unit, ``way_reverse(way, source_vertex)``, the match the
+        other way, and ``way_area(way, vertex)``, the log area ratio of
+        :func:`s4a.method.register.log_area_ratio`; where a method of them has maps, ``way_fmap(way,
+        mode_target, mode_source)`` and ``way_fmap_initial``, NaN for the others; with truth
+        ``true_position(vertex, xyz)``, ``true_match(vertex)`` and ``way_error(way, vertex)``, the distance to it in a
+        straight line as a share of sqrt(area), NaN where it is unknown.
+    """
+    X, T = as_arrays(source)
+    Y, S = as_arrays(target)
+    images = [X[one.match] if one.image is None else one.image for one in outcomes.values()]
+    found = {
+        "way_match": np.stack([one.match.astype(np.int32) for one in outcomes.values()]),
+        "way_reverse": np.stack([one.reverse.astype(np.int32) for one in outcomes.values()]),
+        "way_image": np.stack(images).astype(np.float32),
+        "way_area": np.stack([log_area_ratio(image, Y, S) for image in images]).astype(np.float32),
+    }
+    if any(one.fmap is not None for one in outcomes.values()):
+        found["way_fmap"] = stacked([one.fmap for one in outcomes.values()])
+        found["way_fmap_initial"] = stacked([one.first for one in outcomes.values()])
+    if truth is not None:
+        true, vertex = metrics.true_positions(truth, X, len(Y))
+        size = np.sqrt(vertex_areas(X, T).sum())
+        found |= {"true_position": true, "true_match": vertex.astype(np.int32)}
+        errors = [np.linalg.norm(image - true, axis=1) / size for image in images]
+        found["way_error"] = np.stack(errors).astype(np.float32)
+    return without_coords(target).merge(dataset(**found)).assign_coords(way=list(outcomes))
+
+
+def stacked(maps: list[np.ndarray | None]) -> np.ndarray:
+    """Maps as one array, with NaN where one is smaller than others or there is none.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.evaluation.compare import stacked
+    >>> stacked([None, np.eye(2)]).shape
+    (2, 2, 2)
+    """
+    sizes = [C.shape for C in maps if C is not None]
+    found = np.full((len(maps), *np.max(sizes, axis=0)), np.nan)
+    for place, C in zip(found, maps, strict=True):
+        if C is not None:
+            place[: C.shape[0], : C.shape[1]] = C
+    return found
 
 
 def landmark_vertices(given: np.ndarray, mesh: xr.Dataset, clean: bool) -> np.ndarray:
@@ -357,12 +440,12 @@ def metrics_of_pair(
     truth: np.ndarray | None,
     n_geodesic: int,
     options: dict[str, Any],
-) -> xr.Dataset:
-    """All methods on one pair: metrics and times over ``way``."""
+) -> tuple[xr.Dataset, dict[str, Outcome]]:
+    """All methods on one pair: metrics and times over ``way``, and what each has found."""
     both = Pair(source, target, landmarks, **options)
-    rows, seconds = [], []
+    rows, seconds, outcomes = [], [], {}
     for method in methods:
-        outcome = both.run(method)
+        outcome = outcomes[method] = both.run(method)
         row = metrics.evaluate(
             source.mesh,
             target.mesh,
@@ -377,7 +460,7 @@ def metrics_of_pair(
         seconds.append([spent.get(block, 0.0) for block in BLOCKS])
     table = xr.concat(rows, "way", combine_attrs="drop_conflicts")
     table["block_seconds"] = variable("block_seconds", np.array(seconds)[:, None]).isel(pair=0)
-    return table.assign_coords(way=list(methods), block=list(BLOCKS))
+    return table.assign_coords(way=list(methods), block=list(BLOCKS)), outcomes
 
 
 def collection(

@@ -3,8 +3,10 @@
 Every method works on a :class:`s4a.method.shape.Shape`: ZO and FMAP+ZO on one whose functions are
 the eigenfunctions of the dense mesh, SCALABLE on that of :mod:`s4a.method.scalable`, RE-MATCH on
 the coarse mesh with U Phi, as in the paper.  Ours are RE-MATCH lifted, with functions of
-:mod:`s4a.method.lift`, and joint, which is RE-MATCH and :mod:`s4a.method.joint` after it.  Times
-are CPU seconds of one core, so that a busy machine changes them little.
+:mod:`s4a.method.lift`, and joint, which is RE-MATCH and :mod:`s4a.method.joint` after it; its
+image are the matched vertices, as of all, and that of joint surface is the smooth surface on which
+they were looked up, which lies between them.  Times are CPU seconds of one core, so that a busy
+machine changes them little.
 """
 
 import time
@@ -18,6 +20,7 @@ import xarray as xr
 from scipy.spatial import cKDTree
 
 from s4a.geometry.align import Motion, align, farthest_points
+from s4a.geometry.closest import match_surfaces
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.method import fmap, joint
 from s4a.method.first_map import landmarks_after_motion, nearest_after_motion
@@ -36,7 +39,7 @@ from s4a.method.shape import Basis, Shape
 from s4a.method.spectral import eigenpairs, spectrum
 
 PAPER_METHODS = ("kNN", "ZO", "FMAP+ZO", "SCALABLE", "RE-MATCH")
-OUR_METHODS = ("RE-MATCH lifted", "joint")
+OUR_METHODS = ("RE-MATCH lifted", "joint", "joint surface")
 METHODS = (*PAPER_METHODS, *OUR_METHODS)
 OLD_NAMES = {"RE-MATCH joint": "joint"}
 # the shape of Spaces whose functions a method compares; joint rounds begin with RE-MATCH's match
@@ -47,6 +50,7 @@ KINDS = {
     "RE-MATCH": "coarse",
     "RE-MATCH lifted": "lifted",
     "joint": "coarse",
+    "joint surface": "coarse",
 }
 BLOCKS = (
     "load and clean",
@@ -186,6 +190,8 @@ class SpectralMatch(NamedTuple):
     match: np.ndarray  # (n_target,)
     functions: tuple[np.ndarray, np.ndarray]  # at all vertices, of source and target
     low_match: np.ndarray  # (n_low_target,)
+    first: np.ndarray  # (k_init, k_init), the first map
+    fmap: np.ndarray  # (k, k), the refined one
     seconds: dict[str, float]
 
 
@@ -196,6 +202,8 @@ class Outcome(NamedTuple):
     image: np.ndarray | None  # (n_target, 3), where the method gives more than vertices
     reverse: np.ndarray  # (n_source,), the match the other way
     seconds: dict[str, float]
+    first: np.ndarray | None = None  # (k_init, k_init), the first map where there is one
+    fmap: np.ndarray | None = None  # (k, k), the refined one
 
 
 @dataclass
@@ -231,7 +239,8 @@ class Pair:
         clock = Clock()
         remeshed = KINDS.get(method) in ("coarse", "lifted")
         motion, landmarks, align_seconds = self.align_remeshed if remeshed else self.align_spread
-        aligned = self.landmarks is None or method in ("kNN", "ZO", "joint")
+        registers = method.startswith("joint")
+        aligned = self.landmarks is None or method in ("kNN", "ZO") or registers
         if aligned:
             clock.add("align", align_seconds)
         if not remeshed and (aligned or method == "FMAP+ZO"):
@@ -244,18 +253,21 @@ class Pair:
             )
             return Outcome(match, None, reverse, clock.seconds)
 
-        start = "RE-MATCH" if method == "joint" else method
+        start = "RE-MATCH" if registers else method
         spectral = self.match_spectrally(start, motion, landmarks)
         for block, seconds in spectral.seconds.items():
             clock.add(block, seconds)
-        if method == "joint":
-            match, image = self.refine_jointly(spectral, motion, clock)
-            reverse = cKDTree(image).query(self.source.mesh["position"].values)[1]
+        if registers:
+            match, image, reverse, seconds = self.registered
+            for block, spent in seconds.items():
+                clock.add(block, spent)
+            image = image if method == "joint surface" else None
             return Outcome(match, image, reverse, clock.seconds)
         M, N = self.shapes(method)
         F, G = spectral.functions
         reverse = nearest_in_cells(F, M.cell, G, N.cell)[0]
-        return Outcome(spectral.match, None, reverse, clock.seconds)
+        maps = spectral.first, spectral.fmap
+        return Outcome(spectral.match, None, reverse, clock.seconds, *maps)
 
     def shapes(self, method: str) -> tuple[Shape, Shape]:
         """Source and target in the functions of a method."""
@@ -317,6 +329,7 @@ class Pair:
             # other searches follow, so that near ties do not matter
             "lifted": lambda Q, D: nearest_float32(as_queries(Q), as_candidates(D)),
         }[kind]
+        first = C
         C, low_match = clock(
             "refine", fmap.zoomout, M.low, N.low, C, self.k, step=self.step, nearest=nearest
         )
@@ -328,11 +341,18 @@ class Pair:
         match = low_match
         if kind != "dense":
             match, *_ = clock("full resolution", nearest_in_cells, G, N.cell, F, M.cell)
-        return SpectralMatch(match, (F, G), low_match, clock.seconds)
+        return SpectralMatch(match, (F, G), low_match, first, C, clock.seconds)
 
-    def refine_jointly(self, spectral: SpectralMatch, motion: Motion, clock: Clock) -> Matches:
-        """Joint rounds after RE-MATCH: match and registered surface at full resolution."""
+    @cached_property
+    def registered(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, float]]:
+        """Joint rounds after RE-MATCH.
+
+        Match, registered surface, match the other way, and seconds.
+        """
+        clock = Clock()
         M, N = self.shapes("joint")
+        motion, landmarks, _ = self.align_remeshed
+        spectral = self.match_spectrally("RE-MATCH", motion, landmarks)
         starts = {
             "intrinsic": spectral.low_match,
             "icp": nearest_after_motion(M.low, N.low, motion),
@@ -341,4 +361,6 @@ class Pair:
         match, image, _ = clock(
             "full resolution", register_surface, M, N, tried, spectral.functions
         )
-        return match, image
+        moved = M.to_frame(image)
+        reverse = match_surfaces(M.full.X, M.full.T, moved, N.full.T)
+        return match, image, reverse, clock.seconds

@@ -427,10 +427,27 @@ def _weighted_median(values, weight):
     return values[order[np.searchsorted(total, total[-1] / 2)]]
 
 
-def _true_vertices(truth, X, n):
-    """Truth as positions ``(n.
+def true_positions(truth: ArrayLike, X: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Truth as of :func:`evaluate`, as positions and as vertices of the source.
 
-    3)`` (NaN where unknown) and vertices of the source ``(n,)`` (-1 where unknown).
+    Parameters
+    ----------
+    truth : array_like (n,) of integers, or (n, 3)
+    X : float ndarray (n_source, 3)
+    n : int
+        Vertices of the target.
+
+    Returns
+    -------
+    position : float ndarray (n, 3)
+        NaN where unknown.
+    vertex : int ndarray (n,)
+        -1 where unknown.
+
+    Raises
+    ------
+    ValueError
+        When it is neither, or names a vertex that the source does not have.
     """
     truth = np.asarray(truth)
     if truth.shape == (n,) and truth.dtype.kind in "iu":
@@ -566,7 +583,7 @@ def evaluate(
         found["bijectivity"] = bijectivity(Y, S, match, reverse, vertices=sample).mean()
     coords = {}
     if truth is not None:
-        position, vertex = _true_vertices(truth, X, len(Y))
+        position, vertex = true_positions(truth, X, len(Y))
         known = np.flatnonzero(vertex >= 0)
         if not len(known):
             raise ValueError(

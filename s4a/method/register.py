@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from s4a.geometry.align import Motion
-from s4a.geometry.closest import closest_point_in_star, feature_tree
+from s4a.geometry.closest import closest_point_in_star, feature_tree, match_surfaces
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.method import joint
 from s4a.method.deform import displacement_in_template
@@ -316,7 +316,7 @@ def register_surface(
     method = min(ends, key=lambda name: ends[name].score)
     X = joint.move(N, ends[method].warp)
     if method != "intrinsic":
-        match = joint.nearest_vertices(M, N, X)
+        match = match_surfaces(X, N.T, M.X, M.T)
     attrs |= {"method": method, "score": ends[method].score}
     return match, source.from_frame(X), attrs
 

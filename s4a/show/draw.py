@@ -348,10 +348,14 @@ def label_colors(labels: np.ndarray) -> np.ndarray:
     return palette[place.reshape(np.shape(labels)) % len(palette)]
 
 
-def position_colors(points: np.ndarray) -> np.ndarray:
-    """Colours ``(n, 3)`` that tell places apart: the coordinates as red, green and blue."""
+def position_colors(points: np.ndarray, among: np.ndarray | None = None) -> np.ndarray:
+    """Colours ``(n, 3)`` that tell places apart: the coordinates as red, green and blue.
+
+    Of places near a surface the colours are those of its points ``among``; NaN stays NaN.
+    """
     points = np.asarray(points, float)
-    low, high = points.min(0), points.max(0)
+    box = points if among is None else np.asarray(among, float)
+    low, high = box.min(0), box.max(0)
     return 0.12 + 0.83 * (points - low) / np.maximum(high - low, np.finfo(float).tiny)
 
 

@@ -23,11 +23,12 @@ LADDER = 24  # values of a slider that are kept
 LOCAL = {"picked", "hovered", "webgl", "still", "sample", "spec"}
 
 
-def panel_html(panel: ipywidgets.Box, limit: int = LIMIT) -> str:
+def panel_html(panel: Any, limit: int = LIMIT) -> str:
     """The HTML of a panel with everything in it; `limit` is that of the recorded characters."""
     page = PanelPage(panel, limit)
     return TEMPLATES.get_template("panel.html").render(
         title=panel.title,
+        wide=panel.wide,
         lacking=page.lacking(panel),
         body=page.body,
         scripts=page.scripts,
@@ -262,7 +263,8 @@ class PanelPage:
             self.scripts.setdefault(str(widget._esm), []).append(name)
             return PARTS.widget(name, state_of(widget), hidden)
         if isinstance(widget, ipywidgets.Box):
-            kind = "row" if isinstance(widget, ipywidgets.HBox) else "column"
+            kinds = {ipywidgets.HBox: "row", ipywidgets.GridBox: "grid"}
+            kind = kinds.get(type(widget), "column")
             return PARTS.box(name, kind, list(map(self.element, widget.children)), hidden)
         if isinstance(widget, ipywidgets.HTML):  # a panel's own text, which is HTML already
             return PARTS.box(name, "text", [Markup(widget.value)], hidden)

@@ -9,6 +9,7 @@ except ImportError as error:
         "run: pip install s4a[notebook]"
     ) from error
 
+from s4a.widgets.comparison import Comparison
 from s4a.widgets.correspondence import Correspondence
 from s4a.widgets.explore import Explore
 from s4a.widgets.functional import FunctionalMap
@@ -20,6 +21,7 @@ from s4a.widgets.spectrum import Spectrum
 from s4a.widgets.transfer import Transfer
 
 __all__ = [
+    "Comparison",
     "Correspondence",
     "Explore",
     "FunctionalMap",

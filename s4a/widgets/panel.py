@@ -15,6 +15,7 @@ from s4a.show.surfaces import has
 
 log = logging.getLogger(__name__)
 LAYOUT = {"max_width": "1000px", "overflow": "hidden"}
+WIDER = "1600px"  # of panels of many views
 WIDE = {"width": "340px"}
 
 
@@ -62,6 +63,14 @@ def beside(*widgets: ipywidgets.Widget) -> ipywidgets.HBox:
     return ipywidgets.HBox(widgets, layout={"flex_flow": "row wrap", "align_items": "flex-start"})
 
 
+def grid(*widgets: ipywidgets.Widget) -> ipywidgets.GridBox:
+    """Large parts of equal width, as many side by side as there is room for."""
+    for widget in widgets:
+        widget.layout.min_width = "0"
+    columns = "repeat(auto-fit, minmax(min(300px, 100%), 1fr))"
+    return ipywidgets.GridBox(widgets, layout={"grid_template_columns": columns})
+
+
 class Panel(ipywidgets.VBox):
     """A panel: subclasses build their parts in ``build``, and their callbacks are guarded.
 
@@ -78,6 +87,7 @@ class Panel(ipywidgets.VBox):
 
     needs = ()
     title = "Panel"
+    wide = False  # whether it takes more than the width of a text
     # for a saved page:
     live = ()  # groups of controls, by name, whose values it keeps; the last varies slowest
     clicks = ()  # chart, part of the mark that is clicked, and the control that it sets
@@ -91,7 +101,7 @@ class Panel(ipywidgets.VBox):
                 f"the panel {self.title} needs {', '.join(lacking)}, "
                 "which this study does not have (yet)"
             )
-        super().__init__(layout=LAYOUT)
+        super().__init__(layout=LAYOUT | ({"max_width": WIDER} if self.wide else {}))
         self.study = study
         self.message, self.failed = ipywidgets.HTML(), False
         self.children = [*self.build(**options), self.message]

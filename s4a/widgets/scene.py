@@ -129,6 +129,8 @@ class Scene(View):
     radius = traitlets.Float(0.0).tag(sync=True)
     link = traitlets.Bytes().tag(sync=True)
     link_values = traitlets.Bytes().tag(sync=True)
+    link_back = traitlets.Bytes().tag(sync=True)
+    link_color = traitlets.List().tag(sync=True)
     link_text = traitlets.Unicode("").tag(sync=True)
     bar = traitlets.Dict().tag(sync=True)
     title = traitlets.Unicode("").tag(sync=True)
@@ -157,7 +159,7 @@ class Scene(View):
             self._send_colors(colors, None, 0.0)
             self.radius = extent(points) / 100
             self.points = []
-            self.link = self.link_values = b""
+            self.link = self.link_values = self.link_back = b""
             if title is not None:
                 self.title = title
             self.corner = to_bytes(triangles, "uint32")
@@ -227,6 +229,37 @@ class Scene(View):
         percent = b"" if values is None else to_bytes(100 * np.asarray(values) + 0.5, "uint8")
         with self.hold_sync():
             self.link_text, self.link_values = text, percent
+            self.link = to_bytes(link, "int32")
+
+    def compare(
+        self,
+        link: np.ndarray,
+        back: np.ndarray,
+        text: str,
+        color: tuple,
+        values: np.ndarray | None = None,
+    ) -> None:
+        """Let the browser compare this view with others of the same surface and the group.
+
+        A vertex that is picked is marked on all of them, and on the view of the other surface where
+        each of them has it, in its colour; one picked there is marked on each where it has that.
+
+        Parameters
+        ----------
+        link : int ndarray (n,)
+            A vertex of the other surface for each vertex, -1 for none.
+        back : int ndarray (m,)
+            A vertex of this surface for each of the other, -1 for none.
+        text : str
+            What is said of them, with ``{here}``, ``{there}`` and ``{value}``.
+        color : tuple of 3 floats
+        values : float ndarray (n,), optional
+            What is said in percent, NaN where unknown.
+        """
+        with self.hold_sync():
+            self.link_text, self.link_color = text, list(color)
+            self.link_values = b"" if values is None else to_bytes(values, "float32")
+            self.link_back = to_bytes(back, "int32")
             self.link = to_bytes(link, "int32")
 
     def over(self, points: np.ndarray | None = None, triangles: np.ndarray | None = None) -> None:

@@ -5,7 +5,7 @@ With truth where there is any, beside pyFM.  Tables are printed as they stand in
 The real shapes are those of the shared data beside the checkout, or in a folder that
 ``--data FOLDER`` names, a folder of PLY files for each set; what is absent is skipped.  Times are
 CPU seconds of one core.  Arguments pick parts: registered, more, embedded, heads, collection, and
-of the first two the sets: ``compare.py registered faces cats``.
+of the first two the sets: ``compare.py registered faces cats``, ``compare.py more brains``.
 """
 
 import argparse
@@ -287,7 +287,7 @@ def heads(given=None):
             rows.append(
                 compare.metrics_of_pair(
                     reference, target, compare.METHODS, None, begin, None, 300, options
-                )
+                )[0]
             )
             say(f"\nTable 1, {first.stem} and {path.stem}\n")
             table_1(xr.concat(rows[-1:], "pair"))
@@ -359,23 +359,24 @@ PARTS = ("registered", "more", "embedded", "collection", "heads")
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("parts", nargs="*", metavar="PART", help=", ".join([*PARTS, *SETS]))
+    known = [*PARTS, *SETS, "brains"]
+    parser.add_argument("parts", nargs="*", metavar="PART", help=", ".join(known))
     parser.add_argument("--data", type=Path, help="a folder of meshes for each set")
     args = parser.parse_args()
-    wrong = set(args.parts) - {*PARTS, *SETS}
+    wrong = set(args.parts) - set(known)
     if wrong:
         parser.error(f"unknown parts {', '.join(wrong)}")
     parts = [part for part in args.parts if part in PARTS] or PARTS
-    sets = [name for name in args.parts if name in SETS] or SETS
+    sets = [name for name in args.parts if name in known[len(PARTS) :]] or known[len(PARTS) :]
     real = args.data is not None or DATA.is_dir()
-    if "registered" in parts and real:
-        for one in sets:
+    real_sets = [name for name in sets if name in SETS] if real else []
+    if "registered" in parts:
+        for one in real_sets:
             registered(one, SETS[one], args.data)
     if "more" in parts:
-        if real:
-            for one in sets:
-                more(registered_pairs(one, 5, args.data), one)
-        if len(sets) == len(SETS):
+        for one in real_sets:
+            more(registered_pairs(one, 5, args.data), one)
+        if "brains" in sets:
             more(embedded_pairs(100_000, 2), "synthetic brains")
     if "embedded" in parts:
         embedded()

@@ -635,6 +635,52 @@ def test_the_page_of_correspondences_follows_the_pointer_and_the_keyboard(offlin
     page.close()
 
 
+@pytest.fixture(scope="module")
+def compared():
+    """What two methods find on a pair of brains, with the truth."""
+    brains = s4a.synthetic.brains(2, 900)
+    one, two = (node.to_dataset() for node in brains["original"].children.values())
+    reference = brains["truth/brain_02/reference_point"].values
+    truth = np.asarray(s4a.synthetic.position(brains["truth"], "brain_01", reference))
+    options = {"n_coarse": 200, "k": 20, "k_init": 10, "n_geodesic": 50, "keep": True}
+    return s4a.compare.pair(one, two, truth=truth, methods=["kNN", "RE-MATCH"], **options)
+
+
+def test_the_page_of_methods_marks_a_place_in_all_views(offline, compared, tmp_path):
+    panel = widgets.Comparison(compared, methods=["kNN", "RE-MATCH", "truth"])
+    page, errors = opened(offline, saved(panel, tmp_path / "methods.html"))
+    page.wait_for_function(DRAWN)
+    for width, columns in ((1920, 4), (800, 2)):
+        page.set_viewport_size({"width": width, "height": 1000})
+        boxes = [canvas.bounding_box() for canvas in visible(page, VIEW).all()]
+        assert len(boxes) == 4
+        assert len({round(box["x"]) for box in boxes}) == columns
+        assert max(box["x"] + box["width"] for box in boxes) <= width
+    chosen(page, "colors", "error")
+    chosen(page, "way1", "truth")
+    visible(page, ".s4a-title").filter(has_text=re.compile("^truth$")).nth(1).wait_for()
+    chosen(page, "way1", "RE-MATCH")
+
+    at = cursor(visible(page, VIEW).nth(1), "ArrowRight")
+    kept = compared["pairs/pair"].dataset
+    match = [*kept["way_match"].values[:, at], kept["true_match"].values[at]]
+    views = visible(page, VIEW)
+    there = views.first.evaluate("(c) => c.view.points.map((p) => p.slice(0, 3))")
+    np.testing.assert_allclose(there, compared["source/position"].values[match], rtol=1e-5)
+    said = [text.inner_text() for text in visible(page, ".s4a-readout").all()[1:]]
+    error = 100 * kept["way_error"].values[1, at]
+    assert said[1] == f"target vertex {at} → source vertex {match[1]}, error {error:.2f} %"
+    assert said[2] == f"target vertex {at} → source vertex {match[2]}, error 0.00 %"
+
+    at = cursor(views.first, "ArrowLeft")
+    back = kept["way_reverse"].values[:, at]
+    for i in range(2):
+        there = views.nth(1 + i).evaluate("(c) => c.view.points[0].slice(0, 3)")
+        np.testing.assert_allclose(there, kept["position"].values[back[i]], rtol=1e-5)
+    assert errors == []
+    page.close()
+
+
 def test_the_page_of_a_transfer_says_what_needs_python(offline, study, tmp_path):
     page, errors = opened(offline, saved(widgets.Transfer(study), tmp_path / "transfer.html"))
     page.wait_for_function(DRAWN)

@@ -7,8 +7,24 @@ export default {
       model.save_changes();
     };
     let hovered = 0, later = 0, link = null, values = null;
+    // Views of one surface with a match each: a vertex is marked on all of them, and on the other surface in their colours.
+    const compare = (hit) => {
+      const views = [...view.camera.views], ball = (at, colour) => [...at, ...colour, model.get("radius")];
+      const here = view.fan, fans = views.filter((one) => one.fan), others = views.filter((one) => !one.fan);
+      for (const one of fans) {
+        const vertex = here ? hit.vertex : one.fan.back[hit.vertex];
+        one.points = vertex < 0 ? [] : [ball(one.at(vertex), one.fan.colour)];
+        one.readout.textContent = one.fan.say(vertex);
+      }
+      for (const one of others) {
+        if (!here) one.points = one === view ? [ball(view.at(hit.vertex), [0.9, 0.6, 0])] : [];
+        else one.points = fans.filter((fan) => fan.fan.link[hit.vertex] >= 0).map((fan) => ball(one.at(fan.fan.link[hit.vertex]), fan.fan.colour));
+      }
+      view.moved();
+    };
     // The image of a vertex on the other view of the group: marked at once, without a kernel.
     const carry = (hit) => {
+      if (hit && hit.vertex >= 0 && [...view.camera.views].some((one) => one.fan)) return compare(hit);
       if (!link || !hit || hit.vertex < 0 || hit.vertex >= link.length) return;
       const there = link[hit.vertex], radius = model.get("radius"), ball = (at) => [...at, 0.9, 0.6, 0, radius];
       const sure = values ? `, confidence ${(values[hit.vertex] / 100).toFixed(2)}` : "";
@@ -50,7 +66,14 @@ export default {
     };
     const links = () => {
       link = numbers(Int32Array, model.get("link"));
-      values = numbers(Uint8Array, model.get("link_values"));
+      const back = numbers(Int32Array, model.get("link_back"));
+      values = numbers(back ? Float32Array : Uint8Array, model.get("link_values"));
+      view.fan = back && link && {
+        link, back, colour: model.get("link_color"),
+        say: (vertex) => vertex < 0 ? "nothing is matched to this vertex" : model.get("link_text").replace("{here}", vertex)
+          .replace("{there}", link[vertex] < 0 ? "unknown" : link[vertex])
+          .replace("{value}", values && !Number.isNaN(values[vertex]) ? (100 * values[vertex]).toFixed(2) : "unknown"),
+      };
     };
     const ghosts = () => {
       const position = numbers(Float32Array, model.get("ghost_position")), corner = numbers(Uint32Array, model.get("ghost_corner"));
@@ -74,7 +97,7 @@ export default {
       still.alt = `${model.get("title")}, a still picture: this browser has no WebGL2`;
     };
     const on = {
-      "change:position": geometry, "change:color": color, "change:coordinate": color, "change:cell": color, "change:link": links, "change:link_values": links,
+      "change:position": geometry, "change:color": color, "change:coordinate": color, "change:cell": color, "change:link": links, "change:link_values": links, "change:link_back": links, "change:link_color": links, "change:link_text": links,
       "change:ghost_position": ghosts, "change:title": words,
       "change:caption": words, "change:bar": words, "change:points": words, "change:still": picture,
       "change:turn": () => view.reset(model.get("turn")),

@@ -1,0 +1,167 @@
+"""The panel of methods side by side, without a browser."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+pytest.importorskip("anywidget")
+from ipywidgets.widgets import widget as registry  # the open widgets are counted in it
+
+from s4a import compare, synthetic
+from s4a.method.register import log_area_ratio
+from s4a.show.draw import position_colors
+from s4a.widgets import Comparison
+
+METHODS = ["kNN", "RE-MATCH", "joint"]
+SMALL = {"n_coarse": 200, "k": 20, "k_init": 10, "n_geodesic": 50}
+
+
+@pytest.fixture(scope="module")
+def found():
+    """Two brains and what three methods find on the second; the last 100 truths are unknown."""
+    brains = synthetic.brains(3, 700)
+    source, *targets = (node.to_dataset() for node in brains["original"].children.values())
+    names = list(brains["original"].children)
+    truth = {}
+    for name in names[1:]:
+        reference = brains["truth"][name]["reference_point"]
+        truth[name] = np.asarray(synthetic.position(brains["truth"], names[0], reference))
+        truth[name][-100:] = np.nan
+    pairs = dict(zip(names[1:], targets, strict=True))
+    return compare.pairs(source, pairs, methods=METHODS, truth=truth, keep=True, **SMALL)
+
+
+@pytest.fixture
+def panel(found):
+    before, made = len(registry._instances), []
+
+    def make(**options):
+        made.append(Comparison(found, **options))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+    assert len(registry._instances) == before
+
+
+def floats(data):
+    return np.frombuffer(data, "<f4").reshape(-1, 3)
+
+
+def test_what_is_kept_agrees_with_the_table(found):
+    table = found["metrics"].to_dataset()
+    for name, node in found["pairs"].children.items():
+        kept, X = node.to_dataset(), found["source/position"].values
+        one = table.sel(pair=name)
+        for way in METHODS:
+            match, image = kept["way_match"].sel(way=way), kept["way_image"].sel(way=way)
+            if way != "joint":
+                np.testing.assert_allclose(image, X[match], atol=1e-4)
+            error = kept["way_error"].sel(way=way)
+            assert float(error.mean()) == pytest.approx(one["straight_error"].sel(way=way).item())
+            Y, T = kept["position"].values, kept["corner_vertex"].values
+            expected = log_area_ratio(image.values.astype(float), Y, T)
+            np.testing.assert_allclose(kept["way_area"].sel(way=way), expected, atol=1e-3)
+        assert np.isnan(kept["true_position"][-100:]).all()
+        assert (kept["true_match"][-100:] == -1).all()
+        assert np.isnan(kept["way_fmap"].sel(way=["kNN", "joint"])).all()
+        assert np.isfinite(kept["way_fmap"].sel(way="RE-MATCH")).all()
+        assert kept["way_fmap_initial"].shape == (3, 10, 10)
+
+
+def test_without_keep_there_is_the_table_alone(found):
+    source, target = found["source"].to_dataset(), found["pairs/brain_02"].to_dataset()
+    alone = compare.pair(source, target[["position", "corner_vertex"]], methods=["kNN"], **SMALL)
+    assert isinstance(alone, xr.Dataset)
+    with pytest.raises(ValueError, match="keep=True"):
+        Comparison(alone)
+
+
+def test_the_target_has_the_colours_of_the_places_where_a_method_puts_it(found, panel):
+    shown = panel(methods=["RE-MATCH", "truth"])
+    X = found["source/position"].values
+    expected = (255 * position_colors(X)).round()
+    kept = found["pairs/brain_02"].to_dataset()
+    colors = [np.frombuffer(scene.color, np.uint8).reshape(-1, 3) for scene in shown.scenes]
+    np.testing.assert_allclose(colors[0], expected, atol=1)
+    match = kept["way_match"].sel(way="RE-MATCH").values
+    np.testing.assert_allclose(colors[1], expected[match], atol=1)
+    assert (colors[2][-100:] == 153).all()  # where the truth is unknown
+    shown.colors.value = "checker"
+    assert (floats(shown.scenes[0].coordinate) == X.astype(np.float32)).all()
+    np.testing.assert_allclose(floats(shown.scenes[1].coordinate), X[match], atol=1e-4)
+    assert shown.scenes[1].cell == shown.scenes[0].cell > 0
+    shown.way0.value = "joint"
+    image = kept["way_image"].sel(way="joint").values
+    np.testing.assert_allclose(floats(shown.scenes[1].coordinate), image, atol=1e-4)
+
+
+def test_errors_have_one_scale_and_the_mean_is_told(found, panel):
+    shown = panel()
+    assert [choice.value for choice in shown.ways] == ["RE-MATCH", "joint"]
+    shown.colors.value = "error"
+    bars = [scene.bar for scene in shown.scenes[1:]]
+    assert bars[0] == bars[1]
+    mean = 100 * found["metrics/straight_error"].sel(way="joint", pair="brain_02").item()
+    assert shown.scenes[2].title == f"joint, error {mean:.2f} %"
+    shown.pair.value = "brain_03"
+    mean = 100 * found["metrics/straight_error"].sel(way="joint", pair="brain_03").item()
+    assert shown.scenes[2].title == f"joint, error {mean:.2f} %"
+    shown.colors.value = "area"
+    assert shown.scenes[1].bar["high"] == 2
+    assert shown.message.value == ""
+
+
+def test_a_point_is_marked_where_each_method_has_it(found, panel):
+    shown = panel(methods=["kNN", "joint"])
+    kept = found["pairs/brain_02"].to_dataset()
+    X, Y = found["source/position"].values, kept["position"].values
+    shown.scenes[2].picked = {"vertex": 17, "count": 1}
+    match = kept["way_match"].sel(way=["kNN", "joint"]).values[:, 17]
+    places = np.array([place[:3] for place in shown.scenes[0].points])
+    np.testing.assert_allclose(places, X[match])
+    assert shown.scenes[1].points[0][:3] == Y[17].tolist()
+    error = 100 * kept["way_error"].sel(way="joint").values[17]
+    assert shown.scenes[2].caption == (
+        f"target vertex 17 → source vertex {match[1]}, error {error:.2f} %"
+    )
+    shown.scenes[0].picked = {"vertex": 40, "count": 1}
+    back = kept["way_reverse"].sel(way="kNN").values[40]
+    assert shown.scenes[1].points[0][:3] == Y[back].tolist()
+    shown.scenes[1].picked = {"vertex": 650, "count": 1}
+    assert shown.scenes[1].caption.endswith("error unknown %")
+
+
+def test_the_browser_knows_both_ways_and_the_errors(found, panel):
+    scene = panel(methods=["RE-MATCH"]).scenes[1]
+    kept = found["pairs/brain_02"].to_dataset().sel(way="RE-MATCH")
+    assert (np.frombuffer(scene.link, "<i4") == kept["way_match"]).all()
+    assert (np.frombuffer(scene.link_back, "<i4") == kept["way_reverse"]).all()
+    np.testing.assert_array_equal(np.frombuffer(scene.link_values, "<f4"), kept["way_error"])
+
+
+def test_without_truth_there_is_no_error(found, panel):
+    source, target = found["source"].to_dataset(), found["pairs/brain_02"].to_dataset()
+    mesh = target[["position", "corner_vertex"]]
+    one = Comparison(compare.pair(source, mesh, methods=["kNN"], keep=True, **SMALL))
+    assert "error" not in [value for _, value in one.colors.options]
+    assert one.scenes[1].title == "kNN"
+    one.scenes[1].picked = {"vertex": 3, "count": 1}
+    assert "error" not in one.scenes[1].caption
+    one.close()
+
+
+def test_methods_that_are_not_there_are_refused(found):
+    with pytest.raises(ValueError, match="methods must be 1 to 7 of kNN, RE-MATCH, joint, truth"):
+        Comparison(found, methods=["ZO"])
+    with pytest.raises(ValueError, match="methods must be 1 to 7"):
+        Comparison(found, methods=["kNN"] * 8)
+
+
+def test_the_result_of_the_command_can_be_shown(found, tmp_path):
+    found.to_netcdf(tmp_path / "compare.nc", engine="h5netcdf")
+    with xr.open_datatree(tmp_path / "compare.nc", engine="h5netcdf") as opened:
+        panel = Comparison(opened, methods=["joint"])
+        assert panel.scenes[1].title.startswith("joint, error")
+        panel.close()
