@@ -361,8 +361,8 @@ def kept(
         other way, and ``way_area(way, vertex)``, the log area ratio of
         :func:`s4a.method.register.log_area_ratio`; where a method of them has maps, ``way_fmap(way,
         mode_target, mode_source)`` and ``way_fmap_initial``, NaN for the others; with truth
-        ``true_position(vertex, xyz)``, ``true_match(vertex)`` and ``way_error(way, vertex)``, the distance to it in a
-        straight line as a share of sqrt(area), NaN where it is unknown.
+        ``true_position(vertex, xyz)``, ``true_match(vertex)`` and ``way_error(way, vertex)``, the
+        distance to it in a straight line as a share of sqrt(area), NaN where it is unknown.
     """
     X, T = as_arrays(source)
     Y, S = as_arrays(target)
