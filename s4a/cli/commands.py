@@ -72,9 +72,11 @@ def run(args: Namespace) -> int:
         study = analyse(args.paths, store=args.out, **options_of(args))
     again = shlex.join(["s4a", *(word for word in args.words if word != "--keep-doubtful")])
     full = Path(args.out) / "report.txt"
-    full.write_text(tables.report_table(study["report"].to_dataset()) + "\n", encoding="utf-8")
+    report = study["report"].to_dataset()
+    lines = [tables.report_table(report), *tables.stage_lines(report)]
+    full.write_text("\n".join(lines) + "\n", encoding="utf-8")
     write(tables.run_summary(study, time.perf_counter() - begin, again=again))
-    write(f"study: {args.out}; pictures: s4a view {args.out}; every shape: {full}")
+    write("\n".join(tables.place_lines(args.out, str(full))))
     return 1 if study["report"].attrs["unforeseen"] else 0
 
 

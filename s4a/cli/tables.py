@@ -3,6 +3,7 @@
 Every function gives a text, or the cells of a row; nothing is printed or written here.
 """
 
+import shlex
 import textwrap
 from collections.abc import Iterable, Sequence
 
@@ -35,8 +36,10 @@ METRICS = {
     "label_accuracy": ("labels", 1, 3),
     "landmark_error": ("landmarks %", 100, 2),
 }
-SCREEN = 100  # columns of a summary
-MOST, MOST_REMARKS = 15, 6  # excluded shapes, and remarks, that a summary gives a line each
+SCREEN, LINES = 100, 40  # columns and lines of a summary
+LEAST, MOST_REMARKS = 5, 6  # excluded shapes at least, and remarks at most, with lines of their own
+LONGEST = 24  # letters of a name
+LARGEST = 3  # stages whose time a summary says
 TRANSFERRED = [
     "target",
     "cycle error",
@@ -69,7 +72,7 @@ def table(rows: Iterable[Sequence], head: Sequence[str], width: int = 120) -> st
     margin = sum(widths[:-1]) + 2 * (len(head) - 1)
     lines = []
     for *cells, long in rows:
-        first, *rest = textwrap.wrap(long, max(width - margin, 40)) or [""]
+        first, *rest = wrapped(long, max(width - margin, 40)) or [""]
         layout = zip([*cells, first], widths, numeric, strict=True)
         lines.append("  ".join(c.rjust(w) if n else c.ljust(w) for c, w, n in layout).rstrip())
         lines += [" " * margin + line for line in rest]
@@ -81,16 +84,44 @@ def is_number(cell: str) -> bool:
     return cell == "-" or cell.replace(".", "", 1).isdigit()
 
 
+def wrapped(text: str, width: int, indent: str = "") -> list[str]:
+    """Lines of a text, broken at blanks only: paths and words stay whole.
+
+    Examples
+    --------
+    >>> from s4a.cli.tables import wrapped
+    >>> wrapped("16 edges of zero-area triangles", 14)
+    ['16 edges of', 'zero-area', 'triangles']
+    """
+    return textwrap.wrap(
+        text,
+        width,
+        initial_indent=indent,
+        subsequent_indent=indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+
+
 def report_table(report: xr.Dataset) -> str:
-    """What was found in every shape and done about it, and what looks wrong."""
-    rows = []
+    """A row for every shape; below it what was found and done, and what looks wrong."""
+    rows, texts = [], []
     for name in report["shape"].values:
         shape = report.sel(shape=name)
         counts = [int(shape[count]) if count in shape else -1 for count in COUNTS]
         cells = ["-" if count < 0 else count for count in counts]
-        rows.append([name, *cells, shape["status"].item(), shape["reason"].item()])
-    head = ["shape", *COUNTS.values(), "status", "found and done"]
-    return "\n".join([table(rows, head), *doubts(report)])
+        rows.append([name, *cells, shape["status"].item()])
+        warning = shape["warning"].item()
+        texts.append([shape["reason"].item(), f"warning: {warning}" if warning else ""])
+    head, *lines = table(rows, ["shape", *COUNTS.values(), "status"]).splitlines()
+    whole = [head]
+    for line, below in zip(lines, texts, strict=True):
+        whole.append(line)
+        for text in below:
+            whole += wrapped(text, SCREEN, "    ")
+    for remark in report.attrs["remarks"].splitlines():
+        whole += wrapped(remark, SCREEN, "  ")
+    return "\n".join(whole)
 
 
 FAULTS = ("damaged", "missing", "stale")  # states of files without which a study does not hold
@@ -152,30 +183,52 @@ def run_summary(
         The command of the run, to which flags can be added.
     """
     report = study["report"].to_dataset()
-    lines = ["", *decision_lines(report, again), *remark_lines(report)]
-    lines += [*excluded_lines(report), *shape_lines(report), ""]
-    lines += [median_line(study["latent"].to_dataset())]
+    before = ["", *decision_lines(report, again), *remark_lines(report)]
+    after = [*shape_lines(report), "", *result_lines(study), *cost_lines(report, seconds)]
+    room = LINES - len(before) - len(after) - 6  # for the lines around them and place_lines
+    return "\n".join([*before, *excluded_lines(report, max(room, LEAST)), *after])
+
+
+def result_lines(study: xr.DataTree) -> list[str]:
+    """The median shape, how the shapes are registered, what the first modes explain."""
     registration = registration_of(study)
     confidence, round_trip, distortion = registration_cells(registration)
-    lines.append(
-        f"registered to {registration.attrs['template']}; mean confidence {confidence}, "
-        f"cycle error {round_trip} of sqrt(area), median |distortion| {distortion}"
-    )
+    (template,) = shortened([registration.attrs["template"]], LONGEST)
+    lines = [
+        median_line(study["latent"].to_dataset()),
+        f"registered to {template}; mean confidence {confidence}, "
+        f"cycle error {round_trip} of sqrt(area), median |distortion| {distortion}",
+    ]
     if "pca" in study:
         ratio = 100 * study["pca"].to_dataset()["explained_variance_ratio"].cumsum().values
         shares = [f"{ratio[c - 1]:.1f} % by {c}" for c in (1, 3, 10) if c <= len(ratio)]
         lines.append(f"variance explained: {', '.join(shares)}")
     else:
-        lines.append(f"no modes: {report.attrs['no_modes']}")
-    return "\n".join([*lines, "", *cost_lines(report, seconds)])
+        lines.append(f"no modes: {study['report'].attrs['no_modes']}")
+    return [line for text in lines for line in wrapped(text, SCREEN)]
 
 
 def cost_lines(report: xr.Dataset, seconds: float) -> list[str]:
-    """Seconds of every stage and of the whole run, and the most memory."""
-    costs = zip(report["stage"].values, report["seconds"].values, strict=True)
-    parts = ", ".join(f"{stage} {s:.1f}" for stage, s in costs)
+    """Seconds of the whole run and of the stages that took most, and the most memory."""
+    spent = dict(zip(report["stage"].values.tolist(), report["seconds"].values, strict=True))
+    most = sorted(spent, key=lambda stage: -spent[stage])[:LARGEST]
+    parts = ", ".join(f"{stage} {spent[stage]:.1f}" for stage in most)
     memory = report["peak_memory"].values.max()
-    return textwrap.wrap(f"seconds: {parts}; all {seconds:.1f}; at most {memory:.0f} MiB", SCREEN)
+    return wrapped(f"seconds: {seconds:.1f} ({parts}, ...); at most {memory:.0f} MiB", SCREEN)
+
+
+def stage_lines(report: xr.Dataset) -> list[str]:
+    """Seconds of every stage."""
+    costs = zip(report["stage"].values, report["seconds"].values, strict=True)
+    return wrapped(f"seconds: {', '.join(f'{stage} {s:.1f}' for stage, s in costs)}", SCREEN)
+
+
+def place_lines(study: str, report: str) -> list[str]:
+    """Where the study is, how to look at it, and where every shape is told of."""
+    line = f"study: {study}; pictures: s4a view {study}; every shape: {report}"
+    if len(line) <= SCREEN:
+        return [line]
+    return [f"study: {study}", f"pictures: s4a view {study}", f"every shape: {report}"]
 
 
 def decision_lines(report: xr.Dataset, again: str = "s4a run FOLDER --out STUDY") -> list[str]:
@@ -188,13 +241,46 @@ def decision_lines(report: xr.Dataset, again: str = "s4a run FOLDER --out STUDY"
     lines = [f"TO DECIDE: {n} of {report.sizes['shape']} shapes are doubtful, and {become}"]
     lines += kind_lines(decisions(report))
     if kept:
-        return [*lines, f"  to keep them apart:     {again}", ""]
+        return [*lines, *command_lines("to keep them apart:", again, "", "--keep-doubtful"), ""]
     return [
         *lines,
-        f"  to take all of them in: {again} --keep-doubtful",
-        "  to leave one out:       take its file away and run again; nothing else changes",
+        "  to leave one out: take its file away and run again; nothing else changes",
+        *command_lines("to take all of them in:", again, "--keep-doubtful"),
         "",
     ]
+
+
+def command_lines(what: str, command: str, flag: str = "", without: str = "") -> list[str]:
+    """A command for a shell, in lines that fit on the screen; in words where it is long.
+
+    Parameters
+    ----------
+    what : str
+        What it is for.
+    command : str
+        Without the flags.
+    flag, without : str
+        The flag that it gets, or one that the command of the run has and it does not.
+
+    Examples
+    --------
+    >>> from s4a.cli.tables import command_lines
+    >>> command_lines("to take all of them in:", "s4a run d --out s", "--keep-doubtful")
+    ['  to take all of them in: s4a run d --out s --keep-doubtful']
+    >>> command_lines("to take them in:", "s4a run " + 400 * "a.ply ", "--keep-doubtful")
+    ['  to take them in: the same command with --keep-doubtful']
+    """
+    words = [shlex.quote(word) for word in shlex.split(f"{command} {flag}")]
+    line, lines = f"  {what}", []
+    for word in words:
+        if len(line) + len(word) + 3 > SCREEN:  # a blank, and two for the mark of the next line
+            lines.append(f"{line} \\")
+            line = "     "
+        line += f" {word}"
+    lines.append(line)
+    if len(lines) > 3 or max(map(len, lines)) > SCREEN:
+        return [f"  {what} the same command {f'with {flag}' if flag else f'without {without}'}"]
+    return lines
 
 
 def kind_lines(found: list[Decision]) -> list[str]:
@@ -202,7 +288,8 @@ def kind_lines(found: list[Decision]) -> list[str]:
     heads = [f"{len(one.names):3} {one.kind}" for one in found]
     first = max(map(len, heads), default=0)
     room = SCREEN - first - 6 - max((len(one.remedy) for one in found), default=0)
-    names = [listed(one.names, max(room, 26)) for one in found]
+    letters = max(min(LONGEST, room - len(", 999 more")), 5)
+    names = [listed(one.names, room, letters) for one in found]
     second = max(map(len, names), default=0)
     return [
         f"{head.ljust(first)}  {few.ljust(second)}  -> {one.remedy}"
@@ -210,8 +297,8 @@ def kind_lines(found: list[Decision]) -> list[str]:
     ]
 
 
-def excluded_lines(report: xr.Dataset) -> list[str]:
-    """The shapes that could not be used, each with its reason, as many as there is room for."""
+def excluded_lines(report: xr.Dataset, most: int) -> list[str]:
+    """The shapes that could not be used, each with its reason; at most so many of them."""
     out = report.sel(shape=report["status"].values == "excluded")
     names = out["shape"].values.tolist()
     if not names:
@@ -220,15 +307,38 @@ def excluded_lines(report: xr.Dataset) -> list[str]:
         short_reason(*texts)
         for texts in zip(out["reason"].values.tolist(), out["path"].values.tolist(), strict=True)
     ]
-    shown = list(zip(shortened(names, 20), reasons, strict=True))[:MOST]
+    shown = list(zip(shortened(names, 20), reasons, strict=True))[:most]
     width = max(len(name) for name, _ in shown)
     lines = [f"{len(names)} of {report.sizes['shape']} shapes cannot be used:"]
     for name, reason in shown:
         head = f"  {name.ljust(width)}  "
-        lines += [head + text for text in shortened([reason], SCREEN - len(head))]
-    if len(names) > MOST:
-        lines.append(f"  and {len(names) - MOST} more: {listed(names[MOST:], 60)}")
+        lines.append(head + without_middle(reason, SCREEN - len(head)))
+    if len(names) > most:
+        lines.append(f"  and {len(names) - most} more: {listed(names[most:], 80)}")
     return [*lines, ""]
+
+
+def without_middle(text: str, longest: int) -> str:
+    """A text of at most so many letters: the words in the middle are left out where it has more.
+
+    Examples
+    --------
+    >>> from s4a.cli.tables import without_middle
+    >>> without_middle("one of PLY, OBJ, OFF, STL expected, found 14 bytes", 36)
+    'one of PLY, OBJ, … found 14 bytes'
+    """
+    words = text.split()
+    if len(text) <= longest or len(words) < 3:
+        return shortened([text], longest)[0]
+    first, last, room = [words[0]], [words[-1]], longest - len(words[0]) - len(words[-1]) - 3
+    rest = words[1:-1]
+    while rest and room >= 0:  # from both ends by turns
+        from_end = len(" ".join(last)) < len(" ".join(first))
+        word = rest.pop(-1 if from_end else 0)
+        room -= len(word) + 1
+        if room >= 0:
+            last, first = ([word, *last], first) if from_end else (last, [*first, word])
+    return shortened([" ".join([*first, "…", *last])], longest)[0]
 
 
 def short_reason(reason: str, path: str) -> str:
@@ -251,7 +361,7 @@ def short_reason(reason: str, path: str) -> str:
 def remark_lines(report: xr.Dataset) -> list[str]:
     """What concerns the collection, shortened, and what else looks wrong with shapes, by kind."""
     remarks = report.attrs["remarks"].splitlines()
-    lines = [f"  {line}" for line in shortened(remarks, SCREEN - 2)]
+    lines = [f"  {without_middle(line, SCREEN - 2)}" for line in remarks]
     if len(lines) > MOST_REMARKS:
         lines = [*lines[:MOST_REMARKS], f"  and {len(remarks) - MOST_REMARKS} more remarks"]
     lines += kind_lines(notices(report))
@@ -270,8 +380,10 @@ def median_line(latent: xr.Dataset) -> str:
     """The median shape, and the three shapes that are nearest to the limit shape."""
     distance = latent["distance_to_median"]
     nearest = distance.isel(shape=distance.argsort().values[:3])
-    near = ", ".join(f"{d['shape'].item()} {d.item():.4f}" for d in nearest)
-    return f"median shape: {latent.attrs['median']}; nearest to the limit shape (eq. 5): {near}"
+    names = shortened(nearest["shape"].values.tolist(), LONGEST)
+    near = ", ".join(f"{name} {d:.4f}" for name, d in zip(names, nearest.values, strict=True))
+    (median,) = shortened([latent.attrs["median"]], LONGEST)
+    return f"median shape: {median}; nearest to the limit shape (eq. 5): {near}"
 
 
 def registration_cells(registration: xr.Dataset) -> list[str]:

@@ -196,20 +196,38 @@ def _compare_genus(attrs, told, of_all):
 
 
 def _compare_intersections(evidence, told):
-    share = np.array([seen.attrs["intersecting"] for seen in evidence.values()])
-    for i, (name, seen) in enumerate(evidence.items()):
-        usual = max(float(np.median(np.delete(share, i))), 0.0)
-        if share[i] > max(CROSSING, MUCH_MORE * usual):
-            words = (
-                f"{seen.attrs['self_intersections']} triangles pass through others, "
-                f"{100 * share[i]:.1f} % (in the others {100 * usual:.1f} %); "
-                "wrap=True makes a surface that does not"
-            )
-            told[name].append(doubt("intersections", words))
+    for name, share, usual in _much_more("intersecting", CROSSING, evidence):
+        words = (
+            f"{evidence[name].attrs['self_intersections']} triangles pass through others, "
+            f"{100 * share:.1f} % (in the others {100 * usual:.1f} %); "
+            "wrap=True makes a surface that does not"
+        )
+        told[name].append(doubt("intersections", words))
+
+
+def _compare_lattices(evidence, told):
+    for name, step, usual in _much_more("lattice", LATTICE, evidence):
+        words = (
+            f"its coordinates are rounded, to {step:.2f} of an edge (in the others "
+            f"{usual:.2f}); export it with more digits"
+        )
+        told[name].append(doubt("spacing", words))
+
+
+def _much_more(attr, least, evidence):
+    """Names with more than the least and many times the usual of the others; with both numbers."""
+    values = np.array([seen.attrs[attr] for seen in evidence.values()])
+    for i, name in enumerate(evidence):
+        usual = max(float(np.median(np.delete(values, i))), 0.0)
+        if values[i] > max(least, MUCH_MORE * usual):
+            yield name, values[i], usual
 
 
 def _compare_duplicates(evidence, told):
-    """Shapes with the same numbers, which no motion, no order of vertices and no format changes."""
+    """Shapes with the same numbers, which no motion, no order of vertices and no format changes.
+
+    A reflection changes the sign of the chirality, which of a symmetric shape is none.
+    """
     chirality = [seen.attrs["chirality"] for seen in evidence.values()]
     numbers = np.column_stack([in_numbers(list(evidence.values())), chirality])
     names = list(evidence)
@@ -217,8 +235,10 @@ def _compare_duplicates(evidence, told):
     for i, j in sorted(cKDTree(numbers).query_pairs(SAME, p=np.inf)):
         first.setdefault(j, i)
     for j, i in first.items():
+        is_symmetric = abs(chirality[i] + chirality[j]) < SAME
+        mirrored = " (or its mirror image)" if is_symmetric else ""
         words = (
-            f"the same surface as {names[i]}, under two names; leave one of them out, "
+            f"the same surface as {names[i]}, under two names{mirrored}; leave one of them out, "
             "or it counts twice"
         )
         told[names[j]].append(doubt("duplicate", words))
@@ -287,17 +307,6 @@ def _compare_boundaries(evidence, told):
                 "leave it out, or close_holes=True where it only has holes"
             )
             told[name].append(doubt("partial", words))
-
-
-def _compare_lattices(evidence, told):
-    step = np.array([seen.attrs["lattice"] for seen in evidence.values()])
-    for i, name in enumerate(evidence):
-        if step[i] > max(LATTICE, MUCH_MORE * np.median(np.delete(step, i))):
-            words = (
-                f"its coordinates are rounded, to {step[i]:.2f} of an edge (in the others "
-                f"{np.median(np.delete(step, i)):.2f}); export it with more digits"
-            )
-            told[name].append(doubt("spacing", words))
 
 
 def _compare_forms(evidence, told):

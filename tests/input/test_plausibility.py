@@ -21,12 +21,17 @@ def portrait(X, T):
     return evidence.portray(clean(as_dataset(X, T)), intersections=False)
 
 
-def told(portraits):
-    """Name -> kinds, doubtful ones with an exclamation mark, and the remarks."""
+def doubts_of(portraits):
+    """Name -> doubts, and the remarks."""
     chosen = {name: portraits[name] for name in evidence.pick_references(portraits)}
     seen = {name: evidence.compare(name, one, chosen) for name, one in portraits.items()}
     attrs = {name: {"area": one.attrs["surface"]} for name, one in portraits.items()}
-    found, remarks = plausibility.find_warnings(attrs, seen)
+    return plausibility.find_warnings(attrs, seen)
+
+
+def told(portraits):
+    """Name -> kinds, doubtful ones with an exclamation mark, and the remarks."""
+    found, remarks = doubts_of(portraits)
     kinds = {n: [one.kind + "!" * one.doubtful for one in doubts] for n, doubts in found.items()}
     return {name: words for name, words in kinds.items() if words}, remarks
 
@@ -50,6 +55,16 @@ def test_each_oddity_is_told_of_the_shape_that_has_it_and_of_no_other(portraits,
         "duplicate!": lambda: (SHAPES["s1"][0][:, [1, 2, 0]] + 50, SHAPES["s1"][1]),
     }[kind]
     assert told(portraits | {"s3": portrait(*odd())}) == ({"s3": [kind]}, [])
+
+
+def test_of_a_symmetric_shape_a_copy_may_be_the_mirror_image_and_that_is_said(portraits):
+    X, T = faulty.SPHERE
+    pairs = {"s3": SHAPES["s1"], "e1": (X * [30, 40, 60], T), "e2": mirrored(X * [30, 40, 60], T)}
+    found, _ = doubts_of(portraits | {name: portrait(*mesh) for name, mesh in pairs.items()})
+    words = {n: one.words for n in found for one in found[n] if one.kind == "duplicate"}
+    assert list(words) == ["s3", "e2"]
+    assert words["s3"].startswith("the same surface as s1, under two names; ")
+    assert words["e2"].startswith("the same surface as e1, under two names (or its mirror image)")
 
 
 def test_a_turned_shape_is_not_told_as_the_alignment_turns_it(portraits):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from s4a import analyse, explore, insert, latent_match, open_study, statistics, synthetic
 from s4a.cli import tables
@@ -170,5 +171,35 @@ def test_the_summary_begins_with_what_to_decide_and_fits_on_a_screen(study):
     assert lines[1].startswith("TO DECIDE: 2 of 8 shapes are doubtful")
     assert lines[2].startswith("  2 unit  a_metre, z_inch  -> scale the files")
     assert any("s4a run d --out s --keep-doubtful" in line for line in lines)
-    assert len(lines) <= 50
-    assert max(map(len, lines)) <= 110
+    assert len(lines) < 40
+    assert max(map(len, lines)) <= 100
+
+
+def test_a_summary_of_many_doubts_long_names_and_long_commands_fits_on_a_screen_too(study):
+    report = study["report"].to_dataset()
+    n = 60
+    names = [f"{i:03d}_{'of_a_very_long_name_' * 4}" for i in range(n)]
+    kinds = ["unit", "size", "mirrored", "partial", "kind", "duplicate", "registration"]
+    status = np.array(["doubtful", "excluded", "ok"])[np.arange(n) % 3]
+    reason = "cannot be read as mesh: one of PLY, OBJ, OFF, STL, VTK, GIFTI expected, found 7 bytes"
+    many = report.isel(shape=np.arange(n) % 5).assign_coords(shape=names)
+    many = many.assign(
+        status=("shape", status),
+        reason=("shape", [reason + 40 * " more" if one == "excluded" else "" for one in status]),
+        path=("shape", [f"folder/{name}.ply" for name in names]),
+        doubtful_kinds=("shape", [kinds[i % 7] if i % 3 == 0 else "" for i in range(n)]),
+        warning_kinds=("shape", [["genus", "spacing", "dropped"][i % 3] for i in range(n)]),
+    ).assign_attrs(remarks="\n".join(9 * ["a remark of many words " * 20]))
+    other = study.copy()
+    other["report"] = xr.DataTree(many)
+    long = f"s4a run {' '.join(f'/data/scans/{name}.ply' for name in names)}"
+    for again, shown in (("s4a run 'my scans' --out s" + 9 * " --k-init 12", 1), (long, 0)):
+        text = tables.run_summary(other, 1.0, again=again)
+        assert "TO DECIDE: 20 of 60" in text
+        assert "20 of 60 shapes cannot be used" in text
+        assert all(f" {kind} " in text for kind in kinds)
+        assert max(map(len, text.splitlines())) <= 100
+        assert len(text.splitlines()) <= 50
+        assert text.count("s4a run 'my scans'") == shown
+        assert ("the same command with --keep-doubtful" in text) != shown
+    assert {*names, *reason.split()} <= set(tables.report_table(many).split())
