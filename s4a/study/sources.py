@@ -1,5 +1,6 @@
 """The shapes that an analysis is given (5.1, the data), each with the key of its content."""
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -7,7 +8,7 @@ import xarray as xr
 
 from s4a.geometry.mesh import as_dataset
 from s4a.input.files import check_names, find_meshes
-from s4a.input.raw import read_bytes
+from s4a.input.raw import read_bytes, shown
 from s4a.input.subjects import listed
 from s4a.schema import require
 from s4a.study.store import read, task_key
@@ -30,6 +31,8 @@ def find_sources(shapes: Collection, pattern: str | None = None) -> Sources:
     ------
     ValueError
         When there is no shape, or a name or a mesh that cannot be used.
+    OSError
+        When a file has gone while all were looked at.
 
     Examples
     --------
@@ -46,7 +49,11 @@ def find_sources(shapes: Collection, pattern: str | None = None) -> Sources:
         shapes = {name: node.to_dataset() for name, node in shapes["original"].children.items()}
     if not isinstance(shapes, dict):
         files = sorted((name, path) for path, name in find_meshes(shapes, pattern))
-        return {name: (str(path), content_of_file(path)) for name, path in files}
+        found = {name: (str(path), content_of_file(path)) for name, path in files}
+        for _, path in files:  # an unmounted folder is not one of unreadable files
+            if not os.path.lexists(path):
+                raise OSError(f"{shown(path)} has gone since the run began: start it again")
+        return found
     check_names(shapes)
     meshes = {
         name: mesh if isinstance(mesh, xr.Dataset) else as_dataset(*mesh)

@@ -2,6 +2,10 @@
 
 Synthetic brains, and real collections where the shared data are beside the checkout; the first
 four, on which the thresholds were chosen, and others. ``plausibility.py [COLLECTION ...]``.
+
+``plausibility.py registrations [COLLECTION ...]`` registers shapes of known correspondence, one
+template to the others of its collection, once as by default and once from first maps of 10
+landmarks, which fail in far poses; and counts of which failed registrations a run would tell.
 """
 
 import subprocess
@@ -17,6 +21,7 @@ import xarray as xr
 import s4a
 from s4a.geometry.mesh import as_arrays, as_dataset, triangle_areas, vertex_areas
 from s4a.input import evidence, plausibility
+from s4a.study.doubts import doubtful
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 CHOSEN_ON = ("brains", "cats", "faces", "bodies 0-9")
@@ -33,6 +38,18 @@ FILES = {  # collection: folder, those of its sorted files
 }
 KINDS = ("brains", "cats", "femurs", "vertebrae")  # planted in the others
 BASES = 1  # shapes of each collection that every oddity is planted in
+PAIRS = {  # folder, the files of a collection, and the places of its templates among these
+    "bodies 0-9": ("faust", list(range(10)), (0,)),
+    "bodies 0 and 10-19": ("faust", [0, *range(10, 20)], (0,)),
+    "cats": ("cats", list(range(11)), (0,)),
+    "bodies 10-19": ("faust", list(range(10, 20)), (0, 3, 6)),
+    "remeshed bodies": ("faust15k", list(range(10)), (0, 5)),
+    "children": ("kids", list(range(6)), (0, 3)),
+}
+PAIRS_CHOSEN_ON = tuple(PAIRS)[:3]  # as are the thresholds of s4a.study.doubts
+CORRESPONDING = {"faust15k": 6890}  # of these only the first vertices correspond
+WAYS: dict[str, dict] = {"as by default": {}, "10 landmarks": {"init": "landmarks"}}
+RIGHT, FAILED = 3.0, 4.0  # % of sqrt(area): a registration below and above, by its mean error
 
 
 def hippocampi(most=12):
@@ -209,6 +226,73 @@ def clean_brains():
     sys.stdout.write(f"told of {sum(n for n, _ in sizes)} brains of other seeds: {told}\n")
 
 
+def error_of(template, shape, match, known):
+    """Mean distance of matched and true vertices, % of sqrt(area); the files have one numbering."""
+    row = template["file_vertex"].values
+    became = shape["vertex_of_file"].values
+    true = np.where(row < known, became[np.minimum(row, known - 1)], -1)
+    X, there = shape["position"].values, true >= 0
+    missed = np.linalg.norm(X[match[there]] - X[true[there]], axis=1)
+    return 100 * missed.mean() / np.sqrt(shape.attrs["area"])
+
+
+def registered(name, folder, at, way):
+    """Of every other shape of a collection: error, badness, mean |distortion|, what is told."""
+    part, numbers, _ = PAIRS[name]
+    files = sorted((folder / part).glob("*.ply"))
+    shapes = {files[i].stem: s4a.read_shape(files[i]) for i in numbers}
+    template = shapes.pop(files[numbers[at]].stem)
+    study = s4a.register_pairs(template, shapes, both=False, n_coarse=3000, n_jobs=1, **WAYS[way])
+    found = study["registration"].to_dataset().load()
+    badness = dict(zip(shapes, found["badness"].sel(shape=list(shapes)).values, strict=True))
+    size = abs(found["distortion"].sel(shape=list(shapes))).mean("vertex").values
+    distortion = dict(zip(shapes, size.tolist(), strict=True))
+    of_shapes, of_all = doubtful(badness, distortion)
+    for other, mesh in shapes.items():
+        known = CORRESPONDING.get(part, mesh.sizes["file_vertex_index"])
+        match = found["registered_match"].sel(shape=other).values
+        told = "doubtful" if of_all or any(one.doubtful for one in of_shapes.get(other, [])) else ""
+        told = told or ("warning" if other in of_shapes else "")
+        error = error_of(template, mesh, match, known)
+        sys.stdout.write(
+            f"    {name}, {way}, {files[numbers[at]].stem} -> {other}: error {error:.2f} %, "
+            f"badness {badness[other]:.4f}, times |distortion| "
+            f"{badness[other] * distortion[other]:.5f}: {told or '-'}{' (all)' if of_all else ''}\n"
+        )
+        sys.stdout.flush()
+        yield error, told
+
+
+def registrations(names):
+    """Of how many failed registrations a run would tell, and of how many right ones."""
+    table = {}
+    with tempfile.TemporaryDirectory() as folder:
+        parts = sorted({PAIRS[name][0] for name in names})
+        command = [sys.executable, DATA / "unpack.py", folder, *parts]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        for name in names:
+            for way in WAYS:
+                table[name, way] = [
+                    one for at in PAIRS[name][2] for one in registered(name, Path(folder), at, way)
+                ]
+    tuned = [one for (name, _), of in table.items() if name in PAIRS_CHOSEN_ON for one in of]
+    others = [one for (name, _), of in table.items() if name not in PAIRS_CHOSEN_ON for one in of]
+    table["all on which thresholds were chosen", ""], table["all others", ""] = tuned, others
+    head = ["collection", "first maps", "pairs", f"failed, over {FAILED:.0f} %"]
+    head += ["of these doubtful", "only warned of", f"right, under {RIGHT:.0f} %"]
+    head += ["of these doubtful", "only warned of", "between, told"]
+    sys.stdout.write(f"\n| {' | '.join(head)} |\n{'|---' * len(head)}|\n")
+    for (name, way), of in table.items():
+        failed = [told for error, told in of if error > FAILED]
+        right = [told for error, told in of if error < RIGHT]
+        between = [told for error, told in of if RIGHT <= error <= FAILED]
+        cells = [name, way, len(of)]
+        for group in (failed, right):
+            cells += [len(group), group.count("doubtful"), group.count("warning")]
+        cells.append(f"{sum(map(bool, between))}/{len(between)}")
+        sys.stdout.write(f"| {' | '.join(map(str, cells))} |\n")
+
+
 def main(names):
     warnings.simplefilter("ignore")
     with tempfile.TemporaryDirectory() as folder:
@@ -233,4 +317,7 @@ def main(names):
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    if sys.argv[1:2] == ["registrations"]:
+        registrations(sys.argv[2:] or list(PAIRS))
+    else:
+        main(sys.argv[1:])

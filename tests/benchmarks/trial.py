@@ -146,9 +146,9 @@ def differing(one, other):
 
 
 def used_and_told(report, bad):
-    """Of the bad shapes that a study uses: name -> kinds of what its report tells, empty for nothing.
+    """Of the bad shapes that a study uses: name -> kinds of what its report tells, or nothing.
 
-    An odd shape may be an honest outlier: then it is told, and nothing else.
+    An odd shape may be an honest outlier: then it is told, and no more.
     """
     of = {name: report.sel(shape=name) for name in bad if name in report["shape"].values}
     used = [name for name, row in of.items() if row["status"].item() in ("ok", "repaired")]

@@ -251,6 +251,13 @@ PROOFS = [
         "test_files_that_vanish_or_change_while_they_are_read_end_the_run_which_then_goes_on",
     ),
     (
+        "a folder of meshes that vanishes, as one that is no longer mounted",
+        "one error that names a file, until all are read; no later stage needs them; finished "
+        "files are kept",
+        ENDS,
+        "test_a_folder_that_vanishes_ends_a_run_until_it_is_read_and_is_not_missed_in_later_stages",
+    ),
+    (
         "an error that nobody foresaw, or no memory, in the task of one shape",
         "the shape is excluded with one line, exit code 1; the traceback is in `.log` of the study",
         ENDS,

@@ -19,7 +19,7 @@ import pytest
 
 from s4a import analyse, cli, open_study, synthetic
 from s4a.schema import dataset
-from s4a.study import pipeline, processes, store, tasks
+from s4a.study import pipeline, processes, sources, store, tasks
 from s4a.study.runner import Run
 
 # of meshes as coarse as these, some registrations are doubtful; so there are modes all the same
@@ -289,9 +289,57 @@ def test_files_that_vanish_or_change_while_they_are_read_end_the_run_which_then_
     restore()
     monkeypatch.setattr(tasks, "read_shape", read)
     analyse(meshes / "*.ply", store=folder, intersections=False, **OPTIONS).close()
+    assert_equal_but_paths(folder, whole)
+
+
+def test_a_folder_that_vanishes_ends_a_run_until_it_is_read_and_is_not_missed_in_later_stages(
+    files, whole, tmp_path, monkeypatch
+):
+    meshes, away, folder = tmp_path / "meshes", tmp_path / "away", tmp_path / "study"
+    meshes.mkdir()
+    for file in files:
+        (meshes / file.name).write_bytes(file.read_bytes())
+    options = {"store": folder, "intersections": False, **OPTIONS}
+    replace, content = os.replace, sources.content_of_file
+    vanish_at = []
+
+    def vanish(place):
+        if vanish_at == [place]:
+            meshes.rename(away)
+            vanish_at.clear()
+
+    def looked_at(path):  # before the first stage
+        vanish(Path(path).name)
+        return content(path)
+
+    def renamed(temporary, path):
+        replace(temporary, path)
+        vanish(Path(path).relative_to(folder).as_posix())
+
+    monkeypatch.setattr(sources, "content_of_file", looked_at)
+    monkeypatch.setattr(os, "replace", renamed)
+    for place in ("brain_02.ply", "original/brain_02.nc"):
+        vanish_at.append(place)
+        with pytest.raises(OSError, match=r"brain_0.\.ply has .*gone since the run began"):
+            analyse(meshes, **options)
+        away.rename(meshes)
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("[!.]*.nc")}
+    assert [path.name for path in sorted(before)] == ["brain_01.nc", "brain_02.nc"]
+    vanish_at.append("original/brain_03.nc")  # the last one that is read
+    analyse(meshes, **options).close()
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    assert_equal_but_paths(folder, whole)
+    with pytest.raises(ValueError, match=r"no file, folder or match of .*meshes"):
+        analyse(meshes, **options)
+    assert_equal_but_paths(folder, whole)
+
+
+def assert_equal_but_paths(folder, whole):
+    """The files of a study are those of another whose meshes were elsewhere."""
     found = contents(folder)
+    assert sorted(found) == sorted(whole)
     for file in set(whole) - {"report.nc"}:
-        assert found[file].equals(whole[file]), file  # the attributes have other paths
+        assert found[file].equals(whole[file]), file
 
 
 @pytest.mark.parametrize(
