@@ -3,6 +3,8 @@
 A point on a surface is a triangle and three barycentric weights, the shares of its corners.
 """
 
+from typing import NamedTuple
+
 import igl
 import numpy as np
 import scipy.sparse as sp
@@ -138,7 +140,7 @@ def closest_point_on_triangles(
 
     Parameters
     ----------
-    P, A, B, C : float ndarray (n, 3)
+    P, A, B, C : float ndarray (n, d)
 
     Returns
     -------
@@ -183,18 +185,49 @@ def closest_point_on_triangles(
     return np.stack([np.maximum(1 - v - w, 0), v, w], axis=1)
 
 
+class Stars(NamedTuple):
+    """The triangles around every vertex.
+
+    Those of v are ``triangle[start[v] : start[v] + count[v]]``.
+    """
+
+    triangle: np.ndarray  # (3 m,)
+    start: np.ndarray  # (n,)
+    count: np.ndarray  # (n,)
+
+
+def stars(T: np.ndarray, n: int) -> Stars:
+    """The triangles around each of n vertices.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.geometry.closest import stars
+    >>> around = stars(np.array([[0, 1, 2], [2, 1, 3]]), 4)
+    >>> around.count.tolist(), around.triangle[around.start[3] :].tolist()
+    ([1, 2, 2, 1], [1])
+    """
+    order = np.argsort(T.ravel(), kind="stable")
+    count = np.bincount(T.ravel(), minlength=n)
+    return Stars(order // 3, np.cumsum(count) - count, count)
+
+
 def closest_point_in_star(
-    P: np.ndarray, nearest: np.ndarray, X: np.ndarray, T: np.ndarray
+    P: np.ndarray, nearest: np.ndarray, X: np.ndarray, T: np.ndarray, around: Stars | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Closest point of the triangles around a given vertex, for every point.
 
     Parameters
     ----------
-    P : float ndarray (p, 3)
+    P : float ndarray (p, d)
+        In three dimensions, or in those of :func:`features`.
     nearest : int ndarray (p,)
         A vertex of the mesh for each point; only the triangles that touch it are searched, so that
         a thin wall is never crossed.  It must have at least one triangle.
-    X, T : the mesh
+    X : float ndarray (n, d)
+    T : int ndarray (m, 3)
+    around : Stars, optional
+        Of the mesh, where they are known.
 
     Returns
     -------
@@ -202,11 +235,7 @@ def closest_point_in_star(
     weights : float ndarray (p, 3)
         Barycentric, non-negative, rows sum to 1.
     """
-    order = np.argsort(
-        T.ravel(), kind="stable"
-    )  # the triangles of vertex v are star[start[v]:start[v+1]]
-    star, degree = order // 3, np.bincount(T.ravel(), minlength=len(X))
-    start = np.cumsum(degree) - degree
+    star, start, degree = around or stars(T, len(X))
     triangle, weights = np.empty(len(P), np.int64), np.empty((len(P), 3))
     for block in np.array_split(np.arange(len(P)), max(1, len(P) // 50_000)):
         repeat = degree[nearest[block]]

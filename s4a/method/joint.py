@@ -7,7 +7,7 @@ coupling both is that of Smooth Shells (Eisenberger, Laehner, Cremers, CVPR 2020
 far apart, every part of N turns on its own before.  All lengths are for surfaces of unit area.
 
 A *warp* (R, t, c) takes N to R x + t + Phi c, with one R (3, 3) and t (3,) for all of N, or one
-for each vertex of low resolution.
+for each vertex of low resolution; R is a rotation, after elastic rounds any linear map.
 """
 
 from typing import NamedTuple

@@ -14,6 +14,7 @@ from s4a.geometry.closest import closest_point_in_star, feature_tree, match_surf
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.method import joint
 from s4a.method.deform import displacement_in_template
+from s4a.method.elastic import elastic_rounds
 from s4a.method.first_map import nearest_after_motion
 from s4a.method.fmap import fmap_from_match
 from s4a.method.nearest import nearest_in_cells, nearest_of_few, nearest_rows
@@ -181,8 +182,8 @@ def register(
         Rigid motion of the shape onto the template found by ICP, between their frames.
     k : int
         Functions in which the displacement lives.
-    refine : {"joint", "intrinsic"}
-        Joint rounds, or the spectral match alone.
+    refine : {"joint", "elastic", "intrinsic"}
+        Joint rounds, elastic rounds after those of low resolution, or the spectral match alone.
     scale : bool
         Whether size is taken out of the displacement.
     parts : bool
@@ -205,12 +206,17 @@ def register(
         ``score``, its score at full resolution, and ``score_<candidate>`` at low resolution.
     """
     candidates = {}  # none: the spectral match alone
-    if refine == "joint":
+    if refine != "intrinsic":
         candidates = joint.candidates(source.low, target.low, starts, k=k, parts=parts)
     by_icp = motion_in_unit(source, target, motion, scale) if alignment == "icp" else None
     # image = R x + t + U Phi c, smooth already: the line after eq. 8
     match, image, attrs = register_surface(
-        source, target, candidates, functions, by_icp and (motion, by_icp.ratio)
+        source,
+        target,
+        candidates,
+        functions,
+        by_icp and (motion, by_icp.ratio),
+        elastic=refine == "elastic",
     )
     triangle, barycentric = way_back(source, target, image)
     X, T = as_arrays(target.original)
@@ -276,6 +282,8 @@ def register_surface(
     candidates: dict[str, joint.Candidate],
     functions: Functions,
     placed: tuple[Motion, float] | None = None,
+    *,
+    elastic: bool = False,
 ) -> tuple[np.ndarray, np.ndarray, dict]:
     """The template registered at full resolution: the best of the finalists of low resolution.
 
@@ -288,6 +296,8 @@ def register_surface(
     placed : tuple (motion, ratio), optional
         After which the displacement of the spectral match is smoothed, see
         :func:`s4a.method.joint.warp_after`; by default after the motion that fits it best.
+    elastic : bool
+        Whether the finalists go through :func:`s4a.method.elastic.elastic_rounds`.
 
     Returns
     -------
@@ -304,7 +314,10 @@ def register_surface(
     }
     ends = {}
     for name in joint.finalists(candidates) if candidates else ["intrinsic"]:
-        if name == "intrinsic":
+        if elastic:
+            warp = elastic_rounds(M, target.low, candidates[name].warp)
+            part = joint.nearest_vertices(M, N, joint.move(N, warp), N.near_coarse)
+        elif name == "intrinsic":
             match, compared, certified = match_functions(source, target, *functions)
             attrs |= {"compared_share": compared, "certified_share": certified}
             part = match[N.near_coarse]
@@ -315,7 +328,7 @@ def register_surface(
         ends[name] = joint.Candidate(score, part, warp)
     method = min(ends, key=lambda name: ends[name].score)
     X = joint.move(N, ends[method].warp)
-    if method != "intrinsic":
+    if elastic or method != "intrinsic":
         match = match_surfaces(X, N.T, M.X, M.T)
     attrs |= {"method": method, "score": ends[method].score}
     return match, source.from_frame(X), attrs

@@ -14,8 +14,8 @@ import xarray as xr
 from scipy.spatial import cKDTree
 
 from s4a.geometry.align import Cloud, cloud, farthest_points
-from s4a.geometry.closest import feature_tree
-from s4a.geometry.mesh import as_arrays, edge_graph, edges, vertex_areas
+from s4a.geometry.closest import Stars, feature_tree, stars
+from s4a.geometry.mesh import as_arrays, edge_graph, edges, vertex_areas, vertex_normals
 from s4a.method.deform import smoother
 from s4a.method.spectral import unit_mass
 
@@ -116,6 +116,16 @@ class Basis:
     def tree(self) -> cKDTree:
         """KD-tree over position and normal of the vertices, 6 dims."""
         return feature_tree(self.X, self.T)
+
+    @cached_property
+    def normals(self) -> np.ndarray:
+        """Unit normals of the vertices ``(n, 3)``."""
+        return vertex_normals(self.X, self.T)
+
+    @cached_property
+    def stars(self) -> Stars:
+        """The triangles around every vertex."""
+        return stars(self.T, len(self.X))
 
     @cached_property
     def graph(self) -> sp.csr_matrix:

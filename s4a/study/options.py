@@ -22,7 +22,7 @@ CHOICES = {
     "init": ("dense", "landmarks"),
     "ahead": ("always", "network", "never"),
     "weights": ("cycles", "equal"),
-    "refine": ("joint", "intrinsic"),
+    "refine": ("joint", "elastic", "intrinsic"),
     "alignment": ("fitted", "icp"),
     "how": ("ours", "standard"),
     "norm": tuple(NORMS),

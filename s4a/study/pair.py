@@ -40,8 +40,9 @@ def match_pair(source: xr.Dataset, target: xr.Dataset, **options: Any) -> xr.Dat
     sharpen : int
         Rounds of ZoomOut after the last in which coarse vertices of the target look among all of
         the source.
-    refine : {"joint", "intrinsic"}
-        Joint rounds after ZoomOut (default), or the paper's ZoomOut alone and eq. 4.
+    refine : {"joint", "elastic", "intrinsic"}
+        Joint rounds after ZoomOut (default), also elastic ones, or the paper's ZoomOut alone and
+        eq. 4; see :func:`s4a.analyse`.
     lift, parts, alignment, area_weighted, n_projected
         See :func:`s4a.analyse`.
     n_coarse : int
