@@ -1,0 +1,152 @@
+"""Elastic registration: the smoothing of the displacement (4.2, eq. 8) with a price on bending.
+
+The paper cuts a displacement off after K eigenfunctions of the template N; within these every
+tangential shift costs nothing, so that rounds of nearest neighbours drift along the surface.  Here
+the coefficients c (K, 3) and a linear map A x + b of what the first rounds left minimise
+
+    sum_i a_i |z_i - y_i|^2_i + stiffness * sum_k lambda_k^2 |c_k|^2,   z = A x + b + Phi c,
+
+where y_i is the point of the shape's surface M that is nearest to z_i in position and normal,
+a_i the vertex area, lambda_k an eigenvalue.  |d|^2_i = (m_i . d)^2 + slide (|d|^2 - (m_i . d)^2)
+along the mean m_i of both normals: vertices may slide, as in the point-to-plane distance of Chen
+and Medioni (1992), with the normals of both surfaces as of Rusinkiewicz (2019).  The second term is
+the bending energy, the integral of |Laplacian|^2 of the displacement.  The stiffness falls from
+round to round, as in the non-rigid ICP of Amberg, Romdhani and Vetter (CVPR 2007).  Lengths are for
+surfaces of unit area.
+"""
+
+import numpy as np
+import scipy.linalg
+
+from s4a.geometry.closest import closest_point_in_star, features, interpolate
+from s4a.geometry.mesh import vertex_normals
+from s4a.method.joint import Warp, move, turn
+from s4a.method.shape import Basis
+
+# chosen on faces, brains and cortex templates, see docs/decisions.md
+STIFFNESS = (1e-4, 3e-8)
+N_STEPS = 8
+SLIDE = 0.1
+
+
+def nearest_on_surface(
+    source: Basis, X: np.ndarray, normals: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The points of the source's surface nearest to rows of X in position and normal.
+
+    Unlike nearest vertices they do not crowd where the source is finely meshed.
+
+    Parameters
+    ----------
+    source : Basis
+    X, normals : float ndarray (n, 3)
+
+    Returns
+    -------
+    points, normals : float ndarray (n, 3)
+        On the surface of the source.
+    """
+    rows = features(X, normals)  # (n, 6)
+    nearest = source.tree.query(rows)[1]
+    triangle, weights = closest_point_in_star(
+        rows, nearest, source.tree.data, source.T, source.stars
+    )
+    points = interpolate(source.X, source.T, triangle, weights)
+    normals = interpolate(source.normals, source.T, triangle, weights)
+    return points, unit(normals)
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Vectors ``(n, 3)`` of length 1; those of length 0 stay."""
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return vectors / np.where(length == 0, 1, length)
+
+
+def normal_equations(
+    E: np.ndarray, area: np.ndarray, m: np.ndarray, y: np.ndarray, slide: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Matrix ``(3 q, 3 q)`` and right side ``(3 q,)`` of the first term, for z = E w, w ``(q, 3)``.
+
+    With W_i = slide I + (1 - slide) m_i m_i^T it is sum_i a_i (z_i - y_i)^T W_i (z_i - y_i); the
+    unknowns are the columns of w, one after the other.
+
+    Parameters
+    ----------
+    E : float ndarray (n, q)
+    area : float ndarray (n,)
+    m : float ndarray (n, 3)
+        Unit normals.
+    y : float ndarray (n, 3)
+    slide : float
+    """
+    q = E.shape[1]
+    matrix = np.empty((3, q, 3, q))
+    everywhere = slide * E.T @ (area[:, None] * E)
+    for i in range(3):
+        for j in range(i, 3):
+            weight = (1 - slide) * area * m[:, i] * m[:, j]
+            block = E.T @ (weight[:, None] * E)
+            if i == j:
+                block += everywhere
+            matrix[i, :, j] = block
+            matrix[j, :, i] = block
+    along = np.einsum("ni,ni->n", m, y)[:, None] * m
+    right = E.T @ (area[:, None] * (slide * y + (1 - slide) * along))  # (q, 3)
+    return matrix.reshape(3 * q, 3 * q), right.T.ravel()
+
+
+def elastic_rounds(
+    source: Basis,
+    target: Basis,
+    warp: Warp,
+    *,
+    stiffness: tuple[float, float] = STIFFNESS,
+    steps: int = N_STEPS,
+    rounds: int = 2,
+    slide: float = SLIDE,
+) -> Warp:
+    """The warp after rounds in which the target's displacement becomes less and less stiff.
+
+    Parameters
+    ----------
+    source : Basis
+        At full resolution: its surface is searched.
+    target : Basis
+        At low resolution.
+    warp : tuple (R, t, c)
+        Where to begin.  Where every vertex has a motion R, t of its own, these stay, and bending
+        is counted from there.
+    stiffness : tuple of float
+        Of the first and of the last step; between them it falls by equal factors.
+    steps, rounds : int
+        Values of the stiffness, and rounds with each.
+    slide : float
+        Weight of the distance along the surface, that across it weighs 1.
+
+    Returns
+    -------
+    warp : tuple (R, t, c)
+        R is a linear map, and no rotation.
+    """
+    R, t, _ = warp
+    start = turn(target, R, t)  # (n, 3)
+    n = len(start)
+    smooth = target.Phi[:, 1:]  # the constant is b
+    E = np.concatenate([smooth, start, np.ones((n, 1))], axis=1)  # (n, K - 1 + 3 + 1)
+    bending = np.zeros(E.shape[1])
+    bending[: smooth.shape[1]] = target.eigenvalue[1:] ** 2
+    X = move(target, warp)
+    for weight in np.repeat(np.geomspace(*stiffness, steps), rounds):
+        normals = vertex_normals(X, target.T)
+        y, normals_y = nearest_on_surface(source, X, normals)
+        matrix, right = normal_equations(E, target.area, unit(normals + normals_y), y, slide)
+        # of start and smooth functions some sums are nearly equal: a little keeps them apart
+        matrix[np.diag_indices_from(matrix)] += np.tile(weight * bending, 3) + 1e-12
+        w = scipy.linalg.solve(matrix, right, assume_a="pos").reshape(3, -1).T  # (q, 3)
+        X = E @ w
+    A = w[-4:-1].T  # (3, 3)
+    b = w[-1]
+    c = np.concatenate([np.zeros((1, 3)), w[:-4]])  # (K, 3)
+    if R.ndim == 2:
+        return A @ R, A @ t + b, c
+    return A @ R, t @ A.T + b, c
