@@ -23,10 +23,13 @@ from s4a.geometry.mesh import vertex_normals
 from s4a.method.joint import Warp, move, turn
 from s4a.method.shape import Basis
 
-# chosen on faces, brains and cortex templates, see docs/decisions.md
+# Of the first and of the last step.  Chosen on a pair of faces, one of brains and two cortex
+# templates, reported on others: docs/decisions.md
 STIFFNESS = (1e-4, 3e-8)
+SLIDE = (0.01, 0.1)  # little lets first steps advance, more keeps last ones from drifting
 N_STEPS = 8
-SLIDE = 0.1
+N_ROUNDS = 8
+STILL = 1e-3  # share of sqrt(area): a step ends with a round that moves less
 
 
 def nearest_on_surface(
@@ -101,9 +104,9 @@ def elastic_rounds(
     warp: Warp,
     *,
     stiffness: tuple[float, float] = STIFFNESS,
+    slide: tuple[float, float] = SLIDE,
     steps: int = N_STEPS,
-    rounds: int = 2,
-    slide: float = SLIDE,
+    rounds: int = N_ROUNDS,
 ) -> Warp:
     """The warp after rounds in which the target's displacement becomes less and less stiff.
 
@@ -114,14 +117,12 @@ def elastic_rounds(
     target : Basis
         At low resolution.
     warp : tuple (R, t, c)
-        Where to begin.  Where every vertex has a motion R, t of its own, these stay, and bending
-        is counted from there.
-    stiffness : tuple of float
-        Of the first and of the last step; between them it falls by equal factors.
+        Where to begin, with one motion for all: bending is counted from there.
+    stiffness, slide : tuple of float
+        Of the first and of the last step, between which they change by equal factors.  `slide` is
+        the weight of the distance along the surface; that across it weighs 1.
     steps, rounds : int
-        Values of the stiffness, and rounds with each.
-    slide : float
-        Weight of the distance along the surface, that across it weighs 1.
+        Values of the stiffness, and rounds with each at most; fewer where nothing moves any more.
 
     Returns
     -------
@@ -136,17 +137,21 @@ def elastic_rounds(
     bending = np.zeros(E.shape[1])
     bending[: smooth.shape[1]] = target.eigenvalue[1:] ** 2
     X = move(target, warp)
-    for weight in np.repeat(np.geomspace(*stiffness, steps), rounds):
-        normals = vertex_normals(X, target.T)
-        y, normals_y = nearest_on_surface(source, X, normals)
-        matrix, right = normal_equations(E, target.area, unit(normals + normals_y), y, slide)
-        # of start and smooth functions some sums are nearly equal: a little keeps them apart
-        matrix[np.diag_indices_from(matrix)] += np.tile(weight * bending, 3) + 1e-12
-        w = scipy.linalg.solve(matrix, right, assume_a="pos").reshape(3, -1).T  # (q, 3)
-        X = E @ w
+    for weight, along in zip(
+        np.geomspace(*stiffness, steps), np.geomspace(*slide, steps), strict=True
+    ):
+        for _ in range(rounds):
+            normals = vertex_normals(X, target.T)
+            y, normals_y = nearest_on_surface(source, X, normals)
+            m = unit(normals + normals_y)
+            matrix, right = normal_equations(E, target.area, m, y, along)
+            # start and smooth functions nearly depend on each other: a little keeps them apart
+            matrix[np.diag_indices_from(matrix)] += np.tile(weight * bending, 3) + 1e-12
+            w = scipy.linalg.solve(matrix, right, assume_a="pos").reshape(3, -1).T  # (q, 3)
+            before, X = X, E @ w
+            if target.area @ ((X - before) ** 2).sum(1) < STILL**2:
+                break
     A = w[-4:-1].T  # (3, 3)
     b = w[-1]
     c = np.concatenate([np.zeros((1, 3)), w[:-4]])  # (K, 3)
-    if R.ndim == 2:
-        return A @ R, A @ t + b, c
-    return A @ R, t @ A.T + b, c
+    return A @ R, A @ t + b, c
