@@ -1,0 +1,224 @@
+"""Registration beside the peers that users of anatomy pick, on meshes that share no vertices.
+
+``peers.py [faces brains skulls cortex] [--tuned]``.  All begin at one rigid motion, of ICP.  Mean
+distance to the truth: faces and brains in % of sqrt(area), skulls in mm at 51 landmarks, cortex the
+share of vertices with the right label.  Each peer runs with two settings; both are shown.
+
+The pairs that elastic rounds were tuned on are shown with ``--tuned`` and left out otherwise; of
+cortex templates there is one pair, which was tuned on.  All but brains need the shared data beside
+the checkout; peers come with the extra ``bench``.
+"""
+
+import itertools
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pymeshlab
+from scipy.spatial import cKDTree
+
+import s4a
+from s4a import synthetic
+from s4a.geometry.align import align
+from s4a.geometry.closest import closest_point, interpolate
+from s4a.geometry.mesh import as_arrays, as_dataset, triangle_normals, vertex_areas, vertex_normals
+from s4a.input.annotations import read_landmarks
+
+DATA = Path(__file__).parents[3] / "shared" / "data"
+TUNED = {"faces": [(0, 1)], "brains": [(1, 2)], "skulls": [], "cortex": [("conte69", "fsa5")]}
+REPORTED = {
+    "faces": [(2, 3), (4, 5), (6, 7)],
+    "brains": [(2, 3), (3, 4), (4, 1)],
+    "skulls": [(0, 1), (2, 3)],
+    "cortex": [],
+}
+
+
+def remeshed(mesh):
+    """The same surface with vertices of its own."""
+    X, T = as_arrays(mesh)
+    length = 0.93 * np.linalg.norm(X[T[:, 0]] - X[T[:, 1]], axis=1).mean()
+    meshes = pymeshlab.MeshSet()
+    meshes.add_mesh(pymeshlab.Mesh(X, T))
+    meshes.meshing_isotropic_explicit_remeshing(
+        targetlen=pymeshlab.PureValue(float(length)), iterations=6
+    )
+    new = meshes.current_mesh()
+    return s4a.clean(as_dataset(new.vertex_matrix(), new.face_matrix()))
+
+
+def faces(folder, pairs):
+    """Template, shape and a measure of the template's image, pair by pair."""
+    for a, b in pairs:
+        template, shape = (
+            s4a.read_shape(folder / "faces" / f"identity{i:03d}.ply") for i in (a, b)
+        )
+        true = shape["position"].values
+        yield f"faces {a} to {b}", template, remeshed(shape), distance(template, true)
+
+
+def brains(_folder, pairs):
+    tree = synthetic.brains(4, 20_000, 5)
+    for a, b in pairs:
+        names = [f"brain_{i:02d}" for i in (a, b)]
+        template, shape = (tree["original"][name].to_dataset() for name in names)
+        at = tree["truth"][names[0]]["reference_point"].values
+        true = synthetic.position(tree["truth"], names[1], at)
+        yield f"brains {a} to {b}", template, shape, distance(template, true)
+
+
+def distance(template, true):
+    """Mean distance to the truth in % of sqrt(area)."""
+    area = vertex_areas(*as_arrays(template))
+
+    def measure(image):
+        return 100 * np.linalg.norm(image - true, axis=1) @ area / area.sum() ** 1.5
+
+    return measure
+
+
+def skulls(folder, pairs):
+    files = sorted((folder / "skulls").glob("*.ply"))
+    for a, b in pairs:
+        template, shape = (s4a.read_shape(files[i]) for i in (a, b))
+        mark, true = (
+            read_landmarks(files[i].with_suffix(".mrk.json"))["landmark_position"].values
+            for i in (a, b)
+        )
+        X, T = as_arrays(template)
+        on_template = closest_point(mark, X, T)
+
+        def measure(image, T=T, on_template=on_template, shape=shape, true=true):
+            Y, S = as_arrays(shape)
+            at = interpolate(image, T, *on_template)
+            return np.linalg.norm(interpolate(Y, S, *closest_point(at, Y, S)) - true, axis=1).mean()
+
+        yield f"skulls {files[a].stem} to {files[b].stem}, mm", template, shape, measure
+
+
+def cortex(folder, pairs):
+    file = {"fsa5": "fsa5_lh", "conte69": "conte69_32k_lh"}
+    for pair in pairs:
+        template, shape = (s4a.read_shape(folder / "brains" / f"{file[n]}.gii") for n in pair)
+        labels = []
+        for name, mesh in zip(pair, (template, shape), strict=True):
+            with np.load(folder / "brains" / f"labels_{name}_lh_then_rh.npz") as arrays:
+                labels.append(arrays["aparc"][: mesh.sizes["vertex"]])
+
+        def measure(image, shape=shape, labels=labels):
+            nearest = cKDTree(shape["position"].values).query(image)[1]
+            return 100 * (labels[1][nearest] == labels[0]).mean()
+
+        yield f"cortex {pair[1]} to {pair[0]}, % right", template, shape, measure
+
+
+def ours(template, shape, _start, refine):
+    found = s4a.match_pair(shape, template, refine=refine)
+    moved = template["position"].values + found["displacement"].values - found["translation"].values
+    return moved @ found["rotation"].values / found["scale"].item()
+
+
+def nearest(_template, shape, start):
+    X, T = as_arrays(shape)
+    return interpolate(X, T, *closest_point(start, X, T))
+
+
+def meshmonk(template, shape, start, iterations):
+    import meshmonk
+
+    X, T = as_arrays(template)
+    Y, S = as_arrays(shape)
+    rows = [
+        np.concatenate([P, vertex_normals(P, F)], axis=1).astype(np.float32)
+        for P, F in ((start, T), (Y, S))
+    ]
+    found = meshmonk.pyramid_register(
+        floating_features=rows[0],
+        target_features=rows[1],
+        floating_faces=T.astype(np.int32),
+        target_faces=S.astype(np.int32),
+        floating_flags=np.ones(len(X), np.float32),
+        target_flags=np.ones(len(Y), np.float32),
+        num_iterations=iterations,
+    )
+    return np.asarray(found.aligned_vertices, float)
+
+
+def rustcpd(_template, shape, start, beta):
+    import rustcpd
+
+    Y = as_arrays(shape)[0]
+    every = max(1, len(start) // 3000), max(1, len(Y) // 3000)
+    center, size = start.mean(0), start.std()
+    few, target = ((P[::n] - center) / size for P, n in zip((start, Y), every, strict=True))
+    found = rustcpd.register_deformable(target, few, beta=beta)
+    moved = np.asarray(found.transformed) * size + center
+    # the displacement of the few, carried to all by the kernel of the method
+    kernel = np.exp(-((few[:, None] - few[None]) ** 2).sum(2) / (2 * beta**2))
+    weight = np.linalg.solve(kernel + 1e-3 * np.eye(len(few)), (moved - start[:: every[0]]) / size)
+    image = np.empty_like(start)
+    for part in np.array_split(np.arange(len(start)), 1 + len(start) // 5000):
+        P = (start[part] - center) / size
+        image[part] = start[part] + size * (
+            np.exp(-((P[:, None] - few[None]) ** 2).sum(2) / (2 * beta**2)) @ weight
+        )
+    return image
+
+
+METHODS = {
+    "S4A, joint rounds (default)": (ours, "joint"),
+    "S4A, elastic rounds": (ours, "elastic"),
+    "ICP, nearest point": (nearest,),
+    "MeshMonk, 80 iterations": (meshmonk, 80),
+    "MeshMonk, 200 iterations": (meshmonk, 200),
+    "rustcpd, beta 1": (rustcpd, 1.0),
+    "rustcpd, beta 0.5": (rustcpd, 0.5),
+}
+
+
+def begin(template, shape):
+    """The template's vertices after the rigid motion of ICP onto the shape."""
+    clouds = []
+    for mesh in (template, shape):
+        X, T = as_arrays(mesh)
+        every = slice(None, None, max(1, len(X) // 6000))
+        clouds += [X[every], vertex_areas(X, T)[every]]
+    R, t = align(*clouds)[:2]
+    return template["position"].values @ R.T + t
+
+
+def turned_over(template, image):
+    """How many triangles look against the surface around them."""
+    T = as_arrays(template)[1]
+    around = vertex_normals(image, T)[T].sum(axis=1)
+    return int((np.einsum("tx,tx->t", triangle_normals(image, T), around) < 0).sum())
+
+
+def main(words):
+    sets = [word for word in words if word in REPORTED] or list(REPORTED)
+    chosen = TUNED if "--tuned" in words else REPORTED
+    with tempfile.TemporaryDirectory() as folder:
+        if DATA.is_dir():
+            subprocess.run(
+                [sys.executable, DATA / "unpack.py", folder], check=True, stdout=subprocess.DEVNULL
+            )
+        pairs = itertools.chain(*(globals()[name](Path(folder), chosen[name]) for name in sets))
+        for title, template, shape, measure in pairs:
+            sys.stdout.write(f"\n{title:40} {'result':>8} {'turned':>7} {'CPU s':>7}\n")
+            start = begin(template, shape)
+            for name, (method, *settings) in METHODS.items():
+                spent = time.process_time()
+                image = method(template, shape, start, *settings)
+                spent = time.process_time() - spent
+                flips = turned_over(template, image)
+                sys.stdout.write(f"{name:40} {measure(image):8.3f} {flips:7d} {spent:7.1f}\n")
+                sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    warnings.simplefilter("ignore")
+    main(sys.argv[1:])

@@ -1,0 +1,140 @@
+"""Elastic rounds: what they minimise, what they find again, and that they stay at the truth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from s4a import analyse, match_pair, synthetic
+from s4a.geometry.closest import distance_to_surface
+from s4a.geometry.mesh import triangle_normals, vertex_normals
+from s4a.method import elastic, joint
+from s4a.method.register import register_surface
+from s4a.study.options import pair_options
+from s4a.study.pair import shape_of
+
+
+@pytest.fixture(scope="module")
+def pair():
+    """A template, a shape of other vertices, and where the former's vertices are on the latter."""
+    tree = synthetic.brains(2, 3000, seed=5)
+    options = pair_options({"n_coarse": 1500, "k": 60})
+    template, shape = (
+        shape_of(tree["original"][name].to_dataset(), options) for name in ("brain_01", "brain_02")
+    )
+    truth = tree["truth"]
+    at = synthetic.position(truth, "brain_02", truth["brain_01"]["reference_point"].values)
+    return template, shape, shape.to_frame(at)
+
+
+def starts(template, shape):
+    """Two starts: the shapes as they lie, and a match that is 0.1 off everywhere."""
+    near = shape.low.tree.query(template.low.tree.data)[1]
+    off = shape.low.tree.query(template.low.tree.data + [0.5, 0, 0, 0, 0, 0])[1]
+    return [joint.fit_warp(shape.low, template.low, match) for match in (near, off)]
+
+
+def error(image, truth):
+    return np.linalg.norm(image - truth, axis=1).mean()
+
+
+@pytest.fixture(scope="module")
+def ends(pair):
+    template, shape, _ = pair
+    return [
+        elastic.elastic_rounds(shape.full, template.low, warp) for warp in starts(template, shape)
+    ]
+
+
+def test_they_end_nearer_to_the_truth_than_joint_rounds(pair, ends):
+    template, shape, truth = pair
+    near = shape.low.tree.query(template.low.tree.data)[1]
+    warp = joint.low_rounds(shape.low, template.low, near, k=60)[1]
+    warp = joint.dense_rounds(shape.full, template.full, warp)[1]
+    by_joint = error(joint.move(template.full, warp), truth)
+    by_elastic = error(joint.move(template.full, ends[0]), truth)
+    assert by_elastic < 0.5 * by_joint
+
+
+def test_two_starts_end_at_one_place(pair, ends):
+    template, shape, _ = pair
+    begin = [joint.move(template.full, warp) for warp in starts(template, shape)]
+    end = [joint.move(template.full, warp) for warp in ends]
+    assert error(*end) < 0.05 * error(*begin)
+
+
+def test_no_triangle_is_turned_over(pair, ends):
+    template, _, _ = pair
+    T = template.full.T
+    image = joint.move(template.full, ends[0])
+    around = vertex_normals(image, T)[T].mean(axis=1)
+    assert (np.einsum("tx,tx->t", triangle_normals(image, T), around) > 0).all()
+
+
+def test_a_linear_map_bends_nothing_and_stays(pair):
+    template, _, _ = pair
+    A = np.array([[1.1, 0.1, 0.0], [0.0, 0.95, 0.05], [-0.1, 0.0, 1.0]])
+    source = replace(template.low, X=template.low.X @ A.T + 0.1)
+    begin = A, np.full(3, 0.1), np.zeros((1, 3))
+    R, t, c = elastic.elastic_rounds(source, template.low, begin)
+    assert R == pytest.approx(A, abs=1e-6)
+    assert t == pytest.approx(0.1, abs=1e-6)
+    assert np.abs(c).max() < 1e-6
+
+
+def test_the_normal_equations_are_those_of_the_sum():
+    rng = np.random.default_rng(0)
+    E, y = rng.normal(size=(20, 4)), rng.normal(size=(20, 3))
+    area, m = rng.uniform(0.5, 1, 20), elastic.unit(rng.normal(size=(20, 3)))
+    matrix, right = elastic.normal_equations(E, area, m, y, 0.1)
+
+    def total(w):
+        d = E @ w.reshape(3, -1).T - y
+        across = (m * d).sum(1) ** 2
+        return area @ (across + 0.1 * ((d**2).sum(1) - across))
+
+    for _ in range(5):
+        w, v = rng.normal(size=(2, 12))
+        slope = (total(w + 1e-4 * v) - total(w - 1e-4 * v)) / 2e-4
+        assert slope == pytest.approx(2 * (matrix @ w - right) @ v, rel=1e-6)
+
+
+def test_nearest_points_lie_on_the_surface_and_no_farther_than_nearest_vertices(pair):
+    template, shape, _ = pair
+    X, T = template.low.X, template.low.T
+    points, normals = elastic.nearest_on_surface(shape.full, X, vertex_normals(X, T))
+    assert distance_to_surface(points, shape.full.X, shape.full.T).max() < 1e-9
+    assert np.linalg.norm(normals, axis=1) == pytest.approx(1)
+    vertex = joint.nearest_vertices(shape.full, template.low, X)
+    gap = np.linalg.norm(points - X, axis=1).mean()
+    assert gap < 0.9 * np.linalg.norm(shape.full.X[vertex] - X, axis=1).mean()
+
+
+def test_where_parts_turned_on_their_own_nothing_changes(pair, monkeypatch):
+    template, shape, _ = pair
+
+    def never(*_args, **_options):
+        raise AssertionError("elastic rounds begin at one motion for all")
+
+    one = starts(template, shape)[0]
+    n = len(template.low.X)
+    parts = np.repeat(one[0][None], n, 0), np.repeat(one[1][None], n, 0), one[2]
+    candidate = joint.Candidate(0.0, np.zeros(n, int), parts)
+    monkeypatch.setattr("s4a.method.register.elastic_rounds", never)
+    functions = shape.low.Phi, template.low.Phi
+    ends = [
+        register_surface(shape, template, {"icp+parts": candidate}, functions, elastic=asked)[1]
+        for asked in (True, False)
+    ]
+    assert (ends[0] == ends[1]).all()
+
+
+def test_a_study_and_a_pair_take_it_and_say_so(brains):
+    names = ("brain_01", "brain_02")
+    meshes = {name: brains["original"][name].to_dataset() for name in names}
+    small = {"n_coarse": 400, "k": 20, "k_init": 8}
+    found = match_pair(meshes["brain_02"], meshes["brain_01"], refine="elastic", **small)
+    assert np.isfinite(found["displacement"]).all()
+    with analyse(meshes, refine="elastic", n_jobs=1, **small) as study:
+        assert study["report"].attrs["refine"] == "elastic"
+        assert (study["registration"]["confidence"] > 0).any()
