@@ -152,21 +152,12 @@ def rustcpd(_template, shape, start, beta):
     import rustcpd
 
     Y = as_arrays(shape)[0]
-    every = max(1, len(start) // 3000), max(1, len(Y) // 3000)
     center, size = start.mean(0), start.std()
-    few, target = ((P[::n] - center) / size for P, n in zip((start, Y), every, strict=True))
-    found = rustcpd.register_deformable(target, few, beta=beta)
-    moved = np.asarray(found.transformed) * size + center
-    # the displacement of the few, carried to all by the kernel of the method
-    kernel = np.exp(-((few[:, None] - few[None]) ** 2).sum(2) / (2 * beta**2))
-    weight = np.linalg.solve(kernel + 1e-3 * np.eye(len(few)), (moved - start[:: every[0]]) / size)
-    image = np.empty_like(start)
-    for part in np.array_split(np.arange(len(start)), 1 + len(start) // 5000):
-        P = (start[part] - center) / size
-        image[part] = start[part] + size * (
-            np.exp(-((P[:, None] - few[None]) ** 2).sum(2) / (2 * beta**2)) @ weight
-        )
-    return image
+    few, target = ((P[:: max(1, len(P) // 3000)] - center) / size for P in (start, Y))
+    found = rustcpd.register_deformable(
+        target, few, beta=beta, low_rank_method="pivoted_cholesky", parallel=False
+    )
+    return found.transform((start - center) / size) * size + center
 
 
 METHODS = {
