@@ -325,6 +325,7 @@ def file_points(mesh: xr.Dataset) -> np.ndarray:
 
 def compare(args: Namespace) -> int:
     """The methods of the paper's Table 1 on pairs, or of its Table 2 on a collection."""
+    result: xr.Dataset | xr.DataTree
     if args.collection:
         result, names, seconds, text = compare_collection(args)
     else:

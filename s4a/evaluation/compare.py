@@ -169,7 +169,7 @@ def pair(
     truth: Any = None,
     landmarks: Any = None,
     **options: Any,
-) -> xr.Dataset:
+) -> xr.Dataset | xr.DataTree:
     """Table 1 for one pair: see :func:`pairs`.
 
     Parameters
@@ -367,7 +367,7 @@ def kept(
     X, T = as_arrays(source)
     Y, S = as_arrays(target)
     images = [X[one.match] if one.image is None else one.image for one in outcomes.values()]
-    found = {
+    found: dict[str, ArrayLike] = {
         "way_match": np.stack([one.match.astype(np.int32) for one in outcomes.values()]),
         "way_reverse": np.stack([one.reverse.astype(np.int32) for one in outcomes.values()]),
         "way_image": np.stack(images).astype(np.float32),
@@ -382,7 +382,7 @@ def kept(
         found |= {"true_position": true, "true_match": vertex.astype(np.int32)}
         errors = [np.linalg.norm(image - true, axis=1) / size for image in images]
         found["way_error"] = np.stack(errors).astype(np.float32)
-    return without_coords(target).merge(dataset(**found)).assign_coords(way=list(outcomes))
+    return without_coords(target).merge(dataset(None, **found)).assign_coords(way=list(outcomes))
 
 
 def stacked(maps: list[np.ndarray | None]) -> np.ndarray:

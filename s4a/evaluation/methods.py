@@ -258,9 +258,9 @@ class Pair:
         for block, seconds in spectral.seconds.items():
             clock.add(block, seconds)
         if registers:
-            match, image, reverse, seconds = self.registered
-            for block, spent in seconds.items():
-                clock.add(block, spent)
+            match, image, reverse, of_registration = self.registered
+            for block, seconds in of_registration.items():
+                clock.add(block, seconds)
             image = image if method == "joint surface" else None
             return Outcome(match, image, reverse, clock.seconds)
         M, N = self.shapes(method)

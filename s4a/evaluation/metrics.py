@@ -448,6 +448,14 @@ def true_positions(truth: ArrayLike, X: np.ndarray, n: int) -> tuple[np.ndarray,
     ------
     ValueError
         When it is neither, or names a vertex that the source does not have.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.metrics import true_positions
+    >>> position, vertex = true_positions(np.array([1, -1]), np.eye(3), 2)
+    >>> position[0].tolist(), vertex.tolist()
+    ([0.0, 1.0, 0.0], [1, -1])
     """
     truth = np.asarray(truth)
     if truth.shape == (n,) and truth.dtype.kind in "iu":

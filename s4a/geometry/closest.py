@@ -188,12 +188,12 @@ def closest_point_on_triangles(
 class Stars(NamedTuple):
     """The triangles around every vertex.
 
-    Those of v are ``triangle[start[v] : start[v] + count[v]]``.
+    Those of v are ``triangle[start[v] : start[v] + degree[v]]``.
     """
 
     triangle: np.ndarray  # (3 m,)
     start: np.ndarray  # (n,)
-    count: np.ndarray  # (n,)
+    degree: np.ndarray  # (n,)
 
 
 def stars(T: np.ndarray, n: int) -> Stars:
@@ -204,12 +204,12 @@ def stars(T: np.ndarray, n: int) -> Stars:
     >>> import numpy as np
     >>> from s4a.geometry.closest import stars
     >>> around = stars(np.array([[0, 1, 2], [2, 1, 3]]), 4)
-    >>> around.count.tolist(), around.triangle[around.start[3] :].tolist()
+    >>> around.degree.tolist(), around.triangle[around.start[3] :].tolist()
     ([1, 2, 2, 1], [1])
     """
     order = np.argsort(T.ravel(), kind="stable")
-    count = np.bincount(T.ravel(), minlength=n)
-    return Stars(order // 3, np.cumsum(count) - count, count)
+    degree = np.bincount(T.ravel(), minlength=n)
+    return Stars(order // 3, np.cumsum(degree) - degree, degree)
 
 
 def closest_point_in_star(

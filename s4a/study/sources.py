@@ -49,7 +49,7 @@ def find_sources(shapes: Collection, pattern: str | None = None) -> Sources:
         shapes = {name: node.to_dataset() for name, node in shapes["original"].children.items()}
     if not isinstance(shapes, dict):
         files = sorted((name, path) for path, name in find_meshes(shapes, pattern))
-        found = {name: (str(path), content_of_file(path)) for name, path in files}
+        found: Sources = {name: (str(path), content_of_file(path)) for name, path in files}
         for _, path in files:  # an unmounted folder is not one of unreadable files
             if not os.path.lexists(path):
                 raise OSError(f"{shown(path)} has gone since the run began: start it again")
