@@ -24,7 +24,7 @@ SHOWN = [
 ]
 ERROR = ("error", "error")
 TRUTH = "truth"
-FIRST = ("SCALABLE", "RE-MATCH", "joint")  # what is shown first, where it is there
+FIRST = ("SCALABLE", "RE-MATCH", "joint surface")  # what is shown first, where it is there
 MOST = 7  # methods side by side
 CELLS = 14  # of the checkerboard along the surface's extent
 FULL_ERROR = 0.98  # quantile of the errors of a method that the colours reach, in the median
@@ -44,8 +44,8 @@ class Comparison(Panel):
         Of :func:`s4a.compare.pairs` with ``keep=True``, or opened from the ``compare.nc`` of
         ``s4a compare --keep``.
     methods : sequence of str, optional
-        At most seven methods of it, shown first; SCALABLE, RE-MATCH and joint by default.  "truth"
-        is one where it is known.
+        At most seven methods of it, shown first; SCALABLE, RE-MATCH and joint surface by
+        default.  "truth" is one where it is known.
     view, up
         From where the surfaces are seen first; see :func:`s4a.show.draw.rotation`.
 
@@ -126,7 +126,7 @@ class Comparison(Panel):
 
     def first(self, known: list[str]) -> list[str]:
         """The methods that are shown first."""
-        return [way for way in FIRST if way in known] or known[: len(FIRST)]
+        return list(dict.fromkeys([*(way for way in FIRST if way in known), *known]))[: len(FIRST)]
 
     @property
     def found(self) -> xr.Dataset:
