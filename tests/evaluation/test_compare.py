@@ -57,6 +57,17 @@ def test_every_method_has_every_metric_and_its_time_by_block(found):
     assert spent.sel(way="joint").sum() > spent.sel(way="RE-MATCH").sum()
 
 
+def test_nearest_neighbours_in_space_have_the_largest_chamfer_distance_of_the_papers(found):
+    chamfer = found["chamfer"].sel(way=list(compare.PAPER_METHODS))
+    assert (chamfer.idxmax("way") == "kNN").all()
+
+
+def test_maps_of_low_resolution_take_less_time_than_those_of_dense_meshes(found):
+    seconds = found["block_seconds"].sum("block")
+    dense = seconds.sel(way=["ZO", "FMAP+ZO"]).min("way")
+    assert (seconds.sel(way=["SCALABLE", "RE-MATCH"]) < dense).all()
+
+
 def test_joint_rounds_are_nearer_to_the_truth_than_every_other_method(found):
     error = found["straight_error"].mean("pair")
     others = error.drop_sel(way=["joint", "joint surface"])

@@ -169,6 +169,14 @@ def transfers(external):
     }
 
 
+def test_through_the_median_a_template_is_matched_once_for_all_shapes(paper, meshes, seen):
+    external = meshes["brain_04"]
+    with s4a.open_study(paper) as study:
+        found = s4a.transfer_labels(study, external["label"].values, source=external)
+    assert len(found.children) == 3
+    assert len(seen) == 1
+
+
 @pytest.mark.parametrize("what", ["labels", "scalars", "landmarks"])
 def test_every_transfer_takes_a_preset_in_the_place_of_the_options_of_a_study(
     what, study, meshes, seen
