@@ -19,7 +19,7 @@ import pytest
 
 from s4a import analyse, cli, open_study, synthetic
 from s4a.schema import dataset
-from s4a.study import pipeline, processes, sources, store, tasks
+from s4a.study import doubts, pipeline, processes, sources, store, tasks
 from s4a.study.runner import Run
 
 # of meshes as coarse as these, some registrations are doubtful; so there are modes all the same
@@ -355,14 +355,15 @@ def assert_equal_but_paths(folder, whole):
 def test_an_error_in_the_task_of_one_shape_costs_that_shape_and_is_told(
     files, tmp_path, monkeypatch, capsys, error, stage
 ):
-    task = getattr(pipeline, stage)
+    module = doubts if stage == "compare_shape" else pipeline
+    task = getattr(module, stage)
 
     def wrong(*arguments):
         if any("brain_02" in str(argument)[-20:] for argument in arguments[:2]):
             raise error
         return task(*arguments)
 
-    monkeypatch.setattr(pipeline, stage, wrong)
+    monkeypatch.setattr(module, stage, wrong)
     folder = tmp_path / "study"
     assert cli.main(["run", *map(str, files), "--out", str(folder), *FLAGS]) == 1
     said = capsys.readouterr().out
@@ -377,7 +378,7 @@ def test_an_error_in_the_task_of_one_shape_costs_that_shape_and_is_told(
     log = folder / re.search(r"see (\S+\.txt) in the folder of the study", reason)[1]
     assert log.read_text().startswith("Traceback")
     assert "in wrong" in log.read_text()
-    monkeypatch.setattr(pipeline, stage, task)
+    monkeypatch.setattr(module, stage, task)
     assert cli.main(["run", *map(str, files), "--out", str(folder), *FLAGS]) == 0
     assert not log.exists()
 
