@@ -44,6 +44,7 @@ from s4a.show.pictures import write_animation, write_picture
 from s4a.study.insert import insert as place
 from s4a.study.options import PAIR, Options
 from s4a.study.pipeline import analyse
+from s4a.study.processes import spawned_end_too
 from s4a.study.store import ENGINE
 from s4a.study.tree import left_out, open_study
 from s4a.study.verify import verify as look_through
@@ -107,6 +108,7 @@ def cluster(address: str | None) -> Iterator[None]:
     n_workers = int(known[1] or 0)
     with contextlib.ExitStack() as stack:
         if n_workers:
+            stack.enter_context(spawned_end_too())
             local = LocalCluster(n_workers=n_workers, threads_per_worker=1, dashboard_address=None)
             address = stack.enter_context(local).scheduler_address
         stack.enter_context(Client(address))

@@ -10,6 +10,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
+from multiprocessing import spawn
 from pathlib import Path
 from typing import Any
 
@@ -87,6 +88,30 @@ def end_with(owner: int, at_once: bool, *, interruptible: bool = False) -> None:
     if os.getppid() != owner:  # it ended before this line
         os._exit(1)
     threading.Thread(target=watch, daemon=True).start()
+
+
+@contextlib.contextmanager
+def spawned_end_too() -> Iterator[None]:
+    """Processes that multiprocessing spawns meanwhile end within a second of this one.
+
+    Those of dask look for the process that started them only once they have imported dask, which
+    takes seconds; here they do before they import anything.
+    """
+    before = spawn.get_command_line
+    text = f"{inspect.getsource(end_with)}\nend_with({os.getpid()}, False, interruptible=True)\n"
+
+    def watching(**options: Any) -> list[str]:
+        line = list(before(**options))
+        if "-c" in line:  # not in a frozen program
+            line[line.index("-c") + 1] = text + line[line.index("-c") + 1]
+        return line
+
+    if os.name == "posix":  # elsewhere the line is one text, and its quotes are not escaped
+        spawn.get_command_line = watching
+    try:
+        yield
+    finally:
+        spawn.get_command_line = before
 
 
 @contextlib.contextmanager

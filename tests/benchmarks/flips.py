@@ -25,21 +25,33 @@ import time
 import traceback
 from pathlib import Path
 
+import numpy as np
 import xarray as xr
 
 from s4a import analyse, cli, open_study, synthetic
+from s4a.show import draw, page, pictures
 from s4a.study import store
 
 N_SHAPES, N_VERTICES = 6, 400
 OPTIONS = {"n_coarse": 150, "k_init": 8, "k": 12, "intersections": False, "keep_doubtful": True}
-LIMIT = 120  # seconds of a command
+LIMIT, END = 60, 600  # seconds of CPU of a command, and of the clock
 MEMORY = 4 * 2**30  # bytes that it may ask for more than it has
 NAMED, SAME, WRONG = "named error", "same result", "wrong"
 
 
 def show(study, out):
-    """``s4a view``."""
-    return cli.main(["view", str(study), "--out", str(out / "page.html")])
+    """``s4a view``, with small pictures; all that they are drawn of is noted beside the page."""
+    drawn = hashlib.sha256()
+
+    def small(points, triangles, *, colors=None, **options):
+        for values in (points, triangles, np.zeros(0) if colors is None else colors):
+            drawn.update(np.ascontiguousarray(values).tobytes())
+        return draw.render(points, triangles, colors=colors, **options | {"size": (50, 40)})
+
+    page.render = pictures.render = small
+    code = cli.main(["view", str(study), "--out", str(out / "page.html")])
+    (out / "drawn").write_text(drawn.hexdigest())
+    return code
 
 
 def test(study, out):
@@ -119,6 +131,8 @@ def outcome(command, study, out):
             os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
         used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, used + MEMORY))
+        spent = int(time.process_time())
+        resource.setrlimit(resource.RLIMIT_CPU, (spent + LIMIT, spent + LIMIT))
         code = 70
         try:
             code = command(study, out)
@@ -127,7 +141,7 @@ def outcome(command, study, out):
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
-    end = time.monotonic() + LIMIT
+    end = time.monotonic() + END
     while not (state := os.waitpid(process, os.WNOHANG))[0]:
         if time.monotonic() > end:
             os.kill(process, signal.SIGKILL)
@@ -166,6 +180,9 @@ def main(arguments=None):
     with tempfile.TemporaryDirectory() as folder:
         folder = Path(folder).resolve()
         study, out = make(folder), folder / "out"
+        out.mkdir()
+        for command in COMMANDS.values():  # what they import, each process below has then
+            command(study, out)
         whole = {name: outcome(command, study, out) for name, command in COMMANDS.items()}
         again = {name: outcome(command, study, out) for name, command in COMMANDS.items()}
         assert whole == again

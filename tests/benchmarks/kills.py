@@ -32,7 +32,7 @@ import psutil
 from s4a import cli, synthetic
 from s4a.study import store
 
-SMALL = "--no-intersections --keep-doubtful --n-coarse 150 --k-init 8 --k 12".split()
+SMALL = "--no-intersections --keep-doubtful --n-coarse 100 --k-init 8 --k 12".split()
 STAGES = {  # the first file of each, the last stage first
     "modes, report": "pca.nc",
     "registration": "registration.nc",
@@ -123,7 +123,7 @@ class Bench:
 
     def __init__(self, folder, unsynchronized=False):
         self.folder = Path(folder)
-        self.files = synthetic.write(synthetic.brains(4, 300, seed=2), self.folder / "meshes")
+        self.files = synthetic.write(synthetic.brains(3, 200, seed=2), self.folder / "meshes")
         self.files[0].with_name("truth.nc").unlink()
         (self.folder / "hook").mkdir()
         (self.folder / "hook" / "sitecustomize.py").write_text(JOURNAL)

@@ -294,6 +294,12 @@ PROOFS = [
         "test_workers_are_gone_within_seconds_of_the_end_of_a_run_and_leave_nothing",
     ),
     (
+        "kill -9 of a run with `--cluster local:N` while its workers start",
+        "they are gone within a second",
+        "test_cluster.py",
+        "test_workers_of_dask_that_are_just_starting_are_gone_soon_after_a_run_that_is_killed",
+    ),
+    (
         "kill -9 of a run and all of its workers at once",
         "resumes; the next run removes the semaphores and memory maps that they left",
         ENDS,
