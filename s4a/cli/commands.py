@@ -69,10 +69,10 @@ def check(args: Namespace) -> int:
 def run(args: Namespace) -> int:
     """The whole analysis over a folder of meshes."""
     begin = time.perf_counter()
+    full = within(args.out, "report.txt")
     with cluster(args.cluster):
         study = analyse(args.paths, store=args.out, **options_of(args))
     again = shlex.join(["s4a", *(word for word in args.words if word != "--keep-doubtful")])
-    full = Path(args.out) / "report.txt"
     report = study["report"].to_dataset()
     lines = [tables.report_table(report), *tables.stage_lines(report)]
     full.write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -435,10 +435,16 @@ def positions_by_name(file: str) -> dict[str, np.ndarray]:
 
 
 def within(study: str, name: str) -> Path:
-    """A place in the folder of a study, which may be of a stranger: it must be no link."""
+    """A file or folder to write in that of a study, which may be of a stranger.
+
+    Neither it nor what lies in it may be a link, a pipe or a device.
+    """
     place = Path(study) / name
-    if place.is_symlink():
-        raise ValueError(f"{place} is a symbolic link, and is not written through: give --out")
+    for path in (place, *(sorted(place.iterdir()) if place.is_dir() else [])):
+        if path.is_symlink():
+            raise ValueError(f"{path} is a symbolic link, and is not written through: remove it")
+        if path.exists() and not path.is_file() and not path.is_dir():
+            raise ValueError(f"{path} is a pipe or a device, and is not written to: remove it")
     return place
 
 

@@ -465,6 +465,19 @@ PROOFS = [
         "test_symbolic_links_within_a_study_are_not_followed",
     ),
     (
+        "a symbolic link in the place of a report, a page or results that a command writes into a "
+        "study",
+        "refused before anything is computed; what it leads to is not touched",
+        SEAL,
+        "test_a_link_in_a_study_is_not_written_through",
+    ),
+    (
+        "a pipe in such a place",
+        "refused before anything is computed",
+        SEAL,
+        "test_a_pipe_in_a_study_is_not_written_to",
+    ),
+    (
         "a file without a variable, an attribute or a name, with an index out of range, of another "
         "kind or size",
         "refused with the file and what it should hold",

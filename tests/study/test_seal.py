@@ -333,15 +333,33 @@ def test_symbolic_links_within_a_study_are_not_followed(folder, tmp_path, place)
     assert "pca" in open_study(whole)  # the study itself may be a link
 
 
-@pytest.mark.parametrize(
-    ("command", "name"), [("view", "study.html"), ("statistics", "statistics")]
-)
+IN_STUDY = [
+    (["view"], "study.html"),
+    (["statistics"], "statistics"),
+    (["statistics"], "statistics/evaluation.csv"),
+    (["run", "absent.ply", "--out"], "report.txt"),
+]
+
+
+@pytest.mark.parametrize(("command", "name"), IN_STUDY)
 def test_a_link_in_a_study_is_not_written_through(folder, tmp_path, capsys, command, name):
     (tmp_path / "diary").write_text("mine")
+    (folder / name).parent.mkdir(exist_ok=True)
+    (folder / name).unlink(missing_ok=True)
     (folder / name).symlink_to(tmp_path / "diary")
-    assert cli.main([command, str(folder)]) == 2
+    assert cli.main([*command, str(folder)]) == 2
     assert f"{name} is a symbolic link" in capsys.readouterr().err
     assert (tmp_path / "diary").read_text() == "mine"
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no pipes")
+@pytest.mark.parametrize(("command", "name"), IN_STUDY)
+def test_a_pipe_in_a_study_is_not_written_to(folder, capsys, command, name):
+    (folder / name).parent.mkdir(exist_ok=True)
+    (folder / name).unlink(missing_ok=True)
+    os.mkfifo(folder / name)
+    assert cli.main([*command, str(folder)]) == 2
+    assert f"{name} is a pipe" in capsys.readouterr().err
 
 
 def test_a_report_of_somebody_else_in_a_study_is_not_overwritten(tmp_path):
