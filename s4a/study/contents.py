@@ -172,7 +172,9 @@ def check_names(names: Iterable[str]) -> None:
 # ---- what files have in common
 
 
-def check_fit(name: str, data: xr.Dataset, others: Mapping[str, xr.Dataset]) -> None:
+def check_fit(
+    name: str, data: xr.Dataset, others: Mapping[str, xr.Dataset], damaged: Iterable[str] = ()
+) -> None:
     """ValueError where a file does not fit to those of the study that it was made from.
 
     Parameters
@@ -182,6 +184,8 @@ def check_fit(name: str, data: xr.Dataset, others: Mapping[str, xr.Dataset]) -> 
     data : Dataset
     others : dict of str to Dataset
         By name, those that were read before.
+    damaged : iterable of str
+        Names of those that could not be read: what was made from them may be right.
     """
     stage, _, shape = name.partition("/")
     original = others.get(f"original/{shape}")
@@ -201,7 +205,9 @@ def check_fit(name: str, data: xr.Dataset, others: Mapping[str, xr.Dataset]) -> 
     elif stage == "latent" and not shape:
         fit_latent(data, others)
     elif stage == "pca" and "registration" in others:
-        names = [one.partition("/")[2] for one in others if one.startswith("registration/")]
+        names = [
+            one.partition("/")[2] for one in (*others, *damaged) if one.startswith("registration/")
+        ]
         check_among("scores", data["shape"].values.tolist(), names)
         check_size(data, "vertex", others["registration"].sizes["vertex"], "registration")
 

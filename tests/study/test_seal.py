@@ -474,6 +474,14 @@ def test_verify_says_in_one_line_what_holds_and_its_exit_code_whether(folder, ca
     ]
 
 
+@pytest.mark.parametrize("name", ["original/brain_01.nc", "registration/brain_01.nc"])
+def test_verify_does_not_blame_what_was_made_from_a_damaged_file(folder, name):
+    path = folder / name
+    path.write_bytes(flipped(path.read_bytes(), 8 * 100))
+    found = verify(folder)
+    assert found["file"].values[found["state"].values != "whole"].tolist() == [name]
+
+
 def test_verify_tells_files_of_an_earlier_run_and_those_from_before_checksums(brains, folder):
     path = folder / "original/brain_01.nc"
     data = store.read(path)
