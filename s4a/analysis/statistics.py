@@ -266,8 +266,8 @@ def _numbers(values):
     """The variable of a regression as floats ``(s,)``, or what else to do."""
     if values.dtype.kind == "U":
         raise ValueError(
-            f"a regression needs a variable of numbers, found text such as {values[0]!r}; a group "
-            "test takes text"
+            f"a regression needs a variable of numbers, found text such as {str(values[0])!r}; a "
+            "group test takes text"
         )
     if values.ndim > 1:
         raise ValueError(f"a regression needs one number for each shape, found {values.shape}")

@@ -165,6 +165,8 @@ def statistics(args: Namespace) -> int:
 
     Tests of groups and variables of its table.
     """
+    if args.covariates and not (args.group or args.variable):
+        raise ValueError("--covariates are of a test: give --group, --variable or both")
     study, out = open_study(args.study), args.out or str(within(args.study, "statistics"))
     study = with_table(study, args.table) if args.table else study
     study = tests.with_doubtful(study) if args.keep_doubtful else study

@@ -96,7 +96,7 @@ def add_options(add: Callable, names: Iterable[str], *, unset: bool = False) -> 
             kind = {"type": components}
         else:
             kind = {"type": whole if isinstance(shown, int) or name == "n_latent" else str}
-            kind = {"type": processes} if name == "n_jobs" else kind
+            kind = {"type": OTHER_NUMBERS.get(name, kind["type"])}
             text += "" if shown is None else f" (default: {shown})"
         value = None if unset and name != "n_jobs" else default
         add("--" + name.replace("_", "-"), default=value, help=text, **kind)
@@ -124,6 +124,17 @@ def processes(text: str) -> int:
             f"a number from 1 to {MOST_PROCESSES} needed, or -1 for all cores, found {number}"
         )
     return number
+
+
+def not_negative(text: str) -> int:
+    """A whole number from 0, as seeds are."""
+    number = whole(text)
+    if number < 0:
+        raise argparse.ArgumentTypeError(f"a whole number from 0 needed, found {number}")
+    return number
+
+
+OTHER_NUMBERS: dict[str, Callable[[str], int]] = {"n_jobs": processes, "seed": not_negative}
 
 
 def _check(add):

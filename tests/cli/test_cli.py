@@ -96,6 +96,7 @@ def test_check_takes_a_pattern(folder, capsys):
         (["check", "nowhere"], "nowhere"),
         (["view", "nowhere"], "not a study folder"),
         (["run", "nowhere", "--out", "study"], "nowhere"),
+        (["statistics", "nowhere", "--covariates", "age"], "give --group, --variable or both"),
         (
             ["run", "nowhere", "--out", "study", "--k", "3"],
             "k must be an integer of at least 4; found 3",
@@ -228,6 +229,7 @@ def test_a_mesh_written_by_the_library_passes_the_check(tmp_path, capsys):
         (["--n-pairs", "99999999999"], "n_pairs must be an integer of at most 2147483647"),
         (["--k", "NaN"], "a whole number of at most 18 digits needed, found 'NaN'"),
         (["--seed", "1e3"], "a whole number of at most 18 digits needed, found '1e3'"),
+        (["--seed", "-1"], "a whole number from 0 needed, found -1"),
         (["--n-coarse", "²"], "a whole number of at most 18 digits needed, found '²'"),
         (["--components", "²"], "found '²'"),
         (["--n-jobs", "0"], "a number from 1 to 1000 needed, or -1 for all cores, found 0"),

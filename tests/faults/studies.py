@@ -409,6 +409,12 @@ PROOFS = [
         "test_a_number_of_permutations_that_makes_no_test_is_refused",
     ),
     (
+        "covariates, and no group or variable to test",
+        "one sentence, exit code 2",
+        "test_cli.py",
+        "test_an_error_is_one_line_and_the_exit_code_2",
+    ),
+    (
         "statistics of equal shapes, or with displacements that are not finite",
         "error with the names",
         STATISTICS,
