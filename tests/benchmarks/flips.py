@@ -125,6 +125,7 @@ def outcome(command, study, out):
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir()
     said, complained = out.with_suffix(".out"), out.with_suffix(".err")
+    sys.stdout.flush()  # or the process below says it, too
     process = os.fork()
     if not process:
         for number, path in ((1, said), (2, complained)):
@@ -193,6 +194,7 @@ def main(arguments=None):
             bit = rng.randrange(8 * path.stat().st_size)
             name = path.relative_to(study).as_posix()
             flip(path, bit)
+            sys.stderr.write(f"bit {bit} of {name}\n")
             for command, function in COMMANDS.items():
                 found = outcome(function, study, out)
                 what = judge(found, whole[command], name)
