@@ -3,9 +3,9 @@
 Every row runs in a process of its own with one BLAS thread, ours and the other in turn, on the same
 input: seconds of CPU, of the clock, and the peak of memory above what the process holds before.
 pyFM is on PyPI as ``pyfmaps`` (the extra ``bench``).  ``speed.py stages``, ``pipelines``,
-``growth``, ``pairs``, ``nearest`` or ``seals`` runs one part, ``speed.py methods faces heads`` an
-analysis by RE-MATCH and by SCALABLE of ten shapes of each, ``speed.py whole 51 100000`` the whole
-analysis of so many synthetic shapes of so many vertices.
+``growth``, ``pairs``, ``nearest`` or ``seals`` runs one part, ``speed.py methods brains faces
+heads`` an analysis by RE-MATCH and by SCALABLE of ten shapes of each, ``speed.py whole 51 100000``
+the whole analysis of so many synthetic shapes of so many vertices.
 """
 
 import itertools
@@ -50,15 +50,24 @@ def say(text):
     sys.stdout.flush()
 
 
+def peak():
+    """Peak memory of this process in MiB; not that of its parent, which ru_maxrss begins with."""
+    status = Path("/proc/self/status")
+    if not status.exists():
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    words = dict(line.split(":", 1) for line in status.read_text().splitlines())
+    return int(words["VmHWM"].split()[0]) / 1024
+
+
 def child(function, *arguments):
     """What the function gives, its seconds of CPU and of the clock, and its peak memory in MiB."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # some native filters print
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    before = peak()
     cpu, wall = time.process_time(), time.perf_counter()
     with threadpool_limits(1):
         result = function(*arguments)
     spent = time.process_time() - cpu, time.perf_counter() - wall
-    return result, *spent, (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+    return result, *spent, peak() - before
 
 
 def measured(function, *arguments):
@@ -575,19 +584,33 @@ def one_numbering(study):
     return image
 
 
-def methods(folder, *sets, n=10):
-    """A whole study by RE-MATCH and by SCALABLE, by default and as in the paper, on real shapes.
+def planted(study, truth):
+    """The true image of the template's vertices on a synthetic brain."""
 
-    Errors are in % of sqrt(area): where vertex i is vertex i, the mean distance of matches and of
-    the registered surface from the truth; Chamfer (eq. 9) of the shape and the image of the
-    template.
+    def image(shape, template):
+        row = study["original"][template]["file_vertex"].values
+        return synthetic.position(truth, shape, truth[template]["reference_point"].values[row])
+
+    return image
+
+
+def methods(folder, *sets, n=10):
+    """A whole study by RE-MATCH and by SCALABLE, by default and as in the paper.
+
+    Errors are in % of sqrt(area): where the truth is known, as of faces whose vertex i is vertex i,
+    the mean distance of matches and of the registered surface from it; Chamfer (eq. 9) of the shape
+    and the image of the template.
     """
-    for name in sets or ("faces", "heads"):
-        subprocess.run(
-            [sys.executable, DATA / "unpack.py", folder, name],
-            check=True,
-            stdout=subprocess.DEVNULL,
-        )
+    for name in sets or ("brains", "faces", "heads"):
+        truth = None
+        if name == "brains":  # synthetic ones, each with vertices of its own
+            paths, truth = collection(n, 20_000, folder / name)
+        else:
+            subprocess.run(
+                [sys.executable, DATA / "unpack.py", folder, name],
+                check=True,
+                stdout=subprocess.DEVNULL,
+            )
         paths = [str(path) for path in sorted((folder / name).glob("*.ply"))[:n]]
         say(f"\nA study of {len(paths)} {name}, one process\n")
         say(
@@ -599,7 +622,8 @@ def methods(folder, *sets, n=10):
             _, cpu, _, memory = measured(analysed, paths, out, method, preset)
             disk = sum(path.stat().st_size for path in out.rglob("*.nc")) / 2**20
             with s4a.open_study(out) as study:
-                widths = zip(study_errors(study, name), (8, 9, 9, 7), strict=True)
+                image = {"faces": one_numbering(study), "brains": planted(study, truth)}.get(name)
+                widths = zip(study_errors(study, image), (8, 9, 9, 7), strict=True)
                 errors = [f"{error:>{width}}" for error, width in widths]
                 ratio = study["pca"]["explained_variance_ratio"].values[:3].sum()
                 say(
@@ -608,7 +632,7 @@ def methods(folder, *sets, n=10):
                 )
 
 
-def study_errors(study, name):
+def study_errors(study, image):
     """Errors of the matches and of the surfaces, Chamfer distance, round trip, as texts."""
     data = study["registration"].to_dataset()
     template = data.attrs["template"]
@@ -619,8 +643,8 @@ def study_errors(study, name):
         match = data["registered_match"].sel(shape=shape).values
         chamfer.append(metrics.chamfer(X, X[match]))
     far = ["", ""]
-    if name == "faces":
-        error = accuracy.accuracy(study, one_numbering(study))["error"].mean("shape")
+    if image is not None:
+        error = accuracy.accuracy(study, image)["error"].mean("shape")
         far = [f"{100 * error.sel(way=way):.3f}" for way in (accuracy.MATCH, accuracy.SURFACE)]
     trip = data["round_trip"].values.mean(1).sum() / (data.sizes["shape"] - 1)
     return [*far, f"{100 * np.mean(chamfer):.4f}", f"{100 * trip:.3f}"]
