@@ -339,20 +339,20 @@ def where(source, seen):
 
 # first maps and Consistent ZoomOut of Table 2
 FIRST = {
-    "landmarks (the paper)": {"preset": "paper"},
-    "landmarks, our rounds": {"init": "landmarks"},
-    "nearest neighbours, our rounds": {},
+    "paper": ("landmarks (the paper)", {"preset": "paper"}),
+    "landmarks": ("landmarks, our rounds", {"init": "landmarks"}),
+    "nearest": ("nearest neighbours, our rounds", {}),
 }
 
 
-def table_2(given=None):
+def table_2(given=None, first=tuple(FIRST)):
     """Ten real heads, with the paper's first maps and with ours."""
     say("\nTable 2 on ten real heads")
     with tempfile.TemporaryDirectory() as folder:
         shapes = s4a.read_shapes(files_of("heads", folder, given))
-    all_rows, distances, kept = [], [], {}
-    for what, options in FIRST.items():
-        found = kept[what] = compare.collection(shapes, **options)
+    all_rows, distances = [], []
+    for what, options in (FIRST[name] for name in first):
+        found = compare.collection(shapes, **options)
         seconds, chamfer = found["collection_seconds"], found["collection_chamfer"].mean("shape")
         for way in found["way"].values:
             for how in found["how"].values:
@@ -401,6 +401,7 @@ if __name__ == "__main__":
     parser.add_argument("parts", nargs="*", metavar="PART", help=", ".join(known))
     parser.add_argument("--data", type=Path, help="a folder of meshes for each set")
     parser.add_argument("--init", choices=INITS, help="first maps of registered and more")
+    parser.add_argument("--first", nargs="+", choices=FIRST, default=[*FIRST], help="of collection")
     parser.add_argument("--methods", nargs="+", default=compare.METHODS, help="of heads")
     parser.add_argument("--pairs", type=int, help="of more, and of heads: 5 by default")
     parser.add_argument("--peer", action="store_true", help="pyFM beside registered shapes, too")
@@ -423,6 +424,6 @@ if __name__ == "__main__":
     if "embedded" in parts:
         embedded()
     if "collection" in parts and real:
-        table_2(args.data)
+        table_2(args.data, args.first)
     if "heads" in parts and real:
         heads(args.data, args.methods, args.pairs or 5)

@@ -45,7 +45,7 @@ def test_the_preset_sets_every_option_that_has_a_default_of_ours():
 
 
 def test_every_addition_and_the_papers_choice_are_in_the_documentation():
-    table = (DOCS / "api/study.md").read_text(encoding="utf-8")
+    table = (DOCS / "differences.md").read_text(encoding="utf-8")
     said = " ".join(s4a.analyse.__doc__.split())
     for name, value in PAPER.items():
         assert f"| `{name}`: " in table
