@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator
 from multiprocessing import spawn
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import psutil
@@ -112,6 +113,36 @@ def spawned_end_too() -> Iterator[None]:
         yield
     finally:
         spawn.get_command_line = before
+
+
+@contextlib.contextmanager
+def interruption_kept() -> Iterator[threading.Event]:
+    """Ctrl-C is remembered, as its KeyboardInterrupt may be lost.
+
+    Python drops one that comes in a destructor or in the callback of a weak reference, of which
+    HDF5 has many, and says "Exception ignored"; a library may take it for an error of its own.
+
+    Yields
+    ------
+    threading.Event
+        Set from the first Ctrl-C on.
+    """
+    asked = threading.Event()
+    before = signal.getsignal(signal.SIGINT)
+    # signals come to the main thread, and this one may be ignored
+    if threading.current_thread() is not threading.main_thread() or not callable(before):
+        yield asked
+        return
+
+    def remember(number: int, frame: FrameType | None) -> None:
+        asked.set()
+        before(number, frame)
+
+    signal.signal(signal.SIGINT, remember)
+    try:
+        yield asked
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextlib.contextmanager

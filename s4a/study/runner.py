@@ -6,6 +6,7 @@ import json
 import logging
 import os
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
@@ -19,7 +20,7 @@ from joblib import delayed, effective_n_jobs
 from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
-from s4a.study.processes import died, workers
+from s4a.study.processes import died, interruption_kept, workers
 from s4a.study.seal import open_regular
 from s4a.study.store import LOGS, Claim, is_done, open_without_following, task_key, write
 
@@ -114,6 +115,7 @@ class Run:
         self.failures, self.unforeseen = {}, []
         self.costs = read_costs(self.costs_file)
         self.doing = "begin"
+        self.interrupted = threading.Event()
 
     @property
     def costs_file(self) -> Path:
@@ -127,6 +129,7 @@ class Run:
         They are added to those of earlier runs over the folder where a `share` of the stage is left
         to do, and take their place where all of it is.
         """
+        self.end_if_interrupted()
         begin = time.perf_counter()
         self.doing, self.workers = name, {}
         seconds, memory = self.costs.get(name, (0.0, 0.0)) if share < 1 else (0.0, 0.0)
@@ -155,6 +158,7 @@ class Run:
             log.info("%s: %d of %d to do", stage, len(missing), len(tasks))
             outcomes = self.outcomes(missing)
             for done in tqdm(outcomes, total=len(missing), desc=stage, disable=not missing):
+                self.end_if_interrupted()
                 self.workers[done.pid] = max(done.memory, self.workers.get(done.pid, 0))
                 if done.failure and not each:
                     raise (StageError if done.unforeseen else ValueError)(
@@ -208,6 +212,11 @@ class Run:
                 else:
                     raise StageError(f"processes die before they begin ({how})") from error
 
+    def end_if_interrupted(self) -> None:
+        """KeyboardInterrupt where Ctrl-C was asked for, and that of Python was lost."""
+        if self.interrupted.is_set():
+            raise KeyboardInterrupt
+
     def has(self, task: Task) -> bool:
         """Whether the file of a task is there, whole and of this key."""
         return is_done(self.folder / task.file, task.key)
@@ -218,10 +227,13 @@ class Run:
         file = self.folder / LOGS / "run.txt"
         file.unlink(missing_ok=True)
         try:
-            yield
+            with interruption_kept() as self.interrupted:
+                yield
         except (ValueError, OSError, StageError):
+            self.end_if_interrupted()  # it may be what became of it
             raise
         except Exception as error:
+            self.end_if_interrupted()
             note(file, traceback.format_exc())
             raise StageError(
                 f"{self.doing}: {in_a_line(error)}: a fault of S4A or of its installation, not of "

@@ -294,6 +294,12 @@ PROOFS = [
         "test_workers_are_gone_within_seconds_of_the_end_of_a_run_and_leave_nothing",
     ),
     (
+        "Ctrl-C that comes where Python drops it, as in a destructor",
+        "the run ends after the task that it is at",
+        ENDS,
+        "test_an_interruption_that_gets_lost_ends_the_run_after_the_task",
+    ),
+    (
         "kill -9 of a run with `--cluster local:N` while its workers start",
         "they are gone within a second",
         "test_cluster.py",

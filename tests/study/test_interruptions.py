@@ -102,6 +102,21 @@ def test_workers_are_gone_within_seconds_of_the_end_of_a_run_and_leave_nothing(
     assert not remains(run.pid)
 
 
+def test_an_interruption_that_gets_lost_ends_the_run_after_the_task(files, tmp_path, monkeypatch):
+    remesh_shape, before = pipeline.remesh_shape, signal.getsignal(signal.SIGINT)
+
+    def losing(*arguments):
+        with contextlib.suppress(KeyboardInterrupt):  # as Python does in a destructor
+            signal.raise_signal(signal.SIGINT)
+        return remesh_shape(*arguments)
+
+    monkeypatch.setattr(pipeline, "remesh_shape", losing)
+    with pytest.raises(KeyboardInterrupt):
+        analyse(files[:2], store=tmp_path / "study", n_jobs=1, **OPTIONS)
+    assert len(list(tmp_path.glob("study/coarse/[!.]*.nc"))) == 1
+    assert signal.getsignal(signal.SIGINT) is before
+
+
 def test_a_run_killed_with_its_workers_goes_on_and_the_next_one_removes_what_they_left(
     files, tmp_path
 ):
