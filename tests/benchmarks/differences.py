@@ -323,7 +323,7 @@ Each alone, on top of the paper (errors: matched, surface):
 
 {additions}
 
-[Elastic rounds](decisions.md#elastic-rounds) are not the default. `parts` and `wide` are shown
+Elastic rounds ([what was measured](decisions.md)) are not the default. `parts` and `wide` are shown
 with what they need: joint rounds, and 1,000 spread vertices. Of shapes of 10,000 vertices the
 25,000 of `n_projected` would be all; it is measured with 2,500, as 25,000 are of 100,000.
 `ahead`, `sharpen` and `both` concern pairs that are matched on their own.
