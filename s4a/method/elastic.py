@@ -13,23 +13,38 @@ and Medioni (1992), with the normals of both surfaces as of Rusinkiewicz (2019).
 the bending energy, the integral of |Laplacian|^2 of the displacement.  The stiffness falls from
 round to round, as in the non-rigid ICP of Amberg, Romdhani and Vetter (CVPR 2007).  Lengths are for
 surfaces of unit area.
+
+What K functions cannot follow is left to local rounds: a displacement d (n, 3) of the vertices of
+low resolution, beyond the warp, that minimises
+
+    sum_i a_i |d_i - r_i|^2 + time * integral |grad d|^2,
+
+r_i what d_i and the way to the nearest point add up to, the way along the surface counted by half.
+That is one implicit step of heat diffusion, (A + time W) d = A r; the time falls, as that of the
+smoothing in MeshMonk does (White et al., Scientific Reports 2019).
 """
 
 import numpy as np
 import scipy.linalg
+import scipy.sparse as sp
 
 from s4a.geometry.closest import closest_point_in_star, features, interpolate
-from s4a.geometry.mesh import vertex_normals
+from s4a.geometry.mesh import cotan_weights, vertex_normals
+from s4a.geometry.mesh import stiffness as stiffness_matrix
 from s4a.method.joint import Warp, move, turn
 from s4a.method.shape import Basis
+from s4a.method.spectral import factor
 
-# Of the first and of the last step.  Chosen on a pair of faces, one of brains and two cortex
-# templates, reported on others: docs/decisions.md
-STIFFNESS = (1e-4, 3e-8)
+# Of the first and of the last step.  Chosen on a pair of faces, of brains and of skulls and two
+# cortex templates, reported on others: docs/decisions.md
+STIFFNESS = (1e-4, 1e-7)
 SLIDE = (0.01, 0.1)  # little lets first steps advance, more keeps last ones from drifting
 N_STEPS = 8
 N_ROUNDS = 8
 STILL = 1e-3  # share of sqrt(area): a step ends with a round that moves less
+TIME = (2e-2, 2e-4)  # of local rounds: smooth over 0.2, then over 0.02 of sqrt(area)
+LOCAL_SLIDE = 0.5
+N_LOCAL_ROUNDS = 10
 
 
 def nearest_on_surface(
@@ -155,3 +170,47 @@ def elastic_rounds(
     b = w[-1]
     c = np.concatenate([np.zeros((1, 3)), w[:-4]])  # (K, 3)
     return A @ R, A @ t + b, c
+
+
+def local_rounds(
+    source: Basis,
+    target: Basis,
+    X: np.ndarray,
+    *,
+    time: tuple[float, float] = TIME,
+    slide: float = LOCAL_SLIDE,
+    rounds: int = N_LOCAL_ROUNDS,
+) -> np.ndarray:
+    """A displacement beyond that of elastic rounds, free at every vertex of low resolution.
+
+    Parameters
+    ----------
+    source : Basis
+        At full resolution: its surface is searched.
+    target : Basis
+        At low resolution.
+    X : float ndarray (n, 3)
+        Its vertices after the elastic rounds.
+    time : tuple of float
+        Of the heat diffusion in the first and in the last round.
+    slide : float
+        Weight of the way along the surface.
+    rounds : int
+
+    Returns
+    -------
+    float ndarray (n, 3)
+    """
+    n = len(X)
+    A = sp.diags_array(target.area)
+    W = stiffness_matrix(*cotan_weights(target.X, target.T), n)
+    d = np.zeros((n, 3))
+    for step in np.geomspace(*time, rounds):
+        normals = vertex_normals(X + d, target.T)
+        y, normals_y = nearest_on_surface(source, X + d, normals)
+        way = y - X - d
+        m = unit(normals + normals_y)
+        across = np.einsum("ni,ni->n", m, way)[:, None] * m
+        goal = d + slide * way + (1 - slide) * across
+        d = factor(A + step * W)(target.area[:, None] * goal)
+    return d

@@ -155,7 +155,10 @@ def best_first_map(
     for name, first in maps.items():
         match = fmap.zoomout(source, target, first, k, step=step)[1]
         end = joint.low_rounds(source, target, match, k_first=20, step=20, rounds=1, by_parts=True)
-        score[name] = joint.registration_score(source, target, *end) + stretch(target, end[1])
+        image = joint.move(target, end[1])
+        score[name] = joint.registration_score(source, target, end[0], image) + stretch(
+            target, end[1]
+        )
     best = min(score, key=score.get)
     return best, maps[best], fits[best]
 

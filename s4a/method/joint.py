@@ -181,7 +181,7 @@ def registration_score(
     source: Basis,
     target: Basis,
     match: np.ndarray,
-    warp: Warp,
+    X: np.ndarray,
     *,
     n_samples: int = 300,
     limit: float = 0.5,
@@ -202,9 +202,9 @@ def registration_score(
         At one resolution.
     match : int ndarray (s,)
         For the target's vertices near coarse ones.
-    warp : tuple (R, t, c)
+    X : float ndarray (n_target, 3)
+        The registered target.
     """
-    X = move(target, warp)
     tree = feature_tree(X, target.T)
     rows = np.arange(len(X))[target.near_coarse]
     back = X[tree.query(source.tree.data[source.near_coarse])[1]]
@@ -263,7 +263,7 @@ def candidates(
     tried = {}
 
     def enter(name, match, warp):
-        score = registration_score(source, target, match, warp)
+        score = registration_score(source, target, match, move(target, warp))
         tried[name] = Candidate(score, match, warp)
 
     for name, match in starts.items():

@@ -14,7 +14,7 @@ from s4a.geometry.closest import closest_point_in_star, feature_tree, match_surf
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.method import joint
 from s4a.method.deform import displacement_in_template
-from s4a.method.elastic import elastic_rounds
+from s4a.method.elastic import elastic_rounds, local_rounds
 from s4a.method.first_map import nearest_after_motion
 from s4a.method.fmap import fmap_from_match
 from s4a.method.nearest import nearest_in_cells, nearest_of_few, nearest_rows
@@ -313,26 +313,34 @@ def register_surface(
     attrs: dict[str, float | str] = {
         f"score_{name}": candidate.score for name, candidate in candidates.items()
     }
-    ends = {}
+    ends = {}  # name -> score and registered template (n_target, 3)
     for name in joint.finalists(candidates) if candidates else ["intrinsic"]:
         if elastic and candidates[name].warp[0].ndim == 2:  # not by parts
-            warp = elastic_rounds(M, target.low, candidates[name].warp)
-            part = joint.nearest_vertices(M, N, joint.move(N, warp), N.near_coarse)
+            X = elastic_surface(source, target, candidates[name].warp)
+            part = joint.nearest_vertices(M, N, X, N.near_coarse)
         elif name == "intrinsic":
             match, compared, certified = match_functions(source, target, *functions)
             attrs |= {"compared_share": compared, "certified_share": certified}
             part = match[N.near_coarse]
             warp = joint.warp_after(M, N, part, *placed) if placed else joint.fit_warp(M, N, part)
+            X = joint.move(N, warp)
         else:
             part, warp = joint.dense_rounds(M, N, candidates[name].warp)
-        score = joint.registration_score(M, N, part, warp)
-        ends[name] = joint.Candidate(score, part, warp)
-    method = min(ends, key=lambda name: ends[name].score)
-    X = joint.move(N, ends[method].warp)
+            X = joint.move(N, warp)
+        ends[name] = joint.registration_score(M, N, part, X), X
+    method = min(ends, key=lambda name: ends[name][0])
+    score, X = ends[method]
     if elastic or method != "intrinsic":
         match = match_surfaces(X, N.T, M.X, M.T)
-    attrs |= {"method": method, "score": ends[method].score}
+    attrs |= {"method": method, "score": score}
     return match, source.from_frame(X), attrs
+
+
+def elastic_surface(source: Shape, target: Shape, warp: joint.Warp) -> np.ndarray:
+    """The template ``(n_target, 3)`` after elastic rounds from a warp, and then local ones."""
+    warp = elastic_rounds(source.full, target.low, warp)
+    local = local_rounds(source.full, target.low, joint.move(target.low, warp))  # (n_low, 3)
+    return joint.move(target.full, warp) + target.U @ local
 
 
 def way_back(source: Shape, target: Shape, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -5,9 +5,12 @@ Its exercises without an answer and with the one of the book.
 
 import asyncio
 import json
+import queue
 import re
 import subprocess
+import time
 
+import numpy as np
 import pytest
 from paths import NOTEBOOKS, ROOT
 
@@ -43,6 +46,27 @@ def exercises(notebook):
             yield i, re.search(r"```python\n(.*?)\n```", solution, re.DOTALL)[1]
 
 
+def listen_in_slices(channel, seconds=5):
+    """Let a channel look for its message again and again until the time is over.
+
+    A socket of zmq now and then does not wake the event loop for a message that has come: with one
+    look as long as the cell may take, the client waits all of that beside an idle kernel.
+    """
+    look = channel.get_msg
+
+    async def get_msg(timeout=None):
+        end = time.monotonic() + (np.inf if timeout is None else timeout)
+        while True:
+            left = end - time.monotonic()
+            try:
+                return await look(timeout=max(0, min(seconds, left)))
+            except queue.Empty:
+                if left <= seconds:
+                    raise
+
+    channel.get_msg = get_msg
+
+
 async def added(client, source):
     """Run code that is not in the notebook; what it shows as text."""
     cell = nbformat.v4.new_code_cell(source)
@@ -64,6 +88,7 @@ async def played(path, folder):
         notebook, timeout=150, kernel_name="python3", resources={"metadata": {"path": str(folder)}}
     )
     async with client.async_setup_kernel():
+        listen_in_slices(client.kc.shell_channel)
         for i, cell in enumerate(list(notebook.cells)):
             await client.async_execute_cell(
                 cell, i

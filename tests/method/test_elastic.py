@@ -7,7 +7,7 @@ import pytest
 
 from s4a import analyse, match_pair, synthetic
 from s4a.geometry.closest import distance_to_surface
-from s4a.geometry.mesh import triangle_normals, vertex_normals
+from s4a.geometry.mesh import cotan_weights, stiffness, triangle_normals, vertex_normals
 from s4a.method import elastic, joint
 from s4a.method.register import register_surface
 from s4a.study.options import pair_options
@@ -108,6 +108,55 @@ def test_nearest_points_lie_on_the_surface_and_no_farther_than_nearest_vertices(
     vertex = joint.nearest_vertices(shape.full, template.low, X)
     gap = np.linalg.norm(points - X, axis=1).mean()
     assert gap < 0.9 * np.linalg.norm(shape.full.X[vertex] - X, axis=1).mean()
+
+
+@pytest.fixture(scope="module")
+def local(pair, ends):
+    """Where elastic rounds end at low resolution, and the displacement of local rounds after."""
+    template, shape, _ = pair
+    X = joint.move(template.low, ends[0])
+    return X, elastic.local_rounds(shape.full, template.low, X)
+
+
+def gap(X, shape):
+    return distance_to_surface(X, shape.full.X, shape.full.T).mean()
+
+
+def test_local_rounds_come_nearer_to_the_surface_and_stay_as_near_to_the_truth(pair, ends, local):
+    template, shape, truth = pair
+    X, d = local
+    assert gap(X + d, shape) < 0.8 * gap(X, shape)
+    before = joint.move(template.full, ends[0])
+    after = before + template.U @ d
+    assert error(after, truth) < 1.05 * error(before, truth)
+
+
+def test_local_rounds_find_a_bump_that_no_function_of_the_basis_has(pair):
+    template, _, _ = pair
+    low = template.low
+    place = low.X[100]
+    bump = 0.01 * np.exp(-((low.X - place) ** 2).sum(1) / (2 * 0.05**2))[:, None] * low.normals
+    source = replace(low, X=low.X + bump)
+    d = elastic.local_rounds(source, low, low.X)
+    assert np.linalg.norm(d - bump, axis=1).max() < 0.4 * np.linalg.norm(bump, axis=1).max()
+    coarse = low.first(10)
+    left = bump - coarse.field(coarse.coefficients(bump))
+    assert np.linalg.norm(d - bump, axis=1).mean() < 0.5 * np.linalg.norm(left, axis=1).mean()
+
+
+def test_a_local_round_is_a_step_of_heat_diffusion(pair):
+    template, shape, _ = pair
+    low, time = template.low, 0.01
+    d = elastic.local_rounds(shape.full, low, low.X, time=(time, time), slide=1.0, rounds=1)
+    y, _ = elastic.nearest_on_surface(shape.full, low.X, vertex_normals(low.X, low.T))
+    W = stiffness(*cotan_weights(low.X, low.T), len(low.X))
+    A = low.area[:, None]
+    assert A * d + time * (W @ d) == pytest.approx(A * (y - low.X), abs=1e-9)
+
+
+def test_on_the_surface_itself_nothing_is_left_to_do(pair):
+    template, _, _ = pair
+    assert np.abs(elastic.local_rounds(template.low, template.low, template.low.X)).max() < 1e-12
 
 
 def test_where_parts_turned_on_their_own_nothing_changes(pair, monkeypatch):
