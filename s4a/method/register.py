@@ -183,7 +183,9 @@ def register(
     k : int
         Functions in which the displacement lives.
     refine : {"joint", "elastic", "intrinsic"}
-        Joint rounds, elastic rounds after those of low resolution, or the spectral match alone.
+        Joint rounds, elastic and local rounds after those of low resolution, or the spectral match
+        alone.  After local rounds the displacement is not only in the first k functions;
+        ``displacement_coefficient`` is its part there.
     scale : bool
         Whether size is taken out of the displacement.
     parts : bool
@@ -209,7 +211,7 @@ def register(
     if refine != "intrinsic":
         candidates = joint.candidates(source.low, target.low, starts, k=k, parts=parts)
     by_icp = motion_in_unit(source, target, motion, scale) if alignment == "icp" else None
-    # image = R x + t + U Phi c, smooth already: the line after eq. 8
+    # image = R x + t + U Phi c, smooth already: the line after eq. 8; or of elastic rounds
     match, image, attrs = register_surface(
         source,
         target,
@@ -297,8 +299,8 @@ def register_surface(
         After which the displacement of the spectral match is smoothed, see
         :func:`s4a.method.joint.warp_after`; by default after the motion that fits it best.
     elastic : bool
-        Whether the finalists go through :func:`s4a.method.elastic.elastic_rounds`; those by parts,
-        of far poses, do not: bodies ended 0.05 to 0.1 % of sqrt(area) farther from the truth.
+        Whether the finalists go through :func:`elastic_surface`; those by parts, of far poses, do
+        not: bodies ended 0.05 to 0.1 % of sqrt(area) farther from the truth.
 
     Returns
     -------

@@ -105,9 +105,9 @@ def analyse(
         Of pairs that are matched on their own, see :func:`s4a.match_pair`, as external meshes of a
         transfer are.
     refine : {"joint", "elastic", "intrinsic"}, optional
-        Registration with joint rounds (default), with elastic rounds after those of low resolution,
-        which is nearer to the truth where meshes differ (:mod:`s4a.method.elastic`), or the paper's
-        spectral match alone (eq. 7 or 4).
+        Registration with joint rounds (default), with elastic and local rounds after those of low
+        resolution, which is nearer to the truth where meshes differ (:mod:`s4a.method.elastic`), or
+        the paper's spectral match alone (eq. 7 or 4).
     parts : bool, optional
         Whether in far poses joint rounds turn every part on its own (default).
     alignment : {"fitted", "icp"}, optional
