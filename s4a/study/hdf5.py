@@ -119,7 +119,10 @@ class StudyFile:
             raise OSError(f"{name} has no list of its dims")
         lists = np.empty(attribute.shape, attribute.dtype)
         attribute.read(lists, mtype=h5t.py_create(attribute.dtype))
-        return [h5r.get_name(refs[0], self.file.id).decode().lstrip("/") for refs in lists]
+        found = [h5r.get_name(refs[0], self.file.id) for refs in lists]
+        if None in found:
+            raise OSError(f"{name} has a dim that is not in its file")
+        return [dim.decode().lstrip("/") for dim in found]
 
     def values(self, name: str) -> np.ndarray:
         """The values of a variable."""

@@ -362,6 +362,14 @@ def test_a_pipe_in_a_study_is_not_written_to(folder, capsys, command, name):
     assert f"{name} is a pipe" in capsys.readouterr().err
 
 
+def test_a_dim_that_is_not_there_is_told(file):
+    store.read(file).to_netcdf(file, engine=store.ENGINE)  # without checksums
+    with h5py.File(file, "r+") as raw:
+        del raw["xyz"]
+    with pytest.raises(OSError, match=r"a\.nc cannot be read \(position has a dim that is not in"):
+        store.open_file(file)
+
+
 def test_a_report_of_somebody_else_in_a_study_is_not_overwritten(tmp_path):
     (tmp_path / ".lock").touch()
     synthetic.sphere(50).to_netcdf(tmp_path / "report.nc", engine=store.ENGINE)
