@@ -206,17 +206,17 @@ def hemispheres(folder):
         with np.load(folder / "brains" / f"labels_{name}_lh_then_rh.npz") as arrays:
             aparc = arrays["aparc"]
         for side, mirror in (("lh", False), ("rh", True)):
-            X, T = s4a.read_mesh(folder / "brains" / f"{file}_{side}.gii")
+            X, T, _ = s4a.read_mesh(folder / "brains" / f"{file}_{side}.gii")
             meshes[f"{name}_{side}"] = cortex(X, T, mirror)
             own = aparc[len(X) :] - 35 * (aparc[len(X) :] > 0) if mirror else aparc[: len(X)]
             labels["aparc"][f"{name}_{side}"] = own
-    X, T = s4a.read_mesh(folder / "brains" / "civet.ply")
+    X, T, _ = s4a.read_mesh(folder / "brains" / "civet.ply")
     aal, n = np.load(folder / "brains" / "civet_labels.npy"), len(X) // 2
     for side, part in (("lh", slice(0, n)), ("rh", slice(n, None))):
         inside = (T >= n).all(axis=1) if side == "rh" else (T < n).all(axis=1)
         meshes[f"civet_{side}"] = cortex(X[part], T[inside] - (part.start), side == "rh")
         labels["aal"][f"civet_{side}"] = aal[part] - (aal[part] > 0) * (side == "rh")
-    X, T = s4a.read_mesh(DATA / "brain_individuals" / "pycortex_S1" / "pia_lh.gii")
+    X, T, _ = s4a.read_mesh(DATA / "brain_individuals" / "pycortex_S1" / "pia_lh.gii")
     meshes["S1_lh"] = cortex(X, T)
     for of_atlas in labels.values():
         for name, label in of_atlas.items():
