@@ -102,6 +102,15 @@ def test_workers_are_gone_within_seconds_of_the_end_of_a_run_and_leave_nothing(
     assert not remains(run.pid)
 
 
+@pytest.fixture
+def interruptible():
+    """Ctrl-C raises KeyboardInterrupt, also where a shell began all this with it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_an_interruption_that_gets_lost_ends_the_run_after_the_task(files, tmp_path, monkeypatch):
     remesh_shape, before = pipeline.remesh_shape, signal.getsignal(signal.SIGINT)
 
