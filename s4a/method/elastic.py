@@ -74,6 +74,21 @@ def nearest_on_surface(
     return points, unit(normals)
 
 
+def points_ahead(source: Basis, X: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where the vertices X of a mesh are drawn, and the directions across both surfaces there.
+
+    Returns
+    -------
+    y : float ndarray (n, 3)
+        Of :func:`nearest_on_surface`.
+    m : float ndarray (n, 3)
+        Unit mean of the normals of both surfaces.
+    """
+    normals = vertex_normals(X, T)
+    y, normals_y = nearest_on_surface(source, X, normals)
+    return y, unit(normals + normals_y)
+
+
 def unit(vectors: np.ndarray) -> np.ndarray:
     """Vectors ``(n, 3)`` of length 1; those of length 0 stay."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
@@ -156,9 +171,7 @@ def elastic_rounds(
         np.geomspace(*stiffness, steps), np.geomspace(*slide, steps), strict=True
     ):
         for _ in range(rounds):
-            normals = vertex_normals(X, target.T)
-            y, normals_y = nearest_on_surface(source, X, normals)
-            m = unit(normals + normals_y)
+            y, m = points_ahead(source, X, target.T)
             matrix, right = normal_equations(E, target.area, m, y, along)
             # start and smooth functions nearly depend on each other: a little keeps them apart
             matrix[np.diag_indices_from(matrix)] += np.tile(weight * bending, 3) + 1e-12
@@ -185,12 +198,10 @@ def local_rounds(
 
     Parameters
     ----------
-    source : Basis
-        At full resolution: its surface is searched.
-    target : Basis
-        At low resolution.
+    source, target : Basis
+        As of :func:`elastic_rounds`.
     X : float ndarray (n, 3)
-        Its vertices after the elastic rounds.
+        The target's vertices after the elastic rounds.
     time : tuple of float
         Of the heat diffusion in the first and in the last round.
     slide : float
@@ -200,16 +211,15 @@ def local_rounds(
     Returns
     -------
     float ndarray (n, 3)
+        d, in the frame of the source.
     """
     n = len(X)
     A = sp.diags_array(target.area)
     W = stiffness_matrix(*cotan_weights(target.X, target.T), n)
     d = np.zeros((n, 3))
     for step in np.geomspace(*time, rounds):
-        normals = vertex_normals(X + d, target.T)
-        y, normals_y = nearest_on_surface(source, X + d, normals)
+        y, m = points_ahead(source, X + d, target.T)
         way = y - X - d
-        m = unit(normals + normals_y)
         across = np.einsum("ni,ni->n", m, way)[:, None] * m
         goal = d + slide * way + (1 - slide) * across
         d = factor(A + step * W)(target.area[:, None] * goal)

@@ -101,12 +101,11 @@ def map_after_motion(
     return fmap.refine_once(source, target, C) if ahead else C
 
 
-def stretch(target: Basis, warp: joint.Warp) -> float:
-    """Median |log| of the lengths of the registered edges by those of the target."""
+def stretch(target: Basis, X: np.ndarray) -> float:
+    """Median |log| of the edges' lengths where the target is at X ``(n, 3)``, by its own."""
     ends = edges(target.T).T  # (2, e)
     after, before = (
-        np.maximum(np.linalg.norm(np.subtract(*X[ends]), axis=1), 1e-12)
-        for X in (joint.move(target, warp), target.X)
+        np.maximum(np.linalg.norm(np.subtract(*P[ends]), axis=1), 1e-12) for P in (X, target.X)
     )
     return float(np.median(np.abs(np.log(after / before))))
 
@@ -156,9 +155,8 @@ def best_first_map(
         match = fmap.zoomout(source, target, first, k, step=step)[1]
         end = joint.low_rounds(source, target, match, k_first=20, step=20, rounds=1, by_parts=True)
         image = joint.move(target, end[1])
-        score[name] = joint.registration_score(source, target, end[0], image) + stretch(
-            target, end[1]
-        )
+        gap = joint.registration_score(source, target, end[0], image)
+        score[name] = gap + stretch(target, image)
     best = min(score, key=score.get)
     return best, maps[best], fits[best]
 

@@ -306,7 +306,7 @@ def register_surface(
     -------
     match : int ndarray (n_target,)
     image : float ndarray (n_target, 3)
-        Registered template in the frame and unit of the source's file, smooth.
+        Registered template in the frame and unit of the source's file.
     attrs : dict
         See :func:`register`.
     """

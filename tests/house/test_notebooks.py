@@ -5,12 +5,12 @@ Its exercises without an answer and with the one of the book.
 
 import asyncio
 import json
+import math
 import queue
 import re
 import subprocess
 import time
 
-import numpy as np
 import pytest
 from paths import NOTEBOOKS, ROOT
 
@@ -55,7 +55,7 @@ def listen_in_slices(channel, seconds=5):
     look = channel.get_msg
 
     async def get_msg(timeout=None):
-        end = time.monotonic() + (np.inf if timeout is None else timeout)
+        end = time.monotonic() + (math.inf if timeout is None else timeout)
         while True:
             left = end - time.monotonic()
             try:
