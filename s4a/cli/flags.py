@@ -37,7 +37,7 @@ HELP = {
     "n_spread": "vertices on which Consistent ZoomOut looks for matches; 0 for all",
     "wide": "its last rounds in which these look among all vertices",
     "sharpen": "rounds of ZoomOut of a single pair that look among all vertices of the source",
-    "refine": "joint rounds, elastic ones after them, or the paper's spectral match alone",
+    "refine": "elastic rounds, joint ones, or the paper's spectral match alone",
     "parts": "in far poses joint rounds turn every part on its own",
     "alignment": "displacements after the motion that fits best, or after that of ICP",
     "area_weighted": "weigh vertices by area in the projection after eq. 8",

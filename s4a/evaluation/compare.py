@@ -226,9 +226,9 @@ def pairs(
     low-resolution mesh, and eq. 4 with U Phi, as ``s4a.match_pair(..., preset="paper")``.
 
     Ours are RE-MATCH lifted: with the eigenfunctions of :mod:`s4a.method.lift` in the place of
-    U Phi, and the last two rounds of ZoomOut look among all vertices of the source; joint: joint
-    rounds after RE-MATCH, of which the matched vertices are compared, as of all others; and joint
-    surface: the same, of which the registered surface is.
+    U Phi, and the last two rounds of ZoomOut look among all vertices of the source; registered:
+    the default of ``s4a.match_pair`` after RE-MATCH, of which the matched vertices are compared, as
+    of all others; and registered surface: the same, of which the surface is.
 
     Parameters
     ----------
@@ -278,7 +278,7 @@ def pairs(
         method, and ``block_seconds(way, pair, block)``, the blocks of Fig. 3, in CPU seconds of one
         core.  What two methods share, as the alignment or a basis, is made once and charged to
         both; the alignment only to those that use it, which with given landmarks are kNN, ZO and
-        the joint rounds.
+        registered.
 
         With `keep` this is ``/metrics`` of a tree, whose ``/source`` is the source's mesh and
         ``/pairs/<pair>`` the target's, with what :func:`kept` says.

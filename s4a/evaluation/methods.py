@@ -3,10 +3,10 @@
 Every method works on a :class:`s4a.method.shape.Shape`: ZO and FMAP+ZO on one whose functions are
 the eigenfunctions of the dense mesh, SCALABLE on that of :mod:`s4a.method.scalable`, RE-MATCH on
 the coarse mesh with U Phi, as in the paper.  Ours are RE-MATCH lifted, with functions of
-:mod:`s4a.method.lift`, and joint, which is RE-MATCH and :mod:`s4a.method.joint` after it; its
-image are the matched vertices, as of all, and that of joint surface is the smooth surface on which
-they were looked up, which lies between them.  Times are CPU seconds of one core, so that a busy
-machine changes them little.
+:mod:`s4a.method.lift`, and registered, which is RE-MATCH and the registration of
+:mod:`s4a.method.register` after it; its image are the matched vertices, as of all, and that of
+registered surface is the smooth surface on which they were looked up, which lies between them.
+Times are CPU seconds of one core, so that a busy machine changes them little.
 """
 
 import time
@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 from s4a.geometry.align import Motion, align, farthest_points
 from s4a.geometry.closest import match_surfaces
 from s4a.geometry.mesh import as_arrays, vertex_areas
-from s4a.method import fmap, joint
+from s4a.method import fmap
 from s4a.method.first_map import landmarks_after_motion, nearest_after_motion
 from s4a.method.lift import SPARE, lifted
 from s4a.method.nearest import (
@@ -32,25 +32,29 @@ from s4a.method.nearest import (
     nearest_in_cells,
     nearest_rows,
 )
-from s4a.method.register import register_surface, sharpen_map
+from s4a.method.register import find_candidates, register_surface, sharpen_map
 from s4a.method.remesh import coarsen, laplacian
 from s4a.method.scalable import local_space, spectral_space
 from s4a.method.shape import Basis, Shape
 from s4a.method.spectral import eigenpairs, spectrum
 
 PAPER_METHODS = ("kNN", "ZO", "FMAP+ZO", "SCALABLE", "RE-MATCH")
-OUR_METHODS = ("RE-MATCH lifted", "joint", "joint surface")
+OUR_METHODS = ("RE-MATCH lifted", "registered", "registered surface")
 METHODS = (*PAPER_METHODS, *OUR_METHODS)
-OLD_NAMES = {"RE-MATCH joint": "joint"}
-# the shape of Spaces whose functions a method compares; joint rounds begin with RE-MATCH's match
+OLD_NAMES = {
+    "RE-MATCH joint": "registered",
+    "joint": "registered",
+    "joint surface": "registered surface",
+}
+# the shape of Spaces whose functions a method compares; registration begins with RE-MATCH's match
 KINDS = {
     "ZO": "dense",
     "FMAP+ZO": "dense",
     "SCALABLE": "local",
     "RE-MATCH": "coarse",
     "RE-MATCH lifted": "lifted",
-    "joint": "coarse",
-    "joint surface": "coarse",
+    "registered": "coarse",
+    "registered surface": "coarse",
 }
 BLOCKS = (
     "load and clean",
@@ -239,7 +243,7 @@ class Pair:
         clock = Clock()
         remeshed = KINDS.get(method) in ("coarse", "lifted")
         motion, landmarks, align_seconds = self.align_remeshed if remeshed else self.align_spread
-        registers = method.startswith("joint")
+        registers = method.startswith("registered")
         aligned = self.landmarks is None or method in ("kNN", "ZO") or registers
         if aligned:
             clock.add("align", align_seconds)
@@ -261,7 +265,7 @@ class Pair:
             match, image, reverse, of_registration = self.registered
             for block, seconds in of_registration.items():
                 clock.add(block, seconds)
-            image = image if method == "joint surface" else None
+            image = image if method == "registered surface" else None
             return Outcome(match, image, reverse, clock.seconds)
         M, N = self.shapes(method)
         F, G = spectral.functions
@@ -345,21 +349,21 @@ class Pair:
 
     @cached_property
     def registered(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, float]]:
-        """Joint rounds after RE-MATCH.
+        """Registration by default after RE-MATCH.
 
         Match, registered surface, match the other way, and seconds.
         """
         clock = Clock()
-        M, N = self.shapes("joint")
+        M, N = self.shapes("registered")
         motion, landmarks, _ = self.align_remeshed
         spectral = self.match_spectrally("RE-MATCH", motion, landmarks)
         starts = {
             "intrinsic": spectral.low_match,
             "icp": nearest_after_motion(M.low, N.low, motion),
         }
-        tried = clock("refine", joint.candidates, M.low, N.low, starts, k=self.k)
+        tried = clock("refine", find_candidates, M, N, starts, k=self.k)
         match, image, _ = clock(
-            "full resolution", register_surface, M, N, tried, spectral.functions
+            "full resolution", register_surface, M, N, tried, spectral.functions, elastic=True
         )
         moved = M.to_frame(image)
         reverse = match_surfaces(M.full.X, M.full.T, moved, N.full.T)

@@ -59,6 +59,24 @@ def vertex_normals(X: np.ndarray, T: np.ndarray) -> np.ndarray:
     return N / np.where(length > 0, length, 1)
 
 
+def turned(vectors: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Vectors ``(n, 3)`` after the least rotations that take unit vectors `start` to `end`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.geometry.mesh import turned
+    >>> x, y, z = np.eye(3)[:, None]
+    >>> turned(x, x, y).tolist(), turned(z, x, y).tolist()
+    ([[0.0, 1.0, 0.0]], [[0.0, 0.0, 1.0]])
+    """
+    # Rodrigues: v cos + (a x v) sin + a (a . v) (1 - cos), with the axis a sin = start x end
+    axis = np.cross(start, end)
+    cos = np.einsum("ij,ij->i", start, end)[:, None]
+    along = np.einsum("ij,ij->i", axis, vectors)[:, None]
+    return vectors * cos + np.cross(axis, vectors) + axis * along / np.maximum(1 + cos, 1e-6)
+
+
 def directed_edges(T: np.ndarray) -> np.ndarray:
     """The half-edges ``(3 m, 2)`` of the triangles: corners 0-1 of all, then 1-2, then 2-0."""
     return np.concatenate([T[:, [0, 1]], T[:, [1, 2]], T[:, [2, 0]]])

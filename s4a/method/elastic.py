@@ -29,8 +29,6 @@ import scipy.linalg
 import scipy.sparse as sp
 
 from s4a.geometry.closest import closest_point_in_star, features, interpolate
-from s4a.geometry.mesh import cotan_weights, vertex_normals
-from s4a.geometry.mesh import stiffness as stiffness_matrix
 from s4a.method.joint import Warp, move, turn
 from s4a.method.shape import Basis
 from s4a.method.spectral import factor
@@ -74,8 +72,8 @@ def nearest_on_surface(
     return points, unit(normals)
 
 
-def points_ahead(source: Basis, X: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where the vertices X of a mesh are drawn, and the directions across both surfaces there.
+def points_ahead(source: Basis, target: Basis, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where the target's vertices at X are drawn, and the directions across both surfaces there.
 
     Returns
     -------
@@ -84,7 +82,7 @@ def points_ahead(source: Basis, X: np.ndarray, T: np.ndarray) -> tuple[np.ndarra
     m : float ndarray (n, 3)
         Unit mean of the normals of both surfaces.
     """
-    normals = vertex_normals(X, T)
+    normals = target.normals_at(X)
     y, normals_y = nearest_on_surface(source, X, normals)
     return y, unit(normals + normals_y)
 
@@ -135,7 +133,7 @@ def elastic_rounds(
     *,
     stiffness: tuple[float, float] = STIFFNESS,
     slide: tuple[float, float] = SLIDE,
-    steps: int = N_STEPS,
+    steps: slice = slice(None),
     rounds: int = N_ROUNDS,
 ) -> Warp:
     """The warp after rounds in which the target's displacement becomes less and less stiff.
@@ -145,14 +143,17 @@ def elastic_rounds(
     source : Basis
         At full resolution: its surface is searched.
     target : Basis
-        At low resolution.
+        At low resolution, with the normals of the original mesh:
+        :attr:`s4a.method.shape.Shape.low_on_surface`.
     warp : tuple (R, t, c)
         Where to begin, with one motion for all: bending is counted from there.
     stiffness, slide : tuple of float
-        Of the first and of the last step, between which they change by equal factors.  `slide` is
-        the weight of the distance along the surface; that across it weighs 1.
-    steps, rounds : int
-        Values of the stiffness, and rounds with each at most; fewer where nothing moves any more.
+        Of the first and of the last of 8 steps, between which they change by equal factors.
+        `slide` is the weight of the distance along the surface; that across it weighs 1.
+    steps : slice
+        Those that are made; all by default.
+    rounds : int
+        With each value at most; fewer where nothing moves any more.
 
     Returns
     -------
@@ -167,11 +168,10 @@ def elastic_rounds(
     bending = np.zeros(E.shape[1])
     bending[: smooth.shape[1]] = target.eigenvalue[1:] ** 2
     X = move(target, warp)
-    for weight, along in zip(
-        np.geomspace(*stiffness, steps), np.geomspace(*slide, steps), strict=True
-    ):
+    both = (np.geomspace(*ends, N_STEPS)[steps] for ends in (stiffness, slide))
+    for weight, along in zip(*both, strict=True):
         for _ in range(rounds):
-            y, m = points_ahead(source, X, target.T)
+            y, m = points_ahead(source, target, X)
             matrix, right = normal_equations(E, target.area, m, y, along)
             # start and smooth functions nearly depend on each other: a little keeps them apart
             matrix[np.diag_indices_from(matrix)] += np.tile(weight * bending, 3) + 1e-12
@@ -188,6 +188,7 @@ def elastic_rounds(
 def local_rounds(
     source: Basis,
     target: Basis,
+    W: sp.csr_matrix,
     X: np.ndarray,
     *,
     time: tuple[float, float] = TIME,
@@ -200,6 +201,8 @@ def local_rounds(
     ----------
     source, target : Basis
         As of :func:`elastic_rounds`.
+    W : sparse matrix (n, n)
+        Stiffness of the target's low resolution.
     X : float ndarray (n, 3)
         The target's vertices after the elastic rounds.
     time : tuple of float
@@ -213,12 +216,10 @@ def local_rounds(
     float ndarray (n, 3)
         d, in the frame of the source.
     """
-    n = len(X)
     A = sp.diags_array(target.area)
-    W = stiffness_matrix(*cotan_weights(target.X, target.T), n)
-    d = np.zeros((n, 3))
+    d = np.zeros_like(X)
     for step in np.geomspace(*time, rounds):
-        y, m = points_ahead(source, X + d, target.T)
+        y, m = points_ahead(source, target, X + d)
         way = y - X - d
         across = np.einsum("ni,ni->n", m, way)[:, None] * m
         goal = d + slide * way + (1 - slide) * across

@@ -230,6 +230,20 @@ def far_apart(source: Basis, target: Basis, match: np.ndarray) -> bool:
     return bool(np.quantile(gap, 0.9) > FAR + 0.4 / np.sqrt(len(source.X)))
 
 
+def as_given(source: Basis, target: Basis, starts: dict[str, np.ndarray]) -> dict[str, Candidate]:
+    """Registrations at low resolution: every start (n_target,) as it is, with its score."""
+    return {
+        name: scored(source, target, match, fit_warp(source, target, match))
+        for name, match in starts.items()
+    }
+
+
+def scored(source: Basis, target: Basis, match: np.ndarray, warp: Warp) -> Candidate:
+    """A registration with its score."""
+    score = registration_score(source, target, match, move(target, warp))
+    return Candidate(score, match, warp)
+
+
 def candidates(
     source: Basis,
     target: Basis,
@@ -260,14 +274,11 @@ def candidates(
         ``"<start>"``, ``"<start>+joint"``, ``"<start>+joint+spectral"`` or ``"<start>+parts"`` ->
         :class:`Candidate`.
     """
-    tried = {}
+    tried = as_given(source, target, starts)
 
     def enter(name, match, warp):
-        score = registration_score(source, target, match, move(target, warp))
-        tried[name] = Candidate(score, match, warp)
+        tried[name] = scored(source, target, match, warp)
 
-    for name, match in starts.items():
-        enter(name, match, fit_warp(source, target, match))
     for name, match in starts.items():
         enter(f"{name}+joint", *low_rounds(source, target, match, k=k))
     best = min(starts, key=lambda name: tried[f"{name}+joint"].score)
@@ -282,7 +293,7 @@ def candidates(
     return tried
 
 
-def finalists(tried: dict[str, Candidate], *, margin: float = 1.25) -> list[str]:
+def finalists(tried: dict[str, Candidate], *, margin: float) -> list[str]:
     """Names of the candidates whose score is within `margin` of the least, at most two, best first.
 
     Scores at low resolution have the coarse sampling in them; near ones can only be told apart at

@@ -21,6 +21,7 @@ from s4a.method.nearest import nearest_in_cells, nearest_of_few, nearest_rows
 from s4a.method.shape import Shape
 from s4a.schema import INPUT, dataset, in_unit
 
+SAME = 0.002  # share of sqrt(area): of 12 pairs ends of which one was worse lay 0.004 to 0.06 apart
 CONFIDENCE_LENGTH = 0.02  # share of sqrt(area) at which the confidence has fallen to 1 / e
 
 Functions = tuple[np.ndarray, np.ndarray]  # of source and target, rows of which are compared
@@ -126,7 +127,7 @@ def from_latent(
 ) -> xr.Dataset:
     """One shape registered by the latent bases of a network (eq. 6, 7 and 8).
 
-    Eq. 6 gives one start and ICP another; joint rounds refine both, and the best is kept.  Eq. 7,
+    Eq. 6 gives one start and ICP another; elastic rounds refine both, and the best is kept.  Eq. 7,
     or eq. 3 and 4, is the match at full resolution with ``refine="intrinsic"``, as in the paper, or
     where that candidate is the best; eq. 8 follows.
 
@@ -162,7 +163,7 @@ def register(
     motion: Motion,
     *,
     k: int = 100,
-    refine: str = "joint",
+    refine: str = "elastic",
     scale: bool = False,
     parts: bool = True,
     alignment: str = "fitted",
@@ -182,14 +183,14 @@ def register(
         Rigid motion of the shape onto the template found by ICP, between their frames.
     k : int
         Functions in which the displacement lives.
-    refine : {"joint", "elastic", "intrinsic"}
-        Joint rounds, elastic and local rounds after those of low resolution, or the spectral match
+    refine : {"elastic", "joint", "intrinsic"}
+        Elastic and local rounds, after joint ones in far poses; joint rounds; or the spectral match
         alone.  After local rounds the displacement is not only in the first k functions;
         ``displacement_coefficient`` is its part there.
     scale : bool
         Whether size is taken out of the displacement.
     parts : bool
-        Whether joint rounds may turn the parts of a shape on their own.
+        Whether in far poses joint rounds may turn the parts of a shape on their own.
     alignment : {"fitted", "icp"}
         The displacement is measured after the motion that fits the registered surface best, or
         after that of ICP, as the paper has it: then eq. 8 and (U Phi)(U Phi)^+ are as printed.
@@ -207,9 +208,7 @@ def register(
         of the input, in the template's frame.  Attributes ``method``, the candidate that was kept,
         ``score``, its score at full resolution, and ``score_<candidate>`` at low resolution.
     """
-    candidates = {}  # none: the spectral match alone
-    if refine != "intrinsic":
-        candidates = joint.candidates(source.low, target.low, starts, k=k, parts=parts)
+    candidates = find_candidates(source, target, starts, k=k, refine=refine, parts=parts)
     by_icp = motion_in_unit(source, target, motion, scale) if alignment == "icp" else None
     # image = R x + t + U Phi c, smooth already: the line after eq. 8; or of elastic rounds
     match, image, attrs = register_surface(
@@ -278,6 +277,38 @@ def motion_in_unit(source: Shape, target: Shape, motion: Motion, scale: bool) ->
     return Placed(R, center_target + size_target * t - s * R @ center, s, s * size / size_target)
 
 
+def find_candidates(
+    source: Shape,
+    target: Shape,
+    starts: dict[str, np.ndarray],
+    *,
+    k: int = 100,
+    refine: str = "elastic",
+    parts: bool = True,
+) -> dict[str, joint.Candidate]:
+    """Where registration at full resolution may begin: of low resolution, with scores.
+
+    Elastic rounds need no better start than a match of the right parts: from eq. 6, from ICP and
+    from joint rounds after either they end 0.0000 to 0.0006 of sqrt(area) apart on faces, skulls,
+    cortex and most heads, so that joint rounds are left to far poses.
+
+    Parameters
+    ----------
+    source, target, starts, k, refine, parts : see :func:`register`
+
+    Returns
+    -------
+    dict
+        Name -> :class:`s4a.method.joint.Candidate`; none for the spectral match alone.
+    """
+    if refine == "intrinsic":
+        return {}
+    M, N = source.low, target.low
+    if refine == "joint" or all(joint.far_apart(M, N, match) for match in starts.values()):
+        return joint.candidates(M, N, starts, k=k, parts=parts)
+    return joint.as_given(M, N, starts)
+
+
 def register_surface(
     source: Shape,
     target: Shape,
@@ -293,14 +324,14 @@ def register_surface(
     ----------
     source, target : Shape
     candidates : dict
-        Of :func:`s4a.method.joint.candidates`; empty for the spectral match alone.
+        Of :func:`find_candidates`; empty for the spectral match alone.
     functions : see :func:`register`
     placed : tuple (motion, ratio), optional
         After which the displacement of the spectral match is smoothed, see
         :func:`s4a.method.joint.warp_after`; by default after the motion that fits it best.
     elastic : bool
-        Whether the finalists go through :func:`elastic_surface`; those by parts, of far poses, do
-        not: bodies ended 0.05 to 0.1 % of sqrt(area) farther from the truth.
+        Whether finalists go through :func:`elastic_surfaces`; those by parts, of far poses, do not:
+        bodies ended 0.05 to 0.1 % of sqrt(area) farther from the truth.
 
     Returns
     -------
@@ -316,33 +347,53 @@ def register_surface(
         f"score_{name}": candidate.score for name, candidate in candidates.items()
     }
     ends = {}  # name -> score and registered template (n_target, 3)
-    for name in joint.finalists(candidates) if candidates else ["intrinsic"]:
-        if elastic and candidates[name].warp[0].ndim == 2:  # not by parts
-            X = elastic_surface(source, target, candidates[name].warp)
+    # starts as they are tell less of their ends than joint rounds do
+    margin = 2.0 if elastic else 1.25
+    names = joint.finalists(candidates, margin=margin) if candidates else ["intrinsic"]
+    if elastic:
+        whole = {n: candidates[n].warp for n in names if candidates[n].warp[0].ndim == 2}
+        names = [name for name in names if name not in whole]  # by parts
+        for name, X in elastic_surfaces(source, target, whole).items():
             part = joint.nearest_vertices(M, N, X, N.near_coarse)
-        elif name == "intrinsic":
+            ends[f"{name}+elastic"] = joint.registration_score(M, N, part, X), X
+    for name in names:
+        if name == "intrinsic":
             match, compared, certified = match_functions(source, target, *functions)
             attrs |= {"compared_share": compared, "certified_share": certified}
             part = match[N.near_coarse]
             warp = joint.warp_after(M, N, part, *placed) if placed else joint.fit_warp(M, N, part)
-            X = joint.move(N, warp)
         else:
             part, warp = joint.dense_rounds(M, N, candidates[name].warp)
-            X = joint.move(N, warp)
+        X = joint.move(N, warp)
         ends[name] = joint.registration_score(M, N, part, X), X
     method = min(ends, key=lambda name: ends[name][0])
     score, X = ends[method]
-    if elastic or method != "intrinsic":
+    if method != "intrinsic":
         match = match_surfaces(X, N.T, M.X, M.T)
     attrs |= {"method": method, "score": score}
     return match, source.from_frame(X), attrs
 
 
-def elastic_surface(source: Shape, target: Shape, warp: joint.Warp) -> np.ndarray:
-    """The template ``(n_target, 3)`` after elastic rounds from a warp, and then local ones."""
-    warp = elastic_rounds(source.full, target.low, warp)
-    local = local_rounds(source.full, target.low, joint.move(target.low, warp))  # (n_low, 3)
-    return joint.move(target.full, warp) + target.U @ local
+def elastic_surfaces(
+    source: Shape, target: Shape, starts: dict[str, joint.Warp]
+) -> dict[str, np.ndarray]:
+    """The template ``(n_target, 3)`` after elastic rounds from several starts, and local ones.
+
+    Starts that meet in the first, stiffest step go on as one, by the name of the first.
+    """
+    M, N = source.full, target.low_on_surface
+    met: dict[str, np.ndarray] = {}  # name -> template (n_low, 3) after the first step
+    surfaces = {}
+    for name, start in starts.items():
+        warp = elastic_rounds(M, N, start, steps=slice(0, 1))
+        X = joint.move(N, warp)
+        if any(np.linalg.norm(X - other, axis=1) @ N.area < SAME for other in met.values()):
+            continue
+        met[name] = X
+        warp = elastic_rounds(M, N, warp, steps=slice(1, None))
+        local = local_rounds(M, N, target.W, joint.move(N, warp))
+        surfaces[name] = joint.move(target.full, warp) + target.U @ local
+    return surfaces
 
 
 def way_back(source: Shape, target: Shape, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -13,9 +13,17 @@ import scipy.sparse as sp
 import xarray as xr
 from scipy.spatial import cKDTree
 
-from s4a.geometry.align import Cloud, cloud, farthest_points
+from s4a.geometry.align import Cloud, cloud, farthest_points, rigid_transform
 from s4a.geometry.closest import Stars, feature_tree, stars
-from s4a.geometry.mesh import as_arrays, edge_graph, edges, vertex_areas, vertex_normals
+from s4a.geometry.mesh import (
+    as_arrays,
+    edge_graph,
+    edges,
+    stiffness,
+    turned,
+    vertex_areas,
+    vertex_normals,
+)
 from s4a.method.deform import smoother
 from s4a.method.spectral import unit_mass
 
@@ -51,6 +59,8 @@ class Basis:
         Whether these vertices weigh by their areas when a field is projected.
     lifted : bool
         Whether Phi has a row for each of the n vertices although there is U.
+    surface_normals : float ndarray (n, 3), optional
+        Unit normals of the finer surface that the vertices are of; by default those of the mesh.
     """
 
     X: np.ndarray
@@ -63,6 +73,7 @@ class Basis:
     near_coarse: np.ndarray | slice | None = None
     area_weighted: bool = True
     lifted: bool = False
+    surface_normals: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         if self.mass is None:
@@ -121,6 +132,17 @@ class Basis:
     def normals(self) -> np.ndarray:
         """Unit normals of the vertices ``(n, 3)``."""
         return vertex_normals(self.X, self.T)
+
+    def normals_at(self, X: np.ndarray) -> np.ndarray:
+        """Unit normals of the surface ``(n, 3)`` where the vertices have moved to X.
+
+        Those of a finer surface turn with all of the mesh, and then as its normals do there.
+        """
+        moved = vertex_normals(X, self.T)
+        if self.surface_normals is None:
+            return moved
+        R, _, _ = rigid_transform(self.X, X, self.area)
+        return turned(self.surface_normals @ R.T, self.normals @ R.T, moved)
 
     @cached_property
     def stars(self) -> Stars:
@@ -235,6 +257,25 @@ class Shape:
         eigenvalue = self.coarse["eigenvalue"].values
         mass = unit_mass(self.coarse) if self.is_sampled else None
         return Basis(self.to_frame(X), T, area / area.sum(), Phi, eigenvalue, mass)
+
+    @cached_property
+    def W(self) -> sp.csr_matrix:
+        """Stiffness matrix of the low resolution ``(n_coarse, n_coarse)``; of SCALABLE U^T W U."""
+        E, w = (self.coarse[name].values for name in ("edge_vertex", "cotan_weight"))
+        return stiffness(E, w, self.coarse.sizes["vertex"])
+
+    @cached_property
+    def low_on_surface(self) -> Basis:
+        """The coarse mesh with the normals of the original one.
+
+        Its own differ from these: whoever looks for nearest points by normals, too, would be drawn
+        aside, and a shape registered to itself would move by 0.04 to 0.1 % of sqrt(area).
+        """
+        low = self.low
+        of_file = self.coarse["sample_vertex"].values  # (n_coarse,), -1 for none
+        normals = self.full.normals[of_file]
+        normals[of_file < 0] = low.normals[of_file < 0]
+        return replace(low, surface_normals=normals)
 
     @cached_property
     def full(self) -> Basis:

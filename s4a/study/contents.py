@@ -19,12 +19,12 @@ REQUIRED: dict[str, tuple[str, dict[str, type]]] = {
     "original": ("position corner_vertex file_vertex", {"status": str, "reason": str, "area": int}),
     "coarse": (
         "position corner_vertex vertex_area sample_vertex coarse_vertex coarse_weight eigenvalue "
-        "eigenfunction",
+        "eigenfunction edge_vertex cotan_weight",
         {"wrapped": int, "kept_whole": int, "laplacian": str},
     ),
     "coarse/scalable": (
-        "position corner_vertex vertex_area sample_vertex edge_vertex edge_mass sample_cell "
-        "local_vertex local_sample local_weight eigenvalue eigenfunction",
+        "position corner_vertex vertex_area sample_vertex edge_vertex cotan_weight edge_mass "
+        "sample_cell local_vertex local_sample local_weight eigenvalue eigenfunction",
         {"method": str, "wrapped": int, "kept_whole": int, "laplacian": str},
     ),
     "network/sketch": (

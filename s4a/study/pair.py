@@ -40,9 +40,9 @@ def match_pair(source: xr.Dataset, target: xr.Dataset, **options: Any) -> xr.Dat
     sharpen : int
         Rounds of ZoomOut after the last in which coarse vertices of the target look among all of
         the source.
-    refine : {"joint", "elastic", "intrinsic"}
-        Joint rounds after ZoomOut (default), also elastic ones, or the paper's ZoomOut alone and
-        eq. 4; see :func:`s4a.analyse`.
+    refine : {"elastic", "joint", "intrinsic"}
+        Elastic rounds after ZoomOut (default), joint ones, or the paper's ZoomOut alone and eq. 4;
+        see :func:`s4a.analyse`.
     lift, parts, alignment, area_weighted, n_projected
         See :func:`s4a.analyse`.
     n_coarse : int
@@ -101,7 +101,7 @@ def shape_of(mesh: xr.Dataset, options: Options) -> Shape:
 
 
 def match_shapes(source: Shape, target: Shape, options: Options) -> tuple[xr.Dataset, xr.Dataset]:
-    """:func:`match_pair` for two shapes: steps 2 to 4 of 4.1, ZoomOut and eq. 4, joint rounds.
+    """:func:`match_pair` for two shapes: steps 2 to 4 of 4.1, ZoomOut and eq. 4, elastic rounds.
 
     Returns
     -------

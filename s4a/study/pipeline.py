@@ -104,10 +104,10 @@ def analyse(
     sharpen : int, optional
         Of pairs that are matched on their own, see :func:`s4a.match_pair`, as external meshes of a
         transfer are.
-    refine : {"joint", "elastic", "intrinsic"}, optional
-        Registration with joint rounds (default), with elastic and local rounds after those of low
-        resolution, which is nearer to the truth where meshes differ (:mod:`s4a.method.elastic`), or
-        the paper's spectral match alone (eq. 7 or 4).
+    refine : {"elastic", "joint", "intrinsic"}, optional
+        Registration with elastic and local rounds (:mod:`s4a.method.elastic`, default), where poses
+        are far apart after joint ones; with joint rounds (:mod:`s4a.method.joint`); or the paper's
+        spectral match alone (eq. 7 or 4).
     parts : bool, optional
         Whether in far poses joint rounds turn every part on its own (default).
     alignment : {"fitted", "icp"}, optional
@@ -122,8 +122,8 @@ def analyse(
         Of transfer: whether a pair that is matched on its own is matched both ways (default), see
         :func:`s4a.register_pairs`.
     how : {"ours", "standard"}
-        Full resolution by eq. 7 (default), or by eq. 3 and 4; with joint rounds that match is one
-        candidate among others.
+        Full resolution by eq. 7 (default), or by eq. 3 and 4; unless ``refine="intrinsic"`` that
+        match is one candidate among others.
     norm : {"h2", "h1", "frobenius", "h2_image", "h2_both"}
         Norm of eq. 5, see :func:`s4a.method.median.distance_to_identity`.
     keep_rounds : bool
@@ -178,13 +178,13 @@ def analyse(
     >>> list(study["pca"]["score"].dims), study["registration"].sizes["vertex"]
     (['shape', 'component'], 200)
 
-    The paper, and joint rounds alone added to it:
+    The paper, and elastic rounds alone added to it:
 
     >>> from s4a.study.options import PAPER
     >>> small = {"n_coarse": 100, "k": 10, "k_init": 6, "n_pairs": 3}
     >>> brains = s4a.synthetic.brains(3, 200)
     >>> paper = s4a.analyse(brains, preset="paper", **small)
-    >>> joint = s4a.analyse(brains, **PAPER | {"refine": "joint"}, **small)
+    >>> elastic = s4a.analyse(brains, **PAPER | {"refine": "elastic"}, **small)
     """
     if store is None:
         with temporary_folder() as folder:

@@ -24,7 +24,7 @@ SHOWN = [
 ]
 ERROR = ("error", "error")
 TRUTH = "truth"
-FIRST = ("SCALABLE", "RE-MATCH", "joint surface")  # what is shown first, where it is there
+FIRST = ("SCALABLE", "RE-MATCH", "registered surface")  # what is shown first, where it is there
 MOST = 7  # methods side by side
 CELLS = 14  # of the checkerboard along the surface's extent
 FULL_ERROR = 0.98  # quantile of the errors of a method that the colours reach, in the median
@@ -44,7 +44,7 @@ class Comparison(Panel):
         Of :func:`s4a.compare.pairs` with ``keep=True``, or opened from the ``compare.nc`` of
         ``s4a compare --keep``.
     methods : sequence of str, optional
-        At most seven methods of it, shown first; SCALABLE, RE-MATCH and joint surface by
+        At most seven methods of it, shown first; SCALABLE, RE-MATCH and registered surface by
         default.  "truth" is one where it is known.
     view, up
         From where the surfaces are seen first; see :func:`s4a.show.draw.rotation`.

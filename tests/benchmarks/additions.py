@@ -117,13 +117,13 @@ INSTEAD = {
 }
 N_PROJECTED = 2500  # of 10,000 vertices, as 25,000 of 100,000
 ON_THE_PAPER = {
-    "refine": {"refine": "joint"},
-    "elastic": {"refine": "elastic"},
+    "refine": {"refine": "elastic"},
+    "joint": {"refine": "joint"},
     "init": {"init": "dense"},
     "lift": {"lift": True},
     "n_spread": {"n_spread": DEFAULTS["n_spread"]},
     "wide": {name: DEFAULTS[name] for name in ("n_spread", "wide")},
-    "parts": {"refine": "joint", "parts": True},
+    "parts": {"refine": "elastic", "parts": True},
     "alignment": {"alignment": "fitted"},
     "area_weighted": {"area_weighted": True},
     "n_projected": {"n_projected": N_PROJECTED},
@@ -145,7 +145,7 @@ def study_rows():
     rows = {"paper": PAPER, "default": {}}
     rows |= {f"paper, {name}": PAPER | added for name, added in ON_THE_PAPER.items()}
     rows |= {f"default without {name}": {name: PAPER[name]} for name in ("init", "parts")}
-    rows["default, elastic"] = {"refine": "elastic"}
+    rows["default, joint"] = {"refine": "joint"}
     rows["default, lift"] = {"lift": True}
     rows |= {f"paper, {name}={value}": PAPER | {name: value} for name, value in READINGS.items()}
     rows |= {f"paper, {name}": PAPER for name in INSTEAD}

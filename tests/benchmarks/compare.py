@@ -35,9 +35,9 @@ DATA = Path(__file__).parents[3] / "shared" / "data"
 CORRESPONDING = {"faust15k": 6890}  # of these only the first vertices correspond
 SETS = {"faces": 2, "faust15k": 2, "cats": 2, "kids": 1}  # pairs
 SHOWN = ("geodesic_error", "chamfer", "hausdorff", "dirichlet", "coverage", "bijectivity")
-COMPARED = ("FMAP+ZO", "RE-MATCH", "RE-MATCH lifted", "joint")  # on more pairs
+COMPARED = ("FMAP+ZO", "RE-MATCH", "RE-MATCH lifted", "registered")  # on more pairs
 N_LANDMARKS = 10
-LOOKED_AT = ("RE-MATCH", "joint", "joint surface")
+LOOKED_AT = ("RE-MATCH", "registered", "registered surface")
 FAR_GAP = 3  # % of sqrt(area), full yellow in the picture
 BELOW = (150, 20)  # from where the part is seen that one head has and another has not
 PICTURE = Path(__file__).parents[2] / "docs" / "heads.png"
@@ -233,7 +233,7 @@ def verdict(found):
         claims |= {
             f"RE-MATCH is the nearest to the truth of the five ({by_error[0]} is)": by_error[0]
             == "RE-MATCH",
-            "joint rounds are nearer to the truth than all five": error["joint"]
+            "our registration is nearer to the truth than all five": error["registered"]
             < error[by_error[0]],
             "the order by Chamfer distance is the order by the truth": sorted(
                 five, key=of["chamfer"].get

@@ -178,8 +178,8 @@ def meshmonk(template, shape, start, iterations, size=None):
 
 
 METHODS = {
-    "S4A, joint rounds (default)": (ours, "joint"),
-    "S4A, elastic rounds": (ours, "elastic"),
+    "S4A, elastic rounds (default)": (ours, "elastic"),
+    "S4A, joint rounds": (ours, "joint"),
     "ICP, nearest point": (nearest,),
     "MeshMonk, 80 iterations": (meshmonk, 80),
     "MeshMonk, 80, sqrt(area) 200": (meshmonk, 80, 200.0),

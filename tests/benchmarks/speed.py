@@ -478,10 +478,10 @@ def pipelines(folder, n=6, n_vertices=50_000):
     )
     paths, truth = collection(n, n_vertices, folder / "files")
     paths, template = [str(p) for p in paths], Path(paths[0]).stem
-    names = ("s4a, refine='joint'", "s4a, refine='intrinsic'", "pymeshlab + igl + pyFM")
+    names = ("s4a, refine='elastic'", "s4a, refine='intrinsic'", "pymeshlab + igl + pyFM")
     found = beside(
         "files -> dense matches",
-        (names[0], our_pipeline, paths, folder / "joint", "joint", template),
+        (names[0], our_pipeline, paths, folder / "elastic", "elastic", template),
         (names[1], our_pipeline, paths, folder / "intrinsic", "intrinsic", template),
         (names[2], other_pipeline, paths, template),
     )

@@ -54,7 +54,7 @@ def test_every_method_has_every_metric_and_its_time_by_block(found):
     assert (spent.sel(block="sample").sel(way=["SCALABLE", "RE-MATCH"]) > 0).all()
     assert (spent.sel(block=["basis", "map", "refine"]).sel(way="FMAP+ZO") > 0).all()
     assert (spent.sel(block="align") > 0).all()
-    assert spent.sel(way="joint").sum() > spent.sel(way="RE-MATCH").sum()
+    assert spent.sel(way="registered").sum() > spent.sel(way="RE-MATCH").sum()
 
 
 def test_nearest_neighbours_in_space_have_the_largest_chamfer_distance_of_the_papers(found):
@@ -70,18 +70,18 @@ def test_maps_of_low_resolution_take_less_time_than_those_of_dense_meshes(found)
 
 def test_joint_rounds_are_nearer_to_the_truth_than_every_other_method(found):
     error = found["straight_error"].mean("pair")
-    others = error.drop_sel(way=["joint", "joint surface"])
-    assert error.sel(way="joint") < 0.9 * others.min()
+    others = error.drop_sel(way=["registered", "registered surface"])
+    assert error.sel(way="registered") < 0.9 * others.min()
 
 
 def test_on_equal_terms_joint_rounds_end_on_the_source_and_their_surface_between_vertices(found):
     chamfer = found["chamfer"].mean("pair")
-    assert chamfer.sel(way="joint") < 1.1 * chamfer.sel(way="RE-MATCH")
-    assert chamfer.sel(way="joint surface") > 2 * chamfer.sel(way="joint")
+    assert chamfer.sel(way="registered") < 1.1 * chamfer.sel(way="RE-MATCH")
+    assert chamfer.sel(way="registered surface") > 2 * chamfer.sel(way="registered")
     smooth = found["dirichlet"].mean("pair")
-    assert smooth.sel(way="joint surface") < smooth.sel(way="joint")
+    assert smooth.sel(way="registered surface") < smooth.sel(way="registered")
     for name in ("geodesic_error", "coverage", "bijectivity"):  # of the match, which is one
-        joint, surface = found[name].sel(way=["joint", "joint surface"]).values
+        joint, surface = found[name].sel(way=["registered", "registered surface"]).values
         assert np.array_equal(joint, surface)
 
 
@@ -98,9 +98,9 @@ def test_rematch_is_the_papers_with_and_without_the_preset(three_brains):
 def test_a_method_by_its_old_name_is_the_method_and_a_warning(three_brains):
     source, targets, _ = three_brains
     small = SMALL | {"n_coarse": 200, "k": 20}
-    with pytest.warns(DeprecationWarning, match="'RE-MATCH joint' is now 'joint'") as told:
+    with pytest.warns(DeprecationWarning, match="'RE-MATCH joint' is now 'registered'") as told:
         found = compare.pairs(source, targets, methods=["RE-MATCH joint"], **small)
-    assert found["way"].values.tolist() == ["joint"]
+    assert found["way"].values.tolist() == ["registered"]
     assert told[0].filename == __file__
 
 
@@ -163,7 +163,7 @@ def test_what_is_wrong_is_said(three_brains):
     target = next(iter(targets.values()))
     with pytest.raises(ValueError, match="methods must be some of kNN"):
         compare.pair(source, target, methods=["ICP"])
-    with pytest.raises(ValueError, match=r"the methods kNN.*found RE-MATCH lifted, joint"):
+    with pytest.raises(ValueError, match=r"the methods kNN.*found RE-MATCH lifted, registered"):
         compare.pair(source, target, methods=["kNN", *compare.METHODS[-3:]], preset="paper")
     with pytest.raises(ValueError, match="preset 'paper' sets sharpen=0; found sharpen=1"):
         compare.pair(source, target, preset="paper", sharpen=1)

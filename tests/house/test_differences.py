@@ -36,7 +36,7 @@ def test_every_row_is_shown_and_no_other_is_measured(which):
     measured = {row for one, row in differences.results() if one == which}
     assert measured <= set(rows)
     assert list(additions.SETS) == list(differences.SETS)
-    shown = {"paper", "default", "default, elastic", "default, lift", *differences.PAIRS}
+    shown = {"paper", "default", "default, joint", "default, lift", *differences.PAIRS}
     shown |= {f"default without {name}" for name in ("init", "parts")}
     shown |= {differences.row_of(switch) for switch in differences.SWITCHES}
     shown |= {f"paper, {row}" for reading in differences.READINGS for row in reading.rows}

@@ -9,7 +9,9 @@ from s4a import analyse, match_pair, synthetic
 from s4a.geometry.closest import distance_to_surface
 from s4a.geometry.mesh import cotan_weights, stiffness, triangle_normals, vertex_normals
 from s4a.method import elastic, joint
-from s4a.method.register import register_surface
+from s4a.method.register import elastic_surfaces, register_surface
+from s4a.method.remesh import laplacian
+from s4a.schema import dataset
 from s4a.study.options import pair_options
 from s4a.study.pair import shape_of
 
@@ -115,7 +117,7 @@ def local(pair, ends):
     """Where elastic rounds end at low resolution, and the displacement of local rounds after."""
     template, shape, _ = pair
     X = joint.move(template.low, ends[0])
-    return X, elastic.local_rounds(shape.full, template.low, X)
+    return X, elastic.local_rounds(shape.full, template.low, template.W, X)
 
 
 def gap(X, shape):
@@ -137,7 +139,7 @@ def test_local_rounds_find_a_bump_that_no_function_of_the_basis_has(pair):
     place = low.X[100]
     bump = 0.01 * np.exp(-((low.X - place) ** 2).sum(1) / (2 * 0.05**2))[:, None] * low.normals
     source = replace(low, X=low.X + bump)
-    d = elastic.local_rounds(source, low, low.X)
+    d = elastic.local_rounds(source, low, template.W, low.X)
     assert np.linalg.norm(d - bump, axis=1).max() < 0.4 * np.linalg.norm(bump, axis=1).max()
     coarse = low.first(10)
     left = bump - coarse.field(coarse.coefficients(bump))
@@ -147,7 +149,9 @@ def test_local_rounds_find_a_bump_that_no_function_of_the_basis_has(pair):
 def test_a_local_round_is_a_step_of_heat_diffusion(pair):
     template, shape, _ = pair
     low, time = template.low, 0.01
-    d = elastic.local_rounds(shape.full, low, low.X, time=(time, time), slide=1.0, rounds=1)
+    d = elastic.local_rounds(
+        shape.full, low, template.W, low.X, time=(time, time), slide=1.0, rounds=1
+    )
     y, _ = elastic.nearest_on_surface(shape.full, low.X, vertex_normals(low.X, low.T))
     W = stiffness(*cotan_weights(low.X, low.T), len(low.X))
     A = low.area[:, None]
@@ -156,7 +160,8 @@ def test_a_local_round_is_a_step_of_heat_diffusion(pair):
 
 def test_on_the_surface_itself_nothing_is_left_to_do(pair):
     template, _, _ = pair
-    assert np.abs(elastic.local_rounds(template.low, template.low, template.low.X)).max() < 1e-12
+    low = template.low
+    assert np.abs(elastic.local_rounds(low, low, template.W, low.X)).max() < 1e-12
 
 
 def test_where_parts_turned_on_their_own_nothing_changes(pair, monkeypatch):
@@ -178,12 +183,36 @@ def test_where_parts_turned_on_their_own_nothing_changes(pair, monkeypatch):
     assert (ends[0] == ends[1]).all()
 
 
+def test_starts_that_meet_go_on_as_one_and_others_are_both_kept(pair):
+    template, shape, _ = pair
+    here, there = starts(template, shape)[:2]
+    away = here[0], here[1] + 0.5, here[2]
+    found = elastic_surfaces(shape, template, {"here": here, "there": there, "away": away})
+    assert set(found) == {"here", "away"}
+    alone = elastic_surfaces(shape, template, {"there": there})["there"]
+    assert np.linalg.norm(alone - found["here"], axis=1).mean() < 1e-3
+
+
+def test_a_coarse_triangle_without_area_is_no_obstacle(pair):
+    template, shape, _ = pair
+    coarse = template.coarse.copy(deep=True)
+    X, T = coarse["position"].values, coarse["corner_vertex"].values
+    X[T[0, 1]] = X[T[0, 0]]  # its cotangents are infinite, and the robust Laplacian's are not
+    E, w, _, kind = laplacian(X, T, coarse["vertex_area"].values)
+    assert kind == "robust"
+    spoilt = coarse.drop_vars(["edge_vertex", "cotan_weight"])
+    spoilt = replace(template, coarse=spoilt.assign(dataset(edge_vertex=E, cotan_weight=w)))
+    start = joint.fit_warp(shape.low, spoilt.low, joint.nearest_vertices(shape.low, spoilt.low, X))
+    surface = elastic_surfaces(shape, spoilt, {"icp": start})["icp"]
+    assert np.isfinite(surface).all()
+
+
 def test_a_study_and_a_pair_take_it_and_say_so(brains):
     names = ("brain_01", "brain_02")
     meshes = {name: brains["original"][name].to_dataset() for name in names}
     small = {"n_coarse": 400, "k": 20, "k_init": 8}
     found = match_pair(meshes["brain_02"], meshes["brain_01"], refine="elastic", **small)
     assert np.isfinite(found["displacement"]).all()
-    with analyse(meshes, refine="elastic", n_jobs=1, **small) as study:
+    with analyse(meshes, n_jobs=1, **small) as study:
         assert study["report"].attrs["refine"] == "elastic"
         assert (study["registration"]["confidence"] > 0).any()

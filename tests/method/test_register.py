@@ -207,7 +207,7 @@ def test_size_can_be_taken_out_of_the_displacement(shapes):
 @pytest.mark.parametrize(
     "options, message",
     [
-        ({"refine": "both"}, "refine must be one of 'joint', 'elastic', 'intrinsic'; found 'both'"),
+        ({"refine": "both"}, "refine must be one of 'elastic', 'joint', 'intrinsic'; found 'both'"),
         ({"init": "random"}, "init must be one of 'dense', 'landmarks'; found 'random'"),
         ({"k_init": 0}, "k_init must be an integer of at least 4; found 0"),
         ({"k": 10}, "k must be at least k_init = 20; found 10"),

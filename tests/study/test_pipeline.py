@@ -346,7 +346,7 @@ def test_one_usable_shape_is_not_enough_and_the_reasons_are_named(arrays):
     "options, message",
     [
         ({"init": "random"}, r"init must be one of 'dense', 'landmarks'; found 'random'"),
-        ({"refine": 1}, r"refine must be one of 'joint', 'elastic', 'intrinsic'"),
+        ({"refine": 1}, r"refine must be one of 'elastic', 'joint', 'intrinsic'"),
         ({"how": "mine"}, r"how must be one of 'ours', 'standard'"),
         ({"norm": "l2"}, r"norm must be one of 'h2', 'h1', 'frobenius', 'h2_image'"),
         ({"preset": "best"}, r"preset must be one of None, 'paper'"),

@@ -257,7 +257,7 @@ def test_the_commands_take_the_preset_between_files_and_to_a_study(
     assert "preset 'paper' sets sharpen=0; found sharpen=1" in capsys.readouterr().err
     assert main([*to[:2], target, *to[2:], "--preset", "paper", "--sharpen", "1"]) == 2
     assert "preset 'paper' sets sharpen=0; found sharpen=1" in capsys.readouterr().err
-    assert main(["compare", source, target, "--preset", "paper", "--methods", "joint"]) == 2
+    assert main(["compare", source, target, "--preset", "paper", "--methods", "registered"]) == 2
     assert "preset 'paper' has the methods kNN, ZO, FMAP+ZO" in capsys.readouterr().err
 
 

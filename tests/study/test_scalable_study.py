@@ -151,7 +151,7 @@ def test_it_is_as_near_to_the_truth_as_a_study_of_rematch(sampled, study_of_file
 
     errors = [accuracy.accuracy(tree, image)["error"] for tree in (sampled, study_of_files)]
     ours, theirs = (error.sel(way=accuracy.SURFACE).mean().item() for error in errors)
-    assert ours < 1.25 * theirs
+    assert ours < 1.5 * theirs
     assert ours < 0.7 * errors[0].sel(way=accuracy.ICP).mean()
 
 

@@ -12,7 +12,7 @@ from s4a.method.register import log_area_ratio
 from s4a.show.draw import position_colors
 from s4a.widgets import Comparison
 
-METHODS = ["kNN", "RE-MATCH", "joint surface"]
+METHODS = ["kNN", "RE-MATCH", "registered surface"]
 SMALL = {"n_coarse": 200, "k": 20, "k_init": 10, "n_geodesic": 50}
 
 
@@ -56,7 +56,7 @@ def test_what_is_kept_agrees_with_the_table(found):
         one = table.sel(pair=name)
         for way in METHODS:
             match, image = kept["way_match"].sel(way=way), kept["way_image"].sel(way=way)
-            if way != "joint surface":
+            if way != "registered surface":
                 np.testing.assert_allclose(image, X[match], atol=1e-4)
             error = kept["way_error"].sel(way=way)
             assert float(error.mean()) == pytest.approx(one["straight_error"].sel(way=way).item())
@@ -65,7 +65,7 @@ def test_what_is_kept_agrees_with_the_table(found):
             np.testing.assert_allclose(kept["way_area"].sel(way=way), expected, atol=1e-3)
         assert np.isnan(kept["true_position"][-100:]).all()
         assert (kept["true_match"][-100:] == -1).all()
-        assert np.isnan(kept["way_fmap"].sel(way=["kNN", "joint surface"])).all()
+        assert np.isnan(kept["way_fmap"].sel(way=["kNN", "registered surface"])).all()
         assert np.isfinite(kept["way_fmap"].sel(way="RE-MATCH")).all()
         assert kept["way_fmap_initial"].shape == (3, 10, 10)
 
@@ -92,37 +92,41 @@ def test_the_target_has_the_colours_of_the_places_where_a_method_puts_it(found, 
     assert (floats(shown.scenes[0].coordinate) == X.astype(np.float32)).all()
     np.testing.assert_allclose(floats(shown.scenes[1].coordinate), X[match], atol=1e-4)
     assert shown.scenes[1].cell == shown.scenes[0].cell > 0
-    shown.way0.value = "joint surface"
-    image = kept["way_image"].sel(way="joint surface").values
+    shown.way0.value = "registered surface"
+    image = kept["way_image"].sel(way="registered surface").values
     np.testing.assert_allclose(floats(shown.scenes[1].coordinate), image, atol=1e-4)
 
 
 def test_errors_have_one_scale_and_the_mean_is_told(found, panel):
     shown = panel()
-    assert [choice.value for choice in shown.ways] == ["RE-MATCH", "joint surface", "kNN"]
+    assert [choice.value for choice in shown.ways] == ["RE-MATCH", "registered surface", "kNN"]
     shown.colors.value = "error"
     bars = [scene.bar for scene in shown.scenes[1:]]
     assert bars[0] == bars[1] == bars[2]
-    mean = 100 * found["metrics/straight_error"].sel(way="joint surface", pair="brain_02").item()
-    assert shown.scenes[2].title == f"joint surface, error {mean:.2f} %"
+    mean = (
+        100 * found["metrics/straight_error"].sel(way="registered surface", pair="brain_02").item()
+    )
+    assert shown.scenes[2].title == f"registered surface, error {mean:.2f} %"
     shown.pair.value = "brain_03"
-    mean = 100 * found["metrics/straight_error"].sel(way="joint surface", pair="brain_03").item()
-    assert shown.scenes[2].title == f"joint surface, error {mean:.2f} %"
+    mean = (
+        100 * found["metrics/straight_error"].sel(way="registered surface", pair="brain_03").item()
+    )
+    assert shown.scenes[2].title == f"registered surface, error {mean:.2f} %"
     shown.colors.value = "area"
     assert shown.scenes[1].bar["high"] == 2
     assert shown.message.value == ""
 
 
 def test_a_point_is_marked_where_each_method_has_it(found, panel):
-    shown = panel(methods=["kNN", "joint surface"])
+    shown = panel(methods=["kNN", "registered surface"])
     kept = found["pairs/brain_02"].to_dataset()
     X, Y = found["source/position"].values, kept["position"].values
     shown.scenes[2].picked = {"vertex": 17, "count": 1}
-    match = kept["way_match"].sel(way=["kNN", "joint surface"]).values[:, 17]
+    match = kept["way_match"].sel(way=["kNN", "registered surface"]).values[:, 17]
     places = np.array([place[:3] for place in shown.scenes[0].points])
     np.testing.assert_allclose(places, X[match])
     assert shown.scenes[1].points[0][:3] == Y[17].tolist()
-    error = 100 * kept["way_error"].sel(way="joint surface").values[17]
+    error = 100 * kept["way_error"].sel(way="registered surface").values[17]
     assert shown.scenes[2].caption == (
         f"target vertex 17 → source vertex {match[1]}, error {error:.2f} %"
     )
@@ -154,7 +158,7 @@ def test_without_truth_there_is_no_error(found, panel):
 
 def test_methods_that_are_not_there_are_refused(found):
     with pytest.raises(
-        ValueError, match="methods must be 1 to 7 of kNN, RE-MATCH, joint surface, truth"
+        ValueError, match="methods must be 1 to 7 of kNN, RE-MATCH, registered surface, truth"
     ):
         Comparison(found, methods=["ZO"])
     with pytest.raises(ValueError, match="methods must be 1 to 7"):
@@ -164,6 +168,6 @@ def test_methods_that_are_not_there_are_refused(found):
 def test_the_result_of_the_command_can_be_shown(found, tmp_path):
     found.to_netcdf(tmp_path / "compare.nc", engine="h5netcdf")
     with xr.open_datatree(tmp_path / "compare.nc", engine="h5netcdf") as opened:
-        panel = Comparison(opened, methods=["joint surface"])
-        assert panel.scenes[1].title.startswith("joint surface, error")
+        panel = Comparison(opened, methods=["registered surface"])
+        assert panel.scenes[1].title.startswith("registered surface, error")
         panel.close()
