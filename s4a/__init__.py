@@ -21,42 +21,51 @@ new shapes                :func:`insert`
 for other programs        :func:`write_registered`, :func:`write_training_set`
 the embedded collection   :mod:`s4a.synthetic`
 ========================  ====================================================================
+
+They and the modules of the rooms (``s4a.method.fmap``) are imported when they are first used.
 """
 
+from functools import partial
+from importlib import import_module
 from importlib.metadata import version
+from importlib.util import find_spec
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 from s4a._moved import install
-from s4a.accessor import explore
-from s4a.analysis import statistics
-from s4a.analysis.export import write_registered, write_training_set
-from s4a.analysis.transfer import (
-    register_pairs,
-    transfer_labels,
-    transfer_landmarks,
-    transfer_scalars,
-)
-from s4a.datasets import synthetic
-from s4a.evaluation import compare, metrics
-from s4a.input.clean import clean
-from s4a.input.collection import read_shape, read_shapes
-from s4a.input.files import read_mesh, write_mesh
-from s4a.method.pca import synthesize
-from s4a.method.remesh import coarsen
-from s4a.method.spectral import reconstruct, spectrum
-from s4a.method.steps import (
-    align_pair,
-    build_network,
-    latent_map,
-    latent_match,
-    refine_network,
-    register_shape,
-)
-from s4a.show.page import write_page
-from s4a.study.insert import insert
-from s4a.study.pair import match_pair
-from s4a.study.pipeline import analyse
-from s4a.study.tree import open_study
-from s4a.study.verify import verify
+
+if TYPE_CHECKING:
+    from s4a.accessor import explore
+    from s4a.analysis import statistics
+    from s4a.analysis.export import write_registered, write_training_set
+    from s4a.analysis.transfer import (
+        register_pairs,
+        transfer_labels,
+        transfer_landmarks,
+        transfer_scalars,
+    )
+    from s4a.datasets import synthetic
+    from s4a.evaluation import compare, metrics
+    from s4a.input.clean import clean
+    from s4a.input.collection import read_shape, read_shapes
+    from s4a.input.files import read_mesh, write_mesh
+    from s4a.method.pca import synthesize
+    from s4a.method.remesh import coarsen
+    from s4a.method.spectral import reconstruct, spectrum
+    from s4a.method.steps import (
+        align_pair,
+        build_network,
+        latent_map,
+        latent_match,
+        refine_network,
+        register_shape,
+    )
+    from s4a.show.page import write_page
+    from s4a.study.insert import insert
+    from s4a.study.pair import match_pair
+    from s4a.study.pipeline import analyse
+    from s4a.study.tree import open_study
+    from s4a.study.verify import verify
 
 install()
 __version__ = version("s4a")
@@ -94,3 +103,52 @@ __all__ = [
     "write_registered",
     "write_training_set",
 ]
+# module -> the public names that it holds
+PLACES = {
+    "accessor": "explore",
+    "analysis": "statistics",
+    "analysis.export": "write_registered write_training_set",
+    "analysis.transfer": "register_pairs transfer_labels transfer_landmarks transfer_scalars",
+    "datasets": "synthetic",
+    "evaluation": "compare metrics",
+    "input.clean": "clean",
+    "input.collection": "read_shape read_shapes",
+    "input.files": "read_mesh write_mesh",
+    "method.pca": "synthesize",
+    "method.remesh": "coarsen",
+    "method.spectral": "reconstruct spectrum",
+    "method.steps": "align_pair build_network latent_map latent_match refine_network "
+    "register_shape",
+    "show.page": "write_page",
+    "study.insert": "insert",
+    "study.pair": "match_pair",
+    "study.pipeline": "analyse",
+    "study.tree": "open_study",
+    "study.verify": "verify",
+}
+MODULE_OF = {name: module for module, names in PLACES.items() for name in names.split()}
+
+
+def __getattr__(name: str) -> Any:
+    """A public name, imported now; ``study.s4a`` is there from the first one on."""
+    if name not in MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    import_module("s4a.accessor")
+    globals()[name] = getattr(import_module(f"s4a.{MODULE_OF[name]}"), name)
+    return globals()[name]
+
+
+def __dir__() -> list[str]:
+    """What completion offers."""
+    return sorted({*globals(), *__all__})
+
+
+def _module_of(room: str, name: str) -> ModuleType:
+    """A module of a room, imported now."""
+    if find_spec(f"s4a.{room}.{name}") is None:
+        raise AttributeError(f"module 's4a.{room}' has no attribute {name!r}")
+    return import_module(f"s4a.{room}.{name}")
+
+
+for _room in ("analysis", "datasets", "evaluation", "geometry", "input", "method", "show", "study"):
+    vars(import_module(f"s4a.{_room}"))["__getattr__"] = partial(_module_of, _room)

@@ -16,17 +16,11 @@ To add a statistic:
 """
 
 import logging
+from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
 from scipy import stats
-from sklearn.base import ClassifierMixin, clone
-from sklearn.decomposition import PCA
-from sklearn.linear_model import LogisticRegression
-from sklearn.metrics import balanced_accuracy_score
-from sklearn.model_selection import StratifiedKFold, cross_val_predict, permutation_test_score
-from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import StandardScaler
 
 from s4a.analysis.generalization import generalization
 from s4a.analysis.inputs import (
@@ -50,6 +44,9 @@ from s4a.geometry.mesh import as_arrays, vertex_normals
 from s4a.method.deform import normal_displacement
 from s4a.method.pca import center_gram, gram, principal_components
 from s4a.schema import dataset, in_unit, unit_of
+
+if TYPE_CHECKING:
+    from sklearn.base import ClassifierMixin
 
 log = logging.getLogger(__name__)
 
@@ -439,7 +436,7 @@ def outliers(
 def classify(
     study: xr.DataTree,
     group: Values,
-    estimator: ClassifierMixin | None = None,
+    estimator: "ClassifierMixin | None" = None,
     *,
     n_components: int | None = None,
     n_folds: int = 5,
@@ -489,6 +486,15 @@ def classify(
     >>> classes["predicted"].sizes["shape"], classes.attrs["chance"]
     (6, 0.5)
     """
+    # here, as nothing else needs scikit-learn
+    from sklearn.base import clone
+    from sklearn.decomposition import PCA
+    from sklearn.linear_model import LogisticRegression
+    from sklearn.metrics import balanced_accuracy_score
+    from sklearn.model_selection import StratifiedKFold, cross_val_predict, permutation_test_score
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import StandardScaler
+
     _check_permutations(n_permutations)
     if n_folds < 2:
         raise ValueError(f"n_folds needs a number from 2, found {n_folds}")

@@ -1,6 +1,7 @@
 """The commands of the command line: from parsed arguments to what is written and an exit code.
 
 The flags are in :mod:`s4a.cli.flags`; what is shown is put into words in :mod:`s4a.cli.tables`.
+Every command imports what it needs, so that none waits for what the others need.
 """
 
 import contextlib
@@ -13,47 +14,20 @@ from argparse import Namespace
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
-import xarray as xr
-from joblib import parallel_config
-
-from s4a.analysis import statistics as tests
-from s4a.analysis import transfer as travel
-from s4a.analysis.export import write_registered, write_results
-from s4a.analysis.landmarks import locate
-from s4a.cli import tables
-from s4a.datasets import synthetic
-from s4a.evaluation import accuracy
-from s4a.evaluation import compare as comparison
-from s4a.input.annotations import (
-    labels_of_file,
-    labels_of_mesh,
-    read_labels,
-    read_landmarks,
-    write_landmarks,
-)
-from s4a.input.collection import read_shape, read_shapes
-from s4a.input.decisions import listed
-from s4a.input.files import find_meshes, read_mesh, stem_of
 from s4a.input.raw import shown
-from s4a.input.subjects import with_table
-from s4a.show import charts
-from s4a.show.page import write_page
-from s4a.show.pictures import write_animation, write_picture
-from s4a.study.insert import insert as place
-from s4a.study.options import PAIR, Options
-from s4a.study.pipeline import analyse
-from s4a.study.processes import spawned_end_too
-from s4a.study.store import ENGINE
-from s4a.study.tree import left_out, open_study
-from s4a.study.verify import verify as look_through
 
-PAIRS = (*PAIR, "both")  # options of `s4a transfer`
+if TYPE_CHECKING:
+    import numpy as np
+    import xarray as xr
 
 
 def check(args: Namespace) -> int:
     """Read and clean every file, and say what was found."""
+    from s4a.cli import tables
+    from s4a.input.collection import read_shapes
+
     report = read_shapes(
         args.paths,
         components=args.components,
@@ -68,6 +42,9 @@ def check(args: Namespace) -> int:
 
 def run(args: Namespace) -> int:
     """The whole analysis over a folder of meshes."""
+    from s4a.cli import tables
+    from s4a.study.pipeline import analyse
+
     begin = time.perf_counter()
     full = within(args.out, "report.txt")
     with cluster(args.cluster):
@@ -83,6 +60,8 @@ def run(args: Namespace) -> int:
 
 def options_of(args: Namespace) -> dict:
     """The options of `analyse` from parsed flags, and how many processes."""
+    from s4a.study.options import Options
+
     return {name: getattr(args, name) for name in [*(f.name for f in fields(Options)), "n_jobs"]}
 
 
@@ -105,6 +84,10 @@ def cluster(address: str | None) -> Iterator[None]:
         from dask.distributed import Client, LocalCluster
     except ImportError as error:
         raise ValueError("--cluster needs dask.distributed: pip install 's4a[cluster]'") from error
+    from joblib import parallel_config
+
+    from s4a.study.processes import spawned_end_too
+
     n_workers = int(known[1] or 0)
     with contextlib.ExitStack() as stack:
         if n_workers:
@@ -121,6 +104,13 @@ def demo(args: Namespace) -> int:
 
     Its accuracy against the truth is printed.
     """
+    from s4a.cli import tables
+    from s4a.datasets import synthetic
+    from s4a.evaluation import accuracy
+    from s4a.show.page import write_page
+    from s4a.show.pictures import write_picture
+    from s4a.study.pipeline import analyse
+
     begin, out = time.perf_counter(), Path(args.out)
     collection = synthetic.brains(args.shapes, args.vertices, args.seed, dirty=args.dirty)
     study = analyse(collection, store=out, preset=args.preset, n_jobs=args.n_jobs, seed=args.seed)
@@ -146,13 +136,19 @@ def demo(args: Namespace) -> int:
 
 def verify(args: Namespace) -> int:
     """Whether every file of a study is as it was written, and they belong together."""
-    found = look_through(args.study)
+    from s4a.cli import tables
+    from s4a.study.verify import verify
+
+    found = verify(args.study)
     write(tables.verify_lines(found))
     return 1 if tables.count_faults(found) else 0
 
 
 def view(args: Namespace) -> int:
     """One self-contained page of a study."""
+    from s4a.show.page import write_page
+    from s4a.study.tree import open_study
+
     page = Path(args.out) if args.out else within(args.study, "study.html")
     title = args.title or Path(args.study).name
     write_page(open_study(args.study), page, title=title, view=args.view, up=args.up)
@@ -165,6 +161,15 @@ def statistics(args: Namespace) -> int:
 
     Tests of groups and variables of its table.
     """
+    from s4a.analysis import statistics as tests
+    from s4a.analysis.export import write_results
+    from s4a.cli import tables
+    from s4a.input.decisions import listed
+    from s4a.input.subjects import with_table
+    from s4a.show.page import write_page
+    from s4a.show.pictures import write_animation
+    from s4a.study.tree import left_out, open_study
+
     if args.covariates and not (args.group or args.variable):
         raise ValueError("--covariates are of a test: give --group, --variable or both")
     study, out = open_study(args.study), args.out or str(within(args.study, "statistics"))
@@ -200,8 +205,10 @@ def statistics(args: Namespace) -> int:
     return 0
 
 
-def tests_of(study: xr.DataTree, args: Namespace) -> dict[str, xr.Dataset]:
+def tests_of(study: "xr.DataTree", args: Namespace) -> "dict[str, xr.Dataset]":
     """The tests of the group and the variable that are asked for."""
+    from s4a.analysis import statistics as tests
+
     options = {
         "covariates": args.covariates or None,
         "seed": args.seed,
@@ -225,7 +232,13 @@ def tests_of(study: xr.DataTree, args: Namespace) -> dict[str, xr.Dataset]:
 
 def insert(args: Namespace) -> int:
     """New shapes in a finished study, which stays as it is."""
-    inserted = place(open_study(args.study), args.shapes, n_jobs=args.n_jobs)
+    from s4a.analysis.export import write_registered
+    from s4a.cli import tables
+    from s4a.study.insert import insert
+    from s4a.study.store import ENGINE
+    from s4a.study.tree import open_study
+
+    inserted = insert(open_study(args.study), args.shapes, n_jobs=args.n_jobs)
     out = new_folder(args.out)
     inserted.to_netcdf(out / "inserted.nc", engine=ENGINE)
     write_registered(inserted, out)
@@ -236,6 +249,14 @@ def insert(args: Namespace) -> int:
 
 def transfer(args: Namespace) -> int:
     """Labels and landmarks of one mesh on others."""
+    from s4a.analysis import transfer as travel
+    from s4a.analysis.landmarks import locate
+    from s4a.cli import tables
+    from s4a.input.annotations import labels_of_mesh, read_labels, read_landmarks
+    from s4a.input.collection import read_shape
+    from s4a.study.options import PAIR
+    from s4a.study.tree import open_study
+
     if not (args.labels or args.landmarks):
         raise ValueError(
             "something to transfer needed: give --labels FILE, --landmarks FILE or both"
@@ -251,7 +272,8 @@ def transfer(args: Namespace) -> int:
             f"{args.source}"
         )
     excluded = []
-    given = {name: getattr(args, name) for name in PAIRS if getattr(args, name) is not None}
+    asked = {name: getattr(args, name) for name in (*PAIR, "both")}
+    given = {name: value for name, value in asked.items() if value is not None}
     if len(args.targets) == 1 and (Path(args.targets[0]) / "registration.nc").is_file():
         study = open_study(args.targets[0])
     else:
@@ -269,16 +291,20 @@ def transfer(args: Namespace) -> int:
 
 
 def registered_pairs(
-    source: xr.Dataset, args: Namespace, options: dict
-) -> tuple[xr.DataTree, list[str]]:
+    source: "xr.Dataset", args: Namespace, options: dict
+) -> "tuple[xr.DataTree, list[str]]":
     """The source registered as the template of every target, and the targets that are left out."""
+    from s4a.analysis.transfer import register_pairs
+    from s4a.input.collection import read_shapes
+    from s4a.study.options import Options
+
     shapes = read_shapes(args.targets, compare=False)
     report = shapes["report"].to_dataset()
     excluded = report["shape"].values[report["status"].values == "excluded"].tolist()
     for name in excluded:
         write(f"{name} excluded: {report['reason'].sel(shape=name).item()}")
     meshes = {name: node.to_dataset() for name, node in shapes["original"].children.items()}
-    study = travel.register_pairs(
+    study = register_pairs(
         source,
         meshes,
         name=next(n for n in ("template", "template_", "template__") if n not in meshes),
@@ -288,8 +314,14 @@ def registered_pairs(
     return study, excluded
 
 
-def transferred_rows(study: xr.DataTree, labels: Mapping, points: Mapping, out: Path) -> list[list]:
+def transferred_rows(
+    study: "xr.DataTree", labels: Mapping, points: Mapping, out: Path
+) -> list[list]:
     """Write the files of every target; the rows of the table that is shown."""
+    from s4a.cli import tables
+    from s4a.input.annotations import write_landmarks
+    from s4a.input.files import stem_of
+
     meshes = {name: study["original"][name].to_dataset() for name in labels or points}
     stems = {name: stem_of(mesh.attrs.get("path") or name) for name, mesh in meshes.items()}
     rows = []
@@ -307,8 +339,12 @@ def transferred_rows(study: xr.DataTree, labels: Mapping, points: Mapping, out: 
     return rows
 
 
-def write_labels(labels: xr.Dataset, mesh: xr.Dataset, out: Path, stem: str) -> list[str]:
+def write_labels(labels: "xr.Dataset", mesh: "xr.Dataset", out: Path, stem: str) -> list[str]:
     """Write labels and their confidence as NPY, a row for each vertex of the file; the cells."""
+    import numpy as np
+
+    from s4a.input.annotations import labels_of_file
+
     points = file_points(mesh)
     label, dropped = labels_of_file(labels["label"].values, mesh, points)
     confidence, _ = labels_of_file(labels["confidence"].values, mesh, points)
@@ -318,8 +354,12 @@ def write_labels(labels: xr.Dataset, mesh: xr.Dataset, out: Path, stem: str) -> 
     return [*means, str(dropped)]
 
 
-def file_points(mesh: xr.Dataset) -> np.ndarray:
+def file_points(mesh: "xr.Dataset") -> "np.ndarray":
     """The vertices of a mesh's file (n, 3); those that were kept, where the file is gone."""
+    import numpy as np
+
+    from s4a.input.files import read_mesh
+
     if Path(mesh.attrs.get("path") or "").is_file():
         return read_mesh(mesh.attrs["path"])[0]
     points = np.full((mesh.sizes["file_vertex_index"], 3), np.nan)
@@ -329,6 +369,9 @@ def file_points(mesh: xr.Dataset) -> np.ndarray:
 
 def compare(args: Namespace) -> int:
     """The methods of the paper's Table 1 on pairs, or of its Table 2 on a collection."""
+    from s4a.show import charts
+    from s4a.study.store import ENGINE
+
     result: xr.Dataset | xr.DataTree
     if args.collection:
         result, names, seconds, text = compare_collection(args)
@@ -346,8 +389,12 @@ def compare(args: Namespace) -> int:
     return 0
 
 
-def compare_collection(args: Namespace) -> tuple[xr.Dataset, list[str], np.ndarray, str]:
+def compare_collection(args: Namespace) -> "tuple[xr.Dataset, list[str], np.ndarray, str]":
     """Table 2: the result, names of the bars of Fig. 3, their seconds by block, and a text."""
+    from s4a.cli import tables
+    from s4a.evaluation import compare as comparison
+    from s4a.study.options import Options
+
     if args.paths or args.truth or args.landmarks or args.keep:
         raise ValueError(
             "--collection takes the shapes alone: no SOURCE, TARGET, --truth, --landmarks or --keep"
@@ -369,8 +416,14 @@ def compare_collection(args: Namespace) -> tuple[xr.Dataset, list[str], np.ndarr
 
 def compare_pairs(
     args: Namespace,
-) -> tuple[xr.Dataset | xr.DataTree, list[str], np.ndarray, str]:
+) -> "tuple[xr.Dataset | xr.DataTree, list[str], np.ndarray, str]":
     """Table 1: as :func:`compare_collection`."""
+    import xarray as xr
+
+    from s4a.cli import tables
+    from s4a.evaluation import compare as comparison
+    from s4a.input.files import find_meshes
+
     if len(args.paths) < 2:
         raise ValueError("compare needs SOURCE and TARGET, or --collection PATH...")
     source, *paths = args.paths
@@ -393,22 +446,26 @@ def compare_pairs(
     return result, names, seconds, f"{tables.comparison_table(found)}\n\n{blocks}"
 
 
-def truth_of(files: list[str] | None, targets: dict) -> dict[str, np.ndarray] | None:
+def truth_of(files: list[str] | None, targets: dict) -> "dict[str, np.ndarray] | None":
     """The truth in one file for every target, in the same order, or none."""
+    from s4a.evaluation.compare import read_truth
+
     if not files:
         return None
     if len(files) != len(targets):
         raise ValueError(
             f"--truth needs a file for each of the {len(targets)} targets, found {len(files)}"
         )
-    return {name: comparison.read_truth(file) for name, file in zip(targets, files, strict=True)}
+    return {name: read_truth(file) for name, file in zip(targets, files, strict=True)}
 
 
-def landmark_pairs(files: list[str] | None, targets: dict) -> dict[str, list[np.ndarray]] | None:
+def landmark_pairs(files: list[str] | None, targets: dict) -> "dict[str, list[np.ndarray]] | None":
     """Positions of the landmarks that source and target both have by name, for every target.
 
     None where they share none.
     """
+    import numpy as np
+
     if not files:
         return None
     if len(files) != 1 + len(targets):
@@ -429,8 +486,10 @@ def landmark_pairs(files: list[str] | None, targets: dict) -> dict[str, list[np.
     return pairs
 
 
-def positions_by_name(file: str) -> dict[str, np.ndarray]:
+def positions_by_name(file: str) -> "dict[str, np.ndarray]":
     """The landmarks of a file: name -> position (3,)."""
+    from s4a.input.annotations import read_landmarks
+
     landmarks = read_landmarks(file)
     names = landmarks["landmark_name"].values.tolist()
     return dict(zip(names, landmarks["landmark_position"].values, strict=True))

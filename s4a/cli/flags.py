@@ -10,16 +10,11 @@ import logging
 import re
 import sys
 from collections.abc import Callable, Iterable
+from importlib.metadata import version
 from typing import Any
 
-from s4a.analysis.statistics import VARIANCES
 from s4a.cli import commands
-from s4a.evaluation.compare import METHODS
 from s4a.input.raw import shown
-from s4a.show.draw import VIEWS
-from s4a.study.options import CHOICES, DEFAULTS, Options
-from s4a.study.runner import StageError
-from s4a.study.store import VERSION
 
 MOST_PROCESSES = 1000  # so that a slip of the key starts no million of them
 HELP = {
@@ -63,18 +58,22 @@ HELP = {
 }
 
 
-def parser() -> argparse.ArgumentParser:
-    """The parser of all commands."""
+def parser(only: str | None = None) -> argparse.ArgumentParser:
+    """The parser of all commands, with the flags of all or of one.
+
+    What the flags of a command may be is asked of the modules that it needs.
+    """
     top = argparse.ArgumentParser(
         prog="s4a", description="Scalable spectral statistical shape analysis"
     )
-    top.add_argument("--version", action="version", version=f"s4a {VERSION}")
+    top.add_argument("--version", action="version", version=f"s4a {version('s4a')}")
     subparsers = top.add_subparsers(required=True, metavar="command")
     for command, add_flags in FLAGS.items():
         text = command.__doc__
         sub = subparsers.add_parser(command.__name__, help=text, description=text)
         sub.set_defaults(function=command)
-        add_flags(sub.add_argument)
+        if only in (None, command.__name__):
+            add_flags(sub.add_argument)
     return top
 
 
@@ -83,6 +82,8 @@ def add_options(add: Callable, names: Iterable[str], *, unset: bool = False) -> 
 
     With `unset` those that are not given are None.
     """
+    from s4a.study.options import CHOICES, DEFAULTS, Options
+
     for name in names:
         default = -1 if name == "n_jobs" else getattr(Options, name)
         shown = DEFAULTS.get(name, default)
@@ -165,6 +166,8 @@ def _verify(add):
 
 
 def _view(add):
+    from s4a.show.draw import VIEWS
+
     add("study", metavar="STUDY")
     add("--out", metavar="PAGE", help="file of the page (default: STUDY/study.html)")
     add("--title", help="title of the page (default: name of the folder)")
@@ -173,6 +176,8 @@ def _view(add):
 
 
 def _statistics(add):
+    from s4a.analysis.statistics import VARIANCES
+
     add("study", metavar="STUDY")
     text = "test and map of the difference between groups; classification"
     add("--group", metavar="COLUMN", help=text)
@@ -203,6 +208,8 @@ def _insert(add):
 
 
 def _transfer(add):
+    from s4a.study.options import PAIR
+
     add("source", metavar="SOURCE", help="mesh file that the labels and landmarks belong to")
     text = "mesh files, folders or globs; or one study folder, whose options hold unless given"
     add("targets", nargs="+", metavar="TARGET", help=text)
@@ -213,10 +220,12 @@ def _transfer(add):
     text = "for <target>.labels.npy, .confidence.npy, .landmarks.csv"
     add("--out", required=True, metavar="DIR", help=text)
     add_options(add, ["n_jobs"])
-    add_options(add, commands.PAIRS, unset=True)
+    add_options(add, (*PAIR, "both"), unset=True)
 
 
 def _compare(add):
+    from s4a.evaluation.compare import METHODS
+
     text = "the reference and one or more other meshes"
     add("paths", nargs="*", metavar="SOURCE TARGET", help=text)
     text = "Table 2 on these folders, globs or mesh files"
@@ -273,7 +282,11 @@ def main(arguments: list[str] | None = None) -> int:
     """
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
     words = sys.argv[1:] if arguments is None else arguments
-    args = parser().parse_args(words, argparse.Namespace(words=words))  # ends here where they err
+    command = next((word for word in words if not word.startswith("-")), "")
+    # ends here where they err
+    args = parser(command).parse_args(words, argparse.Namespace(words=words))
+    from s4a.study.runner import StageError
+
     filters = [(handler, Once()) for handler in logging.getLogger().handlers]
     for handler, once in filters:
         handler.addFilter(once)

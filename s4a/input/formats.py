@@ -27,7 +27,6 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import nibabel
 import numpy as np
 
 from s4a.input import bounded
@@ -442,6 +441,8 @@ def _stl_bytes(X, T, _):
 
 
 def _gifti_bytes(X, T, scalars):
+    import nibabel  # here, as nothing else needs it
+
     arrays = [("POINTSET", X.astype(np.float32), {}), ("TRIANGLE", T, {})]
     for name, values in scalars.items():
         arrays.append(("SHAPE", values.astype(np.float32), {"Name": name}))

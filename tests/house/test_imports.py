@@ -90,11 +90,58 @@ def test_no_module_takes_the_public_names():
     assert named == set()
 
 
-def test_importing_s4a_loads_no_widgets_no_pymeshlab_and_no_cluster():
-    heavy = ("ipywidgets", "pythreejs", "anywidget", "pymeshlab", "dask", "pyFM")
-    code = f"import sys, s4a\nsys.stdout.write(' '.join(m for m in {heavy} if m in sys.modules))"
+PANELS = ("ipywidgets", "pythreejs", "anywidget")
+OFTEN = ("numpy", "xarray", "pandas", "scipy", "h5py", "joblib", "psutil")
+SELDOM = ("matplotlib", "sklearn", "nibabel", "jinja2", "PIL", "pymeshlab", "dask", "pyFM", *PANELS)
+HELP = """import contextlib, io
+with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()):
+    s4a.cli.main(["--help"])"""
+
+
+def loaded_by(code, modules):
+    """Which of these modules Python has when it has run the code."""
+    end = f"sys.stdout.write(' '.join(m for m in {modules} if m in sys.modules))"
+    code = f"import sys\n{code}\n{end}"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert found.stdout == ""
+    return found.stdout.split()
+
+
+@pytest.mark.parametrize("code", ["import s4a", f"import s4a.cli\n{HELP}"])
+def test_importing_s4a_and_its_help_load_no_other_package(code):
+    assert loaded_by(code, (*OFTEN, *SELDOM)) == []
+
+
+def test_workers_load_what_they_compute_with_and_no_more():
+    code = "import s4a.study.runner, s4a.study.tasks"
+    assert loaded_by(code, (*OFTEN, *SELDOM, "scipy.stats")) == list(OFTEN)
+
+
+def test_public_names_are_where_types_and_completion_say():
+    tree = ast.parse(MODULES["__init__"].read_text(encoding="utf-8"))
+    [types] = [node for node in tree.body if isinstance(node, ast.If)]
+    told = {alias.name: node.module for node in types.body for alias in node.names}
+    assert told == {name: f"s4a.{module}" for name, module in s4a.MODULE_OF.items()}
+    assert sorted(told) == s4a.__all__
+    assert set(told) < set(dir(s4a))
+    for name, module in told.items():
+        assert getattr(s4a, name) is getattr(importlib.import_module(module), name)
+
+
+def test_modules_of_rooms_need_no_import_of_their_own():
+    code = "import s4a\nassert s4a.geometry.mesh.edges([[0, 1, 2]]).shape == (3, 2)"
+    assert loaded_by(code, ["numpy", "s4a.method.fmap"]) == ["numpy"]
+
+
+def test_names_that_are_nowhere_are_attribute_errors():
+    with pytest.raises(AttributeError, match=r"module 's4a' has no attribute 'analyze'"):
+        _ = s4a.analyze
+    with pytest.raises(AttributeError, match=r"module 's4a\.method' has no attribute 'fmaps'"):
+        _ = s4a.method.fmaps
+
+
+def test_studies_have_their_accessor_with_the_first_public_name():
+    code = "import s4a\ns4a.open_study\nimport xarray\nassert xarray.DataTree().s4a.explore"
+    assert loaded_by(code, PANELS) == []
 
 
 @pytest.mark.parametrize("old, new", _moved.MOVED.items())

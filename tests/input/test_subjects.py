@@ -8,7 +8,6 @@ import pytest
 import xarray as xr
 
 from s4a import analyse, cli, insert, open_study, statistics, synthetic
-from s4a.cli import commands
 from s4a.input.annotations import read_labels, read_landmarks
 from s4a.input.subjects import read_table, with_table
 
@@ -189,8 +188,7 @@ def test_a_table_can_take_the_place_of_the_first(folder):
 
 def test_the_command_prints_tables_and_writes_files(folder, capsys, monkeypatch):
     monkeypatch.setattr(
-        commands,
-        "write_page",
+        "s4a.show.page.write_page",
         lambda tree, file, **_: file.write_text(str(tree["pca"].sizes["component"])),
     )
     command = [
