@@ -63,8 +63,12 @@ def describe_by_others(
     )
 
 
-def leave_one_out(K: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-    """Every field against the model of all others.
+def leave_one_out(K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Every field against the model of all others, as :func:`describe_by_others` has it.
+
+    The scatter of the others is that of all less a matrix of rank one, S - s / (s - 1) x x^T with x
+    the field less the mean of all, so that their components come from those of all (Golub 1973) in
+    O(s^2) for each field.
 
     Parameters
     ----------
@@ -76,16 +80,125 @@ def leave_one_out(K: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[np.ndarra
     error : float ndarray (s, s - 1)
         Vertex distance after reconstruction with 0, 1, ... s - 2 components.
     score : float ndarray (s, s - 2)
-        Scores in standard deviations of the others' model.
-    steps : list of float ndarray (c, s - 1)
-        As of :func:`describe_by_others`.
+        Scores in standard deviations of the others' model, positive, as the sign of a component is
+        nobody's choice.
     """
-    described = []
-    for i in range(len(K)):
-        others = np.delete(np.arange(len(K)), i)
-        described.append(describe_by_others(K[np.ix_(others, others)], K[i, others], K[i, i]))
-    error, score, steps = zip(*described, strict=True)
-    return np.array(error), np.array(score), list(steps)
+    s = len(K)
+    centred = center_gram(K)
+    variance, V = principal_components(centred)
+    scatter = variance * (s - 1)
+    grown = s / (s - 1)  # of a field less the mean of the others, to that less the mean of all
+    error, score = np.zeros((s, s - 1)), np.full((s, s - 2), np.nan)
+    if not len(scatter):  # equal fields
+        return error, score
+    for i in range(s):
+        left, coefficient = downdate(scatter, V[i] * np.sqrt(scatter), grown)
+        least = max(1e-12 * left[0], s * np.finfo(float).eps * scatter[0])
+        n = min((left > least).sum(), s - 2)
+        left, coefficient = left[:n], coefficient[:n]
+        explained = np.concatenate([[0], np.cumsum(coefficient**2)])
+        rest = np.sqrt(np.maximum(grown**2 * centred[i, i] - explained, 0))
+        error[i] = np.pad(rest, (0, s - 1 - len(rest)), mode="edge")
+        score[i, :n] = coefficient / np.sqrt(left / (s - 2))
+    return error, score
+
+
+def downdate(d: np.ndarray, z: np.ndarray, rho: float) -> tuple[np.ndarray, np.ndarray]:
+    """Eigenvalues of diag(d) - rho z z^T, and how long rho z is along each eigenvector.
+
+    Parameters
+    ----------
+    d : float ndarray (c,)
+        Positive, descending.
+    z : float ndarray (c,)
+    rho : float
+        Positive; no eigenvalue is under 0 but by rounding.
+
+    Returns
+    -------
+    eigenvalue : float ndarray (c,)
+        Descending.
+    along : float ndarray (c,)
+        Not negative.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.analysis.model import downdate
+    >>> eigenvalue, along = downdate(np.array([3.0, 2.0]), np.array([1.0, 0.0]), 0.5)
+    >>> eigenvalue.round(6).tolist(), along.round(6).tolist()
+    ([2.5, 2.0], [0.5, 0.0])
+    """
+    # of equal eigenvalues one eigenvector takes all of z, the others stay as they are; so do those
+    # on which z is nothing (Dongarra & Sorensen 1987)
+    least = 8 * np.finfo(float).eps * d[0]
+    group = np.cumsum(np.r_[False, d[:-1] - d[1:] > least])
+    w = np.zeros(len(d))
+    w[np.unique(group, return_index=True)[1]] = rho * np.bincount(group, z**2)
+    moves = np.sqrt(w * w.sum()) > least
+    eigenvalue, along = d.copy(), np.zeros(len(d))
+    if moves.any():
+        eigenvalue[moves], slope = secular_roots(d[moves], w[moves])
+        along[moves] = np.sqrt(rho / slope)
+    order = np.argsort(-eigenvalue, kind="stable")
+    return eigenvalue[order], along[order]
+
+
+def secular_roots(d: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The roots of f(x) = sum_j w_j / (d_j - x) - 1, and the slopes of f there.
+
+    One lies under each d_k and over the next, the last one over 0.  All are sought at once, each
+    from its nearer pole (Li 1994: f is near c + a / (d_k - x) + b / (d_k+1 - x), whose root is the
+    next x), by halves where that does not end.
+
+    Parameters
+    ----------
+    d : float ndarray (c,)
+        Different, positive, descending.
+    w : float ndarray (c,)
+        Positive.
+
+    Returns
+    -------
+    root, slope : float ndarray (c,)
+    """
+    eps = np.finfo(float).eps
+    under = np.append(d[1:], 0.0)
+    half = (d - under) / 2
+    is_high = 1 / (d - (under + half)[:, None]) @ w < 1  # the root is nearer to d_k
+    origin = np.where(is_high, d, under)
+    x = np.where(is_high, -half, half)
+    low, high = np.minimum(x, 0), np.maximum(x, 0)
+    slope = np.zeros(len(d))
+    pole = np.where(is_high, w, np.append(w[1:], 0.0))  # weight of the nearer one
+    todo = np.arange(len(d))
+    for step in range(200):
+        inverse = 1 / ((d - origin[todo, None]) - x[todo, None])  # (root, c)
+        f = inverse @ w - 1
+        far = np.abs(inverse) @ w + 1
+        inverse *= inverse
+        slope[todo] = df = inverse @ w
+        low[todo] = np.where(f < 0, x[todo], low[todo])
+        high[todo] = np.where(f < 0, high[todo], x[todo])
+        wide = high[todo] - low[todo]
+        left = (np.abs(f) > 4 * eps * far) & (wide > 2 * eps * np.abs(x[todo]) + eps**2 * d[0])
+        todo, f, df = todo[left], f[left], df[left]
+        if not len(todo):
+            return origin + x, slope
+        a, b = (end[todo] - origin[todo] - x[todo] for end in (d, under))
+        upper = is_high[todo]
+        # the nearer pole with its own weight, the other with what makes the slope right
+        near, other = np.where(upper, a, b), np.where(upper, b, a)
+        c = f - other * df - pole[todo] / near * (1 - other / near)
+        B = (a + b) * f - a * b * df
+        root = np.sqrt(np.abs(B**2 - 4 * a * b * f * c))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            move = np.where(B <= 0, (B - root) / (2 * c), 2 * a * b * f / (B + root))
+        new = x[todo] + move
+        halved = (low[todo] + high[todo]) / 2
+        inside = (new > low[todo]) & (new < high[todo]) & (step < 20)
+        x[todo] = np.where(inside, new, halved)
+    raise ArithmeticError(f"{len(todo)} of {len(d)} eigenvalues were not found")
 
 
 def specificity(
@@ -261,7 +374,7 @@ def evaluate(
     s = len(d)
     rng = np.random.default_rng(seed)
     K = gram(d - d.mean(0), area)
-    error, _, steps = leave_one_out(K)
+    error, _ = leave_one_out(K)
     distance, nearest, score = specificity(K, n_samples, rng)
     variance, _ = principal_components(center_gram(K))
     c = len(variance)
@@ -279,7 +392,7 @@ def evaluate(
         points = draw_points(area, n_points, rng)
         P = registration["position"].values[points] + d[:, points]  # (s, p, 3)
         few = score[:n_surface], nearest[:, :n_surface]
-        quality = quality.merge(_measure_surfaces(registration, d, K, P, steps, *few))
+        quality = quality.merge(_measure_surfaces(registration, d, K, P, *few))
     quality = in_unit(quality, unit_of(registration["displacement"]))
     features = _coefficients(study, d, area)
     return quality.merge(_compare_with_chance(features, c, n_permutations, rng))
@@ -290,14 +403,17 @@ def _per_component(values, c):
     return np.pad(values, (0, c), constant_values=np.nan)[:c]
 
 
-def _measure_surfaces(registration, d, K, P, steps, score, nearest):
+def _measure_surfaces(registration, d, K, P, score, nearest):
     """Generalization and specificity as mean distances of points P ``(s, p, 3)`` to surfaces."""
     X, T = as_arrays(registration)
     _, V = principal_components(center_gram(K))
     c = V.shape[1]
-    kept = np.stack(
-        [surface_error(np.delete(P, i, axis=0), steps[i], X + d[i], T) for i in range(len(d))]
-    )  # (s, s - 1)
+    kept = []  # (s, s - 1)
+    for i in range(len(d)):
+        others = np.delete(np.arange(len(d)), i)
+        *_, steps = describe_by_others(K[np.ix_(others, others)], K[i, others], K[i, i])
+        kept.append(surface_error(P[others], steps, X + d[i], T))
+    kept = np.stack(kept)
     modes = np.einsum("sc,spx->cpx", V, P - P.mean(0)) / np.sqrt(len(d) - 1)
     samples = P.mean(0) + np.cumsum(score[:, :, None, None] * modes, axis=1)  # (n_samples, c, p, 3)
     random = np.zeros(nearest.shape)  # (c, n_samples)

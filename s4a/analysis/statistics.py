@@ -415,7 +415,7 @@ def outliers(
     K = gram(d - d.mean(0), area)
     variance, _ = principal_components(center_gram(K))
     c = count_components(variance, s, n_components, most=s - 3)
-    error, score, _ = leave_one_out(K)
+    error, score = leave_one_out(K)
     error = error[:, c]
     squared = np.nansum(score[:, :c] ** 2, axis=1)
     n = s - 1

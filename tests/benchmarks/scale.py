@@ -1,13 +1,17 @@
 """How S4A starts, and how its steps grow with the number of shapes.
 
 ``scale.py start`` measures processes from their first moment on: CPU seconds, the least of five,
-and peak memory.
+and peak memory.  ``scale.py left_out 800`` computes leave-one-out of so many shapes in both ways.
 """
 
 import os
 import subprocess
 import sys
 import time
+
+import numpy as np
+
+from s4a.analysis import model
 
 STARTS = {
     "python, nothing": ["-c", ""],
@@ -44,8 +48,28 @@ def start():
         say(f"{name:28} {cpu:8.2f} {wall:8.2f} {memory:8.0f}")
 
 
-PARTS = {"start": start}
+def left_out(*sizes):
+    """Leave-one-out: the components of all shapes but one from those of all, and each anew."""
+    say(f"\n{'shapes':>8} {'CPU s':>8} {'anew':>8} {'largest difference of the errors':>36}")
+    for s in sizes or (100, 200, 400):
+        x = np.random.default_rng(0).normal(size=(s, 2000)) * np.linspace(1, 0.01, 2000)
+        K = x @ x.T
+        begin = time.process_time()
+        error, _ = model.leave_one_out(K)
+        between = time.process_time()
+        anew = []
+        for i in range(s):
+            others = np.delete(np.arange(s), i)
+            rows = K[np.ix_(others, others)], K[i, others], K[i, i]
+            anew.append(model.describe_by_others(*rows)[0])
+        spent = between - begin, time.process_time() - between
+        gap = np.abs(error - anew).max() / error.max()
+        say(f"{s:8} {spent[0]:8.2f} {spent[1]:8.2f} {gap:36.1e}")
+
+
+PARTS = {"start": start, "left_out": left_out}
 
 if __name__ == "__main__":
-    for part in sys.argv[1:] or PARTS:
-        PARTS[part]()
+    part, *words = sys.argv[1:] or [""]
+    for run in [PARTS[part]] if part else PARTS.values():
+        run(*map(int, words))

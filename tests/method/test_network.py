@@ -54,6 +54,53 @@ def test_every_shape_is_in_a_triangle_with_twice_as_many_pairs_as_shapes(n):
         assert set(np.array(both)[cycles].ravel().tolist()) == set(range(n))
 
 
+def chosen_by_definition(distance, n_pairs):
+    """The pairs one by one, as :func:`network.choose_pairs` says in words."""
+    n = len(distance)
+    inside, edges, closing = [int(np.argmin(distance.sum(1)))], [], []
+    while len(inside) < n:
+        ways = [(distance[i, j], j, i) for j in range(n) if j not in inside for i in inside]
+        least = min(ways)[0]
+        new = min(j for d, j, _ in ways if d == least)
+        parent = next(i for i in inside if distance[i, new] == least)
+        around = sorted({j for edge in edges for j in edge if parent in edge} - {parent})
+        if around:
+            closing.append({new, min(around, key=lambda j: (distance[new, j], j))})
+        edges.append({new, parent})
+        inside.append(new)
+    near = [sorted({*range(n)} - {i}, key=lambda j, i=i: (distance[i, j], j)) for i in range(n)]
+    rest = sorted(
+        itertools.combinations(range(n), 2),
+        key=lambda p: (
+            min(near[p[0]].index(p[1]), near[p[1]].index(p[0])),
+            distance[p],
+            p,
+        ),
+    )
+    wanted = [tuple(sorted(pair)) for pair in (*edges, *closing, *rest)]
+    return sorted([*dict.fromkeys(wanted)][:n_pairs])
+
+
+@pytest.mark.parametrize("kind", ["plane", "ties", "star", "no metric"])
+@pytest.mark.parametrize("seed", range(8))
+def test_pairs_are_those_of_the_definition(kind, seed):
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(2, 25))
+    x = rng.normal(size=(n, 2))
+    distance = np.linalg.norm(x[:, None] - x, axis=2)
+    if kind == "ties":
+        distance = np.round(distance)
+    elif kind == "star":
+        distance = np.linalg.norm(x, axis=1)[:, None] + np.linalg.norm(x, axis=1)
+    elif kind == "no metric":
+        distance = rng.uniform(size=(n, n))
+        distance += distance.T
+    np.fill_diagonal(distance, 0)
+    for n_pairs in {n - 1, 2 * n, 4 * n}:
+        found = network.choose_pairs(distance, n_pairs).tolist()
+        assert [tuple(pair) for pair in found] == chosen_by_definition(distance, n_pairs)
+
+
 def test_equal_shapes_can_be_paired():
     assert is_connected(network.choose_pairs(np.zeros((5, 5)), 6), 5)
 
