@@ -195,6 +195,7 @@ def write_tree(folder, names, template):
     X, T = as_arrays(synthetic.sphere(50))
     mesh = {"position": X, "corner_vertex": T}
     sizes = {"vertex": 50, "original_vertex": 50, "corner": 3, "xyz": 3, "xyz_2": 3, "mode": 2}
+    sizes |= {"edge": 144, "end": 2}
     for name in names:
         original = zeros("original", sizes, {"reason": name}, **mesh)
         store.write(original, folder / "original" / f"{name}.nc", "o")
