@@ -36,7 +36,7 @@ from s4a.method.spectral import factor
 # Of the first and of the last step.  Chosen on a pair of faces, of brains and of skulls and two
 # cortex templates, reported on others: docs/decisions.md
 STIFFNESS = (1e-4, 1e-7)
-SLIDE = (0.01, 0.1)  # little lets first steps advance, more keeps last ones from drifting
+SLIDE = 0.1  # less drifts along the surface, more holds vertices where they began
 N_STEPS = 8
 N_ROUNDS = 8
 STILL = 1e-3  # share of sqrt(area): a step ends with a round that moves less
@@ -132,7 +132,7 @@ def elastic_rounds(
     warp: Warp,
     *,
     stiffness: tuple[float, float] = STIFFNESS,
-    slide: tuple[float, float] = SLIDE,
+    slide: float = SLIDE,
     steps: slice = slice(None),
     rounds: int = N_ROUNDS,
 ) -> Warp:
@@ -147,9 +147,10 @@ def elastic_rounds(
         :attr:`s4a.method.shape.Shape.low_on_surface`.
     warp : tuple (R, t, c)
         Where to begin, with one motion for all: bending is counted from there.
-    stiffness, slide : tuple of float
-        Of the first and of the last of 8 steps, between which they change by equal factors.
-        `slide` is the weight of the distance along the surface; that across it weighs 1.
+    stiffness : tuple of float
+        Of the first and of the last of 8 steps, between which it falls by equal factors.
+    slide : float
+        Weight of the distance along the surface; that across it weighs 1.
     steps : slice
         Those that are made; all by default.
     rounds : int
@@ -168,11 +169,10 @@ def elastic_rounds(
     bending = np.zeros(E.shape[1])
     bending[: smooth.shape[1]] = target.eigenvalue[1:] ** 2
     X = move(target, warp)
-    both = (np.geomspace(*ends, N_STEPS)[steps] for ends in (stiffness, slide))
-    for weight, along in zip(*both, strict=True):
+    for weight in np.geomspace(*stiffness, N_STEPS)[steps]:
         for _ in range(rounds):
             y, m = points_ahead(source, target, X)
-            matrix, right = normal_equations(E, target.area, m, y, along)
+            matrix, right = normal_equations(E, target.area, m, y, slide)
             # start and smooth functions nearly depend on each other: a little keeps them apart
             matrix[np.diag_indices_from(matrix)] += np.tile(weight * bending, 3) + 1e-12
             w = scipy.linalg.solve(matrix, right, assume_a="pos").reshape(3, -1).T  # (q, 3)
