@@ -1,9 +1,11 @@
 """Principal modes of the displacements (6.1, Fig. 4 and 5): PCA, and new shapes from scores.
 
 There are far fewer shapes s than vertices n, so that PCA works on the Gram matrix ``(s, s)`` of the
-displacements and costs next to nothing on large meshes.
+displacements and costs next to nothing on large meshes.  It is added up over blocks of vertices, so
+that little more memory is needed than the fields and the modes have themselves.
 """
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +14,8 @@ import xarray as xr
 from s4a.geometry.mesh import vertex_normals
 from s4a.method.deform import normal_displacement, smoother
 from s4a.schema import dataset, in_unit, require, unit_of
+
+BLOCK = 2**24  # numbers of all fields in a block of vertices: 128 MiB
 
 
 class PrincipalModes(NamedTuple):
@@ -29,8 +33,15 @@ class PrincipalModes(NamedTuple):
     ratio: np.ndarray
 
 
-def gram(fields: np.ndarray, area: np.ndarray) -> np.ndarray:
+def gram(fields: np.ndarray, area: np.ndarray, mean: np.ndarray | None = None) -> np.ndarray:
     """Inner products of fields ``(s, n, d)`` under the areas scaled to sum 1, ``(s, s)``.
+
+    Parameters
+    ----------
+    fields : float ndarray (s, n, d)
+    area : float ndarray (n,)
+    mean : float ndarray (n, d), optional
+        Taken from each field.
 
     Examples
     --------
@@ -39,9 +50,28 @@ def gram(fields: np.ndarray, area: np.ndarray) -> np.ndarray:
     >>> gram(np.array([[[1.0, 0, 0], [3, 0, 0]]]), np.array([1.0, 1.0])).round(6).tolist()
     [[5.0]]
     """
-    rows = np.asarray(fields, np.float64) * np.sqrt(area / area.sum())[:, None]
-    rows = rows.reshape(len(rows), -1)  # (s, n d)
-    return rows @ rows.T
+    weight = np.sqrt(area / area.sum())[:, None]
+    K = np.zeros((len(fields), len(fields)))
+    for block in blocks(fields.shape):
+        part = fields[:, block] if mean is None else fields[:, block] - mean[block]
+        rows = (np.asarray(part, np.float64) * weight[block]).reshape(len(fields), -1)  # (s, b d)
+        K += rows @ rows.T
+    return K
+
+
+def blocks(shape: tuple[int, ...]) -> Iterator[slice]:
+    """Vertices of fields ``(s, n, d)`` in blocks of at most :data:`BLOCK` numbers.
+
+    Examples
+    --------
+    >>> from s4a.method.pca import blocks
+    >>> list(blocks((1000, 10_000, 3)))
+    [slice(0, 5592, None), slice(5592, 11184, None)]
+    """
+    s, n, d = shape
+    size = max(1, BLOCK // max(s * d, 1))
+    for begin in range(0, n, size):
+        yield slice(begin, begin + size)
 
 
 def center_gram(K: np.ndarray) -> np.ndarray:
@@ -73,13 +103,18 @@ def gram_pca(fields: np.ndarray, area: np.ndarray) -> PrincipalModes:
     Returns
     -------
     PrincipalModes
-        Their signs make the third moment of the scores positive.
+        Of the precision of the fields.  Their signs make the third moment of the scores positive.
     """
     s = len(fields)
     mean = fields.mean(axis=0)
-    variance, V = principal_components(gram(fields - mean, area))
+    variance, V = principal_components(gram(fields, area, mean))
     V = V * np.where((V**3).sum(0) < 0, -1.0, 1.0)  # (s, c)
-    deformation = np.einsum("sc,snd->cnd", V, fields - mean, optimize=True) / np.sqrt(s - 1)
+    deformation = np.empty((V.shape[1], *mean.shape), np.result_type(fields, np.float32))
+    for block in blocks(fields.shape):
+        part = fields[:, block] - mean[block]
+        modes = np.einsum("sc,snd->cnd", V, part, optimize=True)
+        modes /= np.sqrt(s - 1)
+        deformation[:, block] = modes
     ratio = variance / variance.sum()
     return PrincipalModes(mean, deformation, np.sqrt(variance), V * np.sqrt(s - 1), ratio)
 
@@ -156,7 +191,7 @@ def pca(
     d = registration["displacement"].transpose("shape", "vertex", "xyz").values
     if len(d) < 3:
         raise ValueError(f"PCA needs at least 3 shapes, found {len(d)}")
-    broken = ~np.isfinite(d).all(axis=(1, 2))
+    broken = ~np.array([np.isfinite(one).all() for one in d])
     if broken.any():
         which = ", ".join(map(str, registration["shape"].values[broken]))
         raise ValueError(f"PCA needs displacements that are finite; leave out {which}")
@@ -168,7 +203,7 @@ def pca(
         raise ValueError("PCA needs shapes that differ; all displacements are equal")
     result = dataset(
         mean_displacement=modes.mean.astype(np.float32),
-        deformation=modes.deformation.astype(np.float32),
+        deformation=modes.deformation.astype(np.float32, copy=False),
         standard_deviation=modes.standard_deviation,
         score=modes.score,
         explained_variance_ratio=modes.ratio,

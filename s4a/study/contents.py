@@ -232,12 +232,6 @@ def fit_registration(data: xr.Dataset, others: Mapping[str, xr.Dataset]) -> None
     """:func:`check_fit` of the registration of one shape."""
     mesh = others["registration"]
     check_size(data, "vertex", mesh.sizes["vertex"], "registration")
-    triangle = data["template_triangle"].values
-    if triangle.size and triangle.max() >= mesh.sizes["triangle"]:
-        raise ValueError(
-            f"template_triangle needs indices 0..{mesh.sizes['triangle'] - 1} of the template's "
-            f"triangles, found {triangle.max()}"
-        )
     template = others.get(f"coarse/{mesh.attrs['template']}")
     if "low_vertex" in data.sizes and template is not None:
         name = f"coarse/{mesh.attrs['template']}"

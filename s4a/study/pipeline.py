@@ -36,6 +36,7 @@ from s4a.study.store import (
     attributes,
     is_done,
     lock,
+    open_file,
     read,
     task_key,
     write,
@@ -416,8 +417,8 @@ def modes(run: Run, registered: Keys, doubts: Doubts, options: Options) -> str:
     with run.stage("modes"):
         mesh = read(run.folder / "registration.nc")
         template = mesh.attrs["template"]
-        files = {name: read(run.folder / f"registration/{name}.nc") for name in registered}
-        data = stack_registration(mesh, files, list(files))["registration"]
+        files = {name: open_file(run.folder / f"registration/{name}.nc") for name in registered}
+        data = stack_registration(mesh, files, list(files), lazily=True)["registration"]
         apart = [
             name
             for name in registered

@@ -13,7 +13,7 @@ import os
 import re
 import sys
 import uuid
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -188,6 +188,55 @@ class Stored(BackendArray):
         return values[key]
 
 
+class Stacked(BackendArray):
+    """Variables of equal shape, one of each shape of a study; read are those that are asked for."""
+
+    def __init__(self, variables: list[xr.Variable]):
+        self.variables = variables
+        shapes = {one.shape for one in variables}
+        if len(shapes) != 1:
+            raise ValueError(f"arrays of one shape needed, found {sorted(shapes)}")
+        self.shape = (len(variables), *shapes.pop())
+        self.dtype = np.result_type(*(one.dtype for one in variables))
+
+    def __getitem__(self, key):
+        return indexing.explicit_indexing_adapter(
+            key, self.shape, indexing.IndexingSupport.OUTER, self.part
+        )
+
+    def part(self, key: tuple) -> np.ndarray:
+        """The selection: of each axis an integer, a slice or an array of integers."""
+        first, *rest = key
+        rows = np.arange(len(self.variables))[first]
+        if np.ndim(rows) == 0:
+            return selected(self.variables[rows].values, rest)
+        found = None
+        for i, row in enumerate(rows):
+            values = selected(self.variables[row].values, rest)
+            if found is None:
+                found = np.empty((len(rows), *values.shape), self.dtype)
+            found[i] = values
+        if found is None:  # no rows
+            found = np.empty((0, *self.shape[1:]), self.dtype)
+            found = selected(found, [slice(None), *rest])
+        return found
+
+
+def selected(values: np.ndarray, key: Iterable) -> np.ndarray:
+    """The entries of an array that are selected along each of its axes by itself."""
+    axis = 0
+    for one in key:
+        values = values[(slice(None),) * axis + (one,)]
+        axis += np.ndim(one) > 0 or isinstance(one, slice)
+    return values
+
+
+def stacked(variables: list[xr.Variable]) -> Any:
+    """What a variable holds that is read from several files when it is used, and then kept."""
+    lazy: Any = indexing.LazilyIndexedArray(Stacked(variables))
+    return indexing.MemoryCachedArray(indexing.CopyOnWriteArray(lazy))
+
+
 class DamagedError(OSError):
     """A file of a study that is not, or no longer, what a run wrote."""
 
@@ -220,18 +269,24 @@ def readable(path: Path | str) -> Iterator[tuple[StudyFile, Seal | None]]:
             yield found, seal
 
 
-def open_file(path: Path | str) -> xr.Dataset:
+def open_file(path: Path | str, others: Mapping[str, int] | None = None) -> xr.Dataset:
     """The Dataset of one file; its larger variables are read when they are used.
 
     What :func:`xarray.open_dataset` gives, in a third of the time.  Only files as :func:`write`
     writes them can be read, see :mod:`s4a.study.hdf5`.
+
+    Parameters
+    ----------
+    path : path
+    others : dict of str to int, optional
+        Sizes of dims of other files, into which indices of this one point.
     """
     path = Path(path).absolute()  # what is read later does not follow the working directory
     with readable(path) as (file, seal):
         attrs = file.attributes()
         attrs.pop(SEALED, None)
         variables: dict[str, xr.Variable] = {}
-        sizes: dict[str, int] = {}
+        sizes = dict(others or {})
         for name, place in file.places.items():
             dims = file.dims(name)
             sizes |= dict(zip(dims, place.shape, strict=True))
@@ -250,9 +305,9 @@ def open_file(path: Path | str) -> xr.Dataset:
     return data
 
 
-def read(path: Path | str) -> xr.Dataset:
-    """The Dataset of one file, in memory."""
-    return open_file(path).load()
+def read(path: Path | str, others: Mapping[str, int] | None = None) -> xr.Dataset:
+    """The Dataset of :func:`open_file`, in memory."""
+    return open_file(path, others).load()
 
 
 def arrays(path: Path | str, *names: str) -> list[np.ndarray]:

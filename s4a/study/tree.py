@@ -10,7 +10,7 @@ import xarray as xr
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.schema import INPUT, in_unit, unit_of, variable
 from s4a.study.contents import check_contents, check_fit
-from s4a.study.store import DamagedError, check_is_study, damage_named, open_file, read
+from s4a.study.store import DamagedError, check_is_study, damage_named, open_file, read, stacked
 
 log = logging.getLogger(__name__)
 
@@ -40,7 +40,7 @@ def template_mesh(original: xr.Dataset, name: str) -> xr.Dataset:
 
 
 def stack_registration(
-    template: xr.Dataset, files: dict[str, xr.Dataset], names: list[str]
+    template: xr.Dataset, files: dict[str, xr.Dataset], names: list[str], *, lazily: bool = False
 ) -> dict[str, xr.Dataset]:
     """``/registration``, rectangular, and below it the way back of each shape.
 
@@ -54,6 +54,9 @@ def stack_registration(
         Registrations, see :func:`s4a.method.register.registration`.
     names : list of str
         The shapes in order.
+    lazily : bool
+        Whether a variable is read from its files when it is used, only those of the shapes that are
+        asked for, or is in memory now.
     """
     shapes = [files[name] for name in names]
     mesh = template[[v for v in ("position", "corner_vertex", "vertex_area") if v in template]]
@@ -62,7 +65,12 @@ def stack_registration(
     data = mesh.assign_attrs(attrs)
     for name in STACKED:
         if all(name in shape for shape in shapes):
-            data[name] = variable(name, np.stack([shape[name].values for shape in shapes]))
+            each = [shape[name].variable for shape in shapes]
+            if lazily:
+                like = variable(name, np.broadcast_to(0, (len(each), *each[0].shape)))
+                data[name] = xr.Variable(like.dims, stacked(each), like.attrs)
+            else:
+                data[name] = variable(name, np.stack([one.values for one in each]))
     data["method"] = variable("method", [shape.attrs.get("method", "") for shape in shapes])
     data["badness"] = variable("badness", [shape.attrs.get("score", np.nan) for shape in shapes])
     units = {unit_of(shape["displacement"]) for shape in shapes}
@@ -93,7 +101,7 @@ class Reader:
         self.damaged: set[str] = set()
 
     def read(
-        self, names: Iterable[str], open_with: Callable[[Path], xr.Dataset] = open_file
+        self, names: Iterable[str], open_with: Callable[..., xr.Dataset] = open_file
     ) -> dict[str, xr.Dataset]:
         """The files of these names that are there and made from files read before.
 
@@ -124,10 +132,13 @@ class Reader:
         """The file of that name, as ``coarse/brain_01``."""
         return self.folder / f"{name}.nc"
 
-    def open(self, name: str, open_with: Callable[[Path], xr.Dataset]) -> tuple[xr.Dataset, str]:
+    def open(self, name: str, open_with: Callable[..., xr.Dataset]) -> tuple[xr.Dataset, str]:
         """A file, whose contents are checked, and why it has no place in the study if so."""
         path = self.path(name)
-        data = open_with(path)
+        others = {}  # the way back points into the triangles of the template
+        if name.startswith("registration/") and "registration" in self.files:
+            others["triangle"] = self.files["registration"].sizes["triangle"]
+        data = open_with(path, others)
         with damage_named(path):
             check_contents(name, data)
         fault = self.fault(data)
@@ -150,9 +161,10 @@ class Reader:
 def open_study(folder: Path | str) -> xr.DataTree:
     """Open a study folder, finished or not.
 
-    Per-shape nodes are read when they are used; the stages that are there are in the tree, those
+    Variables are read when they are used, of ``/registration`` those of the shapes that are asked
+    for; no file is held open.  The stages that are there are in the tree, those
     that are not yet computed are absent, as are files that were made from others than those now in
-    the folder (that is said in a warning of the log).  ``/registration`` is put together in memory.
+    the folder (that is said in a warning of the log).
 
     Every file is checked: its bytes by their checksums, see :mod:`s4a.study.seal`, its variables by
     what a file of its name holds, see :mod:`s4a.study.contents`.  Nothing leads out of the folder:
@@ -200,10 +212,10 @@ def open_study(folder: Path | str) -> xr.DataTree:
         apart = apart_of(template["registration"])
         nodes |= reader.read(f"latent/{name}" for name in apart)
         names = sorted([*nodes["latent"]["shape"].values.tolist(), *apart])
-        files = reader.read((f"registration/{name}" for name in names), read)
+        files = reader.read(f"registration/{name}" for name in names)
         files = {path.removeprefix("registration/"): data for path, data in files.items()}
         if files:
-            nodes |= stack_registration(template["registration"], files, list(files))
+            nodes |= stack_registration(template["registration"], files, list(files), lazily=True)
     nodes |= reader.read(["pca", "subjects", "report"])
     if "report" in nodes:
         nodes = as_reported(nodes)

@@ -164,3 +164,18 @@ def test_identical_shapes_are_refused_with_the_reason(planted, shift):
 def test_a_registration_without_displacement_is_refused_by_name(planted):
     with pytest.raises(ValueError, match="lacks displacement"):
         pca.pca(planted[0].drop_vars("displacement"), planted[1])
+
+
+def test_modes_by_blocks_of_vertices_are_those_of_the_whole(planted, monkeypatch):
+    registration, area, *_ = planted
+    d = registration["displacement"].values
+    whole, K = pca.gram_pca(d, area), pca.gram(d, area)
+    monkeypatch.setattr(pca, "BLOCK", 10 * 3 * 37)  # 800 vertices are 21 blocks and a part of one
+    assert len(list(pca.blocks(d.shape))) == 22
+    found = pca.gram_pca(d, area)
+    assert pca.gram(d, area) == pytest.approx(K, rel=1e-12)
+    for name in ("mean", "deformation", "standard_deviation", "score", "ratio"):
+        there = getattr(whole, name)[:3] if name == "deformation" else getattr(whole, name)
+        here = getattr(found, name)[:3] if name == "deformation" else getattr(found, name)
+        assert here.dtype == there.dtype
+        assert here[..., :3] == pytest.approx(there[..., :3], rel=1e-5, abs=1e-5)

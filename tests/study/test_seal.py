@@ -448,7 +448,8 @@ def test_a_file_that_does_not_hold_what_it_should_is_named_with_what(
     key, made_from = data.attrs.pop("task_key"), data.attrs.pop("made_from").split()
     store.write(change(data), path, key, made_from)
     for command in ("view", "statistics"):  # they need not read all
-        code = cli.main([command, str(folder), "--out", str(folder / "out")])
+        out = folder / f"{command}.out"
+        code = cli.main([command, str(folder), "--out", str(out)])
         said = capsys.readouterr().err
         assert code in (0, 2)
         assert (".nc cannot be read" in said) == (code == 2)

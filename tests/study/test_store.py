@@ -1,5 +1,6 @@
 """A study on disk: keys, whole files, one run at a time, and what is read is what was written."""
 
+import os
 import shutil
 import subprocess
 import sys
@@ -285,6 +286,52 @@ def test_parts_of_a_stored_variable_are_parts_of_the_whole(tmp_path):
     assert (position[::-2].values == whole[::-2]).all()
     assert (position[[5, 3], 1].values == whole[[5, 3], 1]).all()
     assert (position.values == whole).all()
+
+
+def test_a_registration_is_read_when_it_is_used_and_only_of_the_shapes_asked_for(
+    study_folder, study, monkeypatch
+):
+    read, part = [], store.Stored.part
+    monkeypatch.setattr(
+        store.Stored,
+        "part",
+        lambda self, key: read.append((self.path.stem, self.name)) or part(self, key),
+    )
+    n_open = len(os.listdir("/proc/self/fd")) if sys.platform == "linux" else 0
+    registration = open_study(study_folder)["registration"].to_dataset()
+    names = registration["shape"].values.tolist()
+    assert not [name for name in read if name[0] in names]
+    assert n_open == (len(os.listdir("/proc/self/fd")) if sys.platform == "linux" else 0)
+    one = registration["displacement"].sel(shape=names[2])
+    read.clear()
+    whole = study["registration"].to_dataset()
+    assert one.identical(whole["displacement"].sel(shape=names[2]))
+    assert read == [(names[2], "displacement")]
+    assert registration.identical(whole)
+    read.clear()
+    assert registration.identical(whole)  # and is then kept
+    assert read == []
+
+
+def test_parts_of_a_registration_are_parts_of_the_whole(study_folder, study):
+    whole = study["registration"]["displacement"]
+    for part in (
+        {"shape": 1},
+        {"shape": -1, "vertex": 5},
+        {"shape": [2, 0], "xyz": [1, 1]},
+        {"shape": slice(None, None, -2), "vertex": slice(3, 40, 7)},
+        {"shape": [], "vertex": [4, 2]},
+        {"shape": 3, "vertex": [4, 2], "xyz": 0},
+        {"vertex": [9, 3], "xyz": 2},
+        {"shape": xr.DataArray([1, 2], dims="at"), "vertex": xr.DataArray([5, 6], dims="at")},
+    ):
+        lazy = open_study(study_folder)["registration"]["displacement"]
+        assert lazy.isel(part).identical(whole.isel(part)), part
+    lazy = open_study(study_folder)["registration"]["displacement"]
+    lazy[1, :10] = 7.0  # in memory, and nowhere else
+    assert (lazy[1, :10] == 7).all()
+    assert lazy[0].identical(whole[0])
+    assert open_study(study_folder)["registration"]["displacement"].identical(whole)
 
 
 def test_a_file_written_anew_after_it_was_opened_is_refused(tmp_path):
