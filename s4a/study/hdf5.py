@@ -15,6 +15,8 @@ import h5py
 import numpy as np
 from h5py import h5a, h5d, h5l, h5o, h5r, h5t, h5z
 
+# how numbers may be packed: by zlib, or shuffled before it
+PACKINGS = {(h5z.FILTER_DEFLATE,), (h5z.FILTER_SHUFFLE, h5z.FILTER_DEFLATE)}
 LARGEST_TEXT = 2**31  # bytes of memory that the texts of a variable or an attribute may need
 # attributes with which HDF5 and netCDF keep account of dimensions
 DIMS, SCALE = "DIMENSION_LIST", "CLASS"
@@ -174,9 +176,13 @@ def packed_place_of(name: str, stored: h5d.DatasetID, size: int) -> Place:
     """
     plan, shape, dtype = stored.get_create_plist(), stored.shape, stored.dtype
     filters = tuple(plan.get_filter(i)[0] for i in range(plan.get_nfilters()))
-    known = {(h5z.FILTER_DEFLATE,), (h5z.FILTER_SHUFFLE, h5z.FILTER_DEFLATE)}
     whole = plan.get_layout() == h5d.CHUNKED and plan.get_chunk() == shape
-    if dtype.kind not in "iuf" or not whole or filters not in known or stored.get_num_chunks() != 1:
+    if (
+        dtype.kind not in "iuf"
+        or not whole
+        or filters not in PACKINGS
+        or stored.get_num_chunks() != 1
+    ):
         raise OSError(f"{name} is packed in another way than variables of a study are")
     chunk = stored.get_chunk_info(0)
     begin, end = chunk.byte_offset, chunk.byte_offset + chunk.size

@@ -5,12 +5,13 @@ Behind its HDF5, which ends where it says and is read by any program, a file has
     s4a seal, CRC-32 of bytes from, to:
     "" 0 6021205 5d41402a
     "position" 9522 2409522 0b7c1f3e
+    {"variables": {"position": {"dims": ["vertex", "xyz"], ...}}, "attrs": {"unit": "mm", ...}}
     00000101 8c2f90aa s4a seal
 
 The line without a name is for all bytes that no other line names: what HDF5 says of the variables,
 attributes and small variables.  They are checked when the file is opened, before HDF5 sees them; a
-larger variable is checked whenever it is read.  The last line has the length of those before it,
-and their own checksum.
+larger variable is checked whenever it is read.  The line in braces is the header, see
+:mod:`s4a.study.header`.  The last line has the length of those before it, and their own checksum.
 """
 
 import json
@@ -26,6 +27,7 @@ import h5py
 import numpy as np
 
 from s4a.study.hdf5 import Place, StudyFile
+from s4a.study.header import header_of
 
 HEAD = b"\ns4a seal, CRC-32 of bytes from, to:\n"
 FOOT = b"s4a seal\n"
@@ -45,10 +47,14 @@ class Part(NamedTuple):
 
 
 class Seal(NamedTuple):
-    """The seal of a file: of its larger variables by name, and of all other bytes."""
+    """The seal of a file: of its larger variables by name, and of all other bytes; its header.
+
+    The header is empty where the file was written before there were any.
+    """
 
     rest: Part
     parts: dict[str, Part]
+    header: str = ""
 
 
 def open_regular(path: Path | str) -> BufferedReader:
@@ -80,7 +86,8 @@ def is_larger(place: Place) -> bool:
 def add_seal(whole: BufferedIOBase) -> None:
     """Write the seal behind an HDF5 file in a buffer."""
     with h5py.File(whole, "r") as file:
-        places = StudyFile(file, whole).places
+        found = StudyFile(file, whole)
+        places, header = found.places, header_of(found)
     ends = {name: (place.begin, place.end) for name, place in places.items() if is_larger(place)}
     parts = {name: Part(own[0], own[1], checksum(whole, [own])) for name, own in ends.items()}
     end = whole.seek(0, os.SEEK_END)
@@ -89,7 +96,7 @@ def add_seal(whole: BufferedIOBase) -> None:
         f"{json.dumps(name)} {begin} {end} {found:08x}\n"
         for name, (begin, end, found) in {"": rest, **parts}.items()
     ]
-    text = HEAD + "".join(lines).encode()
+    text = HEAD + "".join([*lines, header, "\n"]).encode()
     whole.seek(0, os.SEEK_END)
     whole.write(text + f"{len(text):08d} {zlib.crc32(text):08x} ".encode() + FOOT)
 
@@ -130,14 +137,17 @@ def read_seal(file: BufferedIOBase) -> Seal | None:
     text = file.read(int(length))
     if begin < 0 or f"{zlib.crc32(text):08x}" != expected.decode() or not text.startswith(HEAD):
         raise OSError("its seal is damaged")
-    parts = {}
+    parts, header = {}, ""
     for line in text.removeprefix(HEAD).decode().splitlines():
+        if line.startswith("{"):
+            header = line
+            continue
         name, *ends, found = line.rsplit(" ", 3)
         parts[json.loads(name)] = Part(int(ends[0]), int(ends[1]), int(found, 16))
     rest = parts.pop("")
     if rest.end != begin or any(not 0 <= a <= b <= begin for a, b, _ in parts.values()):
         raise OSError("its seal is of another file")
-    return Seal(rest, parts)
+    return Seal(rest, parts, header)
 
 
 def check_rest(file: BufferedIOBase, seal: Seal) -> None:

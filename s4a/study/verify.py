@@ -1,12 +1,16 @@
 """What holds of a study (4): each of its files read whole, and whether all belong together."""
 
 from collections.abc import Iterator
+from io import BufferedReader
 from pathlib import Path
 
+import h5py
 import xarray as xr
 
 from s4a.schema import dataset
 from s4a.study.contents import REQUIRED, kind_of
+from s4a.study.hdf5 import StudyFile
+from s4a.study.header import header_of
 from s4a.study.seal import open_regular, read_seal
 from s4a.study.store import STAGES, check_is_study, damage_named, open_file
 from s4a.study.tree import Reader, apart_of
@@ -115,12 +119,21 @@ def look(reader: Reader, name: str) -> tuple[str, str]:
         for variable in data.variables.values():  # as it is read, it is checked
             variable.to_numpy()
         with damage_named(path), open_regular(path) as raw:
-            sealed = read_seal(raw) is not None
+            seal = read_seal(raw)
+            if seal and seal.header:
+                check_header(raw, seal.header)
     except OSError as error:
         return "damaged", str(error.__cause__ or error)
     if fault:
         return "stale", fault
-    return ("whole", "") if sealed else ("unsealed", "")
+    return ("whole", "") if seal else ("unsealed", "")
+
+
+def check_header(raw: BufferedReader, header: str) -> None:
+    """OSError where a header says something else than HDF5, which other programs ask."""
+    with h5py.File(raw) as file:
+        if header_of(StudyFile(file, raw)) != header:
+            raise OSError("its header is not that of its HDF5")
 
 
 def needed_files(report: xr.Dataset, registration: xr.Dataset | None) -> list[str]:

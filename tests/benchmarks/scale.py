@@ -1,17 +1,27 @@
 """How S4A starts, and how its steps grow with the number of shapes.
 
 ``scale.py start`` measures processes from their first moment on: CPU seconds, the least of five,
-and peak memory.  ``scale.py left_out 800`` computes leave-one-out of so many shapes in both ways.
+and peak memory.  ``scale.py left_out 800`` computes leave-one-out of so many shapes in both ways,
+``scale.py open 1000`` opens a study of so many small shapes.
 """
 
 import os
+import resource
+import shutil
 import subprocess
 import sys
+import tempfile
 import time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
 
 import numpy as np
 
+import s4a
+from s4a import synthetic
 from s4a.analysis import model
+from s4a.study import store
 
 STARTS = {
     "python, nothing": ["-c", ""],
@@ -67,7 +77,48 @@ def left_out(*sizes):
         say(f"{s:8} {spent[0]:8.2f} {spent[1]:8.2f} {gap:36.1e}")
 
 
-PARTS = {"start": start, "left_out": left_out}
+def study_of(n, folder):
+    """The study of four small brains as one of n: their files under other names."""
+    s4a.analyse(synthetic.brains(4, 1000), store=folder, n_jobs=1, n_coarse=300, k=20, n_pairs=6)
+    own = [path.stem for path in sorted((folder / "original").glob("*.nc"))]
+    names = [*own, *(f"copy_{i:04d}" for i in range(4, n))]
+    for i, name in enumerate(names[4:]):
+        for stage in ("original", "coarse", "registration"):
+            shutil.copy(folder / stage / f"{own[i % 4]}.nc", folder / stage / f"{name}.nc")
+    for of_all in ("latent", "report"):
+        data = store.read(folder / f"{of_all}.nc")
+        key, made_from = data.attrs["task_key"], data.attrs["made_from"].split()
+        data = data.isel(shape=np.arange(n) % 4).assign_coords(shape=names)
+        store.write(data, folder / f"{of_all}.nc", key, made_from)
+    return names
+
+
+def opened(folder):
+    """CPU seconds of opening a study, of reading one shape, MiB of both, and files left open."""
+    resource.setrlimit(resource.RLIMIT_NOFILE, (256, 256))
+    open_study = s4a.open_study
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    begin = time.process_time()
+    study = open_study(folder)
+    between = time.process_time()
+    study["registration"]["displacement"][-1].load()
+    spent = between - begin, time.process_time() - between
+    n_open = len(os.listdir("/proc/self/fd")) if sys.platform == "linux" else -1
+    return *spent, (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024, n_open
+
+
+def opening(*sizes):
+    """How long a study of so many small shapes takes to open, with at most 256 open files."""
+    say(f"\n{'shapes':>8} {'open s':>8} {'one s':>8} {'MiB':>8} {'files open':>11}")
+    for n in sizes or (50, 200):
+        with tempfile.TemporaryDirectory() as folder:
+            study_of(n, Path(folder) / "study")
+            with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+                found = pool.submit(opened, Path(folder) / "study").result()
+        say("{:8} {:8.2f} {:8.3f} {:8.0f} {:11}".format(n, *found))
+
+
+PARTS = {"start": start, "left_out": left_out, "open": opening}
 
 if __name__ == "__main__":
     part, *words = sys.argv[1:] or [""]

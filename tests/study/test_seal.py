@@ -1,5 +1,6 @@
 """A damaged byte is seen; a study of a stranger leads nowhere; each file holds what it should."""
 
+import json
 import os
 import random
 import shutil
@@ -12,7 +13,7 @@ import xarray as xr
 from small import OPTIONS
 
 from s4a import analyse, cli, open_study, synthetic, verify
-from s4a.study import store
+from s4a.study import seal, store
 from s4a.study.runner import read_costs
 
 SECRET = b"the diary of somebody else " * 40
@@ -456,6 +457,80 @@ def test_a_file_that_does_not_hold_what_it_should_is_named_with_what(
     with pytest.raises(OSError, match=message):
         open_study(folder).load()
     assert "damaged" in verify(folder)["state"].values
+
+
+# ---- headers
+
+
+def with_header(path, change):
+    """Seal a file anew with another header, as somebody could who knows how."""
+    data = path.read_bytes()
+    begin = data.index(seal.HEAD)
+    lines = data[begin:].removeprefix(seal.HEAD).decode().splitlines()[:-1]
+    *parts, header = lines
+    text = seal.HEAD + "".join(f"{line}\n" for line in [*parts, *change(header)]).encode()
+    foot = f"{len(text):08d} {zlib.crc32(text):08x} ".encode() + seal.FOOT
+    path.write_bytes(data[:begin] + text + foot)
+
+
+def put(value, *keys):
+    """A change of one entry of a header."""
+
+    def change(header):
+        said = json.loads(header)
+        place = said["variables"]
+        for key in keys[:-1]:
+            place = place[key]
+        place[keys[-1]] = value
+        return [json.dumps(said)]
+
+    return change
+
+
+def test_a_file_sealed_before_there_were_headers_is_read_the_same(file):
+    whole = store.read(file)
+    with_header(file, lambda header: [])
+    assert store.is_done(file, "key")
+    xr.testing.assert_identical(store.read(file), whole)
+
+
+LIES = {
+    "beyond the file": put([0, 10**12, [500, 3], "<f8", []], "position", "place"),
+    "before the file": put([-8, 11992, [500, 3], "<f8", []], "position", "place"),
+    "more values than bytes": put([0, 8, [10**9, 3], "<f8", []], "position", "place"),
+    "unpacks to too much": put([0, 8, [10**9, 3], "<f8", [1]], "position", "place"),
+    "objects": put([0, 12000, [500, 3], "|O8", []], "position", "place"),
+    "a dim too few": put(["vertex"], "position", "dims"),
+    "sizes that differ": put(["vertex", "corner"], "corner_vertex", "dims"),
+    "cut off": lambda header: [header[:-9]],
+}
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_a_header_that_cannot_be_is_refused(file, lie):
+    with_header(file, LIES[lie])
+    with pytest.raises(OSError, match=r"a\.nc cannot be read"):
+        store.read(file)
+
+
+def test_a_header_that_names_more_text_than_there_can_be_is_refused(tmp_path):
+    file = tmp_path / "subjects.nc"
+    store.write(xr.Dataset(coords={"shape": ["a", "b"]}), file, "key")
+    texts = ["x" * 10**6, *[""] * 10**4]
+    place = [0, 0, [len(texts)], "text", []]
+    with_header(
+        file, lambda header: put(texts, "shape", "texts")(put(place, "shape", "place")(header)[0])
+    )
+    with pytest.raises(OSError, match="shape has more text than its file"):
+        store.read(file)
+
+
+def test_verify_sees_a_header_that_says_something_else_than_hdf5(folder):
+    with_header(folder / "coarse/brain_01.nc", put("m", "position", "attrs", "units"))
+    assert open_study(folder)["coarse/brain_01"]["position"].attrs["units"] == "m"
+    row = verify(folder).sel(file="coarse/brain_01.nc")
+    assert row["state"].item() == "damaged"
+    assert "its header is not that of its HDF5" in row["fault"].item()
 
 
 # ---- verify
