@@ -6,11 +6,15 @@ seconds.  With ``--write`` they go into ``docs/differences.csv``, and from there
 ``docs/differences.md``, which ``differences.py --write`` makes anew without running anything.
 ``--only`` runs the rows of these names, or that have one of the words in their name, ``--missing``
 those without a result.  Faces and bodies are those of the shared data beside the checkout, or in a
-folder that ``--data`` names, a folder of PLY files for each set.
+folder that ``--data`` names, a folder of PLY files for each set.  Each is remeshed once: what comes
+of it is kept in ``CACHE``, by content, parameters and version.
 """
 
 import argparse
 import contextlib
+import hashlib
+import importlib.metadata
+import os
 import subprocess
 import sys
 import tempfile
@@ -35,6 +39,7 @@ from s4a.schema import dataset
 from s4a.study.options import DEFAULTS, PAPER
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
+CACHE = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "s4a-benchmarks"
 N_COARSE = 2000
 N_VERTICES = 10_000  # of a shape that is remeshed
 CARRIED = 300  # vertices of the template that are carried over as landmarks
@@ -188,12 +193,28 @@ def unpacked(name, numbers, given=None):
         return {files[i].stem: as_arrays(s4a.read_shape(files[i])) for i in numbers}
 
 
-def remeshed(X, T, n_vertices):
+def remeshed(X, T, n_vertices, subdivisions=2, iterations=10):
     """About so many vertices on the same surface, which tell nothing of the mesh's own.
 
     Isotropic remeshing keeps many vertices, and of registered shapes the same ones; of a mesh
     that is subdivided first hardly any.
     """
+    version = importlib.metadata.version("pymeshlab")
+    key = hashlib.sha256(X.tobytes() + T.tobytes())
+    key.update(repr((X.dtype, T.dtype, n_vertices, subdivisions, iterations, version)).encode())
+    file = CACHE / f"{key.hexdigest()}.npz"
+    if not file.is_file():
+        V, F = isotropic(X, T, n_vertices, subdivisions, iterations)
+        CACHE.mkdir(parents=True, exist_ok=True)
+        part = file.with_suffix(f".{os.getpid()}.npz")
+        np.savez(part, V=V, F=F)
+        part.replace(file)
+    with np.load(file) as kept:
+        return s4a.clean(as_dataset(kept["V"], kept["F"]))
+
+
+def isotropic(X, T, n_vertices, subdivisions, iterations):
+    """Points and triangles of PyMeshLab's isotropic remeshing of a subdivided mesh."""
     import pymeshlab
 
     length = np.sqrt(2 / np.sqrt(3) * vertex_areas(X, T).sum() / n_vertices)
@@ -201,14 +222,13 @@ def remeshed(X, T, n_vertices):
         meshes = pymeshlab.MeshSet(verbose=False)
         meshes.add_mesh(pymeshlab.Mesh(X, T))
         meshes.meshing_surface_subdivision_midpoint(
-            iterations=2, threshold=pymeshlab.PureValue(0.0)
+            iterations=subdivisions, threshold=pymeshlab.PureValue(0.0)
         )
         meshes.meshing_isotropic_explicit_remeshing(
-            targetlen=pymeshlab.PureValue(length), iterations=10
+            targetlen=pymeshlab.PureValue(length), iterations=iterations
         )
         found = meshes.current_mesh()
-        V, F = found.vertex_matrix(), found.face_matrix().astype(np.int64)
-    return s4a.clean(as_dataset(V, F))
+        return found.vertex_matrix(), found.face_matrix().astype(np.int64)
 
 
 def registered(name, numbers, given=None):
