@@ -36,7 +36,8 @@ from s4a.method.spectral import factor
 # Of the first and of the last step.  Chosen on a pair of faces, of brains and of skulls and two
 # cortex templates, reported on others: docs/decisions.md
 STIFFNESS = (1e-4, 1e-7)
-SLIDE = 0.1  # less drifts along the surface, more holds vertices where they began
+# of the first two steps, that starts meet, and of the others, that they do not drift from there
+SLIDE = (0.01, 0.1)
 N_STEPS = 8
 N_ROUNDS = 8
 STILL = 1e-3  # share of sqrt(area): a step ends with a round that moves less
@@ -132,7 +133,7 @@ def elastic_rounds(
     warp: Warp,
     *,
     stiffness: tuple[float, float] = STIFFNESS,
-    slide: float = SLIDE,
+    slide: tuple[float, float] = SLIDE,
     steps: slice = slice(None),
     rounds: int = N_ROUNDS,
 ) -> Warp:
@@ -149,8 +150,9 @@ def elastic_rounds(
         Where to begin, with one motion for all: bending is counted from there.
     stiffness : tuple of float
         Of the first and of the last of 8 steps, between which it falls by equal factors.
-    slide : float
-        Weight of the distance along the surface; that across it weighs 1.
+    slide : tuple of float
+        Weight of the distance along the surface in the first two steps, and in the others; that
+        across it weighs 1.
     steps : slice
         Those that are made; all by default.
     rounds : int
@@ -169,10 +171,11 @@ def elastic_rounds(
     bending = np.zeros(E.shape[1])
     bending[: smooth.shape[1]] = target.eigenvalue[1:] ** 2
     X = move(target, warp)
-    for weight in np.geomspace(*stiffness, N_STEPS)[steps]:
+    along = np.repeat(slide, (2, N_STEPS - 2))
+    for weight, free in zip(np.geomspace(*stiffness, N_STEPS)[steps], along[steps], strict=True):
         for _ in range(rounds):
             y, m = points_ahead(source, target, X)
-            matrix, right = normal_equations(E, target.area, m, y, slide)
+            matrix, right = normal_equations(E, target.area, m, y, free)
             # start and smooth functions nearly depend on each other: a little keeps them apart
             matrix[np.diag_indices_from(matrix)] += np.tile(weight * bending, 3) + 1e-12
             w = scipy.linalg.solve(matrix, right, assume_a="pos").reshape(3, -1).T  # (q, 3)

@@ -1,10 +1,9 @@
 """How far registered surfaces move when what should not matter changes.
 
 ``stability.py [FOLDER]``: a collection of meshes, by default the ten heads of the shared data, is
-analysed with its first shape as the template; then without its last one, with another seed, with
-one shape inserted into the study of the others, and with joint rounds in the place of elastic ones
-both ways.  Of every shape the mean and the largest distance between its registered surfaces before
-and after, and of the shape that was inserted that to the one computed with all.
+analysed with its first shape as the template; then without its last one, which is inserted into
+that study, and with another seed.  Of every shape the mean and the largest distance between its
+registered surfaces before and after.
 """
 
 import argparse
@@ -64,8 +63,8 @@ def report(meshes, refine, folder):
     usual = surfaces(s4a.analyse(meshes, **options))
     with s4a.analyse(fewer, store=folder, **options) as study:
         ends = {f"without {names[-1]}": surfaces(study)}
-    with s4a.insert(folder, {names[-1]: meshes[names[-1]]}, n_jobs=2) as study:
-        ends[f"{names[-1]} inserted"] = surfaces(study)
+        new = s4a.insert(study, {names[-1]: meshes[names[-1]]}, n_jobs=2)
+        ends[f"{names[-1]} inserted"] = surfaces(new)
     ends["seed 1"] = surfaces(s4a.analyse(meshes, **options, seed=1))
     sys.stdout.write(f"| refine={refine!r}, % of sqrt(area): mean, largest | ")
     sys.stdout.write(f"{' | '.join(ends)} |\n{'|---' * (len(ends) + 1)}|\n")
