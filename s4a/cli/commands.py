@@ -5,6 +5,7 @@ Every command imports what it needs, so that none waits for what the others need
 """
 
 import contextlib
+import logging
 import re
 import shlex
 import sys
@@ -47,7 +48,7 @@ def run(args: Namespace) -> int:
 
     begin = time.perf_counter()
     full = within(args.out, "report.txt")
-    with cluster(args.cluster):
+    with cluster(args.cluster), lines_or_bars():
         study = analyse(args.paths, store=args.out, **options_of(args))
     again = shlex.join(["s4a", *(word for word in args.words if word != "--keep-doubtful")])
     report = study["report"].to_dataset()
@@ -63,6 +64,19 @@ def options_of(args: Namespace) -> dict:
     from s4a.study.options import Options
 
     return {name: getattr(args, name) for name in [*(f.name for f in fields(Options)), "n_jobs"]}
+
+
+@contextlib.contextmanager
+def lines_or_bars() -> Iterator[None]:
+    """A line of the log for each stage meanwhile, in place of bars, where there is no terminal."""
+    log = logging.getLogger("s4a.study.runner")
+    before = log.level
+    if not sys.stderr.isatty():
+        log.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        log.setLevel(before)
 
 
 @contextlib.contextmanager
@@ -142,6 +156,15 @@ def verify(args: Namespace) -> int:
     found = verify(args.study)
     write(tables.verify_lines(found))
     return 1 if tables.count_faults(found) else 0
+
+
+def status(args: Namespace) -> int:
+    """How far a run is, or was when it was stopped."""
+    from s4a.cli import tables
+    from s4a.study.progress import status
+
+    write(tables.status_lines(status(args.study), time.time()))
+    return 0
 
 
 def view(args: Namespace) -> int:

@@ -165,6 +165,10 @@ def _verify(add):
     add("study", metavar="STUDY")
 
 
+def _status(add):
+    add("study", metavar="STUDY")
+
+
 def _view(add):
     from s4a.show.draw import VIEWS
 
@@ -251,6 +255,7 @@ FLAGS = {
     commands.check: _check,
     commands.run: _run,
     commands.verify: _verify,
+    commands.status: _status,
     commands.demo: _demo,
     commands.view: _view,
     commands.statistics: _statistics,

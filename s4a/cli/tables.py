@@ -5,6 +5,7 @@ Every function gives a text, or the cells of a row; nothing is printed or writte
 
 import shlex
 import textwrap
+import time
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -14,6 +15,7 @@ from s4a.analysis.inputs import registration_of
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.input.decisions import Decision, decisions, listed, notices, shortened
 from s4a.method.pca import mahalanobis
+from s4a.study.progress import STAGES, Status
 
 COUNTS = {
     "file_vertices": "vertices",
@@ -160,6 +162,38 @@ def verify_lines(found: xr.Dataset) -> str:
     return "\n".join(
         [line, *(f"  {file}, {state}: {fault}" for file, state, fault in rows if fault)]
     )
+
+
+def status_lines(status: Status, now: float) -> str:
+    """How far a run is, at a time in seconds since 1970: a line for each stage."""
+    since, told = (time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(t)) for t in status[3:5])
+    heads = {
+        "running": f"running since {since}: process {status.owner} and {status.processes - 1} "
+        f"below it, {status.memory:.0f} MiB now",
+        "finished": f"finished at {told}",
+        "stopped": f"stopped, it last told at {told}; the same command goes on where it stopped",
+        "elsewhere": f"on {status.host}, of which this machine knows no more than the study says: "
+        f"it last told at {told}",
+    }
+    rows = []
+    for name in dict.fromkeys([*STAGES, *status.stages]):
+        if name not in status.stages:
+            if status.state != "finished":
+                rows.append([name, *["-"] * 5])
+            continue
+        stage = status.stages[name]
+        goes_on = status.state in ("running", "elsewhere") and not stage.ended
+        seconds = stage.seconds + (now - stage.begun if goes_on else 0)
+        remaining = stage.remaining(now) if goes_on else np.nan
+        cells = [f"{seconds:.0f}", f"{stage.memory:.0f}" if stage.ended else "-"]
+        left = "-" if np.isnan(remaining) else f"about {remaining:.0f}"
+        rows.append([name, str(stage.done), str(stage.all), *cells, left])
+    lines = [heads[status.state], table(rows, ["stage", "done", "of", "s", "peak MiB", "s left"])]
+    shown = list(status.failures.items())[:LEAST]
+    lines += [f"left out: {name}: {without_middle(why, SCREEN)}" for name, why in shown]
+    if len(status.failures) > LEAST:
+        lines.append(f"and {len(status.failures) - LEAST} more")
+    return "\n".join(lines)
 
 
 def doubts(report: xr.Dataset) -> list[str]:

@@ -203,7 +203,7 @@ def analyse(
             write(of_contents(subjects, sources), run.folder / "subjects.nc")
         else:
             remarks += kept_table(run.folder / "subjects.nc", sources)
-        with run.unforeseen_told():
+        with run.notes.whole(), run.unforeseen_told():
             run_steps(run, sources, settings, remarks)
     return open_study(store)
 

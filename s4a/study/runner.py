@@ -21,6 +21,7 @@ from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
 from s4a.study.processes import died, interruption_kept, workers
+from s4a.study.progress import Notes, write_at_once
 from s4a.study.seal import open_regular
 from s4a.study.store import LOGS, Claim, is_done, open_without_following, task_key, write
 
@@ -114,6 +115,7 @@ class Run:
         self.folder, self.n_jobs, self.claim = claim.folder, n_jobs, claim
         self.failures, self.unforeseen = {}, []
         self.costs = read_costs(self.costs_file)
+        self.notes = Notes(self.folder, claim.owner)
         self.doing = "begin"
         self.interrupted = threading.Event()
 
@@ -123,28 +125,37 @@ class Run:
         return self.folder / ".costs.json"
 
     @contextlib.contextmanager
-    def stage(self, name: str, share: float = 1.0) -> Iterator[None]:
+    def stage(self, name: str, share: float = 1.0, *, done: int = 0, of: int = 1) -> Iterator[None]:
         """Time and peak memory of a stage (seconds; MiB, this process and its workers together).
 
         They are added to those of earlier runs over the folder where a `share` of the stage is left
-        to do, and take their place where all of it is.
+        to do, and take their place where all of it is.  Its end is one line of the log.
+
+        Parameters
+        ----------
+        name : str
+        share : float
+        done, of : int
+            How many of its tasks are done, of how many.
         """
         self.end_if_interrupted()
         begin = time.perf_counter()
         self.doing, self.workers = name, {}
         seconds, memory = self.costs.get(name, (0.0, 0.0)) if share < 1 else (0.0, 0.0)
+        self.notes.begin(name, done, of, seconds, memory)
+        whole = False
         try:
             yield
+            whole = True
         finally:  # an interrupted stage has cost something too
             if share > 0 or name not in self.costs:
                 own = {os.getpid(): peak_memory()}
                 memory = np.fmax(memory, sum((self.workers | own).values()))
                 self.costs[name] = [seconds + time.perf_counter() - begin, float(memory)]
-                with contextlib.suppress(OSError):
-                    new = self.costs_file.with_name(".costs.json.tmp")
-                    new.unlink(missing_ok=True)
-                    new.write_text(json.dumps(self.costs))
-                    os.replace(new, self.costs_file)  # a link in its place is not followed
+                write_at_once(self.costs_file, json.dumps(self.costs))
+            self.notes.end(name, whole, *self.costs[name])
+        spent, peak = time.perf_counter() - begin, self.costs[name][1]
+        log.info("%s: %d of %d were to do, %.1f s, %.0f MiB", name, of - done, of, spent, peak)
 
     def do(self, stage: str, tasks: list[Task], *, each: bool = True) -> Keys:
         """Do the tasks whose file is not done; name -> key of all that are done then.
@@ -154,10 +165,11 @@ class Run:
         shape, and what is finished is kept.
         """
         missing = [task for task in tasks if not self.has(task)]
-        with self.stage(stage, len(missing) / max(len(tasks), 1)):
-            log.info("%s: %d of %d to do", stage, len(missing), len(tasks))
+        n_done, share = len(tasks) - len(missing), len(missing) / max(len(tasks), 1)
+        with self.stage(stage, share, done=n_done, of=len(tasks)):
             outcomes = self.outcomes(missing)
-            for done in tqdm(outcomes, total=len(missing), desc=stage, disable=not missing):
+            no_bar = not missing or told_in_lines()
+            for done in tqdm(outcomes, total=len(missing), desc=stage, disable=no_bar):
                 self.end_if_interrupted()
                 self.workers[done.pid] = max(done.memory, self.workers.get(done.pid, 0))
                 if done.failure and not each:
@@ -169,6 +181,7 @@ class Run:
                     self.unforeseen.append(done.name)
                 if done.failure:
                     self.failures[done.name] = f"{stage}: {done.failure}"
+                self.notes.add(stage, {n: self.failures[n] for n in [done.name] if done.failure})
         return {task.name: task.key for task in tasks if task.name not in self.failures}
 
     def outcomes(self, tasks: list[Task]) -> Iterator[Outcome]:
@@ -239,6 +252,11 @@ class Run:
                 f"{self.doing}: {in_a_line(error)}: a fault of S4A or of its installation, not of "
                 f"a shape; its traceback is in {file}; finished files are kept"
             ) from error
+
+
+def told_in_lines() -> bool:
+    """Whether the log has a line for each stage, as its level is INFO: there are no bars then."""
+    return log.isEnabledFor(logging.INFO)
 
 
 def read_costs(path: Path) -> dict[str, list[float]]:

@@ -21,6 +21,7 @@ from s4a.method.register import from_latent, identity
 from s4a.method.shape import Basis, Shape
 from s4a.schema import dataset, in_unit, unit_of
 from s4a.study.options import Options
+from s4a.study.runner import told_in_lines
 from s4a.study.sources import content_of_file
 from s4a.study.store import arrays, attributes, open_file, read
 
@@ -107,7 +108,8 @@ def consistent_maps(
     first = steps.with_motions(first, motions, reference)
     coarse = {name: open_file(folder / "coarse" / f"{name}.nc") for name in names}
     k_init = first.sizes["mode_source_initial"]
-    with tqdm(total=options.k - k_init, desc="consistent ZoomOut") as bar:
+    n_sizes, no_bar = options.k - k_init, told_in_lines()
+    with tqdm(total=n_sizes, desc="consistent ZoomOut", disable=no_bar) as bar:
         tree = steps.refine_network(
             coarse,
             first,

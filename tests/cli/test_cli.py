@@ -14,6 +14,7 @@ from small import FLAGS
 from s4a import analyse, cli, synthetic, write_mesh
 from s4a.cli import commands, tables
 from s4a.geometry.mesh import as_arrays
+from s4a.study.progress import STAGES
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +52,14 @@ def test_run_again_does_nothing_again(ran, folder, capsys):
     assert cli.main(["run", str(folder), "--out", str(study), *FLAGS]) == 0
     assert (study / "latent.nc").stat().st_mtime_ns == before
     assert "4 ok" in capsys.readouterr().out
+
+
+def test_run_writes_a_line_for_each_stage_where_there_is_no_terminal(ran):
+    _, result = ran
+    lines = [line for line in result.stderr.splitlines() if line.startswith("INFO: ")]
+    assert [line.split(": ")[1] for line in lines] == list(STAGES)
+    assert re.fullmatch(r"INFO: registration: 4 of 4 were to do, [\d.]+ s, \d+ MiB", lines[-2])
+    assert "it/s" not in result.stderr
 
 
 def test_view_writes_a_page_into_the_study_or_where_it_is_told(ran, tmp_path, monkeypatch, capsys):

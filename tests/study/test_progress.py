@@ -1,0 +1,116 @@
+"""How far a run is, while it goes on, after it was stopped or killed, and at its end."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+from small import OPTIONS
+
+from s4a import analyse, cli
+from s4a.study import pipeline, progress, tasks
+from s4a.study.progress import FILE, STAGES, Stage, status
+
+
+def test_a_finished_run_has_done_all_of_every_stage(study_folder, capsys):
+    found = status(study_folder)
+    assert found.state == "finished"
+    assert tuple(found.stages) == STAGES
+    assert all(stage.done == stage.all and stage.ended for stage in found.stages.values())
+    assert found.stages["registration"].all == 4
+    assert found.failures == {}
+    assert (found.memory, found.processes) == (0, 0)
+    assert cli.main(["status", str(study_folder)]) == 0
+    first, _, *lines = capsys.readouterr().out.splitlines()
+    assert first.startswith("finished at 20")
+    assert [line.split("  ")[0] for line in lines] == list(STAGES)
+
+
+def test_a_run_that_goes_on_or_is_stopped_says_how_far_it_is(brains, tmp_path, monkeypatch, capsys):
+    seen = []
+
+    def remesh(folder, name, options):
+        if name == "brain_03":
+            seen.append(status(folder))
+            cli.main(["status", str(folder)])
+            raise KeyboardInterrupt
+        return tasks.remesh_shape(folder, name, options)
+
+    monkeypatch.setattr(progress, "EVERY", 0)
+    monkeypatch.setattr(pipeline, "remesh_shape", remesh)
+    with pytest.raises(KeyboardInterrupt):
+        analyse(brains, store=tmp_path, **OPTIONS)
+    (found,) = seen
+    assert (found.state, found.processes >= 1, found.memory > 10) == ("running", True, True)
+    now, before = found.stages["remesh and spectrum"], found.stages["compare"]
+    assert (now.done, now.all, now.had, now.ended) == (2, 4, 0, False)
+    assert (before.done, before.all, before.ended) == (4, 4, True)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("running since 20")
+    (line,) = (line for line in lines if line.startswith("remesh and spectrum"))
+    assert line.split()[3:5] == ["2", "4"]
+    assert line.split()[-2] == "about"
+    assert lines[-1].split() == ["modes", *"-----"]
+
+    stopped = status(tmp_path)
+    assert stopped.state == "stopped"
+    assert stopped.stages["remesh and spectrum"][:3] == (2, 4, 0)
+    monkeypatch.undo()
+    analyse(brains, store=tmp_path, **OPTIONS).close()
+    again = status(tmp_path)
+    assert again.state == "finished"
+    assert again.stages["remesh and spectrum"][:3] == (4, 4, 2)
+    assert again.stages["read and clean"][:3] == (4, 4, 4)
+
+
+def test_the_time_that_is_left_is_by_the_pace_of_this_run():
+    stage = Stage(30, 50, 20, 100.0, 7.0, 1.0, False)
+    assert stage.remaining(110.0) == 20.0  # 10 in 10 seconds, 20 are left
+    assert stage._replace(done=20).remaining(110.0) != stage._replace(done=20).remaining(110.0)
+    assert stage._replace(ended=True).remaining(110.0) == 0.0
+
+
+@pytest.fixture
+def note(study_folder, tmp_path):
+    """Puts a changed note of a finished run into a folder."""
+
+    def put(**changes):
+        said = json.loads((study_folder / FILE).read_text())
+        (tmp_path / FILE).write_text(json.dumps(said | changes))
+        return tmp_path
+
+    return put
+
+
+def test_a_run_whose_process_is_gone_is_stopped_and_one_of_another_machine_elsewhere(note, capsys):
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    assert status(note(over="", owner=gone.pid)).state == "stopped"
+    # a process of that number which began after the run is another one
+    child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    try:
+        assert status(note(over="", owner=child.pid, begun=10**9)).state == "stopped"
+        assert status(note(over="", owner=child.pid, begun=10**10)).state == "running"
+    finally:
+        child.communicate(b"\n")
+    folder = note(over="", host="node-17", failures={"a": "x", "b": "y " * 99})
+    assert status(folder).state == "elsewhere"
+    assert cli.main(["status", str(folder)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("on node-17, ")
+    assert lines[-2] == "left out: a: x"
+    assert len(lines[-1]) < 130
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "null", '{"stages": {}}', '{"stages": {"a": [1]}}', "\xff"]
+)
+def test_a_note_of_another_form_is_refused(tmp_path, text):
+    (tmp_path / FILE).write_bytes(text.encode("latin-1"))
+    with pytest.raises(ValueError, match=r"\.progress\.json"):
+        status(tmp_path)
+
+
+def test_a_folder_in_which_nothing_was_begun_is_told(tmp_path, capsys):
+    assert cli.main(["status", str(tmp_path)]) == 2
+    assert "no run of this version of s4a has begun there" in capsys.readouterr().err
