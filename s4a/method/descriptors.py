@@ -134,6 +134,33 @@ def wks(
     return signature(Phi, kernel) if landmark is None else landmark_signature(Phi, kernel, landmark)
 
 
+def mean_curvature(
+    X: np.ndarray, normals: np.ndarray, area: np.ndarray, Phi: np.ndarray, eigenvalue: np.ndarray
+) -> np.ndarray:
+    """Signed mean curvature ``(n,)`` of the surface that k eigenfunctions keep of a mesh.
+
+    Half of <L X, normal>, L X = Phi Lambda Phi^T A X: positive where the surface bulges outwards.
+    Unlike signatures it changes with the embedding, and tells the front of a body from its back.
+
+    Parameters
+    ----------
+    X, normals : float ndarray (n, 3)
+    area : float ndarray (n,), of sum 1
+    Phi : float ndarray (n, k)
+    eigenvalue : float ndarray (k,)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.method.descriptors import mean_curvature
+    >>> X = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
+    >>> mean_curvature(X, X, np.full(6, 1 / 6), 3**0.5 * X, np.full(3, 2.0)).round(6).tolist()
+    [1.0, 1.0, 1.0, 1.0, 1.0, 1.0]
+    """
+    smooth = Phi @ (eigenvalue[:, None] * (Phi.T @ (area[:, None] * X)))  # L X, (n, 3)
+    return np.einsum("nx,nx->n", smooth, normals) / 2
+
+
 def multiplication(Phi: np.ndarray, area: np.ndarray, f: np.ndarray) -> np.ndarray:
     """Operators g -> f g in the basis: Phi^T A diag(f) Phi for d functions ``(d, k, k)``.
 

@@ -4,6 +4,8 @@ The paper's way is from nearest neighbours after ICP, of all vertices or of 10 l
 poses are far apart these are wrong: then the best of several maps is taken.
 """
 
+import itertools
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,12 +17,17 @@ from s4a.method import fmap, joint
 from s4a.method.shape import Basis
 
 N_LANDMARKS = 10  # of step 3
+# Of a pair alone, in a far pose: signatures, functions by k_init, and weight of the orientation.
+# Signed mean curvature goes with each: front and back of a body differ by nothing else
+SEARCHED = tuple(itertools.product(("hks+wks", "wks", "hks"), (0.5, 1.0, 1.5), (1.0, 10.0)))
+CURVATURE = 3.0  # its weight by that of a signature
+FOUND = 0.07  # score at which the search ends; of wrong maps between bodies it is 0.11 or more
 
 
 class FirstMap(NamedTuple):
     """A first map of a directed pair, and what it was made of."""
 
-    name: str  # "dense", "landmarks", or of far poses "icp", "hks" or "wks"
+    name: str  # "dense", "landmarks", or of far poses that of best_first_map
     C: np.ndarray  # (k_init, k_init)
     fitted: np.ndarray  # (k_init, k_init), before the step of ZoomOut ahead
     near: np.ndarray  # (n_target,), nearest neighbours in space after the motion
@@ -118,6 +125,7 @@ def best_first_map(
     *,
     k: int = 60,
     step: int = 10,
+    search: bool = False,
 ) -> tuple[str, np.ndarray, np.ndarray]:
     """The best of a first map and of those from heat and from wave kernels, which no pose changes.
 
@@ -137,28 +145,47 @@ def best_first_map(
         That map before its step of ZoomOut; C where there was none.
     k, step : int
         Of the short ZoomOut.
+    search : bool
+        Whether to go on through :data:`SEARCHED` until a score is below :data:`FOUND`.
 
     Returns
     -------
-    name : {"icp", "hks", "wks"}
+    name : str
+        "icp", "hks" or "wks", or of the search as "hks+wks, curvature, k 10, oriented 1".
     C, fitted : float ndarray (k_init, k_init)
         The map, and as it was before its step of ZoomOut.
     """
-    maps = {"icp": C}
-    fits = {"icp": C if fitted is None else fitted}
-    for kind in ("hks", "wks"):
-        fits[kind] = fmap.fmap_from_descriptors(source, target, k=len(C), kind=kind)
-        maps[kind] = fmap.refine_once(source, target, fits[kind])
     k = min(k, source.k, target.k)
-    score = {}
-    for name, first in maps.items():
-        match = fmap.zoomout(source, target, first, k, step=step)[1]
+    maps = [("icp", C, C if fitted is None else fitted)]
+    tried = []  # score, name, map, fit
+    for one in itertools.chain(maps, maps_of_signatures(source, target, len(C), search)):
+        match = fmap.zoomout(source, target, one[1], k, step=step)[1]
         end = joint.low_rounds(source, target, match, k_first=20, step=20, rounds=1, by_parts=True)
         image = joint.move(target, end[1])
         gap = joint.registration_score(source, target, end[0], image)
-        score[name] = gap + stretch(target, image)
-    best = min(score, key=score.get)
-    return best, maps[best], fits[best]
+        tried.append((gap + stretch(target, image), *one))
+        if len(tried) >= 3 and min(score for score, *_ in tried) < FOUND:
+            break
+    return min(tried, key=lambda one: one[0])[1:]
+
+
+def maps_of_signatures(
+    source: Basis, target: Basis, k: int, search: bool
+) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Name, first map and its fit ``(k, k)`` of heat and of wave kernels, and of a search more."""
+    for kind in ("hks", "wks"):
+        fitted = fmap.fmap_from_descriptors(source, target, k=k, kind=kind)
+        yield kind, fmap.refine_once(source, target, fitted), fitted
+    for kind, share, oriented in SEARCHED if search else ():
+        size = min(max(4, round(share * k)), source.k, target.k)
+        fitted = fmap.fmap_from_descriptors(
+            source, target, k=size, kind=kind, oriented=oriented, curvature=CURVATURE
+        )
+        if size < k:
+            fitted = fmap.zoomout(source, target, fitted, k, step=k)[0]
+        fitted = fitted[:k, :k]
+        name = f"{kind}, curvature, k {size}, oriented {oriented:g}"
+        yield name, fmap.refine_once(source, target, fitted), fitted
 
 
 def have_signatures(source: Basis, target: Basis, k: int) -> bool:
@@ -179,6 +206,7 @@ def first_map(
     k_init: int = 20,
     init: str = "dense",
     ahead: bool = True,
+    search: bool = False,
 ) -> FirstMap:
     """:func:`map_after_motion`, or :func:`best_first_map` where poses are far apart.
 
@@ -191,6 +219,8 @@ def first_map(
     motion : tuple (R, t)
         Rigid motion of the source onto the target.
     k_init, init, ahead : see :func:`map_after_motion`
+    search : bool
+        See :func:`best_first_map`; for pairs alone, as Consistent ZoomOut mends those of a network.
     """
     near = nearest_after_motion(source, target, motion)
     fitted, landmarks = fit_after_motion(
@@ -199,6 +229,6 @@ def first_map(
     C = fmap.refine_once(source, target, fitted) if ahead else fitted
     far = init == "dense" and joint.far_apart(source, target, near)
     if far and have_signatures(source, target, k_init):
-        name, C, fitted = best_first_map(source, target, C, fitted)
+        name, C, fitted = best_first_map(source, target, C, fitted, search=search)
         return FirstMap(name, C, fitted, near, None)
     return FirstMap(init, C, fitted, near, landmarks)

@@ -15,6 +15,7 @@ from s4a.method.descriptors import (
     heat_filter,
     landmark_coefficients,
     landmark_signature,
+    mean_curvature,
     multiplication,
     orientation,
     signature,
@@ -30,6 +31,7 @@ from s4a.method.shape import Basis, Shape
 from s4a.schema import dataset, require
 
 FILTERS = {"wks": wave_filter, "hks": heat_filter}
+SCALES = (20, 40, 60, 90)  # functions that mean curvatures are of
 
 
 def fmap_from_match(
@@ -241,6 +243,7 @@ def fmap_from_descriptors(
     laplacian: float = 1e-3,
     commute: float = 1.0,
     oriented: float = 1.0,
+    curvature: float = 0.0,
 ) -> np.ndarray:
     """C ``(k, k)`` from descriptors: :func:`fit_descriptors` for two bases.
 
@@ -251,15 +254,27 @@ def fmap_from_descriptors(
     landmarks : tuple of int ndarray (p,)
         Corresponding vertices.
     kind, n, every, laplacian, commute, oriented : see :func:`fit_descriptors`
+        Of several kinds, "hks+wks", the signatures of all.
+    curvature : float
+        Weight of signed mean curvatures at four scales beside a signature.
     """
     F, products, turns = [], [], []  # of source and target
     for end, other, landmark in zip((source, target), (target, source), landmarks, strict=True):
-        kernel = FILTERS[kind](end.eigenvalue, other.eigenvalue, n=n)[::every]
+        kernel = np.concatenate(
+            [
+                FILTERS[one](end.eigenvalue, other.eigenvalue, n=n)[::every]
+                for one in kind.split("+")
+            ]
+        )
         f = signature(end.Phi, kernel)  # (n, d)
         if landmark is not None:
             f = np.column_stack([f, landmark_signature(end.Phi, kernel, landmark)])
+        if curvature:
+            f = np.column_stack([f, *curvatures(end)])
         f = f - end.area @ f
         f /= np.sqrt(end.area @ f**2)
+        if curvature:
+            f[:, -len(SCALES) :] *= np.sqrt(curvature)
         Phi = end.Phi[:, :k]
         F.append(Phi.T @ (end.area[:, None] * f))  # (k, d)
         products.append(multiplication(Phi, end.area, f) if commute else None)
@@ -276,6 +291,14 @@ def fmap_from_descriptors(
         operators=operators,
         constant=constant_to_constant(source, target),
     )
+
+
+def curvatures(end: Basis) -> list[np.ndarray]:
+    """Signed mean curvatures ``(n,)`` of an end by :data:`SCALES` of its functions."""
+    return [
+        mean_curvature(end.X, end.normals, end.area, end.Phi[:, :k], end.eigenvalue[:k])
+        for k in SCALES
+    ]
 
 
 def fit_descriptors(

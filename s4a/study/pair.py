@@ -116,7 +116,7 @@ def match_shapes(source: Shape, target: Shape, options: Options) -> tuple[xr.Dat
     k_init = min(options.k_init, k)
     R, t, _ = align(M.X, M.area, N.X, N.area)
     ahead = options.ahead == "always"
-    first = first_map(M, N, (R, t), k_init=k_init, init=options.init, ahead=ahead)
+    first = first_map(M, N, (R, t), k_init=k_init, init=options.init, ahead=ahead, search=True)
     C, match = fmap.zoomout(M, N, first.C, k, step=options.step)
     for _ in range(options.sharpen):
         C = sharpen_map(source, target, C, source.full.Phi if source.is_lifted else None)

@@ -52,7 +52,7 @@ def shapes(bent):
 def test_a_far_pose_is_matched_where_nearest_neighbours_begin_wrong(bent, monkeypatch):
     found = match_pair(*bent, n_coarse=1000, k=50)
     assert found.attrs["method"] == "intrinsic+parts"
-    assert found.attrs["first_map"] in ("hks", "wks")
+    assert found.attrs["first_map"].split(",")[0] in ("hks", "wks", "hks+wks")
     assert error(found, bent[0]) < 0.002
     monkeypatch.setattr(joint, "far_apart", lambda *_: False)
     assert error(match_pair(*bent, n_coarse=1000, k=50), bent[0]) > 0.05
@@ -113,6 +113,31 @@ def test_of_first_maps_the_one_that_fits_is_taken(shapes):
     name, C, _ = first_map.best_first_map(low, low, np.diag((-1.0) ** np.arange(20)))
     assert name in ("hks", "wks")
     assert np.diag(C).min() > 0.9
+
+
+def test_a_search_goes_on_to_maps_of_signatures_and_curvature_until_one_fits(shapes, monkeypatch):
+    low = shapes[0].low
+    turned_over = np.diag((-1.0) ** np.arange(20))
+    fit = first_map.fmap.fmap_from_descriptors
+
+    def spoilt(*ends, curvature=0.0, **options):
+        return fit(*ends, curvature=curvature, **options) if curvature else turned_over
+
+    monkeypatch.setattr(first_map.fmap, "fmap_from_descriptors", spoilt)
+    assert np.diag(first_map.best_first_map(low, low, turned_over)[1]).min() < 0
+    name, C, fitted = first_map.best_first_map(low, low, turned_over, search=True)
+    assert name == "hks+wks, curvature, k 10, oriented 1"
+    assert np.diag(C).min() > 0.9
+    assert C.shape == fitted.shape == (20, 20)
+
+
+def test_all_maps_of_a_search_carry_a_shape_to_itself(shapes):
+    low = shapes[0].low
+    found = {name: C for name, C, _ in first_map.maps_of_signatures(low, low, 20, True)}
+    assert len(found) == 2 + len(first_map.SEARCHED)
+    for name, C in found.items():
+        assert C.shape == (20, 20), name
+        assert np.diag(C).min() > 0.9, name
 
 
 def test_the_network_of_an_analysis_starts_from_maps_that_no_pose_changes(bent):
