@@ -293,8 +293,8 @@ in 5.1; all are registered to the first. Of every vertex of the template the dis
 it is carried and where it truly is, mean over vertices and shapes, in % of the square root of the
 area: to the *matched* vertex of the shape (eq. 4, 7), which cannot be nearer than the vertices lie
 apart, and to the registered *surface*, template + displacement (eq. 8 and the line after it). CPU
-seconds are of the whole analysis, on a server that other programs kept busy: differences of less
-than a fifth say nothing. All else is as by default, or as the paper has it.
+seconds are of the whole analysis, in several runs on a server that other programs kept busy:
+differences of less than a half say nothing. All else is as by default, or as the paper has it.
 
 - *brains*: synthetic, in the same pose, each of 10,000 vertices of its own.
 - *faces*: six identities of a published face model (006 to 011; of those before, 002 is so
@@ -324,9 +324,10 @@ Each alone, on top of the paper (errors: matched, surface):
 {additions}
 
 Elastic rounds beside joint ones on other sets: [what was measured](decisions.md).
-`parts` and `wide` are shown with what they need: elastic rounds, and 1,000 spread vertices. Of
-shapes of 10,000 vertices the
-25,000 of `n_projected` would be all; it is measured with 2,500, as 25,000 are of 100,000.
+`parts` and `wide` are shown with what they need: elastic rounds, and 1,000 spread vertices. Where
+poses are far apart elastic rounds need `parts`: without, bodies end farther from the truth than by
+the paper alone. Of shapes of 10,000 vertices the 25,000 of `n_projected` would be all; it is
+measured with 2,500, as 25,000 are of 100,000.
 `ahead`, `sharpen` and `both` concern pairs that are matched on their own.
 
 ## Pairs that are matched on their own (4.1, 6.2)
@@ -449,7 +450,7 @@ def errors_of(found, rows):
 def summary(found):
     """What the additions do on each set, in words made from the figures."""
     lines = []
-    single = [row_of(switch) for switch in SWITCHES]
+    single = {row_of(switch): name_of(switch) for switch in SWITCHES}
     for which in SETS:
         of = {row: float(line["surface"]) for (one, row), line in found.items() if one == which}
         if not {"paper", "default"} <= set(of):
@@ -466,9 +467,8 @@ def summary(found):
             f"{seconds[1]:.1f} for {seconds[0]:.1f} CPU seconds."
         )
         for row, what in ((best, "takes most off"), (worst, "adds most")):
-            option = row.removeprefix("paper, ")
             if (times[row] < 0.99) if row == best else (times[row] > 1.01):
-                line += f" Of the single additions `{option}` {what} ({times[row]:.2f} times)."
+                line += f" Of the single additions {single[row]} {what} ({times[row]:.2f} times)."
         lines.append(line)
     return "\n".join(lines)
 
