@@ -68,21 +68,21 @@ def test_maps_of_low_resolution_take_less_time_than_those_of_dense_meshes(found)
     assert (seconds.sel(way=["SCALABLE", "RE-MATCH"]) < dense).all()
 
 
-def test_joint_rounds_are_nearer_to_the_truth_than_every_other_method(found):
+def test_the_default_is_nearer_to_the_truth_than_every_other_method(found):
     error = found["straight_error"].mean("pair")
     others = error.drop_sel(way=["registered", "registered surface"])
     assert error.sel(way="registered") < 0.9 * others.min()
 
 
-def test_on_equal_terms_joint_rounds_end_on_the_source_and_their_surface_between_vertices(found):
+def test_on_equal_terms_the_default_ends_on_the_source_and_its_surface_between_vertices(found):
     chamfer = found["chamfer"].mean("pair")
     assert chamfer.sel(way="registered") < 1.1 * chamfer.sel(way="RE-MATCH")
     assert chamfer.sel(way="registered surface") > 2 * chamfer.sel(way="registered")
     smooth = found["dirichlet"].mean("pair")
     assert smooth.sel(way="registered surface") < smooth.sel(way="registered")
     for name in ("geodesic_error", "coverage", "bijectivity"):  # of the match, which is one
-        joint, surface = found[name].sel(way=["registered", "registered surface"]).values
-        assert np.array_equal(joint, surface)
+        matched, surface = found[name].sel(way=["registered", "registered surface"]).values
+        assert np.array_equal(matched, surface)
 
 
 def test_rematch_is_the_papers_with_and_without_the_preset(three_brains):
