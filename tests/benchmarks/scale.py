@@ -2,9 +2,11 @@
 
 ``scale.py start`` measures processes from their first moment on: CPU seconds, the least of five,
 and peak memory.  ``scale.py left_out 800`` computes leave-one-out of so many shapes in both ways,
-``scale.py open 1000`` opens a study of so many small shapes.
+``scale.py open 1000`` opens a study of so many small shapes, ``scale.py growth 50 100 200 400``
+analyses so many tiny ones and fits the exponents of every stage.
 """
 
+import contextlib
 import os
 import resource
 import shutil
@@ -22,6 +24,7 @@ import s4a
 from s4a import synthetic
 from s4a.analysis import model
 from s4a.study import store
+from s4a.study.runner import Run
 
 STARTS = {
     "python, nothing": ["-c", ""],
@@ -118,7 +121,46 @@ def opening(*sizes):
         say("{:8} {:8.2f} {:8.3f} {:8.0f} {:11}".format(n, *found))
 
 
-PARTS = {"start": start, "left_out": left_out, "open": opening}
+def spent_on(n):
+    """CPU seconds of every stage of n tiny shapes, with four pairs each, and of what follows."""
+    spent, stage = {}, Run.stage
+
+    @contextlib.contextmanager
+    def timed(self, name, *arguments, **options):
+        begin = time.process_time()
+        with stage(self, name, *arguments, **options):
+            yield
+        spent[name] = time.process_time() - begin
+
+    Run.stage = timed
+    with tempfile.TemporaryDirectory() as folder:
+        # of meshes as coarse as these some registrations are doubtful
+        options = {"n_coarse": 150, "k_init": 8, "k": 12, "keep_doubtful": True}
+        s4a.analyse(synthetic.brains(n, 500), store=folder, n_jobs=1, n_pairs=4 * n, **options)
+        begin = time.process_time()
+        study = s4a.open_study(folder)
+        spent["open the study"] = time.process_time() - begin
+        begin = time.process_time()
+        s4a.statistics.outliers(study)
+        spent["outliers"] = time.process_time() - begin
+    return spent
+
+
+def growth(*sizes):
+    """How the CPU seconds of every stage grow with the shapes: the slope of their logarithms."""
+    sizes = sizes or (50, 100, 200, 400)
+    found = []
+    for n in sizes:
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+            found.append(pool.submit(spent_on, n).result())
+    say(f"\nCPU seconds, one process, {', '.join(map(str, sizes))} shapes of 500 vertices")
+    for stage in found[0]:
+        seconds = np.array([max(one[stage], 1e-3) for one in found])
+        slope = np.polyfit(np.log(sizes), np.log(seconds), 1)[0]
+        say(f"{stage:32} {' '.join(f'{s:8.2f}' for s in seconds)}   exponent {slope:5.2f}")
+
+
+PARTS = {"start": start, "left_out": left_out, "open": opening, "growth": growth}
 
 if __name__ == "__main__":
     part, *words = sys.argv[1:] or [""]
