@@ -338,9 +338,10 @@ as landmarks (`s4a.transfer_landmarks`), along both matches of a pair where ther
 
 {pairs}
 
-The rows with elastic rounds are of a day on which their weight of the way along the surface grew
-from 0.01 to 0.1 by equal factors (as it is now, the default of a collection ends at 0.827 for 0.656
-on brains, 0.206 for 0.215 on faces), and bodies had fewer first maps to choose from.
+The defaults without `init`, `ahead`, `sharpen` and `both` are older: in elastic rounds the weight of
+the way along the surface grew from 0.01 to 0.1 by equal factors, and with it the default ended at
+0.656 on brains and 0.215 on faces. All rows of bodies are from before a pair in a far pose searched
+on for a first map.
 
 ## What the paper leaves open
 
