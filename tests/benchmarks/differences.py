@@ -338,11 +338,6 @@ as landmarks (`s4a.transfer_landmarks`), along both matches of a pair where ther
 
 {pairs}
 
-The defaults without `init`, `ahead`, `sharpen` and `both` are older: in elastic rounds the weight of
-the way along the surface grew from 0.01 to 0.1 by equal factors, and with it the default ended at
-0.656 on brains and 0.215 on faces. All rows of bodies are from before a pair in a far pose searched
-on for a first map.
-
 ## What the paper leaves open
 
 | | equation | in the paper | read here as | another reading |
