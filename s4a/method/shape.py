@@ -25,6 +25,7 @@ from s4a.geometry.mesh import (
     vertex_normals,
 )
 from s4a.method.deform import smoother
+from s4a.method.remesh import laplacian
 from s4a.method.spectral import unit_mass
 
 N_SPREAD = 1000  # spread vertices of a shape on which Consistent ZoomOut looks for matches
@@ -260,8 +261,14 @@ class Shape:
 
     @cached_property
     def W(self) -> sp.csr_matrix:
-        """Stiffness matrix of the low resolution ``(n_coarse, n_coarse)``; of SCALABLE U^T W U."""
-        E, w = (self.coarse[name].values for name in ("edge_vertex", "cotan_weight"))
+        """Stiffness matrix of the low resolution ``(n_coarse, n_coarse)``; of SCALABLE U^T W U.
+
+        A study that was made smaller to be handed on may lack it: then it is computed again.
+        """
+        if "cotan_weight" in self.coarse:
+            E, w = (self.coarse[name].values for name in ("edge_vertex", "cotan_weight"))
+        else:
+            E, w, *_ = laplacian(*as_arrays(self.coarse), self.coarse["vertex_area"].values)
         return stiffness(E, w, self.coarse.sizes["vertex"])
 
     @cached_property

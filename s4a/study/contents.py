@@ -19,7 +19,7 @@ REQUIRED: dict[str, tuple[str, dict[str, type]]] = {
     "original": ("position corner_vertex file_vertex", {"status": str, "reason": str, "area": int}),
     "coarse": (
         "position corner_vertex vertex_area sample_vertex coarse_vertex coarse_weight eigenvalue "
-        "eigenfunction edge_vertex cotan_weight",
+        "eigenfunction",
         {"wrapped": int, "kept_whole": int, "laplacian": str},
     ),
     "coarse/scalable": (

@@ -40,7 +40,8 @@ def prepare():
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     folder = tmp_path_factory.mktemp("binder") / "whole"
-    s4a.analyse(s4a.synthetic.brains(3, 300), n_coarse=100, n_pairs=3, k=20, store=folder)
+    options = {"n_coarse": 100, "n_pairs": 3, "k": 20, "keep_doubtful": True}
+    s4a.analyse(s4a.synthetic.brains(3, 300), **options, store=folder)
     return folder
 
 

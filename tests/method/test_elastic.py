@@ -207,6 +207,12 @@ def test_a_coarse_triangle_without_area_is_no_obstacle(pair):
     assert np.isfinite(surface).all()
 
 
+def test_the_stiffness_is_computed_again_where_a_study_was_made_smaller(pair):
+    template, _, _ = pair
+    smaller = replace(template, coarse=template.coarse.drop_vars(["edge_vertex", "cotan_weight"]))
+    assert (smaller.W != template.W).nnz == 0
+
+
 def test_a_study_and_a_pair_take_it_and_say_so(brains):
     names = ("brain_01", "brain_02")
     meshes = {name: brains["original"][name].to_dataset() for name in names}
