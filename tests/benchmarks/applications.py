@@ -60,7 +60,7 @@ def variance(folder=None):
         for preset in ("paper", None):
             study = s4a.analyse(shapes, preset=preset, n_jobs=-1)
             for resolution, ratio in (
-                ("high, eq. 7" if preset else "high, joint rounds", "explained_variance_ratio"),
+                ("high, eq. 7" if preset else "high, elastic rounds", "explained_variance_ratio"),
                 ("low, eq. 6, as smooth", "explained_variance_ratio_low"),
                 ("low, eq. 6, as it is", "explained_variance_ratio_raw"),
             ):
