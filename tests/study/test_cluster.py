@@ -126,10 +126,18 @@ def test_workers_of_dask_that_are_just_starting_are_gone_soon_after_a_run_that_i
     ) as run:
 
         def workers():
-            started = psutil.Process(run.pid).children(recursive=True)
-            return [p for p in started if "spawn_main" in " ".join(p.cmdline())]
+            found = []
+            for process in psutil.Process(run.pid).children(recursive=True):
+                with contextlib.suppress(psutil.Error):  # it ended since it was listed
+                    if "spawn_main" in " ".join(process.cmdline()):
+                        found.append(process)
+            return found
 
-        wait_for(lambda: len(workers()) == 2, "worker")
+        try:
+            wait_for(lambda: len(workers()) == 2, "worker")
+        except AssertionError:
+            run.kill()  # or its workers would sleep for ten minutes
+            raise
         started = workers()
         time.sleep(1)
         assert all(process.is_running() for process in started)
