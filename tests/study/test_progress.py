@@ -12,15 +12,16 @@ from s4a.study import pipeline, progress, tasks
 from s4a.study.progress import FILE, STAGES, Stage, status
 
 
-def test_a_finished_run_has_done_all_of_every_stage(study_folder, capsys):
-    found = status(study_folder)
+def test_a_finished_run_has_done_all_of_every_stage(brains, tmp_path, capsys):
+    analyse(brains, store=tmp_path, **OPTIONS).close()  # one that no other test has run again
+    found = status(tmp_path)
     assert found.state == "finished"
     assert tuple(found.stages) == STAGES
     assert all(stage.done == stage.all and stage.ended for stage in found.stages.values())
     assert found.stages["registration"].all == 4
     assert found.failures == {}
     assert (found.memory, found.processes) == (0, 0)
-    assert cli.main(["status", str(study_folder)]) == 0
+    assert cli.main(["status", str(tmp_path)]) == 0
     first, _, *lines = capsys.readouterr().out.splitlines()
     assert first.startswith("finished at 20")
     assert [line.split("  ")[0] for line in lines] == list(STAGES)
