@@ -17,6 +17,7 @@ check: $(VENV)/.test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/repo-review --show errskip .
 
 fuzz: $(VENV)/.test
 	$(BIN)/python tests/fuzz.py

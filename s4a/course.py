@@ -60,7 +60,7 @@ def check(answer: Any, expected: Any, hint: str = "", *, within: float = 0.01) -
 def _shown(message):
     """The error, which IPython shows without the way it took through this file."""
     error = AssertionError(message)
-    error._render_traceback_ = lambda: [message]
+    setattr(error, "_render_traceback_", lambda: [message])  # noqa: B010, IPython looks for it
     return error
 
 

@@ -258,7 +258,8 @@ def _column(study, name, shapes, what):
     if name not in table:
         raise ValueError(
             f"{what} needs a column of that name in /subjects, which has "
-            f"{', '.join(table.data_vars) or 'none'}; give a table, or the values themselves"
+            f"{', '.join(map(str, table.data_vars)) or 'none'}; "
+            "give a table, or the values themselves"
         )
     missing = [shape for shape in shapes if shape not in table["shape"].values]
     if missing:

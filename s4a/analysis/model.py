@@ -408,12 +408,12 @@ def _measure_surfaces(registration, d, K, P, score, nearest):
     X, T = as_arrays(registration)
     _, V = principal_components(center_gram(K))
     c = V.shape[1]
-    kept = []  # (s, s - 1)
+    rows = []
     for i in range(len(d)):
         others = np.delete(np.arange(len(d)), i)
         *_, steps = describe_by_others(K[np.ix_(others, others)], K[i, others], K[i, i])
-        kept.append(surface_error(P[others], steps, X + d[i], T))
-    kept = np.stack(kept)
+        rows.append(surface_error(P[others], steps, X + d[i], T))
+    kept = np.stack(rows)  # (s, s - 1)
     modes = np.einsum("sc,spx->cpx", V, P - P.mean(0)) / np.sqrt(len(d) - 1)
     samples = P.mean(0) + np.cumsum(score[:, :, None, None] * modes, axis=1)  # (n_samples, c, p, 3)
     random = np.zeros(nearest.shape)  # (c, n_samples)

@@ -15,7 +15,7 @@ from argparse import Namespace
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from s4a.input.raw import shown
 
@@ -128,7 +128,7 @@ def demo(args: Namespace) -> int:
     begin, out = time.perf_counter(), Path(args.out)
     collection = synthetic.brains(args.shapes, args.vertices, args.seed, dirty=args.dirty)
     study = analyse(collection, store=out, preset=args.preset, n_jobs=args.n_jobs, seed=args.seed)
-    truth = collection["truth"]
+    truth: Any = collection["truth"]
 
     def image(shape, template):
         return synthetic.position(truth, shape, truth[template]["reference_point"].values)

@@ -9,6 +9,7 @@ right, y to the front, z up.
 """
 
 from pathlib import Path
+from typing import Any
 
 import fpsample
 import numpy as np
@@ -34,7 +35,7 @@ SEMI_AXES = np.array([64.0, 86.0, 61.0])
 
 # Centre, width, push, turn and mirror of the slides and turns of each mode, on the right side; a
 # mirror of 1 repeats it on the left as in a mirror, -1 with the opposite sign, 0 not at all.
-MODES = [
+MODES: list[list[Any]] = [
     [((62, 0, 5), 44, (0, 0, 0), (1, 0, 0), 1)],
     [((0, 60, 10), 38, (0, 0, 0), (0, 1, 0), 0), ((0, -60, 10), 38, (0, 0, 0), (0, -1, 0), 0)],
     [

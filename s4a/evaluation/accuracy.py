@@ -111,7 +111,8 @@ def accuracy(
     shapes = [s for s in registration["shape"].values.tolist() if s != template]
 
     def shape(name):
-        return Shape(*(study[stage][name].to_dataset().load() for stage in ("original", "coarse")))
+        original, coarse = (study[s][name].to_dataset().load() for s in ("original", "coarse"))
+        return Shape(original, coarse)
 
     keep = ["registered_match", "displacement", "rotation", "translation", "scale"]
     target = shape(template)

@@ -85,15 +85,15 @@ def _npz_labels(data, file, name, n):
         if name not in arrays:
             raise ValueError(f"no array {name!r}; it has {', '.join(arrays)}")
         return arrays[name]()
-    arrays = {key: read() for key, read in arrays.items()}
+    found = {key: read() for key, read in arrays.items()}
     fitting = [
-        key for key, values in arrays.items() if values.ndim == 1 and n in (None, len(values))
+        key for key, values in found.items() if values.ndim == 1 and n in (None, len(values))
     ]
     if len(fitting) != 1:
-        shapes = ", ".join(f"{key} {values.shape}" for key, values in arrays.items())
+        shapes = ", ".join(f"{key} {values.shape}" for key, values in found.items())
         wanted = "one array" if n is None else f"one array of {n} values"
         raise ValueError(f"{wanted} needed, found {shapes}; name it as {file}:NAME")
-    return arrays[fitting[0]]
+    return found[fitting[0]]
 
 
 def _gifti_labels(data):
@@ -334,8 +334,8 @@ def _slicer_points(text):
             (p.get("label", ""), p["position"], curve, m.get("type") == "ClosedCurve")
             for p in points
         ]
-    names, points, curve, closed = zip(*rows, strict=True) if rows else ((),) * 4
-    return names, points, systems.pop(), curve, closed
+    labels, places, curves, closed = zip(*rows, strict=True) if rows else ((),) * 4
+    return labels, places, systems.pop(), curves, closed
 
 
 def _meshlab_points(text):

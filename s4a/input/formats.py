@@ -26,6 +26,7 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -205,7 +206,7 @@ def _ply_rows(body, at, name, count, properties):
 def _ply_row_type(properties, lists):
     """The structure of a row whose lists have these lengths."""
     lengths = {key: length for key, _, length in lists}
-    fields = []
+    fields: list[Any] = []
     for key, types in properties:
         if len(types) == 1:
             fields.append((key, types[0]))
@@ -253,20 +254,20 @@ def _ply_mixed_rows(body, at, name, count, properties):
 
 def _read_obj(data):
     text = data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")  # lines that go on
-    points, corners, sizes, n_before = [], [], [], []
+    places, indices, sizes, n_before = [], [], [], []
     for line in text.splitlines():
         words = line.split()
         if words[:1] == [b"v"]:
-            points.append(words[1:4])
+            places.append(words[1:4])
         elif words[:1] == [b"f"]:
-            corners += [word.partition(b"/")[0] for word in words[1:]]
+            indices += [word.partition(b"/")[0] for word in words[1:]]
             sizes.append(len(words) - 1)
-            n_before.append(len(points))
-    points = np.array(points, np.float64)
+            n_before.append(len(places))
+    points = np.array(places, np.float64)
     short = sum(size < 3 for size in sizes)
     if short:
         raise ValueError(f"faces of 3 corners or more expected, found {short} with fewer")
-    corners = np.array(corners, np.int64)
+    corners = np.array(indices, np.int64)
     if (corners == 0).any():
         raise ValueError("face indices from 1, or from -1 backwards, expected; found 0")
     # -1 is the last of the vertices that stand before the face
@@ -302,11 +303,11 @@ def _read_stl(data):
     count = int.from_bytes(data[80:84], "little")
     starts_as_text = re.match(rb"\s*solid\b", data, re.I) and b"\0" not in data[:1000]
     if starts_as_text and len(data) != 84 + 50 * count:
-        corners = re.findall(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", data, re.I)
+        found = re.findall(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", data, re.I)
         facets = len(re.findall(rb"\bfacet\b", data, re.I))
-        _need(3 * facets, len(corners), "vertices of facets")
+        _need(3 * facets, len(found), "vertices of facets")
         _need(1, len(re.findall(rb"\bendsolid\b", data, re.I)), "endsolid")
-        corners = np.array(corners, np.float64)
+        corners = np.array(found, np.float64)
     else:
         _need(count, (len(data) - 84) // 50, "triangles")
         corners = np.frombuffer(data, STL_TRIANGLE, count, 84)["corner"].reshape(-1, 3)
@@ -441,16 +442,16 @@ def _stl_bytes(X, T, _):
 
 
 def _gifti_bytes(X, T, scalars):
-    import nibabel  # here, as nothing else needs it
+    from nibabel.gifti import gifti  # here, as nothing else needs it
 
     arrays = [("POINTSET", X.astype(np.float32), {}), ("TRIANGLE", T, {})]
     for name, values in scalars.items():
         arrays.append(("SHAPE", values.astype(np.float32), {"Name": name}))
-    image = nibabel.gifti.GiftiImage()
-    for intent, values, meta in arrays:
-        meta = nibabel.gifti.GiftiMetaData(meta)
+    image = gifti.GiftiImage()
+    for intent, values, words in arrays:
+        meta = gifti.GiftiMetaData(words)
         image.add_gifti_data_array(
-            nibabel.gifti.GiftiDataArray(values, f"NIFTI_INTENT_{intent}", meta=meta)
+            gifti.GiftiDataArray(values, f"NIFTI_INTENT_{intent}", meta=meta)
         )
     return image.to_bytes()
 

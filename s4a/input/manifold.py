@@ -80,11 +80,11 @@ def _pairs_around_edges(P, F, group, edge_of, count):
     """
     order = np.argsort(edge_of, kind="stable")
     first = np.cumsum(count) - count
-    pairs = [np.empty((0, 2), np.int64)]
+    found = [np.empty((0, 2), np.int64)]
     for k in range(3, MOST_AROUND_EDGE + 1):
         around = order[first[count == k][:, None] + np.arange(k)]  # (edges, k) half-edges
-        pairs += [around[:, [i, j]] for i in range(k) for j in range(i + 1, k)]
-    pairs = np.concatenate(pairs)
+        found += [around[:, [i, j]] for i in range(k) for j in range(i + 1, k)]
+    pairs = np.concatenate(found)
     h, g = pairs.T
     m = len(F)
     normal = triangle_normals(P, F)

@@ -217,7 +217,8 @@ class _Xml:
 
     def __init__(self, data):
         appended = re.search(rb"<AppendedData([^<>]{0,400})>\s{0,99}_", data)
-        self.appended, self.appended_is_base64 = b"", False
+        self.appended: bytes | memoryview = b""
+        self.appended_is_base64 = False
         self.limit = limit_of(len(data))  # bytes that its arrays may still have
         if appended:  # raw bytes are no XML
             self.appended_is_base64 = b"raw" not in appended[1]

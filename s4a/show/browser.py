@@ -14,6 +14,7 @@ from jinja2.utils import htmlsafe_json_dumps
 from markupsafe import Markup
 from matplotlib import colormaps
 from matplotlib.colors import Colormap, to_hex
+from matplotlib.figure import Figure
 
 from s4a.show import charts
 from s4a.show.draw import SIGNED, UNKNOWN, Viewpoint, data_uri, image_bytes, rotation
@@ -139,7 +140,7 @@ def webp_uri(pixels: np.ndarray) -> str:
     return data_uri(image_bytes(pixels))
 
 
-def svg_uri(figure: charts.Figure) -> str:
+def svg_uri(figure: Figure) -> str:
     """A matplotlib Figure as the address of an image inside a page."""
     return data_uri(charts.svg(figure), "image/svg+xml")
 

@@ -253,7 +253,7 @@ def render(
 def _sampled(colors, corners, weights, flat):
     """The colour of every sample from the colours of the corners of its triangle."""
     colors = np.asarray(colors, np.float32)
-    colors = np.where(np.isfinite(colors), colors, np.float32(UNKNOWN))
+    colors = np.where(np.isfinite(colors), colors, np.array(UNKNOWN, np.float32))
     if flat:
         return colors[np.take_along_axis(corners, weights.argmax(1)[:, None], axis=1)[:, 0]]
     return np.einsum("sc,scx->sx", weights, colors[corners])

@@ -34,7 +34,7 @@ def header_of(file: StudyFile) -> str:
 
 def _encoded(attrs):
     """Attributes for JSON: texts as they are, numbers and arrays with their type before them."""
-    found = {}
+    found: dict[str, str | list[Any]] = {}
     for name, value in attrs.items():
         if isinstance(value, str):
             found[name] = value
