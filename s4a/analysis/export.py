@@ -15,6 +15,7 @@ from s4a.analysis.transfer import transfer_labels, transfer_landmarks
 from s4a.geometry.mesh import as_arrays
 from s4a.input.annotations import write_landmarks
 from s4a.input.files import write_mesh
+from s4a.seeds import RNG, seed_of
 from s4a.study import store
 
 FORMATS = {"ply": ".ply", "vtk": ".vtk", "obj": ".obj", "npz": ".npz", "gifti": ".gii"}
@@ -142,6 +143,7 @@ def write_training_set(
     source: str | xr.Dataset | None = None,
     test_share: float = 0.2,
     seed: int = 0,
+    rng: RNG | None = None,
     **options: Any,
 ) -> dict[str, list[str]]:
     """Write a training set for learners of segmentations and key-points, with its split.
@@ -158,7 +160,7 @@ def write_training_set(
     label, landmarks, source : see :func:`s4a.transfer_labels` and :func:`s4a.transfer_landmarks`
     test_share : float
         Of the shapes, rounded up.
-    seed : int
+    seed, rng : see :mod:`s4a.seeds`
         Of the split.
     **options
         By which an external source is matched, see :func:`s4a.transfer_labels`.
@@ -216,7 +218,7 @@ def write_training_set(
             write_landmarks(
                 folder / "landmarks" / f"{name}.csv", carried["landmarks"][name].to_dataset()
             )
-    order = np.random.default_rng(seed).permutation(len(names))
+    order = np.random.default_rng(seed_of(seed, rng)).permutation(len(names))
     split = {
         "train": sorted(names[i] for i in order[n_test:]),
         "test": sorted(names[i] for i in order[:n_test]),

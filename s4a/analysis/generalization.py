@@ -14,6 +14,7 @@ from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.method.pca import gram
 from s4a.method.register import from_latent, identity
 from s4a.schema import dataset, in_unit, unit_of
+from s4a.seeds import RNG, seed_of
 from s4a.study.insert import insert
 from s4a.study.options import Options
 from s4a.study.processes import workers
@@ -126,7 +127,12 @@ def _errors_of(study, name, n_points, seed, n_jobs):
 
 
 def generalization(
-    study: xr.DataTree, *, n_points: int = 500, n_jobs: int | None = None, seed: int = 0
+    study: xr.DataTree,
+    *,
+    n_points: int = 500,
+    n_jobs: int | None = None,
+    seed: int = 0,
+    rng: RNG | None = None,
 ) -> xr.Dataset:
     """Generalization with correspondences found anew, each shape new to the study of the others.
 
@@ -144,7 +150,7 @@ def generalization(
         it was read, are measured; 0 leaves these out.
     n_jobs : int, optional
         As in joblib; the result does not depend on it.
-    seed : int
+    seed, rng : see :mod:`s4a.seeds`
         Of these vertices.
 
     Returns
@@ -180,6 +186,7 @@ def generalization(
         raise ValueError(f"at least 5 shapes needed to leave one out, found {len(names)}")
     # first the template, alone: to leave it out is the one turn with work to share out
     template = registration.attrs["template"]
+    seed = seed_of(seed, rng)
     first = _errors_of(study, template, n_points, seed, n_jobs)
     rest = workers(n_jobs, return_as="generator")(
         delayed(_errors_of)(study, name, n_points, seed, 1) for name in names if name != template

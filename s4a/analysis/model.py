@@ -18,6 +18,7 @@ from s4a.method.deform import smoother
 from s4a.method.pca import center_gram, gram, principal_components, synthesize
 from s4a.method.shape import Shape
 from s4a.schema import dataset, in_unit, unit_of
+from s4a.seeds import RNG, seed_of
 
 KEPT = "kept from the whole collection: optimistic"
 
@@ -325,6 +326,7 @@ def evaluate(
     n_points: int = 500,
     n_surface: int = 20,
     seed: int = 0,
+    rng: RNG | None = None,
 ) -> xr.Dataset:
     """Compactness, generalization and specificity for every number of components, and chance.
 
@@ -340,7 +342,7 @@ def evaluate(
         Vertices from which distances to surfaces are measured; 0 leaves these out.
     n_surface : int
         Random shapes whose distances to surfaces are measured.
-    seed : int
+    seed, rng : see :mod:`s4a.seeds`
 
     Returns
     -------
@@ -372,10 +374,10 @@ def evaluate(
     """
     registration, d, area = displacements_of(study)
     s = len(d)
-    rng = np.random.default_rng(seed)
+    draw = np.random.default_rng(seed_of(seed, rng))
     K = gram(d - d.mean(0), area)
     error, _ = leave_one_out(K)
-    distance, nearest, score = specificity(K, n_samples, rng)
+    distance, nearest, score = specificity(K, n_samples, draw)
     variance, _ = principal_components(center_gram(K))
     c = len(variance)
     compactness = np.cumsum(variance)
@@ -389,13 +391,13 @@ def evaluate(
         specificity_error=stats.sem(distance, axis=1),
     )
     if n_points:
-        points = draw_points(area, n_points, rng)
+        points = draw_points(area, n_points, draw)
         P = registration["position"].values[points] + d[:, points]  # (s, p, 3)
         few = score[:n_surface], nearest[:, :n_surface]
         quality = quality.merge(_measure_surfaces(registration, d, K, P, *few))
     quality = in_unit(quality, unit_of(registration["displacement"]))
     features = _coefficients(study, d, area)
-    return quality.merge(_compare_with_chance(features, c, n_permutations, rng))
+    return quality.merge(_compare_with_chance(features, c, n_permutations, draw))
 
 
 def _per_component(values, c):
@@ -454,7 +456,12 @@ def _coefficients(study, d, area):
 
 
 def sample(
-    study: xr.DataTree, n: int, *, n_components: int | None = None, seed: int = 0
+    study: xr.DataTree,
+    n: int,
+    *,
+    n_components: int | None = None,
+    seed: int = 0,
+    rng: RNG | None = None,
 ) -> xr.DataTree:
     """New shapes from the model: normal scores on the first components.
 
@@ -464,7 +471,7 @@ def sample(
     n : int
     n_components : int, optional
         All by default.
-    seed : int
+    seed, rng : see :mod:`s4a.seeds`
 
     Returns
     -------
@@ -490,7 +497,7 @@ def sample(
     c = most if n_components is None else n_components
     if not 1 <= c <= most:
         raise ValueError(f"n_components needs a number from 1 to {most}, found {c}")
-    score = np.random.default_rng(seed).normal(size=(n, c))
+    score = np.random.default_rng(seed_of(seed, rng)).normal(size=(n, c))
     names = [f"sample_{i + 1:0{len(str(n))}d}" for i in range(n)]
     meshes = {name: synthesize(study, row) for name, row in zip(names, score, strict=True)}
     return xr.DataTree.from_dict({"/": dataset(score=score).assign_coords(shape=names), **meshes})

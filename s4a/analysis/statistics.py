@@ -44,6 +44,7 @@ from s4a.geometry.mesh import as_arrays, vertex_normals
 from s4a.method.deform import normal_displacement
 from s4a.method.pca import center_gram, gram, principal_components
 from s4a.schema import dataset, in_unit, unit_of
+from s4a.seeds import RNG, seed_of
 
 if TYPE_CHECKING:
     from sklearn.base import ClassifierMixin
@@ -80,6 +81,7 @@ def group_test(
     n_permutations: int = 9999,
     variances: str = "equal",
     seed: int = 0,
+    rng: RNG | None = None,
 ) -> xr.Dataset:
     """Do groups of shapes differ?  Permutation Hotelling T^2 on the scores.
 
@@ -100,7 +102,7 @@ def group_test(
         Whether shapes are permuted, which is exact where they scatter alike in all groups; or the
         signs of their residuals are changed, which holds where the groups scatter differently, and
         takes errors as symmetric.
-    seed : int
+    seed, rng : see :mod:`s4a.seeds`
 
     Returns
     -------
@@ -125,7 +127,7 @@ def group_test(
     >>> test.attrs["groups"], bool(test["p_value"] > 0.05)
     ('a: 3, b: 3', True)
     """
-    options = _options(n_permutations, variances, seed)
+    options = _options(n_permutations, variances, seed_of(seed, rng))
     sample = sample_of(study, group, "group", covariates)
     sizes = group_sizes(sample.values)
     _, x = indicators(sample.values)
@@ -142,12 +144,13 @@ def group_map(
     n_permutations: int = 999,
     variances: str = "equal",
     seed: int = 0,
+    rng: RNG | None = None,
 ) -> xr.Dataset:
     """Where do groups of shapes differ?  A permutation test at every vertex of the template.
 
     Parameters
     ----------
-    study, group, covariates, n_permutations, variances, seed : see :func:`group_test`
+    study, group, covariates, n_permutations, variances, seed, rng : see :func:`group_test`
     of : {"vector", "normal"}
         The displacements, or their part along the normals.
 
@@ -174,7 +177,7 @@ def group_map(
     >>> where["effect"].dims, bool((where["p_family_wise"] > 0.05).all())
     (('vertex', 'xyz'), True)
     """
-    options = _options(n_permutations, variances, seed)
+    options = _options(n_permutations, variances, seed_of(seed, rng))
     sample = sample_of(study, group, "group", covariates)
     sizes = group_sizes(sample.values)
     names, x = indicators(sample.values)
@@ -198,6 +201,7 @@ def regression(
     n_permutations: int = 999,
     variances: str = "equal",
     seed: int = 0,
+    rng: RNG | None = None,
 ) -> xr.Dataset:
     """How does shape change with a continuous variable, such as age?
 
@@ -205,7 +209,7 @@ def regression(
     ----------
     study : DataTree
     variable : array_like (shape,), dict of shape to value, or name in /subjects
-    covariates, n_components, n_permutations, variances, seed : see :func:`group_test`
+    covariates, n_components, n_permutations, variances, seed, rng : see :func:`group_test`
     of : see :func:`group_map`
 
     Returns
@@ -234,7 +238,7 @@ def regression(
     >>> bool(abs(predicted - s4a.synthesize(study, [2.0])["position"]).max() < 1e-2)
     True
     """
-    options = _options(n_permutations, variances, seed)
+    options = _options(n_permutations, variances, seed_of(seed, rng))
     sample = sample_of(study, variable, "variable", covariates)
     x = _numbers(sample.values)
     test = _test_scores(sample, x, n_components, options)
@@ -442,6 +446,7 @@ def classify(
     n_folds: int = 5,
     n_permutations: int = 99,
     seed: int = 0,
+    rng: RNG | None = None,
 ) -> xr.Dataset:
     """Can the groups be told from the shapes?
 
@@ -463,7 +468,7 @@ def classify(
         Stratified; at most the size of the smallest group.
     n_permutations : int
         Of the groups, for the p value.
-    seed : int
+    seed, rng : see :mod:`s4a.seeds`
 
     Returns
     -------
@@ -495,6 +500,7 @@ def classify(
     from sklearn.pipeline import make_pipeline
     from sklearn.preprocessing import StandardScaler
 
+    seed = seed_of(seed, rng)
     _check_permutations(n_permutations)
     if n_folds < 2:
         raise ValueError(f"n_folds needs a number from 2, found {n_folds}")

@@ -89,7 +89,7 @@ def register_pairs(
         As in joblib; the result does not depend on it.
     method, k_init, k, step, lift, init, ahead, sharpen, refine, parts, alignment
         See :func:`s4a.match_pair`.
-    area_weighted, n_projected, n_coarse, preset, seed
+    area_weighted, n_projected, n_coarse, preset, seed, rng
         See :func:`s4a.match_pair`; ``preset="paper"`` sets both=False, too.
 
     Returns

@@ -24,6 +24,7 @@ from s4a.geometry.mesh import as_arrays, as_dataset, edge_graph, edges, vertex_a
 from s4a.input.collection import read_shapes
 from s4a.input.files import write_mesh
 from s4a.schema import dataset, in_unit
+from s4a.seeds import RNG, seed_of
 from s4a.study.pipeline import analyse
 
 MODE_RMS = 4.5  # mm, root mean square displacement of mode 1 at one standard deviation
@@ -227,14 +228,14 @@ def _own_parts(n, rng):
     return centre, width, push
 
 
-def plant(n: int = 12, seed: int = 0, *, n_modes: int = 3) -> xr.Dataset:
+def plant(n: int = 12, seed: int = 0, *, n_modes: int = 3, rng: RNG | None = None) -> xr.Dataset:
     """The planted parameters of a population: all that :func:`position` needs, without any mesh.
 
     Parameters
     ----------
     n : int
         Number of shapes.
-    seed : int
+    seed, rng : see :mod:`s4a.seeds`
     n_modes : int
         Number of planted modes.
 
@@ -259,12 +260,13 @@ def plant(n: int = 12, seed: int = 0, *, n_modes: int = 3) -> xr.Dataset:
     """
     if n < 1:
         raise ValueError(f"a population needs n of 1 or more shapes, found {n}")
-    rng = np.random.default_rng([seed, 0])
+    seed = seed_of(seed, rng)
+    draw = np.random.default_rng([seed, 0])
     centre, width, push, turn = _planted_modes(n_modes)
-    score = _planted_scores(n, n_modes, rng)
-    own_centre, own_width, own_push = _own_parts(n, rng)
+    score = _planted_scores(n, n_modes, draw)
+    own_centre, own_width, own_push = _own_parts(n, draw)
     pose = Rotation.from_rotvec(
-        _random_directions(rng, n) * np.deg2rad(rng.uniform(0, POSE[0], (n, 1)))
+        _random_directions(draw, n) * np.deg2rad(draw.uniform(0, POSE[0], (n, 1)))
     )
     truth = dataset(
         {
@@ -283,7 +285,7 @@ def plant(n: int = 12, seed: int = 0, *, n_modes: int = 3) -> xr.Dataset:
         own_width=own_width,
         own_push=own_push,
         rotation=pose.as_matrix(),
-        translation=rng.normal(0, POSE[1], (n, 3)),
+        translation=draw.normal(0, POSE[1], (n, 3)),
         landmark_name=np.array(list(LANDMARKS)),
         landmark_reference=_unit(list(LANDMARKS.values())),
     )
@@ -412,7 +414,12 @@ def _annotate(mesh, truth, shape, reference_point):
 
 
 def raw_brain(
-    truth: xr.Dataset | xr.DataTree, shape: str, n_vertices: int = 40_000, seed: int = 0
+    truth: xr.Dataset | xr.DataTree,
+    shape: str,
+    n_vertices: int = 40_000,
+    seed: int = 0,
+    *,
+    rng: RNG | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A brain with the artefacts of :func:`s4a.datasets.artifacts.soil`, as it could lie in a file.
 
@@ -421,7 +428,7 @@ def raw_brain(
     truth, shape : as of :func:`position`
     n_vertices : int
         Before the artefacts are put in.
-    seed : int
+    seed, rng : see :mod:`s4a.seeds`
 
     Returns
     -------
@@ -439,6 +446,7 @@ def raw_brain(
     >>> len(points) > 500, bool(np.isnan(reference_point).any())
     (True, True)
     """
+    seed = seed_of(seed, rng)
     i = _index(truth, shape)
     u, T = _mesh(truth, shape, n_vertices, np.random.default_rng([seed, 1, i]))
     return soil(position(truth, shape, u), T, u, np.random.default_rng([seed, 2, i]))
@@ -456,7 +464,13 @@ def _reference_after_cleaning(mesh, raw, reference_point):
 
 
 def brains(
-    n: int = 12, n_vertices: int = 40_000, seed: int = 0, *, dirty: bool = False, n_modes: int = 3
+    n: int = 12,
+    n_vertices: int = 40_000,
+    seed: int = 0,
+    *,
+    dirty: bool = False,
+    n_modes: int = 3,
+    rng: RNG | None = None,
 ) -> xr.DataTree:
     """A population of brains with planted modes and exact correspondences.
 
@@ -466,7 +480,7 @@ def brains(
         Number of shapes.
     n_vertices : int
         Vertices of each, exactly unless `dirty`.  The population does not depend on it.
-    seed : int
+    seed, rng : see :mod:`s4a.seeds`
     dirty : bool
         Whether the meshes are those of :func:`raw_brain`, cleaned; ``/raw/<shape>`` then holds them
         as they were.
@@ -497,6 +511,7 @@ def brains(
     >>> np.abs(exact - mesh["position"]).max().item() < 1e-9
     True
     """
+    seed = seed_of(seed, rng)
     truth = plant(n, seed, n_modes=n_modes)
     raw = {}
     for i, shape in enumerate(truth["shape"].values.tolist()):

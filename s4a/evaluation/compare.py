@@ -40,6 +40,7 @@ from s4a.method.first_map import map_after_motion
 from s4a.method.register import latent_functions, log_area_ratio, match_functions, match_low
 from s4a.method.shape import Basis, Shape
 from s4a.schema import check_count, check_switch, dataset, require, variable
+from s4a.seeds import RNG, seed_of
 from s4a.study.options import PRESETS as STUDY_PRESETS
 from s4a.study.options import Options, apply_preset
 
@@ -217,6 +218,7 @@ def pairs(
     n_geodesic: int = 1000,
     keep: bool = False,
     seed: int = 0,
+    rng: RNG | None = None,
 ) -> xr.Dataset | xr.DataTree:
     """The five pair methods of Table 1, and three of ours, on the same cleaned input.
 
@@ -269,7 +271,7 @@ def pairs(
     keep : bool
         Whether the meshes, matches and maps are returned, too, as
         :class:`s4a.widgets.Comparison` shows them: some 30 bytes a vertex and method.
-    seed : int
+    seed, rng : see :mod:`s4a.seeds`
 
     Returns
     -------
@@ -298,6 +300,7 @@ def pairs(
     0.0
     """
     settings = apply_preset(preset, {"sharpen": sharpen, "init": init}, PRESETS)
+    seed = seed_of(seed, rng)
     check_count("sharpen", settings["sharpen"])
     if settings["init"] not in INITS:
         raise ValueError(f"init must be {' or '.join(map(repr, INITS))}; found {init!r}")
@@ -477,6 +480,7 @@ def collection(
     n_spread: int | None = None,
     wide: int | None = None,
     seed: int = 0,
+    rng: RNG | None = None,
 ) -> xr.Dataset:
     """Table 2: the collection in the space of SCALABLE and of RE-MATCH.
 
@@ -488,7 +492,7 @@ def collection(
         As of :func:`s4a.read_shapes`, or what it gives.
     methods : sequence of str
         Some of :data:`COLLECTION_METHODS`.
-    n_coarse, n_pairs, k_init, k, step, seed
+    n_coarse, n_pairs, k_init, k, step, seed, rng
         See :func:`s4a.analyse`.
     preset : {None, "paper"}
         ``"paper"`` sets init="landmarks", n_spread=0 and wide=0; another value of these is refused.
@@ -531,7 +535,7 @@ def collection(
         k_init=k_init,
         k=k,
         step=step,
-        seed=seed,
+        seed=seed_of(seed, rng),
         **apply_preset(preset, given, presets),
     )
     begin = time.process_time()

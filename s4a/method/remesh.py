@@ -50,6 +50,7 @@ from s4a.geometry.voronoi import (
     voronoi_cells,
 )
 from s4a.schema import dataset, require
+from s4a.seeds import RNG, seed_of
 
 FIRST = 0.95  # share of n_coarse that is sampled first; mending faults needs the rest
 MOST = 1.1  # share of n_coarse from which on handles are cut, rather than more samples added
@@ -279,7 +280,12 @@ def check_clean(X: np.ndarray, T: np.ndarray) -> dict[str, int]:
 
 
 def coarsen(
-    mesh: xr.Dataset, *, n_coarse: int = 6000, wrap: bool = False, seed: int = 0
+    mesh: xr.Dataset,
+    *,
+    n_coarse: int = 6000,
+    wrap: bool = False,
+    seed: int = 0,
+    rng: RNG | None = None,
 ) -> xr.Dataset:
     """Low-resolution mesh of about `n_coarse` vertices, and U that carries functions back (4.1).
 
@@ -295,7 +301,7 @@ def coarsen(
     wrap : bool
         Coarsen a closed surface wrapped around the mesh, for scans whose inside is of no interest
         (needs pymeshlab).
-    seed : int
+    seed, rng : see :mod:`s4a.seeds`
         The sampling starts at an outermost vertex; another seed starts elsewhere.
 
     Returns
@@ -336,6 +342,7 @@ def coarsen(
     >>> bool(np.allclose(coarse["coarse_weight"].sum("corner"), 1))
     True
     """
+    seed = seed_of(seed, rng)
     require(mesh, "position", "corner_vertex", what="mesh")
     if int(n_coarse) != n_coarse or n_coarse < 4:
         raise ValueError(f"n_coarse must be an integer of at least 4, found {n_coarse!r}")

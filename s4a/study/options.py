@@ -16,6 +16,7 @@ from s4a.input.clean import check_components
 from s4a.method.median import NORMS
 from s4a.method.shape import N_CENTRAL, N_SPREAD, Shape
 from s4a.schema import check_count, check_switch, check_text
+from s4a.seeds import RNG, seeded
 
 CHOICES = {
     "method": ("rematch", "scalable"),
@@ -326,8 +327,8 @@ def _in_kind(word, kinds):
 def takes_options(*names: str) -> Callable:
     """Decorate a function of ``**options`` so that its signature shows those of :class:`Options`.
 
-    Those of these names, all by default.  Each option and its default stand in :class:`Options`
-    alone.
+    Those of these names, all by default, and ``rng`` beside ``seed``.  Each option and its default
+    stand in :class:`Options` alone.
     """
 
     def decorate(function):
@@ -335,6 +336,8 @@ def takes_options(*names: str) -> Callable:
         own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
         options = inspect.signature(Options).parameters
         chosen = [options[name] for name in names or options]
+        if "seed" in (names or options):
+            chosen.append(options["seed"].replace(name="rng", default=None, annotation=RNG | None))
         function.__signature__ = signature.replace(parameters=[*own, *chosen])
         return function
 
@@ -351,6 +354,7 @@ def pair_options(given: dict, of_study: Options | None = None) -> Options:
     ValueError
         When one is outside its range, or contradicts the preset.
     """
+    given = seeded(given)
     wrong = [name for name in given if name not in (*PAIR, "both")]
     if wrong:
         raise TypeError(

@@ -49,7 +49,7 @@ def match_pair(source: xr.Dataset, target: xr.Dataset, **options: Any) -> xr.Dat
         Vertices of the low-resolution meshes.
     preset : {None, "paper"}
         ``"paper"`` leaves out all that is added to 4.1, see :func:`s4a.analyse`.
-    seed : int
+    seed, rng : see :mod:`s4a.seeds`
 
     Returns
     -------

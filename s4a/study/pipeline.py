@@ -19,6 +19,7 @@ from s4a.input.plausibility import Doubts
 from s4a.input.subjects import read_table
 from s4a.method.network import choose_pairs, spectral_distance
 from s4a.method.pca import pca_without
+from s4a.seeds import seeded
 from s4a.study.doubts import (
     check_plausibility,
     check_usable,
@@ -158,7 +159,7 @@ def analyse(
     n_jobs : int, optional
         Processes, as in joblib: -1 for all cores given to this process.  The result does not depend
         on it.
-    seed : int
+    seed, rng : see :mod:`s4a.seeds`
 
     Returns
     -------
@@ -187,6 +188,7 @@ def analyse(
     >>> paper = s4a.analyse(brains, preset="paper", **small)
     >>> elastic = s4a.analyse(brains, **PAPER | {"refine": "elastic"}, **small)
     """
+    options = seeded(options)
     if store is None:
         with temporary_folder() as folder:
             study = analyse(shapes, store=folder, n_jobs=n_jobs, **options)

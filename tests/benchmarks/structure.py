@@ -30,6 +30,7 @@ FUNCTION = (ast.FunctionDef, ast.AsyncFunctionDef)
 # The order in which data flow; tests/house/test_imports.py holds every import to it.
 ROOMS = (
     "schema",
+    "seeds",
     "geometry",
     "input",
     "method",
@@ -393,7 +394,8 @@ def room_map(modules: dict[str, Module]) -> str:
 #     | method        |<--(7)-(15)
 LEFT, WIDTH, CHIP, ROW, PAD, GAP, COLUMN = 24, 640, 22, 27, 12, 12, 38
 COLORS = (
-    "#4e6e81 #3d7ea6 #2a9d8f #d1495b #8f5d9c #c77d1e #7a8b3c #b0577b #4c6ef5 #5f7d4f #6b6b6b"
+    "#4e6e81 #6d7f8a #3d7ea6 #2a9d8f #d1495b #8f5d9c #c77d1e #7a8b3c #b0577b #4c6ef5 #5f7d4f "
+    "#6b6b6b"
 ).split()
 
 

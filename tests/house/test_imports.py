@@ -18,6 +18,7 @@ FOLDER = Path(s4a.__file__).parent
 # The order in which data flow: a room imports from those before it and from none after it.
 ROOMS = (
     "schema",
+    "seeds",
     "geometry",
     "input",
     "method",
