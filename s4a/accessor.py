@@ -12,7 +12,14 @@ if TYPE_CHECKING:
     from s4a.widgets.explore import Explore
 
 
-def explore(study: xr.DataTree, *, view: str = "corner", up: str = "z") -> "Explore":
+def explore(
+    study: xr.DataTree,
+    *,
+    width: float | str | None = None,
+    font: float | None = None,
+    view: str = "corner",
+    up: str = "z",
+) -> "Explore":
     """Tabs over a finished or running study, for notebooks.
 
     Modes, network, maps, median, correspondence, spectrum.
@@ -21,6 +28,11 @@ def explore(study: xr.DataTree, *, view: str = "corner", up: str = "z") -> "Expl
     ----------
     study : xarray.DataTree
         As :func:`s4a.analyse` or :func:`s4a.open_study` give it.
+    width : float or str, optional
+        Of the panels, in pixels or as CSS has it; all that the cell has by default.
+    font : float, optional
+        Size of their text in pixels; by default it follows their width, so that a projector shows
+        it large.
     view, up
         From where surfaces are seen first, and which axis points up; see
         :func:`s4a.show.draw.rotation`.
@@ -45,7 +57,8 @@ def explore(study: xr.DataTree, *, view: str = "corner", up: str = "z") -> "Expl
     >>> s4a.explore(study).tabs.titles[:3]
     ('Modes', 'Network', 'Functional map')
     """
-    return import_module("s4a.widgets.explore").explore(study, view=view, up=up)
+    options = {"width": width, "font": font, "view": view, "up": up}
+    return import_module("s4a.widgets.explore").explore(study, **options)
 
 
 @xr.register_datatree_accessor("s4a")
@@ -55,6 +68,13 @@ class StudyAccessor:
     def __init__(self, study: xr.DataTree):
         self._study = study
 
-    def explore(self, *, view: str = "corner", up: str = "z") -> "Explore":
+    def explore(
+        self,
+        *,
+        width: float | str | None = None,
+        font: float | None = None,
+        view: str = "corner",
+        up: str = "z",
+    ) -> "Explore":
         """See :func:`s4a.explore`."""
-        return explore(self._study, view=view, up=up)
+        return explore(self._study, width=width, font=font, view=view, up=up)

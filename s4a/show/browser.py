@@ -32,6 +32,7 @@ STYLE = (FOLDER / "esm" / "style.css").read_text(encoding="utf-8")
 SCENE = script("dom", "surface", "view", "scene_widget")
 CHART = script("dom", "chart", "chart_widget")
 MODES = script("dom", "surface", "view", "chart", "modes_widget")
+FRAME = script("dom", "frame_widget")
 
 
 # ---- numbers for the scripts

@@ -28,7 +28,6 @@ def panel_html(panel: Any, limit: int = LIMIT) -> str:
     page = PanelPage(panel, limit)
     return TEMPLATES.get_template("panel.html").render(
         title=panel.title,
-        wide=panel.wide,
         lacking=page.lacking(panel),
         body=page.body,
         scripts=page.scripts,
@@ -108,7 +107,8 @@ class Control:
         else:
             kind = "select"
         name = self.widget.description
-        return PARTS.control(self.id, kind, name, self.labels, self.open, self.at)
+        tooltip = self.widget.tooltip or ""
+        return PARTS.control(self.id, kind, name, self.labels, self.open, self.at, tooltip)
 
 
 class Recording:
@@ -264,7 +264,7 @@ class PanelPage:
             return PARTS.widget(name, state_of(widget), hidden)
         if isinstance(widget, ipywidgets.Box):
             kinds = {ipywidgets.HBox: "row", ipywidgets.GridBox: "grid"}
-            kind = kinds.get(type(widget), "column")
+            kind = " ".join([kinds.get(type(widget), "column"), *widget._dom_classes])
             return PARTS.box(name, kind, list(map(self.element, widget.children)), hidden)
         if isinstance(widget, ipywidgets.HTML):  # a panel's own text, which is HTML already
             return PARTS.box(name, "text", [Markup(widget.value)], hidden)

@@ -14,7 +14,7 @@ from matplotlib.colors import to_rgb
 from s4a.show.browser import color_scale
 from s4a.show.draw import OKABE_ITO, SIGNED, position_colors, ramp_colors, signed_colors
 from s4a.show.surfaces import mesh_of
-from s4a.widgets.panel import WIDE, Panel, dropdown, grid, row
+from s4a.widgets.panel import WIDE, Panel, check, dropdown, grid, row
 from s4a.widgets.scene import Scene, camera_group, extent, round_number
 
 SHOWN = [
@@ -25,6 +25,12 @@ SHOWN = [
 ERROR = ("error", "error")
 TRUTH = "truth"
 FIRST = ("SCALABLE", "RE-MATCH", "registered surface")  # what is shown first, where it is there
+COLORS = (
+    "what is seen on the target: what a method carries from the source, what it does to areas, or "
+    "how far it is from the truth"
+)
+METHOD = "which method's match is shown in this view"
+FOLLOW = "mark what is under the pointer in all views, and not only what is clicked"
 MOST = 7  # methods side by side
 CELLS = 14  # of the checkerboard along the surface's extent
 FULL_ERROR = 0.98  # quantile of the errors of a method that the colours reach, in the median
@@ -72,7 +78,6 @@ class Comparison(Panel):
     """
 
     title = "Methods side by side"
-    wide = True
     vertex = traitlets.Int(-1)
 
     def __init__(self, found: xr.DataTree, **options: Any):
@@ -100,13 +105,13 @@ class Comparison(Panel):
             raise ValueError(
                 f"methods must be 1 to {MOST} of {', '.join(known)}; found {', '.join(ways)}"
             )
-        self.pair = dropdown("pair", list(self.pairs))
+        self.pair = dropdown("pair", "the shapes between which methods match", list(self.pairs))
         looks = [*SHOWN, ERROR] if TRUTH in known else SHOWN
-        self.colors = dropdown("colours", looks, layout=WIDE)
-        self.hover = ipywidgets.Checkbox(True, description="follow the pointer", indent=False)
+        self.colors = dropdown("colours", COLORS, looks, layout=WIDE)
+        self.hover = check("follow the pointer", FOLLOW, True)
         self.ways = []
         for i, way in enumerate(ways):
-            self.ways.append(dropdown(f"method {i + 1}", known, value=way, layout=WIDE))
+            self.ways.append(dropdown(f"method {i + 1}", METHOD, known, value=way, layout=WIDE))
             setattr(self, f"way{i}", self.ways[-1])
         self.live = (*(("colors", f"way{i}", "pair") for i in range(len(ways))), ("hover",))
         look = {"group": camera_group(), "view": view, "up": up, "height": 340, "clickable": True}

@@ -17,7 +17,7 @@ from s4a.show.surfaces import (
     template_vertices,
     unit_text,
 )
-from s4a.widgets.panel import Panel, beside, dropdown, row
+from s4a.widgets.panel import Panel, beside, check, dropdown, row
 from s4a.widgets.scene import Scene, camera_group, extent, round_number
 
 MAPS = [
@@ -26,6 +26,12 @@ MAPS = [
     ("latent basis, full resolution (eq. 7)", "dense"),
 ]
 SHOWN = [("coordinates", "place"), ("checkerboard", "checker"), ("confidence", "confidence")]
+WHICH = "the registered surface, or nearest rows of the latent basis at either resolution"
+COLORS = (
+    "what is carried between the surfaces: coordinates, a checkerboard, or the registration's "
+    "confidence from 0 to 1"
+)
+FOLLOW = "mark what is under the pointer on the other surface too, and not only what is clicked"
 CELLS = 14  # of the checkerboard along the surface's extent
 
 
@@ -54,10 +60,12 @@ class Correspondence(Panel):
         self.template = str(registration.attrs["template"])
         names = [name for name in names_of(registration) if name != self.template]
         latent = has(self.study, "latent/latent_basis") and "coarse" in self.study.children
-        self.choice = dropdown("shape", labelled(self.study, names))
-        self.map = dropdown("map", MAPS if latent else MAPS[:1], layout={"width": "360px"})
-        self.colors = dropdown("colours", SHOWN, layout={"width": "320px"})
-        self.hover = ipywidgets.Checkbox(True, description="follow the pointer", indent=False)
+        self.choice = dropdown(
+            "shape", "the shape beside the template", labelled(self.study, names)
+        )
+        self.map = dropdown("map", WHICH, MAPS if latent else MAPS[:1], layout={"width": "28em"})
+        self.colors = dropdown("colours", COLORS, SHOWN, layout={"width": "24em"})
+        self.hover = check("follow the pointer", FOLLOW, True)
         look = {"group": camera_group(), "view": view, "up": up, "height": 400, "clickable": True}
         self.scenes = [Scene(**look), Scene(**look)]
         self.matches = {}  # (shape, map) -> match

@@ -13,7 +13,7 @@ from s4a.widgets.functional import FunctionalMap
 from s4a.widgets.median import Median
 from s4a.widgets.modes import Modes
 from s4a.widgets.network import Network
-from s4a.widgets.panel import LAYOUT, close_all
+from s4a.widgets.panel import close_all, layout_of
 from s4a.widgets.spectrum import Spectrum
 from s4a.widgets.transfer import Transfer
 
@@ -41,8 +41,10 @@ class Explore(ipywidgets.VBox):
     ----------
     study : xarray.DataTree
         Finished or not; the tab of a stage that is not there yet says what is missing.
+    width : float or str, optional
+        In pixels, or any width of CSS; all that the cell has by default.
     **options
-        Given to every panel: ``view`` and ``up``.
+        Given to every panel: ``font``, ``view`` and ``up``.
 
     Attributes
     ----------
@@ -50,12 +52,12 @@ class Explore(ipywidgets.VBox):
         Title of the tab -> panel, of those that were opened.
     """
 
-    def __init__(self, study: xr.DataTree, **options: Any):
+    def __init__(self, study: xr.DataTree, *, width: float | str | None = None, **options: Any):
         self.study, self.options, self.panels = study, options, {}
         boxes = [ipywidgets.VBox() for _ in PANELS]
         self.tabs = ipywidgets.Tab(children=boxes, titles=list(PANELS))
         self.tabs.add_class("s4a-tabs")  # in style.css
-        super().__init__([self.tabs], layout=LAYOUT)
+        super().__init__([self.tabs], layout=layout_of(width))
         self.tabs.observe(self.fill, "selected_index")
         self.fill()
         self.cell = None  # at whose next run they close

@@ -9,7 +9,7 @@ from s4a.method.shape import Shape
 from s4a.show.browser import PARTS
 from s4a.show.surfaces import low_text, surface
 from s4a.widgets.chart import Chart
-from s4a.widgets.panel import WIDE, Panel, beside, dropdown, int_slider, row
+from s4a.widgets.panel import WIDE, Panel, beside, check, dropdown, int_slider, row
 from s4a.widgets.scene import Scene, camera_group
 
 STEP = 5
@@ -17,6 +17,9 @@ KINDS = [
     ("consistent ZoomOut, as in the study", "study"),
     ("ZoomOut of this pair alone", "zoomout"),
 ]
+WHICH = "made consistent with the maps among all shapes, or by ZoomOut of this pair alone"
+ROW = "row of the matrix: the eigenfunction of the target that is shown"
+COLUMN = "column of the matrix: the eigenfunction of the source that is shown"
 TOLD = 3  # exchanged runs of modes that are told in words
 
 
@@ -46,20 +49,21 @@ class FunctionalMap(Panel):
         first, last = network.sizes["mode_source_initial"], network.sizes["mode_source"]
         ends = zip(self.source, self.target, strict=True)
         options = [(f"{source} → {target}", i) for i, (source, target) in enumerate(ends)]
-        self.choice = dropdown("pair", options)
-        self.kind = dropdown("map", KINDS, layout=WIDE)
+        self.choice = dropdown("pair", "the shape from which the map goes, and to which", options)
+        self.kind = dropdown("map", WHICH, KINDS, layout=WIDE)
         self.k = ipywidgets.SelectionSlider(
             options=sorted({*range(first, last, STEP), last}),
             value=last,
             description="modes k",
+            tooltip="size of the map: ZoomOut adds modes step by step",
             continuous_update=False,
             layout=WIDE,
         )
-        self.block = ipywidgets.Checkbox(description="first ten modes only", indent=False)
-        self.row = int_slider("target ψ", 1, 0, last - 1, "300px")
-        self.column = int_slider("source φ", 1, 0, last - 1, "300px")
+        self.block = check("first ten modes only", "the upper left corner of the matrix, magnified")
+        self.row = int_slider("target ψ", ROW, 1, 0, last - 1, "23em")
+        self.column = int_slider("source φ", COLUMN, 1, 0, last - 1, "23em")
         self.matrix, self.numbers = Chart(), ipywidgets.HTML()
-        look = {"group": camera_group(), "view": view, "up": up, "height": 250}
+        look = {"group": camera_group(), "view": view, "up": up, "height": 300}
         self.scenes = [Scene(**look), Scene(**look)]
         self.maps = {}  # size -> C, of ZoomOut of this pair alone
         self.on_change(self.choice, lambda value: self.set_trait("pair", value))
@@ -71,11 +75,10 @@ class FunctionalMap(Panel):
         self.pair = pair
         self.take(pair)
         return [
-            row(self.choice, self.kind),
-            row(self.k, self.block),
+            row(self.choice, self.kind, self.k, self.block),
             row(self.column, self.row),
             self.numbers,
-            beside(ipywidgets.VBox([self.matrix]), ipywidgets.VBox(self.scenes)),
+            beside(self.matrix, *self.scenes, least="20em"),
         ]
 
     def names(self) -> tuple[str, str]:

@@ -11,6 +11,14 @@ from s4a.widgets.chart import Chart
 from s4a.widgets.panel import Panel, beside, dropdown, int_slider, row
 from s4a.widgets.scene import Scene, camera_group
 
+OPERATOR = (
+    "which shape difference is compared with the identity: of areas, or of angles (conformal)"
+)
+NORM = (
+    "how modes count in the distance to the identity (eq. 5): h2 and h1 damp fine ones, frobenius "
+    "none; h2_image and h2_both also weigh the image"
+)
+MODES = "how many latent functions the shape differences are cut to"
 OPERATORS = {"area": "area_difference", "conformal": "conformal_difference"}
 
 
@@ -33,11 +41,13 @@ class Median(Panel):
         """Choices, bars and the surface."""
         latent = self.study["latent"].dataset
         self.names, n_modes = names_of(latent), latent.sizes["latent"]
-        self.operator = dropdown("operator", list(OPERATORS))
-        self.norm = dropdown("norm", list(NORMS), value=str(latent.attrs.get("norm", "h2")))
-        self.modes = int_slider("modes K", n_modes, 2, n_modes, "330px")
-        self.stage = dropdown("surfaces", resolutions(self.study))
-        self.shape = dropdown("shape", labelled(self.study, self.names))
+        self.operator = dropdown("operator", OPERATOR, list(OPERATORS))
+        self.norm = dropdown("norm", NORM, list(NORMS), value=str(latent.attrs.get("norm", "h2")))
+        self.modes = int_slider("modes K", MODES, n_modes, 2, n_modes)
+        self.stage = dropdown("surfaces", "which meshes are drawn", resolutions(self.study))
+        self.shape = dropdown(
+            "shape", "what is shown beside the bars", labelled(self.study, self.names)
+        )
         self.bars = Chart()
         self.scene = Scene(group=camera_group(), view=view, up=up, height=420)
         self.ties = ipywidgets.HTML()

@@ -72,7 +72,9 @@ class Modes(Panel):
         )
         traitlets.link((self.view, "scores"), (self, "scores"))
         options = [(f"{name}, {size:,} vertices", name) for name, size in sizes.items()]
-        self.resolution = dropdown("resolution", options, value=resolution)
+        self.resolution = dropdown(
+            "resolution", "which vertices are moved", options, value=resolution
+        )
         self.on_change(self.resolution, lambda name: self.view.change_mesh(*self.arrays(name)))
         self.path = file_name("shape.ply")
         mesh_help = "the shape as it stands, at full resolution"

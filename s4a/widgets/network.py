@@ -21,6 +21,17 @@ STAGES = [
     ("after Consistent ZoomOut", "cycle_error"),
     ("before Consistent ZoomOut", "cycle_error_initial"),
 ]
+WHICH = (
+    "colour of a map: its cycle error, that is how far compositions with other maps are from the "
+    "identity; before or after Consistent ZoomOut"
+)
+BUDGET = (
+    "how many pairs of shapes have maps: those of nearest spectra, and what keeps all connected"
+)
+PLACES = (
+    "where the shapes stand: on a circle, or by the first two components of their shape differences"
+)
+NARROW = {"width": "20em"}
 N_EIGENVALUES = 20  # by which shapes are told apart when pairs are chosen
 # without the bright end, which is hard to see on white
 ERRORS = ListedColormap(colormaps["viridis_r"](np.linspace(0.15, 1, 256)))
@@ -57,18 +68,20 @@ class Network(Panel):
         k = min(N_EIGENVALUES, *map(len, spectra))
         self.distance = spectral_distance([values[:k] for values in spectra])
         n, used = len(self.names), len(set(self.pairs))
-        self.stage = dropdown("colours", STAGES, layout={"width": "320px"})
+        self.stage = dropdown("colours", WHICH, STAGES, layout={"width": "22em"})
         self.budget = int_slider(
-            "pairs", used, n - 1, max(n - 1, n * (n - 1) // 2), continuous_update=True
+            "pairs", BUDGET, used, n - 1, max(n - 1, n * (n - 1) // 2), continuous_update=True
         )
         maps = zip(self.source, self.target, strict=True)
         options: list = labelled(self.study, self.names)
         options += [(f"{source} → {target}", i) for i, (source, target) in enumerate(maps)]
-        self.choice = dropdown("show", options)
-        self.where = dropdown("places", ["circle", "shape differences"])
+        self.choice = dropdown(
+            "show", "a shape, or a map between two of them", options, layout=NARROW
+        )
+        self.where = dropdown("places", PLACES, ["circle", "shape differences"], layout=NARROW)
         self.facts, self.bar = ipywidgets.HTML(), ipywidgets.HTML()
         self.graph, self.matrix = Chart(), Chart()
-        look = {"group": camera_group(), "view": view, "up": up, "height": 300}
+        look = {"group": camera_group(), "view": view, "up": up, "height": 185}
         self.scenes = [Scene(**look), Scene(**look)]
         self.redraw(self.draw, self.where, self.budget)
         self.redraw(self.change_stage, self.stage)
@@ -78,11 +91,11 @@ class Network(Panel):
         self.on_change(self, self.show_node, "node")
         self.draw()
         self.node = self.median or self.names[0]
+        columns = ipywidgets.VBox([self.graph, self.bar]), self.matrix, ipywidgets.VBox(self.scenes)
         return [
             row(self.stage, self.choice, self.where),
             row(self.budget, self.facts),
-            beside(ipywidgets.VBox([self.graph, self.bar]), self.matrix),
-            beside(*self.scenes),
+            beside(*columns, least="20em"),
         ]
 
     def places(self) -> np.ndarray:
@@ -194,5 +207,7 @@ class Network(Panel):
         error, weight = pair[self.stage.value].item(), pair["weight"].item()
         on_source.caption = "its coordinates as colours"
         carried = "the colours that the map carries"
-        on_target.caption = f"{carried}; cycle error {error:.3f}, weight {weight:.2f}"
+        on_target.caption = (
+            f"{carried}; cycle error {error:.3f}, weight {weight:.2f} in Consistent ZoomOut"
+        )
         self.draw()

@@ -6,17 +6,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import anywidget
 import ipywidgets
+import traitlets
 import xarray as xr
 
-from s4a.show.browser import PARTS
-from s4a.show.panel_page import LIMIT, panel_html
+from s4a.show.browser import FRAME, PARTS, STYLE
+from s4a.show.panel_page import LIMIT, panel_html, widgets_in
 from s4a.show.surfaces import has
 
 log = logging.getLogger(__name__)
-LAYOUT = {"max_width": "1000px", "overflow": "hidden"}
-WIDER = "1600px"  # of panels of many views
-WIDE = {"width": "340px"}
+WIDE = {"width": "26em"}
 
 
 def close_all(widget: ipywidgets.Widget) -> None:
@@ -33,22 +33,53 @@ def close_all(widget: ipywidgets.Widget) -> None:
     ipywidgets.Widget.close(widget)
 
 
-def dropdown(description: str, options: list, **more: Any) -> ipywidgets.Dropdown:
-    """A list to choose from."""
-    return ipywidgets.Dropdown(options=options, description=description, **more)
+def layout_of(width: float | str | None) -> dict[str, str]:
+    """The layout of a panel that takes all the width there is, or `width`: pixels or CSS.
+
+    Examples
+    --------
+    >>> from s4a.widgets.panel import layout_of
+    >>> layout_of(900)
+    {'overflow': 'hidden', 'width': '900px', 'max_width': '100%'}
+    """
+    layout = {"overflow": "hidden"}
+    if width is not None:
+        text = width if isinstance(width, str) else f"{width:g}px"
+        layout |= {"width": text, "max_width": "100%"}
+    return layout
+
+
+def dropdown(description: str, tooltip: str, options: list, **more: Any) -> ipywidgets.Dropdown:
+    """A list to choose from, and what it is."""
+    return ipywidgets.Dropdown(options=options, description=description, tooltip=tooltip, **more)
+
+
+def check(description: str, tooltip: str, on: bool = False, **more: Any) -> ipywidgets.Checkbox:
+    """A box to tick, and what it is."""
+    more = {"layout": {"width": "auto"}} | more
+    return ipywidgets.Checkbox(on, description=description, tooltip=tooltip, indent=False, **more)
 
 
 def int_slider(
-    description: str, value: int, low: int, high: int, width: str = "340px", **more: Any
+    description: str,
+    tooltip: str,
+    value: int,
+    low: int,
+    high: int,
+    width: str = "26em",
+    **more: Any,
 ) -> ipywidgets.IntSlider:
-    """A slider of integers that tells its value when it is let go."""
+    """A slider of integers that tells its value when it is let go, and what it is."""
     more = {"continuous_update": False, "layout": {"width": width}} | more
-    return ipywidgets.IntSlider(value, min=low, max=high, description=description, **more)
+    return ipywidgets.IntSlider(
+        value, min=low, max=high, description=description, tooltip=tooltip, **more
+    )
 
 
 def file_name(name: str) -> ipywidgets.Text:
     """The name of a file to write."""
-    return ipywidgets.Text(name, description="file", layout={"width": "260px"})
+    tooltip = "the file to write, in the folder of the notebook"
+    return ipywidgets.Text(name, description="file", tooltip=tooltip, layout={"width": "20em"})
 
 
 def row(*widgets: ipywidgets.Widget) -> ipywidgets.HBox:
@@ -56,10 +87,10 @@ def row(*widgets: ipywidgets.Widget) -> ipywidgets.HBox:
     return ipywidgets.HBox(widgets, layout={"flex_flow": "row wrap", "align_items": "center"})
 
 
-def beside(*widgets: ipywidgets.Widget) -> ipywidgets.HBox:
-    """Large parts side by side, of equal width where there is room for it."""
+def beside(*widgets: ipywidgets.Widget, least: str = "24em") -> ipywidgets.HBox:
+    """Large parts side by side, of equal width where there is room for the `least` of each."""
     for widget in widgets:
-        widget.layout.flex, widget.layout.min_width = "1 1 320px", "0"
+        widget.layout.flex, widget.layout.min_width = f"1 1 {least}", "0"
     return ipywidgets.HBox(widgets, layout={"flex_flow": "row wrap", "align_items": "flex-start"})
 
 
@@ -67,8 +98,27 @@ def grid(*widgets: ipywidgets.Widget) -> ipywidgets.GridBox:
     """Large parts of equal width, as many side by side as there is room for."""
     for widget in widgets:
         widget.layout.min_width = "0"
-    columns = "repeat(auto-fit, minmax(min(300px, 100%), 1fr))"
+    columns = "repeat(auto-fit, minmax(min(20em, 100%), 1fr))"
     return ipywidgets.GridBox(widgets, layout={"grid_template_columns": columns})
+
+
+class Frame(anywidget.AnyWidget):
+    """What every panel has around its parts: full screen, the size of its text, names for a reader.
+
+    Attributes
+    ----------
+    title : str
+        What the panel is called.
+    font : float
+        Size of the text in pixels; 0 for one that follows the panel's width.
+    help : dict
+        The tooltip of a control, by what stands before it: some frontends leave it out.
+    """
+
+    _esm, _css = FRAME, STYLE
+    title = traitlets.Unicode("").tag(sync=True)
+    font = traitlets.Float(0.0).tag(sync=True)
+    help = traitlets.Dict().tag(sync=True)
 
 
 class Panel(ipywidgets.VBox):
@@ -78,6 +128,12 @@ class Panel(ipywidgets.VBox):
     ----------
     study : xarray.DataTree
         With the nodes that the panel's ``needs`` name.
+    width : float or str, optional
+        In pixels, or any width of CSS; all that the cell has by default.
+    font : float, optional
+        Size of the text in pixels; by default it follows the panel's width.
+    **options
+        Of the panel itself, such as ``view`` and ``up``.
 
     Raises
     ------
@@ -87,24 +143,34 @@ class Panel(ipywidgets.VBox):
 
     needs = ()
     title = "Panel"
-    wide = False  # whether it takes more than the width of a text
     # for a saved page:
     live = ()  # groups of controls, by name, whose values it keeps; the last varies slowest
     clicks = ()  # chart, part of the mark that is clicked, and the control that it sets
     every = ()  # sliders of which it keeps every value, and not only two dozen of them
     python = ()  # what else needs Python
 
-    def __init__(self, study: xr.DataTree, **options: Any):
+    def __init__(
+        self,
+        study: xr.DataTree,
+        *,
+        width: float | str | None = None,
+        font: float | None = None,
+        **options: Any,
+    ):
         lacking = [name for name in self.needs if not has(study, name)]
         if lacking:
             raise ValueError(
                 f"the panel {self.title} needs {', '.join(lacking)}, "
                 "which this study does not have (yet)"
             )
-        super().__init__(layout=LAYOUT | ({"max_width": WIDER} if self.wide else {}))
+        super().__init__(layout=layout_of(width))
+        self.add_class("s4a-panel")  # in style.css
         self.study = study
+        self.frame = Frame(title=self.title, font=font or 0.0)
         self.message, self.failed = ipywidgets.HTML(), False
-        self.children = [*self.build(**options), self.message]
+        self.children = [self.frame, *self.build(**options), self.message]
+        told = [part for part in widgets_in(self) if getattr(part, "tooltip", None)]
+        self.frame.help = {part.description: part.tooltip for part in told}
 
     def build(self, **options: Any) -> list[ipywidgets.Widget]:
         """The parts of the panel."""

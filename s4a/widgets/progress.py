@@ -100,7 +100,7 @@ class Progress(Panel):
 
     def build(self) -> list[ipywidgets.Widget]:
         """A bar for each stage, and the buttons."""
-        look = {"max": 1, "style": {"description_width": "200px"}, "layout": {"width": "440px"}}
+        look = {"max": 1, "style": {"description_width": "15em"}, "layout": {"width": "34em"}}
         self.bars = {stage: ipywidgets.IntProgress(description=stage, **look) for stage in STAGES}
         self.texts = {stage: ipywidgets.HTML() for stage in STAGES}
         self.total = ipywidgets.HTML()

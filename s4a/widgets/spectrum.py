@@ -11,6 +11,8 @@ from s4a.widgets.chart import Chart
 from s4a.widgets.panel import Panel, beside, dropdown, int_slider, row
 from s4a.widgets.scene import Scene, camera_group
 
+FIRST = "how many eigenfunctions the surface is put together from"
+
 
 class Spectrum(Panel):
     """Eigenvalues with Weyl's line, an eigenfunction, the surface from its first k coefficients.
@@ -35,9 +37,13 @@ class Spectrum(Panel):
         }
         self.names = list(self.eigenvalues)
         k = min(len(values) for values in self.eigenvalues.values())
-        self.choice = dropdown("shape", labelled(self.study, self.names))
-        self.mode = int_slider("mode", 1, 0, k - 1, continuous_update=True)
-        self.k = int_slider("first k", min(20, k), 1, k)
+        self.choice = dropdown(
+            "shape", "whose functions are shown", labelled(self.study, self.names)
+        )
+        self.mode = int_slider(
+            "mode", "which eigenfunction is shown", 1, 0, k - 1, continuous_update=True
+        )
+        self.k = int_slider("first k", FIRST, min(20, k), 1, k)
         self.curves, self.gaps = Chart(), Chart()
         look = {"group": camera_group(), "view": view, "up": up, "height": 300}
         self.function, self.rebuilt = Scene(**look), Scene(**look)

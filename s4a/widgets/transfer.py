@@ -16,7 +16,7 @@ from s4a.schema import dataset
 from s4a.show.browser import PARTS
 from s4a.show.draw import label_colors
 from s4a.show.surfaces import aligned, labelled, names_of, unit_text
-from s4a.widgets.panel import Panel, beside, dropdown, file_name, row
+from s4a.widgets.panel import Panel, beside, check, dropdown, file_name, row
 from s4a.widgets.scene import Scene, camera_group, extent, round_number
 
 COLUMNS = ["name", "x", "y", "z", "confidence"]
@@ -49,13 +49,17 @@ class Transfer(Panel):
         names, template = names_of(registration), str(registration.attrs["template"])
         options = labelled(self.study, names)
         self.choices = {
-            "source": dropdown("source", options, value=template),
-            "target": dropdown("target", options),
+            "source": dropdown(
+                "source", "labels and landmarks are of this shape", options, value=template
+            ),
+            "target": dropdown("target", "they are carried to this shape", options),
         }
-        self.labels = ipywidgets.Checkbox(
-            True, description="labels", indent=False, layout={"width": "auto"}
+        self.labels = check("labels", "colour both surfaces by the labels of the source", True)
+        self.name = ipywidgets.Combobox(
+            description="landmark",
+            placeholder="a name, then click",
+            tooltip="the landmark that the next click on the source places or moves",
         )
-        self.name = ipywidgets.Combobox(description="landmark", placeholder="a name, then click")
         self.remove = self.button(
             "Remove", lambda: self.drop(self.landmark), "the landmark that is named"
         )
@@ -66,8 +70,8 @@ class Transfer(Panel):
             step=0.5,
             description=f"radius ({unit_text(self.study, template)})",
             style={"description_width": "initial"},
-            tooltip="of the spheres",
-            layout={"width": "180px"},
+            tooltip="of the spheres that mark landmarks",
+            layout={"width": "24em"},
         )
         self.path = file_name("landmarks.csv")
         self.csv = self.saving(

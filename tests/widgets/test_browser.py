@@ -60,6 +60,15 @@ Progress(s4a.synthetic.brains(3, 8000, seed=1), {store!r}, n_coarse=300, k=12, k
 """
 
 
+SIZES = """
+from IPython.display import display
+
+for options in ({"width": 360}, {"width": 1000}, {"font": 20}, {}):
+    display(study.s4a.explore(**options))
+"""
+TITLES = ("Modes", "Network", "Functional map", "Median", "Correspondence", "Transfer", "Spectrum")
+
+
 @pytest.fixture(scope="module")
 def study(tmp_path_factory):
     folder = tmp_path_factory.mktemp("study")
@@ -87,6 +96,9 @@ def folder(study, tmp_path_factory):
         cell | {"source": PROGRESS.format(store=str(folder / "run")), "id": "progress"}
     ]
     (folder / "progress.ipynb").write_text(json.dumps(notebook), encoding="utf-8")
+    sizes = f"{opened}\n{SIZES}"
+    notebook["cells"] = [cell | {"source": sizes, "id": "sizes"}]
+    (folder / "sizes.ipynb").write_text(json.dumps(notebook), encoding="utf-8")
     (folder / "app").mkdir()
     news = {
         "@jupyterlab/apputils-extension:notification": {
@@ -431,6 +443,150 @@ def test_nothing_is_cut_off_at_800_pixels(page):
         for part in visible(page, ".s4a").all():
             assert part.evaluate("(e) => e.scrollWidth <= e.clientWidth + 2")
             assert part.bounding_box()["x"] + part.bounding_box()["width"] <= 800
+
+
+# ---- any width
+
+
+@pytest.fixture(scope="module")
+def sizes(browser, lab, messages):
+    """A notebook with the tabs of 360 and 1,000 pixels, of a large text, and as wide as it is."""
+    page = watched(browser.new_page(viewport={"width": 1920, "height": 1080}), messages)
+    page.set_default_timeout(60_000)
+    run_notebook(page, lab, "sizes.ipynb")
+    page.keyboard.press("Control+b")  # the files beside the notebook go
+    page.wait_for_function(f"{SEEN}.length === 4 && {SEEN}.every((view) => view.frames > 0)")
+    yield page
+    page.close()
+
+
+def tabs_of(page, i, title="Modes"):
+    """The i-th tabs of a page, with a panel opened and drawn."""
+    tabs = page.locator(".s4a-tabs").nth(i)
+    tabs.locator(".lm-TabBar-tabLabel", has_text=title).click()
+    tabs.locator(f".s4a-panel >> visible=true >> {VIEW} >> visible=true").first.wait_for()
+    page.wait_for_function(DRAWN)
+    page.wait_for_timeout(200)  # charts follow the width
+    return tabs
+
+
+def panel_of(tabs):
+    return tabs.locator(".s4a-panel").filter(visible=True)
+
+
+SMALLEST = """(panel) => {
+  const sizes = [], walk = document.createTreeWalker(panel, NodeFilter.SHOW_TEXT);
+  while (walk.nextNode()) {
+    const at = walk.currentNode.parentElement, svg = at.ownerSVGElement;
+    if (!walk.currentNode.textContent.trim() || !at.getClientRects().length) continue;
+    if (at.closest("title, style, script, option")) continue;
+    const scale = svg ? svg.getBoundingClientRect().width / svg.viewBox.baseVal.width : 1;
+    sizes.push([scale * parseFloat(getComputedStyle(at).fontSize), walk.currentNode.textContent]);
+  }
+  return sizes.sort((a, b) => a[0] - b[0])[0];
+}"""
+
+
+@pytest.mark.parametrize("title", TITLES)
+def test_a_cell_of_360_pixels_has_a_surface_of_300(sizes, title):
+    tabs = tabs_of(sizes, 0, title)
+    assert tabs.bounding_box()["width"] <= 360
+    for canvas in tabs.locator(VIEW).filter(visible=True).all():
+        assert canvas.bounding_box()["width"] >= 300
+    panel = panel_of(tabs)
+    assert panel.evaluate("(e) => e.scrollWidth <= e.clientWidth + 2"), "nothing is cut off"
+    assert panel.evaluate(SMALLEST)[0] > 11
+
+
+@pytest.mark.parametrize("title", TITLES)
+def test_a_screen_of_1920_pixels_is_filled_and_read_from_afar(sizes, title):
+    panel = panel_of(tabs_of(sizes, 3, title))
+    assert panel.bounding_box()["width"] >= 1500
+    smallest, text = panel.evaluate(SMALLEST)
+    assert smallest >= 16, text
+
+
+def test_the_size_of_the_text_can_be_given(sizes):
+    panel = panel_of(tabs_of(sizes, 2))
+    assert panel.locator(".s4a-title").first.evaluate("(e) => getComputedStyle(e).fontSize") == (
+        "20px"
+    )
+
+
+def test_a_panel_fills_the_screen(sizes):
+    panel = panel_of(tabs_of(sizes, 1, "Median"))
+    panel.get_by_role("button", name="Full screen").click()
+    sizes.wait_for_function("document.fullscreenElement?.matches('.s4a-panel')")
+    assert panel.bounding_box()["width"] == 1920
+    assert panel.evaluate(SMALLEST)[0] >= 18
+    panel.get_by_role("button", name="Leave full screen").click()
+    sizes.wait_for_function("!document.fullscreenElement")
+    assert panel.bounding_box()["width"] < 1000
+
+
+# ---- one glance
+
+
+def test_seven_tabs_stand_in_one_row_of_1000_pixels(sizes):
+    tabs = tabs_of(sizes, 1).locator(".lm-TabBar-tab")
+    assert tabs.count() == 7
+    assert len({tab.bounding_box()["y"] for tab in tabs.all()}) == 1
+    for label in tabs.locator(".lm-TabBar-tabLabel").all():
+        assert label.evaluate("(e) => e.scrollWidth <= e.clientWidth + 1"), label.inner_text()
+
+
+@pytest.mark.parametrize("title", ["Network", "Functional map"])
+def test_graph_matrix_and_both_surfaces_are_seen_at_once(sizes, title):
+    sizes.set_viewport_size({"width": 1366, "height": 680})
+    panel = panel_of(tabs_of(sizes, 3, title))
+    if title == "Network":
+        panel.locator(".s4a-edge").nth(6).dispatch_event("click")
+        panel.locator(".s4a-title", has_text="the target").wait_for()
+    assert panel.locator(VIEW).filter(visible=True).count() == 2
+    assert panel.locator(".s4a-matrix").is_visible()
+    box = panel.bounding_box()
+    assert box["width"] <= 1366
+    assert box["height"] <= 680
+    sizes.set_viewport_size({"width": 1920, "height": 1080})
+
+
+def test_both_ends_of_a_mode_take_the_full_width_and_stay_in_the_picture(sizes):
+    panel = panel_of(tabs_of(sizes, 1))
+    panel.get_by_role("button", name="−3 · mean · +3").click()
+    shown = panel.locator(VIEW)
+    shown.nth(2).wait_for()
+    sizes.wait_for_function(f"{SEEN}.every((view) => view.frames > 0)")
+    boxes = [canvas.bounding_box() for canvas in shown.all()]
+    assert boxes[-1]["x"] + boxes[-1]["width"] - boxes[0]["x"] > (
+        0.96 * panel.bounding_box()["width"]
+    )
+    outside = """(c) => {
+      const view = c.view, { w, h, scale } = view.placement(), P = view.surfaces[0].position;
+      const R = view.camera.turn, m = view.frame.centre;
+      let most = 0;
+      for (let i = 0; i < P.length; i += 3) {
+        const p = [0, 1, 2].map((k) => P[i + k] - m[k]);
+        const at = (k) => scale * Math.abs(R[k] * p[0] + R[k + 1] * p[1] + R[k + 2] * p[2]);
+        most = Math.max(most, (2 * at(0)) / w, (2 * at(3)) / h);
+      }
+      return most;
+    }"""
+    for mode in panel.locator(".s4a-slider input").all():
+        mode.focus()
+        assert all(canvas.evaluate(outside) <= 1 for canvas in shown.all())
+    panel.get_by_role("button", name="−3 · mean · +3").click()
+
+
+@pytest.mark.parametrize("title", TITLES)
+def test_every_control_says_what_it_is(sizes, title):
+    panel = panel_of(tabs_of(sizes, 1, title))
+    unsaid = panel.evaluate(
+        "(e) => [...e.querySelectorAll('input, select, button, [role=slider]')]"
+        ".filter((c) => c.getClientRects().length)"
+        ".filter((c) => !c.closest('[title]')?.title)"
+        ".map((c) => c.outerHTML)"
+    )
+    assert unsaid == []
 
 
 def test_without_webgl_the_notebook_shows_still_pictures(flat, lab, study):

@@ -17,10 +17,29 @@ function bounds(values, margin = 0.08) {
   return [low - pad, high + pad];
 }
 
+// The width of a chart in its own unit, a thirteenth of the text's size: that of its parent, up to `most`. The text of a
+// chart is of one size at every width.
+function room(parent, most, least = 230) {
+  const look = getComputedStyle(parent), inner = parent.clientWidth - parseFloat(look.paddingLeft) - parseFloat(look.paddingRight);
+  return inner > 0 ? Math.min(most, Math.max(least, Math.round((13 * inner) / (parseFloat(look.fontSize) || 13)))) : most;
+}
+const atMost = (svg, width) => (svg.style.maxWidth = `calc(${width} / 13 * var(--s4a-size, 13px))`);
+
+// Calls `act` when the room of a parent is another one.
+function onRoom(parent, act) {
+  let last = room(parent, 1e4);
+  const observer = new ResizeObserver(() => {
+    const now = room(parent, 1e4);
+    if (parent.clientWidth && Math.abs(now - last) > 2) { last = now; act(); }
+  });
+  observer.observe(parent);
+  return () => observer.disconnect();
+}
+
 // A drawing of the given size with both axes; gives the scales.
 function plot(parent, { width, height, x, y, xlabel = "", ylabel = "", title = "", left = 48, grid = true }) {
   const svg = node(parent, "svg", { viewBox: `0 0 ${width} ${height}`, class: "s4a-chart", role: "group", "aria-label": title });
-  svg.style.maxWidth = `${width}px`;
+  atMost(svg, width);
   const top = title ? 22 : 8, bottom = height - 36, right = width - 10;
   const X = (v) => left + ((v - x[0]) / (x[1] - x[0])) * (right - left);
   const Y = (v) => bottom - ((v - y[0]) / (y[1] - y[0])) * (bottom - top);
@@ -54,7 +73,7 @@ function brief(names, room = 16) {
 }
 
 // Names beside their marks, each where it hides nothing; one that finds no place is left to the hover and the focus.
-function labels(svg, { x, y, names, width, height, sides, letter = 5.3, gap = 7, ...look }) {
+function labels(svg, { x, y, names, width, height, sides, letter = 6.4, gap = 7, ...look }) {
   const taken = x.map((v, i) => [v - 6, y[i] - 6, v + 6, y[i] + 6]);
   brief(names).forEach((text, i) => {
     const wide = letter * text.length;
@@ -99,7 +118,7 @@ function reachable(marks, readout, pick) {
 const line = (parent) => html(parent, "div", { class: "s4a-readout", "aria-live": "polite" }, " ");
 
 function scatter(parent, spec, pick) {
-  const { x, y, names, xlabel, ylabel, title, selected = -1, faint = [], width = 360, height = 300 } = spec;
+  const { x, y, names, xlabel, ylabel, title, selected = -1, faint = [], width = room(parent, spec.most ?? 430), height = 300 } = spec;
   const frame = plot(parent, { width, height, x: bounds([...x, ...(spec.reach || [0])]), y: bounds([...y, ...(spec.reach || [0])]), xlabel, ylabel, title });
   const marks = x.map((_, i) => {
     const at = node(frame.svg, "circle", { cx: frame.X(x[i]), cy: frame.Y(y[i]), r: i === selected ? 7 : 5, fill: i === selected ? ORANGE : faint[i] ? PALE : BLUE, stroke: "#fff" });
@@ -115,7 +134,7 @@ function scatter(parent, spec, pick) {
 }
 
 function bars(parent, spec, pick) {
-  const { values, names, label, title, marked = [], selected = -1, width = 430 } = spec, told = brief(names);
+  const { values, names, label, title, marked = [], selected = -1, width = room(parent, 430) } = spec, told = brief(names);
   const row = values.length > 25 ? 15 : 20, height = 26 + row * values.length + 40, left = 10 + 6.5 * Math.max(...told.map((n) => n.length), 4);
   const frame = plot(parent, { width, height, left, x: [0, Math.max(...values) * 1.18 || 1], y: [0, 1], xlabel: label, title, grid: false });
   frame.svg.querySelectorAll("text[text-anchor=end]").forEach((t) => t.remove());
@@ -131,7 +150,7 @@ function bars(parent, spec, pick) {
 }
 
 function lines(parent, spec, pick) {
-  const { series, xlabel, ylabel, title, width = 430, height = 280, ymin, marker } = spec;
+  const { series, xlabel, ylabel, title, width = room(parent, 460), height = 280, ymin, marker } = spec;
   const y = bounds(series.flatMap((s) => s.y), 0.04);
   const frame = plot(parent, { width, height, x: bounds(series.flatMap((s) => s.x), 0.02), y: [ymin ?? y[0], y[1]], xlabel, ylabel, title });
   const drawn = series.map((s) => {
@@ -153,9 +172,9 @@ function lines(parent, spec, pick) {
 }
 
 function graph(parent, spec, pick) {
-  const { x, y, names, source, target, colors, values, weights, title, edges, highlight = -1, faint = [], node: chosen = -1, edge = -1, width = 460, height = 400 } = spec;
+  const { x, y, names, source, target, colors, values, weights, title, edges, highlight = -1, faint = [], node: chosen = -1, edge = -1, width = room(parent, 460) } = spec, { height = Math.round(Math.min(390, Math.max(290, 0.87 * width))) } = spec;
   const svg = node(parent, "svg", { viewBox: `0 0 ${width} ${height}`, class: "s4a-chart", role: "group", "aria-label": title });
-  svg.style.maxWidth = `${width}px`;
+  atMost(svg, width);
   node(svg, "text", { x: 8, y: 14, "font-weight": "bold" }, title);
   const [x0, x1] = bounds(x, 0), [y0, y1] = bounds(y, 0);
   const edgeRoom = 20 + 6.4 * Math.max(...brief(names).map((n) => n.length));
@@ -190,7 +209,7 @@ function graph(parent, spec, pick) {
 function matrix(parent, spec, pick) {
   const { rows, columns, values, palette, limit, blocks = [], label, title, row = -1, column = -1, size = 380 } = spec;
   html(parent, "div", { class: "s4a-title" }, title);
-  const box = html(parent, "div", { class: "s4a-matrix", style: `width:${size}px;max-width:100%;aspect-ratio:${columns}/${rows}` });
+  const box = html(parent, "div", { class: "s4a-matrix", style: `width:${size / 13}em;aspect-ratio:${columns}/${rows}` });
   const inside = (at) => at.row >= 0 && at.row < rows && at.column < columns;
   const canvas = html(box, "canvas", { tabindex: 0, role: "application", "aria-label": `${title}: arrow keys move, Enter shows the cell` });
   Object.assign(canvas, { width: columns, height: rows });

@@ -19,7 +19,8 @@ export default {
       if (focused) el.querySelector("[tabindex='0']")?.focus({ preventScroll: true });
     };
     draw();
+    const stop = onRoom(el, draw);
     for (const name of ["spec", "values"]) model.on(`change:${name}`, draw);
-    return () => { for (const name of ["spec", "values"]) model.off(`change:${name}`, draw); };
+    return () => { stop(); for (const name of ["spec", "values"]) model.off(`change:${name}`, draw); };
   },
 };

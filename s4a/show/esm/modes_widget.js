@@ -10,6 +10,7 @@ class Modes {
     this.corner = numbers(Uint32Array, get("corner"));
     this.deformation = numbers(Float32Array, get("deformation"));
     this.normal = normalsOf(this.mean, this.corner);
+    this.reach = this.far(3);
     this.palettes = { normal: numbers(Uint8Array, get("signed_palette")), magnitude: numbers(Uint8Array, get("ramp_palette")) };
     this.limits = { normal: get("limit"), magnitude: get("limit_magnitude") };
   }
@@ -21,6 +22,22 @@ class Modes {
       for (let i = 0; i < out.length; i++) out[i] += score * D[start + i];
     });
     return out;
+  }
+  // How far from the mean's centre each mode alone takes the surface, at so many standard deviations to either side.
+  far(sigma) {
+    const M = this.mean, D = this.deformation, centre = boxOf(M).centre;
+    let r2 = 0;
+    for (let start = 0; start < D.length; start += M.length) {
+      for (let i = 0; i < M.length; i += 3) {
+        let there = 0, along = 0, moved = 0;
+        for (let x = 0; x < 3; x++) {
+          const p = M[i + x] - centre[x], d = sigma * D[start + i + x];
+          there += p * p; along += p * d; moved += d * d;
+        }
+        r2 = Math.max(r2, there + 2 * Math.abs(along) + moved);
+      }
+    }
+    return Math.sqrt(r2);
   }
   colors(P, kind, out) {
     const palette = this.palettes[kind];
@@ -79,12 +96,12 @@ function modesWidget({ model, el }) {
     while (Math.abs(z) > range) z = Math.sqrt(-2 * Math.log(1 - Math.random())) * Math.cos(2 * Math.PI * Math.random());
     return Math.round(100 * z) / 100;
   })), "a plausible shape: scores drawn from the normal distribution");
-  const kinds = html(buttons, "select", { "aria-label": "colours" });
+  const kinds = html(buttons, "select", { "aria-label": "colours", title: "colour: how far a place moved from the mean, along its normal or at all" });
   for (const [value, text] of [["normal", "along the normal"], ["magnitude", "distance"], ["none", "no colours"]]) html(kinds, "option", { value }, text);
   kinds.addEventListener("change", () => tell("colors", kinds.value));
   const sliders = html(right, "div", { class: "s4a-sliders" });
   const rows = ratio.map((share, c) => {
-    const row = html(sliders, "label", { class: "s4a-slider" });
+    const row = html(sliders, "label", { class: "s4a-slider", title: `component ${c + 1}: ${(100 * share).toFixed(1)} % of the variance; the slider is its score, in standard deviations (σ)` });
     html(row, "span", {}, `PC${c + 1} · ${(100 * share).toFixed(1)} %`);
     const input = html(row, "input", { type: "range", min: -range, max: range, step: 0.05, "aria-label": `component ${c + 1} in standard deviations` });
     const output = html(row, "output", {}, "0.00");
@@ -117,11 +134,12 @@ function modesWidget({ model, el }) {
     views.replaceChildren();
     const three = model.get("beside");
     beside.setAttribute("aria-pressed", three);
+    box.classList.toggle("s4a-beside", three);
     shown = (three ? [-range, 0, range] : [null]).map((at) => {
       const part = html(views, "div"), caption = html(part, "div", { class: "s4a-title" });
       const view = new View(part, { turn: model.get("turn"), group: model.get("group"), height: model.get("height"), label: "shape" });
       view.surfaces = [new Surface()];
-      view.fit(modes.mean);
+      view.fit(modes.mean, modes.reach);
       return Object.assign(view, { at, caption });
     });
     update();
@@ -132,6 +150,7 @@ function modesWidget({ model, el }) {
     shown.forEach((view) => {
       if (!context()) return;
       modes.show(view.surfaces[0], shape(view.at), kind);
+      view.widen(view.surfaces[0].position);
       view.caption.textContent = view.at === null ? "mean + Σ score · deformation" : view.at ? `PC${active + 1} at ${view.at > 0 ? "+" : "−"}3 σ` : "mean";
       view.redraw();
     });
@@ -147,6 +166,7 @@ function modesWidget({ model, el }) {
     crosshair?.(s[0], s[1] ?? 0);
   };
   const chart = () => {
+    [scorePart, variancePart].forEach((part) => part.replaceChildren());
     const samples = model.get("samples"), names = model.get("names"), low = model.get("ratio_low");
     const sum = (values) => values.map((_, i) => values.slice(0, i + 1).reduce((a, b) => a + 100 * b, 0));
     const series = [{ y: sum(ratio), name: "full resolution", color: BLUE, dots: true, wide: true, legend: true }];
@@ -155,10 +175,10 @@ function modesWidget({ model, el }) {
       s.x = s.y.map((_, i) => i + 1);
       s.text = `${s.name}: ${s.y.map((v, i) => `${i + 1}: ${v.toFixed(1)} %`).slice(0, 12).join(", ")}`;
     });
-    lines(variancePart, { series, title: "Cumulative variance", xlabel: "number of components", ylabel: "%", ymin: 0, width: 400, legend: "bottom" }, () => {});
+    lines(variancePart, { series, title: "Cumulative variance", xlabel: "number of components", ylabel: "%", ymin: 0, legend: "bottom" }, () => {});
     crosshair = scatter(scorePart, {
       x: samples.map((s) => s[0]), y: samples.map((s) => s[1] ?? 0), names, title: "Scores: click a shape to see it",
-      faint: model.get("faint"), xlabel: "PC1 (σ)", ylabel: count > 1 ? "PC2 (σ)" : "", width: 400, reach: [-range, range],
+      faint: model.get("faint"), xlabel: "PC1 (σ)", ylabel: count > 1 ? "PC2 (σ)" : "", most: 460, reach: [-range, range],
     }, ({ index }) => { tell("sample", index); set(samples[index]); });
   };
   const picture = () => {
@@ -173,6 +193,7 @@ function modesWidget({ model, el }) {
   Object.entries(on).forEach(([event, act]) => model.on(event, act));
   chart();
   arrange();
+  const stop = onRoom(scorePart, () => { chart(); update(); });
   const webgl = context() !== null;
   views.hidden = !webgl;
   still.hidden = webgl;
@@ -181,6 +202,7 @@ function modesWidget({ model, el }) {
   model.save_changes();
   return () => {
     toggle(false);
+    stop();
     clearTimeout(timer);
     Object.entries(on).forEach(([event, act]) => model.off(event, act));
     shown.forEach((view) => view.dispose());

@@ -6,6 +6,21 @@ function camera(name, turn) {
   return found;
 }
 
+function boxOf(P) {
+  const low = [Infinity, Infinity, Infinity], high = low.map((x) => -x);
+  for (let i = 0; i < P.length; i++) {
+    low[i % 3] = Math.min(low[i % 3], P[i]);
+    high[i % 3] = Math.max(high[i % 3], P[i]);
+  }
+  return { low, high, centre: low.map((x, i) => (x + high[i]) / 2) };
+}
+
+function radiusOf(P, centre) {
+  let r2 = 0;
+  for (let i = 0; i < P.length; i += 3) r2 = Math.max(r2, (P[i] - centre[0]) ** 2 + (P[i + 1] - centre[1]) ** 2 + (P[i + 2] - centre[2]) ** 2);
+  return Math.sqrt(r2);
+}
+
 class View {
   constructor(parent, { turn, group = "", height = 360, label = "surface", onPick, onHover }) {
     Object.assign(this, { surfaces: [], points: [], cursor: -1, onPick, onHover, group });
@@ -15,7 +30,7 @@ class View {
     Object.assign(this.canvas, { className: "s4a-view", tabIndex: 0, view: this });
     this.canvas.setAttribute("role", onPick ? "application" : "img");
     this.name(label);
-    this.canvas.style.height = `${height}px`;
+    this.canvas.style.height = `${height / 13}em`; // of the text that it stands in, as everything in a panel
     parent.append(this.canvas);
     this.camera = camera(group, turn);
     this.camera.views.add(this);
@@ -136,16 +151,12 @@ class View {
     Object.assign(this.camera, { home: [...turn], turn: [...turn], zoom: 1, pan: [0, 0] });
     this.moved();
   }
-  fit(P) { // the ball around the box's centre that holds the surface
-    const low = [Infinity, Infinity, Infinity], high = low.map((x) => -x);
-    for (let i = 0; i < P.length; i++) {
-      low[i % 3] = Math.min(low[i % 3], P[i]);
-      high[i % 3] = Math.max(high[i % 3], P[i]);
-    }
-    const centre = low.map((x, i) => (x + high[i]) / 2);
-    let r2 = 0;
-    for (let i = 0; i < P.length; i += 3) r2 = Math.max(r2, (P[i] - centre[0]) ** 2 + (P[i + 1] - centre[1]) ** 2 + (P[i + 2] - centre[2]) ** 2);
-    this.frame = { centre, radius: Math.sqrt(r2) || 1 };
+  fit(P, reach = 0) { // the ball around the box's centre that holds the surface, or is of a larger radius
+    const centre = boxOf(P).centre;
+    this.frame = { centre, radius: Math.max(radiusOf(P, centre), reach) || 1 };
+  }
+  widen(P) { // a surface that leaves the ball makes it larger
+    this.frame.radius = Math.max(this.frame.radius, radiusOf(P, this.frame.centre));
   }
   placement() {
     const { clientWidth: w, clientHeight: h } = this.canvas, { zoom, pan } = this.camera, half = Math.min(w, h) / 2;
