@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check fuzz format bench structure lab docs clean
+.PHONY: demo test test-lowest test-newest check fuzz format bench structure lab docs clean
 
 demo: $(VENV)/.core
 	$(BIN)/s4a demo
@@ -12,6 +12,15 @@ demo: $(VENV)/.core
 # one process a core, one thread a process; then which lines of s4a no test has run
 test: check
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --dist loadfile --cov --cov-report=term:skip-covered
+
+# the quick tests with every direct dependency in the oldest version that pyproject.toml allows, and with the newest of
+# all; PYTHON=... names another Python. Old versions warn of newer ones below them, so that warnings are no errors there
+QUICK := s4a tests/geometry tests/method tests/input/test_files.py tests/study/test_store.py tests/cli
+test-lowest: $(VENV)-lowest/.ready
+	OMP_NUM_THREADS=1 $(VENV)-lowest/bin/python -m pytest -W default $(QUICK)
+
+test-newest: $(VENV)-newest/.ready
+	OMP_NUM_THREADS=1 $(VENV)-newest/bin/python -m pytest $(QUICK)
 
 check: $(VENV)/.test
 	$(BIN)/ruff check .
@@ -41,7 +50,7 @@ docs: $(VENV)/.docs
 	$(BIN)/python -m sphinx -W --keep-going -b html -d docs/_build/doctrees docs docs/_build/html
 
 clean:
-	rm -rf $(VENV)
+	rm -rf $(VENV) $(VENV)-lowest $(VENV)-newest
 
 $(VENV)/.python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "s4a needs Python 3.11 or newer; this is %s. Try make PYTHON=python3.12" % sys.version)'
@@ -54,4 +63,12 @@ $(VENV)/.core: $(VENV)/.python pyproject.toml
 
 $(VENV)/.%: $(VENV)/.python pyproject.toml
 	$(BIN)/python -m pip install --quiet -e ".[$*]"
+	touch $@
+
+$(VENV)-lowest/.ready: RESOLUTION := lowest-direct
+$(VENV)-newest/.ready: RESOLUTION := highest
+$(VENV)-%/.ready: pyproject.toml
+	$(PYTHON) -m venv --clear $(VENV)-$*
+	$(VENV)-$*/bin/python -m pip install --quiet uv
+	$(VENV)-$*/bin/uv pip install --quiet --python $(VENV)-$*/bin/python --resolution $(RESOLUTION) -e ".[test]"
 	touch $@

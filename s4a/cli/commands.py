@@ -41,6 +41,17 @@ def check(args: Namespace) -> int:
     return 0 if (report["status"] != "excluded").all() else 1
 
 
+def doctor(args: Namespace) -> int:
+    """What this machine lacks, and what to type."""
+    from s4a.cli.doctor import examine, lines
+
+    findings = examine(args.folder)
+    lacking = sum(finding.state == "lacks" for finding in findings)
+    notes = sum(finding.state == "note" for finding in findings)
+    write("\n".join([*lines(findings), f"{lacking} lacking, {notes} to know"]))
+    return 1 if lacking else 0
+
+
 def run(args: Namespace) -> int:
     """The whole analysis over a folder of meshes."""
     from s4a.cli import tables

@@ -143,6 +143,11 @@ def _check(add):
     add_options(add, ["components", "pattern", "strict", "close_holes", "intersections"])
 
 
+def _doctor(add):
+    text = "where studies are to lie (default: here)"
+    add("folder", nargs="?", default=".", metavar="FOLDER", help=text)
+
+
 def _run(add):
     add("paths", nargs="+", metavar="PATH", help="folders, globs or mesh files")
     text = "folder of the study; an unfinished one is resumed"
@@ -252,6 +257,7 @@ def _compare(add):
 
 
 FLAGS = {
+    commands.doctor: _doctor,
     commands.check: _check,
     commands.run: _run,
     commands.verify: _verify,
@@ -290,6 +296,8 @@ def main(arguments: list[str] | None = None) -> int:
     command = next((word for word in words if not word.startswith("-")), "")
     # ends here where they err
     args = parser(command).parse_args(words, argparse.Namespace(words=words))
+    if args.function is commands.doctor:  # it also runs where packages are missing
+        return args.function(args)
     from s4a.study.runner import StageError
 
     filters = [(handler, Once()) for handler in logging.getLogger().handlers]

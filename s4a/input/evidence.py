@@ -5,6 +5,7 @@ Numbers only; :mod:`s4a.input.plausibility` says what they mean.
 
 import itertools
 from dataclasses import dataclass
+from importlib.util import find_spec
 
 import numpy as np
 import xarray as xr
@@ -130,8 +131,18 @@ def lattice_step(X: np.ndarray) -> float:
     return min(steps)
 
 
+def check_meshlab() -> None:
+    """Raise ValueError where PyMeshLab, which counts triangles through others, is not installed."""
+    if find_spec("pymeshlab") is None:
+        raise ValueError(
+            "counting triangles that pass through others needs PyMeshLab: install it with "
+            "`pip install pymeshlab`, or leave it out: intersections=False (--no-intersections)"
+        )
+
+
 def count_intersections(mesh: xr.Dataset) -> int:
     """Triangles of a mesh that pass through others; -1 where PyMeshLab lacks its filter."""
+    check_meshlab()
     import pymeshlab
 
     X, T = as_arrays(mesh)

@@ -1,9 +1,12 @@
 """What looks wrong with a shape beside its collection is told, and nothing else."""
 
+import sys
+
 import numpy as np
 import pytest
 from faults import shapes as faulty
 
+import s4a
 from s4a.geometry.mesh import as_dataset
 from s4a.input import evidence, plausibility
 from s4a.input.clean import clean
@@ -129,3 +132,15 @@ def test_a_registration_that_misses_and_distorts_is_told_where_neither_number_al
         "far": [True],
         "odd": [False],
     }
+
+
+def test_without_pymeshlab_counting_names_it_and_all_else_runs(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pymeshlab", None)
+    brains = s4a.synthetic.brains(3, 200)
+    shapes = {name: node.to_dataset() for name, node in brains["original"].children.items()}
+    small = {"n_coarse": 100, "k": 10, "k_init": 6, "n_pairs": 3}
+    for call in (s4a.read_shapes, lambda shapes: s4a.analyse(shapes, **small)):
+        with pytest.raises(ValueError, match=r"pip install pymeshlab.*intersections=False"):
+            call(shapes)
+    study = s4a.analyse(shapes, **small, intersections=False)
+    assert study["pca"].sizes["shape"] == 3

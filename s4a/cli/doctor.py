@@ -1,0 +1,278 @@
+"""``s4a doctor``: what this machine lacks for S4A, and what to type.
+
+Every check gives a :class:`Finding`; it imports or writes what a run would, and changes nothing:
+files that it writes are removed.
+"""
+
+import contextlib
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, requires, version
+from pathlib import Path
+
+GIB = 2**30
+LEAST_MEMORY = 2.0  # GiB; ten heads of 150,000 vertices take 2.5 on two cores, the demo less
+LEAST_DISK = 1.0  # GiB; a study of 51 shapes of 100,000 vertices takes about half of it
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "firefox", "safari")
+GL = "apt-get install libgl1 libopengl0, or what your system calls libGL.so.1 and libOpenGL.so.0"
+# distributions whose modules have other names
+MODULES = {"libigl": "igl", "pillow": "PIL", "scikit-learn": "sklearn"}
+NAMES = {module: name for name, module in MODULES.items()}
+IMPORTS = """
+import importlib, sys
+for name in sys.argv[1:]:
+    try:
+        importlib.import_module(name)
+    except Exception as error:
+        print(name, *str(error).split())
+"""
+# what PyMeshLab is used for, asked of it in a process of its own: a broken one may end the process
+TRIAL = """
+import pymeshlab
+meshes = pymeshlab.MeshSet(verbose=False)
+wanted = "generate_alpha_wrap", "compute_selection_by_self_intersections_per_face"
+print("lacks", *[name for name in wanted if not hasattr(meshes, name)])
+"""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at.
+
+    Parameters
+    ----------
+    what : str
+    state : {"ok", "note", "lacks"}
+        "lacks" is what a run with all defaults needs; "note" what only some commands need.
+    found : str
+    do : str
+        What to type, or what to do.
+    """
+
+    what: str
+    state: str
+    found: str
+    do: str = ""
+
+
+def examine(folder: Path | str = ".") -> list[Finding]:
+    """All findings on this machine, for studies in a folder.
+
+    Examples
+    --------
+    >>> from s4a.cli.doctor import examine
+    >>> [finding.state for finding in examine() if finding.what == "Python"]
+    ['ok']
+    """
+    found = [Finding("Python", "ok", f"{sys.version.split()[0]}, {sys.executable}")]
+    found += [*dependencies(), meshlab(), writable("study folder", Path(folder), "a place for it")]
+    temporary = Path(tempfile.gettempdir())
+    found += [writable("temporary folder", temporary, "export TMPDIR=FOLDER")]
+    for check in (cache, memory, cores, threads):
+        with contextlib.suppress(ImportError):  # what does not import is told above
+            found.append(check())
+    return [*found, disk(Path(folder)), browser(), *extras()]
+
+
+def dependencies() -> Iterator[Finding]:
+    """Packages that S4A needs and that are missing or older than its floor; one finding if none."""
+    wrong, right = [], 0
+    for name, floor in needed():
+        try:
+            here = version(name)
+        except PackageNotFoundError:
+            wrong.append(Finding(name, "lacks", "not installed", f"pip install '{name}>={floor}'"))
+            continue
+        if numbers(here) < numbers(floor):
+            told = f"{here}, and {floor} or newer is needed"
+            wrong.append(Finding(name, "lacks", told, f"pip install --upgrade '{name}>={floor}'"))
+        right += 1
+    names = [name for name, _ in needed() if name != "pymeshlab"]
+    modules = [MODULES.get(name, name.replace("-", "_")) for name in names]
+    result = run(IMPORTS, *modules)
+    for line in result.stdout.splitlines():
+        name, _, error = line.partition(" ")
+        if not any(MODULES.get(one.what, one.what) == name for one in wrong):
+            doing = f"pip install --force-reinstall {NAMES.get(name, name)}"
+            wrong.append(Finding(name, "lacks", f"does not import: {error}", doing))
+    if result.returncode:
+        last = result.stderr.strip().splitlines()[-1:] or [f"exit code {result.returncode}"]
+        wrong.append(Finding("packages", "lacks", f"end the process: {last[0]}", "a new venv"))
+    yield from wrong
+    if not wrong:
+        yield Finding("packages", "ok", f"S4A {version('s4a')} and the {right} that it needs")
+
+
+def needed(extra: str = "") -> list[tuple[str, str]]:
+    """Name and floor of every package that S4A, or one of its extras, requires itself."""
+    found = []
+    for line in requires("s4a") or []:
+        of = re.search(r"extra == ['\"](\w+)['\"]", line)
+        pair = re.match(r"([\w.-]+)(?:\[\w+\])?>=([\w.]+)", line)
+        if pair and (of[1] if of else "") == extra:
+            found.append((pair[1], pair[2]))
+    return found
+
+
+def numbers(text: str) -> tuple[int, ...]:
+    """A version as numbers.
+
+    Examples
+    --------
+    >>> from s4a.cli.doctor import numbers
+    >>> numbers("2025.7.post1"), numbers("1.15.0rc1") > numbers("1.9")
+    ((2025, 7), True)
+    """
+    return tuple(map(int, re.match(r"\d+(?:\.\d+)*", text)[0].split(".")))
+
+
+def run(script: str, *words: str) -> subprocess.CompletedProcess:
+    """A script in a process of its own, which a broken library may end."""
+    command = [sys.executable, "-c", script, *words]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+
+
+def meshlab() -> Finding:
+    """Whether PyMeshLab imports and has the filters that are used."""
+    doing = "or leave it out: --no-intersections, and no --wrap"
+    result = run(TRIAL)
+    if "No module named 'pymeshlab'" in result.stderr:
+        return Finding("PyMeshLab", "lacks", "not installed", f"pip install pymeshlab; {doing}")
+    if result.returncode:
+        last = result.stderr.strip().splitlines()[-1:] or [f"exit code {result.returncode}"]
+        return Finding("PyMeshLab", "lacks", f"does not import: {last[0]}", f"{GL}; {doing}")
+    lacking = result.stdout.split("lacks")[-1].split()
+    if lacking:
+        return Finding("PyMeshLab", "lacks", f"has no {', '.join(lacking)}", f"{GL}; {doing}")
+    return Finding("PyMeshLab", "ok", f"{version('pymeshlab')}, with its filters")
+
+
+def writable(what: str, folder: Path, instead: str) -> Finding:
+    """Whether a file can be made, locked and renamed in a folder, as every run does."""
+    try:
+        with tempfile.TemporaryDirectory(prefix=".s4a-", dir=folder) as name:
+            there = Path(name) / "a"
+            with open(there, "w") as file:
+                lock(file.fileno())
+            there.rename(Path(name) / "b")
+    except OSError as error:
+        return Finding(what, "lacks", f"{folder}: {error}", f"give another: {instead}")
+    return Finding(what, "ok", f"{folder.resolve()} can be written and locked")
+
+
+def lock(handle: int) -> None:
+    """Hold an open file against other processes, where the system can."""
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        return
+    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def cache() -> Finding:
+    """Whether matplotlib can keep its list of fonts."""
+    import matplotlib
+
+    folder = Path(matplotlib.get_cachedir())
+    if os.access(folder, os.W_OK):
+        return Finding("cache of fonts", "ok", str(folder))
+    told = f"{folder} cannot be written: every command that draws looks for all fonts again"
+    return Finding("cache of fonts", "note", told, "export MPLCONFIGDIR=FOLDER")
+
+
+def memory() -> Finding:
+    """Memory that is free now."""
+    import psutil
+
+    free = psutil.virtual_memory().available / GIB
+    if free >= LEAST_MEMORY:
+        return Finding("memory", "ok", f"{free:.1f} GiB free")
+    told = f"{free:.1f} GiB free; {LEAST_MEMORY:.0f} is little for large meshes"
+    return Finding("memory", "note", told, "--n-jobs 1, or close other programs")
+
+
+def disk(folder: Path) -> Finding:
+    """Room where the study would lie."""
+    there = next(p for p in (folder.resolve(), *folder.resolve().parents) if p.exists())
+    free = shutil.disk_usage(there).free / GIB
+    if free >= LEAST_DISK:
+        return Finding("disk", "ok", f"{free:.1f} GiB free")
+    return Finding("disk", "note", f"{free:.1f} GiB free in {there}", "--out in another place")
+
+
+def cores() -> Finding:
+    """Cores that this process may use: those of a container or a job, not of the machine."""
+    from joblib import cpu_count
+
+    return Finding("cores", "ok", f"{cpu_count()} for this process; --n-jobs takes all by default")
+
+
+def threads() -> Finding:
+    """The libraries of linear algebra and how many threads each would start by itself."""
+    import numpy as np
+    import scipy.linalg  # loads its own
+    from threadpoolctl import threadpool_info
+
+    np.linalg.inv(np.eye(2))
+    scipy.linalg.inv(np.eye(2))
+    pools = threadpool_info()
+    told = ", ".join(
+        f"{pool['internal_api']} {pool['version'] or ''} of {pool['num_threads']}".replace(
+            "  ", " "
+        )
+        for pool in pools
+    )
+    return Finding("threads", "ok", f"{told}; workers of a run take one each")
+
+
+def browser() -> Finding:
+    """Whether a browser is there to look at pages; the pages themselves are made without."""
+    here = next((name for name in BROWSERS if shutil.which(name)), None)
+    if here or sys.platform in ("darwin", "win32"):
+        return Finding("browser", "ok", here or "that of the system")
+    told = "none found: pages of s4a view are written all the same"
+    return Finding("browser", "note", told, "open them on another machine")
+
+
+def extras() -> Iterator[Finding]:
+    """The extras for notebooks, the course and clusters."""
+    for extra, what in (("notebook", "panels"), ("course", "lessons"), ("cluster", "--cluster")):
+        missing = [name for name, _ in needed(extra) if not installed(name)]
+        if missing:
+            told = f"without {', '.join(missing)}"
+            yield Finding(f"for {what}", "note", told, f"pip install 's4a[{extra}]'")
+        else:
+            yield Finding(f"for {what}", "ok", f"s4a[{extra}] is there")
+
+
+def installed(name: str) -> bool:
+    """Whether a distribution is there."""
+    try:
+        version(name)
+    except PackageNotFoundError:
+        return False
+    return True
+
+
+def lines(findings: list[Finding]) -> list[str]:
+    """Findings as lines, each followed by what to do.
+
+    Examples
+    --------
+    >>> from s4a.cli.doctor import Finding, lines
+    >>> print(*lines([Finding("disk", "note", "0.2 GiB free", "--out elsewhere")]), sep="\\n")
+    note   disk              0.2 GiB free
+                             -> --out elsewhere
+    """
+    found = []
+    for one in findings:
+        found.append(f"{one.state:<7}{one.what:<18}{one.found}")
+        if one.do:
+            found.append(f"{'':25}-> {one.do}")
+    return found
