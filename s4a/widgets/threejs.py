@@ -1,27 +1,86 @@
 """Surfaces as pythreejs objects, for scenes of your own: the one file that imports pythreejs.
 
-The panels draw with a small script of their own, as pythreejs bundles three.js of 2018 and its
-morph targets stop at eight modes.  Whoever composes a scene with lines, sprites or other objects
-takes a surface from here.
+Every function gives pythreejs objects, which take lights, sprites, arrows, cameras and materials
+of your own; :func:`renderer` puts them into a scene that can be turned.  The panels keep a small
+renderer of their own: one WebGL context for all views of a page, picking, a keyboard cursor, and
+saved pages of some kB.  pythreejs bundles three.js of 2018, and a page shows eight scenes at once.
+
+The morph targets of that three.js stop at eight modes; a shader that reads the modes from a
+texture (:func:`modes`) does not.
 """
 
+import warnings
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import anywidget
 import numpy as np
 import pythreejs as three
+import traitlets
 import xarray as xr
+from ipywidgets import widget_serialization
+from matplotlib import colormaps
+from matplotlib.colors import Colormap, to_hex
+from scipy.spatial.distance import pdist
+from scipy.spatial.transform import Rotation
 
+from s4a.geometry.align import farthest_points
 from s4a.geometry.mesh import as_arrays, vertex_normals
+from s4a.method.pca import color_limits
 from s4a.schema import require
+from s4a.show.draw import (
+    CLAY,
+    OKABE_ITO,
+    SIGNED,
+    UNKNOWN,
+    Viewpoint,
+    label_colors,
+    position_colors,
+    rotation,
+)
+from s4a.show.surfaces import has, latent_match, mode_arrays, names_of, template_coarse
+from s4a.show.surfaces import surface as study_surface
+
+SCRIPTS = Path(__file__).parent / "scripts"
+LANDMARK = OKABE_ITO[0]
+WIDTH = 2048  # texels of a row of the table of modes: a power of two, so that places are exact
+HUES = "compressed narrowed still widened expanded".split()
+HEIGHT = 4096  # rows that every graphics card takes
+LIGHTS = (  # what three.js fills in for a shader that is lit
+    "ambientLightColor directionalLights directionalShadowMap directionalShadowMatrix spotLights "
+    "spotShadowMap spotShadowMatrix rectAreaLights ltc_1 ltc_2 pointLights pointShadowMap "
+    "pointShadowMatrix hemisphereLights"
+).split()
 
 
-def surface(mesh: xr.Dataset, colors: np.ndarray | None = None) -> three.Mesh:
-    """A mesh Dataset as a smooth pythreejs surface.
+# ---- surfaces
+
+
+def surface(
+    mesh: xr.Dataset,
+    field: str | np.ndarray | xr.DataArray | None = None,
+    cmap: str | Colormap | None = None,
+    *,
+    limits: tuple[float, float] | None = None,
+    colors: np.ndarray | None = None,
+) -> three.Mesh:
+    """A mesh Dataset as a smooth pythreejs surface, coloured by a field.
 
     Parameters
     ----------
     mesh : xarray.Dataset
         With ``position(vertex, xyz)`` and ``corner_vertex(triangle, corner)``.
-    colors : float ndarray (vertex, 3), optional
-        From 0 to 1, for example of :func:`s4a.show.draw.signed_colors`.
+    field : str or ndarray (vertex,) or (vertex, 3), optional
+        A value of each vertex, or the name of such a variable of the mesh: integers and booleans
+        are labels, with a colour each, other numbers go through the colour map, and three of them
+        are red, green and blue, from 0 to 1.  Where it is not finite the surface is grey.
+    cmap : str or matplotlib.colors.Colormap, optional
+        By default red, white and blue for a field of both signs, "viridis" for one of one sign.
+    limits : (float, float), optional
+        Values of the two ends of the colour map; by default those of the field, without its
+        outermost percent, and as far below zero as above for a field of both signs.
+    colors : ndarray (vertex, 3), optional
+        The former name of `field`; deprecated.
 
     Returns
     -------
@@ -30,70 +89,554 @@ def surface(mesh: xr.Dataset, colors: np.ndarray | None = None) -> three.Mesh:
     Raises
     ------
     ValueError
-        When a position is not finite or the colours are not one for each vertex.
+        When a position is not finite or the field has not one value for each vertex.
+
+    Examples
+    --------
+    >>> import s4a
+    >>> from s4a.widgets import threejs
+    >>> mesh = s4a.synthetic.sphere(100)
+    >>> ball = threejs.surface(mesh, mesh["position"][:, 2], "magma")
+    >>> ball.geometry.attributes["color"].array.shape
+    (100, 3)
     """
     require(mesh, "position", "corner_vertex", what="mesh")
+    if colors is not None:
+        warnings.warn("colors is now field", DeprecationWarning, stacklevel=2)
+        field = colors
     X, T = as_arrays(mesh)
+    _check_finite(X)
+    values = None if field is None else _field_colors(mesh, field, cmap, limits)
+    return three.Mesh(_geometry(X, T, color=values), _material(values is not None))
+
+
+def _check_finite(X):
     if not np.isfinite(X).all():
         wrong = (~np.isfinite(X)).any(1).sum()
         raise ValueError(
             f"finite positions needed, found {wrong} vertices that are not; "
             "s4a.clean repairs the mesh"
         )
-    attributes = {
-        "position": X.astype(np.float32),
-        "normal": vertex_normals(X, T).astype(np.float32),
-    }
-    look = {"color": "#cfc7b8"}
-    if colors is not None:
-        colors = np.asarray(colors, np.float32)[:, :3]
-        if len(colors) != len(X):
+
+
+def _field_colors(mesh, field, cmap, limits):
+    """Colours (n, 3) of what was given as the field of a mesh."""
+    if isinstance(field, str):
+        if field not in mesh:
             raise ValueError(
-                f"one colour for each of {len(X)} vertices needed, found {len(colors)}"
+                f"a variable of the mesh needed, found {field!r}; it has {', '.join(mesh)}"
             )
-        attributes["color"], look = np.ascontiguousarray(colors), {"vertexColors": "VertexColors"}
-    geometry = three.BufferGeometry(
+        field = mesh[field]
+    values, n = np.asarray(field), mesh.sizes["vertex"]
+    if values.shape not in ((n,), (n, 3)):
+        raise ValueError(
+            f"a value or a colour (3) for each of {n} vertices needed, found {values.shape}"
+        )
+    if values.ndim == 2:
+        return np.where(np.isfinite(values), np.clip(values, 0, 1), UNKNOWN)
+    if values.dtype.kind in "iub":
+        return label_colors(values.astype(int))
+    return field_colors(values, cmap, limits)
+
+
+def field_colors(
+    values: np.ndarray,
+    cmap: str | Colormap | None = None,
+    limits: tuple[float, float] | None = None,
+) -> np.ndarray:
+    """Colours ``(n, 3)`` of numbers ``(n,)``; see :func:`surface`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.widgets.threejs import field_colors
+    >>> field_colors(np.array([0.0, 0.5, 1.0]), "gray").round().tolist()
+    [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [1.0, 1.0, 1.0]]
+    """
+    known = np.isfinite(values)
+    low, high = np.quantile(values[known], (0.01, 0.99)) if known.any() else (0.0, 1.0)
+    signed = low < 0 < high
+    if limits is not None:
+        low, high = limits
+    elif signed:
+        low, high = -max(-low, high), max(-low, high)
+    shares = np.clip((np.where(known, values, low) - low) / (high - low or 1), 0, 1)
+    colormap = colormaps.get_cmap(cmap or (SIGNED if signed else "viridis"))
+    return np.where(known[:, None], colormap(shares)[:, :3], UNKNOWN)
+
+
+def _geometry(X, T, **attributes):
+    """A geometry of vertices, triangles and what else is of each vertex; None is left out."""
+    known = {"position": X, "normal": vertex_normals(X, T)} | attributes
+    return three.BufferGeometry(
         attributes={
-            name: three.BufferAttribute(values, normalized=False)
-            for name, values in attributes.items()
+            name: three.BufferAttribute(
+                np.ascontiguousarray(values, dtype=np.float32), normalized=False
+            )
+            for name, values in known.items()
+            if values is not None
         },
-        index=three.BufferAttribute(T.astype(np.uint32).ravel(), normalized=False),
+        index=three.BufferAttribute(np.asarray(T, np.uint32).ravel(), normalized=False),
     )
-    material = three.MeshStandardMaterial(roughness=0.7, metalness=0.05, side="DoubleSide", **look)
-    return three.Mesh(geometry, material)
 
 
-def renderer(*objects: three.Object3D, size: tuple[int, int] = (600, 450)) -> three.Renderer:
+def _material(colored):
+    look = {"vertexColors": "VertexColors"} if colored else {"color": to_hex(CLAY)}
+    return three.MeshStandardMaterial(roughness=0.7, metalness=0.05, side="DoubleSide", **look)
+
+
+# ---- modes
+
+
+class Scores(anywidget.AnyWidget):
+    """Sliders of the scores of a mesh of :func:`modes`; the kernel hears when one is let go."""
+
+    _esm = SCRIPTS / "scores.js"
+    _css = SCRIPTS / "scores.css"
+    mesh = traitlets.Instance(three.Mesh).tag(sync=True, **widget_serialization)
+
+
+class ModesMesh(three.Mesh):
+    """A pythreejs mesh whose shader moves its vertices along modes; made by :func:`modes`.
+
+    Attributes
+    ----------
+    scores : list of float
+        In standard deviations, one for each mode; set them and the shape follows.
+    sliders : Scores
+        One for each mode; they move the shape without the kernel.
+    """
+
+    scores = traitlets.List(traitlets.Float()).tag(sync=True)
+
+    def __init__(self, geometry, material, **more):
+        super().__init__(geometry, material, **more)
+        self.sliders = Scores(mesh=self)
+
+    @traitlets.validate("scores")
+    def _one_for_each_mode(self, proposal):
+        n = int(self.material.defines["MODES"])
+        if len(proposal["value"]) != n:
+            raise traitlets.TraitError(f"{n} scores needed, found {len(proposal['value'])}")
+        return proposal["value"]
+
+
+def modes(
+    study: xr.DataTree,
+    *,
+    n_modes: int | None = 10,
+    resolution: str = "full",
+    colored: bool = True,
+) -> ModesMesh:
+    """The mean shape of a study, which its scores deform in the browser (6.1).
+
+    A shader adds up X + sum_k score_k mode_k: the modes are sent once, and a step of a slider is
+    no message to the kernel.  Normals follow the modes to first order.
+
+    Parameters
+    ----------
+    study : xarray.DataTree
+        With ``/registration`` and ``/pca``.
+    n_modes : int, optional
+        How many modes at most; None for all.
+    resolution : {"full", "coarse"}
+        Which vertices of the template.
+    colored : bool
+        Whether the surface is coloured by its displacement along the mean's normals, blue where it
+        expands and red where it is compressed.
+
+    Returns
+    -------
+    ModesMesh
+        A pythreejs Mesh with ``scores`` and, to be displayed beside its scene,
+        ``sliders``.  ``ipywidgets.jsdlink((panel.view, "scores"), (mesh, "scores"))`` lets it
+        follow a :class:`s4a.widgets.Modes` of as many modes, in the browser.  A pythreejs Picker
+        finds it where the mean is.
+
+    Raises
+    ------
+    ValueError
+        When the study has no modes, or there are too many numbers for a texture.
+
+    Examples
+    --------
+    >>> import s4a
+    >>> from s4a.widgets import threejs
+    >>> mesh = threejs.modes(s4a.synthetic.example_study())
+    >>> mesh.scores = [2.0, *mesh.scores[1:]]
+    >>> view = threejs.renderer(mesh)  # in a notebook, display(view, mesh.sliders)
+    """
+    if not (has(study, "registration/position") and has(study, "pca/deformation")):
+        raise ValueError("a study with /registration and /pca needed, as of s4a.analyse")
+    if resolution not in ("full", "coarse"):
+        raise ValueError(f"resolution needs full or coarse, found {resolution!r}")
+    coarse = template_coarse(study) if resolution == "coarse" else None
+    if resolution == "coarse" and coarse is None:
+        raise ValueError("the study has no low resolution of its template; take the full one")
+    mean, T, deformation = mode_arrays(study, coarse, n_modes)
+    table, bends = _mode_table(mean, T, deformation)
+    limit = color_limits(mean, T, deformation)[0]
+    hues = dict(zip(HUES, map(to_hex, SIGNED(np.linspace(0, 1, len(HUES)))), strict=True))
+    slots = -(-len(deformation) // 5) * 5  # pythreejs takes lists of 2, 3, 4, 9 and 16 for vectors
+    uniforms = hues | {
+        "size": [WIDTH, len(table)],
+        "scores": [0.0] * slots,
+        "bends": [*bends.tolist(), *[0.0] * (slots - len(bends))],
+        "limit": limit,
+        "colored": float(colored),
+        "diffuse": to_hex(CLAY),
+        "specular": "#111111",
+        "emissive": "#000000",
+        "shininess": 30.0,
+        "opacity": 1.0,
+        # pythreejs gives its textures, whatever their names, to the last uniform
+        "table": three.DataTexture(table, format="RGBAFormat", type="FloatType"),
+    }
+    material = three.ShaderMaterial(
+        uniforms={name: {"value": None} for name in LIGHTS}
+        | {name: {"value": value} for name, value in uniforms.items()},
+        vertexShader=(SCRIPTS / "modes.vert").read_text(encoding="utf-8"),
+        fragmentShader=(SCRIPTS / "modes.frag").read_text(encoding="utf-8"),
+        defines={"MODES": str(len(deformation)), "SLOTS": str(slots)},
+        lights=True,
+        side="DoubleSide",
+    )
+    geometry = _geometry(mean, T, row=np.arange(len(mean)))
+    return ModesMesh(geometry, material, scores=[0.0] * len(deformation), frustumCulled=False)
+
+
+def _mode_table(mean, T, deformation):
+    """The texture (rows, 2048, 4) of modes and of how they bend the normals, and of what size.
+
+    The change of a normal is the derivative of the area vectors by the score, as a share of their
+    length; 127 steps on each side of nothing, the last of which are `bends`.
+    """
+    c, n = deformation.shape[:2]
+    rows = -(-n * c // WIDTH)
+    if rows > HEIGHT:
+        raise ValueError(
+            f"at most {WIDTH * HEIGHT // n} modes of {n} vertices fit into a texture, found {c}; "
+            "give n_modes, or resolution='coarse'"
+        )
+    area = np.linalg.norm(area_vectors(mean, T), axis=1)[:, None]
+    area = np.maximum(area, np.finfo(float).tiny)
+    table = np.zeros((rows * WIDTH, 4), np.float32)
+    bends = np.empty(c)
+    for k, step in enumerate(deformation):
+        change = area_vectors(mean + step, T) - area_vectors(mean - step, T)  # exact: quadratic
+        change /= 2 * area
+        bends[k] = np.quantile(np.abs(change).max(1), 0.999) or 1.0
+        levels = np.clip(np.round(127 * change / bends[k]), -127, 127) + 127  # 0 .. 254
+        table[k : n * c : c, :3] = step
+        table[k : n * c : c, 3] = levels @ [1, 256, 65536]
+    return table.reshape(rows, WIDTH, 4), bends
+
+
+def area_vectors(X: np.ndarray, T: np.ndarray) -> np.ndarray:
+    """Sums ``(n, 3)`` of the area vectors of the triangles around each vertex.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.widgets.threejs import area_vectors
+    >>> area_vectors(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]]), np.array([[0, 1, 2]]))[0]
+    array([0. , 0. , 0.5])
+    """
+    a, b, c = X[T[:, 0]], X[T[:, 1]], X[T[:, 2]]
+    vectors = np.cross(b - a, c - a) / 2
+    sums = [np.bincount(T.ravel(), np.repeat(part, 3), len(X)) for part in vectors.T]
+    return np.stack(sums, axis=1)
+
+
+# ---- points, correspondences, networks
+
+
+def points(
+    places: xr.Dataset | Mapping[str, np.ndarray] | np.ndarray,
+    color: str = LANDMARK,
+    *,
+    radius: float | None = None,
+    names: bool = True,
+) -> three.Group:
+    """Landmarks as spheres, with their names.
+
+    Parameters
+    ----------
+    places : Dataset, dict of str to (3,), or ndarray (p, 3)
+        A Dataset with ``landmark_position(landmark, xyz)``, and ``landmark_name`` if they have any.
+    color : str
+        Of all, as matplotlib knows it.
+    radius : float, optional
+        In the unit of the places; by default a fiftieth of the diagonal of their box.
+    names : bool
+        Whether the names stand beside the spheres.
+
+    Returns
+    -------
+    pythreejs.Group
+
+    Examples
+    --------
+    >>> from s4a.widgets import threejs
+    >>> [part.name for part in threejs.points({"nose": [0, -1, 0], "chin": [0, -1, -1]}).children]
+    ['nose', 'chin']
+    """
+    if isinstance(places, xr.Dataset):
+        require(places, "landmark_position", what="dataset")
+        where = places["landmark_position"].values
+        labels = [""] * len(where)
+        if "landmark_name" in places:
+            labels = [str(name) for name in places["landmark_name"].values]
+    elif isinstance(places, Mapping):
+        labels, where = list(places), np.array(list(places.values()), float)
+    else:
+        where = np.asarray(places, float)
+        labels = [""] * len(where)
+    if where.ndim != 2 or where.shape[1] != 3 or not len(where) or not np.isfinite(where).all():
+        raise ValueError(f"finite points (p, 3) needed, found an array of shape {where.shape}")
+    size = radius or float(np.linalg.norm(np.ptp(where, axis=0))) / 50 or 1.0
+    ball = three.SphereBufferGeometry(radius=size, widthSegments=20, heightSegments=14)
+    material = three.MeshStandardMaterial(color=to_hex(color), roughness=0.5)
+    group, middle = three.Group(), where.mean(0)
+    for name, place in zip(labels, where, strict=True):
+        group.add(three.Mesh(ball, material, position=place.tolist(), name=name))
+        if names and name:
+            outwards = (place - middle) / (np.linalg.norm(place - middle) or 1.0)
+            group.children[-1].add(_name(name, 3.5 * size * outwards, 2.4 * size))
+    return group
+
+
+def _name(text, place, height, *, hidden=True):
+    """A text that always faces the viewer; where not `hidden`, nothing stands before it."""
+    letters = three.TextTexture(
+        string=text, color="black", size=64, fontFace="monospace", squareTexture=False
+    )
+    material = three.SpriteMaterial(map=letters, transparent=True, depthTest=hidden)
+    width = 0.6 * height * len(text)  # of a monospaced font
+    return three.Sprite(material, position=np.asarray(place).tolist(), scale=[width, height, 1])
+
+
+def correspondence(
+    pair: xr.Dataset | xr.DataTree,
+    source: xr.Dataset | str,
+    target: xr.Dataset | str,
+    *,
+    n_lines: int = 60,
+) -> three.Group:
+    """Two surfaces side by side in matching colours, and lines between sampled matches.
+
+    Parameters
+    ----------
+    pair : xarray.Dataset or xarray.DataTree
+        With ``match(vertex)``, as of :func:`s4a.match_pair`: on each vertex of the target one of
+        the source; or a study, whose latent basis matches two of its shapes (eq. 3).
+    source, target : xarray.Dataset or str
+        The meshes of the pair, or the names of two shapes of the study.
+    n_lines : int
+        How many matches are drawn, spread over the target.
+
+    Returns
+    -------
+    pythreejs.Group
+        Its children are the source, the target, moved to the side, and the lines.
+
+    Raises
+    ------
+    ValueError
+        When the match is not one of these meshes.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import s4a
+    >>> from s4a.widgets import threejs
+    >>> ball, egg = s4a.synthetic.sphere(200), s4a.synthetic.ellipsoid(200)
+    >>> pair = s4a.match_pair(ball, egg, n_coarse=100, k=10, k_init=6)
+    >>> len(threejs.correspondence(pair, ball, egg).children)
+    3
+    """
+    if isinstance(pair, xr.DataTree):
+        for name in (source, target):
+            if name not in pair["coarse"].children:
+                raise ValueError(f"two shapes of the study needed, found {name!r}")
+        match = latent_match(pair, source, target, dense=False)
+        (X, S), (Y, T) = (study_surface(pair, name) for name in (source, target))
+    else:
+        require(pair, "match", what="pair")
+        match, (X, S), (Y, T) = pair["match"].values, as_arrays(source), as_arrays(target)
+    if len(match) != len(Y) or match.max() >= len(X):
+        raise ValueError(
+            f"a match of {len(Y)} vertices of the target to {len(X)} of the source needed, "
+            f"found {len(match)} up to {match.max()}"
+        )
+    middle = (X.max(0) + X.min(0)) / 2
+    aside = middle - (Y.max(0) + Y.min(0)) / 2
+    aside[0] += 0.65 * (np.ptp(X[:, 0]) + np.ptp(Y[:, 0]))
+    Y = Y + aside
+    colors = position_colors(X)
+    here = farthest_points(Y, min(n_lines, len(Y)))
+    lines = _lines(X[match[here]], Y[here], colors[match[here]])
+    return three.Group(
+        children=[
+            three.Mesh(_geometry(X, S, color=colors), _material(True)),
+            three.Mesh(_geometry(Y, T, color=colors[match]), _material(True)),
+            lines,
+        ]
+    )
+
+
+def _lines(begin, end, colors, width=2):
+    """Segments from some points (p, 3) to others, each of one colour."""
+    geometry = three.LineSegmentsGeometry(
+        positions=np.stack([begin, end], axis=1).astype(np.float32),
+        colors=np.stack([colors, colors], axis=1).astype(np.float32),
+    )
+    material = three.LineMaterial(linewidth=width, vertexColors="VertexColors")
+    return three.LineSegments2(geometry, material)
+
+
+def network(
+    study: xr.DataTree, *, cmap: str | Colormap = "viridis_r", names: bool = True
+) -> three.Group:
+    """Shapes at their places in the space of shape differences, joined by their maps (3.4, 3.5).
+
+    Parameters
+    ----------
+    study : xarray.DataTree
+        With ``/coarse``, ``/network`` and ``/latent``.
+    cmap : str or matplotlib.colors.Colormap
+        Of the cycle errors, from 0 to the largest; a pair has the mean of its two maps.
+    names : bool
+        Whether the shapes' names stand above them.
+
+    Returns
+    -------
+    pythreejs.Group
+        A surface for each shape, named after it, their names, and last the lines.
+
+    Raises
+    ------
+    ValueError
+        When the study has no network or no shape differences.
+
+    Examples
+    --------
+    >>> import s4a
+    >>> from s4a.widgets import threejs
+    >>> group = threejs.network(s4a.synthetic.example_study(), names=False)
+    >>> type(group.children[-1]).__name__
+    'LineSegments2'
+    """
+    missing = [
+        name
+        for name in ("network/cycle_error", "latent/area_score", "coarse")
+        if not has(study, name)
+    ]
+    if missing:
+        raise ValueError(f"a study with {', '.join(missing)} needed, as of s4a.analyse")
+    scores = study["latent"].dataset["area_score"]
+    shapes = names_of(scores)
+    surfaces = {name: study_surface(study, name) for name in shapes}
+    size = max(np.ptp(X, axis=0).max() for X, _ in surfaces.values())
+    places = np.zeros((len(shapes), 3))
+    flat = scores.values[:, :3]
+    places[:, : flat.shape[1]] = flat
+    # a tenth of the pairs may lie nearer to each other than the shapes are long
+    places *= 1.3 * size / max(np.quantile(pdist(places), 0.1), np.finfo(float).tiny)
+    group = three.Group()
+    for place, (name, (X, T)) in zip(places, surfaces.items(), strict=True):
+        centred = X - (X.max(0) + X.min(0)) / 2
+        body = three.Mesh(
+            _geometry(centred, T), _material(False), position=place.tolist(), name=name
+        )
+        if names:
+            body.add(_name(name, [0, 0, 0.7 * size], 0.15 * size, hidden=False))
+        group.add(body)
+    net = study["network"].dataset
+    sums: dict[tuple, list[float]] = {}
+    maps = zip(*(net[key].values for key in ("source", "target", "cycle_error")), strict=True)
+    for source, target, error in maps:
+        pair = tuple(sorted(shapes.index(str(name)) for name in (source, target)))
+        sums.setdefault(pair, []).append(float(error))
+    known = np.array([np.nan if np.isnan(e).all() else np.nanmean(e) for e in sums.values()])
+    colors = field_colors(known, cmap, (0.0, float(np.nanmax(known, initial=0)) or 1.0))
+    ends = np.array(list(sums))
+    group.add(_lines(places[ends[:, 0]], places[ends[:, 1]], colors, width=3))
+    return group
+
+
+# ---- scenes
+
+
+def renderer(
+    *objects: three.Object3D,
+    size: tuple[int, int] = (600, 450),
+    view: Viewpoint = "corner",
+    up: str = "z",
+) -> three.Renderer:
     """A pythreejs renderer around objects, lit from the viewer, with controls to turn and zoom.
 
     Parameters
     ----------
-    *objects : pythreejs.Mesh or other pythreejs objects
-        At least one of :func:`surface`; the camera is set to see all of them.
+    *objects : pythreejs.Object3D
+        Of the functions of this module, or of your own; the camera is set to see all of them.
     size : (int, int)
         Width and height in pixels.
+    view, up
+        From where they are seen first; see :func:`s4a.show.draw.rotation`.
+
+    Returns
+    -------
+    pythreejs.Renderer
+        Its ``scene`` takes more: ``view.scene.add(pythreejs.AxesHelper(50))``.
     """
-    surfaces = [item.geometry for item in objects if isinstance(item, three.Mesh)]
-    if not surfaces:
+    corners = [corner for item in objects for corner in _extent(item)]
+    if not corners:
         raise ValueError("a renderer needs at least one surface to look at")
-    points = np.concatenate([geometry.attributes["position"].array for geometry in surfaces])
-    middle = (points.max(0) + points.min(0)) / 2
-    radius = float(np.linalg.norm(np.ptp(points, axis=0))) / 2
+    low, high = np.min(corners, axis=0), np.max(corners, axis=0)
+    middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+    aspect, fov = size[0] / size[1], 40
+    half = np.deg2rad(fov) / 2
+    distance = 0.85 * radius / np.sin(min(half, np.arctan(aspect * np.tan(half))))
+    turn = rotation(view, up)
     camera = three.PerspectiveCamera(
-        position=(middle + radius * np.array([1.5, -2.0, 0.8])).tolist(),
-        up=[0, 0, 1],
-        fov=40,
-        aspect=size[0] / size[1],
+        position=(middle + distance * turn[2]).tolist(),
+        up=np.eye(3)["xyz".index(up)].tolist(),
+        fov=fov,
+        aspect=aspect,
         near=radius / 100,
         far=radius * 20,
-        children=[three.DirectionalLight(position=[0, 0, 1], intensity=0.7)],
+        children=[three.DirectionalLight(position=[0, 0, 1], intensity=0.65)],
     )
     camera.lookAt(middle.tolist())
     controls = three.OrbitControls(controlling=camera, target=middle.tolist())
     scene = three.Scene(
-        children=[*objects, camera, three.AmbientLight(intensity=0.5)], background="#ffffff"
+        children=[*objects, camera, three.AmbientLight(intensity=0.45)], background="#ffffff"
     )
     width, height = size
     return three.Renderer(
         scene=scene, camera=camera, controls=[controls], width=width, height=height, antialias=True
     )
+
+
+def _extent(item: three.Object3D) -> Iterator[np.ndarray]:
+    """Both corners of the box of each thing that is seen of an object and of what is in it."""
+    geometry = getattr(item, "geometry", None)
+    boxes = []
+    if isinstance(geometry, three.BufferGeometry) and "position" in geometry.attributes:
+        X = geometry.attributes["position"].array
+        boxes.append((X.min(0), X.max(0)))
+    elif isinstance(geometry, three.LineSegmentsGeometry):
+        X = geometry.positions.reshape(-1, 3)
+        boxes.append((X.min(0), X.max(0)))
+    elif hasattr(geometry, "radius"):
+        boxes.append((np.full(3, -geometry.radius), np.full(3, geometry.radius)))
+    for child in getattr(item, "children", ()):
+        corners = list(_extent(child))
+        boxes += zip(corners[::2], corners[1::2], strict=True)
+    turn = Rotation.from_quat(item.quaternion).as_matrix()
+    for low, high in boxes:
+        corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), -1).reshape(-1, 3)
+        moved = corners * item.scale @ turn.T + item.position
+        yield moved.min(0)
+        yield moved.max(0)

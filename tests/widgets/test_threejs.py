@@ -2,11 +2,16 @@
 
 import numpy as np
 import pytest
+import traitlets
+import xarray as xr
+from scipy.spatial.distance import cdist, pdist
 
+import s4a
 from s4a import synthetic
+from s4a.geometry.mesh import vertex_normals
 
-pytest.importorskip("pythreejs")
-from s4a.widgets import threejs
+pythreejs = pytest.importorskip("pythreejs")
+threejs = pytest.importorskip("s4a.widgets.threejs")
 
 
 def test_the_arrays_arrive_as_the_browser_needs_them():
@@ -24,6 +29,171 @@ def test_the_arrays_arrive_as_the_browser_needs_them():
     assert np.einsum("nx,nx->n", normals, mesh["position"].values).min() > 0.99
 
 
+def test_a_field_has_the_colours_of_its_values():
+    mesh = synthetic.sphere(162)
+    height = mesh["position"][:, 2]
+
+    def colors(*field, **options):
+        return threejs.surface(mesh, *field, **options).geometry.attributes["color"].array
+
+    signed = colors(height)
+    top, bottom = height.values.argmax(), height.values.argmin()
+    assert signed[top][2] > signed[top][0], "blue"
+    assert signed[bottom][0] > signed[bottom][2], "red"
+    grey = colors(height + 5, "gray", limits=(5, 6))
+    np.testing.assert_allclose(grey[bottom], 0, atol=0.01)
+    np.testing.assert_allclose(grey[top], 1, atol=0.01)
+    labels = (height > 0).values
+    assert len(np.unique(colors(labels), axis=0)) == 2
+    unknown = np.where(labels, np.nan, height.values)
+    np.testing.assert_allclose(colors(unknown)[top], 0.6, atol=1e-6)
+    np.testing.assert_array_equal(
+        threejs.surface(mesh.assign(height=height), "height").geometry.attributes["color"].array,
+        signed,
+    )
+
+
+def test_the_former_name_of_a_field_still_works_and_says_the_new_one():
+    mesh = synthetic.sphere(162)
+    with pytest.warns(DeprecationWarning, match="colors is now field"):
+        ball = threejs.surface(mesh, colors=np.ones((162, 3)))
+    assert ball.geometry.attributes["color"].array.min() == 1
+
+
+def shader(mesh, row, scores):
+    """What the vertex shader adds up for one vertex: its place, and its normal."""
+    uniforms = {name: value["value"] for name, value in mesh.material.uniforms.items()}
+    table = uniforms["table"].data.reshape(-1, 4)
+    n_modes = int(mesh.material.defines["MODES"])
+    place = mesh.geometry.attributes["position"].array[row].astype(float)
+    normal = mesh.geometry.attributes["normal"].array[row].astype(float)
+    for mode, score in enumerate(scores):
+        texel = table[row * n_modes + mode]
+        number = int(texel[3])
+        steps = np.array([number % 256, number // 256 % 256, number // 65536])
+        place += score * texel[:3]
+        normal += score * uniforms["bends"][mode] * (steps - 127) / 127
+    return place, normal / np.linalg.norm(normal)
+
+
+def test_the_table_holds_places_and_normals_of_the_modes(study):
+    mesh = threejs.modes(study)
+    n_modes = study["pca"].sizes["component"]
+    scores = np.array([1.0, -0.7, 0.5])[:n_modes]
+    shape = s4a.synthesize(study, scores)
+    X, T = shape["position"].values, shape["corner_vertex"].values
+    normals = vertex_normals(X, T)
+    turned = []
+    for row in range(0, len(X), 7):
+        place, normal = shader(mesh, row, scores)
+        np.testing.assert_allclose(place, X[row], atol=1e-4 * np.abs(X).max())
+        turned.append(normal @ normals[row])
+    assert np.quantile(turned, 0.05) > 0.97
+    still = threejs.modes(study).geometry.attributes["normal"].array[::7]
+    unturned = np.einsum("nx,nx->n", still, normals[::7])
+    assert np.mean(turned) > np.mean(unturned), "nearer to the truth than the mean's normals"
+
+
+def test_pythreejs_takes_no_list_of_the_scores_for_a_vector_or_a_matrix(study):
+    for n_modes in (1, 2, 3):
+        mesh = threejs.modes(study, n_modes=n_modes)
+        assert len(mesh.material.uniforms["scores"]["value"]) == 5
+        assert len(mesh.scores) == n_modes
+
+
+def test_scores_are_one_for_each_mode(study):
+    mesh = threejs.modes(study, n_modes=2)
+    mesh.scores = [1.0, -2.0]
+    with pytest.raises(traitlets.TraitError, match="2 scores needed, found 3"):
+        mesh.scores = [1.0, 2.0, 3.0]
+    assert mesh.scores == [1.0, -2.0]
+
+
+def test_modes_at_low_resolution_are_those_of_its_vertices(study):
+    low = threejs.modes(study, resolution="coarse", colored=False)
+    template = study["registration"].attrs["template"]
+    n = study["coarse"][template].sizes["vertex"]
+    assert len(low.geometry.attributes["position"].array) == n < 1500
+    assert low.material.uniforms["colored"]["value"] == 0
+
+
+def test_too_many_modes_for_a_texture_are_refused():
+    with pytest.raises(ValueError, match="at most 8 modes of 1000000 vertices"):
+        threejs._mode_table(np.zeros((1_000_000, 3)), None, np.broadcast_to(0, (9, 1_000_000, 3)))
+
+
+def test_landmarks_stand_where_they_are_with_their_names(meshes):
+    mesh = meshes["brain_01"]
+    group = threejs.points(mesh)
+    assert [ball.name for ball in group.children] == mesh["landmark_name"].values.tolist()
+    np.testing.assert_allclose(
+        [ball.position for ball in group.children], mesh["landmark_position"].values
+    )
+    assert all(isinstance(ball.children[0], pythreejs.Sprite) for ball in group.children)
+    bare = threejs.points(mesh["landmark_position"].values[:2], radius=3.0)
+    assert bare.children[0].geometry.radius == 3
+    assert not bare.children[0].children
+
+
+def test_lines_of_a_correspondence_join_matched_vertices(meshes):
+    source, target = (meshes[name] for name in ("brain_01", "brain_02"))
+    match = np.random.default_rng(0).integers(1500, size=1500).astype(np.int32)
+    pair = xr.Dataset({"match": ("vertex", match)})
+    left, right, lines = threejs.correspondence(pair, source, target, n_lines=20).children
+    X, Y = (part.geometry.attributes["position"].array for part in (left, right))
+    ends = lines.geometry.positions
+    assert ends.shape == (20, 2, 3)
+    for begin, end in ends:
+        here = np.linalg.norm(Y - end, axis=1).argmin()
+        np.testing.assert_allclose(X[match[here]], begin, atol=1e-3)
+    assert X[:, 0].max() < Y[:, 0].min(), "side by side"
+    colors = (part.geometry.attributes["color"].array for part in (left, right))
+    source_colors, target_colors = colors
+    np.testing.assert_array_equal(target_colors, source_colors[match])
+
+
+def test_a_study_matches_two_of_its_shapes(study):
+    left, right, _ = threejs.correspondence(study, "brain_01", "brain_02").children
+    X, Y = (part.geometry.attributes["position"].array for part in (left, right))
+    colors = [part.geometry.attributes["color"].array for part in (left, right)]
+    nearest = cdist(Y - Y.mean(0), X - X.mean(0)).argmin(1)
+    assert np.abs(colors[1] - colors[0][nearest]).mean() < 0.1, "the same places, the same colours"
+
+
+def test_the_network_stands_where_its_differences_are_and_is_coloured_by_its_errors(study):
+    group = threejs.network(study, cmap="gray")
+    *bodies, lines = group.children
+    scores = study["latent"]["area_score"]
+    assert [part.name for part in bodies] == scores["shape"].values.tolist()
+    places = np.array([part.position for part in bodies])
+    ratio = pdist(places) / pdist(scores.values[:, :3])
+    np.testing.assert_allclose(ratio, ratio[0], rtol=1e-6)
+    net = study["network"].dataset
+    names = [part.name for part in bodies]
+    mean = {}
+    for source, target, error in zip(
+        net["source"].values, net["target"].values, net["cycle_error"].values, strict=True
+    ):
+        mean.setdefault(frozenset((str(source), str(target))), []).append(error)
+    brightness = lines.geometry.colors[:, 0, 0]
+    for segment, shade in zip(lines.geometry.positions, brightness, strict=True):
+        ends = [names[np.linalg.norm(places - end, axis=1).argmin()] for end in segment]
+        top = max(np.mean(errors) for errors in mean.values())
+        assert shade == pytest.approx(np.mean(mean[frozenset(ends)]) / top, abs=0.01)
+
+
+def test_what_is_in_a_group_is_in_the_picture():
+    group = pythreejs.Group(
+        children=[threejs.surface(synthetic.sphere(162))],
+        position=[100, 0, 0],
+        scale=[2, 2, 2],
+        quaternion=[0, 0, 1, 0],
+    )
+    view = threejs.renderer(group)
+    np.testing.assert_allclose(view.controls[0].target, [100, 0, 0], atol=0.2)
+    assert np.linalg.norm(np.subtract(view.camera.position, [100, 0, 0])) > 2 * 2
+
+
 def test_the_camera_sees_the_surface():
     view = threejs.renderer(threejs.surface(synthetic.ellipsoid(162)))
     distance = np.linalg.norm(view.camera.position)
@@ -35,6 +205,17 @@ def test_what_cannot_be_shown_is_refused():
     mesh = synthetic.sphere(162)
     with pytest.raises(ValueError, match="162 vertices"):
         threejs.surface(mesh, np.ones((5, 3)))
+    with pytest.raises(ValueError, match=r"found 'hight'; it has position"):
+        threejs.surface(mesh, "hight")
+    with pytest.raises(ValueError, match=r"finite points \(p, 3\)"):
+        threejs.points(np.ones((4, 2)))
+    short = xr.Dataset({"match": ("vertex", np.zeros(5, np.int32))})
+    with pytest.raises(ValueError, match="found 5 up to 0"):
+        threejs.correspondence(short, mesh, mesh)
+    with pytest.raises(ValueError, match="/registration and /pca"):
+        threejs.modes(xr.DataTree())
+    with pytest.raises(ValueError, match="network/cycle_error"):
+        threejs.network(xr.DataTree())
     with pytest.raises(ValueError, match="finite"):
         threejs.surface(mesh.assign(position=mesh["position"] * np.nan))
     with pytest.raises(ValueError, match="at least one surface"):

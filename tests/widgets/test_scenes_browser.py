@@ -1,0 +1,285 @@
+"""Scenes of pythreejs in a real JupyterLab: which pixels are drawn, and what the kernel hears."""
+
+import io
+import json
+
+import numpy as np
+import pytest
+from paths import NOTEBOOKS
+from PIL import Image
+from test_browser import (  # noqa: F401, fixtures are found by their names
+    IDLE,
+    browser,
+    driver,
+    lab,
+    pytestmark,
+    run_notebook,
+    serious,
+    watched,
+)
+
+import s4a
+
+CELL = """
+import ipywidgets
+import numpy as np
+import pythreejs
+
+import s4a
+from s4a.widgets import Modes, threejs
+
+study = s4a.open_study({store!r})
+mesh = study["original/brain_01"].to_dataset()
+"""
+CELLS = [
+    """
+deforming = threejs.modes(study)
+panel = Modes(study)
+threejs.renderer(deforming, size=(300, 240), view="front")
+""",
+    "deforming.sliders",
+    """
+left = mesh["position"].values[:, [0]] < 0
+halves = np.where(left, [[1.0, 0, 0]], [[0, 0, 1.0]])
+threejs.renderer(threejs.surface(mesh, halves), size=(300, 240), view="front")
+""",
+    """
+marks = threejs.points(mesh, "#00ff00")
+sun = pythreejs.PointLight(color="#00ffff", position=[0, -900, 0], intensity=2)
+own = threejs.renderer(threejs.surface(mesh), marks, size=(300, 240), view="front")
+own.scene.add(sun)
+own
+""",
+    """
+joined = threejs.correspondence(study, "brain_01", "brain_02")
+threejs.renderer(joined, size=(480, 240), view="front")
+""",
+    'threejs.renderer(threejs.network(study), size=(480, 300), view="top")',
+    """
+ipywidgets.jsdlink((panel.view, "scores"), (deforming, "scores"))
+panel
+""",
+]
+
+
+LARGE = """
+import numpy as np
+import xarray as xr
+
+import s4a
+from s4a.widgets import threejs
+
+mesh = s4a.synthetic.sphere(100_000)
+X = mesh["position"].values
+waves = [np.sin((k + 2) * X[:, [k % 3]]) * X / 20 for k in range(10)]
+pca = xr.Dataset(
+    {
+        "mean_displacement": (("vertex", "xyz"), np.zeros_like(X)),
+        "deformation": (("component", "vertex", "xyz"), np.array(waves)),
+    }
+)
+study = xr.DataTree.from_dict({"/registration": mesh, "/pca": pca})
+deforming = threejs.modes(study)
+threejs.renderer(deforming, size=(400, 300))
+"""
+SCENES = ".jp-OutputArea-output canvas:not(.s4a-view)"
+MODES, HALVES, LANDMARKS, PAIR, NETWORK = range(5)
+
+
+@pytest.fixture(scope="module")
+def folder(study_folder, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scenes")
+    notebook = json.loads((NOTEBOOKS / "00_explore.ipynb").read_text(encoding="utf-8"))
+    cell = next(c for c in notebook["cells"] if c["cell_type"] == "code")
+    sources = [CELL.format(store=str(study_folder)), *CELLS]
+    notebook["cells"] = [
+        cell | {"source": source, "id": f"cell{i}"} for i, source in enumerate(sources)
+    ]
+    (folder / "scenes.ipynb").write_text(json.dumps(notebook), encoding="utf-8")
+    sources = [LARGE, "deforming.sliders"]
+    notebook["cells"] = [
+        cell | {"source": source, "id": f"cell{i}"} for i, source in enumerate(sources)
+    ]
+    (folder / "large.ipynb").write_text(json.dumps(notebook), encoding="utf-8")
+    (folder / "app").mkdir()
+    return folder
+
+
+def opened(browser, lab, name):  # noqa: F811
+    """A page with a notebook whose cells ran; it keeps its errors and what it sends the kernel."""
+    messages = []
+    page = watched(browser.new_page(viewport={"width": 1280, "height": 3600}), messages)
+    page.set_default_timeout(60_000)
+    page.messages, page.sent = messages, []
+    page.on("websocket", lambda socket: socket.on("framesent", lambda text: page.sent.append(text)))
+    run_notebook(page, lab, name)
+    page.wait_for_function("document.querySelectorAll('.s4a-scores input').length > 0")
+    page.wait_for_function(IDLE)
+    return page
+
+
+@pytest.fixture(scope="module")
+def page(browser, lab):  # noqa: F811
+    page = opened(browser, lab, "scenes.ipynb")
+    for i in range(5):
+        drawn(page, i, lambda picture: body(picture).mean() > 0.05)
+    return page
+
+
+def seen(page, i):
+    """The pixels of a scene (height, width, 3)."""
+    picture = page.locator(SCENES).nth(i).screenshot()
+    return np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")).astype(int)
+
+
+def drawn(page, i, as_wanted):
+    """The pixels of a scene as soon as they are as wanted."""
+    for _ in range(60):
+        picture = seen(page, i)
+        if as_wanted(picture):
+            return picture
+        page.wait_for_timeout(250)
+    raise AssertionError(f"scene {i} is not drawn as wanted")
+
+
+def move(slider, value, *, let_go=False):
+    slider.evaluate("(i, v) => { i.value = v; i.dispatchEvent(new Event('input')); }", value)
+    if let_go:
+        slider.evaluate("(i) => i.dispatchEvent(new Event('change'))")
+
+
+def body(picture):
+    return picture.min(2) < 245
+
+
+def test_a_slider_deforms_the_surface_and_sends_nothing_until_it_is_let_go(page):
+    slider = page.locator(".s4a-scores input").first
+    before = seen(page, MODES)
+    sent = len(page.sent)
+    for value in (0.5, 1, 2, 3):
+        move(slider, value)
+    drawn(page, MODES, lambda picture: (body(picture) != body(before)).mean() > 0.01)
+    assert len(page.sent) == sent
+    move(slider, 3, let_go=True)
+    page.wait_for_timeout(500)
+    comms = [text for text in page.sent[sent:] if b"comm_msg" in bytes(text)]
+    assert len(comms) == 1, "one message tells Python where the slider stands"
+
+
+def test_expansion_is_blue_and_compression_red_and_the_light_falls_on_both(page):
+    move(page.locator(".s4a-scores input").first, 3)
+    picture = drawn(page, MODES, lambda p: ((p[..., 2] - p[..., 0]) > 60).mean() > 0.01)
+    assert ((picture[..., 0] - picture[..., 2]) > 60).mean() > 0.005
+    blue = picture[(picture[..., 2] - picture[..., 0]) > 60]
+    assert np.ptp(blue.sum(1)) > 100, "shaded, not flat"
+
+
+def test_the_mean_is_drawn_again_by_a_double_click(page):
+    slider = page.locator(".s4a-scores input").first
+    move(slider, 3)
+    drawn(page, MODES, lambda p: ((p[..., 2] - p[..., 0]) > 60).mean() > 0.01)
+    slider.dispatch_event("dblclick")
+    drawn(page, MODES, lambda p: ((p[..., 2] - p[..., 0]) > 60).mean() < 0.001)
+    assert page.locator(".s4a-scores output").first.inner_text() == "+0.00 σ"
+
+
+def test_the_deformed_surface_is_where_the_sum_of_modes_puts_it(page, study):
+    """Its outline beside that of a surface of the same vertices, drawn by the CPU's numbers."""
+    scores = [2.0, -1.5, 1.0]
+    for i, score in enumerate(scores):
+        move(page.locator(".s4a-scores input").nth(i), score)
+    shape = s4a.synthesize(study, scores)["position"].values
+    mean = s4a.synthesize(study, [0.0] * 3)["position"].values
+    width = np.ptp(shape[:, 0]) / np.ptp(mean[:, 0])
+    height = np.ptp(shape[:, 2]) / np.ptp(mean[:, 2])
+
+    def outline(picture):
+        rows, columns = np.nonzero(body(picture))
+        return np.ptp(columns), np.ptp(rows)
+
+    page.wait_for_timeout(1000)
+    moved = outline(seen(page, MODES))
+    for i in range(3):
+        move(page.locator(".s4a-scores input").nth(i), 0)
+    page.wait_for_timeout(1000)
+    still = outline(seen(page, MODES))
+    assert moved[0] / still[0] == pytest.approx(width, abs=0.04)
+    assert moved[1] / still[1] == pytest.approx(height, abs=0.04)
+
+
+def test_a_panel_moves_the_scene_that_is_linked_to_it(page):
+    before = seen(page, MODES)
+    move(page.locator(".s4a-slider input").first, -3)
+    drawn(page, MODES, lambda picture: (body(picture) != body(before)).mean() > 0.005)
+    assert page.locator(".s4a-scores output").first.inner_text() == "−3.00 σ"
+    move(page.locator(".s4a-slider input").first, 0)
+
+
+def test_the_colours_of_a_field_are_where_its_values_are(page):
+    picture = seen(page, HALVES)
+    red = (picture[..., 0] > 90) & (picture[..., 2] < 60)
+    blue = (picture[..., 2] > 90) & (picture[..., 0] < 60)
+    assert red.mean() > 0.04
+    assert blue.mean() > 0.04
+    assert np.nonzero(red)[1].max() < np.nonzero(blue)[1].mean()
+
+
+def test_landmarks_are_drawn_and_a_light_of_ones_own_shines_on_the_surface(page):
+    picture = seen(page, LANDMARKS)
+    green = (picture[..., 1] > 120) & (picture[..., 0] < 60) & (picture[..., 2] < 60)
+    assert green.sum() > 30
+    lit = body(picture) & (picture[..., 2] - picture[..., 0] > 20)
+    assert lit.mean() > 0.03, "cyan"
+
+
+def test_lines_join_the_two_surfaces_of_a_correspondence(page):
+    picture = seen(page, PAIR)
+    columns = body(picture).any(0)
+    covered = np.nonzero(columns)[0]
+    assert columns[covered.min() : covered.max()].all(), "no gap between them"
+    middle = body(picture)[:, (covered.min() + covered.max()) // 2]
+    assert 4 <= np.count_nonzero(np.diff(middle.astype(int)) == 1), "several lines, no surface"
+
+
+def test_the_network_shows_its_shapes_and_lines_in_the_colours_of_their_errors(page):
+    picture = seen(page, NETWORK)
+    clay = body(picture) & (np.ptp(picture, axis=2) < 40) & (picture.min(2) > 80)
+    assert clay.mean() > 0.03
+    dark_violet = (picture[..., 2] - picture[..., 1] > 40) & (picture[..., 0] < 110)
+    assert dark_violet.sum() > 60, "the end of viridis_r: the largest error"
+
+
+FRAMES = """
+async (steps) => {
+  const input = document.querySelector(".s4a-scores input");
+  const frame = () => new Promise((drawn) => requestAnimationFrame(drawn));
+  const begin = performance.now();
+  for (let step = 0; step < steps; step++) {
+    input.value = 3 * Math.sin(step);
+    input.dispatchEvent(new Event("input"));
+    await frame();
+    const gl = document.querySelector("canvas:not(.s4a-view)").getContext("webgl2");
+    gl?.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
+  }
+  await frame();
+  return (performance.now() - begin) / steps;
+}
+"""
+
+
+def test_ten_modes_of_100000_vertices_move_without_the_kernel(browser, lab, record_property):  # noqa: F811
+    page = opened(browser, lab, "large.ipynb")
+    before = drawn(page, 0, lambda picture: body(picture).mean() > 0.05)
+    assert page.locator(".s4a-scores input").count() == 10
+    page.wait_for_timeout(500)
+    sent = len(page.sent)
+    record_property("ms a frame", page.evaluate(FRAMES, 20))
+    move(page.locator(".s4a-scores input").nth(9), 3)
+    drawn(page, 0, lambda picture: (picture != before).mean() > 0.02)
+    assert len(page.sent) == sent
+    assert serious(page.messages) == []
+    page.close()
+
+
+def test_nothing_went_wrong_in_the_browser(page):
+    assert serious(page.messages) == []
