@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-lowest test-newest check fuzz format bench structure lab docs clean
+.PHONY: demo test test-lowest test-newest check fuzz format bench structure lab docs address release clean
 
 demo: $(VENV)/.core
 	$(BIN)/s4a demo
@@ -48,6 +48,19 @@ lab: $(VENV)/.course
 # S4A_DOCS=off leaves the outputs of the notebooks out, for a quick look
 docs: $(VENV)/.docs
 	$(BIN)/python -m sphinx -W --keep-going -b html -d docs/_build/doctrees docs docs/_build/html
+
+# the public address, NAME=name/s4a, written into every file that says it
+address:
+	$(PYTHON) tools/release.py address $(NAME)
+
+# what has to hold before a release; builds dist/, tries the wheel outside of the repository and uploads nothing
+release: $(VENV)/.test
+	@test -n "$(VERSION)" || { echo "make release VERSION=..."; exit 2; }
+	$(PYTHON) tools/release.py check $(VERSION)
+	$(BIN)/repo-review --show errskip .
+	rm -rf dist && $(BIN)/python -m pip install --quiet build twine && $(BIN)/python -m build --outdir dist .
+	$(BIN)/python -m twine check --strict dist/*
+	tools/try.sh dist/s4a-$(VERSION)-py3-none-any.whl
 
 clean:
 	rm -rf $(VENV) $(VENV)-lowest $(VENV)-newest
