@@ -3,8 +3,8 @@
 The public names, by section of the paper:
 
 ========================  ====================================================================
-reading and cleaning      :func:`read_shapes`, :func:`read_shape`, :func:`clean`, :func:`read_mesh`,
-                          :func:`write_mesh`
+reading and cleaning      :func:`read_shapes`, :func:`read_shape`, :func:`read_labels`,
+                          :func:`clean`, :func:`read_mesh`, :func:`write_mesh`
 4.1 low resolution        :func:`coarsen`
 3.3 spectrum              :func:`spectrum`, :func:`reconstruct`
 4.1 pairs                 :func:`match_pair`
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from s4a.datasets import synthetic
     from s4a.evaluation import compare, metrics
     from s4a.input.clean import clean
-    from s4a.input.collection import read_shape, read_shapes
+    from s4a.input.collection import read_labels, read_shape, read_shapes
     from s4a.input.files import read_mesh, write_mesh
     from s4a.method.pca import synthesize
     from s4a.method.remesh import coarsen
@@ -83,6 +83,7 @@ __all__ = [
     "match_pair",
     "metrics",
     "open_study",
+    "read_labels",
     "read_mesh",
     "read_shape",
     "read_shapes",
@@ -112,7 +113,7 @@ PLACES = {
     "datasets": "synthetic",
     "evaluation": "compare metrics",
     "input.clean": "clean",
-    "input.collection": "read_shape read_shapes",
+    "input.collection": "read_labels read_shape read_shapes",
     "input.files": "read_mesh write_mesh",
     "method.pca": "synthesize",
     "method.remesh": "coarsen",

@@ -35,6 +35,7 @@ def check(args: Namespace) -> int:
         strict=args.strict,
         close_holes=args.close_holes,
         pattern=args.pattern,
+        label=args.label,
         intersections=args.intersections,
     )["report"].to_dataset()
     write("\n".join([*tables.decision_lines(report), tables.report_table(report)]))

@@ -47,6 +47,7 @@ HELP = {
     "close_holes": "close every hole by a fan of triangles",
     "wrap": "wrap the shapes watertight before they are remeshed",
     "intersections": "count triangles that pass through others",
+    "label": "the files are label volumes (NIfTI, MGH): the surface of this label, or several: 1,2",
     "pattern": "only files whose name fits, for example '*brain*'",
     "preset": "'paper' leaves out all that is added to the paper",
     "template": "name of the shape to register to (default: the median shape)",
@@ -140,7 +141,7 @@ OTHER_NUMBERS: dict[str, Callable[[str], int]] = {"n_jobs": processes, "seed": n
 
 def _check(add):
     add("paths", nargs="+", metavar="PATH", help="folders, globs or mesh files")
-    add_options(add, ["components", "pattern", "strict", "close_holes", "intersections"])
+    add_options(add, ["components", "pattern", "label", "strict", "close_holes", "intersections"])
 
 
 def _doctor(add):

@@ -24,8 +24,8 @@ RATIO = 200  # times the size of the file that it may unpack to beyond that
 GZIP = b"\x1f\x8b"
 
 
-def limit_of(size: int) -> int:
-    """Most bytes that a file of `size` bytes may unpack to.
+def limit_of(size: int, least: int = LEAST) -> int:
+    """Most bytes that a file of `size` bytes may unpack to; `least` are never refused.
 
     Examples
     --------
@@ -33,19 +33,20 @@ def limit_of(size: int) -> int:
     >>> limit_of(1000) == LEAST, limit_of(10**6), limit_of(10**9) == LARGEST
     (True, 200000000, True)
     """
-    return min(LARGEST, max(LEAST, RATIO * size))
+    return min(LARGEST, max(least, RATIO * size))
 
 
-def check(unpacked: int, size: int) -> None:
+def check(unpacked: int, size: int, least: int = LEAST) -> None:
     """ValueError when `unpacked` bytes are more than a file of `size` bytes may hold."""
-    if unpacked > limit_of(size):
+    limit = limit_of(size, least)
+    if unpacked > limit:
         raise ValueError(
-            f"at most {limit_of(size) / 2**20:.0f} MiB expected in {size} compressed bytes, "
+            f"at most {limit / 2**20:.0f} MiB expected in {size} compressed bytes, "
             "found more: unpack the file yourself if you trust it"
         )
 
 
-def gunzip(file: BinaryIO) -> bytes:
+def gunzip(file: BinaryIO, least: int = LEAST) -> bytes:
     """The bytes of a gzip file (several members too); ValueError if too many, or it ends early.
 
     What was unpacked is held against what was read for it so far, so that little memory is taken
@@ -64,7 +65,7 @@ def gunzip(file: BinaryIO) -> bytes:
         with gzip.GzipFile(fileobj=file) as stream:
             while part := stream.read(CHUNK):
                 unpacked.write(part)
-                check(unpacked.tell(), file.tell())
+                check(unpacked.tell(), file.tell(), least)
     except EOFError as error:
         raise ValueError(f"the gzip data ends early: found {file.tell()} bytes") from error
     except (OSError, zlib.error) as error:
@@ -72,12 +73,12 @@ def gunzip(file: BinaryIO) -> bytes:
     return unpacked.getvalue()
 
 
-def content(path: Path | str) -> bytes:
+def content(path: Path | str, least: int = LEAST) -> bytes:
     """The bytes of a regular file, unpacked where it is compressed by gzip."""
     with regular_file(path) as file:
         is_packed = file.read(len(GZIP)) == GZIP
         file.seek(0)
-        return gunzip(file) if is_packed else read_all(file)
+        return gunzip(file, least) if is_packed else read_all(file)
 
 
 def unpack(data: bytes, compressor: str, limit: int) -> bytes:

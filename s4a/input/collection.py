@@ -3,6 +3,7 @@
 import os
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -20,6 +21,7 @@ from s4a.input.files import (
     read_mesh,
     with_long_names,
 )
+from s4a.input.labels import Label, check_label, read_volume
 from s4a.input.raw import shown
 from s4a.schema import check_switch, check_text, dataset, in_unit
 
@@ -38,6 +40,7 @@ def read_shape(
     components: str | int = "largest",
     strict: bool = False,
     close_holes: bool = False,
+    label: Label = None,
 ) -> xr.Dataset:
     """Read one mesh file and clean it.
 
@@ -47,6 +50,9 @@ def read_shape(
         See :func:`s4a.input.files.read_mesh` for the formats.
     components, strict, close_holes
         See :func:`s4a.input.clean.clean`.
+    label : int, several, or "all", optional
+        The file is a label volume, and the mesh the surface of what bears this label, see
+        :func:`s4a.input.labels.read_volume`.
 
     Returns
     -------
@@ -70,7 +76,7 @@ def read_shape(
     >>> s4a.read_shape(folder / "ball.ply").sizes["vertex"]
     100
     """
-    points, triangles, attrs = read_mesh(path)
+    points, triangles, attrs = read_mesh(path) if label is None else read_volume(path, label)
     name = os.fsencode(Path(path)).decode("utf-8", "replace")
     try:
         mesh = as_dataset(points, triangles, {"path": name, **attrs})
@@ -90,6 +96,7 @@ def read_shapes(
     strict: bool = False,
     close_holes: bool = False,
     pattern: str | None = None,
+    label: Label = None,
     compare: bool = True,
     intersections: bool = True,
 ) -> xr.DataTree:
@@ -104,6 +111,8 @@ def read_shapes(
         See :func:`s4a.input.clean.clean`.
     pattern : str, optional
         Of the files found, those whose name it matches, such as ``"*_brain"``.
+    label : int, several, or "all", optional
+        The files are label volumes, see :func:`read_labels`.
     compare : bool
         Whether each shape is compared with the others: unit, handedness, pose, genus
         (:mod:`s4a.input.plausibility`).
@@ -137,10 +146,12 @@ def read_shapes(
     check_switch("close_holes", close_holes)
     check_text("pattern", pattern)
     options = {"components": components, "strict": strict, "close_holes": close_holes}
+    label = check_label(label)
+    volumes = label is not None
     meshes, attrs = {}, {}
-    for name, source in _sources(paths, pattern).items():
+    for name, source in _sources(paths, pattern, volumes).items():
         try:
-            meshes[name] = _cleaned(source, **options)
+            meshes[name] = _cleaned(source, label, **options)
             attrs[name] = meshes[name].attrs
         except ValueError as error:
             path = str(source) if isinstance(source, Path) else ""
@@ -154,22 +165,73 @@ def read_shapes(
     used = {name: said for name, said in attrs.items() if said["status"] != "excluded"}
     doubts, remarks = plausibility.find_warnings(used, evidence)
     nodes = {f"/original/{name}": mesh for name, mesh in meshes.items()}
-    remarks = [*remarks, *remarks_on_files(paths, pattern)]
+    remarks = [*remarks, *remarks_on_files(paths, pattern, volumes=volumes)]
     nodes["/report"] = shape_report(attrs, doubts, remarks, evidence)
     return xr.DataTree.from_dict(nodes)
 
 
-def remarks_on_files(paths: Paths | dict | xr.DataTree, pattern: str | None = None) -> list[str]:
+def read_labels(paths: Paths, *, label: Label = "all", **options: Any) -> xr.DataTree:
+    """Surfaces of one structure of every label volume, as a segmentation marks it, cleaned.
+
+    Marching cubes between the voxels inside and those outside, smoothed without shrinking (Taubin),
+    in world coordinates: millimetres, RAS.
+
+    Parameters
+    ----------
+    paths : str, Path or list of these
+        Folders, globs or files: NIfTI (.nii) or FreeSurfer (.mgh, .mgz), each also as .gz.
+    label : int, str or list of int
+        The structure; several (``[1, 2]`` or ``"1,2"``) are one, ``"all"`` is whatever is not 0.
+    **options
+        Of :func:`read_shapes`.
+
+    Returns
+    -------
+    DataTree
+        As of :func:`read_shapes`.  The report says of each volume where a label reached its border
+        and was closed there, and how many components were found and dropped.
+
+    Raises
+    ------
+    ValueError
+        When scikit-image is not installed or no volume has the label; the message has every
+        reason, and the labels that were found.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import nibabel
+    >>> import numpy as np
+    >>> import s4a
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> far = np.linalg.norm(np.indices((24, 24, 24)).T - 11.5, axis=-1)
+    >>> ball = nibabel.Nifti1Image(17 * (far < 10).astype(np.uint8), np.diag([2, 2, 2, 1.0]))
+    >>> ball.to_filename(folder / "ball.nii.gz")
+    >>> shapes = s4a.read_labels(folder, label=17)
+    >>> X = shapes["original/ball"]["position"].values
+    >>> (np.ptp(X, axis=0).round() == 40).all(), shapes["original/ball"].attrs["unit"]
+    (np.True_, 'mm')
+    """
+    if label is None:
+        raise ValueError("label needs a number other than 0, several (1,2) or 'all'; found None")
+    return read_shapes(paths, label=label, **options)
+
+
+def remarks_on_files(
+    paths: Paths | dict | xr.DataTree, pattern: str | None = None, *, volumes: bool = False
+) -> list[str]:
     """In words: the files among `paths` that are no meshes, and those whose names are too long."""
     if isinstance(paths, dict | xr.DataTree):
         return []
+    what = "label volume" if volumes else "mesh"
     others = [
-        f"{shown(file)} is not a mesh ({why}) and was passed over"
-        for file, why in not_meshes(paths, pattern)
+        f"{shown(file)} is not a {what} ({why}) and was passed over"
+        for file, why in not_meshes(paths, pattern, volumes=volumes)
     ]
     shortened = [
         f"{shown(file)} is called {name}: names of shapes have at most {LONGEST_NAME} letters"
-        for file, name in with_long_names(paths, pattern)
+        for file, name in with_long_names(paths, pattern, volumes=volumes)
     ]
     return others + shortened
 
@@ -223,18 +285,20 @@ def _doubtful_columns(doubts):
     return columns | ({"status": "doubtful"} if serious else {})
 
 
-def _sources(paths, pattern):
+def _sources(paths, pattern, volumes):
     """Name to path, arrays or Dataset, in the order of the names."""
     if not isinstance(paths, dict):
-        return dict(sorted((name, path) for path, name in find_meshes(paths, pattern)))
+        return dict(
+            sorted((name, path) for path, name in find_meshes(paths, pattern, volumes=volumes))
+        )
     check_names(paths)
     return dict(sorted(paths.items()))
 
 
-def _cleaned(source, **options):
+def _cleaned(source, label, **options):
     """A file, a Dataset or a pair of arrays, cleaned."""
     if isinstance(source, Path):
-        return read_shape(source, **options)
+        return read_shape(source, label=label, **options)
     if isinstance(source, xr.Dataset):
         return in_unit(clean(source, **options), source.attrs.get("unit"))
     points, triangles = (np.asarray(values) for values in source)

@@ -15,6 +15,7 @@ import numpy as np
 
 from s4a.input import bounded
 from s4a.input.formats import FORMATS, NPZ_KEYS, SURFER, format_of
+from s4a.input.labels import VOLUMES, is_volume
 from s4a.input.raw import check_there, regular_file, shown
 
 SUFFIXES = {suffix: name for name, known in FORMATS.items() for suffix in known.suffixes.split()}
@@ -67,6 +68,8 @@ def read_mesh(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray, dict[str
     name = "mesh"
     try:
         data = bounded.content(path).removeprefix(b"\xef\xbb\xbf")
+        if is_volume(data):
+            raise ValueError("found a volume; with a label (label=17, --label 17) it is a surface")
         name = format_of(data)
         with np.errstate(all="ignore"):  # nonsense in the file is refused, or left to the cleaning
             points, triangles, attrs = FORMATS[name].read(data)
@@ -176,7 +179,9 @@ def write_mesh(
 # the files of a collection
 
 
-def find_meshes(paths: Paths, pattern: str | None = None) -> list[tuple[Path, str]]:
+def find_meshes(
+    paths: Paths, pattern: str | None = None, *, volumes: bool = False
+) -> list[tuple[Path, str]]:
     """The mesh files of a collection and a name for each.
 
     Parameters
@@ -187,6 +192,8 @@ def find_meshes(paths: Paths, pattern: str | None = None) -> list[tuple[Path, st
     pattern : str, optional
         Keep the files whose name, with or without suffix, it matches: ``"*_brain"`` picks one
         structure of many.
+    volumes : bool
+        Look for label volumes (:mod:`s4a.input.labels`) instead of meshes.
 
     Returns
     -------
@@ -200,19 +207,22 @@ def find_meshes(paths: Paths, pattern: str | None = None) -> list[tuple[Path, st
     ValueError
         When a path is missing or no mesh is found.
     """
-    found = _files(paths)
+    found = _files(paths, volumes)
     files = [file for file, why_not in found if not why_not]
     chosen = [file for file in files if pattern is None or _matches(file, pattern)]
     if not chosen:
+        what = "label volume" if volumes else "mesh"
         where = ", ".join(map(shown, _listed(paths))) or "an empty list"
         if pattern and files:
-            raise ValueError(f"no mesh of {len(files)} files matching {pattern!r} in {where}")
+            raise ValueError(f"no {what} of {len(files)} files matching {pattern!r} in {where}")
         others = "".join(f"; {shown(file)} is {why_not}" for file, why_not in found[:3])
-        raise ValueError(f"no mesh ({', '.join(SUFFIXES)}) in {where}{others}")
+        raise ValueError(f"no {what} ({', '.join(_suffixes(volumes))}) in {where}{others}")
     return list(zip(chosen, slugs(chosen), strict=True))
 
 
-def not_meshes(paths: Paths, pattern: str | None = None) -> list[tuple[Path, str]]:
+def not_meshes(
+    paths: Paths, pattern: str | None = None, *, volumes: bool = False
+) -> list[tuple[Path, str]]:
     """What is named like meshes, or matched by a glob, and holds something else.
 
     Folders that cannot be searched are among them, and links to folders, which are not followed.
@@ -224,16 +234,18 @@ def not_meshes(paths: Paths, pattern: str | None = None) -> list[tuple[Path, str
     """
     return [
         (file, why_not)
-        for file, why_not in _files(paths)
+        for file, why_not in _files(paths, volumes)
         if why_not and (pattern is None or _matches(file, pattern) or os.path.isdir(file))
     ]
 
 
-def with_long_names(paths: Paths, pattern: str | None = None) -> list[tuple[Path, str]]:
+def with_long_names(
+    paths: Paths, pattern: str | None = None, *, volumes: bool = False
+) -> list[tuple[Path, str]]:
     """The files of :func:`find_meshes` whose names were cut, and what they became."""
     return [
         (file, name)
-        for file, name in find_meshes(paths, pattern)
+        for file, name in find_meshes(paths, pattern, volumes=volumes)
         if len(name) == LONGEST_NAME and name not in _plain(str(file))
     ]
 
@@ -242,11 +254,15 @@ def _listed(paths):
     return [paths] if isinstance(paths, str | os.PathLike) else list(paths)
 
 
-def _files(paths):
+def _suffixes(volumes):
+    return VOLUMES if volumes else SUFFIXES
+
+
+def _files(paths, volumes=False):
     """All files that are meant, once and sorted, each with why it is no mesh, or ""."""
     by_place = {}
     for path in _listed(paths):
-        for file, why_not in _expand(path):
+        for file, why_not in _expand(path, volumes):
             place = os.path.abspath(file)
             by_place[place] = min(by_place.get(place, (str(file), why_not)), (str(file), why_not))
     return [(Path(file), why_not) for _, (file, why_not) in sorted(by_place.items())]
@@ -256,11 +272,11 @@ def _matches(file, pattern):
     return any(fnmatch.fnmatchcase(name, pattern) for name in (file.name, file.stem, stem_of(file)))
 
 
-def _expand(path):
+def _expand(path, volumes):
     """The files that a folder, a file or a glob means, each with why it is no mesh, or ""."""
     path = Path(os.path.expanduser(path))
     if os.path.isdir(path):
-        return _search(path)
+        return _search(path, volumes)
     if os.path.lexists(path):  # named by itself, it is tried whatever it is
         return [(path, "")]
     matches = glob.glob(str(path), recursive=True) if glob.has_magic(str(path)) else []
@@ -268,11 +284,13 @@ def _expand(path):
         raise ValueError(f"no file, folder or match of {shown(path)}")
     files = []
     for match in map(Path, matches):
-        files += _search(match) if os.path.isdir(match) else [(match, _why_not(match))]
+        files += (
+            _search(match, volumes) if os.path.isdir(match) else [(match, _why_not(match, volumes))]
+        )
     return files
 
 
-def _search(folder):
+def _search(folder, volumes):
     """The files in a folder, to any depth, that are named like meshes, each with why it is none."""
     unread: list[OSError] = []
     files, others = [], []
@@ -281,8 +299,9 @@ def _search(folder):
         meant = [Path(place, name) for name in names if name[0] != "."]
         links = [path for path in inside if path.is_symlink()]
         others += [(path, "a link to a folder, which is not followed") for path in links]
-        files += [(path, _why_not(path)) for path in meant if suffix_of(path) in SUFFIXES]
-        named_so = [path for path in inside if suffix_of(path) in SUFFIXES and path not in links]
+        known = _suffixes(volumes)
+        files += [(path, _why_not(path, volumes)) for path in meant if suffix_of(path) in known]
+        named_so = [path for path in inside if suffix_of(path) in known and path not in links]
         others += [(path, "a folder, and its files were searched") for path in named_so]
     others += [
         (Path(error.filename), f"a folder that cannot be searched: {error.strerror}")
@@ -291,12 +310,14 @@ def _search(folder):
     return files + others
 
 
-def _why_not(file):
+def _why_not(file, volumes):
     """What a file is that may well lie beside the meshes of a collection; "" where it may be one.
 
     Two formats hold other things as well as meshes, and are looked into.
     """
     suffix = suffix_of(file)
+    if volumes:
+        return "" if suffix in VOLUMES else f"a {suffix or 'nameless'} file"
     if suffix in OTHERS:
         return f"a {suffix} file"
     try:

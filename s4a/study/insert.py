@@ -159,8 +159,7 @@ def read_new(
     attrs = {name: {"status": "ok", "reason": ""} | mesh.attrs for name, mesh in meshes.items()}
     if isinstance(shapes, dict) and not shapes:
         return meshes, attrs
-    cleaning = {name: getattr(options, name) for name in ("components", "strict", "close_holes")}
-    tree = read_shapes(shapes, compare=False, **cleaning)
+    tree = read_shapes(shapes, compare=False, **options.of_cleaning)
     report = tree["report"].to_dataset()
     for name in report["shape"].values.tolist():
         if name in tree["original"].children:

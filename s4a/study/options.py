@@ -13,6 +13,7 @@ from typing import Self, get_args
 import xarray as xr
 
 from s4a.input.clean import check_components
+from s4a.input.labels import check_label
 from s4a.method.median import NORMS
 from s4a.method.shape import N_CENTRAL, N_SPREAD, Shape
 from s4a.schema import check_count, check_switch, check_text
@@ -179,6 +180,7 @@ class Options:
     wrap: bool = False
     intersections: bool = True
     pattern: str | None = None
+    label: int | str | None = None
     preset: str | None = None
     template: str | None = None
     table: Path | str | None = None
@@ -195,6 +197,7 @@ class Options:
             if bool in (field.type, *get_args(field.type)):
                 check_switch(field.name, getattr(self, field.name))
         check_components(self.components)
+        object.__setattr__(self, "label", check_label(self.label))
         check_text("pattern", self.pattern)
         check_text("template", self.template)
         if self.method == "scalable":
@@ -227,6 +230,12 @@ class Options:
             raise ValueError(f"k must be at least k_init = {self.k_init}; found {self.k}")
         if self.n_latent is not None and self.n_latent > self.k:
             raise ValueError(f"n_latent must be at most k = {self.k}; found {self.n_latent}")
+
+    @property
+    def of_cleaning(self) -> dict:
+        """The options of :func:`s4a.input.collection.read_shape`."""
+        names = ["components", "strict", "close_holes", *["label"] * (self.label is not None)]
+        return {name: getattr(self, name) for name in names}
 
     @property
     def of_low_resolution(self) -> dict:

@@ -149,6 +149,8 @@ def analyse(
         :func:`s4a.input.subjects.read_table`; they become ``/subjects``, so that
         :mod:`s4a.analysis.statistics` takes their names.  Nothing else depends on it.  Without one,
         a table given to an earlier run stays.
+    label : int, several, or "all", optional
+        The files are label volumes, see :func:`s4a.read_labels`.
     doubtful : {"apart", "stop"}
         Doubtful shapes, such as one mirrored or of another unit, stay apart by default: they are
         placed beside the network of all others and registered, so that nothing changes for these.
@@ -199,8 +201,9 @@ def analyse(
     settings = Options(**options)
     if settings.intersections:
         check_meshlab()
-    sources = find_sources(shapes, settings.pattern)
-    remarks = remarks_on_files(shapes, settings.pattern)
+    volumes = settings.label is not None
+    sources = find_sources(shapes, settings.pattern, volumes=volumes)
+    remarks = remarks_on_files(shapes, settings.pattern, volumes=volumes)
     settings.check_against(list(sources))
     subjects = None if settings.table is None else read_table(settings.table, list(sources))
     with lock(store) as claim:
@@ -242,7 +245,7 @@ def run_steps(run: Run, sources: Sources, options: Options, remarks: list[str]) 
 
 def read_and_clean(run: Run, sources: Sources, options: Options) -> Keys:
     """The shapes, cleaned (5.1): ``/original``."""
-    cleaning = {name: getattr(options, name) for name in ("components", "strict", "close_holes")}
+    cleaning = options.of_cleaning
     todo = [
         Task(n, f"original/{n}.nc", clean_shape, (source, content, cleaning), (content, cleaning))
         for n, (source, content) in sources.items()

@@ -18,7 +18,9 @@ Collection = Path | str | list[Path | str] | dict[str, Any] | xr.DataTree
 Sources = dict[str, tuple[str | xr.Dataset, str]]  # name -> path or mesh, key of its content
 
 
-def find_sources(shapes: Collection, pattern: str | None = None) -> Sources:
+def find_sources(
+    shapes: Collection, pattern: str | None = None, *, volumes: bool = False
+) -> Sources:
     """What the user gave, in the order of the names: path or Dataset, and the key of its content.
 
     Parameters
@@ -26,6 +28,8 @@ def find_sources(shapes: Collection, pattern: str | None = None) -> Sources:
     shapes : see :func:`s4a.analyse`
     pattern : str, optional
         Of the files found, those whose name it matches.
+    volumes : bool
+        Whether the files are label volumes.
 
     Raises
     ------
@@ -48,7 +52,7 @@ def find_sources(shapes: Collection, pattern: str | None = None) -> Sources:
             )
         shapes = {name: node.to_dataset() for name, node in shapes["original"].children.items()}
     if not isinstance(shapes, dict):
-        files = sorted((name, path) for path, name in find_meshes(shapes, pattern))
+        files = sorted((name, path) for path, name in find_meshes(shapes, pattern, volumes=volumes))
         found: Sources = {name: (str(path), content_of_file(path)) for name, path in files}
         for _, path in files:  # an unmounted folder is not one of unreadable files
             if not os.path.lexists(path):

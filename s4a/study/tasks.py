@@ -42,7 +42,7 @@ def clean_shape(source: str | xr.Dataset, content: str, cleaning: dict) -> xr.Da
         area = float(triangle_areas(*as_arrays(source)).sum())
         mesh = source.assign_attrs({"status": "ok", "reason": "", "area": area} | source.attrs)
     else:
-        mesh = clean(source, **cleaning)
+        mesh = clean(source, **{name: cleaning[name] for name in cleaning if name != "label"})
     return in_unit(mesh, source.attrs.get("unit"))
 
 

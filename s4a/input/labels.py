@@ -1,0 +1,226 @@
+"""Surfaces from label volumes (5.1, the data): what a segmentation marks, as a mesh in millimetres.
+
+Between the voxels inside and those outside lies a surface (marching cubes), whose steps of one
+voxel are smoothed without shrinking it (Taubin, "A signal processing approach to fair surface
+design", 1995).
+"""
+
+import io
+import os
+from collections.abc import Iterable
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import sparse
+
+from s4a.geometry.mesh import directed_edges
+from s4a.input import bounded
+from s4a.input.raw import check_there, shown
+
+VOLUMES = {".nii": "NIfTI", ".mgz": "MGH", ".mgh": "MGH"}
+Label = int | str | Iterable[int] | None
+ROUNDS = 20  # of smoothing
+UNPACKED = 2**29  # bytes of a volume that are never refused: labels compress well
+SHRINK, GROW = 0.5, -0.51  # steps of a round: lambda and mu of Taubin
+MILLIMETRES = {"mm": 1.0, "unknown": 1.0, "meter": 1000.0, "micron": 0.001}
+NOTHING = "every voxel is 0: nothing is marked"
+MOST_TOLD = 30  # labels that an error lists
+
+
+def check_label(label: Label) -> int | str | None:
+    """A label as options keep it: a number, several as ``"1,2"``, ``"all"``, or None.
+
+    Raises
+    ------
+    ValueError
+        When it is none of these, or scikit-image is not installed.
+
+    Examples
+    --------
+    >>> from s4a.input.labels import check_label
+    >>> check_label(17), check_label([2, 1]), check_label("1,2"), check_label("all")
+    (17, '1,2', '1,2', 'all')
+    """
+    if label is None or label == "all":
+        known: int | str | None = label
+    else:
+        try:
+            given = label.split(",") if isinstance(label, str) else label
+            numbers = [given] if isinstance(given, int | np.integer) else list(given)
+            if any(isinstance(one, bool | float) for one in numbers):
+                raise ValueError
+            wanted = sorted({int(one) for one in numbers})
+        except (TypeError, ValueError):
+            wanted = []
+        if not wanted or 0 in wanted:
+            raise ValueError(
+                f"label needs a number other than 0, several (1,2) or 'all'; found {label!r}"
+            )
+        known = wanted[0] if len(wanted) == 1 else ",".join(map(str, wanted))
+    if known is not None and find_spec("skimage") is None:
+        raise ValueError(
+            "surfaces from label volumes need scikit-image, which is not installed; "
+            "run: pip install 's4a[labels]'"
+        )
+    return known
+
+
+def is_volume(data: bytes) -> bool:
+    """Whether the first bytes of a file are those of a NIfTI or MGH volume."""
+    return data[344:348] in (b"n+1\0", b"ni1\0") or data[:4] == b"\0\0\0\1"
+
+
+def read_volume(
+    path: str | os.PathLike, label: Label, *, rounds: int = ROUNDS
+) -> tuple[np.ndarray, np.ndarray, dict[str, str]]:
+    """The surface of what a label volume marks, in its world coordinates.
+
+    Parameters
+    ----------
+    path : str or Path
+        NIfTI (.nii) or FreeSurfer (.mgh, .mgz), each also as .gz: whole numbers in three
+        dimensions.
+    label : int, several, or "all"
+        Several are one structure, "all" is whatever is not 0.
+    rounds : int
+        Of smoothing; 0 leaves the steps of the voxels.
+
+    Returns
+    -------
+    points : float64 ndarray (n, 3)
+        In millimetres: to the right, to the front and up (RAS), where the file says how it lies.
+    triangles : int32 ndarray (m, 3)
+        Counter-clockwise seen from outside.
+    attrs : dict of str
+        ``format``, ``unit``, ``coordinate_system``, ``label``, and ``note`` when the volume does
+        not say how it lies, or what is marked reaches its border, where it is closed.
+
+    Raises
+    ------
+    ValueError
+        When the file is no such volume, or marks nothing with one of these labels; the message has
+        the file, and the labels that are there.
+    """
+    path = Path(path)
+    check_there(path)
+    known = check_label(label)
+    try:
+        values, affine, attrs = _volume(bounded.content(path, UNPACKED))
+        inside = _marked(values, known)
+        points, triangles, at_border = _boundary(inside)
+    except Exception as error:  # whatever a file holds, it must not end the run over a collection
+        why = shown(error) or type(error).__name__
+        raise ValueError(f"{shown(path)} cannot be read as a label volume: {why}") from error
+    points = points @ affine[:3, :3].T + affine[:3, 3]
+    if np.linalg.det(affine[:3, :3]) < 0:
+        triangles = triangles[:, ::-1]
+    attrs |= {"label": str(known), "unit": "mm"}
+    notes = [attrs.pop("note", "")]
+    if at_border:
+        notes.append("what is marked reaches the border of the volume, where it was closed")
+    if any(notes):
+        attrs["note"] = "; ".join(filter(None, notes))
+    return smoothed(points, triangles, rounds), np.ascontiguousarray(triangles), attrs
+
+
+def _volume(data):
+    """Whole numbers (x, y, z), the affine map of their indices to millimetres, and attributes."""
+    import nibabel
+
+    if data[:4] == b"\0\0\0\1":
+        kind: Any = nibabel.MGHImage
+        name, n_bytes = "MGH", 284
+    elif is_volume(data):
+        kind, name, n_bytes = nibabel.Nifti1Image, "NIfTI", 352
+    else:
+        raise ValueError(f"NIfTI or MGH expected, found {len(data)} bytes of something else")
+    header = kind.header_class.from_fileobj(io.BytesIO(data))
+    shape = tuple(int(n) for n in header.get_data_shape())
+    while len(shape) > 3 and shape[-1] == 1:
+        shape = shape[:-1]
+    if len(shape) != 3 or min(shape) < 1:
+        raise ValueError(f"a volume of three dimensions expected, found {shape}")
+    needed = int(np.prod(shape, dtype=object)) * header.get_data_dtype().itemsize
+    if needed + n_bytes > len(data):
+        raise ValueError(f"{needed} bytes of voxels {shape} expected, found {len(data) - n_bytes}")
+    image = kind.from_bytes(data)
+    values = np.asanyarray(image.dataobj).reshape(shape)
+    if values.dtype.kind not in "iub":
+        if values.dtype.kind != "f" or not np.array_equal(values, np.round(values)):
+            raise ValueError("whole numbers expected, one a structure: this is no label volume")
+        values = values.astype(np.int64)
+    affine = np.array(image.affine, float)
+    if not np.isfinite(affine).all() or abs(np.linalg.det(affine[:3, :3])) < 1e-12:
+        raise ValueError("its affine map to millimetres cannot be inverted")
+    attrs = {"format": name, "coordinate_system": "RAS"}
+    if name == "NIfTI":
+        affine[:3] *= MILLIMETRES[header.get_xyzt_units()[0]]
+        if int(header["sform_code"]) == 0 == int(header["qform_code"]):
+            del attrs["coordinate_system"]
+            attrs["note"] = "the volume does not say how it lies, left and right may be exchanged"
+    return values, affine, attrs
+
+
+def _marked(values, label):
+    """Which voxels are inside."""
+    if label == "all":
+        inside = values != 0
+        if not inside.any():
+            raise ValueError(NOTHING)
+        return inside
+    wanted = [int(one) for one in str(label).split(",")]
+    found = [int(one) for one in np.unique(values) if one]
+    missing = [one for one in wanted if one not in found]
+    if missing:
+        there = ", ".join(map(str, found[:MOST_TOLD])) + " ..." * (len(found) > MOST_TOLD)
+        what = f"label {', '.join(map(str, missing))} expected"
+        raise ValueError(f"{what}, found {there}" if found else NOTHING)
+    return np.isin(values, wanted)
+
+
+def _boundary(inside):
+    """Points (n, 3) in indices of voxels, triangles, and whether the volume's border was reached.
+
+    Seen from outside the triangles are counter-clockwise where the axes are right-handed.
+    """
+    from skimage.measure import marching_cubes
+
+    spans = []
+    for axis in range(3):
+        used = np.flatnonzero(inside.any(axis=tuple({0, 1, 2} - {axis})))
+        spans.append(slice(used[0], used[-1] + 1))
+    limits = zip(spans, inside.shape, strict=True)
+    at_border = any(span.start == 0 or span.stop == n for span, n in limits)
+    box = np.pad(inside[tuple(spans)], 1)
+    points, triangles, _, _ = marching_cubes(
+        box.astype(np.float32), 0.5, gradient_direction="ascent"
+    )
+    origin = np.array([span.start - 1 for span in spans])
+    return points.astype(float) + origin, triangles.astype(np.int32), at_border
+
+
+def smoothed(X: np.ndarray, T: np.ndarray, rounds: int = ROUNDS) -> np.ndarray:
+    """Points ``(n, 3)`` of a mesh after rounds of Taubin's smoothing, which keeps its volume.
+
+    A step goes towards the mean of the neighbours, the next a little farther back.
+
+    Examples
+    --------
+    >>> import s4a
+    >>> from s4a.geometry.mesh import as_arrays
+    >>> from s4a.input.labels import smoothed
+    >>> X, T = as_arrays(s4a.synthetic.sphere(1000))
+    >>> round(float((smoothed(X, T) ** 2).sum(1).mean()), 2)
+    1.0
+    """
+    a, b = directed_edges(T).T
+    n = len(X)
+    W = sparse.csr_array((np.ones(len(a)), (a, b)), (n, n))
+    W = ((W + W.T) > 0).astype(float)
+    W = sparse.diags_array(1 / np.maximum(W.sum(1), 1)) @ W  # (n, n): the mean of the neighbours
+    for _ in range(rounds):
+        for step in (SHRINK, GROW):
+            X = X + step * (W @ X - X)
+    return X
