@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-lowest test-newest check fuzz format bench structure lab docs address release clean
+.PHONY: demo test test-lowest test-newest check fuzz format bench hangs structure lab docs address release clean
 
 demo: $(VENV)/.core
 	$(BIN)/s4a demo
@@ -37,6 +37,11 @@ format: $(VENV)/.test
 
 bench: $(VENV)/.bench
 	@set -e; for script in $(wildcard tests/benchmarks/*.py); do echo "$$script"; $(BIN)/python "$$script"; done
+
+# lesson 04 twenty times, and every other one three times, on a busy machine: does one hang?
+hangs: $(VENV)/.test
+	$(BIN)/python tests/benchmarks/hangs.py 04 --runs 20
+	$(BIN)/python tests/benchmarks/hangs.py --runs 3
 
 # the picture, the measures and the map of the rooms, made from the code
 structure: $(VENV)/.core

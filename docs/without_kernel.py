@@ -15,6 +15,7 @@ from IPython.display import HTML, display
 from jinja2 import Environment
 from markupsafe import Markup
 
+import s4a.course
 from s4a.show.draw import data_uri
 from s4a.show.panel_page import panel_html
 from s4a.widgets.explore import Explore
@@ -96,8 +97,8 @@ def values_of(slider, n):
     return [type(slider.value)(options[i]) for i in places], places.index(here)
 
 
-def interact(function, **sliders):
-    """In place of that of ipywidgets: the results for some values, and sliders among them."""
+def slide(function, **sliders):
+    """In place of that of the course: the results for some values, and sliders among them."""
     n = N_VALUES if len(sliders) == 1 else 3
     values, places = zip(*(values_of(slider, n) for slider in sliders.values()), strict=True)
     strides = [math.prod(map(len, values[i + 1 :])) for i in range(len(values))]
@@ -115,4 +116,4 @@ def interact(function, **sliders):
     display(HTML(page))
 
 
-ipywidgets.interact = interact
+s4a.course.slide = slide

@@ -1,11 +1,17 @@
-"""Exercises of the notebooks.
+"""Exercises and sliders of the notebooks.
 
 A cell leaves ``answer = ...`` open, and what the reader puts there is checked.
 """
 
-from typing import Any
+import io
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+if TYPE_CHECKING:
+    import ipywidgets
+    from matplotlib.figure import Figure
 
 
 def check(answer: Any, expected: Any, hint: str = "", *, within: float = 0.01) -> str:
@@ -55,6 +61,71 @@ def check(answer: Any, expected: Any, hint: str = "", *, within: float = 0.01) -
     if not right:
         raise _shown(f"Not yet: the answer is {_told(answer)}.{hint}")
     return "Right."
+
+
+def slide(draw: "Callable[..., Figure]", **sliders: "ipywidgets.Widget") -> "ipywidgets.VBox":
+    """A figure that sliders draw anew.
+
+    Unlike ``ipywidgets.interact`` it captures no output, for which programs that run notebooks may
+    wait without end; the picture is the value of an image.
+
+    Parameters
+    ----------
+    draw : callable
+        Takes the values of the sliders by name, and gives a matplotlib Figure.
+    **sliders : ipywidgets.Widget
+        Each with a ``value``; one without a description gets its name.
+
+    Returns
+    -------
+    ipywidgets.VBox
+        The sliders, the picture and, where `draw` fails, its error.
+
+    Examples
+    --------
+    >>> import ipywidgets
+    >>> from matplotlib.figure import Figure
+    >>> from s4a.course import slide
+    >>> def line(n):
+    ...     figure = Figure(figsize=(2, 1))
+    ...     figure.subplots().plot(range(n))
+    ...     return figure
+    >>> n = ipywidgets.IntSlider(3, 2, 9)
+    >>> controls = slide(line, n=n)
+    >>> before = controls.children[-1].value
+    >>> n.value = 5
+    >>> controls.children[-1].value != before
+    True
+    """
+    import html
+
+    import ipywidgets
+
+    picture = ipywidgets.Image(layout={"max_width": "100%"})
+    message = ipywidgets.HTML()
+
+    def redraw(change=None):
+        try:
+            figure = draw(**{name: slider.value for name, slider in sliders.items()})
+            picture.value, picture.width = _png(figure)
+            message.value = ""
+        except Exception as error:  # a callback has no cell to show it
+            message.value = f"<pre>{html.escape(f'{type(error).__name__}: {error}')}</pre>"
+
+    for name, slider in sliders.items():
+        slider.description = slider.description or name
+        slider.observe(redraw, "value")
+    redraw()
+    return ipywidgets.VBox([*sliders.values(), message, picture])
+
+
+def _png(figure):
+    """A figure as PNG of twice the pixels that it is shown with, and that width."""
+    target = io.BytesIO()
+    figure.savefig(target, format="png", dpi=2 * figure.dpi, bbox_inches="tight")
+    data = target.getvalue()
+    width = int.from_bytes(data[16:20], "big")  # of the header of a PNG
+    return data, str(width // 2)
 
 
 def _shown(message):

@@ -155,5 +155,13 @@ def test_it_is_kept_without_outputs_and_with_an_exercise_that_lets_the_others_ru
 
 
 @each_notebook
+def test_no_slider_captures_output_for_which_a_client_may_wait_without_end(path):
+    notebook = nbformat.read(path, as_version=4)
+    for cell in notebook.cells:
+        if cell.cell_type == "code":
+            assert not re.search(r"\binteract\w*\(|\bOutput\(", cell.source), "s4a.course.slide"
+
+
+@each_notebook
 def test_the_table_of_lessons_has_it(path):
     assert f"({path.name})" in (NOTEBOOKS / "README.md").read_text(encoding="utf-8")
