@@ -47,7 +47,7 @@ def check_label(label: Label) -> int | str | None:
         known: int | str | None = label
     else:
         try:
-            given = label.split(",") if isinstance(label, str) else label
+            given: Any = label.split(",") if isinstance(label, str) else label
             numbers = [given] if isinstance(given, int | np.integer) else list(given)
             if any(isinstance(one, bool | float) for one in numbers):
                 raise ValueError
