@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-lowest test-newest check fuzz format bench hangs structure lab docs address release clean
+.PHONY: demo test test-lowest test-newest check fuzz format bench paper hangs structure lab docs address release clean
 
 demo: $(VENV)/.core
 	$(BIN)/s4a demo
@@ -42,6 +42,11 @@ bench: $(VENV)/.bench
 hangs: $(VENV)/.test
 	$(BIN)/python tests/benchmarks/hangs.py 04 --runs 20
 	$(BIN)/python tests/benchmarks/hangs.py --runs 3
+
+# every table that README, documentation and papers quote, into docs/_build/paper, with machine and versions: hours.
+# ONLY=accuracy takes the commands with that word, ONLY=--list names all
+paper: $(VENV)/.bench
+	$(BIN)/python tools/paper.py $(ONLY)
 
 # the picture, the measures and the map of the rooms, made from the code
 structure: $(VENV)/.core

@@ -1,0 +1,93 @@
+"""A figure that a page quotes has a command that prints it, and `make paper` runs that command."""
+
+import re
+import sys
+
+import pytest
+from paths import DOCS, ROOT, benchmark
+
+sys.path.insert(0, str(ROOT / "tools"))
+import paper
+
+# what looks measured: a number with a unit, or a cell of a table with two digits after the point
+FIGURE = re.compile(
+    r"\d[\d,.]*\s?(?:%(?!\w)|seconds\b|GB\b|GiB\b|CPU s|s\b|mm\b)|\|\s*\**\d+\.\d\d+\**\s*\|"
+)
+LIMIT = re.compile(r"`[\w/]*test_\w+\.py")  # a figure that a test holds is a limit
+# sections whose figures are limits in the code, or measured once, as their page says
+EXEMPT = {("docs/plausibility.md", "# What is told of an odd shape, and what cannot be")}
+ONCE = "Figures without a command were measured once and are there to plan with."
+
+
+def sections(page):
+    """Title and text of the sections of a page, without what is code or an address."""
+    text = (ROOT / page).read_text(encoding="utf-8")
+    text = re.sub(r"\]\([^)]*\)|<!-- /?unpublished -->", "]", paper.FENCE.sub("", text))
+    return [(part.split("\n")[0], part) for part in re.split(r"\n(?=## )", text)]
+
+
+@pytest.mark.parametrize("page", paper.PAGES)
+def test_a_section_that_quotes_a_figure_names_a_command_or_the_test_that_holds_it(page):
+    if ONCE in (DOCS / "decisions.md").read_text("utf-8") and page == "docs/decisions.md":
+        return
+    parts = sections(page)
+    if paper.commands_in(parts[0][1]) and page.startswith("docs/"):
+        return  # the head of the page names what makes its tables
+    without = [
+        (title, FIGURE.findall(text)[:3])
+        for title, text in parts
+        if FIGURE.search(text)
+        and not paper.commands_in(text)
+        and not LIMIT.search(text)
+        and (page, title) not in EXEMPT
+    ]
+    assert without == []
+
+
+def test_a_figure_without_a_command_is_seen():
+    assert FIGURE.search("it takes 12.5 s")
+    assert FIGURE.search("| ours | 0.24 |")
+    assert not FIGURE.search("| 3.4 | network |")
+    assert paper.commands_in("no command, but `s4a demo`") == []
+
+
+@pytest.mark.parametrize("command", paper.commands(), ids=" ".join)
+def test_every_command_is_a_script_that_takes_these_words(command):
+    name, *words = command
+    text = (paper.BENCHMARKS / name).read_text(encoding="utf-8")
+    script = benchmark(name.removesuffix(".py"))
+    known = {*getattr(script, "PARTS", ()), *getattr(script, "SETS", ())}
+    known |= {*getattr(script, "REPORTED", ())}
+    for before, word in zip(["", *words], words, strict=False):
+        if word.startswith("--"):
+            assert f'"{word}"' in text, word
+        elif not before.startswith("--") and not word.isdigit():
+            found = word in known or hasattr(script, word) or f'"{word}"' in text
+            assert found, word
+
+
+def test_commands_are_found_on_pages_as_they_are_written():
+    text = "`python tests/benchmarks/claims.py remesh`, `speed.py whole 51 100000`, `test_x.py`"
+    assert paper.commands_in(text) == [
+        ("claims.py", "remesh"),
+        ("speed.py", "whole", "51", "100000"),
+    ]
+    assert paper.commands_in("`additions.py --write`\n```sh\n`poses.py`\n```") == [
+        ("additions.py",)
+    ]
+
+
+def test_what_a_command_prints_is_kept_with_machine_and_versions_at_its_foot(tmp_path, monkeypatch):
+    monkeypatch.setattr(paper, "BENCHMARKS", tmp_path)
+    (tmp_path / "good.py").write_text("import sys; print('| a |', sys.argv[1:])")
+    (tmp_path / "bad.py").write_text("raise SystemExit(3)")
+    path, code = paper.run(("good.py", "two words"), tmp_path / "out")
+    text = path.read_text(encoding="utf-8")
+    assert code == 0
+    assert "| a | ['two words']" in text
+    foot = text.split("\n---\n")[1]
+    assert "cores" in foot
+    assert re.search(r"S4A [\d.]+.*Python 3\.\d+.*numpy [\d.]+.*xarray [\d.]+", foot)
+    path, code = paper.run(("bad.py",), tmp_path / "out")
+    assert code == 3
+    assert "It ended with 3." in path.read_text(encoding="utf-8")

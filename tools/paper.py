@@ -1,0 +1,123 @@
+"""Every table that README, documentation and papers quote, made anew: ``make paper``.
+
+The commands are those that the pages name in backticks, such as ``speed.py growth``; they are
+scripts of ``tests/benchmarks``. Each writes what it prints into ``docs/_build/paper``, with machine
+and versions at its foot. All of them take hours on two cores; ``make paper ONLY=accuracy`` takes
+those whose command contains the word, ``make paper ONLY=--list`` names all and runs none.
+``tests/house/test_paper.py`` fails where a page quotes a figure without a command.
+"""
+
+import os
+import platform
+import re
+import shlex
+import subprocess
+import sys
+import time
+from importlib.metadata import version
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+BENCHMARKS = ROOT / "tests" / "benchmarks"
+OUT = ROOT / "docs" / "_build" / "paper"
+PAGES = (
+    "README.md",
+    "docs/claims.md",
+    "docs/clusters.md",
+    "docs/comparison.md",
+    "docs/decisions.md",
+    "docs/differences.md",
+    "docs/doubtful.md",
+    "docs/install.md",
+    "docs/plausibility.md",
+    "paper/paper.md",
+    "paper/jose.md",
+)
+PACKAGES = ("numpy", "scipy", "xarray", "libigl", "robust_laplacian", "scikit-learn", "pymeshlab")
+CODE = re.compile(r"`([^`]+)`")
+FENCE = re.compile(r"```.*?```", re.DOTALL)
+
+
+def commands_in(text):
+    """The commands that a text names, without the folder and what writes into the pages."""
+    found = []
+    for code in CODE.findall(FENCE.sub("", text)):
+        words = shlex.split(code) if code.count('"') % 2 == 0 and "'" not in code else code.split()
+        words = words[1:] if words[:1] == ["python"] else words
+        if not words or not words[0].endswith(".py"):
+            continue
+        name = words[0].removeprefix("tests/benchmarks/")
+        if (BENCHMARKS / name).is_file():
+            found.append((name, *(word for word in words[1:] if word != "--write")))
+    return found
+
+
+def commands(pages=PAGES):
+    """The commands of all pages, each once, in their order."""
+    texts = [(ROOT / page).read_text(encoding="utf-8") for page in pages]
+    return list(dict.fromkeys(command for text in texts for command in commands_in(text)))
+
+
+def machine():
+    """What it ran on, as the foot of a table."""
+    model = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        names = re.findall(r"^model name\s*: (.+)$", info.read_text(), re.MULTILINE)
+        model = names[0] if names else model
+    try:
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+        told = f", {memory:.0f} GiB"
+    except (AttributeError, ValueError, OSError):  # not on Windows
+        told = ""
+    return f"{model}, {os.cpu_count()} cores{told}, {platform.platform()}"
+
+
+def versions():
+    """The versions of S4A and of what computes for it."""
+    revision = subprocess.run(
+        ["git", "describe", "--always", "--dirty"], cwd=ROOT, capture_output=True, text=True
+    ).stdout.strip()
+    named = ", ".join(f"{name} {version(name)}" for name in PACKAGES)
+    at = f" at {revision}" if revision else ""
+    return f"S4A {version('s4a')}{at}, Python {platform.python_version()}, {named}"
+
+
+def run(command, out=OUT):
+    """Run a command; its output and foot as a file. Gives its path and the exit code."""
+    out.mkdir(parents=True, exist_ok=True)
+    begin = time.time()
+    result = subprocess.run(
+        [sys.executable, str(BENCHMARKS / command[0]), *command[1:]],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        text=True,
+        check=False,
+    )
+    day = time.strftime("%Y-%m-%d")
+    foot = f"{day}, {time.time() - begin:.0f} s. {machine()}. {versions()}."
+    failed = f"\n\nIt ended with {result.returncode}." if result.returncode else ""
+    slug = re.sub(r"\W+", "-", " ".join(command).replace(".py", "")).strip("-")
+    path = out / f"{slug}.md"
+    head = f"# `{shlex.join(command)}`"
+    path.write_text(f"{head}\n\n{result.stdout}\n---\n\n{foot}{failed}\n", encoding="utf-8")
+    return path, result.returncode
+
+
+def main(words):
+    chosen = [c for c in commands() if all(word in " ".join(c) for word in words if word[0] != "-")]
+    codes = []
+    for command in chosen:
+        sys.stdout.write(f"{shlex.join(command)}\n")
+        sys.stdout.flush()
+        if "--list" not in words:
+            path, code = run(command)
+            codes.append(code)
+            sys.stdout.write(
+                f"  -> {path.relative_to(ROOT)}{f', failed: {code}' if code else ''}\n"
+            )
+    return 1 if any(codes) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
