@@ -36,7 +36,8 @@ from s4a.method.spectral import factor
 # Of the first and of the last step.  Chosen on a pair of faces, of brains and of skulls and two
 # cortex templates, reported on others: docs/decisions.md
 STIFFNESS = (1e-4, 1e-7)
-# of the first two steps, that starts meet, and of the others, that they do not drift from there
+# Of the first two steps, in which different starts meet, and of the others, in which vertices must
+# not drift along the surface any more
 SLIDE = (0.01, 0.1)
 N_STEPS = 8
 N_ROUNDS = 8

@@ -21,7 +21,7 @@ from s4a.method.nearest import nearest_in_cells, nearest_of_few, nearest_rows
 from s4a.method.shape import Shape
 from s4a.schema import INPUT, dataset, in_unit
 
-SAME = 0.002  # share of sqrt(area): of 12 pairs ends of which one was worse lay 0.004 to 0.06 apart
+SAME = 0.002  # share of sqrt(area): starts that are nearer after the first step end as one
 CONFIDENCE_LENGTH = 0.02  # share of sqrt(area) at which the confidence has fallen to 1 / e
 
 Functions = tuple[np.ndarray, np.ndarray]  # of source and target, rows of which are compared
@@ -289,8 +289,8 @@ def find_candidates(
     """Where registration at full resolution may begin: of low resolution, with scores.
 
     Elastic rounds need no better start than a match of the right parts: from eq. 6, from ICP and
-    from joint rounds after either they end 0.0000 to 0.0006 of sqrt(area) apart on faces, skulls,
-    cortex and most heads, so that joint rounds are left to far poses.
+    from joint rounds after either they mostly end at one place (docs/decisions.md), so that joint
+    rounds are left to far poses.
 
     Parameters
     ----------
@@ -330,8 +330,8 @@ def register_surface(
         After which the displacement of the spectral match is smoothed, see
         :func:`s4a.method.joint.warp_after`; by default after the motion that fits it best.
     elastic : bool
-        Whether finalists go through :func:`elastic_surfaces`; those by parts, of far poses, do not:
-        bodies ended 0.05 to 0.1 % of sqrt(area) farther from the truth.
+        Whether finalists go through :func:`elastic_surfaces`; those by parts, of far poses, do not,
+        as bodies then ended farther from the truth.
 
     Returns
     -------

@@ -276,7 +276,7 @@ class Shape:
         """The coarse mesh with the normals of the original one.
 
         Its own differ from these: whoever looks for nearest points by normals, too, would be drawn
-        aside, and a shape registered to itself would move by 0.04 to 0.1 % of sqrt(area).
+        aside, and a shape registered to itself would move.
         """
         low = self.low
         of_file = self.coarse["sample_vertex"].values  # (n_coarse,), -1 for none

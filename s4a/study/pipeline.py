@@ -342,9 +342,10 @@ def consistent_zoomout(run: Run, coarse: Keys, first: Keys, options: Options) ->
     key = task_key(list(first.values()), *settings, *rounds_of)
     kept = list((run.folder / "rounds").glob("k_*.nc")) if options.keep_rounds else []
     files = [run.folder / "network.nc", run.folder / "latent.nc", *kept]
-    if bool(kept) == options.keep_rounds and all(is_done(file, key) for file in files):
-        return key
-    with run.stage("consistent ZoomOut and median"):
+    done = bool(kept) == options.keep_rounds and all(is_done(file, key) for file in files)
+    with run.stage("consistent ZoomOut and median", share=float(not done), done=int(done)):
+        if done:
+            return key
         maps = xr.concat([read(run.folder / file) for file in first], dim="pair")
         with parallel_config(backend="threading"):  # here, whatever backend the tasks run on
             n_threads = effective_n_jobs(run.n_jobs)

@@ -62,6 +62,8 @@ def test_a_run_that_goes_on_or_is_stopped_says_how_far_it_is(brains, tmp_path, m
     assert again.state == "finished"
     assert again.stages["remesh and spectrum"][:3] == (4, 4, 2)
     assert again.stages["read and clean"][:3] == (4, 4, 4)
+    analyse(brains, store=tmp_path, **OPTIONS).close()  # nothing is left to do
+    assert list(status(tmp_path).stages) == list(again.stages)
 
 
 def test_the_time_that_is_left_is_by_the_pace_of_this_run():
