@@ -11,8 +11,10 @@ a_i the vertex area, lambda_k an eigenvalue.  |d|^2_i = (m_i . d)^2 + slide (|d|
 along the mean m_i of both normals: vertices may slide, as in the point-to-plane distance of Chen
 and Medioni (1992), with the normals of both surfaces as of Rusinkiewicz (2019).  The second term is
 the bending energy, the integral of |Laplacian|^2 of the displacement.  The stiffness falls from
-round to round, as in the non-rigid ICP of Amberg, Romdhani and Vetter (CVPR 2007).  Lengths are for
-surfaces of unit area.
+round to round, as in the non-rigid ICP of Amberg, Romdhani and Vetter (CVPR 2007), and on where the
+bending energy has settled: there the template follows the shape, and what the price shrinks is the
+displacement alone.  Where each step bends it more, it would follow noise.  Lengths are for surfaces
+of unit area.
 
 What K functions cannot follow is left to local rounds: a displacement d (n, 3) of the vertices of
 low resolution, beyond the warp, that minimises
@@ -40,6 +42,8 @@ STIFFNESS = (1e-4, 1e-7)
 # not drift along the surface any more
 SLIDE = (0.01, 0.1)
 N_STEPS = 8
+N_FURTHER = 5  # steps at most, each with as much less stiffness, where the last was nearly in vain
+SETTLED = 1.2  # as long as a step lets the bending energy grow by less than that factor
 N_ROUNDS = 8
 STILL = 1e-3  # share of sqrt(area): a step ends with a round that moves less
 TIME = (2e-2, 2e-4)  # of local rounds: smooth over 0.2, then over 0.02 of sqrt(area)
@@ -150,12 +154,13 @@ def elastic_rounds(
     warp : tuple (R, t, c)
         Where to begin, with one motion for all: bending is counted from there.
     stiffness : tuple of float
-        Of the first and of the last of 8 steps, between which it falls by equal factors.
+        Of the first and of the last of 8 steps, between which it falls by equal factors.  Up to 5
+        further steps go on as long as the last let the bending energy grow by less than a fifth.
     slide : tuple of float
         Weight of the distance along the surface in the first two steps, and in the others; that
         across it weighs 1.
     steps : slice
-        Those that are made; all by default.
+        Those of the 8 and 5 further ones that are made; at least two before the further ones.
     rounds : int
         With each value at most; fewer where nothing moves any more.
 
@@ -172,17 +177,22 @@ def elastic_rounds(
     bending = np.zeros(E.shape[1])
     bending[: smooth.shape[1]] = target.eigenvalue[1:] ** 2
     X = move(target, warp)
-    along = np.repeat(slide, (2, N_STEPS - 2))
-    for weight, free in zip(np.geomspace(*stiffness, N_STEPS)[steps], along[steps], strict=True):
+    fall = (stiffness[1] / stiffness[0]) ** (1 / (N_STEPS - 1))
+    energies: list[float] = []  # of bending, after each step
+    for step in range(N_STEPS + N_FURTHER)[steps]:
+        if step >= N_STEPS and energies[-1] > SETTLED * energies[-2]:
+            break
+        price = stiffness[0] * fall**step * bending
         for _ in range(rounds):
             y, m = points_ahead(source, target, X)
-            matrix, right = normal_equations(E, target.area, m, y, free)
+            matrix, right = normal_equations(E, target.area, m, y, slide[step >= 2])
             # start and smooth functions nearly depend on each other: a little keeps them apart
-            matrix[np.diag_indices_from(matrix)] += np.tile(weight * bending, 3) + 1e-12
+            matrix[np.diag_indices_from(matrix)] += np.tile(price, 3) + 1e-12
             w = scipy.linalg.solve(matrix, right, assume_a="pos").reshape(3, -1).T  # (q, 3)
             before, X = X, E @ w
             if target.area @ ((X - before) ** 2).sum(1) < STILL**2:
                 break
+        energies.append(bending @ (w**2).sum(1))
     A = w[-4:-1].T  # (3, 3)
     b = w[-1]
     c = np.concatenate([np.zeros((1, 3)), w[:-4]])  # (K, 3)
