@@ -20,7 +20,7 @@ from s4a.show.browser import PARTS, TEMPLATES, to_json
 LIMIT = 24_000_000  # characters of recorded values in a page
 LADDER = 24  # values of a slider that are kept
 # what is the browser's own; of a chart `spec` is kept key by key
-LOCAL = {"picked", "hovered", "webgl", "still", "sample", "spec"}
+LOCAL = {"picked", "hovered", "answer", "webgl", "still", "sample", "spec"}
 
 
 def panel_html(panel: Any, limit: int = LIMIT) -> str:

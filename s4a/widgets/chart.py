@@ -36,18 +36,24 @@ class Chart(anywidget.AnyWidget):
     spec : dict
         The ``kind`` of chart, its numbers and names.
     picked : dict
-        The mark that was clicked: an index, node, edge, or row and column.
+        The mark that was clicked: an index, node, edge, or row and column, and its number `count`.
+    answer : int
+        The number of the mark to which the chart answers as it is; -1 for none.  Answers to marks
+        older than the last are not drawn.
     """
 
     _esm, _css = CHART, STYLE
     spec = traitlets.Dict().tag(sync=True)
     picked = traitlets.Dict().tag(sync=True)
+    answer = traitlets.Int(-1).tag(sync=True)
     values = traitlets.Bytes().tag(sync=True)
     palette = traitlets.Bytes(palette(SIGNED)).tag(sync=True)
 
     def draw(self, kind: str, **spec: Any) -> None:
         """Draw ``scatter``, ``bars``, ``lines`` or ``graph``: numbers as chart.js names them."""
-        self.spec = plain({"kind": kind, **spec})
+        with self.hold_sync():
+            self.answer = -1
+            self.spec = plain({"kind": kind, **spec})
 
     def matrix(self, values: np.ndarray, limit: float = 1.0, **spec: Any) -> None:
         """Draw a matrix ``(rows, columns)`` with signed colours from -limit to limit."""

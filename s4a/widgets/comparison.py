@@ -121,10 +121,8 @@ class Comparison(Panel):
         for i, choice in enumerate(self.ways):
             self.on_change(choice, lambda _, i=i: self.paint_method(i))
         self.on_change(self.hover, self.follow)
-        for event in ("picked", "hovered"):
-            self.on_change(self.scenes[0], self.from_source, event)
-            for scene in self.scenes[1:]:
-                self.on_change(scene, self.from_target, event)
+        for i, scene in enumerate(self.scenes):
+            self.on_pick(scene, self.from_target if i else self.from_source, "picked", "hovered")
         self.draw()
         self.follow(True)
         return [row(self.pair, self.colors, self.hover), row(*self.ways), grid(*self.scenes)]

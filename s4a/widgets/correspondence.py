@@ -73,8 +73,7 @@ class Correspondence(Panel):
         self.redraw(self.draw, self.map, self.colors)
         self.on_change(self.hover, self.follow)
         for scene, carry in zip(self.scenes, (self.to_shape, self.to_template), strict=True):
-            for event in ("picked", "hovered"):
-                self.on_change(scene, carry, event)
+            self.on_pick(scene, carry, "picked", "hovered")
         self.on_change(self, lambda _: self.draw(), "shape")
         self.shape = names[0]
         self.follow(True)

@@ -68,7 +68,7 @@ class FunctionalMap(Panel):
         self.maps = {}  # size -> C, of ZoomOut of this pair alone
         self.on_change(self.choice, lambda value: self.set_trait("pair", value))
         self.redraw(self.draw, self.k, self.kind, self.block)
-        self.on_change(self.matrix, self.pick, "picked")
+        self.on_pick(self.matrix, self.pick)
         self.redraw(lambda: self.pick({}), self.row, self.column)
         self.on_change(self, self.take, "pair")
         self.on_change(self, self.show_cell, "cell")

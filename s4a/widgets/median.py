@@ -53,7 +53,7 @@ class Median(Panel):
         self.ties = ipywidgets.HTML()
         self.redraw(self.rank, self.operator, self.norm, self.modes)
         self.redraw(self.show, self.stage)
-        self.on_change(self.bars, self.pick, "picked")
+        self.on_pick(self.bars, self.pick)
         self.on_change(self.shape, self.select)
         self.on_change(self, lambda _: self.show(), "selected")
         self.rank()

@@ -86,7 +86,7 @@ class Network(Panel):
         self.redraw(self.draw, self.where, self.budget)
         self.redraw(self.change_stage, self.stage)
         self.on_change(self.choice, self.choose)
-        self.on_change(self.graph, self.pick, "picked")
+        self.on_pick(self.graph, self.pick)
         self.on_change(self, self.show_edge, "edge")
         self.on_change(self, self.show_node, "node")
         self.draw()

@@ -1,5 +1,6 @@
 """What all panels share: a line for messages, callbacks that show their errors, closing, a page."""
 
+import contextlib
 import functools
 import logging
 from collections.abc import Callable
@@ -204,6 +205,28 @@ class Panel(ipywidgets.VBox):
     def on_change(self, widget: ipywidgets.Widget, function: Callable, name: str = "value") -> None:
         """Call `function` with the new value of a trait, guarded."""
         widget.observe(self.guarded(lambda change: function(change["new"])), name)
+
+    def on_pick(self, widget: Any, function: Callable, *events: str) -> None:
+        """Call `function` with a place or mark that the browser tells, ``picked`` if not `events`.
+
+        What it changes is sent in one message for each view, with the number of the place.
+        """
+
+        def answer(place):
+            # views of surfaces answer together, as a place is marked in all of them
+            scenes = getattr(self, "scenes", [])
+            views = scenes if widget in scenes else [widget]
+            with contextlib.ExitStack() as held:
+                for view in views:
+                    held.enter_context(view.hold_sync())
+                try:
+                    function(place)
+                finally:
+                    for view in views:
+                        view.answer = place.get("count", 0)
+
+        for event in events or ("picked",):
+            self.on_change(widget, answer, event)
 
     def redraw(self, function: Callable, *controls: ipywidgets.Widget) -> None:
         """Call `function` without arguments when one of the controls has another value."""

@@ -114,7 +114,11 @@ class Scene(View):
         the surface.
     picked, hovered : dict
         The place that was clicked, or is under the pointer (where `hovering` is set): ``vertex``
-        (-1 beside the surface), ``face``, ``weights`` in that triangle, and ``point``.
+        (-1 beside the surface), ``face``, ``weights`` in that triangle, ``point``, and its number
+        `count`.  A place that the browser carries to the other view by itself is hovered unheard.
+    answer : int
+        The number of the place to which marks and caption answer; -1 for none.  An answer to a
+        place older than the last, of any view of the group, is not shown.
     """
 
     _esm = SCENE
@@ -137,6 +141,7 @@ class Scene(View):
     caption = traitlets.Unicode("").tag(sync=True)
     clickable = traitlets.Bool(False).tag(sync=True)
     hovering = traitlets.Bool(False).tag(sync=True)
+    answer = traitlets.Int(-1).tag(sync=True)
     picked = traitlets.Dict().tag(sync=True)
     hovered = traitlets.Dict().tag(sync=True)
 
@@ -196,6 +201,7 @@ class Scene(View):
         self.paint(signed_colors(values, limit), color_scale(SIGNED, -limit, limit, label))
 
     def _send_colors(self, colors, coordinates, cell):
+        self.answer = -1
         self.colors, self.coordinates = colors, coordinates
         self.color = b"" if colors is None else color_bytes(colors)
         self.coordinate = b"" if coordinates is None else to_bytes(coordinates, "float32")
@@ -212,7 +218,9 @@ class Scene(View):
         colors = np.broadcast_to(np.asarray(colors, float).reshape(-1, 3), points.shape)
         self.radius = self.radius if radius is None else float(radius)
         places = np.concatenate([points, colors], axis=1).tolist()
-        self.points = [[*place, self.radius] for place in places]
+        with self.hold_sync():
+            self.answer = -1
+            self.points = [[*place, self.radius] for place in places]
 
     def connect(self, link: np.ndarray, text: str, values: np.ndarray | None = None) -> None:
         """Let the browser mark on the other view of the group what is picked on this one.

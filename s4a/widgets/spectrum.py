@@ -48,8 +48,8 @@ class Spectrum(Panel):
         look = {"group": camera_group(), "view": view, "up": up, "height": 300}
         self.function, self.rebuilt = Scene(**look), Scene(**look)
         self.on_change(self.choice, lambda value: self.set_trait("shape", value))
-        self.on_change(self.curves, self.pick, "picked")
-        self.on_change(self.gaps, self.pick, "picked")
+        self.on_pick(self.curves, self.pick)
+        self.on_pick(self.gaps, self.pick)
         self.redraw(self.show_mode, self.mode)
         self.redraw(self.show_rebuilt, self.k)
         self.on_change(self, lambda _: self.take(), "shape")

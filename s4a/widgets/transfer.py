@@ -86,7 +86,7 @@ class Transfer(Panel):
         self.redraw(self.paint, self.labels)
         self.redraw(self.carry, self.radius)
         traitlets.link((self.name, "value"), (self, "landmark"))
-        self.on_change(self.scenes[0], self.place, "picked")
+        self.on_pick(self.scenes[0], self.place)
         with self.hold_trait_notifications():
             self.source = template
             self.target = next(name for name in names if name != template)

@@ -64,7 +64,23 @@ SIZES = """
 from IPython.display import display
 
 for options in ({"width": 360}, {"width": 1000}, {"font": 20}, {}):
-    display(study.s4a.explore(**options))
+    tabs = study.s4a.explore(**options)
+    tabs["Transfer"].radius.description = "radius (unit of the input)"  # where none is known
+    tabs["Modes"]
+    display(tabs)
+"""
+# every message to and from the kernel takes a quarter of a second; counted are those to it
+DELAYED = """
+const Real = WebSocket;
+window.sent = [];
+window.WebSocket = class extends Real {
+  send(data) {
+    const text = typeof data === "string" ? data : new TextDecoder().decode(data);
+    window.sent.push(text);
+    setTimeout(() => super.send(data), 250);
+  }
+  set onmessage(act) { super.onmessage = (event) => setTimeout(() => act(event), 250); }
+};
 """
 TITLES = ("Modes", "Network", "Functional map", "Median", "Correspondence", "Transfer", "Spectrum")
 
@@ -524,6 +540,12 @@ def test_a_panel_fills_the_screen(sizes):
     assert panel.bounding_box()["width"] < 1000
 
 
+def test_a_field_has_room_for_its_number_beside_a_long_name(sizes):
+    for i in (0, 1):
+        field = panel_of(tabs_of(sizes, i, "Transfer")).locator("input[type=number]")
+        assert field.bounding_box()["width"] > 60
+
+
 # ---- one glance
 
 
@@ -587,6 +609,104 @@ def test_every_control_says_what_it_is(sizes, title):
         ".map((c) => c.outerHTML)"
     )
     assert unsaid == []
+
+
+# ---- far kernels
+
+
+@pytest.fixture(scope="module")
+def far(browser, lab, messages):
+    """A notebook whose kernel is a quarter of a second away."""
+    page = watched(browser.new_page(viewport={"width": 1280, "height": 1300}), messages)
+    page.add_init_script(DELAYED)
+    page.set_default_timeout(60_000)
+    run_notebook(page, lab, "small.ipynb")
+    page.wait_for_function(DRAWN, timeout=120_000)
+    yield page
+    page.close()
+
+
+WATCH = """(all) => {
+  window.places = [];
+  const look = () => {
+    const now = JSON.stringify(all.map((c) => c.view.points.map((p) => p.slice(0, 3))));
+    if (now !== window.places.at(-1)) window.places.push(now);
+  };
+  clearInterval(window.watching);
+  window.watching = setInterval(look, 5);
+}"""
+
+
+def returns(places):
+    """How many times a place that was left is come back to."""
+    return len(places) - len(set(places))
+
+
+def test_a_marker_never_returns_to_an_older_place_however_far_the_kernel(far):
+    open_tab(far, "Correspondence")
+    canvases = visible(far, VIEW)
+    canvases.nth(1).wait_for()
+    far.wait_for_function(f"{SEEN}.length === 2 && {SEEN}.every((v) => v.frames && v.camera)")
+    far.wait_for_timeout(1000)
+    canvases.evaluate_all(WATCH)
+    box = canvases.first.bounding_box()
+    sent = far.evaluate("window.sent.length")
+    y = box["y"] + box["height"] / 2
+    for i in range(45):
+        far.mouse.move(box["x"] + box["width"] * (0.32 + 0.008 * i), y)
+        far.wait_for_timeout(30)
+        if i == 20:
+            heard = far.evaluate("(n) => window.sent.slice(n)", sent)
+            assert [text for text in heard if "hovered" in text] == [], "the browser knows it all"
+        if i in (21, 23, 25):  # clicks, whose answers come when the pointer is elsewhere
+            far.mouse.down()
+            far.mouse.up()
+    far.wait_for_timeout(1500)
+    picks = [text for text in far.evaluate("window.sent") if '"picked"' in text]
+    assert len(picks) >= 2
+    places = far.evaluate("window.places")
+    assert len(places) > 8
+    assert returns(places) == 0, places
+
+
+def test_the_answer_to_the_last_click_is_shown(far, study):
+    canvas = visible(far, VIEW).first
+    box = canvas.bounding_box()
+    far.mouse.move(box["x"] + 3, box["y"] + 3)
+    for dx in (0.45, 0.55):
+        far.mouse.click(box["x"] + box["width"] * dx, box["y"] + box["height"] / 2)
+    far.wait_for_timeout(1500)
+    picked = canvas.evaluate("(c) => c.view.points[0].slice(0, 3)")
+    text = visible(far, ".s4a-readout").filter(has_text="template vertex").first.inner_text()
+    vertex = int(re.search(r"template vertex (\d+)", text)[1])
+    np.testing.assert_allclose(picked, vertices(canvas)[vertex], atol=1e-3)
+    far.get_by_label("colours").filter(visible=True).select_option("checkerboard")
+    far.wait_for_function(f"{SEEN}.every((v) => v.surfaces[0].cell > 0 && !v.points.length)")
+
+
+def test_the_cursor_of_a_matrix_never_returns(far):
+    open_tab(far, "Functional map")
+    matrix = visible(far, ".s4a-matrix canvas").first
+    matrix.wait_for()
+    far.evaluate("""() => {
+      window.cells = [];
+      const look = () => {
+        const at = [...document.querySelectorAll('.s4a-matrix')].find((m) => m.offsetParent)
+          ?.querySelector('svg rect:last-child');
+        const now = at && `${at.getAttribute('x')},${at.getAttribute('y')}`;
+        if (now && now !== window.cells.at(-1)) window.cells.push(now);
+      };
+      setInterval(look, 5);
+    }""")
+    box = matrix.bounding_box()
+    for i in (4, 6, 8, 10, 12):
+        far.mouse.click(box["x"] + box["width"] * i / 24.5, box["y"] + box["height"] * i / 24.5)
+        far.wait_for_timeout(120)
+    far.wait_for_timeout(2000)
+    cells = far.evaluate("window.cells")
+    assert len(cells) == 6
+    assert returns(cells) == 0, cells
+    visible(far, ".s4a-title").filter(has_text="φ11 on").first.wait_for()
 
 
 def test_without_webgl_the_notebook_shows_still_pictures(flat, lab, study):
@@ -670,6 +790,38 @@ def test_the_page_deforms_without_kernel_and_network(offline, study, tmp_path):
     page, errors = opened(offline, saved(widgets.Modes(study), tmp_path / "modes.html"))
     page.wait_for_function(DRAWN)
     check_sliders(page, study)
+    assert errors == []
+    page.close()
+
+
+SMOOTH = "(c) => c.view.smooth"
+
+
+def test_full_resolution_is_drawn_once_after_a_drag_and_not_within(offline, study, tmp_path):
+    page, errors = opened(offline, saved(widgets.Modes(study), tmp_path / "modes.html"))
+    page.wait_for_function(DRAWN)
+    page.wait_for_function(f"{SEEN}[0].smooth > 0")
+    canvas = visible(page, VIEW).first
+    before, box = canvas.evaluate(SMOOTH), canvas.bounding_box()
+    page.mouse.move(box["x"] + 100, box["y"] + 100)
+    page.mouse.down()
+    for step in range(4):
+        page.mouse.move(box["x"] + 110 + 10 * step, box["y"] + 120)
+        page.wait_for_timeout(600)
+    assert canvas.evaluate(SMOOTH) == before
+    page.mouse.up()
+    page.wait_for_timeout(1000)
+    assert canvas.evaluate(SMOOTH) == before + 1
+    # after a long frame it waits for four times as long
+    waited = canvas.evaluate("""async (c) => {
+      const start = performance.now(), before = c.view.smooth;
+      c.view.waiting = 1;  // no other frame in between
+      c.view.took = 200;
+      c.view.redraw();
+      while (c.view.smooth === before) await new Promise((done) => setTimeout(done, 5));
+      return performance.now() - start;
+    }""")
+    assert waited >= 800
     assert errors == []
     page.close()
 

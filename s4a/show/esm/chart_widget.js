@@ -1,7 +1,10 @@
 export default {
   render({ model, el }) {
     el.classList.add("s4a");
+    el.dataset.lmSuppressShortcuts = "true"; // or the notebook takes the arrow keys
+    let asked = 0; // the number of the last mark that was picked
     const draw = () => {
+      if (model.get("answer") >= 0 && model.get("answer") < asked) return; // of an older mark: the answer to the last one comes
       const focused = el.contains(document.activeElement);
       el.replaceChildren();
       const spec = { ...model.get("spec") };
@@ -13,14 +16,15 @@ export default {
         spec.label = ({ row, column }) => `source mode ${column} to target mode ${row}`;
       }
       CHARTS[spec.kind](el, spec, (mark) => {
-        model.set("picked", { ...mark, count: (model.get("picked").count || 0) + 1 });
+        asked = (model.get("picked").count || 0) + 1;
+        model.set("picked", { ...mark, count: asked });
         model.save_changes();
       });
       if (focused) el.querySelector("[tabindex='0']")?.focus({ preventScroll: true });
     };
     draw();
     const stop = onRoom(el, draw);
-    for (const name of ["spec", "values"]) model.on(`change:${name}`, draw);
-    return () => { stop(); for (const name of ["spec", "values"]) model.off(`change:${name}`, draw); };
+    for (const name of ["spec", "values", "answer"]) model.on(`change:${name}`, draw);
+    return () => { stop(); for (const name of ["spec", "values", "answer"]) model.off(`change:${name}`, draw); };
   },
 };

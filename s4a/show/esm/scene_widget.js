@@ -1,11 +1,16 @@
 export default {
   render({ model, el }) {
     el.classList.add("s4a");
+    el.dataset.lmSuppressShortcuts = "true"; // or the notebook takes the arrow keys
     const title = html(el, "div", { class: "s4a-title" });
+    // Every place that is picked or hovered has a number, of all views of a group; what the kernel answers carries the number
+    // of the place that it answers, and is left out where the user is farther by then.
     const send = (name, hit) => {
-      model.set(name, { ...(hit || { vertex: -1 }), count: (model.get(name).count || 0) + 1 });
+      model.set(name, { ...(hit || { vertex: -1 }), count: view.camera.asked });
       model.save_changes();
     };
+    const ask = () => (view.camera.asked = 1 + Math.max(view.camera.asked || 0, ...["picked", "hovered"].map((name) => model.get(name).count || 0)));
+    const current = () => model.get("answer") < 0 || model.get("answer") >= (view.camera.asked || 0);
     let hovered = 0, later = 0, link = null, values = null;
     // Views of one surface with a match each: a vertex is marked on all of them, and on the other surface in their colours.
     const compare = (hit) => {
@@ -22,10 +27,12 @@ export default {
       }
       view.moved();
     };
-    // The image of a vertex on the other view of the group: marked at once, without a kernel.
+    // The image of a vertex on the other view of the group: marked at once. Whether it needs no kernel.
     const carry = (hit) => {
-      if (hit && hit.vertex >= 0 && [...view.camera.views].some((one) => one.fan)) return compare(hit);
-      if (!link || !hit || hit.vertex < 0 || hit.vertex >= link.length) return;
+      const fans = [...view.camera.views].some((one) => one.fan);
+      if (fans && hit && hit.vertex >= 0) compare(hit);
+      if (fans || !link) return fans;
+      if (!hit || hit.vertex < 0 || hit.vertex >= link.length) return true;
       const there = link[hit.vertex], radius = model.get("radius"), ball = (at) => [...at, 0.9, 0.6, 0, radius];
       const sure = values ? `, confidence ${(values[hit.vertex] / 100).toFixed(2)}` : "";
       view.points = [ball(view.at(hit.vertex))];
@@ -36,14 +43,16 @@ export default {
           : model.get("link_text").replace("{here}", hit.vertex).replace("{there}", there) + sure;
       }
       view.moved();
+      return true;
     };
     const view = new View(el, {
       turn: model.get("turn"), group: model.get("group"), height: model.get("height"), label: model.get("title"),
-      onPick: model.get("clickable") && ((hit) => { carry(hit); send("picked", hit); }),
+      onPick: model.get("clickable") && ((hit) => { ask(); carry(hit); send("picked", hit); }),
       onHover: model.get("clickable") && ((hit) => {
         if (!model.get("hovering")) return;
-        carry(hit);
-        clearTimeout(later); // the kernel hears of eight places a second, and of the last
+        clearTimeout(later);
+        ask();
+        if (carry(hit)) return; // the kernel hears of what the browser cannot answer: eight places a second, and the last
         later = setTimeout(() => { hovered = Date.now(); send("hovered", hit); }, Math.max(0, 120 + hovered - Date.now()));
       }),
     });
@@ -56,6 +65,7 @@ export default {
       surface.setMesh(position, corner);
       view.fit(position);
       view.cursor = -1;
+      view.points = model.get("points");
       color();
       links();
     };
@@ -85,8 +95,11 @@ export default {
     const words = () => {
       title.textContent = model.get("title");
       view.name(model.get("title") || "surface");
-      readout.textContent = model.get("caption");
       colorBar(bar, model.get("bar"));
+    };
+    const answered = () => {
+      if (!current()) return; // of a place where the user is no longer
+      readout.textContent = model.get("caption");
       view.points = model.get("points");
       view.redraw();
     };
@@ -99,11 +112,11 @@ export default {
     const on = {
       "change:position": geometry, "change:color": color, "change:coordinate": color, "change:cell": color, "change:link": links, "change:link_values": links, "change:link_back": links, "change:link_color": links, "change:link_text": links,
       "change:ghost_position": ghosts, "change:title": words,
-      "change:caption": words, "change:bar": words, "change:points": words, "change:still": picture,
+      "change:caption": answered, "change:points": answered, "change:answer": answered, "change:bar": words, "change:still": picture,
       "change:turn": () => view.reset(model.get("turn")),
     };
     Object.entries(on).forEach(([event, act]) => model.on(event, act));
-    geometry(), ghosts(), words();
+    geometry(), ghosts(), words(), answered();
     const webgl = context() !== null;
     view.canvas.hidden = !webgl;
     still.hidden = webgl;

@@ -6,6 +6,19 @@ function camera(name, turn) {
   return found;
 }
 
+// The pointers that are down, anywhere in the page: of a drag on a view, or of a slider.
+const held = (globalThis.s4aHeld ??= (() => {
+  const down = new Set();
+  const up = (e) => {
+    if (e.type === "blur") down.clear();
+    down.delete(e.pointerId);
+    document.querySelectorAll("canvas.s4a-view").forEach(({ view }) => view?.due && view.redraw());
+  };
+  addEventListener("pointerdown", (e) => down.add(e.pointerId), true);
+  for (const end of ["pointerup", "pointercancel", "blur"]) addEventListener(end, up, true);
+  return down;
+})());
+
 function boxOf(P) {
   const low = [Infinity, Infinity, Infinity], high = low.map((x) => -x);
   for (let i = 0; i < P.length; i++) {
@@ -163,16 +176,20 @@ class View {
     const scale = (0.97 * zoom * half) / this.frame.radius;
     return { w, h, scale, x: 2 * half * pan[0], y: 2 * half * pan[1] };
   }
-  redraw() { // quickly while things move; smoothly, from twice the pixels, once they rest
+  redraw() { // quickly while things move; smoothly, from twice the pixels, once they rest and nothing is held
     clearTimeout(this.resting);
-    this.resting = setTimeout(() => this.draw(2), 150);
+    this.resting = setTimeout(() => this.rest(), Math.max(150, 4 * (this.took || 0)));
     if (this.waiting) return;
     this.waiting = requestAnimationFrame(() => { this.waiting = 0; this.draw(); });
+  }
+  rest() { // a frame of a large surface costs more than its motion: once after a drag, never within
+    this.due = held.size > 0;
+    if (!this.due) this.draw(2);
   }
   draw(smooth = 1) {
     const on = context(), { w, h, scale, x, y } = this.frame && this.canvas.clientWidth ? this.placement() : {};
     if (!on || !w || !this.surfaces.length) return;
-    const { gl, at } = on, ratio = Math.min(2, globalThis.devicePixelRatio || 1);
+    const start = performance.now(), { gl, at } = on, ratio = Math.min(2, globalThis.devicePixelRatio || 1);
     const width = Math.round(w * ratio), height = Math.round(h * ratio), W = smooth * width, H = smooth * height;
     if (gl.canvas.width < W) gl.canvas.width = W;
     if (gl.canvas.height < H) gl.canvas.height = H;
@@ -189,6 +206,8 @@ class View {
     if (this.cursor >= 0 && 3 * this.cursor < this.surfaces[0].position.length) this.ball.balls(on, [[...this.at(this.cursor), 0.84, 0.37, 0, 0.018 * this.frame.radius]]);
     if (this.canvas.width !== width || this.canvas.height !== height) Object.assign(this.canvas, { width, height });
     this.canvas.getContext("2d").drawImage(gl.canvas, 0, gl.canvas.height - H, W, H, 0, 0, width, height);
+    if (smooth === 1) this.took = performance.now() - start;
+    else this.smooth = (this.smooth || 0) + 1;
     this.frames = (this.frames || 0) + 1;
   }
   // What of the first surface lies under the pointer: triangle, weights, nearest corner and point; null for a miss.
