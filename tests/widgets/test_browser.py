@@ -611,6 +611,26 @@ def test_every_control_says_what_it_is(sizes, title):
     assert unsaid == []
 
 
+def test_sliders_keep_their_arrow_keys_in_notebook_7(sizes):
+    """Its shortcuts hear keys before the page, unless what has the focus says not to."""
+    sizes.evaluate("""() => document.addEventListener("keydown", (event) => {
+      if (event.target.hasAttribute("data-lm-suppress-shortcuts")) return;
+      event.preventDefault();
+      event.stopPropagation();
+    }, true)""")
+    slider = panel_of(tabs_of(sizes, 3)).locator(".s4a-slider input").first
+    move(slider, 0)
+    slider.focus()
+    sizes.keyboard.press("ArrowRight")
+    assert float(slider.input_value()) == pytest.approx(0.05)
+    handle = panel_of(tabs_of(sizes, 3, "Spectrum")).locator("[role=slider]").first
+    assert handle.get_attribute("aria-label") == "mode"
+    before = float(handle.get_attribute("aria-valuenow"))
+    handle.focus()
+    sizes.keyboard.press("ArrowRight")
+    assert float(handle.get_attribute("aria-valuenow")) == before + 1
+
+
 # ---- far kernels
 
 

@@ -1,7 +1,7 @@
 export default {
   render({ model, el }) {
     el.classList.add("s4a");
-    el.dataset.lmSuppressShortcuts = "true"; // or the notebook takes the arrow keys
+    ownKeys(el);
     let asked = 0; // the number of the last mark that was picked
     const draw = () => {
       if (model.get("answer") >= 0 && model.get("answer") < asked) return; // of an older mark: the answer to the last one comes

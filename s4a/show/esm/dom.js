@@ -20,6 +20,9 @@ function html(parent, tag, attributes = {}, text = "") {
   return it;
 }
 
+// What has the focus in here keeps its keys: Notebook 7 would take the arrow keys for its cells, before the page sees them.
+const ownKeys = (box) => box.addEventListener("focusin", ({ target }) => target.setAttribute("data-lm-suppress-shortcuts", "true"));
+
 const short = (x) => (x === null || x === undefined || Number.isNaN(x) ? "none" : String(Number(x.toPrecision(3))));
 
 // A horizontal bar of colours with its numbers: {colors: [css], low, middle, high, label}.

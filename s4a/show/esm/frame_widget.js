@@ -19,7 +19,7 @@ export default {
       if (panel || !(panel = el.closest(".s4a-panel"))) return;
       panel.setAttribute("role", "region");
       panel.setAttribute("aria-label", model.get("title"));
-      panel.dataset.lmSuppressShortcuts = "true"; // or the notebook takes the arrow keys of its controls
+      ownKeys(panel);
       button.hidden = !panel.requestFullscreen || document.fullscreenEnabled === false;
       (watch = new MutationObserver(named)).observe(panel, { childList: true, subtree: true });
       named();

@@ -62,7 +62,7 @@ class Modes {
 
 function modesWidget({ model, el }) {
   el.classList.add("s4a");
-  el.dataset.lmSuppressShortcuts = "true"; // or the notebook takes the arrow keys
+  ownKeys(el);
   const modes = new Modes(model), ratio = model.get("ratio"), count = ratio.length, range = 3;
   let current = [...model.get("scores")]; // ahead of the model's while a slider moves
   const scores = () => [...current];
@@ -108,7 +108,7 @@ function modesWidget({ model, el }) {
     const output = html(row, "output", {}, "0.00");
     input.addEventListener("input", () => { const s = scores(); s[c] = Number(input.value); set(s, c); });
     input.addEventListener("focus", () => { active = c; mark(); });
-    input.addEventListener("keydown", (e) => e.stopPropagation()); // or older notebooks take them still
+    input.addEventListener("keydown", (e) => e.stopPropagation()); // where the notebook hears keys after the slider
     return { row, input, output };
   });
   const distance = html(right, "div", { class: "s4a-readout", "aria-live": "polite" });

@@ -1,7 +1,7 @@
 export default {
   render({ model, el }) {
     el.classList.add("s4a");
-    el.dataset.lmSuppressShortcuts = "true"; // or the notebook takes the arrow keys
+    ownKeys(el);
     const title = html(el, "div", { class: "s4a-title" });
     // Every place that is picked or hovered has a number, of all views of a group; what the kernel answers carries the number
     // of the place that it answers, and is left out where the user is farther by then.
