@@ -216,9 +216,13 @@ class Panel(ipywidgets.VBox):
             # views of surfaces answer together, as a place is marked in all of them
             scenes = getattr(self, "scenes", [])
             views = scenes if widget in scenes else [widget]
+            others = [part for part in widgets_in(self) if part not in views]
             with contextlib.ExitStack() as held:
-                for view in views:
-                    held.enter_context(view.hold_sync())
+                for part in [
+                    *others,
+                    *views,
+                ]:  # the views are told first, as the last that are held
+                    held.enter_context(part.hold_sync())
                 try:
                     function(place)
                 finally:
