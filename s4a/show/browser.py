@@ -131,6 +131,8 @@ def numeral(value: object) -> str:
     >>> numeral(1200), numeral(1.25), numeral("ok")
     ('1,200', '1.2', 'ok')
     """
+    if isinstance(value, Markup):
+        return value
     if isinstance(value, int | np.integer):
         return f"{value:,}"
     return f"{value:,.1f}" if isinstance(value, float | np.floating) else str(value)

@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 from markupsafe import Markup
 
-from s4a.input.decisions import decisions
+from s4a.input.decisions import decisions, notices
 from s4a.method.pca import color_limits
 from s4a.show import charts
 from s4a.show.browser import MODES, PARTS, TEMPLATES, look_state, mesh_state, webp_uri
@@ -90,7 +90,19 @@ def study_html(
         else:
             sections.append((heading, section(study, {"view": view, "up": up})))
     template = TEMPLATES.get_template("study.html")
-    return template.render(title=title, summary=_summary(study), sections=sections)
+    facts = {"summary": _summary(study), "warnings": _warnings(study)}
+    return template.render(title=title, sections=sections, **facts)
+
+
+def _pictures(study):
+    """The place in the page of every shape's picture, by its name."""
+    names = study["coarse"].children if has(study, "coarse") else ()
+    return {name: f"shape-{i}" for i, name in enumerate(names)}
+
+
+def _linked(names, places):
+    """Names of shapes, as links to their pictures where there are any."""
+    return [PARTS.link(name, places[name]) if name in places else name for name in names]
 
 
 def _index(names, name):
@@ -118,16 +130,27 @@ def _summary(study):
     return "; ".join(facts) + "." if facts else "The study is empty."
 
 
-def _decisions(report):
-    """What is to decide on doubtful shapes, kind by kind; nothing where there are none."""
-    rows = [[one.kind, ", ".join(one.names), one.remedy] for one in decisions(report)]
-    if not rows:
+def _warnings(study):
+    """What of the report a reader should know first: shapes left out, doubtful, odd; or nothing."""
+    if not has(study, "report/status"):
+        return Markup("")
+    report, places = study["report"].dataset, _pictures(study)
+    status, names = report["status"].values.astype(str), np.array(names_of(report))
+    lines = []
+    if (status == "excluded").any():
+        left = _linked(names[status == "excluded"], places)
+        lines.append(("excluded", "left out, for the reasons in the table of shapes", left))
+    for kind, found in (("doubtful", decisions(report)), ("odd", notices(report))):
+        for one in found:
+            lines.append((kind, f"{one.kind} ({one.remedy})", _linked(one.names, places)))
+    if not lines:
         return Markup("")
     become = "Doubtful shapes are registered, and in no modes, no statistics and no median; "
     become += "s4a run ... --keep-doubtful takes all of them in."
     if report.attrs.get("keep_doubtful") == "True":
         become = "Doubtful shapes were taken into modes and statistics by keep_doubtful."
-    return PARTS.note(become) + PARTS.table(["to decide", "shapes", "what to do"], rows)
+    note = PARTS.note(become) if (status == "doubtful").any() else Markup("")
+    return PARTS.warnings(lines) + note
 
 
 def _shapes(study, look):
@@ -139,14 +162,15 @@ def _shapes(study, look):
         if key in report and (report[key].values != "").any()
     ]
     meshes = study["original"].children if has(study, "original") else {}
-    rows = []
+    rows, places = [], _pictures(study)
     for i, name in enumerate(names_of(report)):
         size = ["", ""]
         if name in meshes:
             size = [meshes[name].sizes["vertex"], meshes[name].sizes["triangle"]]
-        rows.append([name, status[i], *size, *(report[key].values[i] for key in texts)])
+        linked = PARTS.link(name, places[name]) if name in places else name
+        rows.append([linked, status[i], *size, *(report[key].values[i] for key in texts)])
     head = ["shape", "status", "vertices", "triangles", *texts]
-    return _decisions(report) + PARTS.table(head, rows, status.tolist())
+    return PARTS.table(head, rows, status.tolist(), name="the shapes")
 
 
 def _gallery(study, look):
@@ -154,12 +178,12 @@ def _gallery(study, look):
     texts = {name: text for text, name in labelled(study, names)}
     meshes = [surface(study, name) for name in names]
     frames = shared_frames([X for X, _ in meshes], look)
-    median = attribute(study, "latent", "median")
+    median, places = attribute(study, "latent", "median"), _pictures(study)
     figures = []
     for name, (X, T), frame in zip(names, meshes, frames, strict=True):
         pixels = render(X, T, size=(150, 130), frame=frame, **look)
         caption = f"{texts[name]}, the median" if name == median else texts[name]
-        figures.append(PARTS.picture(pixels, caption, name == median))
+        figures.append(PARTS.picture(pixels, caption, name == median, places[name]))
     kinds = {low_text(study["coarse"][name].dataset) or "low-resolution meshes" for name in names}
     note = PARTS.note(f"The {' and '.join(sorted(kinds))}, all at one scale.")
     return note + PARTS.grid(figures, "gallery")
@@ -209,31 +233,38 @@ def _distances(study, look):
     return note + PARTS.drawing(figure, "the shapes ranked by their distance to the limit shape")
 
 
+def _moved(study, look):
+    """Sliders that move the mean shape; pictures drawn in advance where they cannot."""
+    draw, _ = mode_drawer(study, look)
+    n_frames = 13 if study["registration"].sizes["vertex"] < 50_000 else 7
+    sigmas = np.linspace(-SIGMA, SIGMA, n_frames)
+    sliders = []
+    for mode, ratio in enumerate(study["pca"]["explained_variance_ratio"].values[:N_MODES]):
+        frames = [webp_uri(draw(mode, s)) for s in sigmas]
+        labels = [_label(mode, s) for s in sigmas]
+        share = f"{ratio:.1%} of the variance"
+        sliders.append(PARTS.slider(mode, frames, labels, share))
+    return _live_modes(study, PARTS.grid(sliders), look)
+
+
+def _label(mode, sigma):
+    amount = f"{sigma:+.3g} σ".replace("-", "−") if sigma else "mean"
+    return f"component {mode + 1}, {amount}"
+
+
 def _modes(study, look):
     draw, limit = mode_drawer(study, look)
     unit = study["pca"]["deformation"].attrs.get("units", "")
-    n_frames = 13 if study["registration"].sizes["vertex"] < 50_000 else 7
-    sigmas = np.linspace(-SIGMA, SIGMA, n_frames)
-    pictures, sliders = [], []
-    for mode, ratio in enumerate(study["pca"]["explained_variance_ratio"].values[:N_MODES]):
-        name = f"component {mode + 1}"
-        frames = [draw(mode, s) for s in sigmas]
-        labels = [f"{name}, {s:+.3g} σ".replace("-", "−") if s else f"{name}, mean" for s in sigmas]
-        pictures += [PARTS.picture(frames[i], labels[i]) for i in (0, n_frames // 2, -1)]
+    pictures = []
+    for mode in range(min(N_MODES, study["pca"].sizes["component"])):
+        for sigma in (-SIGMA, 0, SIGMA):
+            pictures.append(PARTS.picture(draw(mode, sigma), _label(mode, sigma)))
         behind = draw(mode, SIGMA, view=opposite(look["view"]))
-        pictures.append(PARTS.picture(behind, f"{labels[-1]}, from behind"))
-        share = f"{ratio:.1%} of the variance"
-        sliders.append(PARTS.slider(mode, list(map(webp_uri, frames)), labels, share))
+        pictures.append(PARTS.picture(behind, f"{_label(mode, SIGMA)}, from behind"))
     note = "Blue is expansion, red is compression, against the mean; one colour scale for all."
     bar = charts.color_bar(SIGNED, -limit, limit, f"displacement along the normal ({unit})")
-    parts = [
-        PARTS.note(note),
-        PARTS.grid(pictures, "row four"),
-        PARTS.drawing(bar, "colour bar"),
-        Markup("<h3>Move along the components</h3>"),
-        _live_modes(study, PARTS.grid(sliders), look),
-    ]
-    return Markup("").join(parts)
+    grid = PARTS.grid(pictures, "row four")
+    return PARTS.note(note) + grid + PARTS.drawing(bar, "colour bar")
 
 
 def _live_modes(study, instead, look):
@@ -252,7 +283,7 @@ def _live_modes(study, instead, look):
         "beside": False,
         "sample": -1,
         "group": "",
-        "height": 420,
+        "height": 275,
         "webgl": "",
         "still": b"",
     }
@@ -346,22 +377,25 @@ def _resources(study, look):
     rows = []
     for i, stage in enumerate(report["stage"].values):
         rows.append([str(stage), *(float(report[key].values[i]) for key in heads)])
-    return PARTS.table(["stage", *heads.values()], rows)
+    return PARTS.table(["stage", *heads.values()], rows, name="time and memory")
 
 
 def _parameters(study, look):
     rows = [[key, value] for key, value in study["report"].attrs.items() if str(value)]
-    return PARTS.table(["parameter", "value"], rows) if rows else PARTS.missing(["parameters"])
+    if not rows:
+        return PARTS.missing(["parameters"])
+    return PARTS.table(["parameter", "value"], rows, name="parameters")
 
 
 # heading, what of the study it needs, and what writes it
 SECTIONS = (
+    ("Move the modes", ["registration/position", "pca/deformation"], _moved),
+    ("Modes of variation", ["registration/position", "pca/deformation"], _modes),
     ("Shapes", ["report/status"], _shapes),
     ("Gallery", ["coarse"], _gallery),
     ("Network of maps", ["network/source", "network/target", "network/cycle_error"], _network),
     ("Functional maps", ["network/fmap"], _maps),
     ("Distance to the limit shape", ["latent/distance_to_median"], _distances),
-    ("Modes of variation", ["registration/position", "pca/deformation"], _modes),
     ("Explained variance", ["pca/explained_variance_ratio"], _variance),
     ("Scores", ["pca/score"], _scores),
     ("Correspondence", ["registration/position", "registration/registered_match"], _correspondence),

@@ -210,11 +210,43 @@ def test_a_broken_surface_is_refused_with_advice():
 
 
 def test_the_page_is_one_file_without_any_address_outside(html):
-    assert not re.findall(r"""(?:src|href)\s*=\s*["'](?!data:)""", html)
+    assert not re.findall(r"""(?:src|href)\s*=\s*["'](?!data:|#)""", html)
     assert "http" not in re.sub(r"data:[^\"]*|http://www.w3.org/2000/svg", "", html)
     assert len(html) < 8e6
     assert html.count("<section>") == len(page.SECTIONS)
     assert "Not there" not in html
+
+
+def test_sliders_come_first_and_the_contents_lead_to_every_section(html):
+    headings = re.findall(r'<h2 id="(section-\d+)">(.*?)</h2>', html)
+    assert headings[0][1] == "Move the modes"
+    contents = re.search(r'<nav aria-label="contents">(.*?)</nav>', html, re.DOTALL)[1]
+    assert re.findall(r'<a href="#(.*?)">(.*?)</a>', contents) == headings
+    assert len(headings) == len(page.SECTIONS)
+
+
+def test_warnings_stand_at_the_top_and_every_shape_leads_to_its_picture(study):
+    part = study.copy()
+    report = part["report"].to_dataset()
+    kinds = ["", "mirrored", "", "", "", "", ""]
+    part["report"] = xr.DataTree(
+        report.assign(
+            doubtful_kinds=("shape", kinds),
+            warning_kinds=("shape", ["", "", "", "size", "", "", ""]),
+            status=("shape", ["ok", "doubtful", "ok", "ok", "ok", "repaired", "excluded"]),
+        )
+    )
+    text = page.study_html(part)
+    top = text[: text.index("<nav")]
+    assert "left out" in top
+    assert "broken &lt;b&gt;" in top
+    pictures = dict(re.findall(r'<figure id="(shape-\d)".*?<figcaption>(.*?)</figcaption>', text))
+    for kind, name in (("mirrored", "shape-1"), ("size", "shape-3")):
+        line = re.search(rf"<li class=.*?{kind}.*?</li>", top)[0]
+        place = re.search(rf'<a href="#(.*?)">{name}</a>', line)[1]
+        assert pictures[place].startswith(name)
+    shapes = text[text.index("Shapes</h2>") :]
+    assert len(set(re.findall(r'<td><a href="#(shape-\d)">', shapes))) == N_SHAPES
 
 
 def test_text_of_the_study_is_escaped(html):

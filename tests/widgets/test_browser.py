@@ -24,6 +24,7 @@ from s4a.show.surfaces import aligned
 
 playwright = pytest.importorskip("playwright.sync_api")
 pytest.importorskip("jupyterlab")
+axe = pytest.importorskip("axe_playwright_python.sync_playwright")
 widgets = pytest.importorskip("s4a.widgets")
 
 CHROMIUM = next(
@@ -777,6 +778,39 @@ def test_the_console_has_no_errors(page, messages):
     assert serious(messages) == []
 
 
+# ---- for readers of screens, with axe-core
+
+
+def barriers(page, context=None):
+    """What axe finds serious or critical: rule, element, and why."""
+    found = axe.Axe().run(page, context).response["violations"]
+    return [
+        (rule["id"], node["html"], node["failureSummary"])
+        for rule in found
+        if rule["impact"] in ("serious", "critical")
+        for node in rule["nodes"]
+    ]
+
+
+def test_axe_sees_what_it_should(browser):
+    page = browser.new_page()
+    page.set_content('<html lang="en"><title>t</title><input><p style="color:#bbb">faint</p>')
+    assert {rule for rule, _, _ in barriers(page)} == {"color-contrast", "label"}
+    page.close()
+
+
+@pytest.mark.parametrize("title", TITLES)
+def test_a_panel_has_no_serious_barrier(sizes, title):
+    tabs = tabs_of(sizes, 3, title)
+    if title == "Network":
+        panel_of(tabs).locator(".s4a-edge").nth(6).dispatch_event("click")
+        panel_of(tabs).locator(".s4a-title", has_text="the target").wait_for()
+    assert panel_of(tabs).get_attribute("role") == "region", "a landmark"
+    panel_of(tabs).evaluate("(e) => (e.id = 'looked-at')")
+    assert barriers(sizes, "#looked-at") == []
+    panel_of(tabs).evaluate("(e) => e.removeAttribute('id')")
+
+
 # ---- without a kernel
 
 
@@ -856,6 +890,36 @@ def test_the_page_of_a_study_has_live_sliders(offline, study, study_page):
     page.wait_for_function(DRAWN)
     check_sliders(page, study)
     assert not page.locator("#modes-instead").is_visible()
+    assert errors == []
+    page.close()
+
+
+def test_the_page_of_a_study_has_no_serious_barrier_and_one_screen_an_idea(offline, study_page):
+    page, errors = opened(offline, study_page)
+    page.set_viewport_size({"width": 1366, "height": 768})
+    page.wait_for_function(DRAWN)
+    assert barriers(page) == []
+    heights = page.evaluate(
+        "[...document.querySelectorAll('section')].map((s) => s.getBoundingClientRect().height)"
+    )
+    assert max(heights) <= 768
+    page.get_by_role("link", name="Gallery").click()
+    page.wait_for_function(
+        "Math.abs(document.querySelector('h2:target').getBoundingClientRect().top) < 300"
+    )
+    assert page.locator("h2:target").inner_text() == "Gallery"
+    assert errors == []
+    page.close()
+
+
+@pytest.mark.parametrize("kind", ["Modes", "Network", "Median", "Transfer", "Comparison"])
+def test_a_saved_panel_has_no_serious_barrier(offline, study, compared, kind, tmp_path):
+    panel = getattr(widgets, kind)(compared if kind == "Comparison" else study)
+    panel.save_html(tmp_path / "panel.html", limit=200_000)
+    panel.close()
+    page, errors = opened(offline, tmp_path / "panel.html")
+    page.wait_for_function(DRAWN)
+    assert barriers(page) == []
     assert errors == []
     page.close()
 
