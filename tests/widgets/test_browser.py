@@ -66,7 +66,8 @@ from IPython.display import display
 
 for options in ({"width": 360}, {"width": 1000}, {"font": 20}, {}):
     tabs = study.s4a.explore(**options)
-    tabs["Transfer"].radius.description = "radius (unit of the input)"  # where none is known
+    panel, name = tabs["Transfer"], "radius (unit of the input)"  # where none is known
+    panel.radius.description, panel.frame.help = name, {**panel.frame.help, name: "of the spheres"}
     tabs["Modes"]
     display(tabs)
 """
