@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-lowest test-newest check fuzz format bench paper hangs structure lab docs address release clean
+.PHONY: demo test test-lowest test-newest check fuzz format bench paper hangs structure lab docs slides address release clean
 
 demo: $(VENV)/.core
 	$(BIN)/s4a demo
@@ -71,6 +71,10 @@ release: $(VENV)/.test
 	rm -rf dist && $(BIN)/python -m pip install --quiet build twine && $(BIN)/python -m build --outdir dist .
 	$(BIN)/python -m twine check --strict dist/*
 	tools/try.sh dist/s4a-$(VERSION)-py3-none-any.whl
+
+# the lecture of 45 minutes, from the notebooks, in docs/_build/slides
+slides: $(VENV)/.docs
+	$(BIN)/python docs/slides.py
 
 clean:
 	rm -rf $(VENV) $(VENV)-lowest $(VENV)-newest

@@ -10,14 +10,17 @@ import math
 
 import ipywidgets
 import numpy as np
+import pythreejs
 from IPython import get_ipython
 from IPython.display import HTML, display
 from jinja2 import Environment
 from markupsafe import Markup
+from matplotlib.colors import to_rgb
 
 import s4a.course
-from s4a.show.draw import data_uri
+from s4a.show.draw import CLAY, data_uri, image_bytes, on_white, render
 from s4a.show.panel_page import panel_html
+from s4a.widgets import threejs
 from s4a.widgets.explore import Explore
 from s4a.widgets.panel import Panel
 
@@ -62,6 +65,38 @@ def framed(panel):
 
 for kind in (Panel, Explore):
     format_of.formatters["text/html"].for_type(kind, framed)
+
+
+def pictured(scene):
+    """A picture of the surfaces of a scene, which turn in the notebook only."""
+    parts = list(scene.scene.children)
+    parts += [
+        part for group in parts if isinstance(group, pythreejs.Group) for part in group.children
+    ]
+    meshes = [part for part in parts if hasattr(getattr(part, "geometry", None), "attributes")]
+    points, triangles, colors = [], [], []
+    for mesh in meshes:
+        known = mesh.geometry.attributes
+        X = known["position"].array + np.array(mesh.position)
+        triangles.append(mesh.geometry.index.array.reshape(-1, 3) + sum(map(len, points)))
+        points.append(X)
+        clay = np.tile(to_rgb(CLAY), (len(X), 1))
+        colors.append(known["color"].array if "color" in known else clay)
+    camera = np.subtract(scene.camera.position, scene.controls[0].target)
+    azimuth, height = np.arctan2(camera[1], camera[0]), np.hypot(*camera[:2])
+    view = (float(np.rad2deg(azimuth)), float(np.rad2deg(np.arctan2(camera[2], height))))
+    pixels = render(
+        *map(np.concatenate, (points, triangles)),
+        colors=np.concatenate(colors),
+        view=view,
+        size=(int(scene.width), int(scene.height)),
+    )
+    address = data_uri(image_bytes(on_white(pixels), "png"), "image/png")
+    return f'<img alt="A scene that turns in the notebook" src="{address}">'
+
+
+format_of.formatters["text/html"].for_type(pythreejs.Renderer, pictured)
+format_of.formatters["text/html"].for_type(threejs.Scores, lambda sliders: "")
 format_of.formatters["text/html"].for_type(ipywidgets.HTML, lambda widget: widget.value)
 
 

@@ -31,12 +31,12 @@ def check(answer: Any, expected: Any, hint: str = "", *, within: float = 0.01) -
     Returns
     -------
     str
-        That it is right.
+        That it is right, or that there is none yet and where to look: an open exercise is no error.
 
     Raises
     ------
     AssertionError
-        When there is no answer yet, or another than the right one.
+        When the answer is not the right one.
 
     Examples
     --------
@@ -51,7 +51,7 @@ def check(answer: Any, expected: Any, hint: str = "", *, within: float = 0.01) -
     """
     hint = f" Hint: {hint}{'' if hint.endswith(('.', '?')) else '.'}" if hint else ""
     if answer is ...:
-        raise _shown(f"No answer yet: put yours in the place of the dots of `answer = ...`.{hint}")
+        return f"No answer yet: put yours in the place of the dots of `answer = ...`.{hint}"
     if callable(expected):
         right = bool(expected(answer))
     elif np.asarray(expected).dtype.kind in "iuf":

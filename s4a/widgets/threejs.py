@@ -417,7 +417,7 @@ def _name(text, place, height, *, hidden=True):
 
 
 def correspondence(
-    pair: xr.Dataset | xr.DataTree,
+    pair: xr.Dataset | xr.DataTree | np.ndarray,
     source: xr.Dataset | str,
     target: xr.Dataset | str,
     *,
@@ -427,9 +427,9 @@ def correspondence(
 
     Parameters
     ----------
-    pair : xarray.Dataset or xarray.DataTree
-        With ``match(vertex)``, as of :func:`s4a.match_pair`: on each vertex of the target one of
-        the source; or a study, whose latent basis matches two of its shapes (eq. 3).
+    pair : xarray.Dataset, xarray.DataTree or int ndarray (vertex,)
+        With ``match(vertex)``, as of :func:`s4a.match_pair`, or this match: on each vertex of the
+        target one of the source; or a study, whose latent basis matches two of its shapes (eq. 3).
     source, target : xarray.Dataset or str
         The meshes of the pair, or the names of two shapes of the study.
     n_lines : int
@@ -462,8 +462,10 @@ def correspondence(
         match = latent_match(pair, source, target, dense=False)
         (X, S), (Y, T) = (study_surface(pair, name) for name in (source, target))
     else:
-        require(pair, "match", what="pair")
-        match, (X, S), (Y, T) = pair["match"].values, as_arrays(source), as_arrays(target)
+        if isinstance(pair, xr.Dataset):
+            require(pair, "match", what="pair")
+            pair = pair["match"].values
+        match, (X, S), (Y, T) = np.asarray(pair), as_arrays(source), as_arrays(target)
     if len(match) != len(Y) or match.max() >= len(X):
         raise ValueError(
             f"a match of {len(Y)} vertices of the target to {len(X)} of the source needed, "

@@ -58,7 +58,7 @@ def test_the_requirements_install_this_project_with_an_extra_that_it_has():
     (extra,) = re.findall(r"^-e \.\[(\w+)\]$", "\n".join(lines("requirements.txt")), re.MULTILINE)
     extras = PROJECT["optional-dependencies"]
     needed = distributions(extras[extra])
-    assert {"s4a[notebook]", "nilearn", "scikit-image"} <= set(needed)
+    assert {"s4a[notebook]", "s4a[labels]", "nilearn"} <= set(needed)
     assert {"jupyterlab", "ipywidgets", "anywidget"} <= set(distributions(extras["notebook"]))
 
 
