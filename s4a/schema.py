@@ -6,6 +6,7 @@ not exist.
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -382,7 +383,7 @@ def covariate(name: str, data: ArrayLike) -> xr.Variable:
     )
 
 
-def dataset(attrs: Mapping | None = None, **variables: ArrayLike) -> xr.Dataset:
+def dataset(attrs: Mapping[str, Any] | None = None, **variables: ArrayLike) -> xr.Dataset:
     """A Dataset of variables of the table, as ``dataset(position=X, corner_vertex=T)``."""
     return xr.Dataset({name: variable(name, data) for name, data in variables.items()}, attrs=attrs)
 

@@ -21,7 +21,7 @@ from s4a.study import store
 FORMATS = {"ply": ".ply", "vtk": ".vtk", "obj": ".obj", "npz": ".npz", "gifti": ".gii"}
 
 
-def write_table(path: Path, head: Iterable, rows: Iterable) -> Path:
+def write_table(path: Path, head: Iterable[Any], rows: Iterable[Any]) -> Path:
     """Write a CSV; gives its path."""
     with open(path, "w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([list(head), *rows])

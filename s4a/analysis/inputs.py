@@ -3,7 +3,7 @@
 import logging
 import re
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -19,7 +19,7 @@ from s4a.study.tree import left_out
 log = logging.getLogger(__name__)
 
 # One value per shape: in the order of the study, by name of the shape, or a column of /subjects.
-Values = np.ndarray | Sequence | dict | str
+Values = np.ndarray | Sequence[Any] | dict[str, Any] | str
 
 DATE = re.compile(r"\d{4}-\d\d?-\d\d?.*|\d{4}/\d\d?/\d\d?|\d\d?[./-]\d\d?[./-](\d\d){1,2}")
 IDENTIFIER = re.compile(r"(\b|_)(id|nr|code)'?$", re.IGNORECASE)  # how names of columns end

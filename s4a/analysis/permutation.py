@@ -11,6 +11,7 @@ shape keeps its own variance, and errors need to be symmetric.
 import itertools
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from scipy import stats
@@ -433,7 +434,7 @@ def vertex_test(
     return share, (1 + reached) / (1 + n_others), (1 + beyond) / (1 + n_others)
 
 
-def batched(items: Iterator, size: int) -> Iterator[list]:
+def batched(items: Iterator[Any], size: int) -> Iterator[list[Any]]:
     """The items in lists of at most `size`."""
     while batch := list(itertools.islice(items, size)):
         yield batch

@@ -151,7 +151,9 @@ def _routes(study: xr.DataTree, name: str) -> tuple[list[Route], list[Route]]:
     return down, up
 
 
-def _routes_from_outside(study: xr.DataTree, mesh: xr.Dataset, given: dict) -> list[Route]:
+def _routes_from_outside(
+    study: xr.DataTree, mesh: xr.Dataset, given: dict[str, Any]
+) -> list[Route]:
     """Routes from an external mesh to the study's template, by its options and those given."""
     name = study["registration"].attrs["template"]
     if "coarse" not in study.children:

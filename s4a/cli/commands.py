@@ -71,7 +71,7 @@ def run(args: Namespace) -> int:
     return 1 if study["report"].attrs["unforeseen"] else 0
 
 
-def options_of(args: Namespace) -> dict:
+def options_of(args: Namespace) -> dict[str, Any]:
     """The options of `analyse` from parsed flags, and how many processes."""
     from s4a.study.options import Options
 
@@ -315,8 +315,8 @@ def transfer(args: Namespace) -> int:
         study, excluded = registered_pairs(source, args, given)
         source, given = None, {}  # it is the template now, and matched
     out = new_folder(args.out)
-    labels: Mapping = {}  # name of a target -> node
-    points: Mapping = {}
+    labels: Mapping[str, Any] = {}  # name of a target -> node
+    points: Mapping[str, Any] = {}
     if label is not None:
         labels = travel.transfer_labels(study, label, source=source, **given).children
     if landmarks is not None:
@@ -326,7 +326,7 @@ def transfer(args: Namespace) -> int:
 
 
 def registered_pairs(
-    source: "xr.Dataset", args: Namespace, options: dict
+    source: "xr.Dataset", args: Namespace, options: dict[str, Any]
 ) -> "tuple[xr.DataTree, list[str]]":
     """The source registered as the template of every target, and the targets that are left out."""
     from s4a.analysis.transfer import register_pairs
@@ -350,8 +350,8 @@ def registered_pairs(
 
 
 def transferred_rows(
-    study: "xr.DataTree", labels: Mapping, points: Mapping, out: Path
-) -> list[list]:
+    study: "xr.DataTree", labels: Mapping[str, Any], points: Mapping[str, Any], out: Path
+) -> list[list[Any]]:
     """Write the files of every target; the rows of the table that is shown."""
     from s4a.cli import tables
     from s4a.input.annotations import write_landmarks
@@ -481,7 +481,7 @@ def compare_pairs(
     return result, names, seconds, f"{tables.comparison_table(found)}\n\n{blocks}"
 
 
-def truth_of(files: list[str] | None, targets: dict) -> "dict[str, np.ndarray] | None":
+def truth_of(files: list[str] | None, targets: dict[str, Any]) -> "dict[str, np.ndarray] | None":
     """The truth in one file for every target, in the same order, or none."""
     from s4a.evaluation.compare import read_truth
 
@@ -494,7 +494,9 @@ def truth_of(files: list[str] | None, targets: dict) -> "dict[str, np.ndarray] |
     return {name: read_truth(file) for name, file in zip(targets, files, strict=True)}
 
 
-def landmark_pairs(files: list[str] | None, targets: dict) -> "dict[str, list[np.ndarray]] | None":
+def landmark_pairs(
+    files: list[str] | None, targets: dict[str, Any]
+) -> "dict[str, list[np.ndarray]] | None":
     """Positions of the landmarks that source and target both have by name, for every target.
 
     None where they share none.

@@ -132,7 +132,7 @@ def numbers(text: str) -> tuple[int, ...]:
     return tuple(map(int, re.match(r"\d+(?:\.\d+)*", text)[0].split(".")))
 
 
-def run(script: str, *words: str) -> subprocess.CompletedProcess:
+def run(script: str, *words: str) -> subprocess.CompletedProcess[str]:
     """A script in a process of its own, which a broken library may end."""
     command = [sys.executable, "-c", script, *words]
     return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)

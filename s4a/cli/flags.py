@@ -78,7 +78,7 @@ def parser(only: str | None = None) -> argparse.ArgumentParser:
     return top
 
 
-def add_options(add: Callable, names: Iterable[str], *, unset: bool = False) -> None:
+def add_options(add: Callable[..., Any], names: Iterable[str], *, unset: bool = False) -> None:
     """A flag for each of these options of :func:`s4a.analyse`, and for ``n_jobs``.
 
     With `unset` those that are not given are None.

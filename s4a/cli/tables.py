@@ -7,6 +7,7 @@ import shlex
 import textwrap
 import time
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -54,7 +55,7 @@ TRANSFERRED = [
 ]
 
 
-def table(rows: Iterable[Sequence], head: Sequence[str], width: int = 120) -> str:
+def table(rows: Iterable[Sequence[Any]], head: Sequence[str], width: int = 120) -> str:
     """Rows of text as aligned columns.
 
     Numbers to the right, a long last column wrapped at `width` characters.

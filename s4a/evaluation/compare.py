@@ -55,7 +55,7 @@ COLLECTION_BLOCKS = (
 )
 HOW = ("standard", "ours")
 # first maps of all methods, and rounds of RE-MATCH lifted
-PRESETS: dict[str | None, dict] = {
+PRESETS: dict[str | None, dict[str, Any]] = {
     None: {"sharpen": 2, "init": "landmarks"},
     "paper": {"sharpen": 0, "init": "landmarks"},
 }

@@ -77,7 +77,9 @@ class Clock:
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
 
-    def __call__(self, block: str, function: Callable, *arguments: Any, **options: Any) -> Any:
+    def __call__(
+        self, block: str, function: Callable[..., Any], *arguments: Any, **options: Any
+    ) -> Any:
         """What a function gives; its seconds go to the block."""
         begin = time.process_time()
         result = function(*arguments, **options)

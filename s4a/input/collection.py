@@ -35,7 +35,7 @@ AREAS = ("area", "area_dropped")
 
 
 def read_shape(
-    path: str | os.PathLike,
+    path: str | os.PathLike[str],
     *,
     components: str | int = "largest",
     strict: bool = False,
@@ -90,7 +90,7 @@ def read_shape(
 
 
 def read_shapes(
-    paths: Paths | dict,
+    paths: Paths | dict[str, Any],
     *,
     components: str | int = "largest",
     strict: bool = False,
@@ -219,7 +219,10 @@ def read_labels(paths: Paths, *, label: Label = "all", **options: Any) -> xr.Dat
 
 
 def remarks_on_files(
-    paths: Paths | dict | xr.DataTree, pattern: str | None = None, *, volumes: bool = False
+    paths: Paths | dict[str, Any] | xr.DataTree,
+    pattern: str | None = None,
+    *,
+    volumes: bool = False,
 ) -> list[str]:
     """In words: the files among `paths` that are no meshes, and those whose names are too long."""
     if isinstance(paths, dict | xr.DataTree):
@@ -237,7 +240,7 @@ def remarks_on_files(
 
 
 def shape_report(
-    attrs: dict[str, dict],
+    attrs: dict[str, dict[str, Any]],
     doubts: plausibility.Doubts | None = None,
     remarks: Iterable[str] = (),
     evidence: dict[str, xr.Dataset] | None = None,
@@ -264,7 +267,7 @@ def shape_report(
         rows.append({**said, **_doubtful_columns(of_shape)})
         if name in evidence:
             rows[-1]["self_intersections"] = evidence[name].attrs["self_intersections"]
-    columns: dict[str, list | np.ndarray] = {
+    columns: dict[str, list[Any] | np.ndarray] = {
         key: [shown(row.get(key, "")) for row in rows] for key in TEXTS
     }
     columns |= {key: np.array([row.get(key, -1) for row in rows], np.int64) for key in COUNTS}

@@ -10,6 +10,7 @@ import zipfile
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -23,10 +24,10 @@ WRITERS = {known.suffixes.split()[0]: known.write for known in FORMATS.values() 
 LONGEST_NAME = 100  # letters of a shape's name, so that files of a study can be named after it
 OTHERS = ".json .csv .txt .md .html .png .jpg .nc .npy .annot .nii".split()  # that a glob may match
 
-Paths = str | os.PathLike | Iterable[str | os.PathLike]
+Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
 
-def read_mesh(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray, dict[str, str]]:
+def read_mesh(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, dict[str, str]]:
     """Points and triangles of a mesh file; the format is told by the content, not by the name.
 
     Parameters
@@ -86,7 +87,7 @@ def read_mesh(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray, dict[str
     return points, triangles, attrs
 
 
-def suffix_of(path: str | os.PathLike) -> str:
+def suffix_of(path: str | os.PathLike[str]) -> str:
     """What the name promises: the suffix in lower case, that before .gz where there is one.
 
     Examples
@@ -98,7 +99,7 @@ def suffix_of(path: str | os.PathLike) -> str:
     return Path(Path(path).name.lower().removesuffix(".gz")).suffix
 
 
-def stem_of(path: str | os.PathLike) -> str:
+def stem_of(path: str | os.PathLike[str]) -> str:
     """The name without .gz and without the suffix of its format; FreeSurfer's suffixes are names.
 
     Examples
@@ -131,7 +132,10 @@ def _checked(points, triangles):
 
 
 def write_mesh(
-    path: str | os.PathLike, points: np.ndarray, triangles: np.ndarray, **vertex_scalars: np.ndarray
+    path: str | os.PathLike[str],
+    points: np.ndarray,
+    triangles: np.ndarray,
+    **vertex_scalars: np.ndarray,
 ) -> None:
     """Write a mesh in the format of the suffix: .ply (binary), .obj, .off, .stl, .vtk, .gii, .npz.
 
@@ -362,7 +366,7 @@ def _digest(text):
     return hashlib.sha256(os.fsencode(text)).hexdigest()[:8]
 
 
-def check_names(names: Iterable) -> None:
+def check_names(names: Iterable[Any]) -> None:
     """ValueError unless there are names, and each is one that :func:`slug` leaves as it is."""
     names = list(names)
     wrong = [name for name in names if not isinstance(name, str) or slug(name) != name]
@@ -373,7 +377,7 @@ def check_names(names: Iterable) -> None:
         )
 
 
-def slugs(files: Iterable[str | os.PathLike]) -> list[str]:
+def slugs(files: Iterable[str | os.PathLike[str]]) -> list[str]:
     """A unique :func:`slug` for each path, also where upper and lower case are one."""
     files = [Path(os.path.abspath(file)) for file in files]
     base = os.path.commonpath([file.parent for file in files])

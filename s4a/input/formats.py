@@ -60,7 +60,7 @@ class Format:
     suffixes: str
     signature: bytes
     read: Callable[[bytes], Surface]
-    write: Callable[[np.ndarray, np.ndarray, dict], bytes] | None = None
+    write: Callable[[np.ndarray, np.ndarray, dict[str, Any]], bytes] | None = None
     scalars: bool = False
 
 

@@ -73,7 +73,7 @@ def is_volume(data: bytes) -> bool:
 
 
 def read_volume(
-    path: str | os.PathLike, label: Label, *, rounds: int = ROUNDS
+    path: str | os.PathLike[str], label: Label, *, rounds: int = ROUNDS
 ) -> tuple[np.ndarray, np.ndarray, dict[str, str]]:
     """The surface of what a label volume marks, in its world coordinates.
 

@@ -16,6 +16,8 @@ repaired is added to `counts`, see :data:`s4a.input.clean.REPAIRS`.
                h               and h + 2m starts at the corner opposite to h
 """
 
+from typing import Any
+
 import numpy as np
 
 from s4a.geometry.mesh import (
@@ -43,7 +45,7 @@ def manifold_mates(edge_of: np.ndarray, count: np.ndarray) -> np.ndarray:
 
 
 def join_triangles(
-    P: np.ndarray, F: np.ndarray, group: np.ndarray, counts: dict
+    P: np.ndarray, F: np.ndarray, group: np.ndarray, counts: dict[str, Any]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find the mates of all half-edges, and orient the triangles consistently.
 
@@ -161,7 +163,7 @@ def join_corners(F: np.ndarray, mate: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def split_double_edges(
-    X: np.ndarray, V: np.ndarray, file_vertex: np.ndarray, mate: np.ndarray, counts: dict
+    X: np.ndarray, V: np.ndarray, file_vertex: np.ndarray, mate: np.ndarray, counts: dict[str, Any]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Give each of two sheets its own midpoint where they share both ends of an edge.
 

@@ -5,7 +5,7 @@ It is named and never changed.
 
 from collections import Counter
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -75,7 +75,7 @@ def in_words(doubts: list[Doubt]) -> str:
 
 
 def find_warnings(
-    attrs: dict[str, dict], evidence: Mapping[str, xr.Dataset]
+    attrs: dict[str, dict[str, Any]], evidence: Mapping[str, xr.Dataset]
 ) -> tuple[Doubts, list[str]]:
     """What looks wrong with each shape, and, in words, with the collection.
 

@@ -4,6 +4,7 @@ The smoothing is the line after eq. 8: projection onto the first functions U Phi
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -13,7 +14,7 @@ from s4a.geometry.align import rigid_transform
 from s4a.method.spectral import project
 
 
-def smoother(Phi: np.ndarray, area: np.ndarray, U: sp.spmatrix | None = None) -> Callable:
+def smoother(Phi: np.ndarray, area: np.ndarray, U: sp.spmatrix | None = None) -> Callable[..., Any]:
     """The A-orthogonal projection d -> B (B^T A B)^-1 B^T A d, B = U Phi.
 
     The paper's U Phi (U Phi)^+ d, weighted by area.  At full resolution B is not orthonormal:
@@ -49,7 +50,7 @@ def onto(
     X: np.ndarray,
     image: np.ndarray,
     area: np.ndarray,
-    coefficients: Callable,
+    coefficients: Callable[..., Any],
     spectrum: tuple[np.ndarray | sp.spmatrix, np.ndarray, np.ndarray] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The motion that brings X onto its image, and the displacement that it leaves, smoothed.

@@ -5,6 +5,7 @@ source -> target; a match holds, for every vertex of the target, a vertex of the
 """
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -64,7 +65,7 @@ def match_from_fmap(
     Phi_source: np.ndarray,
     Phi_target: np.ndarray,
     *,
-    nearest: Callable = nearest_rows,
+    nearest: Callable[..., Any] = nearest_rows,
 ) -> np.ndarray:
     """Nearest neighbours of the rows of Psi among those of Phi C^T (eq. 2)."""
     k_target, k_source = C.shape
@@ -78,7 +79,7 @@ def zoomout(
     k: int,
     *,
     step: int = 5,
-    nearest: Callable = nearest_rows,
+    nearest: Callable[..., Any] = nearest_rows,
 ) -> tuple[np.ndarray, np.ndarray]:
     """ZoomOut (4.1; Melzi et al. 2019): C -> match -> a larger C, until it is k x k.
 
@@ -306,7 +307,7 @@ def fit_descriptors(
     target: xr.Dataset,
     *,
     k: int = 20,
-    landmarks: tuple | None = None,
+    landmarks: tuple[Any, ...] | None = None,
     kind: str = "wks",
     n: int = 100,
     every: int = 5,
@@ -357,7 +358,9 @@ def fit_descriptors(
             raise ValueError(
                 f"the {what} needs {k} eigenfunctions, found {mesh.sizes['mode']}: give a smaller k"
             )
-    vertices: tuple = (None, None) if landmarks is None else tuple(np.asarray(v) for v in landmarks)
+    vertices: tuple[Any, ...] = (
+        (None, None) if landmarks is None else tuple(np.asarray(v) for v in landmarks)
+    )
     if landmarks is not None and (
         len(vertices) != 2 or vertices[0].shape != vertices[1].shape or vertices[0].ndim != 1
     ):

@@ -7,6 +7,7 @@ as far as it can be had.  Y_i is k x m; the functions themselves are Phi_i Y_i, 
 
 import logging
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from joblib import Parallel, delayed
@@ -251,8 +252,8 @@ def consistent_zoomout(
     samples: list[np.ndarray] | None = None,
     wide: int = WIDE,
     n_jobs: int | None = 1,
-    progress: Callable | None = None,
-    keep: Callable | None = None,
+    progress: Callable[..., Any] | None = None,
+    keep: Callable[..., Any] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Consistent ZoomOut (4.2): latent basis -> matches -> larger maps, until all are k x k.
 

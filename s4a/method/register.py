@@ -317,7 +317,7 @@ def register_surface(
     placed: tuple[Motion, float] | None = None,
     *,
     elastic: bool = False,
-) -> tuple[np.ndarray, np.ndarray, dict]:
+) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
     """The template registered at full resolution: the best of the finalists of low resolution.
 
     Parameters

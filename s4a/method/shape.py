@@ -107,7 +107,7 @@ class Basis:
         return low if self.U is None or self.lifted else self.U @ low
 
     @cached_property
-    def coefficients(self) -> Callable:
+    def coefficients(self) -> Callable[..., Any]:
         """Coefficients of a field given at the vertices near coarse ones, see :func:`smoother`."""
         area = self.area[self.near_coarse]
         weight = area if self.area_weighted else np.ones_like(area)

@@ -199,7 +199,7 @@ def refine_network(
     norm: str = "h2",
     keep_rounds: bool = False,
     n_jobs: int | None = 1,
-    progress: Callable | None = None,
+    progress: Callable[..., Any] | None = None,
 ) -> xr.DataTree:
     """Consistent ZoomOut of a network and the median shape (4.2; eq. 3 and 5).
 
@@ -298,7 +298,7 @@ def shape_in(study: xr.DataTree, name: str) -> Shape:
     return Shape(study["original"][name].to_dataset(), study["coarse"][name].to_dataset())
 
 
-def latent_bases(study: xr.DataTree, *names: str) -> tuple:
+def latent_bases(study: xr.DataTree, *names: str) -> tuple[Any, ...]:
     """The latent bases Y ``(k, m)`` of some shapes of a study.
 
     Those of the network are in ``/latent``, those of a shape apart in ``/latent/<shape>``.

@@ -38,7 +38,7 @@ FRAME = script("dom", "frame_widget")
 # ---- numbers for the scripts
 
 
-def to_bytes(array: np.ndarray | list, kind: str) -> bytes:
+def to_bytes(array: np.ndarray | list[Any], kind: str) -> bytes:
     """The bytes of an array of numbers, little-endian and contiguous, as the browser reads them.
 
     Examples
@@ -50,7 +50,7 @@ def to_bytes(array: np.ndarray | list, kind: str) -> bytes:
     return np.ascontiguousarray(array, np.dtype(kind).newbyteorder("<")).tobytes()
 
 
-def color_bytes(colors: np.ndarray | list) -> bytes:
+def color_bytes(colors: np.ndarray | list[Any]) -> bytes:
     """Colours ``(n, 3)`` from 0 to 1 as bytes; rows that are not finite become grey."""
     colors = np.asarray(colors, float)
     known = np.where(np.isfinite(colors), np.clip(colors, 0, 1), UNKNOWN)
@@ -62,7 +62,7 @@ def palette(colormap: str | Colormap) -> bytes:
     return color_bytes(colormaps.get_cmap(colormap)(np.linspace(0, 1, 256))[:, :3])
 
 
-def color_scale(colormap: str | Colormap, low: float, high: float, label: str) -> dict:
+def color_scale(colormap: str | Colormap, low: float, high: float, label: str) -> dict[str, Any]:
     """What the browser draws as a colour bar: eleven colours, the numbers of both ends, a label."""
     colors = colormaps.get_cmap(colormap)(np.linspace(0, 1, 11))
     return {
@@ -73,7 +73,7 @@ def color_scale(colormap: str | Colormap, low: float, high: float, label: str) -
     }
 
 
-def mesh_state(mean: np.ndarray, triangles: np.ndarray, deformation: np.ndarray) -> dict:
+def mesh_state(mean: np.ndarray, triangles: np.ndarray, deformation: np.ndarray) -> dict[str, Any]:
     """The bytes of a mean shape ``(n, 3)``, its triangles and deformations ``(c, n, 3)``."""
     return {
         "mean": to_bytes(mean, "float32"),
@@ -82,7 +82,7 @@ def mesh_state(mean: np.ndarray, triangles: np.ndarray, deformation: np.ndarray)
     }
 
 
-def look_state(limits: tuple[float, float], unit: str, view: Viewpoint, up: str) -> dict:
+def look_state(limits: tuple[float, float], unit: str, view: Viewpoint, up: str) -> dict[str, Any]:
     """Colours of the modes, full at the two `limits`, and from where they are seen first."""
     along, distance = limits
     signed = f"compression · normal displacement ({unit}) · expansion"

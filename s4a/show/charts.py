@@ -306,7 +306,7 @@ def stacked(names: list[str], parts: list[str], seconds: np.ndarray) -> Figure:
     return figure
 
 
-def variance(high: np.ndarray | list, low: np.ndarray | list | None = None) -> Figure:
+def variance(high: np.ndarray | list[Any], low: np.ndarray | list[Any] | None = None) -> Figure:
     """Cumulative share of variance over the number of components, at both resolutions (Fig. 5)."""
     figure, ((ax,),) = _figure(5.2, 3.2)
     curves = (  # rings around dots: both are seen where they agree

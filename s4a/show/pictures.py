@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -17,7 +18,7 @@ N_MODES = 3
 PANEL = (320, 270)  # pixels
 
 
-def shared_frames(surfaces: list[np.ndarray], look: dict) -> list[np.ndarray]:
+def shared_frames(surfaces: list[np.ndarray], look: dict[str, Any]) -> list[np.ndarray]:
     """Frames ``(2, 2)`` around each of some surfaces, all as large as the largest needs.
 
     So sizes can be compared.
@@ -27,7 +28,9 @@ def shared_frames(surfaces: list[np.ndarray], look: dict) -> list[np.ndarray]:
     return [box.mean(0) + np.stack([-half, half]) for box in boxes]
 
 
-def mode_drawer(study: xr.DataTree, look: dict) -> tuple[Callable[..., np.ndarray], float]:
+def mode_drawer(
+    study: xr.DataTree, look: dict[str, Any]
+) -> tuple[Callable[..., np.ndarray], float]:
     """What draws the first components, all on one colour scale.
 
     Returns

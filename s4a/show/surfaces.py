@@ -1,5 +1,7 @@
 """The surfaces of a study, and what stands beside them, as pictures, pages and panels show them."""
 
+from typing import Any
+
 import numpy as np
 import xarray as xr
 
@@ -155,7 +157,7 @@ def mode_arrays(
     return mean[vertex], coarse["corner_vertex"].values, deformation[:, vertex]
 
 
-def score_state(study: xr.DataTree, n_modes: int | None = None) -> dict:
+def score_state(study: xr.DataTree, n_modes: int | None = None) -> dict[str, Any]:
     """Shares of variance, scores and names of a study's modes, as the browser shows them."""
     pca = study["pca"].dataset.isel(component=slice(n_modes))
     low = pca.get("explained_variance_ratio_low")

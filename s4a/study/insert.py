@@ -4,7 +4,7 @@ All others stay as they are.
 """
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -47,7 +47,7 @@ class Inserted(NamedTuple):
 
 def insert(
     study: xr.DataTree,
-    shapes: Path | str | list | dict | xr.Dataset,
+    shapes: Path | str | list[Any] | dict[str, Any] | xr.Dataset,
     *,
     compare: bool = True,
     n_jobs: int | None = None,
@@ -147,8 +147,8 @@ def insert(
 
 
 def read_new(
-    shapes: Path | str | list | dict, options: Options
-) -> tuple[dict[str, xr.Dataset], dict[str, dict]]:
+    shapes: Path | str | list[Any] | dict[str, Any], options: Options
+) -> tuple[dict[str, xr.Dataset], dict[str, dict[str, Any]]]:
     """The new meshes that can be used, clean, and the attributes of all for the report."""
     meshes = {}
     if isinstance(shapes, dict):
@@ -249,7 +249,7 @@ def _insert_one(mesh, frozen, options, references):
     return Inserted(coarse, Y, registration, seen)
 
 
-def known_to(study: xr.DataTree) -> dict[str, dict]:
+def known_to(study: xr.DataTree) -> dict[str, dict[Any, Any]]:
     """Attributes of the registered shapes of a study that are in its modes."""
     doubted = left_out(study)
     names = study["registration"].dataset["shape"].values.tolist()
@@ -274,7 +274,7 @@ def portraits_of(study: xr.DataTree) -> dict[str, xr.Dataset]:
 
 def report_beside(
     study: xr.DataTree,
-    attrs: dict,
+    attrs: dict[str, Any],
     looks: dict[str, xr.Dataset],
     references: dict[str, xr.Dataset],
 ) -> xr.Dataset:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import NoneType
-from typing import Self, get_args
+from typing import Any, Self, get_args
 
 import xarray as xr
 
@@ -61,7 +61,7 @@ PAPER = {
     "n_projected": 0,
     "both": False,
 }
-PRESETS: dict[str | None, dict] = {None: DEFAULTS, "paper": PAPER}
+PRESETS: dict[str | None, dict[str, Any]] = {None: DEFAULTS, "paper": PAPER}
 # switches that method="scalable" does not have, and what each would need
 WITHOUT_MESH = {
     "lift": "lifts the eigenfunctions of one",
@@ -101,7 +101,9 @@ PAIR = (
 )
 
 
-def apply_preset(preset: str | None, given: dict, presets: dict[str | None, dict]) -> dict:
+def apply_preset(
+    preset: str | None, given: dict[str, Any], presets: dict[str | None, dict[str, Any]]
+) -> dict[str, Any]:
     """The options that a preset sets, where those that are `given` are None; theirs where not.
 
     Raises
@@ -232,24 +234,24 @@ class Options:
             raise ValueError(f"n_latent must be at most k = {self.k}; found {self.n_latent}")
 
     @property
-    def of_cleaning(self) -> dict:
+    def of_cleaning(self) -> dict[str, Any]:
         """The options of :func:`s4a.input.collection.read_shape`."""
         names = ["components", "strict", "close_holes", *["label"] * (self.label is not None)]
         return {name: getattr(self, name) for name in names}
 
     @property
-    def of_low_resolution(self) -> dict:
+    def of_low_resolution(self) -> dict[str, Any]:
         """The options of :func:`s4a.method.lift.low_resolution`."""
         names = ("method", "n_coarse", "k", "lift", "wrap", "seed")
         return {name: getattr(self, name) for name in names}
 
     @property
-    def of_first_maps(self) -> dict:
+    def of_first_maps(self) -> dict[str, Any]:
         """The options of :func:`s4a.method.first_map.first_map` in a network, but its size."""
         return {"init": self.init, "ahead": self.ahead != "never"}
 
     @property
-    def of_registration(self) -> dict:
+    def of_registration(self) -> dict[str, Any]:
         """The options of :func:`s4a.method.register.register`."""
         names = ("refine", "scale", "parts", "alignment")
         return {name: getattr(self, name) for name in names}
@@ -275,7 +277,7 @@ class Options:
                 f"{n - 1} (a tree) to {n * (n - 1) // 2} (all pairs)"
             )
 
-    def changed(self, given: dict) -> Self:
+    def changed(self, given: dict[str, Any]) -> Self:
         """These options with some given otherwise; a `preset` that is given sets its own anew.
 
         Raises
@@ -333,7 +335,7 @@ def _in_kind(word, kinds):
     return int(word) if int in kinds and word.isdecimal() else word
 
 
-def takes_options(*names: str) -> Callable:
+def takes_options(*names: str) -> Callable[..., Any]:
     """Decorate a function of ``**options`` so that its signature shows those of :class:`Options`.
 
     Those of these names, all by default, and ``rng`` beside ``seed``.  Each option and its default
@@ -353,7 +355,7 @@ def takes_options(*names: str) -> Callable:
     return decorate
 
 
-def pair_options(given: dict, of_study: Options | None = None) -> Options:
+def pair_options(given: dict[str, Any], of_study: Options | None = None) -> Options:
     """The :class:`Options` of a pair, beside those of a study where there is one.
 
     Raises

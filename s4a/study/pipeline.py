@@ -255,7 +255,7 @@ def read_and_clean(run: Run, sources: Sources, options: Options) -> Keys:
 
 def remesh(run: Run, original: Keys, options: Options) -> Keys:
     """Low-resolution meshes and their spectra (4.1, step 1): ``/coarse``."""
-    settings: tuple = (options.n_coarse, options.wrap, options.seed, options.k)
+    settings: tuple[Any, ...] = (options.n_coarse, options.wrap, options.seed, options.k)
     if options.lift:
         settings = (*settings, "lift")
     if options.method != "rematch":
@@ -316,7 +316,7 @@ def first_maps(run: Run, coarse: Keys, aligned: str, options: Options) -> Keys:
     return run.do("first maps", todo, each=False)
 
 
-def in_batches(pairs: Sequence) -> list:
+def in_batches(pairs: Sequence[Any]) -> list[Any]:
     """The pairs in batches for the tasks of the first maps: four in each, or 64 batches.
 
     Examples

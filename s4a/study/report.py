@@ -3,6 +3,8 @@
 What was done to each shape, doubtful registrations, numbers reduced to what there is, costs.
 """
 
+from typing import Any
+
 import numpy as np
 import xarray as xr
 
@@ -70,7 +72,7 @@ def write_report(
     write(report, run.folder / "report.nc", made_from=registered.values())
 
 
-def of_shape(run: Run, name: str, source: str | xr.Dataset, options: Options) -> dict:
+def of_shape(run: Run, name: str, source: str | xr.Dataset, options: Options) -> dict[str, Any]:
     """Attributes of a shape for :func:`s4a.input.collection.shape_report`: what was done to it."""
     path = {"path": source} if isinstance(source, str) else {}  # may have moved since it was read
     if name in run.failures:
@@ -94,7 +96,7 @@ def costs(run: Run) -> xr.Dataset:
     return dataset(seconds=seconds, peak_memory=memory).assign_coords(stage=list(run.costs))
 
 
-def reduced_k(asked: int, k: int, spectra: dict) -> list[str]:
+def reduced_k(asked: int, k: int, spectra: dict[str, Any]) -> list[str]:
     """Whether the maps are smaller than was asked for, in words.
 
     Parameters

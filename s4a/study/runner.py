@@ -12,6 +12,7 @@ import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import psutil
@@ -60,8 +61,8 @@ class Task:
     name: str
     file: str
     function: Callable[..., xr.Dataset]
-    arguments: tuple
-    inputs: tuple
+    arguments: tuple[Any, ...]
+    inputs: tuple[Any, ...]
     made_from: tuple[str, ...] = ()
 
     @property

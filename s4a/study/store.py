@@ -157,7 +157,7 @@ def write(
             temporary.unlink(missing_ok=True)
 
 
-def without_dask() -> AbstractContextManager:
+def without_dask() -> AbstractContextManager[Any]:
     """Keeps xarray from asking a dask scheduler for a lock on a buffer that only we have."""
     dask = sys.modules.get("dask")
     return dask.config.set(scheduler="synchronous") if dask else nullcontext()
@@ -166,7 +166,9 @@ def without_dask() -> AbstractContextManager:
 class Stored(BackendArray):
     """A variable of a file that is read when it is asked for; it holds no file open."""
 
-    def __init__(self, path: Path, name: str, place: Place, stamp: Seal | str, sizes: dict):
+    def __init__(
+        self, path: Path, name: str, place: Place, stamp: Seal | str, sizes: dict[str, Any]
+    ):
         self.path, self.name, self.place = path, name, place
         self.shape, self.dtype = place.shape, place.dtype
         self.stamp, self.sizes = stamp, sizes  # of the file, and of its dims
@@ -206,7 +208,7 @@ class Stacked(BackendArray):
             key, self.shape, indexing.IndexingSupport.OUTER, self.part
         )
 
-    def part(self, key: tuple) -> np.ndarray:
+    def part(self, key: tuple[Any, ...]) -> np.ndarray:
         """The selection: of each axis an integer, a slice or an array of integers."""
         first, *rest = key
         rows = np.arange(len(self.variables))[first]
@@ -224,7 +226,7 @@ class Stacked(BackendArray):
         return found
 
 
-def selected(values: np.ndarray, key: Iterable) -> np.ndarray:
+def selected(values: np.ndarray, key: Iterable[Any]) -> np.ndarray:
     """The entries of an array that are selected along each of its axes by itself."""
     axis = 0
     for one in key:

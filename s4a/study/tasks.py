@@ -4,6 +4,7 @@ A task gets paths and names, reads the files of earlier tasks, and returns the D
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -26,7 +27,7 @@ from s4a.study.sources import content_of_file
 from s4a.study.store import arrays, attributes, open_file, read
 
 
-def clean_shape(source: str | xr.Dataset, content: str, cleaning: dict) -> xr.Dataset:
+def clean_shape(source: str | xr.Dataset, content: str, cleaning: dict[str, Any]) -> xr.Dataset:
     """A file read and cleaned, or a mesh in memory cleaned where it is not yet.
 
     OSError where the file no longer has the content of that key, which the result would bear.
@@ -91,7 +92,7 @@ def motion_to_reference(folder: Path, name: str) -> tuple[np.ndarray, np.ndarray
     return R, t
 
 
-def map_pairs(folder: Path, pairs: list, k_init: int, options: dict) -> xr.Dataset:
+def map_pairs(folder: Path, pairs: list[Any], k_init: int, options: dict[str, Any]) -> xr.Dataset:
     """First maps of some pairs, in both directions (4.1, steps 3 and 4)."""
     names = sorted({name for pair in pairs for name in pair})
     bases = {name: low_basis(folder, name) for name in names}
