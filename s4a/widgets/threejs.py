@@ -478,12 +478,15 @@ def correspondence(
     colors = position_colors(X)
     here = farthest_points(Y, min(n_lines, len(Y)))
     lines = _lines(X[match[here]], Y[here], colors[match[here]])
+    both = np.concatenate([X, Y])
     return three.Group(
+        # around the origin, where pythreejs first looks, whatever the target of its controls
+        position=(-(both.max(0) + both.min(0)) / 2).tolist(),
         children=[
             three.Mesh(_geometry(X, S, color=colors), _material(True)),
             three.Mesh(_geometry(Y, T, color=colors[match]), _material(True)),
             lines,
-        ]
+        ],
     )
 
 

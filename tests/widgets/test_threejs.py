@@ -139,7 +139,9 @@ def test_lines_of_a_correspondence_join_matched_vertices(meshes):
     source, target = (meshes[name] for name in ("brain_01", "brain_02"))
     match = np.random.default_rng(0).integers(1500, size=1500).astype(np.int32)
     pair = xr.Dataset({"match": ("vertex", match)})
-    left, right, lines = threejs.correspondence(pair, source, target, n_lines=20).children
+    group = threejs.correspondence(pair, source, target, n_lines=20)
+    left, right, lines = group.children
+    np.testing.assert_allclose(threejs.renderer(group).controls[0].target, 0, atol=1e-3)
     X, Y = (part.geometry.attributes["position"].array for part in (left, right))
     ends = lines.geometry.positions
     assert ends.shape == (20, 2, 3)
