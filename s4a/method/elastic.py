@@ -16,6 +16,10 @@ bending energy has settled: there the template follows the shape, and what the p
 displacement alone.  Where each step bends it more, it would follow noise.  Lengths are for surfaces
 of unit area.
 
+Nothing above keeps a surface from shifting along itself over its own boundary.  Where both
+boundaries lie on each other already they are taken for one line, and the squared distances from it
+across the boundary and along the surface, times its length, are added from the third step on.
+
 What K functions cannot follow is left to local rounds: a displacement d (n, 3) of the vertices of
 low resolution, beyond the warp, that minimises
 
@@ -29,6 +33,7 @@ smoothing in MeshMonk does (White et al., Scientific Reports 2019).
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
+from scipy.spatial import cKDTree
 
 from s4a.geometry.closest import closest_point_in_star, features, interpolate
 from s4a.method.joint import Warp, move, turn
@@ -44,6 +49,8 @@ SLIDE = (0.01, 0.1)
 N_STEPS = 8
 N_FURTHER = 5  # steps at most, each with as much less stiffness, where the last was nearly in vain
 SETTLED = 1.2  # as long as a step lets the bending energy grow by less than that factor
+RIM_WEIGHT = 0.01  # share of sqrt(area): of distances at the boundary, by its length
+RIM_NEAR = 0.03  # share of sqrt(area): boundaries that are farther apart may be cut anywhere
 N_ROUNDS = 8
 STILL = 1e-3  # share of sqrt(area): a step ends with a round that moves less
 TIME = (2e-2, 2e-4)  # of local rounds: smooth over 0.2, then over 0.02 of sqrt(area)
@@ -91,6 +98,44 @@ def points_ahead(source: Basis, target: Basis, X: np.ndarray) -> tuple[np.ndarra
     normals = target.normals_at(X)
     y, normals_y = nearest_on_surface(source, X, normals)
     return y, unit(normals + normals_y)
+
+
+def rim_ahead(
+    source: Basis, target: Basis, X: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
+    """Where the target's boundary, its vertices at X, is drawn, if both boundaries are one line.
+
+    They are where nine tenths of the vertices of each lie within :data:`RIM_NEAR` of the other.
+    Scans may end anywhere, and holes are of one shape alone: such boundaries are left as they are.
+
+    Returns
+    -------
+    vertex : int ndarray (r,)
+        Boundary vertices near the source's boundary.
+    length : float ndarray (r,)
+        Of the boundary around each: half its two edges.
+    across : float ndarray (r, 3)
+        Unit vectors along the surface and across its boundary.
+    y : float ndarray (r, 3)
+        The nearest vertices of the source's boundary.
+    """
+    if not (len(source.rim) and len(target.rim)):
+        return None
+    start, end = target.rim.T
+    vertex = np.unique(target.rim)
+    gap, nearest = source.rim_tree.query(X[vertex])
+    back = cKDTree(X[vertex]).query(source.rim_tree.data)[0]
+    if max(np.quantile(gap, 0.9), np.quantile(back, 0.9)) > RIM_NEAR:
+        return None
+    step = X[end] - X[start]
+    tangent, length = np.zeros_like(X), np.zeros(len(X))
+    for corner in (start, end):
+        np.add.at(tangent, corner, step)
+        np.add.at(length, corner, np.linalg.norm(step, axis=1) / 2)
+    near = gap < RIM_NEAR
+    vertex, nearest = vertex[near], nearest[near]
+    across = unit(np.cross(unit(tangent[vertex]), target.normals_at(X)[vertex]))
+    return vertex, length[vertex], across, source.rim_tree.data[nearest]
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
@@ -186,6 +231,12 @@ def elastic_rounds(
         for _ in range(rounds):
             y, m = points_ahead(source, target, X)
             matrix, right = normal_equations(E, target.area, m, y, slide[step >= 2])
+            rim = rim_ahead(source, target, X) if step >= 2 else None
+            if rim is not None:
+                vertex, length, across, y = rim
+                more = normal_equations(E[vertex], RIM_WEIGHT * length, across, y, 0.0)
+                matrix += more[0]
+                right += more[1]
             # start and smooth functions nearly depend on each other: a little keeps them apart
             matrix[np.diag_indices_from(matrix)] += np.tile(price, 3) + 1e-12
             w = scipy.linalg.solve(matrix, right, assume_a="pos").reshape(3, -1).T  # (q, 3)

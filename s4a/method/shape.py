@@ -17,10 +17,12 @@ from s4a.geometry.align import Cloud, cloud, farthest_points, rigid_transform
 from s4a.geometry.closest import Stars, feature_tree, stars
 from s4a.geometry.mesh import (
     as_arrays,
+    directed_edges,
     edge_graph,
     edges,
     stiffness,
     turned,
+    unique_edges,
     vertex_areas,
     vertex_normals,
 )
@@ -149,6 +151,17 @@ class Basis:
     def stars(self) -> Stars:
         """The triangles around every vertex."""
         return stars(self.T, len(self.X))
+
+    @cached_property
+    def rim(self) -> np.ndarray:
+        """Boundary edges ``(r, 2)``, in the direction in which their triangles go around."""
+        _, edge_of, count = unique_edges(self.T, len(self.X))
+        return directed_edges(self.T)[count[edge_of] == 1]
+
+    @cached_property
+    def rim_tree(self) -> cKDTree:
+        """KD-tree over the positions of boundary vertices."""
+        return cKDTree(self.X[np.unique(self.rim)])
 
     @cached_property
     def graph(self) -> sp.csr_matrix:

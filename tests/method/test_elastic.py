@@ -7,10 +7,11 @@ import pytest
 
 from s4a import analyse, match_pair, synthetic
 from s4a.geometry.closest import distance_to_surface
-from s4a.geometry.mesh import cotan_weights, stiffness, triangle_normals, vertex_normals
+from s4a.geometry.mesh import as_dataset, cotan_weights, stiffness, triangle_normals, vertex_normals
 from s4a.method import elastic, joint
 from s4a.method.register import elastic_surfaces, register_surface
 from s4a.method.remesh import laplacian
+from s4a.method.shape import Basis
 from s4a.schema import dataset
 from s4a.study.options import pair_options
 from s4a.study.pair import shape_of
@@ -223,3 +224,43 @@ def test_a_study_and_a_pair_take_it_and_say_so(brains):
     with analyse(meshes, n_jobs=1, **small) as study:
         assert study["report"].attrs["refine"] == "elastic"
         assert (study["registration"]["confidence"] > 0).any()
+
+
+def bowl(n_vertices, height=0.0):
+    """An ellipsoid below a height, where it ends in a straight cut."""
+    mesh = synthetic.ellipsoid(n_vertices, (1.0, 0.8, 0.6))
+    X, T = mesh["position"].values, mesh["corner_vertex"].values
+    T = T[(X[:, 2] < height)[T].all(axis=1)]
+    used = np.unique(T)
+    X, T = X[used], np.searchsorted(used, T)
+    rim = Basis(X, T, np.ones(len(X)), X).rim
+    X[np.unique(rim), 2] = height
+    return as_dataset(X, T)
+
+
+def rim_height(template, shape):
+    """Mean height of the boundary of the registered template above that of the shape."""
+    warp = joint.fit_warp(shape.low, template.low, shape.low.tree.query(template.low.tree.data)[1])
+    end = elastic.elastic_rounds(shape.full, template.low_on_surface, warp)
+    top = shape.from_frame(joint.move(template.low, end))[np.unique(template.low.rim), 2]
+    return np.abs(top - shape.from_frame(shape.full.rim_tree.data)[:, 2].mean()).mean()
+
+
+def test_boundaries_that_lie_on_each_other_end_on_each_other(monkeypatch):
+    options = pair_options({"n_coarse": 800, "k": 40})
+    template, shape = (shape_of(bowl(*how), options) for how in ((2000,), (2600, 0.05)))
+    drawn = rim_height(template, shape)
+    monkeypatch.setattr(elastic, "RIM_WEIGHT", 0.0)
+    assert drawn < 0.5 * rim_height(template, shape)
+
+
+def test_a_shape_that_ends_elsewhere_keeps_its_boundary(monkeypatch):
+    options = pair_options({"n_coarse": 800, "k": 40})
+    template, shape = (shape_of(bowl(*how), options) for how in ((2000,), (2600, 0.2)))
+    assert elastic.rim_ahead(shape.full, template.low, template.low.X) is None
+    kept = rim_height(template, shape)
+    monkeypatch.setattr(elastic, "RIM_WEIGHT", 0.0)
+    assert kept == rim_height(template, shape)
+    closed = shape_of(synthetic.ellipsoid(1000), options)
+    assert elastic.rim_ahead(closed.full, template.low, template.low.X) is None
+    assert elastic.rim_ahead(template.full, closed.low, closed.low.X) is None
