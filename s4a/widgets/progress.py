@@ -82,7 +82,8 @@ class Progress(Panel):
         self.folder, self.explored = Path(store), None
         self.opened = []  # the stages that were ready when the panels were filled
         self.arguments = shapes, options | {"store": str(store)}
-        self.n_shapes = len(find_sources(shapes, options.get("pattern")))
+        volumes = options.get("label") is not None
+        self.n_shapes = len(find_sources(shapes, options.get("pattern"), volumes=volumes))
         super().__init__(xr.DataTree())  # there is no study yet
         self.start()
 

@@ -259,3 +259,13 @@ def test_real_hippocampi_keep_their_volume_and_are_one_closed_surface_each():
         image = nibabel.load(file)
         voxels = (np.asarray(image.dataobj) > 0).sum() * abs(np.linalg.det(image.affine))
         assert enclosed(X - X.mean(0), T) == pytest.approx(voxels, rel=0.04)
+
+
+def test_the_panel_of_a_run_counts_volumes(volumes, tmp_path):
+    from s4a.widgets.progress import Progress
+
+    panel = Progress(volumes, tmp_path / "study", label=17, **OPTIONS)
+    panel.process.join(120)
+    panel.close()
+    assert panel.n_shapes == 5
+    assert list(s4a.open_study(tmp_path / "study")["original"]) == [f"scan_{i}" for i in range(5)]
