@@ -4,7 +4,7 @@ The commands are those that the pages name in backticks, such as ``speed.py grow
 scripts of ``tests/benchmarks``. Each writes what it prints into ``docs/_build/paper``, with machine
 and versions at its foot. All of them take hours on two cores; ``make paper ONLY=accuracy`` takes
 those whose command contains the word, ``make paper ONLY=--list`` names all and runs none.
-``tests/house/test_paper.py`` fails where a page quotes a figure without a command.
+``tests/house/test_figures.py`` fails where a page quotes a figure without a command.
 """
 
 import os
