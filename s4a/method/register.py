@@ -330,8 +330,8 @@ def register_surface(
         After which the displacement of the spectral match is smoothed, see
         :func:`s4a.method.joint.warp_after`; by default after the motion that fits it best.
     elastic : bool
-        Whether finalists go through :func:`elastic_surfaces`; those by parts, of far poses, do not,
-        as bodies then ended farther from the truth.
+        Whether finalists go through :func:`elastic_surfaces`; those by parts, of far poses, through
+        local rounds alone, as bodies otherwise ended farther from the truth.
 
     Returns
     -------
@@ -365,6 +365,11 @@ def register_surface(
         else:
             part, warp = joint.dense_rounds(M, N, candidates[name].warp)
         X = joint.move(N, warp)
+        if elastic:  # here what is left of a turn by parts
+            low = target.low_on_surface
+            X = X + target.U @ local_rounds(M, low, target.W, joint.move(low, warp))
+            part = joint.nearest_vertices(M, N, X, N.near_coarse)
+            name = f"{name}+local"
         ends[name] = joint.registration_score(M, N, part, X), X
     method = min(ends, key=lambda name: ends[name][0])
     score, X = ends[method]

@@ -166,7 +166,7 @@ def test_on_the_surface_itself_nothing_is_left_to_do(pair):
     assert np.abs(elastic.local_rounds(low, low, template.W, low.X)).max() < 1e-12
 
 
-def test_where_parts_turned_on_their_own_nothing_changes(pair, monkeypatch):
+def test_where_parts_turned_on_their_own_local_rounds_alone_follow(pair, monkeypatch):
     template, shape, _ = pair
 
     def never(*_args, **_options):
@@ -178,11 +178,13 @@ def test_where_parts_turned_on_their_own_nothing_changes(pair, monkeypatch):
     candidate = joint.Candidate(0.0, np.zeros(n, int), parts)
     monkeypatch.setattr("s4a.method.register.elastic_rounds", never)
     functions = shape.low.Phi, template.low.Phi
-    ends = [
-        register_surface(shape, template, {"icp+parts": candidate}, functions, elastic=asked)[1]
+    found = {
+        asked: register_surface(shape, template, {"icp+parts": candidate}, functions, elastic=asked)
         for asked in (True, False)
-    ]
-    assert (ends[0] == ends[1]).all()
+    }
+    assert {attrs["method"] for _, _, attrs in found.values()} == {"icp+parts", "icp+parts+local"}
+    far = {asked: gap(shape.to_frame(image), shape) for asked, (_, image, _) in found.items()}
+    assert far[True] < 0.8 * far[False]
 
 
 def test_starts_that_meet_go_on_as_one_and_others_are_both_kept(pair):

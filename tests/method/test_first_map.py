@@ -51,7 +51,7 @@ def shapes(bent):
 
 def test_a_far_pose_is_matched_where_nearest_neighbours_begin_wrong(bent, monkeypatch):
     found = match_pair(*bent, n_coarse=1000, k=50)
-    assert found.attrs["method"] == "intrinsic+parts"
+    assert found.attrs["method"] == "intrinsic+parts+local"
     assert found.attrs["first_map"].split(",")[0] in ("hks", "wks", "hks+wks")
     assert error(found, bent[0]) < 0.002
     monkeypatch.setattr(joint, "far_apart", lambda *_: False)
