@@ -17,8 +17,8 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 
 GIB = 2**30
-LEAST_MEMORY = 2.0  # GiB; ten heads of 150,000 vertices take 2.5 on two cores, the demo less
-LEAST_DISK = 1.0  # GiB; a study of 51 shapes of 100,000 vertices takes about half of it
+LEAST_MEMORY = 2.0  # GiB, for ten heads of 150,000 vertices on two cores; the demo takes less
+LEAST_DISK = 1.0  # GiB, for a study
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "firefox", "safari")
 GL = "apt-get install libgl1 libopengl0, or what your system calls libGL.so.1 and libOpenGL.so.0"
 # distributions whose modules have other names

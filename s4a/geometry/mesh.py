@@ -50,11 +50,24 @@ def vertex_areas(X: np.ndarray, T: np.ndarray) -> np.ndarray:
     return np.bincount(T.ravel(), np.repeat(triangle_areas(X, T) / 3, 3), len(X))
 
 
-def vertex_normals(X: np.ndarray, T: np.ndarray) -> np.ndarray:
-    """Unit normals of the vertices ``(n, 3)``, area-weighted; zero where a vertex has no area."""
+def normal_sums(X: np.ndarray, T: np.ndarray) -> np.ndarray:
+    """Sums ``(n, 3)`` of :func:`triangle_normals` around each vertex: quadratic in X.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.geometry.mesh import normal_sums
+    >>> normal_sums(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]]), np.array([[0, 1, 2]]))[0]
+    array([0., 0., 1.])
+    """
     ones, first_corner = np.ones(T.size), np.arange(0, T.size + 1, 3)
     touches = sp.csc_matrix((ones, T.ravel(), first_corner), (len(X), len(T)))
-    N = touches @ triangle_normals(X, T)  # (n, 3)
+    return touches @ triangle_normals(X, T)
+
+
+def vertex_normals(X: np.ndarray, T: np.ndarray) -> np.ndarray:
+    """Unit normals of the vertices ``(n, 3)``, area-weighted; zero where a vertex has no area."""
+    N = normal_sums(X, T)
     length = np.linalg.norm(N, axis=1, keepdims=True)
     return N / np.where(length > 0, length, 1)
 

@@ -364,10 +364,8 @@ def register_surface(
             warp = joint.warp_after(M, N, part, *placed) if placed else joint.fit_warp(M, N, part)
         else:
             part, warp = joint.dense_rounds(M, N, candidates[name].warp)
-        X = joint.move(N, warp)
-        if elastic:  # here what is left of a turn by parts
-            low = target.low_on_surface
-            X = X + target.U @ local_rounds(M, low, target.W, joint.move(low, warp))
+        X = after_local_rounds(source, target, warp) if elastic else joint.move(N, warp)
+        if elastic:  # here by parts
             part = joint.nearest_vertices(M, N, X, N.near_coarse)
             name = f"{name}+local"
         ends[name] = joint.registration_score(M, N, part, X), X
@@ -396,9 +394,15 @@ def elastic_surfaces(
             continue
         met[name] = X
         warp = elastic_rounds(M, N, warp, steps=slice(1, None))
-        local = local_rounds(M, N, target.W, joint.move(N, warp))
-        surfaces[name] = joint.move(target.full, warp) + target.U @ local
+        surfaces[name] = after_local_rounds(source, target, warp)
     return surfaces
+
+
+def after_local_rounds(source: Shape, target: Shape, warp: joint.Warp) -> np.ndarray:
+    """The template ``(n_target, 3)`` after a warp, by parts or not, and local rounds."""
+    low = target.low_on_surface
+    d = local_rounds(source.full, low, target.W, joint.move(low, warp))
+    return joint.move(target.full, warp) + target.U @ d
 
 
 def way_back(source: Shape, target: Shape, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

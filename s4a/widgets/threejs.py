@@ -25,7 +25,7 @@ from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
 from s4a.geometry.align import farthest_points
-from s4a.geometry.mesh import as_arrays, vertex_normals
+from s4a.geometry.mesh import as_arrays, normal_sums, vertex_normals
 from s4a.method.pca import color_limits
 from s4a.schema import require
 from s4a.show.draw import (
@@ -308,7 +308,7 @@ def modes(
 def _mode_table(mean, T, deformation):
     """The texture (rows, 2048, 4) of modes and of how they bend the normals, and of what size.
 
-    The change of a normal is the derivative of the area vectors by the score, as a share of their
+    The change of a normal is the derivative of their sum by the score, as a share of that sum's
     length; 127 steps on each side of nothing, the last of which are `bends`.
     """
     c, n = deformation.shape[:2]
@@ -318,34 +318,18 @@ def _mode_table(mean, T, deformation):
             f"at most {WIDTH * HEIGHT // n} modes of {n} vertices fit into a texture, found {c}; "
             "give n_modes, or resolution='coarse'"
         )
-    area = np.linalg.norm(area_vectors(mean, T), axis=1)[:, None]
+    area = np.linalg.norm(normal_sums(mean, T), axis=1)[:, None]
     area = np.maximum(area, np.finfo(float).tiny)
     table = np.zeros((rows * WIDTH, 4), np.float32)
     bends = np.empty(c)
     for k, step in enumerate(deformation):
-        change = area_vectors(mean + step, T) - area_vectors(mean - step, T)  # exact: quadratic
+        change = normal_sums(mean + step, T) - normal_sums(mean - step, T)  # exact: quadratic
         change /= 2 * area
         bends[k] = np.quantile(np.abs(change).max(1), 0.999) or 1.0
         levels = np.clip(np.round(127 * change / bends[k]), -127, 127) + 127  # 0 .. 254
         table[k : n * c : c, :3] = step
         table[k : n * c : c, 3] = levels @ [1, 256, 65536]
     return table.reshape(rows, WIDTH, 4), bends
-
-
-def area_vectors(X: np.ndarray, T: np.ndarray) -> np.ndarray:
-    """Sums ``(n, 3)`` of the area vectors of the triangles around each vertex.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from s4a.widgets.threejs import area_vectors
-    >>> area_vectors(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]]), np.array([[0, 1, 2]]))[0]
-    array([0. , 0. , 0.5])
-    """
-    a, b, c = X[T[:, 0]], X[T[:, 1]], X[T[:, 2]]
-    vectors = np.cross(b - a, c - a) / 2
-    sums = [np.bincount(T.ravel(), np.repeat(part, 3), len(X)) for part in vectors.T]
-    return np.stack(sums, axis=1)
 
 
 # ---- points, correspondences, networks
