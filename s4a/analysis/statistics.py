@@ -1,7 +1,8 @@
 """Statistics of a finished study (6.1): the model, groups and variables, outliers, classes.
 
 All take a study and give a Dataset.  What works on plain arrays is in
-:mod:`s4a.analysis.permutation` and :mod:`s4a.analysis.model`.
+:mod:`s4a.analysis.permutation` and :mod:`s4a.analysis.model`; groups and variables are in
+:mod:`s4a.analysis.effects`.
 
 To add a statistic:
 
@@ -15,47 +16,31 @@ To add a statistic:
 5. a test plants an effect, which is found, and none, which is not.
 """
 
-import logging
 from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
 from scipy import stats
 
+from s4a.analysis.effects import (
+    check_permutations,
+    group_map,
+    group_test,
+    predict,
+    regression,
+    regression_modes,
+    scores_of,
+)
 from s4a.analysis.generalization import generalization
-from s4a.analysis.inputs import (
-    Values,
-    displacements_of,
-    group_sizes,
-    sample_of,
-    with_doubtful,
-)
+from s4a.analysis.inputs import Values, displacements_of, group_sizes, sample_of, with_doubtful
 from s4a.analysis.model import KEPT, count_components, evaluate, leave_one_out, sample
-from s4a.analysis.permutation import (
-    count_rearrangements,
-    design,
-    indicators,
-    permutation_test,
-    scatter_test,
-    smallest_p,
-    vertex_test,
-)
-from s4a.geometry.mesh import as_arrays, vertex_normals
-from s4a.method.deform import normal_displacement
+from s4a.analysis.permutation import indicators, smallest_p
 from s4a.method.pca import center_gram, gram, principal_components
 from s4a.schema import dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
 
 if TYPE_CHECKING:
     from sklearn.base import ClassifierMixin
-
-log = logging.getLogger(__name__)
-
-# p of the test of equal scatter under which it is told: 2 of 100 times in vain, and 75 to 90 times
-# where groups of 10 and 10, or 15 and 5, have 1 and 2 standard deviations
-UNEQUAL = 0.02
-MOST_PERMUTATIONS = 10_000_000
-VARIANCES = ("equal", "unequal")
 
 __all__ = [
     "classify",
@@ -70,313 +55,6 @@ __all__ = [
     "sample",
     "with_doubtful",
 ]
-
-
-def group_test(
-    study: xr.DataTree,
-    group: Values,
-    *,
-    covariates: Values | None = None,
-    n_components: int | None = None,
-    n_permutations: int = 9999,
-    variances: str = "equal",
-    seed: int = 0,
-    rng: RNG | None = None,
-) -> xr.Dataset:
-    """Do groups of shapes differ?  Permutation Hotelling T^2 on the scores.
-
-    Covariance shrunk after Ledoit and Wolf.
-
-    Parameters
-    ----------
-    study : DataTree
-    group : array_like (shape,), dict of shape to value, or name in /subjects
-    covariates : as `group`, a dict of name to these, or an array_like (shape, covariate)
-        Or a list of names in /subjects.  Accounted for after Freedman and Lane (1983); text as
-        indicators of its values.  A shape without a value is left out, with a warning.
-    n_components : int, optional
-        As many as hold 90 % of the variance by default, at most half of the number of shapes.
-    n_permutations : int
-        Where fewer are different, each of these is taken once, and p is exact.
-    variances : {"equal", "unequal"}
-        Whether shapes are permuted, which is exact where they scatter alike in all groups; or the
-        signs of their residuals are changed, which holds where the groups scatter differently, and
-        takes errors as symmetric.
-    seed, rng : see :mod:`s4a.seeds`
-
-    Returns
-    -------
-    Dataset
-        ``statistic``, ``p_value``; attributes ``groups`` (sizes), ``components``, ``smallest_p``
-        that the permutations can reach, how many these are, ``covariates`` in words, and the shapes
-        ``left_out``.
-
-    Raises
-    ------
-    ValueError
-        When a group has fewer than 3 shapes, or a covariate is of no use: dates, names of shapes,
-        numbers mixed with text.
-
-    Examples
-    --------
-    With the ``study`` of six small brains, split at random:
-
-    >>> import s4a
-    >>> study = s4a.synthetic.example_study()
-    >>> test = s4a.statistics.group_test(study, ["a", "a", "a", "b", "b", "b"], n_permutations=99)
-    >>> test.attrs["groups"], bool(test["p_value"] > 0.05)
-    ('a: 3, b: 3', True)
-    """
-    options = _options(n_permutations, variances, seed_of(seed, rng))
-    sample = sample_of(study, group, "group", covariates)
-    sizes = group_sizes(sample.values)
-    _, x = indicators(sample.values)
-    test = _test_scores(sample, x, n_components, options)
-    return test.assign_attrs(groups=sizes, **_said(sample, x, options))
-
-
-def group_map(
-    study: xr.DataTree,
-    group: Values,
-    *,
-    covariates: Values | None = None,
-    of: str = "vector",
-    n_permutations: int = 999,
-    variances: str = "equal",
-    seed: int = 0,
-    rng: RNG | None = None,
-) -> xr.Dataset:
-    """Where do groups of shapes differ?  A permutation test at every vertex of the template.
-
-    Parameters
-    ----------
-    study, group, covariates, n_permutations, variances, seed, rng : see :func:`group_test`
-    of : {"vector", "normal"}
-        The displacements, or their part along the normals.
-
-    Returns
-    -------
-    Dataset
-        ``explained_share(vertex)``, ``p_vertex``, ``p_family_wise`` (max-T), ``p_false_discovery``
-        (Benjamini and Hochberg), ``effect(vertex, xyz)`` = mean of the second group minus that of
-        the first, in sorted order, and ``effect_size``: Mahalanobis distance of two groups' means,
-        Cohen's f of several.
-
-    Raises
-    ------
-    ValueError
-        When a group has fewer than 3 shapes.
-
-    Examples
-    --------
-    With the ``study`` of six small brains, split at random:
-
-    >>> import s4a
-    >>> study = s4a.synthetic.example_study()
-    >>> where = s4a.statistics.group_map(study, ["a", "a", "a", "b", "b", "b"], n_permutations=99)
-    >>> where["effect"].dims, bool((where["p_family_wise"] > 0.05).all())
-    (('vertex', 'xyz'), True)
-    """
-    options = _options(n_permutations, variances, seed_of(seed, rng))
-    sample = sample_of(study, group, "group", covariates)
-    sizes = group_sizes(sample.values)
-    names, x = indicators(sample.values)
-    effect_map = _test_vertices(sample, x, of, options)
-    squared = _squared_cohen_f(effect_map)
-    if len(names) == 2:  # Mahalanobis distance of the means: T^2 (1 / n_1 + 1 / n_2)
-        dof = len(x) - sum(basis.shape[1] for basis in design(x, sample.Z))
-        squared = squared * dof * (1 / np.unique(sample.values, return_counts=True)[1]).sum()
-    return effect_map.merge(dataset(effect_size=np.sqrt(squared))).assign_attrs(
-        groups=sizes, of=of, **_said(sample, x, options)
-    )
-
-
-def regression(
-    study: xr.DataTree,
-    variable: Values,
-    *,
-    covariates: Values | None = None,
-    of: str = "vector",
-    n_components: int | None = None,
-    n_permutations: int = 999,
-    variances: str = "equal",
-    seed: int = 0,
-    rng: RNG | None = None,
-) -> xr.Dataset:
-    """How does shape change with a continuous variable, such as age?
-
-    Parameters
-    ----------
-    study : DataTree
-    variable : array_like (shape,), dict of shape to value, or name in /subjects
-    covariates, n_components, n_permutations, variances, seed, rng : see :func:`group_test`
-    of : see :func:`group_map`
-
-    Returns
-    -------
-    Dataset
-        The global test, ``statistic`` and ``p_value``, as of :func:`group_test`; the test at every
-        vertex as of :func:`group_map`, ``effect(vertex, xyz)`` per unit of the variable,
-        ``effect_size`` = Cohen's f, and ``intercept(vertex, xyz)``; ``standard_score(shape)`` of
-        the variable.  Attributes ``mean``, ``standard_deviation``, ``lowest`` and ``highest`` of
-        the variable, and those of :func:`group_test`.
-
-    Raises
-    ------
-    ValueError
-        When the variable is text, constant, infinite, or a combination of the covariates.
-
-    Examples
-    --------
-    With the ``study`` of six small brains; the score of the first mode itself is what it follows:
-
-    >>> import s4a
-    >>> study = s4a.synthetic.example_study()
-    >>> score = study["pca"]["score"].values[:, 0]
-    >>> fit = s4a.statistics.regression(study, score, n_permutations=99)
-    >>> predicted = s4a.statistics.predict(study, fit, 2.0)["position"]
-    >>> bool(abs(predicted - s4a.synthesize(study, [2.0])["position"]).max() < 1e-2)
-    True
-    """
-    options = _options(n_permutations, variances, seed_of(seed, rng))
-    sample = sample_of(study, variable, "variable", covariates)
-    x = _numbers(sample.values)
-    test = _test_scores(sample, x, n_components, options)
-    effect_map = _test_vertices(sample, x, of, options)
-    mean = float(x.mean())
-    deviation = float(x.std(ddof=1))
-    sizes = dataset(
-        effect_size=np.sqrt(_squared_cohen_f(effect_map)), standard_score=(x - mean) / deviation
-    ).assign_coords(shape=sample.registration["shape"].values)
-    return (
-        effect_map.merge(test)
-        .merge(sizes)
-        .assign_attrs(
-            mean=mean,
-            lowest=float(x.min()),
-            highest=float(x.max()),
-            of=of,
-            standard_deviation=deviation,
-            components=test.attrs["components"],
-            **_said(sample, x, options),
-        )
-    )
-
-
-def _numbers(values):
-    """The variable of a regression as floats ``(s,)``, or what else to do."""
-    if values.dtype.kind == "U":
-        raise ValueError(
-            f"a regression needs a variable of numbers, found text such as {str(values[0])!r}; a "
-            "group test takes text"
-        )
-    if values.ndim > 1:
-        raise ValueError(f"a regression needs one number for each shape, found {values.shape}")
-    x = values.astype(float)
-    if not 1e-30 < abs(x).max() < 1e30 and x.any():
-        raise ValueError(
-            f"a regression needs a variable of a size between 1e-30 and 1e30, found {x.max():.3g}; "
-            "give it in another unit"
-        )
-    return x
-
-
-def predict(study: xr.DataTree, fit: xr.Dataset, value: float) -> xr.Dataset:
-    """The shape at a value of the variable of a :func:`regression`.
-
-    :func:`regression_modes` animates it.
-
-    Parameters
-    ----------
-    study : DataTree
-        That of the regression.
-    fit : Dataset
-        As :func:`regression` gives it.
-    value : float
-        Of the variable, in its unit.
-
-    Returns
-    -------
-    Dataset
-        ``position(vertex, xyz)`` and ``corner_vertex``.
-
-    Examples
-    --------
-    With the ``study`` of six small brains; from an age of 0 to 5 a shape moves by five times the
-    effect:
-
-    >>> import numpy as np
-    >>> import s4a
-    >>> study = s4a.synthetic.example_study()
-    >>> fit = s4a.statistics.regression(study, range(6), n_permutations=99)
-    >>> young, old = (s4a.statistics.predict(study, fit, age)["position"] for age in (0, 5))
-    >>> bool(np.allclose(old - young, 5 * fit["effect"]))
-    True
-    """
-    template = study["registration"].to_dataset()
-    displacement = fit["intercept"].values + (value - fit.attrs["mean"]) * fit["effect"].values
-    return dataset(
-        position=template["position"].values + displacement,
-        corner_vertex=template["corner_vertex"].values,
-    )
-
-
-def regression_modes(study: xr.DataTree, fit: xr.Dataset, name: str = "variable") -> xr.DataTree:
-    """A :func:`regression` in the form of a study with one mode, for everything that shows modes.
-
-    ``s4a.explore`` and the panel of the modes play it with a slider, :func:`s4a.write_page` and
-    :func:`s4a.show.pictures.write_animation` make it a file; one standard deviation of the mode is
-    one of the variable.
-
-    Parameters
-    ----------
-    study : DataTree
-    fit : Dataset
-        Of :func:`regression`.
-    name : str
-        Of the variable.
-
-    Returns
-    -------
-    DataTree
-        ``/registration`` and ``/coarse`` of the study, and ``/pca`` with one component:
-        ``deformation`` by the effect of one standard deviation, ``score`` the variable of each
-        shape, ``explained_variance_ratio`` the share of the variance of the displacements that it
-        explains.
-
-    Examples
-    --------
-    With the ``study`` of six small brains:
-
-    >>> import s4a
-    >>> study = s4a.synthetic.example_study()
-    >>> fit = s4a.statistics.regression(study, range(6), n_permutations=99)
-    >>> s4a.statistics.regression_modes(study, fit, "age")["pca"].sizes["component"]
-    1
-    """
-    registration, d, area = displacements_of(study)
-    is_fitted = registration["shape"].isin(fit["shape"]).values
-    registration, d = registration.isel(shape=is_fitted), d[is_fitted]
-    step = fit["effect"].values * fit.attrs["standard_deviation"]  # (n, 3)
-    size = np.sqrt(np.einsum("nx,nx,n->", step, step, area))
-    total = gram(d - d.mean(0), area).trace() / (len(d) - 1)
-    modes = dataset(
-        {"variable": name},
-        mean_displacement=fit["intercept"].values.astype(np.float32),
-        deformation=step[None].astype(np.float32),
-        standard_deviation=np.array([size]),
-        score=fit["standard_score"].values[:, None],
-        explained_variance_ratio=np.array([size**2 / total]),
-    )
-    modes = in_unit(modes, unit_of(registration["displacement"]))
-    nodes = {
-        "/registration": registration,
-        "/pca": modes.assign_coords(shape=registration["shape"].values),
-    }
-    for node in study.subtree:
-        if node.path.split("/")[1] in ("coarse", "original"):
-            nodes[node.path] = node.to_dataset(inherit=False)
-    return xr.DataTree.from_dict(nodes, name=study.name)
 
 
 def outliers(
@@ -501,7 +179,7 @@ def classify(
     from sklearn.preprocessing import StandardScaler
 
     seed = seed_of(seed, rng)
-    _check_permutations(n_permutations)
+    check_permutations(n_permutations)
     if n_folds < 2:
         raise ValueError(f"n_folds needs a number from 2, found {n_folds}")
     sample = sample_of(study, group, "group")
@@ -509,7 +187,7 @@ def classify(
     names, count = np.unique(group, return_counts=True)
     n_folds = min(n_folds, int(count.min()))
     folds = StratifiedKFold(n_folds, shuffle=True, random_state=seed)
-    scores, coordinates = _scores_of(sample, n_components)
+    scores, coordinates = scores_of(sample, n_components)
     n_training = len(group) - int(np.ceil(len(group) / n_folds))
     c = min(scores.shape[1], n_training - 2)
     steps = make_pipeline(
@@ -536,113 +214,3 @@ def classify(
     }
     result = dataset(attrs, predicted=predicted, accuracy=np.array(accuracy), p_value=p)
     return result.assign_coords(shape=sample.registration["shape"].values)
-
-
-# what several of them share
-
-
-def _check_permutations(n):
-    if not 1 <= n <= MOST_PERMUTATIONS:
-        raise ValueError(f"n_permutations needs a number from 1 to {MOST_PERMUTATIONS}, found {n}")
-
-
-def _options(n_permutations, variances, seed):
-    """The options of the permutation tests, checked before anything is computed."""
-    _check_permutations(n_permutations)
-    if variances not in VARIANCES:
-        raise ValueError(f"variances must be 'equal' or 'unequal', found {variances!r}")
-    return {"n_permutations": n_permutations, "variances": variances, "seed": seed}
-
-
-def _said(sample, x, options):
-    """Attributes of a result: what it rests on, and the smallest p that it can reach."""
-    least = smallest_p(options["n_permutations"], x, sample.Z, options["variances"])
-    if least > 0.05:
-        log.warning(
-            "%d shapes allow no p value below %.2g, whatever they are like: more are needed, or "
-            "more permutations",
-            len(x),
-            least,
-        )
-    n = count_rearrangements(x, sample.Z, options["variances"]) - 1
-    return sample.said | {
-        "variances": options["variances"],
-        "permutations": min(n, options["n_permutations"]),
-        "smallest_p": least,
-    }
-
-
-def _scores_of(sample, n_components):
-    """Scores on the first components ``(s, c)``, and all coordinates in the unit of the input."""
-    d = sample.d
-    variance, V = principal_components(center_gram(gram(d - d.mean(0), sample.area)))
-    if not len(variance):
-        raise ValueError("a test needs shapes that differ; all displacements are equal")
-    c = count_components(variance, len(d), n_components, most=len(variance))
-    root = np.sqrt(len(d) - 1)
-    return V[:, :c] * root, V * np.sqrt(variance) * root
-
-
-def _test_scores(sample, x, n_components, options):
-    """One test for the whole shape: Hotelling's T^2 of the scores on x, Z accounted for."""
-    scores, coordinates = _scores_of(sample, n_components)
-    statistic, p = permutation_test(scores, x, covariates=sample.Z, **options)
-    if options["variances"] == "equal":
-        _tell_unequal_variances(coordinates, x, sample)
-    return dataset({"components": scores.shape[1]}, statistic=statistic, p_value=p)
-
-
-def _tell_unequal_variances(coordinates, x, sample):
-    """Say where shapes scatter differently between the groups, or with the variable."""
-    distance, p = scatter_test(coordinates, x, covariates=sample.Z)
-    if p >= UNEQUAL:
-        return
-    unit = unit_of(sample.registration["displacement"])
-    where = "with the variable"
-    which = "too small or too large"
-    groups = np.unique(sample.values)
-    if len(groups) == len(np.unique(x, axis=0)) and len(groups) < len(x) / 2:
-        where = ", ".join(
-            f"{group}: {np.sqrt((distance[sample.values == group] ** 2).mean()):.3g} {unit}"
-            for group in groups
-        )
-        which = "too small where a small group scatters more, too large where a large one does"
-    log.warning(
-        "the shapes scatter differently (%s; p = %.2g), but p values take variances as equal and "
-        "are %s: variances='unequal' (--variances unequal) does without that",
-        where,
-        p,
-        which,
-    )
-
-
-def _test_vertices(sample, x, of, options):
-    """A test at every vertex, and the effect of the first column of x on the displacement."""
-    registration, d, Z = sample.registration, sample.d, sample.Z
-    if of not in ("vector", "normal"):
-        raise ValueError(f"of must be 'vector' or 'normal', found {of!r}")
-    fields = d  # (s, n, 3), or (s, n, 1) along the normals
-    if of == "normal":
-        fields = normal_displacement(d, vertex_normals(*as_arrays(registration)))[..., None]
-    share, p, p_max = vertex_test(fields, x, covariates=Z, **options)
-    columns = np.column_stack([np.ones(len(d)), x] if Z is None else [np.ones(len(d)), x, Z])
-    columns[:, 1:] -= columns[:, 1:].mean(0)  # so that the intercept is where x is at its mean
-    size = np.linalg.norm(columns, axis=0)
-    size[size == 0] = 1
-    B = np.linalg.pinv(columns / size, rcond=1e-10) @ d.reshape(len(d), -1).astype(float)
-    B = B / size[:, None]  # (columns, 3 n)
-    effect_map = dataset(
-        explained_share=share,
-        p_vertex=p,
-        p_family_wise=p_max,
-        p_false_discovery=stats.false_discovery_control(p),
-        effect=B[1].reshape(-1, 3),
-        intercept=B[0].reshape(-1, 3),
-    )
-    return in_unit(effect_map, unit_of(registration["displacement"]))
-
-
-def _squared_cohen_f(effect_map):
-    """Cohen's f^2 at every vertex ``(n,)``: what is explained over what is not."""
-    share = effect_map["explained_share"].values
-    return share / np.maximum(1 - share, 1e-12)

@@ -186,7 +186,7 @@ def _view(add):
 
 
 def _statistics(add):
-    from s4a.analysis.statistics import VARIANCES
+    from s4a.analysis.effects import VARIANCES
 
     add("study", metavar="STUDY")
     text = "test and map of the difference between groups; classification"
