@@ -6,6 +6,7 @@ sealed, from what HDF5 says then.  Values are taken from the bytes of the file i
 """
 
 import json
+import math
 from io import BufferedIOBase
 from typing import Any
 
@@ -97,7 +98,7 @@ def _place(name, variable, size):
     if kind == TEXT:
         return Place(begin, end, shape, h5py.string_dtype())
     dtype = np.dtype(kind)
-    n_bytes = dtype.itemsize * int(np.prod(shape, dtype=object))
+    n_bytes = dtype.itemsize * math.prod(shape)
     if dtype.kind not in "iuf" or (filters and filters not in PACKINGS):
         raise OSError(f"{name} needs numbers or text, found {dtype}")
     if n_bytes > 1032 * (end - begin) if filters else n_bytes != end - begin:

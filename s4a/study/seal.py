@@ -15,6 +15,7 @@ larger variable is checked whenever it is read.  The line in braces is the heade
 """
 
 import json
+import math
 import os
 import stat
 import zlib
@@ -80,7 +81,7 @@ def open_regular(path: Path | str) -> BufferedReader:
 
 def is_larger(place: Place) -> bool:
     """Whether a variable is read only when it is used, and has a line of its own in the seal."""
-    return not place.is_text and int(np.prod(place.shape)) > SMALL
+    return not place.is_text and math.prod(place.shape) > SMALL
 
 
 def add_seal(whole: BufferedIOBase) -> None:

@@ -53,6 +53,10 @@ OF_ALL = ("network", "latent", "registration", "pca", "subjects", "report")  # f
 LOGS = ".log"  # folder in that of a study: a file for each task that is at work or failed
 TEMPORARY = re.compile(r"\.[\w-]+\.nc\.\d+\.tmp")  # as `write` names them
 
+# attributes by which the conventions of netCDF say that values are not what they stand for
+CODES = {"_FillValue", "missing_value", "scale_factor", "add_offset", "_Unsigned", "dtype"}
+CODES |= {"coordinates", "_Encoding"}
+
 ENGINE: Final = "h5netcdf"
 VERSION = version("s4a")
 
@@ -311,12 +315,29 @@ def open_file(path: Path | str, others: Mapping[str, int] | None = None) -> xr.D
             if not is_larger(file.places[name]):
                 check_indices(name, variable.values, sizes)
         # as xarray.decode_cf, which makes three Datasets of it
-        decoded, rest, coordinates = decode_cf_variables(variables, attrs, decode_times=False)
-        data = xr.Dataset(decoded, attrs=rest)
+        coded = {name: one for name, one in variables.items() if not decode_plain(one)}
+        decoded, rest, coordinates = decode_cf_variables(coded, attrs, decode_times=False)
+        data = xr.Dataset({**variables, **decoded}, attrs=rest)
         if not coordinates <= set(data.coords):
             data = data.set_coords(coordinates & set(decoded))
     data.encoding["source"] = str(path)
     return data
+
+
+def decode_plain(variable: xr.Variable) -> bool:
+    """Whether a variable holds its values as they are: numbers, NaN where there is none.
+
+    It is then as xarray decodes it, but for the search for NaN, to put NaN there.
+    """
+    attrs, kind = variable.attrs, variable.dtype.kind
+    fill = attrs.get("_FillValue")
+    missing = kind == "f" and isinstance(fill, np.floating) and bool(np.isnan(fill))
+    if kind not in "iuf" or len(CODES & attrs.keys()) > missing:
+        return False
+    variable.encoding["dtype"] = variable.dtype
+    if missing:
+        variable.encoding["_FillValue"] = attrs.pop("_FillValue")
+    return True
 
 
 def read(path: Path | str, others: Mapping[str, int] | None = None) -> xr.Dataset:

@@ -126,7 +126,7 @@ def run_until(command, study, watch, after):
             child.send_signal(signal.SIGKILL)
             child.wait()
             return stage, None
-        time.sleep(0.02)
+        time.sleep(0.1)
     return "", child.returncode
 
 
