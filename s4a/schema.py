@@ -268,6 +268,10 @@ ROWS = {
     "fit_mirrored": ("reference", ONE, "the same of the shape's mirror image"),
     "hand": ("reference", ONE,
         "positive where the shape is of the reference's hand, negative where its mirror image is"),
+    "handedness": ("shape", ONE,
+        "mean of hand beside the references: positive as most shapes, negative as their mirror "
+        "images"),
+    "reflected": ("shape", ONE, "whether the mirror image of the shape was taken (reflect=)"),
     # the report
     "status": ("shape", ONE, "ok, repaired, doubtful or excluded"),
     "reason": ("shape", ONE, "what was found and done"),

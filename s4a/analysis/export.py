@@ -14,6 +14,7 @@ from s4a.analysis.link import image_in_shape
 from s4a.analysis.transfer import transfer_labels, transfer_landmarks
 from s4a.geometry.mesh import as_arrays
 from s4a.input.annotations import write_landmarks
+from s4a.input.evidence import MIRROR
 from s4a.input.files import write_mesh
 from s4a.seeds import RNG, seed_of
 from s4a.study import store
@@ -49,8 +50,8 @@ def write_registered(
     format : {"ply", "vtk", "obj", "npz", "gifti"}
         All but OBJ hold the ``confidence`` of every vertex too.
     frame : {"template", "shape"}
-        Aligned to the template, or where each shape lies in its file; the unit is that of the
-        input.
+        Aligned to the template, or where each shape lies in its file, mirrored back where the run
+        mirrored it; the unit is that of the input.
     n_modes : int
         Modes written as CSV; the netCDF file has all.
 
@@ -98,15 +99,25 @@ def write_registered(
     for name in names:
         own = registration.sel(shape=name)
         in_template = X + own["displacement"].values
-        points = in_template if frame == "template" else image_in_shape(X, own)
+        points, triangles = in_template, T
+        if frame == "shape":
+            points = image_in_shape(X, own)
+            if is_reflected(study, name):
+                points, triangles = points * MIRROR, T[:, ::-1]
         scalars = {} if format == "obj" else {"confidence": own["confidence"].values}
         paths.append(folder / f"{name}{suffix}")
-        write_mesh(paths[-1], points, T, **scalars)
+        write_mesh(paths[-1], points, triangles, **scalars)
     paths.append(folder / f"template{suffix}")
     write_mesh(paths[-1], X, T)
     return paths + (
         _write_modes(study["pca"].to_dataset(), folder, n_modes) if "pca" in study else []
     )
+
+
+def is_reflected(study: xr.DataTree, name: str) -> bool:
+    """Whether the run took the mirror image of a shape."""
+    meshes = study["original"].children if "original" in study.children else {}
+    return name in meshes and bool(meshes[name].attrs.get("reflected"))
 
 
 def _write_modes(pca, folder, n_modes):
@@ -154,9 +165,10 @@ def write_training_set(
         With ``/original`` and ``/registration``.
     folder : path
         Gets ``meshes/<shape>.ply`` (the cleaned mesh, with all its vertices, in the coordinates of
-        its file), ``labels/<shape>.npy`` (one per vertex) and ``labels/<shape>.confidence.npy``
-        (share of the votes times confidence of the match), ``landmarks/<shape>.csv`` (name,x,y,z),
-        and ``split.json`` with the lists ``train`` and ``test``.
+        its file, or their mirror image where the run took that), ``labels/<shape>.npy`` (one per
+        vertex) and ``labels/<shape>.confidence.npy`` (share of the votes times confidence of the
+        match), ``landmarks/<shape>.csv`` (name,x,y,z), and ``split.json`` with the lists ``train``
+        and ``test``.
     label, landmarks, source : see :func:`s4a.transfer_labels` and :func:`s4a.transfer_landmarks`
     test_share : float
         Of the shapes, rounded up.

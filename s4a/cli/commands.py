@@ -356,6 +356,7 @@ def transferred_rows(
     from s4a.cli import tables
     from s4a.input.annotations import write_landmarks
     from s4a.input.files import stem_of
+    from s4a.input.hands import in_file
 
     meshes = {name: study["original"][name].to_dataset() for name in labels or points}
     stems = {name: stem_of(mesh.attrs.get("path") or name) for name, mesh in meshes.items()}
@@ -368,6 +369,8 @@ def transferred_rows(
             of_labels = write_labels(labels[name].to_dataset(), mesh, out, stem)
         if points:
             landmarks = points[name].to_dataset()
+            place = landmarks["landmark_position"]
+            landmarks["landmark_position"] = place.copy(data=in_file(mesh, place.values))
             write_landmarks(out / f"{stem}.landmarks.csv", landmarks)
             of_points = tables.landmark_cells(landmarks)
         rows.append([stem, *cells, *of_labels, *of_points])
@@ -390,13 +393,14 @@ def write_labels(labels: "xr.Dataset", mesh: "xr.Dataset", out: Path, stem: str)
 
 
 def file_points(mesh: "xr.Dataset") -> "np.ndarray":
-    """The vertices of a mesh's file (n, 3); those that were kept, where the file is gone."""
+    """The vertices of a mesh's file (n, 3), mirrored as it; those kept, where the file is gone."""
     import numpy as np
 
     from s4a.input.files import read_mesh
+    from s4a.input.hands import in_file
 
     if Path(mesh.attrs.get("path") or "").is_file():
-        return read_mesh(mesh.attrs["path"])[0]
+        return in_file(mesh, read_mesh(mesh.attrs["path"])[0])
     points = np.full((mesh.sizes["file_vertex_index"], 3), np.nan)
     points[mesh["file_vertex"].values] = mesh["position"].values
     return points

@@ -51,6 +51,7 @@ HELP = {
     "pattern": "only files whose name fits, for example '*brain*'",
     "preset": "'paper' leaves out all that is added to the paper",
     "template": "name of the shape to register to (default: the median shape)",
+    "reflect": "shapes to mirror: their names, with commas; COLUMN=VALUE of the table; or auto",
     "table": "CSV with a column 'shape', covariates and groups, for the statistics",
     "doubtful": "what becomes of doubtful shapes: they stay apart, or the run stops",
     "keep_doubtful": "take doubtful shapes into modes and statistics",

@@ -11,7 +11,7 @@ import xarray as xr
 
 # kind of a doubt: what to do about it, with the flags of `s4a run`
 REMEDIES = {
-    "mirrored": "mirror the files, if left and right are exchanged",
+    "mirrored": "--reflect mirrors them, if left and right are exchanged",
     "unit": "scale the files to the unit of the others",
     "size": "scale the files, if their size is wrong",
     "kind": "take the files away, if of another kind",

@@ -12,6 +12,7 @@ import xarray as xr
 from scipy.spatial import cKDTree
 
 from s4a.input.evidence import COMPACTNESS, ENOUGH, MOMENT, SIZE, excess, in_numbers
+from s4a.input.hands import COMMON_HAND, OTHER_HAND, hands
 
 AREA_DROPPED = 0.1
 UNITS = {10.0**e: f"10^{e}" for e in (-9, -6, -4, -3, -2, -1, 1, 2, 3, 4, 6, 9)}
@@ -32,7 +33,6 @@ CROSSING = 0.01  # share of the triangles that pass through others
 LATTICE = 0.2  # step of rounded coordinates, of the median edge
 MUCH_MORE = 10.0  # times the others' share of crossing triangles, or step
 CLOSE = 2.0  # times the usual residual; a part is no mirror image
-COMMON_HAND, OTHER_HAND = 0.8, 0.5  # of the mean of `hand` over the references
 
 
 class Doubt(NamedTuple):
@@ -247,7 +247,7 @@ def _compare_duplicates(evidence, told):
 def _compare_hands(evidence, told, of_all):
     """Those of the rarer hand, where the collection has a hand."""
     names = list(evidence)
-    mean = _hands(evidence)
+    mean = hands(evidence)
     fit, fit_mirrored = (
         np.array([np.nanmedian(seen[which]) for seen in evidence.values()])
         for which in ("fit", "fit_mirrored")
@@ -271,30 +271,9 @@ def _compare_hands(evidence, told, of_all):
         words = (
             "fits as a mirror image (ICP residual beside most others "
             f"{np.nanmedian(seen['fit']):.3f} as it is, {np.nanmedian(seen['fit_mirrored']):.3f} "
-            "reflected): left for right? It was kept; mirror the file if that is wrong"
+            "reflected): left for right? It was kept; reflect= mirrors it"
         )
         told[name].append(doubt("mirrored", words))
-
-
-def _hands(evidence):
-    """Mean over the references of the hand of each shape, positive for the commoner one (n,)."""
-    names = list(evidence)
-    references = next(iter(evidence.values()))["reference"].values.tolist()
-    hand = np.array([seen["hand"].values for seen in evidence.values()])  # (n, references)
-    known = np.nan_to_num(hand)
-    beside = np.array([known[names.index(r)] if r in names else 0 * known[0] for r in references])
-    # two references are alike where each sees the other so, and where all shapes see them alike
-    alike = [beside + beside.T, known.T @ known]  # (references, references) each
-    alike = sum(one / max(np.linalg.norm(one), 1e-9) for one in alike)
-    sign = np.where(np.linalg.eigh(alike)[1][:, -1] < 0, -1, 1)
-    mean = _mean(hand * sign)
-    other, this = (mean < 0).sum(), (mean > 0).sum()
-    return -mean if (other, mean[0] < 0) > (this, mean[0] > 0) else mean
-
-
-def _mean(hand):
-    known = np.isfinite(hand)
-    return np.where(known, hand, 0).sum(1) / np.maximum(known.sum(1), 1)
 
 
 def _compare_boundaries(evidence, told):

@@ -32,6 +32,7 @@ REQUIRED: dict[str, tuple[str, dict[str, type]]] = {
         dict.fromkeys(SEEN, int),
     ),
     "network/look": ("moment fit fit_mirrored hand", dict.fromkeys(SEEN, int)),
+    "network/hands": ("shape handedness reflected", {"told": str}),
     "network/motion": ("rotation translation", {"reference": str}),
     "network/first": ("source target fmap_initial", {}),
     "network": ("source target fmap_initial fmap weight cycle_error", {}),

@@ -41,6 +41,12 @@ def check_plausibility(
     if len(original) < 2:
         return original, {}, []
     attrs = {n: attributes(run.folder / f"original/{n}.nc") for n in original}
+    looks = looks_of(run, original, options)
+    return {n: original[n] for n in looks}, *find_warnings({n: attrs[n] for n in looks}, looks)
+
+
+def looks_of(run: Run, original: Keys, options: Options) -> dict[str, xr.Dataset]:
+    """What :func:`s4a.input.evidence.compare` sees in each shape that could be compared."""
     settings = (options.intersections,)
     todo = [
         Task(
@@ -62,8 +68,7 @@ def check_plausibility(
         for n, key in sketches.items()
     ]
     compared = run.do("compare", todo)
-    looks = {name: of_look(run, name) for name in compared}
-    return {n: original[n] for n in compared}, *find_warnings({n: attrs[n] for n in looks}, looks)
+    return {name: of_look(run, name) for name in compared}
 
 
 def references_of(run: Run, sketches: Keys, k: int) -> list[str]:

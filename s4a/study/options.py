@@ -185,6 +185,7 @@ class Options:
     label: int | str | None = None
     preset: str | None = None
     template: str | None = None
+    reflect: str | list[str] | None = None
     table: Path | str | None = None
     doubtful: str = "apart"
     keep_doubtful: bool = False
@@ -202,6 +203,9 @@ class Options:
         object.__setattr__(self, "label", check_label(self.label))
         check_text("pattern", self.pattern)
         check_text("template", self.template)
+        if isinstance(self.reflect, list):
+            object.__setattr__(self, "reflect", ",".join(map(str, self.reflect)))
+        check_text("reflect", self.reflect)
         if self.method == "scalable":
             for name, why in WITHOUT_MESH.items():
                 if getattr(self, name):

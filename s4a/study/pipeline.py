@@ -16,15 +16,18 @@ from joblib import effective_n_jobs, parallel_config
 
 from s4a.input.collection import remarks_on_files
 from s4a.input.evidence import check_meshlab
+from s4a.input.hands import AUTO, hands, of_other_hand, to_reflect
 from s4a.input.plausibility import Doubts
 from s4a.input.subjects import read_table
 from s4a.method.network import choose_pairs, spectral_distance
 from s4a.method.pca import pca_without
+from s4a.schema import dataset
 from s4a.seeds import seeded
 from s4a.study.doubts import (
     check_plausibility,
     check_usable,
     doubt_registrations,
+    looks_of,
     set_apart,
     stop_at_doubts,
 )
@@ -144,6 +147,12 @@ def analyse(
         refused; to add them one at a time, give ``s4a.study.options.PAPER`` with one changed.
     template : str, optional
         Name of the shape to register to; the median shape by default.
+    reflect : str or list of str, optional
+        The shapes that are mirrored (x becomes -x in the coordinates of their files, triangles are
+        turned over), so that left and right ones are of one hand: their names; ``"side=left"``, all
+        with this value in the column ``side`` of the table, or a column of 1 and 0; or ``"auto"``,
+        those of the rarer hand by ICP of pairs, as they are and mirrored
+        (:func:`s4a.input.hands.of_other_hand`).  ``/report`` says of each whether it was.
     table : path, optional
         CSV with a column ``shape`` and covariates or groups, see
         :func:`s4a.input.subjects.read_table`; they become ``/subjects``, so that
@@ -226,7 +235,8 @@ def run_steps(run: Run, sources: Sources, options: Options, remarks: list[str]) 
     #   network/sketch_*, look_*  latent/* of those apart -> registration/* <- registration
     #                                                     |
     #                                                pca, report
-    original = read_and_clean(run, sources, options)
+    reflected, of_hands = choose_reflected(run, sources, options)
+    original = read_and_clean(run, sources, options, reflected)
     original, doubts, told = check_plausibility(run, original, options)
     stop_at_doubts(doubts, options)
     coarse = remesh(run, original, options)
@@ -239,17 +249,51 @@ def run_steps(run: Run, sources: Sources, options: Options, remarks: list[str]) 
     failed, of_all = doubt_registrations(run, registered, placed)
     doubts = {name: [*doubts.get(name, []), *failed.get(name, [])] for name in registered}
     why_no_modes = modes(run, registered, doubts, options)
-    remarks = [*alone, *told, *of_all, *remarks]
+    remarks = [*of_hands, *alone, *told, *of_all, *remarks]
     write_report(run, sources, options, remarks, why_no_modes, registered, doubts)
 
 
-def read_and_clean(run: Run, sources: Sources, options: Options) -> Keys:
-    """The shapes, cleaned (5.1): ``/original``."""
+def choose_reflected(run: Run, sources: Sources, options: Options) -> tuple[list[str], list[str]]:
+    """The shapes whose mirror images are taken, and what is told of the choice.
+
+    Where the shapes themselves shall say (``reflect="auto"``), they are looked at as they are
+    first; ``network/hands`` keeps the choice.
+    """
+    if options.reflect is None:
+        return [], []
+    if options.reflect != AUTO:
+        table = run.folder / "subjects.nc"
+        subjects = read(table) if table.is_file() else None
+        return to_reflect(str(options.reflect), list(sources), subjects), []
+    file = run.folder / "network/hands.nc"
+    contents = [content for _, content in sources.values()]
+    key = task_key(list(sources), contents, options.of_cleaning, options.k, AUTO)
+    if not is_done(file, key):
+        original = read_and_clean(run, sources, options, [])
+        looks = looks_of(run, original, options) if len(original) > 1 else {}
+        reflected, told = of_other_hand(looks)
+        choice = dataset(
+            {"told": "\n".join(told)},
+            handedness=hands(looks) if looks else np.zeros(0),
+            reflected=np.array([name in reflected for name in looks], int),
+        )
+        write(choice.assign_coords(shape=list(looks)), file, key)
+    choice = read(file)
+    reflected = choice["shape"].values[choice["reflected"].values.astype(bool)].tolist()
+    told = choice.attrs["told"].splitlines()
+    for line in told:
+        log.warning("%s", line)
+    return reflected, told
+
+
+def read_and_clean(run: Run, sources: Sources, options: Options, reflected: list[str]) -> Keys:
+    """The shapes, cleaned, some of them mirrored (5.1): ``/original``."""
     cleaning = options.of_cleaning
-    todo = [
-        Task(n, f"original/{n}.nc", clean_shape, (source, content, cleaning), (content, cleaning))
-        for n, (source, content) in sources.items()
-    ]
+    todo = []
+    for n, (source, content) in sources.items():
+        also = [True] if n in reflected else []
+        given = (source, content, cleaning, *also)
+        todo.append(Task(n, f"original/{n}.nc", clean_shape, given, (content, cleaning, *also)))
     return run.do("read and clean", todo)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from s4a.input.collection import shape_report
+from s4a.input.hands import AUTO
 from s4a.input.plausibility import Doubts
 from s4a.schema import dataset
 from s4a.study.doubts import of_look
@@ -60,6 +61,8 @@ def write_report(
         ],
         {name: of_look(run, name) for name in names},
     )
+    if options.reflect is not None:
+        report = report.assign(of_hands(run, list(sources), options).variables)
     report = report.assign(costs(run).variables)
     report = report.assign_attrs(options.to_report() | {"template": template, "no_modes": no_modes})
     report.attrs["unforeseen"] = " ".join(run.unforeseen)  # names of shapes, which have no blanks
@@ -88,6 +91,19 @@ def of_shape(run: Run, name: str, source: str | xr.Dataset, options: Options) ->
     if coarse["laplacian"] == "robust":
         done.append("not manifold at low resolution: robust Laplacian")
     return mesh | {"reason": "; ".join(done)} | path
+
+
+def of_hands(run: Run, names: list[str], options: Options) -> xr.Dataset:
+    """Which shapes were mirrored, and with ``reflect="auto"`` by how clear a hand."""
+    files = {name: run.folder / f"original/{name}.nc" for name in names}
+    reflected = [
+        n not in run.failures and bool(attributes(files[n]).get("reflected")) for n in names
+    ]
+    found = dataset(reflected=np.array(reflected))
+    if options.reflect == AUTO:
+        choice = read(run.folder / "network/hands.nc")
+        found = found.merge(dataset(handedness=choice["handedness"].reindex(shape=names).values))
+    return found
 
 
 def costs(run: Run) -> xr.Dataset:

@@ -15,6 +15,7 @@ from s4a.geometry.mesh import as_arrays, triangle_areas
 from s4a.input import evidence
 from s4a.input.clean import check_range, clean
 from s4a.input.collection import read_shape
+from s4a.input.hands import mirror_image
 from s4a.method import steps
 from s4a.method.lift import low_resolution
 from s4a.method.place import latent_of_new, nearest_spectra, place
@@ -27,11 +28,19 @@ from s4a.study.sources import content_of_file
 from s4a.study.store import arrays, attributes, open_file, read
 
 
-def clean_shape(source: str | xr.Dataset, content: str, cleaning: dict[str, Any]) -> xr.Dataset:
-    """A file read and cleaned, or a mesh in memory cleaned where it is not yet.
+def clean_shape(
+    source: str | xr.Dataset, content: str, cleaning: dict[str, Any], reflected: bool = False
+) -> xr.Dataset:
+    """A file read and cleaned, or a mesh in memory cleaned where it is not yet; its mirror image.
 
     OSError where the file no longer has the content of that key, which the result would bear.
     """
+    mesh = cleaned(source, content, cleaning)
+    return mirror_image(mesh) if reflected else mesh
+
+
+def cleaned(source: str | xr.Dataset, content: str, cleaning: dict[str, Any]) -> xr.Dataset:
+    """:func:`clean_shape` without its mirror."""
     if isinstance(source, str):
         try:
             return read_shape(source, **cleaning)

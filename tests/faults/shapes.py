@@ -435,7 +435,7 @@ def metres(path):
     "fits as a mirror image",
     "warned with both ICP residuals; kept as it is; "
     "one of a nearly symmetric kind cannot be told from the others",
-    "mirror the file, or leave it out",
+    "reflect= mirrors it; or leave it out",
     where="warning",
 )
 def mirrored(path):

@@ -1,0 +1,98 @@
+"""A run takes the mirror images of the shapes that are named, or that it finds itself."""
+
+import numpy as np
+import pytest
+from faults import shapes as faulty
+
+import s4a
+from s4a import analyse, cli, open_study, verify
+from s4a.analysis.export import write_registered
+from s4a.show.page import study_html
+
+OPTIONS = {"n_coarse": 150, "k_init": 8, "k": 15, "n_jobs": 1, "intersections": False}
+LEFT = ["s1", "s3"]
+
+
+@pytest.fixture(scope="module")
+def right():
+    """Five shapes that clearly have a hand."""
+    return {f"s{i}": faulty.shape(300 + i) for i in range(5)}
+
+
+@pytest.fixture(scope="module")
+def mixed(right):
+    """The same, two of them mirrored."""
+    return right | {name: (right[name][0] * [-1, 1, 1], right[name][1][:, ::-1]) for name in LEFT}
+
+
+@pytest.fixture(scope="module")
+def folder(mixed, tmp_path_factory):
+    """The folder of a study that found the left ones itself."""
+    folder = tmp_path_factory.mktemp("reflect") / "study"
+    analyse(mixed, store=folder, reflect="auto", **OPTIONS).close()
+    return folder
+
+
+def test_the_study_of_left_and_right_shapes_is_that_of_right_ones(right, mixed, folder):
+    alone = analyse(right, **OPTIONS)
+    named = analyse(mixed, reflect=LEFT, **OPTIONS)
+    with open_study(folder) as found:
+        for study in (named, found):
+            assert study["pca"].to_dataset().drop_attrs().equals(alone["pca"].to_dataset())
+            report = study["report"].to_dataset()
+            assert report["shape"].values[report["reflected"].values].tolist() == LEFT
+            assert set(report["status"].values) == {"ok"}
+            for name in LEFT:
+                assert study["original"][name].attrs["reflected"] == 1
+                assert "mirrored" in report["reason"].sel(shape=name).item()
+        hand = found["report"]["handedness"]
+        assert (hand.sel(shape=LEFT) < -0.5).all()
+        assert (hand.drop_sel(shape=LEFT) > 0.5).all()
+        assert "mirrored, as reflect= says" in study_html(found)
+    assert "handedness" not in named["report"]
+    assert named["report"].attrs["reflect"] == "s1,s3"
+
+
+def test_a_registered_mirror_image_is_written_where_its_file_has_the_shape(mixed, folder, tmp_path):
+    with open_study(folder) as study:
+        write_registered(study, tmp_path, frame="shape")
+        X = study["registration"]["position"].values
+        for name in ("s0", "s1"):
+            points, triangles, _ = s4a.input.files.read_mesh(tmp_path / f"{name}.ply")
+            assert s4a.geometry.mesh.volume(points, triangles) > 0
+            gap = np.linalg.norm(points.mean(0) - mixed[name][0].mean(0))
+            assert gap < 0.05 * np.ptp(X, axis=0).max()
+
+
+def test_a_finished_study_is_not_computed_again_and_holds(mixed, folder):
+    kept = sorted(folder.glob("*/*.nc"))
+    before = {path: path.stat().st_mtime_ns for path in kept}
+    analyse(mixed, store=folder, reflect="auto", **OPTIONS).close()
+    assert {path: path.stat().st_mtime_ns for path in kept} == before
+    assert set(verify(folder)["state"].values.tolist()) == {"whole"}
+
+
+def test_without_mirroring_the_left_ones_are_told_and_the_report_has_no_column(mixed, folder):
+    study = analyse(mixed, **OPTIONS)
+    report = study["report"].to_dataset()
+    assert report["shape"].values[report["status"].values == "doubtful"].tolist() == LEFT
+    assert "reflect= mirrors it" in report["warning"].sel(shape="s1").item()
+    assert "reflected" not in report
+
+
+def test_the_command_takes_a_column_of_the_table(mixed, tmp_path, capsys):
+    files = tmp_path / "meshes"
+    files.mkdir()
+    for name, (X, T) in mixed.items():
+        s4a.write_mesh(files / f"{name}.ply", X, T)
+    table = tmp_path / "sides.csv"
+    rows = [f"{name},{'left' if name in LEFT else 'right'}" for name in mixed]
+    table.write_text("\n".join(["shape,side", *rows]))
+    flags = [f"--{k.replace('_', '-')}={v}" for k, v in OPTIONS.items() if k != "intersections"]
+    command = ["run", str(files), "--out", str(tmp_path / "study"), *flags, "--no-intersections"]
+    assert cli.main([*command, "--table", str(table), "--reflect", "side=left"]) == 0
+    with open_study(tmp_path / "study") as study:
+        assert study["report"]["reflected"].sel(shape=LEFT).all()
+    capsys.readouterr()
+    assert cli.main([*command, "--reflect", "s9"]) == 2
+    assert "reflect names 's9', none of the shapes" in capsys.readouterr().err
