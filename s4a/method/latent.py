@@ -6,8 +6,8 @@ as far as it can be had.  Y_i is k x m; the functions themselves are Phi_i Y_i, 
 """
 
 import logging
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from joblib import Parallel, delayed
@@ -27,6 +27,7 @@ from s4a.method.shape import N_SPREAD, Basis
 log = logging.getLogger(__name__)
 
 FINAL = 3  # shapes of a study in the last rounds of a new one, on all vertices
+TARGETS = 256  # shapes whose least squares are held at once, 0.3 GB of them
 WIDE = 4  # last rounds of Consistent ZoomOut, which look among all vertices
 ROUGH, FINE = 1e-4, 1e-6  # tolerances of the latent basis: on the way, and at the end
 
@@ -71,17 +72,24 @@ def consistency_form(
         From vectors ``(n k, q)`` to vectors of the same shape.
     """
     k = C.shape[1]
-    blocks = [{i: np.zeros((k, k))} for i in range(n)]
-    for c, i, j, w in zip(C, source.tolist(), target.tolist(), weight, strict=True):
-        blocks[i][i] += w * (c.T @ c)
-        blocks[j][j] += w * np.eye(k)
-        blocks[i][j] = blocks[i].get(j, 0) - w * c.T
-        blocks[j][i] = blocks[j].get(i, 0) - w * c
-    joined = [sorted(row) for row in blocks]
-    rows = [
-        np.concatenate([row[j] for j in near], axis=1, dtype=dtype)  # (k, k len(near))
-        for row, near in zip(blocks, joined, strict=True)
-    ]
+    maps_with: list[list[int]] = [[] for _ in range(n)]
+    for r, (i, j) in enumerate(zip(source.tolist(), target.tolist(), strict=True)):
+        maps_with[i].append(r)
+        maps_with[j].append(r)
+    joined, rows = [], []
+    for shape, own in enumerate(maps_with):  # one after the other: each row once in memory
+        blocks = {shape: np.zeros((k, k))}
+        for r in own:
+            c, i, j, w = C[r], int(source[r]), int(target[r]), weight[r]
+            if shape == i:
+                blocks[i] += w * (c.T @ c)
+                blocks[j] = blocks.get(j, 0) - w * c.T
+            else:
+                blocks[j] += w * np.eye(k)
+                blocks[i] = blocks.get(i, 0) - w * c
+        near = sorted(blocks)
+        joined.append(near)
+        rows.append(np.concatenate([blocks[j] for j in near], axis=1, dtype=dtype))
 
     def product(shapes, V):
         return [rows[i] @ V[joined[i]].reshape(-1, V.shape[2]) for i in shapes]
@@ -240,7 +248,7 @@ def latent_size(n_latent: int | None, k: int, k_final: int) -> int:
 
 
 def consistent_zoomout(
-    bases: list[Basis],
+    bases: Sequence[Basis],
     C: np.ndarray,
     source: np.ndarray,
     target: np.ndarray,
@@ -267,8 +275,9 @@ def consistent_zoomout(
 
     Parameters
     ----------
-    bases : list of Basis
-        The shapes of the network at low resolution, with k functions or more.
+    bases : sequence of Basis
+        The shapes of the network at low resolution, with k functions or more.  Each is asked for
+        once, and in the `wide` last rounds again: it may be read from its file then.
     C : float ndarray (p, k_init, k_init)
     source, target : int ndarray (p,)
         Which shape's functions each map takes, and on which it gives functions.
@@ -299,11 +308,17 @@ def consistent_zoomout(
     Y, latent_eigenvalue : as of :func:`latent_basis`
     """
     cycles = three_cycles(source.tolist(), target.tolist())
-    eigenvalues = np.stack([basis.eigenvalue[:k] for basis in bases])
+    sampled = [
+        Sampled(
+            basis.eigenvalue[:k],
+            basis.Phi if samples is None else basis.Phi[samples[i]],
+            basis.area if samples is None else basis.area[samples[i]],
+        )
+        for i, basis in enumerate(bases)
+    ]
+    eigenvalues = np.stack([one.eigenvalue for one in sampled])
     sizes = [*range(C.shape[1], k, step), k]
-    all_vertices = [np.arange(len(basis.area)) for basis in bases]
-    samples = all_vertices if samples is None else samples
-    wide_sizes = sizes[:-1][max(len(sizes) - 1 - wide, 0) :]
+    wide_sizes = sizes[:-1][max(len(sizes) - 1 - wide, 0) :] if samples is not None else []
     for size, next_size in zip(
         sizes, [*sizes[1:], None], strict=True
     ):  # the last only solves for Y
@@ -319,52 +334,69 @@ def consistent_zoomout(
         if keep:
             keep(C, Y, latent_eigenvalue)
         if next_size:
-            among = all_vertices if size in wide_sizes else samples
-            C = larger_maps(bases, Y, source, target, next_size, samples, among, n_jobs)
+            del C  # those of two sizes need not be in memory
+            of_all = bases if size in wide_sizes else None
+            C = larger_maps(sampled, Y, source, target, next_size, of_all, n_jobs)
     return C, weight, error, Y, latent_eigenvalue
 
 
+class Sampled(NamedTuple):
+    """What Consistent ZoomOut holds of a shape in memory: its functions at its samples.
+
+    ``eigenvalue (k,)``, ``Phi (s, >= k)`` and ``area (s,)``.
+    """
+
+    eigenvalue: np.ndarray
+    Phi: np.ndarray
+    area: np.ndarray
+
+
 def larger_maps(
-    bases: list[Basis],
+    sampled: list[Sampled],
     Y: np.ndarray,
     source: np.ndarray,
     target: np.ndarray,
     k: int,
-    samples: list[np.ndarray],
-    among: list[np.ndarray],
+    bases: Sequence[Basis] | None,
     n_jobs: int | None = 1,
 ) -> np.ndarray:
     """Maps ``(p, k, k)`` from the matches of latent functions (eq. 3), one step of ZoomOut each.
 
     Parameters
     ----------
+    sampled : list of Sampled
+        Vertices of every shape for which matches are looked for.
     Y : float ndarray (n, size, m)
         Latent bases, of a smaller size.
-    samples, among : list of int ndarray
-        Vertices of every shape for which matches are looked for, and among which.
+    bases : sequence of Basis, optional
+        All vertices of every shape, among which matches are looked for, one or a few shapes at a
+        time; among the samples by default.
     """
     size = Y.shape[1]
+    C = np.empty((len(target), k, k))
 
-    def latent_rows(basis, vertices, y):
-        return as_candidates(basis.Phi[vertices, :size] @ y)
-
-    def maps_into(j):
-        """The maps into shape j: its least squares are factored once."""
-        F = bases[j].Phi[samples[j], :k]
-        root = np.sqrt(bases[j].area[samples[j]])
+    def solver_and_query(j):
+        """The least squares of shape j, factored, and what is looked for."""
+        F = np.ascontiguousarray(sampled[j].Phi[:, :k])
+        root = np.sqrt(sampled[j].area)
         solve = np.linalg.pinv(F * root[:, None]) * root  # (k, s)
-        query = as_queries(F[:, :size] @ Y[j])
-        maps = []
-        for i in source[target == j]:
-            match = among[i][nearest_float32(query, rows[i])]
-            maps.append(solve @ bases[i].Phi.take(match, axis=0)[:, :k])
-        return maps
+        return solve, as_queries(F[:, :size] @ Y[j])
+
+    def maps_from(i, rows, of_target):
+        """The maps from shape i into those of some."""
+        Phi = sampled[i].Phi if bases is None else bases[i].Phi
+        candidates = as_candidates(np.ascontiguousarray(Phi[:, :size]) @ Y[i])
+        for r in rows:
+            solve, query = of_target[target[r]]
+            C[r] = solve @ Phi.take(nearest_float32(query, candidates), axis=0)[:, :k]
 
     threads = Parallel(n_jobs=n_jobs, backend="threading")
-    rows = threads(map(delayed(latent_rows), bases, among, Y))
-    by_target = threads(delayed(maps_into)(j) for j in range(len(bases)))
-    C = np.empty((len(target), k, k))
-    C[np.argsort(target, kind="stable")] = [map_ for maps in by_target for map_ in maps]
+    for begin in range(0, len(sampled), TARGETS):
+        some = range(begin, min(begin + TARGETS, len(sampled)))
+        of_target = dict(zip(some, threads(map(delayed(solver_and_query), some)), strict=True))
+        rows = np.flatnonzero((target >= begin) & (target < begin + TARGETS))
+        sources = np.unique(source[rows])
+        threads(delayed(maps_from)(i, rows[source[rows] == i], of_target) for i in sources)
     return C
 
 

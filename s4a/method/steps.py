@@ -30,6 +30,22 @@ def bases_of(coarse: dict[str, xr.Dataset]) -> dict[str, Basis]:
     return {name: Shape(None, mesh).low for name, mesh in coarse.items()}
 
 
+class LowBases(Sequence[Basis]):
+    """The low-resolution meshes of a collection in their frames, each made when it is asked for.
+
+    Of meshes in files no more are in memory than are used at a time.
+    """
+
+    def __init__(self, coarse: dict[str, xr.Dataset]):
+        self.meshes = list(coarse.values())
+
+    def __len__(self) -> int:
+        return len(self.meshes)
+
+    def __getitem__(self, i: Any) -> Any:
+        return Shape(None, self.meshes[i]).low
+
+
 def align_pair(source: xr.Dataset, target: xr.Dataset) -> xr.Dataset:
     """Rigid motion of a shape onto another by iterative closest points (4.1, step 2).
 
@@ -240,9 +256,10 @@ def refine_network(
     ((3, 10, 10), True)
     """
     require(first, "source", "target", "fmap_initial", what="network")
-    bases = bases_of(coarse)
-    names = list(bases)
-    k = min([k, *(basis.k for basis in bases.values())])
+    for name, mesh in coarse.items():
+        require(mesh, *LOW, what=f"coarse mesh {name}")
+    bases, names = LowBases(coarse), list(coarse)
+    k = min([k, *(mesh.sizes["mode"] for mesh in coarse.values())])
     source = np.array([names.index(name) for name in first["source"].values])
     target = np.array([names.index(name) for name in first["target"].values])
     C_initial = first["fmap_initial"].values  # (p, k_init, k_init)
@@ -256,7 +273,7 @@ def refine_network(
 
     with threadpool_limits(1):
         C, weight, _, Y, latent_eigenvalue = consistent_zoomout(
-            list(bases.values()),
+            bases,
             C_initial,
             source,
             target,
@@ -264,7 +281,7 @@ def refine_network(
             step=step,
             n_latent=n_latent,
             weights=weights,
-            samples=[basis.spread_vertices(n_spread) for basis in bases.values()],
+            samples=[basis.spread_vertices(n_spread) for basis in bases],
             wide=wide,
             n_jobs=n_jobs,
             progress=progress,
@@ -279,7 +296,7 @@ def refine_network(
     )
     latent = dataset(latent_basis=Y, latent_eigenvalue=latent_eigenvalue)
     latent = latent.assign_coords(shape=names)
-    eigenvalues = np.stack([basis.eigenvalue[:k] for basis in bases.values()])  # (n, k)
+    eigenvalues = np.stack([mesh["eigenvalue"].values[:k] for mesh in coarse.values()])  # (n, k)
     return xr.DataTree.from_dict(
         {
             "network": first.merge(refined),

@@ -162,12 +162,14 @@ def place_shape(folder: Path, name: str, options: Options) -> xr.Dataset:
     return found.drop_vars("latent_eigenvalue").isel(shape=0)
 
 
-def latent_basis_of(folder: Path, name: str) -> np.ndarray:
-    """The latent basis Y ``(k, m)`` of a shape of the network, or of one that stands apart."""
-    Y = read(folder / "latent.nc")["latent_basis"]
-    if name in Y["shape"]:
-        return Y.sel(shape=name).values
-    return arrays(folder / "latent" / f"{name}.nc", "latent_basis")[0]
+def latent_bases_of(folder: Path, *names: str) -> list[np.ndarray]:
+    """The latent bases Y ``(k, m)`` of shapes of the network, or that stand apart from it."""
+    Y, shapes = arrays(folder / "latent.nc", "latent_basis", "shape")
+    row = {name: i for i, name in enumerate(shapes.tolist())}
+    return [
+        Y[row[name]] if name in row else arrays(folder / "latent" / f"{name}.nc", "latent_basis")[0]
+        for name in names
+    ]
 
 
 def register_shape(folder: Path, name: str, template: str, options: Options) -> xr.Dataset:
@@ -176,9 +178,11 @@ def register_shape(folder: Path, name: str, template: str, options: Options) -> 
     if name == template:
         return identity(target)
     source = shape_of(folder, name, options)
-    bases = latent_basis_of(folder, name), latent_basis_of(folder, template)
+    own, of_template = latent_bases_of(folder, name, template)
     M, N = source.low, target.low
     start = motion_between(*(motion_to_reference(folder, n) for n in (name, template)))
     motion = realign(M.cloud, N.cloud, start)
     how = options.how
-    return from_latent(source, target, bases, motion, how=how, **options.of_registration)
+    return from_latent(
+        source, target, (own, of_template), motion, how=how, **options.of_registration
+    )

@@ -153,11 +153,16 @@ def test_consistent_zoomout_of_identical_shapes_is_the_identity(shapes):
     assert latent_eigenvalue == pytest.approx(shapes[0]["eigenvalue"].values, abs=1e-6)
 
 
-def test_consistent_zoomout_does_not_depend_on_the_workers(shapes, first):
+def test_consistent_zoomout_does_not_depend_on_the_workers_or_on_what_is_held(
+    shapes, first, monkeypatch
+):
     samples = [np.arange(0, s.sizes["vertex"], 2) for s in shapes]
     one, two = (zoomed(shapes, first, n_jobs=n, samples=samples) for n in (1, 3))
-    for a, b in zip(one, two, strict=True):
+    monkeypatch.setattr(latent, "TARGETS", 2)  # of three shapes
+    three = zoomed(shapes, first, samples=samples)
+    for a, b, c in zip(one, two, three, strict=True):
         assert np.array_equal(a, b)
+        assert np.array_equal(a, c)
 
 
 def test_consistent_zoomout_closes_cycles_better_than_the_first_maps(shapes, first):
