@@ -4,6 +4,8 @@
 the value of ``[tool.s4a]`` in ``pyproject.toml``.
 ``release.py check VERSION``: what stands against releasing this version, line by line; ends with 1
 where anything does. It uploads nothing.
+``release.py paper``: what the two papers lack before they are submitted; only their authors can
+say some of it, so that no release waits for it.
 """
 
 import argparse
@@ -24,6 +26,22 @@ PLACES = {
     "paper/paper.md": r"(https://github\.com/)[\w.-]+/s4a(?=\))",
     "paper/jose.md": r"(https://github\.com/)[\w.-]+/s4a(?=\))",
 }
+# the sections that each journal asks for, in its order, and how many words it takes
+PAPERS = {
+    "paper/paper.md": (
+        "Summary",
+        "Statement of need",
+        "State of the field",
+        "Software design",
+        "Research impact statement",
+        "AI usage disclosure",
+        "Acknowledgements",
+        "References",
+    ),
+    "paper/jose.md": ("Summary", "Statement of need", "Acknowledgements", "References"),
+}
+WORDS = {"paper/paper.md": (750, 1750)}
+TO_STATE = "To be stated by the authors"
 UNTIL = re.compile(r"<!-- unpublished -->.*?<!-- /unpublished -->", re.DOTALL)
 
 
@@ -86,6 +104,28 @@ def faults(version, root=ROOT, files=None):
     return found
 
 
+def lacking(paper, root=ROOT):
+    """What a paper lacks before it is submitted, line by line."""
+    text = (root / paper).read_text(encoding="utf-8")
+    _, head, body = text.split("---\n", 2)
+    sections = re.findall(r"^# (.+)$", body, re.MULTILINE)
+    wanted = PAPERS[paper]
+    if [name for name in sections if name in wanted] != list(wanted):
+        yield f"sections {', '.join(wanted)} in this order, found {', '.join(sections)}"
+    if not re.search(r"^date: \d{1,2} [A-Z][a-z]+ \d{4}$", head, re.MULTILINE):
+        yield "date: DAY MONTH YEAR in its head"
+    for words in ("S4A developers", "see CITATION.cff"):
+        if words in head:
+            yield f"names of people and institutions instead of {words!r}"
+    for part in re.split(r"^# ", body, flags=re.MULTILINE):
+        if TO_STATE in part:
+            yield f"{part.splitlines()[0]}: the authors' own statement"
+    few, many = WORDS.get(paper, (0, 10**6))
+    count = len(re.sub(r"<!--.*?-->", "", body, flags=re.DOTALL).split())
+    if not few <= count <= many:
+        yield f"{few} to {many} words, found {count}"
+
+
 def _first(pattern, path):
     found = re.search(pattern, path.read_text(encoding="utf-8"), re.MULTILINE)
     return found[1] if found else None
@@ -96,12 +136,17 @@ def main(arguments=None):
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("address").add_argument("name", nargs="?", default=repository())
     commands.add_parser("check").add_argument("version")
+    commands.add_parser("paper")
     args = parser.parse_args(arguments)
     if args.command == "address":
         if not re.fullmatch(r"[\w.-]+/[\w.-]+", args.name):
             parser.error(f"an address as NAME/s4a needed, found {args.name!r}")
         write_address(args.name)
         return 0
+    if args.command == "paper":
+        found = [f"{paper}: {what}" for paper in PAPERS for what in lacking(paper)]
+        sys.stdout.write("".join(f"{line}\n" for line in found))
+        return 1 if found else 0
     found = faults(args.version)
     sys.stdout.write("".join(f"{line}\n" for line in found))
     sys.stdout.write(f"{len(found)} things stand against releasing {args.version}\n")

@@ -86,3 +86,24 @@ def test_the_citation_is_of_this_version_and_licence():
     text = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
     assert f"\nversion: {project['version']}\n" in text
     assert f"\nlicense: {project['license']}\n" in text
+
+
+@pytest.mark.parametrize("paper", release.PAPERS)
+def test_a_paper_lacks_only_what_its_authors_have_to_say(paper):
+    found = list(release.lacking(paper))
+    assert all(re.match("names of people|date|AI usage", line) for line in found), found
+
+
+def test_a_paper_without_a_section_or_with_too_many_words_is_not_ready(tmp_path):
+    text = (ROOT / "paper" / "paper.md").read_text(encoding="utf-8")
+    (tmp_path / "paper").mkdir()
+    place = tmp_path / "paper" / "paper.md"
+    done = re.sub(r"To be stated by the authors.*", "None.", text)
+    done = done.replace("S4A developers", "A Name").replace("see CITATION.cff", "A Place")
+    place.write_text(done.replace("bibliography:", "date: 1 May 2027\nbibliography:"), "utf-8")
+    assert list(release.lacking("paper/paper.md", tmp_path)) == []
+    place.write_text(done.replace("# Software design", "# Design") + "word " * 2000, "utf-8")
+    found = " ".join(release.lacking("paper/paper.md", tmp_path))
+    assert "sections Summary" in found
+    assert "date" in found
+    assert "750 to 1750 words" in found
