@@ -42,15 +42,37 @@ def say(text):
     sys.stdout.flush()
 
 
+# Runs what follows as -c or -m, and says its own peak at last: ru_maxrss begins with the parent's.
+WITH_PEAK = """
+import atexit, sys
+def say():
+    with open("/proc/self/status") as status:
+        sys.stderr.write(next(line for line in status if line.startswith("VmHWM")))
+atexit.register(say)
+kind, what, *sys.argv[1:] = sys.argv[1:]
+if kind == "-c":
+    exec(what)
+else:
+    import runpy
+    runpy.run_module(what, run_name="__main__", alter_sys=True)
+"""
+
+
 def cost(arguments):
     """CPU seconds of a Python with these arguments, seconds of the clock, its peak in MiB."""
     begin = time.perf_counter()
-    process = subprocess.Popen([sys.executable, *arguments], stdout=subprocess.DEVNULL)
+    process = subprocess.Popen(
+        [sys.executable, "-c", WITH_PEAK, *arguments],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    said = process.stderr.read()
     _, status, used = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
     assert process.returncode == 0, arguments
     wall = time.perf_counter() - begin
-    return used.ru_utime + used.ru_stime, wall, used.ru_maxrss / 1024
+    return used.ru_utime + used.ru_stime, wall, int(said.split("VmHWM:")[1].split()[0]) / 1024
 
 
 def start():
