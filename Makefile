@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-lowest test-newest check fuzz format bench paper hangs structure lab docs slides address release clean
+.PHONY: demo test test-lowest test-newest check fuzz format bench paper figures hangs structure lab docs slides address release submission clean
 
 demo: $(VENV)/.core
 	$(BIN)/s4a demo
@@ -35,18 +35,24 @@ format: $(VENV)/.test
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+# seconds, memory and bytes, into docs/performance, with machine and versions; ONLY=start takes the commands with that word
 bench: $(VENV)/.bench
-	@set -e; for script in $(wildcard tests/benchmarks/*.py); do echo "$$script"; $(BIN)/python "$$script"; done
+	$(BIN)/python tools/paper.py --speed $(ONLY)
 
 # lesson 04 twenty times, and every other one three times, on a busy machine: does one hang?
 hangs: $(VENV)/.test
 	$(BIN)/python tests/benchmarks/hangs.py 04 --runs 20
 	$(BIN)/python tests/benchmarks/hangs.py --runs 3
 
-# every table that README, documentation and papers quote, into docs/_build/paper, with machine and versions: hours.
-# ONLY=accuracy takes the commands with that word, ONLY=--list names all
+# every table that README, documentation and papers quote, into docs/_build/paper, with machine and versions, and every
+# picture: hours. # ONLY=accuracy takes the commands with that word, ONLY=--list names all
 paper: $(VENV)/.bench
 	$(BIN)/python tools/paper.py $(ONLY)
+	@test -n "$(ONLY)" || $(BIN)/python docs/figures.py
+
+# the pictures of README and pages; NAME=figure_3 draws one
+figures: $(VENV)/.bench
+	$(BIN)/python docs/figures.py $(NAME)
 
 # the picture, the measures and the map of the rooms, made from the code
 structure: $(VENV)/.core
@@ -71,6 +77,10 @@ release: $(VENV)/.test
 	rm -rf dist && $(BIN)/python -m pip install --quiet build twine && $(BIN)/python -m build --outdir dist .
 	$(BIN)/python -m twine check --strict dist/*
 	tools/try.sh dist/s4a-$(VERSION)-py3-none-any.whl
+
+# what the papers lack before they are submitted, such as what only their authors can state
+submission:
+	$(PYTHON) tools/release.py paper
 
 # the lecture of 45 minutes, from the notebooks, in docs/_build/slides
 slides: $(VENV)/.docs

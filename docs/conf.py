@@ -5,6 +5,7 @@ No network is needed, to build it or to read it.
 
 import os
 import re
+import sys
 from importlib.metadata import version as version_of
 from pathlib import Path
 
@@ -12,6 +13,8 @@ import nbformat
 from docutils import nodes
 from latex2mathml.converter import convert
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
+import paper
 import s4a
 from s4a import cli
 from s4a.schema import TABLE
@@ -23,7 +26,7 @@ project, author = "S4A", "S4A developers"
 copyright = author
 release = version_of("s4a")
 extensions = ["sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode", "myst_nb"]
-exclude_patterns = ["_build", "_variables.md", "_commands.md"]
+exclude_patterns = ["_build", "_variables.md", "_commands.md", "_performance.md", "performance"]
 root_doc = "index"
 
 autodoc_member_order = "bysource"
@@ -55,6 +58,7 @@ html_theme = "furo"
 html_title = "S4A"
 html_static_path = ["_static"]
 html_css_files = ["s4a.css"]
+html_js_files = ["s4a.js"]
 html_show_sphinx = False
 html_copy_source = False
 
@@ -108,6 +112,13 @@ def list_commands():
         for name, sub in commands.choices.items()
     ]
     write(HERE / "_commands.md", "\n".join(parts))
+
+
+def list_performance():
+    """What the commands of speed printed when each was run last."""
+    files = [paper.kept(command, paper.PERFORMANCE) for command in paper.SPEED]
+    texts = [path.read_text(encoding="utf-8") for path in files if path.exists()]
+    write(HERE / "_performance.md", "\n".join(text.replace("# `", "### `", 1) for text in texts))
 
 
 def write(path, text):
@@ -164,6 +175,7 @@ def setup(app):
     take_course()
     list_variables()
     list_commands()
+    list_performance()
     app.add_html_math_renderer("mathml", (formula, None), (formula, None))
     app.connect("autodoc-process-docstring", bars)
     app.connect("missing-reference", front_door)

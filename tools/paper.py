@@ -4,6 +4,7 @@ The commands are those that the pages name in backticks, such as ``speed.py grow
 scripts of ``tests/benchmarks``. Each writes what it prints into ``docs/_build/paper``, with machine
 and versions at its foot. All of them take hours on two cores; ``make paper ONLY=accuracy`` takes
 those whose command contains the word, ``make paper ONLY=--list`` names all and runs none.
+``make bench`` runs those of speed into ``docs/performance``, which the page on it shows.
 ``tests/house/test_figures.py`` fails where a page quotes a figure without a command.
 """
 
@@ -33,6 +34,18 @@ PAGES = (
     "paper/paper.md",
     "paper/jose.md",
 )
+SPEED = (
+    ("scale.py", "start"),
+    ("scale.py", "open", "400"),
+    ("scale.py", "left_out", "200"),
+    ("speed.py", "nearest"),
+    ("speed.py", "stages"),
+    ("speed.py", "growth"),
+    ("speed.py", "pipelines", "10", "100000"),
+    ("speed.py", "whole", "51", "100000"),
+    ("widgets.py",),
+)
+PERFORMANCE = ROOT / "docs" / "performance"
 PACKAGES = ("numpy", "scipy", "xarray", "libigl", "robust_laplacian", "scikit-learn", "pymeshlab")
 CODE = re.compile(r"`([^`]+)`")
 FENCE = re.compile(r"```.*?```", re.DOTALL)
@@ -83,6 +96,18 @@ def versions():
     return f"S4A {version('s4a')}{at}, Python {platform.python_version()}, {named}"
 
 
+def kept(command, out=OUT):
+    """The file with what a command printed."""
+    slug = re.sub(r"\W+", "-", " ".join(command).replace(".py", "")).strip("-")
+    return out / f"{slug}.md"
+
+
+def as_markdown(text):
+    """What a command printed: tables of Markdown as they are, other lines as they stood."""
+    text = text.strip("\n")
+    return text if re.search(r"^\|", text, re.MULTILINE) else f"```text\n{text}\n```"
+
+
 def run(command, out=OUT):
     """Run a command; its output and foot as a file. Gives its path and the exit code."""
     out.mkdir(parents=True, exist_ok=True)
@@ -97,21 +122,22 @@ def run(command, out=OUT):
     day = time.strftime("%Y-%m-%d")
     foot = f"{day}, {time.time() - begin:.0f} s. {machine()}. {versions()}."
     failed = f"\n\nIt ended with {result.returncode}." if result.returncode else ""
-    slug = re.sub(r"\W+", "-", " ".join(command).replace(".py", "")).strip("-")
-    path = out / f"{slug}.md"
+    path = kept(command, out)
     head = f"# `{shlex.join(command)}`"
-    path.write_text(f"{head}\n\n{result.stdout}\n---\n\n{foot}{failed}\n", encoding="utf-8")
+    said = as_markdown(result.stdout)
+    path.write_text(f"{head}\n\n{said}\n\n---\n\n{foot}{failed}\n", encoding="utf-8")
     return path, result.returncode
 
 
 def main(words):
-    chosen = [c for c in commands() if all(word in " ".join(c) for word in words if word[0] != "-")]
+    known, out = (SPEED, PERFORMANCE) if "--speed" in words else (commands(), OUT)
+    chosen = [c for c in known if all(word in " ".join(c) for word in words if word[0] != "-")]
     codes = []
     for command in chosen:
         sys.stdout.write(f"{shlex.join(command)}\n")
         sys.stdout.flush()
         if "--list" not in words:
-            path, code = run(command)
+            path, code = run(command, out)
             codes.append(code)
             sys.stdout.write(
                 f"  -> {path.relative_to(ROOT)}{f', failed: {code}' if code else ''}\n"

@@ -2,11 +2,18 @@
 
 import re
 import sys
+from pathlib import Path
 
 import pytest
 from paths import DOCS, ROOT, benchmark
+from PIL import Image
+
+import s4a
 
 sys.path.insert(0, str(ROOT / "tools"))
+sys.path.insert(0, str(DOCS))
+import figures
+
 import paper
 
 # what looks measured: a number with a unit, or a cell of a table with two digits after the point
@@ -51,7 +58,7 @@ def test_a_figure_without_a_command_is_seen():
     assert paper.commands_in("no command, but `s4a demo`") == []
 
 
-@pytest.mark.parametrize("command", paper.commands(), ids=" ".join)
+@pytest.mark.parametrize("command", dict.fromkeys((*paper.commands(), *paper.SPEED)), ids=" ".join)
 def test_every_command_is_a_script_that_takes_these_words(command):
     name, *words = command
     text = (paper.BENCHMARKS / name).read_text(encoding="utf-8")
@@ -91,3 +98,59 @@ def test_what_a_command_prints_is_kept_with_machine_and_versions_at_its_foot(tmp
     path, code = paper.run(("bad.py",), tmp_path / "out")
     assert code == 3
     assert "It ended with 3." in path.read_text(encoding="utf-8")
+
+
+def test_every_picture_of_the_pages_is_drawn_by_a_command():
+    pages = [ROOT / "README.md", *DOCS.glob("*.md")]
+    shown = {
+        Path(link).name
+        for page in pages
+        for link in re.findall(r"!\[[^\]]*\]\((?!http)([^)]+)\)", page.read_text(encoding="utf-8"))
+    }
+    drawn = {f"{name}.png" for name in figures.PICTURES}
+    assert drawn <= shown
+    others = {"heads.png": "compare.py", "structure.svg": "structure.py"}
+    assert shown - drawn == set(others)
+    for name, script in others.items():
+        assert f'"{name}"' in (paper.BENCHMARKS / script).read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """The study of a few small brains, and a template that is none of them."""
+    brains = s4a.synthetic.brains(5, 1500, seed=0)
+    meshes = {name: node.to_dataset() for name, node in brains["original"].children.items()}
+    template = meshes.pop("brain_05")
+    store = tmp_path_factory.mktemp("figures")
+    options = {"n_coarse": 400, "k": 20, "k_init": 10, "n_jobs": 1}
+    return s4a.analyse(meshes, store=store, **options), template
+
+
+@pytest.mark.parametrize("name", ["pipeline", "components", "variance", "labels", "landmarks"])
+def test_a_figure_of_the_paper_is_drawn_from_a_study(name, small, tmp_path, monkeypatch):
+    monkeypatch.setattr(figures, "HERE", tmp_path)
+    draw = getattr(figures, name)
+    path = draw(small if name in ("labels", "landmarks") else small[0])
+    with Image.open(path) as picture:
+        assert picture.width > 400
+        assert len(picture.convert("RGB").getcolors(256)) > 20
+
+
+def test_the_brain_that_is_made_higher_has_eigenfunctions_in_another_order(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(figures, "HERE", tmp_path)
+    assert figures.swapped(vertices=3000, n_coarse=800).exists()
+    assert "exchanged: [(2, 3)" in capsys.readouterr().out
+
+
+def test_the_page_on_performance_shows_what_commands_printed_with_machine_and_versions():
+    files = {paper.kept(command, paper.PERFORMANCE): command for command in paper.SPEED}
+    there = sorted(paper.PERFORMANCE.glob("*.md"))
+    assert there
+    for path in there:
+        assert path in files, path.name  # another file would be shown nowhere
+        text = path.read_text(encoding="utf-8")
+        assert text.startswith(f"# `{' '.join(files[path])}`")
+        assert re.search(r"\d{4}-\d\d-\d\d, \d+ s\. .* cores.* S4A [\d.]+", text)
+        assert "It ended with" not in text

@@ -1,0 +1,348 @@
+"""The pictures of README and pages, drawn anew: ``make figures``, or ``figures.py NAME ...``.
+
+The figures of the paper are drawn from the embedded collection, twelve synthetic brains of 40,000
+vertices, analysed with all defaults as ``s4a demo`` does; the two panels are those of this study
+in Chromium. A name is that of a picture without its ending; ``docs/heads.png`` is made by
+``tests/benchmarks/compare.py heads``, ``docs/structure.svg`` by ``make structure``.
+"""
+
+import shutil
+import sys
+import tempfile
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from PIL import Image
+
+import s4a
+from s4a.datasets.synthetic import LABELS
+from s4a.method import fmap, steps
+from s4a.method import pca as modes
+from s4a.show import charts
+from s4a.show.draw import (
+    OKABE_ITO,
+    label_colors,
+    on_white,
+    plane_box,
+    position_colors,
+    render,
+    signed_colors,
+    with_balls,
+)
+from s4a.show.pictures import mode_drawer, write_picture
+from s4a.show.surfaces import carried_colors, mesh_of, network_places, surface
+
+HERE = Path(__file__).parent
+SHAPES, VERTICES, PAIR = 12, 40_000, 10_000
+LOOK = {"view": "corner", "up": "z"}
+SWITCHES = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+]
+DRAWN = (
+    "[...document.querySelectorAll('canvas.s4a-view')]"
+    ".some((c) => c.offsetParent && c.view && c.view.frames > 0)"
+)
+MOVE = """() => {
+  const input = document.querySelector(".s4a-slider input");
+  input.value = 2;
+  input.dispatchEvent(new Event("input"));
+}"""
+
+
+@cache
+def collection(shapes=SHAPES, vertices=VERTICES):
+    return s4a.synthetic.brains(shapes, vertices, seed=0)
+
+
+@cache
+def analysed(shapes=SHAPES, vertices=VERTICES):
+    """The study of the collection; its folder lasts as long as the process."""
+    folder = Path(tempfile.mkdtemp(prefix="s4a-figures-"))
+    return s4a.analyse(collection(shapes, vertices), store=folder / "study", n_jobs=1)
+
+
+def write(figure, name, dpi=120):
+    """A matplotlib figure on white, in 256 colours."""
+    path = HERE / f"{name}.png"
+    figure.savefig(path, dpi=dpi, facecolor="white")
+    reduce(path)
+    return path
+
+
+def reduce(path, width=None):
+    """A picture in 256 colours, at most so wide."""
+    picture = Image.open(path).convert("RGB")
+    if width is not None and picture.width > width:
+        picture = picture.resize((width, round(picture.height * width / picture.width)))
+    picture.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
+        path, optimize=True
+    )
+
+
+def tiled(pictures, columns=2):
+    """Pictures of one size as one, row by row."""
+    white = np.full_like(pictures[0], 255)
+    pictures = [*pictures, *[white] * (-len(pictures) % columns)]
+    rows = [np.hstack(pictures[i : i + columns]) for i in range(0, len(pictures), columns)]
+    return np.vstack(rows)
+
+
+def near(X, T, share=0.2):
+    """The middle of a surface so large that every triangle is seen."""
+    box = plane_box(X, **LOOK)
+    frame = box.mean(0) + np.array([[-1], [1]]) * share * (box[1] - box[0])
+    return seen(X[T].reshape(-1, 3), np.arange(T.size).reshape(-1, 3), frame=frame)
+
+
+def seen(X, T, size=(240, 205), **options):
+    return on_white(render(X, T, size=size, **LOOK, **options))
+
+
+# --------------------------------------------------------------------- the figures of the paper
+
+
+def pipeline(study):
+    """Figure 1: input, remeshed, maps, in correspondence, and what follows."""
+    template = study["registration"].attrs["template"]
+    names = list(study["original"].children)
+    shown = [template, *[name for name in names if name != template][:3]]
+    X, T = mesh_of(study["registration"].dataset)
+    colors = position_colors(X)
+    matched = [(X, T, colors), *[carried_colors(study, name, colors) for name in shown[1:]]]
+    remeshed = [near(*surface(study, template, stage)) for stage in ("original", "coarse")]
+    remeshed = [*[seen(*surface(study, template, s)) for s in ("original", "coarse")], *remeshed]
+    draw, _ = mode_drawer(study, LOOK)
+    parts = {
+        "1 · a collection": tiled([seen(*surface(study, name, "original")) for name in shown]),
+        "2 · remeshed": tiled(remeshed),
+        "3 · a network of maps": None,
+        "4 · in correspondence": tiled([seen(X, T, colors=c) for X, T, c in matched]),
+        "5 · modes of variation": tiled([draw(c, s, (240, 205)) for c in (0, 1) for s in (-3, 3)]),
+    }
+    parts["5 · modes of variation"] = on_white(parts["5 · modes of variation"])
+    figure = Figure(figsize=(11, 2.35), layout="constrained")
+    axes = figure.subplots(1, len(parts))
+    for ax, (title, picture) in zip(axes, parts.items(), strict=True):
+        ax.set_title(title, fontsize=10)
+        ax.set_axis_off()
+        if picture is not None:
+            ax.imshow(picture)
+    pairs = study["network"].dataset
+    places = network_places(study, names)
+    ends = [[names.index(str(n)) for n in pairs[end].values] for end in ("source", "target")]
+    lines = np.stack([places[ends[0]], places[ends[1]]])  # (2, pair, 2)
+    axes[2].plot(lines[..., 0], lines[..., 1], color=charts.BLUE, linewidth=0.8, alpha=0.6)
+    median = names.index(study["latent"].attrs["median"])
+    axes[2].scatter(*places.T, s=26, color="#333333", zorder=2)
+    axes[2].scatter(*places[median], s=110, facecolor="none", edgecolor=charts.ORANGE, zorder=3)
+    axes[2].margins(0.12)
+    return write(figure, "figure_1")
+
+
+def swapped(vertices=6000, n_coarse=1500, stretch=1.2):
+    """Figure 2: a first map, and eigenfunctions that change places."""
+    brains = s4a.synthetic.brains(2, vertices)
+    source, target = (brains[f"original/brain_0{i}"].to_dataset() for i in (1, 2))
+    high = target.assign(position=target["position"] * [1, 1, stretch])
+    M, N, H = (
+        s4a.spectrum(s4a.coarsen(mesh, n_coarse=n_coarse), k=100) for mesh in (source, target, high)
+    )
+    bases = steps.bases_of({"source": M, "target": N, "high": H})
+    low = bases["source"], bases["target"]
+    R, t, _ = s4a.geometry.align.align(low[1].X, low[1].area, low[0].X, low[0].area)
+    lie = {"source": (np.eye(3), np.zeros(3)), "high": (R, t)}  # as in a scanner: alike
+    found = steps.map_pairs(
+        {name: bases[name] for name in lie}, lie, [("source", "high")], init="landmarks"
+    )
+    C = found["fmap_initial"].values[0]
+    runs = fmap.swapped_blocks(C)
+    sys.stdout.write(f"figure 2: eigenfunctions that are exchanged: {runs[:3]}\n")
+    figure = Figure(figsize=(11, 4.2), layout="constrained")
+    left, right = figure.subfigures(1, 2, width_ratios=(1, 2.1))
+    ax = left.subplots()
+    image = ax.imshow(C, cmap=charts.SIGNED, vmin=-1, vmax=1)
+    ax.set(title="C, 20 × 20", xlabel="mode of the source", ylabel="mode of the target")
+    left.colorbar(image, ax=ax, shrink=0.7, location="left")
+    rows = (("source", M, np.eye(3)), ("target", H, R))
+    for row, (name, mesh, turn) in zip(right.subplots(2, 4), rows, strict=True):
+        X, T = mesh_of(mesh)
+        X = X @ turn.T
+        for i, ax in enumerate(row, 1):
+            values = mesh["eigenfunction"].values[:, i]
+            colors = signed_colors(values, np.quantile(np.abs(values), 0.99))
+            ax.imshow(on_white(render(X, T, colors=colors, view="front", size=(300, 260))))
+            ax.set_title(f"{name}, mode {i}", fontsize=9)
+            ax.set_axis_off()
+    return write(figure, "figure_2")
+
+
+def seconds(vertices=PAIR):
+    """Figure 3: CPU seconds of every step of the methods on one pair."""
+    brains = s4a.synthetic.brains(2, vertices, seed=0)
+    source, target = (brains[f"original/brain_0{i}"].to_dataset() for i in (1, 2))
+    found = s4a.compare.pairs(source, {"brain_02": target})["block_seconds"].isel(pair=0)
+    found = found.drop_sel(way="registered surface")  # the same run as "registered"
+    blocks = [str(name) for name in found["block"].values]
+    return write(
+        charts.stacked([str(w) for w in found["way"].values], blocks, found.values), "figure_3"
+    )
+
+
+def components(study):
+    """Figure 4: the first three components."""
+    path = write_picture(study, HERE / "brains.png")
+    reduce(path, 900)
+    return path
+
+
+def variance(study):
+    """Figure 5: explained variance at both resolutions, registered as in the paper."""
+    registration = study["registration"].to_dataset()
+    names = registration["shape"].values.tolist()
+    R, t = registration["icp_rotation"].values, registration["icp_translation"].values
+    fields = [
+        s4a.register_shape(study, name, start=start, refine="intrinsic", alignment="icp")
+        for name, *start in zip(names, R, t, strict=True)
+    ]
+    fields = xr.concat([f[["displacement", "displacement_low"]] for f in fields], "shape")
+    area = s4a.geometry.mesh.vertex_areas(*mesh_of(registration))
+    template = study["coarse"][registration.attrs["template"]].to_dataset()
+    paper = modes.pca(fields.assign_coords(shape=names), area, coarse=template)
+    high, low = (paper[f"explained_variance_ratio{kind}"].values for kind in ("", "_low"))
+    ours = study["pca"]["explained_variance_ratio"].values
+    figure = charts.variance(high, low)
+    (ax,) = figure.axes
+    share = np.cumsum(ours)
+    ax.plot(np.arange(1, len(share) + 1), share, color=charts.GREY, label="default", zorder=0)
+    ax.legend(frameon=False, loc="lower right")
+    for name, ratio in (("high", high), ("low", low), ("default", ours)):
+        sys.stdout.write(f"figure 5: {name}: {ratio[:3].sum():.0%} by three components\n")
+    return write(figure, "figure_5")
+
+
+@cache
+def carried(shapes=5, vertices=PAIR):
+    """A template that is none of the collection, and the study of the others."""
+    brains = s4a.synthetic.brains(shapes, vertices, seed=0)
+    meshes = {name: node.to_dataset() for name, node in brains["original"].children.items()}
+    template = meshes.pop(f"brain_{shapes:02d}")
+    return s4a.analyse(meshes, n_jobs=1), template
+
+
+def labels(held_out):
+    """Figure 6: labels of a template that is none of the collection, carried to a shape of it."""
+    study, template = held_out
+    target = study["original"]["brain_01"].to_dataset()
+    tree = s4a.transfer_labels(study, template["label"].values, source=template)
+    found = tree["brain_01/label"].values
+    own = target["label"].values
+    right = s4a.metrics.label_accuracy(found, own, s4a.geometry.mesh.vertex_areas(*mesh_of(target)))
+    sys.stdout.write(f"figure 6: {right:.1%} of the area has its own label\n")
+    palette = label_colors(np.arange(len(LABELS)))
+    shown = {"template": template, "carried to the shape": target, "the shape's own": target}
+    values = [template["label"].values, found, own]
+    colors = {title: palette[value] for title, value in zip(shown, values, strict=True)}
+    return write(charts.surfaces(shown, colors, flat=True), "figure_6")
+
+
+def landmarks(held_out):
+    """Figure 7: landmarks of the same template, and where they should be."""
+    study, template = held_out
+    target = study["original"]["brain_01"].to_dataset()
+    marks = template[["landmark_name", "landmark_position"]]
+    tree = s4a.transfer_landmarks(study, marks, source=template)
+    found, true = tree["brain_01/landmark_position"].values, target["landmark_position"].values
+    error = np.linalg.norm(found - true, axis=1)
+    sys.stdout.write(f"figure 7: {error.mean():.1f} mm off, the worst {error.max():.1f}\n")
+    palette = np.array([to_rgb(OKABE_ITO[i % len(OKABE_ITO)]) for i in range(len(true))])
+    shown = {
+        "template": (template, marks["landmark_position"].values),
+        "carried to the shape": (target, found),
+        "where they should be": (target, true),
+    }
+    figure = Figure(figsize=(7.5, 2.4), layout="constrained")
+    for ax, (title, (mesh, places)) in zip(figure.subplots(1, 3), shown.items(), strict=True):
+        X, T = mesh_of(mesh)
+        balls = np.column_stack([places, palette, np.full(len(places), 5.0)]).tolist()
+        X, T, colors = with_balls(X, T, None, balls)
+        ax.imshow(on_white(render(X, T, colors=colors, view=(200, 15), size=(360, 300))))
+        ax.set_title(title, fontsize=10)
+        ax.set_axis_off()
+    return write(figure, "figure_7")
+
+
+# ------------------------------------------------------------------------------------ the panels
+
+
+def panel(widget, name, act):
+    """A picture of a panel's page in Chromium, 894 pixels wide."""
+    from playwright.sync_api import sync_playwright
+
+    found = (shutil.which(n) for n in ("chromium", "chromium-browser", "google-chrome"))
+    browser_path = next(filter(None, found))
+    with tempfile.TemporaryDirectory() as folder, sync_playwright() as driver:
+        page_file = widget.save_html(Path(folder) / "panel.html", limit=0)
+        browser = driver.chromium.launch(executable_path=browser_path, args=SWITCHES)
+        page = browser.new_page(viewport={"width": 910, "height": 1000})
+        page.goto(page_file.as_uri())
+        page.wait_for_function(DRAWN)
+        act(page)
+        page.wait_for_timeout(3000)
+        path = HERE / f"{name}.png"
+        page.locator("#w0").screenshot(path=path)
+        browser.close()
+    reduce(path)
+    return path
+
+
+def sliders(study):
+    """Modes, the first at two standard deviations."""
+    from s4a import widgets
+
+    return panel(widgets.Modes(study), "pca", lambda page: page.evaluate(MOVE))
+
+
+def network(study):
+    """The network of functional maps."""
+    from s4a import widgets
+
+    shown = widgets.Network(study)
+    shown.where.value, shown.budget.value = "shape differences", 30
+    shown.edge = shown.shown[0]
+    return panel(shown, "network", lambda page: None)
+
+
+PICTURES = {
+    "figure_1": lambda: pipeline(analysed()),
+    "figure_2": swapped,
+    "figure_3": seconds,
+    "brains": lambda: components(analysed()),
+    "figure_5": lambda: variance(analysed()),
+    "figure_6": lambda: labels(carried()),
+    "figure_7": lambda: landmarks(carried()),
+    "pca": lambda: sliders(analysed()),
+    "network": lambda: network(analysed()),
+}
+
+
+def main(names):
+    unknown = set(names) - set(PICTURES)
+    if unknown:
+        sys.stderr.write(f"pictures are {', '.join(PICTURES)}, found {', '.join(unknown)}\n")
+        return 2
+    for name in names or PICTURES:
+        sys.stdout.write(f"{PICTURES[name]().relative_to(HERE.parent)}\n")
+        sys.stdout.flush()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
