@@ -90,10 +90,12 @@ def latent_of_new(
     norm : see :func:`s4a.analyse`
     """
     D = area_differences(Y)
+    # one by one, so that the last digit does not depend on the others
+    distance = [distance_to_identity(one[None], latent_eigenvalue, norm)[0] for one in D]
     return dataset(
         latent_basis=Y,
         latent_eigenvalue=latent_eigenvalue,
         area_difference=D,
         conformal_difference=conformal_differences(Y, eigenvalues, latent_eigenvalue),
-        distance_to_median=distance_to_identity(D, latent_eigenvalue, norm),
+        distance_to_median=np.array(distance),
     )

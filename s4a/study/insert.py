@@ -20,7 +20,7 @@ from s4a.method.lift import low_resolution
 from s4a.method.pca import project_scores
 from s4a.method.place import latent_of_new, nearest_spectra, place
 from s4a.method.register import from_latent
-from s4a.method.shape import Basis, Shape
+from s4a.method.shape import Shape
 from s4a.schema import dataset, in_unit, require, unit_of
 from s4a.study.options import Options
 from s4a.study.processes import workers
@@ -28,11 +28,15 @@ from s4a.study.tree import left_out, stack_registration, template_mesh
 
 
 class Frozen(NamedTuple):
-    """The study that new shapes come into: the template, and its network, the template first."""
+    """The study that new shapes come into: the template, and its network, the template first.
+
+    Of a study in files, meshes and latent bases are read where a new shape needs them.
+    """
 
     template: Shape
-    low: list[Basis]
-    Y: np.ndarray  # (n, k, m), latent bases
+    coarse: list[xr.Dataset]
+    spectra: list[np.ndarray]  # their eigenvalues
+    Y: xr.DataArray  # (n, k, m), latent bases
     turn: list[np.ndarray]  # rotations onto the template
 
 
@@ -108,8 +112,9 @@ def insert(
         raise ValueError(f"new shapes need other names than the template, {template!r}; rename it")
     frozen = freeze(study, options)
     references = portraits_of(study) if compare else None
+    # in a tuple: a Dataset of its own is kept by one worker of dask, and is lost with that
     results = workers(n_jobs)(
-        delayed(insert_one)(mesh, frozen, options, references) for mesh in meshes.values()
+        delayed(insert_one)((mesh,), frozen, options, references) for mesh in meshes.values()
     )
     inserted = {}
     for name, result in zip(meshes, results, strict=True):
@@ -186,14 +191,15 @@ def freeze(study: xr.DataTree, options: Options) -> Frozen:
     coarse = [study["coarse"][name].to_dataset() for name in names]
     return Frozen(
         options.shape(study["original"][template].to_dataset().load(), coarse[0].load()),
-        [Shape(None, mesh).low for mesh in coarse],
-        latent["latent_basis"].sel(shape=names).values,
+        coarse,
+        [mesh["eigenvalue"].values for mesh in coarse],
+        latent["latent_basis"].sel(shape=names),
         list(rotation.sel(shape=names).values),
     )
 
 
 def insert_one(
-    mesh: xr.Dataset,
+    meshes: tuple[xr.Dataset],
     frozen: Frozen,
     options: Options,
     references: dict[str, xr.Dataset] | None,
@@ -204,7 +210,7 @@ def insert_one(
     """
     try:
         with threadpool_limits(1):
-            return _insert_one(mesh, frozen, options, references)
+            return _insert_one(*meshes, frozen, options, references)
     except ValueError as error:
         return error
 
@@ -220,14 +226,15 @@ def _insert_one(mesh, frozen, options, references):
     new = Shape(None, coarse).low
     template = frozen.template.low
     k_init = min(options.k_init, k)
-    chosen = nearest_spectra(new.eigenvalue, [other.eigenvalue for other in frozen.low], k_init)
+    chosen = nearest_spectra(new.eigenvalue, frozen.spectra, k_init)
     R, t, _ = align(shape.low.X, shape.low.area, template.X, template.area)
-    others = [frozen.low[j] for j in chosen]
+    others = [Shape(None, frozen.coarse[j]).low for j in chosen]
+    of_template, *of_others = frozen.Y[[0, *chosen]].values
     starts = [(frozen.turn[j].T @ R, np.zeros(3)) for j in chosen]
     Y = place(
         new,
         others,
-        frozen.Y[chosen],
+        np.stack(of_others),
         starts,
         k_init=k_init,
         step=options.step,
@@ -237,7 +244,7 @@ def _insert_one(mesh, frozen, options, references):
     registration = from_latent(
         shape,
         frozen.template,
-        (Y, frozen.Y[0]),
+        (Y, of_template),
         (R, t),
         how=options.how,
         **options.of_registration,

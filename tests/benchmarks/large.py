@@ -4,7 +4,9 @@
 analyses them there by ``s4a run`` with five pairs a shape, kills that with SIGKILL half-way through
 every stage, and starts it again.  ``large.py sum`` prints what every run in that folder took, by
 stage, and the exponents in the number of shapes.  ``--whole`` kills nothing; ``--twice`` compares
-the killed study with one that was not, file by file.
+the killed study with one that was not, file by file.  ``large.py insert 20`` inserts so
+many into a study of twelve: one by one, together, and by a dask cluster of four workers, one of
+which is killed.
 
 CPU seconds and memory are those of all processes of the run, looked at every half second; memory is
 the sum of their resident sets, in which pages that they share count for each.
@@ -18,12 +20,15 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
+import joblib
 import numpy as np
 import psutil
 
+import s4a
 from s4a import synthetic
 from s4a.study import store
 from s4a.study.progress import FILE, STAGES
@@ -186,6 +191,65 @@ def equal_studies(a, b):
     return f"differ: {differ}" if differ else f"{len(names)} files, all the same to the bit"
 
 
+def one_by_one(study, files):
+    """Each inserted by itself, into a study that was opened for it."""
+    return [s4a.insert(s4a.open_study(study), [file]) for file in files]
+
+
+def together(study, files):
+    """All at once, in two processes."""
+    return [s4a.insert(s4a.open_study(study), files, n_jobs=2)]
+
+
+def by_dask(study, files):
+    """All at once, by four workers of dask, of which one is killed when it is at work."""
+    from dask.distributed import Client, LocalCluster
+
+    local = LocalCluster(n_workers=4, threads_per_worker=1, dashboard_address=None)
+    with local, Client(local) as client, joblib.parallel_config(backend="dask"):
+
+        def kill_one():
+            while not (busy := [w for w, calls in client.processing().items() if calls]):
+                time.sleep(0.05)
+            time.sleep(1)
+            os.kill(client.run(os.getpid, workers=busy[:1])[busy[0]], signal.SIGKILL)
+
+        killer = threading.Thread(target=kill_one)
+        killer.start()
+        found = [s4a.insert(s4a.open_study(study), files, n_jobs=-1)]
+        killer.join()
+    return found
+
+
+def same_bytes(values):
+    """The bytes of numbers; of a text the text, as its array has room for the longest."""
+    return values.tobytes() if values.dtype.kind in "iuf" else values.tolist()
+
+
+def inserts(folder, n, n_vertices):
+    """Insert n shapes in three ways, and compare every variable of every one."""
+    paths = collection(12 + n, n_vertices, folder / f"files_{12 + n}_{n_vertices}")
+    study = folder / f"study_12_{n_vertices}"
+    s4a.analyse(paths[:12], store=study, n_jobs=-1).close()
+    ways = {}
+    for way in (one_by_one, together, by_dask):
+        begin = time.perf_counter()
+        parts = way(study, paths[12:])
+        ways[way.__name__] = {
+            (path.stem, node, name): same_bytes(data[name].sel(shape=path.stem).values)
+            for path in paths[12:]
+            for part in parts
+            for node in ("latent", "registration", "pca")
+            if path.stem in (data := part[node].to_dataset())["shape"]
+            for name in data
+            if "shape" in data[name].dims
+        }
+        say(f"{way.__name__}: {n} inserted, {time.perf_counter() - begin:.0f} s")
+    first, *others = ways.values()
+    same = all(one == first for one in others)
+    say(f"{len(first)} arrays of {n} shapes: {'the same to the bit' if same else 'THEY DIFFER'}")
+
+
 def table(folder):
     """What all runs of a folder took, and the exponents."""
     found = [json.loads(path.read_text()) for path in folder.glob("*.json")]
@@ -221,13 +285,16 @@ def slope(sizes, seconds):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("part", choices=("run", "sum"))
+    parser.add_argument("part", choices=("run", "sum", "insert"))
     parser.add_argument("shapes", type=int, nargs="*")
     parser.add_argument("--vertices", type=int, default=20_000)
     parser.add_argument("--folder", type=Path, default=Path("large"))
     parser.add_argument("--whole", action="store_true", help="kill nothing")
     parser.add_argument("--twice", action="store_true", help="compare with one not killed")
     args = parser.parse_args()
+    if args.part == "insert":
+        inserts(args.folder, *(args.shapes or [20]), args.vertices)
+        return
     for n in args.shapes or [50] if args.part == "run" else []:
         run(args.folder, n, args.vertices, args.whole, args.twice)
     table(args.folder)
