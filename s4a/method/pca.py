@@ -2,7 +2,7 @@
 
 There are far fewer shapes s than vertices n, so that PCA works on the Gram matrix ``(s, s)`` of the
 displacements and costs next to nothing on large meshes.  It is added up over blocks of vertices, so
-that little more memory is needed than the fields and the modes have themselves.
+that little more memory is needed than the modes have themselves: fields in files are read in parts.
 """
 
 from collections.abc import Iterator
@@ -16,6 +16,7 @@ from s4a.method.deform import normal_displacement, smoother
 from s4a.schema import dataset, in_unit, require, unit_of
 
 BLOCK = 2**24  # numbers of all fields in a block of vertices: 128 MiB
+N_READ = 8  # blocks that are read from files at once, in single precision as they are there
 
 
 class PrincipalModes(NamedTuple):
@@ -33,12 +34,14 @@ class PrincipalModes(NamedTuple):
     ratio: np.ndarray
 
 
-def gram(fields: np.ndarray, area: np.ndarray, mean: np.ndarray | None = None) -> np.ndarray:
+def gram(
+    fields: np.ndarray | xr.Variable, area: np.ndarray, mean: np.ndarray | None = None
+) -> np.ndarray:
     """Inner products of fields ``(s, n, d)`` under the areas scaled to sum 1, ``(s, s)``.
 
     Parameters
     ----------
-    fields : float ndarray (s, n, d)
+    fields : float ndarray or variable (s, n, d)
     area : float ndarray (n,)
     mean : float ndarray (n, d), optional
         Taken from each field.
@@ -52,8 +55,8 @@ def gram(fields: np.ndarray, area: np.ndarray, mean: np.ndarray | None = None) -
     """
     weight = np.sqrt(area / area.sum())[:, None]
     K = np.zeros((len(fields), len(fields)))
-    for block in blocks(fields.shape):
-        part = fields[:, block] if mean is None else fields[:, block] - mean[block]
+    for block, values in parts(fields):
+        part = values if mean is None else values - mean[block]
         rows = (np.asarray(part, np.float64) * weight[block]).reshape(len(fields), -1)  # (s, b d)
         K += rows @ rows.T
     return K
@@ -74,6 +77,17 @@ def blocks(shape: tuple[int, ...]) -> Iterator[slice]:
         yield slice(begin, begin + size)
 
 
+def parts(fields: np.ndarray | xr.Variable) -> Iterator[tuple[slice, np.ndarray]]:
+    """The :func:`blocks` of fields ``(s, n, d)`` and their values, of files read some at a time."""
+    own = list(blocks(fields.shape))
+    for i in range(0, len(own), N_READ):
+        begin = own[i].start
+        several = fields[:, begin : own[min(i + N_READ, len(own)) - 1].stop]
+        values = several.values if isinstance(several, xr.Variable) else several
+        for block in own[i : i + N_READ]:
+            yield block, values[:, block.start - begin : block.stop - begin]
+
+
 def center_gram(K: np.ndarray) -> np.ndarray:
     """Gram matrix ``(s, s)`` of the fields less their mean, from that of the fields."""
     return K - K.mean(0) - K.mean(1)[:, None] + K.mean()
@@ -90,13 +104,13 @@ def principal_components(K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return eigenvalue[keep][::-1] / (len(K) - 1), V[:, keep][:, ::-1]
 
 
-def gram_pca(fields: np.ndarray, area: np.ndarray) -> PrincipalModes:
+def gram_pca(fields: np.ndarray | xr.Variable, area: np.ndarray) -> PrincipalModes:
     """PCA of fields under the inner product of the vertex areas.
 
     Parameters
     ----------
-    fields : float ndarray (s, n, d)
-        One displacement field per shape.
+    fields : float ndarray or variable (s, n, d)
+        One displacement field per shape; a variable may be in files.
     area : float ndarray (n,)
         Template vertex areas; their scale does not matter.
 
@@ -106,12 +120,12 @@ def gram_pca(fields: np.ndarray, area: np.ndarray) -> PrincipalModes:
         Of the precision of the fields.  Their signs make the third moment of the scores positive.
     """
     s = len(fields)
-    mean = fields.mean(axis=0)
+    mean = np.concatenate([values.mean(axis=0) for _, values in parts(fields)])
     variance, V = principal_components(gram(fields, area, mean))
     V = V * np.where((V**3).sum(0) < 0, -1.0, 1.0)  # (s, c)
-    deformation = np.empty((V.shape[1], *mean.shape), np.result_type(fields, np.float32))
-    for block in blocks(fields.shape):
-        part = fields[:, block] - mean[block]
+    deformation = np.empty((V.shape[1], *mean.shape), np.result_type(fields.dtype, np.float32))
+    for block, values in parts(fields):
+        part = values - mean[block]
         modes = np.einsum("sc,snd->cnd", V, part, optimize=True)
         modes /= np.sqrt(s - 1)
         deformation[:, block] = modes
@@ -188,10 +202,10 @@ def pca(
         is no variation to analyse.
     """
     require(registration, "displacement", what="registration")
-    d = registration["displacement"].transpose("shape", "vertex", "xyz").values
+    d = registration["displacement"].transpose("shape", "vertex", "xyz").variable
     if len(d) < 3:
         raise ValueError(f"PCA needs at least 3 shapes, found {len(d)}")
-    broken = ~np.array([np.isfinite(one).all() for one in d])
+    broken = ~np.array([np.isfinite(d[i].values).all() for i in range(len(d))])
     if broken.any():
         which = ", ".join(map(str, registration["shape"].values[broken]))
         raise ValueError(f"PCA needs displacements that are finite; leave out {which}")

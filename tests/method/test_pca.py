@@ -11,6 +11,7 @@ from s4a import synthesize, synthetic
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.method import pca
 from s4a.schema import dataset
+from s4a.study import store
 
 DEVIATIONS = np.array([3.0, 1.5, 0.5])
 
@@ -179,3 +180,27 @@ def test_modes_by_blocks_of_vertices_are_those_of_the_whole(planted, monkeypatch
         here = getattr(found, name)[:3] if name == "deformation" else getattr(found, name)
         assert here.dtype == there.dtype
         assert here[..., :3] == pytest.approx(there[..., :3], rel=1e-5, abs=1e-5)
+
+
+def test_fields_in_files_are_read_in_parts_and_their_modes_are_the_same(monkeypatch, tmp_path):
+    d = np.random.default_rng(0).normal(size=(5, 300, 3)).astype(np.float32)
+    for i, field in enumerate(d):
+        data = dataset(displacement=field[None]).isel(shape=0)
+        store.write(data, tmp_path / f"{i}.nc")
+    files = [store.open_file(tmp_path / f"{i}.nc")["displacement"].variable for i in range(5)]
+    monkeypatch.setattr(pca, "BLOCK", 5 * 3 * 7)  # 7 vertices
+    monkeypatch.setattr(pca, "N_READ", 2)
+    sizes, part = [], store.Stacked.part
+
+    def noted(self, key):
+        found = part(self, key)
+        sizes.append(found.size)
+        return found
+
+    monkeypatch.setattr(store.Stacked, "part", noted)
+    area = np.linspace(1, 2, 300)
+    fields = xr.Variable(("shape", "vertex", "xyz"), store.stacked(files))
+    found, expected = pca.gram_pca(fields, area), pca.gram_pca(d, area)
+    assert max(sizes) == 2 * 5 * 3 * 7
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one, other)
