@@ -145,7 +145,12 @@ def unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def normal_equations(
-    E: np.ndarray, area: np.ndarray, m: np.ndarray, y: np.ndarray, slide: float
+    E: np.ndarray,
+    area: np.ndarray,
+    m: np.ndarray,
+    y: np.ndarray,
+    slide: float,
+    mass: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Matrix ``(3 q, 3 q)`` and right side ``(3 q,)`` of the first term, for z = E w, w ``(q, 3)``.
 
@@ -160,21 +165,21 @@ def normal_equations(
         Unit normals.
     y : float ndarray (n, 3)
     slide : float
+    mass : float ndarray (q, q), optional
+        E^T diag(area) E, where it is known.
     """
-    q = E.shape[1]
-    matrix = np.empty((3, q, 3, q))
-    everywhere = slide * E.T @ (area[:, None] * E)
-    for i in range(3):
-        for j in range(i, 3):
-            weight = (1 - slide) * area * m[:, i] * m[:, j]
-            block = E.T @ (weight[:, None] * E)
-            if i == j:
-                block += everywhere
-            matrix[i, :, j] = block
-            matrix[j, :, i] = block
+    n, q = E.shape
+    # distances across the surface are those of one field: m_i^T z_i, in the 3 q unknowns
+    across = (np.sqrt((1 - slide) * area)[:, None] * m)[:, :, None] * E[:, None]  # (n, 3, q)
+    across = across.reshape(n, 3 * q)
+    matrix = across.T @ across
+    if slide:
+        mass = E.T @ (area[:, None] * E) if mass is None else mass
+        for i in range(0, 3 * q, q):
+            matrix[i : i + q, i : i + q] += slide * mass
     along = np.einsum("ni,ni->n", m, y)[:, None] * m
     right = E.T @ (area[:, None] * (slide * y + (1 - slide) * along))  # (q, 3)
-    return matrix.reshape(3 * q, 3 * q), right.T.ravel()
+    return matrix, right.T.ravel()
 
 
 def elastic_rounds(
@@ -224,13 +229,14 @@ def elastic_rounds(
     X = move(target, warp)
     fall = (stiffness[1] / stiffness[0]) ** (1 / (N_STEPS - 1))
     energies: list[float] = []  # of bending, after each step
+    mass = E.T @ (target.area[:, None] * E)
     for step in range(N_STEPS + N_FURTHER)[steps]:
         if step >= N_STEPS and energies[-1] > SETTLED * energies[-2]:
             break
         price = stiffness[0] * fall**step * bending
         for _ in range(rounds):
             y, m = points_ahead(source, target, X)
-            matrix, right = normal_equations(E, target.area, m, y, slide[step >= 2])
+            matrix, right = normal_equations(E, target.area, m, y, slide[step >= 2], mass)
             rim = rim_ahead(source, target, X) if step >= 2 else None
             if rim is not None:
                 vertex, length, across, y = rim
