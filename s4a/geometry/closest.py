@@ -147,22 +147,28 @@ def closest_point_on_triangles(
     weights : float ndarray (n, 3)
         Non-negative, rows sum to 1.
     """
+    v, w = closest_by_sides(B - A, C - A, P - A)
+    return np.stack([np.maximum(1 - v - w, 0), v, w], axis=1)
 
-    def dot(a, b):
-        return np.einsum("ij,ij->i", a, b)
+
+def closest_by_sides(
+    ab: np.ndarray, ac: np.ndarray, ap: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Weights ``(n,)`` of B and C in the closest point of :func:`closest_point_on_triangles`.
+
+    Parameters
+    ----------
+    ab, ac, ap : float ndarray (n, d)
+        From A to B, to C and to the point.
+    """
 
     def ratio(a, b):
         return np.clip(a / np.where(b == 0, 1, b), 0, 1)
 
-    ab, ac, ap, bp, cp = B - A, C - A, P - A, P - B, P - C
-    d1, d2, d3, d4, d5, d6 = (
-        dot(ab, ap),
-        dot(ac, ap),
-        dot(ab, bp),
-        dot(ac, bp),
-        dot(ab, cp),
-        dot(ac, cp),
-    )
+    d1, d2 = dots(ab, ap), dots(ac, ap)
+    both = dots(ab, ac)
+    d3, d4 = d1 - dots(ab, ab), d2 - both  # of ab and ac with the way from B
+    d5, d6 = d1 - both, d2 - dots(ac, ac)  # and from C
     va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
     total = va + vb + vc
     v, w = ratio(vb, total), ratio(vc, total)  # interior
@@ -182,7 +188,12 @@ def closest_point_on_triangles(
     )
     for region, at_b, at_c in corners:
         v, w = np.where(region, at_b, v), np.where(region, at_c, w)
-    return np.stack([np.maximum(1 - v - w, 0), v, w], axis=1)
+    return v, w
+
+
+def dots(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Dot products ``(n,)`` of the rows of two arrays ``(n, d)``."""
+    return np.einsum("ij,ij->i", a, b)
 
 
 class Stars(NamedTuple):
@@ -246,12 +257,21 @@ def closest_point_in_star(
         first = np.cumsum(repeat) - repeat
         row = np.repeat(np.arange(len(block)), repeat)
         candidate = star[start[nearest[block]][row] + np.arange(len(row)) - first[row]]
-        point = P[block][row]
-        A, B, C = X[T[candidate, 0]], X[T[candidate, 1]], X[T[candidate, 2]]
-        w = closest_point_on_triangles(point, A, B, C)
-        gap = ((w[:, :1] * A + w[:, 1:2] * B + w[:, 2:] * C - point) ** 2).sum(1)
+        A, ab, ac = (X[corner] for corner in T[candidate].T)
+        ap = P[block][row]
+        for side in (ab, ac, ap):  # in place, as below: copies take as long as the products
+            side -= A
+        v, w = closest_by_sides(ab, ac, ap)
+        ab *= v[:, None]
+        ac *= w[:, None]
+        way = ab
+        way += ac
+        way -= ap
+        gap = dots(way, way)
         best = np.minimum.reduceat(gap, first)
         is_best = np.flatnonzero(gap == best[row])
-        pick = is_best[np.unique(row[is_best], return_index=True)[1]]
-        triangle[block], weights[block] = candidate[pick], w[pick]
+        pick = is_best[np.searchsorted(row[is_best], np.arange(len(block)))]  # the first of a row
+        v, w = v[pick], w[pick]
+        triangle[block] = candidate[pick]
+        weights[block] = np.stack([np.maximum(1 - v - w, 0), v, w], axis=1)
     return triangle, weights
