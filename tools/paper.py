@@ -29,6 +29,7 @@ PAGES = (
     "docs/decisions.md",
     "docs/differences.md",
     "docs/doubtful.md",
+    "docs/frontends.md",
     "docs/install.md",
     "docs/plausibility.md",
     "paper/paper.md",
