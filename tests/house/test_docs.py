@@ -6,11 +6,7 @@ The glossary agrees with the schema.
 import ast
 import importlib
 import inspect
-import os
 import re
-import shutil
-import subprocess
-import sys
 
 import pytest
 from paths import DOCS, ROOT
@@ -145,25 +141,6 @@ def test_nothing_is_fetched_to_build_or_to_read_it():
     assert "nb_ipywidgets_js = {}" in conf
 
 
-@pytest.fixture(scope="module")
-def site(tmp_path_factory):
-    """What the documentation says when it is built, and the folder of its pages."""
-    for package in ("furo", "latex2mathml", "myst_nb", "sphinx"):
-        pytest.importorskip(package)
-    out = tmp_path_factory.mktemp("site")
-    options = ["-q", "-W", "--keep-going", "-b", "html", "-d", str(out / "doctrees")]
-    command = [sys.executable, "-m", "sphinx", *options, str(DOCS), str(out / "html")]
-    found = subprocess.run(
-        command,
-        env=os.environ | {"S4A_DOCS": "off"},
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    return found, out / "html"
-
-
 def test_it_builds_without_a_warning(site):
     found, pages = site
     assert found.returncode == 0, found.stderr
@@ -171,43 +148,3 @@ def test_it_builds_without_a_warning(site):
         r"(src|href)=\"https?://[^\"]+\.(js|css)\"",
         (pages / "glossary.html").read_text("utf-8"),
     )
-
-
-@pytest.fixture(scope="module")
-def window(site):
-    """A browser window for the pages; nothing is fetched."""
-    playwright = pytest.importorskip("playwright.sync_api")
-    names = ("chromium", "chromium-browser", "google-chrome")
-    chromium = next(filter(None, map(shutil.which, names)), None)
-    if chromium is None:
-        pytest.skip("needs Chromium: apt-get install chromium")
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(
-            executable_path=chromium, args=["--no-sandbox", "--disable-gpu"]
-        )
-        yield browser.new_page(viewport={"width": 800, "height": 700})
-        browser.close()
-
-
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_axe_finds_nothing_serious_on_the_pages(site, window, scheme):
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright")
-    window.emulate_media(color_scheme=scheme)
-    for name in ("index", "method", "claims", "comparison", "citing", "course/02_laplacian"):
-        window.goto((site[1] / f"{name}.html").as_uri())
-        found = axe.Axe().run(window).response["violations"]
-        bad = [v["id"] for v in found if v["impact"] in ("serious", "critical")]
-        assert bad == [], name
-
-
-def test_the_search_finds_functions_by_their_names(site, window):
-    window.goto((site[1] / "search.html").as_uri() + "?q=fmap_from_match")
-    window.wait_for_selector("#search-results li", timeout=60_000)
-    first = window.locator("#search-results li a").first
-    assert "s4a.method.fmap.fmap_from_match" in first.get_attribute("href")
-
-
-def test_no_page_is_wider_than_a_narrow_window(site, window):
-    for name in ("index", "method", "comparison", "api/maps"):
-        window.goto((site[1] / f"{name}.html").as_uri())
-        assert window.evaluate("document.documentElement.scrollWidth") <= 800, name

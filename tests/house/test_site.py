@@ -1,0 +1,45 @@
+"""The built documentation in Chromium: accessible, searchable, and not too wide."""
+
+import shutil
+
+import pytest
+
+
+@pytest.fixture(scope="module")
+def window(site):
+    """A browser window for the pages; nothing is fetched."""
+    playwright = pytest.importorskip("playwright.sync_api")
+    names = ("chromium", "chromium-browser", "google-chrome")
+    chromium = next(filter(None, map(shutil.which, names)), None)
+    if chromium is None:
+        pytest.skip("needs Chromium: apt-get install chromium")
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(
+            executable_path=chromium, args=["--no-sandbox", "--disable-gpu"]
+        )
+        yield browser.new_page(viewport={"width": 800, "height": 700})
+        browser.close()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_axe_finds_nothing_serious_on_the_pages(site, window, scheme):
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright")
+    window.emulate_media(color_scheme=scheme)
+    for name in ("index", "method", "claims", "comparison", "citing", "course/02_laplacian"):
+        window.goto((site[1] / f"{name}.html").as_uri())
+        found = axe.Axe().run(window).response["violations"]
+        bad = [v["id"] for v in found if v["impact"] in ("serious", "critical")]
+        assert bad == [], name
+
+
+def test_the_search_finds_functions_by_their_names(site, window):
+    window.goto((site[1] / "search.html").as_uri() + "?q=fmap_from_match")
+    window.wait_for_selector("#search-results li", timeout=60_000)
+    first = window.locator("#search-results li a").first
+    assert "s4a.method.fmap.fmap_from_match" in first.get_attribute("href")
+
+
+def test_no_page_is_wider_than_a_narrow_window(site, window):
+    for name in ("index", "method", "comparison", "api/maps"):
+        window.goto((site[1] / f"{name}.html").as_uri())
+        assert window.evaluate("document.documentElement.scrollWidth") <= 800, name
