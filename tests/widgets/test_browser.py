@@ -899,6 +899,25 @@ def study_page(study, tmp_path_factory):
     return s4a.write_page(study, tmp_path_factory.mktemp("page") / "study.html")
 
 
+@pytest.mark.parametrize("width, height", [(1366, 680), (1920, 1080), (3840, 2160)])
+def test_the_page_of_a_study_fills_a_wide_screen_one_idea_at_a_time(
+    offline, study_page, width, height
+):
+    page, _ = opened(offline, study_page)
+    page.set_viewport_size({"width": width, "height": height})
+    page.wait_for_function(DRAWN)
+    wide, tall, text = page.evaluate("""() => {
+      const panel = document.getElementById("modes"), box = panel.getBoundingClientRect();
+      const words = parseFloat(getComputedStyle(panel.querySelector(".s4a-title")).fontSize);
+      return [box.width, box.height, words];
+    }""")
+    sizes = f"{wide:.0f} x {tall:.0f}, text {text:.1f}"
+    assert wide >= 0.8 * width, sizes
+    assert tall <= height, sizes
+    assert text >= (16 if width >= 1920 else 13), sizes
+    page.close()
+
+
 def test_the_page_of_a_study_has_live_sliders(offline, study, study_page):
     page, errors = opened(offline, study_page)
     page.wait_for_function(DRAWN)
