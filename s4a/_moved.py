@@ -18,11 +18,11 @@ PUBLIC = {
 }
 ROOMS = {
     "geometry": "align mesh voronoi",
-    "input": "annotations bounded formats manifold subjects",
+    "input": "annotations bounded formats landmarks manifold subjects",
     "method": "deform descriptors fmap joint latent lift median nearest network pca register "
     "remesh scalable spectral",
     "study": "options pipeline",
-    "analysis": "export landmarks link model permutation transfer",
+    "analysis": "export link model permutation transfer",
     "evaluation": "accuracy",
     "show": "charts draw",
     "cli": "commands tables",

@@ -13,10 +13,10 @@ from joblib import delayed
 from threadpoolctl import threadpool_limits
 
 from s4a.analysis.inputs import all_registered
-from s4a.analysis.landmarks import FARTHEST_LANDMARK, NAMED, locate, trace_curves
 from s4a.analysis.link import Route, blend_routes, carry_along, elect, link
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays
+from s4a.input.landmarks import FARTHEST_LANDMARK, NAMED, locate, trace_curves
 from s4a.method.register import identity
 from s4a.method.shape import Shape
 from s4a.schema import dataset, require
@@ -373,7 +373,7 @@ def transfer_landmarks(
     Parameters
     ----------
     study, source, targets, **options : see :func:`transfer_labels`
-    landmarks, farthest : see :func:`s4a.analysis.landmarks.locate`
+    landmarks, farthest : see :func:`s4a.input.landmarks.locate`
 
     Returns
     -------

@@ -273,7 +273,8 @@ def insert(args: Namespace) -> int:
     from s4a.study.store import ENGINE
     from s4a.study.tree import open_study
 
-    inserted = insert(open_study(args.study), args.shapes, n_jobs=args.n_jobs)
+    study = open_study(args.study)
+    inserted = insert(study, args.shapes, landmarks=args.landmarks, n_jobs=args.n_jobs)
     out = new_folder(args.out)
     inserted.to_netcdf(out / "inserted.nc", engine=ENGINE)
     write_registered(inserted, out)
@@ -285,10 +286,10 @@ def insert(args: Namespace) -> int:
 def transfer(args: Namespace) -> int:
     """Labels and landmarks of one mesh on others."""
     from s4a.analysis import transfer as travel
-    from s4a.analysis.landmarks import locate
     from s4a.cli import tables
     from s4a.input.annotations import labels_of_mesh, read_labels, read_landmarks
     from s4a.input.collection import read_shape
+    from s4a.input.landmarks import locate
     from s4a.study.options import PAIR
     from s4a.study.tree import open_study
 

@@ -52,6 +52,7 @@ HELP = {
     "preset": "'paper' leaves out all that is added to the paper",
     "template": "name of the shape to register to (default: the median shape)",
     "reflect": "shapes to mirror: their names, with commas; COLUMN=VALUE of the table; or auto",
+    "landmarks": "folder of landmark files named as the shapes, which guide registration",
     "table": "CSV with a column 'shape', covariates and groups, for the statistics",
     "doubtful": "what becomes of doubtful shapes: they stay apart, or the run stops",
     "keep_doubtful": "take doubtful shapes into modes and statistics",
@@ -215,6 +216,7 @@ def _insert(add):
     add("shapes", nargs="+", metavar="SHAPE", help="mesh files, folders or globs")
     text = "for inserted.nc, registered meshes and scores"
     add("--out", required=True, metavar="DIR", help=text)
+    add("--landmarks", metavar="DIR", help=HELP["landmarks"])
     add_options(add, ["n_jobs"])
 
 

@@ -36,9 +36,12 @@ def mirror_image(mesh: xr.Dataset) -> xr.Dataset:
     True
     """
     image = mesh.copy()
-    for name in ("position", "landmark_position"):
+    for name in ("position", "landmark_position", "guide_position"):
         if name in mesh:
             image[name] = mesh[name].copy(data=mesh[name].values * MIRROR)
+    for name in ("landmark_barycentric", "guide_barycentric"):
+        if name in mesh:
+            image[name] = mesh[name].copy(data=mesh[name].values[:, ::-1])
     turned = np.ascontiguousarray(mesh["corner_vertex"].values[:, ::-1])
     image["corner_vertex"] = mesh["corner_vertex"].copy(data=turned)
     reasons = [mesh.attrs.get("reason", ""), "mirrored, as reflect= says"]

@@ -20,6 +20,8 @@ Nothing above keeps a surface from shifting along itself over its own boundary. 
 boundaries lie on each other already they are taken for one line, and the squared distances from it
 across the boundary and along the surface, times its length, are added from the third step on.
 
+Landmarks that a user marked on both surfaces add their squared distances, each by the same weight.
+
 What K functions cannot follow is left to local rounds: a displacement d (n, 3) of the vertices of
 low resolution, beyond the warp, that minimises
 
@@ -27,8 +29,11 @@ low resolution, beyond the warp, that minimises
 
 r_i what d_i and the way to the nearest point add up to, the way along the surface counted by half.
 That is one implicit step of heat diffusion, (A + time W) d = A r; the time falls, as that of the
-smoothing in MeshMonk does (White et al., Scientific Reports 2019).
+smoothing in MeshMonk does (White et al., Scientific Reports 2019).  Landmarks add their squared
+distances here, too.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -51,6 +56,7 @@ N_FURTHER = 5  # steps at most, each with as much less stiffness, where the last
 SETTLED = 1.2  # as long as a step lets the bending energy grow by less than that factor
 RIM_WEIGHT = 0.01  # share of sqrt(area): of distances at the boundary, by its length
 RIM_NEAR = 0.03  # share of sqrt(area): boundaries that are farther apart may be cut anywhere
+LANDMARK_WEIGHT = 1e-3  # of each landmark: as much as this share of the area
 N_ROUNDS = 8
 STILL = 1e-3  # share of sqrt(area): a step ends with a round that moves less
 TIME = (2e-2, 2e-4)  # of local rounds: smooth over 0.2, then over 0.02 of sqrt(area)
@@ -98,6 +104,13 @@ def points_ahead(source: Basis, target: Basis, X: np.ndarray) -> tuple[np.ndarra
     normals = target.normals_at(X)
     y, normals_y = nearest_on_surface(source, X, normals)
     return y, unit(normals + normals_y)
+
+
+class Landmarks(NamedTuple):
+    """Landmarks that a user marked on both surfaces."""
+
+    on_target: Basis  # as a surface of no triangles: X (l, 3), and U (l, n) to its low resolution
+    y: np.ndarray  # (l, 3), on the source
 
 
 def rim_ahead(
@@ -182,6 +195,19 @@ def normal_equations(
     return matrix, right.T.ravel()
 
 
+def pins(
+    landmarks: Landmarks | None, smooth: np.ndarray, R: np.ndarray, t: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Matrix and right side of :func:`normal_equations` for landmarks, in all directions alike."""
+    if landmarks is None:
+        return None
+    at, y = landmarks
+    start = turn(at, R, t)  # (l, 3)
+    E = np.concatenate([at.U @ smooth, start, np.ones((len(y), 1))], axis=1)
+    weight = np.full(len(y), LANDMARK_WEIGHT)
+    return normal_equations(E, weight, np.zeros_like(y), y, 1.0)
+
+
 def elastic_rounds(
     source: Basis,
     target: Basis,
@@ -191,6 +217,7 @@ def elastic_rounds(
     slide: tuple[float, float] = SLIDE,
     steps: slice = slice(None),
     rounds: int = N_ROUNDS,
+    landmarks: Landmarks | None = None,
 ) -> Warp:
     """The warp after rounds in which the target's displacement becomes less and less stiff.
 
@@ -213,6 +240,7 @@ def elastic_rounds(
         Those of the 8 and 5 further ones that are made; at least two before the further ones.
     rounds : int
         With each value at most; fewer where nothing moves any more.
+    landmarks : Landmarks, optional
 
     Returns
     -------
@@ -224,6 +252,7 @@ def elastic_rounds(
     n = len(start)
     smooth = target.Phi[:, 1:]  # the constant is b
     E = np.concatenate([smooth, start, np.ones((n, 1))], axis=1)  # (n, K - 1 + 3 + 1)
+    pinned = pins(landmarks, smooth, R, t)
     bending = np.zeros(E.shape[1])
     bending[: smooth.shape[1]] = target.eigenvalue[1:] ** 2
     X = move(target, warp)
@@ -243,6 +272,9 @@ def elastic_rounds(
                 more = normal_equations(E[vertex], RIM_WEIGHT * length, across, y, 0.0)
                 matrix += more[0]
                 right += more[1]
+            if pinned is not None:
+                matrix += pinned[0]
+                right += pinned[1]
             # start and smooth functions nearly depend on each other: a little keeps them apart
             matrix[np.diag_indices_from(matrix)] += np.tile(price, 3) + 1e-12
             w = scipy.linalg.solve(matrix, right, assume_a="pos").reshape(3, -1).T  # (q, 3)
@@ -265,6 +297,7 @@ def local_rounds(
     time: tuple[float, float] = TIME,
     slide: float = LOCAL_SLIDE,
     rounds: int = N_LOCAL_ROUNDS,
+    pull: tuple[sp.csr_matrix, np.ndarray] | None = None,
 ) -> np.ndarray:
     """A displacement beyond that of elastic rounds, free at every vertex of low resolution.
 
@@ -281,6 +314,8 @@ def local_rounds(
     slide : float
         Weight of the way along the surface.
     rounds : int
+    pull : tuple (P, missing), optional
+        Weights ``(l, n)`` of landmarks on the target, and what d is to be there ``(l, 3)``.
 
     Returns
     -------
@@ -288,11 +323,14 @@ def local_rounds(
         d, in the frame of the source.
     """
     A = sp.diags_array(target.area)
+    P, missing = (sp.csr_matrix((0, len(X))), np.zeros((0, 3))) if pull is None else pull
+    pinned = LANDMARK_WEIGHT * P.T @ P
+    toward = LANDMARK_WEIGHT * P.T @ missing
     d = np.zeros_like(X)
     for step in np.geomspace(*time, rounds):
         y, m = points_ahead(source, target, X + d)
         way = y - X - d
         across = np.einsum("ni,ni->n", m, way)[:, None] * m
         goal = d + slide * way + (1 - slide) * across
-        d = factor(A + step * W)(target.area[:, None] * goal)
+        d = factor(A + pinned + step * W)(target.area[:, None] * goal + toward)
     return d

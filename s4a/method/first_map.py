@@ -11,16 +11,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from s4a.geometry.align import Motion, farthest_points
+from s4a.geometry.align import Motion, align, farthest_points, realign, rigid_transform
 from s4a.geometry.mesh import edges
 from s4a.method import fmap, joint
-from s4a.method.shape import Basis
+from s4a.method.shape import Basis, corresponding_landmarks
 
 N_LANDMARKS = 10  # of step 3
 # Of a pair alone, in a far pose: signatures, functions by k_init, and weight of the orientation.
 # Signed mean curvature goes with each: front and back of a body differ by nothing else
 SEARCHED = tuple(itertools.product(("hks+wks", "wks", "hks"), (0.5, 1.0, 1.5), (1.0, 10.0)))
 CURVATURE = 3.0  # its weight by that of a signature
+ON_A_LINE = 0.02  # of sqrt(area): landmarks as near to a line say nothing of turns about it
 FOUND = 0.07  # score at which the search ends; of wrong maps between bodies it is 0.11 or more
 
 
@@ -32,6 +33,20 @@ class FirstMap(NamedTuple):
     fitted: np.ndarray  # (k_init, k_init), before the step of ZoomOut ahead
     near: np.ndarray  # (n_target,), nearest neighbours in space after the motion
     landmarks: tuple[np.ndarray, np.ndarray] | None  # of source and target, where it was fitted so
+
+
+def motion_onto(source: Basis, target: Basis) -> Motion:
+    """Rigid motion (R, t) of the source onto the target by ICP (4.1, step 2).
+
+    It begins where landmarks say, if both have three or more that do not lie on one line.
+    """
+    at_source, at_target = corresponding_landmarks(source, target)
+    P = source.X[at_source]
+    if len(P) < 3 or np.linalg.svd(P - P.mean(0), compute_uv=False)[1] < ON_A_LINE:
+        R, t, _ = align(source.X, source.area, target.X, target.area)
+        return R, t
+    R, t, _ = rigid_transform(P, target.X[at_target])
+    return realign(source.cloud, target.cloud, (R, t))
 
 
 def nearest_after_motion(source: Basis, target: Basis, motion: Motion) -> np.ndarray:
@@ -129,6 +144,8 @@ def best_first_map(
 ) -> tuple[str, np.ndarray, np.ndarray]:
     """The best of a first map and of those from heat and from wave kernels, which no pose changes.
 
+    Where both have landmarks, also of one from wave kernels and these.
+
     Either kind alone fails on some pairs: shapes that nearly are their own mirror image are turned
     over, or limbs exchanged.  Each map is refined by a short ZoomOut and a few rounds of
     :func:`s4a.method.joint.low_rounds` by parts; their end is scored without truth,
@@ -151,12 +168,13 @@ def best_first_map(
     Returns
     -------
     name : str
-        "icp", "hks" or "wks", or of the search as "hks+wks, curvature, k 10, oriented 1".
+        "icp", "marked", "hks" or "wks", or of the search as "hks+wks, curvature, k 10, oriented 1".
     C, fitted : float ndarray (k_init, k_init)
         The map, and as it was before its step of ZoomOut.
     """
     k = min(k, source.k, target.k)
     maps = [("icp", C, C if fitted is None else fitted)]
+    maps += map_of_landmarks(source, target, len(C))
     tried = []  # score, name, map, fit
     for one in itertools.chain(maps, maps_of_signatures(source, target, len(C), search)):
         match = fmap.zoomout(source, target, one[1], k, step=step)[1]
@@ -164,9 +182,20 @@ def best_first_map(
         image = joint.move(target, end[1])
         gap = joint.registration_score(source, target, end[0], image)
         tried.append((gap + stretch(target, image), *one))
-        if len(tried) >= 3 and min(score for score, *_ in tried) < FOUND:
+        if len(tried) >= 2 + len(maps) and min(score for score, *_ in tried) < FOUND:
             break
     return min(tried, key=lambda one: one[0])[1:]
+
+
+def map_of_landmarks(
+    source: Basis, target: Basis, k: int
+) -> list[tuple[str, np.ndarray, np.ndarray]]:
+    """Name, first map and its fit ``(k, k)`` of wave kernels and landmarks, if both have three."""
+    landmarks = corresponding_landmarks(source, target)
+    if len(landmarks[0]) < 3:
+        return []
+    fitted = fmap.fmap_from_descriptors(source, target, k=k, landmarks=landmarks)
+    return [("marked", fmap.refine_once(source, target, fitted), fitted)]
 
 
 def maps_of_signatures(

@@ -20,7 +20,7 @@ from s4a.geometry.mesh import path_lengths, vertex_normals
 from s4a.method.deform import onto
 from s4a.method.fmap import fmap_from_match
 from s4a.method.nearest import nearest_rows
-from s4a.method.shape import Basis
+from s4a.method.shape import Basis, corresponding_landmarks
 from s4a.method.spectral import project
 
 FAR = 0.035  # between shapes of one pose the tenth that is farthest lies nearer, see `far_apart`
@@ -191,7 +191,8 @@ def registration_score(
     The round trip goes from a vertex of the target to its match and back to the vertex whose
     registered position (in position and normal) is nearest, measured along the edges of the target
     and cut at `limit`; the gaps are the mean distances of the registered target and the source, at
-    the vertices near coarse ones of each.  Lengths are for unit area.
+    the vertices near coarse ones of each; to them comes :func:`landmark_gap`.  Lengths are for unit
+    area.
 
     Stretch of edges is left out: on heads and brains with known warps it prefers maps that move
     nothing.
@@ -214,7 +215,15 @@ def registration_score(
     sample = target.outwards[np.linspace(0, len(match) - 1, n_samples).astype(int)]
     end = tree.query(source.tree.data[match[sample]])[1]
     trip = path_lengths(target.graph, rows[sample], end, limit)
-    return float(trip.mean() + gap.mean() + back_gap.mean())
+    return float(trip.mean() + gap.mean() + back_gap.mean() + landmark_gap(source, target, X))
+
+
+def landmark_gap(source: Basis, target: Basis, X: np.ndarray) -> float:
+    """Mean distance of the landmarks that both have, the target's vertices at X; 0 without any."""
+    at_source, at_target = corresponding_landmarks(source, target)
+    if len(at_source) == 0:
+        return 0.0
+    return float(np.linalg.norm(X[at_target] - source.X[at_source], axis=1).mean())
 
 
 def far_apart(source: Basis, target: Basis, match: np.ndarray) -> bool:

@@ -15,7 +15,7 @@ import xarray as xr
 from s4a.geometry.mesh import as_arrays, stiffness, vertex_areas
 from s4a.method.remesh import coarsen, laplacian
 from s4a.method.scalable import reduced
-from s4a.method.shape import Shape
+from s4a.method.shape import Shape, vertices_of_landmarks
 from s4a.method.spectral import factor, spectrum
 from s4a.schema import dataset
 
@@ -223,11 +223,17 @@ def low_resolution(
     """The low-resolution mesh with its functions: :func:`s4a.coarsen`, :func:`s4a.spectrum`.
 
     With `lift` also :func:`lifted`.  With ``method="scalable"`` :func:`s4a.method.scalable.reduced`
-    is in their place, which can neither be lifted nor wrapped.
+    is in their place, which can neither be lifted nor wrapped.  Of landmarks that guide it has
+    ``guide_vertex``, the coarse vertices that weigh most in U there.
     """
     if method == "scalable":
-        return reduced(mesh, n_coarse=n_coarse, k=k, seed=seed)
-    coarse = coarsen(mesh, n_coarse=n_coarse, wrap=wrap, seed=seed)
-    if not lift:
-        return spectrum(coarse, k=k)
-    return lifted(mesh, spectrum(coarse, k=k + SPARE), k)
+        low = reduced(mesh, n_coarse=n_coarse, k=k, seed=seed)
+    else:
+        coarse = coarsen(mesh, n_coarse=n_coarse, wrap=wrap, seed=seed)
+        low = spectrum(coarse, k=k + SPARE) if lift else spectrum(coarse, k=k)
+        low = lifted(mesh, low, k) if lift else low
+    landmarks = vertices_of_landmarks(mesh)
+    if not landmarks:
+        return low
+    vertex = Shape(mesh, low).cell[list(landmarks.values())]
+    return low.merge(dataset(guide_name=list(landmarks), guide_vertex=vertex))

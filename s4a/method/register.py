@@ -14,11 +14,11 @@ from s4a.geometry.closest import closest_point_in_star, feature_tree, match_surf
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.method import joint
 from s4a.method.deform import displacement_in_template
-from s4a.method.elastic import elastic_rounds, local_rounds
+from s4a.method.elastic import Landmarks, elastic_rounds, local_rounds
 from s4a.method.first_map import nearest_after_motion
 from s4a.method.fmap import fmap_from_match
 from s4a.method.nearest import nearest_in_cells, nearest_of_few, nearest_rows
-from s4a.method.shape import Shape
+from s4a.method.shape import Basis, Shape
 from s4a.schema import INPUT, dataset, in_unit
 
 SAME = 0.002  # share of sqrt(area): starts that are nearer after the first step end as one
@@ -350,10 +350,11 @@ def register_surface(
     # starts as they are tell less of their ends than joint rounds do
     margin = 2.0 if elastic else 1.25
     names = joint.finalists(candidates, margin=margin) if candidates else ["intrinsic"]
+    landmarks = common_landmarks(source, target)
     if elastic:
         whole = {n: candidates[n].warp for n in names if candidates[n].warp[0].ndim == 2}
         names = [name for name in names if name not in whole]  # by parts
-        for name, X in elastic_surfaces(source, target, whole).items():
+        for name, X in elastic_surfaces(source, target, whole, landmarks).items():
             part = joint.nearest_vertices(M, N, X, N.near_coarse)
             ends[f"{name}+elastic"] = joint.registration_score(M, N, part, X), X
     for name in names:
@@ -364,7 +365,9 @@ def register_surface(
             warp = joint.warp_after(M, N, part, *placed) if placed else joint.fit_warp(M, N, part)
         else:
             part, warp = joint.dense_rounds(M, N, candidates[name].warp)
-        X = after_local_rounds(source, target, warp) if elastic else joint.move(N, warp)
+        X = joint.move(N, warp)
+        if elastic:
+            X = after_local_rounds(source, target, warp, landmarks)
         if elastic:  # here by parts
             part = joint.nearest_vertices(M, N, X, N.near_coarse)
             name = f"{name}+local"
@@ -378,7 +381,10 @@ def register_surface(
 
 
 def elastic_surfaces(
-    source: Shape, target: Shape, starts: dict[str, joint.Warp]
+    source: Shape,
+    target: Shape,
+    starts: dict[str, joint.Warp],
+    landmarks: Landmarks | None = None,
 ) -> dict[str, np.ndarray]:
     """The template ``(n_target, 3)`` after elastic rounds from several starts, and local ones.
 
@@ -388,20 +394,40 @@ def elastic_surfaces(
     met: dict[str, np.ndarray] = {}  # name -> template (n_low, 3) after the first step
     surfaces = {}
     for name, start in starts.items():
-        warp = elastic_rounds(M, N, start, steps=slice(0, 1))
+        warp = elastic_rounds(M, N, start, steps=slice(0, 1), landmarks=landmarks)
         X = joint.move(N, warp)
         if any(np.linalg.norm(X - other, axis=1) @ N.area < SAME for other in met.values()):
             continue
         met[name] = X
-        warp = elastic_rounds(M, N, warp, steps=slice(1, None))
-        surfaces[name] = after_local_rounds(source, target, warp)
+        warp = elastic_rounds(M, N, warp, steps=slice(1, None), landmarks=landmarks)
+        surfaces[name] = after_local_rounds(source, target, warp, landmarks)
     return surfaces
 
 
-def after_local_rounds(source: Shape, target: Shape, warp: joint.Warp) -> np.ndarray:
+def common_landmarks(source: Shape, target: Shape) -> Landmarks | None:
+    """The landmarks that both shapes have by name; None where there are none."""
+    names, at_source = source.landmarks
+    names_target, at_target = target.landmarks
+    common = [name for name in names_target if name in names]
+    if not common:
+        return None
+    B = at_target[[names_target.index(name) for name in common]]  # (l, n_target)
+    y = at_source[[names.index(name) for name in common]] @ source.full.X
+    N = target.full
+    none = np.zeros((0, 3), int)
+    return Landmarks(Basis(B @ N.X, none, B @ N.area, target.low.Phi, U=B @ target.U), y)
+
+
+def after_local_rounds(
+    source: Shape, target: Shape, warp: joint.Warp, landmarks: Landmarks | None = None
+) -> np.ndarray:
     """The template ``(n_target, 3)`` after a warp, by parts or not, and local rounds."""
     low = target.low_on_surface
-    d = local_rounds(source.full, low, target.W, joint.move(low, warp))
+    pull = None
+    if landmarks is not None:
+        at, y = landmarks
+        pull = at.U, y - joint.move(at, warp)
+    d = local_rounds(source.full, low, target.W, joint.move(low, warp), pull=pull)
     return joint.move(target.full, warp) + target.U @ d
 
 

@@ -4,7 +4,7 @@ Every step of the method takes shapes, or the :class:`Basis` of one at one resol
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -64,6 +64,8 @@ class Basis:
         Whether Phi has a row for each of the n vertices although there is U.
     surface_normals : float ndarray (n, 3), optional
         Unit normals of the finer surface that the vertices are of; by default those of the mesh.
+    landmarks : dict of str to int
+        The vertex at each landmark that was given, or nearest to it.
     """
 
     X: np.ndarray
@@ -77,6 +79,7 @@ class Basis:
     area_weighted: bool = True
     lifted: bool = False
     surface_normals: np.ndarray | None = None
+    landmarks: dict[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.mass is None:
@@ -251,6 +254,22 @@ class Shape:
         )
 
     @cached_property
+    def landmarks(self) -> tuple[list[str], sp.csr_matrix]:
+        """Names of the landmarks that guide, and barycentric weights ``(l, n)`` of each."""
+        mesh = self.original
+        if "guide_triangle" not in mesh:
+            return [], sp.csr_matrix((0, mesh.sizes["vertex"]))
+        _, T = as_arrays(mesh)
+        names = mesh["guide_name"].values.tolist()
+        columns = T[mesh["guide_triangle"].values]  # (l, 3)
+        weights = mesh["guide_barycentric"].values
+        rows = np.repeat(np.arange(len(names)), 3)
+        weights = sp.csr_matrix(
+            (weights.ravel(), (rows, columns.ravel())), (len(names), mesh.sizes["vertex"])
+        )
+        return names, weights
+
+    @cached_property
     def cell(self) -> np.ndarray:
         """The coarse vertex that weighs most at each original vertex ``(n,)``.
 
@@ -270,7 +289,10 @@ class Shape:
         Phi = self.coarse["eigenfunction"].values
         eigenvalue = self.coarse["eigenvalue"].values
         mass = unit_mass(self.coarse) if self.is_sampled else None
-        return Basis(self.to_frame(X), T, area / area.sum(), Phi, eigenvalue, mass)
+        landmarks = vertices_of_landmarks(self.coarse)
+        return Basis(
+            self.to_frame(X), T, area / area.sum(), Phi, eigenvalue, mass, landmarks=landmarks
+        )
 
     @cached_property
     def W(self) -> sp.csr_matrix:
@@ -317,6 +339,7 @@ class Shape:
             self.near_coarse,
             self.area_weighted,
             lifted,
+            landmarks=vertices_of_landmarks(self.original),
         )
 
     @property
@@ -352,3 +375,25 @@ class Shape:
         else:
             near = self.coarse["coarse_weight"].values.max(1)
         return np.flatnonzero(near >= np.partition(near, -n)[-n])
+
+
+def vertices_of_landmarks(mesh: xr.Dataset) -> dict[str, int]:
+    """Name -> vertex of the landmarks that guide; of those within a triangle its nearest corner."""
+    if "guide_name" not in mesh:
+        return {}
+    if "guide_vertex" in mesh:
+        vertex = mesh["guide_vertex"].values
+    else:
+        _, T = as_arrays(mesh)
+        heaviest = mesh["guide_barycentric"].values.argmax(1)
+        vertex = T[mesh["guide_triangle"].values, heaviest]
+    return dict(zip(mesh["guide_name"].values.tolist(), vertex.tolist(), strict=True))
+
+
+def corresponding_landmarks(source: Basis, target: Basis) -> tuple[np.ndarray, np.ndarray]:
+    """The vertices of source and target ``(l,)`` at the landmarks that both have by name."""
+    names = [name for name in target.landmarks if name in source.landmarks]
+    at_source, at_target = (
+        np.array([basis.landmarks[name] for name in names], int) for basis in (source, target)
+    )
+    return at_source, at_target

@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from s4a.geometry.align import Motion, align, motion_between, realign
 from s4a.method import fmap, network
-from s4a.method.first_map import first_map, fit_after_motion
+from s4a.method.first_map import first_map, fit_after_motion, motion_onto
 from s4a.method.latent import WIDE, consistent_zoomout
 from s4a.method.median import median_shape
 from s4a.method.register import from_latent, identity, match_functions, match_low
@@ -186,9 +186,7 @@ def build_network(
     distance = network.spectral_distance([basis.eigenvalue[:k_init] for basis in bases.values()])
     reference = names[int(np.argmin(distance.sum(1)))]
     N = bases[reference]
-    motions = {
-        name: align(M.X, M.area, N.X, N.area)[:2] for name, M in bases.items() if name != reference
-    }
+    motions = {name: motion_onto(M, N) for name, M in bases.items() if name != reference}
     motions[reference] = np.eye(3), np.zeros(3)
     pairs = [(names[i], names[j]) for i, j in network.choose_pairs(distance, n_pairs)]
     maps = map_pairs(bases, motions, pairs, k_init=k_init, init=init, ahead=ahead)
@@ -463,7 +461,7 @@ def register_shape(
     M = source.low
     N = target.low
     if start is None:
-        motion = align(M.X, M.area, N.X, N.area)[:2]
+        motion = motion_onto(M, N)
     else:
         motion = realign(M.cloud, N.cloud, start)
     bases = latent_bases(study, name, template)

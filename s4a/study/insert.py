@@ -11,11 +11,12 @@ import xarray as xr
 from joblib import delayed
 from threadpoolctl import threadpool_limits
 
-from s4a.geometry.align import align
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.input import evidence
 from s4a.input.collection import read_shapes, shape_report
+from s4a.input.landmarks import files_of_landmarks, with_landmarks
 from s4a.input.plausibility import find_warnings
+from s4a.method.first_map import motion_onto
 from s4a.method.lift import low_resolution
 from s4a.method.pca import project_scores
 from s4a.method.place import latent_of_new, nearest_spectra, place
@@ -53,6 +54,7 @@ def insert(
     study: xr.DataTree,
     shapes: Path | str | list[Any] | dict[str, Any] | xr.Dataset,
     *,
+    landmarks: Path | str | None = None,
     compare: bool = True,
     n_jobs: int | None = None,
 ) -> xr.DataTree:
@@ -69,6 +71,8 @@ def insert(
         Of :func:`s4a.analyse` or :func:`s4a.open_study`.
     shapes : path, list of paths, dict or Dataset
         See :func:`s4a.read_shapes`; a single mesh Dataset is named ``new``.
+    landmarks : path, optional
+        Folder with a file of landmarks for some or all of them, see :func:`s4a.analyse`.
     compare : bool
         Whether each new shape is compared with those of the study: unit, handedness, pose, genus,
         as :func:`s4a.read_shapes` does it; what looks wrong is named in ``/report`` and left as it
@@ -107,7 +111,7 @@ def insert(
     options = Options.from_report(study)
     template = study["registration"].attrs["template"]
     shapes = {"new": shapes} if isinstance(shapes, xr.Dataset) else shapes
-    meshes, attrs = read_new(shapes, options)
+    meshes, attrs = read_new(shapes, options, landmarks)
     if template in meshes:
         raise ValueError(f"new shapes need other names than the template, {template!r}; rename it")
     frozen = freeze(study, options)
@@ -152,7 +156,25 @@ def insert(
 
 
 def read_new(
-    shapes: Path | str | list[Any] | dict[str, Any], options: Options
+    shapes: Path | str | list[Any] | dict[str, Any],
+    options: Options,
+    landmarks: Path | str | None = None,
+) -> tuple[dict[str, xr.Dataset], dict[str, dict[str, Any]]]:
+    """The new meshes that can be used, with landmarks, and the attributes of all for the report."""
+    meshes, attrs = read_and_clean(shapes, options)
+    files = {} if landmarks is None else files_of_landmarks(landmarks, meshes)
+    for name, file in files.items():
+        try:
+            meshes[name] = with_landmarks(meshes[name], file)
+        except ValueError as error:
+            attrs[name] = attrs[name] | {"status": "excluded", "reason": str(error)}
+            del meshes[name]
+    return meshes, attrs
+
+
+def read_and_clean(
+    shapes: Path | str | list[Any] | dict[str, Any],
+    options: Options,
 ) -> tuple[dict[str, xr.Dataset], dict[str, dict[str, Any]]]:
     """The new meshes that can be used, clean, and the attributes of all for the report."""
     meshes = {}
@@ -227,7 +249,7 @@ def _insert_one(mesh, frozen, options, references):
     template = frozen.template.low
     k_init = min(options.k_init, k)
     chosen = nearest_spectra(new.eigenvalue, frozen.spectra, k_init)
-    R, t, _ = align(shape.low.X, shape.low.area, template.X, template.area)
+    R, t = motion_onto(shape.low, template)
     others = [Shape(None, frozen.coarse[j]).low for j in chosen]
     of_template, *of_others = frozen.Y[[0, *chosen]].values
     starts = [(frozen.turn[j].T @ R, np.zeros(3)) for j in chosen]

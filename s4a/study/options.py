@@ -187,6 +187,7 @@ class Options:
     template: str | None = None
     reflect: str | list[str] | None = None
     table: Path | str | None = None
+    landmarks: Path | str | None = None
     doubtful: str = "apart"
     keep_doubtful: bool = False
     seed: int = 0
@@ -206,6 +207,11 @@ class Options:
         if isinstance(self.reflect, list):
             object.__setattr__(self, "reflect", ",".join(map(str, self.reflect)))
         check_text("reflect", self.reflect)
+        if self.landmarks is not None and self.refine != "elastic":
+            raise ValueError(
+                f"landmarks pull elastic rounds, and refine={self.refine!r} makes none: "
+                "leave out one of both"
+            )
         if self.method == "scalable":
             for name, why in WITHOUT_MESH.items():
                 if getattr(self, name):

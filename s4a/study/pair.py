@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from s4a.geometry.align import align
 from s4a.method import fmap
-from s4a.method.first_map import first_map
+from s4a.method.first_map import first_map, motion_onto
 from s4a.method.lift import low_resolution
 from s4a.method.register import register, sharpen_map
 from s4a.method.shape import Shape
@@ -114,16 +113,16 @@ def match_shapes(source: Shape, target: Shape, options: Options) -> tuple[xr.Dat
     N = target.low
     k = min(options.k, M.k, N.k)
     k_init = min(options.k_init, k)
-    R, t, _ = align(M.X, M.area, N.X, N.area)
+    motion = motion_onto(M, N)
     ahead = options.ahead == "always"
-    first = first_map(M, N, (R, t), k_init=k_init, init=options.init, ahead=ahead, search=True)
+    first = first_map(M, N, motion, k_init=k_init, init=options.init, ahead=ahead, search=True)
     C, match = fmap.zoomout(M, N, first.C, k, step=options.step)
     for _ in range(options.sharpen):
         C = sharpen_map(source, target, C, source.full.Phi if source.is_lifted else None)
     starts = {"intrinsic": match, "icp": first.near}
     functions = source.functions(C.T), target.functions(np.eye(k))  # eq. 4 compares rows of both
     registration = register(
-        source, target, starts, functions, (R, t), k=k, **options.of_registration
+        source, target, starts, functions, motion, k=k, **options.of_registration
     )
     maps = dataset(fmap=C, fmap_initial=first.C, fmap_fitted=first.fitted)
     if first.landmarks is not None:

@@ -35,7 +35,16 @@ from s4a.study.options import Options, takes_options
 from s4a.study.processes import temporary_folder
 from s4a.study.report import write_report
 from s4a.study.runner import Keys, Run, Task
-from s4a.study.sources import Collection, Sources, find_sources, kept_table, of_contents
+from s4a.study.sources import (
+    Collection,
+    Marked,
+    Sources,
+    find_sources,
+    kept_table,
+    landmarks_of,
+    of_contents,
+    remarks_on_landmarks,
+)
 from s4a.study.store import (
     arrays,
     attributes,
@@ -158,6 +167,10 @@ def analyse(
         :func:`s4a.input.subjects.read_table`; they become ``/subjects``, so that
         :mod:`s4a.analysis.statistics` takes their names.  Nothing else depends on it.  Without one,
         a table given to an earlier run stays.
+    landmarks : path, optional
+        Folder with a file of landmarks for some or all shapes, named as the shape: 3D Slicer
+        (.mrk.json), CSV or MeshLab (.pp).  Those of one name guide and pull registration, see
+        :func:`s4a.with_landmarks`, which gives them to meshes in memory.
     label : int, several, or "all", optional
         The files are label volumes, see :func:`s4a.read_labels`.
     doubtful : {"apart", "stop"}
@@ -214,6 +227,7 @@ def analyse(
     sources = find_sources(shapes, settings.pattern, volumes=volumes)
     remarks = remarks_on_files(shapes, settings.pattern, volumes=volumes)
     settings.check_against(list(sources))
+    marked = landmarks_of(sources, settings.landmarks)
     subjects = None if settings.table is None else read_table(settings.table, list(sources))
     with lock(store) as claim:
         run = Run(claim, n_jobs)
@@ -221,12 +235,15 @@ def analyse(
             write(of_contents(subjects, sources), run.folder / "subjects.nc")
         else:
             remarks += kept_table(run.folder / "subjects.nc", sources)
+        remarks += remarks_on_landmarks(sources, marked)
         with run.notes.whole(), run.unforeseen_told():
-            run_steps(run, sources, settings, remarks)
+            run_steps(run, sources, marked, settings, remarks)
     return open_study(store)
 
 
-def run_steps(run: Run, sources: Sources, options: Options, remarks: list[str]) -> None:
+def run_steps(
+    run: Run, sources: Sources, marked: Marked, options: Options, remarks: list[str]
+) -> None:
     """All steps of the paper in turn; each looks up which of its files are done."""
     # what each file is made from; a key holds the keys of all before it:
     #
@@ -235,8 +252,8 @@ def run_steps(run: Run, sources: Sources, options: Options, remarks: list[str]) 
     #   network/sketch_*, look_*  latent/* of those apart -> registration/* <- registration
     #                                                     |
     #                                                pca, report
-    reflected, of_hands = choose_reflected(run, sources, options)
-    original = read_and_clean(run, sources, options, reflected)
+    reflected, of_hands = choose_reflected(run, sources, marked, options)
+    original = read_and_clean(run, sources, marked, options, reflected)
     original, doubts, told = check_plausibility(run, original, options)
     stop_at_doubts(doubts, options)
     coarse = remesh(run, original, options)
@@ -253,7 +270,9 @@ def run_steps(run: Run, sources: Sources, options: Options, remarks: list[str]) 
     write_report(run, sources, options, remarks, why_no_modes, registered, doubts)
 
 
-def choose_reflected(run: Run, sources: Sources, options: Options) -> tuple[list[str], list[str]]:
+def choose_reflected(
+    run: Run, sources: Sources, marked: Marked, options: Options
+) -> tuple[list[str], list[str]]:
     """The shapes whose mirror images are taken, and what is told of the choice.
 
     Where the shapes themselves shall say (``reflect="auto"``), they are looked at as they are
@@ -269,7 +288,7 @@ def choose_reflected(run: Run, sources: Sources, options: Options) -> tuple[list
     contents = [content for _, content in sources.values()]
     key = task_key(list(sources), contents, options.of_cleaning, options.k, AUTO)
     if not is_done(file, key):
-        original = read_and_clean(run, sources, options, [])
+        original = read_and_clean(run, sources, marked, options, [])
         looks = looks_of(run, original, options) if len(original) > 1 else {}
         reflected, told = of_other_hand(looks)
         choice = dataset(
@@ -286,14 +305,20 @@ def choose_reflected(run: Run, sources: Sources, options: Options) -> tuple[list
     return reflected, told
 
 
-def read_and_clean(run: Run, sources: Sources, options: Options, reflected: list[str]) -> Keys:
-    """The shapes, cleaned, some of them mirrored (5.1): ``/original``."""
+def read_and_clean(
+    run: Run, sources: Sources, marked: Marked, options: Options, reflected: list[str]
+) -> Keys:
+    """The shapes, cleaned, with landmarks, some of them mirrored (5.1): ``/original``."""
     cleaning = options.of_cleaning
     todo = []
     for n, (source, content) in sources.items():
-        also = [True] if n in reflected else []
-        given = (source, content, cleaning, *also)
-        todo.append(Task(n, f"original/{n}.nc", clean_shape, given, (content, cleaning, *also)))
+        also: dict[str, Any] = {"reflected": True} if n in reflected else {}
+        key = (content, cleaning, *also.values())
+        if n in marked:
+            also["landmarks"] = marked[n]
+            key = (*key, marked[n][1])  # wherever the file lies
+        given = (source, content, cleaning, also)
+        todo.append(Task(n, f"original/{n}.nc", clean_shape, given, key))
     return run.do("read and clean", todo)
 
 

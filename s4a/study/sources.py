@@ -8,6 +8,7 @@ import xarray as xr
 
 from s4a.geometry.mesh import as_dataset
 from s4a.input.files import check_names, find_meshes
+from s4a.input.landmarks import files_of_landmarks
 from s4a.input.raw import read_bytes, shown
 from s4a.input.subjects import listed
 from s4a.schema import require
@@ -16,6 +17,7 @@ from s4a.study.store import read, task_key
 # files; or meshes in memory by name, Datasets or (points, triangles); or what read_shapes gives
 Collection = Path | str | list[Path | str] | dict[str, Any] | xr.DataTree
 Sources = dict[str, tuple[str | xr.Dataset, str]]  # name -> path or mesh, key of its content
+Marked = dict[str, tuple[str, str]]  # name -> file of landmarks, key of its content
 
 
 def find_sources(
@@ -81,6 +83,23 @@ def content_key(mesh: xr.Dataset) -> str:
     variables = {str(name): variable.values for name, variable in sorted(mesh.variables.items())}
     parts = [v.tolist() if v.dtype.hasobject else v for v in variables.values()]
     return task_key(list(variables), *parts)
+
+
+def landmarks_of(sources: Sources, folder: Path | str | None) -> Marked:
+    """The files of landmarks that a folder has for the shapes; none without a folder."""
+    files = {} if folder is None else files_of_landmarks(folder, sources)
+    return {name: (str(file), content_of_file(file)) for name, file in files.items()}
+
+
+def remarks_on_landmarks(sources: Sources, marked: Marked) -> list[str]:
+    """In words: which shapes have no file of landmarks, where others have one."""
+    without = [name for name in sources if name not in marked]
+    if not marked or not without:
+        return []
+    return [
+        f"{len(without)} of {len(sources)} shapes have no file of landmarks and are registered "
+        f"without: {listed(without)}"
+    ]
 
 
 def of_contents(subjects: xr.Dataset, sources: Sources) -> xr.Dataset:

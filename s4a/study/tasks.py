@@ -3,6 +3,8 @@
 A task gets paths and names, reads the files of earlier tasks, and returns the Dataset of its own.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +12,15 @@ import numpy as np
 import xarray as xr
 from tqdm.auto import tqdm
 
-from s4a.geometry.align import align, motion_between, realign
+from s4a.geometry.align import motion_between, realign
 from s4a.geometry.mesh import as_arrays, triangle_areas
 from s4a.input import evidence
 from s4a.input.clean import check_range, clean
 from s4a.input.collection import read_shape
 from s4a.input.hands import mirror_image
+from s4a.input.landmarks import guides_of, with_landmarks
 from s4a.method import steps
+from s4a.method.first_map import motion_onto
 from s4a.method.lift import low_resolution
 from s4a.method.place import latent_of_new, nearest_spectra, place
 from s4a.method.register import from_latent, identity
@@ -29,30 +33,45 @@ from s4a.study.store import arrays, attributes, open_file, read
 
 
 def clean_shape(
-    source: str | xr.Dataset, content: str, cleaning: dict[str, Any], reflected: bool = False
+    source: str | xr.Dataset, content: str, cleaning: dict[str, Any], also: dict[str, Any]
 ) -> xr.Dataset:
-    """A file read and cleaned, or a mesh in memory cleaned where it is not yet; its mirror image.
+    """A file read and cleaned, or a mesh in memory cleaned where it is not yet.
 
-    OSError where the file no longer has the content of that key, which the result would bear.
+    With landmarks, a file and the key of its content, and its mirror image where `also` says so.
+
+    OSError where a file no longer has the content of its key, which the result would bear.
     """
     mesh = cleaned(source, content, cleaning)
-    return mirror_image(mesh) if reflected else mesh
+    if "landmarks" in also:
+        file, content_of_landmarks = also["landmarks"]
+        with unchanged(file, content_of_landmarks):
+            mesh = with_landmarks(mesh, file)
+    return mirror_image(mesh) if "reflected" in also else mesh
+
+
+@contextmanager
+def unchanged(path: str, content: str) -> Iterator[None]:
+    """OSError where afterwards a file has no longer the content of that key."""
+    try:
+        yield
+    finally:
+        if content_of_file(path) != content:
+            raise OSError(f"{path} has changed or gone since the run began: start it again")
 
 
 def cleaned(source: str | xr.Dataset, content: str, cleaning: dict[str, Any]) -> xr.Dataset:
-    """:func:`clean_shape` without its mirror."""
+    """:func:`clean_shape` alone, with landmarks where a mesh in memory has some."""
     if isinstance(source, str):
-        try:
+        with unchanged(source, content):
             return read_shape(source, **cleaning)
-        finally:
-            if content_of_file(source) != content:
-                raise OSError(f"{source} has changed or gone since the run began: start it again")
     if "file_vertex" in source:
         check_range(*as_arrays(source))
         area = float(triangle_areas(*as_arrays(source)).sum())
         mesh = source.assign_attrs({"status": "ok", "reason": "", "area": area} | source.attrs)
     else:
         mesh = clean(source, **{name: cleaning[name] for name in cleaning if name != "label"})
+        if "guide_position" in source:  # its triangles are others now
+            mesh = with_landmarks(mesh, guides_of(source))
     return in_unit(mesh, source.attrs.get("unit"))
 
 
@@ -91,7 +110,7 @@ def align_shape(folder: Path, name: str, reference: str) -> xr.Dataset:
     R, t = np.eye(3), np.zeros(3)
     if name != reference:
         M, N = low_basis(folder, name), low_basis(folder, reference)
-        R, t, _ = align(M.X, M.area, N.X, N.area)
+        R, t = motion_onto(M, N)
     return dataset({"reference": reference}, rotation=R, translation=t)
 
 

@@ -28,7 +28,6 @@ from s4a import (
     transfer_scalars,
     write_mesh,
 )
-from s4a.analysis.landmarks import locate
 from s4a.analysis.link import elect
 from s4a.analysis.transfer import pair_study
 from s4a.geometry.closest import (
@@ -45,6 +44,7 @@ from s4a.input.annotations import (
     read_landmarks,
     write_landmarks,
 )
+from s4a.input.landmarks import locate
 from s4a.schema import dataset
 
 OPTIONS = {"n_coarse": 1200, "k": 60}

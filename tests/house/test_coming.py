@@ -9,6 +9,7 @@ from paths import DOCS
 
 import s4a
 from s4a.geometry.mesh import as_arrays
+from s4a.input.annotations import write_landmarks
 
 PAGES = ("coming.md", "faq.md")
 # what a page's options are made small with; the defaults are those of real meshes
@@ -33,6 +34,10 @@ def folder(tmp_path, monkeypatch):
     s4a.write_mesh(tmp_path / "new.ply", *meshes[6])
     s4a.write_mesh(tmp_path / "a.off", *meshes[0])
     s4a.write_mesh(tmp_path / "b.off", *meshes[1])
+    (tmp_path / "marks").mkdir()
+    for name, node in list(shapes.children.items())[:6]:
+        marks = node.to_dataset()[["landmark_name", "landmark_position"]]
+        write_landmarks(tmp_path / "marks" / f"head_{int(name[-2:]) - 1}.csv", marks)
     rows = [f"head_{i},{'abc'[i % 2]},{20 + i * i}" for i in range(6)]
     (tmp_path / "subjects.csv").write_text("\n".join(["shape,group,age", *rows]) + "\n")
     monkeypatch.chdir(tmp_path)

@@ -1,17 +1,25 @@
 """Landmarks and curves on a surface: where a mesh has what a file of points says (6.2, Fig. 7)."""
 
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+
 import numpy as np
 import xarray as xr
 
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays, edge_graph, edges, triangle_areas
-from s4a.input.annotations import MIRROR
+from s4a.input.annotations import MIRROR, read_landmarks
+from s4a.input.files import slug
+from s4a.input.raw import shown
 from s4a.schema import dataset, require
 
 NAMED = ("landmark_name", "landmark_curve", "landmark_closed")
 ROUNDS = 12  # halvings of a segment of a curve
 # Of sqrt(area): a landmark farther from its surface belongs to another mesh or frame.
 FARTHEST_LANDMARK = 0.03
+# of files that may be named as a shape; the longer before those that they end with
+SUFFIXES = (".landmarks.csv", ".mrk.json", ".json", ".csv", ".pp")
 
 
 def locate(
@@ -121,7 +129,7 @@ def follow(
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a.analysis.landmarks import follow
+    >>> from s4a.input.landmarks import follow
     >>> X, T = np.array([[0.0, 0, 0], [4, 0, 0], [0, 4, 0]]), np.array([[0, 1, 2]])
     >>> points, is_given = follow(X[:2], X, T, spacing=1.5)
     >>> points[:, 0].tolist(), is_given.tolist()
@@ -170,3 +178,105 @@ def trace_curves(landmarks: xr.Dataset, mesh: xr.Dataset) -> xr.Dataset:
         landmark_curve=curve[origin],
         landmark_closed=closed[origin],
     )
+
+
+def with_landmarks(mesh: xr.Dataset, landmarks: xr.Dataset | Path | str) -> xr.Dataset:
+    """A mesh that knows its landmarks, so that registration holds them together.
+
+    Landmarks are paired by name: those that two shapes have guide the rigid motion and, in far
+    poses, the first map, and pull the elastic rounds (:mod:`s4a.method.elastic`).  Points of curves
+    have no partner and are left out.
+
+    Parameters
+    ----------
+    mesh : Dataset
+        Clean, as of :func:`s4a.read_shape` or :func:`s4a.clean`.
+    landmarks : Dataset or path
+        As of :func:`s4a.input.annotations.read_landmarks`, or a file that it reads.
+
+    Returns
+    -------
+    Dataset
+        The mesh, and what :func:`locate` says as ``guide_name(guide)``, ``guide_position`` and so
+        on.  Landmarks without them (``landmark_name``) are carried over and compared, and guide
+        nothing.
+
+    Raises
+    ------
+    ValueError
+        When the file cannot be read, no landmark is left, two have one name, or one is farther from
+        the surface than 3 % of sqrt(area).
+
+    Examples
+    --------
+    >>> import s4a
+    >>> from s4a.schema import dataset
+    >>> mesh = s4a.synthetic.ellipsoid(200)
+    >>> top = dataset(landmark_name=["top"], landmark_position=mesh["position"].values[:1])
+    >>> s4a.with_landmarks(mesh, top)["guide_name"].values.tolist()
+    ['top']
+    """
+    given = landmarks if isinstance(landmarks, xr.Dataset) else read_landmarks(landmarks)
+    where = "landmarks" if isinstance(landmarks, xr.Dataset) else shown(landmarks)
+    require(given, "landmark_name", "landmark_position", what="landmarks")
+    if "landmark_curve" in given:
+        given = given.isel(landmark=given["landmark_curve"].values == "")
+        given = given.drop_vars(["landmark_curve", "landmark_closed"])
+    names = given["landmark_name"].values.tolist()
+    twice = [name for name, count in Counter(names).items() if count > 1]
+    if twice or not names:
+        raise ValueError(
+            f"{where}: landmarks of different names needed, found "
+            + (f"{twice[0]!r} {names.count(twice[0])} times" if twice else "none")
+        )
+    there = locate(given, mesh)
+    guides = {str(name).replace("landmark", "guide"): there[name].values for name in there}
+    return mesh.drop_dims("guide", errors="ignore").merge(dataset(None, **guides))
+
+
+def guides_of(mesh: xr.Dataset) -> xr.Dataset:
+    """The landmarks that guide the registration of a mesh, as :func:`with_landmarks` takes them."""
+    return dataset(
+        landmark_name=mesh["guide_name"].values, landmark_position=mesh["guide_position"].values
+    )
+
+
+def files_of_landmarks(folder: Path | str, names: Iterable[str]) -> dict[str, Path]:
+    """The file of landmarks of every shape that has one: in the folder, named as the shape is.
+
+    Parameters
+    ----------
+    folder : path
+    names : iterable of str
+        Of shapes.
+
+    Returns
+    -------
+    dict of str to Path
+
+    Raises
+    ------
+    ValueError
+        When there is no folder, no file in it is of a shape, or two are of one.
+    """
+    names = list(names)
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise ValueError(f"landmarks need a folder of files named as the shapes; found {folder}")
+    found: dict[str, Path] = {}
+    for file in sorted(folder.iterdir()):
+        plain = file.name.lower().removesuffix(".gz")
+        suffix = next((end for end in SUFFIXES if plain.endswith(end)), None)
+        if suffix is None:
+            continue
+        name = slug(file.name[: len(plain) - len(suffix)])
+        if name in found and name in names:
+            raise ValueError(f"one file of landmarks for {name} needed: {found[name]} and {file}")
+        found[name] = file
+    found = {name: found[name] for name in names if name in found}
+    if not found:
+        raise ValueError(
+            f"no file of landmarks in {shown(folder)} is named as a shape, such as "
+            f"{names[0]}.mrk.json, .csv or .pp"
+        )
+    return found
