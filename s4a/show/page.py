@@ -29,6 +29,7 @@ from s4a.show.surfaces import (
 from s4a.study.tree import left_out
 
 LARGE = 20_000  # vertices from which a page moves the low-resolution mesh
+N_LIVE = 20  # modes that a page moves: of 20,000 vertices 0.3 MB each
 N_CARRIED = 5  # shapes to which the template's colours are carried
 
 
@@ -272,12 +273,12 @@ def _live_modes(study, instead, look):
     coarse = template_coarse(study)
     if study["registration"].sizes["vertex"] <= LARGE:
         coarse = None
-    mean, T, deformation = mode_arrays(study, coarse)
+    mean, T, deformation = mode_arrays(study, coarse, N_LIVE)
     unit = study["pca"]["deformation"].attrs.get("units", "")
     state = {
         **mesh_state(mean, T, deformation),
         **look_state(color_limits(mean, T, deformation), unit, **look),
-        **score_state(study),
+        **score_state(study, N_LIVE),
         "scores": [0.0] * len(deformation),
         "colors": "normal",
         "beside": False,
@@ -288,6 +289,8 @@ def _live_modes(study, instead, look):
         "still": b"",
     }
     size = f"{len(mean):,} vertices" + ("" if coarse is None else ", low resolution")
+    if study["pca"].sizes["component"] > N_LIVE:
+        size += f", the first {N_LIVE} components"
     return PARTS.modes(state, MODES, size, instead)
 
 

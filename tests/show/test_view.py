@@ -278,6 +278,16 @@ def test_the_page_holds_the_modes_as_they_are(study, html):
     assert 'id="modes-instead"' in html.replace("'", '"')
 
 
+def test_of_many_modes_the_page_holds_the_first(study, monkeypatch):
+    monkeypatch.setattr(page, "N_LIVE", 2)
+    html = page.study_html(study)
+    state = json.loads(re.search(r'id="modes-state">(.*?)</script>', html, re.DOTALL)[1])
+    deformation = np.frombuffer(base64.b64decode(state["deformation"]["base64"]), "<f4")
+    assert (deformation == study["pca"]["deformation"].values[:2].ravel().astype("<f4")).all()
+    assert {len(scores) for scores in state["samples"]} == {len(state["ratio"])} == {2}
+    assert "the first 2 components" in html
+
+
 def test_the_page_is_the_same_every_time(study, html):
     assert page.study_html(study, title="Seven <ellipsoids>") == html
 
