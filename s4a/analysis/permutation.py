@@ -434,6 +434,65 @@ def vertex_test(
     return share, (1 + reached) / (1 + n_others), (1 + beyond) / (1 + n_others)
 
 
+def mean_test(
+    d: np.ndarray, *, n_permutations: int = 999, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Whether the mean of fields is zero, at every vertex: by changes of their signs.
+
+    The statistic is the share 0..1 of the vectors' scatter around zero that their mean has;
+    Hotelling's T^2 of one sample is (n - 1) share / (1 - share).  No change of sign changes that
+    scatter, so that the test is exact where errors are symmetric.
+
+    Parameters
+    ----------
+    d : float ndarray (n, v, k)
+        Fields of vectors, or with k = 1 of numbers.
+    n_permutations, seed : see :func:`permutation_test`
+
+    Returns
+    -------
+    share, p, p_max : float ndarray (v,)
+        As of :func:`vertex_test`.
+
+    Raises
+    ------
+    ValueError
+        When there are too few fields.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.analysis.permutation import mean_test
+    >>> d = np.random.default_rng(0).normal(size=(12, 50, 3))
+    >>> d[:, 0] += [3, 0, 0]
+    >>> bool(mean_test(d, n_permutations=199)[2].argmin() == 0)
+    True
+    """
+    n, v, k = d.shape
+    if n <= k:
+        raise ValueError(
+            f"{n} shapes are too few for a test of {k} coordinates at a vertex: {k + 1} needed, or "
+            "of='normal'"
+        )
+    E = whiten(np.asarray(d, float)).transpose(0, 2, 1).reshape(n, -1).astype(np.float32)
+
+    def explained(signs):
+        """Shares ``(b, v)`` of the means of fields with these signs ``(b, n)``."""
+        mean = (signs / np.sqrt(n)).astype(np.float32) @ E
+        return (mean.reshape(-1, k, v) ** 2).sum(1)
+
+    others, n_others = rearrangements(np.arange(n), None, n_permutations, seed, "unequal")
+    share = explained(np.ones((1, n)))[0]
+    reached = np.zeros(v, np.int64)
+    largest = np.empty(0, np.float32)
+    for batch in batched(others, max(1, int(2e7 // (v * k)))):
+        changed = explained(np.array(batch))
+        reached += (changed >= share * (1 - 1e-6)).sum(0)
+        largest = np.append(largest, changed.max(1))
+    beyond = n_others - np.searchsorted(np.sort(largest), share * (1 - 1e-6), side="left")
+    return share, (1 + reached) / (1 + n_others), (1 + beyond) / (1 + n_others)
+
+
 def batched(items: Iterator[Any], size: int) -> Iterator[list[Any]]:
     """The items in lists of at most `size`."""
     while batch := list(itertools.islice(items, size)):

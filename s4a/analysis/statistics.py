@@ -1,8 +1,8 @@
-"""Statistics of a finished study (6.1): the model, groups and variables, outliers, classes.
+"""Statistics of a finished study (6.1): the model, groups and variables, sides, outliers, classes.
 
 All take a study and give a Dataset.  What works on plain arrays is in
 :mod:`s4a.analysis.permutation` and :mod:`s4a.analysis.model`; groups and variables are in
-:mod:`s4a.analysis.effects`.
+:mod:`s4a.analysis.effects`, left and right in :mod:`s4a.analysis.asymmetry`.
 
 To add a statistic:
 
@@ -22,6 +22,7 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
+from s4a.analysis.asymmetry import asymmetry, asymmetry_modes, symmetry
 from s4a.analysis.effects import (
     check_permutations,
     group_map,
@@ -43,6 +44,8 @@ if TYPE_CHECKING:
     from sklearn.base import ClassifierMixin
 
 __all__ = [
+    "asymmetry",
+    "asymmetry_modes",
     "classify",
     "evaluate",
     "generalization",
@@ -53,6 +56,7 @@ __all__ = [
     "regression",
     "regression_modes",
     "sample",
+    "symmetry",
     "with_doubtful",
 ]
 

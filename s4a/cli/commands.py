@@ -199,22 +199,12 @@ def statistics(args: Namespace) -> int:
     from s4a.analysis import statistics as tests
     from s4a.analysis.export import write_results
     from s4a.cli import tables
-    from s4a.input.decisions import listed
-    from s4a.input.subjects import with_table
     from s4a.show.page import write_page
     from s4a.show.pictures import write_animation
-    from s4a.study.tree import left_out, open_study
 
     if args.covariates and not (args.group or args.variable):
         raise ValueError("--covariates are of a test: give --group, --variable or both")
-    study, out = open_study(args.study), args.out or str(within(args.study, "statistics"))
-    study = with_table(study, args.table) if args.table else study
-    study = tests.with_doubtful(study) if args.keep_doubtful else study
-    if doubtful := left_out(study):
-        write(
-            f"{len(doubtful)} doubtful shapes are left out, --keep-doubtful takes them in: "
-            f"{listed(doubtful, 200)}\n"
-        )
+    study, out = study_to_test(args)
     results = tests_of(study, args)  # first, as options and columns may be refused
     results["evaluation"] = tests.evaluate(study, seed=args.seed)
     results["outliers"] = tests.outliers(study)
@@ -237,6 +227,48 @@ def statistics(args: Namespace) -> int:
         write_animation(moving, Path(out) / "regression.gif")
     confidence = study["registration"]["confidence"].mean().item()
     write(f"\nmean confidence of the registration {confidence:.2f}; results: {out}")
+    return 0
+
+
+def study_to_test(args: Namespace) -> "tuple[xr.DataTree, str]":
+    """The study with the table and the shapes that are asked for, and the folder of results."""
+    from s4a.analysis.inputs import with_doubtful
+    from s4a.input.decisions import listed
+    from s4a.input.subjects import with_table
+    from s4a.study.tree import left_out, open_study
+
+    study, out = open_study(args.study), args.out or str(within(args.study, "statistics"))
+    study = with_table(study, args.table) if args.table else study
+    study = with_doubtful(study) if args.keep_doubtful else study
+    if doubtful := left_out(study):
+        write(
+            f"{len(doubtful)} doubtful shapes are left out, --keep-doubtful takes them in: "
+            f"{listed(doubtful, 200)}\n"
+        )
+    return study, out
+
+
+def asymmetry(args: Namespace) -> int:
+    """How left and right differ: shares of variance, directional asymmetry, antisymmetry.
+
+    Every shape against its mirror image, or both sides of every subject.
+    """
+    from s4a.analysis import statistics as tests
+    from s4a.analysis.export import write_results
+    from s4a.cli import tables
+    from s4a.show.page import write_page
+
+    study, out = study_to_test(args)
+    options = {} if args.permutations is None else {"n_permutations": args.permutations}
+    found = tests.asymmetry(
+        study, subject=args.subject, side=args.side, of=args.of, seed=args.seed, **options
+    )
+    write_results(found, out, "asymmetry")
+    write(tables.asymmetry_table(found))
+    write("\n" + tables.significance(found, found, "directional asymmetry", study))
+    page = Path(out) / "asymmetry.html"
+    write_page(tests.asymmetry_modes(study, found), page, title="Left against right")
+    write(f"\nresults: {out}; the modes of asymmetry: {page}")
     return 0
 
 

@@ -211,6 +211,20 @@ def _statistics(add):
     add_options(add, ["n_jobs", "seed"])
 
 
+def _asymmetry(add):
+    add("study", metavar="STUDY")
+    text = "of left and right shapes: whose each is (without, every shape against its mirror image)"
+    add("--subject", metavar="COLUMN", help=text)
+    add("--side", metavar="COLUMN", help="and of which side")
+    text = "what is tested at every vertex: along the normals, or vectors (default: normal)"
+    add("--of", choices=["normal", "vector"], default="normal", help=text)
+    add("--table", metavar="FILE", help="in place of the table of the study")
+    add("--keep-doubtful", action="store_true", help="take doubtful shapes in")
+    add("--permutations", type=whole, help="changes of sign (default: 999)")
+    add("--out", metavar="DIR", help="for netCDF, CSV, the page (default: STUDY/statistics)")
+    add_options(add, ["seed"])
+
+
 def _insert(add):
     add("study", metavar="STUDY")
     add("shapes", nargs="+", metavar="SHAPE", help="mesh files, folders or globs")
@@ -269,6 +283,7 @@ FLAGS = {
     commands.demo: _demo,
     commands.view: _view,
     commands.statistics: _statistics,
+    commands.asymmetry: _asymmetry,
     commands.insert: _insert,
     commands.transfer: _transfer,
     commands.compare: _compare,

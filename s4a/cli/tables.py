@@ -509,6 +509,41 @@ def significance(whole: xr.Dataset, where: xr.Dataset, name: str, study: xr.Data
     return "\n".join(lines)
 
 
+def asymmetry_table(found: xr.Dataset) -> str:
+    """Shares of variance of left against right, how large each part is, and antisymmetry.
+
+    Parameters
+    ----------
+    found : Dataset
+        See :func:`s4a.analysis.asymmetry.asymmetry`.
+    """
+    heads = ["sum_of_squares", "degrees_of_freedom", "mean_square", "variance_share", "f_ratio"]
+    rows = [
+        [term.item(), *(f"{found[head].sel(term=term).item():.4g}" for head in heads)]
+        for term in found["term"]
+    ]
+    size = found["asymmetry_size"]
+    of = f"{found.attrs['symmetry']} symmetry, {size.size} individuals"
+    if "sides" in found.attrs:
+        of += f", {found.attrs['sides']}"
+    lines = [of, table(rows, ["", *(head.replace("_", " ") for head in heads)])]
+    lines.append(
+        f"asymmetry of an individual {size.mean().item():.3g} {size.attrs['units']} on average, "
+        f"{found['fluctuating_size'].mean().item():.3g} without the directional part"
+    )
+    p = found["antisymmetry_p"].item()
+    lines.append(
+        f"antisymmetry: kurtosis {found['kurtosis'].item():.2f} along the first component, "
+        f"p = {p:.3g} that normal individuals have as low a one"
+    )
+    if "gap" in found.attrs:
+        lines.append(
+            f"the partner of a vertex's partner misses it by {100 * found.attrs['gap']:.2f} % of "
+            "sqrt(area)"
+        )
+    return "\n".join(lines)
+
+
 def classification_line(result: xr.Dataset) -> str:
     """How well groups are told apart by the scores, in words."""
     share, chance = 100 * result.attrs["balanced_accuracy"], 100 * result.attrs["chance"]
