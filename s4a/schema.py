@@ -182,6 +182,7 @@ ROWS = {
         "share of the variance at low resolution, of the matches of eq. 6, as smooth as at full"),
     "explained_variance_ratio_raw": ("component", ONE,
         "share of the variance at low resolution, of the matches as they are"),
+    "template_vertex": ("vertex", ONE, "vertex of the template that the vertex of a region is"),
     # evaluation of the model, tests and outliers (6.1)
     "compactness": ("component", INPUT2, "variance of the first components together"),
     "compactness_error": ("component", INPUT2, "its standard error"),

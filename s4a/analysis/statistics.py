@@ -36,6 +36,7 @@ from s4a.analysis.generalization import generalization
 from s4a.analysis.inputs import Values, displacements_of, group_sizes, sample_of, with_doubtful
 from s4a.analysis.model import KEPT, count_components, evaluate, leave_one_out, sample
 from s4a.analysis.permutation import indicators, smallest_p
+from s4a.analysis.restrict import with_size, within, without
 from s4a.method.pca import center_gram, gram, principal_components
 from s4a.schema import dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
@@ -58,6 +59,9 @@ __all__ = [
     "sample",
     "symmetry",
     "with_doubtful",
+    "with_size",
+    "within",
+    "without",
 ]
 
 

@@ -205,6 +205,7 @@ def statistics(args: Namespace) -> int:
     if args.covariates and not (args.group or args.variable):
         raise ValueError("--covariates are of a test: give --group, --variable or both")
     study, out = study_to_test(args)
+    study = restricted(study, args)
     results = tests_of(study, args)  # first, as options and columns may be refused
     results["evaluation"] = tests.evaluate(study, seed=args.seed)
     results["outliers"] = tests.outliers(study)
@@ -246,6 +247,29 @@ def study_to_test(args: Namespace) -> "tuple[xr.DataTree, str]":
             f"{listed(doubtful, 200)}\n"
         )
     return study, out
+
+
+def restricted(study: "xr.DataTree", args: Namespace) -> "xr.DataTree":
+    """The study of the part of what varies that is asked for."""
+    from s4a.analysis import restrict
+
+    is_part = args.size_back or args.without or args.label or args.least_confidence
+    if is_part and args.recompute:
+        raise ValueError("--recompute finds whole shapes anew: leave it out, or take all of them")
+    said = []
+    if args.size_back:
+        study = restrict.with_size(study)
+        said.append("with size given back")
+    if args.without:
+        study = restrict.without(study, args.without)
+        said.append(f"without {', '.join(args.without)}")
+    if args.label or args.least_confidence:
+        whole = study["registration"].sizes["vertex"]
+        study = restrict.within(study, args.label or None, least_confidence=args.least_confidence)
+        said.append(f"{study['registration'].sizes['vertex']} of {whole} vertices")
+    if said:
+        write("; ".join(said) + "\n")
+    return study
 
 
 def asymmetry(args: Namespace) -> int:

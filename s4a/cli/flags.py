@@ -205,6 +205,14 @@ def _statistics(add):
     text = "generalization with correspondences found anew (slow)"
     add("--recompute", action="store_true", help=text)
     add("--keep-doubtful", action="store_true", help="take doubtful shapes in")
+    text = "only vertices of the template with these labels"
+    add("--label", nargs="+", type=whole, metavar="LABEL", help=text)
+    text = "only vertices whose mean confidence is this large, 0 to 1"
+    add("--least-confidence", type=float, default=0.0, metavar="SHARE", help=text)
+    text = "nuisances: what lies along their regression is taken from all shapes"
+    add("--without", nargs="+", metavar="COLUMN", help=text)
+    text = "give size back to shapes of which --scale took it out"
+    add("--size-back", action="store_true", help=text)
     text = "of every test (default: 9999, at every vertex 999, of classes 99)"
     add("--permutations", type=whole, help=text)
     add("--out", metavar="DIR", help="for netCDF and CSV (default: STUDY/statistics)")

@@ -1,0 +1,226 @@
+"""Studies of a part of what varies (6.1): a region, without a nuisance, with size given back.
+
+Each takes a study and gives one, with modes of its own, so that every test, measure, page and panel
+takes it; the study given stays as it is.  The alignment is that of the whole shapes.
+"""
+
+import numpy as np
+import xarray as xr
+
+from s4a.analysis.inputs import Values, columns_of, covariates_of, displacements_of, registration_of
+from s4a.analysis.permutation import standardize
+from s4a.geometry.mesh import as_arrays, vertex_areas
+from s4a.input.subjects import listed
+from s4a.method.pca import gram, pca
+from s4a.schema import variable
+
+LEAST = 12  # vertices of a region
+
+
+def within(
+    study: xr.DataTree,
+    region: np.ndarray | int | list[int] | None = None,
+    *,
+    least_confidence: float = 0.0,
+) -> xr.DataTree:
+    """The study of a region of the template.
+
+    Parameters
+    ----------
+    study : DataTree
+    region : bool ndarray (vertex,), int or list of int, optional
+        Vertices of the template, as a mask; or those with this label, or one of these, of
+        ``/original/<template>``.  All by default.
+    least_confidence : float
+        Vertices whose mean ``confidence`` over the shapes is lower are left out, 0 to 1.
+
+    Returns
+    -------
+    DataTree
+        ``/registration`` with these vertices and the triangles among them, ``/pca`` of their
+        displacements, and ``/subjects`` and ``/report``; ``template_vertex`` of ``/registration``
+        says which vertex of the template each is.
+
+    Raises
+    ------
+    ValueError
+        When the mask is of another length, the template has no such label, or too few vertices or
+        triangles are left.
+
+    Examples
+    --------
+    With the ``study`` of six small brains; the right half:
+
+    >>> import s4a
+    >>> study = s4a.synthetic.example_study()
+    >>> right = study["registration"]["position"].values[:, 0] > 0
+    >>> half = s4a.statistics.within(study, right)
+    >>> half["registration"].sizes["vertex"] == right.sum()
+    np.True_
+    """
+    registration = registration_of(study)
+    keep = _mask_of(study, registration, region)
+    if least_confidence:
+        keep = keep & (registration["confidence"].mean("shape").values >= least_confidence)
+    triangles = registration["corner_vertex"].values
+    inside = keep[triangles].all(axis=1)
+    keep = np.isin(np.arange(len(keep)), triangles[inside])  # of a triangle in the region
+    if keep.sum() < LEAST:
+        raise ValueError(
+            f"a region needs at least {LEAST} vertices with triangles among them, found "
+            f"{keep.sum()} of {len(keep)}"
+        )
+    number = np.cumsum(keep) - 1
+    part = registration.drop_vars(
+        [str(name) for name, values in registration.items() if "triangle" in values.dims]
+    ).isel(vertex=keep)
+    part["corner_vertex"] = variable("corner_vertex", number[triangles[inside]])
+    part["template_vertex"] = variable("template_vertex", np.flatnonzero(keep))
+    part["vertex_area"] = variable("vertex_area", vertex_areas(*as_arrays(part)))
+    return _study(study, part)
+
+
+def _mask_of(study, registration, region):
+    """The vertices of a region, as a mask."""
+    n = registration.sizes["vertex"]
+    if region is None:
+        return np.ones(n, bool)
+    if isinstance(region, np.ndarray) and region.dtype == bool:
+        if region.shape != (n,):
+            raise ValueError(
+                f"a region needs one value for each of the template's {n} vertices, found "
+                f"{region.shape}"
+            )
+        return region
+    template = registration.attrs.get("template", "")
+    meshes = study["original"].children if "original" in study.children else {}
+    if template not in meshes or "label" not in meshes[template]:
+        raise ValueError(f"the template {template!r} has no labels; give the region as a mask")
+    label = meshes[template]["label"].values
+    wanted = np.atleast_1d(region)
+    lacking = [str(one) for one in wanted.tolist() if one not in label]
+    if lacking:
+        raise ValueError(
+            f"no vertex of the template has the label {listed(lacking)}; it has "
+            f"{listed(list(map(str, np.unique(label).tolist())), most=20)}"
+        )
+    return np.isin(label, wanted)
+
+
+def without(study: xr.DataTree, nuisance: Values | dict[str, Values] | list[str]) -> xr.DataTree:
+    """The study without a nuisance, such as how far a jaw is open: orthogonal to its regression.
+
+    With B the slopes of the displacements on the nuisance (least squares), what lies along B is
+    taken from every displacement.  What is left has no slope on the nuisance, and its modes are
+    orthogonal to B under the vertex areas.  Other variation along B is gone as well; to account for
+    a variable in a test alone, give it as ``covariates``.
+
+    Parameters
+    ----------
+    study : DataTree
+    nuisance : as ``covariates`` of :func:`s4a.statistics.group_test`
+
+    Returns
+    -------
+    DataTree
+        ``/registration`` with what is left as ``displacement``, ``/pca``, ``/subjects`` and
+        ``/report``.
+
+    Raises
+    ------
+    ValueError
+        When a shape has no value, or the nuisance is constant.
+
+    Examples
+    --------
+    With the ``study`` of six small brains; without the first mode:
+
+    >>> import numpy as np
+    >>> import s4a
+    >>> study = s4a.synthetic.example_study()
+    >>> first = study["pca"]["score"].values[:, 0]
+    >>> rest = s4a.statistics.without(study, first)
+    >>> bool(abs(np.corrcoef(rest["pca"]["score"].values.T, first)[-1, :-1]).max() < 1e-3)
+    True
+    """
+    registration, d, area = displacements_of(study)
+    columns = covariates_of(study, nuisance)
+    Z, _ = columns_of(columns)
+    if Z is None or not np.isfinite(Z).all():
+        raise ValueError("a nuisance needs a value for every shape")
+    U, S, _ = np.linalg.svd(standardize(Z)[0], full_matrices=False)
+    U = U[:, S > 1e-8]
+    if not U.shape[1]:
+        raise ValueError("the nuisance is constant: there is nothing to be without")
+    mean = d.mean(0)
+    around = (d - mean).astype(float)
+    B = np.einsum("sr,snx->rnx", U, around)  # slopes, up to their scale
+    root, V = np.linalg.eigh(gram(B, area))
+    keep = root > 1e-12 * root.max()
+    basis = np.einsum("rk,rnx->knx", V[:, keep] / np.sqrt(root[keep]), B)
+    along = np.einsum("snx,knx,n->sk", around, basis, area, optimize=True)
+    left = mean + around - np.einsum("sk,knx->snx", along, basis)
+    part = registration.drop_vars(
+        [str(name) for name in registration if str(name).startswith("displacement_")]
+    )
+    part["displacement"] = registration["displacement"].copy(data=left.astype(d.dtype))
+    return _study(study, part)
+
+
+def with_size(study: xr.DataTree) -> xr.DataTree:
+    """The study with size given back to shapes that were aligned with it taken out.
+
+    Boas coordinates (Bookstein 2021): a shape that x -> s R x + t made as large as the template is
+    divided by its s around the centre of the template.
+
+    Parameters
+    ----------
+    study : DataTree
+        Of :func:`s4a.analyse` with ``scale=True``.
+
+    Returns
+    -------
+    DataTree
+        ``/registration``, ``/pca``, ``/subjects`` and ``/report``; every ``scale`` is 1.
+
+    Raises
+    ------
+    ValueError
+        When size was not taken out.
+
+    Examples
+    --------
+    With the ``study`` of six small brains, which kept their sizes:
+
+    >>> import s4a
+    >>> s4a.statistics.with_size(s4a.synthetic.example_study())
+    Traceback (most recent call last):
+    ValueError: size was not taken out of these displacements: it is in them (scale=False)
+    """
+    registration = registration_of(study)
+    s = registration["scale"].values
+    if abs(s - 1).max() < 1e-9:
+        raise ValueError(
+            "size was not taken out of these displacements: it is in them (scale=False)"
+        )
+    X, T = as_arrays(registration)
+    area = vertex_areas(X, T)
+    center = area @ X / area.sum()
+    d = registration["displacement"].values
+    sized = (X + d - center) / s[:, None, None] + center - X
+    part = registration.drop_vars(
+        [str(name) for name in registration if str(name).startswith("displacement_")]
+    )
+    part["displacement"] = registration["displacement"].copy(data=sized.astype(d.dtype))
+    part["scale"] = registration["scale"].copy(data=np.ones_like(s))
+    return _study(study, part)
+
+
+def _study(study, registration):
+    """A study of a registration, with modes of its own and the tables of the one it is from."""
+    modes = pca(registration, vertex_areas(*as_arrays(registration)))
+    nodes = {"/registration": registration, "/pca": modes}
+    for name in ("subjects", "report"):
+        if name in study.children:
+            nodes[f"/{name}"] = study[name].to_dataset()
+    return xr.DataTree.from_dict(nodes, name=study.name)

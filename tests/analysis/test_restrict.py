@@ -1,0 +1,146 @@
+"""Parts of what varies (6.1): a region, without a nuisance, with size given back."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from s4a import analyse, cli, statistics, synthetic
+from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
+from s4a.method.pca import gram, pca
+from s4a.schema import dataset
+
+X, T = as_arrays(synthetic.ellipsoid(400))
+TOP = X[:, 2] > 0.3
+
+
+def study_of(d, **columns):
+    """A study of given displacements (s, n, 3), with labels of the template."""
+    names = [f"shape_{i:02d}" for i in range(len(d))]
+    mesh = as_dataset(X, T, {"template": names[0]}).merge(dataset(displacement=d))
+    mesh["confidence"] = ("shape", "vertex"), np.tile(np.where(TOP, 0.9, 0.2), (len(d), 1))
+    mesh["scale"] = ("shape",), np.ones(len(d))
+    mesh = mesh.assign_coords(shape=names)
+    table = xr.Dataset({n: ("shape", v) for n, v in columns.items()}, {"shape": names})
+    original = as_dataset(X, T).merge(dataset(label=np.where(TOP, 7, 3)))
+    nodes = {"registration": mesh, "subjects": table, f"original/{names[0]}": original}
+    return xr.DataTree.from_dict(nodes | {"pca": pca(mesh, vertex_areas(X, T))})
+
+
+def noise(seed, s, size=0.1):
+    """Smooth random fields (s, n, 3)."""
+    rng = np.random.default_rng(seed)
+    k, phase = rng.normal(size=(10, 3)), rng.uniform(0, 6, 10)
+    return size * np.einsum("swx,nw->snx", rng.normal(size=(s, 10, 3)), np.cos(X @ k.T + phase))
+
+
+@pytest.fixture(scope="module")
+def planted():
+    """Twenty shapes: groups differ above, age moves all, as strongly as nothing else."""
+    rng = np.random.default_rng(0)
+    group = np.repeat(["a", "b"], 10)
+    age = rng.permutation(20).astype(float)
+    d = noise(1, 20) + 0.05 * (group == "b")[:, None, None] * TOP[:, None] * X
+    return study_of(d + 0.05 * age[:, None, None] * X * [1, 0, 0], group=group, age=age)
+
+
+def test_a_region_has_its_vertices_their_displacements_and_modes_of_its_own(planted):
+    part = statistics.within(planted, TOP)
+    mesh = part["registration"].to_dataset()
+    vertex = mesh["template_vertex"].values
+    assert set(vertex) <= set(np.flatnonzero(TOP))
+    assert len(vertex) > 0.95 * TOP.sum()
+    assert np.array_equal(mesh["position"].values, X[vertex])
+    whole = planted["registration"]["displacement"].values
+    assert np.array_equal(mesh["displacement"].values, whole[:, vertex])
+    triangles = vertex[mesh["corner_vertex"].values]
+    assert {tuple(t) for t in triangles} == {tuple(t) for t in T[TOP[T].all(axis=1)]}
+    expected = pca(mesh, vertex_areas(*as_arrays(mesh)))
+    assert part["pca"].to_dataset().equals(expected)
+    labelled = statistics.within(planted, 7)
+    assert labelled["registration"].equals(part["registration"])
+    sure = statistics.within(planted, least_confidence=0.5)
+    assert sure["registration"].equals(part["registration"])
+    assert statistics.within(planted)["registration"].sizes["vertex"] == len(X)
+
+
+def test_an_effect_is_found_in_its_region_and_not_in_the_other(planted):
+    options = {"covariates": ["age"], "n_permutations": 199}
+    inside, outside = (
+        statistics.group_test(statistics.within(planted, label), "group", **options)["p_value"]
+        for label in (7, 3)
+    )
+    assert inside <= 0.05 < outside
+    found = statistics.group_map(statistics.within(planted, 7), "group", **options)
+    assert found.sizes["vertex"] == statistics.within(planted, 7)["registration"].sizes["vertex"]
+
+
+@pytest.mark.parametrize(
+    "region, words",
+    [
+        (TOP[:-1], "one value for each of the template's 400 vertices, found .399,."),
+        (9, "no vertex of the template has the label 9; it has 3, 7"),
+        (np.arange(400) < 3, "at least 12 vertices with triangles among them, found"),
+    ],
+)
+def test_a_region_that_is_none_is_an_error(planted, region, words):
+    with pytest.raises(ValueError, match=words):
+        statistics.within(planted, region)
+
+
+def test_without_a_nuisance_nothing_follows_it_and_no_mode_lies_along_it(planted):
+    rest = statistics.without(planted, "age")
+    fit = statistics.regression(planted, "age", n_permutations=9)
+    after = statistics.regression(rest, "age", n_permutations=99)
+    assert abs(after["effect"]).max() < 1e-6 * abs(fit["effect"]).max()
+    assert after["p_value"] > 0.9
+    area = vertex_areas(X, T) / vertex_areas(X, T).sum()
+    modes = rest["pca"]["deformation"].values
+    along = np.einsum("cnx,nx,n->c", modes, fit["effect"].values, area)
+    size = np.sqrt(np.einsum("nx,nx,n->", fit["effect"].values, fit["effect"].values, area))
+    assert abs(along).max() < 1e-6 * size
+    assert planted["pca"]["explained_variance_ratio"].values[0] > 0.5
+    two = statistics.without(planted, ["age", "group"])
+    assert (
+        gram(two["registration"]["displacement"].values, area).trace()
+        < gram(rest["registration"]["displacement"].values, area).trace()
+    )
+    with pytest.raises(ValueError, match="the nuisance is constant"):
+        statistics.without(planted, np.ones(20))
+    with pytest.raises(ValueError, match="a value for every shape"):
+        statistics.without(planted, [np.nan, *range(19)])
+
+
+def test_size_that_was_taken_out_is_given_back():
+    brains = synthetic.brains(5, 300, seed=1)
+    shapes = {
+        name: as_arrays(node.to_dataset()) for name, node in brains["original"].children.items()
+    }
+    shapes = {name: (Y * (1 + 0.1 * i), S) for i, (name, (Y, S)) in enumerate(shapes.items())}
+    options = {"n_coarse": 120, "k": 12, "k_init": 8, "n_jobs": 1, "intersections": False}
+    options |= {"template": "brain_01", "keep_doubtful": True}
+    scaled = analyse(shapes, scale=True, **options)
+    back = statistics.with_size(scaled)
+    kept = analyse(shapes, scale=False, **options)
+
+    def radius(study):
+        mesh = study["registration"].to_dataset()
+        Y = mesh["position"].values + mesh["displacement"].values
+        return np.sqrt(((Y - Y.mean(1, keepdims=True)) ** 2).sum(-1).mean(1))
+
+    assert np.ptp(radius(scaled)) < 0.1 * np.ptp(radius(kept))
+    np.testing.assert_allclose(radius(back), radius(kept), rtol=0.02)
+    assert back["pca"]["explained_variance_ratio"].values[0] > 0.8
+    with pytest.raises(ValueError, match="size was not taken out"):
+        statistics.with_size(kept)
+
+
+def test_the_command_takes_a_region_and_a_nuisance(study_folder, tmp_path, capsys):
+    table = tmp_path / "table.csv"
+    with open(table, "w") as file:
+        names = [path.stem for path in sorted((study_folder / "original").glob("*.nc"))]
+        file.write("shape,age\n" + "\n".join(f"{n},{20 + i**2}" for i, n in enumerate(names)))
+    command = ["statistics", str(study_folder), "--table", str(table), "--out", str(tmp_path / "o")]
+    assert cli.main([*command, "--without", "age", "--least-confidence", "0.2"]) == 0
+    assert "without age" in capsys.readouterr().out
+    assert cli.main([*command, "--label", "999"]) == 2
+    assert "no vertex of the template has the label 999" in capsys.readouterr().err
