@@ -1,4 +1,7 @@
-"""Exercises: what is missing or wrong is told, what is right passes."""
+"""Exercises, quizzes and pictures of the course.
+
+What is missing or wrong is told, what is right passes.
+"""
 
 import io
 import re
@@ -8,11 +11,15 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from s4a.course import check, slide
+from s4a.course import check, diagrams, judge, quiz, slide, takeaway
+from s4a.course.exercises import EXERCISES
+from s4a.course.quizzes import SOURCE, Quiz, read
+from s4a.method.latent import consistency_form
+from s4a.show.charts import matrices, variance
 
 
 def test_an_open_exercise_says_what_to_do_and_hints():
-    said = check(..., 3, "count them")
+    said = judge(..., 3, "count them")
     assert re.fullmatch(r"No answer yet: .*dots.* Hint: count them\.", said)
 
 
@@ -29,7 +36,7 @@ def test_an_open_exercise_says_what_to_do_and_hints():
     ],
 )
 def test_a_right_answer_passes(answer, expected):
-    assert check(answer, expected) == "Right."
+    assert judge(answer, expected) == "Right."
 
 
 @pytest.mark.parametrize(
@@ -49,12 +56,12 @@ def test_a_right_answer_passes(answer, expected):
 )
 def test_a_wrong_answer_fails_with_itself_and_the_hint(answer, expected):
     with pytest.raises(AssertionError, match=r"Not yet: the answer is .+ Hint: look again\."):
-        check(answer, expected, "look again")
+        judge(answer, expected, "look again")
 
 
 def test_an_array_is_told_by_its_shape():
     with pytest.raises(AssertionError, match=r"an array of shape \(2, 3\)"):
-        check(np.zeros((2, 3)), np.zeros(3))
+        judge(np.zeros((2, 3)), np.zeros(3))
 
 
 def test_a_slider_draws_its_picture_anew_without_a_cell_that_captures():
@@ -102,3 +109,122 @@ def test_an_error_of_a_slider_is_shown_and_goes_with_the_next_picture():
     assert picture.value == before
     n.value = 2
     assert message.value == ""
+
+
+def test_an_exercise_is_named_and_needs_nothing_while_it_is_open():
+    for number in EXERCISES:
+        assert re.match(r"No answer yet: .*Hint: .{10,}", check(number, ...)), number
+    assert check("06.1", 20_825) == "Right."
+    with pytest.raises(AssertionError, match="Not yet"):
+        check("06.1", 20_824)
+    with pytest.raises(KeyError):
+        check("99.1", 1)
+
+
+LESSONS = read(SOURCE.read_text(encoding="utf-8"))
+each_quiz = pytest.mark.parametrize("lesson", LESSONS)
+
+
+@each_quiz
+def test_a_quiz_has_three_questions_of_which_one_answer_is_right_and_all_say_why(lesson):
+    assert len(LESSONS[lesson]) == 3
+    for question in LESSONS[lesson]:
+        assert question.text.endswith("?")
+        assert len(question.answers) == 3
+        assert sum(answer.right for answer in question.answers) == 1
+        for answer in question.answers:
+            assert re.fullmatch(r".*\w.*[.?]", answer.text)
+            assert re.fullmatch(r".{9,}[.?]", answer.said)
+
+
+def test_the_place_of_an_answer_does_not_tell_whether_it_is_right():
+    questions = [question for lesson in LESSONS.values() for question in lesson]
+    places = [[a.right for a in question.answers].index(True) for question in questions]
+    assert min(places.count(place) for place in range(3)) > len(questions) / 6
+
+
+def test_a_quiz_is_shut_until_an_answer_is_clicked_and_needs_no_script():
+    shown = quiz("02")._repr_html_()
+    assert shown.count("<details") == shown.count("</details>") == 9
+    assert " open" not in shown
+    assert "<script" not in shown
+    assert shown.count("<b>Right.</b>") == 3
+    names = re.findall(r'name="([^"]+)"', shown)
+    assert sorted(set(names)) == ["quiz-02-1", "quiz-02-2", "quiz-02-3"], "one open at a time"
+    told = repr(quiz("02"))
+    for question in LESSONS["02"]:
+        assert question.text in told
+        assert all(answer.text in told for answer in question.answers)
+        assert not any(answer.said in told for answer in question.answers)
+
+
+def test_a_quiz_of_no_lesson_is_an_error():
+    with pytest.raises(ValueError, match=r"no quiz of lesson '77'; there are those of 00, 01"):
+        quiz("77")
+
+
+def test_a_question_is_read_from_a_task_list_and_its_signs_are_no_markup():
+    text = (
+        "# T\n\n## 01\n\nIs 1 < 2\nby `f(x)`?\n\n- [ ] *No*.\n  It is.\n- [x] Yes.\n  So it is.\n"
+    )
+    [question] = read(text)["01"]
+    assert question.text == "Is 1 < 2 by `f(x)`?"
+    assert sorted((a.text, a.right, a.said) for a in question.answers) == [
+        ("*No*.", False, "It is."),
+        ("Yes.", True, "So it is."),
+    ]
+    shown = Quiz("01", [question])._repr_html_()
+    assert "Is 1 &lt; 2 by <code>f(x)</code>?" in shown
+    assert "<em>No</em>." in shown
+
+
+def test_a_takeaway_has_its_pictures_side_by_side_and_none_of_them_small():
+    figures = variance([0.7, 0.3]), matrices({"C": np.eye(3)})
+    whole = takeaway("A sentence.", *figures)
+    assert whole.get_suptitle() == "A sentence."
+    boxes = [ax.get_position() for ax in whole.axes]
+    assert len(boxes) == 2
+    assert boxes[0].x1 <= boxes[1].x0
+    for ax, box in zip(whole.axes, boxes, strict=True):
+        high, wide = ax.images[0].get_array().shape[:2]
+        pixels = box.width * whole.get_figwidth() * whole.dpi
+        assert pixels > 300
+        assert pixels / (box.height * whole.get_figheight() * whole.dpi) == pytest.approx(
+            wide / high, rel=0.02
+        )
+
+
+@pytest.mark.parametrize("name", ["cotangents", "dual", "pull_back", "latent_space", "two_ways"])
+def test_no_words_of_a_diagram_lie_over_each_other_or_outside(name):
+    figure = getattr(diagrams, name)()
+    figure.canvas.draw()
+    for ax in figure.axes:
+        words = [text for text in (*ax.texts, ax.title) if text.get_text()]
+        assert words
+        boxes = [text.get_window_extent() for text in words]
+        for i, box in enumerate(boxes):
+            assert figure.bbox.x0 <= box.x0, words[i]
+            assert box.x1 <= figure.bbox.x1, words[i]
+            assert figure.bbox.y0 <= box.y0, words[i]
+            assert box.y1 <= figure.bbox.y1, words[i]
+            for j in range(i):
+                assert not box.overlaps(boxes[j]), (words[i], words[j])
+
+
+def test_the_matrix_of_the_diagram_is_the_form_of_the_latent_basis():
+    rng = np.random.default_rng(0)
+    C, Y = rng.normal(size=(3, 2, 2)), rng.normal(size=(3, 2, 2))
+    source, target = np.array([0, 1, 2]), np.array([1, 2, 0])
+    form = consistency_form(C, source, target, np.ones(3), 3)
+    rows = [text.get_text().strip("$") for text in diagrams.latent_space().axes[1].texts]
+    blocks = [row for row in rows if not row.startswith("Y")]
+    names = {"C_{12}": C[0], "C_{23}": C[1], "C_{31}": C[2]}
+
+    def value(block):
+        name = re.search(r"C_\{\d\d\}", block)[0]
+        if block.startswith("-"):
+            return -(names[name].T if "^T" in block else names[name])
+        return names[name].T @ names[name] + np.eye(2)
+
+    L = np.block([[value(block) for block in blocks[3 * i : 3 * i + 3]] for i in range(3)])
+    np.testing.assert_allclose(L @ Y.reshape(6, 2), form(Y.reshape(6, 2)), atol=1e-12)

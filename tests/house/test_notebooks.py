@@ -12,7 +12,10 @@ import subprocess
 import time
 
 import pytest
-from paths import NOTEBOOKS, ROOT
+from paths import DOCS, NOTEBOOKS, ROOT
+
+from s4a.course import quiz
+from s4a.course.exercises import EXERCISES
 
 nbformat = pytest.importorskip("nbformat")
 nbclient = pytest.importorskip("nbclient")
@@ -166,6 +169,77 @@ def test_no_slider_captures_output_for_which_a_client_may_wait_without_end(path)
             assert not re.search(r"\binteract\w*\(|\bOutput\(", cell.source), "s4a.course.slide"
 
 
+def lesson(path):
+    """Its number, as its name begins."""
+    return path.name[:2]
+
+
+def prose(notebook):
+    """What is read of a lesson: its text without solutions, formulas, code and addresses."""
+    texts = [
+        cell.source
+        for cell in notebook.cells
+        if cell.cell_type == "markdown" and "solution" not in tags(cell)
+    ]
+    text = re.sub(r"\$\$.*?\$\$", " ", "\n\n".join(texts), flags=re.DOTALL)
+    text = re.sub(r"\$[^$]+\$|`[^`]+`", "x", text)
+    return re.sub(r"\]\([^)]*\)", "]", text)
+
+
+@each_notebook
+def test_it_is_read_in_a_lesson_and_in_short_sentences(path):
+    text = prose(nbformat.read(path, as_version=4))
+    asked = repr(quiz(lesson(path))).replace("( )", "")
+    n_words = len(re.findall(r"\w[\w'’-]*", f"{text} {asked}"))
+    assert 800 <= n_words <= 1200, n_words
+    parts = re.split(r"(?<=[.:?!;])[\s*_)]+|\n\s*\n|\n(?:- |\d\. )", text)
+    long = [part for part in parts if len(re.findall(r"\w[\w'’-]*", part)) > 30]
+    assert long == []
+
+
+@each_notebook
+def test_it_sums_up_asks_and_has_something_to_turn(path):
+    cells = nbformat.read(path, as_version=4).cells
+    heads = [re.match(r"## .*", cell.source)[0] for cell in cells if cell.source[:3] == "## "]
+    assert heads[-4:] == ["## In three lines", "## Quiz", "## Exercises", "## Where next"]
+    [summary] = [i for i, cell in enumerate(cells) if cell.source.startswith(heads[-4])]
+    assert cells[summary].source.count("\n- ") == 3
+    assert "takeaway(" in cells[summary + 1].source
+    assert cells[summary + 3].source == f'quiz("{lesson(path)}")'
+    code = "\n".join(cell.source for cell in cells if cell.cell_type == "code")
+    turns = r"threejs\.renderer\(|\b(Modes|Median|Transfer|Correspondence)\(|\.explore\("
+    assert re.search(turns, code)
+
+
+@each_notebook
+def test_the_cell_of_an_exercise_does_not_tell_its_answer(path):
+    notebook = nbformat.read(path, as_version=4)
+    numbers = []
+    for i, _ in exercises(notebook):
+        call = notebook.cells[i].source.split(OPEN)[1].strip()
+        found = re.fullmatch(r'check\(\s*"(\d\d\.\d)", answer((?:, [\w\[\]"./()]+)*),?\s*\)', call)
+        assert found, call
+        numbers.append(found[1])
+    asked = [number for number in EXERCISES if number.startswith(lesson(path))]
+    assert numbers == asked
+
+
+@each_notebook
+def test_the_page_for_teachers_has_its_minutes(path):
+    head = nbformat.read(path, as_version=4).cells[0].source
+    minutes = re.search(r"lesson: (\d+) minutes", head)[1]
+    page = (DOCS / "teaching.md").read_text(encoding="utf-8")
+    assert re.search(rf"^\| {lesson(path)} [^|]+ \| {minutes} \| \d+ \|", page, re.MULTILINE)
+
+
 @each_notebook
 def test_the_table_of_lessons_has_it(path):
     assert f"({path.name})" in (NOTEBOOKS / "README.md").read_text(encoding="utf-8")
+
+
+def test_every_exam_question_has_its_solution():
+    page = (DOCS / "teaching.md").read_text(encoding="utf-8")
+    questions = page[page.index("## Exam questions") :].split("\n**")[1:]
+    assert [int(question.split(".")[0]) for question in questions] == [*range(1, 16)]
+    for question in questions:
+        assert re.search(r"<summary>Solution</summary>\n\n.{20,}", question), question

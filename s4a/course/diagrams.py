@@ -1,0 +1,270 @@
+"""Diagrams of the notebooks, where a picture says more than words."""
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import FancyArrowPatch, FancyBboxPatch, Polygon, Rectangle
+from scipy.spatial import Delaunay
+
+from s4a.show.charts import BLUE, GREY, LOOK, ORANGE, _figure
+from s4a.show.draw import SIGNED
+
+GREEN = "#009e73"
+SOFT = {"blue": "#cfe4f2", "orange": "#f7d9c4", "grey": "#eeeeee", "green": "#cdebe0"}
+
+
+def cotangents() -> Figure:
+    """Cotangent weights: of an edge inside, of an edge on the boundary, and a vertex's area.
+
+    Examples
+    --------
+    >>> from s4a.course.diagrams import cotangents
+    >>> len(cotangents().axes)
+    3
+    """
+    figure, ((inside, rim, area),) = _plain(3, 9.5, 3.1)
+    i, j, above, below = np.array([[0.25, 0.5], [1.0, 0.62], [0.52, 1.05], [0.78, 0.08]])
+    for ax, corners in ((inside, (above, below)), (rim, (above,))):
+        for corner, color, name in zip(corners, (BLUE, ORANGE), ("α", "β"), strict=False):
+            ax.add_patch(Polygon([i, j, corner], fc=SOFT["grey"], ec=GREY))
+            _angle(ax, corner, i, j, color, name)
+        ax.plot(*np.c_[i, j], color="black", lw=3, zorder=3)
+        for place, name in ((i, "i"), (j, "j")):
+            ax.plot(*place, "o", color="black", ms=6, zorder=4)
+            shift = [-0.07, -0.01] if name == "i" else [0.06, 0]
+            ax.text(*(place + shift), name, ha="center", va="center", fontsize=11, style="italic")
+    inside.set_title("an edge inside has two triangles")
+    inside.text(0.6, -0.12, r"$w_{ij} = \frac{1}{2}\,(\cot\alpha + \cot\beta)$", ha="center")
+    rim.set_title("an edge on the boundary has one")
+    rim.text(0.66, 0.37, "no triangle here", ha="center", color=GREY)
+    rim.text(0.6, -0.12, r"$w_{ij} = \frac{1}{2}\,\cot\alpha$", ha="center")
+    _areas_around(area)
+    for ax in (inside, rim, area):
+        ax.set(xlim=(0.08, 1.18), ylim=(-0.22, 1.15))
+        ax.set_aspect("equal")
+    return figure
+
+
+def dual(n_samples: int = 12) -> Figure:
+    """Voronoi cells of a flat mesh, where three of them meet, and the triangles of the dual.
+
+    Parameters
+    ----------
+    n_samples : int
+
+    Examples
+    --------
+    >>> from s4a.course.diagrams import dual
+    >>> [ax.get_title() for ax in dual().axes]
+    ['1. every vertex joins a sample', '2. three cells meet: a triangle', '3. ...']
+    """
+    rng = np.random.default_rng(4)
+    rows = np.stack(np.meshgrid(*2 * [np.linspace(0, 1, 30)]), -1).reshape(-1, 2)
+    inside = ((rows > 0) & (rows < 1)).all(1)
+    X = rows + inside[:, None] * rng.uniform(-0.009, 0.009, rows.shape)
+    T = Delaunay(X).simplices
+    sample = [int(np.linalg.norm(X - 0.5, axis=1).argmin())]
+    while len(sample) < n_samples:  # farthest points
+        gap = np.linalg.norm(X[:, None] - X[sample], axis=2).min(1)
+        sample.append(int(gap.argmax()))
+    cell = np.linalg.norm(X[:, None] - X[sample], axis=2).argmin(1)
+    corners = [np.unique(cell[t]) for t in T]
+    meeting = np.array([len(c) == 3 for c in corners])
+    triangles = np.unique([c for c in corners if len(c) == 3], axis=0)
+    shades = colormaps["Set3"]
+    figure, ((one, two, three),) = _plain(3, 9.5, 3.4)
+    for ax, strength in ((one, 1.0), (two, 1.0), (three, 0.35)):
+        alone = np.array([len(c) == 1 for c in corners])
+        shade = cell[T[alone, 0]]
+        ax.tripcolor(*X.T, T[alone], shade, cmap=shades, vmin=0, vmax=11, alpha=strength)
+        ax.triplot(*X.T, T, color="white", lw=0.4)
+        ax.plot(*X[sample].T, "o", color="black", ms=5, zorder=5)
+        ax.set_aspect("equal")
+    for t in T[meeting]:
+        two.add_patch(Polygon(X[t], fc="black", ec="black", zorder=4))
+    three.triplot(*X[sample].T, triangles, color=BLUE, lw=1.8, zorder=4)
+    one.set_title("1. every vertex joins a sample")
+    two.set_title("2. three cells meet: a triangle")
+    three.set_title("3. it joins the three samples")
+    return figure
+
+
+def pull_back() -> Figure:
+    """A match goes from target to source, functions go from source to target; C does the same.
+
+    Examples
+    --------
+    >>> from s4a.course.diagrams import pull_back
+    >>> len(pull_back().axes)
+    2
+    """
+    figure, ((shapes, square),) = _plain(2, 9.5, 3.1)
+    u = np.stack(np.meshgrid(*2 * [np.linspace(-1, 1, 160)]), -1)
+    inside = np.hypot(*u.transpose(2, 0, 1)) < 1
+    f = np.where(inside, np.sin(2.4 * u[..., 0] + 0.4) * np.cos(1.6 * u[..., 1]), np.nan)
+    for x, bend, name in ((0.0, 0.0, "source M"), (3.1, 0.45, "target N")):
+        X = u[..., 0] * (1 - 0.25 * bend) + x
+        Y = u[..., 1] * (1 - 0.3 * bend) + bend * (u[..., 0] ** 2 - 0.4)
+        shapes.pcolormesh(X, Y, f, cmap=SIGNED, vmin=-1.3, vmax=1.3, shading="gouraud")
+        shapes.text(x, -1.5, name, ha="center", fontsize=11)
+    y, x = np.array([3.455, 0.195]), np.array([0.4, 0.35])
+    for place, name, shift in ((y, "y", (0.14, -0.2)), (x, "T(y)", (0, -0.27))):
+        shapes.plot(*place, "o", color="black", ms=6)
+        shapes.text(*(place + shift), name, ha="center", fontsize=11, style="italic")
+    _arrow(shapes, y, x, "1. where does y come from?", bend=0.28, rise=0.62)
+    _arrow(shapes, (0.75, -0.75), (2.4, -0.75), "2. the value goes with it", bend=0.2, rise=-0.4)
+    shapes.text(-0.5, 1.1, "f", ha="center", fontsize=12, style="italic", color=BLUE)
+    shapes.text(3.5, 1.1, "f(T(y))", ha="center", fontsize=12, style="italic", color=BLUE)
+    shapes.set(xlim=(-1.2, 4.3), ylim=(-1.75, 1.6))
+    shapes.set_aspect("equal")
+    boxes = {
+        (0, 1): "f on M\nn values",
+        (2.2, 1): "f ∘ T on N\nn values",
+        (0, 0): "a\nk numbers",
+        (2.2, 0): "b = C a\nk numbers",
+    }
+    for (left, up), text in boxes.items():
+        _box(square, (left, up), text, SOFT["blue" if up else "orange"], (1.0, 0.42))
+    _arrow(square, (0.55, 1), (1.65, 1), "T", rise=0.1)
+    _arrow(square, (0.55, 0), (1.65, 0), "C", rise=0.1)
+    _arrow(square, (0, 0.76), (0, 0.24), "$\\Phi^T A$", rise=0, aside=-0.28)
+    _arrow(square, (2.2, 0.76), (2.2, 0.24), "$\\Psi^T A$", rise=0, aside=0.28)
+    square.set(xlim=(-0.7, 2.9), ylim=(-0.4, 1.5))
+    square.set_title("both ways round end at b")
+    return figure
+
+
+def latent_space() -> Figure:
+    """One space for three shapes, and the matrix whose eigenvectors are its functions.
+
+    Examples
+    --------
+    >>> from s4a.course.diagrams import latent_space
+    >>> len(latent_space().axes)
+    2
+    """
+    figure, ((star, matrix),) = _plain(2, 9.5, 3.7)
+    angle = np.deg2rad([90, 210, 330])
+    places = 1.25 * np.c_[np.cos(angle), np.sin(angle)]
+    for i, place in enumerate(places):
+        _box(star, place, f"shape {i + 1}", SOFT["blue"], (0.8, 0.3))
+        beside = [(0.2, 0), (-0.12, 0.14), (0.12, 0.14)][i]
+        ends = 0.3 * place, 0.82 * place
+        _arrow(star, *ends, f"$Y_{i + 1}$", color=ORANGE, aside=beside[0], rise=beside[1])
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        begin, end = 0.76 * places[i] + 0.24 * places[j], 0.24 * places[i] + 0.76 * places[j]
+        outwards = (begin + end) / np.linalg.norm(begin + end)
+        _arrow(star, begin + 0.12 * outwards, end + 0.12 * outwards, "", color=BLUE)
+        x, y = (begin + end) / 2 + 0.32 * outwards
+        name = f"$C_{{{i + 1}{j + 1}}}$"
+        star.text(x, y, name, ha="center", va="center", color=BLUE, fontsize=11)
+    _box(star, (0, 0), "latent\nspace", SOFT["orange"], (0.5, 0.36))
+    star.set(xlim=(-1.8, 1.8), ylim=(-1.1, 1.6))
+    star.set_aspect("equal")
+    star.set_title(r"wanted: $C_{ij}\, Y_i = Y_j$ along every arrow")
+    blocks = [
+        [r"$C_{12}^T C_{12} + I$", r"$-C_{12}^T$", r"$-C_{31}$"],
+        [r"$-C_{12}$", r"$C_{23}^T C_{23} + I$", r"$-C_{23}^T$"],
+        [r"$-C_{31}^T$", r"$-C_{23}$", r"$C_{31}^T C_{31} + I$"],
+    ]
+    for i, row in enumerate(blocks):
+        for j, text in enumerate(row):
+            color = SOFT["blue" if i == j else "grey"]
+            matrix.add_patch(Rectangle((1.3 * j, -0.7 * i), 1.3, 0.7, fc=color, ec="white", lw=2))
+            matrix.text(1.3 * j + 0.65, 0.35 - 0.7 * i, text, ha="center", va="center")
+        matrix.add_patch(Rectangle((4.3, -0.7 * i), 0.6, 0.7, fc=SOFT["orange"], ec="white", lw=2))
+        matrix.text(4.6, 0.35 - 0.7 * i, f"$Y_{i + 1}$", ha="center", va="center")
+    matrix.set(xlim=(-0.1, 5), ylim=(-1.6, 0.9))
+    matrix.set_title("the matrix L of the sum, and the stacked Y (all weights 1)")
+    return figure
+
+
+def two_ways() -> Figure:
+    """From the latent functions to a match at full resolution: the standard way, and eq. 7.
+
+    Examples
+    --------
+    >>> from s4a.course.diagrams import two_ways
+    >>> [ax.get_title() for ax in two_ways().axes]
+    ['standard: two searches and a fit', 'eq. 7: one search']
+    """
+    figure, ((standard, ours),) = _plain(2, 9.5, 3.3)
+    for ax, low in ((standard, SOFT["orange"]), (ours, SOFT["grey"])):
+        for x, name in ((0, "template"), (2.6, "shape")):
+            _box(ax, (x, 0), f"{name}, low\n$\\Phi\\, Y$", low, (1.05, 0.42))
+            up = "$U \\Phi$" if ax is standard else "$U \\Phi\\, Y$"
+            _box(ax, (x, 1.15), f"{name}, full\n{up}", SOFT["blue"], (1.05, 0.42))
+            _arrow(ax, (x, 0.25), (x, 0.9), "U", rise=0, aside=0.14)
+        ax.set(xlim=(-0.7, 3.3), ylim=(-0.45, 1.6))
+    _arrow(standard, (0.58, 0), (2.02, 0), "search: eq. 3", rise=0.1, color=ORANGE)
+    _arrow(standard, (1.3, 0.24), (1.3, 0.92), "fit C", rise=0, aside=0.27, color=ORANGE)
+    _arrow(standard, (0.58, 1.15), (2.02, 1.15), "search: eq. 4", rise=0.1, color=ORANGE)
+    _arrow(ours, (0.58, 1.15), (2.02, 1.15), "search: eq. 7", rise=0.1, color=ORANGE)
+    standard.set_title("standard: two searches and a fit")
+    ours.set_title("eq. 7: one search")
+    return figure
+
+
+def _plain(columns, width, height):
+    """Axes without frames."""
+    figure, axes = _figure(width, height, columns)
+    figure.set_dpi(120)
+    for ax in axes.flat:
+        ax.set_axis_off()
+        ax.title.set_fontsize(LOOK["axes.titlesize"])
+    return figure, axes
+
+
+def _angle(ax, corner, i, j, color, name):
+    """The angle of a triangle at a corner, opposite to the edge from i to j."""
+    ends = np.array([np.arctan2(*(p - corner)[::-1]) for p in (i, j)])
+    ends = np.unwrap(np.sort(ends))
+    if ends[1] - ends[0] > np.pi:
+        ends = np.array([ends[1], ends[0] + 2 * np.pi])
+    t = np.linspace(*ends, 30)
+    arc = corner + 0.15 * np.c_[np.cos(t), np.sin(t)]
+    ax.add_patch(Polygon([corner, *arc], fc=color, alpha=0.5, ec="none"))
+    middle = corner + 0.23 * np.array([np.cos(ends.mean()), np.sin(ends.mean())])
+    ax.text(*middle, name, color=color, ha="center", va="center", fontsize=12)
+
+
+def _areas_around(ax):
+    """A third of every triangle around a vertex."""
+    center = np.array([0.62, 0.56])
+    angle = np.deg2rad([10, 75, 130, 200, 255, 310])
+    length = np.array([0.5, 0.46, 0.52, 0.48, 0.47, 0.5])
+    ring = center + length[:, None] * np.c_[np.cos(angle), np.sin(angle)]
+    for a, b in zip(ring, np.roll(ring, -1, axis=0), strict=True):
+        ax.add_patch(Polygon([center, a, b], fc=SOFT["grey"], ec=GREY))
+        middle = (center + a + b) / 3
+        part = [center, (center + a) / 2, middle, (center + b) / 2]
+        ax.add_patch(Polygon(part, fc=BLUE, alpha=0.35, ec="none"))
+    ax.plot(*center, "o", color="black", ms=6)
+    ax.set_title("a vertex has a third of each triangle")
+    ax.text(0.6, -0.12, r"$a_i = \frac{1}{3} \sum$ areas around", ha="center")
+
+
+def _box(ax: Axes, center, text, color, size):
+    corner = np.subtract(center, np.divide(size, 2))
+    style = "round,pad=0,rounding_size=0.06"
+    ax.add_patch(FancyBboxPatch(corner, *size, boxstyle=style, fc=color, ec="none", zorder=2))
+    ax.text(*center, text, ha="center", va="center", zorder=3, fontsize=10)
+
+
+def _arrow(ax: Axes, begin, end, text, *, bend=0.0, rise=0.1, aside=0.0, color="black"):
+    """An arrow, and words beside its middle."""
+    style = f"arc3,rad={bend}"
+    arrow = FancyArrowPatch(
+        begin,
+        end,
+        arrowstyle="-|>",
+        mutation_scale=14,
+        lw=1.6,
+        color=color,
+        zorder=4,
+        connectionstyle=style,
+    )
+    ax.add_patch(arrow)
+    x, y = np.add(begin, end) / 2
+    ax.text(x + aside, y + rise, text, ha="center", va="center", color=color, fontsize=10)
