@@ -176,7 +176,7 @@ def latent_space() -> Figure:
         matrix.add_patch(Rectangle((4.3, -0.7 * i), 0.6, 0.7, fc=SOFT["orange"], ec="white", lw=2))
         matrix.text(4.6, 0.35 - 0.7 * i, f"$Y_{i + 1}$", ha="center", va="center")
     matrix.set(xlim=(-0.1, 5), ylim=(-1.6, 0.9))
-    matrix.set_title("the matrix L of the sum, and the stacked Y (all weights 1)")
+    matrix.set_title("the matrix L, and the stacked Y (weights 1)")
     return figure
 
 
