@@ -193,7 +193,7 @@ def test_it_is_read_in_a_lesson_and_in_short_sentences(path):
     n_words = len(re.findall(r"\w[\w'’-]*", f"{text} {asked}"))
     assert 800 <= n_words <= 1200, n_words
     parts = re.split(r"(?<=[.:?!;])[\s*_)]+|\n\s*\n|\n(?:- |\d\. )", text)
-    long = [part for part in parts if len(re.findall(r"\w[\w'’-]*", part)) > 30]
+    long = [part for part in parts if len(re.findall(r"\w[\w'’-]*", part)) > 25]
     assert long == []
 
 
