@@ -2,7 +2,6 @@
 
 import numpy as np
 from matplotlib import colormaps
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch, Polygon, Rectangle
 from scipy.spatial import Delaunay
@@ -61,7 +60,7 @@ def dual(n_samples: int = 12) -> Figure:
     """
     rng = np.random.default_rng(4)
     rows = np.stack(np.meshgrid(*2 * [np.linspace(0, 1, 30)]), -1).reshape(-1, 2)
-    inside = ((rows > 0) & (rows < 1)).all(1)
+    inside = np.all((rows > 0) & (rows < 1), axis=1).astype(float)
     X = rows + inside[:, None] * rng.uniform(-0.009, 0.009, rows.shape)
     T = Delaunay(X).simplices
     sample = [int(np.linalg.norm(X - 0.5, axis=1).argmin())]
@@ -103,16 +102,16 @@ def pull_back() -> Figure:
     u = np.stack(np.meshgrid(*2 * [np.linspace(-1, 1, 160)]), -1)
     inside = np.hypot(*u.transpose(2, 0, 1)) < 1
     f = np.where(inside, np.sin(2.4 * u[..., 0] + 0.4) * np.cos(1.6 * u[..., 1]), np.nan)
-    for x, bend, name in ((0.0, 0.0, "source M"), (3.1, 0.45, "target N")):
-        X = u[..., 0] * (1 - 0.25 * bend) + x
+    for left, bend, name in ((0.0, 0.0, "source M"), (3.1, 0.45, "target N")):
+        X = u[..., 0] * (1 - 0.25 * bend) + left
         Y = u[..., 1] * (1 - 0.3 * bend) + bend * (u[..., 0] ** 2 - 0.4)
         shapes.pcolormesh(X, Y, f, cmap=SIGNED, vmin=-1.3, vmax=1.3, shading="gouraud")
-        shapes.text(x, -1.5, name, ha="center", fontsize=11)
-    y, x = np.array([3.455, 0.195]), np.array([0.4, 0.35])
-    for place, name, shift in ((y, "y", (0.14, -0.2)), (x, "T(y)", (0, -0.27))):
+        shapes.text(left, -1.5, name, ha="center", fontsize=11)
+    here, there = np.array([3.455, 0.195]), np.array([0.4, 0.35])
+    for place, name, shift in ((here, "y", (0.14, -0.2)), (there, "T(y)", (0, -0.27))):
         shapes.plot(*place, "o", color="black", ms=6)
         shapes.text(*(place + shift), name, ha="center", fontsize=11, style="italic")
-    _arrow(shapes, y, x, "1. where does y come from?", bend=0.28, rise=0.62)
+    _arrow(shapes, here, there, "1. where does y come from?", bend=0.28, rise=0.62)
     _arrow(shapes, (0.75, -0.75), (2.4, -0.75), "2. the value goes with it", bend=0.2, rise=-0.4)
     shapes.text(-0.5, 1.1, "f", ha="center", fontsize=12, style="italic", color=BLUE)
     shapes.text(3.5, 1.1, "f(T(y))", ha="center", fontsize=12, style="italic", color=BLUE)
@@ -124,8 +123,8 @@ def pull_back() -> Figure:
         (0, 0): "a\nk numbers",
         (2.2, 0): "b = C a\nk numbers",
     }
-    for (left, up), text in boxes.items():
-        _box(square, (left, up), text, SOFT["blue" if up else "orange"], (1.0, 0.42))
+    for (across, up), text in boxes.items():
+        _box(square, (across, up), text, SOFT["blue" if up else "orange"], (1.0, 0.42))
     _arrow(square, (0.55, 1), (1.65, 1), "T", rise=0.1)
     _arrow(square, (0.55, 0), (1.65, 0), "C", rise=0.1)
     _arrow(square, (0, 0.76), (0, 0.24), "$\\Phi^T A$", rise=0, aside=-0.28)
@@ -222,7 +221,7 @@ def _angle(ax, corner, i, j, color, name):
     ends = np.unwrap(np.sort(ends))
     if ends[1] - ends[0] > np.pi:
         ends = np.array([ends[1], ends[0] + 2 * np.pi])
-    t = np.linspace(*ends, 30)
+    t = np.linspace(ends[0], ends[1], 30)
     arc = corner + 0.15 * np.c_[np.cos(t), np.sin(t)]
     ax.add_patch(Polygon([corner, *arc], fc=color, alpha=0.5, ec="none"))
     middle = corner + 0.23 * np.array([np.cos(ends.mean()), np.sin(ends.mean())])
@@ -245,14 +244,17 @@ def _areas_around(ax):
     ax.text(0.6, -0.12, r"$a_i = \frac{1}{3} \sum$ areas around", ha="center")
 
 
-def _box(ax: Axes, center, text, color, size):
-    corner = np.subtract(center, np.divide(size, 2))
+def _box(ax, center, text, color, size):
+    left, low = np.subtract(center, np.divide(size, 2))
     style = "round,pad=0,rounding_size=0.06"
-    ax.add_patch(FancyBboxPatch(corner, *size, boxstyle=style, fc=color, ec="none", zorder=2))
+    frame = FancyBboxPatch(
+        (left, low), size[0], size[1], boxstyle=style, fc=color, ec="none", zorder=2
+    )
+    ax.add_patch(frame)
     ax.text(*center, text, ha="center", va="center", zorder=3, fontsize=10)
 
 
-def _arrow(ax: Axes, begin, end, text, *, bend=0.0, rise=0.1, aside=0.0, color="black"):
+def _arrow(ax, begin, end, text, *, bend=0.0, rise=0.1, aside=0.0, color="black"):
     """An arrow, and words beside its middle."""
     style = f"arc3,rad={bend}"
     arrow = FancyArrowPatch(

@@ -168,8 +168,8 @@ def _loop(Y, *cycle):
 
 
 def _correlation_carried(pair, field):
-    there = transfer_scalars(pair, field.parts["left"], source="left")["right"]["field"].values
-    return np.corrcoef(there, field.parts["right"])[0, 1]
+    there = transfer_scalars(pair, field.parts["left"], source="left")["right/field"]
+    return np.corrcoef(np.asarray(there), field.parts["right"])[0, 1]
 
 
 def _moved_by_age(fit, years):

@@ -116,8 +116,8 @@ def takeaway(sentence: str, *figures: "Figure") -> "Figure":
         bottom=0,
         top=height / (height + 0.35),
     )
-    for place, picture in zip(grid, pictures, strict=True):
-        ax = whole.add_subplot(place)
+    for i, picture in enumerate(pictures):
+        ax = whole.add_subplot(grid[0, i])
         ax.imshow(picture, interpolation="lanczos")
         ax.set_axis_off()
     whole.set_dpi(150)
