@@ -1,335 +1,41 @@
-"""Surfaces as pythreejs objects, for scenes of your own: the one file that imports pythreejs.
+"""Surfaces as pythreejs objects, for scenes of your own.
 
 Every function gives pythreejs objects, which take lights, sprites, arrows, cameras and materials
 of your own; :func:`renderer` puts them into a scene that can be turned.  The panels keep a small
 renderer of their own: one WebGL context for all views of a page, picking, a keyboard cursor, and
 saved pages of some kB.  pythreejs bundles three.js of 2018, and a page shows eight scenes at once.
-
-The morph targets of that three.js stop at eight modes; a shader that reads the modes from a
-texture (:func:`modes`) does not.
 """
 
-import warnings
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 
-import anywidget
 import numpy as np
 import pythreejs as three
-import traitlets
 import xarray as xr
-from ipywidgets import widget_serialization
-from matplotlib import colormaps
 from matplotlib.colors import Colormap, to_hex
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
 from s4a.geometry.align import farthest_points
-from s4a.geometry.mesh import as_arrays, normal_sums, vertex_normals
-from s4a.method.pca import color_limits
+from s4a.geometry.mesh import as_arrays
 from s4a.schema import require
-from s4a.show.draw import (
-    CLAY,
-    OKABE_ITO,
-    SIGNED,
-    UNKNOWN,
-    Viewpoint,
-    label_colors,
-    position_colors,
-    rotation,
-)
-from s4a.show.surfaces import has, latent_match, mode_arrays, names_of, template_coarse
+from s4a.show.draw import OKABE_ITO, Viewpoint, position_colors, rotation
+from s4a.show.surfaces import has, latent_match, names_of
 from s4a.show.surfaces import surface as study_surface
+from s4a.widgets.three_modes import ModesMesh, Scores, modes
+from s4a.widgets.three_surfaces import field_colors, smooth_geometry, standard_material, surface
 
-SCRIPTS = Path(__file__).parent / "scripts"
+__all__ = [
+    "ModesMesh",
+    "Scores",
+    "correspondence",
+    "field_colors",
+    "modes",
+    "network",
+    "points",
+    "renderer",
+    "surface",
+]
 LANDMARK = OKABE_ITO[0]
-WIDTH = 2048  # texels of a row of the table of modes: a power of two, so that places are exact
-HUES = "compressed narrowed still widened expanded".split()
-HEIGHT = 4096  # rows that every graphics card takes
-LIGHTS = (  # what three.js fills in for a shader that is lit
-    "ambientLightColor directionalLights directionalShadowMap directionalShadowMatrix spotLights "
-    "spotShadowMap spotShadowMatrix rectAreaLights ltc_1 ltc_2 pointLights pointShadowMap "
-    "pointShadowMatrix hemisphereLights"
-).split()
-
-
-# ---- surfaces
-
-
-def surface(
-    mesh: xr.Dataset,
-    field: str | np.ndarray | xr.DataArray | None = None,
-    cmap: str | Colormap | None = None,
-    *,
-    limits: tuple[float, float] | None = None,
-    colors: np.ndarray | None = None,
-) -> three.Mesh:
-    """A mesh Dataset as a smooth pythreejs surface, coloured by a field.
-
-    Parameters
-    ----------
-    mesh : xarray.Dataset
-        With ``position(vertex, xyz)`` and ``corner_vertex(triangle, corner)``.
-    field : str or ndarray (vertex,) or (vertex, 3), optional
-        A value of each vertex, or the name of such a variable of the mesh: integers and booleans
-        are labels, with a colour each, other numbers go through the colour map, and three of them
-        are red, green and blue, from 0 to 1.  Where it is not finite the surface is grey.
-    cmap : str or matplotlib.colors.Colormap, optional
-        By default red, white and blue for a field of both signs, "viridis" for one of one sign.
-    limits : (float, float), optional
-        Values of the two ends of the colour map; by default those of the field, without its
-        outermost percent, and as far below zero as above for a field of both signs.
-    colors : ndarray (vertex, 3), optional
-        The former name of `field`; deprecated.
-
-    Returns
-    -------
-    pythreejs.Mesh
-
-    Raises
-    ------
-    ValueError
-        When a position is not finite or the field has not one value for each vertex.
-
-    Examples
-    --------
-    >>> import s4a
-    >>> from s4a.widgets import threejs
-    >>> mesh = s4a.synthetic.sphere(100)
-    >>> ball = threejs.surface(mesh, mesh["position"][:, 2], "magma")
-    >>> ball.geometry.attributes["color"].array.shape
-    (100, 3)
-    """
-    require(mesh, "position", "corner_vertex", what="mesh")
-    if colors is not None:
-        warnings.warn("colors is now field", DeprecationWarning, stacklevel=2)
-        field = colors
-    X, T = as_arrays(mesh)
-    _check_finite(X)
-    values = None if field is None else _field_colors(mesh, field, cmap, limits)
-    return three.Mesh(_geometry(X, T, color=values), _material(values is not None))
-
-
-def _check_finite(X):
-    if not np.isfinite(X).all():
-        wrong = (~np.isfinite(X)).any(1).sum()
-        raise ValueError(
-            f"finite positions needed, found {wrong} vertices that are not; "
-            "s4a.clean repairs the mesh"
-        )
-
-
-def _field_colors(mesh, field, cmap, limits):
-    """Colours (n, 3) of what was given as the field of a mesh."""
-    if isinstance(field, str):
-        if field not in mesh:
-            raise ValueError(
-                f"a variable of the mesh needed, found {field!r}; it has {', '.join(mesh)}"
-            )
-        field = mesh[field]
-    values, n = np.asarray(field), mesh.sizes["vertex"]
-    if values.shape not in ((n,), (n, 3)):
-        raise ValueError(
-            f"a value or a colour (3) for each of {n} vertices needed, found {values.shape}"
-        )
-    if values.ndim == 2:
-        return np.where(np.isfinite(values), np.clip(values, 0, 1), UNKNOWN)
-    if values.dtype.kind in "iub":
-        return label_colors(values.astype(int))
-    return field_colors(values, cmap, limits)
-
-
-def field_colors(
-    values: np.ndarray,
-    cmap: str | Colormap | None = None,
-    limits: tuple[float, float] | None = None,
-) -> np.ndarray:
-    """Colours ``(n, 3)`` of numbers ``(n,)``; see :func:`surface`.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from s4a.widgets.threejs import field_colors
-    >>> field_colors(np.array([0.0, 0.5, 1.0]), "gray").round().tolist()
-    [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [1.0, 1.0, 1.0]]
-    """
-    known = np.isfinite(values)
-    low, high = np.quantile(values[known], (0.01, 0.99)) if known.any() else (0.0, 1.0)
-    signed = low < 0 < high
-    if limits is not None:
-        low, high = limits
-    elif signed:
-        low, high = -max(-low, high), max(-low, high)
-    shares = np.clip((np.where(known, values, low) - low) / (high - low or 1), 0, 1)
-    colormap = colormaps.get_cmap(cmap or (SIGNED if signed else "viridis"))
-    return np.where(known[:, None], colormap(shares)[:, :3], UNKNOWN)
-
-
-def _geometry(X, T, **attributes):
-    """A geometry of vertices, triangles and what else is of each vertex; None is left out."""
-    known = {"position": X, "normal": vertex_normals(X, T)} | attributes
-    return three.BufferGeometry(
-        attributes={
-            name: three.BufferAttribute(
-                np.ascontiguousarray(values, dtype=np.float32), normalized=False
-            )
-            for name, values in known.items()
-            if values is not None
-        },
-        index=three.BufferAttribute(np.asarray(T, np.uint32).ravel(), normalized=False),
-    )
-
-
-def _material(colored):
-    look = {"vertexColors": "VertexColors"} if colored else {"color": to_hex(CLAY)}
-    return three.MeshStandardMaterial(roughness=0.7, metalness=0.05, side="DoubleSide", **look)
-
-
-# ---- modes
-
-
-class Scores(anywidget.AnyWidget):
-    """Sliders of the scores of a mesh of :func:`modes`; the kernel hears when one is let go."""
-
-    _esm = SCRIPTS / "scores.js"
-    _css = SCRIPTS / "scores.css"
-    mesh = traitlets.Instance(three.Mesh).tag(sync=True, **widget_serialization)
-
-
-class ModesMesh(three.Mesh):
-    """A pythreejs mesh whose shader moves its vertices along modes; made by :func:`modes`.
-
-    Attributes
-    ----------
-    scores : list of float
-        In standard deviations, one for each mode; set them and the shape follows.
-    sliders : Scores
-        One for each mode; they move the shape without the kernel.
-    """
-
-    scores = traitlets.List(traitlets.Float()).tag(sync=True)
-
-    def __init__(self, geometry, material, **more):
-        super().__init__(geometry, material, **more)
-        self.sliders = Scores(mesh=self)
-
-    @traitlets.validate("scores")
-    def _one_for_each_mode(self, proposal):
-        n = int(self.material.defines["MODES"])
-        if len(proposal["value"]) != n:
-            raise traitlets.TraitError(f"{n} scores needed, found {len(proposal['value'])}")
-        return proposal["value"]
-
-
-def modes(
-    study: xr.DataTree,
-    *,
-    n_modes: int | None = 10,
-    resolution: str = "full",
-    colored: bool = True,
-) -> ModesMesh:
-    """The mean shape of a study, which its scores deform in the browser (6.1).
-
-    A shader adds up X + sum_k score_k mode_k: the modes are sent once, and a step of a slider is
-    no message to the kernel.  Normals follow the modes to first order.
-
-    Parameters
-    ----------
-    study : xarray.DataTree
-        With ``/registration`` and ``/pca``.
-    n_modes : int, optional
-        How many modes at most; None for all.
-    resolution : {"full", "coarse"}
-        Which vertices of the template.
-    colored : bool
-        Whether the surface is coloured by its displacement along the mean's normals, blue where it
-        expands and red where it is compressed.
-
-    Returns
-    -------
-    ModesMesh
-        A pythreejs Mesh with ``scores`` and, to be displayed beside its scene,
-        ``sliders``.  ``ipywidgets.jsdlink((panel.view, "scores"), (mesh, "scores"))`` lets it
-        follow a :class:`s4a.widgets.Modes` of as many modes, in the browser.  A pythreejs Picker
-        finds it where the mean is.
-
-    Raises
-    ------
-    ValueError
-        When the study has no modes, or there are too many numbers for a texture.
-
-    Examples
-    --------
-    >>> import s4a
-    >>> from s4a.widgets import threejs
-    >>> mesh = threejs.modes(s4a.synthetic.example_study())
-    >>> mesh.scores = [2.0, *mesh.scores[1:]]
-    >>> view = threejs.renderer(mesh)  # in a notebook, display(view, mesh.sliders)
-    """
-    if not (has(study, "registration/position") and has(study, "pca/deformation")):
-        raise ValueError("a study with /registration and /pca needed, as of s4a.analyse")
-    if resolution not in ("full", "coarse"):
-        raise ValueError(f"resolution needs full or coarse, found {resolution!r}")
-    coarse = template_coarse(study) if resolution == "coarse" else None
-    if resolution == "coarse" and coarse is None:
-        raise ValueError("the study has no low resolution of its template; take the full one")
-    mean, T, deformation = mode_arrays(study, coarse, n_modes)
-    table, bends = _mode_table(mean, T, deformation)
-    limit = color_limits(mean, T, deformation)[0]
-    hues = dict(zip(HUES, map(to_hex, SIGNED(np.linspace(0, 1, len(HUES)))), strict=True))
-    slots = -(-len(deformation) // 5) * 5  # pythreejs takes lists of 2, 3, 4, 9 and 16 for vectors
-    uniforms = hues | {
-        "size": [WIDTH, len(table)],
-        "scores": [0.0] * slots,
-        "bends": [*bends.tolist(), *[0.0] * (slots - len(bends))],
-        "limit": limit,
-        "colored": float(colored),
-        "diffuse": to_hex(CLAY),
-        "specular": "#111111",
-        "emissive": "#000000",
-        "shininess": 30.0,
-        "opacity": 1.0,
-        # pythreejs gives its textures, whatever their names, to the last uniform
-        "table": three.DataTexture(table, format="RGBAFormat", type="FloatType"),
-    }
-    material = three.ShaderMaterial(
-        uniforms={name: {"value": None} for name in LIGHTS}
-        | {name: {"value": value} for name, value in uniforms.items()},
-        vertexShader=(SCRIPTS / "modes.vert").read_text(encoding="utf-8"),
-        fragmentShader=(SCRIPTS / "modes.frag").read_text(encoding="utf-8"),
-        defines={"MODES": str(len(deformation)), "SLOTS": str(slots)},
-        lights=True,
-        side="DoubleSide",
-    )
-    geometry = _geometry(mean, T, row=np.arange(len(mean)))
-    return ModesMesh(geometry, material, scores=[0.0] * len(deformation), frustumCulled=False)
-
-
-def _mode_table(mean, T, deformation):
-    """The texture (rows, 2048, 4) of modes and of how they bend the normals, and of what size.
-
-    The change of a normal is the derivative of their sum by the score, as a share of that sum's
-    length; 127 steps on each side of nothing, the last of which are `bends`.
-    """
-    c, n = deformation.shape[:2]
-    rows = -(-n * c // WIDTH)
-    if rows > HEIGHT:
-        raise ValueError(
-            f"at most {WIDTH * HEIGHT // n} modes of {n} vertices fit into a texture, found {c}; "
-            "give n_modes, or resolution='coarse'"
-        )
-    area = np.linalg.norm(normal_sums(mean, T), axis=1)[:, None]
-    area = np.maximum(area, np.finfo(float).tiny)
-    table = np.zeros((rows * WIDTH, 4), np.float32)
-    bends = np.empty(c)
-    for k, step in enumerate(deformation):
-        change = normal_sums(mean + step, T) - normal_sums(mean - step, T)  # exact: quadratic
-        change /= 2 * area
-        bends[k] = np.quantile(np.abs(change).max(1), 0.999) or 1.0
-        levels = np.clip(np.round(127 * change / bends[k]), -127, 127) + 127  # 0 .. 254
-        table[k : n * c : c, :3] = step
-        table[k : n * c : c, 3] = levels @ [1, 256, 65536]
-    return table.reshape(rows, WIDTH, 4), bends
 
 
 # ---- points, correspondences, networks
@@ -467,8 +173,8 @@ def correspondence(
         # around the origin, where pythreejs first looks, whatever the target of its controls
         position=(-(both.max(0) + both.min(0)) / 2).tolist(),
         children=[
-            three.Mesh(_geometry(X, S, color=colors), _material(True)),
-            three.Mesh(_geometry(Y, T, color=colors[match]), _material(True)),
+            three.Mesh(smooth_geometry(X, S, color=colors), standard_material(True)),
+            three.Mesh(smooth_geometry(Y, T, color=colors[match]), standard_material(True)),
             lines,
         ],
     )
@@ -536,7 +242,10 @@ def network(
     for place, (name, (X, T)) in zip(places, surfaces.items(), strict=True):
         centred = X - (X.max(0) + X.min(0)) / 2
         body = three.Mesh(
-            _geometry(centred, T), _material(False), position=place.tolist(), name=name
+            smooth_geometry(centred, T),
+            standard_material(False),
+            position=place.tolist(),
+            name=name,
         )
         if names:
             body.add(_name(name, [0, 0, 0.7 * size], 0.15 * size, hidden=False))

@@ -12,6 +12,7 @@ from s4a.geometry.mesh import vertex_normals
 
 pythreejs = pytest.importorskip("pythreejs")
 threejs = pytest.importorskip("s4a.widgets.threejs")
+mode_table = pytest.importorskip("s4a.widgets.three_modes").mode_table
 
 
 def test_the_arrays_arrive_as_the_browser_needs_them():
@@ -119,7 +120,7 @@ def test_modes_at_low_resolution_are_those_of_its_vertices(study):
 
 def test_too_many_modes_for_a_texture_are_refused():
     with pytest.raises(ValueError, match="at most 8 modes of 1000000 vertices"):
-        threejs._mode_table(np.zeros((1_000_000, 3)), None, np.broadcast_to(0, (9, 1_000_000, 3)))
+        mode_table(np.zeros((1_000_000, 3)), None, np.broadcast_to(0, (9, 1_000_000, 3)))
 
 
 def test_landmarks_stand_where_they_are_with_their_names(meshes):
