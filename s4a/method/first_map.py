@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from s4a.geometry.align import Motion, align, farthest_points, realign, rigid_transform
@@ -20,8 +21,11 @@ N_LANDMARKS = 10  # of step 3
 # Of a pair alone, in a far pose: signatures, functions by k_init, and weight of the orientation.
 # Signed mean curvature goes with each: front and back of a body differ by nothing else
 SEARCHED = tuple(itertools.product(("hks+wks", "wks", "hks"), (0.5, 1.0, 1.5), (1.0, 10.0)))
+N_ENDS, N_ENDS_OTHER = 5, 7  # extremities of one shape, and of the other among which they are
+N_PAIRED = 8  # the likeliest ways to pair them
 CURVATURE = 3.0  # its weight by that of a signature
 ON_A_LINE = 0.02  # of sqrt(area): landmarks as near to a line say nothing of turns about it
+BENT = 0.3  # weight of the gap of curvatures in that score
 FOUND = 0.07  # score at which the search ends; of wrong maps between bodies it is 0.11 or more
 
 
@@ -150,7 +154,7 @@ def best_first_map(
     over, or limbs exchanged.  Each map is refined by a short ZoomOut and a few rounds of
     :func:`s4a.method.joint.low_rounds` by parts; their end is scored without truth,
     :func:`s4a.method.joint.registration_score` + :func:`stretch`, as a pose hardly stretches the
-    surface.
+    surface, + in a search 0.3 :func:`s4a.method.fmap.curvature_gap`, which tells front from back.
 
     Parameters
     ----------
@@ -163,26 +167,32 @@ def best_first_map(
     k, step : int
         Of the short ZoomOut.
     search : bool
-        Whether to go on through :data:`SEARCHED` until a score is below :data:`FOUND`.
+        Whether to go on through :func:`paired_extremities` and :data:`SEARCHED` until the first two
+        terms of a score are below :data:`FOUND`.
 
     Returns
     -------
     name : str
-        "icp", "marked", "hks" or "wks", or of the search as "hks+wks, curvature, k 10, oriented 1".
+        "icp", "marked", "hks" or "wks", or of the search as "extremities 1" or
+        "hks+wks, curvature, k 10, oriented 1".
     C, fitted : float ndarray (k_init, k_init)
         The map, and as it was before its step of ZoomOut.
     """
     k = min(k, source.k, target.k)
     maps = [("icp", C, C if fitted is None else fitted)]
     maps += map_of_landmarks(source, target, len(C))
+    best = np.inf
     tried = []  # score, name, map, fit
     for one in itertools.chain(maps, maps_of_signatures(source, target, len(C), search)):
         match = fmap.zoomout(source, target, one[1], k, step=step)[1]
         end = joint.low_rounds(source, target, match, k_first=20, step=20, rounds=1, by_parts=True)
         image = joint.move(target, end[1])
         gap = joint.registration_score(source, target, end[0], image)
-        tried.append((gap + stretch(target, image), *one))
-        if len(tried) >= 2 + len(maps) and min(score for score, *_ in tried) < FOUND:
+        score = gap + stretch(target, image)
+        best = min(best, score)
+        bent = BENT * fmap.curvature_gap(source, target, end[0]) if search else 0.0
+        tried.append((score + bent, *one))
+        if len(tried) >= 2 + len(maps) and best < FOUND:
             break
     return min(tried, key=lambda one: one[0])[1:]
 
@@ -201,11 +211,19 @@ def map_of_landmarks(
 def maps_of_signatures(
     source: Basis, target: Basis, k: int, search: bool
 ) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Name, first map and its fit ``(k, k)`` of heat and of wave kernels, and of a search more."""
+    """Name, first map and its fit ``(k, k)`` of heat and of wave kernels, and of a search more.
+
+    The search begins with wave kernels and extremities as landmarks.
+    """
     for kind in ("hks", "wks"):
         fitted = fmap.fmap_from_descriptors(source, target, k=k, kind=kind)
         yield kind, fmap.refine_once(source, target, fitted), fitted
-    for kind, share, oriented in SEARCHED if search else ():
+    if not search:
+        return
+    for i, ends in enumerate(paired_extremities(source, target)):
+        fitted = fmap.fmap_from_descriptors(source, target, k=k, landmarks=ends)
+        yield f"extremities {i + 1}", fmap.refine_once(source, target, fitted), fitted
+    for kind, share, oriented in SEARCHED:
         size = min(max(4, round(share * k)), source.k, target.k)
         fitted = fmap.fmap_from_descriptors(
             source, target, k=size, kind=kind, oriented=oriented, curvature=CURVATURE
@@ -215,6 +233,53 @@ def maps_of_signatures(
         fitted = fitted[:k, :k]
         name = f"{kind}, curvature, k {size}, oriented {oriented:g}"
         yield name, fmap.refine_once(source, target, fitted), fitted
+
+
+def extremities(basis: Basis, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices that lie as far as possible from each other along the edges, as hands and feet do.
+
+    The first is the farthest from the middle.  What is not connected with it is never taken.
+
+    Returns
+    -------
+    vertex : int ndarray (n,)
+    distance : float ndarray (n, n)
+        Between them along the edges.
+    """
+
+    def distance_from(vertex: int) -> np.ndarray:
+        d = dijkstra(basis.graph, indices=vertex)
+        return np.where(np.isfinite(d), d, 0.0)
+
+    from_middle = ((basis.X - basis.area @ basis.X) ** 2).sum(1)
+    vertices = [int(distance_from(int(from_middle.argmin())).argmax())]
+    rows = [distance_from(vertices[0])]
+    while len(vertices) < n:
+        vertices.append(int(np.min(rows, axis=0).argmax()))
+        rows.append(distance_from(vertices[-1]))
+    return np.array(vertices), np.array(rows)[:, vertices]
+
+
+def paired_extremities(source: Basis, target: Basis) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Extremities of the source and of the target ``(5,)``: the likeliest ways to pair them.
+
+    Five of one are some of seven of the other, both ways, and the likelier the better the distances
+    along the edges agree, by the sum of their differences.  A shape that nearly is its own mirror
+    image has several ways that are as good.
+    """
+    ends = [extremities(basis, N_ENDS_OTHER) for basis in (source, target)]
+    chosen = np.array(list(itertools.permutations(range(N_ENDS_OTHER), N_ENDS)))  # (p, 5)
+    found = []
+    for (few, D), (many, E) in (ends, ends[::-1]):
+        D = D[:N_ENDS, :N_ENDS]
+        cost = np.abs(D - E[chosen[:, :, None], chosen[:, None, :]]).sum((1, 2)) / D.sum()
+        for way in np.argsort(cost, kind="stable")[:N_PAIRED]:
+            pair = few[:N_ENDS], many[chosen[way]]
+            found.append((cost[way], pair if few is ends[0][0] else pair[::-1]))
+    ways = {}  # by what is paired, as both directions find some ways
+    for _, (a, b) in sorted(found, key=lambda one: one[0]):
+        ways.setdefault(frozenset(zip(a.tolist(), b.tolist(), strict=True)), (a, b))
+    return list(ways.values())[:N_PAIRED]
 
 
 def have_signatures(source: Basis, target: Basis, k: int) -> bool:

@@ -294,6 +294,23 @@ def fmap_from_descriptors(
     )
 
 
+def curvature_gap(source: Basis, target: Basis, match: np.ndarray) -> float:
+    """How far the signed mean curvature of matched vertices differs, by its spread on the target.
+
+    0 where it is the same, about 1 where one says nothing of the other.  Front and back of a body,
+    which lie alike in every other way, differ by it.
+
+    Parameters
+    ----------
+    source, target : Basis
+    match : int ndarray (n_target,)
+    """
+    H = curvatures(source)[0][match]
+    G = curvatures(target)[0]
+    spread = target.area @ np.abs(G - target.area @ G)
+    return float(target.area @ np.abs(H - G) / spread)
+
+
 def curvatures(end: Basis) -> list[np.ndarray]:
     """Signed mean curvatures ``(n,)`` of an end by :data:`SCALES` of its functions."""
     return [

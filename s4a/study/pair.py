@@ -21,6 +21,10 @@ log = logging.getLogger(__name__)
 def match_pair(source: xr.Dataset, target: xr.Dataset, **options: Any) -> xr.Dataset:
     """Correspondence of two shapes at full resolution (4.1).
 
+    In far poses a search for a first map takes several seconds; where more than two shapes are at
+    hand, a network finds the way more surely: :func:`s4a.analyse`, then
+    :func:`s4a.register_shape`.  Landmarks (:func:`s4a.with_landmarks`) guide every step.
+
     Parameters
     ----------
     source, target : xarray.Dataset

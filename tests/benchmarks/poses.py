@@ -48,8 +48,8 @@ def main():
         files = sorted((Path(folder) / "faust").glob("*.ply"))
         rng = np.random.default_rng(args.seed)
         pairs = [rng.choice(len(files), 2, replace=False).tolist() for _ in range(args.pairs)]
-        searched = () if args.three else first_map.SEARCHED
-        with mock.patch.object(first_map, "SEARCHED", searched):
+        searched = ((), 0) if args.three else (first_map.SEARCHED, first_map.N_PAIRED)
+        with mock.patch.multiple(first_map, SEARCHED=searched[0], N_PAIRED=searched[1]):
             if args.network:
                 report_network(files, pairs)
             else:
@@ -60,7 +60,8 @@ def report(files, pairs, n_landmarks):
     """A line for each pair, and their mean."""
     options = pair_options({"n_coarse": N_COARSE})
     names = [str(i) for i in range(n_landmarks)]
-    vertices = farthest_points(s4a.read_shape(files[0])["position"].values, n_landmarks)
+    first = s4a.read_shape(files[0])["position"].values
+    vertices = farthest_points(first, n_landmarks) if names else []
 
     @cache
     def shape(i):

@@ -3,6 +3,8 @@
 And who pays for them.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -52,7 +54,7 @@ def shapes(bent):
 def test_a_far_pose_is_matched_where_nearest_neighbours_begin_wrong(bent, monkeypatch):
     found = match_pair(*bent, n_coarse=1000, k=50)
     assert found.attrs["method"] == "intrinsic+parts+local"
-    assert found.attrs["first_map"].split(",")[0] in ("hks", "wks", "hks+wks")
+    assert found.attrs["first_map"].split(",")[0] in ("hks", "wks", "hks+wks", "extremities 1")
     assert error(found, bent[0]) < 0.002
     monkeypatch.setattr(joint, "far_apart", lambda *_: False)
     assert error(match_pair(*bent, n_coarse=1000, k=50), bent[0]) > 0.05
@@ -131,11 +133,49 @@ def test_a_search_goes_on_to_maps_of_signatures_and_curvature_until_one_fits(sha
     assert C.shape == fitted.shape == (20, 20)
 
 
+def test_extremities_are_the_ends_of_a_worm_in_any_pose(shapes):
+    for shape in shapes:
+        low = shape.low
+        vertex, distance = first_map.extremities(low, 3)
+        along = shape.coarse["sample_vertex"].values[vertex]  # the sphere's vertex, whose x is 4 s
+        s = as_arrays(synthetic.sphere(2500))[0][along, 0]
+        assert sorted(s[:2].round(1)) == [-1.0, 1.0]
+        assert distance.diagonal() == pytest.approx(0)
+        assert distance == pytest.approx(distance.T)
+
+
+def test_a_piece_that_is_not_connected_has_no_extremity(shapes):
+    low = shapes[0].low
+    n = len(low.X)
+    two = replace(
+        low,
+        X=np.concatenate([low.X, low.X + [9, 0, 0]]),
+        T=np.concatenate([low.T, low.T + n]),
+        area=np.concatenate([low.area, low.area]) / 2,
+    )
+    vertex, distance = first_map.extremities(two, 4)
+    assert len({int(v) // n for v in vertex}) == 1
+    assert np.isfinite(distance).all()
+
+
+def test_extremities_are_paired_by_their_distances_whatever_the_order_of_the_vertices(shapes):
+    low = shapes[0].low
+    order = np.random.default_rng(0).permutation(len(low.X))
+    place = np.argsort(order)
+    other = replace(low, X=low.X[order], T=place[low.T], area=low.area[order])
+    a, b = first_map.paired_extremities(low, other)[0]
+    assert len(a) == first_map.N_ENDS
+    assert (order[b] == a).all()
+
+
 def test_all_maps_of_a_search_carry_a_shape_to_itself(shapes):
     low = shapes[0].low
     found = {name: C for name, C, _ in first_map.maps_of_signatures(low, low, 20, True)}
-    assert len(found) == 2 + len(first_map.SEARCHED)
+    others = [f"extremities {i}" for i in range(2, first_map.N_PAIRED + 1)]  # not with themselves
+    assert len(found) == 3 + len(others) + len(first_map.SEARCHED)
     for name, C in found.items():
+        if name in others:
+            continue
         assert C.shape == (20, 20), name
         assert np.diag(C).min() > 0.9, name
 
