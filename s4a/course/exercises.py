@@ -172,6 +172,12 @@ def _correlation_carried(pair, field):
     return np.corrcoef(np.asarray(there), field.parts["right"])[0, 1]
 
 
+def _directional_share(found):
+    """Of the sums of squares of sides, and of individuals x sides."""
+    _, sides, rest = found["sum_of_squares"].values
+    return sides / (sides + rest)
+
+
 def _moved_by_age(fit, years):
     return years * np.linalg.norm(fit["effect"].values, axis=1).max()
 
@@ -357,5 +363,19 @@ EXERCISES = {
         )[0, 1],
         "a mask: confidence <= np.median(confidence)",
         0.002,
+    ),
+    "15.1": Exercise(
+        lambda: 6,
+        "n subjects have 2 ** (n - 1) different changes of sign, and one of them is what was "
+        "measured",
+        0,
+    ),
+    "15.2": Exercise(
+        _directional_share,
+        "the variance_share of `found`: sides, beside individuals x sides",
+    ),
+    "15.3": Exercise(
+        lambda found: found["fluctuating_size"].idxmax().item(),
+        "`found` has a fluctuating_size for each individual",
     ),
 }
