@@ -439,6 +439,24 @@ PROOFS = [
         "test_a_table_of_other_meshes_is_named",
     ),
     (
+        "guiding landmarks of some shapes only",
+        "the others are registered without, and named",
+        "test_landmarks.py",
+        "test_a_study_keeps_its_landmarks_and_says_who_has_none",
+    ),
+    (
+        "guiding landmarks of another mesh or unit",
+        "the shape is excluded with the landmark and its distance; the others go on",
+        "test_landmarks.py",
+        "test_a_shape_whose_landmarks_lie_elsewhere_is_excluded_with_the_reason",
+    ),
+    (
+        "two guiding landmarks of one name, two files for one shape, a folder without any",
+        "error that names them",
+        "test_landmarks.py",
+        "test_names_that_are_there_twice_are_refused_and_points_of_curves_left_out",
+    ),
+    (
         "a landmark at NaN or 1e300",
         "error with its name",
         TRANSFER,
