@@ -7,7 +7,8 @@ exp(-(e / s)^2 / 2) in the latent basis (:func:`cycle_weights`).
 
 import numpy as np
 from joblib import Parallel, delayed
-from scipy.sparse.csgraph import connected_components, shortest_path
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components, dijkstra, shortest_path
 
 
 def spectral_distance(eigenvalues: np.ndarray | list[np.ndarray]) -> np.ndarray:
@@ -231,3 +232,37 @@ def connectivity(pairs: np.ndarray, n: int) -> dict[str, int]:
         "smallest_degree": int(A.sum(0).min()),
         "diameter": int(steps.max()) if np.isfinite(steps).all() else -1,
     }
+
+
+def nearest_by_maps(pairs: np.ndarray, n: int, first: list[int], most: int) -> np.ndarray:
+    """The shapes that the fewest maps lead to from some of them, these included.
+
+    Parameters
+    ----------
+    pairs : int ndarray (p, 2)
+        Unordered.
+    n : int
+        How many shapes there are.
+    first : list of int
+        From where it is counted: from the first of them; the others are taken in any case.
+    most : int
+        How many at most.
+
+    Returns
+    -------
+    int ndarray (m,)
+        Sorted; of those equally far the first are taken.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.method.network import nearest_by_maps
+    >>> chain = np.array([[0, 1], [1, 2], [2, 3], [3, 4]])
+    >>> nearest_by_maps(chain, 5, [3, 0], 3).tolist()
+    [0, 2, 3]
+    """
+    ends = np.concatenate([pairs, pairs[:, ::-1]])
+    A = csr_array((np.ones(len(ends)), ends.T), shape=(n, n))
+    steps = dijkstra(A, indices=first[0], unweighted=True)
+    steps[first] = -1
+    return np.sort(np.argsort(steps, kind="stable")[:most])

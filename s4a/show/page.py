@@ -13,6 +13,7 @@ from s4a.show.browser import MODES, PARTS, TEMPLATES, look_state, mesh_state, we
 from s4a.show.draw import SIGNED, Viewpoint, opposite, position_colors, ramp_colors, render
 from s4a.show.pictures import N_MODES, PANEL, SIGMA, mode_drawer, shared_frames
 from s4a.show.surfaces import (
+    N_LIVE,
     attribute,
     carried_colors,
     has,
@@ -29,7 +30,6 @@ from s4a.show.surfaces import (
 from s4a.study.tree import left_out
 
 LARGE = 20_000  # vertices from which a page moves the low-resolution mesh
-N_LIVE = 20  # modes that a page moves: of 20,000 vertices 0.3 MB each
 N_CARRIED = 5  # shapes to which the template's colours are carried
 
 

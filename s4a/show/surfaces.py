@@ -10,6 +10,7 @@ from s4a.method.register import match_functions, match_low
 from s4a.method.shape import Shape
 from s4a.method.steps import latent_bases
 
+N_LIVE = 20  # modes that panels and pages move, unless asked: of 20,000 vertices 0.3 MB each
 FAR = 8  # standard deviations beyond which charts of scores leave a doubtful shape out
 RESOLUTIONS = [("low resolution", "coarse"), ("full resolution", "original")]
 SAMPLES = "samples of SCALABLE, joined where their cells meet"

@@ -9,7 +9,14 @@ from s4a.geometry.mesh import vertex_normals
 from s4a.input.files import write_mesh
 from s4a.method.deform import normal_displacement
 from s4a.method.pca import apply_scores, color_limits, mahalanobis, plausible_scores
-from s4a.show.surfaces import attribute, mode_arrays, score_state, template_coarse, unit_text
+from s4a.show.surfaces import (
+    N_LIVE,
+    attribute,
+    mode_arrays,
+    score_state,
+    template_coarse,
+    unit_text,
+)
 from s4a.widgets.modes_view import ModesView
 from s4a.widgets.panel import Panel, dropdown, file_name, row
 from s4a.widgets.scene import camera_group
@@ -28,8 +35,8 @@ class Modes(Panel):
     resolution : {None, "full", "coarse"}
         Which vertices of the template; by default the full resolution, unless its modes are more
         than 40 MB.
-    n_modes : int, optional
-        How many modes; all by default.
+    n_modes : int
+        How many modes, the first, where there are as many.
     view, up
         From where the shape is seen first; see :func:`s4a.show.draw.rotation`.
 
@@ -47,7 +54,7 @@ class Modes(Panel):
     def build(
         self,
         resolution: str | None = None,
-        n_modes: int | None = None,
+        n_modes: int = N_LIVE,
         view: str = "corner",
         up: str = "z",
     ) -> list:

@@ -7,7 +7,7 @@ from matplotlib import colormaps
 from matplotlib.colors import ListedColormap, to_hex
 
 from s4a.method.fmap import match_from_fmap
-from s4a.method.network import choose_pairs, connectivity, spectral_distance
+from s4a.method.network import choose_pairs, connectivity, nearest_by_maps, spectral_distance
 from s4a.show import charts
 from s4a.show.browser import PARTS, color_scale
 from s4a.show.draw import position_colors
@@ -32,6 +32,7 @@ PLACES = (
     "where the shapes stand: on a circle, or by the first two components of their shape differences"
 )
 NARROW = {"width": "20em"}
+MOST = 100  # shapes that a graph shows
 N_EIGENVALUES = 20  # by which shapes are told apart when pairs are chosen
 # without the bright end, which is hard to see on white
 ERRORS = ListedColormap(colormaps["viridis_r"](np.linspace(0.15, 1, 256)))
@@ -39,6 +40,10 @@ ERRORS = ListedColormap(colormaps["viridis_r"](np.linspace(0.15, 1, 256)))
 
 class Network(Panel):
     """Shapes as nodes, maps as edges coloured by cycle error; a click shows the meshes and the map.
+
+    Of more than a hundred shapes the graph has the median, the one that is shown, and those that
+    the fewest maps lead to from there; the numbers beside it are of all, and maps are chosen by a
+    click.
 
     Attributes
     ----------
@@ -61,6 +66,7 @@ class Network(Panel):
         self.source, self.target = (network[key].values.astype(str) for key in ("source", "target"))
         self.names = np.unique(np.r_[self.source, self.target]).tolist()
         self.median = attribute(self.study, "latent", "median")
+        self.doubtful = set(doubtful_names(self.study))
         ends = [np.searchsorted(self.names, names) for names in (self.source, self.target)]
         self.ends = np.stack(ends, axis=1)  # (map, 2)
         self.pairs = [tuple(pair) for pair in np.sort(self.ends, axis=1).tolist()]
@@ -72,9 +78,10 @@ class Network(Panel):
         self.budget = int_slider(
             "pairs", BUDGET, used, n - 1, max(n - 1, n * (n - 1) // 2), continuous_update=True
         )
-        maps = zip(self.source, self.target, strict=True)
         options: list = labelled(self.study, self.names)
-        options += [(f"{source} → {target}", i) for i, (source, target) in enumerate(maps)]
+        if n <= MOST:  # of more, the maps are chosen in the graph
+            maps = zip(self.source, self.target, strict=True)
+            options += [(f"{source} → {target}", i) for i, (source, target) in enumerate(maps)]
         self.choice = dropdown(
             "show", "a shape, or a map between two of them", options, layout=NARROW
         )
@@ -98,12 +105,20 @@ class Network(Panel):
             beside(*columns, least="20em"),
         ]
 
-    def places(self) -> np.ndarray:
-        """Places ``(n, 2)`` of the shapes, by their differences or on a circle."""
+    def places(self, names: list[str]) -> np.ndarray:
+        """Places ``(n, 2)`` of shapes, by their differences or on a circle."""
         places = None
         if self.where.value == "shape differences":
-            places = network_places(self.study, self.names)
-        return charts.on_circle(len(self.names)) if places is None else places
+            places = network_places(self.study, names)
+        return charts.on_circle(len(names)) if places is None else places
+
+    def drawn(self, pairs: np.ndarray) -> np.ndarray:
+        """The shapes that the graph of some pairs shows, by their numbers in `names` ``(n,)``."""
+        if len(self.names) <= MOST:
+            return np.arange(len(self.names))
+        first = [self.node or self.source[self.edge], *[self.target[self.edge]] * (self.edge >= 0)]
+        first += [self.median] * (self.median in self.names)
+        return nearest_by_maps(pairs, len(self.names), [self.names.index(a) for a in first], MOST)
 
     def draw(self) -> None:
         """The graph with the pairs that the budget allows, on one colour scale before and after."""
@@ -111,39 +126,50 @@ class Network(Panel):
         top = float(np.nanmax([network[key].values for _, key in STAGES], initial=0)) or 1.0
         pairs = choose_pairs(self.distance, self.budget.value)
         allowed = {tuple(pair) for pair in pairs.tolist()}
-        self.shown = [i for i, pair in enumerate(self.pairs) if pair in allowed]
-        values = network[self.stage.value].values[self.shown]
-        colors = ERRORS(np.nan_to_num(values / top, nan=0.0))
-        places = self.places()
+        self.allowed = [i for i, pair in enumerate(self.pairs) if pair in allowed]
+        drawn = self.drawn(pairs)
+        names = [self.names[i] for i in drawn]
+        place = np.full(len(self.names), -1)
+        place[drawn] = np.arange(len(drawn))
+        self.shown = [i for i in self.allowed if (place[self.ends[i]] >= 0).all()]
+        values = network[self.stage.value].values
+        colors = ERRORS(np.nan_to_num(values[self.shown] / top, nan=0.0))
+        places = self.places(names)
         self.graph.draw(
             "graph",
             x=places[:, 0],
             y=places[:, 1],
-            names=self.names,
-            source=self.ends[self.shown, 0],
-            target=self.ends[self.shown, 1],
+            names=names,
+            source=place[self.ends[self.shown, 0]],
+            target=place[self.ends[self.shown, 1]],
             colors=[to_hex(color) for color in colors],
-            values=values,
+            values=values[self.shown],
             weights=network["weight"].values[self.shown],
             label="cycle error",
-            title="Click a shape or a map",
-            faint=[name in doubtful_names(self.study) for name in self.names],
-            highlight=self.names.index(self.median) if self.median in self.names else -1,
-            node=self.names.index(self.node) if self.node in self.names else -1,
+            title="Click a shape or a map" + self.part(names),
+            faint=[name in self.doubtful for name in names],
+            highlight=names.index(self.median) if self.median in names else -1,
+            node=names.index(self.node) if self.node in names else -1,
             edge=self.edge,
             edges=self.shown,
         )
+        values = values[self.allowed]
         self.tell(pairs, values)
         scale = color_scale(ERRORS, 0, top, "cycle error, first modes")
         self.bar.value = PARTS.color_bar(scale["colors"], f"{top:.2f}", scale["label"])
+
+    def part(self, names: list[str]) -> str:
+        """How many of all shapes these are, where they are not all."""
+        n = len(self.names)
+        return "" if len(names) == n else f" (the nearest {len(names)} of {n:,})"
 
     def tell(self, pairs: np.ndarray, values: np.ndarray) -> None:
         """Numbers of the graph of some pairs, whose maps have these cycle errors."""
         facts = connectivity(pairs, len(self.names))
         known = values[np.isfinite(values)]
         stored = ""
-        if len(self.shown) < 2 * len(pairs):
-            stored = f", {len(self.shown)} maps of them in the study"
+        if len(self.allowed) < 2 * len(pairs):
+            stored = f", {len(self.allowed)} maps of them in the study"
         apart = apart_of(self.study["registration"]) if "registration" in self.study else []
         others = f"; beside it, doubtful: {', '.join(apart)}" if apart else ""
         middle = f"; median cycle error {np.median(known):.3f}" if len(known) else ""
@@ -190,7 +216,8 @@ class Network(Panel):
         """A map: its matrix, and the colours that it carries from source to target."""
         if edge < 0:
             return
-        self.choice.value = edge
+        if len(self.names) <= MOST:
+            self.choice.value = edge
         self.node = ""
         pair = self.study["network"].dataset.isel(pair=edge)
         C = pair["fmap" if self.stage.value == "cycle_error" else "fmap_initial"].values

@@ -10,25 +10,16 @@ from pathlib import Path
 from typing import Any
 
 import ipywidgets
+import numpy as np
 import xarray as xr
 
 from s4a.show.browser import PARTS
-from s4a.study.options import Options
-from s4a.study.pipeline import analyse, in_batches
-from s4a.study.sources import find_sources
+from s4a.study.pipeline import analyse
+from s4a.study.progress import STAGES, Stage, Status, status
 from s4a.study.tree import open_study
 from s4a.widgets.explore import Explore
 from s4a.widgets.panel import Panel, row
 
-# stage: the files that it writes, and whether there is one for each shape
-STAGES = {
-    "read and clean": ("original/[!.]*.nc", True),
-    "low resolution and spectrum": ("coarse/[!.]*.nc", True),
-    "first maps, in batches": ("network/first_*.nc", False),
-    "consistent maps and median": ("latent.nc", False),
-    "registration": ("registration/[!.]*.nc", True),
-    "modes": ("pca.nc", False),
-}
 EVERY = 0.5  # seconds
 Shapes = Path | str | list[Path | str] | dict[str, Any] | xr.DataTree
 
@@ -57,8 +48,18 @@ def clock(seconds: float) -> str:
     return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
 
 
+def told(found: Status) -> str:
+    """What a run takes now, and the shapes that it left out, with the reason."""
+    text = ""
+    if found.state == "running":
+        text += f"; processes: {found.processes}, {found.memory:.0f} MiB now"
+    return text + "".join(f"; left out {name}: {why}" for name, why in found.failures.items())
+
+
 class Progress(Panel):
     """Runs :func:`s4a.analyse` in a process of its own and shows how far it is.
+
+    Its lines are those of ``s4a status``.
 
     Parameters
     ----------
@@ -82,15 +83,12 @@ class Progress(Panel):
         self.folder, self.explored = Path(store), None
         self.opened = []  # the stages that were ready when the panels were filled
         self.arguments = shapes, options | {"store": str(store)}
-        volumes = options.get("label") is not None
-        self.n_shapes = len(find_sources(shapes, options.get("pattern"), volumes=volumes))
         super().__init__(xr.DataTree())  # there is no study yet
         self.start()
 
     def start(self) -> None:
         """Run, from the beginning or where it stopped."""
         self.state, self.stopped, self.started = "running", threading.Event(), time.monotonic()
-        self.clocks = {}  # stage -> when its first file was seen, how many there were, its end
         context = multiprocessing.get_context("spawn")
         self.answer, there = context.Pipe(duplex=False)
         self.process = context.Process(target=work, args=(there, *self.arguments))
@@ -118,50 +116,35 @@ class Progress(Panel):
         if not stopped.is_set():
             self.guarded(self.finish)()
 
-    def totals(self, shapes: int) -> dict[str, int]:
-        """How many files each stage writes when so many shapes are usable."""
-        pairs = min(self.arguments[1].get("n_pairs", Options.n_pairs), shapes * (shapes - 1) // 2)
-        totals = {stage: shapes if each else 1 for stage, (_, each) in STAGES.items()}
-        totals["read and clean"] = self.n_shapes
-        totals["first maps, in batches"] = len(in_batches(range(max(pairs, shapes - 1))))
-        return totals
-
     def look(self) -> None:
-        """Count the files of every stage, and show how far it is."""
-        now = time.monotonic()
-        counts = {
-            stage: len(list(self.folder.glob(pattern))) for stage, (pattern, _) in STAGES.items()
-        }
-        totals = self.totals(counts["read and clean"] or self.n_shapes)
-        reached = True  # the stage before has ended
-        for i, stage in enumerate(STAGES):
-            done, whole = counts[stage], totals[stage]
-            later = any(list(counts.values())[i + 1 :])
-            ended = done >= whole or (done > 0 and later)
-            bar = self.bars[stage]
-            bar.max, bar.value = whole, done
-            bar.bar_style = "success" if ended else "info"
-            self.texts[stage].value = self.told(stage, done, whole, ended, reached, now)
-            reached = ended
-        self.total.value = PARTS.paragraph(f"{self.state}, {clock(now - self.started)}")
+        """Show how far every stage is, by what the run notes, and who was left out."""
+        text = f"{self.state}, {clock(time.monotonic() - self.started)}"
+        with contextlib.suppress(ValueError):  # nothing is noted yet
+            found = status(self.folder)
+            if found.owner == self.process.pid:  # not by the run before it
+                for name, stage in found.stages.items():
+                    self.show_stage(name, stage)
+                text += told(found)
+        self.total.value = PARTS.paragraph(text)
         ready = self.ready()
         self.view.disabled = not ready
         if self.explored is not None and ready != self.opened:
             self.opened = ready
             self.explored.extend(open_study(self.folder))
 
-    def told(
-        self, stage: str, done: int, whole: int, ended: bool, reached: bool, now: float
-    ) -> str:
-        """How far a stage is, since when, and how long it takes by its pace so far."""
-        text = f"{done} of {whole}"
-        begin, had, end = self.clocks.get(stage, (now, done, now))
-        if reached and not (ended and stage not in self.clocks):
-            self.clocks[stage] = begin, had, end if ended and end > begin else now
-            text += f", {clock(self.clocks[stage][2] - begin)}"
-        if had < done < whole:
-            text += f", about {clock((now - begin) / (done - had) * (whole - done))} left"
-        return text
+    def show_stage(self, name: str, stage: Stage) -> None:
+        """How far a stage is, what it took, and how long it takes by its pace so far."""
+        bar, now = self.bars[name], time.time()
+        bar.max, bar.value = max(stage.all, 1), stage.done if stage.all else stage.ended
+        bar.bar_style = "success" if stage.ended else "info"
+        goes_on = self.state == "running" and not stage.ended
+        text = f"{stage.done} of {stage.all}"
+        text += f", {clock(stage.seconds + goes_on * (now - stage.begun))}"
+        if stage.ended and np.isfinite(stage.memory):
+            text += f", {stage.memory:.0f} MiB"
+        if goes_on and np.isfinite(left := stage.remaining(now)):
+            text += f", about {clock(left)} left"
+        self.texts[name].value = text
 
     def ready(self) -> list[str]:
         """The stages that have ended."""

@@ -11,11 +11,15 @@ from s4a.widgets.chart import Chart
 from s4a.widgets.panel import Panel, beside, dropdown, int_slider, row
 from s4a.widgets.scene import Scene, camera_group
 
+MOST = 100  # curves in a chart
 FIRST = "how many eigenfunctions the surface is put together from"
 
 
 class Spectrum(Panel):
     """Eigenvalues with Weyl's line, an eigenfunction, the surface from its first k coefficients.
+
+    Of more than a hundred shapes the curves are those of every second, third and so on, and of the
+    one that is chosen.
 
     Attributes
     ----------
@@ -85,11 +89,13 @@ class Spectrum(Panel):
             "legend": True,
         }
         look = {"xlabel": "mode k", "marker": self.mode.value}
-        last = sorted(self.names, key=lambda name: name == self.shape)  # the chosen one on top
+        some = self.names[:: -(-len(self.names) // MOST)]  # of equal distances in the list
+        last = [*(name for name in some if name != self.shape), self.shape]  # the chosen one on top
+        part = "" if len(some) == len(self.names) else f" ({len(some)} of {len(self.names):,})"
         self.curves.draw(
             "lines",
             series=[line | {"y": law}, *(self.curve(name, 0 * law) for name in last)],
-            title="Eigenvalues: click a curve",
+            title=f"Eigenvalues: click a curve{part}",
             ylabel="eigenvalue, unit area",
             legend="bottom",
             **look,

@@ -20,12 +20,13 @@ from IPython.core.interactiveshell import ExecutionInfo, InteractiveShell
 from ipywidgets.widgets import widget as registry  # the open widgets are counted in it
 
 import s4a
-from s4a.geometry.mesh import vertex_normals
+from s4a.geometry.mesh import as_dataset, vertex_normals
 from s4a.method.shape import Shape
 from s4a.show.browser import color_bytes
 from s4a.show.draw import position_colors
 from s4a.show.panel_page import widgets_in
 from s4a.show.surfaces import aligned, mesh_of
+from s4a.study.progress import status
 from s4a.widgets import (
     Correspondence,
     Explore,
@@ -455,9 +456,12 @@ def test_an_analysis_shows_its_progress_and_its_panels(tmp_path):
     shapes = s4a.synthetic.brains(3, 500, seed=1)
     panel = Progress(shapes, tmp_path / "study", n_coarse=200, k=12, k_init=6, n_jobs=1)
     assert ended(panel) == "finished"
-    assert [(bar.value, bar.max) for bar in panel.bars.values()] == [
-        (n, n) for n in (3, 3, 1, 1, 3, 1)
-    ]
+    stages = status(tmp_path / "study").stages
+    assert list(panel.bars) == list(stages)
+    assert [bar.value for bar in panel.bars.values()] == [bar.max for bar in panel.bars.values()]
+    assert panel.bars["registration"].max == stages["registration"].all == 3
+    assert panel.texts["read and clean"].value.startswith("3 of 3, 0:0")
+    assert "MiB" in panel.texts["read and clean"].value
     assert {bar.bar_style for bar in panel.bars.values()} == {"success"}
     panel.view.click()
     assert panel.explored["Network"].names == ["brain_01", "brain_02", "brain_03"]
@@ -487,9 +491,14 @@ def test_a_cancelled_analysis_ends(tmp_path):
     panel.close()
 
 
-def test_the_number_of_batches_is_known_before_they_are_done(tmp_path):
-    panel = Progress({"one": tetrahedron()}, tmp_path / "study", n_jobs=1, n_pairs=20)
-    assert [panel.totals(n)["first maps, in batches"] for n in (3, 5, 10)] == [1, 3, 5]
+def test_who_is_left_out_is_told(tmp_path):
+    collection = s4a.synthetic.brains(3, 500, seed=1)
+    meshes = collection["original"].children.items()
+    shapes = {name: mesh.to_dataset() for name, mesh in meshes}
+    shapes["speck"] = as_dataset(np.zeros((3, 3)), np.array([[0, 1, 2]]))
+    panel = Progress(shapes, tmp_path / "study", n_coarse=200, k=12, k_init=6, n_jobs=1)
+    assert ended(panel) == "finished", panel.message.value
+    assert "left out speck: " in panel.total.value
     panel.close()
 
 
