@@ -150,8 +150,7 @@ class Run:
             whole = True
         finally:  # an interrupted stage has cost something too
             if share > 0 or name not in self.costs:
-                own = {os.getpid(): peak_memory()}
-                memory = np.fmax(memory, sum((self.workers | own).values()))
+                memory = np.fmax(memory, together(self.workers, effective_n_jobs(self.n_jobs)))
                 self.costs[name] = [seconds + time.perf_counter() - begin, float(memory)]
                 write_at_once(self.costs_file, json.dumps(self.costs))
             self.notes.end(name, whole, *self.costs[name])
@@ -376,6 +375,20 @@ def deaths(claim: Claim, task: Task) -> int:
     except OSError:
         return 0
     return sum(line.startswith(BEGUN) for line in lines)
+
+
+def together(peaks: dict[int, float], n_jobs: int) -> float:
+    """MiB of this process and its workers at most: of the largest where some took others' places.
+
+    Parameters
+    ----------
+    peaks : dict of int to float
+        Of every worker that there was, by its number; this process may be among them.
+    n_jobs : int
+        How many there were at once.
+    """
+    others = sorted(memory for pid, memory in peaks.items() if pid != os.getpid())
+    return peak_memory() + sum(others[-n_jobs:])
 
 
 def peak_memory() -> float:

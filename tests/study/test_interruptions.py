@@ -20,7 +20,7 @@ import pytest
 from s4a import analyse, cli, open_study, synthetic
 from s4a.schema import dataset
 from s4a.study import doubts, pipeline, processes, sources, store, tasks
-from s4a.study.runner import Run
+from s4a.study.runner import Run, peak_memory, together
 
 # of meshes as coarse as these, some registrations are doubtful; so there are modes all the same
 OPTIONS = {"n_coarse": 150, "k_init": 8, "k": 12, "keep_doubtful": True}
@@ -504,6 +504,12 @@ def test_a_worker_of_a_run_that_is_over_writes_nothing(tmp_path):
         store.write(synthetic.sphere(60), tmp_path / "a.nc", "key", claim=new)
     assert store.read(tmp_path / "a.nc").sizes["vertex"] == 60
     assert not list(tmp_path.glob(".*.tmp"))
+
+
+def test_workers_that_took_the_place_of_others_are_not_counted_with_them():
+    own = peak_memory()
+    found = together({os.getpid(): 1e9, -1: 100.0, -2: 10.0, -3: 50.0}, 2)
+    assert own + 150 <= found < own + 250
 
 
 def test_costs_add_up_over_the_runs_that_share_a_stage_and_stay_where_nothing_is_left_to_do(
