@@ -18,7 +18,7 @@ notebooks, pages          :func:`explore`, :func:`write_page`
 new shapes                :func:`insert`
 6.1 statistics            :mod:`s4a.statistics`
 6.2 transfer              :func:`transfer_labels`, :func:`transfer_landmarks`,
-                          :func:`transfer_scalars`, :func:`register_pairs`
+                          :func:`transfer_scalars`, :func:`register_pairs`, :func:`with_field`
 for other programs        :func:`write_registered`, :func:`write_training_set`
 the embedded collection   :mod:`s4a.synthetic`
 ========================  ====================================================================
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from s4a.accessor import explore
     from s4a.analysis import statistics
     from s4a.analysis.export import write_registered, write_training_set
+    from s4a.analysis.fields import with_field
     from s4a.analysis.transfer import (
         register_pairs,
         transfer_labels,
@@ -101,6 +102,7 @@ __all__ = [
     "transfer_landmarks",
     "transfer_scalars",
     "verify",
+    "with_field",
     "with_landmarks",
     "write_mesh",
     "write_page",
@@ -112,6 +114,7 @@ PLACES = {
     "accessor": "explore",
     "analysis": "statistics",
     "analysis.export": "write_registered write_training_set",
+    "analysis.fields": "with_field",
     "analysis.transfer": "register_pairs transfer_labels transfer_landmarks transfer_scalars",
     "datasets": "synthetic",
     "evaluation": "compare metrics",

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 INPUT = "unit of the input"
 INPUT2 = "squared unit of the input"
+FIELD_UNIT = "unit of the field"
 ONE = "1"
 SHARE = "share of sqrt(area)"
 UNIT_AREA = "1, for the surface scaled to unit area"
@@ -222,6 +223,21 @@ ROWS = {
     "outlier": ("shape", ONE, "whether one of both is beyond its threshold"),
     "predicted": ("shape", ONE, "class predicted while the shape was left out"),
     "accuracy": ("fold", ONE, "balanced accuracy on the left-out shapes"),
+    # fields on the template, and field against shape
+    "carried_field": ("shape vertex", FIELD_UNIT, "field of the shape, carried to the template"),
+    "field_effect": ("vertex", FIELD_UNIT,
+        "difference of the groups' means, or change per unit of the variable"),
+    "field_intercept": ("vertex", FIELD_UNIT, "field where the variable is at its mean"),
+    "field_pattern": ("component vertex", FIELD_UNIT,
+        "change of the field with one standard deviation of its score"),
+    "field_score": ("shape component", ONE,
+        "score of the field of each shape, in standard deviations"),
+    "singular_value": ("component", ONE, "covariance of the scores of field and shape"),
+    "singular_p": ("component", ONE, "p value of the permutation test of the singular value"),
+    "covariance_share": ("component", ONE, "share of the squared covariance of field and shape"),
+    "pair_correlation": ("component", ONE, "correlation of the scores of field and shape"),
+    "rv": ("", ONE, "RV coefficient of field and shape"),
+    "rv_p": ("", ONE, "p value of the permutation test of the RV coefficient"),
     # left against right
     "partner_triangle": ("vertex", ONE,
         "template triangle on which the partner of the vertex on the other side lies"),
@@ -441,8 +457,8 @@ def unit_of(values: xr.DataArray | xr.Dataset) -> str:
     return str(values.attrs.get("units") or values.attrs.get("unit") or INPUT)
 
 
-def in_unit(data: xr.Dataset, unit: str | None) -> xr.Dataset:
-    """A Dataset with the unit in place of "unit of the input", where the unit is known.
+def in_unit(data: xr.Dataset, unit: str | None, *, of: str = INPUT) -> xr.Dataset:
+    """A Dataset with the unit in place of "unit of the input", or `of`, where the unit is known.
 
     Examples
     --------
@@ -450,9 +466,9 @@ def in_unit(data: xr.Dataset, unit: str | None) -> xr.Dataset:
     >>> in_unit(dataset(vertex_area=[1.0]), "mm")["vertex_area"].attrs["units"]
     'mm^2'
     """
-    if not unit or unit == INPUT:
+    if not unit or unit == of:
         return data
-    units = {INPUT: unit, INPUT2: f"{unit}^2"}
+    units = {INPUT: unit, INPUT2: f"{unit}^2"} if of == INPUT else {of: unit}
     data = data.copy()
     for values in data.data_vars.values():
         before = values.attrs.get("units", ONE)

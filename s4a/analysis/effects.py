@@ -1,12 +1,20 @@
 """Groups and variables (6.1): do shapes differ with them, and where on the template?"""
 
 import logging
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from scipy import stats
 
-from s4a.analysis.inputs import Sample, Values, displacements_of, group_sizes, sample_of
+from s4a.analysis.inputs import (
+    Sample,
+    Values,
+    displacements_of,
+    group_sizes,
+    registration_of,
+    sample_of,
+)
 from s4a.analysis.model import count_components
 from s4a.analysis.permutation import (
     count_rearrangements,
@@ -20,7 +28,7 @@ from s4a.analysis.permutation import (
 from s4a.geometry.mesh import as_arrays, vertex_normals
 from s4a.method.deform import normal_displacement
 from s4a.method.pca import center_gram, gram, principal_components
-from s4a.schema import dataset, in_unit, unit_of
+from s4a.schema import FIELD_UNIT, dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
 
 log = logging.getLogger(__name__)
@@ -37,6 +45,7 @@ def group_test(
     group: Values,
     *,
     covariates: Values | None = None,
+    field: str | None = None,
     n_components: int | None = None,
     n_permutations: int = 9999,
     variances: str = "equal",
@@ -54,6 +63,9 @@ def group_test(
     covariates : as `group`, a dict of name to these, or an array_like (shape, covariate)
         Or a list of names in /subjects.  Accounted for after Freedman and Lane (1983); text as
         indicators of its values.  A shape without a value is left out, with a warning.
+    field : str, optional
+        Name in ``/fields`` (:func:`s4a.with_field`): what is tested is that field in place of the
+        displacements.
     n_components : int, optional
         As many as hold 90 % of the variance by default, at most half of the number of shapes.
     n_permutations : int
@@ -87,8 +99,8 @@ def group_test(
     >>> test.attrs["groups"], bool(test["p_value"] > 0.05)
     ('a: 3, b: 3', True)
     """
-    options = _options(n_permutations, variances, seed_of(seed, rng))
-    sample = sample_of(study, group, "group", covariates)
+    options = check_options(n_permutations, variances, seed_of(seed, rng))
+    sample = sample_of(study, group, "group", covariates, field)
     sizes = group_sizes(sample.values)
     _, x = indicators(sample.values)
     test = _test_scores(sample, x, n_components, options)
@@ -100,6 +112,7 @@ def group_map(
     group: Values,
     *,
     covariates: Values | None = None,
+    field: str | None = None,
     of: str = "vector",
     n_permutations: int = 999,
     variances: str = "equal",
@@ -110,7 +123,8 @@ def group_map(
 
     Parameters
     ----------
-    study, group, covariates, n_permutations, variances, seed, rng : see :func:`group_test`
+    study, group, covariates, field, n_permutations, variances, seed, rng
+        See :func:`group_test`.
     of : {"vector", "normal"}
         The displacements, or their part along the normals.
 
@@ -120,7 +134,8 @@ def group_map(
         ``explained_share(vertex)``, ``p_vertex``, ``p_family_wise`` (max-T), ``p_false_discovery``
         (Benjamini and Hochberg), ``effect(vertex, xyz)`` = mean of the second group minus that of
         the first, in sorted order, and ``effect_size``: Mahalanobis distance of two groups' means,
-        Cohen's f of several.
+        Cohen's f of several.  Of a field ``field_effect(vertex)`` in place of ``effect``; NaN where
+        not all shapes have it.
 
     Raises
     ------
@@ -137,8 +152,8 @@ def group_map(
     >>> where["effect"].dims, bool((where["p_family_wise"] > 0.05).all())
     (('vertex', 'xyz'), True)
     """
-    options = _options(n_permutations, variances, seed_of(seed, rng))
-    sample = sample_of(study, group, "group", covariates)
+    options = check_options(n_permutations, variances, seed_of(seed, rng))
+    sample = sample_of(study, group, "group", covariates, field)
     sizes = group_sizes(sample.values)
     names, x = indicators(sample.values)
     effect_map = _test_vertices(sample, x, of, options)
@@ -156,6 +171,7 @@ def regression(
     variable: Values,
     *,
     covariates: Values | None = None,
+    field: str | None = None,
     of: str = "vector",
     n_components: int | None = None,
     n_permutations: int = 999,
@@ -169,7 +185,8 @@ def regression(
     ----------
     study : DataTree
     variable : array_like (shape,), dict of shape to value, or name in /subjects
-    covariates, n_components, n_permutations, variances, seed, rng : see :func:`group_test`
+    covariates, field, n_components, n_permutations, variances, seed, rng
+        See :func:`group_test`.
     of : see :func:`group_map`
 
     Returns
@@ -177,9 +194,10 @@ def regression(
     Dataset
         The global test, ``statistic`` and ``p_value``, as of :func:`group_test`; the test at every
         vertex as of :func:`group_map`, ``effect(vertex, xyz)`` per unit of the variable,
-        ``effect_size`` = Cohen's f, and ``intercept(vertex, xyz)``; ``standard_score(shape)`` of
-        the variable.  Attributes ``mean``, ``standard_deviation``, ``lowest`` and ``highest`` of
-        the variable, and those of :func:`group_test`.
+        ``effect_size`` = Cohen's f, and ``intercept(vertex, xyz)``, of a field ``field_effect`` and
+        ``field_intercept``; ``standard_score(shape)`` of the variable.  Attributes ``mean``,
+        ``standard_deviation``, ``lowest`` and ``highest`` of the variable, and those of
+        :func:`group_test`.
 
     Raises
     ------
@@ -198,9 +216,9 @@ def regression(
     >>> bool(abs(predicted - s4a.synthesize(study, [2.0])["position"]).max() < 1e-2)
     True
     """
-    options = _options(n_permutations, variances, seed_of(seed, rng))
-    sample = sample_of(study, variable, "variable", covariates)
-    x = _numbers(sample.values)
+    options = check_options(n_permutations, variances, seed_of(seed, rng))
+    sample = sample_of(study, variable, "variable", covariates, field)
+    x = numbers_of(sample.values)
     test = _test_scores(sample, x, n_components, options)
     effect_map = _test_vertices(sample, x, of, options)
     mean = float(x.mean())
@@ -223,11 +241,11 @@ def regression(
     )
 
 
-def _numbers(values):
-    """The variable of a regression as floats ``(s,)``, or what else to do."""
+def numbers_of(values: np.ndarray, what: str = "variable") -> np.ndarray:
+    """The variable of a regression as floats ``(s,)``; ValueError says what else to do."""
     if values.dtype.kind == "U":
         raise ValueError(
-            f"a regression needs a variable of numbers, found text such as {str(values[0])!r}; a "
+            f"a regression needs a {what} of numbers, found text such as {str(values[0])!r}; a "
             "group test takes text"
         )
     if values.ndim > 1:
@@ -235,7 +253,7 @@ def _numbers(values):
     x = values.astype(float)
     if not 1e-30 < abs(x).max() < 1e30 and x.any():
         raise ValueError(
-            f"a regression needs a variable of a size between 1e-30 and 1e30, found {x.max():.3g}; "
+            f"a regression needs a {what} of a size between 1e-30 and 1e30, found {x.max():.3g}; "
             "give it in another unit"
         )
     return x
@@ -273,6 +291,7 @@ def predict(study: xr.DataTree, fit: xr.Dataset, value: float) -> xr.Dataset:
     >>> bool(np.allclose(old - young, 5 * fit["effect"]))
     True
     """
+    check_moves(fit)
     template = study["registration"].to_dataset()
     displacement = fit["intercept"].values + (value - fit.attrs["mean"]) * fit["effect"].values
     return dataset(
@@ -314,24 +333,60 @@ def regression_modes(study: xr.DataTree, fit: xr.Dataset, name: str = "variable"
     >>> s4a.statistics.regression_modes(study, fit, "age")["pca"].sizes["component"]
     1
     """
+    check_moves(fit)
     registration, d, area = displacements_of(study)
-    is_fitted = registration["shape"].isin(fit["shape"]).values
-    registration, d = registration.isel(shape=is_fitted), d[is_fitted]
+    d = d[registration["shape"].isin(fit["shape"]).values]
     step = fit["effect"].values * fit.attrs["standard_deviation"]  # (n, 3)
     size = np.sqrt(np.einsum("nx,nx,n->", step, step, area))
     total = gram(d - d.mean(0), area).trace() / (len(d) - 1)
-    modes = dataset(
-        {"variable": name},
-        mean_displacement=fit["intercept"].values.astype(np.float32),
-        deformation=step[None].astype(np.float32),
+    return modes_study(
+        study,
+        fit["shape"],
+        name=name,
+        mean=fit["intercept"].values,
+        deformation=step[None],
         standard_deviation=np.array([size]),
         score=fit["standard_score"].values[:, None],
         explained_variance_ratio=np.array([size**2 / total]),
     )
-    modes = in_unit(modes, unit_of(registration["displacement"]))
+
+
+def modes_study(
+    study: xr.DataTree,
+    shapes: xr.DataArray,
+    *,
+    name: str,
+    deformation: np.ndarray,
+    mean: np.ndarray | None = None,
+    **modes: np.ndarray,
+) -> xr.DataTree:
+    """A study of these shapes whose ``/pca`` are other modes than its own, for what shows modes.
+
+    Parameters
+    ----------
+    study : DataTree
+    shapes : DataArray (shape,)
+    name : str
+        Of the modes.
+    deformation : float ndarray (component, vertex, xyz)
+    mean : float ndarray (vertex, xyz), optional
+        That of the displacements by default.
+    **modes : float ndarray
+        The other variables of ``/pca``.
+    """
+    registration = registration_of(study)
+    registration = registration.isel(shape=registration["shape"].isin(shapes).values)
+    mean = registration["displacement"].values.mean(0) if mean is None else mean
+    pca = dataset(
+        {"variable": name},
+        mean_displacement=mean.astype(np.float32),
+        deformation=deformation.astype(np.float32),
+        **modes,
+    )
+    pca = in_unit(pca, unit_of(registration["displacement"]))
     nodes = {
         "/registration": registration,
-        "/pca": modes.assign_coords(shape=registration["shape"].values),
+        "/pca": pca.assign_coords(shape=registration["shape"].values),
     }
     for node in study.subtree:
         if node.path.split("/")[1] in ("coarse", "original"):
@@ -342,13 +397,22 @@ def regression_modes(study: xr.DataTree, fit: xr.Dataset, name: str = "variable"
 # what several of them share
 
 
+def check_moves(fit: xr.Dataset) -> None:
+    """ValueError where a result is of a field, which moves no vertex."""
+    if "effect" not in fit:
+        raise ValueError(
+            "a regression of displacements needed, found that of a field, which moves no vertex: "
+            "show its field_effect as colours"
+        )
+
+
 def check_permutations(n: int) -> None:
     """ValueError unless so many permutations can be drawn."""
     if not 1 <= n <= MOST_PERMUTATIONS:
         raise ValueError(f"n_permutations needs a number from 1 to {MOST_PERMUTATIONS}, found {n}")
 
 
-def _options(n_permutations, variances, seed):
+def check_options(n_permutations: int, variances: str, seed: int) -> dict[str, Any]:
     """The options of the permutation tests, checked before anything is computed."""
     check_permutations(n_permutations)
     if variances not in VARIANCES:
@@ -399,13 +463,12 @@ def _tell_unequal_variances(coordinates, x, sample):
     distance, p = scatter_test(coordinates, x, covariates=sample.Z)
     if p >= UNEQUAL:
         return
-    unit = unit_of(sample.registration["displacement"])
     where = "with the variable"
     which = "too small or too large"
     groups = np.unique(sample.values)
     if len(groups) == len(np.unique(x, axis=0)) and len(groups) < len(x) / 2:
         where = ", ".join(
-            f"{group}: {np.sqrt((distance[sample.values == group] ** 2).mean()):.3g} {unit}"
+            f"{group}: {np.sqrt((distance[sample.values == group] ** 2).mean()):.3g} {sample.unit}"
             for group in groups
         )
         which = "too small where a small group scatters more, too large where a large one does"
@@ -424,7 +487,10 @@ def _test_vertices(sample, x, of, options):
     if of not in ("vector", "normal"):
         raise ValueError(f"of must be 'vector' or 'normal', found {of!r}")
     fields = d  # (s, n, 3), or (s, n, 1) along the normals
+    is_field = d.shape[2] == 1
     if of == "normal":
+        if is_field:
+            raise ValueError("a field has no part along the normals: leave out of='normal'")
         fields = normal_displacement(d, vertex_normals(*as_arrays(registration)))[..., None]
     share, p, p_max = vertex_test(fields, x, covariates=Z, **options)
     columns = np.column_stack([np.ones(len(d)), x] if Z is None else [np.ones(len(d)), x, Z])
@@ -434,14 +500,20 @@ def _test_vertices(sample, x, of, options):
     B = np.linalg.pinv(columns / size, rcond=1e-10) @ d.reshape(len(d), -1).astype(float)
     B = B / size[:, None]  # (columns, 3 n)
     effect_map = dataset(
-        explained_share=share,
-        p_vertex=p,
-        p_family_wise=p_max,
-        p_false_discovery=stats.false_discovery_control(p),
-        effect=B[1].reshape(-1, 3),
-        intercept=B[0].reshape(-1, 3),
+        explained_share=sample.whole(share),
+        p_vertex=sample.whole(p),
+        p_family_wise=sample.whole(p_max),
+        p_false_discovery=sample.whole(stats.false_discovery_control(p)),
     )
-    return in_unit(effect_map, unit_of(registration["displacement"]))
+    slope, intercept = B[1].reshape(-1, d.shape[2]), B[0].reshape(-1, d.shape[2])
+    if is_field:
+        found = dataset(
+            {"field_unit": sample.unit},
+            field_effect=sample.whole(slope[:, 0]),
+            field_intercept=sample.whole(intercept[:, 0]),
+        )
+        return effect_map.merge(in_unit(found, sample.unit, of=FIELD_UNIT))
+    return in_unit(effect_map.merge(dataset(effect=slope, intercept=intercept)), sample.unit)
 
 
 def _squared_cohen_f(effect_map):

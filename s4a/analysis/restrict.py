@@ -77,7 +77,7 @@ def within(
     part["corner_vertex"] = variable("corner_vertex", number[triangles[inside]])
     part["template_vertex"] = variable("template_vertex", np.flatnonzero(keep))
     part["vertex_area"] = variable("vertex_area", vertex_areas(*as_arrays(part)))
-    return _study(study, part)
+    return _study(study, part, np.flatnonzero(keep))
 
 
 def _mask_of(study, registration, region):
@@ -216,11 +216,14 @@ def with_size(study: xr.DataTree) -> xr.DataTree:
     return _study(study, part)
 
 
-def _study(study, registration):
-    """A study of a registration, with modes of its own and the tables of the one it is from."""
+def _study(study, registration, vertices=slice(None)):
+    """A study of a registration, with modes of its own, tables and fields of the one it is from."""
     modes = pca(registration, vertex_areas(*as_arrays(registration)))
     nodes = {"/registration": registration, "/pca": modes}
     for name in ("subjects", "report"):
         if name in study.children:
             nodes[f"/{name}"] = study[name].to_dataset()
+    if "fields" in study.children:
+        for name, field in study["fields"].children.items():
+            nodes[f"/fields/{name}"] = field.to_dataset().isel(vertex=vertices)
     return xr.DataTree.from_dict(nodes, name=study.name)

@@ -23,6 +23,7 @@ import xarray as xr
 from scipy import stats
 
 from s4a.analysis.asymmetry import asymmetry, asymmetry_modes, symmetry
+from s4a.analysis.covariation import covariation, covariation_modes
 from s4a.analysis.effects import (
     check_permutations,
     group_map,
@@ -48,6 +49,8 @@ __all__ = [
     "asymmetry",
     "asymmetry_modes",
     "classify",
+    "covariation",
+    "covariation_modes",
     "evaluate",
     "generalization",
     "group_map",
@@ -128,6 +131,7 @@ def classify(
     group: Values,
     estimator: "ClassifierMixin | None" = None,
     *,
+    field: str | None = None,
     n_components: int | None = None,
     n_folds: int = 5,
     n_permutations: int = 99,
@@ -148,6 +152,7 @@ def classify(
     group : see :func:`group_test`
     estimator : scikit-learn classifier, optional
         Logistic regression by default; it is cloned.
+    field : see :func:`group_test`
     n_components : int, optional
         As in :func:`group_test`, at most what the training shapes carry.
     n_folds : int
@@ -190,7 +195,7 @@ def classify(
     check_permutations(n_permutations)
     if n_folds < 2:
         raise ValueError(f"n_folds needs a number from 2, found {n_folds}")
-    sample = sample_of(study, group, "group")
+    sample = sample_of(study, group, "group", field=field)
     group, sizes = sample.values, group_sizes(sample.values)
     names, count = np.unique(group, return_counts=True)
     n_folds = min(n_folds, int(count.min()))

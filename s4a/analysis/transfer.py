@@ -334,15 +334,29 @@ def transfer_scalars(
     """
     mesh, each = plan(study, source, targets, options)
     field = _per_vertex(field, mesh, "field").astype(float)
-    known = np.isfinite(field).astype(float)
     carried = {}
     for name, _, routes in each:
-        W, confidence = blend_routes(routes, len(field))
-        weight = W @ known  # of the corners that are not NaN
-        value = W @ np.nan_to_num(field) / np.maximum(weight, 1e-12)
-        value[weight < 0.5] = np.nan
+        value, confidence = _blend_field(routes, field)
         carried[name] = dataset(field=value, confidence=confidence.astype(np.float32))
     return xr.DataTree.from_dict(carried)
+
+
+def on_template(study: xr.DataTree, name: str, field: np.ndarray) -> np.ndarray:
+    """A scalar field of a shape ``(vertex,)`` on the vertices of the template.
+
+    As :func:`transfer_scalars` from the shape to the template; of the template, it stays.
+    """
+    return _blend_field(_routes(study, name)[1], field)[0]
+
+
+def _blend_field(routes, field):
+    """A field at the end of routes, NaN where over half of the weight is on NaN; confidence."""
+    known = np.isfinite(field).astype(float)
+    W, confidence = blend_routes(routes, len(field))
+    weight = W @ known  # of the corners that are not NaN
+    value = W @ np.nan_to_num(field) / np.maximum(weight, 1e-12)
+    value[weight < 0.5] = np.nan
+    return value, confidence
 
 
 def _per_vertex(values, mesh, what):

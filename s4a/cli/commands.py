@@ -199,11 +199,12 @@ def statistics(args: Namespace) -> int:
     from s4a.analysis import statistics as tests
     from s4a.analysis.export import write_results
     from s4a.cli import tables
+    from s4a.cli.results import covariation_lines
     from s4a.show.page import write_page
     from s4a.show.pictures import write_animation
 
-    if args.covariates and not (args.group or args.variable):
-        raise ValueError("--covariates are of a test: give --group, --variable or both")
+    if args.covariates and not (args.group or args.variable or args.field):
+        raise ValueError("--covariates are of a test: give --group, --variable or --field")
     study, out = study_to_test(args)
     study = restricted(study, args)
     results = tests_of(study, args)  # first, as options and columns may be refused
@@ -223,9 +224,13 @@ def statistics(args: Namespace) -> int:
     if args.variable:
         regression = results["regression"]
         write("\n" + tables.significance(regression, regression, args.variable, study))
-        moving = tests.regression_modes(study, regression, args.variable)
-        write_page(moving, Path(out) / "regression.html", title=f"Regression on {args.variable}")
-        write_animation(moving, Path(out) / "regression.gif")
+        if not args.field:
+            moving = tests.regression_modes(study, regression, args.variable)
+            page = Path(out) / "regression.html"
+            write_page(moving, page, title=f"Regression on {args.variable}")
+            write_animation(moving, Path(out) / "regression.gif")
+    if args.field:
+        write("\n" + covariation_lines(results["covariation"]))
     confidence = study["registration"]["confidence"].mean().item()
     write(f"\nmean confidence of the registration {confidence:.2f}; results: {out}")
     return 0
@@ -311,13 +316,16 @@ def tests_of(study: "xr.DataTree", args: Namespace) -> "dict[str, xr.Dataset]":
         n_classified["n_permutations"] = min(args.permutations, 99)  # each trains anew
     results = {}
     if args.group:
-        results["group"] = tests.group_test(study, args.group, **options)
-        results["group_map"] = tests.group_map(study, args.group, **options)
+        results["group"] = tests.group_test(study, args.group, field=args.field, **options)
+        results["group_map"] = tests.group_map(study, args.group, field=args.field, **options)
         results["classification"] = tests.classify(
-            study, args.group, seed=args.seed, **n_classified
+            study, args.group, field=args.field, seed=args.seed, **n_classified
         )
     if args.variable:
-        results["regression"] = tests.regression(study, args.variable, **options)
+        results["regression"] = tests.regression(study, args.variable, field=args.field, **options)
+    if args.field:
+        del options["variances"]
+        results["covariation"] = tests.covariation(study, args.field, **options)
     return results
 
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable
 from importlib.metadata import version
 from typing import Any
 
-from s4a.cli import commands
+from s4a.cli import commands, growing
 from s4a.input.raw import shown
 
 MOST_PROCESSES = 1000  # so that a slip of the key starts no million of them
@@ -196,6 +196,8 @@ def _statistics(add):
     text = "regression of shape on a number, such as age; its animation"
     add("--variable", metavar="COLUMN", help=text)
     add("--covariates", nargs="+", metavar="COLUMN", help="accounted for in both")
+    text = "a field of s4a fields in place of shape in both; and that field against shape"
+    add("--field", metavar="NAME", help=text)
     add("--table", metavar="FILE", help="in place of the table of the study")
     text = (
         "of the shapes around what is tested; unequal where groups scatter differently "
@@ -231,6 +233,16 @@ def _asymmetry(add):
     add("--permutations", type=whole, help="changes of sign (default: 999)")
     add("--out", metavar="DIR", help="for netCDF, CSV, the page (default: STUDY/statistics)")
     add_options(add, ["seed"])
+
+
+def _fields(add):
+    add("study", metavar="STUDY")
+    text = "with a file for each shape: NPY, NPZ, PLY, CSV, GIFTI or FreeSurfer's curv"
+    add("folder", metavar="FOLDER", help=text)
+    text = "of the field; also of its array, column or property in the files"
+    add("--name", required=True, metavar="NAME", help=text)
+    add("--unit", help="of its numbers, such as mm")
+    add("--partial", action="store_true", help="shapes may lack it; tests leave these out")
 
 
 def _insert(add):
@@ -292,6 +304,7 @@ FLAGS = {
     commands.view: _view,
     commands.statistics: _statistics,
     commands.asymmetry: _asymmetry,
+    growing.fields: _fields,
     commands.insert: _insert,
     commands.transfer: _transfer,
     commands.compare: _compare,

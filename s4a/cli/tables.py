@@ -504,7 +504,7 @@ def significance(whole: xr.Dataset, where: xr.Dataset, name: str, study: xr.Data
         p_vertex = where[variable].values  # (n,)
         share = 100 * (area @ (p_vertex < 0.05)) / area.sum()
         lines.append(
-            f"  {share:.1f} % of the area under 0.05 ({words}), smallest {p_vertex.min():.3g}"
+            f"  {share:.1f} % of the area under 0.05 ({words}), smallest {np.nanmin(p_vertex):.3g}"
         )
     return "\n".join(lines)
 

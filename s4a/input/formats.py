@@ -125,7 +125,8 @@ PLY_TYPES = {
 PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
-def _read_ply(data):
+def _ply_tables(data):
+    """The columns of the elements up to vertices and faces."""
     end = re.search(rb"\bend_header[ \t]*\r?\n", data)
     if not end:
         raise ValueError("the header has no end_header")
@@ -138,6 +139,22 @@ def _read_ply(data):
         table[name], at = _ply_rows(body, at, name, count, properties)
         if "vertex" in table and "face" in table:
             break
+    return table
+
+
+def ply_properties(data: bytes) -> dict[str, np.ndarray]:
+    """The numbers that a PLY file has for its vertices, by name.
+
+    Raises
+    ------
+    ValueError
+        When it is cut short, or is no PLY file.
+    """
+    return _ply_tables(data).get("vertex", {})
+
+
+def _read_ply(data):
+    table = _ply_tables(data)
     vertex, face = table.get("vertex", {}), table.get("face", {})
     if not all(axis in vertex for axis in "xyz"):
         elements = ", ".join(table) or "no element"

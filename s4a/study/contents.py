@@ -56,6 +56,7 @@ REQUIRED: dict[str, tuple[str, dict[str, type]]] = {
         "shape mean_displacement deformation standard_deviation score explained_variance_ratio",
         {},
     ),
+    "fields": ("shape carried_field", {}),
     "subjects": ("shape", {}),
     "report": (
         "shape stage status reason warning path area seconds",
@@ -205,11 +206,11 @@ def check_fit(
                 check_size(data, dim, mesh.sizes[dim], f"original/{template}")
     elif stage == "latent" and not shape:
         fit_latent(data, others)
-    elif stage == "pca" and "registration" in others:
+    elif stage in ("pca", "fields") and "registration" in others:
         names = [
             one.partition("/")[2] for one in (*others, *damaged) if one.startswith("registration/")
         ]
-        check_among("scores", data["shape"].values.tolist(), names)
+        check_among("scores" if stage == "pca" else "fields", data["shape"].values.tolist(), names)
         check_size(data, "vertex", others["registration"].sizes["vertex"], "registration")
 
 

@@ -216,6 +216,8 @@ def open_study(folder: Path | str) -> xr.DataTree:
         files = {path.removeprefix("registration/"): data for path, data in files.items()}
         if files:
             nodes |= stack_registration(template["registration"], files, list(files), lazily=True)
+    fields = sorted(path.stem for path in (folder / "fields").glob("[!.]*.nc"))
+    nodes |= reader.read(f"fields/{name}" for name in fields)
     nodes |= reader.read(["pca", "subjects", "report"])
     if "report" in nodes:
         nodes = as_reported(nodes)

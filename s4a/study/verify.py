@@ -26,6 +26,7 @@ ORDER = (
     "rounds/*",
     "registration",
     "registration/*",
+    "fields/*",
     "pca",
     "subjects",
     "report",

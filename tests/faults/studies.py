@@ -427,6 +427,19 @@ PROOFS = [
         "test_statistics_of_shapes_that_are_equal_or_not_finite_say_so",
     ),
     (
+        "a field of the wrong length, missing for one shape, infinite, NaN everywhere, or for "
+        "what is no shape",
+        "error with the shape and what is needed; missing ones are left out on demand",
+        "test_fields.py",
+        "test_a_field_that_does_not_fit_is_refused_by_shape",
+    ),
+    (
+        "a field that is constant in one shape, in all, or NaN at some vertices",
+        "warned, with the shape; refused; these vertices are not tested, warned",
+        "test_fields.py",
+        "test_vertices_and_shapes_without_a_field_are_left_out_and_told",
+    ),
+    (
         "one person with several shapes in the table",
         "warned, with the shapes",
         SUBJECTS,

@@ -1,0 +1,271 @@
+"""Scalar fields carried to the template, tests of them, and field against shape."""
+
+import logging
+import shutil
+
+import numpy as np
+import pytest
+import xarray as xr
+from test_restrict import TOP, X, noise, study_of
+
+import s4a
+from s4a import cli, open_study, statistics, verify, with_field
+from s4a.analysis.covariation import two_block
+from s4a.analysis.fields import write_field
+from s4a.input.scalars import read_scalars
+from s4a.schema import dataset
+
+HEIGHT = X[:, 2]
+
+
+def with_carried(study, values, unit="mm"):
+    """The study with a field that is on the template already."""
+    field = dataset(carried_field=values).assign_coords(shape=study["registration"]["shape"].values)
+    field["carried_field"].attrs["units"] = unit
+    return xr.DataTree.from_dict(
+        {n.path: n.to_dataset(inherit=False) for n in study.subtree} | {"/fields/thickness": field}
+    )
+
+
+def pattern(seed, s):
+    """Smooth random fields (s, n)."""
+    return noise(seed, s, size=1.0)[..., 0]
+
+
+@pytest.fixture(scope="module")
+def planted():
+    """Twenty shapes whose field is thicker above in group b, grows with age, and follows shape."""
+    rng = np.random.default_rng(0)
+    group, age = np.repeat(["a", "b"], 10), rng.permutation(20) * 1.0
+    score = rng.normal(size=20)
+    d = noise(1, 20) + score[:, None, None] * X * [0.5, 0, 0]
+    values = 0.5 * pattern(2, 20) + 3 + 4.0 * (group == "b")[:, None] * TOP
+    values += 0.2 * (age - 9.5)[:, None] * ~TOP + 3 * score[:, None] * HEIGHT
+    return with_carried(study_of(d, group=group, age=age, score=score), values)
+
+
+def test_a_field_of_the_coordinates_is_carried_to_where_the_template_was_registered(study):
+    meshes = study["original"].children.items()
+    heights = {name: mesh["position"].values[:, 2] for name, mesh in meshes}
+    found = with_field(study, "height", heights, unit="mm")
+    field = found["fields/height"].to_dataset()["carried_field"]
+    assert field.dims == ("shape", "vertex")
+    assert field.attrs["units"] == "mm"
+    mesh = study["registration"].to_dataset()
+    template = mesh.attrs["template"]
+    assert np.allclose(field.sel(shape=template), mesh["position"].values[:, 2])
+    name = next(n for n in heights if n != template)
+    own = mesh.sel(shape=name)
+    placed = mesh["position"].values + own["displacement"].values
+    expected = ((placed - own["translation"].values) @ own["rotation"].values)[:, 2]
+    gap = abs(field.sel(shape=name).values - expected)
+    assert np.median(gap) < 0.02 * np.ptp(expected)
+    assert "fields" not in study.children
+
+
+def test_a_field_is_kept_in_the_folder_of_its_study(study_folder, tmp_path, capsys):
+    folder = shutil.copytree(study_folder, tmp_path / "study")
+    study, files = open_study(folder), tmp_path / "files"
+    files.mkdir()
+    rng = np.random.default_rng(0)
+    for name, mesh in study["original"].children.items():
+        np.save(files / f"{name}.npy", rng.normal(size=mesh.sizes["file_vertex_index"]))
+    assert cli.main(["fields", str(folder), str(files), "--name", "noise", "--unit", "um"]) == 0
+    assert "noise of 4 of 4 shapes" in capsys.readouterr().out
+    kept = open_study(folder)["fields/noise"].to_dataset()["carried_field"]
+    assert kept.attrs["units"] == "um"
+    assert np.isfinite(kept).all()
+    assert set(verify(folder)["state"].values.tolist()) == {"whole"}
+    first = folder / "registration" / f"{kept['shape'].values[0]}.nc"
+    first.unlink()  # a study that is registered anew has no field of the old registration
+    assert "fields" not in open_study(folder).children
+
+
+def test_files_of_fields_are_read_as_they_are_written(tmp_path):
+    values = np.array([1.5, -2, 3])
+    np.save(tmp_path / "a.npy", values)
+    np.savez(tmp_path / "a.npz", thickness=values, other=values[:2])
+    (tmp_path / "a.csv").write_text("vertex,thickness\n0,1.5\n1,-2\n2,3\n")
+    (tmp_path / "a.txt").write_text("1.5\n-2\n3\n")
+    s4a.write_mesh(tmp_path / "a.ply", np.eye(3), [[0, 1, 2]], thickness=values)
+    curv = b"\xff\xff\xff" + np.array([3, 1, 1], ">i4").tobytes() + values.astype(">f4").tobytes()
+    (tmp_path / "a.thickness").write_bytes(curv)
+    s4a.write_mesh(tmp_path / "a.gii", np.eye(3), [[0, 1, 2]], thickness=values)
+    for file in sorted(tmp_path.iterdir()):
+        assert read_scalars(file, "thickness", 3).tolist() == values.tolist(), file.name
+        with pytest.raises(ValueError, match=f"{file.name}: 4 numbers, one per vertex, needed"):
+            read_scalars(file, "thickness", 4)
+    for wrong, message in {
+        "a.npz": "an array 'curv' expected, found thickness, other",
+        "a.ply": "a property 'curv' of its vertices expected",
+        "a.csv": "a column 'curv' expected, found vertex, thickness",
+    }.items():
+        with pytest.raises(ValueError, match=message):
+            read_scalars(tmp_path / wrong, "curv")
+    (tmp_path / "cut.curv").write_bytes(curv[:-2])
+    with pytest.raises(ValueError, match=r"cut.curv cannot be read as a field: one number for"):
+        read_scalars(tmp_path / "cut.curv")
+
+
+def test_nibabel_reads_and_writes_the_same_files_of_freesurfer(tmp_path):
+    from nibabel.freesurfer import io
+
+    values = np.random.default_rng(0).normal(size=50).astype(np.float32)
+    io.write_morph_data(tmp_path / "lh.curv", values, 96)
+    assert read_scalars(tmp_path / "lh.curv").tolist() == values.astype(float).tolist()
+
+
+def test_a_field_that_does_not_fit_is_refused_by_shape(study, caplog):
+    meshes = study["original"].children
+    good = {name: np.arange(mesh.sizes["vertex"]) * 1.0 for name, mesh in meshes.items()}
+    first, second, *_ = good
+    with pytest.raises(ValueError, match=f"of {first} needs a number for each of the .*vertices"):
+        with_field(study, "f", good | {first: np.ones(7)})
+    with pytest.raises(ValueError, match=f"lacks {second}: give them, or partial=True"):
+        with_field(study, "f", {name: good[name] for name in good if name != second})
+    with pytest.raises(ValueError, match=f"of {second} needs finite numbers.* 1 are infinite"):
+        with_field(study, "f", good | {second: np.r_[np.inf, good[second][1:]]})
+    with pytest.raises(ValueError, match=f"of {second} is NaN everywhere"):
+        with_field(study, "f", good | {second: good[second] * np.nan})
+    with pytest.raises(ValueError, match="values for nobody, which are no shapes"):
+        with_field(study, "f", good | {"nobody": good[first]})
+    with pytest.raises(ValueError, match="one array for each of 4 shapes, found 2"):
+        with_field(study, "f", [good[first], good[second]])
+    with pytest.raises(ValueError, match=r"needs numbers, found <U1"):
+        with_field(study, "f", good | {first: np.full(len(good[first]), "a")})
+    with pytest.raises(ValueError, match="a name of letters"):
+        with_field(study, "a/b", good)
+    assert not caplog.records
+    with_field(study, "f", good | {first: np.full(len(good[first]), 2.5)})
+    assert f"of {first} is 2.5 everywhere: is it the right file?" in caplog.text
+    found = with_field(study, "f", good | {first: None}, partial=True)
+    assert f"left out of its tests: {first}" in caplog.text
+    values = found["fields/f"].to_dataset()["carried_field"]
+    assert np.isnan(values.sel(shape=first)).all()
+    assert np.isfinite(values.sel(shape=second)).all()
+    with pytest.raises(ValueError, match="no field 'g'; with_field carries one"):
+        write_field(found, "g", "nowhere")
+
+
+def test_groups_that_differ_in_a_field_are_told_where_they_do(planted):
+    options = {"field": "thickness", "covariates": ["age", "score"], "n_permutations": 199}
+    where = statistics.group_map(planted, "group", **options)
+    assert where["field_effect"].attrs["units"] == "mm"
+    assert abs(where["field_effect"].values[TOP].mean() - 4) < 0.5
+    assert (where["p_family_wise"].values[TOP] < 0.05).mean() > 0.9
+    assert (where["p_family_wise"].values[~TOP] < 0.05).mean() < 0.05
+    assert "effect" not in where
+    assert statistics.group_test(planted, "group", **options)["p_value"] < 0.02
+    shape = {**options, "field": None}
+    assert statistics.group_test(planted, "group", **shape)["p_value"] > 0.05
+    classes = statistics.classify(planted, "group", field="thickness", n_permutations=9)
+    assert classes.attrs["balanced_accuracy"] > 0.8
+
+
+def test_the_slope_of_a_field_is_that_of_least_squares(planted):
+    fit = statistics.regression(
+        planted, "age", field="thickness", covariates=["group", "score"], n_permutations=199
+    )
+    table = planted["subjects"]
+    columns = [np.ones(20), table["age"], table["group"] == "b", table["score"]]
+    values = planted["fields/thickness/carried_field"].values
+    slope = np.linalg.lstsq(np.column_stack(columns).astype(float), values, rcond=None)[0][1]
+    assert np.allclose(fit["field_effect"], slope)
+    assert (fit["p_false_discovery"].values[~TOP] < 0.05).mean() > 0.9
+    for refused in (statistics.predict, statistics.regression_modes):
+        with pytest.raises(ValueError, match="that of a field, which moves no vertex"):
+            refused(planted, fit, *([1.0] if refused is statistics.predict else []))
+    with pytest.raises(ValueError, match="a field has no part along the normals"):
+        statistics.regression(planted, "age", field="thickness", of="normal")
+
+
+def test_vertices_and_shapes_without_a_field_are_left_out_and_told(planted, caplog):
+    caplog.set_level(logging.WARNING)
+    values = planted["fields/thickness/carried_field"].values.copy()
+    values[3, :5] = np.nan
+    values[7] = np.nan
+    holed = with_carried(planted, values)
+    where = statistics.group_map(holed, "group", field="thickness", n_permutations=99)
+    assert "lacks in some shape at 5 of" in caplog.text
+    assert "field 'thickness' has no value for 1 of 20 shapes" in caplog.text
+    assert where.attrs["left_out"] == "shape_07"
+    assert np.isnan(where["p_family_wise"].values[:5]).all()
+    assert np.isfinite(where["p_family_wise"].values[5:]).all()
+    with pytest.raises(ValueError, match=r"no field 'curv'; it has thickness"):
+        statistics.group_map(planted, "group", field="curv")
+    same = with_carried(planted, np.ones_like(values))
+    with pytest.raises(ValueError, match="the same in all shapes: there is nothing to test"):
+        statistics.group_map(same, "group", field="thickness")
+
+
+def test_a_field_follows_its_vertices_into_a_region(planted):
+    part = statistics.within(planted, TOP)
+    vertex = part["registration"]["template_vertex"].values
+    values = planted["fields/thickness/carried_field"].values
+    assert np.array_equal(part["fields/thickness/carried_field"].values, values[:, vertex])
+    again = statistics.without(part, "age")
+    assert again["fields/thickness"].equals(part["fields/thickness"])
+
+
+def test_two_blocks_are_those_of_the_singular_value_decomposition():
+    rng = np.random.default_rng(3)
+    A, B = rng.normal(size=(15, 6)), rng.normal(size=(15, 4))
+    found = two_block(A, B, n_permutations=19)
+    A, B = A - A.mean(0), B - B.mean(0)
+    cross = A.T @ B / 14
+    assert np.allclose(found["singular"], np.linalg.svd(cross, compute_uv=False))
+    scores = A @ found["U"][:, 0], B @ found["V"][:, 0]
+    assert np.isclose(found["r"][0], np.corrcoef(*scores)[0, 1])
+    rv = np.trace(A.T @ B @ B.T @ A)
+    rv /= np.sqrt(np.trace(A.T @ A @ A.T @ A) * np.trace(B.T @ B @ B.T @ B))
+    assert np.isclose(found["rv"], rv)
+
+
+def test_a_field_that_follows_shape_is_found_with_its_pattern(planted):
+    found = statistics.covariation(
+        planted, "thickness", covariates=["age", "group"], n_permutations=199
+    )
+    assert found["p_value"] == 0.005
+    assert found["rv_p"] == 0.005
+    assert abs(np.corrcoef(found["field_pattern"].values[0], HEIGHT)[0, 1]) > 0.9
+    along = found["deformation"].values[0, :, 0]
+    assert abs(np.corrcoef(along, X[:, 0])[0, 1]) > 0.9
+    assert found["field_pattern"].attrs["units"] == "mm"
+    # both follow the planted score with the sign that it has
+    both = (
+        np.polyfit(HEIGHT, found["field_pattern"].values[0], 1)[0]
+        * np.polyfit(X[:, 0], along, 1)[0]
+    )
+    assert both > 0
+    moving = statistics.covariation_modes(planted, found)
+    assert np.allclose(moving["pca"]["deformation"], found["deformation"])
+    with pytest.raises(ValueError, match="n_components needs a number from 1 to"):
+        statistics.covariation(planted, "thickness", n_components=99)
+
+
+def test_fields_of_noise_are_told_to_follow_shape_no_more_often_than_said():
+    found = []
+    for run in range(100):
+        rng = np.random.default_rng([1, run])
+        A, B, Z = (rng.normal(size=(15, c)) for c in (6, 4, 2))
+        one = two_block(A, B, covariates=Z, n_permutations=39, seed=run)
+        found.append([one["p"] <= 0.05, one["singular_p"][0] <= 0.05, one["rv_p"] <= 0.05])
+    assert np.all(np.mean(found, axis=0) < 0.12)  # 0.05 and three standard errors
+
+
+def test_the_command_takes_a_field_in_place_of_shape(tmp_path, capsys, study_folder):
+    folder = shutil.copytree(study_folder, tmp_path / "study")
+    study = open_study(folder)
+    meshes, rng = study["original"].children.items(), np.random.default_rng(0)
+    values = {name: rng.normal(size=mesh.sizes["vertex"]) for name, mesh in meshes}
+    write_field(with_field(study, "noise", values), "noise", folder)
+    table = tmp_path / "t.csv"
+    rows = [f"{name},{i + i * i}" for i, name in enumerate(values)]
+    table.write_text("\n".join(["shape,age", *rows]))
+    words = ["--variable", "age", "--table", str(table), "--permutations", "19"]
+    assert cli.main(["statistics", str(folder), *words, "--field", "noise"]) == 0
+    assert "noise against shape: first pair" in capsys.readouterr().out
+    out = folder / "statistics"
+    assert "field_effect" in (out / "regression.vertex.csv").read_text().splitlines()[0]
+    assert (out / "covariation.nc").exists()
+    assert not (out / "regression.html").exists()
