@@ -497,7 +497,7 @@ def compare_collection(args: Namespace) -> "tuple[xr.Dataset, list[str], np.ndar
     """Table 2: the result, names of the bars of Fig. 3, their seconds by block, and a text."""
     from s4a.cli import tables
     from s4a.evaluation import compare as comparison
-    from s4a.study.options import Options
+    from s4a.study.options import N_COARSE, Options
 
     if args.paths or args.truth or args.landmarks or args.keep:
         raise ValueError(
@@ -506,7 +506,7 @@ def compare_collection(args: Namespace) -> "tuple[xr.Dataset, list[str], np.ndar
     result = comparison.collection(
         args.collection,
         methods=args.methods or list(comparison.COLLECTION_METHODS),
-        n_coarse=args.n_coarse,
+        n_coarse=args.n_coarse or N_COARSE,
         n_pairs=args.n_pairs,
         k_init=min(Options.k_init, args.k),
         k=args.k,
@@ -527,6 +527,7 @@ def compare_pairs(
     from s4a.cli import tables
     from s4a.evaluation import compare as comparison
     from s4a.input.files import find_meshes
+    from s4a.study.options import N_COARSE
 
     if len(args.paths) < 2:
         raise ValueError("compare needs SOURCE and TARGET, or --collection PATH...")
@@ -538,7 +539,7 @@ def compare_pairs(
         methods=args.methods,
         truth=truth_of(args.truth, targets),
         landmarks=landmark_pairs(args.landmarks, targets),
-        n_coarse=args.n_coarse,
+        n_coarse=args.n_coarse or N_COARSE,
         k=args.k,
         preset=args.preset,
         keep=args.keep,

@@ -49,7 +49,7 @@ HELP = {
     "intersections": "count triangles that pass through others",
     "label": "the files are label volumes (NIfTI, MGH): the surface of this label, or several: 1,2",
     "pattern": "only files whose name fits, for example '*brain*'",
-    "preset": "'paper' leaves out all that is added to the paper",
+    "preset": "'paper' leaves out all that is added to the paper; 'fast' halves the time",
     "template": "name of the shape to register to (default: the median shape)",
     "reflect": "shapes to mirror: their names, with commas; COLUMN=VALUE of the table; or auto",
     "landmarks": "folder of landmark files named as the shapes, which guide registration",
@@ -85,11 +85,11 @@ def add_options(add: Callable[..., Any], names: Iterable[str], *, unset: bool = 
 
     With `unset` those that are not given are None.
     """
-    from s4a.study.options import CHOICES, DEFAULTS, Options
+    from s4a.study.options import CHOICES, PRESETS, Options
 
     for name in names:
         default = -1 if name == "n_jobs" else getattr(Options, name)
-        shown = DEFAULTS.get(name, default)
+        shown = PRESETS[None].get(name, default)
         text = HELP[name]
         if name in CHOICES:
             kind: dict[str, Any] = {"choices": [choice for choice in CHOICES[name] if choice]}

@@ -528,7 +528,7 @@ def collection(
             f"methods must be some of {', '.join(COLLECTION_METHODS)}; found {wrong or methods!r}"
         )
     given = {"init": init, "n_spread": n_spread, "wide": wide}
-    presets = {name: {key: values[key] for key in given} for name, values in STUDY_PRESETS.items()}
+    presets = {name: {key: STUDY_PRESETS[name][key] for key in given} for name in (None, "paper")}
     options = Options(
         n_coarse=n_coarse,
         n_pairs=n_pairs,

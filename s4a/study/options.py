@@ -28,7 +28,7 @@ CHOICES = {
     "alignment": ("fitted", "icp"),
     "how": ("ours", "standard"),
     "norm": tuple(NORMS),
-    "preset": (None, "paper"),
+    "preset": (None, "paper", "fast"),
     "doubtful": ("apart", "stop"),
 }
 # what is added to the paper, each with its switch; in PAPER none of it.  These are the options that
@@ -61,7 +61,14 @@ PAPER = {
     "n_projected": 0,
     "both": False,
 }
-PRESETS: dict[str | None, dict[str, Any]] = {None: DEFAULTS, "paper": PAPER}
+# about half the time, and what that costs: docs/clusters.md
+FAST = {"n_coarse": 3000, "n_spread": 500, "wide": 0}
+N_COARSE = 6000  # vertices of a low-resolution mesh, where no preset says another number
+PRESETS: dict[str | None, dict[str, Any]] = {
+    None: DEFAULTS | {"n_coarse": N_COARSE},
+    "paper": PAPER,
+    "fast": FAST,
+}
 # switches that method="scalable" does not have, and what each would need
 WITHOUT_MESH = {
     "lift": "lifts the eigenfunctions of one",
@@ -104,12 +111,14 @@ PAIR = (
 def apply_preset(
     preset: str | None, given: dict[str, Any], presets: dict[str | None, dict[str, Any]]
 ) -> dict[str, Any]:
-    """The options that a preset sets, where those that are `given` are None; theirs where not.
+    """The options that presets set: that of None those that the chosen one does not.
+
+    An option that is `given`, and not as None, stays as it is.
 
     Raises
     ------
     ValueError
-        When a preset that is not None sets an option that is given otherwise.
+        When the chosen preset sets an option that is given otherwise, or is none.
 
     Examples
     --------
@@ -118,11 +127,12 @@ def apply_preset(
     0
     """
     if preset not in presets:
-        raise ValueError(f"preset must be one of None, 'paper'; found {preset!r}")
+        choices = ", ".join(map(repr, presets))
+        raise ValueError(f"preset must be one of {choices}; found {preset!r}")
     settings = {}
-    for name, value in presets[preset].items():
+    for name, value in (presets[None] | presets[preset]).items():
         own = given.get(name)
-        if preset and own is not None and own != value:
+        if preset and name in presets[preset] and own is not None and own != value:
             raise ValueError(
                 f"preset {preset!r} sets {name}={value!r}; found {name}={own!r}: "
                 "leave out one of both"
@@ -152,7 +162,6 @@ class Options:
     """
 
     method: str = "rematch"
-    n_coarse: int = 6000
     n_pairs: int = 500
     k_init: int = 20
     k: int = 100
@@ -160,6 +169,7 @@ class Options:
     step: int = 5
     weights: str = "cycles"
     # of these the preset sets what is None
+    n_coarse: int | None = None
     lift: bool | None = None
     init: str | None = None
     ahead: str | None = None
@@ -228,7 +238,7 @@ class Options:
     def _check_choices(self):
         for name, legal in CHOICES.items():
             value = getattr(self, name)
-            if value not in legal and not (value is None and name in DEFAULTS):
+            if value not in legal and not (value is None and name in PRESETS[None]):
                 choices = ", ".join(map(repr, legal))
                 raise ValueError(f"{name} must be one of {choices}; found {value!r}")
 
@@ -290,6 +300,8 @@ class Options:
     def changed(self, given: dict[str, Any]) -> Self:
         """These options with some given otherwise; a `preset` that is given sets its own anew.
 
+        What the preset before it set stands as the default again.
+
         Raises
         ------
         ValueError
@@ -306,7 +318,10 @@ class Options:
         ValueError: preset 'paper' sets refine='intrinsic'; found refine='joint': leave out one of \
 both
         """
-        unset = dict.fromkeys(DEFAULTS) if "preset" in given else {}
+        unset: dict[str, None] = {}
+        if "preset" in given:
+            new, own = given["preset"] or "paper", self.preset or "paper"
+            unset = dict.fromkeys([*PAPER, *PRESETS[own], *PRESETS.get(new, ())])
         return replace(self, **unset | given)
 
     def to_report(self) -> dict[str, str]:

@@ -49,9 +49,10 @@ def match_pair(source: xr.Dataset, target: xr.Dataset, **options: Any) -> xr.Dat
     lift, parts, alignment, area_weighted, n_projected
         See :func:`s4a.analyse`.
     n_coarse : int
-        Vertices of the low-resolution meshes.
-    preset : {None, "paper"}
-        ``"paper"`` leaves out all that is added to 4.1, see :func:`s4a.analyse`.
+        Vertices of the low-resolution meshes; 6,000 by default.
+    preset : {None, "paper", "fast"}
+        ``"paper"`` leaves out all that is added to 4.1, ``"fast"`` takes n_coarse=3000; see
+        :func:`s4a.analyse`.
     seed, rng : see :mod:`s4a.seeds`
 
     Returns

@@ -90,7 +90,7 @@ def analyse(
         and all that takes one takes it; what is called a coarse mesh are then samples, joined
         where their cells meet.  ``lift`` and ``wrap`` need a coarse mesh and are refused.
     n_coarse : int
-        Vertices of the low-resolution meshes (4.1); or samples.
+        Vertices of the low-resolution meshes (4.1), or samples; 6,000 by default.
     n_pairs : int
         Pairs of the network, each with maps both ways; all pairs where there are fewer (5.1).
     k_init, k : int
@@ -149,11 +149,14 @@ def analyse(
         See :func:`s4a.read_shapes`.
     wrap : bool
         Whether shapes are wrapped watertight before they are remeshed.
-    preset : {None, "paper"}
+    preset : {None, "paper", "fast"}
+        ``"fast"`` sets n_coarse=3000, n_spread=500, wide=0, which takes about half the time; its
+        errors are a tenth larger (``tests/benchmarks/cheaper.py``).
         ``"paper"`` leaves out all that is added to the paper: lift=False, init="landmarks",
         ahead="network", n_spread=0, wide=0, sharpen=0, refine="intrinsic", parts=False,
-        alignment="icp", area_weighted=False, n_projected=0, both=False.  Another value of these is
-        refused; to add them one at a time, give ``s4a.study.options.PAPER`` with one changed.
+        alignment="icp", area_weighted=False, n_projected=0, both=False.  Another value of what a
+        preset sets is refused; to add them one at a time, give ``s4a.study.options.PAPER`` with one
+        changed.
     template : str, optional
         Name of the shape to register to; the median shape by default.
     reflect : str or list of str, optional

@@ -150,7 +150,11 @@ def cortex(folder, pairs, _kept=False):
 
 
 def ours(template, shape, _start, refine):
-    found = s4a.match_pair(shape, template, refine=refine)
+    return image_of(s4a.match_pair(shape, template, refine=refine), template)
+
+
+def image_of(found, template):
+    """The registered template in the frame of the shape's file ``(n, 3)``."""
     moved = template["position"].values + found["displacement"].values - found["translation"].values
     return moved @ found["rotation"].values / found["scale"].item()
 

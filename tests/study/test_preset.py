@@ -11,7 +11,7 @@ from small import FLAGS, OPTIONS
 import s4a
 from s4a.analysis import transfer
 from s4a.cli import main
-from s4a.study.options import DEFAULTS, PAPER, Options
+from s4a.study.options import DEFAULTS, FAST, PAPER, Options
 from s4a.study.store import attributes, read, write
 
 PAIR = {name: OPTIONS[name] for name in ("n_coarse", "k_init", "k")}
@@ -50,6 +50,31 @@ def test_every_addition_and_the_papers_choice_are_in_the_documentation():
     for name, value in PAPER.items():
         assert f"| `{name}`: " in table
         assert f"{name}={value!r}".replace("'", '"') in said
+
+
+def test_the_fast_preset_sets_what_it_is_for_and_leaves_the_rest():
+    options = Options(preset="fast", refine="joint")
+    assert {name: getattr(options, name) for name in FAST} == FAST
+    assert options.refine == "joint"
+    with pytest.raises(ValueError, match="preset 'fast' sets n_coarse=3000; found n_coarse=500"):
+        Options(preset="fast", n_coarse=500)
+
+
+@pytest.mark.parametrize(
+    ("own", "given", "n_coarse"),
+    [
+        ({"preset": "fast"}, {"preset": None}, 6000),
+        ({"preset": "fast"}, {"preset": "paper"}, 6000),
+        ({"n_coarse": 500}, {"preset": "fast"}, 3000),
+        ({"n_coarse": 500}, {"preset": "paper"}, 500),
+        ({"n_coarse": 500, "preset": "paper"}, {"preset": None}, 500),
+        ({"preset": "fast"}, {"k": 50}, 3000),
+    ],
+)
+def test_another_preset_takes_back_what_the_one_before_it_set(own, given, n_coarse):
+    options = Options(**own).changed(given)
+    assert options.n_coarse == n_coarse
+    assert options.preset == given.get("preset", own.get("preset"))
 
 
 @pytest.mark.parametrize("name", [name for name in PAPER if PAPER[name] != DEFAULTS[name]])
