@@ -1,12 +1,12 @@
 """The pictures of README and pages, drawn anew: ``make figures``, or ``figures.py NAME ...``.
 
 The figures of the paper are drawn from the embedded collection, twelve synthetic brains of 40,000
-vertices, analysed with all defaults as ``s4a demo`` does; the two panels are those of this study
-in Chromium. A name is that of a picture without its ending; ``docs/heads.png`` is made by
-``tests/benchmarks/compare.py heads``, ``docs/structure.svg`` by ``make structure``.
+vertices, analysed with all defaults as ``s4a demo`` does; the two panels and the scene are those of
+this study in Chromium, the scene in JupyterLab. A name is that of a picture without its ending;
+``docs/heads.png`` is made by ``tests/benchmarks/compare.py heads``, and ``docs/structure.svg`` by
+``make structure``.
 """
 
-import shutil
 import sys
 import tempfile
 from functools import cache
@@ -39,13 +39,6 @@ from s4a.show.surfaces import carried_colors, mesh_of, network_places, surface
 HERE = Path(__file__).parent
 SHAPES, VERTICES, PAIR = 12, 40_000, 10_000
 LOOK = {"view": "corner", "up": "z"}
-SWITCHES = [
-    "--no-sandbox",
-    "--disable-gpu",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-]
 DRAWN = (
     "[...document.querySelectorAll('canvas.s4a-view')]"
     ".some((c) => c.offsetParent && c.view && c.view.frames > 0)"
@@ -282,15 +275,22 @@ def landmarks(held_out):
 # ------------------------------------------------------------------------------------ the panels
 
 
+def front_ends():
+    """The script that opens notebooks in Chromium."""
+    sys.path.insert(0, str(HERE.parent / "tests" / "benchmarks"))
+    import frontends
+
+    return frontends
+
+
 def panel(widget, name, act):
     """A picture of a panel's page in Chromium, 894 pixels wide."""
     from playwright.sync_api import sync_playwright
 
-    found = (shutil.which(n) for n in ("chromium", "chromium-browser", "google-chrome"))
-    browser_path = next(filter(None, found))
+    front = front_ends()
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as driver:
         page_file = widget.save_html(Path(folder) / "panel.html", limit=0)
-        browser = driver.chromium.launch(executable_path=browser_path, args=SWITCHES)
+        browser = driver.chromium.launch(executable_path=front.CHROMIUM, args=front.SWITCHES)
         page = browser.new_page(viewport={"width": 910, "height": 1000})
         page.goto(page_file.as_uri())
         page.wait_for_function(DRAWN)
@@ -320,6 +320,48 @@ def network(study):
     return panel(shown, "network", lambda page: None)
 
 
+# ------------------------------------------------------------------------------------ the scene
+
+SCENE = """
+import s4a
+from s4a.widgets import threejs
+
+study = s4a.open_study({store!r})
+joined = threejs.correspondence(study, "brain_01", "brain_02", n_lines=40)
+view = threejs.renderer(joined, size=(860, 380), view="front")
+view
+"""
+
+
+def scene(study):
+    """A scene of pythreejs, as a notebook in JupyterLab shows it."""
+    import nbformat
+    from playwright.sync_api import sync_playwright
+
+    front = front_ends()
+    store = Path(study["coarse/brain_01"].to_dataset().encoding["source"]).parents[1]
+    cell = nbformat.v4.new_code_cell(SCENE.format(store=str(store)))
+    path = HERE / "scene.png"
+    with tempfile.TemporaryDirectory() as folder, sync_playwright() as driver:
+        kernel = {"name": "python3", "display_name": "Python 3", "language": "python"}
+        notebook = nbformat.v4.new_notebook(cells=[cell], metadata={"kernelspec": kernel})
+        nbformat.write(notebook, Path(folder) / "panel.ipynb")
+        browser = driver.chromium.launch(executable_path=front.CHROMIUM, args=front.SWITCHES)
+        with front.served("jupyterlab", Path(folder)) as address:
+            page = browser.new_page(viewport={"width": 1366, "height": 1000})
+            page.set_default_timeout(180_000)
+            page.goto(address)
+            page.wait_for_selector(".jp-Cell")
+            page.wait_for_timeout(3000)  # the kernel
+            page.evaluate("window.jupyterapp.commands.execute('notebook:run-all-cells')")
+            drawn = page.locator(".jp-OutputArea-output canvas").first
+            drawn.wait_for()
+            page.wait_for_timeout(5000)
+            drawn.screenshot(path=path)
+        browser.close()
+    return path
+
+
 PICTURES = {
     "figure_1": lambda: pipeline(analysed()),
     "figure_2": swapped,
@@ -330,6 +372,7 @@ PICTURES = {
     "figure_7": lambda: landmarks(carried()),
     "pca": lambda: sliders(analysed()),
     "network": lambda: network(analysed()),
+    "scene": lambda: scene(analysed()),
 }
 
 

@@ -1,12 +1,13 @@
 """Diagrams of the notebooks, where a picture says more than words."""
 
 import numpy as np
-from matplotlib import colormaps
+from matplotlib import colormaps, rc_context
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch, Polygon, Rectangle
 from scipy.spatial import Delaunay
 
-from s4a.show.charts import BLUE, GREY, LOOK, ORANGE, _figure
+from s4a.course.parts import Parts
+from s4a.show.charts import BLUE, GREY, LOOK, ORANGE
 from s4a.show.draw import SIGNED
 
 GREEN = "#009e73"
@@ -22,7 +23,14 @@ def cotangents() -> Figure:
     >>> len(cotangents().axes)
     3
     """
-    figure, ((inside, rim, area),) = _plain(3, 9.5, 3.1)
+    figure, ((inside, rim, area),) = _plain(
+        3,
+        9.5,
+        3.1,
+        "An edge i j inside has a triangle on each side, with the angles alpha and beta opposite "
+        "to it: its weight is half the sum of their cotangents. An edge on the boundary has one "
+        "triangle, and half its one cotangent. A vertex has a third of each triangle around it.",
+    )
     i, j, above, below = np.array([[0.25, 0.5], [1.0, 0.62], [0.52, 1.05], [0.78, 0.08]])
     for ax, corners in ((inside, (above, below)), (rim, (above,))):
         for corner, color, name in zip(corners, (BLUE, ORANGE), ("α", "β"), strict=False):
@@ -72,7 +80,14 @@ def dual(n_samples: int = 12) -> Figure:
     meeting = np.array([len(c) == 3 for c in corners])
     triangles = np.unique([c for c in corners if len(c) == 3], axis=0)
     shades = colormaps["Set3"]
-    figure, ((one, two, three),) = _plain(3, 9.5, 3.4)
+    figure, ((one, two, three),) = _plain(
+        3,
+        9.5,
+        3.4,
+        "A flat mesh with twelve samples. First every vertex is coloured as its nearest sample. "
+        "Then the triangles where three colours meet are black. At last each black triangle is a "
+        "large triangle of the dual, which joins the three samples.",
+    )
     for ax, strength in ((one, 1.0), (two, 1.0), (three, 0.35)):
         alone = np.array([len(c) == 1 for c in corners])
         shade = cell[T[alone, 0]]
@@ -98,7 +113,14 @@ def pull_back() -> Figure:
     >>> len(pull_back().axes)
     2
     """
-    figure, ((shapes, square),) = _plain(2, 9.5, 3.1)
+    figure, ((shapes, square),) = _plain(
+        2,
+        9.5,
+        3.1,
+        "Left: an arrow goes from a point y of the target N back to T of y on the source M; the "
+        "value of f comes back along it. Right: a square. T goes from f on M to f of T on N; "
+        "below, C goes from the coefficients a to b; Phi and Psi go down. Both ways end at b.",
+    )
     u = np.stack(np.meshgrid(*2 * [np.linspace(-1, 1, 160)]), -1)
     inside = np.hypot(*u.transpose(2, 0, 1)) < 1
     f = np.where(inside, np.sin(2.4 * u[..., 0] + 0.4) * np.cos(1.6 * u[..., 1]), np.nan)
@@ -143,7 +165,15 @@ def latent_space() -> Figure:
     >>> len(latent_space().axes)
     2
     """
-    figure, ((star, matrix),) = _plain(2, 9.5, 3.7)
+    figure, ((star, matrix),) = _plain(
+        2,
+        9.5,
+        3.7,
+        "Left: three shapes around a latent space. The maps Y 1 to Y 3 go from it to the shapes, "
+        "the maps C 12, C 23 and C 31 from shape to shape. Right: the matrix L in nine blocks, "
+        "with products of the maps on its diagonal and the maps themselves beside it, and Y 1 to "
+        "Y 3 below each other.",
+    )
     angle = np.deg2rad([90, 210, 330])
     places = 1.25 * np.c_[np.cos(angle), np.sin(angle)]
     for i, place in enumerate(places):
@@ -188,7 +218,14 @@ def two_ways() -> Figure:
     >>> [ax.get_title() for ax in two_ways().axes]
     ['standard: two searches and a fit', 'eq. 7: one search']
     """
-    figure, ((standard, ours),) = _plain(2, 9.5, 3.3)
+    figure, ((standard, ours),) = _plain(
+        2,
+        9.5,
+        3.3,
+        "Two squares of template and shape, each at low and at full resolution, U going up. The "
+        "standard way searches at low resolution, fits C, and searches again at full resolution. "
+        "Equation 7 searches once, at full resolution, with U Phi Y.",
+    )
     for ax, low in ((standard, SOFT["orange"]), (ours, SOFT["grey"])):
         for x, name in ((0, "template"), (2.6, "shape")):
             _box(ax, (x, 0), f"{name}, low\n$\\Phi\\, Y$", low, (1.05, 0.42))
@@ -205,10 +242,12 @@ def two_ways() -> Figure:
     return figure
 
 
-def _plain(columns, width, height):
-    """Axes without frames."""
-    figure, axes = _figure(width, height, columns)
-    figure.set_dpi(120)
+def _plain(columns, width, height, alt):
+    """Axes without frames, and in `alt` what they show."""
+    with rc_context(LOOK):
+        figure = Parts(figsize=(width, height), layout="constrained", dpi=120)
+        axes = figure.subplots(1, columns, squeeze=False)
+    figure.alt = alt
     for ax in axes.flat:
         ax.set_axis_off()
         ax.title.set_fontsize(LOOK["axes.titlesize"])

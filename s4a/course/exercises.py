@@ -4,6 +4,8 @@ A cell leaves ``answer = ...`` open.  What the reader puts there is checked here
 itself does not tell.
 """
 
+import html
+import re
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -26,6 +28,16 @@ class Exercise(NamedTuple):
     expected: Callable[..., Any]
     hint: str
     within: float = 0.01
+
+
+class Said(str):
+    """What is said of an answer, which a notebook shows as words and not as a value."""
+
+    __slots__ = ()
+
+    def _repr_html_(self) -> str:
+        words = re.sub(r"`([^`]+)`", r"<code>\1</code>", html.escape(self))
+        return f"<p>{words}</p>"
 
 
 def check(number: str, answer: Any, *given: Any) -> str:
@@ -103,7 +115,7 @@ def judge(answer: Any, expected: Any, hint: str = "", *, within: float = 0.01) -
     """
     hint = f" Hint: {hint}{'' if hint.endswith(('.', '?')) else '.'}" if hint else ""
     if answer is ...:
-        return f"No answer yet: put yours in the place of the dots of `answer = ...`.{hint}"
+        return Said(f"No answer yet: put yours in the place of the dots of `answer = ...`.{hint}")
     if callable(expected):
         right = bool(expected(answer))
     elif np.asarray(expected).dtype.kind in "iuf":
@@ -112,7 +124,7 @@ def judge(answer: Any, expected: Any, hint: str = "", *, within: float = 0.01) -
         right = np.array_equal(answer, expected)
     if not right:
         raise _shown(f"Not yet: the answer is {_told(answer)}.{hint}")
-    return "Right."
+    return Said("Right.")
 
 
 def _shown(message):

@@ -79,6 +79,8 @@ def _png(figure):
 def takeaway(sentence: str, *figures: "Figure") -> "Figure":
     """What to remember of a lesson: some figures in a row, below a sentence.
 
+    In a narrow cell the figures stand below each other.
+
     Parameters
     ----------
     sentence : str
@@ -98,14 +100,15 @@ def takeaway(sentence: str, *figures: "Figure") -> "Figure":
     >>> whole.get_suptitle()
     'Few modes hold most of it.'
     """
-    from matplotlib.figure import Figure
     from PIL import Image
+
+    from s4a.course.parts import Parts
 
     pictures = [np.asarray(Image.open(io.BytesIO(_png(figure)[0]))) for figure in figures]
     shares = [picture.shape[1] / picture.shape[0] for picture in pictures]
     width, gap = 9.5, 0.1
     height = min(3.2, (width - gap * len(shares)) / sum(shares))
-    whole = Figure(figsize=(height * sum(shares) + gap * (len(shares) - 1), height + 0.35))
+    whole = Parts(figsize=(height * sum(shares) + gap * (len(shares) - 1), height + 0.35))
     grid = whole.add_gridspec(
         1,
         len(shares),

@@ -175,8 +175,9 @@ def _free_corner(box, size, room, taken):
     return None
 
 
-def _names(ax, places, names, size=6):
+def _names(ax, places, names):
     """Names beside their points, each where it hides no other, or not at all."""
+    size = 8 if len(names) <= 12 else 6
     inches = ax.figure.get_size_inches() / [len(ax.figure.axes), 1]
     width, height = 72 * inches  # in points, as fonts are
     span = np.ptp(places, axis=0)

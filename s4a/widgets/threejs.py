@@ -295,8 +295,16 @@ def renderer(
     middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     aspect, fov = size[0] / size[1], 40
     half = np.deg2rad(fov) / 2
-    distance = 0.85 * radius / np.sin(min(half, np.arctan(aspect * np.tan(half))))
     turn = rotation(view, up)
+    # what is as deep as wide has room to turn; what is long fills the picture as it is seen first
+    around = 0.85 * radius / np.sin(min(half, np.arctan(aspect * np.tan(half))))
+    box = np.array([place for place in np.ndindex(3, 3, 3) if place != (1, 1, 1)]) - 1
+    ellipsoid = box / np.linalg.norm(box, axis=1, keepdims=True)
+    nearest = []  # from where all of the ellipsoid in the box is seen, and all of the box
+    for points in (ellipsoid, box):
+        x, y, z = turn @ (points * (high - low) / 2).T
+        nearest.append(float((z + np.maximum(np.abs(x) / aspect, np.abs(y)) / np.tan(half)).max()))
+    distance = 1.05 * np.clip(around / 1.05, *nearest)
     camera = three.PerspectiveCamera(
         position=(middle + distance * turn[2]).tolist(),
         up=np.eye(3)["xyz".index(up)].tolist(),
@@ -304,12 +312,12 @@ def renderer(
         aspect=aspect,
         near=radius / 100,
         far=radius * 20,
-        children=[three.DirectionalLight(position=[0, 0, 1], intensity=0.65)],
+        children=[three.DirectionalLight(position=[0, 0, 1], intensity=0.55)],
     )
     camera.lookAt(middle.tolist())
     controls = three.OrbitControls(controlling=camera, target=middle.tolist())
     scene = three.Scene(
-        children=[*objects, camera, three.AmbientLight(intensity=0.45)], background="#ffffff"
+        children=[*objects, camera, three.AmbientLight(intensity=0.4)], background="#ffffff"
     )
     width, height = size
     return three.Renderer(

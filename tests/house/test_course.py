@@ -3,6 +3,7 @@
 What is missing or wrong is told, what is right passes.
 """
 
+import base64
 import io
 import re
 
@@ -209,6 +210,29 @@ def test_no_words_of_a_diagram_lie_over_each_other_or_outside(name):
             assert box.y1 <= figure.bbox.y1, words[i]
             for j in range(i):
                 assert not box.overlaps(boxes[j]), (words[i], words[j])
+
+
+@pytest.mark.parametrize("name", ["cotangents", "dual", "pull_back", "latent_space", "two_ways"])
+def test_a_diagram_is_shown_part_by_part_with_words_for_who_does_not_see_it(name):
+    figure = getattr(diagrams, name)()
+    shown = figure.html()
+    assert shown.count("<img") == len(figure.axes)
+    assert "flex-wrap: wrap" in shown
+    alt = re.search(r'aria-label="([^"]+)"', shown)[1]
+    assert len(alt.split()) > 25
+    for ax, data in zip(figure.axes, re.findall(r"base64,([^\"]+)", shown), strict=True):
+        picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("L"))
+        assert min(picture.shape) > 300, ax.get_title()
+        rim = np.r_[picture[0], picture[-1], picture[:, 0], picture[:, -1]]
+        assert (rim > 250).mean() > 0.99, "nothing is cut"
+
+
+def test_what_is_said_of_an_answer_is_shown_as_words():
+    assert judge(3, 3)._repr_html_() == "<p>Right.</p>"
+    said = check("03.1", ...)._repr_html_()
+    assert said.startswith("<p>No answer yet:")
+    assert "<code>answer = ...</code>" in said
+    assert "<b" not in judge(..., 3, "is 2 <b 3?")._repr_html_()
 
 
 def test_the_matrix_of_the_diagram_is_the_form_of_the_latent_basis():

@@ -204,6 +204,19 @@ def test_the_camera_sees_the_surface():
     np.testing.assert_allclose(view.controls[0].target, 0, atol=0.1)
 
 
+@pytest.mark.parametrize("size", [(360, 200), (500, 500), (300, 600)])
+def test_what_is_long_fills_the_picture_and_nothing_is_cut(size):
+    long = synthetic.ellipsoid(500, (6, 1, 1))
+    view = threejs.renderer(threejs.surface(long), size=size, view="front")
+    X = long["position"].values
+    half = np.tan(np.deg2rad(view.camera.fov) / 2)
+    depth = np.linalg.norm(view.camera.position) - X @ np.array([0, -1, 0])
+    across = np.abs(X[:, 0] / depth).max() / (half * size[0] / size[1])
+    up = np.abs(X[:, 2] / depth).max() / half
+    assert 0.7 < max(across, up) < 1
+
+
+
 def test_what_cannot_be_shown_is_refused():
     mesh = synthetic.sphere(162)
     with pytest.raises(ValueError, match="162 vertices"):

@@ -1,0 +1,66 @@
+"""Figures of the notebooks whose parts stand side by side, or below each other in narrow cells."""
+
+import io
+
+from matplotlib.figure import Figure
+
+GAP = 8  # pixels between parts
+SHRINK, GROW = 0.7, 1.6  # how far the width of a part may be from that of the figure
+PAGE = """
+<figure role="img" aria-label="{{ alt }}" style="margin: 0">
+{% if title %}<div style="font-weight: bold; margin: 4px 0 8px">{{ title }}</div>{% endif %}
+<div style="display: flex; flex-wrap: wrap; align-items: center; gap: {{ gap }}px">
+{% for width, least, most, address in parts %}
+<img alt="" src="{{ address }}" style="flex: {{ width }} 1 {{ least }}px;
+min-width: 0; max-width: min(100%, {{ most }}px); height: auto">
+{% endfor %}
+</div>
+</figure>
+"""
+
+
+class Parts(Figure):
+    """A figure that a notebook shows axes by axes, with words for those who do not see it.
+
+    Attributes
+    ----------
+    alt : str
+        What is seen in it.
+
+    Examples
+    --------
+    >>> from s4a.course.parts import Parts
+    >>> figure = Parts(figsize=(4, 2))
+    >>> figure.alt = "two empty frames"
+    >>> axes = figure.subplots(1, 2)
+    >>> figure.html().count("<img")
+    2
+    """
+
+    alt = ""
+
+    def html(self) -> str:
+        """A page's part with a picture of each axes, twice as sharp as it is shown."""
+        from jinja2 import Environment
+
+        from s4a.show.draw import data_uri
+
+        title = self.get_suptitle()
+        parts = []
+        drawn = self.canvas.get_renderer() if hasattr(self.canvas, "get_renderer") else None
+        self.draw_without_rendering()
+        for ax in self.axes:
+            box = ax.get_tightbbox(drawn)
+            inches = box.transformed(self.dpi_scale_trans.inverted()).padded(0.04)
+            file = io.BytesIO()
+            self.savefig(file, format="png", dpi=192, bbox_inches=inches)
+            width = round(96 * inches.width)
+            address = data_uri(file.getvalue(), "image/png")
+            parts.append((width, round(SHRINK * width), round(GROW * width), address))
+        page = Environment(autoescape=True).from_string(PAGE)
+        return page.render(alt=self.alt or title, title=title, parts=parts, gap=GAP).strip()
+
+    def _ipython_display_(self) -> None:
+        from IPython.display import HTML, display
+
+        display(HTML(self.html()))
