@@ -20,6 +20,7 @@ from matplotlib.colors import to_rgb
 import s4a.course
 from s4a.show.draw import CLAY, data_uri, image_bytes, on_white, render
 from s4a.show.panel_page import panel_html
+from s4a.show.parts import Parts
 from s4a.widgets import threejs
 from s4a.widgets.explore import Explore
 from s4a.widgets.panel import Panel
@@ -104,6 +105,8 @@ def html_of(value):
     """What a cell would show of a value, as HTML."""
     if value is None:
         return ""
+    if isinstance(value, Parts):
+        return Markup(value.html())
     shown, _ = format_of.format(value)
     if "image/png" in shown:
         data = shown["image/png"]

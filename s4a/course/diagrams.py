@@ -6,9 +6,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch, Polygon, Rectangle
 from scipy.spatial import Delaunay
 
-from s4a.course.parts import Parts
 from s4a.show.charts import BLUE, GREY, LOOK, ORANGE
 from s4a.show.draw import SIGNED
+from s4a.show.parts import Parts
 
 GREEN = "#009e73"
 SOFT = {"blue": "#cfe4f2", "orange": "#f7d9c4", "grey": "#eeeeee", "green": "#cdebe0"}

@@ -102,7 +102,7 @@ def takeaway(sentence: str, *figures: "Figure") -> "Figure":
     """
     from PIL import Image
 
-    from s4a.course.parts import Parts
+    from s4a.show.parts import Parts
 
     pictures = [np.asarray(Image.open(io.BytesIO(_png(figure)[0]))) for figure in figures]
     shares = [picture.shape[1] / picture.shape[0] for picture in pictures]

@@ -16,6 +16,7 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter
 
 from s4a.geometry.mesh import as_arrays
 from s4a.show.draw import SIGNED, Viewpoint, render, signed_colors
+from s4a.show.parts import Parts
 
 BLUE, ORANGE, GREY = "#0072b2", "#d55e00", "#777777"
 PALE = "#bbbbbb"
@@ -45,10 +46,10 @@ def svg(figure: Figure) -> bytes:
     return file.getvalue()
 
 
-def _figure(width, height, columns=1, rows=1):
+def _figure(width, height, columns=1, rows=1, kind=Figure):
     """A Figure of that many inches, and its axes ``(rows, columns)``."""
     with rc_context(LOOK):
-        figure = Figure(figsize=(width, height), layout="constrained")
+        figure = kind(figsize=(width, height), layout="constrained")
         return figure, figure.subplots(rows, columns, squeeze=False)
 
 
@@ -69,7 +70,7 @@ def surfaces(
     view: Viewpoint = "corner",
     up: str = "z",
 ) -> Figure:
-    """Pictures of surfaces side by side.
+    """Pictures of surfaces side by side; in a narrow cell, below each other.
 
     Parameters
     ----------
@@ -108,7 +109,9 @@ def surfaces(
         reach = [float(np.quantile(np.abs(array), 0.99)) for array in signed]
         limit = max(reach, default=1.0) or 1.0
     rows, wide = -(-len(meshes) // columns), min(columns, len(meshes))
-    figure, axes = _figure(2.5 * wide + 0.7 * bool(signed), 2.35 * rows, wide, rows)
+    width = 2.5 * wide + 0.7 * bool(signed)
+    figure, axes = _figure(width, 2.35 * rows, wide, rows, Parts)
+    figure.alt = ", ".join(meshes)
     for ax in axes.flat:
         ax.set_axis_off()
     for ax, (title, mesh) in zip(axes.flat, meshes.items(), strict=False):

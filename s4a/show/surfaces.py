@@ -9,6 +9,7 @@ from s4a.method.pca import low_vertices
 from s4a.method.register import match_functions, match_low
 from s4a.method.shape import Shape
 from s4a.method.steps import latent_bases
+from s4a.schema import INPUT, unit_of
 
 N_LIVE = 20  # modes that panels and pages move, unless asked: of 20,000 vertices 0.3 MB each
 FAR = 8  # standard deviations beyond which charts of scores leave a doubtful shape out
@@ -80,9 +81,11 @@ def resolutions(study: xr.DataTree) -> list[tuple[str, str]]:
 
 
 def unit_text(study: xr.DataTree, name: str) -> str:
-    """The unit of a shape's positions where its file says it, or that it is the input's."""
+    """The unit of a shape's positions where its file or the modes say it, or that of the input."""
     node = study["original"].children.get(name) if "original" in study.children else None
-    return str((node is not None and node.attrs.get("unit")) or "unit of the input")
+    if node is not None and node.attrs.get("unit"):
+        return str(node.attrs["unit"])
+    return unit_of(study["pca/mean_displacement"]) if has(study, "pca/mean_displacement") else INPUT
 
 
 def barycentric_place(study: xr.DataTree, name: str) -> tuple[np.ndarray, np.ndarray] | None:

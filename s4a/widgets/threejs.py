@@ -304,7 +304,7 @@ def renderer(
     for points in (ellipsoid, box):
         x, y, z = turn @ (points * (high - low) / 2).T
         nearest.append(float((z + np.maximum(np.abs(x) / aspect, np.abs(y)) / np.tan(half)).max()))
-    distance = 1.05 * np.clip(around / 1.05, *nearest)
+    distance = min(max(around, 1.05 * nearest[0]), 1.05 * nearest[1])
     camera = three.PerspectiveCamera(
         position=(middle + distance * turn[2]).tolist(),
         up=np.eye(3)["xyz".index(up)].tolist(),

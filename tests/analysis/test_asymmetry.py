@@ -17,6 +17,7 @@ from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas, vertex_normal
 from s4a.input.clean import clean
 from s4a.method.pca import pca
 from s4a.schema import dataset
+from s4a.show.surfaces import unit_text
 
 M = np.array([-1.0, 1, 1])
 OPTIONS = {"n_permutations": 199}
@@ -354,8 +355,10 @@ def test_a_template_without_another_side_is_told(caplog):
 def test_modes_play_the_directional_part_first_and_have_its_share(halves):
     push, _ = bump()
     study = study_of(fields(8, 8) + 0.2 * push)
+    study["registration/displacement"].attrs["units"] = "mm"
     found = statistics.asymmetry(study, halves=halves, **OPTIONS)
     modes = statistics.asymmetry_modes(study, found)
+    assert unit_text(modes, "") == "mm"
     share = found["variance_share"].values
     ratio = modes["pca"]["explained_variance_ratio"].values
     assert ratio.sum() == pytest.approx(1)

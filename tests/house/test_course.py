@@ -15,8 +15,9 @@ from PIL import Image
 from s4a.course import check, diagrams, judge, quiz, slide, takeaway
 from s4a.course.exercises import EXERCISES
 from s4a.course.quizzes import SOURCE, Quiz, read
+from s4a.datasets.synthetic import sphere
 from s4a.method.latent import consistency_form
-from s4a.show.charts import matrices, variance
+from s4a.show.charts import matrices, surfaces, variance
 
 
 def test_an_open_exercise_says_what_to_do_and_hints():
@@ -225,6 +226,17 @@ def test_a_diagram_is_shown_part_by_part_with_words_for_who_does_not_see_it(name
         assert min(picture.shape) > 300, ax.get_title()
         rim = np.r_[picture[0], picture[-1], picture[:, 0], picture[:, -1]]
         assert (rim > 250).mean() > 0.99, "nothing is cut"
+
+
+def test_pictures_of_surfaces_wrap_in_a_row_and_stay_together_in_rows():
+    ball = sphere(162)
+    height = ball["position"].values[:, 2]
+    row = surfaces({"a": ball, "b": ball}, {"a": height, "b": height}).html()
+    assert row.count("<img") == 3, "with the colour bar"
+    assert 'aria-label="a, b"' in row
+    rows = surfaces(dict.fromkeys("abc", ball), columns=2).html()
+    assert rows.count("<img") == 1
+    assert takeaway("1 < 2.", variance([0.7]), variance([0.6])).html().count("1 &lt; 2.") == 2
 
 
 def test_what_is_said_of_an_answer_is_shown_as_words():

@@ -216,7 +216,6 @@ def test_what_is_long_fills_the_picture_and_nothing_is_cut(size):
     assert 0.7 < max(across, up) < 1
 
 
-
 def test_what_cannot_be_shown_is_refused():
     mesh = synthetic.sphere(162)
     with pytest.raises(ValueError, match="162 vertices"):

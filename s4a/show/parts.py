@@ -1,8 +1,11 @@
-"""Figures of the notebooks whose parts stand side by side, or below each other in narrow cells."""
+"""Figures whose parts a notebook shows side by side, or below each other in a narrow cell."""
 
 import io
 
 from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
+
+from s4a.show.draw import data_uri
 
 GAP = 8  # pixels between parts
 SHRINK, GROW = 0.7, 1.6  # how far the width of a part may be from that of the figure
@@ -29,7 +32,7 @@ class Parts(Figure):
 
     Examples
     --------
-    >>> from s4a.course.parts import Parts
+    >>> from s4a.show.parts import Parts
     >>> figure = Parts(figsize=(4, 2))
     >>> figure.alt = "two empty frames"
     >>> axes = figure.subplots(1, 2)
@@ -43,14 +46,10 @@ class Parts(Figure):
         """A page's part with a picture of each axes, twice as sharp as it is shown."""
         from jinja2 import Environment
 
-        from s4a.show.draw import data_uri
-
         title = self.get_suptitle()
-        parts = []
-        drawn = self.canvas.get_renderer() if hasattr(self.canvas, "get_renderer") else None
         self.draw_without_rendering()
-        for ax in self.axes:
-            box = ax.get_tightbbox(drawn)
+        parts = []
+        for box in self._boxes():
             inches = box.transformed(self.dpi_scale_trans.inverted()).padded(0.04)
             file = io.BytesIO()
             self.savefig(file, format="png", dpi=192, bbox_inches=inches)
@@ -59,6 +58,13 @@ class Parts(Figure):
             parts.append((width, round(SHRINK * width), round(GROW * width), address))
         page = Environment(autoescape=True).from_string(PAGE)
         return page.render(alt=self.alt or title, title=title, parts=parts, gap=GAP).strip()
+
+    def _boxes(self):
+        """What each part takes of the figure; several rows stay below each other as one."""
+        found = (ax.get_tightbbox() for ax in self.axes)
+        boxes = [box for box in found if box is not None and min(box.size) > 0]
+        rows = {ax.get_subplotspec().rowspan.start for ax in self.axes if ax.get_subplotspec()}
+        return boxes if len(rows) < 2 else [Bbox.union(boxes)]
 
     def _ipython_display_(self) -> None:
         from IPython.display import HTML, display
