@@ -85,7 +85,8 @@ def unit_text(study: xr.DataTree, name: str) -> str:
     node = study["original"].children.get(name) if "original" in study.children else None
     if node is not None and node.attrs.get("unit"):
         return str(node.attrs["unit"])
-    return unit_of(study["pca/mean_displacement"]) if has(study, "pca/mean_displacement") else INPUT
+    known = has(study, "pca/mean_displacement")
+    return unit_of(study["pca"].dataset["mean_displacement"]) if known else INPUT
 
 
 def barycentric_place(study: xr.DataTree, name: str) -> tuple[np.ndarray, np.ndarray] | None:
