@@ -134,7 +134,10 @@ def hotelling(E: np.ndarray, Q: np.ndarray, dof: int) -> np.ndarray:
 
 
 def count_rearrangements(
-    x: np.ndarray, covariates: np.ndarray | None = None, variances: str = "equal"
+    x: np.ndarray,
+    covariates: np.ndarray | None = None,
+    variances: str = "equal",
+    blocks: np.ndarray | None = None,
 ) -> int:
     """How many orders of the shapes differ, or signs of their residuals; what is given is one.
 
@@ -146,10 +149,23 @@ def count_rearrangements(
     >>> count_rearrangements([0, 0, 0, 1, 1, 1]), count_rearrangements(range(6), None, "unequal")
     (20, 32)
     """
-    if variances == "unequal":
-        return 2 ** (len(x) - 1)  # the same signs but turned give the same statistic
-    same = np.unique(_rows(x, covariates), axis=0, return_counts=True)[1].tolist()
-    return math.factorial(len(x)) // math.prod(map(math.factorial, same))
+    rows, places = _rows(x, covariates), _places(blocks, len(x))
+    if variances == "unequal":  # the same signs but turned give the same statistic
+        return 2 ** ((len(x) if blocks is None else len(places)) - 1)
+    return math.prod(_count_orders(rows[of]) for of in places)
+
+
+def _places(blocks, n):
+    """Where each block of exchangeable shapes stands; all are one block where none is named."""
+    if blocks is None:
+        return [np.arange(n)]
+    return [np.flatnonzero(blocks == one) for one in np.unique(blocks)]
+
+
+def _count_orders(rows):
+    """How many orders of rows differ."""
+    same = np.unique(rows, axis=0, return_counts=True)[1].tolist()
+    return math.factorial(len(rows)) // math.prod(map(math.factorial, same))
 
 
 def smallest_p(
@@ -157,6 +173,7 @@ def smallest_p(
     x: np.ndarray,
     covariates: np.ndarray | None = None,
     variances: str = "equal",
+    blocks: np.ndarray | None = None,
 ) -> float:
     """The smallest p that a permutation test of x, a variable or indicators, can reach.
 
@@ -166,7 +183,7 @@ def smallest_p(
     Parameters
     ----------
     n_permutations : int
-    x, covariates, variances : see :func:`permutation_test`
+    x, covariates, variances, blocks : see :func:`permutation_test`
 
     Examples
     --------
@@ -177,13 +194,20 @@ def smallest_p(
     """
     rows = _rows(x, covariates)
     same = 1
-    if covariates is None and variances == "equal":
+    if blocks is not None and covariates is None and variances == "equal":
+        sides = [np.sort(rows[of, 0]) for of in _places(blocks, len(rows))]
+        size = np.ptp(rows)
+        turned = all(np.ptp(one + one[::-1]) <= 1e-9 * size for one in sides)
+        same = 2 if turned else 1  # the order of all turned round changes but the sign of a slope
+    elif covariates is None and variances == "equal":
         code = np.unique(rows, axis=0, return_inverse=True)[1].ravel()
         sizes = np.bincount(code).tolist()
         is_grouping = len(sizes) == rows.shape[1] + 1
         if is_grouping:  # groups of equal size may change places
             same = math.prod(math.factorial(sizes.count(s)) for s in set(sizes))
-    return max(1 / (n_permutations + 1), same / count_rearrangements(x, covariates, variances))
+    return max(
+        1 / (n_permutations + 1), same / count_rearrangements(x, covariates, variances, blocks)
+    )
 
 
 def rearrangements(
@@ -192,12 +216,13 @@ def rearrangements(
     n_permutations: int,
     seed: int,
     variances: str = "equal",
+    blocks: np.ndarray | None = None,
 ) -> tuple[Iterator[np.ndarray], int]:
     """What is done to the residuals: orders, or signs; all others where there are no more.
 
     Parameters
     ----------
-    x, covariates, n_permutations, seed, variances : see :func:`permutation_test`
+    x, covariates, n_permutations, seed, variances, blocks : see :func:`permutation_test`
 
     Returns
     -------
@@ -215,16 +240,41 @@ def rearrangements(
     """
     n = len(x)
     rng = np.random.default_rng(seed)
-    n_others = count_rearrangements(x, covariates, variances) - 1
+    n_others = count_rearrangements(x, covariates, variances, blocks) - 1
     is_exact = n_others <= n_permutations
     if variances == "unequal":
-        every = itertools.product([1.0, -1.0], repeat=n - 1)
-        signs = (np.array([1.0, *row]) for row in itertools.islice(every, 1, None))
-        drawn = (rng.choice([-1.0, 1.0], n) for _ in range(n_permutations))
+        code = np.arange(n) if blocks is None else np.unique(blocks, return_inverse=True)[1]
+        n_signs = code.max() + 1
+        every = itertools.product([1.0, -1.0], repeat=n_signs - 1)
+        signs = (np.array([1.0, *row])[code] for row in itertools.islice(every, 1, None))
+        drawn = (rng.choice([-1.0, 1.0], n_signs)[code] for _ in range(n_permutations))
         return (signs, n_others) if is_exact else (drawn, n_permutations)
+    if blocks is not None:
+        within = _orders_within(_rows(x, covariates), blocks, rng, is_exact)
+        return itertools.islice(within, n_others if is_exact else n_permutations), (
+            n_others if is_exact else n_permutations
+        )
     if is_exact:
         return itertools.islice(_all_orders(_rows(x, covariates)), 1, None), n_others
     return (rng.permutation(n) for _ in range(n_permutations)), n_permutations
+
+
+def _orders_within(rows, blocks, rng, is_exact):
+    """Orders that leave every shape in its block: all but the one as is, or drawn without end."""
+    places = _places(blocks, len(rows))
+    if is_exact:
+        each = [[of[order] for order in _all_orders(rows[of])] for of in places]
+        for chosen in itertools.islice(itertools.product(*each), 1, None):
+            order = np.empty(len(rows), int)
+            order[np.concatenate(places)] = np.concatenate(chosen)
+            yield order
+        return
+    code = np.unique(blocks, return_inverse=True)[1]
+    sorted_places = np.argsort(code, kind="stable")
+    while True:
+        order = np.empty(len(rows), int)
+        order[sorted_places] = np.lexsort((rng.random(len(rows)), code))
+        yield order
 
 
 def _all_orders(rows):
@@ -269,6 +319,7 @@ def permutation_test(
     n_permutations: int = 9999,
     seed: int = 0,
     variances: str = "equal",
+    blocks: np.ndarray | None = None,
 ) -> tuple[float, float]:
     """Permutation test of Hotelling's T^2 of scores on a variable or on groups.
 
@@ -282,6 +333,9 @@ def permutation_test(
     seed : int
     variances : {"equal", "unequal"}
         Residuals are permuted, or have their signs changed.
+    blocks : ndarray (n,), optional
+        Residuals are permuted within these, or change their signs with all of their block; x,
+        covariates and what is tested have mean zero in every block then.
 
     Returns
     -------
@@ -303,7 +357,7 @@ def permutation_test(
     E = scores - Z @ (Z.T @ scores)
     dof = len(E) - Z.shape[1] - Q.shape[1]
     statistic = float(hotelling(E, Q, dof))
-    others, n_others = rearrangements(x, covariates, n_permutations, seed, variances)
+    others, n_others = rearrangements(x, covariates, n_permutations, seed, variances, blocks)
     reached = 0
     for batch in batched(others, max(1, 1_000_000 // E.size)):
         permuted = np.stack([rearranged(E, by) for by in batch])  # (b, n, p)
@@ -371,6 +425,7 @@ def vertex_test(
     n_permutations: int = 999,
     seed: int = 0,
     variances: str = "equal",
+    blocks: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Permutation test at every vertex, with p values corrected for all by the largest (max-T).
 
@@ -383,7 +438,7 @@ def vertex_test(
     ----------
     d : float ndarray (n, v, k)
         Fields of vectors, or with k = 1 of numbers.
-    x, covariates, n_permutations, seed, variances : see :func:`permutation_test`
+    x, covariates, n_permutations, seed, variances, blocks : see :func:`permutation_test`
 
     Returns
     -------
@@ -412,7 +467,7 @@ def vertex_test(
         """Products of b times `per` columns ``(n, b per)`` with the residuals: (b, per, k, v)."""
         return (columns.T.astype(np.float32) @ E).reshape(-1, per, k, v)
 
-    others, n_others = rearrangements(x, covariates, n_permutations, seed, variances)
+    others, n_others = rearrangements(x, covariates, n_permutations, seed, variances, blocks)
     share = (project(Q, q)[0] ** 2).sum(axis=(0, 1))
     reached = np.zeros(v, np.int64)
     largest = np.empty(0, np.float32)

@@ -34,6 +34,7 @@ from s4a.analysis.effects import (
     scores_of,
 )
 from s4a.analysis.generalization import generalization
+from s4a.analysis.growth import growth
 from s4a.analysis.inputs import Values, displacements_of, group_sizes, sample_of, with_doubtful
 from s4a.analysis.model import KEPT, count_components, evaluate, leave_one_out, sample
 from s4a.analysis.permutation import indicators, smallest_p
@@ -55,6 +56,7 @@ __all__ = [
     "generalization",
     "group_map",
     "group_test",
+    "growth",
     "outliers",
     "predict",
     "regression",

@@ -245,6 +245,25 @@ def _fields(add):
     add("--partial", action="store_true", help="shapes may lack it; tests leave these out")
 
 
+def _growth(add):
+    from s4a.analysis.effects import VARIANCES
+
+    add("study", metavar="STUDY")
+    add("--time", required=True, metavar="COLUMN", help="age, or time since the first visit")
+    add("--subject", required=True, metavar="COLUMN", help="whose each shape is")
+    add("--covariates", nargs="+", metavar="COLUMN", help="accounted for")
+    add("--field", metavar="NAME", help="a field of s4a fields in place of shape")
+    text = "what is tested at every vertex: vectors, or along the normals (default: vector)"
+    add("--of", choices=["vector", "normal"], default="vector", help=text)
+    text = "unequal where subjects change differently: signs of subjects (default: equal)"
+    add("--variances", choices=VARIANCES, default="equal", help=text)
+    add("--table", metavar="FILE", help="in place of the table of the study")
+    add("--keep-doubtful", action="store_true", help="take doubtful shapes in")
+    add("--permutations", type=whole, help="of visits within subjects (default: 999)")
+    add("--out", metavar="DIR", help="for netCDF, CSV, the page (default: STUDY/statistics)")
+    add_options(add, ["seed"])
+
+
 def _insert(add):
     add("study", metavar="STUDY")
     add("shapes", nargs="+", metavar="SHAPE", help="mesh files, folders or globs")
@@ -305,6 +324,7 @@ FLAGS = {
     commands.statistics: _statistics,
     commands.asymmetry: _asymmetry,
     growing.fields: _fields,
+    growing.growth: _growth,
     commands.insert: _insert,
     commands.transfer: _transfer,
     commands.compare: _compare,

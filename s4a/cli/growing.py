@@ -1,8 +1,9 @@
 """The commands of fields and of growth, see :mod:`s4a.cli.commands`."""
 
 from argparse import Namespace
+from pathlib import Path
 
-from s4a.cli.commands import write
+from s4a.cli.commands import study_to_test, write
 
 
 def fields(args: Namespace) -> int:
@@ -24,4 +25,36 @@ def fields(args: Namespace) -> int:
         f"{path}\n"
         f"s4a statistics {args.study} --field {args.name} takes it in place of shape"
     )
+    return 0
+
+
+def growth(args: Namespace) -> int:
+    """How shape changes with time in subjects that were seen several times; its animation."""
+    from s4a.analysis import statistics as tests
+    from s4a.analysis.export import write_results
+    from s4a.cli import results, tables
+    from s4a.show.page import write_page
+    from s4a.show.pictures import write_animation
+
+    study, out = study_to_test(args)
+    options = {} if args.permutations is None else {"n_permutations": args.permutations}
+    found = tests.growth(
+        study,
+        args.time,
+        args.subject,
+        covariates=args.covariates or None,
+        field=args.field,
+        of=args.of,
+        variances=args.variances,
+        seed=args.seed,
+        **options,
+    )
+    write_results(found, out, "growth")
+    write(results.growth_lines(found, args.time))
+    write("\n" + tables.significance(found, found, "change within subjects", study))
+    if not args.field:
+        moving = tests.regression_modes(study, found, args.time)
+        write_page(moving, Path(out) / "growth.html", title=f"Growth with {args.time}")
+        write_animation(moving, Path(out) / "growth.gif")
+    write(f"\nresults: {out}")
     return 0

@@ -148,7 +148,7 @@ def _tell_repeated(path, column, values, names):
     if again:
         log.warning(
             "%s: %d values of the column %r stand for several shapes (%s); the tests take all "
-            "shapes as independent, so keep one of each, or their mean",
+            "shapes as independent, so keep one of each, or their mean, or take growth",
             path,
             len(again),
             column,

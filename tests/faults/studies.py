@@ -440,6 +440,13 @@ PROOFS = [
         "test_vertices_and_shapes_without_a_field_are_left_out_and_told",
     ),
     (
+        "growth with a subject of one visit, or none with two, visits without a subject, time as "
+        "text",
+        "warned by name, it is not in the test; error; left out by name; error",
+        "test_growth.py",
+        "test_what_is_no_repeated_measure_is_refused_or_told",
+    ),
+    (
         "one person with several shapes in the table",
         "warned, with the shapes",
         SUBJECTS,
