@@ -15,7 +15,7 @@ reading and cleaning      :func:`read_shapes`, :func:`read_shape`, :func:`read_l
                           :func:`latent_match`, :func:`latent_map`, :func:`register_shape`
 4.2, 6.1 collections      :func:`analyse`, :func:`open_study`, :func:`verify`, :func:`synthesize`
 notebooks, pages          :func:`explore`, :func:`write_page`
-new shapes                :func:`insert`
+new shapes, parts         :func:`insert`, :func:`complete`
 6.1 statistics            :mod:`s4a.statistics`
 6.2 transfer              :func:`transfer_labels`, :func:`transfer_landmarks`,
                           :func:`transfer_scalars`, :func:`register_pairs`, :func:`with_field`
@@ -38,6 +38,7 @@ from s4a._moved import install
 if TYPE_CHECKING:
     from s4a.accessor import explore
     from s4a.analysis import statistics
+    from s4a.analysis.complete import complete
     from s4a.analysis.export import write_registered, write_training_set
     from s4a.analysis.fields import with_field
     from s4a.analysis.transfer import (
@@ -79,6 +80,7 @@ __all__ = [
     "clean",
     "coarsen",
     "compare",
+    "complete",
     "explore",
     "insert",
     "latent_map",
@@ -113,6 +115,7 @@ __all__ = [
 PLACES = {
     "accessor": "explore",
     "analysis": "statistics",
+    "analysis.complete": "complete",
     "analysis.export": "write_registered write_training_set",
     "analysis.fields": "with_field",
     "analysis.transfer": "register_pairs transfer_labels transfer_landmarks transfer_scalars",

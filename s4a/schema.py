@@ -183,6 +183,15 @@ ROWS = {
         "share of the variance at low resolution, of the matches of eq. 6, as smooth as at full"),
     "explained_variance_ratio_raw": ("component", ONE,
         "share of the variance at low resolution, of the matches as they are"),
+    # a part of a shape, and the whole that it may be of
+    "present": ("vertex", ONE, "whether the part has the vertex"),
+    "completion_sd": ("vertex xyz", INPUT,
+        "standard deviation of the completed shape along each axis of the part's file"),
+    "completion_normal_sd": ("vertex", INPUT, "the same along the normal"),
+    "sample_position": ("sample vertex xyz", INPUT,
+        "shapes drawn from all that agree with the part, where it lies in its file"),
+    "score_covariance": ("component component_2", ONE,
+        "covariance of the scores of a completed shape"),
     "template_vertex": ("vertex", ONE, "vertex of the template that the vertex of a region is"),
     # evaluation of the model, tests and outliers (6.1)
     "compactness": ("component", INPUT2, "variance of the first components together"),

@@ -239,6 +239,40 @@ def write_training_set(
     return split
 
 
+def write_completed(found: xr.Dataset, folder: Path | str) -> list[Path]:
+    """Write what :func:`s4a.complete` found.
+
+    Parameters
+    ----------
+    found : Dataset
+    folder : path
+        Made where it is missing.
+
+    Returns
+    -------
+    list of Path
+        ``completed.nc`` with everything, ``completed.ply`` with ``present`` and ``deviation``, the
+        root of the summed variances, at every vertex, and ``sample_<i>.ply``.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    store.write(found, folder / "completed.nc")
+    triangles = found["corner_vertex"].values
+    deviation = np.sqrt((found["completion_sd"].values ** 2).sum(1))
+    write_mesh(
+        folder / "completed.ply",
+        found["position"].values,
+        triangles,
+        present=found["present"].values.astype(float),
+        deviation=deviation,
+    )
+    paths = [folder / "completed.nc", folder / "completed.ply"]
+    for i, position in enumerate(found["sample_position"].values):
+        paths.append(folder / f"sample_{i:02d}.ply")
+        write_mesh(paths[-1], position, triangles)
+    return paths
+
+
 def write_results(result: xr.Dataset, folder: Path | str, name: str) -> list[Path]:
     """Write a Dataset of :mod:`s4a.analysis.statistics` as netCDF, and its columns as CSV.
 

@@ -347,6 +347,27 @@ def insert(args: Namespace) -> int:
     return 1 if (inserted["report"]["status"] == "excluded").any() else 0
 
 
+def complete(args: Namespace) -> int:
+    """A part of a shape matched to a finished study, and the whole that it may be of."""
+    from s4a.analysis.complete import complete
+    from s4a.analysis.export import write_completed
+    from s4a.cli import tables
+    from s4a.study.tree import open_study
+
+    found = complete(
+        open_study(args.study),
+        args.part,
+        landmarks=args.landmarks,
+        components=args.components,
+        n_samples=args.samples,
+        seed=args.seed,
+    )
+    paths = write_completed(found, args.out)
+    write("\n".join(tables.completed_lines(found)))
+    write(f"\nwritten: {', '.join(map(str, paths[:2]))}, samples: {len(paths) - 2}")
+    return 0
+
+
 def transfer(args: Namespace) -> int:
     """Labels and landmarks of one mesh on others."""
     from s4a.analysis import transfer as travel

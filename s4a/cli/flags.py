@@ -273,6 +273,19 @@ def _insert(add):
     add_options(add, ["n_jobs"])
 
 
+def _complete(add):
+    add("study", metavar="STUDY")
+    add("part", metavar="PART", help="mesh file of a part of a shape")
+    add("--out", required=True, metavar="DIR", help="for completed.nc and PLY")
+    text = "landmarks of the part by the names of the template's, three or more: how it lies"
+    add("--landmarks", metavar="FILE", help=text)
+    text = "shapes drawn from all that agree with the part (default: 10)"
+    add("--samples", type=whole, default=10, help=text)
+    text = "pieces of the part to keep, or 'largest' (default: as in the study)"
+    add("--components", type=components, help=text)
+    add_options(add, ["seed"])
+
+
 def _transfer(add):
     from s4a.study.options import PAIR
 
@@ -326,6 +339,7 @@ FLAGS = {
     growing.fields: _fields,
     growing.growth: _growth,
     commands.insert: _insert,
+    commands.complete: _complete,
     commands.transfer: _transfer,
     commands.compare: _compare,
 }

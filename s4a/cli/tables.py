@@ -572,6 +572,20 @@ def inserted_table(inserted: xr.DataTree) -> str:
     return "\n".join([table(rows, head), *doubts(report)])
 
 
+def completed_lines(found: xr.Dataset) -> list[str]:
+    """What :func:`s4a.complete` says of a part, in words."""
+    unit, said = found["position"].attrs["units"], found.attrs
+    deviation, there = np.linalg.norm(found["completion_sd"], axis=1), found["present"].values
+    missing = "" if there.all() else f", of a missing one {deviation[~there].mean():.3g}"
+    scores = " ".join(f"{score:+.2f}" for score in found["score"].values[:5])
+    return [
+        f"{100 * said['missing']:.1f} % of the template {said['template']} are missing",
+        f"left by the modes on the part: {said['residual']:.3g} {unit}",
+        f"standard deviation of a vertex {deviation[there].mean():.3g} {unit}{missing}",
+        f"Mahalanobis {mahalanobis(found['score'].values):.1f}, scores {scores}",
+    ]
+
+
 def score_cells(modes: xr.Dataset) -> list[str]:
     """What the modes leave of one shape, how far it lies from the mean, and its first scores."""
     return [

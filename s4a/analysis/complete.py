@@ -1,0 +1,463 @@
+"""Partial shapes (6.1, outlook): a part matched where it is, and the whole that it may be of.
+
+What the modes of a finished study say of the rest, see :mod:`s4a.method.posterior`; how the part is
+matched, see :mod:`s4a.method.part`.
+"""
+
+import logging
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from scipy import stats
+
+from s4a.analysis.inputs import registration_of
+from s4a.geometry.align import rigid_transform
+from s4a.geometry.mesh import as_arrays, vertex_areas, vertex_normals
+from s4a.input.landmarks import with_landmarks
+from s4a.input.raw import shown
+from s4a.method import posterior
+from s4a.method.deform import displacement_in_template
+from s4a.method.part import (
+    Fit,
+    Part,
+    Pose,
+    Whole,
+    best_fit,
+    different,
+    fit_modes,
+    on_boundary,
+    part_of,
+    refine,
+    rough_starts,
+    seen,
+)
+from s4a.method.pca import gram, low_vertices
+from s4a.method.register import common_unit
+from s4a.method.shape import Shape
+from s4a.schema import check_count, dataset, in_unit
+from s4a.seeds import RNG, seed_of
+from s4a.study.insert import read_new
+from s4a.study.options import Options
+
+log = logging.getLogger(__name__)
+
+LEAST_SHARE = 0.15  # of the template that a part must have
+TESTED_SHARE = 0.45  # with less the intervals have not been tested
+LEAST_INSIDE = 0.6  # share of the part that must lie on the whole
+FOREIGN = 2.0  # times what the modes of the others leave of any shape of the study
+N_REMATCHED = 6  # shapes of the study whose part is matched again
+N_ROUNDS = 2  # of finding what is there, and of matching it
+
+
+class Model(NamedTuple):
+    """A study at the low resolution of its template, lengths for unit area."""
+
+    study: xr.DataTree
+    template: Shape
+    at: np.ndarray  # (n_low,), original vertices
+    X: np.ndarray  # (n_low, 3), of the template
+    fields: np.ndarray  # (s, n_low, 3), displacements
+    modes: np.ndarray  # (c, s), each as weights of the fields
+    area: np.ndarray  # (n_low,), of sum 1
+    scale: bool
+    mean_full: np.ndarray  # (n, 3), mean displacement at full resolution
+    modes_full: np.ndarray  # (c, n, 3)
+
+
+def complete(
+    study: xr.DataTree,
+    part: Path | str | tuple[Any, Any] | xr.Dataset,
+    *,
+    landmarks: Path | str | None = None,
+    components: str | int | None = None,
+    n_samples: int = 10,
+    seed: int = 0,
+    rng: RNG | None = None,
+) -> xr.Dataset:
+    """A part of a shape matched to a finished study, and the whole that it may be of.
+
+    What is missing is found.  Where the part is, the completed shape lies on it; elsewhere it is
+    the mean of all shapes that agree with the part under the modes of the study and what these do
+    not hold, a normal distribution (posterior shape model, Albrecht et al. 2013; the formula is in
+    :mod:`s4a.method.posterior`).  Its standard deviations are such that nine tenths of the study's
+    own shapes, each told from the same part by all others, lie within intervals of 90 %.
+
+    Parameters
+    ----------
+    study : DataTree
+        Of :func:`s4a.analyse` or :func:`s4a.open_study`, with modes; it stays as it is.
+    part : path, tuple (points, triangles) or Dataset
+        A mesh, in any pose; whole shapes are parts without anything missing.
+    landmarks : path, optional
+        Its landmarks; three or more that the template has by name, too, say how it lies.
+    components : "largest" or int, optional
+        How many pieces of the part are taken, see :func:`s4a.clean`; as in the study by default.
+    n_samples : int
+        Shapes drawn from the distribution.
+    seed, rng : see :mod:`s4a.seeds`
+
+    Returns
+    -------
+    Dataset
+        A mesh with the template's triangles: ``position(vertex, xyz)`` where the part lies in its
+        file, ``present(vertex)``, ``completion_sd(vertex, xyz)`` along the axes of the file and
+        ``completion_normal_sd(vertex)``, ``sample_position(sample, vertex, xyz)``;
+        ``score(component)``, ``score_covariance(component, component_2)``; and, as in
+        ``/registration``, ``displacement``, ``rotation``, ``translation`` and ``scale``.
+        Attributes: ``template``; ``missing``, share of the template's area; ``residual``, the
+        distance that modes and motion leave on the part, ``usual_residual``, the largest that the
+        modes of the others leave on the same part of a shape of the study, and ``inside``, the
+        share of the part's points that lie on the whole; ``match_noise``, the deviation of a
+        coordinate where the part is; ``factor`` of the others, and ``left_out_error``, the root
+        mean square error of a coordinate with which the study's own shapes are told by the others
+        where nothing is; ``warning``.
+
+    Raises
+    ------
+    ValueError
+        When the study has no modes, the part cannot be read, it has less than 15 % of the template,
+        or lies nowhere on its shapes.
+
+    Examples
+    --------
+    With the ``study`` of six small brains; of one of these the upper half:
+
+    >>> import s4a
+    >>> study = s4a.synthetic.example_study()
+    >>> mesh = study["original/brain_02"].to_dataset()
+    >>> corners = mesh["position"].values[mesh["corner_vertex"].values]
+    >>> upper = mesh["corner_vertex"].values[corners[:, :, 2].min(1) > 0]
+    >>> found = s4a.complete(study, (mesh["position"].values, upper))
+    >>> 0.4 < found.attrs["missing"] < 0.6
+    True
+    """
+    check_count("n_samples", n_samples)
+    model = model_of(study)
+    mesh = read_part(study, part, components, landmarks)
+    pieces = part_of(*as_arrays(mesh))
+    first = first_pose(study, model)
+    fit, whole = place(pieces, model, first, mesh)
+    check_place(fit, model)
+    low, present, fit = match(pieces, model, whole, fit)
+    share = float(model.area @ present)
+    if share < LEAST_SHARE:
+        raise ValueError(
+            f"a part with at least {100 * LEAST_SHARE:.0f} % of the template's area is needed, "
+            f"found {100 * share:.1f} %"
+        )
+    known = posterior.know(
+        model.fields, model.template.low.Phi, model.X, model.area, present, scale=model.scale
+    )
+    generator = np.random.default_rng(seed_of(seed, rng))
+    result = completed(model, pieces, fit, known, low, n_samples, generator)
+    template = model.template.original
+    result = in_unit(result, common_unit(template, mesh))
+    result.attrs["template"] = study["registration"].attrs["template"]
+    result.attrs["warning"] = "; ".join(warnings_of(result))
+    if result.attrs["warning"]:
+        log.warning("%s", result.attrs["warning"])
+    return result
+
+
+def model_of(study: xr.DataTree) -> Model:
+    """What completion needs of a study; ValueError where it has it not."""
+    missing = [n for n in ("original", "coarse", "registration", "pca") if n not in study.children]
+    if missing:
+        raise ValueError(f"a finished study is needed; this one lacks {', '.join(missing)}")
+    options = Options.from_report(study)
+    if options.method == "scalable":
+        raise ValueError("parts need a study with a coarse mesh; method='scalable' has none")
+    registration = registration_of(study)
+    if registration.sizes["shape"] < 4:
+        raise ValueError(
+            f"parts need a study of at least 4 shapes, found {registration.sizes['shape']}"
+        )
+    name = registration.attrs["template"]
+    template = options.shape(
+        study["original"][name].to_dataset().load(), study["coarse"][name].to_dataset().load()
+    )
+    _, size = template.frame
+    at = low_vertices(template.coarse)
+    fields = registration["displacement"][:, at].values.astype(float) / size
+    modes = study["pca"].to_dataset()
+    score = modes["score"].sel(shape=registration["shape"].values).values  # (s, c)
+    return Model(
+        study,
+        template,
+        at,
+        template.full.X[at],
+        fields,
+        score.T / (len(score) - 1),
+        template.low.area,
+        options.scale,
+        modes["mean_displacement"].values / size,
+        modes["deformation"].values / size,
+    )
+
+
+def read_part(
+    study: xr.DataTree,
+    part: Path | str | tuple[Any, Any] | xr.Dataset,
+    components: str | int | None = None,
+    landmarks: Path | str | None = None,
+) -> xr.Dataset:
+    """The clean mesh of a part: its holes stay open."""
+    given = {"close_holes": False} | ({} if components is None else {"components": components})
+    options = Options.from_report(study).changed(given)
+    if isinstance(part, str | Path) and not Path(part).exists():
+        raise ValueError(f"{shown(part)}: there is no such file")
+    meshes, _ = read_new(part if isinstance(part, str | Path) else {"part": part}, options)
+    if len(meshes) != 1:
+        raise ValueError(f"one part needed, found {len(meshes)}: {', '.join(meshes)}")
+    (mesh,) = meshes.values()
+    return mesh if landmarks is None else with_landmarks(mesh, landmarks)
+
+
+def first_pose(study: xr.DataTree, model: Model) -> Pose:
+    """How the shapes of the study lie in their files, on average."""
+    registration = registration_of(study)
+    U, S, Vt = np.linalg.svd(registration["rotation"].values.mean(0))
+    R = (U * [1, 1, np.sign(np.linalg.det(U @ Vt))]) @ Vt if S[-1] > 0.5 else np.eye(3)
+    s = float(np.exp(np.log(registration["scale"].values).mean()))
+    center, size = model.template.frame
+    t = registration["translation"].values.mean(0)
+    return Pose(R, (t - center) / size, s / size)
+
+
+def whole_of(model: Model) -> Whole:
+    """The mean shape and the modes of a study at low resolution."""
+    mean = model.fields.mean(0)
+    modes = np.einsum("cs,snx->cnx", model.modes, model.fields - mean)
+    T = model.template.low.T
+    return Whole(model.X + mean, T, modes, on_boundary(T, len(model.X)))
+
+
+def place(
+    part: Part, model: Model, first: Pose, mesh: xr.Dataset | None = None
+) -> tuple[Fit, Whole]:
+    """Where a part lies on the shapes of a study, and these at low resolution."""
+    whole = whole_of(model)
+    pose = None if mesh is None else pose_of_landmarks(mesh, model, whole.X, first)
+    if pose is not None:
+        return fit_modes(part, whole, pose, free_size=model.scale), whole
+    starts = different(rough_starts(part, whole, first), first, part)
+    return best_fit(part, whole, starts, first, model.scale), whole
+
+
+def pose_of_landmarks(mesh: xr.Dataset, model: Model, mean: np.ndarray, first: Pose) -> Pose | None:
+    """The motion of three or more landmarks that part and template have by name, if they do."""
+    names, weights = model.template.landmarks
+    own = mesh["guide_name"].values.tolist() if "guide_name" in mesh else []
+    common = [name for name in names if name in own]
+    if len(common) < 3:
+        if own:
+            log.warning("part and template have %d landmarks in common: 3 needed", len(common))
+        return None
+    P = mesh["guide_position"].values[[own.index(name) for name in common]]
+    rows = weights[[names.index(name) for name in common]]
+    shift = model.template.U @ (mean - model.X)
+    Q = rows @ (model.template.full.X + shift)
+    R, _, _ = rigid_transform(P, Q)
+    return Pose(R, Q.mean(0) - first.s * R @ P.mean(0), first.s)
+
+
+def check_place(fit: Fit, model: Model) -> None:
+    """ValueError where a part does not lie on the shapes of the study."""
+    if fit.inside < LEAST_INSIDE:
+        raise ValueError(
+            f"the part does not fit the shapes of the study: only {100 * fit.inside:.0f} % of it "
+            "lies on one that they may be; is it of another kind, or another unit?"
+        )
+
+
+def match(part: Part, model: Model, whole: Whole, fit: Fit) -> tuple[np.ndarray, np.ndarray, Fit]:
+    """The template's low resolution on the part, and which of its vertices are there.
+
+    Returns
+    -------
+    low : float ndarray (n_low, 3)
+        In the frame of the template, as the part is placed by the fit.
+    present : bool ndarray (n_low,)
+    fit : Fit
+    """
+    low = whole.X + np.tensordot(fit.b, whole.modes, 1)
+    placed = fit.pose(part.X)
+    limit = max(0.02, 3 * fit.residual)
+    for _ in range(N_ROUNDS):
+        normals = model.template.low_on_surface.normals_at(low)
+        present = seen(low, normals, part, placed, limit)
+        if model.area @ present < LEAST_SHARE:
+            return low, present, fit
+        low = refine(part, placed, model.template, low, present)
+    normals = model.template.low_on_surface.normals_at(low)
+    return low, present & seen(low, normals, part, placed, limit), fit
+
+
+def completed(
+    model: Model,
+    part: Part,
+    fit: Fit,
+    known: posterior.Known,
+    low: np.ndarray,
+    n_samples: int,
+    rng: np.random.Generator,
+) -> xr.Dataset:
+    """The distribution of the whole when its low resolution is known where it is present."""
+    target, present = model.template, known.present
+    mean = model.X + model.fields.mean(0)
+    weights = posterior.weights_of(known, model.modes)
+    calibration = posterior.Calibration(1.0, 1.0, 0.0)
+    if not present.all():
+        calibration = posterior.calibrate(known, ~present)
+    y = (low - mean)[present]
+    inner = np.einsum("qnx,nx,n->q", known.columns[:, present], y, model.area[present])
+    found = posterior.condition(known, weights, inner, calibration.density)
+    columns = np.einsum("qp,qnx->pnx", weights, known.columns, optimize=True)
+    told = mean + np.tensordot(found.mean, columns, 1)  # (n_low, 3)
+    kappa2 = float(target.low.eigenvalue[-1])
+    left = posterior.extend(low - told, present, target.W, model.area, kappa2)
+    X = target.full.X
+    c = len(model.modes)
+    exact = model.mean_full + np.tensordot(found.mean[:c], model.modes_full, 1)
+    rest = told - mean - np.tensordot(found.mean[:c], columns[:c], 1) + left
+    placed = X + exact + target.U @ rest  # the modes have detail that U has not
+
+    inflate = np.where(present, 1.0, calibration.factor)  # (n_low,)
+    spread = np.einsum("pr,pnx->rnx", found.root, columns, optimize=True) * inflate[:, None]
+    noise, usual = match_again(model, present)
+    white = noise + np.where(present, 0.0, calibration.factor**2 * known.rest)
+    covariance = np.einsum("rnx,rny->nxy", spread, spread, optimize=True)
+    covariance[:, range(3), range(3)] += white[:, None]
+    pose, size = fit.pose, 1 / fit.pose.s
+    full = (target.U @ covariance.reshape(-1, 9)).reshape(-1, 3, 3)
+    there = seen(
+        placed, vertex_normals(placed, target.full.T), part, pose(part.X), max(0.02, fit.residual)
+    )
+    position = size * (placed - pose.t) @ pose.R
+    normals = vertex_normals(position, target.full.T)
+    in_file = size**2 * np.einsum("xi,nxy,yj->nij", pose.R, full, pose.R)
+    drawn = []
+    rough = posterior.rough_fields(target.W, model.area, kappa2)
+    for _ in range(n_samples):
+        moved = np.tensordot(rng.standard_normal(len(spread)), spread, 1)
+        moved += np.sqrt(white)[:, None] * rough(rng)
+        drawn.append(position + size * (target.U @ moved) @ pose.R)
+    area = vertex_areas(*as_arrays(target.original))
+    X = target.original["position"].values
+    d, R, t, s = displacement_in_template(X, position, area, scale=model.scale)
+    covariance = found.root[:c] @ found.root[:c].T
+    return dataset(
+        {
+            "missing": float(1 - area @ there / area.sum()),
+            "residual": size * fit.residual,
+            "usual_residual": size * usual,
+            "inside": fit.inside,
+            "factor": calibration.factor,
+            "match_noise": size * float(np.sqrt(noise)),
+            "left_out_error": size * calibration.error,
+        },
+        position=position,
+        corner_vertex=target.original["corner_vertex"].values,
+        present=there,
+        completion_sd=np.sqrt(np.einsum("nii->ni", in_file)).astype(np.float32),
+        completion_normal_sd=np.sqrt(np.einsum("ni,nij,nj->n", normals, in_file, normals)).astype(
+            np.float32
+        ),
+        sample_position=np.reshape(drawn, (n_samples, len(X), 3)).astype(np.float32),
+        score=found.mean[:c],
+        score_covariance=covariance,
+        displacement=d.astype(np.float32),
+        rotation=R,
+        translation=t,
+        scale=np.array(s),
+    )
+
+
+def match_again(model: Model, present: np.ndarray) -> tuple[float, float]:
+    """Variance of the match of each coordinate: the same part of shapes of the study, found again.
+
+    The part is cut out of up to :data:`N_REMATCHED` of them, matched by the model of the others,
+    and compared with the match of the whole shape.  Nine tenths of all coordinates lie within the
+    interval of 90 % of this variance.  And the largest residual of their fits.
+    """
+    registration = registration_of(model.study)
+    names = registration["shape"].values.tolist()
+    others = [i for i, name in enumerate(names) if name != registration.attrs["template"]]
+    chosen = others[:: max(1, -(-len(others) // N_REMATCHED))]
+    found = [_found_again(model, registration.isel(shape=i), i, present) for i in chosen]
+    gaps = np.abs(np.concatenate([gap for gap, _ in found]))
+    if not len(gaps):
+        return 0.0, np.inf
+    variance = float(np.quantile(gaps, 0.9) / posterior.WITHIN_90) ** 2
+    return variance, max(residual for _, residual in found)
+
+
+def _found_again(model, registered, i, present):
+    """Differences ``(d,)`` of shape i and its part matched by the others, and their residual."""
+    study, name = model.study, registered["shape"].item()
+    mesh = study["original"][name].to_dataset().load()
+    X, T = as_arrays(mesh)
+    there = model.template.U @ present.astype(float) > 0.5
+    back = study["registration"][name]["template_triangle"].values
+    kept = there[model.template.full.T[back]].sum(1) >= 2  # (n_original,)
+    center, size = model.template.frame
+    s = registered["scale"].item() / size
+    pose = Pose(registered["rotation"].values, registered["translation"].values / size, s)
+    pose = pose._replace(t=pose.t - center / size)
+    part = part_of(*cut(X, T, kept))
+    if len(part.X) < 100:
+        return np.zeros(0), 0.0
+    used = np.delete(np.arange(len(model.fields)), i)
+    fields = model.fields[used]
+    rest = model._replace(
+        fields=fields,
+        modes=posterior.modes_of(gram(fields, model.area), np.arange(len(used))),
+    )
+    whole = whole_of(rest)
+    fit = fit_modes(part, whole, pose, free_size=model.scale)
+    low, again, fit = match(part, rest, whole, fit)
+    both = again & present
+    in_file = (low[both] - fit.pose.t) @ fit.pose.R / fit.pose.s
+    return (pose(in_file) - model.X[both] - model.fields[i, both]).ravel(), fit.residual
+
+
+def cut(X: np.ndarray, T: np.ndarray, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The part of a surface whose vertices are kept.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.analysis.complete import cut
+    >>> T = np.array([[0, 1, 2], [1, 3, 2]])
+    >>> cut(np.eye(4, 3), T, np.array([False, True, True, True]))[1].tolist()
+    [[0, 2, 1]]
+    """
+    T = T[kept[T].all(1)]
+    used = np.unique(T)
+    number = np.full(len(X), -1)
+    number[used] = np.arange(len(used))
+    return X[used], number[T]
+
+
+def warnings_of(result: xr.Dataset) -> list[str]:
+    """What looks wrong with a part."""
+    said = []
+    ratio = result.attrs["residual"] / result.attrs["usual_residual"]
+    if ratio > FOREIGN:
+        said.append(
+            f"the modes leave {ratio:.1f} times as much of the part as of any shape of the study: "
+            "it may be of another kind"
+        )
+    score = result["score"].values
+    p = float(stats.chi2.sf(score @ score, len(score)))
+    if p < 1e-4:
+        said.append(
+            f"the scores of the part lie {np.sqrt(score @ score):.1f} from the mean, where "
+            f"{np.sqrt(len(score)):.1f} is usual: it may be of another kind"
+        )
+    if result.attrs["missing"] > 1 - TESTED_SHARE:
+        missing = 100 * result.attrs["missing"]
+        said.append(f"{missing:.0f} % are missing: the intervals are tested up to half")
+    return said
