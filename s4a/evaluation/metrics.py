@@ -23,6 +23,7 @@ from s4a.geometry.mesh import (
     triangle_areas,
     vertex_areas,
 )
+from s4a.method.deform import distortion as distortion
 from s4a.schema import dataset, require
 
 THRESHOLDS = np.linspace(0, 0.25, 101)  # of the error curve, as in Kim et al. (2011), Fig. 6
@@ -295,57 +296,6 @@ def bijectivity(
     [0.0, 0.0, 0.0, 0.0]
     """
     return cycle_error(X, T, match, reverse, vertices=vertices, limit=limit)
-
-
-def distortion(X: np.ndarray, image: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Conformal and area distortion of every triangle that a map carries.
-
-    With s1 >= s2 the singular values of the linear map of a triangle: log(s1 / s2), 0 where angles
-    are kept, and log(s1 s2), 0 where the area is kept, positive where it grows.  They see torn,
-    sheared and collapsed triangles. They cannot see where a triangle goes or whether it is turned
-    over, and a true map between different shapes has distortion, too.
-
-    Parameters
-    ----------
-    X : float ndarray (n, 3)
-        Vertices.
-    image : float ndarray (n, 3)
-        Where the map takes them.
-    T : int ndarray (m, 3)
-
-    Returns
-    -------
-    conformal : float ndarray (m,)
-        Infinite where the image is a line or a point.
-    area : float ndarray (m,)
-        Minus infinity there.  NaN, both, for triangles without an area of their own.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import s4a
-    >>> X, T = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]])
-    >>> conformal, area = s4a.metrics.distortion(X, X * [2.0, 4.0, 1.0], T)
-    >>> bool(np.isclose(conformal[0], np.log(2))), bool(np.isclose(area[0], np.log(8)))
-    (True, True)
-    """
-
-    def gram(P):
-        sides = np.stack([P[T[:, 1]] - P[T[:, 0]], P[T[:, 2]] - P[T[:, 0]]], axis=1)
-        return np.einsum("mix,mjx->mij", sides, sides)
-
-    G, H = gram(X), gram(image)
-    before, after = 2 * triangle_areas(X, T), 2 * triangle_areas(image, T)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        # trace(G^-1 H) = s1^2 + s2^2 and det = (s1 s2)^2,
-        # so that their ratio is 2 cosh(log(s1 / s2))
-        trace = (
-            G[:, 1, 1] * H[:, 0, 0] + G[:, 0, 0] * H[:, 1, 1] - 2 * G[:, 0, 1] * H[:, 0, 1]
-        ) / before**2
-        ratio = np.where(after > 0, trace * before / (2 * after), np.inf)
-        conformal, area = np.arccosh(np.maximum(ratio, 1)), np.log(after / before)
-    flat = before == 0
-    return np.where(flat, np.nan, conformal), np.where(flat, np.nan, area)
 
 
 def label_accuracy(found: ArrayLike, true: ArrayLike, area: np.ndarray | None = None) -> float:

@@ -11,6 +11,7 @@ import scipy.linalg
 import scipy.sparse as sp
 
 from s4a.geometry.align import rigid_transform
+from s4a.geometry.mesh import triangle_areas
 from s4a.method.spectral import project
 
 
@@ -162,3 +163,54 @@ def normal_displacement(displacement: np.ndarray, normals: np.ndarray) -> np.nda
     That is blue in Fig. 4.
     """
     return np.einsum("...nx,nx->...n", displacement, normals)
+
+
+def distortion(X: np.ndarray, image: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Conformal and area distortion of every triangle that a map carries.
+
+    With s1 >= s2 the singular values of the linear map of a triangle: log(s1 / s2), 0 where angles
+    are kept, and log(s1 s2), 0 where the area is kept, positive where it grows.  They see torn,
+    sheared and collapsed triangles. They cannot see where a triangle goes or whether it is turned
+    over, and a true map between different shapes has distortion, too.
+
+    Parameters
+    ----------
+    X : float ndarray (n, 3)
+        Vertices.
+    image : float ndarray (n, 3)
+        Where the map takes them.
+    T : int ndarray (m, 3)
+
+    Returns
+    -------
+    conformal : float ndarray (m,)
+        Infinite where the image is a line or a point.
+    area : float ndarray (m,)
+        Minus infinity there.  NaN, both, for triangles without an area of their own.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import s4a
+    >>> X, T = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]])
+    >>> conformal, area = s4a.metrics.distortion(X, X * [2.0, 4.0, 1.0], T)
+    >>> bool(np.isclose(conformal[0], np.log(2))), bool(np.isclose(area[0], np.log(8)))
+    (True, True)
+    """
+
+    def gram(P):
+        sides = np.stack([P[T[:, 1]] - P[T[:, 0]], P[T[:, 2]] - P[T[:, 0]]], axis=1)
+        return np.einsum("mix,mjx->mij", sides, sides)
+
+    G, H = gram(X), gram(image)
+    before, after = 2 * triangle_areas(X, T), 2 * triangle_areas(image, T)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # trace(G^-1 H) = s1^2 + s2^2 and det = (s1 s2)^2,
+        # so that their ratio is 2 cosh(log(s1 / s2))
+        trace = (
+            G[:, 1, 1] * H[:, 0, 0] + G[:, 0, 0] * H[:, 1, 1] - 2 * G[:, 0, 1] * H[:, 0, 1]
+        ) / before**2
+        ratio = np.where(after > 0, trace * before / (2 * after), np.inf)
+        conformal, area = np.arccosh(np.maximum(ratio, 1)), np.log(after / before)
+    flat = before == 0
+    return np.where(flat, np.nan, conformal), np.where(flat, np.nan, area)

@@ -13,6 +13,7 @@ from s4a.geometry.align import Motion
 from s4a.geometry.closest import closest_point_in_star, feature_tree, match_surfaces
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.method import joint
+from s4a.method.confidence import confidence
 from s4a.method.deform import displacement_in_template
 from s4a.method.elastic import Landmarks, elastic_rounds, local_rounds
 from s4a.method.first_map import nearest_after_motion
@@ -22,7 +23,6 @@ from s4a.method.shape import Basis, Shape
 from s4a.schema import INPUT, dataset, in_unit
 
 SAME = 0.002  # share of sqrt(area): starts that are nearer after the first step end as one
-CONFIDENCE_LENGTH = 0.02  # share of sqrt(area) at which the confidence has fallen to 1 / e
 
 Functions = tuple[np.ndarray, np.ndarray]  # of source and target, rows of which are compared
 
@@ -231,7 +231,7 @@ def register(
     low = s * source.coarse["position"].values[starts["intrinsic"]] @ R.T + t - X_low
     coefficient = target.full.coefficients(displacement[target.near_coarse])  # (k, 3)
     trip = round_trip(target, match, triangle, barycentric)
-    sure = confidence(source, match, image, trip)
+    sure = confidence(source, target, match, image)
     registration = dataset(
         attrs,
         registered_match=match.astype(np.int32),
@@ -456,16 +456,6 @@ def round_trip(
     corner = X[target.full.T[triangle[match]]]  # (n_target, 3 corners, 3)
     back = np.einsum("nc,ncx->nx", barycentric[match], corner)
     return np.linalg.norm(back - X, axis=1)
-
-
-def confidence(source: Shape, match: np.ndarray, image: np.ndarray, trip: np.ndarray) -> np.ndarray:
-    """exp(-(r + g) / 0.02) for every template vertex ``(n_target,)``, in 0..1.
-
-    r is :func:`round_trip`, g the gap between the registered template and the matched vertex, both
-    as shares of sqrt(area).
-    """
-    gap = np.linalg.norm(source.to_frame(image) - source.full.X[match], axis=1)
-    return np.exp(-(trip + gap) / CONFIDENCE_LENGTH)
 
 
 def log_area_ratio(image: np.ndarray, X: np.ndarray, T: np.ndarray) -> np.ndarray:

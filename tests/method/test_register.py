@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from s4a import clean, coarsen, match_pair, spectrum, synthetic
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.method import register
+from s4a.method.confidence import confidence
 from s4a.method.deform import displacement_in_template
 from s4a.method.shape import Shape
 
@@ -158,24 +159,28 @@ def test_the_way_back_reproduces_the_positions(shapes):
     assert found == pytest.approx(image, abs=1e-6)
 
 
-def confidence(source, target, match, image, back):
-    trip = register.round_trip(target, match, *back)
-    return register.confidence(source, match, image, trip)
-
-
-def test_confidence_is_one_for_a_perfect_match_and_low_where_it_is_broken(shapes):
+def test_confidence_is_high_for_a_true_image_and_low_where_that_is_broken(shapes):
     source, target = shapes
     image, every = source.original["position"].values, np.arange(5000)
-    back = register.way_back(source, target, image)
-    assert confidence(source, target, every, image, back) == pytest.approx(1, abs=1e-5)
-    broken = every.copy()
-    right = np.flatnonzero(target.full.X[:, 0] > 0.15)
-    broken[right] = np.random.default_rng(0).permutation(right)
-    found = confidence(source, target, broken, image, back)
-    assert found.min() >= 0
-    assert found.max() <= 1
-    assert found[right].mean() < 0.2
-    assert np.delete(found, right) == pytest.approx(1, abs=1e-5)
+    assert confidence(source, target, every, image).min() > 0.5
+    away, size = target.full.X[:, 0] > 0.15, source.frame[1]
+    broken = image.copy()
+    broken[away] += 0.1 * size * np.random.default_rng(0).standard_normal((away.sum(), 3))
+    found = confidence(source, target, every, broken)
+    assert 0 <= found.min() <= found.max() <= 1
+    assert found[target.full.X[:, 0] > 0.2].mean() < 0.05
+    assert found[target.full.X[:, 0] < 0].mean() > 0.9
+
+
+def test_confidence_falls_where_the_template_leaves_the_surface_and_where_it_is_stretched(shapes):
+    source, target = shapes
+    image, every = source.original["position"].values, np.arange(5000)
+    sure = confidence(source, target, every, image).mean()
+    center = image.mean(axis=0)
+    off = confidence(source, target, every, center + 1.02 * (image - center))
+    stretched = confidence(source, target, every, image * [1.3, 1, 1 / 1.3])
+    assert off.mean() < sure - 0.1
+    assert stretched.mean() < off.mean()
 
 
 def test_the_template_is_registered_to_itself_by_definition(template):

@@ -1,0 +1,149 @@
+"""Whether confidence is what it says: the share of such vertices within 1 % of sqrt(area).
+
+``confidence.py`` registers pairs with a known truth, fits the weights of
+:mod:`s4a.method.confidence` on those of :data:`TUNED`, and says for those of :data:`REPORTED`,
+by the weights of the library: how sure it is of a pair and how much is right; Spearman's
+correlation of confidence and error, and the share of the worst tenth that is among the least sure
+tenth (0.1 by chance); and in bins of confidence, the share that is right.  Bodies, and cats, share their
+connectivity; nothing here looks at that.
+"""
+
+import subprocess
+import sys
+import tempfile
+import warnings
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from peers import DATA, image_of, remeshed
+from scipy.stats import spearmanr
+from sklearn.linear_model import LogisticRegression
+
+import s4a
+from s4a import synthetic
+from s4a.method.confidence import RIGHT, WEIGHTS, evidence
+from s4a.study.options import pair_options
+from s4a.study.pair import match_shapes, shape_of
+
+TUNED = {
+    "faces": [(0, 1)],
+    "brains": [(1, 2)],
+    "cats": [(0, 3)],
+    "faust": [8, 12],  # seed and number of random pairs
+}
+REPORTED = {
+    "faces": [(2, 3), (4, 5), (6, 7)],
+    "brains": [(2, 3), (4, 1)],
+    "cats": [(4, 1), (7, 9)],
+    "faust": [9, 10],
+}
+EACH = 2000  # vertices of a pair in the fit
+
+
+class Pair(NamedTuple):
+    """Two shapes, the template first, and where its vertices are on the other."""
+
+    name: str
+    template: object
+    shape: object
+    true: np.ndarray
+
+
+def pairs_of(folder, chosen):
+    yield from remeshed_faces(folder, chosen["faces"])
+    yield from brains(chosen["brains"])
+    yield from same_vertices(folder, "cats", chosen["cats"])
+    seed, n = chosen["faust"]
+    rng = np.random.default_rng(seed)
+    drawn = [rng.choice(20, 2, replace=False).tolist() for _ in range(n)]
+    yield from same_vertices(folder, "faust", [(target, source) for source, target in drawn])
+
+
+def remeshed_faces(folder, pairs):
+    for a, b in pairs:
+        one, other = (s4a.read_shape(folder / "faces" / f"identity{i:03d}.ply") for i in (a, b))
+        yield Pair(f"faces {a} {b}", one, remeshed(other), other["position"].values)
+
+
+def brains(pairs):
+    tree = synthetic.brains(4, 20_000, 5)
+    for a, b in pairs:
+        names = [f"brain_{i:02d}" for i in (a, b)]
+        one, other = (tree["original"][name].to_dataset() for name in names)
+        at = tree["truth"][names[0]]["reference_point"].values
+        true = synthetic.position(tree["truth"], names[1], at)
+        yield Pair(f"brains {a} {b}", one, other, true)
+
+
+def same_vertices(folder, part, pairs):
+    files = sorted((folder / part).glob("*.ply"))
+    for a, b in pairs:
+        one, other = (s4a.read_shape(files[i]) for i in (a, b))
+        yield Pair(f"{part} {a} {b}", one, other, other["position"].values)
+
+
+def measured(pair):
+    """Error of every vertex, share of sqrt(area); evidence; confidence."""
+    options = pair_options({"n_coarse": 4000})
+    source, target = (shape_of(mesh, options) for mesh in (pair.shape, pair.template))
+    found, _ = match_shapes(source, target, options)
+    image = image_of(found, pair.template)
+    error = np.linalg.norm(image - pair.true, axis=1) / source.frame[1]
+    seen = evidence(source, target, found["registered_match"].values, image)
+    return error, seen, found["confidence"].values
+
+
+def fit(results):
+    """The weights, of vertices that are drawn from every pair."""
+    rng = np.random.default_rng(0)
+    seen, right = [], []
+    for error, evidence_of_pair, _ in results:
+        some = rng.choice(len(error), EACH)
+        seen.append(evidence_of_pair[some])
+        right.append(error[some] < RIGHT)
+    model = LogisticRegression(C=1e3, max_iter=1000)
+    model.fit(np.concatenate(seen), np.concatenate(right))
+    return model.intercept_[0], *model.coef_[0]
+
+
+def caught(error, sure):
+    """The share of the worst tenth that is among the least sure tenth."""
+    n = len(error) // 10
+    return len(np.intersect1d(np.argsort(-error)[:n], np.argsort(sure)[:n])) / n
+
+
+def report(names, results):
+    say = sys.stdout.write
+    say(f"{'pair':16} {'error %':>8} {'right':>6} {'sure':>6} {'Spearman':>9} {'caught':>7}\n")
+    for name, (error, _, sure) in zip(names, results, strict=True):
+        right, rank = (error < RIGHT).mean(), spearmanr(-sure, error)[0]
+        cells = f"{100 * error.mean():8.3f} {right:6.2f} {sure.mean():6.2f} {rank:9.2f}"
+        say(f"{name:16} {cells} {caught(error, sure):7.2f}\n")
+    error, sure = (np.concatenate([one[i] for one in results]) for i in (0, 2))
+    right, bins = error < RIGHT, np.clip((10 * sure).astype(int), 0, 9)
+    say("confidence in the mean, share that is right, share of the vertices:\n")
+    for b in np.unique(bins):
+        say(
+            f"{sure[bins == b].mean():.2f} {right[bins == b].mean():.2f} {(bins == b).mean():.2f}\n"
+        )
+    base = right.mean()
+    say(f"Brier score {np.mean((sure - right) ** 2):.3f}, of the mean {base * (1 - base):.3f}\n")
+
+
+def main():
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, DATA / "unpack.py", folder]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        found = {}
+        for kind, chosen in (("tuned", TUNED), ("reported", REPORTED)):
+            pairs = list(pairs_of(Path(folder), chosen))
+            found[kind] = [pair.name for pair in pairs], [measured(pair) for pair in pairs]
+    fitted = " ".join(f"{weight:.2f}" for weight in fit(found["tuned"][1]))
+    sys.stdout.write(f"fitted weights {fitted}; of the library {WEIGHTS}\n")
+    report(*found["reported"])
+
+
+if __name__ == "__main__":
+    warnings.simplefilter("ignore")
+    main()
