@@ -4,8 +4,11 @@
 :mod:`s4a.method.confidence` on those of :data:`TUNED`, and says for those of :data:`REPORTED`,
 by the weights of the library: how sure it is of a pair and how much is right; Spearman's
 correlation of confidence and error, and the share of the worst tenth that is among the least sure
-tenth (0.1 by chance); and in bins of confidence, the share that is right.  Bodies, and cats, share their
-connectivity; nothing here looks at that.
+tenth (0.1 by chance); and in bins of confidence, the share that is right.  Bodies, and cats, share
+their connectivity; nothing here looks at that.
+
+``confidence.py failures`` registers random pairs of bodies without the search for first maps, of
+which many end with limbs exchanged, and says how well the mean confidence tells these.
 """
 
 import subprocess
@@ -14,14 +17,17 @@ import tempfile
 import warnings
 from pathlib import Path
 from typing import NamedTuple
+from unittest import mock
 
 import numpy as np
 from peers import DATA, image_of, remeshed
 from scipy.stats import spearmanr
 from sklearn.linear_model import LogisticRegression
+from sklearn.metrics import roc_auc_score
 
 import s4a
 from s4a import synthetic
+from s4a.method import first_map
 from s4a.method.confidence import RIGHT, WEIGHTS, evidence
 from s4a.study.options import pair_options
 from s4a.study.pair import match_shapes, shape_of
@@ -39,6 +45,7 @@ REPORTED = {
     "faust": [9, 10],
 }
 EACH = 2000  # vertices of a pair in the fit
+FAILING, FAILED = (8, 9), 4  # seeds of pairs; mean error in % from which a pair has failed
 
 
 class Pair(NamedTuple):
@@ -131,19 +138,46 @@ def report(names, results):
     say(f"Brier score {np.mean((sure - right) ** 2):.3f}, of the mean {base * (1 - base):.3f}\n")
 
 
-def main():
-    with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, DATA / "unpack.py", folder]
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-        found = {}
-        for kind, chosen in (("tuned", TUNED), ("reported", REPORTED)):
-            pairs = list(pairs_of(Path(folder), chosen))
-            found[kind] = [pair.name for pair in pairs], [measured(pair) for pair in pairs]
+def failures(folder):
+    """Whether the mean confidence tells pairs of more than 4 % from the others."""
+    errors, sure = [], []
+    with mock.patch.multiple(first_map, SEARCHED=(), N_PAIRED=0):
+        for seed in FAILING:
+            chosen = {"faces": [], "brains": [], "cats": [], "faust": [seed, 30]}
+            for pair in pairs_of(folder, chosen):
+                error, _, confidence = measured(pair)
+                errors.append(100 * error.mean())
+                sure.append(confidence.mean())
+    errors, sure = np.array(errors), np.array(sure)
+    failed = errors > FAILED
+    told = f"{failed.sum()} of {len(errors)} pairs have more than {FAILED} %"
+    sys.stdout.write(f"{told}; area under the curve {roc_auc_score(failed, -sure):.3f}\n")
+    for name, some in (("failed", failed), ("others", ~failed)):
+        low, middle, high = np.quantile(sure[some], [0, 0.5, 1])
+        sys.stdout.write(f"{name}: mean confidence {low:.2f} to {high:.2f}, median {middle:.2f}\n")
+    limit = np.quantile(sure[~failed], 0.05)
+    caught = (sure[failed] < limit).mean()
+    sys.stdout.write(f"below {limit:.2f}: {caught:.2f} of the failed, 0.05 of the others\n")
+
+
+def calibration(folder):
+    """The fit on the tuned pairs, and what the library's weights say of the reported ones."""
+    found = {}
+    for kind, chosen in (("tuned", TUNED), ("reported", REPORTED)):
+        pairs = list(pairs_of(folder, chosen))
+        found[kind] = [pair.name for pair in pairs], [measured(pair) for pair in pairs]
     fitted = " ".join(f"{weight:.2f}" for weight in fit(found["tuned"][1]))
     sys.stdout.write(f"fitted weights {fitted}; of the library {WEIGHTS}\n")
     report(*found["reported"])
 
 
+def main(words):
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, DATA / "unpack.py", folder]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        (failures if words == ["failures"] else calibration)(Path(folder))
+
+
 if __name__ == "__main__":
     warnings.simplefilter("ignore")
-    main()
+    main(sys.argv[1:])
