@@ -390,4 +390,17 @@ EXERCISES = {
         lambda found: found["fluctuating_size"].idxmax().item(),
         "`found` has a fluctuating_size for each individual",
     ),
+    "17.1": Exercise(
+        lambda: 6,
+        "n children seen twice have 2 ** n orders, of which two give the same statistic",
+        0,
+    ),
+    "17.2": Exercise(
+        lambda fit: float((fit["effect"].values ** 2).sum(1).max() ** 0.5),
+        "`effect` has three coordinates at every vertex, in mm per year",
+    ),
+    "17.3": Exercise(
+        lambda thick: (thick["p_false_discovery"] <= 0.05).mean().item(),
+        "`thick` has a p_false_discovery for each vertex",
+    ),
 }
