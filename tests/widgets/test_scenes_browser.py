@@ -109,7 +109,7 @@ def opened(browser, lab, name):  # noqa: F811
     """A page with a notebook whose cells ran; it keeps its errors and what it sends the kernel."""
     messages = []
     page = watched(browser.new_page(viewport={"width": 1280, "height": 3600}), messages)
-    page.set_default_timeout(60_000)
+    page.set_default_timeout(180_000)  # a machine may be busy
     page.messages, page.sent = messages, []
     page.on("websocket", lambda socket: socket.on("framesent", lambda text: page.sent.append(text)))
     run_notebook(page, lab, name)
