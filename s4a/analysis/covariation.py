@@ -51,7 +51,7 @@ def two_block(
     >>> A, B = rng.normal(size=(2, 30, 4))
     >>> B[:, 2] += 3 * A[:, 0]
     >>> found = two_block(A, B, n_permutations=99)
-    >>> found["p"], bool(found["r"][0] > 0.9)
+    >>> float(found["p"]), bool(found["r"][0] > 0.9)
     (0.01, True)
     """
     n = len(A)
