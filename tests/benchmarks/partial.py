@@ -1,0 +1,217 @@
+"""Parts of shapes completed by a study: errors and intervals, beside rustcpd's posterior.
+
+``partial.py [brains faces skulls] [--few] [--studies FOLDER]``: new shapes, of which a plane with a
+random direction cuts off 0, 10, 30 or 50 % of the vertices, turned at random by 45 degrees, into
+studies that lack them: 12 synthetic brains of 6,000 vertices and 8 others, 16 faces of a published
+model and 8 others, and mouse skulls, each left out of the study of five.  For each cut the mean
+over the shapes of: CPU seconds; the distance to the truth where the part is, in % of sqrt(area),
+of the whole shape inserted, of the part, of rustcpd; the same where it is not, with that of the
+mean shape; the share of coordinates that lie within intervals of 50, 80 and 90 % where nothing is,
+around the truth, and around the match of the whole; where the part is, of 90 %; and where nothing
+is, rustcpd's of 90 %.  Skulls have no truth but the match of the whole.
+
+rustcpd gets the mean and the modes of the same study and the same part: ``pose_initialize`` (with
+translation anchors and adaptive mixing, as it says for partial targets), ``register_atlas``,
+``posterior``.  ``--few`` takes two shapes of each set, ``--studies`` keeps the studies in a folder.
+"""
+
+import logging
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from scipy.spatial.transform import Rotation
+
+import s4a
+from s4a import synthetic
+from s4a.analysis.complete import cut
+from s4a.analysis.generalization import without
+from s4a.geometry.align import farthest_points, rigid_transform
+from s4a.geometry.mesh import as_arrays, vertex_areas
+from s4a.method.pca import pca
+
+DATA = Path(__file__).parents[3] / "shared" / "data"
+OPTIONS = {"n_coarse": 2000, "k_init": 20, "k": 60, "n_jobs": 1}
+SHARES = 0.0, 0.1, 0.3, 0.5
+LEVELS = 0.6745, 1.2816, 1.6449  # of 50, 80 and 90 %
+HEAD = (
+    "missing",
+    "CPU s",
+    "there: whole",
+    "part",
+    "rustcpd",
+    "missing: part",
+    "rustcpd",
+    "mean shape",
+    "truth in 50 %",
+    "80 %",
+    "90 %",
+    "match in 50 %",
+    "80 %",
+    "90 %",
+    "there: truth in 90 %",
+    "match in 90 %",
+    "missing: rustcpd, truth in 90 %",
+)
+
+
+def brains(_folder, store, few):
+    """Study, new mesh and true position of the template's vertices, shape by shape."""
+    tree = synthetic.brains(20, 6000, seed=3)
+    names = sorted(tree["original"].children)
+    meshes = {name: tree["original"][name].to_dataset() for name in names}
+    study = s4a.analyse({n: meshes[n] for n in names[:12]}, store=store, **OPTIONS)
+    u = tree["truth"][study["registration"].attrs["template"]]["reference_point"].values
+    for name in names[12 : 12 + few]:
+        yield study, meshes[name], synthetic.position(tree["truth"], name, u)
+
+
+def faces(folder, store, few):
+    files = sorted((folder / "faces").glob("identity*.ply"))
+    study = s4a.analyse([str(file) for file in files[:16]], store=store, **OPTIONS)
+    for file in files[16 : 16 + few]:
+        mesh = s4a.read_shape(file)
+        yield study, mesh, mesh["position"].values  # vertex i is vertex i
+
+
+def skulls(folder, store, few):
+    files = sorted((folder / "skulls").glob("*.ply"))
+    whole = s4a.analyse([str(file) for file in files], store=store, **OPTIONS)
+    for name in whole["registration"]["shape"].values[:few]:
+        study = without(whole, name)
+        registration = study["registration"].to_dataset()
+        area = vertex_areas(*as_arrays(registration))
+        study = xr.DataTree.from_dict(
+            {node.path: node.to_dataset(inherit=False) for node in study.subtree}
+            | {"pca": pca(registration, area)}
+        )
+        yield study, whole["original"][name].to_dataset().load(), None
+
+
+def image_of(registered):
+    """The template's vertices where the shape lies in its file."""
+    one = registered.isel(shape=0)
+    X = one["position"].values + one["displacement"].values - one["translation"].values
+    return X @ one["rotation"].values / one["scale"].item()
+
+
+def drift(study, X):
+    """rustcpd's completed shape and standard deviation of a coordinate at every vertex."""
+    import rustcpd
+
+    registration, modes = (study[node].to_dataset() for node in ("registration", "pca"))
+    size = np.sqrt(vertex_areas(*as_arrays(registration)).sum())
+    mean = (registration["position"] + modes["mean_displacement"]).values / size
+    target = X[farthest_points(X, 1500)] / size
+    few = np.sort(farthest_points(mean, 1500))
+    deformation = modes["deformation"].values / size  # (c, n, 3)
+    c = len(deformation)
+    variance = (modes["standard_deviation"].values / size) ** 2
+    columns = deformation / np.sqrt(variance)[:, None, None]
+    every, some = (
+        np.ascontiguousarray(part.transpose(1, 2, 0).reshape(-1, c))
+        for part in (columns, columns[:, few])
+    )
+    partial = {"with_scale": False, "adaptive_mixing": 1.0, "outlier_weight": 0.05}
+    start = rustcpd.pose_initialize(
+        mean[few], target, some, variance, translation_anchor_count=6, **partial
+    )
+    fit = rustcpd.register_atlas(
+        target, mean[few], some, variance, initial_state=start.state, **partial
+    )
+    found = fit.posterior(target, mean, every, variance)
+    sd = np.sqrt(np.asarray(found.predictive_variance()) / 3)
+    return size * np.asarray(found.predict()), size * sd
+
+
+def shares_within(error, sd, rows):
+    """Shares of the coordinates of some vertices within the intervals of each level."""
+    if not rows.any():
+        return [np.nan] * len(LEVELS)
+    ratio = np.abs(error / sd)[rows]
+    return [float((ratio <= level).mean()) for level in LEVELS]
+
+
+def row_of(study, mesh, true, share, rng):
+    """What is measured of one cut of one shape."""
+    template = study["registration"].to_dataset()
+    area = vertex_areas(*as_arrays(template))
+    unit = 100 / np.sqrt(area.sum())
+    of_whole = image_of(
+        s4a.insert(study, {"new": mesh}, compare=False)["registration"].to_dataset()
+    )
+    true = of_whole if true is None else true
+    X, T = as_arrays(mesh)
+    direction = rng.normal(size=3)
+    height = X @ direction
+    level = np.quantile(height, 1 - share)
+    part, triangles = cut(X, T, height <= level)
+    there = true @ direction <= level
+    axis = rng.normal(size=3)
+    Q = Rotation.from_rotvec(np.pi / 4 * axis / np.linalg.norm(axis)).as_matrix()
+    spent = time.process_time()
+    found = s4a.complete(study, (part @ Q.T, triangles), n_samples=0)
+    spent = time.process_time() - spent
+    sd = found["completion_sd"].values
+    image = found["position"].values
+    others, others_sd = drift(study, part @ Q.T)
+
+    def distance(points, rows):
+        gap = np.linalg.norm(points - true, axis=1)
+        return unit * gap[rows] @ area[rows] / area[rows].sum() if rows.any() else np.nan
+
+    R, t, _ = rigid_transform(template["position"].values, true, area)
+    mean = template["position"].values + study["pca"]["mean_displacement"].values
+    in_truth = shares_within(image - true @ Q.T, sd, ~there)
+    in_match = shares_within(image - of_whole @ Q.T, sd, ~there)
+    return [
+        spent,
+        distance(of_whole, there),
+        distance(image @ Q, there),
+        distance(others @ Q, there),
+        distance(image @ Q, ~there),
+        distance(others @ Q, ~there),
+        distance(mean @ R.T + t, ~there),
+        *in_truth,
+        *in_match,
+        shares_within(image - true @ Q.T, sd, there)[-1],
+        shares_within(image - of_whole @ Q.T, sd, there)[-1],
+        shares_within(others - true @ Q.T, others_sd[:, None], ~there)[-1],
+    ]
+
+
+def main(words):
+    sets = [word for word in words if word in ("brains", "faces", "skulls")]
+    sets = sets or ["brains", *(["faces", "skulls"] if DATA.is_dir() else [])]
+    with tempfile.TemporaryDirectory() as folder:
+        if DATA.is_dir() and sets != ["brains"]:
+            subprocess.run(
+                [sys.executable, DATA / "unpack.py", folder], check=True, stdout=subprocess.DEVNULL
+            )
+        keep = Path(words[words.index("--studies") + 1] if "--studies" in words else folder)
+        for name in sets:
+            few = 2 if "--few" in words else 8
+            rows = {share: [] for share in SHARES}
+            for i, new in enumerate(globals()[name](Path(folder), keep / f"study_{name}", few)):
+                for share in SHARES:
+                    rng = np.random.default_rng([i, round(10 * share)])
+                    rows[share].append(row_of(*new, share, rng))
+            shapes = len(rows[0.0])
+            sys.stdout.write(f"\n{name}, {shapes} new shapes\n\n| {' | '.join(HEAD)} |\n")
+            sys.stdout.write(f"|{' --- |' * len(HEAD)}\n")
+            for share, of_cut in rows.items():
+                means = np.array(of_cut)
+                cells = [f"{value:.3f}" if value == value else "-" for value in means.mean(0)]
+                sys.stdout.write(f"| {100 * share:.0f} % | {' | '.join(cells)} |\n")
+            sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    warnings.simplefilter("ignore")
+    logging.getLogger("s4a").setLevel(logging.ERROR)
+    main(sys.argv[1:])
