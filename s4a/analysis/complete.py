@@ -46,7 +46,7 @@ log = logging.getLogger(__name__)
 LEAST_SHARE = 0.15  # of the template that a part must have
 TESTED_SHARE = 0.45  # with less the intervals have not been tested
 LEAST_INSIDE = 0.6  # share of the part that must lie on the whole
-FOREIGN = 2.0  # times what the modes of the others leave of any shape of the study
+FOREIGN = 1.4  # times what the modes of the others leave of any shape of the study
 N_REMATCHED = 6  # shapes of the study whose part is matched again
 N_ROUNDS = 2  # of finding what is there, and of matching it
 
@@ -450,7 +450,7 @@ def warnings_of(result: xr.Dataset) -> list[str]:
     if ratio > FOREIGN:
         said.append(
             f"the modes leave {ratio:.1f} times as much of the part as of any shape of the study: "
-            "it may be of another kind"
+            "it may be of another kind, or lie another way than was found, which landmarks say"
         )
     score = result["score"].values
     p = float(stats.chi2.sf(score @ score, len(score)))
