@@ -269,7 +269,7 @@ def best_fit(part: Part, whole: Whole, starts: list[Pose], first: Pose, free_siz
     What is compared is the distance left, over the share of the part that it is of.
     """
     fits = [fit_modes(part, whole, start, rounds=15, free_size=free_size) for start in starts]
-    # all go on, from the mean again: of 16 the right one was the tenth, and then four times as near
+    # all go on, from the mean shape again: after so few rounds the right one may be far behind
     fits = [fit_modes(part, whole, fit.pose, free_size=free_size) for fit in fits]
 
     def badness(fit: Fit) -> float:

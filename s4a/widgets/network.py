@@ -131,7 +131,8 @@ class Network(Panel):
         names = [self.names[i] for i in drawn]
         place = np.full(len(self.names), -1)
         place[drawn] = np.arange(len(drawn))
-        self.shown = [i for i in self.allowed if (place[self.ends[i]] >= 0).all()]
+        between = (place[self.ends] >= 0).all(axis=1)  # maps of which both shapes are drawn
+        self.shown = [i for i in self.allowed if between[i]]
         values = network[self.stage.value].values
         colors = ERRORS(np.nan_to_num(values[self.shown] / top, nan=0.0))
         places = self.places(names)

@@ -39,6 +39,8 @@ from s4a.widgets import (
     Transfer,
 )
 from s4a.widgets import explore as explore_module
+from s4a.widgets import network as network_module
+from s4a.widgets import spectrum as spectrum_module
 from s4a.widgets.modes_view import ModesView
 from s4a.widgets.scene import Scene, View
 
@@ -437,6 +439,39 @@ def test_the_spectrum_shows_every_shape_beside_weyls_line(study, panel):
     all_of_it = float(re.search(r"surface ([\d.e-]+)", spectrum.rebuilt.caption)[1])
     spectrum.k.value = 5
     assert float(re.search(r"surface ([\d.e-]+)", spectrum.rebuilt.caption)[1]) > all_of_it
+
+
+# ---- many shapes
+
+
+def test_of_many_shapes_the_graph_has_those_near_the_one_that_is_shown(panel, monkeypatch):
+    whole = panel(Network)
+    monkeypatch.setattr(network_module, "MOST", 3)
+    network = panel(Network)
+    one = next(name for name in network.names if name != network.median)
+    network.node = one
+    spec = network.graph.spec
+    assert len(spec["names"]) == 3 < len(network.names)
+    assert {one, network.median} <= set(spec["names"])
+    assert f"(the nearest 3 of {len(network.names)})" in spec["title"]
+    ends = [[spec["names"][i] for i in spec[key]] for key in ("source", "target")]
+    assert ends == [[names[e] for e in spec["edges"]] for names in (network.source, network.target)]
+    assert network.facts.value == whole.facts.value  # of all
+    last = len(network.source) - 1
+    network.edge = last  # as by a click: it is no option of the list
+    assert {network.source[last], network.target[last]} <= set(network.graph.spec["names"])
+    assert network.message.value == ""
+
+
+def test_of_many_shapes_the_spectra_are_a_part_and_the_chosen_one(panel, monkeypatch):
+    monkeypatch.setattr(spectrum_module, "MOST", 2)
+    spectrum = panel(Spectrum)
+    spectrum.shape = spectrum.names[1]
+    shown = [series["name"] for series in spectrum.curves.spec["series"][1:]]
+    assert len(shown) < len(spectrum.names)
+    assert shown[-1] == spectrum.names[1]
+    assert len(set(shown)) == len(shown)
+    assert f" of {len(spectrum.names)})" in spectrum.curves.spec["title"]
 
 
 # ---- progress
