@@ -19,7 +19,7 @@ new shapes, parts         :func:`insert`, :func:`complete`
 6.1 statistics            :mod:`s4a.statistics`
 6.2 transfer              :func:`transfer_labels`, :func:`transfer_landmarks`,
                           :func:`transfer_scalars`, :func:`register_pairs`, :func:`with_field`
-for other programs        :func:`write_registered`, :func:`write_training_set`
+for other programs        :func:`write_for`, :func:`write_registered`, :func:`write_training_set`
 the embedded collection   :mod:`s4a.synthetic`
 ========================  ====================================================================
 
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from s4a.analysis.complete import complete
     from s4a.analysis.export import write_registered, write_training_set
     from s4a.analysis.fields import with_field
+    from s4a.analysis.programs import write_for
     from s4a.analysis.transfer import (
         register_pairs,
         transfer_labels,
@@ -106,6 +107,7 @@ __all__ = [
     "verify",
     "with_field",
     "with_landmarks",
+    "write_for",
     "write_mesh",
     "write_page",
     "write_registered",
@@ -118,6 +120,7 @@ PLACES = {
     "analysis.complete": "complete",
     "analysis.export": "write_registered write_training_set",
     "analysis.fields": "with_field",
+    "analysis.programs": "write_for",
     "analysis.transfer": "register_pairs transfer_labels transfer_landmarks transfer_scalars",
     "datasets": "synthetic",
     "evaluation": "compare metrics",

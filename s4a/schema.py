@@ -185,6 +185,9 @@ ROWS = {
     "explained_variance_ratio_raw": ("component", ONE,
         "share of the variance at low resolution, of the matches as they are"),
     # a part of a shape, and the whole that it may be of
+    "aligned_position": ("shape vertex xyz", INPUT,
+        "position of each vertex of the template on the shape, aligned to the template"),
+    "point_vertex": ("point", ONE, "vertex of the template that the point is"),
     "present": ("vertex", ONE, "whether the part has the vertex"),
     "completion_sd": ("vertex xyz", INPUT,
         "standard deviation of the completed shape along each axis of the part's file"),
@@ -397,6 +400,7 @@ POINTS_INTO = {
     "sample_vertex": "original_vertex",
     "coarse_vertex": "vertex",
     "guide_vertex": "vertex",
+    "point_vertex": "vertex",
     "sample_cell": "vertex",
     "local_vertex": "original_vertex",
     "local_sample": "vertex",

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable
 from importlib.metadata import version
 from typing import Any
 
-from s4a.cli import commands, growing
+from s4a.cli import commands, growing, leaving
 from s4a.input.raw import shown
 
 MOST_PROCESSES = 1000  # so that a slip of the key starts no million of them
@@ -286,6 +286,24 @@ def _complete(add):
     add_options(add, ["seed"])
 
 
+def _export(add):
+    from s4a.analysis.programs import PROGRAMS
+
+    add("study", metavar="STUDY")
+    add("--to", required=True, choices=list(PROGRAMS), help="for which program")
+    add("--out", required=True, metavar="DIR", help="for its files")
+    text = "vertices that are points or particles, as far apart as can be (default: 500)"
+    add("--points", type=whole, help=f"slicer, shapeworks, r: {text}")
+    text = "scalismo, paraview: the first modes (default: all; paraview: 3)"
+    add("--modes", type=whole, help=text)
+    text = "slicer: landmarks of the template's file, carried to all shapes (default: its own)"
+    add("--landmarks", metavar="FILE", help=text)
+    text = "nifti: labels of the template's file, whole numbers (default: its own)"
+    add("--labels", metavar="FILE", help=text)
+    text = "nifti: volume whose voxels are labelled (default: that each shape was made of)"
+    add("--grid", metavar="FILE", help=text)
+
+
 def _transfer(add):
     from s4a.study.options import PAIR
 
@@ -340,6 +358,7 @@ FLAGS = {
     growing.growth: _growth,
     commands.insert: _insert,
     commands.complete: _complete,
+    leaving.export: _export,
     commands.transfer: _transfer,
     commands.compare: _compare,
 }

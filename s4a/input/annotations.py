@@ -15,9 +15,13 @@ from scipy.spatial import cKDTree
 from s4a.input import bounded
 from s4a.input.formats import gifti_arrays
 from s4a.input.raw import check_there, shown, text_of
-from s4a.schema import dataset, require
+from s4a.schema import dataset, require, unit_of
 
 LONGEST = 255  # characters of a name: an array of names has room for the longest in each place
+MARKUPS = (
+    "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/"
+    "Resources/Schema/markups-schema-v1.0.3.json#"
+)
 MIRROR = np.array([-1.0, -1.0, 1.0])  # between RAS and LPS
 
 
@@ -329,7 +333,8 @@ def _slicer_points(text):
             curve = m.get("name") or f"curve_{i}"
             curve = f"{curve}_{i}" if curve in taken else curve
             taken.add(curve)
-        points = [p for p in m["controlPoints"] if p.get("positionStatus", "defined") == "defined"]
+        points = m.get("controlPoints") or []  # a region of interest may have none
+        points = [p for p in points if p.get("positionStatus", "defined") == "defined"]
         rows += [
             (p.get("label", ""), p["position"], curve, m.get("type") == "ClosedCurve")
             for p in points
@@ -374,8 +379,17 @@ def _table_points(text):
 
 
 def write_landmarks(path: Path | str, landmarks: xr.Dataset) -> None:
-    """Write landmarks as CSV ``name,x,y,z``, and ``curve,closed`` where there are curves."""
+    """Write landmarks as CSV or, where the name ends in ``.mrk.json``, as 3D Slicer's markups.
+
+    A CSV is ``name,x,y,z``, and ``curve,closed`` where there are curves.  Markups are one list of
+    points, and a list for each curve; they say RAS where the attribute ``coordinate_system`` of the
+    landmarks does, and else LPS, which is what 3D Slicer takes where a file does not say.
+    """
     require(landmarks, "landmark_name", "landmark_position", what="landmarks")
+    if Path(path).name.lower().endswith(".mrk.json"):
+        text = json.dumps(_markups(landmarks), indent=1)
+        Path(path).write_text(text + "\n", encoding="utf-8")
+        return
     columns = [landmarks["landmark_name"].values]
     columns += list(landmarks["landmark_position"].values.astype(float).T)
     head = ["name", "x", "y", "z"]
@@ -386,6 +400,45 @@ def write_landmarks(path: Path | str, landmarks: xr.Dataset) -> None:
         table = csv.writer(file)
         table.writerow(head)
         table.writerows(zip(*(column.tolist() for column in columns), strict=True))
+
+
+def _markups(landmarks):
+    """The content of a file of markups, as 3D Slicer writes it."""
+    system = str(landmarks.attrs.get("coordinate_system") or "LPS")
+    unit = unit_of(landmarks["landmark_position"])
+    about = {"coordinateSystem": system} | ({"coordinateUnits": unit} if unit == "mm" else {})
+    upright = 1.0 if system == "RAS" else -1.0  # the axes of a point are those of RAS
+    n = landmarks.sizes["landmark"]
+    plain = np.full(n, "")
+    curves = landmarks["landmark_curve"].values if "landmark_curve" in landmarks else plain
+    closed = landmarks["landmark_closed"].values if "landmark_closed" in landmarks else plain != ""
+    points = [
+        {
+            "id": str(i),
+            "label": label,
+            "position": position,
+            "orientation": [upright, 0.0, 0.0, 0.0, upright, 0.0, 0.0, 0.0, 1.0],
+            "selected": True,
+            "locked": False,
+            "visibility": True,
+            "positionStatus": "defined",
+        }
+        for i, (label, position) in enumerate(
+            zip(
+                landmarks["landmark_name"].values.tolist(),
+                landmarks["landmark_position"].values.astype(float).tolist(),
+                strict=True,
+            ),
+            1,
+        )
+    ]
+    lists = []
+    for curve in dict.fromkeys(curves.tolist()):
+        of = np.flatnonzero(curves == curve)
+        kind = ("ClosedCurve" if closed[of[0]] else "Curve") if curve else "Fiducial"
+        named = {"name": curve} if curve else {}
+        lists.append({"type": kind, **named, **about, "controlPoints": [points[i] for i in of]})
+    return {"@schema": MARKUPS, "markups": lists}
 
 
 def labels_of_mesh(labels: ArrayLike, mesh: xr.Dataset) -> np.ndarray:

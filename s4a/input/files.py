@@ -137,7 +137,9 @@ def write_mesh(
     triangles: np.ndarray,
     **vertex_scalars: np.ndarray,
 ) -> None:
-    """Write a mesh in the format of the suffix: .ply (binary), .obj, .off, .stl, .vtk, .gii, .npz.
+    """Write a mesh in the format of the suffix.
+
+    These are .ply (binary), .obj, .off, .stl, .vtk, .vtp, .gii and .npz.
 
     Parameters
     ----------
@@ -145,7 +147,7 @@ def write_mesh(
     points : float ndarray (n, 3)
     triangles : int ndarray (m, 3)
     **vertex_scalars : float ndarray (n,)
-        Values per vertex by name; PLY, VTK, GIFTI and NPZ hold them, as float32 but for NPZ.
+        Values per vertex by name; PLY, VTK, VTP, GIFTI and NPZ hold them, as float32 but for NPZ.
 
     Raises
     ------
@@ -176,7 +178,9 @@ def write_mesh(
     if suffix not in WRITERS:
         raise ValueError(f"a name ending in {', '.join(WRITERS)} needed, found {path.name}")
     if scalars and not FORMATS[SUFFIXES[suffix]].scalars:
-        raise ValueError(f"{suffix} holds no values per vertex; write .ply, .vtk, .gii or .npz")
+        raise ValueError(
+            f"{suffix} holds no values per vertex; write .ply, .vtk, .vtp, .gii or .npz"
+        )
     path.write_bytes(WRITERS[suffix](points, triangles, scalars))
 
 

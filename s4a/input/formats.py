@@ -32,7 +32,7 @@ import numpy as np
 
 from s4a.input import bounded
 from s4a.input.manifold import equal_rows
-from s4a.input.vtk import fans, number_type, parse_vtk, parse_vtp, vtk_bytes
+from s4a.input.vtk import fans, number_type, parse_vtk, parse_vtp, vtk_bytes, vtp_bytes
 
 Surface = tuple[np.ndarray, np.ndarray, dict[str, str]]  # points, triangles, attributes
 BRAIN = {"coordinate_system": "RAS", "unit": "mm"}  # what GIFTI and FreeSurfer promise
@@ -486,7 +486,7 @@ FORMATS = {
     "OFF": Format(".off", rb"(ST)?C?N?OFF", _read_off, _off_bytes),
     "STL": Format(".stl", b"", _read_stl, _stl_bytes),
     "VTK": Format(".vtk", b"# vtk DataFile", parse_vtk, vtk_bytes, scalars=True),
-    "VTP": Format(".vtp", b"<(.*<)?VTKFile", parse_vtp),
+    "VTP": Format(".vtp", b"<(.*<)?VTKFile", parse_vtp, vtp_bytes, scalars=True),
     "GIFTI": Format(".gii", b"<(.*<)?GIFTI", _read_gifti, _gifti_bytes, scalars=True),
     "NPZ": Format(".npz", rb"PK\x03\x04", _read_npz, _npz_bytes, scalars=True),
     "FreeSurfer": Format(SURFER, rb"\xff\xff\xfe", _read_freesurfer),

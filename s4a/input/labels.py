@@ -125,42 +125,85 @@ def read_volume(
     return smoothed(points, triangles, rounds), np.ascontiguousarray(triangles), attrs
 
 
+def voxels_marked(path: str | os.PathLike[str], label: Label) -> tuple[np.ndarray, np.ndarray]:
+    """Which voxels ``(x, y, z)`` of a volume have a label, and its affine map to millimetres.
+
+    See :func:`read_volume`.
+    """
+    values, affine, _ = _volume(bounded.content(Path(path), UNPACKED))
+    return _marked(values, check_label(label)), affine
+
+
+def read_grid(path: str | os.PathLike[str]) -> tuple[tuple[int, ...], np.ndarray]:
+    """The shape of a volume and its affine map to millimetres, RAS; of grey values too.
+
+    Raises
+    ------
+    ValueError
+        When the file is no NIfTI or MGH volume of three dimensions.
+    """
+    check_there(path)
+    try:
+        kind, name = _kind_of(data := bounded.content(Path(path), UNPACKED))
+        header = kind.header_class.from_fileobj(io.BytesIO(data))
+        return _shape_of(header), _affine_of(header, name)[0]
+    except Exception as error:  # whatever a file holds, the message must name it
+        why = shown(error) or type(error).__name__
+        raise ValueError(f"{shown(path)} cannot be read as a volume: {why}") from error
+
+
 def _volume(data):
     """Whole numbers (x, y, z), the affine map of their indices to millimetres, and attributes."""
+    kind, name = _kind_of(data)
+    header = kind.header_class.from_fileobj(io.BytesIO(data))
+    shape = _shape_of(header)
+    needed = int(np.prod(shape, dtype=object)) * header.get_data_dtype().itemsize
+    n_bytes = 284 if name == "MGH" else 352
+    if needed + n_bytes > len(data):
+        raise ValueError(f"{needed} bytes of voxels {shape} expected, found {len(data) - n_bytes}")
+    values = np.asanyarray(kind.from_bytes(data).dataobj).reshape(shape)
+    if values.dtype.kind not in "iub":
+        if values.dtype.kind != "f" or not np.array_equal(values, np.round(values)):
+            raise ValueError("whole numbers expected, one a structure: this is no label volume")
+        values = values.astype(np.int64)
+    affine, says = _affine_of(header, name)
+    attrs = {"format": name, "coordinate_system": "RAS"}
+    if not says:
+        del attrs["coordinate_system"]
+        attrs["note"] = "the volume does not say how it lies, left and right may be exchanged"
+    return values, affine, attrs
+
+
+def _kind_of(data):
+    """The class of nibabel's for the first bytes of a file, and the name of the format."""
     import nibabel
 
     if data[:4] == b"\0\0\0\1":
-        kind: Any = nibabel.MGHImage
-        name, n_bytes = "MGH", 284
-    elif is_volume(data):
-        kind, name, n_bytes = nibabel.Nifti1Image, "NIfTI", 352
-    else:
-        raise ValueError(f"NIfTI or MGH expected, found {len(data)} bytes of something else")
-    header = kind.header_class.from_fileobj(io.BytesIO(data))
+        return nibabel.MGHImage, "MGH"
+    if is_volume(data):
+        return nibabel.Nifti1Image, "NIfTI"
+    raise ValueError(f"NIfTI or MGH expected, found {len(data)} bytes of something else")
+
+
+def _shape_of(header):
+    """Three dimensions; ones at the end are none."""
     shape = tuple(int(n) for n in header.get_data_shape())
     while len(shape) > 3 and shape[-1] == 1:
         shape = shape[:-1]
     if len(shape) != 3 or min(shape) < 1:
         raise ValueError(f"a volume of three dimensions expected, found {shape}")
-    needed = int(np.prod(shape, dtype=object)) * header.get_data_dtype().itemsize
-    if needed + n_bytes > len(data):
-        raise ValueError(f"{needed} bytes of voxels {shape} expected, found {len(data) - n_bytes}")
-    image = kind.from_bytes(data)
-    values = np.asanyarray(image.dataobj).reshape(shape)
-    if values.dtype.kind not in "iub":
-        if values.dtype.kind != "f" or not np.array_equal(values, np.round(values)):
-            raise ValueError("whole numbers expected, one a structure: this is no label volume")
-        values = values.astype(np.int64)
-    affine = np.array(image.affine, float)
+    return shape
+
+
+def _affine_of(header, name):
+    """The map of indices to millimetres, and whether the header says how the volume lies."""
+    affine = np.array(header.get_best_affine(), float)
     if not np.isfinite(affine).all() or abs(np.linalg.det(affine[:3, :3])) < 1e-12:
         raise ValueError("its affine map to millimetres cannot be inverted")
-    attrs = {"format": name, "coordinate_system": "RAS"}
-    if name == "NIfTI":
-        affine[:3] *= MILLIMETRES[header.get_xyzt_units()[0]]
-        if int(header["sform_code"]) == 0 == int(header["qform_code"]):
-            del attrs["coordinate_system"]
-            attrs["note"] = "the volume does not say how it lies, left and right may be exchanged"
-    return values, affine, attrs
+    if name == "MGH":
+        return affine, True
+    affine[:3] *= MILLIMETRES[header.get_xyzt_units()[0]]
+    return affine, int(header["sform_code"]) != 0 or int(header["qform_code"]) != 0
 
 
 def _marked(values, label):

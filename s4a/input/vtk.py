@@ -2,6 +2,7 @@
 
 import base64
 import re
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
@@ -171,11 +172,13 @@ def _count_places(values, n):
     return np.array(places, np.int64)
 
 
-def vtk_bytes(X: np.ndarray, T: np.ndarray, scalars: dict[str, np.ndarray]) -> bytes:
-    """A binary legacy file."""
+def vtk_bytes(
+    X: np.ndarray, T: np.ndarray, scalars: dict[str, np.ndarray], title: str = "surface"
+) -> bytes:
+    """A binary legacy file; 3D Slicer takes ``SPACE=RAS`` or ``SPACE=LPS`` from its title."""
     cells = np.column_stack([np.full(len(T), 3), T]).astype(">i4")
     parts = [
-        b"# vtk DataFile Version 3.0\nsurface\nBINARY\nDATASET POLYDATA\n",
+        b"# vtk DataFile Version 3.0\n%b\nBINARY\nDATASET POLYDATA\n" % title.encode("ascii"),
         b"POINTS %d double\n%b\n" % (len(X), X.astype(">f8").tobytes()),
         b"POLYGONS %d %d\n%b\n" % (len(T), cells.size, cells.tobytes()),
     ]
@@ -189,6 +192,41 @@ def vtk_bytes(X: np.ndarray, T: np.ndarray, scalars: dict[str, np.ndarray]) -> b
 
 
 # XML files
+
+
+def vtp_bytes(X: np.ndarray, T: np.ndarray, arrays: dict[str, np.ndarray]) -> bytes:
+    """An XML file whose arrays stand in base64.
+
+    Parameters
+    ----------
+    X : float ndarray (n, 3)
+    T : int ndarray (m, 3)
+    arrays : dict of str to float ndarray (n,) or (n, c)
+        Values, or vectors, of the points by name; kept as float32.
+    """
+    fields = "".join(
+        _data_array(name, np.asarray(values, "<f4")) for name, values in arrays.items()
+    )
+    ends = np.arange(3, 3 * len(T) + 1, 3, dtype="<i8")
+    cells = _data_array("connectivity", T.astype("<i8").ravel()) + _data_array("offsets", ends)
+    piece = f'<Piece NumberOfPoints="{len(X)}" NumberOfPolys="{len(T)}">'
+    return (
+        '<?xml version="1.0"?>\n<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" '
+        f'header_type="UInt64">\n<PolyData>\n{piece}\n<PointData>\n{fields}</PointData>\n'
+        f"<Points>\n{_data_array('Points', X.astype('<f8'))}</Points>\n<Polys>\n{cells}</Polys>\n"
+        "</Piece>\n</PolyData>\n</VTKFile>\n"
+    ).encode()
+
+
+def _data_array(name, values):
+    kind = {"f4": "Float32", "f8": "Float64", "i8": "Int64"}[values.dtype.str[1:]]
+    width = values.shape[1] if values.ndim == 2 else 1
+    raw = np.array(values.nbytes, "<u8").tobytes() + np.ascontiguousarray(values).tobytes()
+    return (
+        f"<DataArray type={quoteattr(kind)} Name={quoteattr(name)} "
+        f'NumberOfComponents="{width}" format="binary">'
+        f"{base64.b64encode(raw).decode()}</DataArray>\n"
+    )
 
 
 def parse_vtp(data: bytes) -> tuple[np.ndarray, np.ndarray, dict[str, str]]:

@@ -1,0 +1,171 @@
+"""Labels of the template carried to every shape and written as volumes, in the grid of its scan.
+
+A voxel whose centre is within a shape has the label of the vertex that is nearest to it (6.2).
+"""
+
+import logging
+from pathlib import Path
+
+import igl
+import numpy as np
+import xarray as xr
+from scipy.spatial import cKDTree
+
+from s4a.analysis.inputs import registration_of
+from s4a.analysis.transfer import transfer_labels
+from s4a.geometry.mesh import as_arrays
+from s4a.input.annotations import MIRROR as BETWEEN_RAS_AND_LPS
+from s4a.input.hands import in_file
+from s4a.input.labels import read_grid, voxels_marked
+from s4a.schema import unit_of
+
+log = logging.getLogger(__name__)
+
+MILLIMETRES = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 0.001}
+VOLUMES = ("NIfTI", "MGH")
+
+
+def write_label_volumes(
+    study: xr.DataTree,
+    folder: Path | str,
+    *,
+    label: np.ndarray | None = None,
+    grid: Path | str | None = None,
+) -> list[Path]:
+    """Write labels of the template, carried to every shape, as NIfTI label volumes.
+
+    Parameters
+    ----------
+    study : DataTree
+    folder : path
+        Gets ``<shape>.nii.gz``: whole numbers, 0 outside of the shape, with the affine map of the
+        grid, in millimetres, RAS.
+    label : int array_like (vertex,), optional
+        Of the template's vertices, not 0; by default those of its file.
+    grid : path, optional
+        NIfTI or MGH volume whose voxels are taken for every shape; by default those of the volume
+        that the shape was made of, of which the voxels that were marked are labelled.
+
+    Returns
+    -------
+    list of Path
+
+    Raises
+    ------
+    ValueError
+        When there are no labels or they are no whole numbers, a shape was made of no volume and
+        there is no grid, or no voxel of the grid is within a shape.
+    """
+    registration = registration_of(study)
+    names, template = registration["shape"].values.tolist(), registration.attrs["template"]
+    if label is None:
+        mesh = study["original"][template].to_dataset()
+        if "label" not in mesh:
+            raise ValueError(
+                f"labels of the template {template!r} needed, its file has none: give label= "
+                "(--labels FILE)"
+            )
+        label = mesh["label"].values
+    label = np.asarray(label)
+    if label.dtype.kind not in "iu" or abs(label).max(initial=0) >= 2**31:
+        raise ValueError(
+            f"a volume of labels needs whole numbers under {2**31}, found {label.dtype}; number "
+            "them first"
+        )
+    grids = {name: _grid_of(study, name, grid) for name in names}  # before anything is written
+    carried = transfer_labels(study, label, targets=names)
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for name in names:
+        mesh = study["original"][name].to_dataset()
+        volume = _volume(mesh, name, carried[name]["label"].values, *grids[name])
+        paths.append(folder / f"{name}.nii.gz")
+        _save(paths[-1], *volume)
+    return paths
+
+
+def _grid_of(study, name, grid):
+    """The volume whose voxels are taken, and the label that made the shape, if it did."""
+    attrs = study["original"][name].attrs
+    if grid is not None:
+        return grid, None
+    if attrs.get("format") not in VOLUMES:
+        raise ValueError(
+            f"{name} was made of no volume, but of {attrs.get('format') or 'arrays'}: give the "
+            "scan whose grid is to be filled, grid= (--grid FILE)"
+        )
+    if not Path(attrs.get("path", "")).is_file():
+        raise ValueError(
+            f"{name} was made of {attrs.get('path')}, which is no longer there: give grid= "
+            "(--grid FILE)"
+        )
+    return attrs["path"], attrs["label"]
+
+
+def _volume(mesh, name, label, grid, made_of):
+    """Labels at the voxels of a grid ``(x, y, z)``, and its affine map."""
+    Y, S = as_arrays(mesh)
+    Y, S = (in_file(mesh, Y), S[:, ::-1]) if mesh.attrs.get("reflected") else (Y, S)
+    Y = _in_millimetres(mesh, name, Y)
+    if made_of is not None:
+        inside, affine = voxels_marked(grid, made_of)
+        voxel = np.argwhere(inside)
+        centre = voxel @ affine[:3, :3].T + affine[:3, 3]
+        shape = inside.shape
+    else:
+        shape, affine = read_grid(grid)
+        voxel, centre = _voxels_within(Y, S, shape, affine)
+        if not len(voxel):
+            raise ValueError(
+                f"no voxel of {grid} is within {name}: the surface lies from "
+                f"{_place(Y.min(0))} to {_place(Y.max(0))} mm (RAS); is it the scan of this shape?"
+            )
+    values = np.zeros(shape, np.int32)
+    values[tuple(voxel.T)] = label[cKDTree(Y).query(centre)[1]]
+    return values, affine
+
+
+def _in_millimetres(mesh, name, Y):
+    """Positions in millimetres, RAS."""
+    unit, system = unit_of(mesh["position"]), mesh.attrs.get("coordinate_system", "")
+    if unit not in MILLIMETRES or not system:
+        log.warning(
+            "%s does not say its unit or whether it is RAS or LPS (%s, %s): millimetres and RAS "
+            "are taken",
+            name,
+            unit,
+            system or "unknown",
+        )
+    Y = Y * MILLIMETRES.get(unit, 1.0)
+    return Y * BETWEEN_RAS_AND_LPS if system == "LPS" else Y
+
+
+def _voxels_within(Y, S, shape, affine):
+    """Indices ``(v, 3)`` of the voxels whose centres are within a surface, and these centres."""
+    inverse = np.linalg.inv(affine)
+    corners = Y @ inverse[:3, :3].T + inverse[:3, 3]
+    low = np.maximum(np.ceil(corners.min(0)).astype(int), 0)
+    high = np.minimum(np.floor(corners.max(0)).astype(int) + 1, shape)
+    if (high <= low).any():
+        return np.empty((0, 3), int), np.empty((0, 3))
+    axes = [np.arange(a, b) for a, b in zip(low, high, strict=True)]
+    voxel = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    centre = voxel @ affine[:3, :3].T + affine[:3, 3]
+    winding = igl.fast_winding_number(Y, S.astype(np.int64), centre)
+    inside = winding > 0.5
+    return voxel[inside], centre[inside]
+
+
+def _place(point):
+    return "(" + ", ".join(f"{x:.1f}" for x in point.tolist()) + ")"
+
+
+def _save(path, values, affine):
+    """Write a NIfTI volume in millimetres."""
+    import nibabel
+
+    small = np.int16 if abs(values).max() < 2**15 else np.int32
+    image = nibabel.Nifti1Image(values.astype(small), affine)
+    image.header.set_xyzt_units("mm")
+    nibabel.save(image, path)
