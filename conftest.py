@@ -1,6 +1,6 @@
 """Examples of docstrings run as they stand, with no name that they do not make themselves.
 
-The example study is made once, and what examples write to temporary folders is gone afterwards.
+The example studies are made once, and what examples write to temporary folders is gone afterwards.
 """
 
 import tempfile
@@ -8,11 +8,17 @@ import tempfile
 import pytest
 
 from s4a import synthetic
+from s4a.datasets import structures
 
 
 @pytest.fixture(scope="session")
 def example_study():
     return synthetic.example_study()
+
+
+@pytest.fixture(scope="session")
+def example_structures():
+    return structures.example_structures()
 
 
 @pytest.fixture(autouse=True)
@@ -23,6 +29,7 @@ def example(request):
     request.node.dtest.globs.clear()
     monkeypatch = request.getfixturevalue("monkeypatch")
     monkeypatch.setattr(tempfile, "tempdir", str(request.getfixturevalue("tmp_path")))
-    if any("example_study" in example.source for example in request.node.dtest.examples):
-        study = request.getfixturevalue("example_study")
-        monkeypatch.setattr(synthetic, "example_study", lambda: study)
+    for module, name in ((synthetic, "example_study"), (structures, "example_structures")):
+        if any(name in example.source for example in request.node.dtest.examples):
+            study = request.getfixturevalue(name)
+            monkeypatch.setattr(module, name, lambda study=study: study)

@@ -55,13 +55,18 @@ def doctor(args: Namespace) -> int:
 
 def run(args: Namespace) -> int:
     """The whole analysis over a folder of meshes."""
-    from s4a.cli import tables
+    from s4a.cli import results, tables
     from s4a.study.pipeline import analyse
 
     begin = time.perf_counter()
     full = within(args.out, "report.txt")
     with cluster(args.cluster), lines_or_bars():
-        study = analyse(args.paths, store=args.out, **options_of(args))
+        several = dict(args.structures) if args.structures else None
+        study = analyse(args.paths, store=args.out, structures=several, **options_of(args))
+    if "structures" in study.children:
+        write(results.run_of_several(study, args.out, time.perf_counter() - begin))
+        parts = study["structures"].children.values()
+        return 1 if any(part["report"].attrs["unforeseen"] for part in parts) else 0
     again = shlex.join(["s4a", *(word for word in args.words if word != "--keep-doubtful")])
     report = study["report"].to_dataset()
     lines = [tables.report_table(report), *tables.stage_lines(report)]

@@ -138,6 +138,14 @@ def not_negative(text: str) -> int:
     return number
 
 
+def named_label(text: str) -> tuple[str, str]:
+    """A structure and its label or labels, as ``left=17``."""
+    name, equals, label = text.partition("=")
+    if not (name and equals and label):
+        raise argparse.ArgumentTypeError(f"a structure and its label needed, as left=17: {text!r}")
+    return name, label
+
+
 OTHER_NUMBERS: dict[str, Callable[[str], int]] = {"n_jobs": processes, "seed": not_negative}
 
 
@@ -157,6 +165,8 @@ def _run(add):
     add("--out", required=True, metavar="STUDY", help=text)
     text = "dask scheduler tcp://host:port, or local:N worker processes"
     add("--cluster", metavar="ADDRESS", help=text)
+    text = "label volumes that each hold several structures: left=1 right=2 (of several labels 1,2)"
+    add("--structures", nargs="+", type=named_label, metavar="NAME=LABEL", help=text)
     add_options(add, HELP)
 
 
@@ -264,6 +274,16 @@ def _growth(add):
     add_options(add, ["seed"])
 
 
+def _structures(add):
+    add("study", metavar="STUDY")
+    add("--scale", action="store_true", help="take the size of each whole subject out")
+    text = "also test whether groups differ in how structures lie, and in their shapes"
+    add("--group", metavar="COLUMN", help=text)
+    add("--permutations", type=whole, help="of the subjects (default: 999)")
+    add("--out", metavar="DIR", help="for netCDF, CSV, the pages (default: STUDY/statistics)")
+    add_options(add, ["seed"])
+
+
 def _insert(add):
     add("study", metavar="STUDY")
     add("shapes", nargs="+", metavar="SHAPE", help="mesh files, folders or globs")
@@ -356,6 +376,7 @@ FLAGS = {
     commands.asymmetry: _asymmetry,
     growing.fields: _fields,
     growing.growth: _growth,
+    growing.structures: _structures,
     commands.insert: _insert,
     commands.complete: _complete,
     leaving.export: _export,

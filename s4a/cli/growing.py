@@ -1,9 +1,9 @@
-"""The commands of fields and of growth, see :mod:`s4a.cli.commands`."""
+"""The commands of fields, of growth and of several structures, see :mod:`s4a.cli.commands`."""
 
 from argparse import Namespace
 from pathlib import Path
 
-from s4a.cli.commands import study_to_test, write
+from s4a.cli.commands import study_to_test, within, write
 
 
 def fields(args: Namespace) -> int:
@@ -56,5 +56,34 @@ def growth(args: Namespace) -> int:
         moving = tests.regression_modes(study, found, args.time)
         write_page(moving, Path(out) / "growth.html", title=f"Growth with {args.time}")
         write_animation(moving, Path(out) / "growth.gif")
+    write(f"\nresults: {out}")
+    return 0
+
+
+def structures(args: Namespace) -> int:
+    """How structures vary in how they lie to each other, and each in its shape."""
+    from s4a.analysis import statistics as tests
+    from s4a.analysis.export import write_results
+    from s4a.analysis.structures import LEVELS
+    from s4a.cli import results
+    from s4a.show.page import write_page
+    from s4a.study.tree import open_study
+
+    study = open_study(args.study)
+    out = Path(args.out) if args.out else within(args.study, "statistics")
+    options = {} if args.permutations is None else {"n_permutations": args.permutations}
+    found = tests.structures(study, scale=args.scale, seed=args.seed, **options)
+    write_results(found, out, "structures")
+    write(results.structure_lines(found))
+    for level in LEVELS:
+        if level in found["level"] and not found["level_share"].sel(level=level).any():
+            write(f"{level}: nothing varies")
+            continue
+        of_level = tests.structures_modes(study, found, level)
+        write(results.level_line(of_level["pca"].to_dataset(), level))
+        if args.group:
+            test = tests.group_test(of_level, args.group, seed=args.seed, **options)
+            write(f"  groups of {args.group}: p = {test['p_value'].item():.3g}")
+        write_page(of_level, out / f"{level}.html", title=f"Structures: {level}")
     write(f"\nresults: {out}")
     return 0

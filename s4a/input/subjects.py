@@ -119,7 +119,7 @@ def read_table(path: Path | str, names: list[str]) -> xr.Dataset:
             )
         if odd := odd_cells(values.tolist()) if values.dtype.kind == "U" else []:
             log.warning("%s: the column %r %s", path, name, odd_words(odd, names, values))
-        if PERSON.fullmatch(name):
+        if PERSON.fullmatch(name) and "structure" not in columns:
             _tell_repeated(path, name, values, names)
     return subjects(columns, names, str(path))
 

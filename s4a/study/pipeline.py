@@ -6,7 +6,7 @@ of them is in :mod:`s4a.study.tasks`.
 """
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +46,7 @@ from s4a.study.sources import (
     remarks_on_landmarks,
 )
 from s4a.study.store import (
+    STRUCTURES,
     arrays,
     attributes,
     is_done,
@@ -54,6 +55,17 @@ from s4a.study.store import (
     read,
     task_key,
     write,
+)
+from s4a.study.structures import (
+    Part,
+    check_one_kind,
+    check_parts,
+    has_structures,
+    is_nested,
+    parts_of_dict,
+    parts_of_labels,
+    parts_of_table,
+    write_contents,
 )
 from s4a.study.tasks import (
     align_shape,
@@ -75,6 +87,7 @@ def analyse(
     *,
     store: Path | str | None = None,
     n_jobs: int | None = None,
+    structures: Mapping[str, int | str] | None = None,
     **options: Any,
 ) -> xr.DataTree:
     """From a collection of meshes to a median shape, dense correspondences and modes.
@@ -82,8 +95,11 @@ def analyse(
     Parameters
     ----------
     shapes : path, list of paths, dict or xarray.DataTree
-        A folder, a glob, files, or meshes in memory: name -> Dataset or (points, triangles), or
-        what :func:`s4a.read_shapes` gives.
+        A folder, a glob, files, or by name a file or a mesh in memory, a Dataset or (points,
+        triangles), or what :func:`s4a.read_shapes` gives.  Of several structures of each subject a
+        dict of such dicts: ``{"subject_1": {"left": mesh, "right": mesh}, ...}``, whose meshes lie
+        where they are to each other; or files and a table with columns ``structure`` and
+        ``subject``; or label volumes, see `structures`.
     method : {"rematch", "scalable"}
         The low resolution (4.1): remeshed (default), or the local functions of SCALABLE, see
         :func:`s4a.method.scalable.reduced`.  The study has the same nodes and variables but for U,
@@ -187,13 +203,18 @@ def analyse(
     n_jobs : int, optional
         Processes, as in joblib: -1 for all cores given to this process.  The result does not depend
         on it.
+    structures : dict, optional
+        The files are label volumes that each hold several structures: the name of each, and its
+        label or labels as of `label`: ``{"anterior": 1, "posterior": 2}``.
     seed, rng : see :mod:`s4a.seeds`
 
     Returns
     -------
     xarray.DataTree
         The study: ``/original``, ``/coarse``, ``/network``, ``/latent``, ``/registration``,
-        ``/pca``, ``/report`` and, with a table, ``/subjects``.
+        ``/pca``, ``/report`` and, with a table, ``/subjects``.  Of several structures these of
+        each in ``/structures/<name>``, with a template of its own, see
+        :func:`s4a.statistics.of_structure` and :func:`s4a.statistics.structures`.
 
     Raises
     ------
@@ -220,27 +241,67 @@ def analyse(
     options = seeded(options)
     if store is None:
         with temporary_folder() as folder:
-            study = analyse(shapes, store=folder, n_jobs=n_jobs, **options)
+            study = analyse(shapes, store=folder, n_jobs=n_jobs, structures=structures, **options)
             loaded = {n.path: n.to_dataset(inherit=False).load() for n in study.subtree}
             return xr.DataTree.from_dict(loaded)
     settings = Options(**options)
     if settings.intersections:
         check_meshlab()
+    if structures is not None:
+        parts = parts_of_labels(shapes, structures, settings)
+        remarks = remarks_on_files(shapes, settings.pattern, volumes=True)
+        return analyse_parts(parts, settings, remarks, store, n_jobs)
+    if isinstance(shapes, dict) and is_nested(shapes):
+        return analyse_parts(parts_of_dict(shapes, settings), settings, [], store, n_jobs)
     volumes = settings.label is not None
     sources = find_sources(shapes, settings.pattern, volumes=volumes)
     remarks = remarks_on_files(shapes, settings.pattern, volumes=volumes)
-    settings.check_against(list(sources))
     marked = landmarks_of(sources, settings.landmarks)
     subjects = None if settings.table is None else read_table(settings.table, list(sources))
+    if has_structures(subjects):
+        parts = parts_of_table(sources, marked, subjects, settings)
+        return analyse_parts(parts, settings, remarks, store, n_jobs)
+    check_one_kind(store, several=False)
+    analyse_part(Part(sources, marked, subjects, settings), remarks, store, n_jobs)
+    return open_study(store)
+
+
+def analyse_part(part: Part, remarks: list[str], store: Path | str, n_jobs: int | None) -> None:
+    """All steps over shapes of one structure; their study is in the folder `store`."""
+    sources, marked, subjects, options = part
+    options.check_against(list(sources))
     with lock(store) as claim:
         run = Run(claim, n_jobs)
         if subjects is not None:
             write(of_contents(subjects, sources), run.folder / "subjects.nc")
         else:
-            remarks += kept_table(run.folder / "subjects.nc", sources)
-        remarks += remarks_on_landmarks(sources, marked)
+            remarks = remarks + kept_table(run.folder / "subjects.nc", sources)
+        remarks = remarks + remarks_on_landmarks(sources, marked)
         with run.notes.whole(), run.unforeseen_told():
-            run_steps(run, sources, marked, settings, remarks)
+            run_steps(run, sources, marked, options, remarks)
+
+
+def analyse_parts(
+    parts: dict[str, Part],
+    options: Options,
+    remarks: list[str],
+    store: Path | str,
+    n_jobs: int | None,
+) -> xr.DataTree:
+    """The study of every structure in a folder of its own, and their tree."""
+    missing = check_parts(parts, options)
+    check_one_kind(store, several=True)
+    for line in missing:
+        log.warning("%s", line)
+    with lock(store) as claim:
+        for name, part in parts.items():
+            log.info("structure %s", name)
+            try:
+                folder = claim.folder / STRUCTURES / name
+                analyse_part(part, [*missing, *remarks], folder, n_jobs)
+            except ValueError as error:
+                raise ValueError(f"structure {name}: {error}") from error
+        write_contents(claim.folder, list(parts))
     return open_study(store)
 
 

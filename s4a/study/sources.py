@@ -14,7 +14,7 @@ from s4a.input.subjects import listed
 from s4a.schema import require
 from s4a.study.store import read, task_key
 
-# files; or meshes in memory by name, Datasets or (points, triangles); or what read_shapes gives
+# files; or by name files or meshes, Datasets or (points, triangles); or what read_shapes gives
 Collection = Path | str | list[Path | str] | dict[str, Any] | xr.DataTree
 Sources = dict[str, tuple[str | xr.Dataset, str]]  # name -> path or mesh, key of its content
 Marked = dict[str, tuple[str, str]]  # name -> file of landmarks, key of its content
@@ -61,13 +61,18 @@ def find_sources(
                 raise OSError(f"{shown(path)} has gone since the run began: start it again")
         return found
     check_names(shapes)
-    meshes = {
-        name: mesh if isinstance(mesh, xr.Dataset) else as_dataset(*mesh)
-        for name, mesh in sorted(shapes.items())
-    }
-    for name, mesh in meshes.items():
-        require(mesh, "position", "corner_vertex", what=f"shape {name}")
-    return {name: (mesh, content_key(mesh)) for name, mesh in meshes.items()}
+    return {name: _source_of(name, mesh) for name, mesh in sorted(shapes.items())}
+
+
+def _source_of(name, mesh):
+    """A mesh or file that was given by name, and the key of its content."""
+    if isinstance(mesh, str | Path):
+        if not Path(mesh).is_file():
+            raise ValueError(f"shape {name}: {shown(mesh)} is no file")
+        return str(mesh), content_of_file(mesh)
+    mesh = mesh if isinstance(mesh, xr.Dataset) else as_dataset(*mesh)
+    require(mesh, "position", "corner_vertex", what=f"shape {name}")
+    return mesh, content_key(mesh)
 
 
 def content_of_file(path: Path | str) -> str:
