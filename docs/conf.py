@@ -13,7 +13,8 @@ import nbformat
 from docutils import nodes
 from latex2mathml.converter import convert
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
+sys.path[:0] = [str(Path(__file__).parents[1] / "tools"), str(Path(__file__).parent)]
+import examples
 import paper
 import s4a
 from s4a import cli
@@ -139,6 +140,16 @@ def bars(app, what, name, obj, options, lines):
             )
 
 
+def pictures(app, what, name, obj, options, lines):
+    """Below examples that end in a figure stands the figure."""
+    if nb_execution_mode == "off" or what in ("module", "class"):
+        return
+    path = examples.draw(name, "\n".join(lines), HERE / "_examples")
+    if path is not None:
+        words = f"What the last example of {name} shows"
+        lines += ["", f".. image:: /_examples/{path.name}", f"   :alt: {words}", ""]
+
+
 def front_door(app, env, node, content):
     """A reference to a public name, as `s4a.analyse`, goes where its module is documented."""
     name = node.get("reftarget", "").removeprefix("s4a.")
@@ -177,5 +188,6 @@ def setup(app):
     list_commands()
     list_performance()
     app.add_html_math_renderer("mathml", (formula, None), (formula, None))
+    app.connect("autodoc-process-docstring", pictures, priority=100)  # before napoleon's words
     app.connect("autodoc-process-docstring", bars)
     app.connect("missing-reference", front_door)

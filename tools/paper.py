@@ -46,6 +46,7 @@ SPEED = (
     ("speed.py", "whole", "51", "100000"),
     ("widgets.py",),
 )
+FLAGS = ("--speed", "--list")
 PERFORMANCE = ROOT / "docs" / "performance"
 PACKAGES = ("numpy", "scipy", "xarray", "libigl", "robust_laplacian", "scikit-learn", "pymeshlab")
 CODE = re.compile(r"`([^`]+)`")
@@ -131,6 +132,10 @@ def run(command, out=OUT):
 
 
 def main(words):
+    unknown = [word for word in words if word.startswith("-") and word not in FLAGS]
+    if unknown:
+        sys.stderr.write(f"{__doc__}\n{unknown[0]}: unknown; known are {', '.join(FLAGS)}\n")
+        return 2
     known, out = (SPEED, PERFORMANCE) if "--speed" in words else (commands(), OUT)
     chosen = [c for c in known if all(word in " ".join(c) for word in words if word[0] != "-")]
     codes = []

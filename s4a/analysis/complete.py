@@ -317,39 +317,27 @@ def completed(
     inner = np.einsum("qnx,nx,n->q", known.columns[:, present], y, model.area[present])
     found = posterior.condition(known, weights, inner, calibration.density)
     columns = np.einsum("qp,qnx->pnx", weights, known.columns, optimize=True)
-    told = mean + np.tensordot(found.mean, columns, 1)  # (n_low, 3)
-    kappa2 = float(target.low.eigenvalue[-1])
-    left = posterior.extend(low - told, present, target.W, model.area, kappa2)
-    X = target.full.X
-    c = len(model.modes)
-    exact = model.mean_full + np.tensordot(found.mean[:c], model.modes_full, 1)
-    rest = told - mean - np.tensordot(found.mean[:c], columns[:c], 1) + left
-    placed = X + exact + target.U @ rest  # the modes have detail that U has not
+    placed = _most_likely(model, present, low, mean, found, columns)  # (n_full, 3)
 
     inflate = np.where(present, 1.0, calibration.factor)  # (n_low,)
     spread = np.einsum("pr,pnx->rnx", found.root, columns, optimize=True) * inflate[:, None]
     noise, usual = match_again(model, present)
     white = noise + np.where(present, 0.0, calibration.factor**2 * known.rest)
-    covariance = np.einsum("rnx,rny->nxy", spread, spread, optimize=True)
-    covariance[:, range(3), range(3)] += white[:, None]
+    full = target.U @ _covariance(spread, white).reshape(-1, 9)
+
     pose, size = fit.pose, 1 / fit.pose.s
-    full = (target.U @ covariance.reshape(-1, 9)).reshape(-1, 3, 3)
     there = seen(
         placed, vertex_normals(placed, target.full.T), part, pose(part.X), max(0.02, fit.residual)
     )
     position = size * (placed - pose.t) @ pose.R
     normals = vertex_normals(position, target.full.T)
-    in_file = size**2 * np.einsum("xi,nxy,yj->nij", pose.R, full, pose.R)
-    drawn = []
-    rough = posterior.rough_fields(target.W, model.area, kappa2)
-    for _ in range(n_samples):
-        moved = np.tensordot(rng.standard_normal(len(spread)), spread, 1)
-        moved += np.sqrt(white)[:, None] * rough(rng)
-        drawn.append(position + size * (target.U @ moved) @ pose.R)
+    in_file = size**2 * np.einsum("xi,nxy,yj->nij", pose.R, full.reshape(-1, 3, 3), pose.R)
+    low_samples = _low_samples(model, spread, white, n_samples, rng)
+    drawn = [position + size * (target.U @ moved) @ pose.R for moved in low_samples]
     area = vertex_areas(*as_arrays(target.original))
     X = target.original["position"].values
     d, R, t, s = displacement_in_template(X, position, area, scale=model.scale)
-    covariance = found.root[:c] @ found.root[:c].T
+    c = len(model.modes)
     return dataset(
         {
             "missing": float(1 - area @ there / area.sum()),
@@ -369,12 +357,39 @@ def completed(
         ),
         sample_position=np.reshape(drawn, (n_samples, len(X), 3)).astype(np.float32),
         score=found.mean[:c],
-        score_covariance=covariance,
+        score_covariance=found.root[:c] @ found.root[:c].T,
         displacement=d.astype(np.float32),
         rotation=R,
         translation=t,
         scale=np.array(s),
     )
+
+
+def _most_likely(model, present, low, mean, found, columns):
+    """The mean of the posterior ``(n_full, 3)``: through the matches where there are any."""
+    target, c = model.template, len(model.modes)
+    told = mean + np.tensordot(found.mean, columns, 1)  # (n_low, 3)
+    kappa2 = float(target.low.eigenvalue[-1])
+    left = posterior.extend(low - told, present, target.W, model.area, kappa2)
+    exact = model.mean_full + np.tensordot(found.mean[:c], model.modes_full, 1)
+    rest = told - mean - np.tensordot(found.mean[:c], columns[:c], 1) + left
+    return target.full.X + exact + target.U @ rest  # the modes have detail that U has not
+
+
+def _covariance(spread, white):
+    """Of each vertex ``(n_low, 3, 3)``: of the fields and of what every vertex has alone."""
+    covariance = np.einsum("rnx,rny->nxy", spread, spread, optimize=True)
+    covariance[:, range(3), range(3)] += white[:, None]
+    return covariance
+
+
+def _low_samples(model, spread, white, n, rng):
+    """Draws from the posterior about its mean, each ``(n_low, 3)``."""
+    target = model.template
+    rough = posterior.rough_fields(target.W, model.area, float(target.low.eigenvalue[-1]))
+    for _ in range(n):
+        moved = np.tensordot(rng.standard_normal(len(spread)), spread, 1)
+        yield moved + np.sqrt(white)[:, None] * rough(rng)
 
 
 def match_again(model: Model, present: np.ndarray) -> tuple[float, float]:

@@ -15,8 +15,8 @@ import xarray as xr
 
 from s4a.analysis.inputs import all_registered
 from s4a.analysis.transfer import on_template
-from s4a.input.files import slug
-from s4a.input.scalars import files_of_scalars, read_scalars
+from s4a.input.files import files_named, slug
+from s4a.input.scalars import SUFFIXES, read_scalars
 from s4a.input.subjects import listed
 from s4a.schema import FIELD_UNIT, dataset, in_unit
 from s4a.study.store import lock, task_key, write
@@ -109,7 +109,7 @@ def with_field(
 def _by_shape(values, shapes, name, study):
     """The field of each shape that has one, by name."""
     if isinstance(values, str | Path):
-        files = files_of_scalars(values, shapes, name)
+        files = files_named(values, shapes, f"the field {name!r}", SUFFIXES, name)
         return {one: read_scalars(file, name) for one, file in files.items()}
     if isinstance(values, dict):
         unknown = sorted(set(map(str, values)) - set(shapes))

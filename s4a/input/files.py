@@ -381,6 +381,62 @@ def check_names(names: Iterable[Any]) -> None:
         )
 
 
+def files_named(
+    folder: Path | str, names: Iterable[str], what: str, suffixes: Iterable[str], field: str = ""
+) -> dict[str, Path]:
+    """The file of every shape that has one: in the folder, named as the shape is.
+
+    Parameters
+    ----------
+    folder : path
+    names : iterable of str
+        Of shapes.
+    what : str
+        What the files hold, for messages.
+    suffixes : iterable of str
+        Endings that such files have, lower case; one of ``.gz`` may follow.
+    field : str, optional
+        Of the field, which may stand behind the shape: ``a.npy``, ``a.thickness.npy`` or, of
+        FreeSurfer, ``a.thickness``.
+
+    Returns
+    -------
+    dict of str to Path
+
+    Raises
+    ------
+    ValueError
+        When there is no folder, no file in it is of a shape, or two are of one.
+    """
+    names, suffixes, folder = list(names), list(suffixes), Path(folder)
+    if not folder.is_dir():
+        raise ValueError(
+            f"{what}: a folder of files named as the shapes needed; found {shown(folder)}"
+        )
+    behind = f".{field}" if field else ""
+    found: dict[str, Path] = {}
+    for file in sorted(folder.iterdir()):
+        plain = file.name[:-3] if file.name.lower().endswith(".gz") else file.name
+        suffix = next((end for end in suffixes if plain.lower().endswith(end)), "")
+        plain = plain[: len(plain) - len(suffix)]
+        if not suffix and not (behind and plain.endswith(behind)):
+            continue
+        name = slug(plain.removesuffix(behind))
+        if name in found and name in names:
+            raise ValueError(
+                f"{what}: one file for {name} needed: {shown(found[name])} and {shown(file)}"
+            )
+        found[name] = file
+    found = {name: found[name] for name in names if name in found}
+    if not found:
+        endings = ", ".join([*suffixes[:4], *filter(None, [behind])])
+        raise ValueError(
+            f"{what}: no file in {shown(folder)} is named as a shape, such as {names[0]} with one "
+            f"of {endings}"
+        )
+    return found
+
+
 def slugs(files: Iterable[str | os.PathLike[str]]) -> list[str]:
     """A unique :func:`slug` for each path, also where upper and lower case are one."""
     files = [Path(os.path.abspath(file)) for file in files]

@@ -1,7 +1,6 @@
 """Landmarks and curves on a surface: where a mesh has what a file of points says (6.2, Fig. 7)."""
 
 from collections import Counter
-from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,6 @@ import xarray as xr
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays, edge_graph, edges, triangle_areas
 from s4a.input.annotations import MIRROR, read_landmarks
-from s4a.input.files import slug
 from s4a.input.raw import shown
 from s4a.schema import dataset, require
 
@@ -239,44 +237,3 @@ def guides_of(mesh: xr.Dataset) -> xr.Dataset:
     return dataset(
         landmark_name=mesh["guide_name"].values, landmark_position=mesh["guide_position"].values
     )
-
-
-def files_of_landmarks(folder: Path | str, names: Iterable[str]) -> dict[str, Path]:
-    """The file of landmarks of every shape that has one: in the folder, named as the shape is.
-
-    Parameters
-    ----------
-    folder : path
-    names : iterable of str
-        Of shapes.
-
-    Returns
-    -------
-    dict of str to Path
-
-    Raises
-    ------
-    ValueError
-        When there is no folder, no file in it is of a shape, or two are of one.
-    """
-    names = list(names)
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise ValueError(f"landmarks need a folder of files named as the shapes; found {folder}")
-    found: dict[str, Path] = {}
-    for file in sorted(folder.iterdir()):
-        plain = file.name.lower().removesuffix(".gz")
-        suffix = next((end for end in SUFFIXES if plain.endswith(end)), None)
-        if suffix is None:
-            continue
-        name = slug(file.name[: len(plain) - len(suffix)])
-        if name in found and name in names:
-            raise ValueError(f"one file of landmarks for {name} needed: {found[name]} and {file}")
-        found[name] = file
-    found = {name: found[name] for name in names if name in found}
-    if not found:
-        raise ValueError(
-            f"no file of landmarks in {shown(folder)} is named as a shape, such as "
-            f"{names[0]}.mrk.json, .csv or .pp"
-        )
-    return found

@@ -1,7 +1,6 @@
 """Files of scalar fields (6.1, 6.2): a number per vertex, in the order of the file of the mesh."""
 
 import zipfile
-from collections.abc import Iterable
 from io import BytesIO
 from pathlib import Path
 
@@ -9,7 +8,6 @@ import numpy as np
 
 from s4a.input import bounded
 from s4a.input.annotations import check_cells, is_number, number_of, table_rows
-from s4a.input.files import slug
 from s4a.input.formats import gifti_arrays, ply_properties
 from s4a.input.raw import check_there, shown, text_of
 
@@ -134,50 +132,3 @@ def _column(text, name):
         raise ValueError(f"a column {name!r} expected, found {', '.join(first)[:80]}")
     check_cells(rows, len(first), 1 + at)
     return np.array([number_of(row[at], line) for line, row in rows.items()])
-
-
-def files_of_scalars(folder: Path | str, names: Iterable[str], field: str) -> dict[str, Path]:
-    """The file of every shape that has one: in the folder, named as the shape is.
-
-    Parameters
-    ----------
-    folder : path
-    names : iterable of str
-        Of shapes.
-    field : str
-        Of the field, which may stand behind the shape: ``a.npy``, ``a.thickness.npy`` or, of
-        FreeSurfer, ``a.thickness``.
-
-    Returns
-    -------
-    dict of str to Path
-
-    Raises
-    ------
-    ValueError
-        When there is no folder, no file in it is of a shape, or two are of one.
-    """
-    names = list(names)
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise ValueError(f"a folder of files named as the shapes needed; found {shown(folder)}")
-    found: dict[str, Path] = {}
-    for file in sorted(folder.iterdir()):
-        plain = file.name[:-3] if file.name.lower().endswith(".gz") else file.name
-        suffix = next((end for end in SUFFIXES if plain.lower().endswith(end)), "")
-        plain = plain[: len(plain) - len(suffix)]
-        if not suffix and not plain.endswith(f".{field}"):
-            continue
-        name = slug(plain.removesuffix(f".{field}"))
-        if name in found and name in names:
-            raise ValueError(
-                f"one file of {field} for {name} needed: {shown(found[name])} and {shown(file)}"
-            )
-        found[name] = file
-    found = {name: found[name] for name in names if name in found}
-    if not found:
-        raise ValueError(
-            f"no file in {shown(folder)} is named as a shape, such as {names[0]}.npy, "
-            f".ply, .csv or {names[0]}.{field}"
-        )
-    return found

@@ -14,7 +14,8 @@ from threadpoolctl import threadpool_limits
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.input import evidence
 from s4a.input.collection import read_shapes, shape_report
-from s4a.input.landmarks import files_of_landmarks, with_landmarks
+from s4a.input.files import files_named
+from s4a.input.landmarks import SUFFIXES, with_landmarks
 from s4a.input.plausibility import find_warnings
 from s4a.method.first_map import motion_onto
 from s4a.method.lift import low_resolution
@@ -162,7 +163,7 @@ def read_new(
 ) -> tuple[dict[str, xr.Dataset], dict[str, dict[str, Any]]]:
     """The new meshes that can be used, with landmarks, and the attributes of all for the report."""
     meshes, attrs = read_and_clean(shapes, options)
-    files = {} if landmarks is None else files_of_landmarks(landmarks, meshes)
+    files = {} if landmarks is None else files_named(landmarks, meshes, "landmarks", SUFFIXES)
     for name, file in files.items():
         try:
             meshes[name] = with_landmarks(meshes[name], file)

@@ -7,8 +7,8 @@ from typing import Any
 import xarray as xr
 
 from s4a.geometry.mesh import as_dataset
-from s4a.input.files import check_names, find_meshes
-from s4a.input.landmarks import files_of_landmarks
+from s4a.input.files import check_names, files_named, find_meshes
+from s4a.input.landmarks import SUFFIXES
 from s4a.input.raw import read_bytes, shown
 from s4a.input.subjects import listed
 from s4a.schema import require
@@ -92,7 +92,7 @@ def content_key(mesh: xr.Dataset) -> str:
 
 def landmarks_of(sources: Sources, folder: Path | str | None) -> Marked:
     """The files of landmarks that a folder has for the shapes; none without a folder."""
-    files = {} if folder is None else files_of_landmarks(folder, sources)
+    files = {} if folder is None else files_named(folder, sources, "landmarks", SUFFIXES)
     return {name: (str(file), content_of_file(file)) for name, file in files.items()}
 
 

@@ -24,8 +24,9 @@ from s4a import (
 from s4a.geometry.closest import interpolate
 from s4a.geometry.mesh import as_arrays
 from s4a.input.annotations import write_landmarks
+from s4a.input.files import files_named
 from s4a.input.hands import mirror_image
-from s4a.input.landmarks import files_of_landmarks
+from s4a.input.landmarks import SUFFIXES
 from s4a.method.first_map import motion_onto
 from s4a.method.lift import low_resolution
 from s4a.method.shape import Shape
@@ -142,19 +143,21 @@ def test_landmarks_given_again_replace_those_before(brains):
 def test_a_folder_of_landmarks_is_read_by_the_names_of_shapes(tmp_path):
     for name in ("head.mrk.json", "arm.landmarks.csv", "Knie 3.csv", "table.txt", "other.pp"):
         (tmp_path / name).write_text("")
-    found = files_of_landmarks(tmp_path, ["head", "arm", "Knie_3", "leg"])
+    found = files_named(tmp_path, ["head", "arm", "Knie_3", "leg"], "landmarks", SUFFIXES)
     assert {name: file.name for name, file in found.items()} == {
         "head": "head.mrk.json",
         "arm": "arm.landmarks.csv",
         "Knie_3": "Knie 3.csv",
     }
     (tmp_path / "head.csv").write_text("")
-    with pytest.raises(ValueError, match=r"one file of landmarks for head needed: .*head\.csv"):
-        files_of_landmarks(tmp_path, ["head"])
-    with pytest.raises(ValueError, match=r"named as a shape, such as foot\.mrk\.json"):
-        files_of_landmarks(tmp_path, ["foot"])
-    with pytest.raises(ValueError, match="landmarks need a folder"):
-        files_of_landmarks(tmp_path / "none", ["head"])
+    with pytest.raises(ValueError, match=r"landmarks: one file for head needed: .*head\.csv"):
+        files_named(tmp_path, ["head"], "landmarks", SUFFIXES)
+    with pytest.raises(
+        ValueError, match=r"named as a shape, such as foot with one of .*\.mrk\.json"
+    ):
+        files_named(tmp_path, ["foot"], "landmarks", SUFFIXES)
+    with pytest.raises(ValueError, match="landmarks: a folder of files"):
+        files_named(tmp_path / "none", ["head"], "landmarks", SUFFIXES)
 
 
 @pytest.fixture(scope="module")
