@@ -13,8 +13,10 @@ import nbformat
 from docutils import nodes
 from latex2mathml.converter import convert
 
-sys.path[:0] = [str(Path(__file__).parents[1] / "tools"), str(Path(__file__).parent)]
+sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
 import examples
+
 import paper
 import s4a
 from s4a import cli

@@ -277,12 +277,28 @@ def transfer_labels(
     --------
     With the ``study`` of six small brains, where the labels of every brain are known:
 
+    >>> import numpy as np
     >>> import s4a
     >>> study = s4a.synthetic.example_study()
     >>> label, true = (study[f"original/{name}/label"].values for name in ("brain_01", "brain_02"))
     >>> carried = s4a.transfer_labels(study, label, source="brain_01", targets=["brain_02"])
     >>> bool((carried["brain_02/label"].values == true).mean() > 0.5)
     True
+
+    Labels of one brain on another, in colours:
+
+    >>> brains = s4a.synthetic.brains(2, 3000)["original"]
+    >>> source, target = (mesh.to_dataset() for mesh in brains.children.values())
+    >>> pairs = s4a.register_pairs(source, {"b": target}, n_coarse=600, k=40)
+    >>> label = source["label"].values
+    >>> found = s4a.transfer_labels(pairs, label)["b/label"].values
+    >>> colors = s4a.show.draw.label_colors(np.arange(label.max() + 1))
+    >>> s4a.show.charts.surfaces(
+    ...     {"template": source, "carried": target},
+    ...     {"template": colors[label], "carried": colors[found]},
+    ...     flat=True,
+    ... )
+    <Parts ...>
     """
     mesh, each = plan(study, source, targets, options)
     label = _per_vertex(label, mesh, "label")

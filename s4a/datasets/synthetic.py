@@ -510,6 +510,12 @@ def brains(
     >>> exact = s4a.synthetic.position(truth, "brain_02", truth["brain_02/reference_point"])
     >>> np.abs(exact - mesh["position"]).max().item() < 1e-9
     True
+
+    Four of them:
+
+    >>> shapes = s4a.synthetic.brains(4, 3000)["original"].children
+    >>> s4a.show.charts.surfaces({name: mesh.to_dataset() for name, mesh in shapes.items()})
+    <Parts ...>
     """
     seed = seed_of(seed, rng)
     truth = plant(n, seed, n_modes=n_modes)

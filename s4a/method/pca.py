@@ -270,6 +270,14 @@ def synthesize(study: xr.DataTree, scores: np.ndarray) -> xr.Dataset:
     >>> moved = (larger["position"] - mean["position"]) / 2
     >>> bool(abs(moved - study["pca"]["deformation"][0].values).max() < 1e-4)
     True
+
+    The first mode of five larger ones:
+
+    >>> brains = s4a.synthetic.brains(5, 3000)
+    >>> larger = s4a.analyse(brains, n_coarse=500, k=40, intersections=False)
+    >>> along = {f"{x:+} sd": s4a.synthesize(larger, [float(x)]) for x in (-2, 0, 2)}
+    >>> s4a.show.charts.surfaces(along, view="left")
+    <Parts ...>
     """
     scores = np.atleast_1d(np.asarray(scores, float))
     if "pca" not in study.children:

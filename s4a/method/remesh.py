@@ -341,6 +341,13 @@ def coarsen(
     1
     >>> bool(np.allclose(coarse["coarse_weight"].sum("corner"), 1))
     True
+
+    A brain of 4,000 vertices and of 500, in pictures:
+
+    >>> brain = s4a.synthetic.brains(1, 4000)["original/brain_01"].to_dataset()
+    >>> few = s4a.coarsen(brain, n_coarse=500)
+    >>> s4a.show.charts.surfaces({"4,000 vertices": brain, "500 vertices": few})
+    <Parts ...>
     """
     seed = seed_of(seed, rng)
     require(mesh, "position", "corner_vertex", what="mesh")

@@ -122,6 +122,10 @@ def spectrum(mesh: xr.Dataset, *, k: int = 100) -> xr.Dataset:
     >>> found = s4a.spectrum(s4a.coarsen(s4a.synthetic.sphere(2000), n_coarse=1000), k=9)
     >>> (found["eigenvalue"].values / (4 * np.pi)).round().tolist()
     [0.0, 2.0, 2.0, 2.0, 6.0, 6.0, 6.0, 6.0, 6.0]
+    >>> Phi = found["eigenfunction"].values
+    >>> waves = {f"mode {i}": Phi[:, i] for i in (1, 4, 8)}
+    >>> s4a.show.charts.surfaces(dict.fromkeys(waves, found), waves, label="eigenfunction")
+    <Parts ...>
     """
     require(mesh, "vertex_area", "edge_vertex", "cotan_weight", what="mesh")
     if int(k) != k or k < 1:
@@ -194,6 +198,15 @@ def reconstruct(mesh: xr.Dataset, f: np.ndarray, *, k: int | None = None) -> np.
     >>> ball = s4a.spectrum(s4a.coarsen(s4a.synthetic.sphere(2000), n_coarse=1000), k=4)
     >>> bool(abs(s4a.reconstruct(ball, ball["position"]) - ball["position"].values).max() < 0.01)
     True
+
+    A brain from 10 functions and from 100:
+
+    >>> brain = s4a.synthetic.brains(1, 4000)["original/brain_01"].to_dataset()
+    >>> few = s4a.spectrum(s4a.coarsen(brain, n_coarse=1500), k=100)
+    >>> built = {f"k = {k}": s4a.reconstruct(few, few["position"], k=k) for k in (10, 100)}
+    >>> pictures = {k: few.assign(position=(few["position"].dims, X)) for k, X in built.items()}
+    >>> s4a.show.charts.surfaces(pictures)
+    <Parts ...>
     """
     require(mesh, "eigenfunction", "vertex_area", what="mesh")
     Phi = mesh["eigenfunction"].values[:, :k]

@@ -252,6 +252,13 @@ def refine_network(
     >>> tree = s4a.refine_network(coarse, s4a.build_network(coarse, k_init=6), k=10)
     >>> tree["latent/latent_basis"].shape, tree["latent"].attrs["median"] in coarse
     ((3, 10, 10), True)
+    >>> network, names = tree["network"].to_dataset(), list(coarse)
+    >>> source, target = ([names.index(n) for n in network[end].values]
+    ...                   for end in ("source", "target"))
+    >>> errors = {"first": network["cycle_error_initial"], "after": network["cycle_error"]}
+    >>> errors = {title: found.values for title, found in errors.items()}
+    >>> s4a.show.charts.network(s4a.show.charts.on_circle(3), names, source, target, errors)
+    <Figure ...>
     """
     require(first, "source", "target", "fmap_initial", what="network")
     for name, mesh in coarse.items():
@@ -406,6 +413,9 @@ def latent_map(study: xr.DataTree, source: str, target: str) -> xr.Dataset:
     >>> C = s4a.latent_map(study, "brain_01", "brain_01")["fmap"].values
     >>> np.allclose(C, np.eye(len(C)))
     True
+    >>> there = s4a.latent_map(study, "brain_01", "brain_02")["fmap"].values
+    >>> s4a.show.charts.matrices({"C of a shape to itself": C, "brain 1 to 2": there})
+    <Figure ...>
     """
     Y_source, Y_target = latent_bases(study, source, target)
     return dataset(fmap=Y_target @ np.linalg.pinv(Y_source))

@@ -98,10 +98,10 @@ def surfaces(
     --------
     >>> import s4a
     >>> from s4a.show.charts import surfaces
-    >>> mesh = s4a.synthetic.sphere(100)
+    >>> mesh = s4a.synthetic.sphere(2000)
     >>> height = mesh["position"].values[:, 2]
-    >>> [ax.get_title() for ax in surfaces({"height": mesh}, {"height": height}).axes]
-    ['height', '']
+    >>> surfaces({"height": mesh}, {"height": height}, label="height")
+    <Parts ...>
     """
     values = {title: np.asarray(array) for title, array in (values or {}).items()}
     signed = [array for array in values.values() if array.ndim == 1]
@@ -233,6 +233,15 @@ def network(
     Returns
     -------
     matplotlib.figure.Figure
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.show.charts import network, on_circle
+    >>> source, target = np.array([0, 1, 2, 3]), np.array([1, 2, 3, 0])
+    >>> errors = {"before": np.array([0.1, 0.8, 0.3, 0.2]), "after": np.full(4, 0.05)}
+    >>> network(on_circle(4), ["a", "b", "c", "d"], source, target, errors, highlight=1)
+    <Figure ...>
     """
     figure, (axes,) = _figure(4.6 * len(errors) + 0.6, 4.2, len(errors))
     finite = np.concatenate([value[np.isfinite(value)] for value in errors.values()])
@@ -259,7 +268,16 @@ def network(
 
 
 def matrices(named: dict[str, np.ndarray], limit: float = 1.0) -> Figure:
-    """Matrices side by side with signed colours, blue positive; `named` maps titles to arrays."""
+    """Matrices side by side with signed colours, blue positive; `named` maps titles to arrays.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.show.charts import matrices
+    >>> turn = np.linalg.qr(np.random.default_rng(0).normal(size=(20, 20)))[0]
+    >>> matrices({"identity": np.eye(20), "a rotation": turn})
+    <Figure ...>
+    """
     figure, (axes,) = _figure(3.4 * len(named) + 0.7, 3.3, len(named))
     for ax, (title, values) in zip(axes, named.items(), strict=True):
         image = ax.imshow(values, cmap=SIGNED, vmin=-limit, vmax=limit, interpolation="nearest")
@@ -273,7 +291,15 @@ def matrices(named: dict[str, np.ndarray], limit: float = 1.0) -> Figure:
 def ranked(
     names: list[str], values: np.ndarray, label: str, highlight: int | None = None
 ) -> Figure:
-    """Bars in rising order; `highlight` is the index of a shape to mark."""
+    """Bars in rising order; `highlight` is the index of a shape to mark.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.show.charts import ranked
+    >>> ranked(["a", "b", "c"], np.array([0.3, 0.1, 0.2]), "distance (eq. 5)", highlight=1)
+    <Figure ...>
+    """
     order = np.argsort(values)
     figure, ((ax,),) = _figure(7.5, max(1.4, 0.5 + 0.17 * len(values)))
     place = np.arange(len(order))
@@ -293,6 +319,12 @@ def stacked(names: list[str], parts: list[str], seconds: np.ndarray) -> Figure:
     ----------
     names, parts : sequence of str
     seconds : float ndarray (name, part)
+
+    Examples
+    --------
+    >>> from s4a.show.charts import stacked
+    >>> stacked(["one way", "another"], ["maps", "matches"], [[3.0, 1.0], [1.0, 2.0]])
+    <Figure ...>
     """
     figure, ((ax,),) = _figure(8, 0.45 * len(names) + 1.4)
     places, left = np.arange(len(names)), np.zeros(len(names))
@@ -311,7 +343,14 @@ def stacked(names: list[str], parts: list[str], seconds: np.ndarray) -> Figure:
 
 
 def variance(high: np.ndarray | list[Any], low: np.ndarray | list[Any] | None = None) -> Figure:
-    """Cumulative share of variance over the number of components, at both resolutions (Fig. 5)."""
+    """Cumulative share of variance over the number of components, at both resolutions (Fig. 5).
+
+    Examples
+    --------
+    >>> from s4a.show.charts import variance
+    >>> variance([0.5, 0.3, 0.1, 0.1], [0.52, 0.3, 0.1, 0.08])
+    <Figure ...>
+    """
     figure, ((ax,),) = _figure(5.2, 3.2)
     curves = (  # rings around dots: both are seen where they agree
         (low, "low resolution", ORANGE, {"ms": 8, "mfc": "none"}),
@@ -339,6 +378,14 @@ def scores(
     """Scores of the shapes on the first components, two by two, in standard deviations.
 
     Those that are `faint` are grey.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.show.charts import scores
+    >>> score = np.random.default_rng(0).normal(size=(8, 3))
+    >>> scores(score, list("abcdefgh"), highlight=2, faint=[False] * 7 + [True])
+    <Figure ...>
     """
     planes = [(a, b) for a, b in ((0, 1), (0, 2)) if b < score.shape[1]] or [(0, 0)]
     figure, (axes,) = _figure(4.2 * len(planes), 3.8, len(planes))
@@ -355,7 +402,14 @@ def scores(
 
 
 def color_bar(colormap: str | Colormap, low: float, high: float, label: str) -> Figure:
-    """A horizontal colour bar."""
+    """A horizontal colour bar.
+
+    Examples
+    --------
+    >>> from s4a.show.charts import color_bar
+    >>> color_bar("viridis", 0, 3, "distance (mm)")
+    <Figure ...>
+    """
     figure, ((ax,),) = _figure(4.2, 0.62)
     scale = ScalarMappable(Normalize(low, high), colormap)
     figure.colorbar(scale, cax=ax, orientation="horizontal", label=label)

@@ -341,6 +341,11 @@ def label_colors(labels: np.ndarray) -> np.ndarray:
     >>> from s4a.show.draw import label_colors
     >>> len(np.unique(label_colors(np.arange(24)), axis=0))
     24
+    >>> import s4a
+    >>> brain = s4a.synthetic.brains(1, 3000)["original/brain_01"].to_dataset()
+    >>> colors = {"regions": label_colors(brain["label"].values)}
+    >>> s4a.show.charts.surfaces({"regions": brain}, colors, flat=True)
+    <Parts ...>
     """
     palette = np.array([to_rgb(color) for color in OKABE_ITO])
     palette = np.concatenate([palette, 0.55 * palette, 0.45 + 0.55 * palette])
@@ -352,6 +357,15 @@ def position_colors(points: np.ndarray, among: np.ndarray | None = None) -> np.n
     """Colours ``(n, 3)`` that tell places apart: the coordinates as red, green and blue.
 
     Of places near a surface the colours are those of its points ``among``; NaN stays NaN.
+
+    Examples
+    --------
+    >>> import s4a
+    >>> from s4a.show.draw import position_colors
+    >>> ball = s4a.synthetic.sphere(2000)
+    >>> colors = {"places": position_colors(ball["position"].values)}
+    >>> s4a.show.charts.surfaces({"places": ball}, colors)
+    <Parts ...>
     """
     points = np.asarray(points, float)
     box = points if among is None else np.asarray(among, float)
@@ -370,6 +384,11 @@ def checkerboard(coordinates: np.ndarray, cell: float) -> np.ndarray:
     >>> from s4a.show.draw import checkerboard
     >>> checkerboard(np.array([[0.1, 0.1, 0.1], [1.1, 0.1, 0.1], [1.1, 1.9, 0.1]]), 1.0)
     array([1. , 0.5, 1. ])
+    >>> import s4a
+    >>> ball = s4a.synthetic.sphere(30_000)
+    >>> grey = checkerboard(ball["position"].values, 0.4)[:, None] * np.ones(3)
+    >>> s4a.show.charts.surfaces({"cubes of 0.4": ball}, {"cubes of 0.4": grey})
+    <Parts ...>
     """
     return 1 - 0.5 * (np.floor(np.asarray(coordinates) / cell).sum(1) % 2)
 

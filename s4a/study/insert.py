@@ -97,6 +97,7 @@ def insert(
 
     Examples
     --------
+    >>> import numpy as np
     >>> import s4a
     >>> brains = s4a.synthetic.brains(4, 1500)["original"]
     >>> brains = {name: mesh.to_dataset() for name, mesh in brains.children.items()}
@@ -104,6 +105,11 @@ def insert(
     >>> study = s4a.analyse(brains, n_coarse=300, k_init=8, k=12)
     >>> s4a.insert(study, {"brain_04": last})["pca"]["score"].sizes["component"]
     2
+    >>> both = [study["pca"], s4a.insert(study, {"brain_04": last})["pca"]]
+    >>> names = [str(name) for pca in both for name in pca["shape"].values]
+    >>> score = np.concatenate([pca["score"].values for pca in both])
+    >>> s4a.show.charts.scores(score, names, highlight=names.index("brain_04"))
+    <Figure ...>
     """
     needed = ("original", "coarse", "latent", "registration")
     missing = [name for name in needed if name not in study.children]

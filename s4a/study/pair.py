@@ -84,6 +84,17 @@ def match_pair(source: xr.Dataset, target: xr.Dataset, **options: Any) -> xr.Dat
     >>> found = s4a.match_pair(mesh, turned, n_coarse=100, k=10, k_init=6)
     >>> found["fmap"].shape, bool((abs(found["displacement"]) < 1e-6).all())
     ((10, 10), True)
+
+    The places of one brain in the colours of the places of another that they match:
+
+    >>> brains = s4a.synthetic.brains(2, 3000)["original"]
+    >>> source, target = (mesh.to_dataset() for mesh in brains.children.values())
+    >>> match = s4a.match_pair(source, target, n_coarse=600, k=40)["match"].values
+    >>> colors = s4a.show.draw.position_colors(source["position"].values)
+    >>> s4a.show.charts.surfaces(
+    ...     {"source": source, "target": target}, {"source": colors, "target": colors[match]}
+    ... )
+    <Parts ...>
     """
     settings = pair_options(options)
     for mesh, what in ((source, "source"), (target, "target")):

@@ -9,10 +9,12 @@ import inspect
 import re
 
 import pytest
+from matplotlib.figure import Figure
 from paths import DOCS, ROOT
 
 import s4a
 from s4a.schema import TABLE
+from s4a.show import charts
 
 PACKAGE = ROOT / "s4a"
 MODULES = sorted(
@@ -150,3 +152,21 @@ def test_it_builds_without_a_warning(site):
         r"(src|href)=\"https?://[^\"]+\.(js|css)\"",
         (pages / "glossary.html").read_text("utf-8"),
     )
+
+
+def test_the_examples_of_every_chart_end_in_its_picture(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(DOCS))
+    examples = importlib.import_module("examples")
+    made = {
+        name: function
+        for name, function in inspect.getmembers(charts, inspect.isfunction)
+        if function.__module__ == charts.__name__
+        and inspect.signature(function).return_annotation is Figure
+    }
+    assert len(made) >= 8
+    for name, function in made.items():
+        path = examples.draw(f"s4a.show.charts.{name}", function.__doc__, tmp_path)
+        assert path.read_bytes().startswith(b"<?xml"), name
+    assert examples.draw("no.picture", ">>> 1 + 1\n2\n", tmp_path) is None
+    with pytest.raises(TypeError, match="needs a figure"):
+        examples.draw("no.figure", ">>> 1 + 1\n<Figure ...>\n", tmp_path)
