@@ -22,7 +22,7 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
-from s4a.analysis.asymmetry import asymmetry, asymmetry_modes, symmetry
+from s4a.analysis.asymmetry import asymmetry, asymmetry_modes
 from s4a.analysis.covariation import covariation, covariation_modes
 from s4a.analysis.effects import (
     check_permutations,
@@ -35,6 +35,7 @@ from s4a.analysis.effects import (
 )
 from s4a.analysis.generalization import generalization
 from s4a.analysis.growth import growth
+from s4a.analysis.halves import symmetric_template, symmetry
 from s4a.analysis.inputs import Values, displacements_of, group_sizes, sample_of, with_doubtful
 from s4a.analysis.model import KEPT, count_components, evaluate, leave_one_out, sample
 from s4a.analysis.permutation import indicators, smallest_p
@@ -67,6 +68,7 @@ __all__ = [
     "sample",
     "structures",
     "structures_modes",
+    "symmetric_template",
     "symmetry",
     "with_doubtful",
     "with_size",

@@ -282,30 +282,6 @@ def restricted(study: "xr.DataTree", args: Namespace) -> "xr.DataTree":
     return study
 
 
-def asymmetry(args: Namespace) -> int:
-    """How left and right differ: shares of variance, directional asymmetry, antisymmetry.
-
-    Every shape against its mirror image, or both sides of every subject.
-    """
-    from s4a.analysis import statistics as tests
-    from s4a.analysis.export import write_results
-    from s4a.cli import tables
-    from s4a.show.page import write_page
-
-    study, out = study_to_test(args)
-    options = {} if args.permutations is None else {"n_permutations": args.permutations}
-    found = tests.asymmetry(
-        study, subject=args.subject, side=args.side, of=args.of, seed=args.seed, **options
-    )
-    write_results(found, out, "asymmetry")
-    write(tables.asymmetry_table(found))
-    write("\n" + tables.significance(found, found, "directional asymmetry", study))
-    page = Path(out) / "asymmetry.html"
-    write_page(tests.asymmetry_modes(study, found), page, title="Left against right")
-    write(f"\nresults: {out}; the modes of asymmetry: {page}")
-    return 0
-
-
 def tests_of(study: "xr.DataTree", args: Namespace) -> "dict[str, xr.Dataset]":
     """The tests of the group and the variable that are asked for."""
     from s4a.analysis import statistics as tests
@@ -343,7 +319,9 @@ def insert(args: Namespace) -> int:
     from s4a.study.tree import open_study
 
     study = open_study(args.study)
-    inserted = insert(study, args.shapes, landmarks=args.landmarks, n_jobs=args.n_jobs)
+    inserted = insert(
+        study, args.shapes, landmarks=args.landmarks, reflect=args.reflect, n_jobs=args.n_jobs
+    )
     out = new_folder(args.out)
     inserted.to_netcdf(out / "inserted.nc", engine=ENGINE)
     write_registered(inserted, out)

@@ -290,6 +290,8 @@ def _insert(add):
     text = "for inserted.nc, registered meshes and scores"
     add("--out", required=True, metavar="DIR", help=text)
     add("--landmarks", metavar="DIR", help=HELP["landmarks"])
+    text = "new shapes to mirror: names, with commas; or auto, those of the other hand"
+    add("--reflect", metavar="NAMES", help=text)
     add_options(add, ["n_jobs"])
 
 
@@ -373,7 +375,7 @@ FLAGS = {
     commands.demo: _demo,
     commands.view: _view,
     commands.statistics: _statistics,
-    commands.asymmetry: _asymmetry,
+    growing.asymmetry: _asymmetry,
     growing.fields: _fields,
     growing.growth: _growth,
     growing.structures: _structures,

@@ -1,4 +1,4 @@
-"""The commands of fields, of growth and of several structures, see :mod:`s4a.cli.commands`."""
+"""The commands of fields, growth, structures and asymmetry, see :mod:`s4a.cli.commands`."""
 
 from argparse import Namespace
 from pathlib import Path
@@ -86,4 +86,32 @@ def structures(args: Namespace) -> int:
             write(f"  groups of {args.group}: p = {test['p_value'].item():.3g}")
         write_page(of_level, out / f"{level}.html", title=f"Structures: {level}")
     write(f"\nresults: {out}")
+    return 0
+
+
+def asymmetry(args: Namespace) -> int:
+    """How left and right differ: shares of variance, directional asymmetry, antisymmetry.
+
+    Every shape against its mirror image, or both sides of every subject.
+    """
+    from s4a.analysis import statistics as tests
+    from s4a.analysis.export import write_results
+    from s4a.cli import tables
+    from s4a.geometry.mesh import as_arrays
+    from s4a.input.files import write_mesh
+    from s4a.show.page import write_page
+
+    study, out = study_to_test(args)
+    options = {} if args.permutations is None else {"n_permutations": args.permutations}
+    found = tests.asymmetry(
+        study, subject=args.subject, side=args.side, of=args.of, seed=args.seed, **options
+    )
+    write_results(found, out, "asymmetry")
+    write(tables.asymmetry_table(found))
+    write("\n" + tables.significance(found, found, "directional asymmetry", study))
+    if found.attrs["symmetry"] == "object":
+        write_mesh(Path(out) / "symmetric.ply", *as_arrays(tests.symmetric_template(study, found)))
+    page = Path(out) / "asymmetry.html"
+    write_page(tests.asymmetry_modes(study, found), page, title="Left against right")
+    write(f"\nresults: {out}; the modes of asymmetry: {page}")
     return 0

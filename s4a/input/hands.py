@@ -140,6 +140,34 @@ def of_other_hand(evidence: Mapping[str, xr.Dataset]) -> tuple[list[str], list[s
     return [n for n, one in zip(names, mean, strict=True) if one <= -OTHER_HAND], remarks
 
 
+def is_of_other_hand(
+    name: str, look: xr.Dataset, known: Mapping[str, xr.Dataset]
+) -> tuple[bool, str]:
+    """Whether one shape is of the rarer hand beside others, and what is told where it is not known.
+
+    Parameters
+    ----------
+    name : str
+    look : Dataset
+        Of :func:`s4a.input.evidence.compare`.
+    known : dict of str to Dataset
+        The same of the others.
+    """
+    *others, own = hands({**known, "": look})
+    common = float(np.median(np.abs(others)))
+    if common < COMMON_HAND:
+        return False, (
+            f"reflect='auto' left {name} as it is: the shapes of the study are too like their own "
+            f"mirror images to tell (mean hand {common:.2f}, {COMMON_HAND} needed)"
+        )
+    if abs(own) < OTHER_HAND:
+        return False, (
+            f"reflect='auto' cannot tell the hand of {name}, which stayed as it is: look at it, "
+            "and name it if it is to be mirrored"
+        )
+    return bool(own <= -OTHER_HAND), ""
+
+
 def to_reflect(reflect: str, names: Sequence[str], table: xr.Dataset | None) -> list[str]:
     """The shapes that ``reflect=`` names, but for ``"auto"``.
 

@@ -3,6 +3,7 @@
 All others stay as they are.
 """
 
+import logging
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,18 +16,22 @@ from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.input import evidence
 from s4a.input.collection import read_shapes, shape_report
 from s4a.input.files import files_named
+from s4a.input.hands import AUTO, is_of_other_hand, mirror_image
 from s4a.input.landmarks import SUFFIXES, with_landmarks
 from s4a.input.plausibility import find_warnings
+from s4a.input.subjects import listed
 from s4a.method.first_map import motion_onto
 from s4a.method.lift import low_resolution
 from s4a.method.pca import project_scores
 from s4a.method.place import latent_of_new, nearest_spectra, place
 from s4a.method.register import from_latent
 from s4a.method.shape import Shape
-from s4a.schema import dataset, in_unit, require, unit_of
+from s4a.schema import dataset, in_unit, require, unit_of, variable
 from s4a.study.options import Options
 from s4a.study.processes import workers
 from s4a.study.tree import left_out, stack_registration, template_mesh
+
+log = logging.getLogger(__name__)
 
 
 class Frozen(NamedTuple):
@@ -56,6 +61,7 @@ def insert(
     shapes: Path | str | list[Any] | dict[str, Any] | xr.Dataset,
     *,
     landmarks: Path | str | None = None,
+    reflect: str | list[str] | None = None,
     compare: bool = True,
     n_jobs: int | None = None,
 ) -> xr.DataTree:
@@ -74,6 +80,10 @@ def insert(
         See :func:`s4a.read_shapes`; a single mesh Dataset is named ``new``.
     landmarks : path, optional
         Folder with a file of landmarks for some or all of them, see :func:`s4a.analyse`.
+    reflect : str or list of str, optional
+        New shapes to mirror, as ``reflect=`` of :func:`s4a.analyse` did it: their names, with
+        commas between them, or ``"auto"``, those of the other hand than the shapes of the study as
+        they are in it.  Without it none is mirrored, and `compare` tells those of the other hand.
     compare : bool
         Whether each new shape is compared with those of the study: unit, handedness, pose, genus,
         as :func:`s4a.read_shapes` does it; what looks wrong is named in ``/report`` and left as it
@@ -93,7 +103,8 @@ def insert(
     Raises
     ------
     ValueError
-        When the study is not finished, no shape can be used, or one has the name of the template.
+        When the study is not finished, no shape can be used, one has the name of the template, or
+        `reflect` names none of them.
 
     Examples
     --------
@@ -122,7 +133,12 @@ def insert(
     if template in meshes:
         raise ValueError(f"new shapes need other names than the template, {template!r}; rename it")
     frozen = freeze(study, options)
-    references = portraits_of(study) if compare else None
+    portraits = portraits_of(study) if compare or reflect == AUTO else {}
+    references = portraits if compare else None
+    mirrored, told = choose_reflected(reflect, meshes, attrs, portraits)
+    for name in mirrored:
+        meshes[name] = mirror_image(meshes[name])
+        attrs[name] = attrs[name] | meshes[name].attrs
     # in a tuple: a Dataset of its own is kept by one worker of dask, and is lost with that
     results = workers(n_jobs)(
         delayed(insert_one)((mesh,), frozen, options, references) for mesh in meshes.values()
@@ -158,8 +174,45 @@ def insert(
     else:
         looks = {name: new.look for name, new in inserted.items() if new.look is not None}
         nodes["report"] = report_beside(study, attrs, looks, references)
-    nodes["report"].attrs["keep_doubtful"] = "True"  # all that were given are in the result
+    report = nodes["report"].attrs
+    report["remarks"] = "\n".join(filter(None, [*told, report["remarks"]]))
+    report["keep_doubtful"] = "True"  # all that were given are in the result
+    if reflect is not None:
+        nodes["report"]["reflected"] = variable("reflected", [name in mirrored for name in attrs])
     return xr.DataTree.from_dict(nodes)
+
+
+def choose_reflected(
+    reflect: str | list[str] | None,
+    meshes: dict[str, xr.Dataset],
+    attrs: dict[str, dict[str, Any]],
+    references: dict[str, xr.Dataset],
+) -> tuple[list[str], list[str]]:
+    """The new shapes whose mirror images are taken, and what is told of the choice."""
+    if reflect is None:
+        return [], []
+    if reflect == AUTO:
+        known = {
+            name: evidence.compare(name, seen, references) for name, seen in references.items()
+        }
+        looks = {
+            name: evidence.compare("", evidence.portray(mesh, intersections=False), references)
+            for name, mesh in meshes.items()
+        }
+        said = {name: is_of_other_hand(name, look, known) for name, look in looks.items()}
+        told = [line for _, line in said.values() if line]
+        for line in told:
+            log.warning("%s", line)
+        return [name for name, (is_other, _) in said.items() if is_other], told
+    names = reflect.split(",") if isinstance(reflect, str) else list(reflect)
+    names = [str(name).strip() for name in names]
+    unknown = [repr(name) for name in names if name not in attrs]
+    if unknown:
+        raise ValueError(
+            f"reflect names {listed(unknown)}, none of the new shapes ({listed(list(attrs))}); "
+            "'auto' mirrors those of the other hand than the study's"
+        )
+    return [name for name in names if name in meshes], []
 
 
 def read_new(

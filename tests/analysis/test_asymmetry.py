@@ -8,9 +8,10 @@ import xarray as xr
 from faults import shapes as faulty
 from scipy import stats
 
-from s4a import cli, statistics, synthetic
+from s4a import cli, open_study, read_mesh, statistics, synthetic
 from s4a.analysis import asymmetry as left_right
-from s4a.analysis.asymmetry import antisymmetry_test, involution, plane_between, sides_test
+from s4a.analysis.asymmetry import antisymmetry_test, sides_test
+from s4a.analysis.halves import involution, plane_between
 from s4a.analysis.permutation import mean_test
 from s4a.geometry.closest import interpolate
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas, vertex_normals
@@ -343,6 +344,30 @@ def test_the_template_of_a_study_finds_its_other_side(study):
     assert np.median(gap) < 0.1 * np.sqrt(vertex_areas(X, T).sum())
 
 
+def test_a_symmetric_template_has_half_of_a_bump_on_each_side(halves):
+    push, high = bump()
+    X, T = MESH
+    study = study_of(fields(3, 5), (X + 0.2 * push, T))
+    mesh = statistics.symmetric_template(study, halves)
+    S = mesh["position"].values
+    assert (mesh["corner_vertex"].values == T).all()
+    place = halves["partner_triangle"].values, halves["partner_barycentric"].values
+    gaps = []
+    for P in (study["registration"]["position"].values, S):  # how far from its mirror image
+        there = interpolate(P, T, *place)
+        plane = plane_between(P, there, vertex_areas(P, T))
+        assert abs(plane.normal[0]) > 0.99
+        gaps.append(np.linalg.norm(plane(there) - P, axis=1))
+    assert gaps[1].max() < 0.15 * gaps[0].max()
+    moved = ((S - X) * vertex_normals(X, T)).sum(1)
+    opposite = np.exp(-((X * M - [1.7, 1.0, 0.6]) ** 2).sum(1) / 0.5) > 0.5
+    for side in (high, opposite):
+        whole = 0.2 * np.linalg.norm(push, axis=1)[high].mean()
+        assert moved[side].mean() == pytest.approx(whole / 2, rel=0.15)
+    again = study_of(fields(3, 5), (S, T))
+    assert statistics.symmetric_template(again, halves).attrs["moved"] < 0.1 * mesh.attrs["moved"]
+
+
 def test_a_template_without_another_side_is_told(caplog):
     mesh = clean(as_dataset(*faulty.shape(400)))
     d = np.random.default_rng(0).normal(size=(5, mesh.sizes["vertex"], 3))
@@ -378,5 +403,11 @@ def test_the_command_writes_tables_and_a_page(study_folder, tmp_path, capsys):
     files = {path.name for path in out.iterdir()}
     assert {"asymmetry.nc", "asymmetry.term.csv", "asymmetry.individual.csv"} <= files
     assert "asymmetry.html" in files
+    X, T, _ = read_mesh(out / "symmetric.ply")
+    with open_study(study_folder) as study:
+        template = study["registration"].to_dataset()
+        assert (template["corner_vertex"].values == T).all()
+        gap = np.linalg.norm(template["position"].values - X, axis=1)
+    assert 0 < gap.mean() < 5  # mm
     assert cli.main([*command, "--subject", "person"]) == 2
     assert "both subject and side" in capsys.readouterr().err

@@ -6,6 +6,11 @@ asymmetry at the vertices after the correction for all, and of the whole shape; 
 is the share of four planted vertices that are found, how often the whole shape is, and how often
 antisymmetry is, in every fifth run.
 
+``asymmetry.py whole [RUNS]``: the same of :func:`s4a.statistics.asymmetry` as it is called: shapes
+of an ellipsoid of 500 vertices, smooth in what is alike on both sides and in what is not, with a
+bump of one side planted; each against its mirror image, along the normals or as vectors, or left
+and right shapes of subjects.
+
 ``asymmetry.py real`` needs the shared data beside the checkout: shares of variance of mouse skulls,
 and femurs beside their mirror images.
 """
@@ -14,16 +19,27 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import xarray as xr
 
 import s4a
 from s4a.analysis.asymmetry import antisymmetry_test, sides_test
+from s4a.analysis.halves import involution
 from s4a.analysis.permutation import mean_test
+from s4a.geometry.mesh import as_arrays, as_dataset, vertex_normals
+from s4a.schema import dataset
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 N_VERTICES, N_PLANTED = 40, 4
 N_PERMUTATIONS = 99
 EFFECT = 1.2  # directional asymmetry at a vertex, in standard deviations of what fluctuates
 HUMPS = 2.0  # of an antisymmetry, in standard deviations around each
+N_OF_SURFACE = 500  # vertices of the ellipsoid
+BUMP = 0.12  # height of the bump on one side of it, whose axes are 2, 3 and 1.5
+WAYS = {
+    "normal": "mirror image, along the normals",
+    "vector": "mirror image, vectors",
+    "sides": "left and right shapes",
+}
 SIZES = (6, 8, 12, 20, 40)
 HEAD = [
     "", "error, vertices", "error, whole", "error, antisymmetry",
@@ -76,6 +92,65 @@ def rates(n: int, kind: str, runs: int) -> np.ndarray:
     return np.nanmean(said, axis=0)
 
 
+def ellipsoid() -> tuple[np.ndarray, np.ndarray, xr.Dataset]:
+    """Vertices, triangles, and their partners as the equation of the surface gives them."""
+    X, T = as_arrays(s4a.synthetic.ellipsoid(N_OF_SURFACE, (2.0, 3.0, 1.5)))
+    (triangle, weights), _, gap = involution(X * [-1, 1, 1], X, T)
+    return X, T, dataset(partner_triangle=triangle, partner_barycentric=weights, partner_gap=gap)
+
+
+def draw_shapes(rng: np.random.Generator, X: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Displacements ``(n, v, 3)`` that are symmetric in x, and that change their sign there.
+
+    Each is a sum of 12 waves, the latter a sixth as high.
+    """
+
+    def waves() -> np.ndarray:
+        k, phase = rng.normal(0, 0.6, (12, 3)), rng.uniform(0, 2 * np.pi, 12)
+        amplitude = rng.normal(size=(n, 12, 3)) / 4
+        there = [np.cos(P @ k.T + phase) for P in (X, X * [-1, 1, 1])]
+        return np.stack([np.einsum("swx,nw->snx", amplitude, cosine) for cosine in there])
+
+    here, other = waves()
+    alike = here + other * [-1, 1, 1]
+    here, other = waves()
+    return 0.3 * alike, 0.05 * (here - other * [-1, 1, 1])
+
+
+def whole_rates(surface: tuple, n: int, way: str, runs: int) -> np.ndarray:
+    """Error at vertices, of the whole shape and of antisymmetry; power of the first two."""
+    X, T, halves = surface
+    height = np.exp(-((X - [1.7, 1.0, 0.6]) ** 2).sum(1) / 0.5)
+    push, high = BUMP * height[:, None] * vertex_normals(X, T), height > 0.5
+    names = [f"shape_{i:02d}" for i in range(n)]
+    options = {"halves": halves, "of": way, "n_permutations": N_PERMUTATIONS}
+    if way == "sides":
+        options = {"subject": names * 2, "side": ["left"] * n + ["right"] * n}
+        options["n_permutations"] = N_PERMUTATIONS
+        names = [f"{name}_{side}" for side in "ab" for name in names]
+    said = np.full((runs, 5), np.nan)
+    for run in range(runs):
+        alike, odd = draw_shapes(np.random.default_rng([run, n, 7]), X, n)
+        for planted in (False, True)[: 1 + (run % 5 == 0)]:
+            d = alike + odd + planted * push
+            if way == "sides":
+                half = odd + planted * push / 2
+                d = np.concatenate([alike - half, alike + half])
+            mesh = as_dataset(X, T, {"template": names[0]}).merge(dataset(displacement=d))
+            study = xr.DataTree.from_dict({"registration": mesh.assign_coords(shape=names)})
+            if way == "sides":  # as a run that mirrored the left ones says it
+                report = dataset(reflected=np.repeat([1, 0], n))
+                study["report"] = xr.DataTree(report.assign_coords(shape=names))
+            found = s4a.statistics.asymmetry(study, seed=run, **options)
+            p, p_value = found["p_family_wise"].values, found["p_value"].item()
+            if planted:
+                said[run, 3:] = (p[high] <= 0.05).mean(), p_value <= 0.05
+            else:
+                of_humps = found["antisymmetry_p"].item()
+                said[run, :3] = p.min() <= 0.05, p_value <= 0.05, of_humps <= 0.05
+    return np.nanmean(said, axis=0)
+
+
 def write(text: str) -> None:
     """A line, at once."""
     sys.stdout.write(text + "\n")
@@ -116,6 +191,20 @@ def real() -> None:
 if __name__ == "__main__":
     if sys.argv[1:] == ["real"]:
         real()
+    elif sys.argv[1:2] == ["whole"]:
+        runs = int(sys.argv[2]) if len(sys.argv) > 2 else 500
+        write(f"{runs} runs a row, {N_PERMUTATIONS} permutations\n")
+        write(f"| {' | '.join(HEAD[:-1])} |\n|{' --- |' * (len(HEAD) - 1)}")
+        surface = ellipsoid()
+        for way, n in (
+            ("normal", 12),
+            ("normal", 20),
+            ("sides", 12),
+            ("sides", 20),
+            ("vector", 12),
+        ):
+            cells = [f"{rate:.3f}" for rate in whole_rates(surface, n, way, runs)]
+            write(f"| {n} individuals, {WAYS[way]} | {' | '.join(cells)} |")
     else:
         runs = int(sys.argv[1]) if len(sys.argv) > 1 else 500
         write(f"{runs} runs a row, {N_PERMUTATIONS} permutations\n")

@@ -96,3 +96,66 @@ def test_the_command_takes_a_column_of_the_table(mixed, tmp_path, capsys):
     capsys.readouterr()
     assert cli.main([*command, "--reflect", "s9"]) == 2
     assert "reflect names 's9', none of the shapes" in capsys.readouterr().err
+
+
+# ---- new shapes in a study whose left ones were mirrored
+
+
+@pytest.fixture(scope="module")
+def newcomer():
+    """Another right shape, and the left one that is its mirror image."""
+    X, T = faulty.shape(310)
+    return (X, T), (X * [-1, 1, 1], T[:, ::-1])
+
+
+def test_a_new_shape_of_the_other_hand_is_mirrored_where_that_is_asked(newcomer, folder, tmp_path):
+    right, left = newcomer
+    with open_study(folder) as study:
+        known = s4a.insert(study, {"s9": right}, n_jobs=1)
+        for reflect in ("auto", "s9", ["s9"]):
+            found = s4a.insert(study, {"s9": left}, reflect=reflect, n_jobs=1)
+            place = found["registration"]["displacement"].values
+            np.testing.assert_allclose(
+                place, known["registration"]["displacement"].values, atol=1e-5
+            )
+            assert found["report"]["reflected"].values.tolist() == [1]
+            assert found["report"]["status"].values.tolist() == ["ok"]
+            assert "mirrored, as reflect= says" in found["report"]["reason"].values[0]
+            assert found["original/s9"].attrs["reflected"] == 1
+        stayed = s4a.insert(study, {"s9": right}, reflect="auto", n_jobs=1)
+    assert stayed["report"]["reflected"].values.tolist() == [0]
+    assert stayed["pca"]["score"].equals(known["pca"]["score"])
+    write_registered(found, tmp_path, frame="shape")  # where its file lies
+    points, _, _ = s4a.read_mesh(tmp_path / "s9.ply")
+    assert np.linalg.norm(points.mean(0) - left[0].mean(0)) < 0.05 * np.ptp(left[0], axis=0).max()
+
+
+def test_a_new_shape_of_the_other_hand_is_told_where_nothing_is_asked(newcomer, folder):
+    with open_study(folder) as study:
+        found = s4a.insert(study, {"s9": newcomer[1]}, n_jobs=1)
+    report = found["report"].sel(shape="s9")
+    assert report["status"].item() == "doubtful"
+    assert "reflect= mirrors it" in report["warning"].item()
+    assert "reflected" not in found["report"]
+
+
+def test_a_hand_that_cannot_be_told_is_said_and_an_unknown_name_is_an_error(
+    newcomer, folder, study, meshes, caplog
+):
+    with pytest.raises(ValueError, match=r"reflect names 's8', none of the new shapes \(s9\)"):
+        s4a.insert(open_study(folder), {"s9": newcomer[0]}, reflect="s8", n_jobs=1)
+    brain = meshes["brain_02"]
+    found = s4a.insert(study, {"again": brain}, reflect="auto", n_jobs=1)
+    said = "reflect='auto' left again as it is: the shapes of the study are too like their own"
+    assert said in found["report"].attrs["remarks"]
+    assert said in caplog.text
+    assert found["report"]["reflected"].values.tolist() == [0]
+
+
+def test_the_command_of_new_shapes_mirrors_them_too(newcomer, folder, tmp_path, capsys):
+    s4a.write_mesh(tmp_path / "s9.ply", *newcomer[1])
+    command = ["insert", str(folder), str(tmp_path / "s9.ply"), "--out", str(tmp_path / "out")]
+    assert cli.main([*command, "--reflect", "auto", "--n-jobs", "1"]) == 0
+    assert "left for right" not in capsys.readouterr().out
+    assert cli.main([*command, "--reflect", "s1", "--n-jobs", "1"]) == 2
+    assert "reflect names 's1', none of the new shapes (s9)" in capsys.readouterr().err
