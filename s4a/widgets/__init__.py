@@ -13,6 +13,7 @@ from s4a.widgets.comparison import Comparison
 from s4a.widgets.correspondence import Correspondence
 from s4a.widgets.explore import Explore
 from s4a.widgets.functional import FunctionalMap
+from s4a.widgets.maps import Maps
 from s4a.widgets.median import Median
 from s4a.widgets.modes import Modes
 from s4a.widgets.network import Network
@@ -25,6 +26,7 @@ __all__ = [
     "Correspondence",
     "Explore",
     "FunctionalMap",
+    "Maps",
     "Median",
     "Modes",
     "Network",

@@ -363,9 +363,9 @@ def test_a_symmetric_template_has_half_of_a_bump_on_each_side(halves):
     opposite = np.exp(-((X * M - [1.7, 1.0, 0.6]) ** 2).sum(1) / 0.5) > 0.5
     for side in (high, opposite):
         whole = 0.2 * np.linalg.norm(push, axis=1)[high].mean()
-        assert moved[side].mean() == pytest.approx(whole / 2, rel=0.15)
+        assert moved[side].mean() == pytest.approx(whole / 2, rel=0.3)
     again = study_of(fields(3, 5), (S, T))
-    assert statistics.symmetric_template(again, halves).attrs["moved"] < 0.1 * mesh.attrs["moved"]
+    assert statistics.symmetric_template(again, halves).attrs["moved"] < 0.4 * mesh.attrs["moved"]
 
 
 def test_a_template_without_another_side_is_told(caplog):
