@@ -7,6 +7,7 @@ this study in Chromium, the scene in JupyterLab. A name is that of a picture wit
 ``make structure``.
 """
 
+import re
 import sys
 import tempfile
 from functools import cache
@@ -362,6 +363,22 @@ def scene(study):
     return path
 
 
+def reliability():
+    """The reliability diagram of confidence, from the table that ``confidence.py`` prints."""
+    text = (HERE / "decisions.md").read_text(encoding="utf-8")
+    said, right = (
+        [float(cell) for cell in re.search(rf"\| {row} \|(.+)\|", text)[1].split("|")]
+        for row in ("confidence", "share that is right")
+    )
+    figure = Figure(figsize=(3.6, 3.4), layout="constrained")
+    ax = figure.subplots()
+    ax.plot([0, 1], [0, 1], color="#dddddd")
+    ax.plot(said, right, "o-", color=charts.BLUE)
+    ax.set(xlabel="confidence", ylabel="share within 1 % of √area", xlim=(0, 1), ylim=(0, 1))
+    ax.set_aspect("equal")
+    return write(figure, "reliability")
+
+
 PICTURES = {
     "figure_1": lambda: pipeline(analysed()),
     "figure_2": swapped,
@@ -373,6 +390,7 @@ PICTURES = {
     "pca": lambda: sliders(analysed()),
     "network": lambda: network(analysed()),
     "scene": lambda: scene(analysed()),
+    "reliability": reliability,
 }
 
 
