@@ -30,14 +30,13 @@ def burn() -> None:
         sum(range(100_000))
 
 
-def spent(process: psutil.Process) -> float:
-    """Seconds of processor time of a process and those that it started."""
-    seconds = 0.0
+def spent(process: psutil.Process, used: dict[int, float]) -> float:
+    """Seconds of processor time of a process and all that it started, those that ended too."""
     for one in [process, *process.children(recursive=True)]:
         with contextlib.suppress(psutil.NoSuchProcess):
             times = one.cpu_times()
-            seconds += times.user + times.system
-    return seconds
+            used[one.pid] = times.user + times.system
+    return sum(used.values())
 
 
 def end(process: psutil.Process) -> None:
@@ -53,12 +52,12 @@ def executed(lesson: Path, folder: str, seconds: float) -> tuple[str, float]:
     begin = time.monotonic()
     with open(Path(folder, "log"), "w", encoding="utf-8") as log:
         process = psutil.Popen([*command, str(lesson)], cwd=folder, stdout=log, stderr=log)
-        seen = [(begin, 0.0)]
+        seen, used = [(begin, 0.0)], {}
         while process.poll() is None:
             time.sleep(1)
             now = time.monotonic()
-            seen.append((now, spent(process)))
-            before = [used for at, used in seen if at <= now - STILL]
+            seen.append((now, spent(process, used)))
+            before = [had for at, had in seen if at <= now - STILL]
             if before and seen[-1][1] - before[-1] < LITTLE:
                 how = "hung" if process.children() else "at its end"
                 end(process)
