@@ -19,6 +19,7 @@ from s4a.widgets.modes import Modes
 from s4a.widgets.network import Network
 from s4a.widgets.progress import Progress
 from s4a.widgets.spectrum import Spectrum
+from s4a.widgets.structures import Structures
 from s4a.widgets.transfer import Transfer
 
 __all__ = [
@@ -32,5 +33,6 @@ __all__ = [
     "Network",
     "Progress",
     "Spectrum",
+    "Structures",
     "Transfer",
 ]

@@ -15,6 +15,7 @@ from s4a.widgets.modes import Modes
 from s4a.widgets.network import Network
 from s4a.widgets.panel import close_all, layout_of
 from s4a.widgets.spectrum import Spectrum
+from s4a.widgets.structures import Structures
 from s4a.widgets.transfer import Transfer
 
 PANELS = {
@@ -26,6 +27,7 @@ PANELS = {
     "Transfer": Transfer,
     "Spectrum": Spectrum,
 }
+OF_SEVERAL = {"Structures": Structures}  # the tabs of a study of several structures
 
 
 def running_cell() -> str | None:
@@ -40,7 +42,8 @@ class Explore(ipywidgets.VBox):
     Parameters
     ----------
     study : xarray.DataTree
-        Finished or not; the tab of a stage that is not there yet says what is missing.
+        Finished or not; the tab of a stage that is not there yet says what is missing.  Of several
+        structures there is one tab with all of them; each has the other tabs as a study of its own.
     width : float or str, optional
         In pixels, or any width of CSS; all that the cell has by default.
     **options
@@ -54,8 +57,9 @@ class Explore(ipywidgets.VBox):
 
     def __init__(self, study: xr.DataTree, *, width: float | str | None = None, **options: Any):
         self.study, self.options, self.panels = study, options, {}
-        boxes = [ipywidgets.VBox() for _ in PANELS]
-        self.tabs = ipywidgets.Tab(children=boxes, titles=list(PANELS))
+        self.kinds = OF_SEVERAL if "structures" in study.children else PANELS
+        boxes = [ipywidgets.VBox() for _ in self.kinds]
+        self.tabs = ipywidgets.Tab(children=boxes, titles=list(self.kinds))
         self.tabs.add_class("s4a-tabs")  # in style.css
         super().__init__([self.tabs], layout=layout_of(width))
         self.tabs.observe(self.fill, "selected_index")
@@ -74,14 +78,14 @@ class Explore(ipywidgets.VBox):
 
     def fill(self, change: object = None) -> None:
         """Build the panel of the selected tab, or say why there is none."""
-        title = list(PANELS)[self.tabs.selected_index or 0]
+        title = list(self.kinds)[self.tabs.selected_index or 0]
         box = self.tabs.children[self.tabs.selected_index or 0]
         if title in self.panels:
             return
         for child in box.children:
             close_all(child)
         try:
-            self.panels[title] = PANELS[title](self.study, **self.options)
+            self.panels[title] = self.kinds[title](self.study, **self.options)
             box.children = [self.panels[title]]
         except ValueError as error:
             box.children = [ipywidgets.HTML(PARTS.message(str(error)))]
@@ -100,7 +104,7 @@ class Explore(ipywidgets.VBox):
 
     def __getitem__(self, title: str) -> ipywidgets.Widget:
         """The panel of a tab, which is opened for it."""
-        self.tabs.selected_index = list(PANELS).index(title)
+        self.tabs.selected_index = list(self.kinds).index(title)
         return self.panels[title]
 
     def close(self) -> None:

@@ -6,7 +6,7 @@ import traitlets
 from s4a.geometry.mesh import vertex_normals
 from s4a.method.deform import normal_displacement
 from s4a.method.pca import apply_scores
-from s4a.show.browser import MODES, look_state, mesh_state
+from s4a.show.browser import MODES, look_state, mesh_state, to_bytes
 from s4a.show.draw import signed_colors
 from s4a.widgets.scene import View
 
@@ -20,7 +20,10 @@ class ModesView(View):
         In standard deviations, one for each component; set them and the shape follows.
     sample : int
         The shape that was clicked last, -1 for none.
-    colors : {"normal", "magnitude", "none"}
+    colors : {"normal", "magnitude", "none", "own"}
+    own : bytes
+        Colours of the vertices that are there to choose, as of
+        :func:`s4a.show.browser.color_bytes`; none by default.
     beside : bool
         Whether the marked component is shown at -3, 0 and 3 standard deviations, side by side.
     """
@@ -40,7 +43,8 @@ class ModesView(View):
     samples = traitlets.List().tag(sync=True)
     names = traitlets.List().tag(sync=True)
     faint = traitlets.List().tag(sync=True)
-    colors = traitlets.Enum(["normal", "magnitude", "none"], "normal").tag(sync=True)
+    colors = traitlets.Enum(["normal", "magnitude", "none", "own"], "normal").tag(sync=True)
+    own = traitlets.Bytes().tag(sync=True)
     beside = traitlets.Bool(False).tag(sync=True)
     sample = traitlets.Int(-1).tag(sync=True)
     height = traitlets.Int(420).tag(sync=True)
@@ -65,10 +69,19 @@ class ModesView(View):
                 self.set_trait(name, value)
         self.draw_still()
 
+    def change_triangles(self, triangles: np.ndarray) -> None:
+        """Other triangles of the same vertices, as where a part of them is not seen."""
+        mean, _, deformation = self.arrays
+        self.arrays = mean, triangles, deformation
+        self.corner = to_bytes(triangles, "uint32")
+        self.draw_still()
+
     def drawn(self) -> tuple | None:
         """The shape as the sliders stand, coloured by how far it moved along the mean's normals."""
         mean, triangles, deformation = self.arrays
         moved = apply_scores(mean, deformation, self.scores)
+        if self.colors == "own" and self.own:
+            return moved, triangles, np.frombuffer(self.own, np.uint8).reshape(-1, 3) / 255
         if self.colors != "normal":
             return moved, triangles, None
         along = normal_displacement(moved - mean, vertex_normals(mean, triangles))

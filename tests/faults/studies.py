@@ -9,6 +9,7 @@ STUDY, ENDS, FAULTS, BOUNDED = (
     "test_bounded.py",
 )
 RAW = "test_raw.py"
+STRUCTURES = "test_structures.py"
 
 STATISTICS, SUBJECTS = "test_statistics.py", "test_subjects.py"
 
@@ -539,6 +540,49 @@ PROOFS = [
         "`s4a verify` names them in one line each; exit code 1 where the study does not hold",
         SEAL,
         "test_verify_says_in_one_line_what_holds_and_its_exit_code_whether",
+    ),
+    (
+        "a subject without one of several structures, or with one that is doubtful",
+        "warned by name; in the modes of its other structures, not in what is said of all together",
+        STRUCTURES,
+        "test_warnings_name_the_subject_that_lacks_a_structure",
+    ),
+    (
+        "two shapes of one structure of a subject, a shape without structure or subject, or a "
+        "column of structures without subjects",
+        "error that names them",
+        "test_several.py",
+        "test_a_subject_with_two_shapes_of_one_structure_is_named",
+    ),
+    (
+        "one structure only, one that a single subject has, structures that are to be mirrored",
+        "error with the reason, before anything is computed",
+        "test_several.py",
+        "test_structures_that_do_not_go_together_are_refused",
+    ),
+    (
+        "a structure of one subject far away, as if in another frame",
+        "warned by subject and structure, with how far",
+        STRUCTURES,
+        "test_a_structure_in_another_frame_is_told",
+    ),
+    (
+        "a structure of one subject mirrored in its file",
+        "warned by subject",
+        STRUCTURES,
+        "test_a_structure_mirrored_in_its_file_is_told",
+    ),
+    (
+        "structures whose files were centred each for itself, so that poses are lost",
+        "warned by structure",
+        STRUCTURES,
+        "test_files_that_were_centred_each_for_itself_are_told",
+    ),
+    (
+        "structures in different units",
+        "error where the files name them; warned where sizes differ by more than 300",
+        STRUCTURES,
+        "test_structures_of_different_units_are_refused_or_told",
     ),
     (
         "archives (NPZ, VTP, GIFTI) that unpack to too much",

@@ -12,6 +12,7 @@ class Modes {
     this.normal = normalsOf(this.mean, this.corner);
     this.reach = this.far(3);
     this.palettes = { normal: numbers(Uint8Array, get("signed_palette")), magnitude: numbers(Uint8Array, get("ramp_palette")) };
+    this.own = numbers(Uint8Array, get("own"));
     this.limits = { normal: get("limit"), magnitude: get("limit_magnitude") };
   }
   positions(scores, out = new Float32Array(this.mean.length)) {
@@ -40,6 +41,7 @@ class Modes {
     return Math.sqrt(r2);
   }
   colors(P, kind, out) {
+    if (kind === "own" && this.own) return out.set(this.own), out;
     const palette = this.palettes[kind];
     if (!palette) return null;
     const M = this.mean, N = this.normal, limit = this.limits[kind];
@@ -98,7 +100,7 @@ function modesWidget({ model, el }) {
     return Math.round(100 * z) / 100;
   })), "a plausible shape: scores drawn from the normal distribution");
   const kinds = html(buttons, "select", { "aria-label": "colours", title: "colour: how far a place moved from the mean, along its normal or at all" });
-  for (const [value, text] of [["normal", "along the normal"], ["magnitude", "distance"], ["none", "no colours"]]) html(kinds, "option", { value }, text);
+  for (const [value, text] of [["normal", "along the normal"], ["magnitude", "distance"], ["none", "no colours"], ...(model.get("own")?.byteLength ? [["own", "of each part"]] : [])]) html(kinds, "option", { value }, text);
   kinds.addEventListener("change", () => tell("colors", kinds.value));
   const sliders = html(right, "div", { class: "s4a-sliders" });
   const rows = ratio.map((share, c) => {
@@ -188,7 +190,7 @@ function modesWidget({ model, el }) {
   };
   const reload = () => { modes.load(); arrange(); };
   const on = {
-    "change:scores": told, "change:colors": update, "change:beside": arrange, "change:deformation": reload,
+    "change:scores": told, "change:colors": update, "change:beside": arrange, "change:deformation": reload, "change:corner": () => { modes.load(); update(); }, "change:own": () => { modes.load(); update(); },
     "change:still": picture, "change:turn": () => shown[0].reset(model.get("turn")),
   };
   Object.entries(on).forEach(([event, act]) => model.on(event, act));
