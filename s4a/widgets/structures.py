@@ -41,8 +41,6 @@ class Structures(Panel):
 
     Attributes
     ----------
-    scores : list of float
-        Of the level that is shown, in standard deviations.
     views : dict of str to ModesView
         Of every level that varies.
     seen, colors : dict of str to widget
@@ -137,7 +135,7 @@ class Structures(Panel):
 
     @property
     def scores(self) -> list[float]:
-        """Of the level that is shown."""
+        """Of the level that is shown, in standard deviations, one for each mode."""
         return self.views[self.level.value].scores
 
     @scores.setter
