@@ -390,6 +390,21 @@ EXERCISES = {
         lambda found: found["fluctuating_size"].idxmax().item(),
         "`found` has a fluctuating_size for each individual",
     ),
+    "16.1": Exercise(
+        lambda half, truth: np.linalg.norm(half["position"] - truth, axis=1)[
+            half["present"].values == 0
+        ].mean(),
+        "the distance at each vertex, then the mean where `present` is 0",
+    ),
+    "16.2": Exercise(
+        lambda found: found["level_share"].sel(level="between").sum().item(),
+        "`level_share` of `found`, level between, both structures added up",
+        0.005,
+    ),
+    "16.3": Exercise(
+        lambda found: np.degrees(np.sqrt((found["pose_rotation"].values ** 2).sum(2)).max()),
+        "the length of each vector of `pose_rotation`, the largest, in degrees",
+    ),
     "17.1": Exercise(
         lambda: 6,
         "n children seen twice have 2 ** n orders, of which two give the same statistic",
