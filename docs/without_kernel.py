@@ -68,21 +68,50 @@ for kind in (Panel, Explore):
     format_of.formatters["text/html"].for_type(kind, framed)
 
 
+def tubes(begin, end, colors, radius):
+    """Prisms in the place of lines ``(n, 3)`` to ``(n, 3)``: points, triangles, colours."""
+    along = end - begin
+    side = np.cross(along, np.eye(3)[np.abs(along).argmin(1)])
+    side *= radius / np.linalg.norm(side, axis=1, keepdims=True)
+    other = np.cross(along, side) / np.linalg.norm(along, axis=1, keepdims=True)
+    around = [np.cos(a) * side + np.sin(a) * other for a in 2 * np.pi * np.arange(3) / 3]
+    X = np.stack([at + way for at in (begin, end) for way in around], axis=1)  # (n, 6, 3)
+    T = np.array([[0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4], [2, 0, 3], [2, 3, 5]])
+    T = T + 6 * np.arange(len(X))[:, None, None]
+    return X.reshape(-1, 3), T.reshape(-1, 3), np.repeat(colors, 6, axis=0)
+
+
+def drawn(part, radius):
+    """Points, triangles and colours of a mesh, or of wires and lines of a radius."""
+    known = part.geometry
+    if isinstance(known, pythreejs.LineSegmentsGeometry):
+        begin, end = np.asarray(known.positions, float).transpose(1, 0, 2)
+        return tubes(begin, end, np.asarray(known.colors)[:, 0], radius)
+    X, T = known.attributes["position"].array + np.array(part.position), known.index.array
+    T = T.reshape(-1, 3)
+    if part.material.wireframe:
+        edges = np.unique(np.sort(np.concatenate([T[:, :2], T[:, 1:], T[:, ::2]]), axis=1), axis=0)
+        color = np.tile(to_rgb(part.material.color), (len(edges), 1))
+        return tubes(*X[edges].transpose(1, 0, 2).astype(float), color, radius)
+    clay = np.tile(to_rgb(CLAY), (len(X), 1))
+    return X, T, known.attributes["color"].array if "color" in known.attributes else clay
+
+
 def pictured(scene):
-    """A picture of the surfaces of a scene, which turn in the notebook only."""
+    """A picture of the surfaces and lines of a scene, which turn in the notebook only."""
     parts = list(scene.scene.children)
     parts += [
         part for group in parts if isinstance(group, pythreejs.Group) for part in group.children
     ]
     meshes = [part for part in parts if hasattr(getattr(part, "geometry", None), "attributes")]
+    corners = np.concatenate([mesh.geometry.attributes["position"].array for mesh in meshes])
+    radius = 0.002 * np.linalg.norm(np.ptp(corners, axis=0))
     points, triangles, colors = [], [], []
-    for mesh in meshes:
-        known = mesh.geometry.attributes
-        X = known["position"].array + np.array(mesh.position)
-        triangles.append(mesh.geometry.index.array.reshape(-1, 3) + sum(map(len, points)))
+    for part in [*meshes, *(part for part in parts if isinstance(part, pythreejs.LineSegments2))]:
+        X, T, color = drawn(part, radius)
+        triangles.append(T + sum(map(len, points)))
         points.append(X)
-        clay = np.tile(to_rgb(CLAY), (len(X), 1))
-        colors.append(known["color"].array if "color" in known else clay)
+        colors.append(color)
     camera = np.subtract(scene.camera.position, scene.controls[0].target)
     azimuth, height = np.arctan2(camera[1], camera[0]), np.hypot(*camera[:2])
     view = (float(np.rad2deg(azimuth)), float(np.rad2deg(np.arctan2(camera[2], height))))

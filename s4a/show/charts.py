@@ -78,7 +78,8 @@ def surfaces(
         Title of each picture and its mesh.
     values : dict of str to float ndarray, optional
         For the same titles colours ``(vertex, 3)``, or signed numbers ``(vertex,)``: these are
-        drawn on one scale from -`limit` to `limit`, blue positive, with a colour bar.
+        drawn on one scale from -`limit` to `limit`, blue positive, with a colour bar; of numbers
+        that are nowhere negative the bar begins at 0.
     limit : float, optional
         By default the largest 99 % quantile of the absolute numbers.
     label : str
@@ -124,7 +125,9 @@ def surfaces(
         ax.set_title(title, parse_math=False)
     if signed:
         scale = ScalarMappable(Normalize(-limit, limit), SIGNED)
-        figure.colorbar(scale, ax=axes, shrink=0.7, label=label, pad=0.01)
+        bar = figure.colorbar(scale, ax=axes, shrink=0.7, label=label, pad=0.01)
+        if min(np.nanmin(array) for array in signed) >= 0:  # errors: the half that they can have
+            bar.ax.set_ylim(0, limit)
     return figure
 
 

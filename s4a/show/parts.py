@@ -49,10 +49,15 @@ class Parts(Figure):
         title = self.get_suptitle()
         self.draw_without_rendering()
         parts = []
-        for box in self._boxes():
+        for shown, box in self._boxes():
             inches = box.transformed(self.dpi_scale_trans.inverted()).padded(0.04)
             file = io.BytesIO()
+            hidden = [ax for ax in self.axes if ax.get_visible() and ax not in shown]
+            for ax in hidden:  # wide titles reach into the boxes of their neighbours
+                ax.set_visible(False)
             self.savefig(file, format="png", dpi=192, bbox_inches=inches)
+            for ax in hidden:
+                ax.set_visible(True)
             width = round(96 * inches.width)
             address = data_uri(file.getvalue(), "image/png")
             parts.append((width, round(SHRINK * width), round(GROW * width), address))
@@ -60,11 +65,11 @@ class Parts(Figure):
         return page.render(alt=self.alt or title, title=title, parts=parts, gap=GAP).strip()
 
     def _boxes(self):
-        """What each part takes of the figure; several rows stay below each other as one."""
-        found = (ax.get_tightbbox() for ax in self.axes)
-        boxes = [box for box in found if box is not None and min(box.size) > 0]
+        """The axes of each part and what it takes; several rows stay below each other as one."""
+        found = [([ax], ax.get_tightbbox()) for ax in self.axes]
+        boxes = [(ax, box) for ax, box in found if box is not None and min(box.size) > 0]
         rows = {ax.get_subplotspec().rowspan.start for ax in self.axes if ax.get_subplotspec()}
-        return boxes if len(rows) < 2 else [Bbox.union(boxes)]
+        return boxes if len(rows) < 2 else [(self.axes, Bbox.union([box for _, box in boxes]))]
 
     def _ipython_display_(self) -> None:
         from IPython.display import HTML, display

@@ -1,0 +1,40 @@
+"""Figures of parts: what a notebook shows of each, and the scale beside surfaces."""
+
+import base64
+import io
+import re
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import s4a
+from s4a.show import charts
+from s4a.show.parts import Parts
+
+
+def pictures(figure):
+    """The picture of each part (height, width, 3)."""
+    found = re.findall(r"base64,([^\"]+)", figure.html())
+    return [np.array(Image.open(io.BytesIO(base64.b64decode(one))).convert("RGB")) for one in found]
+
+
+def test_no_part_shows_what_reaches_over_from_its_neighbour():
+    figure = Parts(figsize=(4, 2))
+    wide, plain = figure.subplots(1, 2)
+    for ax in (wide, plain):
+        ax.imshow(np.ones((4, 4)), cmap="gray", vmin=0, vmax=1)
+        ax.set_axis_off()
+    wide.text(0, 0, "words that reach far over into the picture of the neighbour", clip_on=False)
+    first, second = pictures(figure)
+    assert first.min() < 100  # the words
+    assert second.min() > 250
+    assert all(ax.get_visible() for ax in figure.axes)
+
+
+@pytest.mark.parametrize(("least", "begins"), [(0.0, 0.0), (-1.0, -2.0)])
+def test_the_scale_of_errors_begins_at_zero(least, begins):
+    ball = s4a.synthetic.sphere(100)
+    values = np.linspace(least, 2, 100)
+    figure = charts.surfaces({"ball": ball}, {"ball": values}, limit=2, label="error")
+    assert figure.axes[-1].get_ylim() == (begins, 2)
