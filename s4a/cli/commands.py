@@ -61,8 +61,7 @@ def run(args: Namespace) -> int:
     begin = time.perf_counter()
     full = within(args.out, "report.txt")
     with cluster(args.cluster), lines_or_bars():
-        several = dict(args.structures) if args.structures else None
-        study = analyse(args.paths, store=args.out, structures=several, **options_of(args))
+        study = analyse(args.paths, store=args.out, **options_of(args))
     if "structures" in study.children:
         write(results.run_of_several(study, args.out, time.perf_counter() - begin))
         parts = study["structures"].children.values()
@@ -80,7 +79,8 @@ def options_of(args: Namespace) -> dict[str, Any]:
     """The options of `analyse` from parsed flags, and how many processes."""
     from s4a.study.options import Options
 
-    return {name: getattr(args, name) for name in [*(f.name for f in fields(Options)), "n_jobs"]}
+    options = {name: getattr(args, name) for name in [*(f.name for f in fields(Options)), "n_jobs"]}
+    return options | {"structures": dict(args.structures) if args.structures else None}
 
 
 @contextlib.contextmanager

@@ -48,6 +48,7 @@ HELP = {
     "wrap": "wrap the shapes watertight before they are remeshed",
     "intersections": "count triangles that pass through others",
     "label": "the files are label volumes (NIfTI, MGH): the surface of this label, or several: 1,2",
+    "structures": "label volumes that each hold several structures: left=17 right=53",
     "pattern": "only files whose name fits, for example '*brain*'",
     "preset": "'paper' leaves out all that is added to the paper; 'fast' halves the time",
     "template": "name of the shape to register to (default: the median shape)",
@@ -165,9 +166,9 @@ def _run(add):
     add("--out", required=True, metavar="STUDY", help=text)
     text = "dask scheduler tcp://host:port, or local:N worker processes"
     add("--cluster", metavar="ADDRESS", help=text)
-    text = "label volumes that each hold several structures: left=1 right=2 (of several labels 1,2)"
+    text = HELP["structures"]
     add("--structures", nargs="+", type=named_label, metavar="NAME=LABEL", help=text)
-    add_options(add, HELP)
+    add_options(add, [name for name in HELP if name != "structures"])
 
 
 def _demo(add):
