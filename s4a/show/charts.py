@@ -12,6 +12,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 
 from s4a.geometry.mesh import as_arrays
@@ -161,10 +162,10 @@ def brief(names: list[str], room: int = 16) -> list[str]:
     return [name if len(name) <= room else f"{name[: half - 1]}…{name[-half:]}" for name in told]
 
 
-def _free_corner(box, size, room, taken):
+def _free_corner(box, size, room, taken, outward):
     """Where a name of a `size` in points is written beside its point: offsets right and up.
 
-    Four corners are tried::
+    Four corners are tried, those first that lie `outward`, where fewer lines end::
 
         2 | 1     None if each leaves the `room` from left to right, or lies over a box that
         --+--     is taken.
@@ -172,7 +173,8 @@ def _free_corner(box, size, room, taken):
     """
     x, y = box
     wide, high = size
-    for right, up in ((3, 3), (-3 - wide, 3), (3, -3 - high), (-3 - wide, -3 - high)):
+    corners = ((3, 3), (-3 - wide, 3), (3, -3 - high), (-3 - wide, -3 - high))
+    for right, up in sorted(corners, key=lambda corner: -np.sign(corner) @ outward):
         low, bottom = x + right, y + up
         clear = (taken[:, 2] < low) | (low + wide < taken[:, 0])
         clear |= (taken[:, 3] < bottom) | (bottom + high < taken[:, 1])
@@ -193,7 +195,7 @@ def _names(ax, places, names):
     for i, name in enumerate(brief(names)):
         wide = 0.58 * size * len(name)
         others = np.delete(taken, i, axis=0)  # its own point may touch it
-        offset = _free_corner(at[i], (wide, size), room, others)
+        offset = _free_corner(at[i], (wide, size), room, others, at[i] - at.mean(0))
         if offset is None:
             continue
         corner = at[i] + offset
@@ -209,6 +211,7 @@ def _names(ax, places, names):
             color="#333333",
             zorder=4,
             parse_math=False,
+            path_effects=[withStroke(linewidth=2, foreground="white")],  # over lines
         )
 
 
