@@ -862,6 +862,18 @@ def test_the_page_deforms_without_kernel_and_network(offline, study, tmp_path):
     page.close()
 
 
+@pytest.mark.parametrize("components", [1, 2])
+def test_one_mode_has_no_chart_of_the_variance_of_many(offline, study, tmp_path, components):
+    some = study.copy()
+    some["pca"] = type(study)(study["pca"].to_dataset().isel(component=slice(components)))
+    page, errors = opened(offline, saved(widgets.Modes(some), tmp_path / "few.html"))
+    page.wait_for_function(DRAWN)
+    assert page.get_by_text("Scores: click").count() == 1
+    assert page.get_by_text("Cumulative variance").count() == components - 1
+    assert errors == []
+    page.close()
+
+
 SMOOTH = "(c) => c.view.smooth"
 
 

@@ -178,7 +178,7 @@ function modesWidget({ model, el }) {
       s.x = s.y.map((_, i) => i + 1);
       s.text = `${s.name}: ${s.y.map((v, i) => `${i + 1}: ${v.toFixed(1)} %`).slice(0, 12).join(", ")}`;
     });
-    lines(variancePart, { series, title: "Cumulative variance", xlabel: "number of components", ylabel: "%", ymin: 0, legend: "bottom" }, () => {});
+    if (ratio.length > 1) lines(variancePart, { series, title: "Cumulative variance", xlabel: "number of components", ylabel: "%", ymin: 0, legend: "bottom" }, () => {});
     crosshair = scatter(scorePart, {
       x: samples.map((s) => s[0]), y: samples.map((s) => s[1] ?? 0), names, title: "Scores: click a shape to see it",
       faint: model.get("faint"), xlabel: "PC1 (σ)", ylabel: count > 1 ? "PC2 (σ)" : "", most: 460, reach: [-range, range],
