@@ -118,7 +118,7 @@ def pull_back() -> Figure:
         9.5,
         3.1,
         "Left: an arrow goes from a point y of the target N back to T of y on the source M; the "
-        "value of f comes back along it. Right: a square. T goes from f on M to f of T on N; "
+        "value of f comes back along it. Right: a square. T F goes from f on M to f of T on N; "
         "below, C goes from the coefficients a to b; Phi and Psi go down. Both ways end at b.",
     )
     u = np.stack(np.meshgrid(*2 * [np.linspace(-1, 1, 160)]), -1)
@@ -147,7 +147,7 @@ def pull_back() -> Figure:
     }
     for (across, up), text in boxes.items():
         _box(square, (across, up), text, SOFT["blue" if up else "orange"], (1.0, 0.42))
-    _arrow(square, (0.55, 1), (1.65, 1), "T", rise=0.1)
+    _arrow(square, (0.55, 1), (1.65, 1), "$T_F$", rise=0.12)
     _arrow(square, (0.55, 0), (1.65, 0), "C", rise=0.1)
     _arrow(square, (0, 0.76), (0, 0.24), "$\\Phi^T A$", rise=0, aside=-0.28)
     _arrow(square, (2.2, 0.76), (2.2, 0.24), "$\\Psi^T A$", rise=0, aside=0.28)
@@ -239,6 +239,54 @@ def two_ways() -> Figure:
     _arrow(ours, (0.58, 1.15), (2.02, 1.15), "search: eq. 7", rise=0.1, color=ORANGE)
     standard.set_title("standard: two searches and a fit")
     ours.set_title("eq. 7: one search")
+    return figure
+
+
+def slid() -> Figure:
+    """A point that slid along folds is still on the surface, and the prices of an elastic round.
+
+    Examples
+    --------
+    >>> from s4a.course.diagrams import slid
+    >>> [ax.get_title() for ax in slid().axes]
+    ['slid: the gap is still zero', 'two of the three prices']
+    """
+    figure, ((folds, prices),) = _plain(
+        2,
+        9.5,
+        3.1,
+        "Left: two folds of a surface from the side. The true place of a point is a crest; its "
+        "match has slid down the flank, and is still on the surface. Right: a piece of the "
+        "surface M with its normal m in the point y. The arrow from y to z, where the vertex "
+        "goes, has a part across the surface and a part along it.",
+    )
+    u = np.linspace(0, 2, 200)
+    height = 0.3 * (1 - np.cos(2 * np.pi * u))
+    folds.plot(u, height, color=GREY, lw=2.5)
+    crest, flank = 52, 78  # rows of u
+    folds.plot(u[crest:flank], height[crest:flank], color=ORANGE, lw=4)
+    for i, color, name, shift in (
+        (crest, "black", "true place", (0, 0.13)),
+        (flank, ORANGE, "match", (0.2, 0.05)),
+    ):
+        folds.plot(u[i], height[i], "o", color=color, ms=8, zorder=4)
+        folds.text(u[i] + shift[0], height[i] + shift[1], name, ha="center", color=color)
+    folds.text(1, -0.15, "surface of the source", ha="center", color=GREY)
+    folds.set(xlim=(-0.05, 2.05), ylim=(-0.3, 0.95))
+    folds.set_title("slid: the gap is still zero")
+    bend = np.linspace(-1, 1, 50)
+    prices.plot(bend, -0.12 * bend**2, color=GREY, lw=2.5)
+    y, z = np.zeros(2), np.array([0.6, 0.45])
+    foot = z * [1, 0]
+    _arrow(prices, y, (0, 0.85), "m", rise=0.33, aside=-0.1)
+    _arrow(prices, y, foot, "along", rise=-0.2, aside=0.12, color=BLUE)
+    _arrow(prices, foot, z, "across", rise=0, aside=0.22, color=ORANGE)
+    for place, name, shift in ((y, "y", (-0.09, -0.13)), (z, "z", (0.1, 0.1))):
+        prices.plot(*place, "o", color="black", ms=6, zorder=4)
+        prices.text(*(place + shift), name, ha="center", va="center", fontsize=11, style="italic")
+    prices.text(-0.8, -0.26, "M", ha="center", color=GREY, fontsize=11)
+    prices.set(xlim=(-1.1, 1.1), ylim=(-0.4, 0.95))
+    prices.set_title("two of the three prices")
     return figure
 
 

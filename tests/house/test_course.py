@@ -19,6 +19,8 @@ from s4a.datasets.synthetic import sphere
 from s4a.method.latent import consistency_form
 from s4a.show.charts import matrices, surfaces, variance
 
+DIAGRAMS = ["cotangents", "dual", "pull_back", "latent_space", "two_ways", "slid"]
+
 
 def test_an_open_exercise_says_what_to_do_and_hints():
     said = judge(..., 3, "count them")
@@ -196,7 +198,7 @@ def test_a_takeaway_has_its_pictures_side_by_side_and_none_of_them_small():
         )
 
 
-@pytest.mark.parametrize("name", ["cotangents", "dual", "pull_back", "latent_space", "two_ways"])
+@pytest.mark.parametrize("name", DIAGRAMS)
 def test_no_words_of_a_diagram_lie_over_each_other_or_outside(name):
     figure = getattr(diagrams, name)()
     figure.canvas.draw()
@@ -213,7 +215,7 @@ def test_no_words_of_a_diagram_lie_over_each_other_or_outside(name):
                 assert not box.overlaps(boxes[j]), (words[i], words[j])
 
 
-@pytest.mark.parametrize("name", ["cotangents", "dual", "pull_back", "latent_space", "two_ways"])
+@pytest.mark.parametrize("name", DIAGRAMS)
 def test_a_diagram_is_shown_part_by_part_with_words_for_who_does_not_see_it(name):
     figure = getattr(diagrams, name)()
     shown = figure.html()
