@@ -203,6 +203,10 @@ EXERCISES = {
         lambda study: study["pca"]["explained_variance_ratio"].values[:2].sum(),
         "/pca has the variable explained_variance_ratio",
     ),
+    "00.3": Exercise(
+        lambda study: abs(study["pca"]["score"][:, 0]).idxmax().item(),
+        "/pca has the variable score, a row for each shape; both signs count",
+    ),
     "01.1": Exercise(
         lambda report: report["components"].sel(shape="brain_01").item(),
         "the report has a variable with this name",
