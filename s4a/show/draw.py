@@ -5,10 +5,12 @@ A small renderer in NumPy, and the colours that S4A uses.
 
 import base64
 import io
+from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import Colormap, ListedColormap, to_rgb
+from matplotlib.path import Path
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
@@ -30,6 +32,7 @@ UNKNOWN = (0.6, 0.6, 0.6)
 OKABE_ITO = ("#e69f00", "#56b4e9", "#009e73", "#f0e442", "#0072b2", "#d55e00", "#cc79a7", "#999999")
 # red, white, blue, without the ends, which are too dark to show the shading
 SIGNED = ListedColormap(colormaps["RdBu"](np.linspace(0.06, 0.94, 255)), "signed")
+LASSO = 600  # samples along the picture in which hidden vertices are found
 CHUNK = 2_000_000  # candidate samples at a time, some 100 MB
 
 
@@ -136,6 +139,49 @@ def rasterise(
         seen[sample[front]], weights[sample[front]] = owner[front], w[front]
     sample = np.flatnonzero(seen >= 0)
     return sample, seen[sample], weights[sample], nearest[sample]
+
+
+def vertices_within(
+    X: np.ndarray, T: np.ndarray, polygon: np.ndarray | list[Any], turn: np.ndarray
+) -> np.ndarray:
+    """The vertices that are seen within a polygon of the picture's plane.
+
+    Parameters
+    ----------
+    X : float ndarray (n, 3)
+    T : int ndarray (m, 3)
+    polygon : float ndarray (q, 2)
+        In the plane of the view, x to the right and y up, in the unit of X.
+    turn : float ndarray (3, 3)
+        The rotation of the view, its rows x, y and towards the viewer.
+
+    Returns
+    -------
+    bool ndarray (n,)
+        Not those that face away, nor those that lie behind others.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import s4a
+    >>> from s4a.geometry.mesh import as_arrays
+    >>> from s4a.show.draw import vertices_within
+    >>> X, T = as_arrays(s4a.synthetic.sphere(2000))
+    >>> square = [[0, 0], [2, 0], [2, 2], [0, 2]]
+    >>> found = X[vertices_within(X, T, square, np.eye(3))]
+    >>> bool((found > -0.01).all()), round(len(found) / len(X), 2)
+    (True, 0.12)
+    """
+    P = X @ np.reshape(turn, (3, 3)).T
+    low, reach = P[:, :2].min(0), np.ptp(P[:, :2], axis=0).max()
+    screen = np.c_[(P[:, :2] - low) * (LASSO - 1) / reach, P[:, 2]]
+    sample, _, _, depth = rasterise(screen, T, LASSO, LASSO)
+    front = np.full(LASSO * LASSO, -np.inf)
+    front[sample] = depth
+    column, line = screen[:, :2].astype(int).T
+    seen = P[:, 2] >= front[line * LASSO + column] - 0.01 * reach
+    facing = vertex_normals(P, T)[:, 2] > 0
+    return seen & facing & Path(polygon).contains_points(P[:, :2])
 
 
 def _weight_planes(corners, low):

@@ -18,6 +18,7 @@ from s4a.widgets.median import Median
 from s4a.widgets.modes import Modes
 from s4a.widgets.network import Network
 from s4a.widgets.progress import Progress
+from s4a.widgets.region import Region
 from s4a.widgets.spectrum import Spectrum
 from s4a.widgets.structures import Structures
 from s4a.widgets.transfer import Transfer
@@ -32,6 +33,7 @@ __all__ = [
     "Modes",
     "Network",
     "Progress",
+    "Region",
     "Spectrum",
     "Structures",
     "Transfer",

@@ -116,6 +116,11 @@ class Scene(View):
         The place that was clicked, or is under the pointer (where `hovering` is set): ``vertex``
         (-1 beside the surface), ``face``, ``weights`` in that triangle, ``point``, and its number
         `count`.  A place that the browser carries to the other view by itself is hovered unheard.
+    lasso : bool
+        Whether a drag draws around vertices, and does not turn the surface.
+    drawn_around : dict
+        What was drawn: its ``polygon (q, 2)`` in the plane of the view, in the unit of the surface,
+        the rotation ``turn`` of that view, and its number `count`.
     answer : int
         The number of the place to which marks and caption answer; -1 for none.  An answer to a
         place older than the last, of any view of the group, is not shown.
@@ -144,6 +149,8 @@ class Scene(View):
     answer = traitlets.Int(-1).tag(sync=True)
     picked = traitlets.Dict().tag(sync=True)
     hovered = traitlets.Dict().tag(sync=True)
+    lasso = traitlets.Bool(False).tag(sync=True)
+    drawn_around = traitlets.Dict().tag(sync=True)
 
     surface = colors = coordinates = None  # what is seen, as arrays
 

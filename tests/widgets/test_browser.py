@@ -20,6 +20,7 @@ import pytest
 from paths import NOTEBOOKS
 
 import s4a
+from s4a.show.draw import vertices_within
 from s4a.show.surfaces import aligned
 
 playwright = pytest.importorskip("playwright.sync_api")
@@ -870,6 +871,40 @@ def test_one_mode_has_no_chart_of_the_variance_of_many(offline, study, tmp_path,
     page.wait_for_function(DRAWN)
     assert page.get_by_text("Scores: click").count() == 1
     assert page.get_by_text("Cumulative variance").count() == components - 1
+    assert errors == []
+    page.close()
+
+
+def test_a_lasso_takes_what_is_seen_within_it(offline, study, tmp_path):
+    panel = widgets.Region(study, view="top")
+    panel.lasso.value = True
+    X, T = panel.X, panel.T
+    page, errors = opened(offline, saved(panel, tmp_path / "region.html"))
+    page.wait_for_function(DRAWN)
+    box = visible(page, VIEW).first.bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(x, y - 150)
+    page.mouse.down()
+    for dx, dy in ((400, -150), (400, 150), (0, 150)):  # the right half
+        page.mouse.move(x + dx, y + dy, steps=5)
+    assert page.evaluate(f"{SEEN}[0].path.length") > 10
+    page.mouse.up()
+    drawn = page.evaluate(
+        "Object.values(s4aModels).map((m) => m.get('drawn_around')).find((d) => d && d.polygon)"
+    )
+    found = vertices_within(X, T, drawn["polygon"], drawn["turn"])
+    middle = (X[:, 0].max() + X[:, 0].min()) / 2
+    assert found.mean() > 0.15
+    assert X[found, 0].min() > middle - 3
+    # without the lasso the same drag turns the surface
+    before = page.evaluate(f"{SEEN}[0].camera.turn")
+    assert np.allclose(before, drawn["turn"])
+    page.evaluate(f"{SEEN}[0].lasso = false")
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 60, y, steps=4)
+    page.mouse.up()
+    assert not np.allclose(page.evaluate(f"{SEEN}[0].camera.turn"), before)
     assert errors == []
     page.close()
 

@@ -47,6 +47,7 @@ export default {
     };
     const view = new View(el, {
       turn: model.get("turn"), group: model.get("group"), height: model.get("height"), label: model.get("title"),
+      onLasso: (drawn) => { model.set("drawn_around", { ...drawn, count: 1 + (model.get("drawn_around").count || 0) }); model.save_changes(); },
       onPick: model.get("clickable") && ((hit) => { ask(); carry(hit); send("picked", hit); }),
       onHover: model.get("clickable") && ((hit) => {
         if (!model.get("hovering")) return;
@@ -103,6 +104,10 @@ export default {
       view.points = model.get("points");
       view.redraw();
     };
+    const lasso = () => {
+      view.lasso = model.get("lasso");
+      view.canvas.style.cursor = view.lasso ? "crosshair" : "";
+    };
     const picture = () => {
       const bytes = numbers(Uint8Array, model.get("still"));
       if (still.src) URL.revokeObjectURL(still.src);
@@ -113,10 +118,10 @@ export default {
       "change:position": geometry, "change:color": color, "change:coordinate": color, "change:cell": color, "change:link": links, "change:link_values": links, "change:link_back": links, "change:link_color": links, "change:link_text": links,
       "change:ghost_position": ghosts, "change:title": words,
       "change:caption": answered, "change:points": answered, "change:answer": answered, "change:bar": words, "change:still": picture,
-      "change:turn": () => view.reset(model.get("turn")),
+      "change:lasso": lasso, "change:turn": () => view.reset(model.get("turn")),
     };
     Object.entries(on).forEach(([event, act]) => model.on(event, act));
-    geometry(), ghosts(), words(), answered();
+    geometry(), ghosts(), words(), answered(), lasso();
     const webgl = context() !== null;
     view.canvas.hidden = !webgl;
     still.hidden = webgl;

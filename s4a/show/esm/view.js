@@ -35,8 +35,8 @@ function radiusOf(P, centre) {
 }
 
 class View {
-  constructor(parent, { turn, group = "", height = 360, label = "surface", onPick, onHover }) {
-    Object.assign(this, { surfaces: [], points: [], cursor: -1, onPick, onHover, group });
+  constructor(parent, { turn, group = "", height = 360, label = "surface", onPick, onHover, onLasso }) {
+    Object.assign(this, { surfaces: [], points: [], cursor: -1, lasso: false, path: null, onPick: onPick || null, onHover: onHover || null, onLasso, group });
     this.ball = new Surface();
     this.ball.setMesh(...ballMesh());
     this.canvas = document.createElement("canvas");
@@ -62,10 +62,12 @@ class View {
     canvas.addEventListener("pointerdown", (e) => {
       canvas.setPointerCapture(e.pointerId);
       canvas.focus({ preventScroll: true });
+      if (this.lasso && this.frame && !e.shiftKey) return (this.path = [this.plane(e)]);
       last = [e.clientX, e.clientY];
       travel = 0;
     });
     canvas.addEventListener("pointermove", (e) => {
+      if (this.path) return this.path.push(this.plane(e)), this.redraw();
       if (!last) return this.onHover?.(this.pick(e));
       const dx = e.clientX - last[0], dy = e.clientY - last[1];
       last = [e.clientX, e.clientY];
@@ -74,6 +76,12 @@ class View {
       else this.rotate(dx * 0.01, dy * 0.01);
     });
     canvas.addEventListener("pointerup", (e) => {
+      if (this.path) {
+        const polygon = this.path;
+        this.path = null;
+        if (polygon.length > 2) this.onLasso?.({ polygon, turn: [...this.camera.turn] });
+        return this.redraw();
+      }
       if (last && travel < 4) this.onPick?.(this.pick(e));
       last = null;
     });
@@ -176,6 +184,22 @@ class View {
     const scale = (0.97 * zoom * half) / this.frame.radius;
     return { w, h, scale, x: 2 * half * pan[0], y: 2 * half * pan[1] };
   }
+  middle() { // of the frame, in the plane of the view
+    const R = this.camera.turn, c = this.frame.centre;
+    return [0, 3].map((i) => R[i] * c[0] + R[i + 1] * c[1] + R[i + 2] * c[2]);
+  }
+  plane(e) { // the place under the pointer, in the plane of the view and the unit of the surface
+    const box = this.canvas.getBoundingClientRect(), { w, h, scale, x, y } = this.placement(), [u, v] = this.middle();
+    return [(e.clientX - box.left - w / 2 - x) / scale + u, (h / 2 - (e.clientY - box.top) - y) / scale + v];
+  }
+  outline(ratio) { // the lasso while it is drawn
+    const on = this.canvas.getContext("2d"), { w, h, scale, x, y } = this.placement(), [u, v] = this.middle();
+    on.beginPath();
+    for (const [a, b] of this.path) on.lineTo(ratio * (w / 2 + x + scale * (a - u)), ratio * (h / 2 - y - scale * (b - v)));
+    on.closePath();
+    Object.assign(on, { strokeStyle: "#d55e00", lineWidth: 2 * ratio });
+    on.stroke();
+  }
   redraw() { // quickly while things move; smoothly, from twice the pixels, once they rest and nothing is held
     clearTimeout(this.resting);
     this.resting = setTimeout(() => this.rest(), Math.max(150, 4 * (this.took || 0)));
@@ -206,6 +230,7 @@ class View {
     if (this.cursor >= 0 && 3 * this.cursor < this.surfaces[0].position.length) this.ball.balls(on, [[...this.at(this.cursor), 0.84, 0.37, 0, 0.018 * this.frame.radius]]);
     if (this.canvas.width !== width || this.canvas.height !== height) Object.assign(this.canvas, { width, height });
     this.canvas.getContext("2d").drawImage(gl.canvas, 0, gl.canvas.height - H, W, H, 0, 0, width, height);
+    if (this.path) this.outline(ratio);
     if (smooth === 1) this.took = performance.now() - start;
     else this.smooth = (this.smooth || 0) + 1;
     this.frames = (this.frames || 0) + 1;

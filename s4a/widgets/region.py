@@ -1,0 +1,108 @@
+"""A region of the template (6.1), drawn around on its surface, for statistics within it."""
+
+import ipywidgets
+import numpy as np
+
+from s4a.geometry.mesh import vertex_areas
+from s4a.show.draw import CLAY, vertices_within
+from s4a.widgets.panel import WIDE, Panel, dropdown, row
+from s4a.widgets.scene import MARK, Scene
+
+ADD, REMOVE = "add", "take away"
+LASSO = "while it is pressed a drag draws around vertices, and does not turn the surface"
+HOW = "what becomes of the vertices that are drawn around, of those that are seen"
+LABEL = "the region of a label of the template, to begin with"
+
+
+class Region(Panel):
+    """A region of the template: draw around vertices, or take a label.
+
+    Parameters
+    ----------
+    study : xarray.DataTree
+        With a registration.
+    view, up
+        From where the surface is seen first; see :func:`s4a.show.draw.rotation`.
+
+    Attributes
+    ----------
+    region : bool ndarray (vertex,)
+        The vertices of the template that were chosen, as :func:`s4a.statistics.within` takes them.
+
+    Examples
+    --------
+    With the ``study`` of six small brains; the square is what a drag draws:
+
+    >>> import s4a
+    >>> from s4a.widgets import Region
+    >>> study = s4a.synthetic.example_study()
+    >>> panel = Region(study, view="top")
+    >>> square = [[0, -99], [99, -99], [99, 99], [0, 99]]
+    >>> panel.scene.drawn_around = {"polygon": square, "turn": panel.scene.turn, "count": 1}
+    >>> right = s4a.statistics.within(study, panel.region)
+    >>> bool(right["registration"]["position"].values[:, 0].min() >= 0)
+    True
+    >>> panel.close()
+    """
+
+    needs = ("registration/position",)
+    title = "Region"
+    python = ("drawing a region",)
+
+    def build(self, view: str = "corner", up: str = "z") -> list[ipywidgets.Widget]:
+        """The surface, and what a drag does."""
+        template = self.study["registration"].dataset
+        self.X, self.T = template["position"].values, template["corner_vertex"].values
+        self.area = vertex_areas(self.X, self.T)
+        self.region = np.zeros(len(self.X), bool)
+        self.lasso = ipywidgets.ToggleButton(description="lasso", tooltip=LASSO)
+        self.how = dropdown("drawn", HOW, [ADD, REMOVE])
+        self.none = ipywidgets.Button(description="nothing", tooltip="choose no vertex")
+        self.others = ipywidgets.Button(description="others", tooltip="choose all other vertices")
+        controls = [self.lasso, self.how, self.none, self.others]
+        self.label = self._labels(template.attrs["template"])
+        if self.label is not None:
+            controls.insert(0, self.label)
+            self.label.observe(self.guarded(self.take_label), "value")
+        self.scene = Scene(view=view, up=up, height=420)
+        self.scene.show(self.X, self.T)
+        ipywidgets.link((self.lasso, "value"), (self.scene, "lasso"))
+        self.scene.observe(self.guarded(self.take_drawn), "drawn_around")
+        self.none.on_click(self.guarded(lambda _: self.choose(np.zeros(len(self.X), bool))))
+        self.others.on_click(self.guarded(lambda _: self.choose(~self.region)))
+        self.choose(self.region)
+        return [row(*controls), self.scene]
+
+    def _labels(self, name):
+        """A list of the template's labels; None where it has none."""
+        mesh = self.study["original"].get(name)
+        if mesh is None or "label" not in mesh:
+            return None
+        self.labels = mesh["label"].values
+        options = [("", -1), *((str(one), one) for one in np.unique(self.labels).tolist())]
+        return dropdown("label", LABEL, options, value=-1, layout=WIDE)
+
+    def take_label(self, change: dict) -> None:
+        """The vertices of a label that was chosen from the list."""
+        if change["new"] >= 0:
+            self.choose(self.labels == change["new"])
+
+    def take_drawn(self, change: dict) -> None:
+        """The vertices that were drawn around are added, or taken away."""
+        drawn = change["new"]
+        within = vertices_within(self.X, self.T, drawn["polygon"], drawn["turn"])
+        if not within.any():
+            self.say("no vertex is seen within what was drawn")
+            return
+        self.say("")
+        self.choose(self.region | within if self.how.value == ADD else self.region & ~within)
+
+    def choose(self, region: np.ndarray) -> None:
+        """Make these vertices ``(n,)`` the region, and show it."""
+        self.region = region
+        self.scene.paint(np.where(region[:, None], MARK, CLAY))
+        share = self.area[region].sum() / self.area.sum()
+        self.scene.caption = (
+            f"{region.sum():,} of {len(region):,} vertices, {share:.1%} of the area: "
+            "statistics.within(study, panel.region)"
+        )
