@@ -67,6 +67,9 @@ def slide(draw: "Callable[..., Figure]", **sliders: "ipywidgets.Widget") -> "ipy
     return ipywidgets.VBox([*sliders.values(), message, picture])
 
 
+LEAST = 0.8  # of the size of a figure in a take-away
+
+
 def _png(figure):
     """A figure as PNG of twice the pixels that it is shown with, and that width."""
     target = io.BytesIO()
@@ -107,7 +110,13 @@ def takeaway(sentence: str, *figures: "Figure") -> "Figure":
     pictures = [np.asarray(Image.open(io.BytesIO(_png(figure)[0]))) for figure in figures]
     shares = [picture.shape[1] / picture.shape[0] for picture in pictures]
     width, gap = 9.5, 0.1
-    height = min(3.2, (width - gap * len(shares)) / sum(shares))
+    natural = [
+        picture.shape[0] / (2 * figure.dpi)
+        for picture, figure in zip(pictures, figures, strict=True)
+    ]
+    # smaller than they are drawn only so far as their words can still be read
+    least = LEAST * max(natural)
+    height = max(min(3.2, (width - gap * len(shares)) / sum(shares)), least)
     whole = Parts(figsize=(height * sum(shares) + gap * (len(shares) - 1), height + 0.35))
     grid = whole.add_gridspec(
         1,
