@@ -277,7 +277,7 @@ def test_ten_modes_of_100000_vertices_move_without_the_kernel(browser, lab, reco
     move(page.locator(".s4a-scores input").nth(9), 3)
     drawn(page, 0, lambda picture: (picture != before).mean() > 0.02)
     assert len(page.sent) == sent
-    # anywidget says so of a model that takes longer than two seconds, as on a busy machine; it moved
+    # anywidget says so of a model that takes two seconds, as on a busy machine; it moved
     late = "[anywidget] Failed to initialize model."
     assert [text for text in serious(page.messages) if late not in text] == []
     page.close()
