@@ -57,9 +57,9 @@ format_of = get_ipython().display_formatter
 
 
 def framed(panel):
-    """A panel as a page within the page; of tabs the first."""
+    """A panel as a page within the page; of tabs that of the modes, or the first."""
     if isinstance(panel, Explore):
-        panel = panel["Modes"]
+        panel = panel["Modes" if "Modes" in panel.kinds else next(iter(panel.kinds))]
     html = str(panel_html(panel, LIMIT))
     return templates.from_string(PANEL).render(panel=panel, html=html).strip()
 
