@@ -146,6 +146,8 @@ def pictures(app, what, name, obj, options, lines):
     """Below examples that end in a figure stands the figure."""
     if nb_execution_mode == "off" or what in ("module", "class"):
         return
+    if f"{getattr(obj, '__module__', '')}.{getattr(obj, '__name__', '')}" != name:
+        return  # imported from where it is defined, and documented there
     path = examples.draw(name, "\n".join(lines), HERE / "_examples")
     if path is not None:
         words = f"What the last example of {name} shows"

@@ -23,9 +23,8 @@ from s4a.study.pair import match_shapes, shape_of
 log = logging.getLogger(__name__)
 
 ROUNDS = 5  # of the consensus, and of the involution
-FAR = (
-    0.05  # mean gap of the involution, of sqrt(area), from which the template is told as asymmetric
-)
+# Mean gap of the involution, of sqrt(area), from which the template is told as asymmetric
+FAR = 0.05
 
 
 class Mirror(NamedTuple):

@@ -3,6 +3,7 @@
 import shutil
 
 import pytest
+from paths import DOCS
 
 
 @pytest.fixture(scope="module")
@@ -43,3 +44,20 @@ def test_no_page_is_wider_than_a_narrow_window(site, window):
     for name in ("index", "method", "comparison", "api/maps"):
         window.goto((site[1] / f"{name}.html").as_uri())
         assert window.evaluate("document.documentElement.scrollWidth") <= 800, name
+
+
+def test_a_page_shows_the_first_panel_of_a_study_that_has_no_modes(tmp_path):
+    nbformat = pytest.importorskip("nbformat")
+    client = pytest.importorskip("nbclient")
+    cells = [
+        (DOCS / "without_kernel.py").read_text(encoding="utf-8"),
+        "from s4a.datasets.structures import example_structures",
+        "import s4a; s4a.explore(example_structures())",
+    ]
+    notebook = nbformat.v4.new_notebook(cells=[*map(nbformat.v4.new_code_cell, cells)])
+    resources = {"metadata": {"path": str(tmp_path)}}
+    client.NotebookClient(notebook, timeout=300, resources=resources).execute()
+    shown = [
+        part["data"].get("text/html", "") for part in notebook.cells[-1].outputs if part.get("data")
+    ]
+    assert any('class="panel"' in html and 'title="Structures"' in html for html in shown)
