@@ -291,7 +291,7 @@ def panel(widget, name, act):
     front = front_ends()
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as driver:
         page_file = widget.save_html(Path(folder) / "panel.html", limit=0)
-        browser = driver.chromium.launch(executable_path=front.CHROMIUM, args=front.SWITCHES)
+        browser = front.chromium.launched(driver)
         page = browser.new_page(viewport={"width": 910, "height": 1000})
         page.goto(page_file.as_uri())
         page.wait_for_function(DRAWN)
@@ -347,7 +347,7 @@ def scene(study):
         kernel = {"name": "python3", "display_name": "Python 3", "language": "python"}
         notebook = nbformat.v4.new_notebook(cells=[cell], metadata={"kernelspec": kernel})
         nbformat.write(notebook, Path(folder) / "panel.ipynb")
-        browser = driver.chromium.launch(executable_path=front.CHROMIUM, args=front.SWITCHES)
+        browser = front.chromium.launched(driver)
         with front.served("jupyterlab", Path(folder)) as address:
             page = browser.new_page(viewport={"width": 1366, "height": 1000})
             page.set_default_timeout(180_000)

@@ -10,22 +10,14 @@ there once more: the shader adds up the modes for it again.  Milliseconds, the l
 of ten in turn, with what the page waits for until a pixel can be read.
 """
 
-import shutil
 import sys
 from pathlib import Path
 
+import chromium
+from playwright.sync_api import sync_playwright
+
 import s4a.show
 
-CHROMIUM = next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
-)
-SWITCHES = [
-    "--no-sandbox",
-    "--disable-gpu",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-]
 SIZES, MODES = (30_000, 100_000), 10
 SURFACE = Path(s4a.show.__file__).parent / "esm" / "surface.js"
 PAGE = """
@@ -143,11 +135,9 @@ function measured(vertices, modes) {
 
 
 def main(sizes):
-    from playwright.sync_api import sync_playwright
-
     sys.stdout.write("| vertices | way | least (ms) | median (ms) |\n|---|---|---|---|\n")
     with sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=SWITCHES)
+        browser = chromium.launched(driver)
         for size in sizes:
             page = browser.new_page()
             page.add_script_tag(content=SURFACE.read_text(encoding="utf-8") + PAGE)

@@ -12,7 +12,6 @@ import http.client
 import importlib.metadata
 import json
 import os
-import shutil
 import socket
 import subprocess
 import sys
@@ -21,15 +20,11 @@ import time
 import urllib.request
 from pathlib import Path
 
+import chromium
+from playwright.sync_api import sync_playwright
+
 import s4a
 
-CHROMIUM = next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
-)
-SWITCHES = (
-    "--no-sandbox --disable-gpu --use-gl=angle --use-angle=swiftshader "
-    "--enable-unsafe-swiftshader --disable-quic"
-).split()
 OPENED = "import s4a\nfrom s4a.widgets import Modes\n\npanel = Modes(s4a.open_study({study!r}))\n"
 # what Python has heard is written where this script can read it
 HEARD = """
@@ -162,8 +157,6 @@ def waited(page, condition, seconds=60):
 
 
 def main(names):
-    from playwright.sync_api import sync_playwright
-
     say = sys.stdout.write
     say("| front end | surface drawn | a slider deforms it | Python hears of it | errors |\n")
     say("|---|---|---|---|---|\n")
@@ -173,7 +166,7 @@ def main(names):
         options = {"n_coarse": 500, "k": 24, "k_init": 10, "n_jobs": 1}
         s4a.analyse(brains, store=folder / "study", **options)
         notebooks(folder, folder / "study", heard)
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=SWITCHES)
+        browser = chromium.launched(driver)
         for name in names or COMMANDS:
             try:
                 version = importlib.metadata.version(name)

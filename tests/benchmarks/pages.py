@@ -6,11 +6,11 @@ violation or wider than the window; the last line counts all.  It ends with 1 wh
 anything serious or critical, or a page says an error.
 """
 
-import shutil
 import sys
 from collections import Counter
 from pathlib import Path
 
+import chromium
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import sync_playwright
 
@@ -42,18 +42,14 @@ def looked_at(window, page):
 def main(words):
     site = Path(words[0]) if words else SITE
     pages = sorted(path for path in site.rglob("*.html") if "_static" not in path.parts)
-    names = ("chromium", "chromium-browser", "google-chrome")
-    chromium = next(filter(None, map(shutil.which, names)), None)
-    if chromium is None or not pages:
+    if chromium.PATH is None or not pages:
         sys.stderr.write(f"Chromium and the pages of `make docs` in {site} needed\n")
         return 2
     serious = wide = failed = 0
     say("| page | in | finding | impact | places |")
     say("|---|---|---|---|---|")
     with sync_playwright() as driver:
-        browser = driver.chromium.launch(
-            executable_path=chromium, args=["--no-sandbox", "--disable-gpu"]
-        )
+        browser = chromium.launched(driver)
         for page in pages:
             window = browser.new_page(viewport={"width": WIDE, "height": 700})
             found, width, errors = looked_at(window, page)

@@ -14,28 +14,19 @@ smallest text, in pixels, in windows of four widths.
 """
 
 import json
-import shutil
 import sys
 import tempfile
 import time
 from pathlib import Path
 
+import chromium
 import numpy as np
 from comm import DummyComm
+from playwright.sync_api import sync_playwright
 
 import s4a
 from s4a import widgets
 
-CHROMIUM = next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
-)
-SWITCHES = [
-    "--no-sandbox",
-    "--disable-gpu",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-]
 SIZES = (6_000, 30_000, 100_000)
 STEPS = 6
 VIEWS = (
@@ -191,16 +182,14 @@ def measure(study, browser, count, folder, looks):
 
 
 def main():
-    if CHROMIUM is None:
-        sys.stdout.write("skipped: Chromium is not installed\n")
+    if chromium.PATH is None:
+        sys.stdout.write(f"skipped: {chromium.LACKS}\n")
         return
     sizes, looks = [int(size) for size in sys.argv[1:]] or SIZES, {}
-    from playwright.sync_api import sync_playwright
-
     count = Count()
     sys.stdout.write("| " + " | ".join(COLUMNS) + " |\n" + "|---" * len(COLUMNS) + "|\n")
     with sync_playwright() as driver, tempfile.TemporaryDirectory() as folder:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=SWITCHES)
+        browser = chromium.launched(driver)
         for size in sizes:
             study = s4a.analyse(s4a.synthetic.brains(3, size, seed=0), n_jobs=-1)
             for row in measure(study, browser, count, folder, looks):

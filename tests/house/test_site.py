@@ -1,23 +1,18 @@
 """The built documentation in Chromium: accessible, searchable, and not too wide."""
 
-import shutil
-
 import pytest
-from paths import DOCS
+from paths import DOCS, benchmark
 
 
 @pytest.fixture(scope="module")
 def window(site):
     """A browser window for the pages; nothing is fetched."""
     playwright = pytest.importorskip("playwright.sync_api")
-    names = ("chromium", "chromium-browser", "google-chrome")
-    chromium = next(filter(None, map(shutil.which, names)), None)
-    if chromium is None:
-        pytest.skip("needs Chromium: apt-get install chromium")
+    chromium = benchmark("chromium")
+    if chromium.PATH is None:
+        pytest.skip(chromium.LACKS)
     with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(
-            executable_path=chromium, args=["--no-sandbox", "--disable-gpu"]
-        )
+        browser = chromium.launched(driver)
         yield browser.new_page(viewport={"width": 800, "height": 700})
         browser.close()
 

@@ -7,7 +7,6 @@ import contextlib
 import json
 import os
 import re
-import shutil
 import socket
 import subprocess
 import sys
@@ -17,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from paths import NOTEBOOKS
+from paths import NOTEBOOKS, benchmark
 
 import s4a
 from s4a.show.draw import vertices_within
@@ -28,16 +27,9 @@ pytest.importorskip("jupyterlab")
 axe = pytest.importorskip("axe_playwright_python.sync_playwright")
 widgets = pytest.importorskip("s4a.widgets")
 
-CHROMIUM = next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
-)
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium")
+chromium = benchmark("chromium")
+pytestmark = pytest.mark.skipif(chromium.PATH is None, reason=chromium.LACKS)
 NOTEBOOK = NOTEBOOKS / "00_explore.ipynb"
-SWITCHES = (
-    "--no-sandbox --disable-gpu --use-gl=angle --use-angle=swiftshader "
-    "--enable-unsafe-swiftshader --disable-quic "
-    "--disable-background-networking --no-first-run --disable-component-update --disable-sync"
-).split()
 HARMLESS = ("t.on is not a function", "Unsatisfied version")  # both are JupyterLab's own
 VIEW = "canvas.s4a-view"
 DRAWN = f"[...document.querySelectorAll('{VIEW}')].some((c) => c.offsetParent && c.view.frames > 0)"
@@ -183,7 +175,7 @@ def driver():
 
 @pytest.fixture(scope="module")
 def browser(driver):
-    browser = driver.chromium.launch(executable_path=CHROMIUM, args=SWITCHES)
+    browser = chromium.launched(driver)
     yield browser
     browser.close()
 
@@ -191,9 +183,7 @@ def browser(driver):
 @pytest.fixture(scope="module")
 def flat(driver):
     """A browser that has no WebGL."""
-    browser = driver.chromium.launch(
-        executable_path=CHROMIUM, args=[*SWITCHES, "--disable-3d-apis"]
-    )
+    browser = chromium.launched(driver, "--disable-3d-apis")
     yield browser
     browser.close()
 
