@@ -11,6 +11,9 @@ of an ellipsoid of 500 vertices, smooth in what is alike on both sides and in wh
 bump of one side planted; each against its mirror image, along the normals or as vectors, or left
 and right shapes of subjects.
 
+``asymmetry.py antisymmetry [RUNS]``: how often antisymmetry is found in such shapes of subjects
+where there is none, in draws of its own.
+
 ``asymmetry.py real`` needs the shared data beside the checkout: shares of variance of mouse skulls,
 and femurs beside their mirror images.
 """
@@ -22,10 +25,10 @@ import numpy as np
 import xarray as xr
 
 import s4a
-from s4a.analysis.asymmetry import antisymmetry_test, sides_test
+from s4a.analysis.asymmetry import antisymmetry_test, both_sides, sides_test
 from s4a.analysis.halves import involution
 from s4a.analysis.permutation import mean_test
-from s4a.geometry.mesh import as_arrays, as_dataset, vertex_normals
+from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas, vertex_normals
 from s4a.schema import dataset
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
@@ -71,7 +74,7 @@ def found(a: np.ndarray, run: int, *, planted: bool) -> list[float]:
 
 def antisymmetric(rows: np.ndarray, run: int) -> bool:
     """Whether antisymmetry is found."""
-    return antisymmetry_test(rows, n_draws=N_PERMUTATIONS, seed=run)[1] <= 0.05
+    return antisymmetry_test(rows, seed=run)[1] <= 0.05
 
 
 def rates(n: int, kind: str, runs: int) -> np.ndarray:
@@ -151,6 +154,18 @@ def whole_rates(surface: tuple, n: int, way: str, runs: int) -> np.ndarray:
     return np.nanmean(said, axis=0)
 
 
+def humps(n: int, runs: int) -> float:
+    """How often antisymmetry is found in left and right shapes that have none."""
+    X, T = as_arrays(s4a.synthetic.ellipsoid(N_OF_SURFACE, (2.0, 3.0, 1.5)))
+    area = vertex_areas(X, T)
+    said = np.empty(runs)
+    for run in range(runs):
+        alike, odd = draw_shapes(np.random.default_rng([run, n, 8]), X, n)
+        a = both_sides(X + alike - odd, X + alike + odd, T, area).a
+        said[run] = antisymmetric((a * np.sqrt(area)[:, None]).reshape(n, -1), run)
+    return said.mean()
+
+
 def write(text: str) -> None:
     """A line, at once."""
     sys.stdout.write(text + "\n")
@@ -191,6 +206,10 @@ def real() -> None:
 if __name__ == "__main__":
     if sys.argv[1:] == ["real"]:
         real()
+    elif sys.argv[1:2] == ["antisymmetry"]:
+        runs = int(sys.argv[2]) if len(sys.argv) > 2 else 4000
+        for n in (12, 20):
+            write(f"{n} individuals, {runs} runs: antisymmetry found in {humps(n, runs):.3f}")
     elif sys.argv[1:2] == ["whole"]:
         runs = int(sys.argv[2]) if len(sys.argv) > 2 else 500
         write(f"{runs} runs a row, {N_PERMUTATIONS} permutations\n")
