@@ -3,7 +3,8 @@
 The commands are those that the pages name in backticks, such as ``speed.py growth``; they are
 scripts of ``tests/benchmarks``. Each writes what it prints into ``docs/_build/paper``, with machine
 and versions at its foot. All of them take hours on two cores; ``make paper ONLY=accuracy`` takes
-those whose command contains the word, ``make paper ONLY=--list`` names all and runs none.
+those whose command contains the word, ``make paper ONLY=--list`` names all and runs none, and
+``make paper ONLY=--rest`` those that have not ended well yet, as after a night that was too short.
 ``make bench`` runs those of speed into ``docs/performance``, which the page on it shows.
 ``tests/house/test_figures.py`` fails where a page quotes a figure without a command.
 """
@@ -46,7 +47,7 @@ SPEED = (
     ("speed.py", "whole", "51", "100000"),
     ("widgets.py",),
 )
-FLAGS = ("--speed", "--list")
+FLAGS = ("--speed", "--list", "--rest")
 PERFORMANCE = ROOT / "docs" / "performance"
 PACKAGES = ("numpy", "scipy", "xarray", "libigl", "robust_laplacian", "scikit-learn", "pymeshlab")
 CODE = re.compile(r"`([^`]+)`")
@@ -131,6 +132,12 @@ def run(command, out=OUT):
     return path, result.returncode
 
 
+def ended_well(command, out):
+    """Whether there is what a command printed, to its end."""
+    path = kept(command, out)
+    return path.exists() and "\n\nIt ended with " not in path.read_text(encoding="utf-8")
+
+
 def main(words):
     unknown = [word for word in words if word.startswith("-") and word not in FLAGS]
     if unknown:
@@ -138,6 +145,8 @@ def main(words):
         return 2
     known, out = (SPEED, PERFORMANCE) if "--speed" in words else (commands(), OUT)
     chosen = [c for c in known if all(word in " ".join(c) for word in words if word[0] != "-")]
+    if "--rest" in words:
+        chosen = [command for command in chosen if not ended_well(command, out)]
     codes = []
     for command in chosen:
         sys.stdout.write(f"{shlex.join(command)}\n")

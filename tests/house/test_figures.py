@@ -100,6 +100,20 @@ def test_what_a_command_prints_is_kept_with_machine_and_versions_at_its_foot(tmp
     assert "It ended with 3." in path.read_text(encoding="utf-8")
 
 
+def test_a_night_that_was_too_short_goes_on_with_what_has_not_ended_well(
+    tmp_path, monkeypatch, capsys
+):
+    (tmp_path / "good.py").write_text("print(1)")
+    (tmp_path / "bad.py").write_text("raise SystemExit(3)")
+    for name, value in {"ROOT": tmp_path, "BENCHMARKS": tmp_path, "OUT": tmp_path / "out"}.items():
+        monkeypatch.setattr(paper, name, value)
+    monkeypatch.setattr(paper, "commands", lambda: [("good.py",), ("bad.py",)])
+    assert paper.main([]) == 1
+    capsys.readouterr()
+    assert paper.main(["--rest", "--list"]) == 0
+    assert capsys.readouterr().out == "bad.py\n"
+
+
 def test_every_picture_of_the_pages_is_drawn_by_a_command():
     pages = [ROOT / "README.md", *DOCS.glob("*.md")]
     shown = {
