@@ -5,6 +5,7 @@ matched, see :mod:`s4a.method.part`.
 """
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +19,7 @@ from s4a.geometry.mesh import as_arrays, vertex_areas, vertex_normals
 from s4a.input.landmarks import with_landmarks
 from s4a.input.raw import shown
 from s4a.method import posterior
-from s4a.method.deform import displacement_in_template
+from s4a.method.deform import displacement_in_template, normal_displacement
 from s4a.method.part import (
     Fit,
     Part,
@@ -47,7 +48,8 @@ LEAST_SHARE = 0.15  # of the template that a part must have
 TESTED_SHARE = 0.45  # with less the intervals have not been tested
 LEAST_INSIDE = 0.6  # share of the part that must lie on the whole
 FOREIGN = 1.4  # times what the modes of the others leave of any shape of the study
-N_REMATCHED = 6  # shapes of the study whose part is matched again
+N_REMATCHED = 12  # shapes of the study whose part is matched again
+N_AGAIN = 48  # starts of a part that the modes do not fit
 N_ROUNDS = 2  # of finding what is there, and of matching it
 
 
@@ -81,10 +83,9 @@ def complete(
     What is missing is found.  Where the part is, the completed shape lies on it; elsewhere it is
     the mean of all shapes that agree with the part under the modes of the study and what these do
     not hold, a normal distribution (posterior shape model, Albrecht et al. 2013; the formula is in
-    :mod:`s4a.method.posterior`).  Its standard deviations are such that nine tenths of the study's
-    own shapes, each told from the same part by all others, lie within intervals of 90 %.
-    What all registrations of the study get wrong alike is not in them: around the true places they
-    are too narrow.
+    :mod:`s4a.method.posterior`).  Its standard deviations are such that nine tenths of what shapes
+    of the study have there, each cut in the same way, matched and completed by all others, lie
+    within intervals of 90 %.  What all registrations of the study get wrong alike is not in them.
 
     Parameters
     ----------
@@ -245,7 +246,25 @@ def place(
     if pose is not None:
         return fit_modes(part, whole, pose, free_size=model.scale), whole
     starts = different(rough_starts(part, whole, first), first, part)
-    return best_fit(part, whole, starts, first, model.scale), whole
+    fit = best_fit(part, whole, starts, first, model.scale)
+    if fit.residual > FOREIGN * left_by_others(model):
+        # it lies another way, or is of another kind: every way is looked at once more
+        ends = rough_starts(part, whole, first, turns="I")
+        starts = [fit.pose, *different(ends, first, part, N_AGAIN)]
+        fit = best_fit(part, whole, starts, first, model.scale)
+    return fit, whole
+
+
+def left_by_others(model: Model) -> float:
+    """The root mean square along the normals that the modes of the others leave of a shape at most.
+
+    Of a whole shape in its place, for unit area.
+    """
+    fields = model.fields - model.fields.mean(0)
+    weights = posterior.residual_weights(gram(fields, model.area))
+    left = np.einsum("st,tnx->snx", weights, fields, optimize=True)
+    off = normal_displacement(left, vertex_normals(model.X, model.template.low.T))
+    return float(np.sqrt((off**2 @ model.area).max()))
 
 
 def pose_of_landmarks(mesh: xr.Dataset, model: Model, mean: np.ndarray, first: Pose) -> Pose | None:
@@ -308,21 +327,16 @@ def completed(
 ) -> xr.Dataset:
     """The distribution of the whole when its low resolution is known where it is present."""
     target, present = model.template, known.present
-    mean = model.X + model.fields.mean(0)
-    weights = posterior.weights_of(known, model.modes)
-    calibration = posterior.Calibration(1.0, 1.0, 0.0)
+    density, left_out_error = 1.0, 0.0
     if not present.all():
-        calibration = posterior.calibrate(known, ~present)
-    y = (low - mean)[present]
-    inner = np.einsum("qnx,nx,n->q", known.columns[:, present], y, model.area[present])
-    found = posterior.condition(known, weights, inner, calibration.density)
-    columns = np.einsum("qp,qnx->pnx", weights, known.columns, optimize=True)
-    placed = _most_likely(model, present, low, mean, found, columns)  # (n_full, 3)
+        density, left_out_error = posterior.best_density(known, ~present)
+    again = match_again(model, present, density)
+    told = tell(model, known, low, density)
+    placed = _most_likely(model, present, low, told)  # (n_full, 3)
 
-    inflate = np.where(present, 1.0, calibration.factor)  # (n_low,)
-    spread = np.einsum("pr,pnx->rnx", found.root, columns, optimize=True) * inflate[:, None]
-    noise, usual = match_again(model, present)
-    white = noise + np.where(present, 0.0, calibration.factor**2 * known.rest)
+    inflate = np.where(present, 1.0, again.factor)  # (n_low,)
+    spread = told.spread * inflate[:, None]
+    white = again.noise + np.where(present, 0.0, again.factor**2 * known.rest)
     full = target.U @ _covariance(spread, white).reshape(-1, 9)
 
     pose, size = fit.pose, 1 / fit.pose.s
@@ -342,11 +356,11 @@ def completed(
         {
             "missing": float(1 - area @ there / area.sum()),
             "residual": size * fit.residual,
-            "usual_residual": size * usual,
+            "usual_residual": size * again.residual,
             "inside": fit.inside,
-            "factor": calibration.factor,
-            "match_noise": size * float(np.sqrt(noise)),
-            "left_out_error": size * calibration.error,
+            "factor": again.factor,
+            "match_noise": size * float(np.sqrt(again.noise)),
+            "left_out_error": size * left_out_error,
         },
         position=position,
         corner_vertex=target.original["corner_vertex"].values,
@@ -356,8 +370,8 @@ def completed(
             np.float32
         ),
         sample_position=np.reshape(drawn, (n_samples, len(X), 3)).astype(np.float32),
-        score=found.mean[:c],
-        score_covariance=found.root[:c] @ found.root[:c].T,
+        score=told.weights.mean[:c],
+        score_covariance=told.weights.root[:c] @ told.weights.root[:c].T,
         displacement=d.astype(np.float32),
         rotation=R,
         translation=t,
@@ -365,15 +379,44 @@ def completed(
     )
 
 
-def _most_likely(model, present, low, mean, found, columns):
-    """The mean of the posterior ``(n_full, 3)``: through the matches where there are any."""
-    target, c = model.template, len(model.modes)
-    told = mean + np.tensordot(found.mean, columns, 1)  # (n_low, 3)
+class Told(NamedTuple):
+    """What is told of a shape at low resolution, in the frame of the template.
+
+    ``weights`` of the ``columns (p, n_low, 3)``, ``spread (r, n_low, 3)``, the fields that they may
+    differ by, independent and of one standard deviation each, and ``image (n_low, 3)``, which goes
+    through the matches where there are any.
+    """
+
+    weights: posterior.Posterior
+    columns: np.ndarray
+    spread: np.ndarray
+    image: np.ndarray
+
+
+def tell(model: Model, known: posterior.Known, low: np.ndarray, density: float) -> Told:
+    """The distribution of a shape whose vertices `low` ``(n_low, 3)`` are known where present."""
+    target, present = model.template, known.present
+    mean = model.X + model.fields.mean(0)
+    weights = posterior.weights_of(known, model.modes)
+    y = (low - mean)[present]
+    inner = np.einsum("qnx,nx,n->q", known.columns[:, present], y, model.area[present])
+    found = posterior.condition(known, weights, inner, density)
+    columns = np.einsum("qp,qnx->pnx", weights, known.columns, optimize=True)
+    spread = np.einsum("pr,pnx->rnx", found.root, columns, optimize=True)
+    told = mean + np.tensordot(found.mean, columns, 1)
     kappa2 = float(target.low.eigenvalue[-1])
     left = posterior.extend(low - told, present, target.W, model.area, kappa2)
-    exact = model.mean_full + np.tensordot(found.mean[:c], model.modes_full, 1)
-    rest = told - mean - np.tensordot(found.mean[:c], columns[:c], 1) + left
-    return target.full.X + exact + target.U @ rest  # the modes have detail that U has not
+    return Told(found, columns, spread, told + left)
+
+
+def _most_likely(model, present, low, told):
+    """The mean of the posterior ``(n_full, 3)``."""
+    c = len(model.modes)
+    b = told.weights.mean[:c]
+    exact = model.mean_full + np.tensordot(b, model.modes_full, 1)
+    # the modes have detail that U has not
+    rest = told.image - model.X - model.fields.mean(0) - np.tensordot(b, told.columns[:c], 1)
+    return model.template.full.X + exact + model.template.U @ rest
 
 
 def _covariance(spread, white):
@@ -392,27 +435,55 @@ def _low_samples(model, spread, white, n, rng):
         yield moved + np.sqrt(white)[:, None] * rough(rng)
 
 
-def match_again(model: Model, present: np.ndarray) -> tuple[float, float]:
-    """Variance of the match of each coordinate: the same part of shapes of the study, found again.
+class Again(NamedTuple):
+    """What the same part of shapes of the study says, see :func:`match_again`."""
+
+    noise: float
+    factor: float
+    residual: float
+
+
+def match_again(model: Model, present: np.ndarray, density: float) -> Again:
+    """How well the same part of shapes of the study is found and completed by the others.
 
     The part is cut out of up to :data:`N_REMATCHED` of them, matched by the model of the others,
-    and compared with the match of the whole shape.  Nine tenths of all coordinates lie within the
-    interval of 90 % of this variance.  And the largest residual of their fits.
+    completed, and compared with the match of the whole shape.  Nine tenths of all coordinates lie
+    within the intervals of 90 %: where the part is of the variance ``noise``, where nothing is of
+    the deviations of the distribution times ``factor``, which errors of the pose and of the match
+    widen.  And ``residual``, the largest of their fits.
     """
     registration = registration_of(model.study)
     names = registration["shape"].values.tolist()
     others = [i for i, name in enumerate(names) if name != registration.attrs["template"]]
     chosen = others[:: max(1, -(-len(others) // N_REMATCHED))]
-    found = [_found_again(model, registration.isel(shape=i), i, present) for i in chosen]
-    gaps = np.abs(np.concatenate([gap for gap, _ in found]))
-    if not len(gaps):
-        return 0.0, np.inf
-    variance = float(np.quantile(gaps, 0.9) / posterior.WITHIN_90) ** 2
-    return variance, max(residual for _, residual in found)
+    found = [_found_again(model, registration.isel(shape=i), i, present, density) for i in chosen]
+    found = [one for one in found if one is not None]
+    if not found:
+        return Again(0.0, 1.0, np.inf)
+    gaps, ratios, residuals = zip(*found, strict=True)
+    return Again(deviation_of(gaps) ** 2, deviation_of(ratios), max(residuals))
 
 
-def _found_again(model, registered, i, present):
-    """Differences ``(d,)`` of shape i and its part matched by the others, and their residual."""
+def deviation_of(errors: Sequence[np.ndarray]) -> float:
+    """The standard deviation with whose interval of 90 % nine tenths of all errors agree.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.analysis.complete import deviation_of
+    >>> round(deviation_of([np.full(9, 1.6449), np.array([8.0])]), 2)
+    1.39
+    """
+    every = np.concatenate(errors)
+    return float(np.quantile(every, 0.9)) / posterior.WITHIN_90 if len(every) else 0.0
+
+
+def _found_again(model, registered, i, present, density):
+    """Of shape i completed from its part by the others.
+
+    Differences ``(d,)`` from the match of the whole where the part is, those beside their
+    deviations ``(e,)`` where nothing is, and the residual; None where hardly anything is left.
+    """
     study, name = model.study, registered["shape"].item()
     mesh = study["original"][name].to_dataset().load()
     X, T = as_arrays(mesh)
@@ -425,7 +496,7 @@ def _found_again(model, registered, i, present):
     pose = pose._replace(t=pose.t - center / size)
     part = part_of(*cut(X, T, kept))
     if len(part.X) < 100:
-        return np.zeros(0), 0.0
+        return None
     used = np.delete(np.arange(len(model.fields)), i)
     fields = model.fields[used]
     rest = model._replace(
@@ -435,9 +506,21 @@ def _found_again(model, registered, i, present):
     whole = whole_of(rest)
     fit = fit_modes(part, whole, pose, free_size=model.scale)
     low, again, fit = match(part, rest, whole, fit)
-    both = again & present
-    in_file = (low[both] - fit.pose.t) @ fit.pose.R / fit.pose.s
-    return (pose(in_file) - model.X[both] - model.fields[i, both]).ravel(), fit.residual
+
+    def error(image):
+        in_file = (image - fit.pose.t) @ fit.pose.R / fit.pose.s
+        return np.abs(pose(in_file) - model.X - model.fields[i])
+
+    gap = error(low)[again & present].ravel()
+    missing = ~again & ~present
+    if not missing.any() or model.area @ again < LEAST_SHARE:
+        return gap, np.zeros(0), fit.residual
+    known = posterior.know(
+        fields, model.template.low.Phi, model.X, model.area, again, scale=model.scale
+    )
+    told = tell(rest, known, low, density)
+    deviation = np.sqrt((told.spread[:, missing] ** 2).sum(0) + known.rest)
+    return gap, (error(told.image)[missing] / deviation).ravel(), fit.residual
 
 
 def cut(X: np.ndarray, T: np.ndarray, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

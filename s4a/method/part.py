@@ -118,7 +118,9 @@ def part_of(X: np.ndarray, T: np.ndarray) -> Part:
     return Part(X, T, vertex_normals(X, T), vertex_areas(X, T), on_boundary(T, len(X)))
 
 
-def rough_starts(part: Part, whole: Whole, first: Pose) -> list[tuple[float, Pose]]:
+def rough_starts(
+    part: Part, whole: Whole, first: Pose, *, turns: str = "O"
+) -> list[tuple[float, Pose]]:
     """Poses after rounds of ICP of some points of the part, with their residuals, the best first.
 
     Parameters
@@ -127,6 +129,8 @@ def rough_starts(part: Part, whole: Whole, first: Pose) -> list[tuple[float, Pos
     whole : Whole
     first : Pose
         How the shapes of the study lie in their files; turns and shifts are tried around it.
+    turns : {"O", "I"}
+        The 24 of a cube, or the 60 of an icosahedron.
     """
     P = first(part.X[part.spread(N_ROUGH)])
     center = P.mean(0)
@@ -134,7 +138,7 @@ def rough_starts(part: Part, whole: Whole, first: Pose) -> list[tuple[float, Pos
     anchors = _anchors(whole, first.s**2 * part.area.sum())
     shifts = [np.zeros(3), *(anchors - center)]
     ends = []
-    for turn in Rotation.create_group("O").as_matrix():
+    for turn in Rotation.create_group(turns).as_matrix():
         for shift in shifts:
             R, t = turn, center + shift - turn @ center
             residual = np.inf
@@ -160,7 +164,9 @@ def _anchors(whole, area):
     return np.array(centers)
 
 
-def different(ends: list[tuple[float, Pose]], first: Pose, part: Part) -> list[Pose]:
+def different(
+    ends: list[tuple[float, Pose]], first: Pose, part: Part, most: int = N_STARTS
+) -> list[Pose]:
     """The best poses that differ, and the best of those near the first."""
     points = part.X[part.spread(20)]
     near = [end for end in ends if angle(end[1], first) < LONGEST_TURN]
@@ -169,7 +175,7 @@ def different(ends: list[tuple[float, Pose]], first: Pose, part: Part) -> list[P
         at = pose(points)
         if all(np.linalg.norm(at - other(points), axis=1).mean() > 0.05 for other in chosen):
             chosen.append(pose)
-        if len(chosen) == N_STARTS:
+        if len(chosen) == most:
             break
     return chosen
 

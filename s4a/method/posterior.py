@@ -11,8 +11,8 @@ of modes, functions and small motions, y what is known at some vertices less the
 
 W the weights of these vertices by their areas, P the inverse of the variances before, and 0 of
 motions: how a part lies is not known either.  The same is asked of every shape of the study by the
-model of the others, with the same part known; how large these errors are beside what was predicted
-is the factor of all intervals.
+model of the others, with the same part known: how many places of a part count as independent is
+what makes these errors least.
 """
 
 from collections.abc import Callable
@@ -53,14 +53,6 @@ class Posterior(NamedTuple):
 
     mean: np.ndarray
     root: np.ndarray
-
-
-class Calibration(NamedTuple):
-    """What left-out shapes say: see :func:`calibrate`."""
-
-    density: float
-    factor: float
-    error: float
 
 
 def residual_weights(K: np.ndarray) -> np.ndarray:
@@ -222,19 +214,13 @@ def condition(known: Known, model: np.ndarray, seen: np.ndarray, density: float)
     return Posterior(root @ (root.T @ (weight * (model.T @ seen))), root)
 
 
-def left_out(known: Known, density: float, tested: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Errors of every shape told from its part by the model of the others, and what it predicts.
-
-    Returns
-    -------
-    error, deviation : float ndarray (s, t, 3)
-        At the tested vertices, and the standard deviations there.
-    """
+def left_out(known: Known, density: float, tested: np.ndarray) -> np.ndarray:
+    """Errors ``(s, t, 3)`` of every shape, told from its part by the others, at tested vertices."""
     s, q = known.n_fields, len(known.columns)
     rows = known.columns[:, tested].reshape(q, -1)  # (q, 3 t)
     fields = known.columns[:s]
     K = np.einsum("snx,tnx,n->st", fields, fields, known.area, optimize=True)
-    error, deviation = [], []
+    error = []
     for i in range(s):
         used = np.delete(np.arange(s), i)
         model = weights_of(known, modes_of(K, used))
@@ -243,34 +229,25 @@ def left_out(known: Known, density: float, tested: np.ndarray) -> tuple[np.ndarr
         own[used] = -1 / (s - 1)
         found = condition(known, model, known.gram @ own, density)
         error.append((own - model @ found.mean) @ rows)
-        spread = ((found.root.T @ model.T) @ rows) ** 2
-        deviation.append(np.sqrt(spread.sum(0) + known.rest))
-    shape = (s, len(tested), 3)
-    return np.reshape(error, shape), np.reshape(deviation, shape)
+    return np.reshape(error, (s, len(tested), 3))
 
 
-def calibrate(known: Known, where: np.ndarray) -> Calibration:
-    """How many places of the part count as independent, and the factor of the deviations.
+def best_density(known: Known, where: np.ndarray) -> tuple[float, float]:
+    """How many places of the part count as independent, and the error of shapes left out.
 
-    The density with the least error of shapes left out; then the factor with which nine tenths of
-    their coordinates lie within the intervals that are to hold nine tenths.
+    That of :data:`DENSITY` with the least root mean square error of a coordinate.
 
     Parameters
     ----------
     known : Known
     where : bool ndarray (n,)
-        Vertices at which it is to hold: those that are missing.
+        Vertices at which the errors are looked at: those that are missing.
     """
     rows = np.flatnonzero(where)
     tested = rows[:: max(1, len(rows) // N_TESTED)]
-    best = None
-    for density in DENSITY:
-        error, deviation = left_out(known, density, tested)
-        size = float(np.sqrt((error**2).mean()))
-        if best is None or size < best[2]:
-            best = density, np.abs(error / deviation), size
-    density, ratio, size = best
-    return Calibration(density, float(np.quantile(ratio, 0.9)) / WITHIN_90, size)
+    sizes = [float(np.sqrt((left_out(known, one, tested) ** 2).mean())) for one in DENSITY]
+    least = int(np.argmin(sizes))
+    return DENSITY[least], sizes[least]
 
 
 def extend(
