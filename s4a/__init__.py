@@ -4,8 +4,8 @@ The public names, by section of the paper:
 
 ========================  ====================================================================
 reading and cleaning      :func:`read_shapes`, :func:`read_shape`, :func:`read_labels`,
-                          :func:`clean`, :func:`with_landmarks`, :func:`read_mesh`,
-                          :func:`write_mesh`
+                          :func:`clean`, :func:`with_landmarks`, :func:`with_features`,
+                          :func:`read_mesh`, :func:`write_mesh`
 4.1 low resolution        :func:`coarsen`
 3.3 spectrum              :func:`spectrum`, :func:`reconstruct`
 4.1 pairs                 :func:`match_pair`
@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from s4a.input.collection import read_labels, read_shape, read_shapes
     from s4a.input.files import read_mesh, write_mesh
     from s4a.input.landmarks import with_landmarks
+    from s4a.input.scalars import with_features
     from s4a.method.pca import synthesize
     from s4a.method.remesh import coarsen
     from s4a.method.spectral import reconstruct, spectrum
@@ -105,6 +106,7 @@ __all__ = [
     "transfer_landmarks",
     "transfer_scalars",
     "verify",
+    "with_features",
     "with_field",
     "with_landmarks",
     "write_for",
@@ -128,6 +130,7 @@ PLACES = {
     "input.collection": "read_labels read_shape read_shapes",
     "input.landmarks": "with_landmarks",
     "input.files": "read_mesh write_mesh",
+    "input.scalars": "with_features",
     "method.pca": "synthesize",
     "method.remesh": "coarsen",
     "method.spectral": "reconstruct spectrum",

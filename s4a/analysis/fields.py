@@ -16,7 +16,7 @@ import xarray as xr
 from s4a.analysis.inputs import all_registered
 from s4a.analysis.transfer import on_template
 from s4a.input.files import files_named, slug
-from s4a.input.scalars import SUFFIXES, read_scalars
+from s4a.input.scalars import SUFFIXES, of_vertices, read_scalars
 from s4a.input.subjects import listed
 from s4a.schema import FIELD_UNIT, dataset, in_unit
 from s4a.study.store import lock, task_key, write
@@ -99,11 +99,13 @@ def with_field(
     for i, one in enumerate(shapes):
         if one not in missing:
             mesh = study["original"][one].to_dataset()
-            carried[i] = on_template(study, one, _of_vertices(given[one], mesh, name, one))
-    field = dataset({"template": registration.attrs.get("template", "")}, carried_field=carried)
-    field = in_unit(field.assign_coords(shape=shapes), unit, of=FIELD_UNIT)
+            field = of_vertices(given[one], mesh, f"the field {name!r} of {one}")
+            carried[i] = on_template(study, one, field)
+    template = registration.attrs.get("template", "")
+    of_all = dataset({"template": template}, carried_field=carried).assign_coords(shape=shapes)
+    of_all = in_unit(of_all, unit, of=FIELD_UNIT)
     nodes = {node.path: node.to_dataset(inherit=False) for node in study.subtree}
-    return xr.DataTree.from_dict(nodes | {f"/fields/{name}": field}, name=study.name)
+    return xr.DataTree.from_dict(nodes | {f"/fields/{name}": of_all}, name=study.name)
 
 
 def _by_shape(values, shapes, name, study):
@@ -125,38 +127,6 @@ def _by_shape(values, shapes, name, study):
             f"{len(values)}; or give a dict of shape to array"
         )
     return dict(zip(shapes, values, strict=True))
-
-
-def _of_vertices(values, mesh, name, shape):
-    """The field on the vertices of the cleaned mesh, checked."""
-    values = np.asarray(values)
-    what = f"the field {name!r} of {shape}"
-    if values.dtype.kind not in "iufb":
-        raise ValueError(f"{what} needs numbers, found {values.dtype}")
-    n = mesh.sizes["vertex"]
-    in_file = mesh.sizes.get("file_vertex_index", n)
-    if values.shape not in ((n,), (in_file,)):
-        of_file = "" if n == in_file else f", or each of the {in_file} of its file"
-        raise ValueError(
-            f"{what} needs a number for each of the {n} vertices of its mesh{of_file}; found shape "
-            f"{values.shape}"
-        )
-    if len(values) == in_file and "file_vertex" in mesh:
-        values = values[mesh["file_vertex"].values]
-    values = values.astype(float)
-    if np.isinf(values).any():
-        raise ValueError(
-            f"{what} needs finite numbers, or NaN where there is none; {np.isinf(values).sum()} "
-            "are infinite"
-        )
-    known = values[~np.isnan(values)]
-    if not len(known):
-        raise ValueError(f"{what} is NaN everywhere; leave the shape out with partial=True")
-    if len(known) < n:
-        log.warning("%s is NaN at %d of %d vertices", what, n - len(known), n)
-    if np.ptp(known) <= 1e-12 * abs(known).max():
-        log.warning("%s is %.4g everywhere: is it the right file?", what, known[0])
-    return values
 
 
 def write_field(study: xr.DataTree, name: str, folder: Path | str) -> Path:

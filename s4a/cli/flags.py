@@ -54,6 +54,7 @@ HELP = {
     "template": "name of the shape to register to (default: the median shape)",
     "reflect": "shapes to mirror: their names, with commas; COLUMN=VALUE of the table; or auto",
     "landmarks": "folder of landmark files named as the shapes, which guide registration",
+    "features": "fields that guide registration, with commas: sulc is a.sulc.npy beside a.ply",
     "table": "CSV with a column 'shape', covariates and groups, for the statistics",
     "doubtful": "what becomes of doubtful shapes: they stay apart, or the run stops",
     "keep_doubtful": "take doubtful shapes into modes and statistics",

@@ -1,15 +1,23 @@
 """Files of scalar fields (6.1, 6.2): a number per vertex, in the order of the file of the mesh."""
 
+import logging
 import zipfile
+from collections.abc import Iterable, Mapping
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import xarray as xr
 
 from s4a.input import bounded
 from s4a.input.annotations import check_cells, is_number, number_of, table_rows
+from s4a.input.files import stem_of
 from s4a.input.formats import gifti_arrays, ply_properties
 from s4a.input.raw import check_there, shown, text_of
+from s4a.schema import dataset, require
+
+log = logging.getLogger(__name__)
 
 CURV = b"\xff\xff\xff"  # how FreeSurfer's files of a number per vertex begin
 SUFFIXES = (".npy", ".npz", ".ply", ".csv", ".txt", ".gii")
@@ -65,6 +73,151 @@ def read_scalars(path: Path | str, name: str = "", n: int | None = None) -> np.n
         wanted = "one number per vertex" if n is None else f"{n} numbers, one per vertex,"
         raise ValueError(f"{shown(path)}: {wanted} needed, found an array of shape {values.shape}")
     return values.astype(float)
+
+
+def of_vertices(values: Any, mesh: xr.Dataset, what: str) -> np.ndarray:
+    """A field ``(n,)`` on the vertices of a clean mesh, a number for each of these or of its file.
+
+    ValueError where it is not numbers, has another length, is infinite or NaN everywhere; `what`
+    names it.
+    """
+    values = np.asarray(values)
+    if values.dtype.kind not in "iufb":
+        raise ValueError(f"{what} needs numbers, found {values.dtype}")
+    n = mesh.sizes["vertex"]
+    in_file = mesh.sizes.get("file_vertex_index", n)
+    if values.shape not in ((n,), (in_file,)):
+        of_file = "" if n == in_file else f", or each of the {in_file} of its file"
+        raise ValueError(
+            f"{what} needs a number for each of the {n} vertices of its mesh{of_file}; found shape "
+            f"{values.shape}"
+        )
+    if len(values) == in_file and "file_vertex" in mesh:
+        values = values[mesh["file_vertex"].values]
+    values = values.astype(float)
+    if np.isinf(values).any():
+        raise ValueError(
+            f"{what} needs finite numbers, or NaN where there is none; {np.isinf(values).sum()} "
+            "are infinite"
+        )
+    known = values[~np.isnan(values)]
+    if not len(known):
+        raise ValueError(f"{what} is NaN everywhere: leave it out")
+    if len(known) < n:
+        log.warning("%s is NaN at %d of %d vertices", what, n - len(known), n)
+    if np.ptp(known) <= 1e-12 * abs(known).max():
+        log.warning("%s is %.4g everywhere: is it the right file?", what, known[0])
+    return values
+
+
+def with_features(
+    mesh: xr.Dataset, features: Mapping[str, Any], *, weight: float = 1.0
+) -> xr.Dataset:
+    """A mesh with fields that guide its registration, such as sulcal depth or curvature.
+
+    Fields are paired by name.  Those that two shapes have are descriptors of first maps in far
+    poses, and columns beside position (and normal) where nearest points are searched: in first maps
+    after ICP and in the elastic rounds.  They are taken as the first K functions have them, and one
+    standard deviation counts as much as 2 % of sqrt(area), times `weight`
+    (:data:`s4a.method.shape.FIELD_WEIGHT`).
+
+    Parameters
+    ----------
+    mesh : Dataset
+        Clean, as of :func:`s4a.read_shape` or :func:`s4a.clean`.
+    features : dict of str to array_like (vertex,) or path
+        Name -> a number for each vertex of the mesh, or of its file; or a file of them
+        (:func:`s4a.input.scalars.read_scalars`).  NaN counts as the mean.
+    weight : float
+        Of them all: more where they are to be believed and the surface says little, as on a round
+        one.  All shapes need the same.
+
+    Returns
+    -------
+    Dataset
+        The mesh with ``feature_name(feature)``, ``feature_value(vertex, feature)`` and
+        ``feature_weight(feature)``; others that it had are gone.
+
+    Raises
+    ------
+    ValueError
+        When there is none, a file cannot be read, a field does not fit the mesh, or the weight is
+        not positive.
+
+    Examples
+    --------
+    >>> import s4a
+    >>> mesh = s4a.clean(s4a.synthetic.ellipsoid(200))
+    >>> s4a.with_features(mesh, {"height": mesh["position"].values[:, 2]})["feature_value"].shape
+    (200, 1)
+    """
+    require(mesh, "position", "corner_vertex", what="mesh")
+    if not features:
+        raise ValueError("features needs a field at least, found none")
+    if not (np.isfinite(weight) and weight > 0):
+        raise ValueError(f"weight must be positive, found {weight!r}")
+    values = [
+        of_vertices(
+            read_scalars(given, name) if isinstance(given, str | Path) else given,
+            mesh,
+            f"the feature {name!r}",
+        )
+        for name, given in features.items()
+    ]
+    found = dataset(
+        feature_name=list(features),
+        feature_value=np.stack(values, axis=1),
+        feature_weight=np.full(len(values), float(weight)),
+    )
+    return mesh.drop_dims("feature", errors="ignore").merge(found)
+
+
+def files_beside(path: Path | str, names: Iterable[str]) -> dict[str, Path]:
+    """The files with fields of a mesh, by name: beside its file, or that itself.
+
+    Of the field ``sulc`` of ``a.ply`` that is ``a.sulc`` or ``a.sulc.npy``, with any of
+    :data:`SUFFIXES`; or ``a.ply`` where its vertices have a property ``sulc``.
+
+    Raises
+    ------
+    ValueError
+        When there are two of one name.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import numpy as np
+    >>> from s4a.input.scalars import files_beside
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> np.save(folder / "a.sulc.npy", np.zeros(3))
+    >>> [file.name for file in files_beside(folder / "a.ply", ["sulc", "curv"]).values()]
+    ['a.sulc.npy']
+    """
+    mesh, found = Path(path), {}
+    for name in names:
+        endings = [end + packed for end in ("", *SUFFIXES) for packed in ("", ".gz")]
+        there = [mesh.with_name(f"{stem_of(mesh)}.{name}{end}") for end in endings]
+        there = [file for file in there if file.is_file()]
+        if len(there) > 1:
+            raise ValueError(
+                f"one file with the field {name!r} of {shown(mesh)} needed: "
+                f"{shown(there[0])} and {shown(there[1])}"
+            )
+        if there:
+            found[name] = there[0]
+        elif mesh.is_file() and name in _properties(mesh):
+            found[name] = mesh
+    return found
+
+
+def _properties(path):
+    """The names of what a PLY file has for its vertices; none of another file, or a broken one."""
+    try:
+        data = bounded.content(path)
+        return ply_properties(data) if data[:3] == b"ply" else {}
+    except (ValueError, OSError):  # its own task will say so
+        return {}
 
 
 def _values(data, file, name):

@@ -21,6 +21,8 @@ boundaries lie on each other already they are taken for one line, and the square
 across the boundary and along the surface, times its length, are added from the third step on.
 
 Landmarks that a user marked on both surfaces add their squared distances, each by the same weight.
+Fields that a user gives on both, such as sulcal depth, count beside position and normal in what is
+nearest.
 
 What K functions cannot follow is left to local rounds: a displacement d (n, 3) of the vertices of
 low resolution, beyond the warp, that minimises
@@ -42,7 +44,7 @@ from scipy.spatial import cKDTree
 
 from s4a.geometry.closest import closest_point_in_star, features, interpolate
 from s4a.method.joint import Warp, move, turn
-from s4a.method.shape import Basis
+from s4a.method.shape import Basis, common_fields, field_columns
 from s4a.method.spectral import factor
 
 # Of the first and of the last step.  Chosen on a pair of faces, of brains and of skulls and two
@@ -65,27 +67,30 @@ N_LOCAL_ROUNDS = 10
 
 
 def nearest_on_surface(
-    source: Basis, X: np.ndarray, normals: np.ndarray
+    source: Basis, X: np.ndarray, normals: np.ndarray, target: Basis | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """The points of the source's surface nearest to rows of X in position and normal.
 
-    Unlike nearest vertices they do not crowd where the source is finely meshed.
+    And in the fields that guide both. Unlike nearest vertices they do not crowd where the source is
+    finely meshed.
 
     Parameters
     ----------
     source : Basis
     X, normals : float ndarray (n, 3)
+    target : Basis, optional
+        The surface whose n vertices these are, which may have fields.
 
     Returns
     -------
     points, normals : float ndarray (n, 3)
         On the surface of the source.
     """
-    rows = features(X, normals)  # (n, 6)
-    nearest = source.tree.query(rows)[1]
-    triangle, weights = closest_point_in_star(
-        rows, nearest, source.tree.data, source.T, source.stars
-    )
+    names = () if target is None else common_fields(source, target)
+    rows = features(X, normals, field_columns(target, names) if names else None)  # (n, 6 + f)
+    tree = source.guided_tree(names)
+    nearest = tree.query(rows)[1]
+    triangle, weights = closest_point_in_star(rows, nearest, tree.data, source.T, source.stars)
     points = interpolate(source.X, source.T, triangle, weights)
     normals = interpolate(source.normals, source.T, triangle, weights)
     return points, unit(normals)
@@ -102,7 +107,7 @@ def points_ahead(source: Basis, target: Basis, X: np.ndarray) -> tuple[np.ndarra
         Unit mean of the normals of both surfaces.
     """
     normals = target.normals_at(X)
-    y, normals_y = nearest_on_surface(source, X, normals)
+    y, normals_y = nearest_on_surface(source, X, normals, target)
     return y, unit(normals + normals_y)
 
 

@@ -13,9 +13,10 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from s4a.geometry.align import Motion, align, farthest_points, realign, rigid_transform
+from s4a.geometry.closest import POSITION_WEIGHT
 from s4a.geometry.mesh import edges
 from s4a.method import fmap, joint
-from s4a.method.shape import Basis, corresponding_landmarks
+from s4a.method.shape import Basis, common_fields, corresponding_landmarks, field_columns
 
 N_LANDMARKS = 10  # of step 3
 # Of a pair alone, in a far pose: signatures, functions by k_init, and weight of the orientation.
@@ -54,9 +55,17 @@ def motion_onto(source: Basis, target: Basis) -> Motion:
 
 
 def nearest_after_motion(source: Basis, target: Basis, motion: Motion) -> np.ndarray:
-    """The vertex of the moved source nearest to every vertex of the target ``(n_target,)``."""
+    """The vertex of the moved source nearest to every vertex of the target ``(n_target,)``.
+
+    Nearest in position and in the fields that guide both.
+    """
     R, t = motion
-    return cKDTree(source.X @ R.T + t).query(target.X)[1]
+    P, Q = source.X @ R.T + t, target.X
+    names = common_fields(source, target)
+    if names:
+        P = np.concatenate([POSITION_WEIGHT * P, field_columns(source, names)], axis=1)
+        Q = np.concatenate([POSITION_WEIGHT * Q, field_columns(target, names)], axis=1)
+    return cKDTree(P).query(Q)[1]
 
 
 def landmarks_after_motion(

@@ -28,7 +28,7 @@ from s4a.method.nearest import (
     nearest_float32,
     nearest_rows,
 )
-from s4a.method.shape import Basis, Shape
+from s4a.method.shape import Basis, Shape, common_fields
 from s4a.schema import dataset, require
 
 FILTERS = {"wks": wave_filter, "hks": heat_filter}
@@ -251,7 +251,8 @@ def fmap_from_descriptors(
     Parameters
     ----------
     source, target : Basis
-        With all functions that there are; the triangles are for `oriented`.
+        With all functions that there are; the triangles are for `oriented`.  The fields that guide
+        both are descriptors too.
     landmarks : tuple of int ndarray (p,)
         Corresponding vertices.
     kind, n, every, laplacian, commute, oriented : see :func:`fit_descriptors`
@@ -270,6 +271,7 @@ def fmap_from_descriptors(
         f = signature(end.Phi, kernel)  # (n, d)
         if landmark is not None:
             f = np.column_stack([f, landmark_signature(end.Phi, kernel, landmark)])
+        f = np.column_stack([f, *(end.fields[name] for name in common_fields(source, target))])
         if curvature:
             f = np.column_stack([f, *curvatures(end)])
         f = f - end.area @ f

@@ -15,7 +15,7 @@ import xarray as xr
 from s4a.geometry.mesh import as_arrays, stiffness, vertex_areas
 from s4a.method.remesh import coarsen, laplacian
 from s4a.method.scalable import reduced
-from s4a.method.shape import Shape, vertices_of_landmarks
+from s4a.method.shape import Shape, features_of, vertices_of_landmarks
 from s4a.method.spectral import factor, spectrum
 from s4a.schema import dataset
 
@@ -224,7 +224,8 @@ def low_resolution(
 
     With `lift` also :func:`lifted`.  With ``method="scalable"`` :func:`s4a.method.scalable.reduced`
     is in their place, which can neither be lifted nor wrapped.  Of landmarks that guide it has
-    ``guide_vertex``, the coarse vertices that weigh most in U there.
+    ``guide_vertex``, the coarse vertices that weigh most in U there; of fields that guide their
+    means by the weights of U.
     """
     if method == "scalable":
         low = reduced(mesh, n_coarse=n_coarse, k=k, seed=seed)
@@ -232,8 +233,22 @@ def low_resolution(
         coarse = coarsen(mesh, n_coarse=n_coarse, wrap=wrap, seed=seed)
         low = spectrum(coarse, k=k + SPARE) if lift else spectrum(coarse, k=k)
         low = lifted(mesh, low, k) if lift else low
-    landmarks = vertices_of_landmarks(mesh)
-    if not landmarks:
-        return low
-    vertex = Shape(mesh, low).cell[list(landmarks.values())]
-    return low.merge(dataset(guide_name=list(landmarks), guide_vertex=vertex))
+    shape, landmarks, fields = Shape(mesh, low), vertices_of_landmarks(mesh), features_of(mesh)
+    if landmarks:
+        vertex = shape.cell[list(landmarks.values())]
+        low = low.merge(dataset(guide_name=list(landmarks), guide_vertex=vertex))
+    if fields:
+        values = np.stack([mean_over_cells(shape, one) for one in fields.values()], axis=1)
+        weights = mesh["feature_weight"].values
+        names = list(fields)
+        low = low.merge(dataset(feature_name=names, feature_value=values, feature_weight=weights))
+    return low
+
+
+def mean_over_cells(shape: Shape, values: np.ndarray) -> np.ndarray:
+    """Means of a field ``(n,)`` by the weights of U ``(n_coarse,)``; NaN where none is known."""
+    known = np.isfinite(values)
+    area = np.where(known, vertex_areas(*as_arrays(shape.original)), 0)
+    total = shape.U.T @ area
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return (shape.U.T @ (area * np.where(known, values, 0))) / total

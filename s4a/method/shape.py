@@ -28,10 +28,13 @@ from s4a.geometry.mesh import (
 )
 from s4a.method.deform import smoother
 from s4a.method.remesh import laplacian
-from s4a.method.spectral import unit_mass
+from s4a.method.spectral import project, unit_mass
 
 N_SPREAD = 1000  # spread vertices of a shape on which Consistent ZoomOut looks for matches
 N_PAIRED = 300  # spread vertices of a shape that rigid alignment pairs
+# One standard deviation of a field that guides, beside positions by POSITION_WEIGHT: as much as 2 %
+# of sqrt(area).  With twice as much the labels of cortex are carried over less well
+FIELD_WEIGHT = 0.1
 N_CENTRAL = 25_000  # vertices by which a field on a shape is projected
 
 
@@ -66,6 +69,8 @@ class Basis:
         Unit normals of the finer surface that the vertices are of; by default those of the mesh.
     landmarks : dict of str to int
         The vertex at each landmark that was given, or nearest to it.
+    fields : dict of str to float ndarray (n,)
+        Those that were given to guide, see :func:`smooth_fields`.
     """
 
     X: np.ndarray
@@ -80,6 +85,7 @@ class Basis:
     lifted: bool = False
     surface_normals: np.ndarray | None = None
     landmarks: dict[str, int] = field(default_factory=dict)
+    fields: dict[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.mass is None:
@@ -133,6 +139,19 @@ class Basis:
     def tree(self) -> cKDTree:
         """KD-tree over position and normal of the vertices, 6 dims."""
         return feature_tree(self.X, self.T)
+
+    def guided_tree(self, names: tuple[str, ...]) -> cKDTree:
+        """That over position, normal and some of the fields, 6 dims and one for each."""
+        if not names:
+            return self.tree
+        if names not in self._guided:
+            rows = np.concatenate([self.tree.data, field_columns(self, names)], axis=1)
+            self._guided[names] = cKDTree(rows, leafsize=64)
+        return self._guided[names]
+
+    @cached_property
+    def _guided(self) -> dict[tuple[str, ...], cKDTree]:
+        return {}
 
     @cached_property
     def normals(self) -> np.ndarray:
@@ -289,10 +308,10 @@ class Shape:
         Phi = self.coarse["eigenfunction"].values
         eigenvalue = self.coarse["eigenvalue"].values
         mass = unit_mass(self.coarse) if self.is_sampled else None
-        landmarks = vertices_of_landmarks(self.coarse)
-        return Basis(
-            self.to_frame(X), T, area / area.sum(), Phi, eigenvalue, mass, landmarks=landmarks
-        )
+        area = area / area.sum()
+        X, landmarks = self.to_frame(X), vertices_of_landmarks(self.coarse)
+        low = Basis(X, T, area, Phi, eigenvalue, mass, landmarks=landmarks)
+        return replace(low, fields=smooth_fields(self.coarse, low))
 
     @cached_property
     def W(self) -> sp.csr_matrix:
@@ -340,6 +359,7 @@ class Shape:
             self.area_weighted,
             lifted,
             landmarks=vertices_of_landmarks(self.original),
+            fields={name: self.U @ values for name, values in low.fields.items()},
         )
 
     @property
@@ -388,6 +408,42 @@ def vertices_of_landmarks(mesh: xr.Dataset) -> dict[str, int]:
         heaviest = mesh["guide_barycentric"].values.argmax(1)
         vertex = T[mesh["guide_triangle"].values, heaviest]
     return dict(zip(mesh["guide_name"].values.tolist(), vertex.tolist(), strict=True))
+
+
+def features_of(mesh: xr.Dataset) -> dict[str, np.ndarray]:
+    """The fields of :func:`s4a.with_features`, by name ``(n,)``; none where a mesh has none."""
+    if "feature_name" not in mesh:
+        return {}
+    names = mesh["feature_name"].values.tolist()
+    return dict(zip(names, mesh["feature_value"].values.T, strict=True))
+
+
+def smooth_fields(coarse: xr.Dataset, low: Basis) -> dict[str, np.ndarray]:
+    """Fields that guide as the functions of a surface have them, of mean 0 and variance 1.
+
+    Times their weights.  Noise from vertex to vertex would draw matches aside.  NaN counts as the
+    mean; fields that are the same everywhere say nothing, and are left out.
+    """
+    found = {}
+    for i, (name, values) in enumerate(features_of(coarse).items()):
+        known = np.isfinite(values)
+        share = np.where(known, low.area, 0) / low.area[known].sum()
+        around = np.where(known, values - share @ np.where(known, values, 0), 0)
+        spread = np.sqrt(share @ around**2)
+        if spread > 1e-12 * abs(values[known]).max():
+            around *= coarse["feature_weight"].values[i] / spread
+            found[name] = low.Phi @ project(low.Phi, low.mass, around)
+    return found
+
+
+def common_fields(source: Basis, target: Basis) -> tuple[str, ...]:
+    """Names of the fields that guide both."""
+    return tuple(name for name in target.fields if name in source.fields)
+
+
+def field_columns(basis: Basis, names: tuple[str, ...]) -> np.ndarray:
+    """Fields ``(n, f)`` as columns of rows in which nearest points are searched."""
+    return FIELD_WEIGHT * np.stack([basis.fields[name] for name in names], axis=1)
 
 
 def corresponding_landmarks(source: Basis, target: Basis) -> tuple[np.ndarray, np.ndarray]:

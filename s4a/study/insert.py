@@ -19,6 +19,7 @@ from s4a.input.files import files_named
 from s4a.input.hands import AUTO, is_of_other_hand, mirror_image
 from s4a.input.landmarks import SUFFIXES, with_landmarks
 from s4a.input.plausibility import find_warnings
+from s4a.input.scalars import files_beside, with_features
 from s4a.input.subjects import listed
 from s4a.method.first_map import motion_onto
 from s4a.method.lift import low_resolution
@@ -220,7 +221,7 @@ def read_new(
     options: Options,
     landmarks: Path | str | None = None,
 ) -> tuple[dict[str, xr.Dataset], dict[str, dict[str, Any]]]:
-    """The new meshes that can be used, with landmarks, and the attributes of all for the report."""
+    """The new meshes that can be used, with what guides them, and attributes for the report."""
     meshes, attrs = read_and_clean(shapes, options)
     files = {} if landmarks is None else files_named(landmarks, meshes, "landmarks", SUFFIXES)
     for name, file in files.items():
@@ -229,6 +230,11 @@ def read_new(
         except ValueError as error:
             attrs[name] = attrs[name] | {"status": "excluded", "reason": str(error)}
             del meshes[name]
+    for name, mesh in list(meshes.items()):
+        path = mesh.attrs.get("path", "")
+        fields = files_beside(path, options.feature_names) if path else {}
+        if fields:
+            meshes[name] = with_features(mesh, fields)
     return meshes, attrs
 
 

@@ -13,6 +13,7 @@ from typing import Any, Self, get_args
 import xarray as xr
 
 from s4a.input.clean import check_components
+from s4a.input.files import slug
 from s4a.input.labels import check_label
 from s4a.method.median import NORMS
 from s4a.method.shape import N_CENTRAL, N_SPREAD, Shape
@@ -198,6 +199,7 @@ class Options:
     reflect: str | list[str] | None = None
     table: Path | str | None = None
     landmarks: Path | str | None = None
+    features: str | list[str] | None = None
     doubtful: str = "apart"
     keep_doubtful: bool = False
     seed: int = 0
@@ -217,6 +219,7 @@ class Options:
         if isinstance(self.reflect, list):
             object.__setattr__(self, "reflect", ",".join(map(str, self.reflect)))
         check_text("reflect", self.reflect)
+        self._check_features()
         if self.landmarks is not None and self.refine != "elastic":
             raise ValueError(
                 f"landmarks pull elastic rounds, and refine={self.refine!r} makes none: "
@@ -233,6 +236,19 @@ class Options:
             raise ValueError(
                 "keep_doubtful=True takes doubtful shapes in and doubtful='stop' ends the run "
                 "where there are any: leave out one of both"
+            )
+
+    def _check_features(self):
+        if isinstance(self.features, list | tuple):
+            object.__setattr__(self, "features", ",".join(map(str, self.features)))
+        check_text("features", self.features)
+        wrong = [name for name in self.feature_names if slug(name) != name]
+        if wrong:
+            raise ValueError(f"features need names of letters, digits, _ and -, found {wrong[0]!r}")
+        if self.features is not None and self.label is not None:
+            raise ValueError(
+                "features= are fields of the vertices of meshes, and label= makes meshes of "
+                "volumes, whose vertices nobody knows before: leave out one of both"
             )
 
     def _check_choices(self):
@@ -327,6 +343,11 @@ both
     def to_report(self) -> dict[str, str]:
         """The options in words, as the attributes of ``/report``."""
         return {field.name: str(getattr(self, field.name)) for field in fields(self)}
+
+    @property
+    def feature_names(self) -> list[str]:
+        """Names of the fields that guide registration."""
+        return self.features.split(",") if isinstance(self.features, str) else []
 
     @classmethod
     def from_report(cls, study: xr.DataTree) -> Self:

@@ -39,11 +39,11 @@ from s4a.study.sources import (
     Collection,
     Marked,
     Sources,
+    find_guides,
     find_sources,
     kept_table,
-    landmarks_of,
     of_contents,
-    remarks_on_landmarks,
+    remarks_on_guides,
 )
 from s4a.study.store import (
     STRUCTURES,
@@ -190,6 +190,10 @@ def analyse(
         Folder with a file of landmarks for some or all shapes, named as the shape: 3D Slicer
         (.mrk.json), CSV or MeshLab (.pp).  Those of one name guide and pull registration, see
         :func:`s4a.with_landmarks`, which gives them to meshes in memory.
+    features : list of str, optional
+        Names of fields of the vertices that guide registration, such as ``sulc``, see
+        :func:`s4a.with_features`, which gives them to meshes in memory.  Of the file ``a.ply`` in
+        ``a.sulc`` or ``a.sulc.npy`` (:func:`s4a.input.scalars.files_beside`), or properties of PLY.
     label : int, several, or "all", optional
         The files are label volumes, see :func:`s4a.read_labels`.
     doubtful : {"apart", "stop"}
@@ -256,7 +260,7 @@ def analyse(
     volumes = settings.label is not None
     sources = find_sources(shapes, settings.pattern, volumes=volumes)
     remarks = remarks_on_files(shapes, settings.pattern, volumes=volumes)
-    marked = landmarks_of(sources, settings.landmarks)
+    marked = find_guides(sources, settings.landmarks, settings.feature_names)
     subjects = None if settings.table is None else read_table(settings.table, list(sources))
     if has_structures(subjects):
         parts = parts_of_table(sources, marked, subjects, settings)
@@ -276,7 +280,7 @@ def analyse_part(part: Part, remarks: list[str], store: Path | str, n_jobs: int 
             write(of_contents(subjects, sources), run.folder / "subjects.nc")
         else:
             remarks = remarks + kept_table(run.folder / "subjects.nc", sources)
-        remarks = remarks + remarks_on_landmarks(sources, marked)
+        remarks = remarks + remarks_on_guides(sources, marked, options.feature_names)
         with run.notes.whole(), run.unforeseen_told():
             run_steps(run, sources, marked, options, remarks)
 
@@ -379,8 +383,10 @@ def read_and_clean(
         also: dict[str, Any] = {"reflected": True} if n in reflected else {}
         key = (content, cleaning, *also.values())
         if n in marked:
-            also["landmarks"] = marked[n]
-            key = (*key, marked[n][1])  # wherever the file lies
+            also["guides"] = landmarks, features = marked[n]
+            # wherever the files lie
+            key = (*key, *([landmarks[1]] if landmarks else []))
+            key = (*key, *((name, content) for name, (_, content) in features.items()))
         given = (source, content, cleaning, also)
         todo.append(Task(n, f"original/{n}.nc", clean_shape, given, key))
     return run.do("read and clean", todo)

@@ -1,8 +1,9 @@
 """The shapes that an analysis is given (5.1, the data), each with the key of its content."""
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import xarray as xr
 
@@ -10,14 +11,26 @@ from s4a.geometry.mesh import as_dataset
 from s4a.input.files import check_names, files_named, find_meshes
 from s4a.input.landmarks import SUFFIXES
 from s4a.input.raw import read_bytes, shown
+from s4a.input.scalars import files_beside
 from s4a.input.subjects import listed
+from s4a.method.shape import features_of
 from s4a.schema import require
 from s4a.study.store import read, task_key
 
 # files; or by name files or meshes, Datasets or (points, triangles); or what read_shapes gives
 Collection = Path | str | list[Path | str] | dict[str, Any] | xr.DataTree
 Sources = dict[str, tuple[str | xr.Dataset, str]]  # name -> path or mesh, key of its content
-Marked = dict[str, tuple[str, str]]  # name -> file of landmarks, key of its content
+Keyed = tuple[str, str]  # a file, and the key of its content
+
+
+class Guides(NamedTuple):
+    """Files of what guides the registration of a shape: landmarks, and fields by their names."""
+
+    landmarks: Keyed | None
+    features: dict[str, Keyed]
+
+
+Marked = dict[str, Guides]  # by the name of the shape
 
 
 def find_sources(
@@ -90,21 +103,63 @@ def content_key(mesh: xr.Dataset) -> str:
     return task_key(list(variables), *parts)
 
 
-def landmarks_of(sources: Sources, folder: Path | str | None) -> Marked:
-    """The files of landmarks that a folder has for the shapes; none without a folder."""
+def find_guides(
+    sources: Sources, folder: Path | str | None = None, features: Sequence[str] = ()
+) -> Marked:
+    """What guides the shapes: landmarks of a folder, and fields beside their files.
+
+    ValueError where there is no file of landmarks, or of a field, for any shape.
+    """
     files = {} if folder is None else files_named(folder, sources, "landmarks", SUFFIXES)
-    return {name: (str(file), content_of_file(file)) for name, file in files.items()}
+    beside = {
+        name: files_beside(source, features)
+        for name, (source, _) in sources.items()
+        if features and isinstance(source, str)
+    }
+    for one in features:
+        if not any(one in of for of in [*beside.values(), *_held(sources)]):
+            first = next(iter(sources))
+            raise ValueError(
+                f"features: no shape has a field {one!r}: a file such as {first}.{one}.npy beside "
+                "that of the mesh needed, a property of the vertices of PLY files, or "
+                "s4a.with_features for meshes in memory"
+            )
+    marked = {}
+    for name in sources:
+        landmarks = _keyed(files[name]) if name in files else None
+        of = {one: _keyed(file) for one, file in beside.get(name, {}).items()}
+        if landmarks or of:
+            marked[name] = Guides(landmarks, of)
+    return marked
 
 
-def remarks_on_landmarks(sources: Sources, marked: Marked) -> list[str]:
-    """In words: which shapes have no file of landmarks, where others have one."""
-    without = [name for name in sources if name not in marked]
-    if not marked or not without:
-        return []
+def _keyed(file):
+    return str(file), content_of_file(file)
+
+
+def _held(sources):
+    """The names of fields of each mesh in memory."""
+    return [features_of(mesh) for mesh, _ in sources.values() if not isinstance(mesh, str)]
+
+
+def remarks_on_guides(sources: Sources, marked: Marked, features: Sequence[str] = ()) -> list[str]:
+    """In words: which shapes have no file of landmarks, or of a field, where others have one."""
+    lacking = {"file of landmarks": [n for n in sources if not (n in marked and marked[n][0])]}
+    for one in features:
+        having = {name for name in marked if one in marked[name].features}
+        having |= {n for n, (mesh, _) in sources.items() if mesh_has(mesh, one)}
+        lacking[f"field {one!r}"] = [name for name in sources if name not in having]
     return [
-        f"{len(without)} of {len(sources)} shapes have no file of landmarks and are registered "
-        f"without: {listed(without)}"
+        f"{len(without)} of {len(sources)} shapes have no {what} and are registered without: "
+        f"{listed(without)}"
+        for what, without in lacking.items()
+        if 0 < len(without) < len(sources)
     ]
+
+
+def mesh_has(mesh: str | xr.Dataset, feature: str) -> bool:
+    """Whether a mesh in memory has a field of that name."""
+    return not isinstance(mesh, str) and feature in features_of(mesh)
 
 
 def of_contents(subjects: xr.Dataset, sources: Sources) -> xr.Dataset:

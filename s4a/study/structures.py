@@ -18,7 +18,7 @@ from s4a.input.files import check_names, slug
 from s4a.input.subjects import is_missing, listed, read_table
 from s4a.schema import dataset
 from s4a.study.options import Options
-from s4a.study.sources import Collection, Marked, Sources, find_sources, landmarks_of
+from s4a.study.sources import Collection, Marked, Sources, find_sources
 from s4a.study.store import STAGES, STRUCTURES, write
 from s4a.study.tree import open_study
 
@@ -133,7 +133,7 @@ def parts_of_dict(shapes: Mapping[str, Mapping[str, Any]], options: Options) -> 
     for name in names:
         meshes = {subject: of[name] for subject, of in shapes.items() if name in of}
         rows = None if subjects is None else subjects.sel(shape=sorted(meshes))
-        parts[name] = Part(find_sources(meshes), _no_landmarks(options), rows, options)
+        parts[name] = Part(find_sources(meshes), _no_guides(options), rows, options)
     return parts
 
 
@@ -147,18 +147,23 @@ def parts_of_labels(
     sources = find_sources(shapes, options.pattern, volumes=True)
     subjects = None if options.table is None else read_table(options.table, list(sources))
     return {
-        name: Part(sources, _no_landmarks(options), subjects, replace(options, label=label))
+        name: Part(sources, _no_guides(options), subjects, replace(options, label=label))
         for name, label in structures.items()
     }
 
 
-def _no_landmarks(options: Options) -> Marked:
+def _no_guides(options: Options) -> Marked:
     if options.landmarks is not None:
         raise ValueError(
             "landmarks= has a file for each shape, which are named by a table with columns "
             "'structure' and 'subject'; to meshes in memory s4a.with_landmarks gives them"
         )
-    return landmarks_of({}, None)
+    if options.feature_names:
+        raise ValueError(
+            "features= are files beside those of the shapes, which are named by a table with "
+            "columns 'structure' and 'subject'; to meshes in memory s4a.with_features gives them"
+        )
+    return {}
 
 
 def check_parts(parts: dict[str, Part], options: Options) -> list[str]:

@@ -19,17 +19,20 @@ from s4a.input.clean import check_range, clean
 from s4a.input.collection import read_shape
 from s4a.input.hands import mirror_image
 from s4a.input.landmarks import guides_of, with_landmarks
+from s4a.input.scalars import read_scalars, with_features
 from s4a.method import steps
 from s4a.method.first_map import motion_onto
 from s4a.method.lift import low_resolution
 from s4a.method.place import latent_of_new, nearest_spectra, place
 from s4a.method.register import from_latent, identity
-from s4a.method.shape import Basis, Shape
+from s4a.method.shape import Basis, Shape, features_of
 from s4a.schema import dataset, in_unit, unit_of
 from s4a.study.options import Options
 from s4a.study.runner import told_in_lines
-from s4a.study.sources import content_of_file
+from s4a.study.sources import Guides, content_of_file
 from s4a.study.store import arrays, attributes, open_file, read
+
+NO_GUIDES = Guides(None, {})
 
 
 def clean_shape(
@@ -37,15 +40,23 @@ def clean_shape(
 ) -> xr.Dataset:
     """A file read and cleaned, or a mesh in memory cleaned where it is not yet.
 
-    With landmarks, a file and the key of its content, and its mirror image where `also` says so.
+    With landmarks and fields, files and the keys of their contents, and its mirror image where
+    `also` says so.
 
     OSError where a file no longer has the content of its key, which the result would bear.
     """
     mesh = cleaned(source, content, cleaning)
-    if "landmarks" in also:
-        file, content_of_landmarks = also["landmarks"]
-        with unchanged(file, content_of_landmarks):
+    guides = also.get("guides", NO_GUIDES)
+    if guides.landmarks is not None:
+        file, key = guides.landmarks
+        with unchanged(file, key):
             mesh = with_landmarks(mesh, file)
+    fields = {}
+    for name, (file, key) in guides.features.items():
+        with unchanged(file, key):
+            fields[name] = read_scalars(file, name)
+    if fields:
+        mesh = with_features(mesh, fields)
     return mirror_image(mesh) if "reflected" in also else mesh
 
 
@@ -72,6 +83,9 @@ def cleaned(source: str | xr.Dataset, content: str, cleaning: dict[str, Any]) ->
         mesh = clean(source, **{name: cleaning[name] for name in cleaning if name != "label"})
         if "guide_position" in source:  # its triangles are others now
             mesh = with_landmarks(mesh, guides_of(source))
+        if features_of(source):
+            weight = source["feature_weight"].values[0]
+            mesh = with_features(mesh, features_of(source), weight=weight)
     return in_unit(mesh, source.attrs.get("unit"))
 
 

@@ -466,6 +466,24 @@ PROOFS = [
         "test_a_study_keeps_its_landmarks_and_says_who_has_none",
     ),
     (
+        "a guiding field of some shapes only",
+        "the others are registered without, and named",
+        "test_features.py",
+        "test_a_study_reads_fields_beside_its_files_and_says_who_has_none",
+    ),
+    (
+        "a guiding field that no file has",
+        "error that says where it would be",
+        "test_features.py",
+        "test_a_field_that_no_file_has_is_an_error",
+    ),
+    (
+        "a guiding field of another length, infinite, NaN everywhere or without a file",
+        "error that names it",
+        "test_features.py",
+        "test_a_field_that_does_not_fit_is_refused",
+    ),
+    (
         "guiding landmarks of another mesh or unit",
         "the shape is excluded with the landmark and its distance; the others go on",
         "test_landmarks.py",
