@@ -268,10 +268,14 @@ def _compare_hands(evidence, told, of_all):
         return
     for name in minority:
         seen = evidence[name]
+        beside = ~np.isin(seen["reference"].values, minority)
+        beside |= not beside.any()
+        as_is, reflected = (
+            np.nanmedian(seen[which].values[beside]) for which in ("fit", "fit_mirrored")
+        )
         words = (
-            "fits as a mirror image (ICP residual beside most others "
-            f"{np.nanmedian(seen['fit']):.3f} as it is, {np.nanmedian(seen['fit_mirrored']):.3f} "
-            "reflected): left for right? It was kept; reflect= mirrors it"
+            f"fits as a mirror image (ICP residual beside most others {as_is:.3f} as it is, "
+            f"{reflected:.3f} reflected): left for right? It was kept; reflect= mirrors it"
         )
         told[name].append(doubt("mirrored", words))
 

@@ -1,5 +1,6 @@
 """What looks wrong with a shape beside its collection is told, and nothing else."""
 
+import re
 import sys
 
 import numpy as np
@@ -24,9 +25,9 @@ def portrait(X, T):
     return evidence.portray(clean(as_dataset(X, T)), intersections=False)
 
 
-def doubts_of(portraits):
+def doubts_of(portraits, references=None):
     """Name -> doubts, and the remarks."""
-    chosen = {name: portraits[name] for name in evidence.pick_references(portraits)}
+    chosen = {name: portraits[name] for name in references or evidence.pick_references(portraits)}
     seen = {name: evidence.compare(name, one, chosen) for name, one in portraits.items()}
     attrs = {name: {"area": one.attrs["surface"]} for name, one in portraits.items()}
     return plausibility.find_warnings(attrs, seen)
@@ -80,6 +81,14 @@ def test_of_half_a_collection_of_the_other_hand_the_half_without_the_first_name_
     found, (remark,) = told(portraits | odd)
     assert found == {name: ["mirrored!"] for name in odd}
     assert remark.startswith("mirror images of each other, by ICP: s0, s2, s4, s6 and s1, s3")
+
+
+def test_the_residuals_of_a_mirror_image_are_those_beside_the_other_hand(portraits):
+    odd = {name: portrait(*mirrored(*SHAPES[name])) for name in ("s1", "s3", "s5", "s7")}
+    found, _ = doubts_of(portraits | odd, ["s0", "s2", "s1", "s3", "s5"])
+    for name in ("s1", "s3", "s5"):
+        as_is, reflected = map(float, re.findall(r"0\.\d{3}", found[name][0].words))
+        assert as_is > 2 * reflected
 
 
 def test_of_half_a_collection_in_another_unit_the_half_without_the_first_name_is_told(portraits):
