@@ -272,6 +272,8 @@ class PanelPage:
             return self.controls[widget].html()
         if isinstance(widget, ipywidgets.Button | ipywidgets.Text) or not hasattr(widget, "value"):
             return ""
+        if isinstance(widget, ipywidgets.ColorPicker):
+            return PARTS.swatch(widget.value, widget.tooltip)
         if isinstance(widget, ipywidgets.Checkbox):
             return PARTS.value(widget.description, "yes" if widget.value else "no")
         return PARTS.value(widget.description, getattr(widget, "label", None) or widget.value)

@@ -80,3 +80,9 @@ def test_a_study_of_several_structures_has_a_tab_of_its_own(several):
     assert tabs.tabs.titles == ("Structures",)
     assert isinstance(tabs["Structures"], Structures)
     tabs.close()
+
+
+def test_a_page_shows_the_colour_of_a_structure_and_not_its_number(panel):
+    page = s4a.show.panel_page.panel_html(panel, 2_000_000)
+    assert "background:#4477aa" in page
+    assert "<b>#4477aa</b>" not in page
