@@ -396,9 +396,9 @@ EXERCISES = {
     ),
     "16.1": Exercise(
         lambda half, truth: np.linalg.norm(half["position"] - truth, axis=1)[
-            half["present"].values == 0
+            half["present"].values == 1
         ].mean(),
-        "the distance at each vertex, then the mean where `present` is 0",
+        "the distance at each vertex, then the mean where `present` is 1",
     ),
     "16.2": Exercise(
         lambda found: found["level_share"].sel(level="between").sum().item(),
