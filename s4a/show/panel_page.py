@@ -19,6 +19,8 @@ from s4a.show.browser import PARTS, TEMPLATES, to_json
 
 LIMIT = 24_000_000  # characters of recorded values in a page
 LADDER = 24  # values of a slider that are kept
+# what does nothing in a page, and says nothing there
+SILENT = ipywidgets.Button | ipywidgets.ToggleButton | ipywidgets.Text | ipywidgets.ColorPicker
 # what is the browser's own; of a chart `spec` is kept key by key
 LOCAL = {"picked", "hovered", "answer", "webgl", "still", "sample", "spec"}
 
@@ -270,7 +272,7 @@ class PanelPage:
             return PARTS.box(name, "text", [Markup(widget.value)], hidden)
         if widget in self.controls:
             return self.controls[widget].html()
-        if isinstance(widget, ipywidgets.Button | ipywidgets.Text) or not hasattr(widget, "value"):
+        if isinstance(widget, SILENT) or not hasattr(widget, "value"):
             return ""
         if isinstance(widget, ipywidgets.ColorPicker):
             return PARTS.swatch(widget.value, widget.tooltip)
@@ -280,7 +282,7 @@ class PanelPage:
 
     def lacking(self, panel: ipywidgets.Box) -> list[str]:
         """What of the panel this page cannot do, as it needs Python."""
-        silent = ipywidgets.Button | ipywidgets.Text | ipywidgets.HTML | ipywidgets.IntProgress
+        silent = SILENT | ipywidgets.HTML | ipywidgets.IntProgress
         fixed, partly = [], []
         for widget in widgets_in(panel):
             control = self.controls.get(widget)

@@ -171,7 +171,7 @@ class Panel(ipywidgets.VBox):
         self.message, self.failed = ipywidgets.HTML(), False
         self.children = [self.frame, *self.build(**options), self.message]
         told = [part for part in widgets_in(self) if getattr(part, "tooltip", None)]
-        self.frame.help = {part.description: part.tooltip for part in told}
+        self.frame.help = {part.description: part.tooltip for part in told if part.description}
 
     def build(self, **options: Any) -> list[ipywidgets.Widget]:
         """The parts of the panel."""

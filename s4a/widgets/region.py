@@ -54,23 +54,21 @@ class Region(Panel):
         template = self.study["registration"].dataset
         self.X, self.T = template["position"].values, template["corner_vertex"].values
         self.area = vertex_areas(self.X, self.T)
-        self.region = np.zeros(len(self.X), bool)
-        self.lasso = ipywidgets.ToggleButton(description="lasso", tooltip=LASSO)
-        self.how = dropdown("drawn", HOW, [ADD, REMOVE])
-        self.none = ipywidgets.Button(description="nothing", tooltip="choose no vertex")
-        self.others = ipywidgets.Button(description="others", tooltip="choose all other vertices")
+        self.how, own = dropdown("drawn", HOW, [ADD, REMOVE]), {"layout": {"width": "auto"}}
+        self.lasso = ipywidgets.ToggleButton(description="lasso", tooltip=LASSO, **own)
+        self.none = self.button("nothing", self.clear, "choose no vertex", **own)
+        self.others = self.button("others", self.invert, "choose all other vertices", **own)
         controls = [self.lasso, self.how, self.none, self.others]
         self.label = self._labels(template.attrs["template"])
         if self.label is not None:
             controls.insert(0, self.label)
             self.label.observe(self.guarded(self.take_label), "value")
-        self.scene = Scene(view=view, up=up, height=420)
+        title = f"{template.attrs['template']}, the template"
+        self.scene = Scene(title=title, view=view, up=up, height=420)
         self.scene.show(self.X, self.T)
         ipywidgets.link((self.lasso, "value"), (self.scene, "lasso"))
         self.scene.observe(self.guarded(self.take_drawn), "drawn_around")
-        self.none.on_click(self.guarded(lambda _: self.choose(np.zeros(len(self.X), bool))))
-        self.others.on_click(self.guarded(lambda _: self.choose(~self.region)))
-        self.choose(self.region)
+        self.clear()
         return [row(*controls), self.scene]
 
     def _labels(self, name):
@@ -96,6 +94,14 @@ class Region(Panel):
             return
         self.say("")
         self.choose(self.region | within if self.how.value == ADD else self.region & ~within)
+
+    def clear(self) -> None:
+        """Choose no vertex."""
+        self.choose(np.zeros(len(self.X), bool))
+
+    def invert(self) -> None:
+        """Choose all other vertices."""
+        self.choose(~self.region)
 
     def choose(self, region: np.ndarray) -> None:
         """Make these vertices ``(n,)`` the region, and show it."""

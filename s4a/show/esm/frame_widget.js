@@ -5,10 +5,13 @@ export default {
     const button = html(el, "button", { type: "button", title: "this panel alone on the whole screen; Escape ends it" }, "Full screen");
     let panel = null, watch = null;
     const named = () => panel.querySelectorAll(".widget-inline-hbox").forEach((control) => {
-      const text = control.querySelector("label, .widget-label")?.textContent, handle = control.querySelector("[role=slider]");
-      const help = model.get("help")[text];
+      const labels = [...control.querySelectorAll("label, .widget-label")], text = labels.map((at) => at.textContent.replace("\u200b", "")).find(Boolean); // that of a box is a space of no width
+      const handle = control.querySelector("[role=slider]"), color = control.querySelector("input[type=color]");
+      const help = model.get("help")[text] || (color && labels.find((at) => at.title)?.title); // only the hidden label of a colour has it
       if (help && control.title !== help) control.title = help;
+      if (help && help !== text) for (const at of control.querySelectorAll("[title]")) if (at.title === text) at.title = help; // a box says its name again
       if (text && handle && handle.getAttribute("aria-label") !== text) handle.setAttribute("aria-label", text);
+      if (help && color && color.getAttribute("aria-label") !== help) color.setAttribute("aria-label", help);
     });
     const sized = () => {
       const font = model.get("font");
@@ -21,7 +24,7 @@ export default {
       panel.setAttribute("aria-label", model.get("title"));
       ownKeys(panel);
       button.hidden = !panel.requestFullscreen || document.fullscreenEnabled === false;
-      (watch = new MutationObserver(named)).observe(panel, { childList: true, subtree: true });
+      (watch = new MutationObserver(named)).observe(panel, { childList: true, subtree: true, attributeFilter: ["title"] });
       named();
       sized();
     };

@@ -30,7 +30,7 @@ globalThis.s4aReplay = ({ controls, values, groups, clicks }) => {
     if (inputs[c].type === "checkbox") inputs[c].checked = Boolean(at);
     const told = inputs[c].parentElement.querySelector("output");
     if (told) told.textContent = controls[c].labels[at];
-    inputs[c].setAttribute("aria-valuetext", controls[c].labels[at]);
+    if (inputs[c].type === "range") inputs[c].setAttribute("aria-valuetext", controls[c].labels[at]);
     apply(c);
   };
   inputs.forEach((input, c) => input.addEventListener("input", () => {

@@ -1,0 +1,253 @@
+"""The panels beside the tabs, in a real JupyterLab: as wide as their cells, and clicked.
+
+Also as pages without a kernel.
+"""
+
+import json
+import re
+
+import numpy as np
+import pytest
+from paths import NOTEBOOKS
+from test_browser import (  # noqa: F401, fixtures are found by their names
+    DRAWN,
+    IDLE,
+    SMALLEST,
+    VIEW,
+    barriers,
+    browser,
+    driver,
+    lab,
+    messages,
+    offline,
+    opened,
+    pixels,
+    pytestmark,
+    run_notebook,
+    saved,
+    serious,
+    visible,
+    watched,
+)
+
+from s4a.datasets.structures import example_structures
+from s4a.widgets import Region, Structures
+
+KINDS = ("Maps", "Region", "Structures", "Comparison", "Progress")
+CELL = """
+import ipywidgets
+import numpy as np
+from IPython.display import display
+
+import s4a
+from s4a.datasets.structures import example_structures
+from s4a.widgets import Comparison, Maps, Progress, Region, Structures
+
+study = s4a.open_study({study!r})
+found = s4a.statistics.asymmetry(study, n_permutations=15)
+p = np.where(np.arange(found.sizes["vertex"]) % 3, 0.4, 0.02)
+found = found.assign(p_family_wise=found["p_family_wise"].copy(data=p))
+several = example_structures()
+ball = s4a.synthetic.ellipsoid(300)
+compared = s4a.compare.pair(ball, ball, methods=["kNN"], keep=True)
+brains = s4a.synthetic.brains(3, 300, seed=1)
+make = {{
+    "Maps": lambda: Maps(study, found),
+    "Region": lambda: Region(study, view="top"),
+    "Structures": lambda: Structures(several),
+    "Comparison": lambda: Comparison(compared),
+    "Progress": lambda: Progress(brains, {run!r}, n_coarse=100, k=10, k_init=6, n_jobs=1),
+}}
+for kind in {kinds!r}:
+    for width in ("360px", "100%"):
+        display(ipywidgets.VBox([make[kind]()], layout={{"width": width}}))
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(study_folder, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("panels")
+    notebook = json.loads((NOTEBOOKS / "00_explore.ipynb").read_text(encoding="utf-8"))
+    cell = next(c for c in notebook["cells"] if c["cell_type"] == "code")
+    source = CELL.format(study=str(study_folder), run=str(folder / "run"), kinds=KINDS)
+    notebook["cells"] = [cell | {"source": source, "id": "panels"}]
+    (folder / "panels.ipynb").write_text(json.dumps(notebook), encoding="utf-8")
+    (folder / "app").mkdir()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def page(browser, lab, messages):  # noqa: F811
+    """A notebook with every panel, in a cell of 360 pixels and in a wide one."""
+    page = watched(browser.new_page(viewport={"width": 1920, "height": 1080}), messages)
+    page.set_default_timeout(60_000)
+    run_notebook(page, lab, "panels.ipynb")
+    page.keyboard.press("Control+b")  # the files beside the notebook go
+    n = 2 * len(KINDS)
+    page.wait_for_function(f"document.querySelectorAll('.s4a-panel').length === {n}", timeout=2e5)
+    page.wait_for_function(IDLE)
+    page.wait_for_function(DRAWN)
+    yield page
+    page.close()
+
+
+def panel_of(page, kind, *, wide):
+    """A panel, where it is seen."""
+    panel = page.locator(".s4a-panel").nth(2 * KINDS.index(kind) + wide)
+    panel.scroll_into_view_if_needed()
+    page.wait_for_timeout(400)  # charts follow the width
+    return panel
+
+
+def views(panel):
+    return panel.locator(VIEW).filter(visible=True)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_cell_of_360_pixels_has_a_surface_of_300_and_cuts_nothing(page, kind):
+    panel = panel_of(page, kind, wide=False)
+    assert panel.bounding_box()["width"] <= 360
+    assert all(canvas.bounding_box()["width"] >= 300 for canvas in views(panel).all())
+    assert (views(panel).count() == 0) == (kind == "Progress")
+    right = panel.bounding_box()["x"] + panel.bounding_box()["width"]
+    for part in panel.locator("input, select, button, progress, .progress").all():
+        if part.is_visible():
+            assert part.bounding_box()["x"] + part.bounding_box()["width"] <= right + 1
+    assert panel.evaluate("(e) => e.scrollWidth <= e.clientWidth + 2")
+    assert panel.evaluate(SMALLEST)[0] > 11
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_screen_of_1920_pixels_is_filled_and_read_from_afar(page, kind):
+    panel = panel_of(page, kind, wide=True)
+    assert panel.bounding_box()["width"] >= 1500
+    smallest, text = panel.evaluate(SMALLEST)
+    assert smallest >= 16, text
+
+
+# controls whose tooltip is missing, is their name again, or is that of another one
+UNSAID = """(panel) => {
+  const controls = [...panel.querySelectorAll('input, select, button, [role=slider]')];
+  const told = new Map();
+  return controls.filter((c) => c.getClientRects().length).filter((c) => {
+    const text = c.closest('[title]')?.title, name = c.labels?.[0]?.textContent.trim();
+    const again = told.has(text);
+    told.set(text, c);
+    return !text || text === name || again;
+  }).map((c) => c.outerHTML);
+}"""
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_control_says_what_it_is_and_no_two_say_the_same(page, kind):
+    assert panel_of(page, kind, wide=True).evaluate(UNSAID) == []
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_panel_has_no_serious_barrier(page, kind):
+    panel = panel_of(page, kind, wide=True)
+    assert panel.get_attribute("role") == "region", "a landmark"
+    panel.evaluate("(e) => (e.id = 'looked-at')")
+    assert barriers(page, "#looked-at") == []
+    panel.evaluate("(e) => e.removeAttribute('id')")
+
+
+def test_a_level_makes_the_map_grey_and_a_click_tells_the_values(page):
+    panel = panel_of(page, "Maps", wide=True)
+    canvas = views(panel).first
+    before = pixels(canvas)
+    panel.get_by_label("level").select_option("0.01")
+    panel.locator(".s4a-readout").filter(has_text="0.0 % of the area").wait_for()
+    assert pixels(canvas) != before
+    box = canvas.bounding_box()
+    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    said = panel.locator(".s4a-readout").filter(has_text="directional asymmetry")
+    said.wait_for()
+    assert re.match(r"vertex \d+: directional asymmetry .* mm; p = ", said.inner_text())
+
+
+def test_the_controls_of_a_region_stand_in_one_row_of_a_wide_screen(page):
+    panel = panel_of(page, "Region", wide=True)
+    controls = panel.locator("select, .jupyter-button").all()
+    assert len(controls) == 5
+    middles = [c.bounding_box()["y"] + c.bounding_box()["height"] / 2 for c in controls]
+    assert np.ptp(middles) < 10
+
+
+def test_a_lasso_tells_python_what_is_within_it(page):
+    panel = panel_of(page, "Region", wide=True)
+    canvas = views(panel).first
+    before, box = pixels(canvas), canvas.bounding_box()
+    panel.get_by_role("button", name="lasso").click()
+    page.wait_for_timeout(500)
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(x - 60, y - 60)
+    page.mouse.down()
+    for dx, dy in ((60, -60), (60, 60), (-60, 60)):
+        page.mouse.move(x + dx, y + dy, steps=5)
+    page.mouse.up()
+    said = panel.locator(".s4a-readout").filter(has_text=re.compile("^[1-9]"))
+    said.wait_for()
+    assert pixels(canvas) != before
+    panel.get_by_role("button", name="nothing").click()
+    panel.locator(".s4a-readout").filter(has_text=re.compile("^0 of")).wait_for()
+
+
+def test_structures_are_hidden_and_coloured_and_their_poses_moved(page):
+    panel = panel_of(page, "Structures", wide=True)
+    before = pixels(views(panel).first)
+    panel.get_by_label("right", exact=True).uncheck()
+    page.wait_for_timeout(800)
+    hidden = pixels(views(panel).first)
+    assert hidden != before
+    panel.get_by_label("the colour of left").evaluate(
+        "(i) => { i.value = '#00ff00'; i.dispatchEvent(new Event('change', { bubbles: true })); }"
+    )
+    page.wait_for_timeout(800)
+    assert pixels(views(panel).first) != hidden
+    panel.get_by_label("modes", exact=True).select_option(index=1)
+    page.wait_for_timeout(800)
+    assert views(panel).count() == 1
+    still = pixels(views(panel).first)
+    slider = panel.locator(".s4a-slider input").filter(visible=True).first
+    slider.focus()
+    for _ in range(20):
+        page.keyboard.press("ArrowRight")
+    assert pixels(views(panel).first) != still
+
+
+def test_the_console_has_no_errors(page, messages):  # noqa: F811
+    assert serious(messages) == []
+
+
+# ---- without a kernel
+
+
+def test_the_page_of_structures_has_every_level_and_no_control_that_does_nothing(
+    offline,  # noqa: F811
+    tmp_path,
+):
+    page, errors = opened(offline, saved(Structures(example_structures()), tmp_path / "all.html"))
+    page.wait_for_function(DRAWN)
+    assert page.get_by_text("#4477aa").count() == 0
+    before = np.array(visible(page, VIEW).first.evaluate("(c) => [...c.view.surfaces[0].position]"))
+    for level in (1, 2):
+        page.locator("#c-level").select_option(index=level)
+        page.wait_for_function(DRAWN)
+        slider = visible(page, ".s4a-slider input").first
+        slider.evaluate("(i) => { i.value = 2; i.dispatchEvent(new Event('input')); }")
+        moved = visible(page, VIEW).first.evaluate("(c) => [...c.view.surfaces[0].position]")
+        assert np.abs(np.array(moved) - before).max() > 0.5
+    assert barriers(page) == []
+    assert errors == []
+    page.close()
+
+
+def test_the_page_of_a_region_says_that_drawing_needs_python(offline, study, tmp_path):  # noqa: F811
+    page, errors = opened(offline, saved(Region(study), tmp_path / "region.html"))
+    page.wait_for_function(DRAWN)
+    assert "drawing a region" in page.locator(".note").inner_text()
+    assert page.get_by_text("lasso").count() == 0
+    assert barriers(page) == []
+    assert errors == []
+    page.close()
