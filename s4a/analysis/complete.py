@@ -47,6 +47,7 @@ log = logging.getLogger(__name__)
 LEAST_SHARE = 0.15  # of the template that a part must have
 TESTED_SHARE = 0.45  # with less the intervals have not been tested
 LEAST_INSIDE = 0.6  # share of the part that must lie on the whole
+SURELY_INSIDE = 0.95  # with less every way is looked at once more
 FOREIGN = 1.4  # times what the modes of the others leave of any shape of the study
 N_REMATCHED = 12  # shapes of the study whose part is matched again
 N_AGAIN = 48  # starts of a part that the modes do not fit
@@ -247,7 +248,7 @@ def place(
         return fit_modes(part, whole, pose, free_size=model.scale), whole
     starts = different(rough_starts(part, whole, first), first, part)
     fit = best_fit(part, whole, starts, first, model.scale)
-    if fit.residual > FOREIGN * left_by_others(model):
+    if fit.residual > FOREIGN * left_by_others(model) or fit.inside < SURELY_INSIDE:
         # it lies another way, or is of another kind: every way is looked at once more
         ends = rough_starts(part, whole, first, turns="I")
         starts = [fit.pose, *different(ends, first, part, N_AGAIN)]
@@ -289,7 +290,8 @@ def check_place(fit: Fit, model: Model) -> None:
     if fit.inside < LEAST_INSIDE:
         raise ValueError(
             f"the part does not fit the shapes of the study: only {100 * fit.inside:.0f} % of it "
-            "lies on one that they may be; is it of another kind, or another unit?"
+            "lies on one that they may be; is it of another kind, or another unit? Three landmarks "
+            "that the template has, too, say how it lies (landmarks=)"
         )
 
 
