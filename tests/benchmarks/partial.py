@@ -4,7 +4,7 @@
 random direction cuts off 0, 10, 30 or 50 % of the vertices, turned at random by 45 degrees, into
 studies that lack them: 12 synthetic brains of 6,000 vertices and 8 others, 16 faces of a published
 model and 8 others, and five mouse skulls, each into a study of the four others.  For each cut the
-mean over the shapes of: CPU seconds; the distance to the truth where the part is, in % of sqrt(area),
+mean over the shapes of: CPU seconds; distance to the truth where the part is, in % of sqrt(area),
 of the whole shape inserted, of the part, of rustcpd; the same where it is not, with that of the
 mean shape; the share of coordinates that lie within intervals of 50, 80 and 90 % where nothing is,
 around the truth, and around the match of the whole; where the part is, of 90 %; and where nothing
