@@ -31,6 +31,7 @@ PAGES = (
     "docs/differences.md",
     "docs/doubtful.md",
     "docs/frontends.md",
+    "docs/howto.md",
     "docs/install.md",
     "docs/plausibility.md",
     "paper/paper.md",
