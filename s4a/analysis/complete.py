@@ -136,6 +136,13 @@ def complete(
     >>> found = s4a.complete(study, (mesh["position"].values, upper))
     >>> 0.4 < found.attrs["missing"] < 0.6
     True
+
+    The shape of which the upper half was given, and how sure each place of it is:
+
+    >>> shown = {"the shape": mesh, "completed, with its deviation": found}
+    >>> sure = {"completed, with its deviation": found["completion_normal_sd"].values}
+    >>> s4a.show.charts.surfaces(shown, sure, label="mm")
+    <Parts ...>
     """
     check_count("n_samples", n_samples)
     model = model_of(study)

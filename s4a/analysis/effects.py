@@ -151,6 +151,14 @@ def group_map(
     >>> where = s4a.statistics.group_map(study, ["a", "a", "a", "b", "b", "b"], n_permutations=99)
     >>> where["effect"].dims, bool((where["p_family_wise"] > 0.05).all())
     (('vertex', 'xyz'), True)
+
+    How far the second group is larger, along the normals:
+
+    >>> mean = s4a.synthesize(study, [0.0])
+    >>> X, T = s4a.geometry.mesh.as_arrays(mean)
+    >>> along = (where["effect"].values * s4a.geometry.mesh.vertex_normals(X, T)).sum(1)
+    >>> s4a.show.charts.surfaces({"b minus a": mean}, {"b minus a": along}, label="mm")
+    <Parts ...>
     """
     options = check_options(n_permutations, variances, seed_of(seed, rng))
     sample = sample_of(study, group, "group", covariates, field)
@@ -290,6 +298,9 @@ def predict(study: xr.DataTree, fit: xr.Dataset, value: float) -> xr.Dataset:
     >>> young, old = (s4a.statistics.predict(study, fit, age)["position"] for age in (0, 5))
     >>> bool(np.allclose(old - young, 5 * fit["effect"]))
     True
+    >>> shapes = {f"age {age}": s4a.statistics.predict(study, fit, age) for age in (-5, 2.5, 10)}
+    >>> s4a.show.charts.surfaces(shapes)
+    <Parts ...>
     """
     check_moves(fit)
     template = study["registration"].to_dataset()

@@ -109,8 +109,12 @@ def outliers(
 
     >>> import s4a
     >>> study = s4a.synthetic.example_study()
-    >>> s4a.statistics.outliers(study)["outlier"].values.any()
+    >>> odd = s4a.statistics.outliers(study)
+    >>> odd["outlier"].values.any()
     np.False_
+    >>> names, error = odd["shape"].values.tolist(), odd["left_out_error"].values
+    >>> s4a.show.charts.ranked(names, error, "left-out error (mm)", int(error.argmax()))
+    <Figure ...>
     """
     registration, d, area = displacements_of(study)
     s = len(d)

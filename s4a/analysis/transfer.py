@@ -424,6 +424,7 @@ def transfer_landmarks(
     --------
     With the ``study`` of six small brains:
 
+    >>> import numpy as np
     >>> import s4a
     >>> study = s4a.synthetic.example_study()
     >>> source = study["original/brain_01"].to_dataset()
@@ -431,6 +432,19 @@ def transfer_landmarks(
     >>> carried = s4a.transfer_landmarks(study, landmarks, source="brain_01", targets=["brain_02"])
     >>> carried["brain_02/landmark_position"].dims
     ('landmark', 'xyz')
+
+    Those of the one, and on the other where they were carried:
+
+    >>> from s4a.show.draw import label_colors, with_balls
+    >>> shown, colors = {}, {}
+    >>> for name, found in (("brain_01", landmarks), ("brain_02", carried["brain_02"])):
+    ...     X, T = s4a.geometry.mesh.as_arrays(study[f"original/{name}"].to_dataset())
+    ...     places = found["landmark_position"].values
+    ...     hues, radii = label_colors(np.arange(len(places))), np.full(len(places), 5.0)
+    ...     Y, S, colors[name] = with_balls(X, T, None, np.c_[places, hues, radii].tolist())
+    ...     shown[name] = s4a.geometry.mesh.as_dataset(Y, S)
+    >>> s4a.show.charts.surfaces(shown, colors)
+    <Parts ...>
     """
     mesh, each = plan(study, source, targets, options)
     marked = locate(landmarks, mesh, farthest=farthest)

@@ -179,6 +179,20 @@ def build_network(
     ...           for n, m in meshes.items()}
     >>> s4a.build_network(coarse, k_init=6)["fmap_initial"].shape
     (6, 6, 6)
+
+    The network of a study, an edge for each map, in the colour of its cycles' error:
+
+    >>> import numpy as np
+    >>> study = s4a.synthetic.example_study()
+    >>> network, names = study["network"], list(study["original"].children)
+    >>> source, target = (
+    ...     np.array([names.index(name) for name in network[end].values])
+    ...     for end in ("source", "target")
+    ... )
+    >>> errors = {"error of cycles": network["cycle_error"].values}
+    >>> charts = s4a.show.charts
+    >>> charts.network(charts.on_circle(6), names, source, target, errors)
+    <Figure ...>
     """
     bases = bases_of(coarse)
     names = list(bases)

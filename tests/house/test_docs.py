@@ -4,6 +4,7 @@ The glossary agrees with the schema.
 """
 
 import ast
+import doctest
 import importlib
 import inspect
 import re
@@ -89,6 +90,34 @@ def test_a_public_function_says_what_it_takes_and_gives_and_shows_an_example(nam
         assert ">>>" in text
     if re.search(r"^    +raise ValueError", inspect.getsource(function), re.MULTILINE):
         assert "Raises\n" in text
+
+
+# what gives a surface, something at its vertices, or a network of shapes
+PICTURED = (
+    "build_network",
+    "coarsen",
+    "complete",
+    "insert",
+    "latent_map",
+    "match_pair",
+    "reconstruct",
+    "refine_network",
+    "spectrum",
+    "synthesize",
+    "transfer_labels",
+    "transfer_landmarks",
+    "statistics.group_map",
+    "statistics.outliers",
+    "statistics.predict",
+    "synthetic.brains",
+)
+
+
+@pytest.mark.parametrize("name", PICTURED)
+def test_the_example_of_what_is_best_seen_ends_in_a_picture(name):
+    text = inspect.getdoc(dict(functions())[name])
+    *_, last = doctest.DocTestParser().get_examples(text)
+    assert last.want.startswith(("<Figure ", "<Parts "))
 
 
 def test_the_glossary_has_the_dims_of_the_schema():

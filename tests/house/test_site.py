@@ -5,16 +5,21 @@ from paths import DOCS, benchmark
 
 
 @pytest.fixture(scope="module")
-def window(site):
-    """A browser window for the pages; nothing is fetched."""
+def browser():
     playwright = pytest.importorskip("playwright.sync_api")
     chromium = benchmark("chromium")
     if chromium.PATH is None:
         pytest.skip(chromium.LACKS)
     with playwright.sync_playwright() as driver:
         browser = chromium.launched(driver)
-        yield browser.new_page(viewport={"width": 800, "height": 700})
+        yield browser
         browser.close()
+
+
+@pytest.fixture(scope="module")
+def window(site, browser):
+    """A browser window for the pages; nothing is fetched."""
+    return browser.new_page(viewport={"width": 800, "height": 700})
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -41,18 +46,56 @@ def test_no_page_is_wider_than_a_narrow_window(site, window):
         assert window.evaluate("document.documentElement.scrollWidth") <= 800, name
 
 
-def test_a_page_shows_the_first_panel_of_a_study_that_has_no_modes(tmp_path):
+def shown(cells, folder):
+    """The HTML that the documentation shows of notebook cells, in the order of their outputs."""
     nbformat = pytest.importorskip("nbformat")
     client = pytest.importorskip("nbclient")
-    cells = [
-        (DOCS / "without_kernel.py").read_text(encoding="utf-8"),
-        "from s4a.datasets.structures import example_structures",
-        "import s4a; s4a.explore(example_structures())",
-    ]
+    cells = [(DOCS / "without_kernel.py").read_text(encoding="utf-8"), *cells]
     notebook = nbformat.v4.new_notebook(cells=[*map(nbformat.v4.new_code_cell, cells)])
-    resources = {"metadata": {"path": str(tmp_path)}}
+    resources = {"metadata": {"path": str(folder)}}
     client.NotebookClient(notebook, timeout=300, resources=resources).execute()
-    shown = [
-        part["data"].get("text/html", "") for part in notebook.cells[-1].outputs if part.get("data")
-    ]
-    assert any('class="panel"' in html and 'title="Structures"' in html for html in shown)
+    outputs = [part for cell in notebook.cells for part in cell.outputs if part.get("data")]
+    return [part["data"].get("text/html", "") for part in outputs]
+
+
+STRUCTURES = """
+from s4a.datasets.structures import example_structures
+import s4a; s4a.explore(example_structures())
+"""
+SMALL = """
+import s4a
+study = s4a.synthetic.example_study()
+"""
+
+
+def test_a_page_shows_the_first_panel_of_a_study_that_has_no_modes(tmp_path):
+    html = shown([STRUCTURES], tmp_path)
+    assert any('class="panel"' in part and 'title="Structures"' in part for part in html)
+
+
+def test_a_panel_in_a_page_is_drawn_and_its_slider_deforms_it(browser, tmp_path):
+    parts = shown([SMALL, "s4a.explore(study)"], tmp_path)
+    (html,) = [part for part in parts if 'class="panel"' in part]
+    path = tmp_path / "page.html"
+    path.write_text(f"<!DOCTYPE html><title>page</title>{html}", encoding="utf-8")
+    page = browser.new_page(viewport={"width": 1000, "height": 800})
+    errors = []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.goto(path.as_uri())
+    panel = page.frame_locator("iframe.panel")
+    canvas = panel.locator("canvas.s4a-view").first
+    canvas.wait_for()
+    page.wait_for_timeout(1000)
+    assert canvas.evaluate("(c) => c.view.frames") > 0
+    pixels = "(c) => { c.view.draw(); return c.toDataURL(); }"
+    before = canvas.evaluate(pixels)
+    panel.locator(".s4a-slider input").first.evaluate(
+        "(i) => { i.value = 3; i.dispatchEvent(new Event('input')); }"
+    )
+    assert canvas.evaluate(pixels) != before
+    tall = page.locator("iframe.panel").evaluate(
+        "(e) => e.clientHeight - e.contentDocument.documentElement.scrollHeight"
+    )
+    assert tall >= 0, "nothing of it scrolls"
+    assert errors == []
+    page.close()
