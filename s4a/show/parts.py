@@ -48,6 +48,8 @@ class Parts(Figure):
 
         title = self.get_suptitle()
         self.draw_without_rendering()
+        layout = self.get_layout_engine()
+        self.set_layout_engine("none")  # it would move what is shown where the others are hidden
         parts = []
         for shown, box in self._boxes():
             inches = box.transformed(self.dpi_scale_trans.inverted()).padded(0.04)
@@ -61,6 +63,7 @@ class Parts(Figure):
             width = round(96 * inches.width)
             address = data_uri(file.getvalue(), "image/png")
             parts.append((width, round(SHRINK * width), round(GROW * width), address))
+        self.set_layout_engine(layout)
         page = Environment(autoescape=True).from_string(PAGE)
         return page.render(alt=self.alt or title, title=title, parts=parts, gap=GAP).strip()
 

@@ -32,6 +32,19 @@ def test_no_part_shows_what_reaches_over_from_its_neighbour():
     assert all(ax.get_visible() for ax in figure.axes)
 
 
+def test_no_part_is_cut_beside_longer_titles_and_a_scale():
+    ball = s4a.synthetic.sphere(100)
+    height = ball["position"].values[:, 2]
+    titles = ["one", "two\nlines", "a title that is much wider than its ball"]
+    for shown in (titles, titles[2:]):
+        figure = charts.surfaces(
+            dict.fromkeys(shown, ball), dict.fromkeys(shown, height), label="height"
+        )
+        for picture in pictures(figure):
+            edges = [picture[0], picture[-1], picture[:, 0], picture[:, -1]]
+            assert min(edge.min() for edge in edges) > 250
+
+
 @pytest.mark.parametrize(("least", "begins"), [(0.0, 0.0), (-1.0, -2.0)])
 def test_the_scale_of_errors_begins_at_zero(least, begins):
     ball = s4a.synthetic.sphere(100)
