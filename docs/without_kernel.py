@@ -122,7 +122,10 @@ def pictured(scene):
         size=(int(scene.width), int(scene.height)),
     )
     address = data_uri(image_bytes(on_white(pixels), "png"), "image/png")
-    return f'<img alt="A scene that turns in the notebook" src="{address}">'
+    return (
+        f'<figure style="margin: 0"><img alt="A scene" src="{address}">'
+        "<figcaption>A picture: the scene itself turns in the notebook.</figcaption></figure>"
+    )
 
 
 format_of.formatters["text/html"].for_type(pythreejs.Renderer, pictured)
@@ -158,7 +161,8 @@ def values_of(slider, n):
     if hasattr(slider, "options"):
         options = list(slider.options)
     else:
-        options = list(np.arange(slider.min, slider.max + slider.step / 2, slider.step).round(6))
+        options = np.arange(slider.min, slider.max + slider.step / 2, slider.step).round(6)
+        options = list(options + 0)  # no -0
     here = int(np.argmin([abs(value - slider.value) for value in options]))
     places = sorted({here, *np.linspace(0, len(options) - 1, n).round().astype(int).tolist()})
     return [type(slider.value)(options[i]) for i in places], places.index(here)

@@ -99,3 +99,12 @@ def test_a_panel_in_a_page_is_drawn_and_its_slider_deforms_it(browser, tmp_path)
     assert tall >= 0, "nothing of it scrolls"
     assert errors == []
     page.close()
+
+
+@pytest.mark.parametrize("width", [1280, 1366, 1440, 1600])
+def test_text_and_contents_stand_beside_each_other_in_a_wide_window(site, window, width):
+    narrow = window.viewport_size
+    window.set_viewport_size({"width": width, "height": 700})
+    window.goto((site[1] / "course/02_laplacian.html").as_uri())
+    assert window.evaluate("document.documentElement.scrollWidth") <= width
+    window.set_viewport_size(narrow)
