@@ -273,8 +273,26 @@ def network(
     return figure
 
 
-def matrices(named: dict[str, np.ndarray], limit: float = 1.0) -> Figure:
-    """Matrices side by side with signed colours, blue positive; `named` maps titles to arrays.
+def matrices(
+    named: dict[str, np.ndarray],
+    limit: float = 1.0,
+    *,
+    axes: tuple[str, str] = ("mode of the source", "mode of the target"),
+) -> Figure:
+    """Matrices side by side with signed colours, blue positive.
+
+    Parameters
+    ----------
+    named : dict of str to float ndarray (rows, columns)
+        Title of each matrix and its numbers.
+    limit : float
+        The largest absolute number of the scale.
+    axes : (str, str)
+        What is along the columns, and along the rows.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
 
     Examples
     --------
@@ -284,13 +302,13 @@ def matrices(named: dict[str, np.ndarray], limit: float = 1.0) -> Figure:
     >>> matrices({"identity": np.eye(20), "a rotation": turn})
     <Figure ...>
     """
-    figure, (axes,) = _figure(3.4 * len(named) + 0.7, 3.3, len(named))
-    for ax, (title, values) in zip(axes, named.items(), strict=True):
+    figure, (frames,) = _figure(3.4 * len(named) + 0.7, 3.3, len(named))
+    for ax, (title, values) in zip(frames, named.items(), strict=True):
         image = ax.imshow(values, cmap=SIGNED, vmin=-limit, vmax=limit, interpolation="nearest")
-        ax.set(title=title, xlabel="mode of the source", ylabel="mode of the target")
+        ax.set(title=title, xlabel=axes[0], ylabel=axes[1])
         for axis in (ax.xaxis, ax.yaxis):
             axis.set_major_locator(MaxNLocator(5, integer=True))
-    figure.colorbar(image, ax=list(axes), shrink=0.8, pad=0.01)
+    figure.colorbar(image, ax=list(frames), shrink=0.8, pad=0.01)
     return figure
 
 
