@@ -70,6 +70,13 @@ html_copy_source = False
 WITHOUT_KERNEL = (HERE / "without_kernel.py").read_text(encoding="utf-8")
 
 
+def show_panels(app, docname, source):
+    """Before the first cell of the gallery, the cell that shows panels without a kernel."""
+    if docname == "gallery":
+        cell = f"```{{code-cell}}\n:tags: [remove-cell]\n\n{WITHOUT_KERNEL}```\n\n"
+        source[0] = source[0].replace("```{code-cell}", f"{cell}```{{code-cell}}", 1)
+
+
 def take_course():
     """The notebooks beside the pages.
 
@@ -192,6 +199,7 @@ def setup(app):
     list_commands()
     list_performance()
     app.add_html_math_renderer("mathml", (formula, None), (formula, None))
+    app.connect("source-read", show_panels)
     app.connect("autodoc-process-docstring", pictures, priority=100)  # before napoleon's words
     app.connect("autodoc-process-docstring", bars)
     app.connect("missing-reference", front_door)

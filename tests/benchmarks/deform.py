@@ -1,8 +1,8 @@
 """Modes added up in JavaScript, as the panels do, beside a vertex shader that reads a texture.
 
-    python tests/benchmarks/deform.py [VERTICES ...]
+    python tests/benchmarks/deform.py [VERTICES ...] [--modes 10]
 
-at 30,000 and 100,000 vertices and ten modes, in Chromium with a software renderer.  A step of a
+at 30,000 and 100,000 vertices if none are given, in Chromium with a software renderer.  A step of a
 slider moves all modes: *script* sums them, makes the exact normals anew (those of ``surface.js``)
 and uploads both; *shader* reads displacement and first-order change of the normal, two texels a
 mode, *place alone* only the displacement, which leaves the normals wrong.  A turn draws what is
@@ -10,6 +10,7 @@ there once more: the shader adds up the modes for it again.  Milliseconds, the l
 of ten in turn, with what the page waits for until a pixel can be read.
 """
 
+import argparse
 import sys
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from playwright.sync_api import sync_playwright
 
 import s4a.show
 
-SIZES, MODES = (30_000, 100_000), 10
+SIZES = (30_000, 100_000)
 SURFACE = Path(s4a.show.__file__).parent / "esm" / "surface.js"
 PAGE = """
 const canvas = document.createElement("canvas");
@@ -134,18 +135,22 @@ function measured(vertices, modes) {
 """
 
 
-def main(sizes):
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("vertices", nargs="*", type=int)
+    parser.add_argument("--modes", type=int, default=10)
+    said = parser.parse_args()
     sys.stdout.write("| vertices | way | least (ms) | median (ms) |\n|---|---|---|---|\n")
     with sync_playwright() as driver:
         browser = chromium.launched(driver)
-        for size in sizes:
+        for size in said.vertices or SIZES:
             page = browser.new_page()
             page.add_script_tag(content=SURFACE.read_text(encoding="utf-8") + PAGE)
-            for way, least, median in page.evaluate(f"measured({size}, {MODES})"):
+            for way, least, median in page.evaluate(f"measured({size}, {said.modes})"):
                 sys.stdout.write(f"| {size:,} | {way} | {least:.0f} | {median:.0f} |\n")
             page.close()
         browser.close()
 
 
 if __name__ == "__main__":
-    main([int(word) for word in sys.argv[1:]] or SIZES)
+    main()
