@@ -20,7 +20,7 @@ from s4a.show.browser import PARTS, TEMPLATES, to_json
 LIMIT = 24_000_000  # characters of recorded values in a page
 LADDER = 24  # values of a slider that are kept
 # what does nothing in a page, and says nothing there
-SILENT = ipywidgets.Button | ipywidgets.ToggleButton | ipywidgets.Text | ipywidgets.ColorPicker
+SILENT = ipywidgets.Button | ipywidgets.ToggleButton | ipywidgets.Text
 # what is the browser's own; of a chart `spec` is kept key by key
 LOCAL = {"picked", "hovered", "answer", "webgl", "still", "sample", "spec"}
 
