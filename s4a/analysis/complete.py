@@ -341,7 +341,7 @@ def completed(
         density, left_out_error = posterior.best_density(known, ~present)
     again = match_again(model, present, density)
     told = tell(model, known, low, density)
-    placed = _most_likely(model, present, low, told)  # (n_full, 3)
+    placed = _most_likely(model, told)  # (n_full, 3)
 
     inflate = np.where(present, 1.0, again.factor)  # (n_low,)
     spread = told.spread * inflate[:, None]
@@ -418,7 +418,7 @@ def tell(model: Model, known: posterior.Known, low: np.ndarray, density: float) 
     return Told(found, columns, spread, told + left)
 
 
-def _most_likely(model, present, low, told):
+def _most_likely(model, told):
     """The mean of the posterior ``(n_full, 3)``."""
     c = len(model.modes)
     b = told.weights.mean[:c]

@@ -117,7 +117,9 @@ def find_guides(
         if features and isinstance(source, str)
     }
     for one in features:
-        if not any(one in of for of in [*beside.values(), *_held(sources)]):
+        if not any(
+            one in beside.get(n, {}) or _holds(mesh, one) for n, (mesh, _) in sources.items()
+        ):
             first = next(iter(sources))
             raise ValueError(
                 f"features: no shape has a field {one!r}: a file such as {first}.{one}.npy beside "
@@ -137,9 +139,9 @@ def _keyed(file):
     return str(file), content_of_file(file)
 
 
-def _held(sources):
-    """The names of fields of each mesh in memory."""
-    return [features_of(mesh) for mesh, _ in sources.values() if not isinstance(mesh, str)]
+def _holds(source, feature):
+    """Whether it is a mesh in memory with a field of that name."""
+    return not isinstance(source, str) and feature in features_of(source)
 
 
 def remarks_on_guides(sources: Sources, marked: Marked, features: Sequence[str] = ()) -> list[str]:
@@ -147,7 +149,7 @@ def remarks_on_guides(sources: Sources, marked: Marked, features: Sequence[str] 
     lacking = {"file of landmarks": [n for n in sources if not (n in marked and marked[n][0])]}
     for one in features:
         having = {name for name in marked if one in marked[name].features}
-        having |= {n for n, (mesh, _) in sources.items() if mesh_has(mesh, one)}
+        having |= {n for n, (mesh, _) in sources.items() if _holds(mesh, one)}
         lacking[f"field {one!r}"] = [name for name in sources if name not in having]
     return [
         f"{len(without)} of {len(sources)} shapes have no {what} and are registered without: "
@@ -155,11 +157,6 @@ def remarks_on_guides(sources: Sources, marked: Marked, features: Sequence[str] 
         for what, without in lacking.items()
         if 0 < len(without) < len(sources)
     ]
-
-
-def mesh_has(mesh: str | xr.Dataset, feature: str) -> bool:
-    """Whether a mesh in memory has a field of that name."""
-    return not isinstance(mesh, str) and feature in features_of(mesh)
 
 
 def of_contents(subjects: xr.Dataset, sources: Sources) -> xr.Dataset:

@@ -449,11 +449,7 @@ if __name__ == "__main__":
         "ellipsoids",
         "groups",
         "variance",
-        *(
-            ["brains", "skulls", "faces", "heads", "template", "points", "volumes"]
-            if DATA.is_dir()
-            else []
-        ),
+        *(REAL if DATA.is_dir() else ()),
     ]
     for name in chosen:
         say(f"\n{name}")
