@@ -224,17 +224,16 @@ def read_new(
     """The new meshes that can be used, with what guides them, and attributes for the report."""
     meshes, attrs = read_and_clean(shapes, options)
     files = {} if landmarks is None else files_named(landmarks, meshes, "landmarks", SUFFIXES)
-    for name, file in files.items():
+    for name, mesh in list(meshes.items()):
         try:
-            meshes[name] = with_landmarks(meshes[name], file)
+            if name in files:
+                mesh = with_landmarks(mesh, files[name])
+            path = mesh.attrs.get("path", "")
+            fields = files_beside(path, options.feature_names) if path else {}
+            meshes[name] = with_features(mesh, fields) if fields else mesh
         except ValueError as error:
             attrs[name] = attrs[name] | {"status": "excluded", "reason": str(error)}
             del meshes[name]
-    for name, mesh in list(meshes.items()):
-        path = mesh.attrs.get("path", "")
-        fields = files_beside(path, options.feature_names) if path else {}
-        if fields:
-            meshes[name] = with_features(mesh, fields)
     return meshes, attrs
 
 

@@ -123,6 +123,20 @@ def test_a_study_reads_fields_beside_its_files_and_says_who_has_none(files, tmp_
     again.close()
 
 
+def test_a_new_mesh_with_a_wrong_field_is_left_out_alone(files, tmp_path):
+    study = s4a.analyse(files, pattern="brain*.ply", features=["height"], **OPTIONS)
+    for name in ("right", "wrong"):
+        (tmp_path / f"{name}.ply").write_bytes((files / "brain_01.ply").read_bytes())
+    height = np.load(files / "brain_01.height.npy")
+    np.save(tmp_path / "right.height.npy", height)
+    np.save(tmp_path / "wrong.height.npy", height[:-1])
+    new = s4a.insert(study, tmp_path)
+    assert list(new["coarse"].children) == ["right"]
+    said = new["report"].to_dataset().sel(shape="wrong")
+    assert said["status"].item() == "excluded"
+    assert "height" in said["reason"].item()
+
+
 def test_a_weight_must_be_positive():
     with pytest.raises(ValueError, match="weight must be positive"):
         s4a.with_features(egg()[0], {"a": np.arange(1500)}, weight=0)
