@@ -16,7 +16,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 
 from s4a.geometry.mesh import as_arrays
-from s4a.show.draw import SIGNED, Viewpoint, render, signed_colors
+from s4a.show.draw import SIGNED, Viewpoint, plane_box, render, signed_colors
 from s4a.show.parts import Parts
 
 BLUE, ORANGE, GREY = "#0072b2", "#d55e00", "#777777"
@@ -68,6 +68,7 @@ def surfaces(
     label: str = "",
     columns: int = 4,
     flat: bool = False,
+    one_frame: bool = False,
     view: Viewpoint = "corner",
     up: str = "z",
 ) -> Figure:
@@ -89,6 +90,9 @@ def surfaces(
         Most pictures in a row.
     flat : bool
         Colours of labels: they are not mixed within a triangle.
+    one_frame : bool
+        All pictures show the same part of space, so that sizes and places can be compared; by
+        default each surface fills its picture.
     view, up
         See :func:`s4a.show.draw.rotation`.
 
@@ -114,6 +118,10 @@ def surfaces(
     width = 2.5 * wide + 0.7 * bool(signed)
     figure, axes = _figure(width, 2.35 * rows, wide, rows, Parts)
     figure.alt = ", ".join(meshes)
+    frame = None
+    if one_frame:
+        corners = np.concatenate([as_arrays(mesh)[0] for mesh in meshes.values()])
+        frame = plane_box(corners, view, up)
     for ax in axes.flat:
         ax.set_axis_off()
     for ax, (title, mesh) in zip(axes.flat, meshes.items(), strict=False):
@@ -121,8 +129,10 @@ def surfaces(
         if colors is not None and colors.ndim == 1:
             colors = signed_colors(colors, limit)
         X, T = as_arrays(mesh)
-        size = (360, 300)
-        ax.imshow(render(X, T, colors=colors, flat=flat, view=view, up=up, size=size))
+        drawn = render(
+            X, T, colors=colors, flat=flat, view=view, up=up, size=(360, 300), frame=frame
+        )
+        ax.imshow(drawn)
         ax.set_title(title, parse_math=False)
     if signed:
         scale = ScalarMappable(Normalize(-limit, limit), SIGNED)

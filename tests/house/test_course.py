@@ -241,6 +241,19 @@ def test_pictures_of_surfaces_wrap_in_a_row_and_stay_together_in_rows():
     assert takeaway("1 < 2.", variance([0.7]), variance([0.6])).html().count("1 &lt; 2.") == 2
 
 
+def test_pictures_in_one_frame_show_which_surface_is_larger():
+    ball = sphere(162)
+    shapes = {"whole": ball, "half": ball.assign(position=0.5 * ball["position"])}
+
+    def seen(figure):
+        return [np.count_nonzero(ax.images[0].get_array()[..., 3]) for ax in figure.axes]
+
+    whole, half = seen(surfaces(shapes))
+    assert half == pytest.approx(whole, rel=0.02)
+    whole, half = seen(surfaces(shapes, one_frame=True))
+    assert half == pytest.approx(whole / 4, rel=0.05)
+
+
 def test_what_is_said_of_an_answer_is_shown_as_words():
     assert judge(3, 3)._repr_html_() == "<p>Right.</p>"
     said = check("03.1", ...)._repr_html_()
