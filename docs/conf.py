@@ -66,14 +66,14 @@ html_show_sphinx = False
 html_copy_source = False
 
 # Run first in every notebook: what needs a kernel is shown as a page of its own, or for some
-# values of its slider.
-WITHOUT_KERNEL = (HERE / "without_kernel.py").read_text(encoding="utf-8")
+# values of its slider. In a namespace of its own, so that no cell hides a name of it.
+WITHOUT_KERNEL = f"exec({(HERE / 'without_kernel.py').read_text(encoding='utf-8')!r}, {{}})"
 
 
 def show_panels(app, docname, source):
     """Before the first cell of the gallery, the cell that shows panels without a kernel."""
     if docname == "gallery":
-        cell = f"```{{code-cell}}\n:tags: [remove-cell]\n\n{WITHOUT_KERNEL}```\n\n"
+        cell = f"```{{code-cell}}\n:tags: [remove-cell]\n\n{WITHOUT_KERNEL}\n```\n\n"
         source[0] = source[0].replace("```{code-cell}", f"{cell}```{{code-cell}}", 1)
 
 

@@ -47,8 +47,8 @@ def as_slides(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
 
 def executed(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
     """The notebook with its outputs, those of panels and sliders as HTML."""
-    prelude = nbformat.v4.new_code_cell(PRELUDE.read_text(encoding="utf-8"))
-    notebook.cells.insert(0, prelude)
+    prelude = f"exec({PRELUDE.read_text(encoding='utf-8')!r}, {{}})"  # hides no name of a lesson
+    notebook.cells.insert(0, nbformat.v4.new_code_cell(prelude))
     nbclient.NotebookClient(notebook, timeout=600, kernel_name="python3").execute()
     del notebook.cells[0]
     notebook.metadata.pop("widgets", None)

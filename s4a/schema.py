@@ -283,7 +283,7 @@ ROWS = {
     "directional_normal": ("vertex", INPUT,
         "the same along the normals: half the gap of the shape and its mirror image, outward"),
     "resolution": ("vertex", INPUT,
-        "depth of the triangles: a directional asymmetry below it is not known"),
+        "what triangles and partners may leave: a directional asymmetry below it is not known"),
     "fluctuating": ("vertex", INPUT,
         "fluctuating asymmetry: standard deviation of the asymmetries around their mean"),
     "asymmetry_size": ("individual", INPUT, "root mean square over the area of the asymmetry"),

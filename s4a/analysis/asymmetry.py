@@ -15,7 +15,6 @@ import logging
 from typing import NamedTuple
 
 import numpy as np
-import scipy.sparse as sp
 import xarray as xr
 from scipy import stats
 
@@ -42,14 +41,16 @@ ALIKE = 1e-6  # of the mean size of the asymmetries: below it they are rounding
 class Sides(NamedTuple):
     """Both sides of every individual, aligned to one symmetric consensus.
 
-    ``a (s, n, 3)`` is half the difference, ``along (s, n)`` half the gap along the normals, of
-    which a mean below ``resolution (n,)`` is not known, ``symmetric (s, n, 3)`` the mean of both
-    less that of all, ``consensus (n, 3)`` and ``area (n,)``; ``names`` of the individuals.
+    ``a (s, n, 3)`` is half the difference, ``along (s, n)`` half the gap along the normals; of both
+    ``error_a (n, 3)`` and ``error_along (n,)`` are what triangles and partners leave in all shapes;
+    ``symmetric (s, n, 3)`` the mean of both less that of all, ``consensus (n, 3)`` and
+    ``area (n,)``; ``names`` of the individuals.
     """
 
     a: np.ndarray
     along: np.ndarray
-    resolution: np.ndarray
+    error_a: np.ndarray
+    error_along: np.ndarray
     symmetric: np.ndarray
     consensus: np.ndarray
     area: np.ndarray
@@ -78,36 +79,36 @@ def own_sides(Y: np.ndarray, halves: xr.Dataset, T: np.ndarray, area: np.ndarray
     symmetric = Y - a
     consensus = symmetric.mean(0)
     # along the normals: what of the partner lies opposite, whatever an error along the surface
-    mean, other = Y.mean(0), plane(Y.mean(0))
-    triangle, weights = closest_facing_point(mean, vertex_normals(mean, T), other, T[:, ::-1])
-    gaps = half_differences(Y, T, (triangle, weights[:, ::-1]), plane)
-    along = normal_displacement(gaps, vertex_normals(consensus, T))
-    return Sides(a, along, resolution(consensus, T), symmetric - consensus, consensus, area, [])
+    mean, normals = Y.mean(0), vertex_normals(consensus, T)
+    facing = vertex_normals(mean, T)
+    triangle, weights = closest_facing_point(mean, facing, plane(mean), T[:, ::-1])
+    opposite = triangle, weights[:, ::-1]
+    along = normal_displacement(half_differences(Y, T, opposite, plane), normals)
+    # the consensus is its own mirror image: its gaps are errors, which all shapes have
+    one = consensus[None]
+    (error_a,) = half_differences(one, T, place, plane)
+    (error_along,) = normal_displacement(half_differences(one, T, opposite, plane), normals)
+    symmetric = symmetric - consensus
+    return Sides(a, along, error_a, error_along, symmetric, consensus, area, [])
 
 
-def resolution(X: np.ndarray, T: np.ndarray) -> np.ndarray:
-    """How far along the normals triangles may lie off the surface ``(n,)``.
-
-    A third of how high a vertex, or one beside it, stands over its neighbours' mean, which on a
-    round surface is the depth of the middle of a triangle.  Partners lie anywhere on triangles, and
-    shapes have all the same: a smaller gap of all shapes may be that of the triangles.
+def largest_around(values: np.ndarray, T: np.ndarray) -> np.ndarray:
+    """The largest of numbers ``(n,)`` at each vertex and the two rings around it.
 
     Examples
     --------
-    >>> import s4a
-    >>> from s4a.analysis.asymmetry import resolution
-    >>> from s4a.geometry.mesh import as_arrays
-    >>> resolution(*as_arrays(s4a.synthetic.sphere(1000))).mean().round(4)
-    np.float64(0.0027)
+    >>> import numpy as np
+    >>> from s4a.analysis.asymmetry import largest_around
+    >>> T = np.array([[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4]])
+    >>> largest_around(np.array([9, 0, 0, 0, 5, 0]), T).tolist()
+    [9, 9, 9, 9, 9, 5]
     """
-    n = len(X)
     ends = edges(T)
-    beside = sp.csr_matrix((np.ones(len(ends)), ends.T), (n, n))
-    beside = ((beside + beside.T) > 0).astype(float)
-    mean = beside @ X / np.maximum(np.asarray(beside.sum(1)), 1)
-    height = np.abs(((X - mean) * vertex_normals(X, T)).sum(1))
-    around = beside.multiply(height[None]).max(axis=1).toarray().ravel()
-    return np.maximum(height, around) / 3
+    for _ in range(2):
+        before, values = values, values.copy()
+        for here, there in (ends.T, ends.T[::-1]):
+            np.maximum.at(values, here, before[there])
+    return values
 
 
 def half_differences(
@@ -137,8 +138,9 @@ def both_sides(first: np.ndarray, second: np.ndarray, T: np.ndarray, area: np.nd
     consensus = Y.mean(0)
     a = (second - first) / 2
     along = normal_displacement(a, vertex_normals(consensus, T))
-    exact = np.zeros(len(area))  # both sides have their vertices in the same places
-    return Sides(a, along, exact, (second + first) / 2 - consensus, consensus, area, [])
+    exact = np.zeros_like(consensus)  # both sides have their vertices in the same places
+    symmetric = (second + first) / 2 - consensus
+    return Sides(a, along, exact, exact[:, 0], symmetric, consensus, area, [])
 
 
 def asymmetry(
@@ -164,10 +166,11 @@ def asymmetry(
     halves : Dataset, optional
         Of :func:`symmetry`, where it is there already.
     of : {"normal", "vector"}
-        What the test at every vertex is of: half the gap along the normals between the shapes and
-        their mirror images, opposite to which an error of :func:`symmetry` along the surface does
-        not matter; it is tested whether its mean is larger than ``resolution(vertex)``, the depth
-        of the triangles.  Or vectors, of which any such error is a directional asymmetry.
+        What the tests of directional asymmetry are of: half the gap along the normals between the
+        shapes and their mirror images, opposite to which an error of :func:`symmetry` along the
+        surface matters little.  Or vectors.  The symmetric consensus has such gaps, too, by its
+        triangles and partners: they are taken from all, and a mean counts from
+        ``resolution(vertex)`` on, four times the largest of them around, less its standard error.
     n_permutations : int
         Changes of sign of the individuals; all where fewer are different.
     seed, rng : see :mod:`s4a.seeds`
@@ -180,9 +183,9 @@ def asymmetry(
         their mean, ``symmetric_position(vertex, xyz)``.
         *Directional*: ``directional(vertex, xyz)``, the mean of a, ``directional_normal(vertex)``,
         half the gap along the normals, ``statistic`` and ``p_value`` of the whole shape (F of
-        sides), at every vertex ``explained_share``, ``p_vertex``,
-        ``p_family_wise`` (max-T), ``p_false_discovery``, ``effect_size`` (mean over standard
-        deviation, Mahalanobis).
+        sides in what `of` names, less what is not known), at every vertex ``explained_share``,
+        ``p_vertex``, ``p_family_wise`` (max-T), ``p_false_discovery``, ``effect_size`` (mean over
+        standard deviation, Mahalanobis).
         *Fluctuating*: ``fluctuating(vertex)``, and ``fluctuating_size(individual)`` beside
         ``asymmetry_size(individual)``.
         *Antisymmetry*: ``kurtosis`` of the individuals on the first component of a, and
@@ -237,7 +240,7 @@ def asymmetry(
         without = [*without, *alone]
         sides = both_sides(Y[first], Y[second], T, area)._replace(names=names)
         attrs |= {"symmetry": "matching", "sides": words}
-    result = measured(sides, of, n_permutations, seed)
+    result = measured(sides, T, of, n_permutations, seed)
     if halves is not None:
         result = result.merge(halves.drop_attrs())
     result = in_unit(result, unit_of(registration["displacement"]))
@@ -299,21 +302,23 @@ def _tell_hands(study, side_of, two):
         )
 
 
-def measured(sides: Sides, of: str, n_permutations: int, seed: int) -> xr.Dataset:
+def measured(sides: Sides, T: np.ndarray, of: str, n_permutations: int, seed: int) -> xr.Dataset:
     """All that :func:`asymmetry` says of the sides of individuals."""
     a, area, n = sides.a, sides.area, len(sides.a)
     mean = a.mean(0)
-    fields = a
+    fields, error = a, sides.error_a
     if of == "normal":
-        mean_gap = sides.along.mean(0)
-        fields = (sides.along - np.clip(mean_gap, -sides.resolution, sides.resolution))[..., None]
+        fields, error = sides.along[..., None], sides.error_along[:, None]
+    resolution = 4 * largest_around(np.linalg.norm(error, axis=1), T)
+    fields = without_doubt(fields - error, resolution)
     size = np.sqrt((a**2).sum(-1).mean(0) @ area)
     if size <= ALIKE * np.ptp(sides.consensus, axis=0).max():
         raise ValueError("left and right are the same in all shapes: there is no asymmetry to test")
     fields = np.where(abs(fields) > ALIKE * size, fields, 0)  # the midline has none along normals
-    share, p, p_max = mean_test(fields, n_permutations=n_permutations, seed=seed)
+    changes = {"n_permutations": n_permutations, "seed": seed}
+    share, p, p_max = mean_test(fields, floor=resolution / 6, **changes)
+    statistic, p_value = sides_test(gram(fields, area), **changes)
     K = gram(a, area)
-    statistic, p_value = sides_test(K, n_permutations=n_permutations, seed=seed)
     modes = gram_pca(a, area)
     kurtosis, p_kurtosis = antisymmetry_test(modes.score * modes.standard_deviation, seed=seed)
     squares = 2 * np.array([np.trace(gram(sides.symmetric, area)), K.sum() / n, 0.0])
@@ -326,7 +331,7 @@ def measured(sides: Sides, of: str, n_permutations: int, seed: int) -> xr.Datase
         symmetric_position=sides.consensus,
         directional=mean,
         directional_normal=sides.along.mean(0),
-        resolution=sides.resolution,
+        resolution=resolution,
         fluctuating=np.sqrt((around**2).sum(-1).sum(0) / (n - 1)),
         asymmetry_size=np.sqrt((a**2).sum(-1) @ area),
         fluctuating_size=np.sqrt((around**2).sum(-1) @ area),
@@ -346,6 +351,26 @@ def measured(sides: Sides, of: str, n_permutations: int, seed: int) -> xr.Datase
         variance_share=squares / squares.sum(),
         f_ratio=squares / degrees / (squares[2] / degrees[2]),
     )
+
+
+def without_doubt(fields: np.ndarray, resolution: np.ndarray) -> np.ndarray:
+    """Fields ``(s, n, k)`` less what of their mean triangles and partners may have made.
+
+    That is as long as `resolution` at most, and what is shorter than the standard error of the mean
+    needs no such care: chance does as much.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.analysis.asymmetry import without_doubt
+    >>> without_doubt(np.array([[[1.0]], [[3.0]]]), np.array([2.0])).tolist()
+    [[[0.0]], [[2.0]]]
+    """
+    mean = fields.mean(0)
+    error = np.sqrt(fields.var(0, ddof=1).sum(-1) / len(fields))
+    doubt = np.maximum(resolution - error, 0)
+    length = np.linalg.norm(mean, axis=1)
+    return fields - mean * np.minimum(1, doubt / np.where(length > 0, length, 1))[:, None]
 
 
 def sides_test(K: np.ndarray, *, n_permutations: int, seed: int) -> tuple[float, float]:

@@ -490,7 +490,11 @@ def vertex_test(
 
 
 def mean_test(
-    d: np.ndarray, *, n_permutations: int = 999, seed: int = 0
+    d: np.ndarray,
+    *,
+    floor: np.ndarray | None = None,
+    n_permutations: int = 999,
+    seed: int = 0,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Whether the mean of fields is zero, at every vertex: by changes of their signs.
 
@@ -502,6 +506,9 @@ def mean_test(
     ----------
     d : float ndarray (n, v, k)
         Fields of vectors, or with k = 1 of numbers.
+    floor : float ndarray (v,), optional
+        A standard error of the mean that is added to that of the fields, so that where they hardly
+        scatter a mean as small does not count.
     n_permutations, seed : see :func:`permutation_test`
 
     Returns
@@ -529,7 +536,12 @@ def mean_test(
             f"{n} shapes are too few for a test of {k} coordinates at a vertex: {k + 1} needed, or "
             "of='normal'"
         )
-    E = whiten(np.asarray(d, float)).transpose(0, 2, 1).reshape(n, -1).astype(np.float32)
+    E = whiten(np.asarray(d, float))
+    if floor is not None:
+        scatter = (np.asarray(d, float) ** 2).sum((0, 2))
+        whole = scatter + (n * floor) ** 2
+        E = E * np.sqrt(scatter / np.where(whole > 0, whole, 1))[:, None]
+    E = E.transpose(0, 2, 1).reshape(n, -1).astype(np.float32)
 
     def explained(signs):
         """Shares ``(b, v)`` of the means of fields with these signs ``(b, n)``."""

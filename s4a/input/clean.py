@@ -54,6 +54,14 @@ REPAIRS = {
     "unreferenced_vertices": "vertices without triangles dropped",
     "closed_holes": "holes closed",
 }
+SINGULAR = {
+    "vertices": "vertex",
+    "triangles": "triangle",
+    "edges": "edge",
+    "sides": "side",
+    "components": "component",
+    "holes": "hole",
+}
 
 
 def clean(
@@ -112,7 +120,7 @@ def clean(
     reason = repairs(counts)
     status = "repaired" if reason else "ok"
     if counts["holes"]:
-        kept = f"{counts['holes']} holes kept as boundary (close_holes=True closes them)"
+        kept = counted(counts["holes"], "holes kept as boundary (close_holes=True closes them)")
         reason = "; ".join(filter(None, [reason, kept]))
     attrs = {**mesh.attrs, **counts, "status": status, "reason": reason}
     return as_dataset(X, T, attrs, file_vertex=file_vertex, vertex_of_file=vertex_of_file)
@@ -179,16 +187,31 @@ def repairs(counts: dict[str, int | float]) -> str:
     Examples
     --------
     >>> from s4a.input.clean import repairs
-    >>> repairs({"welded_vertices": 2, "dropped_components": 3, "area_dropped": 0.0214})
-    '2 vertices welded; 3 components dropped (2.1 % of the area)'
+    >>> repairs({"welded_vertices": 2, "dropped_components": 1, "area_dropped": 0.0214})
+    '2 vertices welded; 1 component dropped (2.1 % of the area)'
     """
     parts = []
     for name, text in REPAIRS.items():
         if counts.get(name):
-            parts.append(f"{counts[name]} {text}")
+            parts.append(counted(counts[name], text))
             if name == "dropped_components":
                 parts[-1] += f" ({100 * counts['area_dropped']:.2g} % of the area)"
     return "; ".join(parts)
+
+
+def counted(n: float, text: str) -> str:
+    """A number before what it counts, which is one or many.
+
+    Examples
+    --------
+    >>> from s4a.input.clean import counted
+    >>> counted(1, "holes closed"), counted(2, "holes closed")
+    ('1 hole closed', '2 holes closed')
+    """
+    if n == 1:
+        many = next(word for word in text.split() if word in SINGULAR)
+        text = text.replace(many, SINGULAR[many], 1)
+    return f"{n} {text}"
 
 
 def check_components(components: str | int) -> None:

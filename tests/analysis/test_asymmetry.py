@@ -208,10 +208,22 @@ def test_both_sides_of_subjects_are_compared_and_the_larger_side_is_found():
     assert p > 0.05
 
 
+def test_what_triangles_and_partners_leave_is_no_asymmetry_of_the_whole_shape(halves):
+    shapes = fields(3, 16, symmetric=0.1, fluctuating=0.002)  # less than the triangles leave
+    for of in ("normal", "vector"):
+        found = statistics.asymmetry(study_of(shapes), halves=halves, of=of, **OPTIONS)
+        assert found["p_value"] > 0.05
+        assert found["p_family_wise"].min() > 0.05
+    a = found["asymmetry"].values.astype(float)
+    area = vertex_areas(*MESH) / vertex_areas(*MESH).sum()
+    K = np.einsum("inx,jnx,n->ij", a, a, area)
+    assert sides_test(K, n_permutations=199, seed=0)[1] < 0.05  # as they are
+
+
 def test_the_table_is_that_of_two_way_analysis_of_variance():
     d = np.random.default_rng(0).normal(size=(12, 500, 3)) * 0.01
     found = statistics.asymmetry(
-        matching(d[:6], d[6:] + 0.005), subject="subject", side="side", **OPTIONS
+        matching(d[:6], d[6:] + 0.005), subject="subject", side="side", of="vector", **OPTIONS
     )
     area = vertex_areas(*MESH) / vertex_areas(*MESH).sum()
     a, s = (found[name].values.astype(float) for name in ("asymmetry", "symmetric"))

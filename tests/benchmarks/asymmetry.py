@@ -11,6 +11,9 @@ of an ellipsoid of 500 vertices, smooth in what is alike on both sides and in wh
 bump of one side planted; each against its mirror image, along the normals or as vectors, or left
 and right shapes of subjects.
 
+``asymmetry.py brains [RUNS]``: the errors of a folded brain, the same on both sides, whose partners
+are found by registration; the variation of its shapes as large as that of the ellipsoids, or less.
+
 ``asymmetry.py antisymmetry [RUNS]``: how often antisymmetry is found in such shapes of subjects
 where there is none, in draws of its own.
 
@@ -102,6 +105,22 @@ def ellipsoid() -> tuple[np.ndarray, np.ndarray, xr.Dataset]:
     return X, T, dataset(partner_triangle=triangle, partner_barycentric=weights, partner_gap=gap)
 
 
+def brain(n: int, seed: int) -> tuple[np.ndarray, np.ndarray, xr.Dataset]:
+    """The same of a brain with the same folds on both sides, as large as the ellipsoid.
+
+    Its partners are found by registration.
+    """
+    made = s4a.synthetic.brains(1, n, seed=seed)
+    points = made["truth/brain_01/reference_point"].values
+    T = made["original/brain_01/corner_vertex"].values
+    other = np.where(points[:, :1] < 0, [-1, 1, 1], 1)
+    X = s4a.datasets.synthetic.reference_brain(points * other) * other
+    X *= np.sqrt(vertex_areas(*ellipsoid()[:2]).sum() / vertex_areas(X, T).sum())
+    still = as_dataset(X, T, {"template": "a"}).merge(dataset(displacement=np.zeros((2, *X.shape))))
+    study = xr.DataTree.from_dict({"registration": still.assign_coords(shape=["a", "b"])})
+    return X, T, s4a.statistics.symmetry(study)
+
+
 def draw_shapes(rng: np.random.Generator, X: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
     """Displacements ``(n, v, 3)`` that are symmetric in x, and that change their sign there.
 
@@ -120,8 +139,13 @@ def draw_shapes(rng: np.random.Generator, X: np.ndarray, n: int) -> tuple[np.nda
     return 0.3 * alike, 0.05 * (here - other * [-1, 1, 1])
 
 
-def whole_rates(surface: tuple, n: int, way: str, runs: int) -> np.ndarray:
-    """Error at vertices, of the whole shape and of antisymmetry; power of the first two."""
+def whole_rates(
+    surface: tuple, n: int, way: str, runs: int, size: float = 1.0, every: int = 5
+) -> np.ndarray:
+    """Error at vertices, of the whole shape and of antisymmetry; power of the first two.
+
+    Shapes vary by `size` times as much; the bump is planted in one of `every` runs, or in none.
+    """
     X, T, halves = surface
     height = np.exp(-((X - [1.7, 1.0, 0.6]) ** 2).sum(1) / 0.5)
     push, high = BUMP * height[:, None] * vertex_normals(X, T), height > 0.5
@@ -133,8 +157,9 @@ def whole_rates(surface: tuple, n: int, way: str, runs: int) -> np.ndarray:
         names = [f"{name}_{side}" for side in "ab" for name in names]
     said = np.full((runs, 5), np.nan)
     for run in range(runs):
-        alike, odd = draw_shapes(np.random.default_rng([run, n, 7]), X, n)
-        for planted in (False, True)[: 1 + (run % 5 == 0)]:
+        drawn = draw_shapes(np.random.default_rng([run, n, 7]), X, n)
+        alike, odd = (size * part for part in drawn)
+        for planted in (False, True)[: 1 + (every > 0 and run % every == 0)]:
             d = alike + odd + planted * push
             if way == "sides":
                 half = odd + planted * push / 2
@@ -151,7 +176,7 @@ def whole_rates(surface: tuple, n: int, way: str, runs: int) -> np.ndarray:
             else:
                 of_humps = found["antisymmetry_p"].item()
                 said[run, :3] = p.min() <= 0.05, p_value <= 0.05, of_humps <= 0.05
-    return np.nanmean(said, axis=0)
+    return np.nanmean(said if every else said[:, :3], axis=0)
 
 
 def humps(n: int, runs: int) -> float:
@@ -210,6 +235,17 @@ if __name__ == "__main__":
         runs = int(sys.argv[2]) if len(sys.argv) > 2 else 4000
         for n in (12, 20):
             write(f"{n} individuals, {runs} runs: antisymmetry found in {humps(n, runs):.3f}")
+    elif sys.argv[1:2] == ["brains"]:
+        runs = int(sys.argv[2]) if len(sys.argv) > 2 else 100
+        write(f"{runs} runs a row, {N_PERMUTATIONS} permutations, 20 individuals\n")
+        write(f"| {' | '.join(HEAD[:4])} |\n|{' --- |' * 4}")
+        for n, seed in ((2500, 0), (1500, 1), (5000, 2)):
+            surface = brain(n, seed)
+            for way, size in (("normal", 1.0), ("normal", 0.3), ("vector", 1.0)):
+                rates_of = whole_rates(surface, 20, way, runs, size, every=0)
+                cells = [f"{rate:.3f}" for rate in rates_of]
+                said = f"brain of {n} vertices, {WAYS[way]}, variation times {size}"
+                write(f"| {said} | {' | '.join(cells)} |")
     elif sys.argv[1:2] == ["whole"]:
         runs = int(sys.argv[2]) if len(sys.argv) > 2 else 500
         write(f"{runs} runs a row, {N_PERMUTATIONS} permutations\n")
@@ -221,6 +257,7 @@ if __name__ == "__main__":
             ("sides", 12),
             ("sides", 20),
             ("vector", 12),
+            ("vector", 20),
         ):
             cells = [f"{rate:.3f}" for rate in whole_rates(surface, n, way, runs)]
             write(f"| {n} individuals, {WAYS[way]} | {' | '.join(cells)} |")

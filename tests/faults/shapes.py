@@ -300,7 +300,7 @@ def flipped(path):
     "non-manifold edges",
     "fin.ply",
     "repaired",
-    "1 non-manifold edges separated",
+    "1 non-manifold edge separated",
     "separated into sheets; a robust Laplacian where the low-resolution mesh still has some",
     "`wrap=True` wraps the shape watertight",
 )
@@ -313,7 +313,7 @@ def fin(path):
     "bow-tie vertices",
     "bowtie.ply",
     "repaired",
-    "1 vertices added by splitting non-manifold ones",
+    "1 vertex added by splitting non-manifold ones",
     "split",
     "nothing to do",
 )
@@ -331,7 +331,7 @@ def bowtie(path):
     "holes, open boundary",
     "hole.ply",
     "ok",
-    "1 holes kept as boundary",
+    "1 hole kept as boundary",
     "kept as boundary",
     "`close_holes=True` closes each by a fan",
 )

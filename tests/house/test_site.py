@@ -50,7 +50,8 @@ def shown(cells, folder):
     """The HTML that the documentation shows of notebook cells, in the order of their outputs."""
     nbformat = pytest.importorskip("nbformat")
     client = pytest.importorskip("nbclient")
-    cells = [(DOCS / "without_kernel.py").read_text(encoding="utf-8"), *cells]
+    prelude = (DOCS / "without_kernel.py").read_text(encoding="utf-8")
+    cells = [f"exec({prelude!r}, {{}})", *cells]
     notebook = nbformat.v4.new_notebook(cells=[*map(nbformat.v4.new_code_cell, cells)])
     resources = {"metadata": {"path": str(folder)}}
     client.NotebookClient(notebook, timeout=300, resources=resources).execute()
@@ -66,6 +67,14 @@ SMALL = """
 import s4a
 study = s4a.synthetic.example_study()
 """
+
+
+def test_a_cell_may_use_the_names_of_what_shows_panels(tmp_path):
+    names = "drawn = pictured = framed = html_of = tubes = templates = render = None"
+    scene = "threejs.renderer(threejs.surface(study['original/brain_01']))"
+    scene = f"from s4a.widgets import threejs; {scene}"
+    html = shown([names, SMALL, scene], tmp_path)
+    assert any("A scene" in part for part in html)
 
 
 def test_a_page_shows_the_first_panel_of_a_study_that_has_no_modes(tmp_path):

@@ -472,7 +472,7 @@ def test_a_bad_file_is_excluded_with_its_reason_and_the_rest_goes_on(tmp_path):
     assert "expected 396 rows of face" in cut
     assert (named, twice) == (
         "named .obj but holds PLY, and was read as that; rename it",
-        "1 duplicate triangles dropped",
+        "1 duplicate triangle dropped",
     )
     assert report["file_vertices"].values.tolist() == [-1, 200, 200]
     assert list(shapes["original"]) == ["named", "twice"]
