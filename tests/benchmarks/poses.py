@@ -1,13 +1,14 @@
 """Pairs in far poses, each matched on its own from scratch: errors by the truth.
 
-``poses.py [--seed S] [--pairs N] [--three] [--landmarks N] [--network]``: random ordered pairs of
-twenty registered bodies of the shared data (two persons in ten poses), 4,000 vertices at low
-resolution, with the mean error of each pair in % of sqrt(area); ``--three`` without the search for
-more first maps, ``--landmarks`` with as many of the user's: the vertices of the first body that are
-farthest from each other, its head, hands and feet first; ``--network`` after an analysis of all
-twenty, through whose latent bases any pair is registered (:func:`s4a.register_shape`).  The search
-was tuned on the pairs of seed 7; those of seed 8 are only reported.  Registered bodies share their
-connectivity, which remeshing at low resolution hides.
+``poses.py [--seed S] [--pairs N] [--three] [--landmarks N] [--field] [--network]``: random ordered
+pairs of twenty registered bodies of the shared data (two persons in ten poses), 4,000 vertices at
+low resolution, with the mean error of each pair in % of sqrt(area); ``--three`` without the search
+for more first maps, ``--landmarks`` with as many of the user's: the vertices of the first body that
+are farthest from each other, its head, hands and feet first; ``--field`` with a field of the
+user's, how far to the side of the first body each vertex lies; ``--network`` after an analysis of
+all twenty, through whose latent bases any pair is registered (:func:`s4a.register_shape`).  The
+search was tuned on the pairs of seed 7; those of seed 8 are only reported.  Registered bodies share
+their connectivity, which remeshing at low resolution hides.
 """
 
 import argparse
@@ -40,6 +41,7 @@ def main():
     parser.add_argument("--pairs", type=int, default=30)
     parser.add_argument("--three", action="store_true")
     parser.add_argument("--landmarks", type=int, default=0)
+    parser.add_argument("--field", action="store_true")
     parser.add_argument("--network", action="store_true")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
@@ -53,10 +55,10 @@ def main():
             if args.network:
                 report_network(files, pairs)
             else:
-                report(files, pairs, args.landmarks)
+                report(files, pairs, args.landmarks, args.field)
 
 
-def report(files, pairs, n_landmarks):
+def report(files, pairs, n_landmarks, field):
     """A line for each pair, and their mean."""
     options = pair_options({"n_coarse": N_COARSE})
     names = [str(i) for i in range(n_landmarks)]
@@ -69,6 +71,8 @@ def report(files, pairs, n_landmarks):
         if names:
             P = mesh["position"].values[vertices]
             mesh = s4a.with_landmarks(mesh, dataset(landmark_name=names, landmark_position=P))
+        if field:
+            mesh = s4a.with_features(mesh, {"side": first[:, 0]})
         return shape_of(mesh, options)
 
     errors = []
