@@ -18,6 +18,7 @@ from markupsafe import Markup
 from matplotlib.colors import to_rgb
 
 import s4a.course
+from s4a.geometry.mesh import as_arrays
 from s4a.show.draw import CLAY, data_uri, image_bytes, on_white, render
 from s4a.show.panel_page import panel_html
 from s4a.show.parts import Parts
@@ -87,6 +88,10 @@ def drawn(part, radius):
     if isinstance(known, pythreejs.LineSegmentsGeometry):
         begin, end = np.asarray(known.positions, float).transpose(1, 0, 2)
         return tubes(begin, end, np.asarray(known.colors)[:, 0], radius)
+    if isinstance(known, pythreejs.SphereBufferGeometry):
+        X, T = as_arrays(s4a.synthetic.sphere(200))
+        color = np.tile(to_rgb(part.material.color), (len(X), 1))
+        return X * known.radius + np.array(part.position), T, color
     X, T = known.attributes["position"].array + np.array(part.position), known.index.array
     T = T.reshape(-1, 3)
     if part.material.wireframe:
@@ -106,6 +111,11 @@ def pictured(scene):
     meshes = [part for part in parts if hasattr(getattr(part, "geometry", None), "attributes")]
     corners = np.concatenate([mesh.geometry.attributes["position"].array for mesh in meshes])
     radius = 0.002 * np.linalg.norm(np.ptp(corners, axis=0))
+    meshes += [
+        part
+        for part in parts
+        if isinstance(getattr(part, "geometry", None), pythreejs.SphereBufferGeometry)
+    ]
     points, triangles, colors = [], [], []
     for part in [*meshes, *(part for part in parts if isinstance(part, pythreejs.LineSegments2))]:
         X, T, color = drawn(part, radius)
