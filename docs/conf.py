@@ -16,6 +16,7 @@ from latex2mathml.converter import convert
 sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
 import examples
+from slides import WITHOUT_KERNEL
 
 import paper
 import s4a
@@ -64,10 +65,6 @@ html_css_files = ["s4a.css"]
 html_js_files = ["s4a.js"]
 html_show_sphinx = False
 html_copy_source = False
-
-# Run first in every notebook: what needs a kernel is shown as a page of its own, or for some
-# values of its slider. In a namespace of its own, so that no cell hides a name of it.
-WITHOUT_KERNEL = f"exec({(HERE / 'without_kernel.py').read_text(encoding='utf-8')!r}, {{}})"
 
 
 def show_panels(app, docname, source):

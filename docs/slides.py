@@ -16,7 +16,9 @@ from nbconvert import SlidesExporter
 
 DOCS = Path(__file__).resolve().parent
 NOTEBOOKS = DOCS.parent / "notebooks"
-PRELUDE = DOCS / "without_kernel.py"
+# The first cell of a notebook, in a namespace of its own, so that no cell hides a name of it:
+# what needs a kernel is shown as a page of its own, or for some values of its slider.
+WITHOUT_KERNEL = f"exec({(DOCS / 'without_kernel.py').read_text(encoding='utf-8')!r}, {{}})"
 LECTURE = ("00", "04", "09")  # 45 minutes
 SHORT = 8  # lines of code that are shown
 
@@ -47,8 +49,7 @@ def as_slides(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
 
 def executed(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
     """The notebook with its outputs, those of panels and sliders as HTML."""
-    prelude = f"exec({PRELUDE.read_text(encoding='utf-8')!r}, {{}})"  # hides no name of a lesson
-    notebook.cells.insert(0, nbformat.v4.new_code_cell(prelude))
+    notebook.cells.insert(0, nbformat.v4.new_code_cell(WITHOUT_KERNEL))
     nbclient.NotebookClient(notebook, timeout=600, kernel_name="python3").execute()
     del notebook.cells[0]
     notebook.metadata.pop("widgets", None)

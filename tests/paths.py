@@ -13,8 +13,13 @@ DATA = ROOT.parent / "shared" / "data"  # real meshes, beside the repository; te
 BENCHMARKS = TESTS / "benchmarks"
 
 
+def script(path: Path) -> ModuleType:
+    """A script as a module; it finds those beside it."""
+    if str(path.parent) not in sys.path:
+        sys.path.append(str(path.parent))
+    return importlib.import_module(path.stem)
+
+
 def benchmark(name: str) -> ModuleType:
     """A script of the benchmarks as a module."""
-    if str(BENCHMARKS) not in sys.path:
-        sys.path.append(str(BENCHMARKS))
-    return importlib.import_module(name)
+    return script(BENCHMARKS / f"{name}.py")

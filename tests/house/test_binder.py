@@ -3,7 +3,6 @@
 And the study is made.
 """
 
-import importlib.util
 import os
 import re
 import shutil
@@ -11,7 +10,7 @@ import tomllib
 
 import numpy as np
 import pytest
-from paths import ROOT
+from paths import ROOT, script
 
 import s4a
 from s4a.study.tree import open_study
@@ -31,10 +30,7 @@ def distributions(requirements):
 
 @pytest.fixture(scope="module")
 def prepare():
-    spec = importlib.util.spec_from_file_location("prepare", BINDER / "prepare.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return script(BINDER / "prepare.py")
 
 
 @pytest.fixture(scope="module")

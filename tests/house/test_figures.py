@@ -1,20 +1,16 @@
 """A figure that a page quotes has a command that prints it, and `make paper` runs that command."""
 
 import re
-import sys
 from pathlib import Path
 
 import pytest
-from paths import DOCS, ROOT, benchmark
+from paths import DOCS, ROOT, benchmark, script
 from PIL import Image
 
 import s4a
 
-sys.path.insert(0, str(ROOT / "tools"))
-sys.path.insert(0, str(DOCS))
-import figures
-
-import paper
+figures = script(DOCS / "figures.py")
+paper = script(ROOT / "tools" / "paper.py")
 
 # what looks measured: a number with a unit, or a cell of a table with two digits after the point
 FIGURE = re.compile(
@@ -125,8 +121,8 @@ def test_every_picture_of_the_pages_is_drawn_by_a_command():
     assert drawn <= shown
     others = {"heads.png": "compare.py", "structure.svg": "structure.py"}
     assert shown - drawn == set(others)
-    for name, script in others.items():
-        assert f'"{name}"' in (paper.BENCHMARKS / script).read_text(encoding="utf-8")
+    for name, file in others.items():
+        assert f'"{name}"' in (paper.BENCHMARKS / file).read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="module")

@@ -2,15 +2,13 @@
 
 import re
 import shutil
-import sys
 import tomllib
 from pathlib import Path
 
 import pytest
-from paths import ROOT
+from paths import ROOT, script
 
-sys.path.insert(0, str(ROOT / "tools"))
-import release
+release = script(ROOT / "tools" / "release.py")
 
 
 @pytest.fixture

@@ -1,7 +1,7 @@
 """The built documentation in Chromium: accessible, searchable, and not too wide."""
 
 import pytest
-from paths import DOCS, benchmark
+from paths import DOCS, benchmark, script
 
 
 @pytest.fixture(scope="module")
@@ -50,8 +50,7 @@ def shown(cells, folder):
     """The HTML that the documentation shows of notebook cells, in the order of their outputs."""
     nbformat = pytest.importorskip("nbformat")
     client = pytest.importorskip("nbclient")
-    prelude = (DOCS / "without_kernel.py").read_text(encoding="utf-8")
-    cells = [f"exec({prelude!r}, {{}})", *cells]
+    cells = [script(DOCS / "slides.py").WITHOUT_KERNEL, *cells]
     notebook = nbformat.v4.new_notebook(cells=[*map(nbformat.v4.new_code_cell, cells)])
     resources = {"metadata": {"path": str(folder)}}
     client.NotebookClient(notebook, timeout=300, resources=resources).execute()

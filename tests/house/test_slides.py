@@ -1,18 +1,15 @@
 """Slides made from the notebooks: what begins one, and what is left out."""
 
-import importlib.util
 import re
 
 import pytest
-from paths import DOCS, NOTEBOOKS, ROOT
+from paths import DOCS, NOTEBOOKS, ROOT, script
 
 nbformat = pytest.importorskip("nbformat")
 pytest.importorskip("nbclient")
 pytest.importorskip("nbconvert")
 
-SPEC = importlib.util.spec_from_file_location("slides", DOCS / "slides.py")
-slides = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(slides)
+slides = script(DOCS / "slides.py")
 
 
 def deck(lesson):

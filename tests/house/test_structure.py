@@ -3,19 +3,14 @@
 ``make structure`` writes the pages anew.
 """
 
-import importlib.util
 import re
 
 import pytest
-from paths import DOCS, NOTEBOOKS, ROOT
+from paths import DOCS, NOTEBOOKS, ROOT, benchmark
 
 from s4a._moved import MOVED
 
-SPEC = importlib.util.spec_from_file_location(
-    "structure", ROOT / "tests" / "benchmarks" / "structure.py"
-)
-structure = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(structure)
+structure = benchmark("structure")
 WORDS = [
     *sorted(DOCS.glob("*.md")),
     *sorted((DOCS / "api").glob("*.md")),
