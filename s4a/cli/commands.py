@@ -315,19 +315,24 @@ def insert(args: Namespace) -> int:
     from s4a.analysis.export import write_registered
     from s4a.cli import tables
     from s4a.study.insert import insert
-    from s4a.study.store import ENGINE
-    from s4a.study.tree import open_study
+    from s4a.study.store import ENGINE, STRUCTURES
+    from s4a.study.tree import of_structure, open_study, structure_names
 
     study = open_study(args.study)
-    inserted = insert(
-        study, args.shapes, landmarks=args.landmarks, reflect=args.reflect, n_jobs=args.n_jobs
-    )
+    options = {name: getattr(args, name) for name in ("landmarks", "reflect", "table", "n_jobs")}
+    inserted = insert(study, args.shapes, **options)
     out = new_folder(args.out)
     inserted.to_netcdf(out / "inserted.nc", engine=ENGINE)
-    write_registered(inserted, out)
-    write(tables.inserted_table(inserted))
+    parts = {"": inserted}
+    if STRUCTURES in inserted.children:
+        names = structure_names(inserted)
+        parts = {f"{STRUCTURES}/{name}": of_structure(inserted, name) for name in names}
+    for place, part in parts.items():
+        write_registered(part, out / place)
+        write(f"{place}\n{tables.inserted_table(part)}".lstrip())
     write(f"\nwritten: {out / 'inserted.nc'}, registered meshes and scores in {out}")
-    return 1 if (inserted["report"]["status"] == "excluded").any() else 0
+    lost = [(part["report"]["status"] == "excluded").any() for part in parts.values()]
+    return 1 if any(lost) else 0
 
 
 def complete(args: Namespace) -> int:

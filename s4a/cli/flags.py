@@ -288,12 +288,14 @@ def _structures(add):
 
 def _insert(add):
     add("study", metavar="STUDY")
-    add("shapes", nargs="+", metavar="SHAPE", help="mesh files, folders or globs")
+    add("shapes", nargs="+", metavar="SHAPE", help="mesh files, label volumes, folders or globs")
     text = "for inserted.nc, registered meshes and scores"
     add("--out", required=True, metavar="DIR", help=text)
     add("--landmarks", metavar="DIR", help=HELP["landmarks"])
     text = "new shapes to mirror: names, with commas; or auto, those of the other hand"
     add("--reflect", metavar="NAMES", help=text)
+    text = "CSV of several structures, with columns shape, subject and structure"
+    add("--table", metavar="CSV", help=text)
     add_options(add, ["n_jobs"])
 
 

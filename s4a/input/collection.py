@@ -106,7 +106,7 @@ def read_shapes(
     ----------
     paths : str, Path, list of these, or dict
         A folder, a glob, a file or several of these, see :func:`s4a.input.files.find_meshes`; or
-        shapes in memory as a dict of name to ``(points, triangles)`` or to a mesh Dataset.
+        a dict of name to a file, ``(points, triangles)`` or a mesh Dataset.
     components, strict, close_holes
         See :func:`s4a.input.clean.clean`.
     pattern : str, optional
@@ -300,7 +300,7 @@ def _sources(paths, pattern, volumes):
 
 def _cleaned(source, label, **options):
     """A file, a Dataset or a pair of arrays, cleaned."""
-    if isinstance(source, Path):
+    if isinstance(source, str | Path):
         return read_shape(source, label=label, **options)
     if isinstance(source, xr.Dataset):
         return in_unit(clean(source, **options), source.attrs.get("unit"))

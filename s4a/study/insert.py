@@ -20,7 +20,7 @@ from s4a.input.hands import AUTO, is_of_other_hand, mirror_image
 from s4a.input.landmarks import SUFFIXES, with_landmarks
 from s4a.input.plausibility import find_warnings
 from s4a.input.scalars import files_beside, with_features
-from s4a.input.subjects import listed
+from s4a.input.subjects import listed, read_table
 from s4a.method.first_map import motion_onto
 from s4a.method.lift import low_resolution
 from s4a.method.pca import project_scores
@@ -30,7 +30,17 @@ from s4a.method.shape import Shape
 from s4a.schema import dataset, in_unit, require, unit_of, variable
 from s4a.study.options import Options
 from s4a.study.processes import workers
-from s4a.study.tree import left_out, stack_registration, template_mesh
+from s4a.study.sources import find_sources
+from s4a.study.store import STRUCTURES
+from s4a.study.structures import contents_of, is_nested, lacking, parts_of_table
+from s4a.study.tree import (
+    left_out,
+    nodes_of_structure,
+    of_structure,
+    stack_registration,
+    structure_names,
+    template_mesh,
+)
 
 log = logging.getLogger(__name__)
 
@@ -63,6 +73,7 @@ def insert(
     *,
     landmarks: Path | str | None = None,
     reflect: str | list[str] | None = None,
+    table: Path | str | None = None,
     compare: bool = True,
     n_jobs: int | None = None,
 ) -> xr.DataTree:
@@ -78,13 +89,17 @@ def insert(
     study : DataTree
         Of :func:`s4a.analyse` or :func:`s4a.open_study`.
     shapes : path, list of paths, dict or Dataset
-        See :func:`s4a.read_shapes`; a single mesh Dataset is named ``new``.
+        See :func:`s4a.read_shapes`; a single mesh Dataset is named ``new``.  Into a study of
+        several structures: ``{subject: {structure: mesh}}``, files with a `table`, or label volumes
+        where it was made of these.
     landmarks : path, optional
         Folder with a file of landmarks for some or all of them, see :func:`s4a.analyse`.
     reflect : str or list of str, optional
         New shapes to mirror, as ``reflect=`` of :func:`s4a.analyse` did it: their names, with
         commas between them, or ``"auto"``, those of the other hand than the shapes of the study as
         they are in it.  Without it none is mirrored, and `compare` tells those of the other hand.
+    table : path, optional
+        CSV with columns ``shape``, ``subject`` and ``structure``, as of :func:`s4a.analyse`.
     compare : bool
         Whether each new shape is compared with those of the study: unit, handedness, pose, genus,
         as :func:`s4a.read_shapes` does it; what looks wrong is named in ``/report`` and left as it
@@ -100,12 +115,14 @@ def insert(
         mode, latent)``, shape differences and ``distance_to_median(shape)``; in ``/pca``
         ``score(shape, component)`` on the frozen modes, these, and ``reconstruction_error(shape)``;
         ``/report``.  ``/original`` has the template's mesh too, so that labels can be transferred.
+        Of several structures that of each below ``/structures``, and ``/report`` with
+        ``structure_status(shape, structure)``.
 
     Raises
     ------
     ValueError
         When the study is not finished, no shape can be used, one has the name of the template, or
-        `reflect` names none of them.
+        `reflect` names none of them; when several structures are given other than above.
 
     Examples
     --------
@@ -123,6 +140,27 @@ def insert(
     >>> s4a.show.charts.scores(score, names, highlight=names.index("brain_04"))
     <Figure ...>
     """
+    if STRUCTURES in study.children:
+        if landmarks is not None or reflect is not None:
+            raise ValueError(
+                "landmarks= and reflect= are of shapes of one structure: insert them into "
+                "s4a.statistics.of_structure(study, name)"
+            )
+        return insert_several(study, given_structures(study, shapes, table), compare, n_jobs)
+    if table is not None:
+        raise ValueError("table= says of which structure a shape is; this study has one alone")
+    return insert_shapes(study, shapes, landmarks, reflect, compare, n_jobs)
+
+
+def insert_shapes(
+    study: xr.DataTree,
+    shapes: Path | str | list[Any] | dict[str, Any] | xr.Dataset,
+    landmarks: Path | str | None,
+    reflect: str | list[str] | None,
+    compare: bool,
+    n_jobs: int | None,
+) -> xr.DataTree:
+    """New shapes of one structure, see :func:`insert`."""
     needed = ("original", "coarse", "latent", "registration")
     missing = [name for name in needed if name not in study.children]
     if missing:
@@ -180,6 +218,55 @@ def insert(
     report["keep_doubtful"] = "True"  # all that were given are in the result
     if reflect is not None:
         nodes["report"]["reflected"] = variable("reflected", [name in mirrored for name in attrs])
+    return xr.DataTree.from_dict(nodes)
+
+
+def given_structures(study: xr.DataTree, shapes: Any, table: Path | str | None) -> dict[str, Any]:
+    """The new shapes of each structure that are given, called as their subjects."""
+    names = structure_names(study)
+    given: dict[str, Any]
+    if table is not None:
+        sources = find_sources(shapes)
+        parts = parts_of_table(sources, {}, read_table(table, list(sources)), Options())
+        given = {
+            name: {subject: source for subject, (source, _) in part.sources.items()}
+            for name, part in parts.items()
+        }
+    elif isinstance(shapes, dict) and is_nested(shapes):
+        of_subjects = list(dict.fromkeys(name for of in shapes.values() for name in of))
+        given = {
+            name: {subject: of[name] for subject, of in shapes.items() if name in of}
+            for name in of_subjects
+        }
+    elif all(Options.from_report(of_structure(study, name)).label is not None for name in names):
+        return dict.fromkeys(names, shapes)
+    else:
+        raise ValueError(
+            f"the study has several structures ({listed(names)}): {{subject: {{structure: mesh}}}} "
+            "needed, or files and table=, with columns 'shape', 'subject' and 'structure'"
+        )
+    unknown = [repr(name) for name in given if name not in names]
+    if unknown:
+        raise ValueError(f"the study has no structure {listed(unknown)}; it has {listed(names)}")
+    for line in lacking({name: given.get(name, ()) for name in names}):
+        log.warning("%s: it is inserted without", line)
+    return given
+
+
+def insert_several(
+    study: xr.DataTree, given: dict[str, Any], compare: bool, n_jobs: int | None
+) -> xr.DataTree:
+    """The new shapes of each structure, in the study of that structure."""
+    inserted = {}
+    for name, shapes in given.items():
+        try:
+            of = of_structure(study, name)
+            inserted[name] = insert_shapes(of, shapes, None, None, compare, n_jobs)
+        except ValueError as error:
+            raise ValueError(f"structure {name}: {error}") from error
+    nodes = {"/report": contents_of(inserted)}
+    for name, new in inserted.items():
+        nodes |= nodes_of_structure(name, new)
     return xr.DataTree.from_dict(nodes)
 
 

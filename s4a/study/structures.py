@@ -6,7 +6,7 @@ together is in :mod:`s4a.analysis.structures`; scans of one subject lie in one f
 """
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -181,17 +181,28 @@ def check_parts(parts: dict[str, Part], options: Options) -> list[str]:
             "reflect= would put mirrored structures into another frame than the others of their "
             "subject, and each has a template of its own: leave it out"
         )
-    everyone = sorted({subject for part in parts.values() for subject in part.sources})
-    lacking = {
-        subject: [name for name, part in parts.items() if subject not in part.sources]
-        for subject in everyone
-    }
     return [
-        f"{subject} has no {listed(names)}: it is in the modes of its other structures, and not in "
-        "what is said of all together"
-        for subject, names in lacking.items()
-        if names
+        f"{line}: it is in the modes of its other structures, and not in what is said of all "
+        "together"
+        for line in lacking({name: part.sources for name, part in parts.items()})
     ]
+
+
+def lacking(subjects_of: Mapping[str, Iterable[str]]) -> list[str]:
+    """Which subject has none of some structures, in words.
+
+    Examples
+    --------
+    >>> from s4a.study.structures import lacking
+    >>> lacking({"left": ["a", "b"], "right": ["a"]})
+    ['b has no right']
+    """
+    have = {name: set(subjects) for name, subjects in subjects_of.items()}
+    missing = {
+        subject: [name for name, subjects in have.items() if subject not in subjects]
+        for subject in sorted(set().union(*have.values()))
+    }
+    return [f"{subject} has no {listed(names)}" for subject, names in missing.items() if names]
 
 
 def check_one_kind(folder: Path | str, several: bool) -> None:
@@ -205,12 +216,18 @@ def check_one_kind(folder: Path | str, several: bool) -> None:
 
 def write_contents(folder: Path, names: list[str]) -> None:
     """``structures.nc``: what became of every structure of every subject."""
+    studies = {name: open_study(folder / STRUCTURES / name) for name in names}
+    write(contents_of(studies), folder / f"{STRUCTURES}.nc")
+
+
+def contents_of(studies: Mapping[str, xr.DataTree]) -> xr.Dataset:
+    """``structure_status(shape, structure)``: what became of every structure of every subject."""
     status: dict[str, dict[str, str]] = {}
-    for name in names:
-        report = open_study(folder / STRUCTURES / name)["report"].to_dataset()
+    for name, study in studies.items():
+        report = study["report"].to_dataset()
         shapes = report["shape"].values.tolist()
         status[name] = dict(zip(shapes, report["status"].values.tolist(), strict=True))
     everyone = sorted({subject for of in status.values() for subject in of})
-    table = [[status[name].get(subject, "missing") for name in names] for subject in everyone]
+    table = [[of.get(subject, "missing") for of in status.values()] for subject in everyone]
     data = dataset(structure_status=np.array(table))
-    write(data.assign_coords(shape=everyone, structure=names), folder / f"{STRUCTURES}.nc")
+    return data.assign_coords(shape=everyone, structure=list(status))

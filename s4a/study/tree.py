@@ -321,10 +321,16 @@ def open_structures(folder: Path | str) -> xr.DataTree:
     if gone or not names:
         raise ValueError(f"{within} lacks the study of {listed(gone) or 'any structure'}")
     for name in names:
-        for node in open_study(found[name]).subtree:
-            path = f"/{STRUCTURES}/{name}{node.path}".rstrip("/")
-            nodes[path] = node.to_dataset(inherit=False)
+        nodes |= nodes_of_structure(name, open_study(found[name]))
     return xr.DataTree.from_dict(nodes, name=folder.name)
+
+
+def nodes_of_structure(name: str, study: xr.DataTree) -> dict[str, xr.Dataset]:
+    """The nodes of the study of one structure by their paths in that of several."""
+    return {
+        f"/{STRUCTURES}/{name}{node.path}".rstrip("/"): node.to_dataset(inherit=False)
+        for node in study.subtree
+    }
 
 
 def structure_names(study: xr.DataTree) -> list[str]:

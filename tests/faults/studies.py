@@ -585,6 +585,13 @@ PROOFS = [
         "test_a_structure_in_another_frame_is_told",
     ),
     (
+        "a mesh without its structure, an unknown structure, or landmarks and reflect=, for a "
+        "study of several structures",
+        "error that says how new subjects are given",
+        "test_several.py",
+        "test_what_cannot_be_inserted_into_several_structures_is_told",
+    ),
+    (
         "a structure of one subject mirrored in its file",
         "warned by subject",
         STRUCTURES,

@@ -181,3 +181,82 @@ def test_the_flag_of_structures_needs_a_name_and_a_label(capsys):
     with pytest.raises(SystemExit):
         cli.main(["run", "scans", "--out", "x", "--structures", "left"])
     assert "a structure and its label needed, as left=17" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def study(store):
+    return open_study(store).load()
+
+
+def test_a_new_subject_is_inserted_structure_by_structure(study):
+    new = subjects(8, 200, seed=1)
+    given = {"new_1": new["subject_1"], "new_2": {"left": new["subject_2"]["left"]}}
+    inserted = s4a.insert(study, given, n_jobs=1)
+    status = inserted["report"]["structure_status"]
+    assert status.sel(shape="new_1").values.tolist() == ["ok", "ok"]
+    assert status.sel(shape="new_2").values.tolist() == ["ok", "missing"]
+    for name in ("left", "right"):
+        alone = s4a.insert(
+            s4a.statistics.of_structure(study, name), {"new_1": given["new_1"][name]}, n_jobs=1
+        )
+        found = s4a.statistics.of_structure(inserted, name)["pca"]["score"].sel(shape="new_1")
+        xr.testing.assert_equal(found, alone["pca"]["score"].sel(shape="new_1"))
+
+
+def test_new_subjects_may_lack_a_structure_which_is_told(study, caplog):
+    new = subjects(8, 200, seed=1)["subject_1"]
+    inserted = s4a.insert(study, {"new": {"right": new["right"]}}, n_jobs=1)
+    assert list(inserted["structures"].children) == ["right"]
+    assert "new has no left: it is inserted without" in caplog.text
+
+
+def test_the_command_inserts_files_of_several_structures_by_their_table(store, tmp_path, capsys):
+    lines = ["shape,subject,structure"]
+    for structure, mesh in subjects(8, 200, seed=1)["subject_1"].items():
+        path = tmp_path / f"new_{structure}.ply"
+        write_mesh(path, mesh["position"].values, mesh["corner_vertex"].values)
+        lines.append(f"{path.name},new,{structure}")
+    table, out = tmp_path / "new.csv", tmp_path / "out"
+    table.write_text("\n".join(lines) + "\n")
+    words = ["insert", str(store), str(tmp_path), "--table", str(table), "--out", str(out)]
+    assert cli.main([*words, "--n-jobs", "1"]) == 0
+    said = capsys.readouterr().out
+    assert said.index("structures/left") < said.index("structures/right")
+    assert {"new.ply", "scores.csv"} <= {path.name for path in (out / "structures/left").iterdir()}
+    with xr.open_datatree(out / "inserted.nc") as inserted:
+        assert inserted["report"]["structure_status"].values.tolist() == [["ok", "ok"]]
+
+
+def test_what_cannot_be_inserted_into_several_structures_is_told(study, tmp_path):
+    mesh = s4a.synthetic.sphere(200)
+    with pytest.raises(ValueError, match=r"several structures \(left, right\): {subject: {struc"):
+        s4a.insert(study, {"new": mesh})
+    with pytest.raises(ValueError, match="has no structure 'middle'; it has left, right"):
+        s4a.insert(study, {"new": {"middle": mesh}})
+    with pytest.raises(ValueError, match="of shapes of one structure: insert them into"):
+        s4a.insert(study, {"new": {"left": mesh}}, reflect="auto")
+    with pytest.raises(ValueError, match="structure left: no shape can be inserted"):
+        s4a.insert(study, {"new": {"left": s4a.synthetic.sphere(9)}}, n_jobs=1)
+    of_left = s4a.statistics.of_structure(study, "left")
+    with pytest.raises(ValueError, match="this study has one alone"):
+        s4a.insert(of_left, {"new": mesh}, table=tmp_path / "new.csv")
+
+
+def test_a_label_volume_is_inserted_into_every_structure_of_such_a_study(tmp_path):
+    import nibabel
+
+    grid = np.indices((24, 14, 14)).transpose(1, 2, 3, 0)
+    rng = np.random.default_rng(0)
+    for name in "abcd":
+        labels = np.zeros(grid.shape[:3], np.uint8)
+        for value, x in ((1, 6.5), (2, 17.5)):
+            axes = rng.uniform([4.5, 3.4, 2.6], [5, 3.8, 3])
+            labels[(((grid - [x, 6.5, 6.5]) / axes) ** 2).sum(-1) < 1] = value
+        nibabel.Nifti1Image(labels, np.eye(4)).to_filename(tmp_path / f"{name}.nii.gz")
+    few = [tmp_path / f"{name}.nii.gz" for name in "abc"]
+    study = analyse(few, structures={"front": 1, "back": 2}, keep_doubtful=True, **SMALL)
+    inserted = s4a.insert(study, tmp_path / "d.nii.gz", n_jobs=1)
+    assert inserted["report"]["structure_status"].shape == (1, 2)
+    assert list(inserted["structures"].children) == ["front", "back"]
+    front = s4a.statistics.of_structure(inserted, "front")
+    assert front["registration"]["shape"].values.tolist() == ["d"]
