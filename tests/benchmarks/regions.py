@@ -73,7 +73,7 @@ def rates(way: str, runs: int) -> list[float]:
 
 
 if __name__ == "__main__":
-    runs = int(sys.argv[1]) if len(sys.argv) > 1 else 500
+    runs = int(sys.argv[1]) if len(sys.argv) > 1 else 2000
     head = ["", "error, whole", "error, vertices", "power, whole", "power, vertices"]
     sys.stdout.write(f"{runs} runs a row\n\n| {' | '.join(head)} |\n|{' --- |' * len(head)}\n")
     for way in WAYS:

@@ -145,7 +145,7 @@ if __name__ == "__main__":
     if sys.argv[1:] == ["registered"]:
         registered()
     else:
-        runs = int(sys.argv[1]) if len(sys.argv) > 1 else 500
+        runs = int(sys.argv[1]) if len(sys.argv) > 1 else 2000
         sys.stdout.write(f"{runs} runs a row, {N_PERMUTATIONS} permutations\n\n")
         shares(max(runs // 10, 2))
         sys.stdout.write(f"\n| {' | '.join(HEAD)} |\n|{' --- |' * len(HEAD)}\n")
