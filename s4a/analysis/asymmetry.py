@@ -188,7 +188,8 @@ def asymmetry(
         half the gap along the normals, ``statistic`` and ``p_value`` of the whole shape (F of
         sides in what `of` names, less what is not known), at every vertex ``explained_share``,
         ``p_vertex``, ``p_family_wise`` (max-T), ``p_false_discovery``, ``effect_size`` (mean over
-        standard deviation, Mahalanobis).
+        standard deviation, Mahalanobis; of what is left by ``resolution``, a part of which is
+        added to the deviation).
         *Fluctuating*: ``fluctuating(vertex)``, and ``fluctuating_size(individual)`` beside
         ``asymmetry_size(individual)``.
         *Antisymmetry*: ``kurtosis`` of the individuals on the first component of a, and
