@@ -154,7 +154,7 @@ def read_shapes(
             meshes[name] = _cleaned(source, label, **options)
             attrs[name] = meshes[name].attrs
         except ValueError as error:
-            path = str(source) if isinstance(source, Path) else ""
+            path = str(source) if isinstance(source, str | Path) else ""
             attrs[name] = {"status": "excluded", "reason": str(error), "path": path}
     if not meshes:
         reasons = "; ".join(f"{name}: {said['reason']}" for name, said in attrs.items())

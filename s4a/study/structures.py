@@ -83,6 +83,11 @@ def parts_of_table(
     sources: Sources, marked: Marked, subjects: xr.Dataset, options: Options
 ) -> dict[str, Part]:
     """The shapes by structure, as the columns ``structure`` and ``subject`` of a table say."""
+    if not {COLUMN, SUBJECT} <= set(subjects):
+        raise ValueError(
+            f"{subjects.attrs['path']}: columns {COLUMN!r} and {SUBJECT!r} needed beside 'shape'; "
+            f"found {listed([str(name) for name in subjects.data_vars]) or 'none'}"
+        )
     place: dict[str, dict[str, str]] = {}
     for shape in subjects["shape"].values.tolist():
         cells = [str(subjects[column].sel(shape=shape).item()) for column in (COLUMN, SUBJECT)]
@@ -216,17 +221,18 @@ def check_one_kind(folder: Path | str, several: bool) -> None:
 
 def write_contents(folder: Path, names: list[str]) -> None:
     """``structures.nc``: what became of every structure of every subject."""
-    studies = {name: open_study(folder / STRUCTURES / name) for name in names}
-    write(contents_of(studies), folder / f"{STRUCTURES}.nc")
+    status = {name: status_of(open_study(folder / STRUCTURES / name)) for name in names}
+    write(contents_of(status), folder / f"{STRUCTURES}.nc")
 
 
-def contents_of(studies: Mapping[str, xr.DataTree]) -> xr.Dataset:
+def status_of(study: xr.DataTree) -> dict[str, str]:
+    """What became of every shape of one structure."""
+    report = study["report"].to_dataset()
+    return dict(zip(report["shape"].values.tolist(), report["status"].values.tolist(), strict=True))
+
+
+def contents_of(status: Mapping[str, Mapping[str, str]]) -> xr.Dataset:
     """``structure_status(shape, structure)``: what became of every structure of every subject."""
-    status: dict[str, dict[str, str]] = {}
-    for name, study in studies.items():
-        report = study["report"].to_dataset()
-        shapes = report["shape"].values.tolist()
-        status[name] = dict(zip(shapes, report["status"].values.tolist(), strict=True))
     everyone = sorted({subject for of in status.values() for subject in of})
     table = [[of.get(subject, "missing") for of in status.values()] for subject in everyone]
     data = dataset(structure_status=np.array(table))

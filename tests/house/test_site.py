@@ -50,6 +50,7 @@ def shown(cells, folder):
     """The HTML that the documentation shows of notebook cells, in the order of their outputs."""
     nbformat = pytest.importorskip("nbformat")
     client = pytest.importorskip("nbclient")
+    pytest.importorskip("nbconvert")
     cells = [script(DOCS / "slides.py").WITHOUT_KERNEL, *cells]
     notebook = nbformat.v4.new_notebook(cells=[*map(nbformat.v4.new_code_cell, cells)])
     resources = {"metadata": {"path": str(folder)}}

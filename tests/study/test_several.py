@@ -207,10 +207,28 @@ def test_new_subjects_may_lack_a_structure_which_is_told(study, caplog):
     new = subjects(8, 200, seed=1)["subject_1"]
     inserted = s4a.insert(study, {"new": {"right": new["right"]}}, n_jobs=1)
     assert list(inserted["structures"].children) == ["right"]
+    report = inserted["report"]
+    assert report["structure"].values.tolist() == ["left", "right"]
+    assert report["structure_status"].values.tolist() == [["missing", "ok"]]
     assert "new has no left: it is inserted without" in caplog.text
+    assert "new has no left" in report.attrs["remarks"]
 
 
-def test_the_command_inserts_files_of_several_structures_by_their_table(store, tmp_path, capsys):
+def test_a_structure_that_cannot_be_used_costs_the_others_nothing(study, caplog):
+    new = subjects(8, 200, seed=1)["subject_1"]
+    given = {"new": {"left": s4a.synthetic.sphere(9), "right": new["right"]}}
+    inserted = s4a.insert(study, given, n_jobs=1)
+    assert inserted["report"]["structure_status"].values.tolist() == [["excluded", "ok"]]
+    assert "structure left: no shape can be inserted" in inserted["report"].attrs["remarks"]
+    assert "structure left: no shape can be inserted" in caplog.text
+    alone = s4a.insert(study, {"new": {"right": new["right"]}}, n_jobs=1)
+    score = [one["structures/right/pca"]["score"] for one in (inserted, alone)]
+    xr.testing.assert_equal(*score)
+
+
+def test_the_command_inserts_files_of_several_structures_by_their_table(
+    store, study, tmp_path, capsys
+):
     lines = ["shape,subject,structure"]
     for structure, mesh in subjects(8, 200, seed=1)["subject_1"].items():
         path = tmp_path / f"new_{structure}.ply"
@@ -222,6 +240,11 @@ def test_the_command_inserts_files_of_several_structures_by_their_table(store, t
     assert cli.main([*words, "--n-jobs", "1"]) == 0
     said = capsys.readouterr().out
     assert said.index("structures/left") < said.index("structures/right")
+    direct = s4a.insert(study, {"new": subjects(8, 200, seed=1)["subject_1"]}, n_jobs=1)
+    for side in ("left", "right"):
+        row = (out / f"structures/{side}/scores.csv").read_text().splitlines()[1].split(",")
+        score = direct[f"structures/{side}/pca"]["score"].values[0]
+        np.testing.assert_allclose([float(cell) for cell in row[1:]], score, atol=0.02)
     assert {"new.ply", "scores.csv"} <= {path.name for path in (out / "structures/left").iterdir()}
     with xr.open_datatree(out / "inserted.nc") as inserted:
         assert inserted["report"]["structure_status"].values.tolist() == [["ok", "ok"]]
@@ -237,6 +260,18 @@ def test_what_cannot_be_inserted_into_several_structures_is_told(study, tmp_path
         s4a.insert(study, {"new": {"left": mesh}}, reflect="auto")
     with pytest.raises(ValueError, match="structure left: no shape can be inserted"):
         s4a.insert(study, {"new": {"left": s4a.synthetic.sphere(9)}}, n_jobs=1)
+    with pytest.raises(ValueError, match="a mesh of a structure needed; b has none"):
+        s4a.insert(study, {"a": {"left": mesh}, "b": {}})
+    template = study["structures/left/registration"].attrs["template"]
+    with pytest.raises(ValueError, match="structure left: new shapes need other names than the te"):
+        s4a.insert(study, {template: {"left": mesh}})
+    table = tmp_path / "ages.csv"
+    table.write_text("shape,age\nnew,40\n")
+    write_mesh(tmp_path / "new.ply", mesh["position"].values, mesh["corner_vertex"].values)
+    with pytest.raises(ValueError, match="'structure' and 'subject' needed beside 'shape'; found"):
+        s4a.insert(study, tmp_path / "new.ply", table=table)
+    with pytest.raises(ValueError, match="or files and table="):
+        s4a.insert(study, {"new": {"left": mesh}}, table=table)
     of_left = s4a.statistics.of_structure(study, "left")
     with pytest.raises(ValueError, match="this study has one alone"):
         s4a.insert(of_left, {"new": mesh}, table=tmp_path / "new.csv")
@@ -256,7 +291,10 @@ def test_a_label_volume_is_inserted_into_every_structure_of_such_a_study(tmp_pat
     few = [tmp_path / f"{name}.nii.gz" for name in "abc"]
     study = analyse(few, structures={"front": 1, "back": 2}, keep_doubtful=True, **SMALL)
     inserted = s4a.insert(study, tmp_path / "d.nii.gz", n_jobs=1)
-    assert inserted["report"]["structure_status"].shape == (1, 2)
-    assert list(inserted["structures"].children) == ["front", "back"]
-    front = s4a.statistics.of_structure(inserted, "front")
-    assert front["registration"]["shape"].values.tolist() == ["d"]
+    assert set(inserted["report"]["structure_status"].values.ravel()) <= {"ok", "doubtful"}
+    for name, x in (("front", 6.5), ("back", 17.5)):
+        assert list(inserted[f"structures/{name}/registration"]["shape"].values) == ["d"]
+        points = inserted[f"structures/{name}/original/d"]["position"]
+        assert points[:, 0].mean().item() == pytest.approx(x, abs=0.5)
+    with pytest.raises(ValueError, match="or label volumes, where it was made of these"):
+        s4a.insert(study, {"d": s4a.synthetic.sphere(200)})
