@@ -44,7 +44,7 @@ hangs: $(VENV)/.test
 	$(BIN)/python tests/benchmarks/hangs.py 04 --runs 20
 	$(BIN)/python tests/benchmarks/hangs.py --runs 3
 
-# every table that README, documentation and papers quote, into docs/_build/paper, with machine and versions, and every
+# every table that README, documentation and papers quote, into docs/tables, with machine and versions, and every
 # picture: hours. # ONLY=accuracy takes the commands with that word, ONLY=--list names all
 paper: $(VENV)/.bench
 	$(BIN)/python tools/paper.py $(ONLY)

@@ -30,7 +30,8 @@ project, author = "S4A", "S4A developers"
 copyright = author
 release = version_of("s4a")
 extensions = ["sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode", "myst_nb"]
-exclude_patterns = ["_build", "_variables.md", "_commands.md", "_performance.md", "performance"]
+exclude_patterns = ["_build", "_variables.md", "_commands.md", "_performance.md", "_tables.md"]
+exclude_patterns += ["performance", "tables"]
 root_doc = "index"
 
 autodoc_member_order = "bysource"
@@ -121,11 +122,14 @@ def list_commands():
     write(HERE / "_commands.md", "\n".join(parts))
 
 
-def list_performance():
-    """What the commands of speed printed when each was run last."""
-    files = [paper.kept(command, paper.PERFORMANCE) for command in paper.SPEED]
-    texts = [path.read_text(encoding="utf-8") for path in files if path.exists()]
-    write(HERE / "_performance.md", "\n".join(text.replace("# `", "### `", 1) for text in texts))
+def list_tables():
+    """What the commands of speed, and those of all pages, printed when each was run last."""
+    others = [command for command in paper.commands() if command not in paper.SPEED]
+    for name, head, commands in (("performance", "###", paper.SPEED), ("tables", "##", others)):
+        files = [paper.kept(command) for command in commands]
+        texts = [path.read_text(encoding="utf-8") for path in files if path.exists()]
+        text = "\n".join(text.replace("# `", f"{head} `", 1) for text in texts)
+        write(HERE / f"_{name}.md", text)
 
 
 def write(path, text):
@@ -194,7 +198,7 @@ def setup(app):
     take_course()
     list_variables()
     list_commands()
-    list_performance()
+    list_tables()
     app.add_html_math_renderer("mathml", (formula, None), (formula, None))
     app.connect("source-read", show_panels)
     app.connect("autodoc-process-docstring", pictures, priority=100)  # before napoleon's words

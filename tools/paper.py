@@ -1,12 +1,13 @@
 """Every table that README, documentation and papers quote, made anew: ``make paper``.
 
 The commands are those that the pages name in backticks, such as ``speed.py growth``; they are
-scripts of ``tests/benchmarks``. Each writes what it prints into ``docs/_build/paper``, with machine
-and versions at its foot. All of them take hours on two cores; ``make paper ONLY=accuracy`` takes
-those whose command contains the word, ``make paper ONLY=--list`` names all and runs none, and
-``make paper ONLY=--rest`` those that have not ended well yet, as after a night that was too short.
-``make bench`` runs those of speed into ``docs/performance``, which the page on it shows.
-``tests/house/test_figures.py`` fails where a page quotes a figure without a command.
+scripts of ``tests/benchmarks``. Each writes what it prints into ``docs/tables``, with day, machine
+and versions at its foot; those of speed, which ``make bench`` runs, into ``docs/performance``. Both
+folders stand in the repository, and the documentation has a page of each. All of them take more
+than a night on two cores: ``make paper ONLY=accuracy`` takes those whose command contains the word,
+``make paper ONLY=--list`` names all and runs none, and ``make paper ONLY=--rest`` goes on with
+those that have not ended well yet. ``tests/house/test_figures.py`` fails where a page quotes a
+figure without a command.
 """
 
 import os
@@ -21,7 +22,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 BENCHMARKS = ROOT / "tests" / "benchmarks"
-OUT = ROOT / "docs" / "_build" / "paper"
+TABLES = ROOT / "docs" / "tables"
 PAGES = (
     "README.md",
     "docs/claims.md",
@@ -100,10 +101,10 @@ def versions():
     return f"S4A {version('s4a')}{at}, Python {platform.python_version()}, {named}"
 
 
-def kept(command, out=OUT):
+def kept(command):
     """The file with what a command printed."""
     slug = re.sub(r"\W+", "-", " ".join(command).replace(".py", "")).strip("-")
-    return out / f"{slug}.md"
+    return (PERFORMANCE if command in SPEED else TABLES) / f"{slug}.md"
 
 
 def as_markdown(text):
@@ -112,9 +113,8 @@ def as_markdown(text):
     return text if re.search(r"^\|", text, re.MULTILINE) else f"```text\n{text}\n```"
 
 
-def run(command, out=OUT):
+def run(command):
     """Run a command; its output and foot as a file. Gives its path and the exit code."""
-    out.mkdir(parents=True, exist_ok=True)
     begin = time.time()
     result = subprocess.run(
         [sys.executable, str(BENCHMARKS / command[0]), *command[1:]],
@@ -126,16 +126,17 @@ def run(command, out=OUT):
     day = time.strftime("%Y-%m-%d")
     foot = f"{day}, {time.time() - begin:.0f} s. {machine()}. {versions()}."
     failed = f"\n\nIt ended with {result.returncode}." if result.returncode else ""
-    path = kept(command, out)
+    path = kept(command)
+    path.parent.mkdir(parents=True, exist_ok=True)
     head = f"# `{shlex.join(command)}`"
     said = as_markdown(result.stdout)
     path.write_text(f"{head}\n\n{said}\n\n---\n\n{foot}{failed}\n", encoding="utf-8")
     return path, result.returncode
 
 
-def ended_well(command, out):
+def ended_well(command):
     """Whether there is what a command printed, to its end."""
-    path = kept(command, out)
+    path = kept(command)
     return path.exists() and "\n\nIt ended with " not in path.read_text(encoding="utf-8")
 
 
@@ -144,16 +145,16 @@ def main(words):
     if unknown:
         sys.stderr.write(f"{__doc__}\n{unknown[0]}: unknown; known are {', '.join(FLAGS)}\n")
         return 2
-    known, out = (SPEED, PERFORMANCE) if "--speed" in words else (commands(), OUT)
+    known = SPEED if "--speed" in words else commands()
     chosen = [c for c in known if all(word in " ".join(c) for word in words if word[0] != "-")]
     if "--rest" in words:
-        chosen = [command for command in chosen if not ended_well(command, out)]
+        chosen = [command for command in chosen if not ended_well(command)]
     codes = []
     for command in chosen:
         sys.stdout.write(f"{shlex.join(command)}\n")
         sys.stdout.flush()
         if "--list" not in words:
-            path, code = run(command, out)
+            path, code = run(command)
             codes.append(code)
             sys.stdout.write(
                 f"  -> {path.relative_to(ROOT)}{f', failed: {code}' if code else ''}\n"

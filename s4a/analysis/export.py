@@ -29,6 +29,13 @@ def write_table(path: Path, head: Iterable[Any], rows: Iterable[Any]) -> Path:
     return path
 
 
+def write_scores(pca: xr.Dataset, path: Path) -> Path:
+    """Write the scores as CSV, a row per shape, in standard deviations; gives its path."""
+    columns = (f"component_{c + 1}" for c in range(pca.sizes["component"]))
+    rows = zip(pca["shape"].values.tolist(), pca["score"].values.tolist(), strict=True)
+    return write_table(path, ["shape", *columns], ([name, *row] for name, row in rows))
+
+
 def write_registered(
     study: xr.DataTree,
     folder: Path | str,
@@ -124,14 +131,9 @@ def _write_modes(pca, folder, n_modes):
     """The tables of scores, components and the first modes, and all modes as netCDF."""
     components = range(1, pca.sizes["component"] + 1)
     measures = ["standard_deviation", "explained_variance_ratio"]
-    scores = zip(pca["shape"].values.tolist(), pca["score"].values.tolist(), strict=True)
     columns = (pca[name].values.tolist() for name in measures)
     paths = [
-        write_table(
-            folder / "scores.csv",
-            ["shape", *(f"component_{c}" for c in components)],
-            ([name, *row] for name, row in scores),
-        ),
+        write_scores(pca, folder / "scores.csv"),
         write_table(
             folder / "components.csv",
             ["component", *measures],

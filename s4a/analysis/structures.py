@@ -36,6 +36,7 @@ from s4a.input.subjects import listed
 from s4a.method.pca import center_gram, gram, pca, principal_components
 from s4a.schema import check_switch, covariate, dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
+from s4a.study.insert import scores_of_new
 from s4a.study.tree import of_structure, structure_names
 
 log = logging.getLogger(__name__)
@@ -125,15 +126,58 @@ def poses_of(Y: np.ndarray, area: np.ndarray) -> Poses:
     size = np.sqrt(w @ ((mean - w @ mean) ** 2).sum(1))
     for _ in range(MOST_STEPS):
         g = w @ mean
-        R = np.stack([rigid_transform(mean, points, w)[0] for points in Y])
-        t = np.einsum("n,snx->sx", w, Y) - g  # of the centroid
-        shape = np.einsum("snx,sxy->sny", Y - (g + t)[:, None], R) - (mean - g)
-        turn = Rotation.from_matrix(R).as_rotvec()
+        _, turn, t, shape = poses_on(mean, Y, w)
         step = shape.mean(0), turn.mean(0), t.mean(0)
         if max(abs(step[0]).max(), abs(step[1]).max() * size, abs(step[2]).max()) < CLOSE * size:
             break
         mean = (mean + step[0] - g) @ Rotation.from_rotvec(step[1]).as_matrix().T + g + step[2]
     return Poses(mean, turn, t, shape)
+
+
+def poses_on(mean: np.ndarray, Y: np.ndarray, area: np.ndarray) -> Poses:
+    """The poses of a structure beside a mean shape that is known, and its shapes without.
+
+    Parameters
+    ----------
+    mean : float ndarray (n, 3)
+    Y : float ndarray (s, n, 3)
+    area : float ndarray (n,)
+    """
+    w = area / area.sum()
+    g = w @ mean
+    R = np.stack([rigid_transform(mean, points, w)[0] for points in Y])
+    t = np.einsum("n,snx->sx", w, Y) - g  # of the centroid
+    shape = np.einsum("snx,sxy->sny", Y - (g + t)[:, None], R) - (mean - g)
+    return Poses(mean, Rotation.from_matrix(R).as_rotvec(), t, shape)
+
+
+def wholes_of(found: xr.Dataset) -> np.ndarray:
+    """The aligned subjects ``(s, n, 3)``, all structures of each as one: Y_ik above."""
+    Y = np.empty(found["within_displacement"].shape)
+    for k, here in places_of(found):
+        one = poses_in(found, k, here)
+        area = found["vertex_area"].values[here]
+        g = area @ one.mean / area.sum()
+        turn = Rotation.from_rotvec(one.rotation).as_matrix()
+        turned = np.einsum("sxy,sny->snx", turn, one.mean - g + one.shape)
+        Y[:, here] = turned + (g + one.translation)[:, None]
+    return Y
+
+
+def poses_in(found: xr.Dataset, k: int, here: np.ndarray) -> Poses:
+    """Those of structure k, with vertices `here`, in a Dataset of :func:`structures`."""
+    return Poses(
+        found["position"].values[here],
+        found["pose_rotation"].values[:, k],
+        found["pose_translation"].values[:, k],
+        found["within_displacement"].values[:, here],
+    )
+
+
+def places_of(found: xr.Dataset) -> list[tuple[int, np.ndarray]]:
+    """Number and vertices of each structure of a Dataset of :func:`structures`."""
+    of = found["structure_of_vertex"].values
+    return [(k, np.flatnonzero(of == k)) for k in range(found.sizes["structure"])]
 
 
 def pose_fields(
@@ -232,7 +276,7 @@ def structures(
     whole = align_wholes(np.concatenate(Y, axis=1), area, scale=scale)
     del Y
     each = [poses_of(whole[:, place], area[place]) for place in places]
-    tell_of_poses(names, shapes, each, areas)
+    tell_of_poses(names, shapes, each, areas, each)
     triangles = [T + place[0] for (_, T), place in zip(meshes, places, strict=True)]
     result = measured(each, areas, n_permutations=n_permutations, seed=seed)
     mesh = as_dataset(
@@ -295,7 +339,100 @@ def measured(
     )
 
 
-def structures_modes(study: xr.DataTree, found: xr.Dataset, level: str = "joint") -> xr.DataTree:
+def structures_of_new(found: xr.Dataset, inserted: xr.DataTree) -> xr.Dataset:
+    """How the structures of new subjects lie beside each other, and their shapes.
+
+    Each new subject is moved as a whole onto the mean of those of the study, which stays as it is;
+    then the pose of each structure is that on its mean shape.  A subject of the study itself comes
+    out as it is there.
+
+    Parameters
+    ----------
+    found : Dataset
+        Of :func:`structures`, of the study.
+    inserted : DataTree
+        Of :func:`s4a.insert` into the same study.
+
+    Returns
+    -------
+    Dataset
+        ``pose_rotation``, ``pose_translation``, ``pose_size`` and ``within_displacement`` of the
+        new subjects, and the mean shapes of the study, as of :func:`structures`;
+        :func:`structures_modes` has their scores.  Those without all structures are left out, with
+        a warning.
+
+    Raises
+    ------
+    ValueError
+        When a structure of the study has no new shape, no new subject has all of them, or these
+        were registered to another template or in another unit.
+
+    Examples
+    --------
+    With a ``study`` of two small structures of six subjects, of which one is given once more:
+
+    >>> import s4a
+    >>> study = s4a.datasets.structures.example_structures()
+    >>> found = s4a.statistics.structures(study, n_permutations=99)
+    >>> new = s4a.statistics.structures_of_new(found, study)
+    >>> bool(abs(new["pose_size"] - found["pose_size"]).max() < 1e-4 * found["pose_size"].max())
+    True
+    """
+    names = found["structure"].values.tolist()
+    if structure_names(inserted) != names:
+        raise ValueError(
+            f"new shapes of {listed(names)} needed, found {listed(structure_names(inserted))}"
+        )
+    registered = {name: registration_of(of_structure(inserted, name)) for name in names}
+    shapes = shared_subjects(registered, least=1)
+    unit = unit_of(found["position"])
+    if shared_unit(registered) != unit:
+        raise ValueError(f"new shapes in {unit} needed, found {shared_unit(registered)}")
+    places = places_of(found)
+    counts = [len(here) for _, here in places]
+    others = [registered[name].sizes["vertex"] for name in names]
+    if others != counts:
+        raise ValueError(
+            "shapes inserted into the same study needed, with templates of "
+            f"{listed([str(n) for n in counts])} vertices; found {listed([str(n) for n in others])}"
+        )
+    area, known = found["vertex_area"].values, wholes_of(found)
+    w = area / area.sum()
+    mean = known.mean(0)
+    center, size = w @ mean, np.sqrt(w @ (known[0] ** 2).sum(1))
+    whole = np.empty((len(shapes), len(mean), 3))
+    for i, one in enumerate(shapes):
+        parts = [registered[name].sel(shape=one) for name in names]
+        Y = np.concatenate([image_in_shape(part["position"].values, part) for part in parts])
+        Y -= w @ Y
+        R, _, _ = rigid_transform(Y, mean, w)
+        if found.attrs["scale"] == "True":
+            Y *= size / np.sqrt(w @ (Y**2).sum(1))  # all of the study have the same
+        whole[i] = Y @ R.T + center
+    each = [poses_on(found["position"].values[at], whole[:, at], area[at]) for _, at in places]
+    usual = [poses_in(found, k, at) for k, at in places]
+    tell_of_poses(names, shapes, each, [area[at] for _, at in places], usual)
+    d = [
+        pose_fields(one.mean, area[at], one.rotation, one.translation)
+        for (_, at), one in zip(places, each, strict=True)
+    ]
+    of_area = [area[at] / area[at].sum() for _, at in places]
+    size = [np.sqrt(np.einsum("snx,n->s", f**2, a)) for f, a in zip(d, of_area, strict=True)]
+    new = dataset(
+        pose_rotation=np.stack([one.rotation for one in each], axis=1),
+        pose_translation=np.stack([one.translation for one in each], axis=1),
+        pose_size=np.stack(size, axis=1),
+        within_displacement=np.concatenate([one.shape for one in each], 1).astype(np.float32),
+    )
+    mesh = found[["position", "corner_vertex", "vertex_area", "structure_of_vertex"]]
+    mesh = mesh.drop_vars(["shape", "level"], errors="ignore")
+    result = in_unit(mesh.merge(new), unit).assign_coords(shape=shapes, structure=names)
+    return result.assign_attrs(scale=found.attrs["scale"])
+
+
+def structures_modes(
+    study: xr.DataTree, found: xr.Dataset, level: str = "joint", new: xr.Dataset | None = None
+) -> xr.DataTree:
     """One level of :func:`structures` as a study of all structures together.
 
     Everything that takes a study takes it: its modes are those of the level, and so are groups,
@@ -309,6 +446,9 @@ def structures_modes(study: xr.DataTree, found: xr.Dataset, level: str = "joint"
         Of :func:`structures`.
     level : {"joint", "between", "within"}
         Poses and shapes; poses alone; shapes alone.
+    new : Dataset, optional
+        Of :func:`structures_of_new`: the shapes of the tree are these, and their scores are those
+        on the modes of the study, as of :func:`s4a.insert`.
 
     Returns
     -------
@@ -339,13 +479,32 @@ def structures_modes(study: xr.DataTree, found: xr.Dataset, level: str = "joint"
     """
     if level not in LEVELS:
         raise ValueError(f"level must be one of {', '.join(LEVELS)}; found {level!r}")
-    area, of = found["vertex_area"].values, found["structure_of_vertex"].values
+    registration = of_level(found, level)
+    try:
+        modes = pca(registration, found["vertex_area"].values)
+    except ValueError as error:
+        raise ValueError(f"{level}: {error}") from error
+    modes = modes.assign_attrs(variable=level)
+    if new is not None:
+        registration = of_level(new, level)
+        modes = scores_of_new(modes, registration, found["vertex_area"].values)
+    nodes = {"/registration": registration, "/pca": modes}
+    subjects = (
+        xr.Dataset() if new is not None else shared_columns(study, found["shape"].values.tolist())
+    )
+    if subjects.data_vars:
+        nodes["/subjects"] = subjects
+    return xr.DataTree.from_dict(nodes, name=study.name)
+
+
+def of_level(found: xr.Dataset, level: str) -> xr.Dataset:
+    """The displacements of one level, on all structures as one mesh."""
+    area = found["vertex_area"].values
     d = np.zeros(found["within_displacement"].shape)
     if level != "between":
         d += found["within_displacement"].values
     if level != "within":
-        for k in range(found.sizes["structure"]):
-            here = of == k
+        for k, here in places_of(found):
             d[:, here] += pose_fields(
                 found["position"].values[here],
                 area[here],
@@ -357,22 +516,13 @@ def structures_modes(study: xr.DataTree, found: xr.Dataset, level: str = "joint"
     registration = registration.merge(dataset(displacement=d.astype(np.float32)))
     registration = in_unit(registration, unit_of(found["position"]))
     registration = registration.drop_vars(["structure", "level"], errors="ignore")
-    registration = registration.assign_coords(shape=found["shape"].values)
-    try:
-        modes = pca(registration, area)
-    except ValueError as error:
-        raise ValueError(f"{level}: {error}") from error
-    nodes = {"/registration": registration, "/pca": modes.assign_attrs(variable=level)}
-    subjects = shared_columns(study, found["shape"].values.tolist())
-    if subjects.data_vars:
-        nodes["/subjects"] = subjects
-    return xr.DataTree.from_dict(nodes, name=study.name)
+    return registration.assign_coords(shape=found["shape"].values)
 
 
 # what the structures of a subject share
 
 
-def shared_subjects(registered: dict[str, xr.Dataset]) -> list[str]:
+def shared_subjects(registered: dict[str, xr.Dataset], least: int = 4) -> list[str]:
     """The subjects of which all structures are registered; the others are named in a warning."""
     having = {name: data["shape"].values.tolist() for name, data in registered.items()}
     everyone = sorted({one for names in having.values() for one in names})
@@ -383,10 +533,10 @@ def shared_subjects(registered: dict[str, xr.Dataset]) -> list[str]:
         log.warning(
             "left out, as a structure is missing or doubtful: %s", listed(said, "; ", most=9)
         )
-    if len(shapes) < 4:
+    if len(shapes) < least:
         raise ValueError(
-            f"structures need at least 4 subjects that have all of them, found {len(shapes)} of "
-            f"{len(everyone)}{'; ' if said else ''}{listed(said, '; ')}"
+            f"structures need at least {least} subjects that have all of them, found "
+            f"{len(shapes)} of {len(everyone)}{'; ' if said else ''}{listed(said, '; ')}"
         )
     return shapes
 
@@ -449,18 +599,26 @@ def tell_of_frames(names: list[str], Y: list[np.ndarray], areas: list[np.ndarray
 
 
 def tell_of_poses(
-    names: list[str], shapes: list[str], each: list[Poses], areas: list[np.ndarray]
+    names: list[str],
+    shapes: list[str],
+    each: list[Poses],
+    areas: list[np.ndarray],
+    usual_poses: list[Poses],
 ) -> None:
-    """Warn of structures that lie far from where they are in the other subjects."""
+    """Warn of structures that lie far from where they usually are."""
     far = np.zeros((len(shapes), len(names)))
-    for k, (one, area) in enumerate(zip(each, areas, strict=True)):
-        turn = one.rotation - np.median(one.rotation, axis=0)
-        shift = one.translation - np.median(one.translation, axis=0)
+
+    def distances(one, others, area):
+        turn = one.rotation - np.median(others.rotation, axis=0)
+        shift = one.translation - np.median(others.translation, axis=0)
         d = pose_fields(one.mean, area, turn, shift)
-        away = np.sqrt(np.einsum("n,snx->s", area / area.sum(), d**2))
+        return np.sqrt(np.einsum("n,snx->s", area / area.sum(), d**2))
+
+    for k, (one, others, area) in enumerate(zip(each, usual_poses, areas, strict=True)):
+        away = distances(one, others, area)
         arm = one.mean - (area / area.sum()) @ one.mean
         size = np.sqrt((area / area.sum()) @ (arm**2).sum(1))
-        usual = max(FAR * np.median(away), LEAST * size)
+        usual = max(FAR * np.median(distances(others, others, area)), LEAST * size)
         far[:, k] = np.where(away > usual, away / size, 0)
     said = [
         f"{shapes[i]} ({names[int(far[i].argmax())]}, by {far[i].max():.1f} of its radius)"

@@ -281,6 +281,8 @@ def _structures(add):
     add("--scale", action="store_true", help="take the size of each whole subject out")
     text = "also test whether groups differ in how structures lie, and in their shapes"
     add("--group", metavar="COLUMN", help=text)
+    text = "inserted.nc of s4a insert: poses and scores of new subjects, too"
+    add("--new", metavar="FILE", help=text)
     add("--permutations", type=whole, help="of the subjects (default: 999)")
     add("--out", metavar="DIR", help="for netCDF, CSV, the pages (default: STUDY/statistics)")
     add_options(add, ["seed"])

@@ -4,6 +4,7 @@ import numpy as np
 import xarray as xr
 
 from s4a.cli.tables import run_summary, table
+from s4a.method.pca import mahalanobis
 from s4a.study.tree import of_structure, structure_names
 
 
@@ -80,6 +81,40 @@ def structure_lines(found: xr.Dataset) -> str:
             f"poses and shapes together: RV = {found['pose_shape_rv'].item():.2f}, "
             f"p = {found['pose_shape_p'].item():.3g}"
         )
+    return "\n".join(lines)
+
+
+def pose_table(new: xr.Dataset) -> str:
+    """How each structure of new subjects lies, and how much its shape differs, as a table.
+
+    Parameters
+    ----------
+    new : Dataset
+        See :func:`s4a.analysis.structures.structures_of_new`.
+    """
+    unit = new["position"].attrs["units"]
+    area, of = new["vertex_area"].values, new["structure_of_vertex"].values
+    squared = (new["within_displacement"].values.astype(float) ** 2).sum(2)  # (s, n)
+    rows = []
+    for i, subject in enumerate(new["shape"].values.tolist()):
+        for k, name in enumerate(new["structure"].values.tolist()):
+            turn = np.degrees(np.linalg.norm(new["pose_rotation"].values[i, k]))
+            shift = np.linalg.norm(new["pose_translation"].values[i, k])
+            within = np.sqrt(np.average(squared[i, of == k], weights=area[of == k]))
+            size = new["pose_size"].values[i, k]
+            rows.append(
+                [subject, name, f"{turn:.1f}", *(f"{x:.3g}" for x in (shift, size, within))]
+            )
+    head = ["subject", "structure", "turn (degrees)", f"shift ({unit})"]
+    return table(rows, [*head, f"between ({unit})", f"within ({unit})"])
+
+
+def new_score_lines(pca: xr.Dataset) -> str:
+    """The scores of new subjects on frozen modes, in words."""
+    lines = []
+    for name, row in zip(pca["shape"].values.tolist(), pca["score"].values, strict=True):
+        said = " ".join(f"{score:+.2f}" for score in row[:5])
+        lines.append(f"  {name}: Mahalanobis {mahalanobis(row):.1f}, scores {said}")
     return "\n".join(lines)
 
 

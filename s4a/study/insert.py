@@ -212,7 +212,8 @@ def insert_shapes(
         list(inserted),
     )
     if "pca" in study:
-        nodes["pca"] = scores_of_new(study["pca"].to_dataset(), nodes["registration"])
+        area = vertex_areas(*as_arrays(nodes["registration"]))
+        nodes["pca"] = scores_of_new(study["pca"].to_dataset(), nodes["registration"], area)
     if references is None:
         nodes["report"] = shape_report(attrs)
     else:
@@ -515,14 +516,14 @@ def report_beside(
     return xr.concat(reports, dim="shape").assign_attrs(remarks="\n".join(remarks))
 
 
-def scores_of_new(modes: xr.Dataset, registration: xr.Dataset) -> xr.Dataset:
+def scores_of_new(modes: xr.Dataset, registration: xr.Dataset, area: np.ndarray) -> xr.Dataset:
     """The frozen modes, with the scores of the new shapes in place of those that made them."""
     score, left = project_scores(
         registration["displacement"].values,
         modes["mean_displacement"].values,
         modes["deformation"].values,
         modes["standard_deviation"].values,
-        vertex_areas(*as_arrays(registration)),
+        area,
     )
     new = in_unit(dataset(score=score, reconstruction_error=left), unit_of(modes["deformation"]))
     frozen = modes.drop_vars(["score", "shape", "score_apart", "shape_apart"], errors="ignore")

@@ -12,6 +12,7 @@ from s4a.input.subjects import listed
 from s4a.schema import INPUT, in_unit, unit_of, variable
 from s4a.study.contents import check_contents, check_fit
 from s4a.study.store import (
+    ENGINE,
     STAGES,
     STRUCTURES,
     DamagedError,
@@ -341,6 +342,25 @@ def structure_names(study: xr.DataTree) -> list[str]:
             f" this one has {', '.join(study.children) or 'no nodes'}"
         )
     return list(study[STRUCTURES].children)
+
+
+def open_inserted(file: Path | str) -> xr.DataTree:
+    """What ``s4a insert`` wrote: its folder, or ``inserted.nc`` in it.
+
+    Raises
+    ------
+    ValueError
+        When there is none.
+    """
+    path = Path(file)
+    path = path / "inserted.nc" if path.is_dir() else path
+    if not path.exists():
+        raise ValueError(
+            f"{path}: there is no such file; s4a insert STUDY SHAPES --out DIR writes "
+            "DIR/inserted.nc"
+        )
+    with xr.open_datatree(path, engine=ENGINE) as tree:
+        return tree.load()
 
 
 def of_structure(study: xr.DataTree, name: str) -> xr.DataTree:

@@ -60,6 +60,22 @@ def tree_of(Y, columns=None, unit="mm"):
     return xr.DataTree.from_dict(nodes)
 
 
+def tree_of_new(Y, study):
+    """New subjects, registered to the templates of a study."""
+    tree = tree_of(Y)
+    for k, name in enumerate(NAMES):
+        place = f"structures/{name}/registration"
+        template = study[place]["position"].values
+        data = tree[place].to_dataset()
+        tree[place] = xr.DataTree(
+            data.assign(
+                position=study[place]["position"],
+                displacement=data["displacement"].copy(data=Y[:, k] - template),
+            )
+        )
+    return tree
+
+
 def share(found, level):
     """Of all structures together."""
     return float(found["level_share"].sel(level=level).sum())
@@ -258,6 +274,62 @@ def test_what_is_no_study_of_several_structures_is_refused():
         of_structure(study, "middle")
     with pytest.raises(ValueError, match="at least 4 subjects that have all of them, found 3 of 3"):
         statistics.structures(tree_of(drawn(0, pose=1, n=3)))
+
+
+@pytest.mark.parametrize("scale", [False, True])
+def test_a_new_subject_is_where_it_would_be_in_the_study(scale):
+    Y = drawn(3, pose=1, shape=1) * np.linspace(0.9, 1.1, N)[:, None, None, None]
+    study = tree_of(Y)
+    found = statistics.structures(study, scale=scale, n_permutations=9)
+    Q = Rotation.from_rotvec([0.2, -0.4, 0.3]).as_matrix()
+    again = statistics.structures_of_new(found, tree_of_new(Y @ Q.T + [5, 0, -3], study))
+    for name in ("pose_rotation", "pose_translation", "pose_size", "within_displacement"):
+        scatter = float(abs(found[name]).max())
+        assert np.allclose(again[name], found[name], atol=1e-5 * scatter), name
+    for level in ("joint", "between", "within"):
+        modes = statistics.structures_modes(study, found, level)
+        new = statistics.structures_modes(study, found, level, again)
+        c = int((modes["pca"]["explained_variance_ratio"] > 1e-3).sum())
+        assert np.allclose(new["pca"]["score"][:, :c], modes["pca"]["score"][:, :c], atol=1e-3)
+        size = float(modes["pca"]["standard_deviation"][0])
+        assert float(new["pca"]["reconstruction_error"].max()) < 0.05 * size
+        assert "subjects" not in new.children
+
+
+def test_a_new_subject_with_a_shifted_structure_is_far_along_the_modes_of_poses_alone(caplog):
+    Y = drawn(4, pose=1, shape=1)
+    new = Y[:1].copy()
+    new[0, 1] += [60.0, 0, 0]
+    study = tree_of(Y)
+    found = statistics.structures(study, n_permutations=9)
+    with caplog.at_level(logging.WARNING):
+        far = statistics.structures_of_new(found, tree_of_new(new, study))
+    assert "s00 (" in caplog.text
+    assert "as if in another frame" in caplog.text
+    left = {
+        level: statistics.structures_modes(study, found, level, far)["pca"]
+        for level in ("between", "within")
+    }
+    usual = statistics.structures_modes(study, found, "between")["pca"]["score"]
+    assert abs(left["between"]["score"]).max() > 1.5 * abs(usual).max()
+    own = statistics.structures_modes(study, found, "within")["pca"]["score"][0]
+    assert np.allclose(left["within"]["score"][0], own, atol=0.05)
+
+
+def test_new_subjects_of_other_structures_or_templates_are_refused():
+    Y = drawn(5, pose=1, shape=1)
+    study = tree_of(Y)
+    found = statistics.structures(study, n_permutations=9)
+    left = study.filter(lambda node: "right" not in node.path)
+    with pytest.raises(ValueError, match="new shapes of left, right needed, found left"):
+        statistics.structures_of_new(found, left)
+    with pytest.raises(ValueError, match="new shapes in mm needed, found cm"):
+        statistics.structures_of_new(found, tree_of(Y, unit="cm"))
+    other = study.copy()
+    part = other["structures/left/registration"].to_dataset().isel(vertex=slice(100))
+    other["structures/left/registration"] = xr.DataTree(part.drop_vars("corner_vertex"))
+    with pytest.raises(ValueError, match="needed, with templates of 120, 120 vertices; found 100"):
+        statistics.structures_of_new(found, other)
 
 
 def test_the_arithmetic_needs_no_study():

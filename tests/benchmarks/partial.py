@@ -6,10 +6,10 @@ studies that lack them: 12 synthetic brains of 6,000 vertices and 8 others, 16 f
 model and 8 others, and five mouse skulls, each into a study of the four others.  For each cut the
 mean over the shapes of: CPU seconds; distance to the truth where the part is, in % of sqrt(area),
 of the whole shape inserted, of the part, of rustcpd; the same where it is not, with that of the
-mean shape; the share of coordinates that lie within intervals of 50, 80 and 90 % where nothing is,
-around the truth, and around the match of the whole; where the part is, of 90 %; and where nothing
-is, rustcpd's of 90 %.  Skulls have no truth but the match of the whole.  Parts that are refused are
-counted, and in no mean.
+mean shape laid on the truth of what is there; the share of coordinates that lie within intervals of
+50, 80 and 90 % where nothing is, around the truth, and around the match of the whole; where the
+part is, of 90 %; and where nothing is, rustcpd's of 90 %.  Skulls have no truth but the match of
+the whole.  Parts that are refused are counted, and in no mean.
 
 rustcpd gets the mean and the modes of the same study and the same part: ``pose_initialize`` (with
 translation anchors and adaptive mixing, as it says for partial targets), ``register_atlas``,
@@ -39,6 +39,7 @@ SHARES = 0.0, 0.1, 0.3, 0.5
 LEVELS = 0.6745, 1.2816, 1.6449  # of 50, 80 and 90 %
 HEAD = (
     "missing",
+    "of the area",
     "CPU s",
     "there: whole",
     "part",
@@ -162,11 +163,12 @@ def row_of(study, mesh, true, share, rng):
         gap = np.linalg.norm(points - true, axis=1)
         return unit * gap[rows] @ area[rows] / area[rows].sum() if rows.any() else np.nan
 
-    R, t, _ = rigid_transform(template["position"].values, true, area)
+    R, t, _ = rigid_transform(template["position"].values[there], true[there], area[there])
     mean = template["position"].values + study["pca"]["mean_displacement"].values
     in_truth = shares_within(image - true @ Q.T, sd, ~there)
     in_match = shares_within(image - of_whole @ Q.T, sd, ~there)
     return [
+        found.attrs["missing"],
         spent,
         distance(of_whole, there),
         distance(image @ Q, there),

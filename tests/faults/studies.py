@@ -592,6 +592,12 @@ PROOFS = [
         "test_what_cannot_be_inserted_into_several_structures_is_told",
     ),
     (
+        "new subjects of other structures, unit or templates than the study that is compared",
+        "error that says what was needed and found",
+        STRUCTURES,
+        "test_new_subjects_of_other_structures_or_templates_are_refused",
+    ),
+    (
         "a structure of one subject mirrored in its file",
         "warned by subject",
         STRUCTURES,

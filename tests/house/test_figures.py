@@ -1,6 +1,7 @@
 """A figure that a page quotes has a command that prints it, and `make paper` runs that command."""
 
 import re
+import shlex
 from pathlib import Path
 
 import pytest
@@ -82,16 +83,17 @@ def test_commands_are_found_on_pages_as_they_are_written():
 
 def test_what_a_command_prints_is_kept_with_machine_and_versions_at_its_foot(tmp_path, monkeypatch):
     monkeypatch.setattr(paper, "BENCHMARKS", tmp_path)
+    monkeypatch.setattr(paper, "TABLES", tmp_path / "out")
     (tmp_path / "good.py").write_text("import sys; print('| a |', sys.argv[1:])")
     (tmp_path / "bad.py").write_text("raise SystemExit(3)")
-    path, code = paper.run(("good.py", "two words"), tmp_path / "out")
+    path, code = paper.run(("good.py", "two words"))
     text = path.read_text(encoding="utf-8")
     assert code == 0
     assert "| a | ['two words']" in text
     foot = text.split("\n---\n")[1]
     assert "cores" in foot
     assert re.search(r"S4A [\d.]+.*Python 3\.\d+.*numpy [\d.]+.*xarray [\d.]+", foot)
-    path, code = paper.run(("bad.py",), tmp_path / "out")
+    path, code = paper.run(("bad.py",))
     assert code == 3
     assert "It ended with 3." in path.read_text(encoding="utf-8")
 
@@ -101,8 +103,8 @@ def test_a_night_that_was_too_short_goes_on_with_what_has_not_ended_well(
 ):
     (tmp_path / "good.py").write_text("print(1)")
     (tmp_path / "bad.py").write_text("raise SystemExit(3)")
-    for name, value in {"ROOT": tmp_path, "BENCHMARKS": tmp_path, "OUT": tmp_path / "out"}.items():
-        monkeypatch.setattr(paper, name, value)
+    for name in ("ROOT", "BENCHMARKS", "TABLES"):
+        monkeypatch.setattr(paper, name, tmp_path)
     monkeypatch.setattr(paper, "commands", lambda: [("good.py",), ("bad.py",)])
     assert paper.main([]) == 1
     capsys.readouterr()
@@ -154,13 +156,15 @@ def test_the_brain_that_is_made_higher_has_eigenfunctions_in_another_order(
     assert "exchanged: [(2, 3)" in capsys.readouterr().out
 
 
-def test_the_page_on_performance_shows_what_commands_printed_with_machine_and_versions():
-    files = {paper.kept(command, paper.PERFORMANCE): command for command in paper.SPEED}
-    there = sorted(paper.PERFORMANCE.glob("*.md"))
+@pytest.mark.parametrize("folder", [paper.PERFORMANCE, paper.TABLES], ids=lambda path: path.name)
+def test_a_page_shows_what_commands_printed_with_machine_and_versions(folder):
+    files = {paper.kept(command): command for command in (*paper.SPEED, *paper.commands())}
+    there = sorted(folder.glob("*.md"))
     assert there
     for path in there:
         assert path in files, path.name  # another file would be shown nowhere
         text = path.read_text(encoding="utf-8")
-        assert text.startswith(f"# `{' '.join(files[path])}`")
+        assert text.startswith(f"# `{shlex.join(files[path])}`")
         assert re.search(r"\d{4}-\d\d-\d\d, \d+ s\. .* cores.* S4A [\d.]+", text)
         assert "It ended with" not in text
+        assert not re.search(r"/(tmp|root|home)/", text)  # of one machine

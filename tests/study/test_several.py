@@ -248,6 +248,19 @@ def test_the_command_inserts_files_of_several_structures_by_their_table(
     assert {"new.ply", "scores.csv"} <= {path.name for path in (out / "structures/left").iterdir()}
     with xr.open_datatree(out / "inserted.nc") as inserted:
         assert inserted["report"]["structure_status"].values.tolist() == [["ok", "ok"]]
+    statistics = ["structures", str(store), "--permutations", "9", "--out", str(tmp_path / "both")]
+    assert cli.main([*statistics, "--new", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "new subjects\nsubject  structure  turn" in said
+    assert said.count("  new: Mahalanobis") == 3
+    found = s4a.statistics.structures(study, n_permutations=9)
+    new = s4a.statistics.structures_of_new(found, direct)
+    joint = s4a.statistics.structures_modes(study, found, "joint", new)["pca"]["score"].values[0]
+    row = (tmp_path / "both" / "new_joint.csv").read_text().splitlines()[1].split(",")
+    assert row[0] == "new"
+    np.testing.assert_allclose([float(cell) for cell in row[1:]], joint, atol=0.02)
+    assert cli.main([*statistics, "--new", str(tmp_path / "none.nc")]) == 2
+    assert "s4a insert STUDY SHAPES --out DIR writes DIR/inserted.nc" in capsys.readouterr().err
 
 
 def test_what_cannot_be_inserted_into_several_structures_is_told(study, tmp_path):
