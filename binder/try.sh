@@ -28,9 +28,6 @@ sys.exit(code)
 PYTHON
 }
 
-while read -r package; do
-    dpkg -s "$package" >/dev/null 2>&1 || echo "apt.txt: $package is not installed on this system" >&2
-done <binder/apt.txt
 "$python" -m venv "$root/venv"
 export PATH="$root/venv/bin:$PATH"
 {

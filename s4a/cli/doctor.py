@@ -32,12 +32,11 @@ for name in sys.argv[1:]:
     except Exception as error:
         print(name, *str(error).split())
 """
-# what PyMeshLab is used for, asked of it in a process of its own: a broken one may end the process
+# what wrap=True uses, asked of it in a process of its own: a broken one may end the process
 TRIAL = """
 import pymeshlab
 meshes = pymeshlab.MeshSet(verbose=False)
-wanted = "generate_alpha_wrap", "compute_selection_by_self_intersections_per_face"
-print("lacks", *[name for name in wanted if not hasattr(meshes, name)])
+print("ok" if hasattr(meshes, "generate_alpha_wrap") else "lacks its filters")
 """
 
 
@@ -71,7 +70,7 @@ def examine(folder: Path | str = ".") -> list[Finding]:
     ['ok']
     """
     found = [Finding("Python", "ok", f"{sys.version.split()[0]}, {sys.executable}")]
-    found += [*dependencies(), meshlab(), writable("study folder", Path(folder), "a place for it")]
+    found += [*dependencies(), writable("study folder", Path(folder), "a place for it")]
     temporary = Path(tempfile.gettempdir())
     found += [writable("temporary folder", temporary, "export TMPDIR=FOLDER")]
     for check in (cache, memory, cores, threads):
@@ -93,8 +92,7 @@ def dependencies() -> Iterator[Finding]:
             told = f"{here}, and {floor} or newer is needed"
             wrong.append(Finding(name, "lacks", told, f"pip install --upgrade '{name}>={floor}'"))
         right += 1
-    names = [name for name, _ in needed() if name != "pymeshlab"]
-    modules = [MODULES.get(name, name.replace("-", "_")) for name in names]
+    modules = [MODULES.get(name, name.replace("-", "_")) for name, _ in needed()]
     result = run(IMPORTS, *modules)
     for line in result.stdout.splitlines():
         name, _, error = line.partition(" ")
@@ -138,19 +136,14 @@ def run(script: str, *words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
 
 
-def meshlab() -> Finding:
-    """Whether PyMeshLab imports and has the filters that are used."""
-    doing = "or leave it out: --no-intersections, and no --wrap"
+def wrapping() -> Finding:
+    """Whether PyMeshLab, which only ``wrap=True`` needs, imports and has its filters."""
     result = run(TRIAL)
-    if "No module named 'pymeshlab'" in result.stderr:
-        return Finding("PyMeshLab", "lacks", "not installed", f"pip install pymeshlab; {doing}")
-    if result.returncode:
-        last = result.stderr.strip().splitlines()[-1:] or [f"exit code {result.returncode}"]
-        return Finding("PyMeshLab", "lacks", f"does not import: {last[0]}", f"{GL}; {doing}")
-    lacking = result.stdout.split("lacks")[-1].split()
-    if lacking:
-        return Finding("PyMeshLab", "lacks", f"has no {', '.join(lacking)}", f"{GL}; {doing}")
-    return Finding("PyMeshLab", "ok", f"{version('pymeshlab')}, with its filters")
+    if not result.returncode and result.stdout.strip() == "ok":
+        return Finding("for --wrap", "ok", f"PyMeshLab {version('pymeshlab')}, with its filters")
+    last = [*result.stdout.splitlines(), *result.stderr.strip().splitlines()][-1:]
+    told = last[0] if last else f"ends its process with {result.returncode}"
+    return Finding("for --wrap", "note", f"PyMeshLab: {told}", GL)
 
 
 def writable(what: str, folder: Path, instead: str) -> Finding:
@@ -241,12 +234,15 @@ def browser() -> Finding:
 
 
 def extras() -> Iterator[Finding]:
-    """The extras for notebooks, the course and clusters."""
-    for extra, what in (("notebook", "panels"), ("course", "lessons"), ("cluster", "--cluster")):
+    """The extras for notebooks, the course, clusters and closed surfaces around broken ones."""
+    uses = {"notebook": "panels", "course": "lessons", "cluster": "--cluster", "wrap": "--wrap"}
+    for extra, what in uses.items():
         missing = [name for name, _ in needed(extra) if not installed(name)]
         if missing:
             told = f"without {', '.join(missing)}"
             yield Finding(f"for {what}", "note", told, f"pip install 's4a[{extra}]'")
+        elif extra == "wrap":
+            yield wrapping()
         else:
             yield Finding(f"for {what}", "ok", f"s4a[{extra}] is there")
 

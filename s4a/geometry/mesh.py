@@ -128,6 +128,31 @@ def unique_edges(T: np.ndarray, n: int | None = None) -> tuple[np.ndarray, np.nd
     return np.stack(np.divmod(key, max(n, 1)), axis=1), edge_of, count
 
 
+def equal_rows(A: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which rows of an array ``(n, k)`` are equal; NaN equals nothing.
+
+    Returns
+    -------
+    first : int ndarray (g,)
+        The first row of each group of equal ones, the groups sorted by the last column first.
+    group : int ndarray (n,)
+        The group of each row.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.geometry.mesh import equal_rows
+    >>> first, group = equal_rows(np.array([[5, 1], [0, 0], [5, 1]]))
+    >>> first.tolist(), group.tolist()
+    ([1, 0], [1, 0, 1])
+    """
+    order = np.lexsort(A.T)  # stable; np.unique(axis=0) takes five times as long
+    new = np.r_[True, (A[order[1:]] != A[order[:-1]]).any(axis=1)][: len(A)]
+    group = np.empty(len(A), np.int64)
+    group[order] = np.cumsum(new) - 1
+    return order[new], group
+
+
 def components(pairs: np.ndarray, n: int) -> np.ndarray:
     """Connected component of each of n nodes that the pairs ``(p, 2)`` link, numbered from 0."""
     links = sp.coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), (n, n))

@@ -12,6 +12,7 @@ from s4a.geometry.mesh import (
     as_arrays,
     as_dataset,
     components,
+    equal_rows,
     euler_characteristic,
     n_used,
     triangle_areas,
@@ -20,7 +21,6 @@ from s4a.geometry.mesh import (
 )
 from s4a.input.manifold import (
     cheapest,
-    equal_rows,
     fill_holes,
     join_corners,
     join_triangles,

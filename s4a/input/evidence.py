@@ -5,12 +5,12 @@ Numbers only; :mod:`s4a.input.plausibility` says what they mean.
 
 import itertools
 from dataclasses import dataclass
-from importlib.util import find_spec
 
 import numpy as np
 import xarray as xr
 
 from s4a.geometry.align import Cloud, End, cloud, icp, principal_axes, residual_of
+from s4a.geometry.crossing import count_crossing
 from s4a.geometry.mesh import (
     as_arrays,
     components,
@@ -75,7 +75,7 @@ def portray(mesh: xr.Dataset, *, intersections: bool = True) -> xr.Dataset:
     vertex = np.linspace(0, len(X) - 1, min(len(X), N_POINTS)).astype(int)
     edge, _, count = unique_edges(T, len(X))
     length = np.linalg.norm(X[edge[:, 0]] - X[edge[:, 1]], axis=1)
-    number = count_intersections(mesh) if intersections else -1
+    number = count_crossing(mesh["position"].values, T) if intersections else -1
     sketch = dataset(
         sketch_position=X[vertex] / size,
         sketch_area=area[vertex] / area[vertex].sum(),
@@ -129,31 +129,6 @@ def lattice_step(X: np.ndarray) -> float:
         whole = np.abs(step / least - np.round(step / least)) < 0.02
         steps.append(float(least) if len(step) and whole.all() else 0.0)
     return min(steps)
-
-
-def check_meshlab() -> None:
-    """Raise ValueError where PyMeshLab, which counts triangles through others, is not installed."""
-    if find_spec("pymeshlab") is None:
-        raise ValueError(
-            "counting triangles that pass through others needs PyMeshLab: install it with "
-            "`pip install pymeshlab`, or leave it out: intersections=False (--no-intersections)"
-        )
-
-
-def count_intersections(mesh: xr.Dataset) -> int:
-    """Triangles of a mesh that pass through others; -1 where PyMeshLab lacks its filter."""
-    check_meshlab()
-    import pymeshlab
-
-    X, T = as_arrays(mesh)
-    unit_box = (X - X.min(0)) / max(np.ptp(X), 1e-300)  # its arithmetic is in single precision
-    meshes = pymeshlab.MeshSet(verbose=False)
-    meshes.add_mesh(pymeshlab.Mesh(unit_box, T))
-    try:
-        meshes.compute_selection_by_self_intersections_per_face()
-    except (AttributeError, pymeshlab.PyMeshLabException):
-        return -1
-    return int(meshes.current_mesh().selected_face_number())
 
 
 def in_numbers(portraits: list[xr.Dataset]) -> np.ndarray:

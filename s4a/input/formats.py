@@ -30,8 +30,8 @@ from typing import Any
 
 import numpy as np
 
+from s4a.geometry.mesh import equal_rows
 from s4a.input import bounded
-from s4a.input.manifold import equal_rows
 from s4a.input.vtk import fans, number_type, parse_vtk, parse_vtp, vtk_bytes, vtp_bytes
 
 Surface = tuple[np.ndarray, np.ndarray, dict[str, str]]  # points, triangles, attributes

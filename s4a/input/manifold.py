@@ -234,31 +234,6 @@ def cheapest(cost: np.ndarray, ends: np.ndarray) -> np.ndarray:
     return taken
 
 
-def equal_rows(A: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which rows of an array ``(n, k)`` are equal; NaN equals nothing.
-
-    Returns
-    -------
-    first : int ndarray (g,)
-        The first row of each group of equal ones, the groups sorted by the last column first.
-    group : int ndarray (n,)
-        The group of each row.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from s4a.input.manifold import equal_rows
-    >>> first, group = equal_rows(np.array([[5, 1], [0, 0], [5, 1]]))
-    >>> first.tolist(), group.tolist()
-    ([1, 0], [1, 0, 1])
-    """
-    order = np.lexsort(A.T)  # stable; np.unique(axis=0) takes five times as long
-    new = np.r_[True, (A[order[1:]] != A[order[:-1]]).any(axis=1)][: len(A)]
-    group = np.empty(len(A), np.int64)
-    group[order] = np.cumsum(new) - 1
-    return order[new], group
-
-
 def fill_holes(X: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Close every boundary loop of an oriented manifold by a fan around a new vertex.
 

@@ -205,7 +205,7 @@ def alpha_wrap(
             import pymeshlab
     except ImportError as error:
         raise ValueError(
-            "wrap=True needs pymeshlab: install it with `pip install pymeshlab`"
+            "wrap=True needs PyMeshLab: install it with `pip install 's4a[wrap]'`"
         ) from error
     with silence():
         meshes = pymeshlab.MeshSet(verbose=False)

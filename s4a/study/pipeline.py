@@ -15,7 +15,6 @@ import xarray as xr
 from joblib import effective_n_jobs, parallel_config
 
 from s4a.input.collection import remarks_on_files
-from s4a.input.evidence import check_meshlab
 from s4a.input.hands import AUTO, hands, of_other_hand, to_reflect
 from s4a.input.plausibility import Doubts
 from s4a.input.subjects import read_table
@@ -224,7 +223,6 @@ def analyse(
     ------
     ValueError
         When an option is out of range, or fewer than 2 shapes can be used; the reasons are named.
-        When triangles that pass through others are to be counted and PyMeshLab is not installed.
         With ``doubtful="stop"``, when a shape is doubtful.
 
     Examples
@@ -249,8 +247,6 @@ def analyse(
             loaded = {n.path: n.to_dataset(inherit=False).load() for n in study.subtree}
             return xr.DataTree.from_dict(loaded)
     settings = Options(**options)
-    if settings.intersections:
-        check_meshlab()
     if structures is not None:
         parts = parts_of_labels(shapes, structures, settings)
         remarks = remarks_on_files(shapes, settings.pattern, volumes=True)

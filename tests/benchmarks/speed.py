@@ -29,6 +29,7 @@ import s4a
 from s4a import metrics, synthetic
 from s4a.evaluation import accuracy
 from s4a.geometry.align import align, farthest_points
+from s4a.geometry.crossing import count_crossing
 from s4a.geometry.mesh import as_arrays, triangle_areas
 from s4a.input.files import find_meshes
 from s4a.method import fmap, latent
@@ -97,6 +98,10 @@ def our_read(path):
     return s4a.read_shape(path)
 
 
+def our_crossing(X, T):
+    return count_crossing(X, T)
+
+
 def our_remesh(mesh):
     return s4a.coarsen(mesh)
 
@@ -152,6 +157,15 @@ def other_read(path):
     ):
         found.apply_filter(name)
     return found.current_mesh().vertex_number()
+
+
+def other_crossing(X, T):
+    import pymeshlab
+
+    found = pymeshlab.MeshSet(verbose=False)
+    found.add_mesh(pymeshlab.Mesh(X, T))
+    found.compute_selection_by_self_intersections_per_face()
+    return found.current_mesh().selected_face_number()
 
 
 def closest_points(X, V, F):
@@ -290,7 +304,12 @@ def stages(folder):
         ("s4a.read_shape", our_read, paths[0]),
         ("pymeshlab", other_read, paths[0]),
     )
-    X = mesh["position"].values
+    X, T = as_arrays(mesh)
+    beside(
+        "triangles that pass through others",
+        ("s4a: exact, libigl", our_crossing, X, T),
+        ("pymeshlab", other_crossing, X, T),
+    )
     coarse, *_ = beside(
         "remesh to 6,000 with U",
         ("s4a.coarsen", our_remesh, mesh),

@@ -42,27 +42,27 @@ def test_what_is_lacking_makes_the_exit_code_1(monkeypatch, capsys):
     assert said.endswith("1 lacking, 1 to know\n")
 
 
-def test_a_pymeshlab_without_its_libraries_names_them(other_modules):
-    (other_modules / "pymeshlab.py").write_text("raise ImportError('libGL.so.1: no such file')\n")
-    found = doctor.meshlab()
-    assert found.state == "lacks"
-    assert "libGL.so.1" in found.found
+@pytest.mark.parametrize(
+    "source, told",
+    [
+        ("raise ImportError('libGL.so.1: no such file')\n", "libGL.so.1"),
+        ("class MeshSet:\n    def __init__(self, verbose): pass\n", "lacks its filters"),
+        ("import os; os.abort()\n", "ends its process"),
+    ],
+)
+def test_a_broken_pymeshlab_is_no_more_than_a_note_on_wrapping(other_modules, source, told):
+    (other_modules / "pymeshlab.py").write_text(source)
+    found = doctor.wrapping()
+    assert (found.what, found.state) == ("for --wrap", "note")
+    assert told in found.found
     assert "libgl1 libopengl0" in found.do
-    assert "--no-intersections" in found.do
 
 
-def test_a_pymeshlab_without_its_filters_names_them(other_modules):
-    (other_modules / "pymeshlab.py").write_text(
-        "class MeshSet:\n    def __init__(self, verbose): pass\n    generate_alpha_wrap = 1\n"
-    )
-    found = doctor.meshlab()
-    assert found.state == "lacks"
-    assert found.found == "has no compute_selection_by_self_intersections_per_face"
-
-
-def test_a_pymeshlab_that_ends_its_process_is_told(other_modules):
-    (other_modules / "pymeshlab.py").write_text("import os; os.abort()\n")
-    assert doctor.meshlab().state == "lacks"
+def test_without_pymeshlab_its_extra_is_named(monkeypatch):
+    there = doctor.installed
+    monkeypatch.setattr(doctor, "installed", lambda name: name != "pymeshlab" and there(name))
+    found = of(list(doctor.extras()), "for --wrap")
+    assert (found.state, found.do) == ("note", "pip install 's4a[wrap]'")
 
 
 def test_a_package_that_is_missing_old_or_broken_is_named_with_what_to_type(
@@ -82,8 +82,8 @@ def test_a_package_that_is_missing_old_or_broken_is_named_with_what_to_type(
 
 def test_the_packages_are_those_of_the_project_and_none_of_its_extras():
     names = {name for name, _ in doctor.needed()}
-    assert {"numpy", "pymeshlab", "xarray"} <= names
-    assert not names & {"jupyterlab", "pytest", "dask"}
+    assert {"numpy", "libigl", "xarray"} <= names
+    assert not names & {"jupyterlab", "pymeshlab", "pytest", "dask"}
     assert "jupyterlab" in {name for name, _ in doctor.needed("notebook")}
 
 
@@ -120,4 +120,4 @@ def test_it_runs_where_a_package_that_s4a_imports_is_missing():
         [sys.executable, "-c", code], capture_output=True, text=True, check=False
     )
     assert "Traceback" not in result.stderr
-    assert "PyMeshLab" in result.stdout
+    assert "for --wrap" in result.stdout

@@ -143,13 +143,12 @@ def test_a_registration_that_misses_and_distorts_is_told_where_neither_number_al
     }
 
 
-def test_without_pymeshlab_counting_names_it_and_all_else_runs(monkeypatch):
+def test_without_pymeshlab_all_defaults_run_and_wrapping_names_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "pymeshlab", None)
     brains = s4a.synthetic.brains(3, 200)
     shapes = {name: node.to_dataset() for name, node in brains["original"].children.items()}
     small = {"n_coarse": 100, "k": 10, "k_init": 6, "n_pairs": 3}
-    for call in (s4a.read_shapes, lambda shapes: s4a.analyse(shapes, **small)):
-        with pytest.raises(ValueError, match=r"pip install pymeshlab.*intersections=False"):
-            call(shapes)
-    study = s4a.analyse(shapes, **small, intersections=False)
-    assert study["pca"].sizes["shape"] == 3
+    study = s4a.analyse(shapes, **small)
+    assert study["report"]["self_intersections"].values.tolist() == [0, 0, 0]
+    with pytest.raises(ValueError, match=r"pip install 's4a\[wrap\]'"):
+        s4a.coarsen(shapes["brain_01"], n_coarse=100, wrap=True)
