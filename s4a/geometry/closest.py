@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.spatial import cKDTree
 
-from s4a.geometry.mesh import triangle_areas, triangle_normals, vertex_normals
+from s4a.geometry.mesh import counting_order, triangle_areas, triangle_normals, vertex_normals
 
 # Of positions, for unit area, and of unit normals, where nearest points are searched in both.
 POSITION_WEIGHT, NORMAL_WEIGHT = 5.0, 0.3
@@ -23,7 +23,8 @@ def interpolate(
     values: np.ndarray, T: np.ndarray, triangle: np.ndarray, weights: np.ndarray
 ) -> np.ndarray:
     """Values ``(n, d)`` of the vertices at points of the surface ``(p, d)``."""
-    return np.einsum("pc,pcd->pd", weights, values[T[triangle]])
+    corners = values.take(T.take(triangle, axis=0), axis=0)  # (p, 3, d)
+    return np.einsum("pc,pcd->pd", weights, corners)
 
 
 def interpolation_matrix(
@@ -218,7 +219,7 @@ def stars(T: np.ndarray, n: int) -> Stars:
     >>> around.degree.tolist(), around.triangle[around.start[3] :].tolist()
     ([1, 2, 2, 1], [1])
     """
-    order = np.argsort(T.ravel(), kind="stable")
+    order = counting_order(T.ravel(), n)
     degree = np.bincount(T.ravel(), minlength=n)
     return Stars(order // 3, np.cumsum(degree) - degree, degree)
 
@@ -257,8 +258,9 @@ def closest_point_in_star(
         first = np.cumsum(repeat) - repeat
         row = np.repeat(np.arange(len(block)), repeat)
         candidate = star[start[nearest[block]][row] + np.arange(len(row)) - first[row]]
-        A, ab, ac = (X[corner] for corner in T[candidate].T)
-        ap = P[block][row]
+        # take: rows by fancy indices are copied at a fifth of the speed
+        A, ab, ac = (X.take(corner, axis=0) for corner in T.take(candidate, axis=0).T)
+        ap = P.take(block[row], axis=0)
         for side in (ab, ac, ap):  # in place, as below: copies take as long as the products
             side -= A
         v, w = closest_by_sides(ab, ac, ap)

@@ -120,12 +120,37 @@ def unique_edges(T: np.ndarray, n: int | None = None) -> tuple[np.ndarray, np.nd
     count : int ndarray (e,)
         Triangles at the edge: 2 inside of a manifold, 1 on its boundary.
     """
-    start, end = directed_edges(np.asarray(T, np.int64)).T
+    start, end = directed_edges(T).T
     if n is None:
         n = int(max(start.max(initial=-1), end.max(initial=-1))) + 1
-    key = np.minimum(start, end) * n + np.maximum(start, end)
-    key, edge_of, count = np.unique(key, return_inverse=True, return_counts=True)
-    return np.stack(np.divmod(key, max(n, 1)), axis=1), edge_of, count
+    low, high = np.minimum(start, end), np.maximum(start, end)
+    order = counting_order(high, n)  # np.unique of both as one number takes twice as long
+    order = order.take(counting_order(low.take(order), n))
+    low, high = low.take(order), high.take(order)
+    new = np.ones(len(order), bool)
+    new[1:] = (low[1:] != low[:-1]) | (high[1:] != high[:-1])
+    edge_of = np.empty(len(order), np.int64)
+    edge_of[order] = np.cumsum(new) - 1
+    head = np.flatnonzero(new)
+    E = np.stack([low.take(head), high.take(head)], axis=1).astype(np.int64)
+    return E, edge_of, np.diff(head, append=len(order))
+
+
+def counting_order(key: np.ndarray, n: int) -> np.ndarray:
+    """The order ``(m,)`` that sorts numbers 0 to n - 1; equal ones stay in their order.
+
+    In linear time, as a sparse matrix is transposed: 5 ms for 600,000, of which a sort takes 60.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.geometry.mesh import counting_order
+    >>> counting_order(np.array([2, 0, 1, 0]), 3).tolist()
+    [1, 3, 2, 0]
+    """
+    m = len(key)
+    one_a_row = sp.csr_matrix((np.ones(m, np.int8), key, np.arange(m + 1)), (m, n))
+    return one_a_row.tocsc().indices.astype(np.int64)
 
 
 def equal_rows(A: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -146,8 +171,14 @@ def equal_rows(A: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     >>> first.tolist(), group.tolist()
     ([1, 0], [1, 0, 1])
     """
-    order = np.lexsort(A.T)  # stable; np.unique(axis=0) takes five times as long
-    new = np.r_[True, (A[order[1:]] != A[order[:-1]]).any(axis=1)][: len(A)]
+    if A.dtype.kind in "iu" and A.min(initial=0) >= 0 and A.max(initial=0) < 8 * len(A):
+        order = np.arange(len(A))
+        for column in A.T:
+            order = order.take(counting_order(column.take(order), int(column.max()) + 1))
+    else:
+        order = np.lexsort(A.T)  # stable; np.unique(axis=0) takes five times as long
+    ordered = A.take(order, axis=0)
+    new = np.r_[True, (ordered[1:] != ordered[:-1]).any(axis=1)][: len(A)]
     group = np.empty(len(A), np.int64)
     group[order] = np.cumsum(new) - 1
     return order[new], group
@@ -171,8 +202,8 @@ def edge_graph(X: np.ndarray, E: np.ndarray) -> sp.csr_matrix:
 def path_lengths(G: sp.csr_matrix, start: np.ndarray, end: np.ndarray, limit: float) -> np.ndarray:
     """Lengths of the shortest paths along edges between pairs of vertices ``(p,)``, cut at `limit`.
 
-    Short paths are looked for first, and a few starts at a time, so that neither time nor memory
-    grow with the whole surface.
+    An edge is the shortest path between its ends.  Of the others short paths are looked for first,
+    and a few starts at a time, so that neither time nor memory grow with the whole surface.
 
     Parameters
     ----------
@@ -191,7 +222,8 @@ def path_lengths(G: sp.csr_matrix, start: np.ndarray, end: np.ndarray, limit: fl
     >>> path_lengths(G, np.array([0, 1, 1]), np.array([0, 3, 3]), 9.0).tolist()
     [0.0, 3.0, 3.0]
     """
-    length = np.full(len(start), np.inf)
+    edge = np.asarray(G[start, end]).ravel()
+    length = np.where(start == end, 0.0, np.where(edge > 0, edge, np.inf))
     for reach in (0.1 * limit, limit):
         missing = np.flatnonzero(np.isinf(length))
         origin, row = np.unique(start[missing], return_inverse=True)
@@ -213,8 +245,9 @@ def half_cotangents(X: np.ndarray, T: np.ndarray) -> np.ndarray:
     double_area = np.maximum(2 * triangle_areas(X, T), np.finfo(float).tiny)
     half_cotangent = []
     for i, j, opposite in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        o = X[T[:, opposite]]
-        dot = np.einsum("ij,ij->i", X[T[:, i]] - o, X[T[:, j]] - o)  # (m,)
+        o = X.take(T[:, opposite], axis=0)
+        u, v = X.take(T[:, i], axis=0) - o, X.take(T[:, j], axis=0) - o
+        dot = np.einsum("ij,ij->i", u, v)  # (m,)
         half_cotangent.append(dot / (2 * double_area))
     return np.concatenate(half_cotangent)
 
@@ -252,5 +285,5 @@ def euler_characteristic(T: np.ndarray, E: np.ndarray | None = None) -> int:
 
 def volume(X: np.ndarray, T: np.ndarray) -> float:
     """Signed enclosed volume; positive when the normals point outwards."""
-    a, b, c = (X[corner] for corner in T.T)
+    a, b, c = (X.take(corner, axis=0) for corner in T.T)
     return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)

@@ -483,7 +483,7 @@ def _turn_outwards(X, T, label, n):
     total = np.maximum(np.bincount(label, weight, n), 1)
     centre = np.stack([np.bincount(label, weight * x, n) / total for x in X.T], axis=1)  # (n, 3)
     component = label[T[:, 0]]
-    a, b, c = (X[T[:, i]] - centre[component] for i in range(3))
+    a, b, c = (X.take(T[:, i], axis=0) - centre.take(component, axis=0) for i in range(3))
     volume = np.bincount(component, np.einsum("ij,ij->i", a, np.cross(b, c)) / 6, n)
     area = np.bincount(component, triangle_areas(X, T), n)
     inwards = volume < np.where(closed, 0, -1e-3 * area**1.5)  # a flat open patch has no outside

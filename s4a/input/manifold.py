@@ -22,6 +22,7 @@ import numpy as np
 
 from s4a.geometry.mesh import (
     components,
+    counting_order,
     directed_edges,
     triangle_areas,
     triangle_normals,
@@ -36,7 +37,7 @@ def manifold_mates(edge_of: np.ndarray, count: np.ndarray) -> np.ndarray:
 
     `edge_of` and `count` are those of :func:`s4a.geometry.mesh.unique_edges`.
     """
-    order = np.argsort(edge_of, kind="stable")
+    order = counting_order(edge_of, len(count))
     first = (np.cumsum(count) - count)[count == 2]
     one, other = order[first], order[first + 1]
     mate = np.full(len(edge_of), -1)
@@ -80,7 +81,7 @@ def _pairs_around_edges(P, F, group, edge_of, count):
         pair that encloses less of the inside goes first, so that solids that touch in an edge come
         apart.
     """
-    order = np.argsort(edge_of, kind="stable")
+    order = counting_order(edge_of, len(count))
     first = np.cumsum(count) - count
     found = [np.empty((0, 2), np.int64)]
     for k in range(3, MOST_AROUND_EDGE + 1):
@@ -158,8 +159,10 @@ def join_corners(F: np.ndarray, mate: np.ndarray) -> tuple[np.ndarray, np.ndarra
     label = components(links, 3 * m)
     file_vertex = np.full(label.max() + 1, np.iinfo(np.int64).max)
     np.minimum.at(file_vertex, label, F.T.ravel())
-    order = np.argsort(file_vertex, kind="stable")
-    return np.argsort(order)[label].reshape(3, m).T, file_vertex[order]
+    order = counting_order(file_vertex, F.max() + 1)
+    rank = np.empty_like(file_vertex)
+    rank[order] = np.arange(len(order))
+    return rank.take(label).reshape(3, m).T, file_vertex[order]
 
 
 def split_double_edges(

@@ -18,6 +18,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from s4a.geometry.mesh import counting_order
+
 BLOCK = 512  # cells of queries whose distances to all other cells are held at once
 PAIRS = 2048  # pairs of rows at a time: their differences, 0.8 MB in 100 dims, stay in the cache
 SLACK = 1 + 1e-5  # factor on bounds, for what float32 rounds away
@@ -106,9 +108,9 @@ class Cells:
 def into_cells(rows: np.ndarray, cell: np.ndarray) -> Cells:
     """Rows `(n, d)` grouped by their cell number `(n,)`; cells are those in use."""
     _, cell = np.unique(cell, return_inverse=True)
-    order = np.argsort(cell, kind="stable")
-    rows = np.ascontiguousarray(rows[order], np.float32)
     count = np.bincount(cell)
+    order = counting_order(cell, len(count))
+    rows = np.asarray(rows, np.float32).take(order, axis=0)
     start = np.concatenate([[0], np.cumsum(count)])
     center = np.add.reduceat(rows, start[:-1], axis=0) / count[:, None].astype(np.float32)
     gap = np.linalg.norm(rows - np.repeat(center, count, axis=0), axis=1)  # (n,)

@@ -291,6 +291,11 @@ def collection(n, n_vertices, folder):
     return synthetic.write(tree, folder), tree["truth"]
 
 
+def files_of_collection(n, n_vertices, folder):
+    """The paths alone."""
+    return collection(n, n_vertices, folder)[0]
+
+
 def stages(folder):
     """The table of stages."""
     say(
@@ -708,8 +713,12 @@ def certificates(folder, n_checked=1000):
 
 
 def whole(folder, n=51, n_vertices=VERTICES):
-    """One collection on all cores: the table of stages of the report."""
-    paths, _ = collection(n, n_vertices, folder / "files")
+    """One collection on all cores: the table of stages of the report.
+
+    Another process makes the files, so that its memory is none of the analysis.
+    """
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        paths = pool.submit(files_of_collection, n, n_vertices, folder / "files").result()
     begin = time.perf_counter()
     s4a.analyse(paths, store=folder / "study", n_jobs=-1)
     wall = time.perf_counter() - begin
