@@ -313,11 +313,11 @@ def _weld(P, F, counts):
 
 def _near_pairs(X, tolerance):
     """Pairs of points within the tolerance ``(p, 2)``."""
-    near = np.arange(len(X))  # candidates: those that have another so near in x, y and z
-    for x in X.T:
-        near = near[np.argsort(x[near])]
-        close = np.flatnonzero(np.diff(x[near]) <= tolerance)
-        near = near[np.union1d(close, close + 1)]
+    # candidates have another so near along a line; no lattice of voxels has many on planes across it
+    along = (X - X[0]) @ (np.sqrt([1.0, 2.0, 3.0]) / np.sqrt(6))
+    order = np.argsort(along)
+    close = np.diff(along[order]) <= 1.001 * tolerance  # with what rounding may add
+    near = order[np.append(close, False) | np.append(False, close)]
     tree = cKDTree(X[near], balanced_tree=False, compact_nodes=False)
     crowd = tree.count_neighbors(tree, tolerance) / len(X)
     if crowd > 100:  # the pairs would fill the memory
