@@ -4,20 +4,48 @@ All others stay as they are.  What is done with one shape is in :mod:`s4a.study.
 """
 
 import logging
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import xarray as xr
 
+from s4a.input.files import files_named
+from s4a.input.hands import AUTO, is_of_other_hand, seen_together
+from s4a.input.landmarks import SUFFIXES
 from s4a.input.subjects import listed, read_table
-from s4a.study.newcomers import insert_shapes
+from s4a.study.newcomers import (
+    New,
+    hands_beside,
+    insert_meshes,
+    insert_shapes,
+    named,
+    read_beside,
+)
 from s4a.study.options import Options
-from s4a.study.sources import find_sources
+from s4a.study.sources import Sources, find_sources
 from s4a.study.store import STRUCTURES
-from s4a.study.structures import contents_of, is_nested, lacking, parts_of_table, status_of
+from s4a.study.structures import (
+    contents_of,
+    is_nested,
+    lacking,
+    landmark_folders,
+    mirrored_in,
+    parts_of_table,
+    status_of,
+    to_mirror,
+)
 from s4a.study.tree import nodes_of_structure, of_structure, structure_names
 
 log = logging.getLogger(__name__)
+
+
+class Given(NamedTuple):
+    """The new shapes of one structure, called as their subjects."""
+
+    shapes: dict[str, Any]  # meshes or files
+    landmarks: dict[str, Path]  # files, of those that have one
+    subjects: xr.Dataset | None = None  # their rows of the table
 
 
 def insert(
@@ -46,12 +74,13 @@ def insert(
         several structures: ``{subject: {structure: mesh}}``, files with a `table`, or label volumes
         where it was made of these.
     landmarks : path, optional
-        Folder with a file of landmarks for some or all of them, see :func:`s4a.analyse`; like
-        `reflect` for shapes of one structure alone.
+        Folder with a file of landmarks for some or all of them, see :func:`s4a.analyse`.
     reflect : str or list of str, optional
         New shapes to mirror, as ``reflect=`` of :func:`s4a.analyse` did it: their names, with
         commas between them, or ``"auto"``, those of the other hand than the shapes of the study as
         they are in it.  Without it none is mirrored, and `compare` tells those of the other hand.
+        Of several structures names of subjects, or a column of the `table`; all structures of a
+        subject are mirrored together.
     table : path, optional
         CSV with columns ``shape``, ``subject`` and ``structure`` and a row for every new shape, as
         of :func:`s4a.analyse`.
@@ -71,15 +100,16 @@ def insert(
         ``score(shape, component)`` on the frozen modes, these, and ``reconstruction_error(shape)``;
         ``/report``.  ``/original`` has the template's mesh too, so that labels can be transferred.
         Of several structures that of each below ``/structures``, and ``/report`` with
-        ``structure_status(shape, structure)``; its ``remarks`` name subjects without a structure,
-        and a structure of which no new shape can be used.
+        ``structure_status(shape, structure)`` and, with `reflect`, ``reflected(shape)``; its
+        ``remarks`` name subjects without a structure, and a structure of which no new shape can be
+        used.
 
     Raises
     ------
     ValueError
         When the study is not finished, no shape can be used, one has the name of the template, or
-        `reflect` names none of them; when several structures are given other than above, or
-        `landmarks` or `reflect` with them, or a `table` for a study of one.
+        `reflect` names none of them; when several structures are given other than above, or a
+        `table` for a study of one.
 
     Examples
     --------
@@ -98,59 +128,84 @@ def insert(
     <Figure ...>
     """
     if STRUCTURES in study.children:
-        if landmarks is not None or reflect is not None:
-            raise ValueError(
-                "landmarks= and reflect= are of shapes of one structure: insert them into "
-                "s4a.statistics.of_structure(study, name), or STUDY/structures/NAME; "
-                "s4a.with_landmarks gives landmarks to meshes in memory"
-            )
-        return insert_several(study, given_structures(study, shapes, table), compare, n_jobs)
+        given = given_structures(study, shapes, table, landmarks)
+        return insert_several(study, given, reflect, compare, n_jobs)
     if table is not None:
         raise ValueError("table= says of which structure a shape is; this study has one alone")
     return insert_shapes(study, shapes, landmarks, reflect, compare, n_jobs)
 
 
 def given_structures(
-    study: xr.DataTree, shapes: Any, table: Path | str | None
-) -> dict[str, dict[str, Any]]:
-    """The new shapes of each structure that are given, called as their subjects."""
+    study: xr.DataTree,
+    shapes: Any,
+    table: Path | str | None,
+    landmarks: Path | str | None = None,
+) -> dict[str, Given]:
+    """The new shapes of each structure that are given, and their files of landmarks."""
     names = structure_names(study)
     labels = [Options.from_report(of_structure(study, name)).label for name in names]
     volumes = None not in labels
     nested = isinstance(shapes, dict) and is_nested(shapes)
-    given: dict[str, dict[str, Any]] = {}
-    if nested and table is None:
-        empty = [subject for subject, of in shapes.items() if not of]
-        if empty:
-            raise ValueError(f"a mesh of a structure needed; {listed(empty)} has none")
-        for subject, of in shapes.items():
-            for name, mesh in of.items():
-                given.setdefault(name, {})[subject] = mesh
-    elif table is not None and not nested:
-        sources = find_sources(shapes, volumes=volumes)
-        parts = parts_of_table(sources, {}, read_table(table, list(sources)), Options())
-        for name, part in parts.items():
-            given[name] = {subject: source for subject, (source, _) in part.sources.items()}
-    elif volumes and len(set(labels)) == len(labels) and _are_files(shapes):
-        files = {name: file for name, (file, _) in find_sources(shapes, volumes=True).items()}
-        given = dict.fromkeys(names, files)
+    options = Options(landmarks=landmarks)
+    if table is not None and not nested:
+        given = given_by_table(find_sources(shapes, volumes=volumes), table, options)
     else:
-        raise ValueError(
-            f"the study has several structures ({listed(names)}): {{subject: {{structure: mesh}}}} "
-            "needed, or files and table=, with columns 'shape', 'subject' and 'structure'; or "
-            "label volumes, where it was made of these"
-        )
+        of_each = given_by_name(study, shapes, nested=nested and table is None, labels=labels)
+        folders = landmark_folders(options, names)
+        given = {}
+        for name, of in of_each.items():
+            folder = folders.get(name)
+            files = {} if folder is None else files_named(folder, of, "landmarks", SUFFIXES)
+            given[name] = Given(of, {one: files[one] for one in of if one in files})
     unknown = [repr(name) for name in given if name not in names]
     if unknown:
         raise ValueError(f"the study has no structure {listed(unknown)}; it has {listed(names)}")
-    for name, new in given.items():
+    for name, one in given.items():
         template = study[f"{STRUCTURES}/{name}/registration"].attrs["template"]
-        if template in new:
+        if template in one.shapes:
             raise ValueError(
                 f"structure {name}: new shapes need other names than the template, {template!r}; "
                 "rename it"
             )
     return given
+
+
+def given_by_table(sources: Sources, table: Path | str, options: Options) -> dict[str, Given]:
+    """The new shapes of each structure, as the columns ``structure`` and ``subject`` say."""
+    given = {}
+    for name, part in parts_of_table(sources, read_table(table, list(sources)), options).items():
+        files = {
+            subject: Path(guides.landmarks[0])
+            for subject, guides in part.marked.items()
+            if guides.landmarks
+        }
+        shapes = {subject: source for subject, (source, _) in part.sources.items()}
+        given[name] = Given(shapes, files, part.subjects)
+    return given
+
+
+def given_by_name(
+    study: xr.DataTree, shapes: Any, *, nested: bool, labels: list[int | str | None]
+) -> dict[str, dict[str, Any]]:
+    """The new shapes of each structure, of a dict of dicts or of label volumes."""
+    names = structure_names(study)
+    if nested:
+        empty = [subject for subject, of in shapes.items() if not of]
+        if empty:
+            raise ValueError(f"a mesh of a structure needed; {listed(empty)} has none")
+        given: dict[str, dict[str, Any]] = {}
+        for subject, of in shapes.items():
+            for name, mesh in of.items():
+                given.setdefault(name, {})[subject] = mesh
+        return given
+    if None not in labels and len(set(labels)) == len(labels) and _are_files(shapes):
+        files = {name: file for name, (file, _) in find_sources(shapes, volumes=True).items()}
+        return dict.fromkeys(names, files)
+    raise ValueError(
+        f"the study has several structures ({listed(names)}): {{subject: {{structure: mesh}}}} "
+        "needed, or files and table=, with columns 'shape', 'subject' and 'structure'; or "
+        "label volumes, where it was made of these"
+    )
 
 
 def _are_files(shapes):
@@ -163,31 +218,91 @@ def _are_files(shapes):
 
 
 def insert_several(
-    study: xr.DataTree, given: dict[str, dict[str, Any]], compare: bool, n_jobs: int | None
+    study: xr.DataTree,
+    given: dict[str, Given],
+    reflect: str | list[str] | None,
+    compare: bool,
+    n_jobs: int | None,
 ) -> xr.DataTree:
     """The new shapes of each structure, in the study of that structure.
 
     A structure of which none can be used is told, and costs the others nothing.
     """
     names = structure_names(study)
-    lines = lacking({name: given.get(name, ()) for name in names})
-    nodes, status, failed = {}, {}, []
+    have = {name: given[name].shapes if name in given else {} for name in names}
+    lines = lacking(have)
+    unmarked = [name for name, of in given.items() if not of.landmarks]
+    remarks = [f"{line}: it is inserted without" for line in lines]
+    if 0 < len(unmarked) < len(given):
+        remarks.append(f"no file of landmarks for any {listed(unmarked)}: inserted without")
+    mirrored = None if reflect is None else named_new(reflect, given)
+    status: dict[str, dict[str, str]] = {}
+    read: dict[str, New] = {}
+    failed = []
     for name in names:
-        shapes = given.get(name, {})
-        status[name] = dict.fromkeys(shapes, "excluded")
-        if not shapes:
-            continue
+        of = given.get(name, Given({}, {}))
+        status[name] = dict.fromkeys(of.shapes, "excluded")
+        if of.shapes:
+            try:
+                read[name] = read_beside(
+                    of_structure(study, name),
+                    of.shapes,
+                    of.landmarks,
+                    seen=compare or reflect == AUTO,
+                )
+            except ValueError as error:
+                failed.append(f"structure {name}: {error}")
+    told: list[str] = []
+    if reflect == AUTO:
+        mirrored, told = of_other_hand_beside(read)
+    inserted = {}
+    for name, new in read.items():
+        part = of_structure(study, name)
         try:
-            new = insert_shapes(of_structure(study, name), shapes, None, None, compare, n_jobs)
+            inserted[name] = insert_meshes(part, new, mirrored, told, compare, n_jobs)
         except ValueError as error:
             failed.append(f"structure {name}: {error}")
             continue
-        status[name] = status_of(new)
-        nodes |= nodes_of_structure(name, new)
-    if not nodes:
+        status[name] = status_of(inserted[name])
+    if not inserted:
         raise ValueError("; ".join(failed))
-    remarks = [*(f"{line}: it is inserted without" for line in lines), *failed]
-    for line in remarks:
+    for line in [*remarks, *failed, *told]:
         log.warning("%s", line)
-    nodes["/report"] = contents_of(status).assign_attrs(remarks="\n".join(remarks))
+    nodes = {}
+    for name, part in inserted.items():
+        nodes |= nodes_of_structure(name, part)
+    report = contents_of(status, mirrored_in(inserted.values()))
+    nodes["/report"] = report.assign_attrs(remarks="\n".join([*remarks, *failed, *told]))
     return xr.DataTree.from_dict(nodes)
+
+
+def named_new(reflect: str | list[str], given: Mapping[str, Given]) -> list[str]:
+    """The new subjects that ``reflect=`` names, but for ``"auto"``."""
+    if reflect == AUTO:
+        return []
+    return to_mirror(
+        ",".join(named(reflect)),
+        {name: of.shapes for name, of in given.items()},
+        {name: of.subjects for name, of in given.items()},
+        beside=True,
+    )
+
+
+def of_other_hand_beside(read: Mapping[str, New]) -> tuple[list[str], list[str]]:
+    """The new subjects of the other hand than those of the study, and what is told of them.
+
+    All structures of a subject say so together, see :func:`s4a.input.hands.seen_together`.
+    """
+    beside = {name: hands_beside(new) for name, new in read.items()}
+    subjects = sorted({subject for _, looks in beside.values() for subject in looks})
+    chosen, told = [], []
+    for subject in subjects:
+        own = {name: looks for name, looks in beside.items() if subject in looks[1]}
+        together = seen_together(
+            {name: known | {"": looks[subject]} for name, (known, looks) in own.items()}
+        )
+        look = together.pop("")
+        is_other, line = is_of_other_hand(subject, look, together)
+        told += [line] if line else []
+        chosen += [subject] if is_other else []
+    return chosen, told

@@ -4,6 +4,7 @@ See :func:`s4a.insert`, which also takes them into a study of several structures
 """
 
 import logging
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,6 +31,7 @@ from s4a.method.shape import Shape
 from s4a.schema import dataset, in_unit, require, unit_of, variable
 from s4a.study.options import Options
 from s4a.study.processes import workers
+from s4a.study.tasks import guided
 from s4a.study.tree import left_out, stack_registration, template_mesh
 
 log = logging.getLogger(__name__)
@@ -57,6 +59,15 @@ class Inserted(NamedTuple):
     look: xr.Dataset | None  # None where it was not compared
 
 
+class New(NamedTuple):
+    """New shapes that were read, and those of the study that they are held against."""
+
+    meshes: dict[str, xr.Dataset]  # clean, those that can be used
+    attrs: dict[str, dict[str, Any]]  # of all, for the report
+    options: Options  # of the study
+    portraits: dict[str, xr.Dataset]  # of some shapes of the study, where they are needed
+
+
 def insert_shapes(
     study: xr.DataTree,
     shapes: Path | str | list[Any] | dict[str, Any] | xr.Dataset,
@@ -66,21 +77,67 @@ def insert_shapes(
     n_jobs: int | None,
 ) -> xr.DataTree:
     """New shapes of one structure, see :func:`s4a.insert`."""
+    shapes = {"new": shapes} if isinstance(shapes, xr.Dataset) else shapes
+    new = read_beside(study, shapes, landmarks, seen=compare or reflect == AUTO)
+    mirrored, told = choose_reflected(reflect, new)
+    mirrored = None if reflect is None else mirrored
+    return insert_meshes(study, new, mirrored, told, compare, n_jobs)
+
+
+def read_beside(
+    study: xr.DataTree,
+    shapes: Path | str | list[Any] | dict[str, Any],
+    landmarks: Path | str | Mapping[str, Path] | None,
+    *,
+    seen: bool,
+) -> New:
+    """New shapes for a finished study, read and cleaned as it has been.
+
+    Parameters
+    ----------
+    study : DataTree
+    shapes, landmarks : see :func:`read_new`
+    seen : bool
+        Whether they are to be held against shapes of the study.
+    """
     needed = ("original", "coarse", "latent", "registration")
     missing = [name for name in needed if name not in study.children]
     if missing:
         raise ValueError(f"a finished study is needed; this one lacks {', '.join(missing)}")
     options = Options.from_report(study)
     template = study["registration"].attrs["template"]
-    shapes = {"new": shapes} if isinstance(shapes, xr.Dataset) else shapes
     meshes, attrs = read_new(shapes, options, landmarks)
     if template in meshes:
         raise ValueError(f"new shapes need other names than the template, {template!r}; rename it")
+    return New(meshes, attrs, options, portraits_of(study) if seen else {})
+
+
+def insert_meshes(
+    study: xr.DataTree,
+    new: New,
+    mirrored: list[str] | None,
+    told: list[str],
+    compare: bool,
+    n_jobs: int | None,
+) -> xr.DataTree:
+    """New shapes that were read, in the study of their structure.
+
+    Parameters
+    ----------
+    study : DataTree
+    new : New
+    mirrored : list of str, optional
+        Those whose mirror images are taken; None where nobody asked for any.
+    told : list of str
+        Of that choice, for the report.
+    compare, n_jobs : see :func:`s4a.insert`
+    """
+    options, meshes, attrs = new.options, dict(new.meshes), dict(new.attrs)
+    template = study["registration"].attrs["template"]
     frozen = freeze(study, options)
-    portraits = portraits_of(study) if compare or reflect == AUTO else {}
-    references = portraits if compare else None
-    mirrored, told = choose_reflected(reflect, meshes, attrs, portraits)
-    for name in mirrored:
+    references = new.portraits if compare else None
+    taken = [name for name in mirrored or () if name in meshes]
+    for name in taken:
         meshes[name] = mirror_image(meshes[name])
         attrs[name] = attrs[name] | meshes[name].attrs
     # in a tuple: a Dataset of its own is kept by one worker of dask, and is lost with that
@@ -99,16 +156,16 @@ def insert_shapes(
 
     nodes = {f"original/{name}": meshes[name] for name in inserted}
     nodes[f"original/{template}"] = frozen.template.original
-    nodes |= {f"coarse/{name}": new.coarse for name, new in inserted.items()}
+    nodes |= {f"coarse/{name}": one.coarse for name, one in inserted.items()}
     nodes["latent"] = latent_of_new(
-        np.stack([new.Y for new in inserted.values()]),
-        np.stack([new.coarse["eigenvalue"].values for new in inserted.values()]),
+        np.stack([one.Y for one in inserted.values()]),
+        np.stack([one.coarse["eigenvalue"].values for one in inserted.values()]),
         study["latent"].dataset["latent_eigenvalue"].values,
         options.norm,
     ).assign_coords(shape=list(inserted))
     nodes |= stack_registration(
         template_mesh(frozen.template.original, template),
-        {name: new.registration for name, new in inserted.items()},
+        {name: one.registration for name, one in inserted.items()},
         list(inserted),
     )
     if "pca" in study:
@@ -117,59 +174,80 @@ def insert_shapes(
     if references is None:
         nodes["report"] = shape_report(attrs)
     else:
-        looks = {name: new.look for name, new in inserted.items() if new.look is not None}
+        looks = {name: one.look for name, one in inserted.items() if one.look is not None}
         nodes["report"] = report_beside(study, attrs, looks, references)
     report = nodes["report"].attrs
     report["remarks"] = "\n".join(filter(None, [*told, report["remarks"]]))
     report["keep_doubtful"] = "True"  # all that were given are in the result
-    if reflect is not None:
-        nodes["report"]["reflected"] = variable("reflected", [name in mirrored for name in attrs])
+    if mirrored is not None:
+        nodes["report"]["reflected"] = variable("reflected", [name in taken for name in attrs])
     return xr.DataTree.from_dict(nodes)
 
 
-def choose_reflected(
-    reflect: str | list[str] | None,
-    meshes: dict[str, xr.Dataset],
-    attrs: dict[str, dict[str, Any]],
-    references: dict[str, xr.Dataset],
-) -> tuple[list[str], list[str]]:
+def choose_reflected(reflect: str | list[str] | None, new: New) -> tuple[list[str], list[str]]:
     """The new shapes whose mirror images are taken, and what is told of the choice."""
     if reflect is None:
         return [], []
     if reflect == AUTO:
-        known = {
-            name: evidence.compare(name, seen, references) for name, seen in references.items()
-        }
-        looks = {
-            name: evidence.compare("", evidence.portray(mesh, intersections=False), references)
-            for name, mesh in meshes.items()
-        }
+        known, looks = hands_beside(new)
         said = {name: is_of_other_hand(name, look, known) for name, look in looks.items()}
         told = [line for _, line in said.values() if line]
         for line in told:
             log.warning("%s", line)
         return [name for name, (is_other, _) in said.items() if is_other], told
-    names = reflect.split(",") if isinstance(reflect, str) else list(reflect)
-    names = [str(name).strip() for name in names]
-    unknown = [repr(name) for name in names if name not in attrs]
+    names = named(reflect)
+    unknown = [repr(name) for name in names if name not in new.attrs]
     if unknown:
         raise ValueError(
-            f"reflect names {listed(unknown)}, none of the new shapes ({listed(list(attrs))}); "
+            f"reflect names {listed(unknown)}, none of the new shapes ({listed(list(new.attrs))}); "
             "'auto' mirrors those of the other hand than the study's"
         )
-    return [name for name in names if name in meshes], []
+    return [name for name in names if name in new.meshes], []
+
+
+def named(reflect: str | list[str]) -> list[str]:
+    """The names that ``reflect=`` lists."""
+    names = reflect.split(",") if isinstance(reflect, str) else list(reflect)
+    return [str(name).strip() for name in names]
+
+
+def hands_beside(new: New) -> tuple[dict[str, xr.Dataset], dict[str, xr.Dataset]]:
+    """:func:`s4a.input.evidence.compare` of shapes of the study, and of new ones beside them."""
+    references = new.portraits
+    known = {name: evidence.compare(name, seen, references) for name, seen in references.items()}
+    looks = {
+        name: evidence.compare("", evidence.portray(mesh, intersections=False), references)
+        for name, mesh in new.meshes.items()
+    }
+    return known, looks
 
 
 def read_new(
     shapes: Path | str | list[Any] | dict[str, Any],
     options: Options,
-    landmarks: Path | str | None = None,
+    landmarks: Path | str | Mapping[str, Path] | None = None,
 ) -> tuple[dict[str, xr.Dataset], dict[str, dict[str, Any]]]:
-    """The new meshes that can be used, with what guides them, and attributes for the report."""
+    """The new meshes that can be used, with what guides them, and attributes for the report.
+
+    Parameters
+    ----------
+    shapes : see :func:`s4a.insert`
+    options : Options
+        Of the study.
+    landmarks : path or dict of str to path, optional
+        A folder, or the files of shapes by name.
+    """
     meshes, attrs = read_and_clean(shapes, options)
-    files = {} if landmarks is None else files_named(landmarks, meshes, "landmarks", SUFFIXES)
+    files: Mapping[str, Path] = {}
+    if isinstance(landmarks, Mapping):
+        files = landmarks
+    elif landmarks is not None:
+        files = files_named(landmarks, meshes, "landmarks", SUFFIXES)
     for name, mesh in list(meshes.items()):
         try:
+            source = shapes[name] if isinstance(shapes, dict) else None
+            if isinstance(source, xr.Dataset) and "file_vertex" not in source:
+                mesh = guided(mesh, source)
             if name in files:
                 mesh = with_landmarks(mesh, files[name])
             path = mesh.attrs.get("path", "")
