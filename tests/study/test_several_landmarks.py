@@ -109,6 +109,22 @@ def test_files_of_a_table_have_landmarks_by_their_own_names_or_by_subject(two, f
         assert of_subjects[name].sources == of_files[name].sources
 
 
+def test_files_of_a_dict_have_fields_beside_them(two, tmp_path):
+    scans, _ = files_of(two, tmp_path / "scans")
+    np.save(scans / "left_of_subject_1.depth.npy", np.arange(200.0))
+    np.save(scans / "right_of_subject_2.depth.npy", np.arange(200.0))
+    given = {
+        subject: {name: scans / f"{name}_of_{subject}.ply" for name in of}
+        for subject, of in two.items()
+    }
+    parts = parts_of_dict(given, Options(features="depth"))
+    assert {name: list(part.marked) for name, part in parts.items()} == {
+        "left": ["subject_1"],
+        "right": ["subject_2"],
+    }
+    assert list(parts["left"].marked["subject_1"].features) == ["depth"]
+
+
 def test_label_volumes_have_landmarks_in_a_folder_for_each_label(folder, tmp_path):
     scans = tmp_path / "volumes"
     scans.mkdir()

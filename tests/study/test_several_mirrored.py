@@ -7,6 +7,7 @@ import xarray as xr
 import s4a
 from s4a import analyse, cli, open_study, write_mesh
 from s4a.datasets.structures import subjects
+from s4a.geometry.mesh import as_arrays, volume
 from s4a.input.hands import mirror_image, seen_together, subjects_of_other_hand
 from s4a.input.subjects import subjects as table_of
 from s4a.schema import dataset
@@ -116,6 +117,31 @@ def test_the_command_mirrors_the_subjects_that_a_column_names(alone, mixed, tmp_
     assert "Structures of both sides as one kind are a study of one structure" in said
     assert cli.main([*words, "--reflect", "scan_left_0"]) == 2
     assert "names 'scan_left_0', none of the subjects (subject_1, " in capsys.readouterr().err
+
+
+def test_label_volumes_of_mirrored_scans_are_mirrored_with_all_their_structures(tmp_path):
+    import nibabel
+
+    grid = np.indices((24, 14, 14)).transpose(1, 2, 3, 0)
+    rng = np.random.default_rng(0)
+    for name in "abc":
+        labels = np.zeros(grid.shape[:3], np.uint8)
+        for value, x in ((1, 6.5), (2, 17.5)):
+            axes = rng.uniform([4.5, 3.4, 2.6], [5, 3.8, 3])
+            labels[(((grid - [x, 6.5, 6.5]) / axes) ** 2).sum(-1) < 1] = value
+        affine = np.diag([-1 if name == "c" else 1, 1, 1, 1])
+        nibabel.Nifti1Image(labels, affine).to_filename(tmp_path / f"{name}.nii.gz")
+    out = tmp_path / "study"
+    words = ["run", *map(str, sorted(tmp_path.glob("*.nii.gz"))), "--out", str(out), *FLAGS]
+    words += ["--structures", "front=1", "back=2", "--keep-doubtful"]
+    assert cli.main([*words, "--reflect", "c"]) == 0
+    study = open_study(out)
+    assert study["report"]["reflected"].values.astype(bool).tolist() == [False, False, True]
+    for name, x in (("front", 6.5), ("back", 17.5)):
+        for one in "abc":
+            mesh = study[f"structures/{name}/original/{one}"]
+            assert mesh["position"][:, 0].mean().item() == pytest.approx(x, abs=0.5)
+            assert volume(*as_arrays(mesh)) > 0
 
 
 def test_what_names_no_subject_or_all_is_refused():
