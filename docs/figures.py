@@ -5,6 +5,9 @@ vertices, analysed with all defaults as ``s4a demo`` does; the two panels and th
 this study in Chromium, the scene in JupyterLab. A name is that of a picture without its ending;
 ``docs/heads.png`` is made by ``tests/benchmarks/compare.py heads``, and ``docs/structure.svg`` by
 ``make structure``.
+
+Pictures of data that the project may use and not give away are drawn only where they are named and
+the data lie beside the checkout, into ``docs/_build``, which is not kept: ``structures_real``.
 """
 
 import re
@@ -17,6 +20,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 from PIL import Image
 
 import s4a
@@ -35,9 +39,12 @@ from s4a.show.draw import (
     with_balls,
 )
 from s4a.show.pictures import mode_drawer, write_picture
-from s4a.show.surfaces import carried_colors, mesh_of, network_places, surface
+from s4a.show.surfaces import carried_colors, mesh_of, mode_arrays, network_places, surface
 
 HERE = Path(__file__).parent
+LOCAL_FOLDER = HERE / "_build"
+DATA = HERE.parents[1] / "shared" / "data"  # beside the checkout
+VOLUMES = 24  # label volumes of hippocampi
 SHAPES, VERTICES, PAIR = 12, 40_000, 10_000
 LOOK = {"view": "corner", "up": "z"}
 DRAWN = (
@@ -63,9 +70,10 @@ def analysed(shapes=SHAPES, vertices=VERTICES):
     return s4a.analyse(collection(shapes, vertices), store=folder / "study", n_jobs=1)
 
 
-def write(figure, name, dpi=120):
+def write(figure, name, dpi=120, folder=HERE):
     """A matplotlib figure on white, in 256 colours."""
-    path = HERE / f"{name}.png"
+    folder.mkdir(exist_ok=True)
+    path = folder / f"{name}.png"
     figure.savefig(path, dpi=dpi, facecolor="white")
     reduce(path)
     return path
@@ -379,6 +387,63 @@ def reliability():
     return write(figure, "reliability")
 
 
+# ------------------------------------------------------------------- data that are not given away
+
+
+@cache
+def hippocampi(n=VOLUMES):
+    """The study of the anterior and the posterior part of real hippocampi."""
+    files = sorted((DATA / "hippocampi_msd").glob("*.nii.gz"))[:n]
+    if len(files) < n:
+        raise ValueError(
+            f"{n} label volumes of hippocampi needed in {DATA / 'hippocampi_msd'}, "
+            f"found {len(files)}: those of Task04 of the Medical Segmentation Decathlon"
+        )
+    parts = {"anterior": 1, "posterior": 2}
+    return s4a.analyse(files, structures=parts, n_coarse=1000, k=60)
+
+
+def joint_modes(study, what, name, folder=LOCAL_FOLDER, n_modes=3):
+    """The first joint modes of several structures, each from above and from the side."""
+    found = s4a.statistics.structures(study)
+    names = found["structure"].values.tolist()
+    mean, T, steps = mode_arrays(s4a.statistics.structures_modes(study, found), n_modes=n_modes)
+    palette = np.array([to_rgb(OKABE_ITO[i]) for i in (0, 4, 2, 6, 1, 5, 3, 7)])
+    colors = palette[found["structure_of_vertex"].values % len(palette)]
+    ends = np.concatenate([mean + s * step for step in steps for s in (-2, 2)])
+    share = found["level_share"].sum("structure")
+    figure = Figure(figsize=(10, 0.7 + 1.5 * len(steps)), layout="constrained")
+    figure.suptitle(
+        f"{found.sizes['shape']} {what}: {100 * float(share.sel(level='between')):.0f} % of the "
+        f"variance between the structures, {100 * float(share.sel(level='within')):.0f} % within",
+        fontsize=11,
+    )
+    rows = figure.subplots(len(steps), 3, squeeze=False)
+    for i, (step, row) in enumerate(zip(steps, rows, strict=True)):
+        for s, ax in zip((-2, 0, 2), row, strict=True):
+            views = [
+                render(
+                    mean + s * step, T, colors=colors, flat=True, view=view, size=size,
+                    frame=plane_box(ends, view),
+                )
+                for view, size in (("top", (230, 300)), ("left", (300, 300)))
+            ]  # fmt: skip
+            ax.imshow(on_white(np.hstack(views)))
+            ax.set(xticks=[], yticks=[])
+            ax.spines[:].set_visible(False)
+        explained, between = (
+            100 * float(found[v][i]) for v in ("explained_variance_ratio", "between_share")
+        )
+        row[0].set_ylabel(
+            f"mode {i + 1}: {explained:.0f} %\n{between:.0f} % of it between", fontsize=9
+        )
+    for ax, title in zip(rows[0], ("−2 sd", "mean", "+2 sd"), strict=True):
+        ax.set_title(title, fontsize=10)
+    kinds = [Patch(color=palette[k % len(palette)], label=one) for k, one in enumerate(names)]
+    figure.legend(handles=kinds, loc="outside lower center", ncols=len(kinds), frameon=False)
+    return write(figure, name, folder=folder)
+
+
 PICTURES = {
     "figure_1": lambda: pipeline(analysed()),
     "figure_2": swapped,
@@ -392,15 +457,17 @@ PICTURES = {
     "scene": lambda: scene(analysed()),
     "reliability": reliability,
 }
+LOCAL = {"structures_real": lambda: joint_modes(hippocampi(), "hippocampi", "structures_real")}
 
 
 def main(names):
-    unknown = set(names) - set(PICTURES)
+    known = PICTURES | LOCAL
+    unknown = set(names) - set(known)
     if unknown:
-        sys.stderr.write(f"pictures are {', '.join(PICTURES)}, found {', '.join(unknown)}\n")
+        sys.stderr.write(f"pictures are {', '.join(known)}, found {', '.join(unknown)}\n")
         return 2
     for name in names or PICTURES:
-        sys.stdout.write(f"{PICTURES[name]().relative_to(HERE.parent)}\n")
+        sys.stdout.write(f"{known[name]().relative_to(HERE.parent)}\n")
         sys.stdout.flush()
     return 0
 

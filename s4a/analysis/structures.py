@@ -36,7 +36,7 @@ from s4a.input.subjects import listed
 from s4a.method.pca import center_gram, gram, pca, principal_components
 from s4a.schema import check_switch, covariate, dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
-from s4a.study.insert import scores_of_new
+from s4a.study.newcomers import scores_of_new
 from s4a.study.tree import of_structure, structure_names
 
 log = logging.getLogger(__name__)

@@ -53,7 +53,8 @@ HELP = {
     "preset": "'paper' leaves out all that is added to the paper; 'fast' halves the time",
     "template": "name of the shape to register to (default: the median shape)",
     "reflect": "shapes to mirror: their names, with commas; COLUMN=VALUE of the table; or auto",
-    "landmarks": "folder of landmark files named as the shapes, which guide registration",
+    "landmarks": "folder of landmark files named as the shapes (of several structures also in a "
+    "folder for each), which guide registration",
     "features": "fields that guide registration, with commas: sulc is a.sulc.npy beside a.ply",
     "table": "CSV with a column 'shape', covariates and groups, for the statistics",
     "doubtful": "what becomes of doubtful shapes: they stay apart, or the run stops",
@@ -294,7 +295,8 @@ def _insert(add):
     text = "for inserted.nc, registered meshes and scores"
     add("--out", required=True, metavar="DIR", help=text)
     add("--landmarks", metavar="DIR", help=HELP["landmarks"])
-    text = "new shapes to mirror: names, with commas; or auto, those of the other hand"
+    text = "new shapes to mirror: names, with commas; COLUMN=VALUE of the table of several "
+    text += "structures; or auto, those of the other hand"
     add("--reflect", metavar="NAMES", help=text)
     text = "CSV of several structures, with columns shape, subject and structure"
     add("--table", metavar="CSV", help=text)

@@ -15,29 +15,26 @@ import xarray as xr
 from joblib import effective_n_jobs, parallel_config
 
 from s4a.input.collection import remarks_on_files
-from s4a.input.hands import AUTO, hands, of_other_hand, to_reflect
+from s4a.input.hands import AUTO
 from s4a.input.plausibility import Doubts
 from s4a.input.subjects import read_table
 from s4a.method.network import choose_pairs, spectral_distance
 from s4a.method.pca import pca_without
-from s4a.schema import dataset
 from s4a.seeds import seeded
 from s4a.study.doubts import (
     check_plausibility,
     check_usable,
     doubt_registrations,
-    looks_of,
     set_apart,
     stop_at_doubts,
 )
 from s4a.study.options import Options, takes_options
+from s4a.study.originals import choose_reflected, choose_together, read_and_clean
 from s4a.study.processes import temporary_folder
 from s4a.study.report import write_report
 from s4a.study.runner import Keys, Run, Task
 from s4a.study.sources import (
     Collection,
-    Marked,
-    Sources,
     find_guides,
     find_sources,
     kept_table,
@@ -61,6 +58,7 @@ from s4a.study.structures import (
     check_parts,
     has_structures,
     is_nested,
+    named_subjects,
     parts_of_dict,
     parts_of_labels,
     parts_of_table,
@@ -68,7 +66,6 @@ from s4a.study.structures import (
 )
 from s4a.study.tasks import (
     align_shape,
-    clean_shape,
     consistent_maps,
     map_pairs,
     place_shape,
@@ -179,7 +176,9 @@ def analyse(
         turned over), so that left and right ones are of one hand: their names; ``"side=left"``, all
         with this value in the column ``side`` of the table, or a column of 1 and 0; or ``"auto"``,
         those of the rarer hand by ICP of pairs, as they are and mirrored
-        (:func:`s4a.input.hands.of_other_hand`).  ``/report`` says of each whether it was.
+        (:func:`s4a.input.hands.of_other_hand`).  ``/report`` says of each whether it was.  Of
+        several structures subjects are named, or found by all of their structures, and all
+        structures of one are mirrored together, so that they lie to each other as before.
     table : path, optional
         CSV with a column ``shape`` and covariates or groups, see
         :func:`s4a.input.subjects.read_table`; they become ``/subjects``, so that
@@ -188,7 +187,9 @@ def analyse(
     landmarks : path, optional
         Folder with a file of landmarks for some or all shapes, named as the shape: 3D Slicer
         (.mrk.json), CSV or MeshLab (.pp).  Those of one name guide and pull registration, see
-        :func:`s4a.with_landmarks`, which gives them to meshes in memory.
+        :func:`s4a.with_landmarks`, which gives them to meshes in memory.  Of several structures a
+        folder with one for each structure, with files named as the subjects, such as
+        ``marks/left/subject_1.csv``; or, of files with a table, files named as these.
     features : list of str, optional
         Names of fields of the vertices that guide registration, such as ``sulc``, see
         :func:`s4a.with_features`, which gives them to meshes in memory.  Of the file ``a.ply`` in
@@ -256,19 +257,19 @@ def analyse(
     volumes = settings.label is not None
     sources = find_sources(shapes, settings.pattern, volumes=volumes)
     remarks = remarks_on_files(shapes, settings.pattern, volumes=volumes)
-    marked = find_guides(sources, settings.landmarks, settings.feature_names)
     subjects = None if settings.table is None else read_table(settings.table, list(sources))
-    if has_structures(subjects):
-        parts = parts_of_table(sources, marked, subjects, settings)
+    if subjects is not None and has_structures(subjects):
+        parts = parts_of_table(sources, subjects, settings)
         return analyse_parts(parts, settings, remarks, store, n_jobs)
     check_one_kind(store, several=False)
+    marked = find_guides(sources, settings.landmarks, settings.feature_names)
     analyse_part(Part(sources, marked, subjects, settings), remarks, store, n_jobs)
     return open_study(store)
 
 
 def analyse_part(part: Part, remarks: list[str], store: Path | str, n_jobs: int | None) -> None:
     """All steps over shapes of one structure; their study is in the folder `store`."""
-    sources, marked, subjects, options = part
+    sources, marked, subjects, options, _ = part
     options.check_against(list(sources))
     with lock(store) as claim:
         run = Run(claim, n_jobs)
@@ -278,7 +279,7 @@ def analyse_part(part: Part, remarks: list[str], store: Path | str, n_jobs: int 
             remarks = remarks + kept_table(run.folder / "subjects.nc", sources)
         remarks = remarks + remarks_on_guides(sources, marked, options.feature_names)
         with run.notes.whole(), run.unforeseen_told():
-            run_steps(run, sources, marked, options, remarks)
+            run_steps(run, part, remarks)
 
 
 def analyse_parts(
@@ -290,10 +291,15 @@ def analyse_parts(
 ) -> xr.DataTree:
     """The study of every structure in a folder of its own, and their tree."""
     missing = check_parts(parts, options)
+    named = named_subjects(parts, options)
     check_one_kind(store, several=True)
     for line in missing:
         log.warning("%s", line)
     with lock(store) as claim:
+        if options.reflect == AUTO:
+            parts = choose_together(claim.folder / STRUCTURES, parts, options, n_jobs)
+        else:
+            parts = {name: part._replace(chosen=(named, [])) for name, part in parts.items()}
         for name, part in parts.items():
             log.info("structure %s", name)
             try:
@@ -305,10 +311,9 @@ def analyse_parts(
     return open_study(store)
 
 
-def run_steps(
-    run: Run, sources: Sources, marked: Marked, options: Options, remarks: list[str]
-) -> None:
+def run_steps(run: Run, part: Part, remarks: list[str]) -> None:
     """All steps of the paper in turn; each looks up which of its files are done."""
+    sources, marked, _, options, chosen = part
     # what each file is made from; a key holds the keys of all before it:
     #
     #   original/* -> coarse/* -> network/motion_* -> network/first_* -> network, latent
@@ -316,7 +321,7 @@ def run_steps(
     #   network/sketch_*, look_*  latent/* of those apart -> registration/* <- registration
     #                                                     |
     #                                                pca, report
-    reflected, of_hands = choose_reflected(run, sources, marked, options)
+    reflected, of_hands = chosen or choose_reflected(run, sources, marked, options)
     original = read_and_clean(run, sources, marked, options, reflected)
     original, doubts, told = check_plausibility(run, original, options)
     stop_at_doubts(doubts, options)
@@ -332,60 +337,6 @@ def run_steps(
     why_no_modes = modes(run, registered, doubts, options)
     remarks = [*of_hands, *alone, *told, *of_all, *remarks]
     write_report(run, sources, options, remarks, why_no_modes, registered, doubts)
-
-
-def choose_reflected(
-    run: Run, sources: Sources, marked: Marked, options: Options
-) -> tuple[list[str], list[str]]:
-    """The shapes whose mirror images are taken, and what is told of the choice.
-
-    Where the shapes themselves shall say (``reflect="auto"``), they are looked at as they are
-    first; ``network/hands`` keeps the choice.
-    """
-    if options.reflect is None:
-        return [], []
-    if options.reflect != AUTO:
-        table = run.folder / "subjects.nc"
-        subjects = read(table) if table.is_file() else None
-        return to_reflect(str(options.reflect), list(sources), subjects), []
-    file = run.folder / "network/hands.nc"
-    contents = [content for _, content in sources.values()]
-    key = task_key(list(sources), contents, options.of_cleaning, options.k, AUTO)
-    if not is_done(file, key):
-        original = read_and_clean(run, sources, marked, options, [])
-        looks = looks_of(run, original, options) if len(original) > 1 else {}
-        reflected, told = of_other_hand(looks)
-        choice = dataset(
-            {"told": "\n".join(told)},
-            handedness=hands(looks) if looks else np.zeros(0),
-            reflected=np.array([name in reflected for name in looks], int),
-        )
-        write(choice.assign_coords(shape=list(looks)), file, key)
-    choice = read(file)
-    reflected = choice["shape"].values[choice["reflected"].values.astype(bool)].tolist()
-    told = choice.attrs["told"].splitlines()
-    for line in told:
-        log.warning("%s", line)
-    return reflected, told
-
-
-def read_and_clean(
-    run: Run, sources: Sources, marked: Marked, options: Options, reflected: list[str]
-) -> Keys:
-    """The shapes, cleaned, with landmarks, some of them mirrored (5.1): ``/original``."""
-    cleaning = options.of_cleaning
-    todo = []
-    for n, (source, content) in sources.items():
-        also: dict[str, Any] = {"reflected": True} if n in reflected else {}
-        key = (content, cleaning, *also.values())
-        if n in marked:
-            also["guides"] = landmarks, features = marked[n]
-            # wherever the files lie
-            key = (*key, *([landmarks[1]] if landmarks else []))
-            key = (*key, *((name, content) for name, (_, content) in features.items()))
-        given = (source, content, cleaning, also)
-        todo.append(Task(n, f"original/{n}.nc", clean_shape, given, key))
-    return run.do("read and clean", todo)
 
 
 def remesh(run: Run, original: Keys, options: Options) -> Keys:

@@ -81,12 +81,18 @@ def cleaned(source: str | xr.Dataset, content: str, cleaning: dict[str, Any]) ->
         mesh = source.assign_attrs({"status": "ok", "reason": "", "area": area} | source.attrs)
     else:
         mesh = clean(source, **{name: cleaning[name] for name in cleaning if name != "label"})
-        if "guide_position" in source:  # its triangles are others now
-            mesh = with_landmarks(mesh, guides_of(source))
-        if features_of(source):
-            weight = source["feature_weight"].values[0]
-            mesh = with_features(mesh, features_of(source), weight=weight)
+        mesh = guided(mesh, source)
     return in_unit(mesh, source.attrs.get("unit"))
+
+
+def guided(mesh: xr.Dataset, source: xr.Dataset) -> xr.Dataset:
+    """A clean mesh with the landmarks and fields of the mesh in memory that it was made from."""
+    if "guide_position" in source:  # its triangles are others now
+        mesh = with_landmarks(mesh, guides_of(source))
+    if features_of(source):
+        weight = source["feature_weight"].values[0]
+        mesh = with_features(mesh, features_of(source), weight=weight)
+    return mesh
 
 
 def portray_shape(folder: Path, name: str, intersections: bool) -> xr.Dataset:

@@ -573,7 +573,7 @@ PROOFS = [
         "test_a_subject_with_two_shapes_of_one_structure_is_named",
     ),
     (
-        "one structure only, one that a single subject has, structures that are to be mirrored",
+        "one structure only, one that a single subject has, landmarks in no folder of a structure",
         "error with the reason, before anything is computed",
         "test_several.py",
         "test_structures_that_do_not_go_together_are_refused",
@@ -585,8 +585,8 @@ PROOFS = [
         "test_a_structure_in_another_frame_is_told",
     ),
     (
-        "a mesh without its structure, an unknown structure, or landmarks and reflect=, for a "
-        "study of several structures",
+        "a mesh without its structure, an unknown structure, or reflect= of none of the subjects, "
+        "for a study of several structures",
         "error that says how new subjects are given",
         "test_several.py",
         "test_what_cannot_be_inserted_into_several_structures_is_told",
@@ -596,6 +596,24 @@ PROOFS = [
         "error that says what was needed and found",
         STRUCTURES,
         "test_new_subjects_of_other_structures_or_templates_are_refused",
+    ),
+    (
+        "structures of one subject of which some are to be mirrored and others are not",
+        "error with the subject and what the column has for each, as their poses would be lost",
+        "test_several_mirrored.py",
+        "test_what_names_no_subject_or_all_is_refused",
+    ),
+    (
+        'a subject with structures of both hands, and `reflect="auto"`',
+        "left as it is and named, with the hand of each structure",
+        "test_several_mirrored.py",
+        "test_a_subject_with_structures_of_both_hands_stays_and_is_told",
+    ),
+    (
+        "a folder of landmarks that is named as no structure, or none for some structure",
+        "error with the name; the structure is registered without, and named",
+        "test_several_landmarks.py",
+        "test_a_structure_without_landmarks_and_a_folder_of_none_are_named",
     ),
     (
         "a structure of one subject mirrored in its file",

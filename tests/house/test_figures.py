@@ -127,6 +127,39 @@ def test_every_picture_of_the_pages_is_drawn_by_a_command():
         assert f'"{name}"' in (paper.BENCHMARKS / file).read_text(encoding="utf-8")
 
 
+def test_pictures_of_data_that_are_not_given_away_have_a_command_and_are_not_kept():
+    text = "".join(page.read_text(encoding="utf-8") for page in DOCS.glob("*.md"))
+    for name in figures.LOCAL:
+        assert f"`make figures NAME={name}`" in text
+        assert not (DOCS / f"{name}.png").exists()
+    folder = figures.LOCAL_FOLDER.relative_to(ROOT).as_posix()
+    assert f"/{folder}/" in (ROOT / ".gitignore").read_text(encoding="utf-8").splitlines()
+
+
+def test_joint_modes_of_structures_are_drawn_with_both_shares_in_the_title(tmp_path, monkeypatch):
+    titles = []
+    write = figures.write
+    monkeypatch.setattr(
+        figures, "write", lambda f, *a, **o: titles.append(f.get_suptitle()) or write(f, *a, **o)
+    )
+    study = s4a.datasets.structures.example_structures()
+    path = figures.joint_modes(study, "beans", "modes", folder=tmp_path / "new")
+    said = re.fullmatch(
+        r"6 beans: (\d+) % of the variance between the structures, (\d+) % within", titles[0]
+    )
+    assert sum(map(int, said.groups())) == pytest.approx(100, abs=1)
+    colors = Image.open(path).convert("RGB").getcolors(256)
+    far = [sum(n for n, (r, g, b) in colors if sign * (b - r) > 60) for sign in (1, -1)]
+    assert min(far) > 5000  # blue and orange
+
+
+def test_without_the_label_volumes_their_picture_says_what_it_needs(tmp_path, monkeypatch):
+    monkeypatch.setattr(figures, "DATA", tmp_path)
+    figures.hippocampi.cache_clear()
+    with pytest.raises(ValueError, match=r"24 label volumes of hippocampi .*, found 0"):
+        figures.hippocampi()
+
+
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
     """The study of a few small brains, and a template that is none of them."""

@@ -19,7 +19,7 @@ import pytest
 
 from s4a import analyse, cli, open_study, synthetic
 from s4a.schema import dataset
-from s4a.study import doubts, pipeline, processes, sources, store, tasks
+from s4a.study import doubts, originals, pipeline, processes, sources, store, tasks
 from s4a.study.runner import Run, peak_memory, together
 
 # of meshes as coarse as these, some registrations are doubtful; so there are modes all the same
@@ -379,7 +379,7 @@ def assert_equal_but_paths(folder, whole):
 def test_an_error_in_the_task_of_one_shape_costs_that_shape_and_is_told(
     files, tmp_path, monkeypatch, capsys, error, stage
 ):
-    module = doubts if stage == "compare_shape" else pipeline
+    module = {"clean_shape": originals, "compare_shape": doubts}.get(stage, pipeline)
     task = getattr(module, stage)
 
     def wrong(*arguments):

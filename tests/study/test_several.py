@@ -130,8 +130,9 @@ def test_structures_that_do_not_go_together_are_refused(tmp_path):
     for given, options, words in [
         (two | {"subject_3": mesh}, {}, "a dict of its structures.*single mesh for subject_3"),
         ({name: {"left": of["left"]} for name, of in two.items()}, {}, "several.*found left"),
-        (two, {"reflect": "auto"}, "reflect= would put mirrored structures into another frame"),
-        (two, {"landmarks": str(tmp_path)}, "landmarks= has a file for each shape"),
+        (two, {"reflect": "left"}, "reflect names 'left', none of the subjects .subject_1, subj"),
+        (two, {"landmarks": str(tmp_path)}, "landmarks: a folder for each structure .left, right"),
+        (two, {"features": "sulc"}, "features: no shape has a field 'sulc'"),
         ({"a b": two["subject_1"]}, {}, "shapes need names of letters"),
         ({"a": {"le/ft": mesh, "right": mesh}}, {}, "shapes need names of letters"),
         ({"a": {"left": "no.ply", "right": mesh}}, {}, "shape a: no.ply is no file"),
@@ -156,7 +157,7 @@ def test_files_and_meshes_of_a_dict_are_taken_alike(files):
 def test_parts_of_a_table_keep_the_rows_of_their_shapes(files):
     folder, table = files
     sources = find_sources(folder)
-    parts = parts_of_table(sources, {}, read_table(table, list(sources)), Options())
+    parts = parts_of_table(sources, read_table(table, list(sources)), Options())
     assert list(parts["right"].sources) == [f"subject_{i}" for i in range(1, 6)]
     assert parts["right"].sources["subject_2"] == sources["scan_right_1"]
     assert parts["right"].subjects["age"].values.tolist() == [30, 31, 32, 33, 34]
@@ -269,8 +270,10 @@ def test_what_cannot_be_inserted_into_several_structures_is_told(study, tmp_path
         s4a.insert(study, {"new": mesh})
     with pytest.raises(ValueError, match="has no structure 'middle'; it has left, right"):
         s4a.insert(study, {"new": {"middle": mesh}})
-    with pytest.raises(ValueError, match="of shapes of one structure: insert them into"):
-        s4a.insert(study, {"new": {"left": mesh}}, reflect="auto")
+    with pytest.raises(ValueError, match=r"reflect names 'left', none of the subjects \(new\)"):
+        s4a.insert(study, {"new": {"left": mesh}}, reflect="left")
+    with pytest.raises(ValueError, match="landmarks: a folder needed, with one for each structure"):
+        s4a.insert(study, {"new": {"left": mesh}}, landmarks=tmp_path / "none")
     with pytest.raises(ValueError, match="structure left: no shape can be inserted"):
         s4a.insert(study, {"new": {"left": s4a.synthetic.sphere(9)}}, n_jobs=1)
     with pytest.raises(ValueError, match="a mesh of a structure needed; b has none"):
