@@ -6,9 +6,9 @@ import xarray as xr
 from scipy.spatial.transform import Rotation
 
 from s4a import analyse, cli, complete, insert, synthetic, with_landmarks, write_mesh
-from s4a.analysis.complete import cut
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.method import posterior
+from s4a.method.part import cut
 
 OPTIONS = {"n_coarse": 600, "k_init": 12, "k": 30, "n_jobs": 1}
 TURN = Rotation.from_rotvec([0.3, -0.5, 0.4]).as_matrix()

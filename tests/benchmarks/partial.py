@@ -29,9 +29,9 @@ from scipy.spatial.transform import Rotation
 
 import s4a
 from s4a import synthetic
-from s4a.analysis.complete import cut
 from s4a.geometry.align import farthest_points, rigid_transform
 from s4a.geometry.mesh import as_arrays, vertex_areas
+from s4a.method.part import cut
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 OPTIONS = {"n_coarse": 2000, "k_init": 20, "k": 60, "n_jobs": 1}
