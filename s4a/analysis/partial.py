@@ -37,7 +37,8 @@ class Model(NamedTuple):
 
 def model_of(study: xr.DataTree) -> Model:
     """What completion needs of a study; ValueError where it has it not."""
-    missing = [n for n in ("original", "coarse", "registration", "pca") if n not in study.children]
+    needed = "original", "coarse", "latent", "registration", "pca"
+    missing = [name for name in needed if name not in study.children]
     if missing:
         raise ValueError(f"a finished study is needed; this one lacks {', '.join(missing)}")
     options = Options.from_report(study)
