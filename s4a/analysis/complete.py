@@ -1,19 +1,21 @@
 """Partial shapes (6.1, outlook): a part matched where it is, and the whole that it may be of.
 
-What the modes of a finished study say of the rest, see :mod:`s4a.method.posterior`; how the part is
-matched, see :mod:`s4a.method.part`.
+What the modes of a finished study say of the rest, see :mod:`s4a.analysis.partial` and
+:mod:`s4a.method.posterior`; how the part is matched, see :mod:`s4a.method.part`; how sure all of
+that is, see :mod:`s4a.analysis.calibration`.
 """
 
 import logging
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from scipy import stats
 
+from s4a.analysis.calibration import match_again
 from s4a.analysis.inputs import registration_of
+from s4a.analysis.partial import LEAST_SHARE, Model, match, model_of, tell, whole_of
 from s4a.geometry.align import rigid_transform
 from s4a.geometry.mesh import as_arrays, vertex_areas, vertex_normals
 from s4a.input.landmarks import with_landmarks
@@ -28,15 +30,13 @@ from s4a.method.part import (
     best_fit,
     different,
     fit_modes,
-    on_boundary,
     part_of,
-    refine,
     rough_starts,
     seen,
 )
-from s4a.method.pca import gram, low_vertices
+from s4a.method.part import cut as cut  # where it stood before
+from s4a.method.pca import gram
 from s4a.method.register import common_unit
-from s4a.method.shape import Shape
 from s4a.schema import check_count, dataset, in_unit
 from s4a.seeds import RNG, seed_of
 from s4a.study.newcomers import read_new
@@ -44,29 +44,11 @@ from s4a.study.options import Options
 
 log = logging.getLogger(__name__)
 
-LEAST_SHARE = 0.15  # of the template that a part must have
 TESTED_SHARE = 0.45  # with less the intervals have not been tested
 LEAST_INSIDE = 0.6  # share of the part that must lie on the whole
 SURELY_INSIDE = 0.95  # with less every way is looked at once more
 FOREIGN = 1.4  # times what the modes of the others leave of any shape of the study
-N_REMATCHED = 12  # shapes of the study whose part is matched again
 N_AGAIN = 48  # starts of a part that the modes do not fit
-N_ROUNDS = 2  # of finding what is there, and of matching it
-
-
-class Model(NamedTuple):
-    """A study at the low resolution of its template, lengths for unit area."""
-
-    study: xr.DataTree
-    template: Shape
-    at: np.ndarray  # (n_low,), original vertices
-    X: np.ndarray  # (n_low, 3), of the template
-    fields: np.ndarray  # (s, n_low, 3), displacements
-    modes: np.ndarray  # (c, s), each as weights of the fields
-    area: np.ndarray  # (n_low,), of sum 1
-    scale: bool
-    mean_full: np.ndarray  # (n, 3), mean displacement at full resolution
-    modes_full: np.ndarray  # (c, n, 3)
 
 
 def complete(
@@ -86,7 +68,9 @@ def complete(
     not hold, a normal distribution (posterior shape model, Albrecht et al. 2013; the formula is in
     :mod:`s4a.method.posterior`).  Its standard deviations are such that nine tenths of what shapes
     of the study have there, each cut in the same way, matched and completed by all others, lie
-    within intervals of 90 %.  What all registrations of the study get wrong alike is not in them.
+    within intervals of 90 %, and wider by what two ways of matching the study's shapes differ:
+    over the template, and directly (see :mod:`s4a.analysis.calibration`).  The intervals are for
+    shapes of the population of the study's; what surfaces mislead every match to is not in them.
 
     Parameters
     ----------
@@ -114,9 +98,10 @@ def complete(
         distance that modes and motion leave on the part, ``usual_residual``, the largest that the
         modes of the others leave on the same part of a shape of the study, and ``inside``, the
         share of the part's points that lie on the whole; ``match_noise``, the deviation of a
-        coordinate where the part is; ``factor`` of the others, and ``left_out_error``, the root
-        mean square error of a coordinate with which the study's own shapes are told by the others
-        where nothing is; ``warning``.
+        coordinate where the part is, and ``between_ways``, that between two ways of matching, which
+        is in all deviations; ``factor`` of what the modes leave where nothing is; and
+        ``left_out_error``, the root mean square error of a coordinate with which the study's own
+        shapes are told by the others there; ``warning``.
 
     Raises
     ------
@@ -172,42 +157,6 @@ def complete(
     return result
 
 
-def model_of(study: xr.DataTree) -> Model:
-    """What completion needs of a study; ValueError where it has it not."""
-    missing = [n for n in ("original", "coarse", "registration", "pca") if n not in study.children]
-    if missing:
-        raise ValueError(f"a finished study is needed; this one lacks {', '.join(missing)}")
-    options = Options.from_report(study)
-    if options.method == "scalable":
-        raise ValueError("parts need a study with a coarse mesh; method='scalable' has none")
-    registration = registration_of(study)
-    if registration.sizes["shape"] < 4:
-        raise ValueError(
-            f"parts need a study of at least 4 shapes, found {registration.sizes['shape']}"
-        )
-    name = registration.attrs["template"]
-    template = options.shape(
-        study["original"][name].to_dataset().load(), study["coarse"][name].to_dataset().load()
-    )
-    _, size = template.frame
-    at = low_vertices(template.coarse)
-    fields = registration["displacement"][:, at].values.astype(float) / size
-    modes = study["pca"].to_dataset()
-    score = modes["score"].sel(shape=registration["shape"].values).values  # (s, c)
-    return Model(
-        study,
-        template,
-        at,
-        template.full.X[at],
-        fields,
-        score.T / (len(score) - 1),
-        template.low.area,
-        options.scale,
-        modes["mean_displacement"].values / size,
-        modes["deformation"].values / size,
-    )
-
-
 def read_part(
     study: xr.DataTree,
     part: Path | str | tuple[Any, Any] | xr.Dataset,
@@ -235,14 +184,6 @@ def first_pose(study: xr.DataTree, model: Model) -> Pose:
     center, size = model.template.frame
     t = registration["translation"].values.mean(0)
     return Pose(R, (t - center) / size, s / size)
-
-
-def whole_of(model: Model) -> Whole:
-    """The mean shape and the modes of a study at low resolution."""
-    mean = model.fields.mean(0)
-    modes = np.einsum("cs,snx->cnx", model.modes, model.fields - mean)
-    T = model.template.low.T
-    return Whole(model.X + mean, T, modes, on_boundary(T, len(model.X)))
 
 
 def place(
@@ -302,29 +243,6 @@ def check_place(fit: Fit, model: Model) -> None:
         )
 
 
-def match(part: Part, model: Model, whole: Whole, fit: Fit) -> tuple[np.ndarray, np.ndarray, Fit]:
-    """The template's low resolution on the part, and which of its vertices are there.
-
-    Returns
-    -------
-    low : float ndarray (n_low, 3)
-        In the frame of the template, as the part is placed by the fit.
-    present : bool ndarray (n_low,)
-    fit : Fit
-    """
-    low = whole.X + np.tensordot(fit.b, whole.modes, 1)
-    placed = fit.pose(part.X)
-    limit = max(0.02, 3 * fit.residual)
-    for _ in range(N_ROUNDS):
-        normals = model.template.low_on_surface.normals_at(low)
-        present = seen(low, normals, part, placed, limit)
-        if model.area @ present < LEAST_SHARE:
-            return low, present, fit
-        low = refine(part, placed, model.template, low, present)
-    normals = model.template.low_on_surface.normals_at(low)
-    return low, present & seen(low, normals, part, placed, limit), fit
-
-
 def completed(
     model: Model,
     part: Part,
@@ -345,7 +263,7 @@ def completed(
 
     inflate = np.where(present, 1.0, again.factor)  # (n_low,)
     spread = told.spread * inflate[:, None]
-    white = again.noise + np.where(present, 0.0, again.factor**2 * known.rest)
+    white = again.ways + np.where(present, again.noise, again.factor**2 * known.rest)
     full = target.U @ _covariance(spread, white).reshape(-1, 9)
 
     pose, size = fit.pose, 1 / fit.pose.s
@@ -368,7 +286,8 @@ def completed(
             "usual_residual": size * again.residual,
             "inside": fit.inside,
             "factor": again.factor,
-            "match_noise": size * float(np.sqrt(again.noise)),
+            "match_noise": size * float(np.sqrt(again.noise + again.ways)),
+            "between_ways": size * float(np.sqrt(again.ways)),
             "left_out_error": size * left_out_error,
         },
         position=position,
@@ -386,36 +305,6 @@ def completed(
         translation=t,
         scale=np.array(s),
     )
-
-
-class Told(NamedTuple):
-    """What is told of a shape at low resolution, in the frame of the template.
-
-    ``weights`` of the ``columns (p, n_low, 3)``, ``spread (r, n_low, 3)``, the fields that they may
-    differ by, independent and of one standard deviation each, and ``image (n_low, 3)``, which goes
-    through the matches where there are any.
-    """
-
-    weights: posterior.Posterior
-    columns: np.ndarray
-    spread: np.ndarray
-    image: np.ndarray
-
-
-def tell(model: Model, known: posterior.Known, low: np.ndarray, density: float) -> Told:
-    """The distribution of a shape whose vertices `low` ``(n_low, 3)`` are known where present."""
-    target, present = model.template, known.present
-    mean = model.X + model.fields.mean(0)
-    weights = posterior.weights_of(known, model.modes)
-    y = (low - mean)[present]
-    inner = np.einsum("qnx,nx,n->q", known.columns[:, present], y, model.area[present])
-    found = posterior.condition(known, weights, inner, density)
-    columns = np.einsum("qp,qnx->pnx", weights, known.columns, optimize=True)
-    spread = np.einsum("pr,pnx->rnx", found.root, columns, optimize=True)
-    told = mean + np.tensordot(found.mean, columns, 1)
-    kappa2 = float(target.low.eigenvalue[-1])
-    left = posterior.extend(low - told, present, target.W, model.area, kappa2)
-    return Told(found, columns, spread, told + left)
 
 
 def _most_likely(model, told):
@@ -442,112 +331,6 @@ def _low_samples(model, spread, white, n, rng):
     for _ in range(n):
         moved = np.tensordot(rng.standard_normal(len(spread)), spread, 1)
         yield moved + np.sqrt(white)[:, None] * rough(rng)
-
-
-class Again(NamedTuple):
-    """What the same part of shapes of the study says, see :func:`match_again`."""
-
-    noise: float
-    factor: float
-    residual: float
-
-
-def match_again(model: Model, present: np.ndarray, density: float) -> Again:
-    """How well the same part of shapes of the study is found and completed by the others.
-
-    The part is cut out of up to :data:`N_REMATCHED` of them, matched by the model of the others,
-    completed, and compared with the match of the whole shape.  Nine tenths of all coordinates lie
-    within the intervals of 90 %: where the part is of the variance ``noise``, where nothing is of
-    the deviations of the distribution times ``factor``, which errors of the pose and of the match
-    widen.  And ``residual``, the largest of their fits.
-    """
-    registration = registration_of(model.study)
-    names = registration["shape"].values.tolist()
-    others = [i for i, name in enumerate(names) if name != registration.attrs["template"]]
-    chosen = others[:: max(1, -(-len(others) // N_REMATCHED))]
-    found = [_found_again(model, registration.isel(shape=i), i, present, density) for i in chosen]
-    found = [one for one in found if one is not None]
-    if not found:
-        return Again(0.0, 1.0, np.inf)
-    gaps, ratios, residuals = zip(*found, strict=True)
-    return Again(deviation_of(gaps) ** 2, deviation_of(ratios), max(residuals))
-
-
-def deviation_of(errors: Sequence[np.ndarray]) -> float:
-    """The standard deviation with whose interval of 90 % nine tenths of all errors agree.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from s4a.analysis.complete import deviation_of
-    >>> round(deviation_of([np.full(9, 1.6449), np.array([8.0])]), 2)
-    1.39
-    """
-    every = np.concatenate(errors)
-    return float(np.quantile(every, 0.9)) / posterior.WITHIN_90 if len(every) else 0.0
-
-
-def _found_again(model, registered, i, present, density):
-    """Of shape i completed from its part by the others.
-
-    Differences ``(d,)`` from the match of the whole where the part is, those beside their
-    deviations ``(e,)`` where nothing is, and the residual; None where hardly anything is left.
-    """
-    study, name = model.study, registered["shape"].item()
-    mesh = study["original"][name].to_dataset().load()
-    X, T = as_arrays(mesh)
-    there = model.template.U @ present.astype(float) > 0.5
-    back = study["registration"][name]["template_triangle"].values
-    kept = there[model.template.full.T[back]].sum(1) >= 2  # (n_original,)
-    center, size = model.template.frame
-    s = registered["scale"].item() / size
-    pose = Pose(registered["rotation"].values, registered["translation"].values / size, s)
-    pose = pose._replace(t=pose.t - center / size)
-    part = part_of(*cut(X, T, kept))
-    if len(part.X) < 100:
-        return None
-    used = np.delete(np.arange(len(model.fields)), i)
-    fields = model.fields[used]
-    rest = model._replace(
-        fields=fields,
-        modes=posterior.modes_of(gram(fields, model.area), np.arange(len(used))),
-    )
-    whole = whole_of(rest)
-    fit = fit_modes(part, whole, pose, free_size=model.scale)
-    low, again, fit = match(part, rest, whole, fit)
-
-    def error(image):
-        in_file = (image - fit.pose.t) @ fit.pose.R / fit.pose.s
-        return np.abs(pose(in_file) - model.X - model.fields[i])
-
-    gap = error(low)[again & present].ravel()
-    missing = ~again & ~present
-    if not missing.any() or model.area @ again < LEAST_SHARE:
-        return gap, np.zeros(0), fit.residual
-    known = posterior.know(
-        fields, model.template.low.Phi, model.X, model.area, again, scale=model.scale
-    )
-    told = tell(rest, known, low, density)
-    deviation = np.sqrt((told.spread[:, missing] ** 2).sum(0) + known.rest)
-    return gap, (error(told.image)[missing] / deviation).ravel(), fit.residual
-
-
-def cut(X: np.ndarray, T: np.ndarray, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The part of a surface whose vertices are kept.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from s4a.analysis.complete import cut
-    >>> T = np.array([[0, 1, 2], [1, 3, 2]])
-    >>> cut(np.eye(4, 3), T, np.array([False, True, True, True]))[1].tolist()
-    [[0, 2, 1]]
-    """
-    T = T[kept[T].all(1)]
-    used = np.unique(T)
-    number = np.full(len(X), -1)
-    number[used] = np.arange(len(used))
-    return X[used], number[T]
 
 
 def warnings_of(result: xr.Dataset) -> list[str]:

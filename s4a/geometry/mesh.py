@@ -120,7 +120,7 @@ def unique_edges(T: np.ndarray, n: int | None = None) -> tuple[np.ndarray, np.nd
     count : int ndarray (e,)
         Triangles at the edge: 2 inside of a manifold, 1 on its boundary.
     """
-    start, end = directed_edges(T).T
+    start, end = directed_edges(np.asarray(T)).T
     if n is None:
         n = int(max(start.max(initial=-1), end.max(initial=-1))) + 1
     low, high = np.minimum(start, end), np.maximum(start, end)

@@ -118,6 +118,24 @@ def part_of(X: np.ndarray, T: np.ndarray) -> Part:
     return Part(X, T, vertex_normals(X, T), vertex_areas(X, T), on_boundary(T, len(X)))
 
 
+def cut(X: np.ndarray, T: np.ndarray, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The part of a surface whose vertices are kept.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.method.part import cut
+    >>> T = np.array([[0, 1, 2], [1, 3, 2]])
+    >>> cut(np.eye(4, 3), T, np.array([False, True, True, True]))[1].tolist()
+    [[0, 2, 1]]
+    """
+    T = T[kept[T].all(1)]
+    used = np.unique(T)
+    number = np.full(len(X), -1)
+    number[used] = np.arange(len(used))
+    return X[used], number[T]
+
+
 def rough_starts(
     part: Part, whole: Whole, first: Pose, *, turns: str = "O"
 ) -> list[tuple[float, Pose]]:
