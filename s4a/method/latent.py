@@ -6,21 +6,19 @@ as far as it can be had.  Y_i is k x m; the functions themselves are Phi_i Y_i, 
 """
 
 import logging
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from joblib import Parallel, delayed
 from scipy.sparse.csgraph import breadth_first_order
 from scipy.sparse.linalg import LinearOperator, eigsh
-from scipy.spatial import cKDTree
 
 from s4a.method.fmap import fmap_from_match
 from s4a.method.nearest import (
     as_candidates,
     as_queries,
     nearest_float32,
-    nearest_in_cells,
     nearest_rows,
 )
 from s4a.method.network import cycle_errors, cycle_weights, three_cycles
@@ -31,7 +29,6 @@ log = logging.getLogger(__name__)
 FINAL = 3  # shapes of a study in the last rounds of a new one, on all vertices
 TARGETS = 256  # shapes whose least squares are held at once, 0.3 GB of them
 WIDE = 4  # last rounds of Consistent ZoomOut, which look among all vertices
-N_CELLS = 500  # spread vertices of a shape, around each of which one of its cells lies then
 ROUGH, FINE = 1e-4, 1e-6  # tolerances of the latent basis: on the way, and at the end
 
 Form = Callable[[np.ndarray], np.ndarray]  # the product of a quadratic form with vectors
@@ -322,11 +319,6 @@ def consistent_zoomout(
     eigenvalues = np.stack([one.eigenvalue for one in sampled])
     sizes = [*range(C.shape[1], k, step), k]
     wide_sizes = sizes[:-1][max(len(sizes) - 1 - wide, 0) :] if samples is not None else []
-
-    def all_vertices(i):
-        basis, spread = bases[i], samples[i][:N_CELLS]
-        return AllVertices(basis.Phi, spread, cKDTree(basis.X[spread]).query(basis.X)[1])
-
     for size, next_size in zip(
         sizes, [*sizes[1:], None], strict=True
     ):  # the last only solves for Y
@@ -343,7 +335,7 @@ def consistent_zoomout(
             keep(C, Y, latent_eigenvalue)
         if next_size:
             del C  # those of two sizes need not be in memory
-            of_all = all_vertices if size in wide_sizes else None
+            of_all = bases if size in wide_sizes else None
             C = larger_maps(sampled, Y, source, target, next_size, of_all, n_jobs)
     return C, weight, error, Y, latent_eigenvalue
 
@@ -359,21 +351,13 @@ class Sampled(NamedTuple):
     area: np.ndarray
 
 
-class AllVertices(NamedTuple):
-    """All vertices of a shape, in cells around spread ones."""
-
-    Phi: np.ndarray  # (n, >= k)
-    spread: np.ndarray  # (c,), vertices
-    cell: np.ndarray  # (n,), the nearest of the spread ones
-
-
 def larger_maps(
     sampled: list[Sampled],
     Y: np.ndarray,
     source: np.ndarray,
     target: np.ndarray,
     k: int,
-    of_all: Callable[[int], AllVertices] | None = None,
+    bases: Sequence[Basis] | None,
     n_jobs: int | None = 1,
 ) -> np.ndarray:
     """Maps ``(p, k, k)`` from the matches of latent functions (eq. 3), one step of ZoomOut each.
@@ -384,8 +368,8 @@ def larger_maps(
         Vertices of every shape for which matches are looked for.
     Y : float ndarray (n, size, m)
         Latent bases, of a smaller size.
-    of_all : callable, optional
-        Gives all vertices of shape i, among which matches are looked for, one or a few shapes at a
+    bases : sequence of Basis, optional
+        All vertices of every shape, among which matches are looked for, one or a few shapes at a
         time; among the samples by default.
     """
     size = Y.shape[1]
@@ -400,13 +384,11 @@ def larger_maps(
 
     def maps_from(i, rows, of_target):
         """The maps from shape i into those of some."""
-        vertices = None if of_all is None else of_all(i)
-        Phi = sampled[i].Phi if vertices is None else vertices.Phi
-        F = np.ascontiguousarray(Phi[:, :size]) @ Y[i]
-        queries = [of_target[target[r]][1] for r in rows]
-        matches = nearest_latent(queries, F, vertices)
-        for r, match in zip(rows, matches, strict=True):
-            C[r] = of_target[target[r]][0] @ Phi.take(match, axis=0)[:, :k]
+        Phi = sampled[i].Phi if bases is None else bases[i].Phi
+        candidates = as_candidates(np.ascontiguousarray(Phi[:, :size]) @ Y[i])
+        for r in rows:
+            solve, query = of_target[target[r]]
+            C[r] = solve @ Phi.take(nearest_float32(query, candidates), axis=0)[:, :k]
 
     threads = Parallel(n_jobs=n_jobs, backend="threading")
     for begin in range(0, len(sampled), TARGETS):
@@ -416,32 +398,6 @@ def larger_maps(
         sources = np.unique(source[rows])
         threads(delayed(maps_from)(i, rows[source[rows] == i], of_target) for i in sources)
     return C
-
-
-def nearest_latent(
-    queries: list[np.ndarray], F: np.ndarray, vertices: AllVertices | None = None
-) -> Iterable[np.ndarray]:
-    """For latent functions of several shapes the nearest rows of one shape's (eq. 3).
-
-    Among all vertices the queries of all shapes are searched at once: in the latent space they lie
-    beside each other, so that a few cells hold what is nearest to many of them.
-
-    Parameters
-    ----------
-    queries : list of float32 ndarray (s, m + 1)
-        Of :func:`s4a.method.nearest.as_queries`.
-    F : float ndarray (n, m)
-        Latent functions of the shape that is searched.
-    vertices : AllVertices, optional
-        Of that shape; without them all are compared.
-    """
-    if vertices is None:
-        candidates = as_candidates(F)
-        return (nearest_float32(query, candidates) for query in queries)
-    every = np.concatenate(queries)
-    near = nearest_float32(every, as_candidates(F[vertices.spread]))
-    match, _, _ = nearest_in_cells(every[:, :-1], near, F, vertices.cell)
-    return np.split(match, np.cumsum([len(query) for query in queries])[:-1])
 
 
 def frozen_basis(C_out: np.ndarray, C_in: np.ndarray, Y: np.ndarray) -> np.ndarray:

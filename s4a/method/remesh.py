@@ -16,6 +16,7 @@ of that point::
 import contextlib
 import os
 from collections.abc import Iterator
+from importlib.util import find_spec
 
 import numpy as np
 import robust_laplacian
@@ -196,18 +197,20 @@ def nearest_along_edges(X: np.ndarray, T: np.ndarray, among: np.ndarray) -> np.n
     return dijkstra(G, indices=among, min_only=True, return_predecessors=True)[2]
 
 
+def check_wrap() -> None:
+    """Raise ValueError where PyMeshLab, which wraps a surface around another, is not installed."""
+    if find_spec("pymeshlab") is None:
+        raise ValueError("wrap=True needs PyMeshLab: install it with `pip install 's4a[wrap]'`")
+
+
 def alpha_wrap(
     X: np.ndarray, T: np.ndarray, alpha: float = 1.0, offset: float = 0.2
 ) -> tuple[np.ndarray, np.ndarray]:
     """A closed surface wrapped around the mesh; `alpha` and `offset` in percent of its diagonal."""
-    try:
-        with silence():
-            import pymeshlab
-    except ImportError as error:
-        raise ValueError(
-            "wrap=True needs PyMeshLab: install it with `pip install 's4a[wrap]'`"
-        ) from error
+    check_wrap()
     with silence():
+        import pymeshlab
+
         meshes = pymeshlab.MeshSet(verbose=False)
         if not hasattr(meshes, "generate_alpha_wrap"):
             raise ValueError(

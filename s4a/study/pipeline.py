@@ -20,6 +20,7 @@ from s4a.input.plausibility import Doubts
 from s4a.input.subjects import read_table
 from s4a.method.network import choose_pairs, spectral_distance
 from s4a.method.pca import pca_without
+from s4a.method.remesh import check_wrap
 from s4a.seeds import seeded
 from s4a.study.doubts import (
     check_plausibility,
@@ -248,6 +249,8 @@ def analyse(
             loaded = {n.path: n.to_dataset(inherit=False).load() for n in study.subtree}
             return xr.DataTree.from_dict(loaded)
     settings = Options(**options)
+    if settings.wrap:
+        check_wrap()
     if structures is not None:
         parts = parts_of_labels(shapes, structures, settings)
         remarks = remarks_on_files(shapes, settings.pattern, volumes=True)

@@ -150,5 +150,9 @@ def test_without_pymeshlab_all_defaults_run_and_wrapping_names_it(monkeypatch):
     small = {"n_coarse": 100, "k": 10, "k_init": 6, "n_pairs": 3}
     study = s4a.analyse(shapes, **small)
     assert study["report"]["self_intersections"].values.tolist() == [0, 0, 0]
-    with pytest.raises(ValueError, match=r"pip install 's4a\[wrap\]'"):
-        s4a.coarsen(shapes["brain_01"], n_coarse=100, wrap=True)
+    for wrap in (
+        lambda: s4a.coarsen(shapes["brain_01"], wrap=True),
+        lambda: s4a.analyse({}, wrap=True),
+    ):
+        with pytest.raises(ValueError, match=r"pip install 's4a\[wrap\]'"):
+            wrap()
