@@ -1,20 +1,21 @@
 """Parts of shapes completed by a study: errors and intervals, beside rustcpd's posterior.
 
-``partial.py [brains faces skulls] [--few] [--studies FOLDER]``: new shapes, of which a plane with a
-random direction cuts off 0, 10, 30 or 50 % of the vertices, turned at random by 45 degrees, into
-studies that lack them: 12 synthetic brains of 6,000 vertices and 8 others, 16 faces drawn from a
-published model (its mean face and 24 modes, with normal scores) and 8 others, and five mouse
-skulls, each into a study of the four others.  For each cut the mean over the shapes of: CPU
-seconds; distance to the truth where the part is, in % of sqrt(area), of the whole shape inserted,
-of the part, of rustcpd; the same where it is not, with that of the mean shape laid on the truth of
-what is there alone; the share of coordinates that lie within intervals of 50, 80 and 90 % where
-nothing is, around the truth, and around the match of the whole; where the part is, of 90 %; and
-where nothing is, rustcpd's of 90 %.  Skulls have no truth but the match of the whole.  Parts that
-are refused are counted, and in no mean.
+``partial.py [brains faces skulls] [--few] [--alone] [--seed N] [--studies FOLDER]``: new shapes, of
+which a plane with a random direction cuts off 0, 10, 30 or 50 % of the vertices, turned at random
+by 45 degrees, into studies that lack them: 12 synthetic brains of 6,000 vertices and 8 others, 16
+faces drawn from a published model (its mean face and 24 modes, with normal scores) and 8 others,
+and five mouse skulls, each into a study of the four others.  For each cut the mean over the shapes
+of: CPU seconds; distance to the truth where the part is, in % of sqrt(area), of the whole shape
+inserted, of the part, of rustcpd; the same where it is not, with that of the mean shape laid on the
+truth of what is there alone; the share of coordinates that lie within intervals of 50, 80 and 90 %
+where nothing is, around the truth, and around the match of the whole; where the part is, of 90 %;
+and where nothing is, rustcpd's of 90 %.  Skulls have no truth but the match of the whole.  Parts
+that are refused are counted, and in no mean.
 
 rustcpd gets the mean and the modes of the same study and the same part: ``pose_initialize`` (with
 translation anchors and adaptive mixing, as it says for partial targets), ``register_atlas``,
-``posterior``.  ``--few`` takes two shapes of each set, ``--studies`` keeps the studies in a folder.
+``posterior``; ``--alone`` goes without it.  ``--few`` takes two shapes of each set, ``--seed N``
+other brains and faces than those of 3, ``--studies`` keeps the studies in a folder.
 """
 
 import logging
@@ -62,9 +63,9 @@ HEAD = (
 )
 
 
-def brains(_folder, store, few):
+def brains(_folder, store, few, seed):
     """Study, new mesh and true position of the template's vertices, shape by shape."""
-    tree = synthetic.brains(20, 6000, seed=3)
+    tree = synthetic.brains(20, 6000, seed=seed)
     names = sorted(tree["original"].children)
     meshes = {name: tree["original"][name].to_dataset() for name in names}
     study = s4a.analyse({n: meshes[n] for n in names[:12]}, store=store, **OPTIONS)
@@ -73,7 +74,7 @@ def brains(_folder, store, few):
         yield study, meshes[name], synthetic.position(tree["truth"], name, u)
 
 
-def faces(folder, store, few):
+def faces(folder, store, few, seed):
     """The files of the model are its modes, the largest first: no two are of one population."""
     mean, *modes = (
         s4a.read_shape(file)["position"].values
@@ -82,7 +83,7 @@ def faces(folder, store, few):
             *sorted((folder / "faces").glob("identity*.ply")),
         )
     )
-    scores = np.random.default_rng(3).normal(size=(24, len(modes)))
+    scores = np.random.default_rng(seed).normal(size=(24, len(modes)))
     drawn = mean + np.einsum("sm,mnx->snx", scores, np.array(modes) - mean)
     T = as_arrays(s4a.read_shape(folder / "faces" / "generic_neutral_mesh.ply"))[1]
     study = s4a.analyse({f"face_{i:02d}": (drawn[i], T) for i in range(16)}, store=store, **OPTIONS)
@@ -90,7 +91,7 @@ def faces(folder, store, few):
         yield study, as_dataset(X, T), X  # vertex i is vertex i
 
 
-def skulls(folder, store, few):
+def skulls(folder, store, few, _seed):
     files = sorted((folder / "skulls").glob("*.ply"))
     for i, file in enumerate(files[:few]):
         others = [str(other) for other in files if other != file]
@@ -141,8 +142,8 @@ def whole_inserted(study, mesh):
     return image_of(new["registration"].to_dataset().isel(shape=0))
 
 
-def row_of(study, mesh, true, of_whole, share, rng):
-    """What is measured of one cut of one shape."""
+def row_of(study, mesh, true, of_whole, share, rng, *, alone=False):
+    """What is measured of one cut of one shape, with nan of rustcpd where S4A is `alone`."""
     template = study["registration"].to_dataset()
     area = vertex_areas(*as_arrays(template))
     unit = 100 / np.sqrt(area.sum())
@@ -164,7 +165,10 @@ def row_of(study, mesh, true, of_whole, share, rng):
     spent = time.process_time() - spent
     sd = found["completion_sd"].values
     image = found["position"].values
-    others, others_sd = drift(study, part @ Q.T)
+    if alone:
+        others, others_sd = np.full_like(image, np.nan), np.full(len(image), np.nan)
+    else:
+        others, others_sd = drift(study, part @ Q.T)
 
     def distance(points, rows):
         gap = np.linalg.norm(points - true, axis=1)
@@ -187,7 +191,7 @@ def row_of(study, mesh, true, of_whole, share, rng):
         *in_match,
         shares_within(image - true @ Q.T, sd, there)[-1],
         shares_within(image - of_whole @ Q.T, sd, there)[-1],
-        shares_within(others - true @ Q.T, others_sd[:, None], ~there)[-1],
+        np.nan if alone else shares_within(others - true @ Q.T, others_sd[:, None], ~there)[-1],
     ]
 
 
@@ -200,14 +204,17 @@ def main(words):
                 [sys.executable, DATA / "unpack.py", folder], check=True, stdout=subprocess.DEVNULL
             )
         keep = Path(words[words.index("--studies") + 1] if "--studies" in words else folder)
+        seed = int(words[words.index("--seed") + 1]) if "--seed" in words else 3
         for name in sets:
             few = 2 if "--few" in words else 8
             rows = {share: [] for share in SHARES}
-            for i, new in enumerate(globals()[name](Path(folder), keep / f"study_{name}", few)):
+            store = keep / f"study_{name}_{seed}"
+            for i, new in enumerate(globals()[name](Path(folder), store, few, seed)):
                 of_whole = whole_inserted(*new[:2])
                 for share in SHARES:
                     rng = np.random.default_rng([i, round(10 * share)])
-                    rows[share].append(row_of(*new, of_whole, share, rng))
+                    row = row_of(*new, of_whole, share, rng, alone="--alone" in words)
+                    rows[share].append(row)
             shapes = len(rows[0.0])
             sys.stdout.write(f"\n{name}, {shapes} new shapes\n\n| {' | '.join(HEAD)} |\n")
             sys.stdout.write(f"|{' --- |' * len(HEAD)}\n")
