@@ -13,7 +13,9 @@ It exits with 1 where anything was wrong, or where ``s4a verify`` has not seen a
 """
 
 import argparse
+import contextlib
 import hashlib
+import io
 import os
 import random
 import resource
@@ -182,8 +184,9 @@ def main(arguments=None):
         folder = Path(folder).resolve()
         study, out = make(folder), folder / "out"
         out.mkdir()
-        for command in COMMANDS.values():  # what they import, each process below has then
-            command(study, out)
+        with contextlib.redirect_stdout(io.StringIO()):
+            for command in COMMANDS.values():  # what they import, each process below has then
+                command(study, out)
         whole = {name: outcome(command, study, out) for name, command in COMMANDS.items()}
         again = {name: outcome(command, study, out) for name, command in COMMANDS.items()}
         assert whole == again
