@@ -9,7 +9,7 @@ import numpy as np
 
 from s4a.geometry.mesh import equal_rows
 
-# Pairs that meet are held at once, 40 bytes each: of a surface crumpled into a ball they are all
+# Pairs that cross are held at once, 40 bytes each: of a surface crumpled into a ball they are all
 MOST_PAIRS = 10_000_000
 N_PROBED, N_BESIDE = 200, 5000  # triangles whose boxes are compared to foresee how many there are
 
@@ -25,7 +25,9 @@ def count_crossing(X: np.ndarray, T: np.ndarray, *, most_pairs: int = MOST_PAIRS
     X : float ndarray (n, 3)
     T : int ndarray (m, 3)
     most_pairs : int
-        Where more pairs of triangles may meet, the share of a sample of them is taken for all.
+        Where more pairs of boxes overlap, the triangles of a sample speak for all, without those
+        that cross nothing but triangles with which they have a corner in common: it is no more than
+        a lower bound then, of what is far above any number that matters.
 
     Examples
     --------
@@ -38,6 +40,8 @@ def count_crossing(X: np.ndarray, T: np.ndarray, *, most_pairs: int = MOST_PAIRS
     >>> count_crossing(np.concatenate([X, beside]), np.arange(9).reshape(3, 3))
     2
     """
+    if len(T) == 0:
+        return 0
     X = np.asarray(X, np.float64)
     first, place = equal_rows(X)
     X = np.ascontiguousarray(X[first])
@@ -62,6 +66,7 @@ def expected_pairs(X: np.ndarray, T: np.ndarray) -> float:
     for x in range(3):
         overlap &= low[:, x, None] <= high_other[:, x]
         overlap &= high[:, x, None] >= low_other[:, x]
+    overlap &= some[:, None] != others
     return float(overlap.mean()) * len(T) ** 2 / 2
 
 

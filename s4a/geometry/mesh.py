@@ -120,7 +120,7 @@ def unique_edges(T: np.ndarray, n: int | None = None) -> tuple[np.ndarray, np.nd
     count : int ndarray (e,)
         Triangles at the edge: 2 inside of a manifold, 1 on its boundary.
     """
-    start, end = directed_edges(np.asarray(T)).T
+    start, end = directed_edges(np.asarray(T, np.int64)).T
     if n is None:
         n = int(max(start.max(initial=-1), end.max(initial=-1))) + 1
     low, high = np.minimum(start, end), np.maximum(start, end)
@@ -132,7 +132,7 @@ def unique_edges(T: np.ndarray, n: int | None = None) -> tuple[np.ndarray, np.nd
     edge_of = np.empty(len(order), np.int64)
     edge_of[order] = np.cumsum(new) - 1
     head = np.flatnonzero(new)
-    E = np.stack([low.take(head), high.take(head)], axis=1).astype(np.int64)
+    E = np.stack([low.take(head), high.take(head)], axis=1)
     return E, edge_of, np.diff(head, append=len(order))
 
 
@@ -149,6 +149,8 @@ def counting_order(key: np.ndarray, n: int) -> np.ndarray:
     [1, 3, 2, 0]
     """
     m = len(key)
+    if m and not 0 <= key.min() <= key.max() < n:  # what follows would write beside its memory
+        raise IndexError(f"numbers from 0 to {n - 1} needed, found {key.min()} to {key.max()}")
     one_a_row = sp.csr_matrix((np.ones(m, np.int8), key, np.arange(m + 1)), (m, n))
     return one_a_row.tocsc().indices.astype(np.int64)
 
@@ -222,6 +224,8 @@ def path_lengths(G: sp.csr_matrix, start: np.ndarray, end: np.ndarray, limit: fl
     >>> path_lengths(G, np.array([0, 1, 1]), np.array([0, 3, 3]), 9.0).tolist()
     [0.0, 3.0, 3.0]
     """
+    if len(start) == 0:
+        return np.zeros(0)
     edge = np.asarray(G[start, end]).ravel()
     length = np.where(start == end, 0.0, np.where(edge > 0, edge, np.inf))
     for reach in (0.1 * limit, limit):

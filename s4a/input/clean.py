@@ -314,7 +314,7 @@ def _weld(P, F, counts):
 def _near_pairs(X, tolerance):
     """Pairs of points within the tolerance ``(p, 2)``."""
     # candidates have another so near along a line: few even of a lattice of voxels
-    along = (X - X[0]) @ (np.sqrt([1.0, 2.0, 3.0]) / np.sqrt(6))
+    along = (X - np.median(X, axis=0)) @ (np.sqrt([1.0, 2.0, 3.0]) / np.sqrt(6))
     order = np.argsort(along)
     close = np.diff(along[order]) <= 1.001 * tolerance  # with what rounding may add
     near = order[np.append(close, False) | np.append(False, close)]

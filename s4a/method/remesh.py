@@ -53,6 +53,7 @@ from s4a.geometry.voronoi import (
 from s4a.schema import dataset, require
 from s4a.seeds import RNG, seed_of
 
+GL = "install the system's libgl1 and libopengl0, or see `s4a doctor`"
 FIRST = 0.95  # share of n_coarse that is sampled first; mending faults needs the rest
 MOST = 1.1  # share of n_coarse from which on handles are cut, rather than more samples added
 CUTS = 3  # how often that is tried before samples are added without limit
@@ -198,9 +199,20 @@ def nearest_along_edges(X: np.ndarray, T: np.ndarray, among: np.ndarray) -> np.n
 
 
 def check_wrap() -> None:
-    """Raise ValueError where PyMeshLab, which wraps a surface around another, is not installed."""
+    """Raise ValueError where PyMeshLab, which wraps a surface around another, cannot be used."""
     if find_spec("pymeshlab") is None:
         raise ValueError("wrap=True needs PyMeshLab: install it with `pip install 's4a[wrap]'`")
+    try:
+        with silence():
+            import pymeshlab
+
+            whole = hasattr(pymeshlab.MeshSet(verbose=False), "generate_alpha_wrap")
+    except ImportError as error:
+        raise ValueError(
+            f"wrap=True needs PyMeshLab, which does not import: {error}; {GL}"
+        ) from error
+    if not whole:
+        raise ValueError(f"wrap=True needs a filter that PyMeshLab lacks: {GL}")
 
 
 def alpha_wrap(
@@ -212,11 +224,6 @@ def alpha_wrap(
         import pymeshlab
 
         meshes = pymeshlab.MeshSet(verbose=False)
-        if not hasattr(meshes, "generate_alpha_wrap"):
-            raise ValueError(
-                "pymeshlab came without its alpha wrap filter: "
-                "install the system packages libgl1 and libopengl0"
-            )
         meshes.add_mesh(pymeshlab.Mesh(X, T))
         percent = pymeshlab.PercentageValue
         meshes.generate_alpha_wrap(alpha=percent(alpha), offset=percent(offset))
@@ -303,7 +310,7 @@ def coarsen(
         mesh that has no more is kept.
     wrap : bool
         Coarsen a closed surface wrapped around the mesh, for scans whose inside is of no interest
-        (needs pymeshlab).
+        (needs the extra ``s4a[wrap]``).
     seed, rng : see :mod:`s4a.seeds`
         The sampling starts at an outermost vertex; another seed starts elsewhere.
 

@@ -47,11 +47,11 @@ def check_plausibility(
 
 def looks_of(run: Run, original: Keys, options: Options) -> dict[str, xr.Dataset]:
     """What :func:`s4a.input.evidence.compare` sees in each shape that could be compared."""
+    # how they are counted is part of the key: by PyMeshLab, as once, they were others
     settings = (options.intersections,)
+    counted = ("exactly",) if options.intersections else settings
     todo = [
-        Task(
-            n, f"network/sketch_{n}.nc", portray_shape, (run.folder, n, *settings), (key, settings)
-        )
+        Task(n, f"network/sketch_{n}.nc", portray_shape, (run.folder, n, *settings), (key, counted))
         for n, key in original.items()
     ]
     sketches = run.do("sketch", todo)

@@ -129,7 +129,8 @@ def insert(
     """
     if STRUCTURES in study.children:
         given = given_structures(study, shapes, table, landmarks)
-        return insert_several(study, given, reflect, compare, n_jobs)
+        marked = landmarks is not None
+        return insert_several(study, given, reflect, compare, n_jobs, marked=marked)
     if table is not None:
         raise ValueError("table= says of which structure a shape is; this study has one alone")
     return insert_shapes(study, shapes, landmarks, reflect, compare, n_jobs)
@@ -155,7 +156,10 @@ def given_structures(
         given = {}
         for name, of in of_each.items():
             folder = folders.get(name)
-            files = {} if folder is None else files_named(folder, of, "landmarks", SUFFIXES)
+            try:
+                files = {} if folder is None else files_named(folder, of, "landmarks", SUFFIXES)
+            except ValueError:  # none of these shapes has any: told with those without a folder
+                files = {}
             given[name] = Given(of, {one: files[one] for one in of if one in files})
     unknown = [repr(name) for name in given if name not in names]
     if unknown:
@@ -223,17 +227,20 @@ def insert_several(
     reflect: str | list[str] | None,
     compare: bool,
     n_jobs: int | None,
+    *,
+    marked: bool = False,
 ) -> xr.DataTree:
     """The new shapes of each structure, in the study of that structure.
 
-    A structure of which none can be used is told, and costs the others nothing.
+    A structure of which none can be used is told, and costs the others nothing; so are, where some
+    are to be `marked`, those without any file of landmarks.
     """
     names = structure_names(study)
     have = {name: given[name].shapes if name in given else {} for name in names}
     lines = lacking(have)
     unmarked = [name for name, of in given.items() if not of.landmarks]
     remarks = [f"{line}: it is inserted without" for line in lines]
-    if 0 < len(unmarked) < len(given):
+    if marked and unmarked:
         remarks.append(f"no file of landmarks for any {listed(unmarked)}: inserted without")
     mirrored = None if reflect is None else named_new(reflect, given)
     status: dict[str, dict[str, str]] = {}

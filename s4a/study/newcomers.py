@@ -79,7 +79,7 @@ def insert_shapes(
     """New shapes of one structure, see :func:`s4a.insert`."""
     shapes = {"new": shapes} if isinstance(shapes, xr.Dataset) else shapes
     new = read_beside(study, shapes, landmarks, seen=compare or reflect == AUTO)
-    mirrored, told = choose_reflected(reflect, new)
+    mirrored, told = reflected_of_new(reflect, new)
     mirrored = None if reflect is None else mirrored
     return insert_meshes(study, new, mirrored, told, compare, n_jobs)
 
@@ -184,7 +184,7 @@ def insert_meshes(
     return xr.DataTree.from_dict(nodes)
 
 
-def choose_reflected(reflect: str | list[str] | None, new: New) -> tuple[list[str], list[str]]:
+def reflected_of_new(reflect: str | list[str] | None, new: New) -> tuple[list[str], list[str]]:
     """The new shapes whose mirror images are taken, and what is told of the choice."""
     if reflect is None:
         return [], []
@@ -237,7 +237,7 @@ def read_new(
     landmarks : path or dict of str to path, optional
         A folder, or the files of shapes by name.
     """
-    meshes, attrs = read_and_clean(shapes, options)
+    meshes, attrs = clean_new(shapes, options)
     files: Mapping[str, Path] = {}
     if isinstance(landmarks, Mapping):
         files = landmarks
@@ -259,7 +259,7 @@ def read_new(
     return meshes, attrs
 
 
-def read_and_clean(
+def clean_new(
     shapes: Path | str | list[Any] | dict[str, Any],
     options: Options,
 ) -> tuple[dict[str, xr.Dataset], dict[str, dict[str, Any]]]:

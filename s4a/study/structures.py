@@ -279,7 +279,8 @@ def to_mirror(
     """
     everyone = sorted({subject for of in subjects_of.values() for subject in of})
     column = reflect.partition("=")[0]
-    columns = {str(c) for table in tables.values() if table is not None for c in table.data_vars}
+    there = [table for table in tables.values() if table is not None]
+    columns = sorted({str(column) for table in there for column in table.data_vars})
     values: dict[str, Any] = {}
     for subject in everyone if column in columns else ():
         cells = {
@@ -295,8 +296,11 @@ def to_mirror(
                 f"{subject} has {listed(said)}. Structures of both sides as one kind are a study "
                 "of one structure: leave out the column 'structure'"
             )
+        if not cells:
+            raise ValueError(f"reflect={reflect!r}: {subject} is in no table with that column")
         values[subject] = next(iter(cells.values()))
-    others = {name: [""] * len(everyone) for name in columns - {column}}  # for messages alone
+    # for messages alone
+    others = {name: [""] * len(everyone) for name in columns if name != column}
     own = {column: [values[subject] for subject in everyone]} if values else {}
     table = table_of(own | others, everyone) if columns else None
     return to_reflect(reflect, everyone, table, what="subjects", beside=beside)

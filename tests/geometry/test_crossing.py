@@ -69,3 +69,13 @@ def test_what_a_sample_tells_is_what_counting_does():
     counted, expected = count_crossing(X, T), expected_pairs(X, T)
     told = count_crossing(X, T, most_pairs=int(0.99 * expected))  # of half of them
     assert told == pytest.approx(counted, rel=0.25)
+
+
+def test_large_surfaces_without_crossings_are_counted_and_not_sampled():
+    X, T = sphere()
+    apart = (X.take(T, axis=0) + 10 * np.arange(len(T))[:, None, None]).reshape(-1, 3)
+    assert expected_pairs(apart, np.arange(len(apart)).reshape(-1, 3)) == 0
+
+
+def test_a_surface_without_triangles_has_none():
+    assert count_crossing(np.zeros((0, 3)), np.zeros((0, 3), int)) == 0

@@ -1,3 +1,5 @@
+import sys
+
 import igl
 import numpy as np
 import pytest
@@ -317,6 +319,14 @@ def test_degenerate_coarse_triangles_go_through_the_robust_laplacian():
 def test_what_is_not_clean_is_refused(X, T, options, message):
     with pytest.raises(ValueError, match=message):
         coarsen(as_dataset(X, T), **options)
+
+
+def test_a_pymeshlab_that_does_not_import_says_what_to_install(tmp_path, monkeypatch):
+    (tmp_path / "pymeshlab.py").write_text("raise ImportError('libGL.so.1: no such file')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "pymeshlab", raising=False)
+    with pytest.raises(ValueError, match=r"libGL.so.1.*libgl1 and libopengl0"):
+        coarsen(as_dataset(*bumpy()), n_coarse=1000, wrap=True)
 
 
 def test_wrapping_gives_a_closed_surface_and_weights_for_the_original(capfd):

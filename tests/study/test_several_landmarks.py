@@ -199,3 +199,15 @@ def test_landmarks_guide_new_subjects_and_are_mirrored_with_them(two, folder, tm
         assert "guide_position" not in tree["structures/right/original/new"]
     with pytest.raises(ValueError, match="landmarks: "):
         s4a.insert(study, new, landmarks=flat)
+
+
+def test_a_folder_with_landmarks_of_no_new_subject_is_told_for_each_structure(two, folder):
+    study = analyse(two, **SMALL)
+    new = subjects(6, 200, seed=1)["subject_2"]
+    write_landmarks(folder / "left" / "new.csv", marks(new["left"]))
+    both = s4a.insert(study, {"new": new}, landmarks=folder, n_jobs=1)
+    said = both["report"].attrs["remarks"]
+    assert said == "no file of landmarks for any right: inserted without"
+    assert "guide_position" in both["structures/left/original/new"]
+    one = s4a.insert(study, {"new": {"right": new["right"]}}, landmarks=folder, n_jobs=1)
+    assert "no file of landmarks for any right" in one["report"].attrs["remarks"]

@@ -1,0 +1,72 @@
+"""Edges, orders and paths of a mesh: against other ways to find them, and where nothing is."""
+
+import numpy as np
+import pytest
+from scipy.sparse.csgraph import dijkstra
+
+import s4a
+from s4a.geometry.mesh import (
+    as_arrays,
+    counting_order,
+    directed_edges,
+    edge_graph,
+    edges,
+    equal_rows,
+    path_lengths,
+    unique_edges,
+)
+
+
+@pytest.fixture(scope="module")
+def sphere():
+    return as_arrays(s4a.synthetic.sphere(300))
+
+
+@pytest.mark.parametrize("kind", [np.int32, np.int64, np.uint32, np.uint8])
+def test_unique_edges_are_those_of_numpy(kind, sphere):
+    T = sphere[1][sphere[1].max(1) < 200].astype(kind)
+    both = np.sort(directed_edges(T.astype(int)), axis=1)
+    expected, of, count = np.unique(both, axis=0, return_inverse=True, return_counts=True)
+    E, edge_of, n = unique_edges(T)
+    assert np.array_equal(E, expected)
+    assert np.array_equal(edge_of, of.ravel())
+    assert np.array_equal(n, count)
+
+
+def test_no_triangles_have_no_edges():
+    E, edge_of, count = unique_edges(np.zeros((0, 3), int))
+    assert (E.shape, len(edge_of), len(count)) == ((0, 2), 0, 0)
+
+
+def test_counting_sorts_as_a_stable_sort():
+    key = np.random.default_rng(0).integers(0, 50, 1000)
+    assert np.array_equal(counting_order(key, 50), np.argsort(key, kind="stable"))
+
+
+@pytest.mark.parametrize("key", [[-1, 0], [0, 2]])
+def test_numbers_that_are_not_counted_are_refused(key):
+    with pytest.raises(IndexError, match="0 to 1 needed"):
+        counting_order(np.array(key), 2)
+
+
+@pytest.mark.parametrize("kind", [int, float])
+def test_equal_rows_are_found_alike_for_integers_and_others(kind):
+    A = np.random.default_rng(0).integers(0, 5, (200, 3)).astype(kind)
+    first, group = equal_rows(A)
+    assert np.array_equal(A[first][group], A)
+    assert len(first) == len(np.unique(A, axis=0))
+    assert all(np.flatnonzero(group == g)[0] == f for g, f in enumerate(first))
+
+
+def test_paths_are_those_of_dijkstra_from_neighbours_to_the_limit(sphere):
+    X, T = sphere
+    G = edge_graph(X, edges(T))
+    start, end = np.divmod(np.arange(0, len(X) ** 2, 97), len(X))
+    whole = dijkstra(G)[start, end]
+    assert np.allclose(path_lengths(G, start, end, 0.8), np.minimum(whole, 0.8), atol=1e-12)
+
+
+def test_no_pairs_have_no_paths(sphere):
+    X, T = sphere
+    none = np.zeros(0, int)
+    assert len(path_lengths(edge_graph(X, edges(T)), none, none, 1.0)) == 0
