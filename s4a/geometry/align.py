@@ -199,13 +199,32 @@ def icp(
         Q = np.concatenate([target.X[forth], Y])
         gap = np.concatenate([forth_gap, back_gap])
         # two that are each other's nearest stay or go together, whatever the rounding
-        keep = gap <= (1 + 1e-9) * np.quantile(gap, 1 - trim)
+        keep = gap <= (1 + 1e-9) * quantile(gap, 1 - trim)
         residual = float(np.sqrt(weight[keep] @ gap[keep] ** 2 / weight[keep].sum()))
         R, t, _ = rigid_transform(P[keep], Q[keep], weight[keep])
         if last - residual < tolerance * size:
             break
         last = residual
     return R, t, residual
+
+
+def quantile(values: np.ndarray, share: float) -> float:
+    """``np.quantile`` of a few hundred values ``(n,)``, to the bit and much faster.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.geometry.align import quantile
+    >>> quantile(np.array([4.0, 1.0, 2.0]), 0.75)
+    3.0
+    """
+    at = share * (len(values) - 1)
+    below = min(int(at), len(values) - 1)
+    above = min(below + 1, len(values) - 1)
+    part = np.partition(values, (below, above))
+    a, b, t = float(part[below]), float(part[above]), at - below
+    # from the nearer of both, as NumPy does
+    return b - (b - a) * (1 - t) if t >= 0.5 else a + (b - a) * t
 
 
 def residual_of(end: End) -> float:
