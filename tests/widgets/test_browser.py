@@ -158,7 +158,7 @@ def lab(folder):
             process.terminate()
             try:
                 process.wait(60)
-            except subprocess.TimeoutExpired:  # a kernel that is still busy holds it; kill ends both
+            except subprocess.TimeoutExpired:  # held by a kernel that is busy
                 process.kill()
                 process.wait()
 
