@@ -6,14 +6,16 @@ and versions at its foot; those of speed, which ``make bench`` runs, into ``docs
 folders stand in the repository, and the documentation has a page of each. All of them take more
 than a night on two cores: ``make paper ONLY=accuracy`` takes those whose command contains the word,
 ``make paper ONLY=--list`` names all and runs none, and ``make paper ONLY=--rest`` goes on with
-those that have not ended well yet. ``tests/house/test_figures.py`` fails where a page quotes a
-figure without a command.
+those that have not ended well yet; with ``--minutes=20`` beside it a command that takes longer is
+ended and told, and what it printed before stays. ``tests/house/test_figures.py`` fails where a page
+quotes a figure without a command.
 """
 
 import os
 import platform
 import re
 import shlex
+import signal
 import subprocess
 import sys
 import time
@@ -50,6 +52,7 @@ SPEED = (
     ("widgets.py",),
 )
 FLAGS = ("--speed", "--list", "--rest")
+MINUTES = "--minutes="
 PERFORMANCE = ROOT / "docs" / "performance"
 PACKAGES = ("numpy", "scipy", "xarray", "libigl", "robust_laplacian", "scikit-learn", "pymeshlab")
 CODE = re.compile(r"`([^`]+)`")
@@ -113,25 +116,34 @@ def as_markdown(text):
     return text if re.search(r"^\|", text, re.MULTILINE) else f"```text\n{text}\n```"
 
 
-def run(command):
-    """Run a command; its output and foot as a file. Gives its path and the exit code."""
+def run(command, seconds=None):
+    """Run a command; its output and foot as a file. Gives its path and the exit code.
+
+    TimeoutExpired where it takes longer than `seconds`; then nothing is written.
+    """
     begin = time.time()
-    result = subprocess.run(
+    process = subprocess.Popen(
         [sys.executable, str(BENCHMARKS / command[0]), *command[1:]],
         cwd=ROOT,
         stdout=subprocess.PIPE,
         text=True,
-        check=False,
+        start_new_session=True,
     )
+    try:
+        printed, _ = process.communicate(timeout=seconds)
+    finally:
+        if process.poll() is None:  # too late, or interrupted: its workers go with it
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
     day = time.strftime("%Y-%m-%d")
     foot = f"{day}, {time.time() - begin:.0f} s. {machine()}. {versions()}."
-    failed = f"\n\nIt ended with {result.returncode}." if result.returncode else ""
+    failed = f"\n\nIt ended with {process.returncode}." if process.returncode else ""
     path = kept(command)
     path.parent.mkdir(parents=True, exist_ok=True)
     head = f"# `{shlex.join(command)}`"
-    said = as_markdown(result.stdout)
+    said = as_markdown(printed)
     path.write_text(f"{head}\n\n{said}\n\n---\n\n{foot}{failed}\n", encoding="utf-8")
-    return path, result.returncode
+    return path, process.returncode
 
 
 def ended_well(command):
@@ -140,10 +152,20 @@ def ended_well(command):
     return path.exists() and "\n\nIt ended with " not in path.read_text(encoding="utf-8")
 
 
+def limit_in(words):
+    """The seconds that ``--minutes=N`` gives each command, or None; and the other words."""
+    given = [word for word in words if word.startswith(MINUTES)]
+    seconds = 60 * float(given[-1].removeprefix(MINUTES)) if given else None
+    return seconds, [word for word in words if word not in given]
+
+
 def main(words):
+    seconds, words = limit_in(words)
     unknown = [word for word in words if word.startswith("-") and word not in FLAGS]
     if unknown:
-        sys.stderr.write(f"{__doc__}\n{unknown[0]}: unknown; known are {', '.join(FLAGS)}\n")
+        sys.stderr.write(
+            f"{__doc__}\n{unknown[0]}: unknown; known are {', '.join(FLAGS)}, {MINUTES}N\n"
+        )
         return 2
     known = SPEED if "--speed" in words else commands()
     chosen = [c for c in known if all(word in " ".join(c) for word in words if word[0] != "-")]
@@ -154,11 +176,14 @@ def main(words):
         sys.stdout.write(f"{shlex.join(command)}\n")
         sys.stdout.flush()
         if "--list" not in words:
-            path, code = run(command)
+            try:
+                path, code = run(command, seconds)
+                said = f"{path.relative_to(ROOT)}{f', failed: {code}' if code else ''}"
+            except subprocess.TimeoutExpired:
+                code, said = 1, f"nothing: not at its end after {seconds:.0f} s"
             codes.append(code)
-            sys.stdout.write(
-                f"  -> {path.relative_to(ROOT)}{f', failed: {code}' if code else ''}\n"
-            )
+            sys.stdout.write(f"  -> {said}\n")
+            sys.stdout.flush()
     return 1 if any(codes) else 0
 
 

@@ -2,6 +2,7 @@
 
 import re
 import shlex
+import time
 from pathlib import Path
 
 import pytest
@@ -110,6 +111,21 @@ def test_a_night_that_was_too_short_goes_on_with_what_has_not_ended_well(
     capsys.readouterr()
     assert paper.main(["--rest", "--list"]) == 0
     assert capsys.readouterr().out == "bad.py\n"
+
+
+def test_a_command_that_takes_too_long_is_ended_and_what_stood_there_stays(
+    tmp_path, monkeypatch, capsys
+):
+    for name in ("ROOT", "BENCHMARKS", "TABLES"):
+        monkeypatch.setattr(paper, name, tmp_path)
+    (tmp_path / "slow.py").write_text("import time\nprint('begun', flush=True)\ntime.sleep(99)\n")
+    (tmp_path / "slow.md").write_text("of before")
+    monkeypatch.setattr(paper, "commands", lambda: [("slow.py",)])
+    began = time.monotonic()
+    assert paper.main(["--minutes=0.02"]) == 1
+    assert time.monotonic() - began < 60
+    assert (tmp_path / "slow.md").read_text() == "of before"
+    assert "nothing: not at its end after 1 s" in capsys.readouterr().out
 
 
 def test_every_picture_of_the_pages_is_drawn_by_a_command():
