@@ -134,7 +134,7 @@ def run(command, seconds=None):
     finally:
         if process.poll() is None:  # too late, or interrupted: its workers go with it
             os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
+            process.communicate()
     day = time.strftime("%Y-%m-%d")
     foot = f"{day}, {time.time() - begin:.0f} s. {machine()}. {versions()}."
     failed = f"\n\nIt ended with {process.returncode}." if process.returncode else ""
