@@ -364,9 +364,8 @@ class Pair:
             "icp": nearest_after_motion(M.low, N.low, motion),
         }
         tried = clock("refine", find_candidates, M, N, starts, k=self.k)
-        match, image, _ = clock(
+        match, moved, _ = clock(
             "full resolution", register_surface, M, N, tried, spectral.functions, elastic=True
         )
-        moved = M.to_frame(image)
-        reverse = match_surfaces(M.full.X, M.full.T, moved, N.full.T)
-        return match, image, reverse, clock.seconds
+        reverse = match_surfaces(M.full.X, M.full.normals, moved.X, moved.normals)
+        return match, M.from_frame(moved.X), reverse, clock.seconds

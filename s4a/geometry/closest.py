@@ -102,33 +102,40 @@ def feature_tree(X: np.ndarray, T: np.ndarray) -> cKDTree:
 
     With 64 rows a leaf its queries take a quarter less time.
     """
-    return cKDTree(features(X, vertex_normals(X, T)), leafsize=64)
+    return tree_over(features(X, vertex_normals(X, T)))
 
 
-def match_surfaces(Y: np.ndarray, S: np.ndarray, X: np.ndarray, T: np.ndarray) -> np.ndarray:
+def tree_over(rows: np.ndarray) -> cKDTree:
+    """KD-tree over rows of :func:`features`."""
+    return cKDTree(rows, leafsize=64)
+
+
+def match_surfaces(
+    Y: np.ndarray, normals_y: np.ndarray, X: np.ndarray, normals_x: np.ndarray
+) -> np.ndarray:
     """On each vertex of one surface the vertex nearest to it of another that lies on it ``(n,)``.
 
     Nearest in position and, by :data:`CLOSE_WEIGHT`, in normal.
 
     Parameters
     ----------
-    Y, S : float ndarray (n, 3), int ndarray (p, 3)
-        The surface whose vertices ask.
-    X, T : float ndarray (m, 3), int ndarray (q, 3)
-        The surface whose vertices are found, of about unit area.
+    Y, normals_y : float ndarray (n, 3)
+        The vertices that ask, and the unit normals of their surface there.
+    X, normals_x : float ndarray (m, 3)
+        Those that are found, of a surface of about unit area.
 
     Examples
     --------
     >>> import s4a
     >>> from s4a.geometry.closest import match_surfaces
-    >>> from s4a.geometry.mesh import as_arrays
+    >>> from s4a.geometry.mesh import as_arrays, vertex_normals
     >>> X, T = as_arrays(s4a.synthetic.sphere(200))
-    >>> bool((match_surfaces(1.01 * X, T, X, T) == range(200)).all())
+    >>> N = vertex_normals(X, T)
+    >>> bool((match_surfaces(1.01 * X, N, X, N) == range(200)).all())
     True
     """
-    rows = features(X, vertex_normals(X, T), weight=CLOSE_WEIGHT)
-    tree = cKDTree(rows, leafsize=64)
-    return tree.query(features(Y, vertex_normals(Y, S), weight=CLOSE_WEIGHT))[1]
+    tree = tree_over(features(X, normals_x, weight=CLOSE_WEIGHT))
+    return tree.query(features(Y, normals_y, weight=CLOSE_WEIGHT))[1]
 
 
 def closest_point_on_triangles(

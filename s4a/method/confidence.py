@@ -58,7 +58,7 @@ def stretch(X: np.ndarray, image: np.ndarray, T: np.ndarray) -> np.ndarray:
     return np.sqrt(total / np.maximum(weight, np.finfo(float).tiny))
 
 
-def evidence(source: Shape, target: Shape, match: np.ndarray, image: np.ndarray) -> np.ndarray:
+def evidence(source: Shape, target: Shape, match: np.ndarray, P: np.ndarray) -> np.ndarray:
     """Logarithms of gap and stretch, smooth over the template ``(n_target, 2)``.
 
     Parameters
@@ -67,23 +67,23 @@ def evidence(source: Shape, target: Shape, match: np.ndarray, image: np.ndarray)
         The shape and the template.
     match : int ndarray (n_target,)
         Near which vertex of the shape each vertex of the template lies.
-    image : float ndarray (n_target, 3)
-        The registered template, in the unit and frame of the shape's file.
+    P : float ndarray (n_target, 3)
+        The registered template, in the frame of the shape.
     """
-    P, Y, S = source.to_frame(image), source.full.X, source.full.T
+    Y, S = source.full.X, source.full.T
     place = closest_point_in_star(P, match, Y, S, source.full.stars)
     gap = np.linalg.norm(P - interpolate(Y, S, *place), axis=1)  # share of sqrt(area)
     found = np.log(np.stack([gap, stretch(target.full.X, P, target.full.T)], axis=1) + LEAST)
     return target.full.field(target.full.coefficients(found[target.near_coarse]))
 
 
-def confidence(source: Shape, target: Shape, match: np.ndarray, image: np.ndarray) -> np.ndarray:
+def confidence(source: Shape, target: Shape, match: np.ndarray, P: np.ndarray) -> np.ndarray:
     """Probability ``(n_target,)`` that a vertex lies within 1 % of sqrt(area) of its true place.
 
     Parameters
     ----------
-    source, target, match, image : see :func:`evidence`
+    source, target, match, P : see :func:`evidence`
     """
     w_0, *w = WEIGHTS
-    doubt = -(w_0 + evidence(source, target, match, image) @ np.array(w))
+    doubt = -(w_0 + evidence(source, target, match, P) @ np.array(w))
     return 1 / (1 + np.exp(np.clip(doubt, -50, 50)))

@@ -196,7 +196,7 @@ def best_first_map(
         match = fmap.zoomout(source, target, one[1], k, step=step)[1]
         end = joint.low_rounds(source, target, match, k_first=20, step=20, rounds=1, by_parts=True)
         image = joint.move(target, end[1])
-        gap = joint.registration_score(source, target, end[0], image)
+        gap = joint.registration_score(source, target, end[0], target.moved_to(image))
         score = gap + stretch(target, image)
         best = min(best, score)
         bent = BENT * fmap.curvature_gap(source, target, end[0]) if search else 0.0

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from s4a.geometry.align import Motion, rigid_transform
-from s4a.geometry.closest import feature_tree, features
+from s4a.geometry.closest import features
 from s4a.geometry.mesh import path_lengths, vertex_normals
 from s4a.method.deform import onto
 from s4a.method.fmap import fmap_from_match
@@ -181,7 +181,7 @@ def registration_score(
     source: Basis,
     target: Basis,
     match: np.ndarray,
-    X: np.ndarray,
+    moved: Basis,
     *,
     n_samples: int = 300,
     limit: float = 0.5,
@@ -203,10 +203,10 @@ def registration_score(
         At one resolution.
     match : int ndarray (s,)
         For the target's vertices near coarse ones.
-    X : float ndarray (n_target, 3)
-        The registered target.
+    moved : Basis
+        The registered target, see :meth:`s4a.method.shape.Basis.moved_to`.
     """
-    tree = feature_tree(X, target.T)
+    X, tree = moved.X, moved.tree
     rows = np.arange(len(X))[target.near_coarse]
     back = X[tree.query(source.tree.data[source.near_coarse])[1]]
     back_gap = np.linalg.norm(source.X[source.near_coarse] - back, axis=1)
@@ -249,7 +249,7 @@ def as_given(source: Basis, target: Basis, starts: dict[str, np.ndarray]) -> dic
 
 def scored(source: Basis, target: Basis, match: np.ndarray, warp: Warp) -> Candidate:
     """A registration with its score."""
-    score = registration_score(source, target, match, move(target, warp))
+    score = registration_score(source, target, match, target.moved_to(move(target, warp)))
     return Candidate(score, match, warp)
 
 

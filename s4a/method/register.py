@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from s4a.geometry.align import Motion
-from s4a.geometry.closest import closest_point_in_star, feature_tree, match_surfaces
+from s4a.geometry.closest import closest_point_in_star, features, match_surfaces
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.method import joint
 from s4a.method.confidence import confidence
@@ -211,7 +211,7 @@ def register(
     candidates = find_candidates(source, target, starts, k=k, refine=refine, parts=parts)
     by_icp = motion_in_unit(source, target, motion, scale) if alignment == "icp" else None
     # image = R x + t + U Phi c, smooth already: the line after eq. 8; or of elastic rounds
-    match, image, attrs = register_surface(
+    match, moved, attrs = register_surface(
         source,
         target,
         candidates,
@@ -219,7 +219,8 @@ def register(
         by_icp and (motion, by_icp.ratio),
         elastic=refine == "elastic",
     )
-    triangle, barycentric = way_back(source, target, image)
+    image = source.from_frame(moved.X)
+    triangle, barycentric = way_back(source.full, moved)
     X, T = as_arrays(target.original)
     if by_icp:
         R, t, s, _ = by_icp
@@ -231,7 +232,7 @@ def register(
     low = s * source.coarse["position"].values[starts["intrinsic"]] @ R.T + t - X_low
     coefficient = target.full.coefficients(displacement[target.near_coarse])  # (k, 3)
     trip = round_trip(target, match, triangle, barycentric)
-    sure = confidence(source, target, match, image)
+    sure = confidence(source, target, match, moved.X)
     registration = dataset(
         attrs,
         registered_match=match.astype(np.int32),
@@ -317,7 +318,7 @@ def register_surface(
     placed: tuple[Motion, float] | None = None,
     *,
     elastic: bool = False,
-) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
+) -> tuple[np.ndarray, Basis, dict[str, Any]]:
     """The template registered at full resolution: the best of the finalists of low resolution.
 
     Parameters
@@ -336,8 +337,8 @@ def register_surface(
     Returns
     -------
     match : int ndarray (n_target,)
-    image : float ndarray (n_target, 3)
-        Registered template in the frame and unit of the source's file.
+    moved : Basis
+        Registered template, in the frame of the source.
     attrs : dict
         See :func:`register`.
     """
@@ -346,7 +347,7 @@ def register_surface(
     attrs: dict[str, float | str] = {
         f"score_{name}": candidate.score for name, candidate in candidates.items()
     }
-    ends = {}  # name -> score and registered template (n_target, 3)
+    ends = {}  # name -> score and registered template
     # starts as they are tell less of their ends than joint rounds do
     margin = 2.0 if elastic else 1.25
     names = joint.finalists(candidates, margin=margin) if candidates else ["intrinsic"]
@@ -355,8 +356,7 @@ def register_surface(
         whole = {n: candidates[n].warp for n in names if candidates[n].warp[0].ndim == 2}
         names = [name for name in names if name not in whole]  # by parts
         for name, X in elastic_surfaces(source, target, whole, landmarks).items():
-            part = joint.nearest_vertices(M, N, X, N.near_coarse)
-            ends[f"{name}+elastic"] = joint.registration_score(M, N, part, X), X
+            ends[f"{name}+elastic"] = scored_alone(M, N, X)
     for name in names:
         if name == "intrinsic":
             match, compared, certified = match_functions(source, target, *functions)
@@ -365,19 +365,26 @@ def register_surface(
             warp = joint.warp_after(M, N, part, *placed) if placed else joint.fit_warp(M, N, part)
         else:
             part, warp = joint.dense_rounds(M, N, candidates[name].warp)
-        X = joint.move(N, warp)
-        if elastic:
-            X = after_local_rounds(source, target, warp, landmarks)
         if elastic:  # here by parts
-            part = joint.nearest_vertices(M, N, X, N.near_coarse)
-            name = f"{name}+local"
-        ends[name] = joint.registration_score(M, N, part, X), X
+            X = after_local_rounds(source, target, warp, landmarks)
+            ends[f"{name}+local"] = scored_alone(M, N, X)
+        else:
+            moved = N.moved_to(joint.move(N, warp))
+            ends[name] = joint.registration_score(M, N, part, moved), moved
     method = min(ends, key=lambda name: ends[name][0])
-    score, X = ends[method]
+    score, moved = ends[method]
     if method != "intrinsic":
-        match = match_surfaces(X, N.T, M.X, M.T)
+        match = match_surfaces(moved.X, moved.normals, M.X, M.normals)
     attrs |= {"method": method, "score": score}
-    return match, source.from_frame(X), attrs
+    return match, moved, attrs
+
+
+def scored_alone(source: Basis, target: Basis, X: np.ndarray) -> tuple[float, Basis]:
+    """Score of the registered target, matched by what is nearest to it, and that target."""
+    moved = target.moved_to(X)
+    rows = features(X, moved.normals)[target.near_coarse]
+    match = source.tree.query(rows)[1]
+    return joint.registration_score(source, target, match, moved), moved
 
 
 def elastic_surfaces(
@@ -431,21 +438,26 @@ def after_local_rounds(
     return joint.move(target.full, warp) + target.U @ d
 
 
-def way_back(source: Shape, target: Shape, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def way_back(source: Basis, moved: Basis) -> tuple[np.ndarray, np.ndarray]:
     """For every vertex of the source the closest point of the registered template.
 
     The nearest template vertex in position and normal is looked up first, then the closest point on
     the triangles around it, so that the normals agree.
+
+    Parameters
+    ----------
+    source : Basis
+        At full resolution.
+    moved : Basis
+        The registered template, in the frame of the source.
 
     Returns
     -------
     triangle : int ndarray (n_source,)
     barycentric : float ndarray (n_source, 3)
     """
-    X = source.to_frame(image)
-    T = target.full.T
-    nearest = feature_tree(X, T).query(source.full.tree.data)[1]
-    return closest_point_in_star(source.full.X, nearest, X, T)
+    nearest = moved.tree.query(source.tree.data)[1]
+    return closest_point_in_star(source.X, nearest, moved.X, moved.T)
 
 
 def round_trip(

@@ -14,7 +14,7 @@ import xarray as xr
 from scipy.spatial import cKDTree
 
 from s4a.geometry.align import Cloud, cloud, farthest_points, rigid_transform
-from s4a.geometry.closest import Stars, feature_tree, stars
+from s4a.geometry.closest import Stars, features, stars, tree_over
 from s4a.geometry.mesh import (
     as_arrays,
     directed_edges,
@@ -103,6 +103,10 @@ class Basis:
         eigenvalue = None if self.eigenvalue is None else self.eigenvalue[:k]
         return replace(self, Phi=self.Phi[:, :k], eigenvalue=eigenvalue)
 
+    def moved_to(self, X: np.ndarray) -> "Basis":
+        """The same surface where its vertices have moved to X ``(n, 3)``, as registered."""
+        return replace(self, X=X, surface_normals=None)
+
     def extend(self, F: np.ndarray) -> np.ndarray:
         """Functions of the low resolution at all vertices: U F ``(n, q)`` in single precision.
 
@@ -138,7 +142,7 @@ class Basis:
     @cached_property
     def tree(self) -> cKDTree:
         """KD-tree over position and normal of the vertices, 6 dims."""
-        return feature_tree(self.X, self.T)
+        return tree_over(features(self.X, self.normals))
 
     def guided_tree(self, names: tuple[str, ...]) -> cKDTree:
         """That over position, normal and some of the fields, 6 dims and one for each."""
@@ -146,7 +150,7 @@ class Basis:
             return self.tree
         if names not in self._guided:
             rows = np.concatenate([self.tree.data, field_columns(self, names)], axis=1)
-            self._guided[names] = cKDTree(rows, leafsize=64)
+            self._guided[names] = tree_over(rows)
         return self._guided[names]
 
     @cached_property
@@ -238,9 +242,12 @@ class Shape:
         if self.original is None:
             area, X = self.coarse["vertex_area"].values, self.coarse["position"].values
             return area / area.sum() @ X, np.sqrt(area.sum())
-        X, T = as_arrays(self.original)
-        area = vertex_areas(X, T)
+        X, area = self.original["position"].values, self._area
         return area @ X / area.sum(), np.sqrt(area.sum())
+
+    @cached_property
+    def _area(self) -> np.ndarray:
+        return vertex_areas(*as_arrays(self.original))
 
     def to_frame(self, points: np.ndarray) -> np.ndarray:
         """Points ``(p, 3)`` in the unit of the input, in the frame."""
@@ -344,7 +351,7 @@ class Shape:
         X, T = as_arrays(self.original)
         X = self.to_frame(X)
         low = self.low
-        area = vertex_areas(X, T)
+        area = self._area / self._area.sum()
         lifted = self.is_lifted
         Phi = self.coarse["lifted_eigenfunction"].values if lifted else low.Phi
         return Basis(

@@ -97,7 +97,7 @@ def measured(pair):
     found, _ = match_shapes(source, target, options)
     image = image_of(found, pair.template)
     error = np.linalg.norm(image - pair.true, axis=1) / source.frame[1]
-    seen = evidence(source, target, found["registered_match"].values, image)
+    seen = evidence(source, target, found["registered_match"].values, source.to_frame(image))
     return error, seen, found["confidence"].values
 
 

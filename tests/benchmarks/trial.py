@@ -2,9 +2,10 @@
 
 ``python tests/benchmarks/trial.py [FOLDER]`` writes the files, runs ``s4a run`` over all of them,
 and prints the summary and what became of every bad file.  Then it does what the summary says: bad
-ones that are used, with a warning, are taken away.  The results of the good ones are compared bit
-for bit with those of a run over them alone.  It exits with 1 where they differ, where a bad file is
-used and nothing is told of it, or where the summary is longer or wider than a screen.
+ones that stood in the network, used with a warning or of a registration that failed, are taken
+away.  The results of the good ones are compared bit for bit with those of a run over them alone.
+It exits with 1 where they differ, where a bad file is used and nothing is told of it, or where the
+summary is longer or wider than a screen.
 """
 
 import contextlib
@@ -173,7 +174,10 @@ def main(folder):
     told = used_and_told(report, bad)
     words = [f"{name} ({kinds or 'NOT TOLD'})" for name, kinds in told.items()]
     say(f"bad ones that are used, and what is told of them: {', '.join(words) or 'none'}")
-    for name in told:
+    network = study["network"]["shape"].values
+    within = [name for name in bad if name in network]
+    say(f"bad ones in the network: {', '.join(within) or 'none'}")
+    for name in within:
         (folder / "bad" / f"{name}.ply").unlink()
     run([folder / "good", folder / "bad"], folder / "study")
     run([folder / "good"], folder / "alone")

@@ -183,7 +183,7 @@ def test_where_parts_turned_on_their_own_local_rounds_alone_follow(pair, monkeyp
         for asked in (True, False)
     }
     assert {attrs["method"] for _, _, attrs in found.values()} == {"icp+parts", "icp+parts+local"}
-    far = {asked: gap(shape.to_frame(image), shape) for asked, (_, image, _) in found.items()}
+    far = {asked: gap(end.X, shape) for asked, (_, end, _) in found.items()}
     assert far[True] < 0.8 * far[False]
 
 

@@ -79,7 +79,9 @@ def test_a_wrong_match_scores_worse_than_a_right_one(surface):
 
     def score(match):
         warp = deform.onto(surface.X, source.X[match], surface.area, surface.coefficients)
-        return joint.registration_score(source, surface, match, joint.move(surface, warp))
+        return joint.registration_score(
+            source, surface, match, surface.moved_to(joint.move(surface, warp))
+        )
 
     right = score(every)
     assert right < 0.02
