@@ -29,7 +29,7 @@ HELP = {
     "lift": "eigenfunctions of the original meshes, nearly, instead of U Phi",
     "init": "first maps from all nearest neighbours, or the paper's fit on 10 landmarks",
     "ahead": "a step of ZoomOut for all first maps, for those of the network alone, or none",
-    "n_spread": "vertices on which Consistent ZoomOut looks for matches; 0 for all",
+    "n_spread": "vertices at which the network looks for matches; 0 for all",
     "wide": "its last rounds in which these look among all vertices",
     "sharpen": "rounds of ZoomOut of a single pair that look among all vertices of the source",
     "refine": "elastic rounds, joint ones, or the paper's spectral match alone",

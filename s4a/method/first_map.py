@@ -309,6 +309,7 @@ def first_map(
     k_init: int = 20,
     init: str = "dense",
     ahead: bool = True,
+    n_spread: int = 0,
     search: bool = False,
 ) -> FirstMap:
     """:func:`map_after_motion`, or :func:`best_first_map` where poses are far apart.
@@ -322,6 +323,8 @@ def first_map(
     motion : tuple (R, t)
         Rigid motion of the source onto the target.
     k_init, init, ahead : see :func:`map_after_motion`
+    n_spread : int
+        Of the step ahead, see :func:`s4a.method.fmap.refine_once`.
     search : bool
         See :func:`best_first_map`; for pairs alone, as Consistent ZoomOut mends those of a network.
     """
@@ -329,7 +332,7 @@ def first_map(
     fitted, landmarks = fit_after_motion(
         source, target, motion, k_init=k_init, init=init, near=near
     )
-    C = fmap.refine_once(source, target, fitted) if ahead else fitted
+    C = fmap.refine_once(source, target, fitted, n_spread) if ahead else fitted
     far = init == "dense" and joint.far_apart(source, target, near)
     if far and have_signatures(source, target, k_init):
         name, C, fitted = best_first_map(source, target, C, fitted, search=search)

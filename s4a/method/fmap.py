@@ -108,12 +108,21 @@ def zoomout(
     return C, match_from_fmap(C, source.Phi, target.Phi, nearest=nearest)
 
 
-def refine_once(source: Basis, target: Basis, C: np.ndarray) -> np.ndarray:
-    """One step of ZoomOut without growth (4.2): C -> match -> C of the same size."""
+def refine_once(source: Basis, target: Basis, C: np.ndarray, n_spread: int = 0) -> np.ndarray:
+    """One step of ZoomOut without growth (4.2): C -> match -> C of the same size.
+
+    Where `n_spread` is not 0, matches are looked for at as many spread vertices of the target, and
+    C is the least squares there, as in the rounds of Consistent ZoomOut.
+    """
     Phi = source.Phi[:, : C.shape[1]]
     Psi = target.Phi[:, : len(C)]
-    match = nearest_float32(as_queries(Psi), as_candidates(Phi @ C.T))
-    return fmap_from_match(Phi, Psi, target.mass, match)
+    sampled = 0 < n_spread < len(Psi)
+    rows = target.spread_vertices(n_spread) if sampled else slice(None)
+    match = nearest_float32(as_queries(Psi[rows]), as_candidates(Phi @ C.T))
+    if not sampled:
+        return fmap_from_match(Phi, Psi, target.mass, match)
+    root = np.sqrt(target.area[rows])[:, None]
+    return np.linalg.lstsq(root * Psi[rows], root * Phi[match], rcond=None)[0]
 
 
 def fit(

@@ -71,7 +71,7 @@ def place(
     for other, start in zip(others, starts, strict=True):
         R, t = realign(new.cloud, other.cloud, start)
         back = R.T, -R.T @ t
-        maps.append(first_map(other, new, back, k_init=k_init, **options).C)
+        maps.append(first_map(other, new, back, k_init=k_init, n_spread=n_spread, **options).C)
     return latent_basis_of_new(new, others, Y, maps, step=step, n_spread=n_spread)
 
 

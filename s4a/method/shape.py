@@ -13,7 +13,7 @@ import scipy.sparse as sp
 import xarray as xr
 from scipy.spatial import cKDTree
 
-from s4a.geometry.align import Cloud, cloud, farthest_points, rigid_transform
+from s4a.geometry.align import Cloud, farthest_points, rigid_transform
 from s4a.geometry.closest import Stars, features, stars, tree_over
 from s4a.geometry.mesh import (
     as_arrays,
@@ -132,12 +132,18 @@ class Basis:
 
     def spread_vertices(self, n: int = N_SPREAD) -> np.ndarray:
         """Vertices ``(<= n,)`` spread over the surface; all in their order where n is 0."""
+        if N_SPREAD < len(self.X) and 0 < n <= N_SPREAD:
+            return self._spread[:n]  # each is the farthest from those before it
         return farthest_points(self.X, n or len(self.X))
+
+    @cached_property
+    def _spread(self) -> np.ndarray:
+        return farthest_points(self.X, N_SPREAD)
 
     @cached_property
     def cloud(self) -> Cloud:
         """The vertices as rigid alignment takes them."""
-        return cloud(self.X, self.area, N_PAIRED)
+        return Cloud(self.X, self.area, cKDTree(self.X), self.spread_vertices(N_PAIRED))
 
     @cached_property
     def tree(self) -> cKDTree:

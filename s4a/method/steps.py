@@ -87,6 +87,7 @@ def map_pairs(
     k_init: int = 20,
     init: str = "dense",
     ahead: bool = True,
+    n_spread: int = N_SPREAD,
 ) -> xr.Dataset:
     """First maps of some pairs, in both directions (4.1, steps 3 and 4).
 
@@ -100,6 +101,8 @@ def map_pairs(
     k_init, init : see :func:`s4a.analyse`
     ahead : bool
         Whether a step of ZoomOut is done ahead (4.2).
+    n_spread : int
+        Spread vertices on which that step looks for matches; 0 for all.
 
     Returns
     -------
@@ -114,10 +117,10 @@ def map_pairs(
         start = motion_between(motions[a], motions[b])
         R, t = realign(M.cloud, N.cloud, start)
         back_motion = R.T, -R.T @ t
-        first = first_map(M, N, (R, t), k_init=k_init, init=init, ahead=ahead)
+        first = first_map(M, N, (R, t), k_init=k_init, init=init, ahead=ahead, n_spread=n_spread)
         if first.name == init:
             fitted, landmarks = fit_after_motion(N, M, back_motion, k_init=k_init, init=init)
-            back = fmap.refine_once(N, M, fitted) if ahead else fitted
+            back = fmap.refine_once(N, M, fitted, n_spread) if ahead else fitted
         else:  # of far poses: the other direction must tell the same limbs apart
             fitted, landmarks = first.C.T, None
             back = fmap.refine_once(N, M, fitted)
@@ -149,6 +152,7 @@ def build_network(
     k_init: int = 20,
     init: str = "dense",
     ahead: bool = True,
+    n_spread: int = N_SPREAD,
 ) -> xr.Dataset:
     """The network of first maps of a collection (3.4, 4.1): its pairs, and a map each way.
 
@@ -156,7 +160,7 @@ def build_network(
     ----------
     coarse : dict of str to xarray.Dataset
         Name -> low-resolution mesh with its spectrum.
-    n_pairs, k_init, init, ahead : see :func:`map_pairs`
+    n_pairs, k_init, init, ahead, n_spread : see :func:`map_pairs`
 
     Returns
     -------
@@ -203,7 +207,9 @@ def build_network(
     motions = {name: motion_onto(M, N) for name, M in bases.items() if name != reference}
     motions[reference] = np.eye(3), np.zeros(3)
     pairs = [(names[i], names[j]) for i, j in network.choose_pairs(distance, n_pairs)]
-    maps = map_pairs(bases, motions, pairs, k_init=k_init, init=init, ahead=ahead)
+    maps = map_pairs(
+        bases, motions, pairs, k_init=k_init, init=init, ahead=ahead, n_spread=n_spread
+    )
     return with_motions(maps, {name: motions[name] for name in names}, reference)
 
 

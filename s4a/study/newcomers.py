@@ -347,7 +347,6 @@ def _insert_one(mesh, frozen, options, references):
         starts,
         k_init=k_init,
         step=options.step,
-        n_spread=options.n_spread,
         **options.of_first_maps,
     )
     registration = from_latent(

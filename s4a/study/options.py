@@ -284,7 +284,7 @@ class Options:
     @property
     def of_first_maps(self) -> dict[str, Any]:
         """The options of :func:`s4a.method.first_map.first_map` in a network, but its size."""
-        return {"init": self.init, "ahead": self.ahead != "never"}
+        return {"init": self.init, "ahead": self.ahead != "never", "n_spread": self.n_spread}
 
     @property
     def of_registration(self) -> dict[str, Any]:

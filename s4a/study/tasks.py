@@ -193,7 +193,6 @@ def place_shape(folder: Path, name: str, options: Options) -> xr.Dataset:
         [motion_between(motion, motion_to_reference(folder, n)) for n in near],
         k_init=k_init,
         step=options.step,
-        n_spread=options.n_spread,
         **options.of_first_maps,
     )
     latent_eigenvalue = latent["latent_eigenvalue"].values

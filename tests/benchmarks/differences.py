@@ -80,7 +80,7 @@ SWITCHES = [
         "n_spread",
         "eq. 3",
         "for all vertices in every round",
-        "for 1,000 spread vertices, which saves time",
+        "for 1,000 spread vertices, in the step ahead, too, which saves time",
         "`method/latent`",
         ", all",
     ),

@@ -75,6 +75,25 @@ def test_zoomout_ends_at_k_whatever_the_step(shape):
     assert (fmap.zoomout(same, same, np.eye(40), 40)[0] == np.eye(40)).all()
 
 
+def test_a_step_on_spread_vertices_mends_a_map_about_as_well_as_one_on_all(shape, permuted):
+    Phi, area, _, X = shape
+    Psi, area_target, _, Y, _, sign = permuted
+    source, target = (
+        Basis(points, None, weight, functions)
+        for points, weight, functions in ((X, area, Phi), (Y, area_target, Psi))
+    )
+    noisy = np.diag(sign[:12]) + np.random.default_rng(2).normal(0, 0.05, (12, 12))
+
+    def off(C):
+        return np.linalg.norm(C - np.diag(sign[:12]))
+
+    on_all = off(fmap.refine_once(source, target, noisy))
+    assert on_all < off(noisy) / 2
+    assert off(fmap.refine_once(source, target, noisy, 150)) < 1.5 * on_all
+    same = fmap.refine_once(source, target, noisy, len(Y))
+    assert (same == fmap.refine_once(source, target, noisy)).all()
+
+
 def test_a_map_between_different_sizes_has_the_dims_target_by_source(shape):
     Phi, area, _, X = shape
     C = fmap.fmap_from_match(Phi[:, :12], Phi[:, :9], area, np.arange(len(X)))
