@@ -18,6 +18,7 @@ import shlex
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from importlib.metadata import version
 from pathlib import Path
@@ -111,8 +112,12 @@ def kept(command):
 
 
 def as_markdown(text):
-    """What a command printed: tables of Markdown as they are, other lines as they stood."""
-    text = text.strip("\n")
+    """What a command printed: tables of Markdown as they are, other lines as they stood.
+
+    Folders that it made for the time are of one machine, and only named.
+    """
+    temporary = re.escape(tempfile.gettempdir() + os.sep)
+    text = re.sub(rf"{temporary}[^\s/]+", "FOLDER", text.strip("\n"))
     return text if re.search(r"^\|", text, re.MULTILINE) else f"```text\n{text}\n```"
 
 

@@ -2,6 +2,7 @@
 
 import re
 import shlex
+import tempfile
 import time
 from pathlib import Path
 
@@ -126,6 +127,11 @@ def test_a_command_that_takes_too_long_is_ended_and_what_stood_there_stays(
     assert time.monotonic() - began < 60
     assert (tmp_path / "slow.md").read_text() == "of before"
     assert "nothing: not at its end after 1 s" in capsys.readouterr().out
+
+
+def test_a_folder_of_one_machine_is_in_no_table():
+    said = paper.as_markdown(f"study: {tempfile.gettempdir()}/tmp1a/study")
+    assert said == "```text\nstudy: FOLDER/study\n```"
 
 
 def test_every_picture_of_the_pages_is_drawn_by_a_command():
