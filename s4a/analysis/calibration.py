@@ -174,7 +174,7 @@ def gaps_between_ways(model: Model) -> Gaps:
         Of shapes: float ndarray (n_low, 3), in the frame of the template.
     """
     registration = registration_of(model.study)
-    pairs = _pairs_of(registration)
+    pairs = _pairs_of(model.study)
     key = _key_of(model, pairs)
     gaps = _kept.pop(key, None)
     if gaps is None:
@@ -195,14 +195,13 @@ def _others(registration):
     return [name for name in names if name != registration.attrs["template"]]
 
 
-def _pairs_of(registration):
-    """Some of them, each with the one that it is registered onto."""
-    others = _others(registration)
+def _pairs_of(study):
+    """Some of them, each with the shape that it is registered onto; none that stands apart."""
+    registration, network = registration_of(study), study["latent"]["shape"].values.tolist()
+    others = [name for name in _others(registration) if name in network]
+    chosen = spread([name for name in _rematched(registration) if name in network], N_WAYS)
     half = len(others) // 2
-    return [
-        (name, others[(others.index(name) + half) % len(others)])
-        for name in spread(_rematched(registration), N_WAYS)
-    ]
+    return [(name, others[(others.index(name) + half) % len(others)]) for name in chosen]
 
 
 def _key_of(model, pairs):

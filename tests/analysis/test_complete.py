@@ -165,6 +165,16 @@ def test_ways_are_found_once_for_the_content_of_a_study(study, monkeypatch):
         gaps_between_ways(model_of(wrong))
 
 
+def test_a_shape_that_stands_apart_from_the_network_is_registered_onto_no_other(study):
+    latent = study["latent"].to_dataset()
+    name = next(iter(gaps_between_ways(model_of(study))))
+    without = study.copy()
+    without["latent"] = xr.DataTree(latent.sel(shape=latent["shape"] != name))
+    gaps = gaps_between_ways(model_of(without))
+    assert name not in gaps
+    assert len(gaps) == 5  # of seven shapes, the template is one
+
+
 def test_errors_that_the_told_shapes_hold_already_are_not_added_twice():
     rng = np.random.default_rng(3)
     n = 20_000
