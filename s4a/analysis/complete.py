@@ -68,9 +68,10 @@ def complete(
     not hold, a normal distribution (posterior shape model, Albrecht et al. 2013; the formula is in
     :mod:`s4a.method.posterior`).  Its standard deviations are such that nine tenths of what shapes
     of the study have there, each cut in the same way, matched and completed by all others, lie
-    within intervals of 90 %, and wider by what two ways of matching the study's shapes differ:
-    over the template, and directly (see :mod:`s4a.analysis.calibration`).  The intervals are for
-    shapes of the population of the study's; what surfaces mislead every match to is not in them.
+    within intervals of 90 %, and wider by what two ways of matching the study's shapes differ, over
+    the template and directly, as far as that is not in the former (see
+    :mod:`s4a.analysis.calibration`).  The intervals are for shapes of the population of the
+    study's; what surfaces mislead every match to is not in them.
 
     Parameters
     ----------
@@ -98,10 +99,10 @@ def complete(
         distance that modes and motion leave on the part, ``usual_residual``, the largest that the
         modes of the others leave on the same part of a shape of the study, and ``inside``, the
         share of the part's points that lie on the whole; ``match_noise``, the deviation of a
-        coordinate where the part is, and ``between_ways``, that between two ways of matching, which
-        is in all deviations; ``factor`` of what the modes leave where nothing is; and
-        ``left_out_error``, the root mean square error of a coordinate with which the study's own
-        shapes are told by the others there; ``warning``.
+        coordinate where the part is; where nothing is ``factor`` of what the modes leave, and
+        ``added``, the deviation that comes to it of ``between_ways``, that between two ways of
+        matching; and ``left_out_error``, the root mean square error of a coordinate with which the
+        study's own shapes are told by the others there; ``warning``.
 
     Raises
     ------
@@ -263,7 +264,7 @@ def completed(
 
     inflate = np.where(present, 1.0, again.factor)  # (n_low,)
     spread = told.spread * inflate[:, None]
-    white = again.ways + np.where(present, again.noise, again.factor**2 * known.rest)
+    white = np.where(present, again.noise, again.added + again.factor**2 * known.rest)
     full = target.U @ _covariance(spread, white).reshape(-1, 9)
 
     pose, size = fit.pose, 1 / fit.pose.s
@@ -286,8 +287,9 @@ def completed(
             "usual_residual": size * again.residual,
             "inside": fit.inside,
             "factor": again.factor,
-            "match_noise": size * float(np.sqrt(again.noise + again.ways)),
+            "match_noise": size * float(np.sqrt(again.noise)),
             "between_ways": size * float(np.sqrt(again.ways)),
+            "added": size * float(np.sqrt(again.added)),
             "left_out_error": size * left_out_error,
         },
         position=position,
