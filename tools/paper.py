@@ -192,5 +192,11 @@ def main(words):
     return 1 if any(codes) else 0
 
 
+def end(number, _frame):
+    """Leave as after an error, so that a command that is running is ended, too."""
+    sys.exit(128 + number)
+
+
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, end)
     sys.exit(main(sys.argv[1:]))

@@ -150,8 +150,10 @@ def between_ways(gaps: Gaps) -> float:
     Parameters
     ----------
     gaps : dict
-        Of :func:`gaps_between_ways`.
+        Of :func:`gaps_between_ways`; 0 where it is empty, of which a caller has to warn.
     """
+    if not gaps:
+        return 0.0
     return float(np.median([deviation_of([np.abs(gap).ravel()]) for gap in gaps.values()]))
 
 
@@ -180,7 +182,7 @@ def gaps_between_ways(model: Model) -> Gaps:
     if gaps is None:
         gaps = {name: _gap(model, registration, name, onto) for name, onto in pairs}
         for old in list(_kept)[: -N_KEPT + 1]:
-            del _kept[old]
+            _kept.pop(old, None)
     _kept[key] = gaps
     return gaps
 
@@ -196,10 +198,15 @@ def _others(registration):
 
 
 def _pairs_of(study):
-    """Some of them, each with the shape that it is registered onto; none that stands apart."""
+    """Some of them, each with the shape that it is registered onto; none that stands apart.
+
+    None at all where fewer than two stand in the network beside the template.
+    """
     registration, network = registration_of(study), study["latent"]["shape"].values.tolist()
     others = [name for name in _others(registration) if name in network]
     chosen = spread([name for name in _rematched(registration) if name in network], N_WAYS)
+    if len(others) < 2:
+        return []
     half = len(others) // 2
     return [(name, others[(others.index(name) + half) % len(others)]) for name in chosen]
 

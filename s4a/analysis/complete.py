@@ -351,6 +351,11 @@ def warnings_of(result: xr.Dataset) -> list[str]:
             f"the scores of the part lie {np.sqrt(score @ score):.1f} from the mean, where "
             f"{np.sqrt(len(score)):.1f} is usual: it may be of another kind"
         )
+    if result.attrs["between_ways"] == 0:
+        said.append(
+            "how far matches of whole shapes are off could not be measured, which takes two shapes "
+            "in the network beside the template: the intervals are too narrow by it"
+        )
     if result.attrs["missing"] > 1 - TESTED_SHARE:
         missing = 100 * result.attrs["missing"]
         said.append(f"{missing:.0f} % are missing: the intervals are tested up to half")

@@ -616,8 +616,11 @@ def first_maps(bases: list[Basis], options: Options) -> tuple[np.ndarray, np.nda
         M, N = bases[i], bases[j]
         start = motion_between(motions[i], motions[j])
         R, t = realign(M.cloud, N.cloud, start)
-        maps.append(map_after_motion(M, N, (R, t), k_init=k_init, init=options.init))
-        maps.append(map_after_motion(N, M, (R.T, -R.T @ t), k_init=k_init, init=options.init))
+        for one, other, way in ((M, N, (R, t)), (N, M, (R.T, -R.T @ t))):
+            C = map_after_motion(
+                one, other, way, n_spread=options.n_spread, k_init=k_init, init=options.init
+            )
+            maps.append(C)
         source += [i, j]
         target += [j, i]
     return np.array(source), np.array(target), np.stack(maps)

@@ -124,7 +124,13 @@ def fit_after_motion(
 
 
 def map_after_motion(
-    source: Basis, target: Basis, motion: Motion, *, ahead: bool = True, **options: Any
+    source: Basis,
+    target: Basis,
+    motion: Motion,
+    *,
+    ahead: bool = True,
+    n_spread: int = 0,
+    **options: Any,
 ) -> np.ndarray:
     """:func:`fit_after_motion` of these options, and `ahead` one step of ZoomOut (4.2).
 
@@ -133,7 +139,7 @@ def map_after_motion(
     C : float ndarray (k_init, k_init)
     """
     C, _ = fit_after_motion(source, target, motion, **options)
-    return fmap.refine_once(source, target, C) if ahead else C
+    return fmap.refine_once(source, target, C, n_spread) if ahead else C
 
 
 def stretch(target: Basis, X: np.ndarray) -> float:
@@ -324,7 +330,8 @@ def first_map(
         Rigid motion of the source onto the target.
     k_init, init, ahead : see :func:`map_after_motion`
     n_spread : int
-        Of the step ahead, see :func:`s4a.method.fmap.refine_once`.
+        Of the step ahead, see :func:`s4a.method.fmap.refine_once`; maps of far poses, which are
+        looked for in other ways, take all vertices.
     search : bool
         See :func:`best_first_map`; for pairs alone, as Consistent ZoomOut mends those of a network.
     """

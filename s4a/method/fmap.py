@@ -112,11 +112,12 @@ def refine_once(source: Basis, target: Basis, C: np.ndarray, n_spread: int = 0) 
     """One step of ZoomOut without growth (4.2): C -> match -> C of the same size.
 
     Where `n_spread` is not 0, matches are looked for at as many spread vertices of the target, and
-    C is the least squares there, as in the rounds of Consistent ZoomOut.
+    C is the least squares there, as in the rounds of Consistent ZoomOut; at all of them where they
+    are fewer than the functions, which cannot be told apart then.
     """
     Phi = source.Phi[:, : C.shape[1]]
     Psi = target.Phi[:, : len(C)]
-    sampled = 0 < n_spread < len(Psi)
+    sampled = len(C) <= n_spread < len(Psi)
     rows = target.spread_vertices(n_spread) if sampled else slice(None)
     match = nearest_float32(as_queries(Psi[rows]), as_candidates(Phi @ C.T))
     if not sampled:

@@ -102,7 +102,7 @@ def map_pairs(
     ahead : bool
         Whether a step of ZoomOut is done ahead (4.2).
     n_spread : int
-        Spread vertices on which that step looks for matches; 0 for all.
+        Spread vertices on which that step looks for matches in near poses; 0 for all.
 
     Returns
     -------

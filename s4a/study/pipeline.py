@@ -126,8 +126,8 @@ def analyse(
         Whether first maps get a step of ZoomOut without growth ahead (4.2): also those of a pair
         that is matched on its own (default), those of the network alone, as in the paper, or none.
     n_spread : int, optional
-        Vertices on which the step ahead and Consistent ZoomOut look for matches (eq. 3), 1000 by
-        default; 0 for all.
+        Vertices on which Consistent ZoomOut looks for matches (eq. 3), and the step ahead of near
+        poses, 1000 by default; 0 for all.
     wide : int, optional
         Its last rounds in which these look among all vertices, 4 by default.
     sharpen : int, optional
