@@ -13,6 +13,7 @@ from s4a.analysis.calibration import (
     gaps_between_ways,
     share_to_add,
 )
+from s4a.analysis.complete import warnings_of
 from s4a.analysis.partial import model_of
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.method import posterior
@@ -173,6 +174,22 @@ def test_a_shape_that_stands_apart_from_the_network_is_registered_onto_no_other(
     gaps = gaps_between_ways(model_of(without))
     assert name not in gaps
     assert len(gaps) == 5  # of seven shapes, the template is one
+
+
+@pytest.mark.parametrize("n_beside", [0, 1])
+def test_with_fewer_than_two_shapes_beside_the_template_nothing_is_registered_and_that_is_told(
+    study, n_beside, found
+):
+    template = study["registration"].attrs["template"]
+    latent = study["latent"].to_dataset()
+    others = [name for name in latent["shape"].values if name != template]
+    few = study.copy()
+    few["latent"] = xr.DataTree(latent.sel(shape=[template, *others[:n_beside]]))
+    assert calibration.gaps_between_ways(model_of(few)) == {}
+    assert calibration.between_ways({}) == 0
+    said = warnings_of(found.assign_attrs(between_ways=0.0))
+    assert any("too narrow" in line for line in said)
+    assert not any("too narrow" in line for line in warnings_of(found))
 
 
 def test_errors_that_the_told_shapes_hold_already_are_not_added_twice():
