@@ -174,15 +174,6 @@ def test_nothing_is_fetched_to_build_or_to_read_it():
     assert "nb_ipywidgets_js = {}" in conf
 
 
-def test_it_builds_without_a_warning(site):
-    found, pages = site
-    assert found.returncode == 0, found.stderr
-    assert not re.search(
-        r"(src|href)=\"https?://[^\"]+\.(js|css)\"",
-        (pages / "glossary.html").read_text("utf-8"),
-    )
-
-
 def test_the_examples_of_every_chart_end_in_its_picture(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(DOCS))
     examples = importlib.import_module("examples")

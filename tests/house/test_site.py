@@ -1,7 +1,18 @@
-"""The built documentation in Chromium: accessible, searchable, and not too wide."""
+"""The documentation as it is built, and in Chromium: accessible, searchable, and not too wide."""
+
+import re
 
 import pytest
 from paths import DOCS, benchmark, script
+
+
+def test_it_builds_without_a_warning(site):
+    found, pages = site
+    assert found.returncode == 0, found.stderr
+    assert not re.search(
+        r"(src|href)=\"https?://[^\"]+\.(js|css)\"",
+        (pages / "glossary.html").read_text("utf-8"),
+    )
 
 
 @pytest.fixture(scope="module")
