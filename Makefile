@@ -14,7 +14,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --dist loadfile
 test: check
 	$(PYTEST)
 
-# the same, and which lines of s4a no test has run; an eighth slower
+# the same, and which lines of s4a no test has run
 coverage: $(VENV)/.test
 	$(PYTEST) --cov --cov-report=term:skip-covered
 

@@ -53,11 +53,12 @@ def move(target: Basis, warp: Warp) -> np.ndarray:
     return turn(target, R, t) + target.field(c)
 
 
-def nearest_vertices(
-    source: Basis, target: Basis, X: np.ndarray, rows: slice | np.ndarray = slice(None)
-) -> np.ndarray:
-    """The vertices of the source nearest in position and normal to rows of the target at X."""
-    return source.tree.query(features(X, vertex_normals(X, target.T))[rows])[1]
+def nearest_vertices(source: Basis, moved: Basis) -> np.ndarray:
+    """The vertices ``(s,)`` of the source nearest in position and normal to the registered target.
+
+    To its vertices near coarse ones, which at low resolution are all.
+    """
+    return source.tree.query(features(moved.X, moved.normals)[moved.near_coarse])[1]
 
 
 def fit_warp(source: Basis, target: Basis, match: np.ndarray) -> Warp:
@@ -134,7 +135,7 @@ def low_rounds(
             warp = onto(target.X, source.X[match], target.area, coefficients, spectrum)
             X = move(target, warp)
             if not spectral:
-                match = nearest_vertices(source, target, X)
+                match = nearest_vertices(source, target.moved_to(X))
                 continue
             weight = spectral / np.sqrt(K)
             C = fmap_from_match(source.Phi[:, :K], Phi, target.mass, match)
@@ -162,7 +163,7 @@ def dense_rounds(
     match : int ndarray (s,)
     warp : tuple (R, t, c)
     """
-    match = nearest_vertices(source, target, move(target, warp), target.near_coarse)
+    match = nearest_vertices(source, target.moved_to(move(target, warp)))
     R, t, _ = warp
     for _ in range(rounds):
         if R.ndim == 2:
@@ -173,7 +174,7 @@ def dense_rounds(
                 t,
                 target.coefficients(source.X[match] - turn(target, R, t)[target.near_coarse]),
             )
-        match = nearest_vertices(source, target, move(target, warp), target.near_coarse)
+        match = nearest_vertices(source, target.moved_to(move(target, warp)))
     return match, warp
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from s4a.geometry.align import Motion
-from s4a.geometry.closest import closest_point_in_star, features, match_surfaces
+from s4a.geometry.closest import closest_point_in_star, match_surfaces
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.method import joint
 from s4a.method.confidence import confidence
@@ -382,8 +382,7 @@ def register_surface(
 def scored_alone(source: Basis, target: Basis, X: np.ndarray) -> tuple[float, Basis]:
     """Score of the registered target, matched by what is nearest to it, and that target."""
     moved = target.moved_to(X)
-    rows = features(X, moved.normals)[target.near_coarse]
-    match = source.tree.query(rows)[1]
+    match = joint.nearest_vertices(source, moved)
     return joint.registration_score(source, target, match, moved), moved
 
 

@@ -108,7 +108,7 @@ def test_nearest_points_lie_on_the_surface_and_no_farther_than_nearest_vertices(
     points, normals = elastic.nearest_on_surface(shape.full, X, vertex_normals(X, T))
     assert distance_to_surface(points, shape.full.X, shape.full.T).max() < 1e-9
     assert np.linalg.norm(normals, axis=1) == pytest.approx(1)
-    vertex = joint.nearest_vertices(shape.full, template.low, X)
+    vertex = joint.nearest_vertices(shape.full, template.low.moved_to(X))
     gap = np.linalg.norm(points - X, axis=1).mean()
     assert gap < 0.9 * np.linalg.norm(shape.full.X[vertex] - X, axis=1).mean()
 
@@ -206,7 +206,9 @@ def test_a_coarse_triangle_without_area_is_no_obstacle(pair):
     assert kind == "robust"
     spoilt = coarse.drop_vars(["edge_vertex", "cotan_weight"])
     spoilt = replace(template, coarse=spoilt.assign(dataset(edge_vertex=E, cotan_weight=w)))
-    start = joint.fit_warp(shape.low, spoilt.low, joint.nearest_vertices(shape.low, spoilt.low, X))
+    start = joint.fit_warp(
+        shape.low, spoilt.low, joint.nearest_vertices(shape.low, spoilt.low.moved_to(X))
+    )
     surface = elastic_surfaces(shape, spoilt, {"icp": start})["icp"]
     assert np.isfinite(surface).all()
 
