@@ -3,7 +3,7 @@
 Two things are measured, and their variances added:
 
 1. How far what is told lies from the match of the whole: the part is cut out of shapes of the
-   study, matched and completed by all others (:func:`match_again`).
+   study, matched and completed by all others (:func:`found_again`).
 2. How far that match lies from the truth.  All shapes of a study are matched to one template.
    They are registered onto each other, too, and the way over the template is compared with the
    direct one (:func:`between_ways`).
@@ -47,7 +47,7 @@ _kept: dict[str, Gaps] = {}  # by the key of all that they depend on, the latest
 
 
 class Again(NamedTuple):
-    """What the same part of shapes of the study says, see :func:`match_again`."""
+    """What the same part of shapes of the study says, see :func:`again_of`."""
 
     noise: float
     factor: float
@@ -78,25 +78,40 @@ class Found(NamedTuple):
 def match_again(model: Model, present: np.ndarray, density: float) -> Again:
     """How well the same part of shapes of the study is found and completed by the others.
 
-    The part is cut out of up to :data:`N_REMATCHED` of them, matched by the model of the others,
-    completed, and compared with the match of the whole shape.  Nine tenths of all coordinates lie
-    within the intervals of 90 %, of one variance where the part is, and where nothing is of the
-    deviations of the distribution times ``factor``, which errors of the pose and of the match
-    widen.  Of the variance ``ways`` that the matches of whole shapes have, see
-    :func:`between_ways`, the share is added that these errors lack, see :func:`share_to_add`: that
-    gives ``noise``, the variance of a coordinate where the part is, and ``added``, what comes to
-    that of the distribution where nothing is.  ``residual`` is the largest of their fits.
+    See :func:`found_again` and :func:`again_of`.
+    """
+    return again_of(found_again(model, present, density), gaps_between_ways(model))
+
+
+def found_again(model: Model, present: np.ndarray, density: float) -> dict[str, Found]:
+    """The same part of up to :data:`N_REMATCHED` shapes of the study, each told by the others.
+
+    It is cut out of them, matched by the model of the others, completed, and compared with the
+    match of the whole shape.  Shapes of which hardly anything is left are not among them.
     """
     registration = registration_of(model.study)
     names = registration["shape"].values.tolist()
-    gaps = gaps_between_ways(model)
-    ways = between_ways(gaps) ** 2
     found = {}
     for name in _rematched(registration):
         i = names.index(name)
         one = _found_again(model, registration.isel(shape=i), i, present, density)
         if one is not None:
             found[name] = one
+    return found
+
+
+def again_of(found: dict[str, Found], gaps: Gaps) -> Again:
+    """What shapes that were told by the others say of one that is told by all.
+
+    Nine tenths of all coordinates lie within the intervals of 90 %, of one variance where the part
+    is, and where nothing is of the deviations of the distribution times ``factor``, which errors of
+    the pose and of the match widen.  Of the variance ``ways`` that the matches of whole shapes
+    have, see :func:`between_ways`, the share is added that these errors lack, see
+    :func:`share_to_add`: that gives ``noise``, the variance of a coordinate where the part is, and
+    ``added``, what comes to that of the distribution where nothing is.  ``residual`` is the largest
+    of their fits.
+    """
+    ways = between_ways(gaps) ** 2
     if not found:
         return Again(ways, 1.0, ways, ways, np.inf)
     noise, added = _calibrated({name: one.there for name, one in found.items()}, gaps)
@@ -134,8 +149,21 @@ def share_to_add(told: Sequence[tuple[np.ndarray, np.ndarray]]) -> float:
     >>> share_to_add([(-wrong, wrong)]), share_to_add([(np.array([[0.0, 0.0, 0.1]]), wrong)])
     (0.0, 1.0)
     """
-    shares = [1 + 2 * (p * g).sum() / (g**2).sum() for p, g in told if (g**2).sum() > 0]
+    shares = [1 + 2 * held(p, g) for p, g in told if (g**2).sum() > 0]
     return max(0.0, float(np.median(shares))) if shares else 1.0
+
+
+def held(p: np.ndarray, e: np.ndarray) -> float:
+    """How many times the errors e of a match are in the errors p from it: cov(p, e) / var(e).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.analysis.calibration import held
+    >>> held(np.array([-0.5, 0.0, 0.1]), np.array([1.0, 0.0, 0.0]))
+    -0.5
+    """
+    return float((p * e).sum() / (e**2).sum())
 
 
 def between_ways(gaps: Gaps) -> float:

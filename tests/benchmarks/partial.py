@@ -16,6 +16,14 @@ rustcpd gets the mean and the modes of the same study and the same part: ``pose_
 translation anchors and adaptive mixing, as it says for partial targets), ``register_atlas``,
 ``posterior``; ``--alone`` goes without it.  ``--few`` takes two shapes of each set, ``--seed N``
 other brains and faces than those of 3, ``--studies`` keeps the studies in a folder.
+
+``--left-out`` has no new shapes: of the eleven brains of the study beside its template the same
+part is missing, which a plane of random direction cuts off the mean shape, six for each share (two
+with ``--few``), and each is told by the others with the factor and the share of the others.  For
+each cut: the parts of shapes; the share of coordinates where nothing is that lie within intervals
+of 90 % around the truth, and with all of the variance between ways; and the median of cov(p, e) /
+var(e), with p what is told less the match and e the match less the truth, where nothing is, with
+what stands for e in a study, the match less the direct way, and both where the part is.
 """
 
 import logging
@@ -31,9 +39,19 @@ from scipy.spatial.transform import Rotation
 
 import s4a
 from s4a import synthetic
-from s4a.analysis.calibration import image_of
+from s4a.analysis.calibration import (
+    again_of,
+    found_again,
+    gaps_between_ways,
+    held,
+    image_of,
+    pose_of,
+)
+from s4a.analysis.inputs import registration_of
+from s4a.analysis.partial import model_of
 from s4a.geometry.align import farthest_points, rigid_transform
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
+from s4a.method import posterior
 from s4a.method.part import cut
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
@@ -61,17 +79,33 @@ HEAD = (
     "missing: rustcpd, truth in 90 %",
     "refused",
 )
+HEAD_LEFT_OUT = (
+    "missing",
+    "parts of shapes",
+    "truth in 90 %",
+    "with all of the ways",
+    "cov(p, e) / var(e)",
+    "with the direct way",
+    "there: cov(p, e) / var(e)",
+    "with the direct way",
+)
 
 
-def brains(_folder, store, few, seed):
-    """Study, new mesh and true position of the template's vertices, shape by shape."""
+def study_of_brains(store, seed):
+    """Study of the first twelve, all meshes, and true positions of the template's vertices."""
     tree = synthetic.brains(20, 6000, seed=seed)
     names = sorted(tree["original"].children)
     meshes = {name: tree["original"][name].to_dataset() for name in names}
     study = s4a.analyse({n: meshes[n] for n in names[:12]}, store=store, **OPTIONS)
     u = tree["truth"][study["registration"].attrs["template"]]["reference_point"].values
-    for name in names[12 : 12 + few]:
-        yield study, meshes[name], synthetic.position(tree["truth"], name, u)
+    return study, meshes, {n: synthetic.position(tree["truth"], n, u) for n in names}
+
+
+def brains(_folder, store, few, seed):
+    """Study, new mesh and true position of the template's vertices, shape by shape."""
+    study, meshes, true = study_of_brains(store, seed)
+    for name in sorted(meshes)[12 : 12 + few]:
+        yield study, meshes[name], true[name]
 
 
 def faces(folder, store, few, seed):
@@ -195,6 +229,68 @@ def row_of(study, mesh, true, of_whole, share, rng, *, alone=False):
     ]
 
 
+def wrong_of(model, true):
+    """By how much the match of each shape of a study is off the truth, at low resolution."""
+    registration = registration_of(model.study)
+    return {
+        name: model.X + field - pose_of(model, registration.sel(shape=name))(true[name][model.at])
+        for name, field in zip(registration["shape"].values.tolist(), model.fields, strict=True)
+    }
+
+
+def parts_of(model, share, n):
+    """Which vertices of the template `n` planes leave, and the density to tell the others with."""
+    rng = np.random.default_rng(round(10 * share))
+    for direction in rng.normal(size=(n, 3)):
+        height = (model.X + model.fields.mean(0)) @ direction
+        present = height <= np.quantile(height, 1 - share)
+        known = posterior.know(
+            model.fields, model.template.low.Phi, model.X, model.area, present, scale=model.scale
+        )
+        yield present, posterior.best_density(known, ~present)[0]
+
+
+def rows_of_left_out(found, gaps, wrong):
+    """What is measured of the same part of each shape, told by the others; nan without a gap."""
+    for name, one in found.items():
+        others = {n: other for n, other in found.items() if n != name}
+        again = again_of(others, {n: gap for n, gap in gaps.items() if n != name})
+        at, p, deviation = one.missing
+        e = wrong[name]
+        variance = (again.factor * deviation[:, None]) ** 2
+        every = np.ones(len(at), bool)
+        within = [
+            shares_within(p + e[at], np.sqrt(variance + more), every)[-1]
+            for more in (again.added, again.ways)
+        ]
+        ratios = [
+            held(part.error, of[name][part.at]) if name in of else np.nan
+            for part in (one.missing, one.there)
+            for of in (wrong, gaps)
+        ]
+        yield [*within, *ratios]
+
+
+def left_out(store, n_planes, seed):
+    """The table of shapes of a study that are told by the others."""
+    study, _, true = study_of_brains(store, seed)
+    model = model_of(study)
+    gaps, wrong = gaps_between_ways(model), wrong_of(model, true)
+    sys.stdout.write(f"\nbrains of seed {seed}, left out\n\n| {' | '.join(HEAD_LEFT_OUT)} |\n")
+    sys.stdout.write(f"|{' --- |' * len(HEAD_LEFT_OUT)}\n")
+    for share in SHARES[1:]:
+        rows = [
+            row
+            for present, density in parts_of(model, share, n_planes)
+            for row in rows_of_left_out(found_again(model, present, density), gaps, wrong)
+        ]
+        table = np.array(rows)
+        told = [*table[:, :2].mean(0), *np.nanmedian(table[:, 2:], 0)]
+        cells = [str(len(rows)), *(f"{value:.3f}" for value in told)]
+        sys.stdout.write(f"| {100 * share:.0f} % | {' | '.join(cells)} |\n")
+        sys.stdout.flush()
+
+
 def main(words):
     sets = [word for word in words if word in ("brains", "faces", "skulls")]
     sets = sets or ["brains", *(["faces", "skulls"] if DATA.is_dir() else [])]
@@ -205,6 +301,9 @@ def main(words):
             )
         keep = Path(words[words.index("--studies") + 1] if "--studies" in words else folder)
         seed = int(words[words.index("--seed") + 1]) if "--seed" in words else 3
+        if "--left-out" in words:
+            left_out(keep / f"study_brains_{seed}", 2 if "--few" in words else 6, seed)
+            return
         for name in sets:
             few = 2 if "--few" in words else 8
             rows = {share: [] for share in SHARES}
