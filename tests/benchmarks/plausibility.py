@@ -6,6 +6,10 @@ four, on which the thresholds were chosen, and others. ``plausibility.py [COLLEC
 ``plausibility.py registrations [COLLECTION ...]`` registers shapes of known correspondence, one
 template to the others of its collection, once as by default and once from first maps of 10
 landmarks, which fail in far poses; and counts of which failed registrations a run would tell.
+
+``plausibility.py planted [COLLECTION ...]`` begins one registration at a time at a wrong motion,
+the others of the collection as by default.  Which of them failed the truth alone says: one that
+finds its way is a right one.
 """
 
 import subprocess
@@ -17,11 +21,14 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
+from scipy.stats import binomtest
 
 import s4a
 from s4a.geometry.mesh import as_arrays, as_dataset, triangle_areas, vertex_areas
 from s4a.input import evidence, plausibility
+from s4a.study import pair
 from s4a.study.doubts import doubtful
+from s4a.study.options import pair_options
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 CHOSEN_ON = ("brains", "cats", "faces", "bodies 0-9")
@@ -49,6 +56,22 @@ PAIRS = {  # folder, the files of a collection, and the places of its templates 
 PAIRS_CHOSEN_ON = tuple(PAIRS)[:3]  # as are the thresholds of s4a.study.doubts
 CORRESPONDING = {"faust15k": 6890}  # of these only the first vertices correspond
 WAYS: dict[str, dict] = {"as by default": {}, "10 landmarks": {"init": "landmarks"}}
+PLANTED_IN = {  # as PAIRS
+    "bodies 0-9": ("faust", list(range(10)), (0,)),
+    "cats": ("cats", list(range(11)), (0,)),
+    "faces 1-12": ("faces", list(range(1, 13)), (0,)),
+    "bodies 10-19": ("faust", list(range(10, 20)), (3, 6)),
+    "faces 13-24": ("faces", list(range(13, 25)), (0,)),
+    "children": ("kids", list(range(6)), (0,)),
+}
+PLANTED_CHOSEN_ON = tuple(PLANTED_IN)[:3]
+TURNS = {  # along the principal axes of the target, the shortest first
+    "half a turn about the longest axis": (-1, -1, 1),
+    "half a turn about the middle axis": (-1, 1, -1),
+    "half a turn about the shortest axis": (1, -1, -1),
+    "mirrored along the shortest axis": (-1, 1, 1),
+    "mirrored along the middle axis": (1, -1, 1),
+}
 RIGHT, FAILED = 3.0, 4.0  # % of sqrt(area): a registration below and above, by its mean error
 
 
@@ -293,6 +316,139 @@ def registrations(names):
         sys.stdout.write(f"| {' | '.join(map(str, cells))} |\n")
 
 
+def turned(signs):
+    """In place of :func:`s4a.method.first_map.motion_onto`: its motion, then a wrong one."""
+    usual = pair.motion_onto
+
+    def motion(source, target):
+        R, t = usual(source, target)
+        center = target.area @ target.X / target.area.sum()
+        axis = np.linalg.eigh(np.cov(target.X.T, aweights=target.area))[1]
+        wrong = axis * signs @ axis.T
+        return wrong @ R, wrong @ (t - center) + center
+
+    return motion
+
+
+def judged(name, at, meshes, shapes):
+    """Of every registration of a collection, by default and planted: way, error and what is told.
+
+    What is planted is seen beside the registrations of the others as by default.
+    """
+    part = PLANTED_IN[name][0]
+    template, *others = [list(shapes)[at], *(n for i, n in enumerate(shapes) if i != at)]
+    error, badness, distortion = {}, {}, {}
+    for way in ("as by default", *TURNS):
+        # a first map of landmarks, as the dense one is mended by a search
+        more = {"init": "landmarks"} if way in TURNS else {}
+        options = pair_options({"both": False, "n_coarse": 3000, **more})
+        for other in others:
+            usual = pair.motion_onto
+            try:
+                pair.motion_onto = turned(TURNS[way]) if way in TURNS else usual
+                found, _ = pair.match_shapes(shapes[other], shapes[template], options)
+            finally:
+                pair.motion_onto = usual
+            known = CORRESPONDING.get(part, meshes[other].sizes["file_vertex_index"])
+            match = found["registered_match"].values
+            error[way, other] = error_of(meshes[template], meshes[other], match, known)
+            badness[way, other] = float(found.attrs["score"])
+            distortion[way, other] = float(abs(found["distortion"]).mean())
+            beside = {n: (way if n == other else "as by default", n) for n in others}
+            if way == "as by default":
+                continue  # told when all are known
+            yield (
+                way,
+                other,
+                error[way, other],
+                told_of(other, beside, badness, distortion),
+                (
+                    badness[way, other],
+                    distortion[way, other],
+                ),
+            )
+        if way == "as by default":
+            beside = {n: (way, n) for n in others}
+            for other in others:
+                told = told_of(other, beside, badness, distortion)
+                yield (
+                    way,
+                    other,
+                    error[way, other],
+                    told,
+                    (
+                        badness[way, other],
+                        distortion[way, other],
+                    ),
+                )
+
+
+def told_of(name, rows, badness, distortion):
+    """What a run would tell of a shape, where these are its registrations."""
+    of_shapes, of_all = doubtful(
+        {n: badness[row] for n, row in rows.items()},
+        {n: distortion[row] for n, row in rows.items()},
+    )
+    if of_all or any(one.doubtful for one in of_shapes.get(name, [])):
+        return "doubtful"
+    return "warning" if name in of_shapes else ""
+
+
+def share(some, of):
+    """A share and its 95 % interval by Wilson."""
+    if not of:
+        return "-"
+    low, high = binomtest(some, of).proportion_ci(0.95, "wilson")
+    return f"{some}/{of} = {some / of:.3f} ({low:.3f} to {high:.3f})"
+
+
+def planted(names):
+    """Of how many registrations that were begun wrongly and failed a run would tell."""
+    table = {}
+    with tempfile.TemporaryDirectory() as folder:
+        parts = sorted({PLANTED_IN[name][0] for name in names})
+        command = [sys.executable, DATA / "unpack.py", folder, *parts]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        options = pair_options({"both": False, "n_coarse": 3000})
+        for name in names:
+            part, numbers, places = PLANTED_IN[name]
+            files = sorted((Path(folder) / part).glob("*.ply"))
+            meshes = {files[i].stem: s4a.read_shape(files[i]) for i in numbers}
+            shapes = {n: pair.shape_of(mesh, options) for n, mesh in meshes.items()}
+            for at in places:
+                for way, other, error, told, (score, size) in judged(name, at, meshes, shapes):
+                    table.setdefault((name, way), []).append((error, told))
+                    sys.stdout.write(
+                        f"    {name}, {at}, {way}, {other}: error {error:.2f} %, badness "
+                        f"{score:.4f}, |distortion| {size:.4f}: {told or '-'}\n"
+                    )
+                    sys.stdout.flush()
+    head = "| collection | begun | failed | told | right | told in vain | between |"
+    sys.stdout.write(f"\n{head}\n{'|---' * 7}|\n")
+    for (name, way), of in table.items():
+        cells = [name, way, *counts(of)]
+        sys.stdout.write(f"| {' | '.join(map(str, cells))} |\n")
+    for what, chosen in (("on which thresholds were chosen", True), ("only reported", False)):
+        of = [
+            one
+            for (n, _), all_ in table.items()
+            if (n in PLANTED_CHOSEN_ON) == chosen
+            for one in all_
+        ]
+        failed, told, right, vain, _ = counts(of)
+        sys.stdout.write(
+            f"{what}: told of failed {share(told, failed)}, of right {share(vain, right)}\n"
+        )
+
+
+def counts(of):
+    """Failed, of these told; right, of these told; between."""
+    failed = [told for error, told in of if error > FAILED]
+    right = [told for error, told in of if error < RIGHT]
+    between = len(of) - len(failed) - len(right)
+    return len(failed), sum(map(bool, failed)), len(right), sum(map(bool, right)), between
+
+
 def main(names):
     warnings.simplefilter("ignore")
     with tempfile.TemporaryDirectory() as folder:
@@ -319,5 +475,7 @@ def main(names):
 if __name__ == "__main__":
     if sys.argv[1:2] == ["registrations"]:
         registrations(sys.argv[2:] or list(PAIRS))
+    elif sys.argv[1:2] == ["planted"]:
+        planted(sys.argv[2:] or list(PLANTED_IN))
     else:
         main(sys.argv[1:])
