@@ -50,6 +50,8 @@ from s4a.method.spectral import factor
 # Of the first and of the last step.  Chosen on a pair of faces, of brains and of skulls and two
 # cortex templates, reported on others: docs/decisions.md
 STIFFNESS = (1e-4, 1e-7)
+# Before, from each start: so stiff that starts meet, in so many rounds.  Chosen on heads 2 to 6
+STIFFEST, N_MEETING = 1e-3, 16
 # Of the first two steps, in which different starts meet, and of the others, in which vertices must
 # not drift along the surface any more
 SLIDE = (0.01, 0.1)
@@ -59,15 +61,23 @@ SETTLED = 1.2  # as long as a step lets the bending energy grow by less than tha
 RIM_WEIGHT = 0.01  # share of sqrt(area): of distances at the boundary, by its length
 RIM_NEAR = 0.03  # share of sqrt(area): boundaries that are farther apart may be cut anywhere
 LANDMARK_WEIGHT = 1e-3  # of each landmark: as much as this share of the area
+MEET = 0.01  # share of sqrt(area): starts that end nearer to each other than that go on as one
 N_ROUNDS = 8
 STILL = 1e-3  # share of sqrt(area): a step ends with a round that moves less
 TIME = (2e-2, 2e-4)  # of local rounds: smooth over 0.2, then over 0.02 of sqrt(area)
 LOCAL_SLIDE = 0.5
 N_LOCAL_ROUNDS = 10
 
+Rows = np.ndarray | slice
+ALL = slice(None)
+
 
 def nearest_on_surface(
-    source: Basis, X: np.ndarray, normals: np.ndarray, target: Basis | None = None
+    source: Basis,
+    X: np.ndarray,
+    normals: np.ndarray,
+    target: Basis | None = None,
+    vertices: Rows = ALL,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The points of the source's surface nearest to rows of X in position and normal.
 
@@ -80,6 +90,8 @@ def nearest_on_surface(
     X, normals : float ndarray (n, 3)
     target : Basis, optional
         The surface whose n vertices these are, which may have fields.
+    vertices : int ndarray (n,), optional
+        Which of its vertices; all by default.
 
     Returns
     -------
@@ -87,7 +99,8 @@ def nearest_on_surface(
         On the surface of the source.
     """
     names = () if target is None else common_fields(source, target)
-    rows = features(X, normals, field_columns(target, names) if names else None)  # (n, 6 + f)
+    fields = field_columns(target, names)[vertices] if names else None
+    rows = features(X, normals, fields)  # (n, 6 + f)
     tree = source.guided_tree(names)
     nearest = tree.query(rows)[1]
     triangle, weights = closest_point_in_star(rows, nearest, tree.data, source.T, source.stars)
@@ -96,8 +109,12 @@ def nearest_on_surface(
     return points, unit(normals)
 
 
-def points_ahead(source: Basis, target: Basis, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def points_ahead(
+    source: Basis, target: Basis, X: np.ndarray, vertices: Rows = ALL
+) -> tuple[np.ndarray, np.ndarray]:
     """Where the target's vertices at X are drawn, and the directions across both surfaces there.
+
+    All n of them, or some.
 
     Returns
     -------
@@ -106,8 +123,8 @@ def points_ahead(source: Basis, target: Basis, X: np.ndarray) -> tuple[np.ndarra
     m : float ndarray (n, 3)
         Unit mean of the normals of both surfaces.
     """
-    normals = target.normals_at(X)
-    y, normals_y = nearest_on_surface(source, X, normals, target)
+    normals = target.normals_at(X)[vertices]
+    y, normals_y = nearest_on_surface(source, X[vertices], normals, target, vertices)
     return y, unit(normals + normals_y)
 
 
@@ -200,6 +217,12 @@ def normal_equations(
     return matrix, right.T.ravel()
 
 
+def spread_area(target: Basis, spread: np.ndarray) -> np.ndarray:
+    """The area ``(s,)`` of the vertices nearest to each of some that are spread over a surface."""
+    nearest = cKDTree(target.X[spread]).query(target.X)[1]
+    return np.bincount(nearest, target.area, len(spread))
+
+
 def pins(
     landmarks: Landmarks | None, smooth: np.ndarray, R: np.ndarray, t: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray] | None:
@@ -222,6 +245,7 @@ def elastic_rounds(
     slide: tuple[float, float] = SLIDE,
     steps: slice = slice(None),
     rounds: int = N_ROUNDS,
+    vertices: Rows = ALL,
     landmarks: Landmarks | None = None,
 ) -> Warp:
     """The warp after rounds in which the target's displacement becomes less and less stiff.
@@ -245,6 +269,8 @@ def elastic_rounds(
         Those of the 8 and 5 further ones that are made; at least two before the further ones.
     rounds : int
         With each value at most; fewer where nothing moves any more.
+    vertices : int ndarray (s,), optional
+        Those of the target that are drawn, each for the area around it; all by default.
     landmarks : Landmarks, optional
 
     Returns
@@ -263,14 +289,16 @@ def elastic_rounds(
     X = move(target, warp)
     fall = (stiffness[1] / stiffness[0]) ** (1 / (N_STEPS - 1))
     energies: list[float] = []  # of bending, after each step
-    mass = E.T @ (target.area[:, None] * E)
+    area = target.area if isinstance(vertices, slice) else spread_area(target, vertices)
+    F = E[vertices]
+    mass = F.T @ (area[:, None] * F)
     for step in range(N_STEPS + N_FURTHER)[steps]:
         if step >= N_STEPS and energies[-1] > SETTLED * energies[-2]:
             break
         price = stiffness[0] * fall**step * bending
         for _ in range(rounds):
-            y, m = points_ahead(source, target, X)
-            matrix, right = normal_equations(E, target.area, m, y, slide[step >= 2], mass)
+            y, m = points_ahead(source, target, X, vertices)
+            matrix, right = normal_equations(F, area, m, y, slide[step >= 2], mass)
             rim = rim_ahead(source, target, X) if step >= 2 else None
             if rim is not None:
                 vertex, length, across, y = rim
@@ -291,6 +319,50 @@ def elastic_rounds(
     b = w[-1]
     c = np.concatenate([np.zeros((1, 3)), w[:-4]])  # (K, 3)
     return A @ R, A @ t + b, c
+
+
+def starts_that_meet(
+    source: Basis, target: Basis, starts: dict[str, Warp], landmarks: Landmarks | None = None
+) -> dict[str, Warp]:
+    """Starts of elastic rounds after a step so stiff that near ones meet; the mean of those.
+
+    Which of them is the better, small changes of the input decide; the mean follows these.
+
+    Parameters
+    ----------
+    source, target, landmarks : see :func:`elastic_rounds`
+    starts : dict
+        Name -> warp (R, t, c), with one motion for all.
+
+    Returns
+    -------
+    dict
+        Starts that end within :data:`MEET` of the first of some are one, by its name.
+    """
+    spread = target.spread_vertices()
+    met: dict[str, list[Warp]] = {}
+    for name, start in starts.items():
+        warp = elastic_rounds(
+            source,
+            target,
+            start,
+            stiffness=(STIFFEST, STIFFEST),
+            steps=slice(0, 1),
+            rounds=N_MEETING,
+            vertices=spread,
+            landmarks=landmarks,
+        )
+        X = move(target, warp)
+        near = (
+            one
+            for one, (first, *_) in met.items()
+            if np.linalg.norm(X - move(target, first), axis=1) @ target.area < MEET
+        )
+        met.setdefault(next(near, name), []).append(warp)
+    return {
+        name: tuple(sum(p) / len(p) for p in zip(*found, strict=True))
+        for name, found in met.items()
+    }
 
 
 def local_rounds(

@@ -15,14 +15,12 @@ from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.method import joint
 from s4a.method.confidence import confidence
 from s4a.method.deform import displacement_in_template
-from s4a.method.elastic import Landmarks, elastic_rounds, local_rounds
+from s4a.method.elastic import Landmarks, elastic_rounds, local_rounds, starts_that_meet
 from s4a.method.first_map import nearest_after_motion
 from s4a.method.fmap import fmap_from_match
 from s4a.method.nearest import nearest_in_cells, nearest_of_few, nearest_rows
 from s4a.method.shape import Basis, Shape
 from s4a.schema import INPUT, dataset, in_unit
-
-SAME = 0.002  # share of sqrt(area): starts that are nearer after the first step end as one
 
 Functions = tuple[np.ndarray, np.ndarray]  # of source and target, rows of which are compared
 
@@ -394,18 +392,12 @@ def elastic_surfaces(
 ) -> dict[str, np.ndarray]:
     """The template ``(n_target, 3)`` after elastic rounds from several starts, and local ones.
 
-    Starts that meet in the first, stiffest step go on as one, by the name of the first.
+    Starts that meet go on as one, see :func:`s4a.method.elastic.starts_that_meet`.
     """
     M, N = source.full, target.low_on_surface
-    met: dict[str, np.ndarray] = {}  # name -> template (n_low, 3) after the first step
     surfaces = {}
-    for name, start in starts.items():
-        warp = elastic_rounds(M, N, start, steps=slice(0, 1), landmarks=landmarks)
-        X = joint.move(N, warp)
-        if any(np.linalg.norm(X - other, axis=1) @ N.area < SAME for other in met.values()):
-            continue
-        met[name] = X
-        warp = elastic_rounds(M, N, warp, steps=slice(1, None), landmarks=landmarks)
+    for name, start in starts_that_meet(M, N, starts, landmarks).items():
+        warp = elastic_rounds(M, N, start, landmarks=landmarks)
         surfaces[name] = after_local_rounds(source, target, warp, landmarks)
     return surfaces
 

@@ -190,11 +190,20 @@ def test_where_parts_turned_on_their_own_local_rounds_alone_follow(pair, monkeyp
 def test_starts_that_meet_go_on_as_one_and_others_are_both_kept(pair):
     template, shape, _ = pair
     here, there = starts(template, shape)[:2]
-    away = here[0], here[1] + 0.5, here[2]
+    turn = np.diag([-1.0, -1.0, 1.0])  # half a turn
+    away = turn @ here[0], turn @ here[1], here[2] @ turn
     found = elastic_surfaces(shape, template, {"here": here, "there": there, "away": away})
     assert set(found) == {"here", "away"}
     alone = elastic_surfaces(shape, template, {"there": there})["there"]
     assert np.linalg.norm(alone - found["here"], axis=1).mean() < 1e-3
+
+
+def test_which_of_two_starts_that_meet_is_the_first_does_not_matter(pair):
+    template, shape, _ = pair
+    here, there = starts(template, shape)[:2]
+    one = elastic_surfaces(shape, template, {"here": here, "there": there})["here"]
+    other = elastic_surfaces(shape, template, {"there": there, "here": here})["there"]
+    assert np.allclose(one, other, atol=1e-9)
 
 
 def test_a_coarse_triangle_without_area_is_no_obstacle(pair):
