@@ -47,16 +47,17 @@ from s4a.method.joint import Warp, move, turn
 from s4a.method.shape import Basis, common_fields, field_columns
 from s4a.method.spectral import factor
 
-# Of the first and of the last step.  Chosen on a pair of faces, of brains and of skulls and two
-# cortex templates, reported on others: docs/decisions.md
-STIFFNESS = (1e-4, 1e-7)
-# Before, from each start: so stiff that starts meet, in so many rounds.  Chosen on heads 2 to 6
-STIFFEST, N_MEETING = 1e-3, 16
+N_STEPS = 8
+N_FURTHER = 5  # steps at most, where the last was nearly in vain
+# Of each step: from 1e-4 to 1e-7 by equal factors, and on.  Chosen on a pair of faces, of brains
+# and of skulls and two cortex templates, reported on others: docs/decisions.md
+STIFFNESS = 1e-4 * 1e-3 ** (np.arange(N_STEPS + N_FURTHER) / (N_STEPS - 1))
+# Before, from each start: so stiff that starts meet, in rounds until they are as still as this.
+# Chosen on heads 2 to 6
+STIFFEST, N_MEETING, STILLEST = np.array([1e-2, 1e-3]), 32, 1e-4
 # Of the first two steps, in which different starts meet, and of the others, in which vertices must
 # not drift along the surface any more
 SLIDE = (0.01, 0.1)
-N_STEPS = 8
-N_FURTHER = 5  # steps at most, each with as much less stiffness, where the last was nearly in vain
 SETTLED = 1.2  # as long as a step lets the bending energy grow by less than that factor
 RIM_WEIGHT = 0.01  # share of sqrt(area): of distances at the boundary, by its length
 RIM_NEAR = 0.03  # share of sqrt(area): boundaries that are farther apart may be cut anywhere
@@ -241,10 +242,11 @@ def elastic_rounds(
     target: Basis,
     warp: Warp,
     *,
-    stiffness: tuple[float, float] = STIFFNESS,
+    stiffness: np.ndarray = STIFFNESS,
+    further: int = N_FURTHER,
     slide: tuple[float, float] = SLIDE,
-    steps: slice = slice(None),
     rounds: int = N_ROUNDS,
+    still: float = STILL,
     vertices: Rows = ALL,
     landmarks: Landmarks | None = None,
 ) -> Warp:
@@ -259,16 +261,18 @@ def elastic_rounds(
         :attr:`s4a.method.shape.Shape.low_on_surface`.
     warp : tuple (R, t, c)
         Where to begin, with one motion for all: bending is counted from there.
-    stiffness : tuple of float
-        Of the first and of the last of 8 steps, between which it falls by equal factors.  Up to 5
-        further steps go on as long as the last let the bending energy grow by less than a fifth.
+    stiffness : float ndarray (steps,)
+        Of each step.
+    further : int
+        How many of the steps, the last ones, are made only as long as the one before let the
+        bending energy grow by less than a fifth.
     slide : tuple of float
         Weight of the distance along the surface in the first two steps, and in the others; that
         across it weighs 1.
-    steps : slice
-        Those of the 8 and 5 further ones that are made; at least two before the further ones.
     rounds : int
         With each value at most; fewer where nothing moves any more.
+    still : float
+        Share of sqrt(area): the root mean square of what a round moves, below which it is the last.
     vertices : int ndarray (s,), optional
         Those of the target that are drawn, each for the area around it; all by default.
     landmarks : Landmarks, optional
@@ -287,15 +291,14 @@ def elastic_rounds(
     bending = np.zeros(E.shape[1])
     bending[: smooth.shape[1]] = target.eigenvalue[1:] ** 2
     X = move(target, warp)
-    fall = (stiffness[1] / stiffness[0]) ** (1 / (N_STEPS - 1))
     energies: list[float] = []  # of bending, after each step
     area = target.area if isinstance(vertices, slice) else spread_area(target, vertices)
     F = E[vertices]
     mass = F.T @ (area[:, None] * F)
-    for step in range(N_STEPS + N_FURTHER)[steps]:
-        if step >= N_STEPS and energies[-1] > SETTLED * energies[-2]:
+    for step, stiff in enumerate(stiffness):
+        if step >= len(stiffness) - further and energies[-1] > SETTLED * energies[-2]:
             break
-        price = stiffness[0] * fall**step * bending
+        price = stiff * bending
         for _ in range(rounds):
             y, m = points_ahead(source, target, X, vertices)
             matrix, right = normal_equations(F, area, m, y, slide[step >= 2], mass)
@@ -312,7 +315,7 @@ def elastic_rounds(
             matrix[np.diag_indices_from(matrix)] += np.tile(price, 3) + 1e-12
             w = scipy.linalg.solve(matrix, right, assume_a="pos").reshape(3, -1).T  # (q, 3)
             before, X = X, E @ w
-            if target.area @ ((X - before) ** 2).sum(1) < STILL**2:
+            if target.area @ ((X - before) ** 2).sum(1) < still**2:
                 break
         energies.append(bending @ (w**2).sum(1))
     A = w[-4:-1].T  # (3, 3)
@@ -324,7 +327,7 @@ def elastic_rounds(
 def starts_that_meet(
     source: Basis, target: Basis, starts: dict[str, Warp], landmarks: Landmarks | None = None
 ) -> dict[str, Warp]:
-    """Starts of elastic rounds after a step so stiff that near ones meet; the mean of those.
+    """Starts of elastic rounds after steps so stiff that near ones meet; the mean of those.
 
     Which of them is the better, small changes of the input decide; the mean follows these.
 
@@ -346,9 +349,10 @@ def starts_that_meet(
             source,
             target,
             start,
-            stiffness=(STIFFEST, STIFFEST),
-            steps=slice(0, 1),
+            stiffness=STIFFEST,
+            further=0,
             rounds=N_MEETING,
+            still=STILLEST,
             vertices=spread,
             landmarks=landmarks,
         )
