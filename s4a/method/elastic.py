@@ -13,8 +13,9 @@ and Medioni (1992), with the normals of both surfaces as of Rusinkiewicz (2019).
 the bending energy, the integral of |Laplacian|^2 of the displacement.  The stiffness falls from
 round to round, as in the non-rigid ICP of Amberg, Romdhani and Vetter (CVPR 2007), and on where the
 bending energy has settled: there the template follows the shape, and what the price shrinks is the
-displacement alone.  Where each step bends it more, it would follow noise.  Lengths are for surfaces
-of unit area.
+displacement alone.  Where each step bends it more, it would follow noise.  Before all that each
+start is made so stiff that near starts meet, and their mean goes on (:func:`starts_that_meet`).
+Lengths are for surfaces of unit area.
 
 Nothing above keeps a surface from shifting along itself over its own boundary.  Where both
 boundaries lie on each other already they are taken for one line, and the squared distances from it
@@ -53,7 +54,7 @@ N_FURTHER = 5  # steps at most, where the last was nearly in vain
 # and of skulls and two cortex templates, reported on others: docs/decisions.md
 STIFFNESS = 1e-4 * 1e-3 ** (np.arange(N_STEPS + N_FURTHER) / (N_STEPS - 1))
 # Before, from each start: so stiff that starts meet, in rounds until they are as still as this.
-# Chosen on heads 2 to 6
+# Chosen on heads 2 to 10, with nothing left to report on but other collections
 STIFFEST, N_MEETING, STILLEST = np.array([1e-2, 1e-3]), 32, 1e-4
 # Of the first two steps, in which different starts meet, and of the others, in which vertices must
 # not drift along the surface any more
