@@ -30,7 +30,7 @@ HELP = {
     "init": "first maps from all nearest neighbours, or the paper's fit on 10 landmarks",
     "ahead": "a step of ZoomOut for all first maps, for those of the network alone, or none",
     "n_spread": "vertices at which the network looks for matches; 0 for all",
-    "wide": "its last rounds in which these look among all vertices",
+    "wide": "its last rounds in which these look between the samples, too",
     "sharpen": "rounds of ZoomOut of a single pair that look among all vertices of the source",
     "refine": "elastic rounds, joint ones, or the paper's spectral match alone",
     "parts": "in far poses joint rounds turn every part on its own",

@@ -7,7 +7,7 @@ unit nor rounding matters.
 import igl.predicates
 import numpy as np
 
-from s4a.geometry.mesh import equal_rows
+from s4a.geometry.mesh import equal_rows, order_in_space
 
 # Pairs that cross are held at once, 40 bytes each: of a surface crumpled into a ball they are all
 MOST_PAIRS = 10_000_000
@@ -46,6 +46,7 @@ def count_crossing(X: np.ndarray, T: np.ndarray, *, most_pairs: int = MOST_PAIRS
     first, place = equal_rows(X)
     X = np.ascontiguousarray(X[first])
     T = np.ascontiguousarray(place[T], np.int64)
+    T = T[order_in_space(X[T].mean(1))]  # in no order at all the search takes three times as long
     expected = expected_pairs(X, T)
     if expected <= most_pairs:
         _, pair, _ = igl.predicates.find_self_intersections(X, T)

@@ -10,6 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 import xarray as xr
 from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.spatial import cKDTree
 
 from s4a.schema import dataset
 
@@ -153,6 +154,23 @@ def counting_order(key: np.ndarray, n: int) -> np.ndarray:
         raise IndexError(f"numbers from 0 to {n - 1} needed, found {key.min()} to {key.max()}")
     one_a_row = sp.csr_matrix((np.ones(m, np.int8), key, np.arange(m + 1)), (m, n))
     return one_a_row.tocsc().indices.astype(np.int64)
+
+
+def order_in_space(X: np.ndarray) -> np.ndarray:
+    """An order of points in which neighbours mostly follow each other, that of a KD-tree ``(n,)``.
+
+    What takes them in this order finds most in the cache, whatever the order of their file.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.geometry.mesh import order_in_space
+    >>> X = np.random.default_rng(0).random((1000, 3))
+    >>> def steps(X): return float(np.linalg.norm(np.diff(X, axis=0), axis=1).mean().round(1))
+    >>> steps(X), steps(X[order_in_space(X)])
+    (0.7, 0.2)
+    """
+    return cKDTree(X, balanced_tree=False, compact_nodes=False).indices
 
 
 def equal_rows(A: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -13,11 +13,13 @@ import numpy as np
 from joblib import Parallel, delayed
 from scipy.sparse.csgraph import breadth_first_order
 from scipy.sparse.linalg import LinearOperator, eigsh
+from scipy.spatial import cKDTree
 
 from s4a.method.fmap import fmap_from_match
 from s4a.method.nearest import (
     as_candidates,
     as_queries,
+    nearest_around,
     nearest_float32,
     nearest_rows,
 )
@@ -28,7 +30,8 @@ log = logging.getLogger(__name__)
 
 FINAL = 3  # shapes of a study in the last rounds of a new one, on all vertices
 TARGETS = 256  # shapes whose least squares are held at once, 0.3 GB of them
-WIDE = 4  # last rounds of Consistent ZoomOut, which look among all vertices
+WIDE = 4  # last rounds of Consistent ZoomOut, which look between the samples, too
+N_AROUND = 32  # vertices around a sample among which they look
 ROUGH, FINE = 1e-4, 1e-6  # tolerances of the latent basis: on the way, and at the end
 
 Form = Callable[[np.ndarray], np.ndarray]  # the product of a quadratic form with vectors
@@ -268,10 +271,10 @@ def consistent_zoomout(
     Each round embeds every shape in the latent space (rows of Phi_i Y_i), matches nearest
     neighbours for every map (eq. 3) and solves for the next larger maps in the least-squares sense,
     on `samples` only, whose least squares are factored once a round and target shape; on
-    samples Phi^T A of eq. 1 is no inverse of Phi.  In the `wide` last rounds the samples look among
-    all vertices of the source: among its samples they are off by the spacing of these.  With all
-    vertices as samples it is the paper's.  The latent basis is found to ``ROUGH`` on the way and to
-    ``FINE`` at the end.
+    samples Phi^T A of eq. 1 is no inverse of Phi.  Among the source's samples matches are off by
+    the spacing of these: in the `wide` last rounds they are looked for among the ``N_AROUND``
+    vertices around the sample that was found, too.  With all vertices as samples it is the paper's.
+    The latent basis is found to ``ROUGH`` on the way and to ``FINE`` at the end.
 
     Parameters
     ----------
@@ -292,7 +295,7 @@ def consistent_zoomout(
     samples : list of int ndarray, optional
         Spread vertices of every shape; all vertices by default.
     wide : int
-        Last rounds that look among all vertices.
+        Last rounds that look between the samples.
     n_jobs : int
         Threads; the result does not depend on it.
     progress : callable, optional
@@ -308,17 +311,15 @@ def consistent_zoomout(
     Y, latent_eigenvalue : as of :func:`latent_basis`
     """
     cycles = three_cycles(source.tolist(), target.tolist())
+    wide = 0 if samples is None else wide
+    n_around = N_AROUND if wide else 1
     sampled = [
-        Sampled(
-            basis.eigenvalue[:k],
-            basis.Phi if samples is None else basis.Phi[samples[i]],
-            basis.area if samples is None else basis.area[samples[i]],
-        )
+        sample(basis, None if samples is None else samples[i], k, n_around)
         for i, basis in enumerate(bases)
     ]
     eigenvalues = np.stack([one.eigenvalue for one in sampled])
     sizes = [*range(C.shape[1], k, step), k]
-    wide_sizes = sizes[:-1][max(len(sizes) - 1 - wide, 0) :] if samples is not None else []
+    wide_sizes = sizes[:-1][max(len(sizes) - 1 - wide, 0) :]
     for size, next_size in zip(
         sizes, [*sizes[1:], None], strict=True
     ):  # the last only solves for Y
@@ -343,12 +344,28 @@ def consistent_zoomout(
 class Sampled(NamedTuple):
     """What Consistent ZoomOut holds of a shape in memory: its functions at its samples.
 
-    ``eigenvalue (k,)``, ``Phi (s, >= k)`` and ``area (s,)``.
+    ``eigenvalue (k,)``, ``vertex (s,)``, ``Phi (s, >= k)`` and ``area (s,)`` there, and
+    ``around (s, w)``, the vertices nearest to each.
     """
 
     eigenvalue: np.ndarray
+    vertex: np.ndarray
     Phi: np.ndarray
     area: np.ndarray
+    around: np.ndarray
+
+
+def sample(basis: Basis, vertex: np.ndarray | None, k: int, n_around: int) -> Sampled:
+    """A shape at some of its vertices, or at all where None, and so many around each."""
+    eigenvalue = basis.eigenvalue[:k]
+    if vertex is None:
+        every = np.arange(len(basis.area))
+        return Sampled(eigenvalue, every, basis.Phi, basis.area, every[:, None])
+    around = vertex[:, None]
+    if n_around > 1:
+        first = np.arange(1, min(n_around, len(basis.X)) + 1)
+        around = cKDTree(basis.X).query(basis.X[vertex], first)[1]
+    return Sampled(eigenvalue, vertex, basis.Phi[vertex], basis.area[vertex], around)
 
 
 def larger_maps(
@@ -369,8 +386,8 @@ def larger_maps(
     Y : float ndarray (n, size, m)
         Latent bases, of a smaller size.
     bases : sequence of Basis, optional
-        All vertices of every shape, among which matches are looked for, one or a few shapes at a
-        time; among the samples by default.
+        All vertices of every shape, where matches are looked for between the samples, too; one or a
+        few shapes are asked for at a time.
     """
     size = Y.shape[1]
     C = np.empty((len(target), k, k))
@@ -388,7 +405,11 @@ def larger_maps(
         candidates = as_candidates(np.ascontiguousarray(Phi[:, :size]) @ Y[i])
         for r in rows:
             solve, query = of_target[target[r]]
-            C[r] = solve @ Phi.take(nearest_float32(query, candidates), axis=0)[:, :k]
+            if bases is None:
+                match = nearest_float32(query, candidates)
+            else:
+                match = nearest_around(query, candidates, sampled[i].vertex, sampled[i].around)
+            C[r] = solve @ Phi.take(match, axis=0)[:, :k]
 
     threads = Parallel(n_jobs=n_jobs, backend="threading")
     for begin in range(0, len(sampled), TARGETS):

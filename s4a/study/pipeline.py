@@ -129,7 +129,7 @@ def analyse(
         Vertices on which Consistent ZoomOut looks for matches (eq. 3), and the step ahead of near
         poses, 1000 by default; 0 for all.
     wide : int, optional
-        Its last rounds in which these look among all vertices, 4 by default.
+        Its last rounds in which these look between the samples, too, 4 by default.
     sharpen : int, optional
         Of pairs that are matched on their own, see :func:`s4a.match_pair`, as external meshes of a
         transfer are.

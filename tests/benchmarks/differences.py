@@ -88,7 +88,7 @@ SWITCHES = [
         "wide",
         "eq. 3",
         "",
-        "the last rounds look among all vertices",
+        "the last rounds look between the samples, too",
         "`method/latent`",
     ),
     Switch(

@@ -165,6 +165,22 @@ def test_consistent_zoomout_does_not_depend_on_the_workers_or_on_what_is_held(
         assert np.array_equal(a, c)
 
 
+def test_wide_rounds_look_between_the_samples_near_the_one_that_is_found(
+    shapes, first, monkeypatch
+):
+    samples = [Shape(None, shape).low.spread_vertices(150) for shape in shapes]  # of 600
+
+    def maps(wide, n_around=latent.N_AROUND):
+        monkeypatch.setattr(latent, "N_AROUND", n_around)
+        return zoomed(shapes, first, samples=samples, wide=wide)[0]
+
+    of_all = zoomed(shapes, first)[0]
+    far = {wide: np.linalg.norm(maps(wide) - of_all) for wide in (0, 2)}
+    assert far[2] < 0.6 * far[0]
+    assert np.array_equal(maps(2, n_around=1), maps(0))
+    assert np.abs(maps(2, n_around=600) - maps(2)).max() < 0.02  # 32 are nearly as good as all
+
+
 def test_consistent_zoomout_closes_cycles_better_than_the_first_maps(shapes, first):
     cycles = network.three_cycles(*complete(3).tolist())
     _, _, error, _, _ = zoomed(shapes, first)

@@ -6,7 +6,17 @@ The answer of an exhaustive search, with fewer comparisons.
 import numpy as np
 import pytest
 
-from s4a.method.nearest import into_cells, nearest_in_cells, nearest_of_few
+from s4a import synthetic
+from s4a.geometry.mesh import as_arrays
+from s4a.method.nearest import (
+    as_candidates,
+    as_queries,
+    into_cells,
+    nearest_around,
+    nearest_float32,
+    nearest_in_cells,
+    nearest_of_few,
+)
 
 
 def gaps(Q, D):
@@ -143,3 +153,18 @@ def test_few_queries_take_the_first_of_equally_near_rows():
     D = rng.normal(size=(200, 12))
     found = nearest_of_few(D, np.concatenate([D, D]), rng.integers(0, 9, 400))
     assert (found == np.arange(200)).all()
+
+
+def test_a_search_around_what_is_found_among_some_gives_nearly_what_is_nearest_of_all():
+    X, _ = as_arrays(synthetic.ellipsoid(900))
+    some = np.arange(0, 900, 6)  # spread: the vertices are a spiral
+    gap = np.linalg.norm(X[some, None] - X, axis=2)  # (some, n)
+    q, d = as_queries(X + 0.01), as_candidates(X)
+    exact = nearest_float32(q, d)
+
+    def found(width):
+        return nearest_around(q, d, some, np.argsort(gap, axis=1)[:, :width])
+
+    assert np.array_equal(found(900), exact)
+    assert np.isin(found(1), some).all()
+    assert (found(32) == exact).mean() > 0.99 > (found(4) == exact).mean()
