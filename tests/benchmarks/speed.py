@@ -5,10 +5,12 @@ input: seconds of CPU, of the clock, and the peak of memory above what the proce
 pyFM is on PyPI as ``pyfmaps`` (the extra ``bench``).  ``speed.py stages``, ``pipelines``,
 ``growth``, ``pairs``, ``nearest`` or ``seals`` runs one part, ``speed.py methods brains faces
 heads`` an analysis by RE-MATCH and by SCALABLE of ten shapes of each, ``speed.py whole 51 100000``
-the whole analysis of so many synthetic shapes of so many vertices.
+the whole analysis of so many synthetic shapes of so many vertices, ``speed.py versions COMMIT 51
+100000`` the same by an older version and by this one, three times in turn.
 """
 
 import itertools
+import json
 import multiprocessing
 import os
 import resource
@@ -733,6 +735,93 @@ def whole(folder, n=51, n_vertices=VERTICES):
         say(f"{stage:36} {seconds:8.1f} s {memory:8.0f} MiB")
 
 
+# the analysis of one version in a process of its own: its stages, and where the template's vertices
+# are on every shape
+ONE_VERSION = """
+import json, sys, time
+import numpy as np
+import s4a
+paths, store, images, most = json.loads(sys.argv[1])
+begin = time.perf_counter()
+s4a.analyse(paths, store=store, n_jobs=-1)
+wall = time.perf_counter() - begin
+study = s4a.open_study(store)
+report, found = (study[node].to_dataset() for node in ("report", "registration"))
+template = study["latent"].attrs["median"]
+X = study["original"][template]["position"].values
+some = np.linspace(0, len(X) - 1, most).astype(int)
+image = {}
+for name in found["shape"].values.tolist():
+    one = found.sel(shape=name)
+    moved = X[some] + one["displacement"].values[some] - one["translation"].values
+    image[name] = moved @ one["rotation"].values / one["scale"].item()
+np.savez(images, some=some, **image)
+columns = (report[name].values.tolist() for name in ("stage", "seconds", "peak_memory"))
+areas = {name: float(mesh.attrs["area"]) for name, mesh in study["original"].children.items()}
+print(json.dumps({"wall": wall, "template": template, "area": areas, "stages": [*zip(*columns)]}))
+"""
+
+
+def versions(folder, revision, n=51, n_vertices=VERTICES, times=3):
+    """One collection as an older version of the repository analyses it and as this one, in turn.
+
+    Stages, memory, and the mean distance of the registered surfaces from the truth, of 2,000
+    vertices of the template.  The older version runs with the packages that are installed now.
+    """
+    root = Path(__file__).parents[2]
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        paths, truth = pool.submit(collection, n, n_vertices, folder / "files").result()
+    old = folder / "old"
+    git = ["git", "-C", root, "worktree"]
+    subprocess.run([*git, "add", "--detach", old, revision], check=True, capture_output=True)
+    runs = {f"at {revision}": [], "here": []}
+    try:
+        for i in range(times):
+            for (name, found), tree in zip(runs.items(), (old, root), strict=True):
+                study, images = folder / f"{i}_{tree.name}", folder / "images.npz"
+                given = json.dumps([[str(path) for path in paths], str(study), str(images), 2000])
+                end = subprocess.run(
+                    [sys.executable, "-c", ONE_VERSION, given],
+                    env=os.environ | {"PYTHONPATH": str(tree)},
+                    cwd=tree,
+                    check=True,
+                    stdout=subprocess.PIPE,
+                    text=True,
+                )
+                one = json.loads(end.stdout.splitlines()[-1])
+                one["error"] = error_of(images, one["template"], one["area"], truth)
+                found.append(one)
+                say(f"{name}: {one['wall']:.0f} s, error {one['error']:.3f} %")
+                shutil.rmtree(study)
+    finally:
+        subprocess.run([*git, "remove", "--force", old], check=True)
+    say(
+        f"\n{n} shapes of {n_vertices:,} vertices, all defaults, on {os.cpu_count()} cores; "
+        f"seconds of {times} runs in turn, and the largest memory\n"
+    )
+    for name, found in runs.items():
+        say(f"{name}\n")
+        rows = [*zip(*(one["stages"] for one in found), strict=True)]
+        for row in rows:
+            seconds = " ".join(f"{spent:8.1f}" for _, spent, _ in row)
+            say(f"{row[0][0]:36} {seconds} s {max(peak for *_, peak in row):8.0f} MiB")
+        seconds = " ".join(f"{one['wall']:8.1f}" for one in found)
+        errors = " ".join(f"{one['error']:8.3f}" for one in found)
+        say(f"{'whole':36} {seconds} s\n{'error of the surfaces':36} {errors} %\n")
+
+
+def error_of(images, template, area, truth):
+    """Mean distance to the truth of vertices of the template on all shapes, % of sqrt(area)."""
+    with np.load(images) as arrays:
+        at = truth[template]["reference_point"].values[arrays["some"]]
+        names = [name for name in arrays.files if name not in ("some", template)]
+        gaps = [
+            np.linalg.norm(arrays[name] - synthetic.position(truth, name, at), axis=1).mean()
+            for name in names
+        ]
+    return 100 * float(np.mean(gaps / np.sqrt([area[name] for name in names])))
+
+
 def cpu_of(function, times=20):
     """Milliseconds of CPU of a call, the least of five."""
     spent = []
@@ -781,6 +870,7 @@ PARTS = {
     "nearest": certificates,
     "methods": methods,
     "whole": whole,
+    "versions": versions,
 }
 
 if __name__ == "__main__":
