@@ -128,7 +128,9 @@ def list_tables():
     for name, head, commands in (("performance", "###", paper.SPEED), ("tables", "##", others)):
         files = [paper.kept(command) for command in commands]
         texts = [path.read_text(encoding="utf-8") for path in files if path.exists()]
-        text = "\n".join(text.replace("# `", f"{head} `", 1) for text in texts)
+        # what a command printed keeps its headings, below that of the command
+        texts = [re.sub("^#(?=#* )", f"{head}#", text, flags=re.MULTILINE) for text in texts]
+        text = "\n".join(text.replace(f"{head}# `", f"{head} `", 1) for text in texts)
         write(HERE / f"_{name}.md", text)
 
 

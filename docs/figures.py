@@ -70,8 +70,9 @@ def analysed(shapes=SHAPES, vertices=VERTICES):
     return s4a.analyse(collection(shapes, vertices), store=folder / "study", n_jobs=1)
 
 
-def write(figure, name, dpi=120, folder=HERE):
-    """A matplotlib figure on white, in 256 colours."""
+def write(figure, name, dpi=120, folder=None):
+    """A matplotlib figure on white, in 256 colours, beside this file unless a folder is named."""
+    folder = HERE if folder is None else folder
     folder.mkdir(exist_ok=True)
     path = folder / f"{name}.png"
     figure.savefig(path, dpi=dpi, facecolor="white")
@@ -84,9 +85,9 @@ def reduce(path, width=None):
     picture = Image.open(path).convert("RGB")
     if width is not None and picture.width > width:
         picture = picture.resize((width, round(picture.height * width / picture.width)))
-    picture.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
-        path, optimize=True
-    )
+    # colours where most pixels are: those farthest apart leave shaded surfaces in stripes
+    colours = picture.quantize(256, Image.Quantize.MEDIANCUT, kmeans=2, dither=Image.Dither.NONE)
+    colours.save(path, optimize=True)
 
 
 def tiled(pictures, columns=2):
@@ -357,7 +358,7 @@ def scene(study):
         nbformat.write(notebook, Path(folder) / "panel.ipynb")
         browser = front.chromium.launched(driver)
         with front.served("jupyterlab", Path(folder)) as address:
-            page = browser.new_page(viewport={"width": 1366, "height": 1000})
+            page = browser.new_page(viewport={"width": 1600, "height": 1000})
             page.set_default_timeout(180_000)
             page.goto(address)
             page.wait_for_selector(".jp-Cell")

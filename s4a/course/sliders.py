@@ -49,13 +49,16 @@ def slide(draw: "Callable[..., Figure]", **sliders: "ipywidgets.Widget") -> "ipy
 
     import ipywidgets
 
-    picture = ipywidgets.Image(layout={"max_width": "100%"})
+    from s4a.show.parts import GROW
+
+    picture = ipywidgets.Image()
     message = ipywidgets.HTML()
 
     def redraw(change=None):
         try:
             figure = draw(**{name: slider.value for name, slider in sliders.items()})
-            picture.value, picture.width = _png(figure)
+            picture.value, width = _png(figure)
+            picture.layout.width = f"min(100%, {round(GROW * width)}px)"
             message.value = ""
         except Exception as error:  # a callback has no cell to show it
             message.value = f"<pre>{html.escape(f'{type(error).__name__}: {error}')}</pre>"
@@ -76,7 +79,7 @@ def _png(figure):
     figure.savefig(target, format="png", dpi=2 * figure.dpi, bbox_inches="tight")
     data = target.getvalue()
     width = int.from_bytes(data[16:20], "big")  # of the header of a PNG
-    return data, str(width // 2)
+    return data, width // 2
 
 
 def takeaway(sentence: str, *figures: "Figure") -> "Figure":

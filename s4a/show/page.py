@@ -384,7 +384,9 @@ def _resources(study, look):
 
 
 def _parameters(study, look):
-    rows = [[key, value] for key, value in study["report"].attrs.items() if str(value)]
+    attrs = study["report"].attrs
+    # the keys of all that was registered are no parameter, and wider than any page
+    rows = [[key, value] for key, value in attrs.items() if str(value) and key != "made_from"]
     if not rows:
         return PARTS.missing(["parameters"])
     return PARTS.table(["parameter", "value"], rows, name="parameters")

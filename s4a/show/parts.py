@@ -10,16 +10,49 @@ from s4a.show.draw import data_uri
 GAP = 8  # pixels between parts
 SHRINK, GROW = 0.7, 1.6  # how far the width of a part may be from that of the figure
 PAGE = """
+{%- macro share(width, room, gaps) %}(100% - {{ gaps }}px) * {{ width }} / {{ room }}{% endmacro -%}
 <figure role="img" aria-label="{{ alt }}" style="margin: 0">
 {% if title %}<div style="font-weight: bold; margin: 4px 0 8px">{{ title }}</div>{% endif %}
 <div style="display: flex; flex-wrap: wrap; align-items: center; gap: {{ gap }}px">
-{% for width, least, most, address in parts %}
-<img alt="" src="{{ address }}" style="flex: {{ width }} 1 {{ least }}px;
-min-width: 0; max-width: min(100%, {{ most }}px); height: auto">
+{% for width, most, address in parts %}
+<img alt="" src="{{ address }}" style="flex: none; height: auto; max-width: min(100%, {{ most }}px);
+width: max({% for room, gaps, below in lines %}{{ ", " if loop.index0 }}
+{%- if below %}min({{ share(width, room, gaps) }}, ({{ below }}px - 100%) * 1000)
+{%- else %}{{ share(width, room, gaps) }}{% endif %}{% endfor %})">
 {% endfor %}
 </div>
 </figure>
 """
+
+
+def _lines(widths):
+    """For one line of parts, two, and so on: what is to say how wide each part is on them.
+
+    The widths that the fullest line has room for, the pixels of the gaps in it at the most, and
+    below which width of the cell one line less is too few, None for the first. So all parts are of
+    one scale, on as few lines as keep it above `SHRINK`.
+    """
+    n = len(widths)
+    runs = sorted({sum(widths[i:j]) for i in range(n) for j in range(i + 1, n + 1)})
+    lines, below = [], None
+    for count in range(1, n + 1):
+        room = next(run for run in runs if _count(widths, run) <= count)
+        gaps = GAP * (n - count) + 1
+        lines.append((room, gaps, below))
+        below = round(SHRINK * room) + gaps
+    return lines
+
+
+def _count(widths, room):
+    """On how many lines parts stand that are begun when the last has no room."""
+    count, filled = 1, 0
+    for width in widths:
+        if width > room:
+            return len(widths) + 1
+        if filled + width > room:
+            count, filled = count + 1, 0
+        filled += width
+    return count
 
 
 class Parts(Figure):
@@ -62,10 +95,12 @@ class Parts(Figure):
                 ax.set_visible(True)
             width = round(96 * inches.width)
             address = data_uri(file.getvalue(), "image/png")
-            parts.append((width, round(SHRINK * width), round(GROW * width), address))
+            parts.append((width, round(GROW * width), address))
         self.set_layout_engine(layout)
         page = Environment(autoescape=True).from_string(PAGE)
-        return page.render(alt=self.alt or title, title=title, parts=parts, gap=GAP).strip()
+        lines = _lines([width for width, *_ in parts])
+        looks = {"alt": self.alt or title, "title": title, "gap": GAP}
+        return page.render(**looks, parts=parts, lines=lines).strip()
 
     def _boxes(self):
         """The axes of each part and what it takes; several rows stay below each other as one."""

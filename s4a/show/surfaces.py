@@ -49,6 +49,12 @@ def labelled(study: xr.DataTree, names: list[str]) -> list[tuple[str, str]]:
     return [(f"{name} (doubtful)" if name in doubtful else name, name) for name in names]
 
 
+def label_text(mesh: xr.Dataset, value: Any) -> str:
+    """A label of the vertices as text, with its name where the mesh has names of its labels."""
+    names = mesh["label"].attrs.get("names", [])
+    return f"{value} {names[value]}" if value in range(len(names)) else str(value)
+
+
 def mesh_of(mesh: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
     """Positions and triangles of a mesh."""
     return mesh["position"].values, mesh["corner_vertex"].values

@@ -50,7 +50,7 @@ class FunctionalMap(Panel):
         ends = zip(self.source, self.target, strict=True)
         options = [(f"{source} → {target}", i) for i, (source, target) in enumerate(ends)]
         self.choice = dropdown("pair", "the shape from which the map goes, and to which", options)
-        self.kind = dropdown("map", WHICH, KINDS, layout=WIDE)
+        self.kind = dropdown("map", WHICH, KINDS, layout={"width": "29em"})
         self.k = ipywidgets.SelectionSlider(
             options=sorted({*range(first, last, STEP), last}),
             value=last,

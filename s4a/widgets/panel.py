@@ -88,6 +88,12 @@ def row(*widgets: ipywidgets.Widget) -> ipywidgets.HBox:
     return ipywidgets.HBox(widgets, layout={"flex_flow": "row wrap", "align_items": "center"})
 
 
+def together(*widgets: ipywidgets.Widget) -> ipywidgets.HBox:
+    """Widgets that stay on one line, as what they are of is one thing."""
+    layout = {"align_items": "center", "flex": "none", "margin": "0 1em 0 0"}
+    return ipywidgets.HBox(widgets, layout=layout)
+
+
 def beside(*widgets: ipywidgets.Widget, least: str = "24em") -> ipywidgets.HBox:
     """Large parts side by side, of equal width where there is room for the `least` of each."""
     for widget in widgets:

@@ -99,7 +99,7 @@ class Progress(Panel):
 
     def build(self) -> list[ipywidgets.Widget]:
         """A bar for each stage, and the buttons."""
-        look = {"max": 1, "style": {"description_width": "15em"}, "layout": {"width": "34em"}}
+        look = {"max": 1, "style": {"description_width": "18em"}, "layout": {"width": "37em"}}
         self.bars = {stage: ipywidgets.IntProgress(description=stage, **look) for stage in STAGES}
         self.texts = {stage: ipywidgets.HTML() for stage in STAGES}
         self.total = ipywidgets.HTML()

@@ -5,6 +5,7 @@ import numpy as np
 
 from s4a.geometry.mesh import vertex_areas
 from s4a.show.draw import CLAY, vertices_within
+from s4a.show.surfaces import label_text
 from s4a.widgets.panel import WIDE, Panel, dropdown, row
 from s4a.widgets.scene import MARK, Scene
 
@@ -77,7 +78,8 @@ class Region(Panel):
         if mesh is None or "label" not in mesh:
             return None
         self.labels = mesh["label"].values
-        options = [("", -1), *((str(one), one) for one in np.unique(self.labels).tolist())]
+        labels = [(label_text(mesh, one), one) for one in np.unique(self.labels).tolist()]
+        options = [("none", -1), *labels]
         return dropdown("label", LABEL, options, value=-1, layout=WIDE)
 
     def take_label(self, change: dict) -> None:

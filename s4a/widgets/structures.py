@@ -11,7 +11,7 @@ from s4a.schema import unit_of
 from s4a.show.browser import color_bytes
 from s4a.show.surfaces import mode_arrays, score_state
 from s4a.widgets.modes_view import ModesView
-from s4a.widgets.panel import Panel, check, dropdown, row
+from s4a.widgets.panel import Panel, check, dropdown, row, together
 from s4a.widgets.scene import camera_group
 
 WORDS = {
@@ -68,7 +68,10 @@ class Structures(Panel):
         self.seen = {name: check(name, f"whether {name} is seen", on=True) for name in names}
         self.colors = {
             name: ipywidgets.ColorPicker(
-                value=COLORS[k % len(COLORS)], concise=True, tooltip=f"the colour of {name}"
+                value=COLORS[k % len(COLORS)],
+                concise=True,
+                tooltip=f"the colour of {name}",
+                layout={"width": "auto"},
             )
             for k, name in enumerate(names)
         }
@@ -87,7 +90,7 @@ class Structures(Panel):
         self.redraw(self.paint, *self.colors.values())
         self.show_level(level)
         self.paint()
-        pairs = [widget for name in names for widget in (self.seen[name], self.colors[name])]
+        pairs = [together(self.seen[name], self.colors[name]) for name in names]
         return [row(self.level, *pairs), *self.views.values()]
 
     def view_of(self, level: str, n_modes: int, group: str, view: str, up: str) -> ModesView:

@@ -15,7 +15,7 @@ from s4a.input.annotations import write_landmarks
 from s4a.schema import dataset
 from s4a.show.browser import PARTS
 from s4a.show.draw import label_colors
-from s4a.show.surfaces import aligned, labelled, names_of, unit_text
+from s4a.show.surfaces import aligned, label_text, labelled, names_of, unit_text
 from s4a.widgets.panel import Panel, beside, check, dropdown, file_name, row
 from s4a.widgets.scene import Scene, camera_group, extent, round_number
 
@@ -148,7 +148,7 @@ class Transfer(Panel):
         self.scenes[1].caption = caption
         labels = [
             {
-                "name": value,
+                "name": label_text(mesh, value),
                 "color": to_hex(color),
                 "here": f"{np.mean(here == value):.1%}",
                 "there": f"{np.mean(there == value):.1%}",
@@ -205,7 +205,8 @@ class Transfer(Panel):
         rows = [
             [name, *(f"{number:.2f}" for number in numbers[i])] for i, name in enumerate(self.marks)
         ]
-        self.table.value = PARTS.landmarks(f"Landmarks on {self.target}", COLUMNS, rows)
+        caption = f"Landmarks on {self.target} ({unit_text(self.study, self.target)})"
+        self.table.value = PARTS.landmarks(caption, COLUMNS, rows)
 
     def save_csv(self, path: Path | str) -> Path:
         """Write the landmarks on the target as CSV ``name,x,y,z``, in its coordinates."""

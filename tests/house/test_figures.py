@@ -198,6 +198,7 @@ def test_a_figure_of_the_paper_is_drawn_from_a_study(name, small, tmp_path, monk
     monkeypatch.setattr(figures, "HERE", tmp_path)
     draw = getattr(figures, name)
     path = draw(small if name in ("labels", "landmarks") else small[0])
+    assert path.parent == tmp_path, "not over the picture of the page"
     with Image.open(path) as picture:
         assert picture.width > 400
         assert len(picture.convert("RGB").getcolors(256)) > 20
@@ -207,7 +208,9 @@ def test_the_brain_that_is_made_higher_has_eigenfunctions_in_another_order(
     tmp_path, monkeypatch, capsys
 ):
     monkeypatch.setattr(figures, "HERE", tmp_path)
-    assert figures.swapped(vertices=3000, n_coarse=800).exists()
+    path = figures.swapped(vertices=3000, n_coarse=800)
+    assert path.exists()
+    assert path.parent == tmp_path, "not over the picture of the page"
     assert "exchanged: [(2, 3)" in capsys.readouterr().out
 
 

@@ -15,6 +15,13 @@ def test_it_builds_without_a_warning(site):
     )
 
 
+def test_no_name_stands_twice_in_the_contents(site):
+    text = (site[1] / "index.html").read_text("utf-8")
+    names = re.findall(r'<li class="toctree-l1[^>]*><a [^>]*>([^<]*)</a>', text)
+    assert "Every table, as it was printed" in names
+    assert len(set(names)) == len(names)
+
+
 @pytest.fixture(scope="module")
 def browser():
     playwright = pytest.importorskip("playwright.sync_api")

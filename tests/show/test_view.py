@@ -102,7 +102,7 @@ def make_study(n=14):
         explained_variance_ratio_low=[0.6, 0.25, 0.15],
     ).assign_coords(named)
     tree["report"] = dataset(
-        {"n_coarse": 6000, "k": 100, "refine": "joint"},
+        {"n_coarse": 6000, "k": 100, "refine": "joint", "made_from": 7 * f"{'0' * 32} "},
         status=["ok"] * 5 + ["repaired", "excluded"],
         reason=[""] * 5
         + ["3 duplicate triangles removed", "not a surface: <script>alert('&')</script>"],
@@ -268,6 +268,11 @@ def test_the_page_says_what_the_study_says(html):
         "70.0% of the variance",
     ):
         assert text in html
+
+
+def test_the_parameters_are_those_of_the_run_and_no_keys_of_files(html):
+    assert "made_from" not in html
+    assert "<td>n_coarse</td>" in html
 
 
 def test_the_page_holds_the_modes_as_they_are(study, html):

@@ -30,8 +30,10 @@ from test_browser import (  # noqa: F401, fixtures are found by their names
     watched,
 )
 
+import s4a
 from s4a.datasets.structures import example_structures
-from s4a.widgets import Region, Structures
+from s4a.show import charts
+from s4a.widgets import Median, Modes, Region, Structures
 
 KINDS = ("Maps", "Region", "Structures", "Comparison", "Progress")
 CELL = """
@@ -250,4 +252,66 @@ def test_the_page_of_a_region_says_that_drawing_needs_python(offline, study, tmp
     assert page.get_by_text("lasso").count() == 0
     assert barriers(page) == []
     assert errors == []
+    page.close()
+
+
+def test_the_numbers_beside_bars_are_not_cut_in_a_narrow_panel(offline, study, tmp_path):  # noqa: F811
+    page, _ = opened(offline, saved(Median(study), tmp_path / "median.html"))
+    for width in (380, 700):
+        page.set_viewport_size({"width": width, "height": 900})
+        page.wait_for_timeout(300)
+        svg = visible(page, "svg.s4a-chart").first
+        right = svg.bounding_box()["x"] + svg.bounding_box()["width"]
+        ends = [box["x"] + box["width"] for box in boxes_of(svg.locator("rect ~ text"))]
+        assert len(ends) >= 4
+        assert max(ends) <= right
+        numbers = [text for text in svg.locator("rect ~ text").all_text_contents() if "." in text]
+        assert len({len(text.partition(".")[2]) for text in numbers}) == 1, numbers
+    page.close()
+
+
+def boxes_of(locator):
+    return [one.bounding_box() for one in locator.all()]
+
+
+def test_no_name_of_a_shape_lies_under_the_cross_of_the_sliders(offline, study, tmp_path):  # noqa: F811
+    tree = study.copy()
+    pca = tree["pca"].to_dataset()
+    score = pca["score"].values.copy()
+    score[0, :2] = [-0.3, -0.15]  # its name would reach over the mean
+    tree["pca"].dataset = pca.assign(score=(pca["score"].dims, score, pca["score"].attrs))
+    page, _ = opened(offline, saved(Modes(tree), tmp_path / "modes.html"))
+    page.wait_for_function(DRAWN)
+    page.locator(".s4a-cross").wait_for(state="visible")
+    cross = page.locator(".s4a-cross").bounding_box()
+    names = boxes_of(page.locator(".s4a-cross").locator("xpath=..").locator("text.s4a-small"))
+    assert len(names) >= 2
+    for name in names:
+        beside = name["x"] > cross["x"] + cross["width"] or name["x"] + name["width"] < cross["x"]
+        above = name["y"] + name["height"] < cross["y"] + 3
+        assert beside or above or name["y"] > cross["y"] + cross["height"] - 3
+    page.close()
+
+
+def test_pictures_side_by_side_are_of_one_size_however_many_lines_they_take(
+    offline,  # noqa: F811
+    tmp_path,
+):
+    ball = s4a.synthetic.sphere(100)
+    titles = ["one", "two", "three", "four"]
+    heights = dict.fromkeys(titles, ball["position"].values[:, 2])
+    html = charts.surfaces(dict.fromkeys(titles, ball), heights, label="height").html()
+    (tmp_path / "parts.html").write_text(f"<body>{html}</body>", encoding="utf-8")
+    page, _ = opened(offline, tmp_path / "parts.html")
+    lines, shares = [], []
+    for width in (2000, 1000, 640, 330):
+        page.set_viewport_size({"width": width, "height": 900})
+        *pictures, scale = boxes_of(page.locator("img"))
+        widths = [picture["width"] for picture in pictures]
+        assert max(widths) - min(widths) < 2
+        assert max(widths) <= width - 16
+        shares.append(scale["height"] / pictures[-1]["height"])
+        lines.append(len({round(picture["y"]) for picture in pictures}))
+    assert lines == [1, 1, 2, 4]
+    assert shares == pytest.approx([shares[0]] * 4, rel=0.02), "of one scale"
     page.close()

@@ -76,6 +76,7 @@ def test_a_drag_beside_the_surface_says_so_and_changes_nothing(panel):
 def test_a_label_of_the_template_is_a_region(panel, study):
     label = study["original"][study["registration"].attrs["template"]]["label"].values
     name, number = panel.label.options[2]
+    assert panel.label.options[0] == ("none", -1)
+    assert name == f"{number} {s4a.synthetic.LABELS[number]}"
     panel.label.value = number
     np.testing.assert_array_equal(panel.region, label == number)
-    assert name

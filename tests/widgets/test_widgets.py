@@ -380,6 +380,8 @@ def test_labels_and_landmarks_are_carried_as_the_step_module_does_it(study, pane
     here = np.frombuffer(both.scenes[0].color, np.uint8).reshape(-1, 3)
     value = label.values[0]
     assert (shown[0] == here[mesh["label"].values == value]).all()
+    assert f"{value} {mesh['label'].attrs['names'][value]}: " in both.legend.value
+    assert f"Landmarks on {target} (mm)" in both.table.value
 
 
 def test_names_of_labels_and_landmarks_are_text_in_panels_and_saved_pages(study, tmp_path):

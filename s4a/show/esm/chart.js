@@ -73,8 +73,8 @@ function brief(names, room = 16) {
 }
 
 // Names beside their marks, each where it hides nothing; one that finds no place is left to the hover and the focus.
-function labels(svg, { x, y, names, width, height, sides, letter = 6.4, gap = 7, ...look }) {
-  const taken = x.map((v, i) => [v - 6, y[i] - 6, v + 6, y[i] + 6]);
+function labels(svg, { x, y, names, width, height, sides, avoid = [], letter = 6.4, gap = 7, ...look }) {
+  const taken = [...x.map((v, i) => [v - 6, y[i] - 6, v + 6, y[i] + 6]), ...avoid.map(([v, w]) => [v - 8, w - 8, v + 8, w + 8])];
   brief(names).forEach((text, i) => {
     const wide = letter * text.length;
     for (const [right, down] of sides ? sides(i) : [[1, -4], [-1, -4], [1, 12], [-1, 12]]) {
@@ -124,7 +124,7 @@ function scatter(parent, spec, pick) {
     const at = node(frame.svg, "circle", { cx: frame.X(x[i]), cy: frame.Y(y[i]), r: i === selected ? 7 : 5, fill: i === selected ? ORANGE : faint[i] ? PALE : BLUE, stroke: "#fff" });
     return { at, value: { index: i, name: names[i] }, text: `${names[i]}${faint[i] ? " (doubtful)" : ""}: ${short(x[i])}, ${short(y[i])}` };
   });
-  labels(frame.svg, { x: x.map(frame.X), y: y.map(frame.Y), names, width, height: frame.bottom, class: "s4a-small" });
+  labels(frame.svg, { x: x.map(frame.X), y: y.map(frame.Y), names, width, height: frame.bottom, avoid: [[frame.X(0), frame.Y(0)]], class: "s4a-small" }); // where the cross is at first
   const cross = node(frame.svg, "path", { d: "M-7 0H7M0 -7V7", stroke: ORANGE, "stroke-width": 2, visibility: "hidden", class: "s4a-cross" });
   reachable(marks, line(parent), pick);
   return (a, b) => {
@@ -136,14 +136,15 @@ function scatter(parent, spec, pick) {
 function bars(parent, spec, pick) {
   const { values, names, label, title, marked = [], selected = -1, width = room(parent, 430) } = spec, told = brief(names);
   const row = values.length > 25 ? 15 : 20, height = 26 + row * values.length + 40, left = 10 + 6.5 * Math.max(...told.map((n) => n.length), 4);
-  const frame = plot(parent, { width, height, left, x: [0, Math.max(...values) * 1.18 || 1], y: [0, 1], xlabel: label, title, grid: false });
+  const numbers = alike(values), beside = 8 + 7 * Math.max(...numbers.map((n) => n.length)), wide = width - 10 - left; // of the longest bar and its number
+  const frame = plot(parent, { width, height, left, x: [0, (Math.max(...values) * wide) / Math.max(wide - beside, 1) || 1], y: [0, 1], xlabel: label, title, grid: false });
   frame.svg.querySelectorAll("text[text-anchor=end]").forEach((t) => t.remove());
   const marks = values.map((v, i) => {
     const top = frame.top + 2 + i * row;
     const at = node(frame.svg, "rect", { x: left, y: top, width: Math.max(1, frame.X(v) - left), height: row - 4, fill: marked.includes(i) ? ORANGE : BLUE });
     if (i === selected) Object.entries({ stroke: INK, "stroke-width": 2.5 }).forEach(([k, s]) => at.setAttribute(k, s));
     node(frame.svg, "text", { x: left - 4, y: top + row - 8, "text-anchor": "end" }, told[i]);
-    node(frame.svg, "text", { x: frame.X(v) + 4, y: top + row - 8 }, short(v));
+    node(frame.svg, "text", { x: frame.X(v) + 4, y: top + row - 8 }, numbers[i]);
     return { at, value: { index: i, name: names[i] }, text: `${names[i]}: ${v.toPrecision(4)}` };
   });
   reachable(marks, line(parent), pick);

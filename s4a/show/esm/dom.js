@@ -25,6 +25,12 @@ const ownKeys = (box) => box.addEventListener("focusin", ({ target }) => target.
 
 const short = (x) => (x === null || x === undefined || Number.isNaN(x) ? "none" : String(Number(x.toPrecision(3))));
 
+// Numbers in a column, with as many decimals as the one that needs most.
+function alike(values) {
+  const texts = values.map(short), decimals = Math.max(...texts.map((text) => (/^-?[0-9.]+$/.test(text) ? text.split(".")[1] || "" : "").length));
+  return texts.map((text, i) => (/^-?[0-9.]+$/.test(text) ? values[i].toFixed(decimals) : text));
+}
+
 // A horizontal bar of colours with its numbers: {colors: [css], low, middle, high, label}.
 function colorBar(parent, bar) {
   parent.replaceChildren();
