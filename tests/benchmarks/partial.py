@@ -1,21 +1,27 @@
 """Parts of shapes completed by a study: errors and intervals, beside rustcpd's posterior.
 
-``partial.py [brains faces skulls] [--few] [--alone] [--seed N] [--studies FOLDER]``: new shapes, of
-which a plane with a random direction cuts off 0, 10, 30 or 50 % of the vertices, turned at random
-by 45 degrees, into studies that lack them: 12 synthetic brains of 6,000 vertices and 8 others, 16
-faces drawn from a published model (its mean face and 24 modes, with normal scores) and 8 others,
-and five mouse skulls, each into a study of the four others.  For each cut the mean over the shapes
-of: CPU seconds; distance to the truth where the part is, in % of sqrt(area), of the whole shape
-inserted, of the part, of rustcpd; the same where it is not, with that of the mean shape laid on the
-truth of what is there alone; the share of coordinates that lie within intervals of 50, 80 and 90 %
-where nothing is, around the truth, and around the match of the whole; where the part is, of 90 %;
-and where nothing is, rustcpd's of 90 %.  Skulls have no truth but the match of the whole.  Parts
-that are refused are counted, and in no mean.
+``partial.py [brains faces skulls] [--few] [--alone] [--seed N ...] [--studies FOLDER]``: new
+shapes, of which a plane with a random direction cuts off 0, 10, 30 or 50 % of the vertices, turned
+at random by 45 degrees, into studies that lack them: 12 synthetic brains of 6,000 vertices and 8
+others, 16 faces drawn from a published model (its mean face and 24 modes, with normal scores) and 8
+others, and five mouse skulls, each into a study of the four others.  For each cut the mean over the
+shapes of: CPU seconds; distance to the truth where the part is, in % of sqrt(area), of the whole
+shape inserted, of the part, of rustcpd; the same where it is not, with that of the mean shape laid
+on the truth of what is there alone; the share of coordinates that lie within intervals of 50, 80
+and 90 % where nothing is, around the truth, and around the match of the whole; where the part is,
+of 90 %; and where nothing is, rustcpd's of 90 %.  Skulls have no truth but the match of the whole.
+Parts that are refused are counted, and in no mean.
 
 rustcpd gets the mean and the modes of the same study and the same part: ``pose_initialize`` (with
 translation anchors and adaptive mixing, as it says for partial targets), ``register_atlas``,
 ``posterior``; ``--alone`` goes without it.  ``--few`` takes two shapes of each set, ``--seed N``
 other brains and faces than those of 3, ``--studies`` keeps the studies in a folder.
+
+``--seed`` with several numbers (``4 6-8``) makes a study of each.  The shapes of all are numbered
+on, and each is cut by planes of its own: those of the first eight are the same for every seed
+alone.  At the end all are pooled: the mean of every share, its standard error as if all shapes were
+independent and as if those of one study were alike in part, and the least and the largest share of
+single shapes.
 
 ``--left-out`` has no new shapes: of the eleven brains of the study beside its template the same
 part is missing, which a plane of random direction cuts off the mean shape, six for each share (two
@@ -32,6 +38,7 @@ import sys
 import tempfile
 import time
 import warnings
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
@@ -291,38 +298,100 @@ def left_out(store, n_planes, seed):
         sys.stdout.flush()
 
 
+def cuts(name, folder, keep, seed, few, *, first=0, alone=False):
+    """Share of missing -> what is measured of each new shape of one study, None where refused.
+
+    The planes depend on the number of the shape, of which that of the first is given.
+    """
+    rows = {share: [] for share in SHARES}
+    new_shapes = globals()[name](folder, keep / f"study_{name}_{seed}", few, seed)
+    for i, new in enumerate(new_shapes, first):
+        of_whole = whole_inserted(*new[:2])
+        for share in SHARES:
+            rng = np.random.default_rng([i, round(10 * share)])
+            rows[share].append(row_of(*new, of_whole, share, rng, alone=alone))
+    return rows
+
+
+def told(rows):
+    """The table of the new shapes of one study."""
+    head = f"| {' | '.join(HEAD)} |\n|{' --- |' * len(HEAD)}\n"
+    for share, of_cut in rows.items():
+        found = [row for row in of_cut if row is not None]
+        means = np.mean(found, 0) if found else [np.nan] * (len(HEAD) - 1)
+        cells = [f"{value:.3f}" if value == value else "-" for value in means]
+        head += f"| {100 * share:.0f} % | {' | '.join([*cells, str(len(of_cut) - len(found))])} |\n"
+    return head
+
+
+def standard_errors(values, study):
+    """Of a mean over shapes, were all independent, and were those of one study alike in part.
+
+    The second takes the sum of what the shapes of a study lie off the mean as one draw.
+    """
+    off = values - values.mean()
+    n, studies = len(values), np.unique(study)
+    within = np.array([off[study == one].sum() for one in studies])
+    return (
+        float(np.sqrt((off**2).sum() / (n - 1) / n)),
+        float(np.sqrt((within**2).sum() * len(studies) / (len(studies) - 1)) / n),
+    )
+
+
+def pooled(of_seeds):
+    """The table of the new shapes of several studies, seed -> rows as of :func:`cuts`."""
+    columns = [i for i, name in enumerate(HEAD[1:-1]) if "%" in name and "rustcpd" not in name]
+    names = [HEAD[1 + i] for i in columns]
+    names = [f"{name} (standard errors; least, largest)" for name in names]
+    lines = f"| missing | shapes | {' | '.join(names)} |\n|{' --- |' * (2 + len(names))}\n"
+    for share in SHARES:
+        rows = [(n, row) for n, of in of_seeds.items() for row in of[share] if row is not None]
+        study, table = np.array([n for n, _ in rows]), np.array([row for _, row in rows])
+        cells = [str(len(rows))]
+        for values in table[:, columns].T if len(rows) > 1 else []:
+            alone, together = standard_errors(values, study)
+            ends = f"{alone:.3f}, {together:.3f}; {values.min():.2f}, {values.max():.2f}"
+            cells.append(f"{values.mean():.3f} ({ends})" if values.mean() == values.mean() else "-")
+        lines += f"| {100 * share:.0f} % | {' | '.join(cells)} |\n"
+    return lines
+
+
+def numbers_after(word, words, default):
+    """The numbers that follow a word: ``--seed 4 6-8`` are four."""
+    if word not in words:
+        return [default]
+    rest = takewhile(lambda one: one[0].isdigit(), words[words.index(word) + 1 :])
+    ends = [[int(end) for end in one.split("-")] for one in rest]
+    return [n for own in ends for n in range(own[0], own[-1] + 1)]
+
+
 def main(words):
     sets = [word for word in words if word in ("brains", "faces", "skulls")]
     sets = sets or ["brains", *(["faces", "skulls"] if DATA.is_dir() else [])]
+    seeds, few = numbers_after("--seed", words, 3), "--few" in words
     with tempfile.TemporaryDirectory() as folder:
         if DATA.is_dir() and sets != ["brains"]:
             subprocess.run(
                 [sys.executable, DATA / "unpack.py", folder], check=True, stdout=subprocess.DEVNULL
             )
         keep = Path(words[words.index("--studies") + 1] if "--studies" in words else folder)
-        seed = int(words[words.index("--seed") + 1]) if "--seed" in words else 3
         if "--left-out" in words:
-            left_out(keep / f"study_brains_{seed}", 2 if "--few" in words else 6, seed)
+            for seed in seeds:
+                left_out(keep / f"study_brains_{seed}", 2 if few else 6, seed)
             return
         for name in sets:
-            few = 2 if "--few" in words else 8
-            rows = {share: [] for share in SHARES}
-            store = keep / f"study_{name}_{seed}"
-            for i, new in enumerate(globals()[name](Path(folder), store, few, seed)):
-                of_whole = whole_inserted(*new[:2])
-                for share in SHARES:
-                    rng = np.random.default_rng([i, round(10 * share)])
-                    row = row_of(*new, of_whole, share, rng, alone="--alone" in words)
-                    rows[share].append(row)
-            shapes = len(rows[0.0])
-            sys.stdout.write(f"\n{name}, {shapes} new shapes\n\n| {' | '.join(HEAD)} |\n")
-            sys.stdout.write(f"|{' --- |' * len(HEAD)}\n")
-            for share, of_cut in rows.items():
-                told = np.array([row for row in of_cut if row is not None])
-                cells = [f"{value:.3f}" if value == value else "-" for value in told.mean(0)]
-                cells.append(str(len(of_cut) - len(told)))
-                sys.stdout.write(f"| {100 * share:.0f} % | {' | '.join(cells)} |\n")
-            sys.stdout.flush()
+            of_seeds, before = {}, 0
+            for seed in seeds:
+                given = name, Path(folder), keep, seed, 2 if few else 8
+                rows = cuts(*given, first=before, alone="--alone" in words)
+                of_seeds[seed] = rows
+                n = len(rows[SHARES[0]])
+                before += n
+                sys.stdout.write(f"\n{name}, {n} new shapes, seed {seed}\n\n{told(rows)}")
+                sys.stdout.flush()
+            if len(seeds) > 1:
+                sys.stdout.write(f"\n{name}, {len(seeds)} studies\n\n{pooled(of_seeds)}")
+                sys.stdout.flush()
 
 
 if __name__ == "__main__":
