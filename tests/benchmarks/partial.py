@@ -29,7 +29,9 @@ with ``--few``), and each is told by the others with the factor and the share of
 each cut: the parts of shapes; the share of coordinates where nothing is that lie within intervals
 of 90 % around the truth, and with all of the variance between ways; and the median of cov(p, e) /
 var(e), with p what is told less the match and e the match less the truth, where nothing is, with
-what stands for e in a study, the match less the direct way, and both where the part is.
+what stands for e in a study, the match less the direct way, and both where the part is.  The planes
+are the same for every seed; of several the two shares are pooled, with the standard error between
+studies.
 """
 
 import logging
@@ -279,23 +281,49 @@ def rows_of_left_out(found, gaps, wrong):
 
 
 def left_out(store, n_planes, seed):
-    """The table of shapes of a study that are told by the others."""
+    """The table of shapes of a study that are told by the others, and the rows of each share.
+
+    Rows are those of all shapes with the first plane, then with the second, and so on.
+    """
     study, _, true = study_of_brains(store, seed)
     model = model_of(study)
     gaps, wrong = gaps_between_ways(model), wrong_of(model, true)
-    sys.stdout.write(f"\nbrains of seed {seed}, left out\n\n| {' | '.join(HEAD_LEFT_OUT)} |\n")
-    sys.stdout.write(f"|{' --- |' * len(HEAD_LEFT_OUT)}\n")
+    sys.stdout.write(f"\nbrains of seed {seed}, left out\n\n{heading(HEAD_LEFT_OUT)}")
+    tables = {}
     for share in SHARES[1:]:
         rows = [
             row
             for present, density in parts_of(model, share, n_planes)
             for row in rows_of_left_out(found_again(model, present, density), gaps, wrong)
         ]
-        table = np.array(rows)
+        table = tables[share] = np.array(rows)
         told = [*table[:, :2].mean(0), *np.nanmedian(table[:, 2:], 0)]
-        cells = [str(len(rows)), *(f"{value:.3f}" for value in told)]
-        sys.stdout.write(f"| {100 * share:.0f} % | {' | '.join(cells)} |\n")
+        sys.stdout.write(line(share, [str(len(rows)), *(f"{value:.3f}" for value in told)]))
         sys.stdout.flush()
+    return tables
+
+
+def pooled_left_out(of_seeds):
+    """The table of the shapes left out of several studies, seed -> rows as of :func:`left_out`."""
+    lines = heading([*HEAD_LEFT_OUT[:2], *(f"{n} (standard error)" for n in HEAD_LEFT_OUT[2:4])])
+    for share in SHARES[1:]:
+        table = np.concatenate([of[share] for of in of_seeds.values()])
+        study = np.repeat(list(of_seeds), [len(of[share]) for of in of_seeds.values()])
+        of_each = [
+            f"{values.mean():.3f} ({standard_error(values, study):.3f})" for values in table.T[:2]
+        ]
+        lines += line(share, [str(len(table)), *of_each])
+    return lines
+
+
+def heading(names):
+    """The first two lines of a table."""
+    return f"| {' | '.join(names)} |\n|{' --- |' * len(names)}\n"
+
+
+def line(share, cells):
+    """The line of a table with what is missing and these cells."""
+    return f"| {100 * share:.0f} % | {' | '.join(cells)} |\n"
 
 
 def cuts(name, folder, keep, seed, few, *, first=0, alone=False):
@@ -315,44 +343,39 @@ def cuts(name, folder, keep, seed, few, *, first=0, alone=False):
 
 def told(rows):
     """The table of the new shapes of one study."""
-    head = f"| {' | '.join(HEAD)} |\n|{' --- |' * len(HEAD)}\n"
+    lines = heading(HEAD)
     for share, of_cut in rows.items():
         found = [row for row in of_cut if row is not None]
-        means = np.mean(found, 0) if found else [np.nan] * (len(HEAD) - 1)
+        means = np.mean(found, 0) if found else [np.nan] * (len(HEAD) - 2)
         cells = [f"{value:.3f}" if value == value else "-" for value in means]
-        head += f"| {100 * share:.0f} % | {' | '.join([*cells, str(len(of_cut) - len(found))])} |\n"
-    return head
+        lines += line(share, [*cells, str(len(of_cut) - len(found))])
+    return lines
 
 
-def standard_errors(values, study):
-    """Of a mean over shapes, were all independent, and were those of one study alike in part.
+def standard_error(values, group):
+    """Of a mean, where values of one group are alike in part.
 
-    The second takes the sum of what the shapes of a study lie off the mean as one draw.
+    What those of a group lie off the mean counts as one draw.
     """
-    off = values - values.mean()
-    n, studies = len(values), np.unique(study)
-    within = np.array([off[study == one].sum() for one in studies])
-    return (
-        float(np.sqrt((off**2).sum() / (n - 1) / n)),
-        float(np.sqrt((within**2).sum() * len(studies) / (len(studies) - 1)) / n),
-    )
+    off, groups = values - values.mean(), np.unique(group)
+    sums = np.array([off[group == one].sum() for one in groups])
+    return float(np.sqrt((sums**2).sum() * len(groups) / (len(groups) - 1)) / len(values))
 
 
 def pooled(of_seeds):
     """The table of the new shapes of several studies, seed -> rows as of :func:`cuts`."""
     columns = [i for i, name in enumerate(HEAD[1:-1]) if "%" in name and "rustcpd" not in name]
-    names = [HEAD[1 + i] for i in columns]
-    names = [f"{name} (standard errors; least, largest)" for name in names]
-    lines = f"| missing | shapes | {' | '.join(names)} |\n|{' --- |' * (2 + len(names))}\n"
+    names = [f"{HEAD[1 + i]} (standard errors; least, largest)" for i in columns]
+    lines = heading(["missing", "shapes", *names])
     for share in SHARES:
         rows = [(n, row) for n, of in of_seeds.items() for row in of[share] if row is not None]
         study, table = np.array([n for n, _ in rows]), np.array([row for _, row in rows])
-        cells = [str(len(rows))]
-        for values in table[:, columns].T if len(rows) > 1 else []:
-            alone, together = standard_errors(values, study)
+        cells = []
+        for values in table[:, columns].T:
+            alone, together = (standard_error(values, of) for of in (np.arange(len(rows)), study))
             ends = f"{alone:.3f}, {together:.3f}; {values.min():.2f}, {values.max():.2f}"
             cells.append(f"{values.mean():.3f} ({ends})" if values.mean() == values.mean() else "-")
-        lines += f"| {100 * share:.0f} % | {' | '.join(cells)} |\n"
+        lines += line(share, [str(len(rows)), *cells])
     return lines
 
 
@@ -376,8 +399,13 @@ def main(words):
             )
         keep = Path(words[words.index("--studies") + 1] if "--studies" in words else folder)
         if "--left-out" in words:
-            for seed in seeds:
-                left_out(keep / f"study_brains_{seed}", 2 if few else 6, seed)
+            left = {
+                seed: left_out(keep / f"study_brains_{seed}", 2 if few else 6, seed)
+                for seed in seeds
+            }
+            if len(seeds) > 1:
+                sys.stdout.write(f"\nbrains of {len(seeds)} studies, left out\n\n")
+                sys.stdout.write(pooled_left_out(left))
             return
         for name in sets:
             of_seeds, before = {}, 0

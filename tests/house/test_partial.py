@@ -101,10 +101,10 @@ def test_seeds_are_numbers_and_ranges_up_to_the_next_word():
 
 def test_shapes_of_one_study_that_are_alike_make_the_error_of_the_mean_larger():
     values = np.array([0.0, 0.0, 1.0, 1.0, 2.0, 2.0])
-    alone, together = partial.standard_errors(values, np.array([1, 1, 2, 2, 3, 3]))
+    alone = partial.standard_error(values, np.arange(6))
     assert alone == pytest.approx(np.sqrt(4 / 5 / 6))
+    together = partial.standard_error(values, np.array([1, 1, 2, 2, 3, 3]))
     assert together == pytest.approx(np.sqrt(1 / 3))  # of the mean of 0, 1 and 2
-    assert partial.standard_errors(values, np.arange(6)) == pytest.approx((alone, alone))
 
 
 def test_shapes_of_several_studies_are_pooled_and_refused_ones_are_in_no_mean():
@@ -117,6 +117,16 @@ def test_shapes_of_several_studies_are_pooled_and_refused_ones_are_in_no_mean():
     ).splitlines()
     assert len(lines) == 2 + len(partial.SHARES)
     assert lines[-1].startswith("| 50 % | 2 | 0.900 (0.100, 0.100; 0.80, 1.00) | ")
+
+
+def test_shapes_left_out_of_several_studies_are_pooled():
+    tables = {
+        seed: {share: np.full((3, 6), value) for share in partial.SHARES[1:]}
+        for seed, value in ((4, 0.8), (5, 1.0))
+    }
+    lines = partial.pooled_left_out(tables).splitlines()
+    assert len(lines) == 2 + len(partial.SHARES[1:])
+    assert lines[-1] == "| 50 % | 6 | 0.900 (0.100) | 0.900 (0.100) |"
 
 
 def test_each_shape_of_several_studies_is_cut_by_planes_of_its_own(monkeypatch, capsys):
