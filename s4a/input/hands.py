@@ -125,20 +125,31 @@ def of_other_hand(evidence: Mapping[str, xr.Dataset]) -> tuple[list[str], list[s
     """
     if len(evidence) < 2:
         return [], ["reflect='auto' needs two shapes or more to hold against each other"]
-    names, mean = list(evidence), hands(evidence)
-    if np.median(np.abs(mean)) < COMMON_HAND:
+    return _rarer(dict(zip(evidence, hands(evidence).tolist(), strict=True)))
+
+
+def _rarer(hand, of_both=()):
+    """Those of the rarer hand, and what is told; but those of both hands are told elsewhere."""
+    clear = float(np.median(np.abs(list(hand.values()))))
+    if clear < COMMON_HAND:
         return [], [
             "reflect='auto' mirrored none: the shapes are too like their own mirror images to tell "
-            f"(mean hand {np.median(np.abs(mean)):.2f}, {COMMON_HAND} needed); name those to mirror"
+            f"(mean hand {clear:.2f}, {COMMON_HAND} needed); name those to mirror"
         ]
-    weak = [name for name, one in zip(names, mean, strict=True) if abs(one) < OTHER_HAND]
+    of_one = {name: one for name, one in hand.items() if name not in of_both}
+    weak = [name for name, one in of_one.items() if abs(one) < OTHER_HAND]
     remarks = []
     if weak:
+        each = (
+            "it is: look at it, and name it if it is"
+            if len(weak) == 1
+            else "they are: look at them, and name all that are"
+        )
         remarks = [
-            f"reflect='auto' cannot tell the hand of {listed(weak, most=20)}, which stayed as they "
-            "are: look at them, and name all that are to be mirrored"
+            f"reflect='auto' cannot tell the hand of {listed(weak, most=20)}, which stayed as "
+            f"{each} to be mirrored"
         ]
-    return [n for n, one in zip(names, mean, strict=True) if one <= -OTHER_HAND], remarks
+    return [name for name, one in of_one.items() if one <= -OTHER_HAND], remarks
 
 
 def seen_together(looks: Mapping[str, Mapping[str, xr.Dataset]]) -> dict[str, xr.Dataset]:
@@ -206,25 +217,26 @@ def subjects_of_other_hand(
         Those of the rarer hand.
     remarks : list of str
         In words, as of :func:`of_other_hand`; and which subjects have structures of both hands,
-        and stay as they are.
+        and stay as they are: each subject is named once.
     """
     together = seen_together(looks)
-    chosen, told = of_other_hand(together)
     if len(together) < 2:
-        return dict.fromkeys(together, np.nan), [], told
+        return dict.fromkeys(together, np.nan), *of_other_hand(together)
     names, mean = list(together), hands(together)
+    hand = dict(zip(names, mean.tolist(), strict=True))
     table = hand_table(looks, names, names)
     each = np.array([_mean(one * np.where(mean < 0, -1, 1)) for one in table])
     both = (each <= -OTHER_HAND).any(0) & (each >= OTHER_HAND).any(0)
-    clear = np.median(np.abs(mean)) >= COMMON_HAND
-    for i in np.flatnonzero(both & clear):
+    if np.median(np.abs(mean)) < COMMON_HAND:
+        return hand, *_rarer(hand)
+    chosen, told = _rarer(hand, of_both=[names[i] for i in np.flatnonzero(both)])
+    for i in np.flatnonzero(both):
         said = [f"{name} {one:+.2f}" for name, one in zip(looks, each[:, i], strict=True)]
         told.append(
-            f"reflect='auto' left {names[i]} as it is, as its structures are of both hands "
-            f"({listed(said)}): was one of them mirrored in its file?"
+            f"reflect='auto': {names[i]} is of both hands ({listed(said)}) and stayed as it is: "
+            "was one of its structures mirrored in its file?"
         )
-    odd = {names[i] for i in np.flatnonzero(both & clear)}
-    return dict(zip(names, mean.tolist(), strict=True)), [n for n in chosen if n not in odd], told
+    return hand, chosen, told
 
 
 def is_of_other_hand(

@@ -1,21 +1,27 @@
 """Parts of shapes completed by a study: errors and intervals, beside rustcpd's posterior.
 
-``partial.py [brains faces skulls] [--few] [--alone] [--seed N] [--studies FOLDER]``: new shapes, of
-which a plane with a random direction cuts off 0, 10, 30 or 50 % of the vertices, turned at random
-by 45 degrees, into studies that lack them: 12 synthetic brains of 6,000 vertices and 8 others, 16
-faces drawn from a published model (its mean face and 24 modes, with normal scores) and 8 others,
-and five mouse skulls, each into a study of the four others.  For each cut the mean over the shapes
-of: CPU seconds; distance to the truth where the part is, in % of sqrt(area), of the whole shape
-inserted, of the part, of rustcpd; the same where it is not, with that of the mean shape laid on the
-truth of what is there alone; the share of coordinates that lie within intervals of 50, 80 and 90 %
-where nothing is, around the truth, and around the match of the whole; where the part is, of 90 %;
-and where nothing is, rustcpd's of 90 %.  Skulls have no truth but the match of the whole.  Parts
-that are refused are counted, and in no mean.
+``partial.py [brains faces skulls] [--few] [--alone] [--seed N ...] [--studies FOLDER]``: new
+shapes, of which a plane with a random direction cuts off 0, 10, 30 or 50 % of the vertices, turned
+at random by 45 degrees, into studies that lack them: 12 synthetic brains of 6,000 vertices and 8
+others, 16 faces drawn from a published model (its mean face and 24 modes, with normal scores) and 8
+others, and five mouse skulls, each into a study of the four others.  For each cut the mean over the
+shapes of: CPU seconds; distance to the truth where the part is, in % of sqrt(area), of the whole
+shape inserted, of the part, of rustcpd; the same where it is not, with that of the mean shape laid
+on the truth of what is there alone; the share of coordinates that lie within intervals of 50, 80
+and 90 % where nothing is, around the truth, and around the match of the whole; where the part is,
+of 90 %; and where nothing is, rustcpd's of 90 %.  Skulls have no truth but the match of the whole.
+Parts that are refused are counted, and in no mean.
 
 rustcpd gets the mean and the modes of the same study and the same part: ``pose_initialize`` (with
 translation anchors and adaptive mixing, as it says for partial targets), ``register_atlas``,
 ``posterior``; ``--alone`` goes without it.  ``--few`` takes two shapes of each set, ``--seed N``
 other brains and faces than those of 3, ``--studies`` keeps the studies in a folder.
+
+``--seed`` with several numbers (``4 6-8``) makes a study of each.  The shapes of all are numbered
+on, and each is cut by planes of its own: those of the first eight are the same for every seed
+alone.  At the end all are pooled: the mean of every share, its standard error as if all shapes were
+independent and as if those of one study were alike in part, and the least and the largest share of
+single shapes.
 
 ``--left-out`` has no new shapes: of the eleven brains of the study beside its template the same
 part is missing, which a plane of random direction cuts off the mean shape, six for each share (two
@@ -23,7 +29,9 @@ with ``--few``), and each is told by the others with the factor and the share of
 each cut: the parts of shapes; the share of coordinates where nothing is that lie within intervals
 of 90 % around the truth, and with all of the variance between ways; and the median of cov(p, e) /
 var(e), with p what is told less the match and e the match less the truth, where nothing is, with
-what stands for e in a study, the match less the direct way, and both where the part is.
+what stands for e in a study, the match less the direct way, and both where the part is.  The planes
+are the same for every seed; of several the two shares are pooled, with the standard error between
+studies.
 """
 
 import logging
@@ -32,6 +40,7 @@ import sys
 import tempfile
 import time
 import warnings
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
@@ -272,57 +281,145 @@ def rows_of_left_out(found, gaps, wrong):
 
 
 def left_out(store, n_planes, seed):
-    """The table of shapes of a study that are told by the others."""
+    """The table of shapes of a study that are told by the others, and the rows of each share.
+
+    Rows are those of all shapes with the first plane, then with the second, and so on.
+    """
     study, _, true = study_of_brains(store, seed)
     model = model_of(study)
     gaps, wrong = gaps_between_ways(model), wrong_of(model, true)
-    sys.stdout.write(f"\nbrains of seed {seed}, left out\n\n| {' | '.join(HEAD_LEFT_OUT)} |\n")
-    sys.stdout.write(f"|{' --- |' * len(HEAD_LEFT_OUT)}\n")
+    sys.stdout.write(f"\nbrains of seed {seed}, left out\n\n{heading(HEAD_LEFT_OUT)}")
+    tables = {}
     for share in SHARES[1:]:
         rows = [
             row
             for present, density in parts_of(model, share, n_planes)
             for row in rows_of_left_out(found_again(model, present, density), gaps, wrong)
         ]
-        table = np.array(rows)
+        table = tables[share] = np.array(rows)
         told = [*table[:, :2].mean(0), *np.nanmedian(table[:, 2:], 0)]
-        cells = [str(len(rows)), *(f"{value:.3f}" for value in told)]
-        sys.stdout.write(f"| {100 * share:.0f} % | {' | '.join(cells)} |\n")
+        sys.stdout.write(line(share, [str(len(rows)), *(f"{value:.3f}" for value in told)]))
         sys.stdout.flush()
+    return tables
+
+
+def pooled_left_out(of_seeds):
+    """The table of the shapes left out of several studies, seed -> rows as of :func:`left_out`."""
+    lines = heading([*HEAD_LEFT_OUT[:2], *(f"{n} (standard error)" for n in HEAD_LEFT_OUT[2:4])])
+    for share in SHARES[1:]:
+        table = np.concatenate([of[share] for of in of_seeds.values()])
+        study = np.repeat(list(of_seeds), [len(of[share]) for of in of_seeds.values()])
+        of_each = [
+            f"{values.mean():.3f} ({standard_error(values, study):.3f})" for values in table.T[:2]
+        ]
+        lines += line(share, [str(len(table)), *of_each])
+    return lines
+
+
+def heading(names):
+    """The first two lines of a table."""
+    return f"| {' | '.join(names)} |\n|{' --- |' * len(names)}\n"
+
+
+def line(share, cells):
+    """The line of a table with what is missing and these cells."""
+    return f"| {100 * share:.0f} % | {' | '.join(cells)} |\n"
+
+
+def cuts(name, folder, keep, seed, few, *, first=0, alone=False):
+    """Share of missing -> what is measured of each new shape of one study, None where refused.
+
+    The planes depend on the number of the shape, of which that of the first is given.
+    """
+    rows = {share: [] for share in SHARES}
+    new_shapes = globals()[name](folder, keep / f"study_{name}_{seed}", few, seed)
+    for i, new in enumerate(new_shapes, first):
+        of_whole = whole_inserted(*new[:2])
+        for share in SHARES:
+            rng = np.random.default_rng([i, round(10 * share)])
+            rows[share].append(row_of(*new, of_whole, share, rng, alone=alone))
+    return rows
+
+
+def told(rows):
+    """The table of the new shapes of one study."""
+    lines = heading(HEAD)
+    for share, of_cut in rows.items():
+        found = [row for row in of_cut if row is not None]
+        means = np.mean(found, 0) if found else [np.nan] * (len(HEAD) - 2)
+        cells = [f"{value:.3f}" if value == value else "-" for value in means]
+        lines += line(share, [*cells, str(len(of_cut) - len(found))])
+    return lines
+
+
+def standard_error(values, group):
+    """Of a mean, where values of one group are alike in part.
+
+    What those of a group lie off the mean counts as one draw.
+    """
+    off, groups = values - values.mean(), np.unique(group)
+    sums = np.array([off[group == one].sum() for one in groups])
+    return float(np.sqrt((sums**2).sum() * len(groups) / (len(groups) - 1)) / len(values))
+
+
+def pooled(of_seeds):
+    """The table of the new shapes of several studies, seed -> rows as of :func:`cuts`."""
+    columns = [i for i, name in enumerate(HEAD[1:-1]) if "%" in name and "rustcpd" not in name]
+    names = [f"{HEAD[1 + i]} (standard errors; least, largest)" for i in columns]
+    lines = heading(["missing", "shapes", *names])
+    for share in SHARES:
+        rows = [(n, row) for n, of in of_seeds.items() for row in of[share] if row is not None]
+        study, table = np.array([n for n, _ in rows]), np.array([row for _, row in rows])
+        cells = []
+        for values in table[:, columns].T:
+            alone, together = (standard_error(values, of) for of in (np.arange(len(rows)), study))
+            ends = f"{alone:.3f}, {together:.3f}; {values.min():.2f}, {values.max():.2f}"
+            cells.append(f"{values.mean():.3f} ({ends})" if values.mean() == values.mean() else "-")
+        lines += line(share, [str(len(rows)), *cells])
+    return lines
+
+
+def numbers_after(word, words, default):
+    """The numbers that follow a word: ``--seed 4 6-8`` are four."""
+    if word not in words:
+        return [default]
+    rest = takewhile(lambda one: one[0].isdigit(), words[words.index(word) + 1 :])
+    ends = [[int(end) for end in one.split("-")] for one in rest]
+    return [n for own in ends for n in range(own[0], own[-1] + 1)]
 
 
 def main(words):
     sets = [word for word in words if word in ("brains", "faces", "skulls")]
     sets = sets or ["brains", *(["faces", "skulls"] if DATA.is_dir() else [])]
+    seeds, few = numbers_after("--seed", words, 3), "--few" in words
     with tempfile.TemporaryDirectory() as folder:
         if DATA.is_dir() and sets != ["brains"]:
             subprocess.run(
                 [sys.executable, DATA / "unpack.py", folder], check=True, stdout=subprocess.DEVNULL
             )
         keep = Path(words[words.index("--studies") + 1] if "--studies" in words else folder)
-        seed = int(words[words.index("--seed") + 1]) if "--seed" in words else 3
         if "--left-out" in words:
-            left_out(keep / f"study_brains_{seed}", 2 if "--few" in words else 6, seed)
+            left = {
+                seed: left_out(keep / f"study_brains_{seed}", 2 if few else 6, seed)
+                for seed in seeds
+            }
+            if len(seeds) > 1:
+                sys.stdout.write(f"\nbrains of {len(seeds)} studies, left out\n\n")
+                sys.stdout.write(pooled_left_out(left))
             return
         for name in sets:
-            few = 2 if "--few" in words else 8
-            rows = {share: [] for share in SHARES}
-            store = keep / f"study_{name}_{seed}"
-            for i, new in enumerate(globals()[name](Path(folder), store, few, seed)):
-                of_whole = whole_inserted(*new[:2])
-                for share in SHARES:
-                    rng = np.random.default_rng([i, round(10 * share)])
-                    row = row_of(*new, of_whole, share, rng, alone="--alone" in words)
-                    rows[share].append(row)
-            shapes = len(rows[0.0])
-            sys.stdout.write(f"\n{name}, {shapes} new shapes\n\n| {' | '.join(HEAD)} |\n")
-            sys.stdout.write(f"|{' --- |' * len(HEAD)}\n")
-            for share, of_cut in rows.items():
-                told = np.array([row for row in of_cut if row is not None])
-                cells = [f"{value:.3f}" if value == value else "-" for value in told.mean(0)]
-                cells.append(str(len(of_cut) - len(told)))
-                sys.stdout.write(f"| {100 * share:.0f} % | {' | '.join(cells)} |\n")
-            sys.stdout.flush()
+            of_seeds, before = {}, 0
+            for seed in seeds:
+                given = name, Path(folder), keep, seed, 2 if few else 8
+                rows = cuts(*given, first=before, alone="--alone" in words)
+                of_seeds[seed] = rows
+                n = len(rows[SHARES[0]])
+                before += n
+                sys.stdout.write(f"\n{name}, {n} new shapes, seed {seed}\n\n{told(rows)}")
+                sys.stdout.flush()
+            if len(seeds) > 1:
+                sys.stdout.write(f"\n{name}, {len(seeds)} studies\n\n{pooled(of_seeds)}")
+                sys.stdout.flush()
 
 
 if __name__ == "__main__":

@@ -76,7 +76,7 @@ def test_a_shape_of_weak_evidence_is_named_and_stays(handed):
     weak = seen["s4"].assign(hand=0.1 * seen["s4"]["hand"])
     names, (remark,) = of_other_hand(seen | {"s4": weak})
     assert names == ["s1"]
-    assert "cannot tell the hand of s4, which stayed" in remark
+    assert "cannot tell the hand of s4, which stayed as it is: look at it" in remark
     assert of_other_hand({"s0": seen["s0"]})[0] == []
 
 

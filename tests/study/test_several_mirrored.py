@@ -189,12 +189,23 @@ def test_structures_say_together_of_which_hand_a_subject_is():
 
 def test_a_subject_with_structures_of_both_hands_stays_and_is_told():
     both = {"left": looks([1.2, 1.2, -1.2, 1.2]), "right": looks([1.2, 1.2, 1.2, 1.2])}
-    _, names, told = subjects_of_other_hand(both)
+    _, names, (line,) = subjects_of_other_hand(both)
     assert names == []
-    assert any(
-        "left c as it is, as its structures are of both hands (left -1.44, " in line
-        for line in told
-    )
+    assert "c is of both hands (left -1.44, right +1.44) and stayed as it is: was one" in line
+
+
+def test_subjects_of_both_hands_and_those_of_none_are_each_told_once():
+    both = {"left": looks([1.8, 1.8, -1.8, 0.1]), "right": looks([1.8, 1.8, 1.8, 0.1])}
+    hand, names, (unsure, odd) = subjects_of_other_hand(both)
+    assert names == []
+    assert abs(hand["c"]) < 0.5  # what its structures say together says nothing, either
+    assert "cannot tell the hand of d, which stayed as it is: look at it, and name it" in unsure
+    assert "c is of both hands (left -" in odd
+    # where one structure says more than the other, too
+    strong = {"left": looks([1.2, 1.2, -3, 1.2]), "right": looks([1.2, 1.2, 0.9, 1.2])}
+    hand, names, (odd,) = subjects_of_other_hand(strong)
+    assert (hand["c"] < -0.5, names) == (True, [])
+    assert "c is of both hands (left -" in odd
 
 
 def test_one_subject_alone_is_of_no_hand():
