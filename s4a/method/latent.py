@@ -344,12 +344,12 @@ def consistent_zoomout(
 class Sampled(NamedTuple):
     """What Consistent ZoomOut holds of a shape in memory: its functions at its samples.
 
-    ``eigenvalue (k,)``, ``vertex (s,)``, ``Phi (s, >= k)`` and ``area (s,)`` there, and
-    ``around (s, w)``, the vertices nearest to each.
+    ``eigenvalue (k,)``; its vertices ``at (s,)``, ``Phi (s, >= k)`` and ``area (s,)`` there; the
+    vertices nearest to each, ``around (s, w)``.
     """
 
     eigenvalue: np.ndarray
-    vertex: np.ndarray
+    at: np.ndarray
     Phi: np.ndarray
     area: np.ndarray
     around: np.ndarray
@@ -408,7 +408,7 @@ def larger_maps(
             if bases is None:
                 match = nearest_float32(query, candidates)
             else:
-                match = nearest_around(query, candidates, sampled[i].vertex, sampled[i].around)
+                match = nearest_around(query, candidates, sampled[i].at, sampled[i].around)
             C[r] = solve @ Phi.take(match, axis=0)[:, :k]
 
     threads = Parallel(n_jobs=n_jobs, backend="threading")

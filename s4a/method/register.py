@@ -15,12 +15,22 @@ from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.method import joint
 from s4a.method.confidence import confidence
 from s4a.method.deform import displacement_in_template
-from s4a.method.elastic import Landmarks, elastic_rounds, local_rounds, starts_that_meet
+from s4a.method.elastic import (
+    STIFFNESS,
+    Landmarks,
+    elastic_rounds,
+    local_rounds,
+    starts_that_meet,
+)
 from s4a.method.first_map import nearest_after_motion
 from s4a.method.fmap import fmap_from_match
 from s4a.method.nearest import nearest_in_cells, nearest_of_few, nearest_rows
 from s4a.method.shape import Basis, Shape
 from s4a.schema import INPUT, dataset, in_unit
+
+# Where |log| of the ratio of areas is above the first at a hundredth of the template, rounds begin
+# with the second of the steps, too, and are kept where the score is lower by the third, a share
+TORN, LOOSER, CLEARLY = 0.8, 4, 0.08
 
 Functions = tuple[np.ndarray, np.ndarray]  # of source and target, rows of which are compared
 
@@ -355,6 +365,11 @@ def register_surface(
         names = [name for name in names if name not in whole]  # by parts
         for name, X in elastic_surfaces(source, target, whole, landmarks).items():
             ends[f"{name}+elastic"] = scored_alone(M, N, X)
+        if ends and torn(ends[best_of(ends)][1], N):
+            limit = (1 - CLEARLY) * ends[best_of(ends)][0]
+            again = elastic_surfaces(source, target, whole, landmarks, looser=True)
+            scored = {name: scored_alone(M, N, X) for name, X in again.items()}
+            ends |= {f"{name}+looser": end for name, end in scored.items() if end[0] < limit}
     for name in names:
         if name == "intrinsic":
             match, compared, certified = match_functions(source, target, *functions)
@@ -369,12 +384,26 @@ def register_surface(
         else:
             moved = N.moved_to(joint.move(N, warp))
             ends[name] = joint.registration_score(M, N, part, moved), moved
-    method = min(ends, key=lambda name: ends[name][0])
+    method = best_of(ends)
     score, moved = ends[method]
     if method != "intrinsic":
         match = match_surfaces(moved.X, moved.normals, M.X, M.normals)
     attrs |= {"method": method, "score": score}
     return match, moved, attrs
+
+
+def best_of(ends: dict[str, tuple[float, Basis]]) -> str:
+    """The name of the end of registration that has the lowest score."""
+    return min(ends, key=lambda name: ends[name][0])
+
+
+def torn(moved: Basis, target: Basis) -> bool:
+    """Whether a hundredth of the registered template is stretched or squeezed by :data:`TORN`.
+
+    So it is between places where it lies on the right fold and on the one beside.
+    """
+    strain = np.abs(log_area_ratio(moved.X, target.X, target.T))
+    return bool(np.quantile(strain, 0.99) > TORN)
 
 
 def scored_alone(source: Basis, target: Basis, X: np.ndarray) -> tuple[float, Basis]:
@@ -389,15 +418,22 @@ def elastic_surfaces(
     target: Shape,
     starts: dict[str, joint.Warp],
     landmarks: Landmarks | None = None,
+    *,
+    looser: bool = False,
 ) -> dict[str, np.ndarray]:
     """The template ``(n_target, 3)`` after elastic rounds from several starts, and local ones.
 
-    Starts that meet go on as one, see :func:`s4a.method.elastic.starts_that_meet`.
+    Starts that meet go on as one, see :func:`s4a.method.elastic.starts_that_meet`.  Where the end
+    of that lies on a fold beside the one on which a start was right, rounds from the starts
+    themselves that begin less stiff, `looser`, may end on the right one.
     """
     M, N = source.full, target.low_on_surface
+    if not looser:
+        starts = starts_that_meet(M, N, starts, landmarks)
+    stiffness = STIFFNESS[LOOSER if looser else 0 :]
     surfaces = {}
-    for name, start in starts_that_meet(M, N, starts, landmarks).items():
-        warp = elastic_rounds(M, N, start, landmarks=landmarks)
+    for name, start in starts.items():
+        warp = elastic_rounds(M, N, start, stiffness=stiffness, landmarks=landmarks)
         surfaces[name] = after_local_rounds(source, target, warp, landmarks)
     return surfaces
 

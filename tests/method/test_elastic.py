@@ -206,6 +206,30 @@ def test_which_of_two_starts_that_meet_is_the_first_does_not_matter(pair):
     assert np.allclose(one, other, atol=1e-9)
 
 
+def test_rounds_that_begin_less_stiff_are_nearer_where_the_template_is_torn(
+    monkeypatch,
+):
+    tree = synthetic.brains(4, 2500, seed=25)
+    template, shape = (tree[f"original/brain_{i:02d}"].to_dataset() for i in (3, 4))
+    at = tree["truth/brain_03/reference_point"].values
+    true = synthetic.position(tree["truth"], "brain_04", at)
+
+    def registered():
+        found = match_pair(shape, template, n_coarse=600, k=50)
+        image = template["position"] + found["displacement"] - found["translation"]
+        image = image.values @ found["rotation"].values / found["scale"].item()
+        torn = np.quantile(abs(found["distortion"]), 0.99)
+        return found.attrs["method"], torn, np.linalg.norm(image - true, axis=1).mean()
+
+    method, torn, error = registered()
+    monkeypatch.setattr("s4a.method.register.TORN", np.inf)
+    stiff, torn_before, error_before = registered()
+    assert method.endswith("+looser")
+    assert stiff.endswith("+elastic")
+    assert torn < torn_before
+    assert error < 0.7 * error_before
+
+
 def test_a_coarse_triangle_without_area_is_no_obstacle(pair):
     template, shape, _ = pair
     coarse = template.coarse.copy(deep=True)
