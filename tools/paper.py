@@ -50,7 +50,7 @@ SPEED = (
     ("speed.py", "growth"),
     ("speed.py", "pipelines", "10", "100000"),
     ("speed.py", "whole", "51", "100000"),
-    ("speed.py", "versions", "4b9c593", "51", "100000"),
+    ("speed.py", "versions", "51", "100000"),
     ("widgets.py",),
 )
 FLAGS = ("--speed", "--list", "--rest")

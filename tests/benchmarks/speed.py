@@ -5,8 +5,8 @@ input: seconds of CPU, of the clock, and the peak of memory above what the proce
 pyFM is on PyPI as ``pyfmaps`` (the extra ``bench``).  ``speed.py stages``, ``pipelines``,
 ``growth``, ``pairs``, ``nearest`` or ``seals`` runs one part, ``speed.py methods brains faces
 heads`` an analysis by RE-MATCH and by SCALABLE of ten shapes of each, ``speed.py whole 51 100000``
-the whole analysis of so many synthetic shapes of so many vertices, ``speed.py versions COMMIT 51
-100000`` the same by an older version and by this one, three times in turn.
+the whole analysis of so many synthetic shapes of so many vertices, ``speed.py versions 51 100000``
+the same by an older version and by this one, three times in turn.
 """
 
 import itertools
@@ -737,6 +737,7 @@ def whole(folder, n=51, n_vertices=VERTICES):
 
 # the analysis of one version in a process of its own: its stages, and where the template's vertices
 # are on every shape
+BEFORE = "4b9c593"  # of 22 November 2026
 ONE_VERSION = """
 import json, sys, time
 import numpy as np
@@ -762,7 +763,7 @@ print(json.dumps({"wall": wall, "template": template, "area": areas, "stages": [
 """
 
 
-def versions(folder, revision, n=51, n_vertices=VERTICES, times=3):
+def versions(folder, n=51, n_vertices=VERTICES, times=3, revision=BEFORE):
     """One collection as an older version of the repository analyses it and as this one, in turn.
 
     Stages, memory, and the mean distance of the registered surfaces from the truth, of 2,000
