@@ -735,9 +735,9 @@ def whole(folder, n=51, n_vertices=VERTICES):
         say(f"{stage:36} {seconds:8.1f} s {memory:8.0f} MiB")
 
 
+BEFORE = "4b9c593"  # the version of 22 November 2026
 # the analysis of one version in a process of its own: its stages, and where the template's vertices
 # are on every shape
-BEFORE = "4b9c593"  # of 22 November 2026
 ONE_VERSION = """
 import json, sys, time
 import numpy as np
