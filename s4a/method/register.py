@@ -28,9 +28,11 @@ from s4a.method.nearest import nearest_in_cells, nearest_of_few, nearest_rows
 from s4a.method.shape import Basis, Shape
 from s4a.schema import INPUT, dataset, in_unit
 
-# Where |log| of the ratio of areas is above the first at a hundredth of the template, rounds begin
-# with the second of the steps, too, and are kept where the score is lower by the third, a share
-TORN, LOOSER, CLEARLY = 0.8, 4, 0.08
+# |log| of the ratio of areas at the hundredth of the template that changes most, above which it is
+# torn: of 71 registrations in eight, all of them wrong (docs/decisions.md)
+TORN = 0.8
+LOOSER = 4  # the step of elastic rounds with which they begin then, too
+CLEARLY = 0.08  # share by which their score must be lower
 
 Functions = tuple[np.ndarray, np.ndarray]  # of source and target, rows of which are compared
 
@@ -339,8 +341,9 @@ def register_surface(
         After which the displacement of the spectral match is smoothed, see
         :func:`s4a.method.joint.warp_after`; by default after the motion that fits it best.
     elastic : bool
-        Whether finalists go through :func:`elastic_surfaces`; those by parts, of far poses, through
-        local rounds alone, as bodies otherwise ended farther from the truth.
+        Whether finalists go through :func:`elastic_surfaces`, where the best end is :func:`torn`
+        through looser rounds, too; those by parts, of far poses, through local rounds alone, as
+        bodies otherwise ended farther from the truth.
 
     Returns
     -------
