@@ -341,9 +341,9 @@ def register_surface(
         After which the displacement of the spectral match is smoothed, see
         :func:`s4a.method.joint.warp_after`; by default after the motion that fits it best.
     elastic : bool
-        Whether finalists go through :func:`elastic_surfaces`, where the best end is :func:`torn`
-        through looser rounds, too; those by parts, of far poses, through local rounds alone, as
-        bodies otherwise ended farther from the truth.
+        Whether finalists go through :func:`elastic_surfaces`, and through looser rounds, too,
+        where the best end is torn (:func:`tear`); those by parts, of far poses, through local
+        rounds alone, as bodies otherwise ended farther from the truth.
 
     Returns
     -------
@@ -368,11 +368,11 @@ def register_surface(
         names = [name for name in names if name not in whole]  # by parts
         for name, X in elastic_surfaces(source, target, whole, landmarks).items():
             ends[f"{name}+elastic"] = scored_alone(M, N, X)
-        if ends and torn(ends[best_of(ends)][1], N):
-            limit = (1 - CLEARLY) * ends[best_of(ends)][0]
+        if ends and tear(ends[best_of(ends)][1], N) > TORN:
+            torn = ends[best_of(ends)]
             again = elastic_surfaces(source, target, whole, landmarks, looser=True)
-            scored = {name: scored_alone(M, N, X) for name, X in again.items()}
-            ends |= {f"{name}+looser": end for name, end in scored.items() if end[0] < limit}
+            scored = {f"{name}+looser": scored_alone(M, N, X) for name, X in again.items()}
+            ends |= {name: end for name, end in scored.items() if mends(end, torn, N)}
     for name in names:
         if name == "intrinsic":
             match, compared, certified = match_functions(source, target, *functions)
@@ -400,13 +400,20 @@ def best_of(ends: dict[str, tuple[float, Basis]]) -> str:
     return min(ends, key=lambda name: ends[name][0])
 
 
-def torn(moved: Basis, target: Basis) -> bool:
-    """Whether a hundredth of the registered template is stretched or squeezed by :data:`TORN`.
+def tear(moved: Basis, target: Basis) -> float:
+    """How much the registered template is stretched or squeezed where it is most, as |log| of areas.
 
-    So it is between places where it lies on the right fold and on the one beside.
+    The quantile that a hundredth of its vertices exceeds.  Between a place on the right fold and
+    one on the fold beside, the template is torn.
     """
     strain = np.abs(log_area_ratio(moved.X, target.X, target.T))
-    return bool(np.quantile(strain, 0.99) > TORN)
+    return float(np.quantile(strain, 0.99))
+
+
+def mends(end: tuple[float, Basis], torn: tuple[float, Basis], target: Basis) -> bool:
+    """Whether an end has a lower score than a torn one, by :data:`CLEARLY`, and is less torn."""
+    lower = end[0] < (1 - CLEARLY) * torn[0]
+    return lower and tear(end[1], target) < tear(torn[1], target)
 
 
 def scored_alone(source: Basis, target: Basis, X: np.ndarray) -> tuple[float, Basis]:
