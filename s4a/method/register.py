@@ -28,11 +28,11 @@ from s4a.method.nearest import nearest_in_cells, nearest_of_few, nearest_rows
 from s4a.method.shape import Basis, Shape
 from s4a.schema import INPUT, dataset, in_unit
 
-# |log| of the ratio of areas at the hundredth of the template that changes most, above which it is
-# torn: of 71 registrations in eight, all of them wrong (docs/decisions.md)
-TORN = 0.8
+# |log| of the ratio of areas at the hundredth of the template that changes most, above which it may
+# lie on a wrong fold; where looser rounds mend nothing it is mostly below
+TORN = 0.65
 LOOSER = 4  # the step of elastic rounds with which they begin then, too
-CLEARLY = 0.08  # share by which their score must be lower
+MENDED = 0.8  # of score times tear: what it falls to, at most, where a fold is found (decisions.md)
 
 Functions = tuple[np.ndarray, np.ndarray]  # of source and target, rows of which are compared
 
@@ -401,19 +401,22 @@ def best_of(ends: dict[str, tuple[float, Basis]]) -> str:
 
 
 def tear(moved: Basis, target: Basis) -> float:
-    """How much the registered template is stretched or squeezed where it is most, as |log| of areas.
+    """How much the registered template is stretched or squeezed, where it is most.
 
-    The quantile that a hundredth of its vertices exceeds.  Between a place on the right fold and
-    one on the fold beside, the template is torn.
+    The |log| of the ratio of areas that a hundredth of its vertices exceeds.  Between a place on
+    the right fold and one on the fold beside, the template is torn.
     """
     strain = np.abs(log_area_ratio(moved.X, target.X, target.T))
     return float(np.quantile(strain, 0.99))
 
 
 def mends(end: tuple[float, Basis], torn: tuple[float, Basis], target: Basis) -> bool:
-    """Whether an end has a lower score than a torn one, by :data:`CLEARLY`, and is less torn."""
-    lower = end[0] < (1 - CLEARLY) * torn[0]
-    return lower and tear(end[1], target) < tear(torn[1], target)
+    """Whether an end is better than a torn one, in score and tear together (:data:`MENDED`).
+
+    Score alone falls where a looser template follows noise, which tears it more.
+    """
+    before, after = (score * tear(moved, target) for score, moved in (torn, end))
+    return after < MENDED * before
 
 
 def scored_alone(source: Basis, target: Basis, X: np.ndarray) -> tuple[float, Basis]:

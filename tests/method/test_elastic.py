@@ -9,7 +9,7 @@ from s4a import analyse, match_pair, synthetic
 from s4a.geometry.closest import distance_to_surface
 from s4a.geometry.mesh import as_dataset, cotan_weights, stiffness, triangle_normals, vertex_normals
 from s4a.method import elastic, joint
-from s4a.method.register import elastic_surfaces, register_surface
+from s4a.method.register import TORN, elastic_surfaces, mends, register_surface, tear
 from s4a.method.remesh import laplacian
 from s4a.method.shape import Basis
 from s4a.schema import dataset
@@ -228,6 +228,22 @@ def test_rounds_that_begin_less_stiff_are_nearer_where_the_template_is_torn(
     assert stiff.endswith("+elastic")
     assert torn < torn_before
     assert error < 0.7 * error_before
+
+
+def test_a_looser_end_is_kept_where_score_and_tear_fall_together(pair):
+    N = pair[0].full
+    near = np.exp(-40 * ((N.X - N.X[0]) ** 2).sum(1))
+
+    def end(score, stretch):
+        moved = N.moved_to(N.X[0] + (N.X - N.X[0]) * (1 + stretch * near)[:, None])
+        return score, moved
+
+    torn = end(1.0, 0.8)
+    assert tear(end(1.0, 0.0)[1], N) == pytest.approx(0, abs=1e-9)
+    assert tear(torn[1], N) > TORN
+    assert mends(end(0.97, 0.3), torn, N)  # on the right fold: a little nearer, hardly torn
+    assert not mends(end(0.91, 1.0), torn, N)  # it follows noise: nearer, and more torn
+    assert not mends(end(1.3, 0.5), torn, N)  # merely stiffer
 
 
 def test_a_coarse_triangle_without_area_is_no_obstacle(pair):
