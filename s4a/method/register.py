@@ -29,8 +29,9 @@ from s4a.method.shape import Basis, Shape
 from s4a.schema import INPUT, dataset, in_unit
 
 # |log| of the ratio of areas at the hundredth of the template that changes most, above which it may
-# lie on a wrong fold
+# lie on a wrong fold; and by what share less where a low resolution of few vertices smears tears
 TORN = 0.65
+SMEARED, FEW = 0.3, 2000
 LOOSER = 4  # the step of elastic rounds with which they begin then, too
 # of score times tear: what looser rounds must leave at most.  Where they find the right fold they
 # leave 0.3 to 0.72; real heads 0.81 or more where the score falls at all (docs/decisions.md)
@@ -370,7 +371,8 @@ def register_surface(
         names = [name for name in names if name not in whole]  # by parts
         for name, X in elastic_surfaces(source, target, whole, landmarks).items():
             ends[f"{name}+elastic"] = scored_alone(M, N, X)
-        if ends and tear(ends[best_of(ends)][1], N) > TORN:
+        limit = TORN * (1 - SMEARED if len(target.low.X) < FEW else 1)
+        if ends and tear(ends[best_of(ends)][1], N) > limit:
             torn = ends[best_of(ends)]
             again = elastic_surfaces(source, target, whole, landmarks, looser=True)
             scored = {f"{name}+looser": scored_alone(M, N, X) for name, X in again.items()}
