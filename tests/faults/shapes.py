@@ -84,7 +84,9 @@ def text(path):
     X, T = shape()
     write(path, X, T)
     head = path.read_bytes().partition(b"end_header\n")[0]
-    rows = [*(" ".join(map(str, x)) for x in X), *("3 " + " ".join(map(str, t)) for t in T)]
+    # as many digits on every machine, whatever its rounding
+    points = (" ".join(f"{number:.15f}" for number in x) for x in X)
+    rows = [*points, *("3 " + " ".join(map(str, t)) for t in T)]
     path.write_bytes(head + b"end_header\n" + "\n".join(rows).encode())
 
 
