@@ -29,9 +29,10 @@ from s4a.method.shape import Basis, Shape
 from s4a.schema import INPUT, dataset, in_unit
 
 # |log| of the ratio of areas at the hundredth of the template that changes most, above which it may
-# lie on a wrong fold; and by what share less where a low resolution of few vertices smears tears
+# lie on a wrong fold
 TORN = 0.65
-SMEARED, FEW = 0.3, 2000
+FEW = 2000  # vertices of low resolution: fewer smear tears
+SMEARED = 0.3  # by this share of TORN
 LOOSER = 4  # the step of elastic rounds with which they begin then, too
 # of score times tear: what looser rounds must leave at most.  Where they find the right fold they
 # leave 0.3 to 0.72; real heads 0.81 or more where the score falls at all (docs/decisions.md)
@@ -417,7 +418,8 @@ def tear(moved: Basis, target: Basis) -> float:
 def mends(end: tuple[float, Basis], torn: tuple[float, Basis], target: Basis) -> bool:
     """Whether an end is better than a torn one, in score and tear together (:data:`MENDED`).
 
-    Score alone falls where a looser template follows noise, which tears it more.
+    Score alone falls where a looser template follows noise, which tears it more.  The lower score
+    decides among the ends that are left (:func:`best_of`).
     """
     before, after = (score * tear(moved, target) for score, moved in (torn, end))
     return after < MENDED * before
