@@ -99,8 +99,11 @@ def machine():
 def versions():
     """The versions of S4A and of what computes for it."""
     revision = subprocess.run(
-        ["git", "describe", "--always", "--dirty"], cwd=ROOT, capture_output=True, text=True
+        ["git", "describe", "--always"], cwd=ROOT, capture_output=True, text=True
     ).stdout.strip()
+    code = ["s4a", "tests", "pyproject.toml"]  # a picture drawn anew changes no number
+    changed = subprocess.run(["git", "diff", "--quiet", "HEAD", "--", *code], cwd=ROOT).returncode
+    revision += "-dirty" if revision and changed else ""
     named = ", ".join(f"{name} {version(name)}" for name in PACKAGES)
     at = f" at {revision}" if revision else ""
     return f"S4A {version('s4a')}{at}, Python {platform.python_version()}, {named}"
