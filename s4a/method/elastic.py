@@ -251,6 +251,18 @@ def pins(
     return E, np.full(len(y), LANDMARK_WEIGHT), y
 
 
+def step_of(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """The solution of normal equations ``(q, q)``, ``(q,)``.
+
+    Where a surface has collapsed, rounding can leave a direction of which no point tells with less
+    than nothing; then what such directions tell, 1e-10 of the largest, is left out.
+    """
+    try:
+        return scipy.linalg.solve(matrix, right, assume_a="pos")
+    except np.linalg.LinAlgError:
+        return scipy.linalg.lstsq(matrix, right, cond=1e-10)[0]
+
+
 def elastic_rounds(
     source: Basis,
     target: Basis,
@@ -338,7 +350,7 @@ def elastic_rounds(
                 matrix += more[0]
                 right += more[1]
             right -= (apart.T @ (stiff * bending * w)).T.ravel()
-            change = scipy.linalg.solve(matrix + price, right, assume_a="pos")
+            change = step_of(matrix + price, right)
             w = w + apart @ change.reshape(3, -1).T
             before, X = X, E @ w
             if target.area @ ((X - before) ** 2).sum(1) < still**2:

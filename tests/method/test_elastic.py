@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.linalg
 
 from s4a import analyse, match_pair, synthetic
 from s4a.geometry.closest import distance_to_surface
@@ -317,3 +318,17 @@ def test_a_shape_that_ends_elsewhere_keeps_its_boundary(monkeypatch):
     closed = shape_of(synthetic.ellipsoid(1000), options)
     assert elastic.rim_ahead(closed.full, template.low, template.low.X) is None
     assert elastic.rim_ahead(template.full, closed.low, closed.low.X) is None
+
+
+def test_a_direction_that_rounding_leaves_below_nothing_is_not_taken():
+    axes = np.linalg.qr(np.random.default_rng(0).normal(size=(4, 4)))[0]
+    told = np.array([1.0, 0.5, 1e-6, -1e-11])
+    matrix = axes * told @ axes.T
+    matrix = (matrix + matrix.T) / 2
+    right = axes @ np.array([1.0, 1.0, 1e-6, 1e-6])
+    with pytest.raises(np.linalg.LinAlgError):
+        scipy.linalg.solve(matrix, right, assume_a="pos")
+    along = axes.T @ elastic.step_of(matrix, right)
+    assert along == pytest.approx([1, 2, 1, 0], abs=1e-4)
+    sound = matrix + np.eye(4)
+    assert (elastic.step_of(sound, right) == scipy.linalg.solve(sound, right, assume_a="pos")).all()
