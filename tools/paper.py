@@ -102,7 +102,9 @@ def versions():
         ["git", "describe", "--always"], cwd=ROOT, capture_output=True, text=True
     ).stdout.strip()
     code = ["s4a", "tests", "pyproject.toml"]  # a picture drawn anew changes no number
-    changed = subprocess.run(["git", "diff", "--quiet", "HEAD", "--", *code], cwd=ROOT).returncode
+    changed = subprocess.run(
+        ["git", "diff", "--quiet", "HEAD", "--", *code], cwd=ROOT, capture_output=True
+    ).returncode
     revision += "-dirty" if revision and changed else ""
     named = ", ".join(f"{name} {version(name)}" for name in PACKAGES)
     at = f" at {revision}" if revision else ""

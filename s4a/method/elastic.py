@@ -254,13 +254,15 @@ def pins(
 def step_of(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     """The solution of normal equations ``(q, q)``, ``(q,)``.
 
-    Where a surface has collapsed, rounding can leave a direction of which no point tells with less
-    than nothing; then what such directions tell, 1e-10 of the largest, is left out.
+    Where a surface has collapsed, single precision can leave a direction of which no point tells
+    with less than nothing. Then those below 1e-10 of the largest eigenvalue are not taken.
     """
     try:
         return scipy.linalg.solve(matrix, right, assume_a="pos")
     except np.linalg.LinAlgError:
-        return scipy.linalg.lstsq(matrix, right, cond=1e-10)[0]
+        eigenvalue, Q = scipy.linalg.eigh(matrix)
+        told = eigenvalue > 1e-10 * eigenvalue[-1]
+        return Q[:, told] @ (Q[:, told].T @ right / eigenvalue[told])
 
 
 def elastic_rounds(

@@ -320,9 +320,10 @@ def test_a_shape_that_ends_elsewhere_keeps_its_boundary(monkeypatch):
     assert elastic.rim_ahead(template.full, closed.low, closed.low.X) is None
 
 
-def test_a_direction_that_rounding_leaves_below_nothing_is_not_taken():
+@pytest.mark.parametrize("below", [-1e-11, -1e-7])
+def test_a_direction_that_rounding_leaves_below_nothing_is_not_taken(below):
     axes = np.linalg.qr(np.random.default_rng(0).normal(size=(4, 4)))[0]
-    told = np.array([1.0, 0.5, 1e-6, -1e-11])
+    told = np.array([1.0, 0.5, 1e-6, below])
     matrix = axes * told @ axes.T
     matrix = (matrix + matrix.T) / 2
     right = axes @ np.array([1.0, 1.0, 1e-6, 1e-6])
