@@ -450,8 +450,9 @@ def open_without_following(path: str, flags: int) -> int:
 def lock(folder: Path | str) -> Iterator[Claim]:
     """Hold a study folder against a second run.
 
-    Released by the system when the process ends in whatever way.  Temporary files of a run that was
-    killed are removed; a folder with files of somebody else is not touched.
+    Released by the system when the process ends in whatever way.  Temporary files of processes that
+    were killed are removed when it begins and when it ends; a folder with files of somebody else
+    is not touched.
 
     Yields
     ------
@@ -492,8 +493,19 @@ def lock(folder: Path | str) -> Iterator[Claim]:
         handle.write(token)
         handle.flush()
         os.fsync(handle.fileno())  # it says that the folder is a study, after a power cut too
-        for stage in ("", *STAGES):
-            for temporary in (Path(folder) / stage).glob(".*.nc.*.tmp"):
-                if TEMPORARY.fullmatch(temporary.name):
-                    temporary.unlink(missing_ok=True)
-        yield Claim(Path(folder), token)
+        remove_temporary(Path(folder))
+        claim = Claim(Path(folder), token)
+        try:
+            yield claim
+        finally:  # where a task fails, the workers beside it are killed, in the midst of a file too
+            with suppress(ValueError, OSError):
+                claim.check()
+                remove_temporary(Path(folder))
+
+
+def remove_temporary(folder: Path) -> None:
+    """Remove what :func:`write` had begun and not finished, when nobody writes any more."""
+    for stage in ("", *STAGES):
+        for temporary in (folder / stage).glob(".*.nc.*.tmp"):
+            if TEMPORARY.fullmatch(temporary.name):
+                temporary.unlink(missing_ok=True)

@@ -506,6 +506,24 @@ def test_a_worker_of_a_run_that_is_over_writes_nothing(tmp_path):
     assert not list(tmp_path.glob(".*.tmp"))
 
 
+def test_what_a_killed_worker_had_begun_is_gone_when_the_run_is_over(tmp_path):
+    with contextlib.suppress(OSError), store.lock(tmp_path):
+        store.write(synthetic.sphere(50), tmp_path / "coarse" / "a.nc", "key")
+        begun = tmp_path / "coarse" / ".b.nc.1234.tmp"
+        begun.write_bytes(b"half of")
+        raise OSError("no room")
+    assert not begun.exists()
+    assert [path.name for path in (tmp_path / "coarse").iterdir()] == ["a.nc"]
+
+
+def test_a_run_that_lost_its_folder_leaves_what_the_other_has_begun(tmp_path):
+    with store.lock(tmp_path):
+        (tmp_path / store.LOCK).write_text("1 other")
+        begun = tmp_path / ".b.nc.1234.tmp"
+        begun.write_bytes(b"half of")
+    assert begun.exists()
+
+
 def test_workers_that_took_the_place_of_others_are_not_counted_with_them():
     own = peak_memory()
     found = together({os.getpid(): 1e9, -1: 100.0, -2: 10.0, -3: 50.0}, 2)
