@@ -13,9 +13,12 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse as sp
 import xarray as xr
+from scipy.sparse.linalg import cg
 
 from s4a.geometry.closest import closest_facing_point, interpolate, interpolation_matrix
-from s4a.geometry.mesh import as_arrays, vertex_normals
+from s4a.geometry.mesh import as_arrays, stiffness, vertex_areas, vertex_normals
+from s4a.method.confidence import RIGHT
+from s4a.method.remesh import laplacian
 
 # Triangle (p,) and barycentric weights (p, 3) of points on a surface, and how sure they are (p,).
 Places = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -125,8 +128,8 @@ def blend_routes(routes: list[Route], n: int) -> tuple[sp.csr_matrix, np.ndarray
     return W.tocsr(), np.mean(confidences, axis=0)
 
 
-def elect(W: sp.csr_matrix, label: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Votes of the source's vertices for a label at every target vertex.
+def votes_of(W: sp.csr_matrix, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Votes of the source's vertices for every label at every target vertex.
 
     Parameters
     ----------
@@ -136,19 +139,80 @@ def elect(W: sp.csr_matrix, label: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
 
     Returns
     -------
-    winner : ndarray (p,), the label with most votes; the first in sorted order among equals
     vote : float32 ndarray (p, l)
     value : ndarray (l,), the labels, sorted
+    """
+    value, code = np.unique(label, return_inverse=True)
+    one_hot = sp.csr_matrix((np.ones(len(code), np.float32), code, np.arange(len(code) + 1)))
+    return (W @ one_hot).toarray().astype(np.float32), value
+
+
+def uncertainty(confidence: np.ndarray) -> np.ndarray:
+    """Root of the mean squared error of a match that is this sure, as a share of sqrt(area).
+
+    A confidence is the share of such vertices within 1 % of sqrt(area) of the truth.  Where errors
+    are Gaussian in the plane, that is 1 - exp(-0.01^2 / r^2) for the radius r.
+
+    Parameters
+    ----------
+    confidence : ndarray (p,)
+        Below 0.1 it counts as 0.1, which is a radius of 3 %.
+
+    Returns
+    -------
+    ndarray (p,)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.analysis.link import uncertainty
+    >>> uncertainty(np.array([0.1, 0.63, 1.0])).round(3).tolist()
+    [0.031, 0.01, 0.003]
+    """
+    return RIGHT / np.sqrt(-np.log1p(-np.clip(confidence, 0.1, 1 - 1e-6)))
+
+
+def spread_votes(vote: np.ndarray, X: np.ndarray, T: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Votes after a short step of heat: (A + W) v = A v0, W stiffness with t = area radius^2 / 4.
+
+    What votes at a vertex votes around it, too, as far as its match may be wrong.  The kernel of
+    one implicit step has a mean squared radius of 4 t in the plane.
+
+    Parameters
+    ----------
+    vote : float32 ndarray (p, l)
+    X, T : ndarray (p, 3), (q, 3)
+        The target.
+    radius : ndarray (p,)
+        Root of the mean squared radius, as a share of sqrt(area).
+
+    Returns
+    -------
+    float32 ndarray (p, l)
+        Rows sum to 1.
+    """
+    E, w, area, _ = laplacian(X, T, vertex_areas(X, T))
+    t = area.sum() * radius**2 / 4
+    # edges between obtuse corners, whose weights are negative, would make votes so
+    W = stiffness(E, np.maximum(w, 0) * t[E].mean(axis=1), len(X))
+    system = sp.diags(area) + W  # (p, p), positive definite
+    jacobi = sp.diags(1 / system.diagonal())
+    spread = vote.copy()
+    for j, v in enumerate(vote.T.astype(float)):
+        spread[:, j] = cg(system, area * v, x0=v, rtol=1e-5, M=jacobi)[0]
+    spread = spread.clip(0, 1)  # as conjugate gradients are exact to 1e-5
+    return spread / spread.sum(axis=1, keepdims=True)
+
+
+def elect(vote: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """The label with most votes at every vertex; the first in sorted order among equals.
 
     Examples
     --------
     >>> import numpy as np
     >>> import scipy.sparse as sp
-    >>> from s4a.analysis.link import elect
-    >>> elect(sp.csr_matrix([[0.5, 0.2, 0.3]]), np.array([4, 7, 7]))[0].tolist()
+    >>> from s4a.analysis.link import elect, votes_of
+    >>> elect(*votes_of(sp.csr_matrix([[0.5, 0.2, 0.3]]), np.array([4, 7, 7]))).tolist()
     [4]
     """
-    value, code = np.unique(label, return_inverse=True)
-    one_hot = sp.csr_matrix((np.ones(len(code), np.float32), code, np.arange(len(code) + 1)))
-    vote = (W @ one_hot).toarray().astype(np.float32)
-    return value[vote.round(6).argmax(1)], vote, value  # equal votes are equal to six digits
+    return value[vote.round(6).argmax(1)]  # equal votes are equal to six digits

@@ -13,7 +13,16 @@ from joblib import delayed
 from threadpoolctl import threadpool_limits
 
 from s4a.analysis.inputs import all_registered
-from s4a.analysis.link import Route, blend_routes, carry_along, elect, link
+from s4a.analysis.link import (
+    Route,
+    blend_routes,
+    carry_along,
+    elect,
+    link,
+    spread_votes,
+    uncertainty,
+    votes_of,
+)
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays
 from s4a.input.landmarks import FARTHEST_LANDMARK, NAMED, locate, trace_curves
@@ -238,6 +247,7 @@ def transfer_labels(
     source: str | xr.Dataset | None = None,
     targets: list[str] | None = None,
     votes: bool = False,
+    blur: float = 1.0,
     **options: Any,
 ) -> xr.DataTree:
     """Labels of one mesh on every shape of a registered study (6.2, Fig. 6).
@@ -256,6 +266,12 @@ def transfer_labels(
         All other shapes by default.
     votes : bool
         Whether the share of every label is given too.
+    blur : float
+        How far votes count around the place where they fall, in multiples of how far the match may
+        be wrong there by its confidence (:func:`s4a.analysis.link.uncertainty`): where it is sure,
+        borders between labels stay where they fall, elsewhere they come out smooth.  A label that
+        would win nowhere for it keeps the vertices that it has without.  With 0, as in the paper,
+        votes count where they fall; no preset sets it.
     **options
         Of an external source alone: those of :func:`register_pairs`, ``preset`` among them, in the
         place of the study's.
@@ -264,14 +280,16 @@ def transfer_labels(
     -------
     DataTree
         For every target ``label(vertex)``, the label with most votes among the corners of the
-        triangle that each vertex comes to lie on; ``label_share(vertex)``, its share of the votes;
+        triangle that each vertex comes to lie on, and those around; ``label_share(vertex)``, its
+        share of the votes;
         ``confidence(vertex)`` of the match; and with `votes` ``label_vote(vertex, label_value)``.
 
     Raises
     ------
     ValueError
-        When the labels do not fit the source, a shape is not in the study, or an option is given
-        where nothing is matched, is outside its range or contradicts the preset.
+        When the labels do not fit the source, a shape is not in the study, the blur is below 0 or
+        above 10, or an option is given where nothing is matched, is outside its range or
+        contradicts the preset.
 
     Examples
     --------
@@ -300,14 +318,23 @@ def transfer_labels(
     ... )
     <Parts ...>
     """
+    if not 0 <= blur <= 10:
+        raise ValueError(f"blur needs a factor from 0 to 10; found {blur}")
     mesh, each = plan(study, source, targets, options)
     label = _per_vertex(label, mesh, "label")
     carried = {}
-    for name, _, routes in each:
+    for name, target, routes in each:
         W, confidence = blend_routes(routes, len(label))
-        winner, vote, value = elect(W, label)
+        vote, value = votes_of(W, label)
+        winner = elect(vote, value)
+        if blur and any(routes):  # to the source itself there is no way, nor doubt
+            vote = spread_votes(vote, *as_arrays(target), blur * uncertainty(confidence))
+            spread = elect(vote, value)
+            lost = np.setdiff1d(winner, spread)
+            winner = np.where(np.isin(winner, lost), winner, spread)
+        share = vote[np.arange(len(vote)), np.searchsorted(value, winner)]
         carried[name] = dataset(
-            label=winner, label_share=vote.max(1), confidence=confidence.astype(np.float32)
+            label=winner, label_share=share, confidence=confidence.astype(np.float32)
         )
         if votes:
             shares = dataset(label_vote=vote)

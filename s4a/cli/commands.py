@@ -392,7 +392,8 @@ def transfer(args: Namespace) -> int:
     labels: Mapping[str, Any] = {}  # name of a target -> node
     points: Mapping[str, Any] = {}
     if label is not None:
-        labels = travel.transfer_labels(study, label, source=source, **given).children
+        carried = travel.transfer_labels(study, label, source=source, blur=args.blur, **given)
+        labels = carried.children
     if landmarks is not None:
         points = travel.transfer_landmarks(study, landmarks, source=source, **given).children
     write(tables.table(transferred_rows(study, labels, points, out), tables.TRANSFERRED))

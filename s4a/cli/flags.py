@@ -346,6 +346,8 @@ def _transfer(add):
     add("--landmarks", metavar="FILE", help=text)
     text = "for <target>.labels.npy, .confidence.npy, .landmarks.csv"
     add("--out", required=True, metavar="DIR", help=text)
+    text = "how far around votes for labels count, in multiples of how far matches may be wrong"
+    add("--blur", type=float, default=1.0, help=f"{text} (default: 1; 0: not)")
     add_options(add, ["n_jobs"])
     add_options(add, (*PAIR, "both"), unset=True)
 

@@ -28,7 +28,7 @@ from s4a import (
     transfer_scalars,
     write_mesh,
 )
-from s4a.analysis.link import elect
+from s4a.analysis.link import elect, spread_votes, votes_of
 from s4a.analysis.transfer import pair_study
 from s4a.geometry.closest import (
     closest_facing_point,
@@ -90,7 +90,7 @@ def test_labels_and_landmarks_of_a_moved_and_renumbered_copy_are_exact(meshes, m
     copy, order, R = moved
     study = pair_study(match_pair(copy, mesh, **OPTIONS), copy, mesh)
     label = np.arange(mesh.sizes["vertex"])  # every vertex its own
-    found = transfer_labels(study, label)["source"]
+    found = transfer_labels(study, label, blur=0)["source"]
     assert (found["label"].values == order).all()
     assert found["label_share"].values == pytest.approx(1, abs=1e-4)
     assert found["confidence"].values == pytest.approx(1, abs=1e-3)
@@ -185,10 +185,54 @@ def test_matching_both_ways_is_symmetric_and_one_way_is_possible(study, meshes):
 
 def test_the_label_with_most_votes_wins_and_ties_go_to_the_first():
     W = sp.csr_matrix([[0.5, 0.2, 0.3], [0.3, 0.3, 0.4], [0.5, 0.5, 0.0]])
-    winner, vote, value = elect(W, np.array(["b", "a", "a"]))
-    assert winner.tolist() == ["a", "a", "a"]
+    vote, value = votes_of(W, np.array(["b", "a", "a"]))
+    assert elect(vote, value).tolist() == ["a", "a", "a"]
     assert value.tolist() == ["a", "b"]
     assert vote[1] == pytest.approx([0.7, 0.3])
+
+
+def test_votes_spread_as_far_as_the_blur_says_and_keep_their_sum():
+    X, T = as_arrays(synthetic.sphere(4000))
+    area = vertex_areas(X, T)
+    one = np.zeros((len(X), 2), np.float32)
+    one[7, 0], one[:, 1] = 1, 1
+    one[7, 1] = 0
+    vote = spread_votes(one, X, T, np.full(len(X), 0.03))
+    assert vote.sum(axis=1) == pytest.approx(1, abs=1e-4)
+    mass = area * vote[:, 0]
+    assert mass.sum() == pytest.approx(area[7], rel=1e-3)
+    squared = ((X - X[7]) ** 2).sum(axis=1)
+    assert np.sqrt(mass @ squared / mass.sum()) == pytest.approx(
+        0.03 * np.sqrt(area.sum()), rel=0.05
+    )
+
+
+def test_sure_votes_stay_where_they_fall():
+    X, T = as_arrays(synthetic.sphere(4000))
+    sides = np.stack([X[:, 0] > 0, X[:, 0] <= 0], axis=1).astype(np.float32)
+    radius = np.where(X[:, 1] > 0, 0.03, 1e-6)
+    vote = spread_votes(sides, X, T, radius)
+    unsure = (X[:, 1] > 0.2) & (abs(X[:, 0]) < 0.05)
+    sure = (X[:, 1] < -0.2) & (abs(X[:, 0]) < 0.05)
+    assert vote[unsure].max(axis=1).mean() < 0.8
+    assert vote[sure] == pytest.approx(sides[sure], abs=1e-4)
+
+
+def test_blurred_votes_are_nearer_to_the_truth_and_no_label_is_lost(study, meshes):
+    label = meshes["brain_01"]["label"].values.copy()
+    sharp, blurred = (transfer_labels(study, label, blur=blur) for blur in (0, 1))
+    for name in sharp.children:
+        true = meshes[name]["label"].values
+        right = [(found[name]["label"].values == true).mean() for found in (sharp, blurred)]
+        assert right[1] > right[0]
+    T = as_arrays(meshes["brain_01"])[1]
+    label[T[(T == 100).any(axis=1)]] = 77  # a vertex and those around, which others would outvote
+    sharp, blurred = (
+        transfer_labels(study, label, blur=blur)["brain_02/label"].values for blur in (0, 10)
+    )
+    assert 0 < (sharp == 77).sum() == (blurred == 77).sum()
+    with pytest.raises(ValueError, match="from 0 to 10; found 20"):
+        transfer_labels(study, label, blur=20)
 
 
 def test_interpolation_is_exact_for_linear_functions_and_walls_are_not_crossed():
@@ -464,20 +508,18 @@ def test_the_command_writes_labels_per_vertex_of_the_file_and_landmarks(tmp_path
     write_mesh(tmp_path / "target one.obj", points, np.concatenate([L, T + len(loose)]))
     np.save(tmp_path / "labels.npy", source["label"].values)
     write_landmarks(tmp_path / "marks.csv", source)
-    given = [
-        "--labels",
-        tmp_path / "labels.npy",
-        "--landmarks",
-        tmp_path / "marks.csv",
-        "--out",
-        tmp_path / "out",
-    ]
-    given += ["--n-coarse", 1200, "--k", 60, "--n-jobs", 1]
-    command = ["transfer", tmp_path / "source.ply", tmp_path / "target one.obj", *given]
-    assert cli.main([str(a) for a in command]) == 0
+    files = [tmp_path / "source.ply", tmp_path / "target one.obj"]
+    shared = ["--labels", tmp_path / "labels.npy", "--n-coarse", 1200, "--k", 60, "--n-jobs", 1]
+    command = [str(a) for a in ["transfer", *files, *shared]]
+    marks = ["--landmarks", str(tmp_path / "marks.csv"), "--out", str(tmp_path / "out")]
+    assert cli.main([*command, *marks]) == 0
+    assert "50" in capsys.readouterr().out.splitlines()[-1].split()
     label = np.load(tmp_path / "out" / "target one.labels.npy")
     assert label.shape == (len(points),)
     assert (label[50:] == target["label"].values).mean() > 0.93
+    assert cli.main([*command, "--out", str(tmp_path / "sharp"), "--blur", "0"]) == 0
+    sharp = np.load(tmp_path / "sharp" / "target one.labels.npy")
+    assert 0.95 < (sharp == label).mean() < 1
     sure = np.load(tmp_path / "out" / "target one.confidence.npy")
     assert sure.shape == (len(points),)
     assert 0 < sure.min() <= sure.max() <= 1
@@ -487,7 +529,6 @@ def test_the_command_writes_labels_per_vertex_of_the_file_and_landmarks(tmp_path
     assert (
         distance(place["landmark_position"].values, target["landmark_position"].values).mean() < 4
     )
-    assert "50" in capsys.readouterr().out.splitlines()[-1].split()
     assert cli.main(["transfer", "a.ply", "b.ply", "--out", str(tmp_path)]) == 2
     assert "--labels FILE" in capsys.readouterr().err
 

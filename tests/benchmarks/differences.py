@@ -256,6 +256,14 @@ OTHERS = [
         "on modes alone, none on matches",
     ),
     (
+        "6.2",
+        "a vertex gets the label of its match",
+        "the label with most votes of the corners that it lies between, and of those around, as "
+        "far as its match may be wrong; with `s4a.transfer_labels(..., blur=0)` of the corners "
+        "alone (no preset sets it)",
+        "on labels alone: 0 to 3 points (`applications.py parcels`, [decisions](decisions.md))",
+    ),
+    (
         "eq. 10",
         "the second maximum is divided by $n_{\\mathcal N}$",
         "the usual Hausdorff distance; as printed: `hausdorff_paper`, "
