@@ -198,10 +198,12 @@ def spread_votes(vote: np.ndarray, X: np.ndarray, T: np.ndarray, radius: np.ndar
     system = sp.diags(area) + W  # (p, p), positive definite
     jacobi = sp.diags(1 / system.diagonal())
     spread = vote.copy()
-    for j, v in enumerate(vote.T.astype(float)):
-        spread[:, j] = cg(system, area * v, x0=v, rtol=1e-5, M=jacobi)[0]
-    spread = spread.clip(0, 1)  # as conjugate gradients are exact to 1e-5
-    return spread / spread.sum(axis=1, keepdims=True)
+    for column in spread.T:
+        v = column.astype(float)
+        column[:] = cg(system, area * v, x0=v, rtol=1e-5, M=jacobi)[0]
+    np.clip(spread, 0, 1, out=spread)  # as conjugate gradients are exact to 1e-5
+    spread /= spread.sum(axis=1, keepdims=True)
+    return spread
 
 
 def elect(vote: np.ndarray, value: np.ndarray) -> np.ndarray:
