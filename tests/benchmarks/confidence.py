@@ -8,7 +8,8 @@ tenth (0.1 by chance); and in bins of confidence, the share that is right.  Bodi
 their connectivity; nothing here looks at that.
 
 ``confidence.py failures`` registers random pairs of bodies without the search for first maps, of
-which many end with limbs exchanged, and says how well the mean confidence tells these.
+which many end with limbs exchanged, and says how well these are told by their mean confidence, by
+the way there and back, and by the two numbers by which a study doubts a registration.
 """
 
 import subprocess
@@ -29,6 +30,7 @@ import s4a
 from s4a import synthetic
 from s4a.method import first_map
 from s4a.method.confidence import RIGHT, WEIGHTS, evidence
+from s4a.study.doubts import UNSURE, WRONG
 from s4a.study.options import pair_options
 from s4a.study.pair import match_shapes, shape_of
 
@@ -45,7 +47,14 @@ REPORTED = {
     "faust": [9, 10],
 }
 EACH = 2000  # vertices of a pair in the fit
-FAILING, FAILED = (8, 9), 4  # seeds of pairs; mean error in % from which a pair has failed
+FAILING = range(8, 14)  # seeds of pairs
+AT_MOST, FAILED = 3, 4  # mean error in % to which a pair is right, and from which it has failed
+SIGNS = {  # of a registration; what is high is a sign of failure
+    "mean confidence": lambda found: -found["confidence"].values.mean(),
+    "there and back": lambda found: found["round_trip"].values.mean(),
+    "distortion": lambda found: abs(found["distortion"].values).mean(),
+    "badness": lambda found: found.attrs["score"],
+}
 
 
 class Pair(NamedTuple):
@@ -91,14 +100,14 @@ def same_vertices(folder, part, pairs):
 
 
 def measured(pair):
-    """Error of every vertex, share of sqrt(area); evidence; confidence."""
+    """Error of every vertex, share of sqrt(area); evidence; the registration."""
     options = pair_options({"n_coarse": 4000})
     source, target = (shape_of(mesh, options) for mesh in (pair.shape, pair.template))
     found, _ = match_shapes(source, target, options)
     image = image_of(found, pair.template)
     error = np.linalg.norm(image - pair.true, axis=1) / source.frame[1]
     seen = evidence(source, target, found["registered_match"].values, source.to_frame(image))
-    return error, seen, found["confidence"].values
+    return error, seen, found
 
 
 def fit(results):
@@ -123,11 +132,13 @@ def caught(error, sure):
 def report(names, results):
     say = sys.stdout.write
     say(f"{'pair':16} {'error %':>8} {'right':>6} {'sure':>6} {'Spearman':>9} {'caught':>7}\n")
-    for name, (error, _, sure) in zip(names, results, strict=True):
+    for name, (error, _, found) in zip(names, results, strict=True):
+        sure = found["confidence"].values
         right, rank = (error < RIGHT).mean(), spearmanr(-sure, error)[0]
         cells = f"{100 * error.mean():8.3f} {right:6.2f} {sure.mean():6.2f} {rank:9.2f}"
         say(f"{name:16} {cells} {caught(error, sure):7.2f}\n")
-    error, sure = (np.concatenate([one[i] for one in results]) for i in (0, 2))
+    error = np.concatenate([error for error, *_ in results])
+    sure = np.concatenate([found["confidence"].values for *_, found in results])
     right, bins = error < RIGHT, np.clip((10 * sure).astype(int), 0, 9)
     say("confidence in the mean, share that is right, share of the vertices:\n")
     for b in np.unique(bins):
@@ -139,25 +150,36 @@ def report(names, results):
 
 
 def failures(folder):
-    """Whether the mean confidence tells pairs of more than 4 % from the others."""
-    errors, sure = [], []
+    """Whether a registration that failed is told from those that are right, and by what."""
+    errors, signs = [], {name: [] for name in SIGNS}
     with mock.patch.multiple(first_map, SEARCHED=(), N_PAIRED=0):
         for seed in FAILING:
             chosen = {"faces": [], "brains": [], "cats": [], "faust": [seed, 30]}
             for pair in pairs_of(folder, chosen):
-                error, _, confidence = measured(pair)
+                error, _, found = measured(pair)
                 errors.append(100 * error.mean())
-                sure.append(confidence.mean())
-    errors, sure = np.array(errors), np.array(sure)
-    failed = errors > FAILED
-    told = f"{failed.sum()} of {len(errors)} pairs have more than {FAILED} %"
-    sys.stdout.write(f"{told}; area under the curve {roc_auc_score(failed, -sure):.3f}\n")
-    for name, some in (("failed", failed), ("others", ~failed)):
-        low, middle, high = np.quantile(sure[some], [0, 0.5, 1])
-        sys.stdout.write(f"{name}: mean confidence {low:.2f} to {high:.2f}, median {middle:.2f}\n")
-    limit = np.quantile(sure[~failed], 0.05)
-    caught = (sure[failed] < limit).mean()
-    sys.stdout.write(f"below {limit:.2f}: {caught:.2f} of the failed, 0.05 of the others\n")
+                for name, sign in SIGNS.items():
+                    signs[name].append(float(sign(found)))
+    errors = np.array(errors)
+    signs = {name: np.array(values) for name, values in signs.items()}
+    signs["badness x distortion"] = signs["badness"] * signs["distortion"]
+    signs["there and back x distortion"] = signs["there and back"] * signs["distortion"]
+    failed, right = errors > FAILED, errors < AT_MOST
+    sys.stdout.write(
+        f"{len(errors)} pairs: {failed.sum()} failed, more than {FAILED} %; {right.sum()} right, "
+        f"below {AT_MOST} %\n{'':28} area under curve   told of failed, with 5 % of the right\n"
+    )
+    for name, sign in signs.items():
+        area = roc_auc_score(failed[failed | right], sign[failed | right])
+        limit = np.quantile(sign[right], 0.95)
+        caught = (sign[failed] > limit).mean()
+        sys.stdout.write(f"{name:28} {area:16.3f} {caught:14.2f}, beyond {abs(limit):.4f}\n")
+    for what, limit in (("doubtful", WRONG), ("a warning", UNSURE)):
+        told = signs["badness x distortion"] > limit
+        sys.stdout.write(
+            f"{what}, beyond {limit}: {told[failed].sum()} of {failed.sum()} failed, "
+            f"{told[right].sum()} of {right.sum()} right\n"
+        )
 
 
 def calibration(folder):
