@@ -175,8 +175,8 @@ def uncertainty(confidence: np.ndarray) -> np.ndarray:
 def spread_votes(vote: np.ndarray, X: np.ndarray, T: np.ndarray, radius: np.ndarray) -> np.ndarray:
     """Votes after a short step of heat: (A + W) v = A v0, W stiffness with t = area radius^2 / 4.
 
-    What votes at a vertex votes around it, too, as far as its match may be wrong.  The kernel of
-    one implicit step has a mean squared radius of 4 t in the plane.
+    What votes at a vertex votes around it, too, as far as its match may be wrong; A has the areas
+    of the vertices.  The kernel of one implicit step has a mean squared radius of 4 t in the plane.
 
     Parameters
     ----------

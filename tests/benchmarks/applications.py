@@ -20,7 +20,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-import scipy.sparse as sp
 import xarray as xr
 from peers import remeshed
 from scipy import stats
@@ -33,7 +32,7 @@ from s4a import metrics, statistics, synthetic
 from s4a.analysis import permutation, transfer
 from s4a.geometry.align import align, farthest_points
 from s4a.geometry.closest import closest_point, interpolate
-from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
+from s4a.geometry.mesh import as_arrays, as_dataset, edge_graph, edges, vertex_areas
 from s4a.input.annotations import labels_of_mesh, read_landmarks
 from s4a.method.deform import displacement_in_template
 from s4a.method.pca import project_scores
@@ -252,16 +251,16 @@ def template(folder):
             near = tree.query(others[other]["position"].values)[1]
             found["nearest vertex after ICP"][other] = label[near]
         for preset in (None, "paper"):
-            given = {"blur": 0} if preset == "paper" else {}
+            blur = 0 if preset == "paper" else 1
             begin = time.process_time()
             pairs = s4a.register_pairs(
                 source, {n: others[n] for n in known}, name=name, preset=preset
             )
-            pairwise = s4a.transfer_labels(pairs, label, **given)
+            pairwise = s4a.transfer_labels(pairs, label, blur=blur)
             between = time.process_time()
             study = s4a.analyse(others, n_jobs=1, preset=preset)
             made = time.process_time()
-            through = s4a.transfer_labels(study, label, source=source, targets=known, **given)
+            through = s4a.transfer_labels(study, label, source=source, targets=known, blur=blur)
             end = time.process_time()
             median = study["latent"].attrs["median"]
             for way, tree in (("pairwise", pairwise), (f"through {median}", through)):
@@ -320,13 +319,6 @@ def points(folder):
         )
 
 
-def along_edges(X, T, seeds):
-    """Lengths of the shortest paths along edges from every seed to every vertex."""
-    E = np.unique(np.sort(np.concatenate([T[:, :2], T[:, 1:], T[:, ::2]]), axis=1), axis=0)
-    length = np.linalg.norm(X[E[:, 0]] - X[E[:, 1]], axis=1)
-    return dijkstra(sp.csr_matrix((length, E.T), (len(X), len(X))), directed=False, indices=seeds)
-
-
 def parcels(folder):
     """35 regions on remeshed faces, bodies and cats, by how far votes count.
 
@@ -343,7 +335,7 @@ def parcels(folder):
             source, before = s4a.read_shape(files[a]), s4a.read_shape(files[b])
             target = remeshed(before, kept=True)
             X, T = as_arrays(source)
-            far = along_edges(X, T, farthest_points(X, 35))
+            far = dijkstra(edge_graph(X, edges(T)), indices=farthest_points(X, 35))
             label = far.argmin(axis=0)
             X, T = as_arrays(target)
             before = as_arrays(before)

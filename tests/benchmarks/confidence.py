@@ -9,7 +9,7 @@ their connectivity; nothing here looks at that.
 
 ``confidence.py failures`` registers random pairs of bodies without the search for first maps, of
 which many end with limbs exchanged, and says how well these are told by their mean confidence, by
-the way there and back, and by the two numbers by which a study doubts a registration.
+the way there and back, and by badness and distortion, which a study looks at, too.
 """
 
 import subprocess
@@ -21,6 +21,7 @@ from typing import NamedTuple
 from unittest import mock
 
 import numpy as np
+import plausibility
 from peers import DATA, image_of, remeshed
 from scipy.stats import spearmanr
 from sklearn.linear_model import LogisticRegression
@@ -48,7 +49,6 @@ REPORTED = {
 }
 EACH = 2000  # vertices of a pair in the fit
 FAILING = range(8, 14)  # seeds of pairs
-AT_MOST, FAILED = 3, 4  # mean error in % to which a pair is right, and from which it has failed
 SIGNS = {  # of a registration; what is high is a sign of failure
     "mean confidence": lambda found: -found["confidence"].values.mean(),
     "there and back": lambda found: found["round_trip"].values.mean(),
@@ -164,10 +164,11 @@ def failures(folder):
     signs = {name: np.array(values) for name, values in signs.items()}
     signs["badness x distortion"] = signs["badness"] * signs["distortion"]
     signs["there and back x distortion"] = signs["there and back"] * signs["distortion"]
-    failed, right = errors > FAILED, errors < AT_MOST
+    failed, right = errors > plausibility.FAILED, errors < plausibility.RIGHT
     sys.stdout.write(
-        f"{len(errors)} pairs: {failed.sum()} failed, more than {FAILED} %; {right.sum()} right, "
-        f"below {AT_MOST} %\n{'':28} area under curve   told of failed, with 5 % of the right\n"
+        f"{len(errors)} pairs: {failed.sum()} failed, more than {plausibility.FAILED:.0f} %; "
+        f"{right.sum()} right, below {plausibility.RIGHT:.0f} %\n"
+        f"{'':28} area under curve   told of failed, with 5 % of the right\n"
     )
     for name, sign in signs.items():
         area = roc_auc_score(failed[failed | right], sign[failed | right])

@@ -288,7 +288,8 @@ OTHERS = [
 TEXT = """# What differs from the paper
 
 `preset="paper"` is the paper: in `s4a.analyse`, `s4a.match_pair`, `s4a.register_pairs`,
-`s4a.compare`, every transfer of an external mesh, and as `--preset paper`. This page has what is
+`s4a.compare`, every transfer of an external mesh (of labels with `blur=0`, too), and as
+`--preset paper`. This page has what is
 done otherwise by default, what the paper leaves open and how it is read here, and what each is
 worth. To run the paper with one addition:
 `s4a.analyse(shapes, **s4a.study.options.PAPER | {{"refine": "elastic"}})`. Equations and sections
