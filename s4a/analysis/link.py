@@ -17,7 +17,6 @@ from scipy.sparse.linalg import cg
 
 from s4a.geometry.closest import closest_facing_point, interpolate, interpolation_matrix
 from s4a.geometry.mesh import as_arrays, stiffness, vertex_areas, vertex_normals
-from s4a.method.confidence import RIGHT
 from s4a.method.remesh import laplacian
 
 # Triangle (p,) and barycentric weights (p, 3) of points on a surface, and how sure they are (p,).
@@ -145,31 +144,6 @@ def votes_of(W: sp.csr_matrix, label: np.ndarray) -> tuple[np.ndarray, np.ndarra
     value, code = np.unique(label, return_inverse=True)
     one_hot = sp.csr_matrix((np.ones(len(code), np.float32), code, np.arange(len(code) + 1)))
     return (W @ one_hot).toarray().astype(np.float32), value
-
-
-def uncertainty(confidence: np.ndarray) -> np.ndarray:
-    """Root of the mean squared error of a match that is this sure, as a share of sqrt(area).
-
-    A confidence is the share of such vertices within 1 % of sqrt(area) of the truth.  Where errors
-    are Gaussian in the plane, that is 1 - exp(-0.01^2 / r^2) for the radius r.
-
-    Parameters
-    ----------
-    confidence : ndarray (p,)
-        Below 0.1 it counts as 0.1, which is a radius of 3 %.
-
-    Returns
-    -------
-    ndarray (p,)
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from s4a.analysis.link import uncertainty
-    >>> uncertainty(np.array([0.1, 0.63, 1.0])).round(3).tolist()
-    [0.031, 0.01, 0.003]
-    """
-    return RIGHT / np.sqrt(-np.log1p(-np.clip(confidence, 0.1, 1 - 1e-6)))
 
 
 def spread_votes(vote: np.ndarray, X: np.ndarray, T: np.ndarray, radius: np.ndarray) -> np.ndarray:

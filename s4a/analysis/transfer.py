@@ -20,12 +20,12 @@ from s4a.analysis.link import (
     elect,
     link,
     spread_votes,
-    uncertainty,
     votes_of,
 )
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays
 from s4a.input.landmarks import FARTHEST_LANDMARK, NAMED, locate, trace_curves
+from s4a.method.confidence import uncertainty
 from s4a.method.register import identity
 from s4a.method.shape import Shape
 from s4a.schema import dataset, require
@@ -33,6 +33,9 @@ from s4a.study.options import PAIR, Options, pair_options, takes_options
 from s4a.study.pair import match_shapes, shape_of
 from s4a.study.processes import workers
 from s4a.study.tree import stack_registration, template_mesh
+
+# how far votes for labels count, by what the study leaves out
+BLURS = {None: 1.0, "fast": 1.0, "paper": 0.0}
 
 
 def pair_study(result: xr.Dataset, source: xr.Dataset, target: xr.Dataset) -> xr.DataTree:
@@ -99,7 +102,8 @@ def register_pairs(
     method, k_init, k, step, lift, init, ahead, sharpen, refine, parts, alignment
         See :func:`s4a.match_pair`.
     area_weighted, n_projected, n_coarse, preset, seed, rng
-        See :func:`s4a.match_pair`; ``preset="paper"`` sets both=False, too.
+        See :func:`s4a.match_pair`; ``preset="paper"`` sets both=False, too, and blur=0 of
+        :func:`s4a.transfer_labels`.
 
     Returns
     -------
@@ -135,7 +139,19 @@ def register_pairs(
     pairs = parallel(delayed(_match_both)(shape, inside, settings) for shape in others)
     forth = {n: pair[0] for n, pair in zip(shapes, pairs, strict=True)}
     back = {n: pair[1] for n, pair in zip(shapes, pairs, strict=True)} if settings.both else {}
-    return _study_of(name, template, shapes, forth, back)
+    study = _study_of(name, template, shapes, forth, back)
+    study["registration"].attrs["preset"] = str(settings.preset)
+    return study
+
+
+def _preset(study: xr.DataTree, given: dict[str, Any]) -> str | None:
+    """The preset of a transfer: the given one, else that of the study or of its pairs."""
+    if "preset" in given:
+        return given["preset"]
+    if "report" in study.children:
+        return Options.from_report(study).preset
+    preset = study["registration"].attrs.get("preset", "None")
+    return None if preset == "None" else preset
 
 
 def _routes(study: xr.DataTree, name: str) -> tuple[list[Route], list[Route]]:
@@ -247,7 +263,7 @@ def transfer_labels(
     source: str | xr.Dataset | None = None,
     targets: list[str] | None = None,
     votes: bool = False,
-    blur: float = 1.0,
+    blur: float | None = None,
     **options: Any,
 ) -> xr.DataTree:
     """Labels of one mesh on every shape of a registered study (6.2, Fig. 6).
@@ -266,12 +282,13 @@ def transfer_labels(
         All other shapes by default.
     votes : bool
         Whether the share of every label is given too.
-    blur : float
+    blur : float, optional
         How far votes count around the place where they fall, in multiples of how far the match may
-        be wrong there by its confidence (:func:`s4a.analysis.link.uncertainty`): where it is sure,
-        borders between labels stay where they fall, elsewhere they come out smooth.  A label that
-        would win nowhere for it keeps the vertices that it has without.  With 0, as in the paper,
-        votes count where they fall; no preset sets it.
+        be wrong there by its confidence (:func:`s4a.method.confidence.uncertainty`): where it is
+        sure, borders between labels stay where they fall, elsewhere they come out smooth.  A label
+        that would win nowhere for it keeps the vertices that it has without.  With 0, as in the
+        paper, votes count where they fall.  By default 1, and 0 where the study, or the source that
+        is matched to it, has ``preset="paper"``.
     **options
         Of an external source alone: those of :func:`register_pairs`, ``preset`` among them, in the
         place of the study's.
@@ -318,9 +335,10 @@ def transfer_labels(
     ... )
     <Parts ...>
     """
-    if not 0 <= blur <= 10:
+    if blur is not None and not 0 <= blur <= 10:
         raise ValueError(f"blur needs a factor from 0 to 10; found {blur}")
     mesh, each = plan(study, source, targets, options)
+    blur = BLURS[_preset(study, options)] if blur is None else blur
     label = _per_vertex(label, mesh, "label")
     carried = {}
     for name, target, routes in each:

@@ -370,6 +370,8 @@ def transfer(args: Namespace) -> int:
         raise ValueError(
             "something to transfer needed: give --labels FILE, --landmarks FILE or both"
         )
+    if args.blur is not None and not args.labels:
+        raise ValueError("--blur is of labels: give --labels FILE, or leave it out")
     source, label, landmarks = read_shape(args.source), None, None
     if args.labels:
         label = labels_of_mesh(read_labels(args.labels, source.sizes["file_vertex_index"]), source)

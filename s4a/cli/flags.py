@@ -347,7 +347,7 @@ def _transfer(add):
     text = "for <target>.labels.npy, .confidence.npy, .landmarks.csv"
     add("--out", required=True, metavar="DIR", help=text)
     text = "how far around votes for labels count, in multiples of how far matches may be wrong"
-    add("--blur", type=float, default=1.0, help=f"{text} (default: 1; 0: not)")
+    add("--blur", type=float, help=f"{text} (default: 1; 0, not, with --preset paper)")
     add_options(add, ["n_jobs"])
     add_options(add, (*PAIR, "both"), unset=True)
 

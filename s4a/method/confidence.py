@@ -87,3 +87,28 @@ def confidence(source: Shape, target: Shape, match: np.ndarray, P: np.ndarray) -
     w_0, *w = WEIGHTS
     doubt = -(w_0 + evidence(source, target, match, P) @ np.array(w))
     return 1 / (1 + np.exp(np.clip(doubt, -50, 50)))
+
+
+def uncertainty(confidence: np.ndarray) -> np.ndarray:
+    """Root of the mean squared error of a match that is this sure, as a share of sqrt(area).
+
+    A confidence is the share of such vertices within 1 % of sqrt(area) of the truth.  Where errors
+    are Gaussian in the plane, that is 1 - exp(-0.01^2 / r^2) for the radius r.
+
+    Parameters
+    ----------
+    confidence : ndarray (p,)
+        Below 0.1 it counts as 0.1, which is a radius of 3 %.
+
+    Returns
+    -------
+    ndarray (p,)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.method.confidence import uncertainty
+    >>> uncertainty(np.array([0.1, 0.63, 1.0])).round(3).tolist()
+    [0.031, 0.01, 0.003]
+    """
+    return RIGHT / np.sqrt(-np.log1p(-np.clip(confidence, 0.1, 1 - 1e-6)))

@@ -251,16 +251,15 @@ def template(folder):
             near = tree.query(others[other]["position"].values)[1]
             found["nearest vertex after ICP"][other] = label[near]
         for preset in (None, "paper"):
-            blur = 0 if preset == "paper" else 1
             begin = time.process_time()
             pairs = s4a.register_pairs(
                 source, {n: others[n] for n in known}, name=name, preset=preset
             )
-            pairwise = s4a.transfer_labels(pairs, label, blur=blur)
+            pairwise = s4a.transfer_labels(pairs, label)
             between = time.process_time()
             study = s4a.analyse(others, n_jobs=1, preset=preset)
             made = time.process_time()
-            through = s4a.transfer_labels(study, label, source=source, targets=known, blur=blur)
+            through = s4a.transfer_labels(study, label, source=source, targets=known)
             end = time.process_time()
             median = study["latent"].attrs["median"]
             for way, tree in (("pairwise", pairwise), (f"through {median}", through)):

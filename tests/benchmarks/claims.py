@@ -129,13 +129,13 @@ def transfer(given):
         study = s4a.analyse(meshes, n_coarse=2000, preset=preset, n_jobs=1)
         begin = time.process_time()
         pairs = s4a.register_pairs(outside, meshes, n_coarse=2000, preset=preset, n_jobs=1)
-        label, blur = outside["label"].values, 0 if preset == "paper" else 1
-        carried = s4a.transfer_labels(pairs, label, blur=blur)
+        label = outside["label"].values
+        carried = s4a.transfer_labels(pairs, label)
         seconds = time.process_time() - begin
         points = s4a.transfer_landmarks(pairs, marks)
         show(f"pair by pair, preset {preset}", carried, points, meshes, seconds)
         begin = time.process_time()
-        carried = s4a.transfer_labels(study, label, source=outside, blur=blur)
+        carried = s4a.transfer_labels(study, label, source=outside)
         seconds = time.process_time() - begin
         points = s4a.transfer_landmarks(study, marks, source=outside)
         show(f"through the median, preset {preset}", carried, points, meshes, seconds)

@@ -260,7 +260,7 @@ OTHERS = [
         "a vertex gets the label of its match",
         "the label with most votes of the corners that it lies between, and of those around, as "
         "far as its match may be wrong; with `s4a.transfer_labels(..., blur=0)` of the corners "
-        "alone (no preset sets it)",
+        "alone",
         "on labels alone: 0 to 3 points (`applications.py parcels`, [decisions](decisions.md))",
     ),
     (
@@ -288,8 +288,7 @@ OTHERS = [
 TEXT = """# What differs from the paper
 
 `preset="paper"` is the paper: in `s4a.analyse`, `s4a.match_pair`, `s4a.register_pairs`,
-`s4a.compare`, every transfer of an external mesh (of labels with `blur=0`, too), and as
-`--preset paper`. This page has what is
+`s4a.compare`, every transfer of an external mesh, and as `--preset paper`. This page has what is
 done otherwise by default, what the paper leaves open and how it is read here, and what each is
 worth. To run the paper with one addition:
 `s4a.analyse(shapes, **s4a.study.options.PAPER | {{"refine": "elastic"}})`. Equations and sections

@@ -202,6 +202,36 @@ def test_through_the_median_a_template_is_matched_once_for_all_shapes(paper, mes
     assert len(seen) == 1
 
 
+def test_votes_for_labels_spread_unless_the_study_or_its_pairs_are_of_the_paper(
+    study, paper, three, meshes
+):
+    def shares(tree, mesh, **options):
+        found = s4a.transfer_labels(tree, mesh["label"].values, targets=["brain_02"], **options)
+        return found["brain_02"]["label_share"].values
+
+    def spreads(tree, mesh, **options):
+        default, *sharp_and_spread = (
+            shares(tree, mesh, **options | blur) for blur in ({}, {"blur": 0}, {"blur": 1})
+        )
+        sharp, spread = (np.array_equal(default, other) for other in sharp_and_spread)
+        assert sharp != spread
+        return spread
+
+    source, external = "brain_01", meshes["brain_04"]
+    pairs = [
+        s4a.register_pairs(
+            three[source], {"brain_02": three["brain_02"]}, name=source, preset=preset, **PAIR
+        )
+        for preset in (None, "paper")
+    ]
+    assert [spreads(tree, three[source]) for tree in pairs] == [True, False]
+    assert spreads(study, three[source], source=source)
+    assert not spreads(study, external, source=external, preset="paper")
+    with s4a.open_study(paper) as fixed:
+        assert not spreads(fixed, three[source], source=source)
+        assert spreads(fixed, external, source=external, preset=None)
+
+
 @pytest.mark.parametrize("what", ["labels", "scalars", "landmarks"])
 def test_every_transfer_takes_a_preset_in_the_place_of_the_options_of_a_study(
     what, study, meshes, seen
