@@ -11,10 +11,9 @@ import json
 import logging
 import os
 import re
-import sys
 import uuid
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -30,6 +29,7 @@ from xarray.core import indexing
 from s4a.schema import check_indices
 from s4a.study.hdf5 import Place, StudyFile
 from s4a.study.header import Header
+from s4a.study.netcdf import write_netcdf
 from s4a.study.processes import remove_remains
 from s4a.study.seal import (
     BEHIND,
@@ -140,8 +140,7 @@ def write(
     data = data.assign_attrs({"task_key": key, "made_from": " ".join(made_from), SEALED: BEHIND})
     data = data.drop_encoding()  # names put together keep the length of the first file's else
     whole = io.BytesIO()  # HDF5 brings the process down when the disk is full
-    with without_dask():
-        data.to_netcdf(whole, engine=ENGINE)
+    write_netcdf(data, whole)
     add_seal(whole)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -160,12 +159,6 @@ def write(
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
-
-
-def without_dask() -> AbstractContextManager[Any]:
-    """Keeps xarray from asking a dask scheduler for a lock on a buffer that only we have."""
-    dask = sys.modules.get("dask")
-    return dask.config.set(scheduler="synchronous") if dask else nullcontext()
 
 
 class Stored(BackendArray):

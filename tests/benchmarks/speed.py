@@ -3,12 +3,13 @@
 Every row runs in a process of its own with one BLAS thread, ours and the other in turn, on the same
 input: seconds of CPU, of the clock, and the peak of memory above what the process holds before.
 pyFM is on PyPI as ``pyfmaps`` (the extra ``bench``).  ``speed.py stages``, ``pipelines``,
-``growth``, ``pairs``, ``nearest`` or ``seals`` runs one part, ``speed.py methods brains faces
+``growth``, ``pairs``, ``nearest``, ``write`` or ``seals`` runs one part, ``speed.py methods brains faces
 heads`` an analysis by RE-MATCH and by SCALABLE of ten shapes of each, ``speed.py whole 51 100000``
 the whole analysis of so many synthetic shapes of so many vertices, ``speed.py versions 51 100000``
 the same by an older version and by this one, three times in turn.
 """
 
+import io
 import itertools
 import json
 import multiprocessing
@@ -42,6 +43,7 @@ from s4a.method.pca import gram_pca
 from s4a.method.register import match_functions
 from s4a.method.shape import Shape
 from s4a.study import store
+from s4a.study.netcdf import write_netcdf
 from s4a.study.options import Options
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
@@ -864,7 +866,23 @@ def seals(folder):
     say(f"1,000 files of 1,500 vertices opened: {time.process_time() - begin:.1f} s of CPU")
 
 
+def write(folder):
+    """Every file of a study of six brains of 3,000 vertices, as s4a and as xarray write it."""
+    s4a.analyse(synthetic.brains(6, 3000), store=folder, n_coarse=800, n_jobs=1)
+    paths = sorted(folder.rglob("*.nc"))
+    files = [store.read(path).load().drop_encoding() for path in paths]
+    n = sum(len(data.variables) for data in files)
+    say(f"{len(files)} files of {n} variables, CPU ms a variable")
+    for name, write_one in (
+        ("s4a.study.netcdf", lambda data: write_netcdf(data, io.BytesIO())),
+        ("xarray with h5netcdf", lambda data: data.to_netcdf(io.BytesIO(), engine=store.ENGINE)),
+    ):
+        spent = cpu_of(lambda write_one=write_one: [write_one(data) for data in files], 5)
+        say(f"{name:28} {spent / n:8.2f}")
+
+
 PARTS = {
+    "write": write,
     "seals": seals,
     "stages": stages,
     "pipelines": pipelines,

@@ -1,0 +1,87 @@
+"""Files that are written without h5netcdf: xarray and the netCDF library read them as its own."""
+
+import io
+
+import h5py
+import numpy as np
+import pytest
+import xarray as xr
+
+from s4a.study.hdf5 import DIMS
+from s4a.study.netcdf import write_netcdf
+from s4a.study.store import ENGINE, read
+
+EVERYTHING = xr.Dataset(
+    {
+        "matrix": (("row", "column"), np.arange(6, dtype=np.float32).reshape(2, 3), {"unit": "mm"}),
+        "square": (("row", "row_"), np.eye(2)),
+        "empty": (("none", "column"), np.zeros((0, 3))),
+        "small": ("column", np.array([-1, 0, 1], np.int8)),
+        "large": ("column", np.array([0, 1, 2**63], np.uint64)),
+        "gaps": ("column", [1.0, np.nan, -np.inf]),
+        "is_odd": ("column", [True, False, True]),
+        "text": ("column", ["", "é", "two words"]),
+        "when": ("column", np.array(["2026-11-26", "NaT", "1999-01-01"], "M8[ns]")),
+        "one_text": ((), "alone"),
+        "one_number": ((), np.int16(7)),
+    },
+    {"row": ["a", "b"], "beside": ("column", [1.5, 2.5, 3.5]), "column": [10, 20, 30]},
+    {"text": "µm", "none": "", "number": 3, "share": 0.5, "list": [1, 2], "names": ["a", "b"]},
+)
+
+
+def written_by_both(data):
+    """The file of a Dataset as written here, and as by xarray."""
+    here, there = io.BytesIO(), io.BytesIO()
+    write_netcdf(data, here)
+    data.to_netcdf(there, engine=ENGINE)
+    return here, there
+
+
+def test_what_is_written_is_read_again(study_folder):
+    files = [read(path).drop_encoding() for path in sorted(study_folder.rglob("*.nc"))]
+    for data in [EVERYTHING, xr.Dataset(), *files]:
+        with (
+            xr.open_dataset(written_by_both(data)[0], engine=ENGINE) as here,
+            xr.open_dataset(written_by_both(data)[1], engine=ENGINE) as there,
+        ):
+            xr.testing.assert_identical(here, data)
+            xr.testing.assert_identical(here, there)
+            for name, variable in there.variables.items():
+                assert here[name].dtype == variable.dtype, name
+
+
+def test_hdf5_has_the_attributes_and_dims_that_h5netcdf_gives():
+    data = EVERYTHING.drop_vars("empty")
+    with (
+        h5py.File(written_by_both(data)[0], "r") as here,
+        h5py.File(written_by_both(data)[1], "r") as there,
+    ):
+        assert set(here) == set(there)
+        assert set(here.attrs) == set(there.attrs)
+        for name, expected in there.items():
+            found = here[name]
+            assert (found.dtype, found.shape) == (expected.dtype, expected.shape), name
+            assert found.maxshape == expected.maxshape
+            assert set(found.attrs) == set(expected.attrs)
+            for attribute in set(found.attrs) - {DIMS, "REFERENCE_LIST"}:  # these say where
+                np.testing.assert_array_equal(found.attrs[attribute], expected.attrs[attribute])
+            for axis in range(found.ndim if DIMS in found.attrs else 0):
+                scales = found.dims[axis][0].name, expected.dims[axis][0].name
+                assert scales[0] == scales[1]
+
+
+@pytest.mark.parametrize(
+    ("data", "error", "needed"),
+    [
+        (xr.Dataset({"a/b": 1}), ValueError, "without slash"),
+        (xr.Dataset({"row": (("row", "column"), np.eye(2))}), ValueError, "no dim of several"),
+        (xr.Dataset({"a": ("x", np.array([1 + 1j]))}), TypeError, "a needs numbers or texts"),
+        (xr.Dataset({"a": ("x", np.array([b"a", None]))}), TypeError, "a needs numbers or texts"),
+        (xr.Dataset(attrs={"a": {"b": 1}}), TypeError, "a needs numbers or texts"),
+        (xr.Dataset(attrs={"a": None}), TypeError, "a needs numbers or texts"),
+    ],
+)
+def test_what_netcdf_does_not_have_is_refused_by_name(data, error, needed):
+    with pytest.raises(error, match=needed):
+        write_netcdf(data, io.BytesIO())
