@@ -121,20 +121,34 @@ def unique_edges(T: np.ndarray, n: int | None = None) -> tuple[np.ndarray, np.nd
     count : int ndarray (e,)
         Triangles at the edge: 2 inside of a manifold, 1 on its boundary.
     """
-    start, end = directed_edges(np.asarray(T, np.int64)).T
+    start = np.asarray(T).T.astype(np.int64).ravel()  # as in directed_edges
+    end = np.roll(start, -len(T))
     if n is None:
-        n = int(max(start.max(initial=-1), end.max(initial=-1))) + 1
-    low, high = np.minimum(start, end), np.maximum(start, end)
-    order = counting_order(high, n)  # np.unique of both as one number takes twice as long
-    order = order.take(counting_order(low.take(order), n))
-    low, high = low.take(order), high.take(order)
-    new = np.ones(len(order), bool)
-    new[1:] = (low[1:] != low[:-1]) | (high[1:] != high[:-1])
-    edge_of = np.empty(len(order), np.int64)
+        n = int(start.max(initial=-1)) + 1
+    check_numbers(start, n)
+    m, bits = len(start), n.bit_length()
+    edge = np.minimum(start, end) << bits | np.maximum(start, end)  # both in one word
+    places = m.bit_length()
+    if 2 * bits + places < 64:  # and the place of the half-edge: a third of the time of argsort
+        sorted_words = np.sort(edge << places | np.arange(m))
+        order, edge = sorted_words & ((1 << places) - 1), sorted_words >> places
+    else:
+        order = np.argsort(edge)
+        edge = edge.take(order)
+    new = np.ones(m, bool)
+    np.not_equal(edge[1:], edge[:-1], out=new[1:])
+    edge_of = np.empty(m, np.int64)
     edge_of[order] = np.cumsum(new) - 1
     head = np.flatnonzero(new)
-    E = np.stack([low.take(head), high.take(head)], axis=1)
-    return E, edge_of, np.diff(head, append=len(order))
+    edge = edge.take(head)
+    E = np.stack([edge >> bits, edge & ((1 << bits) - 1)], axis=1)
+    return E, edge_of, np.diff(head, append=m)
+
+
+def check_numbers(key: np.ndarray, n: int) -> None:
+    """IndexError unless all are numbers from 0 to n - 1."""
+    if len(key) and not 0 <= key.min() <= key.max() < n:
+        raise IndexError(f"numbers from 0 to {n - 1} needed, found {key.min()} to {key.max()}")
 
 
 def counting_order(key: np.ndarray, n: int) -> np.ndarray:
@@ -149,9 +163,8 @@ def counting_order(key: np.ndarray, n: int) -> np.ndarray:
     >>> counting_order(np.array([2, 0, 1, 0]), 3).tolist()
     [1, 3, 2, 0]
     """
+    check_numbers(key, n)  # what follows would write beside its memory
     m = len(key)
-    if m and not 0 <= key.min() <= key.max() < n:  # what follows would write beside its memory
-        raise IndexError(f"numbers from 0 to {n - 1} needed, found {key.min()} to {key.max()}")
     one_a_row = sp.csr_matrix((np.ones(m, np.int8), key, np.arange(m + 1)), (m, n))
     return one_a_row.tocsc().indices.astype(np.int64)
 

@@ -33,6 +33,20 @@ def test_unique_edges_are_those_of_numpy(kind, sphere):
     assert np.array_equal(n, count)
 
 
+def test_numbers_too_large_for_a_word_of_both_and_the_place_have_the_same_edges(sphere):
+    T, far = sphere[1], 2**30
+    E, edge_of, count = unique_edges(T)
+    found = unique_edges(T + far, far + len(sphere[0]))
+    assert np.array_equal(found[0], E + far)
+    assert np.array_equal(found[1], edge_of)
+    assert np.array_equal(found[2], count)
+
+
+def test_edges_of_vertices_that_are_not_there_are_refused():
+    with pytest.raises(IndexError, match="0 to 2 needed, found 0 to 3"):
+        unique_edges(np.array([[0, 1, 3]]), 3)
+
+
 def test_no_triangles_have_no_edges():
     E, edge_of, count = unique_edges(np.zeros((0, 3), int))
     assert (E.shape, len(edge_of), len(count)) == ((0, 2), 0, 0)
