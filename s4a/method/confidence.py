@@ -70,11 +70,15 @@ def evidence(source: Shape, target: Shape, match: np.ndarray, P: np.ndarray) -> 
     P : float ndarray (n_target, 3)
         The registered template, in the frame of the shape.
     """
+    X, T, near = target.full.X, target.full.T, target.near_coarse  # what is smooth is known there
     Y, S = source.full.X, source.full.T
-    place = closest_point_in_star(P, match, Y, S, source.full.stars)
-    gap = np.linalg.norm(P - interpolate(Y, S, *place), axis=1)  # share of sqrt(area)
-    found = np.log(np.stack([gap, stretch(target.full.X, P, target.full.T)], axis=1) + LEAST)
-    return target.full.field(target.full.coefficients(found[target.near_coarse]))
+    place = closest_point_in_star(P[near], match[near], Y, S, source.full.stars)
+    gap = np.linalg.norm(P[near] - interpolate(Y, S, *place), axis=1)  # share of sqrt(area)
+    beside = np.zeros(len(X), bool)
+    beside[near] = True
+    around = T[beside[T].any(axis=1)]
+    found = np.log(np.stack([gap, stretch(X, P, around)[near]], axis=1) + LEAST)
+    return target.full.field(target.full.coefficients(found))
 
 
 def confidence(source: Shape, target: Shape, match: np.ndarray, P: np.ndarray) -> np.ndarray:
