@@ -155,57 +155,73 @@ def cloud(X: np.ndarray, area: np.ndarray, n_points: int | None = None) -> Cloud
     return Cloud(X, area, cKDTree(X), paired)
 
 
-def icp(
+def icp(source: Cloud, target: Cloud, R: np.ndarray, t: np.ndarray, **options: Any) -> End:
+    """:func:`icp_each` from one start R x + t."""
+    return icp_each(source, target, [(R, t)], **options)[0]
+
+
+def icp_each(
     source: Cloud,
     target: Cloud,
-    R: np.ndarray,
-    t: np.ndarray,
+    starts: list[Motion],
     *,
     rounds: int = 60,
     tolerance: float = 1e-5,
     trim: float = 0.1,
-) -> End:
-    """Iterative closest points (Besl & McKay 1992) from a given start: moves the source.
+) -> list[End]:
+    """Iterative closest points (Besl & McKay 1992) from each of some starts: moves the source.
 
     Each round pairs vertices of the source with the nearest of all of the target and vertices of
     the target with the nearest of all of the source, leaves out the `trim` farthest pairs, and
-    solves for the motion, weighted by area.
+    solves for the motion, weighted by area.  Starts that still move are looked up together.
 
     Parameters
     ----------
     source, target : Cloud
-    R, t : start, R x + t
+    starts : list of tuple (R, t)
+        R x + t.
     rounds : int
+        At least 1.
     tolerance : float
         The end comes when the residual falls by less, as a share of sqrt(area of the source).
     trim : float
 
     Returns
     -------
-    R, t
-        The motion R x + t.
-    residual : float
-        Trimmed root mean square distance of the pairs, both ways.
+    list of tuple (R, t, residual)
+        The motion R x + t, and the trimmed root mean square distance of the pairs, both ways.
     """
     X, Y = source.X[source.paired], target.X[target.paired]
     area, area_y = source.area[source.paired], target.area[target.paired]
     weight = np.concatenate([area / area.sum(), area_y / area_y.sum()])
-    size = np.sqrt(source.area.sum())
-    last = np.inf
+    least = tolerance * np.sqrt(source.area.sum())
+    ends: list[End] = [(R, t, np.inf) for R, t in starts]
+    moving = list(range(len(ends)))
     for _ in range(rounds):
-        forth_gap, forth = target.tree.query(X @ R.T + t)
-        back_gap, back = source.tree.query((Y - t) @ R)
-        P = np.concatenate([X, source.X[back]])  # (pairs, 3)
-        Q = np.concatenate([target.X[forth], Y])
-        gap = np.concatenate([forth_gap, back_gap])
-        # two that are each other's nearest stay or go together, whatever the rounding
-        keep = gap <= (1 + 1e-9) * quantile(gap, 1 - trim)
-        residual = float(np.sqrt(weight[keep] @ gap[keep] ** 2 / weight[keep].sum()))
-        R, t, _ = rigid_transform(P[keep], Q[keep], weight[keep])
-        if last - residual < tolerance * size:
+        forth = _nearest(target, [X @ R.T + t for R, t, _ in (ends[i] for i in moving)])
+        back = _nearest(source, [(Y - t) @ R for R, t, _ in (ends[i] for i in moving)])
+        moved, moving = moving, []
+        for i, (there, forth_gap), (here, back_gap) in zip(moved, forth, back, strict=True):
+            P = np.concatenate([X, source.X[here]])  # (pairs, 3)
+            Q = np.concatenate([target.X[there], Y])
+            gap = np.concatenate([forth_gap, back_gap])
+            # two that are each other's nearest stay or go together, whatever the rounding
+            keep = gap <= (1 + 1e-9) * quantile(gap, 1 - trim)
+            residual = float(np.sqrt(weight[keep] @ gap[keep] ** 2 / weight[keep].sum()))
+            R, t, _ = rigid_transform(P[keep], Q[keep], weight[keep])
+            if ends[i][2] - residual >= least:
+                moving.append(i)
+            ends[i] = R, t, residual
+        if not moving:
             break
-        last = residual
-    return R, t, residual
+    return ends
+
+
+def _nearest(shape, places):
+    """The nearest vertices of a cloud and their distances, for each of some arrays (p, 3)."""
+    gap, nearest = shape.tree.query(np.concatenate(places))
+    each = (len(places), -1)
+    return zip(nearest.reshape(each), gap.reshape(each), strict=True)
 
 
 def quantile(values: np.ndarray, share: float) -> float:
@@ -265,9 +281,8 @@ def try_tilts(
     for _ in range(5):
         R, t, residual = best
         middle = R @ center + t  # the tilts turn X about where its centre has come to lie
-        ends = [
-            icp(source, target, tilt @ R, tilt @ (t - middle) + middle, **options) for tilt in tilts
-        ]
+        starts = [(tilt @ R, tilt @ (t - middle) + middle) for tilt in tilts]
+        ends = icp_each(source, target, starts, **options)
         end = min(ends, key=residual_of)
         if residual_of(end) > 0.999 * residual:
             return best
@@ -310,11 +325,10 @@ def align(
     center, A = principal_axes(X, area)
     center_y, B = principal_axes(Y, area_y)
     flips = [np.diag(d) for d in itertools.product((1, -1), repeat=3) if np.prod(d) == 1]
-    starts = [np.eye(3)] + [B @ flip @ A.T for flip in flips]
+    turns = [np.eye(3)] + [B @ flip @ A.T for flip in flips]
+    starts = [(R, center_y - R @ center) for R in turns]
     source, target = cloud(X, area, n_points), cloud(Y, area_y, n_points)
-    posed, *turned = [
-        icp(source, target, R, center_y - R @ center, tolerance=ROUGH) for R in starts
-    ]
+    posed, *turned = icp_each(source, target, starts, tolerance=ROUGH)
     # the trace of a rotation is 1 + 2 cos(angle): 1 at 90 degrees
     upright = [end for end in turned if np.trace(end[0].T @ posed[0]) >= 1]
     upside_down = [end for end in turned if np.trace(end[0].T @ posed[0]) < 1]

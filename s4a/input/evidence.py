@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
-from s4a.geometry.align import Cloud, End, cloud, icp, principal_axes, residual_of
+from s4a.geometry.align import Cloud, End, cloud, icp_each, principal_axes, residual_of
 from s4a.geometry.crossing import count_crossing
 from s4a.geometry.mesh import (
     as_arrays,
@@ -295,11 +295,11 @@ def best_pose(shape: View, reference: View) -> End:
     R, t, residual
         As of :func:`s4a.geometry.align.icp`.
     """
-    starts = HALF_TURNS + [reference.axes @ half_turn @ shape.axes.T for half_turn in HALF_TURNS]
-    zero = np.zeros(3)
-    rough = [icp(shape.rough, reference.rough, R, zero, tolerance=1e-3, rounds=5) for R in starts]
-    best = sorted(rough, key=residual_of)[:2]
-    ends = [icp(shape.cloud, reference.cloud, R, t, tolerance=1e-4, rounds=30) for R, t, _ in best]
+    turns = HALF_TURNS + [reference.axes @ half_turn @ shape.axes.T for half_turn in HALF_TURNS]
+    starts = [(R, np.zeros(3)) for R in turns]
+    rough = icp_each(shape.rough, reference.rough, starts, tolerance=1e-3, rounds=5)
+    best = [(R, t) for R, t, _ in sorted(rough, key=residual_of)[:2]]
+    ends = icp_each(shape.cloud, reference.cloud, best, tolerance=1e-4, rounds=30)
     return min(ends, key=residual_of)
 
 

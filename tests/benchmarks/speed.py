@@ -3,10 +3,10 @@
 Every row runs in a process of its own with one BLAS thread, ours and the other in turn, on the same
 input: seconds of CPU, of the clock, and the peak of memory above what the process holds before.
 pyFM is on PyPI as ``pyfmaps`` (the extra ``bench``).  ``speed.py stages``, ``pipelines``,
-``growth``, ``pairs``, ``nearest``, ``write`` or ``seals`` runs one part, ``speed.py methods brains faces
-heads`` an analysis by RE-MATCH and by SCALABLE of ten shapes of each, ``speed.py whole 51 100000``
-the whole analysis of so many synthetic shapes of so many vertices, ``speed.py versions 51 100000``
-the same by an older version and by this one, three times in turn.
+``growth``, ``pairs``, ``nearest``, ``write`` or ``seals`` runs one part, ``speed.py methods brains
+faces heads`` an analysis by RE-MATCH and by SCALABLE of ten shapes of each, ``speed.py whole 51
+100000`` the whole analysis of so many synthetic shapes of so many vertices, ``speed.py versions 51
+100000`` the same by an older version and by this one, three times in turn.
 """
 
 import io

@@ -170,3 +170,14 @@ def test_another_seed_or_centre_starts_elsewhere():
 def test_points_that_coincide_are_taken_once():
     X = np.repeat(np.eye(3), 10, axis=0)
     assert sorted(align.many_farthest_points(X, 8, center=np.zeros(3)) // 10) == [0, 1, 2]
+
+
+def test_starts_that_are_looked_up_together_end_as_they_do_alone(brain):
+    X, area = brain
+    clouds = align.cloud(X, area, 200), align.cloud(X * [1.1, 1.0, 0.9], area, 200)
+    starts = [(turned(degrees), np.zeros(3)) for degrees in (0, 30, 180)]
+    together = align.icp_each(*clouds, starts, tolerance=1e-4)
+    assert len({residual for *_, residual in together}) > 1
+    for start, end in zip(starts, together, strict=True):
+        alone = align.icp(*clouds, *start, tolerance=1e-4)
+        assert all(np.array_equal(a, b) for a, b in zip(alone, end, strict=True))
