@@ -34,7 +34,7 @@ def write_netcdf(data: xr.Dataset, file: BufferedIOBase) -> None:
     TypeError
         When a variable or an attribute is neither a number, nor a text, nor an array of them.
     ValueError
-        When a name has a slash, or a variable the name of one of several dims that it has.
+        When a name has a slash, or a variable the name of a dim and others than that alone.
 
     Examples
     --------
@@ -49,6 +49,12 @@ def write_netcdf(data: xr.Dataset, file: BufferedIOBase) -> None:
     """
     variables, attrs = cf_encoder(*encode_dataset_coordinates(data))
     number = {dim: i for i, dim in enumerate(data.sizes)}
+    for name in {**number, **variables}:
+        dims = variables[name].dims if name in variables else (name,)
+        if "/" in name or (name in number and dims != (name,)):
+            raise ValueError(
+                f"a name without slash, and of no dim but its own, needed; found {name}"
+            )
     with h5py.File(file, "w", track_order=True) as root:  # the order of writing, as netCDF asks
         root.attrs["_NCProperties"] = np.array(WRITTEN_BY, "S")
         _add_attributes(root, attrs)
@@ -71,8 +77,6 @@ def write_netcdf(data: xr.Dataset, file: BufferedIOBase) -> None:
 
 def _add_variable(root, name, variable):
     """The values and attributes of a variable, without its dims."""
-    if "/" in name or (name in variable.dims and variable.ndim > 1):
-        raise ValueError(f"a name without slash, which is no dim of several, needed; found {name}")
     attrs = dict(variable.attrs)
     values = _as_stored(variable.values, name)
     fill = attrs.get("_FillValue")
