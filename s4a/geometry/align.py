@@ -264,7 +264,7 @@ def try_tilts(
     degrees : float
         Of a tilt, tried both ways.
     **options
-        Of :func:`icp`.
+        Of :func:`icp_each`.
 
     Returns
     -------
@@ -320,7 +320,7 @@ def align(
 
     Returns
     -------
-    R, t, residual : as of :func:`icp`
+    R, t, residual : as of :func:`icp_each`
     """
     center, A = principal_axes(X, area)
     center_y, B = principal_axes(Y, area_y)

@@ -129,7 +129,7 @@ def unique_edges(T: np.ndarray, n: int | None = None) -> tuple[np.ndarray, np.nd
     m, bits = len(start), n.bit_length()
     edge = np.minimum(start, end) << bits | np.maximum(start, end)  # both in one word
     places = m.bit_length()
-    if 2 * bits + places < 64:  # and the place of the half-edge: a third of the time of argsort
+    if 2 * bits + places < 64:  # and the place of the half-edge, which is faster than argsort
         sorted_words = np.sort(edge << places | np.arange(m))
         order, edge = sorted_words & ((1 << places) - 1), sorted_words >> places
     else:

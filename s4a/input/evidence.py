@@ -293,7 +293,7 @@ def best_pose(shape: View, reference: View) -> End:
     Returns
     -------
     R, t, residual
-        As of :func:`s4a.geometry.align.icp`.
+        As of :func:`s4a.geometry.align.icp_each`.
     """
     turns = HALF_TURNS + [reference.axes @ half_turn @ shape.axes.T for half_turn in HALF_TURNS]
     starts = [(R, np.zeros(3)) for R in turns]

@@ -1,8 +1,7 @@
 """A Dataset as a netCDF-4 file (4), by plain calls of HDF5.
 
 xarray's conventions and what reads them are the same.  It writes by h5netcdf itself, which looks
-names up in the file forty times for each variable: 7 ms, a quarter of the seconds of a small study
-(``speed.py write``).
+names up in the file again and again: ``speed.py write`` has what that takes.
 """
 
 from importlib.metadata import version
