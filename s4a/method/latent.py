@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from joblib import Parallel, delayed
+from joblib import effective_n_jobs
 from scipy.sparse.csgraph import breadth_first_order
 from scipy.sparse.linalg import LinearOperator, eigsh
 from scipy.spatial import cKDTree
@@ -23,7 +23,7 @@ from s4a.method.nearest import (
     nearest_float32,
     nearest_rows,
 )
-from s4a.method.network import cycle_errors, cycle_weights, three_cycles
+from s4a.method.network import cycle_errors, cycle_weights, in_threads, three_cycles
 from s4a.method.shape import N_SPREAD, Basis
 
 log = logging.getLogger(__name__)
@@ -97,15 +97,13 @@ def consistency_form(
     def product(shapes, V):
         return [rows[i] @ V[joined[i]].reshape(-1, V.shape[2]) for i in shapes]
 
-    shares = np.array_split(np.arange(n), n_jobs or 1)
+    shares = np.array_split(np.arange(n), effective_n_jobs(n_jobs))
 
     def apply(V):
         V = np.asarray(V, dtype).reshape(n, k, -1)
         if V.shape[2] == 1:  # one vector takes as long as it takes to start a thread
             return np.concatenate(product(range(n), V))
-        parts = Parallel(n_jobs=n_jobs, backend="threading")(
-            delayed(product)(shapes, V) for shapes in shares
-        )
+        parts = in_threads(lambda shapes: product(shapes, V), shares, n_jobs)
         return np.concatenate([block for part in parts for block in part])
 
     return apply
@@ -399,11 +397,11 @@ def larger_maps(
         solve = np.linalg.pinv(F * root[:, None]) * root  # (k, s)
         return solve, as_queries(F[:, :size] @ Y[j])
 
-    def maps_from(i, rows, of_target):
-        """The maps from shape i into those of some."""
+    def maps_from(i):
+        """The maps from shape i into some of the others."""
         Phi = sampled[i].Phi if bases is None else bases[i].Phi
         candidates = as_candidates(np.ascontiguousarray(Phi[:, :size]) @ Y[i])
-        for r in rows:
+        for r in rows[source[rows] == i]:
             solve, query = of_target[target[r]]
             if bases is None:
                 match = nearest_float32(query, candidates)
@@ -411,13 +409,11 @@ def larger_maps(
                 match = nearest_around(query, candidates, sampled[i].at, sampled[i].around)
             C[r] = solve @ Phi.take(match, axis=0)[:, :k]
 
-    threads = Parallel(n_jobs=n_jobs, backend="threading")
     for begin in range(0, len(sampled), TARGETS):
         some = range(begin, min(begin + TARGETS, len(sampled)))
-        of_target = dict(zip(some, threads(map(delayed(solver_and_query), some)), strict=True))
+        of_target = dict(zip(some, in_threads(solver_and_query, some, n_jobs), strict=True))
         rows = np.flatnonzero((target >= begin) & (target < begin + TARGETS))
-        sources = np.unique(source[rows])
-        threads(delayed(maps_from)(i, rows[source[rows] == i], of_target) for i in sources)
+        in_threads(maps_from, np.unique(source[rows]), n_jobs)
     return C
 
 
