@@ -253,6 +253,8 @@ def inserts(folder, n, n_vertices):
 def table(folder):
     """What all runs of a folder took, and the exponents."""
     found = [json.loads(path.read_text()) for path in folder.glob("*.json")]
+    if not found:
+        sys.exit(f"a run in {folder} is needed, found none: large.py run 50 comes first")
     for kind in sorted({(one["kind"], one["vertices"]) for one in found}):
         runs = [one for one in found if (one["kind"], one["vertices"]) == kind]
         runs.sort(key=lambda one: one["shapes"])
