@@ -51,7 +51,8 @@ def workers(n_jobs: int | None, **options: Any) -> Parallel:
             resource_tracker.ensure_running()
         # as text: a worker is to know it before it imports NumPy and this package, which takes long
         at_once = threading.current_thread() is threading.main_thread()
-        text = f"{inspect.getsource(end_with)}\nend_with({os.getpid()}, {at_once})"
+        text = f"{inspect.getsource(end_with)}\nend_with({os.getpid()}, {at_once})\n"
+        text += f"{inspect.getsource(keep_freed_memory)}\nkeep_freed_memory()"
         options |= {"initializer": exec, "initargs": (text, {})}
     return Parallel(n_jobs=n_jobs, **options)
 
@@ -89,6 +90,22 @@ def end_with(owner: int, at_once: bool, *, interruptible: bool = False) -> None:
     if os.getppid() != owner:  # it ended before this line
         os._exit(1)
     threading.Thread(target=watch, daemon=True).start()
+
+
+def keep_freed_memory() -> None:
+    """Let this process use memory again that its arrays freed.
+
+    The C library of Linux gives large arrays back to the system, which then clears each page of
+    the next one, the longer the more processes do so. Elsewhere nothing is done.
+    """
+    import ctypes
+    import sys
+
+    c = ctypes.CDLL(None) if sys.platform == "linux" else None
+    if hasattr(c, "mallopt"):  # of glibc, not of musl
+        m_trim_threshold, m_mmap_threshold = -1, -3
+        c.mallopt(m_trim_threshold, 2**31 - 1)
+        c.mallopt(m_mmap_threshold, 2**30)
 
 
 @contextlib.contextmanager
