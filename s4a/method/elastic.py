@@ -46,7 +46,7 @@ from scipy.spatial import cKDTree
 from s4a.geometry.closest import closest_point_in_star, features, interpolate
 from s4a.method.joint import Warp, move, turn
 from s4a.method.shape import Basis, common_fields, field_columns
-from s4a.method.spectral import factor
+from s4a.method.spectral import Diffusion
 
 N_STEPS = 8
 N_FURTHER = 5  # steps at most, where the last was nearly in vain
@@ -412,7 +412,7 @@ def starts_that_meet(
 def local_rounds(
     source: Basis,
     target: Basis,
-    W: sp.csr_matrix,
+    diffusion: Diffusion,
     X: np.ndarray,
     *,
     time: tuple[float, float] = TIME,
@@ -426,8 +426,8 @@ def local_rounds(
     ----------
     source, target : Basis
         As of :func:`elastic_rounds`.
-    W : sparse matrix (n, n)
-        Stiffness of the target's low resolution.
+    diffusion : Diffusion
+        On the target.
     X : float ndarray (n, 3)
         The target's vertices after the elastic rounds.
     time : tuple of float
@@ -443,15 +443,16 @@ def local_rounds(
     float ndarray (n, 3)
         d, in the frame of the source.
     """
-    A = sp.diags_array(target.area)
-    P, missing = (sp.csr_matrix((0, len(X))), np.zeros((0, 3))) if pull is None else pull
-    pinned = LANDMARK_WEIGHT * P.T @ P
-    toward = LANDMARK_WEIGHT * P.T @ missing
+    pinned, toward = None, 0.0
+    if pull is not None:
+        P, missing = pull
+        pinned = LANDMARK_WEIGHT * P.T @ P
+        toward = LANDMARK_WEIGHT * P.T @ missing
     d = np.zeros_like(X)
     for step in np.geomspace(*time, rounds):
         y, m = points_ahead(source, target, X + d)
         way = y - X - d
         across = np.einsum("ni,ni->n", m, way)[:, None] * m
         goal = d + slide * way + (1 - slide) * across
-        d = factor(A + pinned + step * W)(target.area[:, None] * goal + toward)
+        d = diffusion.step(step, pinned)(target.area[:, None] * goal + toward)
     return d

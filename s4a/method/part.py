@@ -33,6 +33,7 @@ from s4a.geometry.closest import (
 from s4a.geometry.mesh import triangle_normals, vertex_areas, vertex_normals
 from s4a.method.elastic import elastic_rounds, local_rounds
 from s4a.method.shape import Basis, Shape
+from s4a.method.spectral import Diffusion
 
 N_ROUGH = 150  # points of the part in the first rounds of ICP, and
 N_ROUGH_ROUNDS = 12
@@ -351,4 +352,4 @@ def refine(
     start = np.eye(3), np.zeros(3), np.zeros((target_low.k, 3))
     R, t, c = elastic_rounds(source, target_low, start)
     X = X_low @ R.T + t + target_low.field(c)
-    return X + local_rounds(source, target_low, target.W, X)
+    return X + local_rounds(source, target_low, Diffusion(target_low.area, target.W), X)

@@ -480,7 +480,7 @@ def after_local_rounds(
     if landmarks is not None:
         at, y = landmarks
         pull = at.U, y - joint.move(at, warp)
-    d = local_rounds(source.full, low, target.W, joint.move(low, warp), pull=pull)
+    d = local_rounds(source.full, low, target.diffusion, joint.move(low, warp), pull=pull)
     return joint.move(target.full, warp) + target.U @ d
 
 

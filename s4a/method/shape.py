@@ -28,7 +28,7 @@ from s4a.geometry.mesh import (
 )
 from s4a.method.deform import smoother
 from s4a.method.remesh import laplacian
-from s4a.method.spectral import project, unit_mass
+from s4a.method.spectral import Diffusion, project, unit_mass
 
 N_SPREAD = 1000  # spread vertices of a shape on which Consistent ZoomOut looks for matches
 N_PAIRED = 300  # spread vertices of a shape that rigid alignment pairs
@@ -337,6 +337,11 @@ class Shape:
         else:
             E, w, *_ = laplacian(*as_arrays(self.coarse), self.coarse["vertex_area"].values)
         return stiffness(E, w, self.coarse.sizes["vertex"])
+
+    @cached_property
+    def diffusion(self) -> Diffusion:
+        """Of heat at low resolution."""
+        return Diffusion(self.low.area, self.W)
 
     @cached_property
     def low_on_surface(self) -> Basis:

@@ -69,6 +69,42 @@ def factor(S: sp.spmatrix) -> Callable[[np.ndarray], np.ndarray]:
     ).solve
 
 
+class Diffusion:
+    """Implicit steps of heat diffusion, (A + time W) x = b; the factors of a time are kept.
+
+    Parameters
+    ----------
+    area : float ndarray (n,)
+        A.
+    W : sparse matrix (n, n)
+        Stiffness.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import scipy.sparse as sp
+    >>> from s4a.method.spectral import Diffusion
+    >>> W = sp.csr_matrix([[1.0, -1], [-1, 1]])
+    >>> Diffusion(np.array([0.5, 0.5]), W).step(0.5)(np.array([1.0, 0])).round(3).tolist()
+    [1.333, 0.667]
+    """
+
+    def __init__(self, area: np.ndarray, W: sp.csr_matrix) -> None:
+        self.A = sp.diags_array(area)
+        self.W = W
+        self._steps: dict[float, Callable[[np.ndarray], np.ndarray]] = {}
+
+    def step(
+        self, time: float, pinned: sp.sparray | None = None
+    ) -> Callable[[np.ndarray], np.ndarray]:
+        """The function that solves for x ``(n, q)``; with `pinned` added to A none is kept."""
+        if pinned is not None:
+            return factor(self.A + pinned + time * self.W)
+        if time not in self._steps:
+            self._steps[time] = factor(self.A + time * self.W)
+        return self._steps[time]
+
+
 def project(Phi: np.ndarray, area: np.ndarray | sp.spmatrix, f: np.ndarray) -> np.ndarray:
     """Coefficients a = Phi^T A f of a function ``(k,)`` or of several ``(k, d)``.
 

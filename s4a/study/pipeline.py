@@ -68,6 +68,7 @@ from s4a.study.structures import (
 from s4a.study.tasks import (
     align_shape,
     consistent_maps,
+    last_template,
     map_pairs,
     place_shape,
     register_shape,
@@ -506,7 +507,9 @@ def register(run: Run, coarse: Keys, placed: Keys, latent: str, options: Options
                 (template_key, *own),
             )
         )
-    return run.do("registration", todo)
+    registered = run.do("registration", todo)
+    last_template.clear()  # of this process, where it registered itself
+    return registered
 
 
 def modes(run: Run, registered: Keys, doubts: Doubts, options: Options) -> str:

@@ -119,7 +119,7 @@ def local(pair, ends):
     """Where elastic rounds end at low resolution, and the displacement of local rounds after."""
     template, shape, _ = pair
     X = joint.move(template.low, ends[0])
-    return X, elastic.local_rounds(shape.full, template.low, template.W, X)
+    return X, elastic.local_rounds(shape.full, template.low, template.diffusion, X)
 
 
 def gap(X, shape):
@@ -142,7 +142,7 @@ def test_local_rounds_find_a_bump_that_no_function_of_the_basis_has(pair):
     place = low.X[100]
     bump = 0.01 * np.exp(-((low.X - place) ** 2).sum(1) / (2 * 0.05**2))[:, None] * low.normals
     source = replace(low, X=low.X + bump)
-    d = elastic.local_rounds(source, low, template.W, low.X)
+    d = elastic.local_rounds(source, low, template.diffusion, low.X)
     assert np.linalg.norm(d - bump, axis=1).max() < 0.4 * np.linalg.norm(bump, axis=1).max()
     coarse = low.first(10)
     left = bump - coarse.field(coarse.coefficients(bump))
@@ -153,7 +153,7 @@ def test_a_local_round_is_a_step_of_heat_diffusion(pair):
     template, shape, _ = pair
     low, time = template.low, 0.01
     d = elastic.local_rounds(
-        shape.full, low, template.W, low.X, time=(time, time), slide=1.0, rounds=1
+        shape.full, low, template.diffusion, low.X, time=(time, time), slide=1.0, rounds=1
     )
     y, _ = elastic.nearest_on_surface(shape.full, low.X, vertex_normals(low.X, low.T))
     W = stiffness(*cotan_weights(low.X, low.T), len(low.X))
@@ -164,7 +164,7 @@ def test_a_local_round_is_a_step_of_heat_diffusion(pair):
 def test_on_the_surface_itself_nothing_is_left_to_do(pair):
     template, _, _ = pair
     low = template.low
-    assert np.abs(elastic.local_rounds(low, low, template.W, low.X)).max() < 1e-12
+    assert np.abs(elastic.local_rounds(low, low, template.diffusion, low.X)).max() < 1e-12
 
 
 def test_where_parts_turned_on_their_own_local_rounds_alone_follow(pair, monkeypatch):
@@ -266,7 +266,7 @@ def test_a_coarse_triangle_without_area_is_no_obstacle(pair):
 def test_the_stiffness_is_computed_again_where_a_study_was_made_smaller(pair):
     template, _, _ = pair
     smaller = replace(template, coarse=template.coarse.drop_vars(["edge_vertex", "cotan_weight"]))
-    assert (smaller.W != template.W).nnz == 0
+    assert (smaller.W != template.diffusion).nnz == 0
 
 
 def test_a_study_and_a_pair_take_it_and_say_so(brains):
