@@ -4,10 +4,12 @@ End to end, the same on any number of workers, resumed after a kill, failures na
 """
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,7 +20,8 @@ from small import OPTIONS
 from s4a import analyse, statistics, synthesize, synthetic
 from s4a.evaluation import accuracy
 from s4a.geometry.mesh import as_arrays, vertex_areas
-from s4a.study import store
+from s4a.study import store, tasks
+from s4a.study.options import Options
 
 RESULTS = ("network", "latent", "registration", "pca")
 
@@ -118,6 +121,21 @@ def test_every_shape_is_synthesized_from_its_scores(study):
 
 def test_two_workers_give_the_bits_of_one(brains, study):
     assert_same(analyse(brains, **OPTIONS | {"n_jobs": 2}), study)
+
+
+def test_a_process_keeps_the_template_until_its_file_is_another(brains, study_folder, tmp_path):
+    folder = shutil.copytree(study_folder, tmp_path / "study")
+    name = brains["truth"]["shape"].values[0].item()
+    options = Options(k=OPTIONS["k"])
+    kept = tasks.template_of(folder, name, options)
+    assert tasks.template_of(folder, name, options) is kept
+    assert tasks.template_of(folder, name, replace(options, n_projected=10)) is not kept
+    coarse = store.read(folder / f"coarse/{name}.nc")
+    store.write(coarse, folder / f"coarse/{name}.nc", "another", [])
+    other = tasks.template_of(folder, name, options)
+    assert other is not kept
+    assert list(tasks.last_template.values()) == [other]
+    tasks.last_template.clear()
 
 
 def test_labels_and_landmarks_stay_with_the_shapes(brains, study):
