@@ -13,7 +13,7 @@ import scipy.sparse as sp
 import xarray as xr
 from scipy.spatial import cKDTree
 
-from s4a.geometry.align import Cloud, farthest_points, rigid_transform
+from s4a.geometry.align import Cloud, farthest_points, many_farthest_points, rigid_transform
 from s4a.geometry.closest import Stars, features, stars, tree_over
 from s4a.geometry.mesh import (
     as_arrays,
@@ -138,7 +138,7 @@ class Basis:
 
     @cached_property
     def _spread(self) -> np.ndarray:
-        return farthest_points(self.X, N_SPREAD)
+        return many_farthest_points(self.X, N_SPREAD, center=self.X.mean(0))
 
     @cached_property
     def cloud(self) -> Cloud:
