@@ -35,6 +35,7 @@ from s4a.geometry.mesh import (
     edges,
     euler_characteristic,
     half_cotangents,
+    lexical_order,
     n_used,
     triangle_areas,
     unique_edges,
@@ -139,13 +140,14 @@ def sorted_mesh(X: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
 
     The same surface gives the same coarse mesh, however its file numbers it.
     """
-    order = np.lexsort(X.T[::-1])
+    order = lexical_order(X[:, ::-1])
     rank = np.empty(len(X), np.int64)
     rank[order] = np.arange(len(X))
     T = rank[T]
     turn = (T.argmin(1)[:, None] + np.arange(3)) % 3  # the least corner first, the turn kept
     T = np.take_along_axis(T, turn, axis=1)
-    return X[order], T[np.lexsort((T[:, 2], T[:, 0] * len(X) + T[:, 1]))], order
+    first_two = T[:, 0] * len(X) + T[:, 1]
+    return X[order], T[lexical_order(np.stack([T[:, 2], first_two], axis=1))], order
 
 
 def coarse_surface(

@@ -12,6 +12,7 @@ from s4a.geometry.mesh import (
     edge_graph,
     edges,
     equal_rows,
+    lexical_order,
     path_lengths,
     unique_edges,
 )
@@ -84,3 +85,20 @@ def test_no_pairs_have_no_paths(sphere):
     X, T = sphere
     none = np.zeros(0, int)
     assert len(path_lengths(edge_graph(X, edges(T)), none, none, 1.0)) == 0
+
+
+@pytest.mark.parametrize(
+    "A",
+    [
+        np.random.default_rng(0).random((200, 3)),
+        np.random.default_rng(1).random((40, 3)).repeat(5, axis=0),
+        np.random.default_rng(2).integers(0, 3, (200, 3)).astype(float),
+        np.random.default_rng(3).choice([np.nan, -np.inf, 0.0, -0.0, 1.0], (200, 2)),
+        np.random.default_rng(4).integers(0, 50, (200, 2)),
+        np.empty((0, 3)),
+        np.ones((1, 3)),
+    ],
+    ids=["apart", "repeated", "few values", "special values", "integers", "none", "one"],
+)
+def test_the_lexical_order_is_that_of_numpy(A):
+    assert np.array_equal(lexical_order(A), np.lexsort(A.T))
