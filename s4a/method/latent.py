@@ -20,6 +20,7 @@ from s4a.method.nearest import (
     as_candidates,
     as_queries,
     nearest_around,
+    nearest_both_ways,
     nearest_float32,
     nearest_rows,
 )
@@ -389,6 +390,7 @@ def larger_maps(
     """
     size = Y.shape[1]
     C = np.empty((len(target), k, k))
+    match = sample_matches(sampled, Y, source, target, n_jobs)
 
     def solver_and_query(j):
         """The least squares of shape j, factored, and what is looked for."""
@@ -399,22 +401,53 @@ def larger_maps(
 
     def maps_from(i):
         """The maps from shape i into some of the others."""
-        Phi = sampled[i].Phi if bases is None else bases[i].Phi
-        candidates = as_candidates(np.ascontiguousarray(Phi[:, :size]) @ Y[i])
-        for r in rows[source[rows] == i]:
+        Phi = np.ascontiguousarray((sampled[i] if bases is None else bases[i]).Phi[:, :k])
+        if bases is not None:
+            rows = np.ascontiguousarray(as_candidates(Phi[:, :size] @ Y[i]).T)
+        for r in some_maps[source[some_maps] == i]:
             solve, query = of_target[target[r]]
-            if bases is None:
-                match = nearest_float32(query, candidates)
-            else:
-                match = nearest_around(query, candidates, sampled[i].at, sampled[i].around)
-            C[r] = solve @ Phi.take(match, axis=0)[:, :k]
+            found = match[r]
+            if bases is not None:
+                found = nearest_around(query, rows, sampled[i].around[found])
+            C[r] = solve @ Phi.take(found, axis=0)
 
     for begin in range(0, len(sampled), TARGETS):
         some = range(begin, min(begin + TARGETS, len(sampled)))
         of_target = dict(zip(some, in_threads(solver_and_query, some, n_jobs), strict=True))
-        rows = np.flatnonzero((target >= begin) & (target < begin + TARGETS))
-        in_threads(maps_from, np.unique(source[rows]), n_jobs)
+        some_maps = np.flatnonzero((target >= begin) & (target < begin + TARGETS))
+        in_threads(maps_from, np.unique(source[some_maps]), n_jobs)
     return C
+
+
+def sample_matches(
+    sampled: list[Sampled],
+    Y: np.ndarray,
+    source: np.ndarray,
+    target: np.ndarray,
+    n_jobs: int | None = 1,
+) -> list[np.ndarray]:
+    """For every map, the source's sample that is nearest to each of the target's (eq. 3).
+
+    Maps there and back between two shapes take one matrix product.
+    """
+    row = {pair: r for r, pair in enumerate(zip(source.tolist(), target.tolist(), strict=True))}
+    match: list[np.ndarray] = [np.empty(0, np.int64)] * len(row)
+
+    def functions(i):
+        return as_candidates(sampled[i].Phi[:, : Y.shape[1]] @ Y[i])
+
+    def match_pair(pair):
+        i, j = pair
+        query = of_shape[j].T.copy()
+        query[:, -1] = -1  # as of as_queries
+        if (j, i) in row:
+            match[row[i, j]], match[row[j, i]] = nearest_both_ways(query, of_shape[i])
+        else:
+            match[row[i, j]] = nearest_float32(query, of_shape[i])
+
+    of_shape = in_threads(functions, range(len(sampled)), n_jobs)
+    in_threads(match_pair, [(i, j) for i, j in row if i < j or (j, i) not in row], n_jobs)
+    return match
 
 
 def frozen_basis(C_out: np.ndarray, C_in: np.ndarray, Y: np.ndarray) -> np.ndarray:

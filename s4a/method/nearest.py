@@ -90,38 +90,61 @@ def nearest_float32(q: np.ndarray, d: np.ndarray) -> np.ndarray:
     return np.concatenate([score.argmax(axis=1) for _, score in scores_in_blocks(q, d)])
 
 
-def nearest_around(
-    q: np.ndarray, d: np.ndarray, some: np.ndarray, around: np.ndarray
-) -> np.ndarray:
-    """The nearest of those around the nearest of some; mostly, but not always, the nearest of all.
+def nearest_both_ways(q: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """For every row of q the nearest of d, and the other way, from one matrix product.
+
+    The first as of :func:`nearest_float32`; of the second, d's term of the distance is the same for
+    all rows of q, and q's is taken off each block.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.method.nearest import as_candidates, as_queries, nearest_both_ways
+    >>> Q, D = np.array([[0.1], [4.0]]), np.array([[0.0], [5.0], [0.3]])
+    >>> [found.tolist() for found in nearest_both_ways(as_queries(Q), as_candidates(D))]
+    [[0, 1], [0, 1, 0]]
+    """
+    half = np.einsum("ij,ij->i", q[:, :-1], q[:, :-1]) / 2
+    of_q, of_d = np.empty(len(q), np.int64), np.zeros(d.shape[1], np.int64)
+    highest = np.full(d.shape[1], -np.inf, np.float32)
+    column = np.arange(d.shape[1])
+    for start, score in scores_in_blocks(q, d):
+        end = start + len(score)
+        of_q[start:end] = score.argmax(axis=1)
+        score -= half[start:end, None]
+        best = score.argmax(axis=0)
+        value = score[best, column]
+        nearer = value > highest
+        of_d[nearer], highest[nearer] = start + best[nearer], value[nearer]
+    return of_q, of_d
+
+
+def nearest_around(q: np.ndarray, rows: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """The nearest of a few rows, others for each query.
 
     Parameters
     ----------
     q : float32 ndarray (n, m + 1)
         As of :func:`as_queries`.
-    d : float32 ndarray (m + 1, p)
-        As of :func:`as_candidates`.
-    some : int ndarray (s,)
-        Columns of d that are compared first, with every query.
-    around : int ndarray (s, w)
-        Columns that are compared with a query whose nearest of `some` is the one of their row.
+    rows : float32 ndarray (p, m + 1)
+        As of :func:`as_candidates`, transposed.
+    near : int ndarray (n, w)
+        The rows that each query is compared with.
 
     Returns
     -------
     int ndarray (n,)
-        Columns of d.
+        Rows.
 
     Examples
     --------
     >>> import numpy as np
     >>> from s4a.method.nearest import as_candidates, as_queries, nearest_around
-    >>> d = as_candidates(np.arange(9.0)[:, None])
-    >>> around = np.array([[0, 1, 2], [6, 7, 8]])
-    >>> nearest_around(as_queries(np.array([[1.9], [5.8]])), d, np.array([1, 7]), around).tolist()
+    >>> rows = np.ascontiguousarray(as_candidates(np.arange(9.0)[:, None]).T)
+    >>> near = np.array([[0, 1, 2], [6, 7, 8]])
+    >>> nearest_around(as_queries(np.array([[1.9], [5.8]])), rows, near).tolist()
     [2, 6]
     """
-    rows = np.ascontiguousarray(d.T)
-    near = around[nearest_float32(q, np.ascontiguousarray(rows[some].T))]  # (n, w)
     nearest = np.empty(len(q), np.int64)
     for start in range(0, len(q), AROUND):
         columns = near[start : start + AROUND]

@@ -13,6 +13,7 @@ from s4a.method.nearest import (
     as_queries,
     into_cells,
     nearest_around,
+    nearest_both_ways,
     nearest_float32,
     nearest_in_cells,
     nearest_of_few,
@@ -163,8 +164,27 @@ def test_a_search_around_what_is_found_among_some_gives_nearly_what_is_nearest_o
     exact = nearest_float32(q, d)
 
     def found(width):
-        return nearest_around(q, d, some, np.argsort(gap, axis=1)[:, :width])
+        around = np.argsort(gap, axis=1)[:, :width]
+        return nearest_around(q, d.T, around[nearest_float32(q, d[:, some])])
 
     assert np.array_equal(found(900), exact)
     assert np.isin(found(1), some).all()
     assert (found(32) == exact).mean() > 0.99 > (found(4) == exact).mean()
+
+
+@pytest.mark.parametrize(("n", "m"), [(600, 700), (1, 300), (300, 1), (256, 512)])
+def test_one_product_gives_the_nearest_both_ways(n, m):
+    rng = np.random.default_rng(n)
+    A, B = rng.normal(size=(n, 20)) + 3, rng.normal(size=(m, 20)) * [[1], [4]][n % 2] + 3
+    of_a, of_b = nearest_both_ways(as_queries(A), as_candidates(B))
+    gap = np.linalg.norm(A[:, None] - B, axis=2)
+    assert np.array_equal(of_a, gap.argmin(1))
+    assert np.array_equal(of_b, gap.argmin(0))
+
+
+def test_both_ways_take_the_first_of_rows_that_are_equally_near():
+    A = np.random.default_rng(5).integers(0, 3, (400, 3)).astype(float)
+    of_a, of_b = nearest_both_ways(as_queries(A), as_candidates(A))
+    first = (A[:, None] == A).all(2).argmax(1)
+    assert np.array_equal(of_a, first)
+    assert np.array_equal(of_b, first)
