@@ -114,8 +114,12 @@ class Forked:
 
     def workers(self):
         """Its worker processes."""
-        children = psutil.Process(self.pid).children()
-        return [process for process in children if "LokyProcess" in " ".join(process.cmdline())]
+        found = []
+        with contextlib.suppress(psutil.NoSuchProcess):  # one that has just ended, too
+            for process in psutil.Process(self.pid).children():
+                if "LokyProcess" in " ".join(process.cmdline()):
+                    found.append(process)
+        return found
 
 
 class Bench:

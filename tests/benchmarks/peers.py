@@ -10,12 +10,17 @@ Faces are registered, vertex i is vertex i; the shape is remeshed so that its ve
 of these.  Isotropic remeshing alone keeps some: how many is said above each pair, and ``--kept``
 shows what that is worth to whom.
 
+Each method runs in a process of its own, which is ended at 900 s of CPU or 16 GiB; then the row
+says so.
+
 The pairs that elastic rounds were tuned on are shown with ``--tuned`` and left out otherwise; of
 cortex templates there is one pair, which was tuned on.  All but brains need the shared data beside
 the checkout; the others come with the extra ``bench``.
 """
 
 import itertools
+import multiprocessing
+import resource
 import subprocess
 import sys
 import tempfile
@@ -34,6 +39,10 @@ from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays, as_dataset, triangle_normals, vertex_areas, vertex_normals
 from s4a.input.annotations import read_landmarks
 
+MOST_SECONDS, MOST_BYTES = (
+    900,
+    16 * 2**30,
+)  # of CPU and of memory, that a method may take for a pair
 SHARES = 0.9, 0.99  # of the area, or of the landmarks, whose errors are below the percentile
 DATA = Path(__file__).parents[3] / "shared" / "data"
 TUNED = {
@@ -260,6 +269,31 @@ def turned_over(template, image):
     return int((np.einsum("tx,tx->t", triangle_normals(image, T), around) < 0).sum())
 
 
+def within_limits(method, *given):
+    """What a method gives and its CPU seconds, in a process of its own; or None and why."""
+    context = multiprocessing.get_context("fork")
+    receive, send = context.Pipe(duplex=False)
+
+    def run():
+        resource.setrlimit(resource.RLIMIT_CPU, (MOST_SECONDS, MOST_SECONDS))
+        resource.setrlimit(resource.RLIMIT_AS, (MOST_BYTES, MOST_BYTES))
+        begin = time.process_time()
+        try:
+            send.send((method(*given), time.process_time() - begin))
+        except MemoryError:
+            send.send((None, f"more than {MOST_BYTES / 2**30:.0f} GiB"))
+
+    process = context.Process(target=run)
+    process.start()
+    send.close()
+    try:
+        found = receive.recv()
+    except EOFError:
+        found = None, f"more than {MOST_SECONDS} s, or a crash"
+    process.join()
+    return found
+
+
 def main(words):
     sets = [word for word in words if word in REPORTED] or list(REPORTED)
     chosen = TUNED if "--tuned" in words else REPORTED
@@ -279,9 +313,10 @@ def main(words):
             for name, (method, *settings) in METHODS.items():
                 if method not in (ours, nearest) and "--ours" in words:
                     continue
-                spent = time.process_time()
-                image = method(template, shape, start, *settings)
-                spent = time.process_time() - spent
+                image, spent = within_limits(method, template, shape, start, *settings)
+                if image is None:
+                    sys.stdout.write(f"{name:42} {spent}\n")
+                    continue
                 flips = turned_over(template, image)
                 errors = " ".join(f"{error:8.3f}" for error in measure(image))
                 sys.stdout.write(f"{name:42} {errors} {flips:7d} {spent:7.1f}\n")
