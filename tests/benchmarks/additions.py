@@ -113,7 +113,7 @@ INSTEAD = {
         "s4a.method.remesh.closest_point_in_star": closest_in_space,
         "s4a.method.remesh.sample_surface": geodesic_farthest,
     },
-    "ICP from one start": {"s4a.study.tasks.align": one_start},
+    "ICP from one start": {"s4a.method.first_map.align": one_start},
     "first maps of pyFM": {
         "s4a.method.first_map.fit_after_motion": pyfm_fit,
         "s4a.method.steps.fit_after_motion": pyfm_fit,

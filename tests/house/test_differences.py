@@ -1,5 +1,6 @@
 """The page of what differs from the paper: every switch, every result, no figure by hand."""
 
+import importlib
 import re
 
 import pytest
@@ -76,3 +77,11 @@ def test_a_row_is_the_paper_or_the_default_with_one_thing_changed(row):
     expected = 0 if unchanged or in_place else with_its_need.get(row, 1)
     assert len(changed) == expected
     assert pair_options(options) if row.startswith("pairs") else Options(**options)
+
+
+@pytest.mark.parametrize(
+    "name", sorted({n for of_row in additions.INSTEAD.values() for n in of_row})
+)
+def test_what_is_put_in_the_place_of_ours_is_there(name):
+    module, _, function = name.rpartition(".")
+    assert callable(getattr(importlib.import_module(module), function))
