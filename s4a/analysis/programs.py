@@ -126,10 +126,11 @@ def write_slicer(
     name = registration.attrs["template"]
     own_marks = landmarks is None and "landmark_position" in study["original"][name]
     landmarks = study["original"][name].to_dataset() if own_marks else landmarks
-    carried = {}
+    carried: dict[str, xr.Dataset] = {}
     if landmarks is not None:
         (folder / "landmarks").mkdir(exist_ok=True)
-        carried = dict(transfer_landmarks(study, landmarks).children)
+        others = transfer_landmarks(study, landmarks).children
+        carried = {name: landmarks} | {other: node.to_dataset() for other, node in others.items()}
     unit, paths, unknown = unit_of(registration["displacement"]), [], []
     names = np.array([str(vertex) for vertex in chosen.tolist()])
     for shape in registration["shape"].values.tolist():
@@ -141,10 +142,9 @@ def write_slicer(
         scalars = {"confidence": own["confidence"].values}
         paths[-1].write_bytes(vtk_bytes(points, triangles, scalars, title))
         lists = {"points": dataset(landmark_name=names, landmark_position=points[chosen])}
-        if shape in carried or (carried and shape == name):
-            marks = carried[shape].to_dataset() if shape in carried else landmarks
-            kept = [n for n in marks if str(n) in MARKS]
-            marks = marks[kept].drop_attrs()
+        if shape in carried:
+            kept = [n for n in carried[shape] if str(n) in MARKS]
+            marks = carried[shape][kept].drop_attrs()
             place = in_file(
                 study["original"][shape].to_dataset(), marks["landmark_position"].values
             )
@@ -333,7 +333,7 @@ def write_r(study: xr.DataTree, folder: Path | str, *, n_points: int = N_POINTS)
         table = study["subjects"].to_dataset().reindex(shape=names)
         columns |= {str(name): table[name].values.tolist() for name in table.data_vars}
     if "pca" in study.children:
-        scores = study["pca"]["score"].sel(shape=names).values
+        scores = study["pca"].to_dataset()["score"].sel(shape=names).values
         columns |= {f"component_{i}": of.tolist() for i, of in enumerate(scores.T, 1)}
     write_table(paths[2], columns, zip(*columns.values(), strict=True))
     paths[3].write_text(R_SCRIPT, encoding="utf-8")

@@ -50,7 +50,8 @@ def write_scalismo(
     registration = registration_of(study)
     X, T = as_arrays(registration)
     mean = synthesize(study, np.zeros(1))["position"].values
-    D = study["pca"]["deformation"].values.astype(float)  # (c, n, 3), each of one deviation
+    modes = study["pca"].to_dataset()
+    D = modes["deformation"].values.astype(float)  # (c, n, 3), each of one deviation
     if n_modes is not None:
         check_count("n_modes", n_modes, 1)
         D = D[:n_modes]

@@ -387,17 +387,18 @@ def transfer(args: Namespace) -> int:
     given = {name: value for name, value in asked.items() if value is not None}
     if len(args.targets) == 1 and (Path(args.targets[0]) / "registration.nc").is_file():
         study = open_study(args.targets[0])
+        given["source"] = source
     else:
         study, excluded = registered_pairs(source, args, given)
-        source, given = None, {}  # it is the template now, and matched
+        given = {}  # the source is the template now, and matched
     out = new_folder(args.out)
     labels: Mapping[str, Any] = {}  # name of a target -> node
     points: Mapping[str, Any] = {}
     if label is not None:
-        carried = travel.transfer_labels(study, label, source=source, blur=args.blur, **given)
+        carried = travel.transfer_labels(study, label, blur=args.blur, **given)
         labels = carried.children
     if landmarks is not None:
-        points = travel.transfer_landmarks(study, landmarks, source=source, **given).children
+        points = travel.transfer_landmarks(study, landmarks, **given).children
     write(tables.table(transferred_rows(study, labels, points, out), tables.TRANSFERRED))
     return 1 if excluded else 0
 
@@ -495,7 +496,7 @@ def compare(args: Namespace) -> int:
         result, names, seconds, text = compare_pairs(args)
     out = new_folder(args.out)
     result.to_netcdf(out / "compare.nc", engine=ENGINE)
-    figure = charts.stacked(names, result["block"].values.tolist(), seconds)
+    figure = charts.stacked(names, result.coords["block"].values.tolist(), seconds)
     figure.savefig(out / "compare.png", dpi=150)
     write(text)
     write(

@@ -16,6 +16,8 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 
+from s4a.study.locks import hold
+
 GIB = 2**30
 LEAST_MEMORY = 2.0  # GiB, for ten heads of 150,000 vertices on two cores; the demo takes less
 LEAST_DISK = 1.0  # GiB, for a study
@@ -127,7 +129,7 @@ def numbers(text: str) -> tuple[int, ...]:
     >>> numbers("2025.7.post1"), numbers("1.15.0rc1") > numbers("1.9")
     ((2025, 7), True)
     """
-    return tuple(map(int, re.match(r"\d+(?:\.\d+)*", text)[0].split(".")))
+    return tuple(map(int, re.findall(r"^\d+(?:\.\d+)*", text)[0].split(".")))
 
 
 def run(script: str, *words: str) -> subprocess.CompletedProcess[str]:
@@ -152,20 +154,11 @@ def writable(what: str, folder: Path, instead: str) -> Finding:
         with tempfile.TemporaryDirectory(prefix=".s4a-", dir=folder) as name:
             there = Path(name) / "a"
             with open(there, "w") as file:
-                lock(file.fileno())
+                hold(file.fileno())
             there.rename(Path(name) / "b")
     except OSError as error:
         return Finding(what, "lacks", f"{folder}: {error}", f"give another: {instead}")
     return Finding(what, "ok", f"{folder.resolve()} can be written and locked")
-
-
-def lock(handle: int) -> None:
-    """Hold an open file against other processes, where the system can."""
-    try:
-        import fcntl
-    except ImportError:  # Windows
-        return
-    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def cache() -> Finding:

@@ -566,8 +566,9 @@ def write(tree: xr.DataTree, folder: Path | str) -> list[Path]:
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    nodes, paths = {"/": tree["truth"].to_dataset()}, []
-    for shape in tree["truth/shape"].values:
+    truth, paths = tree["truth"].to_dataset(), []
+    nodes = {"/": truth}
+    for shape in truth["shape"].values:
         mesh = tree[f"raw/{shape}" if "raw" in tree.children else f"original/{shape}"].to_dataset()
         node = tree["truth"].children[shape]
         reference = mesh if "reference_point" in mesh else node.to_dataset(inherit=False)

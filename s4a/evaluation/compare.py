@@ -328,7 +328,7 @@ def pairs(
                 check_landmarks(at_source, at_target, M, N)
                 vertices = at_source, at_target
             true = None if truth is None else truth[name]
-            if truth is not None and not in_memory:
+            if true is not None and not in_memory:
                 true = truth_in_meshes(true, M.mesh, N.mesh)
             load = load_source + load_target
             row, outcomes = metrics_of_pair(

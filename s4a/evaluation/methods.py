@@ -264,10 +264,10 @@ class Pair:
         for block, seconds in spectral.seconds.items():
             clock.add(block, seconds)
         if registers:
-            match, image, reverse, of_registration = self.registered
+            match, surface, reverse, of_registration = self.registered
             for block, seconds in of_registration.items():
                 clock.add(block, seconds)
-            image = image if method == "registered surface" else None
+            image = surface if method == "registered surface" else None
             return Outcome(match, image, reverse, clock.seconds)
         M, N = self.shapes(method)
         F, G = spectral.functions

@@ -439,9 +439,9 @@ def files_named(
 
 def slugs(files: Iterable[str | os.PathLike[str]]) -> list[str]:
     """A unique :func:`slug` for each path, also where upper and lower case are one."""
-    files = [Path(os.path.abspath(file)) for file in files]
-    base = os.path.commonpath([file.parent for file in files])
-    paths = [file.relative_to(base).as_posix() for file in files]
+    whole = [Path(os.path.abspath(file)) for file in files]
+    base = os.path.commonpath([file.parent for file in whole])
+    paths = [file.relative_to(base).as_posix() for file in whole]
     level = dict.fromkeys(paths, 0)  # how much of the path a name is made of
 
     def name(path):

@@ -294,8 +294,8 @@ def _read_obj(data):
 
 def _read_off(data):
     text = re.sub(rb"#.*", b"", data)
-    header = re.match(rb"\s*(?:ST)?C?N?OFF(?P<binary>[ \t]+BINARY)?", text)
-    if header["binary"]:
+    header = next(re.finditer(rb"\A\s*(?:ST)?C?N?OFF([ \t]+BINARY)?", text))
+    if header[1]:
         raise ValueError("binary OFF is not supported; save it as text, PLY or STL")
     lines = [line for line in text[header.end() :].splitlines() if line.strip()]
     n, m = (int(word) for word in lines[0].split()[:2])

@@ -229,6 +229,7 @@ def with_table(study: xr.DataTree, path: Path | str) -> xr.DataTree:
 
     The tables are shared, the study given stays as it is.
     """
-    names = study["report" if "report" in study else "registration"]["shape"].values.tolist()
+    listed = study["report" if "report" in study else "registration"].to_dataset()
+    names = listed["shape"].values.tolist()
     nodes = {n.path: n.to_dataset(inherit=False) for n in study.subtree if n.path != "/subjects"}
     return xr.DataTree.from_dict(nodes | {"/subjects": read_table(path, names)}, name=study.name)

@@ -77,7 +77,7 @@ def parse_vtk(data: bytes) -> tuple[np.ndarray, np.ndarray, dict[str, str]]:
         elif section in (b"POINT_DATA", b"CELL_DATA"):
             break
         elif section == b"METADATA":  # to the next empty line
-            file.at = re.compile(rb"\n[ \t\r]*\n|\Z").search(data, file.at - 1).end()
+            file.at = next(re.compile(rb"\n[ \t\r]*\n|\Z").finditer(data, file.at - 1)).end()
         elif section == b"FIELD":
             file.skip_fields(int(words[2]))
         else:
@@ -98,7 +98,7 @@ class _Legacy:
 
     def line(self):
         """Words of the next line that is not empty; none at the end."""
-        line = re.compile(rb"\s*([^\n]*)").match(self.data, self.at)
+        line = next(re.compile(rb"\s*([^\n]*)").finditer(self.data, self.at))
         self.at = min(line.end() + 1, len(self.data))
         return line[1].split()
 
@@ -239,7 +239,7 @@ def parse_vtp(data: bytes) -> tuple[np.ndarray, np.ndarray, dict[str, str]]:
         X = file.values(piece.find("Points/DataArray")).reshape(-1, 3)
         arrays = {"connectivity": np.empty(0, np.int64), "offsets": np.empty(0, np.int64)}
         for node in piece.findall("Polys/DataArray"):
-            arrays[node.get("Name")] = file.values(node).astype(np.int64)
+            arrays[str(node.get("Name"))] = file.values(node).astype(np.int64)
         offsets = np.r_[0, arrays["offsets"]]
         for name, count in {"NumberOfPoints": len(X), "NumberOfPolys": len(offsets) - 1}.items():
             if int(piece.get(name) or 0) != count:

@@ -100,8 +100,10 @@ def nearest_on_surface(
     points, normals : float ndarray (n, 3)
         On the surface of the source.
     """
-    names = () if target is None else common_fields(source, target)
-    fields = field_columns(target, names)[vertices] if names else None
+    names: tuple[str, ...] = ()
+    fields = None
+    if target is not None and (names := common_fields(source, target)):
+        fields = field_columns(target, names)[vertices]
     rows = features(X, normals, fields)  # (n, 6 + f)
     tree = source.guided_tree(names)
     nearest = tree.query(rows)[1]

@@ -290,11 +290,14 @@ def fmap_from_descriptors(
             f[:, -len(SCALES) :] *= np.sqrt(curvature)
         Phi = end.Phi[:, :k]
         F.append(Phi.T @ (end.area[:, None] * f))  # (k, d)
-        products.append(multiplication(Phi, end.area, f) if commute else None)
-        turns.append(orientation(end.T, Phi, f) if oriented else None)
+        if commute:
+            products.append(multiplication(Phi, end.area, f))
+        if oriented:
+            turns.append(orientation(end.T, Phi, f))
     operators = []
-    for weight, (P, Q) in ((commute, products), (oriented, turns)):
+    for weight, ends in ((commute, products), (oriented, turns)):
         if weight:
+            P, Q = ends
             operators.append((weight / (P**2).sum(), P, Q))
     size = np.linalg.norm(F[0])
     return fit(
@@ -397,8 +400,8 @@ def fit_descriptors(
             f"landmarks need as many vertices of the source as of the target, found {landmarks!r}"
         )
     C = fmap_from_descriptors(
-        Shape(None, source).low,
-        Shape(None, target).low,
+        Shape(coarse=source).low,
+        Shape(coarse=target).low,
         k=k,
         landmarks=vertices,
         kind=kind,

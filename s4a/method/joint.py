@@ -123,7 +123,6 @@ def low_rounds(
     warp : tuple (R, t, c)
     """
     k = min(k, target.k, source.k)
-    normals = vertex_normals(source.X, source.T) if spectral else None
     for K in [*range(min(k_first, k), k, step), k]:
         Phi = target.Phi[:, :K]
         spectrum = (target.mass, Phi, target.eigenvalue[:K]) if by_parts else None
@@ -141,7 +140,7 @@ def low_rounds(
             C = fmap_from_match(source.Phi[:, :K], Phi, target.mass, match)
             match = nearest_rows(
                 features(X, vertex_normals(X, target.T), weight * Phi),
-                features(source.X, normals, weight * source.Phi[:, :K] @ C.T),
+                features(source.X, source.normals, weight * source.Phi[:, :K] @ C.T),
             )
     return match, warp
 

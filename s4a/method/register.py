@@ -550,7 +550,7 @@ def identity(template: Shape) -> xr.Dataset:
     corner = np.argsort(T.ravel(), kind="stable")[last]
     zero = np.zeros(X.shape, np.float32)
     low: dict[str, np.ndarray] = {}
-    if template.coarse is not None:
+    if template.coarse:
         n_low = template.coarse.sizes["vertex"]
         low["displacement_low"] = np.zeros((n_low, 3), np.float32)
         low["registered_match_low"] = np.arange(n_low, dtype=np.int32)

@@ -53,7 +53,7 @@ class Basis:
     Phi : float ndarray (p, k)
         Functions on the vertices, p = n; or on those of the low resolution, where there is U.
     eigenvalue : float ndarray (k,)
-        Theirs, for unit area.
+        Theirs, for unit area; none where nothing asks for them.
     mass : float ndarray (p,) or sparse matrix (p, p), optional
         What Phi is orthonormal in; the areas by default.
     U : sparse matrix (n, p), optional
@@ -77,7 +77,7 @@ class Basis:
     T: np.ndarray
     area: np.ndarray
     Phi: np.ndarray
-    eigenvalue: np.ndarray | None = None
+    eigenvalue: np.ndarray = field(default_factory=lambda: np.empty(0))
     mass: np.ndarray | sp.sparray | sp.spmatrix | None = None
     U: sp.csr_matrix | None = None
     near_coarse: np.ndarray | slice | None = None
@@ -100,8 +100,7 @@ class Basis:
 
     def first(self, k: int) -> "Basis":
         """The same surface with its first k functions."""
-        eigenvalue = None if self.eigenvalue is None else self.eigenvalue[:k]
-        return replace(self, Phi=self.Phi[:, :k], eigenvalue=eigenvalue)
+        return replace(self, Phi=self.Phi[:, :k], eigenvalue=self.eigenvalue[:k])
 
     def moved_to(self, X: np.ndarray) -> "Basis":
         """The same surface where its vertices have moved to X ``(n, 3)``, as registered."""
@@ -219,9 +218,9 @@ class Shape:
 
     Parameters
     ----------
-    original : xarray.Dataset or None
-        The clean mesh: ``position``, ``corner_vertex``.
-    coarse : xarray.Dataset or None
+    original : xarray.Dataset, optional
+        The clean mesh: ``position``, ``corner_vertex``; empty where no step needs it.
+    coarse : xarray.Dataset, optional
         As :func:`s4a.coarsen` and :func:`s4a.spectrum` make it, or :func:`s4a.method.lift.lifted`,
         or :func:`s4a.method.scalable.reduced`: then what is called coarse are samples.
     n_projected : int
@@ -230,8 +229,8 @@ class Shape:
         Whether they weigh by their areas then.
     """
 
-    original: xr.Dataset | None
-    coarse: xr.Dataset | None = None
+    original: xr.Dataset = field(default_factory=xr.Dataset)
+    coarse: xr.Dataset = field(default_factory=xr.Dataset)
     n_projected: int = N_CENTRAL
     area_weighted: bool = True
 
@@ -245,7 +244,7 @@ class Shape:
     @cached_property
     def frame(self) -> tuple[np.ndarray, float]:
         """Center ``(3,)`` and size, in the unit of the input."""
-        if self.original is None:
+        if not self.original:
             area, X = self.coarse["vertex_area"].values, self.coarse["position"].values
             return area / area.sum() @ X, np.sqrt(area.sum())
         X, area = self.original["position"].values, self._area
@@ -383,12 +382,12 @@ class Shape:
     @property
     def is_sampled(self) -> bool:
         """Whether the low resolution is that of :mod:`s4a.method.scalable`."""
-        return self.coarse is not None and "local_weight" in self.coarse
+        return "local_weight" in self.coarse
 
     @property
     def is_lifted(self) -> bool:
         """Whether the functions of ``full`` are lifted ones, and not U Phi."""
-        return self.coarse is not None and "lifted_eigenfunction" in self.coarse
+        return "lifted_eigenfunction" in self.coarse
 
     def functions(self, A: np.ndarray) -> np.ndarray:
         """The functions Phi A that full resolution compares, A ``(k, m)``.

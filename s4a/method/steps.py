@@ -27,7 +27,7 @@ def bases_of(coarse: dict[str, xr.Dataset]) -> dict[str, Basis]:
     """The low-resolution meshes of a collection in their frames; ValueError where one is none."""
     for name, mesh in coarse.items():
         require(mesh, *LOW, what=f"coarse mesh {name}")
-    return {name: Shape(None, mesh).low for name, mesh in coarse.items()}
+    return {name: Shape(coarse=mesh).low for name, mesh in coarse.items()}
 
 
 class LowBases(Sequence[Basis]):
@@ -43,7 +43,7 @@ class LowBases(Sequence[Basis]):
         return len(self.meshes)
 
     def __getitem__(self, i: Any) -> Any:
-        return Shape(None, self.meshes[i]).low
+        return Shape(coarse=self.meshes[i]).low
 
 
 def align_pair(source: xr.Dataset, target: xr.Dataset) -> xr.Dataset:

@@ -162,7 +162,7 @@ def brief(names: list[str], room: int = 16) -> list[str]:
         """Length of what all texts begin with, up to a separator."""
         first, last = min(texts), max(texts)
         same = (i for i, (a, b) in enumerate(zip(first, last, strict=False)) if a != b)
-        return len(re.match(r"(.*[_\W])?", first[: next(same, len(first))], re.DOTALL)[0])
+        return len(re.findall(r"\A(?:.*[_\W])?", first[: next(same, len(first))], re.DOTALL)[0])
 
     start = shared(names)
     stop = shared([name[start:][::-1] for name in names])

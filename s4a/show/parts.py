@@ -106,7 +106,8 @@ class Parts(Figure):
         """The axes of each part and what it takes; several rows stay below each other as one."""
         found = [([ax], ax.get_tightbbox()) for ax in self.axes]
         boxes = [(ax, box) for ax, box in found if box is not None and min(box.size) > 0]
-        rows = {ax.get_subplotspec().rowspan.start for ax in self.axes if ax.get_subplotspec()}
+        places = [ax.get_subplotspec() for ax in self.axes]
+        rows = {place.rowspan.start for place in places if place}
         return boxes if len(rows) < 2 else [(self.axes, Bbox.union([box for _, box in boxes]))]
 
     def _ipython_display_(self) -> None:

@@ -80,8 +80,8 @@ def insert_shapes(
     shapes = {"new": shapes} if isinstance(shapes, xr.Dataset) else shapes
     new = read_beside(study, shapes, landmarks, seen=compare or reflect == AUTO)
     mirrored, told = reflected_of_new(reflect, new)
-    mirrored = None if reflect is None else mirrored
-    return insert_meshes(study, new, mirrored, told, compare, n_jobs)
+    chosen = None if reflect is None else mirrored
+    return insert_meshes(study, new, chosen, told, compare, n_jobs)
 
 
 def read_beside(
@@ -332,12 +332,12 @@ def _insert_one(mesh, frozen, options, references):
             f"the study needs {k} eigenfunctions, this shape has only {coarse.sizes['mode']}"
         )
     shape = options.shape(mesh, coarse)
-    new = Shape(None, coarse).low
+    new = Shape(coarse=coarse).low
     template = frozen.template.low
     k_init = min(options.k_init, k)
     chosen = nearest_spectra(new.eigenvalue, frozen.spectra, k_init)
     R, t = motion_onto(shape.low, template)
-    others = [Shape(None, frozen.coarse[j]).low for j in chosen]
+    others = [Shape(coarse=frozen.coarse[j]).low for j in chosen]
     of_template, *of_others = frozen.Y[[0, *chosen]].values
     starts = [(frozen.turn[j].T @ R, np.zeros(3)) for j in chosen]
     Y = place(

@@ -70,6 +70,7 @@ PRESETS: dict[str | None, dict[str, Any]] = {
     "paper": PAPER,
     "fast": FAST,
 }
+BY_PRESET: Any = None  # an option that is not given, until the preset has set it
 # switches that method="scalable" does not have, and what each would need
 WITHOUT_MESH = {
     "lift": "lifts the eigenfunctions of one",
@@ -169,20 +170,19 @@ class Options:
     n_latent: int | None = None
     step: int = 5
     weights: str = "cycles"
-    # of these the preset sets what is None
-    n_coarse: int | None = None
-    lift: bool | None = None
-    init: str | None = None
-    ahead: str | None = None
-    n_spread: int | None = None
-    wide: int | None = None
-    sharpen: int | None = None
-    refine: str | None = None
-    parts: bool | None = None
-    alignment: str | None = None
-    area_weighted: bool | None = None
-    n_projected: int | None = None
-    both: bool | None = None
+    n_coarse: int = BY_PRESET
+    lift: bool = BY_PRESET
+    init: str = BY_PRESET
+    ahead: str = BY_PRESET
+    n_spread: int = BY_PRESET
+    wide: int = BY_PRESET
+    sharpen: int = BY_PRESET
+    refine: str = BY_PRESET
+    parts: bool = BY_PRESET
+    alignment: str = BY_PRESET
+    area_weighted: bool = BY_PRESET
+    n_projected: int = BY_PRESET
+    both: bool = BY_PRESET
     how: str = "ours"
     norm: str = "h2"
     keep_rounds: bool = False
@@ -292,7 +292,7 @@ class Options:
         names = ("refine", "scale", "parts", "alignment")
         return {name: getattr(self, name) for name in names}
 
-    def shape(self, original: xr.Dataset | None, coarse: xr.Dataset | None) -> Shape:
+    def shape(self, original: xr.Dataset, coarse: xr.Dataset) -> Shape:
         """A shape whose fields are projected as these options say."""
         projection = {name: getattr(self, name) for name in ("n_projected", "area_weighted")}
         return Shape(original, coarse, **projection)
@@ -393,6 +393,11 @@ def takes_options(*names: str) -> Callable[..., Any]:
         own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
         options = inspect.signature(Options).parameters
         chosen = [options[name] for name in names or options]
+        # what a preset sets may also be given as None
+        chosen = [
+            one.replace(annotation=one.annotation | None) if one.default is None else one
+            for one in chosen
+        ]
         if "seed" in (names or options):
             chosen.append(options["seed"].replace(name="rng", default=None, annotation=RNG | None))
         function.__signature__ = signature.replace(parameters=[*own, *chosen])

@@ -20,10 +20,7 @@ from joblib import Parallel
 from joblib.externals.loky.backend import resource_tracker
 from joblib.parallel import LokyBackend, get_active_backend
 
-try:
-    import fcntl
-except ImportError:  # on Windows, where nobody can tell who holds what
-    fcntl = None
+from s4a.study.locks import CAN_HOLD, hold
 
 TEMPORARY = "s4a-"  # how the folder of a study that nobody keeps begins
 
@@ -101,7 +98,9 @@ def keep_freed_memory() -> None:
     import ctypes
     import sys
 
-    c = ctypes.CDLL(None) if sys.platform == "linux" else None
+    if sys.platform != "linux":
+        return
+    c = ctypes.CDLL(None)
     if hasattr(c, "mallopt"):  # of glibc, not of musl
         m_trim_threshold, m_mmap_threshold = -1, -3
         c.mallopt(m_trim_threshold, 2**31 - 1)
@@ -234,7 +233,7 @@ def temporary_folder() -> Iterator[Path]:
 
 def remove_abandoned(parent: Path) -> None:
     """Remove the temporary studies that no process holds any more."""
-    if fcntl is None:
+    if not CAN_HOLD:
         return
     for folder in parent.glob(f"{TEMPORARY}????????"):
         with contextlib.suppress(OSError), held(folder):
@@ -250,12 +249,12 @@ def remove_abandoned(parent: Path) -> None:
 @contextlib.contextmanager
 def held(folder: Path) -> Iterator[None]:
     """Hold a folder until this process ends in whatever way; OSError when another one does."""
-    if fcntl is None:
+    if not CAN_HOLD:
         yield
         return
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        hold(handle)
         yield
     finally:
         os.close(handle)

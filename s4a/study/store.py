@@ -29,6 +29,7 @@ from xarray.core import indexing
 from s4a.schema import check_indices
 from s4a.study.hdf5 import Place, StudyFile
 from s4a.study.header import Header
+from s4a.study.locks import hold
 from s4a.study.netcdf import write_netcdf
 from s4a.study.processes import remove_remains
 from s4a.study.seal import (
@@ -459,19 +460,14 @@ def lock(folder: Path | str) -> Iterator[Claim]:
     """
     check_own(Path(folder))
     try:
-        import fcntl
-    except ImportError:  # on Windows
-        fcntl = None
-        log.warning("this system cannot lock %s; start no second run in it", folder)
-    try:
         Path(folder).mkdir(parents=True, exist_ok=True)
         handle = open(Path(folder) / LOCK, "a+", errors="replace", opener=open_without_following)
     except OSError as error:
         raise OSError(f"{folder} cannot be written ({error}): give another folder") from error
     with handle:
         try:
-            if fcntl:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if not hold(handle.fileno()):
+                log.warning("this system cannot lock %s; start no second run in it", folder)
         except OSError:
             handle.seek(0)
             owner, *_ = handle.read().split() or ["unknown"]

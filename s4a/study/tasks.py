@@ -133,7 +133,7 @@ def template_of(folder: Path, name: str, options: Options) -> Shape:
 
 def low_basis(folder: Path, name: str) -> Basis:
     """The coarse mesh of a shape, centred and for unit area, and its eigenfunctions."""
-    return Shape(None, open_file(folder / "coarse" / f"{name}.nc")).low
+    return Shape(coarse=open_file(folder / "coarse" / f"{name}.nc")).low
 
 
 def align_shape(folder: Path, name: str, reference: str) -> xr.Dataset:

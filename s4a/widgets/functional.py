@@ -109,7 +109,7 @@ class FunctionalMap(Panel):
         first = network["fmap_initial"].values
         size = max((done for done in self.maps if done <= k), default=len(first))
         C = self.maps.get(size, first)
-        source, target = (Shape(None, mesh).low for mesh in self.meshes)
+        source, target = (Shape(coarse=mesh).low for mesh in self.meshes)
         while size < k:
             size = min(size + STEP, k)
             C, _ = zoomout(source, target, C, size, step=STEP)

@@ -301,8 +301,8 @@ in 5.1; all are registered to the first. Of every vertex of the template the dis
 it is carried and where it truly is, mean over vertices and shapes, in % of the square root of the
 area: to the *matched* vertex of the shape (eq. 4, 7), which cannot be nearer than the vertices lie
 apart, and to the registered *surface*, template + displacement (eq. 8 and the line after it). CPU
-seconds are of the whole analysis, in several runs on a server that other programs kept busy:
-differences of less than a half say nothing. All else is as by default, or as the paper has it.
+seconds are of the whole analysis, in one run beside another program: differences of less than a
+fifth say nothing. All else is as by default, or as the paper has it.
 
 - *brains*: synthetic, in the same pose, each of 10,000 vertices of its own.
 - *faces*: six identities of a published face model (006 to 011; of those before, 002 is so

@@ -230,7 +230,7 @@ def test_the_fit_on_descriptors_of_a_shape_and_itself_renumbered_is_the_map_betw
     other["eigenfunction"] = other["eigenfunction"] * sign
     for kind in ("wks", "hks"):
         C = fmap.fit_descriptors(mesh, other, kind=kind)["fmap"].values
-        match = fmap.zoomout(Shape(None, mesh).low, Shape(None, other).low, C, 60)
+        match = fmap.zoomout(Shape(coarse=mesh).low, Shape(coarse=other).low, C, 60)
         assert (match[1] == order).all(), kind
 
 

@@ -200,6 +200,8 @@ def test_zoomout_is_that_of_pyfm_to_the_last_index(name):
     peer, their_match = refine.zoomout_refine(
         C, Phi, Psi, nit=8, step=5, A2=area, return_p2p=True, n_jobs=1
     )
-    ours, match = fmap.zoomout(*(Shape(None, mesh).low for mesh in (source, target)), C, 60, step=5)
+    ours, match = fmap.zoomout(
+        *(Shape(coarse=mesh).low for mesh in (source, target)), C, 60, step=5
+    )
     assert (match == their_match).all()
     assert ours == pytest.approx(peer, abs=1e-12)

@@ -26,7 +26,7 @@ def surface():
     mesh = spectrum(
         coarsen(synthetic.brains(1, 6000)["original/brain_01"].to_dataset(), n_coarse=1500), k=60
     )
-    return Shape(None, mesh).low
+    return Shape(coarse=mesh).low
 
 
 def moved(surface, X):

@@ -129,13 +129,13 @@ def shapes():
 
 
 def zoomed(shapes, first, **options):
-    bases = [Shape(None, mesh).low for mesh in shapes]
+    bases = [Shape(coarse=mesh).low for mesh in shapes]
     return latent.consistent_zoomout(bases, first, *complete(len(shapes)), 25, step=4, **options)
 
 
 @pytest.fixture(scope="module")
 def first(shapes):
-    low = [Shape(None, mesh).low for mesh in shapes]
+    low = [Shape(coarse=mesh).low for mesh in shapes]
     still = (np.eye(3), np.zeros(3))
     return np.stack([map_after_motion(low[i], low[j], still, k_init=12) for i, j in complete(3).T])
 
@@ -168,7 +168,7 @@ def test_consistent_zoomout_does_not_depend_on_the_workers_or_on_what_is_held(
 def test_wide_rounds_look_between_the_samples_near_the_one_that_is_found(
     shapes, first, monkeypatch
 ):
-    samples = [Shape(None, shape).low.spread_vertices(150) for shape in shapes]  # of 600
+    samples = [Shape(coarse=shape).low.spread_vertices(150) for shape in shapes]  # of 600
 
     def maps(wide, n_around=latent.N_AROUND):
         monkeypatch.setattr(latent, "N_AROUND", n_around)

@@ -124,7 +124,7 @@ def test_the_spectral_distance_of_scaled_spectra_is_the_logarithm_of_the_scale()
 
 @pytest.fixture(scope="module")
 def low(low_brain):
-    return Shape(None, low_brain).low
+    return Shape(coarse=low_brain).low
 
 
 @pytest.mark.parametrize("init", ["dense", "landmarks"])

@@ -80,7 +80,7 @@ def test_the_landmarks_are_ten_and_their_partners_the_nearest_after_icp(paper):
     assert network.sizes["landmark"] == 10
     for p in range(network.sizes["pair"]):
         M, N = (
-            Shape(None, paper["coarse"][network[end].values[p]].to_dataset()).low.X
+            Shape(coarse=paper["coarse"][network[end].values[p]].to_dataset()).low.X
             for end in ("source", "target")
         )
         R, t = network["pair_rotation"].values[p], network["pair_translation"].values[p]
@@ -227,7 +227,7 @@ def test_the_smooth_displacement_is_the_projection_as_printed(way, request):
 def test_consistent_zoomout_is_that_of_pyfm_where_weights_are_equal(paper):
     """Same subspaces, same matches from the same maps; other weights of pyFM's are by cycles."""
     names = paper["latent"]["shape"].values.tolist()
-    bases = [Shape(None, paper["coarse"][name].to_dataset()).low for name in names]
+    bases = [Shape(coarse=paper["coarse"][name].to_dataset()).low for name in names]
     source, target = (
         np.array([names.index(name) for name in paper["network"][end].values])
         for end in ("source", "target")

@@ -100,7 +100,7 @@ def test_three_landmarks_say_how_a_shape_lies_that_its_form_does_not_tell(n):
     turn = Rotation.from_euler("x", 180, degrees=True).as_matrix()
     there = mesh["position"].values[[0, 200, 400][:n]]
     lows = [
-        Shape(None, low_resolution(with_landmarks(mesh, points(P)), n_coarse=300, k=10)).low
+        Shape(coarse=low_resolution(with_landmarks(mesh, points(P)), n_coarse=300, k=10)).low
         for P in (there, there @ turn.T)
     ]
     R, _ = motion_onto(*lows)
@@ -113,7 +113,7 @@ def test_three_landmarks_on_a_line_say_nothing_of_turns_about_it():
     X = mesh["position"].values
     near = [int(np.argmin(np.linalg.norm(X - [x, 0, 0], axis=1))) for x in (-3, 3)]
     row = points(X[[near[0], near[1], near[0]]] + [[0, 0, 0], [0, 0, 0], [0.01, 0, 0]])
-    low = Shape(None, low_resolution(with_landmarks(mesh, row), n_coarse=300, k=10)).low
+    low = Shape(coarse=low_resolution(with_landmarks(mesh, row), n_coarse=300, k=10)).low
     R, _ = motion_onto(low, low)
     assert np.allclose(R, np.eye(3), atol=0.02)  # of ICP, as without
 

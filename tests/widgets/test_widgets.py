@@ -240,7 +240,7 @@ def test_zoomout_is_replayed_as_the_step_module_does_it(study, panel):
     fmap.kind.value = "zoomout"
     row = study["network"].dataset.isel(pair=1)
     source, target = (study["coarse"][row[key].item()] for key in ("source", "target"))
-    bases = (Shape(None, mesh.to_dataset()).low for mesh in (source, target))
+    bases = (Shape(coarse=mesh.to_dataset()).low for mesh in (source, target))
     C, _ = s4a.method.fmap.zoomout(*bases, row["fmap_initial"].values, 24)
     np.testing.assert_allclose(fmap.C, C)
     fmap.k.value = 10
