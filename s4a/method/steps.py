@@ -490,9 +490,10 @@ def register_shape(
     source = shape_in(study, name)
     M = source.low
     N = target.low
-    if start is None:
-        motion = motion_onto(M, N)
-    else:
-        motion = realign(M.cloud, N.cloud, start)
     bases = latent_bases(study, name, template)
-    return from_latent(source, target, bases, motion, how=how, **options)
+    with threadpool_limits(1):
+        if start is None:
+            motion = motion_onto(M, N)
+        else:
+            motion = realign(M.cloud, N.cloud, start)
+        return from_latent(source, target, bases, motion, how=how, **options)

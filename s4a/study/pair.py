@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from threadpoolctl import threadpool_limits
 
 from s4a.method import fmap
 from s4a.method.first_map import first_map, motion_onto
@@ -99,9 +100,10 @@ def match_pair(source: xr.Dataset, target: xr.Dataset, **options: Any) -> xr.Dat
     settings = pair_options(options)
     for mesh, what in ((source, "source"), (target, "target")):
         require(mesh, "position", "corner_vertex", what=what)
-    M, N = (shape_of(mesh, settings) for mesh in (source, target))
+    with threadpool_limits(1):  # products of a pair are small: more threads of BLAS take longer
+        M, N = (shape_of(mesh, settings) for mesh in (source, target))
+        registration, maps = match_shapes(M, N, settings)
     least = min(M.low.k, N.low.k)
-    registration, maps = match_shapes(M, N, settings)
     if least < settings.k:
         note = f"k = {settings.k} reduced to {least}, the eigenfunctions that the smaller mesh has"
         registration.attrs["note"] = note
