@@ -146,13 +146,15 @@ PLACES = {
 MODULE_OF = {name: module for module, names in PLACES.items() for name in names.split()}
 
 
-def __getattr__(name: str) -> Any:
-    """A public name, imported now; ``study.s4a`` is there from the first one on."""
-    if name not in MODULE_OF:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    import_module("s4a.accessor")
-    globals()[name] = getattr(import_module(f"s4a.{MODULE_OF[name]}"), name)
-    return globals()[name]
+if not TYPE_CHECKING:  # or every misspelt name would pass as Any
+
+    def __getattr__(name: str) -> Any:
+        """A public name, imported now; ``study.s4a`` is there from the first one on."""
+        if name not in MODULE_OF:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        import_module("s4a.accessor")
+        globals()[name] = getattr(import_module(f"s4a.{MODULE_OF[name]}"), name)
+        return globals()[name]
 
 
 def __dir__() -> list[str]:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import NoneType
-from typing import Any, Self, get_args
+from typing import Any, Self, TypeVar, get_args
 
 import xarray as xr
 
@@ -70,6 +70,7 @@ PRESETS: dict[str | None, dict[str, Any]] = {
     "paper": PAPER,
     "fast": FAST,
 }
+Function = TypeVar("Function", bound=Callable[..., Any])
 BY_PRESET: Any = None  # an option that is not given, until the preset has set it
 # switches that method="scalable" does not have, and what each would need
 WITHOUT_MESH = {
@@ -381,14 +382,14 @@ def _in_kind(word, kinds):
     return int(word) if int in kinds and word.isdecimal() else word
 
 
-def takes_options(*names: str) -> Callable[..., Any]:
+def takes_options(*names: str) -> Callable[[Function], Function]:
     """Decorate a function of ``**options`` so that its signature shows those of :class:`Options`.
 
     Those of these names, all by default, and ``rng`` beside ``seed``.  Each option and its default
     stand in :class:`Options` alone.
     """
 
-    def decorate(function):
+    def decorate(function: Function) -> Function:
         signature = inspect.signature(function)
         own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
         options = inspect.signature(Options).parameters
@@ -400,7 +401,7 @@ def takes_options(*names: str) -> Callable[..., Any]:
         ]
         if "seed" in (names or options):
             chosen.append(options["seed"].replace(name="rng", default=None, annotation=RNG | None))
-        function.__signature__ = signature.replace(parameters=[*own, *chosen])
+        vars(function)["__signature__"] = signature.replace(parameters=[*own, *chosen])
         return function
 
     return decorate
