@@ -36,6 +36,7 @@ from typing import TYPE_CHECKING, Any
 from s4a._moved import install
 
 if TYPE_CHECKING:
+    from s4a import widgets as widgets
     from s4a.accessor import explore
     from s4a.analysis import statistics
     from s4a.analysis.complete import complete
@@ -150,6 +151,8 @@ if not TYPE_CHECKING:  # or every misspelt name would pass as Any
 
     def __getattr__(name: str) -> Any:
         """A public name, imported now; ``study.s4a`` is there from the first one on."""
+        if name == "widgets":  # a room that pip install "s4a[notebook]" brings
+            return import_module("s4a.widgets")
         if name not in MODULE_OF:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         import_module("s4a.accessor")
@@ -159,7 +162,7 @@ if not TYPE_CHECKING:  # or every misspelt name would pass as Any
 
 def __dir__() -> list[str]:
     """What completion offers."""
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *__all__, "widgets"})
 
 
 def _module_of(room: str, name: str) -> ModuleType:

@@ -14,11 +14,12 @@ from s4a.input.subjects import is_missing, is_plain_number, listed, odd_cells, o
 from s4a.method.pca import pca_without
 from s4a.schema import require, unit_of
 from s4a.study.options import Options
-from s4a.study.tree import left_out
+from s4a.study.tree import check_is_one, left_out
 
 log = logging.getLogger(__name__)
 
-# One value per shape: in the order of the study, by name of the shape, or a column of /subjects.
+# One value per shape: in the order of the study; by name of the shape, in a dict, a pandas object
+# with an index or a DataArray with the coordinate shape; or a column of /subjects.
 Values = np.ndarray | Sequence[Any] | dict[str, Any] | str
 
 DATE = re.compile(r"\d{4}-\d\d?-\d\d?.*|\d{4}/\d\d?/\d\d?|\d\d?[./-]\d\d?[./-](\d\d){1,2}")
@@ -121,7 +122,7 @@ def _sample(study, registration, d, area, columns, tested, field):
     if field is not None:
         values, unit = field_of(study, field, names)
         columns = columns | {f"field {field!r}": np.where(np.isnan(values).all(1), np.nan, 0.0)}
-    unknown = {column: _is_unknown(of) for column, of in columns.items()}
+    unknown = {column: is_unknown(of) for column, of in columns.items()}
     for column, of in unknown.items():
         if of.any():
             log.warning(
@@ -168,6 +169,7 @@ def _field_everywhere(values, field):
 
 def all_registered(study: xr.DataTree) -> xr.Dataset:
     """``/registration`` of a study, doubtful shapes too; ValueError where it has none."""
+    check_is_one(study)
     if "registration" not in study:
         raise ValueError(
             f"a registered study is needed; this one has {', '.join(study.children) or 'no nodes'}"
@@ -283,7 +285,7 @@ def values_of(study: xr.DataTree, values: Values, what: str) -> np.ndarray:
         if missing:
             raise ValueError(f"{what} needs a value for every shape; it lacks {listed(missing)}")
         values = [values[name] for name in names]
-    values = np.asarray(values)
+    values = np.asarray(_in_order(values, names, what))
     everyone = all_registered(study)["shape"].values.tolist()
     if values.ndim and len(values) == len(everyone):  # those that are left out may have one too
         values = values[[everyone.index(name) for name in names]]
@@ -292,6 +294,30 @@ def values_of(study: xr.DataTree, values: Values, what: str) -> np.ndarray:
             f"{what} needs one value for each of {len(names)} shapes, found shape {values.shape}"
         )
     return _plain(values, names, what)
+
+
+def _in_order(values, names, what):
+    """Values in the order of the shapes, where an index of pandas or xarray has their names.
+
+    A pandas index of numbers is none of names, unless all shapes are called by numbers.
+    """
+    if isinstance(values, xr.DataArray) and "shape" in values.indexes:
+        values = values.transpose("shape", ...)
+        labels = values["shape"].values.tolist()
+    elif hasattr(values, "iloc"):
+        labels = values.index.tolist()
+    else:
+        return values
+    words = list(map(str, labels))
+    if not set(names) <= set(words) and not any(isinstance(label, str) for label in labels):
+        return values
+    missing = [name for name in names if name not in words]
+    if missing:
+        raise ValueError(f"{what} needs a value for every shape; it lacks {listed(missing)}")
+    twice = [name for name in names if words.count(name) > 1]
+    if twice:
+        raise ValueError(f"{what} needs one value for every shape; it has more of {listed(twice)}")
+    return np.asarray(values)[[words.index(name) for name in names]]
 
 
 def _plain(values, names, what):
@@ -353,7 +379,7 @@ def _column(study, name, shapes, what):
     return table[name].sel(shape=shapes).values
 
 
-def _is_unknown(values):
+def is_unknown(values: np.ndarray) -> np.ndarray:
     """Which shapes ``(s,)`` lack a value."""
     unknown = values == "" if values.dtype.kind == "U" else np.isnan(values.astype(float))
     return unknown.reshape(len(values), -1).any(axis=1)

@@ -25,6 +25,7 @@ from s4a.input.annotations import write_landmarks
 from s4a.input.evidence import MIRROR
 from s4a.input.files import write_mesh
 from s4a.input.hands import in_file
+from s4a.input.landmarks import locate
 from s4a.input.vtk import vtk_bytes, vtp_bytes
 from s4a.method.pca import synthesize
 from s4a.schema import check_count, dataset, in_unit, unit_of, variable
@@ -130,6 +131,8 @@ def write_slicer(
     if landmarks is not None:
         (folder / "landmarks").mkdir(exist_ok=True)
         others = transfer_landmarks(study, landmarks).children
+        if not own_marks:  # on the surface and in its coordinates, as on all others
+            landmarks = locate(landmarks, study["original"][name].to_dataset())
         carried = {name: landmarks} | {other: node.to_dataset() for other, node in others.items()}
     unit, paths, unknown = unit_of(registration["displacement"]), [], []
     names = np.array([str(vertex) for vertex in chosen.tolist()])

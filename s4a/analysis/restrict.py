@@ -4,10 +4,19 @@ Each takes a study and gives one, with modes of its own, so that every test, mea
 takes it; the study given stays as it is.  The alignment is that of the whole shapes.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 import xarray as xr
 
-from s4a.analysis.inputs import Values, columns_of, covariates_of, displacements_of, registration_of
+from s4a.analysis.inputs import (
+    Values,
+    columns_of,
+    covariates_of,
+    displacements_of,
+    is_unknown,
+    registration_of,
+)
 from s4a.analysis.permutation import standardize
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.input.subjects import listed
@@ -19,8 +28,9 @@ LEAST = 12  # vertices of a region
 
 def within(
     study: xr.DataTree,
-    region: np.ndarray | int | list[int] | None = None,
+    region: np.ndarray | xr.DataArray | int | str | Sequence[bool | int | str] | None = None,
     *,
+    labels: np.ndarray | None = None,
     least_confidence: float = 0.0,
 ) -> xr.DataTree:
     """The study of a region of the template.
@@ -28,9 +38,12 @@ def within(
     Parameters
     ----------
     study : DataTree
-    region : bool ndarray (vertex,), int or list of int, optional
-        Vertices of the template, as a mask; or those with this label, or one of these, of
-        ``/original/<template>``.  All by default.
+    region : bool array (vertex,), int, str or list of these, optional
+        Vertices of the template, as a mask; or those with this label, or one of these.  All by
+        default.
+    labels : ndarray (vertex,), optional
+        The labels of the template's vertices; by default those of ``/original/<template>``, which
+        has some where the mesh was given in memory with ``label``.
     least_confidence : float
         Vertices whose mean ``confidence`` over the shapes is lower are left out, 0 to 1.
 
@@ -59,7 +72,7 @@ def within(
     np.True_
     """
     registration = registration_of(study)
-    keep = _mask_of(study, registration, region)
+    keep = _mask_of(study, registration, region, labels)
     if least_confidence:
         keep = keep & (registration["confidence"].mean("shape").values >= least_confidence)
     triangles = registration["corner_vertex"].values
@@ -75,36 +88,60 @@ def within(
         [str(name) for name, values in registration.items() if "triangle" in values.dims]
     ).isel(vertex=keep)
     part["corner_vertex"] = variable("corner_vertex", number[triangles[inside]])
-    part["template_vertex"] = variable("template_vertex", np.flatnonzero(keep))
+    part["template_vertex"] = variable("template_vertex", template_vertices(registration)[keep])
     part["vertex_area"] = variable("vertex_area", vertex_areas(*as_arrays(part)))
     return _study(study, part, np.flatnonzero(keep))
 
 
-def _mask_of(study, registration, region):
+def template_vertices(registration: xr.Dataset) -> np.ndarray:
+    """Which vertex of the template each vertex of a registration is ``(n,)``."""
+    if "template_vertex" in registration:  # of a region
+        return np.asarray(registration["template_vertex"].values)
+    return np.arange(registration.sizes["vertex"])
+
+
+def _mask_of(study, registration, region, labels):
     """The vertices of a region, as a mask."""
     n = registration.sizes["vertex"]
     if region is None:
         return np.ones(n, bool)
-    if isinstance(region, np.ndarray) and region.dtype == bool:
-        if region.shape != (n,):
+    wanted = np.atleast_1d(np.asarray(region))
+    if wanted.dtype == bool:
+        if wanted.shape != (n,):
             raise ValueError(
                 f"a region needs one value for each of the template's {n} vertices, found "
-                f"{region.shape}"
+                f"{wanted.shape}"
             )
-        return region
-    template = registration.attrs.get("template", "")
-    meshes = study["original"].children if "original" in study.children else {}
-    if template not in meshes or "label" not in meshes[template]:
-        raise ValueError(f"the template {template!r} has no labels; give the region as a mask")
-    label = meshes[template]["label"].values
-    wanted = np.atleast_1d(region)
-    lacking = [str(one) for one in wanted.tolist() if one not in label]
+        return wanted
+    label = _labels_of(study, registration, labels)
+    there = set(label.tolist())
+    lacking = [str(one) for one in wanted.tolist() if one not in there]
     if lacking:
         raise ValueError(
             f"no vertex of the template has the label {listed(lacking)}; it has "
             f"{listed(list(map(str, np.unique(label).tolist())), most=20)}"
         )
     return np.isin(label, wanted)
+
+
+def _labels_of(study, registration, given):
+    """A label for every vertex of a registration: of those given, or of the template."""
+    template = registration.attrs.get("template", "")
+    meshes = study["original"].children if "original" in study.children else {}
+    if given is None:
+        if template not in meshes or "label" not in meshes[template]:
+            raise ValueError(
+                f"the template {template!r} has no labels; give them as labels= (--labels FILE), "
+                "or the region as a mask"
+            )
+        return meshes[template]["label"].values
+    n = registration.sizes["vertex"]
+    if np.shape(given) != (n,):
+        raise ValueError(
+            f"labels need one value for each of the template's {n} vertices, found "
+            f"{np.shape(given)}"
+        )
+    return np.asarray(given)
 
 
 def without(study: xr.DataTree, nuisance: Values | dict[str, Values] | list[str]) -> xr.DataTree:
@@ -145,9 +182,15 @@ def without(study: xr.DataTree, nuisance: Values | dict[str, Values] | list[str]
     """
     registration, d, area = displacements_of(study)
     columns = covariates_of(study, nuisance)
+    for name, values in columns.items():
+        lacking = registration["shape"].values[is_unknown(values)].tolist()
+        if lacking:
+            raise ValueError(
+                f"a nuisance needs a value for every shape; {name} lacks {listed(lacking)}"
+            )
     Z, _ = columns_of(columns)
-    if Z is None or not np.isfinite(Z).all():
-        raise ValueError("a nuisance needs a value for every shape")
+    if Z is None:
+        raise ValueError("a nuisance needs a value for every shape, found none")
     U, S, _ = np.linalg.svd(standardize(Z)[0], full_matrices=False)
     U = U[:, S > 1e-8]
     if not U.shape[1]:

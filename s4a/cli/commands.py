@@ -263,6 +263,8 @@ def restricted(study: "xr.DataTree", args: Namespace) -> "xr.DataTree":
     """The study of the part of what varies that is asked for."""
     from s4a.analysis import restrict
 
+    if args.labels and not args.label:
+        raise ValueError("--labels is where --label looks: give --label LABEL..., or leave it out")
     is_part = args.size_back or args.without or args.label or args.least_confidence
     if is_part and args.recompute:
         raise ValueError("--recompute finds whole shapes anew: leave it out, or take all of them")
@@ -275,11 +277,27 @@ def restricted(study: "xr.DataTree", args: Namespace) -> "xr.DataTree":
         said.append(f"without {', '.join(args.without)}")
     if args.label or args.least_confidence:
         whole = study["registration"].sizes["vertex"]
-        study = restrict.within(study, args.label or None, least_confidence=args.least_confidence)
+        study = restrict.within(
+            study,
+            args.label or None,
+            labels=template_labels(study, args.labels),
+            least_confidence=args.least_confidence,
+        )
         said.append(f"{study['registration'].sizes['vertex']} of {whole} vertices")
     if said:
         write("; ".join(said) + "\n")
     return study
+
+
+def template_labels(study: "xr.DataTree", file: str | None) -> "np.ndarray | None":
+    """Labels of the template, from a file with one for each vertex of its file."""
+    from s4a.analysis.inputs import all_registered
+    from s4a.input.annotations import labels_of_mesh, read_labels
+
+    if file is None:
+        return None
+    mesh = study["original"][all_registered(study).attrs["template"]].to_dataset()
+    return labels_of_mesh(read_labels(file, mesh.sizes["file_vertex_index"]), mesh)
 
 
 def tests_of(study: "xr.DataTree", args: Namespace) -> "dict[str, xr.Dataset]":
@@ -364,6 +382,7 @@ def transfer(args: Namespace) -> int:
     from s4a.input.collection import read_shape
     from s4a.input.landmarks import locate
     from s4a.study.options import PAIR
+    from s4a.study.store import STRUCTURES, check_is_study
     from s4a.study.tree import open_study
 
     if not (args.labels or args.landmarks):
@@ -372,6 +391,12 @@ def transfer(args: Namespace) -> int:
         )
     if args.blur is not None and not args.labels:
         raise ValueError("--blur is of labels: give --labels FILE, or leave it out")
+    first = Path(args.targets[0])
+    into_study = len(args.targets) == 1 and (
+        (first / "registration.nc").is_file() or (first / STRUCTURES).is_dir()
+    )
+    if into_study:
+        check_is_study(first)
     source, label, landmarks = read_shape(args.source), None, None
     if args.labels:
         label = labels_of_mesh(read_labels(args.labels, source.sizes["file_vertex_index"]), source)
@@ -385,8 +410,8 @@ def transfer(args: Namespace) -> int:
     excluded = []
     asked = {name: getattr(args, name) for name in (*PAIR, "both")}
     given = {name: value for name, value in asked.items() if value is not None}
-    if len(args.targets) == 1 and (Path(args.targets[0]) / "registration.nc").is_file():
-        study = open_study(args.targets[0])
+    if into_study:
+        study = open_study(first)
         given["source"] = source
     else:
         study, excluded = registered_pairs(source, args, given)
@@ -476,9 +501,12 @@ def file_points(mesh: "xr.Dataset") -> "np.ndarray":
 
     from s4a.input.files import read_mesh
     from s4a.input.hands import in_file
+    from s4a.input.labels import read_volume
 
-    if Path(mesh.attrs.get("path") or "").is_file():
-        return in_file(mesh, read_mesh(mesh.attrs["path"])[0])
+    path, label = mesh.attrs.get("path") or "", mesh.attrs.get("label")
+    if Path(path).is_file():
+        read = read_volume(path, label) if label else read_mesh(path)
+        return in_file(mesh, read[0])
     points = np.full((mesh.sizes["file_vertex_index"], 3), np.nan)
     points[mesh["file_vertex"].values] = mesh["position"].values
     return points
@@ -539,13 +567,17 @@ def compare_pairs(
 
     from s4a.cli import tables
     from s4a.evaluation import compare as comparison
-    from s4a.input.files import find_meshes
+    from s4a.input.files import find_meshes, slugs
     from s4a.study.options import N_COARSE
 
     if len(args.paths) < 2:
         raise ValueError("compare needs SOURCE and TARGET, or --collection PATH...")
     source, *paths = args.paths
-    targets = {name: path for target in paths for path, name in find_meshes(target)}
+    files = [file for target in paths for file, _ in find_meshes(target)]
+    twice = [str(file) for file in files if files.count(file) > 1]
+    if twice:
+        raise ValueError(f"every TARGET once needed, found {twice[0]} more than once")
+    targets = dict(zip(slugs(files), files, strict=True))  # in the order given, as --truth is
     result = comparison.pairs(
         source,
         targets,

@@ -100,7 +100,7 @@ def add_options(add: Callable[..., Any], names: Iterable[str], *, unset: bool = 
         elif isinstance(shown, bool):
             kind = {"action": argparse.BooleanOptionalAction}
         elif name == "components":
-            kind = {"type": components}
+            kind = {"type": number_or_name}
         else:
             kind = {"type": whole if isinstance(shown, int) or name == "n_latent" else str}
             kind = {"type": OTHER_NUMBERS.get(name, kind["type"])}
@@ -109,8 +109,8 @@ def add_options(add: Callable[..., Any], names: Iterable[str], *, unset: bool = 
         add("--" + name.replace("_", "-"), default=value, help=text, **kind)
 
 
-def components(text: str) -> int | str:
-    """A number of components, or the word as it is."""
+def number_or_name(text: str) -> int | str:
+    """A number of components or of a label, or the word as it is."""
     return whole(text) if text.isdecimal() else text
 
 
@@ -221,7 +221,9 @@ def _statistics(add):
     add("--recompute", action="store_true", help=text)
     add("--keep-doubtful", action="store_true", help="take doubtful shapes in")
     text = "only vertices of the template with these labels"
-    add("--label", nargs="+", type=whole, metavar="LABEL", help=text)
+    add("--label", nargs="+", type=number_or_name, metavar="LABEL", help=text)
+    text = "labels of the template's file for --label: NPY, NPZ (FILE:NAME), CSV, GIFTI or annot"
+    add("--labels", metavar="FILE", help=text)
     text = "only vertices whose mean confidence is this large, 0 to 1"
     add("--least-confidence", type=float, default=0.0, metavar="SHARE", help=text)
     text = "nuisances: what lies along their regression is taken from all shapes"
@@ -282,8 +284,8 @@ def _structures(add):
     add("--scale", action="store_true", help="take the size of each whole subject out")
     text = "also test whether groups differ in how structures lie, and in their shapes"
     add("--group", metavar="COLUMN", help=text)
-    text = "inserted.nc of s4a insert: poses and scores of new subjects, too"
-    add("--new", metavar="FILE", help=text)
+    text = "folder of s4a insert, or its inserted.nc: poses and scores of new subjects, too"
+    add("--new", metavar="DIR", help=text)
     add("--permutations", type=whole, help="of the subjects (default: 999)")
     add("--out", metavar="DIR", help="for netCDF, CSV, the pages (default: STUDY/statistics)")
     add_options(add, ["seed"])
@@ -312,7 +314,7 @@ def _complete(add):
     text = "shapes drawn from all that agree with the part (default: 10)"
     add("--samples", type=whole, default=10, help=text)
     text = "pieces of the part to keep, or 'largest' (default: as in the study)"
-    add("--components", type=components, help=text)
+    add("--components", type=number_or_name, help=text)
     add_options(add, ["seed"])
 
 

@@ -2,7 +2,7 @@
 
 from argparse import Namespace
 
-from s4a.cli.commands import write
+from s4a.cli.commands import template_labels, write
 
 # option of the functions of s4a.analysis.programs -> flag
 GIVEN = {"n_points": "points", "n_modes": "modes", "landmarks": "landmarks", "grid": "grid"}
@@ -10,9 +10,8 @@ GIVEN = {"n_points": "points", "n_modes": "modes", "landmarks": "landmarks", "gr
 
 def export(args: Namespace) -> int:
     """A study in the files of Slicer, ShapeWorks, Scalismo, ParaView, R, or as label volumes."""
-    from s4a.analysis.inputs import all_registered
     from s4a.analysis.programs import write_for
-    from s4a.input.annotations import labels_of_mesh, read_labels, read_landmarks
+    from s4a.input.annotations import read_landmarks
     from s4a.study.tree import open_study
 
     study = open_study(args.study)
@@ -21,10 +20,7 @@ def export(args: Namespace) -> int:
     if args.landmarks:
         options["landmarks"] = read_landmarks(args.landmarks)
     if args.labels:
-        template = all_registered(study).attrs["template"]
-        mesh = study["original"][template].to_dataset()
-        labels = read_labels(args.labels, mesh.sizes["file_vertex_index"])
-        options["label"] = labels_of_mesh(labels, mesh)
+        options["label"] = template_labels(study, args.labels)
     paths = write_for(study, args.out, args.to, **options)
     write(f"{len(paths)} files for {args.to} in {args.out}, such as {paths[-1].name}")
     return 0

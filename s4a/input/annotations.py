@@ -249,22 +249,40 @@ def _text_labels(data):
     elif len(head) > 1:
         raise ValueError(f"a column 'label' needed, found {', '.join(first)}")
     at = head.index("label") if "label" in head else 0
-    of_vertex = head.index("vertex") if "label" in head and "vertex" in head else None
-    check_cells(rows, len(head), 1 + max(at, of_vertex or 0))
+    order = order_of_vertices(head, rows) if "label" in head else None
+    check_cells(rows, len(head), 1 + at)
     values = [row[at] for row in rows.values()]
     labels = (
         np.array([float(v) for v in values])
         if all(map(is_number, values))
         else np.array(short(values))
     )
-    if of_vertex is not None:
-        vertex = np.array([number_of(row[of_vertex], line) for line, row in rows.items()])
-        if not np.array_equal(np.sort(vertex), np.arange(len(vertex))):
-            raise ValueError(
-                f"the column 'vertex' needs every index from 0 to {len(vertex) - 1} once"
-            )
-        labels = labels[np.argsort(vertex)]
-    return labels
+    return labels if order is None else labels[order]
+
+
+def order_of_vertices(head: list[str], rows: dict[int, list[str]]) -> np.ndarray | None:
+    """The rows of a table in the order of its column ``vertex``; None where it has none.
+
+    Parameters
+    ----------
+    head : list of str
+        The names of the columns, in lower case.
+    rows : dict of int to list of str
+        The cells of each row below, by its line in the file.
+
+    Raises
+    ------
+    ValueError
+        When the column has not every index once, from 0.
+    """
+    if "vertex" not in head:
+        return None
+    at = head.index("vertex")
+    check_cells(rows, len(head), 1 + at)
+    vertex = np.array([number_of(row[at], line) for line, row in rows.items()])
+    if not np.array_equal(np.sort(vertex), np.arange(len(vertex))):
+        raise ValueError(f"the column 'vertex' needs every index from 0 to {len(vertex) - 1} once")
+    return np.argsort(vertex)
 
 
 def read_landmarks(path: Path | str) -> xr.Dataset:

@@ -275,7 +275,8 @@ def _compare_hands(evidence, told, of_all):
         )
         words = (
             f"fits as a mirror image (ICP residual beside most others {as_is:.3f} as it is, "
-            f"{reflected:.3f} reflected): left for right? It was kept; reflect= mirrors it"
+            f"{reflected:.3f} reflected): left for right? It is as its file has it; "
+            "reflect= mirrors it"
         )
         told[name].append(doubt("mirrored", words))
 

@@ -11,7 +11,13 @@ import numpy as np
 import xarray as xr
 
 from s4a.input import bounded
-from s4a.input.annotations import check_cells, is_number, number_of, table_rows
+from s4a.input.annotations import (
+    check_cells,
+    is_number,
+    number_of,
+    order_of_vertices,
+    table_rows,
+)
 from s4a.input.files import stem_of
 from s4a.input.formats import gifti_arrays, ply_properties
 from s4a.input.raw import check_there, shown, text_of
@@ -274,6 +280,7 @@ def _column(text, name):
     """The column of that name, or the only one."""
     rows = table_rows(text)
     first = next(iter(rows.values()))
+    order = None
     if len(first) == 1:
         at = 0
         if not is_number(first[0]):
@@ -281,7 +288,9 @@ def _column(text, name):
     elif name in first:
         at = first.index(name)
         del rows[next(iter(rows))]
+        order = order_of_vertices([cell.lower() for cell in first], rows)
     else:
         raise ValueError(f"a column {name!r} expected, found {', '.join(first)[:80]}")
     check_cells(rows, len(first), 1 + at)
-    return np.array([number_of(row[at], line) for line, row in rows.items()])
+    values = np.array([number_of(row[at], line) for line, row in rows.items()])
+    return values if order is None else values[order]

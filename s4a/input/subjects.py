@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from s4a.input.annotations import is_number, table_rows
 from s4a.input.bounded import content
-from s4a.input.files import slug
+from s4a.input.files import slug, stem_of
 from s4a.input.raw import shown, text_of
 from s4a.schema import covariate
 
@@ -48,7 +48,10 @@ def _head_and_rows(path):
 
 def _shape_of(cell, names):
     """The shape that a cell names, by its name or its file; the cell itself where there is none."""
-    return next((n for n in (cell, slug(cell), slug(Path(cell).stem)) if n in names), cell)
+    *folders, file = Path(cell).parts or [""]
+    ends = [[*folders[i:], stem_of(file)] for i in range(len(folders) + 1)]  # names of shapes are
+    known = (cell, slug(cell), *(slug("/".join(end)) for end in ends))  # of folders, too, if needed
+    return next((name for name in known if name in names), cell)
 
 
 def read_table(path: Path | str, names: list[str]) -> xr.Dataset:
@@ -58,7 +61,7 @@ def read_table(path: Path | str, names: list[str]) -> xr.Dataset:
     ----------
     path : path
         CSV with a header, separated by commas, semicolons or tabs, a row per shape; the column
-        ``shape`` has the name of the shape or that of its file.
+        ``shape`` has the name of the shape, or its file with or without folders.
     names : list of str
         The shapes.
 

@@ -16,7 +16,8 @@ from threadpoolctl import threadpool_limits
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.input import evidence
 from s4a.input.collection import read_shapes, shape_report
-from s4a.input.files import files_named
+from s4a.input.files import SUFFIXES as MESHES
+from s4a.input.files import files_named, suffix_of
 from s4a.input.hands import AUTO, is_of_other_hand, mirror_image
 from s4a.input.landmarks import SUFFIXES, with_landmarks
 from s4a.input.plausibility import find_warnings
@@ -273,7 +274,10 @@ def clean_new(
     attrs = {name: {"status": "ok", "reason": ""} | mesh.attrs for name, mesh in meshes.items()}
     if isinstance(shapes, dict) and not shapes:
         return meshes, attrs
-    tree = read_shapes(shapes, compare=False, **options.of_cleaning)
+    cleaning = options.of_cleaning
+    if not isinstance(shapes, dict) and are_meshes(shapes):  # in a study of label volumes
+        cleaning = cleaning | {"label": None}
+    tree = read_shapes(shapes, compare=False, **cleaning)
     report = tree["report"].to_dataset()
     for name in report["shape"].values.tolist():
         if name in tree["original"].children:
@@ -283,6 +287,12 @@ def clean_new(
             row = report.sel(shape=name)
             attrs[name] = {column: row[column].item() for column in ("status", "reason", "path")}
     return meshes, attrs
+
+
+def are_meshes(paths: Path | str | list[Any]) -> bool:
+    """Whether all of these are files that are named as meshes."""
+    files = [paths] if isinstance(paths, str | Path) else paths
+    return all(Path(file).is_file() and suffix_of(file) in MESHES for file in files)
 
 
 def freeze(study: xr.DataTree, options: Options) -> Frozen:

@@ -15,6 +15,7 @@ from tqdm.auto import tqdm
 from s4a.geometry.align import motion_between, realign
 from s4a.geometry.mesh import as_arrays, triangle_areas
 from s4a.input import evidence
+from s4a.input.annotations import labels_of_mesh
 from s4a.input.clean import check_range, clean
 from s4a.input.collection import read_shape
 from s4a.input.hands import mirror_image
@@ -87,12 +88,15 @@ def cleaned(source: str | xr.Dataset, content: str, cleaning: dict[str, Any]) ->
 
 
 def guided(mesh: xr.Dataset, source: xr.Dataset) -> xr.Dataset:
-    """A clean mesh with the landmarks and fields of the mesh in memory that it was made from."""
+    """A clean mesh with landmarks, fields and labels of the mesh in memory it was made from."""
     if "guide_position" in source:  # its triangles are others now
         mesh = with_landmarks(mesh, guides_of(source))
     if features_of(source):
         weight = source["feature_weight"].values[0]
         mesh = with_features(mesh, features_of(source), weight=weight)
+    if "label" in source:
+        label = labels_of_mesh(source["label"].values, mesh)
+        mesh = mesh.assign(label=("vertex", label, source["label"].attrs))
     return mesh
 
 

@@ -334,6 +334,17 @@ def nodes_of_structure(name: str, study: xr.DataTree) -> dict[str, xr.Dataset]:
     }
 
 
+def check_is_one(study: xr.DataTree) -> None:
+    """ValueError where a study is one of several structures, which are analysed one by one."""
+    if STRUCTURES in study.children:
+        names = list(study[STRUCTURES].children)
+        raise ValueError(
+            f"this is a study of several structures ({listed(names)}): take one of them, as "
+            f"s4a.statistics.of_structure(study, {names[0]!r}) or STUDY/{STRUCTURES}/{names[0]}; "
+            "`s4a structures STUDY` compares them"
+        )
+
+
 def structure_names(study: xr.DataTree) -> list[str]:
     """The structures of a study of several; ValueError where it has none."""
     if STRUCTURES not in study.children:

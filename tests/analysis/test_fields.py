@@ -107,6 +107,15 @@ def test_files_of_fields_are_read_as_they_are_written(tmp_path):
         read_scalars(tmp_path / "cut.curv")
 
 
+def test_rows_of_a_table_are_in_the_order_of_its_vertices(tmp_path):
+    file = tmp_path / "thickness.csv"
+    file.write_text("vertex,thickness\n2,30\n0,10\n1,20\n")
+    assert read_scalars(file, "thickness").tolist() == [10, 20, 30]
+    file.write_text("vertex,thickness\n2,30\n0,10\n2,20\n")
+    with pytest.raises(ValueError, match="'vertex' needs every index from 0 to 2 once"):
+        read_scalars(file, "thickness")
+
+
 def test_nibabel_reads_and_writes_the_same_files_of_freesurfer(tmp_path):
     from nibabel.freesurfer import io
 

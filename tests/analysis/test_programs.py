@@ -365,6 +365,20 @@ def test_slicer_has_surfaces_points_and_landmarks_where_the_files_lie(study, tmp
         assert np.linalg.norm(gap, axis=1).mean() < 15  # mm, few vertices
 
 
+def test_landmarks_of_the_other_frame_are_written_where_the_template_lies(study, tmp_path):
+    name = study["registration"].attrs["template"]
+    Y = study["original"][name]["position"].values[[5, 200, 400]]
+    given = dataset(
+        {"coordinate_system": "LPS"},
+        landmark_name=list("abc"),
+        landmark_position=Y * [-1, -1, 1],
+    )
+    write_for(study, tmp_path, "slicer", n_points=5, landmarks=given)
+    written = read_landmarks(tmp_path / "landmarks" / f"{name}.mrk.json")
+    assert written.attrs["coordinate_system"] == "RAS"
+    assert written["landmark_position"].values == pytest.approx(Y, abs=1e-5)
+
+
 def test_slicer_is_told_where_no_file_says_its_frame(study, tmp_path, caplog):
     plain = study.copy(deep=True)
     for node in plain["original"].children.values():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from s4a import analyse, cli, statistics, synthetic
+from s4a import analyse, cli, open_study, statistics, synthetic
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.method.pca import gram, pca
 from s4a.schema import dataset
@@ -87,6 +87,24 @@ def test_a_region_that_is_none_is_an_error(planted, region, words):
         statistics.within(planted, region)
 
 
+def test_a_region_of_a_region_says_which_vertices_of_the_template_it_has(planted):
+    top = statistics.within(planted, TOP.tolist())
+    mesh = top["registration"].to_dataset()
+    half = statistics.within(top, mesh["position"][:, 0] > 0)["registration"].to_dataset()
+    assert np.array_equal(half["position"].values, X[half["template_vertex"].values])
+
+
+def test_labels_of_a_region_can_be_given(planted):
+    labels = np.where(TOP, "top", "rest")
+    named = statistics.within(planted, "top", labels=labels)
+    assert named["registration"].equals(statistics.within(planted, 7)["registration"])
+    with pytest.raises(ValueError, match=r"for each of the template's 400 vertices, found \(3,\)"):
+        statistics.within(planted, "top", labels=labels[:3])
+    bare = planted.filter(lambda node: "label" not in node)
+    with pytest.raises(ValueError, match=r"has no labels; give them as labels= \(--labels FILE\)"):
+        statistics.within(bare, 7)
+
+
 def test_without_a_nuisance_nothing_follows_it_and_no_mode_lies_along_it(planted):
     rest = statistics.without(planted, "age")
     fit = statistics.regression(planted, "age", n_permutations=9)
@@ -106,8 +124,10 @@ def test_without_a_nuisance_nothing_follows_it_and_no_mode_lies_along_it(planted
     )
     with pytest.raises(ValueError, match="the nuisance is constant"):
         statistics.without(planted, np.ones(20))
-    with pytest.raises(ValueError, match="a value for every shape"):
+    with pytest.raises(ValueError, match="value for every shape; covariate lacks shape_00"):
         statistics.without(planted, [np.nan, *range(19)])
+    with pytest.raises(ValueError, match="value for every shape; covariate lacks shape_18"):
+        statistics.without(planted, np.array([*"ab" * 9, "NA", "a"]))
 
 
 def test_size_that_was_taken_out_is_given_back():
@@ -144,3 +164,12 @@ def test_the_command_takes_a_region_and_a_nuisance(study_folder, tmp_path, capsy
     assert "without age" in capsys.readouterr().out
     assert cli.main([*command, "--label", "999"]) == 2
     assert "no vertex of the template has the label 999" in capsys.readouterr().err
+    with open_study(study_folder) as study:
+        template = study["registration"].attrs["template"]
+        Y = study[f"original/{template}/position"].values
+    np.savetxt(tmp_path / "halves.csv", np.where(Y[:, 0] > 0, 5, 9), "%d")  # the file's vertices
+    halves = ["--label", "5", "--labels", str(tmp_path / "halves.csv")]
+    assert cli.main([*command, *halves]) == 0
+    assert f" of {len(Y)} vertices" in capsys.readouterr().out
+    assert cli.main([*command, *halves[2:]]) == 2
+    assert "--labels is where --label looks" in capsys.readouterr().err

@@ -4,6 +4,7 @@ And p values under no difference.
 """
 
 import numpy as np
+import pandas
 import pytest
 import xarray as xr
 from PIL import Image
@@ -13,6 +14,7 @@ from sklearn.svm import SVC
 
 from s4a import statistics, synthesize, synthetic, write_page
 from s4a.analysis import model, permutation
+from s4a.analysis.inputs import values_of
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.method.pca import center_gram, gram, gram_pca, pca, principal_components
 from s4a.schema import dataset
@@ -54,6 +56,24 @@ def smooth_noise(rng, u, s, size=0.1, waves=12):
         * np.einsum("swx,nw->snx", rng.normal(size=(s, waves, 3)), np.cos(u @ k.T + phase))
         / np.sqrt(waves)
     )
+
+
+def test_values_with_names_are_taken_by_name_in_whatever_order_they_come(family):
+    study, _ = family
+    names = study["registration"]["shape"].values
+    by_name = xr.DataArray(SCORES, {"shape": names})[::-1]
+    mixed = by_name.to_pandas().sample(frac=1, random_state=1)
+    frame = pandas.DataFrame({"a": mixed, "b": mixed**2})
+    known = SCORES, np.stack([SCORES, SCORES**2], axis=1)
+    for given, expected in ((by_name, known[0]), (mixed, known[0]), (frame, known[1])):
+        assert values_of(study, given, "age").tolist() == expected.tolist()
+    rows = pandas.Series(SCORES, index=range(1, len(SCORES) + 1))  # an index of rows is no name
+    assert values_of(study, rows, "age").tolist() == SCORES.tolist()
+    with pytest.raises(ValueError, match="age needs a value for every shape; it lacks shape_00"):
+        values_of(study, mixed.rename({"shape_00": "shape_0"}), "age")
+    twice = pandas.concat([mixed, mixed[:1]])
+    with pytest.raises(ValueError, match="one value for every shape; it has more of shape_0"):
+        values_of(study, twice, "age")
 
 
 @pytest.fixture(scope="module")

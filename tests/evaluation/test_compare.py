@@ -1,5 +1,7 @@
 """The comparison of Table 1 and Table 2."""
 
+import shutil
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -248,6 +250,18 @@ def test_the_command_writes_table_file_and_figure(tmp_path, capsys):
     assert "a file for the source and each target" in capsys.readouterr().err
     assert main(["compare", "--collection", str(tmp_path), "--methods", "RE-MATCH", *options]) == 0
     assert "median shape" in capsys.readouterr().out
+    truth, options[1] = str(tmp_path / "truth.npy"), str(tmp_path / "again")
+    others = [tmp_path / f"{folder} scans" / "head.ply" for folder in "ba"]
+    for path in others:
+        path.parent.mkdir()
+        shutil.copy(two, path)
+    last = ["--methods", "kNN", "--truth", truth, truth, *options]
+    assert main(["compare", one, *map(str, others), *last]) == 0
+    with xr.open_dataset(tmp_path / "again" / "compare.nc") as found:
+        assert found["pair"].values.tolist() == ["b_scans_head", "a_scans_head"]
+    capsys.readouterr()
+    assert main(["compare", one, two, two, *options]) == 2
+    assert "every TARGET once needed" in capsys.readouterr().err
     assert main(["compare", one, *options]) == 2
     assert "SOURCE and TARGET" in capsys.readouterr().err
     assert main(["compare", one, "--collection", str(tmp_path), *options]) == 2

@@ -122,6 +122,7 @@ def test_public_names_are_where_types_and_completion_say():
     places = [node for node in tree.body if isinstance(node, ast.If)]
     [types] = [node for node in places if ast.unparse(node.test) == "TYPE_CHECKING"]
     told = {alias.name: node.module for node in types.body for alias in node.names}
+    assert told.pop("widgets") == "s4a"  # a room of its own, see below
     assert told == {name: f"s4a.{module}" for name, module in s4a.MODULE_OF.items()}
     assert sorted(told) == s4a.__all__
     assert set(told) < set(dir(s4a))
@@ -132,6 +133,12 @@ def test_public_names_are_where_types_and_completion_say():
 def test_modules_of_rooms_need_no_import_of_their_own():
     code = "import s4a\nassert s4a.geometry.mesh.edges([[0, 1, 2]]).shape == (3, 2)"
     assert loaded_by(code, ["numpy", "s4a.method.fmap"]) == ["numpy"]
+
+
+def test_panels_are_there_when_they_are_asked_for():
+    code = "import s4a\nassert s4a.widgets.Region.__name__ == 'Region'"
+    assert loaded_by(code, PANELS[:1]) == ["ipywidgets"]
+    assert "widgets" in dir(s4a)
 
 
 def test_names_that_are_nowhere_are_attribute_errors():

@@ -230,7 +230,21 @@ def test_one_command_leads_from_volumes_to_modes_and_resumes_and_inserts(volumes
     new = s4a.insert(study, volumes / "scan_4.nii.gz")
     assert new["pca"]["score"].sizes == {"shape": 1, "component": 3}
     assert "label 17" in capsys.readouterr().out or new["original/scan_4"].attrs["label"] == "17"
+    mesh = as_arrays(study["original/scan_1"].to_dataset())
     study.close()
+    s4a.write_mesh(tmp_path / "a mesh.ply", *mesh)  # meshes go into a study of volumes, too
+    into = [str(out), str(tmp_path / "a mesh.ply"), "--out", str(tmp_path / "new")]
+    assert cli.main(["insert", *into]) == 0
+    Y, S = mesh
+    half = S[Y[S][:, :, 0].min(1) > Y[:, 0].mean() - 4]
+    s4a.write_mesh(tmp_path / "half.ply", Y, half)
+    part = [str(out), str(tmp_path / "half.ply"), "--samples", "0", "--out", str(tmp_path / "h")]
+    assert cli.main(["complete", *part]) == 0
+    np.save(tmp_path / "labels.npy", (Y[:, 0] > Y[:, 0].mean()).astype(int))
+    labels = ["--labels", str(tmp_path / "labels.npy"), "--out", str(tmp_path / "carried")]
+    assert cli.main(["transfer", str(tmp_path / "a mesh.ply"), str(out), *labels]) == 0
+    carried = np.load(tmp_path / "carried" / "scan_2.labels.npy")
+    assert len(carried) == len(read_volume(volumes / "scan_2.nii.gz", 17)[0])
 
 
 def test_another_label_is_another_file_of_the_study(volumes, tmp_path):

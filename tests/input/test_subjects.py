@@ -9,6 +9,7 @@ import xarray as xr
 
 from s4a import analyse, cli, insert, open_study, statistics, synthetic
 from s4a.input.annotations import read_labels, read_landmarks
+from s4a.input.files import slugs
 from s4a.input.subjects import read_table, with_table
 
 OPTIONS = {"n_coarse": 300, "k_init": 8, "k": 12, "n_jobs": 1}
@@ -44,6 +45,16 @@ def test_columns_are_whole_numbers_numbers_or_text_in_the_order_of_the_shapes(tm
     assert found["site"].values.tolist() == ["", "Bern"]
     assert found["weight"].values == pytest.approx([np.nan, 60.5], nan_ok=True)
     assert found["age"].attrs["long_name"] == "column 'age' of the table of the shapes"
+
+
+def test_a_row_may_name_the_file_of_its_shape_with_folders_and_gz(tmp_path):
+    file = tmp_path / "table.csv"
+    file.write_text("shape,age\nb.nii.gz,4\na.nii.gz,3\n")
+    assert read_table(file, slugs(["d/a.nii.gz", "d/b.nii.gz"]))["age"].values.tolist() == [3, 4]
+    names = slugs(["d/s1/head.ply", "d/s2/head.ply"])
+    for folder in ("", "d/", "/data/d/"):
+        file.write_text(f"shape,age\n{folder}s2/head.ply,4\n{folder}s1/head.ply,3\n")
+        assert read_table(file, names)["age"].values.tolist() == [3, 4]
 
 
 def test_whole_numbers_that_no_integer_holds_are_numbers(tmp_path):

@@ -20,6 +20,7 @@ from small import OPTIONS
 from s4a import analyse, statistics, synthesize, synthetic
 from s4a.evaluation import accuracy
 from s4a.geometry.mesh import as_arrays, vertex_areas
+from s4a.schema import dataset
 from s4a.study import store, tasks
 from s4a.study.options import Options
 
@@ -144,6 +145,15 @@ def test_labels_and_landmarks_stay_with_the_shapes(brains, study):
         assert np.array_equal(
             study[f"original/{name}/landmark_position"], mesh["landmark_position"]
         )
+
+
+def test_labels_stay_with_a_mesh_in_memory_that_is_cleaned(meshes):
+    mesh = next(iter(meshes.values()))
+    X, T = as_arrays(mesh)
+    more = np.concatenate([[[900.0, 0, 0]], X])  # a vertex of no triangle: cleaning drops it
+    given = dataset(position=more, corner_vertex=T + 1, label=[99, *mesh["label"].values])
+    cleaned = tasks.cleaned(given, "", Options().of_cleaning)
+    assert cleaned["label"].values.tolist() == mesh["label"].values.tolist()
 
 
 def test_the_order_of_the_files_does_not_matter(brain_files, study_of_files):

@@ -65,6 +65,16 @@ def test_each_structure_is_a_study_of_its_own_folder(store):
     assert (s4a.verify(store / "structures/left")["state"] == "whole").all()
 
 
+def test_commands_for_one_structure_name_those_that_there_are(store, files, capsys):
+    for words in (["view"], ["status"], ["statistics"], ["export", "--to", "r", "--out", "x"]):
+        assert cli.main([words[0], str(store), *words[1:]]) == 2
+        assert "a study of several structures (left, right)" in capsys.readouterr().err
+    labels = ["--labels", "no.npy", "--out", "x"]
+    source = next(files[0].glob("*left*.ply"))
+    assert cli.main(["transfer", str(source), str(store), *labels]) == 2
+    assert "a study of several structures (left, right)" in capsys.readouterr().err
+
+
 def test_the_command_prints_variances_and_writes_pages(store, tmp_path, capsys):
     assert cli.main(["structures", str(store), "--permutations", "9", "--out", str(tmp_path)]) == 0
     said = capsys.readouterr().out
