@@ -248,7 +248,7 @@ ROWS = {
         "change of the field with one standard deviation of its score"),
     "field_score": ("shape component", ONE,
         "score of the field of each shape, in standard deviations"),
-    "singular_value": ("component", ONE, "covariance of the scores of field and shape"),
+    "singular_value": ("component", ONE, "covariance of the scores of field and shape, not standardized"),
     "singular_p": ("component", ONE, "p value of the permutation test of the singular value"),
     "covariance_share": ("component", ONE, "share of the squared covariance of field and shape"),
     "pair_correlation": ("component", ONE, "correlation of the scores of field and shape"),

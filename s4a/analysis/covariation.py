@@ -7,12 +7,14 @@ is the covariance of a pair (its singular value), their correlation (r-PLS), and
 of both blocks, |A^T B|^2 / (|A^T A| |B^T B|) (Escoufier 1973).  p values come of permuted shapes.
 """
 
+import math
+
 import numpy as np
 import xarray as xr
 
 from s4a.analysis.effects import check_permutations, modes_study
 from s4a.analysis.inputs import Values, field_sample
-from s4a.analysis.permutation import batched, design, smallest_p
+from s4a.analysis.permutation import batched, design
 from s4a.method.pca import center_gram, gram, principal_components
 from s4a.schema import FIELD_UNIT, dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
@@ -39,9 +41,9 @@ def two_block(
     Returns
     -------
     dict of str to ndarray
-        ``U (p, k)``, ``V (q, k)`` and ``singular (k,)`` of A^T B / (s - 1); ``r (k,)``, the
-        correlations of the scores; ``rv``; ``p`` of the first correlation (r-PLS), ``singular_p
-        (k,)`` and ``rv_p``.
+        ``U (p, k)``, ``V (q, k)`` and ``singular (k,)`` of A^T B / (s - 1), both less what the
+        covariates explain; ``r (k,)``, the correlations of the scores; ``rv``; ``p`` of the first
+        correlation (r-PLS), ``singular_p (k,)`` and ``rv_p``.
 
     Examples
     --------
@@ -55,14 +57,8 @@ def two_block(
     (0.01, True)
     """
     n = len(A)
-    Z = np.full((n, 1), 1 / np.sqrt(n))
-    if covariates is not None:
-        Z, _ = design(np.random.default_rng(0).normal(size=n), covariates)  # the basis of Z alone
-
-    def freed(M):
-        return M - Z @ (Z.T @ M)
-
-    A, B = freed(np.asarray(A, float)), freed(np.asarray(B, float))
+    Z = basis_of(covariates, n)
+    A, B = (free(np.asarray(M, float), Z) for M in (A, B))
     size = np.linalg.norm(A.T @ A)
     U, singular, Vt = np.linalg.svd(A.T @ B / (n - 1), full_matrices=False)
     scores = A @ U, B @ Vt.T
@@ -70,7 +66,7 @@ def two_block(
 
     def measures(permuted):
         """Singular values over the size of B, first correlation and RV of blocks (b, s, q)."""
-        permuted = permuted - Z @ (Z.T @ permuted)
+        permuted = free(permuted, Z)
         Ub, S, Vb = np.linalg.svd(A.T @ permuted, full_matrices=False)
         length = np.sqrt((permuted**2).sum((1, 2)))
         K = permuted @ permuted.swapaxes(1, 2)  # (b, s, s)
@@ -129,7 +125,8 @@ def covariation(
     -------
     Dataset
         ``deformation(component, vertex, xyz)`` and ``field_pattern(component, vertex)`` of one
-        standard deviation of the scores, ``score(shape, component)`` and ``field_score``;
+        standard deviation of the scores, ``score(shape, component)`` and ``field_score``, freed of
+        the covariates as what is tested is;
         ``singular_value(component)``, its share ``covariance_share`` of all squared covariance, and
         ``singular_p``; ``pair_correlation(component)``; ``statistic``, the first of these (r-PLS),
         and its ``p_value``; ``rv`` and ``rv_p``.
@@ -169,14 +166,16 @@ def covariation(
     if not 1 <= c <= most:
         raise ValueError(f"n_components needs a number from 1 to {most}, found {c}")
     n = len(A)
+    Z = basis_of(of_field.Z, n)
     scores, deviations, axes = [], [], []
     for sample, M, axis in ((of_shape, A, found["U"]), (of_field, B, found["V"])):
-        score = (M - M.mean(0)) @ axis[:, :c]
+        M = free(M, Z)
+        score = M @ axis[:, :c]
         deviation = score.std(axis=0, ddof=1)
         deviation[deviation == 0] = 1
-        around = sample.d - sample.d.mean(0)
+        around = free(sample.d.reshape(n, -1).astype(float), Z).reshape(sample.d.shape)
         # an axis in coordinates is sum_s of the shapes: M^T (M M^T)^-1 brings it back to them
-        weight = np.linalg.pinv(M - M.mean(0)).T @ axis[:, :c]  # (s, c)
+        weight = np.linalg.pinv(M).T @ axis[:, :c]  # (s, c)
         axes.append(np.einsum("sc,snk->cnk", weight * deviation, around, optimize=True))
         scores.append(score / deviation)
         deviations.append(deviation)
@@ -202,9 +201,21 @@ def covariation(
     return result.assign_coords(shape=of_field.registration["shape"].values).assign_attrs(
         field=field,
         permutations=n_permutations,
-        smallest_p=smallest_p(n_permutations, np.arange(n)),
+        smallest_p=max(1 / (n_permutations + 1), 1 / math.factorial(n)),
         **of_field.said,
     )
+
+
+def basis_of(covariates: np.ndarray | None, n: int) -> np.ndarray:
+    """An orthonormal basis ``(n, r)`` of the constant and the covariates."""
+    if covariates is None:
+        return np.full((n, 1), 1 / np.sqrt(n))
+    return design(np.random.default_rng(0).normal(size=n), covariates)[0]  # of Z alone
+
+
+def free(M: np.ndarray, Z: np.ndarray) -> np.ndarray:
+    """What an orthonormal basis Z ``(n, r)`` does not explain of M ``(..., n, c)``."""
+    return np.asarray(M - Z @ (Z.T @ M))
 
 
 def coordinates(d: np.ndarray, area: np.ndarray) -> np.ndarray:

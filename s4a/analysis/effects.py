@@ -23,6 +23,7 @@ from s4a.analysis.permutation import (
     permutation_test,
     scatter_test,
     smallest_p,
+    standardize,
     vertex_test,
 )
 from s4a.geometry.mesh import as_arrays, vertex_normals
@@ -204,8 +205,8 @@ def regression(
         vertex as of :func:`group_map`, ``effect(vertex, xyz)`` per unit of the variable,
         ``effect_size`` = Cohen's f, and ``intercept(vertex, xyz)``, of a field ``field_effect`` and
         ``field_intercept``; ``standard_score(shape)`` of the variable.  Attributes ``mean``,
-        ``standard_deviation``, ``lowest`` and ``highest`` of the variable, and those of
-        :func:`group_test`.
+        ``standard_deviation``, ``lowest`` and ``highest`` of the variable, ``freed_deviation`` of
+        what the covariates leave of it, and those of :func:`group_test`.
 
     Raises
     ------
@@ -243,10 +244,21 @@ def regression(
             highest=float(x.max()),
             of=of,
             standard_deviation=deviation,
+            freed_deviation=freed_deviation(x, sample.Z),
             components=test.attrs["components"],
             **_said(sample, x, options),
         )
     )
+
+
+def freed_deviation(x: np.ndarray, Z: np.ndarray | None) -> float:
+    """The standard deviation of what covariates ``(s, c)`` leave of a variable ``(s,)``."""
+    if Z is None:
+        return float(x.std(ddof=1))
+    left = x - x.mean()
+    columns = standardize(Z)[0]
+    left = left - columns @ np.linalg.lstsq(columns, left, rcond=None)[0]
+    return float(np.sqrt(left @ left / (len(x) - 1)))
 
 
 def numbers_of(values: np.ndarray, what: str = "variable") -> np.ndarray:
@@ -349,6 +361,9 @@ def regression_modes(study: xr.DataTree, fit: xr.Dataset, name: str = "variable"
     d = d[registration["shape"].isin(fit["shape"]).values]
     step = fit["effect"].values * fit.attrs["standard_deviation"]  # (n, 3)
     size = np.sqrt(np.einsum("nx,nx,n->", step, step, area))
+    # the slope explains what varies with the part of the variable that covariates leave
+    free = fit.attrs.get("freed_deviation", fit.attrs["standard_deviation"])
+    explained = size * free / fit.attrs["standard_deviation"]
     total = gram(d - d.mean(0), area).trace() / (len(d) - 1)
     return modes_study(
         study,
@@ -358,7 +373,7 @@ def regression_modes(study: xr.DataTree, fit: xr.Dataset, name: str = "variable"
         deformation=step[None],
         standard_deviation=np.array([size]),
         score=fit["standard_score"].values[:, None],
-        explained_variance_ratio=np.array([size**2 / total]),
+        explained_variance_ratio=np.array([explained**2 / total]),
     )
 
 

@@ -98,6 +98,11 @@ def write_registered(
         raise ValueError(
             "shapes need names other than 'template', which is the file of the template's mesh"
         )
+    if frame == "shape" and "rotation" not in registration:
+        raise ValueError(
+            "frame='shape' needs the motion of every shape, and this study has none, as of "
+            "structures_modes: write it in the frame of the template"
+        )
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     suffix = FORMATS[format]
@@ -111,7 +116,8 @@ def write_registered(
             points = image_in_shape(X, own)
             if is_reflected(study, name):
                 points, triangles = points * MIRROR, T[:, ::-1]
-        scalars = {} if format == "obj" else {"confidence": own["confidence"].values}
+        has_scalars = format != "obj" and "confidence" in own
+        scalars = {"confidence": own["confidence"].values} if has_scalars else {}
         paths.append(folder / f"{name}{suffix}")
         write_mesh(paths[-1], points, triangles, **scalars)
     paths.append(folder / f"template{suffix}")
@@ -123,8 +129,13 @@ def write_registered(
 
 def is_reflected(study: xr.DataTree, name: str) -> bool:
     """Whether the run took the mirror image of a shape."""
-    meshes = study["original"].children if "original" in study.children else {}
-    return name in meshes and bool(meshes[name].attrs.get("reflected"))
+    if "original" in study.children:
+        meshes = study["original"].children
+        return name in meshes and bool(meshes[name].attrs.get("reflected"))
+    report = study["report"].to_dataset() if "report" in study.children else xr.Dataset()
+    if "reflected" not in report:  # the study of a part of what varies has its report alone
+        return False
+    return bool(report["reflected"].sel(shape=name))
 
 
 def _write_modes(pca, folder, n_modes):

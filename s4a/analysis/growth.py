@@ -18,7 +18,7 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
-from s4a.analysis.effects import check_options, numbers_of
+from s4a.analysis.effects import check_options, freed_deviation, numbers_of
 from s4a.analysis.inputs import Values, registration_of, sample_of, values_of
 from s4a.analysis.model import count_components
 from s4a.analysis.permutation import (
@@ -269,12 +269,19 @@ def growth(
         lowest=float(t.min()),
         highest=float(t.max()),
         standard_deviation=float(t.std(ddof=1)),
+        freed_deviation=_deviation_within(sample.Z, t, whose),
         of=of,
         subjects=len(np.unique(whose)),
         once=len(np.unique(whose[~seen])),
         variances=variances,
         **sample.said,
     )
+
+
+def _deviation_within(Z, t, subject):
+    """The standard deviation of time within subjects, of what the covariates leave of it there."""
+    inside = within_subjects(t[:, None], subject)[:, 0]
+    return freed_deviation(inside, None if Z is None else within_subjects(Z, subject))
 
 
 def _with_subjects(study, sample, subject):
@@ -351,7 +358,8 @@ def _test(sample, t, subject, seen, of, n_components, options):
     if of == "normal":
         N = vertex_normals(*as_arrays(sample.registration))
         fields = normal_displacement(E, N)[..., None]
-    dof = len(x) - n_subjects - (0 if Z is None else np.linalg.matrix_rank(Z))  # of visits
+    rank = 0 if Z is None else int(np.linalg.matrix_rank(standardize(Z)[0]))
+    dof = len(x) - n_subjects - rank  # of visits
     if dof < fields.shape[2] + 1:
         raise ValueError(
             f"{len(x)} visits of {n_subjects} subjects are too few for a test of "
@@ -387,7 +395,7 @@ def _test(sample, t, subject, seen, of, n_components, options):
         "p_false_discovery": sample.whole(stats.false_discovery_control(p)),
         "effect_size": np.sqrt(found / np.maximum(1 - found, 1e-12)),
         # as many visits as are not taken by the means of subjects are free
-        "statistic": statistic * (dof - 1) / (len(x) - 2 - (0 if Z is None else Z.shape[1])),
+        "statistic": statistic * (dof - 1) / (len(x) - 2 - rank),
         "p_value": p_value,
     }
 

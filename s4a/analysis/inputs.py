@@ -228,7 +228,7 @@ def with_doubtful(study: xr.DataTree) -> xr.DataTree:
     if "report" in study.children:
         nodes["/report"] = nodes["/report"].assign_attrs(keep_doubtful="True")
     registration = all_registered(study)
-    template = registration.attrs["template"]
+    template = registration.attrs.get("template", "")
     coarse = nodes.get(f"/coarse/{template}")
     area_weighted = Options.from_report(study).area_weighted
     nodes["/pca"] = pca_without(registration, [], coarse, area_weighted=area_weighted)

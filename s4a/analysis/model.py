@@ -262,11 +262,17 @@ def variance_baseline(
 
 
 def count_components(
-    variance: np.ndarray, s: int, n_components: int | None, *, most: int, share: float = 0.9
+    variance: np.ndarray,
+    s: int,
+    n_components: int | None,
+    *,
+    most: int,
+    share: float = 0.9,
+    at_most: int | None = None,
 ) -> int:
     """How many components of s shapes a test takes; ValueError where it would be more than `most`.
 
-    By default as many as hold `share` of the variance, at most half of the shapes.
+    By default as many as hold `share` of the variance, at most half of the shapes or `at_most`.
 
     Examples
     --------
@@ -278,7 +284,8 @@ def count_components(
     if n_components is None:
         explained = np.cumsum(variance / variance.sum())
         enough = int(np.searchsorted(explained, share - 1e-9)) + 1
-        n_components = max(1, min(enough, s // 2, len(variance), most))
+        limit = s // 2 if at_most is None else at_most
+        n_components = max(1, min(enough, limit, len(variance), most))
     c = int(n_components)
     if not 1 <= c <= most:
         raise ValueError(f"n_components needs a number from 1 to {most}, found {c}")
@@ -446,7 +453,7 @@ def _coefficients(study, d, area):
 
     Where the study has no eigenfunctions, the basis is that of the vertices.
     """
-    template = study["registration"].attrs["template"]
+    template = study["registration"].attrs.get("template", "")  # of several structures none
     if "coarse" not in study or template not in study["coarse"].children:
         return (d * np.sqrt(area)[:, None]).reshape(len(d), -1).astype(float)
     shape = Shape(study["original"][template].to_dataset(), study["coarse"][template].to_dataset())

@@ -178,7 +178,8 @@ def smallest_p(
     """The smallest p that a permutation test of x, a variable or indicators, can reach.
 
     Bound by the number of permutations drawn, and by how many are different: two that only exchange
-    shapes of equal values, or groups of equal size, give the same statistic.
+    shapes of equal values, or groups of equal size, or turn round a variable that is symmetric
+    about its mean, give the same statistic.
 
     Parameters
     ----------
@@ -192,14 +193,16 @@ def smallest_p(
     >>> smallest_p(99, range(20)), smallest_p(9999, x)
     (0.01, 0.1)
     """
+    if covariates is not None and not np.ptp(covariates, axis=0).any():
+        covariates = None  # a constant is in the mean, and changes nothing
     rows = _rows(x, covariates)
     same = 1
-    if blocks is not None and covariates is None and variances == "equal":
+    if covariates is None and variances == "equal" and rows.shape[1] == 1:
         sides = [np.sort(rows[of, 0]) for of in _places(blocks, len(rows))]
         size = np.ptp(rows)
         turned = all(np.ptp(one + one[::-1]) <= 1e-9 * size for one in sides)
         same = 2 if turned else 1  # the order of all turned round changes but the sign of a slope
-    elif covariates is None and variances == "equal":
+    elif covariates is None and variances == "equal" and blocks is None:
         code = np.unique(rows, axis=0, return_inverse=True)[1].ravel()
         sizes = np.bincount(code).tolist()
         is_grouping = len(sizes) == rows.shape[1] + 1
@@ -460,7 +463,10 @@ def vertex_test(
             f"mean and covariates: {r + k + 1} needed, or fewer covariates, or of='normal'"
         )
     E = np.asarray(d, float).reshape(n, -1)  # (n, v k)
-    E = whiten((E - Z @ (Z.T @ E)).reshape(n, v, k))
+    rounding = 1e-12 * abs(E).max()
+    E = (E - Z @ (Z.T @ E)).reshape(n, v, k)
+    E[:, abs(E).max((0, 2)) <= rounding] = 0  # where nothing varies there is nothing to explain
+    E = whiten(E)
     E = E.transpose(0, 2, 1).reshape(n, -1).astype(np.float32)  # (n, k v)
 
     def project(columns, per):
@@ -469,6 +475,7 @@ def vertex_test(
 
     others, n_others = rearrangements(x, covariates, n_permutations, seed, variances, blocks)
     share = (project(Q, q)[0] ** 2).sum(axis=(0, 1))
+    least = share * (1 - 1e-6) - 1e-7  # of an equal share, in single precision
     reached = np.zeros(v, np.int64)
     largest = np.empty(0, np.float32)
     block = max(1, int(2e7 // (v * k * (q + r))))  # permutations at once: 80 MB of products
@@ -483,9 +490,9 @@ def vertex_test(
         else:
             A = project(np.concatenate([rearranged(Z, by) for by in back], axis=1), r)
             permuted = explained_share(A, B)
-        reached += (permuted >= share * (1 - 1e-6)).sum(0)
+        reached += (permuted >= least).sum(0)
         largest = np.append(largest, permuted.max(1))
-    beyond = n_others - np.searchsorted(np.sort(largest), share * (1 - 1e-6), side="left")
+    beyond = n_others - np.searchsorted(np.sort(largest), least, side="left")
     return share, (1 + reached) / (1 + n_others), (1 + beyond) / (1 + n_others)
 
 

@@ -87,15 +87,17 @@ def outliers(
     ----------
     study : DataTree
     n_components : int, optional
-        As in :func:`group_test`.
+        By default as many as hold 90 % of the variance, at most a tenth of the shapes: the more
+        there are, the more the largest of a sample lie above those of its population.
     level : float
-        Share of shapes of a normal population whose Mahalanobis distance is called too large.
+        The most of a normal population whose Mahalanobis distance is called too large.
 
     Returns
     -------
     Dataset
         Each shape left out of the model: ``mahalanobis(shape)`` of its scores and ``outlier_p`` (F
-        distribution of a new observation), ``left_out_error(shape)`` in the unit of the input, and
+        distribution of a new observation, which is exact for a population of as many components and
+        too large where it has more), ``left_out_error(shape)`` in the unit of the input, and
         ``outlier(shape)``: p under `level`, or the error more than 3.5 robust standard deviations
         over the median (Iglewicz and Hoaglin 1993).
 
@@ -121,7 +123,7 @@ def outliers(
     s = len(d)
     K = gram(d - d.mean(0), area)
     variance, _ = principal_components(center_gram(K))
-    c = count_components(variance, s, n_components, most=s - 3)
+    c = count_components(variance, s, n_components, most=s - 3, at_most=s // 10)
     error, score = leave_one_out(K)
     error = error[:, c]
     squared = np.nansum(score[:, :c] ** 2, axis=1)

@@ -72,7 +72,8 @@ def read_table(path: Path | str, names: list[str]) -> xr.Dataset:
         numbers, NaN where a value is missing; or text, empty where one is missing.  Missing is an
         empty cell, ``NA``, ``n/a``, ``NaN``, ``-`` or ``null``, in letters of any size.  A column
         that is mostly numbers but not all, as with ``?`` or decimal commas, is kept as text with a
-        warning, and no test takes it.
+        warning, and no test takes it.  So is one in which different digits would be one number, as
+        ``01`` and ``1`` or two of 17 digits: they tell subjects apart.
 
     Raises
     ------
@@ -133,6 +134,9 @@ def _values(cells):
     if not known or not all(map(is_plain_number, known)):
         return np.array(["" if is_missing(c) else c for c in cells])
     numbers = np.array([np.nan if is_missing(c) else float(c) for c in cells])
+    digits = {c for c in known if c.lstrip("+-").isdigit()}
+    if len({float(c) for c in digits}) < len(digits):  # 01 and 1, or of more digits than a number
+        return np.array(["" if is_missing(c) else c for c in cells])
     whole = (
         len(known) == len(cells)
         and all(c.lstrip("+-").isdigit() for c in cells)

@@ -171,6 +171,19 @@ def test_groups_that_differ_in_a_field_are_told_where_they_do(planted):
     assert classes.attrs["balanced_accuracy"] > 0.8
 
 
+def test_scores_of_a_covariation_are_freed_of_its_covariates(planted):
+    z = np.random.default_rng(1).normal(size=planted["registration"].sizes["shape"])
+    found = statistics.covariation(planted, "thickness", covariates={"z": z}, n_permutations=9)
+    for a, b, r in zip(
+        found["score"].values.T,
+        found["field_score"].values.T,
+        found["pair_correlation"].values,
+        strict=True,
+    ):
+        assert np.isclose(np.corrcoef(a, b)[0, 1], r)
+        assert abs(np.corrcoef(a, z)[0, 1]) < 1e-6
+
+
 def test_the_slope_of_a_field_is_that_of_least_squares(planted):
     fit = statistics.regression(
         planted, "age", field="thickness", covariates=["group", "score"], n_permutations=199

@@ -81,6 +81,17 @@ def test_unbalanced_data_have_the_likelihood_of_dense_matrices(restricted):
         assert np.allclose(fit.error[:, i], error, rtol=1e-4)
 
 
+def test_a_covariate_that_changes_nothing_changes_no_statistic(planted):
+    rng = np.random.default_rng(0)
+    w, options = rng.normal(size=24), {"of": "normal", "n_permutations": 9}
+    constant = np.repeat(rng.normal(size=8), 3)  # within subjects
+    fits = [
+        statistics.growth(planted, "age", "person", covariates=of, **options)
+        for of in ({"w": w}, {"w": w, "constant": constant}, {"w": w, "twice": 2 * w})
+    ]
+    assert np.allclose([fit["statistic"] for fit in fits], fits[0]["statistic"])
+
+
 def test_a_planted_growth_is_found_where_it_is_with_its_slope(planted):
     fit = statistics.growth(planted, "age", "person", n_permutations=199)
     assert np.allclose(fit["effect"].values[TOP, 0].mean(), 0.05, rtol=0.15)

@@ -5,6 +5,7 @@ import pytest
 import xarray as xr
 
 from s4a import analyse, cli, open_study, statistics, synthetic
+from s4a.analysis.link import image_in_shape
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.method.pca import gram, pca
 from s4a.schema import dataset
@@ -150,6 +151,10 @@ def test_size_that_was_taken_out_is_given_back():
     assert np.ptp(radius(scaled)) < 0.1 * np.ptp(radius(kept))
     np.testing.assert_allclose(radius(back), radius(kept), rtol=0.02)
     assert back["pca"]["explained_variance_ratio"].values[0] > 0.8
+    position = scaled["registration"]["position"].values
+    for name in shapes:  # where the files lie, before and after
+        ends = [image_in_shape(position, s["registration"].sel(shape=name)) for s in (scaled, back)]
+        assert np.allclose(*ends, atol=1e-4)
     with pytest.raises(ValueError, match="size was not taken out"):
         statistics.with_size(kept)
 

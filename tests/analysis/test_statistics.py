@@ -14,7 +14,7 @@ from sklearn.svm import SVC
 
 from s4a import statistics, synthesize, synthetic, write_page
 from s4a.analysis import model, permutation
-from s4a.analysis.inputs import values_of
+from s4a.analysis.inputs import displacements_of, values_of
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.method.pca import center_gram, gram, gram_pca, pca, principal_components
 from s4a.schema import dataset
@@ -56,6 +56,38 @@ def smooth_noise(rng, u, s, size=0.1, waves=12):
         * np.einsum("swx,nw->snx", rng.normal(size=(s, waves, 3)), np.cos(u @ k.T + phase))
         / np.sqrt(waves)
     )
+
+
+def test_a_mode_of_a_regression_explains_what_covariates_leave_of_its_variable(planted):
+    whole = planted[0]
+    _, d, _ = displacements_of(whole)
+    rng = np.random.default_rng(0)
+    z = rng.normal(size=len(d))
+    x = z + 0.05 * rng.normal(size=len(d))
+    X, T = as_arrays(whole["registration"].to_dataset())
+    study = study_of(X, T, 0.001 * d + (x - z)[:, None, None] * X)
+    fit = statistics.regression(study, x, covariates={"z": z}, n_permutations=9)
+    assert fit.attrs["freed_deviation"] < 0.1 * fit.attrs["standard_deviation"]
+    modes = statistics.regression_modes(study, fit)["pca"]
+    assert 0.5 < modes["explained_variance_ratio"].item() <= 1
+
+
+def test_the_smallest_p_knows_of_a_symmetric_variable_and_of_constants():
+    assert permutation.smallest_p(999, np.arange(4)) == 2 / 24
+    assert permutation.smallest_p(999, np.array([0, 1, 2, 4])) == 1 / 24
+    x = permutation.indicators(list("aaabbb"))[1]
+    assert permutation.smallest_p(999, x, np.ones((6, 1))) == permutation.smallest_p(999, x) == 0.1
+
+
+def test_where_nothing_varies_a_test_of_vertices_finds_nothing():
+    x = permutation.indicators(list("aaabbb"))[1]
+    for z in (None, np.arange(6.0)[:, None]):
+        d = np.full((6, 3, 1), 0.1) * np.array([1, 1, 1, 1, 1, 1 + 1e-15])[:, None, None]
+        d[:, 2, 0] = [0, 0.1, 0, 3, 3.2, 3]
+        share, p, _ = permutation.vertex_test(d, x, covariates=z)
+        assert share[:2].tolist() == [0, 0]
+        assert p[:2].tolist() == [1, 1]
+        assert share[2] > 0.5
 
 
 def test_values_with_names_are_taken_by_name_in_whatever_order_they_come(family):

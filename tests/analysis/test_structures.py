@@ -199,7 +199,7 @@ def test_a_group_that_differs_in_poses_is_found_between_structures_and_not_withi
     assert p["within"] > 0.05
 
 
-def test_a_level_is_a_study_for_what_takes_one():
+def test_a_level_is_a_study_for_what_takes_one(tmp_path):
     study = tree_of(drawn(0, pose=1, shape=1))
     found = statistics.structures(study, n_permutations=9)
     of_level = statistics.structures_modes(study, found, "between")
@@ -208,6 +208,11 @@ def test_a_level_is_a_study_for_what_takes_one():
     assert triangles.max() == 2 * len(U) - 1
     moved = s4a.synthesize(of_level, [2.0])["position"].values
     assert np.allclose(moved, mean + 2 * deformation[0])
+    assert statistics.evaluate(of_level)["generalization"].sizes["component"] > 0
+    assert statistics.with_doubtful(of_level)["pca"].sizes == of_level["pca"].sizes
+    assert s4a.write_registered(of_level, tmp_path)[0].is_file()
+    with pytest.raises(ValueError, match="needs the motion of every shape"):
+        s4a.write_registered(of_level, tmp_path, frame="shape")
     part = statistics.within(of_level, found["structure_of_vertex"].values == 1)
     assert part["registration"].sizes["vertex"] == len(U)
     with pytest.raises(ValueError, match="level must be one of joint, between, within"):

@@ -63,6 +63,16 @@ def test_whole_numbers_that_no_integer_holds_are_numbers(tmp_path):
     assert read_table(file, ["a", "b"])["size"].values.tolist() == [1e30, -1.0]
 
 
+def test_digits_that_would_become_one_number_stay_apart(tmp_path):
+    file = tmp_path / "table.csv"
+    file.write_text("shape,who,age\na,90071992547409931,01\nb,90071992547409932,2\nc,-,3\n")
+    found = read_table(file, ["a", "b", "c"])
+    assert found["who"].values.tolist() == ["90071992547409931", "90071992547409932", ""]
+    assert found["age"].values.tolist() == [1, 2, 3]
+    file.write_text("shape,who\na,01\nb,1\nc,2\n")
+    assert read_table(file, ["a", "b", "c"])["who"].values.tolist() == ["01", "1", "2"]
+
+
 def test_what_says_that_a_value_is_missing_is_neither_number_nor_text(tmp_path):
     file = tmp_path / "table.csv"
     file.write_text("shape,age,site\na,NA,n/a\nb,31,Bern\nc,-,-\nd,,NaN\n")
