@@ -5,7 +5,7 @@ everywhere, and checks its input through :func:`require`.  A variable that is no
 not exist.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -248,7 +248,8 @@ ROWS = {
         "change of the field with one standard deviation of its score"),
     "field_score": ("shape component", ONE,
         "score of the field of each shape, in standard deviations"),
-    "singular_value": ("component", ONE, "covariance of the scores of field and shape, not standardized"),
+    "singular_value": ("component", ONE,
+        "covariance of the scores of field and shape, not standardized"),
     "singular_p": ("component", ONE, "p value of the permutation test of the singular value"),
     "covariance_share": ("component", ONE, "share of the squared covariance of field and shape"),
     "pair_correlation": ("component", ONE, "correlation of the scores of field and shape"),
@@ -575,6 +576,21 @@ def check_switch(name: str, value: object) -> None:
     """ValueError unless an option is True or False."""
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name} must be True or False; found {value!r}")
+
+
+def check_choice(name: str, value: object, legal: Collection[object]) -> None:
+    """ValueError unless an option is one of the legal choices.
+
+    Examples
+    --------
+    >>> from s4a.schema import check_choice
+    >>> check_choice("init", "landmark", ("dense", "landmarks"))
+    Traceback (most recent call last):
+    ValueError: init must be one of 'dense', 'landmarks'; found 'landmark'
+    """
+    if value not in legal:
+        choices = ", ".join(map(repr, legal))
+        raise ValueError(f"{name} must be one of {choices}; found {value!r}")
 
 
 def check_count(name: str, value: object, least: int = 0) -> None:

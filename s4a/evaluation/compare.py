@@ -4,6 +4,7 @@ All work on one cleaned input.  What the methods are is in :mod:`s4a.evaluation.
 """
 
 import io
+import logging
 import time
 import warnings
 from collections.abc import Mapping, Sequence
@@ -43,6 +44,8 @@ from s4a.schema import check_count, check_switch, dataset, require, variable
 from s4a.seeds import RNG, seed_of
 from s4a.study.options import PRESETS as STUDY_PRESETS
 from s4a.study.options import Options, apply_preset
+
+log = logging.getLogger(__name__)
 
 __all__ = ["COLLECTION_METHODS", "METHODS", "collection", "pair", "pairs"]
 
@@ -251,7 +254,8 @@ def pairs(
     n_coarse : int
         Vertices of the low-resolution mesh, and samples of SCALABLE.
     k_init, k : int
-        Sizes of the first and of the refined map.
+        Sizes of the first and of the refined map; as many as the meshes have functions, where these
+        are fewer.
     step : int
         Growth of the map per round of ZoomOut, as in :func:`s4a.analyse`.  Steps of 10 take half
         the time of that block of ZO and FMAP+ZO; on a child of 60,000 vertices in two poses they
@@ -280,7 +284,7 @@ def pairs(
         method, and ``block_seconds(way, pair, block)``, the blocks of Fig. 3, in CPU seconds of one
         core.  What two methods share, as the alignment or a basis, is made once and charged to
         both; the alignment only to those that use it, which with given landmarks are kNN, ZO and
-        registered.
+        registered.  The attribute ``note`` says where k had to be reduced.
 
         With `keep` this is ``/metrics`` of a tree, whose ``/source`` is the source's mesh and
         ``/pairs/<pair>`` the target's, with what :func:`kept` says.
@@ -312,7 +316,7 @@ def pairs(
     if keep and any("/" in str(name) for name in targets):
         raise ValueError(f"with keep=True names of pairs hold no '/'; found {', '.join(targets)}")
     options = {"k_init": k_init, "k": k, "step": step} | settings
-    rows, nodes = [], {}
+    rows, nodes, notes = [], {}, {}
     with threadpool_limits(1):
         mesh, load_source = load_mesh(source, "source")
         M = Spaces(mesh, n_coarse, k, seed)
@@ -335,15 +339,30 @@ def pairs(
                 M, N, methods, vertices, load, true, n_geodesic, options
             )
             rows.append(row)
+            notes[name] = row.attrs.pop("note", "")
             if keep:
                 nodes[f"pairs/{name}"] = kept(M.mesh, N.mesh, outcomes, true)
     table = xr.concat(rows, "pair", combine_attrs="drop_conflicts")
     attrs = options | {"n_coarse": n_coarse, "seed": seed}
     table = table.assign_coords(pair=list(targets)).transpose("way", "pair", ...)
-    table = table.assign_attrs(attrs)
+    table = table.assign_attrs(attrs | told(notes))
     if not keep:
         return table
     return xr.DataTree.from_dict({"metrics": table, "source": without_coords(M.mesh), **nodes})
+
+
+def note_on_k(k: int, least: int) -> str:
+    """What is told where meshes have fewer functions than k."""
+    return f"k = {k} reduced to {least}, the eigenfunctions that the smaller mesh has"
+
+
+def told(notes: Mapping[str, str]) -> dict[str, str]:
+    """Notes by what they are on, as an attribute and in the log; nothing where all are empty."""
+    note = "; ".join(f"{name}: {text}" for name, text in notes.items() if text)
+    if not note:
+        return {}
+    log.warning("%s", note)
+    return {"note": note}
 
 
 def without_coords(mesh: xr.Dataset) -> xr.Dataset:
@@ -463,6 +482,9 @@ def metrics_of_pair(
         seconds.append([spent.get(block, 0.0) for block in BLOCKS])
     table = xr.concat(rows, "way", combine_attrs="drop_conflicts")
     table["block_seconds"] = variable("block_seconds", np.array(seconds)[:, None]).isel(pair=0)
+    least = min((len(one.fmap) for one in both.spectral.values()), default=both.k)
+    if least < both.k:
+        table.attrs["note"] = note_on_k(both.k, least)
     return table.assign_coords(way=list(methods), block=list(BLOCKS)), outcomes
 
 
@@ -506,7 +528,8 @@ def collection(
         ``collection_chamfer(way, how, shape)``, eq. 9 between each shape and the image of the
         median shape, the template, as a share of sqrt(area), NaN for the template;
         ``collection_seconds(way, how, block)``, CPU seconds of one core, full resolution alone
-        differing by ``how``; ``median_shape(way)`` and ``distance_to_median(way, shape)``.
+        differing by ``how``; ``median_shape(way)`` and ``distance_to_median(way, shape)``.  The
+        attribute ``note`` says where k had to be reduced.
 
     Raises
     ------
@@ -548,7 +571,9 @@ def collection(
         rows = [
             one_collection(meshes, way, load, options) for way in tqdm(methods, desc="collection")
         ]
-    return xr.concat(rows, "way").assign_coords(way=list(methods))
+    notes = {way: row.attrs.pop("note", "") for way, row in zip(methods, rows, strict=True)}
+    table = xr.concat(rows, "way").assign_coords(way=list(methods))
+    return table.assign_attrs(told(notes))
 
 
 def one_collection(
@@ -563,6 +588,7 @@ def one_collection(
     spaces = [Spaces(mesh, options.n_coarse, options.k, options.seed) for mesh in meshes.values()]
     shapes = [space.local if way == "SCALABLE" else space.coarse for space in spaces]
     bases = [shape.low for shape in shapes]
+    k = min(options.k, *(basis.k for basis in bases))
     source, target, maps = first_maps(bases, options)
     network_seconds = time.process_time() - begin
 
@@ -572,13 +598,13 @@ def one_collection(
         maps,
         source,
         target,
-        options.k,
+        k,
         step=options.step,
         samples=[basis.spread_vertices(options.n_spread) for basis in bases],
         wide=options.wide,
     )
     found = dataset(latent_basis=Y, latent_eigenvalue=latent_eigenvalue).assign_coords(shape=names)
-    found = median.median_shape(found, np.stack([basis.eigenvalue for basis in bases]))
+    found = median.median_shape(found, np.stack([basis.eigenvalue[:k] for basis in bases]))
     zoomout_seconds = time.process_time() - begin
 
     template = names.index(found.attrs["median"])
@@ -597,12 +623,14 @@ def one_collection(
             "distance_to_median": found["distance_to_median"].variable,
         }
     )
+    if k < options.k:
+        measures.attrs["note"] = note_on_k(options.k, k)
     return measures.assign_coords(how=list(HOW), block=list(COLLECTION_BLOCKS), shape=names)
 
 
 def first_maps(bases: list[Basis], options: Options) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """First maps of a network, both ways: sources and targets ``(p,)``, maps ``(p, k, k)``."""
-    k_init = options.k_init
+    k_init = min(options.k_init, *(basis.k for basis in bases))
     distance = network.spectral_distance([basis.eigenvalue[:k_init] for basis in bases])
     reference = bases[int(np.argmin(distance.sum(1)))]
     motions = []

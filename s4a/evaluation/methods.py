@@ -95,7 +95,8 @@ class Clock:
 class Spaces:
     """A clean mesh and the shapes that the methods make of it, each made once.
 
-    ``clock`` holds what was spent on the ``sample`` and the ``basis`` of each.
+    Of a mesh with too few vertices for k functions they have as many as it can carry.  ``clock``
+    holds what was spent on the ``sample`` and the ``basis`` of each.
     """
 
     mesh: xr.Dataset
@@ -129,7 +130,7 @@ class Spaces:
     def _dense(self):
         X, T = as_arrays(self.mesh)
         E, w, area, _ = laplacian(X, T, vertex_areas(X, T))
-        eigenvalue, Phi = eigenpairs(E, w, area, self.k)
+        eigenvalue, Phi = eigenpairs(E, w, area, min(self.k, len(X) - 2))
         basis = Basis(self.X, T, area / area.sum(), Phi, eigenvalue)
         return Shape.of(self.mesh, low=basis, full=basis, U=None, cell=self.spread[2])
 
@@ -137,7 +138,8 @@ class Spaces:
     def local(self) -> Shape:
         """The samples of SCALABLE and its local functions."""
         parts = self.clock("local sample", local_space, self.mesh, self.n_coarse, self.seed)
-        return self.clock("local basis", spectral_space, self.mesh, *parts, self.k)
+        k = min(self.k, len(parts[0]) - 2)
+        return self.clock("local basis", spectral_space, self.mesh, *parts, k)
 
     @cached_property
     def sampled(self) -> xr.Dataset:
@@ -309,6 +311,8 @@ class Pair:
     def _match_spectrally(self, method, motion, landmarks):
         clock = Clock()
         M, N = self.shapes(method)
+        k = min(self.k, M.low.k, N.low.k)
+        k_init = min(self.k_init, k)
         kind = KINDS[method]
         parts = ("remeshed", kind) if kind in ("coarse", "lifted") else (kind,)
         for block in ("sample", "basis"):
@@ -317,17 +321,17 @@ class Pair:
                 clock.add(block, sum(spent))
         if method == "ZO":
             match, _ = clock("map", match_in_space, self.source, self.target, motion)
-            Phi, Psi = M.low.Phi[:, : self.k_init], N.low.Phi[:, : self.k_init]
+            Phi, Psi = M.low.Phi[:, :k_init], N.low.Phi[:, :k_init]
             C = clock("map", fmap.fmap_from_match, Phi, Psi, N.low.mass, match)
         elif self.init == "landmarks":
             if self.landmarks is None:  # of the meshes that the map is computed on
                 landmarks = clock("map", landmarks_after_motion, M.low.X, N.low.X, motion)
             else:
                 landmarks = at_low_resolution(M, N, landmarks)
-            ends = M.low.first(self.k_init), N.low.first(self.k_init)
+            ends = M.low.first(k_init), N.low.first(k_init)
             C = clock("map", fmap.fmap_from_landmarks, *ends, *landmarks)
         else:
-            C = clock("map", fit_map, M, N, landmarks, self.k_init)
+            C = clock("map", fit_map, M, N, landmarks, k_init)
         nearest = {
             "dense": lambda Q, D: nearest_in_cells(Q, N.cell, D, M.cell)[0],
             "local": nearest_rows,
@@ -337,13 +341,13 @@ class Pair:
         }[kind]
         first = C
         C, low_match = clock(
-            "refine", fmap.zoomout, M.low, N.low, C, self.k, step=self.step, nearest=nearest
+            "refine", fmap.zoomout, M.low, N.low, C, k, step=self.step, nearest=nearest
         )
         if kind == "lifted":
             for _ in range(self.sharpen):
                 C = clock("refine", sharpen_map, M, N, C, M.full.Phi)
         F = clock("full resolution", functions_at_all_vertices, M, C)
-        G = functions_at_all_vertices(N)
+        G = functions_at_all_vertices(N)[:, :k]
         match = low_match
         if kind != "dense":
             match, *_ = clock("full resolution", nearest_in_cells, G, N.cell, F, M.cell)
@@ -363,7 +367,8 @@ class Pair:
             "intrinsic": spectral.low_match,
             "icp": nearest_after_motion(M.low, N.low, motion),
         }
-        tried = clock("refine", find_candidates, M, N, starts, k=self.k)
+        k = len(spectral.fmap)
+        tried = clock("refine", find_candidates, M, N, starts, k=k)
         match, moved, _ = clock(
             "full resolution", register_surface, M, N, tried, spectral.functions, elastic=True
         )

@@ -17,6 +17,7 @@ POSITION_WEIGHT, NORMAL_WEIGHT = 5.0, 0.3
 # once surfaces lie on each other: enough for the right side of a thin part, and the noise of a
 # scan's normals, 0.1 and more, weighs no longer as much as several edges of 100,000 vertices
 CLOSE_WEIGHT = 0.05
+FLAT = 1e-14  # squared sine of the angle at A up to which a triangle is taken for a line
 
 
 def interpolate(
@@ -169,19 +170,15 @@ def closest_by_sides(
     ab, ac, ap : float ndarray (n, d)
         From A to B, to C and to the point.
     """
-
-    def ratio(a, b):
-        return np.clip(a / np.where(b == 0, 1, b), 0, 1)
-
     d1, d2 = dots(ab, ap), dots(ac, ap)
-    both = dots(ab, ac)
-    d3, d4 = d1 - dots(ab, ab), d2 - both  # of ab and ac with the way from B
-    d5, d6 = d1 - both, d2 - dots(ac, ac)  # and from C
+    both, of_ab, of_ac = dots(ab, ac), dots(ab, ab), dots(ac, ac)
+    d3, d4 = d1 - of_ab, d2 - both  # of ab and ac with the way from B
+    d5, d6 = d1 - both, d2 - of_ac  # and from C
     va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
     total = va + vb + vc
     v, w = ratio(vb, total), ratio(vc, total)  # interior
-    flat = total <= 0  # a degenerate triangle: its nearest corner, unless an edge below is nearer
-    v, w = np.where(flat, 0.0, v), np.where(flat, 0.0, w)
+    none = total <= 0  # by rounding: its nearest corner, unless an edge below is nearer
+    v, w = np.where(none, 0.0, v), np.where(none, 0.0, w)
     bc = (va <= 0) & (d4 - d3 >= 0) & (d5 - d6 >= 0)
     t = ratio(d4 - d3, (d4 - d3) + (d5 - d6))
     v, w = np.where(bc, 1 - t, v), np.where(bc, t, w)
@@ -196,7 +193,28 @@ def closest_by_sides(
     )
     for region, at_b, at_c in corners:
         v, w = np.where(region, at_b, v), np.where(region, at_c, w)
+    flat = np.flatnonzero(both * both >= (1 - FLAT) * of_ab * of_ac)
+    if len(flat):  # signs that tell the regions apart are those of rounding there
+        v[flat], w[flat] = closest_on_sides(ab[flat], ac[flat], ap[flat])
     return v, w
+
+
+def closest_on_sides(
+    ab: np.ndarray, ac: np.ndarray, ap: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """:func:`closest_by_sides` of degenerate triangles: the nearest point of the three sides."""
+    bc, zero = ac - ab, np.zeros(len(ab))
+    t = ratio(dots(bc, ap - ab), dots(bc, bc))
+    v = np.stack([ratio(dots(ab, ap), dots(ab, ab)), zero, 1 - t])  # (3 sides, n)
+    w = np.stack([zero, ratio(dots(ac, ap), dots(ac, ac)), t])
+    gap = np.linalg.norm(v[..., None] * ab + w[..., None] * ac - ap, axis=2)
+    nearest = gap.argmin(axis=0), np.arange(len(ab))
+    return v[nearest], w[nearest]
+
+
+def ratio(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The ratio a / b, from 0 to 1; 0 where both are 0."""
+    return np.clip(a / np.where(b == 0, 1, b), 0, 1)
 
 
 def dots(a: np.ndarray, b: np.ndarray) -> np.ndarray:

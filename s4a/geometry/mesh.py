@@ -29,11 +29,16 @@ def as_dataset(
 
 def as_arrays(mesh: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
     """Positions ``(n, 3)`` float64 and triangles ``(m, 3)`` int32 of a mesh Dataset."""
-    return mesh["position"].values, mesh["corner_vertex"].values
+    X, T = mesh["position"].values, mesh["corner_vertex"].values
+    return (
+        X.astype(np.float64, casting="same_kind", copy=False),
+        T.astype(np.int32, casting="same_kind", copy=False),
+    )
 
 
 def triangle_normals(X: np.ndarray, T: np.ndarray) -> np.ndarray:
     """Normals of the triangles ``(m, 3)``, as long as twice their area."""
+    X = np.asarray(X, float)  # products of integers may overflow
     a, b, c = (X.take(corner, axis=0) for corner in T.T)
     ux, uy, uz = (b - a).T
     vx, vy, vz = (c - a).T

@@ -31,7 +31,7 @@ def heat_filter(eigenvalue: np.ndarray, *others: np.ndarray, n: int = 100) -> np
     [[0.99, 0.01, 0.0], [1.0, 0.0, 0.0]]
     """
     spectra = (eigenvalue, *others)
-    shortest = 4 * np.log(10) / max(s[-1] for s in spectra)
+    shortest = 4 * np.log(10) / min(s[-1] for s in spectra)
     longest = 4 * np.log(10) / max(s[s > 0][0] for s in spectra)
     time = np.geomspace(shortest, longest, n)
     kernel = np.exp(-time[:, None] * eigenvalue)  # (n, k)

@@ -16,8 +16,15 @@ from s4a.geometry.align import Motion, align, farthest_points, realign, rigid_tr
 from s4a.geometry.closest import POSITION_WEIGHT
 from s4a.geometry.mesh import edges
 from s4a.method import fmap, joint
-from s4a.method.shape import Basis, common_fields, corresponding_landmarks, field_columns
+from s4a.method.shape import (
+    Basis,
+    common_fields,
+    corresponding_landmarks,
+    field_columns,
+)
+from s4a.schema import check_choice
 
+INITS = ("dense", "landmarks")  # what first maps are fitted on
 N_LANDMARKS = 10  # of step 3
 # Of a pair alone, in a far pose: signatures, functions by k_init, and weight of the orientation.
 # Signed mean curvature goes with each: front and back of a body differ by nothing else
@@ -114,6 +121,7 @@ def fit_after_motion(
     landmarks : tuple of int ndarray (10,), or None
         Of source and target, where it was fitted on them.
     """
+    check_choice("init", init, INITS)
     source = source.first(k_init)
     target = target.first(k_init)
     if init == "landmarks":

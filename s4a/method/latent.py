@@ -31,6 +31,8 @@ log = logging.getLogger(__name__)
 
 FINAL = 3  # shapes of a study in the last rounds of a new one, on all vertices
 TARGETS = 256  # shapes whose least squares are held at once, 0.3 GB of them
+WEIGHTS = ("cycles", "equal")  # of maps: by the errors of their cycles, or 1 for all
+PER_FUNCTION = 2  # samples, at least: the least squares of fewer are poor, or have no one solution
 WIDE = 4  # last rounds of Consistent ZoomOut, which look between the samples, too
 N_AROUND = 32  # vertices around a sample among which they look
 ROUGH, FINE = 1e-4, 1e-6  # tolerances of the latent basis: on the way, and at the end
@@ -245,8 +247,11 @@ def latent_basis(
 
 
 def latent_size(n_latent: int | None, k: int, k_final: int) -> int:
-    """Latent dimension at size k: all of it, or the share of it that `n_latent` is of `k_final`."""
-    return k if n_latent is None else max(1, round(k * n_latent / k_final))
+    """Latent dimension at size k: all of it, or the share of it that `n_latent` is of `k_final`.
+
+    Where `k_final` had to be reduced below `n_latent`, all of it.
+    """
+    return k if n_latent is None else min(k, max(1, round(k * n_latent / k_final)))
 
 
 def consistent_zoomout(
@@ -292,7 +297,8 @@ def consistent_zoomout(
     weights : {"cycles", "equal"}
         Of the maps, by their cycle errors, or 1 for all.
     samples : list of int ndarray, optional
-        Spread vertices of every shape; all vertices by default.
+        Spread vertices of every shape, 2 k or more of them where these are not all; all vertices by
+        default.
     wide : int
         Last rounds that look between the samples.
     n_jobs : int
@@ -308,6 +314,11 @@ def consistent_zoomout(
     weight, error : float ndarray (p,)
         Weights and cycle errors of the final maps.
     Y, latent_eigenvalue : as of :func:`latent_basis`
+
+    Raises
+    ------
+    ValueError
+        When samples are too few for maps of k functions.
     """
     cycles = three_cycles(source.tolist(), target.tolist())
     wide = 0 if samples is None else wide
@@ -318,6 +329,8 @@ def consistent_zoomout(
     ]
     eigenvalues = np.stack([one.eigenvalue for one in sampled])
     sizes = [*range(C.shape[1], k, step), k]
+    if samples is not None and len(sizes) > 1:
+        check_samples(sampled, k)
     wide_sizes = sizes[:-1][max(len(sizes) - 1 - wide, 0) :]
     for size, next_size in zip(
         sizes, [*sizes[1:], None], strict=True
@@ -352,6 +365,18 @@ class Sampled(NamedTuple):
     Phi: np.ndarray
     area: np.ndarray
     around: np.ndarray
+    n: int  # vertices of the shape
+
+
+def check_samples(sampled: list[Sampled], k: int) -> None:
+    """ValueError where a shape has samples, not all its vertices, too few for k functions."""
+    least = PER_FUNCTION * k
+    fewest = min((len(one.at) for one in sampled if len(one.at) < one.n), default=least)
+    if fewest < least:
+        raise ValueError(
+            f"maps of k = {k} functions need {least} spread vertices or more; found {fewest}: "
+            f"give n_spread={least} or more, n_spread=0 for all vertices, or a smaller k"
+        )
 
 
 def sample(basis: Basis, vertex: np.ndarray | None, k: int, n_around: int) -> Sampled:
@@ -359,12 +384,13 @@ def sample(basis: Basis, vertex: np.ndarray | None, k: int, n_around: int) -> Sa
     eigenvalue = basis.eigenvalue[:k]
     if vertex is None:
         every = np.arange(len(basis.area))
-        return Sampled(eigenvalue, every, basis.Phi, basis.area, every[:, None])
+        return Sampled(eigenvalue, every, basis.Phi, basis.area, every[:, None], len(every))
     around = vertex[:, None]
     if n_around > 1:
         first = np.arange(1, min(n_around, len(basis.X)) + 1)
         around = cKDTree(basis.X).query(basis.X[vertex], first)[1]
-    return Sampled(eigenvalue, vertex, basis.Phi[vertex], basis.area[vertex], around)
+    Phi, area = basis.Phi[vertex], basis.area[vertex]
+    return Sampled(eigenvalue, vertex, Phi, area, around, len(basis.area))
 
 
 def larger_maps(

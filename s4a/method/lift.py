@@ -16,7 +16,7 @@ from s4a.geometry.mesh import as_arrays, stiffness, vertex_areas
 from s4a.method.remesh import coarsen, laplacian
 from s4a.method.scalable import reduced
 from s4a.method.shape import Shape, features_of, vertices_of_landmarks
-from s4a.method.spectral import factor, spectrum
+from s4a.method.spectral import factor, spectrum, with_constant_first
 from s4a.schema import dataset
 
 SPARE = 10  # functions more than are asked for: the last ones of a span are the least exact
@@ -163,8 +163,11 @@ def lift(
     B = inverse_step(W, area, U, stiffness(E, w, len(a)), a / a.sum(), Phi, eigenvalue)
     zero = eigenvalue == 0
     B[:, zero] = U @ Phi[:, zero]  # the constants of the pieces are eigenfunctions as they are
-    eigenvalue, B = rayleigh_ritz(W, area, B, k)
-    eigenvalue[: zero.sum()] = 0.0  # descriptors would take rounding, 1e-5, for a frequency
+    n_zero = int(zero.sum())
+    eigenvalue, B = rayleigh_ritz(W, area, B, max(k, n_zero))
+    eigenvalue[:n_zero] = 0.0  # descriptors would take rounding, 1e-5, for a frequency
+    B[:, :n_zero] = with_constant_first(B[:, :n_zero], area)
+    eigenvalue, B = eigenvalue[:k], B[:, :k]
     third = np.einsum("n,nk,nk,nk->k", area.astype(B.dtype), B, B, B)  # moments: as in eigenpairs
     B *= np.where(third < 0, -1, 1).astype(B.dtype)
     return np.maximum(eigenvalue, 0.0), B

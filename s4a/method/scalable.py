@@ -25,6 +25,7 @@ from s4a.geometry.mesh import as_arrays, edge_graph, stiffness, unique_edges, ve
 from s4a.geometry.voronoi import add_samples, dual, farthest_of_each, voronoi_cells
 from s4a.method.remesh import check_clean, laplacian, sample_surface
 from s4a.method.shape import Basis, Shape
+from s4a.method.spectral import with_constant_first
 from s4a.schema import dataset, in_unit, require, unit_of
 
 log = logging.getLogger(__name__)
@@ -153,8 +154,9 @@ def reduced_eigenpairs(
     eigenvalue, Phi = eigenvalue[order], Phi[:, order]
     zero = np.abs(eigenvalue) < 1e-9 * max(eigenvalue[-1], 1.0)
     eigenvalue = np.where(zero, 0.0, eigenvalue)  # kernels would take rounding for a frequency
+    Phi[:, zero] = with_constant_first(Phi[:, zero], U.T @ area)
     Phi = Phi * np.where(area @ (U @ Phi) ** 3 < 0, -1.0, 1.0)
-    if zero.sum() == 1:
+    if zero.any():
         Phi[:, 0] = 1.0  # exactly, as in eigenpairs
     return eigenvalue, Phi, mass.tocsr()
 

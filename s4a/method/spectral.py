@@ -13,7 +13,7 @@ import scipy.sparse.linalg as spla
 import xarray as xr
 
 from s4a.geometry.mesh import stiffness
-from s4a.schema import dataset, require
+from s4a.schema import check_count, dataset, require
 
 log = logging.getLogger(__name__)
 
@@ -38,7 +38,8 @@ def eigenpairs(
     -------
     eigenvalue : float ndarray (k,)
     Phi : float ndarray (n, k)
-        Phi^T A Phi = I for areas of sum 1; the sign of a column makes its third moment positive.
+        Phi^T A Phi = I for areas of sum 1; the first is the constant 1, also where several pieces
+        have as many eigenvalues 0; the sign of a column makes its third moment positive.
     """
     n = len(area)
     a = area / area.sum()
@@ -53,10 +54,33 @@ def eigenpairs(
     eigenvalue = eigenvalue[order]
     Phi = V[:, order] / np.sqrt(a)[:, None]  # (n, k)
     eigenvalue = np.where(np.abs(eigenvalue) < 1e-9 * max(eigenvalue[-1], 1.0), 0.0, eigenvalue)
+    zero = eigenvalue == 0
+    Phi[:, zero] = with_constant_first(Phi[:, zero], a)
     Phi *= np.where(a @ Phi**3 < 0, -1.0, 1.0)
-    if (eigenvalue == 0).sum() == 1:
+    if zero.any():
         Phi[:, 0] = 1.0  # exactly, so that constants stay constant in every map
     return eigenvalue, Phi
+
+
+def with_constant_first(Z: np.ndarray, area: np.ndarray) -> np.ndarray:
+    """Functions ``(n, z)`` of eigenvalue 0, turned so that the first is the constant 1.
+
+    Of several pieces the solver gives any functions that are constant on each.
+
+    Parameters
+    ----------
+    Z : float ndarray (n, z)
+        Orthonormal.
+    area : float ndarray (n,)
+        Integrals of the functions that Z holds the coefficients of: vertex areas of sum 1.
+    """
+    if Z.shape[1] < 2:
+        return Z
+    c = Z.T @ area  # (z,), coefficients of the constant
+    Q = np.linalg.qr(np.column_stack([c, np.eye(len(c))]))[0]
+    if Q[:, 0] @ c < 0:
+        Q[:, 0] *= -1
+    return Z @ Q.astype(Z.dtype)
 
 
 def factor(S: sp.spmatrix) -> Callable[[np.ndarray], np.ndarray]:
@@ -130,7 +154,7 @@ def spectrum(mesh: xr.Dataset, *, k: int = 100) -> xr.Dataset:
     ----------
     mesh : xarray.Dataset
         Needs ``vertex_area``, ``edge_vertex`` and ``cotan_weight`` as :func:`s4a.coarsen` gives
-        them.
+        them.  A spectrum that it has is replaced, with all that depends on its modes.
     k : int
         Number of eigenpairs.  Where the mesh has too few vertices for it, as many as it can carry
         are given and the attribute ``k_reduced_from`` says so.
@@ -145,8 +169,8 @@ def spectrum(mesh: xr.Dataset, *, k: int = 100) -> xr.Dataset:
     Raises
     ------
     ValueError
-        When k is not a positive integer, the mesh has fewer than 3 vertices, or the solver finds no
-        eigenpairs.
+        When k is not a positive integer, the mesh has fewer than 3 vertices or is of samples of
+        SCALABLE, or the solver finds no eigenpairs.
 
     Examples
     --------
@@ -166,6 +190,11 @@ def spectrum(mesh: xr.Dataset, *, k: int = 100) -> xr.Dataset:
     require(mesh, "vertex_area", "edge_vertex", "cotan_weight", what="mesh")
     if int(k) != k or k < 1:
         raise ValueError(f"k must be a positive integer, found {k!r}")
+    if "edge_mass" in mesh:
+        raise ValueError(
+            "a low-resolution mesh of s4a.coarsen needed; samples of SCALABLE come with their "
+            "spectrum: make them anew with another k"
+        )
     n = mesh.sizes["vertex"]
     possible = min(int(k), n - 2)
     if possible < 1:
@@ -179,6 +208,8 @@ def spectrum(mesh: xr.Dataset, *, k: int = 100) -> xr.Dataset:
         raise ValueError(
             f"no {possible} eigenpairs of a mesh with {n} vertices: {error}"
         ) from error
+    mesh = mesh.drop_dims("mode", errors="ignore")  # of the spectrum before
+    mesh.attrs.pop("k_reduced_from", None)
     attrs = dict(mesh.attrs, zero_eigenvalues=int((eigenvalue == 0).sum()))
     if possible < k:
         log.warning("k reduced from %d to %d: the mesh has only %d vertices", k, possible, n)
@@ -226,6 +257,11 @@ def reconstruct(mesh: xr.Dataset, f: np.ndarray, *, k: int | None = None) -> np.
     -------
     float ndarray, of the shape of `f`
 
+    Raises
+    ------
+    ValueError
+        When the mesh lacks its variables, or k is not a positive integer.
+
     Examples
     --------
     The positions of a sphere are eigenfunctions, so that four of them are enough:
@@ -245,8 +281,10 @@ def reconstruct(mesh: xr.Dataset, f: np.ndarray, *, k: int | None = None) -> np.
     <Parts ...>
     """
     require(mesh, "eigenfunction", "vertex_area", what="mesh")
-    Phi = mesh["eigenfunction"].values[:, :k]
-    return Phi @ project(Phi, unit_mass(mesh), np.asarray(f, float))
+    if k is not None:
+        check_count("k", k, 1)
+    Phi, f = mesh["eigenfunction"].values[:, :k], np.asarray(f, float)
+    return (Phi @ project(Phi, unit_mass(mesh), f)).reshape(f.shape)
 
 
 def weyl(k: int) -> np.ndarray:

@@ -13,13 +13,23 @@ from threadpoolctl import threadpool_limits
 
 from s4a.geometry.align import Motion, align, motion_between, realign
 from s4a.method import fmap, network
-from s4a.method.first_map import first_map, fit_after_motion, motion_onto
-from s4a.method.latent import WIDE, consistent_zoomout
-from s4a.method.median import median_shape
-from s4a.method.register import from_latent, identity, match_functions, match_low
+from s4a.method.first_map import INITS, first_map, fit_after_motion, motion_onto
+from s4a.method.latent import WEIGHTS, WIDE, consistent_zoomout
+from s4a.method.median import NORMS, median_shape
+from s4a.method.register import WORDS, from_latent, identity, match_functions, match_low
 from s4a.method.shape import N_SPREAD, Basis, Shape
-from s4a.schema import dataset, require
+from s4a.schema import check_choice, check_count, dataset, require
 
+REGISTRATION: dict[str, Callable[[str], Any]] = {  # options in a report, from their words
+    "refine": str,
+    "scale": "True".__eq__,
+    "parts": "True".__eq__,
+    "alignment": str,
+    "how": str,
+    "area_weighted": "True".__eq__,
+    "n_projected": int,
+}
+PROJECTION = ("area_weighted", "n_projected")  # those of a Shape
 LOW = ("position", "corner_vertex", "vertex_area", "eigenvalue", "eigenfunction")
 
 
@@ -173,7 +183,7 @@ def build_network(
     Raises
     ------
     ValueError
-        When a mesh lacks its variables, or the pairs cannot connect the shapes.
+        When a mesh lacks its variables, `init` is none, or the pairs cannot connect the shapes.
 
     Examples
     --------
@@ -198,6 +208,7 @@ def build_network(
     >>> charts.network(charts.on_circle(6), names, source, target, errors)
     <Figure ...>
     """
+    check_choice("init", init, INITS)
     bases = bases_of(coarse)
     names = list(bases)
     k_init = min(k_init, *(basis.k for basis in bases.values()))
@@ -261,7 +272,8 @@ def refine_network(
     Raises
     ------
     ValueError
-        When a mesh or the network lacks its variables.
+        When a mesh or the network lacks its variables, or an option is outside its range: k is at
+        least the size of the first maps, and at most half of `n_spread` where that is not 0.
 
     Examples
     --------
@@ -280,6 +292,12 @@ def refine_network(
     >>> s4a.show.charts.network(s4a.show.charts.on_circle(3), names, source, target, errors)
     <Figure ...>
     """
+    check_choice("weights", weights, WEIGHTS)
+    check_choice("norm", norm, NORMS)
+    check_count("k", k, 1)
+    check_count("step", step, 1)
+    if n_latent is not None and n_latent > k:
+        raise ValueError(f"n_latent must be at most k = {k}; found {n_latent}")
     require(first, "source", "target", "fmap_initial", what="network")
     for name, mesh in coarse.items():
         require(mesh, *LOW, what=f"coarse mesh {name}")
@@ -288,6 +306,8 @@ def refine_network(
     source = np.array([names.index(name) for name in first["source"].values])
     target = np.array([names.index(name) for name in first["target"].values])
     C_initial = first["fmap_initial"].values  # (p, k_init, k_init)
+    if k < C_initial.shape[1]:
+        raise ValueError(f"k must be at least {C_initial.shape[1]}, as first maps; found {k}")
     rounds = {}
 
     def keep(C, Y, latent_eigenvalue):
@@ -331,13 +351,50 @@ def refine_network(
     )
 
 
-def shape_in(study: xr.DataTree, name: str) -> Shape:
-    """A shape of a study at both resolutions; ValueError where the study has none of that name."""
+def shape_in(study: xr.DataTree, name: str, **projection: Any) -> Shape:
+    """A shape of a study at both resolutions; ValueError where the study has none of that name.
+
+    Its fields are projected as `projection` says, see :class:`s4a.method.shape.Shape`.
+    """
     for stage in ("original", "coarse"):
         if stage not in study.children or name not in study[stage].children:
             known = ", ".join(study[stage].children) if stage in study.children else "no such node"
             raise ValueError(f"a study with /{stage}/{name} is needed; this one has {known}")
-    return Shape(study["original"][name].to_dataset(), study["coarse"][name].to_dataset())
+    original, coarse = (study[stage][name].to_dataset() for stage in ("original", "coarse"))
+    return Shape(original, coarse, **projection)
+
+
+def options_of_registration(study: xr.DataTree) -> dict[str, Any]:
+    """The options that registrations of a study were made with, as far as its report names them."""
+    words = study["report"].attrs if "report" in study else {}
+    return {name: kind(words[name]) for name, kind in REGISTRATION.items() if name in words}
+
+
+def template_of(study: xr.DataTree) -> str:
+    """The template of a study: that of its registration, or the median shape."""
+    if "registration" in study and "template" in study["registration"].attrs:
+        return study["registration"].attrs["template"]
+    return study["latent"].attrs["median"]
+
+
+def aligned(study: xr.DataTree, source: str, target: str) -> Motion | None:
+    """Motion of a shape of a study onto another by those of its network; None where it has none.
+
+    Both were moved onto one reference; a shape apart from the network is moved there first.
+    """
+    network = study["network"].dataset if "network" in study else xr.Dataset()
+    if "icp_rotation" not in network:
+        return None
+    motions = []
+    for name in (source, target):
+        if name in network["shape"]:
+            placed = network.sel(shape=name)
+            motion = placed["icp_rotation"].values, placed["icp_translation"].values
+        else:
+            reference = network.attrs["reference"]
+            motion = motion_onto(shape_in(study, name).low, shape_in(study, reference).low)
+        motions.append(motion)
+    return motion_between(*motions)
 
 
 def latent_bases(study: xr.DataTree, *names: str) -> tuple[Any, ...]:
@@ -384,7 +441,7 @@ def latent_match(
     Raises
     ------
     ValueError
-        When a shape is not in the study, or `how` is another.
+        When a shape is not in the study, or `how` is another word.
 
     Examples
     --------
@@ -394,8 +451,6 @@ def latent_match(
     >>> match.sizes["vertex"] == study["original/brain_02"].sizes["vertex"]
     True
     """
-    if how not in ("ours", "standard"):
-        raise ValueError(f"how must be 'ours' or 'standard', found {how!r}")
     shapes = shape_in(study, source), shape_in(study, target)
     match, functions = match_low(*shapes, latent_bases(study, source, target), how=how)
     if full:
@@ -447,24 +502,30 @@ def register_shape(
     template: str | None = None,
     *,
     start: Motion | None = None,
-    how: str = "ours",
+    how: str | None = None,
     **options: Any,
 ) -> xr.Dataset:
     """One shape of a study registered to the template (4.2; eq. 6, 7 and 8).
 
+    By default as the study has it, with the options of its report.
+
     Parameters
     ----------
     study : xarray.DataTree
-        With ``/original``, ``/coarse`` and ``/latent``.
+        With ``/original``, ``/coarse`` and ``/latent``; ``/network``, ``/registration`` and
+        ``/report``, as far as it has them, say what is the default of the others.
     name, template : str
-        The median shape is the template by default.
+        The template of the study by default; the median shape, where nothing is registered yet.
     start : tuple (R, t), optional
-        About the rigid motion of the shape onto the template, between their frames; found by ICP
-        from the principal axes by default.
-    how : {"ours", "standard"}
+        About the rigid motion of the shape onto the template, between their frames; by default that
+        by which the network is aligned, or where there is none that of ICP from the principal axes.
+    how : {"ours", "standard"}, optional
         Eq. 7, or eq. 3 and 4.
     **options
-        Of :func:`s4a.method.register.register`: ``refine``, ``scale``, ``parts``, ``alignment``.
+        ``refine``, ``scale``, ``parts`` and ``alignment`` of
+        :func:`s4a.method.register.register`; ``n_projected`` and ``area_weighted`` of
+        :class:`s4a.method.shape.Shape`.  One that is not given, or as None, is that of the study's
+        report, as `how` is; their own defaults hold where it names none.
 
     Returns
     -------
@@ -474,7 +535,9 @@ def register_shape(
     Raises
     ------
     ValueError
-        When a shape is not in the study.
+        When a shape is not in the study, or an option is none of its choices.
+    TypeError
+        When an option is another.
 
     Examples
     --------
@@ -483,17 +546,26 @@ def register_shape(
     >>> s4a.register_shape(study, "brain_02")["displacement"].dims
     ('vertex', 'xyz')
     """
-    template = study["latent"].attrs["median"] if template is None else template
-    target = shape_in(study, template)
+    wrong = [option for option in options if option not in REGISTRATION]
+    if wrong:
+        raise TypeError(
+            f"unexpected options {', '.join(wrong)}; those of a registration are "
+            f"{', '.join(REGISTRATION)}"
+        )
+    given = {key: value for key, value in (options | {"how": how}).items() if value is not None}
+    options = options_of_registration(study) | given
+    for option in WORDS.keys() & options.keys():
+        check_choice(option, options[option], WORDS[option])
+    projection = {key: options.pop(key) for key in PROJECTION if key in options}
+    template = template_of(study) if template is None else template
+    target = shape_in(study, template, **projection)
     if name == template:
         return identity(target)
-    source = shape_in(study, name)
+    source = shape_in(study, name, **projection)
+    bases = latent_bases(study, name, template)
     M = source.low
     N = target.low
-    bases = latent_bases(study, name, template)
     with threadpool_limits(1):
-        if start is None:
-            motion = motion_onto(M, N)
-        else:
-            motion = realign(M.cloud, N.cloud, start)
-        return from_latent(source, target, bases, motion, how=how, **options)
+        start = aligned(study, name, template) if start is None else start
+        motion = motion_onto(M, N) if start is None else realign(M.cloud, N.cloud, start)
+        return from_latent(source, target, bases, motion, **options)

@@ -15,19 +15,20 @@ import xarray as xr
 from s4a.input.clean import check_components
 from s4a.input.files import slug
 from s4a.input.labels import check_label
+from s4a.method.first_map import INITS
+from s4a.method.latent import PER_FUNCTION, WEIGHTS
 from s4a.method.median import NORMS
+from s4a.method.register import WORDS
 from s4a.method.shape import N_CENTRAL, N_SPREAD, Shape
-from s4a.schema import check_count, check_switch, check_text
+from s4a.schema import check_choice, check_count, check_switch, check_text
 from s4a.seeds import RNG, seeded
 
 CHOICES = {
     "method": ("rematch", "scalable"),
-    "init": ("dense", "landmarks"),
+    "init": INITS,
     "ahead": ("always", "network", "never"),
-    "weights": ("cycles", "equal"),
-    "refine": ("elastic", "joint", "intrinsic"),
-    "alignment": ("fitted", "icp"),
-    "how": ("ours", "standard"),
+    "weights": WEIGHTS,
+    **WORDS,
     "norm": tuple(NORMS),
     "preset": (None, "paper", "fast"),
     "doubtful": ("apart", "stop"),
@@ -255,9 +256,8 @@ class Options:
     def _check_choices(self):
         for name, legal in CHOICES.items():
             value = getattr(self, name)
-            if value not in legal and not (value is None and name in PRESETS[None]):
-                choices = ", ".join(map(repr, legal))
-                raise ValueError(f"{name} must be one of {choices}; found {value!r}")
+            if value is not None or name not in PRESETS[None]:
+                check_choice(name, value, legal)
 
     def _check_numbers(self):
         for name, least in LOWEST.items():
@@ -269,6 +269,18 @@ class Options:
             raise ValueError(f"k must be at least k_init = {self.k_init}; found {self.k}")
         if self.n_latent is not None and self.n_latent > self.k:
             raise ValueError(f"n_latent must be at most k = {self.k}; found {self.n_latent}")
+        own = (PRESETS[None] | PRESETS[self.preset])["n_spread"]
+        if self.n_spread != own:  # pairs, of any k, take no notice of a default
+            self.check_spread()
+
+    def check_spread(self) -> None:
+        """ValueError where Consistent ZoomOut would have too few spread vertices for k."""
+        least = min(PER_FUNCTION * self.k, self.n_coarse)
+        if 0 < self.n_spread < least:
+            raise ValueError(
+                f"n_spread must be 0, for all vertices, or at least {least}, for k = {self.k}; "
+                f"found {self.n_spread}"
+            )
 
     @property
     def of_cleaning(self) -> dict[str, Any]:

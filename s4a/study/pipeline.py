@@ -128,7 +128,7 @@ def analyse(
         that is matched on its own (default), those of the network alone, as in the paper, or none.
     n_spread : int, optional
         Vertices on which Consistent ZoomOut looks for matches (eq. 3), and the step ahead of near
-        poses, 1000 by default; 0 for all.
+        poses, 1000 by default and 2 k at least; 0 for all.
     wide : int, optional
         Its last rounds in which these look between the samples, too, 4 by default.
     sharpen : int, optional
@@ -251,6 +251,7 @@ def analyse(
             loaded = {n.path: n.to_dataset(inherit=False).load() for n in study.subtree}
             return xr.DataTree.from_dict(loaded)
     settings = Options(**options)
+    settings.check_spread()
     if settings.wrap:
         check_wrap()
     if structures is not None:

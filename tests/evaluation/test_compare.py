@@ -195,6 +195,30 @@ def test_both_ways_to_full_resolution_share_all_but_the_last_block(three_brains)
         assert found["distance_to_median"].sel(way=way).idxmin().item() == template
 
 
+def test_small_meshes_are_compared_in_as_many_functions_as_they_have_and_a_note_says_so(caplog):
+    few, more = synthetic.ellipsoid(60), synthetic.ellipsoid(90, (1.3, 1.1, 1.0))
+    for source, target in ((few, more), (more, few)):
+        found = compare.pair(source, target, n_geodesic=20)
+        assert found["way"].values.tolist() == list(compare.METHODS)
+        assert np.isfinite(found["chamfer"]).all()
+        note = "pair: k = 100 reduced to 58, the eigenfunctions that the smaller mesh has"
+        assert found.attrs["note"] == note
+        assert note in caplog.text
+    itself = compare.pair(few, few, truth=np.arange(60), n_geodesic=20)
+    assert (itself["geodesic_error"].sel(way=["ZO", "RE-MATCH", "registered"]) == 0).all()
+    enough = compare.pair(few, more, methods=["ZO"], k=20, n_geodesic=20)
+    assert "note" not in enough.attrs
+
+
+def test_a_collection_of_small_meshes_is_compared_in_as_many_functions_as_all_have(caplog):
+    found = compare.collection(synthetic.brains(3, 300), n_coarse=100)
+    assert found["collection_chamfer"].notnull().sum() == 8
+    assert "RE-MATCH: k = 100 reduced to" in found.attrs["note"]
+    assert found.attrs["note"] in caplog.text
+    few = compare.collection(synthetic.brains(3, 300), n_coarse=100, k=30)
+    assert "note" not in few.attrs
+
+
 def test_the_space_of_a_mesh_itself_has_no_projection():
     dense = Spaces(synthetic.sphere(500), k=9).dense
     assert dense.U is None

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from s4a import synthetic
-from s4a.geometry.closest import feature_tree, match_surfaces
+from s4a.geometry.closest import closest_point_on_triangles, feature_tree, match_surfaces
 from s4a.geometry.mesh import as_arrays, vertex_normals
 
 
@@ -25,6 +25,39 @@ def test_a_smooth_surface_finds_its_vertices_on_a_rough_one(ball):
     ).mean() > 0.93
     by_normals_too = feature_tree(rough, T).query(feature_tree(X, T).data)[1]
     assert (by_normals_too == here).mean() < 0.75
+
+
+def on_grid(P, A, B, C, n=200):
+    """Least distance of a point from a triangle, by its points on a grid."""
+    i, j = np.array([(i, j) for i in range(n + 1) for j in range(n + 1 - i)]).T / n
+    return np.linalg.norm(A + i[:, None] * (B - A) + j[:, None] * (C - A) - P, axis=1).min()
+
+
+@pytest.mark.parametrize("d", [2, 3, 6])
+@pytest.mark.parametrize("shape", ["A = B", "B = C", "A = C", "all one", "a line", "a triangle"])
+def test_the_closest_point_is_found_on_triangles_of_any_shape(shape, d):
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        P, A, B, C = rng.normal(size=(4, d))
+        if shape == "all one":
+            B = C = A
+        elif shape == "a line":
+            A, B, C = rng.integers(0, 5, (3, 1)) / 4 * rng.normal(size=d)
+        else:
+            A, B, C = {"A = B": (A, A, C), "B = C": (A, B, B), "A = C": (A, B, A)}.get(
+                shape, (A, B, C)
+            )
+        weights = closest_point_on_triangles(*(one[None] for one in (P, A, B, C)))[0]
+        assert weights.sum() == pytest.approx(1)
+        assert (weights >= 0).all()
+        gap = np.linalg.norm(weights @ [A, B, C] - P)
+        least = on_grid(P, A, B, C)
+        assert least - 0.02 < gap < least + 1e-9
+
+
+def test_the_closest_point_of_a_segment_as_a_triangle_lies_within_it():
+    P, A, C = np.array([[0.5, 1, 0]]), np.zeros((1, 3)), np.array([[1.0, 0, 0]])
+    assert closest_point_on_triangles(P, A, A, C).tolist() == [[0.5, 0, 0.5]]
 
 
 def test_the_right_side_of_a_thin_wall_is_found(ball):

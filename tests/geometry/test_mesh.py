@@ -2,11 +2,14 @@
 
 import numpy as np
 import pytest
+import xarray as xr
 from scipy.sparse.csgraph import dijkstra
 
 import s4a
+from s4a.evaluation.metrics import evaluate
 from s4a.geometry.mesh import (
     as_arrays,
+    as_dataset,
     counting_order,
     directed_edges,
     edge_graph,
@@ -14,8 +17,43 @@ from s4a.geometry.mesh import (
     equal_rows,
     lexical_order,
     path_lengths,
+    triangle_areas,
     unique_edges,
 )
+
+
+def whole(kind):
+    """An ellipsoid whose positions are whole numbers of that kind."""
+    X, T = as_arrays(s4a.synthetic.ellipsoid(300))
+    mesh = as_dataset(X, T.astype(np.int64))
+    return mesh.assign(
+        position=(mesh["position"].dims, np.round(10_000 * X).astype(kind)),
+        corner_vertex=(mesh["corner_vertex"].dims, T.astype(np.int64)),
+    )
+
+
+def test_arrays_of_a_mesh_have_one_kind_and_are_no_copies_of_what_has_it():
+    X, T = as_arrays(whole(np.int16))
+    assert (X.dtype, T.dtype) == (np.float64, np.int32)
+    mesh = s4a.synthetic.ellipsoid(300)
+    for values, name in zip(as_arrays(mesh), ("position", "corner_vertex"), strict=True):
+        assert np.shares_memory(values, mesh[name].values)
+    with pytest.raises(TypeError, match="Cannot cast"):
+        as_arrays(mesh.assign(corner_vertex=mesh["corner_vertex"] + 0.5))
+
+
+@pytest.mark.parametrize("kind", [np.int16, np.int64, np.float32])
+def test_positions_of_any_kind_are_those_numbers(kind):
+    mesh, same = whole(kind), whole(np.float64)
+    assert s4a.coarsen(mesh, n_coarse=100).identical(s4a.coarsen(same, n_coarse=100))
+    found, expected = (
+        s4a.match_pair(one, one, n_coarse=100, k=10, k_init=6) for one in (mesh, same)
+    )
+    xr.testing.assert_identical(found, expected)
+    match = np.arange(300)[::-1]
+    xr.testing.assert_identical(*(evaluate(one, one, match) for one in (mesh, same)))
+    X, T = mesh["position"].values, mesh["corner_vertex"].values
+    assert np.array_equal(triangle_areas(X, T), triangle_areas(*as_arrays(same)))
 
 
 @pytest.fixture(scope="module")

@@ -97,7 +97,15 @@ def test_both_spectra_of_a_pair_are_filtered_at_the_same_times_and_energies():
         np.exp(-t)
         for t in np.diff(np.log(descriptors.heat_filter(low, high, n=7)[:, 1:3]), axis=1)[:, 0]
     ]
-    assert np.log(heat) == pytest.approx(np.geomspace(4 * np.log(10) / 30, 4 * np.log(10) / 2, 7))
+    assert np.log(heat) == pytest.approx(np.geomspace(4 * np.log(10) / 9, 4 * np.log(10) / 2, 7))
+
+
+def test_a_shape_fits_itself_with_fewer_functions_by_either_kernel(brains):
+    mesh = brains[0]
+    few = mesh.isel(mode=slice(20))
+    for kind in ("hks", "wks"):
+        C = fmap.fit_descriptors(few, mesh, k=20, kind=kind)["fmap"].values
+        assert np.linalg.norm(C - np.eye(20)) < 0.01, kind
 
 
 def test_modes_of_eigenvalue_0_take_no_part_in_the_wave_kernel():

@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+import s4a
 from s4a import coarsen, reconstruct, spectrum, synthetic
-from s4a.geometry.mesh import cotan_weights, vertex_areas
+from s4a.geometry.mesh import as_dataset, cotan_weights, vertex_areas
 from s4a.method import spectral
+from s4a.method.lift import low_resolution
 from s4a.schema import dataset
 
 SPHERE = np.repeat([0.0, 2.0, 6.0, 12.0], [1, 3, 5, 7]) * 4 * np.pi  # l (l + 1), for unit area
@@ -107,6 +109,18 @@ def test_functions_in_the_span_are_reconstructed_exactly(ellipsoid):
     assert reconstruct(ellipsoid, np.full(900, 7.0), k=1) == pytest.approx(np.full(900, 7.0))
 
 
+def test_what_is_reconstructed_has_the_shape_of_what_is_given(ellipsoid):
+    f = ellipsoid["eigenfunction"].values @ np.random.default_rng(2).normal(size=(20, 9))
+    f = f.reshape(900, 3, 3)
+    assert reconstruct(ellipsoid, f) == pytest.approx(f, abs=1e-9)
+
+
+@pytest.mark.parametrize("k", [0, -3, 2.5])
+def test_no_function_is_reconstructed_from_fewer_than_one_other(ellipsoid, k):
+    with pytest.raises(ValueError, match="k must be an integer of at least 1"):
+        reconstruct(ellipsoid, np.ones(900), k=k)
+
+
 def test_reconstruction_from_more_functions_is_nearer(ellipsoid):
     X = ellipsoid["position"].values
     error = [np.linalg.norm(reconstruct(ellipsoid, X, k=k) - X) for k in (1, 4, 20)]
@@ -119,11 +133,56 @@ def test_two_pieces_have_two_zero_eigenvalues_and_the_mesh_says_so():
     assert two.attrs["zero_eigenvalues"] == 2
 
 
+def pieces(*places, n=150):
+    """Ellipsoids of several sizes at several places, as one mesh."""
+    X, T = arrays(synthetic.ellipsoid(n))
+    X = [X * (1 + 0.2 * i) + [place, 0, 0] for i, place in enumerate(places)]
+    return as_dataset(np.concatenate(X), np.concatenate([T + i * n for i in range(len(places))]))
+
+
+@pytest.mark.parametrize("options", [{}, {"method": "scalable"}, {"lift": True}])
+@pytest.mark.parametrize("k", [2, 10])
+def test_the_first_function_of_several_pieces_is_the_constant_whatever_the_space(options, k):
+    low = low_resolution(pieces(0, 4, 9), n_coarse=300, k=k, **options)
+    Phi, A = low["eigenfunction"].values, spectral.unit_mass(low)
+    assert low["eigenvalue"].values[:2].tolist() == [0, 0]
+    assert Phi[:, 0] == pytest.approx(np.ones(len(Phi)), abs=1e-4)
+    A = A if A.ndim == 2 else np.diag(A)
+    assert Phi.T @ (A @ Phi) == pytest.approx(np.eye(k), abs=1e-4)
+
+
+def test_landmark_maps_of_shapes_of_several_pieces_carry_constants_to_constants():
+    shapes = {"a": pieces(0, 4), "b": pieces(0, 5)}
+    coarse = {n: spectrum(coarsen(mesh, n_coarse=200), k=10) for n, mesh in shapes.items()}
+    of_one = {  # coefficients of the function 1
+        n: spectral.unit_area(mesh) @ mesh["eigenfunction"].values[:, :6]
+        for n, mesh in coarse.items()
+    }
+    network = s4a.build_network(coarse, k_init=6, init="landmarks", ahead=False)
+    for i, j, C in zip(
+        *(network[name].values for name in ("source", "target", "fmap_initial")), strict=True
+    ):
+        assert C @ of_one[i] == pytest.approx(of_one[j], abs=1e-9)
+
+
 def test_a_mesh_with_fewer_vertices_than_k_gives_what_it_can_and_says_so(caplog):
     mesh = spectrum(prepared(*arrays(synthetic.sphere(30))), k=100)
     assert mesh.sizes["mode"] == 28
     assert mesh.attrs["k_reduced_from"] == 100
     assert "28" in caplog.text
+
+
+def test_a_spectrum_asked_for_again_replaces_the_one_before():
+    mesh = prepared(*arrays(synthetic.sphere(30)))
+    again = spectrum(spectrum(mesh, k=100), k=5)
+    assert again.identical(spectrum(mesh, k=5))
+    assert spectrum(again, k=12).identical(spectrum(mesh, k=12))
+
+
+def test_samples_of_scalable_keep_the_spectrum_that_they_come_with():
+    low = low_resolution(synthetic.sphere(200), method="scalable", n_coarse=100, k=5)
+    with pytest.raises(ValueError, match="samples of SCALABLE come with their spectrum"):
+        spectrum(low, k=6)
 
 
 @pytest.mark.parametrize("k", [0, -3, 2.5])
