@@ -117,7 +117,10 @@ def judge(answer: Any, expected: Any, hint: str = "", *, within: float = 0.01) -
     if answer is ...:
         return Said(f"No answer yet: put yours in the place of the dots of `answer = ...`.{hint}")
     if callable(expected):
-        right = bool(expected(answer))
+        try:
+            right = bool(expected(answer))
+        except (TypeError, ValueError, IndexError, AttributeError):  # of an answer of another kind
+            right = False
     elif np.asarray(expected).dtype.kind in "iuf":
         right = _near(answer, np.asarray(expected, float), within)
     else:
@@ -134,17 +137,27 @@ def _shown(message):
     return error
 
 
+def _shape(answer):
+    """The shape of an answer as an array; None where its rows are of several lengths."""
+    try:
+        return np.shape(answer)
+    except ValueError:
+        return None
+
+
 def _near(answer, expected, within):
+    if _shape(answer) != expected.shape:
+        return False
     answer = np.asarray(answer)
-    if answer.dtype.kind not in "iuf" or answer.shape != expected.shape:
+    if answer.dtype.kind not in "iuf":
         return False
     return bool((np.abs(answer - expected) <= within * np.abs(expected).max(initial=0)).all())
 
 
 def _told(answer):
     """The answer in a few words."""
-    shape = np.shape(answer) if not isinstance(answer, str | dict | set) else ()
-    return f"an array of shape {shape}" if len(shape) else f"{answer!r:.60}"
+    shape = _shape(answer) if not isinstance(answer, str | dict | set) else ()
+    return f"an array of shape {shape}" if shape else f"{answer!r:.60}"
 
 
 def _rms(brain, k):
@@ -247,9 +260,10 @@ EXERCISES = {
         "np.linalg.norm gives the Frobenius norm; C acts first",
     ),
     "04.3": Exercise(
-        lambda C, C_mirror: [i for i in range(1, 9) if C[i, i] * C_mirror[i, i] < 0],
+        lambda C, C_mirror: (
+            lambda modes: sorted(modes) == [i for i in range(1, 9) if C[i, i] * C_mirror[i, i] < 0]
+        ),
         "an odd mode has diagonal entries of opposite sign in the two matrices",
-        0,
     ),
     "05.1": Exercise(lambda: 17, "once before each growth of C, and once for the final C", 0),
     "05.2": Exercise(

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from matplotlib import rc_context
+from matplotlib import colormaps, rc_context
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Colormap, Normalize
@@ -60,6 +60,20 @@ def on_circle(n: int) -> np.ndarray:
     return np.stack([np.sin(angle), np.cos(angle)], axis=1)
 
 
+def reach(values: np.ndarray, share: float) -> float:
+    """The `share` quantile of the absolute numbers that are not NaN; 0 where all are.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.show.charts import reach
+    >>> reach(np.array([-2.0, np.nan, 1.0, 0.0]), 0.5)
+    1.0
+    """
+    known = np.abs(values)[~np.isnan(values)]
+    return float(np.quantile(known, share)) if known.size else 0.0
+
+
 def surfaces(
     meshes: dict[str, xr.Dataset],
     values: dict[str, np.ndarray] | None = None,
@@ -81,9 +95,9 @@ def surfaces(
     values : dict of str to float ndarray, optional
         For the same titles colours ``(vertex, 3)``, or signed numbers ``(vertex,)``: these are
         drawn on one scale from -`limit` to `limit`, blue positive, with a colour bar; of numbers
-        that are nowhere negative the bar begins at 0.
+        that are nowhere negative the bar begins at 0.  What is NaN is grey.
     limit : float, optional
-        By default the largest 99 % quantile of the absolute numbers.
+        By default the largest 99 % quantile of the absolute numbers that are not NaN.
     label : str
         Of the colour bar.
     columns : int
@@ -112,8 +126,7 @@ def surfaces(
     values = {title: np.asarray(array) for title, array in (values or {}).items()}
     signed = [array for array in values.values() if array.ndim == 1]
     if limit is None:
-        reach = [float(np.quantile(np.abs(array), 0.99)) for array in signed]
-        limit = max(reach, default=1.0) or 1.0
+        limit = max((reach(array, 0.99) for array in signed), default=1.0) or 1.0
     rows, wide = -(-len(meshes) // columns), min(columns, len(meshes))
     width = 2.5 * wide + 0.7 * bool(signed)
     figure, axes = _figure(width, 2.35 * rows, wide, rows, Parts)
@@ -137,7 +150,7 @@ def surfaces(
     if signed:
         scale = ScalarMappable(Normalize(-limit, limit), SIGNED)
         bar = figure.colorbar(scale, ax=axes, shrink=0.7, label=label, pad=0.01)
-        if min(np.nanmin(array) for array in signed) >= 0:  # errors: the half that they can have
+        if not any((array < 0).any() for array in signed):  # errors: the half that they can have
             bar.ax.set_ylim(0, limit)
     return figure
 
@@ -242,7 +255,7 @@ def network(
     source, target : int ndarray (pair,)
         Which shape each map takes and gives.
     errors : dict of str to float ndarray (pair,)
-        Title of each picture and the value that colours its edges.
+        Title of each picture and the value that colours its edges, grey where it is NaN.
     highlight : int, optional
         The shape to mark.
 
@@ -261,10 +274,11 @@ def network(
     """
     figure, (axes,) = _figure(4.6 * len(errors) + 0.6, 4.2, len(errors))
     finite = np.concatenate([value[np.isfinite(value)] for value in errors.values()])
-    scale = ScalarMappable(Normalize(0, finite.max(initial=0) or 1), "viridis_r")
+    colormap = colormaps["viridis_r"].with_extremes(bad=PALE)
+    scale = ScalarMappable(Normalize(0, finite.max(initial=0) or 1), colormap)
     lines = np.stack([places[source], places[target]], axis=1)  # (pair, 2, 2)
     for ax, (title, value) in zip(axes, errors.items(), strict=True):
-        order = np.argsort(value)  # the worst on top
+        order = np.argsort(np.nan_to_num(value, nan=-1))  # the worst on top, the unknown below
         colors = scale.to_rgba(value[order])
         ax.add_collection(
             LineCollection(list(lines[order]), colors=colors, linewidths=1, alpha=0.8)

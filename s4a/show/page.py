@@ -213,6 +213,8 @@ def _network(study, look):
     figure = charts.network(places, names, *ends, errors, median)
     note = f"{len(source)} maps among {len(names)} shapes, {where}; the median is circled. "
     note += "Both errors are of the first modes, as many as the maps had before."
+    if any(np.isnan(values).any() for values in errors.values()):
+        note += " Grey maps are in no cycle: their error is unknown."
     return PARTS.note(note) + PARTS.drawing(figure, "the network of maps, coloured by cycle error")
 
 
@@ -370,7 +372,7 @@ def _confidence(study, look):
     for key, words in others.items():
         if key in registration:
             value = np.abs(registration[key]).mean("shape").values
-            limit = float(np.quantile(value, 0.95)) or 1.0
+            limit = charts.reach(value, 0.95) or 1.0
             caption = f"{words}, from 0 to {limit:.2g}; mean over the shapes"
             figures.append(painted(caption, X, value, limit))
     note = "Everywhere, and the shapes where it is lowest; "

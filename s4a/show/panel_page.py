@@ -8,7 +8,7 @@ import itertools
 import json
 import math
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import ipywidgets
@@ -23,6 +23,8 @@ LADDER = 24  # values of a slider that are kept
 SILENT = ipywidgets.Button | ipywidgets.ToggleButton | ipywidgets.Text
 # what is the browser's own; of a chart `spec` is kept key by key
 LOCAL = {"picked", "hovered", "answer", "webgl", "still", "sample", "spec"}
+
+PICKS = ("points", "caption")  # traits of a view that tell of what was picked
 
 
 def panel_html(panel: Any, limit: int = LIMIT) -> str:
@@ -69,6 +71,18 @@ def shown(widget: ipywidgets.Widget) -> dict[tuple[str, str | None], Any]:
         values |= {(name, None): getattr(widget, name) for name in names}
         values |= {("spec", key): value for key, value in getattr(widget, "spec", {}).items()}
     return values
+
+
+@contextmanager
+def unchanged_picks(panel: ipywidgets.Box, widgets: list[ipywidgets.Widget]) -> Iterator[None]:
+    """What was picked in a panel, its marks and what is said of it are in the end as before."""
+    names = [name for name in panel.trait_names() if name not in ipywidgets.VBox.class_traits()]
+    parts = [(panel, name) for name in names]
+    parts += [(part, name) for part in widgets for name in PICKS if part.has_trait(name)]
+    before = [(part, name, getattr(part, name)) for part, name in parts]
+    yield
+    for part, name, value in before:
+        setattr(part, name, value)
 
 
 class Control:
@@ -133,10 +147,10 @@ class Recording:
             # the notebook's browser is told of the end only, which is the beginning
             for widget in self.widgets:
                 silence.enter_context(widget.hold_sync())
-            runs = [
-                self.run(group, limit * (i + 1) // len(panel.live))
-                for i, group in enumerate(panel.live)
-            ]
+            runs = []
+            for i, group in enumerate(panel.live):
+                with unchanged_picks(panel, self.widgets):
+                    runs.append(self.run(group, limit * (i + 1) // len(panel.live)))
         depends = [differing(*run) for run in runs]
         self.groups = [
             self.group(*run, own, depends) for run, own in zip(runs, depends, strict=True)

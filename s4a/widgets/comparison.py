@@ -57,8 +57,8 @@ class Comparison(Panel):
 
     Attributes
     ----------
-    vertex : int
-        The vertex of the target that was picked last; -1 for none.
+    vertex, source_vertex : int
+        The vertex of the target, or of the source, that was picked last; -1 for none.
 
     Raises
     ------
@@ -78,7 +78,7 @@ class Comparison(Panel):
     """
 
     title = "Methods side by side"
-    vertex = traitlets.Int(-1)
+    vertex, source_vertex = traitlets.Int(-1), traitlets.Int(-1)
 
     def __init__(self, found: xr.DataTree, **options: Any):
         kept = isinstance(found, xr.DataTree) and {"source", "pairs"} <= found.children.keys()
@@ -173,12 +173,13 @@ class Comparison(Panel):
 
     def draw(self) -> None:
         """Both surfaces of a pair, and their colours."""
-        self.vertex = -1
+        self.vertex = self.source_vertex = -1
         self.surfaces = mesh_of(self.study["source"].dataset), mesh_of(self.found)
         count = len(self.surfaces[0][0])
         self.scenes[0].show(*self.surfaces[0], title=f"the source, {count:,} vertices")
         for scene in self.scenes[1:]:
             scene.show(*self.surfaces[1])
+            scene.caption = ""
         self.paint()
 
     def paint(self) -> None:
@@ -239,21 +240,21 @@ class Comparison(Panel):
     def from_target(self, place: dict) -> None:
         """A place of the target: where each method puts it."""
         if place.get("vertex", -1) >= 0:
-            self.vertex = place["vertex"]
+            self.vertex, self.source_vertex = place["vertex"], -1
             self.point()
 
     def from_source(self, place: dict) -> None:
         """A place of the source: where each method finds it on the target."""
-        vertex = place.get("vertex", -1)
-        if vertex < 0:
-            return
-        self.vertex = -1
-        self.scenes[0].mark(self.surfaces[0][0][vertex])
-        for i, choice in enumerate(self.ways):
-            self.mark_method(i, int(self.way_back(choice.value)[vertex]))
+        if place.get("vertex", -1) >= 0:
+            self.vertex, self.source_vertex = -1, place["vertex"]
+            self.point()
 
     def point(self) -> None:
-        """Mark the vertex of the target, and where each method puts it on the source."""
+        """Mark the vertex that was picked, and where each method has it on the other surface."""
+        if self.source_vertex >= 0:
+            self.scenes[0].mark(self.surfaces[0][0][self.source_vertex])
+            for i, choice in enumerate(self.ways):
+                self.mark_method(i, int(self.way_back(choice.value)[self.source_vertex]))
         if self.vertex < 0:
             return
         ends = np.array([self.match(choice.value)[self.vertex] for choice in self.ways])

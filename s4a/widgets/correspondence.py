@@ -59,7 +59,8 @@ class Correspondence(Panel):
         registration = self.study["registration"].dataset
         self.template = str(registration.attrs["template"])
         names = [name for name in names_of(registration) if name != self.template]
-        latent = has(self.study, "latent/latent_basis") and "coarse" in self.study.children
+        latent = has(self.study, "latent/latent_basis") and has(self.study, "coarse")
+        latent = latent and self.template in self.study["coarse"].children
         self.choice = dropdown(
             "shape", "the shape beside the template", labelled(self.study, names)
         )

@@ -1,5 +1,6 @@
 """All panels of a study as tabs; each is built when its tab is first opened."""
 
+import logging
 from typing import Any
 
 import ipywidgets
@@ -8,6 +9,7 @@ from IPython import get_ipython
 from IPython.core.interactiveshell import ExecutionInfo
 
 from s4a.show.browser import PARTS
+from s4a.show.surfaces import has
 from s4a.widgets.correspondence import Correspondence
 from s4a.widgets.functional import FunctionalMap
 from s4a.widgets.median import Median
@@ -18,6 +20,7 @@ from s4a.widgets.spectrum import Spectrum
 from s4a.widgets.structures import Structures
 from s4a.widgets.transfer import Transfer
 
+log = logging.getLogger(__name__)
 PANELS = {
     "Modes": Modes,
     "Network": Network,
@@ -57,6 +60,7 @@ class Explore(ipywidgets.VBox):
 
     def __init__(self, study: xr.DataTree, *, width: float | str | None = None, **options: Any):
         self.study, self.options, self.panels = study, options, {}
+        self.reasons = {}  # title of the tab -> why it has no panel
         self.kinds = OF_SEVERAL if "structures" in study.children else PANELS
         boxes = [ipywidgets.VBox() for _ in self.kinds]
         self.tabs = ipywidgets.Tab(children=boxes, titles=list(self.kinds))
@@ -87,8 +91,14 @@ class Explore(ipywidgets.VBox):
         try:
             self.panels[title] = self.kinds[title](self.study, **self.options)
             box.children = [self.panels[title]]
-        except ValueError as error:
-            box.children = [ipywidgets.HTML(PARTS.message(str(error)))]
+            self.reasons.pop(title, None)
+        except Exception as error:  # whatever it is, the tab must show it
+            reason = str(error)
+            if not isinstance(error, ValueError):
+                log.exception("%s", title)
+                reason = f"{type(error).__name__}: {error}"
+            self.reasons[title] = reason
+            box.children = [ipywidgets.HTML(PARTS.message(reason))]
 
     def refresh(self, study: xr.DataTree) -> None:
         """Show a newer state of the study in all panels."""
@@ -100,11 +110,24 @@ class Explore(ipywidgets.VBox):
     def extend(self, study: xr.DataTree) -> None:
         """Show what a newer state of the study has more; panels that are open stay as they are."""
         self.study = study
+        self.reasons.clear()
         self.fill()
 
     def __getitem__(self, title: str) -> ipywidgets.Widget:
         """The panel of a tab, which is opened for it."""
+        if title not in self.kinds:
+            raise ValueError(f"there is no tab {title!r}; there are {', '.join(self.kinds)}")
         self.tabs.selected_index = list(self.kinds).index(title)
+        if title not in self.panels:
+            ready = [
+                name
+                for name, kind in self.kinds.items()
+                if name not in self.reasons and all(has(self.study, need) for need in kind.needs)
+            ]
+            raise ValueError(
+                f"the tab {title!r} has no panel: {self.reasons[title]}; "
+                f"there are {', '.join(ready) or 'no others'}"
+            )
         return self.panels[title]
 
     def close(self) -> None:

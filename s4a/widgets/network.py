@@ -33,9 +33,11 @@ PLACES = (
 )
 NARROW = {"width": "20em"}
 MOST = 100  # shapes that a graph shows
-N_EIGENVALUES = 20  # by which shapes are told apart when pairs are chosen
 # without the bright end, which is hard to see on white
-ERRORS = ListedColormap(colormaps["viridis_r"](np.linspace(0.15, 1, 256)))
+ERRORS = ListedColormap(colormaps["viridis_r"](np.linspace(0.15, 1, 256))).with_extremes(
+    bad=charts.PALE
+)
+UNKNOWN = "unknown: in no cycle"
 
 
 class Network(Panel):
@@ -53,7 +55,9 @@ class Network(Panel):
         The shape that is shown alone, "" for none.
     """
 
-    needs = ("network/source", "network/target", "network/fmap", "network/cycle_error")
+    needs = tuple(
+        f"network/{key}" for key in ("source", "target", "fmap", "fmap_initial", "cycle_error")
+    )
     title = "Network of maps"
     edge = traitlets.Int(-1)
     node = traitlets.Unicode("")
@@ -71,9 +75,10 @@ class Network(Panel):
         self.ends = np.stack(ends, axis=1)  # (map, 2)
         self.pairs = [tuple(pair) for pair in np.sort(self.ends, axis=1).tolist()]
         spectra = [self.study["coarse"][name]["eigenvalue"].values for name in self.names]
-        k = min(N_EIGENVALUES, *map(len, spectra))
+        k = network.sizes["mode_source_initial"]  # by as many the study chose its pairs
         self.distance = spectral_distance([values[:k] for values in spectra])
         n, used = len(self.names), len(set(self.pairs))
+        self.used = used  # pairs that have maps
         self.stage = dropdown("colours", WHICH, STAGES, layout={"width": "22em"})
         self.budget = int_slider(
             "pairs", BUDGET, used, n - 1, max(n - 1, n * (n - 1) // 2), continuous_update=True
@@ -120,11 +125,18 @@ class Network(Panel):
         first += [self.median] * (self.median in self.names)
         return nearest_by_maps(pairs, len(self.names), [self.names.index(a) for a in first], MOST)
 
+    def budgeted(self) -> np.ndarray:
+        """The pairs that the budget allows ``(p, 2)``: those of the study, or of another choice."""
+        if self.budget.value == self.used:
+            return np.unique(self.pairs, axis=0)
+        return choose_pairs(self.distance, self.budget.value)
+
     def draw(self) -> None:
         """The graph with the pairs that the budget allows, on one colour scale before and after."""
         network = self.study["network"].dataset
-        top = float(np.nanmax([network[key].values for _, key in STAGES], initial=0)) or 1.0
-        pairs = choose_pairs(self.distance, self.budget.value)
+        errors = np.nan_to_num([network[key].values for _, key in STAGES])
+        top = float(errors.max(initial=0)) or 1.0
+        pairs = self.budgeted()
         allowed = {tuple(pair) for pair in pairs.tolist()}
         self.allowed = [i for i, pair in enumerate(self.pairs) if pair in allowed]
         drawn = self.drawn(pairs)
@@ -134,7 +146,7 @@ class Network(Panel):
         between = (place[self.ends] >= 0).all(axis=1)  # maps of which both shapes are drawn
         self.shown = [i for i in self.allowed if between[i]]
         values = network[self.stage.value].values
-        colors = ERRORS(np.nan_to_num(values[self.shown] / top, nan=0.0))
+        colors = ERRORS(values[self.shown] / top)
         places = self.places(names)
         self.graph.draw(
             "graph",
@@ -147,6 +159,7 @@ class Network(Panel):
             values=values[self.shown],
             weights=network["weight"].values[self.shown],
             label="cycle error",
+            unknown=UNKNOWN,
             title="Click a shape or a map" + self.part(names),
             faint=[name in self.doubtful for name in names],
             highlight=names.index(self.median) if self.median in names else -1,
@@ -235,7 +248,8 @@ class Network(Panel):
         error, weight = pair[self.stage.value].item(), pair["weight"].item()
         on_source.caption = "its coordinates as colours"
         carried = "the colours that the map carries"
+        told = UNKNOWN if np.isnan(error) else f"{error:.3f}"
         on_target.caption = (
-            f"{carried}; cycle error {error:.3f}, weight {weight:.2f} in Consistent ZoomOut"
+            f"{carried}; cycle error {told}, weight {weight:.2f} in Consistent ZoomOut"
         )
         self.draw()

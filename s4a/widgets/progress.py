@@ -88,6 +88,8 @@ class Progress(Panel):
 
     def start(self) -> None:
         """Run, from the beginning or where it stopped."""
+        self.say("")
+        self.view.disabled = not self.ready()
         self.state, self.stopped, self.started = "running", threading.Event(), time.monotonic()
         context = multiprocessing.get_context("spawn")
         self.answer, there = context.Pipe(duplex=False)

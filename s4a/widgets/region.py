@@ -12,6 +12,7 @@ from s4a.widgets.scene import MARK, Scene
 ADD, REMOVE = "add", "take away"
 LASSO = "while it is pressed a drag draws around vertices, and does not turn the surface"
 HOW = "what becomes of the vertices that are drawn around, of those that are seen"
+NO_LABEL = ()  # the value of "none" in the list, which cannot hold None
 LABEL = "the region of a label of the template, to begin with"
 
 
@@ -79,12 +80,12 @@ class Region(Panel):
             return None
         self.labels = mesh["label"].values
         labels = [(label_text(mesh, one), one) for one in np.unique(self.labels).tolist()]
-        options = [("none", -1), *labels]
-        return dropdown("label", LABEL, options, value=-1, layout=WIDE)
+        options = [("none", NO_LABEL), *labels]
+        return dropdown("label", LABEL, options, value=NO_LABEL, layout=WIDE)
 
     def take_label(self, change: dict) -> None:
         """The vertices of a label that was chosen from the list."""
-        if change["new"] >= 0:
+        if change["new"] != NO_LABEL:
             self.choose(self.labels == change["new"])
 
     def take_drawn(self, change: dict) -> None:
@@ -95,14 +96,22 @@ class Region(Panel):
             self.say("no vertex is seen within what was drawn")
             return
         self.say("")
+        self.leave_label()
         self.choose(self.region | within if self.how.value == ADD else self.region & ~within)
+
+    def leave_label(self) -> None:
+        """Set the list of labels back, as the region is of none of them any more."""
+        if self.label is not None:
+            self.label.value = NO_LABEL
 
     def clear(self) -> None:
         """Choose no vertex."""
+        self.leave_label()
         self.choose(np.zeros(len(self.X), bool))
 
     def invert(self) -> None:
         """Choose all other vertices."""
+        self.leave_label()
         self.choose(~self.region)
 
     def choose(self, region: np.ndarray) -> None:

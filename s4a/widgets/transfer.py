@@ -47,12 +47,25 @@ class Transfer(Panel):
         """Choices, the two surfaces, legend and table."""
         registration = self.study["registration"].dataset
         names, template = names_of(registration), str(registration.attrs["template"])
-        options = labelled(self.study, names)
+        own = [template] if template in self.study["original"].children else []
+        sources = list(dict.fromkeys([*names, *own]))  # of inserted shapes the template is none
+        source = template if template in sources else names[0]
+        others = [name for name in names if name != source]
+        if not others:
+            raise ValueError(
+                f"the panel {self.title} needs a shape to carry to beside {source}; this study has "
+                f"neither another shape nor the mesh of its template {template}"
+            )
         self.choices = {
             "source": dropdown(
-                "source", "labels and landmarks are of this shape", options, value=template
+                "source",
+                "labels and landmarks are of this shape",
+                labelled(self.study, sources),
+                value=source,
             ),
-            "target": dropdown("target", "they are carried to this shape", options),
+            "target": dropdown(
+                "target", "they are carried to this shape", labelled(self.study, names)
+            ),
         }
         self.labels = check("labels", "colour both surfaces by the labels of the source", True)
         self.name = ipywidgets.Combobox(
@@ -80,6 +93,7 @@ class Transfer(Panel):
         self.legend, self.table = ipywidgets.HTML(), ipywidgets.HTML()
         look = {"group": camera_group(), "view": view, "up": up, "height": 380}
         self.scenes = [Scene(**look, clickable=True), Scene(**look)]
+        self.on_change(self, self.begin_marks, "source")
         for role, choice in self.choices.items():
             self.on_change(choice, lambda value, role=role: self.set_trait(role, value))
             self.on_change(self, lambda _: self.draw(), role)
@@ -88,8 +102,7 @@ class Transfer(Panel):
         traitlets.link((self.name, "value"), (self, "landmark"))
         self.on_pick(self.scenes[0], self.place)
         with self.hold_trait_notifications():
-            self.source = template
-            self.target = next(name for name in names if name != template)
+            self.source, self.target = source, others[0]
         return [
             row(*self.choices.values(), self.labels),
             row(self.name, self.remove, self.radius, self.path, self.csv),
@@ -106,16 +119,19 @@ class Transfer(Panel):
         """The mesh of a shape, in its own coordinates."""
         return self.study["original"][name].to_dataset()
 
-    def draw(self) -> None:
-        """Both surfaces; the landmarks that the source has in the study are placed on it."""
-        if not self.source or not self.target:
-            return
-        self.choices["source"].value, self.choices["target"].value = self.source, self.target
-        mesh = self.mesh(self.source)
+    def begin_marks(self, source: str) -> None:
+        """Place the landmarks that a source has in the study on it."""
+        mesh = self.mesh(source)
         self.marks = {}  # name -> position (3,) on the source, in its own coordinates
         if "landmark_position" in mesh:
             names = mesh["landmark_name"].values.astype(str).tolist()
             self.marks = dict(zip(names, mesh["landmark_position"].values, strict=True))
+
+    def draw(self) -> None:
+        """Both surfaces, and the landmarks on them."""
+        if not self.source or not self.target:
+            return
+        self.choices["source"].value, self.choices["target"].value = self.source, self.target
         roles = {"source": self.source, "target": self.target}
         for scene, (role, name) in zip(self.scenes, roles.items(), strict=True):
             X, T = as_arrays(self.mesh(name))
@@ -133,6 +149,7 @@ class Transfer(Panel):
         if "label" not in mesh or not self.labels.value:
             for scene in self.scenes:
                 scene.paint(None)
+                scene.caption = ""
             return
         here = mesh["label"].values
         on_target = transfer_labels(self.study, here, source=self.source, targets=[self.target])

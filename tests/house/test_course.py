@@ -9,6 +9,7 @@ import re
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -17,7 +18,7 @@ from s4a.course.exercises import EXERCISES
 from s4a.course.quizzes import SOURCE, Quiz, read
 from s4a.datasets.synthetic import sphere
 from s4a.method.latent import consistency_form
-from s4a.show.charts import matrices, surfaces, variance
+from s4a.show.charts import PALE, matrices, network, on_circle, surfaces, variance
 
 DIAGRAMS = ["cotangents", "dual", "pull_back", "latent_space", "two_ways", "slid"]
 
@@ -51,6 +52,9 @@ def test_a_right_answer_passes(answer, expected):
         (None, 3),
         (np.nan, 3),
         ([1.0, 2.0, 3.0], np.ones(2)),
+        ([[1], [1, 2]], 3),
+        ([[1], [1, 2]], lambda n: n > 0),
+        (np.zeros(2), lambda n: n > 0),
         (np.ones((2, 1)), np.ones(2)),
         ("brain_02", "brain_01"),
         ([1], [1, 4]),
@@ -124,6 +128,60 @@ def test_an_exercise_is_named_and_needs_nothing_while_it_is_open():
         check("06.1", 20_824)
     with pytest.raises(KeyError):
         check("99.1", 1)
+
+
+BASIS = np.random.default_rng(0).normal(size=(30, 20))
+
+
+@pytest.mark.parametrize(
+    "number, answer, given",
+    [
+        ("01.3", 10**6, (sphere(162).assign(file_vertex=("vertex", np.arange(162))),)),
+        ("02.3", 3.0, (sphere(162),)),
+        ("04.1", None, (np.eye(20), np.ones(20), BASIS, np.ones(30))),
+        ("04.3", 3, (np.eye(9), -np.eye(9))),
+        ("06.3", np.zeros(3), (np.tile(np.eye(4), (6, 1, 1)),)),
+        ("07.2", np.zeros((60, 60)), ()),
+        ("07.2", "nothing", ()),
+        ("08.2", np.zeros(4), ()),
+        ("09.3", np.zeros((3, 3)), ()),
+    ],
+)
+def test_a_wrong_answer_of_another_kind_gets_the_hint(number, answer, given):
+    with pytest.raises(AssertionError, match=r"Not yet: the answer is .+ Hint: "):
+        check(number, answer, *given)
+
+
+def test_the_odd_modes_may_be_a_list_or_a_set():
+    C = np.diag([1.0, 1, -1, 1, -1, 1, 1, 1, 1])
+    for answer in ([2, 4], {2, 4}, np.array([2, 4])):
+        assert check("04.3", answer, C, np.eye(9)) == "Right."
+    with pytest.raises(AssertionError, match="Not yet"):
+        check("04.3", {2, 3}, C, np.eye(9))
+
+
+def test_values_that_are_unknown_are_grey_and_leave_the_others_as_they_are():
+    ball = sphere(162)
+    height = ball["position"].values[:, 2]
+    some = np.where(np.arange(162) == 5, np.nan, height)
+    limit = np.quantile(abs(np.delete(height, 5)), 0.99)
+    shown, bar = surfaces({"a": ball}, {"a": some}).axes
+    expected = surfaces({"a": ball}, {"a": some}, limit=limit).axes[0]
+    np.testing.assert_array_equal(shown.images[0].get_array(), expected.images[0].get_array())
+    assert bar.get_ylim() == pytest.approx((-limit, limit))
+    unknown = surfaces({"a": ball}, {"a": np.full(162, np.nan)}).axes[0].images[0].get_array()
+    assert np.ptp(unknown[unknown[..., 3] == 255, :3].astype(int), axis=1).max() <= 1  # grey
+
+
+def test_maps_of_unknown_error_are_grey_lines_below_the_others():
+    ends = np.array([0, 1, 2]), np.array([1, 2, 0])
+    errors = {"after": np.array([np.nan, 0.2, 0.1]), "unknown": np.full(3, np.nan)}
+    one, other, _ = network(on_circle(3), list("abc"), *ends, errors).axes
+    for ax, n in ((one, 1), (other, 3)):
+        [lines] = ax.collections[:1]
+        colors = lines.get_colors()
+        np.testing.assert_allclose(colors[:n, :3], [to_rgb(PALE)] * n)
+        assert (np.ptp(colors[n:, :3], axis=1) > 0.1).all()
 
 
 LESSONS = read(SOURCE.read_text(encoding="utf-8"))

@@ -312,6 +312,24 @@ def test_an_unfinished_study_shows_what_there_is(study, node, tmp_path, monkeypa
     assert text.count("<section>") == len(page.SECTIONS)
 
 
+def test_a_vertex_of_unknown_distortion_leaves_the_others_their_colours(study, monkeypatch):
+    limits = []
+    monkeypatch.setattr(
+        page, "ramp_colors", lambda values, low, high: limits.append(high) or 0 * values[:, None]
+    )
+    monkeypatch.setattr(page, "render", lambda *surface, **look: np.zeros((2, 2, 4), np.uint8))
+    registration = study["registration"].to_dataset()
+    values = np.random.default_rng(0).random(registration["confidence"].shape)
+    values[:, 3] = np.nan
+    registration["distortion"] = registration["confidence"].copy(data=values)
+    registration["round_trip"] = registration["confidence"].copy(data=np.full(values.shape, np.nan))
+    part = study.copy()
+    part["registration"].dataset = registration
+    page.study_html(part)
+    known = np.delete(values, 3, axis=1).mean(0)
+    assert limits[-2:] == pytest.approx([1.0, np.quantile(known, 0.95)])
+
+
 def test_an_empty_study_gives_a_page_too():
     text = page.study_html(xr.DataTree())
     assert "The study is empty." in text

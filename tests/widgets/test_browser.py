@@ -411,6 +411,20 @@ def test_the_keyboard_carries_points_to_the_shape(page, study):
     canvas.press("Escape")
 
 
+def test_nothing_is_said_or_marked_of_the_shape_before(page):
+    shapes = visible(page, "select").filter(has_text="brain_").first
+    *_, one, other = shapes.locator("option").all_inner_texts()
+    canvas, said = visible(page, VIEW).first, visible(page, ".s4a-readout")
+    marks = f"{SEEN}.map((view) => view.points.length).join()"
+    for name in (one, other):
+        shapes.select_option(name)
+        said.filter(has_text="carried to the shape").nth(1).wait_for()
+        page.wait_for_function(f"{marks} === '0,0'")
+        cursor(canvas, "ArrowUp")
+        said.filter(has_text=f"↔ {name} vertex").nth(1).wait_for()
+    canvas.press("Escape")
+
+
 def test_the_checkerboard_is_drawn(page):
     canvas = visible(page, VIEW).nth(1)
     before = pixels(canvas)
@@ -1022,6 +1036,21 @@ def test_the_page_of_the_network_shows_the_map_that_is_clicked(offline, study, t
     visible(page, "[data-node]").nth(1).dispatch_event("click")
     visible(page, ".s4a-title").filter(has_text=re.compile("^brain_02$")).wait_for()
     assert visible(page, VIEW).count() == 1
+    assert errors == []
+    page.close()
+
+
+def test_the_page_of_the_network_says_which_maps_are_in_no_cycle(offline, study, tmp_path):
+    tree = study.copy()
+    maps = tree["network"].to_dataset()
+    maps["cycle_error"] = maps["cycle_error"].where(np.arange(maps.sizes["pair"]) != 3)
+    tree["network"] = type(study)(maps)
+    page, errors = opened(offline, saved(widgets.Network(tree), tmp_path / "network.html"))
+    page.wait_for_function(DRAWN)
+    edges = page.locator(".s4a-edge")
+    told = [edge.get_attribute("aria-label") for edge in edges.all()]
+    assert [i for i, text in enumerate(told) if "cycle error unknown: in no cycle" in text] == [3]
+    assert edges.nth(3).locator(".s4a-line").get_attribute("stroke") == "#bbbbbb"
     assert errors == []
     page.close()
 

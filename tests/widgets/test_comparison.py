@@ -137,6 +137,37 @@ def test_a_point_is_marked_where_each_method_has_it(found, panel):
     assert shown.scenes[1].caption.endswith("error unknown %")
 
 
+def test_a_place_of_the_source_stays_marked_where_another_method_has_it(found, panel):
+    shown = panel(methods=["kNN", "RE-MATCH"])
+    kept = found["pairs/brain_02"].to_dataset()
+    way_back = kept["way_reverse"].sel(way="registered surface").values
+    vertex = int(np.argmax(way_back >= 0))
+    shown.scenes[0].picked = {"vertex": vertex, "count": 1}
+    shown.way0.value = "registered surface"
+    assert shown.scenes[1].points[0][:3] == kept["position"].values[way_back[vertex]].tolist()
+    assert shown.scenes[1].caption.startswith(f"target vertex {way_back[vertex]} → ")
+    assert shown.scenes[0].points[0][:3] == found["source/position"].values[vertex].tolist()
+
+
+@pytest.mark.parametrize("side", [0, 1])
+def test_nothing_is_marked_or_said_of_another_pair(panel, side):
+    shown = panel(methods=["kNN", "truth"])
+    shown.scenes[side].picked = {"vertex": 17, "count": 1}
+    assert "vertex" in shown.scenes[1].caption
+    shown.pair.value = "brain_03"
+    assert [scene.points for scene in shown.scenes] == [[], [], []]
+    assert [scene.caption for scene in shown.scenes] == ["colours are coordinates", "", ""]
+
+
+def test_a_saved_page_leaves_the_place_that_was_picked(panel, tmp_path):
+    shown = panel(methods=["kNN", "truth"])
+    shown.scenes[0].picked = {"vertex": 17, "count": 1}
+    before = [(scene.points, scene.caption) for scene in shown.scenes]
+    shown.save_html(tmp_path / "page.html")
+    assert [(scene.points, scene.caption) for scene in shown.scenes] == before
+    assert shown.source_vertex == 17
+
+
 def test_the_browser_knows_both_ways_and_the_errors(found, panel):
     scene = panel(methods=["RE-MATCH"]).scenes[1]
     kept = found["pairs/brain_02"].to_dataset().sel(way="RE-MATCH")

@@ -108,3 +108,13 @@ def test_a_saved_page_has_every_choice(panel, tmp_path, caplog):
         page = one.save_html(tmp_path / "map.html").read_text(encoding="utf-8")
     for words in ("directional asymmetry", "fluctuating asymmetry", "family-wise", "brain_03"):
         assert words in page
+
+
+def test_a_saved_page_leaves_the_vertex_that_was_clicked(panel, tmp_path):
+    one = panel()
+    one.scene.picked = {"vertex": 7, "count": 1}
+    before = one.scene.points, one.scene.caption
+    text = one.save_html(tmp_path / "page.html").read_text(encoding="utf-8")
+    assert (one.scene.points, one.scene.caption) == before
+    assert one.vertex == 7
+    assert "vertex 7: " in text

@@ -76,7 +76,33 @@ def test_a_drag_beside_the_surface_says_so_and_changes_nothing(panel):
 def test_a_label_of_the_template_is_a_region(panel, study):
     label = study["original"][study["registration"].attrs["template"]]["label"].values
     name, number = panel.label.options[2]
-    assert panel.label.options[0] == ("none", -1)
+    assert panel.label.label == panel.label.options[0][0] == "none"
     assert name == f"{number} {s4a.synthetic.LABELS[number]}"
     panel.label.value = number
     np.testing.assert_array_equal(panel.region, label == number)
+
+
+def test_the_list_says_the_label_only_while_the_region_is_that_label(panel):
+    number = panel.label.options[2][1]
+    leave = (panel.none.click, panel.others.click, lambda: draw(panel, WIDE, "top"))
+    for act in leave:
+        panel.label.value = number
+        chosen = panel.region
+        act()
+        assert panel.label.label == "none"
+        panel.label.value = number
+        np.testing.assert_array_equal(panel.region, chosen)
+
+
+@pytest.mark.parametrize("kind", [int, str])
+def test_a_label_of_any_value_is_another_than_none(study, kind):
+    tree = study.copy()
+    node = tree["original"][study["registration"].attrs["template"]]
+    label = np.where(node["label"].values == node["label"].values[0], -1, 5).astype(kind)
+    node.dataset = node.to_dataset().assign(label=("vertex", label))
+    panel = Region(tree)
+    assert panel.label.label == "none"
+    panel.label.value = kind(-1)
+    np.testing.assert_array_equal(panel.region, label == kind(-1))
+    assert panel.region.any()
+    panel.close()

@@ -21,8 +21,10 @@ from ipywidgets.widgets import widget as registry  # the open widgets are counte
 
 import s4a
 from s4a.geometry.mesh import as_dataset, vertex_normals
+from s4a.method.network import spectral_distance
 from s4a.method.shape import Shape
 from s4a.show.browser import color_bytes
+from s4a.show.charts import PALE
 from s4a.show.draw import position_colors
 from s4a.show.panel_page import widgets_in
 from s4a.show.surfaces import aligned, mesh_of
@@ -235,6 +237,54 @@ def test_edges_are_coloured_before_and_after_on_one_scale(study, panel):
     )
 
 
+def with_network(study, network):
+    """The study with another network."""
+    tree = study.copy()
+    tree["network"] = xr.DataTree(network)
+    return tree
+
+
+def test_the_first_pairs_are_those_of_the_study_and_others_are_chosen_as_it_does(study):
+    maps = study["network"].to_dataset()
+    spectra = [mesh["eigenvalue"].values[:10] for mesh in study["coarse"].children.values()]
+    for name in study["coarse"].children:  # stars, of which one at most has the nearest spectra
+        star = (maps["source"] == name) | (maps["target"] == name)
+        network = Network(with_network(study, maps.isel(pair=star.values)))
+        assert network.shown == list(range(6))
+        assert re.search(r">3 pairs: connected, 0 triangles", network.facts.value)
+        network.budget.value = 4
+        network.budget.value = 3
+        assert network.shown == list(range(6))
+        np.testing.assert_array_equal(network.distance, spectral_distance(spectra))
+        network.close()
+
+
+def test_maps_of_unknown_error_are_grey_and_said_to_be_in_no_cycle(study):
+    maps = study["network"].to_dataset()
+    maps["cycle_error"] = maps["cycle_error"].where(np.arange(maps.sizes["pair"]) != 3)
+    network = Network(with_network(study, maps))
+    colors = network.graph.spec["colors"]
+    assert [i for i, color in enumerate(colors) if color == PALE] == [3]
+    network.edge = 3
+    assert "cycle error unknown: in no cycle, weight" in network.scenes[1].caption
+    network.edge = 4
+    assert re.search(r"cycle error 0\.\d+, weight", network.scenes[1].caption)
+    network.close()
+
+
+def test_two_shapes_have_a_network_without_cycles(study):
+    maps = study["network"].to_dataset()
+    ends = maps["source"].values[0], maps["target"].values[0]
+    own = np.isin(maps["source"], ends) & np.isin(maps["target"], ends)
+    maps = maps.isel(pair=own).assign(cycle_error=("pair", np.full(2, np.nan)))
+    maps["cycle_error_initial"] = maps["cycle_error"]
+    network = Network(with_network(study, maps))
+    assert network.graph.spec["colors"] == [PALE, PALE]
+    assert ">1.00<" in network.bar.value
+    assert network.message.value == ""
+    network.close()
+
+
 def test_zoomout_is_replayed_as_the_step_module_does_it(study, panel):
     fmap = panel(FunctionalMap, pair=1)
     fmap.kind.value = "zoomout"
@@ -429,6 +479,53 @@ def test_a_click_places_or_moves_a_landmark_and_it_is_saved(study, panel, tmp_pa
     assert both.message.value == ""
 
 
+def test_landmarks_that_were_placed_stay_until_another_source_is_chosen(panel, tmp_path):
+    both = panel(Transfer)
+    own = list(both.marks)
+    both.landmark = "mine"
+    both.scenes[0].picked = {"vertex": 5, "face": 3, "weights": [1 / 3] * 3, "count": 1}
+    both.choices["target"].value = both.choices["target"].options[-1][1]
+    assert list(both.marks) == [*own, "mine"]
+    text = both.save_html(tmp_path / "page.html").read_text(encoding="utf-8")
+    assert list(both.marks) == [*own, "mine"]
+    assert ">mine<" in both.table.value
+    assert ">mine<" in text
+    both.source = next(name for name in both.choices["source"].options if name[1] != both.source)[1]
+    assert "mine" not in both.marks
+
+
+def test_a_saved_page_leaves_the_point_that_was_picked(panel, tmp_path):
+    both = panel(Correspondence)
+    both.scenes[0].picked = {"vertex": 5, "count": 1}
+
+    def picked():
+        told = [(scene.points, scene.caption) for scene in both.scenes]
+        return both.vertex, both.image, told
+
+    before = picked()
+    assert before[0] == 5
+    text = both.save_html(tmp_path / "page.html").read_text(encoding="utf-8")
+    assert picked() == before
+    assert text.count(before[2][0][1]) >= 2
+
+
+def test_nothing_is_said_of_labels_that_are_not_shown(study, panel):
+    both = panel(Transfer)
+    assert both.scenes[1].caption.startswith("labels carried from ")
+    both.labels.value = False
+    assert [scene.caption for scene in both.scenes] == ["", ""]
+    both.labels.value = True
+    assert both.scenes[1].caption.startswith("labels carried from ")
+    tree = study.copy()
+    tree[f"original/{both.target}"].dataset = (
+        tree[f"original/{both.target}"].to_dataset().drop_vars("label")
+    )
+    bare = Transfer(tree)
+    bare.source, bare.target = both.target, both.source
+    assert [scene.caption for scene in bare.scenes] == ["", ""]
+    bare.close()
+
+
 def test_the_spectrum_shows_every_shape_beside_weyls_line(study, panel):
     spectrum = panel(Spectrum)
     series = {one["name"]: one["y"] for one in spectrum.curves.spec["series"]}
@@ -528,6 +625,19 @@ def test_a_cancelled_analysis_ends(tmp_path):
     panel.close()
 
 
+def test_a_resumed_analysis_is_not_called_cancelled(tmp_path):
+    panel = Progress(s4a.synthetic.brains(3, 20_000, seed=1), tmp_path / "study", n_jobs=1)
+    assert panel.view.disabled, "nothing is there to open"
+    panel.stop.click()
+    assert "cancelled" in panel.message.value
+    assert ended(panel) == "cancelled"
+    panel.go_on.click()
+    assert panel.state == "running"
+    assert panel.message.value == ""
+    assert panel.view.disabled == (not panel.ready())
+    panel.close()
+
+
 def test_who_is_left_out_is_told(tmp_path):
     collection = s4a.synthetic.brains(3, 500, seed=1)
     meshes = collection["original"].children.items()
@@ -598,9 +708,70 @@ def test_an_unfinished_study_says_what_is_missing(study):
     assert tabs["Spectrum"].names == list(study["coarse"].children)
     with pytest.raises(ValueError, match="network/source"):
         Network(started)
+    with pytest.raises(ValueError, match=r"'Modes' has no panel: .* pca/.*; there are Spectrum$"):
+        tabs["Modes"]
+    with pytest.raises(ValueError, match=r"no tab 'Mode'; there are Modes, Network"):
+        tabs["Mode"]
     tabs.refresh(study)
     assert tabs["Modes"].scores == [0.0] * 3
     tabs.close()
+
+
+def test_a_tab_shows_any_error_of_its_panel(study, monkeypatch, caplog):
+    def broken(study):
+        raise KeyError("gone")
+
+    broken.needs = ()
+    monkeypatch.setitem(explore_module.PANELS, "Median", broken)
+    tabs = Explore(study)
+    tabs.tabs.selected_index = list(tabs.kinds).index("Median")
+    assert "KeyError: " in tabs.tabs.children[tabs.tabs.selected_index].children[0].value
+    assert caplog.records
+    tabs.close()
+
+
+@pytest.fixture(scope="module")
+def inserted():
+    """A study of six brains, and one with a new brain inserted."""
+    mesh = s4a.synthetic.brains(7, 200)["original/brain_07"].to_dataset()
+    return s4a.insert(s4a.synthetic.example_study(), {"brain_07": mesh})
+
+
+def test_of_an_inserted_shape_every_tab_is_shown_that_has_its_stage(inserted, caplog):
+    tabs = Explore(inserted)
+    for title in tabs.kinds:
+        tabs.tabs.selected_index = list(tabs.kinds).index(title)
+    assert list(tabs.panels) == ["Modes", "Median", "Correspondence", "Transfer", "Spectrum"]
+    assert not caplog.records
+    tabs.close()
+
+
+def test_labels_of_the_template_are_carried_to_an_inserted_shape(inserted, tmp_path):
+    both = Transfer(inserted)
+    template = inserted["registration"].attrs["template"]
+    assert (both.source, both.target) == (template, "brain_07")
+    label = inserted[f"original/{template}"]["label"].values
+    expected = s4a.transfer_labels(inserted, label, source=template, targets=["brain_07"])
+    assert (both.carried["label"].values == expected["brain_07"]["label"].values).all()
+    assert [value for _, value in both.choices["target"].options] == ["brain_07"]
+    both.save_html(tmp_path / "page.html")
+    assert both.message.value == ""
+    both.close()
+
+
+def test_a_correspondence_has_no_map_for_which_the_template_lacks_its_low_resolution(inserted):
+    both = Correspondence(inserted)
+    assert [value for _, value in both.map.options] == ["registered"]
+    both.close()
+
+
+def test_a_shape_that_nothing_can_be_carried_to_is_told(inserted):
+    template = inserted["registration"].attrs["template"]
+    nodes = {node.path: node.to_dataset(inherit=False) for node in inserted.subtree}
+    del nodes[f"/original/{template}"]
+    alone = xr.DataTree.from_dict(nodes)
+    with pytest.raises(ValueError, match="needs a shape to carry to beside brain_07"):
+        Transfer(alone)
 
 
 def test_errors_in_callbacks_are_shown_and_logged(panel, caplog):

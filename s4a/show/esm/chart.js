@@ -190,7 +190,7 @@ function graph(parent, spec, pick) {
     node(at, "path", { d, stroke: colors[i], "stroke-width": marked ? 4 : 1 + 1.8 * (weights ? weights[i] : 0.3), class: "s4a-line" });
     const weight = weights ? `, weight ${short(weights[i])}` : "";
     if (marked) svg.append(at);
-    return { at, value: { edge: edges[i] }, text: `${names[s]} → ${names[t]}: ${spec.label} ${short(values[i])}${weight}` };
+    return { at, value: { edge: edges[i] }, text: `${names[s]} → ${names[t]}: ${spec.label} ${values[i] === null ? spec.unknown : short(values[i])}${weight}` };
   });
   marks.push(...names.map((name, i) => {
     const at = node(svg, "g", { "data-node": i });

@@ -59,6 +59,11 @@ export default {
     });
     const still = html(el, "img", { alt: "", class: "s4a-still" }), bar = html(el, "div"), readout = html(el, "div", { class: "s4a-readout", "aria-live": "polite" });
     view.readout = readout;
+    view.told = () => {
+      readout.textContent = model.get("caption");
+      view.points = model.get("points");
+      view.redraw();
+    };
     const surface = new Surface(), ghost = new Surface(0.35);
     const geometry = () => {
       const position = numbers(Float32Array, model.get("position")), corner = numbers(Uint32Array, model.get("corner"));
@@ -66,7 +71,6 @@ export default {
       surface.setMesh(position, corner);
       view.fit(position);
       view.cursor = -1;
-      view.points = model.get("points");
       color();
       links();
     };
@@ -85,6 +89,7 @@ export default {
           .replace("{there}", link[vertex] < 0 ? "unknown" : link[vertex])
           .replace("{value}", values && !Number.isNaN(values[vertex]) ? (100 * values[vertex]).toFixed(2) : "unknown"),
       };
+      for (const one of view.camera.views) one.told?.(); // what the browser said and marked by itself was of the links before
     };
     const ghosts = () => {
       const position = numbers(Float32Array, model.get("ghost_position")), corner = numbers(Uint32Array, model.get("ghost_corner"));
@@ -98,12 +103,7 @@ export default {
       view.name(model.get("title") || "surface");
       colorBar(bar, model.get("bar"));
     };
-    const answered = () => {
-      if (!current()) return; // of a place where the user is no longer
-      readout.textContent = model.get("caption");
-      view.points = model.get("points");
-      view.redraw();
-    };
+    const answered = () => current() && view.told(); // not of a place where the user is no longer
     const lasso = () => {
       view.lasso = model.get("lasso");
       view.canvas.style.cursor = view.lasso ? "crosshair" : "";
