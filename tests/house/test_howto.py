@@ -89,4 +89,4 @@ def test_every_cell_of_the_gallery_shows_a_picture_and_most_charts_stand_in_it(
     public = [name for name, made in vars(charts).items() if inspect.isfunction(made)]
     drawing = {n for n in public if n[0] != "_" and vars(charts)[n].__module__ == charts.__name__}
     left_out = {name for name in drawing if f"charts.{name}(" not in text}
-    assert left_out == {"svg", "brief", "color_bar"}
+    assert left_out == {"svg", "brief", "color_bar", "reach"}
