@@ -97,7 +97,7 @@ def pyfm_fit(source, target, motion, *, k_init=20, init="landmarks", near=None):
         n_descr=100, landmarks=marks, subsample_step=5, k_process=k, k_descr=k, verbose=False
     )
     model.fit(K=(k_init, k_init), w_descr=1, w_lap=1e-2, w_dcomm=1e-1, verbose=False)
-    return model.FM, landmarks
+    return model.FM_12, landmarks
 
 
 def one_start(X, area, Y, area_y):

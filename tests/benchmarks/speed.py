@@ -233,7 +233,7 @@ def other_first_map(a, b, landmarks):
     model = FunctionalMapping(processed(*a), processed(*b))
     model.preprocess(n_descr=100, landmarks=landmarks, subsample_step=5, k_process=K, k_descr=K)
     model.fit(K=(K_INIT, K_INIT))
-    return model.FM
+    return model.FM_12
 
 
 def other_zoomout(C, a, b):
@@ -483,7 +483,7 @@ def other_pipeline(paths, template):
         landmarks = np.c_[landmark, nearest_rows(moved[a][landmark], moved[b])]
         model.preprocess(n_descr=100, landmarks=landmarks, subsample_step=5, k_process=K, k_descr=K)
         model.fit(K=(K_INIT, K_INIT))
-        maps[i, j] = model.FM
+        maps[i, j] = model.FM_12
     found = FMN([shapes[n][3] for n in names], maps)
     found.zoomout_refine(
         nit=(K - K_INIT) // 5, step=5, subsample=1000, isometric=True, cclb_ratio=1, n_jobs=1
