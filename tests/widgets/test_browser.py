@@ -743,6 +743,7 @@ def test_the_cursor_of_a_matrix_never_returns(far):
       };
       setInterval(look, 5);
     }""")
+    far.wait_for_function("window.cells.length === 1")  # where it is before the first click
     box = matrix.bounding_box()
     for i in (4, 6, 8, 10, 12):
         far.mouse.click(box["x"] + box["width"] * i / 24.5, box["y"] + box["height"] * i / 24.5)
