@@ -16,12 +16,7 @@ from s4a.geometry.align import Motion, align, farthest_points, realign, rigid_tr
 from s4a.geometry.closest import POSITION_WEIGHT
 from s4a.geometry.mesh import edges
 from s4a.method import fmap, joint
-from s4a.method.shape import (
-    Basis,
-    common_fields,
-    corresponding_landmarks,
-    field_columns,
-)
+from s4a.method.shape import Basis, common_fields, corresponding_landmarks, field_columns
 from s4a.schema import check_choice
 
 INITS = ("dense", "landmarks")  # what first maps are fitted on

@@ -17,7 +17,7 @@ says so.
 The pairs that elastic rounds were tuned on are shown with ``--tuned`` and left out otherwise; of
 cortex templates there is one pair, which was tuned on.  ``--more`` shows pairs that stand in
 neither, among them every other one of the five skulls, without joint rounds and without trimesh,
-which takes twenty minutes for a skull; at the end the mean of each method over the pairs of a set,
+which takes 16 to 19 minutes a skull; at the end the mean of each method over the pairs of a set,
 and on how many it is nearer than S4A.  All but brains need the shared data beside the checkout; the
 others come with the extra ``bench``.
 """
