@@ -15,7 +15,7 @@ import xarray as xr
 from s4a.analysis.effects import check_permutations, modes_study
 from s4a.analysis.inputs import Values, field_sample
 from s4a.analysis.permutation import batched, design
-from s4a.method.pca import center_gram, gram, principal_components
+from s4a.method.pca import gram, principal_components
 from s4a.schema import FIELD_UNIT, dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
 
@@ -220,7 +220,7 @@ def free(M: np.ndarray, Z: np.ndarray) -> np.ndarray:
 
 def coordinates(d: np.ndarray, area: np.ndarray) -> np.ndarray:
     """Isometric coordinates ``(s, c)`` of fields ``(s, n, k)`` under the areas, less their mean."""
-    variance, V = principal_components(center_gram(gram(d - d.mean(0), area)))
+    variance, V = principal_components(gram(d - d.mean(0), area))
     return V * np.sqrt(variance * (len(d) - 1))
 
 

@@ -28,7 +28,7 @@ from s4a.analysis.permutation import (
 )
 from s4a.geometry.mesh import as_arrays, vertex_normals
 from s4a.method.deform import normal_displacement
-from s4a.method.pca import center_gram, gram, principal_components
+from s4a.method.pca import gram, principal_components
 from s4a.schema import FIELD_UNIT, dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
 
@@ -467,7 +467,7 @@ def _said(sample, x, options):
 def scores_of(sample: Sample, n_components: int | None) -> tuple[np.ndarray, np.ndarray]:
     """Scores on the first components ``(s, c)``, and all coordinates in the unit of the input."""
     d = sample.d
-    variance, V = principal_components(center_gram(gram(d - d.mean(0), sample.area)))
+    variance, V = principal_components(gram(d - d.mean(0), sample.area))
     if not len(variance):
         raise ValueError("a test needs shapes that differ; all displacements are equal")
     c = count_components(variance, len(d), n_components, most=len(variance))

@@ -31,7 +31,7 @@ from s4a.analysis.permutation import (
 from s4a.geometry.mesh import as_arrays, vertex_normals
 from s4a.input.subjects import listed
 from s4a.method.deform import normal_displacement
-from s4a.method.pca import center_gram, gram, principal_components
+from s4a.method.pca import gram, principal_components
 from s4a.schema import FIELD_UNIT, dataset, in_unit
 from s4a.seeds import RNG, seed_of
 
@@ -367,7 +367,7 @@ def _test(sample, t, subject, seen, of, n_components, options):
         )
     blocked = {"covariates": Z, "blocks": subject, **options}
     share, p, p_max = vertex_test(fields, x, **blocked)
-    variance, V = principal_components(center_gram(gram(E, sample.area)))
+    variance, V = principal_components(gram(E, sample.area))
     if not len(variance):
         raise ValueError("growth needs shapes that differ within subjects; all visits are equal")
     c = count_components(variance, dof, n_components, most=len(variance))

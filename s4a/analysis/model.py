@@ -47,7 +47,7 @@ def describe_by_others(
         Row c: what component c adds, in terms of the others less their mean.
     """
     n = len(inner)
-    variance, V = principal_components(center_gram(inner))
+    variance, V = principal_components(inner)
     c = len(variance)
     deviation = np.sqrt(variance)
     length = np.sqrt(variance * (n - 1))  # of the components, as sums of the others
@@ -220,7 +220,7 @@ def specificity(
     nearest : int ndarray (c, n_samples)
     score : float ndarray (n_samples, c)
     """
-    variance, V = principal_components(center_gram(K))
+    variance, V = principal_components(K)
     shapes = V * np.sqrt(variance * (len(K) - 1))  # (s, c), coordinates of the collection
     score = rng.normal(size=(n_samples, len(variance)))
     samples = score * np.sqrt(variance)  # (n_samples, c)
@@ -385,7 +385,7 @@ def evaluate(
     K = gram(d - d.mean(0), area)
     error, _ = leave_one_out(K)
     distance, nearest, score = specificity(K, n_samples, draw)
-    variance, _ = principal_components(center_gram(K))
+    variance, _ = principal_components(K)
     c = len(variance)
     compactness = np.cumsum(variance)
     quality = dataset(
@@ -415,7 +415,7 @@ def _per_component(values, c):
 def _measure_surfaces(registration, d, K, P, score, nearest):
     """Generalization and specificity as mean distances of points P ``(s, p, 3)`` to surfaces."""
     X, T = as_arrays(registration)
-    _, V = principal_components(center_gram(K))
+    _, V = principal_components(K)
     c = V.shape[1]
     rows = []
     for i in range(len(d)):

@@ -41,7 +41,7 @@ from s4a.analysis.model import KEPT, count_components, evaluate, leave_one_out, 
 from s4a.analysis.permutation import indicators, smallest_p
 from s4a.analysis.restrict import with_size, within, without
 from s4a.analysis.structures import structures, structures_modes, structures_of_new
-from s4a.method.pca import center_gram, gram, principal_components
+from s4a.method.pca import gram, principal_components
 from s4a.schema import dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
 from s4a.study.tree import of_structure
@@ -122,7 +122,7 @@ def outliers(
     registration, d, area = displacements_of(study)
     s = len(d)
     K = gram(d - d.mean(0), area)
-    variance, _ = principal_components(center_gram(K))
+    variance, _ = principal_components(K)
     c = count_components(variance, s, n_components, most=s - 3, at_most=s // 10)
     error, score = leave_one_out(K)
     error = error[:, c]

@@ -16,7 +16,7 @@ from s4a import statistics, synthesize, synthetic, write_page
 from s4a.analysis import model, permutation
 from s4a.analysis.inputs import displacements_of, values_of
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
-from s4a.method.pca import center_gram, gram, gram_pca, pca, principal_components
+from s4a.method.pca import gram, gram_pca, pca, principal_components
 from s4a.schema import dataset
 from s4a.show.pictures import write_animation
 from s4a.widgets.modes import Modes
@@ -177,7 +177,7 @@ def test_specificity_is_the_distance_between_the_fields():
     d, area = rng.normal(size=(5, 20, 3)), rng.uniform(1, 2, 20)
     K = gram(d - d.mean(0), area)
     distance, nearest, score = model.specificity(K, 7, rng)
-    variance, V = principal_components(center_gram(K))
+    variance, V = principal_components(K)
     modes = np.einsum("sc,snx->cnx", V, d - d.mean(0)) / np.sqrt(4)
     w = (area / area.sum())[:, None]
     assert distance.shape == (len(variance), 7) == (4, 7)
