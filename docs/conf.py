@@ -48,6 +48,11 @@ suppress_warnings = ["mystnb.unknown_mime_type"]
 
 # S4A_DOCS=off leaves the outputs out, for a quick look at words
 nb_execution_mode = os.environ.get("S4A_DOCS", "cache")
+# S4A_LESSONS="00 04" runs these lessons and nothing else, to look at their pages
+SOME = os.environ.get("S4A_LESSONS", "").split()
+if SOME:
+    others = {path.name for path in NOTEBOOKS.glob("*.ipynb") if path.name[:2] not in SOME}
+    nb_execution_excludepatterns = ["gallery.md", *sorted(others)]
 nb_execution_cache_path = str(HERE / "_build" / "notebooks")
 nb_execution_timeout = 600
 nb_execution_raise_on_error = True
@@ -154,7 +159,7 @@ def bars(app, what, name, obj, options, lines):
 
 def pictures(app, what, name, obj, options, lines):
     """Below examples that end in a figure stands the figure."""
-    if nb_execution_mode == "off" or what in ("module", "class"):
+    if nb_execution_mode == "off" or SOME or what in ("module", "class"):
         return
     if f"{getattr(obj, '__module__', '')}.{getattr(obj, '__name__', '')}" != name:
         return  # imported from where it is defined, and documented there

@@ -6,13 +6,13 @@ A voxel whose centre is within a shape has the label of the vertex that is neare
 import logging
 from pathlib import Path
 
-import igl
 import numpy as np
 import xarray as xr
 from scipy.spatial import cKDTree
 
 from s4a.analysis.inputs import registration_of
 from s4a.analysis.transfer import transfer_labels
+from s4a.geometry.compiled import igl
 from s4a.geometry.mesh import as_arrays
 from s4a.input.annotations import MIRROR as BETWEEN_RAS_AND_LPS
 from s4a.input.hands import in_file

@@ -174,8 +174,10 @@ def cache() -> Finding:
 
 def memory() -> Finding:
     """Memory that is free now."""
-    import psutil
+    from s4a.geometry.compiled import psutil
 
+    if not psutil:
+        return Finding("memory", "note", "how much is free cannot be seen", "pip install psutil")
     free = psutil.virtual_memory().available / GIB
     if free >= LEAST_MEMORY:
         return Finding("memory", "ok", f"{free:.1f} GiB free")

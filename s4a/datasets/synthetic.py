@@ -11,7 +11,6 @@ right, y to the front, z up.
 from pathlib import Path
 from typing import Any
 
-import fpsample
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
@@ -20,6 +19,8 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, ndtri
 
 from s4a.datasets.artifacts import soil
+from s4a.geometry.align import spread
+from s4a.geometry.compiled import fpsample
 from s4a.geometry.mesh import as_arrays, as_dataset, edge_graph, edges, vertex_areas
 from s4a.input.collection import read_shapes
 from s4a.input.files import write_mesh
@@ -378,8 +379,12 @@ def _mesh(truth, shape, n_vertices, rng):
     u = _unit(u + rng.normal(0, 0.3 * np.sqrt(4 * np.pi / len(u)), u.shape))
     x = position(truth, shape, u).astype(np.float32)
     start = int(rng.integers(len(u)))
-    h = min(7, int(np.log2(len(u))))  # levels of its tree, whose leaves must not be empty
-    u = u[np.sort(fpsample.bucket_fps_kdline_sampling(x, n_vertices, h=h, start_idx=start))]
+    if fpsample:
+        h = min(7, int(np.log2(len(u))))  # levels of its tree, whose leaves must not be empty
+        sample = fpsample.bucket_fps_kdline_sampling(x, n_vertices, h=h, start_idx=start)
+    else:
+        sample = spread(x, n_vertices, start)
+    u = u[np.sort(sample)]
     return u, _delaunay(u)
 
 

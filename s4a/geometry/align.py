@@ -7,10 +7,11 @@ import itertools
 from dataclasses import dataclass
 from typing import Any
 
-import fpsample
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+
+from s4a.geometry.compiled import fpsample
 
 Motion = tuple[np.ndarray, np.ndarray]  # R (3, 3), t (3,)
 End = tuple[np.ndarray, np.ndarray, float]  # of an ICP: R, t and the residual
@@ -94,7 +95,35 @@ def farthest_points(P: np.ndarray, k: int) -> np.ndarray:
     if k >= len(P):
         return np.arange(len(P))
     start = int(np.argmax(((P - P.mean(0)) ** 2).sum(1)))
+    if not fpsample:
+        return spread(P, k, start)
     return fpsample.fps_sampling(P, k, start_idx=start).astype(np.int64)
+
+
+def spread(P: np.ndarray, k: int, start: int) -> np.ndarray:
+    """Farthest points from the point `start` on, by comparing all; fewer where points coincide.
+
+    Parameters
+    ----------
+    P : float ndarray (n, d)
+    k, start : int
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.geometry.align import spread
+    >>> spread(np.array([[0.0, 0], [1, 0], [5, 0], [5, 0]]), 4, 0).tolist()
+    [0, 2, 1]
+    """
+    columns = np.ascontiguousarray(P.T, float)
+    sample, gap = [start], np.full(len(P), np.inf)
+    while True:
+        way = columns - columns[:, sample[-1:]]
+        np.minimum(gap, (way * way).sum(0), out=gap)
+        if len(sample) >= k or gap.max() == 0:
+            break
+        sample.append(int(gap.argmax()))
+    return np.array(sample, np.int64)
 
 
 def many_farthest_points(P: np.ndarray, k: int, *, center: np.ndarray, seed: int = 0) -> np.ndarray:
@@ -120,6 +149,11 @@ def many_farthest_points(P: np.ndarray, k: int, *, center: np.ndarray, seed: int
         return np.arange(0)
     P = P - center
     radius = np.linalg.norm(P, axis=1)
+    if not fpsample:
+        if seed:
+            opposite = P[np.argsort(-radius, kind="stable")[seed % len(P)]]
+            radius = np.linalg.norm(P + opposite, axis=1)
+        return spread(P, k, int(radius.argmax()))
     # fpsample starts at a place in a tree of its own.  So a beacon is added, far away in one more
     # dimension; it may be taken again when all others coincide with samples, but goes in any case.
     beacon = np.zeros((1, P.shape[1] + 1))

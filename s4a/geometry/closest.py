@@ -5,11 +5,11 @@ A point on a surface is a triangle and three barycentric weights, the shares of 
 
 from typing import NamedTuple
 
-import igl
 import numpy as np
 import scipy.sparse as sp
 from scipy.spatial import cKDTree
 
+from s4a.geometry.compiled import igl
 from s4a.geometry.mesh import counting_order, triangle_areas, triangle_normals, vertex_normals
 
 # Of positions, for unit area, and of unit normals, where nearest points are searched in both.
@@ -52,6 +52,8 @@ def closest_point(P: np.ndarray, X: np.ndarray, T: np.ndarray) -> tuple[np.ndarr
     P = np.ascontiguousarray(P, np.float64)
     X = np.ascontiguousarray(X, np.float64)
     T = np.ascontiguousarray(T, np.int64)
+    if not igl:
+        return closest_of_all(P, X, T)
     triangle = igl.point_mesh_squared_distance(P, X, T)[1].reshape(-1)
     a, b, c = T[triangle].T
     return triangle, closest_point_on_triangles(P, X[a], X[b], X[c])
@@ -59,12 +61,48 @@ def closest_point(P: np.ndarray, X: np.ndarray, T: np.ndarray) -> tuple[np.ndarr
 
 def distance_to_surface(P: np.ndarray, X: np.ndarray, T: np.ndarray) -> np.ndarray:
     """Distances ``(p,)`` of points from a surface."""
+    if not igl:
+        return np.linalg.norm(interpolate(X, T, *closest_of_all(P, X, T)) - P, axis=1)
     squared = igl.point_mesh_squared_distance(
         np.ascontiguousarray(P, np.float64),
         np.ascontiguousarray(X, np.float64),
         np.ascontiguousarray(T, np.int64),
     )[0]
     return np.sqrt(np.maximum(squared, 0))
+
+
+def closest_of_all(P: np.ndarray, X: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """As :func:`closest_point`, without libigl: of the triangles whose centroids are near enough.
+
+    The nearest centroid lies on the surface, at a distance d, so the closest point is within d, and
+    the centroid of its triangle within d and the largest distance of a corner from its centroid.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.geometry.closest import closest_of_all
+    >>> X = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
+    >>> T = np.array([[0, 1, 2], [1, 3, 2]])
+    >>> triangle, weights = closest_of_all(np.array([[0.5, 0, 2]]), X, T)
+    >>> triangle.tolist(), weights.tolist()
+    ([0], [[0.5, 0.5, 0.0]])
+    """
+    middle = X[T].mean(1)
+    reach = np.linalg.norm(X[T] - middle[:, None], axis=2).max()
+    tree = cKDTree(middle)
+    triangle, weights = np.empty(len(P), np.int64), np.empty((len(P), 3))
+    for block in np.array_split(np.arange(len(P)), len(P) // 2000 + 1):
+        within = (tree.query(P[block])[0] + reach) * (1 + 1e-12)
+        near = tree.query_ball_point(P[block], within)
+        row = np.repeat(np.arange(len(block)), list(map(len, near)))
+        candidate = np.concatenate([np.empty(0, np.int64), *near]).astype(np.int64)
+        a, b, c = T[candidate].T
+        share = closest_point_on_triangles(P[block][row], X[a], X[b], X[c])
+        gap = np.linalg.norm(interpolate(X, T, candidate, share) - P[block][row], axis=1)
+        order = np.lexsort((candidate, gap, row))
+        best = order[np.searchsorted(row[order], np.arange(len(block)))]  # the first of a row
+        triangle[block], weights[block] = candidate[best], share[best]
+    return triangle, weights
 
 
 def closest_facing_point(

@@ -4,10 +4,14 @@ Which pairs meet is decided with exact predicates (Shewchuk 1997, in libigl), so
 unit nor rounding matters.
 """
 
-import igl.predicates
+import logging
+
 import numpy as np
 
+from s4a.geometry.compiled import igl
 from s4a.geometry.mesh import equal_rows, order_in_space
+
+log = logging.getLogger(__name__)
 
 # Pairs that cross are held at once, 40 bytes each: of a surface crumpled into a ball they are all
 MOST_PAIRS = 10_000_000
@@ -56,6 +60,21 @@ def count_crossing(X: np.ndarray, T: np.ndarray, *, most_pairs: int = MOST_PAIRS
     _, pair, _ = igl.predicates.find_intersections(X, some, X, T)
     apart = (some[pair[:, 0], :, None] != T[pair[:, 1], None, :]).all((1, 2))
     return round(len(np.unique(pair[apart, 0])) / len(sample) * len(T))
+
+
+def can_count(asked: bool) -> bool:
+    """Whether triangles that cross are counted: if `asked`, and libigl is there, or it warns.
+
+    Examples
+    --------
+    >>> from s4a.geometry.crossing import can_count
+    >>> can_count(True), can_count(False)
+    (True, False)
+    """
+    if asked and not igl:
+        log.warning("self-intersections are not counted, as libigl cannot be imported here")
+        return False
+    return asked
 
 
 def expected_pairs(X: np.ndarray, T: np.ndarray) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from s4a.geometry.align import Cloud, End, cloud, icp_each, principal_axes, residual_of
-from s4a.geometry.crossing import count_crossing
+from s4a.geometry.crossing import can_count, count_crossing
 from s4a.geometry.mesh import (
     as_arrays,
     components,
@@ -263,6 +263,7 @@ def examine(meshes: dict[str, xr.Dataset], *, intersections: bool = True) -> dic
     >>> seen["a"]["fit"].round(2).values.tolist()
     [nan, 0.23]
     """
+    intersections = can_count(intersections)
     seen = {name: portray(mesh, intersections=intersections) for name, mesh in meshes.items()}
     references = {name: seen[name] for name in pick_references(seen)}
     return {name: compare(name, one, references) for name, one in seen.items()}

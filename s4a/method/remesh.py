@@ -19,7 +19,6 @@ from collections.abc import Iterator
 from importlib.util import find_spec
 
 import numpy as np
-import robust_laplacian
 import scipy.sparse as sp
 import xarray as xr
 from scipy.sparse.csgraph import dijkstra
@@ -27,6 +26,7 @@ from scipy.spatial import cKDTree
 
 from s4a.geometry.align import many_farthest_points
 from s4a.geometry.closest import closest_point_in_star
+from s4a.geometry.compiled import robust_laplacian
 from s4a.geometry.mesh import (
     as_arrays,
     components,

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
+from s4a.geometry.crossing import can_count
 from s4a.input.decisions import doubtful_lines
 from s4a.input.evidence import pick_references
 from s4a.input.plausibility import Doubts, doubt, find_warnings
@@ -48,8 +49,8 @@ def check_plausibility(
 def looks_of(run: Run, original: Keys, options: Options) -> dict[str, xr.Dataset]:
     """What :func:`s4a.input.evidence.compare` sees in each shape that could be compared."""
     # how they are counted is part of the key: by PyMeshLab, as once, they were others
-    settings = (options.intersections,)
-    counted = ("exactly",) if options.intersections else settings
+    settings = (can_count(options.intersections),)
+    counted = ("exactly",) if settings[0] else settings
     todo = [
         Task(n, f"network/sketch_{n}.nc", portray_shape, (run.folder, n, *settings), (key, counted))
         for n, key in original.items()

@@ -13,6 +13,7 @@ import xarray as xr
 from joblib import delayed
 from threadpoolctl import threadpool_limits
 
+from s4a.geometry.crossing import can_count
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.input import evidence
 from s4a.input.collection import read_shapes, shape_report
@@ -369,7 +370,7 @@ def _insert_one(mesh, frozen, options, references):
     )
     seen = None
     if references is not None:
-        portrait = evidence.portray(mesh, intersections=options.intersections)
+        portrait = evidence.portray(mesh, intersections=can_count(options.intersections))
         seen = evidence.compare("", portrait, references)
     return Inserted(coarse, Y, registration, seen)
 

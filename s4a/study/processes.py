@@ -15,11 +15,10 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-import psutil
 from joblib import Parallel
-from joblib.externals.loky.backend import resource_tracker
 from joblib.parallel import LokyBackend, get_active_backend
 
+from s4a.geometry.compiled import psutil
 from s4a.study.locks import CAN_HOLD, hold
 
 TEMPORARY = "s4a-"  # how the folder of a study that nobody keeps begins
@@ -44,6 +43,8 @@ def workers(n_jobs: int | None, **options: Any) -> Parallel:
     """
     backend, _ = get_active_backend()
     if isinstance(backend, LokyBackend) and backend.effective_n_jobs(n_jobs) > 1:
+        from joblib.externals.loky.backend import resource_tracker  # needs processes
+
         with closed_terminal_waits():
             resource_tracker.ensure_running()
         # as text: a worker is to know it before it imports NumPy and this package, which takes long
@@ -188,7 +189,7 @@ def remove_remains(token: str) -> None:
         Of :class:`s4a.study.store.Claim`, as it was found in a lock that nobody held.
     """
     owner = re.match(r"\d{1,9}\b", token)
-    if not owner or psutil.pid_exists(int(owner[0])):
+    if not owner or not psutil or psutil.pid_exists(int(owner[0])):
         return
     shared = Path("/dev/shm")
     for path in shared.glob(f"sem.loky-{owner[0]}-*"):

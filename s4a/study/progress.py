@@ -9,8 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import psutil
-
+from s4a.geometry.compiled import psutil
 from s4a.study.seal import open_regular
 from s4a.study.store import STRUCTURES, check_is_study
 
@@ -209,6 +208,8 @@ def memory_of(owner: int, begun: float) -> tuple[float, int]:
 
     None where the process of that number is not the one that noted the time `begun`.
     """
+    if not psutil:  # in a browser, where this is the only process
+        return 0.0, int(owner == os.getpid())
     try:
         process = psutil.Process(owner)
         if process.create_time() > begun + 1 or process.status() == psutil.STATUS_ZOMBIE:

@@ -15,12 +15,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
 import xarray as xr
 from joblib import delayed, effective_n_jobs
 from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
+from s4a.geometry.compiled import psutil
 from s4a.study.processes import died, interruption_kept, workers
 from s4a.study.progress import Notes, write_at_once
 from s4a.study.seal import open_regular
@@ -395,7 +395,9 @@ def peak_memory() -> float:
     """Peak resident memory of this process in MiB; nan where the system does not say."""
     try:
         import resource
-    except ImportError:  # on Windows
+    except ImportError:  # on Windows, and in a browser
+        if not psutil:
+            return float("nan")
         return getattr(psutil.Process().memory_info(), "peak_wset", np.nan) / 2**20
     unit = 2**20 if sys.platform == "darwin" else 2**10
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit

@@ -92,7 +92,13 @@ class Progress(Panel):
         self.view.disabled = not self.ready()
         self.state, self.stopped, self.started = "running", threading.Event(), time.monotonic()
         context = multiprocessing.get_context("spawn")
-        self.answer, there = context.Pipe(duplex=False)
+        try:
+            self.answer, there = context.Pipe(duplex=False)
+        except ImportError as error:
+            raise ImportError(
+                "Progress runs the analysis in a process of its own, and this kernel cannot start "
+                "one, as in a browser: call s4a.analyse instead"
+            ) from error
         self.process = context.Process(target=work, args=(there, *self.arguments))
         self.process.start()
         there.close()

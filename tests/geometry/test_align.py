@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from s4a import synthetic
 from s4a.geometry import align
+from s4a.geometry.compiled import Missing
 from s4a.geometry.mesh import as_arrays, vertex_areas
 
 
@@ -143,6 +144,14 @@ def test_all_points_are_given_where_more_are_wanted_than_there_are(n):
     assert (align.farthest_points(X, 20) == np.arange(n)).all()
 
 
+@pytest.fixture(params=["fpsample", "NumPy"])
+def sampler(request, monkeypatch):
+    """Farthest points by the package, and by what stands for it in a browser."""
+    if request.param == "NumPy":
+        monkeypatch.setattr(align, "fpsample", Missing("fpsample", ImportError()))
+
+
+@pytest.mark.usefixtures("sampler")
 @pytest.mark.parametrize("n, k", [(2, 1), (7, 5), (300, 40), (2000, 300)])
 def test_farthest_points_are_those_of_the_exhaustive_search(n, k):
     X = np.random.default_rng(n).normal(size=(n, 3))
@@ -155,6 +164,7 @@ def test_farthest_points_are_those_of_the_exhaustive_search(n, k):
     assert align.many_farthest_points(X, k, center=X.mean(0)).tolist() == found
 
 
+@pytest.mark.usefixtures("sampler")
 def test_another_seed_or_centre_starts_elsewhere():
     X = np.random.default_rng(7).normal(size=(500, 3))
     center = np.zeros(3)
@@ -167,6 +177,7 @@ def test_another_seed_or_centre_starts_elsewhere():
     assert align.many_farthest_points(X, 5, center=center)[0] == outermost
 
 
+@pytest.mark.usefixtures("sampler")
 def test_points_that_coincide_are_taken_once():
     X = np.repeat(np.eye(3), 10, axis=0)
     assert sorted(align.many_farthest_points(X, 8, center=np.zeros(3)) // 10) == [0, 1, 2]

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from s4a import synthetic
+from s4a.geometry import closest
 from s4a.geometry.closest import closest_point_on_triangles, feature_tree, match_surfaces
+from s4a.geometry.compiled import Missing
 from s4a.geometry.mesh import as_arrays, vertex_normals
 
 
@@ -67,3 +69,17 @@ def test_the_right_side_of_a_thin_wall_is_found(ball):
     match = match_surfaces(moved, vertex_normals(moved, T), wall, vertex_normals(wall, T))
     inside = np.linalg.norm(X[:, :2], axis=1) < 0.8 * np.abs(X).max()
     assert (np.sign(X[match, 2]) == np.sign(X[:, 2]))[inside].mean() > 0.99
+
+
+@pytest.mark.parametrize("far", [0.01, 0.5, 5.0])
+def test_without_libigl_the_closest_points_are_as_near(ball, far, monkeypatch):
+    X, T = ball
+    rng = np.random.default_rng(1)
+    X = X * [1, 2, 3]  # triangles of several sizes
+    P = X[rng.integers(len(X), size=2500)] + far * rng.normal(size=(2500, 3))
+    expected = closest.distance_to_surface(P, X, T)
+    monkeypatch.setattr(closest, "igl", Missing("libigl", ImportError()))
+    assert closest.distance_to_surface(P, X, T) == pytest.approx(expected, abs=1e-9)
+    triangle, weights = closest.closest_point(P, X, T)
+    found = np.linalg.norm(closest.interpolate(X, T, triangle, weights) - P, axis=1)
+    assert found == pytest.approx(expected, abs=1e-9)
