@@ -3,6 +3,8 @@
 No network is needed, to build it or to read it.
 """
 
+import base64
+import io
 import os
 import re
 import sys
@@ -12,6 +14,7 @@ from pathlib import Path
 import nbformat
 from docutils import nodes
 from latex2mathml.converter import convert
+from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
@@ -25,6 +28,7 @@ from s4a.schema import TABLE
 
 HERE = Path(__file__).parent
 NOTEBOOKS = HERE.parent / "notebooks"
+LARGE = 20_000  # letters of a picture that is packed
 
 project, author = "S4A", "S4A developers"
 copyright = author
@@ -67,6 +71,7 @@ html_math_renderer = "mathml"
 html_theme = "furo"
 html_title = "S4A"
 html_static_path = ["_static"]
+html_favicon = "_static/favicon.svg"  # or browsers ask for one that is not there
 html_css_files = ["s4a.css"]
 html_js_files = ["s4a.js"]
 html_show_sphinx = False
@@ -169,6 +174,23 @@ def pictures(app, what, name, obj, options, lines):
         lines += ["", f".. image:: /_examples/{path.name}", f"   :alt: {words}", ""]
 
 
+def smaller(found):
+    """A picture in a page as WebP: without loss, or with where that is too large."""
+    picture, small = Image.open(io.BytesIO(base64.b64decode(found[1]))), io.BytesIO()
+    picture.save(small, "webp", lossless=True)
+    if small.tell() > LARGE:
+        small = io.BytesIO()
+        picture.save(small, "webp", quality=90)
+    return f"data:image/webp;base64,{base64.b64encode(small.getvalue()).decode()}"
+
+
+def pack_pictures(app, pagename, templatename, context, doctree):
+    """Large pictures in the outputs of notebooks become smaller, so that pages load soon."""
+    pattern = rf"data:image/png;base64,([A-Za-z0-9+/]{{{LARGE},}}=*)"
+    if "body" in context:
+        context["body"] = re.sub(pattern, smaller, context["body"])
+
+
 def front_door(app, env, node, content):
     """A reference to a public name, as `s4a.analyse`, goes where its module is documented."""
     name = node.get("reftarget", "").removeprefix("s4a.")
@@ -211,3 +233,4 @@ def setup(app):
     app.connect("autodoc-process-docstring", pictures, priority=100)  # before napoleon's words
     app.connect("autodoc-process-docstring", bars)
     app.connect("missing-reference", front_door)
+    app.connect("html-page-context", pack_pictures)

@@ -3,7 +3,9 @@
 Panels and sliders as HTML that needs no kernel.
 """
 
+import base64
 import contextlib
+import gzip
 import io
 import itertools
 import math
@@ -24,13 +26,54 @@ from s4a.show.panel_page import panel_html
 from s4a.show.parts import Parts
 from s4a.widgets import threejs
 from s4a.widgets.explore import Explore
-from s4a.widgets.panel import Panel
+from s4a.widgets.panel import OfKernel
 
-LIMIT = 1_500_000  # characters of a panel
+LIMIT = 1_500_000  # recorded characters of the panels of a cell, together
 N_VALUES = 5  # of a slider
-PANEL = """
-<iframe class="panel" title="{{ panel.title }}" srcdoc="{{ html }}"
-onload="this.style.height = this.contentDocument.documentElement.scrollHeight + 8 + 'px'"></iframe>
+# a panel is unpacked when it is first shown, and as tall as what is in it
+PANELS = """
+<div class="panels">
+{% if pages | length > 1 %}
+<div role="group" aria-label="Panels">
+{% for title, _ in pages %}
+<button type="button" aria-pressed="false">{{ title }}</button>
+{% endfor %}
+</div>
+{% endif %}
+{% for title, page in pages %}
+<iframe class="panel" title="{{ title }}" data-page="{{ page }}" hidden></iframe>
+{% endfor %}
+<script>
+{
+  const box = document.currentScript.parentNode;
+  const frames = [...box.querySelectorAll("iframe")];
+  const buttons = [...box.querySelectorAll("button")];
+  const fit = (frame) => {
+    const page = frame.contentDocument.documentElement;
+    frame.style.height = page.offsetHeight + 8 + "px";
+  };
+  const unpacked = (text) => {
+    const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+    return new Response(stream).text();
+  };
+  const show = async (i) => {
+    frames.forEach((frame, j) => { frame.hidden = i !== j; });
+    buttons.forEach((button, j) => button.setAttribute("aria-pressed", i === j));
+    const frame = frames[i], packed = frame.dataset.page;
+    if (!packed) return;
+    delete frame.dataset.page;
+    const page = await unpacked(packed);
+    frame.addEventListener("load", () => {
+      new ResizeObserver(() => fit(frame)).observe(frame.contentDocument.documentElement);
+    });
+    frame.srcdoc = page;
+  };
+  buttons.forEach((button, i) => button.addEventListener("click", () => show(i)));
+  show(0);
+}
+</script>
+</div>
 """
 # each slider's places are strides apart in the list of all frames
 SLIDERS = """
@@ -58,15 +101,26 @@ format_of = get_ipython().display_formatter
 
 
 def framed(panel):
-    """A panel as a page within the page; of tabs that of the modes, or the first."""
+    """A panel as a page within the page; of tabs all that the study has, with buttons."""
     if isinstance(panel, Explore):
-        panel = panel["Modes" if "Modes" in panel.kinds else next(iter(panel.kinds))]
-    html = str(panel_html(panel, LIMIT))
-    return templates.from_string(PANEL).render(panel=panel, html=html).strip()
+        panels = {}
+        for title in panel.kinds:
+            with contextlib.suppress(ValueError):  # the study lacks what it shows
+                panels[title] = panel[title]
+        panel.tabs.selected_index = 0
+    else:
+        panels = {panel.title: panel}
+    pages = [(title, packed(one, LIMIT // len(panels))) for title, one in panels.items()]
+    return templates.from_string(PANELS).render(pages=pages).strip()
 
 
-for kind in (Panel, Explore):
-    format_of.formatters["text/html"].for_type(kind, framed)
+def packed(panel, limit):
+    """The page of a panel, compressed, in letters."""
+    html = panel_html(panel, limit).encode()
+    return base64.b64encode(gzip.compress(html, mtime=0)).decode()
+
+
+OfKernel.without_kernel = framed
 
 
 def tubes(begin, end, colors, radius):

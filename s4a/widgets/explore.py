@@ -15,7 +15,7 @@ from s4a.widgets.functional import FunctionalMap
 from s4a.widgets.median import Median
 from s4a.widgets.modes import Modes
 from s4a.widgets.network import Network
-from s4a.widgets.panel import close_all, layout_of
+from s4a.widgets.panel import OfKernel, close_all, layout_of
 from s4a.widgets.spectrum import Spectrum
 from s4a.widgets.structures import Structures
 from s4a.widgets.transfer import Transfer
@@ -39,7 +39,7 @@ def running_cell() -> str | None:
     return kernel.get_parent().get("metadata", {}).get("cellId") if kernel else None
 
 
-class Explore(ipywidgets.VBox):
+class Explore(OfKernel):
     """Tabs over a study.
 
     Parameters
@@ -57,6 +57,9 @@ class Explore(ipywidgets.VBox):
     panels : dict
         Title of the tab -> panel, of those that were opened.
     """
+
+    title = "Panels of a study"
+    page = 'panels["Modes"].save_html("modes.html")'
 
     def __init__(self, study: xr.DataTree, *, width: float | str | None = None, **options: Any):
         self.study, self.options, self.panels = study, options, {}

@@ -126,9 +126,29 @@ class Frame(anywidget.AnyWidget):
     title = traitlets.Unicode("").tag(sync=True)
     font = traitlets.Float(0.0).tag(sync=True)
     help = traitlets.Dict().tag(sync=True)
+    asked = traitlets.Float(0.0).tag(sync=True)  # by a page that wants to know if there is a kernel
+    heard = traitlets.Float(0.0).tag(sync=True)  # the answer: the same number
+
+    @traitlets.observe("asked")
+    def _answer(self, change: dict) -> None:
+        self.heard = change["new"]
 
 
-class Panel(ipywidgets.VBox):
+class OfKernel(ipywidgets.VBox):
+    """A widget that says so where a notebook is shown without its kernel, as by nbconvert."""
+
+    title = ""
+    page = 'panel.save_html("panel.html")'  # what writes a page of it
+
+    def without_kernel(self) -> str:
+        """What is shown in place of the widget, as HTML; a page of it takes too long to record."""
+        return PARTS.needs_kernel(self.title, self.page)
+
+    def _repr_mimebundle_(self, **options: Any) -> dict[str, Any]:
+        return super()._repr_mimebundle_(**options) | {"text/html": self.without_kernel()}
+
+
+class Panel(OfKernel):
     """A panel: subclasses build their parts in ``build``, and their callbacks are guarded.
 
     Parameters

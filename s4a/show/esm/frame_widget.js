@@ -1,4 +1,21 @@
 // What every panel has around its parts: a button for the full screen, its own size of text, a name, and names for its sliders.
+const PATIENCE = 5000; // ms
+
+// Scripts of widgets run in a page that was saved with their state, too, where no kernel is: whoever does not answer
+// while it is not at work is not there. It may come late, as a front end need not say that its kernel works.
+function askKernel(model, el) {
+  if (model.saved) return () => {}; // a page that answers by itself
+  const asked = Date.now(), working = ["busy", "starting", "restarting", "autorestarting"];
+  const note = html(el, "div", { role: "status", hidden: "" }, "Python does not answer: this panel is interactive with a running kernel; its save_html writes a page that works without one.");
+  const wait = setInterval(() => { note.hidden = working.includes(model.widget_manager?.kernel?.status); }, PATIENCE);
+  const heard = () => { if (model.get("heard") === asked) end(); };
+  const end = () => { clearInterval(wait); note.remove(); model.off("change:heard", heard); };
+  model.on("change:heard", heard);
+  model.set("asked", asked);
+  model.save_changes();
+  return end;
+}
+
 export default {
   render({ model, el }) {
     el.classList.add("s4a", "s4a-frame");
@@ -34,7 +51,9 @@ export default {
     observer.observe(el);
     document.addEventListener("fullscreenchange", told);
     model.on("change:font", sized);
+    const end = askKernel(model, el);
     return () => {
+      end();
       observer.disconnect();
       watch?.disconnect();
       document.removeEventListener("fullscreenchange", told);

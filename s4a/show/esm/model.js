@@ -16,5 +16,6 @@ globalThis.s4aModel = (id) => {
     on: (event, act) => { (heard[event] ||= []).push(act); },
     off: (event, act) => { heard[event] = (heard[event] || []).filter((other) => other !== act); },
     save_changes: () => {},
+    saved: true,
   });
 };
