@@ -34,7 +34,7 @@ NOT_SHOWN = (
 def reduced(data):
     """A Dataset of a study without what no panel shows.
 
-    It is rounded to about four digits, to be compressed on disk.
+    It is rounded to about four digits, so it compresses well.
     """
     data = data.drop_vars(NOT_SHOWN, errors="ignore")
     for name, values in data.data_vars.items():
@@ -42,13 +42,6 @@ def reduced(data):
             data[name] = values.copy(data=rounded(values.values))
         elif values.dtype == np.int64:
             data[name] = values.astype(np.int32)
-        if values.size > 1000:  # a chunk has costs of its own
-            data[name].encoding = {
-                "zlib": True,
-                "shuffle": True,
-                "complevel": 9,
-                "chunksizes": values.shape,
-            }
     return data
 
 
@@ -71,7 +64,7 @@ def reduce(whole, small):
         if name.parent.name != "network":  # first maps and motions, on the way to what is shown
             data = store.read(path)
             key, made_from = data.attrs["task_key"], data.attrs["made_from"].split()
-            store.write(reduced(data), Path(small) / name, key, made_from)
+            store.write(reduced(data), Path(small) / name, key, made_from, compression=4)
 
 
 def collection(folder=FOLDER, *, n=51, n_vertices=2000, n_coarse=600, n_pairs=150, k=30):

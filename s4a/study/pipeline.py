@@ -441,7 +441,7 @@ def consistent_zoomout(run: Run, coarse: Keys, first: Keys, options: Options) ->
         maps = xr.concat([read(run.folder / file) for file in first], dim="pair")
         with parallel_config(backend="threading"):  # here, whatever backend the tasks run on
             n_threads = effective_n_jobs(run.n_jobs)
-        tree = consistent_maps(run.folder, list(coarse), maps, options, n_threads)
+        tree = consistent_maps(run, list(coarse), maps, options, n_threads)
         for old in (run.folder / "rounds").glob("k_*.nc"):  # of other maps
             old.unlink()
         rounds = [f"rounds/{name}" for name in tree["rounds"].children] if "rounds" in tree else []

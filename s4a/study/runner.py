@@ -30,6 +30,7 @@ log = logging.getLogger(__name__)
 
 Keys = dict[str, str]  # name of a shape, or file of several -> key of what was computed
 BEGUN = "begun"
+LONGEST = len("align doubtful shapes: ")  # of the names beside the progress bar
 
 
 @dataclass(frozen=True)
@@ -118,6 +119,7 @@ class Run:
         self.costs = read_costs(self.costs_file)
         self.notes = Notes(self.folder, claim.owner)
         self.doing = "begin"
+        self.bar: Any = None  # of tqdm, once a stage has something to do
         self.interrupted = threading.Event()
 
     @property
@@ -168,8 +170,9 @@ class Run:
         n_done, share = len(tasks) - len(missing), len(missing) / max(len(tasks), 1)
         with self.stage(stage, share, done=n_done, of=len(tasks)):
             outcomes = self.outcomes(missing)
-            no_bar = not missing or told_in_lines()
-            for done in tqdm(outcomes, total=len(missing), desc=stage, disable=no_bar):
+            if missing:
+                self.show(stage, len(missing))
+            for done in outcomes:
                 self.end_if_interrupted()
                 self.workers[done.pid] = max(done.memory, self.workers.get(done.pid, 0))
                 if done.failure and not each:
@@ -182,7 +185,20 @@ class Run:
                 if done.failure:
                     self.failures[done.name] = f"{stage}: {done.failure}"
                 self.notes.add(stage, {n: self.failures[n] for n in [done.name] if done.failure})
+                self.bar.update()
         return {task.name: task.key for task in tasks if task.name not in self.failures}
+
+    def show(self, stage: str, total: int) -> tqdm:
+        """The progress bar, at the beginning of a stage: one for all, which goes with the run."""
+        stage = f"{stage}: ".ljust(LONGEST)
+        if self.bar is None:
+            look = {"leave": False, "bar_format": "{desc}{percentage:3.0f}%|{bar}{r_bar}"}
+            self.bar = tqdm(desc=stage, total=total, disable=told_in_lines(), **look)
+            if box := getattr(self.bar, "container", None):  # in a notebook
+                box.children[0].layout.width = "17em"
+        self.bar.set_description_str(stage, refresh=False)
+        self.bar.reset(total)
+        return self.bar
 
     def outcomes(self, tasks: list[Task]) -> Iterator[Outcome]:
         """Do the tasks side by side, each in a process of its own where two processes died of it.
@@ -236,7 +252,10 @@ class Run:
 
     @contextlib.contextmanager
     def unforeseen_told(self) -> Iterator[None]:
-        """An error that nobody foresaw becomes a StageError, its traceback a file of the study."""
+        """An error that nobody foresaw becomes a StageError, its traceback a file of the study.
+
+        The progress bar is gone at the end.
+        """
         file = self.folder / LOGS / "run.txt"
         file.unlink(missing_ok=True)
         try:
@@ -252,6 +271,9 @@ class Run:
                 f"{self.doing}: {in_a_line(error)}: a fault of S4A or of its installation, not of "
                 f"a shape; its traceback is in {file}; finished files are kept"
             ) from error
+        finally:
+            if self.bar is not None:
+                self.bar.close()
 
 
 def told_in_lines() -> bool:

@@ -121,6 +121,8 @@ def write(
     key: str = "",
     made_from: Iterable[str] = (),
     claim: Claim | None = None,
+    *,
+    compression: int = 0,
 ) -> None:
     """Write a Dataset to `path` at once: under a temporary name in the same folder, then renamed.
 
@@ -135,13 +137,15 @@ def write(
         one of them is no longer there, as after a run with other options was stopped half-way.
     claim : Claim, optional
         Nothing is written when it no longer holds.
+    compression : int
+        Of :func:`s4a.study.netcdf.write_netcdf`; encodings of the variables count for nothing.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     data = data.assign_attrs({"task_key": key, "made_from": " ".join(made_from), SEALED: BEHIND})
     data = data.drop_encoding()  # names put together keep the length of the first file's else
     whole = io.BytesIO()  # HDF5 brings the process down when the disk is full
-    write_netcdf(data, whole)
+    write_netcdf(data, whole, compression)
     add_seal(whole)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from tqdm.auto import tqdm
 
 from s4a.geometry.align import motion_between, realign
 from s4a.geometry.mesh import as_arrays, triangle_areas
@@ -29,7 +28,7 @@ from s4a.method.register import from_latent, identity
 from s4a.method.shape import Basis, Shape, features_of
 from s4a.schema import dataset, in_unit, unit_of
 from s4a.study.options import Options
-from s4a.study.runner import told_in_lines
+from s4a.study.runner import Run
 from s4a.study.sources import Guides, content_of_file
 from s4a.study.store import arrays, attributes, open_file, read
 
@@ -164,32 +163,30 @@ def map_pairs(folder: Path, pairs: list[Any], k_init: int, options: dict[str, An
 
 
 def consistent_maps(
-    folder: Path, names: list[str], first: xr.Dataset, options: Options, n_jobs: int
+    run: Run, names: list[str], first: xr.Dataset, options: Options, n_jobs: int
 ) -> xr.DataTree:
     """Consistent ZoomOut over the network and the median (4.2): ``/network`` and ``/latent``."""
+    folder = run.folder
     motions = {name: motion_to_reference(folder, name) for name in names}
     reference = attributes(folder / "network" / f"motion_{names[0]}.nc")["reference"]
     first = steps.with_motions(first, motions, reference)
     coarse = {name: open_file(folder / "coarse" / f"{name}.nc") for name in names}
     k_init = first.sizes["mode_source_initial"]
-    n_sizes, no_bar = options.k - k_init, told_in_lines()
-    with tqdm(total=n_sizes, desc="consistent ZoomOut", disable=no_bar) as bar:
-        tree = steps.refine_network(
-            coarse,
-            first,
-            k=options.k,
-            step=options.step,
-            n_latent=options.n_latent,
-            weights=options.weights,
-            n_spread=options.n_spread,
-            wide=options.wide,
-            norm=options.norm,
-            keep_rounds=options.keep_rounds,
-            n_jobs=n_jobs,
-            progress=lambda size: bar.update(size - k_init - bar.n),
-        )
-        bar.total = bar.n  # k may be less than was asked for
-    return tree
+    bar = run.show("consistent ZoomOut", options.k - k_init)
+    return steps.refine_network(
+        coarse,
+        first,
+        k=options.k,
+        step=options.step,
+        n_latent=options.n_latent,
+        weights=options.weights,
+        n_spread=options.n_spread,
+        wide=options.wide,
+        norm=options.norm,
+        keep_rounds=options.keep_rounds,
+        n_jobs=n_jobs,
+        progress=lambda size: bar.update(size - k_init - bar.n),
+    )
 
 
 def place_shape(folder: Path, name: str, options: Options) -> xr.Dataset:

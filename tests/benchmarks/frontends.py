@@ -98,12 +98,13 @@ def notebooks(folder, study, heard):
 
 
 @contextlib.contextmanager
-def served(name, folder):
-    """The address of a front end on a port of its own."""
+def served(name, folder, path=None):
+    """The address of a front end on a port of its own, of the notebook or another `path`."""
     with contextlib.closing(socket.socket()) as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    words, path = COMMANDS[name]
+    words, own = COMMANDS[name]
+    path = own if path is None else path
     command = [sys.executable, *words.format(port=port).split()]
     with open(folder / f"{name}.log", "w") as log:
         process = subprocess.Popen(command, cwd=folder, stdout=log, stderr=log, env=os.environ)

@@ -8,6 +8,7 @@ import re
 import shutil
 import tomllib
 
+import h5py
 import numpy as np
 import pytest
 from paths import ROOT, script
@@ -50,11 +51,11 @@ def folder(prepare, whole, monkeypatch, tmp_path):
     return prepare.collection(tmp_path / "study", n=3, n_vertices=300)
 
 
-def test_the_requirements_install_this_project_with_an_extra_that_it_has():
-    (extra,) = re.findall(r"^-e \.\[(\w+)\]$", "\n".join(lines("requirements.txt")), re.MULTILINE)
+def test_the_requirements_install_this_project_with_extras_that_it_has():
+    (named,) = re.findall(r"^-e \.\[([\w,]+)\]$", "\n".join(lines("requirements.txt")), re.M)
     extras = PROJECT["optional-dependencies"]
-    needed = distributions(extras[extra])
-    assert {"s4a[notebook]", "s4a[labels]", "nilearn"} <= set(needed)
+    needed = distributions(sum((extras[extra] for extra in named.split(",")), []))
+    assert {"s4a[notebook]", "s4a[labels]", "nilearn", "pymeshlab"} <= set(needed)
     assert {"jupyterlab", "ipywidgets", "anywidget"} <= set(distributions(extras["notebook"]))
 
 
@@ -78,8 +79,10 @@ def test_the_runtime_is_a_python_that_the_project_allows():
     assert (int(major), int(minor)) >= tuple(map(int, least))
 
 
-def test_nothing_that_needs_graphics_libraries_is_installed():
-    assert not (BINDER / "apt.txt").exists()
+def test_pymeshlab_has_its_libraries_there_and_is_no_dependency_of_the_library_itself():
+    # GPL-3: a user installs it, or the image of Binder, but never the library by itself
+    checked = re.findall(r"lib\w+\.so\.\d+:(\w+)", (ROOT / ".ci" / "run").read_text())
+    assert lines("apt.txt") == checked
     of_extra = PROJECT["optional-dependencies"]
     assert [e for e in of_extra if "pymeshlab" in distributions(of_extra[e])] == ["wrap"]
     assert "pymeshlab" not in distributions(PROJECT["dependencies"])
@@ -131,6 +134,23 @@ def test_it_is_that_of_the_analysis_to_four_digits(folder, whole):
         assert np.abs(study[name].values - exact[name].values).max() < 2e-4 * scale
     assert study["latent"].attrs["median"] == exact["latent"].attrs["median"]
     assert "displacement_raw" not in study["registration"]
+
+
+def test_its_larger_variables_are_compressed_on_disk(folder, prepare):
+    larger = set()
+    for path in folder.rglob("*.nc"):
+        with h5py.File(path) as file:
+            for name, one in file.items():
+                if one.dtype.kind in "iuf" and one.size > 1000:
+                    larger.add(name)
+                    assert (one.compression, one.shuffle) == ("gzip", True), (path.name, name)
+    assert {"eigenfunction", "deformation"} <= larger
+
+
+def test_at_its_true_size_it_is_small_enough_and_has_ten_modes(prepare, tmp_path):
+    study = open_study(prepare.collection(tmp_path / "study"))
+    assert study["registration/displacement"].sizes == {"shape": 51, "vertex": 2000, "xyz": 3}
+    assert s4a.synthesize(study, [0.0] * 9 + [3.0])["position"].shape == (2000, 3)
 
 
 def test_rounding_keeps_its_digits_and_what_is_not_finite(prepare):

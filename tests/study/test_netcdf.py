@@ -9,7 +9,7 @@ import xarray as xr
 
 from s4a.study.hdf5 import DIMS
 from s4a.study.netcdf import write_netcdf
-from s4a.study.store import ENGINE, read
+from s4a.study.store import ENGINE, read, write
 
 EVERYTHING = xr.Dataset(
     {
@@ -50,6 +50,33 @@ def test_what_is_written_is_read_again(study_folder):
             xr.testing.assert_identical(here, there)
             for name, variable in there.variables.items():
                 assert here[name].dtype == variable.dtype, name
+
+
+def test_a_file_that_is_compressed_is_smaller_and_holds_the_same(tmp_path):
+    large = np.arange(3000.0).round(-1)
+    data = EVERYTHING.assign(large_one=("vertex", large), gone=("vertex", large * np.nan))
+    whole, small, path = io.BytesIO(), io.BytesIO(), tmp_path / "small.nc"
+    write_netcdf(data, whole)
+    write_netcdf(data, small, 4)
+    assert len(whole.getvalue()) - len(small.getvalue()) > 0.9 * 2 * large.nbytes
+    with h5py.File(small) as file:
+        packed = {name for name, one in file.items() if one.compression == "gzip" and one.shuffle}
+    assert packed == {"large_one", "gone"}
+    with xr.open_dataset(small, engine=ENGINE) as here:
+        xr.testing.assert_identical(here, data)
+    data = data[["large_one", "gone"]]
+    write(data, path, compression=4)
+    found = read(path)
+    assert path.stat().st_size < large.nbytes
+    xr.testing.assert_equal(found, data)
+
+
+def test_an_encoding_that_a_dataset_brings_along_compresses_nothing(tmp_path):
+    data = xr.Dataset({"zero": ("vertex", np.zeros(3000))})
+    data["zero"].encoding = {"zlib": True, "complevel": 9, "chunksizes": (3000,)}
+    write(data, tmp_path / "a.nc")
+    with h5py.File(tmp_path / "a.nc") as file:
+        assert file["zero"].chunks is None
 
 
 def test_hdf5_has_the_attributes_and_dims_that_h5netcdf_gives():

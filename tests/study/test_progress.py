@@ -1,13 +1,14 @@
 """How far a run is, while it goes on, after it was stopped or killed, and at its end."""
 
 import json
+import logging
 import subprocess
 import sys
 
 import pytest
 from small import OPTIONS
 
-from s4a import analyse, cli
+from s4a import analyse, cli, synthetic
 from s4a.study import pipeline, progress, tasks
 from s4a.study.progress import FILE, STAGES, Stage, status
 
@@ -25,6 +26,16 @@ def test_a_finished_run_has_done_all_of_every_stage(brains, tmp_path, capsys):
     first, _, *lines = capsys.readouterr().out.splitlines()
     assert first.startswith("finished at 20")
     assert [line.split("  ")[0] for line in lines] == list(STAGES)
+
+
+def test_the_bars_of_all_stages_begin_at_one_column_and_nothing_is_left_of_them(caplog, capsys):
+    caplog.set_level(logging.WARNING, "s4a.study.runner")  # or lines of the log take their place
+    analyse(synthetic.brains(3, 200), n_coarse=100, k=10, k_init=6, n_pairs=3, n_jobs=1)
+    *bars, blank, end = capsys.readouterr().err.split("\r")
+    drawn = [bar for bar in bars if "|" in bar]
+    assert {"read and clean", "consistent ZoomOut"} <= {bar.partition(":")[0] for bar in drawn}
+    assert len({bar.index("|") for bar in drawn}) == 1
+    assert (blank.strip(), end) == ("", "")
 
 
 def test_a_run_that_goes_on_or_is_stopped_says_how_far_it_is(brains, tmp_path, monkeypatch, capsys):
