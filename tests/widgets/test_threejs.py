@@ -9,6 +9,7 @@ from scipy.spatial.distance import cdist, pdist
 import s4a
 from s4a import synthetic
 from s4a.geometry.mesh import vertex_normals
+from s4a.show.surfaces import mode_limits
 
 pythreejs = pytest.importorskip("pythreejs")
 threejs = pytest.importorskip("s4a.widgets.threejs")
@@ -116,6 +117,12 @@ def test_modes_at_low_resolution_are_those_of_its_vertices(study):
     n = study["coarse"][template].sizes["vertex"]
     assert len(low.geometry.attributes["position"].array) == n < 1500
     assert low.material.uniforms["colored"]["value"] == 0
+
+
+def test_scenes_at_both_resolutions_have_the_scale_of_sliders_and_pictures(study):
+    for resolution in ("full", "coarse"):
+        mesh = threejs.modes(study, resolution=resolution, n_modes=2)
+        assert mesh.material.uniforms["limit"]["value"] == mode_limits(study)[0]
 
 
 def test_too_many_modes_for_a_texture_are_refused():

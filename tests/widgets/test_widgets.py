@@ -27,7 +27,8 @@ from s4a.show.browser import color_bytes
 from s4a.show.charts import PALE
 from s4a.show.draw import position_colors
 from s4a.show.panel_page import widgets_in
-from s4a.show.surfaces import aligned, mesh_of
+from s4a.show.pictures import mode_drawer
+from s4a.show.surfaces import aligned, mesh_of, mode_limits
 from s4a.study.progress import status
 from s4a.widgets import (
     Correspondence,
@@ -161,6 +162,14 @@ def test_the_mesh_is_saved_with_its_displacement_along_the_normal(study, panel, 
 def test_fewer_modes_can_be_shown(panel):
     modes = panel(Modes, n_modes=2)
     assert len(modes.scores) == len(modes.view.ratio) == 2
+
+
+def test_sliders_at_both_resolutions_and_pictures_have_one_scale(study, panel):
+    _, limit = mode_drawer(study, {"view": "corner", "up": "z"})
+    for resolution in ("full", "coarse"):
+        view = panel(Modes, resolution=resolution, n_modes=1).view
+        assert (view.limit, view.limit_magnitude) == mode_limits(study)
+        assert view.bars["normal"]["high"] == view.limit == limit
 
 
 def test_without_webgl_python_deforms(study):
