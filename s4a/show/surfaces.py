@@ -10,6 +10,7 @@ from s4a.method.register import match_functions, match_low
 from s4a.method.shape import Shape
 from s4a.method.steps import latent_bases
 from s4a.schema import INPUT, unit_of
+from s4a.show.draw import cycle_error_limits
 
 N_LIVE = 20  # modes that panels and pages move, unless asked: of 20,000 vertices 0.3 MB each
 N_SCALED = 3  # modes that set the scale of colours
@@ -224,6 +225,13 @@ def network_places(study: xr.DataTree, names: list[str]) -> np.ndarray | None:
     if scores.sizes["difference_component"] < 2 or not set(names) <= set(names_of(scores)):
         return None
     return scores.sel(shape=names).values[:, :2]
+
+
+def network_limits(study: xr.DataTree) -> tuple[float, float]:
+    """Smallest and largest cycle error of a study's colours, from its maps before and after."""
+    network = study["network"].dataset
+    keys = ("cycle_error_initial", "cycle_error")
+    return cycle_error_limits(*(network[key].values for key in keys if key in network))
 
 
 def latent_match(study: xr.DataTree, source: str, target: str, *, dense: bool) -> np.ndarray:
