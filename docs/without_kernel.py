@@ -21,6 +21,7 @@ from matplotlib.colors import to_rgb
 
 import s4a.course
 from s4a.geometry.mesh import as_arrays
+from s4a.show.browser import PARTS
 from s4a.show.draw import CLAY, data_uri, image_bytes, on_white, render
 from s4a.show.panel_page import panel_html
 from s4a.show.parts import Parts
@@ -186,8 +187,12 @@ def pictured(scene):
         size=(int(scene.width), int(scene.height)),
     )
     address = data_uri(image_bytes(on_white(pixels), "png"), "image/png")
+    bars = [
+        PARTS.color_bar(bar["colors"], f"{bar['low']:.2g}", f"{bar['high']:.2g}", bar["label"])
+        for bar in (part.bar for part in parts if hasattr(part, "bar"))
+    ]
     return (
-        f'<figure style="margin: 0"><img alt="A scene" src="{address}">'
+        f'<figure style="margin: 0"><img alt="A scene" src="{address}">{"".join(bars)}'
         "<figcaption>A picture: the scene itself turns in the notebook.</figcaption></figure>"
     )
 

@@ -203,7 +203,8 @@ def build_network(
     ...     np.array([names.index(name) for name in network[end].values])
     ...     for end in ("source", "target")
     ... )
-    >>> errors = {"error of cycles": network["cycle_error"].values}
+    >>> errors = {"first": network["cycle_error_initial"], "after": network["cycle_error"]}
+    >>> errors = {title: found.values for title, found in errors.items()}
     >>> charts = s4a.show.charts
     >>> charts.network(charts.on_circle(6), names, source, target, errors)
     <Figure ...>

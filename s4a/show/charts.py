@@ -7,16 +7,25 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from matplotlib import colormaps, rc_context
+from matplotlib import rc_context
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
-from matplotlib.colors import Colormap, Normalize
+from matplotlib.colors import Colormap, LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 
 from s4a.geometry.mesh import as_arrays
-from s4a.show.draw import SIGNED, Viewpoint, plane_box, render, signed_colors
+from s4a.show.draw import (
+    CYCLE_ERROR,
+    SIGNED,
+    Viewpoint,
+    cycle_error_colors,
+    cycle_error_limits,
+    plane_box,
+    render,
+    signed_colors,
+)
 from s4a.show.parts import Parts
 
 BLUE, ORANGE, GREY = "#0072b2", "#d55e00", "#777777"
@@ -245,8 +254,10 @@ def network(
     target: np.ndarray,
     errors: dict[str, np.ndarray],
     highlight: int | None = None,
+    *,
+    limits: tuple[float, float] | None = None,
 ) -> Figure:
-    """The graph of maps, once for each named array of edge errors, on one colour scale.
+    """The graph of maps, once for each named array of edge errors, on one logarithmic scale.
 
     Parameters
     ----------
@@ -258,6 +269,9 @@ def network(
         Title of each picture and the value that colours its edges, grey where it is NaN.
     highlight : int, optional
         The shape to mark.
+    limits : (float, float), optional
+        Smallest and largest error of the scale, see :func:`s4a.show.draw.cycle_error_limits`; by
+        default those of all `errors`.
 
     Returns
     -------
@@ -273,16 +287,12 @@ def network(
     <Figure ...>
     """
     figure, (axes,) = _figure(4.6 * len(errors) + 0.6, 4.2, len(errors))
-    finite = np.concatenate([value[np.isfinite(value)] for value in errors.values()])
-    colormap = colormaps["viridis_r"].with_extremes(bad=PALE)
-    scale = ScalarMappable(Normalize(0, finite.max(initial=0) or 1), colormap)
+    limits = limits or cycle_error_limits(*errors.values())
     lines = np.stack([places[source], places[target]], axis=1)  # (pair, 2, 2)
     for ax, (title, value) in zip(axes, errors.items(), strict=True):
         order = np.argsort(np.nan_to_num(value, nan=-1))  # the worst on top, the unknown below
-        colors = scale.to_rgba(value[order])
-        ax.add_collection(
-            LineCollection(list(lines[order]), colors=colors, linewidths=1, alpha=0.8)
-        )
+        colors = cycle_error_colors(value[order], limits)
+        ax.add_collection(LineCollection(list(lines[order]), colors=list(colors), linewidths=1.2))
         ax.scatter(*places.T, s=22, color="#333333", zorder=2)
         if highlight is not None:
             ring = {"facecolor": "none", "edgecolor": ORANGE, "linewidth": 2}
@@ -293,7 +303,11 @@ def network(
         ax.set_title(title)
         ax.margins(0.12)
         ax.set_axis_off()
-    figure.colorbar(scale, ax=list(axes), shrink=0.7, label="cycle error", pad=0.01)
+    scale = ScalarMappable(LogNorm(*limits), CYCLE_ERROR)
+    bar = figure.colorbar(scale, ax=list(axes), shrink=0.7, label="cycle error", pad=0.01)
+    ticks = np.geomspace(*limits, 5)
+    bar.ax.minorticks_off()
+    bar.set_ticks(ticks, labels=[f"{tick:.2g}" for tick in ticks])
     return figure
 
 
@@ -301,7 +315,7 @@ def matrices(
     named: dict[str, np.ndarray],
     limit: float = 1.0,
     *,
-    axes: tuple[str, str] = ("mode of the source", "mode of the target"),
+    axes: tuple[str, str] = ("eigenfunction of the source", "eigenfunction of the target"),
 ) -> Figure:
     """Matrices side by side with signed colours, blue positive.
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
-from matplotlib.colors import Colormap, ListedColormap, to_rgb
+from matplotlib.colors import Colormap, ListedColormap, LogNorm, to_rgb
 from matplotlib.path import Path
 from PIL import Image
 from scipy.ndimage import gaussian_filter
@@ -32,6 +32,11 @@ UNKNOWN = (0.6, 0.6, 0.6)
 OKABE_ITO = ("#e69f00", "#56b4e9", "#009e73", "#f0e442", "#0072b2", "#d55e00", "#cc79a7", "#999999")
 # red, white, blue, without the ends, which are too dark to show the shading
 SIGNED = ListedColormap(colormaps["RdBu"](np.linspace(0.06, 0.94, 255)), "signed")
+# cycle errors, small to large: without viridis' bright end, which is hard to see on white
+CYCLE_ERROR = ListedColormap(
+    colormaps["viridis_r"](np.linspace(0.15, 1, 256)), "cycle_error"
+).with_extremes(bad="#bbbbbb")
+SPREAD = 2, 100  # largest cycle error of the scale by the smallest: at least and at most
 LASSO = 600  # samples along the picture in which hidden vertices are found
 CHUNK = 2_000_000  # candidate samples at a time, some 100 MB
 
@@ -397,6 +402,62 @@ def label_colors(labels: np.ndarray) -> np.ndarray:
     palette = np.concatenate([palette, 0.55 * palette, 0.45 + 0.55 * palette])
     _, place = np.unique(labels, return_inverse=True)
     return palette[place.reshape(np.shape(labels)) % len(palette)]
+
+
+def cycle_error_limits(*errors: np.ndarray) -> tuple[float, float]:
+    """Smallest and largest cycle error of the colour scale, from the errors of all stages.
+
+    One scale for a study, whatever of it is shown: maps before and after Consistent ZoomOut can be
+    compared, and an error has the same colour in a panel, a chart and a scene.
+
+    Parameters
+    ----------
+    *errors : float ndarray (pair,)
+        Of each stage; NaN for maps in no cycle.
+
+    Returns
+    -------
+    (float, float)
+        From the smallest to the largest error that is known, but at least a factor of 2, so that
+        maps that are equally good look so, and at most a factor of 100: smaller errors have the
+        colour of the smallest.  (0.5, 1) where all errors are 0 or unknown.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.show.draw import cycle_error_limits
+    >>> cycle_error_limits(np.array([0.08, np.nan, 0.06]), np.array([0.035, 0.04]))
+    (0.035, 0.08)
+    >>> cycle_error_limits(np.array([0.0, 1.0])), cycle_error_limits(np.array([1.0, 0.9]))
+    ((0.01, 1.0), (0.5, 1.0))
+    """
+    known = np.concatenate([np.ravel(values)[np.isfinite(np.ravel(values))] for values in errors])
+    high = float(known.max(initial=0)) or 1.0
+    least, most = SPREAD
+    return float(np.clip(known.min(initial=high), high / most, high / least)), high
+
+
+def cycle_error_colors(errors: np.ndarray, limits: tuple[float, float]) -> np.ndarray:
+    """Colours ``(pair, 3)`` of cycle errors, yellow-green to violet: equal steps, equal ratios.
+
+    Parameters
+    ----------
+    errors : float ndarray (pair,)
+        What is NaN, for maps in no cycle, is grey.
+    limits : (float, float)
+        Of :func:`cycle_error_limits`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from matplotlib.colors import to_hex
+    >>> from s4a.show.draw import cycle_error_colors
+    >>> colors = cycle_error_colors(np.array([0.01, 0.1, 1.0, np.nan]), (0.01, 1.0))
+    >>> [to_hex(color) for color in colors]
+    ['#b8de29', '#25848e', '#440154', '#bbbbbb']
+    """
+    share = LogNorm(*limits, clip=True)(np.ma.masked_invalid(errors))
+    return np.asarray(CYCLE_ERROR(share))[..., :3]
 
 
 def position_colors(points: np.ndarray, among: np.ndarray | None = None) -> np.ndarray:

@@ -7,7 +7,6 @@ import xarray as xr
 from markupsafe import Markup
 
 from s4a.input.decisions import decisions, notices
-from s4a.method.pca import color_limits
 from s4a.show import charts
 from s4a.show.browser import MODES, PARTS, TEMPLATES, look_state, mesh_state, webp_uri
 from s4a.show.draw import SIGNED, Viewpoint, opposite, position_colors, ramp_colors, render
@@ -21,6 +20,7 @@ from s4a.show.surfaces import (
     low_text,
     mesh_of,
     mode_arrays,
+    mode_limits,
     names_of,
     network_places,
     score_state,
@@ -270,7 +270,8 @@ def _modes(study, look):
             pictures.append(PARTS.picture(draw(mode, sigma), _label(mode, sigma)))
         behind = draw(mode, SIGMA, view=opposite(look["view"]))
         pictures.append(PARTS.picture(behind, f"{_label(mode, SIGMA)}, from behind"))
-    note = "Blue is expansion, red is compression, against the mean; one colour scale for all."
+    note = "Blue is expansion, red is compression, against the mean; one colour scale for all, "
+    note += "that of the sliders. What moves farther has the full colour."
     bar = charts.color_bar(SIGNED, -limit, limit, f"displacement along the normal ({unit})")
     grid = PARTS.grid(pictures, "row four")
     return PARTS.note(note) + grid + PARTS.drawing(bar, "colour bar")
@@ -285,7 +286,7 @@ def _live_modes(study, instead, look):
     unit = study["pca"]["deformation"].attrs.get("units", "")
     state = {
         **mesh_state(mean, T, deformation),
-        **look_state(color_limits(mean, T, deformation), unit, **look),
+        **look_state(mode_limits(study), unit, **look),
         **score_state(study, N_LIVE),
         "scores": [0.0] * len(deformation),
         "colors": "normal",

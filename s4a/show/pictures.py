@@ -11,7 +11,7 @@ from PIL import Image
 from s4a.geometry.mesh import vertex_normals
 from s4a.method.deform import normal_displacement
 from s4a.show.draw import Viewpoint, image_bytes, on_white, plane_box, render, signed_colors
-from s4a.show.surfaces import mode_arrays
+from s4a.show.surfaces import mode_arrays, mode_limits
 
 SIGMA = 3  # the modes are shown from -3 to 3 standard deviations
 N_MODES = 3
@@ -39,11 +39,12 @@ def mode_drawer(
         ``draw(mode, s, size=PANEL, **look)`` is the picture of the mean shape moved by s standard
         deviations, coloured by how far it moves along its normal.
     limit : float
-        The displacement of the full colours, in the unit of the input.
+        The displacement of the full colours, in the unit of the input; see
+        :func:`s4a.show.surfaces.mode_limits`.
     """
     mean, T, steps = mode_arrays(study, n_modes=N_MODES)
     along = normal_displacement(steps, vertex_normals(mean, T))
-    limit = float(SIGMA * np.quantile(np.abs(along), 0.99)) or 1.0
+    limit, _ = mode_limits(study)
     extremes = np.concatenate([mean + s * step for step in steps for s in (-SIGMA, SIGMA)])
 
     def draw(mode, s, size=PANEL, **other):

@@ -5,13 +5,15 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from s4a.method.pca import low_vertices
+from s4a.method.pca import color_limits, low_vertices
 from s4a.method.register import match_functions, match_low
 from s4a.method.shape import Shape
 from s4a.method.steps import latent_bases
 from s4a.schema import INPUT, unit_of
+from s4a.show.draw import cycle_error_limits
 
 N_LIVE = 20  # modes that panels and pages move, unless asked: of 20,000 vertices 0.3 MB each
+N_SCALED = 3  # modes that set the scale of colours
 FAR = 8  # standard deviations beyond which charts of scores leave a doubtful shape out
 RESOLUTIONS = [("low resolution", "coarse"), ("full resolution", "original")]
 SAMPLES = "samples of SCALABLE, joined where their cells meet"
@@ -168,6 +170,26 @@ def mode_arrays(
     return mean[vertex], coarse["corner_vertex"].values, deformation[:, vertex]
 
 
+def mode_limits(study: xr.DataTree) -> tuple[float, float]:
+    """Displacements of the full colours of a study's modes: along the normal, and in length.
+
+    The scale of sliders, pictures and scenes alike: it is that of the full resolution and of the
+    first modes, however many modes and whichever vertices are shown.  See
+    :func:`s4a.method.pca.color_limits`.
+
+    Parameters
+    ----------
+    study : xarray.DataTree
+        With ``/registration`` and ``/pca``.
+
+    Returns
+    -------
+    (float, float)
+        In the unit of the input.
+    """
+    return color_limits(*mode_arrays(study, n_modes=N_SCALED))
+
+
 def score_state(study: xr.DataTree, n_modes: int | None = None) -> dict[str, Any]:
     """Shares of variance, scores and names of a study's modes, as the browser shows them."""
     pca = study["pca"].dataset.isel(component=slice(n_modes))
@@ -203,6 +225,13 @@ def network_places(study: xr.DataTree, names: list[str]) -> np.ndarray | None:
     if scores.sizes["difference_component"] < 2 or not set(names) <= set(names_of(scores)):
         return None
     return scores.sel(shape=names).values[:, :2]
+
+
+def network_limits(study: xr.DataTree) -> tuple[float, float]:
+    """Smallest and largest cycle error of a study's colours, from its maps before and after."""
+    network = study["network"].dataset
+    keys = ("cycle_error_initial", "cycle_error")
+    return cycle_error_limits(*(network[key].values for key in keys if key in network))
 
 
 def latent_match(study: xr.DataTree, source: str, target: str, *, dense: bool) -> np.ndarray:

@@ -9,6 +9,12 @@ import traitlets
 from s4a.show.browser import CHART, STYLE, palette, to_bytes
 from s4a.show.draw import SIGNED
 
+AXES = "eigenfunction of the source", "eigenfunction of the target"  # of columns, and of rows
+DIRECTION = (
+    "C transfers functions from the source to the target: of their coefficients a on the source "
+    "(columns) it makes b = C a on the target (rows)."
+)
+
 
 def plain(value: object) -> object:
     """NumPy numbers and arrays as Python's own, NaN as None, so that they can be sent.
@@ -56,8 +62,8 @@ class Chart(anywidget.AnyWidget):
             self.spec = plain({"kind": kind, **spec})
 
     def matrix(self, values: np.ndarray, limit: float = 1.0, **spec: Any) -> None:
-        """Draw a matrix ``(rows, columns)`` with signed colours from -limit to limit."""
+        """Draw a functional map ``(rows, columns)`` with signed colours from -limit to limit."""
         rows, columns = np.shape(values)
         with self.hold_sync():
             self.values = to_bytes(values, "float32")
-            self.draw("matrix", rows=rows, columns=columns, limit=limit, **spec)
+            self.draw("matrix", rows=rows, columns=columns, limit=limit, axes=AXES, **spec)

@@ -1,4 +1,4 @@
-"""Functional maps (3.3, 4.1, Fig. 2): the matrix, its modes on both meshes, ZoomOut in steps."""
+"""Functional maps (3.3, 4.1, Fig. 2): the matrix, eigenfunctions on both meshes, ZoomOut in steps."""
 
 import ipywidgets
 import numpy as np
@@ -8,7 +8,7 @@ from s4a.method.fmap import off_diagonal_mass, orthogonality_error, swapped_bloc
 from s4a.method.shape import Shape
 from s4a.show.browser import PARTS
 from s4a.show.surfaces import low_text, surface
-from s4a.widgets.chart import Chart
+from s4a.widgets.chart import DIRECTION, Chart
 from s4a.widgets.panel import WIDE, Panel, beside, check, dropdown, int_slider, row
 from s4a.widgets.scene import Scene, camera_group
 
@@ -20,7 +20,7 @@ KINDS = [
 WHICH = "made consistent with the maps among all shapes, or by ZoomOut of this pair alone"
 ROW = "row of the matrix: the eigenfunction of the target that is shown"
 COLUMN = "column of the matrix: the eigenfunction of the source that is shown"
-TOLD = 3  # exchanged runs of modes that are told in words
+TOLD = 3  # exchanged runs of eigenfunctions that are told in words
 
 
 class FunctionalMap(Panel):
@@ -31,7 +31,7 @@ class FunctionalMap(Panel):
     pair : int
         Row of ``/network``.
     cell : tuple (row, column)
-        Mode of the target and mode of the source.
+        Eigenfunction of the target and eigenfunction of the source.
     """
 
     needs = ("network/fmap", "network/fmap_initial")
@@ -54,12 +54,12 @@ class FunctionalMap(Panel):
         self.k = ipywidgets.SelectionSlider(
             options=sorted({*range(first, last, STEP), last}),
             value=last,
-            description="modes k",
-            tooltip="size of the map: ZoomOut adds modes step by step",
+            description="size k",
+            tooltip="how many eigenfunctions the map links: ZoomOut adds them step by step",
             continuous_update=False,
             layout=WIDE,
         )
-        self.block = check("first ten modes only", "the upper left corner of the matrix, magnified")
+        self.block = check("first ten only", "the upper left corner of the matrix, magnified")
         self.row = int_slider("target ψ", ROW, 1, 0, last - 1, "23em")
         self.column = int_slider("source φ", COLUMN, 1, 0, last - 1, "23em")
         self.matrix, self.numbers = Chart(), ipywidgets.HTML()
@@ -117,7 +117,7 @@ class FunctionalMap(Panel):
         return C
 
     def draw(self) -> None:
-        """The matrix, its numbers, and frames around runs of modes that are exchanged."""
+        """The matrix, its numbers, and frames around runs of eigenfunctions that are exchanged."""
         k = self.k.value
         self.C = C = self.map_of(k)
         blocks = swapped_blocks(C)
@@ -125,6 +125,7 @@ class FunctionalMap(Panel):
         self.matrix.matrix(
             C[:size, :size],
             title=f"{' → '.join(self.names())}, {k} × {k}",
+            note=DIRECTION,
             blocks=[block for block in blocks if block[1] < size],
             row=self.cell[0],
             column=self.cell[1],
@@ -135,11 +136,10 @@ class FunctionalMap(Panel):
         swapped = "No swapped blocks."
         if runs:
             runs = ", ".join(runs[:TOLD])
-            swapped = f"Exchanged among each other, framed: modes {runs}{more}."
+            swapped = f"Exchanged among each other, framed: eigenfunctions {runs}{more}."
         self.numbers.value = PARTS.paragraph(
             f"off the diagonal {off_diagonal_mass(C):.1%} of the squared entries; "
-            f"|CᵀC − I| / √k = {orthogonality_error(C):.3f}. {swapped} "
-            "Blue is positive, red negative, −1 to 1."
+            f"|CᵀC − I| / √k = {orthogonality_error(C):.3f}. {swapped}"
         )
 
     def show_cell(self, cell: tuple[int, int]) -> None:

@@ -8,11 +8,12 @@ import traitlets
 from s4a.geometry.mesh import vertex_normals
 from s4a.input.files import write_mesh
 from s4a.method.deform import normal_displacement
-from s4a.method.pca import apply_scores, color_limits, mahalanobis, plausible_scores
+from s4a.method.pca import apply_scores, mahalanobis, plausible_scores
 from s4a.show.surfaces import (
     N_LIVE,
     attribute,
     mode_arrays,
+    mode_limits,
     score_state,
     template_coarse,
     unit_text,
@@ -64,13 +65,12 @@ class Modes(Panel):
         sizes = {"full": self.study["registration"].sizes["vertex"]}
         if self.coarse is not None:
             sizes["coarse"] = self.coarse.sizes["vertex"]
-        smallest = list(sizes)[-1]
         if resolution is None:
             deformation = self.study["pca"]["deformation"].isel(component=slice(n_modes))
-            resolution = smallest if deformation.nbytes > LARGE else "full"
+            resolution = list(sizes)[-1] if deformation.nbytes > LARGE else "full"
         self.view = ModesView(
             *self.arrays(resolution),
-            limits=color_limits(*self.arrays(smallest)),
+            limits=mode_limits(self.study),
             unit=unit_text(self.study, attribute(self.study, "registration", "template")),
             **score_state(self.study, n_modes),
             group=camera_group(),

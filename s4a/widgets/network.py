@@ -3,23 +3,29 @@
 import ipywidgets
 import numpy as np
 import traitlets
-from matplotlib import colormaps
-from matplotlib.colors import ListedColormap, to_hex
+from matplotlib.colors import to_hex
 
 from s4a.method.fmap import match_from_fmap
 from s4a.method.network import choose_pairs, connectivity, nearest_by_maps, spectral_distance
 from s4a.show import charts
 from s4a.show.browser import PARTS, color_scale
-from s4a.show.draw import position_colors
-from s4a.show.surfaces import attribute, doubtful_names, labelled, network_places, surface
+from s4a.show.draw import CYCLE_ERROR, cycle_error_colors, position_colors
+from s4a.show.surfaces import (
+    attribute,
+    doubtful_names,
+    labelled,
+    network_limits,
+    network_places,
+    surface,
+)
 from s4a.study.tree import apart_of
-from s4a.widgets.chart import Chart
+from s4a.widgets.chart import DIRECTION, Chart
 from s4a.widgets.panel import Panel, beside, dropdown, int_slider, row
 from s4a.widgets.scene import Scene, camera_group
 
 STAGES = [
-    ("after Consistent ZoomOut", "cycle_error"),
     ("before Consistent ZoomOut", "cycle_error_initial"),
+    ("after Consistent ZoomOut", "cycle_error"),
 ]
 WHICH = (
     "colour of a map: its cycle error, that is how far compositions with other maps are from the "
@@ -33,11 +39,8 @@ PLACES = (
 )
 NARROW = {"width": "20em"}
 MOST = 100  # shapes that a graph shows
-# without the bright end, which is hard to see on white
-ERRORS = ListedColormap(colormaps["viridis_r"](np.linspace(0.15, 1, 256))).with_extremes(
-    bad=charts.PALE
-)
 UNKNOWN = "unknown: in no cycle"
+ERRORS = "cycle error (logarithmic)"
 
 
 class Network(Panel):
@@ -134,8 +137,7 @@ class Network(Panel):
     def draw(self) -> None:
         """The graph with the pairs that the budget allows, on one colour scale before and after."""
         network = self.study["network"].dataset
-        errors = np.nan_to_num([network[key].values for _, key in STAGES])
-        top = float(errors.max(initial=0)) or 1.0
+        low, high = network_limits(self.study)
         pairs = self.budgeted()
         allowed = {tuple(pair) for pair in pairs.tolist()}
         self.allowed = [i for i, pair in enumerate(self.pairs) if pair in allowed]
@@ -146,7 +148,7 @@ class Network(Panel):
         between = (place[self.ends] >= 0).all(axis=1)  # maps of which both shapes are drawn
         self.shown = [i for i in self.allowed if between[i]]
         values = network[self.stage.value].values
-        colors = ERRORS(values[self.shown] / top)
+        colors = cycle_error_colors(values[self.shown], (low, high))
         places = self.places(names)
         self.graph.draw(
             "graph",
@@ -169,8 +171,9 @@ class Network(Panel):
         )
         values = values[self.allowed]
         self.tell(pairs, values)
-        scale = color_scale(ERRORS, 0, top, "cycle error, first modes")
-        self.bar.value = PARTS.color_bar(scale["colors"], f"{top:.2f}", scale["label"])
+        scale = color_scale(CYCLE_ERROR, low, high, ERRORS)
+        numbers = f"{low:.2g}", f"{high:.2g}"
+        self.bar.value = PARTS.color_bar(scale["colors"], *numbers, scale["label"])
 
     def part(self, names: list[str]) -> str:
         """How many of all shapes these are, where they are not all."""
@@ -186,7 +189,10 @@ class Network(Panel):
             stored = f", {len(self.allowed)} maps of them in the study"
         apart = apart_of(self.study["registration"]) if "registration" in self.study else []
         others = f"; beside it, doubtful: {', '.join(apart)}" if apart else ""
-        middle = f"; median cycle error {np.median(known):.3f}" if len(known) else ""
+        middle = ""
+        if len(known):
+            middle = f"; cycle errors {known.min():.3f} to {known.max():.3f}, "
+            middle += f"median {np.median(known):.3f}"
         self.facts.value = PARTS.paragraph(
             f"{len(pairs)} pairs{stored}: "
             f"{'connected' if facts['components'] == 1 else 'NOT connected'}, "
@@ -238,7 +244,7 @@ class Network(Panel):
         source, target = names = str(self.source[edge]), str(self.target[edge])
         on_source, on_target = self.scenes
         self.matrix.layout.display = on_target.layout.display = ""
-        self.matrix.matrix(C, title=f"{source} → {target}, {len(C)} × {len(C)}")
+        self.matrix.matrix(C, title=f"{source} → {target}, {len(C)} × {len(C)}", note=DIRECTION)
         bases = [self.study["coarse"][name].dataset["eigenfunction"].values for name in names]
         match = match_from_fmap(C, *bases)
         X, T = surface(self.study, source)

@@ -6,10 +6,10 @@ import xarray as xr
 from matplotlib.colors import to_rgb
 
 from s4a.analysis.structures import LEVELS, structures, structures_modes
-from s4a.method.pca import apply_scores, color_limits
+from s4a.method.pca import apply_scores
 from s4a.schema import unit_of
 from s4a.show.browser import color_bytes
-from s4a.show.surfaces import mode_arrays, score_state
+from s4a.show.surfaces import mode_arrays, mode_limits, score_state
 from s4a.widgets.modes_view import ModesView
 from s4a.widgets.panel import Panel, check, dropdown, row, together
 from s4a.widgets.scene import camera_group
@@ -96,10 +96,9 @@ class Structures(Panel):
     def view_of(self, level: str, n_modes: int, group: str, view: str, up: str) -> ModesView:
         """The sliders of a level."""
         study = structures_modes(self.study, self.found, level)
-        arrays = mode_arrays(study, None, n_modes)
         return ModesView(
-            *arrays,
-            limits=color_limits(*arrays),
+            *mode_arrays(study, None, n_modes),
+            limits=mode_limits(study),
             unit=unit_of(self.found["position"]),
             **score_state(study, n_modes),
             group=group,

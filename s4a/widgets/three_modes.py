@@ -15,9 +15,8 @@ from ipywidgets import widget_serialization
 from matplotlib.colors import to_hex
 
 from s4a.geometry.mesh import normal_sums
-from s4a.method.pca import color_limits
 from s4a.show.draw import CLAY, SIGNED
-from s4a.show.surfaces import has, mode_arrays, template_coarse
+from s4a.show.surfaces import has, mode_arrays, mode_limits, template_coarse
 from s4a.widgets.three_surfaces import smooth_geometry
 
 SCRIPTS = Path(__file__).parent / "scripts"
@@ -118,7 +117,7 @@ def modes(
         raise ValueError("the study has no low resolution of its template; take the full one")
     mean, T, deformation = mode_arrays(study, coarse, n_modes)
     table, bends = mode_table(mean, T, deformation)
-    limit = color_limits(mean, T, deformation)[0]
+    limit, _ = mode_limits(study)
     hues = dict(zip(HUES, map(to_hex, SIGNED(np.linspace(0, 1, len(HUES)))), strict=True))
     slots = -(-len(deformation) // 5) * 5  # pythreejs takes lists of 2, 3, 4, 9 and 16 for vectors
     uniforms = hues | {

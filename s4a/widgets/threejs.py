@@ -11,15 +11,23 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 import pythreejs as three
 import xarray as xr
-from matplotlib.colors import Colormap, to_hex
+from matplotlib.colors import to_hex, to_rgb
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
 from s4a.geometry.align import farthest_points
 from s4a.geometry.mesh import as_arrays
 from s4a.schema import require
-from s4a.show.draw import OKABE_ITO, Viewpoint, position_colors, rotation
-from s4a.show.surfaces import has, latent_match, names_of
+from s4a.show.browser import color_scale
+from s4a.show.draw import (
+    CYCLE_ERROR,
+    OKABE_ITO,
+    Viewpoint,
+    cycle_error_colors,
+    position_colors,
+    rotation,
+)
+from s4a.show.surfaces import has, latent_match, names_of, network_limits
 from s4a.show.surfaces import surface as study_surface
 from s4a.widgets.three_modes import ModesMesh, Scores, modes
 from s4a.widgets.three_surfaces import field_colors, smooth_geometry, standard_material, surface
@@ -190,24 +198,22 @@ def _lines(begin, end, colors, width=2):
     return three.LineSegments2(geometry, material)
 
 
-def network(
-    study: xr.DataTree, *, cmap: str | Colormap = "viridis_r", names: bool = True
-) -> three.Group:
+def network(study: xr.DataTree, *, names: bool = True) -> three.Group:
     """Shapes at their places in the space of shape differences, joined by their maps (3.4, 3.5).
 
     Parameters
     ----------
     study : xarray.DataTree
         With ``/coarse``, ``/network`` and ``/latent``.
-    cmap : str or matplotlib.colors.Colormap
-        Of the cycle errors, from 0 to the largest; a pair has the mean of its two maps.
     names : bool
         Whether the shapes' names stand above them.
 
     Returns
     -------
     pythreejs.Group
-        A surface for each shape, named after it, their names, and last the lines.
+        A surface for each shape, named after it, their names, and last the lines: each in the
+        colour of the mean cycle error of a pair's two maps, as in the panel
+        :class:`s4a.widgets.Network`.  Its ``bar`` is the colour bar, which :func:`renderer` shows.
 
     Raises
     ------
@@ -257,9 +263,29 @@ def network(
         pair = tuple(sorted(shapes.index(str(name)) for name in (source, target)))
         sums.setdefault(pair, []).append(float(error))
     known = np.array([np.nan if np.isnan(e).all() else np.nanmean(e) for e in sums.values()])
-    colors = field_colors(known, cmap, (0.0, float(np.nanmax(known, initial=0)) or 1.0))
+    limits = network_limits(study)
+    colors = cycle_error_colors(known, limits)
     ends = np.array(list(sums))
     group.add(_lines(places[ends[:, 0]], places[ends[:, 1]], colors, width=3))
+    group.bar = color_scale(CYCLE_ERROR, *limits, "cycle error (logarithmic)")
+    return group
+
+
+def _color_bar(bar):
+    """A colour bar of width 1, as of :func:`s4a.show.browser.color_scale`, over all else."""
+    colors = np.array([to_rgb(color) for color in bar["colors"]])
+    places, shares = np.linspace(0, 1, len(colors)), np.linspace(0, 1, 256)
+    texels = np.full((1, 256, 4), 255, np.uint8)
+    texels[0, :, :3] = np.transpose([255 * np.interp(shares, places, c) for c in colors.T])
+    look = {"transparent": True, "depthTest": False}
+    strip = three.SpriteMaterial(map=three.DataTexture(texels), **look)
+    height = 0.045  # of the text
+    group = three.Group(name="colour bar", children=[three.Sprite(strip, scale=[1, 0.04, 1])])
+    for text, side in ((f"{bar['low']:.2g}", -1), (bar["label"], 0), (f"{bar['high']:.2g}", 1)):
+        width = 0.6 * height * len(text)
+        group.add(_name(text, [side * (1 - width) / 2, -0.05, 0], height, hidden=False))
+    for part in group.children:
+        part.renderOrder = 1
     return group
 
 
@@ -277,7 +303,8 @@ def renderer(
     Parameters
     ----------
     *objects : pythreejs.Object3D
-        Of the functions of this module, or of your own; the camera is set to see all of them.
+        Of the functions of this module, or of your own; the camera is set to see all of them.  A
+        colour bar of theirs stands at the lower edge.
     size : (int, int)
         Width and height in pixels.
     view, up
@@ -305,6 +332,8 @@ def renderer(
         x, y, z = turn @ (points * (high - low) / 2).T
         nearest.append(float((z + np.maximum(np.abs(x) / aspect, np.abs(y)) / np.tan(half)).max()))
     distance = min(max(around, 1.05 * nearest[0]), 1.05 * nearest[1])
+    bars = [item.bar for item in objects if hasattr(item, "bar")]
+    distance *= 1.2 if bars else 1  # room for them below
     camera = three.PerspectiveCamera(
         position=(middle + distance * turn[2]).tolist(),
         up=np.eye(3)["xyz".index(up)].tolist(),
@@ -314,6 +343,13 @@ def renderer(
         far=radius * 20,
         children=[three.DirectionalLight(position=[0, 0, 1], intensity=0.55)],
     )
+    for bar in bars:
+        drawn, away = _color_bar(bar), radius / 20  # just before the camera, with which it moves
+        bottom = away * np.tan(half)
+        width = 1.2 * min(aspect, 2) * bottom
+        drawn.scale = [width] * 3
+        drawn.position = [0, 0.08 * width - bottom, -away]
+        camera.add(drawn)
     camera.lookAt(middle.tolist())
     controls = three.OrbitControls(controlling=camera, target=middle.tolist())
     scene = three.Scene(

@@ -12,6 +12,7 @@ from PIL import Image
 from s4a.geometry.mesh import as_dataset, vertex_areas
 from s4a.schema import dataset
 from s4a.show import draw, page, pictures
+from s4a.show.surfaces import mode_limits
 
 K, N_SHAPES = 12, 6
 
@@ -281,6 +282,25 @@ def test_the_page_holds_the_modes_as_they_are(study, html):
     assert (deformation == study["pca"]["deformation"].values.ravel().astype(np.float32)).all()
     assert state["ratio"] == [0.7, 0.2, 0.1]
     assert 'id="modes-instead"' in html.replace("'", '"')
+
+
+def test_sliders_and_pictures_of_a_page_have_the_same_scale(study, html):
+    state = json.loads(re.search(r'id="modes-state">(.*?)</script>', html, re.DOTALL)[1])
+    _, limit = pictures.mode_drawer(study, {"view": "corner", "up": "z"})
+    assert state["limit"] == limit == mode_limits(study)[0]
+    assert state["bars"]["normal"]["high"] == state["limit"]
+
+
+def test_the_scale_of_modes_is_the_displacement_at_three_standard_deviations():
+    X, T = sphere()
+    grows = dataset(
+        mean_displacement=0 * X,
+        deformation=np.stack([2 * X, X, X, 9 * X]),  # along the normals, which are X itself
+    )
+    of_four = xr.DataTree.from_dict(
+        {"registration": dataset(position=X, corner_vertex=T), "pca": grows}
+    )
+    np.testing.assert_allclose(mode_limits(of_four), 3 * 2, rtol=0.01)
 
 
 def test_of_many_modes_the_page_holds_the_first(study, monkeypatch):

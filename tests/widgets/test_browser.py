@@ -322,7 +322,8 @@ def test_a_clicked_edge_shows_its_map(page, study):
     visible(page, ".s4a-title").filter(has_text=f"{source} → {target}").wait_for()
     visible(page, ".s4a-title").filter(has_text=f"{target}, the target").wait_for()
     net = study["network"].dataset
-    C = net["fmap"].values[(net["source"].values == source) & (net["target"].values == target)][0]
+    own = (net["source"].values == source) & (net["target"].values == target)
+    C = net["fmap_initial"].values[own][0]
     matrix = visible(page, ".s4a-matrix canvas").first
     box = matrix.bounding_box()
     page.mouse.move(box["x"] + box["width"] * 3.5 / len(C), box["y"] + box["height"] * 2.5 / len(C))
@@ -1024,7 +1025,8 @@ def test_the_page_of_the_network_shows_the_map_that_is_clicked(offline, study, t
     visible(page, ".s4a-title").filter(has_text=f"{target}, the target").wait_for()
     assert page.locator("#c-choice option:checked").inner_text() == f"{source} → {target}"
     net = study["network"].dataset
-    C = net["fmap"].values[(net["source"].values == source) & (net["target"].values == target)][0]
+    own = (net["source"].values == source) & (net["target"].values == target)
+    C = net["fmap_initial"].values[own][0]
     page.locator(".s4a-matrix canvas").focus()
     page.keyboard.press("ArrowRight")
     text = visible(page, ".s4a-readout").filter(has_text="C[0, 1]").inner_text()
@@ -1032,8 +1034,8 @@ def test_the_page_of_the_network_shows_the_map_that_is_clicked(offline, study, t
     move(page.locator("#c-budget"), 0)
     page.wait_for_selector("text=/4 pairs.*: connected/")
     assert visible(page, ".s4a-edge").count() == 8
-    chosen(page, "stage", "before Consistent ZoomOut")
-    visible(page, ".s4a-title").filter(has_text="10 × 10").wait_for()
+    chosen(page, "stage", "after Consistent ZoomOut")
+    visible(page, ".s4a-title").filter(has_text="24 × 24").wait_for()
     visible(page, "[data-node]").nth(1).dispatch_event("click")
     visible(page, ".s4a-title").filter(has_text=re.compile("^brain_02$")).wait_for()
     assert visible(page, VIEW).count() == 1
@@ -1048,6 +1050,7 @@ def test_the_page_of_the_network_says_which_maps_are_in_no_cycle(offline, study,
     tree["network"] = type(study)(maps)
     page, errors = opened(offline, saved(widgets.Network(tree), tmp_path / "network.html"))
     page.wait_for_function(DRAWN)
+    chosen(page, "stage", "after Consistent ZoomOut")
     edges = page.locator(".s4a-edge")
     told = [edge.get_attribute("aria-label") for edge in edges.all()]
     assert [i for i, text in enumerate(told) if "cycle error unknown: in no cycle" in text] == [3]

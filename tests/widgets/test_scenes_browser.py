@@ -241,12 +241,19 @@ def test_lines_join_the_two_surfaces_of_a_correspondence(page):
     assert 4 <= np.count_nonzero(np.diff(middle.astype(int)) == 1), "several lines, no surface"
 
 
+def green(picture):
+    return (picture[..., 1] - picture[..., 0] > 30) & (picture[..., 1] - picture[..., 2] > 30)
+
+
 def test_the_network_shows_its_shapes_and_lines_in_the_colours_of_their_errors(page):
     picture = seen(page, NETWORK)
     clay = body(picture) & (np.ptp(picture, axis=2) < 40) & (picture.min(2) > 80)
     assert clay.mean() > 0.03
-    dark_violet = (picture[..., 2] - picture[..., 1] > 40) & (picture[..., 0] < 110)
-    assert dark_violet.sum() > 60, "the end of viridis_r: the largest error"
+    lines, bar = np.split(picture, [4 * len(picture) // 5])
+    assert green(lines).sum() > 60, "small errors: maps after Consistent ZoomOut"
+    assert green(bar).sum() > 60, "the colour bar begins with the smallest error of all maps"
+    violet = (bar[..., 2] - bar[..., 1] > 40) & (bar[..., 0] < 110)
+    assert violet.sum() > 60, "and ends with the largest, before Consistent ZoomOut"
 
 
 FRAMES = """

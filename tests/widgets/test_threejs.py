@@ -9,6 +9,8 @@ from scipy.spatial.distance import cdist, pdist
 import s4a
 from s4a import synthetic
 from s4a.geometry.mesh import vertex_normals
+from s4a.show.draw import cycle_error_colors
+from s4a.show.surfaces import mode_limits
 
 pythreejs = pytest.importorskip("pythreejs")
 threejs = pytest.importorskip("s4a.widgets.threejs")
@@ -118,6 +120,12 @@ def test_modes_at_low_resolution_are_those_of_its_vertices(study):
     assert low.material.uniforms["colored"]["value"] == 0
 
 
+def test_scenes_at_both_resolutions_have_the_scale_of_sliders_and_pictures(study):
+    for resolution in ("full", "coarse"):
+        mesh = threejs.modes(study, resolution=resolution, n_modes=2)
+        assert mesh.material.uniforms["limit"]["value"] == mode_limits(study)[0]
+
+
 def test_too_many_modes_for_a_texture_are_refused():
     with pytest.raises(ValueError, match="at most 8 modes of 1000000 vertices"):
         mode_table(np.zeros((1_000_000, 3)), None, np.broadcast_to(0, (9, 1_000_000, 3)))
@@ -164,7 +172,7 @@ def test_a_study_matches_two_of_its_shapes(study):
 
 
 def test_the_network_stands_where_its_differences_are_and_is_coloured_by_its_errors(study):
-    group = threejs.network(study, cmap="gray")
+    group = threejs.network(study, names=False)
     *bodies, lines = group.children
     scores = study["latent"]["area_score"]
     assert [part.name for part in bodies] == scores["shape"].values.tolist()
@@ -178,11 +186,34 @@ def test_the_network_stands_where_its_differences_are_and_is_coloured_by_its_err
         net["source"].values, net["target"].values, net["cycle_error"].values, strict=True
     ):
         mean.setdefault(frozenset((str(source), str(target))), []).append(error)
-    brightness = lines.geometry.colors[:, 0, 0]
-    for segment, shade in zip(lines.geometry.positions, brightness, strict=True):
+    both = net["cycle_error_initial"].values, net["cycle_error"].values
+    limits = np.min(both), np.max(both)
+    assert (group.bar["low"], group.bar["high"]) == limits
+    for segment, color in zip(lines.geometry.positions, lines.geometry.colors, strict=True):
         ends = [names[np.linalg.norm(places - end, axis=1).argmin()] for end in segment]
-        top = max(np.mean(errors) for errors in mean.values())
-        assert shade == pytest.approx(np.mean(mean[frozenset(ends)]) / top, abs=0.01)
+        error = np.mean(mean[frozenset(ends)])
+        np.testing.assert_allclose(color, cycle_error_colors(np.full(2, error), limits), atol=1e-6)
+
+
+def test_the_bar_of_a_network_stands_below_it_and_moves_with_the_camera(study):
+    group = threejs.network(study)
+    scene = threejs.renderer(group, size=(400, 300), view="top")
+    assert not [part for part in threejs.renderer(group.children[0]).camera.children if part.name]
+    (bar,) = [part for part in scene.camera.children if part.name == "colour bar"]
+    strip, low, label, high = bar.children
+    assert (low.name, label.name) == ("", "")
+    texts = [part.material.map.string for part in (low, label, high)]
+    assert texts[0] == f"{group.bar['low']:.2g}"
+    assert texts[2] == f"{group.bar['high']:.2g}"
+    assert "cycle error" in texts[1]
+    limits = group.bar["low"], group.bar["high"]
+    ends = cycle_error_colors(np.array(limits), limits)
+    np.testing.assert_allclose(strip.material.map.data[0, [0, -1], :3] / 255, ends, atol=0.01)
+    # in the picture's plane at the bar's distance, from -1 to 1
+    x, y, _ = np.array(bar.position) / (-bar.position[2] * np.tan(np.deg2rad(20)))
+    width = bar.scale[0] / (-bar.position[2] * np.tan(np.deg2rad(20)))
+    assert abs(x) + width / 2 < 400 / 300
+    assert -1 < y - 0.0725 * width < y + 0.02 * width < -0.7
 
 
 def test_what_is_in_a_group_is_in_the_picture():

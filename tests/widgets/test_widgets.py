@@ -18,16 +18,19 @@ import xarray as xr
 pytest.importorskip("anywidget")
 from IPython.core.interactiveshell import ExecutionInfo, InteractiveShell
 from ipywidgets.widgets import widget as registry  # the open widgets are counted in it
+from matplotlib.colors import to_rgb
 
 import s4a
 from s4a.geometry.mesh import as_dataset, vertex_normals
 from s4a.method.network import spectral_distance
 from s4a.method.shape import Shape
+from s4a.show import charts
 from s4a.show.browser import color_bytes
 from s4a.show.charts import PALE
-from s4a.show.draw import position_colors
+from s4a.show.draw import cycle_error_colors, cycle_error_limits, position_colors
 from s4a.show.panel_page import widgets_in
-from s4a.show.surfaces import aligned, mesh_of
+from s4a.show.pictures import mode_drawer
+from s4a.show.surfaces import aligned, mesh_of, mode_limits
 from s4a.study.progress import status
 from s4a.widgets import (
     Correspondence,
@@ -163,6 +166,14 @@ def test_fewer_modes_can_be_shown(panel):
     assert len(modes.scores) == len(modes.view.ratio) == 2
 
 
+def test_sliders_at_both_resolutions_and_pictures_have_one_scale(study, panel):
+    _, limit = mode_drawer(study, {"view": "corner", "up": "z"})
+    for resolution in ("full", "coarse"):
+        view = panel(Modes, resolution=resolution, n_modes=1).view
+        assert (view.limit, view.limit_magnitude) == mode_limits(study)
+        assert view.bars["normal"]["high"] == view.limit == limit
+
+
 def test_without_webgl_python_deforms(study):
     pca, (X, T) = study["pca"].dataset, mesh_of(study["registration"])
     mean = X + pca["mean_displacement"].values
@@ -198,8 +209,10 @@ def test_a_clicked_edge_shows_its_map_and_both_meshes(study, panel):
     assert network.matrix.spec["title"].startswith(
         f"{row['source'].item()} → {row['target'].item()}"
     )
-    shown = np.frombuffer(network.matrix.values, "<f4").reshape(row["fmap"].shape)
-    assert (shown == row["fmap"].values.astype(np.float32)).all()
+    for stage, key in (("cycle_error_initial", "fmap_initial"), ("cycle_error", "fmap")):
+        network.stage.value = stage
+        shown = np.frombuffer(network.matrix.values, "<f4").reshape(row[key].shape)
+        assert (shown == row[key].values.astype(np.float32)).all()
     for view, key in zip(network.scenes, ("source", "target"), strict=True):
         name = row[key].item()
         X = aligned(study, name, study["coarse"][name]["position"].values)
@@ -228,13 +241,37 @@ def test_the_edge_budget_tells_how_the_network_hangs_together(panel):
 
 def test_edges_are_coloured_before_and_after_on_one_scale(study, panel):
     network = panel(Network)
-    bar, after = network.bar.value, network.graph.spec["values"]
-    network.stage.value = "cycle_error_initial"
-    assert network.bar.value == bar
-    assert network.graph.spec["values"] != after
-    np.testing.assert_allclose(
-        network.graph.spec["values"], study["network"]["cycle_error_initial"].values
+    bar = network.bar.value
+    both = [study["network"][key].values for key in ("cycle_error_initial", "cycle_error")]
+    limits = np.min(both), np.max(both)
+    for key, errors in zip(("cycle_error_initial", "cycle_error"), both, strict=True):
+        network.stage.value = key
+        assert network.bar.value == bar
+        np.testing.assert_allclose(network.graph.spec["values"], errors)
+        colors = [to_rgb(color) for color in network.graph.spec["colors"]]
+        np.testing.assert_allclose(colors, cycle_error_colors(errors, limits), atol=1 / 255)
+        assert f"cycle errors {errors.min():.3f} to {errors.max():.3f}" in network.facts.value
+    assert f">{limits[0]:.2g}<" in bar
+    assert f">{limits[1]:.2g}<" in bar
+    lines = charts.network(
+        charts.on_circle(len(network.names)),
+        network.names,
+        *network.ends.T,
+        dict(zip(("before", "after"), both, strict=True)),
     )
+    drawn = lines.axes[1].collections[0].get_colors()[:, :3]
+    np.testing.assert_allclose(np.sort(drawn, axis=0), np.sort(colors, axis=0), atol=1 / 255)
+
+
+def test_the_colours_of_cycle_errors_tell_maps_apart_that_differ_by_a_tenth():
+    before, after = np.array([0.056, 0.062, 0.080]), np.array([0.0355, 0.039])  # as in lesson 00
+    limits = cycle_error_limits(before, after)
+    assert limits == (0.0355, 0.080)
+    colors = [255 * cycle_error_colors(errors, limits) for errors in (before, after)]
+    for several in colors:
+        assert np.linalg.norm(np.diff(several, axis=0), axis=1).min() > 15
+    gaps = np.abs(np.subtract.outer(*(several.sum(1) for several in colors)))
+    assert gaps.min() > 15, "both stages on one scale"
 
 
 def with_network(study, network):
@@ -263,6 +300,7 @@ def test_maps_of_unknown_error_are_grey_and_said_to_be_in_no_cycle(study):
     maps = study["network"].to_dataset()
     maps["cycle_error"] = maps["cycle_error"].where(np.arange(maps.sizes["pair"]) != 3)
     network = Network(with_network(study, maps))
+    network.stage.value = "cycle_error"
     colors = network.graph.spec["colors"]
     assert [i for i, color in enumerate(colors) if color == PALE] == [3]
     network.edge = 3
@@ -280,7 +318,8 @@ def test_two_shapes_have_a_network_without_cycles(study):
     maps["cycle_error_initial"] = maps["cycle_error"]
     network = Network(with_network(study, maps))
     assert network.graph.spec["colors"] == [PALE, PALE]
-    assert ">1.00<" in network.bar.value
+    assert ">0.5<" in network.bar.value
+    assert ">1<" in network.bar.value
     assert network.message.value == ""
     network.close()
 

@@ -206,13 +206,32 @@ function graph(parent, spec, pick) {
   reachable([...marks.slice(source.length), ...marks.slice(0, source.length)], line(parent), pick);
 }
 
-// A matrix as pixels: `values` row by row, coloured by a palette of 256 colours from -limit to limit.
+// A matrix as pixels: `values` row by row, coloured by a palette of 256 colours from -limit to limit. Its frame:
+//
+//   ylabel | ticks | pixels
+//          |       | ticks
+//          |       | xlabel
+//          |       | colour bar
 function matrix(parent, spec, pick) {
-  const { rows, columns, values, palette, limit, blocks = [], label, title, row = -1, column = -1, size = 380 } = spec;
+  const { rows, columns, values, palette, limit, blocks = [], label, title, note = "", axes = ["", ""], row = -1, column = -1, size = 380 } = spec;
   html(parent, "div", { class: "s4a-title" }, title);
-  const box = html(parent, "div", { class: "s4a-matrix", style: `width:${size / 13}em;aspect-ratio:${columns}/${rows}` });
+  const frame = html(parent, "div", { class: "s4a-matrix-frame", style: `max-width:${size / 13}em` });
+  html(frame, "div", { class: "s4a-ylabel" }, axes[1]);
+  const numbered = (count, side, extent) => {
+    const scale = html(frame, "div", { class: `s4a-${extent}ticks`, "aria-hidden": "true" });
+    const whole = ticks(0, count - 1, 4).filter(Number.isInteger);
+    for (const i of whole) html(scale, "span", { style: `${side}:${(100 * (i + 0.5)) / count}%` }, i);
+    if (extent === "y") scale.style.width = `${String(count - 1).length + 0.5}ch`;
+  };
+  numbered(rows, "top", "y");
+  const box = html(frame, "div", { class: "s4a-matrix", style: `aspect-ratio:${columns}/${rows}` });
+  numbered(columns, "left", "x");
+  html(frame, "div", { class: "s4a-xlabel" }, axes[0]);
+  const colors = Array.from({ length: 11 }, (_, i) => `rgb(${palette.subarray(3 * Math.round(25.5 * i)).slice(0, 3).join()})`);
+  colorBar(html(frame, "div", { class: "s4a-matrix-bar" }), { colors, low: -limit, label: "entry of the matrix", high: limit });
+  html(parent, "div", { class: "s4a-note" }, note);
   const inside = (at) => at.row >= 0 && at.row < rows && at.column < columns;
-  const canvas = html(box, "canvas", { tabindex: 0, role: "application", "aria-label": `${title}: arrow keys move, Enter shows the cell` });
+  const canvas = html(box, "canvas", { tabindex: 0, role: "application", "aria-label": `${[title, axes[0] && `columns: ${axes[0]}, rows: ${axes[1]}`].filter(Boolean).join("; ")}: arrow keys move, Enter shows the cell` });
   Object.assign(canvas, { width: columns, height: rows });
   const paint = canvas.getContext("2d"), image = paint.createImageData(columns, rows);
   values.forEach((v, i) => {

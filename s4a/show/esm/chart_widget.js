@@ -13,7 +13,7 @@ export default {
         spec.values = numbers(Float32Array, model.get("values"));
         if (spec.values.length !== spec.rows * spec.columns) return; // the other half of the message is on its way
         spec.palette = numbers(Uint8Array, model.get("palette"));
-        spec.label = ({ row, column }) => `source mode ${column} to target mode ${row}`;
+        spec.label = ({ row, column }) => `source φ${column} to target ψ${row}`;
       }
       CHARTS[spec.kind](el, spec, (mark) => {
         asked = (model.get("picked").count || 0) + 1;
