@@ -155,6 +155,7 @@ function modesWidget({ model, el }) {
       modes.show(view.surfaces[0], shape(view.at), kind);
       view.widen(view.surfaces[0].position);
       view.caption.textContent = view.at === null ? "mean + Σ score · deformation" : view.at ? `PC${active + 1} at ${view.at > 0 ? "+" : "−"}3 σ` : "mean";
+      view.name(view.at === null ? "shape" : view.caption.textContent);
       view.redraw();
     });
     rows.forEach(({ input, output }, c) => {

@@ -123,7 +123,7 @@ export default {
     Object.entries(on).forEach(([event, act]) => model.on(event, act));
     geometry(), ghosts(), words(), answered(), lasso();
     const webgl = context() !== null;
-    view.canvas.hidden = !webgl;
+    view.box.hidden = !webgl;
     still.hidden = webgl;
     if (!webgl) picture();
     if (model.get("webgl") !== (webgl ? "yes" : "no")) {

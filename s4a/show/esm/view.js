@@ -34,17 +34,41 @@ function radiusOf(P, centre) {
   return Math.sqrt(r2);
 }
 
+// The row of buttons in a corner of a view; what it lacks is added by who knows of it: `add(text, act, help)`, where the name
+// of the surface follows the help, so that no two buttons of a panel say the same.
+function toolbar(view) {
+  const row = html(view.box, "div", { class: "s4a-toolbar", role: "group" }), helps = new Map();
+  let label = "surface";
+  const say = (help, it) => { it.title = `${help}: ${label}`; it.setAttribute("aria-label", it.title); };
+  const add = (text, act, help, more = {}) => {
+    const it = html(row, "button", { type: "button", ...more }, text);
+    it.addEventListener("click", act);
+    helps.set(it, help);
+    say(help, it);
+    return it;
+  };
+  const name = (now) => {
+    label = now;
+    row.setAttribute("aria-label", `view of ${label}`);
+    helps.forEach(say);
+  };
+  add("+", () => view.scale(1.25), "zoom in");
+  add("−", () => view.scale(1 / 1.25), "zoom out");
+  add("⟲", () => view.reset(), "reset the view");
+  return { row, add, name };
+}
+
 class View {
   constructor(parent, { turn, group = "", height = 360, label = "surface", onPick, onHover, onLasso }) {
     Object.assign(this, { surfaces: [], points: [], cursor: -1, lasso: false, path: null, onPick: onPick || null, onHover: onHover || null, onLasso, group });
     this.ball = new Surface();
     this.ball.setMesh(...ballMesh());
-    this.canvas = document.createElement("canvas");
-    Object.assign(this.canvas, { className: "s4a-view", tabIndex: 0, view: this });
-    this.canvas.setAttribute("role", onPick ? "application" : "img");
-    this.name(label);
+    this.box = html(parent, "div", { class: "s4a-surface" });
+    this.canvas = html(this.box, "canvas", { class: "s4a-view", tabindex: 0, role: onPick ? "application" : "img" });
+    this.canvas.view = this;
     this.canvas.style.height = `${height / 13}em`; // of the text that it stands in, as everything in a panel
-    parent.append(this.canvas);
+    this.toolbar = toolbar(this);
+    this.name(label);
     this.camera = camera(group, turn);
     this.camera.views.add(this);
     this.observer = new ResizeObserver(() => this.redraw());
@@ -52,8 +76,11 @@ class View {
     this.listen();
   }
   name(label) {
+    if (label === this.label) return;
+    this.label = label;
     const choose = this.onPick ? ", C starts a cursor that the arrow keys move over the surface, with shift by one edge, Enter picks its vertex, Escape ends it" : "";
     this.canvas.setAttribute("aria-label", `${label}: drag or arrow keys turn, wheel or + and - zoom, shift and drag move, 0 resets${choose}`);
+    this.toolbar.name(label);
   }
   moved() { this.camera.views.forEach((view) => view.redraw()); }
   listen() {
@@ -272,6 +299,6 @@ class View {
     this.camera.views.delete(this);
     if (!this.camera.views.size && this.group) globalThis.s4aCameras.delete(this.group);
     [...this.surfaces, this.ball].forEach((surface) => surface.dispose());
-    this.canvas.remove();
+    this.box.remove();
   }
 }
