@@ -106,6 +106,7 @@ export default {
     const answered = () => current() && view.told(); // not of a place where the user is no longer
     const lasso = () => {
       view.lasso = model.get("lasso");
+      view.grip();
       view.canvas.style.cursor = view.lasso ? "crosshair" : "";
     };
     const picture = () => {
