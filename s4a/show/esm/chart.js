@@ -43,7 +43,7 @@ function plot(parent, { width, height, x, y, xlabel = "", ylabel = "", title = "
   const top = title ? 22 : 8, bottom = height - 36, right = width - 10;
   const X = (v) => left + ((v - x[0]) / (x[1] - x[0])) * (right - left);
   const Y = (v) => bottom - ((v - y[0]) / (y[1] - y[0])) * (bottom - top);
-  if (title) node(svg, "text", { x: left, y: 14, "font-weight": "bold" }, title);
+  if (title) node(svg, "text", { x: Math.max(0, Math.min(left, width - 7.2 * title.length)), y: 14, "font-weight": "bold" }, title);
   for (const t of ticks(...x, 6)) {
     if (grid) node(svg, "line", { x1: X(t), x2: X(t), y1: top, y2: bottom, stroke: FAINT });
     node(svg, "text", { x: X(t), y: bottom + 14, "text-anchor": "middle" }, short(t));
@@ -73,13 +73,13 @@ function brief(names, room = 16) {
 }
 
 // Names beside their marks, each where it hides nothing; one that finds no place is left to the hover and the focus.
-function labels(svg, { x, y, names, width, height, sides, avoid = [], letter = 6.4, gap = 7, ...look }) {
+function labels(svg, { x, y, names, width, height, start = 0, sides, avoid = [], letter = 6.4, gap = 7, ...look }) {
   const taken = [...x.map((v, i) => [v - 6, y[i] - 6, v + 6, y[i] + 6]), ...avoid.map(([v, w]) => [v - 8, w - 8, v + 8, w + 8])];
   brief(names).forEach((text, i) => {
     const wide = letter * text.length;
     for (const [right, down] of sides ? sides(i) : [[1, -4], [-1, -4], [1, 12], [-1, 12]]) {
       const left = right > 0 ? x[i] + gap : x[i] - gap - wide, low = y[i] + down, box = [left, low - 9, left + wide, low + 2];
-      if (box[0] < 0 || box[2] > width || box[1] < 0 || box[3] > height) continue;
+      if (box[0] < start || box[2] > width || box[1] < 0 || box[3] > height) continue;
       if (taken.some((other, j) => j !== i && box[0] < other[2] && other[0] < box[2] && box[1] < other[3] && other[1] < box[3])) continue;
       taken.push(box);
       node(svg, "text", { x: x[i] + right * gap, y: low, "text-anchor": right > 0 ? "start" : "end", ...look }, text);
@@ -94,20 +94,21 @@ function reachable(marks, readout, pick) {
     at.setAttribute("tabindex", i ? -1 : 0);
     at.setAttribute("role", "button");
     at.setAttribute("aria-label", text);
+    at.dataset.mark = JSON.stringify(value);
     at.classList.add("s4a-mark");
     node(at, "title", {}, text);
     const say = () => (readout.textContent = text);
     at.addEventListener("pointerenter", say);
-    at.addEventListener("focus", say);
+    at.addEventListener("focus", () => {
+      marks.forEach((other) => other.at.setAttribute("tabindex", -1));
+      at.setAttribute("tabindex", 0);
+      say();
+    });
     at.addEventListener("click", () => pick(value));
     at.addEventListener("keydown", (e) => {
       const step = { ArrowRight: 1, ArrowDown: 1, ArrowLeft: -1, ArrowUp: -1 }[e.key];
-      if (step) {
-        const next = marks[(i + step + marks.length) % marks.length].at;
-        at.setAttribute("tabindex", -1);
-        next.setAttribute("tabindex", 0);
-        next.focus();
-      } else if (e.key === "Enter" || e.key === " ") pick(value);
+      if (step) marks[(i + step + marks.length) % marks.length].at.focus();
+      else if (e.key === "Enter" || e.key === " ") pick(value);
       else return;
       e.preventDefault();
       e.stopPropagation();
@@ -115,16 +116,26 @@ function reachable(marks, readout, pick) {
   });
 }
 
+// Draws anew what is in a parent; the focus stays on the mark that had it, or goes to the first one where that is gone.
+function redrawn(parent, draw) {
+  const last = parent.getRootNode().activeElement; // of the page, or of a shadow tree
+  const within = parent.contains(last);
+  draw();
+  if (!within || last.isConnected) return;
+  const stops = [...parent.querySelectorAll("[tabindex]")], same = stops.find((at) => last.dataset.mark && at.dataset.mark === last.dataset.mark);
+  (same || stops.find((at) => at.tabIndex === 0))?.focus({ preventScroll: true });
+}
+
 const line = (parent) => html(parent, "div", { class: "s4a-readout", "aria-live": "polite" }, " ");
 
 function scatter(parent, spec, pick) {
-  const { x, y, names, xlabel, ylabel, title, selected = -1, faint = [], width = room(parent, spec.most ?? 430), height = 300 } = spec;
+  const { x, y, names, xlabel, ylabel, title, selected = -1, faint = [], width = room(parent, spec.most ?? 430) } = spec, { height = Math.min(300, width) } = spec;
   const frame = plot(parent, { width, height, x: bounds([...x, ...(spec.reach || [0])]), y: bounds([...y, ...(spec.reach || [0])]), xlabel, ylabel, title });
   const marks = x.map((_, i) => {
     const at = node(frame.svg, "circle", { cx: frame.X(x[i]), cy: frame.Y(y[i]), r: i === selected ? 7 : 5, fill: i === selected ? ORANGE : faint[i] ? PALE : BLUE, stroke: "#fff" });
     return { at, value: { index: i, name: names[i] }, text: `${names[i]}${faint[i] ? " (doubtful)" : ""}: ${short(x[i])}, ${short(y[i])}` };
   });
-  labels(frame.svg, { x: x.map(frame.X), y: y.map(frame.Y), names, width, height: frame.bottom, avoid: [[frame.X(0), frame.Y(0)]], class: "s4a-small" }); // where the cross is at first
+  labels(frame.svg, { x: x.map(frame.X), y: y.map(frame.Y), names, width, height: frame.bottom, start: frame.left, avoid: [[frame.X(0), frame.Y(0)]], class: "s4a-small" }); // where the cross is at first
   const cross = node(frame.svg, "path", { d: "M-7 0H7M0 -7V7", stroke: ORANGE, "stroke-width": 2, visibility: "hidden", class: "s4a-cross" });
   reachable(marks, line(parent), pick);
   return (a, b) => {
@@ -151,7 +162,7 @@ function bars(parent, spec, pick) {
 }
 
 function lines(parent, spec, pick) {
-  const { series, xlabel, ylabel, title, width = room(parent, 460), height = 280, ymin, marker } = spec;
+  const { series, xlabel, ylabel, title, width = room(parent, 460), ymin, marker } = spec, { height = Math.min(280, width) } = spec;
   const y = bounds(series.flatMap((s) => s.y), 0.04);
   const frame = plot(parent, { width, height, x: bounds(series.flatMap((s) => s.x), 0.02), y: [ymin ?? y[0], y[1]], xlabel, ylabel, title });
   const drawn = series.map((s) => {

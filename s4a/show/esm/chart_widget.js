@@ -5,22 +5,21 @@ export default {
     let asked = 0; // the number of the last mark that was picked
     const draw = () => {
       if (model.get("answer") >= 0 && model.get("answer") < asked) return; // of an older mark: the answer to the last one comes
-      const focused = el.contains(document.activeElement);
-      el.replaceChildren();
       const spec = { ...model.get("spec") };
-      if (!spec.kind) return;
       if (spec.kind === "matrix") {
         spec.values = numbers(Float32Array, model.get("values"));
         if (spec.values.length !== spec.rows * spec.columns) return; // the other half of the message is on its way
         spec.palette = numbers(Uint8Array, model.get("palette"));
         spec.label = ({ row, column }) => `source φ${column} to target ψ${row}`;
       }
-      CHARTS[spec.kind](el, spec, (mark) => {
-        asked = (model.get("picked").count || 0) + 1;
-        model.set("picked", { ...mark, count: asked });
-        model.save_changes();
+      redrawn(el, () => {
+        el.replaceChildren();
+        if (spec.kind) CHARTS[spec.kind](el, spec, (mark) => {
+          asked = (model.get("picked").count || 0) + 1;
+          model.set("picked", { ...mark, count: asked });
+          model.save_changes();
+        });
       });
-      if (focused) el.querySelector("[tabindex='0']")?.focus({ preventScroll: true });
     };
     draw();
     const stop = onRoom(el, draw);

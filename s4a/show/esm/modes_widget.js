@@ -114,7 +114,7 @@ function modesWidget({ model, el }) {
     return { row, input, output };
   });
   const distance = html(right, "div", { class: "s4a-readout", "aria-live": "polite" });
-  const charts = html(el, "div", { class: "s4a-charts" }), scorePart = html(charts, "div"), variancePart = html(charts, "div");
+  const charts = html(box, "div", { class: "s4a-charts" }), scorePart = html(charts, "div"), variancePart = html(charts, "div");
 
   const mark = () => rows.forEach(({ row }, c) => row.classList.toggle("s4a-active", c === active));
   const toggle = (on = !playing) => {
@@ -155,6 +155,7 @@ function modesWidget({ model, el }) {
       modes.show(view.surfaces[0], shape(view.at), kind);
       view.widen(view.surfaces[0].position);
       view.caption.textContent = view.at === null ? "mean + Σ score · deformation" : view.at ? `PC${active + 1} at ${view.at > 0 ? "+" : "−"}3 σ` : "mean";
+      view.name(view.at === null ? "shape" : view.caption.textContent);
       view.redraw();
     });
     rows.forEach(({ input, output }, c) => {
@@ -196,7 +197,7 @@ function modesWidget({ model, el }) {
   Object.entries(on).forEach(([event, act]) => model.on(event, act));
   chart();
   arrange();
-  const stop = onRoom(scorePart, () => { chart(); update(); });
+  const stop = onRoom(scorePart, () => { redrawn(charts, chart); update(); });
   const webgl = context() !== null;
   views.hidden = !webgl;
   still.hidden = webgl;

@@ -106,6 +106,7 @@ export default {
     const answered = () => current() && view.told(); // not of a place where the user is no longer
     const lasso = () => {
       view.lasso = model.get("lasso");
+      view.grip();
       view.canvas.style.cursor = view.lasso ? "crosshair" : "";
     };
     const picture = () => {
@@ -123,7 +124,7 @@ export default {
     Object.entries(on).forEach(([event, act]) => model.on(event, act));
     geometry(), ghosts(), words(), answered(), lasso();
     const webgl = context() !== null;
-    view.canvas.hidden = !webgl;
+    view.box.hidden = !webgl;
     still.hidden = webgl;
     if (!webgl) picture();
     if (model.get("webgl") !== (webgl ? "yes" : "no")) {

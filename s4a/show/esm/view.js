@@ -34,61 +34,114 @@ function radiusOf(P, centre) {
   return Math.sqrt(r2);
 }
 
+// The row of buttons in a corner of a view; what it lacks is added by who knows of it: `add(text, act, help)`, where the name
+// of the surface follows the help, so that no two buttons of a panel say the same.
+function toolbar(view) {
+  const row = html(view.box, "div", { class: "s4a-toolbar", role: "group" }), helps = new Map();
+  let label = "surface";
+  const say = (help, it) => { it.title = `${help}: ${label}`; it.setAttribute("aria-label", it.title); };
+  const add = (text, act, help, more = {}) => {
+    const it = html(row, "button", { type: "button", ...more }, text);
+    it.addEventListener("click", act);
+    helps.set(it, help);
+    say(help, it);
+    return it;
+  };
+  const name = (now) => {
+    label = now;
+    row.setAttribute("aria-label", `view of ${label}`);
+    helps.forEach(say);
+  };
+  add("+", () => view.scale(1.25), "zoom in");
+  add("−", () => view.scale(1 / 1.25), "zoom out");
+  add("⟲", () => view.reset(), "reset the view");
+  return { row, add, name };
+}
+
 class View {
   constructor(parent, { turn, group = "", height = 360, label = "surface", onPick, onHover, onLasso }) {
     Object.assign(this, { surfaces: [], points: [], cursor: -1, lasso: false, path: null, onPick: onPick || null, onHover: onHover || null, onLasso, group });
     this.ball = new Surface();
     this.ball.setMesh(...ballMesh());
-    this.canvas = document.createElement("canvas");
-    Object.assign(this.canvas, { className: "s4a-view", tabIndex: 0, view: this });
-    this.canvas.setAttribute("role", onPick ? "application" : "img");
-    this.name(label);
+    this.box = html(parent, "div", { class: "s4a-surface" });
+    this.canvas = html(this.box, "canvas", { class: "s4a-view", tabindex: 0, role: onPick ? "application" : "img" });
+    this.canvas.view = this;
     this.canvas.style.height = `${height / 13}em`; // of the text that it stands in, as everything in a panel
-    parent.append(this.canvas);
+    this.toolbar = toolbar(this);
+    this.finger = this.toolbar.add("Turn", () => {
+      this.camera.touch = !this.camera.touch;
+      this.camera.views.forEach((view) => view.grip());
+    }, "one finger turns the surface, or else scrolls the page", { class: "s4a-finger" });
     this.camera = camera(group, turn);
     this.camera.views.add(this);
+    this.name(label);
+    this.grip();
     this.observer = new ResizeObserver(() => this.redraw());
     this.observer.observe(this.canvas);
     this.listen();
   }
   name(label) {
+    if (label === this.label) return;
+    this.label = label;
     const choose = this.onPick ? ", C starts a cursor that the arrow keys move over the surface, with shift by one edge, Enter picks its vertex, Escape ends it" : "";
-    this.canvas.setAttribute("aria-label", `${label}: drag or arrow keys turn, wheel or + and - zoom, shift and drag move, 0 resets${choose}`);
+    this.canvas.setAttribute("aria-label", `${label}: drag or arrow keys turn, wheel or + and - zoom, shift and drag move, two fingers zoom and move, 0 resets${choose}`);
+    this.toolbar.name(label);
   }
   moved() { this.camera.views.forEach((view) => view.redraw()); }
+  grip() { // whether one finger is ours, or scrolls the page; two are always ours
+    this.canvas.style.touchAction = this.camera.touch || this.lasso ? "none" : "";
+    this.finger.setAttribute("aria-pressed", Boolean(this.camera.touch));
+  }
   listen() {
-    const canvas = this.canvas;
+    const canvas = this.canvas, fingers = new Map(), place = (e) => [e.clientX, e.clientY];
     let last = null, travel = 0;
     canvas.addEventListener("pointerdown", (e) => {
       canvas.setPointerCapture(e.pointerId);
-      canvas.focus({ preventScroll: true });
+      if (e.pointerType === "touch") {
+        fingers.set(e.pointerId, place(e));
+        if (fingers.size > 1) return (last = this.path = null);
+      } else canvas.focus({ preventScroll: true });
       if (this.lasso && this.frame && !e.shiftKey) return (this.path = [this.plane(e)]);
-      last = [e.clientX, e.clientY];
+      last = place(e);
       travel = 0;
     });
     canvas.addEventListener("pointermove", (e) => {
       if (this.path) return this.path.push(this.plane(e)), this.redraw();
-      if (!last) return this.onHover?.(this.pick(e));
+      if (fingers.has(e.pointerId)) {
+        const before = [...fingers.values()];
+        fingers.set(e.pointerId, place(e));
+        if (before.length === 2) return this.pinch(before, [...fingers.values()]);
+      }
+      if (!last) return e.pointerType !== "touch" && this.onHover?.(this.pick(e));
       const dx = e.clientX - last[0], dy = e.clientY - last[1];
-      last = [e.clientX, e.clientY];
+      last = place(e);
       travel += Math.abs(dx) + Math.abs(dy);
+      if (e.pointerType === "touch" && !this.camera.touch) return;
       if (e.shiftKey || e.buttons > 1) this.shift(dx, dy);
       else this.rotate(dx * 0.01, dy * 0.01);
     });
     canvas.addEventListener("pointerup", (e) => {
+      fingers.delete(e.pointerId);
       if (this.path) {
         const polygon = this.path;
         this.path = null;
         if (polygon.length > 2) this.onLasso?.({ polygon, turn: [...this.camera.turn] });
         return this.redraw();
       }
-      if (last && travel < 4) this.onPick?.(this.pick(e));
+      if (last && travel < (e.pointerType === "touch" ? 12 : 4)) {
+        canvas.focus({ preventScroll: true });
+        this.onPick?.(this.pick(e));
+      }
       last = null;
+    });
+    canvas.addEventListener("pointercancel", (e) => { // the page scrolls
+      fingers.delete(e.pointerId);
+      last = this.path = null;
     });
     canvas.addEventListener("contextmenu", (e) => e.preventDefault());
     canvas.addEventListener("dblclick", () => this.reset());
     canvas.addEventListener("wheel", (e) => {
-      if (document.activeElement !== canvas) return; // the page scrolls until the view was clicked
+      if (canvas.getRootNode().activeElement !== canvas) return; // the page scrolls until the view was clicked
       e.preventDefault();
       this.scale(Math.exp(-0.0015 * e.deltaY));
     }, { passive: false });
@@ -163,6 +216,13 @@ class View {
     const { clientWidth: w, clientHeight: h } = this.canvas, [x, y] = this.camera.pan;
     this.camera.pan = [x + dx / Math.min(w, h), y - dy / Math.min(w, h)];
     this.moved();
+  }
+  pinch(before, now) { // what lay under two fingers stays under them
+    const box = this.canvas.getBoundingClientRect(), size = Math.min(box.width, box.height);
+    const middle = ([a, b]) => [(a[0] + b[0]) / 2 - box.left - box.width / 2, box.top + box.height / 2 - (a[1] + b[1]) / 2].map((v) => v / size);
+    const apart = ([a, b]) => Math.hypot(a[0] - b[0], a[1] - b[1]) || 1, zoom = this.camera.zoom, from = middle(before), to = middle(now);
+    this.scale(apart(now) / apart(before));
+    this.camera.pan = this.camera.pan.map((p, i) => to[i] - ((from[i] - p) * this.camera.zoom) / zoom);
   }
   scale(factor) {
     this.camera.zoom = Math.min(40, Math.max(0.2, this.camera.zoom * factor));
@@ -272,6 +332,6 @@ class View {
     this.camera.views.delete(this);
     if (!this.camera.views.size && this.group) globalThis.s4aCameras.delete(this.group);
     [...this.surfaces, this.ball].forEach((surface) => surface.dispose());
-    this.canvas.remove();
+    this.box.remove();
   }
 }
