@@ -297,7 +297,7 @@ EXERCISES = {
     "08.1": Exercise(lambda: 10**10, "every row of one with every row of the other", 0),
     "08.2": Exercise(
         lambda: lambda gap: 0 <= gap < 1e-6,
-        "apply B @ s4a.method.deform.smoother(B, area)(...) to `smooth`",
+        "apply the function `smooth` to the field `smoothed`",
     ),
     "08.3": Exercise(
         lambda match, n: 1 - np.unique(match).size / n,
