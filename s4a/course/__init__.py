@@ -1,7 +1,28 @@
-"""The course (notebooks/): exercises that check themselves, quizzes, sliders, diagrams."""
+"""The course (notebooks/): exercises that check themselves, quizzes, sliders, diagrams.
+
+With them stand the few functions on plain arrays that lessons call beside the public ones: charts,
+and what a mesh is made of.
+"""
 
 from s4a.course.exercises import check, judge
 from s4a.course.quizzes import quiz
 from s4a.course.sliders import slide, takeaway
+from s4a.geometry.mesh import as_arrays, as_dataset, triangle_areas, vertex_areas, vertex_normals
+from s4a.show import charts
+from s4a.show.draw import label_colors, position_colors
 
-__all__ = ["check", "judge", "quiz", "slide", "takeaway"]
+__all__ = [
+    "as_arrays",
+    "as_dataset",
+    "charts",
+    "check",
+    "judge",
+    "label_colors",
+    "position_colors",
+    "quiz",
+    "slide",
+    "takeaway",
+    "triangle_areas",
+    "vertex_areas",
+    "vertex_normals",
+]

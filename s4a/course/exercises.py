@@ -297,7 +297,7 @@ EXERCISES = {
     "08.1": Exercise(lambda: 10**10, "every row of one with every row of the other", 0),
     "08.2": Exercise(
         lambda: lambda gap: 0 <= gap < 1e-6,
-        "apply B @ s4a.method.deform.smoother(B, area)(...) to `smooth`",
+        "apply the function `smooth` to the field `smoothed`",
     ),
     "08.3": Exercise(
         lambda match, n: 1 - np.unique(match).size / n,
@@ -324,8 +324,10 @@ EXERCISES = {
         "metrics.chamfer takes two arrays of points; the image is X[match]",
     ),
     "10.2": Exercise(
-        lambda table: table["seconds"]["FMAP+ZO"] / table["seconds"]["RE-MATCH"],
-        "sum block_seconds over the blocks, or look into `table`",
+        lambda mean: (
+            mean["seconds"].sel(way="FMAP+ZO") / mean["seconds"].sel(way="RE-MATCH")
+        ).item(),
+        "mean['seconds'].sel(way=...) has those of a method",
     ),
     "10.3": Exercise(
         lambda n: lambda match: _is_wrong_everywhere_and_no_set_tells(match, n),
