@@ -184,8 +184,13 @@ def smaller(found):
     return f"data:image/webp;base64,{base64.b64encode(small.getvalue()).decode()}"
 
 
-def pack_pictures(app, pagename, templatename, context, doctree):
-    """Large pictures in the outputs of notebooks become smaller, so that pages load soon."""
+STATE = "application/vnd.jupyter.widget-state+json"
+
+
+def pack_page(app, pagename, templatename, context, doctree):
+    """Smaller pictures of notebooks, and no state of widgets, so that a page is loaded soon."""
+    scripts = context.get("script_files", [])
+    scripts[:] = [one for one in scripts if getattr(one, "attributes", {}).get("type") != STATE]
     pattern = rf"data:image/png;base64,([A-Za-z0-9+/]{{{LARGE},}}=*)"
     if "body" in context:
         context["body"] = re.sub(pattern, smaller, context["body"])
@@ -233,4 +238,4 @@ def setup(app):
     app.connect("autodoc-process-docstring", pictures, priority=100)  # before napoleon's words
     app.connect("autodoc-process-docstring", bars)
     app.connect("missing-reference", front_door)
-    app.connect("html-page-context", pack_pictures)
+    app.connect("html-page-context", pack_page, priority=900)  # after those of myst_nb

@@ -9,6 +9,9 @@ import gzip
 import io
 import itertools
 import math
+import os
+
+os.environ["TQDM_DISABLE"] = "1"  # bars of progress are widgets, too; read when tqdm is imported
 
 import ipywidgets
 import numpy as np
@@ -30,6 +33,7 @@ from s4a.widgets.explore import Explore
 from s4a.widgets.panel import OfKernel
 
 LIMIT = 1_500_000  # recorded characters of the panels of a cell, together
+MOST = 3_700_000  # letters of their pages, compressed: with pictures a page has less than 5 MB
 N_VALUES = 5  # of a slider
 # a panel is unpacked when it is first shown, and as tall as what is in it
 PANELS = """
@@ -111,7 +115,12 @@ def framed(panel):
         panel.tabs.selected_index = 0
     else:
         panels = {panel.title: panel}
-    pages = [(title, packed(one, LIMIT // len(panels))) for title, one in panels.items()]
+    limit = LIMIT if len(panels) == 1 else 2 * LIMIT // len(panels)
+    while True:  # where the surfaces are fine, fewer values of the controls are kept
+        pages = [(title, packed(one, limit)) for title, one in panels.items()]
+        if sum(len(page) for _, page in pages) <= MOST or limit == 0:
+            break
+        limit = limit // 2 if limit > LIMIT // 100 else 0
     return templates.from_string(PANELS).render(pages=pages).strip()
 
 

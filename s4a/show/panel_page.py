@@ -148,6 +148,10 @@ class Recording:
             for widget in self.widgets:
                 silence.enter_context(widget.hold_sync())
             runs = []
+            # what is shown now is in the page in any case, and counts for nothing
+            for value in (v for widget in self.widgets for v in shown(widget).values()):
+                self.keep(value)
+            self.size = 0
             for i, group in enumerate(panel.live):
                 with unchanged_picks(panel, self.widgets):
                     runs.append(self.run(group, limit * (i + 1) // len(panel.live)))

@@ -195,6 +195,6 @@ class Progress(Panel):
     def close(self) -> None:
         """Cancel a run that goes on, and close everything."""
         self.stopped.set()
-        if self.process.is_alive():
+        if hasattr(self, "process") and self.process.is_alive():
             self.cancel()
         super().close()

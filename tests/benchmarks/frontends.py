@@ -4,8 +4,8 @@
 
 Each that is installed beside S4A (``pip install notebook voila marimo``) gets a notebook that opens
 a small study and its panel of modes; looked at is whether the surface is drawn, whether a slider
-deforms it, whether Python hears of it, whether an arrow key moves the slider, and what the console
-of the page says.
+deforms it, whether Python hears of it, whether an arrow key moves the slider, whether the panel
+finds its kernel, and what the console of the page says.
 """
 
 import contextlib
@@ -124,7 +124,7 @@ def served(name, folder, path=None):
 
 
 def tried(name, folder, browser, heard):
-    """What a front end shows: drawn, moved, heard, moved by a key, and the errors of its page."""
+    """Whether it is drawn, moved, heard, moved by a key, finds its kernel; errors of its page."""
     messages = []
     heard.unlink(missing_ok=True)
     with served(name, folder) as address:
@@ -149,9 +149,11 @@ def tried(name, folder, browser, heard):
         value = slider.input_value()
         page.keyboard.press("ArrowRight")
         keyed = waited(page, lambda: float(slider.input_value()) > float(value), 5)
+        page.wait_for_timeout(6000)  # a panel waits five seconds for its kernel
+        known = page.get_by_text("Python does not answer").count() == 0
         page.close()
     told = [m.splitlines()[0] for m in messages if not any(h in m for h in HARMLESS)]
-    return drawn, moved, answered, keyed, list(dict.fromkeys(told))
+    return drawn, moved, answered, keyed, known, list(dict.fromkeys(told))
 
 
 def waited(page, condition, seconds=60):
@@ -166,8 +168,9 @@ def waited(page, condition, seconds=60):
 def main(names):
     say = sys.stdout.write
     heads = "surface drawn | a slider deforms it | Python hears of it | an arrow key moves it"
+    heads += " | its kernel is found"
     say(f"| front end | {heads} | errors |\n")
-    say("|---|---|---|---|---|---|\n")
+    say("|---|---|---|---|---|---|---|\n")
     with tempfile.TemporaryDirectory() as place, sync_playwright() as driver:
         folder, heard = Path(place), Path(place) / "heard"
         brains = s4a.synthetic.brains(5, 2000, seed=1)
@@ -179,7 +182,7 @@ def main(names):
             try:
                 version = importlib.metadata.version(name)
             except importlib.metadata.PackageNotFoundError:
-                say(f"| {name} is not installed | | | | | |\n")
+                say(f"| {name} is not installed | | | | | | |\n")
                 continue
             *held, errors = tried(name, folder, browser, heard)
             cells = ["yes" if one else "NO" for one in held]

@@ -21,7 +21,7 @@ from playwright.sync_api import sync_playwright
 SITE = Path(__file__).parents[2] / "docs" / "_build" / "html"
 LESSONS = ("00", "02", "04", "06", "09")
 MOST = 5_000_000  # bytes of a page with all that it loads
-WIDGET = re.compile(r"application/vnd\.jupyter\.widget-view|\b[A-Z]\w+\((children|value)=")
+WIDGET = re.compile(r"application/vnd\.jupyter\.widget|\b[A-Z]\w+\((children|value)=")
 # of a panel: its canvases and charts, as they are seen
 SEEN = """(body) => [...body.querySelectorAll("canvas.s4a-view")]
   .map((c) => { c.view.draw(); return c.toDataURL(); })
@@ -97,6 +97,7 @@ def looked_at(browser, base, path):
     window.goto(base + path, wait_until="load")
     panels = worked(window)
     shown = window.locator(".cell_output").all_inner_texts()
+    shown += [s.evaluate("(s) => s.type") for s in window.locator("script[type$='+json']").all()]
     errors += [f"a widget without its kernel: {t[:60]}" for t in shown if WIDGET.search(t)]
     size = sum(len(request.response().body()) for request in loaded)
     window.close()

@@ -42,7 +42,16 @@ def refuse(thread):
 
 
 def block():
-    """From now on no module that is lacking is found, and no thread starts."""
+    """From now on no module that is lacking is found, and no thread starts.
+
+    scikit-learn is loaded before, as its newest version, unlike that of Pyodide, needs pipes; what
+    it loaded of joblib and multiprocessing is loaded again without their compiled part.
+    """
+    import sklearn.decomposition  # noqa: F401
+
+    for name in [*sys.modules]:
+        if name.partition(".")[0] in ("joblib", "multiprocessing"):
+            del sys.modules[name]
     sys.meta_path[:] = map(Without, sys.meta_path)
     for name in LACKING:
         sys.modules.pop(name, None)

@@ -25,6 +25,7 @@ def done(study_folder, tmp_path_factory):
         command, env=environment, cwd=place, capture_output=True, text=True, check=False
     )
     assert run.returncode == 0, run.stderr
+    assert "Traceback" not in run.stderr, run.stderr  # of what is raised where nobody can catch it
     return json.loads(run.stdout)
 
 

@@ -6,7 +6,7 @@ const PATIENCE = 5000; // ms
 function askKernel(model, el) {
   if (model.saved) return () => {}; // a page that answers by itself
   const asked = Date.now(), working = ["busy", "starting", "restarting", "autorestarting"];
-  const note = html(el, "div", { role: "status", hidden: "" }, "Python does not answer: this panel is interactive with a running kernel; its save_html writes a page that works without one.");
+  const note = html(el, "div", { role: "status", hidden: "", style: "flex: 1" }, "Python does not answer: this panel is interactive with a running kernel; its save_html writes a page that works without one.");
   const wait = setInterval(() => { note.hidden = working.includes(model.widget_manager?.kernel?.status); }, PATIENCE);
   const heard = () => { if (model.get("heard") === asked) end(); };
   const end = () => { clearInterval(wait); note.remove(); model.off("change:heard", heard); };
