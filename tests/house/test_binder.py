@@ -54,7 +54,7 @@ def folder(prepare, whole, monkeypatch, tmp_path):
 def test_the_requirements_install_this_project_with_extras_that_it_has():
     (named,) = re.findall(r"^-e \.\[([\w,]+)\]$", "\n".join(lines("requirements.txt")), re.M)
     extras = PROJECT["optional-dependencies"]
-    needed = distributions(sum((extras[extra] for extra in named.split(",")), []))
+    needed = distributions(line for extra in named.split(",") for line in extras[extra])
     assert {"s4a[notebook]", "s4a[labels]", "nilearn", "pymeshlab"} <= set(needed)
     assert {"jupyterlab", "ipywidgets", "anywidget"} <= set(distributions(extras["notebook"]))
 
