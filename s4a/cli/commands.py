@@ -58,19 +58,18 @@ def run(args: Namespace) -> int:
     from s4a.cli import results, tables
     from s4a.study.pipeline import analyse
 
-    begin = time.perf_counter()
     full = within(args.out, "report.txt")
     with cluster(args.cluster), lines_or_bars():
         study = analyse(args.paths, store=args.out, **options_of(args))
     if "structures" in study.children:
-        write(results.run_of_several(study, args.out, time.perf_counter() - begin))
+        write(results.run_of_several(study, args.out))
         parts = study["structures"].children.values()
         return 1 if any(part["report"].attrs["unforeseen"] for part in parts) else 0
     again = shlex.join(["s4a", *(word for word in args.words if word != "--keep-doubtful")])
     report = study["report"].to_dataset()
     lines = [tables.report_table(report), *tables.stage_lines(report)]
     full.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    write(tables.run_summary(study, time.perf_counter() - begin, again=again))
+    write(tables.run_summary(study, again=again))
     write("\n".join(tables.place_lines(args.out, str(full))))
     return 1 if study["report"].attrs["unforeseen"] else 0
 
@@ -142,7 +141,7 @@ def demo(args: Namespace) -> int:
     from s4a.show.pictures import write_picture
     from s4a.study.pipeline import analyse
 
-    begin, out = time.perf_counter(), Path(args.out)
+    out = Path(args.out)
     collection = synthetic.brains(args.shapes, args.vertices, args.seed, dirty=args.dirty)
     study = analyse(collection, store=out, preset=args.preset, n_jobs=args.n_jobs, seed=args.seed)
     truth: Any = collection["truth"]
@@ -150,16 +149,16 @@ def demo(args: Namespace) -> int:
     def image(shape, template):
         return synthetic.position(truth, shape, truth[template]["reference_point"].values)
 
+    write(tables.run_summary(study))
+    if "pca" in study:
+        write(f"\npicture: {write_picture(study, out / 'modes.png')}")
     errors = accuracy.accuracy(study, image, n_jobs=args.n_jobs)
-    write(tables.run_summary(study, time.perf_counter() - begin))
     write("\n" + tables.error_table(errors))
-    page = out / "study.html"
-    write_page(study, page, title="Synthetic brains")
-    pictures = str(page)
     if "pca" in study:
         write(tables.planted_line(study["pca"].to_dataset(), truth.to_dataset()))
-        pictures += f", {write_picture(study, out / 'modes.png')}"
-    write(f"\npictures: {pictures} ({time.perf_counter() - begin:.0f} s in all)")
+    page = out / "study.html"
+    write_page(study, page, title="Synthetic brains")
+    write(f"\npage: {page}")
     if args.open:
         webbrowser.open(page.resolve().as_uri())
     return 0

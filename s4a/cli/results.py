@@ -124,7 +124,7 @@ def level_line(pca: xr.Dataset, level: str) -> str:
     return f"{level}: modes of {shares} % of its variance"
 
 
-def run_of_several(study: xr.DataTree, folder: str, seconds: float) -> str:
+def run_of_several(study: xr.DataTree, folder: str) -> str:
     """The end of a run over several structures: that of each, and what compares them.
 
     Parameters
@@ -132,11 +132,9 @@ def run_of_several(study: xr.DataTree, folder: str, seconds: float) -> str:
     study : DataTree
     folder : str
         Of the study.
-    seconds : float
-        Of the whole run.
     """
     lines = []
     for name in structure_names(study):
-        summary = run_summary(of_structure(study, name), seconds)
+        summary = run_summary(of_structure(study, name))
         lines += [f"structure {name}, a study of its own in {folder}/structures/{name}", summary]
     return "\n".join([*lines, f"\ns4a structures {folder} compares them"])

@@ -17,6 +17,7 @@ from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.input.decisions import Decision, decisions, listed, notices, shortened
 from s4a.method.pca import mahalanobis
 from s4a.study.progress import STAGES, Status
+from s4a.study.tree import seconds_of
 
 COUNTS = {
     "file_vertices": "vertices",
@@ -204,22 +205,18 @@ def doubts(report: xr.Dataset) -> list[str]:
     return [f"  {line}" for line in [*lines, *report.attrs["remarks"].splitlines()]]
 
 
-def run_summary(
-    study: xr.DataTree, seconds: float, *, again: str = "s4a run FOLDER --out STUDY"
-) -> str:
+def run_summary(study: xr.DataTree, *, again: str = "s4a run FOLDER --out STUDY") -> str:
     """The end of a run, on one screen: what to decide first, then the shapes and the results.
 
     Parameters
     ----------
     study : DataTree
-    seconds : float
-        Of the whole run.
     again : str
         The command of the run, to which flags can be added.
     """
     report = study["report"].to_dataset()
     before = ["", *decision_lines(report, again), *remark_lines(report)]
-    after = [*shape_lines(report), "", *result_lines(study), *cost_lines(report, seconds)]
+    after = [*shape_lines(report), "", *result_lines(study), *cost_lines(report)]
     room = LINES - len(before) - len(after) - 6  # for the lines around them and place_lines
     return "\n".join([*before, *excluded_lines(report, max(room, LEAST)), *after])
 
@@ -243,13 +240,13 @@ def result_lines(study: xr.DataTree) -> list[str]:
     return [line for text in lines for line in wrapped(text, SCREEN)]
 
 
-def cost_lines(report: xr.Dataset, seconds: float) -> list[str]:
-    """Seconds of the whole run and of the stages that took most, and the most memory."""
+def cost_lines(report: xr.Dataset) -> list[str]:
+    """Seconds of all stages and of those that took most, and the most memory."""
     spent = dict(zip(report["stage"].values.tolist(), report["seconds"].values, strict=True))
     most = sorted(spent, key=lambda stage: -spent[stage])[:LARGEST]
     parts = ", ".join(f"{stage} {spent[stage]:.1f}" for stage in most)
     memory = report["peak_memory"].values.max()
-    return wrapped(f"seconds: {seconds:.1f} ({parts}, ...); at most {memory:.0f} MiB", SCREEN)
+    return wrapped(f"{seconds_of(report)} ({parts}, ...); at most {memory:.0f} MiB", SCREEN)
 
 
 def stage_lines(report: xr.Dataset) -> list[str]:

@@ -27,7 +27,7 @@ from s4a.show.surfaces import (
     surface,
     template_coarse,
 )
-from s4a.study.tree import check_is_one, left_out
+from s4a.study.tree import check_is_one, left_out, seconds_of
 
 LARGE = 20_000  # vertices from which a page moves the low-resolution mesh
 N_CARRIED = 5  # shapes to which the template's colours are carried
@@ -133,7 +133,7 @@ def _summary(study):
         ratio = study["pca"]["explained_variance_ratio"].values[:N_MODES]
         facts.append(f"the first {len(ratio)} components hold {ratio.sum():.0%} of the variance")
     if has(study, "report/seconds"):
-        facts.append(f"{study['report']['seconds'].values.sum():.0f} s of computing")
+        facts.append(seconds_of(study["report"].to_dataset()))
     return "; ".join(facts) + "." if facts else "The study is empty."
 
 

@@ -62,7 +62,9 @@ def write_netcdf(data: xr.Dataset, file: BufferedIOBase, compression: int = 0) -
     with h5py.File(file, "w", libver=libver, track_order=True) as root:
         root.attrs["_NCProperties"] = np.array(WRITTEN_BY, "S")
         _add_attributes(root, attrs)
-        stored = {name: _add_variable(root, name, one, compression) for name, one in variables.items()}
+        stored = {
+            name: _add_variable(root, name, one, compression) for name, one in variables.items()
+        }
         scales = {dim: stored[dim] for dim in number if dim in stored}
         for dim, size in data.sizes.items():
             if dim not in scales:

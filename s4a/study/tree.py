@@ -244,6 +244,19 @@ def apart_of(registration: xr.Dataset) -> list[str]:
     return str(registration.attrs.get("apart", "")).split()
 
 
+def seconds_of(report: xr.Dataset) -> str:
+    """Seconds of all stages together, in the words of the command line and of the page.
+
+    Examples
+    --------
+    >>> from s4a.schema import dataset
+    >>> from s4a.study.tree import seconds_of
+    >>> seconds_of(dataset(seconds=[20.2, 48.6]))
+    '69 s of computing'
+    """
+    return f"{report['seconds'].sum().item():.0f} s of computing"
+
+
 def left_out(study: xr.DataTree) -> list[str]:
     """The doubtful shapes of a study, which modes and statistics are made without.
 

@@ -1,4 +1,4 @@
-"""What a student sees on Binder: lesson 00 run in JupyterLab, and the page of the sliders, in Chromium.
+"""What a student sees on Binder, in Chromium: lesson 00 in JupyterLab, and the page of the sliders.
 
     python tests/benchmarks/binder_pages.py [--pictures FOLDER]
 

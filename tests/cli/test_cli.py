@@ -188,7 +188,7 @@ def test_demo_finds_the_planted_modes_and_writes_its_page(tmp_path, monkeypatch,
     )
     said = capsys.readouterr().out
     assert "correlation of planted and recovered scores" in said
-    assert "S4A, registered surface" in said
+    assert said.index("modes.png") < said.index("S4A, registered surface")  # a picture first
     assert (out / "study.html").exists()
 
 
@@ -207,6 +207,8 @@ def test_demo_of_two_shapes_ends_well_without_modes(tmp_path, capsys):
     assert cli.main(arguments) == 0
     out = capsys.readouterr().out
     assert "no modes: PCA needs at least 3 shapes" in out
+    (seconds,) = re.findall(r"\d+ s of computing", out)
+    assert seconds in (tmp_path / "study.html").read_text(encoding="utf-8")
     assert "study.html" in out
     assert "modes.png" not in out
 

@@ -6,6 +6,8 @@ And the study is made.
 import os
 import re
 import shutil
+import subprocess
+import sys
 import tomllib
 
 import h5py
@@ -54,7 +56,7 @@ def folder(prepare, whole, monkeypatch, tmp_path):
 def test_the_requirements_install_this_project_with_extras_that_it_has():
     (named,) = re.findall(r"^-e \.\[([\w,]+)\]$", "\n".join(lines("requirements.txt")), re.M)
     extras = PROJECT["optional-dependencies"]
-    needed = distributions(sum((extras[extra] for extra in named.split(",")), []))
+    needed = distributions(line for extra in named.split(",") for line in extras[extra])
     assert {"s4a[notebook]", "s4a[labels]", "nilearn", "pymeshlab"} <= set(needed)
     assert {"jupyterlab", "ipywidgets", "anywidget"} <= set(distributions(extras["notebook"]))
 
@@ -97,6 +99,29 @@ def test_post_build_is_executable_stops_at_an_error_and_runs_what_is_there():
     paths = re.findall(r"\S+\.(?:py|ipynb)", text)
     assert len(paths) == 2
     assert all((ROOT / path).is_file() for path in paths)
+
+
+@pytest.mark.skipif(not (shutil.which("bash") and shutil.which("git")), reason="needs bash, git")
+def test_the_trial_ends_at_the_first_step_that_fails_and_shows_what_it_said(tmp_path):
+    binder = tmp_path / "binder"
+    binder.mkdir()
+    shutil.copy(BINDER / "try.sh", binder)
+    (binder / "requirements.txt").write_text("")
+    (binder / "postBuild").write_text("#!/bin/bash\necho it broke\nexit 3\n")
+    (binder / "postBuild").chmod(0o755)
+    author = "-c user.name=nobody -c user.email=nobody@localhost".split()
+    for words in (["init", "-q"], ["add", "-A"], [*author, "commit", "-q", "-m", "all"]):
+        subprocess.run(["git", *words], cwd=tmp_path, check=True)
+    trial = subprocess.run(
+        [binder / "try.sh"],
+        env=os.environ | {"PYTHON": sys.executable},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert trial.returncode != 0
+    assert "it broke\n\npostBuild failed (3)" in trial.stdout
+    assert "lesson 00" not in trial.stdout + trial.stderr
 
 
 def test_the_links_of_the_readme_open_notebooks_that_are_there():

@@ -167,7 +167,7 @@ def test_panels_and_page_mark_them(study):
 
 
 def test_the_summary_begins_with_what_to_decide_and_fits_on_a_screen(study):
-    lines = tables.run_summary(study, 1.0, again="s4a run d --out s").splitlines()
+    lines = tables.run_summary(study, again="s4a run d --out s").splitlines()
     assert lines[1].startswith("TO DECIDE: 2 of 8 shapes are doubtful")
     assert lines[2].startswith("  2 unit  a_metre, z_inch  -> scale the files")
     assert any("s4a run d --out s --keep-doubtful" in line for line in lines)
@@ -194,7 +194,7 @@ def test_a_summary_of_many_doubts_long_names_and_long_commands_fits_on_a_screen_
     other["report"] = xr.DataTree(many)
     long = f"s4a run {' '.join(f'/data/scans/{name}.ply' for name in names)}"
     for again, shown in (("s4a run 'my scans' --out s" + 9 * " --k-init 12", 1), (long, 0)):
-        text = tables.run_summary(other, 1.0, again=again)
+        text = tables.run_summary(other, again=again)
         assert "TO DECIDE: 20 of 60" in text
         assert "20 of 60 shapes cannot be used" in text
         assert all(f" {kind} " in text for kind in kinds)
