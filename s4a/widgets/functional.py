@@ -1,4 +1,4 @@
-"""Functional maps (3.3, 4.1, Fig. 2): the matrix, eigenfunctions on both meshes, ZoomOut in steps."""
+"""Functional maps (3.3, 4.1, Fig. 2): the matrix, its eigenfunctions on both meshes, ZoomOut."""
 
 import ipywidgets
 import numpy as np

@@ -82,7 +82,7 @@ class Network(Panel):
         self.distance = spectral_distance([values[:k] for values in spectra])
         n, used = len(self.names), len(set(self.pairs))
         self.used = used  # pairs that have maps
-        self.stage = dropdown("colours", WHICH, STAGES, layout={"width": "22em"})
+        self.stage = dropdown("colours", WHICH, STAGES, layout={"width": "23em"})
         self.budget = int_slider(
             "pairs", BUDGET, used, n - 1, max(n - 1, n * (n - 1) // 2), continuous_update=True
         )
