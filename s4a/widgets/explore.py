@@ -4,18 +4,19 @@ import logging
 from typing import Any
 
 import ipywidgets
+import traitlets
 import xarray as xr
 from IPython import get_ipython
 from IPython.core.interactiveshell import ExecutionInfo
 
 from s4a.show.browser import PARTS
-from s4a.show.surfaces import has
+from s4a.show.surfaces import attribute, has
 from s4a.widgets.correspondence import Correspondence
 from s4a.widgets.functional import FunctionalMap
 from s4a.widgets.median import Median
 from s4a.widgets.modes import Modes
 from s4a.widgets.network import Network
-from s4a.widgets.panel import OfKernel, close_all, layout_of
+from s4a.widgets.panel import OfKernel, Panel, close_all, layout_of
 from s4a.widgets.spectrum import Spectrum
 from s4a.widgets.structures import Structures
 from s4a.widgets.transfer import Transfer
@@ -56,10 +57,16 @@ class Explore(OfKernel):
     ----------
     panels : dict
         Title of the tab -> panel, of those that were opened.
+    pair : tuple of str
+        Source and target of the map that is chosen in all tabs, ("", "") for none.
+    shape : str
+        The shape that is chosen in all tabs, at first the median; "" for none.
     """
 
     title = "Panels of a study"
     page = 'panels["Modes"].save_html("modes.html")'
+    pair = traitlets.Tuple(("", ""))
+    shape = traitlets.Unicode("")
 
     def __init__(self, study: xr.DataTree, *, width: float | str | None = None, **options: Any):
         self.study, self.options, self.panels = study, options, {}
@@ -69,7 +76,9 @@ class Explore(OfKernel):
         self.tabs = ipywidgets.Tab(children=boxes, titles=list(self.kinds))
         self.tabs.add_class("s4a-tabs")  # in style.css
         super().__init__([self.tabs], layout=layout_of(width))
+        self.shape = attribute(study, "latent", "median")
         self.tabs.observe(self.fill, "selected_index")
+        self.observe(lambda _: self.give(), ["pair", "shape"])
         self.fill()
         self.cell = None  # at whose next run they close
 
@@ -84,17 +93,21 @@ class Explore(OfKernel):
             self.close()
 
     def fill(self, change: object = None) -> None:
-        """Build the panel of the selected tab, or say why there is none."""
+        """Build the panel of the selected tab, or say why there is none; it shows the selection."""
         title = list(self.kinds)[self.tabs.selected_index or 0]
         box = self.tabs.children[self.tabs.selected_index or 0]
         if title in self.panels:
+            self.give()
             return
         for child in box.children:
             close_all(child)
         try:
-            self.panels[title] = self.kinds[title](self.study, **self.options)
-            box.children = [self.panels[title]]
+            self.panels[title] = panel = self.kinds[title](self.study, **self.options)
+            box.children = [panel]
             self.reasons.pop(title, None)
+            if panel.shares:
+                panel.observe(lambda _: self.take(panel), panel.shares)
+            self.give()
         except Exception as error:  # whatever it is, the tab must show it
             reason = str(error)
             if not isinstance(error, ValueError):
@@ -102,6 +115,19 @@ class Explore(OfKernel):
                 reason = f"{type(error).__name__}: {error}"
             self.reasons[title] = reason
             box.children = [ipywidgets.HTML(PARTS.message(reason))]
+
+    def take(self, panel: Panel) -> None:
+        """Choose for all tabs what is chosen in a panel."""
+        found = panel.selection()
+        with self.hold_trait_notifications():  # told together: a panel shows a pair or a shape
+            self.pair = found.get("pair", self.pair)
+            self.shape = found.get("shape") or self.shape
+
+    def give(self) -> None:
+        """Show the selection in the tab that is seen; the others get it when they are."""
+        panel = self.panels.get(list(self.kinds)[self.tabs.selected_index or 0])
+        if panel is not None:
+            panel.guarded(panel.adopt)(self.pair, self.shape)
 
     def refresh(self, study: xr.DataTree) -> None:
         """Show a newer state of the study in all panels."""

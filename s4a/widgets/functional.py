@@ -1,4 +1,4 @@
-"""Functional maps (3.3, 4.1, Fig. 2): the matrix, eigenfunctions on both meshes, ZoomOut in steps."""
+"""Functional maps (3.3, 4.1, Fig. 2): the matrix, its eigenfunctions on both meshes, ZoomOut."""
 
 import ipywidgets
 import numpy as np
@@ -40,6 +40,7 @@ class FunctionalMap(Panel):
     cell = traitlets.Tuple((1, 1))
     live = (("k", "kind", "block", "choice"), ("row", "choice"), ("column", "choice"))
     every = ("row", "column")
+    shares = ("pair",)
     clicks = (("matrix", "row", "row"), ("matrix", "column", "column"))
 
     def build(self, pair: int = 0, view: str = "corner", up: str = "z") -> list[ipywidgets.Widget]:
@@ -80,6 +81,15 @@ class FunctionalMap(Panel):
             self.numbers,
             beside(self.matrix, *self.scenes, least="20em"),
         ]
+
+    def selection(self) -> dict:
+        """The pair whose map is shown."""
+        return {"pair": self.names()}
+
+    def adopt(self, pair: tuple[str, str], shape: str) -> None:
+        """Show the map of a pair that has one."""
+        for found in np.flatnonzero((self.source == pair[0]) & (self.target == pair[1])):
+            self.pair = int(found)
 
     def names(self) -> tuple[str, str]:
         """Source and target of the pair."""

@@ -36,6 +36,7 @@ class Median(Panel):
     selected = traitlets.Unicode("")
     live = (("operator", "norm", "modes", "shape"),)
     clicks = (("bars", "name", "shape"),)
+    shares = ("selected",)
 
     def build(self, view: str = "corner", up: str = "z") -> list[ipywidgets.Widget]:
         """Choices, bars and the surface."""
@@ -64,6 +65,15 @@ class Median(Panel):
             self.ties,
             beside(self.bars, self.scene),
         ]
+
+    def selection(self) -> dict:
+        """The shape that is shown."""
+        return {"shape": self.selected}
+
+    def adopt(self, pair: tuple[str, str], shape: str) -> None:
+        """Show a shape that is ranked."""
+        if shape in self.names:
+            self.select(shape)
 
     def rank(self) -> None:
         """Distances for the operator, norm and number of modes that are chosen."""

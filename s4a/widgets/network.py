@@ -66,6 +66,7 @@ class Network(Panel):
     node = traitlets.Unicode("")
     live = (("stage", "budget", "where"), ("stage", "choice"))
     clicks = (("graph", "edge", "choice"), ("graph", "node", "choice"))
+    shares = ("edge", "node")
 
     def build(self, view: str = "corner", up: str = "z") -> list[ipywidgets.Widget]:
         """Choices, graph, matrix and two surfaces."""
@@ -82,7 +83,7 @@ class Network(Panel):
         self.distance = spectral_distance([values[:k] for values in spectra])
         n, used = len(self.names), len(set(self.pairs))
         self.used = used  # pairs that have maps
-        self.stage = dropdown("colours", WHICH, STAGES, layout={"width": "22em"})
+        self.stage = dropdown("colours", WHICH, STAGES, layout={"width": "23em"})
         self.budget = int_slider(
             "pairs", BUDGET, used, n - 1, max(n - 1, n * (n - 1) // 2), continuous_update=True
         )
@@ -112,6 +113,19 @@ class Network(Panel):
             row(self.budget, self.facts),
             beside(*columns, least="20em"),
         ]
+
+    def selection(self) -> dict:
+        """The pair whose map is shown, or the shape that is shown alone."""
+        if self.edge < 0:
+            return {"pair": ("", ""), "shape": self.node}
+        return {"pair": (str(self.source[self.edge]), str(self.target[self.edge]))}
+
+    def adopt(self, pair: tuple[str, str], shape: str) -> None:
+        """Show the map of a pair that has one; a shape where no map is shown."""
+        for found in np.flatnonzero((self.source == pair[0]) & (self.target == pair[1])):
+            self.edge = int(found)
+        if self.edge < 0 and shape in self.names:
+            self.node = shape
 
     def places(self, names: list[str]) -> np.ndarray:
         """Places ``(n, 2)`` of shapes, by their differences or on a circle."""

@@ -175,6 +175,7 @@ class Panel(OfKernel):
     clicks = ()  # chart, part of the mark that is clicked, and the control that it sets
     every = ()  # sliders of which it keeps every value, and not only two dozen of them
     python = ()  # what else needs Python
+    shares = ()  # traits that say which pair or shape is chosen in it, for the other tabs
 
     def __init__(
         self,
@@ -202,6 +203,13 @@ class Panel(OfKernel):
     def build(self, **options: Any) -> list[ipywidgets.Widget]:
         """The parts of the panel."""
         raise NotImplementedError
+
+    def selection(self) -> dict[str, Any]:
+        """The names of the ``pair`` (source, target) and of the ``shape`` chosen in the panel."""
+        return {}
+
+    def adopt(self, pair: tuple[str, str], shape: str) -> None:
+        """Show the pair or shape chosen in another tab, where the panel has it; "" for none."""
 
     def control(self, name: str) -> ipywidgets.Widget:
         """The control of a name in `live`."""

@@ -32,6 +32,7 @@ class Spectrum(Panel):
     live = (("mode", "choice"), ("k", "choice"))
     every = ("mode",)
     clicks = (("curves", "series", "choice"), ("gaps", "series", "choice"))
+    shares = ("shape",)
 
     def build(self, view: str = "corner", up: str = "z") -> list[ipywidgets.Widget]:
         """Choices, curves and two surfaces."""
@@ -61,6 +62,15 @@ class Spectrum(Panel):
         modes = ipywidgets.VBox([self.mode, self.function])
         rebuilt = ipywidgets.VBox([self.k, self.rebuilt])
         return [row(self.choice), beside(self.curves, self.gaps), beside(modes, rebuilt)]
+
+    def selection(self) -> dict:
+        """The shape whose functions are shown."""
+        return {"shape": self.shape}
+
+    def adopt(self, pair: tuple[str, str], shape: str) -> None:
+        """Show the functions of a shape that has any."""
+        if shape in self.names:
+            self.shape = shape
 
     def pick(self, mark: dict) -> None:
         """The curve that was clicked."""

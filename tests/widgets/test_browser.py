@@ -4,6 +4,7 @@ Pages without a kernel.
 """
 
 import contextlib
+import itertools
 import json
 import os
 import re
@@ -325,6 +326,7 @@ def test_a_clicked_edge_shows_its_map(page, study):
     own = (net["source"].values == source) & (net["target"].values == target)
     C = net["fmap_initial"].values[own][0]
     matrix = visible(page, ".s4a-matrix canvas").first
+    matrix.scroll_into_view_if_needed()
     box = matrix.bounding_box()
     page.mouse.move(box["x"] + box["width"] * 3.5 / len(C), box["y"] + box["height"] * 2.5 / len(C))
     text = visible(page, ".s4a-readout").filter(has_text="C[2, 3]").inner_text()
@@ -1059,8 +1061,14 @@ def test_the_page_of_the_network_says_which_maps_are_in_no_cycle(offline, study,
     page.close()
 
 
-def test_the_page_of_a_map_replays_zoomout_and_shows_its_modes(offline, study, tmp_path):
-    page, errors = opened(offline, saved(widgets.FunctionalMap(study), tmp_path / "map.html"))
+@pytest.fixture(scope="module")
+def map_page(study, tmp_path_factory):
+    path = tmp_path_factory.mktemp("map") / "map.html"
+    return saved(widgets.FunctionalMap(study), path)
+
+
+def test_the_page_of_a_map_replays_zoomout_and_shows_its_modes(offline, map_page):
+    page, errors = opened(offline, map_page)
     page.wait_for_function(DRAWN)
     before = pixels(visible(page, VIEW).first)
     move(page.locator("#c-k"), 1)
@@ -1073,6 +1081,42 @@ def test_the_page_of_a_map_replays_zoomout_and_shows_its_modes(offline, study, t
     assert pixels(visible(page, VIEW).first) != before
     chosen(page, "choice", "brain_02 → brain_03")
     visible(page, ".s4a-title").filter(has_text="φ3 on brain_02").wait_for()
+    assert errors == []
+    page.close()
+
+
+@pytest.mark.parametrize("width", [300, 1366])
+def test_the_axes_of_a_matrix_number_its_cells_and_nothing_overlaps(offline, map_page, width):
+    page, errors = opened(offline, map_page)
+    page.set_viewport_size({"width": width, "height": 800})
+    page.wait_for_function(DRAWN)
+    frame = page.locator(".s4a-matrix-frame")
+    assert frame.locator(".s4a-xlabel").inner_text() == "eigenfunction of the source"
+    assert frame.locator(".s4a-ylabel").inner_text() == "eigenfunction of the target"
+    assert frame.locator(".s4a-numbers span").all_inner_texts() == [
+        "-1",
+        "entry of the matrix",
+        "1",
+    ]
+    assert "b = C a" in page.locator(".s4a-note").inner_text()
+    cells = frame.locator("canvas").bounding_box()
+    for axis, length in (("x", "width"), ("y", "height")):
+        for tick in frame.locator(f".s4a-{axis}ticks span").all():
+            box, number = tick.bounding_box(), int(tick.inner_text())
+            at = (box[axis] + box[length] / 2 - cells[axis]) / cells[length] * 24
+            assert at == pytest.approx(number + 0.5, abs=0.3), axis
+    parts = (
+        ".s4a-ylabel, .s4a-yticks span, canvas, .s4a-xticks span, .s4a-xlabel, .s4a-numbers span"
+    )
+    found = [*frame.locator(parts).all(), page.locator(".s4a-note")]
+    found += [page.locator(".s4a-title").first, page.locator(".s4a-readout").first]
+    boxes = [part.bounding_box() for part in found]
+    assert len(boxes) > 12
+    for a, b in itertools.combinations(boxes, 2):
+        across = min(a["x"] + a["width"], b["x"] + b["width"]) - max(a["x"], b["x"])
+        down = min(a["y"] + a["height"], b["y"] + b["height"]) - max(a["y"], b["y"])
+        assert min(across, down) < 1, (a, b)
+    assert max(box["x"] + box["width"] for box in boxes) <= width
     assert errors == []
     page.close()
 

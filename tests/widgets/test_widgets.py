@@ -389,6 +389,34 @@ def test_points_are_carried_there_and_back(study, panel):
     assert both.image == 40
 
 
+def test_two_shapes_are_matched_by_way_of_the_template(study, panel):
+    both = panel(Correspondence)
+    template, source, shape = both.template, *both.names[:2]
+    both.source, both.shape = source, shape
+    registered = study["registration"]["registered_match"]
+    X, Y = both.pair[0][0], both.pair[1][0]
+    assert len(X) == study["original"][source].sizes["vertex"]
+    there, back = both.match(), both.way_back()
+    # a vertex of the template, carried to both shapes, is one place
+    on_source, on_shape = (registered.sel(shape=name).values for name in (source, shape))
+    size = np.ptp(Y, axis=0).max()
+    assert np.median(np.linalg.norm(Y[there[on_source]] - Y[on_shape], axis=1)) < 0.02 * size
+    assert np.median(np.linalg.norm(X[back[there]] - X, axis=1)) < 0.03 * size
+    colors = [np.frombuffer(view.color, np.uint8).reshape(-1, 3) for view in both.scenes]
+    assert np.abs(colors[0].astype(int) - colors[1][there]).mean() < 6
+    both.scenes[0].picked = {"vertex": 17, "count": 1}
+    assert (both.vertex, both.image) == (17, there[17])
+    assert both.scenes[0].caption == f"{source} vertex 17 ↔ {shape} vertex {there[17]}"
+    both.colors.value = "confidence"
+    assert "belongs to the registration" in both.scenes[0].caption
+    for kind in ("low", "dense"):
+        both.map.value = kind
+        assert len(both.match()) == len(both.pair[0][0])
+    both.source = template
+    assert both.scenes[0].title.startswith(f"{template}, the template")
+    assert both.message.value == ""
+
+
 @pytest.mark.parametrize("kind", ["low", "dense"])
 def test_the_match_of_the_latent_basis_can_be_shown(panel, kind):
     both = panel(Correspondence)
@@ -736,6 +764,87 @@ def test_tabs_are_built_when_opened_and_leave_nothing(study):
         tabs.refresh(study)
         tabs.close()
     assert len(registry._instances) == before
+
+
+def drawings(tabs, monkeypatch):
+    """The titles of tabs that draw from now on, in their order."""
+    drawn = []
+    for title, panel in tabs.panels.items():
+        for view in panel.scenes if hasattr(panel, "scenes") else []:
+            monkeypatch.setattr(
+                view,
+                "show",
+                lambda *a, title=title, show=view.show, **k: (drawn.append(title), show(*a, **k)),
+            )
+    return drawn
+
+
+def test_a_pair_is_chosen_in_all_tabs_that_are_opened_before_or_later(study, monkeypatch):
+    tabs = Explore(study)
+    network = tabs["Network"]
+    maps = tabs["Functional map"]
+    assert maps.pair == 0, "nothing is chosen yet"
+    tabs["Network"].graph.picked = {"edge": 7, "count": 1}
+    source, target = tabs.pair
+    assert (source, target) == (network.source[7], network.target[7])
+    drawn = drawings(tabs, monkeypatch)
+    assert tabs["Functional map"] is maps  # opened before
+    assert maps.names() == (source, target)
+    assert drawn == 2 * ["Functional map"], "one time on each surface, and no other tab"
+    both = tabs["Correspondence"]  # opened later
+    assert {both.source, both.shape} == {source, target}
+    assert tabs.pair == (source, target), "the direction stays"
+    tabs["Functional map"].choice.value = 2
+    assert tabs["Network"].edge == 2
+    assert f"{maps.source[2]} → {maps.target[2]}" in network.matrix.spec["title"]
+    both = tabs["Correspondence"]
+    assert {both.source, both.shape} == {maps.source[2], maps.target[2]}
+    other = next(name for name in both.names if name not in tabs.pair)
+    both.choice.value = other
+    assert tabs.pair == (both.source, other)
+    assert tabs["Functional map"].names() == tabs.pair
+    tabs.pair = (str(maps.source[5]), str(maps.target[5]))  # by a program, in the tab that is seen
+    assert maps.pair == 5
+    tabs.pair = ("nobody", "brain_01")
+    assert maps.pair == 5
+    assert all(panel.message.value == "" for panel in tabs.panels.values())
+    tabs.close()
+
+
+def test_every_pair_of_a_network_is_shown_by_all_tabs_without_a_loop(study):
+    tabs = Explore(study)
+    network = tabs["Network"]
+    for edge in range(len(network.source)):
+        tabs["Network"].choice.value = edge
+        pair = str(network.source[edge]), str(network.target[edge])
+        both = tabs["Correspondence"]
+        assert {both.source, both.shape} == set(pair)
+        assert tabs["Functional map"].names() == tabs.pair == pair
+        assert tabs["Network"].edge == edge
+    tabs.close()
+
+
+def test_a_shape_is_chosen_in_all_tabs(study):
+    tabs = Explore(study)
+    spectrum = tabs["Spectrum"]
+    assert spectrum.shape == tabs.shape == study["latent"].attrs["median"]
+    tabs["Median"].bars.picked = {"index": 2, "count": 1}
+    chosen = tabs.shape
+    assert chosen == tabs["Median"].selected != study["latent"].attrs["median"]
+    assert tabs["Spectrum"].shape == chosen
+    assert tabs["Network"].node == chosen
+    other = next(name for name in spectrum.names if name != chosen)
+    tabs["Spectrum"].curves.picked = {"series": other, "count": 1}
+    assert tabs["Median"].selected == other
+    network = tabs["Network"]
+    network.graph.picked = {"edge": 1, "count": 1}
+    tabs["Spectrum"].choice.value = chosen
+    assert tabs["Network"].edge == 1, "a pair that is chosen stays"
+    network.graph.picked = {"node": other, "count": 2}
+    assert (network.node, network.edge) == (other, -1)
+    assert tabs.pair == ("", "")
+    assert tabs["Spectrum"].shape == tabs["Median"].selected == other
+    tabs.close()
 
 
 def test_an_unfinished_study_says_what_is_missing(study):
