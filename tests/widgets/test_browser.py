@@ -971,6 +971,8 @@ def test_the_page_of_a_study_fills_a_wide_screen_one_idea_at_a_time(
     sizes = f"{wide:.0f} x {tall:.0f}, text {text:.1f}"
     assert wide >= 0.8 * width, sizes
     assert tall <= height, sizes
+    box = visible(page, VIEW).first.bounding_box()
+    assert 0.75 < box["height"] / box["width"] < 1.3, "a shape is as wide as the smaller of both"
     assert text >= (16 if width >= 1920 else 13), sizes
     page.close()
 
