@@ -293,7 +293,7 @@ def _live_modes(study, instead, look):
         "beside": False,
         "sample": -1,
         "group": "",
-        "height": 275,
+        "height": 500,
         "webgl": "",
         "still": b"",
     }

@@ -137,6 +137,7 @@ def lab(folder):
         "ServerApp.open_browser": False,
         "IdentityProvider.token": "",
         "LabApp.app_settings_dir": folder / "app",
+        "LabApp.expose_app_in_browser": True,  # for its themes
     }
     command = [
         sys.executable,
@@ -473,6 +474,28 @@ def test_nothing_is_cut_off_at_800_pixels(page):
         for part in visible(page, ".s4a").all():
             assert part.evaluate("(e) => e.scrollWidth <= e.clientWidth + 2")
             assert part.bounding_box()["x"] + part.bounding_box()["width"] <= 800
+
+
+def test_nothing_scrolls_sideways_and_charts_are_seen_at_once_beside_the_files(page):
+    """On a screen of 1366 by 768 pixels, with the file browser open."""
+    page.set_viewport_size({"width": 1366, "height": 768})
+    wide = """() => [...document.querySelectorAll(".jp-Notebook, .jp-Notebook *")]
+      .filter((e) => e.getClientRects().length && e.scrollWidth > e.clientWidth)
+      .filter((e) => /auto|scroll/.test(getComputedStyle(e).overflowX)).map((e) => e.className)"""
+    assert page.locator(".jp-FileBrowser").is_visible()
+    for title in reversed(TITLES):
+        open_tab(page, title)
+        page.wait_for_timeout(300)
+        assert page.evaluate(wide) == [], title
+    page.locator(".s4a-tabs").evaluate("(e) => e.scrollIntoView()")
+    page.wait_for_timeout(300)
+    window = page.locator(".jp-WindowedPanel-outer").bounding_box()
+    for part in (VIEW, ".s4a-slider", "svg.s4a-chart"):
+        assert visible(page, part).count() > 0
+        for one in visible(page, part).all():
+            box = one.bounding_box()
+            assert window["y"] <= box["y"]
+            assert box["y"] + box["height"] <= window["y"] + window["height"], part
 
 
 # ---- any width
@@ -839,6 +862,92 @@ def test_a_panel_has_no_serious_barrier(sizes, title):
     panel_of(tabs).evaluate("(e) => e.removeAttribute('id')")
 
 
+# ---- every theme
+
+THEMES = ("JupyterLab Dark", "JupyterLab Dark High Contrast", "JupyterLab Light")
+FIELDS = "select, input[type=text], input[type=number]"
+NO_TEXTS = "title, style, script, option, :disabled"
+CONTRAST = r"""(root, [fields, noTexts]) => {
+  const rgba = (text) => {
+    const [r, g, b, a = 1] = text.match(/[\d.]+/g).map(Number);
+    return [r, g, b, a];
+  };
+  const over = (top, below) => [0, 1, 2].map((i) => top[3] * top[i] + (1 - top[3]) * below[i]);
+  const ground = (at) => {  // of all grounds down to the first that hides what is below
+    const layers = [];
+    for (; at; at = at.parentElement) {
+      layers.push(rgba(getComputedStyle(at).backgroundColor));
+      if (layers.at(-1)[3] === 1) break;
+    }
+    return layers.reverse().reduce((below, layer) => over(layer, below), [255, 255, 255]);
+  };
+  const linear = (v) => (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);
+  const light = (rgb) => {
+    const [r, g, b] = rgb.map((v) => linear(v / 255));
+    return 0.2126 * r + 0.7152 * g + 0.0722 * b;
+  };
+  const found = [], walk = document.createTreeWalker(root, NodeFilter.SHOW_ALL);
+  while (walk.nextNode()) {
+    const node = walk.currentNode, field = node.matches?.(fields);
+    const at = field ? node : node.parentElement;
+    if (!field && !(node.nodeType === Node.TEXT_NODE && node.textContent.trim())) continue;
+    if (!at.getClientRects().length || at.closest(noTexts)) continue;
+    const look = getComputedStyle(at), back = ground(at);
+    const color = over(rgba(at.ownerSVGElement ? look.fill : look.color), back);
+    const [low, high] = [light(color), light(back)].sort((a, b) => a - b);
+    found.push([(high + 0.05) / (low + 0.05), node.value ?? node.textContent]);
+  }
+  return found;
+}"""
+
+
+@contextlib.contextmanager
+def themed(page, theme):
+    """The page in a theme of JupyterLab, and in the light one afterwards."""
+    change = "(theme) => jupyterapp.commands.execute('apputils:change-theme', { theme })"
+    try:
+        page.evaluate(change, theme)
+        page.wait_for_function("(n) => document.body.dataset.jpThemeName === n", arg=theme)
+        yield
+    finally:
+        page.evaluate(change, "JupyterLab Light")
+
+
+def contrasts(part):
+    """Contrast and text of all that is read in a part of a page."""
+    return part.evaluate(CONTRAST, [FIELDS, NO_TEXTS])
+
+
+def faint(part):
+    """How many texts are in a part of a page, and those that cannot be read on their ground."""
+    found = contrasts(part)
+    return len(found), [(round(ratio, 1), text) for ratio, text in found if ratio < 4.5]
+
+
+def test_contrast_is_measured_as_wcag_defines_it(browser):
+    page = browser.new_page()
+    page.set_content("<p style='color:#777'>grey</p><p style='background:#000;color:#fff'>white")
+    ratios = {text: ratio for ratio, text in contrasts(page.locator("body"))}
+    assert ratios["grey"] == pytest.approx(4.48, abs=0.01)
+    assert ratios["white"] == pytest.approx(21)
+    assert faint(page.locator("body")) == (2, [(4.5, "grey")])
+    page.close()
+
+
+@pytest.mark.parametrize("theme", THEMES)
+def test_every_text_of_every_tab_is_read_in_every_theme(sizes, theme):
+    with themed(sizes, theme):
+        for title in TITLES:
+            tabs = tabs_of(sizes, 3, title)
+            n, unread = faint(tabs)
+            assert n > 20
+            assert unread == [], title
+            if theme == "JupyterLab Dark":
+                tabs.evaluate("(e) => (e.id = 'looked-at')")
+                assert barriers(sizes, "#looked-at") == []
+                tabs.evaluate("(e) => e.removeAttribute('id')")
+
+
 # ---- without a kernel
 
 
@@ -974,6 +1083,8 @@ def test_the_page_of_a_study_fills_a_wide_screen_one_idea_at_a_time(
     sizes = f"{wide:.0f} x {tall:.0f}, text {text:.1f}"
     assert wide >= 0.8 * width, sizes
     assert tall <= height, sizes
+    box = visible(page, VIEW).first.bounding_box()
+    assert 0.75 < box["height"] / box["width"] < 1.3, "a shape is as wide as the smaller of both"
     assert text >= (16 if width >= 1920 else 13), sizes
     page.close()
 

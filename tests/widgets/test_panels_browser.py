@@ -13,10 +13,12 @@ from test_browser import (  # noqa: F401, fixtures are found by their names
     DRAWN,
     IDLE,
     SMALLEST,
+    THEMES,
     VIEW,
     barriers,
     browser,
     driver,
+    faint,
     lab,
     messages,
     offline,
@@ -26,6 +28,7 @@ from test_browser import (  # noqa: F401, fixtures are found by their names
     run_notebook,
     saved,
     serious,
+    themed,
     visible,
     watched,
 )
@@ -152,6 +155,20 @@ def test_a_panel_has_no_serious_barrier(page, kind):
     panel.evaluate("(e) => (e.id = 'looked-at')")
     assert barriers(page, "#looked-at") == []
     panel.evaluate("(e) => e.removeAttribute('id')")
+
+
+@pytest.mark.parametrize("theme", THEMES)
+def test_every_text_of_every_panel_is_read_in_every_theme(page, theme):
+    with themed(page, theme):
+        for kind in KINDS:
+            panel = panel_of(page, kind, wide=True)
+            n, unread = faint(panel)
+            assert n > 5
+            assert unread == [], kind
+            if theme == "JupyterLab Dark":
+                panel.evaluate("(e) => (e.id = 'looked-at')")
+                assert barriers(page, "#looked-at") == []
+                panel.evaluate("(e) => e.removeAttribute('id')")
 
 
 def test_a_level_makes_the_map_grey_and_a_click_tells_the_values(page):

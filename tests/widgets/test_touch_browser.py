@@ -1,0 +1,202 @@
+"""Panels under fingers and under the keyboard: saved pages on an emulated phone, and on a desk."""
+
+import numpy as np
+import pytest
+from test_browser import (  # noqa: F401, fixtures are found by their names
+    DRAWN,
+    VIEW,
+    browser,
+    driver,
+    offline,
+    opened,
+    playwright,
+    pytestmark,
+    saved,
+    visible,
+)
+
+from s4a import widgets
+
+WIDTH, HEIGHT = 390, 844
+CAMERA = "(c) => ({ turn: [...c.view.camera.turn], zoom: c.view.camera.zoom })"
+PICKED = "(c, [x, y]) => c.view.pick({ clientX: x, clientY: y })?.point"
+
+
+@pytest.fixture(scope="module")
+def phone(browser):  # noqa: F811
+    """A browser with fingers and no mouse."""
+    context = browser.new_context(
+        viewport={"width": WIDTH, "height": HEIGHT}, has_touch=True, is_mobile=True, offline=True
+    )
+    yield context
+    context.close()
+
+
+@pytest.fixture(scope="module")
+def matches(phone, study, tmp_path_factory):
+    """The page of correspondences on the phone, where all places of a surface can be picked."""
+    path = saved(widgets.Correspondence(study), tmp_path_factory.mktemp("touch") / "page.html")
+    page, errors = opened(phone, path)
+    page.wait_for_function(DRAWN)
+    yield page
+    assert errors == []
+    page.close()
+
+
+def touch(page, *paths, steps=10):
+    """Fingers that go down, along a path of two points each, and up."""
+    session = page.context.new_cdp_session(page)
+
+    def tell(kind, share=None):
+        at = (
+            []
+            if share is None
+            else [(1 - share) * np.array(a) + share * np.array(b) for a, b in paths]
+        )
+        points = [{"x": float(x), "y": float(y), "id": i} for i, (x, y) in enumerate(at)]
+        session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+    tell("touchStart", 0)
+    for step in range(steps):
+        tell("touchMove", (step + 1) / steps)
+    tell("touchEnd")
+    page.wait_for_timeout(400)
+    session.detach()
+
+
+def tap(button):
+    button.tap()
+    button.page.wait_for_timeout(150)  # the browser makes a click of it
+
+
+@pytest.fixture
+def surface(matches):
+    """The first surface in the middle of the screen, as it was at first; and its middle."""
+    canvas = visible(matches, VIEW).first
+    canvas.evaluate("(c) => { c.view.reset(); scrollTo(0, 0); }")
+    matches.wait_for_timeout(200)
+    box = canvas.bounding_box()
+    return canvas, np.array([box["x"] + box["width"] / 2, box["y"] + box["height"] / 2])
+
+
+def test_one_finger_scrolls_the_page_until_it_is_told_to_turn(matches, surface):
+    canvas, middle = surface
+    before = canvas.evaluate(CAMERA)
+    touch(matches, (middle + [0, 60], middle - [0, 120]))
+    assert matches.evaluate("scrollY") > 50
+    assert canvas.evaluate(CAMERA) == before
+
+    matches.evaluate("scrollTo(0, 0)")
+    button = matches.get_by_role("button", name="one finger turns the surface").first
+    tap(button)
+    assert button.get_attribute("aria-pressed") == "true"
+    touch(matches, (middle + [0, 60], middle - [0, 120]))
+    assert matches.evaluate("scrollY") == 0
+    assert not np.allclose(canvas.evaluate(CAMERA)["turn"], before["turn"])
+    tap(button)
+    assert button.get_attribute("aria-pressed") == "false"
+
+
+def test_what_two_fingers_hold_stays_under_them(matches, surface):
+    canvas, middle = surface
+    before = canvas.evaluate(CAMERA)
+    start, end = middle + [20, 10], middle + [-15, 40]
+    held = canvas.evaluate(PICKED, start.tolist())
+    touch(matches, *[(start + s * np.array([30, 0]), end + s * np.array([60, 0])) for s in (-1, 1)])
+    after = canvas.evaluate(CAMERA)
+    assert after["zoom"] == pytest.approx(2 * before["zoom"], rel=0.02)
+    assert after["turn"] == before["turn"]
+    there = canvas.evaluate(PICKED, end.tolist())
+    size = np.ptp(canvas.evaluate("(c) => [...c.view.surfaces[0].position]"))
+    np.testing.assert_allclose(there, held, atol=0.02 * size)
+    assert matches.evaluate("[scrollY, visualViewport.scale]") == [0, 1], "not the page"
+
+
+def test_a_tap_picks_a_vertex(matches, surface):
+    canvas, middle = surface
+    matches.touchscreen.tap(*middle)
+    matches.wait_for_function(f"document.querySelector('{VIEW}').view.points.length === 1")
+    point = canvas.evaluate("(c) => c.view.points[0].slice(0, 3)")
+    vertex = canvas.evaluate(
+        "(c, [x, y]) => c.view.pick({ clientX: x, clientY: y }).vertex", middle.tolist()
+    )
+    np.testing.assert_allclose(canvas.evaluate("(c, i) => c.view.at(i)", vertex), point)
+
+
+def test_every_surface_has_buttons_that_zoom_in_and_out_and_reset(matches, surface):
+    canvas, _ = surface
+    home = canvas.evaluate(CAMERA)
+    n = visible(matches, VIEW).count()
+    names = ("zoom in: ", "zoom out: ", "reset the view: ")
+    zoom_in, zoom_out, reset = (visible(matches, f"[aria-label^='{name}']") for name in names)
+    assert [zoom_in.count(), zoom_out.count(), reset.count()] == [n, n, n]
+    tap(zoom_in.first)
+    tap(zoom_in.first)
+    assert canvas.evaluate(CAMERA)["zoom"] > 1.4 * home["zoom"]
+    tap(zoom_out.first)
+    tap(zoom_out.first)
+    assert canvas.evaluate(CAMERA)["zoom"] == pytest.approx(home["zoom"])
+    tap(zoom_out.first)
+    tap(reset.first)
+    assert canvas.evaluate(CAMERA) == home
+
+
+# the controls of a page that are smaller than a finger needs
+SMALL = """() => [...document.querySelectorAll("button, select, input:not([type=checkbox])")]
+  .filter((e) => e.getClientRects().length)
+  .map((e) => [e.getBoundingClientRect(), e.outerHTML])
+  .filter(([box]) => box.height < 24 || box.width < 24)"""
+
+
+@pytest.mark.parametrize("kind", ["Modes", "Network", "Spectrum"])
+def test_controls_are_24_pixels_high_and_nothing_is_wider_than_the_phone(
+    phone, study, tmp_path, kind
+):
+    page, errors = opened(phone, saved(getattr(widgets, kind)(study), tmp_path / "page.html"))
+    page.wait_for_function(DRAWN)
+    assert page.locator("input[type=range]").count() > 0
+    assert page.evaluate(SMALL) == []
+    assert page.evaluate("document.documentElement.scrollWidth") <= WIDTH
+    assert errors == []
+    page.close()
+
+
+FOCUSED = "document.activeElement.getAttribute('aria-label')"
+AGAIN = """(old) => {
+  const at = document.activeElement;
+  return at.isConnected && at !== window.clicked && at.matches(".s4a-mark");
+}"""
+
+
+@pytest.mark.parametrize("kind, marks", [("Median", "rect.s4a-mark"), ("Network", "[data-node]")])
+def test_a_clicked_mark_keeps_the_focus_and_the_arrow_keys_go_on_from_it(
+    offline,  # noqa: F811
+    study,
+    tmp_path,
+    kind,
+    marks,
+):
+    panel = getattr(widgets, kind)(study)
+    panel.save_html(tmp_path / "page.html", limit=800_000)
+    panel.close()
+    page, errors = opened(offline, tmp_path / "page.html")
+    page.wait_for_function(DRAWN)
+    mark = visible(page, marks).nth(2)
+    name = mark.get_attribute("aria-label").split(":")[0].split(",")[0]
+    mark.evaluate("(at) => (window.clicked = at)")
+    mark.locator("circle").last.click() if kind == "Network" else mark.click()
+    page.wait_for_function(AGAIN)
+    assert page.evaluate(FOCUSED).startswith(name)
+    next_name = visible(page, marks).nth(3).get_attribute("aria-label")
+    page.keyboard.press("ArrowRight")
+    assert page.evaluate(FOCUSED) == next_name
+    page.evaluate("window.clicked = document.activeElement")
+    page.keyboard.press("Enter")
+    page.wait_for_function(AGAIN)
+    assert page.evaluate(FOCUSED).startswith(next_name.split(":")[0].split(",")[0])
+    stops = page.evaluate(
+        "document.activeElement.closest('svg').querySelectorAll('[tabindex=\"0\"]').length"
+    )
+    assert stops == 1, "one tab stop"
+    assert errors == []
+    page.close()
