@@ -342,8 +342,7 @@ EXERCISES = {
             np.bincount(carried, vertex_areas(*as_arrays(target)))[LABELS.index("occipital right")]
             / 100
         ),
-        "s4a.geometry.mesh.vertex_areas of the target, summed where the label is that; "
-        "1 cm² is 100 mm²",
+        "`areas` of brain_04, summed where the label is that; 1 cm² is 100 mm²",
     ),
     "11.3": Exercise(
         lambda brains, target: np.corrcoef(
