@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test coverage test-lowest test-newest check fuzz format bench paper figures hangs structure lab docs slides address release submission clean
+.PHONY: demo test coverage test-lowest test-newest check fuzz format bench paper figures hangs structure lab docs slides address release binder submission clean
 
 demo: $(VENV)/.core
 	$(BIN)/s4a demo
@@ -74,7 +74,8 @@ docs: $(VENV)/.docs
 address:
 	$(PYTHON) tools/release.py address $(NAME)
 
-# what has to hold before a release; builds dist/, tries the wheel outside of the repository and uploads nothing
+# what has to hold before a release; builds dist/, tries the wheel outside of the repository, also by uvx and pipx, and
+# uploads nothing
 release: $(VENV)/.test
 	@test -n "$(VERSION)" || { echo "make release VERSION=..."; exit 2; }
 	$(PYTHON) tools/release.py check $(VERSION)
@@ -82,6 +83,11 @@ release: $(VENV)/.test
 	rm -rf dist && $(BIN)/python -m pip install --quiet build twine && $(BIN)/python -m build --outdir dist .
 	$(BIN)/python -m twine check --strict dist/*
 	tools/try.sh dist/s4a-$(VERSION)-py3-none-any.whl
+
+# what Binder builds, from an empty environment on one core, and both of its pages opened in Chromium: ten minutes;
+# PICTURES=folder gets screenshots
+binder:
+	binder/try.sh $(PICTURES)
 
 # what the papers lack before they are submitted, such as what only their authors can state
 submission:

@@ -43,6 +43,7 @@ def moves(page):
     if not waited(page, lambda: canvas.evaluate(DRAWN)):
         return False
     before = canvas.evaluate(SHOT)
+    canvas.scroll_into_view_if_needed()
     page.locator(".s4a-slider input").first.evaluate(MOVE)
     return waited(page, lambda: canvas.evaluate(SHOT) != before)
 
