@@ -1,7 +1,8 @@
 #!/bin/bash
 # A wheel as a new user has it, away from the repository: installed into a fresh environment, then s4a doctor; then run
 # without an installation, by uvx and by pipx from the folder of the wheel, as `uvx s4a demo` is once it is published.
-# Ends non-zero where the first picture takes more than 60 seconds (two cores that do nothing else; without downloads).
+# Ends non-zero where the first picture takes more than 60 seconds (LIMIT=... names another number, as on a busy machine),
+# of two cores and without downloads.
 #   tools/try.sh dist/s4a-0.1.0-py3-none-any.whl [STUDY OPTIONS OF s4a demo...]
 set -euo pipefail
 wheel=$(realpath "$1")
@@ -27,5 +28,8 @@ for tool in uvx pipx; do
     seconds=$(($(date -r "by_$tool/modes.png" +%s) - begin))
     ls -l "by_$tool/study.html"
     echo "$tool: the first picture after $seconds s"
-    [ "$seconds" -le 60 ] || { echo "at most 60 s expected, found $seconds: does this machine do something else?"; exit 1; }
+    if [ "$seconds" -gt "${LIMIT:-60}" ]; then
+        echo "at most ${LIMIT:-60} s expected, found $seconds: does this machine do something else meanwhile?"
+        exit 1
+    fi
 done
