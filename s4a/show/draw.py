@@ -454,7 +454,7 @@ def cycle_error_colors(errors: np.ndarray, limits: tuple[float, float]) -> np.nd
     >>> from s4a.show.draw import cycle_error_colors
     >>> colors = cycle_error_colors(np.array([0.01, 0.1, 1.0, np.nan]), (0.01, 1.0))
     >>> [to_hex(color) for color in colors]
-    ['#b8de29', '#25848e', '#440154', '#bbbbbb']
+    ['#9bd93c', '#277e8e', '#440154', '#bbbbbb']
     """
     share = LogNorm(*limits, clip=True)(np.ma.masked_invalid(errors))
     return np.asarray(CYCLE_ERROR(share))[..., :3]

@@ -245,6 +245,7 @@ class Correspondence(Panel):
         X, value = self.pair[0][0], self.confidence()
         colors, coordinates, bar = position_colors(X), (None, None), None
         caption = f"the coordinates of {self.on_left}, carried to the shape"
+        caption += "" if self.from_template else " by way of the template"
         if self.colors.value == "confidence" and value is None:
             caption = f"the confidence belongs to the registration of the template; here {caption}"
         elif self.colors.value == "confidence":

@@ -332,6 +332,12 @@ def test_a_clicked_edge_shows_its_map(page, study):
     page.mouse.move(box["x"] + box["width"] * 3.5 / len(C), box["y"] + box["height"] * 2.5 / len(C))
     text = visible(page, ".s4a-readout").filter(has_text="C[2, 3]").inner_text()
     assert float(re.search(r"= (\S+)", text)[1]) == pytest.approx(C[2, 3], rel=6e-3)
+    open_tab(page, "Functional map")
+    visible(page, ".s4a-title").filter(has_text=f"φ1 on {source}").wait_for()
+    visible(page, ".s4a-title").filter(has_text=f"ψ1 on {target}").wait_for()
+    open_tab(page, "Correspondence")
+    for name in (source, target):
+        visible(page, ".s4a-title").filter(has_text=re.compile(f"^{name},")).wait_for()
 
 
 def test_a_clicked_bar_shows_its_shape(page):
@@ -416,7 +422,7 @@ def test_the_keyboard_carries_points_to_the_shape(page, study):
 
 
 def test_nothing_is_said_or_marked_of_the_shape_before(page):
-    shapes = visible(page, "select").filter(has_text="brain_").first
+    shapes = page.get_by_label("shape", exact=True).filter(visible=True)
     *_, one, other = shapes.locator("option").all_inner_texts()
     canvas, said = visible(page, VIEW).first, visible(page, ".s4a-readout")
     marks = f"{SEEN}.map((view) => view.points.length).join()"
