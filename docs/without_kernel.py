@@ -9,9 +9,6 @@ import gzip
 import io
 import itertools
 import math
-import os
-
-os.environ["TQDM_DISABLE"] = "1"  # bars of progress are widgets, too; read when tqdm is imported
 
 import ipywidgets
 import numpy as np
@@ -21,6 +18,7 @@ from IPython.display import HTML, display
 from jinja2 import Environment
 from markupsafe import Markup
 from matplotlib.colors import to_rgb
+from tqdm.notebook import tqdm as bar
 
 import s4a.course
 from s4a.geometry.mesh import as_arrays
@@ -131,6 +129,15 @@ def packed(panel, limit):
 
 
 OfKernel.without_kernel = framed
+begin_bar = bar.__init__
+
+
+def no_bar(self, *values, **options):
+    """Bars of progress are widgets, too: none is shown."""
+    begin_bar(self, *values, **options | {"disable": True})
+
+
+bar.__init__ = no_bar
 
 
 def tubes(begin, end, colors, radius):
