@@ -36,6 +36,10 @@ N_VALUES = 5  # of a slider
 # a panel is unpacked when it is first shown, and as tall as what is in it
 PANELS = """
 <div class="panels">
+<style>
+.panels button { font: inherit; padding: 0.3em 0.8em; }
+.panels button[aria-pressed=true] { font-weight: bold; border-bottom: 3px solid #0072b2; }
+</style>
 {% if pages | length > 1 %}
 <div role="group" aria-label="Panels">
 {% for title, _ in pages %}
