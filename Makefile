@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test coverage test-lowest test-newest check fuzz format bench paper figures hangs structure lab docs slides address release binder submission clean
+.PHONY: demo test coverage test-lowest test-newest check fuzz format bench paper figures hangs structure lab docs pages slides address release binder submission clean
 
 demo: $(VENV)/.core
 	$(BIN)/s4a demo
@@ -69,6 +69,12 @@ lab: $(VENV)/.course
 # S4A_DOCS=off leaves the outputs of the notebooks out, for a quick look
 docs: $(VENV)/.docs
 	$(BIN)/python -m sphinx -W --keep-going -b html -d docs/_build/doctrees docs docs/_build/html
+
+# the lessons that are shown on the web: run, made into pages, and looked at in Chromium from a plain server
+LESSONS := 00 02 04 06 09
+pages: $(VENV)/.test
+	S4A_LESSONS="$(LESSONS)" $(BIN)/python -m sphinx -q --keep-going -b html -d docs/_build/doctrees docs docs/_build/html
+	$(BIN)/python tests/benchmarks/offline.py $(LESSONS)
 
 # the public address, NAME=name/s4a, written into every file that says it
 address:

@@ -9,9 +9,6 @@ import gzip
 import io
 import itertools
 import math
-import os
-
-os.environ["TQDM_DISABLE"] = "1"  # bars of progress are widgets, too; read when tqdm is imported
 
 import ipywidgets
 import numpy as np
@@ -21,6 +18,7 @@ from IPython.display import HTML, display
 from jinja2 import Environment
 from markupsafe import Markup
 from matplotlib.colors import to_rgb
+from tqdm.notebook import tqdm as bar
 
 import s4a.course
 from s4a.geometry.mesh import as_arrays
@@ -38,6 +36,10 @@ N_VALUES = 5  # of a slider
 # a panel is unpacked when it is first shown, and as tall as what is in it
 PANELS = """
 <div class="panels">
+<style>
+.panels button { font: inherit; padding: 0.3em 0.8em; }
+.panels button[aria-pressed=true] { font-weight: bold; border-bottom: 3px solid #0072b2; }
+</style>
 {% if pages | length > 1 %}
 <div role="group" aria-label="Panels">
 {% for title, _ in pages %}
@@ -131,6 +133,15 @@ def packed(panel, limit):
 
 
 OfKernel.without_kernel = framed
+begin_bar = bar.__init__
+
+
+def no_bar(self, *values, **options):
+    """Bars of progress are widgets, too: none is shown."""
+    begin_bar(self, *values, **options | {"disable": True})
+
+
+bar.__init__ = no_bar
 
 
 def tubes(begin, end, colors, radius):

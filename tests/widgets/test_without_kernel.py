@@ -131,3 +131,18 @@ def test_python_answers_what_it_is_asked(study):
     panel.frame.asked = 17.0
     assert panel.frame.heard == 17.0
     panel.close()
+
+
+def test_a_click_on_what_a_saved_page_did_not_keep_says_so(browser, study, tmp_path):
+    panel = widgets.Median(study)
+    path = panel.save_html(tmp_path / "median.html", limit=0)
+    panel.close()
+    page = browser.new_page()
+    page.goto(path.as_uri())
+    page.wait_for_selector("canvas.s4a-view")
+    said = page.locator("#not-kept")
+    assert said.inner_text() == ""
+    other = next(name for name in study["coarse"].children if name != panel.shape.value)
+    page.locator(f"rect.s4a-mark[aria-label^='{other}:']").dispatch_event("click")
+    assert said.inner_text().startswith(f"{other} is not kept in this page")
+    page.close()

@@ -23,8 +23,11 @@ globalThis.s4aReplay = ({ controls, values, groups, clicks }) => {
       s4aModels[id]?.update(state);
     }
   };
+  const said = document.getElementById("not-kept");
   const choose = (c, at) => {
-    if (controls[c].at === at || !controls[c].open.includes(at)) return;
+    const kept = controls[c].open.includes(at);
+    said.textContent = kept ? "" : `${controls[c].labels[at]} is not kept in this page; a notebook shows it.`;
+    if (controls[c].at === at || !kept) return;
     controls[c].at = at;
     inputs[c].value = inputs[c].type === "range" ? controls[c].open.indexOf(at) : at;
     if (inputs[c].type === "checkbox") inputs[c].checked = Boolean(at);
