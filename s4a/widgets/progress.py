@@ -107,9 +107,10 @@ class Progress(Panel):
 
     def build(self) -> list[ipywidgets.Widget]:
         """A bar for each stage, and the buttons."""
-        look = {"max": 1, "style": {"description_width": "18em"}, "layout": {"width": "37em"}}
+        wide = {"flex": "1 1 22em", "width": "auto", "min_width": "0", "max_width": "37em"}
+        look = {"max": 1, "style": {"description_width": "min(18em, 60%)"}, "layout": wide}
         self.bars = {stage: ipywidgets.IntProgress(description=stage, **look) for stage in STAGES}
-        self.texts = {stage: ipywidgets.HTML() for stage in STAGES}
+        self.texts = {stage: ipywidgets.HTML(layout={"flex": "1 1 12em"}) for stage in STAGES}
         self.total = ipywidgets.HTML()
         self.stop = self.button("Cancel", self.cancel, "what is finished stays and is used again")
         self.go_on = self.button("Resume", self.start, "where it stopped", disabled=True)

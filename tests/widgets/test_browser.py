@@ -675,6 +675,21 @@ def test_sliders_keep_their_arrow_keys_in_notebook_7(sizes):
     assert float(handle.get_attribute("aria-valuenow")) == before + 1
 
 
+def test_a_slider_is_hit_within_24_pixels(sizes):
+    panel = panel_of(tabs_of(sizes, 3, "Spectrum"))
+    handle, track = panel.locator("[role=slider]").first, panel.locator(".noUi-base").first
+    panel.get_by_text("first k").scroll_into_view_if_needed()
+    sizes.wait_for_timeout(300)
+    before, box = float(handle.get_attribute("aria-valuenow")), track.bounding_box()
+    for share, off in ((0.7, 11), (0.4, -11)):
+        y = box["y"] + box["height"] / 2 + off
+        sizes.mouse.click(box["x"] + share * box["width"], y)
+        now = float(handle.get_attribute("aria-valuenow"))
+        assert now != before
+        before = now
+        sizes.wait_for_timeout(500)  # the knob moves there
+
+
 # ---- far kernels
 
 
@@ -907,16 +922,26 @@ CONTRAST = r"""(root, [fields, noTexts]) => {
 }"""
 
 
+def change_theme(page, theme):
+    """Choose a theme of JupyterLab, and wait until it is there and its picture in between gone."""
+    page.evaluate(
+        "(theme) => jupyterapp.commands.execute('apputils:change-theme', { theme })", theme
+    )
+    page.wait_for_function(
+        "(theme) => document.body.dataset.jpThemeName === theme"
+        " && !document.getElementById('jupyterlab-splash')",
+        arg=theme,
+    )
+
+
 @contextlib.contextmanager
 def themed(page, theme):
     """The page in a theme of JupyterLab, and in the light one afterwards."""
-    change = "(theme) => jupyterapp.commands.execute('apputils:change-theme', { theme })"
     try:
-        page.evaluate(change, theme)
-        page.wait_for_function("(n) => document.body.dataset.jpThemeName === n", arg=theme)
+        change_theme(page, theme)
         yield
     finally:
-        page.evaluate(change, "JupyterLab Light")
+        change_theme(page, THEMES[-1])
 
 
 def contrasts(part):
