@@ -4,10 +4,11 @@
 const SECONDS = 4; // of a film
 const WEBM = typeof MediaRecorder === "function" && "captureStream" in HTMLCanvasElement.prototype && MediaRecorder.isTypeSupported("video/webm");
 
-// The view turned around the upright axis of the picture.
-function spun(turn, angle) {
-  const [right, up, towards] = [0, 3, 6].map((i) => turn.slice(i, i + 3)), c = Math.cos(angle), s = Math.sin(angle);
-  return [...right.map((v, i) => c * v + s * towards[i]), ...up, ...towards.map((v, i) => c * v - s * right[i])];
+// The rotation of a camera whose surface is turned around the axis that points up: that of its first view, which lies across.
+function spun({ turn, home }, angle) {
+  const [up = 1] = [0, 1, 2].filter((i) => Math.abs(home[i]) < 1e-6).sort((i, j) => Math.abs(home[3 + j]) - Math.abs(home[3 + i]));
+  const a = (up + 1) % 3, b = (up + 2) % 3, c = Math.cos(angle), s = Math.sin(angle);
+  return turn.map((v, i) => (i % 3 === up ? v : i % 3 === a ? c * v + s * turn[i + b - a] : c * v - s * turn[i + a - b]));
 }
 
 // Views side by side on a canvas of so many pixels: above each its title, below it its colour bar, or one below all.
@@ -42,7 +43,7 @@ function sheet(views, { width, ground = "#fff", angle = 0, score = null }, canva
     const moved = score !== null && view.slider ? view.slider().at(score) : { title: view.heading(), surfaces: view.surfaces };
     write(moved.title, x + cell / 2, y + line / 2, 0.96 * cell);
     const high = Math.round((cell * view.canvas.clientHeight) / view.canvas.clientWidth);
-    view.paint(on, [x, y + line, cell, high], { surfaces: moved.surfaces, turn: spun(view.camera.turn, angle) });
+    view.paint(on, [x, y + line, cell, high], { surfaces: moved.surfaces, turn: spun(view.camera, angle) });
     if (!one) drawBar(bars[i], x + cell / 2, y + line + tall, 0.9 * cell);
   });
   if (one) drawBar(bars[0], width / 2, rows * row, 0.9 * width);
@@ -68,14 +69,15 @@ async function film(views, width, kind, motion, told) {
   const ended = new Promise((done) => (recorder.onstop = done));
   recorder.start();
   const start = performance.now();
-  for (let share = 0; share < 1; share = (performance.now() - start) / (1000 * SECONDS)) {
-    told(share);
-    draw(share);
-    await later(20);
+  try {
+    for (let share = 0; share < 1; share = (performance.now() - start) / (1000 * SECONDS)) {
+      told(share);
+      draw(share);
+      await later(20);
+    }
+  } finally {
+    recorder.stop();
   }
-  draw(1);
-  await later(50);
-  recorder.stop();
   await ended;
   return new Blob(parts, { type: "video/webm" });
 }
@@ -103,9 +105,9 @@ function saving(view) {
     return it;
   };
   const widths = (most) => [600, 800, 1200, 1920, 2560, 3840].filter((w) => w <= most).map((w) => [w, `${w} pixels${w === 3840 ? " (4K)" : ""}`]);
-  const which = all.length > 1 && choice(html(box, "p"), "surfaces", [["all", `all ${all.length}, side by side`], ["one", view.heading() || "this one"]]);
+  const which = all.length > 1 && choice(html(box, "p"), "surfaces", [["one", view.heading() || "this one"], ["all", `all ${all.length}, side by side`]]);
   const views = () => (which && which.value === "all" ? all : [view]), name = (end) => `${views()[0].heading().toLowerCase().replace(/[^\p{L}\p{N}]+/gu, "-").replace(/^-|-$/g, "") || "surface"}.${end}`;
-  if (which && view.alone) which.value = "one";
+  if (which && !view.alone) which.value = "all";
 
   const still = part("Picture (PNG)"), width = choice(still, "width", widths(3840)), ground = choice(still, "ground", [["#fff", "white"], ["", "transparent"]]);
   width.value = 1920;
@@ -145,6 +147,6 @@ function saving(view) {
   });
   html(box, "button", { type: "button" }, "Close").addEventListener("click", () => box.close());
   box.addEventListener("close", () => box.remove());
-  for (const event of ["keydown", "pointerdown", "wheel"]) box.addEventListener(event, (e) => e.stopPropagation()); // not for the surface
+  box.addEventListener("keydown", (e) => e.stopPropagation()); // where the notebook hears keys after it
   box.showModal();
 }
