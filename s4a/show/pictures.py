@@ -111,7 +111,7 @@ def write_picture(
     view, up
         From where a study or a mesh is seen; see :func:`s4a.show.draw.rotation`.
     width : int
-        In pixels, 100 to 3840.  The height follows from the surfaces.
+        In pixels, 100 to 3840, which takes up to a minute and 1 GB; the height follows.
     transparent : bool
         Without the white ground.
 
@@ -144,7 +144,7 @@ def write_picture(
     cells = draw(scores)
     columns = len(scores) if together else len(cells)
     frames = _frames([cells], together)
-    _sheet(cells, frames, columns, width, title, transparent).save(path, optimize=True)
+    _sheet(cells, frames, columns, width, title, transparent).save(path)
     return path
 
 
