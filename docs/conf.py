@@ -19,6 +19,7 @@ from PIL import Image
 sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
 import examples
+import thumbnails
 from slides import WITHOUT_KERNEL
 
 import paper
@@ -235,6 +236,7 @@ def setup(app):
     list_tables()
     app.add_html_math_renderer("mathml", (formula, None), (formula, None))
     app.connect("source-read", show_panels)
+    app.connect("doctree-resolved", thumbnails.add)
     app.connect("autodoc-process-docstring", pictures, priority=100)  # before napoleon's words
     app.connect("autodoc-process-docstring", bars)
     app.connect("missing-reference", front_door)

@@ -38,7 +38,7 @@ from s4a.show.draw import (
     signed_colors,
     with_balls,
 )
-from s4a.show.pictures import mode_drawer, write_picture
+from s4a.show.pictures import mode_drawer
 from s4a.show.surfaces import carried_colors, mesh_of, mode_arrays, network_places, surface
 
 HERE = Path(__file__).parent
@@ -201,9 +201,15 @@ def seconds(vertices=PAIR):
 
 def components(study):
     """Figure 4: the first three components."""
-    path = write_picture(study, HERE / "brains.png")
-    reduce(path, 900)
+    path = s4a.write_picture(study, HERE / "brains.png", width=900)
+    reduce(path)
     return path
+
+
+def film(study, n_frames=36):
+    """The film at the top of README: the first three modes, there and back."""
+    modes, path = (1, 2, 3), HERE / "modes.gif"
+    return s4a.write_film(study, path, mode=modes, width=720, n_frames=n_frames, seconds=5)
 
 
 def variance(study):
@@ -450,6 +456,7 @@ PICTURES = {
     "figure_2": swapped,
     "figure_3": seconds,
     "brains": lambda: components(analysed()),
+    "modes": lambda: film(analysed()),
     "figure_5": lambda: variance(analysed()),
     "figure_6": lambda: labels(carried()),
     "figure_7": lambda: landmarks(carried()),

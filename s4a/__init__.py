@@ -15,6 +15,7 @@ reading and cleaning      :func:`read_shapes`, :func:`read_shape`, :func:`read_l
                           :func:`latent_match`, :func:`latent_map`, :func:`register_shape`
 4.2, 6.1 collections      :func:`analyse`, :func:`open_study`, :func:`verify`, :func:`synthesize`
 notebooks, pages          :func:`explore`, :func:`write_page`
+pictures, films           :func:`write_picture`, :func:`write_film`
 new shapes, parts         :func:`insert`, :func:`complete`
 6.1 statistics            :mod:`s4a.statistics`
 6.2 transfer              :func:`transfer_labels`, :func:`transfer_landmarks`,
@@ -68,6 +69,7 @@ if TYPE_CHECKING:
         register_shape,
     )
     from s4a.show.page import write_page
+    from s4a.show.pictures import write_film, write_picture
     from s4a.study.insert import insert
     from s4a.study.pair import match_pair
     from s4a.study.pipeline import analyse
@@ -110,9 +112,11 @@ __all__ = [
     "with_features",
     "with_field",
     "with_landmarks",
+    "write_film",
     "write_for",
     "write_mesh",
     "write_page",
+    "write_picture",
     "write_registered",
     "write_training_set",
 ]
@@ -138,6 +142,7 @@ PLACES = {
     "method.steps": "align_pair build_network latent_map latent_match refine_network "
     "register_shape",
     "show.page": "write_page",
+    "show.pictures": "write_film write_picture",
     "study.insert": "insert",
     "study.pair": "match_pair",
     "study.pipeline": "analyse",

@@ -327,7 +327,7 @@ def regression_modes(study: xr.DataTree, fit: xr.Dataset, name: str = "variable"
     """A :func:`regression` in the form of a study with one mode, for everything that shows modes.
 
     ``s4a.explore`` and the panel of the modes play it with a slider, :func:`s4a.write_page` and
-    :func:`s4a.show.pictures.write_animation` make it a file; one standard deviation of the mode is
+    :func:`s4a.write_film` make it a file; one standard deviation of the mode is
     one of the variable.
 
     Parameters

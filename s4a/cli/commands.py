@@ -205,7 +205,7 @@ def statistics(args: Namespace) -> int:
     from s4a.cli import tables
     from s4a.cli.results import covariation_lines
     from s4a.show.page import write_page
-    from s4a.show.pictures import write_animation
+    from s4a.show.pictures import write_film
 
     if args.covariates and not (args.group or args.variable or args.field):
         raise ValueError("--covariates are of a test: give --group, --variable or --field")
@@ -232,7 +232,7 @@ def statistics(args: Namespace) -> int:
             moving = tests.regression_modes(study, regression, args.variable)
             page = Path(out) / "regression.html"
             write_page(moving, page, title=f"Regression on {args.variable}")
-            write_animation(moving, Path(out) / "regression.gif")
+            write_film(moving, Path(out) / "regression.gif")
     if args.field:
         write("\n" + covariation_lines(results["covariation"]))
     confidence = study["registration"]["confidence"].mean().item()

@@ -34,7 +34,7 @@ def growth(args: Namespace) -> int:
     from s4a.analysis.export import write_results
     from s4a.cli import results, tables
     from s4a.show.page import write_page
-    from s4a.show.pictures import write_animation
+    from s4a.show.pictures import write_film
 
     study, out = study_to_test(args)
     options = {} if args.permutations is None else {"n_permutations": args.permutations}
@@ -55,7 +55,7 @@ def growth(args: Namespace) -> int:
     if not args.field:
         moving = tests.regression_modes(study, found, args.time)
         write_page(moving, Path(out) / "growth.html", title=f"Growth with {args.time}")
-        write_animation(moving, Path(out) / "growth.gif")
+        write_film(moving, Path(out) / "growth.gif")
     write(f"\nresults: {out}")
     return 0
 

@@ -29,9 +29,9 @@ def script(*names: str) -> str:
 
 
 STYLE = (FOLDER / "esm" / "style.css").read_text(encoding="utf-8")
-SCENE = script("dom", "surface", "view", "scene_widget")
+SCENE = script("dom", "surface", "view", "gif", "save", "scene_widget")
 CHART = script("dom", "chart", "chart_widget")
-MODES = script("dom", "surface", "view", "chart", "modes_widget")
+MODES = script("dom", "surface", "view", "gif", "save", "chart", "modes_widget")
 FRAME = script("dom", "frame_widget")
 
 

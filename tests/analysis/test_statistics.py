@@ -18,7 +18,7 @@ from s4a.analysis.inputs import displacements_of, values_of
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.method.pca import gram, gram_pca, pca, principal_components
 from s4a.schema import dataset
-from s4a.show.pictures import write_animation
+from s4a.show.pictures import write_film
 from s4a.widgets.modes import Modes
 
 SCORES = np.array([-1.9, -1.1, -0.6, -0.2, 0.1, 0.4, 0.9, 1.2, 1.2])
@@ -606,7 +606,6 @@ def test_a_regression_is_a_mode_that_page_panel_and_animation_show(planted, tmp_
     assert panel.vertices() == pytest.approx(later, abs=1e-5)
     panel.close()
     assert "component 1" in write_page(moving, tmp_path / "page.html").read_text()
-    with Image.open(
-        write_animation(moving, tmp_path / "age.gif", n_frames=4, size=(60, 50))
-    ) as picture:
-        assert (picture.n_frames, picture.size) == (4, (60, 50))
+    path = write_film(moving, tmp_path / "age.gif", mode=None, n_frames=4, width=100)
+    with Image.open(path) as picture:
+        assert (picture.n_frames, picture.width) == (4, 100)

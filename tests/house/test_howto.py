@@ -63,6 +63,8 @@ def test_every_cell_runs_and_shows_a_picture(tmp_path, monkeypatch):
     file = tmp_path / "mode_1.vtk"
     assert len(s4a.read_mesh(file)[0]) == names["mean"].sizes["vertex"]
     assert b"mode_1" in file.read_bytes()
+    with Image.open(tmp_path / "mode_1.gif") as film:
+        assert film.n_frames == 12
     assert (tmp_path / "scores.csv").read_text().count("\n") == 9
     with xr.open_dataset(tmp_path / "study" / "pca.nc", engine="h5netcdf") as pca:
         assert pca["score"].sizes["shape"] == 8

@@ -7,7 +7,6 @@ import re
 import numpy as np
 import pytest
 import xarray as xr
-from PIL import Image
 
 from s4a.geometry.mesh import as_dataset, vertex_areas
 from s4a.schema import dataset
@@ -362,17 +361,3 @@ def test_modes_that_could_not_be_are_explained(study):
     part["report"].attrs["no_modes"] = "three shapes are needed <found 2>"
     del part["coarse"], part["registration"]
     assert "three shapes are needed &lt;found 2&gt;" in page.study_html(part)
-
-
-def test_the_picture_of_the_modes_is_blue_where_the_shape_grows(study, tmp_path):
-    path = pictures.write_picture(study, tmp_path / "modes.png", view="front", size=(120, 100))
-    pixels = np.asarray(Image.open(path)).astype(int)
-    assert pixels.shape == (300, 360, 3)
-    small, mean, large = np.split(pixels[:100], 3, axis=1)
-
-    def reddest(part):
-        return (part[..., 0] - part[..., 2])[np.ptp(part, axis=-1) > 60]
-
-    assert (reddest(small) > 0).all()
-    assert (reddest(large) < 0).all()
-    assert len(reddest(mean)) == 0

@@ -132,6 +132,18 @@ function modesWidget({ model, el }) {
     };
     playing = requestAnimationFrame(step);
   };
+  // What a film shows: the marked mode from one end to the other, the others as they stand.
+  const filmed = new Surface();
+  const slider = () => ({
+    name: `PC${active + 1} from −${range} to +${range} σ`, ends: [-range, range],
+    at: (score) => {
+      const s = scores().map((other, c) => (c === active ? score : other));
+      modes.show(filmed, s, model.get("colors"));
+      shown[0].widen(filmed.position);
+      return { title: said(s), surfaces: [filmed] };
+    },
+  });
+  const said = (s) => s.map((score, c) => (score ? `PC${c + 1} ${score < 0 ? "−" : "+"}${Math.abs(score).toFixed(1)} σ` : "")).filter(Boolean).join(", ") || "mean";
   const arrange = () => {
     shown.forEach((view) => view.dispose());
     views.replaceChildren();
@@ -143,7 +155,8 @@ function modesWidget({ model, el }) {
       const view = new View(part, { turn: model.get("turn"), group: model.get("group"), height: model.get("height"), label: "shape" });
       view.surfaces = [new Surface()];
       view.fit(modes.mean, modes.reach);
-      return Object.assign(view, { at, caption });
+      const heading = () => (at === null ? said(scores()) : caption.textContent), bar = () => model.get("bars")[model.get("colors")];
+      return Object.assign(view, { at, caption, heading, bar, slider: at === null ? slider : undefined });
     });
     update();
   };
@@ -210,6 +223,7 @@ function modesWidget({ model, el }) {
     clearTimeout(timer);
     Object.entries(on).forEach(([event, act]) => model.off(event, act));
     shown.forEach((view) => view.dispose());
+    filmed.dispose();
   };
 }
 export default { render: modesWidget };

@@ -58,7 +58,7 @@ export default {
       }),
     });
     const still = html(el, "img", { alt: "", class: "s4a-still" }), bar = html(el, "div"), readout = html(el, "div", { class: "s4a-readout", "aria-live": "polite" });
-    view.readout = readout;
+    Object.assign(view, { readout, alone: true, heading: () => model.get("title"), bar: () => model.get("bar") });
     view.told = () => {
       readout.textContent = model.get("caption");
       view.points = model.get("points");

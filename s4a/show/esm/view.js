@@ -55,6 +55,7 @@ function toolbar(view) {
   add("+", () => view.scale(1.25), "zoom in");
   add("−", () => view.scale(1 / 1.25), "zoom out");
   add("⟲", () => view.reset(), "reset the view");
+  add("Save", () => saving(view), "save a picture or a film");
   return { row, add, name };
 }
 
@@ -270,23 +271,37 @@ class View {
     this.due = held.size > 0;
     if (!this.due) this.draw(2);
   }
-  draw(smooth = 1) {
-    const on = context(), { w, h, scale, x, y } = this.frame && this.canvas.clientWidth ? this.placement() : {};
-    if (!on || !w || !this.surfaces.length) return;
-    const start = performance.now(), { gl, at } = on, ratio = Math.min(2, globalThis.devicePixelRatio || 1);
-    const width = Math.round(w * ratio), height = Math.round(h * ratio), W = smooth * width, H = smooth * height;
-    if (gl.canvas.width < W) gl.canvas.width = W;
-    if (gl.canvas.height < H) gl.canvas.height = H;
-    gl.viewport(0, 0, W, H);
-    gl.clearColor(1, 1, 1, 1); // the background is fixed, so that colours mean the same in every theme
+  // Of what is seen, in W by H pixels, the tile at (left, top) of so many pixels, into the lower left corner of the context.
+  render(on, [W, H], [left, top, width, height], ground, { surfaces = this.surfaces, turn = this.camera.turn } = {}) {
+    const { gl, at } = on, { w, h, scale, x, y } = this.placement(), across = W / width, down = H / height;
+    if (gl.canvas.width < width) gl.canvas.width = width;
+    if (gl.canvas.height < height) gl.canvas.height = height;
+    gl.viewport(0, 0, width, height);
+    gl.clearColor(...ground);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    const R = this.camera.turn;
-    gl.uniformMatrix3fv(at.turn, true, R);
+    gl.uniformMatrix3fv(at.turn, true, turn);
     gl.uniform3f(at.centre, ...this.frame.centre);
-    gl.uniform4f(at.place, (2 * scale) / w, (2 * scale) / h, (2 * x) / w, (2 * y) / h);
+    const right = ((2 * x) / w) * across + (W - 2 * left) / width - 1, up = ((2 * y) / h) * down - (H - 2 * top) / height + 1;
+    gl.uniform4f(at.place, ((2 * scale) / w) * across, ((2 * scale) / h) * down, right, up);
     gl.uniform1f(at.depth, 1 / (4 * this.frame.radius));
-    [...this.surfaces].sort((a, b) => b.opacity - a.opacity).forEach((surface) => surface.draw(on));
+    [...surfaces].sort((a, b) => b.opacity - a.opacity).forEach((surface) => surface.draw(on));
     this.ball.balls(on, this.points);
+  }
+  // What is seen, without a ground, in a box of another canvas: in tiles of twice its pixels, as 4K would need a large context.
+  paint(target, [left, top, width, height], options) {
+    const on = context(), { canvas } = on.gl, most = 1024;
+    for (let y = 0; y < height; y += most) for (let x = 0; x < width; x += most) {
+      const w = Math.min(most, width - x), h = Math.min(most, height - y);
+      this.render(on, [2 * width, 2 * height], [2 * x, 2 * y, 2 * w, 2 * h], [0, 0, 0, 0], options);
+      target.drawImage(canvas, 0, canvas.height - 2 * h, 2 * w, 2 * h, left + x, top + y, w, h);
+    }
+  }
+  draw(smooth = 1) {
+    const on = context(), { w, h } = this.frame && this.canvas.clientWidth ? this.placement() : {};
+    if (!on || !w || !this.surfaces.length) return;
+    const start = performance.now(), { gl } = on, ratio = Math.min(2, globalThis.devicePixelRatio || 1);
+    const width = Math.round(w * ratio), height = Math.round(h * ratio), W = smooth * width, H = smooth * height;
+    this.render(on, [W, H], [0, 0, W, H], [1, 1, 1, 1]); // the background is fixed, so that colours mean the same in every theme
     if (this.cursor >= 0 && 3 * this.cursor < this.surfaces[0].position.length) this.ball.balls(on, [[...this.at(this.cursor), 0.84, 0.37, 0, 0.018 * this.frame.radius]]);
     if (this.canvas.width !== width || this.canvas.height !== height) Object.assign(this.canvas, { width, height });
     this.canvas.getContext("2d").drawImage(gl.canvas, 0, gl.canvas.height - H, W, H, 0, 0, width, height);

@@ -1,0 +1,152 @@
+// Save picture and Save film: what the views of a panel show, with their titles and colour bars, as a file. All of it is made
+// in the browser, so that a page without a kernel has it, too.
+
+const SECONDS = 4; // of a film
+const WEBM = typeof MediaRecorder === "function" && "captureStream" in HTMLCanvasElement.prototype && MediaRecorder.isTypeSupported("video/webm");
+
+// The rotation of a camera whose surface is turned around the axis that points up: that of its first view, which lies across.
+function spun({ turn, home }, angle) {
+  const [up = 1] = [0, 1, 2].filter((i) => Math.abs(home[i]) < 1e-6).sort((i, j) => Math.abs(home[3 + j]) - Math.abs(home[3 + i]));
+  const a = (up + 1) % 3, b = (up + 2) % 3, c = Math.cos(angle), s = Math.sin(angle);
+  return turn.map((v, i) => (i % 3 === up ? v : i % 3 === a ? c * v + s * turn[i + b - a] : c * v - s * turn[i + a - b]));
+}
+
+// Views side by side on a canvas of so many pixels: above each its title, below it its colour bar, or one below all.
+function sheet(views, { width, ground = "#fff", angle = 0, score = null }, canvas = document.createElement("canvas")) {
+  const columns = views.length < 5 ? views.length : Math.ceil(views.length / 2), cell = Math.floor(width / columns);
+  const text = Math.max(10, Math.round(Math.min(width / 40, cell / 18))), line = Math.round(1.7 * text);
+  const tall = Math.max(...views.map(({ canvas: { clientWidth, clientHeight } }) => Math.round((cell * clientHeight) / clientWidth)));
+  const bars = views.map((view) => view.bar?.()), one = bars.every((bar) => JSON.stringify(bar) === JSON.stringify(bars[0]));
+  const below = bars.some((bar) => bar?.colors) ? 2 * line : 0, row = line + tall + (one ? 0 : below), rows = Math.ceil(views.length / columns);
+  Object.assign(canvas, { width, height: 2 * Math.ceil((rows * row + (one ? below : 0)) / 2) }); // films are of even height
+  const on = canvas.getContext("2d", { willReadFrequently: true });
+  const write = (words, x, y, room, align = "center") => {
+    const font = (size) => (on.font = `${size}px system-ui, sans-serif`);
+    font(text);
+    font(Math.min(text, (text * room) / on.measureText(words).width));
+    Object.assign(on, { fillStyle: "#222", textAlign: align, textBaseline: "middle" });
+    on.fillText(words, x, y);
+  };
+  const drawBar = (bar, x, y, room) => {
+    if (!bar?.colors) return;
+    const wide = Math.min(room, 40 * text), left = x - wide / 2, colours = on.createLinearGradient(left, 0, left + wide, 0);
+    bar.colors.forEach((colour, i) => colours.addColorStop(i / (bar.colors.length - 1), colour));
+    on.fillStyle = colours;
+    on.fillRect(left, y + 0.3 * text, wide, text);
+    write(String(typeof bar.low === "number" ? short(bar.low) : bar.low), left, y + 1.5 * line, wide / 4, "left");
+    write(String(typeof bar.high === "number" ? short(bar.high) : bar.high), left + wide, y + 1.5 * line, wide / 4, "right");
+    write(bar.label, x, y + 1.5 * line, wide - 10 * text > wide / 3 ? wide - 10 * text : wide / 3);
+  };
+  if (ground) Object.assign(on, { fillStyle: ground }).fillRect(0, 0, canvas.width, canvas.height);
+  views.forEach((view, i) => {
+    const x = (i % columns) * cell, y = Math.floor(i / columns) * row;
+    const moved = score !== null && view.slider ? view.slider().at(score) : { title: view.heading(), surfaces: view.surfaces };
+    write(moved.title, x + cell / 2, y + line / 2, 0.96 * cell);
+    const high = Math.round((cell * view.canvas.clientHeight) / view.canvas.clientWidth);
+    view.paint(on, [x, y + line, cell, high], { surfaces: moved.surfaces, turn: spun(view.camera, angle) });
+    if (!one) drawBar(bars[i], x + cell / 2, y + line + tall, 0.9 * cell);
+  });
+  if (one) drawBar(bars[0], width / 2, rows * row, 0.9 * width);
+  return canvas;
+}
+
+// A film of views: `motion` takes the share of it that is over, from 0 to 1.
+async function film(views, width, kind, motion, told) {
+  const canvas = sheet(views, { width, ...motion(0) }), later = (ms) => new Promise((done) => setTimeout(done, ms));
+  const draw = (share) => sheet(views, { width, ...motion(share) }, canvas);
+  if (kind === "gif") {
+    const n = 50, { height } = canvas;
+    const frame = async (i) => {
+      told(i / n);
+      await later(0);
+      return draw(i / n).getContext("2d").getImageData(0, 0, width, height).data;
+    };
+    return gif({ width, height, n, hundredths: (100 * SECONDS) / n, frame });
+  }
+  // a browser records what it sees: as many pictures as can be drawn in that time
+  const recorder = new MediaRecorder(canvas.captureStream(), { mimeType: "video/webm", videoBitsPerSecond: 12e6 }), parts = [];
+  recorder.ondataavailable = ({ data }) => parts.push(data);
+  const ended = new Promise((done) => (recorder.onstop = done));
+  recorder.start();
+  const start = performance.now();
+  try {
+    for (let share = 0; share < 1; share = (performance.now() - start) / (1000 * SECONDS)) {
+      told(share);
+      draw(share);
+      await later(20);
+    }
+  } finally {
+    recorder.stop();
+  }
+  await ended;
+  return new Blob(parts, { type: "video/webm" });
+}
+
+function download(blob, name) {
+  const link = html(document.body, "a", { href: URL.createObjectURL(blob), download: name });
+  link.click();
+  link.remove();
+  setTimeout(() => URL.revokeObjectURL(link.href), 60_000);
+}
+
+// The dialog of a view, which is there while it is open.
+function saving(view) {
+  const box = html(view.box, "dialog", { class: "s4a-save", "aria-label": `save ${view.label}` });
+  const panel = view.box.closest(".s4a-panel"), seen = (other) => other.frame && other.canvas.clientWidth && other.box.closest(".s4a-panel") === panel;
+  const all = [...view.camera.views].filter(seen), slider = view.slider?.();
+  const choice = (row, text, options) => {
+    const label = html(row, "label", {}, `${text} `), it = html(label, "select");
+    for (const [value, words] of options) html(it, "option", { value }, words);
+    return it;
+  };
+  const part = (title) => {
+    const it = html(box, "fieldset");
+    html(it, "legend", {}, title);
+    return it;
+  };
+  const widths = (most) => [600, 800, 1200, 1920, 2560, 3840].filter((w) => w <= most).map((w) => [w, `${w} pixels${w === 3840 ? " (4K)" : ""}`]);
+  const which = all.length > 1 && choice(html(box, "p"), "surfaces", [["one", view.heading() || "this one"], ["all", `all ${all.length}, side by side`]]);
+  const views = () => (which && which.value === "all" ? all : [view]), name = (end) => `${views()[0].heading().toLowerCase().replace(/[^\p{L}\p{N}]+/gu, "-").replace(/^-|-$/g, "") || "surface"}.${end}`;
+  if (which && !view.alone) which.value = "all";
+
+  const still = part("Picture (PNG)"), width = choice(still, "width", widths(3840)), ground = choice(still, "ground", [["#fff", "white"], ["", "transparent"]]);
+  width.value = 1920;
+  const moving = part("Film"), wide = choice(moving, "width", widths(1920));
+  const kind = choice(moving, "format", [["gif", "GIF"], ...(WEBM ? [["webm", "WebM"]] : [])]);
+  const motion = choice(moving, "motion", [...(slider ? [["slider", slider.name]] : []), ["turn", "one turn"]]);
+  const told = html(box, "output", { role: "status" }), buttons = [];
+  const button = (row, text, act) => {
+    const it = html(row, "button", { type: "button" }, text);
+    buttons.push(it);
+    it.addEventListener("click", async () => {
+      buttons.forEach((one) => (one.disabled = true));
+      try {
+        const [blob, file] = await act();
+        if (!box.open) return;
+        download(blob, file);
+        told.textContent = `saved: ${file}, ${(blob.size / 1e6).toFixed(1)} MB`;
+      } catch (error) {
+        told.textContent = `not saved: ${error.message}`;
+      }
+      buttons.forEach((one) => (one.disabled = false));
+    });
+  };
+  button(still, "Save picture", () => new Promise((done, fail) => {
+    sheet(views(), { width: Number(width.value), ground: ground.value }).toBlob((blob) => (blob ? done([blob, name("png")]) : fail(new Error("the picture is too large for this browser"))));
+  }));
+  button(moving, "Save film", async () => {
+    const slides = motion.value === "slider", [from, to] = slides ? slider.ends : [0, 2 * Math.PI];
+    const at = (share) => (slides ? { score: (from + to) / 2 - ((to - from) / 2) * Math.cos(2 * Math.PI * share) } : { angle: 2 * Math.PI * share });
+    if (slides) slider.ends.forEach((end) => slider.at(end)); // so that no frame is of another scale
+    const end = kind.value, shown = views();
+    const made = await film(shown, Number(wide.value), end, at, (share) => {
+      if (!box.open || !view.box.isConnected) throw new Error("the dialog was closed");
+      told.textContent = `${Math.round(100 * share)} %`;
+    });
+    return [made, name(end)];
+  });
+  html(box, "button", { type: "button" }, "Close").addEventListener("click", () => box.close());
+  box.addEventListener("close", () => box.remove());
+  box.addEventListener("keydown", (e) => e.stopPropagation()); // where the notebook hears keys after it
+  box.showModal();
+}

@@ -1,0 +1,151 @@
+"""Pictures and films that are written without a browser."""
+
+import numpy as np
+import pytest
+from PIL import Image
+from test_view import make_study, sphere
+
+import s4a
+from s4a.geometry.mesh import as_dataset
+from s4a.show.surfaces import mode_limits
+
+
+@pytest.fixture(scope="module")
+def study():
+    return make_study()
+
+
+def pixels(path):
+    with Image.open(path) as picture:
+        return np.asarray(picture.convert("RGB")).astype(int)
+
+
+def reddest(part):
+    """Red less blue, where there is a colour."""
+    return (part[..., 0] - part[..., 2])[np.ptp(part, axis=-1) > 60]
+
+
+def film_frames(path):
+    with Image.open(path) as film:
+        found = []
+        for i in range(film.n_frames):
+            film.seek(i)
+            found.append(np.asarray(film.convert("RGB")).astype(int))
+    return found
+
+
+def test_a_picture_of_the_modes_is_blue_where_the_shape_grows(study, tmp_path):
+    path = s4a.write_picture(study, tmp_path / "modes.png", view="front", width=360)
+    found = pixels(path)
+    assert found.shape[1] == 360
+    small, mean, large = np.split(found[: len(found) // 4], 3, axis=1)
+    assert (reddest(small) > 0).all()
+    assert (reddest(large) < 0).all()
+    assert len(reddest(mean)) == 0
+
+
+def test_a_picture_has_the_wanted_width_and_ground(study, tmp_path):
+    options = {"mode": 1, "score": 2, "width": 401}
+    for transparent in (False, True):
+        path = s4a.write_picture(study, tmp_path / "a.png", transparent=transparent, **options)
+        with Image.open(path) as picture:
+            assert (picture.mode, picture.width) == ("RGBA", 401)
+            opacity = np.asarray(picture)[..., 3]
+        assert (opacity.min() == 0) == transparent
+        assert opacity.max() == 255
+
+
+def test_a_picture_that_is_rendered_in_bands_is_the_same(study, tmp_path, monkeypatch):
+    options = {"mode": 1, "score": 2, "width": 200}
+    whole = pixels(s4a.write_picture(study, tmp_path / "whole.png", **options))
+    monkeypatch.setattr(s4a.show.pictures, "BAND", 200 * 40)
+    bands = pixels(s4a.write_picture(study, tmp_path / "bands.png", **options))
+    assert np.abs(whole - bands).max() < 40  # the shade of creases reaches less far
+    assert np.abs(whole - bands).mean() < 1
+
+
+def test_the_colour_bar_has_the_limits_of_the_panels(study, tmp_path, monkeypatch):
+    words = []
+    write = s4a.show.pictures._write
+    monkeypatch.setattr(
+        s4a.show.pictures,
+        "_write",
+        lambda sheet, text, *a: words.append(text) or write(sheet, text, *a),
+    )
+    s4a.write_picture(study, tmp_path / "a.png", mode=1, score=-2, title="Ellipsoids", width=300)
+    limit = f"{mode_limits(study)[0]:.3g}"
+    assert {"Ellipsoids", limit, f"−{limit}"} <= set(words)
+    assert any("mode 1" in text and "−2.0 σ" in text for text in words)
+
+
+def test_numbers_that_are_nowhere_negative_begin_at_0_in_white(tmp_path):
+    X, T = sphere()
+    values = np.clip(X[:, 2], 0, None)
+    found = pixels(
+        s4a.write_picture(as_dataset(X, T), tmp_path / "a.png", values=values, width=200)
+    )
+    assert (reddest(found[:100]) < 0).all()
+    assert len(reddest(found[:100])) > 100
+    assert len(reddest(found[150:190])) == 0
+
+
+def test_a_panel_is_drawn_as_it_stands_without_a_browser(tmp_path):
+    widgets = pytest.importorskip("s4a.widgets")
+    panel = widgets.FunctionalMap(s4a.synthetic.example_study())
+    first = pixels(s4a.write_picture(panel, tmp_path / "a.png", width=300))
+    panel.cell = (3, 3)
+    second = pixels(s4a.write_picture(panel, tmp_path / "b.png", width=300))
+    for half in np.split(np.abs(first - second), 2, axis=1):  # both of its surfaces
+        assert half.max() > 60
+    panel.close()
+
+
+def test_a_film_of_a_mode_goes_there_and_back(study, tmp_path):
+    path = s4a.write_film(study, tmp_path / "a.gif", mode=1, n_frames=6, width=120, seconds=3)
+    with Image.open(path) as film:
+        assert film.n_frames == 6
+        assert (film.width, film.info["duration"], film.info["loop"]) == (120, 500, 0)
+    first, *_, last = frames = film_frames(path)
+    assert np.abs(first - frames[3]).max() > 100
+    assert (reddest(first[:100]) > 0).all()
+    assert (reddest(frames[3][:100]) < 0).all()
+    assert frames[1] == pytest.approx(last, abs=60)
+    assert (first[0, 0] == 255).all()
+
+
+@pytest.mark.parametrize("ending", ["gif", "webp", "apng"])
+def test_a_film_of_one_turn_shows_every_side(tmp_path, ending):
+    X, T = sphere()
+    colors = np.where(X[:, :1] > 0, [[1.0, 0, 0]], [[0, 0, 1.0]])
+    path = tmp_path / f"a.{ending}"
+    mesh = as_dataset(X, T)
+    s4a.write_film(mesh, path, turn=True, values=colors, view="right", n_frames=4, width=100)
+    frames = film_frames(path)
+    assert len(frames) == 4
+    assert np.median(reddest(frames[0])) > 60
+    assert np.median(reddest(frames[2])) < -60
+    assert reddest(frames[1]).min() < 0 < reddest(frames[1]).max()
+
+
+@pytest.mark.parametrize(
+    "name, options, found",
+    [
+        ("a.jpg", {}, r"\.png, found a.jpg"),
+        ("a.png", {"width": 3841}, "100 to 3840 pixels, found 3841"),
+        ("a.png", {"mode": 9}, "mode needs 1 to 3, found 9"),
+        ("a.png", {"mode": 0}, "mode needs 1 to 3, found 0"),
+    ],
+)
+def test_what_no_picture_can_be_is_refused(study, tmp_path, name, options, found):
+    with pytest.raises(ValueError, match=found):
+        s4a.write_picture(study, tmp_path / name, **options)
+    assert not (tmp_path / name).exists()
+
+
+def test_what_no_film_can_be_is_refused(study, tmp_path):
+    with pytest.raises(ValueError, match=r"found a\.webm; a panel's Save film writes WebM"):
+        s4a.write_film(study, tmp_path / "a.webm")
+    with pytest.raises(ValueError, match="turn=True"):
+        s4a.write_film(as_dataset(*sphere()), tmp_path / "a.gif")
+    with pytest.raises(ValueError, match="a mesh or a panel with a surface is needed, found str"):
+        s4a.write_film("study", tmp_path / "a.gif", turn=True)
