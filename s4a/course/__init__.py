@@ -7,6 +7,7 @@ and what a mesh is made of.
 from s4a.course.exercises import check, judge
 from s4a.course.quizzes import quiz
 from s4a.course.sliders import slide, takeaway
+from s4a.datasets.structures import subjects
 from s4a.geometry.mesh import as_arrays, as_dataset, triangle_areas, vertex_areas, vertex_normals
 from s4a.show import charts
 from s4a.show.draw import label_colors, position_colors
@@ -21,6 +22,7 @@ __all__ = [
     "position_colors",
     "quiz",
     "slide",
+    "subjects",
     "takeaway",
     "triangle_areas",
     "vertex_areas",

@@ -382,7 +382,7 @@ EXERCISES = {
     ),
     "14.1": Exercise(
         lambda mesh: triangle_areas(*as_arrays(mesh)).sum() / 100,
-        "add up s4a.geometry.mesh.triangle_areas of its arrays; 1 cm² is 100 mm²",
+        "its attributes have what cleaning measured; 1 cm² is 100 mm²",
     ),
     "14.2": Exercise(
         _correlation_carried,
