@@ -1,13 +1,14 @@
 """The course (notebooks/): exercises that check themselves, quizzes, sliders, diagrams.
 
-With them stand the few functions on plain arrays that lessons call beside the public ones: charts,
-and what a mesh is made of.
+With them stand the few functions on plain arrays that lessons call besides the public ones: charts,
+what a mesh is made of, and KnnSearch.
 """
 
 from s4a.course.exercises import check, judge
 from s4a.course.quizzes import quiz
 from s4a.course.sliders import slide, takeaway
 from s4a.geometry.mesh import as_arrays, as_dataset, triangle_areas, vertex_areas, vertex_normals
+from s4a.method.nearest import nearest_rows
 from s4a.show import charts
 from s4a.show.draw import label_colors, position_colors
 
@@ -18,6 +19,7 @@ __all__ = [
     "check",
     "judge",
     "label_colors",
+    "nearest_rows",
     "position_colors",
     "quiz",
     "slide",
