@@ -1,12 +1,13 @@
 """The course (notebooks/): exercises that check themselves, quizzes, sliders, diagrams.
 
 With them stand the few functions on plain arrays that lessons call besides the public ones: charts,
-what a mesh is made of, and KnnSearch.
+what a mesh is made of, closest points, and KnnSearch.
 """
 
 from s4a.course.exercises import check, judge
 from s4a.course.quizzes import quiz
 from s4a.course.sliders import slide, takeaway
+from s4a.geometry.closest import closest_point
 from s4a.geometry.mesh import as_arrays, as_dataset, triangle_areas, vertex_areas, vertex_normals
 from s4a.method.nearest import nearest_rows
 from s4a.show import charts
@@ -17,6 +18,7 @@ __all__ = [
     "as_dataset",
     "charts",
     "check",
+    "closest_point",
     "judge",
     "label_colors",
     "nearest_rows",
