@@ -4,6 +4,7 @@ With them stand the few functions on plain arrays that lessons call besides the 
 what a mesh is made of, closest points, and KnnSearch.
 """
 
+from s4a.course import diagrams
 from s4a.course.exercises import check, judge
 from s4a.course.quizzes import quiz
 from s4a.course.sliders import slide, takeaway
@@ -19,6 +20,7 @@ __all__ = [
     "charts",
     "check",
     "closest_point",
+    "diagrams",
     "judge",
     "label_colors",
     "nearest_rows",

@@ -226,7 +226,7 @@ EXERCISES = {
     ),
     "01.2": Exercise(
         lambda mesh: triangle_areas(*as_arrays(mesh)).sum() / 100,
-        "add up s4a.geometry.mesh.triangle_areas of its arrays; 1 cm² is 100 mm²",
+        "add up s4a.course.triangle_areas of its arrays; 1 cm² is 100 mm²",
     ),
     "01.3": Exercise(
         lambda brain: lambda v: brain["file_vertex"].values[v] == 1000,
@@ -272,9 +272,7 @@ EXERCISES = {
         ),
         "nearest_rows of Psi among Phi Cᵀ, 20 columns each; then as_map with 25",
     ),
-    "05.3": Exercise(
-        lambda gap: np.mean(gap > 5), "ends['ground truth']['after'] has the errors in %"
-    ),
+    "05.3": Exercise(lambda gap: np.mean(gap > 5), "`after` has the errors in %"),
     "06.1": Exercise(lambda: 20_825, "choose 3 of 51", 0),
     "06.2": Exercise(
         lambda Y: lambda C: np.shape(C) == (60, 60) and np.allclose(C @ Y[0], Y[3], atol=1e-6),
