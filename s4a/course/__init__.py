@@ -1,14 +1,17 @@
 """The course (notebooks/): exercises that check themselves, quizzes, sliders, diagrams.
 
-With them stand the few functions on plain arrays that lessons call beside the public ones: charts,
-and what a mesh is made of.
+With them stand the few functions on plain arrays that lessons call besides the public ones: charts,
+what a mesh is made of, closest points, and KnnSearch.
 """
 
+from s4a.course import diagrams
 from s4a.course.exercises import check, judge
 from s4a.course.quizzes import quiz
 from s4a.course.sliders import slide, takeaway
 from s4a.datasets.structures import subjects
+from s4a.geometry.closest import closest_point
 from s4a.geometry.mesh import as_arrays, as_dataset, triangle_areas, vertex_areas, vertex_normals
+from s4a.method.nearest import nearest_rows
 from s4a.show import charts
 from s4a.show.draw import label_colors, position_colors
 
@@ -17,8 +20,11 @@ __all__ = [
     "as_dataset",
     "charts",
     "check",
+    "closest_point",
+    "diagrams",
     "judge",
     "label_colors",
+    "nearest_rows",
     "position_colors",
     "quiz",
     "slide",

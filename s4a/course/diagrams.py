@@ -243,22 +243,20 @@ def two_ways() -> Figure:
 
 
 def slid() -> Figure:
-    """A point that slid along folds is still on the surface, and the prices of an elastic round.
+    """A match that slid along folds is still on the surface.
 
     Examples
     --------
     >>> from s4a.course.diagrams import slid
     >>> [ax.get_title() for ax in slid().axes]
-    ['slid: the gap is still zero', 'two of the three prices']
+    ['slid: still on the surface']
     """
-    figure, ((folds, prices),) = _plain(
-        2,
-        9.5,
+    figure, ((folds,),) = _plain(
+        1,
+        5,
         3.1,
-        "Left: two folds of a surface from the side. The true place of a point is a crest; its "
-        "match has slid down the flank, and is still on the surface. Right: a piece of the "
-        "surface M with its normal m in the point y. The arrow from y to z, where the vertex "
-        "goes, has a part across the surface and a part along it.",
+        "Two folds of a surface from the side. The true position of a point is a crest; its match "
+        "has slid down the flank, and is still on the surface.",
     )
     u = np.linspace(0, 2, 200)
     height = 0.3 * (1 - np.cos(2 * np.pi * u))
@@ -266,27 +264,14 @@ def slid() -> Figure:
     crest, flank = 52, 78  # rows of u
     folds.plot(u[crest:flank], height[crest:flank], color=ORANGE, lw=4)
     for i, color, name, shift in (
-        (crest, "black", "true place", (0, 0.13)),
+        (crest, "black", "true position", (0, 0.13)),
         (flank, ORANGE, "match", (0.2, 0.05)),
     ):
         folds.plot(u[i], height[i], "o", color=color, ms=8, zorder=4)
         folds.text(u[i] + shift[0], height[i] + shift[1], name, ha="center", color=color)
     folds.text(1, -0.15, "surface of the source", ha="center", color=GREY)
     folds.set(xlim=(-0.05, 2.05), ylim=(-0.3, 0.95))
-    folds.set_title("slid: the gap is still zero")
-    bend = np.linspace(-1, 1, 50)
-    prices.plot(bend, -0.12 * bend**2, color=GREY, lw=2.5)
-    y, z = np.zeros(2), np.array([0.6, 0.45])
-    foot = z * [1, 0]
-    _arrow(prices, y, (0, 0.85), "m", rise=0.33, aside=-0.1)
-    _arrow(prices, y, foot, "along", rise=-0.2, aside=0.12, color=BLUE)
-    _arrow(prices, foot, z, "across", rise=0, aside=0.22, color=ORANGE)
-    for place, name, shift in ((y, "y", (-0.09, -0.13)), (z, "z", (0.1, 0.1))):
-        prices.plot(*place, "o", color="black", ms=6, zorder=4)
-        prices.text(*(place + shift), name, ha="center", va="center", fontsize=11, style="italic")
-    prices.text(-0.8, -0.26, "M", ha="center", color=GREY, fontsize=11)
-    prices.set(xlim=(-1.1, 1.1), ylim=(-0.4, 0.95))
-    prices.set_title("two of the three prices")
+    folds.set_title("slid: still on the surface")
     return figure
 
 

@@ -3,6 +3,7 @@
 Its exercises without an answer and with the one of the book.
 """
 
+import ast
 import asyncio
 import json
 import math
@@ -14,12 +15,15 @@ import time
 import pytest
 from paths import DOCS, NOTEBOOKS, ROOT
 
+import s4a
+from s4a import course
 from s4a.course import quiz
 from s4a.course.exercises import EXERCISES
 
 nbformat = pytest.importorskip("nbformat")
 nbclient = pytest.importorskip("nbclient")
 pytest.importorskip("ipykernel")
+widgets = pytest.importorskip("s4a.widgets")
 
 LESSONS = sorted(NOTEBOOKS.glob("*.ipynb"))
 MEMORY = 1500  # MiB, of the 2 GB that Binder gives
@@ -114,6 +118,37 @@ async def played(path, folder):
         return json.loads((await added(client, SPENT)).strip("'"))
 
 
+PUBLIC = {  # module -> what a lesson may take of it; None: whatever has no underscore
+    "s4a": {*s4a.__all__, "course", "widgets"},
+    "s4a.course": {*course.__all__},
+    "s4a.widgets": {*widgets.__all__, "threejs"},
+    **{f"s4a.{name}": None for name in ("compare", "metrics", "statistics", "synthetic")},
+}
+
+
+def not_public(source):
+    """The names of s4a that code imports or looks up, and that are not public."""
+    found = []  # (module, name)
+    for node in ast.walk(ast.parse(re.sub(r"^ *[%!].*$", "", source, flags=re.MULTILINE))):
+        if isinstance(node, ast.Import):
+            found += [alias.name.rpartition(".")[::2] for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            found += [(node.module or "", alias.name) for alias in node.names]
+        elif isinstance(node, ast.Attribute):
+            found += [(ast.unparse(node.value), node.attr)]
+
+    def allowed(module, name):
+        names = PUBLIC.get(module, ())
+        return not name.startswith("_") if names is None else name in names
+
+    return [
+        f"{module}.{name}"
+        for module, name in found
+        if re.match(r"s4a(\.|$)", module) and (module in PUBLIC or "(" not in module)
+        if not allowed(module, name)
+    ]
+
+
 def untracked(folder):
     """Which files that a lesson wrote git would see, had it run in its own folder."""
     names = [
@@ -161,6 +196,29 @@ def test_it_is_kept_without_outputs_and_with_an_exercise_that_lets_the_others_ru
     assert all("raises-exception" in tags(notebook.cells[i]) for i in found)
 
 
+@pytest.mark.parametrize(
+    "source, names",
+    [
+        ("from s4a.method import fmap", ["s4a.method.fmap"]),
+        ("import s4a.geometry.mesh as m", ["s4a.geometry.mesh"]),
+        ("%matplotlib inline\ns4a.show.render(1)", ["s4a.show.render", "s4a.show"]),
+        ("from s4a.course.exercises import judge", ["s4a.course.exercises.judge"]),
+        ("from s4a.widgets import Modes, threejs\ns4a.synthetic.sphere(9).sizes", []),
+        ("import s4a.widgets\nfrom s4a import metrics\ns4a.widgets.Median(1).children", []),
+    ],
+)
+def test_names_that_are_not_public_are_found(source, names):
+    assert not_public(source) == names
+
+
+@each_notebook
+def test_its_code_and_its_solutions_use_public_names_only(path):
+    notebook = nbformat.read(path, as_version=4)
+    code = [cell.source for cell in notebook.cells if cell.cell_type == "code"]
+    code += dict(exercises(notebook)).values()
+    assert [name for source in code for name in not_public(source)] == []
+
+
 @each_notebook
 def test_no_slider_captures_output_for_which_a_client_may_wait_without_end(path):
     notebook = nbformat.read(path, as_version=4)
@@ -191,7 +249,7 @@ def test_it_is_read_in_a_lesson_and_in_short_sentences(path):
     text = prose(nbformat.read(path, as_version=4))
     asked = repr(quiz(lesson(path))).replace("( )", "")
     n_words = len(re.findall(r"\w[\w'’-]*", f"{text} {asked}"))
-    assert 800 <= n_words <= 1200, n_words
+    assert 600 <= n_words <= 900, n_words
     parts = re.split(r"(?<=[.:?!;])[\s*_)]+|\n\s*\n|\n(?:- |\d\. )", text)
     long = [part for part in parts if len(re.findall(r"\w[\w'’-]*", part)) > 25]
     assert long == []
