@@ -1,6 +1,6 @@
 """The pictures of README and pages, drawn anew: ``make figures``, or ``figures.py NAME ...``.
 
-The figures of the paper are drawn from the embedded collection, twelve synthetic brains of 40,000
+The figures of the paper are drawn from the bundled collection, twelve synthetic brains of 40,000
 vertices, analysed with all defaults as ``s4a demo`` does; the two panels and the scene are those of
 this study in Chromium, the scene in JupyterLab. A name is that of a picture without its ending;
 ``docs/heads.png`` is made by ``tests/benchmarks/compare.py heads``, and ``docs/structure.svg`` by
@@ -207,7 +207,7 @@ def components(study):
 
 
 def film(study, n_frames=36):
-    """The film at the top of README: the first three modes, there and back."""
+    """The film at the top of README: the first three modes, from one end to the other and back."""
     modes, path = (1, 2, 3), HERE / "modes.gif"
     return s4a.write_film(study, path, mode=modes, width=720, n_frames=n_frames, seconds=5)
 

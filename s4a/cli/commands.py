@@ -130,7 +130,7 @@ def cluster(address: str | None) -> Iterator[None]:
 
 
 def demo(args: Namespace) -> int:
-    """The whole analysis on the embedded collection, as a page.
+    """The whole analysis on the bundled collection, as a page.
 
     Its accuracy against the truth is printed.
     """

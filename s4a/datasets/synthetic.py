@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, ndtri
 
 from s4a.datasets.artifacts import soil
-from s4a.geometry.align import spread
+from s4a.geometry.align import farthest_samples
 from s4a.geometry.compiled import fpsample
 from s4a.geometry.mesh import as_arrays, as_dataset, edge_graph, edges, vertex_areas
 from s4a.input.collection import read_shapes
@@ -383,7 +383,7 @@ def _mesh(truth, shape, n_vertices, rng):
         h = min(7, int(np.log2(len(u))))  # levels of its tree, whose leaves must not be empty
         sample = fpsample.bucket_fps_kdline_sampling(x, n_vertices, h=h, start_idx=start)
     else:
-        sample = spread(x, n_vertices, start)
+        sample = farthest_samples(x, n_vertices, start)
     u = u[np.sort(sample)]
     return u, _delaunay(u)
 

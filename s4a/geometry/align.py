@@ -96,11 +96,11 @@ def farthest_points(P: np.ndarray, k: int) -> np.ndarray:
         return np.arange(len(P))
     start = int(np.argmax(((P - P.mean(0)) ** 2).sum(1)))
     if not fpsample:
-        return spread(P, k, start)
+        return farthest_samples(P, k, start)
     return fpsample.fps_sampling(P, k, start_idx=start).astype(np.int64)
 
 
-def spread(P: np.ndarray, k: int, start: int) -> np.ndarray:
+def farthest_samples(P: np.ndarray, k: int, start: int) -> np.ndarray:
     """Farthest points from the point `start` on, by comparing all; fewer where points coincide.
 
     Parameters
@@ -111,8 +111,8 @@ def spread(P: np.ndarray, k: int, start: int) -> np.ndarray:
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a.geometry.align import spread
-    >>> spread(np.array([[0.0, 0], [1, 0], [5, 0], [5, 0]]), 4, 0).tolist()
+    >>> from s4a.geometry.align import farthest_samples
+    >>> farthest_samples(np.array([[0.0, 0], [1, 0], [5, 0], [5, 0]]), 4, 0).tolist()
     [0, 2, 1]
     """
     columns = np.ascontiguousarray(P.T, float)
@@ -153,7 +153,7 @@ def many_farthest_points(P: np.ndarray, k: int, *, center: np.ndarray, seed: int
         if seed:
             opposite = P[np.argsort(-radius, kind="stable")[seed % len(P)]]
             radius = np.linalg.norm(P + opposite, axis=1)
-        return spread(P, k, int(radius.argmax()))
+        return farthest_samples(P, k, int(radius.argmax()))
     # fpsample starts at a place in a tree of its own.  So a beacon is added, far away in one more
     # dimension; it may be taken again when all others coincide with samples, but goes in any case.
     beacon = np.zeros((1, P.shape[1] + 1))

@@ -63,7 +63,7 @@ def count_crossing(X: np.ndarray, T: np.ndarray, *, most_pairs: int = MOST_PAIRS
 
 
 def can_count(asked: bool) -> bool:
-    """Whether triangles that cross are counted: if `asked`, and libigl is there, or it warns.
+    """Return `asked`, or False with a warning where libigl is missing.
 
     Examples
     --------

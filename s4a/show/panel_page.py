@@ -144,6 +144,8 @@ class Recording:
         }
         self.values, self.place, self.size = [], {}, 0
         with ExitStack() as silence:
+            panel.recording = True
+            silence.callback(setattr, panel, "recording", False)
             # the notebook's browser is told of the end only, which is the beginning
             for widget in self.widgets:
                 silence.enter_context(widget.hold_sync())
@@ -190,10 +192,10 @@ class Recording:
         """
         controls = [self.controls[name] for name in names]
         orders = [control.order() for control in reversed(controls)]
-        states, start = {}, self.size
+        states = {}
         total = math.prod(map(len, orders))
         for places in tqdm(itertools.product(*orders), total=total, desc="page", leave=False):
-            if self.size > limit and self.size > start:
+            if states and self.size >= limit:
                 break
             places = places[::-1]
             for control, place in zip(controls, places, strict=True):

@@ -165,7 +165,7 @@ def write_film(
     n_frames: int = 48,
     seconds: float = 4.0,
 ) -> Path:
-    """Write a film with titles and colour bar: modes of a study there and back, or one turn.
+    """Write a film with titles and colour bar: modes of a study to both ends, or one turn.
 
     Parameters
     ----------
@@ -218,9 +218,11 @@ def write_film(
     """
     path = _checked(path, FILMS, width)
     draw, axis, together = _source(what, mode, values, label, view, up)
-    if n_frames < 2 or not (turn or together):
+    if n_frames < 2:
+        raise ValueError(f"n_frames needs at least 2, found {n_frames}")
+    if not (turn or together):
         raise ValueError(
-            f"a film needs n_frames of at least 2, found {n_frames}, and a study whose modes move; "
+            f"a study whose modes move is needed, found {type(what).__name__}; "
             "a mesh or a panel is filmed with turn=True"
         )
 
@@ -237,9 +239,11 @@ def write_film(
     ]
     if path.suffix == ".gif":
         pictures = _few_colors(pictures)
+    # ms; GIF has hundredths of a second, and the rounded ones add up to all seconds
+    ends = 10 * np.round(100 * seconds * np.arange(n_frames + 1) / n_frames).astype(int)
     pictures[0].save(
         path, FILMS[path.suffix], save_all=True, append_images=pictures[1:],
-        duration=round(1000 * seconds / n_frames), loop=0,
+        duration=np.diff(ends).tolist(), loop=0,
     )  # fmt: skip
     return path
 
@@ -278,6 +282,10 @@ def _source(what, mode, values, label, view, up):
     cells = []
     if isinstance(what, xr.Dataset) and "corner_vertex" in what:
         X, T = as_arrays(what)
+        if values is not None and len(values) != len(X):
+            raise ValueError(
+                f"values need one row for each of the {len(X)} vertices, found {len(values)}"
+            )
         cells.append(Cell("", X @ R.T, T, *_painted(values, label)))
     elif hasattr(what, "comm"):  # a widget
         cells, axis = list(_views(what)), np.array([0.0, 1, 0])
@@ -293,7 +301,7 @@ def _modes(study, mode, view, up):
     """What draws modes, one a row, at scores, one a column."""
     share = study["pca"]["explained_variance_ratio"].values
     modes = np.arange(1, 1 + min(N_MODES, len(share))) if mode is None else np.atleast_1d(mode)
-    if modes.min() < 1 or modes.max() > len(share):
+    if not len(modes) or modes.min() < 1 or modes.max() > len(share):
         raise ValueError(f"mode needs 1 to {len(share)}, found {mode}")
     mean, T, steps = mode_arrays(study, n_modes=max(N_MODES, modes.max()))
     along = normal_displacement(steps, vertex_normals(mean, T))
@@ -328,6 +336,8 @@ def _views(widget):
     """The surfaces that a panel shows, from where they are seen first."""
     from s4a.show.panel_page import widgets_in
 
+    if hasattr(widget, "tabs"):  # of explore: the one that is seen
+        widget = widget.tabs.children[widget.tabs.selected_index or 0]
     for part in widgets_in(widget):
         drawn = part.drawn() if hasattr(part, "drawn") else None
         if drawn is not None and part.layout.display != "none":

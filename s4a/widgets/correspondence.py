@@ -241,17 +241,17 @@ class Correspondence(Panel):
         return (colors[match], colors), coordinates, None, caption
 
     def registered_look(self) -> tuple:
-        """The same of the registration: the source's, carried to the shape."""
+        """The same of the registration: the source's, transferred to the shape."""
         X, value = self.pair[0][0], self.confidence()
         colors, coordinates, bar = position_colors(X), (None, None), None
-        caption = f"the coordinates of {self.on_left}, carried to the shape"
+        caption = f"the coordinates of {self.on_left}, transferred to the shape"
         caption += "" if self.from_template else " by way of the template"
         if self.colors.value == "confidence" and value is None:
             caption = f"the confidence belongs to the registration of the template; here {caption}"
         elif self.colors.value == "confidence":
             colors = ramp_colors(value, 0, 1)
             bar = color_scale("viridis", 0, 1, f"confidence, {value.mean():.2f} on average")
-            caption = "the registration's confidence, carried to the shape"
+            caption = "the registration's confidence, transferred to the shape"
         if self.colors.value == "checker":
             carried = self.carried(X)
             coordinates = X, None if carried is None else np.nan_to_num(carried)

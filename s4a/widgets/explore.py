@@ -58,13 +58,13 @@ class Explore(OfKernel):
     panels : dict
         Title of the tab -> panel, of those that were opened.
     pair : tuple of str
-        Source and target of the map that is chosen in all tabs, ("", "") for none.
+        Source and target of the map that is chosen in all tabs, ("", "") for none.  *Network* and
+        *Functional map* stay as they are where the network has no such map.
     shape : str
         The shape that is chosen in all tabs, at first the median; "" for none.
     """
 
     title = "Panels of a study"
-    page = 'panels["Modes"].save_html("modes.html")'
     pair = traitlets.Tuple(("", ""))
     shape = traitlets.Unicode("")
 
@@ -81,6 +81,12 @@ class Explore(OfKernel):
         self.observe(lambda _: self.give(), ["pair", "shape"])
         self.fill()
         self.cell = None  # at whose next run they close
+
+    @property
+    def page(self) -> str:
+        """What writes a page of the first tab."""
+        title = next(iter(self.kinds))
+        return f'panels["{title}"].save_html("{title.lower()}.html")'
 
     def close_with(self, cell: str) -> None:
         """Close when the cell of the notebook is run again, so that nothing piles up."""
@@ -118,6 +124,8 @@ class Explore(OfKernel):
 
     def take(self, panel: Panel) -> None:
         """Choose for all tabs what is chosen in a panel."""
+        if panel.recording:  # its values are gone through, and nothing is chosen
+            return
         found = panel.selection()
         with self.hold_trait_notifications():  # told together: a panel shows a pair or a shape
             self.pair = found.get("pair", self.pair)
@@ -139,6 +147,7 @@ class Explore(OfKernel):
     def extend(self, study: xr.DataTree) -> None:
         """Show what a newer state of the study has more; panels that are open stay as they are."""
         self.study = study
+        self.shape = self.shape or attribute(study, "latent", "median")
         self.reasons.clear()
         self.fill()
 

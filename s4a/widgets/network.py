@@ -134,7 +134,7 @@ class Network(Panel):
             places = network_places(self.study, names)
         return charts.on_circle(len(names)) if places is None else places
 
-    def drawn(self, pairs: np.ndarray) -> np.ndarray:
+    def drawn_shapes(self, pairs: np.ndarray) -> np.ndarray:
         """The shapes that the graph of some pairs shows, by their numbers in `names` ``(n,)``."""
         if len(self.names) <= MOST:
             return np.arange(len(self.names))
@@ -155,7 +155,7 @@ class Network(Panel):
         pairs = self.budgeted()
         allowed = {tuple(pair) for pair in pairs.tolist()}
         self.allowed = [i for i, pair in enumerate(self.pairs) if pair in allowed]
-        drawn = self.drawn(pairs)
+        drawn = self.drawn_shapes(pairs)
         names = [self.names[i] for i in drawn]
         place = np.full(len(self.names), -1)
         place[drawn] = np.arange(len(drawn))

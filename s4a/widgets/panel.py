@@ -176,6 +176,7 @@ class Panel(OfKernel):
     every = ()  # sliders of which it keeps every value, and not only two dozen of them
     python = ()  # what else needs Python
     shares = ()  # traits that say which pair or shape is chosen in it, for the other tabs
+    recording = False  # while a saved page goes through the values of its controls
 
     def __init__(
         self,

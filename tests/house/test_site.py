@@ -101,7 +101,7 @@ def test_a_page_shows_the_first_panel_of_a_study_that_has_no_modes(tmp_path):
     assert any('class="panel"' in part and 'title="Structures"' in part for part in html)
 
 
-def test_every_panel_of_a_page_works_without_a_kernel_and_from_plain_files(browser, tmp_path):
+def test_two_panels_of_a_page_work_without_a_kernel_and_from_plain_files(browser, tmp_path):
     offline = benchmark("offline")
     two = f"panels = s4a.widgets.explore.PANELS\nfor title in {SLOW}: del panels[title]"
     parts = shown([SMALL, two, "s4a.explore(study)"], tmp_path)

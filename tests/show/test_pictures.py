@@ -100,7 +100,39 @@ def test_a_panel_is_drawn_as_it_stands_without_a_browser(tmp_path):
     panel.close()
 
 
-def test_a_film_of_a_mode_goes_there_and_back(study, tmp_path):
+def test_every_panel_with_a_surface_is_drawn_and_of_tabs_the_one_that_is_seen(tmp_path):
+    panels = pytest.importorskip("s4a.widgets.explore")
+    tabs = panels.explore(s4a.synthetic.example_study())
+    sizes = []
+    for title in panels.PANELS:
+        panel = tabs[title]
+        for what in (panel, tabs):
+            path = s4a.write_picture(what, tmp_path / "a.png", width=200)
+            with Image.open(path) as picture:
+                sizes.append(picture.size)
+    assert sizes[::2] == sizes[1::2]
+    tabs.close()
+
+
+def test_values_of_another_mesh_are_refused(tmp_path):
+    mesh = s4a.synthetic.brains(1, 300)["original/brain_01"].to_dataset()
+    n = mesh.sizes["vertex"]
+    with pytest.raises(ValueError, match=f"each of the {n} vertices, found 3"):
+        s4a.write_picture(mesh, tmp_path / "a.png", values=np.arange(3))
+
+
+@pytest.mark.parametrize("n_frames", [7, 48])
+def test_a_film_takes_its_seconds(study, tmp_path, n_frames):
+    path = s4a.write_film(study, tmp_path / "a.gif", n_frames=n_frames, width=100, seconds=4)
+    with Image.open(path) as film:
+        total = 0
+        for i in range(film.n_frames):
+            film.seek(i)
+            total += film.info["duration"]
+    assert total == 4000
+
+
+def test_a_film_of_a_mode_goes_to_both_ends_and_back(study, tmp_path):
     path = s4a.write_film(study, tmp_path / "a.gif", mode=1, n_frames=6, width=120, seconds=3)
     with Image.open(path) as film:
         assert film.n_frames == 6

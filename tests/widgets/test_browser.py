@@ -1370,7 +1370,7 @@ def test_the_page_of_methods_marks_a_place_in_all_views(offline, compared, tmp_p
 def test_the_page_of_a_transfer_says_what_needs_python(offline, study, tmp_path):
     page, errors = opened(offline, saved(widgets.Transfer(study), tmp_path / "transfer.html"))
     page.wait_for_function(DRAWN)
-    assert "placing landmarks" in page.locator(".note").inner_text()
+    assert "placing landmarks" in page.locator(".note:not(#not-kept)").inner_text()
     chosen(page, "target", "brain_05")
     visible(page, ".s4a-title").filter(has_text="brain_05, the target").wait_for()
     page.wait_for_selector("text=Landmarks on brain_05")

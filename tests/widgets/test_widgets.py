@@ -824,6 +824,15 @@ def test_every_pair_of_a_network_is_shown_by_all_tabs_without_a_loop(study):
     tabs.close()
 
 
+def test_a_page_of_one_panel_chooses_nothing_in_the_other_tabs(study, tmp_path):
+    tabs = Explore(study)
+    network = tabs["Network"]
+    chosen = tabs.pair, tabs.shape
+    network.save_html(tmp_path / "network.html", limit=100_000)
+    assert (tabs.pair, tabs.shape) == chosen
+    tabs.close()
+
+
 def test_a_shape_is_chosen_in_all_tabs(study):
     tabs = Explore(study)
     spectrum = tabs["Spectrum"]

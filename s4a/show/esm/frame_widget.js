@@ -8,7 +8,7 @@ function askKernel(model, el) {
   const asked = Date.now(), working = ["busy", "starting", "restarting", "autorestarting"];
   const note = html(el, "div", { role: "status", hidden: "", style: "flex: 1" }, "Python does not answer: this panel is interactive with a running kernel; its save_html writes a page that works without one.");
   const wait = setInterval(() => { note.hidden = working.includes(model.widget_manager?.kernel?.status); }, PATIENCE);
-  const heard = () => { if (model.get("heard") === asked) end(); };
+  const heard = () => { if (model.get("heard") >= asked) end(); };
   const end = () => { clearInterval(wait); note.remove(); model.off("change:heard", heard); };
   model.on("change:heard", heard);
   model.set("asked", asked);
