@@ -21,7 +21,7 @@ new shapes, parts         :func:`insert`, :func:`complete`
 6.2 transfer              :func:`transfer_labels`, :func:`transfer_landmarks`,
                           :func:`transfer_scalars`, :func:`register_pairs`, :func:`with_field`
 for other programs        :func:`write_for`, :func:`write_registered`, :func:`write_training_set`
-the bundled collection   :mod:`s4a.synthetic`
+the bundled collection    :mod:`s4a.synthetic`
 ========================  ====================================================================
 
 They and the modules of the rooms (``s4a.method.fmap``) are imported when they are first used.
