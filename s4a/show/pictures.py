@@ -140,7 +140,7 @@ def write_picture(
     """
     path = _checked(path, (".png",), width)
     draw, _, together = _source(what, mode, values, label, view, up)
-    scores = np.atleast_1d(score)
+    scores = _numbers("score", score)
     cells = draw(scores)
     columns = len(scores) if together else len(cells)
     frames = _frames([cells], together)
@@ -218,8 +218,11 @@ def write_film(
     """
     path = _checked(path, FILMS, width)
     draw, axis, together = _source(what, mode, values, label, view, up)
-    if n_frames < 2:
-        raise ValueError(f"n_frames needs at least 2, found {n_frames}")
+    _whole("n_frames", n_frames, 2, 10_000)
+    for name, given in (("score", score), ("reach", reach), ("seconds", seconds)):
+        if _numbers(name, given).size > 1 or (name == "seconds" and given < 0.01 * n_frames):
+            more = f", at least 0.01 for each of {n_frames} frames" if name == "seconds" else ""
+            raise ValueError(f"{name} needs one number{more}, found {given!r}")
     if not (turn or together):
         raise ValueError(
             f"a study whose modes move is needed, found {type(what).__name__}; "
@@ -237,12 +240,12 @@ def write_film(
         _sheet(shown, frames, len(shown), width, title, False).convert("RGB")
         for shown in map(cells, range(n_frames))
     ]
-    if path.suffix == ".gif":
+    if path.suffix.lower() == ".gif":
         pictures = _few_colors(pictures)
     # ms; GIF has hundredths of a second, and the rounded ones add up to all seconds
     ends = 10 * np.round(100 * seconds * np.arange(n_frames + 1) / n_frames).astype(int)
     pictures[0].save(
-        path, FILMS[path.suffix], save_all=True, append_images=pictures[1:],
+        path, FILMS[path.suffix.lower()], save_all=True, append_images=pictures[1:],
         duration=np.diff(ends).tolist(), loop=0,
     )  # fmt: skip
     return path
@@ -251,12 +254,27 @@ def write_film(
 def _checked(path: Path | str, endings: Iterable[str], width: int) -> Path:
     """The path, if such a file can be written."""
     path = Path(path)
-    if path.suffix not in endings:
+    if path.suffix.lower() not in endings:
         more = "; a panel's Save film writes WebM" if path.suffix == ".webm" else ""
         raise ValueError(f"the file has to end in {' or '.join(endings)}, found {path.name}{more}")
-    if not 100 <= width <= WIDEST:
-        raise ValueError(f"width needs 100 to {WIDEST} pixels, found {width}")
+    _whole("width (pixels)", width, 100, WIDEST)
+    if not path.parent.is_dir():
+        raise ValueError(f"the folder {path.parent} is not there: make it, or give another path")
     return path
+
+
+def _whole(name, given, low, high):
+    """ValueError unless it is a whole number within both ends."""
+    if not isinstance(given, int | np.integer) or not low <= given <= high:
+        raise ValueError(f"{name} needs a whole number from {low} to {high}, found {given!r}")
+
+
+def _numbers(name, given, least=1):
+    """Finite numbers as an array, at least so many of them."""
+    numbers = np.atleast_1d(given)
+    if numbers.dtype.kind not in "iuf" or numbers.size < least or not np.isfinite(numbers).all():
+        raise ValueError(f"{name} needs a finite number, found {given!r}")
+    return numbers
 
 
 def _few_colors(pictures: list[Image.Image]) -> list[Image.Image]:
@@ -282,9 +300,10 @@ def _source(what, mode, values, label, view, up):
     cells = []
     if isinstance(what, xr.Dataset) and "corner_vertex" in what:
         X, T = as_arrays(what)
-        if values is not None and len(values) != len(X):
+        if values is not None and np.shape(values) not in ((len(X),), (len(X), 3)):
             raise ValueError(
-                f"values need one row for each of the {len(X)} vertices, found {len(values)}"
+                f"values need a number or a colour (r, g, b) for each of the {len(X)} vertices, "
+                f"found an array of shape {np.shape(values)}"
             )
         cells.append(Cell("", X @ R.T, T, *_painted(values, label)))
     elif hasattr(what, "comm"):  # a widget
@@ -301,8 +320,12 @@ def _modes(study, mode, view, up):
     """What draws modes, one a row, at scores, one a column."""
     share = study["pca"]["explained_variance_ratio"].values
     modes = np.arange(1, 1 + min(N_MODES, len(share))) if mode is None else np.atleast_1d(mode)
-    if not len(modes) or modes.min() < 1 or modes.max() > len(share):
-        raise ValueError(f"mode needs 1 to {len(share)}, found {mode}")
+    if (
+        modes.dtype.kind not in "iu"
+        or not len(modes)
+        or not 1 <= min(modes) <= max(modes) <= len(share)
+    ):
+        raise ValueError(f"mode needs whole numbers from 1 to {len(share)}, found {mode!r}")
     mean, T, steps = mode_arrays(study, n_modes=max(N_MODES, modes.max()))
     along = normal_displacement(steps, vertex_normals(mean, T))
     limits, R = mode_limits(study), rotation(view, up)

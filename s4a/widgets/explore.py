@@ -72,7 +72,8 @@ class Explore(OfKernel):
         self.study, self.options, self.panels = study, options, {}
         self.reasons = {}  # title of the tab -> why it has no panel
         self.kinds = OF_SEVERAL if "structures" in study.children else PANELS
-        boxes = [ipywidgets.VBox() for _ in self.kinds]
+        later = PARTS.message("This tab is filled by a running kernel when it is opened.")
+        boxes = [ipywidgets.VBox([ipywidgets.HTML(later)]) for _ in self.kinds]
         self.tabs = ipywidgets.Tab(children=boxes, titles=list(self.kinds))
         self.tabs.add_class("s4a-tabs")  # in style.css
         super().__init__([self.tabs], layout=layout_of(width))

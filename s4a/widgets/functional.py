@@ -10,7 +10,7 @@ from s4a.show.browser import PARTS
 from s4a.show.surfaces import low_text, surface
 from s4a.widgets.chart import DIRECTION, Chart
 from s4a.widgets.panel import WIDE, Panel, beside, check, dropdown, int_slider, row
-from s4a.widgets.scene import Scene, camera_group
+from s4a.widgets.scene import Scene, camera_group, signed_limit
 
 STEP = 5
 KINDS = [
@@ -158,7 +158,12 @@ class FunctionalMap(Panel):
         self.matrix.spec = self.matrix.spec | {"row": cell[0], "column": cell[1]}
         modes = (("source φ", cell[1]), ("target ψ", cell[0]))
         shapes = zip(self.scenes, self.meshes, self.names(), strict=True)
-        for (role, mode), (scene, mesh, name) in zip(modes, shapes, strict=True):
+        each = [
+            mesh["eigenfunction"].values[:, mode]
+            for mesh, (_, mode) in zip(self.meshes, modes, strict=True)
+        ]
+        limit = max(map(signed_limit, each))
+        for (role, mode), (scene, mesh, name), values in zip(modes, shapes, each, strict=True):
             eigenvalue = mesh["eigenvalue"].values[mode]
             scene.title = f"{role}{mode} on {name}, eigenvalue {eigenvalue:.2f}"
-            scene.paint_function(mesh["eigenfunction"].values[:, mode], "eigenfunction")
+            scene.paint_function(values, "eigenfunction", limit)

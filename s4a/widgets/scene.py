@@ -51,6 +51,19 @@ def round_number(x: float) -> float:
     return float(power * max(m for m in (1, 2, 5) if m * power <= x * (1 + 1e-9)))
 
 
+def signed_limit(values: np.ndarray) -> float:
+    """The size at which the colours of a signed function ``(n,)`` are full: its 99 % quantile.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.widgets.scene import signed_limit
+    >>> signed_limit(np.array([-2.0, 2.0]))
+    2.0
+    """
+    return float(np.quantile(np.abs(values), 0.99))
+
+
 def camera_group() -> str:
     """A name that no other panel has: the views of one panel turn together, those of two do not."""
     return uuid4().hex
@@ -202,9 +215,9 @@ class Scene(View):
             self._send_colors(colors, coordinates, cell)
         self.draw_still()
 
-    def paint_function(self, values: np.ndarray, label: str) -> None:
-        """A signed function ``(n,)`` as colours, full at the 99 % quantile of what it reaches."""
-        limit = float(np.quantile(np.abs(values), 0.99))
+    def paint_function(self, values: np.ndarray, label: str, limit: float | None = None) -> None:
+        """A signed function ``(n,)`` as colours, full at `limit` or :func:`signed_limit`."""
+        limit = signed_limit(values) if limit is None else limit
         self.paint(signed_colors(values, limit), color_scale(SIGNED, -limit, limit, label))
 
     def _send_colors(self, colors, coordinates, cell):

@@ -97,14 +97,15 @@ class Spectrum(Panel):
             "dash": "6 4",
             "wide": True,
             "legend": True,
+            "reference": True,
         }
         look = {"xlabel": "mode k", "marker": self.mode.value}
         some = self.names[:: -(-len(self.names) // MOST)]  # of equal distances in the list
-        last = [*(name for name in some if name != self.shape), self.shape]  # the chosen one on top
+        some = some if self.shape in some else [*some, self.shape]
         part = "" if len(some) == len(self.names) else f" ({len(some)} of {len(self.names):,})"
         self.curves.draw(
             "lines",
-            series=[line | {"y": law}, *(self.curve(name, 0 * law) for name in last)],
+            series=[line | {"y": law}, *(self.curve(name, 0 * law) for name in some)],
             title=f"Eigenvalues: click a curve{part}",
             ylabel="eigenvalue, unit area",
             legend="bottom",
@@ -112,7 +113,7 @@ class Spectrum(Panel):
         )
         self.gaps.draw(
             "lines",
-            series=[line | {"y": 0 * law}, *(self.curve(name, law) for name in last)],
+            series=[line | {"y": 0 * law}, *(self.curve(name, law) for name in some)],
             title="The same, less Weyl's law",
             ylabel="eigenvalue − 4 π k",
             legend="left",

@@ -36,6 +36,15 @@ function onRoom(parent, act) {
   return () => observer.disconnect();
 }
 
+// As many ticks as their texts have room for side by side.
+function fewer(range, room) {
+  for (let count = 6; count > 1; count--) {
+    const found = ticks(...range, count), wide = 7 * Math.max(...found.map((t) => short(t).length)) + 6;
+    if (wide * (found.length - 1) <= room || found.length < 3) return found;
+  }
+  return ticks(...range, 1);
+}
+
 // A drawing of the given size with both axes; gives the scales.
 function plot(parent, { width, height, x, y, xlabel = "", ylabel = "", title = "", left = 48, grid = true }) {
   const svg = node(parent, "svg", { viewBox: `0 0 ${width} ${height}`, class: "s4a-chart", role: "group", "aria-label": title });
@@ -44,7 +53,7 @@ function plot(parent, { width, height, x, y, xlabel = "", ylabel = "", title = "
   const X = (v) => left + ((v - x[0]) / (x[1] - x[0])) * (right - left);
   const Y = (v) => bottom - ((v - y[0]) / (y[1] - y[0])) * (bottom - top);
   if (title) node(svg, "text", { x: Math.max(0, Math.min(left, width - 7.2 * title.length)), y: 14, "font-weight": "bold" }, title);
-  for (const t of ticks(...x, 6)) {
+  for (const t of fewer(x, right - left)) {
     if (grid) node(svg, "line", { x1: X(t), x2: X(t), y1: top, y2: bottom, stroke: FAINT });
     node(svg, "text", { x: X(t), y: bottom + 14, "text-anchor": "middle" }, short(t));
   }
@@ -167,12 +176,13 @@ function lines(parent, spec, pick) {
   const frame = plot(parent, { width, height, x: bounds(series.flatMap((s) => s.x), 0.02), y: [ymin ?? y[0], y[1]], xlabel, ylabel, title });
   const drawn = series.map((s) => {
     const d = s.x.map((v, i) => `${i ? "L" : "M"}${frame.X(v).toFixed(1)} ${frame.Y(s.y[i]).toFixed(1)}`).join("");
-    node(frame.svg, "path", { d, fill: "none", stroke: s.color || BLUE, "stroke-width": s.wide ? 2.5 : 1.2, "stroke-dasharray": s.dash || "", "pointer-events": "none" });
+    const path = node(frame.svg, "path", { d, fill: "none", stroke: s.color || BLUE, "stroke-width": s.wide ? 2.5 : 1.2, "stroke-dasharray": s.dash || "", "pointer-events": "none" });
     const at = node(frame.svg, "g", { fill: s.color || BLUE, class: "s4a-series" });
     node(at, "path", { d, fill: "none", stroke: "transparent", "stroke-width": 9 });
     if (s.dots) s.x.forEach((v, i) => node(at, "circle", { cx: frame.X(v), cy: frame.Y(s.y[i]), r: 3.2 }));
-    return { at, value: { series: s.name }, text: s.text || s.name };
+    return { path, at, chosen: s.wide, reference: s.reference, value: { series: s.name }, text: s.text || s.name };
   });
+  for (const { path, at, chosen } of drawn) if (chosen) frame.svg.append(path, at); // over the others
   const told = series.filter((s) => s.legend), below = Boolean(spec.legend);
   told.forEach((s, i) => {
     const x0 = spec.legend === "bottom" ? frame.right - 130 : frame.left + 10, y0 = below ? frame.bottom - 15 * (told.length - i) : frame.top + 10 + 15 * i;
@@ -180,7 +190,7 @@ function lines(parent, spec, pick) {
     node(frame.svg, "text", { x: x0 + 30, y: y0 + 4, class: "s4a-halo" }, s.name);
   });
   if (marker !== undefined) node(frame.svg, "line", { x1: frame.X(marker), x2: frame.X(marker), y1: frame.top, y2: frame.bottom, stroke: ORANGE, "stroke-width": 2 });
-  reachable(drawn, line(parent), pick);
+  reachable(drawn.filter((mark) => !mark.reference), line(parent), pick);
 }
 
 function graph(parent, spec, pick) {

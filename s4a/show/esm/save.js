@@ -63,20 +63,26 @@ async function film(views, width, kind, motion, told) {
     };
     return gif({ width, height, n, hundredths: (100 * SECONDS) / n, frame });
   }
-  // a browser records what it sees: as many pictures as can be drawn in that time
-  const recorder = new MediaRecorder(canvas.captureStream(), { mimeType: "video/webm", videoBitsPerSecond: 12e6 }), parts = [];
+  // a browser records what it sees, in time: the pictures are drawn before
+  const n = 50, pictures = [], on = canvas.getContext("2d"), parts = [];
+  for (let i = 0; i <= n; i++) {
+    told(i / n);
+    pictures.push(await createImageBitmap(draw(i / n)));
+    await later(0);
+  }
+  const recorder = new MediaRecorder(canvas.captureStream(), { mimeType: "video/webm", videoBitsPerSecond: 12e6 });
   recorder.ondataavailable = ({ data }) => parts.push(data);
   const ended = new Promise((done) => (recorder.onstop = done));
   recorder.start();
-  const start = performance.now();
   try {
-    for (let share = 0; share < 1; share = (performance.now() - start) / (1000 * SECONDS)) {
-      told(share);
-      draw(share);
-      await later(20);
+    for (const picture of pictures) {
+      on.drawImage(picture, 0, 0);
+      await later((1000 * SECONDS) / n);
     }
+    await later(1200); // the last one is on its way
   } finally {
     recorder.stop();
+    pictures.forEach((picture) => picture.close());
   }
   await ended;
   return new Blob(parts, { type: "video/webm" });
@@ -106,7 +112,7 @@ function saving(view) {
   };
   const widths = (most) => [600, 800, 1200, 1920, 2560, 3840].filter((w) => w <= most).map((w) => [w, `${w} pixels${w === 3840 ? " (4K)" : ""}`]);
   const which = all.length > 1 && choice(html(box, "p"), "surfaces", [["one", view.heading() || "this one"], ["all", `all ${all.length}, side by side`]]);
-  const views = () => (which && which.value === "all" ? all : [view]), name = (end) => `${views()[0].heading().toLowerCase().replace(/[^\p{L}\p{N}]+/gu, "-").replace(/^-|-$/g, "") || "surface"}.${end}`;
+  const views = () => (which && which.value === "all" ? all : [view]), name = (end, of = "") => `${(of || views()[0].heading()).toLowerCase().replace(/−/g, "minus ").replace(/\+/g, "plus ").replace(/[^\p{L}\p{N}]+/gu, "-").replace(/^-|-$/g, "") || "surface"}.${end}`;
   if (which && !view.alone) which.value = "all";
 
   const still = part("Picture (PNG)"), width = choice(still, "width", widths(3840)), ground = choice(still, "ground", [["#fff", "white"], ["", "transparent"]]);
@@ -143,7 +149,7 @@ function saving(view) {
       if (!box.open || !view.box.isConnected) throw new Error("the dialog was closed");
       told.textContent = `${Math.round(100 * share)} %`;
     });
-    return [made, name(end)];
+    return [made, name(end, slides ? slider.name : "")];
   });
   html(box, "button", { type: "button" }, "Close").addEventListener("click", () => box.close());
   box.addEventListener("close", () => box.remove());
