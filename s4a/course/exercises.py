@@ -263,7 +263,7 @@ EXERCISES = {
         lambda C, C_mirror: (
             lambda modes: sorted(modes) == [i for i in range(1, 9) if C[i, i] * C_mirror[i, i] < 0]
         ),
-        "an odd mode has diagonal entries of opposite sign in the two matrices",
+        "an odd eigenfunction has diagonal entries of opposite sign in the two matrices",
     ),
     "05.1": Exercise(lambda: 17, "once before each growth of C, and once for the final C", 0),
     "05.2": Exercise(
