@@ -428,7 +428,7 @@ def test_nothing_is_said_or_marked_of_the_shape_before(page):
     marks = f"{SEEN}.map((view) => view.points.length).join()"
     for name in (one, other):
         shapes.select_option(name)
-        said.filter(has_text="carried to the shape").nth(1).wait_for()
+        said.filter(has_text="transferred to the shape").nth(1).wait_for()
         page.wait_for_function(f"{marks} === '0,0'")
         cursor(canvas, "ArrowUp")
         said.filter(has_text=f"↔ {name} vertex").nth(1).wait_for()

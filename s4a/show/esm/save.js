@@ -71,15 +71,19 @@ async function film(views, width, kind, motion, told) {
     await later(0);
   }
   const recorder = new MediaRecorder(canvas.captureStream(), { mimeType: "video/webm", videoBitsPerSecond: 12e6 });
-  recorder.ondataavailable = ({ data }) => parts.push(data);
+  let bytes = 0;
+  recorder.ondataavailable = ({ data }) => { parts.push(data); bytes += data.size; };
   const ended = new Promise((done) => (recorder.onstop = done));
-  recorder.start();
+  recorder.start(200);
   try {
     for (const picture of pictures) {
       on.drawImage(picture, 0, 0);
       await later((1000 * SECONDS) / n);
     }
-    await later(1200); // the last one is on its way
+    for (let before = -1, tries = 0; (before < bytes || !bytes) && tries < 20; tries++) { // until the last one is encoded, which may be late
+      before = bytes;
+      await later(1200);
+    }
   } finally {
     recorder.stop();
     pictures.forEach((picture) => picture.close());
