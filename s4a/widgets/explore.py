@@ -128,7 +128,7 @@ class Explore(OfKernel):
         if panel.recording:  # its values are gone through, and nothing is chosen
             return
         found = panel.selection()
-        with self.hold_trait_notifications():  # told together: a panel shows a pair or a shape
+        with self.hold_trait_notifications():  # sent together: a panel shows a pair or a shape
             self.pair = found.get("pair", self.pair)
             self.shape = found.get("shape") or self.shape
 

@@ -20,7 +20,7 @@ KINDS = [
 WHICH = "made consistent with the maps among all shapes, or by ZoomOut of this pair alone"
 ROW = "row of the matrix: the eigenfunction of the target that is shown"
 COLUMN = "column of the matrix: the eigenfunction of the source that is shown"
-TOLD = 3  # exchanged runs of eigenfunctions that are told in words
+MOST = 3  # exchanged runs of eigenfunctions that are named in words
 
 
 class FunctionalMap(Panel):
@@ -142,10 +142,10 @@ class FunctionalMap(Panel):
         )
         values = self.meshes[0]["eigenvalue"].values
         runs = [f"{a}–{b} (eigenvalues {values[a]:.1f}–{values[b]:.1f})" for a, b in blocks]
-        more = f" and {len(runs) - TOLD} more" if len(runs) > TOLD else ""
+        more = f" and {len(runs) - MOST} more" if len(runs) > MOST else ""
         swapped = "No swapped blocks."
         if runs:
-            runs = ", ".join(runs[:TOLD])
+            runs = ", ".join(runs[:MOST])
             swapped = f"Exchanged among each other, framed: eigenfunctions {runs}{more}."
         self.numbers.value = PARTS.paragraph(
             f"off the diagonal {off_diagonal_mass(C):.1%} of the squared entries; "

@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from paths import benchmark
+from test_browser import browser, driver  # noqa: F401, fixtures are found by their names
 
 from s4a.show.browser import FRAME
 
@@ -70,20 +70,8 @@ window.ready = true;
 </script>"""
 
 
-@pytest.fixture(scope="module")
-def browser():
-    playwright = pytest.importorskip("playwright.sync_api")
-    chromium = benchmark("chromium")
-    if chromium.PATH is None:
-        pytest.skip(chromium.LACKS)
-    with playwright.sync_playwright() as driver:
-        browser = chromium.launched(driver)
-        yield browser
-        browser.close()
-
-
 @pytest.fixture
-def framed(browser):
+def framed(browser):  # noqa: F811
     """Opens a frame in a page whose time is ours."""
     page = browser.new_page()
     page.clock.install()
@@ -132,7 +120,7 @@ def test_python_answers_what_it_is_asked(study):
     panel.close()
 
 
-def test_a_click_on_what_a_saved_page_did_not_keep_says_so(browser, study, tmp_path):
+def test_a_click_on_what_a_saved_page_did_not_keep_says_so(browser, study, tmp_path):  # noqa: F811
     panel = widgets.Median(study)
     path = panel.save_html(tmp_path / "median.html", limit=0)
     panel.close()

@@ -51,13 +51,13 @@ function sheet(views, { width, ground = "#fff", angle = 0, score = null }, canva
 }
 
 // A film of views: `motion` takes the share of it that is over, from 0 to 1.
-async function film(views, width, kind, motion, told) {
+async function film(views, width, kind, motion, progress) {
   const canvas = sheet(views, { width, ...motion(0) }), later = (ms) => new Promise((done) => setTimeout(done, ms));
   const draw = (share) => sheet(views, { width, ...motion(share) }, canvas);
   if (kind === "gif") {
     const n = 50, { height } = canvas;
     const frame = async (i) => {
-      told(i / n);
+      progress(i / n);
       await later(0);
       return draw(i / n).getContext("2d").getImageData(0, 0, width, height).data;
     };
@@ -66,7 +66,7 @@ async function film(views, width, kind, motion, told) {
   // a browser records what it sees, in time: the pictures are drawn before
   const n = 50, pictures = [], on = canvas.getContext("2d"), parts = [];
   for (let i = 0; i <= n; i++) {
-    told(i / n);
+    progress(i / n);
     pictures.push(await createImageBitmap(draw(i / n)));
     await later(0);
   }
@@ -124,7 +124,7 @@ function saving(view) {
   const moving = part("Film"), wide = choice(moving, "width", widths(1920));
   const kind = choice(moving, "format", [["gif", "GIF"], ...(WEBM ? [["webm", "WebM"]] : [])]);
   const motion = choice(moving, "motion", [...(slider ? [["slider", slider.name]] : []), ["turn", "one turn"]]);
-  const told = html(box, "output", { role: "status" }), buttons = [];
+  const progress = html(box, "output", { role: "status" }), buttons = [];
   const button = (row, text, act) => {
     const it = html(row, "button", { type: "button" }, text);
     buttons.push(it);
@@ -134,9 +134,9 @@ function saving(view) {
         const [blob, file] = await act();
         if (!box.open) return;
         download(blob, file);
-        told.textContent = `saved: ${file}, ${(blob.size / 1e6).toFixed(1)} MB`;
+        progress.textContent = `saved: ${file}, ${(blob.size / 1e6).toFixed(1)} MB`;
       } catch (error) {
-        told.textContent = `not saved: ${error.message}`;
+        progress.textContent = `not saved: ${error.message}`;
       }
       buttons.forEach((one) => (one.disabled = false));
     });
@@ -151,7 +151,7 @@ function saving(view) {
     const end = kind.value, shown = views();
     const made = await film(shown, Number(wide.value), end, at, (share) => {
       if (!box.open || !view.box.isConnected) throw new Error("the dialog was closed");
-      told.textContent = `${Math.round(100 * share)} %`;
+      progress.textContent = `${Math.round(100 * share)} %`;
     });
     return [made, name(end, slides ? slider.name : "")];
   });
