@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test coverage test-lowest test-newest check fuzz format bench paper figures hangs structure lab docs pages slides address release binder submission clean
+.PHONY: demo test coverage test-lowest test-newest check fuzz format bench paper figures hangs structure weight lab docs pages slides address release binder submission clean
 
 demo: $(VENV)/.core
 	$(BIN)/s4a demo
@@ -62,6 +62,10 @@ figures: $(VENV)/.bench
 # the picture, the measures and the map of the rooms, made from the code
 structure: $(VENV)/.core
 	$(BIN)/python benchmarks/structure.py --write
+
+# modules, lines, options, tests and bytes; REVISION=... prints those of that revision next to them
+weight: $(VENV)/.test
+	$(BIN)/python tools/weight.py $(REVISION)
 
 lab: $(VENV)/.course
 	$(BIN)/jupyter lab $(wildcard notebooks)
