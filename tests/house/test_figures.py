@@ -73,7 +73,7 @@ def test_every_command_is_a_script_that_takes_these_words(command):
 
 
 def test_commands_are_found_on_pages_as_they_are_written():
-    text = "`python tests/benchmarks/claims.py remesh`, `speed.py whole 51 100000`, `test_x.py`"
+    text = "`python benchmarks/claims.py remesh`, `speed.py whole 51 100000`, `test_x.py`"
     assert paper.commands_in(text) == [
         ("claims.py", "remesh"),
         ("speed.py", "whole", "51", "100000"),
