@@ -332,14 +332,15 @@ def insert(args: Namespace) -> int:
     from s4a.analysis.export import write_registered
     from s4a.cli import tables
     from s4a.study.insert import insert
-    from s4a.study.store import ENGINE, STRUCTURES
+    from s4a.study.store import STRUCTURES
+    from s4a.study.store import write as write_file
     from s4a.study.tree import of_structure, open_study, structure_names
 
     study = open_study(args.study)
     options = {name: getattr(args, name) for name in ("landmarks", "reflect", "table", "n_jobs")}
     inserted = insert(study, args.shapes, **options)
     out = new_folder(args.out)
-    inserted.to_netcdf(out / "inserted.nc", engine=ENGINE)
+    write_file(inserted, out / "inserted.nc")
     parts, status = {"": inserted}, "status"
     if STRUCTURES in inserted.children:
         status = "structure_status"
@@ -514,7 +515,6 @@ def file_points(mesh: "xr.Dataset") -> "np.ndarray":
 def compare(args: Namespace) -> int:
     """The methods of the paper's Table 1 on pairs, or of its Table 2 on a collection."""
     from s4a.show import charts
-    from s4a.study.store import ENGINE
 
     result: xr.Dataset | xr.DataTree
     if args.collection:
@@ -522,7 +522,7 @@ def compare(args: Namespace) -> int:
     else:
         result, names, seconds, text = compare_pairs(args)
     out = new_folder(args.out)
-    result.to_netcdf(out / "compare.nc", engine=ENGINE)
+    result.to_netcdf(out / "compare.nc", engine="h5netcdf")
     figure = charts.stacked(names, result.coords["block"].values.tolist(), seconds)
     figure.savefig(out / "compare.png", dpi=150)
     write(text)

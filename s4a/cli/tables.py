@@ -151,13 +151,11 @@ def verify_lines(found: xr.Dataset) -> str:
     counts = {state: states.count(state) for state in dict.fromkeys(states)}
     n = sum(count for state, count in counts.items() if state not in ("foreign", "left over"))
     others = [f"{count} {state}" for state, count in counts.items() if state != "whole"]
-    if not count_faults(found) and not counts.get("unsealed"):
+    if not count_faults(found):
         line = f"{n} files, all whole and made from each other"
         line += f"; beside them {', '.join(others)}" if others else ""
     else:
         line = f"{n} files: {counts.get('whole', 0)} whole, {', '.join(others)}"
-    if counts.get("unsealed"):
-        line += "; unsealed ones were written before files had checksums: damage is not seen"
     if count_faults(found):
         line += "; the same `s4a run` again makes what is wrong anew, and nothing else"
     rows = zip(found["file"].values, states, found["fault"].values, strict=True)

@@ -15,10 +15,11 @@ import xarray as xr
 from s4a.input.hands import AUTO, hands, of_other_hand, subjects_of_other_hand, to_reflect
 from s4a.schema import dataset
 from s4a.study.doubts import looks_of
+from s4a.study.netcdf import is_done, read
 from s4a.study.options import Options
 from s4a.study.runner import Keys, Run, Task
 from s4a.study.sources import Marked, Sources
-from s4a.study.store import is_done, lock, read, task_key, write
+from s4a.study.store import lock, task_key, write
 from s4a.study.structures import Part
 from s4a.study.tasks import clean_shape
 

@@ -29,6 +29,7 @@ from s4a.study.doubts import (
     set_apart,
     stop_at_doubts,
 )
+from s4a.study.netcdf import arrays, attributes, is_done, open_file, read
 from s4a.study.options import Options, takes_options
 from s4a.study.originals import choose_reflected, choose_together, read_and_clean
 from s4a.study.processes import temporary_folder
@@ -42,17 +43,7 @@ from s4a.study.sources import (
     of_contents,
     remarks_on_guides,
 )
-from s4a.study.store import (
-    STRUCTURES,
-    arrays,
-    attributes,
-    is_done,
-    lock,
-    open_file,
-    read,
-    task_key,
-    write,
-)
+from s4a.study.store import STRUCTURES, lock, task_key, write
 from s4a.study.structures import (
     Part,
     check_one_kind,

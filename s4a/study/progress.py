@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from s4a.geometry.compiled import psutil
-from s4a.study.seal import open_regular
+from s4a.study.netcdf import check_regular
 from s4a.study.store import STRUCTURES, check_is_study
 
 FILE = ".progress.json"
 EVERY = 1.0  # seconds between two notes of a stage
-LARGEST = 2**24  # bytes of a note that are read
 # of every run, in order; those of doubtful shapes are in some
 STAGES = (
     "read and clean",
@@ -167,8 +166,8 @@ def status(folder: Path | str) -> Status:
     """
     path = Path(folder) / FILE
     try:
-        with open_regular(path) as file:
-            said = json.loads(file.read(LARGEST).decode())
+        check_regular(path)
+        said = json.loads(path.read_text("utf-8"))
     except FileNotFoundError:
         if (Path(folder) / STRUCTURES).is_dir():
             check_is_study(Path(folder))  # one of several structures: says so

@@ -13,7 +13,7 @@ STRUCTURES = "test_structures.py"
 
 STATISTICS, SUBJECTS = "test_statistics.py", "test_subjects.py"
 
-SEAL = "test_seal.py"
+SEAL = "test_files.py"
 
 # input, outcome, file and name of the test
 PROOFS = [
@@ -377,7 +377,7 @@ PROOFS = [
         "a packed variable of a study that unpacks to more or less than it says",
         "refused with the file, before memory is asked for",
         SEAL,
-        "test_a_variable_that_says_it_unpacks_to_more_than_deflate_can_is_refused",
+        "test_what_leads_out_of_a_file_or_unpacks_is_refused_before_it_is_read",
     ),
     (
         "covariates that are constant or a linear combination of others",
@@ -509,10 +509,10 @@ PROOFS = [
         "test_a_run_makes_damaged_files_anew_and_no_others_and_the_same_bytes",
     ),
     (
-        "bytes lost, zeroed or cut off",
+        "bytes cut off",
         "the same",
         SEAL,
-        "test_bytes_lost_or_zeroed_anywhere_are_seen",
+        "test_a_truncated_file_is_an_error",
     ),
     (
         "`.costs.json` of another form",

@@ -11,8 +11,9 @@ from small import FLAGS, OPTIONS
 import s4a
 from s4a.analysis import transfer
 from s4a.cli import main
+from s4a.study.netcdf import attributes, read
 from s4a.study.options import DEFAULTS, FAST, PAPER, Options
-from s4a.study.store import attributes, read, write
+from s4a.study.store import write
 
 PAIR = {name: OPTIONS[name] for name in ("n_coarse", "k_init", "k")}
 NEW = (
