@@ -20,7 +20,6 @@ from s4a.widgets.network import Network
 from s4a.widgets.progress import Progress
 from s4a.widgets.region import Region
 from s4a.widgets.spectrum import Spectrum
-from s4a.widgets.structures import Structures
 from s4a.widgets.transfer import Transfer
 
 __all__ = [
@@ -35,6 +34,5 @@ __all__ = [
     "Progress",
     "Region",
     "Spectrum",
-    "Structures",
     "Transfer",
 ]

@@ -18,7 +18,6 @@ from s4a.widgets.modes import Modes
 from s4a.widgets.network import Network
 from s4a.widgets.panel import OfKernel, Panel, close_all, layout_of
 from s4a.widgets.spectrum import Spectrum
-from s4a.widgets.structures import Structures
 from s4a.widgets.transfer import Transfer
 
 log = logging.getLogger(__name__)
@@ -31,7 +30,6 @@ PANELS = {
     "Transfer": Transfer,
     "Spectrum": Spectrum,
 }
-OF_SEVERAL = {"Structures": Structures}  # the tabs of a study of several structures
 
 
 def running_cell() -> str | None:
@@ -46,8 +44,7 @@ class Explore(OfKernel):
     Parameters
     ----------
     study : xarray.DataTree
-        Finished or not; the tab of a stage that is not there yet says what is missing.  Of several
-        structures there is one tab with all of them; each has the other tabs as a study of its own.
+        Finished or not; the tab of a stage that is not there yet says what is missing.
     width : float or str, optional
         In pixels, or any width of CSS; all that the cell has by default.
     **options
@@ -71,7 +68,7 @@ class Explore(OfKernel):
     def __init__(self, study: xr.DataTree, *, width: float | str | None = None, **options: Any):
         self.study, self.options, self.panels = study, options, {}
         self.reasons = {}  # title of the tab -> why it has no panel
-        self.kinds = OF_SEVERAL if "structures" in study.children else PANELS
+        self.kinds = PANELS
         later = PARTS.message("This tab is filled by a running kernel when it is opened.")
         boxes = [ipywidgets.VBox([ipywidgets.HTML(later)]) for _ in self.kinds]
         self.tabs = ipywidgets.Tab(children=boxes, titles=list(self.kinds))

@@ -1,0 +1,19 @@
+"""Morphometrics with S4A: several structures of each subject, with public names of s4a only."""
+
+from s4a_morphometrics.poses import structures, structures_modes, structures_of_new
+from s4a_morphometrics.several import (
+    analyse_structures,
+    insert_structures,
+    of_structure,
+    open_structures,
+)
+
+__all__ = [
+    "analyse_structures",
+    "insert_structures",
+    "of_structure",
+    "open_structures",
+    "structures",
+    "structures_modes",
+    "structures_of_new",
+]
