@@ -2,7 +2,7 @@
 
 Each step makes its output through :func:`variable`, so that names, dims and attributes are the same
 everywhere, and checks its input through :func:`require`.  A variable that is not in the table does
-not exist.
+not exist; extensions add rows by the entry points ``s4a.variables``.
 """
 
 from collections.abc import Collection, Mapping
@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
+
+from s4a.extensions import extensions
 
 INPUT = "unit of the input"
 INPUT2 = "squared unit of the input"
@@ -298,24 +300,6 @@ ROWS = {
     "mean_square": ("term", INPUT2, "sum of squares by degrees of freedom"),
     "variance_share": ("term", ONE, "share of the sums of squares"),
     "f_ratio": ("term", ONE, "mean square by that of individuals x sides"),
-    # several structures of each subject
-    "structure_status": ("shape structure", ONE,
-        "ok, repaired, doubtful or excluded; missing where a subject has none"),
-    "structure_of_vertex": ("vertex", ONE, "structure that the vertex is of"),
-    "pose_rotation": ("shape structure xyz", "rad",
-        "turn of the structure in the whole, a vector around its centroid"),
-    "pose_translation": ("shape structure xyz", INPUT,
-        "shift of the structure's centroid in the whole"),
-    "pose_size": ("shape structure", INPUT,
-        "root mean square over its area of what both displace"),
-    "within_displacement": ("shape vertex xyz", INPUT,
-        "displacement of the structure's mean shape, its pose taken out"),
-    "level_variance": ("structure level", INPUT2,
-        "variance of poses (between) and of shapes (within), mean square over the area of all"),
-    "level_share": ("structure level", ONE, "its share of the variance"),
-    "between_share": ("component", ONE, "share of the joint component that is of poses"),
-    "pose_shape_rv": ("", ONE, "RV coefficient of poses and shapes"),
-    "pose_shape_p": ("", ONE, "p value of the permutation test of that coefficient"),
     # the truth of a synthetic collection
     "reference_point": ("vertex xyz", ONE,
         "point of the unit sphere that the vertex is the image of"),
@@ -409,9 +393,38 @@ ROWS = {
         "peak resident memory of this process and its workers in the stage"),
 }
 # fmt: on
-TABLE = {
-    name: (tuple(dims.split()), unit, long_name) for name, (dims, unit, long_name) in ROWS.items()
-}
+
+
+class Table(dict[str, tuple[tuple[str, ...], str, str]]):
+    """Name of a variable -> its dims, unit and meaning, of the core and of the extensions.
+
+    The rows of the extensions are added when a name is looked up that the core does not have.
+    """
+
+    def __init__(self, rows: Mapping[str, tuple[str, str, str]]):
+        super().__init__()
+        self.extended = False
+        self.add(rows)
+
+    def add(self, rows: Mapping[str, tuple[str, str, str]]) -> None:
+        """Take rows in, with dims in one text."""
+        for name, (dims, unit, long_name) in rows.items():
+            self.setdefault(name, (tuple(dims.split()), unit, long_name))
+
+    def __contains__(self, name: object) -> bool:
+        if not super().__contains__(name) and not self.extended:
+            self.extended = True
+            for rows in extensions("s4a.variables").values():
+                self.add(rows)
+        return super().__contains__(name)
+
+    def __missing__(self, name: str) -> tuple[tuple[str, ...], str, str]:
+        if name in self:
+            return self[name]
+        raise KeyError(name)
+
+
+TABLE = Table(ROWS)
 
 # variables of indices: the dim that they point into; -1 points nowhere
 POINTS_INTO = {

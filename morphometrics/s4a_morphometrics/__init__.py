@@ -1,4 +1,4 @@
-"""Morphometrics with S4A: several structures of each subject, with public names of s4a only."""
+"""Morphometrics on studies of S4A: an extension made of public names of ``s4a`` only."""
 
 from s4a_morphometrics.poses import structures, structures_modes, structures_of_new
 from s4a_morphometrics.several import (

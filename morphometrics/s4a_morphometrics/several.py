@@ -135,7 +135,8 @@ def analyse_structures(
             own |= {"label": part.label, "reflect": mirrored_of(chosen, part)}
             place = None if store is None else folder / FOLDER / name
             try:
-                studies[name] = s4a.analyse(part.shapes, store=place, n_jobs=n_jobs, **options | own)
+                own |= {"store": place, "n_jobs": n_jobs}
+                studies[name] = s4a.analyse(part.shapes, **options | own)
             except ValueError as error:
                 raise ValueError(f"structure {name}: {error}") from error
     return tree_of(studies, notes)

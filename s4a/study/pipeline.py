@@ -151,7 +151,7 @@ def analyse(
         Whether shapes are wrapped watertight before they are remeshed.
     preset : {None, "paper", "fast"}
         ``"fast"`` sets n_coarse=3000, n_spread=500, wide=0, which takes about half the time; its
-        errors are a tenth larger (``tests/benchmarks/cheaper.py``).
+        errors are a tenth larger (``benchmarks/cheaper.py``).
         ``"paper"`` leaves out all that is added to the paper: lift=False, init="landmarks",
         ahead="network", n_spread=0, wide=0, sharpen=0, refine="intrinsic", parts=False,
         alignment="icp", area_weighted=False, n_projected=0, both=False.  Another value of what a

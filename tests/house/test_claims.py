@@ -34,7 +34,7 @@ def test_a_row_has_its_six_cells_and_one_of_the_verdicts(row):
 def test_every_command_is_a_script_and_every_word_one_that_it_takes(row):
     for command in re.findall(r"`([^`]+)`", row[4]):
         name, *words = command.split()
-        assert (ROOT / "tests" / "benchmarks" / name).is_file(), command
+        assert (ROOT / "benchmarks" / name).is_file(), command
         script = benchmark(name.removesuffix(".py"))
         for word in words:
             known = {*getattr(script, "PARTS", ()), *getattr(script, "SETS", ())}

@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 
 import pytest
+import s4a_morphometrics.synthetic
 from paths import DOCS, ROOT, benchmark, script
 from PIL import Image
 
@@ -73,7 +74,7 @@ def test_every_command_is_a_script_that_takes_these_words(command):
 
 
 def test_commands_are_found_on_pages_as_they_are_written():
-    text = "`python tests/benchmarks/claims.py remesh`, `speed.py whole 51 100000`, `test_x.py`"
+    text = "`python benchmarks/claims.py remesh`, `speed.py whole 51 100000`, `test_x.py`"
     assert paper.commands_in(text) == [
         ("claims.py", "remesh"),
         ("speed.py", "whole", "51", "100000"),
@@ -164,7 +165,7 @@ def test_joint_modes_of_structures_are_drawn_with_both_shares_in_the_title(tmp_p
     monkeypatch.setattr(
         figures, "write", lambda f, *a, **o: titles.append(f.get_suptitle()) or write(f, *a, **o)
     )
-    study = s4a.datasets.structures.example_structures()
+    study = s4a_morphometrics.synthetic.example_structures()
     path = figures.joint_modes(study, "beans", "modes", folder=tmp_path / "new")
     said = re.fullmatch(
         r"6 beans: (\d+) % of the variance between the structures, (\d+) % within", titles[0]

@@ -43,7 +43,9 @@ def test_public_functions_have_types():
 @each_page
 def test_every_path_of_the_repository_that_a_page_names_is_there(path):
     text = path.read_text(encoding="utf-8")
-    named = re.findall(r"\b(?:s4a|tests|docs|binder|notebooks)/[\w/]*\w\.(?:py|md|svg|ipynb)", text)
+    named = re.findall(
+        r"\b(?:s4a|tests|benchmarks|docs|binder|notebooks)/[\w/]*\w\.(?:py|md|svg|ipynb)", text
+    )
     assert [file for file in named if not (ROOT / file).exists()] == []
 
 
