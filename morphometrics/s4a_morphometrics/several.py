@@ -425,7 +425,7 @@ def open_structures(folder: Path | str) -> xr.DataTree:
     if not (folder / NOTES).is_file():
         raise ValueError(
             f"{folder} is no study of several structures: it has no {NOTES}; run "
-            f"`s4a structures run ... --out {folder}`"
+            f"`s4a run-structures ... --out {folder}`"
         )
     try:
         notes = json.loads((folder / NOTES).read_text())

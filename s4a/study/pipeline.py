@@ -232,11 +232,11 @@ def analyse(
         check_wrap()
     volumes = settings.label is not None
     sources = find_sources(shapes, settings.pattern, volumes=volumes)
-    settings.check_against(list(sources))
     remarks = remarks_on_files(shapes, settings.pattern, volumes=volumes)
     subjects = None if settings.table is None else read_table(settings.table, list(sources))
     if subjects is not None:
         check_one_structure(subjects)
+    settings.check_against(list(sources))
     marked = find_guides(sources, settings.landmarks, settings.feature_names)
     with lock(store) as claim:
         run = Run(claim, n_jobs)
