@@ -27,7 +27,7 @@ LONG_LINE = 100
 LONG_FUNCTION = 60  # lines of code
 FUNCTION = (ast.FunctionDef, ast.AsyncFunctionDef)
 
-# The order in which data flow; tests/house/test_imports.py holds every import to it.
+# The order in which data flow; tests/project/test_imports.py holds every import to it.
 ROOMS = (
     "schema",
     "seeds",
