@@ -118,14 +118,14 @@ $(VENV)/.core: $(VENV)/.python pyproject.toml
 	$(BIN)/python -m pip install --quiet -e .
 	touch $@
 
-$(VENV)/.%: $(VENV)/.python pyproject.toml
-	$(BIN)/python -m pip install --quiet -e ".[$*]"
+$(VENV)/.%: $(VENV)/.python pyproject.toml morphometrics/pyproject.toml
+	$(BIN)/python -m pip install --quiet -e ".[$*]" -e ./morphometrics
 	touch $@
 
 $(VENV)-lowest/.ready: RESOLUTION := lowest-direct
 $(VENV)-newest/.ready: RESOLUTION := highest
-$(VENV)-%/.ready: pyproject.toml
+$(VENV)-%/.ready: pyproject.toml morphometrics/pyproject.toml
 	$(PYTHON) -m venv --clear $(VENV)-$*
 	$(VENV)-$*/bin/python -m pip install --quiet uv
-	$(VENV)-$*/bin/uv pip install --quiet --python $(VENV)-$*/bin/python --resolution $(RESOLUTION) -e ".[test]"
+	$(VENV)-$*/bin/uv pip install --quiet --python $(VENV)-$*/bin/python --resolution $(RESOLUTION) -e ".[test]" -e ./morphometrics
 	touch $@

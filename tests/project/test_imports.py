@@ -17,6 +17,7 @@ FOLDER = Path(s4a.__file__).parent
 
 # The order in which data flow: a room imports from those before it and from none after it.
 ROOMS = (
+    "extensions",
     "schema",
     "seeds",
     "geometry",
