@@ -23,6 +23,7 @@ from .analysis.transfer import transfer_scalars as transfer_scalars
 from .datasets import synthetic as synthetic
 from .evaluation import compare as compare
 from .evaluation import metrics as metrics
+from .input.annotations import with_features as with_features
 from .input.clean import clean as clean
 from .input.collection import read_labels as read_labels
 from .input.collection import read_shape as read_shape
@@ -30,7 +31,6 @@ from .input.collection import read_shapes as read_shapes
 from .input.files import read_mesh as read_mesh
 from .input.files import write_mesh as write_mesh
 from .input.landmarks import with_landmarks as with_landmarks
-from .input.annotations import with_features as with_features
 from .method.pca import synthesize as synthesize
 from .method.remesh import coarsen as coarsen
 from .method.spectral import reconstruct as reconstruct
