@@ -27,7 +27,7 @@ from s4a.study.options import Options
 
 Looks = Mapping[
     str, Mapping[str, xr.Dataset]
-]  # structure -> subject -> s4a.input.plausibility.compare
+]  # structure -> subject -> comparison
 
 
 def find_mirrored(

@@ -225,7 +225,7 @@ def reflected_of_new(
 def hands_beside(
     meshes: dict[str, xr.Dataset], portraits: dict[str, xr.Dataset]
 ) -> tuple[dict[str, xr.Dataset], dict[str, xr.Dataset]]:
-    """:func:`s4a.input.plausibility.compare` of shapes of the study, and of new ones beside them."""
+    """:func:`s4a.input.plausibility.compare` of shapes of the study, and of new ones."""
     known = {name: plausibility.compare(name, seen, portraits) for name, seen in portraits.items()}
     looks = {
         name: plausibility.compare("", plausibility.portray(mesh, intersections=False), portraits)
