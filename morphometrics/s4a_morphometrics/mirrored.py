@@ -11,7 +11,6 @@ import numpy as np
 import xarray as xr
 
 import s4a
-from s4a.input.evidence import examine
 from s4a.input.hands import (
     COMMON_HAND,
     OTHER_HAND,
@@ -20,12 +19,15 @@ from s4a.input.hands import (
     of_other_hand,
     of_rarer_hand,
 )
+from s4a.input.plausibility import examine
 from s4a.input.subjects import listed
 from s4a.schema import dataset
 from s4a.study.insert import clean_new, hands_beside, portraits_of
 from s4a.study.options import Options
 
-Looks = Mapping[str, Mapping[str, xr.Dataset]]  # structure -> subject -> s4a.input.evidence.compare
+Looks = Mapping[
+    str, Mapping[str, xr.Dataset]
+]  # structure -> subject -> comparison
 
 
 def find_mirrored(

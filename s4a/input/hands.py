@@ -1,8 +1,8 @@
 """Left and right (5.1, the data): which shapes are mirror images of the others, and their mirror.
 
-Each shape was held against several others, as it is and mirrored (:mod:`s4a.input.evidence`).  The
-signs that agree best with all of these pairs are those of the leading eigenvector of their matrix:
-no shape is the one that all others are held against.
+Each shape was held against several others, as it is and mirrored
+(:mod:`s4a.input.plausibility`).  The signs that agree best with all of these pairs are those of
+the leading eigenvector of their matrix: no shape is the one that all others are held against.
 """
 
 from collections.abc import Mapping, Sequence
@@ -10,9 +10,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import xarray as xr
 
-from s4a.input.evidence import MIRROR
 from s4a.input.subjects import listed
 
+MIRROR = np.array([-1.0, 1.0, 1.0])
 COMMON_HAND, OTHER_HAND = 0.8, 0.5  # of the mean of `hand` over the references
 AUTO = "auto"
 YES, NO = ("1", "1.0", "true", "yes"), ("0", "0.0", "false", "no")
@@ -60,7 +60,7 @@ def hands(evidence: Mapping[str, xr.Dataset]) -> np.ndarray:
     Parameters
     ----------
     evidence : dict of str to Dataset
-        Name -> :func:`s4a.input.evidence.compare`.
+        Name -> :func:`s4a.input.plausibility.compare`.
 
     Returns
     -------
@@ -159,7 +159,7 @@ def is_of_other_hand(
     ----------
     name : str
     look : Dataset
-        Of :func:`s4a.input.evidence.compare`.
+        Of :func:`s4a.input.plausibility.compare`.
     known : dict of str to Dataset
         The same of the others.
     """

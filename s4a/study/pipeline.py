@@ -177,7 +177,7 @@ def analyse(
     features : list of str, optional
         Names of fields of the vertices that guide registration, such as ``sulc``, see
         :func:`s4a.with_features`, which gives them to meshes in memory.  Of the file ``a.ply`` in
-        ``a.sulc`` or ``a.sulc.npy`` (:func:`s4a.input.scalars.files_beside`), or properties of PLY.
+        ``a.sulc`` or ``a.sulc.npy`` (:func:`s4a.input.annotations.files_beside`), or of PLY.
     label : int, several, or "all", optional
         The files are label volumes, see :func:`s4a.read_labels`.
     doubtful : {"apart", "stop"}
