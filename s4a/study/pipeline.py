@@ -166,7 +166,7 @@ def analyse(
         Whether shapes are wrapped watertight before they are remeshed.
     preset : {None, "paper", "fast"}
         ``"fast"`` sets n_coarse=3000, n_spread=500, wide=0, which takes about half the time; its
-        errors are a tenth larger (``tests/benchmarks/cheaper.py``).
+        errors are a tenth larger (``benchmarks/cheaper.py``).
         ``"paper"`` leaves out all that is added to the paper: lift=False, init="landmarks",
         ahead="network", n_spread=0, wide=0, sharpen=0, refine="intrinsic", parts=False,
         alignment="icp", area_weighted=False, n_projected=0, both=False.  Another value of what a
@@ -196,7 +196,7 @@ def analyse(
     features : list of str, optional
         Names of fields of the vertices that guide registration, such as ``sulc``, see
         :func:`s4a.with_features`, which gives them to meshes in memory.  Of the file ``a.ply`` in
-        ``a.sulc`` or ``a.sulc.npy`` (:func:`s4a.input.scalars.files_beside`), or properties of PLY.
+        ``a.sulc`` or ``a.sulc.npy`` (:func:`s4a.input.annotations.files_beside`), or of PLY.
     label : int, several, or "all", optional
         The files are label volumes, see :func:`s4a.read_labels`.
     doubtful : {"apart", "stop"}
