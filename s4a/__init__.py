@@ -13,7 +13,8 @@ reading and cleaning      :func:`read_shapes`, :func:`read_shape`, :func:`read_l
 5.2, 5.3 comparison       :mod:`s4a.compare`
 4.1, 4.2 step by step     :func:`align_pair`, :func:`build_network`, :func:`refine_network`,
                           :func:`latent_match`, :func:`latent_map`, :func:`register_shape`
-4.2, 6.1 collections      :func:`analyse`, :func:`open_study`, :func:`verify`, :func:`synthesize`
+4.2, 6.1 collections      :func:`analyse`, :class:`Options`, :func:`open_study`,
+                          :func:`verify`, :func:`synthesize`
 notebooks, pages          :func:`explore`, :func:`write_page`
 pictures, films           :func:`write_picture`, :func:`write_film`
 new shapes, parts         :func:`insert`, :func:`complete`
@@ -68,6 +69,7 @@ if TYPE_CHECKING:
         refine_network,
         register_shape,
     )
+    from s4a.options import Options
     from s4a.show.page import write_page
     from s4a.show.pictures import write_film, write_picture
     from s4a.study.insert import insert
@@ -79,6 +81,7 @@ if TYPE_CHECKING:
 install()
 __version__ = version("s4a")
 __all__ = [
+    "Options",
     "align_pair",
     "analyse",
     "build_network",
@@ -139,6 +142,7 @@ PLACES = {
     "method.pca": "synthesize",
     "method.remesh": "coarsen",
     "method.spectral": "reconstruct spectrum",
+    "options": "Options",
     "method.steps": "align_pair build_network latent_map latent_match refine_network "
     "register_shape",
     "show.page": "write_page",

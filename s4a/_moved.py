@@ -21,7 +21,7 @@ ROOMS = {
     "input": "annotations bounded formats landmarks manifold subjects",
     "method": "deform descriptors fmap joint latent lift median nearest network pca register "
     "remesh scalable spectral",
-    "study": "options pipeline",
+    "study": "pipeline",
     "analysis": "export link model permutation transfer",
     "evaluation": "accuracy",
     "show": "charts draw",

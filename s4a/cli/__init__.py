@@ -1,5 +1,5 @@
 """The command line."""
 
-from s4a.cli.flags import HELP, main, parser
+from s4a.cli.flags import main, parser
 
-__all__ = ["HELP", "main", "parser"]
+__all__ = ["main", "parser"]

@@ -14,6 +14,7 @@ from s4a.input.files import files_named
 from s4a.input.hands import AUTO, is_of_other_hand, seen_together
 from s4a.input.landmarks import SUFFIXES
 from s4a.input.subjects import listed, read_table
+from s4a.options import Options
 from s4a.study.newcomers import (
     New,
     hands_beside,
@@ -22,7 +23,6 @@ from s4a.study.newcomers import (
     named,
     read_beside,
 )
-from s4a.study.options import Options
 from s4a.study.sources import Sources, find_sources
 from s4a.study.store import STRUCTURES
 from s4a.study.structures import (

@@ -13,9 +13,9 @@ import numpy as np
 import xarray as xr
 
 from s4a.input.hands import AUTO, hands, of_other_hand, subjects_of_other_hand, to_reflect
+from s4a.options import Options
 from s4a.schema import dataset
 from s4a.study.doubts import looks_of
-from s4a.study.options import Options
 from s4a.study.runner import Keys, Run, Task
 from s4a.study.sources import Marked, Sources
 from s4a.study.store import is_done, lock, read, task_key, write
@@ -31,7 +31,7 @@ def read_and_clean(
     run: Run, sources: Sources, marked: Marked, options: Options, reflected: list[str]
 ) -> Keys:
     """The shapes, cleaned, with landmarks, some of them mirrored (5.1): ``/original``."""
-    cleaning = options.of_cleaning
+    cleaning = options.of("cleaning")
     todo = []
     for n, (source, content) in sources.items():
         also: dict[str, Any] = {"reflected": True} if n in reflected else {}
@@ -62,7 +62,7 @@ def choose_reflected(
         return to_reflect(str(options.reflect), list(sources), subjects), []
     file = run.folder / CHOICE
     contents = [content for _, content in sources.values()]
-    key = task_key(list(sources), contents, options.of_cleaning, options.k, AUTO)
+    key = task_key(list(sources), contents, options.of("cleaning"), options.k, AUTO)
     if not is_done(file, key):
         looks = looks_as_given(run, sources, marked, options)
         reflected, told = of_other_hand(looks)
@@ -85,7 +85,7 @@ def choose_together(
         [name, list(part.sources), [content for _, content in part.sources.values()]]
         for name, part in parts.items()
     ]
-    cleaning = [part.options.of_cleaning for part in parts.values()]
+    cleaning = [part.options.of("cleaning") for part in parts.values()]
     key = task_key(given, cleaning, options.k, AUTO)
     files = {name: folder / name / CHOICE for name in parts}
     if not all(is_done(file, key) for file in files.values()):

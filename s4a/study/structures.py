@@ -19,8 +19,8 @@ from s4a.input.hands import AUTO, to_reflect
 from s4a.input.raw import shown
 from s4a.input.subjects import is_missing, listed, read_table
 from s4a.input.subjects import subjects as table_of
+from s4a.options import Options
 from s4a.schema import dataset
-from s4a.study.options import Options
 from s4a.study.sources import Collection, Marked, Sources, find_guides, find_sources
 from s4a.study.store import STAGES, STRUCTURES, write
 from s4a.study.tree import open_study
@@ -133,7 +133,7 @@ def parts_of_dict(shapes: Mapping[str, Mapping[str, Any]], options: Options) -> 
     Examples
     --------
     >>> import s4a
-    >>> from s4a.study.options import Options
+    >>> from s4a.options import Options
     >>> from s4a.study.structures import parts_of_dict
     >>> two = {"left": s4a.synthetic.sphere(9), "right": s4a.synthetic.sphere(12)}
     >>> parts = parts_of_dict({"a": two, "b": two}, Options())

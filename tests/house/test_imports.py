@@ -19,6 +19,7 @@ FOLDER = Path(s4a.__file__).parent
 ROOMS = (
     "schema",
     "seeds",
+    "options",
     "geometry",
     "input",
     "method",

@@ -9,7 +9,7 @@ from s4a import analyse, cli, open_study, write_mesh
 from s4a.cli.flags import named_label
 from s4a.datasets.structures import subjects
 from s4a.input.subjects import read_table
-from s4a.study.options import Options
+from s4a.options import Options
 from s4a.study.sources import find_sources
 from s4a.study.structures import parts_of_dict, parts_of_labels, parts_of_table
 

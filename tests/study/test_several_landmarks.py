@@ -11,9 +11,9 @@ from s4a.input.annotations import write_landmarks
 from s4a.input.hands import mirror_image
 from s4a.input.subjects import read_table
 from s4a.method.shape import features_of
+from s4a.options import Options
 from s4a.schema import dataset
 from s4a.study.newcomers import read_new
-from s4a.study.options import Options
 from s4a.study.sources import find_sources
 from s4a.study.structures import (
     check_parts,
