@@ -3,7 +3,7 @@
 The figures of the paper are drawn from the bundled collection, twelve synthetic brains of 40,000
 vertices, analysed with all defaults as ``s4a demo`` does; the two panels and the scene are those of
 this study in Chromium, the scene in JupyterLab. A name is that of a picture without its ending;
-``docs/heads.png`` is made by ``tests/benchmarks/compare.py heads``, and ``docs/structure.svg`` by
+``docs/heads.png`` is made by ``benchmarks/compare.py heads``, and ``docs/structure.svg`` by
 ``make structure``.
 
 Pictures of data that the project may use and not give away are drawn only where they are named and
@@ -293,7 +293,7 @@ def landmarks(held_out):
 
 def front_ends():
     """The script that opens notebooks in Chromium."""
-    sys.path.insert(0, str(HERE.parent / "tests" / "benchmarks"))
+    sys.path.insert(0, str(HERE.parent / "benchmarks"))
     import frontends
 
     return frontends

@@ -53,11 +53,11 @@ if TYPE_CHECKING:
     )
     from s4a.datasets import synthetic
     from s4a.evaluation import compare, metrics
+    from s4a.input.annotations import with_features
     from s4a.input.clean import clean
     from s4a.input.collection import read_labels, read_shape, read_shapes
     from s4a.input.files import read_mesh, write_mesh
     from s4a.input.landmarks import with_landmarks
-    from s4a.input.scalars import with_features
     from s4a.method.pca import synthesize
     from s4a.method.remesh import coarsen
     from s4a.method.spectral import reconstruct, spectrum
@@ -138,7 +138,7 @@ PLACES = {
     "input.collection": "read_labels read_shape read_shapes",
     "input.landmarks": "with_landmarks",
     "input.files": "read_mesh write_mesh",
-    "input.scalars": "with_features",
+    "input.annotations": "with_features",
     "method.pca": "synthesize",
     "method.remesh": "coarsen",
     "method.spectral": "reconstruct spectrum",

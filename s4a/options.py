@@ -307,7 +307,7 @@ class Options:
     features: str | list[str] | None = option(
         None,
         "fields that guide registration, with commas: sulc is a.sulc.npy beside a.ply",
-        more="Or a.sulc, or a property of PLY (:func:`s4a.input.scalars.files_beside`); see "
+        more="Or a.sulc, or a property of PLY (:func:`s4a.input.annotations.files_beside`); see "
         ":func:`s4a.with_features`, which gives them to meshes in memory",
         group=INPUT,
     )

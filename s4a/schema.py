@@ -2,7 +2,7 @@
 
 Each step makes its output through :func:`variable`, so that names, dims and attributes are the same
 everywhere, and checks its input through :func:`require`.  A variable that is not in the table does
-not exist.
+not exist; extensions add rows by the entry points ``s4a.variables``.
 """
 
 from collections.abc import Collection, Mapping
@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
+
+from s4a.extensions import extensions
 
 INPUT = "unit of the input"
 INPUT2 = "squared unit of the input"
@@ -409,9 +411,38 @@ ROWS = {
         "peak resident memory of this process and its workers in the stage"),
 }
 # fmt: on
-TABLE = {
-    name: (tuple(dims.split()), unit, long_name) for name, (dims, unit, long_name) in ROWS.items()
-}
+
+
+class Table(dict[str, tuple[tuple[str, ...], str, str]]):
+    """Name of a variable -> its dims, unit and meaning, of the core and of the extensions.
+
+    The rows of the extensions are added when a name is looked up that the core does not have.
+    """
+
+    def __init__(self, rows: Mapping[str, tuple[str, str, str]]):
+        super().__init__()
+        self.extended = False
+        self.add(rows)
+
+    def add(self, rows: Mapping[str, tuple[str, str, str]]) -> None:
+        """Take rows in, with dims in one text."""
+        for name, (dims, unit, long_name) in rows.items():
+            self.setdefault(name, (tuple(dims.split()), unit, long_name))
+
+    def __contains__(self, name: object) -> bool:
+        if not super().__contains__(name) and not self.extended:
+            self.extended = True
+            for rows in extensions("s4a.variables").values():
+                self.add(rows)
+        return super().__contains__(name)
+
+    def __missing__(self, name: str) -> tuple[tuple[str, ...], str, str]:
+        if name in self:
+            return self[name]
+        raise KeyError(name)
+
+
+TABLE = Table(ROWS)
 
 # variables of indices: the dim that they point into; -1 points nowhere
 POINTS_INTO = {

@@ -14,8 +14,8 @@ from s4a.analysis.link import image_in_shape
 from s4a.analysis.transfer import transfer_labels, transfer_landmarks
 from s4a.geometry.mesh import as_arrays
 from s4a.input.annotations import write_landmarks
-from s4a.input.evidence import MIRROR
 from s4a.input.files import write_mesh
+from s4a.input.hands import MIRROR
 from s4a.seeds import RNG, seed_of
 from s4a.study import store
 

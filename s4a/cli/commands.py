@@ -243,7 +243,7 @@ def statistics(args: Namespace) -> int:
 def study_to_test(args: Namespace) -> "tuple[xr.DataTree, str]":
     """The study with the table and the shapes that are asked for, and the folder of results."""
     from s4a.analysis.inputs import with_doubtful
-    from s4a.input.decisions import listed
+    from s4a.input.plausibility import listed
     from s4a.input.subjects import with_table
     from s4a.study.tree import left_out, open_study
 

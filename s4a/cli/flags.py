@@ -10,13 +10,32 @@ import logging
 import re
 import sys
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any, get_args
 
 from s4a.cli import commands, growing, leaving
+from s4a.extensions import extensions
 from s4a.input.raw import shown
 
 MOST_PROCESSES = 1000  # so that a slip of the key starts no million of them
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command of the command line, of the core or of an extension.
+
+    Parameters
+    ----------
+    run : callable
+        Takes the parsed arguments and gives the exit code; its docstring is the help.
+    flags : callable
+        Adds the flags of the command through the function that it is given, as
+        ``add("--out", help="...")``; see :meth:`argparse.ArgumentParser.add_argument`.
+    """
+
+    run: Callable[[argparse.Namespace], int]
+    flags: Callable[[Callable[..., Any]], None]
 
 
 def parser(only: str | None = None) -> argparse.ArgumentParser:
@@ -29,12 +48,12 @@ def parser(only: str | None = None) -> argparse.ArgumentParser:
     )
     top.add_argument("--version", action="version", version=f"s4a {version('s4a')}")
     subparsers = top.add_subparsers(required=True, metavar="command")
-    for command, add_flags in FLAGS.items():
-        text = command.__doc__
-        sub = subparsers.add_parser(command.__name__, help=text, description=text)
-        sub.set_defaults(function=command)
-        if only in (None, command.__name__):
-            add_flags(sub.add_argument)
+    for name, command in (extensions("s4a.commands") | COMMANDS).items():
+        text = command.run.__doc__
+        sub = subparsers.add_parser(name, help=text, description=text)
+        sub.set_defaults(function=command.run)
+        if only in (None, name):
+            command.flags(sub.add_argument)
     return top
 
 
@@ -326,24 +345,24 @@ def _compare(add):
     add_options(add, ["n_coarse", "n_pairs", "k", "preset", "seed"])
 
 
-FLAGS = {
-    commands.doctor: _doctor,
-    commands.check: _check,
-    commands.run: _run,
-    commands.verify: _verify,
-    commands.status: _status,
-    commands.demo: _demo,
-    commands.view: _view,
-    commands.statistics: _statistics,
-    growing.asymmetry: _asymmetry,
-    growing.fields: _fields,
-    growing.growth: _growth,
-    growing.structures: _structures,
-    commands.insert: _insert,
-    commands.complete: _complete,
-    leaving.export: _export,
-    commands.transfer: _transfer,
-    commands.compare: _compare,
+COMMANDS = {
+    "doctor": Command(commands.doctor, _doctor),
+    "check": Command(commands.check, _check),
+    "run": Command(commands.run, _run),
+    "verify": Command(commands.verify, _verify),
+    "status": Command(commands.status, _status),
+    "demo": Command(commands.demo, _demo),
+    "view": Command(commands.view, _view),
+    "statistics": Command(commands.statistics, _statistics),
+    "asymmetry": Command(growing.asymmetry, _asymmetry),
+    "fields": Command(growing.fields, _fields),
+    "growth": Command(growing.growth, _growth),
+    "structures": Command(growing.structures, _structures),
+    "insert": Command(commands.insert, _insert),
+    "complete": Command(commands.complete, _complete),
+    "export": Command(leaving.export, _export),
+    "transfer": Command(commands.transfer, _transfer),
+    "compare": Command(commands.compare, _compare),
 }
 
 

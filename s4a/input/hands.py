@@ -1,7 +1,7 @@
 """Left and right (5.1, the data): which shapes are mirror images of the others, and their mirror.
 
-Each shape was held against several others, as it is and mirrored (:mod:`s4a.input.evidence`).  The
-signs that agree best with all of these pairs are those of the leading eigenvector of their matrix:
+Each shape was held against several others, as it is and mirrored
+(:mod:`s4a.input.plausibility`).  The signs that agree best with all of these pairs are those of the leading eigenvector of their matrix:
 no shape is the one that all others are held against.
 """
 
@@ -10,10 +10,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import xarray as xr
 
-from s4a.input.evidence import MIRROR
 from s4a.input.subjects import listed
 from s4a.schema import dataset
 
+MIRROR = np.array([-1.0, 1.0, 1.0])
 COMMON_HAND, OTHER_HAND = 0.8, 0.5  # of the mean of `hand` over the references
 AUTO = "auto"
 YES, NO = ("1", "1.0", "true", "yes"), ("0", "0.0", "false", "no")
@@ -61,7 +61,7 @@ def hands(evidence: Mapping[str, xr.Dataset]) -> np.ndarray:
     Parameters
     ----------
     evidence : dict of str to Dataset
-        Name -> :func:`s4a.input.evidence.compare`.
+        Name -> :func:`s4a.input.plausibility.compare`.
 
     Returns
     -------
@@ -158,7 +158,7 @@ def seen_together(looks: Mapping[str, Mapping[str, xr.Dataset]]) -> dict[str, xr
     Parameters
     ----------
     looks : dict of str to dict of str to Dataset
-        Structure -> subject -> :func:`s4a.input.evidence.compare`.
+        Structure -> subject -> :func:`s4a.input.plausibility.compare`.
 
     Returns
     -------
@@ -248,7 +248,7 @@ def is_of_other_hand(
     ----------
     name : str
     look : Dataset
-        Of :func:`s4a.input.evidence.compare`.
+        Of :func:`s4a.input.plausibility.compare`.
     known : dict of str to Dataset
         The same of the others.
     """

@@ -11,9 +11,8 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from s4a.input.annotations import is_number, table_rows
-from s4a.input.bounded import content
 from s4a.input.files import slug, stem_of
-from s4a.input.raw import shown, text_of
+from s4a.input.raw import content, shown, text_of
 from s4a.schema import covariate
 
 log = logging.getLogger(__name__)

@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 from markupsafe import Markup
 
-from s4a.input.decisions import decisions, notices
+from s4a.input.plausibility import decisions, notices
 from s4a.options import kept_options
 from s4a.show import charts
 from s4a.show.browser import MODES, PARTS, TEMPLATES, look_state, mesh_state, webp_uri

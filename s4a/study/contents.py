@@ -12,7 +12,7 @@ import xarray as xr
 from s4a.input.files import slug
 from s4a.schema import POINTS_INTO, TABLE
 
-# what s4a.input.evidence says of a shape
+# what s4a.input.plausibility says of a shape
 SEEN = "surface compactness chirality open_boundary lattice self_intersections intersecting".split()
 # variables, and attributes with what they are
 REQUIRED: dict[str, tuple[str, dict[str, type]]] = {

@@ -15,14 +15,14 @@ from threadpoolctl import threadpool_limits
 
 from s4a.geometry.crossing import can_count
 from s4a.geometry.mesh import as_arrays, vertex_areas
-from s4a.input import evidence
+from s4a.input import plausibility
+from s4a.input.annotations import files_beside, with_features
 from s4a.input.collection import read_shapes, shape_report
 from s4a.input.files import SUFFIXES as MESHES
 from s4a.input.files import files_named, suffix_of
 from s4a.input.hands import AUTO, is_of_other_hand, mirror_image
 from s4a.input.landmarks import SUFFIXES, with_landmarks
 from s4a.input.plausibility import find_warnings
-from s4a.input.scalars import files_beside, with_features
 from s4a.input.subjects import listed
 from s4a.method.first_map import motion_onto
 from s4a.method.lift import low_resolution
@@ -215,11 +215,13 @@ def named(reflect: str | list[str]) -> list[str]:
 
 
 def hands_beside(new: New) -> tuple[dict[str, xr.Dataset], dict[str, xr.Dataset]]:
-    """:func:`s4a.input.evidence.compare` of shapes of the study, and of new ones beside them."""
+    """:func:`s4a.input.plausibility.compare` of shapes of the study, and new ones beside them."""
     references = new.portraits
-    known = {name: evidence.compare(name, seen, references) for name, seen in references.items()}
+    known = {
+        name: plausibility.compare(name, seen, references) for name, seen in references.items()
+    }
     looks = {
-        name: evidence.compare("", evidence.portray(mesh, intersections=False), references)
+        name: plausibility.compare("", plausibility.portray(mesh, intersections=False), references)
         for name, mesh in new.meshes.items()
     }
     return known, looks
@@ -375,8 +377,8 @@ def _insert_one(mesh, frozen, options, references):
     )
     seen = None
     if references is not None:
-        portrait = evidence.portray(mesh, intersections=can_count(options.intersections))
-        seen = evidence.compare("", portrait, references)
+        portrait = plausibility.portray(mesh, intersections=can_count(options.intersections))
+        seen = plausibility.compare("", portrait, references)
     return Inserted(coarse, Y, registration, seen)
 
 
@@ -392,15 +394,15 @@ def portraits_of(study: xr.DataTree) -> dict[str, xr.Dataset]:
     portraits = {}
     known = known_to(study)
     by_size = sorted(known, key=lambda name: known[name]["area"])
-    for name in evidence.spread(by_size, 2 * evidence.N_REFERENCES):
+    for name in plausibility.spread(by_size, 2 * plausibility.N_REFERENCES):
         mesh = study["original"][name].to_dataset()
-        seen = evidence.portray(mesh, intersections=False)
+        seen = plausibility.portray(mesh, intersections=False)
         if "report" in study:  # where they were counted
             number = int(study["report"]["self_intersections"].sel(shape=name))
             share = number / mesh.sizes["triangle"] if number >= 0 else -1.0
             seen = seen.assign_attrs(self_intersections=number, intersecting=share)
         portraits[name] = seen
-    return {name: portraits[name] for name in evidence.pick_references(portraits)}
+    return {name: portraits[name] for name in plausibility.pick_references(portraits)}
 
 
 def report_beside(
@@ -412,7 +414,7 @@ def report_beside(
     """The report on the new shapes, each beside those of the study."""
     known = known_to(study)
     known_looks = {
-        name: evidence.compare(name, seen, references) for name, seen in references.items()
+        name: plausibility.compare(name, seen, references) for name, seen in references.items()
     }
     told_before = find_warnings(known, known_looks)[1]
     reports, remarks = [], {}

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import xarray as xr
 
 from s4a.geometry.mesh import as_dataset
+from s4a.input.annotations import files_beside
 from s4a.input.files import check_names, files_named, find_meshes
 from s4a.input.landmarks import SUFFIXES
 from s4a.input.raw import read_bytes, shown
-from s4a.input.scalars import files_beside
 from s4a.input.subjects import listed
 from s4a.method.shape import features_of
 from s4a.schema import require

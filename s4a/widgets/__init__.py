@@ -1,5 +1,7 @@
 """Panels of a study for notebooks: they show arrays, what is computed is in the step modules."""
 
+from typing import Any
+
 try:
     import anywidget  # noqa: F401
     import ipywidgets  # noqa: F401
@@ -9,6 +11,7 @@ except ImportError as error:
         "run: pip install s4a[notebook]"
     ) from error
 
+from s4a.extensions import extensions
 from s4a.widgets.comparison import Comparison
 from s4a.widgets.correspondence import Correspondence
 from s4a.widgets.explore import Explore
@@ -17,6 +20,7 @@ from s4a.widgets.maps import Maps
 from s4a.widgets.median import Median
 from s4a.widgets.modes import Modes
 from s4a.widgets.network import Network
+from s4a.widgets.panel import Panel
 from s4a.widgets.progress import Progress
 from s4a.widgets.region import Region
 from s4a.widgets.spectrum import Spectrum
@@ -32,9 +36,18 @@ __all__ = [
     "Median",
     "Modes",
     "Network",
+    "Panel",
     "Progress",
     "Region",
     "Spectrum",
     "Structures",
     "Transfer",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """A panel of an extension."""
+    try:
+        return extensions("s4a.panels")[name]
+    except KeyError:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}") from None

@@ -9,6 +9,7 @@ import xarray as xr
 from IPython import get_ipython
 from IPython.core.interactiveshell import ExecutionInfo
 
+from s4a.extensions import extensions
 from s4a.show.browser import PARTS
 from s4a.show.surfaces import attribute, has
 from s4a.widgets.correspondence import Correspondence
@@ -32,6 +33,19 @@ PANELS = {
     "Spectrum": Spectrum,
 }
 OF_SEVERAL = {"Structures": Structures}  # the tabs of a study of several structures
+STAGES = ("original", "coarse", "network", "latent", "registration", "pca")  # nodes of every study
+
+
+def kinds_of(study: xr.DataTree) -> dict[str, type[Panel]]:
+    """Title of a tab -> its panel: those whose needs the study has, or a finished run gives it."""
+    kinds = OF_SEVERAL if "structures" in study.children else PANELS
+    coming = STAGES if set(STAGES) & set(study.children) else ()
+    added = {
+        kind.title: kind
+        for kind in extensions("s4a.panels").values()
+        if all(has(study, need) or need.partition("/")[0] in coming for need in kind.needs)
+    }
+    return kinds | added
 
 
 def running_cell() -> str | None:
@@ -71,7 +85,7 @@ class Explore(OfKernel):
     def __init__(self, study: xr.DataTree, *, width: float | str | None = None, **options: Any):
         self.study, self.options, self.panels = study, options, {}
         self.reasons = {}  # title of the tab -> why it has no panel
-        self.kinds = OF_SEVERAL if "structures" in study.children else PANELS
+        self.kinds = kinds_of(study)
         later = PARTS.message("This tab is filled by a running kernel when it is opened.")
         boxes = [ipywidgets.VBox([ipywidgets.HTML(later)]) for _ in self.kinds]
         self.tabs = ipywidgets.Tab(children=boxes, titles=list(self.kinds))
