@@ -11,6 +11,7 @@ import re
 import textwrap
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields, replace
+from functools import partial
 from importlib.util import find_spec
 from numbers import Integral
 from pathlib import Path
@@ -25,8 +26,6 @@ N_SPREAD = 1000  # spread vertices of a shape on which Consistent ZoomOut looks 
 N_CENTRAL = 25_000  # vertices by which a field on a shape is projected
 PER_FUNCTION = 2  # samples, at least: the least squares of fewer are poor, or have no one solution
 FEATURE = re.compile(r"[A-Za-z0-9_-]{1,100}")  # as a file can be named
-INPUT, NETWORK, REGISTRATION = "input", "low resolution and network", "registration"
-QUALITY, COMPUTING = "quality control", "computing"
 # switches that method="scalable" does not have, and what each would need
 WITHOUT_MESH = {
     "lift": "lifts the eigenfunctions of one",
@@ -86,6 +85,14 @@ def option(
         name: value for name, value in (("paper", paper), ("fast", fast)) if value is not MISSING
     }
     return field(default=None if told["presets"] else default, metadata=told)
+
+
+# of each group
+reading = partial(option, group="input")
+network = partial(option, group="low resolution and network")
+registration = partial(option, group="registration")
+quality = partial(option, group="quality control")
+computing = partial(option, group="computing")
 
 
 def check_components(components: Any) -> str | int:
@@ -235,336 +242,141 @@ class Options:
     ValueError: preset 'paper' sets refine='intrinsic'; found refine='joint': leave out one of both
     """
 
-    preset: str | None = option(
-        None,
+    # fmt: off
+    preset: str | None = computing(None,
         "'paper' leaves out all that is added to the paper; 'fast' halves the time",
-        more="The errors of 'fast' are a tenth larger (``benchmarks/cheaper.py``).  Another value "
-        "of what a preset sets is refused; to add one thing to the paper, give "
-        '``s4a.options.PRESETS["paper"]`` with that changed',
-        choices=("paper", "fast"),
-        group=COMPUTING,
-        pair=True,
-    )
-    seed: int = option(
-        0,
-        "seed of all randomness",
-        more="Or ``rng``, see :mod:`s4a.seeds`",
-        group=COMPUTING,
-        of="low resolution",
-        pair=True,
-    )
-    pattern: str | None = option(
-        None, "only files whose name fits, for example '*brain*'", group=INPUT
-    )
-    components: str | int = option(
-        "largest",
-        "'largest', 'all' or how many pieces of each mesh to keep",
-        check=check_components,
-        group=INPUT,
-        of="cleaning",
-    )
-    strict: bool = option(
-        False,
-        "exclude shapes with vertices that are not finite instead of repairing them",
-        group=INPUT,
-        of="cleaning",
-    )
-    close_holes: bool = option(
-        False, "close every hole by a fan of triangles", group=INPUT, of="cleaning"
-    )
-    label: int | str | None = option(
-        None,
+        choices=("paper", "fast"), pair=True,
+        more="The errors of 'fast' are a tenth larger (``benchmarks/cheaper.py``).  Another "
+        "value of what a preset sets is refused; to add one thing to the paper, give "
+        '``s4a.options.PRESETS["paper"]`` with that changed')
+    seed: int = computing(0, "seed of all randomness", of="low resolution", pair=True,
+        more="Or ``rng``, see :mod:`s4a.seeds`")
+    pattern: str | None = reading(None, "only files whose name fits, for example '*brain*'")
+    components: str | int = reading("largest",
+        "'largest', 'all' or how many pieces of each mesh to keep", check=check_components,
+        of="cleaning")
+    strict: bool = reading(False,
+        "exclude shapes with vertices that are not finite instead of repairing them", of="cleaning")
+    close_holes: bool = reading(False, "close every hole by a fan of triangles", of="cleaning")
+    label: int | str | None = reading(None,
         "the files are label volumes (NIfTI, MGH): the surface of this label, or several: 1,2",
-        more='Or of ``"all"``, see :func:`s4a.read_labels`',
-        check=check_label,
-        group=INPUT,
-        of="cleaning",
-    )
-    reflect: str | list[str] | None = option(
-        None,
+        check=check_label, of="cleaning", more='Or of ``"all"``, see :func:`s4a.read_labels`')
+    reflect: str | list[str] | None = reading(None,
         "shapes to mirror: their names, with commas; COLUMN=VALUE of the table; or auto",
         more="x becomes -x in the coordinates of their files, and triangles are turned over, so "
-        "that left and right ones are of one hand.  A column may also have 1 and 0; ``auto`` are "
-        "those of the rarer hand by ICP of pairs, as they are and mirrored "
-        "(:func:`s4a.input.hands.of_other_hand`).  ``/report`` says of each whether it was",
-        group=INPUT,
-    )
-    table: Path | str | None = option(
-        None,
+        "that left and right ones are of one hand.  A column may also have 1 and 0; ``auto`` "
+        "are those of the rarer hand by ICP of pairs, as they are and mirrored "
+        "(:func:`s4a.input.hands.of_other_hand`).  ``/report`` says of each whether it was")
+    table: Path | str | None = reading(None,
         "CSV with a column 'shape', covariates and groups, for the statistics",
-        more="See :func:`s4a.input.subjects.read_table`; they become ``/subjects``.  Nothing else "
-        "depends on it.  Without one, a table given to an earlier run stays",
-        group=INPUT,
-    )
-    landmarks: Path | str | None = option(
-        None,
+        more="See :func:`s4a.input.subjects.read_table`; they become ``/subjects``.  Nothing "
+        "else depends on it.  Without one, a table given to an earlier run stays")
+    landmarks: Path | str | None = reading(None,
         "folder of landmark files named as the shapes, which guide registration",
-        more="3D Slicer (.mrk.json), CSV or MeshLab (.pp), for some or all shapes.  Those of one "
-        "name guide and pull registration, see :func:`s4a.with_landmarks`, which gives them to "
-        "meshes in memory",
-        group=INPUT,
-    )
-    features: str | list[str] | None = option(
-        None,
+        more="3D Slicer (.mrk.json), CSV or MeshLab (.pp), for some or all shapes.  Those of "
+        "one name guide and pull registration, see :func:`s4a.with_landmarks`, which gives them "
+        "to meshes in memory")
+    features: str | list[str] | None = reading(None,
         "fields that guide registration, with commas: sulc is a.sulc.npy beside a.ply",
         more="Or a.sulc, or a property of PLY (:func:`s4a.input.annotations.files_beside`); see "
-        ":func:`s4a.with_features`, which gives them to meshes in memory",
-        group=INPUT,
-    )
-    method: str = option(
-        "rematch",
+        ":func:`s4a.with_features`, which gives them to meshes in memory")
+    method: str = network("rematch",
         "low resolution by remeshing, or by the local functions of SCALABLE",
-        more="The study has the same nodes and variables but for U, and all that takes one takes "
-        "it; what is called a coarse mesh are then samples, joined where their cells meet.  "
-        "``lift`` and ``wrap`` need a coarse mesh and are refused",
-        choices=("rematch", "scalable"),
-        section="4.1",
-        see="method/scalable",
-        group=NETWORK,
-        of="low resolution",
+        choices=("rematch", "scalable"), section="4.1", see="method/scalable", of="low resolution",
         pair=True,
-    )
-    n_coarse: int = option(
-        N_COARSE,
-        "vertices of the low-resolution meshes",
-        more="Or samples of SCALABLE",
-        least=100,
-        fast=3000,
-        section="4.1",
-        group=NETWORK,
-        of="low resolution",
+        more="The study has the same nodes and variables but for U, and all that takes one "
+        "takes it; what is called a coarse mesh are then samples, joined where their cells "
+        "meet.  ``lift`` and ``wrap`` need a coarse mesh and are refused")
+    n_coarse: int = network(N_COARSE, "vertices of the low-resolution meshes", least=100,
+        fast=3000, section="4.1", of="low resolution", pair=True, more="Or samples of SCALABLE")
+    wrap: bool = network(False, "wrap the shapes watertight before they are remeshed",
+        of="low resolution")
+    lift: bool = network(False,
+        "eigenfunctions of the original meshes, nearly, instead of U Phi", paper=False,
+        section="eq. 4, 7, 8", instead="$U \\phi$", see="method/lift", of="low resolution",
         pair=True,
-    )
-    wrap: bool = option(
-        False,
-        "wrap the shapes watertight before they are remeshed",
-        group=NETWORK,
-        of="low resolution",
-    )
-    lift: bool = option(
-        False,
-        "eigenfunctions of the original meshes, nearly, instead of U Phi",
         more="By inverse iteration, in eq. 4, 7 and the smoothing of eq. 8.  They are kept in "
-        "``/coarse``: 40 MB for 100,000 vertices",
-        paper=False,
-        section="eq. 4, 7, 8",
-        instead="$U \\phi$",
-        see="method/lift",
-        group=NETWORK,
-        of="low resolution",
-        pair=True,
-    )
-    k_init: int = option(
-        20, "size of the first functional maps", least=4, section="5.1", group=NETWORK, pair=True
-    )
-    k: int = option(
-        100,
-        "size of the refined functional maps",
-        least=4,
-        section="5.1",
-        group=NETWORK,
-        of="low resolution",
-        pair=True,
-    )
-    n_pairs: int = option(
-        500,
-        "pairs of the network, each with maps both ways",
-        more="All pairs where there are fewer",
-        least=1,
-        section="5.1",
-        group=NETWORK,
-    )
-    init: str = option(
-        "dense",
+        "``/coarse``: 40 MB for 100,000 vertices")
+    k_init: int = network(20, "size of the first functional maps", least=4, section="5.1",
+        pair=True)
+    k: int = network(100, "size of the refined functional maps", least=4, section="5.1",
+        of="low resolution", pair=True)
+    n_pairs: int = network(500, "pairs of the network, each with maps both ways", least=1,
+        section="5.1", more="All pairs where there are fewer")
+    init: str = network("dense",
         "first maps from all nearest neighbours, or the paper's fit on 10 landmarks",
+        choices=("dense", "landmarks"), paper="landmarks", section="4.1, steps 3 and 4",
+        instead="first map fitted on 10 landmarks", see="method/first_map", of="first maps",
+        pair=True,
         more="The former after ICP; in far poses the best of several maps, see "
-        ":func:`s4a.match_pair`",
-        choices=("dense", "landmarks"),
-        paper="landmarks",
-        section="4.1, steps 3 and 4",
-        instead="first map fitted on 10 landmarks",
-        see="method/first_map",
-        group=NETWORK,
+        ":func:`s4a.match_pair`")
+    ahead: str = network("always",
+        "a step of ZoomOut without growth for all first maps, for those of the network alone, "
+        "or none", choices=("always", "network", "never"), paper="network", section="4.2",
+        instead="a step of ZoomOut ahead of Consistent ZoomOut", see="method/first_map",
+        of="first maps", given_as="never".__ne__, pair=True,
+        more="All are also those of a pair that is matched on its own (4.1)")
+    step: int = network(5, "growth of the maps per round of Consistent ZoomOut", least=1,
+        section="4.2", pair=True)
+    n_latent: int | None = network(None, "dimension of the latent space; k by default", least=2,
+        section="eq. 3")
+    weights: str = network("cycles", "of the maps: by how far their cycles close, or 1",
+        choices=("cycles", "equal"), section="eq. 3", see="method/network")
+    n_spread: int = network(N_SPREAD,
+        "vertices at which the network looks for matches; 0 for all", paper=0, fast=500,
+        section="eq. 3", instead="for all vertices in every round", see="method/latent",
         of="first maps",
-        pair=True,
-    )
-    ahead: str = option(
-        "always",
-        "a step of ZoomOut without growth for all first maps, for those of the network alone, or "
-        "none",
-        more="All are also those of a pair that is matched on its own (4.1)",
-        choices=("always", "network", "never"),
-        paper="network",
-        section="4.2",
-        instead="a step of ZoomOut ahead of Consistent ZoomOut",
-        see="method/first_map",
-        group=NETWORK,
-        of="first maps",
-        given_as="never".__ne__,
-        pair=True,
-    )
-    step: int = option(
-        5,
-        "growth of the maps per round of Consistent ZoomOut",
-        least=1,
-        section="4.2",
-        group=NETWORK,
-        pair=True,
-    )
-    n_latent: int | None = option(
-        None, "dimension of the latent space; k by default", least=2, section="eq. 3", group=NETWORK
-    )
-    weights: str = option(
-        "cycles",
-        "of the maps: by how far their cycles close, or 1",
-        choices=("cycles", "equal"),
-        section="eq. 3",
-        see="method/network",
-        group=NETWORK,
-    )
-    n_spread: int = option(
-        N_SPREAD,
-        "vertices at which the network looks for matches; 0 for all",
-        more="In the step ahead of near poses, too, which saves time; 2 k at least",
-        paper=0,
-        fast=500,
-        section="eq. 3",
-        instead="for all vertices in every round",
-        see="method/latent",
-        group=NETWORK,
-        of="first maps",
-    )
-    wide: int = option(
-        4,
-        "its last rounds in which these look between the samples, too",
-        paper=0,
-        fast=0,
-        section="eq. 3",
-        see="method/latent",
-        group=NETWORK,
-    )
-    norm: str = option(
-        "h2",
-        "norm that decides which shape is the median",
-        more="See :func:`s4a.method.median.distance_to_identity`",
-        choices=("h2", "h1", "frobenius", "h2_image", "h2_both"),
-        section="eq. 5",
-        group=NETWORK,
-    )
-    keep_rounds: bool = option(
-        False,
+        more="In the step ahead of near poses, too, which saves time; 2 k at least")
+    wide: int = network(4, "its last rounds in which these look between the samples, too",
+        paper=0, fast=0, section="eq. 3", see="method/latent")
+    norm: str = network("h2", "norm that decides which shape is the median",
+        choices=("h2", "h1", "frobenius", "h2_image", "h2_both"), section="eq. 5",
+        more="See :func:`s4a.method.median.distance_to_identity`")
+    keep_rounds: bool = network(False,
         "keep the maps and latent bases of every round of Consistent ZoomOut",
-        more="They are ``/rounds``",
-        group=NETWORK,
-    )
-    template: str | None = option(
-        None, "name of the shape to register to; the median shape by default", group=REGISTRATION
-    )
-    how: str = option(
-        "ours",
-        "full resolution by eq. 7, or by eq. 3 and 4",
-        more='Unless ``refine="intrinsic"`` that match is one candidate among others',
-        choices=("ours", "standard"),
-        section="4.2",
-        group=REGISTRATION,
-    )
-    refine: str = option(
-        "elastic",
+        more="They are ``/rounds``")
+    template: str | None = registration(None,
+        "name of the shape to register to; the median shape by default")
+    how: str = registration("ours", "full resolution by eq. 7, or by eq. 3 and 4",
+        choices=("ours", "standard"), section="4.2",
+        more='Unless ``refine="intrinsic"`` that match is one candidate among others')
+    refine: str = registration("elastic",
         "elastic rounds, joint ones, or the paper's spectral match alone",
+        choices=("elastic", "joint", "intrinsic"), paper="intrinsic", section="eq. 7, 4",
+        instead="the match as it is", see="method/elastic", of="registration", pair=True,
         more="A price on bending and distances across the surface; in far poses joint rounds "
-        "before (:mod:`s4a.method.joint`).  Joint alone: the best of several ends",
-        choices=("elastic", "joint", "intrinsic"),
-        paper="intrinsic",
-        section="eq. 7, 4",
-        instead="the match as it is",
-        see="method/elastic",
-        group=REGISTRATION,
-        of="registration",
-        pair=True,
-    )
-    parts: bool = option(
-        True,
-        "in far poses joint rounds turn every part on its own",
-        paper=False,
-        section="eq. 8",
-        see="method/deform",
-        group=REGISTRATION,
-        of="registration",
-        pair=True,
-    )
-    sharpen: int = option(
-        1,
-        "rounds of ZoomOut of a single pair that look among all vertices of the source",
-        more="External meshes of a transfer are single pairs, too",
-        paper=0,
-        section="eq. 4",
-        instead="after ZoomOut on coarse vertices",
-        see="method/register",
-        group=REGISTRATION,
-        pair=True,
-    )
-    both: bool = option(
-        True,
-        "match single pairs both ways and transfer along both",
-        more="The mean of both, see :func:`s4a.register_pairs`",
-        paper=False,
-        section="6.2",
-        instead="a template registered to a shape",
-        see="analysis/transfer",
-        group=REGISTRATION,
-        pair=True,
-    )
-    alignment: str = option(
-        "fitted",
+        "before (:mod:`s4a.method.joint`).  Joint alone: the best of several ends")
+    parts: bool = registration(True, "in far poses joint rounds turn every part on its own",
+        paper=False, section="eq. 8", see="method/deform", of="registration", pair=True)
+    sharpen: int = registration(1,
+        "rounds of ZoomOut of a single pair that look among all vertices of the source", paper=0,
+        section="eq. 4", instead="after ZoomOut on coarse vertices", see="method/register",
+        pair=True, more="External meshes of a transfer are single pairs, too")
+    both: bool = registration(True, "match single pairs both ways and transfer along both",
+        paper=False, section="6.2", instead="a template registered to a shape",
+        see="analysis/transfer", pair=True, more="The mean of both, see :func:`s4a.register_pairs`")
+    alignment: str = registration("fitted",
         "displacements after the motion that fits the registered surface best, or after that of "
-        "ICP",
-        choices=("fitted", "icp"),
-        paper="icp",
-        section="eq. 8",
-        instead="after ICP (4.1, step 2)",
-        see="method/deform",
-        group=REGISTRATION,
-        of="registration",
-        pair=True,
-    )
-    area_weighted: bool = option(
-        True,
-        "weigh vertices by area in the projection after eq. 8",
-        paper=False,
-        section="after eq. 8",
-        instead="$(U \\phi)^\\dagger$ as printed",
-        see="method/deform",
-        group=REGISTRATION,
-        of="projection",
-        pair=True,
-    )
-    n_projected: int = option(
-        N_CENTRAL,
-        "vertices, near coarse ones, by which that projection is computed; 0 for all",
-        paper=0,
-        section="after eq. 8",
-        instead="on all vertices",
-        see="method/shape",
-        group=REGISTRATION,
-        of="projection",
-        pair=True,
-    )
-    scale: bool = option(
-        False, "take size out of the displacements", group=REGISTRATION, of="registration"
-    )
-    intersections: bool = option(True, "count triangles that pass through others", group=QUALITY)
-    doubtful: str = option(
-        "apart",
+        "ICP", choices=("fitted", "icp"), paper="icp", section="eq. 8",
+        instead="after ICP (4.1, step 2)", see="method/deform", of="registration", pair=True)
+    area_weighted: bool = registration(True,
+        "weigh vertices by area in the projection of displacements", paper=False,
+        section="after eq. 8", instead="$(U \\phi)^\\dagger$ as printed", see="method/deform",
+        of="projection", pair=True)
+    n_projected: int = registration(N_CENTRAL,
+        "vertices, near coarse ones, by which that projection is computed; 0 for all", paper=0,
+        section="after eq. 8", instead="on all vertices", see="method/shape", of="projection",
+        pair=True)
+    scale: bool = registration(False, "take size out of the displacements", of="registration")
+    intersections: bool = quality(True, "count triangles that pass through others")
+    doubtful: str = quality("apart",
         "what becomes of doubtful shapes: they stay apart, or the run stops",
+        choices=("apart", "stop"),
         more="Such are shapes mirrored or of another unit.  Apart they are placed beside the "
         "network of all others and registered, so that nothing changes for these.  A run stops "
-        "before the long stages",
-        choices=("apart", "stop"),
-        group=QUALITY,
-    )
-    keep_doubtful: bool = option(
-        False, "take doubtful shapes into modes and statistics", group=QUALITY
-    )
+        "before the long stages")
+    keep_doubtful: bool = quality(False, "take doubtful shapes into modes and statistics")
+    # fmt: on
 
     def __post_init__(self):
         settings = apply_preset(self.preset, vars(self), PRESETS)
