@@ -40,7 +40,7 @@ from s4a.method.register import common_unit
 from s4a.options import Options
 from s4a.schema import check_count, dataset, in_unit
 from s4a.seeds import RNG, seed_of
-from s4a.study.newcomers import read_new
+from s4a.study.insert import read_new
 
 log = logging.getLogger(__name__)
 

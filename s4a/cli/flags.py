@@ -108,14 +108,6 @@ def processes(text: str) -> int:
     return number
 
 
-def named_label(text: str) -> tuple[str, str]:
-    """A structure and its label or labels, as ``left=17``."""
-    name, equals, label = text.partition("=")
-    if not (name and equals and label):
-        raise argparse.ArgumentTypeError(f"a structure and its label needed, as left=17: {text!r}")
-    return name, label
-
-
 def _check(add):
     add("paths", nargs="+", metavar="PATH", help="folders, globs or mesh files")
     add_options(add, ["components", "pattern", "label", "strict", "close_holes", "intersections"])
@@ -134,8 +126,6 @@ def _run(add):
     add("--out", required=True, metavar="STUDY", help=text)
     text = "dask scheduler tcp://host:port, or local:N worker processes"
     add("--cluster", metavar="ADDRESS", help=text)
-    text = "label volumes that each hold several structures: left=17 right=53"
-    add("--structures", nargs="+", type=named_label, metavar="NAME=LABEL", help=text)
     add_options(add, [*DECLARED, "n_jobs"])
 
 
@@ -245,29 +235,14 @@ def _growth(add):
     add_options(add, ["seed"])
 
 
-def _structures(add):
-    add("study", metavar="STUDY")
-    add("--scale", action="store_true", help="take the size of each whole subject out")
-    text = "also test whether groups differ in how structures lie, and in their shapes"
-    add("--group", metavar="COLUMN", help=text)
-    text = "folder of s4a insert, or its inserted.nc: poses and scores of new subjects, too"
-    add("--new", metavar="DIR", help=text)
-    add("--permutations", type=whole, help="of the subjects (default: 999)")
-    add("--out", metavar="DIR", help="for netCDF, CSV, the pages (default: STUDY/statistics)")
-    add_options(add, ["seed"])
-
-
 def _insert(add):
     add("study", metavar="STUDY")
     add("shapes", nargs="+", metavar="SHAPE", help="mesh files, label volumes, folders or globs")
     text = "for inserted.nc, registered meshes and scores"
     add("--out", required=True, metavar="DIR", help=text)
     add("--landmarks", metavar="DIR", help="folder of landmark files named as the shapes")
-    text = "new shapes to mirror: names, with commas; COLUMN=VALUE of the table of several "
-    text += "structures; or auto, those of the other hand"
+    text = "new shapes to mirror: names, with commas; or auto, those of the other hand"
     add("--reflect", metavar="NAMES", help=text)
-    text = "CSV of several structures, with columns shape, subject and structure"
-    add("--table", metavar="CSV", help=text)
     add_options(add, ["n_jobs"])
 
 
@@ -357,7 +332,6 @@ COMMANDS = {
     "asymmetry": Command(growing.asymmetry, _asymmetry),
     "fields": Command(growing.fields, _fields),
     "growth": Command(growing.growth, _growth),
-    "structures": Command(growing.structures, _structures),
     "insert": Command(commands.insert, _insert),
     "complete": Command(commands.complete, _complete),
     "export": Command(leaving.export, _export),

@@ -136,7 +136,6 @@ def test_wrong_usage_ends_with_2_says_how_and_leaves_the_log_as_it_was(arguments
 def test_every_option_of_analyse_is_a_flag_of_run_with_the_same_default():
     found = commands.options_of(cli.parser().parse_args(["run", "a", "b", "--out", "study"]))
     assert found.pop("n_jobs") == -1  # on the command line all cores are taken
-    assert found.pop("structures") is None
     assert Options(**found) == Options()
 
 

@@ -3,18 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
-
-import s4a
-from s4a import analyse, cli, write_mesh
-from s4a.datasets.structures import subjects
-from s4a.input.annotations import write_landmarks
-from s4a.input.hands import mirror_image
-from s4a.input.subjects import read_table
-from s4a.method.shape import features_of
-from s4a.options import Options
-from s4a.schema import dataset
 from s4a.study.newcomers import read_new
-from s4a.study.sources import find_sources
 from s4a.study.structures import (
     check_parts,
     landmark_folders,
@@ -22,6 +11,17 @@ from s4a.study.structures import (
     parts_of_labels,
     parts_of_table,
 )
+from s4a_morphometrics.synthetic import subjects
+
+import s4a
+from s4a import analyse, cli, write_mesh
+from s4a.input.annotations import write_landmarks
+from s4a.input.hands import mirror_image
+from s4a.input.subjects import read_table
+from s4a.method.shape import features_of
+from s4a.options import Options
+from s4a.schema import dataset
+from s4a.study.sources import find_sources
 
 SMALL = {"n_coarse": 100, "k": 10, "k_init": 6, "n_pairs": 3, "n_jobs": 1}
 WHERE = np.concatenate([np.eye(3), -np.eye(3)])  # on the unit sphere that all beans are made of

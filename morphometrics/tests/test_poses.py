@@ -5,12 +5,12 @@ import logging
 import numpy as np
 import pytest
 import xarray as xr
+from s4a_morphometrics.poses import align_wholes, measured, pose_fields, poses_of
+from s4a_morphometrics.synthetic import bean, example_structures, subjects
 from scipy.spatial.transform import Rotation
 
 import s4a
 from s4a import statistics
-from s4a.analysis.structures import align_wholes, measured, pose_fields, poses_of
-from s4a.datasets.structures import bean, example_structures, subjects
 from s4a.geometry.mesh import vertex_areas
 from s4a.schema import dataset, in_unit
 from s4a.show.surfaces import mode_arrays

@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 import xarray as xr
+from s4a.study.structures import to_mirror
+from s4a_morphometrics.synthetic import subjects
 
 import s4a
 from s4a import analyse, cli, open_study, write_mesh
-from s4a.datasets.structures import subjects
 from s4a.geometry.mesh import as_arrays, volume
 from s4a.input.hands import mirror_image, seen_together, subjects_of_other_hand
 from s4a.input.subjects import subjects as table_of
 from s4a.schema import dataset
-from s4a.study.structures import to_mirror
 
 SMALL = {"n_coarse": 100, "k": 10, "k_init": 6, "n_pairs": 6, "n_jobs": 1}
 FLAGS = "--n-coarse 100 --k 10 --k-init 6 --n-pairs 6 --n-jobs 1".split()

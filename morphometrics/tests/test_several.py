@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 import xarray as xr
+from s4a.study.structures import parts_of_dict, parts_of_labels, parts_of_table
+from s4a_morphometrics.synthetic import subjects
 
 import s4a
 from s4a import analyse, cli, open_study, write_mesh
 from s4a.cli.flags import named_label
-from s4a.datasets.structures import subjects
 from s4a.input.subjects import read_table
 from s4a.options import Options
 from s4a.study.sources import find_sources
-from s4a.study.structures import parts_of_dict, parts_of_labels, parts_of_table
 
 SMALL = {"n_coarse": 100, "k": 10, "k_init": 6, "n_pairs": 6, "n_jobs": 1}
 FLAGS = "--n-coarse 100 --k 10 --k-init 6 --n-pairs 6 --n-jobs 1".split()

@@ -5,9 +5,9 @@ import pytest
 
 pytest.importorskip("anywidget")
 from ipywidgets.widgets import widget as registry
+from s4a_morphometrics.synthetic import example_structures
 
 import s4a
-from s4a.datasets.structures import example_structures
 from s4a.widgets import Explore, Structures
 
 
