@@ -27,7 +27,7 @@ LONG_LINE = 100
 LONG_FUNCTION = 60  # lines of code
 FUNCTION = (ast.FunctionDef, ast.AsyncFunctionDef)
 
-# The order in which data flow; tests/house/test_imports.py holds every import to it.
+# The order in which data flow; tests/project/test_imports.py holds every import to it.
 ROOMS = (
     "schema",
     "seeds",
@@ -212,31 +212,13 @@ def reachable(graph, name):
     return seen
 
 
-def old_rooms() -> dict[str, str]:
-    """The room in which every module lies that once lay beside all others."""
-    sys.path.insert(0, str(ROOT))
-    from s4a._moved import MOVED  # the standard library only
-
-    sys.path.remove(str(ROOT))
-    return {old: new.partition(".")[0] for old, new in MOVED.items()} | {
-        "clean": "input",
-        "insert": "study",
-    }
-
-
-def room_of(module, rooms):
-    """The room of a module; a module that lay in no room counts where it lies now."""
-    return rooms.get(module.name, module.room)
-
-
 def arrows_between_rooms(modules, graph):
     """Counter of (room that imports, room that is imported) over the imports of all modules."""
-    rooms = old_rooms() if "input.files" not in modules else {}
     arrows = Counter()
     for name, needs in graph.items():
-        here = room_of(modules[name], rooms)
+        here = modules[name].room
         for needed in needs:
-            there = room_of(modules[needed], rooms)
+            there = modules[needed].room
             if here != there and here in ROOMS and there in ROOMS:
                 arrows[here, there] += 1
     return arrows

@@ -1,17 +1,14 @@
 """How the house hangs together: rooms in the order of the data, and nothing heavy loaded early."""
 
 import ast
-import importlib
 import subprocess
 import sys
-import warnings
 from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 import s4a
-from s4a import _moved
 
 FOLDER = Path(s4a.__file__).parent
 
@@ -34,7 +31,6 @@ ROOMS = (
 FRONT_DOOR = (
     "__init__",
     "__main__",
-    "_moved",
     "accessor",
     "course",
 )  # they stand outside of the order
@@ -118,17 +114,12 @@ def test_workers_load_what_they_compute_with_and_no_more():
     assert loaded_by(code, (*OFTEN, *SELDOM, "scipy.stats")) == list(OFTEN)
 
 
-def test_public_names_are_where_types_and_completion_say():
-    tree = ast.parse(MODULES["__init__"].read_text(encoding="utf-8"))
-    places = [node for node in tree.body if isinstance(node, ast.If)]
-    [types] = [node for node in places if ast.unparse(node.test) == "TYPE_CHECKING"]
-    told = {alias.name: node.module for node in types.body for alias in node.names}
-    assert told.pop("widgets") == "s4a"  # a room of its own, see below
-    assert told == {name: f"s4a.{module}" for name, module in s4a.MODULE_OF.items()}
-    assert sorted(told) == s4a.__all__
-    assert set(told) < set(dir(s4a))
-    for name, module in told.items():
-        assert getattr(s4a, name) is getattr(importlib.import_module(module), name)
+def test_every_public_name_is_there_and_completion_offers_no_other():
+    assert set(s4a.__all__) | {"widgets"} == set(dir(s4a))
+    for name in s4a.__all__:
+        assert getattr(s4a, name) is not None
+    assert callable(s4a.clean)
+    assert callable(s4a.insert)
 
 
 def test_modules_of_rooms_need_no_import_of_their_own():
@@ -143,30 +134,12 @@ def test_panels_are_there_when_they_are_asked_for():
 
 
 def test_names_that_are_nowhere_are_attribute_errors():
-    with pytest.raises(AttributeError, match=r"module 's4a' has no attribute 'analyze'"):
+    with pytest.raises(AttributeError, match="No s4a attribute analyze"):
         _ = s4a.analyze
-    with pytest.raises(AttributeError, match=r"module 's4a\.method' has no attribute 'fmaps'"):
+    with pytest.raises(AttributeError, match=r"No s4a\.method attribute fmaps"):
         _ = s4a.method.fmaps
 
 
 def test_studies_have_their_accessor_with_the_first_public_name():
     code = "import s4a\ns4a.open_study\nimport xarray\nassert xarray.DataTree().s4a.explore"
     assert loaded_by(code, PANELS) == []
-
-
-@pytest.mark.parametrize("old, new", _moved.MOVED.items())
-def test_an_old_name_of_a_module_is_the_new_module(old, new):
-    expected = importlib.import_module(f"s4a.{new}")
-    spec = expected.__spec__
-    sys.modules.pop(f"s4a.{old}", None)
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        assert importlib.import_module(f"s4a.{old}") is expected
-    messages = [str(w.message) for w in said if w.category is DeprecationWarning]
-    assert messages == ([] if old in _moved.PUBLIC else [f"s4a.{old} is now s4a.{new}"])
-    assert expected.__spec__ is spec
-
-
-def test_functions_that_share_an_old_name_with_a_module_stay_functions():
-    assert callable(s4a.clean)
-    assert callable(s4a.insert)

@@ -8,8 +8,6 @@ import re
 import pytest
 from paths import DOCS, NOTEBOOKS, ROOT, benchmark
 
-from s4a._moved import MOVED
-
 structure = benchmark("structure")
 WORDS = [
     *sorted(DOCS.glob("*.md")),
@@ -59,13 +57,6 @@ def test_every_module_of_the_table_in_the_readme_is_there():
         for name in re.findall(r"`([\w/]+)`", cell):
             room, _, module = name.rpartition("/") if "/" in name else (room, "", name)
             assert (ROOT / "s4a" / room / f"{module}.py").exists(), name
-
-
-@each_page
-def test_no_page_names_a_module_as_it_was_called_before(path):
-    old = set(MOVED) - {"compare", "metrics", "statistics", "synthetic"}
-    named = re.findall(r"(?<![\w/])s4a\.(\w+)\b(?!\()", path.read_text(encoding="utf-8"))
-    assert sorted(old & set(named)) == []
 
 
 def test_lines_of_code_are_neither_blank_nor_comment_nor_docstring(tmp_path):

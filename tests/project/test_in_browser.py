@@ -20,7 +20,7 @@ def done(study_folder, tmp_path_factory):
     """What the script did, in a process of its own and with its own temporary folder."""
     place = str(tmp_path_factory.mktemp("browser"))
     environment = os.environ | {"TMPDIR": place, "TEMP": place, "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, str(TESTS / "house" / "in_browser.py"), str(study_folder)]
+    command = [sys.executable, str(TESTS / "project" / "in_browser.py"), str(study_folder)]
     run = subprocess.run(
         command, env=environment, cwd=place, capture_output=True, text=True, check=False
     )
