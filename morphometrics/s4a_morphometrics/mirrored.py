@@ -25,9 +25,7 @@ from s4a.schema import dataset
 from s4a.study.insert import clean_new, hands_beside, portraits_of
 from s4a.study.options import Options
 
-Looks = Mapping[
-    str, Mapping[str, xr.Dataset]
-]  # structure -> subject -> comparison
+Looks = Mapping[str, Mapping[str, xr.Dataset]]  # structure -> subject -> comparison
 
 
 def find_mirrored(

@@ -154,14 +154,14 @@ def folder_of(store: Path | str | None) -> Iterator[Path]:
     yield Path(store)
 
 
-def given_files(part: Part, folder: Path, name: str) -> dict[str, Path]:
+def given_files(part: Part, folder: Path, name: str) -> dict[str, Any]:
     """The table and the landmarks of one structure, written as :func:`s4a.analyse` takes them."""
-    given = {}
+    given: dict[str, Any] = {}
     if part.rows:
         given["table"] = folder / f"{name}.csv"
-        with given["table"].open("w", newline="", encoding="utf-8") as file:
+        with given["table"].open("w", newline="", encoding="utf-8") as table:
             columns = list(next(iter(part.rows.values())))
-            lines = csv.writer(file)
+            lines = csv.writer(table)
             lines.writerow(["shape", *columns])
             lines.writerows([shape, *cells.values()] for shape, cells in part.rows.items())
     if part.landmarks:
@@ -489,7 +489,7 @@ def of_structure(study: xr.DataTree, name: str) -> xr.DataTree:
     names = structure_names(study)
     if name not in names:
         raise ValueError(f"the study has no structure {name!r}; it has {listed(names)}")
-    return study[FOLDER][name].copy()
+    return study[FOLDER].children[name].copy()
 
 
 # ---- new subjects
@@ -558,7 +558,7 @@ def insert_structures(
         given = {name: (studies[name], part.shapes) for name, part in parts.items() if part.shapes}
         chosen, told = find_mirrored_new(given)
     elif reflect is not None:
-        chosen = named_subjects(Options(reflect=reflect).reflect, parts)
+        chosen = named_subjects(str(Options(reflect=reflect).reflect), parts)
     inserted, failed = {}, []
     with TemporaryDirectory() as folder:
         for name, part in parts.items():
