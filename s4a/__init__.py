@@ -16,11 +16,11 @@ reading and cleaning      :func:`read_shapes`, :func:`read_shape`, :func:`read_l
 4.2, 6.1 collections      :func:`analyse`, :func:`open_study`, :func:`verify`, :func:`synthesize`
 notebooks, pages          :func:`explore`, :func:`write_page`
 pictures, films           :func:`write_picture`, :func:`write_film`
-new shapes, parts         :func:`insert`, :func:`complete`
+new shapes                :func:`insert`
 6.1 statistics            :mod:`s4a.statistics`
 6.2 transfer              :func:`transfer_labels`, :func:`transfer_landmarks`,
                           :func:`transfer_scalars`, :func:`register_pairs`, :func:`with_field`
-for other programs        :func:`write_for`, :func:`write_registered`, :func:`write_training_set`
+for other programs        :func:`write_registered`, :func:`write_label_volumes`
 the bundled collection    :mod:`s4a.synthetic`
 ========================  ====================================================================
 
@@ -40,16 +40,15 @@ if TYPE_CHECKING:
     from s4a import widgets as widgets
     from s4a.accessor import explore
     from s4a.analysis import statistics
-    from s4a.analysis.complete import complete
-    from s4a.analysis.export import write_registered, write_training_set
+    from s4a.analysis.export import write_registered
     from s4a.analysis.fields import with_field
-    from s4a.analysis.programs import write_for
     from s4a.analysis.transfer import (
         register_pairs,
         transfer_labels,
         transfer_landmarks,
         transfer_scalars,
     )
+    from s4a.analysis.volumes import write_label_volumes
     from s4a.datasets import synthetic
     from s4a.evaluation import compare, metrics
     from s4a.input.clean import clean
@@ -85,7 +84,6 @@ __all__ = [
     "clean",
     "coarsen",
     "compare",
-    "complete",
     "explore",
     "insert",
     "latent_map",
@@ -113,22 +111,20 @@ __all__ = [
     "with_field",
     "with_landmarks",
     "write_film",
-    "write_for",
+    "write_label_volumes",
     "write_mesh",
     "write_page",
     "write_picture",
     "write_registered",
-    "write_training_set",
 ]
 # module -> the public names that it holds
 PLACES = {
     "accessor": "explore",
     "analysis": "statistics",
-    "analysis.complete": "complete",
-    "analysis.export": "write_registered write_training_set",
+    "analysis.export": "write_registered",
     "analysis.fields": "with_field",
-    "analysis.programs": "write_for",
     "analysis.transfer": "register_pairs transfer_labels transfer_landmarks transfer_scalars",
+    "analysis.volumes": "write_label_volumes",
     "datasets": "synthetic",
     "evaluation": "compare metrics",
     "input.clean": "clean",

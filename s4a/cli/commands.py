@@ -203,12 +203,11 @@ def statistics(args: Namespace) -> int:
     from s4a.analysis import statistics as tests
     from s4a.analysis.export import write_results
     from s4a.cli import tables
-    from s4a.cli.results import covariation_lines
     from s4a.show.page import write_page
     from s4a.show.pictures import write_film
 
-    if args.covariates and not (args.group or args.variable or args.field):
-        raise ValueError("--covariates are of a test: give --group, --variable or --field")
+    if (args.covariates or args.field) and not (args.group or args.variable):
+        raise ValueError("--covariates and --field are of a test: give --group or --variable")
     study, out = study_to_test(args)
     study = restricted(study, args)
     results = tests_of(study, args)  # first, as options and columns may be refused
@@ -233,8 +232,6 @@ def statistics(args: Namespace) -> int:
             page = Path(out) / "regression.html"
             write_page(moving, page, title=f"Regression on {args.variable}")
             write_film(moving, Path(out) / "regression.gif")
-    if args.field:
-        write("\n" + covariation_lines(results["covariation"]))
     confidence = study["registration"]["confidence"].mean().item()
     write(f"\nmean confidence of the registration {confidence:.2f}; results: {out}")
     return 0
@@ -321,9 +318,6 @@ def tests_of(study: "xr.DataTree", args: Namespace) -> "dict[str, xr.Dataset]":
         )
     if args.variable:
         results["regression"] = tests.regression(study, args.variable, field=args.field, **options)
-    if args.field:
-        del options["variances"]
-        results["covariation"] = tests.covariation(study, args.field, **options)
     return results
 
 
@@ -350,27 +344,6 @@ def insert(args: Namespace) -> int:
         write(f"{place}\n{tables.inserted_table(part)}".lstrip())
     write(f"\nwritten: {out / 'inserted.nc'}, registered meshes and scores in {out}")
     return 1 if (inserted["report"][status] == "excluded").any() else 0
-
-
-def complete(args: Namespace) -> int:
-    """A part of a shape matched to a finished study, and the whole that it may be of."""
-    from s4a.analysis.complete import complete
-    from s4a.analysis.export import write_completed
-    from s4a.cli import tables
-    from s4a.study.tree import open_study
-
-    found = complete(
-        open_study(args.study),
-        args.part,
-        landmarks=args.landmarks,
-        components=args.components,
-        n_samples=args.samples,
-        seed=args.seed,
-    )
-    paths = write_completed(found, args.out)
-    write("\n".join(tables.completed_lines(found)))
-    write(f"\nwritten: {', '.join(map(str, paths[:2]))}, samples: {len(paths) - 2}")
-    return 0
 
 
 def transfer(args: Namespace) -> int:

@@ -1,9 +1,9 @@
-"""The commands of fields, growth, structures and asymmetry, see :mod:`s4a.cli.commands`."""
+"""The commands of fields and structures, see :mod:`s4a.cli.commands`."""
 
 from argparse import Namespace
 from pathlib import Path
 
-from s4a.cli.commands import study_to_test, within, write
+from s4a.cli.commands import within, write
 
 
 def fields(args: Namespace) -> int:
@@ -25,38 +25,6 @@ def fields(args: Namespace) -> int:
         f"{path}\n"
         f"s4a statistics {args.study} --field {args.name} takes it in place of shape"
     )
-    return 0
-
-
-def growth(args: Namespace) -> int:
-    """How shape changes with time in subjects that were seen several times; its animation."""
-    from s4a.analysis import statistics as tests
-    from s4a.analysis.export import write_results
-    from s4a.cli import results, tables
-    from s4a.show.page import write_page
-    from s4a.show.pictures import write_film
-
-    study, out = study_to_test(args)
-    options = {} if args.permutations is None else {"n_permutations": args.permutations}
-    found = tests.growth(
-        study,
-        args.time,
-        args.subject,
-        covariates=args.covariates or None,
-        field=args.field,
-        of=args.of,
-        variances=args.variances,
-        seed=args.seed,
-        **options,
-    )
-    write_results(found, out, "growth")
-    write(results.growth_lines(found, args.time))
-    write("\n" + tables.significance(found, found, "change within subjects", study))
-    if not args.field:
-        moving = tests.regression_modes(study, found, args.time)
-        write_page(moving, Path(out) / "growth.html", title=f"Growth with {args.time}")
-        write_film(moving, Path(out) / "growth.gif")
-    write(f"\nresults: {out}")
     return 0
 
 
@@ -96,32 +64,4 @@ def structures(args: Namespace) -> int:
             write_scores(scores, out / f"new_{level}.csv")
         write_page(of_level, out / f"{level}.html", title=f"Structures: {level}")
     write(f"\nresults: {out}")
-    return 0
-
-
-def asymmetry(args: Namespace) -> int:
-    """How left and right differ: shares of variance, directional asymmetry, antisymmetry.
-
-    Every shape against its mirror image, or both sides of every subject.
-    """
-    from s4a.analysis import statistics as tests
-    from s4a.analysis.export import write_results
-    from s4a.cli import tables
-    from s4a.geometry.mesh import as_arrays
-    from s4a.input.files import write_mesh
-    from s4a.show.page import write_page
-
-    study, out = study_to_test(args)
-    options = {} if args.permutations is None else {"n_permutations": args.permutations}
-    found = tests.asymmetry(
-        study, subject=args.subject, side=args.side, of=args.of, seed=args.seed, **options
-    )
-    write_results(found, out, "asymmetry")
-    write(tables.asymmetry_table(found))
-    write("\n" + tables.significance(found, found, "directional asymmetry", study))
-    if found.attrs["symmetry"] == "object":
-        write_mesh(Path(out) / "symmetric.ply", *as_arrays(tests.symmetric_template(study, found)))
-    page = Path(out) / "asymmetry.html"
-    write_page(tests.asymmetry_modes(study, found), page, title="Left against right")
-    write(f"\nresults: {out}; the modes of asymmetry: {page}")
     return 0

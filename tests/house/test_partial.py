@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from paths import benchmark
 
-from s4a.analysis.calibration import Errors, Found, image_of
 from s4a.analysis.inputs import registration_of
-from s4a.analysis.partial import model_of
+from s4a_morphometrics.calibration import Errors, Found, image_of
+from s4a_morphometrics.partial import model_of
 
 partial = benchmark("partial")
 NAMES = list("abcd")

@@ -49,7 +49,7 @@ from s4a.datasets.structures import example_structures
 from s4a.widgets import Comparison, Maps, Progress, Region, Structures
 
 study = s4a.open_study({study!r})
-found = s4a.statistics.asymmetry(study, n_permutations=15)
+found = s4a.statistics.regression(study, range(4), of="normal", n_permutations=15)
 p = np.where(np.arange(found.sizes["vertex"]) % 3, 0.4, 0.02)
 found = found.assign(p_family_wise=found["p_family_wise"].copy(data=p))
 several = example_structures()
