@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test coverage test-lowest test-newest check fuzz format bench paper figures hangs structure lab docs pages slides address release binder submission clean
+.PHONY: demo test coverage test-lowest test-newest check fuzz format bench paper figures hangs structure weight lab docs pages slides address release binder submission clean
 
 demo: $(VENV)/.core
 	$(BIN)/s4a demo
@@ -46,8 +46,8 @@ bench: $(VENV)/.bench
 
 # lesson 04 twenty times, and every other one three times, on a busy machine: does one hang?
 hangs: $(VENV)/.test
-	$(BIN)/python tests/benchmarks/hangs.py 04 --runs 20
-	$(BIN)/python tests/benchmarks/hangs.py --runs 3
+	$(BIN)/python benchmarks/hangs.py 04 --runs 20
+	$(BIN)/python benchmarks/hangs.py --runs 3
 
 # every table that README, documentation and papers quote, into docs/tables, with machine and versions, and every
 # picture: hours. # ONLY=accuracy takes the commands with that word, ONLY=--list names all
@@ -61,7 +61,11 @@ figures: $(VENV)/.bench
 
 # the picture, the measures and the map of the rooms, made from the code
 structure: $(VENV)/.core
-	$(BIN)/python tests/benchmarks/structure.py --write
+	$(BIN)/python benchmarks/structure.py --write
+
+# modules, lines, options, tests and bytes; REVISION=... prints those of that revision next to them
+weight: $(VENV)/.test
+	$(BIN)/python tools/weight.py $(REVISION)
 
 lab: $(VENV)/.course
 	$(BIN)/jupyter lab $(wildcard notebooks)
@@ -73,7 +77,7 @@ docs: $(VENV)/.docs
 # the lessons that are shown on the web: run, made into pages, and looked at in Chromium from a plain server
 pages: $(VENV)/.test
 	S4A_LESSONS="00 02 04 06 09" $(BIN)/python -m sphinx -q --keep-going -b html -d docs/_build/doctrees docs docs/_build/html
-	$(BIN)/python tests/benchmarks/offline.py
+	$(BIN)/python benchmarks/offline.py
 
 # the public address, NAME=name/s4a, written into every file that says it
 address:

@@ -41,4 +41,4 @@ step "lesson 00, from a clean kernel" jupyter execute notebooks/00_explore.ipynb
 du -sh "$root/venv" binder/study_51 notebooks/study_00 | sed "s#$root/##"
 step "a driver of Chromium" pip install --quiet playwright
 # shellcheck disable=SC2086
-python tests/benchmarks/binder_pages.py $pictures
+python benchmarks/binder_pages.py $pictures

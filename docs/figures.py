@@ -3,7 +3,7 @@
 The figures of the paper are drawn from the bundled collection, twelve synthetic brains of 40,000
 vertices, analysed with all defaults as ``s4a demo`` does; the two panels and the scene are those of
 this study in Chromium, the scene in JupyterLab. A name is that of a picture without its ending;
-``docs/heads.png`` is made by ``tests/benchmarks/compare.py heads``, and ``docs/structure.svg`` by
+``docs/heads.png`` is made by ``benchmarks/compare.py heads``, and ``docs/structure.svg`` by
 ``make structure``.
 
 Pictures of data that the project may use and not give away are drawn only where they are named and
@@ -24,6 +24,7 @@ from matplotlib.patches import Patch
 from PIL import Image
 
 import s4a
+import s4a_morphometrics
 from s4a.datasets.synthetic import LABELS
 from s4a.method import fmap, steps
 from s4a.method import pca as modes
@@ -293,7 +294,7 @@ def landmarks(held_out):
 
 def front_ends():
     """The script that opens notebooks in Chromium."""
-    sys.path.insert(0, str(HERE.parent / "tests" / "benchmarks"))
+    sys.path.insert(0, str(HERE.parent / "benchmarks"))
     import frontends
 
     return frontends
@@ -407,14 +408,14 @@ def hippocampi(n=VOLUMES):
             f"found {len(files)}: those of Task04 of the Medical Segmentation Decathlon"
         )
     parts = {"anterior": 1, "posterior": 2}
-    return s4a.analyse(files, structures=parts, n_coarse=1000, k=60)
+    return s4a_morphometrics.analyse_structures(files, structures=parts, n_coarse=1000, k=60)
 
 
 def joint_modes(study, what, name, folder=LOCAL_FOLDER, n_modes=3):
     """The first joint modes of several structures, each from above and from the side."""
-    found = s4a.statistics.structures(study)
+    found = s4a_morphometrics.structures(study)
     names = found["structure"].values.tolist()
-    mean, T, steps = mode_arrays(s4a.statistics.structures_modes(study, found), n_modes=n_modes)
+    mean, T, steps = mode_arrays(s4a_morphometrics.structures_modes(study, found), n_modes=n_modes)
     palette = np.array([to_rgb(OKABE_ITO[i]) for i in (0, 4, 2, 6, 1, 5, 3, 7)])
     colors = palette[found["structure_of_vertex"].values % len(palette)]
     ends = np.concatenate([mean + s * step for step in steps for s in (-2, 2)])

@@ -10,7 +10,7 @@ ROOT = TESTS.parent
 DOCS = ROOT / "docs"
 NOTEBOOKS = ROOT / "notebooks"
 DATA = ROOT.parent / "shared" / "data"  # real meshes, beside the repository; tests skip without
-BENCHMARKS = TESTS / "benchmarks"
+BENCHMARKS = ROOT / "benchmarks"
 
 
 def script(path: Path) -> ModuleType:

@@ -1,14 +1,14 @@
 """Every table that README, documentation and papers quote, made anew: ``make paper``.
 
 The commands are those that the pages name in backticks, such as ``speed.py growth``; they are
-scripts of ``tests/benchmarks``. Each writes what it prints into ``docs/tables``, with day, machine
+scripts of ``benchmarks``. Each writes what it prints into ``docs/tables``, with day, machine
 and versions at its foot; those of speed, which ``make bench`` runs, into ``docs/performance``. Both
 folders stand in the repository, and the documentation has a page of each. All of them take more
 than a night on two cores: ``make paper ONLY=accuracy`` takes those whose command contains the word,
 ``make paper ONLY=--list`` names all and runs none, and ``make paper ONLY=--rest`` goes on with
 those that have not ended well yet; with ``--minutes=20`` beside it a command that takes longer is
-ended and told, and what it printed before stays. ``tests/house/test_figures.py`` fails where a page
-quotes a figure without a command.
+ended and told, and what it printed before stays. ``tests/project/test_documents.py`` fails where a
+page quotes a figure without a command.
 """
 
 import os
@@ -24,7 +24,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-BENCHMARKS = ROOT / "tests" / "benchmarks"
+BENCHMARKS = ROOT / "benchmarks"
 TABLES = ROOT / "docs" / "tables"
 PAGES = (
     "README.md",
@@ -69,7 +69,7 @@ def commands_in(text):
         words = words[1:] if words[:1] == ["python"] else words
         if not words or not words[0].endswith(".py"):
             continue
-        name = words[0].removeprefix("tests/benchmarks/")
+        name = words[0].removeprefix("benchmarks/")
         if (BENCHMARKS / name).is_file():
             found.append((name, *(word for word in words[1:] if word != "--write")))
     return found
@@ -101,7 +101,7 @@ def versions():
     revision = subprocess.run(
         ["git", "describe", "--always"], cwd=ROOT, capture_output=True, text=True
     ).stdout.strip()
-    code = ["s4a", "tests", "pyproject.toml"]  # a picture drawn anew changes no number
+    code = ["s4a", "benchmarks", "pyproject.toml"]  # a picture drawn anew changes no number
     changed = subprocess.run(
         ["git", "diff", "--quiet", "HEAD", "--", *code], cwd=ROOT, capture_output=True
     ).returncode

@@ -6,6 +6,9 @@ left and right         :func:`asymmetry`, :func:`asymmetry_modes`, :func:`symmet
 several visits         :func:`growth`
 fields against shape   :func:`covariation`, :func:`covariation_modes`
 parts of shapes        :func:`complete`, :func:`write_completed`
+several structures     :func:`analyse_structures`, :func:`open_structures`,
+                       :func:`insert_structures`, :func:`of_structure`, :func:`structures`,
+                       :func:`structures_modes`, :func:`structures_of_new`
 other programs         :func:`write_for`, :func:`write_training_set`
 =====================  =====================================================================
 

@@ -26,7 +26,7 @@ import xarray as xr
 from s4a.analysis.inputs import registration_of
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays
-from s4a.input.evidence import spread
+from s4a.input.plausibility import spread
 from s4a.method.first_map import motion_onto
 from s4a.method.pca import gram
 from s4a.method.register import from_latent

@@ -30,7 +30,7 @@ def add_test(add: Add, permuted: str, *, field: str = "", unequal: str = "") -> 
     add_options(add, ["seed"])
 
 
-def drawn(args: Namespace) -> dict[str, int]:
+def drawn(args: Namespace) -> dict[str, Any]:
     """How often a test rearranges, and the seed."""
     given = {"n_permutations": args.permutations, "seed": args.seed}
     return {name: value for name, value in given.items() if value is not None}

@@ -11,8 +11,8 @@ import xarray as xr
 from s4a.analysis.inputs import registration_of
 from s4a.analysis.link import image_in_shape
 from s4a.geometry.mesh import as_arrays
-from s4a.input.evidence import MIRROR
 from s4a.input.files import write_mesh
+from s4a.input.hands import MIRROR
 from s4a.study import store
 
 FORMATS = {"ply": ".ply", "vtk": ".vtk", "obj": ".obj", "npz": ".npz", "gifti": ".gii"}

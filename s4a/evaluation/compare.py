@@ -33,9 +33,8 @@ from s4a.evaluation.methods import (
 )
 from s4a.geometry.align import align, motion_between, realign
 from s4a.geometry.mesh import as_arrays, vertex_areas
-from s4a.input.bounded import content, npy
 from s4a.input.collection import read_shape, read_shapes
-from s4a.input.raw import shown, text_of
+from s4a.input.raw import content, npy, shown, text_of
 from s4a.method import latent, median, network
 from s4a.method.first_map import map_after_motion
 from s4a.method.register import latent_functions, log_area_ratio, match_functions, match_low

@@ -402,7 +402,7 @@ def true_positions(truth: ArrayLike, X: np.ndarray, n: int) -> tuple[np.ndarray,
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a.metrics import true_positions
+    >>> from s4a.evaluation.metrics import true_positions
     >>> position, vertex = true_positions(np.array([1, -1]), np.eye(3), 2)
     >>> position[0].tolist(), vertex.tolist()
     ([0.0, 1.0, 0.0], [1, -1])

@@ -7,7 +7,7 @@ to triangle, errors do not: what is smooth in them, U Phi (U Phi)^+ log g, is th
     confidence = 1 / (1 + exp(-(w_0 + w_g log g + w_s log s)))
 
 is the probability that the vertex lies within :data:`RIGHT` of its true place.  The weights are
-those of a logistic regression on pairs with a known truth; ``tests/benchmarks/confidence.py`` makes
+those of a logistic regression on pairs with a known truth; ``benchmarks/confidence.py`` makes
 it, and says how well it holds for others.  A vertex that slides along a smooth surface leaves no
 gap and needs little stretch: where poses are near and all is within 1 %, the order of the vertices
 by their confidence says nothing of the order of their errors.

@@ -10,7 +10,7 @@ from simulated import TOP, field_study, with_carried
 import s4a
 from s4a import cli, open_study, statistics, verify, with_field
 from s4a.analysis.fields import write_field
-from s4a.input.scalars import read_scalars
+from s4a.input.annotations import read_scalars
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,353 @@
+"""What each deviation from the paper is worth, one at a time and all together, on sets with truth.
+
+``additions.py [brains] [faces] [bodies] [--only ROW...] [--data FOLDER] [--write]``: mean distances
+to the truth in % of sqrt(area), of the matched vertices and of the registered surface, and CPU
+seconds.  With ``--write`` they go into ``docs/differences.csv``, and from there into the page
+``docs/differences.md``, which ``differences.py --write`` makes anew without running anything.
+``--only`` runs the rows of these names, or that have one of the words in their name, ``--missing``
+those without a result.  Faces and bodies are those of the shared data beside the checkout, or in a
+folder that ``--data`` names, a folder of PLY files for each set.  Each is remeshed once: what comes
+of it is kept in ``CACHE``, by content, parameters and version.
+"""
+
+import argparse
+import contextlib
+import hashlib
+import importlib.metadata
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from unittest import mock
+
+import differences
+import numpy as np
+from scipy.optimize import linprog
+from scipy.sparse import csr_matrix, diags
+from scipy.sparse.csgraph import dijkstra
+
+import s4a
+from s4a import synthetic
+from s4a.geometry.align import cloud, icp
+from s4a.geometry.closest import closest_point, interpolate
+from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
+from s4a.method.first_map import landmarks_after_motion
+from s4a.method.remesh import silence
+from s4a.schema import dataset
+from s4a.study.options import DEFAULTS, PAPER
+
+DATA = Path(__file__).parents[2] / "shared" / "data"
+CACHE = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "s4a-benchmarks"
+N_COARSE = 2000
+N_VERTICES = 10_000  # of a shape that is remeshed
+CARRIED = 300  # vertices of the template that are carried over as landmarks
+
+# ------------------------------------------------------------------------------ what the paper had
+
+
+def geodesic_farthest(X, T, G, rim, avoid, k, seed=0):
+    """ReMatching's samples: farthest points along the edges, one at a time."""
+    start = np.flatnonzero(~avoid)[0]
+    distance = dijkstra(G, indices=start)
+    samples = [int(np.argmax(np.where(np.isfinite(distance), distance, -1)))]
+    distance = dijkstra(G, indices=samples[0])
+    while len(samples) < k:
+        new = int(np.argmax(np.where(np.isfinite(distance) & ~avoid, distance, -1)))
+        samples.append(new)
+        near = dijkstra(G, indices=new, limit=distance[new])
+        distance = np.minimum(distance, near)
+    return np.sort(samples)
+
+
+def closest_in_space(X, cell, Y, C):
+    """ReMatching's U: the closest point in space of the whole coarse mesh."""
+    return closest_point(X, Y, C)
+
+
+def program_errors(C, cycles, k=None, *, n_jobs=1):
+    """Errors of maps by the linear program of Huang et al. (2020), as in pyFM.
+
+    The least of weighted sums such that those of the three maps of a cycle are what it lacks.
+    """
+    ij, jk, ki = cycles.T
+    lack = np.linalg.norm(C[ki] @ C[jk] @ C[ij] - np.eye(C.shape[1]), axis=(1, 2))
+    rows = np.repeat(np.arange(len(cycles)), 3)
+    A = csr_matrix((np.ones(3 * len(cycles)), (rows, cycles.ravel())), (len(cycles), len(C)))
+    found = linprog(1 / (A.T @ lack), A_ub=-A, b_ub=-lack, bounds=(0, None), method="highs-ds")
+    return found.x
+
+
+def pyfm_fit(source, target, motion, *, k_init=20, init="landmarks", near=None):
+    """PyFM's first map: wave kernels of the shapes and around the landmarks, its own weights."""
+    from pyFM.functional import FunctionalMapping
+    from pyFM.mesh import TriMesh
+
+    landmarks = landmarks_after_motion(source.X, target.X, motion)
+    meshes = []
+    for basis in (source, target):
+        mesh = TriMesh(basis.X, basis.T)
+        mesh.eigenvalues, mesh.eigenvectors, mesh.A = basis.eigenvalue, basis.Phi, diags(basis.area)
+        meshes.append(mesh)
+    model = FunctionalMapping(*meshes)
+    marks = np.stack(landmarks, axis=1)
+    k = min(source.k, target.k)  # with more, pyFM computes functions of its own
+    model.preprocess(
+        n_descr=100, landmarks=marks, subsample_step=5, k_process=k, k_descr=k, verbose=False
+    )
+    model.fit(K=(k_init, k_init), w_descr=1, w_lap=1e-2, w_dcomm=1e-1, verbose=False)
+    return model.FM_12, landmarks
+
+
+def one_start(X, area, Y, area_y):
+    """ICP from the pose as given alone, centroids on each other."""
+    shift = area_y @ Y / area_y.sum() - area @ X / area.sum()
+    return icp(cloud(X, area), cloud(Y, area_y), np.eye(3), shift)
+
+
+# what is put in the place of ours, where there is no switch
+INSTEAD = {
+    "U by closest points in space": {"s4a.method.remesh.closest_point_in_star": closest_in_space},
+    "samples and U of ReMatching": {
+        "s4a.method.remesh.closest_point_in_star": closest_in_space,
+        "s4a.method.remesh.sample_surface": geodesic_farthest,
+    },
+    "ICP from one start": {"s4a.method.first_map.align": one_start},
+    "first maps of pyFM": {
+        "s4a.method.first_map.fit_after_motion": pyfm_fit,
+        "s4a.method.steps.fit_after_motion": pyfm_fit,
+    },
+    "weights of the linear program": {"s4a.method.latent.cycle_errors": program_errors},
+}
+N_PROJECTED = 2500  # of 10,000 vertices, as 25,000 of 100,000
+ON_THE_PAPER = {
+    "refine": {"refine": "elastic"},
+    "joint": {"refine": "joint"},
+    "init": {"init": "dense"},
+    "lift": {"lift": True},
+    "n_spread": {"n_spread": DEFAULTS["n_spread"]},
+    "wide": {name: DEFAULTS[name] for name in ("n_spread", "wide")},
+    "parts": {"refine": "elastic", "parts": True},
+    "alignment": {"alignment": "fitted"},
+    "area_weighted": {"area_weighted": True},
+    "n_projected": {"n_projected": N_PROJECTED},
+}
+READINGS = {
+    "how": "standard",
+    "method": "scalable",
+    "ahead": "never",
+    "weights": "equal",
+    "n_latent": 90,
+    "step": 10,
+}
+NORMS = ("h2", "h1", "frobenius", "h2_image", "h2_both")
+OF_A_PAIR = ("refine", "init", "ahead", "sharpen", "both")
+
+
+def study_rows():
+    """Name of a row -> options of the analysis of a collection; what matters most comes first."""
+    rows = {"paper": PAPER, "default": {}}
+    rows |= {f"paper, {name}": PAPER | added for name, added in ON_THE_PAPER.items()}
+    rows |= {f"default without {name}": {name: PAPER[name]} for name in ("init", "parts")}
+    rows["default, joint"] = {"refine": "joint"}
+    rows["default, lift"] = {"lift": True}
+    rows |= {f"paper, {name}={value}": PAPER | {name: value} for name, value in READINGS.items()}
+    rows |= {f"paper, {name}": PAPER for name in INSTEAD}
+    rows |= {f"paper, norm={name}": PAPER | {"norm": name, "template": None} for name in NORMS}
+    return rows
+
+
+def pair_rows():
+    """The same of pairs that are matched on their own."""
+    paper = {name: value for name, value in PAPER.items() if name not in ("n_spread", "wide")}
+    rows = {"pairs: paper": paper, "pairs: default": {}}
+    for name in OF_A_PAIR:
+        rows[f"pairs: paper, {name}"] = paper | {name: DEFAULTS[name]}
+        rows[f"pairs: default without {name}"] = {name: PAPER[name]}
+    return rows
+
+
+# ------------------------------------------------------------------------------- sets with truth
+
+
+def brains(given=None):
+    """Six synthetic brains of 10,000 vertices, and where every template vertex is on each."""
+    tree = synthetic.brains(6, N_VERTICES, 3)
+    truth = tree["truth"]
+    meshes = {name: node.to_dataset() for name, node in tree["original"].children.items()}
+
+    def image(shape, template):
+        return synthetic.position(truth, shape, truth[template]["reference_point"].values)
+
+    return meshes, image
+
+
+def unpacked(name, numbers, given=None):
+    """Some of the registered shapes of a set: name -> (points, triangles)."""
+    with tempfile.TemporaryDirectory() as folder:
+        if given is None:
+            command = [sys.executable, DATA / "unpack.py", folder, name]
+            subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        files = sorted((Path(given or folder) / name).glob("*.ply"))
+        return {files[i].stem: as_arrays(s4a.read_shape(files[i])) for i in numbers}
+
+
+def remeshed(X, T, n_vertices, subdivisions=2, iterations=10):
+    """About so many vertices on the same surface, which tell nothing of the mesh's own.
+
+    Isotropic remeshing keeps many vertices, and of registered shapes the same ones; of a mesh
+    that is subdivided first hardly any.
+    """
+    version = importlib.metadata.version("pymeshlab")
+    key = hashlib.sha256(X.tobytes() + T.tobytes())
+    key.update(repr((X.dtype, T.dtype, n_vertices, subdivisions, iterations, version)).encode())
+    file = CACHE / f"{key.hexdigest()}.npz"
+    if not file.is_file():
+        V, F = isotropic(X, T, n_vertices, subdivisions, iterations)
+        CACHE.mkdir(parents=True, exist_ok=True)
+        part = file.with_suffix(f".{os.getpid()}.npz")
+        np.savez(part, V=V, F=F)
+        part.replace(file)
+    with np.load(file) as kept:
+        return s4a.clean(as_dataset(kept["V"], kept["F"]))
+
+
+def isotropic(X, T, n_vertices, subdivisions, iterations):
+    """Points and triangles of PyMeshLab's isotropic remeshing of a subdivided mesh."""
+    import pymeshlab
+
+    length = np.sqrt(2 / np.sqrt(3) * vertex_areas(X, T).sum() / n_vertices)
+    with silence():
+        meshes = pymeshlab.MeshSet(verbose=False)
+        meshes.add_mesh(pymeshlab.Mesh(X, T))
+        meshes.meshing_surface_subdivision_midpoint(
+            iterations=subdivisions, threshold=pymeshlab.PureValue(0.0)
+        )
+        meshes.meshing_isotropic_explicit_remeshing(
+            targetlen=pymeshlab.PureValue(length), iterations=iterations
+        )
+        found = meshes.current_mesh()
+        return found.vertex_matrix(), found.face_matrix().astype(np.int64)
+
+
+def registered(name, numbers, given=None):
+    """Registered shapes, each remeshed on its own: truth goes through the common triangles."""
+    before = unpacked(name, numbers, given)
+    meshes = {name: remeshed(*mesh, N_VERTICES) for name, mesh in before.items()}
+
+    def image(shape, template):
+        place = closest_point(meshes[template]["position"].values, *before[template])
+        return interpolate(before[shape][0], before[template][1], *place)
+
+    return meshes, image
+
+
+SETS = {
+    "brains": brains,
+    "faces": lambda given: registered("faces", range(7, 13), given),
+    "bodies": lambda given: registered("faust", range(6), given),
+}
+
+# -------------------------------------------------------------------------------------- measurement
+
+
+@contextlib.contextmanager
+def in_place(functions):
+    """Other functions in the place of ours."""
+    with contextlib.ExitStack() as stack:
+        for name, function in functions.items():
+            stack.enter_context(mock.patch(name, function))
+        yield
+
+
+def errors(study, image):
+    """Mean errors of the matched vertices and of the registered surface, in % of sqrt(area)."""
+    registration = study["registration"].to_dataset()
+    template = registration.attrs["template"]
+    size = np.sqrt(registration["vertex_area"].values.sum())
+    found = []
+    for name in registration["shape"].values.tolist():
+        if name == template:
+            continue
+        one = registration.sel(shape=name)
+        true = np.asarray(image(name, template))
+        matched = study["original"][name]["position"].values[one["registered_match"].values]
+        moved = one["position"].values + one["displacement"].values - one["translation"].values
+        surface = moved @ one["rotation"].values / one["scale"].item()
+        ends = np.stack([matched, surface])
+        found.append(np.linalg.norm(ends - true, axis=2).mean(1))
+    return 100 * np.mean(found, axis=0) / size
+
+
+def carried_error(study, image):
+    """Mean error of vertices of the template that are carried over, both ways where there are."""
+    registration = study["registration"].to_dataset()
+    template = registration.attrs["template"]
+    size = np.sqrt(registration["vertex_area"].values.sum())
+    X = registration["position"].values
+    some = np.linspace(0, len(X) - 1, CARRIED).astype(int)
+    marks = dataset(landmark_position=X[some], landmark_name=some.astype(str))
+    found = [
+        np.linalg.norm(
+            node["landmark_position"].values - np.asarray(image(name, template))[some], axis=1
+        ).mean()
+        for name, node in s4a.transfer_landmarks(study, marks).children.items()
+    ]
+    return 100 * np.mean(found) / size
+
+
+def measure(row, options, meshes, image, folder):
+    """The cells of a row of the results; rows of norms share all but the registration."""
+    first = min(meshes)
+    begin = time.process_time()
+    if row.startswith("pairs: "):
+        others = {name: mesh for name, mesh in meshes.items() if name != first}
+        study = s4a.register_pairs(
+            meshes[first], others, name=first, n_coarse=N_COARSE, n_jobs=1, **options
+        )
+        seconds = time.process_time() - begin
+        carried = f"{carried_error(study, image):.3f}"
+    else:
+        given = {"template": first, "n_coarse": N_COARSE, "keep_doubtful": True, "n_jobs": 1}
+        if "norm=" in row:
+            given["store"] = folder
+        with in_place(INSTEAD.get(row.removeprefix("paper, "), {})):
+            study = s4a.analyse(meshes, **given | options)
+        seconds = time.process_time() - begin
+        carried = ""
+    match, surface = errors(study, image)
+    template = study["registration"].attrs["template"]
+    return [f"{match:.3f}", f"{surface:.3f}", carried, f"{seconds:.1f}", template]
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("sets", nargs="*", metavar="SET", help=f"some of {', '.join(SETS)}")
+    parser.add_argument("--only", nargs="+", default=[""], metavar="ROW")
+    parser.add_argument("--data", type=Path, help="a folder of meshes for each set")
+    parser.add_argument("--write", action="store_true")
+    parser.add_argument("--missing", action="store_true", help="only rows without a result")
+    args = parser.parse_args()
+    real = args.data is not None or DATA.is_dir()
+    for which in args.sets or [name for name in SETS if name == "brains" or real]:
+        meshes, image = SETS[which](args.data)
+        sys.stdout.write(f"\n{which}: matched, surface, carried, CPU s, template\n")
+        rows = {**study_rows(), **pair_rows()}
+        chosen = [row for word in args.only for row in rows if row == word]
+        chosen += [row for word in args.only for row in rows if word not in rows and word in row]
+        with tempfile.TemporaryDirectory() as folder:
+            for row in dict.fromkeys(chosen):
+                if args.missing and (which, row) in differences.results():
+                    continue
+                cells = measure(row, rows[row], meshes, image, Path(folder) / "study")
+                sys.stdout.write(f"{row:42} {' '.join(f'{cell:>8}' for cell in cells)}\n")
+                sys.stdout.flush()
+                if args.write:
+                    differences.keep(which, row, cells)
+    if args.write:
+        differences.write_page()
+
+
+if __name__ == "__main__":
+    main()
