@@ -23,10 +23,10 @@ from s4a.input.raw import shown
 from s4a.method.deform import displacement_in_template, normal_displacement
 from s4a.method.pca import gram
 from s4a.method.register import common_unit
+from s4a.options import Options
 from s4a.schema import check_count, dataset, in_unit
 from s4a.seeds import RNG, seed_of
 from s4a.study.insert import read_new
-from s4a.study.options import Options
 from s4a_morphometrics import posterior
 from s4a_morphometrics.calibration import match_again
 from s4a_morphometrics.part import (

@@ -12,7 +12,7 @@ import xarray as xr
 from s4a.analysis.inputs import registration_of
 from s4a.method.pca import low_vertices
 from s4a.method.shape import Shape
-from s4a.study.options import Options
+from s4a.options import Options
 from s4a_morphometrics import posterior
 from s4a_morphometrics.part import Fit, Part, Whole, on_boundary, refine, seen
 
@@ -50,8 +50,10 @@ def model_of(study: xr.DataTree) -> Model:
             f"parts need a study of at least 4 shapes, found {registration.sizes['shape']}"
         )
     name = registration.attrs["template"]
-    template = options.shape(
-        study["original"][name].to_dataset().load(), study["coarse"][name].to_dataset().load()
+    template = Shape(
+        study["original"][name].to_dataset().load(),
+        study["coarse"][name].to_dataset().load(),
+        **options.of("projection"),
     )
     _, size = template.frame
     at = low_vertices(template.coarse)

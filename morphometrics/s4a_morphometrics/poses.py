@@ -250,8 +250,9 @@ def structures(
     --------
     With a ``study`` of two small structures of six subjects:
 
-    >>> import s4a
-    >>> study = s4a_morphometrics.synthetic.example_structures()
+    >>> import s4a_morphometrics
+    >>> from s4a_morphometrics.synthetic import example_structures
+    >>> study = example_structures()
     >>> found = s4a_morphometrics.structures(study, n_permutations=99)
     >>> float(found["level_share"].sum().round(6)), found.sizes["shape"]
     (1.0, 6)
@@ -371,8 +372,9 @@ def structures_of_new(found: xr.Dataset, inserted: xr.DataTree) -> xr.Dataset:
     --------
     With a ``study`` of two small structures of six subjects, of which one is given once more:
 
-    >>> import s4a
-    >>> study = s4a_morphometrics.synthetic.example_structures()
+    >>> import s4a_morphometrics
+    >>> from s4a_morphometrics.synthetic import example_structures
+    >>> study = example_structures()
     >>> found = s4a_morphometrics.structures(study, n_permutations=99)
     >>> new = s4a_morphometrics.structures_of_new(found, study)
     >>> bool(abs(new["pose_size"] - found["pose_size"]).max() < 1e-4 * found["pose_size"].max())
@@ -470,8 +472,9 @@ def structures_modes(
     --------
     With a ``study`` of two small structures of six subjects:
 
-    >>> import s4a
-    >>> study = s4a_morphometrics.synthetic.example_structures()
+    >>> import s4a_morphometrics
+    >>> from s4a_morphometrics.synthetic import example_structures
+    >>> study = example_structures()
     >>> found = s4a_morphometrics.structures(study, n_permutations=99)
     >>> poses = s4a_morphometrics.structures_modes(study, found, "between")
     >>> poses["pca"].sizes["component"]

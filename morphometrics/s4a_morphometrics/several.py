@@ -26,9 +26,9 @@ from s4a.input.hands import AUTO, to_reflect
 from s4a.input.landmarks import SUFFIXES
 from s4a.input.raw import shown
 from s4a.input.subjects import is_missing, listed, read_cells, subjects
+from s4a.options import Options
 from s4a.schema import dataset
 from s4a.seeds import seeded
-from s4a.study.options import Options
 from s4a_morphometrics.mirrored import find_mirrored, find_mirrored_new
 
 log = logging.getLogger(__name__)
@@ -116,7 +116,7 @@ def analyse_structures(
     remarks += remarks_on_files(shapes, settings.pattern, volumes=structures is not None)
     chosen, hand = None, None
     if reflect == AUTO:
-        cleaning = settings.of_cleaning
+        cleaning = settings.of("cleaning")
         given = {name: (of.shapes, cleaning | {"label": of.label}) for name, of in parts.items()}
         hand, chosen, told = find_mirrored(given)
         remarks += told
@@ -425,7 +425,7 @@ def open_structures(folder: Path | str) -> xr.DataTree:
     if not (folder / NOTES).is_file():
         raise ValueError(
             f"{folder} is no study of several structures: it has no {NOTES}; run "
-            f"`s4a structures run ... --out {folder}`"
+            f"`s4a run-structures ... --out {folder}`"
         )
     try:
         notes = json.loads((folder / NOTES).read_text())

@@ -72,7 +72,7 @@ def run(args: Namespace) -> int:
 
 def options_of(args: Namespace) -> dict[str, Any]:
     """The options of `analyse` from parsed flags, and how many processes."""
-    from s4a.study.options import Options
+    from s4a.options import Options
 
     return {
         name: getattr(args, name)
@@ -367,7 +367,7 @@ def transfer(args: Namespace) -> int:
     from s4a.input.annotations import labels_of_mesh, read_labels, read_landmarks
     from s4a.input.collection import read_shape
     from s4a.input.landmarks import locate
-    from s4a.study.options import PAIR
+    from s4a.options import DECLARED
     from s4a.study.store import check_is_study
     from s4a.study.tree import open_study
 
@@ -392,7 +392,7 @@ def transfer(args: Namespace) -> int:
             f"{args.source}"
         )
     excluded = []
-    asked = {name: getattr(args, name) for name in (*PAIR, "both")}
+    asked = {n: getattr(args, n) for n, one in DECLARED.items() if one.metadata["pair"]}
     given = {name: value for name, value in asked.items() if value is not None}
     if into_study:
         study = open_study(first)
@@ -418,7 +418,7 @@ def registered_pairs(
     """The source registered as the template of every target, and the targets that are left out."""
     from s4a.analysis.transfer import register_pairs
     from s4a.input.collection import read_shapes
-    from s4a.study.options import Options
+    from s4a.options import Options
 
     shapes = read_shapes(args.targets, compare=False)
     report = shapes["report"].to_dataset()
@@ -522,7 +522,7 @@ def compare_collection(args: Namespace) -> "tuple[xr.Dataset, list[str], np.ndar
     """Table 2: the result, names of the bars of Fig. 3, their seconds by block, and a text."""
     from s4a.cli import tables
     from s4a.evaluation import compare as comparison
-    from s4a.study.options import N_COARSE, Options
+    from s4a.options import N_COARSE, Options
 
     if args.paths or args.truth or args.landmarks or args.keep:
         raise ValueError(
@@ -552,7 +552,7 @@ def compare_pairs(
     from s4a.cli import tables
     from s4a.evaluation import compare as comparison
     from s4a.input.files import find_meshes, slugs
-    from s4a.study.options import N_COARSE
+    from s4a.options import N_COARSE
 
     if len(args.paths) < 2:
         raise ValueError("compare needs SOURCE and TARGET, or --collection PATH...")

@@ -25,7 +25,7 @@ Keyed = tuple[str, str]  # a file, and the key of its content
 
 
 SEVERAL = (
-    "s4a_morphometrics.analyse_structures (s4a structures run) analyses several structures of each "
+    "s4a_morphometrics.analyse_structures (s4a run-structures) analyses several structures of each "
     "subject: pip install 's4a[morphometrics]'"
 )
 
