@@ -72,14 +72,17 @@ def run_lesson(name, study):
 
 def panels_of(study):
     """Every panel and its title; those of a comparison, a test and structures are of small ones."""
-    from s4a_morphometrics.synthetic import example_structures
-
     from s4a import compare, statistics, synthetic, widgets
+    from s4a_morphometrics.synthetic import example_structures
 
     for title, kind in widgets.explore.PANELS.items():
         yield title, kind(study)
     yield "Region", widgets.Region(study)
-    yield "Maps", widgets.Maps(study, statistics.asymmetry(study, n_permutations=15))
+    numbers = range(study["registration"].sizes["shape"])
+    yield (
+        "Maps",
+        widgets.Maps(study, statistics.regression(study, numbers, of="normal", n_permutations=15)),
+    )
     yield "Structures", widgets.Structures(example_structures())
     pair = [node.to_dataset() for node in synthetic.brains(2, 300)["original"].children.values()]
     options = {"n_coarse": 200, "k": 20, "k_init": 10, "n_geodesic": 50}

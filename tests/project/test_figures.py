@@ -7,11 +7,11 @@ import time
 from pathlib import Path
 
 import pytest
-import s4a_morphometrics.synthetic
 from paths import DOCS, ROOT, benchmark, script
 from PIL import Image
 
 import s4a
+import s4a_morphometrics.synthetic
 
 figures = script(DOCS / "figures.py")
 paper = script(ROOT / "tools" / "paper.py")

@@ -18,15 +18,16 @@ import xarray as xr
 from paths import DOCS
 
 import s4a
-from s4a import read_mesh, write_for
+from s4a import read_mesh
 from s4a.analysis.link import image_in_shape
-from s4a.analysis.programs import PROGRAMS, R_SCRIPT
-from s4a.analysis.scalismo import read_scalismo
 from s4a.cli import main
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.input.annotations import read_landmarks, write_landmarks
 from s4a.input.subjects import with_table
 from s4a.schema import dataset
+from s4a_morphometrics import write_for
+from s4a_morphometrics.programs import PROGRAMS, R_SCRIPT
+from s4a_morphometrics.scalismo import read_scalismo
 
 
 @pytest.fixture(scope="module")

@@ -8,10 +8,7 @@ import xarray as xr
 from faults import shapes as faulty
 from scipy import stats
 
-from s4a import cli, open_study, read_mesh, statistics, synthetic
-from s4a.analysis import asymmetry as left_right
-from s4a.analysis.asymmetry import antisymmetry_test, sides_test
-from s4a.analysis.halves import involution, plane_between
+from s4a import cli, open_study, read_mesh, synthetic
 from s4a.analysis.permutation import mean_test
 from s4a.geometry.closest import interpolate
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas, vertex_normals
@@ -19,6 +16,10 @@ from s4a.input.clean import clean
 from s4a.method.pca import pca
 from s4a.schema import dataset
 from s4a.show.surfaces import unit_text
+from s4a_morphometrics import asymmetry, asymmetry_modes, symmetric_template, symmetry
+from s4a_morphometrics import bilateral as left_right
+from s4a_morphometrics.bilateral import antisymmetry_test, sides_test
+from s4a_morphometrics.halves import involution, plane_between
 
 M = np.array([-1.0, 1, 1])
 OPTIONS = {"n_permutations": 199}
@@ -89,7 +90,7 @@ def test_a_map_to_the_other_side_that_errs_becomes_an_involution():
 
 def test_the_parts_add_up_and_the_asymmetry_changes_sign_on_the_other_side(halves):
     study = study_of(fields(0, 8))
-    found = statistics.asymmetry(study, halves=halves, **OPTIONS)
+    found = asymmetry(study, halves=halves, **OPTIONS)
     a, s = found["asymmetry"].values, found["symmetric"].values
     mean = found["symmetric_position"].values
     X, T = MESH
@@ -116,7 +117,7 @@ def test_the_parts_add_up_and_the_asymmetry_changes_sign_on_the_other_side(halve
 def test_directional_asymmetry_is_found_where_it_is_and_on_the_other_side(halves):
     push, patch = bump()
     study = study_of(fields(1, 14) + 0.4 * push)
-    found = statistics.asymmetry(study, halves=halves, **OPTIONS)
+    found = asymmetry(study, halves=halves, **OPTIONS)
     assert found["p_value"].item() == 0.005
     T = MESH[1]
     place = halves["partner_triangle"].values, halves["partner_barycentric"].values
@@ -131,16 +132,14 @@ def test_directional_asymmetry_is_found_where_it_is_and_on_the_other_side(halves
     assert outward[there].mean() == pytest.approx(-0.15, abs=0.06)
     assert found["effect_size"].values[patch].mean() > 1
     assert found["antisymmetry_p"] > 0.05
-    vectors = statistics.asymmetry(study, halves=halves, of="vector", **OPTIONS)
+    vectors = asymmetry(study, halves=halves, of="vector", **OPTIONS)
     assert (vectors["p_family_wise"].values[patch] <= 0.05).mean() > 0.5
 
 
 def test_without_it_nothing_is_found(halves):
     p = []
     for seed in range(12):
-        found = statistics.asymmetry(
-            study_of(fields(10 + seed, 10)), halves=halves, n_permutations=99
-        )
+        found = asymmetry(study_of(fields(10 + seed, 10)), halves=halves, n_permutations=99)
         p.append([found["p_value"].item(), found["p_family_wise"].min().item()])
     assert (np.array(p) <= 0.05).mean(0).max() <= 0.25
     assert np.median(p) > 0.2
@@ -154,7 +153,7 @@ def test_an_error_of_the_partners_along_the_surface_is_no_asymmetry_along_the_no
     study = study_of(fields(30, 12))
     of = {}
     for kind in ("vector", "normal"):
-        found = statistics.asymmetry(study, halves=wrong, of=kind, **OPTIONS)
+        found = asymmetry(study, halves=wrong, of=kind, **OPTIONS)
         of[kind] = (found["p_family_wise"].values <= 0.05).mean()
     assert of["vector"] > 0.2
     assert of["normal"] < 0.05
@@ -164,15 +163,13 @@ def test_antisymmetry_is_told_from_directional_asymmetry(halves):
     push, _ = bump()
     sign = np.where(np.arange(16) % 2, 1.0, -1.0)
     d = fields(2, 16) + 0.8 * sign[:, None, None] * push
-    found = statistics.asymmetry(study_of(d), halves=halves, **OPTIONS)
+    found = asymmetry(study_of(d), halves=halves, **OPTIONS)
     assert found["antisymmetry_p"] < 0.02
     assert found["kurtosis"] < 1.6
     assert found["p_value"] > 0.05
     assert abs(np.corrcoef(found["asymmetry_score"].values[:, 0], sign)[0, 1]) > 0.9
-    larger = statistics.asymmetry(
-        study_of(fields(2, 16, fluctuating=0.1)), halves=halves, **OPTIONS
-    )
-    smaller = statistics.asymmetry(study_of(fields(2, 16)), halves=halves, **OPTIONS)
+    larger = asymmetry(study_of(fields(2, 16, fluctuating=0.1)), halves=halves, **OPTIONS)
+    smaller = asymmetry(study_of(fields(2, 16)), halves=halves, **OPTIONS)
     ratio = larger["fluctuating_size"] / smaller["fluctuating_size"]
     assert ratio.values == pytest.approx(2, abs=0.15)
 
@@ -194,7 +191,7 @@ def test_both_sides_of_subjects_are_compared_and_the_larger_side_is_found():
     push, patch = bump()
     d, own = fields(3, 9), fields(4, 18, symmetric=0.02)
     study = matching(d + own[:9], d + own[9:] + 0.6 * push)
-    found = statistics.asymmetry(study, subject="subject", side="side", **OPTIONS)
+    found = asymmetry(study, subject="subject", side="side", **OPTIONS)
     assert found.attrs["sides"] == "right less left"
     assert found["individual"].values.tolist() == [f"p{i}" for i in range(9)]
     assert found["p_value"] <= 0.03
@@ -204,14 +201,14 @@ def test_both_sides_of_subjects_are_compared_and_the_larger_side_is_found():
     assert outward[patch].mean() == pytest.approx(0.22, abs=0.06)
     assert "partner_gap" not in found
     other = matching(d + own[:9], d + own[9:])
-    p = statistics.asymmetry(other, subject="subject", side="side", **OPTIONS)["p_value"]
+    p = asymmetry(other, subject="subject", side="side", **OPTIONS)["p_value"]
     assert p > 0.05
 
 
 def test_what_triangles_and_partners_leave_is_no_asymmetry_of_the_whole_shape(halves):
     shapes = fields(3, 16, symmetric=0.1, fluctuating=0.002)  # less than the triangles leave
     for of in ("normal", "vector"):
-        found = statistics.asymmetry(study_of(shapes), halves=halves, of=of, **OPTIONS)
+        found = asymmetry(study_of(shapes), halves=halves, of=of, **OPTIONS)
         assert found["p_value"] > 0.05
         assert found["p_family_wise"].min() > 0.05
     a = found["asymmetry"].values.astype(float)
@@ -222,7 +219,7 @@ def test_what_triangles_and_partners_leave_is_no_asymmetry_of_the_whole_shape(ha
 
 def test_the_table_is_that_of_two_way_analysis_of_variance():
     d = np.random.default_rng(0).normal(size=(12, 500, 3)) * 0.01
-    found = statistics.asymmetry(
+    found = asymmetry(
         matching(d[:6], d[6:] + 0.005), subject="subject", side="side", of="vector", **OPTIONS
     )
     area = vertex_areas(*MESH) / vertex_areas(*MESH).sum()
@@ -258,7 +255,7 @@ def test_the_table_is_that_of_two_way_analysis_of_variance():
 def test_sides_that_are_no_pairs_are_errors_that_name_the_shapes(columns, words):
     d = fields(5, 12)
     with pytest.raises(ValueError, match=words):
-        statistics.asymmetry(matching(d[:6], d[6:], **columns), subject="subject", side="side")
+        asymmetry(matching(d[:6], d[6:], **columns), subject="subject", side="side")
 
 
 def test_a_subject_with_one_side_is_left_out_by_name_and_hands_are_looked_at(caplog):
@@ -266,7 +263,7 @@ def test_a_subject_with_one_side_is_left_out_by_name_and_hands_are_looked_at(cap
     study = matching(
         d[:6], d[6:], subject=[*(f"p{i}" for i in range(6))] + ["p0", "p1", "p2", "p3", "p4", "q"]
     )
-    found = statistics.asymmetry(study, subject="subject", side="side", **OPTIONS)
+    found = asymmetry(study, subject="subject", side="side", **OPTIONS)
     assert found.sizes["individual"] == 5
     assert "left out, as the other side of their subject lacks: shape_05, shape_11" in caplog.text
     assert "the run mirrored none of the shapes" in caplog.text
@@ -274,22 +271,22 @@ def test_a_subject_with_one_side_is_left_out_by_name_and_hands_are_looked_at(cap
     names = study["registration"]["shape"].values
     report = dataset(reflected=np.arange(12) < 6, status=["ok"] * 12).assign_coords(shape=names)
     study["report"] = xr.DataTree(report)
-    statistics.asymmetry(study, subject="subject", side="side", **OPTIONS)
+    asymmetry(study, subject="subject", side="side", **OPTIONS)
     assert "the run mirrored" not in caplog.text
 
 
 def test_what_cannot_be_tested_is_an_error(halves):
     study = study_of(fields(7, 6))
     with pytest.raises(ValueError, match="both subject and side"):
-        statistics.asymmetry(study, subject="subject")
+        asymmetry(study, subject="subject")
     with pytest.raises(ValueError, match="of must be 'vector' or 'normal'"):
-        statistics.asymmetry(study, of="size")
+        asymmetry(study, of="size")
     with pytest.raises(ValueError, match="4 needed, or of='normal'"):
         mean_test(np.ones((3, 5, 3)))
     d = fields(7, 4)
     twice = matching(d, d)
     with pytest.raises(ValueError, match="left and right are the same in all shapes"):
-        statistics.asymmetry(twice, subject="subject", side="side")
+        asymmetry(twice, subject="subject", side="side")
 
 
 # ---- the tests on arrays
@@ -340,7 +337,7 @@ def test_p_of_antisymmetry_is_uniform_for_normal_individuals_of_any_covariance(s
 
 
 def test_the_template_of_a_study_finds_its_other_side(study):
-    halves = statistics.symmetry(study)
+    halves = symmetry(study)
     assert halves.attrs["gap"] < min(0.03, halves.attrs["gap_before"])
     mesh = study["registration"].to_dataset()
     X, T = as_arrays(mesh)
@@ -356,7 +353,7 @@ def test_a_symmetric_template_has_half_of_a_bump_on_each_side(halves):
     push, high = bump()
     X, T = MESH
     study = study_of(fields(3, 5), (X + 0.2 * push, T))
-    mesh = statistics.symmetric_template(study, halves)
+    mesh = symmetric_template(study, halves)
     S = mesh["position"].values
     assert (mesh["corner_vertex"].values == T).all()
     place = halves["partner_triangle"].values, halves["partner_barycentric"].values
@@ -373,7 +370,7 @@ def test_a_symmetric_template_has_half_of_a_bump_on_each_side(halves):
         whole = 0.2 * np.linalg.norm(push, axis=1)[high].mean()
         assert moved[side].mean() == pytest.approx(whole / 2, rel=0.3)
     again = study_of(fields(3, 5), (S, T))
-    assert statistics.symmetric_template(again, halves).attrs["moved"] < 0.4 * mesh.attrs["moved"]
+    assert symmetric_template(again, halves).attrs["moved"] < 0.4 * mesh.attrs["moved"]
 
 
 def test_a_template_without_another_side_is_told(caplog):
@@ -381,7 +378,7 @@ def test_a_template_without_another_side_is_told(caplog):
     d = np.random.default_rng(0).normal(size=(5, mesh.sizes["vertex"], 3))
     X, T = as_arrays(mesh)
     with caplog.at_level(logging.WARNING):
-        statistics.symmetry(study_of(d, (X * [1, 1 + X[:, :1].max() / 50, 1], T)))
+        symmetry(study_of(d, (X * [1, 1 + X[:, :1].max() / 50, 1], T)))
     assert "is it symmetric? Of left and right shapes give subject and side" in caplog.text
 
 
@@ -389,8 +386,8 @@ def test_modes_play_the_directional_part_first_and_have_its_share(halves):
     push, _ = bump()
     study = study_of(fields(8, 8) + 0.2 * push)
     study["registration/displacement"].attrs["units"] = "mm"
-    found = statistics.asymmetry(study, halves=halves, **OPTIONS)
-    modes = statistics.asymmetry_modes(study, found)
+    found = asymmetry(study, halves=halves, **OPTIONS)
+    modes = asymmetry_modes(study, found)
     assert unit_text(modes, "") == "mm"
     share = found["variance_share"].values
     ratio = modes["pca"]["explained_variance_ratio"].values

@@ -1,7 +1,7 @@
 """What a study says of a part (6.1): its model at low resolution, the part's match, and the rest.
 
-How the part is found stands in :mod:`s4a.analysis.complete`, how sure the rest is in
-:mod:`s4a.analysis.calibration`.
+How the part is found stands in :mod:`s4a_morphometrics.completion`, how sure the rest is in
+:mod:`s4a_morphometrics.calibration`.
 """
 
 from typing import NamedTuple
@@ -10,11 +10,11 @@ import numpy as np
 import xarray as xr
 
 from s4a.analysis.inputs import registration_of
-from s4a.method import posterior
-from s4a.method.part import Fit, Part, Whole, on_boundary, refine, seen
 from s4a.method.pca import low_vertices
 from s4a.method.shape import Shape
 from s4a.options import Options
+from s4a_morphometrics import posterior
+from s4a_morphometrics.part import Fit, Part, Whole, on_boundary, refine, seen
 
 LEAST_SHARE = 0.15  # of the template that a part must have
 N_ROUNDS = 2  # of finding what is there, and of matching it

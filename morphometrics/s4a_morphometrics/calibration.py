@@ -24,19 +24,19 @@ import numpy as np
 import xarray as xr
 
 from s4a.analysis.inputs import registration_of
-from s4a.analysis.partial import LEAST_SHARE, Model, match, tell, whole_of
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays
 from s4a.input.plausibility import spread
-from s4a.method import posterior
 from s4a.method.first_map import motion_onto
-from s4a.method.part import Pose, cut, fit_modes, part_of
 from s4a.method.pca import gram
 from s4a.method.register import from_latent
 from s4a.method.shape import Shape
 from s4a.options import Options, kept_options
 from s4a.study.sources import content_key
 from s4a.study.store import task_key
+from s4a_morphometrics import posterior
+from s4a_morphometrics.part import Pose, cut, fit_modes, part_of
+from s4a_morphometrics.partial import LEAST_SHARE, Model, match, tell, whole_of
 
 N_REMATCHED = 12  # shapes of the study whose part is matched again
 N_WAYS = 6  # of them, those that are registered onto another
@@ -145,7 +145,7 @@ def share_to_add(told: Sequence[tuple[np.ndarray, np.ndarray]]) -> float:
     What is told lies off the match by what that has wrong, and by something else:
 
     >>> import numpy as np
-    >>> from s4a.analysis.calibration import share_to_add
+    >>> from s4a_morphometrics.calibration import share_to_add
     >>> wrong = np.array([[0.1, -0.2, 0.0]])
     >>> share_to_add([(-wrong, wrong)]), share_to_add([(np.array([[0.0, 0.0, 0.1]]), wrong)])
     (0.0, 1.0)
@@ -160,7 +160,7 @@ def held(p: np.ndarray, e: np.ndarray) -> float:
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a.analysis.calibration import held
+    >>> from s4a_morphometrics.calibration import held
     >>> held(np.array([-0.5, 0.0, 0.1]), np.array([1.0, 0.0, 0.0]))
     -0.5
     """
@@ -197,7 +197,7 @@ def gaps_between_ways(model: Model) -> Gaps:
     Parameters
     ----------
     model : Model
-        See :func:`s4a.analysis.partial.model_of`.
+        See :func:`s4a_morphometrics.partial.model_of`.
 
     Returns
     -------
@@ -312,7 +312,7 @@ def deviation_of(errors: Sequence[np.ndarray]) -> float:
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a.analysis.calibration import deviation_of
+    >>> from s4a_morphometrics.calibration import deviation_of
     >>> round(deviation_of([np.full(9, 1.6449), np.array([8.0])]), 2)
     1.39
     """

@@ -48,7 +48,7 @@ def two_block(
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a.analysis.covariation import two_block
+    >>> from s4a_morphometrics.two_block import two_block
     >>> rng = np.random.default_rng(0)
     >>> A, B = rng.normal(size=(2, 30, 4))
     >>> B[:, 2] += 3 * A[:, 0]
@@ -147,11 +147,12 @@ def covariation(
     With the ``study`` of six small brains; the height of their vertices is of their shape:
 
     >>> import s4a
+    >>> import s4a_morphometrics
     >>> study = s4a.synthetic.example_study()
     >>> meshes = study["original"].children.items()
     >>> height = {name: mesh["position"].values[:, 2] for name, mesh in meshes}
     >>> study = s4a.with_field(study, "height", height, unit="mm")
-    >>> found = s4a.statistics.covariation(study, "height", n_permutations=99)
+    >>> found = s4a_morphometrics.covariation(study, "height", n_permutations=99)
     >>> bool(0 < found["rv"] < 1), found["field_pattern"].dims
     (True, ('component', 'vertex'))
     """
@@ -244,12 +245,13 @@ def covariation_modes(study: xr.DataTree, found: xr.Dataset) -> xr.DataTree:
     With the ``study`` of six small brains:
 
     >>> import s4a
+    >>> import s4a_morphometrics
     >>> study = s4a.synthetic.example_study()
     >>> meshes = study["original"].children.items()
     >>> height = {name: mesh["position"].values[:, 2] for name, mesh in meshes}
     >>> study = s4a.with_field(study, "height", height)
-    >>> found = s4a.statistics.covariation(study, "height", n_permutations=99)
-    >>> moving = s4a.statistics.covariation_modes(study, found)
+    >>> found = s4a_morphometrics.covariation(study, "height", n_permutations=99)
+    >>> moving = s4a_morphometrics.covariation_modes(study, found)
     >>> moving["pca"].sizes["component"] == found.sizes["component"]
     True
     """

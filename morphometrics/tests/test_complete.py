@@ -5,19 +5,18 @@ import pytest
 import xarray as xr
 from scipy.spatial.transform import Rotation
 
-from s4a import analyse, cli, complete, insert, synthetic, with_landmarks, write_mesh
-from s4a.analysis import calibration
-from s4a.analysis.calibration import (
+from s4a import analyse, cli, insert, synthetic, with_landmarks, write_mesh
+from s4a.geometry.mesh import as_arrays, vertex_areas
+from s4a_morphometrics import calibration, complete, posterior
+from s4a_morphometrics.calibration import (
     between_ways,
     deviation_of,
     gaps_between_ways,
     share_to_add,
 )
-from s4a.analysis.complete import warnings_of
-from s4a.analysis.partial import model_of
-from s4a.geometry.mesh import as_arrays, vertex_areas
-from s4a.method import posterior
-from s4a.method.part import cut
+from s4a_morphometrics.completion import warnings_of
+from s4a_morphometrics.part import cut
+from s4a_morphometrics.partial import model_of
 
 OPTIONS = {"n_coarse": 600, "k_init": 12, "k": 30, "n_jobs": 1}
 TURN = Rotation.from_rotvec([0.3, -0.5, 0.4]).as_matrix()

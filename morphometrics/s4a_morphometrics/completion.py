@@ -1,8 +1,8 @@
 """Partial shapes (6.1, outlook): a part matched where it is, and the whole that it may be of.
 
-What the modes of a finished study say of the rest, see :mod:`s4a.analysis.partial` and
-:mod:`s4a.method.posterior`; how the part is matched, see :mod:`s4a.method.part`; how sure all of
-that is, see :mod:`s4a.analysis.calibration`.
+What the modes of a finished study say of the rest, see :mod:`s4a_morphometrics.partial` and
+:mod:`s4a_morphometrics.posterior`; how the part is matched, see :mod:`s4a_morphometrics.part`;
+how sure all of that is, see :mod:`s4a_morphometrics.calibration`.
 """
 
 import logging
@@ -13,16 +13,23 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
-from s4a.analysis.calibration import match_again
+from s4a.analysis.export import write_dataset
 from s4a.analysis.inputs import registration_of
-from s4a.analysis.partial import LEAST_SHARE, Model, match, model_of, tell, whole_of
 from s4a.geometry.align import rigid_transform
 from s4a.geometry.mesh import as_arrays, vertex_areas, vertex_normals
+from s4a.input.files import write_mesh
 from s4a.input.landmarks import with_landmarks
 from s4a.input.raw import shown
-from s4a.method import posterior
 from s4a.method.deform import displacement_in_template, normal_displacement
-from s4a.method.part import (
+from s4a.method.pca import gram
+from s4a.method.register import common_unit
+from s4a.options import Options
+from s4a.schema import check_count, dataset, in_unit
+from s4a.seeds import RNG, seed_of
+from s4a.study.insert import read_new
+from s4a_morphometrics import posterior
+from s4a_morphometrics.calibration import match_again
+from s4a_morphometrics.part import (
     Fit,
     Part,
     Pose,
@@ -34,13 +41,7 @@ from s4a.method.part import (
     rough_starts,
     seen,
 )
-from s4a.method.part import cut as cut  # where it stood before
-from s4a.method.pca import gram
-from s4a.method.register import common_unit
-from s4a.options import Options
-from s4a.schema import check_count, dataset, in_unit
-from s4a.seeds import RNG, seed_of
-from s4a.study.insert import read_new
+from s4a_morphometrics.partial import LEAST_SHARE, Model, match, model_of, tell, whole_of
 
 log = logging.getLogger(__name__)
 
@@ -66,11 +67,11 @@ def complete(
     What is missing is found.  Where the part is, the completed shape lies on it; elsewhere it is
     the mean of all shapes that agree with the part under the modes of the study and what these do
     not hold, a normal distribution (posterior shape model, Albrecht et al. 2013; the formula is in
-    :mod:`s4a.method.posterior`).  Its standard deviations are such that nine tenths of what shapes
-    of the study have there, each cut in the same way, matched and completed by all others, lie
-    within intervals of 90 %, and wider by what two ways of matching the study's shapes differ, over
-    the template and directly, as far as that is not in the former (see
-    :mod:`s4a.analysis.calibration`).  The intervals are for shapes of the population of the
+    :mod:`s4a_morphometrics.posterior`).  Its standard deviations are such that nine tenths of what
+    shapes of the study have there, each cut in the same way, matched and completed by all others,
+    lie within intervals of 90 %, and wider by what two ways of matching the study's shapes differ,
+    over the template and directly, as far as that is not in the former (see
+    :mod:`s4a_morphometrics.calibration`).  The intervals are for shapes of the population of the
     study's; what surfaces mislead every match to is not in them.
 
     Parameters
@@ -115,11 +116,12 @@ def complete(
     With the ``study`` of six small brains; of one of these the upper half:
 
     >>> import s4a
+    >>> import s4a_morphometrics
     >>> study = s4a.synthetic.example_study()
     >>> mesh = study["original/brain_02"].to_dataset()
     >>> corners = mesh["position"].values[mesh["corner_vertex"].values]
     >>> upper = mesh["corner_vertex"].values[corners[:, :, 2].min(1) > 0]
-    >>> found = s4a.complete(study, (mesh["position"].values, upper))
+    >>> found = s4a_morphometrics.complete(study, (mesh["position"].values, upper))
     >>> 0.4 < found.attrs["missing"] < 0.6
     True
 
@@ -360,3 +362,37 @@ def warnings_of(result: xr.Dataset) -> list[str]:
         missing = 100 * result.attrs["missing"]
         said.append(f"{missing:.0f} % are missing: the intervals are tested up to half")
     return said
+
+
+def write_completed(found: xr.Dataset, folder: Path | str) -> list[Path]:
+    """Write what :func:`s4a_morphometrics.complete` found.
+
+    Parameters
+    ----------
+    found : Dataset
+    folder : path
+        Made where it is missing.
+
+    Returns
+    -------
+    list of Path
+        ``completed.nc`` with everything, ``completed.ply`` with ``present`` and ``deviation``, the
+        root of the summed variances, at every vertex, and ``sample_<i>.ply``.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_dataset(found, folder / "completed.nc")
+    triangles = found["corner_vertex"].values
+    deviation = np.sqrt((found["completion_sd"].values ** 2).sum(1))
+    write_mesh(
+        folder / "completed.ply",
+        found["position"].values,
+        triangles,
+        present=found["present"].values.astype(float),
+        deviation=deviation,
+    )
+    paths = [folder / "completed.nc", folder / "completed.ply"]
+    for i, position in enumerate(found["sample_position"].values):
+        paths.append(folder / f"sample_{i:02d}.ply")
+        write_mesh(paths[-1], position, triangles)
+    return paths

@@ -84,7 +84,7 @@ def random_intercepts(
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a.analysis.growth import random_intercepts
+    >>> from s4a_morphometrics.longitudinal import random_intercepts
     >>> age, subject = np.tile([1.0, 2, 3], 4), np.repeat([0, 1, 2, 3], 3)
     >>> Y = 2 * age + 10 * subject + np.tile([0.1, -0.2, 0.1], 4)
     >>> fit = random_intercepts(Y[:, None], np.column_stack([np.ones(12), age]), subject)
@@ -162,7 +162,7 @@ def within_subjects(values: np.ndarray, subject: np.ndarray) -> np.ndarray:
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a.analysis.growth import within_subjects
+    >>> from s4a_morphometrics.longitudinal import within_subjects
     >>> within_subjects(np.array([1.0, 3, 7]), np.array([0, 0, 1])).tolist()
     [-1.0, 1.0, 0.0]
     """
@@ -241,9 +241,10 @@ def growth(
     With the ``study`` of six small brains, as of three subjects:
 
     >>> import s4a
+    >>> import s4a_morphometrics
     >>> study = s4a.synthetic.example_study()
     >>> age, subject = [1, 2, 1, 3, 2, 4], ["a", "a", "b", "b", "c", "c"]
-    >>> fit = s4a.statistics.growth(study, age, subject, of="normal", n_permutations=99)
+    >>> fit = s4a_morphometrics.growth(study, age, subject, of="normal", n_permutations=99)
     >>> fit["effect"].dims, fit.attrs["subjects"], fit.attrs["smallest_p"]
     (('vertex', 'xyz'), 3, 0.25)
     """

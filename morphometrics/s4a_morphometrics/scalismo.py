@@ -112,7 +112,8 @@ def read_scalismo(path: Path | str) -> xr.DataTree:
 
     >>> import tempfile
     >>> import s4a
-    >>> from s4a.analysis.scalismo import read_scalismo, write_scalismo
+    >>> import s4a_morphometrics
+    >>> from s4a_morphometrics.scalismo import read_scalismo, write_scalismo
     >>> study = s4a.synthetic.example_study()
     >>> model = read_scalismo(*write_scalismo(study, tempfile.mkdtemp()))
     >>> mean, again = (s4a.synthesize(tree, [0.0])["position"].values for tree in (study, model))

@@ -70,7 +70,7 @@ def residual_weights(K: Array) -> Array:
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a.method.posterior import residual_weights
+    >>> from s4a_morphometrics.posterior import residual_weights
     >>> x = np.array([[0.0, 0], [2, 0], [1, 3]])
     >>> residual_weights((x - x.mean(0)) @ (x - x.mean(0)).T)[2].round(6).tolist()
     [-0.5, -0.5, 1.0]
@@ -94,7 +94,7 @@ def motions(X: Array, center: Array, *, scale: bool = False) -> Array:
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a.method.posterior import motions
+    >>> from s4a_morphometrics.posterior import motions
     >>> motions(np.array([[1.0, 0, 0]]), np.zeros(3))[2].tolist()
     [[0.0, 1.0, 0.0]]
     """

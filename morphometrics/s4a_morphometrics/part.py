@@ -105,7 +105,7 @@ def on_boundary(T: Array, n: int) -> Array:
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a.method.part import on_boundary
+    >>> from s4a_morphometrics.part import on_boundary
     >>> on_boundary(np.array([[0, 1, 2], [1, 0, 3], [2, 1, 3], [0, 2, 3]]), 4).any()
     np.False_
     """
@@ -126,7 +126,7 @@ def cut(X: Array, T: Array, kept: Array) -> tuple[Array, Array]:
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a.method.part import cut
+    >>> from s4a_morphometrics.part import cut
     >>> T = np.array([[0, 1, 2], [1, 3, 2]])
     >>> cut(np.eye(4, 3), T, np.array([False, True, True, True]))[1].tolist()
     [[0, 2, 1]]

@@ -19,7 +19,6 @@ import xarray as xr
 from scipy import stats
 
 from s4a.analysis.effects import check_permutations
-from s4a.analysis.halves import ROUNDS, Mirror, plane_between, symmetry
 from s4a.analysis.inputs import Values, displacements_of, registration_of, values_of
 from s4a.analysis.permutation import mean_test, rearrangements, smallest_p
 from s4a.geometry.align import rigid_transform
@@ -31,6 +30,7 @@ from s4a.method.pca import gram, gram_pca
 from s4a.schema import dataset, in_unit, require, unit_of
 from s4a.seeds import RNG, seed_of
 from s4a.study.tree import left_out
+from s4a_morphometrics.halves import ROUNDS, Mirror, plane_between, symmetry
 
 log = logging.getLogger(__name__)
 
@@ -101,7 +101,7 @@ def largest_around(values: np.ndarray, T: np.ndarray) -> np.ndarray:
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a.analysis.asymmetry import largest_around
+    >>> from s4a_morphometrics.bilateral import largest_around
     >>> T = np.array([[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4]])
     >>> largest_around(np.array([9, 0, 0, 0, 5, 0]), T).tolist()
     [9, 9, 9, 9, 9, 5]
@@ -215,8 +215,9 @@ def asymmetry(
     With the ``study`` of six small brains, which have directional asymmetry planted nowhere:
 
     >>> import s4a
+    >>> import s4a_morphometrics
     >>> study = s4a.synthetic.example_study()
-    >>> found = s4a.statistics.asymmetry(study, n_permutations=99)
+    >>> found = s4a_morphometrics.asymmetry(study, n_permutations=99)
     >>> found["variance_share"]["term"].values.tolist()
     ['individuals', 'sides', 'individuals x sides']
     >>> found["directional"].dims, round(float(found["variance_share"].sum()), 6)
@@ -366,7 +367,7 @@ def without_doubt(fields: np.ndarray, resolution: np.ndarray) -> np.ndarray:
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a.analysis.asymmetry import without_doubt
+    >>> from s4a_morphometrics.bilateral import without_doubt
     >>> without_doubt(np.array([[[1.0]], [[3.0]]]), np.array([2.0])).tolist()
     [[[0.0]], [[2.0]]]
     """
@@ -388,7 +389,7 @@ def sides_test(K: np.ndarray, *, n_permutations: int, seed: int) -> tuple[float,
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a.analysis.asymmetry import sides_test
+    >>> from s4a_morphometrics.bilateral import sides_test
     >>> a = 1 + 0.1 * np.arange(6.0)
     >>> sides_test(np.outer(a, a), n_permutations=99, seed=0)[1]
     0.03125
@@ -416,7 +417,7 @@ def antisymmetry_test(
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a.analysis.asymmetry import antisymmetry_test
+    >>> from s4a_morphometrics.bilateral import antisymmetry_test
     >>> rng = np.random.default_rng(0)
     >>> noise = rng.normal(size=(30, 3))
     >>> humps = noise + np.outer(rng.choice([-4, 4], 30), [1, 0, 0])
@@ -455,9 +456,10 @@ def asymmetry_modes(study: xr.DataTree, found: xr.Dataset) -> xr.DataTree:
     With the ``study`` of six small brains:
 
     >>> import s4a
+    >>> import s4a_morphometrics
     >>> study = s4a.synthetic.example_study()
-    >>> found = s4a.statistics.asymmetry(study, n_permutations=99)
-    >>> s4a.statistics.asymmetry_modes(study, found)["pca"].sizes["component"]
+    >>> found = s4a_morphometrics.asymmetry(study, n_permutations=99)
+    >>> s4a_morphometrics.asymmetry_modes(study, found)["pca"].sizes["component"]
     6
     """
     registration = registration_of(study)

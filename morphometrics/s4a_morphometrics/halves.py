@@ -51,7 +51,7 @@ def plane_between(X: np.ndarray, Y: np.ndarray, area: np.ndarray) -> Mirror:
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a.analysis.halves import plane_between
+    >>> from s4a_morphometrics.halves import plane_between
     >>> X = np.array([[1.0, 0, 0], [2, 1, 0], [3, 0, 4]])
     >>> abs(plane_between(X, X * [-1, 1, 1], np.ones(3)).normal).round(6).tolist()
     [1.0, 0.0, 0.0]
@@ -87,8 +87,9 @@ def symmetry(study: xr.DataTree) -> xr.Dataset:
     With the ``study`` of six small brains:
 
     >>> import s4a
+    >>> import s4a_morphometrics
     >>> study = s4a.synthetic.example_study()
-    >>> halves = s4a.statistics.symmetry(study)
+    >>> halves = s4a_morphometrics.symmetry(study)
     >>> halves["partner_triangle"].dims, halves.attrs["gap"] < halves.attrs["gap_before"]
     (('vertex',), True)
     """
@@ -134,7 +135,7 @@ def symmetric_template(study: xr.DataTree, halves: xr.Dataset | None = None) -> 
     With M the reflection that fits best, its vertices are (x(v) + M x(tau(v))) / 2, on the same
     triangles, so that it takes the place of the template's mesh; :func:`s4a.write_mesh` writes it.
     The mean of all shapes and their mirror images is ``symmetric_position`` of
-    :func:`s4a.statistics.asymmetry`.
+    :func:`s4a_morphometrics.asymmetry`.
 
     Parameters
     ----------
@@ -155,8 +156,9 @@ def symmetric_template(study: xr.DataTree, halves: xr.Dataset | None = None) -> 
     With the ``study`` of six small brains:
 
     >>> import s4a
+    >>> import s4a_morphometrics
     >>> study = s4a.synthetic.example_study()
-    >>> mesh = s4a.statistics.symmetric_template(study)
+    >>> mesh = s4a_morphometrics.symmetric_template(study)
     >>> mesh["position"].dims, 0 < mesh.attrs["moved"] < 0.1
     (('vertex', 'xyz'), True)
     """

@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from s4a.analysis.export import is_reflected, write_table
+from s4a.analysis.export import is_reflected, write_dataset, write_table
 from s4a.analysis.inputs import registration_of
 from s4a.analysis.link import image_in_shape
-from s4a.analysis.scalismo import write_scalismo
-from s4a.analysis.transfer import transfer_landmarks
+from s4a.analysis.transfer import transfer_labels, transfer_landmarks
 from s4a.analysis.volumes import write_label_volumes
 from s4a.geometry.align import farthest_points
 from s4a.geometry.mesh import as_arrays, vertex_normals
@@ -28,7 +27,8 @@ from s4a.input.hands import MIRROR, in_file
 from s4a.input.landmarks import locate
 from s4a.method.pca import synthesize
 from s4a.schema import check_count, dataset, in_unit, unit_of, variable
-from s4a.study import store
+from s4a.seeds import RNG, seed_of
+from s4a_morphometrics.scalismo import write_scalismo
 
 log = logging.getLogger(__name__)
 
@@ -58,8 +58,8 @@ def write_for(study: xr.DataTree, folder: Path | str, program: str, **options: A
         Made where it is missing.
     program : {"slicer", "shapeworks", "scalismo", "paraview", "r", "nifti"}
         See :func:`write_slicer`, :func:`write_shapeworks`,
-        :func:`s4a.analysis.scalismo.write_scalismo`, :func:`write_paraview`, :func:`write_r` and
-        :func:`s4a.analysis.volumes.write_label_volumes`.
+        :func:`s4a_morphometrics.scalismo.write_scalismo`, :func:`write_paraview`, :func:`write_r`
+        and :func:`s4a.analysis.volumes.write_label_volumes`.
     **options
         Those of that function.
 
@@ -78,8 +78,9 @@ def write_for(study: xr.DataTree, folder: Path | str, program: str, **options: A
 
     >>> import tempfile
     >>> import s4a
+    >>> import s4a_morphometrics
     >>> study = s4a.synthetic.example_study()
-    >>> [path.name for path in s4a.write_for(study, tempfile.mkdtemp(), "scalismo")]
+    >>> [path.name for path in s4a_morphometrics.write_for(study, tempfile.mkdtemp(), "scalismo")]
     ['model.h5']
     """
     if program not in PROGRAMS:
@@ -324,7 +325,7 @@ def write_r(study: xr.DataTree, folder: Path | str, *, n_points: int = N_POINTS)
     whole = dataset(aligned_position=position, corner_vertex=T, point_vertex=chosen)
     paths = [folder / name for name in ("shapes.nc", "points.tps", "subjects.csv", "study.R")]
     unit = unit_of(registration["displacement"])
-    store.write(in_unit(whole.assign_coords(shape=names), unit), paths[0])
+    write_dataset(in_unit(whole.assign_coords(shape=names), unit), paths[0])
     with open(paths[1], "w", encoding="utf-8") as file:
         for name, points in zip(names.tolist(), position[:, chosen], strict=True):
             file.write(f"LM3={len(chosen)}\n")
@@ -363,6 +364,101 @@ def _in_file(study, name, X, T, own):
     if is_reflected(study, name):
         points, triangles = points * MIRROR, T[:, ::-1]
     return points, triangles, study["original"][name].attrs.get("coordinate_system", "")
+
+
+def write_training_set(
+    study: xr.DataTree,
+    folder: Path | str,
+    *,
+    label: np.ndarray | None = None,
+    landmarks: xr.Dataset | None = None,
+    source: str | xr.Dataset | None = None,
+    test_share: float = 0.2,
+    seed: int = 0,
+    rng: RNG | None = None,
+    **options: Any,
+) -> dict[str, list[str]]:
+    """Write a training set for learners of segmentations and key-points, with its split.
+
+    Parameters
+    ----------
+    study : DataTree
+        With ``/original`` and ``/registration``.
+    folder : path
+        Gets ``meshes/<shape>.ply`` (the cleaned mesh, with all its vertices, in the coordinates of
+        its file, or their mirror image where the run took that), ``labels/<shape>.npy`` (one per
+        vertex) and ``labels/<shape>.confidence.npy`` (share of the votes times confidence of the
+        match), ``landmarks/<shape>.csv`` (name,x,y,z), and ``split.json`` with the lists ``train``
+        and ``test``.
+    label, landmarks, source : see :func:`s4a.transfer_labels` and :func:`s4a.transfer_landmarks`
+    test_share : float
+        Of the shapes, rounded up.
+    seed, rng : see :mod:`s4a.seeds`
+        Of the split.
+    **options
+        By which an external source is matched, see :func:`s4a.transfer_labels`.
+
+    Returns
+    -------
+    dict
+        The split.
+
+    Raises
+    ------
+    ValueError
+        When there is nothing to learn, or the share leaves no shape to train or to test on.
+
+    Examples
+    --------
+    With the ``study`` of six small brains:
+
+    >>> import tempfile
+    >>> import s4a
+    >>> import s4a_morphometrics
+    >>> study = s4a.synthetic.example_study()
+    >>> folder = tempfile.mkdtemp()
+    >>> label = study["original/brain_01/label"].values
+    >>> split = s4a_morphometrics.write_training_set(study, folder, label=label, source="brain_01")
+    >>> len(split["train"]), len(split["test"])
+    (4, 2)
+    """
+    if label is None and landmarks is None:
+        raise ValueError("a training set needs labels, landmarks or both; found neither")
+    folder = Path(folder)
+    names = registration_of(study)["shape"].values.tolist()
+    n_test = int(np.ceil(test_share * len(names)))
+    if not 0 < n_test < len(names):
+        raise ValueError(
+            f"test_share needs a share of {len(names)} shapes that leaves some on both sides: "
+            f"{test_share}"
+        )
+    where = {"source": source, "targets": names} | options
+    carried = {}  # before anything is written: it may fail
+    if label is not None:
+        carried["labels"] = transfer_labels(study, label, **where)
+    if landmarks is not None:
+        carried["landmarks"] = transfer_landmarks(study, landmarks, **where)
+    for part in ("meshes", *carried):
+        (folder / part).mkdir(parents=True, exist_ok=True)
+    for name in names:
+        mesh = study["original"][name].to_dataset()
+        write_mesh(folder / "meshes" / f"{name}.ply", *as_arrays(mesh))
+        if "labels" in carried:
+            own = carried["labels"][name].to_dataset()
+            sure = own["label_share"] * own["confidence"]
+            np.save(folder / "labels" / f"{name}.npy", own["label"].values)
+            np.save(folder / "labels" / f"{name}.confidence.npy", sure.values)
+        if "landmarks" in carried:
+            write_landmarks(
+                folder / "landmarks" / f"{name}.csv", carried["landmarks"][name].to_dataset()
+            )
+    order = np.random.default_rng(seed_of(seed, rng)).permutation(len(names))
+    split = {
+        "train": sorted(names[i] for i in order[n_test:]),
+        "test": sorted(names[i] for i in order[:n_test]),
+    }
+    (folder / "split.json").write_text(json.dumps(split, indent=1) + "\n")
+    return split
 
 
 PROGRAMS: dict[str, Callable[..., list[Path]]] = {

@@ -6,17 +6,17 @@ import shutil
 import numpy as np
 import pytest
 from scipy import optimize
-from test_fields import with_carried
-from test_restrict import TOP, noise, study_of
+from simulated import TOP, noise, study_of, with_carried
 
 from s4a import cli, open_study, statistics
-from s4a.analysis.growth import random_intercepts, within_subjects
 from s4a.analysis.permutation import (
     count_rearrangements,
     rearrangements,
     smallest_p,
     vertex_test,
 )
+from s4a_morphometrics import growth
+from s4a_morphometrics.longitudinal import random_intercepts, within_subjects
 
 SUBJECT = np.repeat(np.arange(8), 3)
 AGE = np.tile([0.0, 1, 2.5], 8) + 0.3 * SUBJECT
@@ -86,14 +86,14 @@ def test_a_covariate_that_changes_nothing_changes_no_statistic(planted):
     w, options = rng.normal(size=24), {"of": "normal", "n_permutations": 9}
     constant = np.repeat(rng.normal(size=8), 3)  # within subjects
     fits = [
-        statistics.growth(planted, "age", "person", covariates=of, **options)
+        growth(planted, "age", "person", covariates=of, **options)
         for of in ({"w": w}, {"w": w, "constant": constant}, {"w": w, "twice": 2 * w})
     ]
     assert np.allclose([fit["statistic"] for fit in fits], fits[0]["statistic"])
 
 
 def test_a_planted_growth_is_found_where_it_is_with_its_slope(planted):
-    fit = statistics.growth(planted, "age", "person", n_permutations=199)
+    fit = growth(planted, "age", "person", n_permutations=199)
     assert np.allclose(fit["effect"].values[TOP, 0].mean(), 0.05, rtol=0.15)
     assert abs(fit["effect"].values[~TOP]).mean() < 0.01
     assert (fit["p_family_wise"].values[TOP] < 0.05).mean() > 0.8
@@ -103,17 +103,15 @@ def test_a_planted_growth_is_found_where_it_is_with_its_slope(planted):
     assert np.corrcoef(fit["shape_time"], AGE)[0, 1] > 0.3
     assert fit.attrs["subjects"] == 8
     assert fit.attrs["once"] == 0
-    beside = statistics.growth(planted, "age", "person", covariates="sex", n_permutations=199)
+    beside = growth(planted, "age", "person", covariates="sex", n_permutations=199)
     assert np.array_equal(beside["p_vertex"], fit["p_vertex"])
-    signs = statistics.growth(
-        planted, "age", "person", of="normal", variances="unequal", n_permutations=199
-    )
+    signs = growth(planted, "age", "person", of="normal", variances="unequal", n_permutations=199)
     assert signs.attrs["smallest_p"] == 2**-7
     assert signs["p_value"] <= 0.02
 
 
 def test_the_trajectory_is_the_mean_shape_at_each_time_and_a_mode_that_plays(planted):
-    fit = statistics.growth(planted, "age", "person", n_permutations=99)
+    fit = growth(planted, "age", "person", n_permutations=99)
     young, old = (statistics.predict(planted, fit, age)["position"].values for age in (0, 4))
     assert np.allclose(old - young, 4 * fit["effect"])
     moving = statistics.regression_modes(planted, fit, "age")
@@ -126,7 +124,7 @@ def test_the_trajectory_is_the_mean_shape_at_each_time_and_a_mode_that_plays(pla
 def test_a_field_grows_too(planted):
     values = noise(5, 24, size=0.1)[..., 0] + 0.4 * AGE[:, None] * TOP
     study = with_carried(planted, values)
-    fit = statistics.growth(study, "age", "person", field="thickness", n_permutations=199)
+    fit = growth(study, "age", "person", field="thickness", n_permutations=199)
     assert np.allclose(fit["field_effect"].values[TOP], 0.4, atol=0.1)
     assert np.allclose(fit["field_within_effect"].values[TOP], 0.4, atol=0.1)
     assert fit["field_effect"].attrs["units"] == "mm"
@@ -177,23 +175,23 @@ def test_what_is_no_repeated_measure_is_refused_or_told(planted, caplog):
     person = planted["subjects"]["person"].values
     options = {"n_permutations": 99}
     with pytest.raises(ValueError, match="two subjects that were seen at different times, found 0"):
-        statistics.growth(planted, "age", [f"q{i}" for i in range(24)], **options)
+        growth(planted, "age", [f"q{i}" for i in range(24)], **options)
     with pytest.raises(ValueError, match="needs a time of numbers, found text such as 'f'"):
-        statistics.growth(planted, "sex", "person", **options)
+        growth(planted, "sex", "person", **options)
     with pytest.raises(ValueError, match="24 shapes"):
-        statistics.growth(planted, "age", ["a", "b"], **options)
+        growth(planted, "age", ["a", "b"], **options)
     with pytest.raises(ValueError, match="combination of the covariates"):
-        statistics.growth(planted, "age", "person", covariates={"years": AGE * 2}, **options)
+        growth(planted, "age", "person", covariates={"years": AGE * 2}, **options)
     with pytest.raises(ValueError, match="of must be 'vector' or 'normal'"):
-        statistics.growth(planted, "age", "person", of="x", **options)
+        growth(planted, "age", "person", of="x", **options)
     caplog.clear()
     alone = np.where(np.arange(24) == 23, "alone", person)
-    fit = statistics.growth(planted, "age", alone, **options)
+    fit = growth(planted, "age", alone, **options)
     assert "seen at one time only" in caplog.text
     assert "alone" in caplog.text
     assert fit.attrs["once"] == 1
     unknown = np.where(np.arange(24) == 5, "", person)
-    fit = statistics.growth(planted, "age", unknown, **options)
+    fit = growth(planted, "age", unknown, **options)
     assert fit.attrs["left_out"] == "shape_05"
     assert fit.sizes["shape"] == 23
     caplog.clear()
@@ -201,7 +199,7 @@ def test_what_is_no_repeated_measure_is_refused_or_told(planted, caplog):
         np.arange(24) < 4, np.repeat([0, 1], 12)[np.arange(24) * 3 % 24], np.arange(24) + 9
     )
     few[:4] = [0, 0, 1, 1]
-    statistics.growth(planted, "age", few, of="normal", **options)
+    growth(planted, "age", few, of="normal", **options)
     assert "allow no p value below 0.5" in caplog.text
 
 
