@@ -1,15 +1,11 @@
 """``rng=`` beside ``seed=`` (SPEC 7): in every public function that takes a seed, and the same."""
 
-import inspect
-
 import numpy as np
 import pytest
-from test_docs import functions
 
 import s4a
 from s4a.seeds import seed_of
 
-SEEDED = [(n, f) for n, f in functions() if "seed" in inspect.signature(f).parameters]
 STATISTICS = {
     "group_test": (["a", "b"] * 3,),
     "group_map": (["a", "b"] * 3,),
@@ -20,19 +16,6 @@ STATISTICS = {
 @pytest.fixture(scope="module")
 def study():
     return s4a.synthetic.example_study()
-
-
-def test_the_functions_that_take_a_seed_are_found():
-    names = {name for name, _ in SEEDED}
-    assert {"analyse", "match_pair", "coarsen", "statistics.group_test"} <= names
-
-
-@pytest.mark.parametrize("name, function", SEEDED)
-def test_a_function_that_takes_a_seed_takes_rng_by_name_alone(name, function):
-    rng = inspect.signature(function).parameters["rng"]
-    assert rng.default is None
-    assert rng.kind is rng.KEYWORD_ONLY
-    assert "rng" in inspect.getdoc(function)
 
 
 def test_seed_and_rng_of_a_number_are_the_same_and_those_of_another_are_not():
