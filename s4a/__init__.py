@@ -24,158 +24,23 @@ for other programs        :func:`write_for`, :func:`write_registered`, :func:`wr
 the bundled collection    :mod:`s4a.synthetic`
 ========================  ====================================================================
 
-They and the modules of the rooms (``s4a.method.fmap``) are imported when they are first used.
+They and the modules of the subpackages (``s4a.method.fmap``) are imported when they are first used;
+which they are says ``__init__.pyi``.
 """
 
-from functools import partial
 from importlib import import_module
 from importlib.metadata import version
-from importlib.util import find_spec
-from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from s4a._moved import install
+import lazy_loader
 
-if TYPE_CHECKING:
-    from s4a import widgets as widgets
-    from s4a.accessor import explore
-    from s4a.analysis import statistics
-    from s4a.analysis.complete import complete
-    from s4a.analysis.export import write_registered, write_training_set
-    from s4a.analysis.fields import with_field
-    from s4a.analysis.programs import write_for
-    from s4a.analysis.transfer import (
-        register_pairs,
-        transfer_labels,
-        transfer_landmarks,
-        transfer_scalars,
-    )
-    from s4a.datasets import synthetic
-    from s4a.evaluation import compare, metrics
-    from s4a.input.clean import clean
-    from s4a.input.collection import read_labels, read_shape, read_shapes
-    from s4a.input.files import read_mesh, write_mesh
-    from s4a.input.landmarks import with_landmarks
-    from s4a.input.scalars import with_features
-    from s4a.method.pca import synthesize
-    from s4a.method.remesh import coarsen
-    from s4a.method.spectral import reconstruct, spectrum
-    from s4a.method.steps import (
-        align_pair,
-        build_network,
-        latent_map,
-        latent_match,
-        refine_network,
-        register_shape,
-    )
-    from s4a.show.page import write_page
-    from s4a.show.pictures import write_film, write_picture
-    from s4a.study.insert import insert
-    from s4a.study.pair import match_pair
-    from s4a.study.pipeline import analyse
-    from s4a.study.tree import open_study
-    from s4a.study.verify import verify
-
-install()
 __version__ = version("s4a")
-__all__ = [
-    "align_pair",
-    "analyse",
-    "build_network",
-    "clean",
-    "coarsen",
-    "compare",
-    "complete",
-    "explore",
-    "insert",
-    "latent_map",
-    "latent_match",
-    "match_pair",
-    "metrics",
-    "open_study",
-    "read_labels",
-    "read_mesh",
-    "read_shape",
-    "read_shapes",
-    "reconstruct",
-    "refine_network",
-    "register_pairs",
-    "register_shape",
-    "spectrum",
-    "statistics",
-    "synthesize",
-    "synthetic",
-    "transfer_labels",
-    "transfer_landmarks",
-    "transfer_scalars",
-    "verify",
-    "with_features",
-    "with_field",
-    "with_landmarks",
-    "write_film",
-    "write_for",
-    "write_mesh",
-    "write_page",
-    "write_picture",
-    "write_registered",
-    "write_training_set",
-]
-# module -> the public names that it holds
-PLACES = {
-    "accessor": "explore",
-    "analysis": "statistics",
-    "analysis.complete": "complete",
-    "analysis.export": "write_registered write_training_set",
-    "analysis.fields": "with_field",
-    "analysis.programs": "write_for",
-    "analysis.transfer": "register_pairs transfer_labels transfer_landmarks transfer_scalars",
-    "datasets": "synthetic",
-    "evaluation": "compare metrics",
-    "input.clean": "clean",
-    "input.collection": "read_labels read_shape read_shapes",
-    "input.landmarks": "with_landmarks",
-    "input.files": "read_mesh write_mesh",
-    "input.scalars": "with_features",
-    "method.pca": "synthesize",
-    "method.remesh": "coarsen",
-    "method.spectral": "reconstruct spectrum",
-    "method.steps": "align_pair build_network latent_map latent_match refine_network "
-    "register_shape",
-    "show.page": "write_page",
-    "show.pictures": "write_film write_picture",
-    "study.insert": "insert",
-    "study.pair": "match_pair",
-    "study.pipeline": "analyse",
-    "study.tree": "open_study",
-    "study.verify": "verify",
-}
-MODULE_OF = {name: module for module, names in PLACES.items() for name in names.split()}
+_first_use, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__all__.remove("widgets")  # needs pip install "s4a[notebook]", and `from s4a import *` does not
 
 
-if not TYPE_CHECKING:  # or every misspelt name would pass as Any
-
-    def __getattr__(name: str) -> Any:
-        """A public name, imported now; ``study.s4a`` is there from the first one on."""
-        if name == "widgets":  # a room that pip install "s4a[notebook]" brings
-            return import_module("s4a.widgets")
-        if name not in MODULE_OF:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        import_module("s4a.accessor")
-        globals()[name] = getattr(import_module(f"s4a.{MODULE_OF[name]}"), name)
-        return globals()[name]
-
-
-def __dir__() -> list[str]:
-    """What completion offers."""
-    return sorted({*globals(), *__all__, "widgets"})
-
-
-def _module_of(room: str, name: str) -> ModuleType:
-    """A module of a room, imported now."""
-    if find_spec(f"s4a.{room}.{name}") is None:
-        raise AttributeError(f"module 's4a.{room}' has no attribute {name!r}")
-    return import_module(f"s4a.{room}.{name}")
-
-
-for _room in ("analysis", "datasets", "evaluation", "geometry", "input", "method", "show", "study"):
-    vars(import_module(f"s4a.{_room}"))["__getattr__"] = partial(_module_of, _room)
+def __getattr__(name: str) -> Any:
+    """Import a public name; from the first one on ``study.s4a`` is there."""
+    found = _first_use(name)
+    import_module("s4a.accessor")
+    return found

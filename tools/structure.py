@@ -35,7 +35,7 @@ SUBPACKAGES = (
     "cli",
 )
 # outside of that order, as they bring the others together
-FRONT = ("__init__", "__main__", "_moved", "accessor", "course")
+FRONT = ("__init__", "__main__", "accessor", "course")
 
 
 def modules_of(folder=ROOT / "s4a"):

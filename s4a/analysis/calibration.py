@@ -27,7 +27,7 @@ from s4a.analysis.inputs import registration_of
 from s4a.analysis.partial import LEAST_SHARE, Model, match, tell, whole_of
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays
-from s4a.input.evidence import spread
+from s4a.input.plausibility import spread
 from s4a.method import posterior
 from s4a.method.first_map import motion_onto
 from s4a.method.part import Pose, cut, fit_modes, part_of

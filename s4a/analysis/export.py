@@ -14,8 +14,8 @@ from s4a.analysis.link import image_in_shape
 from s4a.analysis.transfer import transfer_labels, transfer_landmarks
 from s4a.geometry.mesh import as_arrays
 from s4a.input.annotations import write_landmarks
-from s4a.input.evidence import MIRROR
 from s4a.input.files import write_mesh
+from s4a.input.hands import MIRROR
 from s4a.seeds import RNG, seed_of
 from s4a.study import store
 
@@ -100,8 +100,8 @@ def write_registered(
         )
     if frame == "shape" and "rotation" not in registration:
         raise ValueError(
-            "frame='shape' needs the motion of every shape, and this study has none, as of "
-            "structures_modes: write it in the frame of the template"
+            "frame='shape' needs the motion of every shape, and this study has none: write it in the "
+            "frame of the template"
         )
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)

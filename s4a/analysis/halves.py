@@ -14,8 +14,7 @@ from s4a.analysis.inputs import registration_of
 from s4a.analysis.link import image_in_shape
 from s4a.geometry.closest import closest_facing_point, interpolate
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas, vertex_normals
-from s4a.input.evidence import MIRROR
-from s4a.input.hands import mirror_image
+from s4a.input.hands import MIRROR, mirror_image
 from s4a.schema import dataset, in_unit, require, unit_of
 from s4a.study.options import Options
 from s4a.study.pair import match_shapes, shape_of

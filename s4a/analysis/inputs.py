@@ -14,7 +14,7 @@ from s4a.input.subjects import is_missing, is_plain_number, listed, odd_cells, o
 from s4a.method.pca import pca_without
 from s4a.schema import require, unit_of
 from s4a.study.options import Options
-from s4a.study.tree import check_is_one, left_out
+from s4a.study.tree import left_out
 
 log = logging.getLogger(__name__)
 
@@ -169,7 +169,6 @@ def _field_everywhere(values, field):
 
 def all_registered(study: xr.DataTree) -> xr.Dataset:
     """``/registration`` of a study, doubtful shapes too; ValueError where it has none."""
-    check_is_one(study)
     if "registration" not in study:
         raise ValueError(
             f"a registered study is needed; this one has {', '.join(study.children) or 'no nodes'}"

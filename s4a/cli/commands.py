@@ -55,16 +55,12 @@ def doctor(args: Namespace) -> int:
 
 def run(args: Namespace) -> int:
     """The whole analysis over a folder of meshes."""
-    from s4a.cli import results, tables
+    from s4a.cli import tables
     from s4a.study.pipeline import analyse
 
     full = within(args.out, "report.txt")
     with cluster(args.cluster), lines_or_bars():
         study = analyse(args.paths, store=args.out, **options_of(args))
-    if "structures" in study.children:
-        write(results.run_of_several(study, args.out))
-        parts = study["structures"].children.values()
-        return 1 if any(part["report"].attrs["unforeseen"] for part in parts) else 0
     again = shlex.join(["s4a", *(word for word in args.words if word != "--keep-doubtful")])
     report = study["report"].to_dataset()
     lines = [tables.report_table(report), *tables.stage_lines(report)]
@@ -78,8 +74,7 @@ def options_of(args: Namespace) -> dict[str, Any]:
     """The options of `analyse` from parsed flags, and how many processes."""
     from s4a.study.options import Options
 
-    options = {name: getattr(args, name) for name in [*(f.name for f in fields(Options)), "n_jobs"]}
-    return options | {"structures": dict(args.structures) if args.structures else None}
+    return {name: getattr(args, name) for name in [*(f.name for f in fields(Options)), "n_jobs"]}
 
 
 @contextlib.contextmanager
@@ -243,7 +238,7 @@ def statistics(args: Namespace) -> int:
 def study_to_test(args: Namespace) -> "tuple[xr.DataTree, str]":
     """The study with the table and the shapes that are asked for, and the folder of results."""
     from s4a.analysis.inputs import with_doubtful
-    from s4a.input.decisions import listed
+    from s4a.input.plausibility import listed
     from s4a.input.subjects import with_table
     from s4a.study.tree import left_out, open_study
 
@@ -332,24 +327,18 @@ def insert(args: Namespace) -> int:
     from s4a.analysis.export import write_registered
     from s4a.cli import tables
     from s4a.study.insert import insert
-    from s4a.study.store import ENGINE, STRUCTURES
-    from s4a.study.tree import of_structure, open_study, structure_names
+    from s4a.study.store import ENGINE
+    from s4a.study.tree import open_study
 
     study = open_study(args.study)
-    options = {name: getattr(args, name) for name in ("landmarks", "reflect", "table", "n_jobs")}
+    options = {name: getattr(args, name) for name in ("landmarks", "reflect", "n_jobs")}
     inserted = insert(study, args.shapes, **options)
     out = new_folder(args.out)
     inserted.to_netcdf(out / "inserted.nc", engine=ENGINE)
-    parts, status = {"": inserted}, "status"
-    if STRUCTURES in inserted.children:
-        status = "structure_status"
-        names = structure_names(inserted)
-        parts = {f"{STRUCTURES}/{name}": of_structure(inserted, name) for name in names}
-    for place, part in parts.items():
-        write_registered(part, out / place)
-        write(f"{place}\n{tables.inserted_table(part)}".lstrip())
+    write_registered(inserted, out)
+    write(tables.inserted_table(inserted))
     write(f"\nwritten: {out / 'inserted.nc'}, registered meshes and scores in {out}")
-    return 1 if (inserted["report"][status] == "excluded").any() else 0
+    return 1 if (inserted["report"]["status"] == "excluded").any() else 0
 
 
 def complete(args: Namespace) -> int:
@@ -381,7 +370,7 @@ def transfer(args: Namespace) -> int:
     from s4a.input.collection import read_shape
     from s4a.input.landmarks import locate
     from s4a.study.options import PAIR
-    from s4a.study.store import STRUCTURES, check_is_study
+    from s4a.study.store import check_is_study
     from s4a.study.tree import open_study
 
     if not (args.labels or args.landmarks):
@@ -391,9 +380,7 @@ def transfer(args: Namespace) -> int:
     if args.blur is not None and not args.labels:
         raise ValueError("--blur is of labels: give --labels FILE, or leave it out")
     first = Path(args.targets[0])
-    into_study = len(args.targets) == 1 and (
-        (first / "registration.nc").is_file() or (first / STRUCTURES).is_dir()
-    )
+    into_study = len(args.targets) == 1 and any(first.glob("**/registration.nc"))
     if into_study:
         check_is_study(first)
     source, label, landmarks = read_shape(args.source), None, None

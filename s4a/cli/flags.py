@@ -50,13 +50,11 @@ HELP = {
     "wrap": "wrap the shapes watertight before they are remeshed",
     "intersections": "count triangles that pass through others",
     "label": "the files are label volumes (NIfTI, MGH): the surface of this label, or several: 1,2",
-    "structures": "label volumes that each hold several structures: left=17 right=53",
     "pattern": "only files whose name fits, for example '*brain*'",
     "preset": "'paper' leaves out all that is added to the paper; 'fast' halves the time",
     "template": "name of the shape to register to (default: the median shape)",
     "reflect": "shapes to mirror: their names, with commas; COLUMN=VALUE of the table; or auto",
-    "landmarks": "folder of landmark files named as the shapes (of several structures also in a "
-    "folder for each), which guide registration",
+    "landmarks": "folder of landmark files named as the shapes, which guide registration",
     "features": "fields that guide registration, with commas: sulc is a.sulc.npy beside a.ply",
     "table": "CSV with a column 'shape', covariates and groups, for the statistics",
     "doubtful": "what becomes of doubtful shapes: they stay apart, or the run stops",
@@ -160,14 +158,6 @@ def not_negative(text: str) -> int:
     return number
 
 
-def named_label(text: str) -> tuple[str, str]:
-    """A structure and its label or labels, as ``left=17``."""
-    name, equals, label = text.partition("=")
-    if not (name and equals and label):
-        raise argparse.ArgumentTypeError(f"a structure and its label needed, as left=17: {text!r}")
-    return name, label
-
-
 OTHER_NUMBERS: dict[str, Callable[[str], int]] = {"n_jobs": processes, "seed": not_negative}
 
 
@@ -187,9 +177,7 @@ def _run(add):
     add("--out", required=True, metavar="STUDY", help=text)
     text = "dask scheduler tcp://host:port, or local:N worker processes"
     add("--cluster", metavar="ADDRESS", help=text)
-    text = HELP["structures"]
-    add("--structures", nargs="+", type=named_label, metavar="NAME=LABEL", help=text)
-    add_options(add, [name for name in HELP if name != "structures"])
+    add_options(add, HELP)
 
 
 def _demo(add):
@@ -298,29 +286,14 @@ def _growth(add):
     add_options(add, ["seed"])
 
 
-def _structures(add):
-    add("study", metavar="STUDY")
-    add("--scale", action="store_true", help="take the size of each whole subject out")
-    text = "also test whether groups differ in how structures lie, and in their shapes"
-    add("--group", metavar="COLUMN", help=text)
-    text = "folder of s4a insert, or its inserted.nc: poses and scores of new subjects, too"
-    add("--new", metavar="DIR", help=text)
-    add("--permutations", type=whole, help="of the subjects (default: 999)")
-    add("--out", metavar="DIR", help="for netCDF, CSV, the pages (default: STUDY/statistics)")
-    add_options(add, ["seed"])
-
-
 def _insert(add):
     add("study", metavar="STUDY")
     add("shapes", nargs="+", metavar="SHAPE", help="mesh files, label volumes, folders or globs")
     text = "for inserted.nc, registered meshes and scores"
     add("--out", required=True, metavar="DIR", help=text)
     add("--landmarks", metavar="DIR", help=HELP["landmarks"])
-    text = "new shapes to mirror: names, with commas; COLUMN=VALUE of the table of several "
-    text += "structures; or auto, those of the other hand"
+    text = "new shapes to mirror: names, with commas; or auto, those of the other hand"
     add("--reflect", metavar="NAMES", help=text)
-    text = "CSV of several structures, with columns shape, subject and structure"
-    add("--table", metavar="CSV", help=text)
     add_options(add, ["n_jobs"])
 
 
@@ -409,7 +382,6 @@ COMMANDS = {
     "asymmetry": Command(growing.asymmetry, _asymmetry),
     "fields": Command(growing.fields, _fields),
     "growth": Command(growing.growth, _growth),
-    "structures": Command(growing.structures, _structures),
     "insert": Command(commands.insert, _insert),
     "complete": Command(commands.complete, _complete),
     "export": Command(leaving.export, _export),

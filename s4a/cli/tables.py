@@ -14,7 +14,7 @@ import xarray as xr
 
 from s4a.analysis.inputs import registration_of
 from s4a.geometry.mesh import as_arrays, vertex_areas
-from s4a.input.decisions import Decision, decisions, listed, notices, shortened
+from s4a.input.plausibility import Decision, decisions, listed, notices, shortened
 from s4a.method.pca import mahalanobis
 from s4a.study.progress import STAGES, Status
 from s4a.study.tree import seconds_of

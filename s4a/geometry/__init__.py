@@ -1,1 +1,9 @@
 """Surfaces as arrays (3.1): triangles, normals, areas, distances, rigid motions."""
+
+from pkgutil import iter_modules
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__, [m.name for m in iter_modules(__path__)]
+)

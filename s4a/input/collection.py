@@ -11,7 +11,6 @@ import xarray as xr
 from s4a.geometry.mesh import as_dataset
 from s4a.input import plausibility
 from s4a.input.clean import REPAIRS, check_components, clean
-from s4a.input.evidence import examine
 from s4a.input.files import (
     LONGEST_NAME,
     Paths,
@@ -22,6 +21,7 @@ from s4a.input.files import (
     with_long_names,
 )
 from s4a.input.labels import Label, check_label, read_volume
+from s4a.input.plausibility import examine
 from s4a.input.raw import shown
 from s4a.schema import check_switch, check_text, dataset, in_unit
 
@@ -258,7 +258,7 @@ def shape_report(
     remarks : list of str
         On the collection, the most important first.
     evidence : dict, optional
-        Name -> :func:`s4a.input.evidence.compare`, whose counts are columns.
+        Name -> :func:`s4a.input.plausibility.compare`, whose counts are columns.
     """
     evidence, doubts = evidence or {}, doubts or {}
     rows = []

@@ -16,7 +16,7 @@ import numpy as np
 from scipy import sparse
 
 from s4a.geometry.mesh import directed_edges
-from s4a.input import bounded
+from s4a.input import raw
 from s4a.input.raw import check_there, shown
 
 VOLUMES = {".nii": "NIfTI", ".mgz": "MGH", ".mgh": "MGH"}
@@ -107,7 +107,7 @@ def read_volume(
     check_there(path)
     known = check_label(label)
     try:
-        values, affine, attrs = _volume(bounded.content(path, UNPACKED))
+        values, affine, attrs = _volume(raw.content(path, UNPACKED))
         inside = _marked(values, known)
         points, triangles, at_border = _boundary(inside)
     except Exception as error:  # whatever a file holds, it must not end the run over a collection
@@ -130,7 +130,7 @@ def voxels_marked(path: str | os.PathLike[str], label: Label) -> tuple[np.ndarra
 
     See :func:`read_volume`.
     """
-    values, affine, _ = _volume(bounded.content(Path(path), UNPACKED))
+    values, affine, _ = _volume(raw.content(Path(path), UNPACKED))
     return _marked(values, check_label(label)), affine
 
 
@@ -144,7 +144,7 @@ def read_grid(path: str | os.PathLike[str]) -> tuple[tuple[int, ...], np.ndarray
     """
     check_there(path)
     try:
-        kind, name = _kind_of(data := bounded.content(Path(path), UNPACKED))
+        kind, name = _kind_of(data := raw.content(Path(path), UNPACKED))
         header = kind.header_class.from_fileobj(io.BytesIO(data))
         return _shape_of(header), _affine_of(header, name)[0]
     except Exception as error:  # whatever a file holds, the message must name it

@@ -1,1 +1,9 @@
 """The method: one file a step of sections 3, 4 and 6.1 of the paper."""
+
+from pkgutil import iter_modules
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__, [m.name for m in iter_modules(__path__)]
+)

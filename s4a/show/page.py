@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 from markupsafe import Markup
 
-from s4a.input.decisions import decisions, notices
+from s4a.input.plausibility import decisions, notices
 from s4a.show import charts
 from s4a.show.browser import MODES, PARTS, TEMPLATES, look_state, mesh_state, webp_uri
 from s4a.show.draw import SIGNED, Viewpoint, opposite, position_colors, ramp_colors, render
@@ -27,7 +27,7 @@ from s4a.show.surfaces import (
     surface,
     template_coarse,
 )
-from s4a.study.tree import check_is_one, left_out, seconds_of
+from s4a.study.tree import left_out, seconds_of
 
 LARGE = 20_000  # vertices from which a page moves the low-resolution mesh
 N_CARRIED = 5  # shapes to which the template's colours are carried
@@ -58,11 +58,6 @@ def write_page(
     -------
     pathlib.Path
 
-    Raises
-    ------
-    ValueError
-        When the study is one of several structures.
-
     Examples
     --------
     >>> import tempfile
@@ -86,7 +81,6 @@ def study_html(
     up: str = "z",
 ) -> str:
     """The HTML of a study; see :func:`write_page`."""
-    check_is_one(study)
     sections = []
     for heading, needs, section in SECTIONS:
         lacking = [name for name in needs if not has(study, name)]

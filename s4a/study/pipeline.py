@@ -6,7 +6,7 @@ of them is in :mod:`s4a.study.tasks`.
 """
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,6 @@ import xarray as xr
 from joblib import effective_n_jobs, parallel_config
 
 from s4a.input.collection import remarks_on_files
-from s4a.input.hands import AUTO
 from s4a.input.plausibility import Doubts
 from s4a.input.subjects import read_table
 from s4a.method.network import choose_pairs, spectral_distance
@@ -30,12 +29,15 @@ from s4a.study.doubts import (
     stop_at_doubts,
 )
 from s4a.study.options import Options, takes_options
-from s4a.study.originals import choose_reflected, choose_together, read_and_clean
+from s4a.study.originals import choose_reflected, read_and_clean
 from s4a.study.processes import temporary_folder
 from s4a.study.report import write_report
 from s4a.study.runner import Keys, Run, Task
 from s4a.study.sources import (
     Collection,
+    Marked,
+    Sources,
+    check_one_structure,
     find_guides,
     find_sources,
     kept_table,
@@ -43,7 +45,6 @@ from s4a.study.sources import (
     remarks_on_guides,
 )
 from s4a.study.store import (
-    STRUCTURES,
     arrays,
     attributes,
     is_done,
@@ -52,18 +53,6 @@ from s4a.study.store import (
     read,
     task_key,
     write,
-)
-from s4a.study.structures import (
-    Part,
-    check_one_kind,
-    check_parts,
-    has_structures,
-    is_nested,
-    named_subjects,
-    parts_of_dict,
-    parts_of_labels,
-    parts_of_table,
-    write_contents,
 )
 from s4a.study.tasks import (
     align_shape,
@@ -85,7 +74,6 @@ def analyse(
     *,
     store: Path | str | None = None,
     n_jobs: int | None = None,
-    structures: Mapping[str, int | str] | None = None,
     **options: Any,
 ) -> xr.DataTree:
     """From a collection of meshes to a median shape, dense correspondences and modes.
@@ -94,10 +82,7 @@ def analyse(
     ----------
     shapes : path, list of paths, dict or xarray.DataTree
         A folder, a glob, files, or by name a file or a mesh in memory, a Dataset or (points,
-        triangles), or what :func:`s4a.read_shapes` gives.  Of several structures of each subject a
-        dict of such dicts: ``{"subject_1": {"left": mesh, "right": mesh}, ...}``, whose meshes lie
-        where they are to each other; or files and a table with columns ``structure`` and
-        ``subject``; or label volumes, see `structures`.
+        triangles), or what :func:`s4a.read_shapes` gives.
     method : {"rematch", "scalable"}
         The low resolution (4.1): remeshed (default), or the local functions of SCALABLE, see
         :func:`s4a.method.scalable.reduced`.  The study has the same nodes and variables but for U,
@@ -179,9 +164,7 @@ def analyse(
         turned over), so that left and right ones are of one hand: their names; ``"side=left"``, all
         with this value in the column ``side`` of the table, or a column of 1 and 0; or ``"auto"``,
         those of the rarer hand by ICP of pairs, as they are and mirrored
-        (:func:`s4a.input.hands.of_other_hand`).  ``/report`` says of each whether it was.  Of
-        several structures subjects are named, or found by all of their structures, and all
-        structures of one are mirrored together, so that they lie to each other as before.
+        (:func:`s4a.input.hands.of_other_hand`).  ``/report`` says of each whether it was.
     table : path, optional
         CSV with a column ``shape`` and covariates or groups, see
         :func:`s4a.input.subjects.read_table`; they become ``/subjects``, so that
@@ -190,13 +173,11 @@ def analyse(
     landmarks : path, optional
         Folder with a file of landmarks for some or all shapes, named as the shape: 3D Slicer
         (.mrk.json), CSV or MeshLab (.pp).  Those of one name guide and pull registration, see
-        :func:`s4a.with_landmarks`, which gives them to meshes in memory.  Of several structures a
-        folder with one for each structure, with files named as the subjects, such as
-        ``marks/left/subject_1.csv``; or, of files with a table, files named as these.
+        :func:`s4a.with_landmarks`, which gives them to meshes in memory.
     features : list of str, optional
         Names of fields of the vertices that guide registration, such as ``sulc``, see
         :func:`s4a.with_features`, which gives them to meshes in memory.  Of the file ``a.ply`` in
-        ``a.sulc`` or ``a.sulc.npy`` (:func:`s4a.input.scalars.files_beside`), or properties of PLY.
+        ``a.sulc`` or ``a.sulc.npy`` (:func:`s4a.input.annotations.files_beside`), or of PLY.
     label : int, several, or "all", optional
         The files are label volumes, see :func:`s4a.read_labels`.
     doubtful : {"apart", "stop"}
@@ -210,18 +191,13 @@ def analyse(
     n_jobs : int, optional
         Processes, as in joblib: -1 for all cores given to this process.  The result does not depend
         on it.
-    structures : dict, optional
-        The files are label volumes that each hold several structures: the name of each, and its
-        label or labels as of `label`: ``{"anterior": 1, "posterior": 2}``.
     seed, rng : see :mod:`s4a.seeds`
 
     Returns
     -------
     xarray.DataTree
         The study: ``/original``, ``/coarse``, ``/network``, ``/latent``, ``/registration``,
-        ``/pca``, ``/report`` and, with a table, ``/subjects``.  Of several structures these of
-        each in ``/structures/<name>``, with a template of its own, see
-        :func:`s4a.statistics.of_structure` and :func:`s4a.statistics.structures`.
+        ``/pca``, ``/report`` and, with a table, ``/subjects``.
 
     Raises
     ------
@@ -247,79 +223,37 @@ def analyse(
     options = seeded(options)
     if store is None:
         with temporary_folder() as folder:
-            study = analyse(shapes, store=folder, n_jobs=n_jobs, structures=structures, **options)
+            study = analyse(shapes, store=folder, n_jobs=n_jobs, **options)
             loaded = {n.path: n.to_dataset(inherit=False).load() for n in study.subtree}
             return xr.DataTree.from_dict(loaded)
     settings = Options(**options)
     settings.check_spread()
     if settings.wrap:
         check_wrap()
-    if structures is not None:
-        parts = parts_of_labels(shapes, structures, settings)
-        remarks = remarks_on_files(shapes, settings.pattern, volumes=True)
-        return analyse_parts(parts, settings, remarks, store, n_jobs)
-    if isinstance(shapes, dict) and is_nested(shapes):
-        return analyse_parts(parts_of_dict(shapes, settings), settings, [], store, n_jobs)
     volumes = settings.label is not None
     sources = find_sources(shapes, settings.pattern, volumes=volumes)
     remarks = remarks_on_files(shapes, settings.pattern, volumes=volumes)
     subjects = None if settings.table is None else read_table(settings.table, list(sources))
-    if subjects is not None and has_structures(subjects):
-        parts = parts_of_table(sources, subjects, settings)
-        return analyse_parts(parts, settings, remarks, store, n_jobs)
-    check_one_kind(store, several=False)
+    if subjects is not None:
+        check_one_structure(subjects)
+    settings.check_against(list(sources))
     marked = find_guides(sources, settings.landmarks, settings.feature_names)
-    analyse_part(Part(sources, marked, subjects, settings), remarks, store, n_jobs)
-    return open_study(store)
-
-
-def analyse_part(part: Part, remarks: list[str], store: Path | str, n_jobs: int | None) -> None:
-    """All steps over shapes of one structure; their study is in the folder `store`."""
-    sources, marked, subjects, options, _ = part
-    options.check_against(list(sources))
     with lock(store) as claim:
         run = Run(claim, n_jobs)
         if subjects is not None:
             write(of_contents(subjects, sources), run.folder / "subjects.nc")
         else:
             remarks = remarks + kept_table(run.folder / "subjects.nc", sources)
-        remarks = remarks + remarks_on_guides(sources, marked, options.feature_names)
+        remarks = remarks + remarks_on_guides(sources, marked, settings.feature_names)
         with run.notes.whole(), run.unforeseen_told():
-            run_steps(run, part, remarks)
-
-
-def analyse_parts(
-    parts: dict[str, Part],
-    options: Options,
-    remarks: list[str],
-    store: Path | str,
-    n_jobs: int | None,
-) -> xr.DataTree:
-    """The study of every structure in a folder of its own, and their tree."""
-    missing = check_parts(parts, options)
-    named = named_subjects(parts, options)
-    check_one_kind(store, several=True)
-    for line in missing:
-        log.warning("%s", line)
-    with lock(store) as claim:
-        if options.reflect == AUTO:
-            parts = choose_together(claim.folder / STRUCTURES, parts, options, n_jobs)
-        else:
-            parts = {name: part._replace(chosen=(named, [])) for name, part in parts.items()}
-        for name, part in parts.items():
-            log.info("structure %s", name)
-            try:
-                folder = claim.folder / STRUCTURES / name
-                analyse_part(part, [*missing, *remarks], folder, n_jobs)
-            except ValueError as error:
-                raise ValueError(f"structure {name}: {error}") from error
-        write_contents(claim.folder, list(parts))
+            run_steps(run, sources, marked, settings, remarks)
     return open_study(store)
 
 
-def run_steps(run: Run, part: Part, remarks: list[str]) -> None:
+def run_steps(
+    run: Run, sources: Sources, marked: Marked, options: Options, remarks: list[str]
+) -> None:
     """All steps of the paper in turn; each looks up which of its files are done."""
-    sources, marked, _, options, chosen = part
     # what each file is made from; a key holds the keys of all before it:
     #
     #   original/* -> coarse/* -> network/motion_* -> network/first_* -> network, latent
@@ -327,7 +261,7 @@ def run_steps(run: Run, part: Part, remarks: list[str]) -> None:
     #   network/sketch_*, look_*  latent/* of those apart -> registration/* <- registration
     #                                                     |
     #                                                pca, report
-    reflected, of_hands = chosen or choose_reflected(run, sources, marked, options)
+    reflected, of_hands = choose_reflected(run, sources, marked, options)
     original = read_and_clean(run, sources, marked, options, reflected)
     original, doubts, told = check_plausibility(run, original, options)
     stop_at_doubts(doubts, options)

@@ -13,13 +13,12 @@ import xarray as xr
 
 from s4a.geometry.align import motion_between, realign
 from s4a.geometry.mesh import as_arrays, triangle_areas
-from s4a.input import evidence
-from s4a.input.annotations import labels_of_mesh
+from s4a.input import plausibility
+from s4a.input.annotations import labels_of_mesh, read_scalars, with_features
 from s4a.input.clean import check_range, clean
 from s4a.input.collection import read_shape
 from s4a.input.hands import mirror_image
 from s4a.input.landmarks import guides_of, with_landmarks
-from s4a.input.scalars import read_scalars, with_features
 from s4a.method import steps
 from s4a.method.first_map import motion_onto
 from s4a.method.lift import low_resolution
@@ -100,14 +99,14 @@ def guided(mesh: xr.Dataset, source: xr.Dataset) -> xr.Dataset:
 
 
 def portray_shape(folder: Path, name: str, intersections: bool) -> xr.Dataset:
-    """What :func:`s4a.input.evidence.portray` sees in a shape."""
-    return evidence.portray(read(folder / f"original/{name}.nc"), intersections=intersections)
+    """What :func:`s4a.input.plausibility.portray` sees in a shape."""
+    return plausibility.portray(read(folder / f"original/{name}.nc"), intersections=intersections)
 
 
 def compare_shape(folder: Path, name: str, references: list[str]) -> xr.Dataset:
-    """What :func:`s4a.input.evidence.compare` sees in a shape beside the references."""
+    """What :func:`s4a.input.plausibility.compare` sees in a shape beside the references."""
     portraits = {n: read(folder / f"network/sketch_{n}.nc") for n in {*references, name}}
-    return evidence.compare(name, portraits[name], {n: portraits[n] for n in references})
+    return plausibility.compare(name, portraits[name], {n: portraits[n] for n in references})
 
 
 def remesh_shape(folder: Path, name: str, options: Options) -> xr.Dataset:

@@ -12,7 +12,7 @@ import s4a
 from s4a import cli, open_study, statistics, verify, with_field
 from s4a.analysis.covariation import two_block
 from s4a.analysis.fields import write_field
-from s4a.input.scalars import read_scalars
+from s4a.input.annotations import read_scalars
 from s4a.schema import dataset
 
 HEIGHT = X[:, 2]
