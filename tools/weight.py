@@ -32,7 +32,9 @@ SILENT = {getattr(tokenize, name) for name in "COMMENT NL NEWLINE INDENT DEDENT 
 OPTIONS = """import inspect
 from s4a.study.options import Options
 print(len(inspect.signature(Options).parameters))"""
-NAMES = "import s4a; print(len(s4a.__all__))"
+NAMES = """import s4a, pathlib
+folder = pathlib.Path(s4a.__file__).parent
+print(sum(not (folder / name).is_dir() for name in s4a.__all__))"""
 WHEEL = "import hatchling.build as b, sys; print(b.build_wheel(sys.argv[1]))"
 
 
