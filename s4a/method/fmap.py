@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
-import xarray as xr
 
 from s4a.method.nearest import as_candidates, as_queries, nearest_float32, nearest_rows
-from s4a.method.shape import Basis, Shape, common_fields
-from s4a.schema import Array, dataset, require
+from s4a.method.shape import Basis, common_fields
+from s4a.schema import Array
 
 
 def heat_filter(eigenvalue: Array, *others: Array, n: int = 100) -> Array:
@@ -442,17 +441,29 @@ def fmap_from_descriptors(
     oriented: float = 1.0,
     curvature: float = 0.0,
 ) -> Array:
-    """C ``(k, k)`` from descriptors: :func:`fit_descriptors` for two bases.
+    """C ``(k, k)`` fitted on descriptors, with or without landmarks (step 4 of 4.1).
+
+    :func:`fit` of E(C) = |C F - G|^2 / |F|^2 + laplacian sum (mu_i - lambda_j)^2 C_ij^2 /
+    lambda_max^2 + commute sum |C P - Q C|^2 / sum |P|^2, where F and G are the coefficients of the
+    descriptors, P and Q the products with them, and the same once more with `oriented` for the
+    operators that a mirror image turns over.  Descriptors are taken with all functions that there
+    are, less their mean, scaled to norm 1.
 
     Parameters
     ----------
     source, target : Basis
         With all functions that there are; the triangles are for `oriented`.  The fields that guide
         both are descriptors too.
+    k : int
+        Size of the map.
     landmarks : tuple of int ndarray (p,)
-        Corresponding vertices.
-    kind, n, every, laplacian, commute, oriented : see :func:`fit_descriptors`
-        Of several kinds, "hks+wks", the signatures of all.
+        Corresponding vertices; descriptors around each are added to those of the shapes.
+    kind : {"wks", "hks", "hks+wks"}
+        Wave or heat kernel signatures, or both.
+    n, every : int
+        Of n energies or times every `every`-th is used: neighbours are nearly equal.
+    laplacian, commute, oriented : float
+        Weights against that of preserving the descriptors; 0 leaves a term out.
     curvature : float
         Weight of signed mean curvatures at four scales beside a signature.
     """
@@ -518,86 +529,6 @@ def curvatures(end: Basis) -> list[Array]:
         mean_curvature(end.X, end.normals, end.area, end.Phi[:, :k], end.eigenvalue[:k])
         for k in SCALES
     ]
-
-
-def fit_descriptors(
-    source: xr.Dataset,
-    target: xr.Dataset,
-    *,
-    k: int = 20,
-    landmarks: tuple[Any, ...] | None = None,
-    kind: str = "wks",
-    n: int = 100,
-    every: int = 5,
-    laplacian: float = 1e-3,
-    commute: float = 1.0,
-    oriented: float = 1.0,
-) -> xr.Dataset:
-    """Fit of a functional map on descriptors, with or without landmarks (step 4 of 4.1).
-
-    :func:`fit` of E(C) = |C F - G|^2 / |F|^2 + laplacian sum (mu_i - lambda_j)^2 C_ij^2 /
-    lambda_max^2 + commute sum |C P - Q C|^2 / sum |P|^2, where F and G are the coefficients of the
-    descriptors, P and Q the products with them, and the same once more with `oriented` for the
-    operators that a mirror image turns over.  Descriptors are taken with all eigenfunctions that
-    the meshes have, less their mean, scaled to norm 1.
-
-    Parameters
-    ----------
-    source, target : Dataset
-        Meshes with their spectrum, as of :func:`s4a.spectrum`; at either resolution.
-    k : int
-        Size of the map.
-    landmarks : tuple of int array_like (p,), optional
-        Corresponding vertices of source and target; descriptors around each are added to those of
-        the shapes.
-    kind : {"wks", "hks"}
-    n, every : int
-        Of n energies or times every `every`-th is used: neighbours are nearly equal.
-    laplacian, commute, oriented : float
-        Weights against that of preserving the descriptors; 0 leaves a term out.
-
-    Returns
-    -------
-    Dataset
-        ``fmap(mode_target, mode_source)``, k x k.
-
-    Raises
-    ------
-    ValueError
-        When a mesh lacks its spectrum or has fewer than k eigenfunctions, or the options are not as
-        above.
-    """
-    if kind not in FILTERS:
-        raise ValueError(f"kind must be 'wks' or 'hks', found {kind!r}")
-    variables = ("position", "corner_vertex", "vertex_area", "eigenvalue", "eigenfunction")
-    for mesh, what in ((source, "source"), (target, "target")):
-        require(mesh, *variables, what=what)
-        if mesh.sizes["mode"] < k:
-            raise ValueError(
-                f"the {what} needs {k} eigenfunctions, found {mesh.sizes['mode']}: give a smaller k"
-            )
-    vertices: tuple[Any, ...] = (
-        (None, None) if landmarks is None else tuple(np.asarray(v) for v in landmarks)
-    )
-    if landmarks is not None and (
-        len(vertices) != 2 or vertices[0].shape != vertices[1].shape or vertices[0].ndim != 1
-    ):
-        raise ValueError(
-            f"landmarks need as many vertices of the source as of the target, found {landmarks!r}"
-        )
-    C = fmap_from_descriptors(
-        Shape(coarse=source).low,
-        Shape(coarse=target).low,
-        k=k,
-        landmarks=vertices,
-        kind=kind,
-        n=n,
-        every=every,
-        laplacian=laplacian,
-        commute=commute,
-        oriented=oriented,
-    )
-    return dataset(fmap=C)
 
 
 def orthogonality_error(C: Array) -> float:

@@ -25,7 +25,7 @@ from s4a.geometry.mesh import as_arrays, edge_graph, stiffness, unique_edges, ve
 from s4a.geometry.voronoi import add_samples, dual, farthest_of_each, voronoi_cells
 from s4a.method.remesh import check_clean, laplacian, sample_surface
 from s4a.method.shape import Basis, Shape
-from s4a.method.spectral import with_constant_first
+from s4a.method.spectral import factor, with_constant_first
 from s4a.schema import Array, dataset, in_unit, require, unit_of
 
 log = logging.getLogger(__name__)
@@ -132,16 +132,9 @@ def reduced_eigenpairs(
         U^T A U; Phi^T mass Phi = I.
     """
     stiff, mass = (U.T @ W @ U).tocsc(), (U.T @ sp.diags(area) @ U).tocsc()
-    shift = (
-        1e-6 * stiff.diagonal().sum() / mass.diagonal().sum()
-    )  # keeps the factor away from the constants
-    solve = spla.splu(
-        (stiff + shift * mass).tocsc(),
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    ).solve
-    inverse = spla.LinearOperator(stiff.shape, matvec=solve, dtype=float)
+    # keeps the factor away from the constants
+    shift = 1e-6 * stiff.diagonal().sum() / mass.diagonal().sum()
+    inverse = spla.LinearOperator(stiff.shape, matvec=factor(stiff + shift * mass), dtype=float)
     start = 1 + 1e-3 * np.cos(np.arange(U.shape[1]))
     eigenvalue, Phi = spla.eigsh(
         stiff, k=k, M=mass, sigma=-shift, OPinv=inverse, v0=start, which="LM"

@@ -14,6 +14,10 @@ from s4a.method import fmap, spectral
 from s4a.method.shape import Shape
 
 
+def low(mesh):
+    return Shape(coarse=mesh).low
+
+
 @pytest.fixture(scope="module")
 def brains():
     tree = synthetic.brains(2, 4000)
@@ -103,7 +107,7 @@ def test_a_shape_fits_itself_with_fewer_functions_by_either_kernel(brains):
     mesh = brains[0]
     few = mesh.isel(mode=slice(20))
     for kind in ("hks", "wks"):
-        C = fmap.fit_descriptors(few, mesh, k=20, kind=kind)["fmap"].values
+        C = fmap.fmap_from_descriptors(low(few), low(mesh), k=20, kind=kind)
         assert np.linalg.norm(C - np.eye(20)) < 0.01, kind
 
 
@@ -236,7 +240,7 @@ def test_the_fit_on_descriptors_of_a_shape_and_itself_renumbered_is_the_map_betw
     )
     other["eigenfunction"] = other["eigenfunction"] * sign
     for kind in ("wks", "hks"):
-        C = fmap.fit_descriptors(mesh, other, kind=kind)["fmap"].values
+        C = fmap.fmap_from_descriptors(low(mesh), low(other), kind=kind)
         match = fmap.zoomout(Shape(coarse=mesh).low, Shape(coarse=other).low, C, 60)
         assert (match[1] == order).all(), kind
 
@@ -247,8 +251,8 @@ def test_descriptors_alone_match_different_brains_and_landmarks_help(brains):
     landmark = farthest_points(X, 8)
     nearest = np.linalg.norm(X[landmark][:, None] - target["position"].values, axis=2).argmin(1)
     error = {}
-    for name, marks in (("alone", None), ("landmarks", (landmark, nearest))):
-        C = fmap.fit_descriptors(source, target, landmarks=marks)["fmap"].values
+    for name, marks in (("alone", (None, None)), ("landmarks", (landmark, nearest))):
+        C = fmap.fmap_from_descriptors(low(source), low(target), landmarks=marks)
         match = fmap.match_from_fmap(C, Phi, Psi)
         true = np.linalg.norm(X[:, None] - target["position"].values, axis=2).argmin(0)
         error[name] = metrics.geodesic_error(X, T, match, true).mean()
@@ -268,19 +272,6 @@ def test_the_orientation_term_prefers_the_map_that_keeps_the_sides_over_its_mirr
     kept = (W**2).sum()
     assert ((C @ W - turned @ C) ** 2).sum() > 2 * kept
     assert ((C @ W + turned @ C) ** 2).sum() < 0.1 * kept
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"k": 61}, "source needs 61 eigenfunctions"),
-        ({"kind": "sift"}, "kind must be"),
-        ({"landmarks": ([1, 2], [3])}, "as many vertices"),
-    ],
-)
-def test_a_fit_that_cannot_be_is_refused(brains, options, message):
-    with pytest.raises(ValueError, match=message):
-        fmap.fit_descriptors(*brains, **options)
 
 
 def test_wave_filters_of_a_narrow_common_range_have_sum_one():
