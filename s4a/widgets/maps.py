@@ -12,7 +12,6 @@ from s4a.schema import unit_of
 from s4a.show.browser import color_scale
 from s4a.show.draw import SIGNED, ramp_colors, signed_colors
 from s4a.widgets.panel import WIDE, Panel, dropdown, row
-from s4a.widgets.scene import Scene
 
 # variable -> what it is called; those of vectors are shown along the normals
 SIGNED_MAPS = {
@@ -92,31 +91,27 @@ class Maps(Panel):
             )
         super().__init__(study, **options)
 
-    def build(self, view: str = "corner", up: str = "z") -> list[ipywidgets.Widget]:
+    def build(self) -> list[ipywidgets.Widget]:
         """Choices and the surface."""
         found, template = self.found, self.study["registration"].dataset
-        known = list(self.known)
-        if "asymmetry" in found:
-            known.append(("of one individual", INDIVIDUAL))
         tests = [(words, name) for name, words in P_VALUES.items() if name in found]
-        self.map = dropdown("map", MAP, known, layout=WIDE)
+        self.map = dropdown("map", MAP, self.known, layout=WIDE)
         self.where = dropdown("where", WHERE, [*tests, (EVERYWHERE, EVERYWHERE)], layout=WIDE)
         self.level = dropdown("level", LEVEL, LEVELS)
-        controls = [self.map, self.where, self.level]
         first = [self.map]
         if "asymmetry" in found:
+            self.map.options = [*self.known, ("of one individual", INDIVIDUAL)]
             names = found["individual"].values.tolist()
             self.individual = dropdown("individual", OF, names, layout=WIDE)
-            self.live = (("map", "where", "level"), ("individual",))
-            controls.append(self.individual)
+            self.live = (*self.live, ("individual",))
             first.append(self.individual)
-        self.scene = Scene(view=view, up=up, height=420, clickable=True)
+        self.scene = self.new_scene(420, clickable=True)
         self.T = template["corner_vertex"].values
         self.X = found.get("symmetric_position", template["position"]).values
         self.normals = vertex_normals(self.X, self.T)
         self.area = vertex_areas(self.X, self.T)
         self.scene.show(self.X, self.T)
-        self.redraw(self.paint, *controls)
+        self.redraw(self.paint, *first, self.where, self.level)
         self.on_pick(self.scene, self.pick)
         self.paint()
         return [row(*first), row(self.where, self.level), self.scene]
@@ -176,10 +171,7 @@ class Maps(Panel):
 
     def pick(self, place: dict) -> None:
         """A vertex that was clicked: its value and p values."""
-        vertex = place.get("vertex", -1)
-        if vertex < 0:
-            return
-        self.vertex = vertex
+        self.vertex = vertex = place["vertex"]
         values, _, unit = self.values()
         size = f"{values[vertex]:.3g}" + ("" if unit == "1" else f" {unit}")
         said = [
