@@ -8,17 +8,11 @@ import tempfile
 import pytest
 
 from s4a import synthetic
-from s4a.datasets import structures
 
 
 @pytest.fixture(scope="session")
 def example_study():
     return synthetic.example_study()
-
-
-@pytest.fixture(scope="session")
-def example_structures():
-    return structures.example_structures()
 
 
 @pytest.fixture(autouse=True)
@@ -29,7 +23,6 @@ def example(request):
     request.node.dtest.globs.clear()
     monkeypatch = request.getfixturevalue("monkeypatch")
     monkeypatch.setattr(tempfile, "tempdir", str(request.getfixturevalue("tmp_path")))
-    for module, name in ((synthetic, "example_study"), (structures, "example_structures")):
-        if any(name in example.source for example in request.node.dtest.examples):
-            study = request.getfixturevalue(name)
-            monkeypatch.setattr(module, name, lambda study=study: study)
+    if any("example_study" in example.source for example in request.node.dtest.examples):
+        study = request.getfixturevalue("example_study")
+        monkeypatch.setattr(synthetic, "example_study", lambda: study)

@@ -143,7 +143,7 @@ def skulls(folder, store, few, _seed):
 
 
 def drift(study, X):
-    """Rustcpd's completed shape and standard deviation of a coordinate at every vertex."""
+    """rustcpd's completed shape and standard deviation of a coordinate at every vertex."""
     import rustcpd
 
     registration, modes = (study[node].to_dataset() for node in ("registration", "pca"))

@@ -41,6 +41,7 @@ from .method.steps import latent_map as latent_map
 from .method.steps import latent_match as latent_match
 from .method.steps import refine_network as refine_network
 from .method.steps import register_shape as register_shape
+from .options import Options as Options
 from .show.page import write_page as write_page
 from .show.pictures import write_film as write_film
 from .show.pictures import write_picture as write_picture

@@ -33,7 +33,8 @@ from s4a.method.first_map import motion_onto
 from s4a.method.part import Pose, cut, fit_modes, part_of
 from s4a.method.pca import gram
 from s4a.method.register import from_latent
-from s4a.study.options import Options
+from s4a.method.shape import Shape
+from s4a.options import Options, kept_options
 from s4a.study.sources import content_key
 from s4a.study.store import task_key
 
@@ -251,7 +252,7 @@ def _key_of(model, pairs):
         registration_of(study)[placed].sel(shape=names),
         *(study[node][n].to_dataset() for node in ("original", "coarse") for n in names),
     ]
-    return task_key(pairs, Options.from_report(study).to_report(), *map(content_key, contents))
+    return task_key(pairs, kept_options(study), *map(content_key, contents))
 
 
 def _gap(model, registration, name, onto):
@@ -268,13 +269,19 @@ def _direct_way(study, name, onto):
     """Where the vertices of one shape lie on another in its file, as that is registered onto it."""
     options = Options.from_report(study)
     source, target = (
-        options.shape(study["original"][n].to_dataset().load(), study["coarse"][n].to_dataset())
+        Shape(
+            study["original"][n].to_dataset().load(),
+            study["coarse"][n].to_dataset(),
+            **options.of("projection"),
+        )
         for n in (name, onto)
     )
     Y = study["latent"].to_dataset()["latent_basis"]
     bases = Y.sel(shape=name).values, Y.sel(shape=onto).values
     motion = motion_onto(source.low, target.low)
-    direct = from_latent(source, target, bases, motion, how=options.how, **options.of_registration)
+    direct = from_latent(
+        source, target, bases, motion, how=options.how, **options.of("registration")
+    )
     return image_of(direct.assign(position=target.original["position"]))
 
 

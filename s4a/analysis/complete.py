@@ -37,10 +37,10 @@ from s4a.method.part import (
 from s4a.method.part import cut as cut  # where it stood before
 from s4a.method.pca import gram
 from s4a.method.register import common_unit
+from s4a.options import Options
 from s4a.schema import check_count, dataset, in_unit
 from s4a.seeds import RNG, seed_of
-from s4a.study.newcomers import read_new
-from s4a.study.options import Options
+from s4a.study.insert import read_new
 
 log = logging.getLogger(__name__)
 

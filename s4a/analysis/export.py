@@ -100,8 +100,8 @@ def write_registered(
         )
     if frame == "shape" and "rotation" not in registration:
         raise ValueError(
-            "frame='shape' needs the motion of every shape, and this study has none, as of "
-            "structures_modes: write it in the frame of the template"
+            "frame='shape' needs the motion of every shape, and this study has none: write it in "
+            "the frame of the template"
         )
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)

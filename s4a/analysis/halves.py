@@ -15,8 +15,9 @@ from s4a.analysis.link import image_in_shape
 from s4a.geometry.closest import closest_facing_point, interpolate
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas, vertex_normals
 from s4a.input.hands import MIRROR, mirror_image
+from s4a.method.shape import Shape
+from s4a.options import Options
 from s4a.schema import dataset, in_unit, require, unit_of
-from s4a.study.options import Options
 from s4a.study.pair import match_shapes, shape_of
 
 log = logging.getLogger(__name__)
@@ -99,8 +100,8 @@ def symmetry(study: xr.DataTree) -> xr.Dataset:
     if "coarse" in study.children and name in study["coarse"].children:
         low = study["coarse"][name].to_dataset().load()
         mesh = study["original"][name].to_dataset().load()
-        template = options.shape(mesh, low)
-        image = options.shape(mirror_image(mesh), mirror_image(low))
+        template = Shape(mesh, low, **options.of("projection"))
+        image = Shape(mirror_image(mesh), mirror_image(low), **options.of("projection"))
     else:
         mesh = as_dataset(X, T)
         template, image = shape_of(mesh, options), shape_of(mirror_image(mesh), options)

@@ -14,7 +14,7 @@ from s4a.method import posterior
 from s4a.method.part import Fit, Part, Whole, on_boundary, refine, seen
 from s4a.method.pca import low_vertices
 from s4a.method.shape import Shape
-from s4a.study.options import Options
+from s4a.options import Options
 
 LEAST_SHARE = 0.15  # of the template that a part must have
 N_ROUNDS = 2  # of finding what is there, and of matching it
@@ -50,8 +50,10 @@ def model_of(study: xr.DataTree) -> Model:
             f"parts need a study of at least 4 shapes, found {registration.sizes['shape']}"
         )
     name = registration.attrs["template"]
-    template = options.shape(
-        study["original"][name].to_dataset().load(), study["coarse"][name].to_dataset().load()
+    template = Shape(
+        study["original"][name].to_dataset().load(),
+        study["coarse"][name].to_dataset().load(),
+        **options.of("projection"),
     )
     _, size = template.frame
     at = low_vertices(template.coarse)

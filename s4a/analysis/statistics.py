@@ -40,11 +40,9 @@ from s4a.analysis.inputs import Values, displacements_of, group_sizes, sample_of
 from s4a.analysis.model import KEPT, count_components, evaluate, leave_one_out, sample
 from s4a.analysis.permutation import indicators, smallest_p
 from s4a.analysis.restrict import with_size, within, without
-from s4a.analysis.structures import structures, structures_modes, structures_of_new
 from s4a.method.pca import gram, principal_components
 from s4a.schema import dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
-from s4a.study.tree import of_structure
 
 if TYPE_CHECKING:
     from sklearn.base import ClassifierMixin
@@ -60,15 +58,11 @@ __all__ = [
     "group_map",
     "group_test",
     "growth",
-    "of_structure",
     "outliers",
     "predict",
     "regression",
     "regression_modes",
     "sample",
-    "structures",
-    "structures_modes",
-    "structures_of_new",
     "symmetric_template",
     "symmetry",
     "with_doubtful",

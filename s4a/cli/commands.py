@@ -55,16 +55,12 @@ def doctor(args: Namespace) -> int:
 
 def run(args: Namespace) -> int:
     """The whole analysis over a folder of meshes."""
-    from s4a.cli import results, tables
+    from s4a.cli import tables
     from s4a.study.pipeline import analyse
 
     full = within(args.out, "report.txt")
     with cluster(args.cluster), lines_or_bars():
         study = analyse(args.paths, store=args.out, **options_of(args))
-    if "structures" in study.children:
-        write(results.run_of_several(study, args.out))
-        parts = study["structures"].children.values()
-        return 1 if any(part["report"].attrs["unforeseen"] for part in parts) else 0
     again = shlex.join(["s4a", *(word for word in args.words if word != "--keep-doubtful")])
     report = study["report"].to_dataset()
     lines = [tables.report_table(report), *tables.stage_lines(report)]
@@ -76,10 +72,9 @@ def run(args: Namespace) -> int:
 
 def options_of(args: Namespace) -> dict[str, Any]:
     """The options of `analyse` from parsed flags, and how many processes."""
-    from s4a.study.options import Options
+    from s4a.options import Options
 
-    options = {name: getattr(args, name) for name in [*(f.name for f in fields(Options)), "n_jobs"]}
-    return options | {"structures": dict(args.structures) if args.structures else None}
+    return {name: getattr(args, name) for name in [*(f.name for f in fields(Options)), "n_jobs"]}
 
 
 @contextlib.contextmanager
@@ -332,24 +327,18 @@ def insert(args: Namespace) -> int:
     from s4a.analysis.export import write_registered
     from s4a.cli import tables
     from s4a.study.insert import insert
-    from s4a.study.store import ENGINE, STRUCTURES
-    from s4a.study.tree import of_structure, open_study, structure_names
+    from s4a.study.store import ENGINE
+    from s4a.study.tree import open_study
 
     study = open_study(args.study)
-    options = {name: getattr(args, name) for name in ("landmarks", "reflect", "table", "n_jobs")}
+    options = {name: getattr(args, name) for name in ("landmarks", "reflect", "n_jobs")}
     inserted = insert(study, args.shapes, **options)
     out = new_folder(args.out)
     inserted.to_netcdf(out / "inserted.nc", engine=ENGINE)
-    parts, status = {"": inserted}, "status"
-    if STRUCTURES in inserted.children:
-        status = "structure_status"
-        names = structure_names(inserted)
-        parts = {f"{STRUCTURES}/{name}": of_structure(inserted, name) for name in names}
-    for place, part in parts.items():
-        write_registered(part, out / place)
-        write(f"{place}\n{tables.inserted_table(part)}".lstrip())
+    write_registered(inserted, out)
+    write(tables.inserted_table(inserted))
     write(f"\nwritten: {out / 'inserted.nc'}, registered meshes and scores in {out}")
-    return 1 if (inserted["report"][status] == "excluded").any() else 0
+    return 1 if (inserted["report"]["status"] == "excluded").any() else 0
 
 
 def complete(args: Namespace) -> int:
@@ -380,8 +369,8 @@ def transfer(args: Namespace) -> int:
     from s4a.input.annotations import labels_of_mesh, read_labels, read_landmarks
     from s4a.input.collection import read_shape
     from s4a.input.landmarks import locate
-    from s4a.study.options import PAIR
-    from s4a.study.store import STRUCTURES, check_is_study
+    from s4a.options import DECLARED
+    from s4a.study.store import check_is_study
     from s4a.study.tree import open_study
 
     if not (args.labels or args.landmarks):
@@ -391,9 +380,7 @@ def transfer(args: Namespace) -> int:
     if args.blur is not None and not args.labels:
         raise ValueError("--blur is of labels: give --labels FILE, or leave it out")
     first = Path(args.targets[0])
-    into_study = len(args.targets) == 1 and (
-        (first / "registration.nc").is_file() or (first / STRUCTURES).is_dir()
-    )
+    into_study = len(args.targets) == 1 and any(first.glob("**/registration.nc"))
     if into_study:
         check_is_study(first)
     source, label, landmarks = read_shape(args.source), None, None
@@ -407,7 +394,7 @@ def transfer(args: Namespace) -> int:
             f"{args.source}"
         )
     excluded = []
-    asked = {name: getattr(args, name) for name in (*PAIR, "both")}
+    asked = {n: getattr(args, n) for n, one in DECLARED.items() if one.metadata["pair"]}
     given = {name: value for name, value in asked.items() if value is not None}
     if into_study:
         study = open_study(first)
@@ -433,7 +420,7 @@ def registered_pairs(
     """The source registered as the template of every target, and the targets that are left out."""
     from s4a.analysis.transfer import register_pairs
     from s4a.input.collection import read_shapes
-    from s4a.study.options import Options
+    from s4a.options import Options
 
     shapes = read_shapes(args.targets, compare=False)
     report = shapes["report"].to_dataset()
@@ -537,7 +524,7 @@ def compare_collection(args: Namespace) -> "tuple[xr.Dataset, list[str], np.ndar
     """Table 2: the result, names of the bars of Fig. 3, their seconds by block, and a text."""
     from s4a.cli import tables
     from s4a.evaluation import compare as comparison
-    from s4a.study.options import N_COARSE, Options
+    from s4a.options import N_COARSE, Options
 
     if args.paths or args.truth or args.landmarks or args.keep:
         raise ValueError(
@@ -567,7 +554,7 @@ def compare_pairs(
     from s4a.cli import tables
     from s4a.evaluation import compare as comparison
     from s4a.input.files import find_meshes, slugs
-    from s4a.study.options import N_COARSE
+    from s4a.options import N_COARSE
 
     if len(args.paths) < 2:
         raise ValueError("compare needs SOURCE and TARGET, or --collection PATH...")

@@ -16,6 +16,7 @@ from s4a.analysis.inputs import registration_of
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.input.plausibility import Decision, decisions, listed, notices, shortened
 from s4a.method.pca import mahalanobis
+from s4a.options import kept_options
 from s4a.study.progress import STAGES, Status
 from s4a.study.tree import seconds_of
 
@@ -268,7 +269,7 @@ def decision_lines(report: xr.Dataset, again: str = "s4a run FOLDER --out STUDY"
     n = int((report["status"] == "doubtful").sum())
     if not n:
         return []
-    kept = report.attrs.get("keep_doubtful") == "True"
+    kept = kept_options(report).get("keep_doubtful")
     become = "taken in as they are" if kept else "kept apart: in no modes, no statistics, no median"
     lines = [f"TO DECIDE: {n} of {report.sizes['shape']} shapes are doubtful, and {become}"]
     lines += kind_lines(decisions(report))

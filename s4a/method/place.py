@@ -15,7 +15,8 @@ from s4a.method.first_map import first_map
 from s4a.method.latent import latent_basis_of_new
 from s4a.method.median import area_differences, conformal_differences, distance_to_identity
 from s4a.method.network import spectral_distance
-from s4a.method.shape import N_SPREAD, Basis
+from s4a.method.shape import Basis
+from s4a.options import N_SPREAD
 from s4a.schema import dataset
 
 NEIGHBOURS = 6  # shapes of the network whose maps a new one has

@@ -26,7 +26,8 @@ from s4a.method.first_map import nearest_after_motion
 from s4a.method.fmap import fmap_from_match
 from s4a.method.nearest import nearest_in_cells, nearest_of_few, nearest_rows
 from s4a.method.shape import Basis, Shape
-from s4a.schema import INPUT, check_choice, dataset, in_unit
+from s4a.options import check
+from s4a.schema import INPUT, dataset, in_unit
 
 # |log| of the ratio of areas at the hundredth of the template that changes most, above which it may
 # lie on a wrong fold
@@ -37,12 +38,6 @@ LOOSER = 4  # the step of elastic rounds with which they begin then, too
 # of score times tear: what looser rounds must leave at most.  Where they find the right fold they
 # leave 0.3 to 0.72; real heads 0.81 or more where the score falls at all (docs/decisions.md)
 MENDED = 0.75
-
-WORDS = {  # what options may be
-    "refine": ("elastic", "joint", "intrinsic"),
-    "alignment": ("fitted", "icp"),
-    "how": ("ours", "standard"),
-}
 
 Functions = tuple[np.ndarray, np.ndarray]  # of source and target, rows of which are compared
 
@@ -66,7 +61,7 @@ def match_low(
     functions : tuple of float ndarray (n_coarse, m)
         At all vertices where they are lifted.
     """
-    check_choice("how", how, WORDS["how"])
+    check("how", how)
     Y_source, Y_target = bases  # (k, m) each
     k = len(Y_source)
     Phi = source.low.Phi[:, :k]
@@ -229,7 +224,7 @@ def register(
         of the input, in the template's frame.  Attributes ``method``, the candidate that was kept,
         ``score``, its score at full resolution, and ``score_<candidate>`` at low resolution.
     """
-    check_choice("alignment", alignment, WORDS["alignment"])
+    check("alignment", alignment)
     candidates = find_candidates(source, target, starts, k=k, refine=refine, parts=parts)
     by_icp = motion_in_unit(source, target, motion, scale) if alignment == "icp" else None
     # image = R x + t + U Phi c, smooth already: the line after eq. 8; or of elastic rounds
@@ -324,7 +319,7 @@ def find_candidates(
     dict
         Name -> :class:`s4a.method.joint.Candidate`; none for the spectral match alone.
     """
-    check_choice("refine", refine, WORDS["refine"])
+    check("refine", refine)
     if refine == "intrinsic":
         return {}
     M, N = source.low, target.low

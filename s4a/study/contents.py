@@ -58,15 +58,12 @@ REQUIRED: dict[str, tuple[str, dict[str, type]]] = {
     ),
     "fields": ("shape carried_field", {}),
     "subjects": ("shape", {}),
-    "structures": ("shape structure structure_status", {}),
     "report": (
         "shape stage status reason warning path area seconds",
         {"template": str, "remarks": str, "no_modes": str},
     ),
 }
-TEXTS = set(
-    "source target status reason warning path shape stage structure structure_status".split()
-)
+TEXTS = set("source target status reason warning path shape stage".split())
 SIZES = {"xyz": 3, "xyz_2": 3, "corner": 3, "end": 2}
 
 
@@ -114,8 +111,7 @@ def check_contents(name: str, data: xr.Dataset) -> None:
     words, attrs = REQUIRED[kind]
     needed = words.split()
     missing = [one for one in needed if one not in data.variables]
-    for named in ("shape", "structure"):
-        check_names(data.coords[named].values.astype(str).tolist() if named in data.coords else [])
+    check_names(data.coords["shape"].values.astype(str).tolist() if "shape" in data.coords else [])
     if missing:
         raise ValueError(f"it lacks {', '.join(missing)}")
     for attr, kind_of_value in attrs.items():

@@ -9,7 +9,7 @@ STUDY, ENDS, FAULTS, BOUNDED = (
     "test_bounded.py",
 )
 RAW = "test_raw.py"
-STRUCTURES = "test_structures.py"
+STRUCTURES = "test_poses.py"
 
 STATISTICS, SUBJECTS = "test_statistics.py", "test_subjects.py"
 
@@ -570,7 +570,7 @@ PROOFS = [
         "column of structures without subjects",
         "error that names them",
         "test_several.py",
-        "test_a_subject_with_two_shapes_of_one_structure_is_named",
+        "test_tables_that_do_not_say_whose_a_shape_is_are_refused",
     ),
     (
         "one structure only, one that a single subject has, landmarks in no folder of a structure",
@@ -582,14 +582,14 @@ PROOFS = [
         "a structure of one subject far away, as if in another frame",
         "warned by subject and structure, with how far",
         STRUCTURES,
-        "test_a_structure_in_another_frame_is_told",
+        "test_structures_that_do_not_fit_together_are_told_of",
     ),
     (
         "a mesh without its structure, an unknown structure, or reflect= of none of the subjects, "
         "for a study of several structures",
         "error that says how new subjects are given",
         "test_several.py",
-        "test_what_cannot_be_inserted_into_several_structures_is_told",
+        "test_what_cannot_be_inserted_is_refused",
     ),
     (
         "new subjects of other structures, unit or templates than the study that is compared",
@@ -600,38 +600,38 @@ PROOFS = [
     (
         "structures of one subject of which some are to be mirrored and others are not",
         "error with the subject and what the column has for each, as their poses would be lost",
-        "test_several_mirrored.py",
-        "test_what_names_no_subject_or_all_is_refused",
+        "test_several.py",
+        "test_structures_of_one_subject_are_mirrored_together_or_not_at_all",
     ),
     (
         'a subject with structures of both hands, and `reflect="auto"`',
         "left as it is and named, with the hand of each structure",
-        "test_several_mirrored.py",
-        "test_a_subject_with_structures_of_both_hands_stays_and_is_told",
+        "test_several.py",
+        "test_structures_say_together_of_which_hand_a_subject_is",
     ),
     (
         "a folder of landmarks that is named as no structure, or none for some structure",
         "error with the name; the structure is registered without, and named",
-        "test_several_landmarks.py",
-        "test_a_structure_without_landmarks_and_a_folder_of_none_are_named",
+        "test_several.py",
+        "test_landmarks_of_folders_and_of_a_table_do_what_those_in_memory_do",
     ),
     (
         "a structure of one subject mirrored in its file",
         "warned by subject",
         STRUCTURES,
-        "test_a_structure_mirrored_in_its_file_is_told",
+        "test_structures_that_do_not_fit_together_are_told_of",
     ),
     (
         "structures whose files were centred each for itself, so that poses are lost",
         "warned by structure",
         STRUCTURES,
-        "test_files_that_were_centred_each_for_itself_are_told",
+        "test_structures_that_do_not_fit_together_are_told_of",
     ),
     (
         "structures in different units",
         "error where the files name them; warned where sizes differ by more than 300",
         STRUCTURES,
-        "test_structures_of_different_units_are_refused_or_told",
+        "test_structures_that_do_not_fit_together_are_told_of",
     ),
     (
         "archives (NPZ, VTP, GIFTI) that unpack to too much",

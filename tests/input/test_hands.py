@@ -92,7 +92,6 @@ def test_names_and_columns_choose(reflect, chosen):
     "reflect, words",
     [
         ("a,d", r"reflect names 'd', none of the shapes \(a, b, c\), and no column of the table"),
-        ("a,b,c", "mirrors all 3 shapes, which changes nothing"),
         ("none", "mirrors none of the 3 shapes"),
         ("side=x", "no shape has 'x' in the column 'side', which has l, r"),
         ("hand=l", r"needs a table with the column 'hand'; it has side, gap, none"),

@@ -62,7 +62,7 @@ def test_everything_public_has_a_docstring_and_so_stands_in_the_reference(path):
 
 
 def test_every_public_name_is_listed_by_section_of_the_paper():
-    listed = re.findall(r":(?:func|mod):`(?:s4a\.)?(\w+)`", s4a.__doc__)
+    listed = re.findall(r":(?:class|func|mod):`(?:s4a\.)?(\w+)`", s4a.__doc__)
     assert sorted(listed) == sorted(s4a.__all__)
 
 

@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 
 import pytest
+import s4a_morphometrics.synthetic
 from paths import DOCS, ROOT, benchmark, script
 from PIL import Image
 
@@ -164,7 +165,7 @@ def test_joint_modes_of_structures_are_drawn_with_both_shares_in_the_title(tmp_p
     monkeypatch.setattr(
         figures, "write", lambda f, *a, **o: titles.append(f.get_suptitle()) or write(f, *a, **o)
     )
-    study = s4a.datasets.structures.example_structures()
+    study = s4a_morphometrics.synthetic.example_structures()
     path = figures.joint_modes(study, "beans", "modes", folder=tmp_path / "new")
     said = re.fullmatch(
         r"6 beans: (\d+) % of the variance between the structures, (\d+) % within", titles[0]

@@ -17,6 +17,7 @@ ROOMS = (
     "extensions",
     "schema",
     "seeds",
+    "options",
     "geometry",
     "input",
     "method",

@@ -78,7 +78,7 @@ def shown(cells, folder):
 
 
 STRUCTURES = """
-from s4a.datasets.structures import example_structures
+from s4a_morphometrics.synthetic import example_structures
 import s4a; s4a.explore(example_structures())
 """
 SMALL = """

@@ -9,6 +9,8 @@ import re
 import numpy as np
 import pytest
 from paths import NOTEBOOKS
+from s4a_morphometrics.structures_panel import Structures
+from s4a_morphometrics.synthetic import example_structures
 from test_browser import (  # noqa: F401, fixtures are found by their names
     DRAWN,
     IDLE,
@@ -34,9 +36,8 @@ from test_browser import (  # noqa: F401, fixtures are found by their names
 )
 
 import s4a
-from s4a.datasets.structures import example_structures
 from s4a.show import charts
-from s4a.widgets import Median, Modes, Region, Structures
+from s4a.widgets import Median, Modes, Region
 
 KINDS = ("Maps", "Region", "Structures", "Comparison", "Progress")
 CELL = """
@@ -45,8 +46,9 @@ import numpy as np
 from IPython.display import display
 
 import s4a
-from s4a.datasets.structures import example_structures
-from s4a.widgets import Comparison, Maps, Progress, Region, Structures
+from s4a_morphometrics.structures_panel import Structures
+from s4a_morphometrics.synthetic import example_structures
+from s4a.widgets import Comparison, Maps, Progress, Region
 
 study = s4a.open_study({study!r})
 found = s4a.statistics.asymmetry(study, n_permutations=15)

@@ -36,8 +36,8 @@ from s4a.input.subjects import listed
 from s4a.method.pca import center_gram, gram, pca, principal_components
 from s4a.schema import check_switch, covariate, dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
-from s4a.study.newcomers import scores_of_new
-from s4a.study.tree import of_structure, structure_names
+from s4a.study.insert import scores_of_new
+from s4a_morphometrics.several import of_structure, structure_names
 
 log = logging.getLogger(__name__)
 
@@ -80,7 +80,7 @@ def align_wholes(Y: np.ndarray, area: np.ndarray, *, scale: bool = False) -> np.
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a.analysis.structures import align_wholes
+    >>> from s4a_morphometrics.poses import align_wholes
     >>> Y = np.eye(4)[:, 1:] * [1, 2, 3]
     >>> turned = Y[:, [1, 2, 0]] + 5  # by 120 degrees
     >>> one, other = align_wholes(np.stack([Y, turned]), np.ones(4))
@@ -115,7 +115,7 @@ def poses_of(Y: np.ndarray, area: np.ndarray) -> Poses:
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a.analysis.structures import poses_of
+    >>> from s4a_morphometrics.poses import poses_of
     >>> Y = np.eye(4)[:, 1:] * [1.0, 2, 3]
     >>> found = poses_of(np.stack([Y + [1, 0, 0], Y - [1, 0, 0]]), np.ones(4))
     >>> found.translation.round(6)[:, 0].tolist(), bool(abs(found.shape).max() < 1e-9)
@@ -188,7 +188,7 @@ def pose_fields(
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a.analysis.structures import pose_fields
+    >>> from s4a_morphometrics.poses import pose_fields
     >>> X = np.array([[1.0, 0, 0], [-1, 0, 0]])
     >>> pose_fields(X, np.ones(2), np.array([[0, 0, 0.1]]), np.zeros((1, 3)))[0].tolist()
     [[0.0, 0.1, 0.0], [0.0, -0.1, 0.0]]
@@ -210,7 +210,7 @@ def structures(
     Parameters
     ----------
     study : DataTree
-        Of several structures, see :func:`s4a.analyse`.
+        Of several structures, see :func:`s4a_morphometrics.analyse_structures`.
     scale : bool
         Whether the size of each subject, all structures together, is taken out.
     n_permutations : int
@@ -250,9 +250,10 @@ def structures(
     --------
     With a ``study`` of two small structures of six subjects:
 
-    >>> import s4a
-    >>> study = s4a.datasets.structures.example_structures()
-    >>> found = s4a.statistics.structures(study, n_permutations=99)
+    >>> import s4a_morphometrics
+    >>> from s4a_morphometrics.synthetic import example_structures
+    >>> study = example_structures()
+    >>> found = s4a_morphometrics.structures(study, n_permutations=99)
     >>> float(found["level_share"].sum().round(6)), found.sizes["shape"]
     (1.0, 6)
     """
@@ -351,7 +352,7 @@ def structures_of_new(found: xr.Dataset, inserted: xr.DataTree) -> xr.Dataset:
     found : Dataset
         Of :func:`structures`, of the study.
     inserted : DataTree
-        Of :func:`s4a.insert` into the same study.
+        Of :func:`s4a_morphometrics.insert_structures` into the same study.
 
     Returns
     -------
@@ -371,10 +372,11 @@ def structures_of_new(found: xr.Dataset, inserted: xr.DataTree) -> xr.Dataset:
     --------
     With a ``study`` of two small structures of six subjects, of which one is given once more:
 
-    >>> import s4a
-    >>> study = s4a.datasets.structures.example_structures()
-    >>> found = s4a.statistics.structures(study, n_permutations=99)
-    >>> new = s4a.statistics.structures_of_new(found, study)
+    >>> import s4a_morphometrics
+    >>> from s4a_morphometrics.synthetic import example_structures
+    >>> study = example_structures()
+    >>> found = s4a_morphometrics.structures(study, n_permutations=99)
+    >>> new = s4a_morphometrics.structures_of_new(found, study)
     >>> bool(abs(new["pose_size"] - found["pose_size"]).max() < 1e-4 * found["pose_size"].max())
     True
     """
@@ -448,7 +450,7 @@ def structures_modes(
         Poses and shapes; poses alone; shapes alone.
     new : Dataset, optional
         Of :func:`structures_of_new`: the shapes of the tree are these, and their scores are those
-        on the modes of the study, as of :func:`s4a.insert`.
+        on the modes of the study, as of :func:`s4a_morphometrics.insert_structures`.
 
     Returns
     -------
@@ -470,10 +472,11 @@ def structures_modes(
     --------
     With a ``study`` of two small structures of six subjects:
 
-    >>> import s4a
-    >>> study = s4a.datasets.structures.example_structures()
-    >>> found = s4a.statistics.structures(study, n_permutations=99)
-    >>> poses = s4a.statistics.structures_modes(study, found, "between")
+    >>> import s4a_morphometrics
+    >>> from s4a_morphometrics.synthetic import example_structures
+    >>> study = example_structures()
+    >>> found = s4a_morphometrics.structures(study, n_permutations=99)
+    >>> poses = s4a_morphometrics.structures_modes(study, found, "between")
     >>> poses["pca"].sizes["component"]
     5
     """

@@ -10,7 +10,7 @@ from s4a.geometry.align import rigid_transform
 from s4a.geometry.mesh import as_dataset, vertex_areas
 from s4a.schema import check_count
 from s4a.seeds import RNG, seed_of
-from s4a.study.pipeline import analyse
+from s4a_morphometrics.several import analyse_structures
 
 AXES = (12.0, 7.0, 5.0)  # mm, half
 SIDES = {"left": -1.0, "right": 1.0}
@@ -30,7 +30,7 @@ def bean(u: ArrayLike, length: float = 0.0, bend: float = 0.0) -> np.ndarray:
 
     Examples
     --------
-    >>> from s4a.datasets.structures import bean
+    >>> from s4a_morphometrics.synthetic import bean
     >>> bean([[0, 1, 0], [0, -1, 0]]).round(1).tolist()
     [[0.0, 7.0, -1.0], [0.0, -7.0, -1.0]]
     """
@@ -68,13 +68,14 @@ def subjects(
     Returns
     -------
     dict of dict of Dataset
-        For :func:`s4a.analyse`: ``{"subject_1": {"left": mesh, "right": mesh}, ...}``; each mesh
-        has ``reference_point(vertex, xyz)``, by which those of all subjects correspond.  Vertices
+        For :func:`s4a_morphometrics.analyse_structures`: ``{"subject_1": {"left": mesh, "right":
+        mesh}, ...}``; each mesh has ``reference_point(vertex, xyz)``, by which those of all
+        subjects correspond.  Vertices
         lie elsewhere in every subject, and each scan has another frame.
 
     Examples
     --------
-    >>> from s4a.datasets.structures import subjects
+    >>> from s4a_morphometrics.synthetic import subjects
     >>> two = subjects(2, 100)
     >>> list(two), list(two["subject_1"]), two["subject_1"]["left"].sizes["vertex"]
     (['subject_1', 'subject_2'], ['left', 'right'], 100)
@@ -112,12 +113,13 @@ def example_structures() -> xr.DataTree:
     Returns
     -------
     DataTree
-        As of ``s4a.analyse``, in memory, made in some seconds; the same every time.
+        As of :func:`s4a_morphometrics.analyse_structures`, in memory, made in some seconds; the
+        same every time.
 
     Examples
     --------
-    >>> from s4a.datasets.structures import example_structures
+    >>> from s4a_morphometrics.synthetic import example_structures
     >>> list(example_structures()["structures"].children)
     ['left', 'right']
     """
-    return analyse(subjects(6, 200), n_coarse=100, k=10, k_init=6, n_pairs=6)
+    return analyse_structures(subjects(6, 200), n_coarse=100, k=10, k_init=6, n_pairs=6)

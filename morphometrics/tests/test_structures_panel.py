@@ -5,23 +5,18 @@ import pytest
 
 pytest.importorskip("anywidget")
 from ipywidgets.widgets import widget as registry
+from s4a_morphometrics import structures, structures_modes
+from s4a_morphometrics.structures_panel import Structures
 
 import s4a
-from s4a.datasets.structures import example_structures
-from s4a.widgets import Explore, Structures
-
-
-@pytest.fixture(scope="module")
-def several():
-    return example_structures()
+from s4a.widgets import Explore
 
 
 @pytest.fixture
 def panel(several):
     """The panel, of which nothing is left after the test."""
     before = len(registry._instances)
-    found = s4a.statistics.structures(several, n_permutations=9)
-    made = Structures(several, found=found)
+    made = Structures(several, found=structures(several, n_permutations=9))
     yield made
     made.close()
     assert len(registry._instances) == before
@@ -33,46 +28,39 @@ def test_each_level_has_its_sliders_and_one_is_shown(panel, several):
         panel.level.value = level
         shown = [one for one, view in panel.views.items() if view.layout.display != "none"]
         assert shown == [level]
-        of_level = s4a.statistics.structures_modes(several, panel.found, level)
+        of_level = structures_modes(several, panel.found, level)
         panel.scores = [2.0, -1.0, 0, 0, 0]
         expected = s4a.synthesize(of_level, [2.0, -1.0])["position"].values
         np.testing.assert_allclose(panel.vertices(), expected, atol=1e-4)
     assert "% of the variance" in panel.level.options[1][0]
 
 
-def test_a_structure_that_is_not_seen_is_not_drawn(panel):
+def test_structures_are_hidden_and_coloured(panel):
+    of = panel.found["structure_of_vertex"].values
     view = panel.views["joint"]
-    whole = np.frombuffer(view.corner, "<u4").reshape(-1, 3)
+    panel.colors["right"].value = "#00ff00"
+    own = np.frombuffer(view.own, np.uint8).reshape(-1, 3)
+    assert (own[of == 1] == [0, 255, 0]).all()
+    assert (own[of == 0] == [0x44, 0x77, 0xAA]).all()
+    view.webgl = "no"
+    still = view.still
+    panel.colors["left"].value = "#000000"
+    assert still[1:4] == b"PNG"
+    assert view.still != still
     panel.seen["left"].value = False
     rest = np.frombuffer(view.corner, "<u4").reshape(-1, 3)
-    assert 0 < len(rest) < len(whole)
-    of = panel.found["structure_of_vertex"].values
+    assert len(rest)
     assert (of[rest] == 1).all()
     panel.seen["right"].value = False
     assert "tick at least one structure" in panel.message.value
 
 
-def test_each_structure_has_the_colour_that_is_picked(panel):
-    panel.colors["right"].value = "#00ff00"
-    own = np.frombuffer(panel.views["within"].own, np.uint8).reshape(-1, 3)
-    of = panel.found["structure_of_vertex"].values
-    assert (own[of == 1] == [0, 255, 0]).all()
-    assert (own[of == 0] == [0x44, 0x77, 0xAA]).all()
-
-
-def test_without_webgl_the_structures_are_drawn_in_their_colours(panel):
-    view = panel.views["joint"]
-    view.webgl = "no"
-    still = view.still
-    assert still[1:4] == b"PNG"
-    panel.colors["left"].value = "#000000"
-    assert view.still != still
-
-
-def test_a_page_of_it_has_all_levels(panel, tmp_path):
+def test_a_page_has_all_levels_and_shows_colours(panel, tmp_path):
     text = panel.save_html(tmp_path / "structures.html").read_text(encoding="utf-8")
     assert "within structures: shapes" in text
     assert text.count('"deformation"') >= 3
+    assert "background:#4477aa" in text
+    assert "<b>#4477aa</b>" not in text
 
 
 def test_a_study_of_several_structures_has_a_tab_of_its_own(several):
@@ -80,9 +68,3 @@ def test_a_study_of_several_structures_has_a_tab_of_its_own(several):
     assert tabs.tabs.titles == ("Structures",)
     assert isinstance(tabs["Structures"], Structures)
     tabs.close()
-
-
-def test_a_page_shows_the_colour_of_a_structure_and_not_its_number(panel):
-    page = s4a.show.panel_page.panel_html(panel, 2_000_000)
-    assert "background:#4477aa" in page
-    assert "<b>#4477aa</b>" not in page

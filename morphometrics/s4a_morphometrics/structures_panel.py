@@ -5,13 +5,14 @@ import numpy as np
 import xarray as xr
 from matplotlib.colors import to_rgb
 
-from s4a.analysis.structures import LEVELS, structures, structures_modes
 from s4a.method.pca import apply_scores
 from s4a.schema import unit_of
 from s4a.show.browser import color_bytes
 from s4a.show.surfaces import mode_arrays, mode_limits, score_state
 from s4a.widgets.modes import ModesView
 from s4a.widgets.panel import Panel, check, dropdown, row, together
+
+from s4a_morphometrics.poses import LEVELS, structures, structures_modes
 
 WORDS = {
     "joint": "poses and shapes",
@@ -28,9 +29,9 @@ class Structures(Panel):
     Parameters
     ----------
     study : xarray.DataTree
-        Of several structures, see :func:`s4a.analyse`.
+        Of several structures, see :func:`s4a_morphometrics.analyse_structures`.
     found : xarray.Dataset, optional
-        Of :func:`s4a.statistics.structures`, which is computed by default.
+        Of :func:`s4a_morphometrics.structures`, which is computed by default.
     level : {"joint", "between", "within"}
         Whose modes are on the sliders first: of poses and shapes, of poses, of shapes.
     n_modes : int
