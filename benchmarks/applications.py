@@ -28,6 +28,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 import s4a
+import s4a_morphometrics
 from s4a import metrics, statistics, synthetic
 from s4a.analysis import permutation, transfer
 from s4a.geometry.align import align, farthest_points
@@ -464,26 +465,27 @@ def volumes():
     files = DATA / "hippocampi_msd"
     with tempfile.TemporaryDirectory() as folder:
         for name, words in (
-            ("whole", ["--label", "1,2"]),
-            ("two structures", ["--structures", "anterior=1", "posterior=2"]),
+            ("whole", ["run", "--label", "1,2"]),
+            ("two structures", ["run-structures", "--structures", "anterior=1", "posterior=2"]),
         ):
             out = Path(folder) / name.replace(" ", "_")
-            command = ["run", str(files), *words, "--n-coarse", "1000", "--k", "60"]
+            command = [*words, "--n-coarse", "1000", "--k", "60", "--", str(files)]
             begin = time.perf_counter()
             subprocess.run(
-                [sys.executable, "-m", "s4a", *command, "--out", str(out)],
+                [sys.executable, "-m", "s4a", command[0], "--out", str(out), *command[1:]],
                 check=True,
                 capture_output=True,
             )
             took = time.perf_counter() - begin
-            with s4a.open_study(out) as study:
+            opened = s4a.open_study if name == "whole" else s4a_morphometrics.open_structures
+            with opened(out) as study:
                 if name == "whole":
                     share = np.cumsum(study["pca"]["explained_variance_ratio"].values)
                     n = study["registration"].sizes["shape"]
                     said = f"{100 * share[0]:.0f}, {100 * share[4]:.0f} and {100 * share[9]:.0f} %"
                     said = f"{said} of the variance by 1, 5 and 10 modes"
                 else:
-                    found = statistics.structures(study)
+                    found = s4a_morphometrics.structures(study)
                     between = float(found["level_share"].sel(level="between").sum())
                     n = found.sizes["shape"]
                     said = f"{100 * between:.0f} % of the variance between the structures"

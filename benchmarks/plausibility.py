@@ -25,10 +25,10 @@ from scipy.stats import binomtest
 
 import s4a
 from s4a.geometry.mesh import as_arrays, as_dataset, triangle_areas, vertex_areas
-from s4a.input import evidence, plausibility
+from s4a.input import plausibility
+from s4a.options import Options
 from s4a.study import pair
 from s4a.study.doubts import doubtful
-from s4a.study.options import pair_options
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 CHOSEN_ON = ("brains", "cats", "faces", "bodies 0-9")
@@ -162,18 +162,18 @@ class Collection:
     def portray(self, mesh):
         mesh = s4a.clean(as_dataset(*mesh))
         start = time.process_time()
-        portrait = evidence.portray(mesh, intersections=False)
+        portrait = plausibility.portray(mesh, intersections=False)
         self.seconds += time.process_time() - start
         return portrait
 
     def compare(self, name, portraits, references):
-        """:func:`evidence.compare`, with each pair of portraits compared once."""
+        """:func:`plausibility.compare`, with each pair of portraits compared once."""
         seen = []
         for other in references:
             a, b = portraits[name], portraits[other]
             if (id(a), id(b)) not in self.pairs:
                 start = time.process_time()
-                found = evidence.compare("" if a is not b else other, a, {other: b})
+                found = plausibility.compare("" if a is not b else other, a, {other: b})
                 self.seconds += time.process_time() - start
                 self.pairs[id(a), id(b)] = found, a, b  # held, so that their ids stay theirs
             seen.append(self.pairs[id(a), id(b)][0].assign_coords(reference=[other]))
@@ -190,7 +190,7 @@ class Collection:
         """Name -> kinds of doubts, those that make it doubtful with an exclamation mark."""
         portraits = self.portraits | {name: self.portray(m) for name, m in planted.items()}
         attrs = {name: {"area": one.attrs["surface"]} for name, one in portraits.items()}
-        references = evidence.pick_references(portraits)
+        references = plausibility.pick_references(portraits)
         seen = {name: self.compare(name, portraits, references) for name in portraits}
         doubts, _ = plausibility.find_warnings(attrs, seen)
         return {
@@ -341,7 +341,7 @@ def judged(name, at, meshes, shapes):
     for way in ("as by default", *TURNS):
         # a first map of landmarks, as the dense one is mended by a search
         more = {"init": "landmarks"} if way in TURNS else {}
-        options = pair_options({"both": False, "n_coarse": 3000, **more})
+        options = Options(both=False, n_coarse=3000, **more)
         for other in others:
             usual = pair.motion_onto
             try:
@@ -409,7 +409,7 @@ def planted(names):
         parts = sorted({PLANTED_IN[name][0] for name in names})
         command = [sys.executable, DATA / "unpack.py", folder, *parts]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-        options = pair_options({"both": False, "n_coarse": 3000})
+        options = Options(both=False, n_coarse=3000)
         for name in names:
             part, numbers, places = PLANTED_IN[name]
             files = sorted((Path(folder) / part).glob("*.ply"))

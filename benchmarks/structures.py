@@ -18,12 +18,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import s4a
-from s4a.analysis.covariation import coordinates, two_block
+import s4a_morphometrics
 from s4a.analysis.permutation import permutation_test
-from s4a.analysis.structures import Poses, align_wholes, measured, pose_fields, poses_of
-from s4a.datasets.structures import bean, subjects
 from s4a.geometry.align import rigid_transform
 from s4a.geometry.mesh import vertex_areas
+from s4a_morphometrics.poses import Poses, align_wholes, measured, pose_fields, poses_of
+from s4a_morphometrics.synthetic import bean, subjects
+from s4a_morphometrics.two_block import coordinates, two_block
 
 SPHERE = s4a.synthetic.sphere(120)
 U, T = SPHERE["position"].values, SPHERE["corner_vertex"].values
@@ -115,8 +116,8 @@ def registered() -> None:
     sys.stdout.write(f"| {' | '.join(head)} |\n|{' --- |' * len(head)}\n")
     for name, (pose, shape) in PLANTED.items():
         made = subjects(8, 600, pose=pose, shape=shape)
-        study = s4a.analyse(made, n_coarse=400, k=24, k_init=10, n_jobs=1)
-        found = s4a.statistics.structures(study, n_permutations=1)
+        study = s4a_morphometrics.analyse_structures(made, n_coarse=400, k=24, k_init=10, n_jobs=1)
+        found = s4a_morphometrics.structures(study, n_permutations=1)
         points, areas = [], []
         for k in ("left", "right"):
             template = made[study[f"structures/{k}/registration"].attrs["template"]][k]

@@ -24,6 +24,7 @@ from matplotlib.patches import Patch
 from PIL import Image
 
 import s4a
+import s4a_morphometrics
 from s4a.datasets.synthetic import LABELS
 from s4a.method import fmap, steps
 from s4a.method import pca as modes
@@ -407,14 +408,14 @@ def hippocampi(n=VOLUMES):
             f"found {len(files)}: those of Task04 of the Medical Segmentation Decathlon"
         )
     parts = {"anterior": 1, "posterior": 2}
-    return s4a.analyse(files, structures=parts, n_coarse=1000, k=60)
+    return s4a_morphometrics.analyse_structures(files, structures=parts, n_coarse=1000, k=60)
 
 
 def joint_modes(study, what, name, folder=LOCAL_FOLDER, n_modes=3):
     """The first joint modes of several structures, each from above and from the side."""
-    found = s4a.statistics.structures(study)
+    found = s4a_morphometrics.structures(study)
     names = found["structure"].values.tolist()
-    mean, T, steps = mode_arrays(s4a.statistics.structures_modes(study, found), n_modes=n_modes)
+    mean, T, steps = mode_arrays(s4a_morphometrics.structures_modes(study, found), n_modes=n_modes)
     palette = np.array([to_rgb(OKABE_ITO[i]) for i in (0, 4, 2, 6, 1, 5, 3, 7)])
     colors = palette[found["structure_of_vertex"].values % len(palette)]
     ends = np.concatenate([mean + s * step for step in steps for s in (-2, 2)])

@@ -11,18 +11,17 @@ from . import study as study
 from . import widgets as widgets
 from .accessor import explore as explore
 from .analysis import statistics as statistics
-from .analysis.complete import complete as complete
 from .analysis.export import write_registered as write_registered
-from .analysis.export import write_training_set as write_training_set
 from .analysis.fields import with_field as with_field
-from .analysis.programs import write_for as write_for
 from .analysis.transfer import register_pairs as register_pairs
 from .analysis.transfer import transfer_labels as transfer_labels
 from .analysis.transfer import transfer_landmarks as transfer_landmarks
 from .analysis.transfer import transfer_scalars as transfer_scalars
+from .analysis.volumes import write_label_volumes as write_label_volumes
 from .datasets import synthetic as synthetic
 from .evaluation import compare as compare
 from .evaluation import metrics as metrics
+from .input.annotations import with_features as with_features
 from .input.clean import clean as clean
 from .input.collection import read_labels as read_labels
 from .input.collection import read_shape as read_shape
@@ -30,7 +29,6 @@ from .input.collection import read_shapes as read_shapes
 from .input.files import read_mesh as read_mesh
 from .input.files import write_mesh as write_mesh
 from .input.landmarks import with_landmarks as with_landmarks
-from .input.scalars import with_features as with_features
 from .method.pca import synthesize as synthesize
 from .method.remesh import coarsen as coarsen
 from .method.spectral import reconstruct as reconstruct
@@ -41,6 +39,7 @@ from .method.steps import latent_map as latent_map
 from .method.steps import latent_match as latent_match
 from .method.steps import refine_network as refine_network
 from .method.steps import register_shape as register_shape
+from .options import Options as Options
 from .show.page import write_page as write_page
 from .show.pictures import write_film as write_film
 from .show.pictures import write_picture as write_picture

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from s4a.extensions import extensions
 
+Array = np.ndarray  # of numbers; its dims and kind stand in the docstring
 INPUT = "unit of the input"
 INPUT2 = "squared unit of the input"
 FIELD_UNIT = "unit of the field"
@@ -189,18 +190,6 @@ ROWS = {
         "share of the variance at low resolution, of the matches of eq. 6, as smooth as at full"),
     "explained_variance_ratio_raw": ("component", ONE,
         "share of the variance at low resolution, of the matches as they are"),
-    # a part of a shape, and the whole that it may be of
-    "aligned_position": ("shape vertex xyz", INPUT,
-        "position of each vertex of the template on the shape, aligned to the template"),
-    "point_vertex": ("point", ONE, "vertex of the template that the point is"),
-    "present": ("vertex", ONE, "whether the part has the vertex"),
-    "completion_sd": ("vertex xyz", INPUT,
-        "standard deviation of the completed shape along each axis of the part's file"),
-    "completion_normal_sd": ("vertex", INPUT, "the same along the normal"),
-    "sample_position": ("sample vertex xyz", INPUT,
-        "shapes drawn from all that agree with the part, where it lies in its file"),
-    "score_covariance": ("component component_2", ONE,
-        "covariance of the scores of a completed shape"),
     "template_vertex": ("vertex", ONE, "vertex of the template that the vertex of a region is"),
     # evaluation of the model, tests and outliers (6.1)
     "compactness": ("component", INPUT2, "variance of the first components together"),
@@ -246,78 +235,6 @@ ROWS = {
     "field_effect": ("vertex", FIELD_UNIT,
         "difference of the groups' means, or change per unit of the variable"),
     "field_intercept": ("vertex", FIELD_UNIT, "field where the variable is at its mean"),
-    "field_pattern": ("component vertex", FIELD_UNIT,
-        "change of the field with one standard deviation of its score"),
-    "field_score": ("shape component", ONE,
-        "score of the field of each shape, in standard deviations"),
-    "singular_value": ("component", ONE,
-        "covariance of the scores of field and shape, not standardized"),
-    "singular_p": ("component", ONE, "p value of the permutation test of the singular value"),
-    "covariance_share": ("component", ONE, "share of the squared covariance of field and shape"),
-    "pair_correlation": ("component", ONE, "correlation of the scores of field and shape"),
-    "rv": ("", ONE, "RV coefficient of field and shape"),
-    "rv_p": ("", ONE, "p value of the permutation test of the RV coefficient"),
-    # growth: several visits of each subject
-    "effect_error": ("vertex xyz", INPUT, "standard error of the change per unit of time"),
-    "within_effect": ("vertex xyz", INPUT, "change per unit of time within subjects alone"),
-    "field_error": ("vertex", FIELD_UNIT, "standard error of the change per unit of time"),
-    "field_within_effect": ("vertex", FIELD_UNIT,
-        "change per unit of time within subjects alone"),
-    "subject_variance": ("vertex", INPUT2, "variance of the intercepts of subjects"),
-    "residual_variance": ("vertex", INPUT2, "variance of visits around their subjects' lines"),
-    "field_subject_variance": ("vertex", FIELD_UNIT + ", squared",
-        "variance of the intercepts of subjects"),
-    "field_residual_variance": ("vertex", FIELD_UNIT + ", squared",
-        "variance of visits around their subjects' lines"),
-    "intraclass_correlation": ("vertex", ONE,
-        "share of the variance that is between subjects, 0 to 1"),
-    "shape_time": ("shape", "as in the table", "time at which the mean shape is nearest to this"),
-    # left against right
-    "partner_triangle": ("vertex", ONE,
-        "template triangle on which the partner of the vertex on the other side lies"),
-    "partner_barycentric": ("vertex corner", ONE, "barycentric weights in that triangle"),
-    "partner_gap": ("vertex", INPUT, "distance of the vertex and the partner of its partner"),
-    "asymmetry": ("individual vertex xyz", INPUT,
-        "half of the shape less its mirror image, or of one side less the other"),
-    "symmetric": ("individual vertex xyz", INPUT,
-        "mean of both, less that of all: the symmetric component"),
-    "symmetric_position": ("vertex xyz", INPUT, "mean of both and of all: the symmetric consensus"),
-    "directional": ("vertex xyz", INPUT, "directional asymmetry: mean of the asymmetries"),
-    "directional_normal": ("vertex", INPUT,
-        "the same along the normals: half the gap of the shape and its mirror image, outward"),
-    "resolution": ("vertex", INPUT,
-        "what triangles and partners may leave: a directional asymmetry below it is not known"),
-    "fluctuating": ("vertex", INPUT,
-        "fluctuating asymmetry: standard deviation of the asymmetries around their mean"),
-    "asymmetry_size": ("individual", INPUT, "root mean square over the area of the asymmetry"),
-    "fluctuating_size": ("individual", INPUT, "the same of the asymmetry less the mean of all"),
-    "asymmetry_score": ("individual component", ONE,
-        "score along the components of the asymmetries, in standard deviations"),
-    "kurtosis": ("", ONE, "kurtosis along the first of them: 3 if normal, towards 1 of two humps"),
-    "antisymmetry_p": ("", ONE, "share of normal samples whose kurtosis is as low"),
-    "sum_of_squares": ("term", INPUT2, "sum of squares over both sides"),
-    "degrees_of_freedom": ("term", ONE, "degrees of freedom, of each coordinate"),
-    "mean_square": ("term", INPUT2, "sum of squares by degrees of freedom"),
-    "variance_share": ("term", ONE, "share of the sums of squares"),
-    "f_ratio": ("term", ONE, "mean square by that of individuals x sides"),
-    # several structures of each subject
-    "structure_status": ("shape structure", ONE,
-        "ok, repaired, doubtful or excluded; missing where a subject has none"),
-    "structure_of_vertex": ("vertex", ONE, "structure that the vertex is of"),
-    "pose_rotation": ("shape structure xyz", "rad",
-        "turn of the structure in the whole, a vector around its centroid"),
-    "pose_translation": ("shape structure xyz", INPUT,
-        "shift of the structure's centroid in the whole"),
-    "pose_size": ("shape structure", INPUT,
-        "root mean square over its area of what both displace"),
-    "within_displacement": ("shape vertex xyz", INPUT,
-        "displacement of the structure's mean shape, its pose taken out"),
-    "level_variance": ("structure level", INPUT2,
-        "variance of poses (between) and of shapes (within), mean square over the area of all"),
-    "level_share": ("structure level", ONE, "its share of the variance"),
-    "between_share": ("component", ONE, "share of the joint component that is of poses"),
-    "pose_shape_rv": ("", ONE, "RV coefficient of poses and shapes"),
-    "pose_shape_p": ("", ONE, "p value of the permutation test of that coefficient"),
     # the truth of a synthetic collection
     "reference_point": ("vertex xyz", ONE,
         "point of the unit sphere that the vertex is the image of"),
@@ -453,13 +370,11 @@ POINTS_INTO = {
     "sample_vertex": "original_vertex",
     "coarse_vertex": "vertex",
     "guide_vertex": "vertex",
-    "point_vertex": "vertex",
     "sample_cell": "vertex",
     "local_vertex": "original_vertex",
     "local_sample": "vertex",
     "registered_match": "original_vertex",
     "template_triangle": "triangle",
-    "partner_triangle": "triangle",
     "way_match": "source_vertex",
     "way_reverse": "vertex",
     "true_match": "source_vertex",
@@ -518,16 +433,13 @@ HOLDS = {
     ),
     "fields": ("shape carried_field", "", ""),
     "subjects": ("shape", "", ""),
-    "structures": ("shape structure structure_status", "", ""),
     "report": (
         "shape stage status reason warning path area seconds",
         "template remarks no_modes",
         "",
     ),
 }
-TEXTS = set(
-    "source target status reason warning path shape stage structure structure_status".split()
-)
+TEXTS = set("source target status reason warning path shape stage".split())
 
 
 def variable(name: str, data: ArrayLike, **attrs: str | float | list[str]) -> xr.Variable:

@@ -7,8 +7,8 @@ folders stand in the repository, and the documentation has a page of each. All o
 than a night on two cores: ``make paper ONLY=accuracy`` takes those whose command contains the word,
 ``make paper ONLY=--list`` names all and runs none, and ``make paper ONLY=--rest`` goes on with
 those that have not ended well yet; with ``--minutes=20`` beside it a command that takes longer is
-ended and told, and what it printed before stays. ``tests/house/test_figures.py`` fails where a page
-quotes a figure without a command.
+ended and told, and what it printed before stays. ``tests/project/test_documents.py`` fails where a
+page quotes a figure without a command.
 """
 
 import os

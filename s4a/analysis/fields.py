@@ -15,8 +15,8 @@ import xarray as xr
 
 from s4a.analysis.inputs import all_registered
 from s4a.analysis.transfer import on_template
+from s4a.input.annotations import SUFFIXES, of_vertices, read_scalars
 from s4a.input.files import files_named, slug
-from s4a.input.scalars import SUFFIXES, of_vertices, read_scalars
 from s4a.input.subjects import listed
 from s4a.schema import FIELD_UNIT, dataset, in_unit
 from s4a.study.store import lock, task_key, write
@@ -47,7 +47,7 @@ def with_field(
     values : dict of str to array_like (vertex,), sequence of these, or path
         A number for each vertex of the file of a shape, or of its mesh in ``/original``; NaN where
         there is none.  By shape, or in the order of the study.  Or a folder of files named as the
-        shapes (:func:`s4a.input.scalars.read_scalars`).
+        shapes (:func:`s4a.input.annotations.read_scalars`).
     unit : str, optional
         Of the numbers, such as ``mm``.
     partial : bool

@@ -453,7 +453,7 @@ def _coefficients(study, d, area):
 
     Where the study has no eigenfunctions, the basis is that of the vertices.
     """
-    template = study["registration"].attrs.get("template", "")  # of several structures none
+    template = study["registration"].attrs.get("template", "")  # none where it is no shape
     if "coarse" not in study or template not in study["coarse"].children:
         return (d * np.sqrt(area)[:, None]).reshape(len(d), -1).astype(float)
     shape = Shape(study["original"][template].to_dataset(), study["coarse"][template].to_dataset())

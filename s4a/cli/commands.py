@@ -5,6 +5,7 @@ Every command imports what it needs, so that none waits for what the others need
 """
 
 import contextlib
+import dataclasses
 import logging
 import re
 import shlex
@@ -13,7 +14,6 @@ import time
 import webbrowser
 from argparse import Namespace
 from collections.abc import Iterator, Mapping
-from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -55,16 +55,12 @@ def doctor(args: Namespace) -> int:
 
 def run(args: Namespace) -> int:
     """The whole analysis over a folder of meshes."""
-    from s4a.cli import results, tables
+    from s4a.cli import tables
     from s4a.study.pipeline import analyse
 
     full = within(args.out, "report.txt")
     with cluster(args.cluster), lines_or_bars():
         study = analyse(args.paths, store=args.out, **options_of(args))
-    if "structures" in study.children:
-        write(results.run_of_several(study, args.out))
-        parts = study["structures"].children.values()
-        return 1 if any(part["report"].attrs["unforeseen"] for part in parts) else 0
     again = shlex.join(["s4a", *(word for word in args.words if word != "--keep-doubtful")])
     report = study["report"].to_dataset()
     lines = [tables.report_table(report), *tables.stage_lines(report)]
@@ -76,10 +72,12 @@ def run(args: Namespace) -> int:
 
 def options_of(args: Namespace) -> dict[str, Any]:
     """The options of `analyse` from parsed flags, and how many processes."""
-    from s4a.study.options import Options
+    from s4a.options import Options
 
-    options = {name: getattr(args, name) for name in [*(f.name for f in fields(Options)), "n_jobs"]}
-    return options | {"structures": dict(args.structures) if args.structures else None}
+    return {
+        name: getattr(args, name)
+        for name in [*(f.name for f in dataclasses.fields(Options)), "n_jobs"]
+    }
 
 
 @contextlib.contextmanager
@@ -203,12 +201,11 @@ def statistics(args: Namespace) -> int:
     from s4a.analysis import statistics as tests
     from s4a.analysis.export import write_results
     from s4a.cli import tables
-    from s4a.cli.results import covariation_lines
     from s4a.show.page import write_page
     from s4a.show.pictures import write_film
 
-    if args.covariates and not (args.group or args.variable or args.field):
-        raise ValueError("--covariates are of a test: give --group, --variable or --field")
+    if (args.covariates or args.field) and not (args.group or args.variable):
+        raise ValueError("--covariates and --field are of a test: give --group or --variable")
     study, out = study_to_test(args)
     study = restricted(study, args)
     results = tests_of(study, args)  # first, as options and columns may be refused
@@ -233,8 +230,6 @@ def statistics(args: Namespace) -> int:
             page = Path(out) / "regression.html"
             write_page(moving, page, title=f"Regression on {args.variable}")
             write_film(moving, Path(out) / "regression.gif")
-    if args.field:
-        write("\n" + covariation_lines(results["covariation"]))
     confidence = study["registration"]["confidence"].mean().item()
     write(f"\nmean confidence of the registration {confidence:.2f}; results: {out}")
     return 0
@@ -243,7 +238,7 @@ def statistics(args: Namespace) -> int:
 def study_to_test(args: Namespace) -> "tuple[xr.DataTree, str]":
     """The study with the table and the shapes that are asked for, and the folder of results."""
     from s4a.analysis.inputs import with_doubtful
-    from s4a.input.decisions import listed
+    from s4a.input.plausibility import listed
     from s4a.input.subjects import with_table
     from s4a.study.tree import left_out, open_study
 
@@ -321,10 +316,29 @@ def tests_of(study: "xr.DataTree", args: Namespace) -> "dict[str, xr.Dataset]":
         )
     if args.variable:
         results["regression"] = tests.regression(study, args.variable, field=args.field, **options)
-    if args.field:
-        del options["variances"]
-        results["covariation"] = tests.covariation(study, args.field, **options)
     return results
+
+
+def fields(args: Namespace) -> int:
+    """A number per vertex of every shape, such as thickness, carried to the template and kept."""
+    import numpy as np
+
+    from s4a.analysis.fields import with_field, write_field
+    from s4a.study.tree import open_study
+
+    study = open_study(args.study)
+    study = with_field(study, args.name, args.folder, unit=args.unit, partial=args.partial)
+    path = write_field(study, args.name, args.study)
+    field = study["fields"][args.name].to_dataset()["carried_field"]
+    known = np.isfinite(field.values)
+    write(
+        f"{args.name} of {known.any(1).sum()} of {len(known)} shapes, "
+        f"{np.nanmin(field):.4g} to {np.nanmax(field):.4g} {field.attrs['units']}, mean "
+        f"{np.nanmean(field):.4g}, at {100 * known.mean():.0f} % of the template's vertices: "
+        f"{path}\n"
+        f"s4a statistics {args.study} --field {args.name} takes it in place of shape"
+    )
+    return 0
 
 
 def insert(args: Namespace) -> int:
@@ -332,46 +346,18 @@ def insert(args: Namespace) -> int:
     from s4a.analysis.export import write_registered
     from s4a.cli import tables
     from s4a.study.insert import insert
-    from s4a.study.store import STRUCTURES
     from s4a.study.store import write as write_file
-    from s4a.study.tree import of_structure, open_study, structure_names
+    from s4a.study.tree import open_study
 
     study = open_study(args.study)
-    options = {name: getattr(args, name) for name in ("landmarks", "reflect", "table", "n_jobs")}
+    options = {name: getattr(args, name) for name in ("landmarks", "reflect", "n_jobs")}
     inserted = insert(study, args.shapes, **options)
     out = new_folder(args.out)
     write_file(inserted, out / "inserted.nc")
-    parts, status = {"": inserted}, "status"
-    if STRUCTURES in inserted.children:
-        status = "structure_status"
-        names = structure_names(inserted)
-        parts = {f"{STRUCTURES}/{name}": of_structure(inserted, name) for name in names}
-    for place, part in parts.items():
-        write_registered(part, out / place)
-        write(f"{place}\n{tables.inserted_table(part)}".lstrip())
+    write_registered(inserted, out)
+    write(tables.inserted_table(inserted))
     write(f"\nwritten: {out / 'inserted.nc'}, registered meshes and scores in {out}")
-    return 1 if (inserted["report"][status] == "excluded").any() else 0
-
-
-def complete(args: Namespace) -> int:
-    """A part of a shape matched to a finished study, and the whole that it may be of."""
-    from s4a.analysis.complete import complete
-    from s4a.analysis.export import write_completed
-    from s4a.cli import tables
-    from s4a.study.tree import open_study
-
-    found = complete(
-        open_study(args.study),
-        args.part,
-        landmarks=args.landmarks,
-        components=args.components,
-        n_samples=args.samples,
-        seed=args.seed,
-    )
-    paths = write_completed(found, args.out)
-    write("\n".join(tables.completed_lines(found)))
-    write(f"\nwritten: {', '.join(map(str, paths[:2]))}, samples: {len(paths) - 2}")
-    return 0
+    return 1 if (inserted["report"]["status"] == "excluded").any() else 0
 
 
 def transfer(args: Namespace) -> int:
@@ -381,8 +367,8 @@ def transfer(args: Namespace) -> int:
     from s4a.input.annotations import labels_of_mesh, read_labels, read_landmarks
     from s4a.input.collection import read_shape
     from s4a.input.landmarks import locate
-    from s4a.study.options import PAIR
-    from s4a.study.store import STRUCTURES, check_is_study
+    from s4a.options import DECLARED
+    from s4a.study.store import check_is_study
     from s4a.study.tree import open_study
 
     if not (args.labels or args.landmarks):
@@ -392,9 +378,7 @@ def transfer(args: Namespace) -> int:
     if args.blur is not None and not args.labels:
         raise ValueError("--blur is of labels: give --labels FILE, or leave it out")
     first = Path(args.targets[0])
-    into_study = len(args.targets) == 1 and (
-        (first / "registration.nc").is_file() or (first / STRUCTURES).is_dir()
-    )
+    into_study = len(args.targets) == 1 and any(first.glob("**/registration.nc"))
     if into_study:
         check_is_study(first)
     source, label, landmarks = read_shape(args.source), None, None
@@ -408,7 +392,7 @@ def transfer(args: Namespace) -> int:
             f"{args.source}"
         )
     excluded = []
-    asked = {name: getattr(args, name) for name in (*PAIR, "both")}
+    asked = {n: getattr(args, n) for n, one in DECLARED.items() if one.metadata["pair"]}
     given = {name: value for name, value in asked.items() if value is not None}
     if into_study:
         study = open_study(first)
@@ -434,7 +418,7 @@ def registered_pairs(
     """The source registered as the template of every target, and the targets that are left out."""
     from s4a.analysis.transfer import register_pairs
     from s4a.input.collection import read_shapes
-    from s4a.study.options import Options
+    from s4a.options import Options
 
     shapes = read_shapes(args.targets, compare=False)
     report = shapes["report"].to_dataset()
@@ -537,7 +521,7 @@ def compare_collection(args: Namespace) -> "tuple[xr.Dataset, list[str], np.ndar
     """Table 2: the result, names of the bars of Fig. 3, their seconds by block, and a text."""
     from s4a.cli import tables
     from s4a.evaluation import compare as comparison
-    from s4a.study.options import N_COARSE, Options
+    from s4a.options import N_COARSE, Options
 
     if args.paths or args.truth or args.landmarks or args.keep:
         raise ValueError(
@@ -567,7 +551,7 @@ def compare_pairs(
     from s4a.cli import tables
     from s4a.evaluation import compare as comparison
     from s4a.input.files import find_meshes, slugs
-    from s4a.study.options import N_COARSE
+    from s4a.options import N_COARSE
 
     if len(args.paths) < 2:
         raise ValueError("compare needs SOURCE and TARGET, or --collection PATH...")

@@ -8,7 +8,6 @@ from s4a.course import diagrams
 from s4a.course.exercises import check, judge
 from s4a.course.quizzes import quiz
 from s4a.course.sliders import slide, takeaway
-from s4a.datasets.structures import subjects
 from s4a.geometry.closest import closest_point
 from s4a.geometry.mesh import as_arrays, as_dataset, triangle_areas, vertex_areas, vertex_normals
 from s4a.method.nearest import nearest_rows
@@ -28,7 +27,6 @@ __all__ = [
     "position_colors",
     "quiz",
     "slide",
-    "subjects",
     "takeaway",
     "triangle_areas",
     "vertex_areas",

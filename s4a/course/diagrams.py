@@ -17,20 +17,17 @@ SOFT = {"blue": "#cfe4f2", "orange": "#f7d9c4", "grey": "#eeeeee", "green": "#cd
 def cotangents() -> Figure:
     """Cotangent weights: of an edge inside, of an edge on the boundary, and a vertex's area.
 
+    An edge i j inside has a triangle on each side, with the angles alpha and beta opposite to
+    it: its weight is half the sum of their cotangents. An edge on the boundary has one
+    triangle, and half its one cotangent. A vertex has a third of each triangle around it.
+
     Examples
     --------
     >>> from s4a.course.diagrams import cotangents
     >>> len(cotangents().axes)
     3
     """
-    figure, ((inside, rim, area),) = _plain(
-        3,
-        9.5,
-        3.1,
-        "An edge i j inside has a triangle on each side, with the angles alpha and beta opposite "
-        "to it: its weight is half the sum of their cotangents. An edge on the boundary has one "
-        "triangle, and half its one cotangent. A vertex has a third of each triangle around it.",
-    )
+    figure, ((inside, rim, area),) = _plain(cotangents, 3, 9.5, 3.1)
     i, j, above, below = np.array([[0.25, 0.5], [1.0, 0.62], [0.52, 1.05], [0.78, 0.08]])
     for ax, corners in ((inside, (above, below)), (rim, (above,))):
         for corner, color, name in zip(corners, (BLUE, ORANGE), ("α", "β"), strict=False):
@@ -56,6 +53,10 @@ def cotangents() -> Figure:
 def dual(n_samples: int = 12) -> Figure:
     """Voronoi cells of a flat mesh, where three of them meet, and the triangles of the dual.
 
+    A flat mesh with twelve samples. First every vertex is coloured as its nearest sample.
+    Then the triangles where three colours meet are black. At last each black triangle is a
+    large triangle of the dual, which joins the three samples.
+
     Parameters
     ----------
     n_samples : int
@@ -80,14 +81,7 @@ def dual(n_samples: int = 12) -> Figure:
     meeting = np.array([len(c) == 3 for c in corners])
     triangles = np.unique([c for c in corners if len(c) == 3], axis=0)
     shades = colormaps["Set3"]
-    figure, ((one, two, three),) = _plain(
-        3,
-        9.5,
-        3.4,
-        "A flat mesh with twelve samples. First every vertex is coloured as its nearest sample. "
-        "Then the triangles where three colours meet are black. At last each black triangle is a "
-        "large triangle of the dual, which joins the three samples.",
-    )
+    figure, ((one, two, three),) = _plain(dual, 3, 9.5, 3.4)
     for ax, strength in ((one, 1.0), (two, 1.0), (three, 0.35)):
         alone = np.array([len(c) == 1 for c in corners])
         shade = cell[T[alone, 0]]
@@ -107,20 +101,17 @@ def dual(n_samples: int = 12) -> Figure:
 def pull_back() -> Figure:
     """A match goes from target to source, functions go from source to target; C does the same.
 
+    Left: an arrow goes from a point y of the target N back to T of y on the source M; the
+    value of f comes back along it. Right: a square. T F goes from f on M to f of T on N;
+    below, C goes from the coefficients a to b; Phi and Psi go down. Both ways end at b.
+
     Examples
     --------
     >>> from s4a.course.diagrams import pull_back
     >>> len(pull_back().axes)
     2
     """
-    figure, ((shapes, square),) = _plain(
-        2,
-        9.5,
-        3.1,
-        "Left: an arrow goes from a point y of the target N back to T of y on the source M; the "
-        "value of f comes back along it. Right: a square. T F goes from f on M to f of T on N; "
-        "below, C goes from the coefficients a to b; Phi and Psi go down. Both ways end at b.",
-    )
+    figure, ((shapes, square),) = _plain(pull_back, 2, 9.5, 3.1)
     u = np.stack(np.meshgrid(*2 * [np.linspace(-1, 1, 160)]), -1)
     inside = np.hypot(*u.transpose(2, 0, 1)) < 1
     f = np.where(inside, np.sin(2.4 * u[..., 0] + 0.4) * np.cos(1.6 * u[..., 1]), np.nan)
@@ -139,14 +130,12 @@ def pull_back() -> Figure:
     shapes.text(3.5, 1.1, "f(T(y))", ha="center", fontsize=12, style="italic", color=BLUE)
     shapes.set(xlim=(-1.2, 4.3), ylim=(-1.75, 1.6))
     shapes.set_aspect("equal")
-    boxes = {
-        (0, 1): "f on M\nn values",
-        (2.2, 1): "f ∘ T on N\nn values",
-        (0, 0): "a\nk numbers",
-        (2.2, 0): "b = C a\nk numbers",
-    }
-    for (across, up), text in boxes.items():
-        _box(square, (across, up), text, SOFT["blue" if up else "orange"], (1.0, 0.42))
+    for up, kind, texts in (
+        (1, "blue", ("f on M\nn values", "f ∘ T on N\nn values")),
+        (0, "orange", ("a\nk numbers", "b = C a\nk numbers")),
+    ):
+        for across, text in zip((0, 2.2), texts, strict=True):
+            _box(square, (across, up), text, SOFT[kind], (1.0, 0.42))
     _arrow(square, (0.55, 1), (1.65, 1), "$T_F$", rise=0.12)
     _arrow(square, (0.55, 0), (1.65, 0), "C", rise=0.1)
     _arrow(square, (0, 0.76), (0, 0.24), "$\\Phi^T A$", rise=0, aside=-0.28)
@@ -159,21 +148,18 @@ def pull_back() -> Figure:
 def latent_space() -> Figure:
     """One space for three shapes, and the matrix whose eigenvectors are its functions.
 
+    Left: three shapes around a latent space. The maps Y 1 to Y 3 go from it to the shapes,
+    the maps C 12, C 23 and C 31 from shape to shape. Right: the matrix L in nine blocks, with
+    products of the maps on its diagonal and the maps themselves beside it, and Y 1 to Y 3
+    below each other.
+
     Examples
     --------
     >>> from s4a.course.diagrams import latent_space
     >>> len(latent_space().axes)
     2
     """
-    figure, ((star, matrix),) = _plain(
-        2,
-        9.5,
-        3.7,
-        "Left: three shapes around a latent space. The maps Y 1 to Y 3 go from it to the shapes, "
-        "the maps C 12, C 23 and C 31 from shape to shape. Right: the matrix L in nine blocks, "
-        "with products of the maps on its diagonal and the maps themselves beside it, and Y 1 to "
-        "Y 3 below each other.",
-    )
+    figure, ((star, matrix),) = _plain(latent_space, 2, 9.5, 3.7)
     angle = np.deg2rad([90, 210, 330])
     places = 1.25 * np.c_[np.cos(angle), np.sin(angle)]
     for i, place in enumerate(places):
@@ -212,20 +198,17 @@ def latent_space() -> Figure:
 def two_ways() -> Figure:
     """From the latent functions to a match at full resolution: the standard way, and eq. 7.
 
+    Two squares of template and shape, each at low and at full resolution, U going up. The
+    standard way searches at low resolution, fits C, and searches again at full resolution.
+    Equation 7 searches once, at full resolution, with U Phi Y.
+
     Examples
     --------
     >>> from s4a.course.diagrams import two_ways
     >>> [ax.get_title() for ax in two_ways().axes]
     ['standard: two searches and a fit', 'eq. 7: one search']
     """
-    figure, ((standard, ours),) = _plain(
-        2,
-        9.5,
-        3.3,
-        "Two squares of template and shape, each at low and at full resolution, U going up. The "
-        "standard way searches at low resolution, fits C, and searches again at full resolution. "
-        "Equation 7 searches once, at full resolution, with U Phi Y.",
-    )
+    figure, ((standard, ours),) = _plain(two_ways, 2, 9.5, 3.3)
     for ax, low in ((standard, SOFT["orange"]), (ours, SOFT["grey"])):
         for x, name in ((0, "template"), (2.6, "shape")):
             _box(ax, (x, 0), f"{name}, low\n$\\Phi\\, Y$", low, (1.05, 0.42))
@@ -245,19 +228,16 @@ def two_ways() -> Figure:
 def slid() -> Figure:
     """A match that slid along folds is still on the surface.
 
+    Two folds of a surface from the side. The true position of a point is a crest; its match
+    has slid down the flank, and is still on the surface.
+
     Examples
     --------
     >>> from s4a.course.diagrams import slid
     >>> [ax.get_title() for ax in slid().axes]
     ['slid: still on the surface']
     """
-    figure, ((folds,),) = _plain(
-        1,
-        5,
-        3.1,
-        "Two folds of a surface from the side. The true position of a point is a crest; its match "
-        "has slid down the flank, and is still on the surface.",
-    )
+    figure, ((folds,),) = _plain(slid, 1, 5, 3.1)
     u = np.linspace(0, 2, 200)
     height = 0.3 * (1 - np.cos(2 * np.pi * u))
     folds.plot(u, height, color=GREY, lw=2.5)
@@ -275,12 +255,12 @@ def slid() -> Figure:
     return figure
 
 
-def _plain(columns, width, height, alt):
-    """Axes without frames, and in `alt` what they show."""
+def _plain(draw, columns, width, height):
+    """Axes without frames; what they show is said in the second paragraph on the drawing."""
     with rc_context(LOOK):
         figure = Parts(figsize=(width, height), layout="constrained", dpi=120)
         axes = figure.subplots(1, columns, squeeze=False)
-    figure.alt = alt
+    figure.alt = " ".join((draw.__doc__ or "\n\n").split("\n\n")[1].split())
     for ax in axes.flat:
         ax.set_axis_off()
         ax.title.set_fontsize(LOOK["axes.titlesize"])
@@ -317,28 +297,16 @@ def _areas_around(ax):
 
 
 def _box(ax, center, text, color, size):
-    left, low = np.subtract(center, np.divide(size, 2))
-    style = "round,pad=0,rounding_size=0.06"
-    frame = FancyBboxPatch(
-        (left, low), size[0], size[1], boxstyle=style, fc=color, ec="none", zorder=2
-    )
-    ax.add_patch(frame)
+    corner = np.subtract(center, np.divide(size, 2))
+    style = {"boxstyle": "round,pad=0,rounding_size=0.06", "fc": color, "ec": "none"}
+    ax.add_patch(FancyBboxPatch(corner, *size, **style, zorder=2))
     ax.text(*center, text, ha="center", va="center", zorder=3, fontsize=10)
 
 
 def _arrow(ax, begin, end, text, *, bend=0.0, rise=0.1, aside=0.0, color="black"):
     """An arrow, and words beside its middle."""
-    style = f"arc3,rad={bend}"
-    arrow = FancyArrowPatch(
-        begin,
-        end,
-        arrowstyle="-|>",
-        mutation_scale=14,
-        lw=1.6,
-        color=color,
-        zorder=4,
-        connectionstyle=style,
-    )
-    ax.add_patch(arrow)
+    style = {"arrowstyle": "-|>", "mutation_scale": 14, "lw": 1.6, "color": color}
+    curve = f"arc3,rad={bend}"
+    ax.add_patch(FancyArrowPatch(begin, end, **style, connectionstyle=curve, zorder=4))
     x, y = np.add(begin, end) / 2
     ax.text(x + aside, y + rise, text, ha="center", va="center", color=color, fontsize=10)

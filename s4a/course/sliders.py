@@ -112,27 +112,16 @@ def takeaway(sentence: str, *figures: "Figure") -> "Figure":
 
     pictures = [np.asarray(Image.open(io.BytesIO(_png(figure)[0]))) for figure in figures]
     shares = [picture.shape[1] / picture.shape[0] for picture in pictures]
+    natural = [len(one) / (2 * of.dpi) for one, of in zip(pictures, figures, strict=True)]
     width, gap = 9.5, 0.1
-    natural = [
-        picture.shape[0] / (2 * figure.dpi)
-        for picture, figure in zip(pictures, figures, strict=True)
-    ]
     # smaller than they are drawn only so far as their words can still be read
-    least = LEAST * max(natural)
-    height = max(min(3.2, (width - gap * len(shares)) / sum(shares)), least)
+    height = min(3.2, (width - gap * len(shares)) / sum(shares))
+    height = max(height, LEAST * max(natural))
     whole = Parts(figsize=(height * sum(shares) + gap * (len(shares) - 1), height + 0.35))
-    grid = whole.add_gridspec(
-        1,
-        len(shares),
-        width_ratios=shares,
-        wspace=gap * len(shares) / whole.get_figwidth(),
-        left=0,
-        right=1,
-        bottom=0,
-        top=height / (height + 0.35),
-    )
-    for i, picture in enumerate(pictures):
-        ax = whole.add_subplot(grid[0, i])
+    room = {"left": 0, "right": 1, "bottom": 0, "top": height / (height + 0.35)}
+    room["wspace"] = gap * len(shares) / whole.get_figwidth()
+    axes = whole.subplots(1, len(shares), squeeze=False, width_ratios=shares, gridspec_kw=room)
+    for ax, picture in zip(axes.flat, pictures, strict=True):
         ax.imshow(picture, interpolation="lanczos")
         ax.set_axis_off()
     whole.set_dpi(150)

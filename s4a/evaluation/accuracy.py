@@ -13,18 +13,15 @@ from threadpoolctl import threadpool_limits
 
 from s4a.evaluation.metrics import geodesic_error
 from s4a.geometry.align import align
+from s4a.geometry.mesh import as_arrays
 from s4a.method import fmap
 from s4a.method.first_map import map_after_motion, nearest_after_motion
 from s4a.method.register import match_functions
 from s4a.method.shape import Shape
 from s4a.study.processes import workers
 
-ICP, ZOOMOUT, MATCH, SURFACE = (
-    "nearest neighbour after ICP",
-    "pairwise ZoomOut",
-    "S4A, matched vertex",
-    "S4A, registered surface",
-)
+ICP, ZOOMOUT = "nearest neighbour after ICP", "pairwise ZoomOut"
+MATCH, SURFACE = "S4A, matched vertex", "S4A, registered surface"
 
 
 def simple_matches(source: Shape, target: Shape, *, k_init: int = 20) -> dict[str, np.ndarray]:
@@ -39,8 +36,7 @@ def simple_matches(source: Shape, target: Shape, *, k_init: int = 20) -> dict[st
     dict
         Method -> int ndarray (n_target,), vertices of the source.
     """
-    M = source.low
-    N = target.low
+    M, N = source.low, target.low
     R, t, _ = align(M.X, M.area, N.X, N.area)
     near = nearest_after_motion(source.full, target.full, (R, t))
     C = map_after_motion(M, N, (R, t), k_init=k_init)
@@ -52,29 +48,26 @@ def simple_matches(source: Shape, target: Shape, *, k_init: int = 20) -> dict[st
 
 def _errors(source, target, registered, image, n_geodesic):
     """Mean errors of all methods on one shape: straight line, and geodesic where asked for."""
+    known = np.isfinite(image).all(axis=1)
+    (X, T), size = as_arrays(source.original), source.frame[1]
     with threadpool_limits(1):
-        known = np.isfinite(image).all(axis=1)
-        X, size = source.original["position"].values, source.frame[1]
         matches = simple_matches(source, target) | {MATCH: registered["registered_match"].values}
-        straight = {
-            name: np.linalg.norm(X[m] - image, axis=1)[known].mean() / size
-            for name, m in matches.items()
-        }
         R, t, s = (registered[v].values for v in ("rotation", "translation", "scale"))
         moved = target.original["position"].values + registered["displacement"].values
-        moved = (moved - t) @ R / s
-        straight[SURFACE] = np.linalg.norm(moved - image, axis=1)[known].mean() / size
-        geodesic = dict.fromkeys(straight, np.nan)
+        images = {name: X[match] for name, match in matches.items()}
+        images[SURFACE] = (moved - t) @ R / s
+        errors = {
+            name: [np.linalg.norm(found - image, axis=1)[known].mean() / size, np.nan]
+            for name, found in images.items()
+        }
         if n_geodesic:
             some = np.flatnonzero(known)[:: max(1, known.sum() // n_geodesic)]
             true = cKDTree(X).query(image[some])[1]
-            T = source.original["corner_vertex"].values
-            found = {name: m[some] for name, m in matches.items()}
-            every = geodesic_error(
-                X, T, np.concatenate([*found.values()]), np.tile(true, len(found))
-            )
-            geodesic |= dict(zip(found, every.reshape(len(found), -1).mean(1), strict=True))
-        return straight, geodesic
+            found = np.concatenate([match[some] for match in matches.values()])
+            far = geodesic_error(X, T, found, np.tile(true, len(matches)))
+            for name, each in zip(matches, far.reshape(len(matches), -1), strict=True):
+                errors[name][1] = each.mean()
+    return list(errors.values())
 
 
 def accuracy(
@@ -108,30 +101,28 @@ def accuracy(
     """
     registration = study["registration"].to_dataset()
     template = registration.attrs["template"]
-    shapes = [s for s in registration["shape"].values.tolist() if s != template]
+    names = [name for name in registration["shape"].values.tolist() if name != template]
+    keep = ["registered_match", "displacement", "rotation", "translation", "scale"]
 
     def shape(name):
         original, coarse = (study[s][name].to_dataset().load() for s in ("original", "coarse"))
         return Shape(original, coarse)
 
-    keep = ["registered_match", "displacement", "rotation", "translation", "scale"]
     target = shape(template)
     found = workers(n_jobs)(
         delayed(_errors)(
-            shape(s),
+            shape(name),
             target,
-            registration[keep].sel(shape=s).load(),
-            np.asarray(image(s, template)),
+            registration[keep].sel(shape=name).load(),
+            np.asarray(image(name, template)),
             n_geodesic,
         )
-        for s in shapes
+        for name in names
     )
-    methods = [ICP, ZOOMOUT, MATCH, SURFACE]
+    both = np.array(found).reshape(len(names), 4, 2).T  # (measure, method, shape)
     note = {"units": "share of sqrt(area)"}
     return xr.Dataset(
-        {
-            name: (("way", "shape"), [[pair[i][m] for pair in found] for m in methods], note)
-            for i, name in enumerate(("error", "geodesic_error"))
-        },
-        {"way": methods, "shape": shapes},
+        {"error": (("way", "shape"), both[0], note)}
+        | {"geodesic_error": (("way", "shape"), both[1], note)},
+        {"way": [ICP, ZOOMOUT, MATCH, SURFACE], "shape": names},
     )

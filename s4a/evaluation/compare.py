@@ -6,7 +6,6 @@ All work on one cleaned input.  What the methods are is in :mod:`s4a.evaluation.
 import io
 import logging
 import time
-import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,9 +22,9 @@ from s4a.evaluation.methods import (
     BLOCKS,
     INITS,
     METHODS,
-    OLD_NAMES,
     OUR_METHODS,
     PAPER_METHODS,
+    Clock,
     Matches,
     Outcome,
     Pair,
@@ -33,62 +32,43 @@ from s4a.evaluation.methods import (
 )
 from s4a.geometry.align import align, motion_between, realign
 from s4a.geometry.mesh import as_arrays, vertex_areas
-from s4a.input.bounded import content, npy
 from s4a.input.collection import read_shape, read_shapes
-from s4a.input.raw import shown, text_of
+from s4a.input.raw import content, npy, shown, text_of
 from s4a.method import latent, median, network
 from s4a.method.first_map import map_after_motion
 from s4a.method.register import latent_functions, log_area_ratio, match_functions, match_low
 from s4a.method.shape import Basis, Shape
-from s4a.schema import check_count, check_switch, dataset, require, variable
+from s4a.options import PRESETS as STUDY_PRESETS
+from s4a.options import Options, apply_preset
+from s4a.schema import check_choice, check_count, check_switch, dataset, require, variable
 from s4a.seeds import RNG, seed_of
-from s4a.study.options import PRESETS as STUDY_PRESETS
-from s4a.study.options import Options, apply_preset
 
 log = logging.getLogger(__name__)
 
 __all__ = ["COLLECTION_METHODS", "METHODS", "collection", "pair", "pairs"]
 
 COLLECTION_METHODS = ("SCALABLE", "RE-MATCH")
-COLLECTION_BLOCKS = (
-    "load and clean",
-    "basis and first maps",
-    "consistent ZoomOut",
-    "full resolution",
-)
+COLLECTION_BLOCKS = BLOCKS[0], "basis and first maps", "consistent ZoomOut", BLOCKS[-1]
 HOW = ("standard", "ours")
-# first maps of all methods, and rounds of RE-MATCH lifted
+# rounds of RE-MATCH lifted, and first maps of all methods
 PRESETS: dict[str | None, dict[str, Any]] = {
     None: {"sharpen": 2, "init": "landmarks"},
     "paper": {"sharpen": 0, "init": "landmarks"},
 }
 
 
-def by_new_names(methods: Sequence[str] | None) -> Sequence[str] | None:
-    """The methods by their names of today; DeprecationWarning where one has an old name."""
-    if methods is None or isinstance(methods, str):
-        return methods
-    for old in OLD_NAMES.keys() & set(methods):
-        text = f"the method {old!r} is now {OLD_NAMES[old]!r}"
-        warnings.warn(text, DeprecationWarning, stacklevel=3)
-    return [OLD_NAMES.get(method, method) for method in methods]
+def check_some(methods: Sequence[str], known: Sequence[str]) -> None:
+    """ValueError unless the methods are some of the known ones."""
+    wrong = [method for method in methods if method not in known]
+    if wrong or not len(methods) or isinstance(methods, str):
+        raise ValueError(f"methods must be some of {', '.join(known)}; found {wrong or methods!r}")
 
 
 def checked_methods(methods: Sequence[str] | None, preset: str | None) -> Sequence[str]:
-    """The methods; all by default, of the paper alone with its preset.
-
-    Raises
-    ------
-    ValueError
-        Unless all are some of :data:`METHODS`, and of the paper's with its preset.
-    """
+    """The methods; all by default, of the paper alone with its preset, which has no others."""
     if methods is None:
         return PAPER_METHODS if preset == "paper" else METHODS
-    wrong = [method for method in methods if method not in METHODS]
-    if wrong or not len(methods) or isinstance(methods, str):
-        raise ValueError(
-            f"methods must be some of {', '.join(METHODS)}; found {wrong or methods!r}"
-        )
+    check_some(methods, METHODS)
     added = [method for method in methods if method in OUR_METHODS]
     if preset == "paper" and added:
         raise ValueError(
@@ -151,18 +131,15 @@ def read_truth(path: Path | str) -> np.ndarray:
     """
     try:
         data = content(path)
-        if str(path).endswith(".npy"):
-            found = npy(data)
-        else:
-            found = np.loadtxt(io.StringIO(text_of(data)), delimiter=_delimiter(path))
+        delimiter = "," if str(path).endswith(".csv") else None
+        as_text = not str(path).endswith(".npy")
+        found = (
+            np.loadtxt(io.StringIO(text_of(data)), delimiter=delimiter) if as_text else npy(data)
+        )
     except ValueError as error:
         raise ValueError(f"{shown(path)} cannot be read as truth: {shown(error)}") from error
     whole = found.ndim == 1 and np.array_equal(found, np.round(found))
     return found.astype(np.int64) if whole else found
-
-
-def _delimiter(path):
-    return "," if str(path).endswith(".csv") else None
 
 
 def pair(
@@ -196,12 +173,9 @@ def pair(
     >>> float(found["geodesic_error"].sel(way="kNN").item())
     0.0
     """
-
-    def one(value):
-        return None if value is None else {"pair": value}
-
-    options |= {"methods": by_new_names(methods), "truth": one(truth), "landmarks": one(landmarks)}
-    return pairs(source, {"pair": target}, **options)
+    for name, value in (("truth", truth), ("landmarks", landmarks)):
+        options[name] = None if value is None else {"pair": value}
+    return pairs(source, {"pair": target}, methods=methods, **options)
 
 
 def pairs(
@@ -306,16 +280,15 @@ def pairs(
     settings = apply_preset(preset, {"sharpen": sharpen, "init": init}, PRESETS)
     seed = seed_of(seed, rng)
     check_count("sharpen", settings["sharpen"])
-    if settings["init"] not in INITS:
-        raise ValueError(f"init must be {' or '.join(map(repr, INITS))}; found {init!r}")
-    methods = checked_methods(by_new_names(methods), preset)
+    check_choice("init", settings["init"], INITS)
+    check_switch("keep", keep)
+    methods = checked_methods(methods, preset)
     in_memory = isinstance(source, xr.Dataset)
     if any(isinstance(target, xr.Dataset) != in_memory for target in targets.values()):
         raise ValueError("source and targets need to be all paths or all Datasets")
-    check_switch("keep", keep)
     if keep and any("/" in str(name) for name in targets):
         raise ValueError(f"with keep=True names of pairs hold no '/'; found {', '.join(targets)}")
-    options = {"k_init": k_init, "k": k, "step": step} | settings
+    options: dict[str, Any] = {"k_init": k_init, "k": k, "step": step} | settings
     rows, nodes, notes = [], {}, {}
     with threadpool_limits(1):
         mesh, load_source = load_mesh(source, "source")
@@ -323,37 +296,30 @@ def pairs(
         for name, target in tqdm(targets.items(), desc="pairs", disable=len(targets) < 2):
             mesh, load_target = load_mesh(target, f"target {name}")
             N = Spaces(mesh, n_coarse, k, seed)
-            vertices = None
-            if landmarks is not None:
-                at_source, at_target = (
-                    landmark_vertices(np.asarray(marks), end.mesh, in_memory)
-                    for marks, end in zip(landmarks[name], (M, N), strict=True)
-                )
-                check_landmarks(at_source, at_target, M, N)
-                vertices = at_source, at_target
+            marks = None if landmarks is None else landmarks_of(landmarks[name], M, N, in_memory)
             true = None if truth is None else truth[name]
             if true is not None and not in_memory:
                 true = truth_in_meshes(true, M.mesh, N.mesh)
-            load = load_source + load_target
+            both = Pair(M, N, marks, **options)
             row, outcomes = metrics_of_pair(
-                M, N, methods, vertices, load, true, n_geodesic, options
+                both, methods, load_source + load_target, true, n_geodesic
             )
             rows.append(row)
             notes[name] = row.attrs.pop("note", "")
             if keep:
                 nodes[f"pairs/{name}"] = kept(M.mesh, N.mesh, outcomes, true)
     table = xr.concat(rows, "pair", combine_attrs="drop_conflicts")
-    attrs = options | {"n_coarse": n_coarse, "seed": seed}
     table = table.assign_coords(pair=list(targets)).transpose("way", "pair", ...)
-    table = table.assign_attrs(attrs | told(notes))
+    table = table.assign_attrs(options | {"n_coarse": n_coarse, "seed": seed} | told(notes))
     if not keep:
         return table
     return xr.DataTree.from_dict({"metrics": table, "source": without_coords(M.mesh), **nodes})
 
 
-def note_on_k(k: int, least: int) -> str:
-    """What is told where meshes have fewer functions than k."""
-    return f"k = {k} reduced to {least}, the eigenfunctions that the smaller mesh has"
+def note_on_k(k: int, least: int) -> dict[str, str]:
+    """What is told, as an attribute, where meshes have fewer functions than k."""
+    note = f"k = {k} reduced to {least}, the eigenfunctions that the smaller mesh has"
+    return {"note": note} if least < k else {}
 
 
 def told(notes: Mapping[str, str]) -> dict[str, str]:
@@ -386,24 +352,22 @@ def kept(
         ``true_position(vertex, xyz)``, ``true_match(vertex)`` and ``way_error(way, vertex)``, the
         distance to it in a straight line as a share of sqrt(area), NaN where it is unknown.
     """
-    X, T = as_arrays(source)
-    Y, S = as_arrays(target)
-    images = [X[one.match] if one.image is None else one.image for one in outcomes.values()]
+    (X, T), (Y, S), each = as_arrays(source), as_arrays(target), outcomes.values()
+    images = [X[one.match] if one.image is None else one.image for one in each]
     found: dict[str, ArrayLike] = {
-        "way_match": np.stack([one.match.astype(np.int32) for one in outcomes.values()]),
-        "way_reverse": np.stack([one.reverse.astype(np.int32) for one in outcomes.values()]),
+        "way_match": np.stack([one.match for one in each]).astype(np.int32),
+        "way_reverse": np.stack([one.reverse for one in each]).astype(np.int32),
         "way_image": np.stack(images).astype(np.float32),
         "way_area": np.stack([log_area_ratio(image, Y, S) for image in images]).astype(np.float32),
     }
-    if any(one.fmap is not None for one in outcomes.values()):
-        found["way_fmap"] = stacked([one.fmap for one in outcomes.values()])
-        found["way_fmap_initial"] = stacked([one.first for one in outcomes.values()])
+    if any(one.fmap is not None for one in each):
+        found["way_fmap"] = stacked([one.fmap for one in each])
+        found["way_fmap_initial"] = stacked([one.first for one in each])
     if truth is not None:
         true, vertex = metrics.true_positions(truth, X, len(Y))
-        size = np.sqrt(vertex_areas(X, T).sum())
+        errors = np.linalg.norm(np.stack(images) - true, axis=2) / np.sqrt(vertex_areas(X, T).sum())
         found |= {"true_position": true, "true_match": vertex.astype(np.int32)}
-        errors = [np.linalg.norm(image - true, axis=1) / size for image in images]
-        found["way_error"] = np.stack(errors).astype(np.float32)
+        found["way_error"] = errors.astype(np.float32)
     return without_coords(target).merge(dataset(None, **found)).assign_coords(way=list(outcomes))
 
 
@@ -425,66 +389,46 @@ def stacked(maps: list[np.ndarray | None]) -> np.ndarray:
     return found
 
 
-def landmark_vertices(given: np.ndarray, mesh: xr.Dataset, clean: bool) -> np.ndarray:
-    """Vertices of the mesh that landmarks mean.
+def landmarks_of(given: Any, source: Spaces, target: Spaces, clean: bool) -> Matches:
+    """Vertices of both meshes that landmarks mean.
 
-    The nearest ones to positions ``(p, 3)``, or those that rows of its file became.
+    The nearest ones to positions ``(p, 3)``, or those that rows of their files became.
     """
-    if given.ndim == 2 and given.shape[1] == 3:
-        return cKDTree(mesh["position"].values).query(given)[1]
-    return given if clean or given.dtype.kind not in "iu" else in_mesh(given, mesh)
-
-
-def check_landmarks(
-    at_source: np.ndarray, at_target: np.ndarray, source: Spaces, target: Spaces
-) -> None:
-    """ValueError unless they are pairs of vertices of both shapes."""
-    ends = ((at_source, source), (at_target, target))
-    good = all(v.ndim == 1 and v.dtype.kind in "iu" and v.min(initial=0) >= 0 for v, _ in ends)
-    if (
-        not good
-        or len(at_source) != len(at_target)
-        or len(at_source) < 3
-        or any(v.max() >= len(s.X) for v, s in ends)
-    ):
-        raise ValueError(
-            "landmarks need two arrays of at least 3 vertices that the clean meshes have, of the "
-            f"source and of the target; found {at_source.tolist()} and {at_target.tolist()}"
-        )
+    ends: list[np.ndarray] = []
+    for marks, space in zip(given, (source, target), strict=True):
+        at = np.asarray(marks)
+        if at.ndim == 2 and at.shape[1] == 3:
+            at = cKDTree(space.mesh["position"].values).query(at)[1]
+        elif not clean and at.dtype.kind in "iu":
+            at = in_mesh(at, space.mesh)
+        ends.append(at)
+        good = at.ndim == 1 and at.dtype.kind in "iu" and len(at) >= 3
+        if not (good and 0 <= at.min() <= at.max() < len(space.X) and len(at) == len(ends[0])):
+            raise ValueError(
+                "landmarks need two arrays of at least 3 vertices that the clean meshes have, of "
+                f"the source and of the target; found {at.tolist()} of the "
+                f"{'target' if len(ends) > 1 else 'source'}"
+            )
+    return ends[0], ends[1]
 
 
 def metrics_of_pair(
-    source: Spaces,
-    target: Spaces,
-    methods: Sequence[str],
-    landmarks: Matches | None,
-    load: float,
-    truth: np.ndarray | None,
-    n_geodesic: int,
-    options: dict[str, Any],
+    both: Pair, methods: Sequence[str], load: float, truth: np.ndarray | None, n_geodesic: int
 ) -> tuple[xr.Dataset, dict[str, Outcome]]:
     """All methods on one pair: metrics and times over ``way``, and what each has found."""
-    both = Pair(source, target, landmarks, **options)
-    rows, seconds, outcomes = [], [], {}
-    for method in methods:
-        outcome = outcomes[method] = both.run(method)
-        row = metrics.evaluate(
-            source.mesh,
-            target.mesh,
-            outcome.match,
-            image=outcome.image,
-            reverse=outcome.reverse,
-            truth=truth,
-            n_geodesic=n_geodesic,
-        )
-        rows.append(row)
-        spent = {"load and clean": load} | outcome.seconds
+    outcomes = {method: both.run(method) for method in methods}
+    options: dict[str, Any] = {"truth": truth, "n_geodesic": n_geodesic}
+    rows, seconds = [], []
+    for one in outcomes.values():
+        found: dict[str, Any] = {"image": one.image, "reverse": one.reverse}
+        M, N = both.source.mesh, both.target.mesh
+        rows.append(metrics.evaluate(M, N, one.match, **found, **options))
+        spent = {**one.seconds, BLOCKS[0]: load}
         seconds.append([spent.get(block, 0.0) for block in BLOCKS])
     table = xr.concat(rows, "way", combine_attrs="drop_conflicts")
     table["block_seconds"] = variable("block_seconds", np.array(seconds)[:, None]).isel(pair=0)
     least = min((len(one.fmap) for one in both.spectral.values()), default=both.k)
-    if least < both.k:
-        table.attrs["note"] = note_on_k(both.k, least)
+    table.attrs |= note_on_k(both.k, least)
     return table.assign_coords(way=list(methods), block=list(BLOCKS)), outcomes
 
 
@@ -545,22 +489,12 @@ def collection(
     >>> found["collection_chamfer"].dims
     ('way', 'how', 'shape')
     """
-    wrong = [m for m in methods if m not in COLLECTION_METHODS]
-    if wrong or not len(methods):
-        raise ValueError(
-            f"methods must be some of {', '.join(COLLECTION_METHODS)}; found {wrong or methods!r}"
-        )
-    given = {"init": init, "n_spread": n_spread, "wide": wide}
+    check_some(methods, COLLECTION_METHODS)
+    given: dict[str, Any] = {"init": init, "n_spread": n_spread, "wide": wide}
     presets = {name: {key: STUDY_PRESETS[name][key] for key in given} for name in (None, "paper")}
-    options = Options(
-        n_coarse=n_coarse,
-        n_pairs=n_pairs,
-        k_init=k_init,
-        k=k,
-        step=step,
-        seed=seed_of(seed, rng),
-        **apply_preset(preset, given, presets),
-    )
+    given = apply_preset(preset, given, presets) | {"seed": seed_of(seed, rng)}
+    given |= {"n_coarse": n_coarse, "n_pairs": n_pairs, "k_init": k_init, "k": k, "step": step}
+    options = Options(**given)
     begin = time.process_time()
     tree = shapes if isinstance(shapes, xr.DataTree) else read_shapes(shapes)
     load = time.process_time() - begin
@@ -568,64 +502,48 @@ def collection(
     if len(meshes) < 2:
         raise ValueError(f"a collection needs at least 2 shapes, found {len(meshes)}")
     with threadpool_limits(1):
-        rows = [
-            one_collection(meshes, way, load, options) for way in tqdm(methods, desc="collection")
-        ]
+        bar = tqdm(methods, desc="collection")
+        rows = [one_collection(meshes, way, load, options) for way in bar]
     notes = {way: row.attrs.pop("note", "") for way, row in zip(methods, rows, strict=True)}
     table = xr.concat(rows, "way").assign_coords(way=list(methods))
     return table.assign_attrs(told(notes))
 
 
 def one_collection(
-    meshes: dict[str, xr.Dataset],
-    way: str,
-    load: float,
-    options: Options,
+    meshes: dict[str, xr.Dataset], way: str, load: float, options: Options
 ) -> xr.Dataset:
     """One row of Table 2."""
-    names = list(meshes)
+    names, clock = list(meshes), Clock()
     begin = time.process_time()
     spaces = [Spaces(mesh, options.n_coarse, options.k, options.seed) for mesh in meshes.values()]
     shapes = [space.local if way == "SCALABLE" else space.coarse for space in spaces]
     bases = [shape.low for shape in shapes]
     k = min(options.k, *(basis.k for basis in bases))
     source, target, maps = first_maps(bases, options)
-    network_seconds = time.process_time() - begin
-
-    begin = time.process_time()
-    _, _, _, Y, latent_eigenvalue = latent.consistent_zoomout(
-        bases,
-        maps,
-        source,
-        target,
-        k,
-        step=options.step,
-        samples=[basis.spread_vertices(options.n_spread) for basis in bases],
-        wide=options.wide,
-    )
-    found = dataset(latent_basis=Y, latent_eigenvalue=latent_eigenvalue).assign_coords(shape=names)
-    found = median.median_shape(found, np.stack([basis.eigenvalue[:k] for basis in bases]))
-    zoomout_seconds = time.process_time() - begin
-
+    shared = [load, time.process_time() - begin]
+    samples = [basis.spread_vertices(options.n_spread) for basis in bases]
+    growth: dict[str, Any] = {"step": options.step, "samples": samples, "wide": options.wide}
+    ends = source, target, k
+    *_, Y, low = clock("latent", latent.consistent_zoomout, bases, maps, *ends, **growth)
+    found = dataset(latent_basis=Y, latent_eigenvalue=low).assign_coords(shape=names)
+    spectra = np.stack([basis.eigenvalue[:k] for basis in bases])
+    found = clock("latent", median.median_shape, found, spectra)
+    shared.append(clock["latent"])
     template = names.index(found.attrs["median"])
-    chamfer = np.full((len(HOW), len(names)), np.nan)
-    seconds = []
-    for row, how in enumerate(HOW):
-        chamfer[row], full_seconds = chamfer_to_template(spaces, shapes, Y, template, how)
-        seconds.append([load, network_seconds, zoomout_seconds, full_seconds])
-    measures = xr.Dataset(
-        {
-            "collection_chamfer": variable("collection_chamfer", chamfer[None]).isel(way=0),
-            "collection_seconds": variable("collection_seconds", np.array(seconds)[None]).isel(
-                way=0
-            ),
-            "median_shape": variable("median_shape", np.array([names[template]])).isel(way=0),
-            "distance_to_median": found["distance_to_median"].variable,
-        }
+    chamfer, full = zip(
+        *(chamfer_to_template(spaces, shapes, Y, template, how) for how in HOW), strict=True
     )
-    if k < options.k:
-        measures.attrs["note"] = note_on_k(options.k, k)
-    return measures.assign_coords(how=list(HOW), block=list(COLLECTION_BLOCKS), shape=names)
+    measures = {
+        "collection_chamfer": np.stack(chamfer),
+        "collection_seconds": np.array([[*shared, seconds] for seconds in full]),
+        "median_shape": np.array(names[template]),
+    }
+    table = xr.Dataset(
+        {name: variable(name, values[None]).isel(way=0) for name, values in measures.items()}
+        | {"distance_to_median": found["distance_to_median"].variable},
+        attrs=note_on_k(options.k, k),
+    )
+    return table.assign_coords(how=list(HOW), block=list(COLLECTION_BLOCKS), shape=names)
 
 
 def first_maps(bases: list[Basis], options: Options) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -633,25 +551,21 @@ def first_maps(bases: list[Basis], options: Options) -> tuple[np.ndarray, np.nda
     k_init = min(options.k_init, *(basis.k for basis in bases))
     distance = network.spectral_distance([basis.eigenvalue[:k_init] for basis in bases])
     reference = bases[int(np.argmin(distance.sum(1)))]
-    motions = []
-    for basis in bases:
-        motion = np.eye(3), np.zeros(3)
-        if basis is not reference:
-            motion = align(basis.X, basis.area, reference.X, reference.area)[:2]
-        motions.append(motion)
-    source, target, maps = [], [], []
+    still = np.eye(3), np.zeros(3)
+    motions = [
+        still if M is reference else align(M.X, M.area, reference.X, reference.area)[:2]
+        for M in bases
+    ]
+    settings: dict[str, Any] = {"k_init": k_init, "init": options.init}
+    settings["n_spread"] = options.n_spread
+    ends, maps = [], []
     for i, j in network.choose_pairs(distance, options.n_pairs):
         M, N = bases[i], bases[j]
-        start = motion_between(motions[i], motions[j])
-        R, t = realign(M.cloud, N.cloud, start)
-        for one, other, way in ((M, N, (R, t)), (N, M, (R.T, -R.T @ t))):
-            C = map_after_motion(
-                one, other, way, n_spread=options.n_spread, k_init=k_init, init=options.init
-            )
-            maps.append(C)
-        source += [i, j]
-        target += [j, i]
-    return np.array(source), np.array(target), np.stack(maps)
+        R, t = realign(M.cloud, N.cloud, motion_between(motions[i], motions[j]))
+        maps.append(map_after_motion(M, N, (R, t), **settings))
+        maps.append(map_after_motion(N, M, (R.T, -R.T @ t), **settings))
+        ends += [(i, j), (j, i)]
+    return *np.array(ends).T, np.stack(maps)
 
 
 def chamfer_to_template(
@@ -664,11 +578,8 @@ def chamfer_to_template(
         if i == template:
             continue
         begin = time.process_time()
-        bases = Y[i], Y[template]
-        if how == "standard":
-            _, functions = match_low(shape, shapes[template], bases, how=how)
-        else:
-            functions = latent_functions(shape, shapes[template], bases)
+        ends = shape, shapes[template], (Y[i], Y[template])
+        functions = match_low(*ends, how=how)[1] if how == HOW[0] else latent_functions(*ends)
         match, *_ = match_functions(shape, shapes[template], *functions)
         seconds += time.process_time() - begin
         chamfer[i] = metrics.chamfer(space.X, space.X[match])

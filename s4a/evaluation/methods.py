@@ -10,7 +10,8 @@ Times are CPU seconds of one core, so that a busy machine changes them little.
 """
 
 import time
-from collections.abc import Callable
+from collections import defaultdict
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -41,41 +42,22 @@ from s4a.method.spectral import eigenpairs, spectrum
 PAPER_METHODS = ("kNN", "ZO", "FMAP+ZO", "SCALABLE", "RE-MATCH")
 OUR_METHODS = ("RE-MATCH lifted", "registered", "registered surface")
 METHODS = (*PAPER_METHODS, *OUR_METHODS)
-OLD_NAMES = {
-    "RE-MATCH joint": "registered",
-    "joint": "registered",
-    "joint surface": "registered surface",
-}
 # the shape of Spaces whose functions a method compares; registration begins with RE-MATCH's match
-KINDS = {
-    "ZO": "dense",
-    "FMAP+ZO": "dense",
-    "SCALABLE": "local",
-    "RE-MATCH": "coarse",
-    "RE-MATCH lifted": "lifted",
-    "registered": "coarse",
-    "registered surface": "coarse",
-}
-BLOCKS = (
-    "load and clean",
-    "align",
-    "sample",
-    "basis",
-    "map",
-    "refine",
-    "full resolution",
-)  # of Fig. 3
+KINDS = {"ZO": "dense", "FMAP+ZO": "dense", "SCALABLE": "local", "RE-MATCH": "coarse"}
+KINDS |= {"RE-MATCH lifted": "lifted", "registered": "coarse", "registered surface": "coarse"}
+# of Fig. 3
+BLOCKS = ("load and clean", "align", "sample", "basis", "map", "refine", "full resolution")
 N_SPREAD = 3000  # points of each shape by which it is aligned, and that group dense searches
 INITS = ("landmarks", "descriptors")  # fits of first maps
 
 Matches = tuple[np.ndarray, np.ndarray]
 
 
-class Clock:
+class Clock(defaultdict[str, float]):
     """CPU seconds by block."""
 
     def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
+        super().__init__(float)
 
     def __call__(
         self, block: str, function: Callable[..., Any], *arguments: Any, **options: Any
@@ -83,12 +65,13 @@ class Clock:
         """What a function gives; its seconds go to the block."""
         begin = time.process_time()
         result = function(*arguments, **options)
-        self.add(block, time.process_time() - begin)
+        self[block] += time.process_time() - begin
         return result
 
-    def add(self, block: str, seconds: float) -> None:
-        """Seconds that were spent on a block, once more perhaps."""
-        self.seconds[block] = self.seconds.get(block, 0.0) + seconds
+    def add(self, seconds: Mapping[str, float]) -> None:
+        """Seconds that were spent on some blocks, once more perhaps."""
+        for block, spent in seconds.items():
+            self[block] += spent
 
 
 @dataclass
@@ -186,32 +169,23 @@ def at_low_resolution(M: Shape, N: Shape, landmarks: Matches) -> list[np.ndarray
 
 
 def fit_map(M: Shape, N: Shape, landmarks: Matches, k: int) -> np.ndarray:
-    """First map ``(k, k)`` from landmarks and wave kernels, see `fmap.fit_descriptors`."""
+    """First map ``(k, k)`` from landmarks and wave kernels, see `fmap.fmap_from_descriptors`."""
     at_source, at_target = at_low_resolution(M, N, landmarks)
     bases = [replace(shape.low, area=shape.low.area / shape.low.area.sum()) for shape in (M, N)]
     return fmap.fmap_from_descriptors(*bases, k=k, landmarks=(at_source, at_target), oriented=0)
 
 
-class SpectralMatch(NamedTuple):
-    """What a spectral method finds: the match, the functions behind it, and the coarse match."""
-
-    match: np.ndarray  # (n_target,)
-    functions: tuple[np.ndarray, np.ndarray]  # at all vertices, of source and target
-    low_match: np.ndarray  # (n_low_target,)
-    first: np.ndarray  # (k_init, k_init), the first map
-    fmap: np.ndarray  # (k, k), the refined one
-    seconds: dict[str, float]
-
-
 class Outcome(NamedTuple):
-    """One method on one pair."""
+    """One method on one pair; a spectral one also has its maps, and the functions behind them."""
 
     match: np.ndarray  # (n_target,)
     image: np.ndarray | None  # (n_target, 3), where the method gives more than vertices
-    reverse: np.ndarray  # (n_source,), the match the other way
+    reverse: Any  # (n_source,), the match the other way
     seconds: dict[str, float]
-    first: np.ndarray | None = None  # (k_init, k_init), the first map where there is one
-    fmap: np.ndarray | None = None  # (k, k), the refined one
+    first: np.ndarray | None = None  # (k_init, k_init), the first map
+    fmap: Any = None  # (k, k), the refined one
+    functions: Any = None  # at all vertices, of source and target
+    low_match: Any = None  # (n_low_target,)
 
 
 @dataclass
@@ -240,7 +214,7 @@ class Pair:
     step: int = 5
     sharpen: int = 2
     init: str = "landmarks"
-    spectral: dict[str, SpectralMatch] = field(default_factory=dict)
+    spectral: dict[str, Outcome] = field(default_factory=dict)
 
     def run(self, method: str) -> Outcome:
         """A method of :data:`METHODS`."""
@@ -250,32 +224,25 @@ class Pair:
         registers = method.startswith("registered")
         aligned = self.landmarks is None or method in ("kNN", "ZO") or registers
         if aligned:
-            clock.add("align", align_seconds)
+            clock["align"] += align_seconds
         if not remeshed and (aligned or method == "FMAP+ZO"):
             # spread points align, and group the searches of the dense methods
-            spent = sum(end.clock.seconds["spread"] for end in (self.source, self.target))
-            clock.add("align" if aligned else "refine", spent)
+            spent = sum(end.clock["spread"] for end in (self.source, self.target))
+            clock["align" if aligned else "refine"] += spent
         if method == "kNN":
-            match, reverse = clock(
-                "full resolution", match_in_space, self.source, self.target, motion
-            )
-            return Outcome(match, None, reverse, clock.seconds)
-
-        start = "RE-MATCH" if registers else method
-        spectral = self.match_spectrally(start, motion, landmarks)
-        for block, seconds in spectral.seconds.items():
-            clock.add(block, seconds)
+            ends = self.source, self.target
+            match, reverse = clock("full resolution", match_in_space, *ends, motion)
+            return Outcome(match, None, reverse, clock)
+        spectral = self.match_spectrally("RE-MATCH" if registers else method, motion, landmarks)
+        clock.add(spectral.seconds)
         if registers:
-            match, surface, reverse, of_registration = self.registered
-            for block, seconds in of_registration.items():
-                clock.add(block, seconds)
-            image = surface if method == "registered surface" else None
-            return Outcome(match, image, reverse, clock.seconds)
+            found = self.registered
+            clock.add(found.seconds)
+            image = found.image if method == "registered surface" else None
+            return found._replace(image=image, seconds=clock)
         M, N = self.shapes(method)
         F, G = spectral.functions
-        reverse = nearest_in_cells(F, M.cell, G, N.cell)[0]
-        maps = spectral.first, spectral.fmap
-        return Outcome(spectral.match, None, reverse, clock.seconds, *maps)
+        return spectral._replace(reverse=nearest_in_cells(F, M.cell, G, N.cell)[0], seconds=clock)
 
     def shapes(self, method: str) -> tuple[Shape, Shape]:
         """Source and target in the functions of a method."""
@@ -300,9 +267,9 @@ class Pair:
         landmarks = self.landmarks
         if landmarks is None:
             landmarks = clock("align", landmarks_after_motion, self.source.X, self.target.X, (R, t))
-        return (R, t), landmarks, clock.seconds["align"]
+        return (R, t), landmarks, clock["align"]
 
-    def match_spectrally(self, method: str, motion: Motion, landmarks: Matches) -> SpectralMatch:
+    def match_spectrally(self, method: str, motion: Motion, landmarks: Matches) -> Outcome:
         """A method of functions: first map, ZoomOut and match at full resolution."""
         if method not in self.spectral:
             self.spectral[method] = self._match_spectrally(method, motion, landmarks)
@@ -317,8 +284,7 @@ class Pair:
         parts = ("remeshed", kind) if kind in ("coarse", "lifted") else (kind,)
         for block in ("sample", "basis"):
             for end in (self.source, self.target):
-                spent = [end.clock.seconds.get(f"{part} {block}", 0.0) for part in parts]
-                clock.add(block, sum(spent))
+                clock[block] += sum(end.clock.get(f"{part} {block}", 0.0) for part in parts)
         if method == "ZO":
             match, _ = clock("map", match_in_space, self.source, self.target, motion)
             Phi, Psi = M.low.Phi[:, :k_init], N.low.Phi[:, :k_init]
@@ -339,10 +305,8 @@ class Pair:
             # other searches follow, so that near ties do not matter
             "lifted": lambda Q, D: nearest_float32(as_queries(Q), as_candidates(D)),
         }[kind]
-        first = C
-        C, low_match = clock(
-            "refine", fmap.zoomout, M.low, N.low, C, k, step=self.step, nearest=nearest
-        )
+        first, options = C, {"step": self.step, "nearest": nearest}
+        C, low_match = clock("refine", fmap.zoomout, M.low, N.low, C, k, **options)
         if kind == "lifted":
             for _ in range(self.sharpen):
                 C = clock("refine", sharpen_map, M, N, C, M.full.Phi)
@@ -351,26 +315,19 @@ class Pair:
         match = low_match
         if kind != "dense":
             match, *_ = clock("full resolution", nearest_in_cells, G, N.cell, F, M.cell)
-        return SpectralMatch(match, (F, G), low_match, first, C, clock.seconds)
+        return Outcome(match, None, None, clock, first, C, (F, G), low_match)
 
     @cached_property
-    def registered(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, float]]:
-        """Registration by default after RE-MATCH.
-
-        Match, registered surface, match the other way, and seconds.
-        """
+    def registered(self) -> Outcome:
+        """Registration by default after RE-MATCH; its image is the registered surface."""
         clock = Clock()
         M, N = self.shapes("registered")
         motion, landmarks, _ = self.align_remeshed
         spectral = self.match_spectrally("RE-MATCH", motion, landmarks)
-        starts = {
-            "intrinsic": spectral.low_match,
-            "icp": nearest_after_motion(M.low, N.low, motion),
-        }
-        k = len(spectral.fmap)
-        tried = clock("refine", find_candidates, M, N, starts, k=k)
-        match, moved, _ = clock(
-            "full resolution", register_surface, M, N, tried, spectral.functions, elastic=True
-        )
+        icp = nearest_after_motion(M.low, N.low, motion)
+        starts = {"intrinsic": spectral.low_match, "icp": icp}
+        tried = clock("refine", find_candidates, M, N, starts, k=len(spectral.fmap))
+        ends = M, N, tried, spectral.functions
+        match, moved, _ = clock("full resolution", register_surface, *ends, elastic=True)
         reverse = match_surfaces(M.full.X, M.full.normals, moved.X, moved.normals)
-        return match, M.from_frame(moved.X), reverse, clock.seconds
+        return Outcome(match, M.from_frame(moved.X), reverse, clock)

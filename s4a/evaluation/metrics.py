@@ -350,14 +350,12 @@ def dice(found: ArrayLike, true: ArrayLike, area: np.ndarray | None = None) -> d
     """
     found, true = np.asarray(found), np.asarray(true)
     area = np.ones(len(found)) if area is None else area
-    return {
-        label: float(
-            2
-            * area[(found == label) & (true == label)].sum()
-            / (area[found == label].sum() + area[true == label].sum())
-        )
-        for label in np.union1d(found, true).tolist()
-    }
+    overlap = {}
+    for label in np.union1d(found, true).tolist():
+        here, there = found == label, true == label
+        both = 2 * area[here & there].sum()
+        overlap[label] = float(both / (area[here].sum() + area[there].sum()))
+    return overlap
 
 
 def landmark_error(found: ArrayLike, true: ArrayLike) -> np.ndarray:
@@ -429,18 +427,18 @@ def true_positions(truth: ArrayLike, X: np.ndarray, n: int) -> tuple[np.ndarray,
 def _match_of(match, mesh, other, what):
     match = np.asarray(match)
     n, p = mesh.sizes["vertex"], other.sizes["vertex"]
-    if (
-        match.shape != (n,)
-        or match.dtype.kind not in "iu"
-        or match.min(initial=0) < 0
-        or match.max(initial=0) >= p
-    ):
+    low, high = match.min(initial=0), match.max(initial=0)
+    if match.shape != (n,) or match.dtype.kind not in "iu" or low < 0 or high >= p:
         raise ValueError(
             f"{what} needs {n} integers from 0 to {p - 1}, one for each vertex; "
-            f"found {match.dtype} of shape {match.shape} "
-            f"from {match.min(initial=0)} to {match.max(initial=0)}"
+            f"found {match.dtype} of shape {match.shape} from {low} to {high}"
         )
     return match
+
+
+def _some(n, most):
+    """At most so many of n rows, evenly spaced."""
+    return np.unique(np.linspace(0, n - 1, min(most, n)).astype(int))
 
 
 def evaluate(
@@ -520,8 +518,6 @@ def evaluate(
         raise ValueError(
             f"image needs a position for each vertex of the target, {Y.shape}; found {image.shape}"
         )
-    sample = np.unique(np.linspace(0, len(Y) - 1, min(n_geodesic, len(Y))).astype(int))
-
     forth, back = gaps(X / size, image / size)
     conformal, growth = distortion(Y / size_target, image / size, S)
     weight = triangle_areas(Y, S)
@@ -538,6 +534,7 @@ def evaluate(
     }
     if reverse is not None:
         reverse = _match_of(reverse, source, target, "reverse")
+        sample = _some(len(Y), n_geodesic)
         found["bijectivity"] = bijectivity(Y, S, match, reverse, vertices=sample).mean()
     coords = {}
     if truth is not None:
@@ -547,9 +544,7 @@ def evaluate(
             raise ValueError(
                 "truth is unknown at every vertex of the target; leave it out, or give some"
             )
-        some = known[
-            np.unique(np.linspace(0, len(known) - 1, min(n_geodesic, len(known))).astype(int))
-        ]
+        some = known[_some(len(known), n_geodesic)]
         error = geodesic_error(X, T, match[some], vertex[some])
         found |= {
             "geodesic_error": error.mean(),
@@ -563,21 +558,17 @@ def evaluate(
         found["label_accuracy"] = label_accuracy(carried, true, area_target)
         found["label_dice"] = np.mean([overlap[label] for label in np.unique(true).tolist()])
     if "landmark_name" in source and "landmark_name" in target:
-        ours, theirs = (
-            dict(
-                zip(
-                    mesh["landmark_name"].values.tolist(),
-                    mesh["landmark_position"].values,
-                    strict=True,
-                )
-            )
-            for mesh in (source, target)
-        )
+        ours, theirs = map(_landmarks, (source, target))
         shared = [name for name in theirs if name in ours]
         if shared:
             place = closest_point(np.array([theirs[name] for name in shared]), Y, S)
-            error = landmark_error(
-                interpolate(image, S, *place), np.array([ours[name] for name in shared])
-            )
+            true = np.array([ours[name] for name in shared])
+            error = landmark_error(interpolate(image, S, *place), true)
             found["landmark_error"] = error.mean() / size
     return dataset(**found).assign_coords(coords)
+
+
+def _landmarks(mesh):
+    """The positions of a mesh's landmarks by name."""
+    names = mesh["landmark_name"].values.tolist()
+    return dict(zip(names, mesh["landmark_position"].values, strict=True))

@@ -1,8 +1,10 @@
 """Cleaning (4.1, before step 1): from the triangles of a file to an oriented manifold surface.
 
-What makes the triangles a manifold, edge by edge, is in :mod:`s4a.input.manifold`, which says how
+What makes the triangles a manifold, edge by edge, is in :mod:`s4a.input.clean`, which says how
 half-edges are counted.
 """
+
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -12,6 +14,8 @@ from s4a.geometry.mesh import (
     as_arrays,
     as_dataset,
     components,
+    counting_order,
+    directed_edges,
     equal_rows,
     euler_characteristic,
     n_used,
@@ -19,14 +23,7 @@ from s4a.geometry.mesh import (
     triangle_normals,
     unique_edges,
 )
-from s4a.input.manifold import (
-    cheapest,
-    fill_holes,
-    join_corners,
-    join_triangles,
-    manifold_mates,
-    split_double_edges,
-)
+from s4a.options import check_components
 from s4a.schema import require
 
 # of the diagonal of the bounding box: nearer vertices are one, lower triangles are flat
@@ -89,7 +86,7 @@ def clean(
         Refuse vertices that are not finite instead of removing them with their triangles.
     close_holes : bool
         Close every hole by a fan of triangles around a new vertex, see
-        :func:`s4a.input.manifold.fill_holes`.
+        :func:`s4a.input.clean.fill_holes`.
 
     Returns
     -------
@@ -212,18 +209,6 @@ def counted(n: float, text: str) -> str:
         many = next(word for word in text.split() if word in SINGULAR)
         text = text.replace(many, SINGULAR[many], 1)
     return f"{n} {text}"
-
-
-def check_components(components: str | int) -> None:
-    """ValueError unless `components` is "largest", "all" or a number from 1."""
-    if isinstance(components, int | np.integer) and not isinstance(components, bool):
-        known = components >= 1
-    else:
-        known = components in ("largest", "all")
-    if not known:
-        raise ValueError(
-            f'components needs to be "largest", "all" or a number from 1; found {components!r}'
-        )
 
 
 def _validated(points, triangles, components):
@@ -407,7 +392,7 @@ def _flips(P, F, group, flat, tolerance):
     #    /   \               / | \       q p b is flat: b lies on the long edge, and may lie beyond;
     #   p-----q     ->      p  |  q      p q d keeps its orientation, as it has the area
     #    \.b./               \.b./
-    m, corner = len(F), F.T.ravel()  # corner h starts half-edge h, see s4a.input.manifold
+    m, corner = len(F), F.T.ravel()  # corner h starts half-edge h, see s4a.input.clean
     E, edge_of, count = unique_edges(group[F], len(P))
     half = flat + m * _heights(P, F[flat])[1]
     at_boundary = flat[count[edge_of[half]] == 1]
@@ -523,3 +508,253 @@ def _vertex_of_file(group, new, file_vertex):
     own = first(file_vertex, len(group))
     welded = np.r_[first(group[file_vertex], group.max() + 1), -1]  # the last for group -1
     return np.where(own >= 0, own, welded[group]).astype(np.int32)
+
+
+MOST_AROUND_EDGE = 16  # an edge with more triangles is cut: pairing takes their number squared
+
+
+def manifold_mates(edge_of: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """The mate of each half-edge ``(3 m,)`` on edges with two triangles, else -1.
+
+    `edge_of` and `count` are those of :func:`s4a.geometry.mesh.unique_edges`.
+    """
+    order = counting_order(edge_of, len(count))
+    first = (np.cumsum(count) - count)[count == 2]
+    one, other = order[first], order[first + 1]
+    mate = np.full(len(edge_of), -1)
+    mate[one], mate[other] = other, one
+    return mate
+
+
+def join_triangles(
+    P: np.ndarray, F: np.ndarray, group: np.ndarray, counts: dict[str, Any]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find the mates of all half-edges, and orient the triangles consistently.
+
+    Returns
+    -------
+    F : int ndarray (m, 3)
+        The triangles, some turned.
+    mate : int ndarray (3 m,)
+        Of each half-edge, -1 at boundaries and cuts.
+    """
+    _, edge_of, count = unique_edges(group[F], len(P))
+    F, mate = _orient(P, F, group, manifold_mates(edge_of, count), counts)
+    if (count > 2).any():
+        _, edge_of, count = unique_edges(group[F], len(P))
+        counts["nonmanifold_edges"] = int((count > 2).sum())
+        pairs, cost = _pairs_around_edges(P, F, group, edge_of, count)
+        one, other = pairs[cheapest(cost, pairs)].T
+        mate[one], mate[other] = other, one
+        F, mate = _orient(P, F, group, mate, counts)
+    counts["cut_edges"] = int((mate < 0).sum() - (count == 1).sum())
+    return F, mate
+
+
+def _pairs_around_edges(P, F, group, edge_of, count):
+    """All pairs of half-edges on each non-manifold edge, and how badly each continues the surface.
+
+    Returns
+    -------
+    pairs : int ndarray (c, 2)
+    cost : float ndarray (c,)
+        1 - cos of the bend, more for a pair that disagrees in orientation; between equal bends the
+        pair that encloses less of the inside goes first, so that solids that touch in an edge come
+        apart.
+    """
+    order = counting_order(edge_of, len(count))
+    first = np.cumsum(count) - count
+    found = [np.empty((0, 2), np.int64)]
+    for k in range(3, MOST_AROUND_EDGE + 1):
+        around = order[first[count == k][:, None] + np.arange(k)]  # (edges, k) half-edges
+        found += [around[:, [i, j]] for i in range(k) for j in range(i + 1, k)]
+    pairs = np.concatenate(found)
+    h, g = pairs.T
+    m = len(F)
+    normal = triangle_normals(P, F)
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    normal /= np.maximum(length, np.finfo(float).tiny)  # some have lost theirs to rounding
+    start = group[F].T.ravel()
+    twisted = start[h] == start[g]
+    cos = np.einsum("ij,ij->i", normal[h % m], normal[g % m]) * np.where(twisted, -1, 1)
+    corner = F.T.ravel()
+    towards = P[corner[(g + 2 * m) % (3 * m)]] - P[corner[h]]  # to the other one's third corner
+    convex = np.einsum("ij,ij->i", normal[h % m], towards) < 0
+    return pairs, np.round(1 - cos, 6) + 4 * twisted - 1e-7 * convex
+
+
+def _orient(P, F, group, mate, counts):
+    """Turn triangles so that mates run against each other, most of each patch's area as it was.
+
+    A triangle stands for two nodes, as it is and reversed; a patch whose two copies are connected
+    cannot be oriented (a Moebius strip), and is cut where the file's orientation changes.
+    """
+    m = len(F)
+    h = np.flatnonzero(mate > np.arange(3 * m))
+    g = mate[h]
+    start = group[F].T.ravel()
+    twisted = start[h] == start[g]
+    if not twisted.any():
+        return F, mate
+    t, u = h % m, g % m
+    links = np.stack([np.r_[t, t + m], np.r_[u + m * twisted, u + m * ~twisted]], axis=1)
+    label = components(links, 2 * m)
+    as_is, turned = label[:m], label[m:]
+    area = np.bincount(as_is, triangle_areas(P, F), label.max() + 1)
+    tie = (area[turned] == area[as_is]) & (turned < as_is)
+    flip = (area[turned] > area[as_is]) | tie
+    cut = twisted & (as_is == turned)[t]
+    mate[h[cut]] = mate[g[cut]] = -1
+    counts["reoriented_triangles"] += int(flip.sum())
+    return _reverse(F, mate, np.flatnonzero(flip))
+
+
+def _reverse(F, mate, t):
+    """Exchange corners 0 and 1 of triangles t: half-edge 0 stays, 1 and 2 trade places."""
+    m, F = len(F), F.copy()
+    F[t] = F[t][:, [1, 0, 2]]
+    moved = np.arange(3 * m)
+    moved[t + m] = t + 2 * m
+    moved[t + 2 * m] = t + m
+    mate = mate[moved]
+    return F, np.where(mate >= 0, moved[mate], -1)
+
+
+def join_corners(F: np.ndarray, mate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices as the sets of corners that mates join: one for each umbrella of triangles.
+
+    A bow-tie or the end of a separated edge falls apart into several.
+
+    Returns
+    -------
+    V : int ndarray (m, 3)
+        The triangles' corners as such vertices.
+    file_vertex : int ndarray (n,)
+        The smallest file vertex of each.
+    """
+    m = len(F)
+    h = np.flatnonzero(mate > np.arange(3 * m))
+    g = mate[h]
+    # the start of one is the end of the other
+    links = np.stack([np.r_[h, (h + m) % (3 * m)], np.r_[(g + m) % (3 * m), g]], axis=1)
+    label = components(links, 3 * m)
+    file_vertex = np.full(label.max() + 1, np.iinfo(np.int64).max)
+    np.minimum.at(file_vertex, label, F.T.ravel())
+    order = counting_order(file_vertex, F.max() + 1)
+    rank = np.empty_like(file_vertex)
+    rank[order] = np.arange(len(order))
+    return rank.take(label).reshape(3, m).T, file_vertex[order]
+
+
+def split_double_edges(
+    X: np.ndarray, V: np.ndarray, file_vertex: np.ndarray, mate: np.ndarray, counts: dict[str, Any]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Give each of two sheets its own midpoint where they share both ends of an edge.
+
+    Returns
+    -------
+    X : float ndarray (n + s, 3)
+        The midpoints appended.
+    V : int ndarray (m', 3)
+        A triangle with midpoints is replaced by those around them.
+    file_vertex : int ndarray (n + s,)
+    """
+    m, n = len(V), len(X)
+    E, edge_of, count = unique_edges(V, n)
+    start = V.T.ravel()
+    turn = np.bincount(edge_of, np.where(start < np.roll(start, -m), 1, -1))
+    double = (count > 2) | ((count == 2) & (turn != 0))
+    half = np.flatnonzero(double[edge_of])
+    if len(half) == 0:
+        return X, V, file_vertex
+    sheet = np.where(mate[half] >= 0, np.minimum(mate[half], half), half)
+    sheets, middle = np.unique(sheet, return_inverse=True)
+    of_half = np.full(3 * m, -1)
+    of_half[half] = n + middle
+    M = of_half.reshape(3, m).T  # (m, 3) the midpoint of each side, or -1
+    #        r             a is there: the sides are turned until it is;
+    #      / | \           without c the triangle a-c-p is none, without b it is a-q-b
+    #    c   |   b
+    #   /  \ | /  \
+    #  p-----a-----q
+    t = np.flatnonzero((M >= 0).any(axis=1))
+    turn = ((M[t] >= 0).argmax(axis=1)[:, None] + np.arange(3)) % 3
+    p, q, r = np.take_along_axis(V[t], turn, 1).T
+    a, b, c = np.take_along_axis(M[t], turn, 1).T
+    b = np.where(b < 0, r, b)
+    c = np.where(c < 0, p, c)
+    parts = [(a, q, b), (a, b, r), (a, r, c), (a, c, p)]
+    fan = np.concatenate([np.stack(part, axis=1) for part in parts])
+    fan = fan[(fan[:, 0] != fan[:, 2]) & (fan[:, 1] != fan[:, 2])]
+    ends = E[edge_of[sheets]]
+    counts["inserted_vertices"] = len(sheets)
+    X = np.concatenate([X, X[ends].mean(axis=1)])
+    V = np.concatenate([np.delete(V, t, axis=0), fan])
+    return X, V, np.r_[file_vertex, file_vertex[ends].min(axis=1)]
+
+
+def cheapest(cost: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Greedy matching: the mask of the pairs taken in order of cost, each end once.
+
+    Parameters
+    ----------
+    cost : float ndarray (c,)
+    ends : int ndarray (c, 2)
+    """
+    if len(cost) == 0:
+        return np.zeros(0, bool)
+    rank = np.argsort(np.argsort(cost, kind="stable"))
+    items, ends = np.unique(ends, return_inverse=True)
+    ends = ends.reshape(-1, 2)
+    taken, used = np.zeros(len(cost), bool), np.zeros(len(items), bool)
+    left = np.arange(len(cost))
+    while len(left):  # all pairs at once that are the best of both their ends
+        best = np.full(len(items), len(cost))
+        np.minimum.at(best, ends[left], rank[left, None])
+        win = left[(best[ends[left]] == rank[left, None]).all(axis=1)]
+        taken[win] = True
+        used[ends[win]] = True
+        left = left[~used[ends[left]].any(axis=1)]
+    return taken
+
+
+def fill_holes(X: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Close every boundary loop of an oriented manifold by a fan around a new vertex.
+
+    Parameters
+    ----------
+    X : float ndarray (n, 3)
+    T : int ndarray (m, 3)
+
+    Returns
+    -------
+    X : float ndarray (n + h, 3)
+        A vertex for each of h loops is appended, at the mean of the loop weighted by the length of
+        its edges.
+    T : int ndarray (m + b, 3)
+        A triangle for each of b boundary edges is appended.
+    nearby : int ndarray (h,)
+        A vertex of each loop.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.input.clean import fill_holes
+    >>> X = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    >>> X, T, nearby = fill_holes(X, np.array([[0, 1, 3], [1, 2, 3], [2, 0, 3]]))
+    >>> X[4].round(2).tolist(), T[3:].tolist(), nearby.tolist()
+    ([0.35, 0.35, 0.0], [[1, 0, 4], [2, 1, 4], [0, 2, 4]], [0])
+    """
+    E, n = directed_edges(T), len(X)
+    E = E[~np.isin(E @ [n, 1], E[:, ::-1] @ [n, 1])]
+    rim, ends = np.unique(E, return_inverse=True)
+    ends = ends.reshape(-1, 2)
+    loop = components(ends, len(rim))
+    of, h = loop[ends[:, 0]], loop.max(initial=-1) + 1
+    length = np.linalg.norm(X[E[:, 0]] - X[E[:, 1]], axis=1)
+    weight = length / np.bincount(of, length, h)[of] if len(E) else length
+    middle = np.stack([np.bincount(of, weight * X[E, i].mean(1), h) for i in range(3)], axis=1)
+    fans = np.column_stack([E[:, 1], E[:, 0], n + of])
+    nearby = np.full(h, n)
+    np.minimum.at(nearby, of, E[:, 0])
+    return np.concatenate([X, middle]), np.concatenate([T, fans]), nearby

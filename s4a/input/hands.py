@@ -1,8 +1,8 @@
 """Left and right (5.1, the data): which shapes are mirror images of the others, and their mirror.
 
-Each shape was held against several others, as it is and mirrored (:mod:`s4a.input.evidence`).  The
-signs that agree best with all of these pairs are those of the leading eigenvector of their matrix:
-no shape is the one that all others are held against.
+Each shape was held against several others, as it is and mirrored
+(:mod:`s4a.input.plausibility`).  The signs that agree best with all of these pairs are those of the
+leading eigenvector of their matrix: no shape is the one that all others are held against.
 """
 
 from collections.abc import Mapping, Sequence
@@ -10,10 +10,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import xarray as xr
 
-from s4a.input.evidence import MIRROR
 from s4a.input.subjects import listed
-from s4a.schema import dataset
 
+MIRROR = np.array([-1.0, 1.0, 1.0])
 COMMON_HAND, OTHER_HAND = 0.8, 0.5  # of the mean of `hand` over the references
 AUTO = "auto"
 YES, NO = ("1", "1.0", "true", "yes"), ("0", "0.0", "false", "no")
@@ -61,7 +60,7 @@ def hands(evidence: Mapping[str, xr.Dataset]) -> np.ndarray:
     Parameters
     ----------
     evidence : dict of str to Dataset
-        Name -> :func:`s4a.input.evidence.compare`.
+        Name -> :func:`s4a.input.plausibility.compare`.
 
     Returns
     -------
@@ -125,19 +124,18 @@ def of_other_hand(evidence: Mapping[str, xr.Dataset]) -> tuple[list[str], list[s
     """
     if len(evidence) < 2:
         return [], ["reflect='auto' needs two shapes or more to hold against each other"]
-    return _rarer(dict(zip(evidence, hands(evidence).tolist(), strict=True)))
+    return of_rarer_hand(dict(zip(evidence, hands(evidence).tolist(), strict=True)))
 
 
-def _rarer(hand, of_both=()):
-    """Those of the rarer hand, and what is told; but those of both hands are told elsewhere."""
+def of_rarer_hand(hand: Mapping[str, float]) -> tuple[list[str], list[str]]:
+    """Those of the rarer hand, by :func:`hands` of each, and what is told."""
     clear = float(np.median(np.abs(list(hand.values()))))
     if clear < COMMON_HAND:
         return [], [
             "reflect='auto' mirrored none: the shapes are too like their own mirror images to tell "
             f"(mean hand {clear:.2f}, {COMMON_HAND} needed); name those to mirror"
         ]
-    of_one = {name: one for name, one in hand.items() if name not in of_both}
-    weak = [name for name, one in of_one.items() if abs(one) < OTHER_HAND]
+    weak = [name for name, one in hand.items() if abs(one) < OTHER_HAND]
     remarks = []
     if weak:
         each = (
@@ -149,94 +147,7 @@ def _rarer(hand, of_both=()):
             f"reflect='auto' cannot tell the hand of {listed(weak, most=20)}, which stayed as "
             f"{each} to be mirrored"
         ]
-    return [name for name, one in of_one.items() if one <= -OTHER_HAND], remarks
-
-
-def seen_together(looks: Mapping[str, Mapping[str, xr.Dataset]]) -> dict[str, xr.Dataset]:
-    """What several structures of each subject say together of its hand, for :func:`hands`.
-
-    Parameters
-    ----------
-    looks : dict of str to dict of str to Dataset
-        Structure -> subject -> :func:`s4a.input.evidence.compare`.
-
-    Returns
-    -------
-    dict of str to Dataset
-        Subject -> ``hand(reference)``, the sum over the n structures that both have, over sqrt(n):
-        their noise is then that of one.  NaN where they have none.
-
-    Examples
-    --------
-    >>> from s4a.input.hands import seen_together
-    >>> from s4a.schema import dataset
-    >>> a = dataset(hand=[0.6]).assign_coords(reference=["b"])
-    >>> seen_together({"left": {"a": a}, "right": {"a": a}})["a"]["hand"].round(2).values.tolist()
-    [0.85]
-    """
-    subjects = sorted({name for of in looks.values() for name in of})
-    beside = [look["reference"].values for of in looks.values() for look in of.values()]
-    references = sorted({str(one) for names in beside for one in names})
-    table = hand_table(looks, subjects, references)
-    known = np.isfinite(table)
-    n = known.sum(0)
-    whole = np.where(n, np.where(known, table, 0).sum(0) / np.sqrt(np.maximum(n, 1)), np.nan)
-    return {
-        name: dataset(hand=row).assign_coords(reference=references)
-        for name, row in zip(subjects, whole, strict=True)
-    }
-
-
-def hand_table(
-    looks: Mapping[str, Mapping[str, xr.Dataset]], subjects: list[str], references: list[str]
-) -> np.ndarray:
-    """``hand`` of every structure ``(structures, subjects, references)``, NaN where not known."""
-    table = np.full((len(looks), len(subjects), len(references)), np.nan)
-    for k, of in enumerate(looks.values()):
-        for name, look in of.items():
-            row = look["hand"].reindex(reference=references).values
-            table[k, subjects.index(name)] = row
-    return table
-
-
-def subjects_of_other_hand(
-    looks: Mapping[str, Mapping[str, xr.Dataset]],
-) -> tuple[dict[str, float], list[str], list[str]]:
-    """The subjects of several structures that ``reflect="auto"`` mirrors, each as a whole.
-
-    Parameters
-    ----------
-    looks : dict of str to dict of str to Dataset
-        As of :func:`seen_together`.
-
-    Returns
-    -------
-    hand : dict of str to float
-        Of every subject, as of :func:`hands`.
-    names : list of str
-        Those of the rarer hand.
-    remarks : list of str
-        In words, as of :func:`of_other_hand`; and which subjects have structures of both hands,
-        and stay as they are: each subject is named once.
-    """
-    together = seen_together(looks)
-    if len(together) < 2:
-        return dict.fromkeys(together, np.nan), *of_other_hand(together)
-    names, mean = list(together), hands(together)
-    hand = dict(zip(names, mean.tolist(), strict=True))
-    table = hand_table(looks, names, names)
-    each = np.array([_mean(one * np.where(mean < 0, -1, 1)) for one in table])
-    both = (each <= -OTHER_HAND).any(0) & (each >= OTHER_HAND).any(0)
-    if np.median(np.abs(mean)) < COMMON_HAND:
-        return hand, *_rarer(hand)
-    chosen, told = _rarer(hand, of_both=[names[i] for i in np.flatnonzero(both)])
-    for i in np.flatnonzero(both):
-        said = [f"{name} {one:+.2f}" for name, one in zip(looks, each[:, i], strict=True)]
-        told.append(
-            f"reflect='auto': {names[i]} is of both hands ({listed(said)}) and stayed as it is: "
-            "was one of its structures mirrored in its file?"
-        )
-    return hand, chosen, told
+    return [name for name, one in hand.items() if one <= -OTHER_HAND], remarks
 
 
 def is_of_other_hand(
@@ -248,7 +159,7 @@ def is_of_other_hand(
     ----------
     name : str
     look : Dataset
-        Of :func:`s4a.input.evidence.compare`.
+        Of :func:`s4a.input.plausibility.compare`.
     known : dict of str to Dataset
         The same of the others.
     """
@@ -267,14 +178,7 @@ def is_of_other_hand(
     return bool(own <= -OTHER_HAND), ""
 
 
-def to_reflect(
-    reflect: str,
-    names: Sequence[str],
-    table: xr.Dataset | None,
-    *,
-    what: str = "shapes",
-    beside: bool = False,
-) -> list[str]:
+def to_reflect(reflect: str, names: Sequence[str], table: xr.Dataset | None) -> list[str]:
     """The shapes that ``reflect=`` names, but for ``"auto"``.
 
     Parameters
@@ -286,16 +190,12 @@ def to_reflect(
         Of all shapes.
     table : Dataset, optional
         ``/subjects``.
-    what : str
-        What they are, for messages.
-    beside : bool
-        Whether they come beside others, so that all of them may be mirrored.
 
     Raises
     ------
     ValueError
-        When a name is none of the shapes, a column is not in the table or lacks a value, or all
-        shapes would be mirrored, or none.
+        When a name is none of the shapes, a column is not in the table or lacks a value, or no
+        shape would be mirrored.
 
     Examples
     --------
@@ -319,17 +219,12 @@ def to_reflect(
     unknown = [name for name in chosen if name not in names]
     if unknown:
         raise ValueError(
-            f"reflect names {listed(list(map(repr, unknown)))}, none of the {what} "
+            f"reflect names {listed(list(map(repr, unknown)))}, none of the shapes "
             f"({listed(list(names), most=8)}), and no column of the table "
             f"({', '.join(columns) or 'there is none'})"
         )
-    if set(chosen) == set(names) and not beside:
-        raise ValueError(
-            f"reflect={reflect!r} mirrors all {len(names)} {what}, which changes nothing among "
-            "them: name those of one hand"
-        )
     if not chosen:
-        raise ValueError(f"reflect={reflect!r} mirrors none of the {len(names)} {what}")
+        raise ValueError(f"reflect={reflect!r} mirrors none of the {len(names)} shapes")
     return [name for name in names if name in chosen]
 
 

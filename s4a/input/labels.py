@@ -8,16 +8,14 @@ design", 1995).
 import io
 import os
 from collections.abc import Iterable
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy import sparse
 
 from s4a.geometry.mesh import directed_edges
-from s4a.input import bounded
-from s4a.input.raw import check_there, shown
+from s4a.input.raw import check_there, content, reading
+from s4a.options import check_label
 
 VOLUMES = {".nii": "NIfTI", ".mgz": "MGH", ".mgh": "MGH"}
 Label = int | str | Iterable[int] | None
@@ -25,46 +23,7 @@ ROUNDS = 20  # of smoothing
 UNPACKED = 2**29  # bytes of a volume that are never refused: labels compress well
 SHRINK, GROW = 0.5, -0.51  # steps of a round: lambda and mu of Taubin
 MILLIMETRES = {"mm": 1.0, "unknown": 1.0, "meter": 1000.0, "micron": 0.001}
-NOTHING = "every voxel is 0: nothing is marked"
 MOST_TOLD = 30  # labels that an error lists
-
-
-def check_label(label: Label) -> int | str | None:
-    """A label as options keep it: a number, several as ``"1,2"``, ``"all"``, or None.
-
-    Raises
-    ------
-    ValueError
-        When it is none of these, or scikit-image is not installed.
-
-    Examples
-    --------
-    >>> from s4a.input.labels import check_label
-    >>> check_label(17), check_label([2, 1]), check_label("1,2"), check_label("all")
-    (17, '1,2', '1,2', 'all')
-    """
-    if label is None or label == "all":
-        known: int | str | None = label
-    else:
-        try:
-            given: Any = label.split(",") if isinstance(label, str) else label
-            numbers = [given] if isinstance(given, int | np.integer) else list(given)
-            if any(isinstance(one, bool | float) for one in numbers):
-                raise ValueError
-            wanted = sorted({int(one) for one in numbers})
-        except (TypeError, ValueError):
-            wanted = []
-        if not wanted or 0 in wanted:
-            raise ValueError(
-                f"label needs a number other than 0, several (1,2) or 'all'; found {label!r}"
-            )
-        known = wanted[0] if len(wanted) == 1 else ",".join(map(str, wanted))
-    if known is not None and find_spec("skimage") is None:
-        raise ValueError(
-            "surfaces from label volumes need scikit-image, which is not installed; "
-            "run: pip install 's4a[labels]'"
-        )
-    return known
 
 
 def is_volume(data: bytes) -> bool:
@@ -106,22 +65,16 @@ def read_volume(
     path = Path(path)
     check_there(path)
     known = check_label(label)
-    try:
-        values, affine, attrs = _volume(bounded.content(path, UNPACKED))
-        inside = _marked(values, known)
-        points, triangles, at_border = _boundary(inside)
-    except Exception as error:  # whatever a file holds, it must not end the run over a collection
-        why = shown(error) or type(error).__name__
-        raise ValueError(f"{shown(path)} cannot be read as a label volume: {why}") from error
+    with reading(path, "a label volume"):
+        values, affine, attrs = _volume(content(path, UNPACKED))
+        points, triangles, at_border = _boundary(_marked(values, known))
     points = points @ affine[:3, :3].T + affine[:3, 3]
     if np.linalg.det(affine[:3, :3]) < 0:
         triangles = triangles[:, ::-1]
     attrs |= {"label": str(known), "unit": "mm"}
-    notes = [attrs.pop("note", "")]
     if at_border:
-        notes.append("what is marked reaches the border of the volume, where it was closed")
-    if any(notes):
-        attrs["note"] = "; ".join(filter(None, notes))
+        closed = "what is marked reaches the border of the volume, where it was closed"
+        attrs["note"] = "; ".join(filter(None, [attrs.get("note"), closed]))
     return smoothed(points, triangles, rounds), np.ascontiguousarray(triangles), attrs
 
 
@@ -130,7 +83,7 @@ def voxels_marked(path: str | os.PathLike[str], label: Label) -> tuple[np.ndarra
 
     See :func:`read_volume`.
     """
-    values, affine, _ = _volume(bounded.content(Path(path), UNPACKED))
+    values, affine, _ = _volume(content(Path(path), UNPACKED))
     return _marked(values, check_label(label)), affine
 
 
@@ -143,13 +96,10 @@ def read_grid(path: str | os.PathLike[str]) -> tuple[tuple[int, ...], np.ndarray
         When the file is no NIfTI or MGH volume of three dimensions.
     """
     check_there(path)
-    try:
-        kind, name = _kind_of(data := bounded.content(Path(path), UNPACKED))
+    with reading(path, "a volume"):
+        kind, name = _kind_of(data := content(Path(path), UNPACKED))
         header = kind.header_class.from_fileobj(io.BytesIO(data))
         return _shape_of(header), _affine_of(header, name)[0]
-    except Exception as error:  # whatever a file holds, the message must name it
-        why = shown(error) or type(error).__name__
-        raise ValueError(f"{shown(path)} cannot be read as a volume: {why}") from error
 
 
 def _volume(data):
@@ -167,11 +117,12 @@ def _volume(data):
             raise ValueError("whole numbers expected, one a structure: this is no label volume")
         values = values.astype(np.int64)
     affine, says = _affine_of(header, name)
-    attrs = {"format": name, "coordinate_system": "RAS"}
-    if not says:
-        del attrs["coordinate_system"]
-        attrs["note"] = "the volume does not say how it lies, left and right may be exchanged"
-    return values, affine, attrs
+    note = "the volume does not say how it lies, left and right may be exchanged"
+    return (
+        values,
+        affine,
+        {"format": name} | ({"coordinate_system": "RAS"} if says else {"note": note}),
+    )
 
 
 def _kind_of(data):
@@ -208,18 +159,15 @@ def _affine_of(header, name):
 
 def _marked(values, label):
     """Which voxels are inside."""
-    if label == "all":
-        inside = values != 0
-        if not inside.any():
-            raise ValueError(NOTHING)
-        return inside
-    wanted = [int(one) for one in str(label).split(",")]
-    found = [int(one) for one in np.unique(values) if one]
+    found = np.unique(values)
+    found = found[found != 0].tolist()
+    if not found:
+        raise ValueError("every voxel is 0: nothing is marked")
+    wanted = found if label == "all" else [int(one) for one in str(label).split(",")]
     missing = [one for one in wanted if one not in found]
     if missing:
         there = ", ".join(map(str, found[:MOST_TOLD])) + " ..." * (len(found) > MOST_TOLD)
-        what = f"label {', '.join(map(str, missing))} expected"
-        raise ValueError(f"{what}, found {there}" if found else NOTHING)
+        raise ValueError(f"label {', '.join(map(str, missing))} expected, found {there}")
     return np.isin(values, wanted)
 
 

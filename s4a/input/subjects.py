@@ -1,6 +1,5 @@
 """Covariates and groups of the shapes (6.1): a table on which only the statistics depend."""
 
-import csv
 import logging
 import re
 from collections.abc import Mapping, Sequence
@@ -11,9 +10,8 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from s4a.input.annotations import is_number, table_rows
-from s4a.input.bounded import content
 from s4a.input.files import slug, stem_of
-from s4a.input.raw import shown, text_of
+from s4a.input.raw import content, reading, text_of
 from s4a.schema import covariate
 
 log = logging.getLogger(__name__)
@@ -23,10 +21,8 @@ PERSON = re.compile(r"(subject|participant|patient|person)([ _-]?(id|nr|no))?", 
 
 
 def _head_and_rows(path):
-    try:
+    with reading(path, "a table"):
         rows = table_rows(text_of(content(path)))
-    except (ValueError, csv.Error) as error:
-        raise ValueError(f"{shown(path)} cannot be read as a table: {shown(error)}") from error
     head = rows.pop(next(iter(rows)))
     if "shape" not in head:
         raise ValueError(
@@ -92,27 +88,9 @@ def read_table(path: Path | str, names: list[str]) -> xr.Dataset:
     >>> table["age"].values.tolist(), table["sex"].values.tolist()
     ([nan, 31.0], ['m', 'f'])
     """
-    path = Path(path)
-    head, rows = _head_and_rows(path)
-    row_of = {}
-    for row in rows:
-        name = _shape_of(row[head.index("shape")], names)
-        if name in row_of:
-            raise ValueError(f"{path}: one row for each shape needed; found two for {name!r}")
-        row_of[name] = row
-    unknown = [name for name in row_of if name not in names]
-    missing = [name for name in names if name not in row_of]
-    if unknown or missing:
-        said = [f"no shape is called {', '.join(map(repr, unknown))}"] if unknown else []
-        said += [f"no row for {', '.join(missing)}"] if missing else []
-        raise ValueError(
-            f"{path}: a row for every shape and no other needed in the column 'shape'; "
-            + "; ".join(said)
-        )
+    cells = read_cells(path, names)
     columns = {
-        column: _values([row_of[name][i] for name in names])
-        for i, column in enumerate(head)
-        if column != "shape"
+        column: _values([cells[name][column] for name in names]) for column in cells[names[0]]
     }
     if not columns:
         raise ValueError(f"{path}: a column beside 'shape' needed, found none")
@@ -123,9 +101,31 @@ def read_table(path: Path | str, names: list[str]) -> xr.Dataset:
             )
         if odd := odd_cells(values.tolist()) if values.dtype.kind == "U" else []:
             log.warning("%s: the column %r %s", path, name, odd_words(odd, names, values))
-        if PERSON.fullmatch(name) and "structure" not in columns:
+        if PERSON.fullmatch(name):
             _tell_repeated(path, name, values, names)
     return subjects(columns, names, str(path))
+
+
+def read_cells(path: Path | str, names: Sequence[str]) -> dict[str, dict[str, str]]:
+    """The cells of a table as text, by shape and column; see :func:`read_table`."""
+    head, rows = _head_and_rows(path)
+    row_of: dict[str, dict[str, str]] = {}
+    for row in rows:
+        name = _shape_of(row[head.index("shape")], names)
+        if name in row_of:
+            raise ValueError(f"{path}: one row for each shape needed; found two for {name!r}")
+        row_of[name] = dict(zip(head, row, strict=True))
+        del row_of[name]["shape"]
+    unknown = [name for name in row_of if name not in names]
+    missing = [name for name in names if name not in row_of]
+    if unknown or missing:
+        said = [f"no shape is called {', '.join(map(repr, unknown))}"] if unknown else []
+        said += [f"no row for {', '.join(missing)}"] if missing else []
+        raise ValueError(
+            f"{path}: a row for every shape and no other needed in the column 'shape'; "
+            + "; ".join(said)
+        )
+    return row_of
 
 
 def _values(cells):

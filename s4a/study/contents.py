@@ -110,7 +110,7 @@ def check_variable(name: str, values: xr.Variable, needed: bool) -> None:
 
 def check_names(data: xr.Dataset) -> None:
     """ValueError where a shape or stage is there twice, or a name would lead out of the folder."""
-    for name in ("shape", "structure", "stage"):
+    for name in ("shape", "stage"):
         if name in data.coords:
             each, counts = np.unique(data.coords[name].values.astype(str), return_counts=True)
             if (counts > 1).any():
@@ -118,8 +118,7 @@ def check_names(data: xr.Dataset) -> None:
                 raise ValueError(f"{name} needs names that differ, found {twice} more than once")
     names = [str(data.attrs[attr]) for attr in ("template", "median") if attr in data.attrs]
     names += str(data.attrs.get("apart", "")).split()
-    for coordinate in ("shape", "structure"):
-        names += data.coords[coordinate].values.astype(str).tolist() if coordinate in data else []
+    names += data.coords["shape"].values.astype(str).tolist() if "shape" in data.coords else []
     wrong = [name for name in names if slug(name) != name]
     if wrong:
         raise ValueError(f"shapes need names of letters, digits, _ and -; found {wrong}")

@@ -10,11 +10,9 @@ import numpy as np
 import xarray as xr
 
 from s4a.geometry.crossing import can_count
-from s4a.input.decisions import doubtful_lines
-from s4a.input.evidence import pick_references
-from s4a.input.plausibility import Doubts, doubt, find_warnings
+from s4a.input.plausibility import Doubts, doubt, doubtful_lines, find_warnings, pick_references
+from s4a.options import Options
 from s4a.study.netcdf import arrays, attributes, open_file, read
-from s4a.study.options import Options
 from s4a.study.runner import Keys, Run, Task
 from s4a.study.store import task_key
 from s4a.study.tasks import compare_shape, portray_shape
@@ -48,7 +46,7 @@ def check_plausibility(
 
 
 def looks_of(run: Run, original: Keys, options: Options) -> dict[str, xr.Dataset]:
-    """What :func:`s4a.input.evidence.compare` sees in each shape that could be compared."""
+    """What :func:`s4a.input.plausibility.compare` sees in each shape that could be compared."""
     # how they are counted is part of the key: by PyMeshLab, as once, they were others
     settings = (can_count(options.intersections),)
     counted = ("exactly",) if settings[0] else settings
@@ -83,7 +81,7 @@ def references_of(run: Run, sketches: Keys, k: int) -> list[str]:
 
 
 def of_look(run: Run, name: str) -> xr.Dataset:
-    """What :func:`s4a.input.evidence.compare` saw in a shape."""
+    """What :func:`s4a.input.plausibility.compare` saw in a shape."""
     return read(run.folder / f"network/look_{name}.nc")
 
 
@@ -236,9 +234,6 @@ def doubtful(
             continue
         sure = "probably" if name in wrong else "maybe, in places,"
         also = f", mean |distortion| {distortion[name]:.2f}" if name in distortion else ""
-        words = (
-            f"{sure} registered wrongly (badness {score:.3f}{also}): "
-            "look at it in s4a view, compare its file with the template's, or leave it out"
-        )
-        found[name] = [doubt("registration", words, name in wrong)]
+        said = doubt("registration", name in wrong, sure=sure, badness=score, distortion=also)
+        found[name] = [said]
     return found, []

@@ -1,51 +1,60 @@
-"""New shapes in a finished study (4.2, 6.1), of one structure or of several of each subject.
-
-All others stay as they are.  What is done with one shape is in :mod:`s4a.study.newcomers`.
-"""
+"""New shapes in a finished study, which stays as it is (4.2, 6.1): read, placed, registered."""
 
 import logging
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import xarray as xr
+from joblib import delayed
+from threadpoolctl import threadpool_limits
 
-from s4a.input.files import files_named
-from s4a.input.hands import AUTO, is_of_other_hand, seen_together
-from s4a.input.landmarks import SUFFIXES
-from s4a.input.subjects import listed, read_table
-from s4a.study.newcomers import (
-    New,
-    hands_beside,
-    insert_meshes,
-    insert_shapes,
-    named,
-    read_beside,
-)
-from s4a.study.options import Options
-from s4a.study.sources import Sources, find_sources
-from s4a.study.store import STRUCTURES
-from s4a.study.structures import (
-    contents_of,
-    is_nested,
-    lacking,
-    landmark_folders,
-    mirrored_in,
-    parts_of_table,
-    status_of,
-    to_mirror,
-)
-from s4a.study.tree import nodes_of_structure, of_structure, structure_names
+from s4a.geometry.crossing import can_count
+from s4a.geometry.mesh import as_arrays, vertex_areas
+from s4a.input import plausibility
+from s4a.input.annotations import files_beside, with_features
+from s4a.input.collection import read_shapes, shape_report
+from s4a.input.files import SUFFIXES as MESHES
+from s4a.input.files import files_named, suffix_of
+from s4a.input.hands import AUTO, is_of_other_hand, mirror_image
+from s4a.input.landmarks import SUFFIXES, with_landmarks
+from s4a.input.plausibility import find_warnings
+from s4a.input.subjects import listed
+from s4a.method.first_map import motion_onto
+from s4a.method.latent import latent_of_new, nearest_spectra, place
+from s4a.method.lift import low_resolution
+from s4a.method.pca import project_scores
+from s4a.method.register import from_latent
+from s4a.method.shape import Shape
+from s4a.options import Options, with_options
+from s4a.schema import dataset, in_unit, require, unit_of, variable
+from s4a.study.processes import workers
+from s4a.study.tasks import guided
+from s4a.study.tree import left_out, stack_registration, template_mesh
 
 log = logging.getLogger(__name__)
 
 
-class Given(NamedTuple):
-    """The new shapes of one structure, called as their subjects."""
+class Frozen(NamedTuple):
+    """The study that new shapes come into: the template, and its network, the template first.
 
-    shapes: dict[str, Any]  # meshes or files
-    landmarks: dict[str, Path]  # files, of those that have one
-    subjects: xr.Dataset | None = None  # their rows of the table
+    Of a study in files, meshes and latent bases are read where a new shape needs them.
+    """
+
+    template: Shape
+    coarse: list[xr.Dataset]
+    spectra: list[np.ndarray]  # their eigenvalues
+    Y: xr.DataArray  # (n, k, m), latent bases
+    turn: list[np.ndarray]  # rotations onto the template
+
+
+class Inserted(NamedTuple):
+    """What is made of one new shape."""
+
+    coarse: xr.Dataset
+    Y: np.ndarray  # (k, m), latent basis
+    registration: xr.Dataset
+    look: xr.Dataset | None  # None where it was not compared
 
 
 def insert(
@@ -54,7 +63,6 @@ def insert(
     *,
     landmarks: Path | str | None = None,
     reflect: str | list[str] | None = None,
-    table: Path | str | None = None,
     compare: bool = True,
     n_jobs: int | None = None,
 ) -> xr.DataTree:
@@ -70,20 +78,13 @@ def insert(
     study : DataTree
         Of :func:`s4a.analyse` or :func:`s4a.open_study`.
     shapes : path, list of paths, dict or Dataset
-        See :func:`s4a.read_shapes`; a single mesh Dataset is named ``new``.  Into a study of
-        several structures: ``{subject: {structure: mesh}}``, files with a `table`, or label volumes
-        where it was made of these.
+        See :func:`s4a.read_shapes`; a single mesh Dataset is named ``new``.
     landmarks : path, optional
         Folder with a file of landmarks for some or all of them, see :func:`s4a.analyse`.
     reflect : str or list of str, optional
         New shapes to mirror, as ``reflect=`` of :func:`s4a.analyse` did it: their names, with
         commas between them, or ``"auto"``, those of the other hand than the shapes of the study as
         they are in it.  Without it none is mirrored, and `compare` tells those of the other hand.
-        Of several structures names of subjects, or a column of the `table`; all structures of a
-        subject are mirrored together.
-    table : path, optional
-        CSV with columns ``shape``, ``subject`` and ``structure`` and a row for every new shape, as
-        of :func:`s4a.analyse`.
     compare : bool
         Whether each new shape is compared with those of the study: unit, handedness, pose, genus,
         as :func:`s4a.read_shapes` does it; what looks wrong is named in ``/report`` and left as it
@@ -99,17 +100,12 @@ def insert(
         mode, latent)``, shape differences and ``distance_to_median(shape)``; in ``/pca``
         ``score(shape, component)`` on the frozen modes, these, and ``reconstruction_error(shape)``;
         ``/report``.  ``/original`` has the template's mesh too, so that labels can be transferred.
-        Of several structures that of each below ``/structures``, and ``/report`` with
-        ``structure_status(shape, structure)`` and, with `reflect`, ``reflected(shape)``; its
-        ``remarks`` name subjects without a structure, and a structure of which no new shape can be
-        used.
 
     Raises
     ------
     ValueError
         When the study is not finished, no shape can be used, one has the name of the template, or
-        `reflect` names none of them; when several structures are given other than above, or a
-        `table` for a study of one.
+        `reflect` names none of them.
 
     Examples
     --------
@@ -127,189 +123,315 @@ def insert(
     >>> s4a.show.charts.scores(score, names, highlight=names.index("brain_04"))
     <Figure ...>
     """
-    if STRUCTURES in study.children:
-        given = given_structures(study, shapes, table, landmarks)
-        marked = landmarks is not None
-        return insert_several(study, given, reflect, compare, n_jobs, marked=marked)
-    if table is not None:
-        raise ValueError("table= says of which structure a shape is; this study has one alone")
-    return insert_shapes(study, shapes, landmarks, reflect, compare, n_jobs)
-
-
-def given_structures(
-    study: xr.DataTree,
-    shapes: Any,
-    table: Path | str | None,
-    landmarks: Path | str | None = None,
-) -> dict[str, Given]:
-    """The new shapes of each structure that are given, and their files of landmarks."""
-    names = structure_names(study)
-    labels = [Options.from_report(of_structure(study, name)).label for name in names]
-    volumes = None not in labels
-    nested = isinstance(shapes, dict) and is_nested(shapes)
-    options = Options(landmarks=landmarks)
-    if table is not None and not nested:
-        given = given_by_table(find_sources(shapes, volumes=volumes), table, options)
-    else:
-        of_each = given_by_name(study, shapes, nested=nested and table is None, labels=labels)
-        folders = landmark_folders(options, names)
-        given = {}
-        for name, of in of_each.items():
-            folder = folders.get(name)
-            try:
-                files = {} if folder is None else files_named(folder, of, "landmarks", SUFFIXES)
-            except ValueError:  # none of these shapes has any: told with those without a folder
-                files = {}
-            given[name] = Given(of, {one: files[one] for one in of if one in files})
-    unknown = [repr(name) for name in given if name not in names]
-    if unknown:
-        raise ValueError(f"the study has no structure {listed(unknown)}; it has {listed(names)}")
-    for name, one in given.items():
-        template = study[f"{STRUCTURES}/{name}/registration"].attrs["template"]
-        if template in one.shapes:
-            raise ValueError(
-                f"structure {name}: new shapes need other names than the template, {template!r}; "
-                "rename it"
-            )
-    return given
-
-
-def given_by_table(sources: Sources, table: Path | str, options: Options) -> dict[str, Given]:
-    """The new shapes of each structure, as the columns ``structure`` and ``subject`` say."""
-    given = {}
-    for name, part in parts_of_table(sources, read_table(table, list(sources)), options).items():
-        files = {
-            subject: Path(guides.landmarks[0])
-            for subject, guides in part.marked.items()
-            if guides.landmarks
-        }
-        shapes = {subject: source for subject, (source, _) in part.sources.items()}
-        given[name] = Given(shapes, files, part.subjects)
-    return given
-
-
-def given_by_name(
-    study: xr.DataTree, shapes: Any, *, nested: bool, labels: list[int | str | None]
-) -> dict[str, dict[str, Any]]:
-    """The new shapes of each structure, of a dict of dicts or of label volumes."""
-    names = structure_names(study)
-    if nested:
-        empty = [subject for subject, of in shapes.items() if not of]
-        if empty:
-            raise ValueError(f"a mesh of a structure needed; {listed(empty)} has none")
-        given: dict[str, dict[str, Any]] = {}
-        for subject, of in shapes.items():
-            for name, mesh in of.items():
-                given.setdefault(name, {})[subject] = mesh
-        return given
-    if None not in labels and len(set(labels)) == len(labels) and _are_files(shapes):
-        files = {name: file for name, (file, _) in find_sources(shapes, volumes=True).items()}
-        return dict.fromkeys(names, files)
-    raise ValueError(
-        f"the study has several structures ({listed(names)}): {{subject: {{structure: mesh}}}} "
-        "needed, or files and table=, with columns 'shape', 'subject' and 'structure'; or "
-        "label volumes, where it was made of these"
+    shapes = {"new": shapes} if isinstance(shapes, xr.Dataset) else shapes
+    needed = ("original", "coarse", "latent", "registration")
+    missing = [name for name in needed if name not in study.children]
+    if missing:
+        raise ValueError(f"a finished study is needed; this one lacks {', '.join(missing)}")
+    options = Options.from_report(study)
+    template = study["registration"].attrs["template"]
+    meshes, attrs = read_new(shapes, options, landmarks)
+    if template in meshes:
+        raise ValueError(f"new shapes need other names than the template, {template!r}; rename it")
+    portraits = portraits_of(study) if compare or reflect == AUTO else {}
+    mirrored, told = reflected_of_new(reflect, meshes, list(attrs), portraits)
+    for name in mirrored:
+        meshes[name] = mirror_image(meshes[name])
+        attrs[name] = attrs[name] | meshes[name].attrs
+    frozen = freeze(study, options)
+    references = portraits if compare else None
+    # in a tuple: a Dataset of its own is kept by one worker of dask, and is lost with that
+    results = workers(n_jobs)(
+        delayed(insert_one)((mesh,), frozen, options, references) for mesh in meshes.values()
     )
-
-
-def _are_files(shapes):
-    """Whether shapes are given by their files alone."""
-    each = shapes.values() if isinstance(shapes, dict) else shapes
-    each = [each] if isinstance(each, str | Path) else each
-    return isinstance(shapes, dict | list | str | Path) and all(
-        isinstance(one, str | Path) for one in each
-    )
-
-
-def insert_several(
-    study: xr.DataTree,
-    given: dict[str, Given],
-    reflect: str | list[str] | None,
-    compare: bool,
-    n_jobs: int | None,
-    *,
-    marked: bool = False,
-) -> xr.DataTree:
-    """The new shapes of each structure, in the study of that structure.
-
-    A structure of which none can be used is told, and costs the others nothing; so are, where some
-    are to be `marked`, those without any file of landmarks.
-    """
-    names = structure_names(study)
-    have = {name: given[name].shapes if name in given else {} for name in names}
-    lines = lacking(have)
-    unmarked = [name for name, of in given.items() if not of.landmarks]
-    remarks = [f"{line}: it is inserted without" for line in lines]
-    if marked and unmarked:
-        remarks.append(f"no file of landmarks for any {listed(unmarked)}: inserted without")
-    mirrored = None if reflect is None else named_new(reflect, given)
-    status: dict[str, dict[str, str]] = {}
-    read: dict[str, New] = {}
-    failed = []
-    for name in names:
-        of = given.get(name, Given({}, {}))
-        status[name] = dict.fromkeys(of.shapes, "excluded")
-        if of.shapes:
-            try:
-                read[name] = read_beside(
-                    of_structure(study, name),
-                    of.shapes,
-                    of.landmarks,
-                    seen=compare or reflect == AUTO,
-                )
-            except ValueError as error:
-                failed.append(f"structure {name}: {error}")
-    told: list[str] = []
-    if reflect == AUTO:
-        mirrored, told = of_other_hand_beside(read)
     inserted = {}
-    for name, new in read.items():
-        part = of_structure(study, name)
-        try:
-            inserted[name] = insert_meshes(part, new, mirrored, told, compare, n_jobs)
-        except ValueError as error:
-            failed.append(f"structure {name}: {error}")
-            continue
-        status[name] = status_of(inserted[name])
+    for name, result in zip(meshes, results, strict=True):
+        if isinstance(result, ValueError):
+            attrs[name] = attrs[name] | {"status": "excluded", "reason": str(result)}
+        else:
+            inserted[name] = result
     if not inserted:
-        raise ValueError("; ".join(failed))
-    for line in [*remarks, *failed, *told]:
-        log.warning("%s", line)
-    nodes = {}
-    for name, part in inserted.items():
-        nodes |= nodes_of_structure(name, part)
-    report = contents_of(status, mirrored_in(inserted.values()))
-    nodes["/report"] = report.assign_attrs(remarks="\n".join([*remarks, *failed, *told]))
+        reasons = "; ".join(f"{name}: {said['reason']}" for name, said in attrs.items())
+        raise ValueError(f"no shape can be inserted ({reasons})")
+
+    nodes = {f"original/{name}": meshes[name] for name in inserted}
+    nodes[f"original/{template}"] = frozen.template.original
+    nodes |= {f"coarse/{name}": one.coarse for name, one in inserted.items()}
+    nodes["latent"] = latent_of_new(
+        np.stack([one.Y for one in inserted.values()]),
+        np.stack([one.coarse["eigenvalue"].values for one in inserted.values()]),
+        study["latent"].dataset["latent_eigenvalue"].values,
+        options.norm,
+    ).assign_coords(shape=list(inserted))
+    nodes |= stack_registration(
+        template_mesh(frozen.template.original, template),
+        {name: one.registration for name, one in inserted.items()},
+        list(inserted),
+    )
+    if "pca" in study:
+        area = vertex_areas(*as_arrays(nodes["registration"]))
+        nodes["pca"] = scores_of_new(study["pca"].to_dataset(), nodes["registration"], area)
+    if references is None:
+        nodes["report"] = shape_report(attrs)
+    else:
+        looks = {name: one.look for name, one in inserted.items() if one.look is not None}
+        nodes["report"] = report_beside(study, attrs, looks, references)
+    report = nodes["report"].attrs
+    report["remarks"] = "\n".join(filter(None, [*told, report["remarks"]]))
+    # all that were given are in the result
+    report.update(with_options(report, {"keep_doubtful": True}))
+    if reflect is not None:
+        nodes["report"]["reflected"] = variable("reflected", [name in mirrored for name in attrs])
     return xr.DataTree.from_dict(nodes)
 
 
-def named_new(reflect: str | list[str], given: Mapping[str, Given]) -> list[str]:
-    """The new subjects that ``reflect=`` names, but for ``"auto"``."""
+def reflected_of_new(
+    reflect: str | list[str] | None,
+    meshes: dict[str, xr.Dataset],
+    given: list[str],
+    portraits: dict[str, xr.Dataset],
+) -> tuple[list[str], list[str]]:
+    """The new shapes whose mirror images are taken, and what is told of the choice.
+
+    Parameters
+    ----------
+    reflect : see :func:`insert`
+    meshes : dict of str to Dataset
+        The new ones that can be used.
+    given : list of str
+        Names of all.
+    portraits : dict of str to Dataset
+        Of shapes of the study, see :func:`portraits_of`.
+    """
+    if reflect is None:
+        return [], []
     if reflect == AUTO:
-        return []
-    return to_mirror(
-        ",".join(named(reflect)),
-        {name: of.shapes for name, of in given.items()},
-        {name: of.subjects for name, of in given.items()},
-        beside=True,
+        known, looks = hands_beside(meshes, portraits)
+        said = {name: is_of_other_hand(name, look, known) for name, look in looks.items()}
+        told = [line for _, line in said.values() if line]
+        for line in told:
+            log.warning("%s", line)
+        return [name for name, (is_other, _) in said.items() if is_other], told
+    names = reflect.split(",") if isinstance(reflect, str) else reflect
+    names = [str(name).strip() for name in names]
+    unknown = [repr(name) for name in names if name not in given]
+    if unknown:
+        raise ValueError(
+            f"reflect names {listed(unknown)}, none of the new shapes ({listed(given)}); "
+            "'auto' mirrors those of the other hand than the study's"
+        )
+    return [name for name in names if name in meshes], []
+
+
+def hands_beside(
+    meshes: dict[str, xr.Dataset], portraits: dict[str, xr.Dataset]
+) -> tuple[dict[str, xr.Dataset], dict[str, xr.Dataset]]:
+    """:func:`s4a.input.plausibility.compare` of shapes of the study, and of new ones."""
+    known = {name: plausibility.compare(name, seen, portraits) for name, seen in portraits.items()}
+    looks = {
+        name: plausibility.compare("", plausibility.portray(mesh, intersections=False), portraits)
+        for name, mesh in meshes.items()
+    }
+    return known, looks
+
+
+def read_new(
+    shapes: Path | str | list[Any] | dict[str, Any],
+    options: Options,
+    landmarks: Path | str | None = None,
+) -> tuple[dict[str, xr.Dataset], dict[str, dict[str, Any]]]:
+    """The new meshes that can be used, with what guides them, and attributes for the report."""
+    meshes, attrs = clean_new(shapes, options)
+    files = {} if landmarks is None else files_named(landmarks, meshes, "landmarks", SUFFIXES)
+    for name, mesh in list(meshes.items()):
+        try:
+            source = shapes[name] if isinstance(shapes, dict) else None
+            if isinstance(source, xr.Dataset) and "file_vertex" not in source:
+                mesh = guided(mesh, source)
+            if name in files:
+                mesh = with_landmarks(mesh, files[name])
+            path = mesh.attrs.get("path", "")
+            fields = files_beside(path, options.feature_names) if path else {}
+            meshes[name] = with_features(mesh, fields) if fields else mesh
+        except ValueError as error:
+            attrs[name] = attrs[name] | {"status": "excluded", "reason": str(error)}
+            del meshes[name]
+    return meshes, attrs
+
+
+def clean_new(
+    shapes: Path | str | list[Any] | dict[str, Any],
+    options: Options,
+) -> tuple[dict[str, xr.Dataset], dict[str, dict[str, Any]]]:
+    """The new meshes that can be used, clean, and the attributes of all for the report."""
+    meshes = {}
+    if isinstance(shapes, dict):
+        for name, mesh in shapes.items():
+            if isinstance(mesh, xr.Dataset) and "file_vertex" in mesh:  # clean as it is
+                meshes[name] = mesh
+        shapes = {name: mesh for name, mesh in shapes.items() if name not in meshes}
+    attrs = {name: {"status": "ok", "reason": ""} | mesh.attrs for name, mesh in meshes.items()}
+    if isinstance(shapes, dict) and not shapes:
+        return meshes, attrs
+    cleaning = options.of("cleaning")
+    if not isinstance(shapes, dict) and are_meshes(shapes):  # in a study of label volumes
+        cleaning = cleaning | {"label": None}
+    tree = read_shapes(shapes, compare=False, **cleaning)
+    report = tree["report"].to_dataset()
+    for name in report["shape"].values.tolist():
+        if name in tree["original"].children:
+            meshes[name] = tree[f"original/{name}"].to_dataset()
+            attrs[name] = meshes[name].attrs
+        else:
+            row = report.sel(shape=name)
+            attrs[name] = {column: row[column].item() for column in ("status", "reason", "path")}
+    return meshes, attrs
+
+
+def are_meshes(paths: Path | str | list[Any]) -> bool:
+    """Whether all of these are files that are named as meshes."""
+    files = [paths] if isinstance(paths, str | Path) else paths
+    return all(Path(file).is_file() and suffix_of(file) in MESHES for file in files)
+
+
+def freeze(study: xr.DataTree, options: Options) -> Frozen:
+    """What new shapes need of a study, the template first.
+
+    Shapes that failed, and those that the study leaves out as doubtful, are not among them.
+    """
+    latent = study["latent"].to_dataset()
+    require(latent, "latent_basis", "latent_eigenvalue", what="latent dataset")
+    rotation = study["registration"].dataset["rotation"]
+    template = study["registration"].attrs["template"]
+    registered = set(rotation["shape"].values.tolist()) - set(left_out(study))
+    others = [n for n in latent["shape"].values.tolist() if n in registered and n != template]
+    names = [template, *others]
+    coarse = [study["coarse"][name].to_dataset() for name in names]
+    return Frozen(
+        Shape(
+            study["original"][template].to_dataset().load(),
+            coarse[0].load(),
+            **options.of("projection"),
+        ),
+        coarse,
+        [mesh["eigenvalue"].values for mesh in coarse],
+        latent["latent_basis"].sel(shape=names),
+        list(rotation.sel(shape=names).values),
     )
 
 
-def of_other_hand_beside(read: Mapping[str, New]) -> tuple[list[str], list[str]]:
-    """The new subjects of the other hand than those of the study, and what is told of them.
+def insert_one(
+    meshes: tuple[xr.Dataset],
+    frozen: Frozen,
+    options: Options,
+    references: dict[str, xr.Dataset] | None,
+) -> Inserted | ValueError:
+    """One new shape: coarse mesh, latent basis, registration, plausibility; or why there is none.
 
-    All structures of a subject say so together, see :func:`s4a.input.hands.seen_together`.
+    An error is given back and not raised, as it costs this shape alone.
     """
-    beside = {name: hands_beside(new) for name, new in read.items()}
-    subjects = sorted({subject for _, looks in beside.values() for subject in looks})
-    chosen, told = [], []
-    for subject in subjects:
-        own = {name: looks for name, looks in beside.items() if subject in looks[1]}
-        together = seen_together(
-            {name: known | {"": looks[subject]} for name, (known, looks) in own.items()}
+    try:
+        with threadpool_limits(1):
+            return _insert_one(*meshes, frozen, options, references)
+    except ValueError as error:
+        return error
+
+
+def _insert_one(mesh, frozen, options, references):
+    _, k, _ = frozen.Y.shape
+    coarse = low_resolution(mesh, **options.of("low resolution") | {"k": k})
+    if coarse.sizes["mode"] < k:
+        raise ValueError(
+            f"the study needs {k} eigenfunctions, this shape has only {coarse.sizes['mode']}"
         )
-        look = together.pop("")
-        is_other, line = is_of_other_hand(subject, look, together)
-        told += [line] if line else []
-        chosen += [subject] if is_other else []
-    return chosen, told
+    shape = Shape(mesh, coarse, **options.of("projection"))
+    new = Shape(coarse=coarse).low
+    template = frozen.template.low
+    k_init = min(options.k_init, k)
+    chosen = nearest_spectra(new.eigenvalue, frozen.spectra, k_init)
+    R, t = motion_onto(shape.low, template)
+    others = [Shape(coarse=frozen.coarse[j]).low for j in chosen]
+    of_template, *of_others = frozen.Y[[0, *chosen]].values
+    starts = [(frozen.turn[j].T @ R, np.zeros(3)) for j in chosen]
+    Y = place(
+        new,
+        others,
+        np.stack(of_others),
+        starts,
+        k_init=k_init,
+        step=options.step,
+        **options.of("first maps"),
+    )
+    registration = from_latent(
+        shape,
+        frozen.template,
+        (Y, of_template),
+        (R, t),
+        how=options.how,
+        **options.of("registration"),
+    )
+    seen = None
+    if references is not None:
+        portrait = plausibility.portray(mesh, intersections=can_count(options.intersections))
+        seen = plausibility.compare("", portrait, references)
+    return Inserted(coarse, Y, registration, seen)
+
+
+def known_to(study: xr.DataTree) -> dict[str, dict[Any, Any]]:
+    """Attributes of the registered shapes of a study that are in its modes."""
+    doubted = left_out(study)
+    names = study["registration"].dataset["shape"].values.tolist()
+    return {name: study["original"][name].attrs for name in names if name not in doubted}
+
+
+def portraits_of(study: xr.DataTree) -> dict[str, xr.Dataset]:
+    """Portraits of the shapes of a study beside which new ones are seen."""
+    portraits = {}
+    known = known_to(study)
+    by_size = sorted(known, key=lambda name: known[name]["area"])
+    for name in plausibility.spread(by_size, 2 * plausibility.N_REFERENCES):
+        mesh = study["original"][name].to_dataset()
+        seen = plausibility.portray(mesh, intersections=False)
+        if "report" in study:  # where they were counted
+            number = int(study["report"]["self_intersections"].sel(shape=name))
+            share = number / mesh.sizes["triangle"] if number >= 0 else -1.0
+            seen = seen.assign_attrs(self_intersections=number, intersecting=share)
+        portraits[name] = seen
+    return {name: portraits[name] for name in plausibility.pick_references(portraits)}
+
+
+def report_beside(
+    study: xr.DataTree,
+    attrs: dict[str, Any],
+    looks: dict[str, xr.Dataset],
+    references: dict[str, xr.Dataset],
+) -> xr.Dataset:
+    """The report on the new shapes, each beside those of the study."""
+    known = known_to(study)
+    known_looks = {
+        name: plausibility.compare(name, seen, references) for name, seen in references.items()
+    }
+    told_before = find_warnings(known, known_looks)[1]
+    reports, remarks = [], {}
+    for name, said in attrs.items():
+        if name not in looks:  # it could not be used
+            reports.append(shape_report({name: said}))
+            continue
+        doubts, told = find_warnings(known | {name: said}, known_looks | {name: looks[name]})
+        reports.append(shape_report({name: said}, doubts, evidence={name: looks[name]}))
+        remarks |= dict.fromkeys(line for line in told if line not in told_before)
+    return xr.concat(reports, dim="shape").assign_attrs(remarks="\n".join(remarks))
+
+
+def scores_of_new(modes: xr.Dataset, registration: xr.Dataset, area: np.ndarray) -> xr.Dataset:
+    """The frozen modes, with the scores of the new shapes in place of those that made them."""
+    score, left = project_scores(
+        registration["displacement"].values,
+        modes["mean_displacement"].values,
+        modes["deformation"].values,
+        modes["standard_deviation"].values,
+        area,
+    )
+    new = in_unit(dataset(score=score, reconstruction_error=left), unit_of(modes["deformation"]))
+    frozen = modes.drop_vars(["score", "shape", "score_apart", "shape_apart"], errors="ignore")
+    return frozen.merge(new).assign_coords(shape=registration["shape"])

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 from s4a.geometry.compiled import psutil
 from s4a.study.netcdf import check_regular
-from s4a.study.store import STRUCTURES, check_is_study
 
 FILE = ".progress.json"
 EVERY = 1.0  # seconds between two notes of a stage
@@ -169,8 +168,6 @@ def status(folder: Path | str) -> Status:
         check_regular(path)
         said = json.loads(path.read_text("utf-8"))
     except FileNotFoundError:
-        if (Path(folder) / STRUCTURES).is_dir():
-            check_is_study(Path(folder))  # one of several structures: says so
         raise ValueError(
             f"{folder} has no {FILE}: no run of this version of s4a has begun there; "
             "`s4a verify` says what a study holds"

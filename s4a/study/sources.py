@@ -5,13 +5,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import xarray as xr
 
 from s4a.geometry.mesh import as_dataset
+from s4a.input.annotations import files_beside
 from s4a.input.files import check_names, files_named, find_meshes
 from s4a.input.landmarks import SUFFIXES
 from s4a.input.raw import read_bytes, shown
-from s4a.input.scalars import files_beside
 from s4a.input.subjects import listed
 from s4a.method.shape import features_of
 from s4a.schema import require
@@ -22,6 +23,12 @@ from s4a.study.store import task_key
 Collection = Path | str | list[Path | str] | dict[str, Any] | xr.DataTree
 Sources = dict[str, tuple[str | xr.Dataset, str]]  # name -> path or mesh, key of its content
 Keyed = tuple[str, str]  # a file, and the key of its content
+
+
+SEVERAL = (
+    "s4a_morphometrics.analyse_structures (s4a run-structures) analyses several structures of each "
+    "subject: pip install 's4a[morphometrics]'"
+)
 
 
 class Guides(NamedTuple):
@@ -80,6 +87,11 @@ def find_sources(
 
 def _source_of(name, mesh):
     """A mesh or file that was given by name, and the key of its content."""
+    if isinstance(mesh, dict):
+        raise ValueError(
+            f"shape {name}: a mesh or a file needed, found a dict of {listed(list(map(str, mesh)))}"
+            f"; {SEVERAL}"
+        )
     if isinstance(mesh, str | Path):
         if not Path(mesh).is_file():
             raise ValueError(f"shape {name}: {shown(mesh)} is no file")
@@ -158,6 +170,15 @@ def remarks_on_guides(sources: Sources, marked: Marked, features: Sequence[str] 
         for what, without in lacking.items()
         if 0 < len(without) < len(sources)
     ]
+
+
+def check_one_structure(subjects: xr.Dataset) -> None:
+    """ValueError where a table says that shapes are several structures of one subject."""
+    if {"structure", "subject"} <= set(subjects) and len(np.unique(subjects["structure"])) > 1:
+        raise ValueError(
+            f"{subjects.attrs['path']}: the column 'structure' names several, and one collection "
+            f"has shapes of one kind; {SEVERAL}, or call the column otherwise"
+        )
 
 
 def of_contents(subjects: xr.Dataset, sources: Sources) -> xr.Dataset:

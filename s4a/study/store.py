@@ -31,7 +31,6 @@ LOCK = ".lock"
 # folders of a study
 STAGES = ("original", "coarse", "network", "latent", "rounds", "registration", "fields")
 OF_ALL = ("network", "latent", "registration", "pca", "subjects", "report")  # files beside them
-STRUCTURES = "structures"  # folder of a study of several, with one of each structure
 LOGS = ".log"  # folder in that of a study: a file for each task that is at work or failed
 TEMPORARY = re.compile(r"\.[\w-]+\.nc\.\d+\.tmp")  # as `write` names them
 
@@ -147,15 +146,12 @@ def refuse_links(folder: Path) -> None:
 
 
 def check_is_study(folder: Path) -> None:
-    """ValueError unless a folder is a study of one structure, and none within it is a link."""
-    if (folder / STRUCTURES).is_dir() and not (folder / STAGES[0]).is_dir():
-        names = sorted(path.name for path in (folder / STRUCTURES).iterdir() if path.is_dir())
-        each = " or ".join(str(folder / STRUCTURES / name) for name in names[:2])
-        raise ValueError(
-            f"{folder} is a study of several structures ({', '.join(names[:9])}): give one of "
-            f"them, such as {each}; `s4a structures {folder}` compares them"
-        )
+    """ValueError unless a folder is a study, and none within it is a link."""
     if not (folder / STAGES[0]).is_dir():
+        if inner := sorted(folder.glob(f"*/*/{STAGES[0]}")):
+            raise ValueError(
+                f"{folder} has studies in it: give one of them, such as {inner[0].parent}"
+            )
         raise ValueError(
             f"{folder} is not a study folder: it has no folder {STAGES[0]!r}; "
             f"run `s4a run ... --out {folder}`"

@@ -13,22 +13,21 @@ import xarray as xr
 
 from s4a.geometry.align import motion_between, realign
 from s4a.geometry.mesh import as_arrays, triangle_areas
-from s4a.input import evidence
-from s4a.input.annotations import labels_of_mesh
+from s4a.input import plausibility
+from s4a.input.annotations import labels_of_mesh, read_scalars, with_features
 from s4a.input.clean import check_range, clean
 from s4a.input.collection import read_shape
 from s4a.input.hands import mirror_image
 from s4a.input.landmarks import guides_of, with_landmarks
-from s4a.input.scalars import read_scalars, with_features
 from s4a.method import steps
 from s4a.method.first_map import motion_onto
+from s4a.method.latent import latent_of_new, nearest_spectra, place
 from s4a.method.lift import low_resolution
-from s4a.method.place import latent_of_new, nearest_spectra, place
 from s4a.method.register import from_latent, identity
 from s4a.method.shape import Basis, Shape, features_of
+from s4a.options import Options
 from s4a.schema import dataset, in_unit, unit_of
 from s4a.study.netcdf import arrays, attributes, open_file, read
-from s4a.study.options import Options
 from s4a.study.runner import Run
 from s4a.study.sources import Guides, content_of_file
 
@@ -100,28 +99,27 @@ def guided(mesh: xr.Dataset, source: xr.Dataset) -> xr.Dataset:
 
 
 def portray_shape(folder: Path, name: str, intersections: bool) -> xr.Dataset:
-    """What :func:`s4a.input.evidence.portray` sees in a shape."""
-    return evidence.portray(read(folder / f"original/{name}.nc"), intersections=intersections)
+    """What :func:`s4a.input.plausibility.portray` sees in a shape."""
+    return plausibility.portray(read(folder / f"original/{name}.nc"), intersections=intersections)
 
 
 def compare_shape(folder: Path, name: str, references: list[str]) -> xr.Dataset:
-    """What :func:`s4a.input.evidence.compare` sees in a shape beside the references."""
+    """What :func:`s4a.input.plausibility.compare` sees in a shape beside the references."""
     portraits = {n: read(folder / f"network/sketch_{n}.nc") for n in {*references, name}}
-    return evidence.compare(name, portraits[name], {n: portraits[n] for n in references})
+    return plausibility.compare(name, portraits[name], {n: portraits[n] for n in references})
 
 
 def remesh_shape(folder: Path, name: str, options: Options) -> xr.Dataset:
     """The low-resolution mesh of a shape of the study, its U (4.1) and its spectrum (3.3)."""
     mesh = read(folder / "original" / f"{name}.nc")
-    low = low_resolution(mesh, **options.of_low_resolution)
+    low = low_resolution(mesh, **options.of("low resolution"))
     return in_unit(low, unit_of(mesh["position"]))
 
 
 def shape_of(folder: Path, name: str, options: Options) -> Shape:
     """A shape of the study at both resolutions; its arrays are read when they are used."""
-    return options.shape(
-        *(open_file(folder / stage / f"{name}.nc") for stage in ("original", "coarse"))
-    )
+    original, coarse = (open_file(folder / s / f"{name}.nc") for s in ("original", "coarse"))
+    return Shape(original, coarse, **options.of("projection"))
 
 
 def template_of(folder: Path, name: str, options: Options) -> Shape:
@@ -205,7 +203,7 @@ def place_shape(folder: Path, name: str, options: Options) -> xr.Dataset:
         [motion_between(motion, motion_to_reference(folder, n)) for n in near],
         k_init=k_init,
         step=options.step,
-        **options.of_first_maps,
+        **options.of("first maps"),
     )
     latent_eigenvalue = latent["latent_eigenvalue"].values
     found = latent_of_new(Y[None], own[None], latent_eigenvalue, options.norm)
@@ -234,5 +232,5 @@ def register_shape(folder: Path, name: str, template: str, options: Options) -> 
     motion = realign(M.cloud, N.cloud, start)
     how = options.how
     return from_latent(
-        source, target, (own, of_template), motion, how=how, **options.of_registration
+        source, target, (own, of_template), motion, how=how, **options.of("registration")
     )

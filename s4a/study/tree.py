@@ -8,11 +8,11 @@ import numpy as np
 import xarray as xr
 
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
-from s4a.input.subjects import listed
+from s4a.options import kept_options
 from s4a.schema import INPUT, in_unit, unit_of, variable
 from s4a.study.contents import check_contents, check_fit
 from s4a.study.netcdf import DamagedError, damage_named, open_file, read, read_tree, stacked
-from s4a.study.store import STAGES, STRUCTURES, check_is_study
+from s4a.study.store import check_is_study
 
 log = logging.getLogger(__name__)
 
@@ -180,8 +180,6 @@ def open_study(folder: Path | str) -> xr.DataTree:
     Returns
     -------
     xarray.DataTree
-        Of several structures ``/structures`` with a study of each, see
-        :func:`s4a.study.tree.of_structure`.
 
     Raises
     ------
@@ -205,8 +203,6 @@ def open_study(folder: Path | str) -> xr.DataTree:
     ['coarse', 'latent', 'network', 'original', 'pca', 'registration', 'report']
     """
     folder = Path(folder)
-    if (folder / STRUCTURES).is_dir() and not (folder / STAGES[0]).is_dir():
-        return open_structures(folder)
     check_is_study(folder)
     reader = Reader(folder, reported(folder))
     names = sorted(path.stem for path in (folder / "original").glob("[!.]*.nc"))
@@ -256,7 +252,7 @@ def left_out(study: xr.DataTree) -> list[str]:
     if "report" not in study.children or "registration" not in study.children:
         return []
     report = study["report"].dataset
-    if "status" not in report or report.attrs.get("keep_doubtful") == "True":
+    if "status" not in report or kept_options(report).get("keep_doubtful"):
         return []
     template = study["registration"].attrs.get("template")
     doubtful = report["shape"].values[report["status"].values == "doubtful"].tolist()
@@ -290,75 +286,6 @@ def as_reported(nodes: dict[str, xr.Dataset]) -> dict[str, xr.Dataset]:
     return reported
 
 
-# ---- several structures
-
-
-def open_structures(folder: Path | str) -> xr.DataTree:
-    """A folder of several structures as one tree: a study of each in ``/structures/<name>``.
-
-    ``/report`` says what became of every structure of every subject.
-
-    Raises
-    ------
-    ValueError
-        When a folder in it is a link, or has none of the structures.
-    """
-    folder = Path(folder)
-    within = folder / STRUCTURES
-    places = [within, *sorted(within.iterdir())]
-    for place in places:
-        if place.is_symlink():
-            raise ValueError(
-                f"{place} is a symbolic link, which is not followed within a study: "
-                "put the folder itself in its place"
-            )
-    found = {place.name: place for place in places[1:] if place.is_dir()}
-    nodes: dict[str, xr.Dataset] = {}
-    names = list(found)
-    file = folder / f"{STRUCTURES}.nc"
-    if file.is_file():
-        contents = read(file)
-        with damage_named(file):
-            check_contents(STRUCTURES, contents)
-        names = contents["structure"].values.tolist()
-        nodes["/report"] = contents  # not above the studies, whose shapes may be others
-    gone = [name for name in names if name not in found]
-    if gone or not names:
-        raise ValueError(f"{within} lacks the study of {listed(gone) or 'any structure'}")
-    for name in names:
-        nodes |= nodes_of_structure(name, open_study(found[name]))
-    return xr.DataTree.from_dict(nodes, name=folder.name)
-
-
-def nodes_of_structure(name: str, study: xr.DataTree) -> dict[str, xr.Dataset]:
-    """The nodes of the study of one structure by their paths in that of several."""
-    return {
-        f"/{STRUCTURES}/{name}{node.path}".rstrip("/"): node.to_dataset(inherit=False)
-        for node in study.subtree
-    }
-
-
-def check_is_one(study: xr.DataTree) -> None:
-    """ValueError where a study is one of several structures, which are analysed one by one."""
-    if STRUCTURES in study.children:
-        names = list(study[STRUCTURES].children)
-        raise ValueError(
-            f"this is a study of several structures ({listed(names)}): take one of them, as "
-            f"s4a.statistics.of_structure(study, {names[0]!r}) or STUDY/{STRUCTURES}/{names[0]}; "
-            "`s4a structures STUDY` compares them"
-        )
-
-
-def structure_names(study: xr.DataTree) -> list[str]:
-    """The structures of a study of several; ValueError where it has none."""
-    if STRUCTURES not in study.children:
-        raise ValueError(
-            "a study of several structures needed, as of s4a.analyse({subject: {structure: mesh}});"
-            f" this one has {', '.join(study.children) or 'no nodes'}"
-        )
-    return list(study[STRUCTURES].children)
-
-
 def open_inserted(file: Path | str) -> xr.DataTree:
     """What ``s4a insert`` wrote: its folder, or ``inserted.nc`` in it.
 
@@ -375,42 +302,3 @@ def open_inserted(file: Path | str) -> xr.DataTree:
             "DIR/inserted.nc"
         )
     return read_tree(path)
-
-
-def of_structure(study: xr.DataTree, name: str) -> xr.DataTree:
-    """The study of one structure, for all that takes a study.
-
-    Parameters
-    ----------
-    study : DataTree
-        Of several structures.
-    name : str
-        Of the structure.
-
-    Returns
-    -------
-    DataTree
-
-    Raises
-    ------
-    ValueError
-        When the study has no such structure.
-
-    Examples
-    --------
-    With a ``study`` of two small structures of six subjects:
-
-    >>> import s4a
-    >>> study = s4a.datasets.structures.example_structures()
-    >>> s4a.statistics.of_structure(study, "left")["pca"].sizes["shape"]
-    6
-    """
-    names = structure_names(study)
-    if name not in names:
-        raise ValueError(f"the study has no structure {name!r}; it has {listed(names)}")
-    top = f"/{STRUCTURES}/{name}"
-    nodes = {
-        node.path.removeprefix(top) or "/": node.to_dataset(inherit=False)
-        for node in study[STRUCTURES].children[name].subtree
-    }
-    return xr.DataTree.from_dict(nodes, name=name)

@@ -24,7 +24,6 @@ from s4a.widgets.panel import Panel
 from s4a.widgets.progress import Progress
 from s4a.widgets.region import Region
 from s4a.widgets.spectrum import Spectrum
-from s4a.widgets.structures import Structures
 from s4a.widgets.transfer import Transfer
 
 __all__ = [
@@ -40,7 +39,6 @@ __all__ = [
     "Progress",
     "Region",
     "Spectrum",
-    "Structures",
     "Transfer",
 ]
 

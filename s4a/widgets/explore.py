@@ -19,7 +19,6 @@ from s4a.widgets.modes import Modes
 from s4a.widgets.network import Network
 from s4a.widgets.panel import OfKernel, Panel, close_all, layout_of
 from s4a.widgets.spectrum import Spectrum
-from s4a.widgets.structures import Structures
 from s4a.widgets.transfer import Transfer
 
 log = logging.getLogger(__name__)
@@ -32,20 +31,19 @@ PANELS = {
     "Transfer": Transfer,
     "Spectrum": Spectrum,
 }
-OF_SEVERAL = {"Structures": Structures}  # the tabs of a study of several structures
 STAGES = ("original", "coarse", "network", "latent", "registration", "pca")  # nodes of every study
 
 
 def kinds_of(study: xr.DataTree) -> dict[str, type[Panel]]:
     """Title of a tab -> its panel: those whose needs the study has, or a finished run gives it."""
-    kinds = OF_SEVERAL if "structures" in study.children else PANELS
-    coming = STAGES if set(STAGES) & set(study.children) else ()
-    added = {
-        kind.title: kind
-        for kind in extensions("s4a.panels").values()
+    known = PANELS | {kind.title: kind for kind in extensions("s4a.panels").values()}
+    coming = STAGES if not study.children or set(STAGES) & set(study.children) else ()
+    found = {
+        title: kind
+        for title, kind in known.items()
         if all(has(study, need) or need.partition("/")[0] in coming for need in kind.needs)
     }
-    return kinds | added
+    return found or PANELS
 
 
 def running_cell() -> str | None:
@@ -60,8 +58,7 @@ class Explore(OfKernel):
     Parameters
     ----------
     study : xarray.DataTree
-        Finished or not; the tab of a stage that is not there yet says what is missing.  Of several
-        structures there is one tab with all of them; each has the other tabs as a study of its own.
+        Finished or not; the tab of a stage that is not there yet says what is missing.
     width : float or str, optional
         In pixels, or any width of CSS; all that the cell has by default.
     **options

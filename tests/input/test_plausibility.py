@@ -9,7 +9,7 @@ from faults import shapes as faulty
 
 import s4a
 from s4a.geometry.mesh import as_dataset
-from s4a.input import evidence, plausibility
+from s4a.input import plausibility
 from s4a.input.clean import clean
 from s4a.study.doubts import doubtful
 
@@ -22,13 +22,15 @@ def portraits():
 
 
 def portrait(X, T):
-    return evidence.portray(clean(as_dataset(X, T)), intersections=False)
+    return plausibility.portray(clean(as_dataset(X, T)), intersections=False)
 
 
 def doubts_of(portraits, references=None):
     """Name -> doubts, and the remarks."""
-    chosen = {name: portraits[name] for name in references or evidence.pick_references(portraits)}
-    seen = {name: evidence.compare(name, one, chosen) for name, one in portraits.items()}
+    chosen = {
+        name: portraits[name] for name in references or plausibility.pick_references(portraits)
+    }
+    seen = {name: plausibility.compare(name, one, chosen) for name, one in portraits.items()}
     attrs = {name: {"area": one.attrs["surface"]} for name, one in portraits.items()}
     return plausibility.find_warnings(attrs, seen)
 

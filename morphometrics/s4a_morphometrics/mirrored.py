@@ -1,0 +1,147 @@
+"""Left and right of whole subjects (5.1, the data): all of their structures say it together.
+
+Each structure is held against that of other subjects, as it is and mirrored; what the structures of
+a subject say is added up.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+import s4a
+from s4a.input.hands import (
+    COMMON_HAND,
+    OTHER_HAND,
+    hands,
+    is_of_other_hand,
+    of_other_hand,
+    of_rarer_hand,
+)
+from s4a.input.plausibility import examine
+from s4a.input.subjects import listed
+from s4a.options import Options
+from s4a.schema import dataset
+from s4a.study.insert import clean_new, hands_beside, portraits_of
+
+Looks = Mapping[str, Mapping[str, xr.Dataset]]  # structure -> subject -> comparison
+
+
+def find_mirrored(
+    given: Mapping[str, tuple[dict[str, Any], dict[str, Any]]],
+) -> tuple[dict[str, float], list[str], list[str]]:
+    """The subjects that ``reflect="auto"`` mirrors, see :func:`subjects_of_other_hand`.
+
+    Parameters
+    ----------
+    given : dict of str to tuple
+        Of each structure its shapes by subject, and the options of :func:`s4a.read_shapes`.
+    """
+    looks = {}
+    for name, (shapes, cleaning) in given.items():
+        original = s4a.read_shapes(shapes, compare=False, **cleaning)["original"]
+        meshes = {subject: node.to_dataset() for subject, node in original.children.items()}
+        looks[name] = examine(meshes, intersections=False) if len(meshes) > 1 else {}
+    return subjects_of_other_hand(looks)
+
+
+def find_mirrored_new(
+    given: Mapping[str, tuple[xr.DataTree, dict[str, Any]]],
+) -> tuple[list[str], list[str]]:
+    """The new subjects of the other hand than those of a study, and what is told of them.
+
+    Parameters
+    ----------
+    given : dict of str to tuple
+        Of each structure its study, and the new shapes by subject.
+    """
+    beside = {}
+    for name, (study, shapes) in given.items():
+        meshes, _ = clean_new(shapes, Options.from_report(study))
+        beside[name] = hands_beside(meshes, portraits_of(study))
+    subjects = sorted({subject for _, looks in beside.values() for subject in looks})
+    chosen, told = [], []
+    for subject in subjects:
+        own = {name: looks for name, looks in beside.items() if subject in looks[1]}
+        together = seen_together(
+            {name: known | {"": looks[subject]} for name, (known, looks) in own.items()}
+        )
+        look = together.pop("")
+        is_other, line = is_of_other_hand(subject, look, together)
+        told += [line] if line else []
+        chosen += [subject] if is_other else []
+    return chosen, told
+
+
+def seen_together(looks: Looks) -> dict[str, xr.Dataset]:
+    """What several structures of each subject say together, for :func:`s4a.input.hands.hands`.
+
+    Returns
+    -------
+    dict of str to Dataset
+        Subject -> ``hand(reference)``, the sum over the n structures that both have, over sqrt(n):
+        their noise is then that of one.  NaN where they have none.
+
+    Examples
+    --------
+    >>> from s4a.schema import dataset
+    >>> from s4a_morphometrics.mirrored import seen_together
+    >>> a = dataset(hand=[0.6]).assign_coords(reference=["b"])
+    >>> seen_together({"left": {"a": a}, "right": {"a": a}})["a"]["hand"].round(2).values.tolist()
+    [0.85]
+    """
+    subjects = sorted({name for of in looks.values() for name in of})
+    beside = [look["reference"].values for of in looks.values() for look in of.values()]
+    references = sorted({str(one) for names in beside for one in names})
+    table = hand_table(looks, subjects, references)
+    known = np.isfinite(table)
+    n = known.sum(0)
+    whole = np.where(n, np.where(known, table, 0).sum(0) / np.sqrt(np.maximum(n, 1)), np.nan)
+    return {
+        name: dataset(hand=row).assign_coords(reference=references)
+        for name, row in zip(subjects, whole, strict=True)
+    }
+
+
+def hand_table(looks: Looks, subjects: list[str], references: list[str]) -> np.ndarray:
+    """``hand`` of every structure ``(structures, subjects, references)``, NaN where not known."""
+    table = np.full((len(looks), len(subjects), len(references)), np.nan)
+    for k, of in enumerate(looks.values()):
+        for name, look in of.items():
+            table[k, subjects.index(name)] = look["hand"].reindex(reference=references).values
+    return table
+
+
+def subjects_of_other_hand(looks: Looks) -> tuple[dict[str, float], list[str], list[str]]:
+    """The subjects of the rarer hand, each as a whole.
+
+    Returns
+    -------
+    hand : dict of str to float
+        Of every subject, as of :func:`s4a.input.hands.hands`.
+    names : list of str
+        Those of the rarer hand.
+    remarks : list of str
+        In words, as of :func:`s4a.input.hands.of_other_hand`; and which subjects have structures of
+        both hands, and stay as they are: each subject is named once.
+    """
+    together = seen_together(looks)
+    if len(together) < 2:
+        return dict.fromkeys(together, np.nan), *of_other_hand(together)
+    names, mean = list(together), hands(together)
+    hand = dict(zip(names, mean.tolist(), strict=True))
+    table = hand_table(looks, names, names) * np.where(mean < 0, -1, 1)
+    known = np.isfinite(table)
+    each = np.where(known, table, 0).sum(2) / np.maximum(known.sum(2), 1)  # (structures, subjects)
+    both = (each <= -OTHER_HAND).any(0) & (each >= OTHER_HAND).any(0)
+    if np.median(np.abs(mean)) < COMMON_HAND or both.all():
+        return hand, *of_rarer_hand(hand)
+    chosen, told = of_rarer_hand({name: hand[name] for name in np.array(names)[~both]})
+    for i in np.flatnonzero(both):
+        said = [f"{name} {one:+.2f}" for name, one in zip(looks, each[:, i], strict=True)]
+        told.append(
+            f"reflect='auto': {names[i]} is of both hands ({listed(said)}) and stayed as it is: "
+            "was one of its structures mirrored in its file?"
+        )
+    return hand, chosen, told

@@ -1,0 +1,136 @@
+"""The commands of several structures: their flags, what they do, and what they print."""
+
+from argparse import ArgumentTypeError, Namespace
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from s4a.cli.commands import cluster, lines_or_bars, new_folder, within, write
+from s4a.cli.flags import Command, add_options, whole
+from s4a.options import DECLARED
+
+FOLDERS = "folder of landmark files, with one for each structure, or named as files of the table"
+OPTIONS = [*(name for name in DECLARED if name != "label"), "n_jobs"]
+TABLE = "CSV with columns shape, subject and structure"
+
+
+def run(args: Namespace) -> int:
+    """The analysis of every structure of each subject: files and a table, or label volumes."""
+    from s4a.cli.tables import run_summary
+    from s4a_morphometrics.several import analyse_structures
+
+    given = dict(args.structures) if args.structures else None
+    options = {name: getattr(args, name) for name in OPTIONS}
+    with cluster(args.cluster), lines_or_bars():
+        study = analyse_structures(args.paths, store=args.out, structures=given, **options)
+    parts = study["structures"].children
+    for name, part in parts.items():
+        write(f"structure {name}, a study of its own in {args.out}/structures/{name}")
+        write(run_summary(part))
+    write(f"\ns4a structures {args.out} compares them")
+    return 1 if any(part["report"].attrs["unforeseen"] for part in parts.values()) else 0
+
+
+def insert(args: Namespace) -> int:
+    """New subjects in the studies of several structures, which stay as they are."""
+    from s4a.analysis.export import write_registered
+    from s4a.cli.tables import inserted_table
+    from s4a_morphometrics.several import insert_structures, open_structures
+
+    study = open_structures(args.study)
+    options = {name: getattr(args, name) for name in ("landmarks", "reflect", "table", "n_jobs")}
+    inserted = insert_structures(study, args.shapes, **options)
+    out = new_folder(args.out)
+    inserted.to_netcdf(out / "inserted.nc", engine="h5netcdf")
+    for name, part in inserted["structures"].children.items():
+        write_registered(part, out / "structures" / name)
+        write(f"structures/{name}\n{inserted_table(part)}")
+    write(f"\nwritten: {out / 'inserted.nc'}, registered meshes and scores in {out}")
+    return 1 if (inserted["report"]["structure_status"] == "excluded").any() else 0
+
+
+def compare(args: Namespace) -> int:
+    """How structures vary in how they lie to each other, and each in its shape."""
+    from s4a.analysis.effects import group_test
+    from s4a.analysis.export import write_results, write_scores
+    from s4a.show.page import write_page
+    from s4a.study.tree import open_inserted
+    from s4a_morphometrics import poses, structures_tables
+    from s4a_morphometrics.several import open_structures
+
+    study = open_structures(args.study)
+    out = Path(args.out) if args.out else within(args.study, "statistics")
+    options = {} if args.permutations is None else {"n_permutations": args.permutations}
+    inserted = open_inserted(args.new) if args.new else None
+    found = poses.structures(study, scale=args.scale, seed=args.seed, **options)
+    write_results(found, out, "structures")
+    write(structures_tables.structure_lines(found))
+    new = None
+    if inserted is not None:
+        new = poses.structures_of_new(found, inserted)
+        write_results(new, out, "new_structures")
+        write(f"\nnew subjects\n{structures_tables.pose_table(new)}\n")
+    for level in poses.LEVELS:
+        if level in found["level"] and not found["level_share"].sel(level=level).any():
+            write(f"{level}: nothing varies")
+            continue
+        of_level = poses.structures_modes(study, found, level)
+        ratio = of_level["pca"].dataset["explained_variance_ratio"].values[:5]
+        shares = ", ".join(f"{100 * one:.1f}" for one in ratio)
+        write(f"{level}: modes of {shares} % of its variance")
+        if args.group:
+            test = group_test(of_level, args.group, seed=args.seed, **options)
+            write(f"  groups of {args.group}: p = {test['p_value'].item():.3g}")
+        if new is not None:
+            scores = poses.structures_modes(study, found, level, new)["pca"].to_dataset()
+            write(structures_tables.new_score_lines(scores))
+            write_scores(scores, out / f"new_{level}.csv")
+        write_page(of_level, out / f"{level}.html", title=f"Structures: {level}")
+    write(f"\nresults: {out}")
+    return 0
+
+
+def named_label(text: str) -> tuple[str, str]:
+    """A structure and its label or labels, as ``left=17``."""
+    name, equals, label = text.partition("=")
+    if not (name and equals and label):
+        raise ArgumentTypeError(f"a structure and its label needed, as left=17: {text!r}")
+    return name, label
+
+
+def _run(add: Callable[..., Any]) -> None:
+    add("paths", nargs="+", metavar="PATH", help="folders, globs or mesh files, or label volumes")
+    text = "folder of the study; an unfinished one is resumed"
+    add("--out", required=True, metavar="STUDY", help=text)
+    text = "dask scheduler tcp://host:port, or local:N worker processes"
+    add("--cluster", metavar="ADDRESS", help=text)
+    text = "label volumes that each hold several structures: left=17 right=53"
+    add("--structures", nargs="+", type=named_label, metavar="NAME=LABEL", help=text)
+    add_options(add, OPTIONS)
+
+
+def _insert(add: Callable[..., Any]) -> None:
+    add("study", metavar="STUDY")
+    add("shapes", nargs="+", metavar="SHAPE", help="mesh files, label volumes, folders or globs")
+    text = "for inserted.nc, registered meshes and scores"
+    add("--out", required=True, metavar="DIR", help=text)
+    add("--landmarks", metavar="DIR", help=FOLDERS)
+    text = "new subjects to mirror: names, with commas; COLUMN=VALUE of the table; or auto"
+    add("--reflect", metavar="NAMES", help=text)
+    add("--table", metavar="CSV", help=TABLE)
+    add_options(add, ["n_jobs"])
+
+
+def _compare(add: Callable[..., Any]) -> None:
+    add("study", metavar="STUDY")
+    add("--scale", action="store_true", help="take the size of each whole subject out")
+    text = "also test whether groups differ in how structures lie, and in their shapes"
+    add("--group", metavar="COLUMN", help=text)
+    text = "folder of s4a insert-structures, or its inserted.nc: poses and scores of new subjects"
+    add("--new", metavar="DIR", help=text)
+    add("--permutations", type=whole, help="of the subjects (default: 999)")
+    add("--out", metavar="DIR", help="for netCDF, CSV, the pages (default: STUDY/statistics)")
+    add_options(add, ["seed"])
+
+
+RUN, INSERT, COMPARE = Command(run, _run), Command(insert, _insert), Command(compare, _compare)
