@@ -114,12 +114,9 @@ def cluster(address: str | None) -> Iterator[None]:
         raise ValueError("--cluster needs dask.distributed: pip install 's4a[cluster]'") from error
     from joblib import parallel_config
 
-    from s4a.study.processes import spawned_end_too
-
     n_workers = int(known[1] or 0)
     with contextlib.ExitStack() as stack:
         if n_workers:
-            stack.enter_context(spawned_end_too())
             local = LocalCluster(n_workers=n_workers, threads_per_worker=1, dashboard_address=None)
             address = stack.enter_context(local).scheduler_address
         stack.enter_context(Client(address))
