@@ -1,8 +1,8 @@
 """The commands of the command line: from what was typed to what is written and an exit code.
 
 The parameters of a command are its arguments and flags (:mod:`s4a.cli.flags`); what is shown is put
-into words in :mod:`s4a.cli.tables`.  Every command imports what it needs, so that none waits for
-what the others need.
+into words in :mod:`s4a.cli.tables`.  What they need is imported when it is first used, so that
+none waits for what the others need.
 """
 
 import contextlib
@@ -16,12 +16,22 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import lazy_loader
+
+import s4a
+from s4a.cli import tables
+from s4a.cli.doctor import examine, lines
 from s4a.cli.flags import ALL_OPTIONS, command
 from s4a.options import DECLARED, N_COARSE, Options
 
 if TYPE_CHECKING:
     import numpy as np
     import xarray as xr
+
+    from s4a.input import annotations
+else:
+    np = lazy_loader.load("numpy")
+    annotations = lazy_loader.load("s4a.input.annotations", suppress_warning=True)
 
 
 def check(paths: list[str], **options: Any) -> int:
@@ -32,10 +42,7 @@ def check(paths: list[str], **options: Any) -> int:
     paths : PATH
         folders, globs or mesh files
     """
-    from s4a.cli import tables
-    from s4a.input.collection import read_shapes
-
-    report = read_shapes(paths, **options)["report"].to_dataset()
+    report = s4a.read_shapes(paths, **options)["report"].to_dataset()
     write(*tables.decision_lines(report), tables.report_table(report))
     return 0 if (report["status"] != "excluded").all() else 1
 
@@ -48,8 +55,6 @@ def doctor(folder: str = ".") -> int:
     folder : FOLDER
         where studies are to lie (default: here)
     """
-    from s4a.cli.doctor import examine, lines
-
     findings = examine(folder)
     lacking = sum(finding.state == "lacks" for finding in findings)
     notes = sum(finding.state == "note" for finding in findings)
@@ -71,12 +76,9 @@ def run(
     cluster : ADDRESS
         dask scheduler tcp://host:port, or local:N worker processes
     """
-    from s4a.cli import tables
-    from s4a.study.pipeline import analyse
-
     full = within(out, "report.txt")
     with on_cluster(cluster), lines_or_bars():
-        study = analyse(paths, store=out, **options)
+        study = s4a.analyse(paths, store=out, **options)
     again = shlex.join(["s4a", *(word for word in words if word != "--keep-doubtful")])
     report = study["report"].to_dataset()
     lines = [tables.report_table(report), *tables.stage_lines(report)]
@@ -119,11 +121,9 @@ def on_cluster(address: str | None) -> Iterator[None]:
         raise ValueError("--cluster needs dask.distributed: pip install 's4a[cluster]'") from error
     from joblib import parallel_config
 
-    from s4a.study.processes import spawned_end_too
-
     with contextlib.ExitStack() as stack:
         if known[1]:
-            stack.enter_context(spawned_end_too())
+            stack.enter_context(s4a.study.processes.spawned_end_too())
             n = int(known[1])
             local = LocalCluster(n_workers=n, threads_per_worker=1, dashboard_address=None)
             address = stack.enter_context(local).scheduler_address
@@ -159,29 +159,22 @@ def demo(
     open
         open the page in a browser
     """
-    from s4a.cli import tables
-    from s4a.datasets import synthetic
-    from s4a.evaluation import accuracy
-    from s4a.show.page import write_page
-    from s4a.show.pictures import write_picture
-    from s4a.study.pipeline import analyse
-
-    collection = synthetic.brains(shapes, vertices, seed, dirty=dirty)
-    study = analyse(collection, store=out, seed=seed, **options)
+    collection = s4a.synthetic.brains(shapes, vertices, seed, dirty=dirty)
+    study = s4a.analyse(collection, store=out, seed=seed, **options)
     truth: Any = collection["truth"]
 
     def image(shape, template):
-        return synthetic.position(truth, shape, truth[template]["reference_point"].values)
+        return s4a.synthetic.position(truth, shape, truth[template]["reference_point"].values)
 
     write(tables.run_summary(study))
     if "pca" in study:
-        write(f"\npicture: {write_picture(study, Path(out) / 'modes.png')}")
-    errors = accuracy.accuracy(study, image, n_jobs=options["n_jobs"])
+        write(f"\npicture: {s4a.write_picture(study, Path(out) / 'modes.png')}")
+    errors = s4a.evaluation.accuracy.accuracy(study, image, n_jobs=options["n_jobs"])
     write("", tables.error_table(errors))
     if "pca" in study:
         write(tables.planted_line(study["pca"].to_dataset(), truth.to_dataset()))
     page = Path(out) / "study.html"
-    write_page(study, page, title="Synthetic brains")
+    s4a.write_page(study, page, title="Synthetic brains")
     write(f"\npage: {page}")
     if open:
         webbrowser.open(page.resolve().as_uri())
@@ -196,10 +189,7 @@ def verify(study: str) -> int:
     study : STUDY
         its folder
     """
-    from s4a.cli import tables
-    from s4a.study.verify import verify
-
-    found = verify(study)
+    found = s4a.verify(study)
     write(tables.verify_lines(found))
     return 1 if tables.count_faults(found) else 0
 
@@ -212,10 +202,7 @@ def status(study: str) -> int:
     study : STUDY
         its folder
     """
-    from s4a.cli import tables
-    from s4a.study.progress import status
-
-    write(tables.status_lines(status(study), time.time()))
+    write(tables.status_lines(s4a.study.progress.status(study), time.time()))
     return 0
 
 
@@ -242,11 +229,8 @@ def view(
     up
         axis that points up
     """
-    from s4a.show.page import write_page
-    from s4a.study.tree import open_study
-
     page = Path(out) if out else within(study, "study.html")
-    write_page(open_study(study), page, title=title or Path(study).name, view=view, up=up)
+    s4a.write_page(s4a.open_study(study), page, title=title or Path(study).name, view=view, up=up)
     write(f"wrote {page} ({page.stat().st_size / 1e6:.1f} MB)")
     return 0
 
@@ -311,10 +295,6 @@ def statistics(
     out : DIR
         for netCDF and CSV (default: STUDY/statistics)
     """
-    from s4a.analysis import statistics as tests
-    from s4a.analysis.export import write_results
-    from s4a.cli import tables
-
     if (covariates or field) and not (group or variable):
         raise ValueError("--covariates and --field are of a test: give --group or --variable")
     if labels and not label:
@@ -325,12 +305,12 @@ def statistics(
     tree = restricted(tree, size_back, without, label, labels, least_confidence)
     options = {"covariates": covariates, "field": field, "seed": seed, "variances": variances}
     results = tests_of(tree, group, variable, permutations, options)  # first: these may be refused
-    results["evaluation"] = tests.evaluate(tree, seed=seed)
-    results["outliers"] = tests.outliers(tree)
+    results["evaluation"] = s4a.statistics.evaluate(tree, seed=seed)
+    results["outliers"] = s4a.statistics.outliers(tree)
     if recompute:
-        results["generalization"] = tests.generalization(tree, n_jobs=n_jobs, seed=seed)
+        results["generalization"] = s4a.statistics.generalization(tree, n_jobs=n_jobs, seed=seed)
     for name, result in results.items():
-        write_results(result, out, name)
+        s4a.analysis.export.write_results(result, out, name)
     write(tables.evaluation_table(results["evaluation"], results.get("generalization")))
     outlier = results["outliers"]["outlier"]
     write(f"\noutliers: {', '.join(outlier['shape'].values[outlier.values]) or 'none'}")
@@ -350,31 +330,22 @@ def statistics(
 
 def write_moving(study: "xr.DataTree", regression: "xr.Dataset", name: str, out: Path) -> None:
     """The regression on a variable as a page and as a film."""
-    from s4a.analysis.statistics import regression_modes
-    from s4a.show.page import write_page
-    from s4a.show.pictures import write_film
-
-    moving = regression_modes(study, regression, name)
-    write_page(moving, out / "regression.html", title=f"Regression on {name}")
-    write_film(moving, out / "regression.gif")
+    moving = s4a.statistics.regression_modes(study, regression, name)
+    s4a.write_page(moving, out / "regression.html", title=f"Regression on {name}")
+    s4a.write_film(moving, out / "regression.gif")
 
 
 def study_to_test(
     study: str, out: str | None, table: str | None, keep_doubtful: bool
 ) -> "tuple[xr.DataTree, str]":
     """The study with the table and the shapes that are asked for, and the folder of results."""
-    from s4a.analysis.inputs import with_doubtful
-    from s4a.input.plausibility import listed
-    from s4a.input.subjects import with_table
-    from s4a.study.tree import left_out, open_study
-
-    tree, out = open_study(study), out or str(within(study, "statistics"))
-    tree = with_table(tree, table) if table else tree
-    tree = with_doubtful(tree) if keep_doubtful else tree
-    if doubtful := left_out(tree):
+    tree, out = s4a.open_study(study), out or str(within(study, "statistics"))
+    tree = s4a.input.subjects.with_table(tree, table) if table else tree
+    tree = s4a.statistics.with_doubtful(tree) if keep_doubtful else tree
+    if doubtful := s4a.study.tree.left_out(tree):
         write(
             f"{len(doubtful)} doubtful shapes are left out, --keep-doubtful takes them in: "
-            f"{listed(doubtful, 200)}\n"
+            f"{s4a.input.plausibility.listed(doubtful, 200)}\n"
         )
     return tree, out
 
@@ -388,19 +359,17 @@ def restricted(
     least_confidence: float,
 ) -> "xr.DataTree":
     """The study of the part of what varies that is asked for."""
-    from s4a.analysis import restrict
-
     said = []
     if size_back:
-        study = restrict.with_size(study)
+        study = s4a.statistics.with_size(study)
         said.append("with size given back")
     if without:
-        study = restrict.without(study, without)
+        study = s4a.statistics.without(study, without)
         said.append(f"without {', '.join(without)}")
     if label or least_confidence:
         whole = study["registration"].sizes["vertex"]
         of = template_labels(study, labels)
-        study = restrict.within(study, label, labels=of, least_confidence=least_confidence)
+        study = s4a.statistics.within(study, label, labels=of, least_confidence=least_confidence)
         said.append(f"{study['registration'].sizes['vertex']} of {whole} vertices")
     if said:
         write("; ".join(said) + "\n")
@@ -409,13 +378,16 @@ def restricted(
 
 def template_labels(study: "xr.DataTree", file: str | None) -> "np.ndarray | None":
     """Labels of the template, from a file with one for each vertex of its file."""
-    from s4a.analysis.inputs import all_registered
-    from s4a.input.annotations import labels_of_mesh, read_labels
-
     if file is None:
         return None
-    mesh = study["original"][all_registered(study).attrs["template"]].to_dataset()
-    return labels_of_mesh(read_labels(file, mesh.sizes["file_vertex_index"]), mesh)
+    template = s4a.analysis.inputs.all_registered(study).attrs["template"]
+    return labels_in(file, study["original"][template].to_dataset())
+
+
+def labels_in(file: str, mesh: "xr.Dataset") -> "np.ndarray":
+    """Labels of a mesh, from a file with one for each vertex of its file."""
+    label = annotations.read_labels(file, mesh.sizes["file_vertex_index"])
+    return annotations.labels_of_mesh(label, mesh)
 
 
 def tests_of(
@@ -426,19 +398,17 @@ def tests_of(
     options: dict[str, Any],
 ) -> "dict[str, xr.Dataset]":
     """The tests of the group and the variable that are asked for."""
-    from s4a.analysis import statistics as tests
-
     of_classes = {name: options[name] for name in ("field", "seed")}
     if permutations is not None:
         options = options | {"n_permutations": permutations}
         of_classes["n_permutations"] = min(permutations, 99)  # each trains anew
     results = {}
     if group:
-        results["group"] = tests.group_test(study, group, **options)
-        results["group_map"] = tests.group_map(study, group, **options)
-        results["classification"] = tests.classify(study, group, **of_classes)
+        results["group"] = s4a.statistics.group_test(study, group, **options)
+        results["group_map"] = s4a.statistics.group_map(study, group, **options)
+        results["classification"] = s4a.statistics.classify(study, group, **of_classes)
     if variable:
-        results["regression"] = tests.regression(study, variable, **options)
+        results["regression"] = s4a.statistics.regression(study, variable, **options)
     return results
 
 
@@ -460,13 +430,8 @@ def fields(
     partial
         shapes may lack it; tests leave these out
     """
-    import numpy as np
-
-    from s4a.analysis.fields import with_field, write_field
-    from s4a.study.tree import open_study
-
-    tree = with_field(open_study(study), name, folder, unit=unit, partial=partial)
-    path = write_field(tree, name, study)
+    tree = s4a.with_field(s4a.open_study(study), name, folder, unit=unit, partial=partial)
+    path = s4a.analysis.fields.write_field(tree, name, study)
     field = tree["fields"][name].to_dataset()["carried_field"]
     known = np.isfinite(field.values)
     write(
@@ -503,17 +468,11 @@ def insert(
     reflect : NAMES
         new shapes to mirror: names, with commas; or auto, those of the other hand
     """
-    from s4a.analysis.export import write_registered
-    from s4a.cli import tables
-    from s4a.study.insert import insert
-    from s4a.study.store import ENGINE
-    from s4a.study.tree import open_study
-
-    tree = open_study(study)
-    inserted = insert(tree, shapes, landmarks=landmarks, reflect=reflect, n_jobs=n_jobs)
+    tree = s4a.open_study(study)
+    inserted = s4a.insert(tree, shapes, landmarks=landmarks, reflect=reflect, n_jobs=n_jobs)
     folder = new_folder(out)
-    inserted.to_netcdf(folder / "inserted.nc", engine=ENGINE)
-    write_registered(inserted, folder)
+    inserted.to_netcdf(folder / "inserted.nc", engine=s4a.study.store.ENGINE)
+    s4a.write_registered(inserted, folder)
     write(tables.inserted_table(inserted), "")
     write(f"written: {folder / 'inserted.nc'}, registered meshes and scores in {folder}")
     return 1 if (inserted["report"]["status"] == "excluded").any() else 0
@@ -548,14 +507,6 @@ def transfer(
         how far around votes for labels count, in multiples of how far matches may be wrong
         (default: 1; 0, not, with --preset paper)
     """
-    from s4a.analysis import transfer as travel
-    from s4a.cli import tables
-    from s4a.input.annotations import labels_of_mesh, read_labels, read_landmarks
-    from s4a.input.collection import read_shape
-    from s4a.input.landmarks import locate
-    from s4a.study.store import check_is_study
-    from s4a.study.tree import open_study
-
     if not (labels or landmarks):
         raise ValueError(
             "something to transfer needed: give --labels FILE, --landmarks FILE or both"
@@ -564,28 +515,28 @@ def transfer(
         raise ValueError("--blur is of labels: give --labels FILE, or leave it out")
     into_study = len(targets) == 1 and any(Path(targets[0]).glob("**/registration.nc"))
     if into_study:
-        check_is_study(targets[0])
-    mesh, label, points = read_shape(source), None, None
+        s4a.study.store.check_is_study(Path(targets[0]))
+    mesh, label, points = s4a.read_shape(source), None, None
     if labels:
-        label = labels_of_mesh(read_labels(labels, mesh.sizes["file_vertex_index"]), mesh)
+        label = labels_in(labels, mesh)
     if landmarks:
-        points = read_landmarks(landmarks)
-        distance = locate(points, mesh)["landmark_distance"].values
+        points = annotations.read_landmarks(landmarks)
+        distance = s4a.input.landmarks.locate(points, mesh)["landmark_distance"].values
         far = f"at most {distance.max():.3g} from the surface of {source}"
         write(f"{len(distance)} landmarks, {far}")
     given = {name: value for name, value in options.items() if value is not None}
     excluded: list[str] = []
     if into_study:
-        study = open_study(targets[0])
+        study = s4a.open_study(targets[0])
         given["source"] = mesh
     else:
         study, excluded = registered_pairs(mesh, targets, n_jobs, given)
         given = {}  # the source is the template now, and matched
     folder, carried = new_folder(out), {}
     if label is not None:
-        carried["labels"] = travel.transfer_labels(study, label, blur=blur, **given)
+        carried["labels"] = s4a.transfer_labels(study, label, blur=blur, **given)
     if points is not None:
-        carried["landmarks"] = travel.transfer_landmarks(study, points, **given)
+        carried["landmarks"] = s4a.transfer_landmarks(study, points, **given)
     write(tables.table(transferred_rows(study, carried, folder), tables.TRANSFERRED))
     return 1 if excluded else 0
 
@@ -594,10 +545,7 @@ def registered_pairs(
     source: "xr.Dataset", targets: list[str], n_jobs: int, options: dict[str, Any]
 ) -> "tuple[xr.DataTree, list[str]]":
     """The source registered as the template of every target, and the targets that are left out."""
-    from s4a.analysis.transfer import register_pairs
-    from s4a.input.collection import read_shapes
-
-    shapes = read_shapes(targets, compare=False)
+    shapes = s4a.read_shapes(targets, compare=False)
     report = shapes["report"].to_dataset()
     excluded = report["shape"].values[report["status"].values == "excluded"].tolist()
     for name in excluded:
@@ -605,21 +553,19 @@ def registered_pairs(
     meshes = {name: node.to_dataset() for name, node in shapes["original"].children.items()}
     name = next(n for n in ("template", "template_", "template__") if n not in meshes)
     options = {"k_init": min(Options.k_init, options.get("k", Options.k))} | options
-    return register_pairs(source, meshes, name=name, n_jobs=n_jobs, **options), excluded
+    return s4a.register_pairs(source, meshes, name=name, n_jobs=n_jobs, **options), excluded
 
 
 def transferred_rows(
     study: "xr.DataTree", carried: "dict[str, xr.DataTree]", out: Path
 ) -> list[list[Any]]:
     """Write the files of every target; the rows of the table that is shown."""
-    from s4a.cli import tables
-    from s4a.input.annotations import write_landmarks
-    from s4a.input.files import stem_of
-    from s4a.input.hands import in_file
-
     first, *_ = carried.values()
     meshes = {name: study["original"][name].to_dataset() for name in first.children}
-    stems = {name: stem_of(mesh.attrs.get("path") or name) for name, mesh in meshes.items()}
+    stems = {
+        name: s4a.input.files.stem_of(mesh.attrs.get("path") or name)
+        for name, mesh in meshes.items()
+    }
     rows = []
     for name, mesh in meshes.items():
         stem = stems[name] if list(stems.values()).count(stems[name]) == 1 else name
@@ -630,8 +576,9 @@ def transferred_rows(
         if "landmarks" in carried:
             landmarks = carried["landmarks"][name].to_dataset()
             place = landmarks["landmark_position"]
-            landmarks["landmark_position"] = place.copy(data=in_file(mesh, place.values))
-            write_landmarks(out / f"{stem}.landmarks.csv", landmarks)
+            X = s4a.input.hands.in_file(mesh, place.values)
+            landmarks["landmark_position"] = place.copy(data=X)
+            annotations.write_landmarks(out / f"{stem}.landmarks.csv", landmarks)
             of_points = tables.landmark_cells(landmarks)
         rows.append([stem, *cells, *of_labels, *of_points])
     return rows
@@ -639,13 +586,9 @@ def transferred_rows(
 
 def write_labels(labels: "xr.Dataset", mesh: "xr.Dataset", out: Path, stem: str) -> list[str]:
     """Write labels and their confidence as NPY, a row for each vertex of the file; the cells."""
-    import numpy as np
-
-    from s4a.input.annotations import labels_of_file
-
     points = file_points(mesh)
     for name in ("label", "confidence"):
-        values, dropped = labels_of_file(labels[name].values, mesh, points)
+        values, dropped = annotations.labels_of_file(labels[name].values, mesh, points)
         np.save(out / f"{stem}.{'labels' if name == 'label' else name}.npy", values)
     means = [f"{labels[name].mean().item():.2f}" for name in ("confidence", "label_share")]
     return [*means, str(dropped)]
@@ -653,16 +596,10 @@ def write_labels(labels: "xr.Dataset", mesh: "xr.Dataset", out: Path, stem: str)
 
 def file_points(mesh: "xr.Dataset") -> "np.ndarray":
     """The vertices of a mesh's file (n, 3), mirrored as it; those kept, where the file is gone."""
-    import numpy as np
-
-    from s4a.input.files import read_mesh
-    from s4a.input.hands import in_file
-    from s4a.input.labels import read_volume
-
     path, label = mesh.attrs.get("path") or "", mesh.attrs.get("label")
     if Path(path).is_file():
-        read = read_volume(path, label) if label else read_mesh(path)
-        return in_file(mesh, read[0])
+        read = s4a.input.labels.read_volume(path, label) if label else s4a.read_mesh(path)
+        return s4a.input.hands.in_file(mesh, read[0])
     points = np.full((mesh.sizes["file_vertex_index"], 3), np.nan)
     points[mesh["file_vertex"].values] = mesh["position"].values
     return points
@@ -701,10 +638,6 @@ def compare(
     out : DIR
         for compare.nc and compare.png
     """
-    from s4a.cli import tables
-    from s4a.show import charts
-    from s4a.study.store import ENGINE
-
     options["n_coarse"] = options["n_coarse"] or N_COARSE
     result: xr.Dataset | xr.DataTree
     if collection:
@@ -724,8 +657,8 @@ def compare(
         blocks = tables.block_table(names, found["block"].values.tolist(), seconds)
         text = f"{tables.comparison_table(found)}\n\n{blocks}"
     folder = new_folder(out)
-    result.to_netcdf(folder / "compare.nc", engine=ENGINE)
-    figure = charts.stacked(names, result.coords["block"].values.tolist(), seconds)
+    result.to_netcdf(folder / "compare.nc", engine=s4a.study.store.ENGINE)
+    figure = s4a.show.charts.stacked(names, result.coords["block"].values.tolist(), seconds)
     figure.savefig(folder / "compare.png", dpi=150)
     write(
         text,
@@ -739,11 +672,9 @@ def compare_collection(
     paths: list[str], methods: list[str] | None, n_pairs: int, options: dict[str, Any]
 ) -> "xr.Dataset":
     """Table 2."""
-    from s4a.evaluation import compare as comparison
-
     k_init = min(Options.k_init, options["k"])
-    methods = methods or list(comparison.COLLECTION_METHODS)
-    return comparison.collection(paths, methods=methods, n_pairs=n_pairs, k_init=k_init, **options)
+    methods = methods or list(s4a.compare.COLLECTION_METHODS)
+    return s4a.compare.collection(paths, methods=methods, n_pairs=n_pairs, k_init=k_init, **options)
 
 
 def compare_pairs(
@@ -754,23 +685,20 @@ def compare_pairs(
     keep: bool,
 ) -> Any:
     """Table 1, a Dataset; a tree with what is to be kept."""
-    from s4a.evaluation import compare as comparison
-    from s4a.input.files import find_meshes, slugs
-
     if len(paths) < 2:
         raise ValueError("compare needs SOURCE and TARGET, or --collection PATH...")
     source, *targets = paths
-    files = [file for target in targets for file, _ in find_meshes(target)]
+    files = [file for target in targets for file, _ in s4a.input.files.find_meshes(target)]
     twice = [str(file) for file in files if files.count(file) > 1]
     if twice:
         raise ValueError(f"every TARGET once needed, found {twice[0]} more than once")
-    names = slugs(files)  # in the order given, as --truth is
+    names = s4a.input.files.slugs(files)  # in the order given, as --truth is
     if truth and len(truth) != len(files):
         raise ValueError(
             f"--truth needs a file for each of the {len(files)} targets, found {len(truth)}"
         )
-    known = {name: comparison.read_truth(f) for name, f in zip(names, truth or [], strict=False)}
-    return comparison.pairs(
+    known = {name: s4a.compare.read_truth(f) for name, f in zip(names, truth or [], strict=False)}
+    return s4a.compare.pairs(
         source,
         dict(zip(names, files, strict=True)),
         truth=known or None,
@@ -784,8 +712,6 @@ def landmark_pairs(
     files: list[str] | None, targets: list[str]
 ) -> "dict[str, list[np.ndarray]] | None":
     """Positions of the landmarks that source and target both have by name, for every target."""
-    from s4a.input.annotations import read_landmarks
-
     if not files:
         return None
     if len(files) != 1 + len(targets):
@@ -793,7 +719,9 @@ def landmark_pairs(
             "--landmarks needs a file for the source and each target, "
             f"{1 + len(targets)}; found {len(files)}"
         )
-    source, *others = (read_landmarks(file).set_index(landmark="landmark_name") for file in files)
+    source, *others = (
+        annotations.read_landmarks(file).set_index(landmark="landmark_name") for file in files
+    )
     pairs = {}
     for name, file, target in zip(targets, files[1:], others, strict=True):
         both = [mark for mark in source["landmark"].values if mark in target["landmark"]]
@@ -830,9 +758,7 @@ def new_folder(path: str) -> Path:
 
 def write(*texts: str) -> None:
     """Texts to the output, and new lines; of what a file says, nothing moves the cursor."""
-    from s4a.input.raw import shown
-
-    lines = [shown(line) for text in texts for line in text.split("\n")]
+    lines = [s4a.input.raw.shown(line) for text in texts for line in text.split("\n")]
     sys.stdout.write("\n".join(lines) + "\n")
 
 
