@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from s4a.extensions import extensions
 
+Array = np.ndarray  # of numbers; its dims and kind stand in the docstring
 INPUT = "unit of the input"
 INPUT2 = "squared unit of the input"
 FIELD_UNIT = "unit of the field"

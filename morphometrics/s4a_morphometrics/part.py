@@ -34,6 +34,7 @@ from s4a.geometry.mesh import triangle_normals, vertex_areas, vertex_normals
 from s4a.method.elastic import elastic_rounds, local_rounds
 from s4a.method.shape import Basis, Shape
 from s4a.method.spectral import Diffusion
+from s4a.schema import Array
 
 N_ROUGH = 150  # points of the part in the first rounds of ICP, and
 N_ROUGH_ROUNDS = 12
@@ -52,11 +53,11 @@ LONGEST_TURN = 60.0  # degrees within which a pose counts as that of the study's
 class Pose(NamedTuple):
     """The motion s R x + t of a part into the frame of the template."""
 
-    R: np.ndarray
-    t: np.ndarray
+    R: Array
+    t: Array
     s: float
 
-    def __call__(self, X: np.ndarray) -> np.ndarray:
+    def __call__(self, X: Array) -> Array:
         """Points ``(n, 3)`` moved."""
         return self.s * X @ self.R.T + self.t
 
@@ -64,13 +65,13 @@ class Pose(NamedTuple):
 class Part(NamedTuple):
     """A part: vertices ``X``, triangles ``T``, normals ``N``, areas ``area``, boundary ``rim``."""
 
-    X: np.ndarray
-    T: np.ndarray
-    N: np.ndarray
-    area: np.ndarray
-    rim: np.ndarray  # (n,) of bool
+    X: Array
+    T: Array
+    N: Array
+    area: Array
+    rim: Array  # (n,) of bool
 
-    def spread(self, n: int) -> np.ndarray:
+    def spread(self, n: int) -> Array:
         """Vertices within, spread."""
         inner = np.flatnonzero(~self.rim & (self.area > 0))
         return inner[farthest_points(self.X[inner], n)]
@@ -79,10 +80,10 @@ class Part(NamedTuple):
 class Whole(NamedTuple):
     """The mean shape and its modes at low resolution, of unit area: ``X``, ``T``, ``modes``."""
 
-    X: np.ndarray  # (n, 3)
-    T: np.ndarray
-    modes: np.ndarray  # (c, n, 3)
-    rim: np.ndarray  # (n,) of bool
+    X: Array  # (n, 3)
+    T: Array
+    modes: Array  # (c, n, 3)
+    rim: Array  # (n,) of bool
 
 
 class Fit(NamedTuple):
@@ -93,12 +94,12 @@ class Fit(NamedTuple):
     """
 
     pose: Pose
-    b: np.ndarray
+    b: Array
     residual: float
     inside: float
 
 
-def on_boundary(T: np.ndarray, n: int) -> np.ndarray:
+def on_boundary(T: Array, n: int) -> Array:
     """Which of n vertices are on the boundary.
 
     Examples
@@ -114,12 +115,12 @@ def on_boundary(T: np.ndarray, n: int) -> np.ndarray:
     return found
 
 
-def part_of(X: np.ndarray, T: np.ndarray) -> Part:
+def part_of(X: Array, T: Array) -> Part:
     """A part of its vertices and triangles."""
     return Part(X, T, vertex_normals(X, T), vertex_areas(X, T), on_boundary(T, len(X)))
 
 
-def cut(X: np.ndarray, T: np.ndarray, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def cut(X: Array, T: Array, kept: Array) -> tuple[Array, Array]:
     """The part of a surface whose vertices are kept.
 
     Examples
@@ -305,7 +306,7 @@ def best_fit(part: Part, whole: Whole, starts: list[Pose], first: Pose, free_siz
     return min(fits, key=badness)
 
 
-def seen(X: np.ndarray, N: np.ndarray, part: Part, placed: np.ndarray, limit: float) -> np.ndarray:
+def seen(X: Array, N: Array, part: Part, placed: Array, limit: float) -> Array:
     """Which vertices of the whole the part has.
 
     Parameters
@@ -327,9 +328,7 @@ def seen(X: np.ndarray, N: np.ndarray, part: Part, placed: np.ndarray, limit: fl
     return (gap <= limit) & facing & ~at_rim
 
 
-def refine(
-    part: Part, placed: np.ndarray, target: Shape, X_low: np.ndarray, present: np.ndarray
-) -> np.ndarray:
+def refine(part: Part, placed: Array, target: Shape, X_low: Array, present: Array) -> Array:
     """The low resolution ``(n, 3)`` after elastic and local rounds of the vertices that are there.
 
     Parameters

@@ -23,6 +23,7 @@ import scipy.linalg
 import scipy.sparse as sp
 
 from s4a.method.spectral import factor
+from s4a.schema import Array
 
 DENSITY = (0.25, 1.0, 4.0, 16.0)  # independent places known on all of the template, by functions
 WITHIN_90 = 1.6449  # standard deviations
@@ -38,24 +39,24 @@ class Known(NamedTuple):
     smooth fields; ``rest``, the variance of every coordinate that none of them holds.
     """
 
-    columns: np.ndarray
+    columns: Array
     n_fields: int
     n_smooth: int
-    area: np.ndarray
-    present: np.ndarray
-    gram: np.ndarray
-    variance: np.ndarray
+    area: Array
+    present: Array
+    gram: Array
+    variance: Array
     rest: float
 
 
 class Posterior(NamedTuple):
     """Normal weights of columns: ``mean (p,)``, and ``root (p, p)`` with covariance root root^T."""
 
-    mean: np.ndarray
-    root: np.ndarray
+    mean: Array
+    root: Array
 
 
-def residual_weights(K: np.ndarray) -> np.ndarray:
+def residual_weights(K: Array) -> Array:
     """Row i: weights ``(s,)`` of all fields that give field i less its best description by others.
 
     The nearest field of the affine hull of the others: with the pseudo-inverse P of the centred
@@ -78,7 +79,7 @@ def residual_weights(K: np.ndarray) -> np.ndarray:
     return P / np.diag(P)[:, None]
 
 
-def smooth_variance(coefficient: np.ndarray) -> np.ndarray:
+def smooth_variance(coefficient: Array) -> Array:
     """Variance ``(K,)`` of coefficients ``(s, K, 3)``, a mean over functions of like frequency."""
     variance = (coefficient**2).mean((0, 2))  # (K,)
     total = np.concatenate([[0], np.cumsum(variance)])
@@ -87,7 +88,7 @@ def smooth_variance(coefficient: np.ndarray) -> np.ndarray:
     return (total[end] - total[first]) / (end - first)
 
 
-def motions(X: np.ndarray, center: np.ndarray, *, scale: bool = False) -> np.ndarray:
+def motions(X: Array, center: Array, *, scale: bool = False) -> Array:
     """Small motions ``(6 or 7, n, 3)`` of points X ``(n, 3)``: turns, shifts, growth.
 
     Examples
@@ -104,13 +105,7 @@ def motions(X: np.ndarray, center: np.ndarray, *, scale: bool = False) -> np.nda
 
 
 def know(
-    fields: np.ndarray,
-    Phi: np.ndarray,
-    X: np.ndarray,
-    area: np.ndarray,
-    present: np.ndarray,
-    *,
-    scale: bool = False,
+    fields: Array, Phi: Array, X: Array, area: Array, present: Array, *, scale: bool = False
 ) -> Known:
     """What a study says of shapes of which some vertices are known.
 
@@ -149,7 +144,7 @@ def know(
     return Known(columns, s, len(smooth), area, present, rows @ rows.T, variance, rest)
 
 
-def weights_of(known: Known, modes: np.ndarray) -> np.ndarray:
+def weights_of(known: Known, modes: Array) -> Array:
     """Weights of all columns ``(q, p)`` that give modes, functions and motions.
 
     Parameters
@@ -165,7 +160,7 @@ def weights_of(known: Known, modes: np.ndarray) -> np.ndarray:
     return weights
 
 
-def modes_of(K: np.ndarray, used: np.ndarray) -> np.ndarray:
+def modes_of(K: Array, used: Array) -> Array:
     """Modes of some fields, of one standard deviation each, as weights of all ``(c, s)``.
 
     Parameters
@@ -182,7 +177,7 @@ def modes_of(K: np.ndarray, used: np.ndarray) -> np.ndarray:
     return modes
 
 
-def precision(known: Known, model: np.ndarray, density: float) -> tuple[np.ndarray, float]:
+def precision(known: Known, model: Array, density: float) -> tuple[Array, float]:
     """Matrix H of the module's equation, and the weight of the area in W."""
     c = model.shape[1] - (len(known.columns) - known.n_fields)
     weight = density * known.n_smooth / 3 / known.rest
@@ -195,7 +190,7 @@ def precision(known: Known, model: np.ndarray, density: float) -> tuple[np.ndarr
     return H, weight
 
 
-def condition(known: Known, model: np.ndarray, seen: np.ndarray, density: float) -> Posterior:
+def condition(known: Known, model: Array, seen: Array, density: float) -> Posterior:
     """Weights of the model's columns when the part is known.
 
     Parameters
@@ -214,7 +209,7 @@ def condition(known: Known, model: np.ndarray, seen: np.ndarray, density: float)
     return Posterior(root @ (root.T @ (weight * (model.T @ seen))), root)
 
 
-def left_out(known: Known, density: float, tested: np.ndarray) -> np.ndarray:
+def left_out(known: Known, density: float, tested: Array) -> Array:
     """Errors ``(s, t, 3)`` of every shape, told from its part by the others, at tested vertices."""
     s, q = known.n_fields, len(known.columns)
     rows = known.columns[:, tested].reshape(q, -1)  # (q, 3 t)
@@ -232,7 +227,7 @@ def left_out(known: Known, density: float, tested: np.ndarray) -> np.ndarray:
     return np.reshape(error, (s, len(tested), 3))
 
 
-def best_density(known: Known, where: np.ndarray) -> tuple[float, float]:
+def best_density(known: Known, where: Array) -> tuple[float, float]:
     """How many places of the part count as independent, and the error of shapes left out.
 
     That of :data:`DENSITY` with the least root mean square error of a coordinate.
@@ -250,9 +245,7 @@ def best_density(known: Known, where: np.ndarray) -> tuple[float, float]:
     return DENSITY[least], sizes[least]
 
 
-def extend(
-    values: np.ndarray, known: np.ndarray, W: sp.csr_matrix, area: np.ndarray, kappa2: float
-) -> np.ndarray:
+def extend(values: Array, known: Array, W: sp.csr_matrix, area: Array, kappa2: float) -> Array:
     """Values ``(n, 3)`` of the known vertices, fading to 0 on the others: (W + kappa^2 A) u = 0.
 
     Parameters
@@ -274,8 +267,8 @@ def extend(
 
 
 def rough_fields(
-    W: sp.csr_matrix, area: np.ndarray, kappa2: float
-) -> Callable[[np.random.Generator], np.ndarray]:
+    W: sp.csr_matrix, area: Array, kappa2: float
+) -> Callable[[np.random.Generator], Array]:
     """Draws random fields ``(n, 3)`` of variance about 1, alike over 1 / kappa.
 
     (W + kappa^2 A) u = A^(1/2) g with g white, of variance 1 / (4 pi kappa^2) on a plane (Lindgren,
@@ -284,7 +277,7 @@ def rough_fields(
     solve = factor(W + kappa2 * sp.diags_array(area))
     size = np.sqrt(4 * np.pi * kappa2)
 
-    def draw(rng: np.random.Generator) -> np.ndarray:
+    def draw(rng: np.random.Generator) -> Array:
         return size * solve(np.sqrt(area)[:, None] * rng.standard_normal((len(area), 3)))
 
     return draw

@@ -13,7 +13,6 @@ from s4a.show.browser import color_scale
 from s4a.show.draw import SIGNED, ramp_colors, signed_colors
 from s4a.show.surfaces import has
 from s4a.widgets.panel import WIDE, Panel, dropdown, row
-from s4a.widgets.scene import Scene
 
 # variable -> what it is called; those of vectors are shown along the normals
 SIGNED_MAPS = {
@@ -90,14 +89,14 @@ class Maps(Panel):
             )
         super().__init__(study, **options)
 
-    def build(self, view: str = "corner", up: str = "z") -> list[ipywidgets.Widget]:
+    def build(self) -> list[ipywidgets.Widget]:
         """Choices and the surface."""
         found, template = self.found, self.study["registration"].dataset
         tests = [(words, name) for name, words in P_VALUES.items() if name in found]
         self.map = dropdown("map", MAP, self.known, layout=WIDE)
         self.where = dropdown("where", WHERE, [*tests, (EVERYWHERE, EVERYWHERE)], layout=WIDE)
         self.level = dropdown("level", LEVEL, LEVELS)
-        self.scene = Scene(view=view, up=up, height=420, clickable=True)
+        self.scene = self.new_scene(420, clickable=True)
         self.T = template["corner_vertex"].values
         self.X = self.surface().values
         self.normals = vertex_normals(self.X, self.T)
@@ -160,10 +159,7 @@ class Maps(Panel):
 
     def pick(self, place: dict) -> None:
         """A vertex that was clicked: its value and p values."""
-        vertex = place.get("vertex", -1)
-        if vertex < 0:
-            return
-        self.vertex = vertex
+        self.vertex = vertex = place["vertex"]
         values, _, unit = self.values()
         size = f"{values[vertex]:.3g}" + ("" if unit == "1" else f" {unit}")
         said = [

@@ -1,15 +1,25 @@
-"""A surface in three dimensions: arrays in, a view that turns, is coloured and can be clicked out.
+"""What panels are made of: surfaces that turn, and charts; both can be clicked.
 
-Where the browser has no WebGL2 it says so, and is sent a still picture at every change.
+Arrays in, places and marks out.  Where the browser has no WebGL2 it says so, and is sent a still
+picture of the surface at every change.
 """
 
+from typing import Any
 from uuid import uuid4
 
 import anywidget
 import numpy as np
 import traitlets
 
-from s4a.show.browser import SCENE, STYLE, color_bytes, color_scale, to_bytes
+from s4a.show.browser import (
+    CHART,
+    SCENE,
+    STYLE,
+    color_bytes,
+    color_scale,
+    palette,
+    to_bytes,
+)
 from s4a.show.draw import (
     SIGNED,
     checkerboard,
@@ -31,7 +41,7 @@ def extent(points: np.ndarray) -> float:
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a.widgets.scene import extent
+    >>> from s4a.widgets.views import extent
     >>> extent(np.array([[0, 0, 0], [1, 2, 2.0]]))
     3.0
     """
@@ -43,7 +53,7 @@ def round_number(x: float) -> float:
 
     Examples
     --------
-    >>> from s4a.widgets.scene import round_number
+    >>> from s4a.widgets.views import round_number
     >>> round_number(17.3), round_number(0.6)
     (10.0, 0.5)
     """
@@ -57,7 +67,7 @@ def signed_limit(values: np.ndarray) -> float:
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a.widgets.scene import signed_limit
+    >>> from s4a.widgets.views import signed_limit
     >>> signed_limit(np.array([-2.0, 2.0]))
     2.0
     """
@@ -100,9 +110,8 @@ class View(anywidget.AnyWidget):
             return b""
         points, triangles, colors = drawn
         # the rotation is applied here, and the renderer then looks along z from the top
-        turned = points @ np.reshape(self.turn, (3, 3)).T
-        pixels = render(turned, triangles, colors=colors, view="top", size=SIZE)
-        return image_bytes(on_white(pixels), "png")
+        turned, look = points @ np.reshape(self.turn, (3, 3)).T, {"view": "top", "size": SIZE}
+        return image_bytes(on_white(render(turned, triangles, colors=colors, **look)), "png")
 
     def draw_still(self, change: object = None) -> None:
         """Send a still picture where the browser has no WebGL2."""
@@ -242,52 +251,38 @@ class Scene(View):
             self.answer = -1
             self.points = [[*place, self.radius] for place in places]
 
-    def connect(self, link: np.ndarray, text: str, values: np.ndarray | None = None) -> None:
-        """Let the browser mark on the other view of the group what is picked on this one.
-
-        Parameters
-        ----------
-        link : int ndarray (n,)
-            A vertex of the other view for each vertex, -1 for none.
-        text : str
-            What is said of them, with ``{here}`` and ``{there}`` for the two.
-        values : float ndarray (n,), optional
-            The confidence, from 0 to 1.
-        """
-        percent = b"" if values is None else to_bytes(100 * np.asarray(values) + 0.5, "uint8")
-        with self.hold_sync():
-            self.link_text, self.link_values = text, percent
-            self.link = to_bytes(link, "int32")
-
-    def compare(
+    def connect(
         self,
         link: np.ndarray,
-        back: np.ndarray,
         text: str,
-        color: tuple,
         values: np.ndarray | None = None,
+        *,
+        back: np.ndarray | None = None,
+        color: tuple = (),
     ) -> None:
-        """Let the browser compare this view with others of the same surface and the group.
+        """Let the browser mark on the other view of the group what is picked on this one.
 
-        A vertex that is picked is marked on all of them, and on the view of the other surface where
-        each of them has it, in its colour; one picked there is marked on each where it has that.
+        With `back` it compares this view with others of the same surface and the group: a vertex
+        that is picked is marked on all of them, and on the view of the other surface where each of
+        them has it, in its colour; one picked there is marked on each where it has that.
 
         Parameters
         ----------
         link : int ndarray (n,)
             A vertex of the other surface for each vertex, -1 for none.
-        back : int ndarray (m,)
-            A vertex of this surface for each of the other, -1 for none.
         text : str
-            What is said of them, with ``{here}``, ``{there}`` and ``{value}``.
-        color : tuple of 3 floats
+            What is said of them, with ``{here}`` and ``{there}`` for the two, and ``{value}``.
         values : float ndarray (n,), optional
-            What is said in percent, NaN where unknown.
+            The confidence, from 0 to 1; of views that are compared what is said in percent, NaN
+            where unknown.
+        back : int ndarray (m,), optional
+            A vertex of this surface for each of the other, -1 for none.
+        color : tuple of 3 floats
         """
         with self.hold_sync():
             self.link_text, self.link_color = text, list(color)
             self.link_values = b"" if values is None else to_bytes(values, "float32")
-            self.link_back = to_bytes(back, "int32")
+            self.link_back = b"" if back is None else to_bytes(back, "int32")
             self.link = to_bytes(link, "int32")
 
     def over(self, points: np.ndarray | None = None, triangles: np.ndarray | None = None) -> None:
@@ -304,3 +299,63 @@ class Scene(View):
         if self.coordinates is not None:
             colors = np.asarray(colors) * checkerboard(self.coordinates, self.cell)[:, None]
         return with_balls(*self.surface, colors, self.points)
+
+
+AXES = "eigenfunction of the source", "eigenfunction of the target"  # of columns, and of rows
+DIRECTION = (
+    "C transfers functions from the source to the target: of their coefficients a on the source "
+    "(columns) it makes b = C a on the target (rows)."
+)
+
+
+def plain(value: object) -> object:
+    """NumPy numbers and arrays as Python's own, NaN as None, so that they can be sent.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.widgets.views import plain
+    >>> plain({"x": np.array([1.0, np.nan]), "n": np.int64(3)})
+    {'x': [1.0, None], 'n': 3}
+    """
+    if isinstance(value, dict):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [plain(item) for item in value]
+    value = value.item() if isinstance(value, np.generic) else value
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+class Chart(anywidget.AnyWidget):
+    """A chart in the browser.
+
+    Attributes
+    ----------
+    spec : dict
+        The ``kind`` of chart, its numbers and names.
+    picked : dict
+        The mark that was clicked: an index, node, edge, or row and column, and its number `count`.
+    answer : int
+        The number of the mark to which the chart answers as it is; -1 for none.  Answers to marks
+        older than the last are not drawn.
+    """
+
+    _esm, _css = CHART, STYLE
+    spec = traitlets.Dict().tag(sync=True)
+    picked = traitlets.Dict().tag(sync=True)
+    answer = traitlets.Int(-1).tag(sync=True)
+    values = traitlets.Bytes().tag(sync=True)
+    palette = traitlets.Bytes(palette(SIGNED)).tag(sync=True)
+
+    def draw(self, kind: str, **spec: Any) -> None:
+        """Draw ``scatter``, ``bars``, ``lines`` or ``graph``: numbers as chart.js names them."""
+        with self.hold_sync():
+            self.answer = -1
+            self.spec = plain({"kind": kind, **spec})
+
+    def matrix(self, values: np.ndarray, limit: float = 1.0, **spec: Any) -> None:
+        """Draw a functional map ``(rows, columns)`` with signed colours from -limit to limit."""
+        rows, columns = np.shape(values)
+        with self.hold_sync():
+            self.values = to_bytes(values, "float32")
+            self.draw("matrix", rows=rows, columns=columns, limit=limit, axes=AXES, **spec)
