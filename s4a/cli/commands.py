@@ -81,7 +81,7 @@ def run(
         study = s4a.analyse(paths, store=out, **options)
     again = shlex.join(["s4a", *(word for word in words if word != "--keep-doubtful")])
     report = study["report"].to_dataset()
-    lines = [tables.report_table(report), *tables.stage_lines(report)]
+    lines = [tables.report_table(report), *tables.cost_lines(report)]
     full.write_text("\n".join(lines) + "\n", encoding="utf-8")
     write(tables.run_summary(study, again=again), *tables.place_lines(out, str(full)))
     return 1 if study["report"].attrs["unforeseen"] else 0
