@@ -207,7 +207,7 @@ FAULTS = [
           AGAIN),
     Fault("header that promises more than is there", "promise.ply", promise, "excluded",
           "expected 9000000 rows of vertex, found", "excluded before memory is asked for", AGAIN),
-    Fault("PLY named .stl", "ply_inside.stl", of(1), "ok", "named .stl but holds PLY",
+    Fault("PLY named .stl", "ply_inside.stl", of(1, suffix=".ply"), "ok", "named .stl but holds PLY",
           "read as what it is", "rename the file"),
     Fault("STL named .ply", "stl_inside.ply", of(2, suffix=".stl"), "ok",
           "named .ply but holds STL", "read as what it is", "rename the file"),
