@@ -35,8 +35,8 @@ from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.method.first_map import landmarks_after_motion
 from s4a.method.remesh import silence
+from s4a.options import PRESETS
 from s4a.schema import dataset
-from s4a.study.options import DEFAULTS, PAPER
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 CACHE = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "s4a-benchmarks"
@@ -120,6 +120,8 @@ INSTEAD = {
     },
     "weights of the linear program": {"s4a.method.latent.cycle_errors": program_errors},
 }
+PAPER = PRESETS["paper"]
+DEFAULTS = PRESETS[None]
 N_PROJECTED = 2500  # of 10,000 vertices, as 25,000 of 100,000
 ON_THE_PAPER = {
     "refine": {"refine": "elastic"},

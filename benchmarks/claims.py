@@ -23,7 +23,7 @@ from s4a import synthetic
 from s4a.evaluation.methods import Spaces
 from s4a.geometry.closest import distance_to_surface
 from s4a.geometry.mesh import as_arrays, vertex_areas
-from s4a.study.options import Options
+from s4a.options import Options
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 K = 50  # eigenfunctions that are compared
@@ -97,7 +97,7 @@ def swaps(given):
             for shape, node in tree["original"].children.items()
         }
         options = Options(preset="paper")
-        C = s4a.build_network(coarse, k_init=20, **options.of_first_maps)["fmap_initial"].values
+        C = s4a.build_network(coarse, k_init=20, **options.of("first maps"))["fmap_initial"].values
         block = np.abs(C[:, 1:5, 1:5])
         swapped = (block.argmax(2) != np.arange(4)).any(1)
         say(f"{name}: {swapped.sum()} of {len(swapped)} maps")

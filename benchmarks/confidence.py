@@ -31,8 +31,8 @@ import s4a
 from s4a import synthetic
 from s4a.method import first_map
 from s4a.method.register import RIGHT, WEIGHTS, evidence
+from s4a.options import Options
 from s4a.study.doubts import UNSURE, WRONG
-from s4a.study.options import pair_options
 from s4a.study.pair import match_shapes, shape_of
 
 TUNED = {
@@ -101,7 +101,7 @@ def same_vertices(folder, part, pairs):
 
 def measured(pair):
     """Error of every vertex, share of sqrt(area); evidence; the registration."""
-    options = pair_options({"n_coarse": 4000})
+    options = Options(n_coarse=4000)
     source, target = (shape_of(mesh, options) for mesh in (pair.shape, pair.template))
     found, _ = match_shapes(source, target, options)
     image = image_of(found, pair.template)

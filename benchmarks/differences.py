@@ -5,130 +5,32 @@
 """
 
 import csv
+import re
 import sys
 from pathlib import Path
 from typing import NamedTuple
 
-from s4a.study.options import DEFAULTS, PAPER
+from s4a.options import DECLARED, PRESETS
 
+PAPER = PRESETS["paper"]
+DEFAULTS = {name: PRESETS[None][name] for name in PAPER}
 DOCS = Path(__file__).parents[1] / "docs"
 RESULTS = DOCS / "differences.csv"
 PAGE = DOCS / "differences.md"
 HEAD = ["set", "row", "matched", "surface", "carried", "seconds", "template"]
 SETS = ("brains", "faces", "bodies")
+SWITCH = ["equation", "in the paper", "here", "where", "option: default, in the paper"]
 LACKING = "not yet"  # in the place of a figure that was not measured
 
 
-class Switch(NamedTuple):
-    """An addition that has an option of its own."""
-
-    option: str
-    equation: str
-    paper: str
-    here: str
-    where: str
-    note: str = ""
-    value: str = ""  # where it is another than the default
-
-
-SWITCHES = [
-    Switch(
-        "refine",
-        "eq. 7, 4",
-        "the match as it is",
-        "a price on bending and distances across the surface; in far poses joint rounds before",
-        "`method/elastic`, `joint`",
-    ),
-    Switch(
-        "refine",
-        "eq. 7, 4",
-        "",
-        "joint rounds alone, and the best of several ends",
-        "`method/joint`",
-        value="joint",
-    ),
-    Switch(
-        "parts",
-        "eq. 8",
-        "",
-        "in far poses every part turns on its own in the joint rounds",
-        "`method/joint`, `deform`",
-    ),
-    Switch(
-        "init",
-        "4.1, steps 3 and 4",
-        "first map fitted on 10 landmarks",
-        "fitted on all nearest neighbours; in far poses the best of several maps",
-        "`method/first_map`",
-    ),
-    Switch(
-        "ahead",
-        "4.2",
-        "a step of ZoomOut ahead of Consistent ZoomOut",
-        "ahead of ZoomOut of a single pair (4.1), too",
-        "`method/first_map`",
-    ),
-    Switch(
-        "lift",
-        "eq. 4, 7, 8",
-        "$U \\phi$",
-        "eigenfunctions of the original mesh, nearly, by inverse iteration",
-        "`method/lift`",
-        "; `RE-MATCH lifted` of `s4a.compare`: True",
-    ),
-    Switch(
-        "n_spread",
-        "eq. 3",
-        "for all vertices in every round",
-        "for 1,000 spread vertices, in the step ahead, too, which saves time",
-        "`method/latent`",
-        ", all",
-    ),
-    Switch(
-        "wide",
-        "eq. 3",
-        "",
-        "the last rounds look between the samples, too",
-        "`method/latent`",
-    ),
-    Switch(
-        "sharpen",
-        "eq. 4",
-        "after ZoomOut on coarse vertices",
-        "a round more among all vertices of the source",
-        "`method/register`",
-        "; `RE-MATCH lifted` of `s4a.compare`: 2",
-    ),
-    Switch(
-        "alignment",
-        "eq. 8",
-        "after ICP (4.1, step 2)",
-        "after the motion that fits the registered surface best",
-        "`method/deform`",
-    ),
-    Switch(
-        "area_weighted",
-        "after eq. 8",
-        "$(U \\phi)^\\dagger$",
-        "weighted by areas",
-        "`method/deform`",
-    ),
-    Switch(
-        "n_projected",
-        "after eq. 8",
-        "on all vertices",
-        "on 25,000 vertices near coarse ones",
-        "`method/shape`",
-        ", all",
-    ),
-    Switch(
-        "both",
-        "6.2",
-        "a template registered to a shape",
-        "and the shape to the template, the mean of both",
-        "`analysis/transfer`",
-    ),
-]
+# additions that are another value of an option than its default, and rows of their own
+OTHER = {"joint": "refine"}
+MORE = {  # what the table also says of a value
+    "lift": "; `RE-MATCH lifted` of `s4a.compare`: True",
+    "sharpen": "; `RE-MATCH lifted` of `s4a.compare`: 2",
+    "n_spread": ", all",
+    "n_projected": ", all",
+}
 
 
 class Reading(NamedTuple):
@@ -291,8 +193,8 @@ TEXT = """# What differs from the paper
 `s4a.compare`, every transfer of an external mesh, and as `--preset paper`. This page has what is
 done otherwise by default, what the paper leaves open and how it is read here, and what each is
 worth. To run the paper with one addition:
-`s4a.analyse(shapes, **s4a.study.options.PAPER | {{"refine": "elastic"}})`. Equations and sections
-are those of the paper; that its equations hold for the arrays of a study is tested by brute force
+`s4a.analyse(shapes, **s4a.options.PRESETS["paper"] | {{"refine": "elastic"}})`. Equations and
+sections are those of the paper; that its equations hold for arrays is tested by brute force
 (`tests/method/test_paper.py`). What holds of the paper's claims stands on [a page of its
 own](claims.md).
 
@@ -323,8 +225,6 @@ makes this page from it; `python benchmarks/differences.py --write` makes the pa
 
 ## Additions, each with a switch
 
-| equation | in the paper | added here | where | option: default, in the paper |
-| --- | --- | --- | --- | --- |
 {switches}
 
 Each alone, on top of the paper (errors: matched, surface):
@@ -458,7 +358,7 @@ def errors_of(found, rows):
 def summary(found):
     """What the additions do on each set, in words made from the figures."""
     lines = []
-    single = {row_of(switch): name_of(switch) for switch in SWITCHES}
+    single = additions()
     for which in SETS:
         of = {row: float(line["surface"]) for (one, row), line in found.items() if one == which}
         if not {"paper", "default"} <= set(of):
@@ -481,14 +381,20 @@ def summary(found):
     return "\n".join(lines)
 
 
-def row_of(switch):
-    """The row of the results in which a switch alone is added to the paper."""
-    return f"paper, {switch.value or switch.option}"
+def additions():
+    """The rows of the results in which one thing alone is added to the paper, and their names."""
+    rows = {f"paper, {value}": f'`{option}="{value}"`' for value, option in OTHER.items()}
+    return {f"paper, {option}": f"`{option}`" for option in PAPER} | rows
 
 
-def name_of(switch):
-    """Its name on the page."""
-    return f"`{switch.option}={quoted(switch.value)}`" if switch.value else f"`{switch.option}`"
+def line_of(name):
+    """The line of the table of an option that the preset of the paper sets, as it is declared."""
+    told = DECLARED[name].metadata
+    text = told["help"] if not told["more"] else f"{told['help']}. {told['more']}"
+    text = re.sub(r"``|:\w+:(?=`)", lambda mark: "`" if mark[0] == "``" else "", text)
+    where = f"`{told['see']}`"
+    values = f"`{name}`: {quoted(DEFAULTS[name])}, {quoted(PAPER[name])}{MORE.get(name, '')}"
+    return [told["section"], told["instead"], text, where, values]
 
 
 def quoted(value):
@@ -498,13 +404,13 @@ def quoted(value):
 
 def page(found):
     """The page."""
-    additions = {"paper": "the paper alone"}
-    additions |= {
+    rows = {"paper": "the paper alone"}
+    rows |= {
         row: f"and {name}"
-        for row, name in {row_of(switch): name_of(switch) for switch in SWITCHES}.items()
+        for row, name in additions().items()
         if any((which, row) in found for which in SETS)
     }
-    additions |= {
+    rows |= {
         "default": "all of them, the default",
         "default without init": "the default without `init`",
         "default without parts": "the default without `parts`",
@@ -524,12 +430,8 @@ def page(found):
     heads = [f"{which}: {what}" for which in SETS for what in ("median", "errors")]
     return TEXT.format(
         summary=summary(found),
-        switches="\n".join(
-            f"| {s.equation} | {s.paper} | {s.here} | {s.where} | `{s.option}`: "
-            f"{quoted(s.value or DEFAULTS[s.option])}, {quoted(PAPER[s.option])}{s.note} |"
-            for s in SWITCHES
-        ),
-        additions=errors_of(found, additions),
+        switches=table(SWITCH, map(line_of, PAPER)),
+        additions=errors_of(found, rows),
         pairs=measured(found, PAIRS, ("surface", "carried", "seconds")),
         readings="\n".join(
             f"| {number} | {r.equation} | {r.paper} | {r.here} | {r.other} |"

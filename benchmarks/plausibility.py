@@ -26,9 +26,9 @@ from scipy.stats import binomtest
 import s4a
 from s4a.geometry.mesh import as_arrays, as_dataset, triangle_areas, vertex_areas
 from s4a.input import plausibility
+from s4a.options import Options
 from s4a.study import pair
 from s4a.study.doubts import doubtful
-from s4a.study.options import pair_options
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 CHOSEN_ON = ("brains", "cats", "faces", "bodies 0-9")
@@ -341,7 +341,7 @@ def judged(name, at, meshes, shapes):
     for way in ("as by default", *TURNS):
         # a first map of landmarks, as the dense one is mended by a search
         more = {"init": "landmarks"} if way in TURNS else {}
-        options = pair_options({"both": False, "n_coarse": 3000, **more})
+        options = Options(both=False, n_coarse=3000, **more)
         for other in others:
             usual = pair.motion_onto
             try:
@@ -409,7 +409,7 @@ def planted(names):
         parts = sorted({PLANTED_IN[name][0] for name in names})
         command = [sys.executable, DATA / "unpack.py", folder, *parts]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-        options = pair_options({"both": False, "n_coarse": 3000})
+        options = Options(both=False, n_coarse=3000)
         for name in names:
             part, numbers, places = PLANTED_IN[name]
             files = sorted((Path(folder) / part).glob("*.ply"))

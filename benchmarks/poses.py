@@ -27,8 +27,8 @@ from plausibility import error_of
 import s4a
 from s4a.geometry.align import farthest_points
 from s4a.method import first_map
+from s4a.options import Options
 from s4a.schema import dataset
-from s4a.study.options import pair_options
 from s4a.study.pair import match_shapes, shape_of
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -60,7 +60,7 @@ def main():
 
 def report(files, pairs, n_landmarks, field):
     """A line for each pair, and their mean."""
-    options = pair_options({"n_coarse": N_COARSE})
+    options = Options(n_coarse=N_COARSE)
     names = [str(i) for i in range(n_landmarks)]
     first = s4a.read_shape(files[0])["position"].values
     vertices = farthest_points(first, n_landmarks) if names else []

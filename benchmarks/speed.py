@@ -42,9 +42,9 @@ from s4a.method.nearest import nearest_in_cells, nearest_rows
 from s4a.method.pca import gram_pca
 from s4a.method.register import match_functions
 from s4a.method.shape import Shape
+from s4a.options import Options
 from s4a.study import store
 from s4a.study.netcdf import write_netcdf
-from s4a.study.options import Options
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 VERTICES, NETWORK, K_INIT, K = 100_000, 10, 20, 100
@@ -562,7 +562,7 @@ def growth(folder):
 def seconds_of_pairs(coarse, n_pairs, options):
     """CPU seconds of the stages that look at pairs, on low-resolution meshes that are there."""
     begin = time.process_time()
-    first = s4a.build_network(coarse, n_pairs=n_pairs, **options.of_first_maps)
+    first = s4a.build_network(coarse, n_pairs=n_pairs, **options.of("first maps"))
     between = time.process_time()
     names = ("weights", "n_spread", "wide")
     s4a.refine_network(coarse, first, k=K, **{name: getattr(options, name) for name in names})

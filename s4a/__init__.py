@@ -13,14 +13,15 @@ reading and cleaning      :func:`read_shapes`, :func:`read_shape`, :func:`read_l
 5.2, 5.3 comparison       :mod:`s4a.compare`
 4.1, 4.2 step by step     :func:`align_pair`, :func:`build_network`, :func:`refine_network`,
                           :func:`latent_match`, :func:`latent_map`, :func:`register_shape`
-4.2, 6.1 collections      :func:`analyse`, :func:`open_study`, :func:`verify`, :func:`synthesize`
+4.2, 6.1 collections      :func:`analyse`, :class:`Options`, :func:`open_study`,
+                          :func:`verify`, :func:`synthesize`
 notebooks, pages          :func:`explore`, :func:`write_page`
 pictures, films           :func:`write_picture`, :func:`write_film`
-new shapes, parts         :func:`insert`, :func:`complete`
+new shapes                :func:`insert`
 6.1 statistics            :mod:`s4a.statistics`
 6.2 transfer              :func:`transfer_labels`, :func:`transfer_landmarks`,
                           :func:`transfer_scalars`, :func:`register_pairs`, :func:`with_field`
-for other programs        :func:`write_for`, :func:`write_registered`, :func:`write_training_set`
+for other programs        :func:`write_registered`, :func:`write_label_volumes`
 the bundled collection    :mod:`s4a.synthetic`
 ========================  ====================================================================
 

@@ -11,15 +11,13 @@ from . import study as study
 from . import widgets as widgets
 from .accessor import explore as explore
 from .analysis import statistics as statistics
-from .analysis.complete import complete as complete
 from .analysis.export import write_registered as write_registered
-from .analysis.export import write_training_set as write_training_set
 from .analysis.fields import with_field as with_field
-from .analysis.programs import write_for as write_for
 from .analysis.transfer import register_pairs as register_pairs
 from .analysis.transfer import transfer_labels as transfer_labels
 from .analysis.transfer import transfer_landmarks as transfer_landmarks
 from .analysis.transfer import transfer_scalars as transfer_scalars
+from .analysis.volumes import write_label_volumes as write_label_volumes
 from .datasets import synthetic as synthetic
 from .evaluation import compare as compare
 from .evaluation import metrics as metrics
@@ -41,6 +39,7 @@ from .method.steps import latent_map as latent_map
 from .method.steps import latent_match as latent_match
 from .method.steps import refine_network as refine_network
 from .method.steps import register_shape as register_shape
+from .options import Options as Options
 from .show.page import write_page as write_page
 from .show.pictures import write_film as write_film
 from .show.pictures import write_picture as write_picture

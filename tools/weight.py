@@ -30,9 +30,14 @@ PARTS = {
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 SILENT = {getattr(tokenize, name) for name in "COMMENT NL NEWLINE INDENT DEDENT ENDMARKER".split()}
 OPTIONS = """import inspect
-from s4a.study.options import Options
+try:
+    from s4a.options import Options
+except ImportError:  # before it moved
+    from s4a.options import Options
 print(len(inspect.signature(Options).parameters))"""
-NAMES = "import s4a; print(len(s4a.__all__))"
+NAMES = """import s4a, pathlib
+folder = pathlib.Path(s4a.__file__).parent
+print(sum(not (folder / name).is_dir() for name in s4a.__all__))"""
 WHEEL = "import hatchling.build as b, sys; print(b.build_wheel(sys.argv[1]))"
 
 

@@ -21,13 +21,11 @@ from s4a.input.hands import (
 )
 from s4a.input.plausibility import examine
 from s4a.input.subjects import listed
+from s4a.options import Options
 from s4a.schema import dataset
 from s4a.study.insert import clean_new, hands_beside, portraits_of
-from s4a.study.options import Options
 
-Looks = Mapping[
-    str, Mapping[str, xr.Dataset]
-]  # structure -> subject -> comparison
+Looks = Mapping[str, Mapping[str, xr.Dataset]]  # structure -> subject -> comparison
 
 
 def find_mirrored(

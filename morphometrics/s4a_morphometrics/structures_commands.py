@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from s4a.cli.commands import cluster, lines_or_bars, new_folder, within, write
-from s4a.cli.flags import HELP, Command, add_options, whole
+from s4a.cli.flags import Command, add_options, whole
+from s4a.options import DECLARED
 
 FOLDERS = "folder of landmark files, with one for each structure, or named as files of the table"
-OPTIONS = [name for name in HELP if name != "label"]
+OPTIONS = [*(name for name in DECLARED if name != "label"), "n_jobs"]
 TABLE = "CSV with columns shape, subject and structure"
 
 
@@ -74,7 +75,7 @@ def compare(args: Namespace) -> int:
             write(f"{level}: nothing varies")
             continue
         of_level = poses.structures_modes(study, found, level)
-        ratio = of_level["pca"]["explained_variance_ratio"].values[:5]
+        ratio = of_level["pca"].dataset["explained_variance_ratio"].values[:5]
         shares = ", ".join(f"{100 * one:.1f}" for one in ratio)
         write(f"{level}: modes of {shares} % of its variance")
         if args.group:

@@ -13,10 +13,11 @@ from s4a.geometry.align import realign
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.method.pca import gram
 from s4a.method.register import from_latent, identity
+from s4a.method.shape import Shape
+from s4a.options import Options
 from s4a.schema import dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
 from s4a.study.insert import insert
-from s4a.study.options import Options
 from s4a.study.processes import workers
 from s4a.study.tree import stack_registration, template_mesh
 
@@ -72,7 +73,10 @@ def _register_anew(nodes, latent, rotation, options, n_jobs):
     names = latent["shape"].values.tolist()
     median = str(latent["distance_to_median"].idxmin().item())
     shapes = {
-        n: options.shape(nodes[f"original/{n}"].load(), nodes[f"coarse/{n}"].load()) for n in names
+        n: Shape(
+            nodes[f"original/{n}"].load(), nodes[f"coarse/{n}"].load(), **options.of("projection")
+        )
+        for n in names
     }
     template = shapes[median]
     Y = {n: latent["latent_basis"].sel(shape=n).values for n in names}
@@ -98,7 +102,7 @@ def _register(shape, template, bases, rotation, options):
     with threadpool_limits(1):
         motion = realign(shape.low.cloud, template.low.cloud, (rotation, np.zeros(3)))
         how = options.how
-        return from_latent(shape, template, bases, motion, how=how, **options.of_registration)
+        return from_latent(shape, template, bases, motion, how=how, **options.of("registration"))
 
 
 def _errors_of(study, name, n_points, seed, n_jobs):

@@ -12,8 +12,8 @@ from s4a.analysis.permutation import indicators, standardize
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.input.subjects import is_missing, is_plain_number, listed, odd_cells, odd_words
 from s4a.method.pca import pca_without
+from s4a.options import Options, with_options
 from s4a.schema import require, unit_of
-from s4a.study.options import Options
 from s4a.study.tree import left_out
 
 log = logging.getLogger(__name__)
@@ -225,7 +225,9 @@ def with_doubtful(study: xr.DataTree) -> xr.DataTree:
     """
     nodes = {node.path: node.to_dataset(inherit=False) for node in study.subtree}
     if "report" in study.children:
-        nodes["/report"] = nodes["/report"].assign_attrs(keep_doubtful="True")
+        nodes["/report"] = nodes["/report"].assign_attrs(
+            with_options(nodes["/report"].attrs, {"keep_doubtful": True, "doubtful": "apart"})
+        )
     registration = all_registered(study)
     template = registration.attrs.get("template", "")
     coarse = nodes.get(f"/coarse/{template}")

@@ -27,8 +27,8 @@ from s4a.geometry.mesh import as_arrays
 from s4a.input.landmarks import FARTHEST_LANDMARK, NAMED, locate, trace_curves
 from s4a.method.register import identity, uncertainty
 from s4a.method.shape import Shape
+from s4a.options import Options, given_options
 from s4a.schema import dataset, require
-from s4a.study.options import PAIR, Options, pair_options, takes_options
 from s4a.study.pair import match_shapes, shape_of
 from s4a.study.processes import workers
 from s4a.study.tree import stack_registration, template_mesh
@@ -76,13 +76,13 @@ def _match_both(shape, template, options):
         return forth, match_shapes(template, shape, options)[0] if options.both else None
 
 
-@takes_options("both", *PAIR)
 def register_pairs(
     template: xr.Dataset,
     shapes: dict[str, xr.Dataset],
     *,
     name: str = "template",
     n_jobs: int | None = None,
+    preset: str | None = None,
     **options: Any,
 ) -> xr.DataTree:
     """The template registered to each shape on its own (6.2, the first way): a study for transfer.
@@ -94,15 +94,14 @@ def register_pairs(
     shapes : dict of str to Dataset
     name : str
         Of the template among the shapes.
-    both : bool, optional
-        Whether each pair is matched both ways, as by default; transfer then takes the mean of both.
     n_jobs : int, optional
         As in joblib; the result does not depend on it.
-    method, k_init, k, step, lift, init, ahead, sharpen, refine, parts, alignment
-        See :func:`s4a.match_pair`.
-    area_weighted, n_projected, n_coarse, preset, seed, rng
-        See :func:`s4a.match_pair`; ``preset="paper"`` sets both=False, too, and blur=0 of
+    preset : {None, "paper", "fast"}
+        As of :func:`s4a.match_pair`; ``"paper"`` sets both=False, too, and blur=0 of
         :func:`s4a.transfer_labels`.
+    **options
+        Those of :func:`s4a.match_pair`, and ``both``: whether each pair is matched both ways, as by
+        default; transfer then takes the mean of both.  See :class:`s4a.Options`.
 
     Returns
     -------
@@ -132,14 +131,14 @@ def register_pairs(
     meshes = {name: template, **shapes}
     for what, mesh in meshes.items():
         require(mesh, "position", "corner_vertex", what=f"mesh {what}")
-    settings = pair_options(options)
+    settings = given_options({"preset": preset, **options}, pair=True)
     parallel = workers(n_jobs)
     inside, *others = parallel(delayed(_shape_of)(mesh, settings) for mesh in meshes.values())
     pairs = parallel(delayed(_match_both)(shape, inside, settings) for shape in others)
     forth = {n: pair[0] for n, pair in zip(shapes, pairs, strict=True)}
     back = {n: pair[1] for n, pair in zip(shapes, pairs, strict=True)} if settings.both else {}
     study = _study_of(name, template, shapes, forth, back)
-    study["registration"].attrs["preset"] = str(settings.preset)
+    study["registration"].attrs["preset"] = settings.preset or ""
     return study
 
 
@@ -149,8 +148,7 @@ def _preset(study: xr.DataTree, given: dict[str, Any]) -> str | None:
         return given["preset"]
     if "report" in study.children:
         return Options.from_report(study).preset
-    preset = study["registration"].attrs.get("preset", "None")
-    return None if preset == "None" else preset
+    return study["registration"].attrs.get("preset") or None
 
 
 def _routes(study: xr.DataTree, name: str) -> tuple[list[Route], list[Route]]:
@@ -187,9 +185,11 @@ def _routes_from_outside(
         )
     template = study["original"][name].to_dataset().load()
     own = Options.from_report(study)
-    options = pair_options(given, own)
-    if options.of_low_resolution == own.of_low_resolution:
-        inside = options.shape(template, study["coarse"][name].to_dataset().load())
+    options = given_options(given, own, pair=True)
+    if options.of("low resolution") == own.of("low resolution"):
+        inside = Shape(
+            template, study["coarse"][name].to_dataset().load(), **options.of("projection")
+        )
     else:
         inside = _shape_of(template, options)
     outside = _shape_of(mesh, options)

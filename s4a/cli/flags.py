@@ -12,56 +12,13 @@ import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib.metadata import version
-from typing import Any
+from typing import Any, get_args
 
-from s4a.cli import commands, growing, leaving
+from s4a.cli import commands
 from s4a.extensions import extensions
 from s4a.input.raw import shown
 
 MOST_PROCESSES = 1000  # so that a slip of the key starts no million of them
-HELP = {
-    "method": "low resolution by remeshing, or by the local functions of SCALABLE",
-    "n_coarse": "vertices of the low-resolution meshes",
-    "n_pairs": "pairs of the network",
-    "k_init": "size of the first functional maps",
-    "k": "size of the refined functional maps",
-    "n_latent": "dimension of the latent space (default: k)",
-    "step": "growth of the maps per round of Consistent ZoomOut",
-    "weights": "of the maps in eq. 3: by how far their cycles close, or 1",
-    "lift": "eigenfunctions of the original meshes, nearly, instead of U Phi",
-    "init": "first maps from all nearest neighbours, or the paper's fit on 10 landmarks",
-    "ahead": "a step of ZoomOut for all first maps, for those of the network alone, or none",
-    "n_spread": "vertices at which the network looks for matches; 0 for all",
-    "wide": "its last rounds in which these look between the samples, too",
-    "sharpen": "rounds of ZoomOut of a single pair that look among all vertices of the source",
-    "refine": "elastic rounds, joint ones, or the paper's spectral match alone",
-    "parts": "in far poses joint rounds turn every part on its own",
-    "alignment": "displacements after the motion that fits best, or after that of ICP",
-    "area_weighted": "weigh vertices by area in the projection after eq. 8",
-    "n_projected": "vertices by which that projection is computed; 0 for all",
-    "both": "match single pairs both ways and transfer along both",
-    "how": "full resolution by eq. 7, or by eq. 3 and 4",
-    "norm": "norm of eq. 5",
-    "keep_rounds": "keep the maps and latent bases of every round of Consistent ZoomOut",
-    "scale": "take size out of the displacements",
-    "components": "'largest', 'all' or how many to keep",
-    "strict": "exclude shapes with vertices that are not finite instead of repairing them",
-    "close_holes": "close every hole by a fan of triangles",
-    "wrap": "wrap the shapes watertight before they are remeshed",
-    "intersections": "count triangles that pass through others",
-    "label": "the files are label volumes (NIfTI, MGH): the surface of this label, or several: 1,2",
-    "pattern": "only files whose name fits, for example '*brain*'",
-    "preset": "'paper' leaves out all that is added to the paper; 'fast' halves the time",
-    "template": "name of the shape to register to (default: the median shape)",
-    "reflect": "shapes to mirror: their names, with commas; COLUMN=VALUE of the table; or auto",
-    "landmarks": "folder of landmark files named as the shapes, which guide registration",
-    "features": "fields that guide registration, with commas: sulc is a.sulc.npy beside a.ply",
-    "table": "CSV with a column 'shape', covariates and groups, for the statistics",
-    "doubtful": "what becomes of doubtful shapes: they stay apart, or the run stops",
-    "keep_doubtful": "take doubtful shapes into modes and statistics",
-    "n_jobs": "processes; -1 for all cores",
-    "seed": "seed of all randomness",
-}
 
 
 @dataclass(frozen=True)
@@ -105,25 +62,26 @@ def add_options(add: Callable[..., Any], names: Iterable[str], *, unset: bool = 
 
     With `unset` those that are not given are None.
     """
-    from s4a.study.options import CHOICES, PRESETS, Options
+    from s4a.options import DECLARED
 
     for name in names:
-        default = -1 if name == "n_jobs" else getattr(Options, name)
-        shown = PRESETS[None].get(name, default)
-        text = HELP[name]
-        if name in CHOICES:
-            kind: dict[str, Any] = {"choices": [choice for choice in CHOICES[name] if choice]}
-            text += f" (default: {shown})"
-        elif isinstance(shown, bool):
+        flag = "--" + name.replace("_", "-")
+        if name == "n_jobs":
+            add(flag, default=-1, type=processes, help="processes; -1 for all cores (default: -1)")
+            continue
+        declared = DECLARED[name]
+        told, kinds = declared.metadata, get_args(declared.type) or (declared.type,)
+        text, default = told["help"], told["default"]
+        kind: dict[str, Any] = {"type": str}
+        if told["choices"]:
+            kind = {"choices": told["choices"]}
+        elif bool in kinds:
             kind = {"action": argparse.BooleanOptionalAction}
-        elif name == "components":
-            kind = {"type": number_or_name}
-        else:
-            kind = {"type": whole if isinstance(shown, int) or name == "n_latent" else str}
-            kind = {"type": OTHER_NUMBERS.get(name, kind["type"])}
-            text += "" if shown is None else f" (default: {shown})"
-        value = None if unset and name != "n_jobs" else default
-        add("--" + name.replace("_", "-"), default=value, help=text, **kind)
+        elif int in kinds:
+            kind = {"type": number_or_name if str in kinds else whole}
+        if default is not None and bool not in kinds:
+            text += f" (default: {default})"
+        add(flag, default=None if unset else declared.default, help=text, **kind)
 
 
 def number_or_name(text: str) -> int | str:
@@ -150,17 +108,6 @@ def processes(text: str) -> int:
     return number
 
 
-def not_negative(text: str) -> int:
-    """A whole number from 0, as seeds are."""
-    number = whole(text)
-    if number < 0:
-        raise argparse.ArgumentTypeError(f"a whole number from 0 needed, found {number}")
-    return number
-
-
-OTHER_NUMBERS: dict[str, Callable[[str], int]] = {"n_jobs": processes, "seed": not_negative}
-
-
 def _check(add):
     add("paths", nargs="+", metavar="PATH", help="folders, globs or mesh files")
     add_options(add, ["components", "pattern", "label", "strict", "close_holes", "intersections"])
@@ -172,12 +119,14 @@ def _doctor(add):
 
 
 def _run(add):
+    from s4a.options import DECLARED
+
     add("paths", nargs="+", metavar="PATH", help="folders, globs or mesh files")
     text = "folder of the study; an unfinished one is resumed"
     add("--out", required=True, metavar="STUDY", help=text)
     text = "dask scheduler tcp://host:port, or local:N worker processes"
     add("--cluster", metavar="ADDRESS", help=text)
-    add_options(add, HELP)
+    add_options(add, [*DECLARED, "n_jobs"])
 
 
 def _demo(add):
@@ -216,7 +165,7 @@ def _statistics(add):
     text = "regression of shape on a number, such as age; its animation"
     add("--variable", metavar="COLUMN", help=text)
     add("--covariates", nargs="+", metavar="COLUMN", help="accounted for in both")
-    text = "a field of s4a fields in place of shape in both; and that field against shape"
+    text = "a field of s4a fields in place of shape in both"
     add("--field", metavar="NAME", help=text)
     add("--table", metavar="FILE", help="in place of the table of the study")
     text = (
@@ -243,20 +192,6 @@ def _statistics(add):
     add_options(add, ["n_jobs", "seed"])
 
 
-def _asymmetry(add):
-    add("study", metavar="STUDY")
-    text = "of left and right shapes: whose each is (without, every shape against its mirror image)"
-    add("--subject", metavar="COLUMN", help=text)
-    add("--side", metavar="COLUMN", help="and of which side")
-    text = "what is tested at every vertex: along the normals, or vectors (default: normal)"
-    add("--of", choices=["normal", "vector"], default="normal", help=text)
-    add("--table", metavar="FILE", help="in place of the table of the study")
-    add("--keep-doubtful", action="store_true", help="take doubtful shapes in")
-    add("--permutations", type=whole, help="changes of sign (default: 999)")
-    add("--out", metavar="DIR", help="for netCDF, CSV, the page (default: STUDY/statistics)")
-    add_options(add, ["seed"])
-
-
 def _fields(add):
     add("study", metavar="STUDY")
     text = "with a file for each shape: NPY, NPZ, PLY, CSV, GIFTI or FreeSurfer's curv"
@@ -266,23 +201,6 @@ def _fields(add):
     add("--unit", help="of its numbers, such as mm")
     add("--partial", action="store_true", help="shapes may lack it; tests leave these out")
 
-
-def _growth(add):
-    from s4a.analysis.effects import VARIANCES
-
-    add("study", metavar="STUDY")
-    add("--time", required=True, metavar="COLUMN", help="age, or time since the first visit")
-    add("--subject", required=True, metavar="COLUMN", help="whose each shape is")
-    add("--covariates", nargs="+", metavar="COLUMN", help="accounted for")
-    add("--field", metavar="NAME", help="a field of s4a fields in place of shape")
-    text = "what is tested at every vertex: vectors, or along the normals (default: vector)"
-    add("--of", choices=["vector", "normal"], default="vector", help=text)
-    text = "unequal where subjects change differently: signs of subjects (default: equal)"
-    add("--variances", choices=VARIANCES, default="equal", help=text)
-    add("--table", metavar="FILE", help="in place of the table of the study")
-    add("--keep-doubtful", action="store_true", help="take doubtful shapes in")
-    add("--permutations", type=whole, help="of visits within subjects (default: 999)")
-    add("--out", metavar="DIR", help="for netCDF, CSV, the page (default: STUDY/statistics)")
     add_options(add, ["seed"])
 
 
@@ -291,45 +209,14 @@ def _insert(add):
     add("shapes", nargs="+", metavar="SHAPE", help="mesh files, label volumes, folders or globs")
     text = "for inserted.nc, registered meshes and scores"
     add("--out", required=True, metavar="DIR", help=text)
-    add("--landmarks", metavar="DIR", help=HELP["landmarks"])
+    add("--landmarks", metavar="DIR", help="folder of landmark files named as the shapes")
     text = "new shapes to mirror: names, with commas; or auto, those of the other hand"
     add("--reflect", metavar="NAMES", help=text)
     add_options(add, ["n_jobs"])
 
 
-def _complete(add):
-    add("study", metavar="STUDY")
-    add("part", metavar="PART", help="mesh file of a part of a shape")
-    add("--out", required=True, metavar="DIR", help="for completed.nc and PLY")
-    text = "landmarks of the part by the names of the template's, three or more: how it lies"
-    add("--landmarks", metavar="FILE", help=text)
-    text = "shapes drawn from all that agree with the part (default: 10)"
-    add("--samples", type=whole, default=10, help=text)
-    text = "pieces of the part to keep, or 'largest' (default: as in the study)"
-    add("--components", type=number_or_name, help=text)
-    add_options(add, ["seed"])
-
-
-def _export(add):
-    from s4a.analysis.programs import PROGRAMS
-
-    add("study", metavar="STUDY")
-    add("--to", required=True, choices=list(PROGRAMS), help="for which program")
-    add("--out", required=True, metavar="DIR", help="for its files")
-    text = "vertices that are points or particles, as far apart as can be (default: 500)"
-    add("--points", type=whole, help=f"slicer, shapeworks, r: {text}")
-    text = "scalismo, paraview: the first modes (default: all; paraview: 3)"
-    add("--modes", type=whole, help=text)
-    text = "slicer: landmarks of the template's file, carried to all shapes (default: its own)"
-    add("--landmarks", metavar="FILE", help=text)
-    text = "nifti: labels of the template's file, whole numbers (default: its own)"
-    add("--labels", metavar="FILE", help=text)
-    text = "nifti: volume whose voxels are labelled (default: that each shape was made of)"
-    add("--grid", metavar="FILE", help=text)
-
-
 def _transfer(add):
-    from s4a.study.options import PAIR
+    from s4a.options import DECLARED
 
     add("source", metavar="SOURCE", help="mesh file that the labels and landmarks belong to")
     text = "mesh files, folders or globs; or one study folder, whose options hold unless given"
@@ -343,7 +230,8 @@ def _transfer(add):
     text = "how far around votes for labels count, in multiples of how far matches may be wrong"
     add("--blur", type=float, help=f"{text} (default: 1; 0, not, with --preset paper)")
     add_options(add, ["n_jobs"])
-    add_options(add, (*PAIR, "both"), unset=True)
+    pair = [name for name, one in DECLARED.items() if one.metadata["pair"]]
+    add_options(add, pair, unset=True)
 
 
 def _compare(add):
@@ -379,12 +267,8 @@ COMMANDS = {
     "demo": Command(commands.demo, _demo),
     "view": Command(commands.view, _view),
     "statistics": Command(commands.statistics, _statistics),
-    "asymmetry": Command(growing.asymmetry, _asymmetry),
-    "fields": Command(growing.fields, _fields),
-    "growth": Command(growing.growth, _growth),
+    "fields": Command(commands.fields, _fields),
     "insert": Command(commands.insert, _insert),
-    "complete": Command(commands.complete, _complete),
-    "export": Command(leaving.export, _export),
     "transfer": Command(commands.transfer, _transfer),
     "compare": Command(commands.compare, _compare),
 }

@@ -38,10 +38,10 @@ from s4a.method import latent, median, network
 from s4a.method.first_map import map_after_motion
 from s4a.method.register import latent_functions, log_area_ratio, match_functions, match_low
 from s4a.method.shape import Basis, Shape
+from s4a.options import PRESETS as STUDY_PRESETS
+from s4a.options import Options, apply_preset
 from s4a.schema import check_choice, check_count, check_switch, dataset, require, variable
 from s4a.seeds import RNG, seed_of
-from s4a.study.options import PRESETS as STUDY_PRESETS
-from s4a.study.options import Options, apply_preset
 
 log = logging.getLogger(__name__)
 

@@ -23,6 +23,7 @@ from s4a.geometry.mesh import (
     triangle_normals,
     unique_edges,
 )
+from s4a.options import check_components
 from s4a.schema import require
 
 # of the diagonal of the bounding box: nearer vertices are one, lower triangles are flat
@@ -208,18 +209,6 @@ def counted(n: float, text: str) -> str:
         many = next(word for word in text.split() if word in SINGULAR)
         text = text.replace(many, SINGULAR[many], 1)
     return f"{n} {text}"
-
-
-def check_components(components: str | int) -> None:
-    """ValueError unless `components` is "largest", "all" or a number from 1."""
-    if isinstance(components, int | np.integer) and not isinstance(components, bool):
-        known = components >= 1
-    else:
-        known = components in ("largest", "all")
-    if not known:
-        raise ValueError(
-            f'components needs to be "largest", "all" or a number from 1; found {components!r}'
-        )
 
 
 def _validated(points, triangles, components):

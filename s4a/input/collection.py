@@ -10,7 +10,7 @@ import xarray as xr
 
 from s4a.geometry.mesh import as_dataset
 from s4a.input import plausibility
-from s4a.input.clean import REPAIRS, check_components, clean
+from s4a.input.clean import REPAIRS, clean
 from s4a.input.files import (
     LONGEST_NAME,
     Paths,
@@ -20,10 +20,11 @@ from s4a.input.files import (
     read_mesh,
     with_long_names,
 )
-from s4a.input.labels import Label, check_label, read_volume
+from s4a.input.labels import Label, read_volume
 from s4a.input.plausibility import examine
 from s4a.input.raw import shown
-from s4a.schema import check_switch, check_text, dataset, in_unit
+from s4a.options import check, check_label
+from s4a.schema import dataset, in_unit
 
 # columns of the report
 COUNTS = [
@@ -141,10 +142,9 @@ def read_shapes(
     >>> list(shapes["original"]), shapes["report"]["status"].values.tolist()
     (['good'], ['excluded', 'ok'])
     """
-    check_components(components)
-    check_switch("strict", strict)
-    check_switch("close_holes", close_holes)
-    check_text("pattern", pattern)
+    given = {"components": components, "strict": strict, "close_holes": close_holes}
+    for name, value in {**given, "pattern": pattern}.items():
+        check(name, value)
     options = {"components": components, "strict": strict, "close_holes": close_holes}
     label = check_label(label)
     volumes = label is not None

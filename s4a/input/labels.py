@@ -8,15 +8,14 @@ design", 1995).
 import io
 import os
 from collections.abc import Iterable
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy import sparse
 
 from s4a.geometry.mesh import directed_edges
 from s4a.input.raw import check_there, content, reading
+from s4a.options import check_label
 
 VOLUMES = {".nii": "NIfTI", ".mgz": "MGH", ".mgh": "MGH"}
 Label = int | str | Iterable[int] | None
@@ -25,44 +24,6 @@ UNPACKED = 2**29  # bytes of a volume that are never refused: labels compress we
 SHRINK, GROW = 0.5, -0.51  # steps of a round: lambda and mu of Taubin
 MILLIMETRES = {"mm": 1.0, "unknown": 1.0, "meter": 1000.0, "micron": 0.001}
 MOST_TOLD = 30  # labels that an error lists
-
-
-def check_label(label: Label) -> int | str | None:
-    """A label as options keep it: a number, several as ``"1,2"``, ``"all"``, or None.
-
-    Raises
-    ------
-    ValueError
-        When it is none of these, or scikit-image is not installed.
-
-    Examples
-    --------
-    >>> from s4a.input.labels import check_label
-    >>> check_label(17), check_label([2, 1]), check_label("1,2"), check_label("all")
-    (17, '1,2', '1,2', 'all')
-    """
-    if label is None or label == "all":
-        known: int | str | None = label
-    else:
-        try:
-            given: Any = label.split(",") if isinstance(label, str) else label
-            numbers = [given] if isinstance(given, int | np.integer) else list(given)
-            if any(isinstance(one, bool | float) for one in numbers):
-                raise ValueError
-            wanted = sorted({int(one) for one in numbers})
-        except (TypeError, ValueError):
-            wanted = []
-        if not wanted or 0 in wanted:
-            raise ValueError(
-                f"label needs a number other than 0, several (1,2) or 'all'; found {label!r}"
-            )
-        known = wanted[0] if len(wanted) == 1 else ",".join(map(str, wanted))
-    if known is not None and find_spec("skimage") is None:
-        raise ValueError(
-            "surfaces from label volumes need scikit-image, which is not installed; "
-            "run: pip install 's4a[labels]'"
-        )
-    return known
 
 
 def is_volume(data: bytes) -> bool:

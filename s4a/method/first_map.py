@@ -17,9 +17,9 @@ from s4a.geometry.closest import POSITION_WEIGHT
 from s4a.geometry.mesh import edges
 from s4a.method import fmap, joint
 from s4a.method.shape import Basis, common_fields, corresponding_landmarks, field_columns
-from s4a.schema import Array, check_choice
+from s4a.options import check
+from s4a.schema import Array
 
-INITS = ("dense", "landmarks")  # what first maps are fitted on
 N_LANDMARKS = 10  # of step 3
 # Of a pair alone, in a far pose: signatures, functions by k_init, and weight of the orientation.
 # Signed mean curvature goes with each: front and back of a body differ by nothing else
@@ -116,7 +116,7 @@ def fit_after_motion(
     landmarks : tuple of int ndarray (10,), or None
         Of source and target, where it was fitted on them.
     """
-    check_choice("init", init, INITS)
+    check("init", init)
     source = source.first(k_init)
     target = target.first(k_init)
     if init == "landmarks":

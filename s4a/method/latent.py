@@ -35,15 +35,14 @@ from s4a.method.network import (
     spectral_distance,
     three_cycles,
 )
-from s4a.method.shape import N_SPREAD, Basis
+from s4a.method.shape import Basis
+from s4a.options import N_SPREAD, PER_FUNCTION
 from s4a.schema import Array, dataset
 
 log = logging.getLogger(__name__)
 
 FINAL = 3  # shapes of a study in the last rounds of a new one, on all vertices
 TARGETS = 256  # shapes whose least squares are held at once, 0.3 GB of them
-WEIGHTS = ("cycles", "equal")  # of maps: by the errors of their cycles, or 1 for all
-PER_FUNCTION = 2  # samples, at least: the least squares of fewer are poor, or have no one solution
 WIDE = 4  # last rounds of Consistent ZoomOut, which look between the samples, too
 N_AROUND = 32  # vertices around a sample among which they look
 ROUGH, FINE = 1e-4, 1e-6  # tolerances of the latent basis: on the way, and at the end

@@ -19,7 +19,8 @@ from s4a.method.first_map import nearest_after_motion
 from s4a.method.fmap import fmap_from_match
 from s4a.method.nearest import nearest_in_cells, nearest_of_few, nearest_rows
 from s4a.method.shape import Basis, Shape
-from s4a.schema import INPUT, Array, check_choice, dataset, in_unit
+from s4a.options import check
+from s4a.schema import INPUT, Array, dataset, in_unit
 
 RIGHT = 0.01  # share of sqrt(area): errors below are right
 LEAST = 1e-4  # added to gap and stretch: what is below is noise of the mesh
@@ -129,12 +130,6 @@ LOOSER = 4  # the step of elastic rounds with which they begin then, too
 # leave 0.3 to 0.72; real heads 0.81 or more where the score falls at all (docs/decisions.md)
 MENDED = 0.75
 
-WORDS = {  # what options may be
-    "refine": ("elastic", "joint", "intrinsic"),
-    "alignment": ("fitted", "icp"),
-    "how": ("ours", "standard"),
-}
-
 Functions = tuple[Array, Array]  # of source and target, rows of which are compared
 
 
@@ -157,7 +152,7 @@ def match_low(
     functions : tuple of float ndarray (n_coarse, m)
         At all vertices where they are lifted.
     """
-    check_choice("how", how, WORDS["how"])
+    check("how", how)
     Y_source, Y_target = bases  # (k, m) each
     k = len(Y_source)
     Phi = source.low.Phi[:, :k]
@@ -318,7 +313,7 @@ def register(
         of the input, in the template's frame.  Attributes ``method``, the candidate that was kept,
         ``score``, its score at full resolution, and ``score_<candidate>`` at low resolution.
     """
-    check_choice("alignment", alignment, WORDS["alignment"])
+    check("alignment", alignment)
     candidates = find_candidates(source, target, starts, k=k, refine=refine, parts=parts)
     by_icp = motion_in_unit(source, target, motion, scale) if alignment == "icp" else None
     # image = R x + t + U Phi c, smooth already: the line after eq. 8; or of elastic rounds
@@ -413,7 +408,7 @@ def find_candidates(
     dict
         Name -> :class:`s4a.method.joint.Candidate`; none for the spectral match alone.
     """
-    check_choice("refine", refine, WORDS["refine"])
+    check("refine", refine)
     if refine == "intrinsic":
         return {}
     M, N = source.low, target.low

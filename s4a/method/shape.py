@@ -29,14 +29,13 @@ from s4a.geometry.mesh import (
 from s4a.method.deform import smoother
 from s4a.method.remesh import laplacian
 from s4a.method.spectral import Diffusion, project, unit_mass
+from s4a.options import N_CENTRAL, N_SPREAD
 from s4a.schema import Array
 
-N_SPREAD = 1000  # spread vertices of a shape on which Consistent ZoomOut looks for matches
 N_PAIRED = 300  # spread vertices of a shape that rigid alignment pairs
 # One standard deviation of a field that guides, beside positions by POSITION_WEIGHT: as much as 2 %
 # of sqrt(area).  With twice as much the labels of cortex are carried over less well
 FIELD_WEIGHT = 0.1
-N_CENTRAL = 25_000  # vertices by which a field on a shape is projected
 
 
 @dataclass(frozen=True)

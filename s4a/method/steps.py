@@ -13,23 +13,20 @@ from threadpoolctl import threadpool_limits
 
 from s4a.geometry.align import Motion, align, motion_between, realign
 from s4a.method import fmap, network
-from s4a.method.first_map import INITS, first_map, fit_after_motion, motion_onto
-from s4a.method.latent import WEIGHTS, WIDE, consistent_zoomout
-from s4a.method.median import NORMS, median_shape
-from s4a.method.register import WORDS, from_latent, identity, match_functions, match_low
-from s4a.method.shape import N_SPREAD, Basis, Shape
-from s4a.schema import check_choice, check_count, dataset, require
+from s4a.method.first_map import first_map, fit_after_motion, motion_onto
+from s4a.method.latent import WIDE, consistent_zoomout
+from s4a.method.median import median_shape
+from s4a.method.register import from_latent, identity, match_functions, match_low
+from s4a.method.shape import Basis, Shape
+from s4a.options import DECLARED, N_SPREAD, check, kept_options
+from s4a.schema import check_count, dataset, require
 
-REGISTRATION: dict[str, Callable[[str], Any]] = {  # options in a report, from their words
-    "refine": str,
-    "scale": "True".__eq__,
-    "parts": "True".__eq__,
-    "alignment": str,
-    "how": str,
-    "area_weighted": "True".__eq__,
-    "n_projected": int,
-}
-PROJECTION = ("area_weighted", "n_projected")  # those of a Shape
+PROJECTION = [name for name, one in DECLARED.items() if one.metadata["of"] == "projection"]
+REGISTRATION = [
+    *(name for name, one in DECLARED.items() if one.metadata["of"] == "registration"),
+    "how",
+    *PROJECTION,
+]
 LOW = ("position", "corner_vertex", "vertex_area", "eigenvalue", "eigenfunction")
 
 
@@ -209,7 +206,7 @@ def build_network(
     >>> charts.network(charts.on_circle(6), names, source, target, errors)
     <Figure ...>
     """
-    check_choice("init", init, INITS)
+    check("init", init)
     bases = bases_of(coarse)
     names = list(bases)
     k_init = min(k_init, *(basis.k for basis in bases.values()))
@@ -293,10 +290,10 @@ def refine_network(
     >>> s4a.show.charts.network(s4a.show.charts.on_circle(3), names, source, target, errors)
     <Figure ...>
     """
-    check_choice("weights", weights, WEIGHTS)
-    check_choice("norm", norm, NORMS)
+    check("weights", weights)
+    check("norm", norm)
     check_count("k", k, 1)
-    check_count("step", step, 1)
+    check("step", step)
     if n_latent is not None and n_latent > k:
         raise ValueError(f"n_latent must be at most k = {k}; found {n_latent}")
     require(first, "source", "target", "fmap_initial", what="network")
@@ -367,8 +364,7 @@ def shape_in(study: xr.DataTree, name: str, **projection: Any) -> Shape:
 
 def options_of_registration(study: xr.DataTree) -> dict[str, Any]:
     """The options that registrations of a study were made with, as far as its report names them."""
-    words = study["report"].attrs if "report" in study else {}
-    return {name: kind(words[name]) for name, kind in REGISTRATION.items() if name in words}
+    return {name: v for name, v in kept_options(study).items() if name in REGISTRATION}
 
 
 def template_of(study: xr.DataTree) -> str:
@@ -555,8 +551,8 @@ def register_shape(
         )
     given = {key: value for key, value in (options | {"how": how}).items() if value is not None}
     options = options_of_registration(study) | given
-    for option in WORDS.keys() & options.keys():
-        check_choice(option, options[option], WORDS[option])
+    for option in options.keys() & {"refine", "alignment", "how"}:
+        check(option, options[option])
     projection = {key: options.pop(key) for key in PROJECTION if key in options}
     template = template_of(study) if template is None else template
     target = shape_in(study, template, **projection)

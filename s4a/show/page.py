@@ -7,6 +7,7 @@ import xarray as xr
 from markupsafe import Markup
 
 from s4a.input.plausibility import decisions, notices
+from s4a.options import kept_options
 from s4a.show import charts
 from s4a.show.browser import MODES, PARTS, TEMPLATES, look_state, mesh_state, webp_uri
 from s4a.show.draw import SIGNED, Viewpoint, opposite, position_colors, ramp_colors, render
@@ -148,7 +149,7 @@ def _warnings(study):
         return Markup("")
     become = "Doubtful shapes are registered, and in no modes, no statistics and no median; "
     become += "s4a run ... --keep-doubtful takes all of them in."
-    if report.attrs.get("keep_doubtful") == "True":
+    if kept_options(report).get("keep_doubtful"):
         become = "Doubtful shapes were taken into modes and statistics by keep_doubtful."
     note = PARTS.note(become) if (status == "doubtful").any() else Markup("")
     return PARTS.warnings(lines) + note
@@ -388,8 +389,10 @@ def _resources(study, look):
 
 def _parameters(study, look):
     attrs = study["report"].attrs
+    rows = [[name, str(value)] for name, value in kept_options(study).items()]
     # the keys of all that was registered are no parameter, and wider than any page
-    rows = [[key, value] for key, value in attrs.items() if str(value) and key != "made_from"]
+    others = [[key, value] for key, value in attrs.items() if str(value)]
+    rows += [row for row in others if row[0] not in ("made_from", "options")]
     if not rows:
         return PARTS.missing(["parameters"])
     return PARTS.table(["parameter", "value"], rows, name="parameters")

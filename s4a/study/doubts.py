@@ -11,7 +11,7 @@ import xarray as xr
 
 from s4a.geometry.crossing import can_count
 from s4a.input.plausibility import Doubts, doubt, doubtful_lines, find_warnings, pick_references
-from s4a.study.options import Options
+from s4a.options import Options
 from s4a.study.runner import Keys, Run, Task
 from s4a.study.store import arrays, attributes, open_file, read, task_key
 from s4a.study.tasks import compare_shape, portray_shape

@@ -26,8 +26,8 @@ from s4a.method.lift import low_resolution
 from s4a.method.pca import project_scores
 from s4a.method.register import from_latent
 from s4a.method.shape import Shape
+from s4a.options import Options, with_options
 from s4a.schema import dataset, in_unit, require, unit_of, variable
-from s4a.study.options import Options
 from s4a.study.processes import workers
 from s4a.study.tasks import guided
 from s4a.study.tree import left_out, stack_registration, template_mesh
@@ -178,7 +178,8 @@ def insert(
         nodes["report"] = report_beside(study, attrs, looks, references)
     report = nodes["report"].attrs
     report["remarks"] = "\n".join(filter(None, [*told, report["remarks"]]))
-    report["keep_doubtful"] = "True"  # all that were given are in the result
+    # all that were given are in the result
+    report.update(with_options(report, {"keep_doubtful": True}))
     if reflect is not None:
         nodes["report"]["reflected"] = variable("reflected", [name in mirrored for name in attrs])
     return xr.DataTree.from_dict(nodes)
@@ -272,7 +273,7 @@ def clean_new(
     attrs = {name: {"status": "ok", "reason": ""} | mesh.attrs for name, mesh in meshes.items()}
     if isinstance(shapes, dict) and not shapes:
         return meshes, attrs
-    cleaning = options.of_cleaning
+    cleaning = options.of("cleaning")
     if not isinstance(shapes, dict) and are_meshes(shapes):  # in a study of label volumes
         cleaning = cleaning | {"label": None}
     tree = read_shapes(shapes, compare=False, **cleaning)
@@ -307,7 +308,11 @@ def freeze(study: xr.DataTree, options: Options) -> Frozen:
     names = [template, *others]
     coarse = [study["coarse"][name].to_dataset() for name in names]
     return Frozen(
-        options.shape(study["original"][template].to_dataset().load(), coarse[0].load()),
+        Shape(
+            study["original"][template].to_dataset().load(),
+            coarse[0].load(),
+            **options.of("projection"),
+        ),
         coarse,
         [mesh["eigenvalue"].values for mesh in coarse],
         latent["latent_basis"].sel(shape=names),
@@ -334,12 +339,12 @@ def insert_one(
 
 def _insert_one(mesh, frozen, options, references):
     _, k, _ = frozen.Y.shape
-    coarse = low_resolution(mesh, **options.of_low_resolution | {"k": k})
+    coarse = low_resolution(mesh, **options.of("low resolution") | {"k": k})
     if coarse.sizes["mode"] < k:
         raise ValueError(
             f"the study needs {k} eigenfunctions, this shape has only {coarse.sizes['mode']}"
         )
-    shape = options.shape(mesh, coarse)
+    shape = Shape(mesh, coarse, **options.of("projection"))
     new = Shape(coarse=coarse).low
     template = frozen.template.low
     k_init = min(options.k_init, k)
@@ -355,7 +360,7 @@ def _insert_one(mesh, frozen, options, references):
         starts,
         k_init=k_init,
         step=options.step,
-        **options.of_first_maps,
+        **options.of("first maps"),
     )
     registration = from_latent(
         shape,
@@ -363,7 +368,7 @@ def _insert_one(mesh, frozen, options, references):
         (Y, of_template),
         (R, t),
         how=options.how,
-        **options.of_registration,
+        **options.of("registration"),
     )
     seen = None
     if references is not None:

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 
 from s4a.input.hands import AUTO, hands, of_other_hand, to_reflect
+from s4a.options import Options
 from s4a.schema import dataset
 from s4a.study.doubts import looks_of
-from s4a.study.options import Options
 from s4a.study.runner import Keys, Run, Task
 from s4a.study.sources import Marked, Sources
 from s4a.study.store import is_done, read, task_key, write
@@ -23,7 +23,7 @@ def read_and_clean(
     run: Run, sources: Sources, marked: Marked, options: Options, reflected: list[str]
 ) -> Keys:
     """The shapes, cleaned, with landmarks, some of them mirrored (5.1): ``/original``."""
-    cleaning = options.of_cleaning
+    cleaning = options.of("cleaning")
     todo = []
     for n, (source, content) in sources.items():
         also: dict[str, Any] = {"reflected": True} if n in reflected else {}
@@ -52,11 +52,11 @@ def choose_reflected(
         table = run.folder / "subjects.nc"
         subjects = read(table) if table.is_file() else None
         reflected = to_reflect(str(options.reflect), list(sources), subjects)
-        told = f"reflect= mirrors all {len(sources)} shapes, which changes nothing among them"
-        return reflected, [told] if len(reflected) == len(sources) else []
+        is_all = len(reflected) == len(sources)
+        return reflected, ["reflect= mirrors all: nothing changes among them"] if is_all else []
     file = run.folder / CHOICE
     contents = [content for _, content in sources.values()]
-    key = task_key(list(sources), contents, options.of_cleaning, options.k, AUTO)
+    key = task_key(list(sources), contents, options.of("cleaning"), options.k, AUTO)
     if not is_done(file, key):
         original = read_and_clean(run, sources, marked, options, [])
         looks = looks_of(run, original, options) if len(original) > 1 else {}

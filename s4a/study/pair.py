@@ -12,14 +12,15 @@ from s4a.method.first_map import first_map, motion_onto
 from s4a.method.lift import low_resolution
 from s4a.method.register import register, sharpen_map
 from s4a.method.shape import Shape
+from s4a.options import Options, given_options
 from s4a.schema import dataset, require
-from s4a.study.options import PAIR, Options, pair_options, takes_options
 
 log = logging.getLogger(__name__)
 
 
-@takes_options(*PAIR)
-def match_pair(source: xr.Dataset, target: xr.Dataset, **options: Any) -> xr.Dataset:
+def match_pair(
+    source: xr.Dataset, target: xr.Dataset, *, preset: str | None = None, **options: Any
+) -> xr.Dataset:
     """Correspondence of two shapes at full resolution (4.1).
 
     In far poses a search for a first map takes several seconds; where more than two shapes are at
@@ -31,30 +32,13 @@ def match_pair(source: xr.Dataset, target: xr.Dataset, **options: Any) -> xr.Dat
     source, target : xarray.Dataset
         Clean meshes (``position``, ``corner_vertex``), as of :func:`s4a.read_shapes` or
         :func:`s4a.clean`.
-    method : {"rematch", "scalable"}
-        The low resolution, see :func:`s4a.analyse`.
-    k_init, k, step : int
-        Sizes of the first and of the refined functional map; growth per round of ZoomOut.
-    init : {"dense", "landmarks"}
-        First map from all nearest neighbours after ICP (default), or the paper's fit on 10
-        landmarks.  Where the former say that poses are far apart,
-        :func:`s4a.method.first_map.best_first_map` is taken, which costs about 2 s more.
-    ahead : {"always", "network", "never"}
-        Whether the first map gets a step of ZoomOut without growth; "network" says not here (4.2).
-    sharpen : int
-        Rounds of ZoomOut after the last in which coarse vertices of the target look among all of
-        the source.
-    refine : {"elastic", "joint", "intrinsic"}
-        Elastic rounds after ZoomOut (default), joint ones, or the paper's ZoomOut alone and eq. 4;
-        see :func:`s4a.analyse`.
-    lift, parts, alignment, area_weighted, n_projected
-        See :func:`s4a.analyse`.
-    n_coarse : int
-        Vertices of the low-resolution meshes; 6,000 by default.
     preset : {None, "paper", "fast"}
-        ``"paper"`` leaves out all that is added to 4.1, ``"fast"`` takes n_coarse=3000; see
-        :func:`s4a.analyse`.
-    seed, rng : see :mod:`s4a.seeds`
+        ``"paper"`` leaves out all that is added to 4.1, ``"fast"`` takes n_coarse=3000.
+    **options
+        ``n_coarse, k_init, k, step, init, ahead, sharpen, refine, parts, lift, alignment,
+        area_weighted, n_projected, method, seed`` or ``rng``: see :class:`s4a.Options`.  Where
+        poses are far apart :func:`s4a.method.first_map.best_first_map` is taken, which costs about
+        2 s more.
 
     Returns
     -------
@@ -97,7 +81,7 @@ def match_pair(source: xr.Dataset, target: xr.Dataset, **options: Any) -> xr.Dat
     ... )
     <Parts ...>
     """
-    settings = pair_options(options)
+    settings = given_options({"preset": preset, **options}, pair=True)
     for mesh, what in ((source, "source"), (target, "target")):
         require(mesh, "position", "corner_vertex", what=what)
     with threadpool_limits(1):  # products of a pair are small: more threads of BLAS take longer
@@ -114,7 +98,9 @@ def match_pair(source: xr.Dataset, target: xr.Dataset, **options: Any) -> xr.Dat
 
 def shape_of(mesh: xr.Dataset, options: Options) -> Shape:
     """The shape of a mesh, with its low resolution and functions."""
-    return options.shape(mesh, low_resolution(mesh, **options.of_low_resolution))
+    return Shape(
+        mesh, low_resolution(mesh, **options.of("low resolution")), **options.of("projection")
+    )
 
 
 def match_shapes(source: Shape, target: Shape, options: Options) -> tuple[xr.Dataset, xr.Dataset]:
@@ -140,7 +126,7 @@ def match_shapes(source: Shape, target: Shape, options: Options) -> tuple[xr.Dat
     starts = {"intrinsic": match, "icp": first.near}
     functions = source.functions(C.T), target.functions(np.eye(k))  # eq. 4 compares rows of both
     registration = register(
-        source, target, starts, functions, motion, k=k, **options.of_registration
+        source, target, starts, functions, motion, k=k, **options.of("registration")
     )
     maps = dataset(fmap=C, fmap_initial=first.C, fmap_fitted=first.fitted)
     if first.landmarks is not None:

@@ -20,7 +20,7 @@ from s4a.input.subjects import read_table
 from s4a.method.network import choose_pairs, spectral_distance
 from s4a.method.pca import pca_without
 from s4a.method.remesh import check_wrap
-from s4a.seeds import seeded
+from s4a.options import Options, given_options
 from s4a.study.doubts import (
     check_plausibility,
     check_usable,
@@ -28,7 +28,6 @@ from s4a.study.doubts import (
     set_apart,
     stop_at_doubts,
 )
-from s4a.study.options import Options, takes_options
 from s4a.study.originals import choose_reflected, read_and_clean
 from s4a.study.processes import temporary_folder
 from s4a.study.report import write_report
@@ -68,13 +67,23 @@ from s4a.study.tree import open_study, stack_registration, template_mesh
 log = logging.getLogger(__name__)
 
 
-@takes_options()
 def analyse(
     shapes: Collection,
     *,
+    preset: str | None = None,
+    n_coarse: int | None = None,
+    n_pairs: int | None = None,
+    k: int | None = None,
+    label: int | str | None = None,
+    reflect: str | list[str] | None = None,
+    table: Path | str | None = None,
+    landmarks: Path | str | None = None,
+    template: str | None = None,
+    scale: bool | None = None,
+    options: Options | None = None,
     store: Path | str | None = None,
     n_jobs: int | None = None,
-    **options: Any,
+    **others: Any,
 ) -> xr.DataTree:
     """From a collection of meshes to a median shape, dense correspondences and modes.
 
@@ -83,115 +92,18 @@ def analyse(
     shapes : path, list of paths, dict or xarray.DataTree
         A folder, a glob, files, or by name a file or a mesh in memory, a Dataset or (points,
         triangles), or what :func:`s4a.read_shapes` gives.
-    method : {"rematch", "scalable"}
-        The low resolution (4.1): remeshed (default), or the local functions of SCALABLE, see
-        :func:`s4a.method.scalable.reduced`.  The study has the same nodes and variables but for U,
-        and all that takes one takes it; what is called a coarse mesh are then samples, joined
-        where their cells meet.  ``lift`` and ``wrap`` need a coarse mesh and are refused.
-    n_coarse : int
-        Vertices of the low-resolution meshes (4.1), or samples; 6,000 by default.
-    n_pairs : int
-        Pairs of the network, each with maps both ways; all pairs where there are fewer (5.1).
-    k_init, k : int
-        Sizes of the first and of the refined maps.
-    n_latent : int, optional
-        Dimension of the latent space; k by default.
-    step : int
-        Growth of the maps per round of Consistent ZoomOut.
-    weights : {"cycles", "equal"}
-        Of the maps in eq. 3: by how far their cycles close, see :mod:`s4a.method.network`, or 1.
-    lift : bool, optional
-        Whether the functions are eigenfunctions of the original meshes, nearly
-        (:mod:`s4a.method.lift`), instead of U Phi in eq. 4, 7 and the smoothing of eq. 8.  They are
-        kept in ``/coarse``: 40 MB for 100,000 vertices.  Not by default.
-    init : {"dense", "landmarks"}, optional
-        First maps from all nearest neighbours after ICP (default), or the paper's fit on 10
-        landmarks (4.1, steps 3 and 4).  Of pairs in far poses the former are replaced, see
-        :func:`s4a.match_pair`.
-    ahead : {"always", "network", "never"}, optional
-        Whether first maps get a step of ZoomOut without growth ahead (4.2): also those of a pair
-        that is matched on its own (default), those of the network alone, as in the paper, or none.
-    n_spread : int, optional
-        Vertices on which Consistent ZoomOut looks for matches (eq. 3), and the step ahead of near
-        poses, 1000 by default and 2 k at least; 0 for all.
-    wide : int, optional
-        Its last rounds in which these look between the samples, too, 4 by default.
-    sharpen : int, optional
-        Of pairs that are matched on their own, see :func:`s4a.match_pair`, as external meshes of a
-        transfer are.
-    refine : {"elastic", "joint", "intrinsic"}, optional
-        Registration with elastic and local rounds (:mod:`s4a.method.elastic`, default), where poses
-        are far apart after joint ones; with joint rounds (:mod:`s4a.method.joint`); or the paper's
-        spectral match alone (eq. 7 or 4).
-    parts : bool, optional
-        Whether in far poses joint rounds turn every part on its own (default).
-    alignment : {"fitted", "icp"}, optional
-        Displacements (eq. 8) are measured after the rigid motion that fits the registered surface
-        best (default), or after that of ICP (4.1, step 2).
-    area_weighted : bool, optional
-        Whether vertices weigh by their areas in the projection after eq. 8 (default), or the pseudo
-        inverse (U Phi)^+ is as printed.
-    n_projected : int, optional
-        Vertices by which that projection is computed, 25,000 by default; 0 for all.
-    both : bool, optional
-        Of transfer: whether a pair that is matched on its own is matched both ways (default), see
-        :func:`s4a.register_pairs`.
-    how : {"ours", "standard"}
-        Full resolution by eq. 7 (default), or by eq. 3 and 4; unless ``refine="intrinsic"`` that
-        match is one candidate among others.
-    norm : {"h2", "h1", "frobenius", "h2_image", "h2_both"}
-        Norm of eq. 5, see :func:`s4a.method.median.distance_to_identity`.
-    keep_rounds : bool
-        Whether maps and latent bases of every round of Consistent ZoomOut are kept: ``/rounds``.
-    scale : bool
-        Whether size is taken out of the displacements.
-    components, strict, close_holes, intersections, pattern
-        See :func:`s4a.read_shapes`.
-    wrap : bool
-        Whether shapes are wrapped watertight before they are remeshed.
-    preset : {None, "paper", "fast"}
-        ``"fast"`` sets n_coarse=3000, n_spread=500, wide=0, which takes about half the time; its
-        errors are a tenth larger (``benchmarks/cheaper.py``).
-        ``"paper"`` leaves out all that is added to the paper: lift=False, init="landmarks",
-        ahead="network", n_spread=0, wide=0, sharpen=0, refine="intrinsic", parts=False,
-        alignment="icp", area_weighted=False, n_projected=0, both=False.  Another value of what a
-        preset sets is refused; to add them one at a time, give ``s4a.study.options.PAPER`` with one
-        changed.
-    template : str, optional
-        Name of the shape to register to; the median shape by default.
-    reflect : str or list of str, optional
-        The shapes that are mirrored (x becomes -x in the coordinates of their files, triangles are
-        turned over), so that left and right ones are of one hand: their names; ``"side=left"``, all
-        with this value in the column ``side`` of the table, or a column of 1 and 0; or ``"auto"``,
-        those of the rarer hand by ICP of pairs, as they are and mirrored
-        (:func:`s4a.input.hands.of_other_hand`).  ``/report`` says of each whether it was.
-    table : path, optional
-        CSV with a column ``shape`` and covariates or groups, see
-        :func:`s4a.input.subjects.read_table`; they become ``/subjects``, so that
-        :mod:`s4a.analysis.statistics` takes their names.  Nothing else depends on it.  Without one,
-        a table given to an earlier run stays.
-    landmarks : path, optional
-        Folder with a file of landmarks for some or all shapes, named as the shape: 3D Slicer
-        (.mrk.json), CSV or MeshLab (.pp).  Those of one name guide and pull registration, see
-        :func:`s4a.with_landmarks`, which gives them to meshes in memory.
-    features : list of str, optional
-        Names of fields of the vertices that guide registration, such as ``sulc``, see
-        :func:`s4a.with_features`, which gives them to meshes in memory.  Of the file ``a.ply`` in
-        ``a.sulc`` or ``a.sulc.npy`` (:func:`s4a.input.annotations.files_beside`), or of PLY.
-    label : int, several, or "all", optional
-        The files are label volumes, see :func:`s4a.read_labels`.
-    doubtful : {"apart", "stop"}
-        Doubtful shapes, such as one mirrored or of another unit, stay apart by default: they are
-        placed beside the network of all others and registered, so that nothing changes for these.
-        ``"stop"`` ends the run with a ValueError before the long stages, where there are any.
-    keep_doubtful : bool
-        Whether they enter modes and statistics.
+    preset, n_coarse, n_pairs, k, label, reflect, table, landmarks, template, scale
+        The options that people change; one that is not given, or as None, is that of `options`, or
+        its default.  See :class:`s4a.Options`.
+    options : Options, optional
+        In place of the defaults.
+    **others
+        Every other option, by the name that it has in :class:`s4a.Options`; ``rng`` for ``seed``.
     store : path, optional
         Folder of the study.  A run that was killed goes on at the first missing file.
     n_jobs : int, optional
         Processes, as in joblib: -1 for all cores given to this process.  The result does not depend
         on it.
-    seed, rng : see :mod:`s4a.seeds`
 
     Returns
     -------
@@ -204,6 +116,8 @@ def analyse(
     ValueError
         When an option is out of range, or fewer than 2 shapes can be used; the reasons are named.
         With ``doubtful="stop"``, when a shape is doubtful.
+    TypeError
+        When an option is given that there is not.
 
     Examples
     --------
@@ -214,19 +128,31 @@ def analyse(
 
     The paper, and elastic rounds alone added to it:
 
-    >>> from s4a.study.options import PAPER
+    >>> from s4a.options import PRESETS
     >>> small = {"n_coarse": 100, "k": 10, "k_init": 6, "n_pairs": 3}
     >>> brains = s4a.synthetic.brains(3, 200)
     >>> paper = s4a.analyse(brains, preset="paper", **small)
-    >>> elastic = s4a.analyse(brains, **PAPER | {"refine": "elastic"}, **small)
+    >>> elastic = s4a.analyse(brains, **PRESETS["paper"] | {"refine": "elastic"}, **small)
     """
-    options = seeded(options)
+    shown = {
+        "preset": preset,
+        "n_coarse": n_coarse,
+        "n_pairs": n_pairs,
+        "k": k,
+        "label": label,
+        "reflect": reflect,
+        "table": table,
+        "landmarks": landmarks,
+        "template": template,
+        "scale": scale,
+    }
+    given = {name: value for name, value in shown.items() if value is not None}
+    settings = given_options(given | others, options)
     if store is None:
         with temporary_folder() as folder:
-            study = analyse(shapes, store=folder, n_jobs=n_jobs, **options)
+            study = analyse(shapes, options=settings, store=folder, n_jobs=n_jobs)
             loaded = {n.path: n.to_dataset(inherit=False).load() for n in study.subtree}
             return xr.DataTree.from_dict(loaded)
-    settings = Options(**options)
     settings.check_spread()
     if settings.wrap:
         check_wrap()
@@ -333,7 +259,7 @@ def first_maps(run: Run, coarse: Keys, aligned: str, options: Options) -> Keys:
     names, k_init = list(coarse), spectra.shape[1]
     pairs = choose_pairs(spectral_distance(spectra), options.n_pairs)
     batches = in_batches([[names[i], names[j]] for i, j in pairs])
-    settings = (k_init, options.of_first_maps)
+    settings = (k_init, options.of("first maps"))
     files = {f"network/first_{i:03d}.nc": batch for i, batch in enumerate(batches)}
     todo = [
         Task(f, f, map_pairs, (run.folder, batch, *settings), (aligned, batch, *settings))
@@ -402,7 +328,7 @@ def place(run: Run, apart: Keys, reference: tuple[str, str], latent: str, option
         for n, key in apart.items()
     ]
     aligned = run.do("align doubtful shapes", todo) if apart else {}
-    settings = (options.k_init, options.of_first_maps, options.step, options.norm)
+    settings = (options.k_init, options.of("first maps"), options.step, options.norm)
     todo = [
         Task(
             n,
@@ -421,7 +347,7 @@ def register(run: Run, coarse: Keys, placed: Keys, latent: str, options: Options
     """Every shape registered to the template, the median shape by default (4.2, eq. 6 to 8)."""
     template = options.template or attributes(run.folder / "latent.nc")["median"]
     projection = (options.area_weighted, options.n_projected)
-    way = (template, options.how, options.of_registration, projection)
+    way = (template, options.how, options.of("registration"), projection)
     template_key = task_key(latent, way)
     mesh = template_mesh(read(run.folder / f"original/{template}.nc"), template)
     if placed:

@@ -11,9 +11,9 @@ import xarray as xr
 from s4a.input.collection import shape_report
 from s4a.input.hands import AUTO
 from s4a.input.plausibility import Doubts
+from s4a.options import Options, with_options
 from s4a.schema import dataset
 from s4a.study.doubts import of_look
-from s4a.study.options import Options
 from s4a.study.runner import Run
 from s4a.study.sources import Sources
 from s4a.study.store import arrays, attributes, read, write
@@ -64,7 +64,9 @@ def write_report(
     if options.reflect is not None:
         report = report.assign(of_hands(run, list(sources), options).variables)
     report = report.assign(costs(run).variables)
-    report = report.assign_attrs(options.to_report() | {"template": template, "no_modes": no_modes})
+    report = report.assign_attrs(
+        with_options({"template": template, "no_modes": no_modes}, vars(options))
+    )
     report.attrs["unforeseen"] = " ".join(run.unforeseen)  # names of shapes, which have no blanks
     of_template = report.sel(shape=template)
     if of_template["status"].item() == "doubtful":

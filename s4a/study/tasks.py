@@ -25,8 +25,8 @@ from s4a.method.latent import latent_of_new, nearest_spectra, place
 from s4a.method.lift import low_resolution
 from s4a.method.register import from_latent, identity
 from s4a.method.shape import Basis, Shape, features_of
+from s4a.options import Options
 from s4a.schema import dataset, in_unit, unit_of
-from s4a.study.options import Options
 from s4a.study.runner import Run
 from s4a.study.sources import Guides, content_of_file
 from s4a.study.store import arrays, attributes, open_file, read
@@ -112,15 +112,14 @@ def compare_shape(folder: Path, name: str, references: list[str]) -> xr.Dataset:
 def remesh_shape(folder: Path, name: str, options: Options) -> xr.Dataset:
     """The low-resolution mesh of a shape of the study, its U (4.1) and its spectrum (3.3)."""
     mesh = read(folder / "original" / f"{name}.nc")
-    low = low_resolution(mesh, **options.of_low_resolution)
+    low = low_resolution(mesh, **options.of("low resolution"))
     return in_unit(low, unit_of(mesh["position"]))
 
 
 def shape_of(folder: Path, name: str, options: Options) -> Shape:
     """A shape of the study at both resolutions; its arrays are read when they are used."""
-    return options.shape(
-        *(open_file(folder / stage / f"{name}.nc") for stage in ("original", "coarse"))
-    )
+    original, coarse = (open_file(folder / s / f"{name}.nc") for s in ("original", "coarse"))
+    return Shape(original, coarse, **options.of("projection"))
 
 
 def template_of(folder: Path, name: str, options: Options) -> Shape:
@@ -204,7 +203,7 @@ def place_shape(folder: Path, name: str, options: Options) -> xr.Dataset:
         [motion_between(motion, motion_to_reference(folder, n)) for n in near],
         k_init=k_init,
         step=options.step,
-        **options.of_first_maps,
+        **options.of("first maps"),
     )
     latent_eigenvalue = latent["latent_eigenvalue"].values
     found = latent_of_new(Y[None], own[None], latent_eigenvalue, options.norm)
@@ -233,5 +232,5 @@ def register_shape(folder: Path, name: str, template: str, options: Options) -> 
     motion = realign(M.cloud, N.cloud, start)
     how = options.how
     return from_latent(
-        source, target, (own, of_template), motion, how=how, **options.of_registration
+        source, target, (own, of_template), motion, how=how, **options.of("registration")
     )

@@ -8,6 +8,7 @@ import numpy as np
 import xarray as xr
 
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
+from s4a.options import kept_options
 from s4a.schema import INPUT, in_unit, unit_of, variable
 from s4a.study.contents import check_contents, check_fit
 from s4a.study.store import (
@@ -258,7 +259,7 @@ def left_out(study: xr.DataTree) -> list[str]:
     if "report" not in study.children or "registration" not in study.children:
         return []
     report = study["report"].dataset
-    if "status" not in report or report.attrs.get("keep_doubtful") == "True":
+    if "status" not in report or kept_options(report).get("keep_doubtful"):
         return []
     template = study["registration"].attrs.get("template")
     doubtful = report["shape"].values[report["status"].values == "doubtful"].tolist()

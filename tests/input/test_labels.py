@@ -11,7 +11,7 @@ import s4a
 from s4a import cli
 from s4a.geometry.mesh import as_arrays
 from s4a.input.labels import check_label, read_volume
-from s4a.study.options import Options
+from s4a.options import Options, with_options
 
 pytest.importorskip("skimage")
 nibabel = pytest.importorskip("nibabel")
@@ -165,7 +165,7 @@ def test_labels_that_are_none_are_refused(label):
 
 
 def test_without_scikit_image_it_says_what_to_install(monkeypatch):
-    monkeypatch.setattr("s4a.input.labels.find_spec", lambda name: None)
+    monkeypatch.setattr("s4a.options.find_spec", lambda name: None)
     assert Options(label=None).label is None
     with pytest.raises(ValueError, match=r"pip install 's4a\[labels\]'"):
         Options(label=17)
@@ -175,7 +175,7 @@ def test_options_keep_their_labels_in_the_report():
     for label in (17, "1,2", "all", None, [2, 1]):
         options = Options(label=label)
         report = s4a.read_shapes({"a": as_arrays(s4a.synthetic.sphere(30))})
-        report["report"].attrs.update(options.to_report())
+        report["report"].attrs = with_options({}, vars(options))
         assert Options.from_report(report) == options
     assert Options(label=[2, 1]).label == "1,2"
 
@@ -226,7 +226,7 @@ def test_one_command_leads_from_volumes_to_modes_and_resumes_and_inserts(volumes
     assert cli.main(["verify", str(out)]) == 0
     study = s4a.open_study(out)
     assert study["pca"].sizes["component"] == 3
-    assert study["report"].attrs["label"] == "17"
+    assert Options.from_report(study).label == 17
     new = s4a.insert(study, volumes / "scan_4.nii.gz")
     assert new["pca"]["score"].sizes == {"shape": 1, "component": 3}
     assert "label 17" in capsys.readouterr().out or new["original/scan_4"].attrs["label"] == "17"

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from s4a import analyse, cli, insert, open_study, statistics, synthetic
+from s4a import Options, analyse, cli, insert, open_study, statistics, synthetic
 from s4a.input.annotations import read_labels, read_landmarks
 from s4a.input.files import slugs
 from s4a.input.subjects import read_table, with_table
@@ -129,7 +129,7 @@ def test_a_study_has_the_table_and_nothing_else_depends_on_it(folder, brains):
     work = folder / "study"
     with open_study(work) as study:
         assert study["subjects"]["age"].values.tolist() == [20, 27, 34, 41, 48, 55]
-        assert study["report"].attrs["table"].endswith("six.csv")
+        assert Options.from_report(study).table.endswith("six.csv")
         modes = study["pca"].to_dataset().load()
     before = {
         p: p.stat().st_mtime_ns for p in [work / "latent.nc", *(work / "registration").iterdir()]

@@ -13,8 +13,8 @@ from s4a.method import elastic, joint
 from s4a.method.register import TORN, elastic_surfaces, mends, register_surface, tear
 from s4a.method.remesh import laplacian
 from s4a.method.shape import Basis
+from s4a.options import Options
 from s4a.schema import dataset
-from s4a.study.options import pair_options
 from s4a.study.pair import shape_of
 
 
@@ -22,7 +22,7 @@ from s4a.study.pair import shape_of
 def pair():
     """A template, a shape of other vertices, and where the former's vertices are on the latter."""
     tree = synthetic.brains(2, 3000, seed=5)
-    options = pair_options({"n_coarse": 1500, "k": 60})
+    options = Options(n_coarse=1500, k=60)
     template, shape = (
         shape_of(tree["original"][name].to_dataset(), options) for name in ("brain_01", "brain_02")
     )
@@ -276,7 +276,7 @@ def test_a_study_and_a_pair_take_it_and_say_so(brains):
     found = match_pair(meshes["brain_02"], meshes["brain_01"], refine="elastic", **small)
     assert np.isfinite(found["displacement"]).all()
     with analyse(meshes, n_jobs=1, **small) as study:
-        assert study["report"].attrs["refine"] == "elastic"
+        assert Options.from_report(study).refine == "elastic"
         assert (study["registration"]["confidence"] > 0).any()
 
 
@@ -301,7 +301,7 @@ def rim_height(template, shape):
 
 
 def test_boundaries_that_lie_on_each_other_end_on_each_other(monkeypatch):
-    options = pair_options({"n_coarse": 800, "k": 40})
+    options = Options(n_coarse=800, k=40)
     template, shape = (shape_of(bowl(*how), options) for how in ((2000,), (2600, 0.05)))
     drawn = rim_height(template, shape)
     monkeypatch.setattr(elastic, "RIM_WEIGHT", 0.0)
@@ -309,7 +309,7 @@ def test_boundaries_that_lie_on_each_other_end_on_each_other(monkeypatch):
 
 
 def test_a_shape_that_ends_elsewhere_keeps_its_boundary(monkeypatch):
-    options = pair_options({"n_coarse": 800, "k": 40})
+    options = Options(n_coarse=800, k=40)
     template, shape = (shape_of(bowl(*how), options) for how in ((2000,), (2600, 0.2)))
     assert elastic.rim_ahead(shape.full, template.low, template.low.X) is None
     kept = rim_height(template, shape)

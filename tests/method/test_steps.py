@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 
 import s4a
 from s4a.method.shape import Shape
-from s4a.study.options import Options
+from s4a.options import Options
 
 OPTIONS = {"n_coarse": 300, "k": 24, "k_init": 10, "n_pairs": 5}
 

@@ -20,9 +20,9 @@ from small import OPTIONS
 from s4a import analyse, statistics, synthesize, synthetic
 from s4a.evaluation import accuracy
 from s4a.geometry.mesh import as_arrays, vertex_areas
+from s4a.options import Options
 from s4a.schema import dataset
 from s4a.study import store, tasks
-from s4a.study.options import Options
 
 RESULTS = ("network", "latent", "registration", "pca")
 
@@ -64,7 +64,7 @@ def test_a_study_has_all_stages_and_says_what_it_did(study, brains):
     assert report["status"].values.tolist() == ["ok"] * 4
     assert report["seconds"].values.min() > 0
     assert report["peak_memory"].values.min() > 10
-    assert report.attrs["k_init"] == "10"
+    assert Options.from_report(report).k_init == 10
     assert study["network"].sizes["pair"] == 12
     assert study["network"]["fmap"].shape == (12, 24, 24)
     assert registration["vertex_area"].sum() == pytest.approx(
@@ -254,11 +254,7 @@ def test_the_paper_preset_runs_the_paper_way(brains):
     tree = analyse(brains, preset="paper", **OPTIONS)
     registration, report = tree["registration"].to_dataset(), tree["report"].to_dataset()
     assert set(registration["method"].values) == {"template", "intrinsic"}
-    assert [report.attrs[o] for o in ("init", "refine", "how")] == [
-        "landmarks",
-        "intrinsic",
-        "ours",
-    ]
+    assert Options.from_report(report) == Options(preset="paper", **OPTIONS)
     assert tree["pca"]["explained_variance_ratio"].sum() == pytest.approx(1)
 
 

@@ -4,16 +4,17 @@ import shutil
 
 import numpy as np
 import pytest
-from paths import DOCS
 from scipy.spatial.distance import cdist
 from small import FLAGS, OPTIONS
 
 import s4a
 from s4a.analysis import transfer
 from s4a.cli import main
-from s4a.study.options import DEFAULTS, FAST, PAPER, Options
+from s4a.options import PRESETS, Options
 from s4a.study.store import attributes, read, write
 
+PAPER, FAST = PRESETS["paper"], PRESETS["fast"]
+DEFAULTS = {name: PRESETS[None][name] for name in PAPER}
 PAIR = {name: OPTIONS[name] for name in ("n_coarse", "k_init", "k")}
 NEW = (
     "registered_match_low",
@@ -36,20 +37,6 @@ def paper(three, tmp_path_factory):
     options = {"preset": "paper", "close_holes": True, "keep_rounds": True}
     s4a.analyse(three, store=folder, **options, **OPTIONS).close()
     return folder
-
-
-def test_the_preset_sets_every_option_that_has_a_default_of_ours():
-    assert PAPER.keys() == DEFAULTS.keys()
-    options = Options(preset="paper")
-    assert {name: getattr(options, name) for name in PAPER} == PAPER
-
-
-def test_every_addition_and_the_papers_choice_are_in_the_documentation():
-    table = (DOCS / "differences.md").read_text(encoding="utf-8")
-    said = " ".join(s4a.analyse.__doc__.split())
-    for name, value in PAPER.items():
-        assert f"| `{name}`: " in table
-        assert f"{name}={value!r}".replace("'", '"') in said
 
 
 def test_the_fast_preset_sets_what_it_is_for_and_leaves_the_rest():
@@ -93,7 +80,7 @@ def test_an_option_that_the_preset_fixes_is_refused_by_name(name, meshes):
 
 def test_a_pair_has_no_options_of_a_collection(meshes):
     source, target, *_ = meshes.values()
-    with pytest.raises(TypeError, match="unexpected options n_pairs; those of a pair are k_init"):
+    with pytest.raises(TypeError, match="unexpected option n_pairs of a pair; there are preset"):
         s4a.match_pair(source, target, n_pairs=3)
 
 
@@ -268,7 +255,7 @@ def test_options_are_refused_where_nothing_is_matched(what, study, meshes):
     message = "options preset need a source that is none of the shapes.*the shape 'brain_04'"
     with pytest.raises(ValueError, match=message):
         transfers(external)[what](study, source="brain_04", preset="paper")
-    with pytest.raises(TypeError, match="unexpected options n_pairs; those of a pair are"):
+    with pytest.raises(TypeError, match="unexpected option n_pairs of a pair; there are preset"):
         transfers(external)[what](study, source=external, n_pairs=3)
 
 

@@ -16,9 +16,9 @@ from s4a.method.pca import low_vertices
 from s4a.method.scalable import reduce, reduced
 from s4a.method.shape import Shape
 from s4a.method.spectral import unit_mass
+from s4a.options import Options
 from s4a.show.surfaces import SAMPLES
 from s4a.study import pipeline
-from s4a.study.options import Options
 from s4a.study.store import DamagedError, is_done, read, task_key, write
 
 U = {"coarse_vertex", "coarse_weight"}
@@ -69,7 +69,7 @@ def test_the_tree_is_that_of_a_study_of_rematch_but_for_the_entries_of_u(
     assert {(path.split("/")[1], name) for path, name, *_ in ours - theirs} == {
         ("coarse", name) for name in LOCAL
     }
-    assert sampled["report"].attrs["method"] == "scalable"
+    assert Options.from_report(sampled).method == "scalable"
 
 
 def test_the_low_resolution_is_the_reduced_basis_of_scalable(sampled):
