@@ -11,7 +11,6 @@ from s4a.show.browser import color_bytes
 from s4a.show.surfaces import mode_arrays, mode_limits, score_state
 from s4a.widgets.modes import ModesView
 from s4a.widgets.panel import Panel, check, dropdown, row, together
-
 from s4a_morphometrics.poses import LEVELS, structures, structures_modes
 
 WORDS = {
