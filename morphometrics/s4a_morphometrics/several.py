@@ -111,6 +111,8 @@ def analyse_structures(
     """
     options = seeded(options)
     settings = Options(**options, reflect=reflect)
+    if settings.label is not None:
+        raise ValueError("structures= gives the labels of each structure: leave out label=")
     parts = parts_of(shapes, structures, table, landmarks, settings.pattern)
     remarks = check_parts(parts, marked=landmarks is not None)
     remarks += remarks_on_files(shapes, settings.pattern, volumes=structures is not None)
@@ -127,7 +129,8 @@ def analyse_structures(
     with folder_of(store) as folder:
         (folder / FOLDER).mkdir(parents=True, exist_ok=True)
         notes = {"structures": list(parts), "remarks": remarks, "mirrored": chosen, "hand": hand}
-        (folder / NOTES).write_text(json.dumps(notes))
+        (folder / f"{NOTES}.tmp").write_text(json.dumps(notes))
+        (folder / f"{NOTES}.tmp").replace(folder / NOTES)
         studies = {}
         for name, part in parts.items():
             log.info("structure %s", name)
@@ -149,19 +152,23 @@ def folder_of(store: Path | str | None) -> Iterator[Path]:
         with TemporaryDirectory() as folder:
             yield Path(folder)
         return
-    if any(Path(store).glob("original/*.nc")):
-        raise ValueError(f"{store} has a study of one structure: give another folder for several")
-    yield Path(store)
+    folder = Path(store)
+    if any(folder.glob("[!.]*")) and not (folder / NOTES).is_file():
+        raise ValueError(
+            f"{folder} is no study of several structures and is not empty: give a new or an empty "
+            "folder"
+        )
+    yield folder
 
 
-def given_files(part: Part, folder: Path, name: str) -> dict[str, Path]:
+def given_files(part: Part, folder: Path, name: str) -> dict[str, Any]:
     """The table and the landmarks of one structure, written as :func:`s4a.analyse` takes them."""
-    given = {}
+    given: dict[str, Any] = {}
     if part.rows:
         given["table"] = folder / f"{name}.csv"
-        with given["table"].open("w", newline="", encoding="utf-8") as file:
+        with given["table"].open("w", newline="", encoding="utf-8") as table:
             columns = list(next(iter(part.rows.values())))
-            lines = csv.writer(file)
+            lines = csv.writer(table)
             lines.writerow(["shape", *columns])
             lines.writerows([shape, *cells.values()] for shape, cells in part.rows.items())
     if part.landmarks:
@@ -169,8 +176,9 @@ def given_files(part: Part, folder: Path, name: str) -> dict[str, Path]:
         shutil.rmtree(marks, ignore_errors=True)
         marks.mkdir(parents=True)
         for subject, file in part.landmarks.items():
-            suffix = next(end for end in SUFFIXES if end in file.name.lower())
-            shutil.copy(file, marks / f"{subject}{suffix}")
+            *_, suffix = (end for end in SUFFIXES if end in file.name.lower())
+            at = file.name.lower().rindex(suffix)  # .gz may follow
+            shutil.copy(file, marks / f"{subject}{file.name[at:]}")
     return given
 
 
@@ -489,7 +497,7 @@ def of_structure(study: xr.DataTree, name: str) -> xr.DataTree:
     names = structure_names(study)
     if name not in names:
         raise ValueError(f"the study has no structure {name!r}; it has {listed(names)}")
-    return study[FOLDER][name].copy()
+    return study[FOLDER].children[name].copy()
 
 
 # ---- new subjects
@@ -558,7 +566,7 @@ def insert_structures(
         given = {name: (studies[name], part.shapes) for name, part in parts.items() if part.shapes}
         chosen, told = find_mirrored_new(given)
     elif reflect is not None:
-        chosen = named_subjects(Options(reflect=reflect).reflect, parts)
+        chosen = named_subjects(str(Options(reflect=reflect).reflect), parts)
     inserted, failed = {}, []
     with TemporaryDirectory() as folder:
         for name, part in parts.items():

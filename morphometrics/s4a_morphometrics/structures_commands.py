@@ -75,7 +75,7 @@ def compare(args: Namespace) -> int:
             write(f"{level}: nothing varies")
             continue
         of_level = poses.structures_modes(study, found, level)
-        ratio = of_level["pca"]["explained_variance_ratio"].values[:5]
+        ratio = of_level["pca"].dataset["explained_variance_ratio"].values[:5]
         shares = ", ".join(f"{100 * one:.1f}" for one in ratio)
         write(f"{level}: modes of {shares} % of its variance")
         if args.group:

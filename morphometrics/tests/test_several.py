@@ -3,6 +3,13 @@
 import numpy as np
 import pytest
 import xarray as xr
+
+import s4a
+from s4a import cli, write_mesh
+from s4a.geometry.mesh import as_arrays, volume
+from s4a.input.annotations import write_landmarks
+from s4a.input.hands import mirror_image
+from s4a.schema import dataset
 from s4a_morphometrics import (
     analyse_structures,
     insert_structures,
@@ -16,13 +23,6 @@ from s4a_morphometrics.mirrored import seen_together, subjects_of_other_hand
 from s4a_morphometrics.several import Part, named_subjects, parts_of
 from s4a_morphometrics.structures_commands import named_label
 from s4a_morphometrics.synthetic import subjects
-
-import s4a
-from s4a import cli, write_mesh
-from s4a.geometry.mesh import as_arrays, volume
-from s4a.input.annotations import write_landmarks
-from s4a.input.hands import mirror_image
-from s4a.schema import dataset
 
 SMALL = {"n_coarse": 100, "k": 10, "k_init": 6, "n_pairs": 6, "n_jobs": 1}
 FLAGS = "--n-coarse 100 --k 10 --k-init 6 --n-pairs 6 --n-jobs 1".split()
@@ -126,7 +126,7 @@ def test_folders_of_one_and_of_several_are_not_taken_for_each_other(store, files
             command(store)
     with pytest.raises(ValueError, match="is no study of several structures"):
         open_structures(store / "structures/left")
-    with pytest.raises(ValueError, match="has a study of one structure"):
+    with pytest.raises(ValueError, match="is no study of several structures and is not empty"):
         analyse_structures(files[0], table=files[1], store=store / "structures/left", **SMALL)
     (tmp_path / "structures").mkdir()
     (tmp_path / "structures/left").symlink_to(store / "structures/left")
@@ -171,6 +171,7 @@ THREE = {f"subject_{i}": TWO for i in (1, 2, 3)}
     "given, options, words",
     [
         (THREE | {"b": MESH}, {}, "a dict of its structures.*single mesh for b"),
+        (THREE, {"label": 1}, "gives the labels of each structure: leave out label="),
         ({"a": {"left": MESH}, "b": {"left": MESH}}, {}, "several structures needed; found left"),
         ({"a": MESH}, {}, "several structures of each subject: {subject: {structure: mesh}}"),
         (THREE, {"reflect": "left"}, "reflect names 'left', none of the shapes .subject_1, subj"),

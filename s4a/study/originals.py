@@ -52,8 +52,8 @@ def choose_reflected(
         table = run.folder / "subjects.nc"
         subjects = read(table) if table.is_file() else None
         reflected = to_reflect(str(options.reflect), list(sources), subjects)
-        told = f"reflect= mirrors all {len(sources)} shapes, which changes nothing among them"
-        return reflected, [told] if len(reflected) == len(sources) else []
+        is_all = len(reflected) == len(sources)
+        return reflected, ["reflect= mirrors all: nothing changes among them"] if is_all else []
     file = run.folder / CHOICE
     contents = [content for _, content in sources.values()]
     key = task_key(list(sources), contents, options.of("cleaning"), options.k, AUTO)
