@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test coverage test-lowest test-newest check fuzz format bench paper figures hangs structure weight lab docs pages slides address release binder submission clean
+.PHONY: demo test check-docs coverage test-lowest test-newest check fuzz format bench paper figures hangs structure weight lab docs pages slides address release binder submission clean
 
 demo: $(VENV)/.core
 	$(BIN)/s4a demo
@@ -13,6 +13,10 @@ demo: $(VENV)/.core
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --dist loadfile
 test: check
 	$(PYTEST)
+
+# the rules of the project: its documentation as it is built, lessons and pages as they run, imports, the wheel
+check-docs: $(VENV)/.test
+	$(PYTEST) tests/project
 
 # the same, and which lines of s4a no test has run
 coverage: $(VENV)/.test
@@ -59,9 +63,9 @@ paper: $(VENV)/.bench
 figures: $(VENV)/.bench
 	$(BIN)/python docs/figures.py $(NAME)
 
-# the picture, the measures and the map of the rooms, made from the code
+# the picture, the table and the map of the subpackages, made from the code
 structure: $(VENV)/.core
-	$(BIN)/python benchmarks/structure.py --write
+	$(BIN)/python tools/structure.py --write
 
 # modules, lines, options, tests and bytes; REVISION=... prints those of that revision next to them
 weight: $(VENV)/.test

@@ -1,13 +1,16 @@
-"""Examples of docstrings run as they stand, with no name that they do not make themselves.
+"""What the tests of both distributions share: small shapes and studies, and how examples run.
 
-The example studies are made once, and what examples write to temporary folders is gone afterwards.
+Each worker makes the shapes and studies once, when first needed; tests copy what they change.
+Examples of docstrings run as they stand, with no name that they do not make themselves; what they
+write to temporary folders is gone afterwards.
 """
 
 import tempfile
 
 import pytest
+from small import OPTIONS
 
-from s4a import synthetic
+from s4a import analyse, coarsen, open_study, spectrum, synthetic
 
 
 @pytest.fixture(scope="session")
@@ -26,3 +29,76 @@ def example(request):
     if any("example_study" in example.source for example in request.node.dtest.examples):
         study = request.getfixturevalue("example_study")
         monkeypatch.setattr(synthetic, "example_study", lambda: study)
+
+
+@pytest.fixture(scope="session")
+def brains():
+    """Four small brains with labels, landmarks and the truth."""
+    return synthetic.brains(4, 1500, seed=1)
+
+
+@pytest.fixture(scope="session")
+def meshes(brains):
+    """The brains as Datasets by name."""
+    return {name: node.to_dataset() for name, node in brains["original"].children.items()}
+
+
+@pytest.fixture(scope="session")
+def brain_files(brains, tmp_path_factory):
+    """The brains as PLY files."""
+    paths = synthetic.write(brains, tmp_path_factory.mktemp("brains"))
+    paths[0].with_name("truth.nc").unlink()
+    return paths
+
+
+@pytest.fixture(scope="session")
+def study_folder(brains, tmp_path_factory):
+    """The folder of the finished study of the brains."""
+    folder = tmp_path_factory.mktemp("study") / "brains"
+    analyse(brains, store=folder, **OPTIONS).close()
+    return folder
+
+
+@pytest.fixture(scope="session")
+def study(study_folder):
+    """The study of the brains, in memory."""
+    with open_study(study_folder) as tree:
+        return tree.load()
+
+
+@pytest.fixture(scope="session")
+def study_of_files(brain_files):
+    """The study of the files, whose positions are rounded to single precision."""
+    return analyse(brain_files, **OPTIONS)
+
+
+@pytest.fixture(scope="session")
+def brain():
+    """One brain of 4,000 vertices."""
+    return synthetic.brains(1, 4000)["original/brain_01"].to_dataset()
+
+
+@pytest.fixture(scope="session")
+def low_brain(brain):
+    """That brain at low resolution, with 40 eigenfunctions."""
+    return spectrum(coarsen(brain, n_coarse=900), k=40)
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Processor time and peak memory of every notebook that ran, and of all together."""
+    reports = [r for kind in ("passed", "failed") for r in terminalreporter.getreports(kind)]
+    spent = sorted(
+        value
+        for r in reports
+        if r.when == "call"
+        for name, value in r.user_properties
+        if name == "notebook"
+    )
+    if spent:
+        terminalreporter.section("notebooks")
+        for name, seconds, memory in spent:
+            terminalreporter.write_line(f"{name:28}{seconds:8.1f} s{memory:8.0f} MiB")
+        total, most = sum(s for _, s, _ in spent), max(m for *_, m in spent)
+        terminalreporter.write_line(
+            f"{f'{len(spent)} together':28}{total:8.1f} s{most:8.0f} MiB at most"
+        )

@@ -20,7 +20,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-import s4a_morphometrics
 import xarray as xr
 from peers import remeshed
 from scipy import stats
@@ -29,6 +28,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 import s4a
+import s4a_morphometrics
 from s4a import metrics, statistics, synthetic
 from s4a.analysis import permutation, transfer
 from s4a.geometry.align import align, farthest_points

@@ -6,10 +6,10 @@ asymmetry at the vertices after the correction for all, and of the whole shape; 
 is the share of four planted vertices that are found, how often the whole shape is, and how often
 antisymmetry is, in every fifth run.
 
-``asymmetry.py whole [RUNS]``: the same of :func:`s4a.statistics.asymmetry` as it is called: shapes
-of an ellipsoid of 500 vertices, smooth in what is alike on both sides and in what is not, with a
-bump of one side planted; each against its mirror image, along the normals or as vectors, or left
-and right shapes of subjects.
+``asymmetry.py whole [RUNS]``: the same of :func:`s4a_morphometrics.asymmetry` as it is called:
+shapes of an ellipsoid of 500 vertices, smooth in what is alike on both sides and in what is not,
+with a bump of one side planted; each against its mirror image, along the normals or as vectors, or
+left and right shapes of subjects.
 
 ``asymmetry.py brains [RUNS]``: the errors of a folded brain, the same on both sides, whose partners
 are found by registration; the variation of its shapes as large as that of the ellipsoids, or less.
@@ -28,11 +28,12 @@ import numpy as np
 import xarray as xr
 
 import s4a
-from s4a.analysis.asymmetry import antisymmetry_test, both_sides, sides_test
-from s4a.analysis.halves import involution
+import s4a_morphometrics
 from s4a.analysis.permutation import mean_test
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas, vertex_normals
 from s4a.schema import dataset
+from s4a_morphometrics.bilateral import antisymmetry_test, both_sides, sides_test
+from s4a_morphometrics.halves import involution
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 N_VERTICES, N_PLANTED = 40, 4
@@ -118,7 +119,7 @@ def brain(n: int, seed: int) -> tuple[np.ndarray, np.ndarray, xr.Dataset]:
     X *= np.sqrt(vertex_areas(*ellipsoid()[:2]).sum() / vertex_areas(X, T).sum())
     still = as_dataset(X, T, {"template": "a"}).merge(dataset(displacement=np.zeros((2, *X.shape))))
     study = xr.DataTree.from_dict({"registration": still.assign_coords(shape=["a", "b"])})
-    return X, T, s4a.statistics.symmetry(study)
+    return X, T, s4a_morphometrics.symmetry(study)
 
 
 def draw_shapes(rng: np.random.Generator, X: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -169,7 +170,7 @@ def whole_rates(
             if way == "sides":  # as a run that mirrored the left ones says it
                 report = dataset(reflected=np.repeat([1, 0], n))
                 study["report"] = xr.DataTree(report.assign_coords(shape=names))
-            found = s4a.statistics.asymmetry(study, seed=run, **options)
+            found = s4a_morphometrics.asymmetry(study, seed=run, **options)
             p, p_value = found["p_family_wise"].values, found["p_value"].item()
             if planted:
                 said[run, 3:] = (p[high] <= 0.05).mean(), p_value <= 0.05
@@ -211,7 +212,7 @@ def real() -> None:
     write("| --- | --- | --- | --- | --- |")
     options = {"n_coarse": 2000, "k": 50, "intersections": False, "n_jobs": 1}
     skulls = s4a.analyse(DATA / "mouse_skulls", **options)
-    shares("mouse skulls, object", s4a.statistics.asymmetry(skulls))
+    shares("mouse skulls, object", s4a_morphometrics.asymmetry(skulls))
     meshes = {}
     for file in sorted((DATA / "lower_limb_bones").glob("*femur*.npz")):
         with np.load(file) as arrays:
@@ -222,7 +223,7 @@ def real() -> None:
     report = femurs["report"].to_dataset()
     names = report["shape"].values.tolist()
     write(f"mirrored of {len(names)} femurs and mirror images: {int(report['reflected'].sum())}")
-    found = s4a.statistics.asymmetry(
+    found = s4a_morphometrics.asymmetry(
         femurs, subject=[name[:-2] for name in names], side=[name[-1] for name in names]
     )
     shares("femurs and their mirror images, matching", found)

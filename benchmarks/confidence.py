@@ -1,7 +1,7 @@
 """Whether confidence is what it says: the share of such vertices within 1 % of sqrt(area).
 
 ``confidence.py`` registers pairs with a known truth, fits the weights of
-:mod:`s4a.method.confidence` on those of :data:`TUNED`, and says for those of :data:`REPORTED`,
+:mod:`s4a.method.register` on those of :data:`TUNED`, and says for those of :data:`REPORTED`,
 by the weights of the library: how sure it is of a pair and how much is right; Spearman's
 correlation of confidence and error, and the share of the worst tenth that is among the least sure
 tenth (0.1 by chance); and in bins of confidence, the share that is right.  Bodies, and cats, share
@@ -30,7 +30,7 @@ from sklearn.metrics import roc_auc_score
 import s4a
 from s4a import synthetic
 from s4a.method import first_map
-from s4a.method.confidence import RIGHT, WEIGHTS, evidence
+from s4a.method.register import RIGHT, WEIGHTS, evidence
 from s4a.options import Options
 from s4a.study.doubts import UNSURE, WRONG
 from s4a.study.pair import match_shapes, shape_of

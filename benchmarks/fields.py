@@ -17,6 +17,7 @@ import s4a
 from s4a import statistics
 from s4a.geometry.mesh import as_arrays, as_dataset
 from s4a.schema import dataset
+from s4a_morphometrics import covariation
 
 X, T = as_arrays(s4a.synthetic.ellipsoid(200))
 REGION = X[:, 2] > np.quantile(X[:, 2], 5 / 6)
@@ -71,7 +72,7 @@ def found(run: int, setting: tuple[int, int, str], effect: float) -> list[float]
     p = statistics.group_map(study, group, **options)["p_family_wise"].values
     at = (p[REGION] <= 0.05).mean() if effect else p.min() <= 0.05
     whole = statistics.group_test(study, group, **options)["p_value"].item() <= 0.05
-    pairs = statistics.covariation(study, **options)
+    pairs = covariation(study, **options)
     by = (pairs["p_value"], pairs["singular_p"][0], pairs["rv_p"])
     return [at, whole, *(p.item() <= 0.05 for p in by)]
 

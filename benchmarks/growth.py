@@ -15,8 +15,8 @@ import time
 
 import numpy as np
 
-from s4a.analysis.growth import random_intercepts, within_subjects
 from s4a.analysis.permutation import permutation_test, vertex_test
+from s4a_morphometrics.longitudinal import random_intercepts, within_subjects
 
 N_VERTICES, N_PLANTED, N_PERMUTATIONS = 40, 4, 99
 EFFECT = 0.6  # slope per standard deviation of time within subjects, in those of the residuals

@@ -47,8 +47,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import s4a
+import s4a_morphometrics
 from s4a import synthetic
-from s4a.analysis.calibration import (
+from s4a.analysis.inputs import registration_of
+from s4a.geometry.align import farthest_points, rigid_transform
+from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
+from s4a_morphometrics import posterior
+from s4a_morphometrics.calibration import (
     again_of,
     found_again,
     gaps_between_ways,
@@ -56,12 +61,8 @@ from s4a.analysis.calibration import (
     image_of,
     pose_of,
 )
-from s4a.analysis.inputs import registration_of
-from s4a.analysis.partial import model_of
-from s4a.geometry.align import farthest_points, rigid_transform
-from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
-from s4a.method import posterior
-from s4a.method.part import cut
+from s4a_morphometrics.part import cut
+from s4a_morphometrics.partial import model_of
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 OPTIONS = {"n_coarse": 2000, "k_init": 20, "k": 60, "n_jobs": 1}
@@ -201,7 +202,7 @@ def row_of(study, mesh, true, of_whole, share, rng, *, alone=False):
     Q = Rotation.from_rotvec(np.pi / 4 * axis / np.linalg.norm(axis)).as_matrix()
     spent = time.process_time()
     try:
-        found = s4a.complete(study, (part @ Q.T, triangles), n_samples=0)
+        found = s4a_morphometrics.complete(study, (part @ Q.T, triangles), n_samples=0)
     except ValueError as error:
         sys.stderr.write(f"refused: {error}\n")
         return None

@@ -15,16 +15,16 @@ import logging
 import sys
 
 import numpy as np
-import s4a_morphometrics
-from s4a_morphometrics.poses import Poses, align_wholes, measured, pose_fields, poses_of
-from s4a_morphometrics.synthetic import bean, subjects
 from scipy.spatial.transform import Rotation
 
 import s4a
-from s4a.analysis.covariation import coordinates, two_block
+import s4a_morphometrics
 from s4a.analysis.permutation import permutation_test
 from s4a.geometry.align import rigid_transform
 from s4a.geometry.mesh import vertex_areas
+from s4a_morphometrics.poses import Poses, align_wholes, measured, pose_fields, poses_of
+from s4a_morphometrics.synthetic import bean, subjects
+from s4a_morphometrics.two_block import coordinates, two_block
 
 SPHERE = s4a.synthetic.sphere(120)
 U, T = SPHERE["position"].values, SPHERE["corner_vertex"].values

@@ -17,7 +17,6 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-import s4a_morphometrics
 import xarray as xr
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
@@ -25,6 +24,7 @@ from matplotlib.patches import Patch
 from PIL import Image
 
 import s4a
+import s4a_morphometrics
 from s4a.datasets.synthetic import LABELS
 from s4a.method import fmap, steps
 from s4a.method import pca as modes

@@ -1,6 +1,7 @@
 """The example study of several structures is made once for all tests and examples."""
 
 import pytest
+
 from s4a_morphometrics import synthetic
 
 

@@ -17,11 +17,11 @@ reading and cleaning      :func:`read_shapes`, :func:`read_shape`, :func:`read_l
                           :func:`verify`, :func:`synthesize`
 notebooks, pages          :func:`explore`, :func:`write_page`
 pictures, films           :func:`write_picture`, :func:`write_film`
-new shapes, parts         :func:`insert`, :func:`complete`
+new shapes                :func:`insert`
 6.1 statistics            :mod:`s4a.statistics`
 6.2 transfer              :func:`transfer_labels`, :func:`transfer_landmarks`,
                           :func:`transfer_scalars`, :func:`register_pairs`, :func:`with_field`
-for other programs        :func:`write_for`, :func:`write_registered`, :func:`write_training_set`
+for other programs        :func:`write_registered`, :func:`write_label_volumes`
 the bundled collection    :mod:`s4a.synthetic`
 ========================  ====================================================================
 

@@ -11,15 +11,13 @@ from . import study as study
 from . import widgets as widgets
 from .accessor import explore as explore
 from .analysis import statistics as statistics
-from .analysis.complete import complete as complete
 from .analysis.export import write_registered as write_registered
-from .analysis.export import write_training_set as write_training_set
 from .analysis.fields import with_field as with_field
-from .analysis.programs import write_for as write_for
 from .analysis.transfer import register_pairs as register_pairs
 from .analysis.transfer import transfer_labels as transfer_labels
 from .analysis.transfer import transfer_landmarks as transfer_landmarks
 from .analysis.transfer import transfer_scalars as transfer_scalars
+from .analysis.volumes import write_label_volumes as write_label_volumes
 from .datasets import synthetic as synthetic
 from .evaluation import compare as compare
 from .evaluation import metrics as metrics

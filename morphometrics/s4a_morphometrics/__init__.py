@@ -1,19 +1,20 @@
-"""Morphometrics on studies of S4A: an extension made of public names of ``s4a`` only."""
+"""Morphometrics on studies of S4A: an extension made of public names of ``s4a`` only.
 
-from s4a_morphometrics.poses import structures, structures_modes, structures_of_new
-from s4a_morphometrics.several import (
-    analyse_structures,
-    insert_structures,
-    of_structure,
-    open_structures,
-)
+=====================  =====================================================================
+left and right         :func:`asymmetry`, :func:`asymmetry_modes`, :func:`symmetry`,
+                       :func:`symmetric_template`
+several visits         :func:`growth`
+fields against shape   :func:`covariation`, :func:`covariation_modes`
+parts of shapes        :func:`complete`, :func:`write_completed`
+several structures     :func:`analyse_structures`, :func:`open_structures`,
+                       :func:`insert_structures`, :func:`of_structure`, :func:`structures`,
+                       :func:`structures_modes`, :func:`structures_of_new`
+other programs         :func:`write_for`, :func:`write_training_set`
+=====================  =====================================================================
 
-__all__ = [
-    "analyse_structures",
-    "insert_structures",
-    "of_structure",
-    "open_structures",
-    "structures",
-    "structures_modes",
-    "structures_of_new",
-]
+They are imported when they are first used.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -26,7 +26,6 @@ import numpy as np
 import xarray as xr
 from scipy.spatial.transform import Rotation
 
-from s4a.analysis.covariation import coordinates, two_block
 from s4a.analysis.effects import check_permutations
 from s4a.analysis.inputs import registration_of
 from s4a.analysis.link import image_in_shape
@@ -38,6 +37,7 @@ from s4a.schema import check_switch, covariate, dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
 from s4a.study.insert import scores_of_new
 from s4a_morphometrics.several import of_structure, structure_names
+from s4a_morphometrics.two_block import coordinates, two_block
 
 log = logging.getLogger(__name__)
 
@@ -230,7 +230,7 @@ def structures(
         structures, and ``level_share``, which add up to 1.  Of the joint components ``score``,
         ``standard_deviation``, ``explained_variance_ratio`` and ``between_share(component)``, how
         much of each is of poses.  ``pose_shape_rv`` of poses and shapes and its ``pose_shape_p``
-        (:mod:`s4a.analysis.covariation`); NaN where one of both does not vary.
+        (:mod:`s4a_morphometrics.two_block`); NaN where one of both does not vary.
         A shape is a subject; those without all structures are left out, with a warning.
 
     Raises

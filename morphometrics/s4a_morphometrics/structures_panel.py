@@ -9,9 +9,8 @@ from s4a.method.pca import apply_scores
 from s4a.schema import unit_of
 from s4a.show.browser import color_bytes
 from s4a.show.surfaces import mode_arrays, mode_limits, score_state
-from s4a.widgets.modes_view import ModesView
+from s4a.widgets.modes import ModesView
 from s4a.widgets.panel import Panel, check, dropdown, row, together
-from s4a.widgets.scene import camera_group
 from s4a_morphometrics.poses import LEVELS, structures, structures_modes
 
 WORDS = {
@@ -57,8 +56,6 @@ class Structures(Panel):
         found: xr.Dataset | None = None,
         level: str = "joint",
         n_modes: int = N_MODES,
-        view: str = "corner",
-        up: str = "z",
     ) -> list:
         """A list of levels, a box and a colour for each structure, and the sliders."""
         self.found = structures(self.study) if found is None else found
@@ -75,8 +72,7 @@ class Structures(Panel):
             )
             for k, name in enumerate(names)
         }
-        group = camera_group()
-        self.views = {one: self.view_of(one, n_modes, group, view, up) for one in varying}
+        self.views = {one: self.view_of(one, n_modes) for one in varying}
         share = 100 * variance / variance.sum()
         options = [
             (WORDS[one] + ("" if one == "joint" else f", {share[one]:.0f} % of the variance"), one)
@@ -93,7 +89,7 @@ class Structures(Panel):
         pairs = [together(self.seen[name], self.colors[name]) for name in names]
         return [row(self.level, *pairs), *self.views.values()]
 
-    def view_of(self, level: str, n_modes: int, group: str, view: str, up: str) -> ModesView:
+    def view_of(self, level: str, n_modes: int) -> ModesView:
         """The sliders of a level."""
         study = structures_modes(self.study, self.found, level)
         return ModesView(
@@ -101,9 +97,7 @@ class Structures(Panel):
             limits=mode_limits(study),
             unit=unit_of(self.found["position"]),
             **score_state(study, n_modes),
-            group=group,
-            view=view,
-            up=up,
+            **self.camera,
             colors="own",
         )
 

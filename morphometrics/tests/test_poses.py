@@ -5,9 +5,6 @@ import logging
 import numpy as np
 import pytest
 import xarray as xr
-from s4a_morphometrics import of_structure, structures, structures_modes, structures_of_new
-from s4a_morphometrics.poses import align_wholes, measured, pose_fields, poses_of
-from s4a_morphometrics.synthetic import bean, subjects
 from scipy.interpolate import RBFInterpolator
 from scipy.spatial.transform import Rotation
 
@@ -16,6 +13,9 @@ from s4a import statistics
 from s4a.geometry.mesh import vertex_areas
 from s4a.input.subjects import subjects as table_of
 from s4a.schema import dataset, in_unit
+from s4a_morphometrics import of_structure, structures, structures_modes, structures_of_new
+from s4a_morphometrics.poses import align_wholes, measured, pose_fields, poses_of
+from s4a_morphometrics.synthetic import bean, subjects
 
 SPHERE = s4a.synthetic.sphere(120)
 U, T = SPHERE["position"].values, SPHERE["corner_vertex"].values

@@ -3,6 +3,13 @@
 import numpy as np
 import pytest
 import xarray as xr
+
+import s4a
+from s4a import cli, write_mesh
+from s4a.geometry.mesh import as_arrays, volume
+from s4a.input.annotations import write_landmarks
+from s4a.input.hands import mirror_image
+from s4a.schema import dataset
 from s4a_morphometrics import (
     analyse_structures,
     insert_structures,
@@ -16,13 +23,6 @@ from s4a_morphometrics.mirrored import seen_together, subjects_of_other_hand
 from s4a_morphometrics.several import Part, named_subjects, parts_of
 from s4a_morphometrics.structures_commands import named_label
 from s4a_morphometrics.synthetic import subjects
-
-import s4a
-from s4a import cli, write_mesh
-from s4a.geometry.mesh import as_arrays, volume
-from s4a.input.annotations import write_landmarks
-from s4a.input.hands import mirror_image
-from s4a.schema import dataset
 
 SMALL = {"n_coarse": 100, "k": 10, "k_init": 6, "n_pairs": 6, "n_jobs": 1}
 FLAGS = "--n-coarse 100 --k 10 --k-init 6 --n-pairs 6 --n-jobs 1".split()

@@ -5,11 +5,11 @@ import pytest
 
 pytest.importorskip("anywidget")
 from ipywidgets.widgets import widget as registry
-from s4a_morphometrics import structures, structures_modes
-from s4a_morphometrics.structures_panel import Structures
 
 import s4a
 from s4a.widgets import Explore
+from s4a_morphometrics import structures, structures_modes
+from s4a_morphometrics.structures_panel import Structures
 
 
 @pytest.fixture

@@ -1,7 +1,6 @@
-"""Registered collections for other programs (4.3, 6.1, 6.2): meshes, tables and training sets."""
+"""Registered collections for other programs (4.3, 6.1, 6.2): meshes and tables."""
 
 import csv
-import json
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -11,12 +10,9 @@ import xarray as xr
 
 from s4a.analysis.inputs import registration_of
 from s4a.analysis.link import image_in_shape
-from s4a.analysis.transfer import transfer_labels, transfer_landmarks
 from s4a.geometry.mesh import as_arrays
-from s4a.input.annotations import write_landmarks
 from s4a.input.files import write_mesh
 from s4a.input.hands import MIRROR
-from s4a.seeds import RNG, seed_of
 from s4a.study import store
 
 FORMATS = {"ply": ".ply", "vtk": ".vtk", "obj": ".obj", "npz": ".npz", "gifti": ".gii"}
@@ -26,6 +22,12 @@ def write_table(path: Path, head: Iterable[Any], rows: Iterable[Any]) -> Path:
     """Write a CSV; gives its path."""
     with open(path, "w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([list(head), *rows])
+    return path
+
+
+def write_dataset(data: xr.Dataset, path: Path) -> Path:
+    """Write a Dataset as a netCDF file, at once and with checksums; gives its path."""
+    store.write(data, path)
     return path
 
 
@@ -154,136 +156,7 @@ def _write_modes(pca, folder, n_modes):
     for c in components[:n_modes]:
         mode = pca["deformation"].values[c - 1].tolist()
         paths.append(write_table(folder / f"mode_{c}.csv", "xyz", mode))
-    store.write(pca.load(), folder / "modes.nc")
-    return [*paths, folder / "modes.nc"]
-
-
-def write_training_set(
-    study: xr.DataTree,
-    folder: Path | str,
-    *,
-    label: np.ndarray | None = None,
-    landmarks: xr.Dataset | None = None,
-    source: str | xr.Dataset | None = None,
-    test_share: float = 0.2,
-    seed: int = 0,
-    rng: RNG | None = None,
-    **options: Any,
-) -> dict[str, list[str]]:
-    """Write a training set for learners of segmentations and key-points, with its split.
-
-    Parameters
-    ----------
-    study : DataTree
-        With ``/original`` and ``/registration``.
-    folder : path
-        Gets ``meshes/<shape>.ply`` (the cleaned mesh, with all its vertices, in the coordinates of
-        its file, or their mirror image where the run took that), ``labels/<shape>.npy`` (one per
-        vertex) and ``labels/<shape>.confidence.npy`` (share of the votes times confidence of the
-        match), ``landmarks/<shape>.csv`` (name,x,y,z), and ``split.json`` with the lists ``train``
-        and ``test``.
-    label, landmarks, source : see :func:`s4a.transfer_labels` and :func:`s4a.transfer_landmarks`
-    test_share : float
-        Of the shapes, rounded up.
-    seed, rng : see :mod:`s4a.seeds`
-        Of the split.
-    **options
-        By which an external source is matched, see :func:`s4a.transfer_labels`.
-
-    Returns
-    -------
-    dict
-        The split.
-
-    Raises
-    ------
-    ValueError
-        When there is nothing to learn, or the share leaves no shape to train or to test on.
-
-    Examples
-    --------
-    With the ``study`` of six small brains:
-
-    >>> import tempfile
-    >>> import s4a
-    >>> study = s4a.synthetic.example_study()
-    >>> folder = tempfile.mkdtemp()
-    >>> label = study["original/brain_01/label"].values
-    >>> split = s4a.write_training_set(study, folder, label=label, source="brain_01")
-    >>> len(split["train"]), len(split["test"])
-    (4, 2)
-    """
-    if label is None and landmarks is None:
-        raise ValueError("a training set needs labels, landmarks or both; found neither")
-    folder = Path(folder)
-    names = registration_of(study)["shape"].values.tolist()
-    n_test = int(np.ceil(test_share * len(names)))
-    if not 0 < n_test < len(names):
-        raise ValueError(
-            f"test_share needs a share of {len(names)} shapes that leaves some on both sides: "
-            f"{test_share}"
-        )
-    where = {"source": source, "targets": names} | options
-    carried = {}  # before anything is written: it may fail
-    if label is not None:
-        carried["labels"] = transfer_labels(study, label, **where)
-    if landmarks is not None:
-        carried["landmarks"] = transfer_landmarks(study, landmarks, **where)
-    for part in ("meshes", *carried):
-        (folder / part).mkdir(parents=True, exist_ok=True)
-    for name in names:
-        mesh = study["original"][name].to_dataset()
-        write_mesh(folder / "meshes" / f"{name}.ply", *as_arrays(mesh))
-        if "labels" in carried:
-            own = carried["labels"][name].to_dataset()
-            sure = own["label_share"] * own["confidence"]
-            np.save(folder / "labels" / f"{name}.npy", own["label"].values)
-            np.save(folder / "labels" / f"{name}.confidence.npy", sure.values)
-        if "landmarks" in carried:
-            write_landmarks(
-                folder / "landmarks" / f"{name}.csv", carried["landmarks"][name].to_dataset()
-            )
-    order = np.random.default_rng(seed_of(seed, rng)).permutation(len(names))
-    split = {
-        "train": sorted(names[i] for i in order[n_test:]),
-        "test": sorted(names[i] for i in order[:n_test]),
-    }
-    (folder / "split.json").write_text(json.dumps(split, indent=1) + "\n")
-    return split
-
-
-def write_completed(found: xr.Dataset, folder: Path | str) -> list[Path]:
-    """Write what :func:`s4a.complete` found.
-
-    Parameters
-    ----------
-    found : Dataset
-    folder : path
-        Made where it is missing.
-
-    Returns
-    -------
-    list of Path
-        ``completed.nc`` with everything, ``completed.ply`` with ``present`` and ``deviation``, the
-        root of the summed variances, at every vertex, and ``sample_<i>.ply``.
-    """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    store.write(found, folder / "completed.nc")
-    triangles = found["corner_vertex"].values
-    deviation = np.sqrt((found["completion_sd"].values ** 2).sum(1))
-    write_mesh(
-        folder / "completed.ply",
-        found["position"].values,
-        triangles,
-        present=found["present"].values.astype(float),
-        deviation=deviation,
-    )
-    paths = [folder / "completed.nc", folder / "completed.ply"]
-    for i, position in enumerate(found["sample_position"].values):
-        paths.append(folder / f"sample_{i:02d}.ply")
-        write_mesh(paths[-1], position, triangles)
-    return paths
+    return [*paths, write_dataset(pca.load(), folder / "modes.nc")]
 
 
 def write_results(result: xr.Dataset, folder: Path | str, name: str) -> list[Path]:
@@ -315,8 +188,7 @@ def write_results(result: xr.Dataset, folder: Path | str, name: str) -> list[Pat
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"{name}.nc"]
-    store.write(result, paths[0])
+    paths = [write_dataset(result, folder / f"{name}.nc")]
     tables = {}  # dims -> columns
     for variable, values in result.data_vars.items():
         if values.ndim < 2:

@@ -1,8 +1,9 @@
-"""Statistics of a finished study (6.1): the model, groups and variables, sides, outliers, classes.
+"""Statistics of a finished study (6.1): the model, groups and variables, outliers, classes.
 
 All take a study and give a Dataset.  What works on plain arrays is in
 :mod:`s4a.analysis.permutation` and :mod:`s4a.analysis.model`; groups and variables are in
-:mod:`s4a.analysis.effects`, left and right in :mod:`s4a.analysis.asymmetry`.
+:mod:`s4a.analysis.effects`.  Asymmetry, growth and fields against shape are in the extension
+``s4a_morphometrics``.
 
 To add a statistic:
 
@@ -22,8 +23,6 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
-from s4a.analysis.asymmetry import asymmetry, asymmetry_modes
-from s4a.analysis.covariation import covariation, covariation_modes
 from s4a.analysis.effects import (
     check_permutations,
     group_map,
@@ -34,8 +33,6 @@ from s4a.analysis.effects import (
     scores_of,
 )
 from s4a.analysis.generalization import generalization
-from s4a.analysis.growth import growth
-from s4a.analysis.halves import symmetric_template, symmetry
 from s4a.analysis.inputs import Values, displacements_of, group_sizes, sample_of, with_doubtful
 from s4a.analysis.model import KEPT, count_components, evaluate, leave_one_out, sample
 from s4a.analysis.permutation import indicators, smallest_p
@@ -48,23 +45,16 @@ if TYPE_CHECKING:
     from sklearn.base import ClassifierMixin
 
 __all__ = [
-    "asymmetry",
-    "asymmetry_modes",
     "classify",
-    "covariation",
-    "covariation_modes",
     "evaluate",
     "generalization",
     "group_map",
     "group_test",
-    "growth",
     "outliers",
     "predict",
     "regression",
     "regression_modes",
     "sample",
-    "symmetric_template",
-    "symmetry",
     "with_doubtful",
     "with_size",
     "within",

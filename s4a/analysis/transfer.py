@@ -25,8 +25,7 @@ from s4a.analysis.link import (
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays
 from s4a.input.landmarks import FARTHEST_LANDMARK, NAMED, locate, trace_curves
-from s4a.method.confidence import uncertainty
-from s4a.method.register import identity
+from s4a.method.register import identity, uncertainty
 from s4a.method.shape import Shape
 from s4a.options import Options, given_options
 from s4a.schema import dataset, require
@@ -284,7 +283,7 @@ def transfer_labels(
         Whether the share of every label is given too.
     blur : float, optional
         How far votes count around the place where they fall, in multiples of how far the match may
-        be wrong there by its confidence (:func:`s4a.method.confidence.uncertainty`): where it is
+        be wrong there by its confidence (:func:`s4a.method.register.uncertainty`): where it is
         sure, borders between labels stay where they fall, elsewhere they come out smooth.  A label
         that would win nowhere for it keeps the vertices that it has without.  With 0, as in the
         paper, votes count where they fall.  By default 1, and 0 where the study, or the source that

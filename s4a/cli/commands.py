@@ -5,6 +5,7 @@ Every command imports what it needs, so that none waits for what the others need
 """
 
 import contextlib
+import dataclasses
 import logging
 import re
 import shlex
@@ -13,7 +14,6 @@ import time
 import webbrowser
 from argparse import Namespace
 from collections.abc import Iterator, Mapping
-from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -74,7 +74,10 @@ def options_of(args: Namespace) -> dict[str, Any]:
     """The options of `analyse` from parsed flags, and how many processes."""
     from s4a.options import Options
 
-    return {name: getattr(args, name) for name in [*(f.name for f in fields(Options)), "n_jobs"]}
+    return {
+        name: getattr(args, name)
+        for name in [*(f.name for f in dataclasses.fields(Options)), "n_jobs"]
+    }
 
 
 @contextlib.contextmanager
@@ -198,12 +201,11 @@ def statistics(args: Namespace) -> int:
     from s4a.analysis import statistics as tests
     from s4a.analysis.export import write_results
     from s4a.cli import tables
-    from s4a.cli.results import covariation_lines
     from s4a.show.page import write_page
     from s4a.show.pictures import write_film
 
-    if args.covariates and not (args.group or args.variable or args.field):
-        raise ValueError("--covariates are of a test: give --group, --variable or --field")
+    if (args.covariates or args.field) and not (args.group or args.variable):
+        raise ValueError("--covariates and --field are of a test: give --group or --variable")
     study, out = study_to_test(args)
     study = restricted(study, args)
     results = tests_of(study, args)  # first, as options and columns may be refused
@@ -228,8 +230,6 @@ def statistics(args: Namespace) -> int:
             page = Path(out) / "regression.html"
             write_page(moving, page, title=f"Regression on {args.variable}")
             write_film(moving, Path(out) / "regression.gif")
-    if args.field:
-        write("\n" + covariation_lines(results["covariation"]))
     confidence = study["registration"]["confidence"].mean().item()
     write(f"\nmean confidence of the registration {confidence:.2f}; results: {out}")
     return 0
@@ -316,10 +316,29 @@ def tests_of(study: "xr.DataTree", args: Namespace) -> "dict[str, xr.Dataset]":
         )
     if args.variable:
         results["regression"] = tests.regression(study, args.variable, field=args.field, **options)
-    if args.field:
-        del options["variances"]
-        results["covariation"] = tests.covariation(study, args.field, **options)
     return results
+
+
+def fields(args: Namespace) -> int:
+    """A number per vertex of every shape, such as thickness, carried to the template and kept."""
+    import numpy as np
+
+    from s4a.analysis.fields import with_field, write_field
+    from s4a.study.tree import open_study
+
+    study = open_study(args.study)
+    study = with_field(study, args.name, args.folder, unit=args.unit, partial=args.partial)
+    path = write_field(study, args.name, args.study)
+    field = study["fields"][args.name].to_dataset()["carried_field"]
+    known = np.isfinite(field.values)
+    write(
+        f"{args.name} of {known.any(1).sum()} of {len(known)} shapes, "
+        f"{np.nanmin(field):.4g} to {np.nanmax(field):.4g} {field.attrs['units']}, mean "
+        f"{np.nanmean(field):.4g}, at {100 * known.mean():.0f} % of the template's vertices: "
+        f"{path}\n"
+        f"s4a statistics {args.study} --field {args.name} takes it in place of shape"
+    )
+    return 0
 
 
 def insert(args: Namespace) -> int:
@@ -339,27 +358,6 @@ def insert(args: Namespace) -> int:
     write(tables.inserted_table(inserted))
     write(f"\nwritten: {out / 'inserted.nc'}, registered meshes and scores in {out}")
     return 1 if (inserted["report"]["status"] == "excluded").any() else 0
-
-
-def complete(args: Namespace) -> int:
-    """A part of a shape matched to a finished study, and the whole that it may be of."""
-    from s4a.analysis.complete import complete
-    from s4a.analysis.export import write_completed
-    from s4a.cli import tables
-    from s4a.study.tree import open_study
-
-    found = complete(
-        open_study(args.study),
-        args.part,
-        landmarks=args.landmarks,
-        components=args.components,
-        n_samples=args.samples,
-        seed=args.seed,
-    )
-    paths = write_completed(found, args.out)
-    write("\n".join(tables.completed_lines(found)))
-    write(f"\nwritten: {', '.join(map(str, paths[:2]))}, samples: {len(paths) - 2}")
-    return 0
 
 
 def transfer(args: Namespace) -> int:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any, get_args
 
-from s4a.cli import commands, growing, leaving
+from s4a.cli import commands
 from s4a.extensions import extensions
 from s4a.input.raw import shown
 
@@ -165,7 +165,7 @@ def _statistics(add):
     text = "regression of shape on a number, such as age; its animation"
     add("--variable", metavar="COLUMN", help=text)
     add("--covariates", nargs="+", metavar="COLUMN", help="accounted for in both")
-    text = "a field of s4a fields in place of shape in both; and that field against shape"
+    text = "a field of s4a fields in place of shape in both"
     add("--field", metavar="NAME", help=text)
     add("--table", metavar="FILE", help="in place of the table of the study")
     text = (
@@ -192,20 +192,6 @@ def _statistics(add):
     add_options(add, ["n_jobs", "seed"])
 
 
-def _asymmetry(add):
-    add("study", metavar="STUDY")
-    text = "of left and right shapes: whose each is (without, every shape against its mirror image)"
-    add("--subject", metavar="COLUMN", help=text)
-    add("--side", metavar="COLUMN", help="and of which side")
-    text = "what is tested at every vertex: along the normals, or vectors (default: normal)"
-    add("--of", choices=["normal", "vector"], default="normal", help=text)
-    add("--table", metavar="FILE", help="in place of the table of the study")
-    add("--keep-doubtful", action="store_true", help="take doubtful shapes in")
-    add("--permutations", type=whole, help="changes of sign (default: 999)")
-    add("--out", metavar="DIR", help="for netCDF, CSV, the page (default: STUDY/statistics)")
-    add_options(add, ["seed"])
-
-
 def _fields(add):
     add("study", metavar="STUDY")
     text = "with a file for each shape: NPY, NPZ, PLY, CSV, GIFTI or FreeSurfer's curv"
@@ -215,23 +201,6 @@ def _fields(add):
     add("--unit", help="of its numbers, such as mm")
     add("--partial", action="store_true", help="shapes may lack it; tests leave these out")
 
-
-def _growth(add):
-    from s4a.analysis.effects import VARIANCES
-
-    add("study", metavar="STUDY")
-    add("--time", required=True, metavar="COLUMN", help="age, or time since the first visit")
-    add("--subject", required=True, metavar="COLUMN", help="whose each shape is")
-    add("--covariates", nargs="+", metavar="COLUMN", help="accounted for")
-    add("--field", metavar="NAME", help="a field of s4a fields in place of shape")
-    text = "what is tested at every vertex: vectors, or along the normals (default: vector)"
-    add("--of", choices=["vector", "normal"], default="vector", help=text)
-    text = "unequal where subjects change differently: signs of subjects (default: equal)"
-    add("--variances", choices=VARIANCES, default="equal", help=text)
-    add("--table", metavar="FILE", help="in place of the table of the study")
-    add("--keep-doubtful", action="store_true", help="take doubtful shapes in")
-    add("--permutations", type=whole, help="of visits within subjects (default: 999)")
-    add("--out", metavar="DIR", help="for netCDF, CSV, the page (default: STUDY/statistics)")
     add_options(add, ["seed"])
 
 
@@ -244,37 +213,6 @@ def _insert(add):
     text = "new shapes to mirror: names, with commas; or auto, those of the other hand"
     add("--reflect", metavar="NAMES", help=text)
     add_options(add, ["n_jobs"])
-
-
-def _complete(add):
-    add("study", metavar="STUDY")
-    add("part", metavar="PART", help="mesh file of a part of a shape")
-    add("--out", required=True, metavar="DIR", help="for completed.nc and PLY")
-    text = "landmarks of the part by the names of the template's, three or more: how it lies"
-    add("--landmarks", metavar="FILE", help=text)
-    text = "shapes drawn from all that agree with the part (default: 10)"
-    add("--samples", type=whole, default=10, help=text)
-    text = "pieces of the part to keep, or 'largest' (default: as in the study)"
-    add("--components", type=number_or_name, help=text)
-    add_options(add, ["seed"])
-
-
-def _export(add):
-    from s4a.analysis.programs import PROGRAMS
-
-    add("study", metavar="STUDY")
-    add("--to", required=True, choices=list(PROGRAMS), help="for which program")
-    add("--out", required=True, metavar="DIR", help="for its files")
-    text = "vertices that are points or particles, as far apart as can be (default: 500)"
-    add("--points", type=whole, help=f"slicer, shapeworks, r: {text}")
-    text = "scalismo, paraview: the first modes (default: all; paraview: 3)"
-    add("--modes", type=whole, help=text)
-    text = "slicer: landmarks of the template's file, carried to all shapes (default: its own)"
-    add("--landmarks", metavar="FILE", help=text)
-    text = "nifti: labels of the template's file, whole numbers (default: its own)"
-    add("--labels", metavar="FILE", help=text)
-    text = "nifti: volume whose voxels are labelled (default: that each shape was made of)"
-    add("--grid", metavar="FILE", help=text)
 
 
 def _transfer(add):
@@ -329,12 +267,8 @@ COMMANDS = {
     "demo": Command(commands.demo, _demo),
     "view": Command(commands.view, _view),
     "statistics": Command(commands.statistics, _statistics),
-    "asymmetry": Command(growing.asymmetry, _asymmetry),
-    "fields": Command(growing.fields, _fields),
-    "growth": Command(growing.growth, _growth),
+    "fields": Command(commands.fields, _fields),
     "insert": Command(commands.insert, _insert),
-    "complete": Command(commands.complete, _complete),
-    "export": Command(leaving.export, _export),
     "transfer": Command(commands.transfer, _transfer),
     "compare": Command(commands.compare, _compare),
 }

@@ -507,41 +507,6 @@ def significance(whole: xr.Dataset, where: xr.Dataset, name: str, study: xr.Data
     return "\n".join(lines)
 
 
-def asymmetry_table(found: xr.Dataset) -> str:
-    """Shares of variance of left against right, how large each part is, and antisymmetry.
-
-    Parameters
-    ----------
-    found : Dataset
-        See :func:`s4a.analysis.asymmetry.asymmetry`.
-    """
-    heads = ["sum_of_squares", "degrees_of_freedom", "mean_square", "variance_share", "f_ratio"]
-    rows = [
-        [term.item(), *(f"{found[head].sel(term=term).item():.4g}" for head in heads)]
-        for term in found["term"]
-    ]
-    size = found["asymmetry_size"]
-    of = f"{found.attrs['symmetry']} symmetry, {size.size} individuals"
-    if "sides" in found.attrs:
-        of += f", {found.attrs['sides']}"
-    lines = [of, table(rows, ["", *(head.replace("_", " ") for head in heads)])]
-    lines.append(
-        f"asymmetry of an individual {size.mean().item():.3g} {size.attrs['units']} on average, "
-        f"{found['fluctuating_size'].mean().item():.3g} without the directional part"
-    )
-    p = found["antisymmetry_p"].item()
-    lines.append(
-        f"antisymmetry: kurtosis {found['kurtosis'].item():.2f} along the first component, "
-        f"p = {p:.3g} that normal individuals have as low a one"
-    )
-    if "gap" in found.attrs:
-        lines.append(
-            f"the partner of a vertex's partner misses it by {100 * found.attrs['gap']:.2f} % of "
-            "sqrt(area)"
-        )
-    return "\n".join(lines)
-
-
 def classification_line(result: xr.Dataset) -> str:
     """How well groups are told apart by the scores, in words."""
     share, chance = 100 * result.attrs["balanced_accuracy"], 100 * result.attrs["chance"]
@@ -568,20 +533,6 @@ def inserted_table(inserted: xr.DataTree) -> str:
     head = ["shape", "confidence", "round trip", "|distortion|", "to limit shape"]
     head += [f"left ({unit})", "Mahalanobis", "scores"]
     return "\n".join([table(rows, head), *doubts(report)])
-
-
-def completed_lines(found: xr.Dataset) -> list[str]:
-    """What :func:`s4a.complete` says of a part, in words."""
-    unit, said = found["position"].attrs["units"], found.attrs
-    deviation, there = np.linalg.norm(found["completion_sd"], axis=1), found["present"].values
-    missing = "" if there.all() else f", of a missing one {deviation[~there].mean():.3g}"
-    scores = " ".join(f"{score:+.2f}" for score in found["score"].values[:5])
-    return [
-        f"{100 * said['missing']:.1f} % of the template {said['template']} are missing",
-        f"left by the modes on the part: {said['residual']:.3g} {unit}",
-        f"standard deviation of a vertex {deviation[there].mean():.3g} {unit}{missing}",
-        f"Mahalanobis {mahalanobis(found['score'].values):.1f}, scores {scores}",
-    ]
 
 
 def score_cells(modes: xr.Dataset) -> list[str]:

@@ -169,7 +169,7 @@ def at_low_resolution(M: Shape, N: Shape, landmarks: Matches) -> list[np.ndarray
 
 
 def fit_map(M: Shape, N: Shape, landmarks: Matches, k: int) -> np.ndarray:
-    """First map ``(k, k)`` from landmarks and wave kernels, see `fmap.fit_descriptors`."""
+    """First map ``(k, k)`` from landmarks and wave kernels, see `fmap.fmap_from_descriptors`."""
     at_source, at_target = at_low_resolution(M, N, landmarks)
     bases = [replace(shape.low, area=shape.low.area / shape.low.area.sum()) for shape in (M, N)]
     return fmap.fmap_from_descriptors(*bases, k=k, landmarks=(at_source, at_target), oriented=0)

@@ -12,9 +12,10 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from s4a.geometry.compiled import fpsample
+from s4a.schema import Array
 
-Motion = tuple[np.ndarray, np.ndarray]  # R (3, 3), t (3,)
-End = tuple[np.ndarray, np.ndarray, float]  # of an ICP: R, t and the residual
+Motion = tuple[Array, Array]  # R (3, 3), t (3,)
+End = tuple[Array, Array, float]  # of an ICP: R, t and the residual
 
 ROUGH = 2e-5  # tolerance where few points are paired, or ends are only compared: twice icp's own
 
@@ -23,15 +24,15 @@ ROUGH = 2e-5  # tolerance where few points are paired, or ends are only compared
 class Cloud:
     """The vertices of a shape as ICP takes them; see :func:`cloud`."""
 
-    X: np.ndarray  # (n, 3)
-    area: np.ndarray  # (n,)
+    X: Array  # (n, 3)
+    area: Array  # (n,)
     tree: cKDTree  # of all vertices
-    paired: np.ndarray  # indices of those that are paired with the other shape's nearest
+    paired: Array  # indices of those that are paired with the other shape's nearest
 
 
 def rigid_transform(
-    P: np.ndarray, Q: np.ndarray, weight: np.ndarray | None = None, *, scale: bool = False
-) -> tuple[np.ndarray, np.ndarray, float]:
+    P: Array, Q: Array, weight: Array | None = None, *, scale: bool = False
+) -> tuple[Array, Array, float]:
     """The motion s R x + t that brings points P closest to Q in the (weighted) least-squares sense.
 
     Kabsch's solution by the SVD of the cross-covariance; with ``scale=True`` Umeyama's (1991).
@@ -69,7 +70,7 @@ def rigid_transform(
     return R, q - s * R @ p, s
 
 
-def farthest_points(P: np.ndarray, k: int) -> np.ndarray:
+def farthest_points(P: Array, k: int) -> Array:
     """Indices of k points, each as far as possible from those before it (Euclidean).
 
     The first is the point farthest from the mean, so that the choice follows the shape and not its
@@ -100,7 +101,7 @@ def farthest_points(P: np.ndarray, k: int) -> np.ndarray:
     return fpsample.fps_sampling(P, k, start_idx=start).astype(np.int64)
 
 
-def farthest_samples(P: np.ndarray, k: int, start: int) -> np.ndarray:
+def farthest_samples(P: Array, k: int, start: int) -> Array:
     """Farthest points from the point `start` on, by comparing all; fewer where points coincide.
 
     Parameters
@@ -126,7 +127,7 @@ def farthest_samples(P: np.ndarray, k: int, start: int) -> np.ndarray:
     return np.array(sample, np.int64)
 
 
-def many_farthest_points(P: np.ndarray, k: int, *, center: np.ndarray, seed: int = 0) -> np.ndarray:
+def many_farthest_points(P: Array, k: int, *, center: Array, seed: int = 0) -> Array:
     """:func:`farthest_points` for thousands of points, by buckets; near ties may fall otherwise.
 
     Parameters
@@ -167,7 +168,7 @@ def many_farthest_points(P: np.ndarray, k: int, *, center: np.ndarray, seed: int
     return sample[np.sort(first)][1:].astype(np.int64) - 1
 
 
-def principal_axes(X: np.ndarray, area: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def principal_axes(X: Array, area: Array) -> tuple[Array, Array]:
     """Centroid and principal axes of an area-weighted point set.
 
     Returns
@@ -183,13 +184,13 @@ def principal_axes(X: np.ndarray, area: np.ndarray) -> tuple[np.ndarray, np.ndar
     return c, V * np.array([1, 1, np.sign(np.linalg.det(V))])
 
 
-def cloud(X: np.ndarray, area: np.ndarray, n_points: int | None = None) -> Cloud:
+def cloud(X: Array, area: Array, n_points: int | None = None) -> Cloud:
     """A shape's vertices and areas for ICP, which pairs `n_points` spread ones of it (or all)."""
     paired = np.arange(len(X)) if n_points is None else farthest_points(X, n_points)
     return Cloud(X, area, cKDTree(X), paired)
 
 
-def icp(source: Cloud, target: Cloud, R: np.ndarray, t: np.ndarray, **options: Any) -> End:
+def icp(source: Cloud, target: Cloud, R: Array, t: Array, **options: Any) -> End:
     """:func:`icp_each` from one start R x + t."""
     return icp_each(source, target, [(R, t)], **options)[0]
 
@@ -258,7 +259,7 @@ def _nearest(shape, places):
     return zip(nearest.reshape(each), gap.reshape(each), strict=True)
 
 
-def quantile(values: np.ndarray, share: float) -> float:
+def quantile(values: Array, share: float) -> float:
     """``np.quantile`` of a few hundred values ``(n,)``, to the bit and much faster.
 
     Examples
@@ -325,10 +326,10 @@ def try_tilts(
 
 
 def align(
-    X: np.ndarray,
-    area: np.ndarray,
-    Y: np.ndarray,
-    area_y: np.ndarray,
+    X: Array,
+    area: Array,
+    Y: Array,
+    area_y: Array,
     *,
     n_points: int = 300,
     clearly: float = 0.98,

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from s4a.geometry.compiled import igl
 from s4a.geometry.mesh import counting_order, triangle_areas, triangle_normals, vertex_normals
+from s4a.schema import Array
 
 # Of positions, for unit area, and of unit normals, where nearest points are searched in both.
 POSITION_WEIGHT, NORMAL_WEIGHT = 5.0, 0.3
@@ -20,17 +21,13 @@ CLOSE_WEIGHT = 0.05
 FLAT = 1e-14  # squared sine of the angle at A up to which a triangle is taken for a line
 
 
-def interpolate(
-    values: np.ndarray, T: np.ndarray, triangle: np.ndarray, weights: np.ndarray
-) -> np.ndarray:
+def interpolate(values: Array, T: Array, triangle: Array, weights: Array) -> Array:
     """Values ``(n, d)`` of the vertices at points of the surface ``(p, d)``."""
     corners = values.take(T.take(triangle, axis=0), axis=0)  # (p, 3, d)
     return np.einsum("pc,pcd->pd", weights, corners)
 
 
-def interpolation_matrix(
-    T: np.ndarray, triangle: np.ndarray, weights: np.ndarray, n: int
-) -> sp.csr_matrix:
+def interpolation_matrix(T: Array, triangle: Array, weights: Array, n: int) -> sp.csr_matrix:
     """Sparse matrix ``(p, n)`` from values of n vertices to those at p points of the surface.
 
     Examples
@@ -47,7 +44,7 @@ def interpolation_matrix(
     return sp.csr_matrix((weights.ravel(), (row, T[triangle].ravel())), (len(triangle), n))
 
 
-def closest_point(P: np.ndarray, X: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def closest_point(P: Array, X: Array, T: Array) -> tuple[Array, Array]:
     """The point of a surface closest to each row of P: triangle ``(p,)``, weights ``(p, 3)``."""
     P = np.ascontiguousarray(P, np.float64)
     X = np.ascontiguousarray(X, np.float64)
@@ -59,7 +56,7 @@ def closest_point(P: np.ndarray, X: np.ndarray, T: np.ndarray) -> tuple[np.ndarr
     return triangle, closest_point_on_triangles(P, X[a], X[b], X[c])
 
 
-def distance_to_surface(P: np.ndarray, X: np.ndarray, T: np.ndarray) -> np.ndarray:
+def distance_to_surface(P: Array, X: Array, T: Array) -> Array:
     """Distances ``(p,)`` of points from a surface."""
     if not igl:
         return np.linalg.norm(interpolate(X, T, *closest_of_all(P, X, T)) - P, axis=1)
@@ -71,7 +68,7 @@ def distance_to_surface(P: np.ndarray, X: np.ndarray, T: np.ndarray) -> np.ndarr
     return np.sqrt(np.maximum(squared, 0))
 
 
-def closest_of_all(P: np.ndarray, X: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def closest_of_all(P: Array, X: Array, T: Array) -> tuple[Array, Array]:
     """As :func:`closest_point`, without libigl: of the triangles whose centroids are near enough.
 
     The nearest centroid lies on the surface, at a distance d, so the closest point is within d, and
@@ -105,9 +102,7 @@ def closest_of_all(P: np.ndarray, X: np.ndarray, T: np.ndarray) -> tuple[np.ndar
     return triangle, weights
 
 
-def closest_facing_point(
-    P: np.ndarray, N: np.ndarray, X: np.ndarray, T: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def closest_facing_point(P: Array, N: Array, X: Array, T: Array) -> tuple[Array, Array]:
     """As :func:`closest_point`, on the side that faces as the normals N ``(p, 3)`` of the points.
 
     Where the closest point lies on a triangle turned away, such as the other side of a thin wall,
@@ -123,11 +118,8 @@ def closest_facing_point(
 
 
 def features(
-    X: np.ndarray,
-    normals: np.ndarray,
-    spectrum: np.ndarray | None = None,
-    weight: float = NORMAL_WEIGHT,
-) -> np.ndarray:
+    X: Array, normals: Array, spectrum: Array | None = None, weight: float = NORMAL_WEIGHT
+) -> Array:
     """Rows in which nearest neighbours are searched: weighted position and normal ``(n, 6)``.
 
     And the spectral coordinates ``(n, k)``, where they are given.
@@ -136,12 +128,12 @@ def features(
     return np.concatenate(parts if spectrum is None else [*parts, spectrum], axis=1)
 
 
-def feature_tree(X: np.ndarray, T: np.ndarray) -> cKDTree:
+def feature_tree(X: Array, T: Array) -> cKDTree:
     """KD-tree over the :func:`features` of a surface."""
     return tree_over(features(X, vertex_normals(X, T)))
 
 
-def tree_over(rows: np.ndarray) -> cKDTree:
+def tree_over(rows: Array) -> cKDTree:
     """KD-tree over rows of :func:`features`.
 
     For queries in the order of a mesh: in no order, larger leaves are as good.
@@ -149,9 +141,7 @@ def tree_over(rows: np.ndarray) -> cKDTree:
     return cKDTree(rows, leafsize=32, balanced_tree=False)
 
 
-def match_surfaces(
-    Y: np.ndarray, normals_y: np.ndarray, X: np.ndarray, normals_x: np.ndarray
-) -> np.ndarray:
+def match_surfaces(Y: Array, normals_y: Array, X: Array, normals_x: Array) -> Array:
     """On each vertex of one surface the vertex nearest to it of another that lies on it ``(n,)``.
 
     Nearest in position and, by :data:`CLOSE_WEIGHT`, in normal.
@@ -177,9 +167,7 @@ def match_surfaces(
     return tree.query(features(Y, normals_y, weight=CLOSE_WEIGHT))[1]
 
 
-def closest_point_on_triangles(
-    P: np.ndarray, A: np.ndarray, B: np.ndarray, C: np.ndarray
-) -> np.ndarray:
+def closest_point_on_triangles(P: Array, A: Array, B: Array, C: Array) -> Array:
     """Barycentric weights of the point of triangle (A_i, B_i, C_i) closest to P_i, row by row.
 
     The seven regions of the triangle (vertices, edges, interior) are told apart by signs of dot
@@ -198,9 +186,7 @@ def closest_point_on_triangles(
     return np.stack([np.maximum(1 - v - w, 0), v, w], axis=1)
 
 
-def closest_by_sides(
-    ab: np.ndarray, ac: np.ndarray, ap: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def closest_by_sides(ab: Array, ac: Array, ap: Array) -> tuple[Array, Array]:
     """Weights ``(n,)`` of B and C in the closest point of :func:`closest_point_on_triangles`.
 
     Parameters
@@ -237,9 +223,7 @@ def closest_by_sides(
     return v, w
 
 
-def closest_on_sides(
-    ab: np.ndarray, ac: np.ndarray, ap: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def closest_on_sides(ab: Array, ac: Array, ap: Array) -> tuple[Array, Array]:
     """:func:`closest_by_sides` of degenerate triangles: the nearest point of the three sides."""
     bc, zero = ac - ab, np.zeros(len(ab))
     t = ratio(dots(bc, ap - ab), dots(bc, bc))
@@ -250,12 +234,12 @@ def closest_on_sides(
     return v[nearest], w[nearest]
 
 
-def ratio(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def ratio(a: Array, b: Array) -> Array:
     """The ratio a / b, from 0 to 1; 0 where both are 0."""
     return np.clip(a / np.where(b == 0, 1, b), 0, 1)
 
 
-def dots(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def dots(a: Array, b: Array) -> Array:
     """Dot products ``(n,)`` of the rows of two arrays ``(n, d)``."""
     return np.einsum("ij,ij->i", a, b)
 
@@ -266,12 +250,12 @@ class Stars(NamedTuple):
     Those of v are ``triangle[start[v] : start[v] + degree[v]]``.
     """
 
-    triangle: np.ndarray  # (3 m,)
-    start: np.ndarray  # (n,)
-    degree: np.ndarray  # (n,)
+    triangle: Array  # (3 m,)
+    start: Array  # (n,)
+    degree: Array  # (n,)
 
 
-def stars(T: np.ndarray, n: int) -> Stars:
+def stars(T: Array, n: int) -> Stars:
     """The triangles around each of n vertices.
 
     Examples
@@ -288,8 +272,8 @@ def stars(T: np.ndarray, n: int) -> Stars:
 
 
 def closest_point_in_star(
-    P: np.ndarray, nearest: np.ndarray, X: np.ndarray, T: np.ndarray, around: Stars | None = None
-) -> tuple[np.ndarray, np.ndarray]:
+    P: Array, nearest: Array, X: Array, T: Array, around: Stars | None = None
+) -> tuple[Array, Array]:
     """Closest point of the triangles around a given vertex, for every point.
 
     Parameters

@@ -10,6 +10,7 @@ import numpy as np
 
 from s4a.geometry.compiled import igl
 from s4a.geometry.mesh import equal_rows, order_in_space
+from s4a.schema import Array
 
 log = logging.getLogger(__name__)
 
@@ -18,7 +19,7 @@ MOST_PAIRS = 10_000_000
 N_PROBED, N_BESIDE = 200, 5000  # triangles whose boxes are compared to foresee how many there are
 
 
-def count_crossing(X: np.ndarray, T: np.ndarray, *, most_pairs: int = MOST_PAIRS) -> int:
+def count_crossing(X: Array, T: Array, *, most_pairs: int = MOST_PAIRS) -> int:
     """How many triangles pass through another, or touch one that has no corner in common with it.
 
     Corners at the same place are one, as where a surface that is not manifold was cut into sheets:
@@ -77,7 +78,7 @@ def can_count(asked: bool) -> bool:
     return asked
 
 
-def expected_pairs(X: np.ndarray, T: np.ndarray) -> float:
+def expected_pairs(X: Array, T: Array) -> float:
     """About how many pairs of triangles have boxes that overlap, from some beside some others."""
     some, others = evenly(len(T), N_PROBED), evenly(len(T), N_BESIDE)
     low, high = X[T[some]].min(1), X[T[some]].max(1)  # (some, 3)
@@ -90,6 +91,6 @@ def expected_pairs(X: np.ndarray, T: np.ndarray) -> float:
     return float(overlap.mean()) * len(T) ** 2 / 2
 
 
-def evenly(n: int, most: int) -> np.ndarray:
+def evenly(n: int, most: int) -> Array:
     """At most so many of the numbers 0 to n - 1, evenly spread."""
     return np.linspace(0, n - 1, min(n, most)).astype(int)

@@ -12,11 +12,11 @@ import xarray as xr
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
-from s4a.schema import dataset
+from s4a.schema import Array, dataset
 
 
 def as_dataset(
-    points: np.ndarray, triangles: np.ndarray, attrs: dict[str, Any] | None = None, **variables: Any
+    points: Array, triangles: Array, attrs: dict[str, Any] | None = None, **variables: Any
 ) -> xr.Dataset:
     """A mesh Dataset: ``position(vertex, xyz)``, ``corner_vertex(triangle, corner)``."""
     return dataset(
@@ -27,7 +27,7 @@ def as_dataset(
     )
 
 
-def as_arrays(mesh: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
+def as_arrays(mesh: xr.Dataset) -> tuple[Array, Array]:
     """Positions ``(n, 3)`` float64 and triangles ``(m, 3)`` int32 of a mesh Dataset."""
     X, T = mesh["position"].values, mesh["corner_vertex"].values
     return (
@@ -36,7 +36,7 @@ def as_arrays(mesh: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-def triangle_normals(X: np.ndarray, T: np.ndarray) -> np.ndarray:
+def triangle_normals(X: Array, T: Array) -> Array:
     """Normals of the triangles ``(m, 3)``, as long as twice their area."""
     X = np.asarray(X, float)  # products of integers may overflow
     a, b, c = (X.take(corner, axis=0) for corner in T.T)
@@ -46,17 +46,17 @@ def triangle_normals(X: np.ndarray, T: np.ndarray) -> np.ndarray:
     return np.stack([uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx], axis=1)
 
 
-def triangle_areas(X: np.ndarray, T: np.ndarray) -> np.ndarray:
+def triangle_areas(X: Array, T: Array) -> Array:
     """Areas of the triangles ``(m,)``."""
     return 0.5 * np.linalg.norm(triangle_normals(X, T), axis=1)
 
 
-def vertex_areas(X: np.ndarray, T: np.ndarray) -> np.ndarray:
+def vertex_areas(X: Array, T: Array) -> Array:
     """Lumped (barycentric) area of every vertex ``(n,)``: a third of each incident triangle."""
     return np.bincount(T.ravel(), np.repeat(triangle_areas(X, T) / 3, 3), len(X))
 
 
-def normal_sums(X: np.ndarray, T: np.ndarray) -> np.ndarray:
+def normal_sums(X: Array, T: Array) -> Array:
     """Sums ``(n, 3)`` of :func:`triangle_normals` around each vertex: quadratic in X.
 
     Examples
@@ -71,14 +71,14 @@ def normal_sums(X: np.ndarray, T: np.ndarray) -> np.ndarray:
     return touches @ triangle_normals(X, T)
 
 
-def vertex_normals(X: np.ndarray, T: np.ndarray) -> np.ndarray:
+def vertex_normals(X: Array, T: Array) -> Array:
     """Unit normals of the vertices ``(n, 3)``, area-weighted; zero where a vertex has no area."""
     N = normal_sums(X, T)
     length = np.linalg.norm(N, axis=1, keepdims=True)
     return N / np.where(length > 0, length, 1)
 
 
-def turned(vectors: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+def turned(vectors: Array, start: Array, end: Array) -> Array:
     """Vectors ``(n, 3)`` after the least rotations that take unit vectors `start` to `end`.
 
     Examples
@@ -96,12 +96,12 @@ def turned(vectors: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarra
     return vectors * cos + np.cross(axis, vectors) + axis * along / np.maximum(1 + cos, 1e-6)
 
 
-def directed_edges(T: np.ndarray) -> np.ndarray:
+def directed_edges(T: Array) -> Array:
     """The half-edges ``(3 m, 2)`` of the triangles: corners 0-1 of all, then 1-2, then 2-0."""
     return np.concatenate([T[:, [0, 1]], T[:, [1, 2]], T[:, [2, 0]]])
 
 
-def edges(T: np.ndarray) -> np.ndarray:
+def edges(T: Array) -> Array:
     """The undirected edges ``(e, 2)``, each once, smaller index first, sorted.
 
     Examples
@@ -114,7 +114,7 @@ def edges(T: np.ndarray) -> np.ndarray:
     return unique_edges(T)[0]
 
 
-def unique_edges(T: np.ndarray, n: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def unique_edges(T: Array, n: int | None = None) -> tuple[Array, Array, Array]:
     """The undirected edges and what belongs to each; n is the number of vertices, if at hand.
 
     Returns
@@ -150,13 +150,13 @@ def unique_edges(T: np.ndarray, n: int | None = None) -> tuple[np.ndarray, np.nd
     return E, edge_of, np.diff(head, append=m)
 
 
-def check_numbers(key: np.ndarray, n: int) -> None:
+def check_numbers(key: Array, n: int) -> None:
     """IndexError unless all are numbers from 0 to n - 1."""
     if len(key) and not 0 <= key.min() <= key.max() < n:
         raise IndexError(f"numbers from 0 to {n - 1} needed, found {key.min()} to {key.max()}")
 
 
-def counting_order(key: np.ndarray, n: int) -> np.ndarray:
+def counting_order(key: Array, n: int) -> Array:
     """The order ``(m,)`` that sorts numbers 0 to n - 1; equal ones stay in their order.
 
     In linear time, as a sparse matrix is transposed: 5 ms for 600,000, of which a sort takes 60.
@@ -174,7 +174,7 @@ def counting_order(key: np.ndarray, n: int) -> np.ndarray:
     return one_a_row.tocsc().indices.astype(np.int64)
 
 
-def order_in_space(X: np.ndarray) -> np.ndarray:
+def order_in_space(X: Array) -> Array:
     """An order of points in which neighbours mostly follow each other, that of a KD-tree ``(n,)``.
 
     What takes them in this order finds most in the cache, whatever the order of their file.
@@ -191,7 +191,7 @@ def order_in_space(X: np.ndarray) -> np.ndarray:
     return cKDTree(X, balanced_tree=False, compact_nodes=False).indices
 
 
-def lexical_order(A: np.ndarray) -> np.ndarray:
+def lexical_order(A: Array) -> Array:
     """The order of rows ``(n, k)``, the last column first; equal rows stay in their order ``(n,)``.
 
     That of :func:`numpy.lexsort`, which is asked for rows alone whose last columns are equal.
@@ -214,7 +214,7 @@ def lexical_order(A: np.ndarray) -> np.ndarray:
     return order
 
 
-def equal_rows(A: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def equal_rows(A: Array) -> tuple[Array, Array]:
     """Which rows of an array ``(n, k)`` are equal; NaN equals nothing.
 
     Returns
@@ -245,13 +245,13 @@ def equal_rows(A: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return order[new], group
 
 
-def components(pairs: np.ndarray, n: int) -> np.ndarray:
+def components(pairs: Array, n: int) -> Array:
     """Connected component of each of n nodes that the pairs ``(p, 2)`` link, numbered from 0."""
     links = sp.coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), (n, n))
     return connected_components(links, directed=False)[1]
 
 
-def edge_graph(X: np.ndarray, E: np.ndarray) -> sp.csr_matrix:
+def edge_graph(X: Array, E: Array) -> sp.csr_matrix:
     """Lengths of the edges E ``(e, 2)`` as a symmetric matrix ``(n, n)``: Dijkstra's graph."""
     i, j = E.T
     length = np.linalg.norm(X[i] - X[j], axis=1)  # (e,)
@@ -260,7 +260,7 @@ def edge_graph(X: np.ndarray, E: np.ndarray) -> sp.csr_matrix:
     return half + half.T
 
 
-def path_lengths(G: sp.csr_matrix, start: np.ndarray, end: np.ndarray, limit: float) -> np.ndarray:
+def path_lengths(G: sp.csr_matrix, start: Array, end: Array, limit: float) -> Array:
     """Lengths of the shortest paths along edges between pairs of vertices ``(p,)``, cut at `limit`.
 
     An edge is the shortest path between its ends.  Of the others short paths are looked for first,
@@ -297,7 +297,7 @@ def path_lengths(G: sp.csr_matrix, start: np.ndarray, end: np.ndarray, limit: fl
     return np.minimum(length, limit)
 
 
-def half_cotangents(X: np.ndarray, T: np.ndarray) -> np.ndarray:
+def half_cotangents(X: Array, T: Array) -> Array:
     """Half the cotangent of the angle opposite to each half-edge ``(3 m,)``.
 
     Half-edges are in the order of :func:`directed_edges`.
@@ -315,7 +315,7 @@ def half_cotangents(X: np.ndarray, T: np.ndarray) -> np.ndarray:
     return np.concatenate(half_cotangent)
 
 
-def cotan_weights(X: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def cotan_weights(X: Array, T: Array) -> tuple[Array, Array]:
     """Cotan weights of the edges: half the sum of the cotangents of the opposite angles.
 
     Returns
@@ -329,24 +329,24 @@ def cotan_weights(X: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return E, np.bincount(edge_of, half_cotangents(X, T), len(E))
 
 
-def stiffness(E: np.ndarray, w: np.ndarray, n: int) -> sp.csr_matrix:
+def stiffness(E: Array, w: Array, n: int) -> sp.csr_matrix:
     """Sparse symmetric stiffness matrix W ``(n, n)`` of the edges' weights."""
     i, j = E.T
     W = sp.coo_matrix((-np.r_[w, w], (np.r_[i, j], np.r_[j, i])), (n, n)).tocsr()
     return W - sp.diags(np.asarray(W.sum(axis=1)).ravel())
 
 
-def n_used(T: np.ndarray) -> int:
+def n_used(T: Array) -> int:
     """How many vertices triangles have."""
     return int(np.count_nonzero(np.bincount(T.ravel())))
 
 
-def euler_characteristic(T: np.ndarray, E: np.ndarray | None = None) -> int:
+def euler_characteristic(T: Array, E: Array | None = None) -> int:
     """V - E + F over the vertices in use; E the edges, where they are at hand."""
     return n_used(T) - len(edges(T) if E is None else E) + len(T)
 
 
-def volume(X: np.ndarray, T: np.ndarray) -> float:
+def volume(X: Array, T: Array) -> float:
     """Signed enclosed volume; positive when the normals point outwards."""
     a, b, c = (X.take(corner, axis=0) for corner in T.T)
     return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)

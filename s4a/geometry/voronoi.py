@@ -15,49 +15,44 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from s4a.geometry.mesh import (
-    components,
-    directed_edges,
-    edge_graph,
-    triangle_areas,
-    unique_edges,
-)
+from s4a.geometry.mesh import components, directed_edges, edge_graph, triangle_areas, unique_edges
+from s4a.schema import Array
 
 
 class MeshGraph(NamedTuple):
     """Triangles and edges of a mesh; see :func:`mesh_graph`."""
 
-    T: np.ndarray  # (m, 3)
-    E: np.ndarray  # (e, 2)
-    is_open: np.ndarray  # (e,) whether the edge lies on the boundary
+    T: Array  # (m, 3)
+    E: Array  # (e, 2)
+    is_open: Array  # (e,) whether the edge lies on the boundary
     G: sp.csr_matrix  # (n, n) lengths of the edges
 
 
 class Voronoi(NamedTuple):
     """Samples of a surface and what is nearest to each along edges."""
 
-    sample: np.ndarray  # (samples,) vertex that each sample is
-    cell: np.ndarray  # (n,) number of each vertex's nearest sample
-    distance: np.ndarray  # (n,) to that sample
+    sample: Array  # (samples,) vertex that each sample is
+    cell: Array  # (n,) number of each vertex's nearest sample
+    distance: Array  # (n,) to that sample
 
 
 class Faults(NamedTuple):
     """What keeps the dual of cells from being a manifold; see :func:`faults`."""
 
-    cell: np.ndarray
-    pair: np.ndarray
-    edge: np.ndarray
-    edge_pair: np.ndarray
-    triangle: np.ndarray
+    cell: Array
+    pair: Array
+    edge: Array
+    edge_pair: Array
+    triangle: Array
 
 
-def mesh_graph(X: np.ndarray, T: np.ndarray) -> MeshGraph:
+def mesh_graph(X: Array, T: Array) -> MeshGraph:
     """The edges of a mesh, which of them are open, and the graph of their lengths."""
     E, _, count = unique_edges(T, len(X))
     return MeshGraph(T, E, count == 1, edge_graph(X, E))
 
 
-def farthest_of_each(group: np.ndarray, vertex: np.ndarray, distance: np.ndarray) -> np.ndarray:
+def farthest_of_each(group: Array, vertex: Array, distance: Array) -> Array:
     """The vertex of greatest distance in every group; `group` and `vertex` go side by side."""
     order = np.lexsort((distance[vertex], group))
     last = np.append(np.diff(group[order]) != 0, True)[: len(order)]
@@ -65,7 +60,7 @@ def farthest_of_each(group: np.ndarray, vertex: np.ndarray, distance: np.ndarray
 
 
 def add_samples(
-    G: sp.csr_matrix, new: np.ndarray, sample: np.ndarray, cell: np.ndarray, distance: np.ndarray
+    G: sp.csr_matrix, new: Array, sample: Array, cell: Array, distance: Array
 ) -> Voronoi:
     """Voronoi cells along edges after new samples: only vertices nearer to one of these change.
 
@@ -89,7 +84,7 @@ def add_samples(
     return Voronoi(np.r_[sample, new], cell, distance)
 
 
-def voronoi_cells(G: sp.csr_matrix, sample: np.ndarray) -> Voronoi:
+def voronoi_cells(G: sp.csr_matrix, sample: Array) -> Voronoi:
     """Voronoi cells of samples, and of one sample more in every component that had none."""
     n = G.shape[0]
     _, part = connected_components(G, directed=False)
@@ -98,15 +93,13 @@ def voronoi_cells(G: sp.csr_matrix, sample: np.ndarray) -> Voronoi:
     return add_samples(G, sample, np.empty(0, np.int64), np.full(n, -1), np.full(n, np.inf))
 
 
-def dual(T: np.ndarray, cell: np.ndarray) -> np.ndarray:
+def dual(T: Array, cell: Array) -> Array:
     """Triangles between cells: one for each triangle of T whose corners lie in three cells."""
     L = cell[T]
     return L[(L[:, 0] != L[:, 1]) & (L[:, 1] != L[:, 2]) & (L[:, 2] != L[:, 0])]
 
 
-def rims(
-    T: np.ndarray, region: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def rims(T: Array, region: Array) -> tuple[Array, Array, Array, Array]:
     """Rims of regions: the closed rows of edges and triangles that lead out of each region.
 
     Parameters
@@ -148,7 +141,7 @@ def rims(
     return np.repeat(step[:, 0], 2), step[:, 1:].ravel() // n, rim[link.ravel()], owner
 
 
-def faults(graph: MeshGraph, cell: np.ndarray, n: int, among: np.ndarray | None = None) -> Faults:
+def faults(graph: MeshGraph, cell: Array, n: int, among: Array | None = None) -> Faults:
     r"""Cells, pairs of cells and triangles that keep the dual from being a manifold.
 
     ::
@@ -201,9 +194,7 @@ def faults(graph: MeshGraph, cell: np.ndarray, n: int, among: np.ndarray | None 
     return Faults(bad | lone, pair, edge[across], row, triangle[corner[is_repeated(C, n)]])
 
 
-def faulty_cells(
-    T: np.ndarray, ends: np.ndarray, is_open: np.ndarray, cell: np.ndarray, among: np.ndarray
-) -> np.ndarray:
+def faulty_cells(T: Array, ends: Array, is_open: Array, cell: Array, among: Array) -> Array:
     """Which cells have no rim, several rims, or several stretches of boundary ``(n,)``.
 
     Handles and holes inside a single rim do no harm: they vanish with the cell.  `ends` are the
@@ -222,8 +213,8 @@ def faulty_cells(
 
 
 def faulty_borders(
-    ends: np.ndarray, is_open: np.ndarray, C: np.ndarray, among: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    ends: Array, is_open: Array, C: Array, among: Array
+) -> tuple[Array, Array, Array]:
     """Pairs of cells ``(p, 2)`` whose border is not one strip, edges across, and their rows.
 
     A strip of edges ends at a corner or at an open edge; a border in one piece has two such ends.
@@ -241,7 +232,7 @@ def faulty_borders(
     return np.stack(np.divmod(key[bad], n), axis=1), across[at], row[border[at]]
 
 
-def is_repeated(C: np.ndarray, n: int) -> np.ndarray:
+def is_repeated(C: Array, n: int) -> Array:
     """Which corners ``(c, 3)`` are of three cells that meet more than once."""
     key = np.sort(C, axis=1) @ [n * n, n, 1]
     _, triple, count = np.unique(key, return_inverse=True, return_counts=True)
@@ -249,7 +240,7 @@ def is_repeated(C: np.ndarray, n: int) -> np.ndarray:
 
 
 def refine(
-    graph: MeshGraph, state: Voronoi, most: float, avoid: np.ndarray
+    graph: MeshGraph, state: Voronoi, most: float, avoid: Array
 ) -> tuple[Voronoi, int, bool]:
     """Add samples where the dual is no manifold, until it is or there are more than `most`.
 
@@ -290,7 +281,7 @@ def refine(
         rounds += 1
 
 
-def thin_regions(graph: MeshGraph, state: Voronoi) -> np.ndarray:
+def thin_regions(graph: MeshGraph, state: Voronoi) -> Array:
     """Cells that are no disk, and pairs of cells that are none together, as disjoint regions."""
     n = len(state.sample)
     fault = faults(graph, state.cell, n)
@@ -304,7 +295,7 @@ def thin_regions(graph: MeshGraph, state: Voronoi) -> np.ndarray:
     return region[state.cell]
 
 
-def between_rims(G: sp.csr_matrix, T: np.ndarray, region: np.ndarray) -> np.ndarray:
+def between_rims(G: sp.csr_matrix, T: Array, region: Array) -> Array:
     """Triangles half-way between the rims of a region ``(m,)``: without them, a tube is cut."""
     triangle, vertex, rim, _ = rims(T, region)
     rim_of = np.full(len(region), -1)
@@ -325,9 +316,7 @@ def between_rims(G: sp.csr_matrix, T: np.ndarray, region: np.ndarray) -> np.ndar
     return removed
 
 
-def cut_handles(
-    X: np.ndarray, T: np.ndarray, removed: np.ndarray, crumb: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def cut_handles(X: Array, T: Array, removed: Array, crumb: float) -> tuple[Array, Array, Array]:
     """The surface without some triangles, the openings closed by a fan around their centre.
 
     Vertices where sheets would touch go, too; pieces of less area than `crumb` that come off are
@@ -368,7 +357,7 @@ def cut_handles(
     return close_with_fans(X, T[~removed], directed_edges(T)[opened])
 
 
-def cuts_apart(T: np.ndarray, gone: np.ndarray, part: np.ndarray) -> np.ndarray:
+def cuts_apart(T: Array, gone: Array, part: Array) -> Array:
     """Triangles ``(m,)`` at holes of the triangles `gone` that touch several parts that stay."""
     hole = components(directed_edges(T[gone]), len(part))
     vertex = np.unique(T[gone])
@@ -377,9 +366,7 @@ def cuts_apart(T: np.ndarray, gone: np.ndarray, part: np.ndarray) -> np.ndarray:
     return (np.bincount(touching[:, 0], minlength=len(part)) > 1)[hole[T[:, 0]]]
 
 
-def close_with_fans(
-    X: np.ndarray, T: np.ndarray, half: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def close_with_fans(X: Array, T: Array, half: Array) -> tuple[Array, Array, Array]:
     """The mesh with every loop of the open half-edges ``(h, 2)`` closed by a fan."""
     n = len(X)
     corner, link = np.unique(half, return_inverse=True)

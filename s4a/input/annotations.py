@@ -7,7 +7,6 @@ import logging
 import zipfile
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +15,9 @@ import xarray as xr
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from s4a.input import raw
 from s4a.input.files import stem_of
 from s4a.input.formats import gifti_arrays, ply_properties
-from s4a.input.raw import check_there, shown, text_of
+from s4a.input.raw import check_there, content, npy, npz, reading, shown, text_of, xml
 from s4a.schema import dataset, require, unit_of
 
 LONGEST = 255  # characters of a name: an array of names has room for the longest in each place
@@ -57,39 +55,37 @@ def read_labels(path: Path | str, n: int | None = None) -> np.ndarray:
     file = Path(f"{before}.npz" if name else before)
     check_there(file)
     kind = Path(file.name.lower().removesuffix(".gz")).suffix
-    readers = {".npy": raw.npy, ".gii": _gifti_labels, ".annot": _annot_labels}
-    try:
-        data = raw.content(file)
+    readers = {".npy": npy, ".gii": _gifti_labels, ".annot": _annot_labels}
+    with reading(path, "labels"):
+        data = content(file)
         if kind == ".npz" or zipfile.is_zipfile(io.BytesIO(data)):
             labels = _npz_labels(data, file.name, name, n)
         else:
             labels = np.asarray(readers.get(kind, _text_labels)(data))
-    except Exception as error:  # whatever the file holds, the message must name it
-        raise ValueError(
-            f"{shown(path)} cannot be read as labels: {shown(error) or type(error).__name__}"
-        ) from error
     labels = labels[:, 0] if labels.ndim == 2 and labels.shape[1] == 1 else labels
-    if labels.ndim != 1 or (n is not None and len(labels) != n):
-        wanted = (
-            "one label per vertex"
-            if n is None
-            else f"{n} labels, one per vertex of the file of the mesh,"
-        )
-        raise ValueError(f"{shown(path)}: {wanted} needed, found an array of shape {labels.shape}")
+    _check_length(path, labels, n, "label")
+    wrong: Any = labels.dtype
     if labels.dtype.kind == "f":
-        wrong = (np.round(labels) != labels) | ~(np.abs(labels) < 2**53)
-        if wrong.any():
-            raise ValueError(
-                f"{shown(path)}: labels need whole numbers or names, found {labels[wrong][0]}"
-            )
-        labels = labels.astype(np.int64)
+        broken = (np.round(labels) != labels) | ~(np.abs(labels) < 2**53)
+        if not broken.any():
+            return labels.astype(np.int64)
+        wrong = labels[broken][0]
     if labels.dtype.kind not in "iubU":
-        raise ValueError(f"{shown(path)}: labels need whole numbers or names, found {labels.dtype}")
+        raise ValueError(f"{shown(path)}: labels need whole numbers or names, found {wrong}")
     return labels
 
 
+def _check_length(path, values, n, what):
+    if values.ndim != 1 or n not in (None, len(values)):
+        wanted = f"one {what} per vertex" if n is None else f"{n} {what}s, one per vertex"
+        of_file = " of the file of the mesh," if n and what == "label" else "," * (n is not None)
+        raise ValueError(
+            f"{shown(path)}: {wanted}{of_file} needed, found an array of shape {values.shape}"
+        )
+
+
 def _npz_labels(data, file, name, n):
-    arrays = raw.npz(data)
+    arrays = npz(data)
     if name:
         if name not in arrays:
             raise ValueError(f"no array {name!r}; it has {', '.join(arrays)}")
@@ -114,75 +110,65 @@ def _gifti_labels(data):
     return found[0]
 
 
-class _Numbers:
+class _Cursor:
     """Big-endian integers, and texts of a length that stands before them, one after the other."""
 
     def __init__(self, data):
         self.data, self.at = data, 0
 
     def take(self, count):
-        """The next integers."""
-        left = (len(self.data) - self.at) // 4
+        """The next bytes."""
+        left = len(self.data) - self.at
         if not 0 <= count <= left:
-            raise ValueError(f"expected {count} numbers, found {left}: the file is cut short")
-        start, self.at = self.at, self.at + 4 * count
-        return np.frombuffer(self.data, ">i4", count, start).astype(np.int64)
+            raise ValueError(f"expected {count} bytes, found {left}: the file is cut short")
+        self.at += count
+        return self.data[self.at - count : self.at]
 
-    def take_one(self):
-        return int(self.take(1)[0])
+    def numbers(self, count):
+        return np.frombuffer(self.take(4 * count), ">i4").astype(np.int64)
 
-    def skip_text(self):
-        length, left = self.take_one(), len(self.data) - self.at
-        if not 0 <= length <= left:
-            raise ValueError(
-                f"expected a text of {length} bytes, found {left}: the file is cut short"
-            )
-        self.at += length
+    def number(self):
+        return int(self.numbers(1)[0])
 
 
 def _annot_labels(data):
     """Rows of the colour table.
 
-    nibabel's reader gives some row to an annotation that is not in the table.
+    nibabel gives some row to an annotation that is not in the table, and asks for any memory that a
+    damaged count names: of 2,000 damaged files 325 wanted more than 2 GiB.
     """
-    file = _Numbers(data)
-    vertex, annotation = file.take(2 * file.take_one()).reshape(-1, 2).T
+    file = _Cursor(data)
+    vertex, annotation = file.numbers(2 * file.number()).reshape(-1, 2).T
     if not np.array_equal(np.sort(vertex), np.arange(len(vertex))):
         raise ValueError(f"every vertex from 0 to {len(vertex) - 1} expected once")
-    if not file.take_one():
+    if not file.number():
         raise ValueError("a colour table expected, found none")
     row_of_colour = _colour_table(file)
-    values, place = np.unique(annotation, return_inverse=True)
-    unknown = [value for value in values.tolist() if value not in row_of_colour]
+    unknown = [value for value in np.unique(annotation).tolist() if value not in row_of_colour]
     if unknown:
         raise ValueError(
             f"annotations of the colour table expected, found {unknown[:3]}, which are not in it"
         )
-    rows = np.array([row_of_colour[value] for value in values.tolist()], np.int64)
-    labels = np.empty(len(vertex), np.int64)
-    labels[vertex] = rows[place]
-    return labels
+    rows = [row_of_colour[value] for value in annotation.tolist()]
+    return np.array(rows, np.int64)[np.argsort(vertex)]
 
 
 def _colour_table(file):
     """The row of each colour, -1 for none; in version 2, rows are numbered in the file."""
-    count = file.take_one()
+    count = file.number()
     numbered = count < 0
     if numbered:
         if count != -2:
             raise ValueError(f"a colour table of version 2 expected, found {-count}")
-        file.take_one()
-    file.skip_text()
-    if numbered:
-        count = file.take_one()
+        file.number()
+    file.take(file.number())  # where it is from
     row_of_colour = {}
-    for i in range(count):
-        row = file.take_one() if numbered else i
-        file.skip_text()
-        red, green, blue, _ = file.take(4).tolist()
+    for i in range(file.number() if numbered else count):
+        row = file.number() if numbered else i
+        file.take(file.number())  # its name
+        red, green, blue, _ = file.numbers(4).tolist()
         row_of_colour.setdefault(red + 256 * green + 65536 * blue, row)
-    row_of_colour[0] = -1
-    return row_of_colour
+    return row_of_colour | {0: -1}
 
 
 def table_rows(text: str) -> dict[int, list[str]]:
@@ -249,20 +235,24 @@ def _text_labels(data):
     rows = table_rows(text_of(data))
     first = next(iter(rows.values()))
     head = [cell.lower() for cell in first]
-    if "label" in head:
-        del rows[next(iter(rows))]
-    elif len(head) > 1:
+    if len(head) > 1 and "label" not in head:
         raise ValueError(f"a column 'label' needed, found {', '.join(first)}")
-    at = head.index("label") if "label" in head else 0
-    order = order_of_vertices(head, rows) if "label" in head else None
-    check_cells(rows, len(head), 1 + at)
-    values = [row[at] for row in rows.values()]
-    labels = (
-        np.array([float(v) for v in values])
-        if all(map(is_number, values))
-        else np.array(short(values))
-    )
-    return labels if order is None else labels[order]
+    at, has_head = (head.index("label"), True) if "label" in head else (0, False)
+    cells = _cells(rows, at, has_head)
+    if all(map(is_number, cells.values())):
+        return np.array([float(cell) for cell in cells.values()])
+    return np.array(short(list(cells.values())))
+
+
+def _cells(rows, at, has_head):
+    """The cells of a column by their lines, in the order of a column ``vertex`` if there is one."""
+    n, order, head = len(next(iter(rows.values()))), None, []
+    if has_head:
+        head = [cell.lower() for cell in rows.pop(next(iter(rows)))]
+        order = order_of_vertices(head, rows) if n > 1 else None
+    check_cells(rows, n, 1 + at)
+    lines = list(rows)
+    return {lines[i]: rows[lines[i]][at] for i in (range(len(lines)) if order is None else order)}
 
 
 def order_of_vertices(head: list[str], rows: dict[int, list[str]]) -> np.ndarray | None:
@@ -314,8 +304,8 @@ def read_landmarks(path: Path | str) -> xr.Dataset:
     """
     path = Path(path)
     check_there(path)
-    try:
-        text = text_of(raw.content(path))
+    with reading(path, "landmarks"):
+        text = text_of(content(path))
         reader = {"{": _slicer_points, "<": _meshlab_points}.get(text.lstrip()[:1], _table_points)
         names, points, system, curve, closed = reader(text)
         points = np.array(points, float).reshape(-1, 3)
@@ -326,21 +316,10 @@ def read_landmarks(path: Path | str) -> xr.Dataset:
             raise ValueError(f"a curve needs two points or more; {single[0]!r} has one")
         names = short([str(name) or str(i + 1) for i, name in enumerate(names)])
         curve = short([str(name) for name in curve])
-    except Exception as error:
-        raise ValueError(
-            f"{shown(path)} cannot be read as landmarks: {shown(error) or type(error).__name__}"
-        ) from error
-    curves = (
-        {"landmark_curve": np.array(curve), "landmark_closed": np.array(closed, bool)}
-        if any(curve)
-        else {}
-    )
-    return dataset(
-        {"coordinate_system": system},
-        landmark_name=np.array(names),
-        landmark_position=points,
-        **curves,
-    )
+    found = {"landmark_name": np.array(names), "landmark_position": points}
+    if any(curve):
+        found |= {"landmark_curve": np.array(curve), "landmark_closed": np.array(closed, bool)}
+    return dataset({"coordinate_system": system}, **found)
 
 
 def _slicer_points(text):
@@ -367,7 +346,7 @@ def _slicer_points(text):
 
 
 def _meshlab_points(text):
-    points = [p for p in raw.xml(text).iter("point") if p.get("active") != "0"]
+    points = [p for p in xml(text).iter("point") if p.get("active") != "0"]
     names = [p.get("name", "") for p in points]
     return names, [[p.get(axis) for axis in "xyz"] for p in points], "", [""] * len(names), []
 
@@ -435,25 +414,15 @@ def _markups(landmarks):
     plain = np.full(n, "")
     curves = landmarks["landmark_curve"].values if "landmark_curve" in landmarks else plain
     closed = landmarks["landmark_closed"].values if "landmark_closed" in landmarks else plain != ""
+    names = landmarks["landmark_name"].values.tolist()
+    places = landmarks["landmark_position"].values.astype(float).tolist()
+    orientation = [upright, 0.0, 0.0, 0.0, upright, 0.0, 0.0, 0.0, 1.0]
+    shared = {"orientation": orientation, "selected": True, "locked": False, "visibility": True}
     points = [
-        {
-            "id": str(i),
-            "label": label,
-            "position": position,
-            "orientation": [upright, 0.0, 0.0, 0.0, upright, 0.0, 0.0, 0.0, 1.0],
-            "selected": True,
-            "locked": False,
-            "visibility": True,
-            "positionStatus": "defined",
-        }
-        for i, (label, position) in enumerate(
-            zip(
-                landmarks["landmark_name"].values.tolist(),
-                landmarks["landmark_position"].values.astype(float).tolist(),
-                strict=True,
-            ),
-            1,
-        )
+        {"id": str(i + 1), "label": names[i], "position": places[i]}
+        | shared
+        | {"positionStatus": "defined"}
+        for i in range(n)
     ]
     lists = []
     for curve in dict.fromkeys(curves.tolist()):
@@ -568,19 +537,13 @@ def read_scalars(path: Path | str, name: str = "", n: int | None = None) -> np.n
     """
     file = Path(path)
     check_there(file)
-    try:
-        data = raw.content(file)
+    with reading(path, "a field"):
+        data = content(file)
         values = np.asarray(_values(data, file.name.lower().removesuffix(".gz"), name))
         if values.dtype.kind not in "iufb":
             raise ValueError(f"numbers expected, found {values.dtype}")
-    except Exception as error:  # whatever the file holds, the message must name it
-        raise ValueError(
-            f"{shown(path)} cannot be read as a field: {shown(error) or type(error).__name__}"
-        ) from error
     values = values.reshape(-1) if values.size == max(values.shape, default=0) else values
-    if values.ndim != 1 or n not in (None, len(values)):
-        wanted = "one number per vertex" if n is None else f"{n} numbers, one per vertex,"
-        raise ValueError(f"{shown(path)}: {wanted} needed, found an array of shape {values.shape}")
+    _check_length(path, values, n, "number")
     return values.astype(float)
 
 
@@ -665,14 +628,11 @@ def with_features(
         raise ValueError("features needs a field at least, found none")
     if not (np.isfinite(weight) and weight > 0):
         raise ValueError(f"weight must be positive, found {weight!r}")
-    values = [
-        of_vertices(
-            read_scalars(given, name) if isinstance(given, str | Path) else given,
-            mesh,
-            f"the feature {name!r}",
-        )
+    fields = {
+        name: read_scalars(given, name) if isinstance(given, str | Path) else given
         for name, given in features.items()
-    ]
+    }
+    values = [of_vertices(field, mesh, f"the feature {name!r}") for name, field in fields.items()]
     found = dataset(
         feature_name=list(features),
         feature_value=np.stack(values, axis=1),
@@ -723,7 +683,7 @@ def files_beside(path: Path | str, names: Iterable[str]) -> dict[str, Path]:
 def _properties(path):
     """The names of what a PLY file has for its vertices; none of another file, or a broken one."""
     try:
-        data = raw.content(path)
+        data = content(path)
         return ply_properties(data) if data[:3] == b"ply" else {}
     except (ValueError, OSError):  # its own task will say so
         return {}
@@ -734,13 +694,19 @@ def _values(data, file, name):
     if data.startswith(CURV):
         return _curv(data)
     if data[:3] == b"ply":
-        return _named(ply_properties(data), name)
-    if zipfile.is_zipfile(BytesIO(data)):
-        arrays = raw.npz(data)
-        wanted = _one_of(arrays, name)
+        columns = ply_properties(data)
+        if name not in columns:
+            known = ", ".join(columns)
+            raise ValueError(f"a property {name!r} of its vertices expected, found {known}")
+        return columns[name]
+    if zipfile.is_zipfile(io.BytesIO(data)):
+        arrays = npz(data)
+        wanted = next(iter(arrays)) if len(arrays) == 1 else name
+        if wanted not in arrays:
+            raise ValueError(f"an array {name!r} expected, found {', '.join(arrays) or 'none'}")
         return arrays[wanted]()
     if file.endswith(".npy"):
-        return raw.npy(data)
+        return npy(data)
     if file.endswith(".gii"):
         found = [values for _, values in gifti_arrays(data) if values.ndim == 1]
         if not found:
@@ -762,38 +728,11 @@ def _curv(data):
     return np.frombuffer(data, ">f4", n, 15)
 
 
-def _one_of(arrays, name):
-    """The name of the array that is asked for, or of the only one."""
-    if name in arrays:
-        return name
-    if len(arrays) == 1:
-        return next(iter(arrays))
-    raise ValueError(f"an array {name!r} expected, found {', '.join(arrays) or 'none'}")
-
-
-def _named(columns, name):
-    if name not in columns:
-        raise ValueError(
-            f"a property {name!r} of its vertices expected, found {', '.join(columns)}"
-        )
-    return columns[name]
-
-
 def _column(text, name):
     """The column of that name, or the only one."""
     rows = table_rows(text)
     first = next(iter(rows.values()))
-    order = None
-    if len(first) == 1:
-        at = 0
-        if not is_number(first[0]):
-            del rows[next(iter(rows))]
-    elif name in first:
-        at = first.index(name)
-        del rows[next(iter(rows))]
-        order = order_of_vertices([cell.lower() for cell in first], rows)
-    else:
+    if len(first) > 1 and name not in first:
         raise ValueError(f"a column {name!r} expected, found {', '.join(first)[:80]}")
-    check_cells(rows, len(first), 1 + at)
-    values = np.array([number_of(row[at], line) for line, row in rows.items()])
-    return values if order is None else values[order]
+    at, has_head = (first.index(name), True) if len(first) > 1 else (0, not is_number(first[0]))
+    return np.array([number_of(cell, line) for line, cell in _cells(rows, at, has_head).items()])

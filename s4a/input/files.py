@@ -14,10 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from s4a.input import raw
 from s4a.input.formats import FORMATS, NPZ_KEYS, SURFER, format_of
 from s4a.input.labels import VOLUMES, is_volume
-from s4a.input.raw import check_there, regular_file, shown
+from s4a.input.raw import check_there, content, regular_file, shown
 
 SUFFIXES = {suffix: name for name, known in FORMATS.items() for suffix in known.suffixes.split()}
 WRITERS = {known.suffixes.split()[0]: known.write for known in FORMATS.values() if known.write}
@@ -68,7 +67,7 @@ def read_mesh(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, dic
     check_there(path)
     name = "mesh"
     try:
-        data = raw.content(path).removeprefix(b"\xef\xbb\xbf")
+        data = content(path).removeprefix(b"\xef\xbb\xbf")
         if is_volume(data):
             raise ValueError("found a volume; with a label (label=17, --label 17) it is a surface")
         name = format_of(data)
@@ -335,7 +334,7 @@ def _why_not(file, volumes):
             if not any(names.issuperset(keys) for keys in NPZ_KEYS):
                 return "an archive of other arrays"
         if suffix == ".gii":
-            data = raw.content(file)
+            data = content(file)
             if b"<GIFTI" in data and b"NIFTI_INTENT_POINTSET" not in data:
                 return "a GIFTI file without points"
     except (ValueError, zipfile.BadZipFile):  # it will be said when it is read

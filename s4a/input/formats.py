@@ -32,8 +32,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from s4a.geometry.mesh import equal_rows
-from s4a.input import raw
-from s4a.input.raw import limit_of, unpack, xml
+from s4a.input.raw import limit_of, npz, unpack, xml
 
 LEGACY_TYPES = {
     "char": "i1", "unsigned_char": "u1", "short": "i2", "unsigned_short": "u2", "int": "i4",
@@ -666,11 +665,11 @@ def gifti_arrays(data: bytes) -> list[tuple[str, np.ndarray]]:
     ValueError
         When an array is cut short, unpacks to too much, or lies in another file.
     """
-    root, arrays, total = raw.xml(data), [], 0
+    root, arrays, total = xml(data), [], 0
     if root.tag != "GIFTI":
         raise ValueError(f"GIFTI expected, found {root.tag[:40]}")
     for node in root.findall("DataArray"):
-        values = _gifti_values(node, raw.limit_of(len(data)) - total)
+        values = _gifti_values(node, limit_of(len(data)) - total)
         total += values.nbytes
         arrays.append((node.get("Intent", "").removeprefix("NIFTI_INTENT_"), values))
     promised = root.get("NumberOfDataArrays")
@@ -691,7 +690,7 @@ def _gifti_values(node, limit):
         values = np.array(text.split(), dtype)
     elif encoding in ("Base64Binary", "GZipBase64Binary"):
         raw = base64.b64decode(text)
-        raw = raw.unpack(raw, "zlib", limit) if encoding == "GZipBase64Binary" else raw
+        raw = unpack(raw, "zlib", limit) if encoding == "GZipBase64Binary" else raw
         values = np.frombuffer(raw, dtype, len(raw) // dtype.itemsize)
     else:
         where = f"{encoding} {node.get('ExternalFileName') or ''}".rstrip()
@@ -736,7 +735,7 @@ NPZ_KEYS = (
 
 
 def _read_npz(data):
-    arrays = raw.npz(data)
+    arrays = npz(data)
     keys = next((keys for keys in NPZ_KEYS if set(keys) <= set(arrays)), None)
     if keys is None:
         wanted = " or ".join(" and ".join(keys) for keys in NPZ_KEYS)

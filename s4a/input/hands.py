@@ -1,8 +1,8 @@
 """Left and right (5.1, the data): which shapes are mirror images of the others, and their mirror.
 
 Each shape was held against several others, as it is and mirrored
-(:mod:`s4a.input.plausibility`).  The signs that agree best with all of these pairs are those of
-the leading eigenvector of their matrix: no shape is the one that all others are held against.
+(:mod:`s4a.input.plausibility`).  The signs that agree best with all of these pairs are those of the
+leading eigenvector of their matrix: no shape is the one that all others are held against.
 """
 
 from collections.abc import Mapping, Sequence

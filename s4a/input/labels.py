@@ -14,8 +14,7 @@ import numpy as np
 from scipy import sparse
 
 from s4a.geometry.mesh import directed_edges
-from s4a.input import raw
-from s4a.input.raw import check_there, shown
+from s4a.input.raw import check_there, content, reading
 from s4a.options import check_label
 
 VOLUMES = {".nii": "NIfTI", ".mgz": "MGH", ".mgh": "MGH"}
@@ -24,7 +23,6 @@ ROUNDS = 20  # of smoothing
 UNPACKED = 2**29  # bytes of a volume that are never refused: labels compress well
 SHRINK, GROW = 0.5, -0.51  # steps of a round: lambda and mu of Taubin
 MILLIMETRES = {"mm": 1.0, "unknown": 1.0, "meter": 1000.0, "micron": 0.001}
-NOTHING = "every voxel is 0: nothing is marked"
 MOST_TOLD = 30  # labels that an error lists
 
 
@@ -67,22 +65,16 @@ def read_volume(
     path = Path(path)
     check_there(path)
     known = check_label(label)
-    try:
-        values, affine, attrs = _volume(raw.content(path, UNPACKED))
-        inside = _marked(values, known)
-        points, triangles, at_border = _boundary(inside)
-    except Exception as error:  # whatever a file holds, it must not end the run over a collection
-        why = shown(error) or type(error).__name__
-        raise ValueError(f"{shown(path)} cannot be read as a label volume: {why}") from error
+    with reading(path, "a label volume"):
+        values, affine, attrs = _volume(content(path, UNPACKED))
+        points, triangles, at_border = _boundary(_marked(values, known))
     points = points @ affine[:3, :3].T + affine[:3, 3]
     if np.linalg.det(affine[:3, :3]) < 0:
         triangles = triangles[:, ::-1]
     attrs |= {"label": str(known), "unit": "mm"}
-    notes = [attrs.pop("note", "")]
     if at_border:
-        notes.append("what is marked reaches the border of the volume, where it was closed")
-    if any(notes):
-        attrs["note"] = "; ".join(filter(None, notes))
+        closed = "what is marked reaches the border of the volume, where it was closed"
+        attrs["note"] = "; ".join(filter(None, [attrs.get("note"), closed]))
     return smoothed(points, triangles, rounds), np.ascontiguousarray(triangles), attrs
 
 
@@ -91,7 +83,7 @@ def voxels_marked(path: str | os.PathLike[str], label: Label) -> tuple[np.ndarra
 
     See :func:`read_volume`.
     """
-    values, affine, _ = _volume(raw.content(Path(path), UNPACKED))
+    values, affine, _ = _volume(content(Path(path), UNPACKED))
     return _marked(values, check_label(label)), affine
 
 
@@ -104,13 +96,10 @@ def read_grid(path: str | os.PathLike[str]) -> tuple[tuple[int, ...], np.ndarray
         When the file is no NIfTI or MGH volume of three dimensions.
     """
     check_there(path)
-    try:
-        kind, name = _kind_of(data := raw.content(Path(path), UNPACKED))
+    with reading(path, "a volume"):
+        kind, name = _kind_of(data := content(Path(path), UNPACKED))
         header = kind.header_class.from_fileobj(io.BytesIO(data))
         return _shape_of(header), _affine_of(header, name)[0]
-    except Exception as error:  # whatever a file holds, the message must name it
-        why = shown(error) or type(error).__name__
-        raise ValueError(f"{shown(path)} cannot be read as a volume: {why}") from error
 
 
 def _volume(data):
@@ -128,11 +117,12 @@ def _volume(data):
             raise ValueError("whole numbers expected, one a structure: this is no label volume")
         values = values.astype(np.int64)
     affine, says = _affine_of(header, name)
-    attrs = {"format": name, "coordinate_system": "RAS"}
-    if not says:
-        del attrs["coordinate_system"]
-        attrs["note"] = "the volume does not say how it lies, left and right may be exchanged"
-    return values, affine, attrs
+    note = "the volume does not say how it lies, left and right may be exchanged"
+    return (
+        values,
+        affine,
+        {"format": name} | ({"coordinate_system": "RAS"} if says else {"note": note}),
+    )
 
 
 def _kind_of(data):
@@ -169,18 +159,15 @@ def _affine_of(header, name):
 
 def _marked(values, label):
     """Which voxels are inside."""
-    if label == "all":
-        inside = values != 0
-        if not inside.any():
-            raise ValueError(NOTHING)
-        return inside
-    wanted = [int(one) for one in str(label).split(",")]
-    found = [int(one) for one in np.unique(values) if one]
+    found = np.unique(values)
+    found = found[found != 0].tolist()
+    if not found:
+        raise ValueError("every voxel is 0: nothing is marked")
+    wanted = found if label == "all" else [int(one) for one in str(label).split(",")]
     missing = [one for one in wanted if one not in found]
     if missing:
         there = ", ".join(map(str, found[:MOST_TOLD])) + " ..." * (len(found) > MOST_TOLD)
-        what = f"label {', '.join(map(str, missing))} expected"
-        raise ValueError(f"{what}, found {there}" if found else NOTHING)
+        raise ValueError(f"label {', '.join(map(str, missing))} expected, found {there}")
     return np.isin(values, wanted)
 
 

@@ -24,6 +24,7 @@ from s4a.geometry.mesh import (
     volume,
 )
 from s4a.input.hands import COMMON_HAND, MIRROR, OTHER_HAND, hands
+from s4a.input.subjects import listed as first_of
 from s4a.schema import dataset
 
 N_POINTS = 3000  # vertices of each shape that are looked at
@@ -343,8 +344,6 @@ def _likeness(shape, reference, asymmetry, reference_asymmetry):
 AREA_DROPPED = 0.1
 UNITS = {10.0**e: f"10^{e}" for e in (-9, -6, -4, -3, -2, -1, 1, 2, 3, 4, 6, 9)}
 UNITS |= {25.4: "25.4", 1 / 25.4: "1/25.4", 2.54: "2.54", 1 / 2.54: "1/2.54"}  # inches
-# of these nobody but the user knows what is meant; an honest outlier is only named
-DOUBTFUL = ("mirrored", "unit", "partial", "duplicate", "registration")
 
 # Thresholds, chosen on synthetic brains, cats, faces and ten bodies (docs/plausibility.md)
 ODD_SIZE = 1.8  # times the size of the others, or less than one over it
@@ -361,19 +360,46 @@ MUCH_MORE = 10.0  # times the others' share of crossing triangles, or step
 CLOSE = 2.0  # times the usual residual; a part is no mirror image
 
 
-class Doubt(NamedTuple):
-    """What looks wrong with a shape, and whether the shape is doubtful for it.
+# kind: whether nobody but the user knows what is meant, so that the shape is doubtful (an honest
+# outlier is only named); what was found beside what; the remedy, with the flags of `s4a run`
+# fmt: off
+KINDS = {
+    "dropped": (False, "{percent:.0f} % of the area was in dropped components; "
+        'components=N or "all" keeps more', "--components all keeps more of them"),
+    "unit": (True, "{ratio:.3g} times the size of the others, near {unit}: another unit, such as "
+        "mm for m? its size was kept; scale the file if that is wrong",
+        "scale the files to the unit of the others"),
+    "size": (False, "{ratio:.3g} times the size of the others; its size was kept; scale the file "
+        "if that is wrong", "scale the files, if their size is wrong"),
+    "genus": (False, "genus {genus}, but {usual} in {number} of {n} shapes; wrap=True closes "
+        "tunnels", "--wrap closes tunnels"),
+    "intersections": (False, "{number} triangles pass through others, {percent:.1f} % (in the "
+        "others {usual_percent:.1f} %); wrap=True makes a surface that does not",
+        "--wrap makes surfaces without"),
+    "duplicate": (True, "the same surface as {other}, under two names{mirrored}; leave one of them "
+        "out, or it counts twice", "keep one file of each shape"),
+    "mirrored": (True, "fits as a mirror image (ICP residual beside most others {fit:.3f} as it "
+        "is, {fit_mirrored:.3f} reflected): left for right? It is as its file has it; reflect= "
+        "mirrors it", "--reflect mirrors them, if left and right are exchanged"),
+    "partial": (True, "its holes are {value:.2g} of sqrt(area) long, of the others {usual:.2g}: is "
+        "a part cut off? Complete the scan, leave it out, or close_holes=True where it only has "
+        "holes", "scan again, or take the files away"),
+    "spacing": (False, "its coordinates are rounded, to {value:.2f} of an edge (in the others "
+        "{usual:.2f}); export it with more digits", "export the files with more digits"),
+    "kind": (False, "unlike the others: {what} {spreads:.0f} times the usual spread away; another "
+        "kind of shape, stretched, or a part? Look at it, and leave it out if it does not belong",
+        "take the files away, if of another kind"),
+    "registration": (True, "{sure} registered wrongly (badness {badness:.3f}{distortion}): look at "
+        "it in s4a view, compare its file with the template's, or leave it out",
+        "look at the page; a larger --n-coarse may help"),
+}
+# fmt: on
+# kind: attribute of the evidence, and the least that is told where it is many times the others'
+MUCH_MORE_OF = {"intersections": ("intersecting", CROSSING), "spacing": ("lattice", LATTICE)}
 
-    Parameters
-    ----------
-    kind : str
-        One word: ``mirrored``, ``unit``, ``size``, ``duplicate``, ``partial``, ``kind``,
-        ``spacing``, ``genus``, ``dropped``, ``intersections`` or ``registration``.
-    words : str
-        What was found, beside what, and what to do.
-    doubtful : bool
-        Whether it makes the shape doubtful; else it is a warning only.
-    """
+
+class Doubt(NamedTuple):
+    """What looks wrong with a shape: a key of :data:`KINDS`, its words, whether it is doubtful."""
 
     kind: str
     words: str
@@ -383,16 +409,19 @@ class Doubt(NamedTuple):
 Doubts = dict[str, list[Doubt]]  # name of a shape -> what looks wrong with it
 
 
-def doubt(kind: str, words: str, doubtful: bool | None = None) -> Doubt:
-    """A doubt of a kind; the kind says whether it makes the shape doubtful, unless it is given.
+def doubt(kind: str, doubtful: bool | None = None, **found: Any) -> Doubt:
+    """A doubt of a kind, whose words take what was `found`.
+
+    The kind says whether it makes the shape doubtful, unless that is given.
 
     Examples
     --------
     >>> from s4a.input.plausibility import doubt
-    >>> doubt("genus", "genus 1, but 0 in 5 of 6 shapes").doubtful
-    False
+    >>> doubt("genus", genus=1, usual=0, number=5, n=6).words
+    'genus 1, but 0 in 5 of 6 shapes; wrap=True closes tunnels'
     """
-    return Doubt(kind, words, kind in DOUBTFUL if doubtful is None else bool(doubtful))
+    usually, words, _ = KINDS[kind]
+    return Doubt(kind, words.format(**found), usually if doubtful is None else bool(doubtful))
 
 
 def in_words(doubts: list[Doubt]) -> str:
@@ -410,7 +439,7 @@ def find_warnings(
     attrs : dict
         Name of every shape that is used -> attributes, as of :func:`s4a.clean`.
     evidence : dict
-        Name -> :func:`s4a.input.plausibility.compare`; may be empty.
+        Name -> :func:`compare`; may be empty.
 
     Returns
     -------
@@ -420,57 +449,48 @@ def find_warnings(
     """
     told: Doubts = {name: [] for name in attrs}
     of_all: list[str] = []
-    evidence = {name: evidence[name] for name in attrs if name in evidence}
-    for name, said in attrs.items():
-        if said.get("area_dropped", 0) > AREA_DROPPED:
-            words = (
-                f"{100 * said['area_dropped']:.0f} % of the area was in dropped components; "
-                'components=N or "all" keeps more'
-            )
-            told[name].append(doubt("dropped", words))
-    _compare_sizes(attrs, told, of_all)
-    _compare_units(attrs, of_all)
-    _compare_genus(attrs, told, of_all)
-    if len(evidence) > 1:
-        _compare_intersections(evidence, told)
-        _compare_duplicates(evidence, told)
-        _compare_hands(evidence, told, of_all)
-    if len(evidence) >= ENOUGH:
-        _compare_boundaries(evidence, told)
-        _compare_lattices(evidence, told)
-        _compare_forms(evidence, told)
+    seen = {name: evidence[name] for name in attrs if name in evidence}
+    # each check yields names and doubts, and adds to `of_all` what concerns several shapes
+    checks = [_dropped(attrs), _sizes(attrs, of_all), _genus(attrs, of_all)]
+    if len(seen) > 1:
+        checks += [_much_more("intersections", seen), _duplicates(seen), _mirrored(seen, of_all)]
+    if len(seen) >= ENOUGH:
+        checks += [_boundaries(seen), _much_more("spacing", seen), _forms(seen, told)]
+    for check in checks:
+        for name, one in check:
+            told[name].append(one)
     return told, of_all
 
 
-def _compare_sizes(attrs, told, of_all):
+def _dropped(attrs):
+    for name, said in attrs.items():
+        if said.get("area_dropped", 0) > AREA_DROPPED:
+            yield name, doubt("dropped", percent=100 * said["area_dropped"])
+
+
+def _sizes(attrs, of_all):
+    """Those of another size, or unit; of two groups of sizes, the smaller group."""
     size = {n: np.log(said["area"]) / 2 for n, said in attrs.items() if said.get("area", 0) > 0}
-    names, values = list(size), np.array(list(size.values()))
-    if len(names) < 2:
-        return
+    names, values = np.array(list(size)), np.array(list(size.values()))
     group = _two_sizes(values)
     if group.any():
-        others = np.median(values[~group])
+        times = np.exp(abs(np.median(values[~group]) - np.median(values[group])))
         of_all.append(
-            f"two sizes, {np.exp(abs(others - np.median(values[group]))):.3g} times apart: "
-            f"{_listed([n for n, odd in zip(names, group, strict=True) if odd])}, and the others; "
-            "no size was changed: scale the files of one of them if their units differ"
+            f"two sizes, {times:.3g} times apart: {first_of(names[group], most=6)}, and the "
+            "others; no size was changed: scale the files of one of them if their units differ"
         )
+    _different_units(attrs, of_all)
+    if len(names) < 2:
+        return
     far = np.abs(excess(values, SIZE)) if len(names) >= ENOUGH else np.zeros(len(names))
-    for i, name in enumerate(names):
+    for i in np.flatnonzero(group) if group.any() else range(len(names)):
         usual = np.median(values[~group] if len(names) > 2 else np.delete(values, i))
         ratio = np.exp(values[i] - usual)
         off = max(ratio, 1 / ratio)
-        if group.any() and not group[i]:
-            continue
-        if off < OTHER_SIZE and not (off > ODD_SIZE and (far[i] > SPREADS or group[i])):
-            continue
-        unit = next((text for factor, text in UNITS.items() if _near(ratio, factor)), None)
-        guess = f", near {unit}: another unit, such as mm for m?" if unit else ";"
-        words = (
-            f"{ratio:.3g} times the size of the others{guess}"
-            " its size was kept; scale the file if that is wrong"
-        )
-        told[name].append(doubt("unit" if unit else "size", words, off > OTHER_SIZE or bool(unit)))
+        if off >= OTHER_SIZE or (off > ODD_SIZE and (far[i] > SPREADS or group[i])):
+            unit = next((text for factor, text in UNITS.items() if _near(ratio, factor)), None)
+            kind = "unit" if unit else "size"
+            yield names[i], doubt(kind, off > OTHER_SIZE or bool(unit), ratio=ratio, unit=unit)
 
 
 def _near(ratio, factor):
@@ -480,22 +500,21 @@ def _near(ratio, factor):
 
 def _two_sizes(values):
     """Those of the smaller of two groups of sizes far apart, of two shapes or more each, (n,)."""
+    odd = np.zeros(len(values), bool)
+    if len(values) < 4:
+        return odd
     order = np.argsort(values, kind="stable")
     step = np.diff(values[order])
-    none = np.zeros(len(values), bool)
-    if len(values) < 4:
-        return none
     cut = 1 + int(np.argmax(step))
     low, high = order[:cut], order[cut:]
     within = max(np.ptp(values[low]), np.ptp(values[high]))
-    if min(len(low), len(high)) < 2 or step[cut - 1] < max(np.log(ODD_SIZE), 2 * within):
-        return none
-    odd = low if (len(low), 0 in low) < (len(high), 0 in high) else high  # the first name stays
-    none[odd] = True
-    return none
+    if min(len(low), len(high)) >= 2 and step[cut - 1] >= max(np.log(ODD_SIZE), 2 * within):
+        # of as many on both sides the first name stays
+        odd[low if (len(low), 0 in low) < (len(high), 0 in high) else high] = True
+    return odd
 
 
-def _compare_units(attrs, of_all):
+def _different_units(attrs, of_all):
     for key in ("unit", "coordinate_system"):
         values = {name: said[key] for name, said in attrs.items() if said.get(key)}
         if len(set(values.values())) > 1:
@@ -505,7 +524,7 @@ def _compare_units(attrs, of_all):
             )
 
 
-def _compare_genus(attrs, told, of_all):
+def _genus(attrs, of_all):
     genus = {name: said["genus"] for name, said in attrs.items() if "genus" in said}
     count = Counter(genus.values())
     if len(count) < 2:
@@ -514,42 +533,22 @@ def _compare_genus(attrs, told, of_all):
     usual, number = count.most_common(1)[0]
     for name, g in genus.items():
         if g != usual and number > len(genus) / 2:
-            words = (
-                f"genus {g}, but {usual} in {number} of {len(genus)} shapes; "
-                "wrap=True closes tunnels"
-            )
-            told[name].append(doubt("genus", words))
+            yield name, doubt("genus", genus=g, usual=usual, number=number, n=len(genus))
 
 
-def _compare_intersections(evidence, told):
-    for name, share, usual in _much_more("intersecting", CROSSING, evidence):
-        words = (
-            f"{evidence[name].attrs['self_intersections']} triangles pass through others, "
-            f"{100 * share:.1f} % (in the others {100 * usual:.1f} %); "
-            "wrap=True makes a surface that does not"
-        )
-        told[name].append(doubt("intersections", words))
-
-
-def _compare_lattices(evidence, told):
-    for name, step, usual in _much_more("lattice", LATTICE, evidence):
-        words = (
-            f"its coordinates are rounded, to {step:.2f} of an edge (in the others "
-            f"{usual:.2f}); export it with more digits"
-        )
-        told[name].append(doubt("spacing", words))
-
-
-def _much_more(attr, least, evidence):
-    """Names with more than the least and many times the usual of the others; with both numbers."""
+def _much_more(kind, evidence):
+    """Those with more than the least of a number, and many times the usual of the others."""
+    attr, least = MUCH_MORE_OF[kind]
     values = np.array([seen.attrs[attr] for seen in evidence.values()])
-    for i, name in enumerate(evidence):
+    for i, (name, seen) in enumerate(evidence.items()):
         usual = max(float(np.median(np.delete(values, i))), 0.0)
         if values[i] > max(least, MUCH_MORE * usual):
-            yield name, values[i], usual
+            percent = {"percent": 100 * values[i], "usual_percent": 100 * usual}
+            number = seen.attrs["self_intersections"]
+            yield name, doubt(kind, value=values[i], usual=usual, number=number, **percent)
 
 
-def _compare_duplicates(evidence, told):
+def _duplicates(evidence):
     """Shapes with the same numbers, which no motion, no order of vertices and no format changes.
 
     A reflection changes the sign of the chirality, which of a symmetric shape is none.
@@ -563,63 +562,42 @@ def _compare_duplicates(evidence, told):
     for j, i in first.items():
         is_symmetric = abs(chirality[i] + chirality[j]) < SAME
         mirrored = " (or its mirror image)" if is_symmetric else ""
-        words = (
-            f"the same surface as {names[i]}, under two names{mirrored}; leave one of them out, "
-            "or it counts twice"
-        )
-        told[names[j]].append(doubt("duplicate", words))
+        yield names[j], doubt("duplicate", other=names[i], mirrored=mirrored)
 
 
-def _compare_hands(evidence, told, of_all):
+def _mirrored(evidence, of_all):
     """Those of the rarer hand, where the collection has a hand."""
-    names = list(evidence)
-    mean = hands(evidence)
+    fits = ("fit", "fit_mirrored")
+    names, mean = np.array(list(evidence)), hands(evidence)
     fit, fit_mirrored = (
-        np.array([np.nanmedian(seen[which]) for seen in evidence.values()])
-        for which in ("fit", "fit_mirrored")
+        np.array([np.nanmedian(seen[way]) for seen in evidence.values()]) for way in fits
     )
     usual = np.median(np.minimum(fit, fit_mirrored))
     close = (fit_mirrored < CLOSE * usual) | (fit_mirrored < fit / CLOSE)
     other = (mean < -OTHER_HAND) & close
     if np.median(np.abs(mean)) < COMMON_HAND or not other.any():
         return
-    minority = [name for name, odd in zip(names, other, strict=True) if odd]
-    majority = [name for name, odd in zip(names, other, strict=True) if not odd]
-    if len(minority) == len(majority):
+    if 2 * other.sum() == len(names):
         of_all.append(
-            f"mirror images of each other, by ICP: {_listed(majority)} and {_listed(minority)}; "
-            "kept as they are"
+            f"mirror images of each other, by ICP: {first_of(names[~other], most=6)} and "
+            f"{first_of(names[other], most=6)}; kept as they are"
         )
-    if len(names) == 2:
-        return
-    for name in minority:
+    for name in names[other] if len(names) > 2 else ():
         seen = evidence[name]
-        beside = ~np.isin(seen["reference"].values, minority)
+        beside = ~np.isin(seen["reference"].values, names[other])
         beside |= not beside.any()
-        as_is, reflected = (
-            np.nanmedian(seen[which].values[beside]) for which in ("fit", "fit_mirrored")
-        )
-        words = (
-            f"fits as a mirror image (ICP residual beside most others {as_is:.3f} as it is, "
-            f"{reflected:.3f} reflected): left for right? It is as its file has it; "
-            "reflect= mirrors it"
-        )
-        told[name].append(doubt("mirrored", words))
+        yield name, doubt("mirrored", **{w: np.nanmedian(seen[w].values[beside]) for w in fits})
 
 
-def _compare_boundaries(evidence, told):
+def _boundaries(evidence):
     length = np.array([seen.attrs["open_boundary"] for seen in evidence.values()])
     for i, (name, more) in enumerate(zip(evidence, excess(length, BOUNDARY), strict=True)):
         if more > SPREADS:
-            words = (
-                f"its holes are {length[i]:.2g} of sqrt(area) long, of the others "
-                f"{np.median(np.delete(length, i)):.2g}: is a part cut off? Complete the scan, "
-                "leave it out, or close_holes=True where it only has holes"
-            )
-            told[name].append(doubt("partial", words))
+            usual = np.median(np.delete(length, i))
+            yield name, doubt("partial", value=length[i], usual=usual)
 
 
-def _compare_forms(evidence, told):
+def _forms(evidence, told):
     """Those unlike the others; where something is told already, that may be the reason."""
     seen = list(evidence.values())
     fit = np.log([max(float(np.nanmedian(one["fit"])), 1e-9) for one in seen])
@@ -627,101 +605,63 @@ def _compare_forms(evidence, told):
     # of extents: poses change them most, so that they need more
     extents = np.abs(excess(np.array(moment).T, MOMENT)).max(1) * SPREADS / EXTENT_SPREADS
     far = {
-        "its distance from them after alignment": excess(fit, FIT),
-        "its volume for its area": np.abs(excess(compactness, COMPACTNESS)),
-        "its extents": extents,
+        "its distance from them after alignment is": excess(fit, FIT),
+        "its volume for its area is": np.abs(excess(compactness, COMPACTNESS)),
+        "its extents are": extents,
     }
     for i, name in enumerate(evidence):
-        if any(one.kind in ("partial", "duplicate") for one in told[name]):
-            continue
-        odd = {what: values[i] for what, values in far.items() if values[i] > SPREADS}
-        if odd:
-            most = max(odd, key=lambda what: odd[what])
-            words = (
-                f"unlike the others: {most} {'are' if most.endswith('s') else 'is'} "
-                f"{odd[most]:.0f} times the usual spread away; another kind of shape, stretched, "
-                "or a part? Look at it, and leave it out if it does not belong"
-            )
-            told[name].append(doubt("kind", words, odd[most] > FAR))
+        what = max(far, key=lambda what: far[what][i])
+        spreads = far[what][i]
+        known = any(one.kind in ("partial", "duplicate") for one in told[name])
+        if spreads > SPREADS and not known:
+            yield name, doubt("kind", spreads > FAR, what=what, spreads=spreads)
 
 
 def _names_by(values, prefix=""):
     """The shapes of each value: ``m: a; mm: b, c``."""
     groups = {v: [name for name in values if values[name] == v] for v in set(values.values())}
-    return "; ".join(f"{prefix}{v}: {_listed(groups[v])}" for v in sorted(groups))
-
-
-def _listed(names, most=6):
-    rest = len(names) - most
-    return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")
-
-
-# kind of a doubt: what to do about it, with the flags of `s4a run`
-REMEDIES = {
-    "mirrored": "--reflect mirrors them, if left and right are exchanged",
-    "unit": "scale the files to the unit of the others",
-    "size": "scale the files, if their size is wrong",
-    "kind": "take the files away, if of another kind",
-    "partial": "scan again, or take the files away",
-    "duplicate": "keep one file of each shape",
-    "spacing": "export the files with more digits",
-    "registration": "look at the page; a larger --n-coarse may help",
-    "genus": "--wrap closes tunnels",
-    "dropped": "--components all keeps more of them",
-    "intersections": "--wrap makes surfaces without",
-}
-OTHERWISE = "look at the page"
+    return "; ".join(f"{prefix}{v}: {first_of(groups[v], most=6)}" for v in sorted(groups))
 
 
 class Decision(NamedTuple):
-    """Shapes with a doubt of one kind, and what to do about it."""
+    """What only the user can say of some shapes: the kind of their doubts, and what to do."""
 
     kind: str
     names: list[str]
     remedy: str
 
 
-def by_kind(kinds: dict[str, str]) -> list[Decision]:
-    """One decision for each kind, that of most shapes first.
-
-    Parameters
-    ----------
-    kinds : dict of str to str
-        Name of a shape -> the kinds of its doubts, with blanks between them.
-
-    Examples
-    --------
-    >>> from s4a.input.plausibility import by_kind
-    >>> [(one.kind, one.names) for one in by_kind({"a": "unit", "b": "mirrored unit", "c": ""})]
-    [('unit', ['a', 'b']), ('mirrored', ['b'])]
-    """
+def _by_kind(kinds: dict[str, str]) -> list[Decision]:
+    """One decision for each kind, that of most shapes first; `kinds` of a shape are words."""
     names: dict[str, list[str]] = {}
     for name, words in kinds.items():
         for kind in words.split():
             names.setdefault(kind, []).append(name)
     order = sorted(names, key=lambda kind: -len(names[kind]))
-    return [Decision(kind, names[kind], REMEDIES.get(kind, OTHERWISE)) for kind in order]
+    otherwise = (False, "", "look at the page")
+    return [Decision(kind, names[kind], KINDS.get(kind, otherwise)[2]) for kind in order]
 
 
-def decisions(report: xr.Dataset) -> list[Decision]:
-    """What is to decide on the doubtful shapes of a report."""
-    return by_kind(column(report, "doubtful_kinds"))
+def decisions(report: xr.Dataset, column: str = "doubtful_kinds") -> list[Decision]:
+    """What is to decide on the doubtful shapes of a report, that of most shapes first."""
+    if column not in report:
+        return []
+    names, words = report["shape"].values.tolist(), report[column].values.tolist()
+    return _by_kind(dict(zip(names, words, strict=True)))
 
 
 def notices(report: xr.Dataset) -> list[Decision]:
     """What else looks wrong with shapes, and makes none of them doubtful."""
-    return by_kind(column(report, "warning_kinds"))
-
-
-def column(report: xr.Dataset, name: str) -> dict[str, str]:
-    """A column of text of a report by the names of the shapes; empty where it has none."""
-    if name not in report:
-        return {}
-    return dict(zip(report["shape"].values.tolist(), report[name].values.tolist(), strict=True))
+    return decisions(report, "warning_kinds")
 
 
 def doubtful_lines(kinds: dict[str, str]) -> list[str]:
     """A line for each kind: how many shapes, which, what to do.
+
+    Parameters
+    ----------
+    kinds : dict of str to str
+        Name of a shape -> the kinds of its doubts, with blanks between them.
 
     Examples
     --------
@@ -731,7 +671,7 @@ def doubtful_lines(kinds: dict[str, str]) -> list[str]:
     """
     return [
         f"{len(one.names)} {one.kind}: {listed(one.names, 50)} ({one.remedy})"
-        for one in by_kind(kinds)
+        for one in _by_kind(kinds)
     ]
 
 
@@ -744,9 +684,8 @@ def listed(names: Sequence[str], room: int, longest: int = 24) -> str:
     >>> listed(["brain_01", "brain_02", "brain_03"], 26)
     'brain_01, brain_02, 1 more'
     """
-    names = list(shortened(names, longest))
-    text = ", ".join(names)
-    shown = len(names)
+    names = shortened(names, longest)
+    text, shown = ", ".join(names), len(names)
     while len(text) > room and shown > 1:
         shown -= 1
         text = ", ".join([*names[:shown], f"{len(names) - shown} more"])

@@ -86,6 +86,16 @@ def check_there(path: AnyPath) -> None:
         pass
 
 
+@contextmanager
+def reading(path: AnyPath, what: str) -> Iterator[None]:
+    """Whatever is wrong with a file, a ValueError that names it and `what` it was read as."""
+    try:
+        yield
+    except Exception as error:  # whatever a file holds, it must not end the run over a collection
+        why = shown(error) or type(error).__name__
+        raise ValueError(f"{shown(path)} cannot be read as {what}: {why}") from error
+
+
 def read_all(file: BinaryIO) -> bytes:
     """The bytes of an open file, :data:`LARGEST_FILE` at most.
 

@@ -1,6 +1,5 @@
 """Covariates and groups of the shapes (6.1): a table on which only the statistics depend."""
 
-import csv
 import logging
 import re
 from collections.abc import Mapping, Sequence
@@ -12,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from s4a.input.annotations import is_number, table_rows
 from s4a.input.files import slug, stem_of
-from s4a.input.raw import content, shown, text_of
+from s4a.input.raw import content, reading, text_of
 from s4a.schema import covariate
 
 log = logging.getLogger(__name__)
@@ -22,10 +21,8 @@ PERSON = re.compile(r"(subject|participant|patient|person)([ _-]?(id|nr|no))?", 
 
 
 def _head_and_rows(path):
-    try:
+    with reading(path, "a table"):
         rows = table_rows(text_of(content(path)))
-    except (ValueError, csv.Error) as error:
-        raise ValueError(f"{shown(path)} cannot be read as a table: {shown(error)}") from error
     head = rows.pop(next(iter(rows)))
     if "shape" not in head:
         raise ValueError(

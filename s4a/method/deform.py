@@ -13,9 +13,10 @@ import scipy.sparse as sp
 from s4a.geometry.align import rigid_transform
 from s4a.geometry.mesh import triangle_areas
 from s4a.method.spectral import project
+from s4a.schema import Array
 
 
-def smoother(Phi: np.ndarray, area: np.ndarray, U: sp.spmatrix | None = None) -> Callable[..., Any]:
+def smoother(Phi: Array, area: Array, U: sp.spmatrix | None = None) -> Callable[..., Any]:
     """The A-orthogonal projection d -> B (B^T A B)^-1 B^T A d, B = U Phi.
 
     The paper's U Phi (U Phi)^+ d, weighted by area.  At full resolution B is not orthonormal:
@@ -48,12 +49,12 @@ def smoother(Phi: np.ndarray, area: np.ndarray, U: sp.spmatrix | None = None) ->
 
 
 def onto(
-    X: np.ndarray,
-    image: np.ndarray,
-    area: np.ndarray,
+    X: Array,
+    image: Array,
+    area: Array,
     coefficients: Callable[..., Any],
-    spectrum: tuple[np.ndarray | sp.spmatrix, np.ndarray, np.ndarray] | None = None,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    spectrum: tuple[Array | sp.spmatrix, Array, Array] | None = None,
+) -> tuple[Array, Array, Array]:
     """The motion that brings X onto its image, and the displacement that it leaves, smoothed.
 
     Parameters
@@ -79,14 +80,14 @@ def onto(
 
 
 def rigid_parts(
-    X: np.ndarray,
-    image: np.ndarray,
-    mass: np.ndarray | sp.spmatrix,
-    Phi: np.ndarray,
-    eigenvalue: np.ndarray,
+    X: Array,
+    image: Array,
+    mass: Array | sp.spmatrix,
+    Phi: Array,
+    eigenvalue: Array,
     *,
     spread: float = 3.0,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[Array, Array]:
     """For every vertex the motion that brings its surroundings closest to their image.
 
     :func:`s4a.geometry.align.rigid_transform` at every vertex, all others weighted by the heat
@@ -128,8 +129,8 @@ def rigid_parts(
 
 
 def displacement_in_template(
-    X: np.ndarray, registered: np.ndarray, area: np.ndarray, *, scale: bool = False
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    X: Array, registered: Array, area: Array, *, scale: bool = False
+) -> tuple[Array, Array, Array, float]:
     """Displacement of the template (eq. 8), in the template's frame.
 
     Image minus template: the paper's with the other sign, so that template + displacement is the
@@ -157,7 +158,7 @@ def displacement_in_template(
     return s * registered @ R.T + t - X, R, t, s
 
 
-def normal_displacement(displacement: np.ndarray, normals: np.ndarray) -> np.ndarray:
+def normal_displacement(displacement: Array, normals: Array) -> Array:
     """Signed displacement along the outward normals ``(..., n)``: positive is expansion.
 
     That is blue in Fig. 4.
@@ -165,7 +166,7 @@ def normal_displacement(displacement: np.ndarray, normals: np.ndarray) -> np.nda
     return np.einsum("...nx,nx->...n", displacement, normals)
 
 
-def distortion(X: np.ndarray, image: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def distortion(X: Array, image: Array, T: Array) -> tuple[Array, Array]:
     """Conformal and area distortion of every triangle that a map carries.
 
     With s1 >= s2 the singular values of the linear map of a triangle: log(s1 / s2), 0 where angles

@@ -47,6 +47,7 @@ from s4a.geometry.closest import closest_point_in_star, features, interpolate
 from s4a.method.joint import Warp, move, turn
 from s4a.method.shape import Basis, common_fields, field_columns
 from s4a.method.spectral import Diffusion
+from s4a.schema import Array
 
 N_STEPS = 8
 N_FURTHER = 5  # steps at most, where the last was nearly in vain
@@ -70,17 +71,13 @@ TIME = (2e-2, 2e-4)  # of local rounds: smooth over 0.2, then over 0.02 of sqrt(
 LOCAL_SLIDE = 0.5
 N_LOCAL_ROUNDS = 10
 
-Rows = np.ndarray | slice
+Rows = Array | slice
 ALL = slice(None)
 
 
 def nearest_on_surface(
-    source: Basis,
-    X: np.ndarray,
-    normals: np.ndarray,
-    target: Basis | None = None,
-    vertices: Rows = ALL,
-) -> tuple[np.ndarray, np.ndarray]:
+    source: Basis, X: Array, normals: Array, target: Basis | None = None, vertices: Rows = ALL
+) -> tuple[Array, Array]:
     """The points of the source's surface nearest to rows of X in position and normal.
 
     And in the fields that guide both. Unlike nearest vertices they do not crowd where the source is
@@ -114,8 +111,8 @@ def nearest_on_surface(
 
 
 def points_ahead(
-    source: Basis, target: Basis, X: np.ndarray, vertices: Rows = ALL
-) -> tuple[np.ndarray, np.ndarray]:
+    source: Basis, target: Basis, X: Array, vertices: Rows = ALL
+) -> tuple[Array, Array]:
     """Where the target's vertices at X are drawn, and the directions across both surfaces there.
 
     All n of them, or some.
@@ -136,12 +133,10 @@ class Landmarks(NamedTuple):
     """Landmarks that a user marked on both surfaces."""
 
     on_target: Basis  # as a surface of no triangles: X (l, 3), and U (l, n) to its low resolution
-    y: np.ndarray  # (l, 3), on the source
+    y: Array  # (l, 3), on the source
 
 
-def rim_ahead(
-    source: Basis, target: Basis, X: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
+def rim_ahead(source: Basis, target: Basis, X: Array) -> tuple[Array, Array, Array, Array] | None:
     """Where the target's boundary, its vertices at X, is drawn, if both boundaries are one line.
 
     They are where nine tenths of the vertices of each lie within :data:`RIM_NEAR` of the other.
@@ -177,20 +172,15 @@ def rim_ahead(
     return vertex, length[vertex], across, source.rim_tree.data[nearest]
 
 
-def unit(vectors: np.ndarray) -> np.ndarray:
+def unit(vectors: Array) -> Array:
     """Vectors ``(n, 3)`` of length 1; those of length 0 stay."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return vectors / np.where(length == 0, 1, length)
 
 
 def normal_equations(
-    E: np.ndarray,
-    area: np.ndarray,
-    m: np.ndarray,
-    y: np.ndarray,
-    slide: float,
-    mass: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
+    E: Array, area: Array, m: Array, y: Array, slide: float, mass: Array | None = None
+) -> tuple[Array, Array]:
     """Matrix ``(3 q, 3 q)`` and right side ``(3 q,)`` of the first term, for z = E w, w ``(q, 3)``.
 
     With W_i = slide I + (1 - slide) m_i m_i^T it is sum_i a_i (z_i - y_i)^T W_i (z_i - y_i); the
@@ -222,13 +212,13 @@ def normal_equations(
     return matrix, right.T.ravel()
 
 
-def spread_area(target: Basis, spread: np.ndarray) -> np.ndarray:
+def spread_area(target: Basis, spread: Array) -> Array:
     """The area ``(s,)`` of the vertices nearest to each of some that are spread over a surface."""
     nearest = cKDTree(target.X[spread]).query(target.X)[1]
     return np.bincount(nearest, target.area, len(spread))
 
 
-def unmixed(E: np.ndarray, area: np.ndarray) -> np.ndarray:
+def unmixed(E: Array, area: Array) -> Array:
     """B ``(q, q)`` for which E B has the vertices at the start without their smooth part.
 
     Smooth functions and the start, three columns of E before its last, nearly depend on each other,
@@ -242,8 +232,8 @@ def unmixed(E: np.ndarray, area: np.ndarray) -> np.ndarray:
 
 
 def pins(
-    landmarks: Landmarks | None, smooth: np.ndarray, R: np.ndarray, t: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    landmarks: Landmarks | None, smooth: Array, R: Array, t: Array
+) -> tuple[Array, Array, Array]:
     """E ``(l, q)``, weight and goal of landmarks, which count in all directions alike."""
     if landmarks is None:
         return np.zeros((0, smooth.shape[1] + 4)), np.zeros(0), np.zeros((0, 3))
@@ -253,7 +243,7 @@ def pins(
     return E, np.full(len(y), LANDMARK_WEIGHT), y
 
 
-def step_of(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+def step_of(matrix: Array, right: Array) -> Array:
     """The solution of normal equations ``(q, q)``, ``(q,)``.
 
     Where a surface has collapsed, single precision can leave a direction of which no point tells
@@ -272,7 +262,7 @@ def elastic_rounds(
     target: Basis,
     warp: Warp,
     *,
-    stiffness: np.ndarray = STIFFNESS,
+    stiffness: Array = STIFFNESS,
     further: int = N_FURTHER,
     slide: tuple[float, float] = SLIDE,
     rounds: int = N_ROUNDS,
@@ -415,13 +405,13 @@ def local_rounds(
     source: Basis,
     target: Basis,
     diffusion: Diffusion,
-    X: np.ndarray,
+    X: Array,
     *,
     time: tuple[float, float] = TIME,
     slide: float = LOCAL_SLIDE,
     rounds: int = N_LOCAL_ROUNDS,
-    pull: tuple[sp.csr_matrix, np.ndarray] | None = None,
-) -> np.ndarray:
+    pull: tuple[sp.csr_matrix, Array] | None = None,
+) -> Array:
     """A displacement beyond that of elastic rounds, free at every vertex of low resolution.
 
     Parameters

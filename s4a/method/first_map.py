@@ -18,6 +18,7 @@ from s4a.geometry.mesh import edges
 from s4a.method import fmap, joint
 from s4a.method.shape import Basis, common_fields, corresponding_landmarks, field_columns
 from s4a.options import check
+from s4a.schema import Array
 
 N_LANDMARKS = 10  # of step 3
 # Of a pair alone, in a far pose: signatures, functions by k_init, and weight of the orientation.
@@ -35,10 +36,10 @@ class FirstMap(NamedTuple):
     """A first map of a directed pair, and what it was made of."""
 
     name: str  # "dense", "landmarks", or of far poses that of best_first_map
-    C: np.ndarray  # (k_init, k_init)
-    fitted: np.ndarray  # (k_init, k_init), before the step of ZoomOut ahead
-    near: np.ndarray  # (n_target,), nearest neighbours in space after the motion
-    landmarks: tuple[np.ndarray, np.ndarray] | None  # of source and target, where it was fitted so
+    C: Array  # (k_init, k_init)
+    fitted: Array  # (k_init, k_init), before the step of ZoomOut ahead
+    near: Array  # (n_target,), nearest neighbours in space after the motion
+    landmarks: tuple[Array, Array] | None  # of source and target, where it was fitted so
 
 
 def motion_onto(source: Basis, target: Basis) -> Motion:
@@ -55,7 +56,7 @@ def motion_onto(source: Basis, target: Basis) -> Motion:
     return realign(source.cloud, target.cloud, (R, t))
 
 
-def nearest_after_motion(source: Basis, target: Basis, motion: Motion) -> np.ndarray:
+def nearest_after_motion(source: Basis, target: Basis, motion: Motion) -> Array:
     """The vertex of the moved source nearest to every vertex of the target ``(n_target,)``.
 
     Nearest in position and in the fields that guide both.
@@ -70,8 +71,8 @@ def nearest_after_motion(source: Basis, target: Basis, motion: Motion) -> np.nda
 
 
 def landmarks_after_motion(
-    X: np.ndarray, Y: np.ndarray, motion: Motion, n: int = N_LANDMARKS
-) -> tuple[np.ndarray, np.ndarray]:
+    X: Array, Y: Array, motion: Motion, n: int = N_LANDMARKS
+) -> tuple[Array, Array]:
     """Step 3: n spread vertices of the source, and the vertices of the target nearest to them.
 
     Parameters
@@ -94,8 +95,8 @@ def fit_after_motion(
     *,
     k_init: int = 20,
     init: str = "dense",
-    near: np.ndarray | None = None,
-) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray] | None]:
+    near: Array | None = None,
+) -> tuple[Array, tuple[Array, Array] | None]:
     """First functional map of a directed pair as it is fitted (4.1, steps 3 and 4).
 
     Parameters
@@ -133,7 +134,7 @@ def map_after_motion(
     ahead: bool = True,
     n_spread: int = 0,
     **options: Any,
-) -> np.ndarray:
+) -> Array:
     """:func:`fit_after_motion` of these options, and `ahead` one step of ZoomOut (4.2).
 
     Returns
@@ -144,7 +145,7 @@ def map_after_motion(
     return fmap.refine_once(source, target, C, n_spread) if ahead else C
 
 
-def stretch(target: Basis, X: np.ndarray) -> float:
+def stretch(target: Basis, X: Array) -> float:
     """Median |log| of the edges' lengths where the target is at X ``(n, 3)``, by its own."""
     ends = edges(target.T).T  # (2, e)
     after, before = (
@@ -156,13 +157,13 @@ def stretch(target: Basis, X: np.ndarray) -> float:
 def best_first_map(
     source: Basis,
     target: Basis,
-    C: np.ndarray,
-    fitted: np.ndarray | None = None,
+    C: Array,
+    fitted: Array | None = None,
     *,
     k: int = 60,
     step: int = 10,
     search: bool = False,
-) -> tuple[str, np.ndarray, np.ndarray]:
+) -> tuple[str, Array, Array]:
     """The best of a first map and of those from heat and from wave kernels, which no pose changes.
 
     Where both have landmarks, also of one from wave kernels and these.
@@ -214,9 +215,7 @@ def best_first_map(
     return min(tried, key=lambda one: one[0])[1:]
 
 
-def map_of_landmarks(
-    source: Basis, target: Basis, k: int
-) -> list[tuple[str, np.ndarray, np.ndarray]]:
+def map_of_landmarks(source: Basis, target: Basis, k: int) -> list[tuple[str, Array, Array]]:
     """Name, first map and its fit ``(k, k)`` of wave kernels and landmarks, if both have three."""
     landmarks = corresponding_landmarks(source, target)
     if len(landmarks[0]) < 3:
@@ -227,7 +226,7 @@ def map_of_landmarks(
 
 def maps_of_signatures(
     source: Basis, target: Basis, k: int, search: bool
-) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+) -> Iterator[tuple[str, Array, Array]]:
     """Name, first map and its fit ``(k, k)`` of heat and of wave kernels, and of a search more.
 
     The search begins with wave kernels and extremities as landmarks.
@@ -252,7 +251,7 @@ def maps_of_signatures(
         yield name, fmap.refine_once(source, target, fitted), fitted
 
 
-def extremities(basis: Basis, n: int) -> tuple[np.ndarray, np.ndarray]:
+def extremities(basis: Basis, n: int) -> tuple[Array, Array]:
     """Vertices that lie as far as possible from each other along the edges, as hands and feet do.
 
     The first is the farthest from the middle.  What is not connected with it is never taken.
@@ -264,7 +263,7 @@ def extremities(basis: Basis, n: int) -> tuple[np.ndarray, np.ndarray]:
         Between them along the edges.
     """
 
-    def distance_from(vertex: int) -> np.ndarray:
+    def distance_from(vertex: int) -> Array:
         d = dijkstra(basis.graph, indices=vertex)
         return np.where(np.isfinite(d), d, 0.0)
 
@@ -277,7 +276,7 @@ def extremities(basis: Basis, n: int) -> tuple[np.ndarray, np.ndarray]:
     return np.array(vertices), np.array(rows)[:, vertices]
 
 
-def paired_extremities(source: Basis, target: Basis) -> list[tuple[np.ndarray, np.ndarray]]:
+def paired_extremities(source: Basis, target: Basis) -> list[tuple[Array, Array]]:
     """Extremities of the source and of the target ``(5,)``: the likeliest ways to pair them.
 
     Five of one are some of seven of the other, both ways, and the likelier the better the distances

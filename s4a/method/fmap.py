@@ -10,37 +10,226 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
-import xarray as xr
 
-from s4a.method.descriptors import (
-    heat_filter,
-    landmark_coefficients,
-    landmark_signature,
-    mean_curvature,
-    multiplication,
-    orientation,
-    signature,
-    wave_filter,
-)
-from s4a.method.nearest import (
-    as_candidates,
-    as_queries,
-    nearest_float32,
-    nearest_rows,
-)
-from s4a.method.shape import Basis, Shape, common_fields
-from s4a.schema import dataset, require
+from s4a.method.nearest import as_candidates, as_queries, nearest_float32, nearest_rows
+from s4a.method.shape import Basis, common_fields
+from s4a.schema import Array
+
+
+def heat_filter(eigenvalue: Array, *others: Array, n: int = 100) -> Array:
+    """Filters exp(-t lambda) of the heat kernel at n times ``(n, k)``, each of sum 1.
+
+    Of Sun, Ovsjanikov and Guibas (2009).  The times are spaced evenly in their logarithm from 4 ln
+    10 / lambda_k to 4 ln 10 / lambda_1; with the spectra of other shapes only as far as all of them
+    reach, so that both ends of a pair are filtered alike.
+
+    Parameters
+    ----------
+    eigenvalue : float ndarray (k,)
+    *others : float ndarray (k_2,)
+        Spectra of the shapes that it is compared with.
+    n : int
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.method.fmap import heat_filter
+    >>> heat_filter(np.array([0.0, 1.0, 2.0]), n=2).round(3).tolist()
+    [[0.99, 0.01, 0.0], [1.0, 0.0, 0.0]]
+    """
+    spectra = (eigenvalue, *others)
+    shortest = 4 * np.log(10) / min(s[-1] for s in spectra)
+    longest = 4 * np.log(10) / max(s[s > 0][0] for s in spectra)
+    time = np.geomspace(shortest, longest, n)
+    kernel = np.exp(-time[:, None] * eigenvalue)  # (n, k)
+    return kernel / kernel.sum(axis=1, keepdims=True)
+
+
+def wave_filter(eigenvalue: Array, *others: Array, n: int = 100) -> Array:
+    """Filters exp(-(e - log lambda)^2 / 2 s^2) of the wave kernel at n energies ``(n, k)``.
+
+    Each of sum 1, as Aubry, Schlickewei and Cremers (2011) set them: s is 7 n-th parts of the range
+    of log lambda, and the energies are spaced evenly in that range less 2 s at both ends.  Modes of
+    eigenvalue 0 take no part.
+
+    Parameters
+    ----------
+    eigenvalue, *others, n : see :func:`heat_filter`
+    """
+    spectra = (eigenvalue, *others)
+    low = max(np.log(s[s > 0][0]) for s in spectra)
+    high = min(np.log(s[-1]) for s in spectra)
+    sigma = 7 * (high - low) / n
+    energy = np.linspace(low + 2 * sigma, high - 2 * sigma, n)
+    moving = eigenvalue > 0
+    kernel = np.zeros((n, len(eigenvalue)))
+    exponent = -((energy[:, None] - np.log(eigenvalue[moving])) ** 2) / (2 * sigma**2)
+    exponent -= exponent.max(axis=1, keepdims=True)  # no row vanishes, however far its energy is
+    kernel[:, moving] = np.exp(exponent)
+    return kernel / kernel.sum(axis=1, keepdims=True)
+
+
+def signature(Phi: Array, kernel: Array) -> Array:
+    """Signature of every vertex ``(n, f)``: the squared eigenfunctions through f filters.
+
+    It does not change with the signs of the eigenfunctions, nor between the sides of a symmetric
+    shape.
+
+    Parameters
+    ----------
+    Phi : float ndarray (n, k)
+    kernel : float ndarray (f, k)
+    """
+    return Phi**2 @ kernel.T
+
+
+def landmark_coefficients(Phi: Array, kernel: Array, landmark: Array) -> Array:
+    """Coefficients ``(k, p f)`` of the signatures around p vertices, filter by filter for each."""
+    return np.einsum("fk,pk->kpf", kernel, Phi[landmark]).reshape(Phi.shape[1], -1)
+
+
+def landmark_signature(Phi: Array, kernel: Array, landmark: Array) -> Array:
+    """Signature of every vertex around p vertices ``(n, p f)``; it tells symmetric sides apart."""
+    return Phi @ landmark_coefficients(Phi, kernel, landmark)
+
+
+def hks(Phi: Array, eigenvalue: Array, *, n: int = 100, landmark: Array | None = None) -> Array:
+    """Heat kernel signature ``(n_vertices, n)``, or around p landmarks ``(n_vertices, p n)``.
+
+    Its filters are those of :func:`heat_filter`.
+
+    Parameters
+    ----------
+    Phi : float ndarray (n_vertices, k)
+        Eigenfunctions; more than 100 change little.
+    eigenvalue : float ndarray (k,)
+    n : int
+        Times.
+    landmark : int ndarray (p,), optional
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.method.fmap import hks
+    >>> Phi = np.array([[1.0, 1.0], [1.0, -1.0]])
+    >>> hks(Phi, np.array([0.0, 9.0]), n=1).round(6).tolist()
+    [[1.0], [1.0]]
+    >>> hks(Phi, np.array([0.0, 9.0]), n=2, landmark=[0]).shape
+    (2, 2)
+    """
+    kernel = heat_filter(eigenvalue, n=n)
+    return signature(Phi, kernel) if landmark is None else landmark_signature(Phi, kernel, landmark)
+
+
+def wks(Phi: Array, eigenvalue: Array, *, n: int = 100, landmark: Array | None = None) -> Array:
+    """Wave kernel signature ``(n_vertices, n)``, or around p landmarks ``(n_vertices, p n)``.
+
+    Its filters are those of :func:`wave_filter`.  It holds finer detail than :func:`hks`, whose low
+    modes weigh on all times.
+
+    Parameters
+    ----------
+    Phi, eigenvalue, landmark : see :func:`hks`
+    n : int
+        Energies.
+    """
+    kernel = wave_filter(eigenvalue, n=n)
+    return signature(Phi, kernel) if landmark is None else landmark_signature(Phi, kernel, landmark)
+
+
+def mean_curvature(X: Array, normals: Array, area: Array, Phi: Array, eigenvalue: Array) -> Array:
+    """Signed mean curvature ``(n,)`` of the surface that k eigenfunctions keep of a mesh.
+
+    Half of <L X, normal>, L X = Phi Lambda Phi^T A X: positive where the surface bulges outwards.
+    Unlike signatures it changes with the embedding, and tells the front of a body from its back.
+
+    Parameters
+    ----------
+    X, normals : float ndarray (n, 3)
+    area : float ndarray (n,), of sum 1
+    Phi : float ndarray (n, k)
+    eigenvalue : float ndarray (k,)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.method.fmap import mean_curvature
+    >>> X = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
+    >>> mean_curvature(X, X, np.full(6, 1 / 6), 3**0.5 * X, np.full(3, 2.0)).round(6).tolist()
+    [1.0, 1.0, 1.0, 1.0, 1.0, 1.0]
+    """
+    smooth = Phi @ (eigenvalue[:, None] * (Phi.T @ (area[:, None] * X)))  # L X, (n, 3)
+    return np.einsum("nx,nx->n", smooth, normals) / 2
+
+
+def multiplication(Phi: Array, area: Array, f: Array) -> Array:
+    """Operators g -> f g in the basis: Phi^T A diag(f) Phi for d functions ``(d, k, k)``.
+
+    After Nogneng and Ovsjanikov (2017).
+
+    Parameters
+    ----------
+    Phi : float ndarray (n, k)
+    area : float ndarray (n,), of sum 1
+    f : float ndarray (n, d)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.method.fmap import multiplication
+    >>> f = np.array([[1.0, 4.0], [3.0, 4.0]])
+    >>> multiplication(np.ones((2, 1)), np.array([0.5, 0.5]), f).ravel().tolist()
+    [2.0, 4.0]
+    """
+    weighted = area[:, None] * Phi
+    return np.stack([weighted.T @ (column[:, None] * Phi) for column in f.T])
+
+
+def orientation(T: Array, Phi: Array, f: Array) -> Array:
+    """Operators g -> <grad f x grad g, normal> in the basis ``(d, k, k)``.
+
+    Of Ren, Poulenard, Wonka and Ovsjanikov (2018).  Of linear functions on a triangle its integral
+    is half the determinant of their differences along two sides: the triangle's shape drops out.
+    The operators change sign where a map turns the surface over, which tells the sides of a
+    symmetric shape apart.
+
+    Parameters
+    ----------
+    T : int ndarray (m, 3)
+        Triangles, turned the same way.
+    Phi : float ndarray (n, k)
+        Basis, orthonormal in the vertex areas.
+    f : float ndarray (n, d)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.method.fmap import orientation
+    >>> f = np.array([[0.0], [1.0], [0.0]])
+    >>> orientation(np.array([[0, 1, 2]]), np.eye(3), f).round(3)[0, 0].tolist()
+    [-0.167, 0.0, 0.167]
+    """
+    a, b, c = T.T
+    mean = Phi[T].mean(axis=1)  # (m, k)
+    along_b, along_c = Phi[b] - Phi[a], Phi[c] - Phi[a]
+    operators = []
+    for column in f.T:
+        f_b, f_c = column[b] - column[a], column[c] - column[a]
+        determinant = f_b[:, None] * along_c - f_c[:, None] * along_b  # (m, k)
+        operators.append(mean.T @ determinant / 2)
+    return np.stack(operators)
+
 
 FILTERS = {"wks": wave_filter, "hks": heat_filter}
 SCALES = (20, 40, 60, 90)  # functions that mean curvatures are of
 
 
 def fmap_from_match(
-    Phi_source: np.ndarray,
-    Phi_target: np.ndarray,
-    area_target: np.ndarray | sp.sparray | sp.spmatrix,
-    match: np.ndarray,
-) -> np.ndarray:
+    Phi_source: Array,
+    Phi_target: Array,
+    area_target: Array | sp.sparray | sp.spmatrix,
+    match: Array,
+) -> Array:
     """C = Psi^T A_N Phi[match]: the map of functions that a match gives (eq. 1 in both bases).
 
     Parameters
@@ -61,12 +250,8 @@ def fmap_from_match(
 
 
 def match_from_fmap(
-    C: np.ndarray,
-    Phi_source: np.ndarray,
-    Phi_target: np.ndarray,
-    *,
-    nearest: Callable[..., Any] = nearest_rows,
-) -> np.ndarray:
+    C: Array, Phi_source: Array, Phi_target: Array, *, nearest: Callable[..., Any] = nearest_rows
+) -> Array:
     """Nearest neighbours of the rows of Psi among those of Phi C^T (eq. 2)."""
     k_target, k_source = C.shape
     return nearest(Phi_target[:, :k_target], Phi_source[:, :k_source] @ C.T)
@@ -75,12 +260,12 @@ def match_from_fmap(
 def zoomout(
     source: Basis,
     target: Basis,
-    C: np.ndarray,
+    C: Array,
     k: int,
     *,
     step: int = 5,
     nearest: Callable[..., Any] = nearest_rows,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[Array, Array]:
     """ZoomOut (4.1; Melzi et al. 2019): C -> match -> a larger C, until it is k x k.
 
     Parameters
@@ -108,7 +293,7 @@ def zoomout(
     return C, match_from_fmap(C, source.Phi, target.Phi, nearest=nearest)
 
 
-def refine_once(source: Basis, target: Basis, C: np.ndarray, n_spread: int = 0) -> np.ndarray:
+def refine_once(source: Basis, target: Basis, C: Array, n_spread: int = 0) -> Array:
     """One step of ZoomOut without growth (4.2): C -> match -> C of the same size.
 
     Where `n_spread` is not 0, matches are looked for at as many spread vertices of the target, and
@@ -127,13 +312,13 @@ def refine_once(source: Basis, target: Basis, C: np.ndarray, n_spread: int = 0) 
 
 
 def fit(
-    F: np.ndarray,
-    G: np.ndarray,
+    F: Array,
+    G: Array,
     *,
-    penalty: np.ndarray | float = 0.0,
-    operators: Sequence[tuple[float, np.ndarray, np.ndarray]] = (),
+    penalty: Array | float = 0.0,
+    operators: Sequence[tuple[float, Array, Array]] = (),
     constant: float = 1.0,
-) -> np.ndarray:
+) -> Array:
     """The C of least energy that carries constants to constants (step 4 of 4.1).
 
     After Ovsjanikov et al. (2012).
@@ -192,7 +377,7 @@ def fit(
     return C
 
 
-def commutator(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+def commutator(source: Array, target: Array) -> Array:
     """(mu_i - lambda_j)^2 / lambda_max^2 ``(k_target, k_source)``, small where C may be large.
 
     Weighted by it, the squared entries of C say how far C is from commuting with the Laplacians.
@@ -208,11 +393,11 @@ def constant_to_constant(source: Basis, target: Basis) -> float:
 def fmap_from_landmarks(
     source: Basis,
     target: Basis,
-    landmark_source: np.ndarray,
-    landmark_target: np.ndarray,
+    landmark_source: Array,
+    landmark_target: Array,
     *,
     commute: float = 1e-3,
-) -> np.ndarray:
+) -> Array:
     """C from landmark pairs (step 4 of 4.1): heat kernels around them kept, Laplacians commute.
 
     :func:`fit` with F and G at 8 times and the penalty commute |F|^2 (mu_i - lambda_j)^2 /
@@ -247,7 +432,7 @@ def fmap_from_descriptors(
     target: Basis,
     *,
     k: int = 20,
-    landmarks: Sequence[np.ndarray] | tuple[None, None] = (None, None),
+    landmarks: Sequence[Array] | tuple[None, None] = (None, None),
     kind: str = "wks",
     n: int = 100,
     every: int = 5,
@@ -255,18 +440,30 @@ def fmap_from_descriptors(
     commute: float = 1.0,
     oriented: float = 1.0,
     curvature: float = 0.0,
-) -> np.ndarray:
-    """C ``(k, k)`` from descriptors: :func:`fit_descriptors` for two bases.
+) -> Array:
+    """C ``(k, k)`` fitted on descriptors, with or without landmarks (step 4 of 4.1).
+
+    :func:`fit` of E(C) = |C F - G|^2 / |F|^2 + laplacian sum (mu_i - lambda_j)^2 C_ij^2 /
+    lambda_max^2 + commute sum |C P - Q C|^2 / sum |P|^2, where F and G are the coefficients of the
+    descriptors, P and Q the products with them, and the same once more with `oriented` for the
+    operators that a mirror image turns over.  Descriptors are taken with all functions that there
+    are, less their mean, scaled to norm 1.
 
     Parameters
     ----------
     source, target : Basis
         With all functions that there are; the triangles are for `oriented`.  The fields that guide
         both are descriptors too.
+    k : int
+        Size of the map.
     landmarks : tuple of int ndarray (p,)
-        Corresponding vertices.
-    kind, n, every, laplacian, commute, oriented : see :func:`fit_descriptors`
-        Of several kinds, "hks+wks", the signatures of all.
+        Corresponding vertices; descriptors around each are added to those of the shapes.
+    kind : {"wks", "hks", "hks+wks"}
+        Wave or heat kernel signatures, or both.
+    n, every : int
+        Of n energies or times every `every`-th is used: neighbours are nearly equal.
+    laplacian, commute, oriented : float
+        Weights against that of preserving the descriptors; 0 leaves a term out.
     curvature : float
         Weight of signed mean curvatures at four scales beside a signature.
     """
@@ -309,7 +506,7 @@ def fmap_from_descriptors(
     )
 
 
-def curvature_gap(source: Basis, target: Basis, match: np.ndarray) -> float:
+def curvature_gap(source: Basis, target: Basis, match: Array) -> float:
     """How far the signed mean curvature of matched vertices differs, by its spread on the target.
 
     0 where it is the same, about 1 where one says nothing of the other.  Front and back of a body,
@@ -326,7 +523,7 @@ def curvature_gap(source: Basis, target: Basis, match: np.ndarray) -> float:
     return float(target.area @ np.abs(H - G) / spread)
 
 
-def curvatures(end: Basis) -> list[np.ndarray]:
+def curvatures(end: Basis) -> list[Array]:
     """Signed mean curvatures ``(n,)`` of an end by :data:`SCALES` of its functions."""
     return [
         mean_curvature(end.X, end.normals, end.area, end.Phi[:, :k], end.eigenvalue[:k])
@@ -334,92 +531,12 @@ def curvatures(end: Basis) -> list[np.ndarray]:
     ]
 
 
-def fit_descriptors(
-    source: xr.Dataset,
-    target: xr.Dataset,
-    *,
-    k: int = 20,
-    landmarks: tuple[Any, ...] | None = None,
-    kind: str = "wks",
-    n: int = 100,
-    every: int = 5,
-    laplacian: float = 1e-3,
-    commute: float = 1.0,
-    oriented: float = 1.0,
-) -> xr.Dataset:
-    """Fit of a functional map on descriptors, with or without landmarks (step 4 of 4.1).
-
-    :func:`fit` of E(C) = |C F - G|^2 / |F|^2 + laplacian sum (mu_i - lambda_j)^2 C_ij^2 /
-    lambda_max^2 + commute sum |C P - Q C|^2 / sum |P|^2, where F and G are the coefficients of the
-    descriptors, P and Q the products with them, and the same once more with `oriented` for the
-    operators that a mirror image turns over.  Descriptors are taken with all eigenfunctions that
-    the meshes have, less their mean, scaled to norm 1.
-
-    Parameters
-    ----------
-    source, target : Dataset
-        Meshes with their spectrum, as of :func:`s4a.spectrum`; at either resolution.
-    k : int
-        Size of the map.
-    landmarks : tuple of int array_like (p,), optional
-        Corresponding vertices of source and target; descriptors around each are added to those of
-        the shapes.
-    kind : {"wks", "hks"}
-    n, every : int
-        Of n energies or times every `every`-th is used: neighbours are nearly equal.
-    laplacian, commute, oriented : float
-        Weights against that of preserving the descriptors; 0 leaves a term out.
-
-    Returns
-    -------
-    Dataset
-        ``fmap(mode_target, mode_source)``, k x k.
-
-    Raises
-    ------
-    ValueError
-        When a mesh lacks its spectrum or has fewer than k eigenfunctions, or the options are not as
-        above.
-    """
-    if kind not in FILTERS:
-        raise ValueError(f"kind must be 'wks' or 'hks', found {kind!r}")
-    variables = ("position", "corner_vertex", "vertex_area", "eigenvalue", "eigenfunction")
-    for mesh, what in ((source, "source"), (target, "target")):
-        require(mesh, *variables, what=what)
-        if mesh.sizes["mode"] < k:
-            raise ValueError(
-                f"the {what} needs {k} eigenfunctions, found {mesh.sizes['mode']}: give a smaller k"
-            )
-    vertices: tuple[Any, ...] = (
-        (None, None) if landmarks is None else tuple(np.asarray(v) for v in landmarks)
-    )
-    if landmarks is not None and (
-        len(vertices) != 2 or vertices[0].shape != vertices[1].shape or vertices[0].ndim != 1
-    ):
-        raise ValueError(
-            f"landmarks need as many vertices of the source as of the target, found {landmarks!r}"
-        )
-    C = fmap_from_descriptors(
-        Shape(coarse=source).low,
-        Shape(coarse=target).low,
-        k=k,
-        landmarks=vertices,
-        kind=kind,
-        n=n,
-        every=every,
-        laplacian=laplacian,
-        commute=commute,
-        oriented=oriented,
-    )
-    return dataset(fmap=C)
-
-
-def orthogonality_error(C: np.ndarray) -> float:
+def orthogonality_error(C: Array) -> float:
     """|C^T C - I|_F / sqrt(k): 0 for a map that preserves areas."""
     return float(np.linalg.norm(C.T @ C - np.eye(C.shape[1])) / np.sqrt(C.shape[1]))
 
 
-def off_diagonal_mass(C: np.ndarray) -> float:
+def off_diagonal_mass(C: Array) -> float:
     """Share of the squared entries of C that is not on its diagonal.
 
     0 for a map between equal spectra.
@@ -435,7 +552,7 @@ def off_diagonal_mass(C: np.ndarray) -> float:
 
 
 def swapped_blocks(
-    C: np.ndarray, *, longest: int = 6, inside: float = 0.75, diagonal: float = 0.5
+    C: Array, *, longest: int = 6, inside: float = 0.75, diagonal: float = 0.5
 ) -> list[tuple[int, int]]:
     """Runs of modes that the map exchanges among each other (Fig. 2).
 

@@ -22,21 +22,22 @@ from s4a.method.fmap import fmap_from_match
 from s4a.method.nearest import nearest_rows
 from s4a.method.shape import Basis, corresponding_landmarks
 from s4a.method.spectral import project
+from s4a.schema import Array
 
 FAR = 0.035  # between shapes of one pose the tenth that is farthest lies nearer, see `far_apart`
 
-Warp = tuple[np.ndarray, np.ndarray, np.ndarray]
+Warp = tuple[Array, Array, Array]
 
 
 class Candidate(NamedTuple):
     """A registration at low resolution, and its score without truth (lower is better)."""
 
     score: float
-    match: np.ndarray
+    match: Array
     warp: Warp
 
 
-def turn(target: Basis, R: np.ndarray, t: np.ndarray) -> np.ndarray:
+def turn(target: Basis, R: Array, t: Array) -> Array:
     """R x + t for every vertex ``(n, 3)``, with one R and t for all, or one a low vertex."""
     if R.ndim == 2:
         return target.X @ R.T + t
@@ -47,13 +48,13 @@ def turn(target: Basis, R: np.ndarray, t: np.ndarray) -> np.ndarray:
     return np.einsum("nij,nj->ni", R.reshape(-1, 3, 3), target.X) + t
 
 
-def move(target: Basis, warp: Warp) -> np.ndarray:
+def move(target: Basis, warp: Warp) -> Array:
     """The registered target R x + t + Phi c ``(n, 3)``."""
     R, t, c = warp
     return turn(target, R, t) + target.field(c)
 
 
-def nearest_vertices(source: Basis, moved: Basis) -> np.ndarray:
+def nearest_vertices(source: Basis, moved: Basis) -> Array:
     """The vertices ``(s,)`` of the source nearest in position and normal to the registered target.
 
     To its vertices near coarse ones, which at low resolution are all.
@@ -61,15 +62,13 @@ def nearest_vertices(source: Basis, moved: Basis) -> np.ndarray:
     return source.tree.query(features(moved.X, moved.normals)[moved.near_coarse])[1]
 
 
-def fit_warp(source: Basis, target: Basis, match: np.ndarray) -> Warp:
+def fit_warp(source: Basis, target: Basis, match: Array) -> Warp:
     """The warp that brings the target's vertices near coarse ones onto their matches ``(s,)``."""
     rows = target.near_coarse
     return onto(target.X[rows], source.X[match], target.area[rows], target.coefficients)
 
 
-def warp_after(
-    source: Basis, target: Basis, match: np.ndarray, motion: Motion, ratio: float
-) -> Warp:
+def warp_after(source: Basis, target: Basis, match: Array, motion: Motion, ratio: float) -> Warp:
     """The warp after a given motion instead of a fitted one: eq. 8 and the line after it.
 
     The source moves by ``ratio R x + t``; what is left to its vertices, matched by the target's
@@ -93,7 +92,7 @@ def warp_after(
 def low_rounds(
     source: Basis,
     target: Basis,
-    match: np.ndarray,
+    match: Array,
     *,
     k_first: int = 30,
     k: int = 100,
@@ -101,7 +100,7 @@ def low_rounds(
     rounds: int = 2,
     spectral: float = 0.0,
     by_parts: bool = False,
-) -> tuple[np.ndarray, Warp]:
+) -> tuple[Array, Warp]:
     """Joint rounds on low-resolution meshes, for K = k_first, k_first + step, ..., k.
 
     Parameters
@@ -147,7 +146,7 @@ def low_rounds(
 
 def dense_rounds(
     source: Basis, target: Basis, warp: Warp, *, rounds: int = 3
-) -> tuple[np.ndarray, Warp]:
+) -> tuple[Array, Warp]:
     """Joint rounds at full resolution, on vertices near coarse ones; motions of parts stay.
 
     Parameters
@@ -180,7 +179,7 @@ def dense_rounds(
 def registration_score(
     source: Basis,
     target: Basis,
-    match: np.ndarray,
+    match: Array,
     moved: Basis,
     *,
     n_samples: int = 300,
@@ -218,7 +217,7 @@ def registration_score(
     return float(trip.mean() + gap.mean() + back_gap.mean() + landmark_gap(source, target, X))
 
 
-def landmark_gap(source: Basis, target: Basis, X: np.ndarray) -> float:
+def landmark_gap(source: Basis, target: Basis, X: Array) -> float:
     """Mean distance of the landmarks that both have, the target's vertices at X; 0 without any."""
     at_source, at_target = corresponding_landmarks(source, target)
     if len(at_source) == 0:
@@ -226,7 +225,7 @@ def landmark_gap(source: Basis, target: Basis, X: np.ndarray) -> float:
     return float(np.linalg.norm(X[at_target] - source.X[at_source], axis=1).mean())
 
 
-def far_apart(source: Basis, target: Basis, match: np.ndarray) -> bool:
+def far_apart(source: Basis, target: Basis, match: Array) -> bool:
     """Whether poses differ: a tenth of the target lies far from its match after a rigid motion.
 
     Far is 0.035 and 0.4 of the mean spacing 1 / sqrt(n) of the source's vertices, which alone keeps
@@ -239,7 +238,7 @@ def far_apart(source: Basis, target: Basis, match: np.ndarray) -> bool:
     return bool(np.quantile(gap, 0.9) > FAR + 0.4 / np.sqrt(len(source.X)))
 
 
-def as_given(source: Basis, target: Basis, starts: dict[str, np.ndarray]) -> dict[str, Candidate]:
+def as_given(source: Basis, target: Basis, starts: dict[str, Array]) -> dict[str, Candidate]:
     """Registrations at low resolution: every start (n_target,) as it is, with its score."""
     return {
         name: scored(source, target, match, fit_warp(source, target, match))
@@ -247,7 +246,7 @@ def as_given(source: Basis, target: Basis, starts: dict[str, np.ndarray]) -> dic
     }
 
 
-def scored(source: Basis, target: Basis, match: np.ndarray, warp: Warp) -> Candidate:
+def scored(source: Basis, target: Basis, match: Array, warp: Warp) -> Candidate:
     """A registration with its score."""
     score = registration_score(source, target, match, target.moved_to(move(target, warp)))
     return Candidate(score, match, warp)
@@ -256,7 +255,7 @@ def scored(source: Basis, target: Basis, match: np.ndarray, warp: Warp) -> Candi
 def candidates(
     source: Basis,
     target: Basis,
-    starts: dict[str, np.ndarray],
+    starts: dict[str, Array],
     *,
     k: int = 100,
     far: float = 0.03,

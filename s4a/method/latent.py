@@ -10,12 +10,16 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import xarray as xr
 from joblib import effective_n_jobs
 from scipy.sparse.csgraph import breadth_first_order
 from scipy.sparse.linalg import LinearOperator, eigsh
 from scipy.spatial import cKDTree
 
+from s4a.geometry.align import Motion, realign
+from s4a.method.first_map import first_map
 from s4a.method.fmap import fmap_from_match
+from s4a.method.median import area_differences, conformal_differences, distance_to_identity
 from s4a.method.nearest import (
     as_candidates,
     as_queries,
@@ -24,9 +28,16 @@ from s4a.method.nearest import (
     nearest_float32,
     nearest_rows,
 )
-from s4a.method.network import cycle_errors, cycle_weights, in_threads, three_cycles
+from s4a.method.network import (
+    cycle_errors,
+    cycle_weights,
+    in_threads,
+    spectral_distance,
+    three_cycles,
+)
 from s4a.method.shape import Basis
 from s4a.options import N_SPREAD, PER_FUNCTION
+from s4a.schema import Array, dataset
 
 log = logging.getLogger(__name__)
 
@@ -36,14 +47,14 @@ WIDE = 4  # last rounds of Consistent ZoomOut, which look between the samples, t
 N_AROUND = 32  # vertices around a sample among which they look
 ROUGH, FINE = 1e-4, 1e-6  # tolerances of the latent basis: on the way, and at the end
 
-Form = Callable[[np.ndarray], np.ndarray]  # the product of a quadratic form with vectors
+Form = Callable[[Array], Array]  # the product of a quadratic form with vectors
 
 
 def consistency_form(
-    C: np.ndarray,
-    source: np.ndarray,
-    target: np.ndarray,
-    weight: np.ndarray,
+    C: Array,
+    source: Array,
+    target: Array,
+    weight: Array,
     n: int,
     *,
     dtype: type = float,
@@ -111,7 +122,7 @@ def consistency_form(
     return apply
 
 
-def spanning_start(C: np.ndarray, source: np.ndarray, target: np.ndarray, n: int) -> np.ndarray:
+def spanning_start(C: Array, source: Array, target: Array, n: int) -> Array:
     """The first guess of all Y ``(n, k, k)``: maps composed along a tree.
 
     Its root, where Y is the identity, is the shape from which most maps start.
@@ -135,8 +146,8 @@ def spanning_start(C: np.ndarray, source: np.ndarray, target: np.ndarray, n: int
 
 
 def smallest_eigenvectors(
-    apply: Form, start: np.ndarray, *, tolerance: float = FINE, max_rounds: int = 100
-) -> np.ndarray:
+    apply: Form, start: Array, *, tolerance: float = FINE, max_rounds: int = 100
+) -> Array:
     """The eigenvectors of the smallest eigenvalues of a positive semi-definite form ``(n, m)``.
 
     Chebyshev-filtered subspaces (Zhou, Saad, Tiago, Chelikowsky 2006): each round damps all above
@@ -173,9 +184,7 @@ def smallest_eigenvectors(
     return V[:, :m]
 
 
-def chebyshev_filter(
-    apply: Form, V: np.ndarray, least: float, cut: float, top: float
-) -> np.ndarray:
+def chebyshev_filter(apply: Form, V: Array, least: float, cut: float, top: float) -> Array:
     """T(L) V, with T the Chebyshev polynomial that is small on [cut, top] and 1 at `least`.
 
     Of degree d it damps by about cosh(2 d sqrt(cut / top)): by ten with the degree taken here.
@@ -194,16 +203,16 @@ def chebyshev_filter(
 
 
 def latent_basis(
-    C: np.ndarray,
-    source: np.ndarray,
-    target: np.ndarray,
-    weight: np.ndarray,
-    eigenvalues: np.ndarray,
+    C: Array,
+    source: Array,
+    target: Array,
+    weight: Array,
+    eigenvalues: Array,
     m: int | None = None,
     *,
     tolerance: float = FINE,
     n_jobs: int | None = 1,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[Array, Array]:
     """Canonical consistent latent basis of a network of functional maps.
 
     Minimises sum w |C_ij Y_i - Y_j|^2 under sum Y_i^T Y_i = n I, then turns the latent space so
@@ -255,20 +264,20 @@ def latent_size(n_latent: int | None, k: int, k_final: int) -> int:
 
 def consistent_zoomout(
     bases: Sequence[Basis],
-    C: np.ndarray,
-    source: np.ndarray,
-    target: np.ndarray,
+    C: Array,
+    source: Array,
+    target: Array,
     k: int,
     *,
     step: int = 5,
     n_latent: int | None = None,
     weights: str = "cycles",
-    samples: list[np.ndarray] | None = None,
+    samples: list[Array] | None = None,
     wide: int = WIDE,
     n_jobs: int | None = 1,
     progress: Callable[..., Any] | None = None,
     keep: Callable[..., Any] | None = None,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[Array, Array, Array, Array, Array]:
     """Consistent ZoomOut (4.2): latent basis -> matches -> larger maps, until all are k x k.
 
     Each round embeds every shape in the latent space (rows of Phi_i Y_i), matches nearest
@@ -359,11 +368,11 @@ class Sampled(NamedTuple):
     vertices nearest to each, ``around (s, w)``.
     """
 
-    eigenvalue: np.ndarray
-    at: np.ndarray
-    Phi: np.ndarray
-    area: np.ndarray
-    around: np.ndarray
+    eigenvalue: Array
+    at: Array
+    Phi: Array
+    area: Array
+    around: Array
     n: int  # vertices of the shape
 
 
@@ -378,7 +387,7 @@ def check_samples(sampled: list[Sampled], k: int) -> None:
         )
 
 
-def sample(basis: Basis, vertex: np.ndarray | None, k: int, n_around: int) -> Sampled:
+def sample(basis: Basis, vertex: Array | None, k: int, n_around: int) -> Sampled:
     """A shape at some of its vertices, or at all where None, and so many around each."""
     eigenvalue = basis.eigenvalue[:k]
     if vertex is None:
@@ -394,13 +403,13 @@ def sample(basis: Basis, vertex: np.ndarray | None, k: int, n_around: int) -> Sa
 
 def larger_maps(
     sampled: list[Sampled],
-    Y: np.ndarray,
-    source: np.ndarray,
-    target: np.ndarray,
+    Y: Array,
+    source: Array,
+    target: Array,
     k: int,
     bases: Sequence[Basis] | None,
     n_jobs: int | None = 1,
-) -> np.ndarray:
+) -> Array:
     """Maps ``(p, k, k)`` from the matches of latent functions (eq. 3), one step of ZoomOut each.
 
     Parameters
@@ -445,18 +454,14 @@ def larger_maps(
 
 
 def sample_matches(
-    sampled: list[Sampled],
-    Y: np.ndarray,
-    source: np.ndarray,
-    target: np.ndarray,
-    n_jobs: int | None = 1,
-) -> list[np.ndarray]:
+    sampled: list[Sampled], Y: Array, source: Array, target: Array, n_jobs: int | None = 1
+) -> list[Array]:
     """For every map, the source's sample that is nearest to each of the target's (eq. 3).
 
     Maps there and back between two shapes take one matrix product.
     """
     row = {pair: r for r, pair in enumerate(zip(source.tolist(), target.tolist(), strict=True))}
-    match: list[np.ndarray] = [np.empty(0, np.int64)] * len(row)
+    match: list[Array] = [np.empty(0, np.int64)] * len(row)
 
     def functions(i):
         return as_candidates(sampled[i].Phi[:, : Y.shape[1]] @ Y[i])
@@ -475,7 +480,7 @@ def sample_matches(
     return match
 
 
-def frozen_basis(C_out: np.ndarray, C_in: np.ndarray, Y: np.ndarray) -> np.ndarray:
+def frozen_basis(C_out: Array, C_in: Array, Y: Array) -> Array:
     """Latent basis of one shape from its maps to and from others whose bases stay (eq. 3).
 
     One block of the unknowns of :func:`latent_basis`: minimises
@@ -509,13 +514,13 @@ def frozen_basis(C_out: np.ndarray, C_in: np.ndarray, Y: np.ndarray) -> np.ndarr
 def latent_basis_of_new(
     new: Basis,
     others: list[Basis],
-    Y: np.ndarray,
-    C: list[np.ndarray],
+    Y: Array,
+    C: list[Array],
     *,
     step: int = 5,
     n_spread: int = N_SPREAD,
     rounds: int = 2,
-) -> np.ndarray:
+) -> Array:
     """Latent basis of a new shape, those of all others frozen: Consistent ZoomOut of one shape.
 
     It starts from the first maps of the others; in every round the rows of the first latent
@@ -570,3 +575,84 @@ def latent_basis_of_new(
             C_in.append(fmap_from_match(Psi, Phi, new.mass, nearest_rows(query, functions)))
         y = frozen_basis(np.stack(C_out), np.stack(C_in), Y[:FINAL])
     return y
+
+
+NEIGHBOURS = 6  # shapes of the network whose maps a new one has
+
+
+def nearest_spectra(own: Array, others: Sequence[Array], k: int) -> list[int]:
+    """The first of the others, and five whose first k eigenvalues are most like its `own`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.method.latent import nearest_spectra
+    >>> spectra = [np.array([0.0, i, 2 * i]) for i in (9, 1, 5, 2, 8, 3, 7, 4)]
+    >>> nearest_spectra(np.array([0.0, 1, 2]), spectra, 3)
+    [0, 1, 3, 5, 7, 2]
+    """
+    distance = spectral_distance([values[:k] for values in (own, *others)])[0]
+    order = np.argsort(distance[2:], kind="stable")  # without itself and the first
+    return [0, *(1 + order[: NEIGHBOURS - 1]).tolist()]
+
+
+def place(
+    new: Basis,
+    others: list[Basis],
+    Y: Array,
+    starts: list[Motion],
+    *,
+    k_init: int = 20,
+    step: int = 5,
+    n_spread: int = N_SPREAD,
+    **options: Any,
+) -> Array:
+    """Latent basis of a new shape from its maps to others, whose bases stay.
+
+    Parameters
+    ----------
+    new : Basis
+    others : list of Basis
+        Of :func:`nearest_spectra`.
+    Y : float ndarray (p, k, m)
+        Their latent bases.
+    starts : list of tuple (R, t)
+        About the rigid motions of the new shape onto each of them.
+    k_init, step, n_spread : see :func:`s4a.analyse`
+    **options
+        Of :func:`s4a.method.first_map.first_map`.
+
+    Returns
+    -------
+    float ndarray (k, m)
+    """
+    maps = []
+    for other, start in zip(others, starts, strict=True):
+        R, t = realign(new.cloud, other.cloud, start)
+        back = R.T, -R.T @ t
+        maps.append(first_map(other, new, back, k_init=k_init, n_spread=n_spread, **options).C)
+    return latent_basis_of_new(new, others, Y, maps, step=step, n_spread=n_spread)
+
+
+def latent_of_new(Y: Array, eigenvalues: Array, latent_eigenvalue: Array, norm: str) -> xr.Dataset:
+    """``/latent`` of new shapes: bases, shape differences, distances to the limit shape (eq. 5).
+
+    Parameters
+    ----------
+    Y : float ndarray (n, k, m)
+    eigenvalues : float ndarray (n, >= k)
+        Of the shapes, for unit area.
+    latent_eigenvalue : float ndarray (m,)
+        Of the network.
+    norm : see :func:`s4a.analyse`
+    """
+    D = area_differences(Y)
+    # one by one, so that the last digit does not depend on the others
+    distance = [distance_to_identity(one[None], latent_eigenvalue, norm)[0] for one in D]
+    return dataset(
+        latent_basis=Y,
+        latent_eigenvalue=latent_eigenvalue,
+        area_difference=D,
+        conformal_difference=conformal_differences(Y, eigenvalues, latent_eigenvalue),
+        distance_to_median=np.array(distance),
+    )

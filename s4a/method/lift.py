@@ -17,7 +17,7 @@ from s4a.method.remesh import coarsen, laplacian
 from s4a.method.scalable import reduced
 from s4a.method.shape import Shape, features_of, vertices_of_landmarks
 from s4a.method.spectral import factor, spectrum, with_constant_first
-from s4a.schema import dataset
+from s4a.schema import Array, dataset
 
 SPARE = 10  # functions more than are asked for: the last ones of a span are the least exact
 ROUNDS = 4  # of the smoother
@@ -25,12 +25,8 @@ LEAST = 0.05  # it acts in LEAST..1 of its spectrum 0..1; below the coarse mesh 
 
 
 def smooth(
-    S: sp.csr_matrix,
-    R: np.ndarray,
-    B: np.ndarray,
-    rounds: int = ROUNDS,
-    least: float = LEAST,
-) -> np.ndarray:
+    S: sp.csr_matrix, R: Array, B: Array, rounds: int = ROUNDS, least: float = LEAST
+) -> Array:
     """Chebyshev iteration for S B = R ``(n, k)``, with eigenvalues of S in 0..1, from B.
 
     It damps what lies in least..1, and enlarges nothing.
@@ -60,13 +56,13 @@ def smooth(
 
 def inverse_step(
     W: sp.csr_matrix,
-    area: np.ndarray,
+    area: Array,
     U: sp.csr_matrix,
     W_coarse: sp.csr_matrix,
-    area_coarse: np.ndarray,
-    Phi: np.ndarray,
-    eigenvalue: np.ndarray,
-) -> np.ndarray:
+    area_coarse: Array,
+    Phi: Array,
+    eigenvalue: Array,
+) -> Array:
     r"""One cycle of two grids for W B = A (U Phi) Lambda, from B = U Phi.
 
     ::
@@ -104,9 +100,7 @@ def inverse_step(
     return smooth(S, R, B)
 
 
-def rayleigh_ritz(
-    W: sp.csr_matrix, area: np.ndarray, B: np.ndarray, k: int
-) -> tuple[np.ndarray, np.ndarray]:
+def rayleigh_ritz(W: sp.csr_matrix, area: Array, B: Array, k: int) -> tuple[Array, Array]:
     """The k least eigenpairs in the span of B: eigenvalues ``(k,)`` and functions ``(n, k)``."""
     stiff = B.T @ (W.astype(B.dtype) @ B)
     mass = B.T @ (area.astype(B.dtype)[:, None] * B)
@@ -117,13 +111,8 @@ def rayleigh_ritz(
 
 
 def lift(
-    X: np.ndarray,
-    T: np.ndarray,
-    area: np.ndarray,
-    U: sp.csr_matrix,
-    coarse: xr.Dataset,
-    k: int,
-) -> tuple[np.ndarray, np.ndarray]:
+    X: Array, T: Array, area: Array, U: sp.csr_matrix, coarse: xr.Dataset, k: int
+) -> tuple[Array, Array]:
     """The first k eigenfunctions of a mesh, nearly, from k or more of its coarse mesh.
 
     Parameters
@@ -205,9 +194,7 @@ def lifted(mesh: xr.Dataset, low: xr.Dataset, k: int) -> xr.Dataset:
     turn = np.linalg.inv(np.linalg.cholesky(Phi.T @ (area[:, None] * Phi))).T
     B = B @ turn.astype(B.dtype)
     functions = dataset(
-        eigenvalue=eigenvalue,
-        eigenfunction=B[vertex].astype(float),
-        lifted_eigenfunction=B,
+        eigenvalue=eigenvalue, eigenfunction=B[vertex].astype(float), lifted_eigenfunction=B
     )
     mesh_alone = low.drop_vars(["eigenvalue", "eigenfunction"])
     return mesh_alone.merge(functions).assign_attrs(low.attrs)
@@ -248,7 +235,7 @@ def low_resolution(
     return low
 
 
-def mean_over_cells(shape: Shape, values: np.ndarray) -> np.ndarray:
+def mean_over_cells(shape: Shape, values: Array) -> Array:
     """Means of a field ``(n,)`` by the weights of U ``(n_coarse,)``; NaN where none is known."""
     known = np.isfinite(values)
     area = np.where(known, vertex_areas(*as_arrays(shape.original)), 0)

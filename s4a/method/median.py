@@ -4,7 +4,7 @@ import numpy as np
 import xarray as xr
 
 from s4a.method.pca import gram_pca
-from s4a.schema import dataset, require
+from s4a.schema import Array, dataset, require
 
 # |(Lambda^0)^a (D - I) (Lambda^0)^-b|_F: the powers a and b of each reading of eq. 5's norm
 NORMS = {
@@ -16,7 +16,7 @@ NORMS = {
 }
 
 
-def area_differences(Y: np.ndarray) -> np.ndarray:
+def area_differences(Y: Array) -> Array:
     """D_i = Y_i^T Y_i ``(n, m, m)``: how each shape's areas differ from the latent mean.
 
     After Huang et al. (2019); Y ``(n, k, m)`` are the consistent latent bases.
@@ -24,9 +24,7 @@ def area_differences(Y: np.ndarray) -> np.ndarray:
     return np.einsum("nkl,nkm->nlm", Y, Y)
 
 
-def conformal_differences(
-    Y: np.ndarray, eigenvalues: np.ndarray, latent_eigenvalue: np.ndarray
-) -> np.ndarray:
+def conformal_differences(Y: Array, eigenvalues: Array, latent_eigenvalue: Array) -> Array:
     """(Lambda^0)^+ Y_i^T Lambda_i Y_i ``(n, m, m)``: how Dirichlet energies differ.
 
     Constant modes are zero.
@@ -38,7 +36,7 @@ def conformal_differences(
     return inverse(latent_eigenvalue)[None, :, None] * D
 
 
-def inverse(latent_eigenvalue: np.ndarray, power: float = 1.0) -> np.ndarray:
+def inverse(latent_eigenvalue: Array, power: float = 1.0) -> Array:
     """Diagonal ``(m,)`` of ((Lambda^0)^+)^power, whose powers may be negative.
 
     Constant modes map to 0.
@@ -47,16 +45,14 @@ def inverse(latent_eigenvalue: np.ndarray, power: float = 1.0) -> np.ndarray:
     return np.where(constant, 0.0, np.where(constant, 1.0, latent_eigenvalue) ** -power)
 
 
-def constant_modes(latent_eigenvalue: np.ndarray) -> np.ndarray:
+def constant_modes(latent_eigenvalue: Array) -> Array:
     """Which latent functions are constant on every component, ``(m,)``: one for each component."""
     constant = latent_eigenvalue < 1e-6 * np.max(latent_eigenvalue, initial=0.0)
     constant[:1] = True
     return constant
 
 
-def distance_to_identity(
-    D: np.ndarray, latent_eigenvalue: np.ndarray, norm: str = "h2"
-) -> np.ndarray:
+def distance_to_identity(D: Array, latent_eigenvalue: Array, norm: str = "h2") -> Array:
     """E(M_i) = |D_i - I| of eq. 5 ``(n,)``.
 
     The paper writes the norm of H_0^2, in which |f| = |Lambda^0 f|, and does not say of what D - I
@@ -76,7 +72,7 @@ def distance_to_identity(
     return np.linalg.norm(weighted[:, varying][:, :, varying], axis=(1, 2))
 
 
-def difference_pca(D: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def difference_pca(D: Array) -> tuple[Array, Array]:
     """PCA of vectorised operators ``(n, m, m)`` (3.6).
 
     Scores ``(n, n - 1)`` in the unit of the operators and shares of variance ``(n - 1,)``.
@@ -89,7 +85,7 @@ def difference_pca(D: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.pad(score, ((0, 0), (0, empty))), np.pad(modes.ratio, (0, empty))
 
 
-def median_shape(latent: xr.Dataset, eigenvalues: np.ndarray, *, norm: str = "h2") -> xr.Dataset:
+def median_shape(latent: xr.Dataset, eigenvalues: Array, *, norm: str = "h2") -> xr.Dataset:
     """Shape differences of a collection, its distances to the limit shape, and the median (eq. 5).
 
     Parameters
@@ -127,7 +123,7 @@ def median_shape(latent: xr.Dataset, eigenvalues: np.ndarray, *, norm: str = "h2
     return latent.assign(differences.data_vars).assign_attrs(latent.attrs, median=median, norm=norm)
 
 
-def near_ties(distance: np.ndarray, *, within: float = 0.05) -> list[int]:
+def near_ties(distance: Array, *, within: float = 0.05) -> list[int]:
     """Indices of the shapes at most the share `within` farther than the nearest, nearest first.
 
     More than one says that the median is a choice among near equals.

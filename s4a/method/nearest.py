@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from s4a.geometry.mesh import counting_order
+from s4a.schema import Array
 
 BLOCK = 512  # cells of queries whose distances to all other cells are held at once
 PAIRS = 2048  # pairs of rows at a time: their differences, 0.8 MB in 100 dims, stay in the cache
@@ -26,7 +27,7 @@ AROUND = 128  # queries whose rows around are gathered at once, 1.6 MB of 32 in 
 SLACK = 1 + 1e-5  # factor on bounds, for what float32 rounds away
 
 
-def nearest_rows(Q: np.ndarray, D: np.ndarray, *, block: int = 256) -> np.ndarray:
+def nearest_rows(Q: Array, D: Array, *, block: int = 256) -> Array:
     """For every row of Q the index of the nearest row of D (Euclidean): KnnSearch of eq. 2, 3, 6.
 
     All are compared, by blocks of one matrix product each.  The product is of (q, -1) and
@@ -61,20 +62,18 @@ def nearest_rows(Q: np.ndarray, D: np.ndarray, *, block: int = 256) -> np.ndarra
     return nearest
 
 
-def as_queries(Q: np.ndarray) -> np.ndarray:
+def as_queries(Q: Array) -> Array:
     """(q, -1) for the rows of Q ``(n, d + 1)`` in single precision."""
     return np.column_stack([Q, np.full(len(Q), -1)]).astype(np.float32)
 
 
-def as_candidates(D: np.ndarray) -> np.ndarray:
+def as_candidates(D: Array) -> Array:
     """(d, |d|^2 / 2) for the rows of D, as columns ``(d + 1, p)`` in single precision."""
     d = np.asarray(D, np.float32)
     return np.ascontiguousarray(np.column_stack([d, np.einsum("ij,ij->i", d, d) / 2]).T)
 
 
-def scores_in_blocks(
-    q: np.ndarray, d: np.ndarray, block: int = 256
-) -> Iterator[tuple[int, np.ndarray]]:
+def scores_in_blocks(q: Array, d: Array, block: int = 256) -> Iterator[tuple[int, Array]]:
     """The matrix product q d block by block: first row, and block; all in one array."""
     scores = np.empty((min(block, len(q)), d.shape[1]), np.float32)
     for start in range(0, len(q), block):
@@ -82,7 +81,7 @@ def scores_in_blocks(
         yield start, np.matmul(part, d, out=scores[: len(part)])
 
 
-def nearest_float32(q: np.ndarray, d: np.ndarray) -> np.ndarray:
+def nearest_float32(q: Array, d: Array) -> Array:
     """:func:`nearest_rows` up to the rounding of single precision, for matrices made once.
 
     They are those of :func:`as_queries` and :func:`as_candidates`.
@@ -90,7 +89,7 @@ def nearest_float32(q: np.ndarray, d: np.ndarray) -> np.ndarray:
     return np.concatenate([score.argmax(axis=1) for _, score in scores_in_blocks(q, d)])
 
 
-def nearest_both_ways(q: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def nearest_both_ways(q: Array, d: Array) -> tuple[Array, Array]:
     """For every row of q the nearest of d, and the other way, from one matrix product.
 
     The first as of :func:`nearest_float32`; of the second, d's term of the distance is the same for
@@ -119,7 +118,7 @@ def nearest_both_ways(q: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndar
     return of_q, of_d
 
 
-def nearest_around(q: np.ndarray, rows: np.ndarray, near: np.ndarray) -> np.ndarray:
+def nearest_around(q: Array, rows: Array, near: Array) -> Array:
     """The nearest of a few rows, others for each query.
 
     Parameters
@@ -158,19 +157,19 @@ def nearest_around(q: np.ndarray, rows: np.ndarray, near: np.ndarray) -> np.ndar
 class Cells:
     """Rows sorted by cell: ``rows[start[c]:start[c + 1]]`` are those of cell c."""
 
-    rows: np.ndarray  # (n, d) float32
-    order: np.ndarray  # (n,) original index of each row
-    start: np.ndarray  # (cells + 1,)
-    center: np.ndarray  # (cells, d)
-    radius: np.ndarray  # (cells,) greatest distance of a row to the centre
+    rows: Array  # (n, d) float32
+    order: Array  # (n,) original index of each row
+    start: Array  # (cells + 1,)
+    center: Array  # (cells, d)
+    radius: Array  # (cells,) greatest distance of a row to the centre
 
     @property
-    def size(self) -> np.ndarray:
+    def size(self) -> Array:
         """Number of rows of each cell."""
         return np.diff(self.start)
 
 
-def into_cells(rows: np.ndarray, cell: np.ndarray) -> Cells:
+def into_cells(rows: Array, cell: Array) -> Cells:
     """Rows `(n, d)` grouped by their cell number `(n,)`; cells are those in use."""
     _, cell = np.unique(cell, return_inverse=True)
     count = np.bincount(cell)
@@ -182,7 +181,7 @@ def into_cells(rows: np.ndarray, cell: np.ndarray) -> Cells:
     return Cells(rows, order, start, center, np.maximum.reduceat(gap, start[:-1]) * SLACK)
 
 
-def squared_distances(A: np.ndarray, B: np.ndarray) -> np.ndarray:
+def squared_distances(A: Array, B: Array) -> Array:
     """All squared distances ``(a, b)`` of float32 rows by one matrix product."""
     D = A @ B.T
     D *= -2
@@ -191,7 +190,7 @@ def squared_distances(A: np.ndarray, B: np.ndarray) -> np.ndarray:
     return np.maximum(D, 0, out=D)
 
 
-def least_distances(A: np.ndarray, B: np.ndarray) -> np.ndarray:
+def least_distances(A: Array, B: Array) -> Array:
     """Distances ``(a, b)`` of float32 rows, reduced by what rounding may have added."""
     D = squared_distances(A, B)
     largest = np.einsum("ij,ij->i", A, A).max() + np.einsum("ij,ij->i", B, B).max()
@@ -199,9 +198,7 @@ def least_distances(A: np.ndarray, B: np.ndarray) -> np.ndarray:
     return np.sqrt(np.maximum(D, 0, out=D), out=D)
 
 
-def search_cells(
-    queries: np.ndarray, origin: np.ndarray, cells: Cells, which: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def search_cells(queries: Array, origin: Array, cells: Cells, which: Array) -> tuple[Array, Array]:
     """The nearest row of the cells `which` for each of `queries`, all compared with all.
 
     `queries` are relative to `origin`, a point near them, and the rows are made so: then small
@@ -222,8 +219,8 @@ def search_cells(
 
 
 def search_pairs(
-    queries: np.ndarray, cells: Cells, who: np.ndarray, which: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    queries: Array, cells: Cells, who: Array, which: Array
+) -> tuple[Array, Array, Array]:
     """Compare the query ``who[i]`` with the rows of the cell ``which[i]``; `who` is sorted.
 
     Returns
@@ -248,18 +245,14 @@ def search_pairs(
     return who, least, np.minimum.reduceat(index, head)
 
 
-def keep_nearer(
-    best: np.ndarray, index: np.ndarray, who: np.ndarray, gap: np.ndarray, found: np.ndarray
-) -> None:
+def keep_nearer(best: Array, index: Array, who: Array, gap: Array, found: Array) -> None:
     """Write in place what is nearer, or as near with a lower index, for the queries `who`."""
     nearer = (gap < best[who]) | ((gap == best[who]) & (found < index[who]))
     best[who[nearer]] = gap[nearer]
     index[who[nearer]] = found[nearer]
 
 
-def nearest_of_few(
-    Q: np.ndarray, D: np.ndarray, cell_d: np.ndarray, *, block: int = 256
-) -> np.ndarray:
+def nearest_of_few(Q: Array, D: Array, cell_d: Array, *, block: int = 256) -> Array:
     """:func:`nearest_in_cells` for queries that are few and far apart, as one in every cell.
 
     All at once, in pairs.  Where the bound leaves nothing out, all pairs of a block are compared: 1
@@ -304,8 +297,8 @@ def nearest_of_few(
 
 
 def nearest_in_cells(
-    Q: np.ndarray, cell_q: np.ndarray, D: np.ndarray, cell_d: np.ndarray, *, first: int = 12
-) -> tuple[np.ndarray, float, float]:
+    Q: Array, cell_q: Array, D: Array, cell_d: Array, *, first: int = 12
+) -> tuple[Array, float, float]:
     """For every row of Q the index of the nearest row of D, exactly up to float32 rounding.
 
     Where several rows are equally near, one of them is given.
@@ -367,8 +360,8 @@ def nearest_in_cells(
 
 
 def not_excluded(
-    rows: np.ndarray, origin: np.ndarray, cells: Cells, reach: np.ndarray, bound: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+    rows: Array, origin: Array, cells: Cells, reach: Array, bound: Array
+) -> tuple[Array, Array]:
     """Queries for which a row nearer than their `bound` is possible, and the cells it can be in.
 
     `reach` is the least distance of each cell to any query; each query's own distance to the centre

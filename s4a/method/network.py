@@ -14,8 +14,10 @@ from joblib import effective_n_jobs
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra, shortest_path
 
+from s4a.schema import Array
 
-def spectral_distance(eigenvalues: np.ndarray | list[np.ndarray]) -> np.ndarray:
+
+def spectral_distance(eigenvalues: Array | list[Array]) -> Array:
     """Distances of shapes by their spectra ``(n, n)``: RMS difference of log eigenvalues.
 
     Parameters
@@ -27,7 +29,7 @@ def spectral_distance(eigenvalues: np.ndarray | list[np.ndarray]) -> np.ndarray:
     return np.sqrt(((x[:, None] - x[None]) ** 2).mean(axis=2))
 
 
-def choose_pairs(distance: np.ndarray, n_pairs: int) -> np.ndarray:
+def choose_pairs(distance: Array, n_pairs: int) -> Array:
     """The unordered pairs of a network: connected, with as many triangles as the budget allows.
 
     First a minimum spanning tree (connectivity), then for every shape a second edge to a neighbour
@@ -73,7 +75,7 @@ def choose_pairs(distance: np.ndarray, n_pairs: int) -> np.ndarray:
     return np.stack(np.divmod(np.sort(chosen), n), axis=1)
 
 
-def tree_and_closing(distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def tree_and_closing(distance: Array) -> tuple[Array, Array]:
     r"""Edges of a minimum spanning tree, and one more for each new shape that closes a triangle.
 
     Prim's algorithm from the most central shape.  A new shape is joined with its nearest shape in
@@ -111,7 +113,7 @@ def tree_and_closing(distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.array(tree), np.array(closing, int).reshape(-1, 2)
 
 
-def by_nearness(distance: np.ndarray) -> np.ndarray:
+def by_nearness(distance: Array) -> Array:
     """All pairs ``(n (n-1) / 2, 2)``, first those that are nearest for one of their two shapes."""
     apart = distance.copy()
     np.fill_diagonal(apart, np.inf)
@@ -121,7 +123,7 @@ def by_nearness(distance: np.ndarray) -> np.ndarray:
     return np.stack([i, j], axis=1)[order]
 
 
-def three_cycles(source: list[int], target: list[int]) -> np.ndarray:
+def three_cycles(source: list[int], target: list[int]) -> Array:
     """Rows of the directed maps i -> j, j -> k, k -> i that close a 3-cycle ``(c, 3)``.
 
     Each cycle comes once.
@@ -150,9 +152,7 @@ def three_cycles(source: list[int], target: list[int]) -> np.ndarray:
     return np.array(cycles, np.int64).reshape(-1, 3)
 
 
-def cycle_errors(
-    C: np.ndarray, cycles: np.ndarray, k: int | None = None, *, n_jobs: int | None = 1
-) -> np.ndarray:
+def cycle_errors(C: Array, cycles: Array, k: int | None = None, *, n_jobs: int | None = 1) -> Array:
     """How far each map is from closing its 3-cycles: mean |C_ki C_jk C_ij - I|_F / sqrt(k).
 
     Of the product only the first `k` rows and columns are looked at, all by default; maps of
@@ -186,7 +186,7 @@ def cycle_errors(
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def cycle_weights(error: np.ndarray) -> np.ndarray:
+def cycle_weights(error: Array) -> Array:
     """Weights exp(-(e / s)^2 / 2) of the maps from their cycle errors, s the median error ``(p,)``.
 
     Maps in no cycle get the median weight; a network without 3-cycles gets plain weights of 1.  No
@@ -199,7 +199,7 @@ def cycle_weights(error: np.ndarray) -> np.ndarray:
     return np.maximum(np.where(known, w, np.nanmedian(w)), 0.01)
 
 
-def connectivity(pairs: np.ndarray, n: int) -> dict[str, int]:
+def connectivity(pairs: Array, n: int) -> dict[str, int]:
     """How well unordered pairs connect n shapes.
 
     Parameters
@@ -236,7 +236,7 @@ def connectivity(pairs: np.ndarray, n: int) -> dict[str, int]:
     }
 
 
-def nearest_by_maps(pairs: np.ndarray, n: int, first: list[int], most: int) -> np.ndarray:
+def nearest_by_maps(pairs: Array, n: int, first: list[int], most: int) -> Array:
     """The shapes that the fewest maps lead to from some of them, these included.
 
     Parameters

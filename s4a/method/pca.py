@@ -13,7 +13,7 @@ import xarray as xr
 
 from s4a.geometry.mesh import vertex_normals
 from s4a.method.deform import normal_displacement, smoother
-from s4a.schema import dataset, in_unit, require, unit_of
+from s4a.schema import Array, dataset, in_unit, require, unit_of
 
 BLOCK = 2**24  # numbers of all fields in a block of vertices: 128 MiB
 N_READ = 8  # blocks that are read from files at once, in single precision as they are there
@@ -27,16 +27,14 @@ class PrincipalModes(NamedTuple):
     and of variance 1 (divisor s - 1); ``ratio (c,)``, shares of the variance, descending.
     """
 
-    mean: np.ndarray
-    deformation: np.ndarray
-    standard_deviation: np.ndarray
-    score: np.ndarray
-    ratio: np.ndarray
+    mean: Array
+    deformation: Array
+    standard_deviation: Array
+    score: Array
+    ratio: Array
 
 
-def gram(
-    fields: np.ndarray | xr.Variable, area: np.ndarray, mean: np.ndarray | None = None
-) -> np.ndarray:
+def gram(fields: Array | xr.Variable, area: Array, mean: Array | None = None) -> Array:
     """Inner products of fields ``(s, n, d)`` under the areas scaled to sum 1, ``(s, s)``.
 
     Parameters
@@ -77,7 +75,7 @@ def blocks(shape: tuple[int, ...]) -> Iterator[slice]:
         yield slice(begin, begin + size)
 
 
-def parts(fields: np.ndarray | xr.Variable) -> Iterator[tuple[slice, np.ndarray]]:
+def parts(fields: Array | xr.Variable) -> Iterator[tuple[slice, Array]]:
     """The :func:`blocks` of fields ``(s, n, d)`` and their values, of files read some at a time."""
     own = list(blocks(fields.shape))
     for i in range(0, len(own), N_READ):
@@ -88,12 +86,12 @@ def parts(fields: np.ndarray | xr.Variable) -> Iterator[tuple[slice, np.ndarray]
             yield block, values[:, block.start - begin : block.stop - begin]
 
 
-def center_gram(K: np.ndarray) -> np.ndarray:
+def center_gram(K: Array) -> Array:
     """Gram matrix ``(s, s)`` of the fields less their mean, from that of the fields."""
     return K - K.mean(0) - K.mean(1)[:, None] + K.mean()
 
 
-def principal_components(K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def principal_components(K: Array) -> tuple[Array, Array]:
     """Variances ``(c,)`` and unit eigenvectors ``(s, c)`` of a Gram matrix, largest first.
 
     The matrix is centred first.  The divisor of the variances is s - 1; components without variance
@@ -109,7 +107,7 @@ def principal_components(K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return fitted.eigenvalues_ / (len(K) - 1), fitted.eigenvectors_
 
 
-def gram_pca(fields: np.ndarray | xr.Variable, area: np.ndarray) -> PrincipalModes:
+def gram_pca(fields: Array | xr.Variable, area: Array) -> PrincipalModes:
     """PCA of fields under the inner product of the vertex areas.
 
     Parameters
@@ -138,7 +136,7 @@ def gram_pca(fields: np.ndarray | xr.Variable, area: np.ndarray) -> PrincipalMod
     return PrincipalModes(mean, deformation, np.sqrt(variance), V * np.sqrt(s - 1), ratio)
 
 
-def low_vertices(coarse: xr.Dataset) -> np.ndarray:
+def low_vertices(coarse: xr.Dataset) -> Array:
     """For every coarse vertex the original vertex in which U weighs it most ``(n_coarse,)``.
 
     Of SCALABLE the vertex that the sample is.
@@ -152,7 +150,7 @@ def low_vertices(coarse: xr.Dataset) -> np.ndarray:
     return heaviest
 
 
-def smooth_low(d: np.ndarray, coarse: xr.Dataset, *, area_weighted: bool = True) -> np.ndarray:
+def smooth_low(d: Array, coarse: xr.Dataset, *, area_weighted: bool = True) -> Array:
     """Displacements at low resolution ``(s, n_coarse, 3)``, smoothed as those at full: Phi Phi^+ d.
 
     The line after eq. 8 without U, in the eigenfunctions of the coarse mesh, so that Fig. 5
@@ -173,7 +171,7 @@ def smooth_low(d: np.ndarray, coarse: xr.Dataset, *, area_weighted: bool = True)
 
 def pca(
     registration: xr.Dataset,
-    area: np.ndarray,
+    area: Array,
     *,
     coarse: xr.Dataset | None = None,
     area_weighted: bool = True,
@@ -244,7 +242,7 @@ def pca(
     return result.assign_coords(shape=registration["shape"])
 
 
-def synthesize(study: xr.DataTree, scores: np.ndarray) -> xr.Dataset:
+def synthesize(study: xr.DataTree, scores: Array) -> xr.Dataset:
     """The shape with given scores: template + mean displacement + sum of score times deformation.
 
     Parameters
@@ -303,7 +301,7 @@ def synthesize(study: xr.DataTree, scores: np.ndarray) -> xr.Dataset:
     return in_unit(mesh, unit_of(template["position"]))
 
 
-def apply_scores(mean: np.ndarray, deformation: np.ndarray, scores: np.ndarray) -> np.ndarray:
+def apply_scores(mean: Array, deformation: Array, scores: Array) -> Array:
     """The mean shape ``(n, 3)`` moved by the scores ``(c,)`` along the deformations ``(c, n, 3)``.
 
     Examples
@@ -318,7 +316,7 @@ def apply_scores(mean: np.ndarray, deformation: np.ndarray, scores: np.ndarray) 
     return mean + np.tensordot(scores, deformation[: len(scores)], axes=1)
 
 
-def mahalanobis(scores: np.ndarray) -> float:
+def mahalanobis(scores: Array) -> float:
     """Mahalanobis distance of a shape from the mean: the length of its scores, of unit variance.
 
     Examples
@@ -330,7 +328,7 @@ def mahalanobis(scores: np.ndarray) -> float:
     return float(np.linalg.norm(scores))
 
 
-def plausible_scores(n: int, *, seed: int | None = None, limit: float = 3.0) -> np.ndarray:
+def plausible_scores(n: int, *, seed: int | None = None, limit: float = 3.0) -> Array:
     """Scores ``(n,)`` of a random shape: normal, those beyond the limit drawn again.
 
     Examples
@@ -347,12 +345,7 @@ def plausible_scores(n: int, *, seed: int | None = None, limit: float = 3.0) -> 
 
 
 def color_limits(
-    mean: np.ndarray,
-    triangles: np.ndarray,
-    deformation: np.ndarray,
-    *,
-    sigma: float = 3,
-    n_modes: int = 3,
+    mean: Array, triangles: Array, deformation: Array, *, sigma: float = 3, n_modes: int = 3
 ) -> tuple[float, float]:
     """Displacements of the full colours: along the normal, and in length.
 
@@ -366,12 +359,8 @@ def color_limits(
 
 
 def project_scores(
-    d: np.ndarray,
-    mean: np.ndarray,
-    deformation: np.ndarray,
-    standard_deviation: np.ndarray,
-    area: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
+    d: Array, mean: Array, deformation: Array, standard_deviation: Array, area: Array
+) -> tuple[Array, Array]:
     """Scores of displacements on given modes, and what the modes leave.
 
     Parameters

@@ -10,24 +10,115 @@ import numpy as np
 import xarray as xr
 
 from s4a.geometry.align import Motion
-from s4a.geometry.closest import closest_point_in_star, match_surfaces
-from s4a.geometry.mesh import as_arrays, vertex_areas
+from s4a.geometry.closest import closest_point_in_star, interpolate, match_surfaces
+from s4a.geometry.mesh import as_arrays, triangle_areas, vertex_areas
 from s4a.method import joint
-from s4a.method.confidence import confidence
-from s4a.method.deform import displacement_in_template
-from s4a.method.elastic import (
-    STIFFNESS,
-    Landmarks,
-    elastic_rounds,
-    local_rounds,
-    starts_that_meet,
-)
+from s4a.method.deform import displacement_in_template, distortion
+from s4a.method.elastic import STIFFNESS, Landmarks, elastic_rounds, local_rounds, starts_that_meet
 from s4a.method.first_map import nearest_after_motion
 from s4a.method.fmap import fmap_from_match
 from s4a.method.nearest import nearest_in_cells, nearest_of_few, nearest_rows
 from s4a.method.shape import Basis, Shape
 from s4a.options import check
-from s4a.schema import INPUT, dataset, in_unit
+from s4a.schema import INPUT, Array, dataset, in_unit
+
+RIGHT = 0.01  # share of sqrt(area): errors below are right
+LEAST = 1e-4  # added to gap and stretch: what is below is noise of the mesh
+# w_0, and those of the logarithms of gap and stretch: docs/decisions.md
+WEIGHTS = (-12.06, -1.46, -1.58)
+
+
+def stretch(X: Array, image: Array, T: Array) -> Array:
+    """How much a map stretches the triangles around every vertex ``(n,)``.
+
+    The root mean square over their areas of sqrt(log(s1)^2 + log(s2)^2), s1 and s2 the singular
+    values of a triangle's linear map.
+
+    Parameters
+    ----------
+    X, image : float ndarray (n, 3)
+        The vertices, and where the map takes them.
+    T : int ndarray (m, 3)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.method.register import stretch
+    >>> X, T = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]])
+    >>> image = X * [2.0, 0.5, 1.0]  # of the same area
+    >>> bool(np.allclose(stretch(X, image, T), np.sqrt(2) * np.log(2)))
+    True
+    """
+    conformal, area = distortion(X, image, T)
+    before = triangle_areas(X, T)
+    squared = (area**2 + conformal**2) / 2  # log(s1)^2 + log(s2)^2
+    squared = np.minimum(np.where(np.isnan(squared), 0.0, squared), 100.0)  # points, collapsed ones
+    corners = T.ravel()
+    total, weight = (
+        np.bincount(corners, np.repeat(values, 3), len(X)) for values in (before * squared, before)
+    )
+    return np.sqrt(total / np.maximum(weight, np.finfo(float).tiny))
+
+
+def evidence(source: Shape, target: Shape, match: Array, P: Array) -> Array:
+    """Logarithms of gap and stretch, smooth over the template ``(n_target, 2)``.
+
+    Parameters
+    ----------
+    source, target : Shape
+        The shape and the template.
+    match : int ndarray (n_target,)
+        Near which vertex of the shape each vertex of the template lies.
+    P : float ndarray (n_target, 3)
+        The registered template, in the frame of the shape.
+    """
+    X, T, near = target.full.X, target.full.T, target.near_coarse  # what is smooth is known there
+    Y, S = source.full.X, source.full.T
+    place = closest_point_in_star(P[near], match[near], Y, S, source.full.stars)
+    gap = np.linalg.norm(P[near] - interpolate(Y, S, *place), axis=1)  # share of sqrt(area)
+    beside = np.zeros(len(X), bool)
+    beside[near] = True
+    around = T[beside[T].any(axis=1)]
+    found = np.log(np.stack([gap, stretch(X, P, around)[near]], axis=1) + LEAST)
+    return target.full.field(target.full.coefficients(found))
+
+
+def confidence(source: Shape, target: Shape, match: Array, P: Array) -> Array:
+    """Probability ``(n_target,)`` that a vertex lies within 1 % of sqrt(area) of its true place.
+
+    Parameters
+    ----------
+    source, target, match, P : see :func:`evidence`
+    """
+    w_0, *w = WEIGHTS
+    doubt = -(w_0 + evidence(source, target, match, P) @ np.array(w))
+    return 1 / (1 + np.exp(np.clip(doubt, -50, 50)))
+
+
+def uncertainty(confidence: Array) -> Array:
+    """Root of the mean squared error of a match that is this sure, as a share of sqrt(area).
+
+    A confidence is the share of such vertices within 1 % of sqrt(area) of the truth.  Where errors
+    are Gaussian in the plane, that is 1 - exp(-0.01^2 / r^2) for the radius r.
+
+    Parameters
+    ----------
+    confidence : ndarray (p,)
+        Below 0.1 it counts as 0.1, which is a radius of 3 %.
+
+    Returns
+    -------
+    ndarray (p,)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.method.register import uncertainty
+    >>> uncertainty(np.array([0.1, 0.63, 1.0])).round(3).tolist()
+    [0.031, 0.01, 0.003]
+    """
+    return RIGHT / np.sqrt(-np.log1p(-np.clip(confidence, 0.1, 1 - 1e-6)))
+
 
 # |log| of the ratio of areas at the hundredth of the template that changes most, above which it may
 # lie on a wrong fold
@@ -39,12 +130,12 @@ LOOSER = 4  # the step of elastic rounds with which they begin then, too
 # leave 0.3 to 0.72; real heads 0.81 or more where the score falls at all (docs/decisions.md)
 MENDED = 0.75
 
-Functions = tuple[np.ndarray, np.ndarray]  # of source and target, rows of which are compared
+Functions = tuple[Array, Array]  # of source and target, rows of which are compared
 
 
 def match_low(
     source: Shape, target: Shape, bases: Functions, *, how: str = "ours"
-) -> tuple[np.ndarray, Functions]:
+) -> tuple[Array, Functions]:
     """Match at low resolution (eq. 6), and the functions whose rows full resolution compares.
 
     Parameters
@@ -78,7 +169,7 @@ def latent_functions(source: Shape, target: Shape, bases: Functions) -> Function
     return source.functions(Y_source), target.functions(Y_target)
 
 
-def mapped_functions(source: Shape, target: Shape, match: np.ndarray, k: int) -> Functions:
+def mapped_functions(source: Shape, target: Shape, match: Array, k: int) -> Functions:
     """Phi C^T and Psi with the k x k map C of the match of eq. 3: the standard way's, for eq. 4."""
     Phi = source.low.Phi[:, :k]
     C = fmap_from_match(Phi, target.low.Phi[:, :k], target.low.mass, match)
@@ -86,8 +177,8 @@ def mapped_functions(source: Shape, target: Shape, match: np.ndarray, k: int) ->
 
 
 def match_functions(
-    source: Shape, target: Shape, F_source: np.ndarray, F_target: np.ndarray
-) -> tuple[np.ndarray, float, float]:
+    source: Shape, target: Shape, F_source: Array, F_target: Array
+) -> tuple[Array, float, float]:
     """Match at full resolution by nearest rows of U F: eq. 7 with F = Phi Y, eq. 4 with Phi C^T.
 
     Functions that have a row for every original vertex are taken as they are.
@@ -103,9 +194,7 @@ def match_functions(
     return nearest_in_cells(queries, target.cell, rows, source.cell)
 
 
-def sharpen_map(
-    source: Shape, target: Shape, C: np.ndarray, B: np.ndarray | None = None
-) -> np.ndarray:
+def sharpen_map(source: Shape, target: Shape, C: Array, B: Array | None = None) -> Array:
     """One more round of ZoomOut: coarse target vertices look among all vertices of the source.
 
     ZoomOut on the coarse meshes can only match coarse vertices, half their spacing off; that noise
@@ -174,7 +263,7 @@ def from_latent(
 def register(
     source: Shape,
     target: Shape,
-    starts: dict[str, np.ndarray],
+    starts: dict[str, Array],
     functions: Functions,
     motion: Motion,
     *,
@@ -277,8 +366,8 @@ def register(
 class Placed(NamedTuple):
     """A motion s R x + t in the unit of the input, and the ratio of sizes that it leaves."""
 
-    R: np.ndarray
-    t: np.ndarray
+    R: Array
+    t: Array
     s: float
     ratio: float
 
@@ -298,7 +387,7 @@ def motion_in_unit(source: Shape, target: Shape, motion: Motion, scale: bool) ->
 def find_candidates(
     source: Shape,
     target: Shape,
-    starts: dict[str, np.ndarray],
+    starts: dict[str, Array],
     *,
     k: int = 100,
     refine: str = "elastic",
@@ -336,7 +425,7 @@ def register_surface(
     placed: tuple[Motion, float] | None = None,
     *,
     elastic: bool = False,
-) -> tuple[np.ndarray, Basis, dict[str, Any]]:
+) -> tuple[Array, Basis, dict[str, Any]]:
     """The template registered at full resolution: the best of the finalists of low resolution.
 
     Parameters
@@ -429,7 +518,7 @@ def mends(end: tuple[float, Basis], torn: tuple[float, Basis], target: Basis) ->
     return after < MENDED * before
 
 
-def scored_alone(source: Basis, target: Basis, X: np.ndarray) -> tuple[float, Basis]:
+def scored_alone(source: Basis, target: Basis, X: Array) -> tuple[float, Basis]:
     """Score of the registered target, matched by what is nearest to it, and that target."""
     moved = target.moved_to(X)
     match = joint.nearest_vertices(source, moved)
@@ -443,7 +532,7 @@ def elastic_surfaces(
     landmarks: Landmarks | None = None,
     *,
     looser: bool = False,
-) -> dict[str, np.ndarray]:
+) -> dict[str, Array]:
     """The template ``(n_target, 3)`` after elastic rounds from several starts, and local ones.
 
     Starts that meet go on as one, see :func:`s4a.method.elastic.starts_that_meet`.  Where the end
@@ -477,7 +566,7 @@ def common_landmarks(source: Shape, target: Shape) -> Landmarks | None:
 
 def after_local_rounds(
     source: Shape, target: Shape, warp: joint.Warp, landmarks: Landmarks | None = None
-) -> np.ndarray:
+) -> Array:
     """The template ``(n_target, 3)`` after a warp, by parts or not, and local rounds."""
     low = target.low_on_surface
     pull = None
@@ -488,7 +577,7 @@ def after_local_rounds(
     return joint.move(target.full, warp) + target.U @ d
 
 
-def way_back(source: Basis, moved: Basis) -> tuple[np.ndarray, np.ndarray]:
+def way_back(source: Basis, moved: Basis) -> tuple[Array, Array]:
     """For every vertex of the source the closest point of the registered template.
 
     The nearest template vertex in position and normal is looked up first, then the closest point on
@@ -510,9 +599,7 @@ def way_back(source: Basis, moved: Basis) -> tuple[np.ndarray, np.ndarray]:
     return closest_point_in_star(source.X, nearest, moved.X, moved.T)
 
 
-def round_trip(
-    target: Shape, match: np.ndarray, triangle: np.ndarray, barycentric: np.ndarray
-) -> np.ndarray:
+def round_trip(target: Shape, match: Array, triangle: Array, barycentric: Array) -> Array:
     """Length of the way template -> shape -> template ``(n_target,)``, as a share of sqrt(area)."""
     X = target.full.X
     corner = X[target.full.T[triangle[match]]]  # (n_target, 3 corners, 3)
@@ -520,7 +607,7 @@ def round_trip(
     return np.linalg.norm(back - X, axis=1)
 
 
-def log_area_ratio(image: np.ndarray, X: np.ndarray, T: np.ndarray) -> np.ndarray:
+def log_area_ratio(image: Array, X: Array, T: Array) -> Array:
     """log(a / A) for every vertex ``(n,)``: its share of the area after and before registration.
 
     0 where nothing is stretched but the size as a whole.
@@ -553,7 +640,7 @@ def identity(template: Shape) -> xr.Dataset:
     last = np.cumsum(np.bincount(T.ravel(), minlength=len(X))) - 1
     corner = np.argsort(T.ravel(), kind="stable")[last]
     zero = np.zeros(X.shape, np.float32)
-    low: dict[str, np.ndarray] = {}
+    low: dict[str, Array] = {}
     if template.coarse:
         n_low = template.coarse.sizes["vertex"]
         low["displacement_low"] = np.zeros((n_low, 3), np.float32)

@@ -51,7 +51,7 @@ from s4a.geometry.voronoi import (
     thin_regions,
     voronoi_cells,
 )
-from s4a.schema import dataset, require
+from s4a.schema import Array, dataset, require
 from s4a.seeds import RNG, seed_of
 
 GL = "install the system's libgl1 and libopengl0, or see `s4a doctor`"
@@ -61,14 +61,8 @@ CUTS = 3  # how often that is tried before samples are added without limit
 
 
 def sample_surface(
-    X: np.ndarray,
-    T: np.ndarray,
-    G: sp.csr_matrix,
-    rim: np.ndarray,
-    avoid: np.ndarray,
-    k: int,
-    seed: int = 0,
-) -> np.ndarray:
+    X: Array, T: Array, G: sp.csr_matrix, rim: Array, avoid: Array, k: int, seed: int = 0
+) -> Array:
     """About k vertices spread over the surface, its boundary edges `rim` at the same spacing.
 
     Farthest points of (position, spacing * normal): the two sides of a thin wall count as apart,
@@ -110,9 +104,7 @@ def sample_surface(
     return np.sort(np.r_[sample, others])
 
 
-def laplacian(
-    X: np.ndarray, T: np.ndarray, area: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, str]:
+def laplacian(X: Array, T: Array, area: Array) -> tuple[Array, Array, Array, str]:
     """Edges, cotan weights, vertex areas, and which Laplacian it is.
 
     Returns
@@ -135,7 +127,7 @@ def laplacian(
     return E, np.bincount(edge_of, half_cotangents(X, T), len(E)), area, "cotan"
 
 
-def sorted_mesh(X: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def sorted_mesh(X: Array, T: Array) -> tuple[Array, Array, Array]:
     """The mesh in an order of vertices and triangles that positions alone decide, and that order.
 
     The same surface gives the same coarse mesh, however its file numbers it.
@@ -151,8 +143,8 @@ def sorted_mesh(X: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
 
 
 def coarse_surface(
-    X: np.ndarray, T: np.ndarray, n_coarse: int, seed: int = 0
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, int]]:
+    X: Array, T: Array, n_coarse: int, seed: int = 0
+) -> tuple[Array, Array, Array, Array, dict[str, int]]:
     """Manifold dual of about `n_coarse` geodesic Voronoi cells.
 
     Returns
@@ -194,7 +186,7 @@ def coarse_surface(
     return V[state.sample], dual(F, state.cell), origin[state.sample], cell, attrs
 
 
-def nearest_along_edges(X: np.ndarray, T: np.ndarray, among: np.ndarray) -> np.ndarray:
+def nearest_along_edges(X: Array, T: Array, among: Array) -> Array:
     """The vertex of `among` that is nearest to each vertex along edges ``(n,)``."""
     G = edge_graph(X, edges(T))
     return dijkstra(G, indices=among, min_only=True, return_predecessors=True)[2]
@@ -217,9 +209,7 @@ def check_wrap() -> None:
         raise ValueError(f"wrap=True needs a filter that PyMeshLab lacks: {GL}")
 
 
-def alpha_wrap(
-    X: np.ndarray, T: np.ndarray, alpha: float = 1.0, offset: float = 0.2
-) -> tuple[np.ndarray, np.ndarray]:
+def alpha_wrap(X: Array, T: Array, alpha: float = 1.0, offset: float = 0.2) -> tuple[Array, Array]:
     """A closed surface wrapped around the mesh; `alpha` and `offset` in percent of its diagonal."""
     check_wrap()
     with silence():
@@ -248,14 +238,14 @@ def silence() -> Iterator[None]:
                 os.close(copy)
 
 
-def nearest_with_normal(X: np.ndarray, T: np.ndarray, V: np.ndarray, F: np.ndarray) -> np.ndarray:
+def nearest_with_normal(X: Array, T: Array, V: Array, F: Array) -> Array:
     """Vertex of (V, F) near each vertex of (X, T), on a side of a wall that faces the same way."""
     reach = 0.02 * np.linalg.norm(np.ptp(V, axis=0))
     tree = cKDTree(np.c_[V, reach * vertex_normals(V, F)])
     return tree.query(np.c_[X, reach * vertex_normals(X, T)])[1]
 
 
-def topology(T: np.ndarray) -> dict[str, int]:
+def topology(T: Array) -> dict[str, int]:
     """Euler characteristic, number of boundary loops, and of edges with three or more triangles."""
     E, _, count = unique_edges(T)
     rim, vertex = np.unique(E[count == 1], return_inverse=True)
@@ -267,7 +257,7 @@ def topology(T: np.ndarray) -> dict[str, int]:
     }
 
 
-def check_clean(X: np.ndarray, T: np.ndarray) -> dict[str, int]:
+def check_clean(X: Array, T: Array) -> dict[str, int]:
     """Topology of a mesh that :func:`coarsen` can take.
 
     Raises

@@ -25,8 +25,8 @@ from s4a.geometry.mesh import as_arrays, edge_graph, stiffness, unique_edges, ve
 from s4a.geometry.voronoi import add_samples, dual, farthest_of_each, voronoi_cells
 from s4a.method.remesh import check_clean, laplacian, sample_surface
 from s4a.method.shape import Basis, Shape
-from s4a.method.spectral import with_constant_first
-from s4a.schema import dataset, in_unit, require, unit_of
+from s4a.method.spectral import factor, with_constant_first
+from s4a.schema import Array, dataset, in_unit, require, unit_of
 
 log = logging.getLogger(__name__)
 
@@ -45,7 +45,7 @@ MEANING = {
 }
 
 
-def bump(distance: np.ndarray, radius: float | np.ndarray) -> np.ndarray:
+def bump(distance: Array, radius: float | Array) -> Array:
     """1 - 3 s^2 + 2 s^3 of s = distance / radius.
 
     1 and flat at the centre, 0 and flat at the radius.
@@ -61,9 +61,7 @@ def bump(distance: np.ndarray, radius: float | np.ndarray) -> np.ndarray:
     return 1 - 3 * s**2 + 2 * s**3
 
 
-def spread(
-    X: np.ndarray, T: np.ndarray, p: int, seed: int = 0
-) -> tuple[np.ndarray, np.ndarray, float, sp.csr_array]:
+def spread(X: Array, T: Array, p: int, seed: int = 0) -> tuple[Array, Array, float, sp.csr_array]:
     """Samples on a mesh such that every vertex lies well inside a bump.
 
     Farthest points of position and normal, and where these leave a vertex out along the surface, as
@@ -91,9 +89,7 @@ def spread(
     return sample, cell, radius, G
 
 
-def local_functions(
-    X: np.ndarray, G: sp.csr_array, sample: np.ndarray, radius: float
-) -> sp.csr_array:
+def local_functions(X: Array, G: sp.csr_array, sample: Array, radius: float) -> sp.csr_array:
     """U: bumps of the distance along edges to each sample.
 
     Scaled so that they sum to 1 at every vertex ``(n, p)``.
@@ -124,8 +120,8 @@ def local_functions(
 
 
 def reduced_eigenpairs(
-    U: sp.csr_array, W: sp.csr_array, area: np.ndarray, k: int
-) -> tuple[np.ndarray, np.ndarray, sp.csc_array]:
+    U: sp.csr_array, W: sp.csr_array, area: Array, k: int
+) -> tuple[Array, Array, sp.csc_array]:
     """The k smallest eigenpairs of U^T W U phi = lambda U^T A U phi, for areas of sum 1.
 
     Returns
@@ -136,16 +132,9 @@ def reduced_eigenpairs(
         U^T A U; Phi^T mass Phi = I.
     """
     stiff, mass = (U.T @ W @ U).tocsc(), (U.T @ sp.diags(area) @ U).tocsc()
-    shift = (
-        1e-6 * stiff.diagonal().sum() / mass.diagonal().sum()
-    )  # keeps the factor away from the constants
-    solve = spla.splu(
-        (stiff + shift * mass).tocsc(),
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    ).solve
-    inverse = spla.LinearOperator(stiff.shape, matvec=solve, dtype=float)
+    # keeps the factor away from the constants
+    shift = 1e-6 * stiff.diagonal().sum() / mass.diagonal().sum()
+    inverse = spla.LinearOperator(stiff.shape, matvec=factor(stiff + shift * mass), dtype=float)
     start = 1 + 1e-3 * np.cos(np.arange(U.shape[1]))
     eigenvalue, Phi = spla.eigsh(
         stiff, k=k, M=mass, sigma=-shift, OPinv=inverse, v0=start, which="LM"
@@ -201,7 +190,7 @@ def reduce(mesh: xr.Dataset, *, n_samples: int = 6000, k: int = 100, seed: int =
 
 def local_space(
     mesh: xr.Dataset, n_samples: int = 6000, seed: int = 0
-) -> tuple[np.ndarray, np.ndarray, sp.csr_matrix]:
+) -> tuple[Array, Array, sp.csr_matrix]:
     """First half of :func:`reduce`: samples ``(p,)``, cells ``(n,)`` and U ``(n, p)``."""
     X, T = as_arrays(mesh)
     X = Shape(mesh).to_frame(X)
@@ -210,7 +199,7 @@ def local_space(
 
 
 def spectral_space(
-    mesh: xr.Dataset, sample: np.ndarray, cell: np.ndarray, U: sp.csr_matrix, k: int = 100
+    mesh: xr.Dataset, sample: Array, cell: Array, U: sp.csr_matrix, k: int = 100
 ) -> Shape:
     """Second half of :func:`reduce`: the eigenpairs in the span of U."""
     if not 1 <= k < len(sample):

@@ -30,6 +30,7 @@ from s4a.method.deform import smoother
 from s4a.method.remesh import laplacian
 from s4a.method.spectral import Diffusion, project, unit_mass
 from s4a.options import N_CENTRAL, N_SPREAD
+from s4a.schema import Array
 
 N_PAIRED = 300  # spread vertices of a shape that rigid alignment pairs
 # One standard deviation of a field that guides, beside positions by POSITION_WEIGHT: as much as 2 %
@@ -72,19 +73,19 @@ class Basis:
         Those that were given to guide, see :func:`smooth_fields`.
     """
 
-    X: np.ndarray
-    T: np.ndarray
-    area: np.ndarray
-    Phi: np.ndarray
-    eigenvalue: np.ndarray = field(default_factory=lambda: np.empty(0))
-    mass: np.ndarray | sp.sparray | sp.spmatrix | None = None
+    X: Array
+    T: Array
+    area: Array
+    Phi: Array
+    eigenvalue: Array = field(default_factory=lambda: np.empty(0))
+    mass: Array | sp.sparray | sp.spmatrix | None = None
     U: sp.csr_matrix | None = None
-    near_coarse: np.ndarray | slice | None = None
+    near_coarse: Array | slice | None = None
     area_weighted: bool = True
     lifted: bool = False
-    surface_normals: np.ndarray | None = None
+    surface_normals: Array | None = None
     landmarks: dict[str, int] = field(default_factory=dict)
-    fields: dict[str, np.ndarray] = field(default_factory=dict)
+    fields: dict[str, Array] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.mass is None:
@@ -101,11 +102,11 @@ class Basis:
         """The same surface with its first k functions."""
         return replace(self, Phi=self.Phi[:, :k], eigenvalue=self.eigenvalue[:k])
 
-    def moved_to(self, X: np.ndarray) -> "Basis":
+    def moved_to(self, X: Array) -> "Basis":
         """The same surface where its vertices have moved to X ``(n, 3)``, as registered."""
         return replace(self, X=X, surface_normals=None)
 
-    def extend(self, F: np.ndarray) -> np.ndarray:
+    def extend(self, F: Array) -> Array:
         """Functions of the low resolution at all vertices: U F ``(n, q)`` in single precision.
 
         Those that have a value at every vertex stay as they are.
@@ -114,7 +115,7 @@ class Basis:
             return F
         return self.U @ F.astype(np.float32)
 
-    def field(self, c: np.ndarray) -> np.ndarray:
+    def field(self, c: Array) -> Array:
         """The field U Phi c ``(n, 3)`` with coefficients c ``(q, 3)`` of the first functions."""
         low = self.Phi[:, : len(c)] @ c
         return low if self.U is None or self.lifted else self.U @ low
@@ -128,14 +129,14 @@ class Basis:
             return smoother(self.Phi[self.near_coarse], weight)
         return smoother(self.Phi, weight, self.U[self.near_coarse])
 
-    def spread_vertices(self, n: int = N_SPREAD) -> np.ndarray:
+    def spread_vertices(self, n: int = N_SPREAD) -> Array:
         """Vertices ``(<= n,)`` spread over the surface; all in their order where n is 0."""
         if N_SPREAD < len(self.X) and 0 < n <= N_SPREAD:
             return self._spread[:n]  # each is the farthest from those before it
         return farthest_points(self.X, n or len(self.X))
 
     @cached_property
-    def _spread(self) -> np.ndarray:
+    def _spread(self) -> Array:
         return many_farthest_points(self.X, N_SPREAD, center=self.X.mean(0))
 
     @cached_property
@@ -162,11 +163,11 @@ class Basis:
         return {}
 
     @cached_property
-    def normals(self) -> np.ndarray:
+    def normals(self) -> Array:
         """Unit normals of the vertices ``(n, 3)``."""
         return vertex_normals(self.X, self.T)
 
-    def normals_at(self, X: np.ndarray) -> np.ndarray:
+    def normals_at(self, X: Array) -> Array:
         """Unit normals of the surface ``(n, 3)`` where the vertices have moved to X.
 
         Those of a finer surface turn with all of the mesh, and then as its normals do there.
@@ -183,7 +184,7 @@ class Basis:
         return stars(self.T, len(self.X))
 
     @cached_property
-    def rim(self) -> np.ndarray:
+    def rim(self) -> Array:
         """Boundary edges ``(r, 2)``, in the direction in which their triangles go around."""
         _, edge_of, count = unique_edges(self.T, len(self.X))
         return directed_edges(self.T)[count[edge_of] == 1]
@@ -199,7 +200,7 @@ class Basis:
         return edge_graph(self.X, edges(self.T))
 
     @cached_property
-    def outwards(self) -> np.ndarray:
+    def outwards(self) -> Array:
         """Rows of the vertices near coarse ones by their distance from the centre.
 
         An order that neither pose nor numbering changes.
@@ -241,7 +242,7 @@ class Shape:
         return shape
 
     @cached_property
-    def frame(self) -> tuple[np.ndarray, float]:
+    def frame(self) -> tuple[Array, float]:
         """Center ``(3,)`` and size, in the unit of the input."""
         if not self.original:
             area, X = self.coarse["vertex_area"].values, self.coarse["position"].values
@@ -250,15 +251,15 @@ class Shape:
         return area @ X / area.sum(), np.sqrt(area.sum())
 
     @cached_property
-    def _area(self) -> np.ndarray:
+    def _area(self) -> Array:
         return vertex_areas(*as_arrays(self.original))
 
-    def to_frame(self, points: np.ndarray) -> np.ndarray:
+    def to_frame(self, points: Array) -> Array:
         """Points ``(p, 3)`` in the unit of the input, in the frame."""
         center, size = self.frame
         return (points - center) / size
 
-    def from_frame(self, points: np.ndarray) -> np.ndarray:
+    def from_frame(self, points: Array) -> Array:
         """Points ``(p, 3)`` of the frame, in the unit of the input."""
         center, size = self.frame
         return points * size + center
@@ -300,7 +301,7 @@ class Shape:
         return names, weights
 
     @cached_property
-    def cell(self) -> np.ndarray:
+    def cell(self) -> Array:
         """The coarse vertex that weighs most at each original vertex ``(n,)``.
 
         Of SCALABLE the sample that is nearest along edges.
@@ -388,7 +389,7 @@ class Shape:
         """Whether the functions of ``full`` are lifted ones, and not U Phi."""
         return "lifted_eigenfunction" in self.coarse
 
-    def functions(self, A: np.ndarray) -> np.ndarray:
+    def functions(self, A: Array) -> Array:
         """The functions Phi A that full resolution compares, A ``(k, m)``.
 
         At coarse vertices, as U takes them from there; lifted ones at all.
@@ -397,7 +398,7 @@ class Shape:
         return basis.Phi[:, : len(A)] @ A.astype(basis.Phi.dtype)
 
     @cached_property
-    def near_coarse(self) -> np.ndarray:
+    def near_coarse(self) -> Array:
         """Original vertices nearest to coarse ones, by their weights in U; all of few.
 
         Of SCALABLE, whose weights also say how dense its samples are, by their distance.
@@ -426,7 +427,7 @@ def vertices_of_landmarks(mesh: xr.Dataset) -> dict[str, int]:
     return dict(zip(mesh["guide_name"].values.tolist(), vertex.tolist(), strict=True))
 
 
-def features_of(mesh: xr.Dataset) -> dict[str, np.ndarray]:
+def features_of(mesh: xr.Dataset) -> dict[str, Array]:
     """The fields of :func:`s4a.with_features`, by name ``(n,)``; none where a mesh has none."""
     if "feature_name" not in mesh:
         return {}
@@ -434,7 +435,7 @@ def features_of(mesh: xr.Dataset) -> dict[str, np.ndarray]:
     return dict(zip(names, mesh["feature_value"].values.T, strict=True))
 
 
-def smooth_fields(coarse: xr.Dataset, low: Basis) -> dict[str, np.ndarray]:
+def smooth_fields(coarse: xr.Dataset, low: Basis) -> dict[str, Array]:
     """Fields that guide as the functions of a surface have them, of mean 0 and variance 1.
 
     Times their weights.  Noise from vertex to vertex would draw matches aside.  NaN counts as the
@@ -457,12 +458,12 @@ def common_fields(source: Basis, target: Basis) -> tuple[str, ...]:
     return tuple(name for name in target.fields if name in source.fields)
 
 
-def field_columns(basis: Basis, names: tuple[str, ...]) -> np.ndarray:
+def field_columns(basis: Basis, names: tuple[str, ...]) -> Array:
     """Fields ``(n, f)`` as columns of rows in which nearest points are searched."""
     return FIELD_WEIGHT * np.stack([basis.fields[name] for name in names], axis=1)
 
 
-def corresponding_landmarks(source: Basis, target: Basis) -> tuple[np.ndarray, np.ndarray]:
+def corresponding_landmarks(source: Basis, target: Basis) -> tuple[Array, Array]:
     """The vertices of source and target ``(l,)`` at the landmarks that both have by name."""
     names = [name for name in target.landmarks if name in source.landmarks]
     at_source, at_target = (

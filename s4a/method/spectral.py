@@ -13,14 +13,12 @@ import scipy.sparse.linalg as spla
 import xarray as xr
 
 from s4a.geometry.mesh import stiffness
-from s4a.schema import check_count, dataset, require
+from s4a.schema import Array, check_count, dataset, require
 
 log = logging.getLogger(__name__)
 
 
-def eigenpairs(
-    E: np.ndarray, w: np.ndarray, area: np.ndarray, k: int
-) -> tuple[np.ndarray, np.ndarray]:
+def eigenpairs(E: Array, w: Array, area: Array, k: int) -> tuple[Array, Array]:
     """The k smallest eigenpairs of W phi = lambda A phi, for the surface scaled to unit area.
 
     Parameters
@@ -62,7 +60,7 @@ def eigenpairs(
     return eigenvalue, Phi
 
 
-def with_constant_first(Z: np.ndarray, area: np.ndarray) -> np.ndarray:
+def with_constant_first(Z: Array, area: Array) -> Array:
     """Functions ``(n, z)`` of eigenvalue 0, turned so that the first is the constant 1.
 
     Of several pieces the solver gives any functions that are constant on each.
@@ -83,7 +81,7 @@ def with_constant_first(Z: np.ndarray, area: np.ndarray) -> np.ndarray:
     return Z @ Q.astype(Z.dtype)
 
 
-def factor(S: sp.spmatrix) -> Callable[[np.ndarray], np.ndarray]:
+def factor(S: sp.spmatrix) -> Callable[[Array], Array]:
     """The function that solves S x = b, for S sparse, symmetric and positive definite."""
     return spla.splu(
         S.tocsc(),
@@ -113,14 +111,12 @@ class Diffusion:
     [1.333, 0.667]
     """
 
-    def __init__(self, area: np.ndarray, W: sp.csr_matrix) -> None:
+    def __init__(self, area: Array, W: sp.csr_matrix) -> None:
         self.A = sp.diags_array(area)
         self.W = W
-        self._steps: dict[float, Callable[[np.ndarray], np.ndarray]] = {}
+        self._steps: dict[float, Callable[[Array], Array]] = {}
 
-    def step(
-        self, time: float, pinned: sp.sparray | None = None
-    ) -> Callable[[np.ndarray], np.ndarray]:
+    def step(self, time: float, pinned: sp.sparray | None = None) -> Callable[[Array], Array]:
         """The function that solves for x ``(n, q)``; with `pinned` added to A none is kept."""
         if pinned is not None:
             return factor(self.A + pinned + time * self.W)
@@ -129,7 +125,7 @@ class Diffusion:
         return self._steps[time]
 
 
-def project(Phi: np.ndarray, area: np.ndarray | sp.spmatrix, f: np.ndarray) -> np.ndarray:
+def project(Phi: Array, area: Array | sp.spmatrix, f: Array) -> Array:
     """Coefficients a = Phi^T A f of a function ``(k,)`` or of several ``(k, d)``.
 
     Parameters
@@ -217,13 +213,13 @@ def spectrum(mesh: xr.Dataset, *, k: int = 100) -> xr.Dataset:
     return xr.merge([mesh, dataset(eigenvalue=eigenvalue, eigenfunction=Phi)]).assign_attrs(attrs)
 
 
-def unit_area(mesh: xr.Dataset) -> np.ndarray:
+def unit_area(mesh: xr.Dataset) -> Array:
     """Vertex areas of a mesh scaled to sum 1 ``(n,)``: the A in which Phi is orthonormal."""
     area = mesh["vertex_area"].values
     return area / area.sum()
 
 
-def unit_mass(mesh: xr.Dataset) -> np.ndarray | sp.csr_matrix:
+def unit_mass(mesh: xr.Dataset) -> Array | sp.csr_matrix:
     """The A in which Phi is orthonormal: :func:`unit_area`, or of SCALABLE U^T A U ``(n, n)``.
 
     That has the vertex areas as its row sums, so that the entries off the diagonal,
@@ -238,7 +234,7 @@ def unit_mass(mesh: xr.Dataset) -> np.ndarray | sp.csr_matrix:
     return sp.csr_matrix(sp.diags(unit_area(mesh)) - off_diagonal)
 
 
-def reconstruct(mesh: xr.Dataset, f: np.ndarray, *, k: int | None = None) -> np.ndarray:
+def reconstruct(mesh: xr.Dataset, f: Array, *, k: int | None = None) -> Array:
     """A function on the mesh from its first k coefficients: Phi Phi^T A f.
 
     On the samples of SCALABLE, whose eigenfunctions are coefficients in local functions, `f` is one
@@ -287,7 +283,7 @@ def reconstruct(mesh: xr.Dataset, f: np.ndarray, *, k: int | None = None) -> np.
     return (Phi @ project(Phi, unit_mass(mesh), f)).reshape(f.shape)
 
 
-def weyl(k: int) -> np.ndarray:
+def weyl(k: int) -> Array:
     """Weyl's law for a closed surface of unit area: the i-th eigenvalue is about 4 pi i ``(k,)``.
 
     Examples

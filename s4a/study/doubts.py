@@ -233,9 +233,6 @@ def doubtful(
             continue
         sure = "probably" if name in wrong else "maybe, in places,"
         also = f", mean |distortion| {distortion[name]:.2f}" if name in distortion else ""
-        words = (
-            f"{sure} registered wrongly (badness {score:.3f}{also}): "
-            "look at it in s4a view, compare its file with the template's, or leave it out"
-        )
-        found[name] = [doubt("registration", words, name in wrong)]
+        said = doubt("registration", name in wrong, sure=sure, badness=score, distortion=also)
+        found[name] = [said]
     return found, []

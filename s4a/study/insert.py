@@ -21,9 +21,9 @@ from s4a.input.landmarks import SUFFIXES, with_landmarks
 from s4a.input.plausibility import find_warnings
 from s4a.input.subjects import listed
 from s4a.method.first_map import motion_onto
+from s4a.method.latent import latent_of_new, nearest_spectra, place
 from s4a.method.lift import low_resolution
 from s4a.method.pca import project_scores
-from s4a.method.place import latent_of_new, nearest_spectra, place
 from s4a.method.register import from_latent
 from s4a.method.shape import Shape
 from s4a.options import Options, with_options

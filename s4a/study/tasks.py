@@ -21,8 +21,8 @@ from s4a.input.hands import mirror_image
 from s4a.input.landmarks import guides_of, with_landmarks
 from s4a.method import steps
 from s4a.method.first_map import motion_onto
+from s4a.method.latent import latent_of_new, nearest_spectra, place
 from s4a.method.lift import low_resolution
-from s4a.method.place import latent_of_new, nearest_spectra, place
 from s4a.method.register import from_latent, identity
 from s4a.method.shape import Basis, Shape, features_of
 from s4a.options import Options

@@ -14,8 +14,9 @@ from matplotlib.colors import to_rgb
 from s4a.show.browser import color_scale
 from s4a.show.draw import OKABE_ITO, SIGNED, position_colors, ramp_colors, signed_colors
 from s4a.show.surfaces import mesh_of
-from s4a.widgets.panel import WIDE, Panel, check, dropdown, grid, row
-from s4a.widgets.scene import Scene, camera_group, extent, round_number
+from s4a.widgets.correspondence import inverse
+from s4a.widgets.panel import WIDE, Panel, dropdown, grid, row
+from s4a.widgets.views import extent, round_number
 
 SHOWN = [
     ("coordinates of the source", "place"),
@@ -30,12 +31,28 @@ COLORS = (
     "how far it is from the truth"
 )
 METHOD = "which method's match is shown in this view"
-FOLLOW = "mark what is under the pointer in all views, and not only what is clicked"
 MOST = 7  # methods side by side
+EVENTS = "picked", "hovered"
 CELLS = 14  # of the checkerboard along the surface's extent
 FULL_ERROR = 0.98  # quantile of the errors of a method that the colours reach, in the median
 FULL_AREA = 2.0  # doublings of the area that the colours reach
 MARKS = [to_rgb(OKABE_ITO[i]) for i in (5, 4, 2, 6, 0, 1, 7)]
+
+
+def with_truth(found: xr.Dataset, n_source: int) -> xr.Dataset:
+    """What was found on a pair, with the truth as one more method, where it is known."""
+    if "true_position" not in found:
+        return found
+    match = found["true_match"].values
+    truth = {
+        "way_match": ("vertex", match),
+        "way_image": (("vertex", "xyz"), found["true_position"].values),
+        "way_reverse": ("source_vertex", inverse(match, n_source)),
+        "way_error": ("vertex", np.where(match >= 0, 0.0, np.nan)),
+        "way_area": ("vertex", np.full(len(match), np.nan)),
+    }
+    known = xr.Dataset(truth).expand_dims(way=[TRUTH])
+    return found.drop_dims("way").merge(xr.concat([found[list(truth)], known], "way"))
 
 
 class Comparison(Panel):
@@ -89,87 +106,53 @@ class Comparison(Panel):
             )
         super().__init__(found, **options)
 
-    def build(
-        self, methods: Any = None, view: str = "corner", up: str = "z"
-    ) -> list[ipywidgets.Widget]:
+    def build(self, methods: Any = None) -> list[ipywidgets.Widget]:
         """Choices, the source, and the target by each method."""
         self.pairs = {
-            name: node.to_dataset() for name, node in self.study["pairs"].children.items()
+            name: with_truth(node.to_dataset(), self.study["source"].sizes["vertex"])
+            for name, node in self.study["pairs"].children.items()
         }
-        known = [str(way) for way in next(iter(self.pairs.values()))["way"].values]
-        if all("true_position" in one for one in self.pairs.values()):
-            known.append(TRUTH)
-        ways = self.first(known) if methods is None else list(methods)
+        each = [one["way"].values.astype(str).tolist() for one in self.pairs.values()]
+        known = [way for way in max(each, key=len) if all(way in ways for ways in each)]
+        ways = methods
+        if methods is None:
+            ways = dict.fromkeys([*(way for way in FIRST if way in known), *known])
+            ways = list(ways)[: len(FIRST)]
         wrong = [way for way in ways if way not in known]
         if wrong or not 0 < len(ways) <= MOST:
             raise ValueError(
                 f"methods must be 1 to {MOST} of {', '.join(known)}; found {', '.join(ways)}"
             )
-        self.pair = dropdown("pair", "the shapes between which methods match", list(self.pairs))
         looks = [*SHOWN, ERROR] if TRUTH in known else SHOWN
-        self.colors = dropdown("colours", COLORS, looks, layout=WIDE)
-        self.hover = check("follow the pointer", FOLLOW, True)
+        self.scenes = [self.new_scene(340, clickable=True) for _ in range(1 + len(ways))]
+        self.pair = dropdown("pair", "the shapes between which methods match", list(self.pairs))
+        self.colors, self.hover = dropdown("colours", COLORS, looks, layout=WIDE), self.follow()
+        self.redraw(self.draw, self.pair)
+        self.redraw(self.paint, self.colors)
+        self.on_pick(self.scenes[0], lambda place: self.choose(-1, place["vertex"]), *EVENTS)
         self.ways = []
         for i, way in enumerate(ways):
             self.ways.append(dropdown(f"method {i + 1}", METHOD, known, value=way, layout=WIDE))
             setattr(self, f"way{i}", self.ways[-1])
+            self.on_change(self.ways[-1], lambda _, i=i: self.paint_method(i))
+            to = self.scenes[1 + i]
+            self.on_pick(to, lambda place: self.choose(place["vertex"], -1), *EVENTS)
         self.live = (*(("colors", f"way{i}", "pair") for i in range(len(ways))), ("hover",))
-        look = {"group": camera_group(), "view": view, "up": up, "height": 340, "clickable": True}
-        self.scenes = [Scene(**look) for _ in range(1 + len(ways))]
-        self.redraw(self.draw, self.pair)
-        self.redraw(self.paint, self.colors)
-        for i, choice in enumerate(self.ways):
-            self.on_change(choice, lambda _, i=i: self.paint_method(i))
-        self.on_change(self.hover, self.follow)
-        for i, scene in enumerate(self.scenes):
-            self.on_pick(scene, self.from_target if i else self.from_source, "picked", "hovered")
         self.draw()
-        self.follow(True)
         return [row(self.pair, self.colors, self.hover), row(*self.ways), grid(*self.scenes)]
-
-    def first(self, known: list[str]) -> list[str]:
-        """The methods that are shown first."""
-        return list(dict.fromkeys([*(way for way in FIRST if way in known), *known]))[: len(FIRST)]
 
     @property
     def found(self) -> xr.Dataset:
         """What was found on the pair that is shown, with the target's mesh."""
         return self.pairs[self.pair.value]
 
-    def follow(self, on: bool) -> None:
-        """Whether points under the pointer are marked, and not only clicked ones."""
-        for scene in self.scenes:
-            scene.hovering = bool(on)
-
-    def image(self, way: str) -> np.ndarray:
-        """Where a method puts the vertices of the target ``(n, 3)``, NaN where unknown."""
-        if way == TRUTH:
-            return self.found["true_position"].values
-        return self.found["way_image"].sel(way=way).values.astype(float)
-
-    def match(self, way: str) -> np.ndarray:
-        """On each vertex of the target a vertex of the source ``(n,)``, -1 where unknown."""
-        if way == TRUTH:
-            return self.found["true_match"].values
-        return self.found["way_match"].sel(way=way).values
-
-    def way_back(self, way: str) -> np.ndarray:
-        """On each vertex of the source a vertex of the target, -1 for none."""
-        if way != TRUTH:
-            return self.found["way_reverse"].sel(way=way).values
-        match = self.match(way)
-        back = np.full(self.study["source"].sizes["vertex"], -1)
-        known = np.flatnonzero(match >= 0)[::-1]  # the first of several stays
-        back[match[known]] = known
-        return back
+    def of(self, name: str, way: str) -> np.ndarray:
+        """A variable of what a method found: ``way_`` match, image, reverse, error or area."""
+        return self.found[f"way_{name}"].sel(way=way).values
 
     def error(self, way: str) -> np.ndarray | None:
         """The error of every vertex of the target ``(n,)``; None where truth is unknown."""
-        if "way_error" not in self.found:
-            return None
-        if way == TRUTH:
-            return np.where(self.match(way) >= 0, 0.0, np.nan)
-        return self.found["way_error"].sel(way=way).values
+        return self.of("error", way) if "way_error" in self.found else None
 
     def draw(self) -> None:
         """Both surfaces of a pair, and their colours."""
@@ -200,68 +183,58 @@ class Comparison(Panel):
         """The target in the colours of the method that is chosen for view `i`."""
         way, scene = self.ways[i].value, self.scenes[1 + i]
         X, _ = self.surfaces[0]
-        image, error = self.image(way), self.error(way)
+        image, error = self.of("image", way), self.error(way)
         mean = "" if error is None or way == TRUTH else f", error {100 * np.nanmean(error):.2f} %"
         scene.title = f"{way}{mean}"
         bar = coordinates = None
         if self.colors.value == "error":
-            limit = self.full_error()
-            label = "error (% of √area)"
-            colors, bar = (
-                ramp_colors(error, 0, limit),
-                color_scale("viridis", 0, 100 * limit, label),
-            )
+            limit, label = self.full_error(), "error (% of √area)"
+            colors = ramp_colors(error, 0, limit)
+            bar = color_scale("viridis", 0, 100 * limit, label)
         elif self.colors.value == "area":
-            doublings = self.area(way) / np.log(2)
-            colors = signed_colors(doublings, FULL_AREA)
             label = "share of the area: doublings"
+            colors = signed_colors(self.of("area", way) / np.log(2), FULL_AREA)
             bar = color_scale(SIGNED, -FULL_AREA, FULL_AREA, label)
         else:
             colors = position_colors(image, among=X)
             if self.colors.value == "checker":
                 coordinates = np.nan_to_num(image)
         scene.paint(np.clip(colors, 0, 1), bar, coordinates, self.cell)
-        value = "" if error is None else ", error {value} %"
-        text = f"target vertex {{here}} → source vertex {{there}}{value}"
-        scene.compare(self.match(way), self.way_back(way), text, MARKS[i], error)
+        back, color = self.of("reverse", way), MARKS[i]
+        scene.connect(self.of("match", way), self.said(error), error, back=back, color=color)
         self.point()
+
+    def said(self, error: np.ndarray | None, **numbers: Any) -> str:
+        """What is said of a vertex of the target; its `numbers` are put in by the browser, too."""
+        text = "target vertex {here} → source vertex {there}"
+        text += "" if error is None else ", error {value} %"
+        return text.format(**numbers) if numbers else text
 
     def full_error(self) -> float:
         """The error at which colours are full, the same for all methods of the pair."""
-        reached = np.nanquantile(self.found["way_error"].values, FULL_ERROR, axis=1)
+        error = self.found["way_error"].drop_sel(way=TRUTH).values
+        reached = np.nanquantile(error, FULL_ERROR, axis=1)
         return float(max(np.median(reached), 1e-6))
 
-    def area(self, way: str) -> np.ndarray:
-        """Log of the share of area that every vertex gets, by that which it has; NaN for truth."""
-        if way == TRUTH:
-            return np.full(self.found.sizes["vertex"], np.nan)
-        return self.found["way_area"].sel(way=way).values.astype(float)
-
-    def from_target(self, place: dict) -> None:
-        """A place of the target: where each method puts it."""
-        if place.get("vertex", -1) >= 0:
-            self.vertex, self.source_vertex = place["vertex"], -1
-            self.point()
-
-    def from_source(self, place: dict) -> None:
-        """A place of the source: where each method finds it on the target."""
-        if place.get("vertex", -1) >= 0:
-            self.vertex, self.source_vertex = -1, place["vertex"]
-            self.point()
+    def choose(self, vertex: int, source_vertex: int) -> None:
+        """A place of the target or of the source, where each method has it on the other."""
+        self.vertex, self.source_vertex = vertex, source_vertex
+        self.point()
 
     def point(self) -> None:
         """Mark the vertex that was picked, and where each method has it on the other surface."""
-        if self.source_vertex >= 0:
-            self.scenes[0].mark(self.surfaces[0][0][self.source_vertex])
-            for i, choice in enumerate(self.ways):
-                self.mark_method(i, int(self.way_back(choice.value)[self.source_vertex]))
-        if self.vertex < 0:
+        X, there = self.surfaces[0][0], self.source_vertex
+        if there >= 0:
+            self.scenes[0].mark(X[there])
+        elif self.vertex >= 0:
+            ends = np.array([self.of("match", choice.value)[self.vertex] for choice in self.ways])
+            colors = np.array(MARKS[: len(ends)])
+            self.scenes[0].mark(X[ends[ends >= 0]], colors[ends >= 0])
+        else:
             return
-        ends = np.array([self.match(choice.value)[self.vertex] for choice in self.ways])
-        colors = np.array(MARKS[: len(ends)])
-        self.scenes[0].mark(self.surfaces[0][0][ends[ends >= 0]], colors[ends >= 0])
-        for i in range(len(self.ways)):
-            self.mark_method(i, self.vertex)
+        for i, choice in enumerate(self.ways):
+            back = self.of("reverse", choice.value)
+            self.mark_method(i, int(back[there]) if there >= 0 else self.vertex)
 
     def mark_method(self, i: int, vertex: int) -> None:
         """Mark a vertex of the target in one view and say where its method puts it; -1 for none."""
@@ -270,9 +243,8 @@ class Comparison(Panel):
         if vertex < 0:
             scene.caption = "nothing is matched to this vertex"
             return
-        there, error = self.match(way)[vertex], self.error(way)
-        text = f"target vertex {vertex} → source vertex {there if there >= 0 else 'unknown'}"
-        if error is not None:
-            known = "unknown" if np.isnan(error[vertex]) else f"{100 * error[vertex]:.2f}"
-            text += f", error {known} %"
-        scene.caption = text
+        there, error = self.of("match", way)[vertex], self.error(way)
+        value = np.nan if error is None else 100 * error[vertex]
+        value = "unknown" if np.isnan(value) else f"{value:.2f}"
+        there = there if there >= 0 else "unknown"
+        scene.caption = self.said(error, here=vertex, there=there, value=value)

@@ -17,8 +17,8 @@ from s4a.show.surfaces import (
     template_vertices,
     unit_text,
 )
-from s4a.widgets.panel import Panel, beside, check, dropdown, row
-from s4a.widgets.scene import Scene, camera_group, extent, round_number
+from s4a.widgets.panel import Panel, beside, dropdown, row
+from s4a.widgets.views import extent, round_number
 
 MAPS = [
     ("registration, full resolution", "registered"),
@@ -31,7 +31,6 @@ COLORS = (
     "what is carried between the surfaces: coordinates, a checkerboard, or the registration's "
     "confidence from 0 to 1"
 )
-FOLLOW = "mark what is under the pointer on the other surface too, and not only what is clicked"
 CELLS = 14  # of the checkerboard along the surface's extent
 
 
@@ -58,8 +57,8 @@ def inverse(match: np.ndarray, n: int) -> np.ndarray:
     >>> inverse(np.array([2, 0, 2]), 4).tolist()
     [1, -1, 0, -1]
     """
-    back = np.full(n, -1)
-    back[match[::-1]] = np.arange(len(match))[::-1]  # the first of several stays
+    back, known = np.full(n, -1), np.flatnonzero(match >= 0)[::-1]
+    back[match[known]] = known  # the first of several stays
     return back
 
 
@@ -86,33 +85,30 @@ class Correspondence(Panel):
     live = (("colors", "choice"), ("hover",))
     shares = ("source", "shape")
 
-    def build(self, view: str = "corner", up: str = "z") -> list[ipywidgets.Widget]:
+    def build(self) -> list[ipywidgets.Widget]:
         """Choices and the two surfaces."""
         registration = self.study["registration"].dataset
         self.template = str(registration.attrs["template"])
-        names = [name for name in names_of(registration) if name != self.template]
+        self.names = [name for name in names_of(registration) if name != self.template]
         latent = has(self.study, "latent/latent_basis") and has(self.study, "coarse")
         latent = latent and self.template in self.study["coarse"].children
-        options = [(f"{self.template}, the template", self.template), *labelled(self.study, names)]
+        shapes = labelled(self.study, self.names)
+        options = [(f"{self.template}, the template", self.template), *shapes]
         self.left = dropdown("source", "the shape on the left", options)
-        self.choice = dropdown("shape", "the shape on the right", labelled(self.study, names))
-        self.names, self.pair_of_tabs, self.shown = names, ("", ""), ("", "")
+        self.choice = dropdown("shape", "the shape on the right", shapes)
         self.map = dropdown("map", WHICH, MAPS if latent else MAPS[:1], layout={"width": "28em"})
         self.colors = dropdown("colours", COLORS, SHOWN, layout={"width": "24em"})
-        self.hover = check("follow the pointer", FOLLOW, True)
-        look = {"group": camera_group(), "view": view, "up": up, "height": 400, "clickable": True}
-        self.scenes = [Scene(**look), Scene(**look)]
+        self.scenes = [self.new_scene(400, clickable=True) for _ in range(2)]
+        self.hover = self.follow()
+        self.pair_of_tabs, self.shown = ("", ""), ("", "")
         self.matches = {}  # (shape, map) -> match
-        self.on_change(self.left, lambda value: self.set_trait("source", value))
-        self.on_change(self.choice, lambda value: self.set_trait("shape", value))
+        self.bind(self.left, "source")
+        self.bind(self.choice, "shape")
         self.redraw(self.draw, self.map, self.colors)
-        self.on_change(self.hover, self.follow)
         for scene, carry in zip(self.scenes, (self.to_shape, self.to_source), strict=True):
             self.on_pick(scene, carry, "picked", "hovered")
-        for name in ("source", "shape"):
-            self.on_change(self, lambda _: self.change_pair(), name)
-        self.show_pair(self.template, names[0])
-        self.follow(True)
+        self.redraw(self.change_pair, "source", "shape")
+        self.show_pair(self.template, self.names[0])
         choices = row(self.left, self.choice, self.map)
         return [choices, row(self.colors, self.hover), beside(*self.scenes)]
 
@@ -138,11 +134,6 @@ class Correspondence(Panel):
         """Draw the pair, where it is another one."""
         if self.shown != (self.source, self.shape):
             self.draw()
-
-    def follow(self, on: bool) -> None:
-        """Whether points under the pointer are carried, and not only clicked ones."""
-        for scene in self.scenes:
-            scene.hovering = bool(on)
 
     @property
     def registered(self) -> bool:
@@ -205,16 +196,15 @@ class Correspondence(Panel):
 
     def draw(self) -> None:
         """Both surfaces with their colours."""
-        self.shown = self.left.value, self.choice.value = self.source, self.shape
+        self.shown = self.source, self.shape
         self.vertex = self.image = -1
         stage = "coarse" if self.map.value == "low" else "original"
         source = surface(self.study, self.source, stage)
         if self.registered and self.from_template:
             source = mesh_of(self.study["registration"].dataset)
         self.pair = source, surface(self.study, self.shape, stage)
-        colors, coordinates, bar, caption = (
-            self.registered_look() if self.registered else self.latent_look()
-        )
+        look = self.registered_look() if self.registered else self.latent_look()
+        colors, coordinates, bar, caption = look
         cell = round_number(extent(source[0]) / CELLS)
         if coordinates[0] is not None:
             unit = unit_text(self.study, self.source)
@@ -225,7 +215,11 @@ class Correspondence(Panel):
             scene.show(X, T, title=f"{titles[i]}, {len(X):,} vertices")
             scene.paint(colors[i], bar, coordinates[i], cell)
             scene.caption = caption
-        self.connect()
+        # the browser marks the images of vertices by itself
+        back, sure = self.way_back(), self.confidence()
+        sure_back = None if sure is None else sure[back] * (back >= 0)
+        self.scenes[0].connect(self.match(), self.linked("{here}", "{there}"), sure)
+        self.scenes[1].connect(back, self.linked("{there}", "{here}"), sure_back)
 
     def latent_look(self) -> tuple:
         """Colours and coordinates of both surfaces, the colour bar, and what they are.
@@ -242,19 +236,19 @@ class Correspondence(Panel):
 
     def registered_look(self) -> tuple:
         """The same of the registration: the source's, transferred to the shape."""
-        X, value = self.pair[0][0], self.confidence()
+        X, value, shown = self.pair[0][0], self.confidence(), self.colors.value
         colors, coordinates, bar = position_colors(X), (None, None), None
         caption = f"the coordinates of {self.on_left}, transferred to the shape"
         caption += "" if self.from_template else " by way of the template"
-        if self.colors.value == "confidence" and value is None:
+        if shown == "checker":
+            carried = self.carried(X)
+            coordinates = X, None if carried is None else np.nan_to_num(carried)
+        elif shown == "confidence" and value is None:
             caption = f"the confidence belongs to the registration of the template; here {caption}"
-        elif self.colors.value == "confidence":
+        elif shown == "confidence":
             colors = ramp_colors(value, 0, 1)
             bar = color_scale("viridis", 0, 1, f"confidence, {value.mean():.2f} on average")
             caption = "the registration's confidence, transferred to the shape"
-        if self.colors.value == "checker":
-            carried = self.carried(X)
-            coordinates = X, None if carried is None else np.nan_to_num(carried)
         return (colors, self.carried(colors)), coordinates, bar, caption
 
     def linked(self, here: object, there: object) -> str:
@@ -262,39 +256,22 @@ class Correspondence(Panel):
         left = "template" if self.from_template else self.source
         return f"{left} vertex {here} ↔ {self.shape} vertex {there}"
 
-    def connect(self) -> None:
-        """Give the browser the images of all vertices, so that it marks them by itself."""
-        back, sure = self.way_back(), self.confidence()
-        sure_back = None if sure is None else sure[back] * (back >= 0)
-        self.scenes[0].connect(self.match(), self.linked("{here}", "{there}"), sure)
-        self.scenes[1].connect(back, self.linked("{there}", "{here}"), sure_back)
-
     def to_shape(self, place: dict) -> None:
         """A place of the source: its image on the shape."""
-        vertex = place.get("vertex", -1)
-        if vertex < 0:
-            return
-        self.vertex, self.image = vertex, int(self.match()[vertex])
-        if self.image < 0:
-            self.say(f"no vertex of {self.shape} is matched to vertex {vertex} of {self.source}")
-        else:
-            self.point()
+        self.vertex, self.image = place["vertex"], int(self.match()[place["vertex"]])
+        self.point(self.image, self.shape, f"vertex {self.vertex} of {self.source}")
 
     def to_source(self, place: dict) -> None:
         """A place of the shape: where it lies on the source."""
-        vertex = place.get("vertex", -1)
-        if vertex < 0:
-            return
-        self.vertex, self.image = int(self.way_back()[vertex]), vertex
-        if self.vertex < 0:
-            self.say(f"no vertex of {self.on_left} is matched to vertex {vertex} of {self.shape}")
-        else:
-            self.point()
+        self.vertex, self.image = int(self.way_back()[place["vertex"]]), place["vertex"]
+        self.point(self.vertex, self.on_left, f"vertex {self.image} of {self.shape}")
 
-    def point(self) -> None:
-        """Mark the vertex and its image, and say which they are."""
-        text = self.linked(self.vertex, self.image)
-        sure = self.confidence()
+    def point(self, found: int, other: str, place: str) -> None:
+        """Mark the vertex and its image, and say which they are, or that nothing was `found`."""
+        if found < 0:
+            self.say(f"no vertex of {other} is matched to {place}")
+            return
+        text, sure = self.linked(self.vertex, self.image), self.confidence()
         if sure is not None:
             text += f", confidence {sure[self.vertex]:.2f}"
         vertices = self.vertex, self.image

@@ -8,9 +8,8 @@ from s4a.method.fmap import off_diagonal_mass, orthogonality_error, swapped_bloc
 from s4a.method.shape import Shape
 from s4a.show.browser import PARTS
 from s4a.show.surfaces import low_text, surface
-from s4a.widgets.chart import DIRECTION, Chart
 from s4a.widgets.panel import WIDE, Panel, beside, check, dropdown, int_slider, row
-from s4a.widgets.scene import Scene, camera_group, signed_limit
+from s4a.widgets.views import DIRECTION, Chart, signed_limit
 
 STEP = 5
 KINDS = [
@@ -20,6 +19,7 @@ KINDS = [
 WHICH = "made consistent with the maps among all shapes, or by ZoomOut of this pair alone"
 ROW = "row of the matrix: the eigenfunction of the target that is shown"
 COLUMN = "column of the matrix: the eigenfunction of the source that is shown"
+SIZE = "how many eigenfunctions the map links: ZoomOut adds them step by step"
 MOST = 3  # exchanged runs of eigenfunctions that are named in words
 
 
@@ -43,7 +43,7 @@ class FunctionalMap(Panel):
     shares = ("pair",)
     clicks = (("matrix", "row", "row"), ("matrix", "column", "column"))
 
-    def build(self, pair: int = 0, view: str = "corner", up: str = "z") -> list[ipywidgets.Widget]:
+    def build(self, pair: int = 0) -> list[ipywidgets.Widget]:
         """Choices, matrix and the two surfaces."""
         network = self.study["network"].dataset
         self.source, self.target = (network[key].values.astype(str) for key in ("source", "target"))
@@ -52,22 +52,19 @@ class FunctionalMap(Panel):
         options = [(f"{source} → {target}", i) for i, (source, target) in enumerate(ends)]
         self.choice = dropdown("pair", "the shape from which the map goes, and to which", options)
         self.kind = dropdown("map", WHICH, KINDS, layout={"width": "29em"})
+        sizes = sorted({*range(first, last, STEP), last})
+        slider = {"continuous_update": False, "layout": WIDE, "tooltip": SIZE}
         self.k = ipywidgets.SelectionSlider(
-            options=sorted({*range(first, last, STEP), last}),
-            value=last,
-            description="size k",
-            tooltip="how many eigenfunctions the map links: ZoomOut adds them step by step",
-            continuous_update=False,
-            layout=WIDE,
+            options=sizes, value=last, description="size k", **slider
         )
         self.block = check("first ten only", "the upper left corner of the matrix, magnified")
-        self.row = int_slider("target ψ", ROW, 1, 0, last - 1, "23em")
-        self.column = int_slider("source φ", COLUMN, 1, 0, last - 1, "23em")
+        narrow = {"layout": {"width": "23em"}}
+        self.row = int_slider("target ψ", ROW, 1, 0, last - 1, **narrow)
+        self.column = int_slider("source φ", COLUMN, 1, 0, last - 1, **narrow)
         self.matrix, self.numbers = Chart(), ipywidgets.HTML()
-        look = {"group": camera_group(), "view": view, "up": up, "height": 300}
-        self.scenes = [Scene(**look), Scene(**look)]
+        self.scenes = [self.new_scene(300), self.new_scene(300)]
         self.maps = {}  # size -> C, of ZoomOut of this pair alone
-        self.on_change(self.choice, lambda value: self.set_trait("pair", value))
+        self.bind(self.choice, "pair")
         self.redraw(self.draw, self.k, self.kind, self.block)
         self.on_pick(self.matrix, self.pick)
         self.redraw(lambda: self.pick({}), self.row, self.column)
@@ -101,7 +98,6 @@ class FunctionalMap(Panel):
 
     def take(self, pair: int) -> None:
         """The two meshes of a pair and its first map."""
-        self.choice.value = pair
         self.meshes = [self.study["coarse"][name].to_dataset() for name in self.names()]
         self.maps = {}
         self.draw()

@@ -11,21 +11,18 @@ from s4a.geometry.mesh import vertex_areas, vertex_normals
 from s4a.schema import unit_of
 from s4a.show.browser import color_scale
 from s4a.show.draw import SIGNED, ramp_colors, signed_colors
+from s4a.show.surfaces import has
 from s4a.widgets.panel import WIDE, Panel, dropdown, row
-from s4a.widgets.scene import Scene
 
 # variable -> what it is called; those of vectors are shown along the normals
 SIGNED_MAPS = {
-    "directional_normal": "directional asymmetry",
     "effect": "effect, along the normals",
     "field_effect": "effect on the field",
 }
 POSITIVE_MAPS = {
-    "fluctuating": "fluctuating asymmetry",
     "effect_size": "effect size",
     "explained_share": "explained share",
 }
-INDIVIDUAL = "individual"
 EVERYWHERE = "everywhere"
 P_VALUES = {
     "p_family_wise": "family-wise",
@@ -36,7 +33,6 @@ LEVELS = [0.05, 0.01, 0.001]
 MAP = "what the colours are; arrows of an effect count as far as they point outwards"
 WHERE = "grey where the p value is larger than the level, by which correction for all vertices"
 LEVEL = "the p value from which on it is grey"
-OF = "whose asymmetry is shown, along the normals"
 GREY = (0.82, 0.82, 0.82)
 FULL = 0.99  # quantile of the values that the colours reach
 
@@ -51,7 +47,7 @@ class Maps(Panel):
     study : xarray.DataTree
         That was tested.
     found : xarray.Dataset
-        Of :func:`s4a.statistics.asymmetry`, ``group_map``, ``regression`` or ``growth``.
+        Of :func:`s4a.statistics.group_map` or :func:`s4a.statistics.regression`.
     view, up
         From where the surface is seen first; see :func:`s4a.show.draw.rotation`.
 
@@ -67,71 +63,62 @@ class Maps(Panel):
     >>> import s4a
     >>> from s4a.widgets import Maps
     >>> study = s4a.synthetic.example_study()
-    >>> panel = Maps(study, s4a.statistics.asymmetry(study, n_permutations=19))
+    >>> panel = Maps(study, s4a.statistics.regression(study, range(6), n_permutations=19))
     >>> panel.map.label, panel.where.label
-    ('directional asymmetry', 'family-wise')
+    ('effect, along the normals', 'family-wise')
     >>> panel.close()
     """
 
     needs = ("registration/position",)
     title = "Map"
+    signed, positive = SIGNED_MAPS, POSITIVE_MAPS
     vertex = traitlets.Int(-1)
     live = (("map", "where", "level"),)
 
     def __init__(self, study: xr.DataTree, found: xr.Dataset, **options: Any):
-        self.found, maps = found, {**SIGNED_MAPS, **POSITIVE_MAPS}
+        self.found, maps = found, self.signed | self.positive
         self.known = [(words, name) for name, words in maps.items() if name in found]
-        template = study["registration"] if "registration" in study.children else {}
-        n = template.sizes["vertex"] if "position" in template else None
-        if n and (not self.known or found.sizes.get("vertex") != n):
+        ready = all(has(study, name) for name in self.needs)
+        n = study["registration"].sizes["vertex"] if ready else None
+        if ready and (not self.known or found.sizes.get("vertex") != n):
             raise ValueError(
                 f"the panel {self.title} needs the maps of a test at the {n} vertices of the "
                 f"template; found {', '.join(map(str, found.data_vars)) or 'nothing'} at "
-                f"{found.sizes.get('vertex', 'no')}: give what statistics.asymmetry, group_map or "
-                "regression found on this study"
+                f"{found.sizes.get('vertex', 'no')}: give what a test such as "
+                "statistics.group_map found on this study"
             )
         super().__init__(study, **options)
 
-    def build(self, view: str = "corner", up: str = "z") -> list[ipywidgets.Widget]:
+    def build(self) -> list[ipywidgets.Widget]:
         """Choices and the surface."""
         found, template = self.found, self.study["registration"].dataset
-        known = list(self.known)
-        if "asymmetry" in found:
-            known.append(("of one individual", INDIVIDUAL))
         tests = [(words, name) for name, words in P_VALUES.items() if name in found]
-        self.map = dropdown("map", MAP, known, layout=WIDE)
+        self.map = dropdown("map", MAP, self.known, layout=WIDE)
         self.where = dropdown("where", WHERE, [*tests, (EVERYWHERE, EVERYWHERE)], layout=WIDE)
         self.level = dropdown("level", LEVEL, LEVELS)
-        controls = [self.map, self.where, self.level]
-        first = [self.map]
-        if "asymmetry" in found:
-            names = found["individual"].values.tolist()
-            self.individual = dropdown("individual", OF, names, layout=WIDE)
-            self.live = (("map", "where", "level"), ("individual",))
-            controls.append(self.individual)
-            first.append(self.individual)
-        self.scene = Scene(view=view, up=up, height=420, clickable=True)
+        self.scene = self.new_scene(420, clickable=True)
         self.T = template["corner_vertex"].values
-        self.X = found.get("symmetric_position", template["position"]).values
+        self.X = self.surface().values
         self.normals = vertex_normals(self.X, self.T)
         self.area = vertex_areas(self.X, self.T)
         self.scene.show(self.X, self.T)
-        self.redraw(self.paint, *controls)
+        self.redraw(self.paint, self.map, self.where, self.level)
         self.on_pick(self.scene, self.pick)
         self.paint()
-        return [row(*first), row(self.where, self.level), self.scene]
+        return [row(self.map), row(self.where, self.level), self.scene]
+
+    def surface(self) -> xr.DataArray:
+        """The positions ``(vertex, xyz)`` of the surface that is shown."""
+        return self.study["registration"].dataset["position"]
 
     def values(self) -> tuple[np.ndarray, bool, str]:
         """The map ``(n,)``, whether it has signs, and its unit."""
         name = self.map.value
-        if name == INDIVIDUAL:
-            own = self.found["asymmetry"].sel(individual=self.individual.value)
-            return (own.values * self.normals).sum(1), True, unit_of(own)
         data = self.found[name]
         values = data.values
         if values.ndim == 2:
             values = (values * self.normals).sum(1)
-        return values, name in SIGNED_MAPS, unit_of(data)
+        return values, name in self.signed, unit_of(data)
 
     def significant(self) -> np.ndarray:
         """Where the p value is at most the level ``(n,)``; everywhere where none is asked for."""
@@ -151,8 +138,6 @@ class Maps(Panel):
         else:
             colors, bar = ramp_colors(known, 0, limit), color_scale("viridis", 0, limit, label)
         self.scene.title = self.map.label
-        if self.map.value == INDIVIDUAL:
-            self.scene.title = f"asymmetry of {self.individual.value}"
         self.scene.paint(np.where(shown[:, None], np.clip(colors, 0, 1), GREY), bar)
         self.scene.mark([])
         self.vertex = -1
@@ -170,16 +155,11 @@ class Maps(Panel):
             )
         if "p_value" in self.found:
             words.append(f"whole shape p = {self.found['p_value'].item():.3g}")
-        if "antisymmetry_p" in self.found:
-            words.append(f"antisymmetry p = {self.found['antisymmetry_p'].item():.3g}")
         return "; ".join(words)
 
     def pick(self, place: dict) -> None:
         """A vertex that was clicked: its value and p values."""
-        vertex = place.get("vertex", -1)
-        if vertex < 0:
-            return
-        self.vertex = vertex
+        self.vertex = vertex = place["vertex"]
         values, _, unit = self.values()
         size = f"{values[vertex]:.3g}" + ("" if unit == "1" else f" {unit}")
         said = [

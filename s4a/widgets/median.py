@@ -7,9 +7,8 @@ import traitlets
 from s4a.method.median import NORMS, distance_to_identity, near_ties
 from s4a.show.browser import PARTS
 from s4a.show.surfaces import labelled, names_of, resolutions, surface
-from s4a.widgets.chart import Chart
 from s4a.widgets.panel import Panel, beside, dropdown, int_slider, row
-from s4a.widgets.scene import Scene, camera_group
+from s4a.widgets.views import Chart
 
 OPERATOR = (
     "which shape difference is compared with the identity: of areas, or of angles (conformal)"
@@ -38,25 +37,22 @@ class Median(Panel):
     clicks = (("bars", "name", "shape"),)
     shares = ("selected",)
 
-    def build(self, view: str = "corner", up: str = "z") -> list[ipywidgets.Widget]:
+    def build(self) -> list[ipywidgets.Widget]:
         """Choices, bars and the surface."""
         latent = self.study["latent"].dataset
         self.names, n_modes = names_of(latent), latent.sizes["latent"]
-        self.operator = dropdown("operator", OPERATOR, list(OPERATORS))
-        self.norm = dropdown("norm", NORM, list(NORMS), value=str(latent.attrs.get("norm", "h2")))
-        self.modes = int_slider("modes K", MODES, n_modes, 2, n_modes)
-        self.stage = dropdown("surfaces", "which meshes are drawn", resolutions(self.study))
-        self.shape = dropdown(
-            "shape", "what is shown beside the bars", labelled(self.study, self.names)
-        )
-        self.bars = Chart()
-        self.scene = Scene(group=camera_group(), view=view, up=up, height=420)
-        self.ties = ipywidgets.HTML()
-        self.redraw(self.rank, self.operator, self.norm, self.modes)
-        self.redraw(self.show, self.stage)
+        norm, options = str(latent.attrs.get("norm", "h2")), labelled(self.study, self.names)
+        self.operator = self.choose(dropdown("operator", OPERATOR, list(OPERATORS)), self.rank)
+        self.norm = self.choose(dropdown("norm", NORM, list(NORMS), value=norm), self.rank)
+        self.modes = self.choose(int_slider("modes K", MODES, n_modes, 2, n_modes), self.rank)
+        stages = dropdown("surfaces", "which meshes are drawn", resolutions(self.study))
+        self.stage = self.choose(stages, self.show)
+        self.shape = dropdown("shape", "what is shown beside the bars", options)
+        self.bars, self.ties = Chart(), ipywidgets.HTML()
+        self.scene = self.new_scene(420)
         self.on_pick(self.bars, self.pick)
-        self.on_change(self.shape, self.select)
-        self.on_change(self, lambda _: self.show(), "selected")
+        self.bind(self.shape, "selected")
+        self.redraw(self.show, "selected")
         self.rank()
         self.selected = self.median
         return [
@@ -73,7 +69,7 @@ class Median(Panel):
     def adopt(self, pair: tuple[str, str], shape: str) -> None:
         """Show a shape that is ranked."""
         if shape in self.names:
-            self.select(shape)
+            self.selected = shape
 
     def rank(self) -> None:
         """Distances for the operator, norm and number of modes that are chosen."""
@@ -82,12 +78,11 @@ class Median(Panel):
         eigenvalues = latent["latent_eigenvalue"].values[:k]
         self.distance = distance_to_identity(D, eigenvalues, self.norm.value)
         self.order = np.argsort(self.distance, kind="stable")
-        self.median = self.names[self.order[0]]
         near = [self.names[i] for i in near_ties(self.distance)][1:]
-        others = "No other within 5 %."
-        if near:
-            others = f"Near ties, at most 5 % farther: {', '.join(near)}."
-        self.ties.value = PARTS.median(self.median, f"{self.distance.min():.4g}", others)
+        others = f"Near ties, at most 5 % farther: {', '.join(near)}."
+        self.median, least = self.names[self.order[0]], f"{self.distance.min():.4g}"
+        others = others if near else "No other within 5 %."
+        self.ties.value = PARTS.median(self.median, least, others)
         self.draw_bars()
         if self.selected:
             self.show()
@@ -107,24 +102,20 @@ class Median(Panel):
 
     def pick(self, mark: dict) -> None:
         """The bar that was clicked."""
-        self.select(self.names[self.order[mark["index"]]])
-
-    def select(self, name: str) -> None:
-        """Show a shape."""
-        self.selected = name
+        self.selected = self.names[self.order[mark["index"]]]
 
     def show(self) -> None:
         """The selected shape, with the median shining through around it."""
-        self.shape.value = name = self.selected
+        name = self.selected
         self.draw_bars()
         i = self.names.index(name)
         rank = int(np.flatnonzero(self.order == i)[0]) + 1
         caption = f"rank {rank} of {len(self.names)}, distance {self.distance[i]:.4g}"
-        title, ghost = f"{name}, the median", ()
+        title, ghost, stage = f"{name}, the median", (), self.stage.value
         if name != self.median:
             title = f"{name}, in {self.median}"
             caption += "; blue, shining through: the median"
-            ghost = surface(self.study, self.median, self.stage.value)
-        self.scene.show(*surface(self.study, name, self.stage.value), title=title)
+            ghost = surface(self.study, self.median, stage)
+        self.scene.show(*surface(self.study, name, stage), title=title)
         self.scene.over(*ghost)
         self.scene.caption = caption

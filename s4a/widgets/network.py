@@ -19,9 +19,8 @@ from s4a.show.surfaces import (
     surface,
 )
 from s4a.study.tree import apart_of
-from s4a.widgets.chart import DIRECTION, Chart
 from s4a.widgets.panel import Panel, beside, dropdown, int_slider, row
-from s4a.widgets.scene import Scene, camera_group
+from s4a.widgets.views import DIRECTION, Chart
 
 STAGES = [
     ("before Consistent ZoomOut", "cycle_error_initial"),
@@ -37,6 +36,7 @@ BUDGET = (
 PLACES = (
     "where the shapes stand: on a circle, or by the first two components of their shape differences"
 )
+SHOW = "a shape, or a map between two of them"
 NARROW = {"width": "20em"}
 MOST = 100  # shapes that a graph shows
 UNKNOWN = "unknown: in no cycle"
@@ -68,41 +68,35 @@ class Network(Panel):
     clicks = (("graph", "edge", "choice"), ("graph", "node", "choice"))
     shares = ("edge", "node")
 
-    def build(self, view: str = "corner", up: str = "z") -> list[ipywidgets.Widget]:
+    def build(self) -> list[ipywidgets.Widget]:
         """Choices, graph, matrix and two surfaces."""
         network = self.study["network"].dataset
         self.source, self.target = (network[key].values.astype(str) for key in ("source", "target"))
-        self.names = np.unique(np.r_[self.source, self.target]).tolist()
+        names, ends = np.unique([self.source, self.target], return_inverse=True)
+        self.names, self.ends = names.tolist(), ends.reshape(2, -1).T  # (map, 2)
+        self.pairs = [tuple(pair) for pair in np.sort(self.ends, axis=1).tolist()]
         self.median = attribute(self.study, "latent", "median")
         self.doubtful = set(doubtful_names(self.study))
-        ends = [np.searchsorted(self.names, names) for names in (self.source, self.target)]
-        self.ends = np.stack(ends, axis=1)  # (map, 2)
-        self.pairs = [tuple(pair) for pair in np.sort(self.ends, axis=1).tolist()]
         spectra = [self.study["coarse"][name]["eigenvalue"].values for name in self.names]
         k = network.sizes["mode_source_initial"]  # by as many the study chose its pairs
         self.distance = spectral_distance([values[:k] for values in spectra])
-        n, used = len(self.names), len(set(self.pairs))
-        self.used = used  # pairs that have maps
-        self.stage = dropdown("colours", WHICH, STAGES, layout={"width": "23em"})
-        self.budget = int_slider(
-            "pairs", BUDGET, used, n - 1, max(n - 1, n * (n - 1) // 2), continuous_update=True
-        )
+        n, self.used = len(self.names), len(set(self.pairs))  # pairs that have maps
+        most = max(n - 1, n * (n - 1) // 2)
         options: list = labelled(self.study, self.names)
         if n <= MOST:  # of more, the maps are chosen in the graph
             maps = zip(self.source, self.target, strict=True)
             options += [(f"{source} → {target}", i) for i, (source, target) in enumerate(maps)]
-        self.choice = dropdown(
-            "show", "a shape, or a map between two of them", options, layout=NARROW
-        )
+        self.stage = dropdown("colours", WHICH, STAGES, layout={"width": "23em"})
+        self.budget = int_slider("pairs", BUDGET, self.used, n - 1, most, continuous_update=True)
+        self.choice = dropdown("show", SHOW, options, layout=NARROW)
         self.where = dropdown("places", PLACES, ["circle", "shape differences"], layout=NARROW)
         self.facts, self.bar = ipywidgets.HTML(), ipywidgets.HTML()
         self.graph, self.matrix = Chart(), Chart()
-        look = {"group": camera_group(), "view": view, "up": up, "height": 185}
-        self.scenes = [Scene(**look), Scene(**look)]
+        self.scenes = [self.new_scene(185), self.new_scene(185)]
         self.redraw(self.draw, self.where, self.budget)
         self.redraw(self.change_stage, self.stage)
         self.on_change(self.choice, self.choose)
-        self.on_pick(self.graph, self.pick)
+        self.on_pick(self.graph, lambda mark: self.choose(mark.get("edge", mark.get("node"))))
         self.on_change(self, self.show_edge, "edge")
         self.on_change(self, self.show_node, "node")
         self.draw()
@@ -138,9 +132,11 @@ class Network(Panel):
         """The shapes that the graph of some pairs shows, by their numbers in `names` ``(n,)``."""
         if len(self.names) <= MOST:
             return np.arange(len(self.names))
-        first = [self.node or self.source[self.edge], *[self.target[self.edge]] * (self.edge >= 0)]
-        first += [self.median] * (self.median in self.names)
-        return nearest_by_maps(pairs, len(self.names), [self.names.index(a) for a in first], MOST)
+        first = [self.node] if self.edge < 0 else [self.source[self.edge], self.target[self.edge]]
+        if self.node:
+            first[0] = self.node
+        known = [self.names.index(name) for name in (*first, self.median) if name in self.names]
+        return nearest_by_maps(pairs, len(self.names), known, MOST)
 
     def budgeted(self) -> np.ndarray:
         """The pairs that the budget allows ``(p, 2)``: those of the study, or of another choice."""
@@ -163,57 +159,51 @@ class Network(Panel):
         self.shown = [i for i in self.allowed if between[i]]
         values = network[self.stage.value].values
         colors = cycle_error_colors(values[self.shown], (low, high))
-        places = self.places(names)
+        source, target = place[self.ends[self.shown]].T
+        x, y = self.places(names).T
+        n = len(self.names)
+        part = "" if len(names) == n else f" (the nearest {len(names)} of {n:,})"
         self.graph.draw(
             "graph",
-            x=places[:, 0],
-            y=places[:, 1],
+            x=x,
+            y=y,
             names=names,
-            source=place[self.ends[self.shown, 0]],
-            target=place[self.ends[self.shown, 1]],
+            source=source,
+            target=target,
             colors=[to_hex(color) for color in colors],
             values=values[self.shown],
             weights=network["weight"].values[self.shown],
             label="cycle error",
             unknown=UNKNOWN,
-            title="Click a shape or a map" + self.part(names),
+            title=f"Click a shape or a map{part}",
             faint=[name in self.doubtful for name in names],
             highlight=names.index(self.median) if self.median in names else -1,
             node=names.index(self.node) if self.node in names else -1,
             edge=self.edge,
             edges=self.shown,
         )
-        values = values[self.allowed]
-        self.tell(pairs, values)
+        self.tell(pairs, values[self.allowed])
         scale = color_scale(CYCLE_ERROR, low, high, ERRORS)
-        numbers = f"{low:.2g}", f"{high:.2g}"
-        self.bar.value = PARTS.color_bar(scale["colors"], *numbers, scale["label"])
-
-    def part(self, names: list[str]) -> str:
-        """How many of all shapes these are, where they are not all."""
-        n = len(self.names)
-        return "" if len(names) == n else f" (the nearest {len(names)} of {n:,})"
+        self.bar.value = PARTS.color_bar(scale["colors"], f"{low:.2g}", f"{high:.2g}", ERRORS)
 
     def tell(self, pairs: np.ndarray, values: np.ndarray) -> None:
         """Numbers of the graph of some pairs, whose maps have these cycle errors."""
-        facts = connectivity(pairs, len(self.names))
-        known = values[np.isfinite(values)]
-        stored = ""
-        if len(self.allowed) < 2 * len(pairs):
-            stored = f", {len(self.allowed)} maps of them in the study"
+        facts, known = connectivity(pairs, len(self.names)), values[np.isfinite(values)]
         apart = apart_of(self.study["registration"]) if "registration" in self.study else []
-        others = f"; beside it, doubtful: {', '.join(apart)}" if apart else ""
-        middle = ""
+        few = len(self.allowed) < 2 * len(pairs)
+        words = [
+            f"{len(pairs)} pairs" + f", {len(self.allowed)} maps of them in the study" * few,
+            f": {'connected' if facts['components'] == 1 else 'NOT connected'}, ",
+            f"{facts['triangles']} triangles, {facts['in_no_triangle']} shapes in none, ",
+            f"smallest degree {facts['smallest_degree']}, ",
+            f"at most {facts['diameter']} maps apart",
+        ]
         if len(known):
-            middle = f"; cycle errors {known.min():.3f} to {known.max():.3f}, "
-            middle += f"median {np.median(known):.3f}"
-        self.facts.value = PARTS.paragraph(
-            f"{len(pairs)} pairs{stored}: "
-            f"{'connected' if facts['components'] == 1 else 'NOT connected'}, "
-            f"{facts['triangles']} triangles, {facts['in_no_triangle']} shapes in none, "
-            f"smallest degree {facts['smallest_degree']}, "
-            f"at most {facts['diameter']} maps apart{middle}{others}"
-        )
+            words.append(f"; cycle errors {known.min():.3f} to {known.max():.3f}, ")
+            words.append(f"median {np.median(known):.3f}")
+        if apart:
+            words.append(f"; beside it, doubtful: {', '.join(apart)}")
+        self.facts.value = PARTS.paragraph("".join(words))
 
     def change_stage(self) -> None:
         """Maps before or after Consistent ZoomOut."""
@@ -221,10 +211,6 @@ class Network(Panel):
             self.show_edge(self.edge)
         else:
             self.draw()
-
-    def pick(self, mark: dict) -> None:
-        """What was clicked in the graph."""
-        self.choose(mark["edge"] if "edge" in mark else mark["node"])
 
     def choose(self, what: int | str) -> None:
         """A map by its row of ``/network``, or a shape by its name."""
@@ -266,10 +252,10 @@ class Network(Panel):
         on_source.show(X, T, colors, f"{source}, the source")
         on_target.show(*surface(self.study, target), colors[match], f"{target}, the target")
         error, weight = pair[self.stage.value].item(), pair["weight"].item()
+        error = UNKNOWN if np.isnan(error) else f"{error:.3f}"
         on_source.caption = "its coordinates as colours"
-        carried = "the colours that the map carries"
-        told = UNKNOWN if np.isnan(error) else f"{error:.3f}"
         on_target.caption = (
-            f"{carried}; cycle error {told}, weight {weight:.2f} in Consistent ZoomOut"
+            f"the colours that the map carries; cycle error {error}, weight {weight:.2f} in "
+            "Consistent ZoomOut"
         )
         self.draw()

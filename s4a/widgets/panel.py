@@ -13,11 +13,14 @@ import traitlets
 import xarray as xr
 
 from s4a.show.browser import FRAME, PARTS, STYLE
+from s4a.show.draw import Viewpoint
 from s4a.show.panel_page import LIMIT, panel_html, widgets_in
 from s4a.show.surfaces import has
+from s4a.widgets.views import Scene, camera_group
 
 log = logging.getLogger(__name__)
 WIDE = {"width": "26em"}
+FOLLOW = "mark what is under the pointer in all views, and not only what is clicked"
 
 
 def close_all(widget: ipywidgets.Widget) -> None:
@@ -62,19 +65,12 @@ def check(description: str, tooltip: str, on: bool = False, **more: Any) -> ipyw
 
 
 def int_slider(
-    description: str,
-    tooltip: str,
-    value: int,
-    low: int,
-    high: int,
-    width: str = "26em",
-    **more: Any,
+    description: str, tooltip: str, value: int, low: int, high: int, **more: Any
 ) -> ipywidgets.IntSlider:
     """A slider of integers that tells its value when it is let go, and what it is."""
-    more = {"continuous_update": False, "layout": {"width": width}} | more
-    return ipywidgets.IntSlider(
-        value, min=low, max=high, description=description, tooltip=tooltip, **more
-    )
+    more = {"continuous_update": False, "layout": WIDE} | more
+    limits = {"min": low, "max": high}
+    return ipywidgets.IntSlider(value, description=description, tooltip=tooltip, **limits, **more)
 
 
 def file_name(name: str) -> ipywidgets.Text:
@@ -159,8 +155,10 @@ class Panel(OfKernel):
         In pixels, or any width of CSS; all that the cell has by default.
     font : float, optional
         Size of the text in pixels; by default it follows the panel's width.
+    view, up
+        From where surfaces are seen first; see :func:`s4a.show.draw.rotation`.
     **options
-        Of the panel itself, such as ``view`` and ``up``.
+        Of the panel itself.
 
     Raises
     ------
@@ -176,6 +174,7 @@ class Panel(OfKernel):
     every = ()  # sliders of which it keeps every value, and not only two dozen of them
     python = ()  # what else needs Python
     shares = ()  # traits that say which pair or shape is chosen in it, for the other tabs
+    scenes: list[Scene] = []  # noqa: RUF012, views that answer together
     recording = False  # while a saved page goes through the values of its controls
 
     def __init__(
@@ -184,6 +183,8 @@ class Panel(OfKernel):
         *,
         width: float | str | None = None,
         font: float | None = None,
+        view: Viewpoint = "corner",
+        up: str = "z",
         **options: Any,
     ):
         lacking = [name for name in self.needs if not has(study, name)]
@@ -194,7 +195,7 @@ class Panel(OfKernel):
             )
         super().__init__(layout=layout_of(width))
         self.add_class("s4a-panel")  # in style.css
-        self.study = study
+        self.study, self.camera = study, {"group": camera_group(), "view": view, "up": up}
         self.frame = Frame(title=self.title, font=font or 0.0)
         self.message, self.failed = ipywidgets.HTML(), False
         self.children = [self.frame, *self.build(**options), self.message]
@@ -204,6 +205,27 @@ class Panel(OfKernel):
     def build(self, **options: Any) -> list[ipywidgets.Widget]:
         """The parts of the panel."""
         raise NotImplementedError
+
+    def new_scene(self, height: int, **options: Any) -> Scene:
+        """A view of a surface, which turns with all others of the panel."""
+        return Scene(height=height, **self.camera, **options)
+
+    def choose(self, control: ipywidgets.Widget, function: Callable[[], Any]) -> Any:
+        """A control, with what is called without arguments when it has another value."""
+        self.redraw(function, control)
+        return control
+
+    def follow(self) -> ipywidgets.Checkbox:
+        """A box that says whether places under the pointer are marked, and not only clicked."""
+        box = check("follow the pointer", FOLLOW, True)
+        for scene in self.scenes:
+            traitlets.link((box, "value"), (scene, "hovering"))
+        return box
+
+    def bind(self, control: ipywidgets.Widget, trait: str) -> None:
+        """Let a control and a trait of the panel have one value; at first the trait's is empty."""
+        self.on_change(control, lambda value: self.set_trait(trait, value))
+        self.on_change(self, lambda value: control.set_trait("value", value), trait)
 
     def selection(self) -> dict[str, Any]:
         """The names of the ``pair`` (source, target) and of the ``shape`` chosen in the panel."""
@@ -249,17 +271,15 @@ class Panel(OfKernel):
 
         def answer(place):
             # views of surfaces answer together, as a place is marked in all of them
-            scenes = getattr(self, "scenes", [])
-            views = scenes if widget in scenes else [widget]
+            views = self.scenes if widget in self.scenes else [widget]
             others = [part for part in widgets_in(self) if part not in views]
             with contextlib.ExitStack() as held:
-                for part in [
-                    *others,
-                    *views,
-                ]:  # the views are told first, as the last that are held
+                # the views are told first, as the last that are held
+                for part in [*others, *views]:
                     held.enter_context(part.hold_sync())
                 try:
-                    function(place)
+                    if place.get("vertex", 0) >= 0:  # not beside the surface
+                        function(place)
                 finally:
                     for view in views:
                         view.answer = place.get("count", 0)
@@ -267,10 +287,12 @@ class Panel(OfKernel):
         for event in events or ("picked",):
             self.on_change(widget, answer, event)
 
-    def redraw(self, function: Callable, *controls: ipywidgets.Widget) -> None:
-        """Call `function` without arguments when one of the controls has another value."""
+    def redraw(self, function: Callable, *controls: ipywidgets.Widget | str) -> None:
+        """Call `function` without arguments when a control, or a trait, has another value."""
         for control in controls:
-            self.on_change(control, lambda _: function())
+            own = isinstance(control, str)
+            where = (self, control) if own else (control, "value")
+            self.on_change(where[0], lambda _: function(), where[1])
 
     def button(
         self, text: str, function: Callable, tooltip: str = "", **more: Any

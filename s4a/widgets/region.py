@@ -7,7 +7,7 @@ from s4a.geometry.mesh import vertex_areas
 from s4a.show.draw import CLAY, vertices_within
 from s4a.show.surfaces import label_text
 from s4a.widgets.panel import WIDE, Panel, dropdown, row
-from s4a.widgets.scene import MARK, Scene
+from s4a.widgets.views import MARK
 
 ADD, REMOVE = "add", "take away"
 LASSO = "while it is pressed a drag draws around vertices, and does not turn the surface"
@@ -51,7 +51,7 @@ class Region(Panel):
     title = "Region"
     python = ("drawing a region",)
 
-    def build(self, view: str = "corner", up: str = "z") -> list[ipywidgets.Widget]:
+    def build(self) -> list[ipywidgets.Widget]:
         """The surface, and what a drag does."""
         template = self.study["registration"].dataset
         self.X, self.T = template["position"].values, template["corner_vertex"].values
@@ -64,12 +64,12 @@ class Region(Panel):
         self.label = self._labels(template.attrs["template"])
         if self.label is not None:
             controls.insert(0, self.label)
-            self.label.observe(self.guarded(self.take_label), "value")
+            self.on_change(self.label, self.take_label)
         title = f"{template.attrs['template']}, the template"
-        self.scene = Scene(title=title, view=view, up=up, height=420)
+        self.scene = self.new_scene(420, title=title)
         self.scene.show(self.X, self.T)
         ipywidgets.link((self.lasso, "value"), (self.scene, "lasso"))
-        self.scene.observe(self.guarded(self.take_drawn), "drawn_around")
+        self.on_change(self.scene, self.take_drawn, "drawn_around")
         self.clear()
         return [row(*controls), self.scene]
 
@@ -83,39 +83,34 @@ class Region(Panel):
         options = [("none", NO_LABEL), *labels]
         return dropdown("label", LABEL, options, value=NO_LABEL, layout=WIDE)
 
-    def take_label(self, change: dict) -> None:
+    def take_label(self, label: object) -> None:
         """The vertices of a label that was chosen from the list."""
-        if change["new"] != NO_LABEL:
-            self.choose(self.labels == change["new"])
+        if label != NO_LABEL:
+            self.take(self.labels == label)
 
-    def take_drawn(self, change: dict) -> None:
+    def take_drawn(self, drawn: dict) -> None:
         """The vertices that were drawn around are added, or taken away."""
-        drawn = change["new"]
         within = vertices_within(self.X, self.T, drawn["polygon"], drawn["turn"])
         if not within.any():
             self.say("no vertex is seen within what was drawn")
             return
         self.say("")
-        self.leave_label()
-        self.choose(self.region | within if self.how.value == ADD else self.region & ~within)
-
-    def leave_label(self) -> None:
-        """Set the list of labels back, as the region is of none of them any more."""
-        if self.label is not None:
-            self.label.value = NO_LABEL
+        self.take(
+            self.region | within if self.how.value == ADD else self.region & ~within, NO_LABEL
+        )
 
     def clear(self) -> None:
         """Choose no vertex."""
-        self.leave_label()
-        self.choose(np.zeros(len(self.X), bool))
+        self.take(np.zeros(len(self.X), bool), NO_LABEL)
 
     def invert(self) -> None:
         """Choose all other vertices."""
-        self.leave_label()
-        self.choose(~self.region)
+        self.take(~self.region, NO_LABEL)
 
-    def choose(self, region: np.ndarray) -> None:
-        """Make these vertices ``(n,)`` the region, and show it."""
+    def take(self, region: np.ndarray, label: object = None) -> None:
+        """Make these vertices ``(n,)`` the region, and show it; `label` where it is of none."""
+        if self.label is not None and label is not None:
+            self.label.value = label
         self.region = region
         self.scene.paint(np.where(region[:, None], MARK, CLAY))
         share = self.area[region].sum() / self.area.sum()

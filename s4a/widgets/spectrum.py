@@ -7,9 +7,8 @@ import traitlets
 from s4a.method.spectral import reconstruct, weyl
 from s4a.show.charts import BLUE, GREY, ORANGE
 from s4a.show.surfaces import labelled, low_text, surface, unit_text
-from s4a.widgets.chart import Chart
 from s4a.widgets.panel import Panel, beside, dropdown, int_slider, row
-from s4a.widgets.scene import Scene, camera_group
+from s4a.widgets.views import Chart
 
 MOST = 100  # curves in a chart
 FIRST = "how many eigenfunctions the surface is put together from"
@@ -34,7 +33,7 @@ class Spectrum(Panel):
     clicks = (("curves", "series", "choice"), ("gaps", "series", "choice"))
     shares = ("shape",)
 
-    def build(self, view: str = "corner", up: str = "z") -> list[ipywidgets.Widget]:
+    def build(self) -> list[ipywidgets.Widget]:
         """Choices, curves and two surfaces."""
         nodes = self.study["coarse"].children.items()
         self.eigenvalues = {
@@ -42,22 +41,18 @@ class Spectrum(Panel):
         }
         self.names = list(self.eigenvalues)
         k = min(len(values) for values in self.eigenvalues.values())
-        self.choice = dropdown(
-            "shape", "whose functions are shown", labelled(self.study, self.names)
-        )
-        self.mode = int_slider(
-            "mode", "which eigenfunction is shown", 1, 0, k - 1, continuous_update=True
-        )
+        options, which = labelled(self.study, self.names), "which eigenfunction is shown"
+        self.choice = dropdown("shape", "whose functions are shown", options)
+        self.mode = int_slider("mode", which, 1, 0, k - 1, continuous_update=True)
         self.k = int_slider("first k", FIRST, min(20, k), 1, k)
         self.curves, self.gaps = Chart(), Chart()
-        look = {"group": camera_group(), "view": view, "up": up, "height": 300}
-        self.function, self.rebuilt = Scene(**look), Scene(**look)
-        self.on_change(self.choice, lambda value: self.set_trait("shape", value))
-        self.on_pick(self.curves, self.pick)
-        self.on_pick(self.gaps, self.pick)
+        self.function, self.rebuilt = self.new_scene(300), self.new_scene(300)
+        self.bind(self.choice, "shape")
+        for chart in (self.curves, self.gaps):
+            self.on_pick(chart, self.pick)
         self.redraw(self.show_mode, self.mode)
         self.redraw(self.show_rebuilt, self.k)
-        self.on_change(self, lambda _: self.take(), "shape")
+        self.redraw(self.take, "shape")
         self.shape = self.names[0]
         modes = ipywidgets.VBox([self.mode, self.function])
         rebuilt = ipywidgets.VBox([self.k, self.rebuilt])
@@ -79,7 +74,6 @@ class Spectrum(Panel):
 
     def take(self) -> None:
         """Another shape."""
-        self.choice.value = self.shape
         self.mesh = self.study["coarse"][self.shape].to_dataset()
         self.surface = surface(self.study, self.shape)
         self.function.show(*self.surface)
@@ -90,35 +84,24 @@ class Spectrum(Panel):
     def draw(self) -> None:
         """The eigenvalues of all shapes, as they are and as they differ from Weyl's law."""
         law = weyl(max(map(len, self.eigenvalues.values())))
-        line = {
-            "name": "Weyl: 4 π k",
-            "x": np.arange(len(law)),
-            "color": GREY,
-            "dash": "6 4",
-            "wide": True,
-            "legend": True,
-            "reference": True,
-        }
-        look = {"xlabel": "mode k", "marker": self.mode.value}
+        look = {"name": "Weyl: 4 π k", "x": np.arange(len(law)), "color": GREY, "dash": "6 4"}
+        look |= dict.fromkeys(("wide", "legend", "reference"), True)
         some = self.names[:: -(-len(self.names) // MOST)]  # of equal distances in the list
         some = some if self.shape in some else [*some, self.shape]
         part = "" if len(some) == len(self.names) else f" ({len(some)} of {len(self.names):,})"
-        self.curves.draw(
-            "lines",
-            series=[line | {"y": law}, *(self.curve(name, 0 * law) for name in some)],
-            title=f"Eigenvalues: click a curve{part}",
-            ylabel="eigenvalue, unit area",
-            legend="bottom",
-            **look,
-        )
-        self.gaps.draw(
-            "lines",
-            series=[line | {"y": 0 * law}, *(self.curve(name, law) for name in some)],
-            title="The same, less Weyl's law",
-            ylabel="eigenvalue − 4 π k",
-            legend="left",
-            **look,
-        )
+        first = f"Eigenvalues: click a curve{part}", "eigenvalue, unit area", "bottom"
+        second = "The same, less Weyl's law", "eigenvalue − 4 π k", "left"
+        for chart, less, words in ((self.curves, 0 * law, first), (self.gaps, law, second)):
+            title, ylabel, legend = words
+            chart.draw(
+                "lines",
+                series=[look | {"y": law - less}, *(self.curve(name, less) for name in some)],
+                title=title,
+                ylabel=ylabel,
+                legend=legend,
+                xlabel="mode k",
+                marker=self.mode.value,
+            )
 
     def curve(self, name: str, law: np.ndarray) -> dict:
         """The curve of a shape's eigenvalues less `law`."""
@@ -129,8 +112,8 @@ class Spectrum(Panel):
             "x": np.arange(len(values)),
             "y": values - law[: len(values)],
             "text": f"{name}: the second eigenvalue is {values[1]:.2f}, {last}",
-            "wide": chosen,
             "color": ORANGE if chosen else BLUE,
+            "wide": chosen,
             "legend": chosen,
         }
 

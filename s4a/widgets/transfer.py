@@ -17,9 +17,12 @@ from s4a.show.browser import PARTS
 from s4a.show.draw import label_colors
 from s4a.show.surfaces import aligned, label_text, labelled, names_of, unit_text
 from s4a.widgets.panel import Panel, beside, check, dropdown, file_name, row
-from s4a.widgets.scene import Scene, camera_group, extent, round_number
+from s4a.widgets.views import extent, round_number
 
 COLUMNS = ["name", "x", "y", "z", "confidence"]
+OF = "labels and landmarks are of this shape"
+NAME = "the landmark that the next click on the source places or moves"
+NAMED, SAVED = "the landmark that is named", "the landmarks on the target"
 LEGEND = 24  # labels that have colours of their own
 
 
@@ -43,7 +46,7 @@ class Transfer(Panel):
     live = (("labels", "target"),)
     python = ("placing landmarks",)
 
-    def build(self, view: str = "corner", up: str = "z") -> list[ipywidgets.Widget]:
+    def build(self) -> list[ipywidgets.Widget]:
         """Choices, the two surfaces, legend and table."""
         registration = self.study["registration"].dataset
         names, template = names_of(registration), str(registration.attrs["template"])
@@ -56,26 +59,15 @@ class Transfer(Panel):
                 f"the panel {self.title} needs a shape to carry to beside {source}; this study has "
                 f"neither another shape nor the mesh of its template {template}"
             )
+        shapes = labelled(self.study, sources), labelled(self.study, names)
         self.choices = {
-            "source": dropdown(
-                "source",
-                "labels and landmarks are of this shape",
-                labelled(self.study, sources),
-                value=source,
-            ),
-            "target": dropdown(
-                "target", "they are carried to this shape", labelled(self.study, names)
-            ),
+            "source": dropdown("source", OF, shapes[0], value=source),
+            "target": dropdown("target", "they are carried to this shape", shapes[1]),
         }
         self.labels = check("labels", "colour both surfaces by the labels of the source", True)
-        self.name = ipywidgets.Combobox(
-            description="landmark",
-            placeholder="a name, then click",
-            tooltip="the landmark that the next click on the source places or moves",
-        )
-        self.remove = self.button(
-            "Remove", lambda: self.drop(self.landmark), "the landmark that is named"
-        )
+        words = {"description": "landmark", "placeholder": "a name, then click", "tooltip": NAME}
+        self.name = ipywidgets.Combobox(**words)
+        self.remove = self.button("Remove", lambda: self.drop(self.landmark), NAMED)
         self.radius = ipywidgets.BoundedFloatText(
             round_number(extent(registration["position"].values) / 60),
             min=0,
@@ -87,16 +79,13 @@ class Transfer(Panel):
             layout={"width": "24em"},
         )
         self.path = file_name("landmarks.csv")
-        self.csv = self.saving(
-            "Save CSV", lambda: self.save_csv(self.path.value), "the landmarks on the target"
-        )
+        self.csv = self.saving("Save CSV", lambda: self.save_csv(self.path.value), SAVED)
         self.legend, self.table = ipywidgets.HTML(), ipywidgets.HTML()
-        look = {"group": camera_group(), "view": view, "up": up, "height": 380}
-        self.scenes = [Scene(**look, clickable=True), Scene(**look)]
+        self.scenes = [self.new_scene(380, clickable=True), self.new_scene(380)]
         self.on_change(self, self.begin_marks, "source")
         for role, choice in self.choices.items():
-            self.on_change(choice, lambda value, role=role: self.set_trait(role, value))
-            self.on_change(self, lambda _: self.draw(), role)
+            self.bind(choice, role)
+        self.redraw(self.draw, "source", "target")
         self.redraw(self.paint, self.labels)
         self.redraw(self.carry, self.radius)
         traitlets.link((self.name, "value"), (self, "landmark"))
@@ -131,9 +120,8 @@ class Transfer(Panel):
         """Both surfaces, and the landmarks on them."""
         if not self.source or not self.target:
             return
-        self.choices["source"].value, self.choices["target"].value = self.source, self.target
-        roles = {"source": self.source, "target": self.target}
-        for scene, (role, name) in zip(self.scenes, roles.items(), strict=True):
+        for scene, role in zip(self.scenes, ("source", "target"), strict=True):
+            name = getattr(self, role)
             X, T = as_arrays(self.mesh(name))
             title = f"{name}, the {role}, {len(X):,} vertices"
             scene.show(aligned(self.study, name, X), T, title=title)
@@ -154,30 +142,22 @@ class Transfer(Panel):
         here = mesh["label"].values
         on_target = transfer_labels(self.study, here, source=self.source, targets=[self.target])
         self.carried = on_target[self.target].dataset
-        there, confidence = (self.carried[key].values for key in ("label", "confidence"))
+        there, sure = (self.carried[key].values for key in ("label", "confidence"))
         values = np.unique(here)
         colors = label_colors(values)  # in the order of the values, so that both surfaces agree
         for scene, label in zip(self.scenes, (here, there), strict=True):
             scene.paint(colors[np.searchsorted(values, label)])
-        caption = (
-            f"labels carried from {self.source}, confidence {confidence.mean():.2f} on average"
-        )
+        caption = f"labels carried from {self.source}, confidence {sure.mean():.2f} on average"
         self.scenes[1].caption = caption
         labels = [
-            {
-                "name": label_text(mesh, value),
-                "color": to_hex(color),
-                "here": f"{np.mean(here == value):.1%}",
-                "there": f"{np.mean(there == value):.1%}",
-            }
+            {"name": label_text(mesh, value), "color": to_hex(color)}
+            | {"here": f"{np.mean(here == value):.1%}", "there": f"{np.mean(there == value):.1%}"}
             for value, color in zip(values, colors, strict=True)
         ]
         self.legend.value = PARTS.legend(labels, len(values) > LEGEND)
 
     def place(self, place: dict) -> None:
         """A click on the source: the landmark that is named comes there; a new one gets a name."""
-        if place.get("vertex", -1) < 0:
-            return
         free = (f"landmark {i}" for i in itertools.count(len(self.marks) + 1))
         name = self.landmark or next(name for name in free if name not in self.marks)
         X, T = as_arrays(self.mesh(self.source))
@@ -213,14 +193,13 @@ class Transfer(Panel):
             self.table.value = PARTS.paragraph("Click on the source to place a landmark.")
             return
         here, there = np.stack(list(self.marks.values())), carried["landmark_position"].values
-        colors = label_colors(np.arange(len(here)))
-        ends = zip(self.scenes, (self.source, self.target), (here, there), strict=True)
-        for scene, name, points in ends:
+        colors, names = label_colors(np.arange(len(here))), (self.source, self.target)
+        for scene, name, points in zip(self.scenes, names, (here, there), strict=True):
             scene.mark(aligned(self.study, name, points), colors, self.radius.value)
-        sure = carried["landmark_confidence"].values
-        numbers = np.column_stack([there, sure])
+        numbers = np.column_stack([there, carried["landmark_confidence"].values])
         rows = [
-            [name, *(f"{number:.2f}" for number in numbers[i])] for i, name in enumerate(self.marks)
+            [name, *(f"{number:.2f}" for number in each)]
+            for name, each in zip(self.marks, numbers, strict=True)
         ]
         caption = f"Landmarks on {self.target} ({unit_text(self.study, self.target)})"
         self.table.value = PARTS.landmarks(caption, COLUMNS, rows)

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from s4a import read_mesh, statistics, write_registered, write_training_set
+from s4a import read_mesh, statistics, write_registered
 from s4a.geometry.mesh import as_arrays
+from s4a_morphometrics import write_training_set
 
 
 @pytest.mark.parametrize(

@@ -5,43 +5,17 @@ import shutil
 
 import numpy as np
 import pytest
-import xarray as xr
-from test_restrict import TOP, X, noise, study_of
+from simulated import TOP, field_study, with_carried
 
 import s4a
 from s4a import cli, open_study, statistics, verify, with_field
-from s4a.analysis.covariation import two_block
 from s4a.analysis.fields import write_field
 from s4a.input.annotations import read_scalars
-from s4a.schema import dataset
-
-HEIGHT = X[:, 2]
-
-
-def with_carried(study, values, unit="mm"):
-    """The study with a field that is on the template already."""
-    field = dataset(carried_field=values).assign_coords(shape=study["registration"]["shape"].values)
-    field["carried_field"].attrs["units"] = unit
-    return xr.DataTree.from_dict(
-        {n.path: n.to_dataset(inherit=False) for n in study.subtree} | {"/fields/thickness": field}
-    )
-
-
-def pattern(seed, s):
-    """Smooth random fields (s, n)."""
-    return noise(seed, s, size=1.0)[..., 0]
 
 
 @pytest.fixture(scope="module")
 def planted():
-    """Twenty shapes whose field is thicker above in group b, grows with age, and follows shape."""
-    rng = np.random.default_rng(0)
-    group, age = np.repeat(["a", "b"], 10), rng.permutation(20) * 1.0
-    score = rng.normal(size=20)
-    d = noise(1, 20) + score[:, None, None] * X * [0.5, 0, 0]
-    values = 0.5 * pattern(2, 20) + 3 + 4.0 * (group == "b")[:, None] * TOP
-    values += 0.2 * (age - 9.5)[:, None] * ~TOP + 3 * score[:, None] * HEIGHT
-    return with_carried(study_of(d, group=group, age=age, score=score), values)
+    return field_study()
 
 
 def test_a_field_of_the_coordinates_is_carried_to_where_the_template_was_registered(study):
@@ -171,19 +145,6 @@ def test_groups_that_differ_in_a_field_are_told_where_they_do(planted):
     assert classes.attrs["balanced_accuracy"] > 0.8
 
 
-def test_scores_of_a_covariation_are_freed_of_its_covariates(planted):
-    z = np.random.default_rng(1).normal(size=planted["registration"].sizes["shape"])
-    found = statistics.covariation(planted, "thickness", covariates={"z": z}, n_permutations=9)
-    for a, b, r in zip(
-        found["score"].values.T,
-        found["field_score"].values.T,
-        found["pair_correlation"].values,
-        strict=True,
-    ):
-        assert np.isclose(np.corrcoef(a, b)[0, 1], r)
-        assert abs(np.corrcoef(a, z)[0, 1]) < 1e-6
-
-
 def test_the_slope_of_a_field_is_that_of_least_squares(planted):
     fit = statistics.regression(
         planted, "age", field="thickness", covariates=["group", "score"], n_permutations=199
@@ -229,53 +190,7 @@ def test_a_field_follows_its_vertices_into_a_region(planted):
     assert again["fields/thickness"].equals(part["fields/thickness"])
 
 
-def test_two_blocks_are_those_of_the_singular_value_decomposition():
-    rng = np.random.default_rng(3)
-    A, B = rng.normal(size=(15, 6)), rng.normal(size=(15, 4))
-    found = two_block(A, B, n_permutations=19)
-    A, B = A - A.mean(0), B - B.mean(0)
-    cross = A.T @ B / 14
-    assert np.allclose(found["singular"], np.linalg.svd(cross, compute_uv=False))
-    scores = A @ found["U"][:, 0], B @ found["V"][:, 0]
-    assert np.isclose(found["r"][0], np.corrcoef(*scores)[0, 1])
-    rv = np.trace(A.T @ B @ B.T @ A)
-    rv /= np.sqrt(np.trace(A.T @ A @ A.T @ A) * np.trace(B.T @ B @ B.T @ B))
-    assert np.isclose(found["rv"], rv)
-
-
-def test_a_field_that_follows_shape_is_found_with_its_pattern(planted):
-    found = statistics.covariation(
-        planted, "thickness", covariates=["age", "group"], n_permutations=199
-    )
-    assert found["p_value"] == 0.005
-    assert found["rv_p"] == 0.005
-    assert abs(np.corrcoef(found["field_pattern"].values[0], HEIGHT)[0, 1]) > 0.9
-    along = found["deformation"].values[0, :, 0]
-    assert abs(np.corrcoef(along, X[:, 0])[0, 1]) > 0.9
-    assert found["field_pattern"].attrs["units"] == "mm"
-    # both follow the planted score with the sign that it has
-    both = (
-        np.polyfit(HEIGHT, found["field_pattern"].values[0], 1)[0]
-        * np.polyfit(X[:, 0], along, 1)[0]
-    )
-    assert both > 0
-    moving = statistics.covariation_modes(planted, found)
-    assert np.allclose(moving["pca"]["deformation"], found["deformation"])
-    with pytest.raises(ValueError, match="n_components needs a number from 1 to"):
-        statistics.covariation(planted, "thickness", n_components=99)
-
-
-def test_fields_of_noise_are_told_to_follow_shape_no_more_often_than_said():
-    found = []
-    for run in range(100):
-        rng = np.random.default_rng([1, run])
-        A, B, Z = (rng.normal(size=(15, c)) for c in (6, 4, 2))
-        one = two_block(A, B, covariates=Z, n_permutations=39, seed=run)
-        found.append([one["p"] <= 0.05, one["singular_p"][0] <= 0.05, one["rv_p"] <= 0.05])
-    assert np.all(np.mean(found, axis=0) < 0.12)  # 0.05 and three standard errors
-
-
-def test_the_command_takes_a_field_in_place_of_shape(tmp_path, capsys, study_folder):
+def test_the_command_takes_a_field_in_place_of_shape(tmp_path, study_folder):
     folder = shutil.copytree(study_folder, tmp_path / "study")
     study = open_study(folder)
     meshes, rng = study["original"].children.items(), np.random.default_rng(0)
@@ -286,8 +201,6 @@ def test_the_command_takes_a_field_in_place_of_shape(tmp_path, capsys, study_fol
     table.write_text("\n".join(["shape,age", *rows]))
     words = ["--variable", "age", "--table", str(table), "--permutations", "19"]
     assert cli.main(["statistics", str(folder), *words, "--field", "noise"]) == 0
-    assert "noise against shape: first pair" in capsys.readouterr().out
     out = folder / "statistics"
     assert "field_effect" in (out / "regression.vertex.csv").read_text().splitlines()[0]
-    assert (out / "covariation.nc").exists()
     assert not (out / "regression.html").exists()

@@ -2,36 +2,12 @@
 
 import numpy as np
 import pytest
-import xarray as xr
+from simulated import TOP, T, X, noise, study_of
 
 from s4a import analyse, cli, open_study, statistics, synthetic
 from s4a.analysis.link import image_in_shape
-from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
+from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.method.pca import gram, pca
-from s4a.schema import dataset
-
-X, T = as_arrays(synthetic.ellipsoid(400))
-TOP = X[:, 2] > 0.3
-
-
-def study_of(d, **columns):
-    """A study of given displacements (s, n, 3), with labels of the template."""
-    names = [f"shape_{i:02d}" for i in range(len(d))]
-    mesh = as_dataset(X, T, {"template": names[0]}).merge(dataset(displacement=d))
-    mesh["confidence"] = ("shape", "vertex"), np.tile(np.where(TOP, 0.9, 0.2), (len(d), 1))
-    mesh["scale"] = ("shape",), np.ones(len(d))
-    mesh = mesh.assign_coords(shape=names)
-    table = xr.Dataset({n: ("shape", v) for n, v in columns.items()}, {"shape": names})
-    original = as_dataset(X, T).merge(dataset(label=np.where(TOP, 7, 3)))
-    nodes = {"registration": mesh, "subjects": table, f"original/{names[0]}": original}
-    return xr.DataTree.from_dict(nodes | {"pca": pca(mesh, vertex_areas(X, T))})
-
-
-def noise(seed, s, size=0.1):
-    """Smooth random fields (s, n, 3)."""
-    rng = np.random.default_rng(seed)
-    k, phase = rng.normal(size=(10, 3)), rng.uniform(0, 6, 10)
-    return size * np.einsum("swx,nw->snx", rng.normal(size=(s, 10, 3)), np.cos(X @ k.T + phase))
 
 
 @pytest.fixture(scope="module")

@@ -103,7 +103,7 @@ def test_check_takes_a_pattern(folder, capsys):
         (["check", "nowhere"], "nowhere"),
         (["view", "nowhere"], "not a study folder"),
         (["run", "nowhere", "--out", "study"], "nowhere"),
-        (["statistics", "nowhere", "--covariates", "age"], "give --group, --variable or --field"),
+        (["statistics", "nowhere", "--covariates", "age"], "give --group or --variable"),
         (
             ["run", "nowhere", "--out", "study", "--k", "3"],
             "k must be an integer of at least 4; found 3",

@@ -47,39 +47,20 @@ class Fault:
         return self.name or self.file.split(".")[0]
 
 
-FAULTS = []
-
-
-def fault(input, file, status, said, outcome, change, **others):
-    def enter(make):
-        FAULTS.append(Fault(input, file, make, status, said, outcome, change, **others))
-        return make
-
-    return enter
-
-
 def write(path, X, T):
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(WRITERS[".ply"](X, T, {}))
 
 
-AGAIN = "export the file again"
-
-
-@fault("zero-byte file", "zero.ply", "excluded", "found 0 bytes", "excluded", AGAIN)
 def zero(path):
     path.write_bytes(b"")
 
 
-@fault(
-    "truncated file", "cut.ply", "excluded", "expected 596 rows of face, found", "excluded", AGAIN
-)
 def cut(path):
     write(path, *shape())
     path.write_bytes(path.read_bytes()[:-1000])
 
 
-@fault("text in a binary PLY", "text.ply", "excluded", "expected .*found", "excluded", AGAIN)
 def text(path):
     X, T = shape()
     write(path, X, T)
@@ -90,73 +71,31 @@ def text(path):
     path.write_bytes(head + b"end_header\n" + "\n".join(rows).encode())
 
 
-@fault(
-    "header that promises more than is there",
-    "promise.ply",
-    "excluded",
-    "expected 9000000 rows of vertex, found",
-    "excluded before memory is asked for",
-    AGAIN,
-)
 def promise(path):
     write(path, *shape())
     path.write_bytes(path.read_bytes().replace(b"vertex 300", b"vertex 9000000"))
 
 
-@fault(
-    "PLY named .stl",
-    "ply_inside.stl",
-    "ok",
-    "named .stl but holds PLY",
-    "read as what it is",
-    "rename the file",
-)
 def ply_inside(path):
     write(path, *shape(1))
 
 
-@fault(
-    "STL named .ply",
-    "stl_inside.ply",
-    "ok",
-    "named .ply but holds STL",
-    "read as what it is",
-    "rename the file",
-)
 def stl_inside(path):
     path.write_bytes(WRITERS[".stl"](*shape(2), {}))
 
 
-@fault("compressed file", "packed.ply.gz", "ok", "^$", "read", "nothing to do")
 def packed(path):
     path.write_bytes(gzip.compress(WRITERS[".ply"](*shape(3), {})))
 
 
-@fault(
-    "compressed file that unpacks to too much",
-    "bomb.ply.gz",
-    "excluded",
-    "at most 64 MiB expected in .* compressed bytes, found more",
-    "excluded at 200 times its size (64 MiB at least, 1 GiB at most)",
-    "unpack it yourself",
-)
 def bomb(path):
     path.write_bytes(gzip.compress(bytes(2**26 + 2**20), 1))
 
 
-@fault(
-    "points only",
-    "points.off",
-    "excluded",
-    "no faces",
-    "excluded",
-    "export the surface, not the points",
-)
 def points(path):
     path.write_text("OFF\n300 0 0\n" + "\n".join("{} {} {}".format(*x) for x in shape()[0]))
 
 
-@fault("quads and polygons", "quads.obj", "ok", "^$", "triangulated", "nothing to do")
 def quads(path):
     X, T = shape(4)
     rows = ["v {} {} {}".format(*x) for x in X]
@@ -167,88 +106,37 @@ def quads(path):
     path.write_text("\n".join(rows + ["f " + " ".join(str(i + 1) for i in f) for f in faces]))
 
 
-@fault(
-    "face index out of range",
-    "beyond.off",
-    "excluded",
-    r"face indices 0\.\.299 expected for 300 vertices, found 0\.\.5000",
-    "excluded before native code",
-    AGAIN,
-)
 def beyond(path):
     X, T = shape()
     path.write_bytes(WRITERS[".off"](X, np.r_[T[:-1], [[0, 1, 5000]]], {}))
 
 
-@fault(
-    "negative face index",
-    "negative.ply",
-    "excluded",
-    r"face indices 0\.\.299 expected for 300 vertices, found -7\.\.",
-    "excluded before native code",
-    AGAIN,
-)
 def negative(path):
     X, T = shape()
     write(path, X, np.r_[T[:-1], [[0, 1, -7]]])
 
 
-@fault(
-    "NaN or infinite coordinates",
-    "nan.ply",
-    "repaired",
-    "2 non-finite vertices removed.*1 holes|2 non-finite vertices removed.*2 holes",
-    "the vertices and their faces are removed, `file_vertex` leads to the file's",
-    "`strict=True` excludes the shape; `close_holes=True` closes what is left open",
-)
 def nan(path):
     X, T = shape(5)
     X[10], X[200] = np.nan, np.inf
     write(path, X, T)
 
 
-@fault(
-    "unreferenced vertices",
-    "unreferenced.ply",
-    "repaired",
-    "3 vertices without triangles dropped",
-    "dropped, `file_vertex` kept",
-    "nothing to do",
-)
 def unreferenced(path):
     X, T = shape(6)
     write(path, np.r_[np.ones((3, 3)), X], T + 3)
 
 
-@fault(
-    "duplicate vertices",
-    "duplicate_vertices.obj",
-    "repaired",
-    "1488 vertices welded",
-    "welded at 1e-7 of the bounding box, `file_vertex` kept",
-    "nothing to do",
-)
 def duplicate_vertices(path):
     X, T = shape(7)
     soup = X[T].reshape(-1, 3) + np.random.default_rng(0).uniform(-1e-6, 1e-6, (3 * len(T), 3))
     path.write_bytes(WRITERS[".obj"](soup, np.arange(len(soup)).reshape(-1, 3), {}))
 
 
-@fault(
-    "STL soup", "soup.stl", "ok", "^$", "corners in the same place are one vertex", "nothing to do"
-)
 def soup(path):
     path.write_bytes(WRITERS[".stl"](*shape(8), {}))
 
 
-@fault(
-    "zero-area faces",
-    "flat.ply",
-    "repaired",
-    "zero-area triangles",
-    "long edges flipped, so that no crack opens; else dropped",
-    "nothing to do",
-)
 def flat(path):
     X, T = shape(9)
     a, b, c = T[0]
@@ -257,40 +145,16 @@ def flat(path):
     write(path, X, np.r_[T[1:], [[a, middle, c], [middle, b, c], [a, b, middle]]])
 
 
-@fault(
-    "faces that repeat a corner",
-    "repeated.ply",
-    "repaired",
-    "2 triangles with repeated corners dropped",
-    "dropped",
-    "nothing to do",
-)
 def repeated(path):
     X, T = shape(10)
     write(path, X, np.r_[T, [[3, 3, 4], [5, 6, 5]]])
 
 
-@fault(
-    "duplicate faces",
-    "twice.ply",
-    "repaired",
-    "5 duplicate triangles dropped",
-    "one is kept",
-    "nothing to do",
-)
 def twice(path):
     X, T = shape(11)
     write(path, X, np.r_[T, T[:5]])
 
 
-@fault(
-    "flipped faces",
-    "flipped.ply",
-    "repaired",
-    "100 triangles reoriented",
-    "turned to agree, and outwards",
-    "nothing to do",
-)
 def flipped(path):
     X, T = shape(12)
     T = T.copy()
@@ -298,27 +162,11 @@ def flipped(path):
     write(path, X, T)
 
 
-@fault(
-    "non-manifold edges",
-    "fin.ply",
-    "repaired",
-    "1 non-manifold edge separated",
-    "separated into sheets; a robust Laplacian where the low-resolution mesh still has some",
-    "`wrap=True` wraps the shape watertight",
-)
 def fin(path):
     X, T = shape(13)
     write(path, np.r_[X, [[90.0, 90, 90]]], np.r_[T, [[T[0, 0], T[0, 1], len(X)]]])
 
 
-@fault(
-    "bow-tie vertices",
-    "bowtie.ply",
-    "repaired",
-    "1 vertex added by splitting non-manifold ones",
-    "split",
-    "nothing to do",
-)
 def bowtie(path):
     X, T = shape(14)
     u, S = as_arrays(synthetic.sphere(20))
@@ -329,14 +177,6 @@ def bowtie(path):
     write(path, np.r_[X, Y], np.r_[T, S])
 
 
-@fault(
-    "holes, open boundary",
-    "hole.ply",
-    "ok",
-    "1 hole kept as boundary",
-    "kept as boundary",
-    "`close_holes=True` closes each by a fan",
-)
 def hole(path):
     X, T = shape(15)
     write(path, X, T[1:])
@@ -349,331 +189,120 @@ def spheres(X, T, *radii):
     return X, T
 
 
-@fault(
-    "several components",
-    "debris.ply",
-    "repaired",
-    r"2 components dropped \([0-9.]+ % of the area\)",
-    "the largest is kept, and the share of the area that was dropped is said",
-    '`components=N` or `"all"` keeps more',
-)
 def debris(path):
     write(path, *spheres(*shape(16), 4, 5))
 
 
-@fault(
-    "components with more than a tenth of the area",
-    "parts.ply",
-    "repaired",
-    "% of the area was in dropped components",
-    "the largest is kept, warned",
-    '`components=N` or `"all"` keeps more',
-    where="warning",
-)
 def parts(path):
     write(path, *spheres(*shape(17), 30))
 
 
-@fault(
-    "largest component under half of the area",
-    "halves.ply",
-    "excluded",
-    r"the largest of 3 components has .* under half; say how many .* components=3",
-    "excluded",
-    '`components=N` or `"all"`',
-)
 def halves(path):
     X, T = shape()
     write(path, np.r_[X, X + 300, X + 600], np.r_[T, T + len(X), T + 2 * len(X)])
 
 
-@fault(
-    "self-intersections",
-    "crossing.ply",
-    "ok",
-    "triangles pass through others, 2.3 % .in the others 0.0 %.",
-    "counted; warned above 1 % and ten times what the others have",
-    "`wrap=True` makes a surface without; `intersections=False` does not look for them",
-    where="warning",
-)
 def crossing(path):
     X, T = shape(18)
     X[np.argmax(X[:, 2])] *= [1, 1, -1.6]
     write(path, X, T)
 
 
-@fault(
-    "genus other than the rest",
-    "handle.ply",
-    "doubtful",
-    "genus 1, but 0 in",
-    "warned, with the table of genus",
-    "`wrap=True` closes tunnels; or leave the shape out",
-    where="warning",
-)
 def handle(path):
     X, T = as_arrays(synthetic.torus(30, 12, 50, 20))
     write(path, X, T)
 
 
-@fault(
-    "shape in other units",
-    "metres.ply",
-    "doubtful",
-    r"times the size of the others, near 10\^-3",
-    "warned with the factor; size is kept",
-    "scale the file",
-    where="warning",
-)
 def metres(path):
     X, T = shape(19)
     write(path, X / 1000, T)
 
 
-@fault(
-    "mirrored shape",
-    "mirrored.ply",
-    "doubtful",
-    "fits as a mirror image",
-    "warned with both ICP residuals; kept as it is; "
-    "one of a nearly symmetric kind cannot be told from the others",
-    "reflect= mirrors it; or leave it out",
-    where="warning",
-)
 def mirrored(path):
     X, T = shape(20)
     write(path, X * [-1, 1, 1], T[:, ::-1])
 
 
-@fault(
-    "shape upside down",
-    "upside_down.ply",
-    "ok",
-    "^$",
-    "the alignment starts from several turns",
-    "nothing to do",
-)
 def upside_down(path):
     X, T = shape(21)
     write(path, X * [1, -1, -1], T)
 
 
-@fault(
-    "a part is cut off",
-    "part.ply",
-    "doubtful",
-    r"its holes are [0-9.]+ of sqrt\(area\) long, of the others 0: is a part cut off",
-    "doubtful: beside five shapes or more, where its holes are much longer",
-    "complete the scan, or leave it out",
-    where="warning",
-)
 def part(path):
     X, T = shape(30)
     write(path, X, T[(X[T, 2] < np.quantile(X[:, 2], 0.7)).all(axis=1)])
 
 
-@fault(
-    "shape stretched by 3",
-    "stretched.ply",
-    "doubtful",
-    "unlike the others: .* times the usual spread away; .* stretched",
-    "warned by its form beside five shapes or more; doubtful where it is far from all others",
-    "look at it; leave it out if it does not belong",
-    where="warning",
-)
 def stretched(path):
     X, T = shape(31)
     write(path, X * [3, 1, 1], T)
 
 
-@fault(
-    "another kind of shape",
-    "rod.ply",
-    "doubtful",
-    "unlike the others: .* times the usual spread away; another kind of shape",
-    "the same",
-    "leave it out",
-    where="warning",
-)
 def rod(path):
     write(path, SPHERE[0] * [120, 25, 25], SPHERE[1])
 
 
-@fault(
-    "the same scan under two names",
-    "same_as_packed.obj",
-    "doubtful",
-    "the same surface as packed, under two names",
-    "doubtful: told by size, moments and volume, in whatever order, pose and format",
-    "leave one of them out",
-    where="warning",
-)
 def same(path):
     X, T = shape(3)
     path.write_bytes(WRITERS[".obj"](np.round(X[::-1], 3) + 500, len(X) - 1 - T[::-1], {}))
 
 
-@fault(
-    "coordinates rounded",
-    "rounded.ply",
-    "ok",
-    r"its coordinates are rounded, to 0\.[0-9]+ of an edge",
-    "warned, where the others' are not",
-    "export it with more digits",
-    where="warning",
-)
 def rounded(path):
     X, T = shape(32)
     write(path, np.round(X / 4) * 4, T)
 
 
-@fault(
-    "inches among centimetres",
-    "inches.ply",
-    "doubtful",
-    r"2\.[45][0-9]* times the size of the others, near 2.54",
-    "doubtful, beside five shapes or more; its size is kept",
-    "scale the file",
-    where="warning",
-)
 def inches(path):
     X, T = shape(33)
     write(path, 2.54 * X, T)
 
 
-@fault("coordinates offset by 1e6", "far.obj", "ok", "^$", "the same as centred", "nothing to do")
 def far(path):
     X, T = shape(22)
     path.write_bytes(WRITERS[".obj"](X + 1e6, T, {}))
 
 
-@fault(
-    "scale 1e-9",
-    "tiny.obj",
-    "doubtful",
-    "1e-09 times the size of the others|e-10 times the size of the others",
-    "the same as scaled, in the input's units; warned as another unit",
-    "scale the file",
-    where="warning",
-)
 def tiny(path):
     X, T = shape(23)
     path.write_bytes(WRITERS[".obj"](X * 1e-9, T, {}))
 
 
-@fault(
-    "scale 1e9",
-    "huge.obj",
-    "doubtful",
-    r"e\+0?[89] times the size of the others",
-    "the same as scaled, in the input's units; warned as another unit",
-    "scale the file",
-    where="warning",
-)
 def huge(path):
     X, T = shape(24)
     path.write_bytes(WRITERS[".obj"](X * 1e9, T, {}))
 
 
-@fault(
-    "coordinates over 1e15",
-    "giant.obj",
-    "excluded",
-    r"coordinates of at most 1e\+15 needed, found",
-    "excluded, as squares of them overflow",
-    "scale the file",
-)
 def giant(path):
     X, T = shape(30)
     path.write_bytes(WRITERS[".obj"](X * 1e37, T, {}))
 
 
-@fault(
-    "an extent under 1e-15",
-    "denormal.obj",
-    "excluded",
-    "an extent of at least 1e-15 needed, found",
-    "excluded, as squares of it vanish",
-    "scale the file",
-)
 def denormal(path):
     X, T = shape(31)
     path.write_bytes(WRITERS[".obj"](X * 1e-300, T, {}))
 
 
-@fault(
-    "an offset in which the shape is lost",
-    "lost.ply",
-    "excluded",
-    "lost in rounding: its extent is .* float32",
-    "excluded: from 1e5 times the extent in float32 files, 1e11 times in float64",
-    "subtract the offset before the file is written",
-)
 def lost(path):
     X, T = shape(32)
     write(path, X + 1e8, T)
 
 
-@fault(
-    "fewer vertices than the target resolution",
-    "few.ply",
-    "ok",
-    "",
-    "used as it is, said in the report",
-    "nothing",
-)
 def few(path):
     write(path, *shape(25, 80))
 
 
-@fault(
-    "spaces and letters outside ASCII in a path",
-    "Schädel der Maus 脳.ply",
-    "ok",
-    "^$",
-    "works; the name is made of ASCII letters",
-    "nothing to do",
-    name="Schadel_der_Maus_u8133",
-)
 def letters(path):
     write(path, *shape(26))
 
 
-@fault(
-    "two files with one stem",
-    "left/one.ply",
-    "ok",
-    "^$",
-    "named by their folders",
-    "nothing",
-    name="left_one",
-)
 def left(path):
     write(path, *shape(27))
 
 
-@fault(
-    "two files with one stem",
-    "right/one.ply",
-    "ok",
-    "^$",
-    "named by their folders",
-    "nothing",
-    name="right_one",
-)
 def right(path):
     write(path, *shape(28))
 
 
-@fault(
-    "HTML in a shape's name",
-    "<img src=x onerror=alert(1)>.ply",
-    "ok",
-    "^$",
-    "escaped wherever it is shown",
-    "rename the file",
-    name="_img_src_x_onerror_alert_1__",
-)
 def html(path):
     write(path, *shape(29))
 
@@ -683,27 +312,10 @@ class Evil:
         return (exec, ("raise SystemExit('a pickle was executed')",))
 
 
-@fault(
-    "pickle in an NPZ",
-    "pickle.npz",
-    "excluded",
-    "pickle",
-    "excluded, never executed",
-    "save plain arrays",
-)
 def pickle(path):
     np.savez(path, V=np.array([Evil()], object), F=np.array([[0, 1, 2]]))
 
 
-@fault(
-    "labels beside the surfaces",
-    "some.label.gii",
-    "",
-    "some.label.gii is not a mesh .a GIFTI file without points. and was passed over",
-    "passed over and said; no lost shape",
-    "nothing to do",
-    where="remarks",
-)
 def label(path):
     import nibabel
 
@@ -711,6 +323,145 @@ def label(path):
     path.write_bytes(nibabel.gifti.GiftiImage(darrays=[array]).to_bytes())
 
 
+AGAIN = "export the file again"
+# fmt: off
+FAULTS = [
+    Fault("zero-byte file", "zero.ply", zero, "excluded", "found 0 bytes", "excluded", AGAIN),
+    Fault("truncated file", "cut.ply", cut, "excluded", "expected 596 rows of face, found",
+          "excluded", AGAIN),
+    Fault("text in a binary PLY", "text.ply", text, "excluded", "expected .*found", "excluded",
+          AGAIN),
+    Fault("header that promises more than is there", "promise.ply", promise, "excluded",
+          "expected 9000000 rows of vertex, found", "excluded before memory is asked for", AGAIN),
+    Fault("PLY named .stl", "ply_inside.stl", ply_inside, "ok", "named .stl but holds PLY",
+          "read as what it is", "rename the file"),
+    Fault("STL named .ply", "stl_inside.ply", stl_inside, "ok", "named .ply but holds STL",
+          "read as what it is", "rename the file"),
+    Fault("compressed file", "packed.ply.gz", packed, "ok", "^$", "read", "nothing to do"),
+    Fault("compressed file that unpacks to too much", "bomb.ply.gz", bomb, "excluded",
+          "at most 64 MiB expected in .* compressed bytes, found more",
+          "excluded at 200 times its size (64 MiB at least, 1 GiB at most)", "unpack it yourself"),
+    Fault("points only", "points.off", points, "excluded", "no faces", "excluded",
+          "export the surface, not the points"),
+    Fault("quads and polygons", "quads.obj", quads, "ok", "^$", "triangulated", "nothing to do"),
+    Fault("face index out of range", "beyond.off", beyond, "excluded",
+          r"face indices 0\.\.299 expected for 300 vertices, found 0\.\.5000",
+          "excluded before native code", AGAIN),
+    Fault("negative face index", "negative.ply", negative, "excluded",
+          r"face indices 0\.\.299 expected for 300 vertices, found -7\.\.",
+          "excluded before native code", AGAIN),
+    Fault("NaN or infinite coordinates", "nan.ply", nan, "repaired",
+          "2 non-finite vertices removed.*1 holes|2 non-finite vertices removed.*2 holes",
+          "the vertices and their faces are removed, `file_vertex` leads to the file's",
+          "`strict=True` excludes the shape; `close_holes=True` closes what is left open"),
+    Fault("unreferenced vertices", "unreferenced.ply", unreferenced, "repaired",
+          "3 vertices without triangles dropped", "dropped, `file_vertex` kept", "nothing to do"),
+    Fault("duplicate vertices", "duplicate_vertices.obj", duplicate_vertices, "repaired",
+          "1488 vertices welded", "welded at 1e-7 of the bounding box, `file_vertex` kept",
+          "nothing to do"),
+    Fault("STL soup", "soup.stl", soup, "ok", "^$", "corners in the same place are one vertex",
+          "nothing to do"),
+    Fault("zero-area faces", "flat.ply", flat, "repaired", "zero-area triangles",
+          "long edges flipped, so that no crack opens; else dropped", "nothing to do"),
+    Fault("faces that repeat a corner", "repeated.ply", repeated, "repaired",
+          "2 triangles with repeated corners dropped", "dropped", "nothing to do"),
+    Fault("duplicate faces", "twice.ply", twice, "repaired", "5 duplicate triangles dropped",
+          "one is kept", "nothing to do"),
+    Fault("flipped faces", "flipped.ply", flipped, "repaired", "100 triangles reoriented",
+          "turned to agree, and outwards", "nothing to do"),
+    Fault("non-manifold edges", "fin.ply", fin, "repaired", "1 non-manifold edge separated",
+          "separated into sheets; a robust Laplacian where the low-resolution mesh still has some",
+          "`wrap=True` wraps the shape watertight"),
+    Fault("bow-tie vertices", "bowtie.ply", bowtie, "repaired",
+          "1 vertex added by splitting non-manifold ones", "split", "nothing to do"),
+    Fault("holes, open boundary", "hole.ply", hole, "ok", "1 hole kept as boundary",
+          "kept as boundary", "`close_holes=True` closes each by a fan"),
+    Fault("several components", "debris.ply", debris, "repaired",
+          r"2 components dropped \([0-9.]+ % of the area\)",
+          "the largest is kept, and the share of the area that was dropped is said",
+          '`components=N` or `"all"` keeps more'),
+    Fault("components with more than a tenth of the area", "parts.ply", parts, "repaired",
+          "% of the area was in dropped components", "the largest is kept, warned",
+          '`components=N` or `"all"` keeps more', where="warning"),
+    Fault("largest component under half of the area", "halves.ply", halves, "excluded",
+          r"the largest of 3 components has .* under half; say how many .* components=3",
+          "excluded", '`components=N` or `"all"`'),
+    Fault("self-intersections", "crossing.ply", crossing, "ok",
+          "triangles pass through others, 2.3 % .in the others 0.0 %.",
+          "counted; warned above 1 % and ten times what the others have",
+          "`wrap=True` makes a surface without; `intersections=False` does not look for them",
+          where="warning"),
+    Fault("genus other than the rest", "handle.ply", handle, "doubtful", "genus 1, but 0 in",
+          "warned, with the table of genus", "`wrap=True` closes tunnels; or leave the shape out",
+          where="warning"),
+    Fault("shape in other units", "metres.ply", metres, "doubtful",
+          r"times the size of the others, near 10\^-3", "warned with the factor; size is kept",
+          "scale the file", where="warning"),
+    Fault("mirrored shape", "mirrored.ply", mirrored, "doubtful", "fits as a mirror image",
+          "warned with both ICP residuals; kept as it is; "
+          "one of a nearly symmetric kind cannot be told from the others",
+          "reflect= mirrors it; or leave it out", where="warning"),
+    Fault("shape upside down", "upside_down.ply", upside_down, "ok", "^$",
+          "the alignment starts from several turns", "nothing to do"),
+    Fault("a part is cut off", "part.ply", part, "doubtful",
+          r"its holes are [0-9.]+ of sqrt\(area\) long, of the others 0: is a part cut off",
+          "doubtful: beside five shapes or more, where its holes are much longer",
+          "complete the scan, or leave it out", where="warning"),
+    Fault("shape stretched by 3", "stretched.ply", stretched, "doubtful",
+          "unlike the others: .* times the usual spread away; .* stretched",
+          "warned by its form beside five shapes or more; doubtful where it is far from all others",
+          "look at it; leave it out if it does not belong", where="warning"),
+    Fault("another kind of shape", "rod.ply", rod, "doubtful",
+          "unlike the others: .* times the usual spread away; another kind of shape", "the same",
+          "leave it out", where="warning"),
+    Fault("the same scan under two names", "same_as_packed.obj", same, "doubtful",
+          "the same surface as packed, under two names",
+          "doubtful: told by size, moments and volume, in whatever order, pose and format",
+          "leave one of them out", where="warning"),
+    Fault("coordinates rounded", "rounded.ply", rounded, "ok",
+          r"its coordinates are rounded, to 0\.[0-9]+ of an edge",
+          "warned, where the others' are not", "export it with more digits", where="warning"),
+    Fault("inches among centimetres", "inches.ply", inches, "doubtful",
+          r"2\.[45][0-9]* times the size of the others, near 2.54",
+          "doubtful, beside five shapes or more; its size is kept", "scale the file",
+          where="warning"),
+    Fault("coordinates offset by 1e6", "far.obj", far, "ok", "^$", "the same as centred",
+          "nothing to do"),
+    Fault("scale 1e-9", "tiny.obj", tiny, "doubtful",
+          "1e-09 times the size of the others|e-10 times the size of the others",
+          "the same as scaled, in the input's units; warned as another unit", "scale the file",
+          where="warning"),
+    Fault("scale 1e9", "huge.obj", huge, "doubtful", r"e\+0?[89] times the size of the others",
+          "the same as scaled, in the input's units; warned as another unit", "scale the file",
+          where="warning"),
+    Fault("coordinates over 1e15", "giant.obj", giant, "excluded",
+          r"coordinates of at most 1e\+15 needed, found", "excluded, as squares of them overflow",
+          "scale the file"),
+    Fault("an extent under 1e-15", "denormal.obj", denormal, "excluded",
+          "an extent of at least 1e-15 needed, found", "excluded, as squares of it vanish",
+          "scale the file"),
+    Fault("an offset in which the shape is lost", "lost.ply", lost, "excluded",
+          "lost in rounding: its extent is .* float32",
+          "excluded: from 1e5 times the extent in float32 files, 1e11 times in float64",
+          "subtract the offset before the file is written"),
+    Fault("fewer vertices than the target resolution", "few.ply", few, "ok", "",
+          "used as it is, said in the report", "nothing"),
+    Fault("spaces and letters outside ASCII in a path", "Schädel der Maus 脳.ply", letters, "ok",
+          "^$", "works; the name is made of ASCII letters", "nothing to do",
+          name="Schadel_der_Maus_u8133"),
+    Fault("two files with one stem", "left/one.ply", left, "ok", "^$", "named by their folders",
+          "nothing", name="left_one"),
+    Fault("two files with one stem", "right/one.ply", right, "ok", "^$", "named by their folders",
+          "nothing", name="right_one"),
+    Fault("HTML in a shape's name", "<img src=x onerror=alert(1)>.ply", html, "ok", "^$",
+          "escaped wherever it is shown", "rename the file", name="_img_src_x_onerror_alert_1__"),
+    Fault("pickle in an NPZ", "pickle.npz", pickle, "excluded", "pickle",
+          "excluded, never executed", "save plain arrays"),
+    Fault("labels beside the surfaces", "some.label.gii", label, "",
+          "some.label.gii is not a mesh .a GIFTI file without points. and was passed over",
+          "passed over and said; no lost shape", "nothing to do", where="remarks"),
+]
+# fmt: on
 GOOD = [f"good_{i}" for i in range(10)]
 
 

@@ -1,4 +1,4 @@
-"""The page of the documentation on faults, from the entries of the tests.
+"""The page of the documentation on faults: its first table from the entries of the tests.
 
 ``python tests/faults/table.py``.
 """
@@ -14,7 +14,6 @@ if __name__ == "__main__":
 from paths import DOCS
 
 from faults.shapes import FAULTS, make
-from faults.studies import PROOFS
 from s4a import read_shapes
 
 PAGE = DOCS / "faults.md"
@@ -65,29 +64,25 @@ def sentences(report):
 
 
 def page(texts):
-    """The page; `texts` is what the report says of every shape."""
+    """The page; `texts` is what the report says of every shape.
+
+    The second table, of collections, options and studies, is kept as it stands.
+    """
     rows = [
-        [
-            cell(f.input),
-            f.status or "no shape",
-            cell(f.outcome),
-            cell(texts[f.shape]),
-            cell(f.change),
-        ]
-        for f in FAULTS
+        (fault.input, fault.status or "no shape", fault.outcome, texts[fault.shape], fault.change)
+        for fault in FAULTS
     ]
-    tests = [
-        [cell(case), cell(outcome), f"`{file}`: {test}"] for case, outcome, file, test in PROOFS
+    lines = ["| " + " | ".join(map(cell, row)) + " |" for row in rows]
+    _, heading, rest = PAGE.read_text(encoding="utf-8").partition(REST)
+    return HEAD + "\n".join(lines) + "\n" + heading + rest
+
+
+def proofs():
+    """File and name of the test of each row of the second table."""
+    _, _, rest = PAGE.read_text(encoding="utf-8").partition(REST)
+    return [
+        re.search(r"`(test_\w+\.py)`: (test_\w+) \|$", row).groups() for row in rest.splitlines()
     ]
-    lines = ["| " + " | ".join(row) + " |" for row in rows]
-    return (
-        HEAD
-        + "\n".join(lines)
-        + "\n"
-        + REST
-        + "\n".join("| " + " | ".join(r) + " |" for r in tests)
-        + "\n"
-    )
 
 
 if __name__ == "__main__":

@@ -10,8 +10,12 @@ from scipy.optimize import minimize
 from s4a import coarsen, metrics, spectrum, synthetic
 from s4a.geometry.align import farthest_points
 from s4a.geometry.mesh import as_arrays, vertex_normals
-from s4a.method import descriptors, fmap, spectral
+from s4a.method import fmap, spectral
 from s4a.method.shape import Shape
+
+
+def low(mesh):
+    return Shape(coarse=mesh).low
 
 
 @pytest.fixture(scope="module")
@@ -38,8 +42,8 @@ def test_signatures_are_those_of_pyfm_at_its_own_settings(shape):
     signatures = pytest.importorskip("pyFM.signatures")
     Phi, _, ev, _, _ = shape
     for ours, theirs in (
-        (descriptors.hks, signatures.auto_HKS),
-        (descriptors.wks, signatures.auto_WKS),
+        (fmap.hks, signatures.auto_HKS),
+        (fmap.wks, signatures.auto_WKS),
     ):
         for landmark in (None, np.array([5, 70, 300])):
             found, expected = (
@@ -49,7 +53,7 @@ def test_signatures_are_those_of_pyfm_at_its_own_settings(shape):
             assert found == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
 
-@pytest.mark.parametrize("signature", [descriptors.hks, descriptors.wks])
+@pytest.mark.parametrize("signature", [fmap.hks, fmap.wks])
 def test_signatures_do_not_change_with_signs_and_numbering_and_those_of_landmarks_follow_them(
     shape, signature
 ):
@@ -67,7 +71,7 @@ def test_a_sphere_has_the_same_signature_everywhere():
     ball = spectrum(
         coarsen(synthetic.sphere(8000), n_coarse=2500), k=49
     )  # all of the modes of degree 0 to 6
-    for signature in (descriptors.hks, descriptors.wks):
+    for signature in (fmap.hks, fmap.wks):
         found = signature(ball["eigenfunction"].values, ball["eigenvalue"].values, n=20)
         assert found.std(axis=0) == pytest.approx(0, abs=0.06)
         assert found.mean(axis=0) == pytest.approx(
@@ -79,7 +83,7 @@ def test_the_heat_kernel_around_a_landmark_is_that_of_the_plane_at_short_times(s
     Phi, area, ev, X, _ = shape
     t = 4 * np.log(10) / ev[-1]
     kernel = np.exp(-t * ev)
-    heat = descriptors.landmark_signature(Phi, kernel[None], np.array([100]))[:, 0]
+    heat = fmap.landmark_signature(Phi, kernel[None], np.array([100]))[:, 0]
     assert area @ heat == pytest.approx(1)  # heat is kept
     assert heat[100] == pytest.approx(1 / (4 * np.pi * t), rel=0.5)
     assert np.linalg.norm(X - X[100], axis=1)[np.argmax(heat)] < 0.05 * np.ptp(X, axis=0).max()
@@ -87,15 +91,14 @@ def test_the_heat_kernel_around_a_landmark_is_that_of_the_plane_at_short_times(s
 
 def test_both_spectra_of_a_pair_are_filtered_at_the_same_times_and_energies():
     low, high = np.array([0.0, 1, 2, 3, 9]), np.array([0.0, 2, 4, 5, 6, 30])
-    for kernel in (descriptors.heat_filter, descriptors.wave_filter):
+    for kernel in (fmap.heat_filter, fmap.wave_filter):
         one, other = kernel(low, high, n=7), kernel(high, low, n=7)
         both = np.intersect1d(low, high)[1:]
         ratio = [k[:, np.searchsorted(s, both)] for k, s in ((one, low), (other, high))]
         assert ratio[0][:, 0] / one[:, 2] == pytest.approx(np.ones(7))
         assert one.sum(axis=1) == pytest.approx(np.ones(7))
     heat = [
-        np.exp(-t)
-        for t in np.diff(np.log(descriptors.heat_filter(low, high, n=7)[:, 1:3]), axis=1)[:, 0]
+        np.exp(-t) for t in np.diff(np.log(fmap.heat_filter(low, high, n=7)[:, 1:3]), axis=1)[:, 0]
     ]
     assert np.log(heat) == pytest.approx(np.geomspace(4 * np.log(10) / 9, 4 * np.log(10) / 2, 7))
 
@@ -104,18 +107,18 @@ def test_a_shape_fits_itself_with_fewer_functions_by_either_kernel(brains):
     mesh = brains[0]
     few = mesh.isel(mode=slice(20))
     for kind in ("hks", "wks"):
-        C = fmap.fit_descriptors(few, mesh, k=20, kind=kind)["fmap"].values
+        C = fmap.fmap_from_descriptors(low(few), low(mesh), k=20, kind=kind)
         assert np.linalg.norm(C - np.eye(20)) < 0.01, kind
 
 
 def test_modes_of_eigenvalue_0_take_no_part_in_the_wave_kernel():
-    assert (descriptors.wave_filter(np.array([0.0, 0, 1, 2, 3]), n=5)[:, :2] == 0).all()
+    assert (fmap.wave_filter(np.array([0.0, 0, 1, 2, 3]), n=5)[:, :2] == 0).all()
 
 
 def test_products_act_on_functions_of_the_basis(shape):
     Phi, area, _, _, _ = shape
     f = Phi[:, 1:3] @ [[1.0, 0.0], [0.0, 2.0]]
-    for column, P in zip(f.T, descriptors.multiplication(Phi, area, f), strict=True):
+    for column, P in zip(f.T, fmap.multiplication(Phi, area, f), strict=True):
         assert pytest.approx(P.T) == P
         assert P[:, 0] == pytest.approx(Phi.T @ (area * column), abs=1e-9)  # the product with 1
 
@@ -127,11 +130,11 @@ def test_the_orientation_operator_of_x_takes_y_to_1_on_a_square_and_to_minus_1_t
     a, b, c, d = (((i + p) * 7 + j + q).ravel() for p, q in ((0, 0), (1, 0), (1, 1), (0, 1)))
     T = np.concatenate([np.c_[a, b, c], np.c_[a, c, d]])
     Phi = np.c_[np.ones(len(X)), X[:, :2]]
-    P = descriptors.orientation(T, Phi, X[:, :2])
+    P = fmap.orientation(T, Phi, X[:, :2])
     area = 6.0
     assert P[0, 0] == pytest.approx([0, 0, area])
     assert P[1, 0] == pytest.approx([0, -area, 0])
-    assert descriptors.orientation(T[:, ::-1], Phi, X[:, :2]) == pytest.approx(-P)
+    assert fmap.orientation(T[:, ::-1], Phi, X[:, :2]) == pytest.approx(-P)
 
 
 def test_the_orientation_operator_is_that_of_pyfm(shape):
@@ -139,7 +142,7 @@ def test_the_orientation_operator_is_that_of_pyfm(shape):
     Phi, _, _, X, T = shape
     f = X[:, :2] * [1.0, 0.01]
     mesh = pyfm.TriMesh(X, T)
-    ours = descriptors.orientation(T, Phi[:, :12], f)
+    ours = fmap.orientation(T, Phi[:, :12], f)
     for column, P in zip(f.T, ours, strict=True):
         operator = mesh.orientation_op(mesh.gradient(column))
         theirs = Phi[:, :12].T @ (np.asarray(mesh.vertex_areas)[:, None] * (operator @ Phi[:, :12]))
@@ -209,8 +212,8 @@ def test_the_fit_is_where_that_of_pyfm_ends(brains, oriented):
     ends = []
     for mesh, f in ((peer.mesh1, peer.descr1), (peer.mesh2, peer.descr2)):
         Phi, area = mesh.eigenvectors[:, :k], mesh.A.diagonal()
-        turn = descriptors.orientation(mesh.faces, Phi, f)
-        ends.append((Phi.T @ (area[:, None] * f), descriptors.multiplication(Phi, area, f), turn))
+        turn = fmap.orientation(mesh.faces, Phi, f)
+        ends.append((Phi.T @ (area[:, None] * f), fmap.multiplication(Phi, area, f), turn))
     (F, P, W), (G, Q, V) = ends
     mask = weights.resolvent_mask(peer.mesh1.eigenvalues[:k], peer.mesh2.eigenvalues[:k])
     tau = weights.canonical_taus(F, G, (P, Q), (W, V) if oriented else [], mask)
@@ -237,7 +240,7 @@ def test_the_fit_on_descriptors_of_a_shape_and_itself_renumbered_is_the_map_betw
     )
     other["eigenfunction"] = other["eigenfunction"] * sign
     for kind in ("wks", "hks"):
-        C = fmap.fit_descriptors(mesh, other, kind=kind)["fmap"].values
+        C = fmap.fmap_from_descriptors(low(mesh), low(other), kind=kind)
         match = fmap.zoomout(Shape(coarse=mesh).low, Shape(coarse=other).low, C, 60)
         assert (match[1] == order).all(), kind
 
@@ -248,8 +251,8 @@ def test_descriptors_alone_match_different_brains_and_landmarks_help(brains):
     landmark = farthest_points(X, 8)
     nearest = np.linalg.norm(X[landmark][:, None] - target["position"].values, axis=2).argmin(1)
     error = {}
-    for name, marks in (("alone", None), ("landmarks", (landmark, nearest))):
-        C = fmap.fit_descriptors(source, target, landmarks=marks)["fmap"].values
+    for name, marks in (("alone", (None, None)), ("landmarks", (landmark, nearest))):
+        C = fmap.fmap_from_descriptors(low(source), low(target), landmarks=marks)
         match = fmap.match_from_fmap(C, Phi, Psi)
         true = np.linalg.norm(X[:, None] - target["position"].values, axis=2).argmin(0)
         error[name] = metrics.geodesic_error(X, T, match, true).mean()
@@ -263,29 +266,14 @@ def test_the_orientation_term_prefers_the_map_that_keeps_the_sides_over_its_mirr
     assert ((vertex_normals(X, T) * X).sum(1) > 0).mean() > 0.99
     mirror = np.linalg.norm(X[:, None] * [1, 1, -1] - X[None], axis=2).argmin(1)
     f = X[:, :2] * X[:, 2:]
-    W = descriptors.orientation(T, Phi, f)
-    turned = descriptors.orientation(T, Phi, f[mirror])
+    W = fmap.orientation(T, Phi, f)
+    turned = fmap.orientation(T, Phi, f[mirror])
     C = fmap.fmap_from_match(Phi, Phi, area, mirror)
     kept = (W**2).sum()
     assert ((C @ W - turned @ C) ** 2).sum() > 2 * kept
     assert ((C @ W + turned @ C) ** 2).sum() < 0.1 * kept
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"k": 61}, "source needs 61 eigenfunctions"),
-        ({"kind": "sift"}, "kind must be"),
-        ({"landmarks": ([1, 2], [3])}, "as many vertices"),
-    ],
-)
-def test_a_fit_that_cannot_be_is_refused(brains, options, message):
-    with pytest.raises(ValueError, match=message):
-        fmap.fit_descriptors(*brains, **options)
-
-
 def test_wave_filters_of_a_narrow_common_range_have_sum_one():
-    kernel = descriptors.wave_filter(
-        np.array([0, 5.0, 26.0, 125.0]), np.array([0, 12.7, 12.9, 14.7])
-    )
+    kernel = fmap.wave_filter(np.array([0, 5.0, 26.0, 125.0]), np.array([0, 12.7, 12.9, 14.7]))
     assert kernel.sum(axis=1) == pytest.approx(1)

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from s4a import clean, coarsen, spectrum, synthetic
 from s4a.geometry.align import align, farthest_points
 from s4a.geometry.mesh import as_dataset
-from s4a.method import descriptors, fmap, spectral
+from s4a.method import fmap, spectral
 from s4a.method.nearest import nearest_rows
 from s4a.method.shape import Basis, Shape
 
@@ -127,12 +127,8 @@ def test_the_landmark_fit_is_the_least_squares_solution_of_its_energy(shape):
     ev, ev_target = eigenvalue[:k], 1.3 * eigenvalue[:k]
     source, target = (basis(Phi[:, :k], area, values) for values in (ev, ev_target))
     C = fmap.fmap_from_landmarks(source, target, landmark, other, commute=commute)
-    F = descriptors.landmark_coefficients(
-        Phi[:, :k], descriptors.heat_filter(ev, ev_target, n=8), landmark
-    )
-    G = descriptors.landmark_coefficients(
-        Phi[:, :k], descriptors.heat_filter(ev_target, ev, n=8), other
-    )
+    F = fmap.landmark_coefficients(Phi[:, :k], fmap.heat_filter(ev, ev_target, n=8), landmark)
+    G = fmap.landmark_coefficients(Phi[:, :k], fmap.heat_filter(ev_target, ev, n=8), other)
     F, G = F / np.linalg.norm(F, axis=0), G / np.linalg.norm(G, axis=0)
     weight = commute * np.trace(F @ F.T) / ev_target[-1] ** 2
 

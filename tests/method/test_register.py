@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from s4a import clean, coarsen, match_pair, spectrum, synthetic
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.method import register
-from s4a.method.confidence import confidence
 from s4a.method.deform import displacement_in_template
+from s4a.method.register import confidence
 from s4a.method.shape import Shape
 
 OPTIONS = {"n_coarse": 2000, "k": 60}

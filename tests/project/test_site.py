@@ -1,25 +1,34 @@
-"""The documentation as it is built, and in Chromium: accessible, searchable, and not too wide."""
+"""The documentation as it is built, and in Chromium: accessible, searchable, and not too wide.
 
+What notebooks show there without a kernel, and the slides of the lecture.
+"""
+
+import os
 import re
+import subprocess
+import sys
 
 import pytest
-from paths import DOCS, benchmark, script
+from paths import DOCS, NOTEBOOKS, ROOT, benchmark, script
+
+nbclient = pytest.importorskip("nbclient")
+nbformat = pytest.importorskip("nbformat")
+for needed in ("furo", "latex2mathml", "myst_nb", "nbconvert", "sphinx"):
+    pytest.importorskip(needed)
+slides = script(DOCS / "slides.py")
 
 
-def test_it_builds_without_a_warning(site):
-    found, pages = site
-    assert found.returncode == 0, found.stderr
-    assert not re.search(
-        r"(src|href)=\"https?://[^\"]+\.(js|css)\"",
-        (pages / "glossary.html").read_text("utf-8"),
-    )
-
-
-def test_no_name_stands_twice_in_the_contents(site):
-    text = (site[1] / "index.html").read_text("utf-8")
-    names = re.findall(r'<li class="toctree-l1[^>]*><a [^>]*>([^<]*)</a>', text)
-    assert "Every table, as it was printed" in names
-    assert len(set(names)) == len(names)
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """The folder of the pages, built without running the lessons."""
+    out = tmp_path_factory.mktemp("site")
+    options = ["-q", "-W", "--keep-going", "-b", "html", "-d", str(out / "doctrees")]
+    command = [sys.executable, "-m", "sphinx", *options, str(DOCS), str(out / "html")]
+    env = os.environ | {"S4A_DOCS": "off"}
+    run = {"env": env, "cwd": ROOT, "capture_output": True, "text": True, "check": False}
+    found = subprocess.run(command, **run)
+    assert found.returncode == 0, found.stderr  # a warning is an error
+    return out / "html"
 
 
 @pytest.fixture(scope="module")
@@ -34,98 +43,82 @@ def browser():
         browser.close()
 
 
-@pytest.fixture(scope="module")
-def window(site, browser):
-    """A browser window for the pages; nothing is fetched."""
-    return browser.new_page(viewport={"width": 800, "height": 700})
+def test_it_builds_without_a_warning_fetches_nothing_and_names_no_page_twice(site):
+    for name in ("index", "glossary"):
+        page = (site / f"{name}.html").read_text("utf-8")
+        assert not re.search(r"(src|href)=\"https?://[^\"]+\.(js|css)\"", page)
+    page = (site / "index.html").read_text("utf-8")
+    names = re.findall(r'<li class="toctree-l1[^>]*><a [^>]*>([^<]*)</a>', page)
+    assert len(set(names)) == len(names) > 10
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_axe_finds_nothing_serious_on_the_pages(site, window, scheme):
+def test_pages_have_nothing_serious_for_axe_fit_their_window_and_are_found(site, browser):
     axe = pytest.importorskip("axe_playwright_python.sync_playwright")
-    window.emulate_media(color_scheme=scheme)
-    for name in ("index", "method", "claims", "comparison", "citing", "course/02_laplacian"):
-        window.goto((site[1] / f"{name}.html").as_uri())
-        found = axe.Axe().run(window).response["violations"]
-        bad = [v["id"] for v in found if v["impact"] in ("serious", "critical")]
-        assert bad == [], name
-
-
-def test_the_search_finds_functions_by_their_names(site, window):
-    window.goto((site[1] / "search.html").as_uri() + "?q=fmap_from_match")
+    window = browser.new_page(viewport={"width": 800, "height": 700})
+    bad = []
+    for name in ("index", "method", "claims", "comparison", "api/maps", "course/02_laplacian"):
+        window.goto((site / f"{name}.html").as_uri())
+        for width in (800, 1280, 1440):
+            window.set_viewport_size({"width": width, "height": 700})
+            scrolled = window.evaluate("document.documentElement.scrollWidth")
+            bad += [(name, width, scrolled)] if scrolled > width else []
+        for scheme in ("light", "dark"):
+            window.emulate_media(color_scheme=scheme)
+            found = axe.Axe().run(window).response["violations"]
+            bad += [
+                (name, scheme, v["id"]) for v in found if v["impact"] in ("serious", "critical")
+            ]
+    assert bad == []
+    window.goto((site / "search.html").as_uri() + "?q=fmap_from_match")
     window.wait_for_selector("#search-results li", timeout=60_000)
     first = window.locator("#search-results li a").first
     assert "s4a.method.fmap.fmap_from_match" in first.get_attribute("href")
 
 
-def test_no_page_is_wider_than_a_narrow_window(site, window):
-    for name in ("index", "method", "comparison", "api/maps"):
-        window.goto((site[1] / f"{name}.html").as_uri())
-        assert window.evaluate("document.documentElement.scrollWidth") <= 800, name
-
-
 def shown(cells, folder):
     """The HTML that the documentation shows of notebook cells, in the order of their outputs."""
-    nbformat = pytest.importorskip("nbformat")
-    client = pytest.importorskip("nbclient")
-    pytest.importorskip("nbconvert")
-    cells = [script(DOCS / "slides.py").WITHOUT_KERNEL, *cells]
+    cells = [slides.WITHOUT_KERNEL, *cells]
     notebook = nbformat.v4.new_notebook(cells=[*map(nbformat.v4.new_code_cell, cells)])
     resources = {"metadata": {"path": str(folder)}}
-    client.NotebookClient(notebook, timeout=300, resources=resources).execute()
+    nbclient.NotebookClient(notebook, timeout=300, resources=resources).execute()
     outputs = [part for cell in notebook.cells for part in cell.outputs if part.get("data")]
     return [part["data"].get("text/html", "") for part in outputs]
 
 
-STRUCTURES = """
-from s4a_morphometrics.synthetic import example_structures
-import s4a; s4a.explore(example_structures())
-"""
-SMALL = """
-import s4a
-study = s4a.synthetic.example_study()
-"""
+NAMES = "drawn = pictured = framed = html_of = tubes = templates = render = None"
+SMALL = "import s4a\nstudy = s4a.synthetic.example_study()"
+SCENE = (
+    "from s4a.widgets import threejs\nthreejs.renderer(threejs.surface(study['original/brain_01']))"
+)
 SLOW = ("Functional map", "Median", "Correspondence", "Transfer", "Spectrum")  # to record
+EXPLORE = f"""panels = s4a.widgets.explore.PANELS
+for title in {SLOW}: del panels[title]
+s4a.explore(study)"""
+HEAD = '<!DOCTYPE html><meta charset="utf-8"><link rel="icon" href="data:,"><title>page</title>'
 
 
-def test_a_cell_may_use_the_names_of_what_shows_panels(tmp_path):
-    names = "drawn = pictured = framed = html_of = tubes = templates = render = None"
-    scene = "threejs.renderer(threejs.surface(study['original/brain_01']))"
-    scene = f"from s4a.widgets import threejs; {scene}"
-    html = shown([names, SMALL, scene], tmp_path)
-    assert any("A scene" in part for part in html)
-
-
-def test_a_page_shows_the_first_panel_of_a_study_that_has_no_modes(tmp_path):
-    html = shown([STRUCTURES], tmp_path)
-    assert any('class="panel"' in part and 'title="Structures"' in part for part in html)
-
-
-def test_two_panels_of_a_page_work_without_a_kernel_and_from_plain_files(browser, tmp_path):
+def test_panels_of_a_page_work_without_a_kernel_and_are_as_tall_as_what_is_in_them(
+    browser, tmp_path
+):
     offline = benchmark("offline")
-    two = f"panels = s4a.widgets.explore.PANELS\nfor title in {SLOW}: del panels[title]"
-    parts = shown([SMALL, two, "s4a.explore(study)"], tmp_path)
-    (html,) = [part for part in parts if 'class="panel"' in part]
-    head = '<!DOCTYPE html><meta charset="utf-8"><link rel="icon" href="data:,"><title>page</title>'
-    (tmp_path / "page.html").write_text(f"{head}{html}", encoding="utf-8")
+    # a cell may use the names of what shows panels
+    *scene, median, panels = shown(
+        [NAMES, SMALL, SCENE, "s4a.widgets.Median(study)", EXPLORE], tmp_path
+    )
+    assert any("A scene" in part for part in scene)
+    (tmp_path / "page.html").write_text(f"{HEAD}{panels}", encoding="utf-8")
     with offline.served(tmp_path) as base:
-        size, errors, hosts, panels = offline.looked_at(browser, base, "page.html")
+        size, errors, hosts, found = offline.looked_at(browser, base, "page.html")
     assert size < offline.MOST
     assert errors == hosts == []
-    assert panels == {"Modes": "", "Network": ""}  # nothing is wrong with them
-
-
-def test_a_panel_is_as_tall_as_what_is_in_it(browser, tmp_path):
-    (html,) = shown([SMALL, "s4a.widgets.Median(study)"], tmp_path)
-    path = tmp_path / "page.html"
-    path.write_text(f"<!DOCTYPE html><title>page</title>{html}", encoding="utf-8")
+    assert found == {"Modes": "", "Network": ""}  # nothing is wrong with them
+    (tmp_path / "page.html").write_text(f"{HEAD}{median}", encoding="utf-8")
     page = browser.new_page(viewport={"width": 1000, "height": 800})
-    page.goto(path.as_uri())
+    page.goto((tmp_path / "page.html").as_uri())
     page.frame_locator("iframe.panel").locator("canvas.s4a-view").first.wait_for()
-    page.wait_for_timeout(500)
     for width in (1000, 500):
         page.set_viewport_size({"width": width, "height": 800})
-        page.wait_for_timeout(300)
+        page.wait_for_timeout(500)
         tall = page.locator("iframe.panel").evaluate(
             "(e) => e.clientHeight - e.contentDocument.documentElement.offsetHeight"
         )
@@ -133,10 +126,15 @@ def test_a_panel_is_as_tall_as_what_is_in_it(browser, tmp_path):
     page.close()
 
 
-@pytest.mark.parametrize("width", [1280, 1366, 1440, 1600])
-def test_text_and_contents_stand_beside_each_other_in_a_wide_window(site, window, width):
-    narrow = window.viewport_size
-    window.set_viewport_size({"width": width, "height": 700})
-    window.goto((site[1] / "course/02_laplacian.html").as_uri())
-    assert window.evaluate("document.documentElement.scrollWidth") <= width
-    window.set_viewport_size(narrow)
+def test_each_heading_of_a_lecture_begins_a_slide_without_exercises():
+    for lesson in slides.LECTURE:
+        (path,) = NOTEBOOKS.glob(f"{lesson}_*.ipynb")
+        notebook = slides.as_slides(nbformat.read(path, as_version=4))
+        kinds = [cell.metadata["slideshow"]["slide_type"] for cell in notebook.cells]
+        for cell, kind in zip(notebook.cells, kinds, strict=True):
+            assert (kind == "slide") == (cell.cell_type == "markdown" and cell.source[0] == "#")
+            assert not re.search(r"answer = \.\.\.|Solution", cell.source)
+        page = slides.page(notebook, "lesson", reveal="here/reveal.js")
+        assert len(re.findall(r"<h[12] id", page)) == kinds.count("slide") >= 2
+        assert page.count("<section>") == 2 * kinds.count("slide") + kinds.count("subslide")
+        assert "plt.rcParams" not in page, "what sets up a notebook is not shown"

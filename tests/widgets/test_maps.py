@@ -18,8 +18,8 @@ from s4a.widgets.maps import GREY
 
 @pytest.fixture(scope="module")
 def found(study):
-    """Left against right, with p values that are given: small on a third of the vertices."""
-    found = statistics.asymmetry(study, n_permutations=15)
+    """A regression, with p values that are given: small on a third of the vertices."""
+    found = statistics.regression(study, [3, 1, 4, 2], of="normal", n_permutations=15)
     p = np.where(np.arange(found.sizes["vertex"]) % 3, 0.4, 0.02)
     return found.assign(p_family_wise=found["p_family_wise"].copy(data=p))
 
@@ -38,21 +38,20 @@ def panel(study, found):
     assert len(registry._instances) == before
 
 
-def test_it_is_grey_where_nothing_is_significant_and_says_how_much_is(panel, found):
+def test_it_is_grey_where_nothing_is_significant_and_says_how_much_is(panel, found, study):
     one = panel()
     significant = found["p_family_wise"].values <= 0.05
-    values = found["directional_normal"].values
+    X, T = as_arrays(study["registration"].to_dataset())
+    values = (found["effect"].values * vertex_normals(X, T)).sum(1)
     limit = np.quantile(abs(values), 0.99)
     assert (one.scene.colors[~significant] == GREY).all()
     expected = np.clip(signed_colors(values, limit), 0, 1)
     np.testing.assert_allclose(one.scene.colors[significant], expected[significant], atol=1e-6)
-    X, T = found["symmetric_position"].values, one.T
     area = vertex_areas(X, T)
     share = 100 * area[significant].sum() / area.sum()
     assert f"{share:.1f} % of the area at p ≤ 0.05 (family-wise), smallest 0.02" in (
         one.scene.caption
     )
-    assert f"antisymmetry p = {found['antisymmetry_p'].item():.3g}" in one.scene.caption
     one.level.value = 0.01
     assert (one.scene.colors == GREY).all()
     assert one.scene.caption.startswith("0.0 % of the area")
@@ -60,23 +59,12 @@ def test_it_is_grey_where_nothing_is_significant_and_says_how_much_is(panel, fou
     assert not (one.scene.colors == GREY).all(1).any()
 
 
-def test_fluctuating_asymmetry_and_that_of_an_individual_are_maps(panel, found):
-    one = panel()
-    one.where.value, one.map.value = "everywhere", "fluctuating"
-    np.testing.assert_array_equal(one.values()[0], found["fluctuating"].values)
-    assert one.values()[1:] == (False, "mm")
-    one.map.value, one.individual.value = "individual", "brain_03"
-    a = found["asymmetry"].sel(individual="brain_03").values
-    normals = vertex_normals(found["symmetric_position"].values, one.T)
-    np.testing.assert_allclose(one.values()[0], (a * normals).sum(1))
-    assert one.scene.title == "asymmetry of brain_03"
-
-
 def test_a_click_tells_the_values_there(panel, found):
     one = panel()
     one.scene.picked = {"vertex": 6, "count": 1}
-    value = found["directional_normal"].values[6]
-    assert one.scene.caption.startswith(f"vertex 6: directional asymmetry {value:.3g} mm; p = 0.02")
+    assert one.scene.caption.startswith(
+        f"vertex 6: effect, along the normals {one.values()[0][6]:.3g}"
+    )
     assert len(one.scene.points) == 1
     assert one.scene.answer == 1
 
@@ -89,13 +77,12 @@ def test_the_map_of_groups_is_shown_too(panel, study):
     np.testing.assert_allclose(one.values()[0], size, atol=1e-12)
     assert (one.scene.colors[size <= 0] == GREY).all()  # without a p value it is not significant
     assert one.map.label == "effect, along the normals"
-    assert "antisymmetry" not in one.scene.caption
     np.testing.assert_array_equal(one.scene.surface[0], X)
 
 
 def test_a_result_without_maps_or_of_another_template_is_refused(panel, study, found):
     for result, words in {
-        "none": (found[["p_value"]], "found p_value at no: give what statistics.asymmetry"),
+        "none": (found[["p_value"]], "found p_value at no: give what a test"),
         "other": (found.isel(vertex=slice(10)), "at the 1500 vertices of the template; .* at 10"),
     }.values():
         with pytest.raises(ValueError, match=words):
@@ -106,7 +93,7 @@ def test_a_saved_page_has_every_choice(panel, tmp_path, caplog):
     one = panel()
     with caplog.at_level(logging.WARNING):
         page = one.save_html(tmp_path / "map.html").read_text(encoding="utf-8")
-    for words in ("directional asymmetry", "fluctuating asymmetry", "family-wise", "brain_03"):
+    for words in ("effect size", "effect, along the normals", "family-wise"):
         assert words in page
 
 

@@ -9,8 +9,6 @@ import re
 import numpy as np
 import pytest
 from paths import NOTEBOOKS
-from s4a_morphometrics.structures_panel import Structures
-from s4a_morphometrics.synthetic import example_structures
 from test_browser import (  # noqa: F401, fixtures are found by their names
     DRAWN,
     IDLE,
@@ -38,6 +36,8 @@ from test_browser import (  # noqa: F401, fixtures are found by their names
 import s4a
 from s4a.show import charts
 from s4a.widgets import Median, Modes, Region
+from s4a_morphometrics.structures_panel import Structures
+from s4a_morphometrics.synthetic import example_structures
 
 KINDS = ("Maps", "Region", "Structures", "Comparison", "Progress")
 CELL = """
@@ -51,7 +51,7 @@ from s4a_morphometrics.synthetic import example_structures
 from s4a.widgets import Comparison, Maps, Progress, Region
 
 study = s4a.open_study({study!r})
-found = s4a.statistics.asymmetry(study, n_permutations=15)
+found = s4a.statistics.regression(study, range(4), of="normal", n_permutations=15)
 p = np.where(np.arange(found.sizes["vertex"]) % 3, 0.4, 0.02)
 found = found.assign(p_family_wise=found["p_family_wise"].copy(data=p))
 several = example_structures()

@@ -46,8 +46,8 @@ from s4a.widgets import (
 from s4a.widgets import explore as explore_module
 from s4a.widgets import network as network_module
 from s4a.widgets import spectrum as spectrum_module
-from s4a.widgets.modes_view import ModesView
-from s4a.widgets.scene import Scene, View
+from s4a.widgets.modes import ModesView
+from s4a.widgets.views import Scene, View
 
 
 @pytest.fixture
@@ -460,9 +460,7 @@ def test_the_browser_knows_the_image_of_every_vertex(study, panel):
     both.scenes[1].picked = {"vertex": 40, "count": 2}
     assert both.vertex == back[40]
     sure = study["registration"]["confidence"].sel(shape=both.shape).values
-    np.testing.assert_allclose(
-        np.frombuffer(both.scenes[0].link_values, np.uint8) / 100, sure, atol=0.006
-    )
+    np.testing.assert_allclose(np.frombuffer(both.scenes[0].link_values, "<f4"), sure)
     both.map.value = "low"
     back = np.frombuffer(both.scenes[1].link, "<i4")
     assert set(back[back >= 0]) <= set(range(len(both.match())))

@@ -34,7 +34,7 @@ export default {
       if (fans || !link) return fans;
       if (!hit || hit.vertex < 0 || hit.vertex >= link.length) return true;
       const there = link[hit.vertex], radius = model.get("radius"), ball = (at) => [...at, 0.9, 0.6, 0, radius];
-      const sure = values ? `, confidence ${(values[hit.vertex] / 100).toFixed(2)}` : "";
+      const sure = values ? `, confidence ${values[hit.vertex].toFixed(2)}` : "";
       view.points = [ball(view.at(hit.vertex))];
       for (const other of view.camera.views) {
         if (other === view) continue;
@@ -82,7 +82,7 @@ export default {
     const links = () => {
       link = numbers(Int32Array, model.get("link"));
       const back = numbers(Int32Array, model.get("link_back"));
-      values = numbers(back ? Float32Array : Uint8Array, model.get("link_values"));
+      values = numbers(Float32Array, model.get("link_values"));
       view.fan = back && link && {
         link, back, colour: model.get("link_color"),
         say: (vertex) => vertex < 0 ? "nothing is matched to this vertex" : model.get("link_text").replace("{here}", vertex)

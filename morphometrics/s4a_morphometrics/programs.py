@@ -1,0 +1,471 @@
+"""A study in the files of other programs (4.3, 6.1, 6.2), from one verb: :func:`write_for`.
+
+What each file holds, in which unit and frame, is on the page *For other programs*.
+"""
+
+import inspect
+import json
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from s4a.analysis.export import is_reflected, write_dataset, write_table
+from s4a.analysis.inputs import registration_of
+from s4a.analysis.link import image_in_shape
+from s4a.analysis.transfer import transfer_labels, transfer_landmarks
+from s4a.analysis.volumes import write_label_volumes
+from s4a.geometry.align import farthest_points
+from s4a.geometry.mesh import as_arrays, vertex_normals
+from s4a.input.annotations import write_landmarks
+from s4a.input.files import write_mesh
+from s4a.input.formats import vtk_bytes, vtp_bytes
+from s4a.input.hands import MIRROR, in_file
+from s4a.input.landmarks import locate
+from s4a.method.pca import synthesize
+from s4a.schema import check_count, dataset, in_unit, unit_of, variable
+from s4a.seeds import RNG, seed_of
+from s4a_morphometrics.scalismo import write_scalismo
+
+log = logging.getLogger(__name__)
+
+N_POINTS = 500  # of a shape, where a program takes points one by one
+R_SCRIPT = """\
+library(ncdf4)
+nc <- nc_open("shapes.nc")
+coords <- aperm(ncvar_get(nc, "aligned_position"), c(2, 1, 3))  # p x 3 x n: geomorph's array
+dimnames(coords)[[3]] <- ncvar_get(nc, "shape")
+faces <- t(ncvar_get(nc, "corner_vertex")) + 1                  # triangles, counted from 1
+chosen <- ncvar_get(nc, "point_vertex") + 1                     # the points of points.tps
+nc_close(nc)
+subjects <- read.csv("subjects.csv", row.names = 1)[dimnames(coords)[[3]], , drop = FALSE]
+flat <- t(apply(coords[chosen, , ], 3, function(x) as.vector(t(x))))  # geomorph: two.d.array()
+modes <- prcomp(flat)
+"""
+
+
+def write_for(study: xr.DataTree, folder: Path | str, program: str, **options: Any) -> list[Path]:
+    """Write a study in the files of another program.
+
+    Parameters
+    ----------
+    study : DataTree
+        With ``/original`` and ``/registration``; Scalismo and ParaView need ``/pca``.
+    folder : path
+        Made where it is missing.
+    program : {"slicer", "shapeworks", "scalismo", "paraview", "r", "nifti"}
+        See :func:`write_slicer`, :func:`write_shapeworks`,
+        :func:`s4a_morphometrics.scalismo.write_scalismo`, :func:`write_paraview`, :func:`write_r`
+        and :func:`s4a.analysis.volumes.write_label_volumes`.
+    **options
+        Those of that function.
+
+    Returns
+    -------
+    list of Path
+
+    Raises
+    ------
+    ValueError
+        When the program is none of these, takes no such option, or the study lacks what it needs.
+
+    Examples
+    --------
+    With the ``study`` of six small brains:
+
+    >>> import tempfile
+    >>> import s4a
+    >>> import s4a_morphometrics
+    >>> study = s4a.synthetic.example_study()
+    >>> [path.name for path in s4a_morphometrics.write_for(study, tempfile.mkdtemp(), "scalismo")]
+    ['model.h5']
+    """
+    if program not in PROGRAMS:
+        raise ValueError(f"program must be one of {', '.join(PROGRAMS)}; found {program!r}")
+    writer = PROGRAMS[program]
+    known = [name for name in inspect.signature(writer).parameters if name not in LEADING]
+    wrong = [name for name in options if name not in known]
+    if wrong:
+        raise ValueError(
+            f"{program} takes the options {', '.join(known)}; found {', '.join(wrong)}"
+        )
+    return writer(study, Path(folder), **options)
+
+
+LEADING = ("study", "folder")
+
+
+def write_slicer(
+    study: xr.DataTree,
+    folder: Path | str,
+    *,
+    n_points: int = N_POINTS,
+    landmarks: xr.Dataset | None = None,
+) -> list[Path]:
+    """Write registered surfaces and points for 3D Slicer and SlicerMorph, where the files lie.
+
+    Parameters
+    ----------
+    study : DataTree
+    folder : path
+        Gets, for every shape, ``<shape>.vtk`` with its ``confidence``, ``points/<shape>.mrk.json``,
+        which SlicerMorph's GPA takes as landmarks, and ``landmarks/<shape>.mrk.json``.
+    n_points : int
+        Vertices that are points, as far apart as can be; the same ones on every shape.
+    landmarks : Dataset, optional
+        Of the template, by default those of its file; carried to all shapes.
+
+    Returns
+    -------
+    list of Path
+    """
+    registration, X, T, chosen = _parts(study, n_points)
+    folder = _folders(folder, "points")
+    name = registration.attrs["template"]
+    own_marks = landmarks is None and "landmark_position" in study["original"][name]
+    landmarks = study["original"][name].to_dataset() if own_marks else landmarks
+    carried: dict[str, xr.Dataset] = {}
+    if landmarks is not None:
+        (folder / "landmarks").mkdir(exist_ok=True)
+        others = transfer_landmarks(study, landmarks).children
+        if not own_marks:  # on the surface and in its coordinates, as on all others
+            landmarks = locate(landmarks, study["original"][name].to_dataset())
+        carried = {name: landmarks} | {other: node.to_dataset() for other, node in others.items()}
+    unit, paths, unknown = unit_of(registration["displacement"]), [], []
+    names = np.array([str(vertex) for vertex in chosen.tolist()])
+    for shape in registration["shape"].values.tolist():
+        own = registration.sel(shape=shape)
+        points, triangles, system = _in_file(study, shape, X, T, own)
+        unknown += [] if system else [shape]
+        paths.append(folder / f"{shape}.vtk")
+        title = f"S4A; SPACE={system}" if system else "S4A"
+        scalars = {"confidence": own["confidence"].values}
+        paths[-1].write_bytes(vtk_bytes(points, triangles, scalars, title))
+        lists = {"points": dataset(landmark_name=names, landmark_position=points[chosen])}
+        if shape in carried:
+            kept = [n for n in carried[shape] if str(n) in MARKS]
+            marks = carried[shape][kept].drop_attrs()
+            place = in_file(
+                study["original"][shape].to_dataset(), marks["landmark_position"].values
+            )
+            marks["landmark_position"] = variable("landmark_position", place)
+            lists["landmarks"] = marks
+        for kind, marks in lists.items():
+            paths.append(folder / kind / f"{shape}.mrk.json")
+            marks = in_unit(marks, unit).assign_attrs(coordinate_system=system)
+            write_landmarks(paths[-1], marks)
+    if unknown:
+        log.warning(
+            "the files of %d shapes, such as %s, do not say whether they are RAS or LPS; 3D Slicer "
+            "takes them as LPS",
+            len(unknown),
+            unknown[0],
+        )
+    return paths
+
+
+MARKS = ("landmark_name", "landmark_position", "landmark_curve", "landmark_closed")
+
+
+def write_shapeworks(
+    study: xr.DataTree, folder: Path | str, *, n_points: int = N_POINTS
+) -> list[Path]:
+    """Write a project of ShapeWorks: the meshes, and corresponding vertices as particles.
+
+    Local particles lie on the mesh of each shape; ``alignment_1`` takes them to the world, which
+    is the frame of the template.
+
+    Parameters
+    ----------
+    study : DataTree
+    folder : path
+        Gets ``study.swproj``, ``shapes/<shape>.ply`` (the cleaned mesh, mirrored where the run
+        mirrored it) and ``particles/<shape>_local.particles`` and ``_world.particles``.
+    n_points : int
+        Particles of a shape, as far apart as can be.
+
+    Returns
+    -------
+    list of Path
+    """
+    registration, X, _, chosen = _parts(study, n_points)
+    folder = _folders(folder, "shapes", "particles")
+    subjects = study["subjects"].to_dataset() if "subjects" in study.children else xr.Dataset()
+    rows, paths = [], []
+    for shape in registration["shape"].values.tolist():
+        own = registration.sel(shape=shape)
+        mesh = f"shapes/{shape}.ply"
+        write_mesh(folder / mesh, *as_arrays(study["original"][shape].to_dataset()))
+        row = {"name": shape, "shape_1": mesh, "groomed_1": mesh}
+        R, t, s = (own[name].values for name in ("rotation", "translation", "scale"))
+        M = np.eye(4)
+        M[:3, :3], M[:3, 3] = s * R, t
+        row["alignment_1"] = " ".join(map(repr, M.ravel().tolist()))
+        row["procrustes_1"] = " ".join(map(repr, np.eye(4).ravel().tolist()))
+        points = {"local": image_in_shape(X, own), "world": X + own["displacement"].values}
+        paths.append(folder / mesh)
+        for kind, place in points.items():
+            row[f"{kind}_particles_1"] = f"particles/{shape}_{kind}.particles"
+            paths.append(folder / row[f"{kind}_particles_1"])
+            np.savetxt(paths[-1], place[chosen], fmt="%.9g")
+        rows.append(row | _cells(subjects, shape))
+    project = {
+        "data": rows,
+        "groom": {},
+        "optimize": {"number_of_particles": str(len(chosen))},
+        "landmarks": [],
+    }
+    paths.append(folder / "study.swproj")
+    paths[-1].write_text(json.dumps(project, indent=4) + "\n", encoding="utf-8")
+    return paths
+
+
+def _cells(subjects, shape):
+    """What the table says of a shape, as texts; columns of words are ShapeWorks's groups."""
+    if "shape" not in subjects.coords or shape not in subjects["shape"].values:
+        return {}
+    row = subjects.sel(shape=shape)
+    return {
+        f"group_{name}" if row[name].dtype.kind == "U" else str(name): str(row[name].item())
+        for name in row.data_vars
+    }
+
+
+def write_paraview(
+    study: xr.DataTree,
+    folder: Path | str,
+    *,
+    n_modes: int = 3,
+    n_steps: int = 25,
+    extent: float = 3.0,
+) -> list[Path]:
+    """Write modes, and the registered shapes, as time series of ParaView, aligned to the template.
+
+    Parameters
+    ----------
+    study : DataTree
+    folder : path
+        Gets ``mode_<i>.pvd``, whose time is the score in standard deviations, ``shapes.pvd``, whose
+        time is the place in the study, and folders of ``.vtp``: ``displacement`` from the mean
+        shape, ``along_normal``, positive where it is outwards, and ``confidence``.
+    n_modes, n_steps : int
+        How many, and surfaces of each.
+    extent : float
+        Scores go from minus to plus this.
+
+    Returns
+    -------
+    list of Path
+        The ``.pvd`` files.
+    """
+    check_count("n_modes", n_modes, 1)
+    check_count("n_steps", n_steps, 2)
+    if not 0 < extent < np.inf:
+        raise ValueError(f"extent needs a positive number of standard deviations, found {extent!r}")
+    registration = registration_of(study)
+    X, T = as_arrays(registration)
+    mean = synthesize(study, np.zeros(1))["position"].values
+    normals = vertex_normals(mean, T)
+    n_modes = min(n_modes, study["pca"].sizes["component"])
+    confidence = registration["confidence"].values
+    series = {}
+    for i in range(n_modes):
+        scores = np.linspace(-extent, extent, n_steps)
+        moved = [
+            synthesize(study, np.eye(n_modes)[i] * score)["position"].values for score in scores
+        ]
+        sure = [confidence.mean(0)] * n_steps
+        series[f"mode_{i + 1}"] = zip(scores.tolist(), moved, sure, strict=True)
+    shapes = X + registration["displacement"].values
+    series["shapes"] = zip(range(len(shapes)), shapes, confidence, strict=True)
+    folder = _folders(folder, *series)
+    paths = []
+    for name, steps in series.items():
+        lines = []
+        for i, (time, position, sure) in enumerate(steps):
+            file, moved = f"{name}/{i:03d}.vtp", position - mean
+            along = (moved * normals).sum(1)
+            fields = {"displacement": moved, "along_normal": along, "confidence": sure}
+            (folder / file).write_bytes(vtp_bytes(position, T, fields))
+            lines.append(f'<DataSet timestep="{time!r}" part="0" file="{file}"/>\n')
+        paths.append(folder / f"{name}.pvd")
+        paths[-1].write_text(
+            '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1" '
+            'byte_order="LittleEndian">\n<Collection>\n'
+            f"{''.join(lines)}</Collection>\n</VTKFile>\n",
+            encoding="utf-8",
+        )
+    return paths
+
+
+def write_r(study: xr.DataTree, folder: Path | str, *, n_points: int = N_POINTS) -> list[Path]:
+    """Write the registered shapes, aligned to the template, for R and geomorph.
+
+    Parameters
+    ----------
+    study : DataTree
+    folder : path
+        Gets ``shapes.nc`` (every vertex; R has its dims the other way round), ``points.tps`` (some
+        vertices, for ``geomorph::readland.tps(file, specID = "ID")``), ``subjects.csv`` (a row per
+        shape, and the scores of its modes) and ``study.R``, which reads them.
+    n_points : int
+        Points of the TPS file, as far apart as can be.
+
+    Returns
+    -------
+    list of Path
+    """
+    registration, X, T, chosen = _parts(study, n_points)
+    folder = _folders(folder)
+    names = registration["shape"].values
+    position = X + registration["displacement"].values.astype(float)
+    whole = dataset(aligned_position=position, corner_vertex=T, point_vertex=chosen)
+    paths = [folder / name for name in ("shapes.nc", "points.tps", "subjects.csv", "study.R")]
+    unit = unit_of(registration["displacement"])
+    write_dataset(in_unit(whole.assign_coords(shape=names), unit), paths[0])
+    with open(paths[1], "w", encoding="utf-8") as file:
+        for name, points in zip(names.tolist(), position[:, chosen], strict=True):
+            file.write(f"LM3={len(chosen)}\n")
+            np.savetxt(file, points, fmt="%.9g")
+            file.write(f"ID={name}\n")
+    columns = {"shape": names.tolist()}
+    if "subjects" in study.children:
+        table = study["subjects"].to_dataset().reindex(shape=names)
+        columns |= {str(name): table[name].values.tolist() for name in table.data_vars}
+    if "pca" in study.children:
+        scores = study["pca"].to_dataset()["score"].sel(shape=names).values
+        columns |= {f"component_{i}": of.tolist() for i, of in enumerate(scores.T, 1)}
+    write_table(paths[2], columns, zip(*columns.values(), strict=True))
+    paths[3].write_text(R_SCRIPT, encoding="utf-8")
+    return paths
+
+
+def _parts(study, n_points):
+    """The registration, the template ``X, T``, and so many of its vertices, far apart."""
+    check_count("n_points", n_points, 3)
+    registration = registration_of(study)
+    X, T = as_arrays(registration)
+    return registration, X, T, farthest_points(X, n_points)
+
+
+def _folders(folder: Path | str, *names: str) -> Path:
+    """A folder with others in it, made where they are missing."""
+    for path in (Path(folder), *(Path(folder) / name for name in names)):
+        path.mkdir(parents=True, exist_ok=True)
+    return Path(folder)
+
+
+def _in_file(study, name, X, T, own):
+    """The registered surface where the file of a shape lies, and the frame that the file says."""
+    points, triangles = image_in_shape(X, own), T
+    if is_reflected(study, name):
+        points, triangles = points * MIRROR, T[:, ::-1]
+    return points, triangles, study["original"][name].attrs.get("coordinate_system", "")
+
+
+def write_training_set(
+    study: xr.DataTree,
+    folder: Path | str,
+    *,
+    label: np.ndarray | None = None,
+    landmarks: xr.Dataset | None = None,
+    source: str | xr.Dataset | None = None,
+    test_share: float = 0.2,
+    seed: int = 0,
+    rng: RNG | None = None,
+    **options: Any,
+) -> dict[str, list[str]]:
+    """Write a training set for learners of segmentations and key-points, with its split.
+
+    Parameters
+    ----------
+    study : DataTree
+        With ``/original`` and ``/registration``.
+    folder : path
+        Gets ``meshes/<shape>.ply`` (the cleaned mesh, with all its vertices, in the coordinates of
+        its file, or their mirror image where the run took that), ``labels/<shape>.npy`` (one per
+        vertex) and ``labels/<shape>.confidence.npy`` (share of the votes times confidence of the
+        match), ``landmarks/<shape>.csv`` (name,x,y,z), and ``split.json`` with the lists ``train``
+        and ``test``.
+    label, landmarks, source : see :func:`s4a.transfer_labels` and :func:`s4a.transfer_landmarks`
+    test_share : float
+        Of the shapes, rounded up.
+    seed, rng : see :mod:`s4a.seeds`
+        Of the split.
+    **options
+        By which an external source is matched, see :func:`s4a.transfer_labels`.
+
+    Returns
+    -------
+    dict
+        The split.
+
+    Raises
+    ------
+    ValueError
+        When there is nothing to learn, or the share leaves no shape to train or to test on.
+
+    Examples
+    --------
+    With the ``study`` of six small brains:
+
+    >>> import tempfile
+    >>> import s4a
+    >>> import s4a_morphometrics
+    >>> study = s4a.synthetic.example_study()
+    >>> folder = tempfile.mkdtemp()
+    >>> label = study["original/brain_01/label"].values
+    >>> split = s4a_morphometrics.write_training_set(study, folder, label=label, source="brain_01")
+    >>> len(split["train"]), len(split["test"])
+    (4, 2)
+    """
+    if label is None and landmarks is None:
+        raise ValueError("a training set needs labels, landmarks or both; found neither")
+    folder = Path(folder)
+    names = registration_of(study)["shape"].values.tolist()
+    n_test = int(np.ceil(test_share * len(names)))
+    if not 0 < n_test < len(names):
+        raise ValueError(
+            f"test_share needs a share of {len(names)} shapes that leaves some on both sides: "
+            f"{test_share}"
+        )
+    where = {"source": source, "targets": names} | options
+    carried = {}  # before anything is written: it may fail
+    if label is not None:
+        carried["labels"] = transfer_labels(study, label, **where)
+    if landmarks is not None:
+        carried["landmarks"] = transfer_landmarks(study, landmarks, **where)
+    for part in ("meshes", *carried):
+        (folder / part).mkdir(parents=True, exist_ok=True)
+    for name in names:
+        mesh = study["original"][name].to_dataset()
+        write_mesh(folder / "meshes" / f"{name}.ply", *as_arrays(mesh))
+        if "labels" in carried:
+            own = carried["labels"][name].to_dataset()
+            sure = own["label_share"] * own["confidence"]
+            np.save(folder / "labels" / f"{name}.npy", own["label"].values)
+            np.save(folder / "labels" / f"{name}.confidence.npy", sure.values)
+        if "landmarks" in carried:
+            write_landmarks(
+                folder / "landmarks" / f"{name}.csv", carried["landmarks"][name].to_dataset()
+            )
+    order = np.random.default_rng(seed_of(seed, rng)).permutation(len(names))
+    split = {
+        "train": sorted(names[i] for i in order[n_test:]),
+        "test": sorted(names[i] for i in order[:n_test]),
+    }
+    (folder / "split.json").write_text(json.dumps(split, indent=1) + "\n")
+    return split
+
+
+PROGRAMS: dict[str, Callable[..., list[Path]]] = {
+    "slicer": write_slicer,
+    "shapeworks": write_shapeworks,
+    "scalismo": write_scalismo,
+    "paraview": write_paraview,
+    "r": write_r,
+    "nifti": write_label_volumes,
+}

@@ -1,0 +1,181 @@
+"""Modes as a statistical shape model of Scalismo and statismo, and such models as modes (6.1).
+
+A model is a Gaussian: x = mean + sum_i a_i sqrt(lambda_i) u_i with a_i standard normal and u_i
+orthonormal over the 3 n coordinates.  Modes are orthonormal under the vertex areas, so that they
+are turned among each other: the Gaussian stays, the components are those of equal weights.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import xarray as xr
+
+from s4a.analysis.inputs import registration_of
+from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
+from s4a.input.raw import check_there, shown
+from s4a.method.pca import synthesize
+from s4a.schema import check_count, dataset, unit_of
+
+LARGEST = 2**32  # bytes of an array of a model
+MODEL = ("model/mean", "model/pcaBasis", "model/pcaVariance")
+REPRESENTER = ("representer/points", "representer/cells")
+
+
+def write_scalismo(
+    study: xr.DataTree, folder: Path | str, *, n_modes: int | None = None
+) -> list[Path]:
+    """Write the modes as a statistical shape model of Scalismo (statismo 0.9), ``model.h5``.
+
+    Parameters
+    ----------
+    study : DataTree
+        With ``/registration`` and ``/pca``.
+    folder : path
+        Made where it is missing.
+    n_modes : int, optional
+        The first modes alone; all by default.
+
+    Returns
+    -------
+    list of Path
+        ``model.h5``: in the frame of the template, the unit of the input and single precision.
+
+    Raises
+    ------
+    ValueError
+        When the study has no modes.
+    """
+    registration = registration_of(study)
+    X, T = as_arrays(registration)
+    mean = synthesize(study, np.zeros(1))["position"].values
+    modes = study["pca"].to_dataset()
+    D = modes["deformation"].values.astype(float)  # (c, n, 3), each of one deviation
+    if n_modes is not None:
+        check_count("n_modes", n_modes, 1)
+        D = D[:n_modes]
+    U, S, _ = np.linalg.svd(D.reshape(len(D), -1).T, full_matrices=False)  # (3 n, c)
+    largest = U[np.abs(U).argmax(0), np.arange(len(S))]
+    basis = U * np.where(largest < 0, -1.0, 1.0)
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "model.h5"
+    with h5py.File(path, "w") as file:
+        file["model/mean"] = mean.ravel().astype(np.float32)
+        file["model/pcaBasis"] = basis.astype(np.float32)
+        file["model/pcaVariance"] = (S**2).astype(np.float32)
+        file["model/noiseVariance"] = np.zeros(1, np.float32)
+        file["representer/points"] = np.ascontiguousarray(X.T, np.float32)
+        file["representer/cells"] = np.ascontiguousarray(T.T, np.int32)
+        words = {
+            "name": "itkStandardMeshRepresenter",
+            "version/majorVersion": "0",
+            "version/minorVersion": "9",
+            "datasetType": "POLYGON_MESH",
+        }
+        for name, value in words.items():
+            file["representer"].attrs[name] = value
+        file["version/majorVersion"], file["version/minorVersion"] = np.int32(0), np.int32(9)
+        file["modelinfo/build-time"] = ""
+        builder = file.create_group("modelinfo/modelBuilder-0")
+        builder["builderName"], builder["buildTime"] = "S4A", ""
+        builder.create_group("parameters")["unit"] = unit_of(registration["displacement"])
+        builder.create_group("dataInfo")
+    return [path]
+
+
+def read_scalismo(path: Path | str) -> xr.DataTree:
+    """A statistical shape model of Scalismo or statismo as modes.
+
+    Parameters
+    ----------
+    path : str or Path
+        HDF5 of a triangle mesh, of the versions 0.8, 0.9 and 1.x.
+
+    Returns
+    -------
+    DataTree
+        ``/registration`` with the reference as template and ``/pca``, as
+        :func:`s4a.synthesize` takes them: ``mean_displacement``, ``deformation``,
+        ``standard_deviation`` (over equal areas of sum 1, as ever) and
+        ``explained_variance_ratio``; its attribute ``noise_variance``.
+
+    Raises
+    ------
+    ValueError
+        When the file is missing or is no such model; the message has the file and what it lacks.
+
+    Examples
+    --------
+    With the ``study`` of six small brains; what was written is read back:
+
+    >>> import tempfile
+    >>> import s4a
+    >>> import s4a_morphometrics
+    >>> from s4a_morphometrics.scalismo import read_scalismo, write_scalismo
+    >>> study = s4a.synthetic.example_study()
+    >>> model = read_scalismo(*write_scalismo(study, tempfile.mkdtemp()))
+    >>> mean, again = (s4a.synthesize(tree, [0.0])["position"].values for tree in (study, model))
+    >>> bool(abs(mean - again).max() < 1e-4)
+    True
+    """
+    check_there(path)
+    try:
+        with h5py.File(path, "r") as file:
+            mean, basis, variance, X, T = (_array(file, name) for name in MODEL + REPRESENTER)
+            noise = _array(file, "model/noiseVariance") if "model/noiseVariance" in file else [0.0]
+            is_scaled = _version(file) == (0, 8)  # columns were of one standard deviation
+    except Exception as error:  # whatever a file holds, the message must name it
+        raise ValueError(
+            f"{shown(path)} cannot be read as a statistical shape model: "
+            f"{shown(error) or type(error).__name__}"
+        ) from error
+    n = X.shape[1] if X.ndim == 2 else 0
+    fits = X.shape == (3, n) and T.shape[:1] == (3,) and T.ndim == 2 and mean.shape == (3 * n,)
+    fits = fits and basis.shape == (3 * n, len(variance)) and variance.ndim == 1 and n > 0
+    if not fits or T.dtype.kind not in "iu" or not (0 <= T.min(initial=0) <= T.max() < n):
+        raise ValueError(
+            f"{shown(path)} cannot be read as a statistical shape model: points (3, n), triangles "
+            "(3, m) of them, mean (3 n) and basis (3 n, c) with c variances needed; found "
+            f"{X.shape}, {T.shape}, {mean.shape}, {basis.shape} and {variance.shape}"
+        )
+    X, T = np.ascontiguousarray(X.T, float), np.ascontiguousarray(T.T, np.int32)
+    width = 1.0 if is_scaled else np.sqrt(np.maximum(variance, 0))
+    D = (basis.astype(float) * width).T.reshape(-1, n, 3)
+    area = vertex_areas(X, T)
+    spread = np.einsum("cnx,n->c", D**2, area / area.sum())
+    modes = dataset(
+        mean_displacement=mean.reshape(n, 3) - X,
+        deformation=D,
+        standard_deviation=np.sqrt(spread),
+        explained_variance_ratio=spread / spread.sum(),
+    )
+    registration = as_dataset(X, T, {"template": "reference"}, vertex_area=area)
+    modes.attrs["noise_variance"] = float(np.ravel(noise)[0])
+    return xr.DataTree.from_dict({"/registration": registration, "/pca": modes})
+
+
+def _array(file: h5py.File, name: str) -> Any:
+    """The numbers of a dataset that the file itself has."""
+    if file.get(name, getclass=True, getlink=True) is not h5py.HardLink:
+        raise ValueError(f"{name} needed, found {', '.join(file) or 'nothing'}")
+    stored = file[name]
+    if not isinstance(stored, h5py.Dataset) or stored.external or stored.is_virtual:
+        raise ValueError(f"{name} needs to be an array within the file")
+    if stored.dtype.kind not in "fiu" or stored.nbytes > LARGEST:
+        raise ValueError(f"{name} needs numbers of at most {LARGEST} bytes, found {stored.dtype}")
+    values = stored[()]
+    if not np.isfinite(values).all():
+        raise ValueError(f"{name} needs finite numbers")
+    return values
+
+
+def _version(file):
+    """Major and minor version; files without are of the first statismo, whose name tells them."""
+    if "version/majorVersion" in file:
+        return tuple(int(_array(file, f"version/{part}Version")) for part in ("major", "minor"))
+    name = file["representer"].attrs.get("name", "")
+    if name in ("vtkPolyDataRepresenter", "itkMeshRepresenter"):
+        return (0, 8)
+    raise ValueError("version/majorVersion needed, found none")

@@ -1,0 +1,325 @@
+"""Parts of shapes in a finished study: found, completed, with intervals that hold."""
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy.spatial.transform import Rotation
+
+from s4a import analyse, cli, insert, synthetic, with_landmarks, write_mesh
+from s4a.geometry.mesh import as_arrays, vertex_areas
+from s4a_morphometrics import calibration, complete, posterior
+from s4a_morphometrics.calibration import (
+    between_ways,
+    deviation_of,
+    gaps_between_ways,
+    share_to_add,
+)
+from s4a_morphometrics.completion import warnings_of
+from s4a_morphometrics.part import cut
+from s4a_morphometrics.partial import model_of
+
+OPTIONS = {"n_coarse": 600, "k_init": 12, "k": 30, "n_jobs": 1}
+TURN = Rotation.from_rotvec([0.3, -0.5, 0.4]).as_matrix()
+
+
+@pytest.fixture(scope="module")
+def tree():
+    return synthetic.brains(8, 2000, seed=5, n_modes=2)
+
+
+@pytest.fixture(scope="module")
+def study(tree):
+    """Seven of eight brains."""
+    names = sorted(tree["original"].children)[:-1]
+    return analyse({name: tree["original"][name].to_dataset() for name in names}, **OPTIONS)
+
+
+@pytest.fixture(scope="module")
+def brain(tree):
+    return tree["original/brain_08"].to_dataset()
+
+
+@pytest.fixture(scope="module")
+def part(brain):
+    """Its rear 30 % are missing, and it is turned."""
+    X, T = as_arrays(brain)
+    X, T = cut(X, T, X[:, 1] > np.quantile(X[:, 1], 0.3))
+    return X @ TURN.T + [5.0, 0, 0], T
+
+
+@pytest.fixture(scope="module")
+def found(study, part):
+    return complete(study, part, n_samples=200)
+
+
+def truth_of(tree, study):
+    """Where the template's vertices truly are on the brain."""
+    template = study["registration"].attrs["template"]
+    u = tree["truth"][template]["reference_point"].values
+    return synthetic.position(tree["truth"], "brain_08", u)
+
+
+def test_what_is_known_of_a_normal_vector_gives_the_rest_as_the_formula_says():
+    rng = np.random.default_rng(0)
+    s, n, K = 6, 40, 4
+    fields = rng.normal(size=(s, n, 3))
+    area = rng.uniform(1, 2, n)
+    area /= area.sum()
+    Phi = np.linalg.qr(rng.normal(size=(n, K)))[0] / np.sqrt(area)[:, None]
+    present = np.arange(n) < 25
+    known = posterior.know(fields, Phi, rng.normal(size=(n, 3)), area, present)
+    gram = np.einsum("snx,tnx,n->st", known.columns[:s], known.columns[:s], area)
+    weights = posterior.weights_of(known, posterior.modes_of(gram, np.arange(s)))
+    shape = rng.normal(size=(n, 3))
+    seen = np.einsum("qnx,nx,n->q", known.columns[:, present], shape[present], area[present])
+    got = posterior.condition(known, weights, seen, 1.0)
+    # the same by the covariance of all coordinates, motions of a large variance
+    E = np.einsum("qp,qnx->nxp", weights, known.columns).reshape(3 * n, -1)
+    weight = K / known.rest
+    before = np.concatenate([np.ones(s - 1), known.variance, np.full(6, 1e9 / weight)])
+    rows = np.repeat(present, 3)
+    cross = (E * before) @ E[rows].T
+    noise = np.diag(np.repeat(1 / (weight * area[present]), 3))
+    told = cross @ np.linalg.solve(cross[rows] + noise, shape[present].ravel())
+    assert E @ got.mean == pytest.approx(told, abs=1e-5 * abs(told).max())
+    covariance = (E * before) @ E.T - cross @ np.linalg.solve(cross[rows] + noise, cross.T)
+    mine = (E @ got.root) @ (E @ got.root).T
+    assert mine == pytest.approx(covariance, abs=1e-4 * abs(mine).max())
+
+
+def test_new_shapes_are_told_as_well_as_those_left_out():
+    rng = np.random.default_rng(1)
+    mesh = synthetic.ellipsoid(300)
+    X, T = as_arrays(mesh)
+    area = vertex_areas(X, T)
+    area /= area.sum()
+    wave = np.cos(X @ rng.normal(size=(3, 8)) + rng.uniform(0, 6, 8))  # (n, 8)
+    fields = np.einsum("swx,nw->snx", rng.normal(size=(60, 8, 3)), wave)
+    fields += 0.05 * rng.normal(size=fields.shape)
+    Phi = np.linalg.qr(wave * np.sqrt(area)[:, None])[0] / np.sqrt(area)[:, None]
+    present = X[:, 2] < np.quantile(X[:, 2], 0.7)
+    known = posterior.know(fields[:30], Phi, X, area, present)
+    density, left_out = posterior.best_density(known, ~present)
+    gram = np.einsum("snx,tnx,n->st", known.columns[:30], known.columns[:30], area)
+    weights = posterior.weights_of(known, posterior.modes_of(gram, np.arange(30)))
+    columns = np.einsum("qp,qnx->pnx", weights, known.columns)
+    errors = []
+    for own in fields[30:] - fields[:30].mean(0):
+        seen = np.einsum("qnx,nx,n->q", known.columns[:, present], own[present], area[present])
+        got = posterior.condition(known, weights, seen, density)
+        errors.append((own - np.tensordot(got.mean, columns, 1))[~present])
+    assert np.sqrt(np.square(errors).mean()) == pytest.approx(left_out, rel=0.3)
+
+
+def test_intervals_hold_nine_tenths_of_what_the_whole_shape_has(study, brain, found):
+    whole = insert(study, {"brain_08": brain}, compare=False)["registration"].to_dataset()
+    whole = whole.isel(shape=0)
+    image = whole["position"].values + whole["displacement"].values - whole["translation"].values
+    image = image @ whole["rotation"].values @ TURN.T + [5.0, 0, 0]
+    # both are matches over the template: what two ways of matching differ by is in neither
+    sd = np.sqrt(found["completion_sd"].values ** 2 - found.attrs["added"] ** 2)
+    ratio = abs(found["position"].values - image) / sd
+    missing = ~found["present"].values
+    assert 0.8 < (ratio[missing] < posterior.WITHIN_90).mean() < 0.99
+
+
+def test_intervals_hold_nine_tenths_of_the_truth(tree, study, found):
+    true = truth_of(tree, study) @ TURN.T + [5.0, 0, 0]
+    within = abs(found["position"].values - true) / found["completion_sd"].values
+    within = within < posterior.WITHIN_90
+    there = found["present"].values
+    assert 0.85 < within[there].mean() < 0.99
+    assert 0.85 < within[~there].mean() < 0.99
+    assert found.attrs["between_ways"] > found.attrs["added"] > 0
+    assert found.attrs["match_noise"] > found.attrs["between_ways"]
+
+
+def slid(study, names):
+    """The study with the template turned by eleven degrees on some of its shapes, and how far."""
+    X = study["registration"]["position"].values
+    slide = np.cross([0, 0, 0.2], X - X.mean(0))
+    wrong = study.copy(deep=True)
+    displacement = wrong["registration"]["displacement"]
+    displacement[displacement["shape"].isin(names)] += slide.astype(np.float32)
+    return wrong, deviation_of([abs(slide).ravel()]) / model_of(study).template.frame[1]
+
+
+def test_what_a_match_has_wrong_on_its_own_is_seen_by_going_round_it(study):
+    names = study["registration"]["shape"].values.tolist()
+    others = [name for name in names if name != study["registration"].attrs["template"]]
+    right = between_ways(gaps_between_ways(model_of(study)))
+    wrong, turned = slid(study, others[:3])  # each is registered onto one of the other three
+    assert right < 0.2 * turned
+    assert between_ways(gaps_between_ways(model_of(wrong))) == pytest.approx(turned, rel=0.15)
+    alike, _ = slid(study, others)
+    assert between_ways(gaps_between_ways(model_of(alike))) < 0.4 * turned
+
+
+def test_ways_are_found_once_for_the_content_of_a_study(study, monkeypatch):
+    found = gaps_between_ways(model_of(study))
+    monkeypatch.setattr(calibration, "from_latent", None)  # no shape can be registered
+    again = gaps_between_ways(model_of(study.copy(deep=True)))
+    assert all(again[name] is gap for name, gap in found.items())
+    wrong, _ = slid(study, list(found)[:1])
+    with pytest.raises(TypeError, match="not callable"):
+        gaps_between_ways(model_of(wrong))
+
+
+def test_a_shape_that_stands_apart_from_the_network_is_registered_onto_no_other(study):
+    latent = study["latent"].to_dataset()
+    name = next(iter(gaps_between_ways(model_of(study))))
+    without = study.copy()
+    without["latent"] = xr.DataTree(latent.sel(shape=latent["shape"] != name))
+    gaps = gaps_between_ways(model_of(without))
+    assert name not in gaps
+    assert len(gaps) == 5  # of seven shapes, the template is one
+
+
+@pytest.mark.parametrize("n_beside", [0, 1])
+def test_with_fewer_than_two_shapes_beside_the_template_nothing_is_registered_and_that_is_told(
+    study, n_beside, found
+):
+    template = study["registration"].attrs["template"]
+    latent = study["latent"].to_dataset()
+    others = [name for name in latent["shape"].values if name != template]
+    few = study.copy()
+    few["latent"] = xr.DataTree(latent.sel(shape=[template, *others[:n_beside]]))
+    assert calibration.gaps_between_ways(model_of(few)) == {}
+    assert calibration.between_ways({}) == 0
+    said = warnings_of(found.assign_attrs(between_ways=0.0))
+    assert any("too narrow" in line for line in said)
+    assert not any("too narrow" in line for line in warnings_of(found))
+
+
+def test_errors_that_the_told_shapes_hold_already_are_not_added_twice():
+    rng = np.random.default_rng(3)
+    n = 20_000
+    told = []
+    for held in (0.0, 0.25, 0.5, 0.75, 1.0):
+        wrong = rng.normal(size=(n, 3))  # of the match
+        told.append((2 * rng.normal(size=(n, 3)) - held * wrong, wrong))
+    # of the truth, p + g: the median of the shapes holds half of what its match has wrong
+    p, g = told[2]
+    added = (p + g).var() - p.var()
+    assert share_to_add(told) == pytest.approx(added, abs=0.05)
+    assert share_to_add(told) == pytest.approx(0.0, abs=0.05)
+    assert share_to_add(told[:1]) == pytest.approx(1.0, abs=0.05)
+
+
+def test_the_missing_area_is_found_and_the_rest_lies_as_well_as_of_the_whole(
+    tree, study, brain, found
+):
+    true = truth_of(tree, study)
+    there = true[:, 1] > np.quantile(brain["position"].values[:, 1], 0.3)
+    assert (found["present"].values == there).mean() > 0.95
+    assert found.attrs["missing"] == pytest.approx(0.3, abs=0.08)
+    error = np.linalg.norm((found["position"].values - [5.0, 0, 0]) @ TURN - true, axis=1)
+    whole = insert(study, {"brain_08": brain}, compare=False)["registration"].to_dataset()
+    whole = whole.isel(shape=0)
+    image = whole["position"].values + whole["displacement"].values - whole["translation"].values
+    of_whole = np.linalg.norm(image @ whole["rotation"].values - true, axis=1)
+    assert error[there].mean() < 1.5 * of_whole[there].mean()
+    mean = study["pca"]["mean_displacement"].values + study["registration"]["position"].values
+    away = np.linalg.norm(mean @ whole["rotation"].values - true, axis=1)
+    assert error[~there].mean() < 0.5 * away[~there].mean()
+
+
+def test_deviations_are_larger_where_nothing_is_and_samples_scatter_by_them(found):
+    sd, there = found["completion_sd"].values, found["present"].values
+    assert sd[~there].mean() > 1.03 * sd[there].mean()
+    normal = found["completion_normal_sd"].values
+    assert (normal <= np.linalg.norm(sd, axis=1) * (1 + 1e-5)).all()
+    drawn = found["sample_position"].values
+    assert drawn.std(0)[~there].mean() == pytest.approx(sd[~there].mean(), rel=0.2)
+    gap = (drawn.mean(0) - found["position"].values)[~there]
+    assert abs(gap).mean() < 0.3 * sd[~there].mean()
+
+
+def test_what_comes_out_is_of_the_study_and_does_not_depend_on_chance(study, part, found):
+    again = complete(study, part, n_samples=200)
+    xr.testing.assert_identical(again, found)
+    X = study["registration"]["position"].values + found["displacement"].values
+    back = (X - found["translation"].values) @ found["rotation"].values / found["scale"].item()
+    assert back == pytest.approx(found["position"].values, abs=1e-3)
+    covariance = found["score_covariance"].values
+    assert np.linalg.eigvalsh(covariance).min() > 0
+    assert np.diag(covariance).max() < 1.05  # the part says something of every mode
+
+
+def test_a_whole_shape_lacks_nothing(study, brain):
+    found = complete(study, brain, n_samples=0)
+    assert found.attrs["missing"] < 0.02
+    assert found.sizes["sample"] == 0
+
+
+def test_landmarks_say_how_a_part_lies(tree, brain, part, tmp_path):
+    names = sorted(tree["original"].children)[:5]
+    marked = {
+        name: with_landmarks(mesh, mesh[["landmark_name", "landmark_position"]])
+        for name in names
+        for mesh in [tree["original"][name].to_dataset()]
+    }
+    study = analyse(marked, **OPTIONS)
+    P = brain["landmark_position"].values
+    there = np.flatnonzero(P[:, 1] > np.quantile(brain["position"].values[:, 1], 0.35))
+    assert len(there) >= 3
+    upside_down = np.diag([1.0, -1, -1])
+    X, T = part
+    rows = [
+        f"{name},{x},{y},{z}"
+        for name, (x, y, z) in zip(
+            brain["landmark_name"].values[there],
+            (P[there] @ TURN.T + [5.0, 0, 0]) @ upside_down,
+            strict=True,
+        )
+    ]
+    file = tmp_path / "part.csv"
+    file.write_text("name,x,y,z\n" + "\n".join(rows) + "\n")
+    found = complete(study, (X @ upside_down, T), landmarks=file, n_samples=0)
+    assert found.attrs["missing"] == pytest.approx(0.3, abs=0.1)
+
+
+def test_what_cannot_be_completed_is_refused_with_the_reason(study, brain, tmp_path):
+    X, T = as_arrays(brain)
+    small = cut(X, T, X[:, 1] > np.quantile(X[:, 1], 0.93))
+    with pytest.raises(ValueError, match=r"at least 15 % of the template's area is needed, found"):
+        complete(study, small)
+    with pytest.raises(ValueError, match="vertices are not finite"):
+        complete(study, (np.full_like(X, np.nan), T))
+    with pytest.raises(ValueError, match="there is no such file"):
+        complete(study, tmp_path / "none.ply")
+    nodes = {name: study[name] for name in ("original", "coarse", "latent", "registration")}
+    with pytest.raises(ValueError, match="a finished study is needed; this one lacks pca"):
+        complete(xr.DataTree.from_dict(nodes), brain)
+    with pytest.raises(ValueError, match="the part does not fit the shapes of the study"):
+        complete(study, (0.1 * X, T))
+
+
+def test_a_part_of_another_bone_is_refused_or_named(study, brain, caplog):
+    X, T = as_arrays(synthetic.sphere(1500))
+    size = np.sqrt(vertex_areas(*as_arrays(brain)).sum() / vertex_areas(X, T).sum())
+    half = cut(size * X, T, X[:, 2] > -0.3)
+    found = complete(study, half, n_samples=0)
+    assert "of another kind" in found.attrs["warning"]
+    assert "of another kind" in caplog.text
+
+
+def test_the_command_writes_the_completed_mesh(study, part, tmp_path, capsys):
+    folder = tmp_path / "study"
+    names = list(study["original"].children)[:4]
+    analyse({n: study["original"][n].to_dataset() for n in names}, store=folder, **OPTIONS).close()
+    file = tmp_path / "part.ply"
+    write_mesh(file, *part)
+    out = tmp_path / "out"
+    words = ["complete", str(folder), str(file), "--out", str(out), "--samples", "1"]
+    assert cli.main(words) == 0
+    said = capsys.readouterr().out
+    assert "% of the template" in said
+    assert sorted(path.name for path in out.iterdir()) == [
+        "completed.nc",
+        "completed.ply",
+        "sample_00.ply",
+    ]
+    with xr.open_dataset(out / "completed.nc") as written:
+        assert written["present"].values.mean() == pytest.approx(0.7, abs=0.15)
+    assert cli.main(["complete", str(folder), str(out / "none.ply"), "--out", str(out)]) == 2

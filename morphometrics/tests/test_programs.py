@@ -1,0 +1,558 @@
+"""Files for other programs: read back as those programs read them, they hold what the study does.
+
+Nothing of :mod:`s4a` reads here, but where it says so.
+"""
+
+import base64
+import json
+import logging
+import shutil
+import subprocess
+import xml.etree.ElementTree as ET
+
+import h5py
+import nibabel
+import numpy as np
+import pytest
+import xarray as xr
+from paths import DOCS
+
+import s4a
+from s4a import read_mesh
+from s4a.analysis.link import image_in_shape
+from s4a.cli import main
+from s4a.geometry.mesh import as_arrays, vertex_areas
+from s4a.input.annotations import read_landmarks, write_landmarks
+from s4a.input.subjects import with_table
+from s4a.schema import dataset
+from s4a_morphometrics import write_for
+from s4a_morphometrics.programs import PROGRAMS, R_SCRIPT
+from s4a_morphometrics.scalismo import read_scalismo
+
+
+@pytest.fixture(scope="module")
+def tabled(study, tmp_path_factory):
+    """The study of the brains, with a table."""
+    names = study["registration"]["shape"].values.tolist()
+    rows = zip(names, "abab", (31, 40, 22, 35), strict=True)
+    table = tmp_path_factory.mktemp("table") / "subjects.csv"
+    table.write_text("shape,group,age\n" + "".join(f"{s},{g},{a}\n" for s, g, a in rows))
+    return with_table(study, table)
+
+
+def aligned(study):
+    """Registered shapes in the frame of the template (s, n, 3)."""
+    data = study["registration"].to_dataset()
+    return data["position"].values + data["displacement"].values
+
+
+# ShapeWorks: a project of JSON, all of whose cells are texts (Libs/Project/JsonProjectReader.cpp)
+
+
+def test_shapeworks_finds_meshes_and_particles_that_its_alignment_takes_to_the_world(
+    tabled, tmp_path
+):
+    write_for(tabled, tmp_path, "shapeworks", n_points=50)
+    project = json.loads((tmp_path / "study.swproj").read_text())
+    rows = project["data"]
+    assert [row["name"] for row in rows] == tabled["registration"]["shape"].values.tolist()
+    assert [row["group_group"] for row in rows] == list("abab")
+    assert [float(row["age"]) for row in rows] == [31, 40, 22, 35]
+    for row, whole in zip(rows, aligned(tabled), strict=True):
+        assert all(isinstance(value, str) for value in row.values())
+        M = [np.array(row[f"{kind}_1"].split(), float) for kind in ("alignment", "procrustes")]
+        M = M[1].reshape(4, 4) @ M[0].reshape(4, 4)
+        local, world = (
+            np.loadtxt(tmp_path / row[f"{kind}_particles_1"]) for kind in ("local", "world")
+        )
+        assert local.shape == (50, 3)
+        assert local @ M[:3, :3].T + M[:3, 3] == pytest.approx(world, abs=1e-5)
+        near = np.linalg.norm(whole[None] - world[:, None], axis=2)
+        assert near.min(1).max() < 1e-4  # each is a vertex of the registered shape
+        X, _, _ = read_mesh(tmp_path / row["shape_1"])
+        assert X == pytest.approx(tabled["original"][row["name"]]["position"].values, abs=1e-3)
+        gap = np.linalg.norm(X[None] - local[:, None], axis=2).min(1)
+        assert gap.mean() < 8  # mm: particles lie on the mesh, as well as it was registered
+    assert project["optimize"] == {"number_of_particles": "50"}
+
+
+def test_particles_of_one_number_are_one_vertex_on_all_shapes(study, tmp_path):
+    write_for(study, tmp_path, "shapeworks", n_points=40)
+    files = sorted((tmp_path / "particles").glob("*_world.particles"))
+    world = np.stack([np.loadtxt(file) for file in files])
+    whole = aligned(study)
+    vertex = np.linalg.norm(whole[0][None] - world[0][:, None], axis=2).argmin(1)
+    assert len(set(vertex.tolist())) == 40
+    assert whole[:, vertex] == pytest.approx(world, abs=1e-5)
+
+
+# Scalismo: as its StatismoIO reads
+
+
+def as_scalismo_reads(path):
+    """Points, cells, mean (n, 3), basis (3 n, c) and variances, of the types that it casts to."""
+    with h5py.File(path) as file:
+        representer = file["representer"]
+        assert representer.attrs["datasetType"] == "POLYGON_MESH"
+        assert representer.attrs["name"] == "itkStandardMeshRepresenter"
+        version = [file[f"version/{part}Version"] for part in ("major", "minor")]
+        assert [v.dtype for v in version] == [np.int32] * 2
+        assert [int(v[()]) for v in version] == [0, 9]
+        points, cells = representer["points"][()], representer["cells"][()]
+        arrays = [file[f"model/{name}"][()] for name in ("mean", "pcaBasis", "pcaVariance")]
+        assert {a.dtype for a in (points, *arrays)} == {np.dtype(np.float32)}
+        assert cells.dtype == np.int32
+        assert file["model/noiseVariance"].shape == (1,)
+        assert points.shape[0] == cells.shape[0] == 3
+        mean, basis, variance = (a.astype(float) for a in arrays)
+        return points.T, cells.T, mean.reshape(-1, 3), basis, variance
+
+
+def test_scalismo_reads_the_gaussian_of_the_modes(study, tmp_path):
+    (path,) = write_for(study, tmp_path, "scalismo")
+    points, cells, mean, basis, variance = as_scalismo_reads(path)
+    data = study["registration"].to_dataset()
+    assert points == pytest.approx(data["position"].values, abs=1e-3)
+    assert (cells == data["corner_vertex"].values).all()
+    assert mean == pytest.approx(s4a.synthesize(study, [0.0])["position"].values, abs=1e-3)
+    assert basis.T @ basis == pytest.approx(np.eye(len(variance)), abs=1e-4)
+    assert (np.diff(variance) <= 0).all()
+    D = study["pca"]["deformation"].values.astype(float).reshape(len(variance), -1)
+    some = np.random.default_rng(0).choice(D.shape[1], 200, replace=False)
+    covariance = (basis[some] * variance) @ basis[some].T
+    assert covariance == pytest.approx(D[:, some].T @ D[:, some], abs=1e-3 * variance[0] / 100)
+
+
+def test_a_model_of_scalismo_is_read_as_modes_of_the_same_spread(study, tmp_path):
+    (path,) = write_for(study, tmp_path, "scalismo", n_modes=2)
+    model = read_scalismo(path)
+    spread = model["pca"]["standard_deviation"].values
+    assert len(spread) == 2
+    known = study["pca"]["standard_deviation"].values[:2]
+    assert (spread**2).sum() == pytest.approx((known**2).sum(), rel=1e-4)
+    moved = s4a.synthesize(model, [1.0])["position"] - s4a.synthesize(model, [0.0])["position"]
+    area = vertex_areas(*as_arrays(model["registration"].to_dataset()))
+    root = np.sqrt(area @ (moved.values**2).sum(1) / area.sum())
+    assert root == pytest.approx(spread[0], rel=1e-4)
+
+
+def test_a_model_of_the_first_statismo_has_its_deviations_in_its_basis(study, tmp_path):
+    (path,) = write_for(study, tmp_path, "scalismo")
+    new = read_scalismo(path)
+    with h5py.File(path, "a") as file:
+        basis = file["model/pcaBasis"][()] * np.sqrt(file["model/pcaVariance"][()])
+        del file["version"], file["model/pcaBasis"]
+        file["model/pcaBasis"] = basis
+        file["representer"].attrs["name"] = "vtkPolyDataRepresenter"
+    old = read_scalismo(path)
+    assert old["pca"]["deformation"].values == pytest.approx(
+        new["pca"]["deformation"].values, abs=1e-4
+    )
+
+
+def test_what_is_no_model_is_refused_by_what_it_lacks(study, tmp_path):
+    (path,) = write_for(study, tmp_path, "scalismo")
+    cut, other = tmp_path / "cut.h5", tmp_path / "other.h5"
+    shutil.copy(path, cut)
+    with h5py.File(cut, "a") as file:
+        mean = file["model/mean"][:-3]
+        del file["model/mean"]
+        file["model/mean"] = mean
+    with h5py.File(other, "w") as file:
+        file["model/mean"] = h5py.ExternalLink(str(path), "model/mean")
+    (tmp_path / "text.h5").write_text("no HDF5")
+    n = study["registration"].sizes["vertex"]
+    for file, words in {
+        cut: rf"cut\.h5 .* points \(3, n\).* found \(3, {n}\), .*\({3 * n - 3},\)",
+        other: "other.h5 cannot be read as a statistical shape model: model/mean needed",
+        tmp_path / "text.h5": "text.h5 cannot be read as a statistical shape model",
+        tmp_path / "none.h5": "no file .*none.h5",
+    }.items():
+        with pytest.raises(ValueError, match=words):
+            read_scalismo(file)
+
+
+# ParaView: its collection and VTK's XML
+
+
+def vtk_array(node):
+    """The numbers of a DataArray in base64 after their length, as VTK reads them."""
+    kinds = {"Float32": "<f4", "Float64": "<f8", "Int64": "<i8"}
+    raw = base64.b64decode(node.text)
+    assert int.from_bytes(raw[:8], "little") == len(raw) - 8
+    values = np.frombuffer(raw[8:], kinds[node.get("type")])
+    width = int(node.get("NumberOfComponents"))
+    return values.reshape(-1, width) if width > 1 else values
+
+
+def test_paraview_plays_a_mode_from_minus_to_plus(study, tmp_path):
+    paths = write_for(study, tmp_path, "paraview", n_modes=2, n_steps=5, extent=2.0)
+    assert [path.name for path in paths] == ["mode_1.pvd", "mode_2.pvd", "shapes.pvd"]
+    root = ET.parse(tmp_path / "mode_2.pvd").getroot()
+    assert root.get("type") == "Collection"
+    steps = [(float(s.get("timestep")), s.get("file")) for s in root.iter("DataSet")]
+    assert [time for time, _ in steps] == [-2, -1, 0, 1, 2]
+    mean = s4a.synthesize(study, [0.0])["position"].values
+    for time, name in steps:
+        tree = ET.parse(tmp_path / name).getroot()
+        assert tree.get("header_type") == "UInt64"
+        arrays = {node.get("Name"): vtk_array(node) for node in tree.iter("DataArray")}
+        known = s4a.synthesize(study, [0.0, time])["position"].values
+        assert arrays["Points"] == pytest.approx(known)
+        assert arrays["displacement"] == pytest.approx(known - mean, abs=1e-3)
+        assert (arrays["offsets"] == np.arange(3, len(arrays["connectivity"]) + 1, 3)).all()
+        triangles = study["registration"]["corner_vertex"].values
+        assert (arrays["connectivity"].reshape(-1, 3) == triangles).all()
+        assert arrays["confidence"].shape == (len(mean),)
+        X, T, _ = read_mesh(tmp_path / name)  # and by the reader that knows what VTK writes
+        assert (X == arrays["Points"]).all()
+        assert (T == triangles).all()
+
+
+def test_paraview_plays_the_registered_shapes_in_the_order_of_the_study(study, tmp_path):
+    write_for(study, tmp_path, "paraview", n_modes=1, n_steps=2)
+    for i, known in enumerate(aligned(study)):
+        X, _, _ = read_mesh(tmp_path / "shapes" / f"{i:03d}.vtp")
+        assert X == pytest.approx(known, abs=1e-4)
+
+
+# R: the netCDF that ncdf4 reads, and what geomorph's readland.tps looks for
+
+
+def test_r_has_every_vertex_and_a_row_for_every_shape(tabled, tmp_path):
+    write_for(tabled, tmp_path, "r", n_points=30)
+    with xr.open_dataset(tmp_path / "shapes.nc", engine="h5netcdf") as data:
+        assert data["aligned_position"].dims == ("shape", "vertex", "xyz")
+        assert data["aligned_position"].values == pytest.approx(aligned(tabled), abs=1e-4)
+        assert data["aligned_position"].attrs["units"] == "mm"
+        chosen = data["point_vertex"].values
+    lines = (tmp_path / "points.tps").read_text().splitlines()
+    assert [line for line in lines if line.startswith("LM3=")] == ["LM3=30"] * 4
+    names = [line[3:] for line in lines if line.startswith("ID=")]
+    assert names == tabled["registration"]["shape"].values.tolist()
+    numbers = np.array([line.split() for line in lines if "=" not in line], float)
+    assert numbers.reshape(4, 30, 3) == pytest.approx(aligned(tabled)[:, chosen], abs=1e-4)
+    rows = (tmp_path / "subjects.csv").read_text().splitlines()
+    assert rows[0].startswith("shape,group,age,component_1")
+    assert rows[1].startswith(f"{names[0]},a,31,")
+
+
+def test_the_page_has_the_lines_that_are_written_for_r(study, tmp_path):
+    write_for(study, tmp_path, "r")
+    assert (tmp_path / "study.R").read_text() == R_SCRIPT
+    assert f"```r\n{R_SCRIPT}```" in (DOCS / "programs.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.skipif(shutil.which("Rscript") is None, reason="R is not installed")
+def test_r_runs_the_lines_that_are_written_for_it(tabled, tmp_path):
+    write_for(tabled, tmp_path, "r", n_points=30)
+    more = 'cat(dim(coords), dim(faces), min(faces), modes$sdev[1:3], subjects$age, sep = "\\n")'
+    (tmp_path / "more.R").write_text(f'source("study.R")\n{more}\n')
+    has = 'quit(status = !requireNamespace("ncdf4", quietly = TRUE))'
+    if subprocess.run(["Rscript", "-e", has], capture_output=True).returncode:
+        pytest.skip("R has no package ncdf4")
+    ran = subprocess.run(
+        ["Rscript", "--vanilla", "more.R"], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert ran.returncode == 0, ran.stderr
+    found = np.array(ran.stdout.split()[-13:], float)
+    data = tabled["registration"].to_dataset()
+    n, m = data.sizes["vertex"], data.sizes["triangle"]
+    assert found[:6].tolist() == [n, 3, 4, m, 3, 1]
+    with xr.open_dataset(tmp_path / "shapes.nc", engine="h5netcdf") as whole:
+        flat = aligned(tabled)[:, whole["point_vertex"].values].reshape(4, -1)
+    spread = np.linalg.svd(flat - flat.mean(0), compute_uv=False)[:3] / np.sqrt(3)
+    assert found[6:9] == pytest.approx(spread, rel=1e-4)
+    assert found[9:].tolist() == [31, 40, 22, 35]
+
+
+# 3D Slicer: its markups, and the frame in the title of a VTK file
+
+
+def slicers_file(system="LPS"):
+    """Markups with all that 3D Slicer 5 writes."""
+    point = {
+        "description": "",
+        "associatedNodeID": "vtkMRMLScalarVolumeNode1",
+        "orientation": [-1.0, -0.0, -0.0, -0.0, -1.0, -0.0, 0.0, 0.0, 1.0],
+        "selected": True,
+        "locked": False,
+        "visibility": True,
+    }
+    places = {"nasion": [1.5, -92.25, 30.0], "left porion": [61.0, 4.5, -7.75]}
+    points = [
+        {"id": str(i), "label": label, "position": place, "positionStatus": "defined", **point}
+        for i, (label, place) in enumerate(places.items(), 1)
+    ]
+    skipped = {"id": "3", "label": "later", "positionStatus": "undefined", **point}
+    about = {
+        "coordinateSystem": system,
+        "coordinateUnits": "mm",
+        "locked": False,
+        "fixedNumberOfControlPoints": False,
+        "labelFormat": "%N-%d",
+        "lastUsedControlPointNumber": 3,
+    }
+    measurement = {"name": "length", "enabled": False, "units": "mm", "printFormat": "%-#4.4g%s"}
+    display = {"visibility": True, "opacity": 1.0, "color": [0.4, 1.0, 1.0], "glyphScale": 1.0}
+    more = {"measurements": [measurement], "display": display}
+    rim = [
+        {"id": str(i), "label": f"rim-{i}", "position": [i, i * i, 0.5], **point}
+        for i in range(1, 5)
+    ]
+    box = {"type": "ROI", **about, "roiType": "Box", "center": [0, 0, 0], "size": [9, 9, 9], **more}
+    return {
+        "@schema": "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/"
+        "Markups/Resources/Schema/markups-schema-v1.0.3.json#",
+        "markups": [
+            {"type": "Fiducial", **about, "controlPoints": [*points, skipped], **more},
+            {"type": "ClosedCurve", **about, "name": "rim", "controlPoints": rim, **more},
+            box,
+        ],
+    }
+
+
+@pytest.mark.parametrize("system", ["LPS", "RAS"])
+def test_a_file_as_slicer_writes_it_is_read_and_written_again(tmp_path, system):
+    (tmp_path / "slicer.mrk.json").write_text(json.dumps(slicers_file(system), indent=4))
+    read = read_landmarks(tmp_path / "slicer.mrk.json")
+    assert read.attrs["coordinate_system"] == system
+    assert read["landmark_name"].values.tolist()[:3] == ["nasion", "left porion", "rim-1"]
+    assert read["landmark_position"].values[1].tolist() == [61.0, 4.5, -7.75]
+    assert read["landmark_closed"].values.tolist() == [False] * 2 + [True] * 4
+    write_landmarks(tmp_path / "ours.mrk.json", read)
+    assert read_landmarks(tmp_path / "ours.mrk.json").identical(read)
+    theirs, ours = slicers_file(system), json.loads((tmp_path / "ours.mrk.json").read_text())
+    assert ours["@schema"] == theirs["@schema"]
+    assert [m["type"] for m in ours["markups"]] == ["Fiducial", "ClosedCurve"]
+    for known, found in zip(theirs["markups"], ours["markups"], strict=False):
+        assert found["coordinateSystem"] == system
+        assert set(found) <= {*known, "name"}
+        for point, again in zip(known["controlPoints"], found["controlPoints"], strict=False):
+            assert set(again) <= {*point, "positionStatus"}
+            assert again["position"] == point["position"]
+            # both axes of a point are turned between LPS and RAS, so that it stands upright
+            sign = 1 if system == "RAS" else -1
+            assert np.diag(np.reshape(again["orientation"], (3, 3))).tolist() == [sign, sign, 1]
+
+
+def test_markups_without_a_frame_are_lps_as_slicer_takes_them(tmp_path):
+    marks = dataset(landmark_name=["a"], landmark_position=[[1.0, 2, 3]])
+    write_landmarks(tmp_path / "a.mrk.json", marks)
+    found = json.loads((tmp_path / "a.mrk.json").read_text())["markups"][0]
+    assert found["coordinateSystem"] == "LPS"
+    assert "coordinateUnits" not in found  # of a length without a unit nothing is said
+
+
+def test_slicer_has_surfaces_points_and_landmarks_where_the_files_lie(study, tmp_path):
+    write_for(study, tmp_path, "slicer", n_points=25)
+    data = study["registration"].to_dataset()
+    for name in data["shape"].values.tolist():
+        assert b"SPACE=RAS" in (tmp_path / f"{name}.vtk").read_bytes()[:200]
+        X, T, attrs = read_mesh(tmp_path / f"{name}.vtk")
+        known = image_in_shape(data["position"].values, data.sel(shape=name))
+        assert X == pytest.approx(known, abs=1e-5)
+        assert (T == data["corner_vertex"].values).all()
+        assert attrs["coordinate_system"] == "RAS"
+        points = read_landmarks(tmp_path / "points" / f"{name}.mrk.json")
+        vertex = points["landmark_name"].values.astype(int)
+        assert len(vertex) == 25
+        assert points["landmark_position"].values == pytest.approx(known[vertex])
+        assert points.attrs["coordinate_system"] == "RAS"
+        marks = read_landmarks(tmp_path / "landmarks" / f"{name}.mrk.json")
+        own = study["original"][name].to_dataset()
+        assert marks["landmark_name"].values.tolist() == own["landmark_name"].values.tolist()
+        gap = marks["landmark_position"].values - own["landmark_position"].values
+        assert np.linalg.norm(gap, axis=1).mean() < 15  # mm, few vertices
+
+
+def test_landmarks_of_the_other_frame_are_written_where_the_template_lies(study, tmp_path):
+    name = study["registration"].attrs["template"]
+    Y = study["original"][name]["position"].values[[5, 200, 400]]
+    given = dataset(
+        {"coordinate_system": "LPS"},
+        landmark_name=list("abc"),
+        landmark_position=Y * [-1, -1, 1],
+    )
+    write_for(study, tmp_path, "slicer", n_points=5, landmarks=given)
+    written = read_landmarks(tmp_path / "landmarks" / f"{name}.mrk.json")
+    assert written.attrs["coordinate_system"] == "RAS"
+    assert written["landmark_position"].values == pytest.approx(Y, abs=1e-5)
+
+
+def test_slicer_is_told_where_no_file_says_its_frame(study, tmp_path, caplog):
+    plain = study.copy(deep=True)
+    for node in plain["original"].children.values():
+        node.attrs.pop("coordinate_system")
+    with caplog.at_level(logging.WARNING):
+        write_for(plain, tmp_path, "slicer", n_points=5)
+    assert "do not say whether they are RAS or LPS; 3D Slicer takes them as LPS" in caplog.text
+    name = plain["registration"]["shape"].values[0]
+    assert b"SPACE" not in (tmp_path / f"{name}.vtk").read_bytes()[:200]
+
+
+def test_a_mirrored_shape_is_written_where_its_file_lies(study, tmp_path):
+    mirrored = study.copy(deep=True)
+    name = study["registration"]["shape"].values[1]
+    mirrored["original"][name].attrs["reflected"] = 1
+    write_for(study, tmp_path / "a", "slicer", n_points=8)
+    write_for(mirrored, tmp_path / "b", "slicer", n_points=8)
+    (X, T, _), (Y, S, _) = (read_mesh(tmp_path / way / f"{name}.vtk") for way in "ab")
+    assert (Y == X * [-1, 1, 1]).all()
+    assert (S == T[:, ::-1]).all()
+    for kind in ("points", "landmarks"):
+        a, b = (read_landmarks(tmp_path / way / kind / f"{name}.mrk.json") for way in "ab")
+        assert b["landmark_position"].values == pytest.approx(
+            a["landmark_position"].values * [-1, 1, 1]
+        )
+
+
+# NIfTI: label volumes in the grid of a scan
+
+AFFINE = np.array([[-2.0, 0, 0, 30], [0, 0, 2, -28], [0, 2, 0, -26], [0, 0, 0, 1]])
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory):
+    """Four label volumes, turned and mirrored as scans are, and the study of label 2."""
+    pytest.importorskip("skimage")
+    folder = tmp_path_factory.mktemp("scans")
+    place = np.stack(np.meshgrid(*[np.arange(28)] * 3, indexing="ij"), -1) - 14
+    for i, axes in enumerate(([11, 8, 7], [10, 9, 7], [11, 9, 6], [10, 8, 8])):
+        bump = ((place - [5, 4, 3 + i]) ** 2).sum(-1) < 30
+        volume = np.where((((place / axes) ** 2).sum(-1) < 1) | bump, 2, 0)
+        volume[:2, :2, :2] = 1  # another structure
+        image = nibabel.Nifti1Image(volume.astype(np.uint8), AFFINE)
+        nibabel.save(image, folder / f"scan_{i}.nii.gz")
+    study = s4a.analyse(folder, label=2, n_coarse=200, k_init=8, k=16, n_jobs=1)
+    return folder, study
+
+
+def halves(study):
+    """Labels of the template: 5 where the world's x is positive, else 9."""
+    name = study["registration"].attrs["template"]
+    X = study["original"][name]["position"].values
+    return np.where(X[:, 0] > np.median(X[:, 0]), 5, 9)
+
+
+def test_labels_fill_the_voxels_that_made_each_shape_in_the_grid_of_its_scan(scans, tmp_path):
+    folder, study = scans
+    paths = write_for(study, tmp_path, "nifti", label=halves(study))
+    assert [path.name for path in paths] == [f"scan_{i}.nii.gz" for i in range(4)]
+    template = study["registration"].attrs["template"]
+    for path in paths:
+        found, scan = nibabel.load(path), nibabel.load(folder / path.name)
+        assert np.array_equal(found.affine, scan.affine)
+        assert found.header.get_xyzt_units()[0] == "mm"
+        values, marked = np.asanyarray(found.dataobj), np.asanyarray(scan.dataobj) == 2
+        assert values.dtype == np.int16
+        assert (np.isin(values, [5, 9]) == marked).all()  # these voxels, and no others
+        x = (np.argwhere(marked) @ AFFINE[:3, :3].T + AFFINE[:3, 3])[:, 0]
+        own = study["original"][path.name.removesuffix(".nii.gz")]["position"].values[:, 0]
+        far = abs(x - np.median(own)) > (4 if path.name.startswith(template) else 8)  # mm
+        assert far.sum() > 500
+        assert ((x > np.median(own)) == (values[marked] == 5))[far].mean() > 0.99
+
+
+def test_labels_fill_what_lies_within_a_shape_in_any_grid(scans, tmp_path):
+    folder, study = scans
+    other = np.diag([1.5, 1.5, 1.5, 1]).astype(float)
+    other[:3, 3] = [-30, -32, -30]
+    grid = tmp_path / "grid.nii.gz"
+    grey = np.random.default_rng(0).random((40, 44, 42)).astype(np.float32)
+    nibabel.save(nibabel.Nifti1Image(grey, other), grid)
+    paths = write_for(study, tmp_path / "out", "nifti", label=halves(study), grid=grid)
+    for path in paths:
+        found, scan = nibabel.load(path), nibabel.load(folder / path.name)
+        assert np.array_equal(found.affine, other)
+        assert found.shape == grey.shape
+        volume = (np.asanyarray(found.dataobj) > 0).sum() * 1.5**3
+        assert volume == pytest.approx((np.asanyarray(scan.dataobj) == 2).sum() * 8, rel=0.03)
+        inverse = np.linalg.inv(AFFINE)
+        place = np.argwhere(np.asanyarray(found.dataobj)) @ other[:3, :3].T + other[:3, 3]
+        voxel = np.rint(place @ inverse[:3, :3].T + inverse[:3, 3]).astype(int)
+        assert (np.asanyarray(scan.dataobj)[tuple(voxel.T)] == 2).mean() > 0.95
+
+
+def test_a_mesh_in_lps_and_one_that_was_mirrored_fill_the_same_voxels(scans, tmp_path):
+    folder, study = scans
+    grid = folder / "scan_0.nii.gz"
+    (known, *_) = write_for(study, tmp_path / "a", "nifti", label=halves(study), grid=grid)
+    turned = study.copy(deep=True)
+    registration, node = turned["registration"], turned["original"]["scan_0"]
+    node["position"] = node["position"] * [-1, -1, 1]
+    node.attrs["coordinate_system"] = "LPS"
+    R = registration["rotation"].values.copy()
+    first = registration["shape"].values.tolist().index("scan_0")
+    R[first] = R[first] @ np.diag([-1.0, -1, 1])
+    registration["rotation"] = registration["rotation"].copy(data=R)
+    if registration.attrs["template"] != "scan_0":
+        (found, *_) = write_for(turned, tmp_path / "b", "nifti", label=halves(study), grid=grid)
+        assert np.array_equal(nibabel.load(found).dataobj, nibabel.load(known).dataobj)
+
+
+# what is refused
+
+
+@pytest.mark.parametrize(
+    "program, options, words",
+    [
+        ("excel", {}, "program must be one of slicer, .*; found 'excel'"),
+        ("r", {"grid": "a.nii"}, "r takes the options n_points; found grid"),
+        ("slicer", {"n_points": 2}, "n_points"),
+        ("paraview", {"extent": -1.0}, "extent needs a positive number .* found -1.0"),
+        ("paraview", {"n_steps": 1}, "n_steps"),
+        ("scalismo", {"n_modes": 0}, "n_modes"),
+        ("nifti", {"label": np.array(["a"] * 1500)}, "whole numbers .* found <U1"),
+        ("nifti", {}, "brain_01 was made of no volume, but of arrays: give the scan"),
+        ("nifti", {"grid": "none.nii"}, "no file .*none.nii"),
+    ],
+)
+def test_an_error_says_what_was_needed(study, tmp_path, program, options, words):
+    with pytest.raises(ValueError, match=words):
+        write_for(study, tmp_path / "out", program, **options)
+
+
+@pytest.mark.parametrize("program", ["scalismo", "paraview"])
+def test_programs_that_play_modes_need_some(study, tmp_path, program):
+    nodes = {node.path: node.to_dataset(inherit=False) for node in study.subtree}
+    del nodes["/pca"]
+    with pytest.raises(ValueError, match="a study with modes is needed"):
+        write_for(xr.DataTree.from_dict(nodes), tmp_path, program)
+
+
+def test_every_program_needs_a_registered_study(brains, tmp_path):
+    for program in PROGRAMS:
+        with pytest.raises(ValueError, match="a registered study is needed"):
+            write_for(brains, tmp_path, program)
+
+
+def test_a_grid_elsewhere_is_refused_and_says_where_the_surface_lies(scans, tmp_path):
+    _, study = scans
+    far = AFFINE.copy()
+    far[:3, 3] += 5000
+    nibabel.save(nibabel.Nifti1Image(np.zeros((9, 9, 9), np.uint8), far), tmp_path / "far.nii")
+    with pytest.raises(ValueError, match=r"no voxel of .*far.nii is within scan_0: .* mm \(RAS\)"):
+        write_for(study, tmp_path, "nifti", label=halves(study), grid=tmp_path / "far.nii")
+
+
+def test_the_command_writes_for_a_program_and_refuses_what_it_does_not_take(
+    study_folder, study, tmp_path, capsys
+):
+    out = str(tmp_path / "out")
+    assert main(["export", str(study_folder), "--to", "slicer", "--out", out, "--points", "9"]) == 0
+    assert "12 files for slicer" in capsys.readouterr().out
+    points = read_landmarks(tmp_path / "out" / "points" / "brain_01.mrk.json")
+    assert points.sizes["landmark"] == 9
+    assert main(["export", str(study_folder), "--to", "r", "--out", out, "--modes", "2"]) == 2
+    assert "s4a: r takes the options n_points; found n_modes" in capsys.readouterr().err
+    grid = tmp_path / "grid.nii.gz"
+    affine = np.diag([4.0, 4, 4, 1])
+    affine[:3, 3] = -120
+    nibabel.save(nibabel.Nifti1Image(np.zeros((60, 60, 60), np.uint8), affine), grid)
+    template = study["registration"].attrs["template"]
+    np.save(tmp_path / "ones.npy", np.full(study["original"][template].sizes["vertex"], 3))
+    words = ["--labels", str(tmp_path / "ones.npy"), "--grid", str(grid)]
+    assert main(["export", str(study_folder), "--to", "nifti", "--out", out, *words]) == 0
+    found = np.asanyarray(nibabel.load(tmp_path / "out" / "brain_01.nii.gz").dataobj)
+    assert np.unique(found).tolist() == [0, 3]

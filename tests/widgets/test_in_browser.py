@@ -1,0 +1,58 @@
+"""What a kernel in the browser can do: all that needs no compiled package but those of Pyodide."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from paths import ROOT, TESTS
+
+from s4a.geometry.compiled import PACKAGES
+
+pytest.importorskip("anywidget")
+
+
+@pytest.fixture(scope="module")
+def done(study_folder, tmp_path_factory):
+    """What the script did, in a process of its own and with its own temporary folder."""
+    place = str(tmp_path_factory.mktemp("browser"))
+    environment = os.environ | {"TMPDIR": place, "TEMP": place, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, str(TESTS / "widgets" / "in_browser.py"), str(study_folder)]
+    run = subprocess.run(
+        command, env=environment, cwd=place, capture_output=True, text=True, check=False
+    )
+    assert run.returncode == 0, run.stderr
+    assert "Traceback" not in run.stderr, run.stderr  # of what is raised where nobody can catch it
+    return json.loads(run.stdout)
+
+
+def test_every_panel_and_a_lesson_work_on_a_ready_study(done):
+    from s4a import widgets
+
+    without = {"Explore", "Panel", "Progress"}  # all together, their class, that of a process
+    assert len(done["panels"]) == len(set(widgets.__all__) - without)
+    assert done["lesson"].startswith("00")
+
+
+def test_a_small_collection_is_made_and_analysed(done):
+    assert done["modes"] == 2
+
+
+def test_what_cannot_be_done_says_what_it_needs_and_what_to_do(done):
+    said = done["refusals"]
+    assert "pip install robust_laplacian" in said["robust_laplacian"]
+    assert "open_study" in said["robust_laplacian"]
+    assert "s4a.analyse" in said["processes"]
+
+
+@pytest.mark.parametrize("name", PACKAGES)
+def test_one_module_imports_a_package_that_a_browser_lacks(name):
+    found = [
+        path.name
+        for path in Path(ROOT / "s4a").rglob("*.py")
+        if re.search(rf"^\s*(import|from) {name}\b", path.read_text("utf-8"), re.MULTILINE)
+    ]
+    assert found == []
