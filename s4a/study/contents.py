@@ -70,6 +70,7 @@ def check_contents(name: str, data: xr.Dataset) -> None:
     if kind == "coarse/shape" and data.attrs.get("method") == "scalable":
         kind = "coarse/scalable"
     needed, texts, numbers = (words.split() for words in HOLDS[kind])
+    check_names(data)
     missing = [one for one in needed if one not in data.variables]
     if missing:
         raise ValueError(f"it lacks {', '.join(missing)}")
@@ -79,7 +80,6 @@ def check_contents(name: str, data: xr.Dataset) -> None:
             raise ValueError(
                 f"the attribute {wrong[0]} needs a {what}, found {data.attrs.get(wrong[0])!r:.40}"
             )
-    check_names(data)
     for one, values in data.variables.items():
         if kind != "subjects":
             check_variable(str(one), values, str(one) in needed)

@@ -19,7 +19,6 @@ from joblib import delayed, effective_n_jobs
 from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
-from s4a.geometry.compiled import psutil
 from s4a.study.netcdf import is_done
 from s4a.study.processes import died, interruption_kept, workers
 from s4a.study.progress import Notes, Stage
@@ -68,6 +67,16 @@ class Task:
     def key(self) -> str:
         """The key of the result: of its inputs and the version of S4A."""
         return task_key(*self.inputs)
+
+    @property
+    def log(self) -> str:
+        """The file in the folder of the study in which a task at work, or failed, is recorded."""
+        return f"{LOGS}/{self.file.replace('/', '-').removesuffix('.nc')}.txt"
+
+    @property
+    def see(self) -> str:
+        """Where its traceback is, in words."""
+        return f"see {self.log} in the folder of the study"
 
 
 class StageError(RuntimeError):
@@ -188,8 +197,9 @@ class Run:
         """The progress bar, at the beginning of a stage: one for all, which goes with the run."""
         stage = f"{stage}: ".ljust(LONGEST)
         if self.bar is None:
+            in_lines = log.isEnabledFor(logging.INFO)  # one for each stage
             look = {"leave": False, "bar_format": "{desc}{percentage:3.0f}%|{bar}{r_bar}"}
-            self.bar = tqdm(desc=stage, total=total, disable=told_in_lines(), **look)
+            self.bar = tqdm(desc=stage, total=total, disable=in_lines, **look)
             if box := getattr(self.bar, "container", None):  # in a notebook
                 box.children[0].layout.width = "17em"
         self.bar.set_description_str(stage, refresh=False)
@@ -230,7 +240,7 @@ class Run:
                     yield Outcome(todo.pop(name).name)  # its process died before it could say so
                 suspects = [name for name in begun if name in todo]
                 if alone and suspects:
-                    failure = f"its process died ({how}); {see(todo.pop(alone[0]))}"
+                    failure = f"its process died ({how}); {todo.pop(alone[0]).see}"
                     yield Outcome(alone[0], failure, True)
                     suspects = []
 
@@ -272,15 +282,10 @@ class Run:
                 self.bar.close()
 
 
-def told_in_lines() -> bool:
-    """Whether the log has a line for each stage, as its level is INFO: there are no bars then."""
-    return log.isEnabledFor(logging.INFO)
-
-
 def do_task(task: Task, claim: Claim) -> Outcome:
     """Compute one Dataset and write its file; with one BLAS thread, as tasks run side by side."""
     claim.check()
-    file = log_file(claim, task)
+    file = claim.folder / task.log
     failure, unforeseen = "", False
     with at_work(file, claim):
         try:
@@ -292,25 +297,10 @@ def do_task(task: Task, claim: Claim) -> Outcome:
         except (Exception, SystemExit) as error:  # whatever it is, it costs this task only
             claim.check()
             text, unforeseen = traceback.format_exc(), not isinstance(error, ValueError)
-            failure = f"{in_a_line(error)}; {see(task)}" if unforeseen else str(error)
+            failure = f"{in_a_line(error)}; {task.see}" if unforeseen else str(error)
     if failure:
         note(file, text)
     return Outcome(task.name, failure, unforeseen, os.getpid(), peak_memory())
-
-
-def log_file(claim: Claim, task: Task) -> Path:
-    """Where a task that is at work, or failed, is recorded."""
-    return claim.folder / log_name(task)
-
-
-def log_name(task: Task) -> str:
-    """The name of that file in the folder of the study."""
-    return f"{LOGS}/{task.file.replace('/', '-').removesuffix('.nc')}.txt"
-
-
-def see(task: Task) -> str:
-    """Where the traceback of a task is, in words."""
-    return f"see {log_name(task)} in the folder of the study"
 
 
 def in_a_line(error: BaseException) -> str:
@@ -336,23 +326,19 @@ def note(file: Path, text: str) -> None:
 
 @contextlib.contextmanager
 def at_work(file: Path, claim: Claim) -> Iterator[None]:
-    """Record a task while a worker is at it; the record stays where its process dies.
+    """Record a task while a worker is at it; the record stays only where its process dies.
 
     It then says where, if the system let it: that of a segmentation fault.
     """
-    if os.getppid() != claim.owner:
-        yield
-        return
-    note(file, f"begun by process {os.getpid()}, {time.strftime('%Y-%m-%d %H:%M:%S')}\n")
     with contextlib.ExitStack() as stack:
-        with contextlib.suppress(OSError):  # what the task writes will tell
-            record = open(file, "a", encoding="utf-8", opener=open_without_following)
-            faulthandler.enable(stack.enter_context(record))
-            stack.callback(faulthandler.enable)  # on the error stream, as joblib has it
-        try:
-            yield
-        finally:
-            file.unlink(missing_ok=True)
+        stack.callback(file.unlink, missing_ok=True)
+        if os.getppid() == claim.owner:
+            note(file, f"begun by process {os.getpid()}, {time.strftime('%Y-%m-%d %H:%M:%S')}\n")
+            with contextlib.suppress(OSError):  # what the task writes will tell
+                record = open(file, "a", encoding="utf-8", opener=open_without_following)
+                faulthandler.enable(stack.enter_context(record))
+                stack.callback(faulthandler.enable)  # on the error stream, as joblib has it
+        yield
 
 
 def together(peaks: dict[int, float], n_jobs: int) -> float:
@@ -374,8 +360,6 @@ def peak_memory() -> float:
     try:
         import resource
     except ImportError:  # on Windows, and in a browser
-        if not psutil:
-            return float("nan")
-        return getattr(psutil.Process().memory_info(), "peak_wset", np.nan) / 2**20
+        return float("nan")
     unit = 2**20 if sys.platform == "darwin" else 2**10
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
