@@ -336,10 +336,9 @@ def _write_group(group, data):
     """The variables, attributes and dims of one group, as the conventions of netCDF have them."""
     variables, attrs = cf_encoder(*encode_dataset_coordinates(data.drop_encoding()))
     _add_attributes(group, attrs)
-    number = {dim: i for i, dim in enumerate(data.sizes)}
-    stored = {}
+    stored: dict[str, h5py.Dataset] = {}
     for name, one in variables.items():
-        if "/" in "".join((name, *one.dims)) or (name in number and one.dims != (name,)):
+        if "/" in "".join((name, *one.dims)) or (name in data.sizes and one.dims != (name,)):
             raise ValueError(
                 f"names without slash, and of no dim but its own, needed; found {name}{one.dims}"
             )
@@ -357,14 +356,9 @@ def _write_group(group, data):
     for dim, size in data.sizes.items():
         scale = stored.get(dim) or group.create_dataset(dim, (size,), ">f4", track_order=True)
         scale.make_scale(dim if dim in stored else f"{NO_VARIABLE}{size:10}")
-        scale.attrs["_Netcdf4Dimid"] = np.int32(number[dim])
     for name, one in variables.items():
-        for axis, dim in enumerate(one.dims if name not in number else ()):
+        for axis, dim in enumerate(one.dims if name not in data.sizes else ()):
             stored[name].dims[axis].attach_scale(group[dim])
-        if one.dims:
-            ids = np.array([number[dim] for dim in one.dims], np.int32)
-            stored[name].attrs["_Netcdf4Coordinates"] = ids
-            stored[name].attrs["_Netcdf4Dimid"] = ids[0]
 
 
 def _as_stored(values, name):

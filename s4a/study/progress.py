@@ -171,22 +171,16 @@ def status(folder: Path | str) -> Status:
 
 
 def _status(said: dict[str, Any]) -> Status:
-    stages = {}
-    for name, (done, of, had, begun, seconds, memory, ended) in said["stages"].items():
-        costs = float(begun), float(seconds), float(memory)
-        stages[name] = Stage(int(done), int(of), int(had), *costs, bool(ended))
-    host, owner, begun = str(said["host"]), int(said["owner"]), float(said["begun"])
-    failures = {str(name): str(why) for name, why in said["failures"].items()}
+    stages = {name: Stage(*stage) for name, stage in said["stages"].items()}
+    owner, begun, state = int(said["owner"]), float(said["begun"]), said["over"]
     memory, processes = 0.0, 0
-    if said["over"] in ("finished", "stopped"):
-        state = said["over"]
-    elif host != platform.node():
+    if not state and said["host"] != platform.node():
         state = "elsewhere"
-    else:
+    elif not state:
         memory, processes = memory_of(owner, begun)
         state = "running" if processes else "stopped"
-    told = float(said["told"])
-    return Status(state, host, owner, begun, told, stages, failures, memory, processes)
+    rest = said["told"], stages, dict(said["failures"]), memory, processes
+    return Status(state, said["host"], owner, begun, *rest)
 
 
 def memory_of(owner: int, begun: float) -> tuple[float, int]:

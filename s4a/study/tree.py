@@ -100,7 +100,6 @@ class Reader:
         # of the files that were read; None where that is not to be asked
         self.keys: set[str] | None = set()
         self.files: dict[str, xr.Dataset] = {}
-        self.damaged: set[str] = set()
 
     def read(
         self, names: Iterable[str], open_with: Callable[..., xr.Dataset] = open_file
@@ -146,7 +145,7 @@ class Reader:
         fault = self.fault(data)
         if not fault:
             with damage_named(path):
-                check_fit(name, data, self.files, self.damaged)
+                check_fit(name, data, self.files)
             if self.keys is not None:
                 self.keys.add(data.attrs.get("task_key", ""))
             self.files[name] = data

@@ -62,7 +62,6 @@ def verify(folder: Path | str) -> xr.Dataset:
         looks[name] = look(reader, name)
         if looks[name][0] == "damaged":
             reader.keys = None  # what was made from it may be right
-            reader.damaged.add(name)
     if "report" in reader.files:
         needed = needed_files(reader.files["report"], reader.files.get("registration"))
         for name in looks:
