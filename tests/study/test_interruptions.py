@@ -21,7 +21,7 @@ from s4a import analyse, cli, open_study, synthetic
 from s4a.schema import dataset
 from s4a.study import doubts, netcdf, originals, pipeline, processes, sources, store, tasks
 from s4a.study.progress import FILE
-from s4a.study.runner import Run, peak_memory, together
+from s4a.study.runner import Run
 
 # of meshes as coarse as these, some registrations are doubtful; so there are modes all the same
 OPTIONS = {"n_coarse": 150, "k_init": 8, "k": 12, "keep_doubtful": True}
@@ -491,30 +491,6 @@ def test_a_worker_of_a_run_that_is_over_writes_nothing(tmp_path):
         store.write(synthetic.sphere(60), tmp_path / "a.nc", "key", claim=new)
     assert netcdf.read(tmp_path / "a.nc").sizes["vertex"] == 60
     assert not list(tmp_path.glob(".*.tmp"))
-
-
-def test_what_a_killed_worker_had_begun_is_gone_when_the_run_is_over(tmp_path):
-    with contextlib.suppress(OSError), store.lock(tmp_path):
-        store.write(synthetic.sphere(50), tmp_path / "coarse" / "a.nc", "key")
-        begun = tmp_path / "coarse" / ".b.nc.1234.tmp"
-        begun.write_bytes(b"half of")
-        raise OSError("no room")
-    assert not begun.exists()
-    assert [path.name for path in (tmp_path / "coarse").iterdir()] == ["a.nc"]
-
-
-def test_a_run_that_lost_its_folder_leaves_what_the_other_has_begun(tmp_path):
-    with store.lock(tmp_path):
-        (tmp_path / store.LOCK).write_text("1 other")
-        begun = tmp_path / ".b.nc.1234.tmp"
-        begun.write_bytes(b"half of")
-    assert begun.exists()
-
-
-def test_workers_that_took_the_place_of_others_are_not_counted_with_them():
-    own = peak_memory()
-    found = together({os.getpid(): 1e9, -1: 100.0, -2: 10.0, -3: 50.0}, 2)
-    assert own + 150 <= found < own + 250
 
 
 def test_costs_add_up_over_the_runs_that_share_a_stage_and_stay_where_nothing_is_left_to_do(

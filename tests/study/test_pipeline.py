@@ -4,16 +4,13 @@ End to end, the same on any number of workers, resumed after a kill, failures na
 """
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
-import xarray as xr
 from scipy.spatial.transform import Rotation
 from small import OPTIONS
 
@@ -22,7 +19,7 @@ from s4a.evaluation import accuracy
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.options import Options
 from s4a.schema import dataset
-from s4a.study import netcdf, store, tasks
+from s4a.study import store, tasks
 
 RESULTS = ("network", "latent", "registration", "pca")
 
@@ -122,21 +119,6 @@ def test_every_shape_is_synthesized_from_its_scores(study):
 
 def test_two_workers_give_the_bits_of_one(brains, study):
     assert_same(analyse(brains, **OPTIONS | {"n_jobs": 2}), study)
-
-
-def test_a_process_keeps_the_template_until_its_file_is_another(brains, study_folder, tmp_path):
-    folder = shutil.copytree(study_folder, tmp_path / "study")
-    name = brains["truth"]["shape"].values[0].item()
-    options = Options(k=OPTIONS["k"])
-    kept = tasks.template_of(folder, name, options)
-    assert tasks.template_of(folder, name, options) is kept
-    assert tasks.template_of(folder, name, replace(options, n_projected=10)) is not kept
-    coarse = netcdf.read(folder / f"coarse/{name}.nc")
-    store.write(coarse, folder / f"coarse/{name}.nc", "another", [])
-    other = tasks.template_of(folder, name, options)
-    assert other is not kept
-    assert list(tasks.last_template.values()) == [other]
-    tasks.last_template.clear()
 
 
 def test_labels_and_landmarks_stay_with_the_shapes(brains, study):
@@ -294,17 +276,6 @@ def test_bad_shapes_are_left_out_and_reported(brain_files, tmp_path):
     assert set(tree["original"].children) == {p.stem for p in brain_files}
 
 
-def test_a_bad_mesh_in_memory_is_left_out_too(arrays):
-    X, T = arrays["brain_01"]
-    bad = {"out_of_range": (X, T + 99), "nothing": (X, T[:0])}
-    tree = analyse({**dict(list(arrays.items())[:3]), **bad}, **OPTIONS)
-    report = tree["report"].to_dataset()
-    assert report["shape"].values[report["status"].values == "excluded"].tolist() == [
-        "nothing",
-        "out_of_range",
-    ]
-
-
 def test_two_shapes_have_no_modes_and_the_study_says_why(arrays):
     tree = analyse(dict(list(arrays.items())[:2]), **OPTIONS)
     assert "pca" not in tree
@@ -424,23 +395,6 @@ def test_names_that_would_nest_are_refused(arrays):
     X, T = arrays["brain_01"]
     with pytest.raises(ValueError, match=r"and -, at most 100 of them; found \['a/b'\]"):
         analyse({"a/b": (X, T), "c": (X, T)}, **OPTIONS)
-
-
-def test_a_mesh_without_triangles_is_refused_by_name(brains):
-    mesh = brains["original/brain_01"].to_dataset()
-    with pytest.raises(ValueError, match="shape a needs the variables position, corner_vertex"):
-        analyse({"a": mesh[["position"]], "b": mesh}, **OPTIONS)
-
-
-def test_a_tree_without_shapes_is_refused(brains):
-    with pytest.raises(ValueError, match="node /original"):
-        analyse(xr.DataTree(), **OPTIONS)
-
-
-def test_numpy_integers_are_integers(arrays, tmp_path):
-    two = dict(list(arrays.items())[:2])
-    with analyse(two, store=tmp_path, **OPTIONS | {"k": np.int64(12), "seed": np.int32(0)}) as tree:
-        assert tree["network"].sizes["mode_source"] == 12
 
 
 def test_a_second_run_in_the_same_folder_is_refused(brains, study_folder):

@@ -11,18 +11,10 @@ import s4a
 from s4a.analysis import transfer
 from s4a.cli import main
 from s4a.options import PRESETS, Options
-from s4a.study.netcdf import attributes, read
-from s4a.study.store import write
 
 PAPER, FAST = PRESETS["paper"], PRESETS["fast"]
 DEFAULTS = {name: PRESETS[None][name] for name in PAPER}
 PAIR = {name: OPTIONS[name] for name in ("n_coarse", "k_init", "k")}
-NEW = (
-    "registered_match_low",
-    "displacement_coefficient",
-    "icp_rotation",
-    "icp_translation",
-)
 
 
 @pytest.fixture(scope="module")
@@ -79,12 +71,6 @@ def test_an_option_that_the_preset_fixes_is_refused_by_name(name, meshes):
             s4a.register_pairs(source, {"a": target}, preset="paper", **{name: DEFAULTS[name]})
 
 
-def test_a_pair_has_no_options_of_a_collection(meshes):
-    source, target, *_ = meshes.values()
-    with pytest.raises(TypeError, match="unexpected option n_pairs of a pair; there are preset"):
-        s4a.match_pair(source, target, n_pairs=3)
-
-
 def test_pairs_of_the_paper_are_matched_one_way_after_icp_alone(three):
     (name, template), (other, shape), _ = three.items()
     study = s4a.register_pairs(template, {other: shape}, name=name, preset="paper", **PAIR)
@@ -118,19 +104,6 @@ def test_rounds_are_opened_and_go_when_they_are_not_asked_for(three, paper, tmp_
     with s4a.analyse(three, store=again, preset="paper", close_holes=True, **OPTIONS) as study:
         assert "rounds" not in study.children
     assert not list(again.glob("rounds/*"))
-
-
-def test_a_study_of_before_opens_and_takes_new_shapes(study_folder, meshes, tmp_path):
-    old = shutil.copytree(study_folder, tmp_path / "old")
-    for path in old.glob("registration/*.nc"):
-        said = attributes(path)
-        data = read(path).drop_vars(NEW)
-        write(data, path, said["task_key"], said["made_from"].split())
-    with s4a.open_study(old) as study:
-        assert not set(NEW) & set(study["registration"].data_vars)
-        assert study["registration"].sizes["shape"] == 4
-        new = s4a.insert(study, {"new": meshes["brain_01"]}, compare=False)
-    assert new["registration"].sizes["shape"] == 1
 
 
 def test_a_new_shape_is_cleaned_and_registered_by_the_options_of_the_study(paper, meshes):
@@ -221,18 +194,6 @@ def test_votes_for_labels_spread_unless_the_study_or_its_pairs_are_of_the_paper(
 
 
 @pytest.mark.parametrize("what", ["labels", "scalars", "landmarks"])
-def test_every_transfer_takes_a_preset_in_the_place_of_the_options_of_a_study(
-    what, study, meshes, seen
-):
-    external = meshes["brain_04"]
-    carry = transfers(external)[what]
-    carry(study, source=external, targets=["brain_01"], preset="paper", k=20)
-    assert len(seen) == 1  # one way
-    assert {name: getattr(seen[0], name) for name in PAPER} == PAPER
-    assert (seen[0].k, seen[0].n_coarse) == (20, OPTIONS["n_coarse"])
-
-
-@pytest.mark.parametrize("what", ["labels", "scalars", "landmarks"])
 def test_a_transfer_refuses_by_name_what_its_preset_fixes(what, study, paper, meshes, seen):
     external = meshes["brain_04"]
     carry = transfers(external)[what]
@@ -302,20 +263,3 @@ def test_the_commands_take_the_preset_between_files_and_to_a_study(
     assert "preset 'paper' sets sharpen=0; found sharpen=1" in capsys.readouterr().err
     assert main(["compare", source, target, "--preset", "paper", "--methods", "registered"]) == 2
     assert "preset 'paper' has the methods kNN, ZO, FMAP+ZO" in capsys.readouterr().err
-
-
-def test_table_2_with_the_preset_has_the_first_maps_of_landmarks(brains, monkeypatch):
-    seen = []
-    fit = s4a.compare.map_after_motion
-
-    def watched(*arguments, **options):
-        seen.append(options["init"])
-        return fit(*arguments, **options)
-
-    monkeypatch.setattr(s4a.compare, "map_after_motion", watched)
-    small = {"n_coarse": 200, "k_init": 8, "k": 12, "n_pairs": 3, "methods": ["RE-MATCH"]}
-    found = s4a.compare.collection(brains, preset="paper", **small)
-    assert set(seen) == {"landmarks"}
-    assert found["collection_chamfer"].notnull().sum() == 2 * 3
-    with pytest.raises(ValueError, match="preset 'paper' sets wide=0; found wide=4"):
-        s4a.compare.collection(brains, preset="paper", wide=4, **small)
