@@ -95,6 +95,7 @@ def add_parameter(
 ) -> None:
     """The flag, or the argument, of one parameter of a function."""
     is_set = one.default is not one.empty
+    told: dict[str, Any]
     told, many = kind_of(one.annotation)
     if is_set and one.default and text and "default" not in text:
         text = f"{text.removesuffix('.')} (default: {one.default})"

@@ -35,7 +35,7 @@ def test_on_this_machine_nothing_is_lacking_and_nothing_is_left_behind(tmp_path,
 
 def test_what_is_lacking_makes_the_exit_code_1(monkeypatch, capsys):
     lacking = [Finding("a", "lacks", "broken", "mend a"), Finding("b", "note", "odd")]
-    monkeypatch.setattr(doctor, "examine", lambda folder: lacking)
+    monkeypatch.setattr("s4a.cli.commands.examine", lambda folder: lacking)
     assert cli.main(["doctor"]) == 1
     said = capsys.readouterr().out
     assert "-> mend a" in said
