@@ -468,7 +468,7 @@ def insert(
     tree = s4a.open_study(study)
     inserted = s4a.insert(tree, shapes, landmarks=landmarks, reflect=reflect, n_jobs=n_jobs)
     folder = new_folder(out)
-    inserted.to_netcdf(folder / "inserted.nc", engine=s4a.study.store.ENGINE)
+    s4a.study.store.write(inserted, folder / "inserted.nc")
     s4a.write_registered(inserted, folder)
     write(tables.inserted_table(inserted), "")
     write(f"written: {folder / 'inserted.nc'}, registered meshes and scores in {folder}")
@@ -653,7 +653,7 @@ def compare(
         blocks = tables.block_table(names, found["block"].values.tolist(), seconds)
         text = f"{tables.comparison_table(found)}\n\n{blocks}"
     folder = new_folder(out)
-    result.to_netcdf(folder / "compare.nc", engine=s4a.study.store.ENGINE)
+    result.to_netcdf(folder / "compare.nc", engine="h5netcdf")
     figure = s4a.show.charts.stacked(names, result.coords["block"].values.tolist(), seconds)
     figure.savefig(folder / "compare.png", dpi=150)
     write(
