@@ -75,7 +75,7 @@ def run(
     """
     full = within(out, "report.txt")
     with on_cluster(cluster), lines_or_bars():
-        study = s4a.analyse(paths, store=out, **options)
+        study = s4a.analyse([*paths], store=out, **options)
     again = shlex.join(["s4a", *(word for word in words if word != "--keep-doubtful")])
     report = study["report"].to_dataset()
     lines = [tables.report_table(report), *tables.cost_lines(report)]

@@ -105,7 +105,7 @@ def add_parameter(
     elif "choices" not in told:
         told["metavar"] = metavar
     if one.kind is one.KEYWORD_ONLY:
-        more = {"nargs": "+"} if many else {}
+        more: dict[str, Any] = {"nargs": "+"} if many else {}
         more |= {"default": one.default} if is_set else {"required": True}
         add(f"--{one.name.replace('_', '-')}", **told, **more)
     else:

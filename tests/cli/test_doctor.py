@@ -59,8 +59,8 @@ def test_a_broken_pymeshlab_is_no_more_than_a_note_on_wrapping(other_modules, so
 
 
 def test_without_pymeshlab_its_extra_is_named(monkeypatch):
-    there = doctor.installed
-    monkeypatch.setattr(doctor, "installed", lambda name: name != "pymeshlab" and there(name))
+    there = doctor.version_of
+    monkeypatch.setattr(doctor, "version_of", lambda n: "" if n == "pymeshlab" else there(n))
     found = of(list(doctor.extras()), "for --wrap")
     assert (found.state, found.do) == ("note", "pip install 's4a[wrap]'")
 
