@@ -32,7 +32,7 @@ COUNTS = [
     *"file_vertices file_triangles components holes genus self_intersections".split(),
 ]
 TEXTS = ("status", "reason", "warning", "doubtful_kinds", "warning_kinds", "path")
-AREAS = ("area", "area_dropped")
+_AREAS = ("area", "area_dropped")
 
 
 def read_shape(
@@ -271,7 +271,7 @@ def shape_report(
         key: [shown(row.get(key, "")) for row in rows] for key in TEXTS
     }
     columns |= {key: np.array([row.get(key, -1) for row in rows], np.int64) for key in COUNTS}
-    columns |= {key: [float(row.get(key, np.nan)) for row in rows] for key in AREAS}
+    columns |= {key: [float(row.get(key, np.nan)) for row in rows] for key in _AREAS}
     report = dataset({"remarks": "\n".join(remarks)}, **columns)
     return report.assign_coords(shape=list(attrs))
 

@@ -17,7 +17,7 @@ from s4a.schema import covariate
 log = logging.getLogger(__name__)
 
 MISSING = ("", "-", "na", "n/a", "nan", "#n/a", "null")  # cells without a value, in lower case
-PERSON = re.compile(r"(subject|participant|patient|person)([ _-]?(id|nr|no))?", re.IGNORECASE)
+_PERSON = re.compile(r"(subject|participant|patient|person)([ _-]?(id|nr|no))?", re.IGNORECASE)
 
 
 def _head_and_rows(path):
@@ -101,7 +101,7 @@ def read_table(path: Path | str, names: list[str]) -> xr.Dataset:
             )
         if odd := odd_cells(values.tolist()) if values.dtype.kind == "U" else []:
             log.warning("%s: the column %r %s", path, name, odd_words(odd, names, values))
-        if PERSON.fullmatch(name):
+        if _PERSON.fullmatch(name):
             _tell_repeated(path, name, values, names)
     return subjects(columns, names, str(path))
 

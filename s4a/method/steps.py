@@ -21,23 +21,23 @@ from s4a.method.shape import Basis, Shape
 from s4a.options import DECLARED, N_SPREAD, check, kept_options
 from s4a.schema import check_count, dataset, require
 
-PROJECTION = [name for name, one in DECLARED.items() if one.metadata["of"] == "projection"]
-REGISTRATION = [
+_PROJECTION = [name for name, one in DECLARED.items() if one.metadata["of"] == "projection"]
+_REGISTRATION = [
     *(name for name, one in DECLARED.items() if one.metadata["of"] == "registration"),
     "how",
-    *PROJECTION,
+    *_PROJECTION,
 ]
-LOW = ("position", "corner_vertex", "vertex_area", "eigenvalue", "eigenfunction")
+_LOW = ("position", "corner_vertex", "vertex_area", "eigenvalue", "eigenfunction")
 
 
 def bases_of(coarse: dict[str, xr.Dataset]) -> dict[str, Basis]:
     """The low-resolution meshes of a collection in their frames; ValueError where one is none."""
     for name, mesh in coarse.items():
-        require(mesh, *LOW, what=f"coarse mesh {name}")
+        require(mesh, *_LOW, what=f"coarse mesh {name}")
     return {name: Shape(coarse=mesh).low for name, mesh in coarse.items()}
 
 
-class LowBases(Sequence[Basis]):
+class _LowBases(Sequence[Basis]):
     """The low-resolution meshes of a collection in their frames, each made when it is asked for.
 
     Of meshes in files no more are in memory than are used at a time.
@@ -298,8 +298,8 @@ def refine_network(
         raise ValueError(f"n_latent must be at most k = {k}; found {n_latent}")
     require(first, "source", "target", "fmap_initial", what="network")
     for name, mesh in coarse.items():
-        require(mesh, *LOW, what=f"coarse mesh {name}")
-    bases, names = LowBases(coarse), list(coarse)
+        require(mesh, *_LOW, what=f"coarse mesh {name}")
+    bases, names = _LowBases(coarse), list(coarse)
     k = min([k, *(mesh.sizes["mode"] for mesh in coarse.values())])
     source = np.array([names.index(name) for name in first["source"].values])
     target = np.array([names.index(name) for name in first["target"].values])
@@ -349,7 +349,7 @@ def refine_network(
     )
 
 
-def shape_in(study: xr.DataTree, name: str, **projection: Any) -> Shape:
+def _shape_in(study: xr.DataTree, name: str, **projection: Any) -> Shape:
     """A shape of a study at both resolutions; ValueError where the study has none of that name.
 
     Its fields are projected as `projection` says, see :class:`s4a.method.shape.Shape`.
@@ -362,9 +362,9 @@ def shape_in(study: xr.DataTree, name: str, **projection: Any) -> Shape:
     return Shape(original, coarse, **projection)
 
 
-def options_of_registration(study: xr.DataTree) -> dict[str, Any]:
+def _options_of_registration(study: xr.DataTree) -> dict[str, Any]:
     """The options that registrations of a study were made with, as far as its report names them."""
-    return {name: v for name, v in kept_options(study).items() if name in REGISTRATION}
+    return {name: v for name, v in kept_options(study).items() if name in _REGISTRATION}
 
 
 def template_of(study: xr.DataTree) -> str:
@@ -389,7 +389,7 @@ def aligned(study: xr.DataTree, source: str, target: str) -> Motion | None:
             motion = placed["icp_rotation"].values, placed["icp_translation"].values
         else:
             reference = network.attrs["reference"]
-            motion = motion_onto(shape_in(study, name).low, shape_in(study, reference).low)
+            motion = motion_onto(_shape_in(study, name).low, _shape_in(study, reference).low)
         motions.append(motion)
     return motion_between(*motions)
 
@@ -448,7 +448,7 @@ def latent_match(
     >>> match.sizes["vertex"] == study["original/brain_02"].sizes["vertex"]
     True
     """
-    shapes = shape_in(study, source), shape_in(study, target)
+    shapes = _shape_in(study, source), _shape_in(study, target)
     match, functions = match_low(*shapes, latent_bases(study, source, target), how=how)
     if full:
         match, *_ = match_functions(*shapes, *functions)
@@ -543,22 +543,22 @@ def register_shape(
     >>> s4a.register_shape(study, "brain_02")["displacement"].dims
     ('vertex', 'xyz')
     """
-    wrong = [option for option in options if option not in REGISTRATION]
+    wrong = [option for option in options if option not in _REGISTRATION]
     if wrong:
         raise TypeError(
             f"unexpected options {', '.join(wrong)}; those of a registration are "
-            f"{', '.join(REGISTRATION)}"
+            f"{', '.join(_REGISTRATION)}"
         )
     given = {key: value for key, value in (options | {"how": how}).items() if value is not None}
-    options = options_of_registration(study) | given
+    options = _options_of_registration(study) | given
     for option in options.keys() & {"refine", "alignment", "how"}:
         check(option, options[option])
-    projection = {key: options.pop(key) for key in PROJECTION if key in options}
+    projection = {key: options.pop(key) for key in _PROJECTION if key in options}
     template = template_of(study) if template is None else template
-    target = shape_in(study, template, **projection)
+    target = _shape_in(study, template, **projection)
     if name == template:
         return identity(target)
-    source = shape_in(study, name, **projection)
+    source = _shape_in(study, name, **projection)
     bases = latent_bases(study, name, template)
     M = source.low
     N = target.low
