@@ -28,9 +28,7 @@ from s4a.seeds import RNG, seed_of
 from s4a.study.pipeline import analyse
 
 
-def _soil(
-    X: np.ndarray, T: np.ndarray, u: np.ndarray, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _soil(X, T, u, rng):
     """A clean mesh made as dirty as a file from a scanner.
 
     4 loose components of 12 to 60 vertices; 3 holes of 10 to 60 triangles; one bow-tie vertex for
@@ -512,14 +510,7 @@ def _annotate(mesh, truth, shape, reference_point):
     return in_unit(mesh.merge(extra).assign_attrs(unit="mm", coordinate_system="RAS"), "mm")
 
 
-def _raw_brain(
-    truth: xr.Dataset | xr.DataTree,
-    shape: str,
-    n_vertices: int = 40_000,
-    seed: int = 0,
-    *,
-    rng: RNG | None = None,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _raw_brain(truth, shape, n_vertices=40_000, seed=0, *, rng=None):
     """A brain with the artefacts of ``_soil``, as it could lie in a file.
 
     Parameters

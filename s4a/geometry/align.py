@@ -283,9 +283,7 @@ def residual_of(end: End) -> float:
     return end[2]
 
 
-def _try_tilts(
-    source: Cloud, target: Cloud, start: End, *, degrees: float = 15.0, **options: Any
-) -> End:
+def _try_tilts(source, target, start, *, degrees=15.0, **options):
     """ICP again from its end tilted about each axis of the target, as long as that ends nearer.
 
     ICP alone ends wherever no pair changes: on folded surfaces up to 20 degrees from the best

@@ -186,7 +186,7 @@ def closest_point_on_triangles(P: Array, A: Array, B: Array, C: Array) -> Array:
     return np.stack([np.maximum(1 - v - w, 0), v, w], axis=1)
 
 
-def _closest_by_sides(ab: Array, ac: Array, ap: Array) -> tuple[Array, Array]:
+def _closest_by_sides(ab, ac, ap):
     """Weights ``(n,)`` of B and C in the closest point of :func:`closest_point_on_triangles`.
 
     Parameters
@@ -223,7 +223,7 @@ def _closest_by_sides(ab: Array, ac: Array, ap: Array) -> tuple[Array, Array]:
     return v, w
 
 
-def _closest_on_sides(ab: Array, ac: Array, ap: Array) -> tuple[Array, Array]:
+def _closest_on_sides(ab, ac, ap):
     """``_closest_by_sides`` of degenerate triangles: the nearest point of the three sides."""
     bc, zero = ac - ab, np.zeros(len(ab))
     t = ratio(dots(bc, ap - ab), dots(bc, bc))

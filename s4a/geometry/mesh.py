@@ -150,7 +150,7 @@ def unique_edges(T: Array, n: int | None = None) -> tuple[Array, Array, Array]:
     return E, edge_of, np.diff(head, append=m)
 
 
-def _check_numbers(key: Array, n: int) -> None:
+def _check_numbers(key, n):
     """IndexError unless all are numbers from 0 to n - 1."""
     if len(key) and not 0 <= key.min() <= key.max() < n:
         raise IndexError(f"numbers from 0 to {n - 1} needed, found {key.min()} to {key.max()}")

@@ -194,7 +194,7 @@ def faults(graph: _MeshGraph, cell: Array, n: int, among: Array | None = None) -
     return Faults(bad | lone, pair, edge[across], row, triangle[corner[_is_repeated(C, n)]])
 
 
-def _faulty_cells(T: Array, ends: Array, is_open: Array, cell: Array, among: Array) -> Array:
+def _faulty_cells(T, ends, is_open, cell, among):
     """Which cells have no rim, several rims, or several stretches of boundary ``(n,)``.
 
     Handles and holes inside a single rim do no harm: they vanish with the cell.  `ends` are the
@@ -212,9 +212,7 @@ def _faulty_cells(T: Array, ends: Array, is_open: Array, cell: Array, among: Arr
     return (suspect & (np.bincount(owner, minlength=n) != 1)) | (among & (stretch_ends > 2))
 
 
-def _faulty_borders(
-    ends: Array, is_open: Array, C: Array, among: Array
-) -> tuple[Array, Array, Array]:
+def _faulty_borders(ends, is_open, C, among):
     """Pairs of cells ``(p, 2)`` whose border is not one strip, edges across, and their rows.
 
     A strip of edges ends at a corner or at an open edge; a border in one piece has two such ends.
@@ -232,7 +230,7 @@ def _faulty_borders(
     return np.stack(np.divmod(key[bad], n), axis=1), across[at], row[border[at]]
 
 
-def _is_repeated(C: Array, n: int) -> Array:
+def _is_repeated(C, n):
     """Which corners ``(c, 3)`` are of three cells that meet more than once."""
     key = np.sort(C, axis=1) @ [n * n, n, 1]
     _, triple, count = np.unique(key, return_inverse=True, return_counts=True)
@@ -357,7 +355,7 @@ def cut_handles(X: Array, T: Array, removed: Array, crumb: float) -> tuple[Array
     return _close_with_fans(X, T[~removed], directed_edges(T)[opened])
 
 
-def _cuts_apart(T: Array, gone: Array, part: Array) -> Array:
+def _cuts_apart(T, gone, part):
     """Triangles ``(m,)`` at holes of the triangles `gone` that touch several parts that stay."""
     hole = components(directed_edges(T[gone]), len(part))
     vertex = np.unique(T[gone])
@@ -366,7 +364,7 @@ def _cuts_apart(T: Array, gone: Array, part: Array) -> Array:
     return (np.bincount(touching[:, 0], minlength=len(part)) > 1)[hole[T[:, 0]]]
 
 
-def _close_with_fans(X: Array, T: Array, half: Array) -> tuple[Array, Array, Array]:
+def _close_with_fans(X, T, half):
     """The mesh with every loop of the open half-edges ``(h, 2)`` closed by a fan."""
     n = len(X)
     corner, link = np.unique(half, return_inverse=True)

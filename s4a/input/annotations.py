@@ -197,7 +197,7 @@ def table_rows(text: str) -> dict[int, list[str]]:
     return rows
 
 
-def _check_cells(rows: dict[int, list[str]], n: int, least: int) -> None:
+def _check_cells(rows, n, least):
     """ValueError unless every row has from `least` to `n` cells; more, where those are empty."""
     for line, row in rows.items():
         if len(row) < least or any(row[n:]):
@@ -207,7 +207,7 @@ def _check_cells(rows: dict[int, list[str]], n: int, least: int) -> None:
             )
 
 
-def _number_of(cell: str, line: int) -> float:
+def _number_of(cell, line):
     """The number in a cell; ValueError with its line where there is none."""
     if not is_number(cell):
         raise ValueError(f"line {line} needs a number where it has {cell[:40]!r}")
@@ -255,7 +255,7 @@ def _cells(rows, at, has_head):
     return {lines[i]: rows[lines[i]][at] for i in (range(len(lines)) if order is None else order)}
 
 
-def _order_of_vertices(head: list[str], rows: dict[int, list[str]]) -> np.ndarray | None:
+def _order_of_vertices(head, rows):
     """The rows of a table in the order of its column ``vertex``; None where it has none.
 
     Parameters

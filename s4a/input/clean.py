@@ -4,8 +4,6 @@ What makes the triangles a manifold, edge by edge, is in :mod:`s4a.input.clean`,
 half-edges are counted.
 """
 
-from typing import Any
-
 import numpy as np
 import xarray as xr
 from scipy.spatial import cKDTree
@@ -513,7 +511,7 @@ def _vertex_of_file(group, new, file_vertex):
 _MOST_AROUND_EDGE = 16  # an edge with more triangles is cut: pairing takes their number squared
 
 
-def _manifold_mates(edge_of: np.ndarray, count: np.ndarray) -> np.ndarray:
+def _manifold_mates(edge_of, count):
     """The mate of each half-edge ``(3 m,)`` on edges with two triangles, else -1.
 
     `edge_of` and `count` are those of :func:`s4a.geometry.mesh.unique_edges`.
@@ -526,9 +524,7 @@ def _manifold_mates(edge_of: np.ndarray, count: np.ndarray) -> np.ndarray:
     return mate
 
 
-def _join_triangles(
-    P: np.ndarray, F: np.ndarray, group: np.ndarray, counts: dict[str, Any]
-) -> tuple[np.ndarray, np.ndarray]:
+def _join_triangles(P, F, group, counts):
     """Find the mates of all half-edges, and orient the triangles consistently.
 
     Returns
@@ -620,7 +616,7 @@ def _reverse(F, mate, t):
     return F, np.where(mate >= 0, moved[mate], -1)
 
 
-def _join_corners(F: np.ndarray, mate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _join_corners(F, mate):
     """Vertices as the sets of corners that mates join: one for each umbrella of triangles.
 
     A bow-tie or the end of a separated edge falls apart into several.
@@ -646,9 +642,7 @@ def _join_corners(F: np.ndarray, mate: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return rank.take(label).reshape(3, m).T, file_vertex[order]
 
 
-def _split_double_edges(
-    X: np.ndarray, V: np.ndarray, file_vertex: np.ndarray, mate: np.ndarray, counts: dict[str, Any]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _split_double_edges(X, V, file_vertex, mate, counts):
     """Give each of two sheets its own midpoint where they share both ends of an edge.
 
     Returns

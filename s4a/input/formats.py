@@ -72,7 +72,7 @@ def fans(corners: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     return corners[np.stack([first, first + step + 1, first + step + 2], axis=1)]
 
 
-def _number_type(name: str | None, order: str) -> np.dtype:
+def _number_type(name, order):
     """The dtype that an XML file names: Float32, or NIFTI_TYPE_UINT8; order is ``<`` or ``>``."""
     known = re.fullmatch(r"(?:NIFTI_TYPE_)?(u?int(8|16|32|64)|float(32|64))", name or "", re.I)
     if not known:
@@ -83,7 +83,7 @@ def _number_type(name: str | None, order: str) -> np.dtype:
 # legacy files
 
 
-def _parse_vtk(data: bytes) -> tuple[np.ndarray, np.ndarray, dict[str, str]]:
+def _parse_vtk(data):
     """Points, triangles and attributes of a legacy file with ``DATASET POLYDATA``."""
     file = _Legacy(data)
     if [word.upper() for word in file.line()] != [b"DATASET", b"POLYDATA"]:
@@ -256,7 +256,7 @@ def _data_array(name, values):
     )
 
 
-def _parse_vtp(data: bytes) -> tuple[np.ndarray, np.ndarray, dict[str, str]]:
+def _parse_vtp(data):
     """Points, triangles and attributes of an XML file in any encoding, compressed or not."""
     file = _Xml(data)
     points, triangles, n_before = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], 0
@@ -416,7 +416,7 @@ def format_of(data: bytes) -> str:
     raise ValueError(f"one of {', '.join(FORMATS)} expected, found {what}")
 
 
-def _whole(values: np.ndarray) -> np.ndarray:
+def _whole(values):
     """Indices as integers; those of an ascii PLY are floats."""
     if values.dtype.kind != "f":
         return values.astype(np.int64)
@@ -546,7 +546,7 @@ def _ply_rows(body, at, name, count, properties):
 
 def _ply_row(body, at, properties):
     """(name, type, begin, length or None) of all in the row at `at`, None if cut; and its end."""
-    parts = []
+    parts: list[Any] = []
     for key, types in properties:
         begin, at = at, at + types[0].itemsize
         if at > len(body):

@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 from scipy.spatial import cKDTree
 
-from s4a.geometry.align import Cloud, End, cloud, icp_each, principal_axes, residual_of
+from s4a.geometry.align import Cloud, cloud, icp_each, principal_axes, residual_of
 from s4a.geometry.crossing import can_count, count_crossing
 from s4a.geometry.mesh import (
     as_arrays,
@@ -136,7 +136,7 @@ def lattice_step(X: np.ndarray) -> float:
     return min(steps)
 
 
-def _in_numbers(portraits: list[xr.Dataset]) -> np.ndarray:
+def _in_numbers(portraits):
     """Logarithms of area, compactness and the three moments of shapes (n, 5)."""
     rows = [
         [one.attrs["surface"], one.attrs["compactness"], *one["moment"].values] for one in portraits
@@ -293,7 +293,7 @@ def view(sketch: xr.Dataset, flip: np.ndarray | float = 1.0) -> View:
     return View(whole, rough, axes, sketch["sketch_normal"].values * flip)
 
 
-def _best_pose(shape: View, reference: View) -> End:
+def _best_pose(shape, reference):
     """ICP of a shape onto a reference, from eight turns: as it is, by its axes, half turns of both.
 
     Returns
@@ -631,7 +631,7 @@ class Decision(NamedTuple):
     remedy: str
 
 
-def _by_kind(kinds: dict[str, str]) -> list[Decision]:
+def _by_kind(kinds):
     """One decision for each kind, that of most shapes first; `kinds` of a shape are words."""
     names: dict[str, list[str]] = {}
     for name, words in kinds.items():

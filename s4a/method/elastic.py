@@ -110,9 +110,7 @@ def nearest_on_surface(
     return points, unit(normals)
 
 
-def _points_ahead(
-    source: Basis, target: Basis, X: Array, vertices: Rows = _ALL
-) -> tuple[Array, Array]:
+def _points_ahead(source, target, X, vertices=_ALL):
     """Where the target's vertices at X are drawn, and the directions across both surfaces there.
 
     All n of them, or some.
@@ -212,13 +210,13 @@ def normal_equations(
     return matrix, right.T.ravel()
 
 
-def _spread_area(target: Basis, spread: Array) -> Array:
+def _spread_area(target, spread):
     """The area ``(s,)`` of the vertices nearest to each of some that are spread over a surface."""
     nearest = cKDTree(target.X[spread]).query(target.X)[1]
     return np.bincount(nearest, target.area, len(spread))
 
 
-def _unmixed(E: Array, area: Array) -> Array:
+def _unmixed(E, area):
     """B ``(q, q)`` for which E B has the vertices at the start without their smooth part.
 
     Smooth functions and the start, three columns of E before its last, nearly depend on each other,

@@ -215,7 +215,7 @@ def best_first_map(
     return min(tried, key=lambda one: one[0])[1:]
 
 
-def _map_of_landmarks(source: Basis, target: Basis, k: int) -> list[tuple[str, Array, Array]]:
+def _map_of_landmarks(source, target, k):
     """Name, first map and its fit ``(k, k)`` of wave kernels and landmarks, if both have three."""
     landmarks = corresponding_landmarks(source, target)
     if len(landmarks[0]) < 3:
@@ -298,7 +298,7 @@ def paired_extremities(source: Basis, target: Basis) -> list[tuple[Array, Array]
     return list(ways.values())[:N_PAIRED]
 
 
-def _have_signatures(source: Basis, target: Basis, k: int) -> bool:
+def _have_signatures(source, target, k):
     """Whether the first k eigenvalues of both, less those of 0, have a range in common.
 
     Those of a surface in many pieces may be 0 all.

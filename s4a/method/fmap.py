@@ -377,7 +377,7 @@ def fit(
     return C
 
 
-def _commutator(source: Array, target: Array) -> Array:
+def _commutator(source, target):
     """(mu_i - lambda_j)^2 / lambda_max^2 ``(k_target, k_source)``, small where C may be large.
 
     Weighted by it, the squared entries of C say how far C is from commuting with the Laplacians.
@@ -385,7 +385,7 @@ def _commutator(source: Array, target: Array) -> Array:
     return ((target[:, None] - source) / max(source[-1], target[-1])) ** 2
 
 
-def _constant_to_constant(source: Basis, target: Basis) -> float:
+def _constant_to_constant(source, target):
     """C[0, 0] of a map that takes constants to constants: the product of their signs."""
     return np.sign(source.Phi[0, 0] * target.Phi[0, 0])
 

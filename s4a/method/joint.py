@@ -217,7 +217,7 @@ def registration_score(
     return float(trip.mean() + gap.mean() + back_gap.mean() + _landmark_gap(source, target, X))
 
 
-def _landmark_gap(source: Basis, target: Basis, X: Array) -> float:
+def _landmark_gap(source, target, X):
     """Mean distance of the landmarks that both have, the target's vertices at X; 0 without any."""
     at_source, at_target = corresponding_landmarks(source, target)
     if len(at_source) == 0:

@@ -122,7 +122,7 @@ def consistency_form(
     return apply
 
 
-def _spanning_start(C: Array, source: Array, target: Array, n: int) -> Array:
+def _spanning_start(C, source, target, n):
     """The first guess of all Y ``(n, k, k)``: maps composed along a tree.
 
     Its root, where Y is the identity, is the shape from which most maps start.
@@ -184,7 +184,7 @@ def smallest_eigenvectors(
     return V[:, :m]
 
 
-def _chebyshev_filter(apply: _Form, V: Array, least: float, cut: float, top: float) -> Array:
+def _chebyshev_filter(apply, V, least, cut, top):
     """T(L) V, with T the Chebyshev polynomial that is small on [cut, top] and 1 at `least`.
 
     Of degree d it damps by about cosh(2 d sqrt(cut / top)): by ten with the degree taken here.
@@ -376,7 +376,7 @@ class _Sampled(NamedTuple):
     n: int  # vertices of the shape
 
 
-def _check_samples(sampled: list[_Sampled], k: int) -> None:
+def _check_samples(sampled, k):
     """ValueError where a shape has samples, not all its vertices, too few for k functions."""
     least = PER_FUNCTION * k
     fewest = min((len(one.at) for one in sampled if len(one.at) < one.n), default=least)
@@ -401,15 +401,7 @@ def sample(basis: Basis, vertex: Array | None, k: int, n_around: int) -> _Sample
     return _Sampled(eigenvalue, vertex, Phi, area, around, len(basis.area))
 
 
-def _larger_maps(
-    sampled: list[_Sampled],
-    Y: Array,
-    source: Array,
-    target: Array,
-    k: int,
-    bases: Sequence[Basis] | None,
-    n_jobs: int | None = 1,
-) -> Array:
+def _larger_maps(sampled, Y, source, target, k, bases, n_jobs=1):
     """Maps ``(p, k, k)`` from the matches of latent functions (eq. 3), one step of ZoomOut each.
 
     Parameters
@@ -453,9 +445,7 @@ def _larger_maps(
     return C
 
 
-def _sample_matches(
-    sampled: list[_Sampled], Y: Array, source: Array, target: Array, n_jobs: int | None = 1
-) -> list[Array]:
+def _sample_matches(sampled, Y, source, target, n_jobs=1):
     """For every map, the source's sample that is nearest to each of the target's (eq. 3).
 
     Maps there and back between two shapes take one matrix product.
@@ -511,16 +501,7 @@ def frozen_basis(C_out: Array, C_in: Array, Y: Array) -> Array:
     return np.linalg.solve(left, right)
 
 
-def _latent_basis_of_new(
-    new: Basis,
-    others: list[Basis],
-    Y: Array,
-    C: list[Array],
-    *,
-    step: int = 5,
-    n_spread: int = N_SPREAD,
-    rounds: int = 2,
-) -> Array:
+def _latent_basis_of_new(new, others, Y, C, *, step=5, n_spread=N_SPREAD, rounds=2):
     """Latent basis of a new shape, those of all others frozen: Consistent ZoomOut of one shape.
 
     It starts from the first maps of the others; in every round the rows of the first latent

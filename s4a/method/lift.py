@@ -54,15 +54,7 @@ def smooth(
     return B
 
 
-def _inverse_step(
-    W: sp.csr_matrix,
-    area: Array,
-    U: sp.csr_matrix,
-    W_coarse: sp.csr_matrix,
-    area_coarse: Array,
-    Phi: Array,
-    eigenvalue: Array,
-) -> Array:
+def _inverse_step(W, area, U, W_coarse, area_coarse, Phi, eigenvalue):
     r"""One cycle of two grids for W B = A (U Phi) Lambda, from B = U Phi.
 
     ::
@@ -100,7 +92,7 @@ def _inverse_step(
     return smooth(S, R, B)
 
 
-def _rayleigh_ritz(W: sp.csr_matrix, area: Array, B: Array, k: int) -> tuple[Array, Array]:
+def _rayleigh_ritz(W, area, B, k):
     """The k least eigenpairs in the span of B: eigenvalues ``(k,)`` and functions ``(n, k)``."""
     stiff = B.T @ (W.astype(B.dtype) @ B)
     mass = B.T @ (area.astype(B.dtype)[:, None] * B)
@@ -235,7 +227,7 @@ def low_resolution(
     return low
 
 
-def _mean_over_cells(shape: Shape, values: Array) -> Array:
+def _mean_over_cells(shape, values):
     """Means of a field ``(n,)`` by the weights of U ``(n_coarse,)``; NaN where none is known."""
     known = np.isfinite(values)
     area = np.where(known, vertex_areas(*as_arrays(shape.original)), 0)

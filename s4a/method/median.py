@@ -45,7 +45,7 @@ def inverse(latent_eigenvalue: Array, power: float = 1.0) -> Array:
     return np.where(constant, 0.0, np.where(constant, 1.0, latent_eigenvalue) ** -power)
 
 
-def _constant_modes(latent_eigenvalue: Array) -> Array:
+def _constant_modes(latent_eigenvalue):
     """Which latent functions are constant on every component, ``(m,)``: one for each component."""
     constant = latent_eigenvalue < 1e-6 * np.max(latent_eigenvalue, initial=0.0)
     constant[:1] = True

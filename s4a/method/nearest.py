@@ -13,7 +13,6 @@ exactly these are searched too::
       '---------'                          '---------'
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,7 +72,7 @@ def as_candidates(D: Array) -> Array:
     return np.ascontiguousarray(np.column_stack([d, np.einsum("ij,ij->i", d, d) / 2]).T)
 
 
-def _scores_in_blocks(q: Array, d: Array, block: int = 256) -> Iterator[tuple[int, Array]]:
+def _scores_in_blocks(q, d, block=256):
     """The matrix product q d block by block: first row, and block; all in one array."""
     scores = np.empty((min(block, len(q)), d.shape[1]), np.float32)
     for start in range(0, len(q), block):
@@ -181,7 +180,7 @@ def into_cells(rows: Array, cell: Array) -> Cells:
     return Cells(rows, order, start, center, np.maximum.reduceat(gap, start[:-1]) * _SLACK)
 
 
-def _squared_distances(A: Array, B: Array) -> Array:
+def _squared_distances(A, B):
     """All squared distances ``(a, b)`` of float32 rows by one matrix product."""
     D = A @ B.T
     D *= -2
@@ -190,7 +189,7 @@ def _squared_distances(A: Array, B: Array) -> Array:
     return np.maximum(D, 0, out=D)
 
 
-def _least_distances(A: Array, B: Array) -> Array:
+def _least_distances(A, B):
     """Distances ``(a, b)`` of float32 rows, reduced by what rounding may have added."""
     D = _squared_distances(A, B)
     largest = np.einsum("ij,ij->i", A, A).max() + np.einsum("ij,ij->i", B, B).max()
@@ -198,7 +197,7 @@ def _least_distances(A: Array, B: Array) -> Array:
     return np.sqrt(np.maximum(D, 0, out=D), out=D)
 
 
-def _search_cells(queries: Array, origin: Array, cells: Cells, which: Array) -> tuple[Array, Array]:
+def _search_cells(queries, origin, cells, which):
     """The nearest row of the cells `which` for each of `queries`, all compared with all.
 
     `queries` are relative to `origin`, a point near them, and the rows are made so: then small
@@ -218,9 +217,7 @@ def _search_cells(queries: Array, origin: Array, cells: Cells, which: Array) -> 
     return D[np.arange(len(queries)), column], order[column]
 
 
-def _search_pairs(
-    queries: Array, cells: Cells, who: Array, which: Array
-) -> tuple[Array, Array, Array]:
+def _search_pairs(queries, cells, who, which):
     """Compare the query ``who[i]`` with the rows of the cell ``which[i]``; `who` is sorted.
 
     Returns
@@ -245,7 +242,7 @@ def _search_pairs(
     return who, least, np.minimum.reduceat(index, head)
 
 
-def _keep_nearer(best: Array, index: Array, who: Array, gap: Array, found: Array) -> None:
+def _keep_nearer(best, index, who, gap, found):
     """Write in place what is nearer, or as near with a lower index, for the queries `who`."""
     nearer = (gap < best[who]) | ((gap == best[who]) & (found < index[who]))
     best[who[nearer]] = gap[nearer]
@@ -359,9 +356,7 @@ def nearest_in_cells(
     return index, float(compared) / (len(Q) * len(D)), 1 - float(unsure) / len(Q)
 
 
-def _not_excluded(
-    rows: Array, origin: Array, cells: Cells, reach: Array, bound: Array
-) -> tuple[Array, Array]:
+def _not_excluded(rows, origin, cells, reach, bound):
     """Queries for which a row nearer than their `bound` is possible, and the cells it can be in.
 
     `reach` is the least distance of each cell to any query; each query's own distance to the centre

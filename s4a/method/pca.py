@@ -150,7 +150,7 @@ def low_vertices(coarse: xr.Dataset) -> Array:
     return heaviest
 
 
-def _smooth_low(d: Array, coarse: xr.Dataset, *, area_weighted: bool = True) -> Array:
+def _smooth_low(d, coarse, *, area_weighted=True):
     """Displacements at low resolution ``(s, n_coarse, 3)``, smoothed as those at full: Phi Phi^+ d.
 
     The line after eq. 8 without U, in the eigenfunctions of the coarse mesh, so that Fig. 5

@@ -169,7 +169,7 @@ def latent_functions(source: Shape, target: Shape, bases: Functions) -> Function
     return source.functions(Y_source), target.functions(Y_target)
 
 
-def _mapped_functions(source: Shape, target: Shape, match: Array, k: int) -> Functions:
+def _mapped_functions(source, target, match, k):
     """Phi C^T and Psi with the k x k map C of the match of eq. 3: the standard way's, for eq. 4."""
     Phi = source.low.Phi[:, :k]
     C = fmap_from_match(Phi, target.low.Phi[:, :k], target.low.mass, match)
@@ -372,7 +372,7 @@ class _Placed(NamedTuple):
     ratio: float
 
 
-def _motion_in_unit(source: Shape, target: Shape, motion: Motion, scale: bool) -> _Placed:
+def _motion_in_unit(source, target, motion, scale):
     """A rigid motion between the frames of two shapes as one between their files.
 
     Without `scale` each keeps its size: the motion turns the source about its centre and carries
@@ -493,7 +493,7 @@ def register_surface(
     return match, moved, attrs
 
 
-def _best_of(ends: dict[str, tuple[float, Basis]]) -> str:
+def _best_of(ends):
     """The name of the end of registration that has the lowest score."""
     return min(ends, key=lambda name: ends[name][0])
 
@@ -518,7 +518,7 @@ def mends(end: tuple[float, Basis], torn: tuple[float, Basis], target: Basis) ->
     return after < _MENDED * before
 
 
-def _scored_alone(source: Basis, target: Basis, X: Array) -> tuple[float, Basis]:
+def _scored_alone(source, target, X):
     """Score of the registered target, matched by what is nearest to it, and that target."""
     moved = target.moved_to(X)
     match = joint.nearest_vertices(source, moved)
@@ -550,7 +550,7 @@ def elastic_surfaces(
     return surfaces
 
 
-def _common_landmarks(source: Shape, target: Shape) -> Landmarks | None:
+def _common_landmarks(source, target):
     """The landmarks that both shapes have by name; None where there are none."""
     names, at_source = source.landmarks
     names_target, at_target = target.landmarks
@@ -564,9 +564,7 @@ def _common_landmarks(source: Shape, target: Shape) -> Landmarks | None:
     return Landmarks(Basis(B @ N.X, none, B @ N.area, target.low.Phi, U=B @ target.U), y)
 
 
-def _after_local_rounds(
-    source: Shape, target: Shape, warp: joint.Warp, landmarks: Landmarks | None = None
-) -> Array:
+def _after_local_rounds(source, target, warp, landmarks=None):
     """The template ``(n_target, 3)`` after a warp, by parts or not, and local rounds."""
     low = target.low_on_surface
     pull = None

@@ -127,7 +127,7 @@ def laplacian(X: Array, T: Array, area: Array) -> tuple[Array, Array, Array, str
     return E, np.bincount(edge_of, half_cotangents(X, T), len(E)), area, "cotan"
 
 
-def _sorted_mesh(X: Array, T: Array) -> tuple[Array, Array, Array]:
+def _sorted_mesh(X, T):
     """The mesh in an order of vertices and triangles that positions alone decide, and that order.
 
     The same surface gives the same coarse mesh, however its file numbers it.
@@ -142,9 +142,7 @@ def _sorted_mesh(X: Array, T: Array) -> tuple[Array, Array, Array]:
     return X[order], T[lexical_order(np.stack([T[:, 2], first_two], axis=1))], order
 
 
-def _coarse_surface(
-    X: Array, T: Array, n_coarse: int, seed: int = 0
-) -> tuple[Array, Array, Array, Array, dict[str, int]]:
+def _coarse_surface(X, T, n_coarse, seed=0):
     """Manifold dual of about `n_coarse` geodesic Voronoi cells.
 
     Returns
@@ -186,7 +184,7 @@ def _coarse_surface(
     return V[state.sample], dual(F, state.cell), origin[state.sample], cell, attrs
 
 
-def _nearest_along_edges(X: Array, T: Array, among: Array) -> Array:
+def _nearest_along_edges(X, T, among):
     """The vertex of `among` that is nearest to each vertex along edges ``(n,)``."""
     G = edge_graph(X, edges(T))
     return dijkstra(G, indices=among, min_only=True, return_predecessors=True)[2]
@@ -238,7 +236,7 @@ def silence() -> Iterator[None]:
                 os.close(copy)
 
 
-def _nearest_with_normal(X: Array, T: Array, V: Array, F: Array) -> Array:
+def _nearest_with_normal(X, T, V, F):
     """Vertex of (V, F) near each vertex of (X, T), on a side of a wall that faces the same way."""
     reach = 0.02 * np.linalg.norm(np.ptp(V, axis=0))
     tree = cKDTree(np.c_[V, reach * vertex_normals(V, F)])

@@ -119,9 +119,7 @@ def local_functions(X: Array, G: sp.csr_array, sample: Array, radius: float) -> 
     return sp.csr_matrix(sp.diags(1 / np.asarray(U.sum(axis=1)).ravel()) @ U)
 
 
-def _reduced_eigenpairs(
-    U: sp.csr_array, W: sp.csr_array, area: Array, k: int
-) -> tuple[Array, Array, sp.csc_array]:
+def _reduced_eigenpairs(U, W, area, k):
     """The k smallest eigenpairs of U^T W U phi = lambda U^T A U phi, for areas of sum 1.
 
     Returns

@@ -435,7 +435,7 @@ def features_of(mesh: xr.Dataset) -> dict[str, Array]:
     return dict(zip(names, mesh["feature_value"].values.T, strict=True))
 
 
-def _smooth_fields(coarse: xr.Dataset, low: Basis) -> dict[str, Array]:
+def _smooth_fields(coarse, low):
     """Fields that guide as the functions of a surface have them, of mean 0 and variance 1.
 
     Times their weights.  Noise from vertex to vertex would draw matches aside.  NaN counts as the

@@ -349,7 +349,7 @@ def refine_network(
     )
 
 
-def _shape_in(study: xr.DataTree, name: str, **projection: Any) -> Shape:
+def _shape_in(study, name, **projection):
     """A shape of a study at both resolutions; ValueError where the study has none of that name.
 
     Its fields are projected as `projection` says, see :class:`s4a.method.shape.Shape`.
@@ -362,7 +362,7 @@ def _shape_in(study: xr.DataTree, name: str, **projection: Any) -> Shape:
     return Shape(original, coarse, **projection)
 
 
-def _options_of_registration(study: xr.DataTree) -> dict[str, Any]:
+def _options_of_registration(study):
     """The options that registrations of a study were made with, as far as its report names them."""
     return {name: v for name, v in kept_options(study).items() if name in _REGISTRATION}
 
