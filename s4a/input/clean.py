@@ -6,6 +6,7 @@ half-edges are counted.
 
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from s4a.geometry.mesh import (
@@ -146,7 +147,8 @@ def clean_arrays(
         and ``genus`` (sum over components); and ``area`` and ``area_dropped``, the share of it in
         the dropped components.
     """
-    P, F = _validated(points, triangles, components)
+    P, F = check_arrays(points, triangles)
+    check_components(components)
     counts: dict[str, int | float] = {"file_vertices": len(P), "file_triangles": len(F)}
     counts |= dict.fromkeys(REPAIRS, 0)
     counts["unreferenced_vertices"] = len(P) - n_used(F)
@@ -209,8 +211,8 @@ def counted(n: float, text: str) -> str:
     return f"{n} {text}"
 
 
-def _validated(points, triangles, components):
-    """The arrays as float64 and int64, or ValueError."""
+def check_arrays(points: ArrayLike, triangles: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Points ``(n, 3)`` as float64 and triangles ``(m, 3)`` as int64, or ValueError."""
     P, F = np.asarray(points, np.float64), np.asarray(triangles)
     if P.ndim != 2 or P.shape[1] != 3 or F.ndim != 2 or F.shape[1] != 3 or len(F) == 0:
         raise ValueError(
@@ -224,7 +226,6 @@ def _validated(points, triangles, components):
             f"triangles need vertex indices 0..{len(P) - 1}, as there are {len(P)} vertices; "
             f"found {F.min()}..{F.max()}, {wrong} triangles out of range"
         )
-    check_components(components)
     return P, F.astype(np.int64)
 
 

@@ -10,7 +10,7 @@ import xarray as xr
 
 from s4a.geometry.mesh import as_dataset
 from s4a.input import plausibility
-from s4a.input.clean import REPAIRS, clean
+from s4a.input.clean import REPAIRS, check_arrays, clean
 from s4a.input.files import (
     LONGEST_NAME,
     Paths,
@@ -18,7 +18,7 @@ from s4a.input.files import (
     find_meshes,
     not_meshes,
     read_mesh,
-    with_long_names,
+    was_cut,
 )
 from s4a.input.labels import Label, read_volume
 from s4a.input.plausibility import examine
@@ -228,15 +228,14 @@ def remarks_on_files(
     if isinstance(paths, dict | xr.DataTree):
         return []
     what = "label volume" if volumes else "mesh"
-    others = [
+    return [
         f"{shown(file)} is not a {what} ({why}) and was passed over"
         for file, why in not_meshes(paths, pattern, volumes=volumes)
-    ]
-    shortened = [
+    ] + [
         f"{shown(file)} is called {name}: names of shapes have at most {LONGEST_NAME} letters"
-        for file, name in with_long_names(paths, pattern, volumes=volumes)
+        for file, name in find_meshes(paths, pattern, volumes=volumes)
+        if was_cut(file, name)
     ]
-    return others + shortened
 
 
 def shape_report(
@@ -304,11 +303,4 @@ def _cleaned(source, label, **options):
         return read_shape(source, label=label, **options)
     if isinstance(source, xr.Dataset):
         return in_unit(clean(source, **options), source.attrs.get("unit"))
-    points, triangles = (np.asarray(values) for values in source)
-    if triangles.dtype.kind not in "iu":
-        raise ValueError(f"triangles need integer vertex indices; found {triangles.dtype}")
-    if points.ndim != 2 or points.shape[1] != 3 or triangles.ndim != 2 or triangles.shape[1] != 3:
-        raise ValueError(
-            f"points (n, 3) and triangles (m, 3) needed, found {points.shape} and {triangles.shape}"
-        )
-    return clean(as_dataset(points, triangles), **options)
+    return clean(as_dataset(*check_arrays(*source)), **options)

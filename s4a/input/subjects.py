@@ -131,17 +131,13 @@ def read_cells(path: Path | str, names: Sequence[str]) -> dict[str, dict[str, st
 def _values(cells):
     """Integers, floats or strings, whatever all cells are."""
     known = [c for c in cells if not is_missing(c)]
-    if not known or not all(map(is_plain_number, known)):
+    digits = {c for c in known if c.lstrip("+-").isdigit()}
+    are_numbers = bool(known) and all(map(is_plain_number, known))
+    # 01 and 1, or of more digits than a number, would become one
+    if not are_numbers or len({float(c) for c in digits}) < len(digits):
         return np.array(["" if is_missing(c) else c for c in cells])
     numbers = np.array([np.nan if is_missing(c) else float(c) for c in cells])
-    digits = {c for c in known if c.lstrip("+-").isdigit()}
-    if len({float(c) for c in digits}) < len(digits):  # 01 and 1, or of more digits than a number
-        return np.array(["" if is_missing(c) else c for c in cells])
-    whole = (
-        len(known) == len(cells)
-        and all(c.lstrip("+-").isdigit() for c in cells)
-        and (abs(numbers) < 2**53).all()
-    )
+    whole = all(c in digits for c in cells) and (abs(numbers) < 2**53).all()
     return numbers.astype(np.int64) if whole else numbers
 
 
@@ -154,12 +150,9 @@ def _tell_repeated(path, column, values, names):
     again = [f"{value}: {', '.join(of)}" for value, of in shapes_of.items() if len(of) > 1]
     if again:
         log.warning(
-            "%s: %d values of the column %r stand for several shapes (%s); the tests take all "
-            "shapes as independent, so keep one of each, or their mean, or take growth",
-            path,
-            len(again),
-            column,
-            listed(again, "; "),
+            f"{path}: {len(again)} values of the column {column!r} stand for several shapes "
+            f"({listed(again, '; ')}); the tests take all shapes as independent, so keep one of "
+            "each, or their mean, or take growth"
         )
 
 
