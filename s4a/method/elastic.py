@@ -36,7 +36,7 @@ smoothing in MeshMonk does (White et al., Scientific Reports 2019).  Landmarks a
 distances here, too.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -374,18 +374,10 @@ def starts_that_meet(
     """
     spread = target.spread_vertices()
     met: dict[str, list[Warp]] = {}
+    stiff: dict[str, Any] = {"rounds": N_MEETING, "still": STILLEST, "further": 0}
+    stiff |= {"vertices": spread, "landmarks": landmarks}
     for name, start in starts.items():
-        warp = elastic_rounds(
-            source,
-            target,
-            start,
-            stiffness=STIFFEST,
-            further=0,
-            rounds=N_MEETING,
-            still=STILLEST,
-            vertices=spread,
-            landmarks=landmarks,
-        )
+        warp = elastic_rounds(source, target, start, stiffness=STIFFEST, **stiff)
         X = move(target, warp)
         near = (
             one

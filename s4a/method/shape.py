@@ -364,20 +364,11 @@ class Shape:
         area = self._area / self._area.sum()
         lifted = self.is_lifted
         Phi = self.coarse["lifted_eigenfunction"].values if lifted else low.Phi
-        return Basis(
-            X,
-            T,
-            area,
-            Phi,
-            low.eigenvalue,
-            low.mass,
-            self.U,
-            self.near_coarse,
-            self.area_weighted,
-            lifted,
-            landmarks=vertices_of_landmarks(self.original),
-            fields={name: self.U @ values for name, values in low.fields.items()},
-        )
+        functions = Phi, low.eigenvalue, low.mass, self.U
+        projection = self.near_coarse, self.area_weighted, lifted
+        landmarks = vertices_of_landmarks(self.original)
+        fields = {name: self.U @ values for name, values in low.fields.items()}
+        return Basis(X, T, area, *functions, *projection, landmarks=landmarks, fields=fields)
 
     @property
     def is_sampled(self) -> bool:
