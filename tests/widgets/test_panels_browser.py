@@ -150,9 +150,9 @@ def test_a_level_makes_the_map_grey_and_a_click_tells_the_values(page):
     assert pixels(canvas) != before
     box = canvas.bounding_box()
     page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
-    said = panel.locator(".s4a-readout").filter(has_text="directional asymmetry")
+    said = panel.locator(".s4a-readout").filter(has_text="effect, along the normals")
     said.wait_for()
-    assert re.match(r"vertex \d+: directional asymmetry .* mm; p = ", said.inner_text())
+    assert re.match(r"vertex \d+: effect, along the normals .*; p = ", said.inner_text())
 
 
 def test_the_controls_of_a_region_stand_in_one_row_of_a_wide_screen(page):
