@@ -451,7 +451,7 @@ def groups():
     x, p = np.repeat([0.0, 1.0], [8, 10]), []
     for seed in range(100):
         scores = np.random.default_rng(seed).standard_t(5, size=(18, 4))
-        p.append(permutation.permutation_test(scores, x, n_permutations=199, seed=seed)[1])
+        p.append(permutation.Model(x, n_permutations=199, seed=seed).test(scores)[1])
     tenths = np.histogram(p, np.linspace(0, 1, 11))[0]
     uniform = stats.kstest(p, "uniform").pvalue
     say(

@@ -29,7 +29,7 @@ import xarray as xr
 
 import s4a
 import s4a_morphometrics
-from s4a.analysis.permutation import mean_test
+from s4a.analysis.permutation import Model
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas, vertex_normals
 from s4a.schema import dataset
 from s4a_morphometrics.bilateral import antisymmetry_test, both_sides, sides_test
@@ -68,11 +68,11 @@ def draw(rng: np.random.Generator, n: int, kind: str) -> np.ndarray:
 
 def found(a: np.ndarray, run: int, *, planted: bool) -> list[float]:
     """Whether, or where, directional asymmetry and antisymmetry are found."""
-    options = {"n_permutations": N_PERMUTATIONS, "seed": run}
-    p_max = mean_test(a, **options)[2]
+    model = Model.of_mean(len(a), N_PERMUTATIONS, run)
+    p_max = model.vertex_test(a)[2]
     rows = a[..., 0]
     at = (p_max[:N_PLANTED] <= 0.05).mean() if planted else p_max.min() <= 0.05
-    whole = sides_test(rows @ rows.T, **options)[1] <= 0.05
+    whole = sides_test(rows @ rows.T, model)[1] <= 0.05
     return [at, whole]
 
 

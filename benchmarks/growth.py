@@ -15,7 +15,7 @@ import time
 
 import numpy as np
 
-from s4a.analysis.permutation import permutation_test, vertex_test
+from s4a.analysis.permutation import Model
 from s4a_morphometrics.longitudinal import random_intercepts, within_subjects
 
 N_VERTICES, N_PLANTED, N_PERMUTATIONS = 40, 4, 99
@@ -70,9 +70,10 @@ def found(run: int, setting: tuple[int, str, str], effect: float, variances: str
     E, x = within_subjects(d[seen], subject), within_subjects(t[seen], subject)
     options = {"blocks": subject, "n_permutations": N_PERMUTATIONS, "seed": run}
     options["variances"] = variances
-    p = vertex_test(E, x, **options)[2]
+    model = Model(x, **options)
+    p = model.vertex_test(E)[2]
     U, S, _ = np.linalg.svd(E[..., 0], full_matrices=False)
-    whole = permutation_test(U[:, :4] * S[:4], x, **options)[1] <= 0.05
+    whole = model.test(U[:, :4] * S[:4])[1] <= 0.05
     return [(p[:N_PLANTED] <= 0.05).mean() if effect else p.min() <= 0.05, whole]
 
 

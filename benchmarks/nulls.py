@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from s4a.analysis.permutation import indicators, permutation_test, vertex_test
+from s4a.analysis.permutation import Model, indicators
 
 N_VERTICES, N_PLANTED = 40, 4
 N_PERMUTATIONS = 99
@@ -92,15 +92,16 @@ def rates(setting: Setting, variances: str, runs: int) -> np.ndarray:
             "variances": variances,
             "seed": run,
         }
-        found[run, 0] = vertex_test(d, x, **options)[2].min() <= 0.05
-        found[run, 1] = permutation_test(scores, x, **options)[1] <= 0.05
+        model = Model(x, **options)
+        found[run, 0] = model.vertex_test(d)[2].min() <= 0.05
+        found[run, 1] = model.test(scores)[1] <= 0.05
         if run % 5:
             continue
         effect = (x[:, 0] - x[:, 0].mean()) / x[:, 0].std()
         d[:, :N_PLANTED, 0] += EFFECT_AT_VERTEX * effect[:, None]
         scores[:, 0] += EFFECT_ON_SCORE * effect
-        found[run, 2] = (vertex_test(d, x, **options)[2][:N_PLANTED] <= 0.05).mean()
-        found[run, 3] = permutation_test(scores, x, **options)[1] <= 0.05
+        found[run, 2] = (model.vertex_test(d)[2][:N_PLANTED] <= 0.05).mean()
+        found[run, 3] = model.test(scores)[1] <= 0.05
     return np.nanmean(found, axis=0)
 
 
@@ -122,9 +123,9 @@ def beside_t_tests(smooth: bool, runs: int) -> np.ndarray:
             p = stats.ttest_ind(d[x == 1], d[x == 0]).pvalue  # (v, 3)
             options = {"n_permutations": N_PERMUTATIONS, "seed": run}
             corrected = [
-                vertex_test(d, x, **options)[2],
+                Model(x, **options).vertex_test(d)[2],
                 3 * v * p.min(1),
-                vertex_test(d[..., :1], x, **options)[2],
+                Model(x, **options).vertex_test(d[..., :1])[2],
                 v * p[:, 0],
             ]
             is_found = np.array(corrected) <= 0.05  # (4, v)

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 import s4a
 import s4a_morphometrics
-from s4a.analysis.permutation import permutation_test
+from s4a.analysis.permutation import Model
 from s4a.geometry.align import rigid_transform
 from s4a.geometry.mesh import vertex_areas
 from s4a_morphometrics.poses import Poses, align_wholes, measured, pose_fields, poses_of
@@ -92,7 +92,8 @@ def found_in(rng, n, run, **effect):
     A, B = levels(parts_of(draw(rng, n, 1, 1, **effect), [AREA, AREA]))
     group = np.arange(n) >= n / 2
     options = {"n_permutations": N_PERMUTATIONS, "seed": run}
-    p = [permutation_test(M[:, :4], group.astype(float), **options)[1] for M in (A, B)]
+    model = Model(group.astype(float), **options)
+    p = [model.test(M[:, :4])[1] for M in (A, B)]
     return [*(one <= 0.05 for one in p), two_block(A, B, **options)["rv_p"] <= 0.05]
 
 

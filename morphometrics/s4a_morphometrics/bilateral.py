@@ -18,9 +18,8 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
-from s4a.analysis.effects import check_permutations
 from s4a.analysis.inputs import Values, displacements_of, registration_of, values_of
-from s4a.analysis.permutation import mean_test, rearrangements, smallest_p
+from s4a.analysis.permutation import Model, check_permutations
 from s4a.geometry.align import rigid_transform
 from s4a.geometry.closest import closest_facing_point, interpolate
 from s4a.geometry.mesh import as_arrays, as_dataset, edges, vertex_areas, vertex_normals
@@ -245,15 +244,13 @@ def asymmetry(
         without = [*without, *alone]
         sides = both_sides(Y[first], Y[second], T, area)._replace(names=names)
         attrs |= {"symmetry": "matching", "sides": words}
-    result = measured(sides, T, of, n_permutations, seed)
+    model = Model.of_mean(len(sides.a), n_permutations, seed)
+    result = measured(sides, T, of, model)
     if halves is not None:
         result = result.merge(halves.drop_attrs())
     result = in_unit(result, unit_of(registration["displacement"]))
     return result.assign_coords(individual=sides.names, term=TERMS).assign_attrs(
-        permutations=min(n_permutations, 2 ** (len(sides.a) - 1) - 1),
-        smallest_p=smallest_p(n_permutations, np.arange(len(sides.a)), variances="unequal"),
-        left_out=", ".join(without),
-        **attrs,
+        left_out=", ".join(without), **attrs, **model.said()
     )
 
 
@@ -307,7 +304,7 @@ def _tell_hands(study, side_of, two):
         )
 
 
-def measured(sides: Sides, T: np.ndarray, of: str, n_permutations: int, seed: int) -> xr.Dataset:
+def measured(sides: Sides, T: np.ndarray, of: str, model: Model) -> xr.Dataset:
     """All that :func:`asymmetry` says of the sides of individuals."""
     a, area, n = sides.a, sides.area, len(sides.a)
     mean = a.mean(0)
@@ -320,12 +317,13 @@ def measured(sides: Sides, T: np.ndarray, of: str, n_permutations: int, seed: in
     if size <= ALIKE * np.ptp(sides.consensus, axis=0).max():
         raise ValueError("left and right are the same in all shapes: there is no asymmetry to test")
     fields = np.where(abs(fields) > ALIKE * size, fields, 0)  # the midline has none along normals
-    changes = {"n_permutations": n_permutations, "seed": seed}
-    share, p, p_max = mean_test(fields, floor=resolution / PARTS, **changes)
-    statistic, p_value = sides_test(gram(fields, area), **changes)
+    share, p, p_max = model.vertex_test(fields, floor=resolution / PARTS)
+    statistic, p_value = sides_test(gram(fields, area), model)
     K = gram(a, area)
     modes = gram_pca(a, area)
-    kurtosis, p_kurtosis = antisymmetry_test(modes.score * modes.standard_deviation, seed=seed)
+    kurtosis, p_kurtosis = antisymmetry_test(
+        modes.score * modes.standard_deviation, seed=model.seed
+    )
     squares = 2 * np.array([np.trace(gram(sides.symmetric, area)), K.sum() / n, 0.0])
     squares[2] = 2 * np.trace(K) - squares[1]
     degrees = np.array([n - 1, 1, n - 1])
@@ -378,30 +376,36 @@ def without_doubt(fields: np.ndarray, resolution: np.ndarray) -> np.ndarray:
     return fields - mean * np.minimum(1, doubt / np.where(length > 0, length, 1))[:, None]
 
 
-def sides_test(K: np.ndarray, *, n_permutations: int, seed: int) -> tuple[float, float]:
+def sides_test(K: np.ndarray, model: Model) -> tuple[float, float]:
     """F of sides over individuals x sides, and p under changes of sign of the individuals.
 
     Parameters
     ----------
     K : float ndarray (s, s)
         Inner products of their asymmetries.
+    model : Model
+        Of changes of their signs.
 
     Examples
     --------
     >>> import numpy as np
+    >>> from s4a.analysis.permutation import Model
     >>> from s4a_morphometrics.bilateral import sides_test
     >>> a = 1 + 0.1 * np.arange(6.0)
-    >>> sides_test(np.outer(a, a), n_permutations=99, seed=0)[1]
+    >>> sides_test(np.outer(a, a), Model.of_mean(6))[1]
     0.03125
     """
-    n = len(K)
-    total = np.trace(K)
-    others, n_others = rearrangements(np.arange(n), None, n_permutations, seed, "unequal")
-    signs = np.array([np.ones(n), *others])  # (permutations + 1, s)
-    of_sides = np.einsum("pi,ij,pj->p", signs, K, signs, optimize=True) / n
-    F = of_sides[0] / max((total - of_sides[0]) / (n - 1), 1e-12 * total)
-    reached = int((of_sides[1:] >= of_sides[0] * (1 - 1e-9)).sum())
-    return float(F), (1 + reached) / (1 + n_others)
+    n, total = len(K), np.trace(K)
+
+    def of(signs):
+        """The sum of squares of sides under changes of sign, ``(b,)``."""
+        S = np.array(signs)
+        return np.einsum("pi,ij,pj->p", S, K, S, optimize=True) / n
+
+    of_sides = of(2 * [np.ones(n)])[0]  # of two rows: einsum rounds one alone in another way
+    F = of_sides / max((total - of_sides) / (n - 1), 1e-12 * total)
+    p, _ = model.p_values(of, of_sides * (1 - 1e-9), 10_000)
+    return float(F), float(p)
 
 
 def antisymmetry_test(

@@ -58,7 +58,7 @@ def asymmetry(args: Namespace) -> int:
     from s4a_morphometrics import bilateral, words
     from s4a_morphometrics.halves import symmetric_template
 
-    study, out = study_to_test(args)
+    study, out = study_to_test(args.study, args.out, args.table, args.keep_doubtful)
     found = bilateral.asymmetry(
         study, subject=args.subject, side=args.side, of=args.of, **drawn(args)
     )
@@ -86,7 +86,7 @@ def growth(args: Namespace) -> int:
     from s4a import statistics, write_film, write_page
     from s4a_morphometrics import longitudinal, words
 
-    study, out = study_to_test(args)
+    study, out = study_to_test(args.study, args.out, args.table, args.keep_doubtful)
     found = longitudinal.growth(
         study,
         args.time,
@@ -122,7 +122,7 @@ def covariation(args: Namespace) -> int:
     from s4a import write_page
     from s4a_morphometrics import two_block, words
 
-    study, out = study_to_test(args)
+    study, out = study_to_test(args.study, args.out, args.table, args.keep_doubtful)
     found = two_block.covariation(
         study, args.field, covariates=args.covariates or None, **drawn(args)
     )

@@ -16,21 +16,18 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
-from scipy import stats
 
-from s4a.analysis.effects import check_options, freed_deviation, numbers_of
+from s4a.analysis.effects import (
+    fields_to_test,
+    freed_deviation,
+    numbers_of,
+    squared_cohen_f,
+    vertex_results,
+)
 from s4a.analysis.inputs import Values, registration_of, sample_of, values_of
 from s4a.analysis.model import count_components
-from s4a.analysis.permutation import (
-    count_rearrangements,
-    permutation_test,
-    smallest_p,
-    standardize,
-    vertex_test,
-)
-from s4a.geometry.mesh import as_arrays, vertex_normals
+from s4a.analysis.permutation import Model, check_options, standardize
 from s4a.input.subjects import listed
-from s4a.method.deform import normal_displacement
 from s4a.method.pca import gram, principal_components
 from s4a.schema import FIELD_UNIT, dataset, in_unit
 from s4a.seeds import RNG, seed_of
@@ -274,7 +271,6 @@ def growth(
         of=of,
         subjects=len(np.unique(whose)),
         once=len(np.unique(whose[~seen])),
-        variances=variances,
         **sample.said,
     )
 
@@ -349,16 +345,9 @@ def _test(sample, t, subject, seen, of, n_components, options):
     if sample.Z is not None:
         Z = within_subjects(sample.Z[seen], subject)
         Z = Z if Z.any() else None
-    k, n_subjects = d.shape[2], len(np.unique(subject))
-    if of not in ("vector", "normal"):
-        raise ValueError(f"of must be 'vector' or 'normal', found {of!r}")
-    if of == "normal" and k == 1:
-        raise ValueError("a field has no part along the normals: leave out of='normal'")
     E = within_subjects(d, subject)
-    fields = E
-    if of == "normal":
-        N = vertex_normals(*as_arrays(sample.registration))
-        fields = normal_displacement(E, N)[..., None]
+    fields = fields_to_test(E, sample.registration, of)
+    n_subjects = len(np.unique(subject))
     rank = 0 if Z is None else int(np.linalg.matrix_rank(standardize(Z)[0]))
     dof = len(x) - n_subjects - rank  # of visits
     if dof < fields.shape[2] + 1:
@@ -366,35 +355,16 @@ def _test(sample, t, subject, seen, of, n_components, options):
             f"{len(x)} visits of {n_subjects} subjects are too few for a test of "
             f"{fields.shape[2]} coordinates at a vertex: more visits needed, or of='normal'"
         )
-    blocked = {"covariates": Z, "blocks": subject, **options}
-    share, p, p_max = vertex_test(fields, x, **blocked)
+    model = Model(x, Z, blocks=subject, **options)
+    found = vertex_results(model.vertex_test(fields), sample)
     variance, V = principal_components(gram(E, sample.area))
     if not len(variance):
         raise ValueError("growth needs shapes that differ within subjects; all visits are equal")
     c = count_components(variance, dof, n_components, most=len(variance))
-    statistic, p_value = permutation_test(V[:, :c] * np.sqrt(len(E) - 1), x, **blocked)
-    rows = {"x": x, "covariates": Z, "variances": options["variances"], "blocks": subject}
-    least = smallest_p(options["n_permutations"], **rows)
-    if least > 0.05:
-        log.warning(
-            "%d visits of %d subjects allow no p value below %.2g, whatever they are like: more "
-            "are needed, or more permutations",
-            len(x),
-            n_subjects,
-            least,
-        )
-    found = sample.whole(share)
-    return {
-        "attrs": {
-            "components": c,
-            "permutations": min(options["n_permutations"], count_rearrangements(**rows) - 1),
-            "smallest_p": least,
-        },
-        "explained_share": found,
-        "p_vertex": sample.whole(p),
-        "p_family_wise": sample.whole(p_max),
-        "p_false_discovery": sample.whole(stats.false_discovery_control(p)),
-        "effect_size": np.sqrt(found / np.maximum(1 - found, 1e-12)),
+    statistic, p_value = model.test(V[:, :c] * np.sqrt(len(E) - 1))
+    return found | {
+        "attrs": {"components": c} | model.said(),
+        "effect_size": np.sqrt(squared_cohen_f(found["explained_share"])),
         # as many visits as are not taken by the means of subjects are free
         "statistic": statistic * (dof - 1) / (len(x) - 2 - rank),
         "p_value": p_value,

@@ -12,9 +12,9 @@ import math
 import numpy as np
 import xarray as xr
 
-from s4a.analysis.effects import check_permutations, modes_study
+from s4a.analysis.effects import modes_study
 from s4a.analysis.inputs import Values, field_sample
-from s4a.analysis.permutation import batched, design
+from s4a.analysis.permutation import check_permutations, design, p_values
 from s4a.method.pca import gram, principal_components
 from s4a.schema import FIELD_UNIT, dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
@@ -65,7 +65,7 @@ def two_block(
     r = _correlation(*scores)
 
     def measures(permuted):
-        """Singular values over the size of B, first correlation and RV of blocks (b, s, q)."""
+        """First correlation, RV, and singular values over the size of B, of blocks (b, s, q)."""
         permuted = free(permuted, Z)
         Ub, S, Vb = np.linalg.svd(A.T @ permuted, full_matrices=False)
         length = np.sqrt((permuted**2).sum((1, 2)))
@@ -73,20 +73,22 @@ def two_block(
         rv = (S**2).sum(1) / (size * np.sqrt((K**2).sum((1, 2))))
         one = np.einsum("sp,bp->bs", A, Ub[:, :, 0])
         other = np.einsum("bsq,bq->bs", permuted, Vb[:, 0])
-        return S / length[:, None], _correlation(one, other, axis=1), rv
+        return np.column_stack([_correlation(one, other, axis=1), rv, S / length[:, None]])
 
-    own = measures(B[None])
+    own = measures(B[None])[0]
     rng = np.random.default_rng(seed)
-    reached = [np.zeros(one.shape[1:], int) for one in own]
     orders = (rng.permutation(n) for _ in range(n_permutations))
-    for batch in batched(orders, max(1, 2_000_000 // (n * n + A.size + B.size))):
-        found = measures(np.stack([B[order] for order in batch]))
-        for count, values, first in zip(reached, found, own, strict=True):
-            count += (values >= first[0] * (1 - 1e-9)).sum(0)
-    singular_p, p, rv_p = ((1 + count) / (1 + n_permutations) for count in reached)
+    at_once = max(1, 2_000_000 // (n * n + A.size + B.size))
+    (p, rv_p, *singular_p), _ = p_values(
+        orders,
+        n_permutations,
+        lambda batch: measures(np.stack([B[order] for order in batch])),
+        own * (1 - 1e-9),
+        at_once,
+    )
     return {
-        "U": U, "V": Vt.T, "singular": singular, "r": r, "rv": own[2][0],
-        "p": p, "singular_p": singular_p, "rv_p": rv_p,
+        "U": U, "V": Vt.T, "singular": singular, "r": r, "rv": own[1],
+        "p": p, "singular_p": np.array(singular_p), "rv_p": rv_p,
     }  # fmt: skip
 
 

@@ -9,12 +9,7 @@ from scipy import optimize
 from simulated import TOP, noise, study_of, with_carried
 
 from s4a import cli, open_study, statistics
-from s4a.analysis.permutation import (
-    count_rearrangements,
-    rearrangements,
-    smallest_p,
-    vertex_test,
-)
+from s4a.analysis.permutation import Model
 from s4a_morphometrics import growth
 from s4a_morphometrics.longitudinal import random_intercepts, within_subjects
 
@@ -135,22 +130,23 @@ def test_a_field_grows_too(planted):
 
 def test_orders_leave_every_visit_with_its_subject_and_are_all_different():
     blocks, x = np.array([0, 1, 0, 1, 1, 2]), np.array([1.0, 2, 3, 4, 5, 6])
-    orders, n = rearrangements(x, None, 99, 0, blocks=blocks)
+    model = Model(x, blocks=blocks)
+    orders, n = model.rearrangements()
     found = {tuple(order) for order in orders}
-    assert len(found) == n == count_rearrangements(x, blocks=blocks) - 1 == 11
+    assert len(found) == n == model.n_rearrangements - 1 == 11
     assert all((blocks[list(order)] == blocks).all() for order in found)
-    drawn, n = rearrangements(x, None, 5, 0, blocks=blocks)
+    drawn, n = Model(x, blocks=blocks, n_permutations=5).rearrangements()
     drawn = list(drawn)
     assert len(drawn) == n == 5
     assert all((blocks[order] == blocks).all() for order in drawn)
-    signs, n = rearrangements(x, None, 99, 0, "unequal", blocks)
+    signs, n = Model(x, None, "unequal", blocks).rearrangements()
     signs = [tuple(one) for one in signs]
     assert len(set(signs)) == n == 3
     assert all(one[0] == one[2] and one[1] == one[3] == one[4] for one in signs)
     # two visits each: all turned round give the same slope but for its sign
     pairs = np.repeat(np.arange(5), 2)
-    assert smallest_p(999, np.arange(10.0), blocks=pairs) == 2 / 2**5
-    assert smallest_p(999, np.arange(10.0) ** 2, blocks=np.repeat([0, 1], 5)) == 1 / 1000
+    assert Model(np.arange(10.0), blocks=pairs).smallest_p == 2 / 2**5
+    assert Model(np.arange(10.0) ** 2, blocks=np.repeat([0, 1], 5)).smallest_p == 1 / 1000
 
 
 def test_changes_of_nothing_are_found_no_more_often_than_said():
@@ -163,7 +159,7 @@ def test_changes_of_nothing_are_found_no_more_often_than_said():
         options = {"blocks": subject, "n_permutations": 39, "seed": run}
         found.append(
             [
-                vertex_test(E, x, variances=v, **options)[2].min() <= 0.05
+                Model(x, variances=v, **options).vertex_test(E)[2].min() <= 0.05
                 for v in ("equal", "unequal")
             ]
         )

@@ -1,7 +1,6 @@
 """Groups and variables (6.1): do shapes differ with them, and where on the template?"""
 
 import logging
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -17,19 +16,16 @@ from s4a.analysis.inputs import (
 )
 from s4a.analysis.model import count_components
 from s4a.analysis.permutation import (
-    count_rearrangements,
-    design,
+    Model,
+    check_options,
     indicators,
-    permutation_test,
     scatter_test,
-    smallest_p,
     standardize,
-    vertex_test,
 )
 from s4a.geometry.mesh import as_arrays, vertex_normals
 from s4a.method.deform import normal_displacement
 from s4a.method.pca import gram, principal_components
-from s4a.schema import FIELD_UNIT, dataset, in_unit, unit_of
+from s4a.schema import FIELD_UNIT, INPUT, dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
 
 log = logging.getLogger(__name__)
@@ -37,8 +33,6 @@ log = logging.getLogger(__name__)
 # p of the test of equal scatter under which it is told: 2 of 100 times in vain, and 75 to 90 times
 # where groups of 10 and 10, or 15 and 5, have 1 and 2 standard deviations
 UNEQUAL = 0.02
-MOST_PERMUTATIONS = 10_000_000
-VARIANCES = ("equal", "unequal")
 
 
 def group_test(
@@ -103,9 +97,9 @@ def group_test(
     options = check_options(n_permutations, variances, seed_of(seed, rng))
     sample = sample_of(study, group, "group", covariates, field)
     sizes = group_sizes(sample.values)
-    _, x = indicators(sample.values)
-    test = _test_scores(sample, x, n_components, options)
-    return test.assign_attrs(groups=sizes, **_said(sample, x, options))
+    model = Model(indicators(sample.values)[1], sample.Z, **options)
+    test = _test_scores(sample, model, n_components)
+    return test.assign_attrs(groups=sizes, **sample.said, **model.said())
 
 
 def group_map(
@@ -165,13 +159,14 @@ def group_map(
     sample = sample_of(study, group, "group", covariates, field)
     sizes = group_sizes(sample.values)
     names, x = indicators(sample.values)
-    effect_map = _test_vertices(sample, x, of, options)
-    squared = _squared_cohen_f(effect_map)
+    model = Model(x, sample.Z, **options)
+    effect_map = _test_vertices(sample, model, of)
+    squared = squared_cohen_f(effect_map["explained_share"].values)
     if len(names) == 2:  # Mahalanobis distance of the means: T^2 (1 / n_1 + 1 / n_2)
-        dof = len(x) - sum(basis.shape[1] for basis in design(x, sample.Z))
+        dof = len(x) - sum(basis.shape[1] for basis in model.bases)
         squared = squared * dof * (1 / np.unique(sample.values, return_counts=True)[1]).sum()
     return effect_map.merge(dataset(effect_size=np.sqrt(squared))).assign_attrs(
-        groups=sizes, of=of, **_said(sample, x, options)
+        groups=sizes, of=of, **sample.said, **model.said()
     )
 
 
@@ -228,12 +223,14 @@ def regression(
     options = check_options(n_permutations, variances, seed_of(seed, rng))
     sample = sample_of(study, variable, "variable", covariates, field)
     x = numbers_of(sample.values)
-    test = _test_scores(sample, x, n_components, options)
-    effect_map = _test_vertices(sample, x, of, options)
+    model = Model(x, sample.Z, **options)
+    test = _test_scores(sample, model, n_components)
+    effect_map = _test_vertices(sample, model, of)
     mean = float(x.mean())
     deviation = float(x.std(ddof=1))
     sizes = dataset(
-        effect_size=np.sqrt(_squared_cohen_f(effect_map)), standard_score=(x - mean) / deviation
+        effect_size=np.sqrt(squared_cohen_f(effect_map["explained_share"].values)),
+        standard_score=(x - mean) / deviation,
     ).assign_coords(shape=sample.registration["shape"].values)
     return (
         effect_map.merge(test)
@@ -246,7 +243,8 @@ def regression(
             standard_deviation=deviation,
             freed_deviation=freed_deviation(x, sample.Z),
             components=test.attrs["components"],
-            **_said(sample, x, options),
+            **sample.said,
+            **model.said(),
         )
     )
 
@@ -432,38 +430,6 @@ def check_moves(fit: xr.Dataset) -> None:
         )
 
 
-def check_permutations(n: int) -> None:
-    """ValueError unless so many permutations can be drawn."""
-    if not 1 <= n <= MOST_PERMUTATIONS:
-        raise ValueError(f"n_permutations needs a number from 1 to {MOST_PERMUTATIONS}, found {n}")
-
-
-def check_options(n_permutations: int, variances: str, seed: int) -> dict[str, Any]:
-    """The options of the permutation tests, checked before anything is computed."""
-    check_permutations(n_permutations)
-    if variances not in VARIANCES:
-        raise ValueError(f"variances must be 'equal' or 'unequal', found {variances!r}")
-    return {"n_permutations": n_permutations, "variances": variances, "seed": seed}
-
-
-def _said(sample, x, options):
-    """Attributes of a result: what it rests on, and the smallest p that it can reach."""
-    least = smallest_p(options["n_permutations"], x, sample.Z, options["variances"])
-    if least > 0.05:
-        log.warning(
-            "%d shapes allow no p value below %.2g, whatever they are like: more are needed, or "
-            "more permutations",
-            len(x),
-            least,
-        )
-    n = count_rearrangements(x, sample.Z, options["variances"]) - 1
-    return sample.said | {
-        "variances": options["variances"],
-        "permutations": min(n, options["n_permutations"]),
-        "smallest_p": least,
-    }
-
-
 def scores_of(sample: Sample, n_components: int | None) -> tuple[np.ndarray, np.ndarray]:
     """Scores on the first components ``(s, c)``, and all coordinates in the unit of the input."""
     d = sample.d
@@ -475,12 +441,12 @@ def scores_of(sample: Sample, n_components: int | None) -> tuple[np.ndarray, np.
     return V[:, :c] * root, V * np.sqrt(variance) * root
 
 
-def _test_scores(sample, x, n_components, options):
+def _test_scores(sample, model, n_components):
     """One test for the whole shape: Hotelling's T^2 of the scores on x, Z accounted for."""
     scores, coordinates = scores_of(sample, n_components)
-    statistic, p = permutation_test(scores, x, covariates=sample.Z, **options)
-    if options["variances"] == "equal":
-        _tell_unequal_variances(coordinates, x, sample)
+    statistic, p = model.test(scores)
+    if model.variances == "equal":
+        _tell_unequal_variances(coordinates, model.x, sample)
     return dataset({"components": scores.shape[1]}, statistic=statistic, p_value=p)
 
 
@@ -507,42 +473,49 @@ def _tell_unequal_variances(coordinates, x, sample):
     )
 
 
-def _test_vertices(sample, x, of, options):
-    """A test at every vertex, and the effect of the first column of x on the displacement."""
-    registration, d, Z = sample.registration, sample.d, sample.Z
+def fields_to_test(d: np.ndarray, registration: xr.Dataset, of: str) -> np.ndarray:
+    """Fields ``(s, n, k)`` of a test at every vertex: vectors, or their part along the normals."""
     if of not in ("vector", "normal"):
         raise ValueError(f"of must be 'vector' or 'normal', found {of!r}")
-    fields = d  # (s, n, 3), or (s, n, 1) along the normals
-    is_field = d.shape[2] == 1
-    if of == "normal":
-        if is_field:
-            raise ValueError("a field has no part along the normals: leave out of='normal'")
-        fields = normal_displacement(d, vertex_normals(*as_arrays(registration)))[..., None]
-    share, p, p_max = vertex_test(fields, x, covariates=Z, **options)
-    columns = np.column_stack([np.ones(len(d)), x] if Z is None else [np.ones(len(d)), x, Z])
+    if of == "vector":
+        return d
+    if d.shape[2] == 1:
+        raise ValueError("a field has no part along the normals: leave out of='normal'")
+    return normal_displacement(d, vertex_normals(*as_arrays(registration)))[..., None]
+
+
+def vertex_results(
+    found: tuple[np.ndarray, np.ndarray, np.ndarray], sample: Sample
+) -> dict[str, np.ndarray]:
+    """What a test at every vertex found, by the names of its variables."""
+    share, p, p_max = found
+    return {
+        "explained_share": sample.whole(share),
+        "p_vertex": sample.whole(p),
+        "p_family_wise": sample.whole(p_max),
+        "p_false_discovery": sample.whole(stats.false_discovery_control(p)),
+    }
+
+
+def _test_vertices(sample, model, of):
+    """A test at every vertex, and the effect of the first column of x on the displacement."""
+    d, k = sample.d, sample.d.shape[2]
+    found = model.vertex_test(fields_to_test(d, sample.registration, of))
+    columns = np.column_stack([np.ones(len(d)), model.rows])
     columns[:, 1:] -= columns[:, 1:].mean(0)  # so that the intercept is where x is at its mean
     size = np.linalg.norm(columns, axis=0)
     size[size == 0] = 1
     B = np.linalg.pinv(columns / size, rcond=1e-10) @ d.reshape(len(d), -1).astype(float)
-    B = B / size[:, None]  # (columns, 3 n)
-    effect_map = dataset(
-        explained_share=sample.whole(share),
-        p_vertex=sample.whole(p),
-        p_family_wise=sample.whole(p_max),
-        p_false_discovery=sample.whole(stats.false_discovery_control(p)),
-    )
-    slope, intercept = B[1].reshape(-1, d.shape[2]), B[0].reshape(-1, d.shape[2])
-    if is_field:
-        found = dataset(
-            {"field_unit": sample.unit},
-            field_effect=sample.whole(slope[:, 0]),
-            field_intercept=sample.whole(intercept[:, 0]),
-        )
-        return effect_map.merge(in_unit(found, sample.unit, of=FIELD_UNIT))
-    return in_unit(effect_map.merge(dataset(effect=slope, intercept=intercept)), sample.unit)
+    intercept, slope = (B / size[:, None])[:2].reshape(2, -1, k)
+    if k == 1:
+        effect = {"field_effect": slope[:, 0], "field_intercept": intercept[:, 0]}
+    else:
+        effect = {"effect": slope, "intercept": intercept}
+    effect = {name: sample.whole(values.T).T for name, values in effect.items()}
+    result = dataset(**vertex_results(found, sample), **effect)
+    return in_unit(result, sample.unit, of=FIELD_UNIT if k == 1 else INPUT)
 
 
-def _squared_cohen_f(effect_map):
+def squared_cohen_f(share: np.ndarray) -> np.ndarray:
     """Cohen's f^2 at every vertex ``(n,)``: what is explained over what is not."""
-    share = effect_map["explained_share"].values
     return share / np.maximum(1 - share, 1e-12)

@@ -5,16 +5,39 @@ The general linear model is Y = Z G + X B + E: Z the intercept and the covariate
 permuted; only the part of X that is orthogonal to Z counts.  Permutations take all shapes as drawn
 with one variance.  Where it differs, between groups or with the variable, the signs of the
 residuals are changed at random instead (the wild bootstrap: Liu 1988; Winkler et al. 2014): every
-shape keeps its own variance, and errors need to be symmetric.
+shape keeps its own variance, and errors need to be symmetric.  Shapes of one block, as visits of
+one subject, change places with each other alone, or their signs together.
 """
 
 import itertools
+import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from scipy import stats
+
+log = logging.getLogger(__name__)
+
+MOST_PERMUTATIONS = 10_000_000
+VARIANCES = ("equal", "unequal")
+
+
+def check_permutations(n: int) -> None:
+    """ValueError unless so many permutations can be drawn."""
+    if not 1 <= n <= MOST_PERMUTATIONS:
+        raise ValueError(f"n_permutations needs a number from 1 to {MOST_PERMUTATIONS}, found {n}")
+
+
+def check_options(n_permutations: int, variances: str, seed: int) -> dict[str, Any]:
+    """The options of a :class:`Model`, checked before anything is computed."""
+    check_permutations(n_permutations)
+    if variances not in VARIANCES:
+        raise ValueError(f"variances must be 'equal' or 'unequal', found {variances!r}")
+    return {"n_permutations": n_permutations, "variances": variances, "seed": seed}
 
 
 def standardize(columns: np.ndarray) -> tuple[np.ndarray, float]:
@@ -133,33 +156,300 @@ def hotelling(E: np.ndarray, Q: np.ndarray, dof: int) -> np.ndarray:
     return np.einsum("...qp,...pq->...", H, np.linalg.solve(S, H.swapaxes(-1, -2)))
 
 
-def count_rearrangements(
-    x: np.ndarray,
-    covariates: np.ndarray | None = None,
-    variances: str = "equal",
-    blocks: np.ndarray | None = None,
-) -> int:
-    """How many orders of the shapes differ, or signs of their residuals; what is given is one.
+@dataclass(frozen=True)
+class Model:
+    """What a permutation test is of, and how residuals are rearranged in it.
 
-    Shapes of equal values of all columns take each other's place without a difference.
+    Parameters
+    ----------
+    x : float ndarray (n,) or (n, q)
+        What is tested: a variable, or :func:`indicators`.
+    covariates : float ndarray (n, c), optional
+    variances : {"equal", "unequal"}
+        Residuals are permuted, or have their signs changed.
+    blocks : ndarray (n,), optional
+        Residuals are permuted within these, or change their signs with all of their block; x,
+        covariates and what is tested have mean zero in every block then.
+    n_permutations, seed : int
+    intercept : bool
+        Whether the mean is accounted for; without it x = 1 tests whether it is zero.
 
     Examples
     --------
-    >>> from s4a.analysis.permutation import count_rearrangements
-    >>> count_rearrangements([0, 0, 0, 1, 1, 1]), count_rearrangements(range(6), None, "unequal")
-    (20, 32)
+    >>> import numpy as np
+    >>> from s4a.analysis.permutation import Model, indicators
+    >>> model = Model(indicators(list("aaabbb"))[1])
+    >>> model.n_rearrangements, model.smallest_p
+    (20, 0.1)
+    >>> others, n = model.rearrangements()
+    >>> n, next(others).tolist()
+    (19, [0, 1, 3, 2, 4, 5])
     """
-    rows, places = _rows(x, covariates), _places(blocks, len(x))
-    if variances == "unequal":  # the same signs but turned give the same statistic
-        return 2 ** ((len(x) if blocks is None else len(places)) - 1)
-    return math.prod(_count_orders(rows[of]) for of in places)
+
+    x: np.ndarray
+    covariates: np.ndarray | None = None
+    variances: str = "equal"
+    blocks: np.ndarray | None = None
+    n_permutations: int = 999
+    seed: int = 0
+    intercept: bool = True
+
+    @classmethod
+    def of_mean(cls, n: int, n_permutations: int = 999, seed: int = 0) -> "Model":
+        """Whether the mean of n shapes is zero, by changes of their signs."""
+        ones = np.ones(n)
+        return cls(ones, None, "unequal", None, n_permutations, seed, intercept=False)
+
+    @cached_property
+    def bases(self) -> tuple[np.ndarray, np.ndarray]:
+        """Orthonormal bases of Z and of what is tested, see :func:`design`."""
+        if self.intercept:
+            return design(self.x, self.covariates)
+        X = np.reshape(self.x, (len(self.x), -1))
+        return np.empty((len(X), 0)), X / np.linalg.norm(X, axis=0)
+
+    @property
+    def rows(self) -> np.ndarray:
+        """The columns of each shape: what is tested, and the covariates ``(n, q + c)``."""
+        x = np.reshape(self.x, (len(self.x), -1))
+        return x if self.covariates is None else np.column_stack([x, self.covariates])
+
+    @property
+    def places(self) -> list[np.ndarray]:
+        """Where each block of exchangeable shapes stands; all are one where none is named."""
+        if self.blocks is None:
+            return [np.arange(len(self.x))]
+        return [np.flatnonzero(self.blocks == one) for one in np.unique(self.blocks)]
+
+    @property
+    def n_rearrangements(self) -> int:
+        """How many orders of the shapes differ, or signs of their residuals; as given is one.
+
+        Shapes of equal values of all columns take each other's place without a difference.
+        """
+        if self.variances == "unequal":  # the same signs but turned give the same statistic
+            return 2 ** ((len(self.x) if self.blocks is None else len(self.places)) - 1)
+        return math.prod(_count_orders(self.rows[of]) for of in self.places)
+
+    @property
+    def smallest_p(self) -> float:
+        """The smallest p that the test can reach.
+
+        Bound by the number of permutations drawn, and by how many are different: two that only
+        exchange shapes of equal values, or groups of equal size, or turn round a variable that is
+        symmetric about its mean, give the same statistic.
+        """
+        return max(1 / (self.n_permutations + 1), self._n_alike() / self.n_rearrangements)
+
+    def _n_alike(self) -> int:
+        """How many rearrangements give the same statistic as any one does."""
+        # a covariate that is constant is in the mean, and changes nothing
+        if self.covariates is not None and np.ptp(self.covariates, axis=0).any():
+            return 1
+        if self.variances == "unequal":
+            return 1
+        rows = np.reshape(self.x, (len(self.x), -1))
+        if rows.shape[1] == 1:
+            sides, size = [np.sort(rows[of, 0]) for of in self.places], np.ptp(rows)
+            # the order of all turned round changes but the sign of a slope
+            return 1 + all(np.ptp(one + one[::-1]) <= 1e-9 * size for one in sides)
+        sizes = np.unique(rows, axis=0, return_counts=True)[1].tolist()
+        if self.blocks is not None or len(sizes) != rows.shape[1] + 1:
+            return 1
+        return math.prod(math.factorial(sizes.count(s)) for s in set(sizes))  # groups change places
+
+    def said(self) -> dict[str, str | int | float]:
+        """Attributes of a result; the log says where shapes are too few for any small p."""
+        least = self.smallest_p
+        if least > 0.05:
+            of = "" if self.blocks is None else f" of {len(self.places)} subjects"
+            log.warning(
+                "%d shapes%s allow no p value below %.2g, whatever they are like: more are needed, "
+                "or more permutations",
+                len(self.x),
+                of,
+                least,
+            )
+        return {
+            "variances": self.variances,
+            "permutations": min(self.n_rearrangements - 1, self.n_permutations),
+            "smallest_p": least,
+        }
+
+    def rearrangements(self) -> tuple[Iterator[np.ndarray], int]:
+        """What is done to the residuals: orders, or signs; all others where there are no more.
+
+        Returns
+        -------
+        rearrangements : iterator of ndarray (n,)
+            Integers, the residual that comes to each place; or with unequal variances 1.0 and -1.0.
+        n_rearrangements : int
+            `n_permutations`, or the number of all that differ from what is given and each other.
+        """
+        rng = np.random.default_rng(self.seed)
+        n, n_others = len(self.x), self.n_rearrangements - 1
+        if n_others <= self.n_permutations:
+            return itertools.islice(self._all(), 1, None), n_others
+        if self.variances == "unequal":
+            code = self._code()
+            drawn = (rng.choice([-1.0, 1.0], code.max() + 1)[code] for _ in itertools.count())
+        elif self.blocks is not None:
+            drawn = (_drawn_within(self.blocks, rng) for _ in itertools.count())
+        else:
+            drawn = (rng.permutation(n) for _ in itertools.count())
+        return itertools.islice(drawn, self.n_permutations), self.n_permutations
+
+    def _code(self) -> np.ndarray:
+        """The number of the block of each shape, whose signs are changed together."""
+        if self.blocks is None:
+            return np.arange(len(self.x))
+        return np.unique(self.blocks, return_inverse=True)[1]
+
+    def _all(self) -> Iterator[np.ndarray]:
+        """Every rearrangement once, as is first."""
+        if self.variances == "unequal":
+            code = self._code()
+            every = itertools.product([1.0, -1.0], repeat=int(code.max()))
+            return (np.array([1.0, *row])[code] for row in every)
+        if self.blocks is None:
+            return _all_orders(self.rows)
+        return _orders_within(self.rows, self.places)
+
+    def p_values(
+        self, statistic: Callable[[list[np.ndarray]], np.ndarray], least: Any, at_once: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The p of statistics of residuals rearranged; exact where all rearrangements are drawn.
+
+        Parameters
+        ----------
+        statistic : callable
+            Of a list of b rearrangements: ndarray (b, ...).
+        least : ndarray (...)
+            What counts as reaching the statistic of the shapes as they are.
+        at_once : int
+            Rearrangements in a list.
+
+        Returns
+        -------
+        p : ndarray (...)
+            (1 + number that reach the statistic) / (1 + number of all).
+        p_max : ndarray (...)
+            Family-wise, by the largest statistic (Westfall & Young 1993, single step).
+        """
+        others, n_others = self.rearrangements()
+        return p_values(others, n_others, statistic, least, at_once)
+
+    def test(self, scores: np.ndarray) -> tuple[float, float]:
+        """Permutation test of Hotelling's T^2 of scores ``(n, p)``: the statistic and its p.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from s4a.analysis.permutation import Model
+        >>> scores = np.random.default_rng(0).normal(size=(20, 3))
+        >>> x = np.repeat([0.0, 1.0], 10)
+        >>> Model(x, n_permutations=99, seed=1).test(scores + 3 * x[:, None])[1]
+        0.01
+        """
+        Z, Q = self.bases
+        E = scores - Z @ (Z.T @ scores)
+        dof = len(E) - Z.shape[1] - Q.shape[1]
+        statistic = float(hotelling(E, Q, dof))
+
+        def of(batch):
+            permuted = np.stack([rearranged(E, by) for by in batch])  # (b, n, p)
+            return hotelling(permuted - Z @ (Z.T @ permuted), Q, dof)
+
+        p, _ = self.p_values(of, statistic * (1 - 1e-9), max(1, 1_000_000 // E.size))
+        return statistic, float(p)
+
+    def vertex_test(
+        self, d: np.ndarray, floor: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Permutation test at every vertex, with p values corrected for all by the largest (max-T).
+
+        The statistic is Pillai's trace, the share 0..1 of the vectors' scatter that X explains; for
+        one column of X, T^2 = dof V / (1 - V).  The scatter is that of the residuals on Z, for
+        every permutation its own: with covariates those of permuted residuals scatter less, and
+        beside the first scatter their shares would be too small.
+
+        Parameters
+        ----------
+        d : float ndarray (n, v, k)
+            Fields of vectors, or with k = 1 of numbers.
+        floor : float ndarray (v,), optional
+            A standard error of the mean that is added to that of the fields, so that where they
+            hardly scatter a mean as small does not count.
+
+        Returns
+        -------
+        share : float ndarray (v,)
+        p : float ndarray (v,), of each vertex alone
+        p_max : float ndarray (v,), family-wise
+
+        Raises
+        ------
+        ValueError
+            When X explains nothing that the covariates leave, or there are too few shapes.
+        """
+        Z, Q = self.bases
+        n, v, k = d.shape
+        r, q = Z.shape[1], Q.shape[1]
+        if n - r <= k:  # the residuals fill all dimensions: what is tested explains all of them
+            raise ValueError(
+                f"{n} shapes are too few for a test of {k} coordinates at a vertex with {r} "
+                f"columns of mean and covariates: {r + k + 1} needed, or fewer covariates, or "
+                "of='normal'"
+            )
+        E = np.asarray(d, float).reshape(n, -1)  # (n, v k)
+        rounding = 1e-12 * abs(E).max()
+        E = (E - Z @ (Z.T @ E)).reshape(n, v, k)
+        E[:, abs(E).max((0, 2)) <= rounding] = 0  # where nothing varies nothing is to be explained
+        scatter = (E**2).sum((0, 2))
+        E = whiten(E)
+        if floor is not None:
+            whole = scatter + (n * floor) ** 2
+            E = E * np.sqrt(scatter / np.where(whole > 0, whole, 1))[:, None]
+        E = E.transpose(0, 2, 1).reshape(n, -1).astype(np.float32)  # (n, k v)
+
+        def project(columns, per):
+            """Products of b times `per` columns ``(n, b per)`` with residuals: (b, per, k, v)."""
+            return (columns.T.astype(np.float32) @ E).reshape(-1, per, k, v)
+
+        def of(batch):
+            # Q^T (I - Z Z^T) P E = (P^T Q)^T E, as Q is orthogonal to Z; P^T is the order back, or
+            # the same signs again
+            back = [np.argsort(by) if by.dtype.kind == "i" else by for by in batch]
+            B = project(np.concatenate([rearranged(Q, by) for by in back], axis=1), q)
+            if r == 0 or (r == 1 and self.variances == "equal"):
+                # the intercept is moved by no permutation, and no sign is with none: the scatter
+                # stays 1
+                return (B**2).sum(axis=(1, 2))  # (b, v)
+            A = project(np.concatenate([rearranged(Z, by) for by in back], axis=1), r)
+            return explained_share(A, B)
+
+        share = (project(Q, q)[0] ** 2).sum(axis=(0, 1))
+        least = share * (1 - 1e-6) - (1e-7 if r else 0)  # of an equal share, in single precision
+        at_once = max(1, int(2e7 // (v * k * (q + r))))  # 80 MB of products
+        return share, *self.p_values(of, least, at_once)
 
 
-def _places(blocks, n):
-    """Where each block of exchangeable shapes stands; all are one block where none is named."""
-    if blocks is None:
-        return [np.arange(n)]
-    return [np.flatnonzero(blocks == one) for one in np.unique(blocks)]
+def p_values(
+    others: Iterator[np.ndarray],
+    n_others: int,
+    statistic: Callable[[list[np.ndarray]], np.ndarray],
+    least: Any,
+    at_once: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """As :meth:`Model.p_values`, of rearrangements that are given, and how many these are."""
+    reached = np.zeros(np.shape(least), np.int64)
+    largest = [np.empty(0, np.float32)]
+    for batch in batched(others, at_once):
+        found = statistic(batch)
+        reached += (found >= least).sum(0)
+        largest.append(found.reshape(len(found), -1).max(1))
+    beyond = n_others - np.searchsorted(np.sort(np.concatenate(largest)), least, side="left")
+    return (1 + reached) / (1 + n_others), (1 + beyond) / (1 + n_others)
 
 
 def _count_orders(rows):
@@ -168,116 +458,21 @@ def _count_orders(rows):
     return math.factorial(len(rows)) // math.prod(map(math.factorial, same))
 
 
-def smallest_p(
-    n_permutations: int,
-    x: np.ndarray,
-    covariates: np.ndarray | None = None,
-    variances: str = "equal",
-    blocks: np.ndarray | None = None,
-) -> float:
-    """The smallest p that a permutation test of x, a variable or indicators, can reach.
-
-    Bound by the number of permutations drawn, and by how many are different: two that only exchange
-    shapes of equal values, or groups of equal size, or turn round a variable that is symmetric
-    about its mean, give the same statistic.
-
-    Parameters
-    ----------
-    n_permutations : int
-    x, covariates, variances, blocks : see :func:`permutation_test`
-
-    Examples
-    --------
-    >>> from s4a.analysis.permutation import indicators, smallest_p
-    >>> x = indicators(list("aaabbb"))[1]
-    >>> smallest_p(99, range(20)), smallest_p(9999, x)
-    (0.01, 0.1)
-    """
-    if covariates is not None and not np.ptp(covariates, axis=0).any():
-        covariates = None  # a constant is in the mean, and changes nothing
-    rows = _rows(x, covariates)
-    same = 1
-    if covariates is None and variances == "equal" and rows.shape[1] == 1:
-        sides = [np.sort(rows[of, 0]) for of in _places(blocks, len(rows))]
-        size = np.ptp(rows)
-        turned = all(np.ptp(one + one[::-1]) <= 1e-9 * size for one in sides)
-        same = 2 if turned else 1  # the order of all turned round changes but the sign of a slope
-    elif covariates is None and variances == "equal" and blocks is None:
-        code = np.unique(rows, axis=0, return_inverse=True)[1].ravel()
-        sizes = np.bincount(code).tolist()
-        is_grouping = len(sizes) == rows.shape[1] + 1
-        if is_grouping:  # groups of equal size may change places
-            same = math.prod(math.factorial(sizes.count(s)) for s in set(sizes))
-    return max(
-        1 / (n_permutations + 1), same / count_rearrangements(x, covariates, variances, blocks)
-    )
-
-
-def rearrangements(
-    x: np.ndarray,
-    covariates: np.ndarray | None,
-    n_permutations: int,
-    seed: int,
-    variances: str = "equal",
-    blocks: np.ndarray | None = None,
-) -> tuple[Iterator[np.ndarray], int]:
-    """What is done to the residuals: orders, or signs; all others where there are no more.
-
-    Parameters
-    ----------
-    x, covariates, n_permutations, seed, variances, blocks : see :func:`permutation_test`
-
-    Returns
-    -------
-    rearrangements : iterator of ndarray (n,)
-        Integers, the residual that comes to each place; or with unequal variances 1.0 and -1.0.
-    n_rearrangements : int
-        `n_permutations`, or the number of all that differ from what is given and each other.
-
-    Examples
-    --------
-    >>> from s4a.analysis.permutation import rearrangements
-    >>> others, n = rearrangements([0, 0, 0, 1, 1, 1], None, 999, seed=0)
-    >>> n, next(others).tolist()
-    (19, [0, 1, 3, 2, 4, 5])
-    """
-    n = len(x)
-    rng = np.random.default_rng(seed)
-    n_others = count_rearrangements(x, covariates, variances, blocks) - 1
-    is_exact = n_others <= n_permutations
-    if variances == "unequal":
-        code = np.arange(n) if blocks is None else np.unique(blocks, return_inverse=True)[1]
-        n_signs = code.max() + 1
-        every = itertools.product([1.0, -1.0], repeat=n_signs - 1)
-        signs = (np.array([1.0, *row])[code] for row in itertools.islice(every, 1, None))
-        drawn = (rng.choice([-1.0, 1.0], n_signs)[code] for _ in range(n_permutations))
-        return (signs, n_others) if is_exact else (drawn, n_permutations)
-    if blocks is not None:
-        within = _orders_within(_rows(x, covariates), blocks, rng, is_exact)
-        return itertools.islice(within, n_others if is_exact else n_permutations), (
-            n_others if is_exact else n_permutations
-        )
-    if is_exact:
-        return itertools.islice(_all_orders(_rows(x, covariates)), 1, None), n_others
-    return (rng.permutation(n) for _ in range(n_permutations)), n_permutations
-
-
-def _orders_within(rows, blocks, rng, is_exact):
-    """Orders that leave every shape in its block: all but the one as is, or drawn without end."""
-    places = _places(blocks, len(rows))
-    if is_exact:
-        each = [[of[order] for order in _all_orders(rows[of])] for of in places]
-        for chosen in itertools.islice(itertools.product(*each), 1, None):
-            order = np.empty(len(rows), int)
-            order[np.concatenate(places)] = np.concatenate(chosen)
-            yield order
-        return
-    code = np.unique(blocks, return_inverse=True)[1]
-    sorted_places = np.argsort(code, kind="stable")
-    while True:
+def _orders_within(rows, places):
+    """Every order once that leaves each shape in its block, as is first."""
+    each = [[of[order] for order in _all_orders(rows[of])] for of in places]
+    for chosen in itertools.product(*each):
         order = np.empty(len(rows), int)
-        order[sorted_places] = np.lexsort((rng.random(len(rows)), code))
+        order[np.concatenate(places)] = np.concatenate(chosen)
         yield order
+
+
+def _drawn_within(blocks, rng):
+    """An order that leaves each shape in its block."""
+    code = np.unique(blocks, return_inverse=True)[1]
+    order = np.empty(len(code), int)
+    order[np.argsort(code, kind="stable")] = np.lexsort((rng.random(len(code)), code))
+    return order
 
 
 def _all_orders(rows):
@@ -308,67 +503,6 @@ def rearranged(rows: np.ndarray, by: np.ndarray) -> np.ndarray:
     return rows * by.reshape(-1, *[1] * (rows.ndim - 1))
 
 
-def _rows(x, covariates):
-    """The model of each shape: what is tested, and the covariates ``(n, q + c)``."""
-    x = np.reshape(x, (len(x), -1))
-    return x if covariates is None else np.column_stack([x, covariates])
-
-
-def permutation_test(
-    scores: np.ndarray,
-    x: np.ndarray,
-    *,
-    covariates: np.ndarray | None = None,
-    n_permutations: int = 9999,
-    seed: int = 0,
-    variances: str = "equal",
-    blocks: np.ndarray | None = None,
-) -> tuple[float, float]:
-    """Permutation test of Hotelling's T^2 of scores on a variable or on groups.
-
-    Parameters
-    ----------
-    scores : float ndarray (n, p)
-    x : float ndarray (n,) or (n, q)
-        A variable, or :func:`indicators`.
-    covariates : float ndarray (n, c), optional
-    n_permutations : int
-    seed : int
-    variances : {"equal", "unequal"}
-        Residuals are permuted, or have their signs changed.
-    blocks : ndarray (n,), optional
-        Residuals are permuted within these, or change their signs with all of their block; x,
-        covariates and what is tested have mean zero in every block then.
-
-    Returns
-    -------
-    statistic : float
-    p : float
-        (1 + number of permutations that reach the statistic) / (1 + number of permutations); exact
-        where no more than `n_permutations` are different, as all are gone through then.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from s4a.analysis.permutation import permutation_test
-    >>> scores = np.random.default_rng(0).normal(size=(20, 3))
-    >>> x = np.repeat([0.0, 1.0], 10)
-    >>> permutation_test(scores + 3 * x[:, None], x, n_permutations=99, seed=1)[1]
-    0.01
-    """
-    Z, Q = design(x, covariates)
-    E = scores - Z @ (Z.T @ scores)
-    dof = len(E) - Z.shape[1] - Q.shape[1]
-    statistic = float(hotelling(E, Q, dof))
-    others, n_others = rearrangements(x, covariates, n_permutations, seed, variances, blocks)
-    reached = 0
-    for batch in batched(others, max(1, 1_000_000 // E.size)):
-        permuted = np.stack([rearranged(E, by) for by in batch])  # (b, n, p)
-        found = hotelling(permuted - Z @ (Z.T @ permuted), Q, dof)
-        reached += int((found >= statistic * (1 - 1e-9)).sum())
-    return statistic, (1 + reached) / (1 + n_others)
-
-
 def scatter_test(
     coordinates: np.ndarray, x: np.ndarray, *, covariates: np.ndarray | None = None
 ) -> tuple[np.ndarray, float]:
@@ -378,7 +512,7 @@ def scatter_test(
     ----------
     coordinates : float ndarray (n, p)
         Of the shapes on all components, in the unit of the input.
-    x, covariates : see :func:`permutation_test`
+    x, covariates : see :class:`Model`
 
     Returns
     -------
@@ -418,153 +552,6 @@ def whiten(E: np.ndarray) -> np.ndarray:
     is_zero = value <= 1e-10 * np.where(largest > 0, largest, 1)
     root = np.sqrt(np.where(is_zero, 1, value))
     return np.einsum("nvd,vde,ve->nve", E, V, np.where(is_zero, 0, 1 / root), optimize=True)
-
-
-def vertex_test(
-    d: np.ndarray,
-    x: np.ndarray,
-    *,
-    covariates: np.ndarray | None = None,
-    n_permutations: int = 999,
-    seed: int = 0,
-    variances: str = "equal",
-    blocks: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Permutation test at every vertex, with p values corrected for all by the largest (max-T).
-
-    The statistic is Pillai's trace, the share 0..1 of the vectors' scatter that X explains; for one
-    column of X, T^2 = dof V / (1 - V).  The scatter is that of the residuals on Z, for every
-    permutation its own: with covariates those of permuted residuals scatter less, and beside the
-    first scatter their shares would be too small.
-
-    Parameters
-    ----------
-    d : float ndarray (n, v, k)
-        Fields of vectors, or with k = 1 of numbers.
-    x, covariates, n_permutations, seed, variances, blocks : see :func:`permutation_test`
-
-    Returns
-    -------
-    share : float ndarray (v,)
-    p : float ndarray (v,), of each vertex alone
-    p_max : float ndarray (v,), family-wise (Westfall & Young 1993, single step)
-
-    Raises
-    ------
-    ValueError
-        When X explains nothing that the covariates leave, or there are too few shapes.
-    """
-    Z, Q = design(x, covariates)
-    n, v, k = d.shape
-    r, q = Z.shape[1], Q.shape[1]
-    if n - r <= k:  # the residuals fill all dimensions: whatever is tested explains all of them
-        raise ValueError(
-            f"{n} shapes are too few for a test of {k} coordinates at a vertex with {r} columns of "
-            f"mean and covariates: {r + k + 1} needed, or fewer covariates, or of='normal'"
-        )
-    E = np.asarray(d, float).reshape(n, -1)  # (n, v k)
-    rounding = 1e-12 * abs(E).max()
-    E = (E - Z @ (Z.T @ E)).reshape(n, v, k)
-    E[:, abs(E).max((0, 2)) <= rounding] = 0  # where nothing varies there is nothing to explain
-    E = whiten(E)
-    E = E.transpose(0, 2, 1).reshape(n, -1).astype(np.float32)  # (n, k v)
-
-    def project(columns, per):
-        """Products of b times `per` columns ``(n, b per)`` with the residuals: (b, per, k, v)."""
-        return (columns.T.astype(np.float32) @ E).reshape(-1, per, k, v)
-
-    others, n_others = rearrangements(x, covariates, n_permutations, seed, variances, blocks)
-    share = (project(Q, q)[0] ** 2).sum(axis=(0, 1))
-    least = share * (1 - 1e-6) - 1e-7  # of an equal share, in single precision
-    reached = np.zeros(v, np.int64)
-    largest = np.empty(0, np.float32)
-    block = max(1, int(2e7 // (v * k * (q + r))))  # permutations at once: 80 MB of products
-    for batch in batched(others, block):
-        # Q^T (I - Z Z^T) P E = (P^T Q)^T E, as Q is orthogonal to Z; P^T is the order back, or the
-        # same signs again
-        back = [np.argsort(by) if by.dtype.kind == "i" else by for by in batch]
-        B = project(np.concatenate([rearranged(Q, by) for by in back], axis=1), q)
-        if r == 1 and variances == "equal":
-            # Z is the intercept alone, which no permutation moves: the scatter stays 1
-            permuted = (B**2).sum(axis=(1, 2))  # (b, v)
-        else:
-            A = project(np.concatenate([rearranged(Z, by) for by in back], axis=1), r)
-            permuted = explained_share(A, B)
-        reached += (permuted >= least).sum(0)
-        largest = np.append(largest, permuted.max(1))
-    beyond = n_others - np.searchsorted(np.sort(largest), least, side="left")
-    return share, (1 + reached) / (1 + n_others), (1 + beyond) / (1 + n_others)
-
-
-def mean_test(
-    d: np.ndarray,
-    *,
-    floor: np.ndarray | None = None,
-    n_permutations: int = 999,
-    seed: int = 0,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Whether the mean of fields is zero, at every vertex: by changes of their signs.
-
-    The statistic is the share 0..1 of the vectors' scatter around zero that their mean has;
-    Hotelling's T^2 of one sample is (n - 1) share / (1 - share).  No change of sign changes that
-    scatter, so that the test is exact where errors are symmetric.
-
-    Parameters
-    ----------
-    d : float ndarray (n, v, k)
-        Fields of vectors, or with k = 1 of numbers.
-    floor : float ndarray (v,), optional
-        A standard error of the mean that is added to that of the fields, so that where they hardly
-        scatter a mean as small does not count.
-    n_permutations, seed : see :func:`permutation_test`
-
-    Returns
-    -------
-    share, p, p_max : float ndarray (v,)
-        As of :func:`vertex_test`.
-
-    Raises
-    ------
-    ValueError
-        When there are too few fields.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from s4a.analysis.permutation import mean_test
-    >>> d = np.random.default_rng(0).normal(size=(12, 50, 3))
-    >>> d[:, 0] += [3, 0, 0]
-    >>> bool(mean_test(d, n_permutations=199)[2].argmin() == 0)
-    True
-    """
-    n, v, k = d.shape
-    if n <= k:
-        raise ValueError(
-            f"{n} shapes are too few for a test of {k} coordinates at a vertex: {k + 1} needed, or "
-            "of='normal'"
-        )
-    E = whiten(np.asarray(d, float))
-    if floor is not None:
-        scatter = (np.asarray(d, float) ** 2).sum((0, 2))
-        whole = scatter + (n * floor) ** 2
-        E = E * np.sqrt(scatter / np.where(whole > 0, whole, 1))[:, None]
-    E = E.transpose(0, 2, 1).reshape(n, -1).astype(np.float32)
-
-    def explained(signs):
-        """Shares ``(b, v)`` of the means of fields with these signs ``(b, n)``."""
-        mean = (signs / np.sqrt(n)).astype(np.float32) @ E
-        return (mean.reshape(-1, k, v) ** 2).sum(1)
-
-    others, n_others = rearrangements(np.arange(n), None, n_permutations, seed, "unequal")
-    share = explained(np.ones((1, n)))[0]
-    reached = np.zeros(v, np.int64)
-    largest = np.empty(0, np.float32)
-    for batch in batched(others, max(1, int(2e7 // (v * k)))):
-        changed = explained(np.array(batch))
-        reached += (changed >= share * (1 - 1e-6)).sum(0)
-        largest = np.append(largest, changed.max(1))
-    beyond = n_others - np.searchsorted(np.sort(largest), share * (1 - 1e-6), side="left")
-    return share, (1 + reached) / (1 + n_others), (1 + beyond) / (1 + n_others)
 
 
 def batched(items: Iterator[Any], size: int) -> Iterator[list[Any]]:

@@ -24,7 +24,6 @@ import xarray as xr
 from scipy import stats
 
 from s4a.analysis.effects import (
-    check_permutations,
     group_map,
     group_test,
     predict,
@@ -35,7 +34,7 @@ from s4a.analysis.effects import (
 from s4a.analysis.generalization import generalization
 from s4a.analysis.inputs import Values, displacements_of, group_sizes, sample_of, with_doubtful
 from s4a.analysis.model import KEPT, count_components, evaluate, leave_one_out, sample
-from s4a.analysis.permutation import indicators, smallest_p
+from s4a.analysis.permutation import Model, check_permutations, indicators
 from s4a.analysis.restrict import with_size, within, without
 from s4a.method.pca import gram, principal_components
 from s4a.schema import dataset, in_unit, unit_of
@@ -217,7 +216,7 @@ def classify(
     *_, p = permutation_test_score(steps, coordinates, group, random_state=seed, **options)
     attrs = {
         "permutations": n_permutations,
-        "smallest_p": smallest_p(n_permutations, indicators(group)[1]),
+        "smallest_p": Model(indicators(group)[1], n_permutations=n_permutations).smallest_p,
         "groups": sizes,
         "left_out": sample.said["left_out"],
         "balanced_accuracy": float(balanced_accuracy_score(group, predicted)),

@@ -15,6 +15,7 @@ from sklearn.svm import SVC
 from s4a import statistics, synthesize, synthetic, write_page
 from s4a.analysis import model, permutation
 from s4a.analysis.inputs import displacements_of, values_of
+from s4a.analysis.permutation import Model
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.method.pca import gram, gram_pca, pca, principal_components
 from s4a.schema import dataset
@@ -73,10 +74,10 @@ def test_a_mode_of_a_regression_explains_what_covariates_leave_of_its_variable(p
 
 
 def test_the_smallest_p_knows_of_a_symmetric_variable_and_of_constants():
-    assert permutation.smallest_p(999, np.arange(4)) == 2 / 24
-    assert permutation.smallest_p(999, np.array([0, 1, 2, 4])) == 1 / 24
+    assert Model(np.arange(4)).smallest_p == 2 / 24
+    assert Model(np.array([0, 1, 2, 4])).smallest_p == 1 / 24
     x = permutation.indicators(list("aaabbb"))[1]
-    assert permutation.smallest_p(999, x, np.ones((6, 1))) == permutation.smallest_p(999, x) == 0.1
+    assert Model(x, np.ones((6, 1))).smallest_p == Model(x).smallest_p == 0.1
 
 
 def test_where_nothing_varies_a_test_of_vertices_finds_nothing():
@@ -84,7 +85,7 @@ def test_where_nothing_varies_a_test_of_vertices_finds_nothing():
     for z in (None, np.arange(6.0)[:, None]):
         d = np.full((6, 3, 1), 0.1) * np.array([1, 1, 1, 1, 1, 1 + 1e-15])[:, None, None]
         d[:, 2, 0] = [0, 0.1, 0, 3, 3.2, 3]
-        share, p, _ = permutation.vertex_test(d, x, covariates=z)
+        share, p, _ = Model(x, z).vertex_test(d)
         assert share[:2].tolist() == [0, 0]
         assert p[:2].tolist() == [1, 1]
         assert share[2] > 0.5
@@ -285,9 +286,7 @@ def test_p_values_are_uniform_without_a_difference(with_covariates):
         Z = rng.normal(size=(18, 2)) + x[:, None] if with_covariates else None
         scores = rng.standard_t(5, size=(18, 4)) @ rng.normal(size=(4, 4))
         scores += 0 if Z is None else 2 * Z[:, :1]
-        p.append(
-            permutation.permutation_test(scores, x, covariates=Z, n_permutations=99, seed=seed)[1]
-        )
+        p.append(Model(x, Z, n_permutations=99, seed=seed).test(scores)[1])
     assert stats.kstest(p, "uniform").pvalue > 0.05
     assert np.mean(np.array(p) <= 0.05) <= 0.11
 
@@ -295,8 +294,8 @@ def test_p_values_are_uniform_without_a_difference(with_covariates):
 def test_family_wise_p_values_keep_their_level():
     x = np.repeat([0.0, 1.0], 9)
     found = [
-        permutation.vertex_test(
-            np.random.default_rng(seed).normal(size=(18, 60, 3)), x, n_permutations=99, seed=seed
+        Model(x, n_permutations=99, seed=seed).vertex_test(
+            np.random.default_rng(seed).normal(size=(18, 60, 3))
         )
         for seed in range(100)
     ]
@@ -311,7 +310,7 @@ def test_covariates_do_not_raise_the_family_wise_error(n, c):
     for seed in range(80):
         rng = np.random.default_rng(seed)
         d, x, Z = rng.normal(size=(n, 30, 3)), rng.normal(size=n), rng.normal(size=(n, c))
-        p_max = permutation.vertex_test(d, x, covariates=Z, n_permutations=99, seed=seed)[2]
+        p_max = Model(x, Z, n_permutations=99, seed=seed).vertex_test(d)[2]
         smallest.append(p_max.min())
     assert np.mean(np.array(smallest) <= 0.05) < 0.16  # four standard errors above 0.05
 
@@ -336,7 +335,7 @@ def test_the_share_of_permuted_residuals_has_the_scatter_of_that_permutation():
 def test_the_statistics_are_those_of_the_textbook():
     rng = np.random.default_rng(4)
     d, x = rng.normal(size=(14, 5, 3)), np.repeat([0.0, 1.0], [6, 8])
-    share, _, _ = permutation.vertex_test(d, x, n_permutations=0)
+    share, _, _ = Model(x, n_permutations=0).vertex_test(d)
     for v in range(5):
         a, b = d[:6, v], d[6:, v]
         S = (np.cov(a.T, bias=True) * 6 + np.cov(b.T, bias=True) * 8) / 12
@@ -344,14 +343,12 @@ def test_the_statistics_are_those_of_the_textbook():
         assert 12 * share[v] / (1 - share[v]) == pytest.approx(
             6 * 8 / 14 * gap @ np.linalg.solve(S, gap), rel=1e-4
         )
-    one, _, _ = permutation.vertex_test(d[..., :1], x, n_permutations=0)
+    one, _, _ = Model(x, n_permutations=0).vertex_test(d[..., :1])
     t = stats.ttest_ind(d[:6, :, 0], d[6:, :, 0]).statistic
     assert 12 * one / (1 - one) == pytest.approx(t**2, rel=1e-4)
     three = np.repeat(["a", "b", "c"], [4, 5, 5])
     F = stats.f_oneway(*(d[three == g, :, 0] for g in "abc")).statistic
-    share, _, _ = permutation.vertex_test(
-        d[..., :1], permutation.indicators(three)[1], n_permutations=0
-    )
+    share, _, _ = Model(permutation.indicators(three)[1], n_permutations=0).vertex_test(d[..., :1])
     assert 11 / 2 * share / (1 - share) == pytest.approx(F, rel=1e-4)
 
 
@@ -478,11 +475,11 @@ def test_where_few_permutations_are_different_p_is_exact():
     t = abs(stats.ttest_ind(d[:3], d[3:]).statistic[:, 0])
     splits = [[i, j, k] for i in range(6) for j in range(i) for k in range(j)]
     others = [abs(stats.ttest_ind(d[s], np.delete(d, s, axis=0)).statistic[:, 0]) for s in splits]
-    _, p, _ = permutation.vertex_test(d, x, n_permutations=999)
+    _, p, _ = Model(x).vertex_test(d)
     assert p == pytest.approx((np.array(others) >= t - 1e-6).mean(0))
-    assert p.min() == permutation.smallest_p(999, x) == pytest.approx(0.1)
-    assert permutation.permutation_test(d[:, :, 0], x)[1] == pytest.approx(0.1)
-    many, n = permutation.rearrangements(x, np.array([0, 1, 0, 1, 0, 1.0]), 9999, seed=0)
+    assert p.min() == Model(x).smallest_p == pytest.approx(0.1)
+    assert Model(x).test(d[:, :, 0])[1] == pytest.approx(0.1)
+    many, n = Model(x, np.array([0, 1, 0, 1, 0, 1.0])).rearrangements()
     assert len({tuple(order) for order in many}) == n == 720 / 4 - 1
 
 
@@ -525,7 +522,7 @@ def test_groups_of_unequal_scatter_are_told_and_signs_hold_the_level(caplog):
         d = np.random.default_rng(seed).normal(size=(20, 30, 3)) * (1 + x)[:, None, None]
         for variances, smallest in found.items():
             options = {"n_permutations": 99, "seed": seed, "variances": variances}
-            smallest.append(permutation.vertex_test(d, x, **options)[2].min())
+            smallest.append(Model(x, **options).vertex_test(d)[2].min())
     assert np.mean(np.array(found["equal"]) <= 0.05) > 0.3
     assert np.mean(np.array(found["unequal"]) <= 0.05) < 0.16
     u, T = as_arrays(synthetic.sphere(100))
