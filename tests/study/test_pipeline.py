@@ -134,7 +134,7 @@ def test_labels_stay_with_a_mesh_in_memory_that_is_cleaned(meshes):
     X, T = as_arrays(mesh)
     more = np.concatenate([[[900.0, 0, 0]], X])  # a vertex of no triangle: cleaning drops it
     given = dataset(position=more, corner_vertex=T + 1, label=[99, *mesh["label"].values])
-    cleaned = tasks.cleaned(given, "", Options().of_cleaning)
+    cleaned = tasks.cleaned(given, "", Options().of("cleaning"))
     assert cleaned["label"].values.tolist() == mesh["label"].values.tolist()
 
 
