@@ -364,8 +364,8 @@ class Study:
 
     def __contains__(self, node: str) -> bool:
         stage, _, name = node.partition("/")
-        found = self.tree.children.get(stage, {})
-        return stage in self.tree.children and (not name or name in found.children)
+        found = self.tree.children.get(stage)
+        return found is not None and (not name or name in found.children)
 
     def __getitem__(self, node: str) -> xr.Dataset:
         return self.tree[node].to_dataset()
@@ -399,8 +399,8 @@ def template_of(study: xr.DataTree) -> str:
     return study["latent"].attrs["median"]
 
 
-def motion_in(study: Study, name: str) -> Motion | None:
-    """Motion of a shape onto the reference of the network; None where the study has no motions.
+def motion_in(study: Study, name: str) -> Any:
+    """Motion (R, t) of a shape onto the reference of the network; None where there are none.
 
     A shape apart from the network is moved there now, if that is not in the study.
     """
@@ -416,7 +416,7 @@ def motion_in(study: Study, name: str) -> Motion | None:
     return motion_onto(shape_in(study, name).low, shape_in(study, network.attrs["reference"]).low)
 
 
-def latent_bases(study: Study, *names: str) -> list[np.ndarray]:
+def latent_bases(study: Study, *names: str) -> tuple[Any, ...]:
     """The latent bases Y ``(k, m)`` of some shapes of a study.
 
     Those of the network are in ``/latent``, those of a shape apart in ``/latent/<shape>``.
@@ -430,7 +430,7 @@ def latent_bases(study: Study, *names: str) -> list[np.ndarray]:
             bases.append(latent["latent_basis"].values[known.index(name)])
         else:
             raise ValueError(f"no shape {name!r} in the network; it has {', '.join(known)}")
-    return bases
+    return tuple(bases)
 
 
 def place_in(

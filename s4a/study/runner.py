@@ -147,7 +147,7 @@ class Run:
         begin, now = time.perf_counter(), time.time()
         self.doing, self.workers = name, {}
         before = self.costs.get(name, [0.0, 0.0]) if share < 1 else [0.0, 0.0]
-        self.notes.stages[name] = Stage(done, of, done, now, *before, False)
+        self.notes.stages[name] = Stage(done, of, done, now, before[0], before[1], False)
         self.notes.write()
         whole = False
         try:
@@ -159,9 +159,9 @@ class Run:
                 peak = together(self.workers, effective_n_jobs(self.n_jobs))
                 self.costs[name] = [before[0] + spent, float(np.fmax(before[1], peak))]
             n_done = of if whole else self.notes.stages[name].done
-            self.notes.stages[name] = Stage(n_done, of, done, now, *self.costs[name], whole)
+            seconds, peak = self.costs[name]
+            self.notes.stages[name] = Stage(n_done, of, done, now, seconds, peak, whole)
             self.notes.write()
-        peak = self.costs[name][1]
         log.info("%s: %d of %d were to do, %.1f s, %.0f MiB", name, of - done, of, spent, peak)
 
     def do(self, stage: str, tasks: list[Task], *, each: bool = True) -> Keys:

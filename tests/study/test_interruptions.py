@@ -19,7 +19,7 @@ import pytest
 
 from s4a import analyse, cli, open_study, synthetic
 from s4a.schema import dataset
-from s4a.study import doubts, netcdf, originals, pipeline, processes, sources, store, tasks
+from s4a.study import doubts, netcdf, pipeline, processes, sources, store, tasks
 from s4a.study.progress import FILE
 from s4a.study.runner import Run
 
@@ -381,7 +381,7 @@ def assert_equal_but_paths(folder, whole):
 def test_an_error_in_the_task_of_one_shape_costs_that_shape_and_is_told(
     files, tmp_path, monkeypatch, capsys, error, stage
 ):
-    module = {"clean_shape": originals, "compare_shape": doubts}.get(stage, pipeline)
+    module = {"compare_shape": doubts}.get(stage, pipeline)
     task = getattr(module, stage)
 
     def wrong(*arguments):

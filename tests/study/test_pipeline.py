@@ -258,7 +258,7 @@ def test_the_standard_way_runs(brains):
 
 
 def test_an_unknown_template_is_refused_with_the_names_before_a_shape_is_read(brains, monkeypatch):
-    monkeypatch.setattr("s4a.study.originals.clean_shape", None)
+    monkeypatch.setattr("s4a.study.pipeline.clean_shape", None)
     with pytest.raises(ValueError, match="template 'x' is none of the shapes: brain_01, brain_02"):
         analyse(brains, template="x", **OPTIONS)
 
@@ -386,7 +386,7 @@ def test_one_usable_shape_is_not_enough_and_the_reasons_are_named(arrays):
 def test_an_option_out_of_range_is_refused_with_the_legal_range_before_a_shape_is_read(
     brains, options, message, monkeypatch
 ):
-    monkeypatch.setattr("s4a.study.originals.clean_shape", None)
+    monkeypatch.setattr("s4a.study.pipeline.clean_shape", None)
     with pytest.raises(ValueError, match=message):
         analyse(brains, **OPTIONS | options)
 
