@@ -80,7 +80,7 @@ def program_errors(C, cycles, k=None, *, n_jobs=1):
 
 
 def pyfm_fit(source, target, motion, *, k_init=20, init="landmarks", near=None):
-    """pyFM's first map: wave kernels of the shapes and around the landmarks, its own weights."""
+    """PyFM's first map: wave kernels of the shapes and around the landmarks, its own weights."""
     from pyFM.functional import FunctionalMapping
     from pyFM.mesh import TriMesh
 

@@ -56,7 +56,7 @@ def unpacked(name, folder):
 
 
 def peer(source, target, landmarks, truth, k_init=20, k=100, step=5):
-    """pyFM's own pipeline: spectrum, wave kernel and landmark descriptors, fit, ZoomOut, match."""
+    """PyFM's own pipeline: spectrum, wave kernel and landmark descriptors, fit, ZoomOut, match."""
     from pyFM.functional import FunctionalMapping
     from pyFM.mesh import TriMesh
 

@@ -32,7 +32,6 @@ import xarray as xr
 
 from s4a import analyse, cli, open_study, synthetic
 from s4a.show import draw, page, pictures
-from s4a.study import store
 
 N_SHAPES, N_VERTICES = 6, 400
 OPTIONS = {"n_coarse": 150, "k_init": 8, "k": 12, "intersections": False, "keep_doubtful": True}
@@ -115,7 +114,7 @@ def written(folder):
     found = {}
     for path in sorted(p for p in folder.rglob("*") if p.is_file()):
         if path.suffix == ".nc":
-            with xr.open_dataset(path, engine=store.ENGINE) as data:
+            with xr.open_dataset(path, engine="h5netcdf") as data:
                 found[path.name] = digest_of(xr.DataTree(data.load()))
         else:
             found[path.name] = hashlib.sha256(path.read_bytes()).hexdigest()

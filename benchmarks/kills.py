@@ -30,7 +30,7 @@ from pathlib import Path
 import psutil
 
 from s4a import cli, synthetic
-from s4a.study import store
+from s4a.study import netcdf
 
 SMALL = "--no-intersections --keep-doubtful --n-coarse 100 --k-init 8 --k 12".split()
 STAGES = {  # the first file of each, the last stage first
@@ -202,7 +202,7 @@ def contents(study):
     """Every file of a study, without what the clock says."""
     found = {}
     for path in list_files(study):
-        data, file = store.read(path), path.relative_to(study).as_posix()
+        data, file = netcdf.read(path), path.relative_to(study).as_posix()
         found[file] = data.drop_dims("stage") if file == "report.nc" else data
     return found
 

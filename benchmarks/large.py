@@ -30,7 +30,7 @@ import psutil
 
 import s4a
 from s4a import synthetic
-from s4a.study import store
+from s4a.study import netcdf
 from s4a.study.progress import FILE, STAGES
 
 BATCH = 50  # brains that are made at once, all of one population
@@ -183,7 +183,7 @@ def equal_studies(a, b):
         return "not the same files"
     differ = []
     for name in names:
-        one, other = (store.read(study / name) for study in (a, b))
+        one, other = (netcdf.read(study / name) for study in (a, b))
         if name == "report.nc":
             one, other = one.drop_dims("stage"), other.drop_dims("stage")
         if not one.identical(other):

@@ -144,7 +144,7 @@ def skulls(folder, store, few, _seed):
 
 
 def drift(study, X):
-    """rustcpd's completed shape and standard deviation of a coordinate at every vertex."""
+    """Rustcpd's completed shape and standard deviation of a coordinate at every vertex."""
     import rustcpd
 
     registration, modes = (study[node].to_dataset() for node in ("registration", "pca"))

@@ -23,7 +23,7 @@ import numpy as np
 import s4a
 from s4a import synthetic
 from s4a.analysis import model
-from s4a.study import store
+from s4a.study import netcdf, store
 from s4a.study.runner import Run
 
 STARTS = {
@@ -111,7 +111,7 @@ def study_of(n, folder):
         for stage in ("original", "coarse", "registration"):
             shutil.copy(folder / stage / f"{own[i % 4]}.nc", folder / stage / f"{name}.nc")
     for of_all in ("latent", "report"):
-        data = store.read(folder / f"{of_all}.nc")
+        data = netcdf.read(folder / f"{of_all}.nc")
         key, made_from = data.attrs["task_key"], data.attrs["made_from"].split()
         data = data.isel(shape=np.arange(n) % 4).assign_coords(shape=names)
         store.write(data, folder / f"{of_all}.nc", key, made_from)

@@ -3,7 +3,7 @@
 Every row runs in a process of its own with one BLAS thread, ours and the other in turn, on the same
 input: seconds of CPU, of the clock, and the peak of memory above what the process holds before.
 pyFM is on PyPI as ``pyfmaps`` (the extra ``bench``).  ``speed.py stages``, ``pipelines``,
-``growth``, ``pairs``, ``nearest``, ``write`` or ``seals`` runs one part, ``speed.py methods brains
+``growth``, ``pairs``, ``nearest``, or ``write`` runs one part, ``speed.py methods brains
 faces heads`` an analysis by RE-MATCH and by SCALABLE of ten shapes of each, ``speed.py whole 51
 100000`` the whole analysis of so many synthetic shapes of so many vertices, ``speed.py versions 51
 100000`` the same by an older version and by this one, three times in turn.
@@ -22,10 +22,8 @@ import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from unittest import mock
 
 import numpy as np
-import xarray as xr
 from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 
@@ -43,7 +41,7 @@ from s4a.method.pca import gram_pca
 from s4a.method.register import match_functions
 from s4a.method.shape import Shape
 from s4a.options import Options
-from s4a.study import store
+from s4a.study import netcdf
 from s4a.study.netcdf import write_netcdf
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -837,45 +835,16 @@ def cpu_of(function, times=20):
     return min(spent)
 
 
-def seals(folder):
-    """What the seal of a study's files costs: one mesh, and the files of 1,000 small ones.
-
-    A file that has one is read by the header in it, any other by what HDF5 says.
-    """
-    file, plain = folder / "sealed.nc", folder / "plain.nc"
-    say(f"{'ms of CPU':28} {'open':>8} {'read':>8} {'is done':>8} {'write':>8}")
-    sealed = {"add_seal": store.add_seal}
-    none = {"add_seal": lambda whole: None, "SEALED": "no_checksums"}
-    for n_vertices in (1500, VERTICES):
-        mesh = synthetic.brains(1, n_vertices)["original/brain_01"].to_dataset()
-        for name, path, instead in (("with its seal", file, sealed), ("without", plain, none)):
-            with mock.patch.multiple(store, **instead):
-                write = cpu_of(lambda path=path, mesh=mesh: store.write(mesh, path, "key"), 5)
-            steps = store.open_file, store.read, lambda path: store.is_done(path, "key")
-            costs = [cpu_of(lambda step=step, path=path: step(path)) for step in steps]
-            row = " ".join(f"{cost:8.1f}" for cost in [*costs, write])
-            say(f"{f'{n_vertices:,} vertices, {name}':28} {row}")
-        with xr.open_dataset(plain, engine=store.ENGINE):
-            other = cpu_of(lambda: xr.open_dataset(plain, engine=store.ENGINE).close())
-        say(f"{'  xarray.open_dataset':28} {other:8.1f}")
-    store.write(synthetic.brains(1, 1500)["original/brain_01"].to_dataset(), file, "key")
-    names = [shutil.copy(file, folder / f"{i}.nc") for i in range(1000)]
-    begin = time.process_time()
-    for name in names:
-        store.open_file(name)
-    say(f"1,000 files of 1,500 vertices opened: {time.process_time() - begin:.1f} s of CPU")
-
-
 def write(folder):
     """Every file of a study of six brains of 3,000 vertices, as s4a and as xarray write it."""
     s4a.analyse(synthetic.brains(6, 3000), store=folder, n_coarse=800, n_jobs=1)
     paths = sorted(folder.rglob("*.nc"))
-    files = [store.read(path).load().drop_encoding() for path in paths]
+    files = [netcdf.read(path).load().drop_encoding() for path in paths]
     n = sum(len(data.variables) for data in files)
     say(f"{len(files)} files of {n} variables, CPU ms a variable")
     for name, write_one in (
         ("s4a.study.netcdf", lambda data: write_netcdf(data, io.BytesIO())),
-        ("xarray with h5netcdf", lambda data: data.to_netcdf(io.BytesIO(), engine=store.ENGINE)),
+        ("xarray with h5netcdf", lambda data: data.to_netcdf(io.BytesIO(), engine="h5netcdf")),
     ):
         spent = cpu_of(lambda write_one=write_one: [write_one(data) for data in files], 5)
         say(f"{name:28} {spent / n:8.2f}")
@@ -883,7 +852,6 @@ def write(folder):
 
 PARTS = {
     "write": write,
-    "seals": seals,
     "stages": stages,
     "pipelines": pipelines,
     "growth": growth,

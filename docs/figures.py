@@ -39,7 +39,7 @@ from s4a.show.draw import (
     signed_colors,
     with_balls,
 )
-from s4a.show.pictures import mode_drawer
+from s4a.show.pictures import mode_pictures
 from s4a.show.surfaces import carried_colors, mesh_of, mode_arrays, network_places, surface
 
 HERE = Path(__file__).parent
@@ -123,13 +123,14 @@ def pipeline(study):
     matched = [(X, T, colors), *[carried_colors(study, name, colors) for name in shown[1:]]]
     remeshed = [near(*surface(study, template, stage)) for stage in ("original", "coarse")]
     remeshed = [*[seen(*surface(study, template, s)) for s in ("original", "coarse")], *remeshed]
-    draw, _ = mode_drawer(study, LOOK)
+    drawn = mode_pictures(study, (-3, 3), 2, size=(240, 205), **LOOK)
+    modes = [picture for row in drawn for picture in row]
     parts = {
         "1 · a collection": tiled([seen(*surface(study, name, "original")) for name in shown]),
         "2 · remeshed": tiled(remeshed),
         "3 · a network of maps": None,
         "4 · in correspondence": tiled([seen(X, T, colors=c) for X, T, c in matched]),
-        "5 · modes of variation": tiled([draw(c, s, (240, 205)) for c in (0, 1) for s in (-3, 3)]),
+        "5 · modes of variation": tiled(modes),
     }
     parts["5 · modes of variation"] = on_white(parts["5 · modes of variation"])
     figure = Figure(figsize=(11, 2.35), layout="constrained")

@@ -274,7 +274,7 @@ ROWS = {
     "median_shape": ("way", ONE, "median shape (eq. 5)"),
     # what holds of a study's files
     "state": ("file", ONE,
-        "whole, unsealed, damaged, missing, stale, left over or foreign, see s4a.verify"),
+        "whole, damaged, missing, stale, left over or foreign, see s4a.verify"),
     "fault": ("file", ONE, "what is wrong with the file; empty where nothing is"),
     # plausibility (5.1): a shape on its own and beside others of its collection
     "sketch_position": ("point xyz", ONE,
@@ -380,6 +380,66 @@ POINTS_INTO = {
     "true_match": "source_vertex",
 }
 NOWHERE = {"vertex_of_file", "sample_vertex", "true_match"}
+
+# what a file of a study holds at least: variables; attributes that are texts, and numbers
+SEEN = "surface compactness chirality open_boundary lattice self_intersections intersecting"
+HOLDS = {
+    "original": ("position corner_vertex file_vertex", "status reason", "area"),
+    "coarse/shape": (
+        "position corner_vertex vertex_area sample_vertex coarse_vertex coarse_weight eigenvalue "
+        "eigenfunction",
+        "laplacian",
+        "wrapped kept_whole",
+    ),
+    "coarse/scalable": (
+        "position corner_vertex vertex_area sample_vertex edge_vertex cotan_weight edge_mass "
+        "sample_cell local_vertex local_sample local_weight eigenvalue eigenfunction",
+        "laplacian",
+        "wrapped kept_whole",
+    ),
+    "network/sketch": (
+        "sketch_position sketch_area sketch_normal sketch_asymmetry moment",
+        "",
+        SEEN,
+    ),
+    "network/look": ("moment fit fit_mirrored hand", "", SEEN),
+    "network/hands": ("shape handedness reflected", "told", ""),
+    "network/motion": ("rotation translation", "reference", ""),
+    "network/first": ("source target fmap_initial", "", ""),
+    "network": ("source target fmap_initial fmap weight cycle_error", "", ""),
+    "latent": (
+        "shape latent_basis latent_eigenvalue area_difference conformal_difference "
+        "distance_to_median",
+        "median",
+        "",
+    ),
+    "latent/shape": (
+        "latent_basis area_difference conformal_difference distance_to_median",
+        "",
+        "",
+    ),
+    "rounds": ("shape fmap latent_basis latent_eigenvalue", "", ""),
+    "registration": ("position corner_vertex vertex_area", "template", ""),
+    "registration/shape": (
+        "registered_match displacement rotation translation scale confidence template_triangle "
+        "template_barycentric",
+        "method",
+        "score",
+    ),
+    "pca": (
+        "shape mean_displacement deformation standard_deviation score explained_variance_ratio",
+        "",
+        "",
+    ),
+    "fields": ("shape carried_field", "", ""),
+    "subjects": ("shape", "", ""),
+    "report": (
+        "shape stage status reason warning path area seconds",
+        "template remarks no_modes",
+        "",
+    ),
+}
+TEXTS = set("source target status reason warning path shape stage".split())
 
 
 def variable(name: str, data: ArrayLike, **attrs: str | float | list[str]) -> xr.Variable:

@@ -26,9 +26,8 @@ from s4a.input.hands import AUTO, to_reflect
 from s4a.input.landmarks import SUFFIXES
 from s4a.input.raw import shown
 from s4a.input.subjects import is_missing, listed, read_cells, subjects
-from s4a.options import Options
+from s4a.options import Options, given_options
 from s4a.schema import dataset
-from s4a.seeds import seeded
 from s4a_morphometrics.mirrored import find_mirrored, find_mirrored_new
 
 log = logging.getLogger(__name__)
@@ -56,12 +55,13 @@ def analyse_structures(
     shapes: Any,
     *,
     structures: Mapping[str, int | str] | None = None,
-    store: Path | str | None = None,
     table: Path | str | None = None,
     landmarks: Path | str | None = None,
     reflect: str | list[str] | None = None,
+    options: Options | None = None,
+    store: Path | str | None = None,
     n_jobs: int | None = None,
-    **options: Any,
+    **others: Any,
 ) -> xr.DataTree:
     """From several structures of each subject to a study of every structure.
 
@@ -73,9 +73,6 @@ def analyse_structures(
     structures : dict, optional
         The files are label volumes that each hold several structures: the name of each, and its
         label or labels: ``{"anterior": 1, "posterior": "2,3"}``.
-    store : path, optional
-        Folder of the study, with one of each structure in ``structures/<name>``.  A run that was
-        killed goes on at the first missing file.
     table : path, optional
         As of :func:`s4a.analyse`; of files with columns ``structure`` and ``subject``.
     landmarks : path, optional
@@ -84,8 +81,11 @@ def analyse_structures(
     reflect : str or list of str, optional
         As of :func:`s4a.analyse`, of subjects.  ``"auto"`` takes all structures of a subject
         together.  All of them are mirrored, so that they lie to each other as before.
-    n_jobs, **options
-        Of :func:`s4a.analyse`.
+    store : path, optional
+        Folder of the study, with one of each structure in ``structures/<name>``.  A run that was
+        killed goes on at the first missing file.
+    options, n_jobs, **others
+        As of :func:`s4a.analyse`.
 
     Returns
     -------
@@ -109,20 +109,22 @@ def analyse_structures(
     >>> list(study["structures"]), study["structures/left/registration"].sizes["shape"]
     (['left', 'right'], 4)
     """
-    options = seeded(options)
-    settings = Options(**options, reflect=reflect)
+    shown = {"table": table, "landmarks": landmarks, "reflect": reflect}
+    given = {name: value for name, value in shown.items() if value is not None}
+    settings = given_options(given | others, options)
     if settings.label is not None:
         raise ValueError("structures= gives the labels of each structure: leave out label=")
-    parts = parts_of(shapes, structures, table, landmarks, settings.pattern)
-    remarks = check_parts(parts, marked=landmarks is not None)
+    parts = parts_of(shapes, structures, settings.table, settings.landmarks, settings.pattern)
+    remarks = check_parts(parts, marked=settings.landmarks is not None)
     remarks += remarks_on_files(shapes, settings.pattern, volumes=structures is not None)
     chosen, hand = None, None
-    if reflect == AUTO:
-        cleaning = settings.of("cleaning")
-        given = {name: (of.shapes, cleaning | {"label": of.label}) for name, of in parts.items()}
-        hand, chosen, told = find_mirrored(given)
+    if settings.reflect == AUTO:
+        cleaning = {
+            name: settings.of("cleaning") | {"label": of.label} for name, of in parts.items()
+        }
+        hand, chosen, told = find_mirrored({n: (of.shapes, cleaning[n]) for n, of in parts.items()})
         remarks += told
-    elif reflect is not None:
+    elif settings.reflect is not None:
         chosen = named_subjects(str(settings.reflect), parts)
     for line in remarks:
         log.warning("%s", line)
@@ -134,12 +136,12 @@ def analyse_structures(
         studies = {}
         for name, part in parts.items():
             log.info("structure %s", name)
-            own = given_files(part, folder / FOLDER, name)
+            own = {"table": None, "landmarks": None, **given_files(part, folder / FOLDER, name)}
             own |= {"label": part.label, "reflect": mirrored_of(chosen, part)}
             place = None if store is None else folder / FOLDER / name
             try:
-                own |= {"store": place, "n_jobs": n_jobs}
-                studies[name] = s4a.analyse(part.shapes, **options | own)
+                one = settings.changed(own)
+                studies[name] = s4a.analyse(part.shapes, options=one, store=place, n_jobs=n_jobs)
             except ValueError as error:
                 raise ValueError(f"structure {name}: {error}") from error
     return tree_of(studies, notes)
@@ -176,7 +178,7 @@ def given_files(part: Part, folder: Path, name: str) -> dict[str, Any]:
         shutil.rmtree(marks, ignore_errors=True)
         marks.mkdir(parents=True)
         for subject, file in part.landmarks.items():
-            *_, suffix = (end for end in SUFFIXES if end in file.name.lower())
+            suffix = next(end for end in SUFFIXES if end in file.name.lower())
             at = file.name.lower().rindex(suffix)  # .gz may follow
             shutil.copy(file, marks / f"{subject}{file.name[at:]}")
     return given

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from s4a.cli.commands import cluster, lines_or_bars, new_folder, within, write
+from s4a.cli.commands import lines_or_bars, new_folder, on_cluster, within, write
 from s4a.cli.flags import Command, add_options, whole
 from s4a.options import DECLARED
 
@@ -21,7 +21,7 @@ def run(args: Namespace) -> int:
 
     given = dict(args.structures) if args.structures else None
     options = {name: getattr(args, name) for name in OPTIONS}
-    with cluster(args.cluster), lines_or_bars():
+    with on_cluster(args.cluster), lines_or_bars():
         study = analyse_structures(args.paths, store=args.out, structures=given, **options)
     parts = study["structures"].children
     for name, part in parts.items():

@@ -1,83 +1,90 @@
-"""The commands of the command line: from parsed arguments to what is written and an exit code.
+"""The commands of the command line: from what was typed to what is written and an exit code.
 
-The flags are in :mod:`s4a.cli.flags`; what is shown is put into words in :mod:`s4a.cli.tables`.
-Every command imports what it needs, so that none waits for what the others need.
+The parameters of a command are its arguments and flags (:mod:`s4a.cli.flags`); what is shown is put
+into words in :mod:`s4a.cli.tables`.  What they need is imported when it is first used, so that
+none waits for what the others need.
 """
 
 import contextlib
-import dataclasses
 import logging
 import re
 import shlex
 import sys
 import time
 import webbrowser
-from argparse import Namespace
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from s4a.input.raw import shown
+import lazy_loader
+
+import s4a
+from s4a.cli import tables
+from s4a.cli.doctor import examine, lines
+from s4a.cli.flags import ALL_OPTIONS, command
+from s4a.options import DECLARED, N_COARSE, Options
 
 if TYPE_CHECKING:
     import numpy as np
     import xarray as xr
 
+    from s4a.input import annotations
+else:
+    np = lazy_loader.load("numpy")
+    annotations = lazy_loader.load("s4a.input.annotations", suppress_warning=True)
 
-def check(args: Namespace) -> int:
-    """Read and clean every file, and say what was found."""
-    from s4a.cli import tables
-    from s4a.input.collection import read_shapes
 
-    report = read_shapes(
-        args.paths,
-        components=args.components,
-        strict=args.strict,
-        close_holes=args.close_holes,
-        pattern=args.pattern,
-        label=args.label,
-        intersections=args.intersections,
-    )["report"].to_dataset()
-    write("\n".join([*tables.decision_lines(report), tables.report_table(report)]))
+def check(paths: list[str], **options: Any) -> int:
+    """Read and clean every file, and say what was found.
+
+    Parameters
+    ----------
+    paths : PATH
+        folders, globs or mesh files
+    """
+    report = s4a.read_shapes(paths, **options)["report"].to_dataset()
+    write(*tables.decision_lines(report), tables.report_table(report))
     return 0 if (report["status"] != "excluded").all() else 1
 
 
-def doctor(args: Namespace) -> int:
-    """What this machine lacks, and what to type."""
-    from s4a.cli.doctor import examine, lines
+def doctor(folder: str = ".") -> int:
+    """What this machine lacks, and what to type.
 
-    findings = examine(args.folder)
+    Parameters
+    ----------
+    folder : FOLDER
+        where studies are to lie (default: here)
+    """
+    findings = examine(folder)
     lacking = sum(finding.state == "lacks" for finding in findings)
     notes = sum(finding.state == "note" for finding in findings)
-    write("\n".join([*lines(findings), f"{lacking} lacking, {notes} to know"]))
+    write(*lines(findings), f"{lacking} lacking, {notes} to know")
     return 1 if lacking else 0
 
 
-def run(args: Namespace) -> int:
-    """The whole analysis over a folder of meshes."""
-    from s4a.cli import tables
-    from s4a.study.pipeline import analyse
+def run(
+    paths: list[str], *, out: str, cluster: str | None = None, words: list[str], **options: Any
+) -> int:
+    """The whole analysis over a folder of meshes.
 
-    full = within(args.out, "report.txt")
-    with cluster(args.cluster), lines_or_bars():
-        study = analyse(args.paths, store=args.out, **options_of(args))
-    again = shlex.join(["s4a", *(word for word in args.words if word != "--keep-doubtful")])
+    Parameters
+    ----------
+    paths : PATH
+        folders, globs or mesh files
+    out : STUDY
+        folder of the study; an unfinished one is resumed
+    cluster : ADDRESS
+        dask scheduler tcp://host:port, or local:N worker processes
+    """
+    full = within(out, "report.txt")
+    with on_cluster(cluster), lines_or_bars():
+        study = s4a.analyse(paths, store=out, **options)
+    again = shlex.join(["s4a", *(word for word in words if word != "--keep-doubtful")])
     report = study["report"].to_dataset()
-    lines = [tables.report_table(report), *tables.stage_lines(report)]
+    lines = [tables.report_table(report), *tables.cost_lines(report)]
     full.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    write(tables.run_summary(study, again=again))
-    write("\n".join(tables.place_lines(args.out, str(full))))
+    write(tables.run_summary(study, again=again), *tables.place_lines(out, str(full)))
     return 1 if study["report"].attrs["unforeseen"] else 0
-
-
-def options_of(args: Namespace) -> dict[str, Any]:
-    """The options of `analyse` from parsed flags, and how many processes."""
-    from s4a.options import Options
-
-    return {
-        name: getattr(args, name)
-        for name in [*(f.name for f in dataclasses.fields(Options)), "n_jobs"]
-    }
 
 
 @contextlib.contextmanager
@@ -94,7 +101,7 @@ def lines_or_bars() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def cluster(address: str | None) -> Iterator[None]:
+def on_cluster(address: str | None) -> Iterator[None]:
     """Run joblib's tasks on a dask scheduler, where there is an address.
 
     ``tcp://host:port``, or ``local:N`` for N processes started here.  The workers must see the
@@ -114,169 +121,255 @@ def cluster(address: str | None) -> Iterator[None]:
         raise ValueError("--cluster needs dask.distributed: pip install 's4a[cluster]'") from error
     from joblib import parallel_config
 
-    from s4a.study.processes import spawned_end_too
-
-    n_workers = int(known[1] or 0)
     with contextlib.ExitStack() as stack:
-        if n_workers:
-            stack.enter_context(spawned_end_too())
-            local = LocalCluster(n_workers=n_workers, threads_per_worker=1, dashboard_address=None)
+        if known[1]:
+            stack.enter_context(s4a.study.processes.spawned_end_too())
+            n = int(known[1])
+            local = LocalCluster(n_workers=n, threads_per_worker=1, dashboard_address=None)
             address = stack.enter_context(local).scheduler_address
         stack.enter_context(Client(address))
         stack.enter_context(parallel_config(backend="dask"))
         yield
 
 
-def demo(args: Namespace) -> int:
+def demo(
+    *,
+    out: str = "demo",
+    shapes: int = 12,
+    vertices: int = 40_000,
+    dirty: bool = False,
+    open: bool = False,
+    seed: int,
+    **options: Any,
+) -> int:
     """The whole analysis on the bundled collection, as a page.
 
     Its accuracy against the truth is printed.
-    """
-    from s4a.cli import tables
-    from s4a.datasets import synthetic
-    from s4a.evaluation import accuracy
-    from s4a.show.page import write_page
-    from s4a.show.pictures import write_picture
-    from s4a.study.pipeline import analyse
 
-    out = Path(args.out)
-    collection = synthetic.brains(args.shapes, args.vertices, args.seed, dirty=args.dirty)
-    study = analyse(collection, store=out, preset=args.preset, n_jobs=args.n_jobs, seed=args.seed)
+    Parameters
+    ----------
+    out : STUDY
+        folder of the study
+    shapes : N
+        number of shapes
+    vertices : N
+        vertices of each
+    dirty
+        with loose parts, holes and non-manifold places
+    open
+        open the page in a browser
+    """
+    collection = s4a.synthetic.brains(shapes, vertices, seed, dirty=dirty)
+    study = s4a.analyse(collection, store=out, seed=seed, **options)
     truth: Any = collection["truth"]
 
     def image(shape, template):
-        return synthetic.position(truth, shape, truth[template]["reference_point"].values)
+        return s4a.synthetic.position(truth, shape, truth[template]["reference_point"].values)
 
     write(tables.run_summary(study))
     if "pca" in study:
-        write(f"\npicture: {write_picture(study, out / 'modes.png')}")
-    errors = accuracy.accuracy(study, image, n_jobs=args.n_jobs)
-    write("\n" + tables.error_table(errors))
+        write(f"\npicture: {s4a.write_picture(study, Path(out) / 'modes.png')}")
+    errors = s4a.evaluation.accuracy.accuracy(study, image, n_jobs=options["n_jobs"])
+    write("", tables.error_table(errors))
     if "pca" in study:
         write(tables.planted_line(study["pca"].to_dataset(), truth.to_dataset()))
-    page = out / "study.html"
-    write_page(study, page, title="Synthetic brains")
+    page = Path(out) / "study.html"
+    s4a.write_page(study, page, title="Synthetic brains")
     write(f"\npage: {page}")
-    if args.open:
+    if open:
         webbrowser.open(page.resolve().as_uri())
     return 0
 
 
-def verify(args: Namespace) -> int:
-    """Whether every file of a study is as it was written, and they belong together."""
-    from s4a.cli import tables
-    from s4a.study.verify import verify
+def verify(study: str) -> int:
+    """Whether every file of a study is as it was written, and they belong together.
 
-    found = verify(args.study)
+    Parameters
+    ----------
+    study : STUDY
+        its folder
+    """
+    found = s4a.verify(study)
     write(tables.verify_lines(found))
     return 1 if tables.count_faults(found) else 0
 
 
-def status(args: Namespace) -> int:
-    """How far a run is, or was when it was stopped."""
-    from s4a.cli import tables
-    from s4a.study.progress import status
+def status(study: str) -> int:
+    """How far a run is, or was when it was stopped.
 
-    write(tables.status_lines(status(args.study), time.time()))
+    Parameters
+    ----------
+    study : STUDY
+        its folder
+    """
+    write(tables.status_lines(s4a.study.progress.status(study), time.time()))
     return 0
 
 
-def view(args: Namespace) -> int:
-    """One self-contained page of a study."""
-    from s4a.show.page import write_page
-    from s4a.study.tree import open_study
+def view(
+    study: str,
+    *,
+    out: str | None = None,
+    title: str | None = None,
+    view: str = "corner",
+    up: Literal["x", "y", "z"] = "z",
+) -> int:
+    """One self-contained page of a study.
 
-    page = Path(args.out) if args.out else within(args.study, "study.html")
-    title = args.title or Path(args.study).name
-    write_page(open_study(args.study), page, title=title, view=args.view, up=args.up)
+    Parameters
+    ----------
+    study : STUDY
+        its folder
+    out : PAGE
+        file of the page (default: STUDY/study.html)
+    title : TITLE
+        of the page (default: name of the folder)
+    view : VIEW
+        from where: corner, front, back, left, right, top or bottom (default: corner)
+    up
+        axis that points up
+    """
+    page = Path(out) if out else within(study, "study.html")
+    s4a.write_page(s4a.open_study(study), page, title=title or Path(study).name, view=view, up=up)
     write(f"wrote {page} ({page.stat().st_size / 1e6:.1f} MB)")
     return 0
 
 
-def statistics(args: Namespace) -> int:
+def statistics(
+    study: str,
+    *,
+    group: str | None = None,
+    variable: str | None = None,
+    covariates: list[str] | None = None,
+    field: str | None = None,
+    table: str | None = None,
+    variances: Literal["equal", "unequal"] = "equal",
+    recompute: bool = False,
+    keep_doubtful: bool = False,
+    label: list[int | str] | None = None,
+    labels: str | None = None,
+    least_confidence: float = 0.0,
+    without: list[str] | None = None,
+    size_back: bool = False,
+    permutations: int | None = None,
+    out: str | None = None,
+    n_jobs: int,
+    seed: int,
+) -> int:
     """Evaluation of the modes and outliers of a study.
 
     Tests of groups and variables of its table.
-    """
-    from s4a.analysis import statistics as tests
-    from s4a.analysis.export import write_results
-    from s4a.cli import tables
-    from s4a.show.page import write_page
-    from s4a.show.pictures import write_film
 
-    if (args.covariates or args.field) and not (args.group or args.variable):
+    Parameters
+    ----------
+    study : STUDY
+        its folder
+    group : COLUMN
+        test and map of the difference between groups; classification
+    variable : COLUMN
+        regression of shape on a number, such as age; its animation
+    covariates : COLUMN
+        accounted for in both
+    field : NAME
+        a field of s4a fields in place of shape in both
+    table : FILE
+        in place of the table of the study
+    variances
+        of the shapes around what is tested; unequal where groups scatter differently
+    recompute
+        generalization with correspondences found anew (slow)
+    keep_doubtful
+        take doubtful shapes in
+    label : LABEL
+        only vertices of the template with these labels
+    labels : FILE
+        labels of the template's file for --label: NPY, NPZ (FILE:NAME), CSV, GIFTI or annot
+    least_confidence : SHARE
+        only vertices whose mean confidence is this large, 0 to 1
+    without : COLUMN
+        nuisances: what lies along their regression is taken from all shapes
+    size_back
+        give size back to shapes of which --scale took it out
+    permutations : N
+        of every test (default: 9999, at every vertex 999, of classes 99)
+    out : DIR
+        for netCDF and CSV (default: STUDY/statistics)
+    """
+    if (covariates or field) and not (group or variable):
         raise ValueError("--covariates and --field are of a test: give --group or --variable")
-    study, out = study_to_test(args)
-    study = restricted(study, args)
-    results = tests_of(study, args)  # first, as options and columns may be refused
-    results["evaluation"] = tests.evaluate(study, seed=args.seed)
-    results["outliers"] = tests.outliers(study)
-    if args.recompute:
-        results["generalization"] = tests.generalization(study, n_jobs=args.n_jobs, seed=args.seed)
+    if labels and not label:
+        raise ValueError("--labels is where --label looks: give --label LABEL..., or leave it out")
+    if recompute and (size_back or without or label or least_confidence):
+        raise ValueError("--recompute finds whole shapes anew: leave it out, or take all of them")
+    tree, out = study_to_test(study, out, table, keep_doubtful)
+    tree = restricted(tree, size_back, without, label, labels, least_confidence)
+    options = {"covariates": covariates, "field": field, "seed": seed, "variances": variances}
+    results = tests_of(tree, group, variable, permutations, options)  # first: these may be refused
+    results["evaluation"] = s4a.statistics.evaluate(tree, seed=seed)
+    results["outliers"] = s4a.statistics.outliers(tree)
+    if recompute:
+        results["generalization"] = s4a.statistics.generalization(tree, n_jobs=n_jobs, seed=seed)
     for name, result in results.items():
-        write_results(result, out, name)
+        s4a.analysis.export.write_results(result, out, name)
     write(tables.evaluation_table(results["evaluation"], results.get("generalization")))
     outlier = results["outliers"]["outlier"]
     write(f"\noutliers: {', '.join(outlier['shape'].values[outlier.values]) or 'none'}")
-    if args.group:
-        name = f"groups of {args.group}"
-        write("\n" + tables.significance(results["group"], results["group_map"], name, study))
+    if group:
+        of = f"groups of {group}"
+        write("", tables.significance(results["group"], results["group_map"], of, tree))
         write(tables.classification_line(results["classification"]))
-    if args.variable:
+    if variable:
         regression = results["regression"]
-        write("\n" + tables.significance(regression, regression, args.variable, study))
-        if not args.field:
-            moving = tests.regression_modes(study, regression, args.variable)
-            page = Path(out) / "regression.html"
-            write_page(moving, page, title=f"Regression on {args.variable}")
-            write_film(moving, Path(out) / "regression.gif")
-    confidence = study["registration"]["confidence"].mean().item()
+        write("", tables.significance(regression, regression, variable, tree))
+        if not field:
+            write_moving(tree, regression, variable, Path(out))
+    confidence = tree["registration"]["confidence"].mean().item()
     write(f"\nmean confidence of the registration {confidence:.2f}; results: {out}")
     return 0
 
 
-def study_to_test(args: Namespace) -> "tuple[xr.DataTree, str]":
-    """The study with the table and the shapes that are asked for, and the folder of results."""
-    from s4a.analysis.inputs import with_doubtful
-    from s4a.input.plausibility import listed
-    from s4a.input.subjects import with_table
-    from s4a.study.tree import left_out, open_study
+def write_moving(study: "xr.DataTree", regression: "xr.Dataset", name: str, out: Path) -> None:
+    """The regression on a variable as a page and as a film."""
+    moving = s4a.statistics.regression_modes(study, regression, name)
+    s4a.write_page(moving, out / "regression.html", title=f"Regression on {name}")
+    s4a.write_film(moving, out / "regression.gif")
 
-    study, out = open_study(args.study), args.out or str(within(args.study, "statistics"))
-    study = with_table(study, args.table) if args.table else study
-    study = with_doubtful(study) if args.keep_doubtful else study
-    if doubtful := left_out(study):
+
+def study_to_test(
+    study: str, out: str | None, table: str | None, keep_doubtful: bool
+) -> "tuple[xr.DataTree, str]":
+    """The study with the table and the shapes that are asked for, and the folder of results."""
+    tree, out = s4a.open_study(study), out or str(within(study, "statistics"))
+    tree = s4a.input.subjects.with_table(tree, table) if table else tree
+    tree = s4a.statistics.with_doubtful(tree) if keep_doubtful else tree
+    if doubtful := s4a.study.tree.left_out(tree):
         write(
             f"{len(doubtful)} doubtful shapes are left out, --keep-doubtful takes them in: "
-            f"{listed(doubtful, 200)}\n"
+            f"{s4a.input.plausibility.listed(doubtful, 200)}\n"
         )
-    return study, out
+    return tree, out
 
 
-def restricted(study: "xr.DataTree", args: Namespace) -> "xr.DataTree":
+def restricted(
+    study: "xr.DataTree",
+    size_back: bool,
+    without: list[str] | None,
+    label: list[int | str] | None,
+    labels: str | None,
+    least_confidence: float,
+) -> "xr.DataTree":
     """The study of the part of what varies that is asked for."""
-    from s4a.analysis import restrict
-
-    if args.labels and not args.label:
-        raise ValueError("--labels is where --label looks: give --label LABEL..., or leave it out")
-    is_part = args.size_back or args.without or args.label or args.least_confidence
-    if is_part and args.recompute:
-        raise ValueError("--recompute finds whole shapes anew: leave it out, or take all of them")
     said = []
-    if args.size_back:
-        study = restrict.with_size(study)
+    if size_back:
+        study = s4a.statistics.with_size(study)
         said.append("with size given back")
-    if args.without:
-        study = restrict.without(study, args.without)
-        said.append(f"without {', '.join(args.without)}")
-    if args.label or args.least_confidence:
+    if without:
+        study = s4a.statistics.without(study, without)
+        said.append(f"without {', '.join(without)}")
+    if label or least_confidence:
         whole = study["registration"].sizes["vertex"]
-        study = restrict.within(
-            study,
-            args.label or None,
-            labels=template_labels(study, args.labels),
-            least_confidence=args.least_confidence,
-        )
+        of = template_labels(study, labels)
+        study = s4a.statistics.within(study, label, labels=of, least_confidence=least_confidence)
         said.append(f"{study['registration'].sizes['vertex']} of {whole} vertices")
     if said:
         write("; ".join(said) + "\n")
@@ -285,180 +378,207 @@ def restricted(study: "xr.DataTree", args: Namespace) -> "xr.DataTree":
 
 def template_labels(study: "xr.DataTree", file: str | None) -> "np.ndarray | None":
     """Labels of the template, from a file with one for each vertex of its file."""
-    from s4a.analysis.inputs import all_registered
-    from s4a.input.annotations import labels_of_mesh, read_labels
-
     if file is None:
         return None
-    mesh = study["original"][all_registered(study).attrs["template"]].to_dataset()
-    return labels_of_mesh(read_labels(file, mesh.sizes["file_vertex_index"]), mesh)
+    template = s4a.analysis.inputs.all_registered(study).attrs["template"]
+    return labels_in(file, study["original"][template].to_dataset())
 
 
-def tests_of(study: "xr.DataTree", args: Namespace) -> "dict[str, xr.Dataset]":
+def labels_in(file: str, mesh: "xr.Dataset") -> "np.ndarray":
+    """Labels of a mesh, from a file with one for each vertex of its file."""
+    label = annotations.read_labels(file, mesh.sizes["file_vertex_index"])
+    return annotations.labels_of_mesh(label, mesh)
+
+
+def tests_of(
+    study: "xr.DataTree",
+    group: str | None,
+    variable: str | None,
+    permutations: int | None,
+    options: dict[str, Any],
+) -> "dict[str, xr.Dataset]":
     """The tests of the group and the variable that are asked for."""
-    from s4a.analysis import statistics as tests
-
-    options = {
-        "covariates": args.covariates or None,
-        "seed": args.seed,
-        "variances": args.variances,
-    }
-    n_classified = {}
-    if args.permutations is not None:
-        options["n_permutations"] = args.permutations
-        n_classified["n_permutations"] = min(args.permutations, 99)  # each trains anew
+    of_classes = {name: options[name] for name in ("field", "seed")}
+    if permutations is not None:
+        options = options | {"n_permutations": permutations}
+        of_classes["n_permutations"] = min(permutations, 99)  # each trains anew
     results = {}
-    if args.group:
-        results["group"] = tests.group_test(study, args.group, field=args.field, **options)
-        results["group_map"] = tests.group_map(study, args.group, field=args.field, **options)
-        results["classification"] = tests.classify(
-            study, args.group, field=args.field, seed=args.seed, **n_classified
-        )
-    if args.variable:
-        results["regression"] = tests.regression(study, args.variable, field=args.field, **options)
+    if group:
+        results["group"] = s4a.statistics.group_test(study, group, **options)
+        results["group_map"] = s4a.statistics.group_map(study, group, **options)
+        results["classification"] = s4a.statistics.classify(study, group, **of_classes)
+    if variable:
+        results["regression"] = s4a.statistics.regression(study, variable, **options)
     return results
 
 
-def fields(args: Namespace) -> int:
-    """A number per vertex of every shape, such as thickness, carried to the template and kept."""
-    import numpy as np
+def fields(
+    study: str, folder: str, *, name: str, unit: str | None = None, partial: bool = False
+) -> int:
+    """A number per vertex of every shape, such as thickness, carried to the template and kept.
 
-    from s4a.analysis.fields import with_field, write_field
-    from s4a.study.tree import open_study
-
-    study = open_study(args.study)
-    study = with_field(study, args.name, args.folder, unit=args.unit, partial=args.partial)
-    path = write_field(study, args.name, args.study)
-    field = study["fields"][args.name].to_dataset()["carried_field"]
+    Parameters
+    ----------
+    study : STUDY
+        its folder
+    folder : FOLDER
+        with a file for each shape: NPY, NPZ, PLY, CSV, GIFTI or FreeSurfer's curv
+    name : NAME
+        of the field; also of its array, column or property in the files
+    unit : UNIT
+        of its numbers, such as mm
+    partial
+        shapes may lack it; tests leave these out
+    """
+    tree = s4a.with_field(s4a.open_study(study), name, folder, unit=unit, partial=partial)
+    path = s4a.analysis.fields.write_field(tree, name, study)
+    field = tree["fields"][name].to_dataset()["carried_field"]
     known = np.isfinite(field.values)
     write(
-        f"{args.name} of {known.any(1).sum()} of {len(known)} shapes, "
+        f"{name} of {known.any(1).sum()} of {len(known)} shapes, "
         f"{np.nanmin(field):.4g} to {np.nanmax(field):.4g} {field.attrs['units']}, mean "
         f"{np.nanmean(field):.4g}, at {100 * known.mean():.0f} % of the template's vertices: "
-        f"{path}\n"
-        f"s4a statistics {args.study} --field {args.name} takes it in place of shape"
+        f"{path}",
+        f"s4a statistics {study} --field {name} takes it in place of shape",
     )
     return 0
 
 
-def insert(args: Namespace) -> int:
-    """New shapes in a finished study, which stays as it is."""
-    from s4a.analysis.export import write_registered
-    from s4a.cli import tables
-    from s4a.study.insert import insert
-    from s4a.study.store import ENGINE
-    from s4a.study.tree import open_study
+def insert(
+    study: str,
+    shapes: list[str],
+    *,
+    out: str,
+    landmarks: str | None = None,
+    reflect: str | None = None,
+    n_jobs: int,
+) -> int:
+    """New shapes in a finished study, which stays as it is.
 
-    study = open_study(args.study)
-    options = {name: getattr(args, name) for name in ("landmarks", "reflect", "n_jobs")}
-    inserted = insert(study, args.shapes, **options)
-    out = new_folder(args.out)
-    inserted.to_netcdf(out / "inserted.nc", engine=ENGINE)
-    write_registered(inserted, out)
-    write(tables.inserted_table(inserted))
-    write(f"\nwritten: {out / 'inserted.nc'}, registered meshes and scores in {out}")
+    Parameters
+    ----------
+    study : STUDY
+        its folder
+    shapes : SHAPE
+        mesh files, label volumes, folders or globs
+    out : DIR
+        for inserted.nc, registered meshes and scores
+    landmarks : DIR
+        folder of landmark files named as the shapes
+    reflect : NAMES
+        new shapes to mirror: names, with commas; or auto, those of the other hand
+    """
+    tree = s4a.open_study(study)
+    inserted = s4a.insert(tree, shapes, landmarks=landmarks, reflect=reflect, n_jobs=n_jobs)
+    folder = new_folder(out)
+    s4a.study.store.write(inserted, folder / "inserted.nc")
+    s4a.write_registered(inserted, folder)
+    write(tables.inserted_table(inserted), "")
+    write(f"written: {folder / 'inserted.nc'}, registered meshes and scores in {folder}")
     return 1 if (inserted["report"]["status"] == "excluded").any() else 0
 
 
-def transfer(args: Namespace) -> int:
-    """Labels and landmarks of one mesh on others."""
-    from s4a.analysis import transfer as travel
-    from s4a.cli import tables
-    from s4a.input.annotations import labels_of_mesh, read_labels, read_landmarks
-    from s4a.input.collection import read_shape
-    from s4a.input.landmarks import locate
-    from s4a.options import DECLARED
-    from s4a.study.store import check_is_study
-    from s4a.study.tree import open_study
+def transfer(
+    source: str,
+    targets: list[str],
+    *,
+    labels: str | None = None,
+    landmarks: str | None = None,
+    out: str,
+    blur: float | None = None,
+    n_jobs: int,
+    **options: Any,
+) -> int:
+    """Labels and landmarks of one mesh on others.
 
-    if not (args.labels or args.landmarks):
+    Parameters
+    ----------
+    source : SOURCE
+        mesh file that the labels and landmarks belong to
+    targets : TARGET
+        mesh files, folders or globs; or one study folder, whose options hold unless given
+    labels : FILE
+        NPY, NPZ (FILE:NAME), CSV, GIFTI label or FreeSurfer annot, also .gz
+    landmarks : FILE
+        points and curves: Slicer .mrk.json, CSV or MeshLab .pp
+    out : DIR
+        for <target>.labels.npy, .confidence.npy, .landmarks.csv
+    blur : MULTIPLE
+        how far around votes for labels count, in multiples of how far matches may be wrong
+        (default: 1; 0, not, with --preset paper)
+    """
+    if not (labels or landmarks):
         raise ValueError(
             "something to transfer needed: give --labels FILE, --landmarks FILE or both"
         )
-    if args.blur is not None and not args.labels:
+    if blur is not None and not labels:
         raise ValueError("--blur is of labels: give --labels FILE, or leave it out")
-    first = Path(args.targets[0])
-    into_study = len(args.targets) == 1 and any(first.glob("**/registration.nc"))
+    into_study = len(targets) == 1 and any(Path(targets[0]).glob("**/registration.nc"))
     if into_study:
-        check_is_study(first)
-    source, label, landmarks = read_shape(args.source), None, None
-    if args.labels:
-        label = labels_of_mesh(read_labels(args.labels, source.sizes["file_vertex_index"]), source)
-    if args.landmarks:
-        landmarks = read_landmarks(args.landmarks)
-        distance = locate(landmarks, source)["landmark_distance"].values
-        write(
-            f"{len(distance)} landmarks, at most {distance.max():.3g} from the surface of "
-            f"{args.source}"
-        )
-    excluded = []
-    asked = {n: getattr(args, n) for n, one in DECLARED.items() if one.metadata["pair"]}
-    given = {name: value for name, value in asked.items() if value is not None}
+        s4a.study.store.check_is_study(Path(targets[0]))
+    mesh, label, points = s4a.read_shape(source), None, None
+    if labels:
+        label = labels_in(labels, mesh)
+    if landmarks:
+        points = annotations.read_landmarks(landmarks)
+        distance = s4a.input.landmarks.locate(points, mesh)["landmark_distance"].values
+        far = f"at most {distance.max():.3g} from the surface of {source}"
+        write(f"{len(distance)} landmarks, {far}")
+    given = {name: value for name, value in options.items() if value is not None}
+    excluded: list[str] = []
     if into_study:
-        study = open_study(first)
-        given["source"] = source
+        study = s4a.open_study(targets[0])
+        given["source"] = mesh
     else:
-        study, excluded = registered_pairs(source, args, given)
+        study, excluded = registered_pairs(mesh, targets, n_jobs, given)
         given = {}  # the source is the template now, and matched
-    out = new_folder(args.out)
-    labels: Mapping[str, Any] = {}  # name of a target -> node
-    points: Mapping[str, Any] = {}
+    folder, carried = new_folder(out), {}
     if label is not None:
-        carried = travel.transfer_labels(study, label, blur=args.blur, **given)
-        labels = carried.children
-    if landmarks is not None:
-        points = travel.transfer_landmarks(study, landmarks, **given).children
-    write(tables.table(transferred_rows(study, labels, points, out), tables.TRANSFERRED))
+        carried["labels"] = s4a.transfer_labels(study, label, blur=blur, **given)
+    if points is not None:
+        carried["landmarks"] = s4a.transfer_landmarks(study, points, **given)
+    write(tables.table(transferred_rows(study, carried, folder), tables.TRANSFERRED))
     return 1 if excluded else 0
 
 
 def registered_pairs(
-    source: "xr.Dataset", args: Namespace, options: dict[str, Any]
+    source: "xr.Dataset", targets: list[str], n_jobs: int, options: dict[str, Any]
 ) -> "tuple[xr.DataTree, list[str]]":
     """The source registered as the template of every target, and the targets that are left out."""
-    from s4a.analysis.transfer import register_pairs
-    from s4a.input.collection import read_shapes
-    from s4a.options import Options
-
-    shapes = read_shapes(args.targets, compare=False)
+    shapes = s4a.read_shapes(targets, compare=False)
     report = shapes["report"].to_dataset()
     excluded = report["shape"].values[report["status"].values == "excluded"].tolist()
     for name in excluded:
         write(f"{name} excluded: {report['reason'].sel(shape=name).item()}")
     meshes = {name: node.to_dataset() for name, node in shapes["original"].children.items()}
-    study = register_pairs(
-        source,
-        meshes,
-        name=next(n for n in ("template", "template_", "template__") if n not in meshes),
-        n_jobs=args.n_jobs,
-        **{"k_init": min(Options.k_init, options.get("k", Options.k))} | options,
-    )
-    return study, excluded
+    name = next(n for n in ("template", "template_", "template__") if n not in meshes)
+    options = {"k_init": min(Options.k_init, options.get("k", Options.k))} | options
+    return s4a.register_pairs(source, meshes, name=name, n_jobs=n_jobs, **options), excluded
 
 
 def transferred_rows(
-    study: "xr.DataTree", labels: Mapping[str, Any], points: Mapping[str, Any], out: Path
+    study: "xr.DataTree", carried: "dict[str, xr.DataTree]", out: Path
 ) -> list[list[Any]]:
     """Write the files of every target; the rows of the table that is shown."""
-    from s4a.cli import tables
-    from s4a.input.annotations import write_landmarks
-    from s4a.input.files import stem_of
-    from s4a.input.hands import in_file
-
-    meshes = {name: study["original"][name].to_dataset() for name in labels or points}
-    stems = {name: stem_of(mesh.attrs.get("path") or name) for name, mesh in meshes.items()}
+    first, *_ = carried.values()
+    meshes = {name: study["original"][name].to_dataset() for name in first.children}
+    stems = {
+        name: s4a.input.files.stem_of(mesh.attrs.get("path") or name)
+        for name, mesh in meshes.items()
+    }
     rows = []
     for name, mesh in meshes.items():
         stem = stems[name] if list(stems.values()).count(stems[name]) == 1 else name
         cells = tables.registration_cells(study["registration"].to_dataset().sel(shape=name))[1:]
         of_labels, of_points = ["-"] * 3, ["-"] * 2
-        if labels:
-            of_labels = write_labels(labels[name].to_dataset(), mesh, out, stem)
-        if points:
-            landmarks = points[name].to_dataset()
+        if "labels" in carried:
+            of_labels = write_labels(carried["labels"][name].to_dataset(), mesh, out, stem)
+        if "landmarks" in carried:
+            landmarks = carried["landmarks"][name].to_dataset()
             place = landmarks["landmark_position"]
-            landmarks["landmark_position"] = place.copy(data=in_file(mesh, place.values))
-            write_landmarks(out / f"{stem}.landmarks.csv", landmarks)
+            X = s4a.input.hands.in_file(mesh, place.values)
+            landmarks["landmark_position"] = place.copy(data=X)
+            annotations.write_landmarks(out / f"{stem}.landmarks.csv", landmarks)
             of_points = tables.landmark_cells(landmarks)
         rows.append([stem, *cells, *of_labels, *of_points])
     return rows
@@ -466,142 +586,132 @@ def transferred_rows(
 
 def write_labels(labels: "xr.Dataset", mesh: "xr.Dataset", out: Path, stem: str) -> list[str]:
     """Write labels and their confidence as NPY, a row for each vertex of the file; the cells."""
-    import numpy as np
-
-    from s4a.input.annotations import labels_of_file
-
     points = file_points(mesh)
-    label, dropped = labels_of_file(labels["label"].values, mesh, points)
-    confidence, _ = labels_of_file(labels["confidence"].values, mesh, points)
-    np.save(out / f"{stem}.labels.npy", label)
-    np.save(out / f"{stem}.confidence.npy", confidence)
+    for name in ("label", "confidence"):
+        values, dropped = annotations.labels_of_file(labels[name].values, mesh, points)
+        np.save(out / f"{stem}.{'labels' if name == 'label' else name}.npy", values)
     means = [f"{labels[name].mean().item():.2f}" for name in ("confidence", "label_share")]
     return [*means, str(dropped)]
 
 
 def file_points(mesh: "xr.Dataset") -> "np.ndarray":
     """The vertices of a mesh's file (n, 3), mirrored as it; those kept, where the file is gone."""
-    import numpy as np
-
-    from s4a.input.files import read_mesh
-    from s4a.input.hands import in_file
-    from s4a.input.labels import read_volume
-
     path, label = mesh.attrs.get("path") or "", mesh.attrs.get("label")
     if Path(path).is_file():
-        read = read_volume(path, label) if label else read_mesh(path)
-        return in_file(mesh, read[0])
+        read = s4a.input.labels.read_volume(path, label) if label else s4a.read_mesh(path)
+        return s4a.input.hands.in_file(mesh, read[0])
     points = np.full((mesh.sizes["file_vertex_index"], 3), np.nan)
     points[mesh["file_vertex"].values] = mesh["position"].values
     return points
 
 
-def compare(args: Namespace) -> int:
-    """The methods of the paper's Table 1 on pairs, or of its Table 2 on a collection."""
-    from s4a.show import charts
-    from s4a.study.store import ENGINE
+def compare(
+    paths: list[str] | None = None,
+    *,
+    collection: list[str] | None = None,
+    methods: list[str] | None = None,
+    truth: list[str] | None = None,
+    landmarks: list[str] | None = None,
+    keep: bool = False,
+    out: str = "compare",
+    n_pairs: int,
+    **options: Any,
+) -> int:
+    """The methods of the paper's Table 1 on pairs, or of its Table 2 on a collection.
 
+    Parameters
+    ----------
+    paths : SOURCE TARGET
+        the reference and one or more other meshes
+    collection : PATH
+        Table 2 on these folders, globs or mesh files
+    methods : METHOD
+        of kNN, ZO, FMAP+ZO, SCALABLE, RE-MATCH, RE-MATCH lifted, registered, registered surface
+    truth : FILE
+        for each target, NPY or text: per vertex of its file that of the source's (from 0; -1:
+        none), or x, y, z
+    landmarks : FILE
+        points by name, of the source's file and of each target's: Slicer .mrk.json, CSV or
+        MeshLab .pp
+    keep
+        meshes, matches and maps are in compare.nc, too, for the panel that shows them
+    out : DIR
+        for compare.nc and compare.png
+    """
+    options["n_coarse"] = options["n_coarse"] or N_COARSE
     result: xr.Dataset | xr.DataTree
-    if args.collection:
-        result, names, seconds, text = compare_collection(args)
+    if collection:
+        if paths or truth or landmarks or keep:
+            raise ValueError(
+                "--collection takes the shapes alone: no SOURCE, TARGET, --truth, --landmarks or "
+                "--keep"
+            )
+        result = found = compare_collection(collection, methods, n_pairs, options)
+        names = [f"{way}, {how}" for way in found["way"].values for how in found["how"].values]
+        seconds = found["collection_seconds"].values.reshape(len(names), -1)
+        text = tables.collection_table(found)
     else:
-        result, names, seconds, text = compare_pairs(args)
-    out = new_folder(args.out)
-    result.to_netcdf(out / "compare.nc", engine=ENGINE)
-    figure = charts.stacked(names, result.coords["block"].values.tolist(), seconds)
-    figure.savefig(out / "compare.png", dpi=150)
-    write(text)
+        result = compare_pairs(paths or [], truth, landmarks, options | {"methods": methods}, keep)
+        found = result["metrics"].to_dataset() if keep else result
+        names, seconds = found["way"].values.tolist(), found["block_seconds"].mean("pair").values
+        blocks = tables.block_table(names, found["block"].values.tolist(), seconds)
+        text = f"{tables.comparison_table(found)}\n\n{blocks}"
+    folder = new_folder(out)
+    result.to_netcdf(folder / "compare.nc", engine="h5netcdf")
+    figure = s4a.show.charts.stacked(names, result.coords["block"].values.tolist(), seconds)
+    figure.savefig(folder / "compare.png", dpi=150)
     write(
-        f"\nlengths in % of sqrt(area), times in CPU seconds of one core; "
-        f"in {out}: compare.nc, compare.png"
+        text,
+        "\nlengths in % of sqrt(area), times in CPU seconds of one core; "
+        f"in {folder}: compare.nc, compare.png",
     )
     return 0
 
 
-def compare_collection(args: Namespace) -> "tuple[xr.Dataset, list[str], np.ndarray, str]":
-    """Table 2: the result, names of the bars of Fig. 3, their seconds by block, and a text."""
-    from s4a.cli import tables
-    from s4a.evaluation import compare as comparison
-    from s4a.options import N_COARSE, Options
-
-    if args.paths or args.truth or args.landmarks or args.keep:
-        raise ValueError(
-            "--collection takes the shapes alone: no SOURCE, TARGET, --truth, --landmarks or --keep"
-        )
-    result = comparison.collection(
-        args.collection,
-        methods=args.methods or list(comparison.COLLECTION_METHODS),
-        n_coarse=args.n_coarse or N_COARSE,
-        n_pairs=args.n_pairs,
-        k_init=min(Options.k_init, args.k),
-        k=args.k,
-        preset=args.preset,
-        seed=args.seed,
-    )
-    names = [f"{method}, {how}" for method in result["way"].values for how in result["how"].values]
-    seconds = result["collection_seconds"].values.reshape(len(names), -1)
-    return result, names, seconds, tables.collection_table(result)
+def compare_collection(
+    paths: list[str], methods: list[str] | None, n_pairs: int, options: dict[str, Any]
+) -> "xr.Dataset":
+    """Table 2."""
+    k_init = min(Options.k_init, options["k"])
+    methods = methods or list(s4a.compare.COLLECTION_METHODS)
+    return s4a.compare.collection(paths, methods=methods, n_pairs=n_pairs, k_init=k_init, **options)
 
 
 def compare_pairs(
-    args: Namespace,
-) -> "tuple[xr.Dataset | xr.DataTree, list[str], np.ndarray, str]":
-    """Table 1: as :func:`compare_collection`."""
-    import xarray as xr
-
-    from s4a.cli import tables
-    from s4a.evaluation import compare as comparison
-    from s4a.input.files import find_meshes, slugs
-    from s4a.options import N_COARSE
-
-    if len(args.paths) < 2:
+    paths: list[str],
+    truth: list[str] | None,
+    landmarks: list[str] | None,
+    options: dict[str, Any],
+    keep: bool,
+) -> Any:
+    """Table 1, a Dataset; a tree with what is to be kept."""
+    if len(paths) < 2:
         raise ValueError("compare needs SOURCE and TARGET, or --collection PATH...")
-    source, *paths = args.paths
-    files = [file for target in paths for file, _ in find_meshes(target)]
+    source, *targets = paths
+    files = [file for target in targets for file, _ in s4a.input.files.find_meshes(target)]
     twice = [str(file) for file in files if files.count(file) > 1]
     if twice:
         raise ValueError(f"every TARGET once needed, found {twice[0]} more than once")
-    targets = dict(zip(slugs(files), files, strict=True))  # in the order given, as --truth is
-    result = comparison.pairs(
-        source,
-        targets,
-        methods=args.methods,
-        truth=truth_of(args.truth, targets),
-        landmarks=landmark_pairs(args.landmarks, targets),
-        n_coarse=args.n_coarse or N_COARSE,
-        k=args.k,
-        preset=args.preset,
-        keep=args.keep,
-        seed=args.seed,
-    )
-    found = result["metrics"].to_dataset() if isinstance(result, xr.DataTree) else result
-    names, seconds = found["way"].values.tolist(), found["block_seconds"].mean("pair").values
-    blocks = tables.block_table(names, found["block"].values.tolist(), seconds)
-    return result, names, seconds, f"{tables.comparison_table(found)}\n\n{blocks}"
-
-
-def truth_of(files: list[str] | None, targets: dict[str, Any]) -> "dict[str, np.ndarray] | None":
-    """The truth in one file for every target, in the same order, or none."""
-    from s4a.evaluation.compare import read_truth
-
-    if not files:
-        return None
-    if len(files) != len(targets):
+    names = s4a.input.files.slugs(files)  # in the order given, as --truth is
+    if truth and len(truth) != len(files):
         raise ValueError(
-            f"--truth needs a file for each of the {len(targets)} targets, found {len(files)}"
+            f"--truth needs a file for each of the {len(files)} targets, found {len(truth)}"
         )
-    return {name: read_truth(file) for name, file in zip(targets, files, strict=True)}
+    known = {name: s4a.compare.read_truth(f) for name, f in zip(names, truth or [], strict=False)}
+    return s4a.compare.pairs(
+        source,
+        dict(zip(names, files, strict=True)),
+        truth=known or None,
+        landmarks=landmark_pairs(landmarks, names),
+        keep=keep,
+        **options,
+    )
 
 
 def landmark_pairs(
-    files: list[str] | None, targets: dict[str, Any]
+    files: list[str] | None, targets: list[str]
 ) -> "dict[str, list[np.ndarray]] | None":
-    """Positions of the landmarks that source and target both have by name, for every target.
-
-    None where they share none.
-    """
-    import numpy as np
-
+    """Positions of the landmarks that source and target both have by name, for every target."""
     if not files:
         return None
     if len(files) != 1 + len(targets):
@@ -609,26 +719,20 @@ def landmark_pairs(
             "--landmarks needs a file for the source and each target, "
             f"{1 + len(targets)}; found {len(files)}"
         )
-    source, *others = map(positions_by_name, files)
+    source, *others = (
+        annotations.read_landmarks(file).set_index(landmark="landmark_name") for file in files
+    )
     pairs = {}
     for name, file, target in zip(targets, files[1:], others, strict=True):
-        both = [landmark for landmark in source if landmark in target]
+        both = [mark for mark in source["landmark"].values if mark in target["landmark"]]
         if len(both) < 3:
             raise ValueError(
                 f"{files[0]} and {file} need 3 landmarks or more of the same names, "
                 f"found {len(both)}"
             )
-        pairs[name] = [np.stack([end[landmark] for landmark in both]) for end in (source, target)]
+        ends = (source.sel(landmark=both), target.sel(landmark=both))
+        pairs[name] = [end["landmark_position"].values for end in ends]
     return pairs
-
-
-def positions_by_name(file: str) -> "dict[str, np.ndarray]":
-    """The landmarks of a file: name -> position (3,)."""
-    from s4a.input.annotations import read_landmarks
-
-    landmarks = read_landmarks(file)
-    names = landmarks["landmark_name"].values.tolist()
-    return dict(zip(names, landmarks["landmark_position"].values, strict=True))
 
 
 def within(study: str, name: str) -> Path:
@@ -652,6 +756,25 @@ def new_folder(path: str) -> Path:
     return folder
 
 
-def write(text: str) -> None:
-    """One text to the output, and a new line; of what a file says, nothing moves the cursor."""
-    sys.stdout.write("\n".join(map(shown, text.split("\n"))) + "\n")
+def write(*texts: str) -> None:
+    """Texts to the output, and new lines; of what a file says, nothing moves the cursor."""
+    lines = [s4a.input.raw.shown(line) for text in texts for line in text.split("\n")]
+    sys.stdout.write("\n".join(lines) + "\n")
+
+
+OF_PAIRS = [name for name, one in DECLARED.items() if one.metadata["pair"]]
+CLEANING = ("components", "pattern", "label", "strict", "close_holes", "intersections")
+COMMANDS = {
+    "doctor": command(doctor),
+    "check": command(check, CLEANING),
+    "run": command(run, ALL_OPTIONS),
+    "verify": command(verify),
+    "status": command(status),
+    "demo": command(demo, ("preset", "n_jobs", "seed")),
+    "view": command(view),
+    "statistics": command(statistics, ("n_jobs", "seed")),
+    "fields": command(fields),
+    "insert": command(insert, ("n_jobs",)),
+    "transfer": command(transfer, (*OF_PAIRS, "n_jobs"), unset=True),
+    "compare": command(compare, ("n_coarse", "n_pairs", "k", "preset", "seed")),
+}

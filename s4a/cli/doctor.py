@@ -16,8 +16,6 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 
-from s4a.study.locks import hold
-
 GIB = 2**30
 LEAST_MEMORY = 2.0  # GiB, for ten heads of 150,000 vertices on two cores; the demo takes less
 LEAST_DISK = 1.0  # GiB, for a study
@@ -150,6 +148,8 @@ def wrapping() -> Finding:
 
 def writable(what: str, folder: Path, instead: str) -> Finding:
     """Whether a file can be made, locked and renamed in a folder, as every run does."""
+    from s4a.study.processes import hold
+
     try:
         with tempfile.TemporaryDirectory(prefix=".s4a-", dir=folder) as name:
             there = Path(name) / "a"

@@ -7,18 +7,22 @@ import shlex
 import textwrap
 import time
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-import xarray as xr
+import lazy_loader
 
-from s4a.analysis.inputs import registration_of
-from s4a.geometry.mesh import as_arrays, vertex_areas
-from s4a.input.plausibility import Decision, decisions, listed, notices, shortened
-from s4a.method.pca import mahalanobis
-from s4a.options import kept_options
-from s4a.study.progress import STAGES, Status
-from s4a.study.tree import seconds_of
+import s4a
+
+if TYPE_CHECKING:
+    import numpy as np
+    import xarray as xr
+
+    from s4a.input import plausibility
+    from s4a.study import progress
+else:  # imported when they are first used, so that a command starts at once
+    np = lazy_loader.load("numpy")
+    plausibility = lazy_loader.load("s4a.input.plausibility", suppress_warning=True)
+    progress = lazy_loader.load("s4a.study.progress", suppress_warning=True)
 
 COUNTS = {
     "file_vertices": "vertices",
@@ -45,16 +49,10 @@ SCREEN, LINES = 100, 40  # columns and lines of a summary
 LEAST, MOST_REMARKS = 5, 6  # excluded shapes at least, and remarks at most, with lines of their own
 LONGEST = 24  # letters of a name
 LARGEST = 3  # stages whose time a summary says
-TRANSFERRED = [
-    "target",
-    "cycle error",
-    "|distortion|",
-    "confidence",
-    "share of votes",
-    "labels of dropped vertices",
-    "landmarks",
-    "spread",
-]
+TRANSFERRED = (
+    *("target", "cycle error", "|distortion|", "confidence", "share of votes"),
+    *("labels of dropped vertices", "landmarks", "spread"),
+)
 
 
 def table(rows: Iterable[Sequence[Any]], head: Sequence[str], width: int = 120) -> str:
@@ -89,7 +87,7 @@ def is_number(cell: str) -> bool:
     return cell == "-" or cell.replace(".", "", 1).isdigit()
 
 
-def wrapped(text: str, width: int, indent: str = "") -> list[str]:
+def wrapped(text: str, width: int, indent: str = "", later: str | None = None) -> list[str]:
     """Lines of a text, broken at blanks only: paths and words stay whole.
 
     Examples
@@ -102,13 +100,13 @@ def wrapped(text: str, width: int, indent: str = "") -> list[str]:
         text,
         width,
         initial_indent=indent,
-        subsequent_indent=indent,
+        subsequent_indent=indent if later is None else later,
         break_long_words=False,
         break_on_hyphens=False,
     )
 
 
-def report_table(report: xr.Dataset) -> str:
+def report_table(report: "xr.Dataset") -> str:
     """A row for every shape; below it what was found and done, and what looks wrong."""
     rows, texts = [], []
     for name in report["shape"].values:
@@ -132,12 +130,12 @@ def report_table(report: xr.Dataset) -> str:
 FAULTS = ("damaged", "missing", "stale")  # states of files without which a study does not hold
 
 
-def count_faults(found: xr.Dataset) -> int:
+def count_faults(found: "xr.Dataset") -> int:
     """How many files of :func:`s4a.verify` make that the study does not hold."""
     return int(np.isin(found["state"].values, FAULTS).sum())
 
 
-def verify_lines(found: xr.Dataset) -> str:
+def verify_lines(found: "xr.Dataset") -> str:
     """What :func:`s4a.verify` has found, in one line, and one for each file that is not whole.
 
     Examples
@@ -146,19 +144,11 @@ def verify_lines(found: xr.Dataset) -> str:
     >>> from s4a.schema import dataset
     >>> found = dataset(state=["whole", "whole"], fault=["", ""])
     >>> print(verify_lines(found.assign_coords(file=["latent.nc", "pca.nc"])))
-    2 files, all whole and made from each other
+    2 files: 2 whole
     """
     states = found["state"].values.tolist()
-    counts = {state: states.count(state) for state in dict.fromkeys(states)}
-    n = sum(count for state, count in counts.items() if state not in ("foreign", "left over"))
-    others = [f"{count} {state}" for state, count in counts.items() if state != "whole"]
-    if not count_faults(found) and not counts.get("unsealed"):
-        line = f"{n} files, all whole and made from each other"
-        line += f"; beside them {', '.join(others)}" if others else ""
-    else:
-        line = f"{n} files: {counts.get('whole', 0)} whole, {', '.join(others)}"
-    if counts.get("unsealed"):
-        line += "; unsealed ones were written before files had checksums: damage is not seen"
+    counts = {state: states.count(state) for state in ["whole", *states]}
+    line = f"{len(states)} files: {', '.join(f'{n} {state}' for state, n in counts.items())}"
     if count_faults(found):
         line += "; the same `s4a run` again makes what is wrong anew, and nothing else"
     rows = zip(found["file"].values, states, found["fault"].values, strict=True)
@@ -167,7 +157,7 @@ def verify_lines(found: xr.Dataset) -> str:
     )
 
 
-def status_lines(status: Status, now: float) -> str:
+def status_lines(status: "progress.Status", now: float) -> str:
     """How far a run is, at a time in seconds since 1970: a line for each stage."""
     since, told = (time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(t)) for t in status[3:5])
     heads = {
@@ -178,35 +168,38 @@ def status_lines(status: Status, now: float) -> str:
         "elsewhere": f"on {status.host}, of which this machine knows no more than the study says: "
         f"it last told at {told}",
     }
-    rows = []
-    for name in dict.fromkeys([*STAGES, *status.stages]):
-        if name not in status.stages:
-            if status.state != "finished":
-                rows.append([name, *["-"] * 5])
-            continue
-        stage = status.stages[name]
-        goes_on = status.state in ("running", "elsewhere") and not stage.ended
-        seconds = stage.seconds + (now - stage.begun if goes_on else 0)
-        remaining = stage.remaining(now) if goes_on else np.nan
-        cells = [f"{seconds:.0f}", f"{stage.memory:.0f}" if stage.ended else "-"]
-        left = "-" if np.isnan(remaining) else f"about {remaining:.0f}"
-        rows.append([name, str(stage.done), str(stage.all), *cells, left])
+    known = status.stages if status.state == "finished" else [*progress.STAGES, *status.stages]
+    goes_on = status.state in ("running", "elsewhere")
+    rows = [
+        [name, *stage_cells(status.stages.get(name), goes_on, now)] for name in dict.fromkeys(known)
+    ]
     lines = [heads[status.state], table(rows, ["stage", "done", "of", "s", "peak MiB", "s left"])]
-    shown = list(status.failures.items())[:LEAST]
-    lines += [f"left out: {name}: {without_middle(why, SCREEN)}" for name, why in shown]
-    if len(status.failures) > LEAST:
-        lines.append(f"and {len(status.failures) - LEAST} more")
-    return "\n".join(lines)
+    lines += [
+        f"left out: {name}: {without_middle(why, SCREEN)}" for name, why in status.failures.items()
+    ]
+    return "\n".join(with_rest(lines, 2 + LEAST))
 
 
-def doubts(report: xr.Dataset) -> list[str]:
-    """Lines: what looks wrong with shapes, and what concerns the collection."""
-    warnings = zip(report["shape"].values, report["warning"].values, strict=True)
-    lines = [f"{name}, warning: {warning}" for name, warning in warnings if warning]
-    return [f"  {line}" for line in [*lines, *report.attrs["remarks"].splitlines()]]
+def stage_cells(stage: "progress.Stage | None", goes_on: bool, now: float) -> list[str]:
+    """How far a stage is, and what it has taken."""
+    if stage is None:
+        return ["-"] * 5
+    runs = goes_on and not stage.ended
+    cells = [stage.done, stage.all, stage.seconds + (now - stage.begun if runs else 0)]
+    left = stage.remaining(now) if runs else np.nan
+    return [
+        *(f"{cell:.0f}" for cell in cells),
+        f"{stage.memory:.0f}" if stage.ended else "-",
+        "-" if np.isnan(left) else f"about {left:.0f}",
+    ]
 
 
-def run_summary(study: xr.DataTree, *, again: str = "s4a run FOLDER --out STUDY") -> str:
+def with_rest(lines: list[str], most: int) -> list[str]:
+    """At most so many lines, and one that says how many more there are."""
+    return lines if len(lines) <= most else [*lines[:most], f"  and {len(lines) - most} more"]
+
+
+def run_summary(study: "xr.DataTree", *, again: str = "s4a run FOLDER --out STUDY") -> str:
     """The end of a run, on one screen: what to decide first, then the shapes and the results.
 
     Parameters
@@ -217,62 +210,64 @@ def run_summary(study: xr.DataTree, *, again: str = "s4a run FOLDER --out STUDY"
     """
     report = study["report"].to_dataset()
     before = ["", *decision_lines(report, again), *remark_lines(report)]
-    after = [*shape_lines(report), "", *result_lines(study), *cost_lines(report)]
+    after = [status_line(report), "", *result_lines(study), *cost_lines(report, LARGEST)]
     room = LINES - len(before) - len(after) - 6  # for the lines around them and place_lines
     return "\n".join([*before, *excluded_lines(report, max(room, LEAST)), *after])
 
 
-def result_lines(study: xr.DataTree) -> list[str]:
+def result_lines(study: "xr.DataTree") -> list[str]:
     """The median shape, how the shapes are registered, what the first modes explain."""
-    registration = registration_of(study)
+    registration = s4a.analysis.inputs.registration_of(study)
+    latent = study["latent"].to_dataset()
+    distance = latent["distance_to_median"].sortby(latent["distance_to_median"])[:3]
+    median, template, *nearest = plausibility.shortened(
+        [latent.attrs["median"], registration.attrs["template"], *distance["shape"].values], LONGEST
+    )
+    near = ", ".join(f"{n} {d:.4f}" for n, d in zip(nearest, distance.values, strict=True))
     confidence, round_trip, distortion = registration_cells(registration)
-    (template,) = shortened([registration.attrs["template"]], LONGEST)
-    lines = [
-        median_line(study["latent"].to_dataset()),
-        f"registered to {template}; mean confidence {confidence}, "
-        f"cycle error {round_trip} of sqrt(area), median |distortion| {distortion}",
-    ]
     if "pca" in study:
         ratio = 100 * study["pca"].to_dataset()["explained_variance_ratio"].cumsum().values
         shares = [f"{ratio[c - 1]:.1f} % by {c}" for c in (1, 3, 10) if c <= len(ratio)]
-        lines.append(f"variance explained: {', '.join(shares)}")
+        modes = f"variance explained: {', '.join(shares)}"
     else:
-        lines.append(f"no modes: {study['report'].attrs['no_modes']}")
-    return [line for text in lines for line in wrapped(text, SCREEN)]
+        modes = f"no modes: {study['report'].attrs['no_modes']}"
+    return [
+        *wrapped(f"median shape: {median}; nearest to the limit shape (eq. 5): {near}", SCREEN),
+        *wrapped(
+            f"registered to {template}; mean confidence {confidence}, "
+            f"cycle error {round_trip} of sqrt(area), median |distortion| {distortion}",
+            SCREEN,
+        ),
+        *wrapped(modes, SCREEN),
+    ]
 
 
-def cost_lines(report: xr.Dataset) -> list[str]:
-    """Seconds of all stages and of those that took most, and the most memory."""
+def cost_lines(report: "xr.Dataset", most: int | None = None) -> list[str]:
+    """Seconds of all stages, in turn, or of those that took most; and the most memory."""
     spent = dict(zip(report["stage"].values.tolist(), report["seconds"].values, strict=True))
-    most = sorted(spent, key=lambda stage: -spent[stage])[:LARGEST]
-    parts = ", ".join(f"{stage} {spent[stage]:.1f}" for stage in most)
+    shown = sorted(spent, key=lambda stage: -spent[stage])[:most] if most else spent
+    parts = ", ".join(f"{stage} {spent[stage]:.1f}" for stage in shown)
     memory = report["peak_memory"].values.max()
-    return wrapped(f"{seconds_of(report)} ({parts}, ...); at most {memory:.0f} MiB", SCREEN)
-
-
-def stage_lines(report: xr.Dataset) -> list[str]:
-    """Seconds of every stage."""
-    costs = zip(report["stage"].values, report["seconds"].values, strict=True)
-    return wrapped(f"seconds: {', '.join(f'{stage} {s:.1f}' for stage, s in costs)}", SCREEN)
+    all_of_them = s4a.study.tree.seconds_of(report)
+    return wrapped(f"{all_of_them} ({parts}); at most {memory:.0f} MiB", SCREEN)
 
 
 def place_lines(study: str, report: str) -> list[str]:
     """Where the study is, how to look at it, and where every shape is told of."""
-    line = f"study: {study}; pictures: s4a view {study}; every shape: {report}"
-    if len(line) <= SCREEN:
-        return [line]
-    return [f"study: {study}", f"pictures: s4a view {study}", f"every shape: {report}"]
+    parts = [f"study: {study}", f"pictures: s4a view {study}", f"every shape: {report}"]
+    line = "; ".join(parts)
+    return [line] if len(line) <= SCREEN else parts
 
 
-def decision_lines(report: xr.Dataset, again: str = "s4a run FOLDER --out STUDY") -> list[str]:
+def decision_lines(report: "xr.Dataset", again: str = "s4a run FOLDER --out STUDY") -> list[str]:
     """Doubtful shapes by what is doubtful, what to do about it, and the commands that do it."""
     n = int((report["status"] == "doubtful").sum())
     if not n:
         return []
-    kept = kept_options(report).get("keep_doubtful")
+    kept = s4a.options.kept_options(report).get("keep_doubtful")
     become = "taken in as they are" if kept else "kept apart: in no modes, no statistics, no median"
     lines = [f"TO DECIDE: {n} of {report.sizes['shape']} shapes are doubtful, and {become}"]
-    lines += kind_lines(decisions(report))
+    lines += kind_lines(plausibility.decisions(report))
     if kept:
         return [*lines, *command_lines("to keep them apart:", again, "", "--keep-doubtful"), ""]
     return [
@@ -303,52 +298,36 @@ def command_lines(what: str, command: str, flag: str = "", without: str = "") ->
     >>> command_lines("to take them in:", "s4a run " + 400 * "a.ply ", "--keep-doubtful")
     ['  to take them in: the same command with --keep-doubtful']
     """
-    words = [shlex.quote(word) for word in shlex.split(f"{command} {flag}")]
-    line, lines = f"  {what}", []
-    for word in words:
-        if len(line) + len(word) + 3 > SCREEN:  # a blank, and two for the mark of the next line
-            lines.append(f"{line} \\")
-            line = "     "
-        line += f" {word}"
-    lines.append(line)
-    if len(lines) > 3 or max(map(len, lines)) > SCREEN:
+    words = [shlex.quote(word).replace(" ", "\0") for word in shlex.split(f"{command} {flag}")]
+    lines = wrapped(f"  {what} {' '.join(words)}", SCREEN - 2, "", " " * 6)
+    if len(lines) > 3 or max(map(len, lines)) > SCREEN - 2:
         return [f"  {what} the same command {f'with {flag}' if flag else f'without {without}'}"]
+    return " \\\n".join(lines).replace("\0", " ").split("\n")
+
+
+def kind_lines(found: list["plausibility.Decision"]) -> list[str]:
+    """A line for each kind: how many shapes, which ones as there is room, what to do."""
+    lines = []
+    for one in found:
+        room = SCREEN - len(one.kind) - len(one.remedy) - 12
+        letters = max(min(LONGEST, room - len(", 999 more")), 5)
+        names = plausibility.listed(one.names, room, letters)
+        lines.append(f"{len(one.names):3} {one.kind}  {names}  -> {one.remedy}")
     return lines
 
 
-def kind_lines(found: list[Decision]) -> list[str]:
-    """A line for each kind: how many shapes, which ones as there is room, what to do."""
-    heads = [f"{len(one.names):3} {one.kind}" for one in found]
-    first = max(map(len, heads), default=0)
-    room = SCREEN - first - 6 - max((len(one.remedy) for one in found), default=0)
-    letters = max(min(LONGEST, room - len(", 999 more")), 5)
-    names = [listed(one.names, room, letters) for one in found]
-    second = max(map(len, names), default=0)
-    return [
-        f"{head.ljust(first)}  {few.ljust(second)}  -> {one.remedy}"
-        for head, few, one in zip(heads, names, found, strict=True)
-    ]
-
-
-def excluded_lines(report: xr.Dataset, most: int) -> list[str]:
+def excluded_lines(report: "xr.Dataset", most: int) -> list[str]:
     """The shapes that could not be used, each with its reason; at most so many of them."""
     out = report.sel(shape=report["status"].values == "excluded")
-    names = out["shape"].values.tolist()
+    names = plausibility.shortened(out["shape"].values.tolist(), 20)
     if not names:
         return []
-    reasons = [
-        short_reason(*texts)
-        for texts in zip(out["reason"].values.tolist(), out["path"].values.tolist(), strict=True)
-    ]
-    shown = list(zip(shortened(names, 20), reasons, strict=True))[:most]
-    width = max(len(name) for name, _ in shown)
-    lines = [f"{len(names)} of {report.sizes['shape']} shapes cannot be used:"]
-    for name, reason in shown:
+    width, lines = max(map(len, names)), []
+    for name, reason, path in zip(names, out["reason"].values, out["path"].values, strict=True):
         head = f"  {name.ljust(width)}  "
-        lines.append(head + without_middle(reason, SCREEN - len(head)))
-    if len(names) > most:
-        lines.append(f"  and {len(names) - most} more: {listed(names[most:], 80)}")
-    return [*lines, ""]
+        lines.append(head + without_middle(short_reason(reason, path), SCREEN - len(head)))
+    head = f"{len(names)} of {report.sizes['shape']} shapes cannot be used:"
+    return [head, *with_rest(lines, most), ""]
 
 
 def without_middle(text: str, longest: int) -> str:
@@ -360,18 +339,11 @@ def without_middle(text: str, longest: int) -> str:
     >>> without_middle("one of PLY, OBJ, OFF, STL expected, found 14 bytes", 36)
     'one of PLY, OBJ, … found 14 bytes'
     """
-    words = text.split()
-    if len(text) <= longest or len(words) < 3:
-        return shortened([text], longest)[0]
-    first, last, room = [words[0]], [words[-1]], longest - len(words[0]) - len(words[-1]) - 3
-    rest = words[1:-1]
-    while rest and room >= 0:  # from both ends by turns
-        from_end = len(" ".join(last)) < len(" ".join(first))
-        word = rest.pop(-1 if from_end else 0)
-        room -= len(word) + 1
-        if room >= 0:
-            last, first = ([word, *last], first) if from_end else (last, [*first, word])
-    return shortened([" ".join([*first, "…", *last])], longest)[0]
+    if len(text) <= longest:
+        return text
+    half = (longest - 3) // 2
+    first, last = (textwrap.shorten(end, half, placeholder="") for end in (text, text[::-1]))
+    return f"{first} … {last[::-1]}".strip()
 
 
 def short_reason(reason: str, path: str) -> str:
@@ -391,42 +363,29 @@ def short_reason(reason: str, path: str) -> str:
     return reason.replace(folder + slash, "").removeprefix(f"{file} ")
 
 
-def remark_lines(report: xr.Dataset) -> list[str]:
+def remark_lines(report: "xr.Dataset") -> list[str]:
     """What concerns the collection, shortened, and what else looks wrong with shapes, by kind."""
     remarks = report.attrs["remarks"].splitlines()
     lines = [f"  {without_middle(line, SCREEN - 2)}" for line in remarks]
-    if len(lines) > MOST_REMARKS:
-        lines = [*lines[:MOST_REMARKS], f"  and {len(remarks) - MOST_REMARKS} more remarks"]
-    lines += kind_lines(notices(report))
+    lines = [*with_rest(lines, MOST_REMARKS), *kind_lines(plausibility.notices(report))]
     return ["to know:", *lines, ""] if lines else []
 
 
-def shape_lines(report: xr.Dataset) -> list[str]:
+def status_line(report: "xr.Dataset") -> str:
     """How many shapes there are of each status."""
     status = report["status"].values
     kinds = ("ok", "repaired", "doubtful", "excluded")
-    counts = ", ".join(f"{(status == kind).sum()} {kind}" for kind in kinds)
-    return [f"{len(status)} shapes: {counts}"]
+    return f"{len(status)} shapes: {', '.join(f'{(status == k).sum()} {k}' for k in kinds)}"
 
 
-def median_line(latent: xr.Dataset) -> str:
-    """The median shape, and the three shapes that are nearest to the limit shape."""
-    distance = latent["distance_to_median"]
-    nearest = distance.isel(shape=distance.argsort().values[:3])
-    names = shortened(nearest["shape"].values.tolist(), LONGEST)
-    near = ", ".join(f"{name} {d:.4f}" for name, d in zip(names, nearest.values, strict=True))
-    (median,) = shortened([latent.attrs["median"]], LONGEST)
-    return f"median shape: {median}; nearest to the limit shape (eq. 5): {near}"
-
-
-def registration_cells(registration: xr.Dataset) -> list[str]:
+def registration_cells(registration: "xr.Dataset") -> list[str]:
     """Mean confidence, mean cycle error and median distortion of registrations."""
     confidence, round_trip = (registration[v].mean().item() for v in ("confidence", "round_trip"))
     distortion = np.median(np.abs(registration["distortion"]))
     return [f"{confidence:.2f}", f"{round_trip:.4f}", f"{distortion:.3f}"]
 
 
-def landmark_cells(landmarks: xr.Dataset) -> list[str]:
+def landmark_cells(landmarks: "xr.Dataset") -> list[str]:
     """Mean confidence and spread of landmarks that were carried over."""
     cells = [f"{landmarks['landmark_confidence'].mean().item():.2f}", "-"]
     if "landmark_spread" in landmarks:
@@ -434,7 +393,7 @@ def landmark_cells(landmarks: xr.Dataset) -> list[str]:
     return cells
 
 
-def planted_line(modes: xr.Dataset, truth: xr.Dataset) -> str:
+def planted_line(modes: "xr.Dataset", truth: "xr.Dataset") -> str:
     """How well the scores of the modes follow those that made synthetic shapes."""
     planted = truth["planted_score"].sel(shape=modes["shape"]).values  # (s, q)
     score = modes["score"].values  # (s, c)
@@ -444,7 +403,7 @@ def planted_line(modes: xr.Dataset, truth: xr.Dataset) -> str:
     return f"correlation of planted and recovered scores: {words}"
 
 
-def error_table(errors: xr.Dataset) -> str:
+def error_table(errors: "xr.Dataset") -> str:
     """Mean errors of :func:`s4a.evaluation.accuracy.accuracy` over the shapes, a row per method."""
     mean = 100 * errors[["error", "geodesic_error"]].mean("shape")
     rows = []
@@ -454,7 +413,7 @@ def error_table(errors: xr.Dataset) -> str:
     return table(rows, ["mean error, % of sqrt(area)", "straight line", "along edges"])
 
 
-def evaluation_table(evaluation: xr.Dataset, recomputed: xr.Dataset | None) -> str:
+def evaluation_table(evaluation: "xr.Dataset", recomputed: "xr.Dataset | None") -> str:
     """Measures by number of components, with their standard errors.
 
     Parameters
@@ -476,7 +435,7 @@ def evaluation_table(evaluation: xr.Dataset, recomputed: xr.Dataset | None) -> s
     return f"lengths in {unit}, ± standard error\n{table(rows, ['components', *columns])}"
 
 
-def measure_cell(data: xr.Dataset, name: str, c: int) -> str:
+def measure_cell(data: "xr.Dataset", name: str, c: int) -> str:
     """A measure of so many components and its standard error."""
     if c >= data.sizes["component"]:
         return "-"
@@ -484,19 +443,18 @@ def measure_cell(data: xr.Dataset, name: str, c: int) -> str:
     return "-" if np.isnan(value) else f"{value:.4g} ± {error:.2g}"
 
 
-def significance(whole: xr.Dataset, where: xr.Dataset, name: str, study: xr.DataTree) -> str:
+def significance(whole: "xr.Dataset", where: "xr.Dataset", name: str, study: "xr.DataTree") -> str:
     """What a test and its map found, in words."""
-    area = vertex_areas(*as_arrays(study["registration"].to_dataset()))
-    p, least = whole["p_value"].item(), whole.attrs["smallest_p"]
-    groups = f" ({whole.attrs['groups']})" if "groups" in whole.attrs else ""
+    mesh = s4a.geometry.mesh.as_arrays(study["registration"].to_dataset())
+    area = s4a.geometry.mesh.vertex_areas(*mesh)
+    attrs = whole.attrs
+    groups = f" ({attrs['groups']})" if "groups" in attrs else ""
     lines = [
-        f"{name}{groups}: p = {p:.3g} over the whole shape, "
-        f"the smallest that can be reached is {least:.2g}"
+        f"{name}{groups}: p = {whole['p_value'].item():.3g} over the whole shape, "
+        f"the smallest that can be reached is {attrs['smallest_p']:.2g}"
     ]
-    if whole.attrs["covariates"]:
-        lines.append(f"  accounted for: {whole.attrs['covariates']}")
-    if whole.attrs["left_out"]:
-        lines.append(f"  left out, doubtful or without a value: {whole.attrs['left_out']}")
+    said = {"covariates": "accounted for", "left_out": "left out, doubtful or without a value"}
+    lines += [f"  {words}: {attrs[key]}" for key, words in said.items() if attrs[key]]
     corrections = {"p_family_wise": "family-wise", "p_false_discovery": "false discovery rate"}
     for variable, words in corrections.items():
         p_vertex = where[variable].values  # (n,)
@@ -507,17 +465,17 @@ def significance(whole: xr.Dataset, where: xr.Dataset, name: str, study: xr.Data
     return "\n".join(lines)
 
 
-def classification_line(result: xr.Dataset) -> str:
+def classification_line(result: "xr.Dataset") -> str:
     """How well groups are told apart by the scores, in words."""
     share, chance = 100 * result.attrs["balanced_accuracy"], 100 * result.attrs["chance"]
     p = result["p_value"].item()
     return f"classified {share:.0f} % right, chance {chance:.0f} %, p = {p:.3g}"
 
 
-def inserted_table(inserted: xr.DataTree) -> str:
+def inserted_table(inserted: "xr.DataTree") -> str:
     """Where new shapes of :func:`s4a.insert` lie in their study, and what looks wrong with them."""
     report, registration = inserted["report"].to_dataset(), inserted["registration"].to_dataset()
-    rows = []
+    rows, lines = [], []
     for name in report["shape"].values.tolist():
         shape = report.sel(shape=name)
         if shape["status"].item() == "excluded":
@@ -525,26 +483,28 @@ def inserted_table(inserted: xr.DataTree) -> str:
         else:
             distance = inserted["latent"]["distance_to_median"].sel(shape=name).item()
             cells = [*registration_cells(registration.sel(shape=name)), f"{distance:.4f}"]
-            cells += ["-"] * 3
-            if "pca" in inserted:
-                cells[-3:] = score_cells(inserted["pca"].to_dataset().sel(shape=name))
+            pca = inserted.get("pca")
+            cells += ["-"] * 3 if pca is None else score_cells(pca.to_dataset().sel(shape=name))
         rows.append([name, *cells])
+        if shape["warning"].item():
+            lines.append(f"  {name}, warning: {shape['warning'].item()}")
+    lines += [f"  {remark}" for remark in report.attrs["remarks"].splitlines()]
     unit = registration["displacement"].attrs["units"]
     head = ["shape", "confidence", "round trip", "|distortion|", "to limit shape"]
     head += [f"left ({unit})", "Mahalanobis", "scores"]
-    return "\n".join([table(rows, head), *doubts(report)])
+    return "\n".join([table(rows, head), *lines])
 
 
-def score_cells(modes: xr.Dataset) -> list[str]:
+def score_cells(modes: "xr.Dataset") -> list[str]:
     """What the modes leave of one shape, how far it lies from the mean, and its first scores."""
     return [
         f"{modes['reconstruction_error'].item():.4g}",
-        f"{mahalanobis(modes['score'].values):.1f}",
+        f"{s4a.method.pca.mahalanobis(modes['score'].values):.1f}",
         " ".join(f"{score:+.2f}" for score in modes["score"].values[:5]),
     ]
 
 
-def comparison_table(pairs: xr.Dataset) -> str:
+def comparison_table(pairs: "xr.Dataset") -> str:
     """Table 1: mean over the pairs of every metric, and the CPU seconds.
 
     Lengths in % of sqrt(area).
@@ -571,7 +531,7 @@ def block_table(methods: Sequence[str], blocks: Sequence[str], seconds: np.ndarr
     return table(rows, ["CPU s", *blocks, "all"])
 
 
-def collection_table(result: xr.Dataset) -> str:
+def collection_table(result: "xr.Dataset") -> str:
     """Table 2: mean Chamfer distance to the template, CPU seconds by block, the median shape."""
     rows = []
     for way in result["way"].values:

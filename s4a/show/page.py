@@ -11,7 +11,7 @@ from s4a.options import kept_options
 from s4a.show import charts
 from s4a.show.browser import MODES, PARTS, TEMPLATES, look_state, mesh_state, webp_uri
 from s4a.show.draw import SIGNED, Viewpoint, opposite, position_colors, ramp_colors, render
-from s4a.show.pictures import N_MODES, PANEL, SIGMA, mode_drawer, shared_frames
+from s4a.show.pictures import N_MODES, PANEL, SIGMA, mode_pictures, shared_frames
 from s4a.show.surfaces import (
     N_LIVE,
     attribute,
@@ -125,7 +125,7 @@ def _summary(study):
         if name := attribute(study, node, key):
             facts.append(f"{key} {name}")
     if has(study, "pca/explained_variance_ratio"):
-        ratio = study["pca"]["explained_variance_ratio"].values[:N_MODES]
+        ratio = _ratio(study)
         facts.append(f"the first {len(ratio)} components hold {ratio.sum():.0%} of the variance")
     if has(study, "report/seconds"):
         facts.append(seconds_of(study["report"].to_dataset()))
@@ -164,13 +164,13 @@ def _shapes(study, look):
         if key in report and (report[key].values != "").any()
     ]
     meshes = study["original"].children if has(study, "original") else {}
-    rows, places = [], _pictures(study)
-    for i, name in enumerate(names_of(report)):
+    names = names_of(report)
+    rows, linked = [], _linked(names, _pictures(study))
+    for i, name in enumerate(names):
         size = ["", ""]
         if name in meshes:
-            size = [meshes[name].sizes["vertex"], meshes[name].sizes["triangle"]]
-        linked = PARTS.link(name, places[name]) if name in places else name
-        rows.append([linked, status[i], *size, *(report[key].values[i] for key in texts)])
+            size = [meshes[name].sizes[kind] for kind in ("vertex", "triangle")]
+        rows.append([linked[i], status[i], *size, *(report[key].values[i] for key in texts)])
     head = ["shape", "status", "vertices", "triangles", *texts]
     return PARTS.table(head, rows, status.tolist(), name="the shapes")
 
@@ -239,16 +239,18 @@ def _distances(study, look):
 
 def _moved(study, look):
     """Sliders that move the mean shape; pictures drawn in advance where they cannot."""
-    draw, _ = mode_drawer(study, look)
     n_frames = 13 if study["registration"].sizes["vertex"] < 50_000 else 7
-    sigmas = np.linspace(-SIGMA, SIGMA, n_frames)
+    sigmas, ratio = np.linspace(-SIGMA, SIGMA, n_frames), _ratio(study)
     sliders = []
-    for mode, ratio in enumerate(study["pca"]["explained_variance_ratio"].values[:N_MODES]):
-        frames = [webp_uri(draw(mode, s)) for s in sigmas]
-        labels = [_label(mode, s) for s in sigmas]
-        share = f"{ratio:.1%} of the variance"
-        sliders.append(PARTS.slider(mode, frames, labels, share))
+    for mode, drawn in enumerate(mode_pictures(study, sigmas, len(ratio), **look)):
+        frames, labels = list(map(webp_uri, drawn)), [_label(mode, s) for s in sigmas]
+        sliders.append(PARTS.slider(mode, frames, labels, f"{ratio[mode]:.1%} of the variance"))
     return _live_modes(study, PARTS.grid(sliders), look)
+
+
+def _ratio(study):
+    """Shares of variance of the first modes, which are drawn."""
+    return study["pca"]["explained_variance_ratio"].values[:N_MODES]
 
 
 def _label(mode, sigma):
@@ -257,14 +259,13 @@ def _label(mode, sigma):
 
 
 def _modes(study, look):
-    draw, limit = mode_drawer(study, look)
-    unit = study["pca"]["deformation"].attrs.get("units", "")
-    pictures = []
-    for mode in range(min(N_MODES, study["pca"].sizes["component"])):
-        for sigma in (-SIGMA, 0, SIGMA):
-            pictures.append(PARTS.picture(draw(mode, sigma), _label(mode, sigma)))
-        behind = draw(mode, SIGMA, view=opposite(look["view"]))
-        pictures.append(PARTS.picture(behind, f"{_label(mode, SIGMA)}, from behind"))
+    limit, unit = mode_limits(study)[0], study["pca"]["deformation"].attrs.get("units", "")
+    scores, n_modes, pictures = (-SIGMA, 0, SIGMA), len(_ratio(study)), []
+    behind = mode_pictures(study, [SIGMA], n_modes, **look | {"view": opposite(look["view"])})
+    for mode, drawn in enumerate(mode_pictures(study, scores, n_modes, **look)):
+        texts = [_label(mode, score) for score in scores]
+        pictures += map(PARTS.picture, drawn, texts)
+        pictures.append(PARTS.picture(behind[mode][0], f"{texts[-1]}, from behind"))
     note = "Blue is expansion, red is compression, against the mean; one colour scale for all, "
     note += "that of the sliders. What moves farther has the full colour."
     bar = charts.color_bar(SIGNED, -limit, limit, f"displacement along the normal ({unit})")
@@ -328,10 +329,8 @@ def _correspondence(study, look):
     template = registration.attrs.get("template", "")
     surfaces = {f"{template}, the template": (X, T, colors)}
     others = [name for name in names_of(registration) if name != template]
-    for name in others[:N_CARRIED]:
-        carried = carried_colors(study, name, colors)
-        if carried is not None:
-            surfaces[name] = carried
+    surfaces |= {name: carried_colors(study, name, colors) for name in others[:N_CARRIED]}
+    surfaces = {name: one for name, one in surfaces.items() if one is not None}
     frames = shared_frames([X for X, _, _ in surfaces.values()], look)
     figures = []
     for (name, (X, T, colors)), frame in zip(surfaces.items(), frames, strict=True):

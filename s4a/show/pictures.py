@@ -1,6 +1,6 @@
 """Pictures and films as files: of the modes of a study (6.1, Fig. 4), of a mesh, of a panel."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,37 +31,30 @@ def shared_frames(surfaces: list[np.ndarray], look: dict[str, Any]) -> list[np.n
 
     So sizes can be compared.
     """
-    boxes = [plane_box(X, **look) for X in surfaces]
-    half = np.max([box[1] - box[0] for box in boxes], axis=0) / 2
+    boxes = np.array([plane_box(X, **look) for X in surfaces])
+    half = (boxes[:, 1] - boxes[:, 0]).max(0) / 2
     return [box.mean(0) + np.stack([-half, half]) for box in boxes]
 
 
-def mode_drawer(
-    study: xr.DataTree, look: dict[str, Any]
-) -> tuple[Callable[..., np.ndarray], float]:
-    """What draws the first components, all on one colour scale.
+def mode_pictures(
+    study: xr.DataTree,
+    scores: Sequence[float],
+    n_modes: int = N_MODES,
+    *,
+    size: tuple[int, int] = PANEL,
+    view: Viewpoint = "corner",
+    up: str = "z",
+) -> list[list[np.ndarray]]:
+    """Pictures ``(height, width, 4)`` of the first modes, one a row, at scores, one a column.
 
-    Returns
-    -------
-    draw : function
-        ``draw(mode, s, size=PANEL, **look)`` is the picture of the mean shape moved by s standard
-        deviations, coloured by how far it moves along its normal.
-    limit : float
-        The displacement of the full colours, in the unit of the input; see
-        :func:`s4a.show.surfaces.mode_limits`.
+    All of one frame, which has room for three standard deviations, and one colour scale, that of
+    :func:`s4a.show.surfaces.mode_limits`.
     """
-    mean, T, steps = mode_arrays(study, n_modes=N_MODES)
-    along = normal_displacement(steps, vertex_normals(mean, T))
-    limit, _ = mode_limits(study)
-    extremes = np.concatenate([mean + s * step for step in steps for s in (-SIGMA, SIGMA)])
-
-    def draw(mode, s, size=PANEL, **other):
-        seen = {**look, **other}
-        colors = signed_colors(s * along[mode], limit)
-        frame = plane_box(extremes, **seen)
-        return render(mean + s * steps[mode], T, colors=colors, size=size, frame=frame, **seen)
-
-    return draw, limit
+    draw = _modes(study, np.arange(1, 1 + n_modes), view, up)
+    frame = _frames([draw((-SIGMA, SIGMA))], True)[0]
+    look = {"view": "top", "size": size, "frame": frame}
+    drawn = [render(c.points, c.triangles, colors=c.colors, **look) for c in draw(scores)]
+    return [drawn[i : i + len(scores)] for i in range(0, len(drawn), len(scores))]
 
 
 class Cell(NamedTuple):
@@ -219,9 +212,12 @@ def write_film(
     path = _checked(path, FILMS, width)
     draw, axis, together = _source(what, mode, values, label, view, up)
     _whole("n_frames", n_frames, 2, 10_000)
-    for name, given in (("score", score), ("reach", reach), ("seconds", seconds)):
-        if _numbers(name, given).size > 1 or (name == "seconds" and given < 0.01 * n_frames):
-            more = f", at least 0.01 for each of {n_frames} frames" if name == "seconds" else ""
+    for name, given, more in (
+        ("score", score, ""),
+        ("reach", reach, ""),
+        ("seconds", seconds, f", at least 0.01 for each of {n_frames} frames"),
+    ):
+        if _numbers(name, given).size > 1 or (more and given < 0.01 * n_frames):
             raise ValueError(f"{name} needs one number{more}, found {given!r}")
     if not (turn or together):
         raise ValueError(
@@ -269,19 +265,18 @@ def _whole(name, given, low, high):
         raise ValueError(f"{name} needs a whole number from {low} to {high}, found {given!r}")
 
 
-def _numbers(name, given, least=1):
-    """Finite numbers as an array, at least so many of them."""
+def _numbers(name, given):
+    """Finite numbers as an array, at least one of them."""
     numbers = np.atleast_1d(given)
-    if numbers.dtype.kind not in "iuf" or numbers.size < least or not np.isfinite(numbers).all():
+    if numbers.dtype.kind not in "iuf" or not numbers.size or not np.isfinite(numbers).all():
         raise ValueError(f"{name} needs a finite number, found {given!r}")
     return numbers
 
 
 def _few_colors(pictures: list[Image.Image]) -> list[Image.Image]:
     """Pictures in 256 colours: the same for all, or plain areas would flicker."""
-    some = np.concatenate(
-        [np.asarray(one)[::2, ::2] for one in pictures[:: len(pictures) // 6 + 1]]
-    )
+    step = len(pictures) // 6 + 1
+    some = np.concatenate([np.asarray(one)[::2, ::2] for one in pictures[::step]])
     few = Image.fromarray(some).quantize(256, kmeans=1)
     pictures = [one.quantize(palette=few, dither=Image.Dither.NONE) for one in pictures]
     colors = np.reshape(few.getpalette() or [], (-1, 3))
@@ -323,7 +318,7 @@ def _modes(study, mode, view, up):
     if (
         modes.dtype.kind not in "iu"
         or not len(modes)
-        or not 1 <= min(modes) <= max(modes) <= len(share)
+        or not set(modes) <= {*range(1, 1 + len(share))}
     ):
         raise ValueError(f"mode needs whole numbers from 1 to {len(share)}, found {mode!r}")
     mean, T, steps = mode_arrays(study, n_modes=max(N_MODES, modes.max()))
@@ -386,8 +381,7 @@ def _frames(times, together):
     low, high = boxes[:, :, 0].min(0), boxes[:, :, 1].max(0)  # (cell, 2)
     if together:
         low, high = np.full_like(low, low.min(0)), np.full_like(high, high.max(0))
-    half = (high - low).max(0) / 2
-    middle = (low + high) / 2
+    half, middle = (high - low).max(0) / 2, (low + high) / 2
     return np.stack([middle - half, middle + half], axis=1)
 
 

@@ -12,8 +12,9 @@ import xarray as xr
 from s4a.geometry.crossing import can_count
 from s4a.input.plausibility import Doubts, doubt, doubtful_lines, find_warnings, pick_references
 from s4a.options import Options
+from s4a.study.netcdf import arrays, attributes, open_file, read
 from s4a.study.runner import Keys, Run, Task
-from s4a.study.store import arrays, attributes, open_file, read, task_key
+from s4a.study.store import task_key
 from s4a.study.tasks import compare_shape, portray_shape
 
 # badness: of one kind 0.02 to 0.03, in far poses 0.01 to 0.03, of a cat and a man 0.14 to 0.16

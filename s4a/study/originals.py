@@ -9,9 +9,10 @@ from s4a.input.hands import AUTO, hands, of_other_hand, to_reflect
 from s4a.options import Options
 from s4a.schema import dataset
 from s4a.study.doubts import looks_of
+from s4a.study.netcdf import is_done, read
 from s4a.study.runner import Keys, Run, Task
 from s4a.study.sources import Marked, Sources
-from s4a.study.store import is_done, read, task_key, write
+from s4a.study.store import task_key, write
 from s4a.study.tasks import clean_shape
 
 log = logging.getLogger(__name__)

@@ -28,6 +28,7 @@ from s4a.study.doubts import (
     set_apart,
     stop_at_doubts,
 )
+from s4a.study.netcdf import arrays, attributes, is_done, open_file, read
 from s4a.study.originals import choose_reflected, read_and_clean
 from s4a.study.processes import temporary_folder
 from s4a.study.report import write_report
@@ -43,16 +44,7 @@ from s4a.study.sources import (
     of_contents,
     remarks_on_guides,
 )
-from s4a.study.store import (
-    arrays,
-    attributes,
-    is_done,
-    lock,
-    open_file,
-    read,
-    task_key,
-    write,
-)
+from s4a.study.store import lock, task_key, write
 from s4a.study.tasks import (
     align_shape,
     consistent_maps,

@@ -10,6 +10,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
+from importlib.util import find_spec
 from multiprocessing import spawn
 from pathlib import Path
 from types import FrameType
@@ -19,8 +20,8 @@ from joblib import Parallel
 from joblib.parallel import LokyBackend, get_active_backend
 
 from s4a.geometry.compiled import psutil
-from s4a.study.locks import CAN_HOLD, hold
 
+CAN_HOLD = find_spec("fcntl") is not None  # not on Windows, where nobody can tell who holds what
 TEMPORARY = "s4a-"  # how the folder of a study that nobody keeps begins
 
 
@@ -245,6 +246,21 @@ def remove_abandoned(parent: Path) -> None:
                 token = lock.read_text() if lock.is_file() else ""
                 shutil.rmtree(folder, ignore_errors=True)
                 remove_remains(token)
+
+
+def hold(handle: int) -> bool:
+    """Hold an open file or folder; False where this system cannot.
+
+    Raises
+    ------
+    OSError
+        When another process holds it.
+    """
+    if CAN_HOLD:
+        import fcntl
+
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    return CAN_HOLD
 
 
 @contextlib.contextmanager

@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from s4a.geometry.compiled import psutil
-from s4a.study.seal import open_regular
+from s4a.study.netcdf import check_regular
 
 FILE = ".progress.json"
 EVERY = 1.0  # seconds between two notes of a stage
-LARGEST = 2**24  # bytes of a note that are read
 # of every run, in order; those of doubtful shapes are in some
 STAGES = (
     "read and clean",
@@ -166,8 +165,8 @@ def status(folder: Path | str) -> Status:
     """
     path = Path(folder) / FILE
     try:
-        with open_regular(path) as file:
-            said = json.loads(file.read(LARGEST).decode())
+        check_regular(path)
+        said = json.loads(path.read_text("utf-8"))
     except FileNotFoundError:
         raise ValueError(
             f"{folder} has no {FILE}: no run of this version of s4a has begun there; "

@@ -14,9 +14,10 @@ from s4a.input.plausibility import Doubts
 from s4a.options import Options, with_options
 from s4a.schema import dataset
 from s4a.study.doubts import of_look
+from s4a.study.netcdf import arrays, attributes, read
 from s4a.study.runner import Run
 from s4a.study.sources import Sources
-from s4a.study.store import arrays, attributes, read, write
+from s4a.study.store import write
 
 
 def write_report(

@@ -21,10 +21,10 @@ from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
 from s4a.geometry.compiled import psutil
+from s4a.study.netcdf import check_regular, is_done
 from s4a.study.processes import died, interruption_kept, workers
 from s4a.study.progress import Notes, write_at_once
-from s4a.study.seal import open_regular
-from s4a.study.store import LOGS, Claim, is_done, open_without_following, task_key, write
+from s4a.study.store import LOGS, Claim, open_without_following, task_key, write
 
 log = logging.getLogger(__name__)
 
@@ -294,8 +294,8 @@ def read_costs(path: Path) -> dict[str, list[float]]:
     {}
     """
     try:
-        with open_regular(path) as file:
-            stages = json.loads(file.read(2**20).decode()).items()
+        check_regular(path)
+        stages = json.loads(path.read_text("utf-8")).items()
         costs = {stage: [float(seconds), float(memory)] for stage, (seconds, memory) in stages}
         for seconds, memory in costs.values():  # memory is nan where the system does not say it
             if not 0 <= seconds < 1e12 or memory < 0 or memory > 1e12:

@@ -16,7 +16,8 @@ from s4a.input.raw import read_bytes, shown
 from s4a.input.subjects import listed
 from s4a.method.shape import features_of
 from s4a.schema import require
-from s4a.study.store import read, task_key
+from s4a.study.netcdf import read
+from s4a.study.store import task_key
 
 # files; or by name files or meshes, Datasets or (points, triangles); or what read_shapes gives
 Collection = Path | str | list[Path | str] | dict[str, Any] | xr.DataTree

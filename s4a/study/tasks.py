@@ -27,9 +27,9 @@ from s4a.method.register import from_latent, identity
 from s4a.method.shape import Basis, Shape, features_of
 from s4a.options import Options
 from s4a.schema import dataset, in_unit, unit_of
+from s4a.study.netcdf import arrays, attributes, open_file, read
 from s4a.study.runner import Run
 from s4a.study.sources import Guides, content_of_file
-from s4a.study.store import arrays, attributes, open_file, read
 
 NO_GUIDES = Guides(None, {})
 last_template: dict[tuple[Any, ...], Shape] = {}  # at most one

@@ -11,15 +11,8 @@ from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.options import kept_options
 from s4a.schema import INPUT, in_unit, unit_of, variable
 from s4a.study.contents import check_contents, check_fit
-from s4a.study.store import (
-    ENGINE,
-    DamagedError,
-    check_is_study,
-    damage_named,
-    open_file,
-    read,
-    stacked,
-)
+from s4a.study.netcdf import DamagedError, damage_named, open_file, read, read_tree, stacked
+from s4a.study.store import check_is_study
 
 log = logging.getLogger(__name__)
 
@@ -175,9 +168,9 @@ def open_study(folder: Path | str) -> xr.DataTree:
     that are not yet computed are absent, as are files that were made from others than those now in
     the folder (that is said in a warning of the log).
 
-    Every file is checked: its bytes by their checksums, see :mod:`s4a.study.seal`, its variables by
-    what a file of its name holds, see :mod:`s4a.study.contents`.  Nothing leads out of the folder:
-    links in it, and what HDF5 would take from other files, are refused.
+    Every file is checked: its bytes by their checksums, see :mod:`s4a.study.netcdf`, its variables
+    by what a file of its name holds, see :mod:`s4a.study.contents`.  Nothing leads out of the
+    folder: links in it, and what HDF5 would take from other files, are refused.
 
     Parameters
     ----------
@@ -308,5 +301,4 @@ def open_inserted(file: Path | str) -> xr.DataTree:
             f"{path}: there is no such file; s4a insert STUDY SHAPES --out DIR writes "
             "DIR/inserted.nc"
         )
-    with xr.open_datatree(path, engine=ENGINE) as tree:
-        return tree.load()
+    return read_tree(path)

@@ -1,43 +1,19 @@
 """What holds of a study (4): each of its files read whole, and whether all belong together."""
 
 from collections.abc import Iterator
-from io import BufferedReader
 from pathlib import Path
 
-import h5py
 import xarray as xr
 
-from s4a.schema import dataset
-from s4a.study.contents import REQUIRED, kind_of
-from s4a.study.hdf5 import StudyFile
-from s4a.study.header import header_of
-from s4a.study.seal import open_regular, read_seal
-from s4a.study.store import STAGES, check_is_study, damage_named, open_file
+from s4a.schema import HOLDS, dataset
+from s4a.study.contents import kind_of
+from s4a.study.netcdf import GROUP, damage_named, open_file, open_hdf5
+from s4a.study.store import STAGES, check_is_study
 from s4a.study.tree import Reader, apart_of
 
-# in the order in which they are made; "*" is for shapes and batches
-ORDER = (
-    "original/*",
-    "coarse/*",
-    "network/*",
-    "network",
-    "latent",
-    "latent/*",
-    "rounds/*",
-    "registration",
-    "registration/*",
-    "fields/*",
-    "pca",
-    "subjects",
-    "report",
-)
 OF_SHAPE = (
-    "original/",
-    "coarse/",
-    "network/sketch_",
-    "network/look_",
-    "network/motion_",
-    "registration/",
+    *("original/", "coarse/", "registration/"),
+    *("network/sketch_", "network/look_", "network/motion_"),
 )
 OF_ALL = ("network", "latent", "registration", "report")
 OWN = {*STAGES, ".lock", ".costs.json", "study.html", "report.txt", "modes.png", "statistics"}
@@ -58,7 +34,6 @@ def verify(folder: Path | str) -> xr.Dataset:
         folder or should be.  States are
 
         - ``whole``: as it was written, with all that it needs, made from files of the study;
-        - ``unsealed``: the same, but it was written before files had checksums;
         - ``damaged``, ``missing``, or ``stale``: made from files that are no longer there, which is
           looked for where none is damaged;
         - ``left over`` from an earlier run, or ``foreign``: no part of the study.
@@ -103,13 +78,14 @@ def verify(folder: Path | str) -> xr.Dataset:
     return dataset(state=list(states), fault=list(faults)).assign_coords(file=list(rows))
 
 
-def names_in_order(folder: Path) -> Iterator[str]:
+def names_in_order(folder: Path) -> list[str]:
     """The files of the study that are there, those before that others are made from."""
-    for pattern in ORDER:
-        for path in sorted(folder.glob(f"{pattern}.nc")):
-            name = path.relative_to(folder).with_suffix("").as_posix()
-            if not path.name.startswith(".") and kind_of(name) in REQUIRED:
-                yield name
+    places = [p for p in (folder, *(folder / stage for stage in STAGES)) if p.is_dir()]
+    paths = [path for place in places for path in place.glob("[!.]*.nc")]
+    names = [path.relative_to(folder).with_suffix("").as_posix() for path in paths]
+    order = list(HOLDS)
+    known = [(order.index(kind_of(name)), name) for name in names if kind_of(name) in HOLDS]
+    return [name for _, name in sorted(known)]
 
 
 def look(reader: Reader, name: str) -> tuple[str, str]:
@@ -117,24 +93,23 @@ def look(reader: Reader, name: str) -> tuple[str, str]:
     path = reader.path(name)
     try:
         data, fault = reader.open(name, open_file)
-        for variable in data.variables.values():  # as it is read, it is checked
-            variable.to_numpy()
-        with damage_named(path), open_regular(path) as raw:
-            seal = read_seal(raw)
-            if seal and seal.header:
-                check_header(raw, seal.header)
+        with damage_named(path):
+            check_netcdf(path, data)
     except OSError as error:
         return "damaged", str(error.__cause__ or error)
-    if fault:
-        return "stale", fault
-    return ("whole", "") if seal else ("unsealed", "")
+    return ("stale", fault) if fault else ("whole", "")
 
 
-def check_header(raw: BufferedReader, header: str) -> None:
-    """OSError where a header says something else than HDF5, which other programs ask."""
-    with h5py.File(raw) as file:
-        if header_of(StudyFile(file, raw)) != header:
-            raise OSError("its header is not that of its HDF5")
+def check_netcdf(path: Path, data: xr.Dataset) -> None:
+    """OSError where other programs find something else in a file than its contents say."""
+    data = data.load()  # as it is read, it is checked
+    with open_hdf5(path) as file:
+        names = {name.decode() for name in file} - {GROUP}
+    if names != {*data.variables, *data.sizes}:
+        raise OSError(f"it has other variables than its contents: {names ^ set(data.variables)}")
+    with xr.open_dataset(path, engine="h5netcdf", decode_times=False) as there:
+        if not there.identical(data):
+            raise OSError("its contents are not those of its HDF5")
 
 
 def needed_files(report: xr.Dataset, registration: xr.Dataset | None) -> list[str]:
@@ -147,9 +122,8 @@ def needed_files(report: xr.Dataset, registration: xr.Dataset | None) -> list[st
 
 def foreign(folder: Path) -> Iterator[str]:
     """What else lies in the folder of a study and in those of its stages, but for hidden files."""
-    for place in (folder, *(folder / stage for stage in STAGES if (folder / stage).is_dir())):
-        for path in sorted(place.iterdir()):
-            name = path.relative_to(folder).as_posix()
-            known = path.suffix == ".nc" and kind_of(name.removesuffix(".nc")) in REQUIRED
-            if not known and name not in OWN and not path.name.startswith("."):
+    known = {*OWN, *(f"{name}.nc" for name in names_in_order(folder))}
+    for pattern in ("[!.]*", *(f"{stage}/[!.]*" for stage in STAGES)):
+        for path in sorted(folder.glob(pattern)):
+            if (name := path.relative_to(folder).as_posix()) not in known:
                 yield name

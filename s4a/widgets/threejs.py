@@ -6,31 +6,35 @@ renderer of their own: one WebGL context for all views of a page, picking, a key
 saved pages of some kB.  pythreejs bundles three.js of 2018, and a page shows eight scenes at once.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from pathlib import Path
 
+import anywidget
 import numpy as np
 import pythreejs as three
+import traitlets
 import xarray as xr
-from matplotlib.colors import to_hex, to_rgb
+from ipywidgets import widget_serialization
+from matplotlib.colors import Colormap, to_hex, to_rgb
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
 from s4a.geometry.align import farthest_points
-from s4a.geometry.mesh import as_arrays
-from s4a.schema import require
+from s4a.geometry.mesh import as_arrays, normal_sums, vertex_normals
+from s4a.schema import check_choice, require
+from s4a.show import draw
 from s4a.show.browser import color_scale
-from s4a.show.draw import (
-    CYCLE_ERROR,
-    OKABE_ITO,
-    Viewpoint,
-    cycle_error_colors,
-    position_colors,
-    rotation,
+from s4a.show.draw import CLAY, SIGNED, Viewpoint
+from s4a.show.surfaces import (
+    has,
+    latent_match,
+    mode_arrays,
+    mode_limits,
+    names_of,
+    network_limits,
+    template_coarse,
 )
-from s4a.show.surfaces import has, latent_match, names_of, network_limits
 from s4a.show.surfaces import surface as study_surface
-from s4a.widgets.three_modes import ModesMesh, Scores, modes
-from s4a.widgets.three_surfaces import field_colors, smooth_geometry, standard_material, surface
 
 __all__ = [
     "ModesMesh",
@@ -43,7 +47,283 @@ __all__ = [
     "renderer",
     "surface",
 ]
-LANDMARK = OKABE_ITO[0]
+LANDMARK = draw.OKABE_ITO[0]
+SCRIPTS = Path(__file__).parent / "scripts"
+WIDTH = 2048  # texels of a row of the table of modes: a power of two, so that places are exact
+HUES = "compressed narrowed still widened expanded".split()
+HEIGHT = 4096  # rows that every graphics card takes
+LIGHTS = (  # what three.js fills in for a shader that is lit
+    "ambientLightColor directionalLights directionalShadowMap directionalShadowMatrix spotLights "
+    "spotShadowMap spotShadowMatrix rectAreaLights ltc_1 ltc_2 pointLights pointShadowMap "
+    "pointShadowMatrix hemisphereLights"
+).split()
+
+
+# ---- surfaces
+
+
+def surface(
+    mesh: xr.Dataset,
+    field: str | np.ndarray | xr.DataArray | None = None,
+    cmap: str | Colormap | None = None,
+    *,
+    limits: tuple[float, float] | None = None,
+) -> three.Mesh:
+    """A mesh Dataset as a smooth pythreejs surface, coloured by a field.
+
+    Parameters
+    ----------
+    mesh : xarray.Dataset
+        With ``position(vertex, xyz)`` and ``corner_vertex(triangle, corner)``.
+    field : str or ndarray (vertex,) or (vertex, 3), optional
+        A value of each vertex, or the name of such a variable of the mesh: integers and booleans
+        are labels, with a colour each, other numbers go through the colour map, and three of them
+        are red, green and blue, from 0 to 1.  Where it is not finite the surface is grey.
+    cmap : str or matplotlib.colors.Colormap, optional
+        By default red, white and blue for a field of both signs, "viridis" for one of one sign.
+    limits : (float, float), optional
+        Values of the two ends of the colour map; by default those of the field, without its
+        outermost percent, and as far below zero as above for a field of both signs.
+
+    Returns
+    -------
+    pythreejs.Mesh
+
+    Raises
+    ------
+    ValueError
+        When a position is not finite or the field has not one value for each vertex.
+
+    Examples
+    --------
+    >>> import s4a
+    >>> from s4a.widgets import threejs
+    >>> mesh = s4a.synthetic.sphere(100)
+    >>> ball = threejs.surface(mesh, mesh["position"][:, 2], "magma")
+    >>> ball.geometry.attributes["color"].array.shape
+    (100, 3)
+    """
+    require(mesh, "position", "corner_vertex", what="mesh")
+    X, T = as_arrays(mesh)
+    wrong = (~np.isfinite(X)).any(1).sum()
+    if wrong:
+        raise ValueError(
+            f"finite positions needed, found {wrong} vertices that are not; "
+            "s4a.clean repairs the mesh"
+        )
+    return _body(X, T, None if field is None else _field_colors(mesh, field, cmap, limits))
+
+
+def _field_colors(mesh, field, cmap, limits):
+    """Colours (n, 3) of what was given as the field of a mesh."""
+    if isinstance(field, str):
+        if field not in mesh:
+            raise ValueError(
+                f"a variable of the mesh needed, found {field!r}; it has {', '.join(mesh)}"
+            )
+        field = mesh[field]
+    values, n = np.asarray(field), mesh.sizes["vertex"]
+    if values.shape not in ((n,), (n, 3)):
+        raise ValueError(
+            f"a value or a colour (3) for each of {n} vertices needed, found {values.shape}"
+        )
+    if values.ndim == 2:
+        return np.where(np.isfinite(values), np.clip(values, 0, 1), draw.UNKNOWN)
+    if values.dtype.kind in "iub":
+        return draw.label_colors(values.astype(int))
+    return field_colors(values, cmap, limits)
+
+
+def field_colors(
+    values: np.ndarray,
+    cmap: str | Colormap | None = None,
+    limits: tuple[float, float] | None = None,
+) -> np.ndarray:
+    """Colours ``(n, 3)`` of numbers ``(n,)``; see :func:`surface`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.widgets.threejs import field_colors
+    >>> field_colors(np.array([0.0, 0.5, 1.0]), "gray").round().tolist()
+    [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [1.0, 1.0, 1.0]]
+    """
+    values = np.where(np.isfinite(values), values, np.nan)
+    known = values[~np.isnan(values)]
+    low, high = np.quantile(known, (0.01, 0.99)) if len(known) else (0.0, 1.0)
+    signed = low < 0 < high
+    if limits is not None:
+        low, high = limits
+    elif signed:
+        low, high = -max(-low, high), max(-low, high)
+    colors = draw.ramp_colors(values, low, high, cmap or (SIGNED if signed else "viridis"))
+    return np.where(np.isnan(colors), draw.UNKNOWN, colors)
+
+
+def _geometry(X, T, **attributes):
+    """A geometry of vertices, triangles and what else is of each vertex; None is left out."""
+    known = {"position": X, "normal": vertex_normals(X, T)} | attributes
+    arrays = {k: np.ascontiguousarray(v, np.float32) for k, v in known.items() if v is not None}
+    index = np.asarray(T, np.uint32).ravel()
+    return three.BufferGeometry(
+        attributes={k: three.BufferAttribute(v, normalized=False) for k, v in arrays.items()},
+        index=three.BufferAttribute(index, normalized=False),
+    )
+
+
+def _body(X, T, colors=None, **options):
+    """A slightly rough surface, seen from both sides; in the vertices' colours or that of clay."""
+    look = {"color": to_hex(CLAY)} if colors is None else {"vertexColors": "VertexColors"}
+    material = three.MeshStandardMaterial(roughness=0.7, metalness=0.05, side="DoubleSide", **look)
+    return three.Mesh(_geometry(X, T, color=colors), material, **options)
+
+
+# ---- modes
+
+
+class Scores(anywidget.AnyWidget):
+    """Sliders of the scores of a mesh of :func:`modes`; the kernel hears when one is let go."""
+
+    _esm = SCRIPTS / "scores.js"
+    _css = SCRIPTS / "scores.css"
+    mesh = traitlets.Instance(three.Mesh).tag(sync=True, **widget_serialization)
+
+
+class ModesMesh(three.Mesh):
+    """A pythreejs mesh whose shader moves its vertices along modes; made by :func:`modes`.
+
+    Attributes
+    ----------
+    scores : list of float
+        In standard deviations, one for each mode; set them and the shape follows.
+    sliders : Scores
+        One for each mode; they move the shape without the kernel.
+    """
+
+    scores = traitlets.List(traitlets.Float()).tag(sync=True)
+
+    def __init__(self, geometry, material, **more):
+        super().__init__(geometry, material, **more)
+        self.sliders = Scores(mesh=self)
+
+    @traitlets.validate("scores")
+    def _one_for_each_mode(self, proposal):
+        n = int(self.material.defines["MODES"])
+        if len(proposal["value"]) != n:
+            raise traitlets.TraitError(f"{n} scores needed, found {len(proposal['value'])}")
+        return proposal["value"]
+
+
+def modes(
+    study: xr.DataTree,
+    *,
+    n_modes: int | None = 10,
+    resolution: str = "full",
+    colored: bool = True,
+) -> ModesMesh:
+    """The mean shape of a study, which its scores deform in the browser (6.1).
+
+    A shader adds up X + sum_k score_k mode_k: the modes are sent once, and a step of a slider is
+    no message to the kernel.  Normals follow the modes to first order.
+
+    Parameters
+    ----------
+    study : xarray.DataTree
+        With ``/registration`` and ``/pca``.
+    n_modes : int, optional
+        How many modes at most; None for all.
+    resolution : {"full", "coarse"}
+        Which vertices of the template.
+    colored : bool
+        Whether the surface is coloured by its displacement along the mean's normals, blue where it
+        expands and red where it is compressed.
+
+    Returns
+    -------
+    ModesMesh
+        A pythreejs Mesh with ``scores`` and, to be displayed beside its scene,
+        ``sliders``.  ``ipywidgets.jsdlink((panel.view, "scores"), (mesh, "scores"))`` lets it
+        follow a :class:`s4a.widgets.Modes` of as many modes, in the browser.  A pythreejs Picker
+        finds it where the mean is.
+
+    Raises
+    ------
+    ValueError
+        When the study has no modes, or there are too many numbers for a texture.
+
+    Examples
+    --------
+    >>> import s4a
+    >>> from s4a.widgets import threejs
+    >>> mesh = threejs.modes(s4a.synthetic.example_study())
+    >>> mesh.scores = [2.0, *mesh.scores[1:]]
+    >>> view = threejs.renderer(mesh)  # in a notebook, display(view, mesh.sliders)
+    """
+    if not (has(study, "registration/position") and has(study, "pca/deformation")):
+        raise ValueError("a study with /registration and /pca needed, as of s4a.analyse")
+    check_choice("resolution", resolution, ("full", "coarse"))
+    coarse = template_coarse(study) if resolution == "coarse" else None
+    if resolution == "coarse" and coarse is None:
+        raise ValueError("the study has no low resolution of its template; take the full one")
+    mean, T, deformation = mode_arrays(study, coarse, n_modes)
+    table, bends = mode_table(mean, T, deformation)
+    limit, _ = mode_limits(study)
+    hues = dict(zip(HUES, map(to_hex, SIGNED(np.linspace(0, 1, len(HUES)))), strict=True))
+    slots = -(-len(deformation) // 5) * 5  # pythreejs takes lists of 2, 3, 4, 9 and 16 for vectors
+    uniforms = hues | {
+        "size": [WIDTH, len(table)],
+        "scores": [0.0] * slots,
+        "bends": [*bends.tolist(), *[0.0] * (slots - len(bends))],
+        "limit": limit,
+        "colored": float(colored),
+        "diffuse": to_hex(CLAY),
+        "specular": "#111111",
+        "emissive": "#000000",
+        "shininess": 30.0,
+        "opacity": 1.0,
+        # pythreejs gives its textures, whatever their names, to the last uniform
+        "table": three.DataTexture(table, format="RGBAFormat", type="FloatType"),
+    }
+    material = three.ShaderMaterial(
+        uniforms={name: {"value": None} for name in LIGHTS}
+        | {name: {"value": value} for name, value in uniforms.items()},
+        vertexShader=(SCRIPTS / "modes.vert").read_text(encoding="utf-8"),
+        fragmentShader=(SCRIPTS / "modes.frag").read_text(encoding="utf-8"),
+        defines={"MODES": str(len(deformation)), "SLOTS": str(slots)},
+        lights=True,
+        side="DoubleSide",
+    )
+    geometry = _geometry(mean, T, row=np.arange(len(mean)))
+    return ModesMesh(geometry, material, scores=[0.0] * len(deformation), frustumCulled=False)
+
+
+def mode_table(
+    mean: np.ndarray, T: np.ndarray, deformation: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The texture (rows, 2048, 4) of modes and of how they bend the normals, and of what size.
+
+    The change of a normal is the derivative of their sum by the score, as a share of that sum's
+    length; 127 steps on each side of nothing, the last of which are `bends`.
+    """
+    c, n = deformation.shape[:2]
+    rows = -(-n * c // WIDTH)
+    if rows > HEIGHT:
+        raise ValueError(
+            f"at most {WIDTH * HEIGHT // n} modes of {n} vertices fit into a texture, found {c}; "
+            "give n_modes, or resolution='coarse'"
+        )
+    area = np.linalg.norm(normal_sums(mean, T), axis=1)[:, None]
+    area = np.maximum(area, np.finfo(float).tiny)
+    table = np.zeros((rows * WIDTH, 4), np.float32)
+    bends = np.empty(c)
+    for k, step in enumerate(deformation):
+        change = normal_sums(mean + step, T) - normal_sums(mean - step, T)  # exact: quadratic
+        change /= 2 * area
+        bends[k] = np.quantile(np.abs(change).max(1), 0.999) or 1.0
+        levels = np.clip(np.round(127 * change / bends[k]), -127, 127) + 127  # 0 .. 254
+        table[k : n * c : c, :3] = step
+        table[k : n * c : c, 3] = levels @ [1, 256, 65536]
+    return table.reshape(rows, WIDTH, 4), bends
 
 
 # ---- points, correspondences, networks
@@ -79,17 +359,16 @@ def points(
     >>> [part.name for part in threejs.points({"nose": [0, -1, 0], "chin": [0, -1, -1]}).children]
     ['nose', 'chin']
     """
+    labels: list[str] = []
     if isinstance(places, xr.Dataset):
         require(places, "landmark_position", what="dataset")
-        where = places["landmark_position"].values
-        labels = [""] * len(where)
         if "landmark_name" in places:
-            labels = [str(name) for name in places["landmark_name"].values]
+            labels = places["landmark_name"].values.astype(str).tolist()
+        places = places["landmark_position"].values
     elif isinstance(places, Mapping):
-        labels, where = list(places), np.array(list(places.values()), float)
-    else:
-        where = np.asarray(places, float)
-        labels = [""] * len(where)
+        labels, places = list(places), np.array(list(places.values()))
+    where = np.asarray(places, float)
+    labels = labels or [""] * len(where)
     if where.ndim != 2 or where.shape[1] != 3 or not len(where) or not np.isfinite(where).all():
         raise ValueError(f"finite points (p, 3) needed, found an array of shape {where.shape}")
     size = radius or float(np.linalg.norm(np.ptp(where, axis=0))) / 50 or 1.0
@@ -173,7 +452,7 @@ def correspondence(
     aside = middle - (Y.max(0) + Y.min(0)) / 2
     aside[0] += 0.65 * (np.ptp(X[:, 0]) + np.ptp(Y[:, 0]))
     Y = Y + aside
-    colors = position_colors(X)
+    colors = draw.position_colors(X)
     here = farthest_points(Y, min(n_lines, len(Y)))
     lines = _lines(X[match[here]], Y[here], colors[match[here]])
     both = np.concatenate([X, Y])
@@ -181,8 +460,8 @@ def correspondence(
         # around the origin, where pythreejs first looks, whatever the target of its controls
         position=(-(both.max(0) + both.min(0)) / 2).tolist(),
         children=[
-            three.Mesh(smooth_geometry(X, S, color=colors), standard_material(True)),
-            three.Mesh(smooth_geometry(Y, T, color=colors[match]), standard_material(True)),
+            _body(X, S, colors),
+            _body(Y, T, colors[match]),
             lines,
         ],
     )
@@ -228,11 +507,8 @@ def network(study: xr.DataTree, *, names: bool = True) -> three.Group:
     >>> type(group.children[-1]).__name__
     'LineSegments2'
     """
-    missing = [
-        name
-        for name in ("network/cycle_error", "latent/area_score", "coarse")
-        if not has(study, name)
-    ]
+    needed = "network/cycle_error", "latent/area_score", "coarse"
+    missing = [name for name in needed if not has(study, name)]
     if missing:
         raise ValueError(f"a study with {', '.join(missing)} needed, as of s4a.analyse")
     scores = study["latent"].dataset["area_score"]
@@ -247,27 +523,17 @@ def network(study: xr.DataTree, *, names: bool = True) -> three.Group:
     group = three.Group()
     for place, (name, (X, T)) in zip(places, surfaces.items(), strict=True):
         centred = X - (X.max(0) + X.min(0)) / 2
-        body = three.Mesh(
-            smooth_geometry(centred, T),
-            standard_material(False),
-            position=place.tolist(),
-            name=name,
-        )
+        body = _body(centred, T, position=place.tolist(), name=name)
         if names:
             body.add(_name(name, [0, 0, 0.7 * size], 0.15 * size, hidden=False))
         group.add(body)
-    net = study["network"].dataset
-    sums: dict[tuple, list[float]] = {}
-    maps = zip(*(net[key].values for key in ("source", "target", "cycle_error")), strict=True)
-    for source, target, error in maps:
-        pair = tuple(sorted(shapes.index(str(name)) for name in (source, target)))
-        sums.setdefault(pair, []).append(float(error))
-    known = np.array([np.nan if np.isnan(e).all() else np.nanmean(e) for e in sums.values()])
-    limits = network_limits(study)
-    colors = cycle_error_colors(known, limits)
-    ends = np.array(list(sums))
-    group.add(_lines(places[ends[:, 0]], places[ends[:, 1]], colors, width=3))
-    group.bar = color_scale(CYCLE_ERROR, *limits, "cycle error (logarithmic)")
+    net, limits = study["network"].dataset, network_limits(study)
+    of = [[shapes.index(name) for name in net[key].values] for key in ("source", "target")]
+    ends, pair = np.unique(np.sort(of, axis=0), axis=1, return_inverse=True)
+    error = net["cycle_error"].to_series().groupby(pair.ravel()).mean()
+    colors = draw.cycle_error_colors(error.to_numpy(), limits)
+    group.add(_lines(places[ends[0]], places[ends[1]], colors, width=3))
+    group.bar = color_scale(draw.CYCLE_ERROR, *limits, "cycle error (logarithmic)")
     return group
 
 
@@ -315,14 +581,14 @@ def renderer(
     pythreejs.Renderer
         Its ``scene`` takes more: ``view.scene.add(pythreejs.AxesHelper(50))``.
     """
-    corners = [corner for item in objects for corner in _extent(item)]
-    if not corners:
+    corners = np.concatenate([np.empty((0, 3)), *map(_corners, objects)])
+    if not len(corners):
         raise ValueError("a renderer needs at least one surface to look at")
-    low, high = np.min(corners, axis=0), np.max(corners, axis=0)
+    low, high = corners.min(0), corners.max(0)
     middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     aspect, fov = size[0] / size[1], 40
     half = np.deg2rad(fov) / 2
-    turn = rotation(view, up)
+    turn = draw.rotation(view, up)
     # what is as deep as wide has room to turn; what is long fills the picture as it is seen first
     around = 0.85 * radius / np.sin(min(half, np.arctan(aspect * np.tan(half))))
     box = np.array([place for place in np.ndindex(3, 3, 3) if place != (1, 1, 1)]) - 1
@@ -361,24 +627,16 @@ def renderer(
     )
 
 
-def _extent(item: three.Object3D) -> Iterator[np.ndarray]:
-    """Both corners of the box of each thing that is seen of an object and of what is in it."""
-    geometry = getattr(item, "geometry", None)
-    boxes = []
+def _corners(item):
+    """The corners ``(p, 3)`` of the boxes of what is seen of an object and of what is in it."""
+    geometry, X = getattr(item, "geometry", None), np.empty((0, 3))
     if isinstance(geometry, three.BufferGeometry) and "position" in geometry.attributes:
         X = geometry.attributes["position"].array
-        boxes.append((X.min(0), X.max(0)))
     elif isinstance(geometry, three.LineSegmentsGeometry):
         X = geometry.positions.reshape(-1, 3)
-        boxes.append((X.min(0), X.max(0)))
     elif hasattr(geometry, "radius"):
-        boxes.append((np.full(3, -geometry.radius), np.full(3, geometry.radius)))
-    for child in getattr(item, "children", ()):
-        corners = list(_extent(child))
-        boxes += zip(corners[::2], corners[1::2], strict=True)
-    turn = Rotation.from_quat(item.quaternion).as_matrix()
-    for low, high in boxes:
-        corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), -1).reshape(-1, 3)
-        moved = corners * item.scale @ turn.T + item.position
-        yield moved.min(0)
-        yield moved.max(0)
+        X = np.array([[-geometry.radius], [geometry.radius]]) * np.ones(3)
+    if len(X):
+        X = np.stack(np.meshgrid(*zip(X.min(0), X.max(0), strict=True)), -1).reshape(-1, 3)
+    X = np.concatenate([X, *map(_corners, getattr(item, "children", ()))])
+    return X * item.scale @ Rotation.from_quat(item.quaternion).as_matrix().T + item.position

@@ -11,8 +11,9 @@ import pytest
 from small import FLAGS
 
 from s4a import Options, cli, synthetic, write_mesh
-from s4a.cli import commands, tables
+from s4a.cli import tables
 from s4a.geometry.mesh import as_arrays
+from s4a.options import DECLARED
 from s4a.study.progress import STAGES
 
 
@@ -133,28 +134,24 @@ def test_wrong_usage_ends_with_2_says_how_and_leaves_the_log_as_it_was(arguments
     assert "usage: s4a" in capsys.readouterr().err
 
 
+def parsed(*flags):
+    """The options of a run from flags, and its other arguments."""
+    args = vars(cli.parser().parse_args(["run", "a", "--out", "study", *flags]))
+    return {name: args.pop(name) for name in DECLARED}, args
+
+
 def test_every_option_of_analyse_is_a_flag_of_run_with_the_same_default():
-    found = commands.options_of(cli.parser().parse_args(["run", "a", "b", "--out", "study"]))
-    assert found.pop("n_jobs") == -1  # on the command line all cores are taken
+    found, others = parsed()
     assert Options(**found) == Options()
+    assert others["n_jobs"] == -1  # on the command line all cores are taken
 
 
 def test_flags_give_the_options_their_values():
-    flags = "--n-coarse 500 --n-latent 40 --init landmarks --scale --no-strict"
-    flags += " --components 2 --template x --seed 7"
-    found = commands.options_of(
-        cli.parser().parse_args(["run", "a", "--out", "study", *flags.split()])
-    )
-    expected = {
-        "n_coarse": 500,
-        "n_latent": 40,
-        "init": "landmarks",
-        "scale": True,
-        "strict": False,
-        "components": 2,
-    }
-    assert {n: found[n] for n in expected} == expected
-    assert (found["template"], found["seed"], found["preset"]) == ("x", 7, None)
+    flags = "--n-coarse 500 --n-latent 40 --init landmarks --scale --no-strict --label 1,2"
+    found, _ = parsed(*flags.split(), *"--components 2 --template None --seed 7".split())
+    given = {"n_coarse": 500, "n_latent": 40, "init": "landmarks", "scale": True, "label": "1,2"}
+    given |= {"components": 2, "template": "None", "seed": 7}
+    assert Options(**found) == Options(**given)
 
 
 @pytest.mark.parametrize(

@@ -47,6 +47,17 @@ class Fault:
         return self.name or self.file.split(".")[0]
 
 
+def of(seed, change=lambda X, T: (X, T), suffix=None):
+    """What writes a shape, changed, in the format of the name or of another suffix."""
+
+    def make(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        seeds = seed if isinstance(seed, tuple) else (seed,)
+        path.write_bytes(WRITERS[suffix or path.suffix](*change(*shape(*seeds)), {}))
+
+    return make
+
+
 def write(path, X, T):
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(WRITERS[".ply"](X, T, {}))
@@ -76,14 +87,6 @@ def promise(path):
     path.write_bytes(path.read_bytes().replace(b"vertex 300", b"vertex 9000000"))
 
 
-def ply_inside(path):
-    write(path, *shape(1))
-
-
-def stl_inside(path):
-    path.write_bytes(WRITERS[".stl"](*shape(2), {}))
-
-
 def packed(path):
     path.write_bytes(gzip.compress(WRITERS[".ply"](*shape(3), {})))
 
@@ -106,35 +109,16 @@ def quads(path):
     path.write_text("\n".join(rows + ["f " + " ".join(str(i + 1) for i in f) for f in faces]))
 
 
-def beyond(path):
-    X, T = shape()
-    path.write_bytes(WRITERS[".off"](X, np.r_[T[:-1], [[0, 1, 5000]]], {}))
-
-
-def negative(path):
-    X, T = shape()
-    write(path, X, np.r_[T[:-1], [[0, 1, -7]]])
-
-
 def nan(path):
     X, T = shape(5)
     X[10], X[200] = np.nan, np.inf
     write(path, X, T)
 
 
-def unreferenced(path):
-    X, T = shape(6)
-    write(path, np.r_[np.ones((3, 3)), X], T + 3)
-
-
 def duplicate_vertices(path):
     X, T = shape(7)
     soup = X[T].reshape(-1, 3) + np.random.default_rng(0).uniform(-1e-6, 1e-6, (3 * len(T), 3))
     path.write_bytes(WRITERS[".obj"](soup, np.arange(len(soup)).reshape(-1, 3), {}))
-
-
-def soup(path):
-    path.write_bytes(WRITERS[".stl"](*shape(8), {}))
 
 
 def flat(path):
@@ -145,26 +129,11 @@ def flat(path):
     write(path, X, np.r_[T[1:], [[a, middle, c], [middle, b, c], [a, b, middle]]])
 
 
-def repeated(path):
-    X, T = shape(10)
-    write(path, X, np.r_[T, [[3, 3, 4], [5, 6, 5]]])
-
-
-def twice(path):
-    X, T = shape(11)
-    write(path, X, np.r_[T, T[:5]])
-
-
 def flipped(path):
     X, T = shape(12)
     T = T.copy()
     T[:100] = T[:100, ::-1]
     write(path, X, T)
-
-
-def fin(path):
-    X, T = shape(13)
-    write(path, np.r_[X, [[90.0, 90, 90]]], np.r_[T, [[T[0, 0], T[0, 1], len(X)]]])
 
 
 def bowtie(path):
@@ -175,11 +144,6 @@ def bowtie(path):
     Y = 5 * (u - u[low]) + X[top]
     S = np.where(S == low, top, S + len(X))
     write(path, np.r_[X, Y], np.r_[T, S])
-
-
-def hole(path):
-    X, T = shape(15)
-    write(path, X, T[1:])
 
 
 def spheres(X, T, *radii):
@@ -197,11 +161,6 @@ def parts(path):
     write(path, *spheres(*shape(17), 30))
 
 
-def halves(path):
-    X, T = shape()
-    write(path, np.r_[X, X + 300, X + 600], np.r_[T, T + len(X), T + 2 * len(X)])
-
-
 def crossing(path):
     X, T = shape(18)
     X[np.argmax(X[:, 2])] *= [1, 1, -1.6]
@@ -213,98 +172,13 @@ def handle(path):
     write(path, X, T)
 
 
-def metres(path):
-    X, T = shape(19)
-    write(path, X / 1000, T)
-
-
-def mirrored(path):
-    X, T = shape(20)
-    write(path, X * [-1, 1, 1], T[:, ::-1])
-
-
-def upside_down(path):
-    X, T = shape(21)
-    write(path, X * [1, -1, -1], T)
-
-
-def part(path):
-    X, T = shape(30)
-    write(path, X, T[(X[T, 2] < np.quantile(X[:, 2], 0.7)).all(axis=1)])
-
-
-def stretched(path):
-    X, T = shape(31)
-    write(path, X * [3, 1, 1], T)
-
-
 def rod(path):
     write(path, SPHERE[0] * [120, 25, 25], SPHERE[1])
-
-
-def same(path):
-    X, T = shape(3)
-    path.write_bytes(WRITERS[".obj"](np.round(X[::-1], 3) + 500, len(X) - 1 - T[::-1], {}))
-
-
-def rounded(path):
-    X, T = shape(32)
-    write(path, np.round(X / 4) * 4, T)
-
-
-def inches(path):
-    X, T = shape(33)
-    write(path, 2.54 * X, T)
 
 
 def far(path):
     X, T = shape(22)
     path.write_bytes(WRITERS[".obj"](X + 1e6, T, {}))
-
-
-def tiny(path):
-    X, T = shape(23)
-    path.write_bytes(WRITERS[".obj"](X * 1e-9, T, {}))
-
-
-def huge(path):
-    X, T = shape(24)
-    path.write_bytes(WRITERS[".obj"](X * 1e9, T, {}))
-
-
-def giant(path):
-    X, T = shape(30)
-    path.write_bytes(WRITERS[".obj"](X * 1e37, T, {}))
-
-
-def denormal(path):
-    X, T = shape(31)
-    path.write_bytes(WRITERS[".obj"](X * 1e-300, T, {}))
-
-
-def lost(path):
-    X, T = shape(32)
-    write(path, X + 1e8, T)
-
-
-def few(path):
-    write(path, *shape(25, 80))
-
-
-def letters(path):
-    write(path, *shape(26))
-
-
-def left(path):
-    write(path, *shape(27))
-
-
-def right(path):
-    write(path, *shape(28))
-
-
-def html(path):
-    write(path, *shape(29))
 
 
 class Evil:
@@ -333,10 +207,10 @@ FAULTS = [
           AGAIN),
     Fault("header that promises more than is there", "promise.ply", promise, "excluded",
           "expected 9000000 rows of vertex, found", "excluded before memory is asked for", AGAIN),
-    Fault("PLY named .stl", "ply_inside.stl", ply_inside, "ok", "named .stl but holds PLY",
-          "read as what it is", "rename the file"),
-    Fault("STL named .ply", "stl_inside.ply", stl_inside, "ok", "named .ply but holds STL",
-          "read as what it is", "rename the file"),
+    Fault("PLY named .stl", "ply_inside.stl", of(1, suffix=".ply"), "ok",
+          "named .stl but holds PLY", "read as what it is", "rename the file"),
+    Fault("STL named .ply", "stl_inside.ply", of(2, suffix=".stl"), "ok",
+          "named .ply but holds STL", "read as what it is", "rename the file"),
     Fault("compressed file", "packed.ply.gz", packed, "ok", "^$", "read", "nothing to do"),
     Fault("compressed file that unpacks to too much", "bomb.ply.gz", bomb, "excluded",
           "at most 64 MiB expected in .* compressed bytes, found more",
@@ -344,38 +218,44 @@ FAULTS = [
     Fault("points only", "points.off", points, "excluded", "no faces", "excluded",
           "export the surface, not the points"),
     Fault("quads and polygons", "quads.obj", quads, "ok", "^$", "triangulated", "nothing to do"),
-    Fault("face index out of range", "beyond.off", beyond, "excluded",
+    Fault("face index out of range", "beyond.off",
+          of(0, lambda X, T: (X, np.r_[T[:-1], [[0, 1, 5000]]])), "excluded",
           r"face indices 0\.\.299 expected for 300 vertices, found 0\.\.5000",
           "excluded before native code", AGAIN),
-    Fault("negative face index", "negative.ply", negative, "excluded",
+    Fault("negative face index", "negative.ply",
+          of(0, lambda X, T: (X, np.r_[T[:-1], [[0, 1, -7]]])), "excluded",
           r"face indices 0\.\.299 expected for 300 vertices, found -7\.\.",
           "excluded before native code", AGAIN),
     Fault("NaN or infinite coordinates", "nan.ply", nan, "repaired",
           "2 non-finite vertices removed.*1 holes|2 non-finite vertices removed.*2 holes",
           "the vertices and their faces are removed, `file_vertex` leads to the file's",
           "`strict=True` excludes the shape; `close_holes=True` closes what is left open"),
-    Fault("unreferenced vertices", "unreferenced.ply", unreferenced, "repaired",
+    Fault("unreferenced vertices", "unreferenced.ply",
+          of(6, lambda X, T: (np.r_[np.ones((3, 3)), X], T + 3)), "repaired",
           "3 vertices without triangles dropped", "dropped, `file_vertex` kept", "nothing to do"),
     Fault("duplicate vertices", "duplicate_vertices.obj", duplicate_vertices, "repaired",
           "1488 vertices welded", "welded at 1e-7 of the bounding box, `file_vertex` kept",
           "nothing to do"),
-    Fault("STL soup", "soup.stl", soup, "ok", "^$", "corners in the same place are one vertex",
+    Fault("STL soup", "soup.stl", of(8), "ok", "^$", "corners in the same place are one vertex",
           "nothing to do"),
     Fault("zero-area faces", "flat.ply", flat, "repaired", "zero-area triangles",
           "long edges flipped, so that no crack opens; else dropped", "nothing to do"),
-    Fault("faces that repeat a corner", "repeated.ply", repeated, "repaired",
+    Fault("faces that repeat a corner", "repeated.ply",
+          of(10, lambda X, T: (X, np.r_[T, [[3, 3, 4], [5, 6, 5]]])), "repaired",
           "2 triangles with repeated corners dropped", "dropped", "nothing to do"),
-    Fault("duplicate faces", "twice.ply", twice, "repaired", "5 duplicate triangles dropped",
-          "one is kept", "nothing to do"),
+    Fault("duplicate faces", "twice.ply", of(11, lambda X, T: (X, np.r_[T, T[:5]])), "repaired",
+          "5 duplicate triangles dropped", "one is kept", "nothing to do"),
     Fault("flipped faces", "flipped.ply", flipped, "repaired", "100 triangles reoriented",
           "turned to agree, and outwards", "nothing to do"),
-    Fault("non-manifold edges", "fin.ply", fin, "repaired", "1 non-manifold edge separated",
+    Fault("non-manifold edges", "fin.ply",
+          of(13, lambda X, T: (np.r_[X, [[90.0, 90, 90]]], np.r_[T, [[T[0, 0], T[0, 1], len(X)]]])),
+          "repaired", "1 non-manifold edge separated",
           "separated into sheets; a robust Laplacian where the low-resolution mesh still has some",
           "`wrap=True` wraps the shape watertight"),
     Fault("bow-tie vertices", "bowtie.ply", bowtie, "repaired",
           "1 vertex added by splitting non-manifold ones", "split", "nothing to do"),
-    Fault("holes, open boundary", "hole.ply", hole, "ok", "1 hole kept as boundary",
-          "kept as boundary", "`close_holes=True` closes each by a fan"),
+    Fault("holes, open boundary", "hole.ply", of(15, lambda X, T: (X, T[1:])), "ok",
+          "1 hole kept as boundary", "kept as boundary", "`close_holes=True` closes each by a fan"),
     Fault("several components", "debris.ply", debris, "repaired",
           r"2 components dropped \([0-9.]+ % of the area\)",
           "the largest is kept, and the share of the area that was dropped is said",
@@ -383,7 +263,9 @@ FAULTS = [
     Fault("components with more than a tenth of the area", "parts.ply", parts, "repaired",
           "% of the area was in dropped components", "the largest is kept, warned",
           '`components=N` or `"all"` keeps more', where="warning"),
-    Fault("largest component under half of the area", "halves.ply", halves, "excluded",
+    Fault("largest component under half of the area", "halves.ply",
+          of(0, lambda X, T: (np.r_[X, X + 300, X + 600], np.r_[T, T + len(X), T + 2 * len(X)])),
+          "excluded",
           r"the largest of 3 components has .* under half; say how many .* components=3",
           "excluded", '`components=N` or `"all"`'),
     Fault("self-intersections", "crossing.ply", crossing, "ok",
@@ -394,66 +276,71 @@ FAULTS = [
     Fault("genus other than the rest", "handle.ply", handle, "doubtful", "genus 1, but 0 in",
           "warned, with the table of genus", "`wrap=True` closes tunnels; or leave the shape out",
           where="warning"),
-    Fault("shape in other units", "metres.ply", metres, "doubtful",
+    Fault("shape in other units", "metres.ply", of(19, lambda X, T: (X / 1000, T)), "doubtful",
           r"times the size of the others, near 10\^-3", "warned with the factor; size is kept",
           "scale the file", where="warning"),
-    Fault("mirrored shape", "mirrored.ply", mirrored, "doubtful", "fits as a mirror image",
+    Fault("mirrored shape", "mirrored.ply", of(20, lambda X, T: (X * [-1, 1, 1], T[:, ::-1])),
+          "doubtful", "fits as a mirror image",
           "warned with both ICP residuals; kept as it is; "
           "one of a nearly symmetric kind cannot be told from the others",
           "reflect= mirrors it; or leave it out", where="warning"),
-    Fault("shape upside down", "upside_down.ply", upside_down, "ok", "^$",
-          "the alignment starts from several turns", "nothing to do"),
-    Fault("a part is cut off", "part.ply", part, "doubtful",
+    Fault("shape upside down", "upside_down.ply", of(21, lambda X, T: (X * [1, -1, -1], T)), "ok",
+          "^$", "the alignment starts from several turns", "nothing to do"),
+    Fault("a part is cut off", "part.ply",
+          of(30, lambda X, T: (X, T[(X[T, 2] < np.quantile(X[:, 2], 0.7)).all(axis=1)])),
+          "doubtful",
           r"its holes are [0-9.]+ of sqrt\(area\) long, of the others 0: is a part cut off",
           "doubtful: beside five shapes or more, where its holes are much longer",
           "complete the scan, or leave it out", where="warning"),
-    Fault("shape stretched by 3", "stretched.ply", stretched, "doubtful",
-          "unlike the others: .* times the usual spread away; .* stretched",
+    Fault("shape stretched by 3", "stretched.ply", of(31, lambda X, T: (X * [3, 1, 1], T)),
+          "doubtful", "unlike the others: .* times the usual spread away; .* stretched",
           "warned by its form beside five shapes or more; doubtful where it is far from all others",
           "look at it; leave it out if it does not belong", where="warning"),
     Fault("another kind of shape", "rod.ply", rod, "doubtful",
           "unlike the others: .* times the usual spread away; another kind of shape", "the same",
           "leave it out", where="warning"),
-    Fault("the same scan under two names", "same_as_packed.obj", same, "doubtful",
+    Fault("the same scan under two names", "same_as_packed.obj",
+          of(3, lambda X, T: (np.round(X[::-1], 3) + 500, len(X) - 1 - T[::-1])), "doubtful",
           "the same surface as packed, under two names",
           "doubtful: told by size, moments and volume, in whatever order, pose and format",
           "leave one of them out", where="warning"),
-    Fault("coordinates rounded", "rounded.ply", rounded, "ok",
+    Fault("coordinates rounded", "rounded.ply", of(32, lambda X, T: (np.round(X / 4) * 4, T)), "ok",
           r"its coordinates are rounded, to 0\.[0-9]+ of an edge",
           "warned, where the others' are not", "export it with more digits", where="warning"),
-    Fault("inches among centimetres", "inches.ply", inches, "doubtful",
+    Fault("inches among centimetres", "inches.ply", of(33, lambda X, T: (2.54 * X, T)), "doubtful",
           r"2\.[45][0-9]* times the size of the others, near 2.54",
           "doubtful, beside five shapes or more; its size is kept", "scale the file",
           where="warning"),
     Fault("coordinates offset by 1e6", "far.obj", far, "ok", "^$", "the same as centred",
           "nothing to do"),
-    Fault("scale 1e-9", "tiny.obj", tiny, "doubtful",
+    Fault("scale 1e-9", "tiny.obj", of(23, lambda X, T: (X * 1e-9, T)), "doubtful",
           "1e-09 times the size of the others|e-10 times the size of the others",
           "the same as scaled, in the input's units; warned as another unit", "scale the file",
           where="warning"),
-    Fault("scale 1e9", "huge.obj", huge, "doubtful", r"e\+0?[89] times the size of the others",
+    Fault("scale 1e9", "huge.obj", of(24, lambda X, T: (X * 1e9, T)), "doubtful",
+          r"e\+0?[89] times the size of the others",
           "the same as scaled, in the input's units; warned as another unit", "scale the file",
           where="warning"),
-    Fault("coordinates over 1e15", "giant.obj", giant, "excluded",
+    Fault("coordinates over 1e15", "giant.obj", of(30, lambda X, T: (X * 1e37, T)), "excluded",
           r"coordinates of at most 1e\+15 needed, found", "excluded, as squares of them overflow",
           "scale the file"),
-    Fault("an extent under 1e-15", "denormal.obj", denormal, "excluded",
+    Fault("an extent under 1e-15", "denormal.obj", of(31, lambda X, T: (X * 1e-300, T)), "excluded",
           "an extent of at least 1e-15 needed, found", "excluded, as squares of it vanish",
           "scale the file"),
-    Fault("an offset in which the shape is lost", "lost.ply", lost, "excluded",
-          "lost in rounding: its extent is .* float32",
+    Fault("an offset in which the shape is lost", "lost.ply", of(32, lambda X, T: (X + 1e8, T)),
+          "excluded", "lost in rounding: its extent is .* float32",
           "excluded: from 1e5 times the extent in float32 files, 1e11 times in float64",
           "subtract the offset before the file is written"),
-    Fault("fewer vertices than the target resolution", "few.ply", few, "ok", "",
+    Fault("fewer vertices than the target resolution", "few.ply", of((25, 80)), "ok", "",
           "used as it is, said in the report", "nothing"),
-    Fault("spaces and letters outside ASCII in a path", "Schädel der Maus 脳.ply", letters, "ok",
+    Fault("spaces and letters outside ASCII in a path", "Schädel der Maus 脳.ply", of(26), "ok",
           "^$", "works; the name is made of ASCII letters", "nothing to do",
           name="Schadel_der_Maus_u8133"),
-    Fault("two files with one stem", "left/one.ply", left, "ok", "^$", "named by their folders",
+    Fault("two files with one stem", "left/one.ply", of(27), "ok", "^$", "named by their folders",
           "nothing", name="left_one"),
-    Fault("two files with one stem", "right/one.ply", right, "ok", "^$", "named by their folders",
+    Fault("two files with one stem", "right/one.ply", of(28), "ok", "^$", "named by their folders",
           "nothing", name="right_one"),
-    Fault("HTML in a shape's name", "<img src=x onerror=alert(1)>.ply", html, "ok", "^$",
+    Fault("HTML in a shape's name", "<img src=x onerror=alert(1)>.ply", of(29), "ok", "^$",
           "escaped wherever it is shown", "rename the file", name="_img_src_x_onerror_alert_1__"),
     Fault("pickle in an NPZ", "pickle.npz", pickle, "excluded", "pickle",
           "excluded, never executed", "save plain arrays"),

@@ -80,9 +80,7 @@ def page(texts):
 def proofs():
     """File and name of the test of each row of the second table."""
     _, _, rest = PAGE.read_text(encoding="utf-8").partition(REST)
-    return [
-        re.search(r"`(test_\w+\.py)`: (test_\w+) \|$", row).groups() for row in rest.splitlines()
-    ]
+    return re.findall(r"`(test_\w+\.py)`: (test_\w+) \|$", rest, re.MULTILINE)
 
 
 if __name__ == "__main__":

@@ -138,6 +138,32 @@ def test_a_far_outlier_does_not_weld_the_shape():
     assert (len(Y), counts["components"]) == (len(X) + 8, 2)
 
 
+def cracked(gap):
+    """A sphere whose triangles have one or the other of two vertices that lie a gap apart."""
+    X, T = sphere()
+    with_it = np.flatnonzero((T == 0).any(axis=1))[::2]
+    T[with_it] = np.where(T[with_it] == 0, len(X), T[with_it])
+    return np.concatenate([X, X[:1] + [[0, 0, gap]]]), T
+
+
+@pytest.mark.parametrize("share, welded", [(0.5, 1), (5, 0)])
+def test_vertices_are_welded_up_to_1e_7_of_the_diagonal(share, welded):
+    X, _ = sphere()
+    diagonal = np.linalg.norm(np.ptp(X, axis=0))
+    _, _, counts = cleaned(*cracked(share * 1e-7 * diagonal))
+    assert counts["welded_vertices"] == welded
+
+
+@pytest.mark.parametrize("share, welded", [(0.5, 1), (5, 0)])
+def test_beside_a_far_outlier_vertices_are_welded_up_to_1e_3_of_the_median_side(share, welded):
+    X, T = sphere()
+    side = np.median(np.linalg.norm(X[T] - X[np.roll(T, 1, axis=1)], axis=2))
+    outlier, sides = cube([0, 0, 0])
+    parts = cracked(share * 1e-3 * side), (1e5 + outlier, sides)
+    _, _, counts = cleaned(*together(*parts), components="all")
+    assert counts["welded_vertices"] == welded
+
+
 def test_crowded_vertices_are_refused_before_memory_runs_out():
     X, T = sphere(2000)
     with pytest.raises(ValueError, match=r"vertices crowd"):

@@ -1,7 +1,7 @@
+import itertools
 import struct
-import zlib
-from base64 import b64encode
 
+import fuzz
 import nibabel
 import numpy as np
 import pytest
@@ -115,16 +115,7 @@ def test_off_with_colours_and_normals_gives_the_positions(tmp_path):
         same_surface(file(tmp_path, "m.off", text))
 
 
-def ascii_stl():
-    text = "solid part\n"
-    for t in T:
-        rows = "".join(f"   vertex {x:e} {y:e} {z:e}\n" for x, y, z in X[t])
-        text += f" facet normal 0 0 0\n  outer loop\n{rows}  endloop\n endfacet\n"
-    return text + "endsolid part\n"
-
-
-def test_stl_is_read_as_text_and_as_binary_that_begins_with_solid(tmp_path):
-    same_surface(file(tmp_path, "a.stl", ascii_stl()))
+def test_a_binary_stl_may_begin_with_solid(tmp_path):
     write_mesh(tmp_path / "b.stl", X, T)
     binary = (tmp_path / "b.stl").read_bytes()
     same_surface(file(tmp_path, "c.stl", b"solid".ljust(80) + binary[80:]))
@@ -147,84 +138,30 @@ def test_vtk_is_read_as_text_with_quads_and_metadata(tmp_path):
     assert attrs == {"format": "VTK", "coordinate_system": "RAS"}
 
 
-@pytest.mark.parametrize("binary", [False, True])
-def test_vtk_5_is_read_with_offsets(tmp_path, binary):
-    def array(values, code):
-        values = np.ravel(values)
-        return values.astype(code).tobytes() if binary else " ".join(map(str, values)).encode()
-
-    head = VTK_HEAD.format("5.1", "BINARY" if binary else "ASCII").encode()
-    data = (
-        head + b"POINTS 5 double\n" + array(X, ">f8") + b"\nPOLYGONS 7 18\nOFFSETS vtktypeint64\n"
-    )
-    data += (
-        array(np.arange(7) * 3, ">i8") + b"\nCONNECTIVITY vtktypeint64\n" + array(T, ">i8") + b"\n"
-    )
-    same_surface(file(tmp_path, "m.vtk", data))
+def test_binary_vtk_5_is_read_with_offsets(tmp_path):
+    head = VTK_HEAD.format("5.1", "BINARY") + "POINTS 5 double\n"
+    data = head.encode() + X.astype(">f8").tobytes() + b"\nPOLYGONS 7 18\nOFFSETS vtktypeint64\n"
+    data += (np.arange(7) * 3).astype(">i8").tobytes() + b"\nCONNECTIVITY vtktypeint64\n"
+    same_surface(file(tmp_path, "m.vtk", data + T.astype(">i8").tobytes() + b"\n"))
 
 
-def vtp(how, compressed, header="UInt32"):
-    size, blob = {"UInt32": "<u4", "UInt64": "<u8"}[header], b""
-
-    def encode(values):
-        raw = values.tobytes()
-        if not compressed:
-            return [np.array([len(raw)], size).tobytes() + raw]
-        blocks = [raw[i : i + 32] for i in range(0, len(raw), 32)]
-        packed = [zlib.compress(block) for block in blocks]
-        sizes = [len(blocks), 32, len(blocks[-1]) % 32, *map(len, packed)]
-        return [np.array(sizes, size).tobytes(), b"".join(packed)]
-
-    def array(name, values, kind, width=1):
-        nonlocal blob
-        tag = f'<DataArray type="{kind}" Name="{name}" NumberOfComponents="{width}" format='
-        if how == "ascii":
-            return f'{tag}"ascii">{" ".join(map(str, values.ravel()))}</DataArray>'
-        parts = encode(values)
-        if how == "binary":
-            return f'{tag}"binary">\n  {b"".join(map(b64encode, parts)).decode()}\n</DataArray>'
-        offset = len(blob)
-        blob += b"".join(parts if how == "raw" else map(b64encode, parts))
-        return f'{tag}"appended" offset="{offset}"/>'
-
-    zlib_attr = ' compressor="vtkZLibDataCompressor"' if compressed else ""
-    text = (
-        '<?xml version="1.0"?>\n'
-        f'<VTKFile type="PolyData" byte_order="LittleEndian" header_type="{header}"{zlib_attr}>'
-    )
-    text += (
-        '<PolyData><Piece NumberOfPoints="5" NumberOfVerts="0" NumberOfStrips="0" '
-        'NumberOfPolys="6"><Points>'
-    )
-    text += array("Points", X.astype("<f8"), "Float64", 3) + "</Points><Polys>"
-    text += array("connectivity", T.astype("<i8"), "Int64") + array(
-        "offsets", np.arange(3, 19, 3), "Int64"
-    )
-    text += "</Polys></Piece></PolyData>"
-    if blob:
-        encoding = "raw" if how == "raw" else "base64"
-        return (
-            f'{text}\n<AppendedData encoding="{encoding}">\n   _'.encode()
-            + blob
-            + b"\n</AppendedData></VTKFile>"
-        )
-    return (text + "</VTKFile>").encode()
+SEEDS = fuzz.seeds()
+MESHES = [name for name, (_, kind, _) in SEEDS.items() if kind == "mesh" and name != "gzip"]
 
 
-@pytest.mark.parametrize("how", ["ascii", "binary", "raw", "base64"])
-@pytest.mark.parametrize("compressed", [False, True])
-@pytest.mark.parametrize("header", ["UInt32", "UInt64"])
-def test_vtp_is_read_in_every_encoding(tmp_path, how, compressed, header):
-    same_surface(file(tmp_path, "m.vtp", vtp(how, compressed, header)))
+def wholes(name):
+    """The whole files of a format from which damaged ones are made."""
+    return [finish(content) for content, finish in SEEDS[name][2] if finish is fuzz.whole]
 
 
-def test_freesurfer_surfaces_are_read(tmp_path):
-    nibabel.freesurfer.io.write_geometry(tmp_path / "lh.pial", X, T, create_stamp="created")
-    assert same_surface(tmp_path / "lh.pial") == {
-        "format": "FreeSurfer",
-        "coordinate_system": "RAS",
-        "unit": "mm",
-    }
+@pytest.mark.parametrize("name", MESHES)
+def test_every_encoding_of_a_format_gives_the_same_surface(tmp_path, name):
+    points, triangles = fuzz.surface()
+    for content in wholes(name):
+        found, corners, attrs = read_mesh(file(tmp_path, f"m{SEEDS[name][0]}", content))
+        np.testing.assert_allclose(found[corners], points[triangles], atol=1e-6)
+        brain = {"coordinate_system": "RAS", "unit": "mm"}
+        assert attrs == {"format": name} | (brain if name in ("GIFTI", "FreeSurfer") else {})
 
 
 @pytest.mark.parametrize(
@@ -235,48 +172,17 @@ def test_npz_is_read_by_any_of_its_keys(tmp_path, keys):
     same_surface(tmp_path / "m.npz")
 
 
-def test_npz_with_pickled_objects_is_refused(tmp_path):
-    np.savez(tmp_path / "m.npz", V=np.array([{}, 1], object), F=T)
-    with pytest.raises(ValueError, match=r"m\.npz cannot be read as NPZ"):
-        read_mesh(tmp_path / "m.npz")
-
-
 def test_the_content_counts_and_not_the_name(tmp_path):
     attrs = same_surface(file(tmp_path, "m.stl", ply("binary_little_endian")))
     assert attrs["format"] == "PLY"
     assert attrs["note"] == "named .stl but holds PLY, and was read as that; rename it"
 
 
-def all_formats(tmp_path):
-    for suffix in (".ply", ".off", ".stl", ".vtk", ".gii", ".npz"):
-        write_mesh(tmp_path / f"m{suffix}", X, T)
-        yield (tmp_path / f"m{suffix}").read_bytes()
-    yield from (ply("ascii", True), ply("binary_big_endian", True), ascii_stl().encode())
-    yield from (
-        vtp(how, compressed) for how in ("ascii", "binary", "raw") for compressed in (False, True)
-    )
-    nibabel.freesurfer.io.write_geometry(tmp_path / "lh.pial", X, T, create_stamp="created")
-    yield (tmp_path / "lh.pial").read_bytes()
-
-
 def test_a_file_cut_anywhere_is_refused_with_its_name(tmp_path):
-    for whole in all_formats(tmp_path):
-        for length in range(0, len(whole) - 40, max(1, len(whole) // 50)):
+    for whole in itertools.chain.from_iterable(map(wholes, set(MESHES) - {"OBJ"})):
+        for length in range(0, len(whole) - 100, max(1, len(whole) // 50)):
             with pytest.raises(ValueError, match=r"cut\.mesh"):
                 read_mesh(file(tmp_path, "cut.mesh", whole[:length]))
-
-
-def test_a_damaged_file_is_read_or_refused_but_nothing_worse(tmp_path):
-    rng = np.random.default_rng(0)
-    for whole in all_formats(tmp_path):
-        for _ in range(40):
-            damaged = np.frombuffer(whole, np.uint8).copy()
-            damaged[rng.integers(0, len(whole), 3)] = rng.integers(0, 256, 3)
-            try:
-                points, triangles, _ = read_mesh(file(tmp_path, "m.mesh", damaged.tobytes()))
-            except ValueError:
-                continue
-            assert 0 <= triangles.min() <= triangles.max() < len(points)
 
 
 def test_counts_beyond_the_file_are_named(tmp_path):
@@ -294,29 +200,16 @@ def test_counts_beyond_the_file_are_named(tmp_path):
             read_mesh(file(tmp_path, name, content))
 
 
+LACKS = "an element vertex with x, y and z expected, found"
+
+
 @pytest.mark.parametrize(
     "before, after, found",
     [
-        (
-            "element vertex",
-            "element point",
-            "an element vertex with x, y and z expected, found point, face",
-        ),
-        (
-            "float z",
-            "float w",
-            "an element vertex with x, y and z expected, found an element vertex with x, y, w",
-        ),
-        (
-            "float z",
-            "real z",
-            "properties of elements, of the types of PLY, expected, found 'property real z'",
-        ),
-        (
-            "format ascii",
-            "format binary",
-            "one of the formats ascii, .* expected in the header, found binary",
-        ),
+        ("element vertex", "element point", f"{LACKS} point, face"),
+        ("float z", "float w", f"{LACKS} an element vertex with x, y, w"),
+        ("float z", "real z", "of the types of PLY, expected, found 'property real z'"),
+        ("format ascii", "format binary", "one of the formats .* in the header, found binary"),
     ],
 )
 def test_a_ply_says_what_its_header_lacks(tmp_path, before, after, found):
@@ -326,7 +219,7 @@ def test_a_ply_says_what_its_header_lacks(tmp_path, before, after, found):
     )
     head += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
     (tmp_path / "m.ply").write_text(head.replace(before, after) + "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
-    with pytest.raises(ValueError, match=f"m.ply cannot be read as PLY: {found}"):
+    with pytest.raises(ValueError, match=f"m.ply cannot be read as PLY: .*{found}"):
         read_mesh(tmp_path / "m.ply")
 
 
@@ -357,14 +250,8 @@ def touch(folder, *names):
 
 
 def test_a_pattern_picks_one_structure_of_a_download(tmp_path):
-    touch(
-        tmp_path,
-        "000003_brain.stl",
-        "000003_liver.stl",
-        "s0011_brain.stl",
-        "readme.txt",
-        "._s0011_brain.stl",
-    )
+    names = "000003_brain.stl|000003_liver.stl|s0011_brain.stl|readme.txt|._s0011_brain.stl"
+    touch(tmp_path, *names.split("|"))
     for pattern in ("*_brain", "*_brain.stl"):
         assert [name for _, name in find_meshes(tmp_path, pattern)] == [
             "000003_brain",
@@ -375,17 +262,8 @@ def test_a_pattern_picks_one_structure_of_a_download(tmp_path):
 
 
 def test_names_are_unique_and_do_not_depend_on_the_order(tmp_path):
-    touch(
-        tmp_path,
-        "a/head.ply",
-        "b/head.ply",
-        "b/head.stl",
-        "b/HEAD.off",
-        "c/Kopf ä.ply",
-        "c/脳.ply",
-        "lh.pial",
-        "a_b.ply",
-    )
+    names = "a/head.ply|b/head.ply|b/head.stl|b/HEAD.off|c/Kopf ä.ply|c/脳.ply|lh.pial|a_b.ply"
+    touch(tmp_path, *names.split("|"))
     found = find_meshes(tmp_path)
     names = [name for _, name in found]
     assert len({name.casefold() for name in names}) == len(names) == 8

@@ -1,10 +1,12 @@
 """Files made to do harm: nothing in them is run, they fill no memory and reach no other file."""
 
 import base64
+import gzip
 import io
 import itertools
 import json
 import os
+import tracemalloc
 import zipfile
 import zlib
 
@@ -13,7 +15,9 @@ import numpy as np
 import pytest
 
 from s4a.input.annotations import read_labels, read_landmarks, write_landmarks
-from s4a.input.files import read_mesh, stem_of
+from s4a.input.files import WRITERS, find_meshes, read_mesh, stem_of, write_mesh
+
+X, T = fuzz.surface()
 
 
 def file(path, content):
@@ -90,20 +94,6 @@ def test_xml_with_entities_is_refused(tmp_path, entities):
         )
 
 
-def test_a_gifti_file_opens_no_other_file(tmp_path):
-    file(tmp_path / "secret", bytes(12))
-    text = (
-        '<GIFTI Version="1.0"><DataArray Intent="NIFTI_INTENT_LABEL" DataType="NIFTI_TYPE_INT32" '
-        'Dimensionality="1" Dim0="3" Encoding="ExternalFileBinary" ExternalFileName="secret" '
-        'ExternalFileOffset="0" '
-        'ArrayIndexingOrder="RowMajorOrder" Endian="LittleEndian"><Data/></DataArray></GIFTI>'
-    )
-    with pytest.raises(
-        ValueError, match="data inside the file expected, found ExternalFileBinary secret"
-    ):
-        read_labels(file(tmp_path / "a.gii", text))
-
-
 def npz(**members):
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -117,22 +107,52 @@ def array(shape, data=b"", kind="<i4"):
     return b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + data
 
 
-def test_label_files_that_unpack_to_more_than_64_mib_and_200_times_their_size_are_refused(tmp_path):
-    zeros = bytes(80_000_000)
-    packed = base64.b64encode(zlib.compress(zeros)).decode()
-    gifti = (
-        '<GIFTI Version="1.0"><DataArray Intent="NIFTI_INTENT_LABEL" DataType="NIFTI_TYPE_INT32" '
-        'Dimensionality="1" Dim0="20000000" Encoding="GZipBase64Binary" '
-        'ArrayIndexingOrder="RowMajorOrder" '
-        f'Endian="LittleEndian"><Data>{packed}</Data></DataArray></GIFTI>'
+GIFTI = (
+    '<GIFTI Version="1.0"><DataArray Intent="NIFTI_INTENT_{}" DataType="NIFTI_TYPE_{}" '
+    'Dimensionality="1" Dim0="{}" Encoding="{}" ArrayIndexingOrder="RowMajorOrder" '
+    'Endian="LittleEndian" ExternalFileName="secret" ExternalFileOffset="0"><Data>{}</Data>'
+    "</DataArray></GIFTI>"
+)
+
+
+def bombs():
+    """Files of less than 400 kB that unpack to 80 MB, and what reads them."""
+    zeros, n = bytes(80_000_000), 20_000_000
+    block = zlib.compress(zeros)
+    packed = base64.b64encode(block).decode()
+    head = base64.b64encode(np.array([1, len(zeros), 0, len(block)], "<u4").tobytes()).decode()
+    vtp = (
+        '<VTKFile type="PolyData" compressor="vtkZLibDataCompressor"><PolyData>'
+        '<Piece NumberOfPoints="9" NumberOfPolys="0"><Points>'
+        f'<DataArray type="Float32" format="binary">{head}{packed}</DataArray>'
+        "</Points></Piece></PolyData></VTKFile>"
     )
-    bombs = {"a.npz": npz(label=array((20_000_000,), zeros)), "b.gii": gifti.encode()}
-    for name, data in bombs.items():
-        assert len(data) < 200_000
-        with pytest.raises(
-            ValueError, match=rf"{name}.*at most .* expected in .*compressed .*found more"
-        ):
-            read_labels(file(tmp_path / name, data))
+    points = GIFTI.format("POINTSET", "FLOAT32", n, "GZipBase64Binary", packed)
+    label = GIFTI.format("LABEL", "INT32", n, "GZipBase64Binary", packed)
+    zeros = array((n,), zeros)
+    return [
+        ("a.gz", gzip.compress(bytes(80_000_000)), read_mesh),
+        ("a.vtp", vtp, read_mesh),
+        ("a.gii", points, read_mesh),
+        ("a.npz", npz(V=zeros, F=zeros), read_mesh),
+        ("b.npz", npz(label=zeros), read_labels),
+        ("b.gii", label, read_labels),
+    ]
+
+
+def test_what_unpacks_to_more_than_64_mib_and_200_times_its_size_is_refused(tmp_path):
+    for name, data, read in bombs():
+        assert len(data) < 400_000
+        with pytest.raises(ValueError, match=rf"{name}.*at most .* in .*compressed .*found more"):
+            read(file(tmp_path / name, data))
+
+
+def test_a_gifti_file_opens_no_other_file(tmp_path):
+    file(tmp_path / "secret", bytes(12))
+    text = GIFTI.format("LABEL", "INT32", 3, "ExternalFileBinary", "")
+    found = "data inside the file expected, found ExternalFileBinary secret"
+    with pytest.raises(ValueError, match=found):
+        read_labels(file(tmp_path / "a.gii", text))
 
 
 def test_an_array_that_promises_more_than_its_file_is_refused_before_room_is_made_for_it(tmp_path):
@@ -236,3 +256,61 @@ def test_names_in_annotations_are_no_paths(tmp_path):
     assert read_landmarks(tmp_path / "out" / "l.csv")["landmark_name"].values.tolist() == names
     for path in ("../../x.ply", "/x.ply", "a/../x.ply.gz"):
         assert stem_of(path) == "x"
+
+
+# compressed files
+
+
+def test_compressed_files_are_read_as_what_they_hold(tmp_path):
+    for suffix in (".ply", ".obj", ".off", ".stl", ".vtk", ".gii", ".npz"):
+        write_mesh(tmp_path / f"m{suffix}", X, T)
+        packed = file(
+            tmp_path / f"m{suffix}.gz", gzip.compress((tmp_path / f"m{suffix}").read_bytes())
+        )
+        (tmp_path / f"m{suffix}").unlink()
+        points, triangles, attrs = read_mesh(packed)
+        assert np.allclose(points[triangles], X[T])
+        assert "note" not in attrs
+    assert [name for _, name in find_meshes(tmp_path)] == [
+        f"m_{s}_gz" for s in "gii npz obj off ply stl vtk".split()
+    ]
+    (tmp_path / "one").mkdir()
+    (tmp_path / "m.ply.gz").rename(tmp_path / "one" / "brain.ply.gz")
+    assert [name for _, name in find_meshes(tmp_path / "one", "brain")] == ["brain"]
+
+
+def test_a_compressed_file_that_is_cut_or_damaged_is_refused(tmp_path):
+    packed = gzip.compress(
+        WRITERS[".obj"](np.random.default_rng(0).random((50, 3)), T, {}), mtime=0
+    )
+    with pytest.raises(ValueError, match="the gzip data ends early: found 40 bytes"):
+        read_mesh(file(tmp_path / "m.ply.gz", packed[:40]))
+    with pytest.raises(ValueError, match="damaged gzip data"):
+        read_mesh(file(tmp_path / "m.ply.gz", packed[:30] + b"\xff" * 30 + packed[60:]))
+
+
+def test_an_archive_that_lies_about_its_sizes_is_read_no_further_than_it_says(tmp_path):
+    packed = io.BytesIO()
+    np.savez_compressed(packed, V=np.zeros(10_000_000), F=np.array([[0, 1, 2]]))
+    true = (80_000_128).to_bytes(4, "little")
+    assert packed.getvalue().count(true) == 2
+    lying = packed.getvalue().replace(true, (1000).to_bytes(4, "little"))
+    with pytest.raises(ValueError, match=r"m.npz cannot be read as NPZ"):
+        read_mesh(file(tmp_path / "m.npz", lying))
+    tracemalloc.start()
+    with pytest.raises(ValueError):
+        read_mesh(tmp_path / "m.npz")
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 10e6
+
+
+def test_what_unpacks_to_too_much_is_refused_before_it_fills_the_memory(tmp_path):
+    part = gzip.compress(bytes(2**26), 9)
+    path = file(tmp_path / "m.ply.gz", 200 * part)  # 12.5 GiB in 13 MB
+    tracemalloc.start()
+    with pytest.raises(ValueError, match=r"at most 64 MiB expected in \d+ compressed bytes"):
+        read_mesh(path)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 2**27

@@ -11,7 +11,7 @@ from s4a import synthesize, synthetic
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.method import pca
 from s4a.schema import dataset
-from s4a.study import store
+from s4a.study import netcdf, store
 
 DEVIATIONS = np.array([3.0, 1.5, 0.5])
 
@@ -187,7 +187,7 @@ def test_fields_in_files_are_read_in_parts_and_their_modes_are_the_same(monkeypa
     for i, field in enumerate(d):
         data = dataset(displacement=field[None]).isel(shape=0)
         store.write(data, tmp_path / f"{i}.nc")
-    files = [store.open_file(tmp_path / f"{i}.nc")["displacement"].variable for i in range(5)]
+    files = [netcdf.open_file(tmp_path / f"{i}.nc")["displacement"].variable for i in range(5)]
     monkeypatch.setattr(pca, "BLOCK", 5 * 3 * 7)  # 7 vertices
     monkeypatch.setattr(pca, "N_READ", 2)
     sizes, part = [], store.Stacked.part

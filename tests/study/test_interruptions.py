@@ -19,7 +19,7 @@ import pytest
 
 from s4a import analyse, cli, open_study, synthetic
 from s4a.schema import dataset
-from s4a.study import doubts, originals, pipeline, processes, sources, store, tasks
+from s4a.study import doubts, netcdf, originals, pipeline, processes, sources, store, tasks
 from s4a.study.runner import Run, peak_memory, together
 
 # of meshes as coarse as these, some registrations are doubtful; so there are modes all the same
@@ -165,7 +165,7 @@ import os, signal, sys
 from pathlib import Path
 from s4a import synthetic
 from s4a import cli
-from s4a.study import store
+from s4a.study import netcdf, store
 
 log, out, rename, kills = Path(sys.argv[1]), Path(sys.argv[2]), os.replace, sys.argv[3].split(",")
 
@@ -181,7 +181,7 @@ def renamed(temporary, path):
 log.write_text("")
 # imports all that the runs below need, once
 store.write(synthetic.sphere(9), log.with_suffix(".nc"))
-store.attributes(log.with_suffix(".nc"))
+netcdf.attributes(log.with_suffix(".nc"))
 os.replace = renamed
 code = -signal.SIGKILL
 while code == -signal.SIGKILL:
@@ -237,7 +237,7 @@ def test_a_run_killed_in_every_stage_ends_with_the_same_study(files, whole, tmp_
 def contents(folder):
     """Every file of a study, without what the clock says."""
     files = {
-        path.relative_to(folder).as_posix(): store.read(path) for path in folder.rglob("[!.]*.nc")
+        path.relative_to(folder).as_posix(): netcdf.read(path) for path in folder.rglob("[!.]*.nc")
     }
     times = ["seconds", "peak_memory"]
     return {
@@ -450,7 +450,7 @@ def test_a_crash_costs_the_shape_whose_processes_die_twice_and_nobody_else(files
     assert told.count("begun by process") == 2
     assert "in crash" in told
     kept = {file for file in whole if "registration" not in file and "/" in file}
-    assert all(store.read(folder / file).identical(whole[file]) for file in kept)
+    assert all(netcdf.read(folder / file).identical(whole[file]) for file in kept)
 
 
 CRASH = """
@@ -500,9 +500,9 @@ def test_a_worker_of_a_run_that_is_over_writes_nothing(tmp_path):
     with store.lock(tmp_path) as new:
         with pytest.raises(ValueError, match=f"the run of process {os.getpid()} no longer holds"):
             store.write(synthetic.sphere(60), tmp_path / "a.nc", "key", claim=old)
-        assert store.read(tmp_path / "a.nc").sizes["vertex"] == 50
+        assert netcdf.read(tmp_path / "a.nc").sizes["vertex"] == 50
         store.write(synthetic.sphere(60), tmp_path / "a.nc", "key", claim=new)
-    assert store.read(tmp_path / "a.nc").sizes["vertex"] == 60
+    assert netcdf.read(tmp_path / "a.nc").sizes["vertex"] == 60
     assert not list(tmp_path.glob(".*.tmp"))
 
 
@@ -565,9 +565,9 @@ def test_a_study_knows_the_files_in_a_folder_that_was_renamed(files, tmp_path):
 def test_another_version_computes_again(tmp_path, monkeypatch):
     path = tmp_path / "a.nc"
     store.write(synthetic.sphere(50), path, store.task_key("content"))
-    assert store.is_done(path, store.task_key("content"))
+    assert netcdf.is_done(path, store.task_key("content"))
     monkeypatch.setattr(store, "VERSION", "999.0")
-    assert not store.is_done(path, store.task_key("content"))
+    assert not netcdf.is_done(path, store.task_key("content"))
 
 
 FULL = """
@@ -594,7 +594,7 @@ def test_a_disk_that_takes_no_more_ends_in_one_error_and_leaves_whole_files(
     assert "goes on where it stopped" in lines[0]
     whole = sorted(folder.rglob("[!.]*.nc"))
     assert whole
-    assert all(store.attributes(path)["task_key"] for path in whole)
+    assert all(netcdf.attributes(path)["task_key"] for path in whole)
     assert not list(folder.rglob(".*.tmp"))
 
 
@@ -617,7 +617,7 @@ def test_a_folder_that_cannot_be_written_is_one_error(tmp_path, monkeypatch):
         OSError, match=r"a.nc cannot be written .*Permission denied.*Finished files are whole"
     ):
         store.write(synthetic.sphere(60), tmp_path / "a.nc", "key")
-    assert store.read(tmp_path / "a.nc").sizes["vertex"] == 50
+    assert netcdf.read(tmp_path / "a.nc").sizes["vertex"] == 50
     assert [p.name for p in tmp_path.iterdir()] == ["a.nc"]
 
 

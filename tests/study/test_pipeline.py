@@ -22,7 +22,7 @@ from s4a.evaluation import accuracy
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.options import Options
 from s4a.schema import dataset
-from s4a.study import store, tasks
+from s4a.study import netcdf, store, tasks
 
 RESULTS = ("network", "latent", "registration", "pca")
 
@@ -131,7 +131,7 @@ def test_a_process_keeps_the_template_until_its_file_is_another(brains, study_fo
     kept = tasks.template_of(folder, name, options)
     assert tasks.template_of(folder, name, options) is kept
     assert tasks.template_of(folder, name, replace(options, n_projected=10)) is not kept
-    coarse = store.read(folder / f"coarse/{name}.nc")
+    coarse = netcdf.read(folder / f"coarse/{name}.nc")
     store.write(coarse, folder / f"coarse/{name}.nc", "another", [])
     other = tasks.template_of(folder, name, options)
     assert other is not kept

@@ -11,7 +11,8 @@ import s4a
 from s4a.analysis import transfer
 from s4a.cli import main
 from s4a.options import PRESETS, Options
-from s4a.study.store import attributes, read, write
+from s4a.study.netcdf import attributes, read
+from s4a.study.store import write
 
 PAPER, FAST = PRESETS["paper"], PRESETS["fast"]
 DEFAULTS = {name: PRESETS[None][name] for name in PAPER}

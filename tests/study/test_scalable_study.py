@@ -19,7 +19,8 @@ from s4a.method.spectral import unit_mass
 from s4a.options import Options
 from s4a.show.surfaces import SAMPLES
 from s4a.study import pipeline
-from s4a.study.store import DamagedError, is_done, read, task_key, write
+from s4a.study.netcdf import DamagedError, is_done, read
+from s4a.study.store import task_key, write
 
 U = {"coarse_vertex", "coarse_weight"}
 LOCAL = {"local_vertex", "local_sample", "local_weight", "sample_cell", "edge_mass"}

@@ -14,7 +14,6 @@ from s4a.show.surfaces import mode_limits
 
 pythreejs = pytest.importorskip("pythreejs")
 threejs = pytest.importorskip("s4a.widgets.threejs")
-mode_table = pytest.importorskip("s4a.widgets.three_modes").mode_table
 
 
 def test_the_arrays_arrive_as_the_browser_needs_them():
@@ -54,13 +53,6 @@ def test_a_field_has_the_colours_of_its_values():
         threejs.surface(mesh.assign(height=height), "height").geometry.attributes["color"].array,
         signed,
     )
-
-
-def test_the_former_name_of_a_field_still_works_and_says_the_new_one():
-    mesh = synthetic.sphere(162)
-    with pytest.warns(DeprecationWarning, match="colors is now field"):
-        ball = threejs.surface(mesh, colors=np.ones((162, 3)))
-    assert ball.geometry.attributes["color"].array.min() == 1
 
 
 def shader(mesh, row, scores):
@@ -128,7 +120,7 @@ def test_scenes_at_both_resolutions_have_the_scale_of_sliders_and_pictures(study
 
 def test_too_many_modes_for_a_texture_are_refused():
     with pytest.raises(ValueError, match="at most 8 modes of 1000000 vertices"):
-        mode_table(np.zeros((1_000_000, 3)), None, np.broadcast_to(0, (9, 1_000_000, 3)))
+        threejs.mode_table(np.zeros((1_000_000, 3)), None, np.broadcast_to(0, (9, 1_000_000, 3)))
 
 
 def test_landmarks_stand_where_they_are_with_their_names(meshes):

@@ -1,0 +1,154 @@
+"""What each term of a score, each stop and each threshold of the method decides.
+
+Most of these were chosen by measurement; a test of a whole study would pass without one of them.
+"""
+
+import numpy as np
+import pytest
+
+from s4a import coarsen, spectrum, synthetic
+from s4a.geometry.mesh import as_arrays, vertex_areas
+from s4a.method import elastic, joint, latent
+from s4a.method.shape import Basis, Shape
+
+# ---- the score of a registration: round trip, distances in both directions, landmarks
+
+
+def basis(X, T, **more):
+    """A surface with one constant function, its area made one."""
+    area = vertex_areas(X, T)
+    return Basis(X / np.sqrt(area.sum()), T, area / area.sum(), np.ones((len(X), 1)), **more)
+
+
+@pytest.fixture(scope="module")
+def sphere():
+    """A sphere of unit area."""
+    return basis(*as_arrays(synthetic.sphere(2000)))
+
+
+def hemisphere(whole):
+    """The upper half of a surface, as it lies, and the vertex of the whole at each of its own."""
+    upper = np.flatnonzero(whole.X[:, 2] > 0)
+    row = np.full(len(whole.X), -1)
+    row[upper] = np.arange(len(upper))
+    T = row[whole.T[(row[whole.T] >= 0).all(axis=1)]]
+    used = np.unique(T)
+    part = Basis(
+        whole.X[upper[used]],
+        np.searchsorted(used, T),
+        whole.area[upper[used]],
+        np.ones((len(used), 1)),
+    )
+    return part, upper[used]
+
+
+def far(X, Y):
+    """Of each of the points X, the distance of the nearest of Y."""
+    return np.linalg.norm(X[:, None] - Y[None], axis=2).min(axis=1)
+
+
+def test_the_identity_scores_zero(sphere):
+    assert joint.registration_score(sphere, sphere, np.arange(len(sphere.X)), sphere) == 0
+
+
+def test_what_the_target_does_not_cover_of_the_source_is_in_the_score(sphere):
+    half, at = hemisphere(sphere)
+    score = joint.registration_score(sphere, half, at, half)
+    assert score == pytest.approx(far(sphere.X, half.X).mean(), rel=0.25)
+    assert score > 0.05
+
+
+def test_what_the_source_lacks_of_the_target_is_in_the_score(sphere):
+    half, _ = hemisphere(sphere)
+    match = half.tree.query(sphere.tree.data)[1]
+    gap = np.linalg.norm(sphere.X - half.X[match], axis=1).mean()
+    assert gap > 0.05
+    assert joint.registration_score(half, sphere, match, sphere) >= gap
+
+
+def test_a_match_that_slides_is_in_the_score_by_its_distance_and_by_its_path(sphere):
+    turn = 0.3
+    c, s = np.cos(turn), np.sin(turn)
+    slid = sphere.X @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    match = np.argmin(np.linalg.norm(slid[:, None] - sphere.X[None], axis=2), axis=1)
+    gap = np.linalg.norm(sphere.X - sphere.X[match], axis=1).mean()
+    # a path along edges is up to a tenth longer than the arc
+    score = joint.registration_score(sphere, sphere, match, sphere)
+    assert 1.95 * gap < score < 2.3 * gap
+
+
+def test_a_round_trip_is_counted_up_to_half_the_size_of_the_surface(sphere):
+    antipode = np.argmin(np.linalg.norm(sphere.X[:, None] + sphere.X[None], axis=2), axis=1)
+    diameter = 2 / np.sqrt(4 * np.pi)
+    score = joint.registration_score(sphere, sphere, antipode, sphere)
+    assert score == pytest.approx(0.5 + diameter, rel=0.01)
+
+
+def test_the_distance_of_landmarks_is_added_to_the_score(sphere):
+    ends = [basis(sphere.X, sphere.T, landmarks={"tip": at}) for at in (0, 1000)]
+    score = joint.registration_score(*ends, np.arange(len(sphere.X)), ends[1])
+    assert score == pytest.approx(np.linalg.norm(sphere.X[0] - sphere.X[1000]))
+
+
+@pytest.mark.parametrize("share, expected", [(0.85, False), (1.15, True)])
+def test_poses_are_far_apart_from_0_035_and_four_tenths_of_the_spacing_on(sphere, share, expected):
+    stretched = sphere.X * [1, 1, 0]  # what moves along the axis is not rigid
+    gap = np.quantile(np.abs(stretched - sphere.X)[:, 2], 0.9)
+    factor = share * (0.035 + 0.4 / np.sqrt(len(sphere.X))) / gap
+    source = sphere.moved_to(sphere.X * [1, 1, 1 + factor])
+    assert joint.far_apart(source, sphere, np.arange(len(sphere.X))) == expected
+
+
+def test_two_candidates_within_the_margin_are_finalists_the_better_one_first():
+    tried = {
+        name: joint.Candidate(score, None, None)
+        for name, score in {"a": 1.2, "b": 1.0, "c": 1.1, "d": 3.0}.items()
+    }
+    assert joint.finalists(tried, margin=1.25) == ["b", "c"]
+    assert joint.finalists(tried, margin=1.05) == ["b"]
+
+
+# ---- elastic iterations
+
+
+@pytest.fixture(scope="module")
+def surface():
+    """A shape of unit area with its eigenfunctions."""
+    brain = synthetic.brains(1, 3000)["original/brain_01"].to_dataset()
+    return Shape(coarse=spectrum(coarsen(brain, n_coarse=600), k=40)).low
+
+
+def ends(surface, X, **options):
+    """Where the vertices of a surface end on the same surface moved to X."""
+    begin = np.eye(3), np.zeros(3), np.zeros((1, 3))
+    return joint.move(
+        surface, elastic.elastic_rounds(surface.moved_to(X), surface, begin, **options)
+    )
+
+
+def smooth(X):
+    waves = [np.sin(6 * X[:, 1]), np.sin(5 * X[:, 2] + 1), np.cos(6 * X[:, 0])]
+    return 0.02 * np.stack(waves, axis=1)
+
+
+def test_all_steps_are_made_while_the_bending_energy_has_settled(surface):
+    X = surface.X + smooth(surface.X)
+    np.testing.assert_array_equal(ends(surface, X), ends(surface, X, further=0))
+    first = ends(surface, X, stiffness=elastic.STIFFNESS[: elastic.N_STEPS], further=0)
+    assert np.abs(ends(surface, X) - first).max() > 1e-3
+
+
+def test_no_further_step_is_made_where_a_step_lets_the_bending_energy_grow(surface):
+    noise = 0.01 * np.random.default_rng(0).normal(size=surface.X.shape)
+    X = surface.X + noise
+    first = ends(surface, X, stiffness=elastic.STIFFNESS[: elastic.N_STEPS], further=0)
+    np.testing.assert_array_equal(ends(surface, X), first)
+    assert np.abs(ends(surface, X, further=0) - first).max() > 1e-2, "it would follow the noise"
+
+
+# ---- the size of the latent basis
+
+
+@pytest.mark.parametrize("k, expected", [(20, 5), (21, 5), (23, 6), (30, 8), (2, 1), (100, 25)])
+def test_the_latent_size_is_the_nearest_whole_number_to_its_share(k, expected):
+    assert latent.latent_size(25, k, 100) == expected  # 5.25 is 5, 5.75 is 6, 7.5 is 8

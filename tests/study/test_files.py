@@ -1,0 +1,486 @@
+"""One file: what is read is what was written, damage is seen, and a stranger's leads nowhere."""
+
+import io
+import os
+import random
+import shutil
+
+import h5py
+import numpy as np
+import pytest
+import xarray as xr
+from small import OPTIONS
+
+from s4a import analyse, cli, open_study, synthetic, verify
+from s4a.study import netcdf, store
+from s4a.study.runner import read_costs
+
+SECRET = b"the diary of somebody else " * 40
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "original" / "a.nc"
+    store.write(synthetic.sphere(500), path, "key")
+    return path
+
+
+@pytest.fixture
+def folder(study_folder, tmp_path):
+    """A copy of the study, to be changed."""
+    return shutil.copytree(study_folder, tmp_path / "study")
+
+
+def flipped(data, bit):
+    changed = bytearray(data)
+    changed[bit // 8] ^= 1 << bit % 8
+    return changed
+
+
+# ---- reading and writing
+
+
+EVERYTHING = xr.Dataset(
+    {
+        "matrix": (("row", "column"), np.arange(6, dtype=np.float32).reshape(2, 3), {"unit": "mm"}),
+        "square": (("row", "row_"), np.eye(2)),
+        "empty": (("none", "column"), np.zeros((0, 3))),
+        "small": ("column", np.array([-1, 0, 1], np.int8)),
+        "large": ("column", np.array([0, 1, 2**63], np.uint64)),
+        "gaps": ("column", [1.0, np.nan, -np.inf]),
+        "is_odd": ("column", [True, False, True]),
+        "text": ("column", ["", "é", "two words"]),
+        "one_text": ((), "alone"),
+        "one_number": ((), np.int16(7)),
+    },
+    {"row": ["a", "b"], "beside": ("column", [1.5, 2.5, 3.5]), "column": [10, 20, 30]},
+    {"text": "µm", "none": "", "number": 3, "share": 0.5, "list": [1, 2], "names": ["a", "b"]},
+)
+
+
+def written_by_both(data):
+    """The file of a Dataset as written here, and as by xarray."""
+    here, there = io.BytesIO(), io.BytesIO()
+    netcdf.write_netcdf(data, here)
+    data.to_netcdf(there, engine="h5netcdf")
+    return here, there
+
+
+def test_what_is_written_is_read_again(study_folder):
+    files = [netcdf.read(path).drop_encoding() for path in sorted(study_folder.rglob("*.nc"))]
+    for data in [EVERYTHING, xr.Dataset(), *files]:
+        ours, others = written_by_both(data)
+        with (
+            xr.open_dataset(ours, engine="h5netcdf") as here,
+            xr.open_dataset(others, engine="h5netcdf") as there,
+        ):
+            xr.testing.assert_identical(here, data)
+            xr.testing.assert_identical(here, there)
+            for name, variable in there.variables.items():
+                assert here[name].dtype == variable.dtype, name
+
+
+def test_a_tree_is_read_as_it_was_written(tmp_path):
+    tree = xr.DataTree.from_dict(
+        {"/": xr.Dataset(attrs={"n": 1}), "/a/b": EVERYTHING, "/c": EVERYTHING}
+    )
+    store.write(tree, tmp_path / "tree.nc")
+    found = netcdf.read_tree(tmp_path / "tree.nc")
+    assert found["a/b"].identical(tree["a/b"])
+    with xr.open_datatree(tmp_path / "tree.nc", group="/a", engine="h5netcdf") as there:
+        assert there["b"].to_dataset().identical(EVERYTHING)
+
+
+def test_hdf5_has_the_dims_that_h5netcdf_gives_and_a_checksum_of_every_variable_of_numbers():
+    ours, others = written_by_both(EVERYTHING.drop_vars("empty"))
+    with h5py.File(ours, "r") as here, h5py.File(others, "r") as there:
+        assert set(here) == {*there, netcdf.GROUP}
+        for name, expected in there.items():
+            if name in ("row_", "none"):  # dims without values
+                continue
+            assert (here[name].dtype, here[name].shape) == (expected.dtype, expected.shape), name
+            assert set(here[name].attrs) == set(expected.attrs)
+            assert here[name].fletcher32 == (expected.dtype.kind in "iuf" and expected.ndim > 0)
+
+
+@pytest.mark.parametrize(
+    ("data", "error", "needed"),
+    [
+        (xr.Dataset({"a/b": 1}), ValueError, "without slash"),
+        (xr.Dataset({"a": ("b/c", [1])}), ValueError, "without slash, .*b/c"),
+        (xr.Dataset({"row": (("row", "column"), np.eye(2))}), ValueError, "found row"),
+        (
+            xr.Dataset({"a": ("x", np.array(["2026"], "M8[ns]"))}),
+            TypeError,
+            "a needs numbers or texts",
+        ),
+        (xr.Dataset({"a": ("x", np.array([1 + 1j]))}), TypeError, "a needs numbers or texts"),
+        (xr.Dataset({"a": ("x", np.array([b"a", None]))}), TypeError, "a needs numbers or texts"),
+        (xr.Dataset(attrs={"a": {"b": 1}}), TypeError, "a needs numbers or texts"),
+        (xr.Dataset(attrs={"a": None}), TypeError, "a needs numbers or texts"),
+    ],
+)
+def test_what_netcdf_does_not_have_is_refused_by_name(data, error, needed):
+    with pytest.raises(error, match=needed):
+        netcdf.write_netcdf(data, io.BytesIO())
+
+
+# ---- damage
+
+
+def test_a_bit_flipped_anywhere_is_an_error_that_names_the_file_or_without_effect(
+    study_folder, tmp_path
+):
+    rng, path, seen = random.Random(0), tmp_path / "a.nc", 0
+    files = sorted(study_folder.rglob("*.nc"))
+    for _ in range(600):
+        file = rng.choice(files)
+        data, key = file.read_bytes(), netcdf.attributes(file)["task_key"]
+        path.write_bytes(flipped(data, rng.randrange(8 * len(data))))
+        try:
+            assert netcdf.read(path).identical(netcdf.read(file))
+        except OSError as error:
+            assert "a.nc cannot be read" in str(error)  # noqa: PT017
+            assert "run the analysis again" in str(error)  # noqa: PT017
+            assert not netcdf.is_done(path, key)
+            seen += 1
+    assert seen > 400
+
+
+@pytest.mark.parametrize("share", [0, 0.001, 0.02, 0.3, 0.6, 0.9, 0.999])
+def test_a_truncated_file_is_an_error(file, share):
+    data = file.read_bytes()
+    file.write_bytes(data[: int(share * len(data))])
+    assert not netcdf.is_done(file, "key")
+    with pytest.raises(OSError, match=r"a\.nc cannot be read"):
+        netcdf.read(file)
+
+
+def test_a_larger_variable_is_checked_when_it_is_read_and_not_before(file):
+    with h5py.File(file) as inside:
+        at = inside["position"].id.get_chunk_info(0).byte_offset
+    file.write_bytes(flipped(file.read_bytes(), 8 * at + 800))
+    data = netcdf.open_file(file)
+    assert data["position"].shape == (500, 3)
+    with pytest.raises(OSError, match=r"a\.nc cannot be read .*filter"):
+        data["position"].load()
+
+
+def test_a_run_makes_damaged_files_anew_and_no_others_and_the_same_bytes(brains, folder):
+    def states():
+        return {p: p.stat().st_mtime_ns for p in folder.rglob("[!.]*.nc")}
+
+    damaged = [
+        folder / name
+        for name in ("original/brain_02.nc", "registration/brain_01.nc", "coarse/brain_03.nc")
+    ]
+    whole = {path: path.read_bytes() for path in damaged}
+    for path, data in whole.items():
+        path.write_bytes(flipped(data, 4 * len(data)))
+    assert set(verify(folder)["state"].values.tolist()) == {"whole", "damaged"}
+    before = states()
+    analyse(brains, store=folder, **OPTIONS).close()
+    changed = {path for path, time in states().items() if before[path] != time}
+    made_by_every_run = {folder / f"{name}.nc" for name in ("registration", "pca", "report")}
+    assert changed - made_by_every_run == set(damaged)
+    assert {path: path.read_bytes() for path in damaged} == whole
+    assert set(verify(folder)["state"].values.tolist()) == {"whole"}
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"[1, 2]",
+        b'"text"',
+        b'{"a": [1]}',
+        b'{"a": [1, 2, 3]}',
+        b'{"a": ["x", 1]}',
+        b'{"a": [-1, 1]}',
+        b'{"a": [NaN, 1]}',
+        b'{"a": [1e999, 1]}',
+        b'{"a": [1, 1%s]}' % (b"0" * 400),
+        b"\xff\xfe",
+        b"[" * 100_000,
+        b"null",
+    ],
+)
+def test_costs_of_another_form_are_told_and_counted_as_none(tmp_path, caplog, content):
+    (tmp_path / "costs.json").write_bytes(content)
+    assert read_costs(tmp_path / "costs.json") == {}
+    assert "times of earlier runs are not counted" in caplog.text
+
+
+# ---- files of strangers
+
+
+def external_storage(file, secret):
+    file.create_dataset("position", (1500,), "f8", external=[(str(secret), 0, 12000)])
+
+
+def external_link(file, secret):
+    file["position"] = h5py.ExternalLink(str(secret), "/age")
+
+
+def soft_link(file, secret):
+    file["position"] = h5py.SoftLink("/corner_vertex")
+
+
+def virtual(file, secret):
+    layout = h5py.VirtualLayout(shape=(500, 3), dtype="f8")
+    layout[:] = h5py.VirtualSource(str(secret), "age", shape=(500, 3))
+    file.create_virtual_dataset("position", layout)
+
+
+def packed(file, secret):
+    file.create_dataset("position", (2**40,), "u1", chunks=(2**20,), compression="gzip")
+
+
+def never_written(file, secret):
+    file.create_dataset("position", (2**50,), "f8")
+
+
+def group(file, secret):
+    file.create_group("position")
+
+
+def compound(file, secret):
+    file["position"] = np.zeros(3, [("a", "f8"), ("b", "i4")])
+
+
+def other_shape(file, secret):
+    file["position"] = np.zeros((3, 3))
+
+
+STRANGE = [external_storage, external_link, soft_link, virtual, packed, never_written, group]
+STRANGE += [compound, other_shape]
+
+
+@pytest.mark.parametrize("strange", STRANGE)
+def test_what_leads_out_of_a_file_or_unpacks_is_refused_before_it_is_read(file, tmp_path, strange):
+    secret = tmp_path / "diary"
+    secret.write_bytes(SECRET)
+    with h5py.File(file, "a") as inside:
+        del inside["position"]
+        strange(inside, secret)
+    with pytest.raises(OSError, match=r"a\.nc cannot be read") as found:
+        netcdf.read(file)
+    assert "diary" not in str(found.value)
+    assert not netcdf.is_done(file, "key")
+
+
+def with_contents(path, change):
+    """Write other contents into a file, as somebody could who knows how."""
+    with netcdf.opened(path) as (_, text, _):
+        text = np.frombuffer(change(text.decode()).encode(), "u1")
+    with h5py.File(path, "a") as inside:
+        del inside[netcdf.CONTENTS]
+        inside[netcdf.CONTENTS] = text
+
+
+TEXTS = '", "'.join(["x" * 10**6, *[""] * 10**5])
+MANY = '"variables": {"a": {"dims": ["b"], "shape": [100001], "dtype": "U", "attrs": {}, "values": '
+MANY += f'["{TEXTS}"]}}, '
+LIES = {
+    "another size": lambda text: text.replace("[500, 3]", "[1000000000, 3]"),
+    "objects": lambda text: text.replace("<f8", "|O8"),
+    "a dim too few": lambda text: text.replace('["vertex", "xyz"]', '["vertex"]'),
+    "cut off": lambda text: text[:-9],
+    "no group": lambda text: "{}",
+    "more text than there can be": lambda text: text.replace('"variables": {', MANY, 1),
+}
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_contents_that_cannot_be_are_refused(file, lie):
+    with_contents(file, LIES[lie])
+    with pytest.raises(OSError, match=r"a\.nc cannot be read"):
+        netcdf.read(file)
+
+
+def test_a_file_of_another_version_is_named_and_computed_again(file):
+    synthetic.sphere(50).to_netcdf(file, engine="h5netcdf")
+    assert not netcdf.is_done(file, "key")
+    with pytest.raises(OSError, match=r"this version of s4a has not written it.*remove it"):
+        netcdf.read(file)
+
+
+@pytest.mark.parametrize("place", ["original", "original/brain_01.nc"])
+def test_symbolic_links_within_a_study_are_not_followed(folder, tmp_path, place):
+    (folder / place).rename(tmp_path / "elsewhere")
+    (folder / place).symlink_to(tmp_path / "elsewhere")
+    with pytest.raises((ValueError, OSError), match=f"{place}.* symbolic link"):
+        open_study(folder)
+    whole = tmp_path / "link"
+    (folder / place).unlink()
+    (tmp_path / "elsewhere").rename(folder / place)
+    whole.symlink_to(folder)
+    assert "pca" in open_study(whole)  # the study itself may be a link
+
+
+IN_STUDY = [
+    (["view"], "study.html"),
+    (["statistics"], "statistics"),
+    (["statistics"], "statistics/evaluation.csv"),
+    (["run", "absent.ply", "--out"], "report.txt"),
+]
+
+
+@pytest.mark.parametrize(("command", "name"), IN_STUDY)
+def test_a_link_in_a_study_is_not_written_through(folder, tmp_path, capsys, command, name):
+    (tmp_path / "diary").write_text("mine")
+    (folder / name).parent.mkdir(exist_ok=True)
+    (folder / name).unlink(missing_ok=True)
+    (folder / name).symlink_to(tmp_path / "diary")
+    assert cli.main([*command, str(folder)]) == 2
+    assert f"{name} is a symbolic link" in capsys.readouterr().err
+    assert (tmp_path / "diary").read_text() == "mine"
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no pipes")
+@pytest.mark.parametrize(("command", "name"), IN_STUDY)
+def test_a_pipe_in_a_study_is_not_written_to(folder, capsys, command, name):
+    (folder / name).parent.mkdir(exist_ok=True)
+    (folder / name).unlink(missing_ok=True)
+    os.mkfifo(folder / name)
+    assert cli.main([*command, str(folder)]) == 2
+    assert f"{name} is a pipe" in capsys.readouterr().err
+
+
+def test_a_damaged_study_is_no_traceback_for_a_command(folder, capsys):
+    path = folder / "pca.nc"
+    path.write_bytes(path.read_bytes()[:9000])
+    assert cli.main(["statistics", str(folder)]) == 2
+    assert "pca.nc cannot be read" in capsys.readouterr().err
+
+
+def test_a_report_of_somebody_else_in_a_study_is_not_overwritten(tmp_path):
+    (tmp_path / ".lock").touch()
+    synthetic.sphere(50).to_netcdf(tmp_path / "report.nc", engine="h5netcdf")
+    before = (tmp_path / "report.nc").read_bytes()
+    with pytest.raises(ValueError, match=r"report\.nc was not made by s4a"), store.lock(tmp_path):
+        pass
+    assert (tmp_path / "report.nc").read_bytes() == before
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no pipes")
+def test_a_pipe_in_the_place_of_a_file_is_not_waited_for(file):
+    file.unlink()
+    os.mkfifo(file)
+    assert not netcdf.is_done(file, "key")
+    with pytest.raises(OSError, match="not a regular file"):
+        netcdf.open_file(file)
+
+
+# ---- what a file holds
+
+
+def without(name):
+    return lambda data: data.drop_vars(name)
+
+
+def as_text(name):
+    return lambda data: data.assign({name: data[name].astype(str)})
+
+
+def beyond(name):
+    return lambda data: data.assign({name: data[name] + 10_000_000})
+
+
+CHANGES = [
+    ("original/brain_01", without("position"), "it lacks position"),
+    ("original/brain_01", beyond("corner_vertex"), "corner_vertex needs indices 0..1499 of vertex"),
+    ("original/brain_01", as_text("position"), "position needs numbers"),
+    ("original/brain_01", lambda d: d.rename(xyz="abc"), "position needs the dims"),
+    ("original/brain_01", lambda d: d.isel(xyz=[0, 1]), "xyz needs 3 entries, found 2"),
+    ("original/brain_01", lambda d: d.drop_attrs(), "the attribute status needs a text"),
+    ("coarse/brain_01", beyond("coarse_vertex"), "coarse_vertex needs indices"),
+    ("coarse/brain_01", beyond("sample_vertex"), "sample_vertex needs indices"),
+    ("coarse/brain_01", without("eigenvalue"), "it lacks eigenvalue"),
+    ("coarse/brain_01", lambda d: d.isel(mode=slice(3)), "modes need as many eigenfunctions"),
+    ("coarse/brain_01", lambda d: d.isel(original_vertex=slice(900)), "needs indices|needs 1500"),
+    (
+        "network",
+        lambda d: d.assign(source=d["source"].copy(data=["?"] * d.sizes["pair"])),
+        "shapes",
+    ),
+    ("latent", without("latent_basis"), "it lacks latent_basis"),
+    ("latent", without("shape"), "it lacks shape"),
+    ("latent", lambda d: d.assign_coords(shape=["brain_01"] * 4), "names that differ"),
+    ("latent", lambda d: d.assign_attrs(median="nobody"), "median needs shapes of the study"),
+    ("registration", lambda d: d.assign_attrs(template="nobody"), "template needs shapes"),
+    ("registration", lambda d: d.drop_attrs(), "the attribute template needs a text"),
+    ("registration", lambda d: d.isel(triangle=slice(9)), "triangle needs"),
+    ("registration/brain_01", beyond("registered_match"), "registered_match needs indices"),
+    ("registration/brain_01", beyond("template_triangle"), "template_triangle needs indices"),
+    ("registration/brain_01", lambda d: d.isel(vertex=slice(9)), "vertex needs"),
+    ("registration/brain_01", lambda d: d.assign_attrs(score="?"), "score needs a number"),
+    ("pca", without("score"), "it lacks score"),
+    ("pca", lambda d: d.isel(vertex=slice(9)), "vertex needs"),
+    ("pca", lambda d: d.assign_coords(shape=list("abcd")), "scores needs shapes of the study"),
+    ("report", without("status"), "it lacks status"),
+    ("report", lambda d: d.isel(shape=[0, 0, 1, 2]), "names that differ"),
+]
+
+
+@pytest.mark.parametrize(("name", "change", "message"), CHANGES)
+def test_a_file_that_does_not_hold_what_it_should_is_named_with_what(folder, name, change, message):
+    path = folder / f"{name}.nc"
+    data = netcdf.read(path)
+    key, made_from = data.attrs.pop("task_key"), data.attrs.pop("made_from").split()
+    store.write(change(data), path, key, made_from)
+    with pytest.raises(OSError, match=message):
+        open_study(folder).load()
+    assert "damaged" in verify(folder)["state"].values
+
+
+# ---- verify
+
+
+def test_verify_says_in_one_line_what_holds_and_its_exit_code_whether(folder, capsys):
+    assert cli.main(["verify", str(folder)]) == 0
+    n = len(list(folder.rglob("[!.]*.nc")))
+    assert capsys.readouterr().out == f"{n} files, all whole and made from each other\n"
+    (folder / "notes.txt").write_text("mine")
+    shutil.copy(folder / "original/brain_01.nc", folder / "original/other.nc")
+    (folder / "network/motion_brain_04.nc").unlink()
+    path = folder / "pca.nc"
+    path.write_bytes(flipped(path.read_bytes(), 8 * 9000))
+    assert cli.main(["verify", str(folder)]) == 1
+    first, *lines = capsys.readouterr().out.splitlines()
+    assert "1 damaged" in first
+    assert "1 missing" in first
+    assert "the same `s4a run` again makes what is wrong anew" in first
+    assert sorted(line.split(",")[0].strip() for line in lines) == [
+        "network/motion_brain_04.nc",
+        "notes.txt",
+        "original/other.nc",
+        "pca.nc",
+    ]
+
+
+@pytest.mark.parametrize("name", ["original/brain_01.nc", "registration/brain_01.nc"])
+def test_verify_does_not_blame_what_was_made_from_a_damaged_file(folder, name):
+    path = folder / name
+    path.write_bytes(flipped(path.read_bytes(), 8 * 100))
+    found = verify(folder)
+    assert found["file"].values[found["state"].values != "whole"].tolist() == [name]
+
+
+def test_verify_tells_files_of_an_earlier_run(folder):
+    path = folder / "original/brain_01.nc"
+    store.write(netcdf.read(path), path, "another key")
+    assert verify(folder)["state"].sel(file="coarse/brain_01.nc").item() == "stale"
+
+
+def test_verify_sees_that_other_programs_are_told_something_else(folder):
+    with h5py.File(folder / "coarse/brain_01.nc", "a") as file:
+        file["position"].attrs["units"] = "m"
+    row = verify(folder).sel(file="coarse/brain_01.nc")
+    assert row["state"].item() == "damaged"
+    assert "its contents are not those of its HDF5" in row["fault"].item()
+
+
+def test_an_unfinished_study_is_told_by_verify(folder):
+    (folder / "report.nc").unlink()
+    found = verify(folder)
+    assert found["state"].sel(file="report.nc").item() == "missing"
