@@ -123,7 +123,12 @@ def growth(
     from s4a_morphometrics import words
 
     tree, folder = study_to_test(study, out, table, keep_doubtful)
-    tested = {"covariates": covariates, "field": field, "of": of, "variances": variances}
+    tested: dict[str, Any] = {
+        "covariates": covariates,
+        "field": field,
+        "of": of,
+        "variances": variances,
+    }
     found = m.growth(tree, time, subject, **tested, **drawn(permutations, seed))
     tell(tree, found, "growth", words.growth_lines(found, time), folder)
     if not field:
@@ -206,7 +211,11 @@ def complete(
     import s4a_morphometrics as m
     from s4a_morphometrics import words
 
-    options = {"landmarks": landmarks, "components": components, "n_samples": samples}
+    options: dict[str, Any] = {
+        "landmarks": landmarks,
+        "components": components,
+        "n_samples": samples,
+    }
     found = m.complete(s4a.open_study(study), part, seed=seed, **options)
     paths = m.write_completed(found, out)
     write("\n".join(words.completed_lines(found)))

@@ -18,7 +18,7 @@ from paths import DOCS
 
 import s4a
 from s4a import read_mesh
-from s4a.analysis.link import image_in_shape
+from s4a.analysis.transfer import image_in_shape
 from s4a.cli import main
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.input.annotations import read_landmarks, write_landmarks

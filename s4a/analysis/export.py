@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from s4a.analysis.inputs import registration_of
-from s4a.analysis.link import image_in_shape
+from s4a.analysis.transfer import image_in_shape
 from s4a.geometry.mesh import as_arrays
 from s4a.input.files import write_mesh
 from s4a.input.hands import MIRROR

@@ -24,8 +24,7 @@ from s4a import (
     transfer_scalars,
     write_mesh,
 )
-from s4a.analysis.link import elect, spread_votes, votes_of
-from s4a.analysis.transfer import pair_study
+from s4a.analysis.transfer import elect, pair_study, spread_votes, votes_of
 from s4a.geometry.closest import (
     closest_facing_point,
     closest_point,
