@@ -25,8 +25,8 @@ def write_table(path: Path, head: Iterable[Any], rows: Iterable[Any]) -> Path:
     return path
 
 
-def write_dataset(data: xr.Dataset, path: Path) -> Path:
-    """Write a Dataset as a netCDF file, at once and with checksums; gives its path."""
+def write_dataset(data: xr.Dataset | xr.DataTree, path: Path) -> Path:
+    """Write a Dataset or tree as a netCDF file, at once and with checksums; gives its path."""
     store.write(data, path)
     return path
 
