@@ -93,7 +93,7 @@ release: $(VENV)/.test
 	@test -n "$(VERSION)" || { echo "make release VERSION=..."; exit 2; }
 	$(PYTHON) tools/release.py check $(VERSION)
 	$(BIN)/repo-review --show errskip .
-	rm -rf dist && $(BIN)/python -m pip install --quiet build twine && $(BIN)/python -m build --outdir dist .
+	rm -rf dist && $(BIN)/python -m pip install --quiet build twine && $(BIN)/python -m build --outdir dist . && $(BIN)/python -m build --outdir dist morphometrics
 	$(BIN)/python -m twine check --strict dist/*
 	tools/try.sh dist/s4a-$(VERSION)-py3-none-any.whl
 

@@ -33,7 +33,7 @@ def run(args: Namespace) -> int:
 
 def insert(args: Namespace) -> int:
     """New subjects in the studies of several structures, which stay as they are."""
-    from s4a.analysis.export import write_registered
+    from s4a.analysis.export import write_dataset, write_registered
     from s4a.cli.tables import inserted_table
     from s4a_morphometrics.several import insert_structures, open_structures
 
@@ -41,7 +41,7 @@ def insert(args: Namespace) -> int:
     options = {name: getattr(args, name) for name in ("landmarks", "reflect", "table", "n_jobs")}
     inserted = insert_structures(study, args.shapes, **options)
     out = new_folder(args.out)
-    inserted.to_netcdf(out / "inserted.nc", engine="h5netcdf")
+    write_dataset(inserted, out / "inserted.nc")
     for name, part in inserted["structures"].children.items():
         write_registered(part, out / "structures" / name)
         write(f"structures/{name}\n{inserted_table(part)}")

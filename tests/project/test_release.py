@@ -175,7 +175,8 @@ def test_the_wheel_holds_the_package_alone_and_uvx_runs_its_demo(tmp_path, monke
 
 def test_binder_installs_this_project_and_runs_what_is_there():
     lines = text("binder/requirements.txt").split()
-    (extras,) = [re.fullmatch(r"\.\[([\w,]+)\]", line)[1] for line in lines if line[0] == "."]
+    (extras,) = [re.fullmatch(r"\.\[([\w,]+)\]", line)[1] for line in lines if line[:2] == ".["]
+    assert "./morphometrics" in lines  # lessons 15 to 17
     needed = {name_of(one) for extra in extras.split(",") for one in EXTRAS[extra]}
     assert {"s4a[notebook]", "s4a[labels]", "nilearn", "pymeshlab"} <= needed
     others = [line for line in lines if line[0] not in "-."]
