@@ -120,7 +120,6 @@ def on_cluster(address: str | None) -> Iterator[None]:
 
     with contextlib.ExitStack() as stack:
         if known[1]:
-            stack.enter_context(s4a.study.processes.spawned_end_too())
             n = int(known[1])
             local = LocalCluster(n_workers=n, threads_per_worker=1, dashboard_address=None)
             address = stack.enter_context(local).scheduler_address

@@ -163,7 +163,7 @@ def analyse(
         else:
             remarks = remarks + kept_table(run.folder / "subjects.nc", sources)
         remarks = remarks + remarks_on_guides(sources, marked, settings.feature_names)
-        with run.notes.whole(), run.unforeseen_told():
+        with run.unforeseen_told():
             run_steps(run, sources, marked, settings, remarks)
     return open_study(store)
 

@@ -16,7 +16,7 @@ OF_SHAPE = (
     *("network/sketch_", "network/look_", "network/motion_"),
 )
 OF_ALL = ("network", "latent", "registration", "report")
-OWN = {*STAGES, ".lock", ".costs.json", "study.html", "report.txt", "modes.png", "statistics"}
+OWN = {*STAGES, ".lock", "study.html", "report.txt", "modes.png", "statistics"}
 
 
 def verify(folder: Path | str) -> xr.Dataset:

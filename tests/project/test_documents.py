@@ -5,7 +5,7 @@ import pkgutil
 import re
 from pathlib import Path
 
-from paths import DOCS, NOTEBOOKS, ROOT, TESTS, benchmark, script
+from paths import DOCS, LESSONS, NOTEBOOKS, ROOT, TESTS, benchmark, script
 from PIL import Image
 from s4a.study.options import PAPER, Options, pair_options
 
@@ -14,7 +14,7 @@ from s4a.schema import TABLE
 figures = script(DOCS / "figures.py")
 paper = script(ROOT / "tools" / "paper.py")
 PAGES = sorted(DOCS.glob("*.md")) + sorted((DOCS / "api").glob("*.md"))
-READ = [*PAGES, *NOTEBOOKS.glob("*.*"), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
+READ = [*PAGES, *NOTEBOOKS / "README.md", *LESSONS, ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 CODE = [ROOT / "s4a", ROOT / "morphometrics", TESTS, ROOT / "benchmarks"]
 
 
@@ -27,11 +27,13 @@ def test_every_page_is_reached_and_every_link_between_pages_leads_somewhere():
     inside = "\n".join(re.findall(r"```\{toctree\}\n(.*?)```", contents, re.DOTALL)).split()
     apart = [page.name for page in PAGES if page.stem not in ("index", *inside)]
     assert [name for name in apart if name[0] != "_"] == []
-    broken = []
+    broken, lessons = [], {path.name for path in LESSONS}
     for page in [*PAGES, ROOT / "README.md"]:
         for link in re.findall(r"\]\((?!http|#)([^)#]+)[^)]*\)", text(page)):
             name = link.removeprefix("course/").replace("index.md", "README.md")
-            if not ((page.parent / link).exists() or (NOTEBOOKS / name).exists()):
+            if not (
+                (page.parent / link).exists() or (NOTEBOOKS / name).exists() or name in lessons
+            ):
                 broken.append((page.name, link))
     assert broken == []
 

@@ -13,7 +13,7 @@ from small import OPTIONS
 
 from s4a import analyse, cli, open_study, synthetic, verify
 from s4a.study import netcdf, store
-from s4a.study.runner import read_costs
+from s4a.study.progress import read_costs
 
 SECRET = b"the diary of somebody else " * 40
 
@@ -192,13 +192,8 @@ def test_a_run_makes_damaged_files_anew_and_no_others_and_the_same_bytes(brains,
     [
         b"[1, 2]",
         b'"text"',
-        b'{"a": [1]}',
-        b'{"a": [1, 2, 3]}',
-        b'{"a": ["x", 1]}',
-        b'{"a": [-1, 1]}',
-        b'{"a": [NaN, 1]}',
-        b'{"a": [1e999, 1]}',
-        b'{"a": [1, 1%s]}' % (b"0" * 400),
+        b'{"costs": {"a": [1, 2, 3]}}',
+        b'{"costs": {"a": ["x", 1]}}',
         b"\xff\xfe",
         b"[" * 100_000,
         b"null",

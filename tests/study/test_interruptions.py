@@ -479,21 +479,6 @@ if __name__ == "__main__":
 """
 
 
-def test_a_task_of_which_two_processes_died_comes_in_a_process_of_its_own(files, tmp_path):
-    """As with one process, which a crash ends: the third run goes past it."""
-    folder = tmp_path / "study"
-    script = CRASH.replace('"n_jobs": 2', '"n_jobs": 1')
-    command = [sys.executable, "-c", script, str(folder), *map(str, files)]
-    (folder / "coarse").mkdir(parents=True)
-    (folder / ".lock").write_text("")
-    (folder / ".killed").write_text("")
-    codes = [subprocess.run(command, capture_output=True, check=False).returncode for _ in range(3)]
-    assert codes == [-signal.SIGSEGV, -signal.SIGSEGV, 0]
-    with open_study(folder) as tree:
-        excluded = (tree["report"]["status"] == "excluded").values.tolist()
-        assert excluded == [False, True, False]
-
-
 def test_a_worker_of_a_run_that_is_over_writes_nothing(tmp_path):
     with store.lock(tmp_path) as old:
         store.write(synthetic.sphere(50), tmp_path / "a.nc", "key", claim=old)
