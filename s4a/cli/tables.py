@@ -3,6 +3,7 @@
 Every function gives a text, or the cells of a row; nothing is printed or written here.
 """
 
+import itertools
 import shlex
 import textwrap
 import time
@@ -53,10 +54,13 @@ TRANSFERRED = (
 )
 
 
-def table(rows: Iterable[Sequence[Any]], head: Sequence[str], width: int = 120) -> str:
+def table(
+    rows: Iterable[Sequence[Any]], head: Sequence[str], number: str = "g", width: int = 120
+) -> str:
     """Rows of text as aligned columns.
 
-    Numbers to the right, a long last column wrapped at `width` characters.
+    Numbers to the right, those with a fraction in the form `number`, or "-" where they are none; a
+    long last column wrapped at `width` characters.
 
     Examples
     --------
@@ -66,7 +70,10 @@ def table(rows: Iterable[Sequence[Any]], head: Sequence[str], width: int = 120) 
     a      1
     b     20
     """
-    rows = [[str(cell) for cell in row] for row in [head, *rows]]
+    rows = [
+        [(f"{x:{number}}" if x == x else "-") if isinstance(x, float) else str(x) for x in row]
+        for row in [head, *rows]
+    ]
     columns = list(zip(*rows, strict=True))
     widths = [max(map(len, column)) for column in columns]
     numeric = [all(map(is_number, column[1:])) for column in columns]
@@ -251,7 +258,7 @@ def cost_lines(report: "xr.Dataset", most: int | None = None) -> list[str]:
     parts = ", ".join(f"{stage} {spent[stage]:.1f}" for stage in shown)
     memory = report["peak_memory"].values.max()
     all_of_them = s4a.study.tree.seconds_of(report)
-    return wrapped(f"{all_of_them} ({parts}); at most {memory:.0f} MiB", SCREEN)
+    return wrapped(f"{all_of_them}, at most {memory:.0f} MiB ({parts})", SCREEN)
 
 
 def place_lines(study: str, report: str) -> list[str]:
@@ -408,11 +415,8 @@ def planted_line(modes: "xr.Dataset", truth: "xr.Dataset") -> str:
 def error_table(errors: "xr.Dataset") -> str:
     """Mean errors of :func:`s4a.evaluation.accuracy.accuracy` over the shapes, a row per method."""
     mean = 100 * errors[["error", "geodesic_error"]].mean("shape")
-    rows = []
-    for method in mean["way"].values:
-        pair = [variable.item() for variable in mean.sel(way=method).data_vars.values()]
-        rows.append([method, *("-" if np.isnan(error) else f"{error:.3f}" for error in pair)])
-    return table(rows, ["mean error, % of sqrt(area)", "straight line", "along edges"])
+    rows = zip(*(mean[name].values for name in ("way", "error", "geodesic_error")), strict=True)
+    return table(rows, ["mean error, % of sqrt(area)", "straight line", "along edges"], ".3f")
 
 
 def evaluation_table(evaluation: "xr.Dataset", recomputed: "xr.Dataset | None") -> str:
@@ -526,22 +530,19 @@ def comparison_table(pairs: "xr.Dataset") -> str:
 
 def block_table(methods: Sequence[str], blocks: Sequence[str], seconds: "np.ndarray") -> str:
     """CPU seconds (m, b) of every method by block (Fig. 3)."""
-    rows = [
-        [method, *(f"{s:.1f}" for s in of_blocks), f"{of_blocks.sum():.1f}"]
-        for method, of_blocks in zip(methods, seconds, strict=True)
-    ]
-    return table(rows, ["CPU s", *blocks, "all"])
+    rows = [[method, *row, row.sum()] for method, row in zip(methods, seconds, strict=True)]
+    return table(rows, ["CPU s", *blocks, "all"], ".1f")
 
 
 def collection_table(result: "xr.Dataset") -> str:
     """Table 2: mean Chamfer distance to the template, CPU seconds by block, the median shape."""
     rows = []
-    for way in result["way"].values:
-        for how in result["how"].values:
-            method = result.sel(way=way, how=how)
-            seconds = method["collection_seconds"].values
-            chamfer = 100 * method["collection_chamfer"].mean().item()
-            costs = [f"{s:.1f}" for s in (*seconds, seconds.sum())]
-            rows.append([way, how, f"{chamfer:.4f}", *costs, method["median_shape"].item()])
+    for way, how in itertools.product(result["way"].values, result["how"].values):
+        method = result.sel(way=way, how=how)
+        seconds = method["collection_seconds"].values
+        chamfer = 100 * method["collection_chamfer"].mean().item()
+        median = method["median_shape"].item()
+        rows.append([way, how, f"{chamfer:.4f}", *seconds, seconds.sum(), median])
     blocks = [f"{block}, s" for block in result["block"].values]
-    return table(rows, ["method", "way up", "Chamfer %", *blocks, "all, s", "median shape"])
+    head = ["method", "way up", "Chamfer %", *blocks, "all, s", "median shape"]
+    return table(rows, head, ".1f")
