@@ -10,7 +10,7 @@ demo: $(VENV)/.core
 	$(BIN)/s4a demo
 
 # one process a core, one thread a process
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --dist loadfile
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --dist loadfile --no-loadscope-reorder
 test: check
 	$(PYTEST)
 

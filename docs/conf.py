@@ -39,7 +39,8 @@ LARGE = 20_000  # letters of a picture that is packed
 project, author = "S4A", "S4A developers"
 copyright = author
 release = version_of("s4a")
-extensions = ["sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode", "myst_nb"]
+extensions = ["sphinx.ext.autodoc", "sphinx.ext.napoleon", "myst_nb"]
+extensions += [] if os.environ.get("S4A_DOCS") == "off" else ["sphinx.ext.viewcode"]
 exclude_patterns = ["_build", "_variables.md", "_commands.md", "_performance.md", "_tables.md"]
 exclude_patterns += ["performance", "tables"]
 root_doc = "index"
