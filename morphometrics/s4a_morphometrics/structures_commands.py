@@ -33,7 +33,7 @@ def run(args: Namespace) -> int:
 
 def insert(args: Namespace) -> int:
     """New subjects in the studies of several structures, which stay as they are."""
-    from s4a.analysis.export import write_dataset, write_registered
+    from s4a.analysis.export import write_registered
     from s4a.cli.tables import inserted_table
     from s4a.study.tree import write_inserted
     from s4a_morphometrics.several import insert_structures, open_structures
@@ -42,11 +42,7 @@ def insert(args: Namespace) -> int:
     options = {name: getattr(args, name) for name in ("landmarks", "reflect", "table", "n_jobs")}
     inserted = insert_structures(study, args.shapes, **options)
     out = new_folder(args.out)
-<<<<<<< HEAD
-    write_dataset(inserted, out / "inserted.nc")
-=======
     path = write_inserted(inserted, out)
->>>>>>> 149d912410ab16d3faed16ba5b2e5aa13f4c48dd
     for name, part in inserted["structures"].children.items():
         write_registered(part, out / "structures" / name)
         write(f"structures/{name}\n{inserted_table(part)}")
