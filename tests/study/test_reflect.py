@@ -7,6 +7,7 @@ from faults import shapes as faulty
 import s4a
 from s4a import analyse, cli, open_study, verify
 from s4a.analysis.export import write_registered
+from s4a.options import Options
 from s4a.show.page import study_html
 
 OPTIONS = {"n_coarse": 150, "k_init": 8, "k": 15, "n_jobs": 1, "intersections": False}
@@ -50,7 +51,7 @@ def test_the_study_of_left_and_right_shapes_is_that_of_right_ones(right, mixed, 
         assert (hand.drop_sel(shape=LEFT) > 0.5).all()
         assert "mirrored, as reflect= says" in study_html(found)
     assert "handedness" not in named["report"]
-    assert named["report"].attrs["reflect"] == "s1,s3"
+    assert Options.from_report(named["report"].to_dataset()).reflect == "s1,s3"
 
 
 def test_a_finished_study_is_not_computed_again_and_holds(mixed, folder):
