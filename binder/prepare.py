@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 import s4a
-from s4a.study import store
+from s4a.study import netcdf, store
 
 FOLDER = Path(__file__).resolve().parent / "study_51"
 LIMIT = 15e6  # bytes
@@ -62,9 +62,10 @@ def reduce(whole, small):
     for path in sorted(Path(whole).rglob("*.nc")):
         name = path.relative_to(whole)
         if name.parent.name != "network":  # first maps and motions, on the way to what is shown
-            data = store.read(path)
+            data = reduced(netcdf.read(path).load())
+            data.encoding["compression"] = 4
             key, made_from = data.attrs["task_key"], data.attrs["made_from"].split()
-            store.write(reduced(data), Path(small) / name, key, made_from, compression=4)
+            store.write(data, Path(small) / name, key, made_from)
 
 
 def collection(folder=FOLDER, *, n=51, n_vertices=2000, n_coarse=600, n_pairs=150, k=30):

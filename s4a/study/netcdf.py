@@ -346,6 +346,8 @@ def _write_group(group, data):
         packed = {}
         if values.dtype.kind in "iuf" and values.size and values.ndim:  # in one chunk
             packed = {"chunks": values.shape, "fletcher32": True}
+            if level := data.encoding.get("compression"):  # of a study to be given away
+                packed |= {"compression": level, "shuffle": True}
         if data.variables[name].dtype.kind not in "iufbUO":
             raise TypeError(f"{name} needs numbers or texts, found {data.variables[name].dtype}")
         fill = one.attrs.get("_FillValue")
