@@ -467,10 +467,10 @@ def insert(
     tree = s4a.open_study(study)
     inserted = s4a.insert(tree, shapes, landmarks=landmarks, reflect=reflect, n_jobs=n_jobs)
     folder = new_folder(out)
-    s4a.study.store.write(inserted, folder / "inserted.nc")
+    path = s4a.study.tree.write_inserted(inserted, folder)
     s4a.write_registered(inserted, folder)
     write(tables.inserted_table(inserted), "")
-    write(f"written: {folder / 'inserted.nc'}, registered meshes and scores in {folder}")
+    write(f"written: {path}, registered meshes and scores in {folder}")
     return 1 if (inserted["report"]["status"] == "excluded").any() else 0
 
 

@@ -428,7 +428,10 @@ def pca_without(
         ) from error
     if not apart:
         return result
-    modes = ("mean_displacement", "deformation", "standard_deviation")
-    d = registration["displacement"].sel(shape=apart).values
-    score, _ = project_scores(d, *(result[name].values for name in modes), area=area)
+    mean, deformation = result["mean_displacement"].values, result["deformation"].values
+    d, sd = (
+        registration["displacement"].sel(shape=apart).values,
+        result["standard_deviation"].values,
+    )
+    score, _ = project_scores(d, mean, deformation, sd, area)
     return result.merge(dataset(score_apart=score)).assign_coords(shape_apart=apart)

@@ -12,7 +12,7 @@ from s4a.options import kept_options
 from s4a.schema import INPUT, in_unit, unit_of, variable
 from s4a.study.contents import check_contents, check_fit
 from s4a.study.netcdf import DamagedError, damage_named, open_file, read, read_tree, stacked
-from s4a.study.store import check_is_study
+from s4a.study.store import check_is_study, write
 
 log = logging.getLogger(__name__)
 
@@ -283,6 +283,13 @@ def as_reported(nodes: dict[str, xr.Dataset]) -> dict[str, xr.Dataset]:
             data = data.assign_attrs(path=paths[name])
         reported[node] = data
     return reported
+
+
+def write_inserted(inserted: xr.DataTree, folder: Path | str) -> Path:
+    """Write what :func:`s4a.insert` gives, for :func:`open_inserted`; its file in the folder."""
+    path = Path(folder) / "inserted.nc"
+    write(inserted, path)
+    return path
 
 
 def open_inserted(file: Path | str) -> xr.DataTree:

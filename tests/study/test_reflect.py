@@ -50,7 +50,7 @@ def test_the_study_of_left_and_right_shapes_is_that_of_right_ones(right, mixed, 
         assert (hand.drop_sel(shape=LEFT) > 0.5).all()
         assert "mirrored, as reflect= says" in study_html(found)
     assert "handedness" not in named["report"]
-    assert named["report"].attrs["reflect"] == "s1,s3"
+    assert s4a.Options.from_report(named).reflect == "s1,s3"
 
 
 def test_a_finished_study_is_not_computed_again_and_holds(mixed, folder):
