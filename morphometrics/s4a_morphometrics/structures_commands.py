@@ -42,11 +42,7 @@ def insert(args: Namespace) -> int:
     options = {name: getattr(args, name) for name in ("landmarks", "reflect", "table", "n_jobs")}
     inserted = insert_structures(study, args.shapes, **options)
     out = new_folder(args.out)
-<<<<<<< HEAD
-    write_dataset(inserted, out / "inserted.nc")
-=======
     path = write_inserted(inserted, out)
->>>>>>> 149d912410ab16d3faed16ba5b2e5aa13f4c48dd
     for name, part in inserted["structures"].children.items():
         write_registered(part, out / "structures" / name)
         write(f"structures/{name}\n{inserted_table(part)}")
