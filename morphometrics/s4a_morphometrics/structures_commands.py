@@ -33,7 +33,7 @@ def run(args: Namespace) -> int:
 
 def insert(args: Namespace) -> int:
     """New subjects in the studies of several structures, which stay as they are."""
-    from s4a.analysis.export import write_dataset, write_registered
+    from s4a.analysis.export import write_registered
     from s4a.cli.tables import inserted_table
     from s4a.study.tree import write_inserted
     from s4a_morphometrics.several import insert_structures, open_structures
