@@ -7,7 +7,6 @@ from faults import shapes as faulty
 import s4a
 from s4a import analyse, cli, open_study, verify
 from s4a.analysis.export import write_registered
-from s4a.options import Options
 from s4a.show.page import study_html
 
 OPTIONS = {"n_coarse": 150, "k_init": 8, "k": 15, "n_jobs": 1, "intersections": False}
