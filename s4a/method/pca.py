@@ -429,14 +429,6 @@ def pca_without(
     if not apart:
         return result
     mean, deformation = result["mean_displacement"].values, result["deformation"].values
-<<<<<<< HEAD
-    d, sd = (
-        registration["displacement"].sel(shape=apart).values,
-        result["standard_deviation"].values,
-    )
-    score, _ = project_scores(d, mean, deformation, sd, area)
-=======
     d, sd = registration["displacement"].sel(shape=apart), result["standard_deviation"].values
     score, _ = project_scores(d.values, mean, deformation, sd, area)
->>>>>>> 7e1a7b2310f9fa455c7776064620c79d235b54f8
     return result.merge(dataset(score_apart=score)).assign_coords(shape_apart=apart)
