@@ -283,9 +283,7 @@ def residual_of(end: End) -> float:
     return end[2]
 
 
-def try_tilts(
-    source: Cloud, target: Cloud, start: End, *, degrees: float = 15.0, **options: Any
-) -> End:
+def _try_tilts(source, target, start, *, degrees=15.0, **options):
     """ICP again from its end tilted about each axis of the target, as long as that ends nearer.
 
     ICP alone ends wherever no pair changes: on folded surfaces up to 20 degrees from the best
@@ -369,7 +367,7 @@ def align(
     upside_down = [end for end in turned if np.trace(end[0].T @ posed[0]) < 1]
 
     def tilt(start: End) -> End:
-        return try_tilts(source, target, start, tolerance=ROUGH)
+        return _try_tilts(source, target, start, tolerance=ROUGH)
 
     best = tilt(min(upright, key=residual_of)) if upright else None
     if best is None or clearly * residual_of(best) > residual_of(posed):

@@ -130,7 +130,7 @@ def unique_edges(T: Array, n: int | None = None) -> tuple[Array, Array, Array]:
     end = np.roll(start, -len(T))
     if n is None:
         n = int(start.max(initial=-1)) + 1
-    check_numbers(start, n)
+    _check_numbers(start, n)
     m, bits = len(start), n.bit_length()
     edge = np.minimum(start, end) << bits | np.maximum(start, end)  # both in one word
     places = m.bit_length()
@@ -150,7 +150,7 @@ def unique_edges(T: Array, n: int | None = None) -> tuple[Array, Array, Array]:
     return E, edge_of, np.diff(head, append=m)
 
 
-def check_numbers(key: Array, n: int) -> None:
+def _check_numbers(key, n):
     """IndexError unless all are numbers from 0 to n - 1."""
     if len(key) and not 0 <= key.min() <= key.max() < n:
         raise IndexError(f"numbers from 0 to {n - 1} needed, found {key.min()} to {key.max()}")
@@ -168,7 +168,7 @@ def counting_order(key: Array, n: int) -> Array:
     >>> counting_order(np.array([2, 0, 1, 0]), 3).tolist()
     [1, 3, 2, 0]
     """
-    check_numbers(key, n)  # what follows would write beside its memory
+    _check_numbers(key, n)  # what follows would write beside its memory
     m = len(key)
     one_a_row = sp.csr_matrix((np.ones(m, np.int8), key, np.arange(m + 1)), (m, n))
     return one_a_row.tocsc().indices.astype(np.int64)

@@ -26,13 +26,13 @@ N_LANDMARKS = 10  # of step 3
 SEARCHED = tuple(itertools.product(("hks+wks", "wks", "hks"), (0.5, 1.0, 1.5), (1.0, 10.0)))
 N_ENDS, N_ENDS_OTHER = 5, 7  # extremities of one shape, and of the other among which they are
 N_PAIRED = 8  # the likeliest ways to pair them
-CURVATURE = 3.0  # its weight by that of a signature
-ON_A_LINE = 0.02  # of sqrt(area): landmarks as near to a line say nothing of turns about it
-BENT = 0.3  # weight of the gap of curvatures in that score
-FOUND = 0.07  # score at which the search ends; of wrong maps between bodies it is 0.11 or more
+_CURVATURE = 3.0  # its weight by that of a signature
+_ON_A_LINE = 0.02  # of sqrt(area): landmarks as near to a line say nothing of turns about it
+_BENT = 0.3  # weight of the gap of curvatures in that score
+_FOUND = 0.07  # score at which the search ends; of wrong maps between bodies it is 0.11 or more
 
 
-class FirstMap(NamedTuple):
+class _FirstMap(NamedTuple):
     """A first map of a directed pair, and what it was made of."""
 
     name: str  # "dense", "landmarks", or of far poses that of best_first_map
@@ -49,7 +49,7 @@ def motion_onto(source: Basis, target: Basis) -> Motion:
     """
     at_source, at_target = corresponding_landmarks(source, target)
     P = source.X[at_source]
-    if len(P) < 3 or np.linalg.svd(P - P.mean(0), compute_uv=False)[1] < ON_A_LINE:
+    if len(P) < 3 or np.linalg.svd(P - P.mean(0), compute_uv=False)[1] < _ON_A_LINE:
         R, t, _ = align(source.X, source.area, target.X, target.area)
         return R, t
     R, t, _ = rigid_transform(P, target.X[at_target])
@@ -186,7 +186,7 @@ def best_first_map(
         Of the short ZoomOut.
     search : bool
         Whether to go on through :func:`paired_extremities` and :data:`SEARCHED` until the first two
-        terms of a score are below :data:`FOUND`.
+        terms of a score are below ``_FOUND``.
 
     Returns
     -------
@@ -198,7 +198,7 @@ def best_first_map(
     """
     k = min(k, source.k, target.k)
     maps = [("icp", C, C if fitted is None else fitted)]
-    maps += map_of_landmarks(source, target, len(C))
+    maps += _map_of_landmarks(source, target, len(C))
     best = np.inf
     tried = []  # score, name, map, fit
     for one in itertools.chain(maps, maps_of_signatures(source, target, len(C), search)):
@@ -208,14 +208,14 @@ def best_first_map(
         gap = joint.registration_score(source, target, end[0], target.moved_to(image))
         score = gap + stretch(target, image)
         best = min(best, score)
-        bent = BENT * fmap.curvature_gap(source, target, end[0]) if search else 0.0
+        bent = _BENT * fmap.curvature_gap(source, target, end[0]) if search else 0.0
         tried.append((score + bent, *one))
-        if len(tried) >= 2 + len(maps) and best < FOUND:
+        if len(tried) >= 2 + len(maps) and best < _FOUND:
             break
     return min(tried, key=lambda one: one[0])[1:]
 
 
-def map_of_landmarks(source: Basis, target: Basis, k: int) -> list[tuple[str, Array, Array]]:
+def _map_of_landmarks(source, target, k):
     """Name, first map and its fit ``(k, k)`` of wave kernels and landmarks, if both have three."""
     landmarks = corresponding_landmarks(source, target)
     if len(landmarks[0]) < 3:
@@ -242,7 +242,7 @@ def maps_of_signatures(
     for kind, share, oriented in SEARCHED:
         size = min(max(4, round(share * k)), source.k, target.k)
         fitted = fmap.fmap_from_descriptors(
-            source, target, k=size, kind=kind, oriented=oriented, curvature=CURVATURE
+            source, target, k=size, kind=kind, oriented=oriented, curvature=_CURVATURE
         )
         if size < k:
             fitted = fmap.zoomout(source, target, fitted, k, step=k)[0]
@@ -298,7 +298,7 @@ def paired_extremities(source: Basis, target: Basis) -> list[tuple[Array, Array]
     return list(ways.values())[:N_PAIRED]
 
 
-def have_signatures(source: Basis, target: Basis, k: int) -> bool:
+def _have_signatures(source, target, k):
     """Whether the first k eigenvalues of both, less those of 0, have a range in common.
 
     Those of a surface in many pieces may be 0 all.
@@ -318,10 +318,10 @@ def first_map(
     ahead: bool = True,
     n_spread: int = 0,
     search: bool = False,
-) -> FirstMap:
+) -> _FirstMap:
     """:func:`map_after_motion`, or :func:`best_first_map` where poses are far apart.
 
-    The latter only where `init` is dense and there are signatures, :func:`have_signatures`.
+    The latter only where `init` is dense and there are signatures, ``_have_signatures``.
 
     Parameters
     ----------
@@ -342,7 +342,7 @@ def first_map(
     )
     C = fmap.refine_once(source, target, fitted, n_spread) if ahead else fitted
     far = init == "dense" and joint.far_apart(source, target, near)
-    if far and have_signatures(source, target, k_init):
+    if far and _have_signatures(source, target, k_init):
         name, C, fitted = best_first_map(source, target, C, fitted, search=search)
-        return FirstMap(name, C, fitted, near, None)
-    return FirstMap(init, C, fitted, near, landmarks)
+        return _FirstMap(name, C, fitted, near, None)
+    return _FirstMap(init, C, fitted, near, landmarks)

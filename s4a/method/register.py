@@ -124,11 +124,11 @@ def uncertainty(confidence: Array) -> Array:
 # lie on a wrong fold
 TORN = 0.65
 FEW = 2000  # vertices of low resolution: fewer smear tears
-SMEARED = 0.3  # by this share of TORN
-LOOSER = 4  # the step of elastic rounds with which they begin then, too
+_SMEARED = 0.3  # by this share of TORN
+_LOOSER = 4  # the step of elastic rounds with which they begin then, too
 # of score times tear: what looser rounds must leave at most.  Where they find the right fold they
 # leave 0.3 to 0.72; real heads 0.81 or more where the score falls at all (docs/decisions.md)
-MENDED = 0.75
+_MENDED = 0.75
 
 Functions = tuple[Array, Array]  # of source and target, rows of which are compared
 
@@ -159,7 +159,7 @@ def match_low(
     Psi = target.low.Phi[:, :k]
     match = nearest_rows(Psi @ Y_target, Phi @ Y_source)  # eq. 6
     if how == "standard":
-        return match, mapped_functions(source, target, match, k)
+        return match, _mapped_functions(source, target, match, k)
     return match, latent_functions(source, target, bases)
 
 
@@ -169,7 +169,7 @@ def latent_functions(source: Shape, target: Shape, bases: Functions) -> Function
     return source.functions(Y_source), target.functions(Y_target)
 
 
-def mapped_functions(source: Shape, target: Shape, match: Array, k: int) -> Functions:
+def _mapped_functions(source, target, match, k):
     """Phi C^T and Psi with the k x k map C of the match of eq. 3: the standard way's, for eq. 4."""
     Phi = source.low.Phi[:, :k]
     C = fmap_from_match(Phi, target.low.Phi[:, :k], target.low.mass, match)
@@ -315,7 +315,7 @@ def register(
     """
     check("alignment", alignment)
     candidates = find_candidates(source, target, starts, k=k, refine=refine, parts=parts)
-    by_icp = motion_in_unit(source, target, motion, scale) if alignment == "icp" else None
+    by_icp = _motion_in_unit(source, target, motion, scale) if alignment == "icp" else None
     # image = R x + t + U Phi c, smooth already: the line after eq. 8; or of elastic rounds
     match, moved, attrs = register_surface(
         source,
@@ -363,7 +363,7 @@ def register(
     return in_unit(registration, common_unit(source.original, target.original))
 
 
-class Placed(NamedTuple):
+class _Placed(NamedTuple):
     """A motion s R x + t in the unit of the input, and the ratio of sizes that it leaves."""
 
     R: Array
@@ -372,7 +372,7 @@ class Placed(NamedTuple):
     ratio: float
 
 
-def motion_in_unit(source: Shape, target: Shape, motion: Motion, scale: bool) -> Placed:
+def _motion_in_unit(source, target, motion, scale):
     """A rigid motion between the frames of two shapes as one between their files.
 
     Without `scale` each keeps its size: the motion turns the source about its centre and carries
@@ -381,7 +381,7 @@ def motion_in_unit(source: Shape, target: Shape, motion: Motion, scale: bool) ->
     (center, size), (center_target, size_target) = source.frame, target.frame
     R, t = motion
     s = size_target / size if scale else 1.0
-    return Placed(R, center_target + size_target * t - s * R @ center, s, s * size / size_target)
+    return _Placed(R, center_target + size_target * t - s * R @ center, s, s * size / size_target)
 
 
 def find_candidates(
@@ -459,17 +459,17 @@ def register_surface(
     # starts as they are tell less of their ends than joint rounds do
     margin = 2.0 if elastic else 1.25
     names = joint.finalists(candidates, margin=margin) if candidates else ["intrinsic"]
-    landmarks = common_landmarks(source, target)
+    landmarks = _common_landmarks(source, target)
     if elastic:
         whole = {n: candidates[n].warp for n in names if candidates[n].warp[0].ndim == 2}
         names = [name for name in names if name not in whole]  # by parts
         for name, X in elastic_surfaces(source, target, whole, landmarks).items():
-            ends[f"{name}+elastic"] = scored_alone(M, N, X)
-        limit = TORN * (1 - SMEARED if len(target.low.X) < FEW else 1)
-        if ends and tear(ends[best_of(ends)][1], N) > limit:
-            torn = ends[best_of(ends)]
+            ends[f"{name}+elastic"] = _scored_alone(M, N, X)
+        limit = TORN * (1 - _SMEARED if len(target.low.X) < FEW else 1)
+        if ends and tear(ends[_best_of(ends)][1], N) > limit:
+            torn = ends[_best_of(ends)]
             again = elastic_surfaces(source, target, whole, landmarks, looser=True)
-            scored = {f"{name}+looser": scored_alone(M, N, X) for name, X in again.items()}
+            scored = {f"{name}+looser": _scored_alone(M, N, X) for name, X in again.items()}
             ends |= {name: end for name, end in scored.items() if mends(end, torn, N)}
     for name in names:
         if name == "intrinsic":
@@ -480,12 +480,12 @@ def register_surface(
         else:
             part, warp = joint.dense_rounds(M, N, candidates[name].warp)
         if elastic:  # here by parts
-            X = after_local_rounds(source, target, warp, landmarks)
-            ends[f"{name}+local"] = scored_alone(M, N, X)
+            X = _after_local_rounds(source, target, warp, landmarks)
+            ends[f"{name}+local"] = _scored_alone(M, N, X)
         else:
             moved = N.moved_to(joint.move(N, warp))
             ends[name] = joint.registration_score(M, N, part, moved), moved
-    method = best_of(ends)
+    method = _best_of(ends)
     score, moved = ends[method]
     if method != "intrinsic":
         match = match_surfaces(moved.X, moved.normals, M.X, M.normals)
@@ -493,7 +493,7 @@ def register_surface(
     return match, moved, attrs
 
 
-def best_of(ends: dict[str, tuple[float, Basis]]) -> str:
+def _best_of(ends):
     """The name of the end of registration that has the lowest score."""
     return min(ends, key=lambda name: ends[name][0])
 
@@ -509,16 +509,16 @@ def tear(moved: Basis, target: Basis) -> float:
 
 
 def mends(end: tuple[float, Basis], torn: tuple[float, Basis], target: Basis) -> bool:
-    """Whether an end is better than a torn one, in score and tear together (:data:`MENDED`).
+    """Whether an end is better than a torn one, in score and tear together (``_MENDED``).
 
     Score alone falls where a looser template follows noise, which tears it more.  The lower score
-    decides among the ends that are left (:func:`best_of`).
+    decides among the ends that are left (``_best_of``).
     """
     before, after = (score * tear(moved, target) for score, moved in (torn, end))
-    return after < MENDED * before
+    return after < _MENDED * before
 
 
-def scored_alone(source: Basis, target: Basis, X: Array) -> tuple[float, Basis]:
+def _scored_alone(source, target, X):
     """Score of the registered target, matched by what is nearest to it, and that target."""
     moved = target.moved_to(X)
     match = joint.nearest_vertices(source, moved)
@@ -542,15 +542,15 @@ def elastic_surfaces(
     M, N = source.full, target.low_on_surface
     if not looser:
         starts = starts_that_meet(M, N, starts, landmarks)
-    stiffness = STIFFNESS[LOOSER if looser else 0 :]
+    stiffness = STIFFNESS[_LOOSER if looser else 0 :]
     surfaces = {}
     for name, start in starts.items():
         warp = elastic_rounds(M, N, start, stiffness=stiffness, landmarks=landmarks)
-        surfaces[name] = after_local_rounds(source, target, warp, landmarks)
+        surfaces[name] = _after_local_rounds(source, target, warp, landmarks)
     return surfaces
 
 
-def common_landmarks(source: Shape, target: Shape) -> Landmarks | None:
+def _common_landmarks(source, target):
     """The landmarks that both shapes have by name; None where there are none."""
     names, at_source = source.landmarks
     names_target, at_target = target.landmarks
@@ -564,9 +564,7 @@ def common_landmarks(source: Shape, target: Shape) -> Landmarks | None:
     return Landmarks(Basis(B @ N.X, none, B @ N.area, target.low.Phi, U=B @ target.U), y)
 
 
-def after_local_rounds(
-    source: Shape, target: Shape, warp: joint.Warp, landmarks: Landmarks | None = None
-) -> Array:
+def _after_local_rounds(source, target, warp, landmarks=None):
     """The template ``(n_target, 3)`` after a warp, by parts or not, and local rounds."""
     low = target.low_on_surface
     pull = None

@@ -70,7 +70,7 @@ class Basis:
     landmarks : dict of str to int
         The vertex at each landmark that was given, or nearest to it.
     fields : dict of str to float ndarray (n,)
-        Those that were given to guide, see :func:`smooth_fields`.
+        Those that were given to guide, see ``_smooth_fields``.
     """
 
     X: Array
@@ -323,7 +323,7 @@ class Shape:
         area = area / area.sum()
         X, landmarks = self.to_frame(X), vertices_of_landmarks(self.coarse)
         low = Basis(X, T, area, Phi, eigenvalue, mass, landmarks=landmarks)
-        return replace(low, fields=smooth_fields(self.coarse, low))
+        return replace(low, fields=_smooth_fields(self.coarse, low))
 
     @cached_property
     def W(self) -> sp.csr_matrix:
@@ -364,20 +364,11 @@ class Shape:
         area = self._area / self._area.sum()
         lifted = self.is_lifted
         Phi = self.coarse["lifted_eigenfunction"].values if lifted else low.Phi
-        return Basis(
-            X,
-            T,
-            area,
-            Phi,
-            low.eigenvalue,
-            low.mass,
-            self.U,
-            self.near_coarse,
-            self.area_weighted,
-            lifted,
-            landmarks=vertices_of_landmarks(self.original),
-            fields={name: self.U @ values for name, values in low.fields.items()},
-        )
+        functions = Phi, low.eigenvalue, low.mass, self.U
+        projection = self.near_coarse, self.area_weighted, lifted
+        landmarks = vertices_of_landmarks(self.original)
+        fields = {name: self.U @ values for name, values in low.fields.items()}
+        return Basis(X, T, area, *functions, *projection, landmarks=landmarks, fields=fields)
 
     @property
     def is_sampled(self) -> bool:
@@ -435,7 +426,7 @@ def features_of(mesh: xr.Dataset) -> dict[str, Array]:
     return dict(zip(names, mesh["feature_value"].values.T, strict=True))
 
 
-def smooth_fields(coarse: xr.Dataset, low: Basis) -> dict[str, Array]:
+def _smooth_fields(coarse, low):
     """Fields that guide as the functions of a surface have them, of mean 0 and variance 1.
 
     Times their weights.  Noise from vertex to vertex would draw matches aside.  NaN counts as the

@@ -66,7 +66,7 @@ def test_view_writes_a_page_into_the_study_or_where_it_is_told(ran, tmp_path, mo
     study, _ = ran
     page = tmp_path / "page.html"
     monkeypatch.setattr(
-        "s4a.show.page.write_page",
+        "s4a.write_page",
         lambda tree, file, **_: file.write_text(f"{len(tree['original'])} shapes"),
     )
     assert cli.main(["view", str(study)]) == 0
@@ -171,7 +171,7 @@ def test_two_shapes_end_well_without_modes_and_the_reason_is_told(folder, tmp_pa
 
 
 def test_demo_finds_the_planted_modes_and_writes_its_page(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("s4a.show.page.write_page", lambda tree, file, **_: file.write_text("page"))
+    monkeypatch.setattr("s4a.write_page", lambda tree, file, **_: file.write_text("page"))
     out = tmp_path / "demo"
     assert (
         cli.main(["demo", "--out", str(out), "--shapes", "4", "--vertices", "700", "--n-jobs", "1"])
