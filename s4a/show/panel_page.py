@@ -135,7 +135,7 @@ class Recording:
             name: Control(panel.control(name), name, name in panel.every) for name in names
         }
         self.values, self.place, self.size = [], {}, 0
-        runs = []
+        runs: list[Any] = []
         with ExitStack() as silence:
             panel.recording = True
             silence.callback(setattr, panel, "recording", False)
@@ -150,8 +150,10 @@ class Recording:
                 with unchanged_picks(panel, self.widgets):
                     runs.append(self.run(group, limit * (i + 1) // len(panel.live)))
         depends = [differing(*run) for run in runs]
-        own = zip(runs, depends, strict=True)
-        self.groups = [self.group(*run, slots, depends) for run, slots in own]
+        self.groups = [
+            self.group(group, states, slots, depends)
+            for (group, states), slots in zip(runs, depends, strict=True)
+        ]
         for name, control in self.controls.items():
             within = [(group.index(name), states) for group, states in runs if name in group]
             kept = [{places[i] for places in states} for i, states in within]

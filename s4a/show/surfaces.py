@@ -244,6 +244,6 @@ def latent_match(study: xr.DataTree, source: str, target: str, *, dense: bool) -
         Shape(study["original"][name].to_dataset(), study["coarse"][name].to_dataset())
         for name in (source, target)
     )
-    bases = latent_bases(Study(study), source, target)
-    match, (F_source, F_target) = match_low(M, N, bases)
+    basis_source, basis_target = latent_bases(Study(study), source, target)
+    match, (F_source, F_target) = match_low(M, N, (basis_source, basis_target))
     return match_functions(M, N, F_source, F_target)[0] if dense else match
