@@ -118,11 +118,12 @@ def surface():
     return Shape(coarse=spectrum(coarsen(brain, n_coarse=600), k=40)).low
 
 
-def ends(surface, X, **options):
+def ends(surface, X, **changed):
     """Where the vertices of a surface end on the same surface moved to X."""
     begin = np.eye(3), np.zeros(3), np.zeros((1, 3))
+    schedule = elastic.FOLLOWING._replace(**changed)
     return joint.move(
-        surface, elastic.elastic_rounds(surface.moved_to(X), surface, begin, **options)
+        surface, elastic.elastic_rounds(surface.moved_to(X), surface, begin, schedule)
     )
 
 
