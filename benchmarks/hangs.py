@@ -20,6 +20,7 @@ from pathlib import Path
 import psutil
 
 NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
+MORE = NOTEBOOKS.parent / "morphometrics" / "notebooks"
 STILL = 30  # seconds without processor time that make a hung run
 LITTLE = 0.5  # seconds of it that an idle client and kernel may use in that time
 
@@ -84,7 +85,7 @@ def main() -> None:
     options = parser.parse_args()
     lessons = [
         path
-        for path in sorted(NOTEBOOKS.glob("*.ipynb"))
+        for path in [*sorted(NOTEBOOKS.glob("*.ipynb")), *sorted(MORE.glob("*.ipynb"))]
         if not options.lessons or path.name.startswith(tuple(options.lessons))
     ]
     burners = [multiprocessing.Process(target=burn, daemon=True) for _ in range(options.load)]

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 import s4a
-from s4a.study import store
+from s4a.study import netcdf, store
 
 FOLDER = Path(__file__).resolve().parent / "study_51"
 LIMIT = 15e6  # bytes
@@ -62,7 +62,7 @@ def reduce(whole, small):
     for path in sorted(Path(whole).rglob("*.nc")):
         name = path.relative_to(whole)
         if name.parent.name != "network":  # first maps and motions, on the way to what is shown
-            data = store.read(path)
+            data = netcdf.read(path)
             key, made_from = data.attrs["task_key"], data.attrs["made_from"].split()
             store.write(reduced(data), Path(small) / name, key, made_from, compression=4)
 

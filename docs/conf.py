@@ -29,12 +29,18 @@ from s4a.schema import TABLE
 
 HERE = Path(__file__).parent
 NOTEBOOKS = HERE.parent / "notebooks"
+LESSONS = {
+    path.name: path
+    for folder in (NOTEBOOKS, HERE.parent / "morphometrics" / "notebooks")
+    for path in sorted(folder.glob("*.ipynb"))
+}
 LARGE = 20_000  # letters of a picture that is packed
 
 project, author = "S4A", "S4A developers"
 copyright = author
 release = version_of("s4a")
-extensions = ["sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode", "myst_nb"]
+extensions = ["sphinx.ext.autodoc", "sphinx.ext.napoleon", "myst_nb"]
+extensions += [] if os.environ.get("S4A_DOCS") == "off" else ["sphinx.ext.viewcode"]
 exclude_patterns = ["_build", "_variables.md", "_commands.md", "_performance.md", "_tables.md"]
 exclude_patterns += ["performance", "tables"]
 root_doc = "index"
@@ -56,7 +62,7 @@ nb_execution_mode = os.environ.get("S4A_DOCS", "cache")
 # S4A_LESSONS="00 04" runs these lessons and nothing else, to look at their pages
 SOME = os.environ.get("S4A_LESSONS", "").split()
 if SOME:
-    others = {path.name for path in NOTEBOOKS.glob("*.ipynb") if path.name[:2] not in SOME}
+    others = {name for name in LESSONS if name[:2] not in SOME}
     nb_execution_excludepatterns = ["gallery.md", *sorted(others)]
 nb_execution_cache_path = str(HERE / "_build" / "notebooks")
 nb_execution_timeout = 600
@@ -93,7 +99,7 @@ def take_course():
     """
     folder = HERE / "course"
     folder.mkdir(exist_ok=True)
-    for path in sorted(NOTEBOOKS.glob("*.ipynb")):
+    for path in LESSONS.values():
         notebook = nbformat.read(path, as_version=4)
         cell = nbformat.v4.new_code_cell(
             WITHOUT_KERNEL, id="without-kernel", metadata={"tags": ["remove-cell"]}
@@ -101,10 +107,11 @@ def take_course():
         notebook.cells.insert(1, cell)
         write(folder / path.name, nbformat.writes(notebook))
     for left in folder.glob("*.ipynb"):
-        if not (NOTEBOOKS / left.name).exists():
+        if left.name not in LESSONS:
             left.unlink()
-    lessons = "\n".join(path.stem for path in sorted(NOTEBOOKS.glob("*.ipynb")))
+    lessons = "\n".join(path.stem for path in LESSONS.values())
     words = (NOTEBOOKS / "README.md").read_text(encoding="utf-8")
+    words = words.replace("../morphometrics/notebooks/", "")
     write(folder / "index.md", f"{words}\n```{{toctree}}\n:hidden:\n\n{lessons}\n```\n")
 
 

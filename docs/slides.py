@@ -16,6 +16,7 @@ from nbconvert import SlidesExporter
 
 DOCS = Path(__file__).resolve().parent
 NOTEBOOKS = DOCS.parent / "notebooks"
+MORE = DOCS.parent / "morphometrics" / "notebooks"
 # The first cell of a notebook, in a namespace of its own, so that no cell hides a name of it:
 # what needs a kernel is shown as a page of its own, or for some values of its slider.
 WITHOUT_KERNEL = f"exec({(DOCS / 'without_kernel.py').read_text(encoding='utf-8')!r}, {{}})"
@@ -78,7 +79,7 @@ def main() -> None:
     options = parser.parse_args()
     folder = DOCS / "_build" / "slides"
     folder.mkdir(parents=True, exist_ok=True)
-    for path in sorted(NOTEBOOKS.glob("*.ipynb")):
+    for path in [*sorted(NOTEBOOKS.glob("*.ipynb")), *sorted(MORE.glob("*.ipynb"))]:
         if path.name.startswith(tuple(options.lessons)):
             notebook = executed(as_slides(nbformat.read(path, as_version=4)))
             file = folder / f"{path.stem}.html"

@@ -4,7 +4,7 @@ They are imported when they are first used.
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import xarray as xr
 
@@ -68,13 +68,6 @@ class StudyAccessor:
     def __init__(self, study: xr.DataTree):
         self._study = study
 
-    def explore(
-        self,
-        *,
-        width: float | str | None = None,
-        font: float | None = None,
-        view: str = "corner",
-        up: str = "z",
-    ) -> "Explore":
+    def explore(self, **options: Any) -> "Explore":
         """See :func:`s4a.explore`."""
-        return explore(self._study, width=width, font=font, view=view, up=up)
+        return explore(self._study, **options)

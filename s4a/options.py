@@ -97,7 +97,11 @@ computing = partial(option, group="computing")
 
 def check_components(components: Any) -> str | int:
     """`components`; ValueError unless it is "largest", "all" or a number from 1."""
-    if isinstance(components, Integral) and components is not True and int(components) >= 1:
+    if (
+        not isinstance(components, bool)
+        and isinstance(components, Integral)
+        and int(components) >= 1
+    ):
         return int(components)
     if isinstance(components, str) and components in ("largest", "all"):
         return components

@@ -23,311 +23,276 @@ SHARE = "share of sqrt(area)"
 UNIT_AREA = "1, for the surface scaled to unit area"
 LARGEST_COUNT = 2**31 - 1  # of options that count, and of seeds: what every library takes
 
-# name: (dims, unit, long_name).  A new variable is a new row, beside those of its step.  In the
-# file of a single shape a leading dim `shape` is absent.
-# fmt: off
-ROWS = {
-    # a mesh, original or coarse
-    "position": ("vertex xyz", INPUT, "vertex position"),
-    "corner_vertex": ("triangle corner", ONE, "vertex at each corner of a triangle"),
-    "file_vertex": ("vertex", ONE, "index of the vertex in its file"),
-    "vertex_of_file": ("file_vertex_index", ONE,
-        "vertex that a vertex of the file became, -1 where dropped"),
-    "label": ("vertex", ONE, "label of the vertex"),
-    "landmark_name": ("landmark", ONE, "name of the landmark"),
-    "landmark_position": ("landmark xyz", INPUT, "position of the landmark"),
-    "guide_name": ("guide", ONE, "name of the landmark that guides registration"),
-    "guide_position": ("guide xyz", INPUT, "its position on the surface"),
-    "guide_triangle": ("guide", ONE, "triangle of the mesh on which it lies"),
-    "guide_barycentric": ("guide corner", ONE, "its barycentric weights in that triangle"),
-    "guide_distance": ("guide", INPUT, "distance from the surface, as it was given"),
-    "guide_vertex": ("guide", ONE, "coarse vertex at it, or nearest to it"),
-    "feature_name": ("feature", ONE, "name of the field that guides registration"),
-    "feature_weight": ("feature", ONE, "how much it counts beside others"),
-    "feature_value": ("vertex feature", ONE, "its value, in its own unit"),
-    "landmark_curve": ("landmark", ONE,
-        "curve of the point, in order along it; empty where it has none"),
-    "landmark_closed": ("landmark", ONE, "whether that curve is closed"),
-    # low resolution (4.1) and its spectrum (3.3)
-    "vertex_area": ("vertex", INPUT2, "lumped area of the vertex, the diagonal of A"),
-    "edge_vertex": ("edge end", ONE, "vertices at both ends of an edge"),
-    "cotan_weight": ("edge", ONE, "cotan weight of the edge, so that the Laplacian is A^-1 W"),
-    "sample_vertex": ("vertex", ONE,
-        "vertex of the original mesh that the coarse vertex is, -1 where it is none"),
-    "coarse_vertex": ("original_vertex corner", ONE,
-        "coarse vertices that carry an original vertex: columns of U"),
-    "coarse_weight": ("original_vertex corner", ONE, "their barycentric weights: entries of U"),
-    # the same of SCALABLE (s4a.method.scalable), whose coarse vertices are samples
-    "sample_cell": ("original_vertex", ONE,
-        "sample that is nearest to the original vertex along edges: its Voronoi cell"),
-    "local_vertex": ("entry", ONE,
-        "original vertex that a local function reaches: row of an entry of U"),
-    "local_sample": ("entry", ONE, "sample that it lives around: column of that entry"),
-    "local_weight": ("entry", ONE, "its value there: the entry, rows of U sum to 1"),
-    "edge_mass": ("edge", INPUT2,
-        "integral of the product of two local functions: entry of U^T A U, whose rows sum to the "
-        "vertex areas"),
-    "eigenvalue": ("mode", UNIT_AREA, "eigenvalue of the Laplace-Beltrami operator"),
-    "eigenfunction": ("vertex mode", UNIT_AREA, "eigenfunction, orthonormal in the vertex areas"),
-    "lifted_eigenfunction": ("original_vertex mode", UNIT_AREA,
-        "eigenfunction of the original mesh, nearly, by a step of inverse iteration"),
-    # one pair (4.1)
-    "match": ("vertex", ONE, "on each vertex of the target, the matched vertex of the source"),
-    # metrics of a pair (5.1, eq. 9 - 11)
-    "chamfer": ("", SHARE, "Chamfer distance of the source and the image of the target (eq. 9)"),
-    "hausdorff": ("", SHARE, "Hausdorff distance of the source and the image of the target"),
-    "hausdorff_paper": ("", SHARE,
-        "the same as eq. 10 prints it: a sum, with 1/n on the second term"),
-    "dirichlet": ("", ONE,
-        "Dirichlet energy of the image's coordinates, source of unit area; 2 if conformal "
-        "(eq. 11)"),
-    "coverage": ("", ONE, "share of the source's area whose vertices are matched to"),
-    "bijectivity": ("", SHARE, "round trip target, source, target along edges, mean"),
-    "conformal_distortion": ("", ONE,
-        "log(s1 / s2) of the maps of triangles that do not collapse, median by area"),
-    "area_distortion": ("", ONE,
-        "|log(area of image / area)| of them, surfaces of unit area, median by area"),
-    "collapsed_share": ("", ONE, "share of the target's area in triangles whose image has no area"),
-    "geodesic_error": ("", SHARE, "distance along edges of matched and true vertices, mean"),
-    "straight_error": ("", SHARE, "distance in a straight line of image and true position, mean"),
-    "error_curve": ("threshold", ONE, "share of the vertices whose geodesic error is no larger"),
-    "label_accuracy": ("", ONE, "share of the area that gets its own label"),
-    "label_dice": ("", ONE, "Dice's overlap by area, mean over the labels of the target"),
-    "landmark_error": ("", SHARE,
-        "distance in a straight line of carried and given landmarks, mean"),
-    # the network of maps (3.4)
-    "source": ("pair", ONE, "shape whose functions the map takes"),
-    "target": ("pair", ONE, "shape on which the map gives functions"),
-    "fmap": ("pair mode_target mode_source", ONE,
-        "functional map, source functions to target functions"),
-    "fmap_initial": ("pair mode_target_initial mode_source_initial", ONE,
-        "functional map before Consistent ZoomOut"),
-    "fmap_fitted": ("pair mode_target_initial mode_source_initial", ONE,
-        "that map before the step of ZoomOut ahead (4.2)"),
-    "pair_rotation": ("pair xyz xyz_2", ONE,
-        "rotation R of ICP, source to target, between their frames (4.1, step 2)"),
-    "pair_translation": ("pair xyz", SHARE, "translation t of ICP, source to target"),
-    "landmark_of_source": ("pair landmark", ONE,
-        "landmarks of the first map: coarse vertices of the source (4.1, step 3)"),
-    "landmark_of_target": ("pair landmark", ONE,
-        "the coarse vertices of the target that are nearest to them after ICP"),
-    "weight": ("pair", ONE,
-        "weight of the map in the consistent latent basis, by its cycle error over all modes"),
-    "cycle_error": ("pair", ONE,
-        "mean |C_cycle - I|_F over the 3-cycles through the pair, first k_init modes, by "
-        "sqrt(k_init)"),
-    "cycle_error_initial": ("pair", ONE, "the same before Consistent ZoomOut"),
-    # latent basis and median (3.4 - 3.6, eq. 3 and 5)
-    "latent_basis": ("shape mode latent", ONE, "consistent latent basis Y of each shape"),
-    "latent_eigenvalue": ("latent", UNIT_AREA, "eigenvalue of the latent (limit) shape"),
-    "area_difference": ("shape latent latent_2", ONE, "area-based shape difference D = Y^T Y"),
-    "conformal_difference": ("shape latent latent_2", ONE, "conformal shape difference"),
-    "distance_to_median": ("shape", ONE,
-        "distance |D_i - I| of each shape to the limit shape (eq. 5)"),
-    "area_score": ("shape difference_component", ONE,
-        "PCA scores of the area-based shape differences"),
-    "conformal_score": ("shape difference_component", ONE,
-        "PCA scores of the conformal shape differences"),
-    "area_variance_ratio": ("difference_component", ONE,
-        "share of variance of the area-based differences"),
-    "conformal_variance_ratio": ("difference_component", ONE,
-        "share of variance of the conformal differences"),
-    # registration (eq. 6 - 8)
-    "registered_match": ("shape vertex", ONE,
-        "on each template vertex, the matched vertex of the shape"),
-    "displacement": ("shape vertex xyz", INPUT,
-        "registered shape minus template, smooth (eq. 8 with the other sign)"),
-    "displacement_raw": ("shape vertex xyz", INPUT,
-        "matched vertex of the aligned shape minus template"),
-    "rotation": ("shape xyz xyz_2", ONE,
-        "rotation R of the alignment x -> s R x + t onto the template"),
-    "translation": ("shape xyz", INPUT, "translation t of the alignment onto the template"),
-    "scale": ("shape", ONE, "scale s of the alignment onto the template"),
-    "registered_match_low": ("shape low_vertex", ONE,
-        "on each coarse vertex of the template, the matched coarse vertex of the shape (eq. 6)"),
-    "displacement_low": ("shape low_vertex xyz", INPUT,
-        "matched vertex of the aligned coarse shape minus coarse template (eq. 6)"),
-    "displacement_coefficient": ("shape mode xyz", INPUT,
-        "coefficients of the displacement in the functions U Phi of the template (6.1)"),
-    "icp_rotation": ("shape xyz xyz_2", ONE,
-        "rotation R of ICP, shape to template or reference, between their frames (4.1, step 2)"),
-    "icp_translation": ("shape xyz", SHARE, "translation t of that motion"),
-    "confidence": ("shape vertex", ONE,
-        "share of such vertices that are within 1 % of sqrt(area) of the truth, by their evidence"),
-    "round_trip": ("shape vertex", SHARE, "cycle error: way from the vertex to the shape and back"),
-    "distortion": ("shape vertex", ONE,
-        "log of the vertex's share of the area, on the shape over on the template"),
-    "method": ("shape", ONE, "start of the match that was kept"),
-    "badness": ("shape", SHARE, "round trip and gaps between the surfaces, mean"),
-    "template_triangle": ("original_vertex", ONE,
-        "template triangle on which the vertex of the shape lies"),
-    "template_barycentric": ("original_vertex corner", ONE, "barycentric weights in that triangle"),
-    # what travels along a registration (6.2)
-    "label_share": ("vertex", ONE, "share of the votes that the label of the vertex has, 0 to 1"),
-    "label_vote": ("vertex label_value", ONE, "share of the votes for every label, rows sum to 1"),
-    "field": ("vertex", ONE, "scalar field"),
-    "landmark_triangle": ("landmark", ONE, "triangle of the mesh on which the landmark lies"),
-    "landmark_barycentric": ("landmark corner", ONE,
-        "barycentric weights of the landmark in that triangle"),
-    "landmark_confidence": ("landmark", ONE, "confidence of the match at the landmark, 0 to 1"),
-    "landmark_distance": ("landmark", INPUT,
-        "distance of the given landmark from the surface it is marked on"),
-    "landmark_spread": ("landmark", INPUT,
-        "distance between the positions that different ways of transfer give"),
-    # modes (6.1)
-    "mean_displacement": ("vertex xyz", INPUT, "mean of the displacements"),
-    "deformation": ("component vertex xyz", INPUT,
-        "deformation of one standard deviation along the component"),
-    "standard_deviation": ("component", INPUT,
-        "standard deviation of the component (area-weighted RMS)"),
-    "score": ("shape component", ONE, "score of each shape, in standard deviations"),
-    "reconstruction_error": ("shape", INPUT,
-        "root mean square over the area of what the modes do not describe"),
-    "score_apart": ("shape_apart component", ONE,
-        "score, in standard deviations, of each doubtful shape that the modes are made without"),
-    "explained_variance_ratio": ("component", ONE, "share of the variance at full resolution"),
-    "explained_variance_ratio_low": ("component", ONE,
-        "share of the variance at low resolution, of the matches of eq. 6, as smooth as at full"),
-    "explained_variance_ratio_raw": ("component", ONE,
-        "share of the variance at low resolution, of the matches as they are"),
-    "template_vertex": ("vertex", ONE, "vertex of the template that the vertex of a region is"),
-    # evaluation of the model, tests and outliers (6.1)
-    "compactness": ("component", INPUT2, "variance of the first components together"),
-    "compactness_error": ("component", INPUT2, "its standard error"),
-    "generalization": ("component", INPUT,
-        "distance of a left-out shape to its reconstruction, mean over shapes"),
-    "generalization_error": ("component", INPUT, "its standard error"),
-    "generalization_surface": ("component", INPUT,
-        "the same from points to the surface, mean distance"),
-    "generalization_surface_error": ("component", INPUT, "its standard error"),
-    "specificity": ("component", INPUT,
-        "distance of a random shape of the model to the nearest shape"),
-    "specificity_error": ("component", INPUT, "its standard error"),
-    "specificity_surface": ("component", INPUT,
-        "the same from points to the surface, mean distance"),
-    "specificity_surface_error": ("component", INPUT, "its standard error"),
-    "variance_ratio": ("component", ONE, "share of the variance, in the basis of the baseline"),
-    "variance_ratio_null": ("component", ONE, "the same when every coefficient is permuted, mean"),
-    "variance_ratio_null_95": ("component", ONE, "the same, 95th percentile"),
-    "statistic": ("", ONE, "test statistic"),
-    "p_value": ("", ONE, "p value of the permutation test"),
-    "explained_share": ("vertex", ONE,
-        "share of the variation at the vertex that is explained (Pillai's trace)"),
-    "p_vertex": ("vertex", ONE, "p value of the vertex alone"),
-    "p_family_wise": ("vertex", ONE, "p value corrected for all vertices by the largest statistic"),
-    "p_false_discovery": ("vertex", ONE, "p value adjusted for the false discovery rate"),
-    "effect_size": ("vertex", ONE, "effect size"),
-    "effect": ("vertex xyz", INPUT,
-        "difference of the groups' means, or change per unit of the variable"),
-    "intercept": ("vertex xyz", INPUT, "displacement where the variable is at its mean"),
-    "standard_score": ("shape", ONE,
-        "variable of the regression, less its mean, in standard deviations"),
-    "mahalanobis": ("shape", ONE,
-        "distance to the mean of all others, in their standard deviations"),
-    "outlier_p": ("shape", ONE, "p value of that distance for a normal population"),
-    "left_out_error": ("shape", INPUT,
-        "distance of the shape to its reconstruction by the model of all others"),
-    "outlier": ("shape", ONE, "whether one of both is beyond its threshold"),
-    "predicted": ("shape", ONE, "class predicted while the shape was left out"),
-    "accuracy": ("fold", ONE, "balanced accuracy on the left-out shapes"),
-    # fields on the template, and field against shape
-    "carried_field": ("shape vertex", FIELD_UNIT, "field of the shape, carried to the template"),
-    "field_effect": ("vertex", FIELD_UNIT,
-        "difference of the groups' means, or change per unit of the variable"),
-    "field_intercept": ("vertex", FIELD_UNIT, "field where the variable is at its mean"),
-    # the truth of a synthetic collection
-    "reference_point": ("vertex xyz", ONE,
-        "point of the unit sphere that the vertex is the image of"),
-    "planted_score": ("shape planted_mode", ONE,
-        "planted score of each shape, in standard deviations"),
-    "planted_centre": ("planted_part xyz", "mm",
-        "centre of each localised field of the planted modes"),
-    "planted_width": ("planted_part", "mm", "its width, the standard deviation of a Gaussian"),
-    "planted_push": ("planted_mode planted_part xyz", "mm", "its translation in each planted mode"),
-    "planted_turn": ("planted_mode planted_part xyz", "rad", "its rotation in each planted mode"),
-    "own_centre": ("shape own_part xyz", "mm",
-        "centres of the noise and, last, of the tumour of each shape"),
-    "own_width": ("shape own_part", "mm", "their widths"),
-    "own_push": ("shape own_part xyz", "mm", "their translations"),
-    "landmark_reference": ("landmark xyz", ONE,
-        "point of the unit sphere that the landmark is the image of"),
-    # the comparison (Table 1, Fig. 3, Table 2)
-    "way_match": ("way vertex", ONE,
-        "on each vertex of the target, the vertex of the source that the method matches"),
-    "way_reverse": ("way source_vertex", ONE,
-        "on each vertex of the source, the vertex of the target that the method matches"),
-    "way_image": ("way vertex xyz", INPUT, "where the method puts a vertex of the target"),
-    "way_area": ("way vertex", ONE,
-        "log of the vertex's share of the area after and before the method moves it"),
-    "way_fmap": ("way mode_target mode_source", ONE,
-        "refined functional map of the method, source functions to target functions"),
-    "way_fmap_initial": ("way mode_target_initial mode_source_initial", ONE,
-        "first functional map of the method"),
-    "way_error": ("way vertex", SHARE, "distance in a straight line of image and true position"),
-    "true_position": ("vertex xyz", INPUT, "where the vertex truly lies on the source"),
-    "true_match": ("vertex", ONE, "vertex of the source nearest to there, -1 where unknown"),
-    "block_seconds": ("way pair block", "s", "CPU time of the block, of one core"),
-    "collection_chamfer": ("way how shape", SHARE,
-        "Chamfer distance of the shape and the image of the template (eq. 9)"),
-    "collection_seconds": ("way how block", "s",
-        "CPU time of the block for the whole collection, of one core"),
-    "median_shape": ("way", ONE, "median shape (eq. 5)"),
-    # what holds of a study's files
-    "state": ("file", ONE,
-        "whole, damaged, missing, stale, left over or foreign, see s4a.verify"),
-    "fault": ("file", ONE, "what is wrong with the file; empty where nothing is"),
-    # plausibility (5.1): a shape on its own and beside others of its collection
-    "sketch_position": ("point xyz", ONE,
-        "some vertices of the shape, centred, of unit root mean square radius"),
-    "sketch_area": ("point", ONE, "their shares of the area"),
-    "sketch_normal": ("point xyz", ONE, "their normals"),
-    "sketch_asymmetry": ("point", ONE, "how far the shape's mirror image lies above the vertex"),
-    "moment": ("axis", ONE, "share of the second moment along each principal axis"),
-    "fit": ("reference", ONE,
-        "residual of ICP onto the reference, both of unit root mean square radius"),
-    "fit_mirrored": ("reference", ONE, "the same of the shape's mirror image"),
-    "hand": ("reference", ONE,
-        "positive where the shape is of the reference's hand, negative where its mirror image is"),
-    "handedness": ("shape", ONE,
-        "mean of hand beside the references: positive as most shapes, negative as their mirror "
-        "images"),
-    "reflected": ("shape", ONE, "whether the mirror image of the shape was taken (reflect=)"),
-    # the report
-    "status": ("shape", ONE, "ok, repaired, doubtful or excluded"),
-    "reason": ("shape", ONE, "what was found and done"),
-    "warning": ("shape", ONE, "what looks wrong and was left as it is"),
-    "doubtful_kinds": ("shape", ONE, "what makes the shape doubtful, a word for each"),
-    "warning_kinds": ("shape", ONE, "what else was warned of, a word for each"),
-    "path": ("shape", ONE, "file of the shape"),
-    "area": ("shape", INPUT2, "area of the surface"),
-    "self_intersections": ("shape", ONE,
-        "triangles that pass through others, -1 where not counted"),
-    "file_vertices": ("shape", ONE, "vertices in the file"),
-    "file_triangles": ("shape", ONE, "triangles in the file"),
-    "nonfinite_vertices": ("shape", ONE, "vertices that are not finite"),
-    "welded_vertices": ("shape", ONE, "vertices welded to another"),
-    "degenerate_triangles": ("shape", ONE, "triangles that repeat a corner"),
-    "duplicate_triangles": ("shape", ONE, "triangles dropped because others have the same corners"),
-    "flipped_edges": ("shape", ONE, "long edges of zero-area triangles flipped"),
-    "flat_triangles": ("shape", ONE, "zero-area triangles dropped"),
-    "nonmanifold_edges": ("shape", ONE, "edges with more than two triangles"),
-    "cut_edges": ("shape", ONE, "sides of edges that were cut open"),
-    "split_vertices": ("shape", ONE, "vertices added where a vertex was not manifold"),
-    "inserted_vertices": ("shape", ONE,
-        "vertices inserted on edges where two sheets share both ends"),
-    "reoriented_triangles": ("shape", ONE, "triangles reoriented"),
-    "unreferenced_vertices": ("shape", ONE, "vertices without triangles"),
-    "closed_holes": ("shape", ONE, "holes closed"),
-    "components": ("shape", ONE, "connected components found"),
-    "dropped_components": ("shape", ONE, "connected components dropped"),
-    "area_dropped": ("shape", ONE, "share of the area in the dropped components"),
-    "holes": ("shape", ONE, "boundary loops"),
-    "genus": ("shape", ONE, "genus, summed over the components"),
-    "seconds": ("stage", "s", "wall time of the stage"),
-    "peak_memory": ("stage", "MiB",
-        "peak resident memory of this process and its workers in the stage"),
-}
-# fmt: on
+_UNITS = {
+    "L": INPUT, "L2": INPUT2, "share": SHARE, "unit area": UNIT_AREA, "field": FIELD_UNIT
+}  # fmt: skip
+
+
+def _rows(text):
+    """The rows ``name | dims | unit | long_name`` of a text, whose longer ones go on indented."""
+    lines = [line for line in text.strip().replace("\n    ", " ").splitlines() if line[0] != "#"]
+    cells = ([cell.strip() for cell in line.split("|", 3)] for line in lines)
+    return {name: (dims, _UNITS.get(unit, unit), meaning) for name, dims, unit, meaning in cells}
+
+
+# A new variable is a new row, beside those of its step; L is the unit of the input.  In the file
+# of a single shape a leading dim `shape` is absent.
+ROWS: dict[str, tuple[str, str, str]] = _rows("""
+# a mesh, original or coarse
+position | vertex xyz | L | vertex position
+corner_vertex | triangle corner | 1 | vertex at each corner of a triangle
+file_vertex | vertex | 1 | index of the vertex in its file
+vertex_of_file | file_vertex_index | 1 | vertex that a vertex of the file became, -1 where dropped
+label | vertex | 1 | label of the vertex
+landmark_name | landmark | 1 | name of the landmark
+landmark_position | landmark xyz | L | position of the landmark
+guide_name | guide | 1 | name of the landmark that guides registration
+guide_position | guide xyz | L | its position on the surface
+guide_triangle | guide | 1 | triangle of the mesh on which it lies
+guide_barycentric | guide corner | 1 | its barycentric weights in that triangle
+guide_distance | guide | L | distance from the surface, as it was given
+guide_vertex | guide | 1 | coarse vertex at it, or nearest to it
+feature_name | feature | 1 | name of the field that guides registration
+feature_weight | feature | 1 | how much it counts beside others
+feature_value | vertex feature | 1 | its value, in its own unit
+landmark_curve | landmark | 1 | curve of the point, in order along it; empty where it has none
+landmark_closed | landmark | 1 | whether that curve is closed
+# low resolution (4.1) and its spectrum (3.3)
+vertex_area | vertex | L2 | lumped area of the vertex, the diagonal of A
+edge_vertex | edge end | 1 | vertices at both ends of an edge
+cotan_weight | edge | 1 | cotan weight of the edge, so that the Laplacian is A^-1 W
+sample_vertex | vertex | 1 | vertex of the original mesh that the coarse vertex is, -1 where it is
+    none
+coarse_vertex | original_vertex corner | 1 | coarse vertices that carry an original vertex: columns
+    of U
+coarse_weight | original_vertex corner | 1 | their barycentric weights: entries of U
+# the same of SCALABLE (s4a.method.scalable), whose coarse vertices are samples
+sample_cell | original_vertex | 1 | sample that is nearest to the original vertex along edges: its
+    Voronoi cell
+local_vertex | entry | 1 | original vertex that a local function reaches: row of an entry of U
+local_sample | entry | 1 | sample that it lives around: column of that entry
+local_weight | entry | 1 | its value there: the entry, rows of U sum to 1
+edge_mass | edge | L2 | integral of the product of two local functions: entry of U^T A U, whose rows
+    sum to the vertex areas
+eigenvalue | mode | unit area | eigenvalue of the Laplace-Beltrami operator
+eigenfunction | vertex mode | unit area | eigenfunction, orthonormal in the vertex areas
+lifted_eigenfunction | original_vertex mode | unit area | eigenfunction of the original mesh,
+    nearly, by a step of inverse iteration
+# one pair (4.1)
+match | vertex | 1 | on each vertex of the target, the matched vertex of the source
+# metrics of a pair (5.1, eq. 9 - 11)
+chamfer | | share | Chamfer distance of the source and the image of the target (eq. 9)
+hausdorff | | share | Hausdorff distance of the source and the image of the target
+hausdorff_paper | | share | the same as eq. 10 prints it: a sum, with 1/n on the second term
+dirichlet | | 1 | Dirichlet energy of the image's coordinates, source of unit area; 2 if conformal
+    (eq. 11)
+coverage | | 1 | share of the source's area whose vertices are matched to
+bijectivity | | share | round trip target, source, target along edges, mean
+conformal_distortion | | 1 | log(s1 / s2) of the maps of triangles that do not collapse, median by
+    area
+area_distortion | | 1 | |log(area of image / area)| of them, surfaces of unit area, median by area
+collapsed_share | | 1 | share of the target's area in triangles whose image has no area
+geodesic_error | | share | distance along edges of matched and true vertices, mean
+straight_error | | share | distance in a straight line of image and true position, mean
+error_curve | threshold | 1 | share of the vertices whose geodesic error is no larger
+label_accuracy | | 1 | share of the area that gets its own label
+label_dice | | 1 | Dice's overlap by area, mean over the labels of the target
+landmark_error | | share | distance in a straight line of carried and given landmarks, mean
+# the network of maps (3.4)
+source | pair | 1 | shape whose functions the map takes
+target | pair | 1 | shape on which the map gives functions
+fmap | pair mode_target mode_source | 1 | functional map, source functions to target functions
+fmap_initial | pair mode_target_initial mode_source_initial | 1 | functional map before Consistent
+    ZoomOut
+fmap_fitted | pair mode_target_initial mode_source_initial | 1 | that map before the step of ZoomOut
+    ahead (4.2)
+pair_rotation | pair xyz xyz_2 | 1 | rotation R of ICP, source to target, between their frames (4.1,
+    step 2)
+pair_translation | pair xyz | share | translation t of ICP, source to target
+landmark_of_source | pair landmark | 1 | landmarks of the first map: coarse vertices of the source
+    (4.1, step 3)
+landmark_of_target | pair landmark | 1 | the coarse vertices of the target that are nearest to them
+    after ICP
+weight | pair | 1 | weight of the map in the consistent latent basis, by its cycle error over all
+    modes
+cycle_error | pair | 1 | mean |C_cycle - I|_F over the 3-cycles through the pair, first k_init
+    modes, by sqrt(k_init)
+cycle_error_initial | pair | 1 | the same before Consistent ZoomOut
+# latent basis and median (3.4 - 3.6, eq. 3 and 5)
+latent_basis | shape mode latent | 1 | consistent latent basis Y of each shape
+latent_eigenvalue | latent | unit area | eigenvalue of the latent (limit) shape
+area_difference | shape latent latent_2 | 1 | area-based shape difference D = Y^T Y
+conformal_difference | shape latent latent_2 | 1 | conformal shape difference
+distance_to_median | shape | 1 | distance |D_i - I| of each shape to the limit shape (eq. 5)
+area_score | shape difference_component | 1 | PCA scores of the area-based shape differences
+conformal_score | shape difference_component | 1 | PCA scores of the conformal shape differences
+area_variance_ratio | difference_component | 1 | share of variance of the area-based differences
+conformal_variance_ratio | difference_component | 1 | share of variance of the conformal differences
+# registration (eq. 6 - 8)
+registered_match | shape vertex | 1 | on each template vertex, the matched vertex of the shape
+displacement | shape vertex xyz | L | registered shape minus template, smooth (eq. 8 with the other
+    sign)
+displacement_raw | shape vertex xyz | L | matched vertex of the aligned shape minus template
+rotation | shape xyz xyz_2 | 1 | rotation R of the alignment x -> s R x + t onto the template
+translation | shape xyz | L | translation t of the alignment onto the template
+scale | shape | 1 | scale s of the alignment onto the template
+registered_match_low | shape low_vertex | 1 | on each coarse vertex of the template, the matched
+    coarse vertex of the shape (eq. 6)
+displacement_low | shape low_vertex xyz | L | matched vertex of the aligned coarse shape minus
+    coarse template (eq. 6)
+displacement_coefficient | shape mode xyz | L | coefficients of the displacement in the functions U
+    Phi of the template (6.1)
+icp_rotation | shape xyz xyz_2 | 1 | rotation R of ICP, shape to template or reference, between
+    their frames (4.1, step 2)
+icp_translation | shape xyz | share | translation t of that motion
+confidence | shape vertex | 1 | share of such vertices that are within 1 % of sqrt(area) of the
+    truth, by their evidence
+round_trip | shape vertex | share | cycle error: way from the vertex to the shape and back
+distortion | shape vertex | 1 | log of the vertex's share of the area, on the shape over on the
+    template
+method | shape | 1 | start of the match that was kept
+badness | shape | share | round trip and gaps between the surfaces, mean
+template_triangle | original_vertex | 1 | template triangle on which the vertex of the shape lies
+template_barycentric | original_vertex corner | 1 | barycentric weights in that triangle
+# what travels along a registration (6.2)
+label_share | vertex | 1 | share of the votes that the label of the vertex has, 0 to 1
+label_vote | vertex label_value | 1 | share of the votes for every label, rows sum to 1
+field | vertex | 1 | scalar field
+landmark_triangle | landmark | 1 | triangle of the mesh on which the landmark lies
+landmark_barycentric | landmark corner | 1 | barycentric weights of the landmark in that triangle
+landmark_confidence | landmark | 1 | confidence of the match at the landmark, 0 to 1
+landmark_distance | landmark | L | distance of the given landmark from the surface it is marked on
+landmark_spread | landmark | L | distance between the positions that different ways of transfer give
+# modes (6.1)
+mean_displacement | vertex xyz | L | mean of the displacements
+deformation | component vertex xyz | L | deformation of one standard deviation along the component
+standard_deviation | component | L | standard deviation of the component (area-weighted RMS)
+score | shape component | 1 | score of each shape, in standard deviations
+reconstruction_error | shape | L | root mean square over the area of what the modes do not describe
+score_apart | shape_apart component | 1 | score, in standard deviations, of each doubtful shape that
+    the modes are made without
+explained_variance_ratio | component | 1 | share of the variance at full resolution
+explained_variance_ratio_low | component | 1 | share of the variance at low resolution, of the
+    matches of eq. 6, as smooth as at full
+explained_variance_ratio_raw | component | 1 | share of the variance at low resolution, of the
+    matches as they are
+template_vertex | vertex | 1 | vertex of the template that the vertex of a region is
+# evaluation of the model, tests and outliers (6.1)
+compactness | component | L2 | variance of the first components together
+compactness_error | component | L2 | its standard error
+generalization | component | L | distance of a left-out shape to its reconstruction, mean over
+    shapes
+generalization_error | component | L | its standard error
+generalization_surface | component | L | the same from points to the surface, mean distance
+generalization_surface_error | component | L | its standard error
+specificity | component | L | distance of a random shape of the model to the nearest shape
+specificity_error | component | L | its standard error
+specificity_surface | component | L | the same from points to the surface, mean distance
+specificity_surface_error | component | L | its standard error
+variance_ratio | component | 1 | share of the variance, in the basis of the baseline
+variance_ratio_null | component | 1 | the same when every coefficient is permuted, mean
+variance_ratio_null_95 | component | 1 | the same, 95th percentile
+statistic | | 1 | test statistic
+p_value | | 1 | p value of the permutation test
+explained_share | vertex | 1 | share of the variation at the vertex that is explained (Pillai's
+    trace)
+p_vertex | vertex | 1 | p value of the vertex alone
+p_family_wise | vertex | 1 | p value corrected for all vertices by the largest statistic
+p_false_discovery | vertex | 1 | p value adjusted for the false discovery rate
+effect_size | vertex | 1 | effect size
+effect | vertex xyz | L | difference of the groups' means, or change per unit of the variable
+intercept | vertex xyz | L | displacement where the variable is at its mean
+standard_score | shape | 1 | variable of the regression, less its mean, in standard deviations
+mahalanobis | shape | 1 | distance to the mean of all others, in their standard deviations
+outlier_p | shape | 1 | p value of that distance for a normal population
+left_out_error | shape | L | distance of the shape to its reconstruction by the model of all others
+outlier | shape | 1 | whether one of both is beyond its threshold
+predicted | shape | 1 | class predicted while the shape was left out
+accuracy | fold | 1 | balanced accuracy on the left-out shapes
+# fields on the template, and field against shape
+carried_field | shape vertex | field | field of the shape, carried to the template
+field_effect | vertex | field | difference of the groups' means, or change per unit of the variable
+field_intercept | vertex | field | field where the variable is at its mean
+# the truth of a synthetic collection
+reference_point | vertex xyz | 1 | point of the unit sphere that the vertex is the image of
+planted_score | shape planted_mode | 1 | planted score of each shape, in standard deviations
+planted_centre | planted_part xyz | mm | centre of each localised field of the planted modes
+planted_width | planted_part | mm | its width, the standard deviation of a Gaussian
+planted_push | planted_mode planted_part xyz | mm | its translation in each planted mode
+planted_turn | planted_mode planted_part xyz | rad | its rotation in each planted mode
+own_centre | shape own_part xyz | mm | centres of the noise and, last, of the tumour of each shape
+own_width | shape own_part | mm | their widths
+own_push | shape own_part xyz | mm | their translations
+landmark_reference | landmark xyz | 1 | point of the unit sphere that the landmark is the image of
+# the comparison (Table 1, Fig. 3, Table 2)
+way_match | way vertex | 1 | on each vertex of the target, the vertex of the source that the method
+    matches
+way_reverse | way source_vertex | 1 | on each vertex of the source, the vertex of the target that
+    the method matches
+way_image | way vertex xyz | L | where the method puts a vertex of the target
+way_area | way vertex | 1 | log of the vertex's share of the area after and before the method moves
+    it
+way_fmap | way mode_target mode_source | 1 | refined functional map of the method, source functions
+    to target functions
+way_fmap_initial | way mode_target_initial mode_source_initial | 1 | first functional map of the
+    method
+way_error | way vertex | share | distance in a straight line of image and true position
+true_position | vertex xyz | L | where the vertex truly lies on the source
+true_match | vertex | 1 | vertex of the source nearest to there, -1 where unknown
+block_seconds | way pair block | s | CPU time of the block, of one core
+collection_chamfer | way how shape | share | Chamfer distance of the shape and the image of the
+    template (eq. 9)
+collection_seconds | way how block | s | CPU time of the block for the whole collection, of one core
+median_shape | way | 1 | median shape (eq. 5)
+# what holds of a study's files
+state | file | 1 | whole, damaged, missing, stale, left over or foreign, see s4a.verify
+fault | file | 1 | what is wrong with the file; empty where nothing is
+# plausibility (5.1): a shape on its own and beside others of its collection
+sketch_position | point xyz | 1 | some vertices of the shape, centred, of unit root mean square
+    radius
+sketch_area | point | 1 | their shares of the area
+sketch_normal | point xyz | 1 | their normals
+sketch_asymmetry | point | 1 | how far the shape's mirror image lies above the vertex
+moment | axis | 1 | share of the second moment along each principal axis
+fit | reference | 1 | residual of ICP onto the reference, both of unit root mean square radius
+fit_mirrored | reference | 1 | the same of the shape's mirror image
+hand | reference | 1 | positive where the shape is of the reference's hand, negative where its
+    mirror image is
+handedness | shape | 1 | mean of hand beside the references: positive as most shapes, negative as
+    their mirror images
+reflected | shape | 1 | whether the mirror image of the shape was taken (reflect=)
+# the report
+status | shape | 1 | ok, repaired, doubtful or excluded
+reason | shape | 1 | what was found and done
+warning | shape | 1 | what looks wrong and was left as it is
+doubtful_kinds | shape | 1 | what makes the shape doubtful, a word for each
+warning_kinds | shape | 1 | what else was warned of, a word for each
+path | shape | 1 | file of the shape
+area | shape | L2 | area of the surface
+self_intersections | shape | 1 | triangles that pass through others, -1 where not counted
+file_vertices | shape | 1 | vertices in the file
+file_triangles | shape | 1 | triangles in the file
+nonfinite_vertices | shape | 1 | vertices that are not finite
+welded_vertices | shape | 1 | vertices welded to another
+degenerate_triangles | shape | 1 | triangles that repeat a corner
+duplicate_triangles | shape | 1 | triangles dropped because others have the same corners
+flipped_edges | shape | 1 | long edges of zero-area triangles flipped
+flat_triangles | shape | 1 | zero-area triangles dropped
+nonmanifold_edges | shape | 1 | edges with more than two triangles
+cut_edges | shape | 1 | sides of edges that were cut open
+split_vertices | shape | 1 | vertices added where a vertex was not manifold
+inserted_vertices | shape | 1 | vertices inserted on edges where two sheets share both ends
+reoriented_triangles | shape | 1 | triangles reoriented
+unreferenced_vertices | shape | 1 | vertices without triangles
+closed_holes | shape | 1 | holes closed
+components | shape | 1 | connected components found
+dropped_components | shape | 1 | connected components dropped
+area_dropped | shape | 1 | share of the area in the dropped components
+holes | shape | 1 | boundary loops
+genus | shape | 1 | genus, summed over the components
+seconds | stage | s | wall time of the stage
+peak_memory | stage | MiB | peak resident memory of this process and its workers in the stage
+""")
 
 
 class Table(dict[str, tuple[tuple[str, ...], str, str]]):
@@ -362,24 +327,17 @@ class Table(dict[str, tuple[tuple[str, ...], str, str]]):
 TABLE = Table(ROWS)
 
 # variables of indices: the dim that they point into; -1 points nowhere
-POINTS_INTO = {
-    "corner_vertex": "vertex",
-    "edge_vertex": "vertex",
-    "file_vertex": "file_vertex_index",
-    "vertex_of_file": "vertex",
-    "sample_vertex": "original_vertex",
-    "coarse_vertex": "vertex",
-    "guide_vertex": "vertex",
-    "sample_cell": "vertex",
-    "local_vertex": "original_vertex",
-    "local_sample": "vertex",
-    "registered_match": "original_vertex",
-    "template_triangle": "triangle",
-    "way_match": "source_vertex",
-    "way_reverse": "vertex",
-    "true_match": "source_vertex",
+_OF_DIM = {
+    "vertex": "corner_vertex edge_vertex vertex_of_file coarse_vertex guide_vertex "
+    "sample_cell local_sample way_reverse",
+    "file_vertex_index": "file_vertex",
+    "original_vertex": "sample_vertex local_vertex registered_match",
+    "triangle": "template_triangle",
+    "source_vertex": "way_match true_match",
 }
+POINTS_INTO = {name: dim for dim, names in _OF_DIM.items() for name in names.split()}
 NOWHERE = {"vertex_of_file", "sample_vertex", "true_match"}
+
 
 # what a file of a study holds at least: variables; attributes that are texts, and numbers
 SEEN = "surface compactness chirality open_boundary lattice self_intersections intersecting"

@@ -9,6 +9,10 @@ TESTS = Path(__file__).resolve().parent
 ROOT = TESTS.parent
 DOCS = ROOT / "docs"
 NOTEBOOKS = ROOT / "notebooks"
+LESSONS = sorted(
+    [*NOTEBOOKS.glob("*.ipynb"), *(ROOT / "morphometrics" / "notebooks").glob("*.ipynb")],
+    key=lambda path: path.name,
+)
 DATA = ROOT.parent / "shared" / "data"  # real meshes, beside the repository; tests skip without
 BENCHMARKS = ROOT / "benchmarks"
 

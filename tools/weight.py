@@ -32,8 +32,8 @@ SILENT = {getattr(tokenize, name) for name in "COMMENT NL NEWLINE INDENT DEDENT 
 OPTIONS = """import inspect
 try:
     from s4a.options import Options
-except ImportError:  # before it moved
-    from s4a.options import Options
+except ImportError:  # of revisions before
+    from s4a.study.options import Options
 print(len(inspect.signature(Options).parameters))"""
 NAMES = """import s4a, pathlib
 folder = pathlib.Path(s4a.__file__).parent

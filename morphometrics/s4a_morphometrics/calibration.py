@@ -20,6 +20,7 @@ and the last term is negative where p holds -e.  The direct way stands for the t
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import joblib
 import numpy as np
 import xarray as xr
 
@@ -32,8 +33,6 @@ from s4a.method.pca import gram
 from s4a.method.register import from_latent
 from s4a.method.shape import Shape
 from s4a.options import Options, kept_options
-from s4a.study.sources import content_key
-from s4a.study.store import task_key
 from s4a_morphometrics import posterior
 from s4a_morphometrics.part import Pose, cut, fit_modes, part_of
 from s4a_morphometrics.partial import LEAST_SHARE, Model, match, tell, whole_of
@@ -252,7 +251,8 @@ def _key_of(model, pairs):
         registration_of(study)[placed].sel(shape=names),
         *(study[node][n].to_dataset() for node in ("original", "coarse") for n in names),
     ]
-    return task_key(pairs, kept_options(study), *map(content_key, contents))
+    arrays = [{str(name): values.values for name, values in one.items()} for one in contents]
+    return joblib.hash([pairs, kept_options(study), arrays])
 
 
 def _gap(model, registration, name, onto):

@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 
 from s4a.analysis.inputs import registration_of
-from s4a.analysis.link import image_in_shape
+from s4a.analysis.transfer import image_in_shape
 from s4a.geometry.closest import closest_facing_point, interpolate
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas, vertex_normals
 from s4a.input.hands import MIRROR, mirror_image

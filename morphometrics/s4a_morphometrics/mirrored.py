@@ -23,7 +23,7 @@ from s4a.input.plausibility import examine
 from s4a.input.subjects import listed
 from s4a.options import Options
 from s4a.schema import dataset
-from s4a.study.insert import clean_new, hands_beside, portraits_of
+from s4a.study.insert import hands_beside, portraits_of, read_new
 
 Looks = Mapping[str, Mapping[str, xr.Dataset]]  # structure -> subject -> comparison
 
@@ -58,7 +58,7 @@ def find_mirrored_new(
     """
     beside = {}
     for name, (study, shapes) in given.items():
-        meshes, _ = clean_new(shapes, Options.from_report(study))
+        meshes, _ = read_new(shapes, Options.from_report(study))
         beside[name] = hands_beside(meshes, portraits_of(study))
     subjects = sorted({subject for _, looks in beside.values() for subject in looks})
     chosen, told = [], []

@@ -26,9 +26,9 @@ import numpy as np
 import xarray as xr
 from scipy.spatial.transform import Rotation
 
-from s4a.analysis.effects import check_permutations
 from s4a.analysis.inputs import registration_of
-from s4a.analysis.link import image_in_shape
+from s4a.analysis.permutation import check_permutations
+from s4a.analysis.transfer import image_in_shape
 from s4a.geometry.align import rigid_transform
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.input.subjects import listed

@@ -15,8 +15,7 @@ import xarray as xr
 
 from s4a.analysis.export import is_reflected, write_dataset, write_table
 from s4a.analysis.inputs import registration_of
-from s4a.analysis.link import image_in_shape
-from s4a.analysis.transfer import transfer_labels, transfer_landmarks
+from s4a.analysis.transfer import image_in_shape, transfer_labels, transfer_landmarks
 from s4a.analysis.volumes import write_label_volumes
 from s4a.geometry.align import farthest_points
 from s4a.geometry.mesh import as_arrays, vertex_normals

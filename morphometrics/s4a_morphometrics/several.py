@@ -151,8 +151,8 @@ def analyse_structures(
 def folder_of(store: Path | str | None) -> Iterator[Path]:
     """The folder of a study of several structures; a temporary one where it is in memory."""
     if store is None:
-        with TemporaryDirectory() as folder:
-            yield Path(folder)
+        with TemporaryDirectory() as temporary:
+            yield Path(temporary)
         return
     folder = Path(store)
     if any(folder.glob("[!.]*")) and not (folder / NOTES).is_file():

@@ -35,17 +35,18 @@ def insert(args: Namespace) -> int:
     """New subjects in the studies of several structures, which stay as they are."""
     from s4a.analysis.export import write_registered
     from s4a.cli.tables import inserted_table
+    from s4a.study.tree import write_inserted
     from s4a_morphometrics.several import insert_structures, open_structures
 
     study = open_structures(args.study)
     options = {name: getattr(args, name) for name in ("landmarks", "reflect", "table", "n_jobs")}
     inserted = insert_structures(study, args.shapes, **options)
     out = new_folder(args.out)
-    inserted.to_netcdf(out / "inserted.nc", engine="h5netcdf")
+    path = write_inserted(inserted, out)
     for name, part in inserted["structures"].children.items():
         write_registered(part, out / "structures" / name)
         write(f"structures/{name}\n{inserted_table(part)}")
-    write(f"\nwritten: {out / 'inserted.nc'}, registered meshes and scores in {out}")
+    write(f"\nwritten: {path}, registered meshes and scores in {out}")
     return 1 if (inserted["report"]["structure_status"] == "excluded").any() else 0
 
 

@@ -92,8 +92,11 @@ class Structures(Panel):
     def view_of(self, level: str, n_modes: int) -> ModesView:
         """The sliders of a level."""
         study = structures_modes(self.study, self.found, level)
+        mean, triangles, deformation = mode_arrays(study, None, n_modes)
         return ModesView(
-            *mode_arrays(study, None, n_modes),
+            mean,
+            triangles,
+            deformation,
             limits=mode_limits(study),
             unit=unit_of(self.found["position"]),
             **score_state(study, n_modes),

@@ -12,7 +12,6 @@ from s4a_morphometrics.calibration import (
     between_ways,
     deviation_of,
     gaps_between_ways,
-    share_to_add,
 )
 from s4a_morphometrics.completion import warnings_of
 from s4a_morphometrics.part import cut
@@ -155,16 +154,6 @@ def test_what_a_match_has_wrong_on_its_own_is_seen_by_going_round_it(study):
     assert between_ways(gaps_between_ways(model_of(alike))) < 0.4 * turned
 
 
-def test_ways_are_found_once_for_the_content_of_a_study(study, monkeypatch):
-    found = gaps_between_ways(model_of(study))
-    monkeypatch.setattr(calibration, "from_latent", None)  # no shape can be registered
-    again = gaps_between_ways(model_of(study.copy(deep=True)))
-    assert all(again[name] is gap for name, gap in found.items())
-    wrong, _ = slid(study, list(found)[:1])
-    with pytest.raises(TypeError, match="not callable"):
-        gaps_between_ways(model_of(wrong))
-
-
 def test_a_shape_that_stands_apart_from_the_network_is_registered_onto_no_other(study):
     latent = study["latent"].to_dataset()
     name = next(iter(gaps_between_ways(model_of(study))))
@@ -189,21 +178,6 @@ def test_with_fewer_than_two_shapes_beside_the_template_nothing_is_registered_an
     said = warnings_of(found.assign_attrs(between_ways=0.0))
     assert any("too narrow" in line for line in said)
     assert not any("too narrow" in line for line in warnings_of(found))
-
-
-def test_errors_that_the_told_shapes_hold_already_are_not_added_twice():
-    rng = np.random.default_rng(3)
-    n = 20_000
-    told = []
-    for held in (0.0, 0.25, 0.5, 0.75, 1.0):
-        wrong = rng.normal(size=(n, 3))  # of the match
-        told.append((2 * rng.normal(size=(n, 3)) - held * wrong, wrong))
-    # of the truth, p + g: the median of the shapes holds half of what its match has wrong
-    p, g = told[2]
-    added = (p + g).var() - p.var()
-    assert share_to_add(told) == pytest.approx(added, abs=0.05)
-    assert share_to_add(told) == pytest.approx(0.0, abs=0.05)
-    assert share_to_add(told[:1]) == pytest.approx(1.0, abs=0.05)
 
 
 def test_the_missing_area_is_found_and_the_rest_lies_as_well_as_of_the_whole(

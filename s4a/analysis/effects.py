@@ -512,7 +512,7 @@ def _test_vertices(sample, model, of):
     else:
         effect = {"effect": slope, "intercept": intercept}
     effect = {name: sample.whole(values.T).T for name, values in effect.items()}
-    result = dataset(**vertex_results(found, sample), **effect)
+    result = dataset(None, **vertex_results(found, sample), **effect)
     return in_unit(result, sample.unit, of=FIELD_UNIT if k == 1 else INPUT)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from s4a.analysis.inputs import registration_of
-from s4a.analysis.link import image_in_shape
+from s4a.analysis.transfer import image_in_shape
 from s4a.geometry.mesh import as_arrays
 from s4a.input.files import write_mesh
 from s4a.input.hands import MIRROR
@@ -25,8 +25,8 @@ def write_table(path: Path, head: Iterable[Any], rows: Iterable[Any]) -> Path:
     return path
 
 
-def write_dataset(data: xr.Dataset, path: Path) -> Path:
-    """Write a Dataset as a netCDF file, at once and with checksums; gives its path."""
+def write_dataset(data: xr.Dataset | xr.DataTree, path: Path) -> Path:
+    """Write a Dataset or tree as a netCDF file, at once and with checksums; gives its path."""
     store.write(data, path)
     return path
 

@@ -1,8 +1,9 @@
 """Scalar fields of the shapes (6.1, 6.2), such as thickness: carried to the template, and kept.
 
 Every vertex of the template takes the value at the place of the shape that it was registered to,
-linear inside triangles (:mod:`s4a.analysis.link`), so that the fields of all shapes can be compared
-vertex by vertex.  Tests take a field by its name: ``field=`` of :mod:`s4a.analysis.effects`.
+linear inside triangles (:mod:`s4a.analysis.transfer`), so that the fields of all shapes can be
+compared vertex by vertex.  Tests take a field by its name: ``field=`` of
+:mod:`s4a.analysis.effects`.
 """
 
 import logging

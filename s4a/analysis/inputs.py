@@ -280,12 +280,7 @@ def values_of(study: xr.DataTree, values: Values, what: str) -> np.ndarray:
     names = registration_of(study)["shape"].values.tolist()
     if isinstance(values, str):
         what = f"{what} {values!r}"
-        values = _column(study, values, names, what)
-    if isinstance(values, dict):
-        missing = [name for name in names if name not in values]
-        if missing:
-            raise ValueError(f"{what} needs a value for every shape; it lacks {listed(missing)}")
-        values = [values[name] for name in names]
+        values = _column(study, values, what)
     values = np.asarray(_in_order(values, names, what))
     everyone = all_registered(study)["shape"].values.tolist()
     if values.ndim and len(values) == len(everyone):  # those that are left out may have one too
@@ -298,27 +293,30 @@ def values_of(study: xr.DataTree, values: Values, what: str) -> np.ndarray:
 
 
 def _in_order(values, names, what):
-    """Values in the order of the shapes, where an index of pandas or xarray has their names.
+    """Values in the order of the shapes, where keys or an index have their names.
 
     A pandas index of numbers is none of names, unless all shapes are called by numbers.
     """
-    if isinstance(values, xr.DataArray) and "shape" in values.indexes:
-        values = values.transpose("shape", ...)
+    rows = values
+    if isinstance(values, dict):
+        labels, rows = list(values), list(values.values())
+    elif isinstance(values, xr.DataArray) and "shape" in values.indexes:
+        rows = values.transpose("shape", ...).values
         labels = values["shape"].values.tolist()
     elif hasattr(values, "iloc"):
-        labels = values.index.tolist()
+        labels, rows = values.index.tolist(), np.asarray(values)
+        if not {*names} <= {*map(str, labels)} and not any(isinstance(x, str) for x in labels):
+            return values
     else:
         return values
     words = list(map(str, labels))
-    if not set(names) <= set(words) and not any(isinstance(label, str) for label in labels):
-        return values
     missing = [name for name in names if name not in words]
     if missing:
         raise ValueError(f"{what} needs a value for every shape; it lacks {listed(missing)}")
     twice = [name for name in names if words.count(name) > 1]
     if twice:
         raise ValueError(f"{what} needs one value for every shape; it has more of {listed(twice)}")
-    return np.asarray(values)[[words.index(name) for name in names]]
+    return [rows[words.index(name)] for name in names]
 
 
 def _plain(values, names, what):
@@ -363,8 +361,8 @@ def _kind(values):
     )
 
 
-def _column(study, name, shapes, what):
-    """A column of ``/subjects``, in the order of the shapes."""
+def _column(study, name, what):
+    """A column of ``/subjects``, by the shapes."""
     table = study["subjects"].to_dataset() if "subjects" in study.children else xr.Dataset()
     if name not in table:
         raise ValueError(
@@ -372,12 +370,7 @@ def _column(study, name, shapes, what):
             f"{', '.join(map(str, table.data_vars)) or 'none'}; "
             "give a table, or the values themselves"
         )
-    missing = [shape for shape in shapes if shape not in table["shape"].values]
-    if missing:
-        raise ValueError(
-            f"{what} needs a row in /subjects for every shape; it lacks {listed(missing)}"
-        )
-    return table[name].sel(shape=shapes).values
+    return dict(zip(table["shape"].values.tolist(), table[name].values.tolist(), strict=True))
 
 
 def is_unknown(values: np.ndarray) -> np.ndarray:

@@ -203,10 +203,7 @@ def without(study: xr.DataTree, nuisance: Values | dict[str, Values] | list[str]
     basis = np.einsum("rk,rnx->knx", V[:, keep] / np.sqrt(root[keep]), B)
     along = np.einsum("snx,knx,n->sk", around, basis, area, optimize=True)
     left = mean + around - np.einsum("sk,knx->snx", along, basis)
-    part = registration.drop_vars(
-        [str(name) for name in registration if str(name).startswith("displacement_")]
-    )
-    part["displacement"] = registration["displacement"].copy(data=left.astype(d.dtype))
+    part = _displaced(registration, left.astype(d.dtype))
     return _study(study, part)
 
 
@@ -251,15 +248,20 @@ def with_size(study: xr.DataTree) -> xr.DataTree:
     center = area @ X / area.sum()
     d = registration["displacement"].values
     sized = (X + d - center) / s[:, None, None] + center - X
-    part = registration.drop_vars(
-        [str(name) for name in registration if str(name).startswith("displacement_")]
-    )
-    part["displacement"] = registration["displacement"].copy(data=sized.astype(d.dtype))
+    part = _displaced(registration, sized.astype(d.dtype))
     part["scale"] = registration["scale"].copy(data=np.ones_like(s))
     if "translation" in registration:  # of the motion x -> R x + t' that leaves sizes as they are
         t = registration["translation"]
         part["translation"] = t.copy(data=(t.values - center) / s[:, None] + center)
     return _study(study, part)
+
+
+def _displaced(registration, d):
+    """A registration with other displacements, and without what else is said of those it had."""
+    others = [str(name) for name in registration if str(name).startswith("displacement_")]
+    return registration.drop_vars(others).assign(
+        displacement=registration["displacement"].copy(data=d)
+    )
 
 
 def _study(study, registration, vertices=slice(None)):

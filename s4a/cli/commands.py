@@ -27,11 +27,8 @@ from s4a.options import DECLARED, N_COARSE, Options
 if TYPE_CHECKING:
     import numpy as np
     import xarray as xr
-
-    from s4a.input import annotations
 else:
     np = lazy_loader.load("numpy")
-    annotations = lazy_loader.load("s4a.input.annotations", suppress_warning=True)
 
 
 def check(paths: list[str], **options: Any) -> int:
@@ -78,7 +75,7 @@ def run(
     """
     full = within(out, "report.txt")
     with on_cluster(cluster), lines_or_bars():
-        study = s4a.analyse(paths, store=out, **options)
+        study = s4a.analyse([*paths], store=out, **options)
     again = shlex.join(["s4a", *(word for word in words if word != "--keep-doubtful")])
     report = study["report"].to_dataset()
     lines = [tables.report_table(report), *tables.cost_lines(report)]
@@ -123,7 +120,6 @@ def on_cluster(address: str | None) -> Iterator[None]:
 
     with contextlib.ExitStack() as stack:
         if known[1]:
-            stack.enter_context(s4a.study.processes.spawned_end_too())
             n = int(known[1])
             local = LocalCluster(n_workers=n, threads_per_worker=1, dashboard_address=None)
             address = stack.enter_context(local).scheduler_address
@@ -386,8 +382,8 @@ def template_labels(study: "xr.DataTree", file: str | None) -> "np.ndarray | Non
 
 def labels_in(file: str, mesh: "xr.Dataset") -> "np.ndarray":
     """Labels of a mesh, from a file with one for each vertex of its file."""
-    label = annotations.read_labels(file, mesh.sizes["file_vertex_index"])
-    return annotations.labels_of_mesh(label, mesh)
+    label = s4a.input.annotations.read_labels(file, mesh.sizes["file_vertex_index"])
+    return s4a.input.annotations.labels_of_mesh(label, mesh)
 
 
 def tests_of(
@@ -471,10 +467,10 @@ def insert(
     tree = s4a.open_study(study)
     inserted = s4a.insert(tree, shapes, landmarks=landmarks, reflect=reflect, n_jobs=n_jobs)
     folder = new_folder(out)
-    s4a.study.store.write(inserted, folder / "inserted.nc")
+    path = s4a.study.tree.write_inserted(inserted, folder)
     s4a.write_registered(inserted, folder)
     write(tables.inserted_table(inserted), "")
-    write(f"written: {folder / 'inserted.nc'}, registered meshes and scores in {folder}")
+    write(f"written: {path}, registered meshes and scores in {folder}")
     return 1 if (inserted["report"]["status"] == "excluded").any() else 0
 
 
@@ -520,7 +516,7 @@ def transfer(
     if labels:
         label = labels_in(labels, mesh)
     if landmarks:
-        points = annotations.read_landmarks(landmarks)
+        points = s4a.input.annotations.read_landmarks(landmarks)
         distance = s4a.input.landmarks.locate(points, mesh)["landmark_distance"].values
         far = f"at most {distance.max():.3g} from the surface of {source}"
         write(f"{len(distance)} landmarks, {far}")
@@ -578,7 +574,7 @@ def transferred_rows(
             place = landmarks["landmark_position"]
             X = s4a.input.hands.in_file(mesh, place.values)
             landmarks["landmark_position"] = place.copy(data=X)
-            annotations.write_landmarks(out / f"{stem}.landmarks.csv", landmarks)
+            s4a.input.annotations.write_landmarks(out / f"{stem}.landmarks.csv", landmarks)
             of_points = tables.landmark_cells(landmarks)
         rows.append([stem, *cells, *of_labels, *of_points])
     return rows
@@ -588,7 +584,7 @@ def write_labels(labels: "xr.Dataset", mesh: "xr.Dataset", out: Path, stem: str)
     """Write labels and their confidence as NPY, a row for each vertex of the file; the cells."""
     points = file_points(mesh)
     for name in ("label", "confidence"):
-        values, dropped = annotations.labels_of_file(labels[name].values, mesh, points)
+        values, dropped = s4a.input.annotations.labels_of_file(labels[name].values, mesh, points)
         np.save(out / f"{stem}.{'labels' if name == 'label' else name}.npy", values)
     means = [f"{labels[name].mean().item():.2f}" for name in ("confidence", "label_share")]
     return [*means, str(dropped)]
@@ -639,17 +635,16 @@ def compare(
         for compare.nc and compare.png
     """
     options["n_coarse"] = options["n_coarse"] or N_COARSE
-    result: xr.Dataset | xr.DataTree
     if collection:
         if paths or truth or landmarks or keep:
             raise ValueError(
                 "--collection takes the shapes alone: no SOURCE, TARGET, --truth, --landmarks or "
                 "--keep"
             )
-        result = found = compare_collection(collection, methods, n_pairs, options)
+        found = compare_collection(collection, methods, n_pairs, options)
         names = [f"{way}, {how}" for way in found["way"].values for how in found["how"].values]
         seconds = found["collection_seconds"].values.reshape(len(names), -1)
-        text = tables.collection_table(found)
+        text, result = tables.collection_table(found), found
     else:
         result = compare_pairs(paths or [], truth, landmarks, options | {"methods": methods}, keep)
         found = result["metrics"].to_dataset() if keep else result
@@ -720,7 +715,8 @@ def landmark_pairs(
             f"{1 + len(targets)}; found {len(files)}"
         )
     source, *others = (
-        annotations.read_landmarks(file).set_index(landmark="landmark_name") for file in files
+        s4a.input.annotations.read_landmarks(file).set_index(landmark="landmark_name")
+        for file in files
     )
     pairs = {}
     for name, file, target in zip(targets, files[1:], others, strict=True):
@@ -758,7 +754,9 @@ def new_folder(path: str) -> Path:
 
 def write(*texts: str) -> None:
     """Texts to the output, and new lines; of what a file says, nothing moves the cursor."""
-    lines = [s4a.input.raw.shown(line) for text in texts for line in text.split("\n")]
+    from s4a.input.raw import shown  # not by s4a, which the doctor may find broken
+
+    lines = [shown(line) for text in texts for line in text.split("\n")]
     sys.stdout.write("\n".join(lines) + "\n")
 
 

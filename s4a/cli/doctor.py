@@ -60,6 +60,11 @@ class Finding:
     do: str = ""
 
 
+def noted(what: str, is_fine: object, fine: str, otherwise: str, do: str) -> Finding:
+    """That a thing is fine, or a note on it."""
+    return Finding(what, "ok", fine) if is_fine else Finding(what, "note", otherwise, do)
+
+
 def examine(folder: Path | str = ".") -> list[Finding]:
     """All findings on this machine, for studies in a folder.
 
@@ -81,17 +86,14 @@ def examine(folder: Path | str = ".") -> list[Finding]:
 
 def dependencies() -> Iterator[Finding]:
     """Packages that S4A needs and that are missing or older than its floor; one finding if none."""
-    wrong, right = [], 0
+    wrong = []
     for name, floor in needed():
-        try:
-            here = version(name)
-        except PackageNotFoundError:
+        here = version_of(name)
+        if not here:
             wrong.append(Finding(name, "lacks", "not installed", f"pip install '{name}>={floor}'"))
-            continue
-        if numbers(here) < numbers(floor):
+        elif numbers(here) < numbers(floor):
             told = f"{here}, and {floor} or newer is needed"
             wrong.append(Finding(name, "lacks", told, f"pip install --upgrade '{name}>={floor}'"))
-        right += 1
     modules = [MODULES.get(name, name.replace("-", "_")) for name, _ in needed()]
     result = run(IMPORTS, *modules)
     for line in result.stdout.splitlines():
@@ -100,11 +102,11 @@ def dependencies() -> Iterator[Finding]:
             doing = f"pip install --force-reinstall {NAMES.get(name, name)}"
             wrong.append(Finding(name, "lacks", f"does not import: {error}", doing))
     if result.returncode:
-        last = result.stderr.strip().splitlines()[-1:] or [f"exit code {result.returncode}"]
-        wrong.append(Finding("packages", "lacks", f"end the process: {last[0]}", "a new venv"))
-    yield from wrong
-    if not wrong:
-        yield Finding("packages", "ok", f"S4A {version('s4a')} and the {right} that it needs")
+        wrong.append(
+            Finding("packages", "lacks", f"end the process: {end_of(result)}", "a new venv")
+        )
+    told = f"S4A {version('s4a')} and the {len(modules)} that it needs"
+    yield from wrong or [Finding("packages", "ok", told)]
 
 
 def needed(extra: str = "") -> list[tuple[str, str]]:
@@ -130,30 +132,42 @@ def numbers(text: str) -> tuple[int, ...]:
     return tuple(map(int, re.findall(r"^\d+(?:\.\d+)*", text)[0].split(".")))
 
 
+def version_of(name: str) -> str:
+    """The version of a distribution, or nothing where it is not there."""
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return ""
+
+
 def run(script: str, *words: str) -> subprocess.CompletedProcess[str]:
     """A script in a process of its own, which a broken library may end."""
     command = [sys.executable, "-c", script, *words]
     return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
 
 
+def end_of(result: subprocess.CompletedProcess[str]) -> str:
+    """The last that a process said, or how it ended."""
+    lines = [*result.stdout.splitlines(), *result.stderr.strip().splitlines()]
+    return lines[-1] if lines else f"ends its process with {result.returncode}"
+
+
 def wrapping() -> Finding:
     """Whether PyMeshLab, which only ``wrap=True`` needs, imports and has its filters."""
     result = run(TRIAL)
-    if not result.returncode and result.stdout.strip() == "ok":
-        return Finding("for --wrap", "ok", f"PyMeshLab {version('pymeshlab')}, with its filters")
-    last = [*result.stdout.splitlines(), *result.stderr.strip().splitlines()][-1:]
-    told = last[0] if last else f"ends its process with {result.returncode}"
-    return Finding("for --wrap", "note", f"PyMeshLab: {told}", GL)
+    is_fine = not result.returncode and result.stdout.strip() == "ok"
+    fine = f"PyMeshLab {version_of('pymeshlab')}, with its filters"
+    return noted("for --wrap", is_fine, fine, f"PyMeshLab: {end_of(result)}", GL)
 
 
 def writable(what: str, folder: Path, instead: str) -> Finding:
     """Whether a file can be made, locked and renamed in a folder, as every run does."""
-    from s4a.study.processes import hold
-
     try:
         with tempfile.TemporaryDirectory(prefix=".s4a-", dir=folder) as name:
             there = Path(name) / "a"
-            with open(there, "w") as file:
+            with open(there, "w") as file, contextlib.suppress(ImportError):
+                from s4a.study.processes import hold
+
                 hold(file.fileno())
             there.rename(Path(name) / "b")
     except OSError as error:
@@ -165,11 +179,10 @@ def cache() -> Finding:
     """Whether matplotlib can keep its list of fonts."""
     import matplotlib
 
-    folder = Path(matplotlib.get_cachedir())
-    if os.access(folder, os.W_OK):
-        return Finding("cache of fonts", "ok", str(folder))
+    folder = matplotlib.get_cachedir()
     told = f"{folder} cannot be written: every command that draws looks for all fonts again"
-    return Finding("cache of fonts", "note", told, "export MPLCONFIGDIR=FOLDER")
+    do = "export MPLCONFIGDIR=FOLDER"
+    return noted("cache of fonts", os.access(folder, os.W_OK), folder, told, do)
 
 
 def memory() -> Finding:
@@ -179,19 +192,17 @@ def memory() -> Finding:
     if not psutil:
         return Finding("memory", "note", "how much is free cannot be seen", "pip install psutil")
     free = psutil.virtual_memory().available / GIB
-    if free >= LEAST_MEMORY:
-        return Finding("memory", "ok", f"{free:.1f} GiB free")
-    told = f"{free:.1f} GiB free; {LEAST_MEMORY:.0f} is little for large meshes"
-    return Finding("memory", "note", told, "--n-jobs 1, or close other programs")
+    told = f"{free:.1f} GiB free"
+    few = f"{told}; {LEAST_MEMORY:.0f} is little for large meshes"
+    return noted("memory", free >= LEAST_MEMORY, told, few, "--n-jobs 1, or close other programs")
 
 
 def disk(folder: Path) -> Finding:
     """Room where the study would lie."""
     there = next(p for p in (folder.resolve(), *folder.resolve().parents) if p.exists())
     free = shutil.disk_usage(there).free / GIB
-    if free >= LEAST_DISK:
-        return Finding("disk", "ok", f"{free:.1f} GiB free")
-    return Finding("disk", "note", f"{free:.1f} GiB free in {there}", "--out in another place")
+    told = f"{free:.1f} GiB free"
+    return noted("disk", free >= LEAST_DISK, told, f"{told} in {there}", "--out in another place")
 
 
 def cores() -> Finding:
@@ -209,46 +220,33 @@ def threads() -> Finding:
 
     np.linalg.inv(np.eye(2))
     scipy.linalg.inv(np.eye(2))
-    pools = threadpool_info()
     told = ", ".join(
-        f"{pool['internal_api']} {pool['version'] or ''} of {pool['num_threads']}".replace(
-            "  ", " "
-        )
-        for pool in pools
+        " ".join(f"{pool['internal_api']} {pool['version'] or ''} of {pool['num_threads']}".split())
+        for pool in threadpool_info()
     )
     return Finding("threads", "ok", f"{told}; workers of a run take one each")
 
 
 def browser() -> Finding:
     """Whether a browser is there to look at pages; the pages themselves are made without."""
-    here = next((name for name in BROWSERS if shutil.which(name)), None)
-    if here or sys.platform in ("darwin", "win32"):
-        return Finding("browser", "ok", here or "that of the system")
+    here = next((name for name in BROWSERS if shutil.which(name)), "")
+    if not here and sys.platform in ("darwin", "win32"):
+        here = "that of the system"
     told = "none found: pages of s4a view are written all the same"
-    return Finding("browser", "note", told, "open them on another machine")
+    return noted("browser", here, here, told, "open them on another machine")
 
 
 def extras() -> Iterator[Finding]:
     """The extras for notebooks, the course, clusters and closed surfaces around broken ones."""
     uses = {"notebook": "panels", "course": "lessons", "cluster": "--cluster", "wrap": "--wrap"}
     for extra, what in uses.items():
-        missing = [name for name, _ in needed(extra) if not installed(name)]
-        if missing:
-            told = f"without {', '.join(missing)}"
-            yield Finding(f"for {what}", "note", told, f"pip install 's4a[{extra}]'")
-        elif extra == "wrap":
+        missing = [name for name, _ in needed(extra) if not version_of(name)]
+        if extra == "wrap" and not missing:
             yield wrapping()
         else:
-            yield Finding(f"for {what}", "ok", f"s4a[{extra}] is there")
-
-
-def installed(name: str) -> bool:
-    """Whether a distribution is there."""
-    try:
-        version(name)
-    except PackageNotFoundError:
-        return False
-    return True
+            do = f"pip install 's4a[{extra}]'"
+            told = f"without {', '.join(missing)}"
+            yield noted(f"for {what}", not missing, f"s4a[{extra}] is there", told, do)
 
 
 def lines(findings: list[Finding]) -> list[str]:

@@ -95,6 +95,7 @@ def add_parameter(
 ) -> None:
     """The flag, or the argument, of one parameter of a function."""
     is_set = one.default is not one.empty
+    told: dict[str, Any]
     told, many = kind_of(one.annotation)
     if is_set and one.default and text and "default" not in text:
         text = f"{text.removesuffix('.')} (default: {one.default})"
@@ -104,7 +105,7 @@ def add_parameter(
     elif "choices" not in told:
         told["metavar"] = metavar
     if one.kind is one.KEYWORD_ONLY:
-        more = {"nargs": "+"} if many else {}
+        more: dict[str, Any] = {"nargs": "+"} if many else {}
         more |= {"default": one.default} if is_set else {"required": True}
         add(f"--{one.name.replace('_', '-')}", **told, **more)
     else:

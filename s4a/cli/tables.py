@@ -3,6 +3,7 @@
 Every function gives a text, or the cells of a row; nothing is printed or written here.
 """
 
+import itertools
 import shlex
 import textwrap
 import time
@@ -17,12 +18,10 @@ if TYPE_CHECKING:
     import numpy as np
     import xarray as xr
 
-    from s4a.input import plausibility
-    from s4a.study import progress
-else:  # imported when they are first used, so that a command starts at once
-    np = lazy_loader.load("numpy")
-    plausibility = lazy_loader.load("s4a.input.plausibility", suppress_warning=True)
-    progress = lazy_loader.load("s4a.study.progress", suppress_warning=True)
+    from s4a.input.plausibility import Decision
+    from s4a.study.progress import Stage, Status
+else:
+    np = lazy_loader.load("numpy")  # so that a command starts at once
 
 COUNTS = {
     "file_vertices": "vertices",
@@ -55,10 +54,13 @@ TRANSFERRED = (
 )
 
 
-def table(rows: Iterable[Sequence[Any]], head: Sequence[str], width: int = 120) -> str:
+def table(
+    rows: Iterable[Sequence[Any]], head: Sequence[str], number: str = "g", width: int = 120
+) -> str:
     """Rows of text as aligned columns.
 
-    Numbers to the right, a long last column wrapped at `width` characters.
+    Numbers to the right, those with a fraction in the form `number`, or "-" where they are none; a
+    long last column wrapped at `width` characters.
 
     Examples
     --------
@@ -68,7 +70,10 @@ def table(rows: Iterable[Sequence[Any]], head: Sequence[str], width: int = 120) 
     a      1
     b     20
     """
-    rows = [[str(cell) for cell in row] for row in [head, *rows]]
+    rows = [
+        [(f"{x:{number}}" if x == x else "-") if isinstance(x, float) else str(x) for x in row]
+        for row in [head, *rows]
+    ]
     columns = list(zip(*rows, strict=True))
     widths = [max(map(len, column)) for column in columns]
     numeric = [all(map(is_number, column[1:])) for column in columns]
@@ -157,7 +162,7 @@ def verify_lines(found: "xr.Dataset") -> str:
     )
 
 
-def status_lines(status: "progress.Status", now: float) -> str:
+def status_lines(status: "Status", now: float) -> str:
     """How far a run is, at a time in seconds since 1970: a line for each stage."""
     since, told = (time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(t)) for t in status[3:5])
     heads = {
@@ -168,7 +173,11 @@ def status_lines(status: "progress.Status", now: float) -> str:
         "elsewhere": f"on {status.host}, of which this machine knows no more than the study says: "
         f"it last told at {told}",
     }
-    known = status.stages if status.state == "finished" else [*progress.STAGES, *status.stages]
+    known = (
+        status.stages
+        if status.state == "finished"
+        else [*s4a.study.progress.STAGES, *status.stages]
+    )
     goes_on = status.state in ("running", "elsewhere")
     rows = [
         [name, *stage_cells(status.stages.get(name), goes_on, now)] for name in dict.fromkeys(known)
@@ -180,7 +189,7 @@ def status_lines(status: "progress.Status", now: float) -> str:
     return "\n".join(with_rest(lines, 2 + LEAST))
 
 
-def stage_cells(stage: "progress.Stage | None", goes_on: bool, now: float) -> list[str]:
+def stage_cells(stage: "Stage | None", goes_on: bool, now: float) -> list[str]:
     """How far a stage is, and what it has taken."""
     if stage is None:
         return ["-"] * 5
@@ -220,7 +229,7 @@ def result_lines(study: "xr.DataTree") -> list[str]:
     registration = s4a.analysis.inputs.registration_of(study)
     latent = study["latent"].to_dataset()
     distance = latent["distance_to_median"].sortby(latent["distance_to_median"])[:3]
-    median, template, *nearest = plausibility.shortened(
+    median, template, *nearest = s4a.input.plausibility.shortened(
         [latent.attrs["median"], registration.attrs["template"], *distance["shape"].values], LONGEST
     )
     near = ", ".join(f"{n} {d:.4f}" for n, d in zip(nearest, distance.values, strict=True))
@@ -249,7 +258,7 @@ def cost_lines(report: "xr.Dataset", most: int | None = None) -> list[str]:
     parts = ", ".join(f"{stage} {spent[stage]:.1f}" for stage in shown)
     memory = report["peak_memory"].values.max()
     all_of_them = s4a.study.tree.seconds_of(report)
-    return wrapped(f"{all_of_them} ({parts}); at most {memory:.0f} MiB", SCREEN)
+    return wrapped(f"{all_of_them}, at most {memory:.0f} MiB ({parts})", SCREEN)
 
 
 def place_lines(study: str, report: str) -> list[str]:
@@ -267,7 +276,7 @@ def decision_lines(report: "xr.Dataset", again: str = "s4a run FOLDER --out STUD
     kept = s4a.options.kept_options(report).get("keep_doubtful")
     become = "taken in as they are" if kept else "kept apart: in no modes, no statistics, no median"
     lines = [f"TO DECIDE: {n} of {report.sizes['shape']} shapes are doubtful, and {become}"]
-    lines += kind_lines(plausibility.decisions(report))
+    lines += kind_lines(s4a.input.plausibility.decisions(report))
     if kept:
         return [*lines, *command_lines("to keep them apart:", again, "", "--keep-doubtful"), ""]
     return [
@@ -305,13 +314,13 @@ def command_lines(what: str, command: str, flag: str = "", without: str = "") ->
     return " \\\n".join(lines).replace("\0", " ").split("\n")
 
 
-def kind_lines(found: list["plausibility.Decision"]) -> list[str]:
+def kind_lines(found: "list[Decision]") -> list[str]:
     """A line for each kind: how many shapes, which ones as there is room, what to do."""
     lines = []
     for one in found:
         room = SCREEN - len(one.kind) - len(one.remedy) - 12
         letters = max(min(LONGEST, room - len(", 999 more")), 5)
-        names = plausibility.listed(one.names, room, letters)
+        names = s4a.input.plausibility.listed(one.names, room, letters)
         lines.append(f"{len(one.names):3} {one.kind}  {names}  -> {one.remedy}")
     return lines
 
@@ -319,7 +328,7 @@ def kind_lines(found: list["plausibility.Decision"]) -> list[str]:
 def excluded_lines(report: "xr.Dataset", most: int) -> list[str]:
     """The shapes that could not be used, each with its reason; at most so many of them."""
     out = report.sel(shape=report["status"].values == "excluded")
-    names = plausibility.shortened(out["shape"].values.tolist(), 20)
+    names = s4a.input.plausibility.shortened(out["shape"].values.tolist(), 20)
     if not names:
         return []
     width, lines = max(map(len, names)), []
@@ -367,7 +376,7 @@ def remark_lines(report: "xr.Dataset") -> list[str]:
     """What concerns the collection, shortened, and what else looks wrong with shapes, by kind."""
     remarks = report.attrs["remarks"].splitlines()
     lines = [f"  {without_middle(line, SCREEN - 2)}" for line in remarks]
-    lines = [*with_rest(lines, MOST_REMARKS), *kind_lines(plausibility.notices(report))]
+    lines = [*with_rest(lines, MOST_REMARKS), *kind_lines(s4a.input.plausibility.notices(report))]
     return ["to know:", *lines, ""] if lines else []
 
 
@@ -406,11 +415,8 @@ def planted_line(modes: "xr.Dataset", truth: "xr.Dataset") -> str:
 def error_table(errors: "xr.Dataset") -> str:
     """Mean errors of :func:`s4a.evaluation.accuracy.accuracy` over the shapes, a row per method."""
     mean = 100 * errors[["error", "geodesic_error"]].mean("shape")
-    rows = []
-    for method in mean["way"].values:
-        pair = [variable.item() for variable in mean.sel(way=method).data_vars.values()]
-        rows.append([method, *("-" if np.isnan(error) else f"{error:.3f}" for error in pair)])
-    return table(rows, ["mean error, % of sqrt(area)", "straight line", "along edges"])
+    rows = zip(*(mean[name].values for name in ("way", "error", "geodesic_error")), strict=True)
+    return table(rows, ["mean error, % of sqrt(area)", "straight line", "along edges"], ".3f")
 
 
 def evaluation_table(evaluation: "xr.Dataset", recomputed: "xr.Dataset | None") -> str:
@@ -522,24 +528,21 @@ def comparison_table(pairs: "xr.Dataset") -> str:
     return table(rows, ["method", "CPU s", *(title for title, *_ in columns.values())])
 
 
-def block_table(methods: Sequence[str], blocks: Sequence[str], seconds: np.ndarray) -> str:
+def block_table(methods: Sequence[str], blocks: Sequence[str], seconds: "np.ndarray") -> str:
     """CPU seconds (m, b) of every method by block (Fig. 3)."""
-    rows = [
-        [method, *(f"{s:.1f}" for s in of_blocks), f"{of_blocks.sum():.1f}"]
-        for method, of_blocks in zip(methods, seconds, strict=True)
-    ]
-    return table(rows, ["CPU s", *blocks, "all"])
+    rows = [[method, *row, row.sum()] for method, row in zip(methods, seconds, strict=True)]
+    return table(rows, ["CPU s", *blocks, "all"], ".1f")
 
 
 def collection_table(result: "xr.Dataset") -> str:
     """Table 2: mean Chamfer distance to the template, CPU seconds by block, the median shape."""
     rows = []
-    for way in result["way"].values:
-        for how in result["how"].values:
-            method = result.sel(way=way, how=how)
-            seconds = method["collection_seconds"].values
-            chamfer = 100 * method["collection_chamfer"].mean().item()
-            costs = [f"{s:.1f}" for s in (*seconds, seconds.sum())]
-            rows.append([way, how, f"{chamfer:.4f}", *costs, method["median_shape"].item()])
+    for way, how in itertools.product(result["way"].values, result["how"].values):
+        method = result.sel(way=way, how=how)
+        seconds = method["collection_seconds"].values
+        chamfer = 100 * method["collection_chamfer"].mean().item()
+        median = method["median_shape"].item()
+        rows.append([way, how, f"{chamfer:.4f}", *seconds, seconds.sum(), median])
     blocks = [f"{block}, s" for block in result["block"].values]
-    return table(rows, ["method", "way up", "Chamfer %", *blocks, "all, s", "median shape"])
+    head = ["method", "way up", "Chamfer %", *blocks, "all, s", "median shape"]
+    return table(rows, head, ".1f")

@@ -11,15 +11,10 @@ from hashlib import sha256
 from pathlib import Path
 from typing import NamedTuple
 
+from markupsafe import Markup
+
 SOURCE = Path(__file__).parent / "quizzes.md"
-STYLE = """
-.s4a-quiz { max-width: 46em; line-height: 1.45; }
-.s4a-quiz p { margin: 0.9em 0 0.3em; }
-.s4a-quiz details { margin: 0.25em 0; border: 1px solid #8888; border-radius: 4px; }
-.s4a-quiz summary { padding: 0.3em 0.6em; cursor: pointer; }
-.s4a-quiz details div { padding: 0.3em 0.9em 0.5em; border-left: 5px solid #d55e00; }
-.s4a-quiz details.right div { border-left-color: #009e73; }
-"""
+PAGE = SOURCE.with_name("quiz.html")
 
 
 class Answer(NamedTuple):
@@ -52,17 +47,12 @@ class Quiz:
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
-        parts = [f'<div class="s4a-quiz"><style>{STYLE}</style>']
-        for i, question in enumerate(self.questions, 1):
-            parts.append(f"<p><b>{i}.</b> {_marked(question.text)}</p>")
-            for answer in question.answers:
-                kind, word = ("right", "Right.") if answer.right else ("wrong", "Not this one.")
-                parts.append(
-                    f'<details class="{kind}" name="quiz-{self.lesson}-{i}">'
-                    f"<summary>{_marked(answer.text)}</summary>"
-                    f"<div><b>{word}</b> {_marked(answer.said)}</div></details>"
-                )
-        return "\n".join([*parts, "</div>"])
+        from jinja2 import Environment
+
+        pages = Environment(trim_blocks=True, autoescape=True)
+        pages.filters["marked"] = _marked
+        page = pages.from_string(PAGE.read_text(encoding="utf-8"))
+        return page.render(lesson=self.lesson, questions=self.questions)
 
 
 def quiz(lesson: str) -> Quiz:
@@ -119,4 +109,4 @@ def _shuffled(asked, answers):
 def _marked(text):
     """A line of Markdown as HTML: what is code, and what is stressed."""
     text = re.sub(r"`(.+?)`", r"<code>\1</code>", html.escape(text, quote=False))
-    return re.sub(r"\*(.+?)\*", r"<em>\1</em>", text)
+    return Markup(re.sub(r"\*(.+?)\*", r"<em>\1</em>", text))

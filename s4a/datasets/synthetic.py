@@ -28,9 +28,7 @@ from s4a.seeds import RNG, seed_of
 from s4a.study.pipeline import analyse
 
 
-def soil(
-    X: np.ndarray, T: np.ndarray, u: np.ndarray, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _soil(X, T, u, rng):
     """A clean mesh made as dirty as a file from a scanner.
 
     4 loose components of 12 to 60 vertices; 3 holes of 10 to 60 triangles; one bow-tie vertex for
@@ -122,12 +120,12 @@ def _debris(near, rng):
     return near * rng.uniform(0.8, 1.15) + u * rng.uniform(0.8, 3, 3), ConvexHull(u).simplices
 
 
-MODE_RMS = 4.5  # mm, root mean square displacement of mode 1 at one standard deviation
-MODE_RATIO = 0.6  # of each mode to the one before it
-NOISE_RMS = 0.4  # mm, of the individual noise: 8 slides 16 to 28 mm wide
-TUMOUR = (4.0, 7.0)  # mm, least and largest height, on a third of the shapes; 10 to 14 mm wide
-POSE = (10.0, 8.0)  # largest rotation in degrees, standard deviation of the translation in mm
-SEMI_AXES = np.array([64.0, 86.0, 61.0])
+_MODE_RMS = 4.5  # mm, root mean square displacement of mode 1 at one standard deviation
+_MODE_RATIO = 0.6  # of each mode to the one before it
+_NOISE_RMS = 0.4  # mm, of the individual noise: 8 slides 16 to 28 mm wide
+_TUMOUR = (4.0, 7.0)  # mm, least and largest height, on a third of the shapes; 10 to 14 mm wide
+_POSE = (10.0, 8.0)  # largest rotation in degrees, standard deviation of the translation in mm
+_SEMI_AXES = np.array([64.0, 86.0, 61.0])
 
 # Centre, width, push, turn and mirror of the slides and turns of each mode, on the right side; a
 # mirror of 1 repeats it on the left as in a mirror, -1 with the opposite sign, 0 not at all.
@@ -142,7 +140,7 @@ MODES: list[list[Any]] = [
     [((30, 55, 25), 26, (0, 0, 0), (0.3, 1, 0.3), 1)],
     [((55, -40, 0), 26, (0, 0, 0), (1, 0, 0), -1)],
 ]
-REGIONS = {
+_REGIONS = {
     "frontal pole": (0.3, 0.95, 0.1),
     "superior frontal": (0.3, 0.55, 0.75),
     "inferior frontal": (0.75, 0.6, 0.1),
@@ -154,7 +152,7 @@ REGIONS = {
     "cerebellum": (0.4, -0.65, -0.65),
     "base": (0.2, 0.25, -0.95),
 }
-LABELS = ["unknown", *(f"{region} {side}" for side in ("left", "right") for region in REGIONS)]
+LABELS = ["unknown", *(f"{region} {side}" for side in ("left", "right") for region in _REGIONS)]
 LANDMARKS = {
     "frontal pole left": (-0.25, 0.95, 0.1),
     "frontal pole right": (0.25, 0.95, 0.1),
@@ -200,7 +198,7 @@ def reference_brain(u: ArrayLike) -> np.ndarray:
     u = np.asarray(u, float)
     x, y, z = u.T
     side = np.abs(x)
-    p = u * SEMI_AXES
+    p = u * _SEMI_AXES
     mirrored = np.stack([np.sqrt(x**2 + 1e-3), y, z], axis=1)
     cerebellum = _bump(mirrored, (0.35, -0.72, -0.68), 9.0)
     stem = _bump(u, (0, -0.36, -0.93), 110.0)
@@ -238,7 +236,7 @@ def reference_brain(u: ArrayLike) -> np.ndarray:
         + 0.012 * folia
     )
     p = p * f[:, None]
-    p[:, 0] *= 1 - 0.10 * p[:, 1] / SEMI_AXES[1]  # narrower in front
+    p[:, 0] *= 1 - 0.10 * p[:, 1] / _SEMI_AXES[1]  # narrower in front
     return p
 
 
@@ -291,7 +289,7 @@ def _planted_modes(n_modes):
     values = np.stack([_fields(x, centre, width, row[:, :3], row[:, 3:]) for row in rows])
     gram = np.einsum("apx,bpx,p->ab", values, values, area / area.sum())
     rows = np.tensordot(np.linalg.inv(np.linalg.cholesky(gram)), rows, 1)[6:]
-    rows *= MODE_RMS * MODE_RATIO ** np.arange(n_modes)[:, None, None]
+    rows *= _MODE_RMS * _MODE_RATIO ** np.arange(n_modes)[:, None, None]
     return centre, width, rows[..., :3], rows[..., 3:]
 
 
@@ -315,11 +313,11 @@ def _own_parts(n, rng):
     outwards = _random_directions(rng, n)
     outwards[:, 2] = np.abs(outwards[:, 2])  # a tumour is on the upper half
     centre[:, 8] = reference_brain(outwards)
-    height = rng.uniform(*TUMOUR, n) * (rng.permutation(n) < n // 3)
+    height = rng.uniform(*_TUMOUR, n) * (rng.permutation(n) < n // 3)
     push[:, 8] = outwards * height[:, None]
     x = reference_brain(_sphere(4000)[0])
     for c, w, a in zip(centre[:, :8], width[:, :8], push[:, :8], strict=True):
-        a *= NOISE_RMS / np.sqrt((_fields(x, c, w, a, 0 * a) ** 2).sum(1).mean())  # in push itself
+        a *= _NOISE_RMS / np.sqrt((_fields(x, c, w, a, 0 * a) ** 2).sum(1).mean())  # in push itself
     return centre, width, push
 
 
@@ -361,14 +359,14 @@ def plant(n: int = 12, seed: int = 0, *, n_modes: int = 3, rng: RNG | None = Non
     score = _planted_scores(n, n_modes, draw)
     own_centre, own_width, own_push = _own_parts(n, draw)
     pose = Rotation.from_rotvec(
-        _random_directions(draw, n) * np.deg2rad(draw.uniform(0, POSE[0], (n, 1)))
+        _random_directions(draw, n) * np.deg2rad(draw.uniform(0, _POSE[0], (n, 1)))
     )
     truth = dataset(
         {
             "seed": seed,
-            "mode_rms": MODE_RMS,
-            "mode_ratio": MODE_RATIO,
-            "noise_rms": NOISE_RMS,
+            "mode_rms": _MODE_RMS,
+            "mode_ratio": _MODE_RATIO,
+            "noise_rms": _NOISE_RMS,
             "unit": "mm",
         },
         planted_score=score,
@@ -380,7 +378,7 @@ def plant(n: int = 12, seed: int = 0, *, n_modes: int = 3, rng: RNG | None = Non
         own_width=own_width,
         own_push=own_push,
         rotation=pose.as_matrix(),
-        translation=draw.normal(0, POSE[1], (n, 3)),
+        translation=draw.normal(0, _POSE[1], (n, 3)),
         landmark_name=np.array(list(LANDMARKS)),
         landmark_reference=_unit(list(LANDMARKS.values())),
     )
@@ -495,7 +493,7 @@ def labels(reference_point: ArrayLike) -> np.ndarray:
     seeds = [
         sign * np.array([1, 0, 0]) * s + [0, *s[1:]]
         for sign in (-1, 1)
-        for s in _unit(list(REGIONS.values()))
+        for s in _unit(list(_REGIONS.values()))
     ]
     nearest = 1 + np.argmax(np.nan_to_num(u) @ np.array(seeds).T, axis=1)
     return np.where(np.isnan(u).any(axis=1), 0, nearest).astype(np.int32)
@@ -512,15 +510,8 @@ def _annotate(mesh, truth, shape, reference_point):
     return in_unit(mesh.merge(extra).assign_attrs(unit="mm", coordinate_system="RAS"), "mm")
 
 
-def raw_brain(
-    truth: xr.Dataset | xr.DataTree,
-    shape: str,
-    n_vertices: int = 40_000,
-    seed: int = 0,
-    *,
-    rng: RNG | None = None,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A brain with the artefacts of :func:`s4a.datasets.synthetic.soil`, as it could lie in a file.
+def _raw_brain(truth, shape, n_vertices=40_000, seed=0, *, rng=None):
+    """A brain with the artefacts of ``_soil``, as it could lie in a file.
 
     Parameters
     ----------
@@ -548,7 +539,7 @@ def raw_brain(
     seed = seed_of(seed, rng)
     i = _index(truth, shape)
     u, T = _mesh(truth, shape, n_vertices, np.random.default_rng([seed, 1, i]))
-    return soil(position(truth, shape, u), T, u, np.random.default_rng([seed, 2, i]))
+    return _soil(position(truth, shape, u), T, u, np.random.default_rng([seed, 2, i]))
 
 
 def _reference_after_cleaning(mesh, raw, reference_point):
@@ -581,7 +572,7 @@ def brains(
         Vertices of each, exactly unless `dirty`.  The population does not depend on it.
     seed, rng : see :mod:`s4a.seeds`
     dirty : bool
-        Whether the meshes are those of :func:`raw_brain`, cleaned; ``/raw/<shape>`` then holds them
+        Whether the meshes are those of ``_raw_brain``, cleaned; ``/raw/<shape>`` then holds them
         as they were.
     n_modes : int
         Number of planted modes.
@@ -621,7 +612,7 @@ def brains(
     raw = {}
     for i, shape in enumerate(truth["shape"].values.tolist()):
         if dirty:
-            raw[shape] = raw_brain(truth, shape, n_vertices, seed)
+            raw[shape] = _raw_brain(truth, shape, n_vertices, seed)
         else:
             u, T = _mesh(truth, shape, n_vertices, np.random.default_rng([seed, 1, i]))
             raw[shape] = position(truth, shape, u), T, u

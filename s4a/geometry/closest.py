@@ -17,8 +17,8 @@ from s4a.schema import Array
 POSITION_WEIGHT, NORMAL_WEIGHT = 5.0, 0.3
 # once surfaces lie on each other: enough for the right side of a thin part, and the noise of a
 # scan's normals, 0.1 and more, weighs no longer as much as several edges of 100,000 vertices
-CLOSE_WEIGHT = 0.05
-FLAT = 1e-14  # squared sine of the angle at A up to which a triangle is taken for a line
+_CLOSE_WEIGHT = 0.05
+_FLAT = 1e-14  # squared sine of the angle at A up to which a triangle is taken for a line
 
 
 def interpolate(values: Array, T: Array, triangle: Array, weights: Array) -> Array:
@@ -142,7 +142,7 @@ def tree_over(rows: Array) -> cKDTree:
 def match_surfaces(Y: Array, normals_y: Array, X: Array, normals_x: Array) -> Array:
     """On each vertex of one surface the vertex nearest to it of another that lies on it ``(n,)``.
 
-    Nearest in position and, by :data:`CLOSE_WEIGHT`, in normal.
+    Nearest in position and, by ``_CLOSE_WEIGHT``, in normal.
 
     Parameters
     ----------
@@ -161,8 +161,8 @@ def match_surfaces(Y: Array, normals_y: Array, X: Array, normals_x: Array) -> Ar
     >>> bool((match_surfaces(1.01 * X, N, X, N) == range(200)).all())
     True
     """
-    tree = tree_over(features(X, normals_x, weight=CLOSE_WEIGHT))
-    return tree.query(features(Y, normals_y, weight=CLOSE_WEIGHT))[1]
+    tree = tree_over(features(X, normals_x, weight=_CLOSE_WEIGHT))
+    return tree.query(features(Y, normals_y, weight=_CLOSE_WEIGHT))[1]
 
 
 def closest_point_on_triangles(P: Array, A: Array, B: Array, C: Array) -> Array:
@@ -180,11 +180,11 @@ def closest_point_on_triangles(P: Array, A: Array, B: Array, C: Array) -> Array:
     weights : float ndarray (n, 3)
         Non-negative, rows sum to 1.
     """
-    v, w = closest_by_sides(B - A, C - A, P - A)
+    v, w = _closest_by_sides(B - A, C - A, P - A)
     return np.stack([np.maximum(1 - v - w, 0), v, w], axis=1)
 
 
-def closest_by_sides(ab: Array, ac: Array, ap: Array) -> tuple[Array, Array]:
+def _closest_by_sides(ab, ac, ap):
     """Weights ``(n,)`` of B and C in the closest point of :func:`closest_point_on_triangles`.
 
     Parameters
@@ -215,14 +215,14 @@ def closest_by_sides(ab: Array, ac: Array, ap: Array) -> tuple[Array, Array]:
     )
     for region, at_b, at_c in corners:
         v, w = np.where(region, at_b, v), np.where(region, at_c, w)
-    flat = np.flatnonzero(both * both >= (1 - FLAT) * of_ab * of_ac)
+    flat = np.flatnonzero(both * both >= (1 - _FLAT) * of_ab * of_ac)
     if len(flat):  # signs that tell the regions apart are those of rounding there
-        v[flat], w[flat] = closest_on_sides(ab[flat], ac[flat], ap[flat])
+        v[flat], w[flat] = _closest_on_sides(ab[flat], ac[flat], ap[flat])
     return v, w
 
 
-def closest_on_sides(ab: Array, ac: Array, ap: Array) -> tuple[Array, Array]:
-    """:func:`closest_by_sides` of degenerate triangles: the nearest point of the three sides."""
+def _closest_on_sides(ab, ac, ap):
+    """``_closest_by_sides`` of degenerate triangles: the nearest point of the three sides."""
     bc, zero = ac - ab, np.zeros(len(ab))
     t = ratio(dots(bc, ap - ab), dots(bc, bc))
     v = np.stack([ratio(dots(ab, ap), dots(ab, ab)), zero, 1 - t])  # (3 sides, n)
@@ -308,7 +308,7 @@ def closest_point_in_star(
         ap = P.take(block[row], axis=0)
         for side in (ab, ac, ap):  # in place, as below: copies take as long as the products
             side -= A
-        v, w = closest_by_sides(ab, ac, ap)
+        v, w = _closest_by_sides(ab, ac, ap)
         ab *= v[:, None]
         ac *= w[:, None]
         way = ab

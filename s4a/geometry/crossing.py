@@ -15,11 +15,11 @@ from s4a.schema import Array
 log = logging.getLogger(__name__)
 
 # Pairs that cross are held at once, 40 bytes each: of a surface crumpled into a ball they are all
-MOST_PAIRS = 10_000_000
+_MOST_PAIRS = 10_000_000
 N_PROBED, N_BESIDE = 200, 5000  # triangles whose boxes are compared to foresee how many there are
 
 
-def count_crossing(X: Array, T: Array, *, most_pairs: int = MOST_PAIRS) -> int:
+def count_crossing(X: Array, T: Array, *, most_pairs: int = _MOST_PAIRS) -> int:
     """How many triangles pass through another, or touch one that has no corner in common with it.
 
     Corners at the same place are one, as where a surface that is not manifold was cut into sheets:

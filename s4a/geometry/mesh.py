@@ -131,7 +131,7 @@ def unique_edges(T: Array, n: int | None = None) -> tuple[Array, Array, Array]:
     return np.stack(np.divmod(edge, n), axis=1), edge_of, count
 
 
-def check_numbers(key: Array, n: int) -> None:
+def _check_numbers(key, n):
     """IndexError unless all are numbers from 0 to n - 1."""
     if len(key) and not 0 <= key.min() <= key.max() < n:
         raise IndexError(f"numbers from 0 to {n - 1} needed, found {key.min()} to {key.max()}")
@@ -149,7 +149,7 @@ def counting_order(key: Array, n: int) -> Array:
     >>> counting_order(np.array([2, 0, 1, 0]), 3).tolist()
     [1, 3, 2, 0]
     """
-    check_numbers(key, n)  # what follows would write beside its memory
+    _check_numbers(key, n)  # what follows would write beside its memory
     m = len(key)
     one_a_row = sp.csr_matrix((np.ones(m, np.int8), key, np.arange(m + 1)), (m, n))
     return one_a_row.tocsc().indices.astype(np.int64)

@@ -19,7 +19,7 @@ from s4a.geometry.mesh import components, directed_edges, edge_graph, triangle_a
 from s4a.schema import Array
 
 
-class MeshGraph(NamedTuple):
+class _MeshGraph(NamedTuple):
     """Triangles and edges of a mesh; see :func:`mesh_graph`."""
 
     T: Array  # (m, 3)
@@ -46,10 +46,10 @@ class Faults(NamedTuple):
     triangle: Array
 
 
-def mesh_graph(X: Array, T: Array) -> MeshGraph:
+def mesh_graph(X: Array, T: Array) -> _MeshGraph:
     """The edges of a mesh, which of them are open, and the graph of their lengths."""
     E, _, count = unique_edges(T, len(X))
-    return MeshGraph(T, E, count == 1, edge_graph(X, E))
+    return _MeshGraph(T, E, count == 1, edge_graph(X, E))
 
 
 def farthest_of_each(group: Array, vertex: Array, distance: Array) -> Array:
@@ -141,7 +141,7 @@ def rims(T: Array, region: Array) -> tuple[Array, Array, Array, Array]:
     return np.repeat(step[:, 0], 2), step[:, 1:].ravel() // n, rim[link.ravel()], owner
 
 
-def faults(graph: MeshGraph, cell: Array, n: int, among: Array | None = None) -> Faults:
+def faults(graph: _MeshGraph, cell: Array, n: int, among: Array | None = None) -> Faults:
     r"""Cells, pairs of cells and triangles that keep the dual from being a manifold.
 
     ::
@@ -186,15 +186,15 @@ def faults(graph: MeshGraph, cell: Array, n: int, among: Array | None = None) ->
     corner = np.flatnonzero((L[:, 0] != L[:, 1]) & (L[:, 1] != L[:, 2]) & (L[:, 2] != L[:, 0]))
     C = L[corner]  # (corners, 3) cells that meet in each corner
 
-    bad = faulty_cells(T_near, ends, is_open, cell, among)
+    bad = _faulty_cells(T_near, ends, is_open, cell, among)
     lone = (np.bincount(ends.ravel(), minlength=n) > 0) & (np.bincount(C.ravel(), minlength=n) == 0)
     if (lone & ~among).any():  # of neighbours not all triangles were looked at
         lone[dual(T, cell)] = False
-    pair, across, row = faulty_borders(ends, is_open, C, among)
-    return Faults(bad | lone, pair, edge[across], row, triangle[corner[is_repeated(C, n)]])
+    pair, across, row = _faulty_borders(ends, is_open, C, among)
+    return Faults(bad | lone, pair, edge[across], row, triangle[corner[_is_repeated(C, n)]])
 
 
-def faulty_cells(T: Array, ends: Array, is_open: Array, cell: Array, among: Array) -> Array:
+def _faulty_cells(T, ends, is_open, cell, among):
     """Which cells have no rim, several rims, or several stretches of boundary ``(n,)``.
 
     Handles and holes inside a single rim do no harm: they vanish with the cell.  `ends` are the
@@ -212,9 +212,7 @@ def faulty_cells(T: Array, ends: Array, is_open: Array, cell: Array, among: Arra
     return (suspect & (np.bincount(owner, minlength=n) != 1)) | (among & (stretch_ends > 2))
 
 
-def faulty_borders(
-    ends: Array, is_open: Array, C: Array, among: Array
-) -> tuple[Array, Array, Array]:
+def _faulty_borders(ends, is_open, C, among):
     """Pairs of cells ``(p, 2)`` whose border is not one strip, edges across, and their rows.
 
     A strip of edges ends at a corner or at an open edge; a border in one piece has two such ends.
@@ -232,7 +230,7 @@ def faulty_borders(
     return np.stack(np.divmod(key[bad], n), axis=1), across[at], row[border[at]]
 
 
-def is_repeated(C: Array, n: int) -> Array:
+def _is_repeated(C, n):
     """Which corners ``(c, 3)`` are of three cells that meet more than once."""
     key = np.sort(C, axis=1) @ [n * n, n, 1]
     _, triple, count = np.unique(key, return_inverse=True, return_counts=True)
@@ -240,7 +238,7 @@ def is_repeated(C: Array, n: int) -> Array:
 
 
 def refine(
-    graph: MeshGraph, state: Voronoi, most: float, avoid: Array
+    graph: _MeshGraph, state: Voronoi, most: float, avoid: Array
 ) -> tuple[Voronoi, int, bool]:
     """Add samples where the dual is no manifold, until it is or there are more than `most`.
 
@@ -281,7 +279,7 @@ def refine(
         rounds += 1
 
 
-def thin_regions(graph: MeshGraph, state: Voronoi) -> Array:
+def thin_regions(graph: _MeshGraph, state: Voronoi) -> Array:
     """Cells that are no disk, and pairs of cells that are none together, as disjoint regions."""
     n = len(state.sample)
     fault = faults(graph, state.cell, n)
@@ -347,17 +345,17 @@ def cut_handles(X: Array, T: Array, removed: Array, crumb: float) -> tuple[Array
         small[farthest_of_each(component, part, part_area)] = False  # the largest of a component
         small &= np.isin(np.arange(n), part[T[removed]])
         gone = removed | small[part[T[:, 0]]]
-        restored = gone & cuts_apart(T, gone, part)
+        restored = gone & _cuts_apart(T, gone, part)
         if not restored.any():
             removed = gone
             break
         removed = removed & ~restored
     was_closed = (left_at_edge() == 1) & (count == 2)
     opened = np.tile(~removed, 3) & was_closed[edge_of]
-    return close_with_fans(X, T[~removed], directed_edges(T)[opened])
+    return _close_with_fans(X, T[~removed], directed_edges(T)[opened])
 
 
-def cuts_apart(T: Array, gone: Array, part: Array) -> Array:
+def _cuts_apart(T, gone, part):
     """Triangles ``(m,)`` at holes of the triangles `gone` that touch several parts that stay."""
     hole = components(directed_edges(T[gone]), len(part))
     vertex = np.unique(T[gone])
@@ -366,7 +364,7 @@ def cuts_apart(T: Array, gone: Array, part: Array) -> Array:
     return (np.bincount(touching[:, 0], minlength=len(part)) > 1)[hole[T[:, 0]]]
 
 
-def close_with_fans(X: Array, T: Array, half: Array) -> tuple[Array, Array, Array]:
+def _close_with_fans(X, T, half):
     """The mesh with every loop of the open half-edges ``(h, 2)`` closed by a fan."""
     n = len(X)
     corner, link = np.unique(half, return_inverse=True)

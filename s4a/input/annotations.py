@@ -21,7 +21,7 @@ from s4a.input.raw import check_there, content, npy, npz, reading, shown, text_o
 from s4a.schema import dataset, require, unit_of
 
 LONGEST = 255  # characters of a name: an array of names has room for the longest in each place
-MARKUPS = (
+_MARKUPS = (
     "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/"
     "Resources/Schema/markups-schema-v1.0.3.json#"
 )
@@ -197,7 +197,7 @@ def table_rows(text: str) -> dict[int, list[str]]:
     return rows
 
 
-def check_cells(rows: dict[int, list[str]], n: int, least: int) -> None:
+def _check_cells(rows, n, least):
     """ValueError unless every row has from `least` to `n` cells; more, where those are empty."""
     for line, row in rows.items():
         if len(row) < least or any(row[n:]):
@@ -207,7 +207,7 @@ def check_cells(rows: dict[int, list[str]], n: int, least: int) -> None:
             )
 
 
-def number_of(cell: str, line: int) -> float:
+def _number_of(cell, line):
     """The number in a cell; ValueError with its line where there is none."""
     if not is_number(cell):
         raise ValueError(f"line {line} needs a number where it has {cell[:40]!r}")
@@ -249,13 +249,13 @@ def _cells(rows, at, has_head):
     n, order, head = len(next(iter(rows.values()))), None, []
     if has_head:
         head = [cell.lower() for cell in rows.pop(next(iter(rows)))]
-        order = order_of_vertices(head, rows) if n > 1 else None
-    check_cells(rows, n, 1 + at)
+        order = _order_of_vertices(head, rows) if n > 1 else None
+    _check_cells(rows, n, 1 + at)
     lines = list(rows)
     return {lines[i]: rows[lines[i]][at] for i in (range(len(lines)) if order is None else order)}
 
 
-def order_of_vertices(head: list[str], rows: dict[int, list[str]]) -> np.ndarray | None:
+def _order_of_vertices(head, rows):
     """The rows of a table in the order of its column ``vertex``; None where it has none.
 
     Parameters
@@ -273,8 +273,8 @@ def order_of_vertices(head: list[str], rows: dict[int, list[str]]) -> np.ndarray
     if "vertex" not in head:
         return None
     at = head.index("vertex")
-    check_cells(rows, len(head), 1 + at)
-    vertex = np.array([number_of(row[at], line) for line, row in rows.items()])
+    _check_cells(rows, len(head), 1 + at)
+    vertex = np.array([_number_of(row[at], line) for line, row in rows.items()])
     if not np.array_equal(np.sort(vertex), np.arange(len(vertex))):
         raise ValueError(f"the column 'vertex' needs every index from 0 to {len(vertex) - 1} once")
     return np.argsort(vertex)
@@ -367,13 +367,13 @@ def _table_points(text):
     else:
         raise ValueError(f"the columns name, x, y and z needed, found {', '.join(first)}")
     used = [i for i in (*x, name, curve, closed) if i is not None]
-    check_cells(rows, len(head), 1 + max(used))
+    _check_cells(rows, len(head), 1 + max(used))
     names, curves, rings = (
         ["" if i is None else row[i] for row in rows.values()] for i in (name, curve, closed)
     )
     return (
         names,
-        [[number_of(row[i], line) for i in x] for line, row in rows.items()],
+        [[_number_of(row[i], line) for i in x] for line, row in rows.items()],
         "",
         curves,
         [c.lower() in ("1", "true", "yes") for c in rings],
@@ -430,7 +430,7 @@ def _markups(landmarks):
         kind = ("ClosedCurve" if closed[of[0]] else "Curve") if curve else "Fiducial"
         named = {"name": curve} if curve else {}
         lists.append({"type": kind, **named, **about, "controlPoints": [points[i] for i in of]})
-    return {"@schema": MARKUPS, "markups": lists}
+    return {"@schema": _MARKUPS, "markups": lists}
 
 
 def labels_of_mesh(labels: ArrayLike, mesh: xr.Dataset) -> np.ndarray:
@@ -497,7 +497,7 @@ def labels_of_file(
 
 log = logging.getLogger(__name__)
 
-CURV = b"\xff\xff\xff"  # how FreeSurfer's files of a number per vertex begin
+_CURV = b"\xff\xff\xff"  # how FreeSurfer's files of a number per vertex begin
 SUFFIXES = (".npy", ".npz", ".ply", ".csv", ".txt", ".gii")
 
 
@@ -691,7 +691,7 @@ def _properties(path):
 
 def _values(data, file, name):
     """The numbers of a file, by what it begins with, or by its suffix."""
-    if data.startswith(CURV):
+    if data.startswith(_CURV):
         return _curv(data)
     if data[:3] == b"ply":
         columns = ply_properties(data)
@@ -735,4 +735,4 @@ def _column(text, name):
     if len(first) > 1 and name not in first:
         raise ValueError(f"a column {name!r} expected, found {', '.join(first)[:80]}")
     at, has_head = (first.index(name), True) if len(first) > 1 else (0, not is_number(first[0]))
-    return np.array([number_of(cell, line) for line, cell in _cells(rows, at, has_head).items()])
+    return np.array([_number_of(cell, line) for line, cell in _cells(rows, at, has_head).items()])

@@ -4,10 +4,9 @@ What makes the triangles a manifold, edge by edge, is in :mod:`s4a.input.clean`,
 half-edges are counted.
 """
 
-from typing import Any
-
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from s4a.geometry.mesh import (
@@ -27,13 +26,13 @@ from s4a.options import check_components
 from s4a.schema import require
 
 # of the diagonal of the bounding box: nearer vertices are one, lower triangles are flat
-RELATIVE_TOLERANCE = 1e-7
+_RELATIVE_TOLERANCE = 1e-7
 # largest coordinate, and one over the least extent: sums of squares stay in float32, which holds
 # the displacements (1e-38 to 3e38)
 LARGEST = 1e15
 # largest coordinate beside the extent: from here on rounding is over 1 % of the extent in float32;
 # in float64 the frame of a shape is 1e-4 of its extent off (measured for offsets of 1e13 and 1e14)
-FARTHEST = {"float32": 1e5, "float64": 1e11}
+_FARTHEST = {"float32": 1e5, "float64": 1e11}
 
 REPAIRS = {
     "nonfinite_vertices": "non-finite vertices removed",
@@ -51,7 +50,7 @@ REPAIRS = {
     "unreferenced_vertices": "vertices without triangles dropped",
     "closed_holes": "holes closed",
 }
-SINGULAR = {
+_SINGULAR = {
     "vertices": "vertex",
     "triangles": "triangle",
     "edges": "edge",
@@ -148,7 +147,8 @@ def clean_arrays(
         and ``genus`` (sum over components); and ``area`` and ``area_dropped``, the share of it in
         the dropped components.
     """
-    P, F = _validated(points, triangles, components)
+    P, F = check_arrays(points, triangles)
+    check_components(components)
     counts: dict[str, int | float] = {"file_vertices": len(P), "file_triangles": len(F)}
     counts |= dict.fromkeys(REPAIRS, 0)
     counts["unreferenced_vertices"] = len(P) - n_used(F)
@@ -161,10 +161,10 @@ def clean_arrays(
         raise ValueError(
             f"a surface needs triangles with area; none of the {counts['file_triangles']} has any"
         )
-    F, mate = join_triangles(P, F, group, counts)
-    V, file_vertex = join_corners(F, mate)
+    F, mate = _join_triangles(P, F, group, counts)
+    V, file_vertex = _join_corners(F, mate)
     counts["split_vertices"] = len(file_vertex) - n_used(group[F])
-    X, T, file_vertex = split_double_edges(P[file_vertex], V, file_vertex, mate, counts)
+    X, T, file_vertex = _split_double_edges(P[file_vertex], V, file_vertex, mate, counts)
     X, T, kept = _keep_components(X, T, components, counts)
     new = np.where(kept, np.cumsum(kept) - 1, -1)
     T, file_vertex = new[T], file_vertex[kept]
@@ -206,13 +206,13 @@ def counted(n: float, text: str) -> str:
     ('1 hole closed', '2 holes closed')
     """
     if n == 1:
-        many = next(word for word in text.split() if word in SINGULAR)
-        text = text.replace(many, SINGULAR[many], 1)
+        many = next(word for word in text.split() if word in _SINGULAR)
+        text = text.replace(many, _SINGULAR[many], 1)
     return f"{n} {text}"
 
 
-def _validated(points, triangles, components):
-    """The arrays as float64 and int64, or ValueError."""
+def check_arrays(points: ArrayLike, triangles: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Points ``(n, 3)`` as float64 and triangles ``(m, 3)`` as int64, or ValueError."""
     P, F = np.asarray(points, np.float64), np.asarray(triangles)
     if P.ndim != 2 or P.shape[1] != 3 or F.ndim != 2 or F.shape[1] != 3 or len(F) == 0:
         raise ValueError(
@@ -226,7 +226,6 @@ def _validated(points, triangles, components):
             f"triangles need vertex indices 0..{len(P) - 1}, as there are {len(P)} vertices; "
             f"found {F.min()}..{F.max()}, {wrong} triangles out of range"
         )
-    check_components(components)
     return P, F.astype(np.int64)
 
 
@@ -271,7 +270,7 @@ def check_range(P: np.ndarray, F: np.ndarray) -> None:
             f"an extent of at least {1 / LARGEST:.0e} needed, found {extent:.1e}: scale the file"
         )
     precision = "float32" if np.array_equal(X, X.astype(np.float32)) else "float64"
-    if size > FARTHEST[precision] * extent > 0:
+    if size > _FARTHEST[precision] * extent > 0:
         raise ValueError(
             f"the shape is lost in rounding: its extent is {extent:.2g}, its coordinates, which "
             f"are of {precision}, reach {size:.1e}; subtract the offset before it is written"
@@ -287,7 +286,7 @@ def _weld(P, F, counts):
         raise ValueError(f"a surface needs extent; all {len(F)} triangles are points")
     # the median side guards against a far outlier, whose bounding box would weld the whole shape
     diagonal = np.linalg.norm(np.ptp(X, axis=0))
-    tolerance = min(RELATIVE_TOLERANCE * diagonal, 1e-3 * np.median(side[side > 0]))
+    tolerance = min(_RELATIVE_TOLERANCE * diagonal, 1e-3 * np.median(side[side > 0]))
     first, place = equal_rows(X)
     label = components(_near_pairs(X[first], tolerance), len(first))
     group = np.full(len(P), -1)
@@ -396,7 +395,7 @@ def _flips(P, F, group, flat, tolerance):
     E, edge_of, count = unique_edges(group[F], len(P))
     half = flat + m * _heights(P, F[flat])[1]
     at_boundary = flat[count[edge_of[half]] == 1]
-    mate = manifold_mates(edge_of, count)[half]
+    mate = _manifold_mates(edge_of, count)[half]
     half, mate = half[mate >= 0], mate[mate >= 0]
     p = corner[mate]
     q = corner[(mate + m) % (3 * m)]
@@ -510,10 +509,10 @@ def _vertex_of_file(group, new, file_vertex):
     return np.where(own >= 0, own, welded[group]).astype(np.int32)
 
 
-MOST_AROUND_EDGE = 16  # an edge with more triangles is cut: pairing takes their number squared
+_MOST_AROUND_EDGE = 16  # an edge with more triangles is cut: pairing takes their number squared
 
 
-def manifold_mates(edge_of: np.ndarray, count: np.ndarray) -> np.ndarray:
+def _manifold_mates(edge_of, count):
     """The mate of each half-edge ``(3 m,)`` on edges with two triangles, else -1.
 
     `edge_of` and `count` are those of :func:`s4a.geometry.mesh.unique_edges`.
@@ -526,9 +525,7 @@ def manifold_mates(edge_of: np.ndarray, count: np.ndarray) -> np.ndarray:
     return mate
 
 
-def join_triangles(
-    P: np.ndarray, F: np.ndarray, group: np.ndarray, counts: dict[str, Any]
-) -> tuple[np.ndarray, np.ndarray]:
+def _join_triangles(P, F, group, counts):
     """Find the mates of all half-edges, and orient the triangles consistently.
 
     Returns
@@ -539,7 +536,7 @@ def join_triangles(
         Of each half-edge, -1 at boundaries and cuts.
     """
     _, edge_of, count = unique_edges(group[F], len(P))
-    F, mate = _orient(P, F, group, manifold_mates(edge_of, count), counts)
+    F, mate = _orient(P, F, group, _manifold_mates(edge_of, count), counts)
     if (count > 2).any():
         _, edge_of, count = unique_edges(group[F], len(P))
         counts["nonmanifold_edges"] = int((count > 2).sum())
@@ -565,7 +562,7 @@ def _pairs_around_edges(P, F, group, edge_of, count):
     order = counting_order(edge_of, len(count))
     first = np.cumsum(count) - count
     found = [np.empty((0, 2), np.int64)]
-    for k in range(3, MOST_AROUND_EDGE + 1):
+    for k in range(3, _MOST_AROUND_EDGE + 1):
         around = order[first[count == k][:, None] + np.arange(k)]  # (edges, k) half-edges
         found += [around[:, [i, j]] for i in range(k) for j in range(i + 1, k)]
     pairs = np.concatenate(found)
@@ -620,7 +617,7 @@ def _reverse(F, mate, t):
     return F, np.where(mate >= 0, moved[mate], -1)
 
 
-def join_corners(F: np.ndarray, mate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _join_corners(F, mate):
     """Vertices as the sets of corners that mates join: one for each umbrella of triangles.
 
     A bow-tie or the end of a separated edge falls apart into several.
@@ -646,9 +643,7 @@ def join_corners(F: np.ndarray, mate: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return rank.take(label).reshape(3, m).T, file_vertex[order]
 
 
-def split_double_edges(
-    X: np.ndarray, V: np.ndarray, file_vertex: np.ndarray, mate: np.ndarray, counts: dict[str, Any]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _split_double_edges(X, V, file_vertex, mate, counts):
     """Give each of two sheets its own midpoint where they share both ends of an edge.
 
     Returns

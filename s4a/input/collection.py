@@ -10,7 +10,7 @@ import xarray as xr
 
 from s4a.geometry.mesh import as_dataset
 from s4a.input import plausibility
-from s4a.input.clean import REPAIRS, clean
+from s4a.input.clean import REPAIRS, check_arrays, clean
 from s4a.input.files import (
     LONGEST_NAME,
     Paths,
@@ -18,7 +18,7 @@ from s4a.input.files import (
     find_meshes,
     not_meshes,
     read_mesh,
-    with_long_names,
+    was_cut,
 )
 from s4a.input.labels import Label, read_volume
 from s4a.input.plausibility import examine
@@ -32,7 +32,7 @@ COUNTS = [
     *"file_vertices file_triangles components holes genus self_intersections".split(),
 ]
 TEXTS = ("status", "reason", "warning", "doubtful_kinds", "warning_kinds", "path")
-AREAS = ("area", "area_dropped")
+_AREAS = ("area", "area_dropped")
 
 
 def read_shape(
@@ -228,15 +228,14 @@ def remarks_on_files(
     if isinstance(paths, dict | xr.DataTree):
         return []
     what = "label volume" if volumes else "mesh"
-    others = [
+    return [
         f"{shown(file)} is not a {what} ({why}) and was passed over"
         for file, why in not_meshes(paths, pattern, volumes=volumes)
-    ]
-    shortened = [
+    ] + [
         f"{shown(file)} is called {name}: names of shapes have at most {LONGEST_NAME} letters"
-        for file, name in with_long_names(paths, pattern, volumes=volumes)
+        for file, name in find_meshes(paths, pattern, volumes=volumes)
+        if was_cut(file, name)
     ]
-    return others + shortened
 
 
 def shape_report(
@@ -271,7 +270,7 @@ def shape_report(
         key: [shown(row.get(key, "")) for row in rows] for key in TEXTS
     }
     columns |= {key: np.array([row.get(key, -1) for row in rows], np.int64) for key in COUNTS}
-    columns |= {key: [float(row.get(key, np.nan)) for row in rows] for key in AREAS}
+    columns |= {key: [float(row.get(key, np.nan)) for row in rows] for key in _AREAS}
     report = dataset({"remarks": "\n".join(remarks)}, **columns)
     return report.assign_coords(shape=list(attrs))
 
@@ -304,11 +303,4 @@ def _cleaned(source, label, **options):
         return read_shape(source, label=label, **options)
     if isinstance(source, xr.Dataset):
         return in_unit(clean(source, **options), source.attrs.get("unit"))
-    points, triangles = (np.asarray(values) for values in source)
-    if triangles.dtype.kind not in "iu":
-        raise ValueError(f"triangles need integer vertex indices; found {triangles.dtype}")
-    if points.ndim != 2 or points.shape[1] != 3 or triangles.ndim != 2 or triangles.shape[1] != 3:
-        raise ValueError(
-            f"points (n, 3) and triangles (m, 3) needed, found {points.shape} and {triangles.shape}"
-        )
-    return clean(as_dataset(points, triangles), **options)
+    return clean(as_dataset(*check_arrays(*source)), **options)

@@ -246,15 +246,9 @@ def not_meshes(
     ]
 
 
-def with_long_names(
-    paths: Paths, pattern: str | None = None, *, volumes: bool = False
-) -> list[tuple[Path, str]]:
-    """The files of :func:`find_meshes` whose names were cut, and what they became."""
-    return [
-        (file, name)
-        for file, name in find_meshes(paths, pattern, volumes=volumes)
-        if len(name) == LONGEST_NAME and name not in _plain(str(file))
-    ]
+def was_cut(file: Path, name: str) -> bool:
+    """Whether the name of a shape was made shorter than its file's."""
+    return len(name) == LONGEST_NAME and name not in _plain(str(file))
 
 
 def _listed(paths):
@@ -291,9 +285,8 @@ def _expand(path, volumes):
         raise ValueError(f"no file, folder or match of {shown(path)}")
     files = []
     for match in map(Path, matches):
-        files += (
-            _search(match, volumes) if os.path.isdir(match) else [(match, _why_not(match, volumes))]
-        )
+        is_file = not os.path.isdir(match)
+        files += [(match, _why_not(match, volumes))] if is_file else _search(match, volumes)
     return files
 
 

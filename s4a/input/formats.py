@@ -35,12 +35,12 @@ import numpy as np
 from s4a.geometry.mesh import equal_rows
 from s4a.input.raw import limit_of, npz, unpack, xml
 
-LEGACY_TYPES = {
+_LEGACY_TYPES = {
     "char": "i1", "unsigned_char": "u1", "short": "i2", "unsigned_short": "u2", "int": "i4",
     "unsigned_int": "u4", "long": "i8", "unsigned_long": "u8", "vtkidtype": "i8",
     "vtktypeint64": "i8", "vtktypeint32": "i4", "float": "f4", "double": "f8",
 }  # fmt: skip
-COMPRESSORS = {"vtkZLibDataCompressor": "zlib", "vtkLZMADataCompressor": "lzma"}
+_COMPRESSORS = {"vtkZLibDataCompressor": "zlib", "vtkLZMADataCompressor": "lzma"}
 
 
 def fans(corners: np.ndarray, offsets: np.ndarray) -> np.ndarray:
@@ -72,7 +72,7 @@ def fans(corners: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     return corners[np.stack([first, first + step + 1, first + step + 2], axis=1)]
 
 
-def number_type(name: str | None, order: str) -> np.dtype:
+def _number_type(name, order):
     """The dtype that an XML file names: Float32, or NIFTI_TYPE_UINT8; order is ``<`` or ``>``."""
     known = re.fullmatch(r"(?:NIFTI_TYPE_)?(u?int(8|16|32|64)|float(32|64))", name or "", re.I)
     if not known:
@@ -83,7 +83,7 @@ def number_type(name: str | None, order: str) -> np.dtype:
 # legacy files
 
 
-def parse_vtk(data: bytes) -> tuple[np.ndarray, np.ndarray, dict[str, str]]:
+def _parse_vtk(data):
     """Points, triangles and attributes of a legacy file with ``DATASET POLYDATA``."""
     file = _Legacy(data)
     if [word.upper() for word in file.line()] != [b"DATASET", b"POLYDATA"]:
@@ -131,7 +131,7 @@ class _Legacy:
 
     def values(self, count, type_name):
         """The next numbers."""
-        dtype = np.dtype(">" + LEGACY_TYPES[type_name.decode().lower()])
+        dtype = np.dtype(">" + _LEGACY_TYPES[type_name.decode().lower()])
         room = len(self.data) - self.at
         if count < 0 or count * (dtype.itemsize if self.binary else 2) > room + 1:
             raise ValueError(
@@ -256,7 +256,7 @@ def _data_array(name, values):
     )
 
 
-def parse_vtp(data: bytes) -> tuple[np.ndarray, np.ndarray, dict[str, str]]:
+def _parse_vtp(data):
     """Points, triangles and attributes of an XML file in any encoding, compressed or not."""
     file = _Xml(data)
     points, triangles, n_before = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], 0
@@ -301,7 +301,7 @@ class _Xml:
 
     def values(self, node):
         """The numbers of a DataArray."""
-        dtype, text = number_type(node.get("type"), self.order), node.text or ""
+        dtype, text = _number_type(node.get("type"), self.order), node.text or ""
         if node.get("format") == "ascii":
             return np.array(text.split(), dtype)
         if node.get("format") == "appended":
@@ -322,8 +322,8 @@ class _Xml:
                     f"arrays of at most {self.limit} bytes more expected, found {length}"
                 )
             return _take(data, w, length, is_base64)
-        if self.compressor not in COMPRESSORS:
-            raise ValueError(f"{' or '.join(COMPRESSORS)} expected, found {self.compressor}")
+        if self.compressor not in _COMPRESSORS:
+            raise ValueError(f"{' or '.join(_COMPRESSORS)} expected, found {self.compressor}")
         # number of blocks, size of a block, size of the last one, compressed size of each
         blocks = int(np.frombuffer(_take(data, 0, w, is_base64), self.size_type)[0])
         sizes = np.frombuffer(_take(data, 3 * w, blocks * w, is_base64), self.size_type).tolist()
@@ -333,7 +333,7 @@ class _Xml:
         body = _take(data, start, sum(sizes), is_base64)
         parts, at, limit = [], 0, self.limit
         for size in sizes:
-            parts.append(unpack(body[at : at + size], COMPRESSORS[self.compressor], limit))
+            parts.append(unpack(body[at : at + size], _COMPRESSORS[self.compressor], limit))
             at += size
             limit -= len(parts[-1])
         return b"".join(parts)
@@ -357,11 +357,11 @@ def _take(data, start, length, is_base64):
 
 
 Surface = tuple[np.ndarray, np.ndarray, dict[str, str]]  # points, triangles, attributes
-BRAIN = {"coordinate_system": "RAS", "unit": "mm"}  # what GIFTI and FreeSurfer promise
+_BRAIN = {"coordinate_system": "RAS", "unit": "mm"}  # what GIFTI and FreeSurfer promise
 
 
 @dataclass(frozen=True)
-class Format:
+class _Format:
     """How a format is named, told, read and written.
 
     Parameters
@@ -416,7 +416,7 @@ def format_of(data: bytes) -> str:
     raise ValueError(f"one of {', '.join(FORMATS)} expected, found {what}")
 
 
-def _whole(values: np.ndarray) -> np.ndarray:
+def _whole(values):
     """Indices as integers; those of an ascii PLY are floats."""
     if values.dtype.kind != "f":
         return values.astype(np.int64)
@@ -439,12 +439,12 @@ def _need(expected, found, what):
 
 # PLY
 
-PLY_TYPES = {
+_PLY_TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
     "float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2",
     "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
 }  # fmt: skip
-PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+_PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
 def _ply_tables(data):
@@ -500,20 +500,20 @@ def _ply_header(text):
         elif words[:1] == ["element"]:
             elements.append((words[1], int(words[2]), []))
         elif words[:1] == ["property"]:
-            types = [PLY_TYPES.get(word) for word in words[1:-1] if word != "list"]
+            types = [_PLY_TYPES.get(word) for word in words[1:-1] if word != "list"]
             if not elements or not all(types):
                 line = " ".join(words)[:80]
                 raise ValueError(
                     f"properties of elements, of the types of PLY, expected, found {line!r}"
                 )
             elements[-1][2].append((words[-1], types))
-    if kind not in PLY_ORDERS:
-        known = ", ".join(PLY_ORDERS)
+    if kind not in _PLY_ORDERS:
+        known = ", ".join(_PLY_ORDERS)
         raise ValueError(f"one of the formats {known} expected in the header, found {kind}")
     for _, _, properties in elements:
         for _, types in properties:
             types[:] = [
-                np.dtype("f8" if kind == "ascii" else PLY_ORDERS[kind] + code) for code in types
+                np.dtype("f8" if kind == "ascii" else _PLY_ORDERS[kind] + code) for code in types
             ]
     return kind, elements
 
@@ -546,7 +546,7 @@ def _ply_rows(body, at, name, count, properties):
 
 def _ply_row(body, at, properties):
     """(name, type, begin, length or None) of all in the row at `at`, None if cut; and its end."""
-    parts = []
+    parts: list[Any] = []
     for key, types in properties:
         begin, at = at, at + types[0].itemsize
         if at > len(body):
@@ -625,7 +625,7 @@ def _read_off(data):
     return points, fans(np.array(corners, np.int64), np.cumsum([0, *sizes])), {}
 
 
-STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corner", "<f4", (3, 3)), ("attribute", "<u2")])
+_STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corner", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
 def _read_stl(data):
@@ -640,7 +640,7 @@ def _read_stl(data):
         corners = np.array(found, np.float64)
     else:
         _need(count, (len(data) - 84) // 50, "triangles")
-        corners = np.frombuffer(data, STL_TRIANGLE, count, 84)["corner"].reshape(-1, 3)
+        corners = np.frombuffer(data, _STL_TRIANGLE, count, 84)["corner"].reshape(-1, 3)
     first, place = equal_rows(corners)
     rank = np.argsort(np.argsort(first))
     return corners[np.sort(first)], rank[place].reshape(-1, 3), {}
@@ -672,7 +672,7 @@ def gifti_arrays(data: bytes) -> list[tuple[str, np.ndarray]]:
 
 def _gifti_values(node, limit):
     order = ">" if node.get("Endian") == "BigEndian" else "<"
-    dtype = number_type(node.get("DataType"), order)
+    dtype = _number_type(node.get("DataType"), order)
     shape = tuple(int(node.get(f"Dim{i}")) for i in range(6) if node.get(f"Dim{i}") is not None)
     promised = node.get("Dimensionality")
     if str(len(shape)) != promised or not shape or min(shape) < 0:
@@ -705,7 +705,7 @@ def _read_gifti(data):
             "one set of points and one of triangles expected, "
             f"found {len(points)} and {len(triangles)}"
         )
-    return points[0], _whole(triangles[0]), BRAIN
+    return points[0], _whole(triangles[0]), _BRAIN
 
 
 def _read_freesurfer(data):
@@ -714,7 +714,7 @@ def _read_freesurfer(data):
     _need(12 * (n + m), len(data) - start - 8, "bytes of vertices and triangles")
     points = np.frombuffer(data, ">f4", 3 * n, start + 8).reshape(n, 3)
     triangles = np.frombuffer(data, ">i4", 3 * m, start + 8 + 12 * n).reshape(m, 3)
-    return points, triangles, BRAIN
+    return points, triangles, _BRAIN
 
 
 NPZ_KEYS = (
@@ -766,7 +766,7 @@ def _off_bytes(X, T, _):
 
 
 def _stl_bytes(X, T, _):
-    rows = np.zeros(len(T), STL_TRIANGLE)
+    rows = np.zeros(len(T), _STL_TRIANGLE)
     rows["corner"] = X[T]
     return b"binary".ljust(80) + len(T).to_bytes(4, "little") + rows.tobytes()
 
@@ -794,13 +794,13 @@ def _npz_bytes(X, T, scalars):
 
 SURFER = ".pial .white .inflated .orig .smoothwm .sphere"  # the name is the suffix: lh.pial
 FORMATS = {
-    "PLY": Format(".ply", rb"ply[\r\n]", _read_ply, _ply_bytes, scalars=True),
-    "OBJ": Format(".obj", b"", _read_obj, _obj_bytes),
-    "OFF": Format(".off", rb"(ST)?C?N?OFF", _read_off, _off_bytes),
-    "STL": Format(".stl", b"", _read_stl, _stl_bytes),
-    "VTK": Format(".vtk", b"# vtk DataFile", parse_vtk, vtk_bytes, scalars=True),
-    "VTP": Format(".vtp", b"<(.*<)?VTKFile", parse_vtp, vtp_bytes, scalars=True),
-    "GIFTI": Format(".gii", b"<(.*<)?GIFTI", _read_gifti, _gifti_bytes, scalars=True),
-    "NPZ": Format(".npz", rb"PK\x03\x04", _read_npz, _npz_bytes, scalars=True),
-    "FreeSurfer": Format(SURFER, rb"\xff\xff\xfe", _read_freesurfer),
+    "PLY": _Format(".ply", rb"ply[\r\n]", _read_ply, _ply_bytes, scalars=True),
+    "OBJ": _Format(".obj", b"", _read_obj, _obj_bytes),
+    "OFF": _Format(".off", rb"(ST)?C?N?OFF", _read_off, _off_bytes),
+    "STL": _Format(".stl", b"", _read_stl, _stl_bytes),
+    "VTK": _Format(".vtk", b"# vtk DataFile", _parse_vtk, vtk_bytes, scalars=True),
+    "VTP": _Format(".vtp", b"<(.*<)?VTKFile", _parse_vtp, vtp_bytes, scalars=True),
+    "GIFTI": _Format(".gii", b"<(.*<)?GIFTI", _read_gifti, _gifti_bytes, scalars=True),
+    "NPZ": _Format(".npz", rb"PK\x03\x04", _read_npz, _npz_bytes, scalars=True),
+    "FreeSurfer": _Format(SURFER, rb"\xff\xff\xfe", _read_freesurfer),
 }

@@ -15,6 +15,7 @@ from s4a.input.subjects import listed
 MIRROR = np.array([-1.0, 1.0, 1.0])
 COMMON_HAND, OTHER_HAND = 0.8, 0.5  # of the mean of `hand` over the references
 AUTO = "auto"
+MANY = ("they are", "them", "all that are")
 YES, NO = ("1", "1.0", "true", "yes"), ("0", "0.0", "false", "no")
 
 
@@ -136,18 +137,12 @@ def of_rarer_hand(hand: Mapping[str, float]) -> tuple[list[str], list[str]]:
             f"(mean hand {clear:.2f}, {COMMON_HAND} needed); name those to mirror"
         ]
     weak = [name for name, one in hand.items() if abs(one) < OTHER_HAND]
-    remarks = []
-    if weak:
-        each = (
-            "it is: look at it, and name it if it is"
-            if len(weak) == 1
-            else "they are: look at them, and name all that are"
-        )
-        remarks = [
-            f"reflect='auto' cannot tell the hand of {listed(weak, most=20)}, which stayed as "
-            f"{each} to be mirrored"
-        ]
-    return [name for name, one in hand.items() if one <= -OTHER_HAND], remarks
+    they, them, which = ("it is", "it", "it if it is") if len(weak) == 1 else MANY
+    remark = (
+        f"reflect='auto' cannot tell the hand of {listed(weak, most=20)}, which stayed as {they}: "
+        f"look at {them}, and name {which} to be mirrored"
+    )
+    return [name for name, one in hand.items() if one <= -OTHER_HAND], [remark] * bool(weak)
 
 
 def is_of_other_hand(

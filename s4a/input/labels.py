@@ -20,10 +20,10 @@ from s4a.options import check_label
 VOLUMES = {".nii": "NIfTI", ".mgz": "MGH", ".mgh": "MGH"}
 Label = int | str | Iterable[int] | None
 ROUNDS = 20  # of smoothing
-UNPACKED = 2**29  # bytes of a volume that are never refused: labels compress well
+_UNPACKED = 2**29  # bytes of a volume that are never refused: labels compress well
 SHRINK, GROW = 0.5, -0.51  # steps of a round: lambda and mu of Taubin
 MILLIMETRES = {"mm": 1.0, "unknown": 1.0, "meter": 1000.0, "micron": 0.001}
-MOST_TOLD = 30  # labels that an error lists
+_MOST_TOLD = 30  # labels that an error lists
 
 
 def is_volume(data: bytes) -> bool:
@@ -66,7 +66,7 @@ def read_volume(
     check_there(path)
     known = check_label(label)
     with reading(path, "a label volume"):
-        values, affine, attrs = _volume(content(path, UNPACKED))
+        values, affine, attrs = _volume(content(path, _UNPACKED))
         points, triangles, at_border = _boundary(_marked(values, known))
     points = points @ affine[:3, :3].T + affine[:3, 3]
     if np.linalg.det(affine[:3, :3]) < 0:
@@ -83,7 +83,7 @@ def voxels_marked(path: str | os.PathLike[str], label: Label) -> tuple[np.ndarra
 
     See :func:`read_volume`.
     """
-    values, affine, _ = _volume(content(Path(path), UNPACKED))
+    values, affine, _ = _volume(content(Path(path), _UNPACKED))
     return _marked(values, check_label(label)), affine
 
 
@@ -97,7 +97,7 @@ def read_grid(path: str | os.PathLike[str]) -> tuple[tuple[int, ...], np.ndarray
     """
     check_there(path)
     with reading(path, "a volume"):
-        kind, name = _kind_of(data := content(Path(path), UNPACKED))
+        kind, name = _kind_of(data := content(Path(path), _UNPACKED))
         header = kind.header_class.from_fileobj(io.BytesIO(data))
         return _shape_of(header), _affine_of(header, name)[0]
 
@@ -166,7 +166,7 @@ def _marked(values, label):
     wanted = found if label == "all" else [int(one) for one in str(label).split(",")]
     missing = [one for one in wanted if one not in found]
     if missing:
-        there = ", ".join(map(str, found[:MOST_TOLD])) + " ..." * (len(found) > MOST_TOLD)
+        there = ", ".join(map(str, found[:_MOST_TOLD])) + " ..." * (len(found) > _MOST_TOLD)
         raise ValueError(f"label {', '.join(map(str, missing))} expected, found {there}")
     return np.isin(values, wanted)
 

@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 from scipy.spatial import cKDTree
 
-from s4a.geometry.align import Cloud, End, cloud, icp_each, principal_axes, residual_of
+from s4a.geometry.align import Cloud, cloud, icp_each, principal_axes, residual_of
 from s4a.geometry.crossing import can_count, count_crossing
 from s4a.geometry.mesh import (
     as_arrays,
@@ -31,12 +31,12 @@ N_POINTS = 3000  # vertices of each shape that are looked at
 N_PAIRED = 300  # of them, those that ICP pairs
 N_ROUGH = 100  # of them, those that ICP pairs while it compares starts
 N_REFERENCES = 6  # shapes beside which every shape is seen
-ENOUGH = 5  # shapes, so that there is a usual spread
-USUAL = 3.0  # spreads within which a shape can be a reference
+_ENOUGH = 5  # shapes, so that there is a usual spread
+_USUAL = 3.0  # spreads within which a shape can be a reference
 # least spreads, of logarithms; collections that vary less would make each of their shapes odd
 SIZE, COMPACTNESS, MOMENT = 0.05, 0.03, 0.05
-TINY = 1e-3  # gaps below it, of shapes that are the same, are no evidence
-HALF_TURNS = [np.diag(d) for d in itertools.product((1.0, -1.0), repeat=3) if np.prod(d) == 1]
+_TINY = 1e-3  # gaps below it, of shapes that are the same, are no evidence
+_HALF_TURNS = [np.diag(d) for d in itertools.product((1.0, -1.0), repeat=3) if np.prod(d) == 1]
 
 
 def portray(mesh: xr.Dataset, *, intersections: bool = True) -> xr.Dataset:
@@ -136,7 +136,7 @@ def lattice_step(X: np.ndarray) -> float:
     return min(steps)
 
 
-def in_numbers(portraits: list[xr.Dataset]) -> np.ndarray:
+def _in_numbers(portraits):
     """Logarithms of area, compactness and the three moments of shapes (n, 5)."""
     rows = [
         [one.attrs["surface"], one.attrs["compactness"], *one["moment"].values] for one in portraits
@@ -188,11 +188,11 @@ def pick_references(portraits: dict[str, xr.Dataset], most: int = N_REFERENCES) 
     >>> "long" in pick_references(seen)
     False
     """
-    numbers = in_numbers(list(portraits.values()))
+    numbers = _in_numbers(list(portraits.values()))
     odd = np.zeros(len(numbers), bool)
-    if len(numbers) >= ENOUGH:
+    if len(numbers) >= _ENOUGH:
         least = np.array([SIZE, COMPACTNESS, MOMENT, MOMENT, MOMENT])
-        odd = np.abs(excess(numbers, least)).max(1) > USUAL
+        odd = np.abs(excess(numbers, least)).max(1) > _USUAL
     usual = [
         (size, name)
         for name, size, far in zip(portraits, numbers[:, 0], odd, strict=True)
@@ -249,7 +249,7 @@ def compare(name: str, portrait: xr.Dataset, references: dict[str, xr.Dataset]) 
         fit_mirrored, gap_mirrored, alike_mirrored = _likeness(
             mirrored, reference, own_asymmetry, asymmetry
         )
-        nearer = np.log(max(gap_mirrored, TINY) / max(gap, TINY))
+        nearer = np.log(max(gap_mirrored, _TINY) / max(gap, _TINY))
         rows.append((fit, fit_mirrored, alike - alike_mirrored + nearer))
     fit, fit_mirrored, hand = np.array(rows).reshape(-1, 3).T
     own = portrait.drop_vars([str(v) for v in portrait.data_vars if str(v).startswith("sketch_")])
@@ -285,7 +285,7 @@ class View:
 
 
 def view(sketch: xr.Dataset, flip: np.ndarray | float = 1.0) -> View:
-    """A sketch, or with ``flip=MIRROR`` its mirror image, ready for :func:`best_pose`."""
+    """A sketch, or with ``flip=MIRROR`` its mirror image, ready for ``_best_pose``."""
     X, area = sketch["sketch_position"].values * flip, sketch["sketch_area"].values
     whole = cloud(X, area, N_PAIRED)
     rough = Cloud(X, area, whole.tree, whole.paired[:N_ROUGH])
@@ -293,7 +293,7 @@ def view(sketch: xr.Dataset, flip: np.ndarray | float = 1.0) -> View:
     return View(whole, rough, axes, sketch["sketch_normal"].values * flip)
 
 
-def best_pose(shape: View, reference: View) -> End:
+def _best_pose(shape, reference):
     """ICP of a shape onto a reference, from eight turns: as it is, by its axes, half turns of both.
 
     Returns
@@ -301,7 +301,7 @@ def best_pose(shape: View, reference: View) -> End:
     R, t, residual
         As of :func:`s4a.geometry.align.icp_each`.
     """
-    turns = HALF_TURNS + [reference.axes @ half_turn @ shape.axes.T for half_turn in HALF_TURNS]
+    turns = _HALF_TURNS + [reference.axes @ half_turn @ shape.axes.T for half_turn in _HALF_TURNS]
     starts = [(R, np.zeros(3)) for R in turns]
     rough = icp_each(shape.rough, reference.rough, starts, tolerance=1e-3, rounds=5)
     best = [(R, t) for R, t, _ in sorted(rough, key=residual_of)[:2]]
@@ -323,7 +323,7 @@ def _gaps(shape, reference, end):
 def _asymmetry(sketch):
     """How far the mirror image lies above each vertex of a sketch (n,), centred, tails cut."""
     mirror_image, own = view(sketch, MIRROR), view(sketch)
-    _, below, _ = _gaps(mirror_image, own, best_pose(mirror_image, own))
+    _, below, _ = _gaps(mirror_image, own, _best_pose(mirror_image, own))
     limit = np.quantile(np.abs(below), 0.95)
     height = -np.clip(below, -limit, limit)
     return height - own.cloud.area @ height
@@ -331,7 +331,7 @@ def _asymmetry(sketch):
 
 def _likeness(shape, reference, asymmetry, reference_asymmetry):
     """Residual, mean gap along the normals, and how alike the asymmetries are, -1 to 1."""
-    end = best_pose(shape, reference)
+    end = _best_pose(shape, reference)
     above, below, there = _gaps(shape, reference, end)
     weight, reference_weight = shape.cloud.area, reference.cloud.area
     gap = weight @ np.abs(above) + reference_weight @ np.abs(below)
@@ -341,22 +341,22 @@ def _likeness(shape, reference, asymmetry, reference_asymmetry):
     return end[2], gap, alike
 
 
-AREA_DROPPED = 0.1
-UNITS = {10.0**e: f"10^{e}" for e in (-9, -6, -4, -3, -2, -1, 1, 2, 3, 4, 6, 9)}
-UNITS |= {25.4: "25.4", 1 / 25.4: "1/25.4", 2.54: "2.54", 1 / 2.54: "1/2.54"}  # inches
+_AREA_DROPPED = 0.1
+_UNITS = {10.0**e: f"10^{e}" for e in (-9, -6, -4, -3, -2, -1, 1, 2, 3, 4, 6, 9)}
+_UNITS |= {25.4: "25.4", 1 / 25.4: "1/25.4", 2.54: "2.54", 1 / 2.54: "1/2.54"}  # inches
 
 # Thresholds, chosen on synthetic brains, cats, faces and ten bodies (docs/plausibility.md)
-ODD_SIZE = 1.8  # times the size of the others, or less than one over it
-OTHER_SIZE = 3.0  # the same, that no anatomy has
+_ODD_SIZE = 1.8  # times the size of the others, or less than one over it
+_OTHER_SIZE = 3.0  # the same, that no anatomy has
 SPREADS = 5.0  # times the usual spread of a size, a boundary or a form: a warning
-EXTENT_SPREADS = 7.0  # the same of extents, which poses change
+_EXTENT_SPREADS = 7.0  # the same of extents, which poses change
 FAR = 8.0  # the same: doubtful
-FIT = 0.12  # least spread of the logarithm of the residual
-BOUNDARY = 0.12  # least spread of lengths over sqrt(area)
+_FIT = 0.12  # least spread of the logarithm of the residual
+_BOUNDARY = 0.12  # least spread of lengths over sqrt(area)
 SAME = 1e-4  # largest difference of two files of one scan, of every number below
-CROSSING = 0.01  # share of the triangles that pass through others
-LATTICE = 0.2  # step of rounded coordinates, of the median edge
-MUCH_MORE = 10.0  # times the others' share of crossing triangles, or step
+_CROSSING = 0.01  # share of the triangles that pass through others
+_LATTICE = 0.2  # step of rounded coordinates, of the median edge
+_MUCH_MORE = 10.0  # times the others' share of crossing triangles, or step
 CLOSE = 2.0  # times the usual residual; a part is no mirror image
 
 
@@ -395,10 +395,10 @@ KINDS = {
 }
 # fmt: on
 # kind: attribute of the evidence, and the least that is told where it is many times the others'
-MUCH_MORE_OF = {"intersections": ("intersecting", CROSSING), "spacing": ("lattice", LATTICE)}
+_MUCH_MORE_OF = {"intersections": ("intersecting", _CROSSING), "spacing": ("lattice", _LATTICE)}
 
 
-class Doubt(NamedTuple):
+class _Doubt(NamedTuple):
     """What looks wrong with a shape: a key of :data:`KINDS`, its words, whether it is doubtful."""
 
     kind: str
@@ -406,10 +406,10 @@ class Doubt(NamedTuple):
     doubtful: bool
 
 
-Doubts = dict[str, list[Doubt]]  # name of a shape -> what looks wrong with it
+Doubts = dict[str, list[_Doubt]]  # name of a shape -> what looks wrong with it
 
 
-def doubt(kind: str, doubtful: bool | None = None, **found: Any) -> Doubt:
+def doubt(kind: str, doubtful: bool | None = None, **found: Any) -> _Doubt:
     """A doubt of a kind, whose words take what was `found`.
 
     The kind says whether it makes the shape doubtful, unless that is given.
@@ -421,10 +421,10 @@ def doubt(kind: str, doubtful: bool | None = None, **found: Any) -> Doubt:
     'genus 1, but 0 in 5 of 6 shapes; wrap=True closes tunnels'
     """
     usually, words, _ = KINDS[kind]
-    return Doubt(kind, words.format(**found), usually if doubtful is None else bool(doubtful))
+    return _Doubt(kind, words.format(**found), usually if doubtful is None else bool(doubtful))
 
 
-def in_words(doubts: list[Doubt]) -> str:
+def in_words(doubts: list[_Doubt]) -> str:
     """The sentences of all doubts about a shape, as they stand in the report's ``warning``."""
     return "; ".join(one.words for one in doubts)
 
@@ -454,7 +454,7 @@ def find_warnings(
     checks = [_dropped(attrs), _sizes(attrs, of_all), _genus(attrs, of_all)]
     if len(seen) > 1:
         checks += [_much_more("intersections", seen), _duplicates(seen), _mirrored(seen, of_all)]
-    if len(seen) >= ENOUGH:
+    if len(seen) >= _ENOUGH:
         checks += [_boundaries(seen), _much_more("spacing", seen), _forms(seen, told)]
     for check in checks:
         for name, one in check:
@@ -464,7 +464,7 @@ def find_warnings(
 
 def _dropped(attrs):
     for name, said in attrs.items():
-        if said.get("area_dropped", 0) > AREA_DROPPED:
+        if said.get("area_dropped", 0) > _AREA_DROPPED:
             yield name, doubt("dropped", percent=100 * said["area_dropped"])
 
 
@@ -482,15 +482,15 @@ def _sizes(attrs, of_all):
     _different_units(attrs, of_all)
     if len(names) < 2:
         return
-    far = np.abs(excess(values, SIZE)) if len(names) >= ENOUGH else np.zeros(len(names))
+    far = np.abs(excess(values, SIZE)) if len(names) >= _ENOUGH else np.zeros(len(names))
     for i in np.flatnonzero(group) if group.any() else range(len(names)):
         usual = np.median(values[~group] if len(names) > 2 else np.delete(values, i))
         ratio = np.exp(values[i] - usual)
         off = max(ratio, 1 / ratio)
-        if off >= OTHER_SIZE or (off > ODD_SIZE and (far[i] > SPREADS or group[i])):
-            unit = next((text for factor, text in UNITS.items() if _near(ratio, factor)), None)
+        if off >= _OTHER_SIZE or (off > _ODD_SIZE and (far[i] > SPREADS or group[i])):
+            unit = next((text for factor, text in _UNITS.items() if _near(ratio, factor)), None)
             kind = "unit" if unit else "size"
-            yield names[i], doubt(kind, off > OTHER_SIZE or bool(unit), ratio=ratio, unit=unit)
+            yield names[i], doubt(kind, off > _OTHER_SIZE or bool(unit), ratio=ratio, unit=unit)
 
 
 def _near(ratio, factor):
@@ -508,7 +508,7 @@ def _two_sizes(values):
     cut = 1 + int(np.argmax(step))
     low, high = order[:cut], order[cut:]
     within = max(np.ptp(values[low]), np.ptp(values[high]))
-    if min(len(low), len(high)) >= 2 and step[cut - 1] >= max(np.log(ODD_SIZE), 2 * within):
+    if min(len(low), len(high)) >= 2 and step[cut - 1] >= max(np.log(_ODD_SIZE), 2 * within):
         # of as many on both sides the first name stays
         odd[low if (len(low), 0 in low) < (len(high), 0 in high) else high] = True
     return odd
@@ -538,11 +538,11 @@ def _genus(attrs, of_all):
 
 def _much_more(kind, evidence):
     """Those with more than the least of a number, and many times the usual of the others."""
-    attr, least = MUCH_MORE_OF[kind]
+    attr, least = _MUCH_MORE_OF[kind]
     values = np.array([seen.attrs[attr] for seen in evidence.values()])
     for i, (name, seen) in enumerate(evidence.items()):
         usual = max(float(np.median(np.delete(values, i))), 0.0)
-        if values[i] > max(least, MUCH_MORE * usual):
+        if values[i] > max(least, _MUCH_MORE * usual):
             percent = {"percent": 100 * values[i], "usual_percent": 100 * usual}
             number = seen.attrs["self_intersections"]
             yield name, doubt(kind, value=values[i], usual=usual, number=number, **percent)
@@ -554,7 +554,7 @@ def _duplicates(evidence):
     A reflection changes the sign of the chirality, which of a symmetric shape is none.
     """
     chirality = [seen.attrs["chirality"] for seen in evidence.values()]
-    numbers = np.column_stack([in_numbers(list(evidence.values())), chirality])
+    numbers = np.column_stack([_in_numbers(list(evidence.values())), chirality])
     names = list(evidence)
     first: dict[int, int] = {}
     for i, j in sorted(cKDTree(numbers).query_pairs(SAME, p=np.inf)):
@@ -591,7 +591,7 @@ def _mirrored(evidence, of_all):
 
 def _boundaries(evidence):
     length = np.array([seen.attrs["open_boundary"] for seen in evidence.values()])
-    for i, (name, more) in enumerate(zip(evidence, excess(length, BOUNDARY), strict=True)):
+    for i, (name, more) in enumerate(zip(evidence, excess(length, _BOUNDARY), strict=True)):
         if more > SPREADS:
             usual = np.median(np.delete(length, i))
             yield name, doubt("partial", value=length[i], usual=usual)
@@ -601,11 +601,11 @@ def _forms(evidence, told):
     """Those unlike the others; where something is told already, that may be the reason."""
     seen = list(evidence.values())
     fit = np.log([max(float(np.nanmedian(one["fit"])), 1e-9) for one in seen])
-    _, compactness, *moment = in_numbers(seen).T
+    _, compactness, *moment = _in_numbers(seen).T
     # of extents: poses change them most, so that they need more
-    extents = np.abs(excess(np.array(moment).T, MOMENT)).max(1) * SPREADS / EXTENT_SPREADS
+    extents = np.abs(excess(np.array(moment).T, MOMENT)).max(1) * SPREADS / _EXTENT_SPREADS
     far = {
-        "its distance from them after alignment is": excess(fit, FIT),
+        "its distance from them after alignment is": excess(fit, _FIT),
         "its volume for its area is": np.abs(excess(compactness, COMPACTNESS)),
         "its extents are": extents,
     }
@@ -631,7 +631,7 @@ class Decision(NamedTuple):
     remedy: str
 
 
-def _by_kind(kinds: dict[str, str]) -> list[Decision]:
+def _by_kind(kinds):
     """One decision for each kind, that of most shapes first; `kinds` of a shape are words."""
     names: dict[str, list[str]] = {}
     for name, words in kinds.items():

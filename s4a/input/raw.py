@@ -25,20 +25,20 @@ import numpy as np
 
 LARGEST_FILE = 2**31  # bytes that are read of one file: 50 million vertices and their triangles
 CHUNK = 2**20  # bytes that are read at a time
-OTHER_KINDS = {
+_OTHER_KINDS = {
     stat.S_IFIFO: "a named pipe",
     stat.S_IFSOCK: "a socket",
     stat.S_IFCHR: "a device",
     stat.S_IFBLK: "a device",
     stat.S_IFDIR: "a folder",
 }
-WORKBOOKS = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")  # of Excel or LibreOffice, new and old
+_WORKBOOKS = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")  # of Excel or LibreOffice, new and old
 
-AnyPath = str | os.PathLike[str]
+_AnyPath = str | os.PathLike[str]
 
 
 @contextmanager
-def regular_file(path: AnyPath) -> Iterator[BinaryIO]:
+def regular_file(path: _AnyPath) -> Iterator[BinaryIO]:
     """A regular file, open for reading.
 
     A pipe would let a run wait for ever, and a device fill the memory.
@@ -65,7 +65,7 @@ def regular_file(path: AnyPath) -> Iterator[BinaryIO]:
 def _check_regular(status):
     kind = stat.S_IFMT(status.st_mode)
     if kind != stat.S_IFREG:
-        raise ValueError(f"a regular file expected, found {OTHER_KINDS.get(kind, 'another kind')}")
+        raise ValueError(f"a regular file expected, found {_OTHER_KINDS.get(kind, 'another kind')}")
     _check_size(status.st_size)
 
 
@@ -76,7 +76,7 @@ def _check_size(size):
         )
 
 
-def check_there(path: AnyPath) -> None:
+def check_there(path: _AnyPath) -> None:
     """ValueError where nothing has this name, not even a link that leads nowhere."""
     try:
         os.lstat(path)
@@ -87,7 +87,7 @@ def check_there(path: AnyPath) -> None:
 
 
 @contextmanager
-def reading(path: AnyPath, what: str) -> Iterator[None]:
+def reading(path: _AnyPath, what: str) -> Iterator[None]:
     """Whatever is wrong with a file, a ValueError that names it and `what` it was read as."""
     try:
         yield
@@ -108,7 +108,7 @@ def read_all(file: BinaryIO) -> bytes:
     return data.getvalue()
 
 
-def read_bytes(path: AnyPath) -> bytes:
+def read_bytes(path: _AnyPath) -> bytes:
     """The bytes of a regular file; ValueError where there is none, see :func:`regular_file`."""
     with regular_file(path) as file:
         return read_all(file)
@@ -145,7 +145,7 @@ def text_of(data: bytes) -> str:
     ValueError: text in UTF-8 expected, found the byte 0xe2 in line 1: it seems to be Latin-1 or
     Windows-1252, where that is 'â'; save it as CSV UTF-8
     """
-    if data.startswith(WORKBOOKS):
+    if data.startswith(_WORKBOOKS):
         raise ValueError("text expected, found a workbook or an archive: export it as CSV UTF-8")
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) or _every_other_is_nul(data):
         raise ValueError("text in UTF-8 expected, found UTF-16: save it as CSV UTF-8")
@@ -176,8 +176,8 @@ def _every_other_is_nul(data):
 
 LARGEST = 2**30  # bytes that a file may unpack to: 30 million vertices and their triangles
 LEAST = 2**26  # unpacked size that is never refused
-RATIO = 200  # times the size of the file that it may unpack to beyond that
-GZIP = b"\x1f\x8b"
+_RATIO = 200  # times the size of the file that it may unpack to beyond that
+_GZIP = b"\x1f\x8b"
 
 
 def limit_of(size: int, least: int = LEAST) -> int:
@@ -189,7 +189,7 @@ def limit_of(size: int, least: int = LEAST) -> int:
     >>> limit_of(1000) == LEAST, limit_of(10**6), limit_of(10**9) == LARGEST
     (True, 200000000, True)
     """
-    return min(LARGEST, max(least, RATIO * size))
+    return min(LARGEST, max(least, _RATIO * size))
 
 
 def check(unpacked: int, size: int, least: int = LEAST) -> None:
@@ -232,7 +232,7 @@ def gunzip(file: BinaryIO, least: int = LEAST) -> bytes:
 def content(path: Path | str, least: int = LEAST) -> bytes:
     """The bytes of a regular file, unpacked where it is compressed by gzip."""
     with regular_file(path) as file:
-        is_packed = file.read(len(GZIP)) == GZIP
+        is_packed = file.read(len(_GZIP)) == _GZIP
         file.seek(0)
         return gunzip(file, least) if is_packed else read_all(file)
 

@@ -17,7 +17,7 @@ from s4a.schema import covariate
 log = logging.getLogger(__name__)
 
 MISSING = ("", "-", "na", "n/a", "nan", "#n/a", "null")  # cells without a value, in lower case
-PERSON = re.compile(r"(subject|participant|patient|person)([ _-]?(id|nr|no))?", re.IGNORECASE)
+_PERSON = re.compile(r"(subject|participant|patient|person)([ _-]?(id|nr|no))?", re.IGNORECASE)
 
 
 def _head_and_rows(path):
@@ -101,7 +101,7 @@ def read_table(path: Path | str, names: list[str]) -> xr.Dataset:
             )
         if odd := odd_cells(values.tolist()) if values.dtype.kind == "U" else []:
             log.warning("%s: the column %r %s", path, name, odd_words(odd, names, values))
-        if PERSON.fullmatch(name):
+        if _PERSON.fullmatch(name):
             _tell_repeated(path, name, values, names)
     return subjects(columns, names, str(path))
 
@@ -131,17 +131,13 @@ def read_cells(path: Path | str, names: Sequence[str]) -> dict[str, dict[str, st
 def _values(cells):
     """Integers, floats or strings, whatever all cells are."""
     known = [c for c in cells if not is_missing(c)]
-    if not known or not all(map(is_plain_number, known)):
+    digits = {c for c in known if c.lstrip("+-").isdigit()}
+    are_numbers = bool(known) and all(map(is_plain_number, known))
+    # 01 and 1, or of more digits than a number, would become one
+    if not are_numbers or len({float(c) for c in digits}) < len(digits):
         return np.array(["" if is_missing(c) else c for c in cells])
     numbers = np.array([np.nan if is_missing(c) else float(c) for c in cells])
-    digits = {c for c in known if c.lstrip("+-").isdigit()}
-    if len({float(c) for c in digits}) < len(digits):  # 01 and 1, or of more digits than a number
-        return np.array(["" if is_missing(c) else c for c in cells])
-    whole = (
-        len(known) == len(cells)
-        and all(c.lstrip("+-").isdigit() for c in cells)
-        and (abs(numbers) < 2**53).all()
-    )
+    whole = all(c in digits for c in cells) and (abs(numbers) < 2**53).all()
     return numbers.astype(np.int64) if whole else numbers
 
 
@@ -154,12 +150,9 @@ def _tell_repeated(path, column, values, names):
     again = [f"{value}: {', '.join(of)}" for value, of in shapes_of.items() if len(of) > 1]
     if again:
         log.warning(
-            "%s: %d values of the column %r stand for several shapes (%s); the tests take all "
-            "shapes as independent, so keep one of each, or their mean, or take growth",
-            path,
-            len(again),
-            column,
-            listed(again, "; "),
+            f"{path}: {len(again)} values of the column {column!r} stand for several shapes "
+            f"({listed(again, '; ')}); the tests take all shapes as independent, so keep one of "
+            "each, or their mean, or take growth"
         )
 
 

@@ -49,18 +49,18 @@ from s4a.method.shape import Basis, common_fields, field_columns
 from s4a.method.spectral import Diffusion
 from s4a.schema import Array
 
-N_STEPS = 8
-N_FURTHER = 5  # steps at most, where the last was nearly in vain
+_N_STEPS = 8
+_N_FURTHER = 5  # steps at most, where the last was nearly in vain
 # Of each step: from 1e-4 to 1e-7 by equal factors, and on.  Chosen on a pair of faces, of brains
 # and of skulls and two cortex templates, reported on others: docs/decisions.md
 STIFFNESS = 1e-4 * 1e-3 ** (np.arange(N_STEPS + N_FURTHER) / (N_STEPS - 1))
 # Of the first two steps, in which different starts meet, and of the others, in which vertices must
 # not drift along the surface any more
 SLIDE = (0.01, 0.1)
-SETTLED = 1.2  # as long as a step lets the bending energy grow by less than that factor
+_SETTLED = 1.2  # as long as a step lets the bending energy grow by less than that factor
 RIM_WEIGHT = 0.01  # share of sqrt(area): of distances at the boundary, by its length
-RIM_NEAR = 0.03  # share of sqrt(area): boundaries that are farther apart may be cut anywhere
-LANDMARK_WEIGHT = 1e-3  # of each landmark: as much as this share of the area
+_RIM_NEAR = 0.03  # share of sqrt(area): boundaries that are farther apart may be cut anywhere
+_LANDMARK_WEIGHT = 1e-3  # of each landmark: as much as this share of the area
 MEET = 0.01  # share of sqrt(area): starts that end nearer to each other than that go on as one
 TIME = (2e-2, 2e-4)  # of local rounds: smooth over 0.2, then over 0.02 of sqrt(area)
 LOCAL_SLIDE = 0.5
@@ -81,11 +81,11 @@ FOLLOWING = Schedule(STIFFNESS, N_FURTHER, 8, 1e-3)
 # report on but other collections
 MEETING = Schedule(np.array([1e-2, 1e-3]), 0, 32, 1e-4)
 Rows = Array | slice
-ALL = slice(None)
+_ALL = slice(None)
 
 
 def nearest_on_surface(
-    source: Basis, X: Array, normals: Array, target: Basis | None = None, vertices: Rows = ALL
+    source: Basis, X: Array, normals: Array, target: Basis | None = None, vertices: Rows = _ALL
 ) -> tuple[Array, Array]:
     """The points of the source's surface nearest to rows of X in position and normal.
 
@@ -119,9 +119,7 @@ def nearest_on_surface(
     return points, unit(normals)
 
 
-def points_ahead(
-    source: Basis, target: Basis, X: Array, vertices: Rows = ALL
-) -> tuple[Array, Array]:
+def _points_ahead(source, target, X, vertices=_ALL):
     """Where the target's vertices at X are drawn, and the directions across both surfaces there.
 
     All n of them, or some.
@@ -148,7 +146,7 @@ class Landmarks(NamedTuple):
 def rim_ahead(source: Basis, target: Basis, X: Array) -> tuple[Array, Array, Array, Array] | None:
     """Where the target's boundary, its vertices at X, is drawn, if both boundaries are one line.
 
-    They are where nine tenths of the vertices of each lie within :data:`RIM_NEAR` of the other.
+    They are where nine tenths of the vertices of each lie within ``_RIM_NEAR`` of the other.
     Scans may end anywhere, and holes are of one shape alone: such boundaries are left as they are.
 
     Returns
@@ -168,14 +166,14 @@ def rim_ahead(source: Basis, target: Basis, X: Array) -> tuple[Array, Array, Arr
     vertex = np.unique(target.rim)
     gap, nearest = source.rim_tree.query(X[vertex])
     back = cKDTree(X[vertex]).query(source.rim_tree.data)[0]
-    if max(np.quantile(gap, 0.9), np.quantile(back, 0.9)) > RIM_NEAR:
+    if max(np.quantile(gap, 0.9), np.quantile(back, 0.9)) > _RIM_NEAR:
         return None
     step = X[end] - X[start]
     tangent, length = np.zeros_like(X), np.zeros(len(X))
     for corner in (start, end):
         np.add.at(tangent, corner, step)
         np.add.at(length, corner, np.linalg.norm(step, axis=1) / 2)
-    near = gap < RIM_NEAR
+    near = gap < _RIM_NEAR
     vertex, nearest = vertex[near], nearest[near]
     across = unit(np.cross(unit(tangent[vertex]), target.normals_at(X)[vertex]))
     return vertex, length[vertex], across, source.rim_tree.data[nearest]
@@ -221,13 +219,13 @@ def normal_equations(
     return matrix, right.T.ravel()
 
 
-def spread_area(target: Basis, spread: Array) -> Array:
+def _spread_area(target, spread):
     """The area ``(s,)`` of the vertices nearest to each of some that are spread over a surface."""
     nearest = cKDTree(target.X[spread]).query(target.X)[1]
     return np.bincount(nearest, target.area, len(spread))
 
 
-def unmixed(E: Array, area: Array) -> Array:
+def _unmixed(E, area):
     """B ``(q, q)`` for which E B has the vertices at the start without their smooth part.
 
     Smooth functions and the start, three columns of E before its last, nearly depend on each other,
@@ -249,7 +247,7 @@ def pins(
     at, y = landmarks
     start = turn(at, R, t)  # (l, 3)
     E = np.concatenate([at.U @ smooth, start, np.ones((len(y), 1))], axis=1)
-    return E, np.full(len(y), LANDMARK_WEIGHT), y
+    return E, np.full(len(y), _LANDMARK_WEIGHT), y
 
 
 def step_of(matrix: Array, right: Array) -> Array:
@@ -307,14 +305,14 @@ def elastic_rounds(
     w[: len(c) - 1] = c[1:]
     w[-4:-1] = np.eye(3)
     w[-1] = c[0] * target.Phi[0, 0]
-    apart = unmixed(E, target.area)
+    apart = _unmixed(E, target.area)
     unlike = E @ apart
     at, pin_weight, pin = pins(landmarks, smooth, R, t)
     bending = np.zeros((len(w), 1))
     bending[: smooth.shape[1], 0] = target.eigenvalue[1:] ** 2
     X = E @ w
     energies: list[float] = []  # of bending, after each step
-    area = target.area if isinstance(vertices, slice) else spread_area(target, vertices)
+    area = target.area if isinstance(vertices, slice) else _spread_area(target, vertices)
     F = unlike[vertices]
     mass = F.T @ (area[:, None] * F)
     sure = len(schedule.stiffness) - schedule.further
@@ -373,6 +371,8 @@ def starts_that_meet(
     """
     spread = target.spread_vertices()
     met: dict[str, list[Warp]] = {}
+    stiff: dict[str, Any] = {"rounds": N_MEETING, "still": STILLEST, "further": 0}
+    stiff |= {"vertices": spread, "landmarks": landmarks}
     for name, start in starts.items():
         options: dict[str, Any] = {"vertices": spread, "landmarks": landmarks}
         warp = elastic_rounds(source, target, start, MEETING, **options)
@@ -395,9 +395,9 @@ def local_rounds(
     diffusion: Diffusion,
     X: Array,
     *,
-    time: tuple[float, float] = TIME,
-    slide: float = LOCAL_SLIDE,
-    rounds: int = N_LOCAL_ROUNDS,
+    time: tuple[float, float] = _TIME,
+    slide: float = _LOCAL_SLIDE,
+    rounds: int = _N_LOCAL_ROUNDS,
     pull: tuple[sp.csr_matrix, Array] | None = None,
 ) -> Array:
     """A displacement beyond that of elastic rounds, free at every vertex of low resolution.
@@ -426,11 +426,11 @@ def local_rounds(
     pinned, toward = None, 0.0
     if pull is not None:
         P, missing = pull
-        pinned = LANDMARK_WEIGHT * P.T @ P
-        toward = LANDMARK_WEIGHT * P.T @ missing
+        pinned = _LANDMARK_WEIGHT * P.T @ P
+        toward = _LANDMARK_WEIGHT * P.T @ missing
     d = np.zeros_like(X)
     for step in np.geomspace(*time, rounds):
-        y, m = points_ahead(source, target, X + d)
+        y, m = _points_ahead(source, target, X + d)
         way = y - X - d
         across = np.einsum("ni,ni->n", m, way)[:, None] * m
         goal = d + slide * way + (1 - slide) * across

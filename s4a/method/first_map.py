@@ -33,7 +33,7 @@ SHORT = 60  # functions of the short ZoomOut that a map is scored after
 FOUND = 0.07  # score at which the search ends; of wrong maps between bodies it is 0.11 or more
 
 
-class FirstMap(NamedTuple):
+class _FirstMap(NamedTuple):
     """A first map of a directed pair, and what it was made of."""
 
     name: str  # "dense", "landmarks", or of far poses that of best_first_map
@@ -50,7 +50,7 @@ def motion_onto(source: Basis, target: Basis) -> Motion:
     """
     at_source, at_target = corresponding_landmarks(source, target)
     P = source.X[at_source]
-    if len(P) < 3 or np.linalg.svd(P - P.mean(0), compute_uv=False)[1] < ON_A_LINE:
+    if len(P) < 3 or np.linalg.svd(P - P.mean(0), compute_uv=False)[1] < _ON_A_LINE:
         R, t, _ = align(source.X, source.area, target.X, target.area)
         return R, t
     R, t, _ = rigid_transform(P, target.X[at_target])
@@ -163,7 +163,7 @@ def best_first_map(
         That map before its step of ZoomOut; C where there was none.
     search : bool
         Whether to go on through :func:`paired_extremities` and :data:`SEARCHED` until the first two
-        terms of a score are below :data:`FOUND`.
+        terms of a score are below ``_FOUND``.
 
     Returns
     -------
@@ -175,7 +175,7 @@ def best_first_map(
     """
     k = min(SHORT, source.k, target.k)
     maps = [("icp", C, C if fitted is None else fitted)]
-    maps += map_of_landmarks(source, target, len(C))
+    maps += _map_of_landmarks(source, target, len(C))
     best = np.inf
     tried = []  # score, name, map, fit
     for one in itertools.chain(maps, maps_of_signatures(source, target, len(C), search)):
@@ -185,14 +185,14 @@ def best_first_map(
         gap = joint.registration_score(source, target, end[0], target.moved_to(image))
         score = gap + stretch(target, image)
         best = min(best, score)
-        bent = BENT * fmap.curvature_gap(source, target, end[0]) if search else 0.0
+        bent = _BENT * fmap.curvature_gap(source, target, end[0]) if search else 0.0
         tried.append((score + bent, *one))
-        if len(tried) >= 2 + len(maps) and best < FOUND:
+        if len(tried) >= 2 + len(maps) and best < _FOUND:
             break
     return min(tried, key=lambda one: one[0])[1:]
 
 
-def map_of_landmarks(source: Basis, target: Basis, k: int) -> list[tuple[str, Array, Array]]:
+def _map_of_landmarks(source, target, k):
     """Name, first map and its fit ``(k, k)`` of wave kernels and landmarks, if both have three."""
     landmarks = corresponding_landmarks(source, target)
     if len(landmarks[0]) < 3:
@@ -219,7 +219,7 @@ def maps_of_signatures(
     for kind, share, oriented in SEARCHED:
         size = min(max(4, round(share * k)), source.k, target.k)
         fitted = fmap.fmap_from_descriptors(
-            source, target, k=size, kind=kind, oriented=oriented, curvature=CURVATURE
+            source, target, k=size, kind=kind, oriented=oriented, curvature=_CURVATURE
         )
         if size < k:
             fitted = fmap.zoomout(source, target, fitted, k, step=k)[0]
@@ -275,7 +275,7 @@ def paired_extremities(source: Basis, target: Basis) -> list[tuple[Array, Array]
     return list(ways.values())[:N_PAIRED]
 
 
-def have_signatures(source: Basis, target: Basis, k: int) -> bool:
+def _have_signatures(source, target, k):
     """Whether the first k eigenvalues of both, less those of 0, have a range in common.
 
     Those of a surface in many pieces may be 0 all.
@@ -290,7 +290,7 @@ def first_map(
 ) -> FirstMap:
     """:func:`map_after_motion`, or :func:`best_first_map` where poses are far apart.
 
-    The latter only where `init` is dense and there are signatures, :func:`have_signatures`.
+    The latter only where `init` is dense and there are signatures, ``_have_signatures``.
 
     Parameters
     ----------

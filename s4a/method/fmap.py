@@ -379,7 +379,7 @@ def fit(
     return C
 
 
-def commutator(source: Array, target: Array) -> Array:
+def _commutator(source, target):
     """(mu_i - lambda_j)^2 / lambda_max^2 ``(k_target, k_source)``, small where C may be large.
 
     Weighted by it, the squared entries of C say how far C is from commuting with the Laplacians.
@@ -387,7 +387,7 @@ def commutator(source: Array, target: Array) -> Array:
     return ((target[:, None] - source) / max(source[-1], target[-1])) ** 2
 
 
-def constant_to_constant(source: Basis, target: Basis) -> float:
+def _constant_to_constant(source, target):
     """C[0, 0] of a map that takes constants to constants: the product of their signs."""
     return np.sign(source.Phi[0, 0] * target.Phi[0, 0])
 
@@ -422,8 +422,8 @@ def fmap_from_landmarks(
         F = landmark_coefficients(end.Phi, kernel, landmark)  # (k, 8 p)
         coefficients.append(F / np.linalg.norm(F, axis=0))
     F, G = coefficients
-    penalty = commute * np.trace(F @ F.T) * commutator(source.eigenvalue, target.eigenvalue)
-    return fit(F, G, penalty=penalty, constant=constant_to_constant(source, target))
+    penalty = commute * np.trace(F @ F.T) * _commutator(source.eigenvalue, target.eigenvalue)
+    return fit(F, G, penalty=penalty, constant=_constant_to_constant(source, target))
 
 
 def fmap_from_descriptors(

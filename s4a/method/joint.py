@@ -190,7 +190,7 @@ def registration_score(
     The round trip goes from a vertex of the target to its match and back to the vertex whose
     registered position (in position and normal) is nearest, measured along the edges of the target
     and cut at `limit`; the gaps are the mean distances of the registered target and the source, at
-    the vertices near coarse ones of each; to them comes :func:`landmark_gap`.  Lengths are for unit
+    the vertices near coarse ones of each; to them comes ``_landmark_gap``.  Lengths are for unit
     area.
 
     Stretch of edges is left out: on heads and brains with known warps it prefers maps that move
@@ -214,10 +214,10 @@ def registration_score(
     sample = target.outwards[np.linspace(0, len(match) - 1, n_samples).astype(int)]
     end = tree.query(source.tree.data[match[sample]])[1]
     trip = path_lengths(target.graph, rows[sample], end, limit)
-    return float(trip.mean() + gap.mean() + back_gap.mean() + landmark_gap(source, target, X))
+    return float(trip.mean() + gap.mean() + back_gap.mean() + _landmark_gap(source, target, X))
 
 
-def landmark_gap(source: Basis, target: Basis, X: Array) -> float:
+def _landmark_gap(source, target, X):
     """Mean distance of the landmarks that both have, the target's vertices at X; 0 without any."""
     at_source, at_target = corresponding_landmarks(source, target)
     if len(at_source) == 0:

@@ -41,13 +41,13 @@ from s4a.schema import Array, dataset
 
 log = logging.getLogger(__name__)
 
-FINAL = 3  # shapes of a study in the last rounds of a new one, on all vertices
+_FINAL = 3  # shapes of a study in the last rounds of a new one, on all vertices
 TARGETS = 256  # shapes whose least squares are held at once, 0.3 GB of them
 WIDE = 4  # last rounds of Consistent ZoomOut, which look between the samples, too
 N_AROUND = 32  # vertices around a sample among which they look
 ROUGH, FINE = 1e-4, 1e-6  # tolerances of the latent basis: on the way, and at the end
 
-Form = Callable[[Array], Array]  # the product of a quadratic form with vectors
+_Form = Callable[[Array], Array]  # the product of a quadratic form with vectors
 
 
 def consistency_form(
@@ -59,7 +59,7 @@ def consistency_form(
     *,
     dtype: type = float,
     n_jobs: int | None = 1,
-) -> Form:
+) -> _Form:
     """The quadratic form sum w |C_ij Y_i - Y_j|^2 of the stacked Y, as its product with vectors.
 
     A map C_ij adds four blocks of k x k::
@@ -122,7 +122,7 @@ def consistency_form(
     return apply
 
 
-def spanning_start(C: Array, source: Array, target: Array, n: int) -> Array:
+def _spanning_start(C, source, target, n):
     """The first guess of all Y ``(n, k, k)``: maps composed along a tree.
 
     Its root, where Y is the identity, is the shape from which most maps start.
@@ -146,7 +146,7 @@ def spanning_start(C: Array, source: Array, target: Array, n: int) -> Array:
 
 
 def smallest_eigenvectors(
-    apply: Form, start: Array, *, tolerance: float = FINE, max_rounds: int = 100
+    apply: _Form, start: Array, *, tolerance: float = FINE, max_rounds: int = 100
 ) -> Array:
     """The eigenvectors of the smallest eigenvalues of a positive semi-definite form ``(n, m)``.
 
@@ -179,12 +179,12 @@ def smallest_eigenvectors(
         residual = np.linalg.norm(LV @ R[:, :m] - V[:, :m] * ritz[:m], axis=0)  # (m,)
         if residual.max() <= tolerance * top:
             return V[:, :m]
-        V = np.linalg.qr(chebyshev_filter(apply, V, ritz[0], ritz[-1], top))[0]
+        V = np.linalg.qr(_chebyshev_filter(apply, V, ritz[0], ritz[-1], top))[0]
     log.warning("the latent basis reached %d rounds before its tolerance", max_rounds)
     return V[:, :m]
 
 
-def chebyshev_filter(apply: Form, V: Array, least: float, cut: float, top: float) -> Array:
+def _chebyshev_filter(apply, V, least, cut, top):
     """T(L) V, with T the Chebyshev polynomial that is small on [cut, top] and 1 at `least`.
 
     Of degree d it damps by about cosh(2 d sqrt(cut / top)): by ten with the degree taken here.
@@ -241,7 +241,7 @@ def latent_basis(
     """
     n, k = len(eigenvalues), C.shape[1]
     m = k if m is None else m
-    start = spanning_start(C, source, target, n).reshape(n * k, k)[:, :m]
+    start = _spanning_start(C, source, target, n).reshape(n * k, k)[:, :m]
     dtype = np.float32 if tolerance >= ROUGH else float
     form = consistency_form(C, source, target, weight, n, dtype=dtype, n_jobs=n_jobs)
     Y = smallest_eigenvectors(form, start, tolerance=tolerance).reshape(n, k, m) * np.sqrt(n)
@@ -338,7 +338,7 @@ def consistent_zoomout(
     eigenvalues = np.stack([one.eigenvalue for one in sampled])
     sizes = [*range(C.shape[1], k, step), k]
     if samples is not None and len(sizes) > 1:
-        check_samples(sampled, k)
+        _check_samples(sampled, k)
     wide_sizes = sizes[:-1][max(len(sizes) - 1 - wide, 0) :]
     for size, next_size in zip(
         sizes, [*sizes[1:], None], strict=True
@@ -357,11 +357,11 @@ def consistent_zoomout(
         if next_size:
             del C  # those of two sizes need not be in memory
             of_all = bases if size in wide_sizes else None
-            C = larger_maps(sampled, Y, source, target, next_size, of_all, n_jobs)
+            C = _larger_maps(sampled, Y, source, target, next_size, of_all, n_jobs)
     return C, weight, error, Y, latent_eigenvalue
 
 
-class Sampled(NamedTuple):
+class _Sampled(NamedTuple):
     """What Consistent ZoomOut holds of a shape in memory: its functions at its samples.
 
     ``eigenvalue (k,)``; its vertices ``at (s,)``, ``Phi (s, >= k)`` and ``area (s,)`` there; the
@@ -376,7 +376,7 @@ class Sampled(NamedTuple):
     n: int  # vertices of the shape
 
 
-def check_samples(sampled: list[Sampled], k: int) -> None:
+def _check_samples(sampled, k):
     """ValueError where a shape has samples, not all its vertices, too few for k functions."""
     least = PER_FUNCTION * k
     fewest = min((len(one.at) for one in sampled if len(one.at) < one.n), default=least)
@@ -387,29 +387,21 @@ def check_samples(sampled: list[Sampled], k: int) -> None:
         )
 
 
-def sample(basis: Basis, vertex: Array | None, k: int, n_around: int) -> Sampled:
+def sample(basis: Basis, vertex: Array | None, k: int, n_around: int) -> _Sampled:
     """A shape at some of its vertices, or at all where None, and so many around each."""
     eigenvalue = basis.eigenvalue[:k]
     if vertex is None:
         every = np.arange(len(basis.area))
-        return Sampled(eigenvalue, every, basis.Phi, basis.area, every[:, None], len(every))
+        return _Sampled(eigenvalue, every, basis.Phi, basis.area, every[:, None], len(every))
     around = vertex[:, None]
     if n_around > 1:
         first = np.arange(1, min(n_around, len(basis.X)) + 1)
         around = cKDTree(basis.X).query(basis.X[vertex], first)[1]
     Phi, area = basis.Phi[vertex], basis.area[vertex]
-    return Sampled(eigenvalue, vertex, Phi, area, around, len(basis.area))
+    return _Sampled(eigenvalue, vertex, Phi, area, around, len(basis.area))
 
 
-def larger_maps(
-    sampled: list[Sampled],
-    Y: Array,
-    source: Array,
-    target: Array,
-    k: int,
-    bases: Sequence[Basis] | None,
-    n_jobs: int | None = 1,
-) -> Array:
+def _larger_maps(sampled, Y, source, target, k, bases, n_jobs=1):
     """Maps ``(p, k, k)`` from the matches of latent functions (eq. 3), one step of ZoomOut each.
 
     Parameters
@@ -424,7 +416,7 @@ def larger_maps(
     """
     size = Y.shape[1]
     C = np.empty((len(target), k, k))
-    match = sample_matches(sampled, Y, source, target, n_jobs)
+    match = _sample_matches(sampled, Y, source, target, n_jobs)
 
     def solver_and_query(j):
         """The least squares of shape j, factored, and what is looked for."""
@@ -453,9 +445,7 @@ def larger_maps(
     return C
 
 
-def sample_matches(
-    sampled: list[Sampled], Y: Array, source: Array, target: Array, n_jobs: int | None = 1
-) -> list[Array]:
+def _sample_matches(sampled, Y, source, target, n_jobs=1):
     """For every map, the source's sample that is nearest to each of the target's (eq. 3).
 
     Maps there and back between two shapes take one matrix product.
@@ -511,16 +501,7 @@ def frozen_basis(C_out: Array, C_in: Array, Y: Array) -> Array:
     return np.linalg.solve(left, right)
 
 
-def latent_basis_of_new(
-    new: Basis,
-    others: list[Basis],
-    Y: Array,
-    C: list[Array],
-    *,
-    step: int = 5,
-    n_spread: int = N_SPREAD,
-    rounds: int = 2,
-) -> Array:
+def _latent_basis_of_new(new, others, Y, C, *, step=5, n_spread=N_SPREAD, rounds=2):
     """Latent basis of a new shape, those of all others frozen: Consistent ZoomOut of one shape.
 
     It starts from the first maps of the others; in every round the rows of the first latent
@@ -569,15 +550,15 @@ def latent_basis_of_new(
     for _ in range(rounds):
         query = Phi @ y
         C_out, C_in = [], []
-        for other, functions in zip(others[:FINAL], F, strict=False):
+        for other, functions in zip(others[:_FINAL], F, strict=False):
             Psi = other.Phi[:, :k]
             C_out.append(fmap_from_match(Phi, Psi, other.mass, nearest_rows(functions, query)))
             C_in.append(fmap_from_match(Psi, Phi, new.mass, nearest_rows(query, functions)))
-        y = frozen_basis(np.stack(C_out), np.stack(C_in), Y[:FINAL])
+        y = frozen_basis(np.stack(C_out), np.stack(C_in), Y[:_FINAL])
     return y
 
 
-NEIGHBOURS = 6  # shapes of the network whose maps a new one has
+_NEIGHBOURS = 6  # shapes of the network whose maps a new one has
 
 
 def nearest_spectra(own: Array, others: Sequence[Array], k: int) -> list[int]:
@@ -593,7 +574,7 @@ def nearest_spectra(own: Array, others: Sequence[Array], k: int) -> list[int]:
     """
     distance = spectral_distance([values[:k] for values in (own, *others)])[0]
     order = np.argsort(distance[2:], kind="stable")  # without itself and the first
-    return [0, *(1 + order[: NEIGHBOURS - 1]).tolist()]
+    return [0, *(1 + order[: _NEIGHBOURS - 1]).tolist()]
 
 
 def place(
@@ -631,7 +612,7 @@ def place(
         R, t = realign(new.cloud, other.cloud, start)
         back = R.T, -R.T @ t
         maps.append(first_map(other, new, back, k_init=k_init, n_spread=n_spread, **options).C)
-    return latent_basis_of_new(new, others, Y, maps, step=step, n_spread=n_spread)
+    return _latent_basis_of_new(new, others, Y, maps, step=step, n_spread=n_spread)
 
 
 def latent_of_new(Y: Array, eigenvalues: Array, latent_eigenvalue: Array, norm: str) -> xr.Dataset:

@@ -54,15 +54,7 @@ def smooth(
     return B
 
 
-def inverse_step(
-    W: sp.csr_matrix,
-    area: Array,
-    U: sp.csr_matrix,
-    W_coarse: sp.csr_matrix,
-    area_coarse: Array,
-    Phi: Array,
-    eigenvalue: Array,
-) -> Array:
+def _inverse_step(W, area, U, W_coarse, area_coarse, Phi, eigenvalue):
     r"""One cycle of two grids for W B = A (U Phi) Lambda, from B = U Phi.
 
     ::
@@ -100,7 +92,7 @@ def inverse_step(
     return smooth(S, R, B)
 
 
-def rayleigh_ritz(W: sp.csr_matrix, area: Array, B: Array, k: int) -> tuple[Array, Array]:
+def _rayleigh_ritz(W, area, B, k):
     """The k least eigenpairs in the span of B: eigenvalues ``(k,)`` and functions ``(n, k)``."""
     stiff = B.T @ (W.astype(B.dtype) @ B)
     mass = B.T @ (area.astype(B.dtype)[:, None] * B)
@@ -149,11 +141,11 @@ def lift(
     W, area = stiffness(E, w, len(X)), area / area.sum()
     E, w, a = (coarse[name].values for name in ("edge_vertex", "cotan_weight", "vertex_area"))
     Phi, eigenvalue = coarse["eigenfunction"].values, coarse["eigenvalue"].values
-    B = inverse_step(W, area, U, stiffness(E, w, len(a)), a / a.sum(), Phi, eigenvalue)
+    B = _inverse_step(W, area, U, stiffness(E, w, len(a)), a / a.sum(), Phi, eigenvalue)
     zero = eigenvalue == 0
     B[:, zero] = U @ Phi[:, zero]  # the constants of the pieces are eigenfunctions as they are
     n_zero = int(zero.sum())
-    eigenvalue, B = rayleigh_ritz(W, area, B, max(k, n_zero))
+    eigenvalue, B = _rayleigh_ritz(W, area, B, max(k, n_zero))
     eigenvalue[:n_zero] = 0.0  # descriptors would take rounding, 1e-5, for a frequency
     B[:, :n_zero] = with_constant_first(B[:, :n_zero], area)
     eigenvalue, B = eigenvalue[:k], B[:, :k]
@@ -228,14 +220,14 @@ def low_resolution(
         vertex = shape.cell[list(landmarks.values())]
         low = low.merge(dataset(guide_name=list(landmarks), guide_vertex=vertex))
     if fields:
-        values = np.stack([mean_over_cells(shape, one) for one in fields.values()], axis=1)
+        values = np.stack([_mean_over_cells(shape, one) for one in fields.values()], axis=1)
         weights = mesh["feature_weight"].values
         names = list(fields)
         low = low.merge(dataset(feature_name=names, feature_value=values, feature_weight=weights))
     return low
 
 
-def mean_over_cells(shape: Shape, values: Array) -> Array:
+def _mean_over_cells(shape, values):
     """Means of a field ``(n,)`` by the weights of U ``(n_coarse,)``; NaN where none is known."""
     known = np.isfinite(values)
     area = np.where(known, vertex_areas(*as_arrays(shape.original)), 0)

@@ -30,7 +30,7 @@ def conformal_differences(Y: Array, eigenvalues: Array, latent_eigenvalue: Array
     Constant modes are zero.
     """
     D = np.einsum("nkl,nk,nkm->nlm", Y, eigenvalues[:, : Y.shape[1]], Y)
-    constant = constant_modes(latent_eigenvalue)
+    constant = _constant_modes(latent_eigenvalue)
     D[:, constant] = 0
     D[:, :, constant] = 0
     return inverse(latent_eigenvalue)[None, :, None] * D
@@ -41,11 +41,11 @@ def inverse(latent_eigenvalue: Array, power: float = 1.0) -> Array:
 
     Constant modes map to 0.
     """
-    constant = constant_modes(latent_eigenvalue)
+    constant = _constant_modes(latent_eigenvalue)
     return np.where(constant, 0.0, np.where(constant, 1.0, latent_eigenvalue) ** -power)
 
 
-def constant_modes(latent_eigenvalue: Array) -> Array:
+def _constant_modes(latent_eigenvalue):
     """Which latent functions are constant on every component, ``(m,)``: one for each component."""
     constant = latent_eigenvalue < 1e-6 * np.max(latent_eigenvalue, initial=0.0)
     constant[:1] = True
@@ -68,7 +68,7 @@ def distance_to_identity(D: Array, latent_eigenvalue: Array, norm: str = "h2") -
     of_image, of_argument = NORMS[norm]
     weighted = (D - np.eye(D.shape[1])) * inverse(latent_eigenvalue, of_argument)  # (n, m, m)
     weighted = inverse(latent_eigenvalue, -of_image)[:, None] * weighted
-    varying = ~constant_modes(latent_eigenvalue)
+    varying = ~_constant_modes(latent_eigenvalue)
     return np.linalg.norm(weighted[:, varying][:, :, varying], axis=(1, 2))
 
 

@@ -13,7 +13,6 @@ exactly these are searched too::
       '---------'                          '---------'
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,8 +22,8 @@ from s4a.schema import Array
 
 BLOCK = 512  # cells of queries whose distances to all other cells are held at once
 PAIRS = 2048  # pairs of rows at a time: their differences, 0.8 MB in 100 dims, stay in the cache
-AROUND = 128  # queries whose rows around are gathered at once, 1.6 MB of 32 in 100 dims
-SLACK = 1 + 1e-5  # factor on bounds, for what float32 rounds away
+_AROUND = 128  # queries whose rows around are gathered at once, 1.6 MB of 32 in 100 dims
+_SLACK = 1 + 1e-5  # factor on bounds, for what float32 rounds away
 
 
 def nearest_rows(Q: Array, D: Array, *, block: int = 256) -> Array:
@@ -48,7 +47,7 @@ def nearest_rows(Q: Array, D: Array, *, block: int = 256) -> Array:
     length = np.linalg.norm(q[:, :-1], axis=1)
     rounding = 16 * np.finfo(np.float32).eps * longest * (length + longest)
     nearest = np.empty(len(q), np.int64)
-    for start, score in scores_in_blocks(q, d, block):
+    for start, score in _scores_in_blocks(q, d, block):
         best = score.argmax(axis=1)
         line = np.arange(len(best))
         least = score[line, best] - rounding[start : start + block]
@@ -73,7 +72,7 @@ def as_candidates(D: Array) -> Array:
     return np.ascontiguousarray(np.column_stack([d, np.einsum("ij,ij->i", d, d) / 2]).T)
 
 
-def scores_in_blocks(q: Array, d: Array, block: int = 256) -> Iterator[tuple[int, Array]]:
+def _scores_in_blocks(q, d, block=256):
     """The matrix product q d block by block: first row, and block; all in one array."""
     scores = np.empty((min(block, len(q)), d.shape[1]), np.float32)
     for start in range(0, len(q), block):
@@ -86,7 +85,7 @@ def nearest_float32(q: Array, d: Array) -> Array:
 
     They are those of :func:`as_queries` and :func:`as_candidates`.
     """
-    return np.concatenate([score.argmax(axis=1) for _, score in scores_in_blocks(q, d)])
+    return np.concatenate([score.argmax(axis=1) for _, score in _scores_in_blocks(q, d)])
 
 
 def nearest_both_ways(q: Array, d: Array) -> tuple[Array, Array]:
@@ -107,7 +106,7 @@ def nearest_both_ways(q: Array, d: Array) -> tuple[Array, Array]:
     of_q, of_d = np.empty(len(q), np.int64), np.zeros(d.shape[1], np.int64)
     highest = np.full(d.shape[1], -np.inf, np.float32)
     column = np.arange(d.shape[1])
-    for start, score in scores_in_blocks(q, d):
+    for start, score in _scores_in_blocks(q, d):
         end = start + len(score)
         of_q[start:end] = score.argmax(axis=1)
         score -= half[start:end, None]
@@ -145,11 +144,11 @@ def nearest_around(q: Array, rows: Array, near: Array) -> Array:
     [2, 6]
     """
     nearest = np.empty(len(q), np.int64)
-    for start in range(0, len(q), AROUND):
-        columns = near[start : start + AROUND]
-        score = rows.take(columns, axis=0) @ q[start : start + AROUND, :, None]  # (AROUND, w, 1)
+    for start in range(0, len(q), _AROUND):
+        columns = near[start : start + _AROUND]
+        score = rows.take(columns, axis=0) @ q[start : start + _AROUND, :, None]  # (AROUND, w, 1)
         best = score[:, :, 0].argmax(axis=1)
-        nearest[start : start + AROUND] = columns[np.arange(len(columns)), best]
+        nearest[start : start + _AROUND] = columns[np.arange(len(columns)), best]
     return nearest
 
 
@@ -178,10 +177,10 @@ def into_cells(rows: Array, cell: Array) -> Cells:
     start = np.concatenate([[0], np.cumsum(count)])
     center = np.add.reduceat(rows, start[:-1], axis=0) / count[:, None].astype(np.float32)
     gap = np.linalg.norm(rows - np.repeat(center, count, axis=0), axis=1)  # (n,)
-    return Cells(rows, order, start, center, np.maximum.reduceat(gap, start[:-1]) * SLACK)
+    return Cells(rows, order, start, center, np.maximum.reduceat(gap, start[:-1]) * _SLACK)
 
 
-def squared_distances(A: Array, B: Array) -> Array:
+def _squared_distances(A, B):
     """All squared distances ``(a, b)`` of float32 rows by one matrix product."""
     D = A @ B.T
     D *= -2
@@ -190,15 +189,15 @@ def squared_distances(A: Array, B: Array) -> Array:
     return np.maximum(D, 0, out=D)
 
 
-def least_distances(A: Array, B: Array) -> Array:
+def _least_distances(A, B):
     """Distances ``(a, b)`` of float32 rows, reduced by what rounding may have added."""
-    D = squared_distances(A, B)
+    D = _squared_distances(A, B)
     largest = np.einsum("ij,ij->i", A, A).max() + np.einsum("ij,ij->i", B, B).max()
     D -= 8 * np.finfo(np.float32).eps * largest
     return np.sqrt(np.maximum(D, 0, out=D), out=D)
 
 
-def search_cells(queries: Array, origin: Array, cells: Cells, which: Array) -> tuple[Array, Array]:
+def _search_cells(queries, origin, cells, which):
     """The nearest row of the cells `which` for each of `queries`, all compared with all.
 
     `queries` are relative to `origin`, a point near them, and the rows are made so: then small
@@ -213,14 +212,12 @@ def search_cells(queries: Array, origin: Array, cells: Cells, which: Array) -> t
     rows = np.concatenate([cells.rows[cells.start[c] : cells.start[c + 1]] for c in which])
     rows -= origin
     order = np.concatenate([cells.order[cells.start[c] : cells.start[c + 1]] for c in which])
-    D = squared_distances(queries, rows)  # (q, rows)
+    D = _squared_distances(queries, rows)  # (q, rows)
     column = D.argmin(axis=1)
     return D[np.arange(len(queries)), column], order[column]
 
 
-def search_pairs(
-    queries: Array, cells: Cells, who: Array, which: Array
-) -> tuple[Array, Array, Array]:
+def _search_pairs(queries, cells, who, which):
     """Compare the query ``who[i]`` with the rows of the cell ``which[i]``; `who` is sorted.
 
     Returns
@@ -245,7 +242,7 @@ def search_pairs(
     return who, least, np.minimum.reduceat(index, head)
 
 
-def keep_nearer(best: Array, index: Array, who: Array, gap: Array, found: Array) -> None:
+def _keep_nearer(best, index, who, gap, found):
     """Write in place what is nearer, or as near with a lower index, for the queries `who`."""
     nearer = (gap < best[who]) | ((gap == best[who]) & (found < index[who]))
     best[who[nearer]] = gap[nearer]
@@ -284,15 +281,15 @@ def nearest_of_few(Q: Array, D: Array, cell_d: Array, *, block: int = 256) -> Ar
     best, index = np.full(len(Q), np.inf, np.float32), np.full(len(Q), len(D))
     for i in range(0, len(Q), block):
         who = np.arange(i, min(i + block, len(Q)))
-        gap = least_distances(Q[who], cells.center)  # (block, cells)
+        gap = _least_distances(Q[who], cells.center)  # (block, cells)
         near = gap.argmin(axis=1)
-        keep_nearer(best, index, *search_pairs(Q, cells, who, near))
+        _keep_nearer(best, index, *_search_pairs(Q, cells, who, near))
         gap -= cells.radius  # no row of the cell is nearer
         gap[np.arange(len(who)), near] = np.inf
-        reached = gap <= np.sqrt(best[who])[:, None] * SLACK
+        reached = gap <= np.sqrt(best[who])[:, None] * _SLACK
         at, which = np.divmod(np.flatnonzero(reached), len(cells.center))
         if len(at):
-            keep_nearer(best, index, *search_pairs(Q, cells, who[at], which))
+            _keep_nearer(best, index, *_search_pairs(Q, cells, who[at], which))
     return index
 
 
@@ -341,27 +338,25 @@ def nearest_in_cells(
     compared = unsure = 0
     for c, origin in enumerate(queries.center):
         if c % BLOCK == 0:
-            gaps = least_distances(queries.center[c : c + BLOCK], cells.center)
+            gaps = _least_distances(queries.center[c : c + BLOCK], cells.center)
         gap = gaps[c % BLOCK]  # (cells,)
         here = slice(queries.start[c], queries.start[c + 1])
         rows = queries.rows[here] - origin  # (q, d)
         near = np.argpartition(gap, first - 1)[:first]
-        best, found = search_cells(rows, origin, cells, near)
+        best, found = _search_cells(rows, origin, cells, near)
         compared += len(rows) * size[near].sum()
         reach = gap - queries.radius[c] - cells.radius  # the bound of the figure
         reach[near] = np.inf
-        who, which = not_excluded(rows, origin, cells, reach, np.sqrt(best) * SLACK)
+        who, which = _not_excluded(rows, origin, cells, reach, np.sqrt(best) * _SLACK)
         if len(which):
-            keep_nearer(best, found, who, *search_cells(rows[who], origin, cells, which))
+            _keep_nearer(best, found, who, *_search_cells(rows[who], origin, cells, which))
             compared += len(who) * size[which].sum()
             unsure += len(who)
         index[queries.order[here]] = found
     return index, float(compared) / (len(Q) * len(D)), 1 - float(unsure) / len(Q)
 
 
-def not_excluded(
-    rows: Array, origin: Array, cells: Cells, reach: Array, bound: Array
-) -> tuple[Array, Array]:
+def _not_excluded(rows, origin, cells, reach, bound):
     """Queries for which a row nearer than their `bound` is possible, and the cells it can be in.
 
     `reach` is the least distance of each cell to any query; each query's own distance to the centre
@@ -370,6 +365,6 @@ def not_excluded(
     which = np.flatnonzero(reach <= bound.max())
     if len(which) == 0:
         return which, which
-    gap = least_distances(rows, cells.center[which] - origin)  # (q, cells)
+    gap = _least_distances(rows, cells.center[which] - origin)  # (q, cells)
     possible = gap - cells.radius[which] <= bound[:, None]
     return np.flatnonzero(possible.any(1)), which[possible.any(0)]

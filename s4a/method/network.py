@@ -68,14 +68,14 @@ def choose_pairs(distance: Array, n_pairs: int) -> Array:
             f"n_pairs = {n_pairs!r} cannot connect {n} shapes: give an integer from {n - 1} "
             f"(a tree) to {n * (n - 1) // 2} (all pairs)"
         )
-    wanted = np.concatenate([*tree_and_closing(distance), by_nearness(distance)])  # most first
+    wanted = np.concatenate([*_tree_and_closing(distance), _by_nearness(distance)])  # most first
     key = wanted.min(axis=1) * n + wanted.max(axis=1)
     _, first = np.unique(key, return_index=True)
     chosen = key[np.sort(first)[: int(n_pairs)]]
     return np.stack(np.divmod(np.sort(chosen), n), axis=1)
 
 
-def tree_and_closing(distance: Array) -> tuple[Array, Array]:
+def _tree_and_closing(distance):
     r"""Edges of a minimum spanning tree, and one more for each new shape that closes a triangle.
 
     Prim's algorithm from the most central shape.  A new shape is joined with its nearest shape in
@@ -113,7 +113,7 @@ def tree_and_closing(distance: Array) -> tuple[Array, Array]:
     return np.array(tree), np.array(closing, int).reshape(-1, 2)
 
 
-def by_nearness(distance: Array) -> Array:
+def _by_nearness(distance):
     """All pairs ``(n (n-1) / 2, 2)``, first those that are nearest for one of their two shapes."""
     apart = distance.copy()
     np.fill_diagonal(apart, np.inf)

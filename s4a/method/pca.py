@@ -19,7 +19,7 @@ BLOCK = 2**24  # numbers of all fields in a block of vertices: 128 MiB
 N_READ = 8  # blocks that are read from files at once, in single precision as they are there
 
 
-class PrincipalModes(NamedTuple):
+class _PrincipalModes(NamedTuple):
     """What :func:`gram_pca` finds in s fields: c modes, c at most s - 1.
 
     ``mean (n, d)``; ``deformation (c, n, d)`` of one standard deviation along each mode;
@@ -107,7 +107,7 @@ def principal_components(K: Array) -> tuple[Array, Array]:
     return fitted.eigenvalues_ / (len(K) - 1), fitted.eigenvectors_
 
 
-def gram_pca(fields: Array | xr.Variable, area: Array) -> PrincipalModes:
+def gram_pca(fields: Array | xr.Variable, area: Array) -> _PrincipalModes:
     """PCA of fields under the inner product of the vertex areas.
 
     Parameters
@@ -133,7 +133,7 @@ def gram_pca(fields: Array | xr.Variable, area: Array) -> PrincipalModes:
         modes /= np.sqrt(s - 1)
         deformation[:, block] = modes
     ratio = variance / variance.sum()
-    return PrincipalModes(mean, deformation, np.sqrt(variance), V * np.sqrt(s - 1), ratio)
+    return _PrincipalModes(mean, deformation, np.sqrt(variance), V * np.sqrt(s - 1), ratio)
 
 
 def low_vertices(coarse: xr.Dataset) -> Array:
@@ -150,7 +150,7 @@ def low_vertices(coarse: xr.Dataset) -> Array:
     return heaviest
 
 
-def smooth_low(d: Array, coarse: xr.Dataset, *, area_weighted: bool = True) -> Array:
+def _smooth_low(d, coarse, *, area_weighted=True):
     """Displacements at low resolution ``(s, n_coarse, 3)``, smoothed as those at full: Phi Phi^+ d.
 
     The line after eq. 8 without U, in the eigenfunctions of the coarse mesh, so that Fig. 5
@@ -187,9 +187,9 @@ def pca(
     coarse : xarray.Dataset, optional
         The template's low-resolution mesh; gives the shares of variance at low resolution as well,
         where the registration has ``displacement_low``.  They are of the matches of eq. 6, smoothed
-        by :func:`smooth_low` as those at full resolution are, and beside them of the matches as
+        by ``_smooth_low`` as those at full resolution are, and beside them of the matches as
         they are.
-    area_weighted : see :func:`smooth_low`
+    area_weighted : see ``_smooth_low``
 
     Returns
     -------
@@ -227,7 +227,7 @@ def pca(
     )
     if coarse is not None and "displacement_low" in registration:
         low = registration["displacement_low"].transpose("shape", "low_vertex", "xyz").values
-        smooth = smooth_low(low, coarse, area_weighted=area_weighted)
+        smooth = _smooth_low(low, coarse, area_weighted=area_weighted)
         smooth_ratio, raw_ratio = (
             np.pad(gram_pca(fields, coarse["vertex_area"].values).ratio, (0, len(d)))
             for fields in (smooth, low)
@@ -428,11 +428,7 @@ def pca_without(
         ) from error
     if not apart:
         return result
-    score, _ = project_scores(
-        registration["displacement"].sel(shape=apart).values,
-        result["mean_displacement"].values,
-        result["deformation"].values,
-        result["standard_deviation"].values,
-        area,
-    )
+    mean, deformation = result["mean_displacement"].values, result["deformation"].values
+    d, sd = registration["displacement"].sel(shape=apart), result["standard_deviation"].values
+    score, _ = project_scores(d.values, mean, deformation, sd, area)
     return result.merge(dataset(score_apart=score)).assign_coords(shape_apart=apart)

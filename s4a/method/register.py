@@ -131,11 +131,11 @@ def uncertainty(confidence: Array) -> Array:
 # lie on a wrong fold
 TORN = 0.65
 FEW = 2000  # vertices of low resolution: fewer smear tears
-SMEARED = 0.3  # by this share of TORN
-LOOSER = 4  # the step of elastic rounds with which they begin then, too
+_SMEARED = 0.3  # by this share of TORN
+_LOOSER = 4  # the step of elastic rounds with which they begin then, too
 # of score times tear: what looser rounds must leave at most.  Where they find the right fold they
 # leave 0.3 to 0.72; real heads 0.81 or more where the score falls at all (docs/decisions.md)
-MENDED = 0.75
+_MENDED = 0.75
 
 Functions = tuple[Array, Array]  # of source and target, rows of which are compared
 
@@ -315,7 +315,7 @@ def register(
     """
     check("alignment", alignment)
     candidates = find_candidates(source, target, starts, k=k, refine=refine, parts=parts)
-    by_icp = motion_in_unit(source, target, motion, scale) if alignment == "icp" else None
+    by_icp = _motion_in_unit(source, target, motion, scale) if alignment == "icp" else None
     # image = R x + t + U Phi c, smooth already: the line after eq. 8; or of elastic rounds
     placed, elastic = by_icp and (motion, by_icp[3]), refine == "elastic"
     match, moved, attrs = register_surface(
@@ -474,7 +474,7 @@ def register_surface(
         else:
             moved = N.moved_to(joint.move(N, warp))
             ends[name] = joint.registration_score(M, N, part, moved), moved
-    method = best_of(ends)
+    method = _best_of(ends)
     score, moved = ends[method]
     if method != "intrinsic":
         match = match_surfaces(moved.X, moved.normals, M.X, M.normals)
@@ -482,7 +482,7 @@ def register_surface(
     return match, moved, attrs
 
 
-def best_of(ends: dict[str, tuple[float, Basis]]) -> str:
+def _best_of(ends):
     """The name of the end of registration that has the lowest score."""
     return min(ends, key=lambda name: ends[name][0])
 
@@ -498,16 +498,16 @@ def tear(moved: Basis, target: Basis) -> float:
 
 
 def mends(end: tuple[float, Basis], torn: tuple[float, Basis], target: Basis) -> bool:
-    """Whether an end is better than a torn one, in score and tear together (:data:`MENDED`).
+    """Whether an end is better than a torn one, in score and tear together (``_MENDED``).
 
     Score alone falls where a looser template follows noise, which tears it more.  The lower score
-    decides among the ends that are left (:func:`best_of`).
+    decides among the ends that are left (``_best_of``).
     """
     before, after = (score * tear(moved, target) for score, moved in (torn, end))
-    return after < MENDED * before
+    return after < _MENDED * before
 
 
-def scored_alone(source: Basis, target: Basis, X: Array) -> tuple[float, Basis]:
+def _scored_alone(source, target, X):
     """Score of the registered target, matched by what is nearest to it, and that target."""
     moved = target.moved_to(X)
     match = joint.nearest_vertices(source, moved)
@@ -534,7 +534,7 @@ def elastic_surfaces(
     return surfaces
 
 
-def common_landmarks(source: Shape, target: Shape) -> Landmarks | None:
+def _common_landmarks(source, target):
     """The landmarks that both shapes have by name; None where there are none."""
     names, at_source = source.landmarks
     names_target, at_target = target.landmarks

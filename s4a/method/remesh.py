@@ -57,7 +57,7 @@ from s4a.seeds import RNG, seed_of
 GL = "install the system's libgl1 and libopengl0, or see `s4a doctor`"
 FIRST = 0.95  # share of n_coarse that is sampled first; mending faults needs the rest
 MOST = 1.1  # share of n_coarse from which on handles are cut, rather than more samples added
-CUTS = 3  # how often that is tried before samples are added without limit
+_CUTS = 3  # how often that is tried before samples are added without limit
 
 
 def sample_surface(
@@ -127,7 +127,7 @@ def laplacian(X: Array, T: Array, area: Array) -> tuple[Array, Array, Array, str
     return E, np.bincount(edge_of, half_cotangents(X, T), len(E)), area, "cotan"
 
 
-def sorted_mesh(X: Array, T: Array) -> tuple[Array, Array, Array]:
+def _sorted_mesh(X, T):
     """The mesh in an order of vertices and triangles that positions alone decide, and that order.
 
     The same surface gives the same coarse mesh, however its file numbers it.
@@ -142,9 +142,7 @@ def sorted_mesh(X: Array, T: Array) -> tuple[Array, Array, Array]:
     return X[order], T[lexical_order(np.stack([T[:, 2], first_two], axis=1))], order
 
 
-def coarse_surface(
-    X: Array, T: Array, n_coarse: int, seed: int = 0
-) -> tuple[Array, Array, Array, Array, dict[str, int]]:
+def _coarse_surface(X, T, n_coarse, seed=0):
     """Manifold dual of about `n_coarse` geodesic Voronoi cells.
 
     Returns
@@ -159,7 +157,7 @@ def coarse_surface(
     """
     V, F = X, T  # the surface as far as handles have been cut
     origin = np.arange(len(X))  # vertex of X that each of V is, -1 for the centre of a fan
-    for most in [MOST * n_coarse] * CUTS + [np.inf]:
+    for most in [MOST * n_coarse] * _CUTS + [np.inf]:
         graph = mesh_graph(V, F)
         centre = origin < 0
         n_first = max(4, round(FIRST * n_coarse))
@@ -182,11 +180,11 @@ def coarse_surface(
         "vertices_cut": int((cell < 0).sum()),
     }
     if attrs["vertices_cut"]:
-        cell = cell[nearest_along_edges(X, T, np.flatnonzero(cell >= 0))]
+        cell = cell[_nearest_along_edges(X, T, np.flatnonzero(cell >= 0))]
     return V[state.sample], dual(F, state.cell), origin[state.sample], cell, attrs
 
 
-def nearest_along_edges(X: Array, T: Array, among: Array) -> Array:
+def _nearest_along_edges(X, T, among):
     """The vertex of `among` that is nearest to each vertex along edges ``(n,)``."""
     G = edge_graph(X, edges(T))
     return dijkstra(G, indices=among, min_only=True, return_predecessors=True)[2]
@@ -238,7 +236,7 @@ def silence() -> Iterator[None]:
                 os.close(copy)
 
 
-def nearest_with_normal(X: Array, T: Array, V: Array, F: Array) -> Array:
+def _nearest_with_normal(X, T, V, F):
     """Vertex of (V, F) near each vertex of (X, T), on a side of a wall that faces the same way."""
     reach = 0.02 * np.linalg.norm(np.ptp(V, axis=0))
     tree = cKDTree(np.c_[V, reach * vertex_normals(V, F)])
@@ -362,18 +360,18 @@ def coarsen(
         "wrapped": int(bool(wrap)),
         "kept_whole": 0,
     }
-    X, T, order = sorted_mesh(*as_arrays(mesh))
-    V, F, _ = sorted_mesh(*alpha_wrap(X, T)) if wrap else (X, T, None)
+    X, T, order = _sorted_mesh(*as_arrays(mesh))
+    V, F, _ = _sorted_mesh(*alpha_wrap(X, T)) if wrap else (X, T, None)
     if len(V) <= n_coarse:
         Y, C = V, F
         sample = cell = np.arange(len(V))
         attrs.update(kept_whole=1, samples_first=len(V), samples_added=0, rounds=0, vertices_cut=0)
     else:
-        Y, C, sample, cell, counts = coarse_surface(V, F, n_coarse, seed)
+        Y, C, sample, cell, counts = _coarse_surface(V, F, n_coarse, seed)
         attrs |= counts
     if wrap:
         sample = np.full(len(Y), -1)
-        cell = cell[nearest_with_normal(X, T, V, F)]
+        cell = cell[_nearest_with_normal(X, T, V, F)]
     triangle, weight = closest_point_in_star(X, cell, Y, C)  # (n,), (n, 3)
     corner = C[triangle]  # (n, 3)
     if wrap:

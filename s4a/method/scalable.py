@@ -30,10 +30,10 @@ from s4a.schema import Array, dataset, in_unit, require, unit_of
 
 log = logging.getLogger(__name__)
 
-RADIUS = 3.0  # of the bumps, in radii of a disk of area / samples: about nine reach every vertex
+_RADIUS = 3.0  # of the bumps, in radii of a disk of area / samples: about nine reach every vertex
 GROUP = 64  # samples whose paths are looked for together
 # what variables of /coarse are here, where there is no coarse mesh
-MEANING = {
+_MEANING = {
     "position": "position of the sample",
     "corner_vertex": "samples whose cells meet: the dual of the cells, for pictures and normals",
     "vertex_area": "integral of the local function: row sum of U^T A U",
@@ -116,9 +116,7 @@ def local_functions(X: Array, G: sp.csr_array, sample: Array, radius: float) -> 
     return sp.csr_matrix(sp.diags(1 / np.asarray(U.sum(axis=1)).ravel()) @ U)
 
 
-def reduced_eigenpairs(
-    U: sp.csr_array, W: sp.csr_array, area: Array, k: int
-) -> tuple[Array, Array, sp.csc_array]:
+def _reduced_eigenpairs(U, W, area, k):
     """The k smallest eigenpairs of U^T W U phi = lambda U^T A U phi, for areas of sum 1.
 
     Returns
@@ -207,7 +205,7 @@ def spectral_space(
     X = Shape(mesh).to_frame(X)
     E, w, area, _ = laplacian(X, T, vertex_areas(X, T))
     area = area / area.sum()
-    eigenvalue, Phi, mass = reduced_eigenpairs(U, stiffness(E, w, len(X)), area, k)
+    eigenvalue, Phi, mass = _reduced_eigenpairs(U, stiffness(E, w, len(X)), area, k)
     low = Basis(X[sample], np.empty((0, 3), np.int32), U.T @ area, Phi, eigenvalue, mass)
     full = Basis(X, T, area, Phi, eigenvalue, mass, U)
     return Shape.of(mesh, low=low, full=full, U=U, cell=cell)
@@ -276,7 +274,7 @@ def reduced(mesh: xr.Dataset, *, n_coarse: int = 6000, k: int = 100, seed: int =
     if not np.isfinite(w).all():
         raise ValueError("finite cotan weights needed; triangles are too thin to have them")
     try:
-        eigenvalue, Phi, mass = reduced_eigenpairs(U, W, area / total, possible)
+        eigenvalue, Phi, mass = _reduced_eigenpairs(U, W, area / total, possible)
     except RuntimeError as error:  # of the factor or of ARPACK
         raise ValueError(f"no {possible} eigenpairs of {p} local functions: {error}") from error
     attrs: dict[str, int | str] = {
@@ -310,6 +308,6 @@ def reduced(mesh: xr.Dataset, *, n_coarse: int = 6000, k: int = 100, seed: int =
         eigenvalue=eigenvalue,
         eigenfunction=Phi,
     )
-    for name, meaning in MEANING.items():
+    for name, meaning in _MEANING.items():
         data[name].attrs["long_name"] = meaning
     return in_unit(data, unit_of(mesh["position"]))

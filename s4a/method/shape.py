@@ -61,7 +61,7 @@ class Basis:
     landmarks : dict of str to int
         The vertex at each landmark that was given, or nearest to it.
     fields : dict of str to float ndarray (n,)
-        Those that were given to guide, see :func:`smooth_fields`.
+        Those that were given to guide, see ``_smooth_fields``.
     """
 
     X: Array
@@ -402,7 +402,7 @@ def features_of(mesh: xr.Dataset) -> dict[str, Array]:
     return dict(zip(names, mesh["feature_value"].values.T, strict=True))
 
 
-def smooth_fields(coarse: xr.Dataset, low: Basis) -> dict[str, Array]:
+def _smooth_fields(coarse, low):
     """Fields that guide as the functions of a surface have them, of mean 0 and variance 1.
 
     Times their weights.  Noise from vertex to vertex would draw matches aside.  NaN counts as the

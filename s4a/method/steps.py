@@ -337,17 +337,42 @@ def refine_network(
     )
 
 
-def shape_in(study: xr.DataTree, name: str, **projection: Any) -> Shape:
+class Study:
+    """The nodes of a study as Datasets, ``study["coarse/brain_01"]``, from a tree.
+
+    What the steps take; :class:`s4a.study.tasks.Folder` gives the same of a folder, lazily.
+
+    Parameters
+    ----------
+    tree : DataTree
+    """
+
+    def __init__(self, tree: xr.DataTree):
+        self.tree = tree
+
+    def __contains__(self, node: str) -> bool:
+        stage, _, name = node.partition("/")
+        found = self.tree.children.get(stage)
+        return found is not None and (not name or name in found.children)
+
+    def __getitem__(self, node: str) -> xr.Dataset:
+        return self.tree[node].to_dataset()
+
+
+def shape_in(study: Study, name: str, **projection: Any) -> Shape:
     """A shape of a study at both resolutions; ValueError where the study has none of that name.
 
     Its fields are projected as `projection` says, see :class:`s4a.method.shape.Shape`.
     """
     for stage in ("original", "coarse"):
-        if stage not in study.children or name not in study[stage].children:
-            known = ", ".join(study[stage].children) if stage in study.children else "no such node"
-            raise ValueError(f"a study with /{stage}/{name} is needed; this one has {known}")
-    original, coarse = (study[stage][name].to_dataset() for stage in ("original", "coarse"))
-    return Shape(original, coarse, **projection)
+        if f"{stage}/{name}" not in study:
+            raise ValueError(f"a study with /{stage}/{name} is needed; this one has none")
+    return Shape(study[f"original/{name}"], study[f"coarse/{name}"], **projection)
+
+
+def basis_in(study: Study, name: str) -> Basis:
+    """The coarse mesh of a shape, centred and for unit area, and its eigenfunctions."""
+    return Shape(coarse=study[f"coarse/{name}"]).low
 
 
 def options_of_registration(study: xr.DataTree) -> dict[str, Any]:
@@ -362,44 +387,89 @@ def template_of(study: xr.DataTree) -> str:
     return study["latent"].attrs["median"]
 
 
-def aligned(study: xr.DataTree, source: str, target: str) -> Motion | None:
-    """Motion of a shape of a study onto another by those of its network; None where it has none.
+def motion_in(study: Study, name: str) -> Any:
+    """Motion (R, t) of a shape onto the reference of the network; None where there are none.
 
-    Both were moved onto one reference; a shape apart from the network is moved there first.
+    A shape apart from the network is moved there now, if that is not in the study.
     """
-    network = study["network"].dataset if "network" in study else xr.Dataset()
+    if f"network/motion_{name}" in study:
+        own = study[f"network/motion_{name}"]
+        return own["rotation"].values, own["translation"].values
+    network = study["network"] if "network" in study else xr.Dataset()
     if "icp_rotation" not in network:
         return None
-    motions = []
-    for name in (source, target):
-        if name in network["shape"]:
-            placed = network.sel(shape=name)
-            motion = placed["icp_rotation"].values, placed["icp_translation"].values
-        else:
-            reference = network.attrs["reference"]
-            motion = motion_onto(shape_in(study, name).low, shape_in(study, reference).low)
-        motions.append(motion)
-    return motion_between(*motions)
+    if name in network["shape"]:
+        own = network.sel(shape=name)
+        return own["icp_rotation"].values, own["icp_translation"].values
+    return motion_onto(shape_in(study, name).low, shape_in(study, network.attrs["reference"]).low)
 
 
-def latent_bases(study: xr.DataTree, *names: str) -> tuple[Any, ...]:
+def latent_bases(study: Study, *names: str) -> tuple[Any, ...]:
     """The latent bases Y ``(k, m)`` of some shapes of a study.
 
     Those of the network are in ``/latent``, those of a shape apart in ``/latent/<shape>``.
     """
-    require(study["latent"].to_dataset(), "latent_basis", what="latent dataset")
-    Y = study["latent"].dataset["latent_basis"]
-    apart = study["latent"].children
-    known = [*Y["shape"].values.tolist(), *apart]
-    wrong = [name for name in names if name not in known]
-    if wrong:
-        raise ValueError(
-            f"no shape {', '.join(map(repr, wrong))} in the network; it has {', '.join(known)}"
-        )
-    return tuple(
-        (apart[name]["latent_basis"] if name in apart else Y.sel(shape=name)).values
-        for name in names
-    )
+    latent, bases = study["latent"], []
+    require(latent, "latent_basis", what="latent dataset")
+    for name in names:
+        if f"latent/{name}" in study:
+            bases.append(study[f"latent/{name}"]["latent_basis"].values)
+        elif name in (known := latent["shape"].values.tolist()):
+            bases.append(latent["latent_basis"].values[known.index(name)])
+        else:
+            raise ValueError(f"no shape {name!r} in the network; it has {', '.join(known)}")
+    return tuple(bases)
+
+
+def place_in(
+    study: Study,
+    names: Sequence[str],
+    basis: Basis,
+    motions: Callable[[str], Motion],
+    **options: Any,
+) -> np.ndarray:
+    """The latent basis Y ``(k, m)`` of a shape beside a network that stays as it is (eq. 3).
+
+    Parameters
+    ----------
+    study : Study
+        With ``/latent`` and ``/coarse``.
+    names : sequence of str
+        The shapes of the network, the first of them always taken.
+    basis : Basis
+        Low resolution of the shape.
+    motions : callable
+        Gives the motion of the shape onto one of these.
+    **options
+        Of :func:`s4a.method.latent.place`.
+    """
+    spectra = [study[f"coarse/{name}"]["eigenvalue"].values for name in names]
+    near = [names[i] for i in nearest_spectra(basis.eigenvalue, spectra, options["k_init"])]
+    bases = [basis_in(study, name) for name in near]
+    Y = np.stack(latent_bases(study, *near))
+    return place(basis, bases, Y, [motions(name) for name in near], **options)
+
+
+def register_in(
+    study: Study,
+    name: str,
+    template: str,
+    target: Shape,
+    start: Motion | None = None,
+    **options: Any,
+) -> xr.Dataset:
+    """:func:`register_shape` to the shape `target`, which is the template, with all options."""
+    if name == template:
+        return identity(target)
+    projection = {one: getattr(target, one) for one in PROJECTION}
+    source = shape_in(study, name, **projection)
+    bases = latent_bases(study, name, template)
+    M, N = source.low, target.low
+    if start is None:
+        own, other = motion_in(study, name), motion_in(study, template)
+        start = motion_between(own, other) if own and other else None
+    motion = motion_onto(M, N) if start is None else realign(M.cloud, N.cloud, start)
+    return from_latent(source, target, bases, motion, **options)
 
 
 def latent_match(
@@ -436,8 +506,9 @@ def latent_match(
     >>> match.sizes["vertex"] == study["original/brain_02"].sizes["vertex"]
     True
     """
-    shapes = shape_in(study, source), shape_in(study, target)
-    match, functions = match_low(*shapes, latent_bases(study, source, target), how=how)
+    nodes = Study(study)
+    shapes = shape_in(nodes, source), shape_in(nodes, target)
+    match, functions = match_low(*shapes, latent_bases(nodes, source, target), how=how)
     if full:
         match, *_ = match_functions(*shapes, *functions)
     return dataset(match=match)
@@ -477,7 +548,7 @@ def latent_map(study: xr.DataTree, source: str, target: str) -> xr.Dataset:
     >>> s4a.show.charts.matrices({"C of a shape to itself": C, "brain 1 to 2": there})
     <Figure ...>
     """
-    Y_source, Y_target = latent_bases(study, source, target)
+    Y_source, Y_target = latent_bases(Study(study), source, target)
     return dataset(fmap=Y_target @ np.linalg.pinv(Y_source))
 
 
@@ -543,14 +614,6 @@ def register_shape(
         check(option, options[option])
     projection = {key: options.pop(key) for key in PROJECTION if key in options}
     template = template_of(study) if template is None else template
-    target = shape_in(study, template, **projection)
-    if name == template:
-        return identity(target)
-    source = shape_in(study, name, **projection)
-    bases = latent_bases(study, name, template)
-    M = source.low
-    N = target.low
+    target = shape_in(Study(study), template, **projection)
     with threadpool_limits(1):
-        start = aligned(study, name, template) if start is None else start
-        motion = motion_onto(M, N) if start is None else realign(M.cloud, N.cloud, start)
-        return from_latent(source, target, bases, motion, **options)
+        return register_in(Study(study), name, template, target, start, **options)

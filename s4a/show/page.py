@@ -1,6 +1,7 @@
 """One self-contained HTML page of a study: pictures, charts and tables that open offline."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -63,6 +64,7 @@ def write_page(
     --------
     >>> import tempfile
     >>> from pathlib import Path
+    from typing import Any
     >>> import xarray as xr
     >>> import s4a
     >>> folder = Path(tempfile.mkdtemp())
@@ -240,7 +242,7 @@ def _distances(study, look):
 def _moved(study, look):
     """Sliders that move the mean shape; pictures drawn in advance where they cannot."""
     n_frames = 13 if study["registration"].sizes["vertex"] < 50_000 else 7
-    sigmas, ratio = np.linspace(-SIGMA, SIGMA, n_frames), _ratio(study)
+    sigmas, ratio = np.linspace(-SIGMA, SIGMA, n_frames).tolist(), _ratio(study)
     sliders = []
     for mode, drawn in enumerate(mode_pictures(study, sigmas, len(ratio), **look)):
         frames, labels = list(map(webp_uri, drawn)), [_label(mode, s) for s in sigmas]
@@ -327,7 +329,7 @@ def _correspondence(study, look):
     X, T = mesh_of(registration)
     colors = position_colors(X)
     template = registration.attrs.get("template", "")
-    surfaces = {f"{template}, the template": (X, T, colors)}
+    surfaces: dict[str, Any] = {f"{template}, the template": (X, T, colors)}
     others = [name for name in names_of(registration) if name != template]
     surfaces |= {name: carried_colors(study, name, colors) for name in others[:N_CARRIED]}
     surfaces = {name: one for name, one in surfaces.items() if one is not None}

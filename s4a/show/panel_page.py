@@ -94,17 +94,17 @@ class Control:
     def __init__(self, widget, name, every):
         self.widget, self.id, self.now = widget, f"c-{name}", widget.value
         if isinstance(widget, ipywidgets.Checkbox):
-            options = [("no", False), ("yes", True)]
+            self.kind, options = "checkbox", [("no", False), ("yes", True)]
         elif isinstance(widget, ipywidgets.IntSlider):
             count = widget.max - widget.min + 1
             step = 1 if every else max(1, math.ceil(count / LADDER))
-            options = sorted({*range(widget.min, widget.max + 1, step), self.now, widget.max})
+            kept = {*range(widget.min, widget.max + 1, step), self.now, widget.max}
+            self.kind, options = "range", sorted(kept)
         else:
-            options = widget.options
-        options = [option if isinstance(option, tuple) else (str(option), option)
-                   for option in options]  # fmt: skip
-        self.labels = [label for label, _ in options]
-        self.values = [value for _, value in options]
+            slides = isinstance(widget, ipywidgets.SelectionSlider)
+            self.kind, options = "range" if slides else "select", widget.options
+        pairs = [one if isinstance(one, tuple) else (str(one), one) for one in options]
+        self.labels, self.values = ([pair[i] for pair in pairs] for i in (0, 1))
         self.at = self.values.index(self.now)
         self.open = []  # places of the values that were kept
 
@@ -114,16 +114,8 @@ class Control:
 
     def html(self) -> str:
         """The control in a page."""
-        if len(self.open) < 2:
-            kind = "text"
-        elif isinstance(self.widget, ipywidgets.Checkbox):
-            kind = "checkbox"
-        elif isinstance(self.widget, ipywidgets.IntSlider | ipywidgets.SelectionSlider):
-            kind = "range"
-        else:
-            kind = "select"
-        name = self.widget.description
-        tooltip = self.widget.tooltip or ""
+        kind = self.kind if len(self.open) > 1 else "text"
+        name, tooltip = self.widget.description, self.widget.tooltip or ""
         return PARTS.control(self.id, kind, name, self.labels, self.open, self.at, tooltip)
 
 
@@ -143,13 +135,13 @@ class Recording:
             name: Control(panel.control(name), name, name in panel.every) for name in names
         }
         self.values, self.place, self.size = [], {}, 0
+        runs: list[Any] = []
         with ExitStack() as silence:
             panel.recording = True
             silence.callback(setattr, panel, "recording", False)
             # the notebook's browser is told of the end only, which is the beginning
             for widget in self.widgets:
                 silence.enter_context(widget.hold_sync())
-            runs = []
             # what is shown now is in the page in any case, and counts for nothing
             for value in (v for widget in self.widgets for v in shown(widget).values()):
                 self.keep(value)
@@ -159,14 +151,12 @@ class Recording:
                     runs.append(self.run(group, limit * (i + 1) // len(panel.live)))
         depends = [differing(*run) for run in runs]
         self.groups = [
-            self.group(*run, own, depends) for run, own in zip(runs, depends, strict=True)
+            self.group(group, states, slots, depends)
+            for (group, states), slots in zip(runs, depends, strict=True)
         ]
         for name, control in self.controls.items():
-            kept = [
-                {places[group.index(name)] for places in states}
-                for group, states in runs
-                if name in group
-            ]
+            within = [(group.index(name), states) for group, states in runs if name in group]
+            kept = [{places[i] for places in states} for i, states in within]
             control.open = sorted(set.intersection(*kept))
         self.clicks = [
             {"id": getattr(panel, chart), "part": part, "control": names.index(name)}
@@ -217,11 +207,11 @@ class Recording:
         slots = [
             slot for slot in own if not any(own[slot] < other.get(slot, set()) for other in depends)
         ]
-        nothing = self.keep(None)
-        rows = {}
-        for places, state in states.items():
-            rows[",".join(map(str, places))] = [state.get(slot, nothing) for slot in slots]
-        order = list(self.controls)
+        nothing, order = self.keep(None), list(self.controls)
+        rows = {
+            ",".join(map(str, places)): [state.get(slot, nothing) for slot in slots]
+            for places, state in states.items()
+        }
         return {"controls": [order.index(name) for name in names], "slots": slots, "rows": rows}
 
     def data(self, ids: dict[ipywidgets.Widget, str]) -> dict[str, Any]:
@@ -253,18 +243,17 @@ class Recording:
 
 def differing(names: list[str], states: dict[tuple, dict]) -> dict[tuple, set[str]]:
     """The slots that differ over the states of a group, and the controls on which each depends."""
-    depends = {}
+    depends: dict[tuple, set[str]] = {}
     for slot in dict.fromkeys(slot for state in states.values() for slot in state):
         value = {places: state.get(slot) for places, state in states.items()}
-        if len(set(value.values())) == 1:
-            continue
-        depends[slot] = set()
         for c, name in enumerate(names):
             # it depends on a control if the places of the others do not say the value
             others = {places: places[:c] + places[c + 1 :] for places in value}
             pairs = {(others[places], value[places]) for places in value}
             if len(pairs) > len(set(others.values())):
-                depends[slot].add(name)
+                depends.setdefault(slot, set()).add(name)
+        if len(set(value.values())) > 1:
+            depends.setdefault(slot, set())
     return depends
 
 
@@ -305,8 +294,7 @@ class PanelPage:
         silent = SILENT | ipywidgets.HTML | ipywidgets.IntProgress
         fixed, partly = [], []
         for widget in widgets_in(panel):
-            control = self.controls.get(widget)
-            name = getattr(widget, "description", "")
+            control, name = self.controls.get(widget), getattr(widget, "description", "")
             if not hasattr(widget, "value") or not name or isinstance(widget, silent):
                 continue
             kept = len(control.open) if control else 0

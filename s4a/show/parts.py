@@ -1,6 +1,7 @@
 """Figures whose parts a notebook shows side by side, or below each other in a narrow cell."""
 
 import io
+from pathlib import Path
 
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
@@ -9,20 +10,7 @@ from s4a.show.draw import data_uri
 
 GAP = 8  # pixels between parts
 SHRINK, GROW = 0.7, 1.6  # how far the width of a part may be from that of the figure
-PAGE = """
-{%- macro share(width, room, gaps) %}(100% - {{ gaps }}px) * {{ width }} / {{ room }}{% endmacro -%}
-<figure role="img" aria-label="{{ alt }}" style="margin: 0">
-{% if title %}<div style="font-weight: bold; margin: 4px 0 8px">{{ title }}</div>{% endif %}
-<div style="display: flex; flex-wrap: wrap; align-items: center; gap: {{ gap }}px">
-{% for width, most, address in parts %}
-<img alt="" src="{{ address }}" style="flex: none; height: auto; max-width: min(100%, {{ most }}px);
-width: max({% for room, gaps, below in lines %}{{ ", " if loop.index0 }}
-{%- if below %}min({{ share(width, room, gaps) }}, ({{ below }}px - 100%) * 1000)
-{%- else %}{{ share(width, room, gaps) }}{% endif %}{% endfor %})">
-{% endfor %}
-</div>
-</figure>
-"""
+PAGE = Path(__file__).parent / "templates" / "figure.html"
 
 
 def _lines(widths):
@@ -97,7 +85,7 @@ class Parts(Figure):
             address = data_uri(file.getvalue(), "image/png")
             parts.append((width, round(GROW * width), address))
         self.set_layout_engine(layout)
-        page = Environment(autoescape=True).from_string(PAGE)
+        page = Environment(autoescape=True).from_string(PAGE.read_text("utf-8"))
         lines = _lines([width for width, *_ in parts])
         looks = {"alt": self.alt or title, "title": title, "gap": GAP}
         return page.render(**looks, parts=parts, lines=lines).strip()

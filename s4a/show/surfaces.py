@@ -8,7 +8,7 @@ import xarray as xr
 from s4a.method.pca import color_limits, low_vertices
 from s4a.method.register import match_functions, match_low
 from s4a.method.shape import Shape
-from s4a.method.steps import latent_bases
+from s4a.method.steps import Study, latent_bases
 from s4a.schema import INPUT, unit_of
 from s4a.show.draw import cycle_error_limits
 
@@ -244,6 +244,6 @@ def latent_match(study: xr.DataTree, source: str, target: str, *, dense: bool) -
         Shape(study["original"][name].to_dataset(), study["coarse"][name].to_dataset())
         for name in (source, target)
     )
-    bases = latent_bases(study, source, target)
-    match, (F_source, F_target) = match_low(M, N, bases)
+    basis_source, basis_target = latent_bases(Study(study), source, target)
+    match, (F_source, F_target) = match_low(M, N, (basis_source, basis_target))
     return match_functions(M, N, F_source, F_target)[0] if dense else match

@@ -4,7 +4,7 @@ A file may be of a stranger, of another version or by hand.  What the steps and 
 from it is checked when it is opened; no larger variable is read for that.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 import xarray as xr
@@ -70,6 +70,7 @@ def check_contents(name: str, data: xr.Dataset) -> None:
     if kind == "coarse/shape" and data.attrs.get("method") == "scalable":
         kind = "coarse/scalable"
     needed, texts, numbers = (words.split() for words in HOLDS[kind])
+    check_names(data)
     missing = [one for one in needed if one not in data.variables]
     if missing:
         raise ValueError(f"it lacks {', '.join(missing)}")
@@ -79,7 +80,6 @@ def check_contents(name: str, data: xr.Dataset) -> None:
             raise ValueError(
                 f"the attribute {wrong[0]} needs a {what}, found {data.attrs.get(wrong[0])!r:.40}"
             )
-    check_names(data)
     for one, values in data.variables.items():
         if kind != "subjects":
             check_variable(str(one), values, str(one) in needed)
@@ -124,9 +124,7 @@ def check_names(data: xr.Dataset) -> None:
         raise ValueError(f"shapes need names of letters, digits, _ and -; found {wrong}")
 
 
-def check_fit(
-    name: str, data: xr.Dataset, others: Mapping[str, xr.Dataset], damaged: Iterable[str] = ()
-) -> None:
+def check_fit(name: str, data: xr.Dataset, others: Mapping[str, xr.Dataset]) -> None:
     """ValueError where a file does not fit to those of the study that it was made from.
 
     Parameters
@@ -136,40 +134,11 @@ def check_fit(
     data : Dataset
     others : dict of str to Dataset
         By name, those that were read before.
-    damaged : iterable of str
-        Names of those that could not be read: what was made from them may be right.
     """
-    kind = kind_of(name)
     template = others.get("registration", data).attrs.get("template", "")
-    for dim, place, of_place in FIT.get(kind, ()):
+    for dim, place, of_place in FIT.get(kind_of(name), ()):
         other = place.format(shape=name.partition("/")[2], template=template)
-        size = others[other].sizes[of_place] if other in others else None
-        optional = dim == "low_vertex" and dim not in data.sizes
-        if size is not None and data.sizes.get(dim) != size and not optional:
-            found = data.sizes.get(dim)
-            raise ValueError(f"{dim} needs {size} entries as in {other}, found {found}")
-    if kind == "latent":
-        names = data["shape"].values.tolist()
-        check_among("median", [data.attrs["median"]], names)
-        if "network" in others:
-            ends = others["network"][["source", "target"]].to_array().values.ravel().tolist()
-            check_among("source and target of network", ends, names)
-        for one in names:
-            n = others[f"coarse/{one}"].sizes["mode"] if f"coarse/{one}" in others else None
-            if n is not None and n < data.sizes["mode"]:
-                raise ValueError(
-                    f"{data.sizes['mode']} modes need as many eigenfunctions of {one}, "
-                    f"found {n} in coarse/{one}"
-                )
-    elif kind == "registration" and "latent" in others:
-        check_among("template", [template], others["latent"]["shape"].values.tolist())
-    elif kind in ("pca", "fields") and "registration" in others:
-        known = [one[13:] for one in (*others, *damaged) if one.startswith("registration/")]
-        check_among("scores" if kind == "pca" else "fields", data["shape"].values.tolist(), known)
-
-
-def check_among(what: str, names: Iterable[str], shapes: Iterable[str]) -> None:
-    """ValueError unless all names are of these shapes."""
-    unknown = sorted(set(names) - set(shapes))
-    if unknown:
-        raise ValueError(f"{what} needs shapes of the study, found {', '.join(unknown)}")
+        if other in others and dim in data.sizes:
+            size, found = others[other].sizes[of_place], data.sizes[dim]
+            if size != found:
+                raise ValueError(f"{dim} needs {size} entries as in {other}, found {found}")

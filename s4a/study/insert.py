@@ -12,40 +12,39 @@ from threadpoolctl import threadpool_limits
 from s4a.geometry.crossing import can_count
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.input import plausibility
-from s4a.input.annotations import files_beside, with_features
-from s4a.input.collection import read_shapes, shape_report
+from s4a.input.collection import shape_report
 from s4a.input.files import SUFFIXES as MESHES
 from s4a.input.files import files_named, suffix_of
 from s4a.input.hands import AUTO, is_of_other_hand, mirror_image
-from s4a.input.landmarks import SUFFIXES, with_landmarks
+from s4a.input.landmarks import SUFFIXES
 from s4a.input.plausibility import find_warnings
 from s4a.input.subjects import listed
 from s4a.method.first_map import motion_onto
-from s4a.method.latent import latent_of_new, nearest_spectra, place
+from s4a.method.latent import latent_of_new
 from s4a.method.lift import low_resolution
 from s4a.method.pca import project_scores
 from s4a.method.register import from_latent
 from s4a.method.shape import Shape
+from s4a.method.steps import Study, latent_bases, place_in
 from s4a.options import Options, with_options
 from s4a.schema import dataset, in_unit, require, unit_of, variable
 from s4a.study.processes import workers
-from s4a.study.tasks import guided
+from s4a.study.sources import find_sources, guides_of_shape
+from s4a.study.tasks import clean_shape
 from s4a.study.tree import left_out, stack_registration, template_mesh
 
 log = logging.getLogger(__name__)
 
 
 class Frozen(NamedTuple):
-    """The study that new shapes come into: the template, and its network, the template first.
+    """What new shapes need of a study: the template, and its network, the template first.
 
     Of a study in files, meshes and latent bases are read where a new shape needs them.
     """
 
     template: Shape
-    coarse: list[xr.Dataset]
-    spectra: list[np.ndarray]  # their eigenvalues
-    Y: xr.DataArray  # (n, k, m), latent bases
-    turn: list[np.ndarray]  # rotations onto the template
+    nodes: Study  # coarse meshes, latent bases, and rotations onto the template
+    names: list[str]
 
 
 class Inserted(NamedTuple):
@@ -241,50 +240,22 @@ def read_new(
     landmarks: Path | str | None = None,
 ) -> tuple[dict[str, xr.Dataset], dict[str, dict[str, Any]]]:
     """The new meshes that can be used, with what guides them, and attributes for the report."""
-    meshes, attrs = clean_new(shapes, options)
-    files = {} if landmarks is None else files_named(landmarks, meshes, "landmarks", SUFFIXES)
-    for name, mesh in list(meshes.items()):
-        try:
-            source = shapes[name] if isinstance(shapes, dict) else None
-            if isinstance(source, xr.Dataset) and "file_vertex" not in source:
-                mesh = guided(mesh, source)
-            if name in files:
-                mesh = with_landmarks(mesh, files[name])
-            path = mesh.attrs.get("path", "")
-            fields = files_beside(path, options.feature_names) if path else {}
-            meshes[name] = with_features(mesh, fields) if fields else mesh
-        except ValueError as error:
-            attrs[name] = attrs[name] | {"status": "excluded", "reason": str(error)}
-            del meshes[name]
-    return meshes, attrs
-
-
-def clean_new(
-    shapes: Path | str | list[Any] | dict[str, Any],
-    options: Options,
-) -> tuple[dict[str, xr.Dataset], dict[str, dict[str, Any]]]:
-    """The new meshes that can be used, clean, and the attributes of all for the report."""
-    meshes = {}
-    if isinstance(shapes, dict):
-        for name, mesh in shapes.items():
-            if isinstance(mesh, xr.Dataset) and "file_vertex" in mesh:  # clean as it is
-                meshes[name] = mesh
-        shapes = {name: mesh for name, mesh in shapes.items() if name not in meshes}
-    attrs = {name: {"status": "ok", "reason": ""} | mesh.attrs for name, mesh in meshes.items()}
-    if isinstance(shapes, dict) and not shapes:
-        return meshes, attrs
+    volumes = options.label is not None and (isinstance(shapes, dict) or not are_meshes(shapes))
+    sources = find_sources(shapes, volumes=volumes)
     cleaning = options.of("cleaning")
-    if not isinstance(shapes, dict) and are_meshes(shapes):  # in a study of label volumes
+    if options.label is not None and not volumes:  # meshes beside a study of label volumes
         cleaning = cleaning | {"label": None}
-    tree = read_shapes(shapes, compare=False, **cleaning)
-    report = tree["report"].to_dataset()
-    for name in report["shape"].values.tolist():
-        if name in tree["original"].children:
-            meshes[name] = tree[f"original/{name}"].to_dataset()
-            attrs[name] = meshes[name].attrs
-        else:
-            row = report.sel(shape=name)
-            attrs[name] = {column: row[column].item() for column in ("status", "reason", "path")}
+    files = {} if landmarks is None else files_named(landmarks, sources, "landmarks", SUFFIXES)
+    meshes: dict[str, xr.Dataset] = {}
+    attrs: dict[str, dict[str, Any]] = {}
+    for name, (source, content) in sources.items():
+        path = source if isinstance(source, str) else source.attrs.get("path", "")
+        try:
+            guides = guides_of_shape(path, files.get(name), options.feature_names)
+            mesh = clean_shape(source, content, cleaning, {"guides": guides})
+            meshes[name], attrs[name] = mesh, {"path": path} | mesh.attrs
+        except ValueError as error:
+            attrs[name] = {"status": "excluded", "reason": str(error), "path": path}
     return meshes, attrs
 
 
@@ -306,18 +277,13 @@ def freeze(study: xr.DataTree, options: Options) -> Frozen:
     registered = set(rotation["shape"].values.tolist()) - set(left_out(study))
     others = [n for n in latent["shape"].values.tolist() if n in registered and n != template]
     names = [template, *others]
-    coarse = [study["coarse"][name].to_dataset() for name in names]
-    return Frozen(
-        Shape(
-            study["original"][template].to_dataset().load(),
-            coarse[0].load(),
-            **options.of("projection"),
-        ),
-        coarse,
-        [mesh["eigenvalue"].values for mesh in coarse],
-        latent["latent_basis"].sel(shape=names),
-        list(rotation.sel(shape=names).values),
-    )
+    nodes = {f"coarse/{name}": study["coarse"][name].to_dataset() for name in names}
+    nodes[f"coarse/{template}"].load()
+    nodes["latent"] = latent[["latent_basis"]].sel(shape=names)
+    nodes["registration"] = rotation.sel(shape=names).to_dataset().load()
+    original = study["original"][template].to_dataset().load()
+    shape = Shape(original, nodes[f"coarse/{template}"], **options.of("projection"))
+    return Frozen(shape, Study(xr.DataTree.from_dict(nodes)), names)
 
 
 def insert_one(
@@ -338,38 +304,28 @@ def insert_one(
 
 
 def _insert_one(mesh, frozen, options, references):
-    _, k, _ = frozen.Y.shape
+    template, study, names = frozen
+    (of_template,) = latent_bases(study, names[0])
+    k = len(of_template)
     coarse = low_resolution(mesh, **options.of("low resolution") | {"k": k})
     if coarse.sizes["mode"] < k:
         raise ValueError(
             f"the study needs {k} eigenfunctions, this shape has only {coarse.sizes['mode']}"
         )
     shape = Shape(mesh, coarse, **options.of("projection"))
-    new = Shape(coarse=coarse).low
-    template = frozen.template.low
-    k_init = min(options.k_init, k)
-    chosen = nearest_spectra(new.eigenvalue, frozen.spectra, k_init)
-    R, t = motion_onto(shape.low, template)
-    others = [Shape(coarse=frozen.coarse[j]).low for j in chosen]
-    of_template, *of_others = frozen.Y[[0, *chosen]].values
-    starts = [(frozen.turn[j].T @ R, np.zeros(3)) for j in chosen]
-    Y = place(
-        new,
-        others,
-        np.stack(of_others),
-        starts,
-        k_init=k_init,
+    R, t = motion_onto(shape.low, template.low)
+    turn = study["registration"]["rotation"]  # onto the template
+    Y = place_in(
+        study,
+        names,
+        Shape(coarse=coarse).low,
+        lambda name: (turn.sel(shape=name).values.T @ R, np.zeros(3)),
+        k_init=min(options.k_init, k),
         step=options.step,
         **options.of("first maps"),
     )
-    registration = from_latent(
-        shape,
-        frozen.template,
-        (Y, of_template),
-        (R, t),
-        how=options.how,
-        **options.of("registration"),
-    )
+    settings = {"how": options.how, **options.of("registration")}
+    registration = from_latent(shape, template, (Y, of_template), (R, t), **settings)
     seen = None
     if references is not None:
         portrait = plausibility.portray(mesh, intersections=can_count(options.intersections))

@@ -33,6 +33,7 @@ from s4a.schema import check_indices
 
 GROUP, CONTENTS = "s4a", "s4a/contents_2"  # with the number of the format
 SMALL = 100  # numbers up to which the contents have the values of a variable
+COMPRESSED = 1000  # numbers from which a variable is compressed where that is asked for
 LARGEST_TEXT = 2**31  # bytes of memory that the texts of a variable may need
 FILTERS = {h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32}
 NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable."  # as netCDF notes it
@@ -148,6 +149,7 @@ class Stored(BackendArray):
     ):
         self.file, self.path, self.one, self.stamp, self.sizes = file, path, one, stamp, sizes
         self.shape, self.dtype = tuple(map(int, one["shape"])), type_of(one)
+        self.written = os.stat(file).st_mtime_ns
 
     def __getitem__(self, key):
         return indexing.explicit_indexing_adapter(
@@ -157,7 +159,8 @@ class Stored(BackendArray):
     def part(self, key: Any) -> np.ndarray:
         """Read the selection from the file; ValueError where it was written anew."""
         with open_hdf5(self.file) as file:
-            if same := values_of(file, CONTENTS).tobytes() == self.stamp:
+            same = os.stat(self.file).st_mtime_ns == self.written  # or by the same run again
+            if same := same or values_of(file, CONTENTS).tobytes() == self.stamp:
                 values = values_in(file, self.path, self.one)
                 check_indices(Path(self.path).name, values, self.sizes)
         if not same:
@@ -238,7 +241,8 @@ def open_file(
             variables[name] = xr.Variable(one["dims"], values, one["attrs"])
         data = xr.Dataset(variables, attrs=nodes[node]["attrs"])
         data.encoding["source"] = str(path)
-        return data.set_coords(nodes[node]["coords"])
+        coords = [name for name in nodes[node]["coords"] if name not in data.coords]
+        return data.set_coords(coords) if coords else data
 
 
 def read(path: Path | str, others: Mapping[str, int] | None = None) -> xr.Dataset:
@@ -279,7 +283,9 @@ def is_done(path: Path | str, key: str) -> bool:
 # ---- writing
 
 
-def write_netcdf(data: xr.Dataset | xr.DataTree, file: BufferedIOBase) -> None:
+def write_netcdf(
+    data: xr.Dataset | xr.DataTree, file: BufferedIOBase, compression: int = 0
+) -> None:
     """Write a Dataset, or each node of a tree as a group, into an empty binary file.
 
     Parameters
@@ -288,6 +294,8 @@ def write_netcdf(data: xr.Dataset | xr.DataTree, file: BufferedIOBase) -> None:
         Of numbers, truth values and texts.
     file : binary file
         Open for reading and writing, such as ``io.BytesIO()``.
+    compression : int
+        Level of zlib, up to 9, for variables of more than 1,000 numbers; 0 compresses nothing.
 
     Raises
     ------
@@ -314,7 +322,7 @@ def write_netcdf(data: xr.Dataset | xr.DataTree, file: BufferedIOBase) -> None:
     with h5py.File(file, "w", libver="v110", track_order=True) as root:  # as netCDF asks
         root.attrs["_NCProperties"] = np.array(f"version=2,hdf5={h5py.version.hdf5_version}", "S")
         for node, one in nodes.items():
-            _write_group(root.require_group(node) if node else root, one)
+            _write_group(root.require_group(node) if node else root, one, compression)
         said = {node: _contents_of(one) for node, one in nodes.items()}
         text = json.dumps(said, default=lambda number: number.tolist()).encode()
         packed = {"chunks": (len(text),), "compression": 1, "fletcher32": True}
@@ -332,14 +340,13 @@ def _contents_of(data):
     return {"attrs": data.attrs, "variables": variables, "coords": list(data.coords)}
 
 
-def _write_group(group, data):
+def _write_group(group, data, compression):
     """The variables, attributes and dims of one group, as the conventions of netCDF have them."""
     variables, attrs = cf_encoder(*encode_dataset_coordinates(data.drop_encoding()))
     _add_attributes(group, attrs)
-    number = {dim: i for i, dim in enumerate(data.sizes)}
-    stored = {}
+    stored: dict[str, h5py.Dataset] = {}
     for name, one in variables.items():
-        if "/" in "".join((name, *one.dims)) or (name in number and one.dims != (name,)):
+        if "/" in "".join((name, *one.dims)) or (name in data.sizes and one.dims != (name,)):
             raise ValueError(
                 f"names without slash, and of no dim but its own, needed; found {name}{one.dims}"
             )
@@ -347,6 +354,8 @@ def _write_group(group, data):
         packed = {}
         if values.dtype.kind in "iuf" and values.size and values.ndim:  # in one chunk
             packed = {"chunks": values.shape, "fletcher32": True}
+            if compression and values.size > COMPRESSED:
+                packed |= {"compression": compression, "shuffle": True}
         if data.variables[name].dtype.kind not in "iufbUO":
             raise TypeError(f"{name} needs numbers or texts, found {data.variables[name].dtype}")
         fill = one.attrs.get("_FillValue")
@@ -357,14 +366,9 @@ def _write_group(group, data):
     for dim, size in data.sizes.items():
         scale = stored.get(dim) or group.create_dataset(dim, (size,), ">f4", track_order=True)
         scale.make_scale(dim if dim in stored else f"{NO_VARIABLE}{size:10}")
-        scale.attrs["_Netcdf4Dimid"] = np.int32(number[dim])
     for name, one in variables.items():
-        for axis, dim in enumerate(one.dims if name not in number else ()):
+        for axis, dim in enumerate(one.dims if name not in data.sizes else ()):
             stored[name].dims[axis].attach_scale(group[dim])
-        if one.dims:
-            ids = np.array([number[dim] for dim in one.dims], np.int32)
-            stored[name].attrs["_Netcdf4Coordinates"] = ids
-            stored[name].attrs["_Netcdf4Dimid"] = ids[0]
 
 
 def _as_stored(values, name):

@@ -15,21 +15,23 @@ import xarray as xr
 from joblib import effective_n_jobs, parallel_config
 
 from s4a.input.collection import remarks_on_files
+from s4a.input.hands import AUTO, hands, of_other_hand, to_reflect
 from s4a.input.plausibility import Doubts
 from s4a.input.subjects import read_table
 from s4a.method.network import choose_pairs, spectral_distance
 from s4a.method.pca import pca_without
 from s4a.method.remesh import check_wrap
 from s4a.options import Options, given_options
+from s4a.schema import dataset
 from s4a.study.doubts import (
     check_plausibility,
     check_usable,
     doubt_registrations,
+    looks_of,
     set_apart,
     stop_at_doubts,
 )
 from s4a.study.netcdf import arrays, attributes, is_done, open_file, read
-from s4a.study.originals import choose_reflected, read_and_clean
 from s4a.study.processes import temporary_folder
 from s4a.study.report import write_report
 from s4a.study.runner import Keys, Run, Task
@@ -47,6 +49,7 @@ from s4a.study.sources import (
 from s4a.study.store import lock, task_key, write
 from s4a.study.tasks import (
     align_shape,
+    clean_shape,
     consistent_maps,
     last_template,
     map_pairs,
@@ -57,6 +60,8 @@ from s4a.study.tasks import (
 from s4a.study.tree import open_study, stack_registration, template_mesh
 
 log = logging.getLogger(__name__)
+
+CHOICE = "network/hands.nc"
 
 
 def analyse(
@@ -163,7 +168,7 @@ def analyse(
         else:
             remarks = remarks + kept_table(run.folder / "subjects.nc", sources)
         remarks = remarks + remarks_on_guides(sources, marked, settings.feature_names)
-        with run.notes.whole(), run.unforeseen_told():
+        with run.unforeseen_told():
             run_steps(run, sources, marked, settings, remarks)
     return open_study(store)
 
@@ -195,6 +200,61 @@ def run_steps(
     why_no_modes = modes(run, registered, doubts, options)
     remarks = [*of_hands, *alone, *told, *of_all, *remarks]
     write_report(run, sources, options, remarks, why_no_modes, registered, doubts)
+
+
+def read_and_clean(
+    run: Run, sources: Sources, marked: Marked, options: Options, reflected: list[str]
+) -> Keys:
+    """The shapes, cleaned, with landmarks, some of them mirrored (5.1): ``/original``."""
+    cleaning = options.of("cleaning")
+    todo = []
+    for n, (source, content) in sources.items():
+        also: dict[str, Any] = {"reflected": True} if n in reflected else {}
+        key = (content, cleaning, *also.values())
+        if n in marked:
+            also["guides"] = landmarks, features = marked[n]
+            # wherever the files lie
+            key = (*key, *([landmarks[1]] if landmarks else []))
+            key = (*key, *((name, content) for name, (_, content) in features.items()))
+        given = (source, content, cleaning, also)
+        todo.append(Task(n, f"original/{n}.nc", clean_shape, given, key))
+    return run.do("read and clean", todo)
+
+
+def choose_reflected(
+    run: Run, sources: Sources, marked: Marked, options: Options
+) -> tuple[list[str], list[str]]:
+    """The shapes whose mirror images are taken, and what is told of the choice.
+
+    Where the shapes themselves shall say (``reflect="auto"``), they are looked at as they are
+    first; ``network/hands`` keeps the choice.
+    """
+    if options.reflect is None:
+        return [], []
+    if options.reflect != AUTO:
+        table = run.folder / "subjects.nc"
+        subjects = read(table) if table.is_file() else None
+        reflected = to_reflect(str(options.reflect), list(sources), subjects)
+        is_all = len(reflected) == len(sources)
+        return reflected, ["reflect= mirrors all: nothing changes among them"] if is_all else []
+    file = run.folder / CHOICE
+    contents = [content for _, content in sources.values()]
+    key = task_key(list(sources), contents, options.of("cleaning"), options.k, AUTO)
+    if not is_done(file, key):
+        original = read_and_clean(run, sources, marked, options, [])
+        looks = looks_of(run, original, options) if len(original) > 1 else {}
+        reflected, told = of_other_hand(looks)
+        choice = dataset(
+            {"told": "\n".join(told)},
+            handedness=hands(looks) if looks else np.zeros(0),
+            reflected=np.array([name in reflected for name in looks], int),
+        )
+        write(choice.assign_coords(shape=list(looks)), file, key)
+    choice = read(file)
+    told = choice.attrs["told"].splitlines()
+    for line in told:
+        log.warning("%s", line)
+    return choice["shape"].values[choice["reflected"].values.astype(bool)].tolist(), told
 
 
 def remesh(run: Run, original: Keys, options: Options) -> Keys:

@@ -1,17 +1,17 @@
 """Worker processes of a run (4): they end with the process that started them, leaving nothing."""
 
 import contextlib
-import inspect
+import ctypes
 import os
 import re
 import shutil
 import signal
+import sys
 import tempfile
 import threading
 import time
 from collections.abc import Iterator
 from importlib.util import find_spec
-from multiprocessing import spawn
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -22,6 +22,7 @@ from joblib.parallel import LokyBackend, get_active_backend
 from s4a.geometry.compiled import psutil
 
 CAN_HOLD = find_spec("fcntl") is not None  # not on Windows, where nobody can tell who holds what
+PR_SET_PDEATHSIG, M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = 1, -1, -3  # of Linux and glibc
 TEMPORARY = "s4a-"  # how the folder of a study that nobody keeps begins
 
 
@@ -44,93 +45,37 @@ def workers(n_jobs: int | None, **options: Any) -> Parallel:
     """
     backend, _ = get_active_backend()
     if isinstance(backend, LokyBackend) and backend.effective_n_jobs(n_jobs) > 1:
-        from joblib.externals.loky.backend import resource_tracker  # needs processes
-
-        with closed_terminal_waits():
-            resource_tracker.ensure_running()
-        # as text: a worker is to know it before it imports NumPy and this package, which takes long
         at_once = threading.current_thread() is threading.main_thread()
-        text = f"{inspect.getsource(end_with)}\nend_with({os.getpid()}, {at_once})\n"
-        text += f"{inspect.getsource(keep_freed_memory)}\nkeep_freed_memory()"
-        options |= {"initializer": exec, "initargs": (text, {})}
+        options |= {"initializer": begin_worker, "initargs": (os.getpid(), at_once)}
     return Parallel(n_jobs=n_jobs, **options)
 
 
-def end_with(owner: int, at_once: bool, *, interruptible: bool = False) -> None:
-    """Let this process end within a second of process `owner`, which started it.
+def begin_worker(owner: int, at_once: bool) -> None:
+    """Let this process end within a second of process `owner`, and ignore Ctrl-C, its affair.
 
     Parameters
     ----------
     owner : int
+        Which started this process.
     at_once : bool
         Whether the system may end it, in the midst of native code too: that looks at the thread
         that started this process, which then must be one that lives as long as the owner.
-    interruptible : bool
-        Whether Ctrl-C ends this process too, or is left to the owner.
     """
-    import ctypes
-    import os
-    import signal
-    import sys
-    import threading
-    import time
-
-    if not interruptible:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if at_once and sys.platform == "linux":
-        pr_set_pdeathsig = 1
-        ctypes.CDLL(None).prctl(pr_set_pdeathsig, signal.SIGKILL)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if sys.platform == "linux":
+        c = ctypes.CDLL(None)
+        if at_once:
+            c.prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        if hasattr(c, "mallopt"):  # of glibc: memory that arrays freed is used again, not cleared
+            c.mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
+            c.mallopt(M_MMAP_THRESHOLD, 2**30)
 
     def watch():
         while os.getppid() == owner:
             time.sleep(0.25)
         os._exit(1)
 
-    if os.getppid() != owner:  # it ended before this line
-        os._exit(1)
     threading.Thread(target=watch, daemon=True).start()
-
-
-def keep_freed_memory() -> None:
-    """Let this process use memory again that its arrays freed.
-
-    The C library of Linux gives large arrays back to the system, which then clears each page of
-    the next one, the longer the more processes do so. Elsewhere nothing is done.
-    """
-    import ctypes
-    import sys
-
-    if sys.platform != "linux":
-        return
-    c = ctypes.CDLL(None)
-    if hasattr(c, "mallopt"):  # of glibc, not of musl
-        m_trim_threshold, m_mmap_threshold = -1, -3
-        c.mallopt(m_trim_threshold, 2**31 - 1)
-        c.mallopt(m_mmap_threshold, 2**30)
-
-
-@contextlib.contextmanager
-def spawned_end_too() -> Iterator[None]:
-    """Processes that multiprocessing spawns meanwhile end within a second of this one.
-
-    Those of dask look for the process that started them only once they have imported dask, which
-    takes seconds; here they do before they import anything.
-    """
-    before = spawn.get_command_line
-    text = f"{inspect.getsource(end_with)}\nend_with({os.getpid()}, False, interruptible=True)\n"
-
-    def watching(**options: Any) -> list[str]:
-        line = list(before(**options))
-        if "-c" in line:  # not in a frozen program
-            line[line.index("-c") + 1] = text + line[line.index("-c") + 1]
-        return line
-
-    if os.name == "posix":  # elsewhere the line is one text, and its quotes are not escaped
-        spawn.get_command_line = watching
-    try:
-        yield
-    finally:
-        spawn.get_command_line = before
 
 
 @contextlib.contextmanager
@@ -161,22 +106,6 @@ def interruption_kept() -> Iterator[threading.Event]:
         yield asked
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-@contextlib.contextmanager
-def closed_terminal_waits() -> Iterator[None]:
-    """A process that is started meanwhile is not ended by its terminal.
-
-    That of joblib removes the semaphores of a run that was killed.
-    """
-    if not hasattr(signal, "pthread_sigmask"):  # on Windows
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def remove_remains(token: str) -> None:

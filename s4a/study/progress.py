@@ -2,15 +2,17 @@
 
 import contextlib
 import json
+import logging
 import os
 import platform
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from s4a.geometry.compiled import psutil
 from s4a.study.netcdf import check_regular
+
+log = logging.getLogger(__name__)
 
 FILE = ".progress.json"
 EVERY = 1.0  # seconds between two notes of a stage
@@ -74,67 +76,55 @@ class Status(NamedTuple):
 class Notes:
     """What a run notes of itself in its folder; what cannot be written is not missed by it.
 
-    Parameters
+    Attributes
     ----------
-    folder : Path
-        Of the study.
-    owner : int
-        The process of the run.
+    costs : dict of str to list
+        Seconds and MiB of every stage, those of earlier runs over the folder included.
+    stages : dict of str to Stage
+        Those that this run reached.
+    failures : dict of str to str
+        Name of a shape that is left out -> why.
     """
 
     def __init__(self, folder: Path, owner: int):
-        self.path = folder / FILE
-        now = time.time()
-        self.said: dict[str, Any] = {"owner": owner, "host": platform.node(), "begun": now}
-        self.told, self.over = now, ""
+        self.path, self.told = folder / FILE, time.time()
+        self.over = ""
+        self.run = {"owner": owner, "host": platform.node(), "begun": self.told}
         self.stages: dict[str, Stage] = {}
         self.failures: dict[str, str] = {}
+        self.costs = read_costs(self.path)
 
-    def begin(self, stage: str, done: int, of: int, seconds: float, memory: float) -> None:
-        """A stage begins, with what it has and has cost already."""
-        self.stages[stage] = Stage(done, of, done, time.time(), seconds, memory, False)
-        self.write()
-
-    def add(self, stage: str, failure: dict[str, str]) -> None:
+    def add(self, stage: str) -> None:
         """One task more is done, or has failed."""
-        self.failures |= failure
         self.stages[stage] = self.stages[stage]._replace(done=self.stages[stage].done + 1)
         if time.time() - self.told > EVERY:
             self.write()
 
-    def end(self, stage: str, whole: bool, seconds: float, memory: float) -> None:
-        """A stage ends, as a `whole` or because it was interrupted."""
-        before = self.stages[stage]
-        done = before.all if whole else before.done
-        self.stages[stage] = before._replace(done=done, seconds=seconds, memory=memory, ended=whole)
-        self.write()
-
-    @contextlib.contextmanager
-    def whole(self) -> Iterator[None]:
-        """All of a run: whether it came to its end, or was interrupted or refused."""
-        over = "stopped"
-        try:
-            yield
-            over = "finished"
-        finally:
-            self.over = over
-            self.write()
-
-    def write(self) -> None:
-        """Write all of it at once."""
-        self.told = time.time()
-        stages = {name: list(stage) for name, stage in self.stages.items()}
-        said = {"told": self.told, "over": self.over, "stages": stages, "failures": self.failures}
-        write_at_once(self.path, json.dumps(self.said | said))
+    def write(self, over: str = "") -> None:
+        """Write all of it at once, and whether the run is over: "finished" or "stopped"."""
+        self.told, self.over = time.time(), over
+        said = self.run | {"told": self.told, "over": over, "stages": self.stages}
+        said |= {"failures": self.failures, "costs": self.costs}
+        with contextlib.suppress(OSError):
+            new = self.path.with_name(f"{self.path.name}.tmp")
+            new.unlink(missing_ok=True)  # it may be a link
+            new.write_text(json.dumps(said))
+            os.replace(new, self.path)
 
 
-def write_at_once(path: Path, text: str) -> None:
-    """Write a small file of a run; a link in its place is not followed, and no error is raised."""
-    with contextlib.suppress(OSError):
-        new = path.with_name(f"{path.name}.tmp")
-        new.unlink(missing_ok=True)
-        new.write_text(text)
-        os.replace(new, path)
+def read_costs(path: Path) -> dict[str, list[float]]:
+    """The costs in the note of an earlier run; a note of any other form is told and has none."""
+    try:
+        check_regular(path)
+        costs = json.loads(path.read_text("utf-8"))["costs"]
+        return {
+            stage: [float(seconds), float(memory)] for stage, (seconds, memory) in costs.items()
+        }
+    except FileNotFoundError:
+        return {}
+    except Exception as error:  # whatever it holds, the run goes on
+        log.warning("%s cannot be read (%s): times of earlier runs are not counted", path, error)
+        return {}
 
 
 def status(folder: Path | str) -> Status:
@@ -181,22 +171,16 @@ def status(folder: Path | str) -> Status:
 
 
 def _status(said: dict[str, Any]) -> Status:
-    stages = {}
-    for name, (done, of, had, begun, seconds, memory, ended) in said["stages"].items():
-        costs = float(begun), float(seconds), float(memory)
-        stages[name] = Stage(int(done), int(of), int(had), *costs, bool(ended))
-    host, owner, begun = str(said["host"]), int(said["owner"]), float(said["begun"])
-    failures = {str(name): str(why) for name, why in said["failures"].items()}
+    stages = {name: Stage(*stage) for name, stage in said["stages"].items()}
+    owner, begun, state = int(said["owner"]), float(said["begun"]), said["over"]
     memory, processes = 0.0, 0
-    if said["over"] in ("finished", "stopped"):
-        state = said["over"]
-    elif host != platform.node():
+    if not state and said["host"] != platform.node():
         state = "elsewhere"
-    else:
+    elif not state:
         memory, processes = memory_of(owner, begun)
         state = "running" if processes else "stopped"
-    told = float(said["told"])
-    return Status(state, host, owner, begun, told, stages, failures, memory, processes)
+    rest = said["told"], stages, dict(said["failures"]), memory, processes
+    return Status(state, said["host"], owner, begun, *rest)
 
 
 def memory_of(owner: int, begun: float) -> tuple[float, int]:

@@ -2,7 +2,6 @@
 
 import contextlib
 import faulthandler
-import json
 import logging
 import os
 import sys
@@ -20,16 +19,14 @@ from joblib import delayed, effective_n_jobs
 from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
-from s4a.geometry.compiled import psutil
-from s4a.study.netcdf import check_regular, is_done
+from s4a.study.netcdf import is_done
 from s4a.study.processes import died, interruption_kept, workers
-from s4a.study.progress import Notes, write_at_once
+from s4a.study.progress import Notes, Stage
 from s4a.study.store import LOGS, Claim, open_without_following, task_key, write
 
 log = logging.getLogger(__name__)
 
 Keys = dict[str, str]  # name of a shape, or file of several -> key of what was computed
-BEGUN = "begun"
 LONGEST = len("align doubtful shapes: ")  # of the names beside the progress bar
 
 
@@ -70,6 +67,16 @@ class Task:
     def key(self) -> str:
         """The key of the result: of its inputs and the version of S4A."""
         return task_key(*self.inputs)
+
+    @property
+    def log(self) -> str:
+        """The file in the folder of the study in which a task at work, or failed, is recorded."""
+        return f"{LOGS}/{self.file.replace('/', '-').removesuffix('.nc')}.txt"
+
+    @property
+    def see(self) -> str:
+        """Where its traceback is, in words."""
+        return f"see {self.log} in the folder of the study"
 
 
 class StageError(RuntimeError):
@@ -115,17 +122,12 @@ class Run:
 
     def __init__(self, claim: Claim, n_jobs: int | None):
         self.folder, self.n_jobs, self.claim = claim.folder, n_jobs, claim
-        self.failures, self.unforeseen = {}, []
-        self.costs = read_costs(self.costs_file)
         self.notes = Notes(self.folder, claim.owner)
+        self.failures, self.costs = self.notes.failures, self.notes.costs
+        self.unforeseen: list[str] = []
         self.doing = "begin"
         self.bar: Any = None  # of tqdm, once a stage has something to do
         self.interrupted = threading.Event()
-
-    @property
-    def costs_file(self) -> Path:
-        """Where the costs are kept for the next run."""
-        return self.folder / ".costs.json"
 
     @contextlib.contextmanager
     def stage(self, name: str, share: float = 1.0, *, done: int = 0, of: int = 1) -> Iterator[None]:
@@ -142,21 +144,24 @@ class Run:
             How many of its tasks are done, of how many.
         """
         self.end_if_interrupted()
-        begin = time.perf_counter()
+        begin, now = time.perf_counter(), time.time()
         self.doing, self.workers = name, {}
-        seconds, memory = self.costs.get(name, (0.0, 0.0)) if share < 1 else (0.0, 0.0)
-        self.notes.begin(name, done, of, seconds, memory)
+        before = self.costs.get(name, [0.0, 0.0]) if share < 1 else [0.0, 0.0]
+        self.notes.stages[name] = Stage(done, of, done, now, before[0], before[1], False)
+        self.notes.write()
         whole = False
         try:
             yield
             whole = True
         finally:  # an interrupted stage has cost something too
+            spent = time.perf_counter() - begin
             if share > 0 or name not in self.costs:
-                memory = np.fmax(memory, together(self.workers, effective_n_jobs(self.n_jobs)))
-                self.costs[name] = [seconds + time.perf_counter() - begin, float(memory)]
-                write_at_once(self.costs_file, json.dumps(self.costs))
-            self.notes.end(name, whole, *self.costs[name])
-        spent, peak = time.perf_counter() - begin, self.costs[name][1]
+                peak = together(self.workers, effective_n_jobs(self.n_jobs))
+                self.costs[name] = [before[0] + spent, float(np.fmax(before[1], peak))]
+            n_done = of if whole else self.notes.stages[name].done
+            seconds, peak = self.costs[name]
+            self.notes.stages[name] = Stage(n_done, of, done, now, seconds, peak, whole)
+            self.notes.write()
         log.info("%s: %d of %d were to do, %.1f s, %.0f MiB", name, of - done, of, spent, peak)
 
     def do(self, stage: str, tasks: list[Task], *, each: bool = True) -> Keys:
@@ -184,7 +189,7 @@ class Run:
                     self.unforeseen.append(done.name)
                 if done.failure:
                     self.failures[done.name] = f"{stage}: {done.failure}"
-                self.notes.add(stage, {n: self.failures[n] for n in [done.name] if done.failure})
+                self.notes.add(stage)
                 self.bar.update()
         return {task.name: task.key for task in tasks if task.name not in self.failures}
 
@@ -192,8 +197,9 @@ class Run:
         """The progress bar, at the beginning of a stage: one for all, which goes with the run."""
         stage = f"{stage}: ".ljust(LONGEST)
         if self.bar is None:
+            in_lines = log.isEnabledFor(logging.INFO)  # one for each stage
             look = {"leave": False, "bar_format": "{desc}{percentage:3.0f}%|{bar}{r_bar}"}
-            self.bar = tqdm(desc=stage, total=total, disable=told_in_lines(), **look)
+            self.bar = tqdm(desc=stage, total=total, disable=in_lines, **look)
             if box := getattr(self.bar, "container", None):  # in a notebook
                 box.children[0].layout.width = "17em"
         self.bar.set_description_str(stage, refresh=False)
@@ -201,16 +207,15 @@ class Run:
         return self.bar
 
     def outcomes(self, tasks: list[Task]) -> Iterator[Outcome]:
-        """Do the tasks side by side, each in a process of its own where two processes died of it.
+        """Do the tasks side by side.
 
         When a worker dies, joblib ends the others too.  Those that were at work then come one at a
         time, until one dies alone: that one has failed, and the rest go on side by side.
         """
         todo = {task.name: task for task in tasks}
-        suspects = [name for name, task in todo.items() if deaths(self.claim, task) > 1]
+        suspects: list[str] = []
         while todo:
-            alone = suspects[:1]
-            begun = []
+            alone, begun = suspects[:1], []
 
             def jobs(names=alone or list(todo), begun=begun):
                 for name in names:
@@ -229,17 +234,15 @@ class Run:
                 how = died(error)
                 if not how:
                     raise
-                finished = [name for name in begun if name in todo and self.has(todo[name])]
-                for name in finished:  # and its process died before it could say so
-                    yield Outcome(todo.pop(name).name)
-                if alone and alone[0] in todo:
-                    task, suspects = todo.pop(alone[0]), []
-                    yield Outcome(task.name, f"its process died ({how}); {see(task)}", True)
-                elif begun:
-                    suspects = [name for name in begun if name in todo]
-                    suspects = [n for n in suspects if deaths(self.claim, todo[n])] or suspects
-                else:
+                if not begun:
                     raise StageError(f"processes die before they begin ({how})") from error
+                for name in [one for one in begun if one in todo and self.has(todo[one])]:
+                    yield Outcome(todo.pop(name).name)  # its process died before it could say so
+                suspects = [name for name in begun if name in todo]
+                if alone and suspects:
+                    failure = f"its process died ({how}); {todo.pop(alone[0]).see}"
+                    yield Outcome(alone[0], failure, True)
+                    suspects = []
 
     def end_if_interrupted(self) -> None:
         """KeyboardInterrupt where Ctrl-C was asked for, and that of Python was lost."""
@@ -261,6 +264,7 @@ class Run:
         try:
             with interruption_kept() as self.interrupted:
                 yield
+            self.notes.write("finished")
         except (ValueError, OSError, StageError):
             self.end_if_interrupted()  # it may be what became of it
             raise
@@ -272,46 +276,16 @@ class Run:
                 f"a shape; its traceback is in {file}; finished files are kept"
             ) from error
         finally:
+            if self.notes.over != "finished":
+                self.notes.write("stopped")
             if self.bar is not None:
                 self.bar.close()
-
-
-def told_in_lines() -> bool:
-    """Whether the log has a line for each stage, as its level is INFO: there are no bars then."""
-    return log.isEnabledFor(logging.INFO)
-
-
-def read_costs(path: Path) -> dict[str, list[float]]:
-    """Seconds and MiB of every stage from the file of an earlier run.
-
-    They are only told: a file of any other form is told and counts as none.
-
-    Examples
-    --------
-    >>> from pathlib import Path
-    >>> from s4a.study.runner import read_costs
-    >>> read_costs(Path("absent.json"))
-    {}
-    """
-    try:
-        check_regular(path)
-        stages = json.loads(path.read_text("utf-8")).items()
-        costs = {stage: [float(seconds), float(memory)] for stage, (seconds, memory) in stages}
-        for seconds, memory in costs.values():  # memory is nan where the system does not say it
-            if not 0 <= seconds < 1e12 or memory < 0 or memory > 1e12:
-                raise ValueError(f"{seconds} s and {memory} MiB are none")
-    except FileNotFoundError:
-        return {}
-    except Exception as error:  # whatever it holds, the run goes on
-        log.warning("%s cannot be read (%s): times of earlier runs are not counted", path, error)
-        return {}
-    return costs
 
 
 def do_task(task: Task, claim: Claim) -> Outcome:
     """Compute one Dataset and write its file; with one BLAS thread, as tasks run side by side."""
     claim.check()
-    file = log_file(claim, task)
+    file = claim.folder / task.log
     failure, unforeseen = "", False
     with at_work(file, claim):
         try:
@@ -323,25 +297,10 @@ def do_task(task: Task, claim: Claim) -> Outcome:
         except (Exception, SystemExit) as error:  # whatever it is, it costs this task only
             claim.check()
             text, unforeseen = traceback.format_exc(), not isinstance(error, ValueError)
-            failure = f"{in_a_line(error)}; {see(task)}" if unforeseen else str(error)
+            failure = f"{in_a_line(error)}; {task.see}" if unforeseen else str(error)
     if failure:
         note(file, text)
     return Outcome(task.name, failure, unforeseen, os.getpid(), peak_memory())
-
-
-def log_file(claim: Claim, task: Task) -> Path:
-    """Where a task that is at work, or failed, is recorded."""
-    return claim.folder / log_name(task)
-
-
-def log_name(task: Task) -> str:
-    """The name of that file in the folder of the study."""
-    return f"{LOGS}/{task.file.replace('/', '-').removesuffix('.nc')}.txt"
-
-
-def see(task: Task) -> str:
-    """Where the traceback of a task is, in words."""
-    return f"see {log_name(task)} in the folder of the study"
 
 
 def in_a_line(error: BaseException) -> str:
@@ -367,36 +326,19 @@ def note(file: Path, text: str) -> None:
 
 @contextlib.contextmanager
 def at_work(file: Path, claim: Claim) -> Iterator[None]:
-    """Record a task while it is at work; the record stays where its process dies.
+    """Record a task while a worker is at it; the record stays only where its process dies.
 
-    In a worker of the run it then says where, if the system let it: that of a segmentation fault.
+    It then says where, if the system let it: that of a segmentation fault.
     """
-    record, of_worker = None, os.getppid() == claim.owner
-    with contextlib.suppress(OSError):  # what the task writes will tell
-        file.parent.mkdir(parents=True, exist_ok=True)
-        record = open(file, "a", encoding="utf-8", opener=open_without_following)
-        record.write(f"{BEGUN} by process {os.getpid()}, {time.strftime('%Y-%m-%d %H:%M:%S')}\n")
-        record.flush()
-    try:
-        if record and of_worker:
-            faulthandler.enable(record)
+    with contextlib.ExitStack() as stack:
+        stack.callback(file.unlink, missing_ok=True)
+        if os.getppid() == claim.owner:
+            note(file, f"begun by process {os.getpid()}, {time.strftime('%Y-%m-%d %H:%M:%S')}\n")
+            with contextlib.suppress(OSError):  # what the task writes will tell
+                record = open(file, "a", encoding="utf-8", opener=open_without_following)
+                faulthandler.enable(stack.enter_context(record))
+                stack.callback(faulthandler.enable)  # on the error stream, as joblib has it
         yield
-    finally:
-        if record and of_worker:
-            faulthandler.enable()  # on the error stream, as joblib has it
-        with contextlib.suppress(OSError):
-            if record:
-                record.close()
-            file.unlink(missing_ok=True)
-
-
-def deaths(claim: Claim, task: Task) -> int:
-    """How often a task was begun by a process that died before it ended."""
-    try:
-        lines = log_file(claim, task).read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError:
-        return 0
-    return sum(line.startswith(BEGUN) for line in lines)
 
 
 def together(peaks: dict[int, float], n_jobs: int) -> float:
@@ -418,8 +360,6 @@ def peak_memory() -> float:
     try:
         import resource
     except ImportError:  # on Windows, and in a browser
-        if not psutil:
-            return float("nan")
-        return getattr(psutil.Process().memory_info(), "peak_wset", np.nan) / 2**20
+        return float("nan")
     unit = 2**20 if sys.platform == "darwin" else 2**10
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit

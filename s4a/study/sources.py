@@ -124,28 +124,24 @@ def find_guides(
     ValueError where there is no file of landmarks, or of a field, for any shape.
     """
     files = {} if folder is None else files_named(folder, sources, "landmarks", SUFFIXES)
-    beside = {
-        name: files_beside(source, features)
-        for name, (source, _) in sources.items()
-        if features and isinstance(source, str)
-    }
+    paths = {name: mesh if isinstance(mesh, str) else "" for name, (mesh, _) in sources.items()}
+    marked = {n: guides_of_shape(paths[n], files.get(n), features) for n in sources}
     for one in features:
-        if not any(
-            one in beside.get(n, {}) or _holds(mesh, one) for n, (mesh, _) in sources.items()
-        ):
+        if not any(one in marked[n].features or _holds(sources[n][0], one) for n in sources):
             first = next(iter(sources))
             raise ValueError(
                 f"features: no shape has a field {one!r}: a file such as {first}.{one}.npy beside "
                 "that of the mesh needed, a property of the vertices of PLY files, or "
                 "s4a.with_features for meshes in memory"
             )
-    marked = {}
-    for name in sources:
-        landmarks = _keyed(files[name]) if name in files else None
-        of = {one: _keyed(file) for one, file in beside.get(name, {}).items()}
-        if landmarks or of:
-            marked[name] = Guides(landmarks, of)
-    return marked
+    return {name: guides for name, guides in marked.items() if any(guides)}
+
+
+def guides_of_shape(path: str, landmarks: Path | None, features: Sequence[str]) -> Guides:
+    """What guides one shape: its file of landmarks, and fields beside its own file."""
+    beside = files_beside(path, features) if path and features else {}
+    fields = {one: _keyed(file) for one, file in beside.items()}
+    return Guides(_keyed(landmarks) if landmarks else None, fields)
 
 
 def _keyed(file):

@@ -95,6 +95,7 @@ def write(
     key: str = "",
     made_from: Iterable[str] = (),
     claim: Claim | None = None,
+    compression: int = 0,
 ) -> None:
     """Write a file at once: under a temporary name in the same folder, then renamed.
 
@@ -109,13 +110,15 @@ def write(
         one of them is no longer there, as after a run with other options was stopped half-way.
     claim : Claim, optional
         Nothing is written when it no longer holds.
+    compression : int
+        See :func:`s4a.study.netcdf.write_netcdf`.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     data = data.copy(deep=False)
     data.attrs = data.attrs | {"task_key": key, "made_from": " ".join(made_from)}
     whole = io.BytesIO()  # HDF5 brings the process down when the disk is full
-    write_netcdf(data, whole)
+    write_netcdf(data, whole, compression)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with temporary.open("wb") as file:

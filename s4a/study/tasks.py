@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from s4a.geometry.align import motion_between, realign
+from s4a.geometry.align import motion_between
 from s4a.geometry.mesh import as_arrays, triangle_areas
 from s4a.input import plausibility
 from s4a.input.annotations import labels_of_mesh, read_scalars, with_features
@@ -21,13 +21,12 @@ from s4a.input.hands import mirror_image
 from s4a.input.landmarks import guides_of, with_landmarks
 from s4a.method import steps
 from s4a.method.first_map import motion_onto
-from s4a.method.latent import latent_of_new, nearest_spectra, place
+from s4a.method.latent import latent_of_new
 from s4a.method.lift import low_resolution
-from s4a.method.register import from_latent, identity
-from s4a.method.shape import Basis, Shape, features_of
+from s4a.method.shape import Shape, features_of
 from s4a.options import Options
 from s4a.schema import dataset, in_unit, unit_of
-from s4a.study.netcdf import arrays, attributes, open_file, read
+from s4a.study.netcdf import open_file, read
 from s4a.study.runner import Run
 from s4a.study.sources import Guides, content_of_file
 
@@ -116,15 +115,22 @@ def remesh_shape(folder: Path, name: str, options: Options) -> xr.Dataset:
     return in_unit(low, unit_of(mesh["position"]))
 
 
-def shape_of(folder: Path, name: str, options: Options) -> Shape:
-    """A shape of the study at both resolutions; its arrays are read when they are used."""
-    original, coarse = (open_file(folder / s / f"{name}.nc") for s in ("original", "coarse"))
-    return Shape(original, coarse, **options.of("projection"))
+class Folder(steps.Study):
+    """The nodes of a study in a folder; their arrays are read when they are used."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+
+    def __contains__(self, node: str) -> bool:
+        return (self.folder / f"{node}.nc").is_file()
+
+    def __getitem__(self, node: str) -> xr.Dataset:
+        return open_file(self.folder / f"{node}.nc")
 
 
 def template_of(folder: Path, name: str, options: Options) -> Shape:
-    """:func:`shape_of` of the template; a process keeps the last, with what it computed of it."""
-    shape = shape_of(folder, name, options)
+    """The template at both resolutions; a process keeps the last, with what it computed of it."""
+    shape = steps.shape_in(Folder(folder), name, **options.of("projection"))
     written = (mesh.attrs["task_key"] for mesh in (shape.original, shape.coarse))
     key = (folder, name, shape.n_projected, shape.area_weighted, *written)
     if key not in last_template:
@@ -132,31 +138,19 @@ def template_of(folder: Path, name: str, options: Options) -> Shape:
     return last_template.setdefault(key, shape)
 
 
-def low_basis(folder: Path, name: str) -> Basis:
-    """The coarse mesh of a shape, centred and for unit area, and its eigenfunctions."""
-    return Shape(coarse=open_file(folder / "coarse" / f"{name}.nc")).low
-
-
 def align_shape(folder: Path, name: str, reference: str) -> xr.Dataset:
     """Rigid motion of a shape onto the reference, both centred and for unit area (4.1, step 2)."""
     R, t = np.eye(3), np.zeros(3)
     if name != reference:
-        M, N = low_basis(folder, name), low_basis(folder, reference)
-        R, t = motion_onto(M, N)
+        R, t = motion_onto(*(steps.basis_in(Folder(folder), n) for n in (name, reference)))
     return dataset({"reference": reference}, rotation=R, translation=t)
-
-
-def motion_to_reference(folder: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """R and t of :func:`align_shape`."""
-    R, t = arrays(folder / "network" / f"motion_{name}.nc", "rotation", "translation")
-    return R, t
 
 
 def map_pairs(folder: Path, pairs: list[Any], k_init: int, options: dict[str, Any]) -> xr.Dataset:
     """First maps of some pairs, in both directions (4.1, steps 3 and 4)."""
-    names = sorted({name for pair in pairs for name in pair})
-    bases = {name: low_basis(folder, name) for name in names}
-    motions = {name: motion_to_reference(folder, name) for name in names}
+    study, names = Folder(folder), sorted({name for pair in pairs for name in pair})
+    bases = {name: steps.basis_in(study, name) for name in names}
+    motions = {name: steps.motion_in(study, name) for name in names}
     return steps.map_pairs(bases, motions, pairs, k_init=k_init, **options)
 
 
@@ -164,11 +158,11 @@ def consistent_maps(
     run: Run, names: list[str], first: xr.Dataset, options: Options, n_jobs: int
 ) -> xr.DataTree:
     """Consistent ZoomOut over the network and the median (4.2): ``/network`` and ``/latent``."""
-    folder = run.folder
-    motions = {name: motion_to_reference(folder, name) for name in names}
-    reference = attributes(folder / "network" / f"motion_{names[0]}.nc")["reference"]
+    study = Folder(run.folder)
+    motions = {name: steps.motion_in(study, name) for name in names}
+    reference = study[f"network/motion_{names[0]}"].attrs["reference"]
     first = steps.with_motions(first, motions, reference)
-    coarse = {name: open_file(folder / "coarse" / f"{name}.nc") for name in names}
+    coarse = {name: study[f"coarse/{name}"] for name in names}
     k_init = first.sizes["mode_source_initial"]
     bar = run.show("consistent ZoomOut", options.k - k_init)
     return steps.refine_network(
@@ -189,48 +183,27 @@ def consistent_maps(
 
 def place_shape(folder: Path, name: str, options: Options) -> xr.Dataset:
     """The latent basis of a shape that stands apart from the network, which stays as it is."""
-    latent = read(folder / "latent.nc")
-    k, median = latent.sizes["mode"], latent.attrs["median"]
-    k_init = min(options.k_init, k)
+    study = Folder(folder)
+    latent, basis = read(folder / "latent.nc"), steps.basis_in(study, name)
+    median, motion = latent.attrs["median"], steps.motion_in(study, name)
     names = [median, *(n for n in latent["shape"].values.tolist() if n != median)]
-    own, *spectra = (arrays(folder / "coarse" / f"{n}.nc", "eigenvalue")[0] for n in (name, *names))
-    near = [names[i] for i in nearest_spectra(own, spectra, k_init)]
-    motion = motion_to_reference(folder, name)
-    Y = place(
-        low_basis(folder, name),
-        [low_basis(folder, n) for n in near],
-        latent["latent_basis"].sel(shape=near).values,
-        [motion_between(motion, motion_to_reference(folder, n)) for n in near],
-        k_init=k_init,
+    Y = steps.place_in(
+        study,
+        names,
+        basis,
+        lambda other: motion_between(motion, steps.motion_in(study, other)),
+        k_init=min(options.k_init, latent.sizes["mode"]),
         step=options.step,
         **options.of("first maps"),
     )
+    eigenvalues = study[f"coarse/{name}"]["eigenvalue"].values[None]
     latent_eigenvalue = latent["latent_eigenvalue"].values
-    found = latent_of_new(Y[None], own[None], latent_eigenvalue, options.norm)
+    found = latent_of_new(Y[None], eigenvalues, latent_eigenvalue, options.norm)
     return found.drop_vars("latent_eigenvalue").isel(shape=0)
-
-
-def latent_bases_of(folder: Path, *names: str) -> list[np.ndarray]:
-    """The latent bases Y ``(k, m)`` of shapes of the network, or that stand apart from it."""
-    Y, shapes = arrays(folder / "latent.nc", "latent_basis", "shape")
-    row = {name: i for i, name in enumerate(shapes.tolist())}
-    return [
-        Y[row[name]] if name in row else arrays(folder / "latent" / f"{name}.nc", "latent_basis")[0]
-        for name in names
-    ]
 
 
 def register_shape(folder: Path, name: str, template: str, options: Options) -> xr.Dataset:
     """One shape registered to the template: eq. 6 at low resolution, then eq. 7 or eq. 3 and 4."""
     target = template_of(folder, template, options)
-    if name == template:
-        return identity(target)
-    source = shape_of(folder, name, options)
-    own, of_template = latent_bases_of(folder, name, template)
-    M, N = source.low, target.low
-    start = motion_between(*(motion_to_reference(folder, n) for n in (name, template)))
-    motion = realign(M.cloud, N.cloud, start)
-    how = options.how
-    return from_latent(
-        source, target, (own, of_template), motion, how=how, **options.of("registration")
-    )
+    settings = {"how": options.how, **options.of("registration")}
+    return steps.register_in(Folder(folder), name, template, target, **settings)

@@ -12,7 +12,7 @@ from s4a.options import kept_options
 from s4a.schema import INPUT, in_unit, unit_of, variable
 from s4a.study.contents import check_contents, check_fit
 from s4a.study.netcdf import DamagedError, damage_named, open_file, read, read_tree, stacked
-from s4a.study.store import check_is_study
+from s4a.study.store import check_is_study, write
 
 log = logging.getLogger(__name__)
 
@@ -100,7 +100,6 @@ class Reader:
         # of the files that were read; None where that is not to be asked
         self.keys: set[str] | None = set()
         self.files: dict[str, xr.Dataset] = {}
-        self.damaged: set[str] = set()
 
     def read(
         self, names: Iterable[str], open_with: Callable[..., xr.Dataset] = open_file
@@ -146,7 +145,7 @@ class Reader:
         fault = self.fault(data)
         if not fault:
             with damage_named(path):
-                check_fit(name, data, self.files, self.damaged)
+                check_fit(name, data, self.files)
             if self.keys is not None:
                 self.keys.add(data.attrs.get("task_key", ""))
             self.files[name] = data
@@ -284,6 +283,13 @@ def as_reported(nodes: dict[str, xr.Dataset]) -> dict[str, xr.Dataset]:
             data = data.assign_attrs(path=paths[name])
         reported[node] = data
     return reported
+
+
+def write_inserted(inserted: xr.DataTree, folder: Path | str) -> Path:
+    """Write what :func:`s4a.insert` gives, for :func:`open_inserted`; its file in the folder."""
+    path = Path(folder) / "inserted.nc"
+    write(inserted, path)
+    return path
 
 
 def open_inserted(file: Path | str) -> xr.DataTree:

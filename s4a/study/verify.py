@@ -16,7 +16,7 @@ OF_SHAPE = (
     *("network/sketch_", "network/look_", "network/motion_"),
 )
 OF_ALL = ("network", "latent", "registration", "report")
-OWN = {*STAGES, ".lock", ".costs.json", "study.html", "report.txt", "modes.png", "statistics"}
+OWN = {*STAGES, ".lock", "study.html", "report.txt", "modes.png", "statistics"}
 
 
 def verify(folder: Path | str) -> xr.Dataset:
@@ -62,7 +62,6 @@ def verify(folder: Path | str) -> xr.Dataset:
         looks[name] = look(reader, name)
         if looks[name][0] == "damaged":
             reader.keys = None  # what was made from it may be right
-            reader.damaged.add(name)
     if "report" in reader.files:
         needed = needed_files(reader.files["report"], reader.files.get("registration"))
         for name in looks:

@@ -1,6 +1,7 @@
 """Principal modes of variation (6.1, Fig. 4 and 5): sliders that deform the mean shape."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import traitlets
@@ -139,13 +140,10 @@ class Modes(Panel):
         if resolution is None:
             deformation = self.study["pca"]["deformation"].isel(component=slice(n_modes))
             resolution = list(sizes)[-1] if deformation.nbytes > LARGE else "full"
-        self.view = ModesView(
-            *self.arrays(resolution),
-            limits=mode_limits(self.study),
-            unit=unit_text(self.study, attribute(self.study, "registration", "template")),
-            **score_state(self.study, n_modes),
-            **self.camera,
-        )
+        look: dict[str, Any] = score_state(self.study, n_modes) | self.camera
+        unit = unit_text(self.study, attribute(self.study, "registration", "template"))
+        arrays, limits = self.arrays(resolution), mode_limits(self.study)
+        self.view = ModesView(*arrays, limits=limits, unit=unit, **look)
         traitlets.link((self.view, "scores"), (self, "scores"))
         options = [(f"{name}, {size:,} vertices", name) for name, size in sizes.items()]
         self.resolution = dropdown(

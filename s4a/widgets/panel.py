@@ -195,7 +195,8 @@ class Panel(OfKernel):
             )
         super().__init__(layout=layout_of(width))
         self.add_class("s4a-panel")  # in style.css
-        self.study, self.camera = study, {"group": camera_group(), "view": view, "up": up}
+        self.study = study
+        self.camera: dict[str, Any] = {"group": camera_group(), "view": view, "up": up}
         self.frame = Frame(title=self.title, font=font or 0.0)
         self.message, self.failed = ipywidgets.HTML(), False
         self.children = [self.frame, *self.build(**options), self.message]

@@ -1,5 +1,7 @@
 """Spectra (3.3): eigenvalues of all shapes, eigenfunctions, what a few of them say of a shape."""
 
+from typing import Any
+
 import ipywidgets
 import numpy as np
 import traitlets
@@ -36,7 +38,7 @@ class Spectrum(Panel):
     def build(self) -> list[ipywidgets.Widget]:
         """Choices, curves and two surfaces."""
         nodes = self.study["coarse"].children.items()
-        self.eigenvalues = {
+        self.eigenvalues: dict[str, Any] = {
             name: node["eigenvalue"].values for name, node in nodes if "eigenvalue" in node
         }
         self.names = list(self.eigenvalues)

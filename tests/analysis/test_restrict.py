@@ -5,7 +5,7 @@ import pytest
 from simulated import TOP, T, X, noise, study_of
 
 from s4a import analyse, cli, open_study, statistics, synthetic
-from s4a.analysis.link import image_in_shape
+from s4a.analysis.transfer import image_in_shape
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.method.pca import gram, pca
 

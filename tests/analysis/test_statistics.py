@@ -315,23 +315,6 @@ def test_covariates_do_not_raise_the_family_wise_error(n, c):
     assert np.mean(np.array(smallest) <= 0.05) < 0.16  # four standard errors above 0.05
 
 
-def test_the_share_of_permuted_residuals_has_the_scatter_of_that_permutation():
-    rng = np.random.default_rng(5)
-    n, v, k = 15, 4, 3
-    Z, Q = permutation.design(rng.normal(size=(n, 2)), rng.normal(size=(n, 3)))
-    E = rng.normal(size=(n, v, k))
-    E -= np.einsum("nr,mr,mvk->nvk", Z, Z, E)
-    P = rng.permutation(n)
-    R = E[P] - np.einsum("nr,mr,mvk->nvk", Z, Z, E[P])  # residuals of the permuted
-    expected = []
-    for vertex in range(v):
-        H = Q.T @ R[:, vertex]
-        expected.append(np.trace(H @ np.linalg.inv(R[:, vertex].T @ R[:, vertex]) @ H.T))
-    white = permutation.whiten(E)[P]
-    A, B = (np.einsum("nr,nvk->rkv", M, white)[None] for M in (Z, Q))
-    assert permutation.explained_share(A, B)[0] == pytest.approx(np.array(expected))
-
-
 def test_the_statistics_are_those_of_the_textbook():
     rng = np.random.default_rng(4)
     d, x = rng.normal(size=(14, 5, 3)), np.repeat([0.0, 1.0], [6, 8])

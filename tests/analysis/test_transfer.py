@@ -5,14 +5,11 @@ Real templates.
 
 import gzip
 import json
-import subprocess
-import sys
 
 import nibabel
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from paths import DATA
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -20,7 +17,6 @@ from s4a import (
     clean,
     cli,
     match_pair,
-    read_shape,
     register_pairs,
     synthetic,
     transfer_labels,
@@ -28,8 +24,7 @@ from s4a import (
     transfer_scalars,
     write_mesh,
 )
-from s4a.analysis.link import elect, spread_votes, votes_of
-from s4a.analysis.transfer import pair_study
+from s4a.analysis.transfer import elect, pair_study, spread_votes, votes_of
 from s4a.geometry.closest import (
     closest_facing_point,
     closest_point,
@@ -534,47 +529,3 @@ def test_the_command_writes_labels_per_vertex_of_the_file_and_landmarks(tmp_path
     points = ["--landmarks", str(tmp_path / "marks.csv"), "--blur", "1"]
     assert cli.main(["transfer", *map(str, files), *points, "--out", str(tmp_path / "no")]) == 2
     assert "--blur is of labels" in capsys.readouterr().err
-
-
-# real data
-
-
-@pytest.fixture(scope="module")
-def templates(tmp_path_factory):
-    """Two cortical templates, fsaverage5 and conte69, left, and their labels."""
-    if not (DATA / "unpack.py").exists():
-        pytest.skip("needs the shared data")
-    folder = tmp_path_factory.mktemp("brains")
-    subprocess.run(
-        [sys.executable, DATA / "unpack.py", folder, "brains"],
-        check=True,
-        stdout=subprocess.DEVNULL,
-    )
-    meshes, labels = {}, {}
-    for name, mesh in (("fsa5", "fsa5_lh.gii"), ("conte69", "conte69_32k_lh.gii")):
-        meshes[name] = read_shape(folder / "brains" / mesh)
-        with np.load(folder / "brains" / f"labels_{name}_lh_then_rh.npz") as arrays:
-            labels[name] = arrays["aparc"][: meshes[name].sizes["vertex"]]
-    return meshes, labels
-
-
-def dice(found, true):
-    both = [
-        2 * ((found == v) & (true == v)).sum() / ((found == v).sum() + (true == v).sum())
-        for v in np.unique(true)
-    ]
-    return np.mean(both)
-
-
-def test_the_parcellation_of_one_brain_template_comes_out_on_another(templates):
-    meshes, labels = templates
-    study = register_pairs(meshes["fsa5"], {"conte69": meshes["conte69"]})
-    found, true = (
-        transfer_labels(study, labels["fsa5"])["conte69"]["label"].values,
-        labels["conte69"],
-    )
-    near = cKDTree(meshes["fsa5"]["position"]).query(meshes["conte69"]["position"])[1]
-    nearest = labels["fsa5"][near]
-    assert (nearest == true).mean() == pytest.approx(0.890, abs=0.001)
-    assert (found == true).mean() > 0.915
-    assert dice(found, true) > dice(nearest, true) + 0.02

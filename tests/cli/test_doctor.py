@@ -35,7 +35,7 @@ def test_on_this_machine_nothing_is_lacking_and_nothing_is_left_behind(tmp_path,
 
 def test_what_is_lacking_makes_the_exit_code_1(monkeypatch, capsys):
     lacking = [Finding("a", "lacks", "broken", "mend a"), Finding("b", "note", "odd")]
-    monkeypatch.setattr(doctor, "examine", lambda folder: lacking)
+    monkeypatch.setattr("s4a.cli.commands.examine", lambda folder: lacking)
     assert cli.main(["doctor"]) == 1
     said = capsys.readouterr().out
     assert "-> mend a" in said
@@ -59,8 +59,8 @@ def test_a_broken_pymeshlab_is_no_more_than_a_note_on_wrapping(other_modules, so
 
 
 def test_without_pymeshlab_its_extra_is_named(monkeypatch):
-    there = doctor.installed
-    monkeypatch.setattr(doctor, "installed", lambda name: name != "pymeshlab" and there(name))
+    there = doctor.version_of
+    monkeypatch.setattr(doctor, "version_of", lambda n: "" if n == "pymeshlab" else there(n))
     found = of(list(doctor.extras()), "for --wrap")
     assert (found.state, found.do) == ("note", "pip install 's4a[wrap]'")
 

@@ -123,7 +123,8 @@ def test_the_documentation_is_current(in_python):
 def test_every_other_row_of_the_table_has_its_test():
     for file, test in table.proofs():
         found = [*TESTS.rglob(file), *(ROOT / "morphometrics/tests").glob(file)]
-        assert f"def {test}(" in found[0].read_text(encoding="utf-8"), (file, test)
+        texts = [path.read_text(encoding="utf-8") for path in found]
+        assert any(f"def {test}(" in text for text in texts), (file, test)
 
 
 # rows that need more than a file

@@ -209,7 +209,7 @@ def test_a_table_can_take_the_place_of_the_first(folder):
 
 def test_the_command_prints_tables_and_writes_files(folder, capsys, monkeypatch):
     monkeypatch.setattr(
-        "s4a.show.page.write_page",
+        "s4a.write_page",
         lambda tree, file, **_: file.write_text(str(tree["pca"].sizes["component"])),
     )
     command = [

@@ -3,12 +3,15 @@
 Most of these were chosen by measurement; a test of a whole study would pass without one of them.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from s4a import coarsen, spectrum, synthetic
 from s4a.geometry.mesh import as_arrays, vertex_areas
-from s4a.method import elastic, joint, latent
+from s4a.method import elastic, first_map, joint, latent
 from s4a.method.shape import Basis, Shape
 
 # ---- the score of a registration: round trip, distances in both directions, landmarks
@@ -153,3 +156,47 @@ def test_no_further_step_is_made_where_a_step_lets_the_bending_energy_grow(surfa
 @pytest.mark.parametrize("k, expected", [(20, 5), (21, 5), (23, 6), (30, 8), (2, 1), (100, 25)])
 def test_the_latent_size_is_the_nearest_whole_number_to_its_share(k, expected):
     assert latent.latent_size(25, k, 100) == expected  # 5.25 is 5, 5.75 is 6, 7.5 is 8
+
+
+def test_starts_that_end_within_a_hundredth_of_each_other_go_on_as_their_mean(surface, monkeypatch):
+    monkeypatch.setattr(elastic, "elastic_rounds", lambda _source, _target, start, **_: start)
+
+    def start(x):
+        return np.eye(3), np.array([x, 0.0, 0.0]), np.zeros((1, 3))
+
+    starts = {"a": start(0.0), "b": start(0.008), "c": start(0.02)}
+    met = elastic.starts_that_meet(surface, surface, starts)
+    assert list(met) == ["a", "c"]
+    assert met["a"][1] == pytest.approx([0.004, 0, 0])
+
+
+# ---- initial maps
+
+
+def test_landmarks_on_a_line_do_not_decide_the_turn_about_it(surface):
+    X, tree = surface.X, cKDTree(surface.X)
+    ends = [np.argmin(X[:, 0]), np.argmax(X[:, 0])]
+    # the third is a vertex next to the first in one shape, and the opposite one in the other
+    _, around = tree.query(X[ends[0]], 3)
+    one, other = ({"a": ends[0], "b": ends[1], "c": third} for third in around[1:])
+    bases = [replace(surface, landmarks=marks) for marks in (one, other)]
+    R, t = first_map.motion_onto(*bases)
+    np.testing.assert_allclose(R, np.eye(3), atol=1e-6)
+    np.testing.assert_allclose(t, 0, atol=1e-6)
+
+
+def test_of_searched_maps_that_fit_alike_the_one_that_keeps_curvatures_is_taken(
+    surface, monkeypatch
+):
+    C = np.eye(10)
+    monkeypatch.setattr(first_map, "maps_of_signatures", lambda *_: iter([("other", C, C)] * 2))
+    monkeypatch.setattr(first_map, "stretch", lambda *_: 0.0)
+
+    def found(search):
+        scores, gaps = iter([0.10, 0.11, 0.5]), iter([0.1, 0.0, 0.0])
+        monkeypatch.setattr(joint, "registration_score", lambda *_: next(scores))
+        monkeypatch.setattr(first_map.fmap, "curvature_gap", lambda *_: next(gaps))
+        return first_map.best_first_map(surface, surface, C, search=search)[0]
+
+    assert found(search=False) == "icp"
+    assert found(search=True) == "other"

@@ -190,16 +190,16 @@ def test_fields_in_files_are_read_in_parts_and_their_modes_are_the_same(monkeypa
     files = [netcdf.open_file(tmp_path / f"{i}.nc")["displacement"].variable for i in range(5)]
     monkeypatch.setattr(pca, "BLOCK", 5 * 3 * 7)  # 7 vertices
     monkeypatch.setattr(pca, "N_READ", 2)
-    sizes, part = [], store.Stacked.part
+    sizes, part = [], netcdf.Stacked.part
 
     def noted(self, key):
         found = part(self, key)
         sizes.append(found.size)
         return found
 
-    monkeypatch.setattr(store.Stacked, "part", noted)
+    monkeypatch.setattr(netcdf.Stacked, "part", noted)
     area = np.linspace(1, 2, 300)
-    fields = xr.Variable(("shape", "vertex", "xyz"), store.stacked(files))
+    fields = xr.Variable(("shape", "vertex", "xyz"), netcdf.stacked(files))
     found, expected = pca.gram_pca(fields, area), pca.gram_pca(d, area)
     assert max(sizes) == 2 * 5 * 3 * 7
     for one, other in zip(found, expected, strict=True):

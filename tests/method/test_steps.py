@@ -174,7 +174,7 @@ def test_a_mesh_aligned_to_itself_stays(coarse):
 def test_what_lacks_is_named(study, coarse):
     with pytest.raises(ValueError, match=r"coarse mesh a needs the variables .*eigenvalue"):
         s4a.build_network({"a": coarse["brain_01"].drop_vars("eigenvalue")})
-    with pytest.raises(ValueError, match="/original/nobody is needed; this one has brain_01"):
+    with pytest.raises(ValueError, match="/original/nobody is needed; this one has none"):
         s4a.latent_match(study, "nobody", "brain_01")
     with pytest.raises(ValueError, match="how must be"):
         s4a.latent_match(study, "brain_01", "brain_02", how="both")

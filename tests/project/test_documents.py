@@ -5,16 +5,16 @@ import pkgutil
 import re
 from pathlib import Path
 
-from paths import DOCS, NOTEBOOKS, ROOT, TESTS, benchmark, script
+from paths import DOCS, LESSONS, NOTEBOOKS, ROOT, TESTS, benchmark, script
 from PIL import Image
-from s4a.study.options import PAPER, Options, pair_options
 
+from s4a.options import PRESETS, Options
 from s4a.schema import TABLE
 
 figures = script(DOCS / "figures.py")
 paper = script(ROOT / "tools" / "paper.py")
 PAGES = sorted(DOCS.glob("*.md")) + sorted((DOCS / "api").glob("*.md"))
-READ = [*PAGES, *NOTEBOOKS.glob("*.*"), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
+READ = [*PAGES, NOTEBOOKS / "README.md", *LESSONS, ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 CODE = [ROOT / "s4a", ROOT / "morphometrics", TESTS, ROOT / "benchmarks"]
 
 
@@ -27,11 +27,13 @@ def test_every_page_is_reached_and_every_link_between_pages_leads_somewhere():
     inside = "\n".join(re.findall(r"```\{toctree\}\n(.*?)```", contents, re.DOTALL)).split()
     apart = [page.name for page in PAGES if page.stem not in ("index", *inside)]
     assert [name for name in apart if name[0] != "_"] == []
-    broken = []
+    broken, lessons = [], {path.name for path in LESSONS}
     for page in [*PAGES, ROOT / "README.md"]:
         for link in re.findall(r"\]\((?!http|#)([^)#]+)[^)]*\)", text(page)):
             name = link.removeprefix("course/").replace("index.md", "README.md")
-            if not ((page.parent / link).exists() or (NOTEBOOKS / name).exists()):
+            if not (
+                (page.parent / link).exists() or (NOTEBOOKS / name).exists() or name in lessons
+            ):
                 broken.append((page.name, link))
     assert broken == []
 
@@ -48,7 +50,7 @@ def test_every_file_and_every_name_of_s4a_that_a_page_names_exists():
     folders = "s4a|morphometrics|tests|benchmarks|tools|docs|binder|notebooks"
     file = re.compile(rf"\b(?:{folders})/[\w/]*\w\.(?:py|md|svg|ipynb)")
     name = re.compile(r"`(s4a(?:_morphometrics)?(?:\.[a-zA-Z]\w*)+)")
-    groups = ("s4a.commands", "s4a.panels", "s4a.variables")  # of entry points
+    groups = ("s4a.commands", "s4a.panels", "s4a.variables", "s4a.widgets.Size")  # of extensions
     wrong = []
     for page in READ:
         wrong += [(page.name, one) for one in file.findall(text(page)) if not (ROOT / one).exists()]
@@ -134,15 +136,13 @@ def test_every_claim_of_the_paper_has_a_verdict_and_the_test_that_guards_it():
 
 def test_every_switch_of_the_preset_is_on_the_page_of_differences_and_every_row_is_an_analysis():
     differences, additions = benchmark("differences"), benchmark("additions")
-    assert {switch.option for switch in differences.SWITCHES} == {*PAPER}
     page = differences.page(differences.results())
-    for name, value in PAPER.items():
+    for name, value in PRESETS["paper"].items():
         own = differences.quoted(getattr(Options(), name))
         assert f"| `{name}`: {own}, {differences.quoted(value)}" in page
     rows = additions.study_rows() | additions.pair_rows()
-    for row, options in rows.items():
-        options = {name: value for name, value in options.items() if name != "template"}
-        assert pair_options(options) if row.startswith("pairs") else Options(**options)
+    for options in rows.values():
+        assert Options(**{name: value for name, value in options.items() if name != "template"})
     assert {row for _, row in differences.results()} <= {*rows}
 
 

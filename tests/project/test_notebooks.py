@@ -13,7 +13,7 @@ import subprocess
 import time
 
 import pytest
-from paths import NOTEBOOKS, ROOT
+from paths import LESSONS, NOTEBOOKS, ROOT
 
 import s4a
 from s4a import course
@@ -24,7 +24,6 @@ nbclient = pytest.importorskip("nbclient")
 pytest.importorskip("ipykernel")
 widgets = pytest.importorskip("s4a.widgets")
 
-LESSONS = sorted(NOTEBOOKS.glob("*.ipynb"))
 MEMORY = 1500  # MiB, of the 2 GB that Binder gives
 OPEN = "answer = ..."
 SPENT = """
@@ -217,7 +216,7 @@ def faults_of(path):
     if f'quiz("{path.name[:2]}")' not in [cell.source for cell in code]:
         yield "no quiz"
     table = (NOTEBOOKS / "README.md").read_text(encoding="utf-8")
-    if f"({path.name})" not in table:
+    if f"{path.name})" not in table:
         yield "it is not in the table of the lessons"
 
 

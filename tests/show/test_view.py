@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from s4a.geometry.mesh import as_dataset, vertex_areas
+from s4a import synthetic
+from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.schema import dataset
 from s4a.show import draw, page, pictures
 from s4a.show.surfaces import mode_limits
@@ -16,28 +17,12 @@ from s4a.show.surfaces import mode_limits
 K, N_SHAPES = 12, 6
 
 
-def sphere(n=14):
-    """A closed, outward oriented sphere: `n` rings of 2 n vertices and the poles."""
-    polar, around = np.pi * np.arange(1, n) / n, np.pi * np.arange(2 * n) / n
-    ring = np.stack(
-        np.broadcast_arrays(
-            np.outer(np.sin(polar), np.cos(around)), np.outer(np.sin(polar), np.sin(around))
-        )
-    )
-    ring = np.stack([*ring, np.broadcast_to(np.cos(polar)[:, None], ring.shape[1:])], axis=-1)
-    X = np.concatenate([[[0, 0, 1.0]], ring.reshape(-1, 3), [[0, 0, -1.0]]])
-    m, south = 2 * n, len(X) - 1
-    i, j = 1 + m * np.arange(n - 2)[:, None], np.arange(m)
-    k = (j + 1) % m
-    sides = [np.stack([i + j, i + m + j, i + k], -1), np.stack([i + k, i + m + j, i + m + k], -1)]
-    caps = [
-        np.stack([0 * j, 1 + j, 1 + k], -1),
-        np.stack([0 * j + south, south - m + k, south - m + j], -1),
-    ]
-    return X, np.concatenate([part.reshape(-1, 3) for part in (*sides, *caps)])
+def sphere(n=366):
+    """Vertices and triangles of a closed sphere."""
+    return as_arrays(synthetic.sphere(n))
 
 
-def make_study(n=14):
+def make_study(n=366):
     """A study as the pipeline leaves it.
 
     Of ellipsoids whose height is the only thing that varies much.
@@ -124,7 +109,7 @@ def html(study):
 
 
 def test_a_sphere_is_drawn_as_a_disk_of_its_area():
-    X, T = sphere(40)
+    X, T = sphere(3122)
     picture = draw.render(X, T, size=(200, 200))
     assert picture.shape == (200, 200, 4)
     assert picture[..., 3].sum() / 255 == pytest.approx(np.pi * (0.94 * 100) ** 2, rel=0.01)
@@ -185,18 +170,14 @@ def test_labels_are_not_mixed():
 
 def test_positive_is_blue_negative_is_red_and_unknown_is_grey():
     X, T = sphere()
-    red, _, blue, _ = draw.render(
-        X, T, colors=draw.signed_colors(np.ones(len(X)), 1), size=(60, 60)
-    )[30, 30].astype(int)
-    assert blue > red + 50
-    red, _, blue, _ = draw.render(
-        X, T, colors=draw.signed_colors(-np.ones(len(X)), 1), size=(60, 60)
-    )[30, 30].astype(int)
-    assert red > blue + 50
-    grey = draw.render(X, T, colors=draw.signed_colors(np.full(len(X), np.nan), 1), size=(60, 60))[
-        30, 30, :3
-    ]
-    assert np.ptp(grey.astype(int)) < 12
+
+    def middle(value):
+        colors = draw.signed_colors(np.full(len(X), value), 1)
+        return draw.render(X, T, colors=colors, size=(60, 60))[30, 30, :3].astype(int)
+
+    assert middle(1)[2] > middle(1)[0] + 50
+    assert middle(-1)[0] > middle(-1)[2] + 50
+    assert np.ptp(middle(np.nan)) < 12
 
 
 def test_a_broken_surface_is_refused_with_advice():

@@ -7,7 +7,6 @@ import sys
 import time
 
 import numpy as np
-import psutil
 import pytest
 from small import FLAGS
 
@@ -101,51 +100,6 @@ def test_a_worker_killed_in_the_middle_costs_only_its_task(brain_files, study_of
     assert (
         len(again) <= 1
     )  # the task of the dead worker may have been written, but not yet told to the scheduler
-
-
-SLOW = """
-import sys, time
-
-if __name__ == "__mp_main__":  # in a worker, before it imports dask
-    time.sleep(600)
-if __name__ == "__main__":
-    from s4a import cli
-    sys.exit(cli.main(sys.argv[1:]))
-"""
-
-
-def test_workers_of_dask_that_are_just_starting_are_gone_soon_after_a_run_that_is_killed(
-    brain_files, tmp_path
-):
-    pytest.importorskip("distributed")
-    (tmp_path / "slow.py").write_text(SLOW)
-    words = [*command()[:1], tmp_path / "slow.py", "run", brain_files[0].parent]
-    words += ["--out", tmp_path / "study", "--cluster", "local:2"]
-    with subprocess.Popen(
-        words, start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    ) as run:
-
-        def workers():
-            found = []
-            for process in psutil.Process(run.pid).children(recursive=True):
-                with contextlib.suppress(psutil.Error):  # it ended since it was listed
-                    if "spawn_main" in " ".join(process.cmdline()):
-                        found.append(process)
-            return found
-
-        try:
-            wait_for(lambda: len(workers()) == 2, "worker")
-        except AssertionError:
-            run.kill()  # or its workers would sleep for ten minutes
-            raise
-        started = workers()
-        time.sleep(1)
-        assert all(process.is_running() for process in started)
-        run.kill()
-        _, alive = psutil.wait_procs(started, timeout=20)
-        for process in alive:
-            process.kill()
-        assert not alive
 
 
 @pytest.mark.parametrize("address", ["nowhere", "local:", "local:0", "local:two"])

@@ -46,19 +46,6 @@ def test_a_field_tells_what_the_surface_does_not():
     assert guided[4.0] < 0.5 * without
 
 
-def test_fields_of_other_names_change_nothing():
-    template, f, _ = egg()
-    shape, g, _ = egg(0.2)
-    plain = s4a.match_pair(shape, template, n_coarse=300, k=20)
-    named = s4a.match_pair(
-        s4a.with_features(shape, {"a": g}),
-        s4a.with_features(template, {"b": f}),
-        n_coarse=300,
-        k=20,
-    )
-    assert (plain["displacement"].values == named["displacement"].values).all()
-
-
 def test_a_field_is_standard_at_both_resolutions_and_unknown_values_count_as_the_mean():
     mesh, f, _ = egg()
     values = 7 + 3 * f
@@ -135,11 +122,6 @@ def test_a_new_mesh_with_a_wrong_field_is_left_out_alone(files, tmp_path):
     said = new["report"].to_dataset().sel(shape="wrong")
     assert said["status"].item() == "excluded"
     assert "height" in said["reason"].item()
-
-
-def test_a_weight_must_be_positive():
-    with pytest.raises(ValueError, match="weight must be positive"):
-        s4a.with_features(egg()[0], {"a": np.arange(1500)}, weight=0)
 
 
 def test_a_field_that_no_file_has_is_an_error(files):

@@ -133,13 +133,6 @@ def test_names_that_are_there_twice_are_refused_and_points_of_curves_left_out(br
         with_landmarks(template, curve.isel(landmark=[1, 2]))
 
 
-def test_landmarks_given_again_replace_those_before(brains):
-    (template, _), (on_template, _) = brains
-    once = with_landmarks(template, points(on_template))
-    again = with_landmarks(once, points(on_template[:2], "uv"))
-    assert again["guide_name"].values.tolist() == ["u", "v"]
-
-
 def test_a_folder_of_landmarks_is_read_by_the_names_of_shapes(tmp_path):
     for name in ("head.mrk.json", "arm.landmarks.csv", "Knie 3.csv", "table.txt", "other.pp"):
         (tmp_path / name).write_text("")

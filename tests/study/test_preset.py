@@ -1,28 +1,22 @@
 """The preset of the paper and the switches of what is added, wherever shapes are registered."""
 
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 from scipy.spatial.distance import cdist
 from small import FLAGS, OPTIONS
 
 import s4a
 from s4a.analysis import transfer
 from s4a.cli import main
-from s4a.options import PRESETS, Options
-from s4a.study.netcdf import attributes, read
-from s4a.study.store import write
+from s4a.options import PRESETS, Options, with_options
 
 PAPER, FAST = PRESETS["paper"], PRESETS["fast"]
 DEFAULTS = {name: PRESETS[None][name] for name in PAPER}
 PAIR = {name: OPTIONS[name] for name in ("n_coarse", "k_init", "k")}
-NEW = (
-    "registered_match_low",
-    "displacement_coefficient",
-    "icp_rotation",
-    "icp_translation",
-)
 
 
 @pytest.fixture(scope="module")
@@ -65,24 +59,44 @@ def test_another_preset_takes_back_what_the_one_before_it_set(own, given, n_coar
     assert options.preset == given.get("preset", own.get("preset"))
 
 
-@pytest.mark.parametrize("name", [name for name in PAPER if PAPER[name] != DEFAULTS[name]])
-def test_an_option_that_the_preset_fixes_is_refused_by_name(name, meshes):
+def test_an_option_that_the_preset_fixes_is_refused_by_name(meshes):
     source, target, *_ = meshes.values()
-    message = f"preset 'paper' sets {name}={PAPER[name]!r}; found {name}={DEFAULTS[name]!r}"
-    with pytest.raises(ValueError, match=message):
-        Options(preset="paper", **{name: DEFAULTS[name]})
-    if name not in ("n_spread", "wide", "both"):
+    for name in [name for name in PAPER if PAPER[name] != DEFAULTS[name]]:
+        message = f"preset 'paper' sets {name}={PAPER[name]!r}; found {name}={DEFAULTS[name]!r}"
+        given = {"preset": "paper", name: DEFAULTS[name]}
         with pytest.raises(ValueError, match=message):
-            s4a.match_pair(source, target, preset="paper", **{name: DEFAULTS[name]})
-    if name not in ("n_spread", "wide"):
-        with pytest.raises(ValueError, match=message):
-            s4a.register_pairs(source, {"a": target}, preset="paper", **{name: DEFAULTS[name]})
+            Options(**given)
+        if name not in ("n_spread", "wide"):  # which are of a network
+            with pytest.raises(ValueError, match=message):
+                s4a.match_pair(source, target, **given)
+            with pytest.raises(ValueError, match=message):
+                s4a.register_pairs(source, {"a": target}, **given)
 
 
-def test_a_pair_has_no_options_of_a_collection(meshes):
-    source, target, *_ = meshes.values()
-    with pytest.raises(TypeError, match="unexpected option n_pairs of a pair; there are preset"):
-        s4a.match_pair(source, target, n_pairs=3)
+def test_options_are_kept_with_their_types_and_come_back():
+    given = {
+        "template": "None",
+        "features": ["a", "b"],
+        "table": Path("t.csv"),
+        "seed": np.int64(3),
+    }
+    options = Options(preset="paper", k=np.int32(50), components=2, scale=np.True_, **given)
+    report = xr.Dataset(attrs=with_options({"template": "the median"}, vars(options)))
+    assert Options.from_report(report) == options
+    assert Options.from_report(xr.DataTree.from_dict({"report": report})) == options
+    assert Options.from_report(xr.Dataset()) == Options()
+    assert (options.template, options.features, options.table) == ("None", "a,b", "t.csv")
+
+
+def test_a_misspelt_option_is_refused_with_the_one_that_is_meant(three):
+    with pytest.raises(TypeError, match=r"unexpected option n_corse; did you mean n_coarse\?"):
+        s4a.analyse(three, n_corse=300)
+
+
+def test_keywords_stand_in_the_place_of_those_of_options(three):
+    given = Options(n_coarse=200, k=12, k_init=8, n_pairs=3, seed=5)
+    study = s4a.analyse(three, options=given, k=16, weights="equal")
+    assert Options.from_report(study) == given.changed({"k": 16, "weights": "equal"})
 
 
 def test_pairs_of_the_paper_are_matched_one_way_after_icp_alone(three):
@@ -118,19 +132,6 @@ def test_rounds_are_opened_and_go_when_they_are_not_asked_for(three, paper, tmp_
     with s4a.analyse(three, store=again, preset="paper", close_holes=True, **OPTIONS) as study:
         assert "rounds" not in study.children
     assert not list(again.glob("rounds/*"))
-
-
-def test_a_study_of_before_opens_and_takes_new_shapes(study_folder, meshes, tmp_path):
-    old = shutil.copytree(study_folder, tmp_path / "old")
-    for path in old.glob("registration/*.nc"):
-        said = attributes(path)
-        data = read(path).drop_vars(NEW)
-        write(data, path, said["task_key"], said["made_from"].split())
-    with s4a.open_study(old) as study:
-        assert not set(NEW) & set(study["registration"].data_vars)
-        assert study["registration"].sizes["shape"] == 4
-        new = s4a.insert(study, {"new": meshes["brain_01"]}, compare=False)
-    assert new["registration"].sizes["shape"] == 1
 
 
 def test_a_new_shape_is_cleaned_and_registered_by_the_options_of_the_study(paper, meshes):
@@ -221,18 +222,6 @@ def test_votes_for_labels_spread_unless_the_study_or_its_pairs_are_of_the_paper(
 
 
 @pytest.mark.parametrize("what", ["labels", "scalars", "landmarks"])
-def test_every_transfer_takes_a_preset_in_the_place_of_the_options_of_a_study(
-    what, study, meshes, seen
-):
-    external = meshes["brain_04"]
-    carry = transfers(external)[what]
-    carry(study, source=external, targets=["brain_01"], preset="paper", k=20)
-    assert len(seen) == 1  # one way
-    assert {name: getattr(seen[0], name) for name in PAPER} == PAPER
-    assert (seen[0].k, seen[0].n_coarse) == (20, OPTIONS["n_coarse"])
-
-
-@pytest.mark.parametrize("what", ["labels", "scalars", "landmarks"])
 def test_a_transfer_refuses_by_name_what_its_preset_fixes(what, study, paper, meshes, seen):
     external = meshes["brain_04"]
     carry = transfers(external)[what]
@@ -302,20 +291,3 @@ def test_the_commands_take_the_preset_between_files_and_to_a_study(
     assert "preset 'paper' sets sharpen=0; found sharpen=1" in capsys.readouterr().err
     assert main(["compare", source, target, "--preset", "paper", "--methods", "registered"]) == 2
     assert "preset 'paper' has the methods kNN, ZO, FMAP+ZO" in capsys.readouterr().err
-
-
-def test_table_2_with_the_preset_has_the_first_maps_of_landmarks(brains, monkeypatch):
-    seen = []
-    fit = s4a.compare.map_after_motion
-
-    def watched(*arguments, **options):
-        seen.append(options["init"])
-        return fit(*arguments, **options)
-
-    monkeypatch.setattr(s4a.compare, "map_after_motion", watched)
-    small = {"n_coarse": 200, "k_init": 8, "k": 12, "n_pairs": 3, "methods": ["RE-MATCH"]}
-    found = s4a.compare.collection(brains, preset="paper", **small)
-    assert set(seen) == {"landmarks"}
-    assert found["collection_chamfer"].notnull().sum() == 2 * 3
-    with pytest.raises(ValueError, match="preset 'paper' sets wide=0; found wide=4"):
-        s4a.compare.collection(brains, preset="paper", wide=4, **small)

@@ -1,16 +1,15 @@
 """How far a run is, while it goes on, after it was stopped or killed, and at its end."""
 
 import json
-import logging
 import subprocess
 import sys
 
 import pytest
 from small import OPTIONS
 
-from s4a import analyse, cli, synthetic
+from s4a import analyse, cli
 from s4a.study import pipeline, progress, tasks
-from s4a.study.progress import FILE, STAGES, Stage, status
+from s4a.study.progress import FILE, STAGES, status
 
 
 def test_a_finished_run_has_done_all_of_every_stage(brains, tmp_path, capsys):
@@ -26,16 +25,6 @@ def test_a_finished_run_has_done_all_of_every_stage(brains, tmp_path, capsys):
     first, _, *lines = capsys.readouterr().out.splitlines()
     assert first.startswith("finished at 20")
     assert [line.split("  ")[0] for line in lines] == list(STAGES)
-
-
-def test_the_bars_of_all_stages_begin_at_one_column_and_nothing_is_left_of_them(caplog, capsys):
-    caplog.set_level(logging.WARNING, "s4a.study.runner")  # or lines of the log take their place
-    analyse(synthetic.brains(3, 200), n_coarse=100, k=10, k_init=6, n_pairs=3, n_jobs=1)
-    *bars, blank, end = capsys.readouterr().err.split("\r")
-    drawn = [bar for bar in bars if "|" in bar]
-    assert {"read and clean", "consistent ZoomOut"} <= {bar.partition(":")[0] for bar in drawn}
-    assert len({bar.index("|") for bar in drawn}) == 1
-    assert (blank.strip(), end) == ("", "")
 
 
 def test_a_run_that_goes_on_or_is_stopped_says_how_far_it_is(brains, tmp_path, monkeypatch, capsys):
@@ -75,13 +64,6 @@ def test_a_run_that_goes_on_or_is_stopped_says_how_far_it_is(brains, tmp_path, m
     assert again.stages["read and clean"][:3] == (4, 4, 4)
     analyse(brains, store=tmp_path, **OPTIONS).close()  # nothing is left to do
     assert list(status(tmp_path).stages) == list(again.stages)
-
-
-def test_the_time_that_is_left_is_by_the_pace_of_this_run():
-    stage = Stage(30, 50, 20, 100.0, 7.0, 1.0, False)
-    assert stage.remaining(110.0) == 20.0  # 10 in 10 seconds, 20 are left
-    assert stage._replace(done=20).remaining(110.0) != stage._replace(done=20).remaining(110.0)
-    assert stage._replace(ended=True).remaining(110.0) == 0.0
 
 
 @pytest.fixture

@@ -11,16 +11,11 @@ import s4a
 from s4a.analysis import transfer
 from s4a.cli import main
 from s4a.evaluation import accuracy, metrics
-from s4a.geometry.mesh import stiffness
 from s4a.method.pca import low_vertices
 from s4a.method.scalable import reduce, reduced
 from s4a.method.shape import Shape
-from s4a.method.spectral import unit_mass
 from s4a.options import Options
 from s4a.show.surfaces import SAMPLES
-from s4a.study import pipeline
-from s4a.study.netcdf import DamagedError, is_done, read
-from s4a.study.store import task_key, write
 
 U = {"coarse_vertex", "coarse_weight"}
 LOCAL = {"local_vertex", "local_sample", "local_weight", "sample_cell", "edge_mass"}
@@ -89,20 +84,6 @@ def test_the_low_resolution_is_the_reduced_basis_of_scalable(sampled):
     assert coarse["position"].values == pytest.approx(X)
 
 
-def test_the_node_alone_holds_the_reduced_eigenproblem(sampled):
-    low = sampled["coarse/brain_01"].to_dataset()
-    E, w, p = low["edge_vertex"].values, low["cotan_weight"].values, low.sizes["vertex"]
-    W, A = stiffness(E, w, p), unit_mass(low)
-    Phi, eigenvalue = low["eigenfunction"].values, low["eigenvalue"].values
-    np.testing.assert_allclose(W @ Phi, (A @ Phi) * eigenvalue, atol=1e-9 * eigenvalue[-1])
-    np.testing.assert_allclose(Phi.T @ (A @ Phi), np.eye(24), atol=1e-9)
-    area = low["vertex_area"].values
-    assert area.sum() == pytest.approx(sampled["original/brain_01"].attrs["area"])
-    # as many functions as samples give any function back; these, its part in their span
-    f = low["position"].values
-    np.testing.assert_allclose(s4a.reconstruct(low, f), Phi @ (Phi.T @ (A @ f)), atol=1e-9)
-
-
 def test_the_paper_on_scalable_is_what_table_2_compares(brains, paper):
     names = {"n_coarse": 400, "k_init": 10, "k": 24, "methods": ["SCALABLE"]}
     found = s4a.compare.collection(brains, preset="paper", **names).isel(way=0)
@@ -156,19 +137,6 @@ def test_it_is_as_near_to_the_truth_as_a_study_of_rematch(sampled, study_of_file
     assert ours < 0.7 * errors[0].sel(way=accuracy.ICP).mean()
 
 
-def test_every_panel_is_built_on_it_and_says_that_its_meshes_are_samples(sampled):
-    pytest.importorskip("anywidget")
-    from s4a.widgets import explore
-
-    for kind in explore.PANELS.values():
-        panel = kind(sampled)
-        assert panel.children
-        panel.close()
-    panel = explore.Spectrum(sampled)
-    assert panel.function.caption == SAMPLES
-    panel.close()
-
-
 def test_the_commands_take_it(folder, brain_files, sampled, tmp_path):
     assert main(["view", str(folder), "--out", str(tmp_path / "page.html")]) == 0
     assert SAMPLES in (tmp_path / "page.html").read_text(encoding="utf-8")
@@ -218,26 +186,6 @@ def test_an_external_mesh_is_matched_by_it(paper, meshes, monkeypatch):
     assert seen == [(True, True, "scalable")]
 
 
-def test_keys_of_studies_of_before_stay_and_another_method_is_another_file(monkeypatch):
-    class Asked:
-        folder = None
-
-        def do(self, stage, tasks):
-            self.key = tasks[0].key
-            return {}
-
-    monkeypatch.setattr(pipeline, "check_usable", lambda *_: None)
-
-    def key(**options):
-        run = Asked()
-        pipeline.remesh(run, {"a": "key of a"}, Options(**options))
-        return run.key
-
-    assert key() == key(method="rematch") == task_key("key of a", (6000, False, 0, 100))
-    assert key(lift=True) == task_key("key of a", (6000, False, 0, 100, "lift"))
-    assert key(method="scalable") == task_key("key of a", (6000, False, 0, 100, "scalable"))
-
-
 def test_what_it_cannot_have_is_refused_by_name(brain_files, tmp_path, capsys):
     with pytest.raises(ValueError, match="method must be one of 'rematch', 'scalable'; found 'zo'"):
         Options(method="zo")
@@ -253,21 +201,6 @@ def test_what_it_cannot_have_is_refused_by_name(brain_files, tmp_path, capsys):
     assert Options(method="scalable", preset="paper").refine == "intrinsic"
 
 
-def test_a_file_without_the_entries_of_u_is_named(folder, tmp_path):
-    copy = shutil.copytree(folder, tmp_path / "copy")
-    path = copy / "coarse/brain_02.nc"
-    data = read(path)
-    write(
-        data.drop_vars("local_weight"),
-        path,
-        data.attrs["task_key"],
-        data.attrs["made_from"].split(),
-    )
-    with pytest.raises(DamagedError, match=r"brain_02.nc .*it lacks local_weight"):
-        s4a.open_study(copy)
-    assert is_done(path, data.attrs["task_key"])
-
-
 def test_fields_are_projected_by_the_vertices_nearest_to_samples(brain):
     low = reduced(brain, n_coarse=300, k=8)
     near = Shape(brain, low, n_projected=600).near_coarse
@@ -277,11 +210,3 @@ def test_fields_are_projected_by_the_vertices_nearest_to_samples(brain):
     assert set(np.argsort(gap)[:300]) <= set(near)
     assert gap[near].max() <= np.sort(gap)[600]
     assert (low_vertices(low) == low["sample_vertex"].values).all()
-
-
-def test_fewer_functions_than_asked_for_are_told_as_of_a_spectrum(caplog):
-    ball = s4a.synthetic.sphere(60)
-    low = reduced(ball, n_coarse=100, k=80)
-    assert low.sizes["mode"] == 58
-    assert low.attrs["k_reduced_from"] == 80
-    assert "k reduced from 80 to 58: the mesh has only 60 samples" in caplog.text

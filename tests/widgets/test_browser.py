@@ -3,48 +3,53 @@
 Pages without a kernel.
 """
 
-import contextlib
 import itertools
 import json
-import os
 import re
-import socket
-import subprocess
-import sys
-import time
-import urllib.request
 from pathlib import Path
 
 import numpy as np
 import pytest
-from paths import NOTEBOOKS, benchmark
+from browsing import (
+    DRAWN,
+    IDLE,
+    SEEN,
+    SMALLEST,
+    STILLS,
+    THEMES,
+    TITLES,
+    VIEW,
+    barriers,
+    check_barriers,
+    check_read,
+    check_themes,
+    chosen,
+    contrasts,
+    cursor,
+    faint,
+    move,
+    needed,
+    notebooks,
+    open_tab,
+    pixels,
+    run_notebook,
+    serious,
+    vertices,
+    visible,
+    watched,
+)
+from paths import NOTEBOOKS
 
 import s4a
 from s4a.show.draw import vertices_within
 from s4a.show.surfaces import aligned
 
-playwright = pytest.importorskip("playwright.sync_api")
+pytest.importorskip("playwright.sync_api")
 pytest.importorskip("jupyterlab")
-axe = pytest.importorskip("axe_playwright_python.sync_playwright")
 widgets = pytest.importorskip("s4a.widgets")
 
-chromium = benchmark("chromium")
-pytestmark = pytest.mark.skipif(chromium.PATH is None, reason=chromium.LACKS)
+pytestmark = needed
 NOTEBOOK = NOTEBOOKS / "00_explore.ipynb"
-HARMLESS = ("t.on is not a function", "Unsatisfied version")  # both are JupyterLab's own
-VIEW = "canvas.s4a-view"
-DRAWN = f"[...document.querySelectorAll('{VIEW}')].some((c) => c.offsetParent && c.view.frames > 0)"
-SEEN = (
-    "[...document.querySelectorAll('canvas.s4a-view')]"
-    ".filter((c) => c.offsetParent).map((c) => c.view)"
-)
-STILLS = (
-    "[...document.querySelectorAll('img.s4a-still')]"
-    ".filter((i) => i.offsetParent && i.naturalWidth > 100)"
-)
-IDLE = (
-    "[...document.querySelectorAll('.jp-InputPrompt')].every((p) => !p.textContent.includes('*'))"
-)
 
 
 PROGRESS = """
@@ -78,7 +83,6 @@ window.WebSocket = class extends Real {
   set onmessage(act) { super.onmessage = (event) => setTimeout(() => act(event), 250); }
 };
 """
-TITLES = ("Modes", "Network", "Functional map", "Median", "Correspondence", "Transfer", "Spectrum")
 
 
 @pytest.fixture(scope="module")
@@ -91,132 +95,17 @@ def study(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def folder(study, tmp_path_factory):
-    """A folder with the main notebook.
-
-    In which the study of this test takes the place of the analysis.
-    """
+    """A folder with the main notebook, in which this study takes the place of the analysis."""
     folder = tmp_path_factory.mktemp("lab")
-    notebook = json.loads(NOTEBOOK.read_text(encoding="utf-8"))
-    cell = next(c for c in notebook["cells"] if "s4a.analyse" in "".join(c["source"]))
     store = Path(study["coarse/brain_01"].to_dataset().encoding["source"]).parent.parent
     opened = f"import s4a\n\nstudy = s4a.open_study({str(store)!r})"
+    notebook = json.loads(NOTEBOOK.read_text(encoding="utf-8"))
+    cell = next(c for c in notebook["cells"] if "s4a.analyse" in "".join(c["source"]))
     cell["source"] = opened
     (folder / NOTEBOOK.name).write_text(json.dumps(notebook), encoding="utf-8")
-    notebook["cells"] = [cell | {"source": f"{opened}\nstudy.s4a.explore()", "id": "small"}]
-    (folder / "small.ipynb").write_text(json.dumps(notebook), encoding="utf-8")
-    notebook["cells"] = [
-        cell | {"source": PROGRESS.format(store=str(folder / "run")), "id": "progress"}
-    ]
-    (folder / "progress.ipynb").write_text(json.dumps(notebook), encoding="utf-8")
-    sizes = f"{opened}\n{SIZES}"
-    notebook["cells"] = [cell | {"source": sizes, "id": "sizes"}]
-    (folder / "sizes.ipynb").write_text(json.dumps(notebook), encoding="utf-8")
-    (folder / "app").mkdir()
-    news = {
-        "@jupyterlab/apputils-extension:notification": {
-            "fetchNews": "false",
-            "checkForUpdates": False,
-        }
-    }
-    (folder / "app" / "overrides.json").write_text(json.dumps(news), encoding="utf-8")
-    return folder
-
-
-@pytest.fixture(scope="module")
-def lab(folder):
-    """The address of a JupyterLab of its own."""
-    with contextlib.closing(socket.socket()) as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    own = {
-        f"JUPYTER_{name}_DIR": str(folder / name.lower()) for name in ("CONFIG", "DATA", "RUNTIME")
-    }
-    options = {
-        "ServerApp.port": port,
-        "ServerApp.root_dir": folder,
-        "ServerApp.open_browser": False,
-        "IdentityProvider.token": "",
-        "LabApp.app_settings_dir": folder / "app",
-        "LabApp.expose_app_in_browser": True,  # for its themes
-    }
-    command = [
-        sys.executable,
-        "-m",
-        "jupyterlab",
-        "--allow-root",
-        *(f"--{k}={v}" for k, v in options.items()),
-    ]
-    with open(folder / "lab.log", "w") as log:
-        process = subprocess.Popen(
-            command,
-            env=os.environ | own | {"IPYTHONDIR": str(folder / "ipython")},
-            stdout=log,
-            stderr=log,
-        )
-        try:
-            wait_for(f"http://127.0.0.1:{port}/api", folder / "lab.log")
-            yield f"http://127.0.0.1:{port}"
-        finally:
-            process.terminate()
-            try:
-                process.wait(60)
-            except subprocess.TimeoutExpired:  # held by a kernel that is busy
-                process.kill()
-                process.wait()
-
-
-def wait_for(address, log, seconds=60):
-    for _ in range(4 * seconds):
-        with contextlib.suppress(OSError), urllib.request.urlopen(address):
-            return
-        time.sleep(0.25)
-    raise TimeoutError(log.read_text())
-
-
-@pytest.fixture(scope="module")
-def driver():
-    with playwright.sync_playwright() as driver:
-        yield driver
-
-
-@pytest.fixture(scope="module")
-def browser(driver):
-    browser = chromium.launched(driver)
-    yield browser
-    browser.close()
-
-
-@pytest.fixture(scope="module")
-def flat(driver):
-    """A browser that has no WebGL."""
-    browser = chromium.launched(driver, "--disable-3d-apis")
-    yield browser
-    browser.close()
-
-
-@pytest.fixture(scope="module")
-def messages():
-    return []
-
-
-def watched(page, messages):
-    """A page whose errors are collected, those of its console as well."""
-    page.on("console", lambda m: m.type == "error" and messages.append(m.text))
-    page.on("pageerror", lambda error: messages.append(str(error)))
-    return page
-
-
-def serious(messages):
-    return [text for text in messages if not any(known in text for known in HARMLESS)]
-
-
-def run_notebook(page, lab, name):
-    """Open a notebook and run all of its cells."""
-    page.goto(f"{lab}/lab/tree/{name}?reset")
-    page.wait_for_selector(".jp-Notebook .jp-Cell", timeout=120_000)
-    page.wait_for_selector("text=Python 3 (ipykernel) | Idle", timeout=120_000)
-    page.get_by_role("menuitem", name="Run", exact=True).click()
-    page.get_by_role("menuitem", name="Run All Cells", exact=True).click()
+    small, sizes = f"{opened}\nstudy.s4a.explore()", f"{opened}\n{SIZES}"
+    run = PROGRESS.format(store=str(folder / "run"))
+    return notebooks(folder, small=[small], sizes=[sizes], progress=[run])
 
 
 @pytest.fixture(scope="module")
@@ -228,29 +117,6 @@ def page(browser, lab, messages):
     page.wait_for_function(DRAWN, timeout=120_000)
     page.wait_for_function(IDLE)
     return page
-
-
-def open_tab(page, title):
-    page.locator(".jupyter-widgets .lm-TabBar-tabLabel", has_text=title).first.click()
-    page.wait_for_function(DRAWN)
-
-
-def visible(page, selector):
-    return page.locator(selector).filter(visible=True)
-
-
-def pixels(canvas):
-    return canvas.evaluate("(c) => { c.view.draw(); return c.toDataURL(); }")
-
-
-def vertices(canvas):
-    return np.array(
-        canvas.evaluate("(c) => Array.from(c.view.surfaces[0].position)"), np.float32
-    ).reshape(-1, 3)
-
-
-def move(slider, value):
-    slider.evaluate("(i, v) => { i.value = v; i.dispatchEvent(new Event('input')); }", value)
 
 
 def check_sliders(page, study):
@@ -371,14 +237,6 @@ def test_a_landmark_is_placed_and_carried_over(page, study):
     page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
     visible(page, "td").filter(has_text=f"landmark {count + 1}").wait_for()
     assert visible(page, VIEW).nth(1).evaluate("(c) => c.view.points.length") == count + 1
-
-
-def cursor(canvas, *keys):
-    """Start the cursor on a view and press keys; the vertex on which it then stands."""
-    canvas.focus()
-    for key in ("c", *keys):
-        canvas.press(key)
-    return int(canvas.get_attribute("data-cursor"))
 
 
 def test_the_keyboard_places_a_landmark(page, study):
@@ -533,36 +391,12 @@ def panel_of(tabs):
     return tabs.locator(".s4a-panel").filter(visible=True)
 
 
-SMALLEST = """(panel) => {
-  const sizes = [], walk = document.createTreeWalker(panel, NodeFilter.SHOW_TEXT);
-  while (walk.nextNode()) {
-    const at = walk.currentNode.parentElement, svg = at.ownerSVGElement;
-    if (!walk.currentNode.textContent.trim() || !at.getClientRects().length) continue;
-    if (at.closest("title, style, script, option")) continue;
-    const scale = svg ? svg.getBoundingClientRect().width / svg.viewBox.baseVal.width : 1;
-    sizes.push([scale * parseFloat(getComputedStyle(at).fontSize), walk.currentNode.textContent]);
-  }
-  return sizes.sort((a, b) => a[0] - b[0])[0];
-}"""
-
-
 @pytest.mark.parametrize("title", TITLES)
-def test_a_cell_of_360_pixels_has_a_surface_of_300(sizes, title):
+def test_a_panel_is_read_and_uncut_in_a_cell_of_360_pixels_and_from_afar(sizes, title):
     tabs = tabs_of(sizes, 0, title)
     assert tabs.bounding_box()["width"] <= 360
-    for canvas in tabs.locator(VIEW).filter(visible=True).all():
-        assert canvas.bounding_box()["width"] >= 300
-    panel = panel_of(tabs)
-    assert panel.evaluate("(e) => e.scrollWidth <= e.clientWidth + 2"), "nothing is cut off"
-    assert panel.evaluate(SMALLEST)[0] > 11
-
-
-@pytest.mark.parametrize("title", TITLES)
-def test_a_screen_of_1920_pixels_is_filled_and_read_from_afar(sizes, title):
-    panel = panel_of(tabs_of(sizes, 3, title))
-    assert panel.bounding_box()["width"] >= 1500
-    smallest, text = panel.evaluate(SMALLEST)
-    assert smallest >= 16, text
+    check_read(panel_of(tabs), 11, width=360)
+    check_read(panel_of(tabs_of(sizes, 3, title)), 16)
 
 
 def test_the_size_of_the_text_can_be_given(sizes):
@@ -853,17 +687,6 @@ def test_the_console_has_no_errors(page, messages):
 # ---- for readers of screens, with axe-core
 
 
-def barriers(page, context=None):
-    """What axe finds serious or critical: rule, element, and why."""
-    found = axe.Axe().run(page, context).response["violations"]
-    return [
-        (rule["id"], node["html"], node["failureSummary"])
-        for rule in found
-        if rule["impact"] in ("serious", "critical")
-        for node in rule["nodes"]
-    ]
-
-
 def test_axe_sees_what_it_should(browser):
     page = browser.new_page()
     page.set_content('<html lang="en"><title>t</title><input><p style="color:#bbb">faint</p>')
@@ -878,81 +701,10 @@ def test_a_panel_has_no_serious_barrier(sizes, title):
         panel_of(tabs).locator(".s4a-edge").nth(6).dispatch_event("click")
         panel_of(tabs).locator(".s4a-title", has_text="the target").wait_for()
     assert panel_of(tabs).get_attribute("role") == "region", "a landmark"
-    panel_of(tabs).evaluate("(e) => (e.id = 'looked-at')")
-    assert barriers(sizes, "#looked-at") == []
-    panel_of(tabs).evaluate("(e) => e.removeAttribute('id')")
+    check_barriers(sizes, panel_of(tabs))
 
 
 # ---- every theme
-
-THEMES = ("JupyterLab Dark", "JupyterLab Dark High Contrast", "JupyterLab Light")
-FIELDS = "select, input[type=text], input[type=number]"
-NO_TEXTS = "title, style, script, option, :disabled"
-CONTRAST = r"""(root, [fields, noTexts]) => {
-  const rgba = (text) => {
-    const [r, g, b, a = 1] = text.match(/[\d.]+/g).map(Number);
-    return [r, g, b, a];
-  };
-  const over = (top, below) => [0, 1, 2].map((i) => top[3] * top[i] + (1 - top[3]) * below[i]);
-  const ground = (at) => {  // of all grounds down to the first that hides what is below
-    const layers = [];
-    for (; at; at = at.parentElement) {
-      layers.push(rgba(getComputedStyle(at).backgroundColor));
-      if (layers.at(-1)[3] === 1) break;
-    }
-    return layers.reverse().reduce((below, layer) => over(layer, below), [255, 255, 255]);
-  };
-  const linear = (v) => (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);
-  const light = (rgb) => {
-    const [r, g, b] = rgb.map((v) => linear(v / 255));
-    return 0.2126 * r + 0.7152 * g + 0.0722 * b;
-  };
-  const found = [], walk = document.createTreeWalker(root, NodeFilter.SHOW_ALL);
-  while (walk.nextNode()) {
-    const node = walk.currentNode, field = node.matches?.(fields);
-    const at = field ? node : node.parentElement;
-    if (!field && !(node.nodeType === Node.TEXT_NODE && node.textContent.trim())) continue;
-    if (!at.getClientRects().length || at.closest(noTexts)) continue;
-    const look = getComputedStyle(at), back = ground(at);
-    const color = over(rgba(at.ownerSVGElement ? look.fill : look.color), back);
-    const [low, high] = [light(color), light(back)].sort((a, b) => a - b);
-    found.push([(high + 0.05) / (low + 0.05), node.value ?? node.textContent]);
-  }
-  return found;
-}"""
-
-
-def change_theme(page, theme):
-    """Choose a theme of JupyterLab, and wait until it is there and its picture in between gone."""
-    page.evaluate(
-        "(theme) => jupyterapp.commands.execute('apputils:change-theme', { theme })", theme
-    )
-    page.wait_for_function(
-        "(theme) => document.body.dataset.jpThemeName === theme"
-        " && !document.getElementById('jupyterlab-splash')",
-        arg=theme,
-    )
-
-
-@contextlib.contextmanager
-def themed(page, theme):
-    """The page in a theme of JupyterLab, and in the light one afterwards."""
-    try:
-        change_theme(page, theme)
-        yield
-    finally:
-        change_theme(page, THEMES[-1])
-
-
-def contrasts(part):
-    """Contrast and text of all that is read in a part of a page."""
-    return part.evaluate(CONTRAST, [FIELDS, NO_TEXTS])
-
-
-def faint(part):
-    """How many texts are in a part of a page, and those that cannot be read on their ground."""
-    found = contrasts(part)
-    return len(found), [(round(ratio, 1), text) for ratio, text in found if ratio < 4.5]
 
 
 def test_contrast_is_measured_as_wcag_defines_it(browser):
@@ -967,73 +719,32 @@ def test_contrast_is_measured_as_wcag_defines_it(browser):
 
 @pytest.mark.parametrize("theme", THEMES)
 def test_every_text_of_every_tab_is_read_in_every_theme(sizes, theme):
-    with themed(sizes, theme):
-        for title in TITLES:
-            tabs = tabs_of(sizes, 3, title)
-            n, unread = faint(tabs)
-            assert n > 20
-            assert unread == [], title
-            if theme == "JupyterLab Dark":
-                tabs.evaluate("(e) => (e.id = 'looked-at')")
-                assert barriers(sizes, "#looked-at") == []
-                tabs.evaluate("(e) => e.removeAttribute('id')")
+    tabs = {title: lambda title=title: tabs_of(sizes, 3, title) for title in TITLES}
+    check_themes(sizes, theme, tabs, 20)
 
 
 # ---- without a kernel
 
 
-@pytest.fixture(scope="module")
-def offline(browser):
-    context = browser.new_context(offline=True)
-    yield context
-    context.close()
-
-
-def opened(context, path):
-    page, errors = context.new_page(), []
-    page.set_default_timeout(30_000)
-    watched(page, errors).goto(path.as_uri())
-    return page, errors
-
-
-def saved(panel, path):
-    """The page of a panel, whose widgets are closed."""
-    panel.save_html(path)
-    panel.close()
-    return path
-
-
-def chosen(page, control, label):
-    """Choose a value of a page's control."""
-    page.locator(f"#c-{control}").select_option(label)
-
-
-def test_the_page_deforms_without_kernel_and_network(offline, study, tmp_path):
-    page, errors = opened(offline, saved(widgets.Modes(study), tmp_path / "modes.html"))
-    page.wait_for_function(DRAWN)
+def test_the_page_deforms_without_kernel_and_network(show, study):
+    page = show(widgets.Modes(study))
     check_sliders(page, study)
-    assert errors == []
-    page.close()
 
 
 @pytest.mark.parametrize("components", [1, 2])
-def test_one_mode_has_no_chart_of_the_variance_of_many(offline, study, tmp_path, components):
+def test_one_mode_has_no_chart_of_the_variance_of_many(show, study, components):
     some = study.copy()
     some["pca"] = type(study)(study["pca"].to_dataset().isel(component=slice(components)))
-    page, errors = opened(offline, saved(widgets.Modes(some), tmp_path / "few.html"))
-    page.wait_for_function(DRAWN)
+    page = show(widgets.Modes(some))
     assert page.get_by_text("Scores: click").count() == 1
     assert page.get_by_text("Cumulative variance").count() == components - 1
-    assert errors == []
-    page.close()
 
 
-def test_a_lasso_takes_what_is_seen_within_it(offline, study, tmp_path):
+def test_a_lasso_takes_what_is_seen_within_it(show, study):
     panel = widgets.Region(study, view="top")
     panel.lasso.value = True
     X, T = panel.X, panel.T
-    page, errors = opened(offline, saved(panel, tmp_path / "region.html"))
-    page.wait_for_function(DRAWN)
+    page = show(panel)
     box = visible(page, VIEW).first.bounding_box()
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
     page.mouse.move(x, y - 150)
@@ -1058,16 +769,13 @@ def test_a_lasso_takes_what_is_seen_within_it(offline, study, tmp_path):
     page.mouse.move(x + 60, y, steps=4)
     page.mouse.up()
     assert not np.allclose(page.evaluate(f"{SEEN}[0].camera.turn"), before)
-    assert errors == []
-    page.close()
 
 
 SMOOTH = "(c) => c.view.smooth"
 
 
-def test_full_resolution_is_drawn_once_after_a_drag_and_not_within(offline, study, tmp_path):
-    page, errors = opened(offline, saved(widgets.Modes(study), tmp_path / "modes.html"))
-    page.wait_for_function(DRAWN)
+def test_full_resolution_is_drawn_once_after_a_drag_and_not_within(show, study):
+    page = show(widgets.Modes(study))
     page.wait_for_function(f"{SEEN}[0].smooth > 0")
     canvas = visible(page, VIEW).first
     before, box = canvas.evaluate(SMOOTH), canvas.bounding_box()
@@ -1090,8 +798,6 @@ def test_full_resolution_is_drawn_once_after_a_drag_and_not_within(offline, stud
       return performance.now() - start;
     }""")
     assert waited >= 800
-    assert errors == []
-    page.close()
 
 
 @pytest.fixture(scope="module")
@@ -1101,9 +807,9 @@ def study_page(study, tmp_path_factory):
 
 @pytest.mark.parametrize("width, height", [(1366, 680), (1920, 1080), (3840, 2160)])
 def test_the_page_of_a_study_fills_a_wide_screen_one_idea_at_a_time(
-    offline, study_page, width, height
+    show, study_page, width, height
 ):
-    page, _ = opened(offline, study_page)
+    page = show(study_page)
     page.set_viewport_size({"width": width, "height": height})
     page.wait_for_function(DRAWN)
     wide, tall, text = page.evaluate("""() => {
@@ -1117,20 +823,16 @@ def test_the_page_of_a_study_fills_a_wide_screen_one_idea_at_a_time(
     box = visible(page, VIEW).first.bounding_box()
     assert 0.75 < box["height"] / box["width"] < 1.3, "a shape is as wide as the smaller of both"
     assert text >= (16 if width >= 1920 else 13), sizes
-    page.close()
 
 
-def test_the_page_of_a_study_has_live_sliders(offline, study, study_page):
-    page, errors = opened(offline, study_page)
-    page.wait_for_function(DRAWN)
+def test_the_page_of_a_study_has_live_sliders(show, study, study_page):
+    page = show(study_page)
     check_sliders(page, study)
     assert not page.locator("#modes-instead").is_visible()
-    assert errors == []
-    page.close()
 
 
-def test_the_page_of_a_study_has_no_serious_barrier_and_one_screen_an_idea(offline, study_page):
-    page, errors = opened(offline, study_page)
+def test_the_page_of_a_study_has_no_serious_barrier_and_one_screen_an_idea(show, study_page):
+    page = show(study_page)
     page.set_viewport_size({"width": 1366, "height": 768})
     page.wait_for_function(DRAWN)
     assert barriers(page) == []
@@ -1143,25 +845,16 @@ def test_the_page_of_a_study_has_no_serious_barrier_and_one_screen_an_idea(offli
         "Math.abs(document.querySelector('h2:target').getBoundingClientRect().top) < 300"
     )
     assert page.locator("h2:target").inner_text() == "Gallery"
-    assert errors == []
-    page.close()
 
 
 @pytest.mark.parametrize("kind", ["Modes", "Network", "Median", "Transfer", "Comparison"])
-def test_a_saved_panel_has_no_serious_barrier(offline, study, compared, kind, tmp_path):
+def test_a_saved_panel_has_no_serious_barrier(show, study, compared, kind):
     panel = getattr(widgets, kind)(compared if kind == "Comparison" else study)
-    panel.save_html(tmp_path / "panel.html", limit=200_000)
-    panel.close()
-    page, errors = opened(offline, tmp_path / "panel.html")
-    page.wait_for_function(DRAWN)
-    assert barriers(page) == []
-    assert errors == []
-    page.close()
+    assert barriers(show(panel, limit=200_000)) == []
 
 
-def test_the_page_of_the_network_shows_the_map_that_is_clicked(offline, study, tmp_path):
-    page, errors = opened(offline, saved(widgets.Network(study), tmp_path / "network.html"))
-    page.wait_for_function(DRAWN)
+def test_the_page_of_the_network_shows_the_map_that_is_clicked(show, study):
+    page = show(widgets.Network(study))
     edge = visible(page, ".s4a-edge").nth(6)
     source, target = re.match(r"(\w+) → (\w+)", edge.get_attribute("aria-label")).groups()
     edge.dispatch_event("click")
@@ -1183,35 +876,32 @@ def test_the_page_of_the_network_shows_the_map_that_is_clicked(offline, study, t
     visible(page, "[data-node]").nth(1).dispatch_event("click")
     visible(page, ".s4a-title").filter(has_text=re.compile("^brain_02$")).wait_for()
     assert visible(page, VIEW).count() == 1
-    assert errors == []
-    page.close()
 
 
-def test_the_page_of_the_network_says_which_maps_are_in_no_cycle(offline, study, tmp_path):
+def test_the_page_of_the_network_says_which_maps_are_in_no_cycle(show, study):
     tree = study.copy()
     maps = tree["network"].to_dataset()
     maps["cycle_error"] = maps["cycle_error"].where(np.arange(maps.sizes["pair"]) != 3)
     tree["network"] = type(study)(maps)
-    page, errors = opened(offline, saved(widgets.Network(tree), tmp_path / "network.html"))
-    page.wait_for_function(DRAWN)
+    page = show(widgets.Network(tree))
     chosen(page, "stage", "after Consistent ZoomOut")
     edges = page.locator(".s4a-edge")
     told = [edge.get_attribute("aria-label") for edge in edges.all()]
     assert [i for i, text in enumerate(told) if "cycle error unknown: in no cycle" in text] == [3]
     assert edges.nth(3).locator(".s4a-line").get_attribute("stroke") == "#bbbbbb"
-    assert errors == []
-    page.close()
 
 
 @pytest.fixture(scope="module")
 def map_page(study, tmp_path_factory):
     path = tmp_path_factory.mktemp("map") / "map.html"
-    return saved(widgets.FunctionalMap(study), path)
+    panel = widgets.FunctionalMap(study)
+    panel.save_html(path)
+    panel.close()
+    return path
 
 
-def test_the_page_of_a_map_replays_zoomout_and_shows_its_modes(offline, map_page):
-    page, errors = opened(offline, map_page)
-    page.wait_for_function(DRAWN)
+def test_the_page_of_a_map_replays_zoomout_and_shows_its_modes(show, map_page):
+    page = show(map_page)
     before = pixels(visible(page, VIEW).first)
     move(page.locator("#c-k"), 1)
     visible(page, ".s4a-title").filter(has_text="15 × 15").wait_for()
@@ -1223,13 +913,11 @@ def test_the_page_of_a_map_replays_zoomout_and_shows_its_modes(offline, map_page
     assert pixels(visible(page, VIEW).first) != before
     chosen(page, "choice", "brain_02 → brain_03")
     visible(page, ".s4a-title").filter(has_text="φ3 on brain_02").wait_for()
-    assert errors == []
-    page.close()
 
 
 @pytest.mark.parametrize("width", [300, 1366])
-def test_the_axes_of_a_matrix_number_its_cells_and_nothing_overlaps(offline, map_page, width):
-    page, errors = opened(offline, map_page)
+def test_the_axes_of_a_matrix_number_its_cells_and_nothing_overlaps(show, map_page, width):
+    page = show(map_page)
     page.set_viewport_size({"width": width, "height": 800})
     page.wait_for_function(DRAWN)
     frame = page.locator(".s4a-matrix-frame")
@@ -1259,13 +947,10 @@ def test_the_axes_of_a_matrix_number_its_cells_and_nothing_overlaps(offline, map
         down = min(a["y"] + a["height"], b["y"] + b["height"]) - max(a["y"], b["y"])
         assert min(across, down) < 1, (a, b)
     assert max(box["x"] + box["width"] for box in boxes) <= width
-    assert errors == []
-    page.close()
 
 
-def test_the_page_of_the_median_ranks_by_the_operator_that_is_chosen(offline, study, tmp_path):
-    page, errors = opened(offline, saved(widgets.Median(study), tmp_path / "median.html"))
-    page.wait_for_function(DRAWN)
+def test_the_page_of_the_median_ranks_by_the_operator_that_is_chosen(show, study):
+    page = show(widgets.Median(study))
     chosen(page, "operator", "conformal")
     D = study["latent"]["conformal_difference"].values
     distance = np.sort(
@@ -1277,13 +962,10 @@ def test_the_page_of_the_median_ranks_by_the_operator_that_is_chosen(offline, st
     bar.click()
     visible(page, ".s4a-title").filter(has_text=f"{name}, in ").wait_for()
     visible(page, ".s4a-readout").filter(has_text="rank 4 of 5").wait_for()
-    assert errors == []
-    page.close()
 
 
-def test_the_page_of_the_spectrum_moves_through_modes_and_reconstructions(offline, study, tmp_path):
-    page, errors = opened(offline, saved(widgets.Spectrum(study), tmp_path / "spectrum.html"))
-    page.wait_for_function(DRAWN)
+def test_the_page_of_the_spectrum_moves_through_modes_and_reconstructions(show, study):
+    page = show(widgets.Spectrum(study))
     move(page.locator("#c-mode"), 7)
     visible(page, ".s4a-title").filter(has_text="φ7 of brain_01").wait_for()
     canvas = visible(page, VIEW).nth(1)
@@ -1296,14 +978,11 @@ def test_the_page_of_the_spectrum_moves_through_modes_and_reconstructions(offlin
         vertices(canvas), s4a.method.spectral.reconstruct(mesh, X, k=5), atol=1e-3
     )
     assert (vertices(canvas) != before).any()
-    assert errors == []
-    page.close()
 
 
-def test_the_page_of_correspondences_follows_the_pointer_and_the_keyboard(offline, study, tmp_path):
+def test_the_page_of_correspondences_follows_the_pointer_and_the_keyboard(show, study):
     panel = widgets.Correspondence(study)
-    page, errors = opened(offline, saved(panel, tmp_path / "correspondence.html"))
-    page.wait_for_function(DRAWN)
+    page = show(panel)
     chosen(page, "choice", "brain_04")
     chosen(page, "colors", "checkerboard")
     at = cursor(visible(page, VIEW).first, "ArrowRight")
@@ -1317,8 +996,6 @@ def test_the_page_of_correspondences_follows_the_pointer_and_the_keyboard(offlin
         shape.evaluate("(c) => c.view.points[0].slice(0, 3)"), vertices(shape)[image]
     )
     assert shape.evaluate("(c) => c.view.surfaces[0].cell") > 0
-    assert errors == []
-    page.close()
 
 
 @pytest.fixture(scope="module")
@@ -1332,10 +1009,9 @@ def compared():
     return s4a.compare.pair(one, two, truth=truth, methods=["kNN", "RE-MATCH"], **options)
 
 
-def test_the_page_of_methods_marks_a_place_in_all_views(offline, compared, tmp_path):
+def test_the_page_of_methods_marks_a_place_in_all_views(show, compared):
     panel = widgets.Comparison(compared, methods=["kNN", "RE-MATCH", "truth"])
-    page, errors = opened(offline, saved(panel, tmp_path / "methods.html"))
-    page.wait_for_function(DRAWN)
+    page = show(panel)
     for width, columns in ((1920, 4), (800, 2)):
         page.set_viewport_size({"width": width, "height": 1000})
         boxes = [canvas.bounding_box() for canvas in visible(page, VIEW).all()]
@@ -1363,35 +1039,24 @@ def test_the_page_of_methods_marks_a_place_in_all_views(offline, compared, tmp_p
     for i in range(2):
         there = views.nth(1 + i).evaluate("(c) => c.view.points[0].slice(0, 3)")
         np.testing.assert_allclose(there, kept["position"].values[back[i]], rtol=1e-5)
-    assert errors == []
-    page.close()
 
 
-def test_the_page_of_a_transfer_says_what_needs_python(offline, study, tmp_path):
-    page, errors = opened(offline, saved(widgets.Transfer(study), tmp_path / "transfer.html"))
-    page.wait_for_function(DRAWN)
+def test_the_page_of_a_transfer_says_what_needs_python(show, study):
+    page = show(widgets.Transfer(study))
     assert "placing landmarks" in page.locator(".note:not(#not-kept)").inner_text()
     chosen(page, "target", "brain_05")
     visible(page, ".s4a-title").filter(has_text="brain_05, the target").wait_for()
     page.wait_for_selector("text=Landmarks on brain_05")
-    assert errors == []
-    page.close()
 
 
-def test_without_webgl_pages_have_still_pictures(flat, study, study_page, tmp_path):
-    for path in (saved(widgets.Modes(study), tmp_path / "modes.html"), study_page):
-        page, errors = opened(flat, path)
+def test_without_webgl_pages_have_still_pictures(show, flat, study, study_page):
+    for what in (widgets.Modes(study), study_page):
+        page = show(what, flat, drawn=False)
         page.wait_for_function(
             "[...document.querySelectorAll('img')].some((i) => i.naturalWidth > 100)"
         )
         assert visible(page, VIEW).count() == 0
-        assert errors == []
-        if path.name == "study.html":
-            image, slider = (
-                page.locator("#modes-instead img").first,
-                page.locator("#modes-instead input").first,
-            )
-            before = image.get_attribute("src")
-            move(slider, 0)
-            assert image.get_attribute("src") != before
-        page.close()
+    image = page.locator("#modes-instead img").first
+    before = image.get_attribute("src")
+    move(page.locator("#modes-instead input").first, 0)
+    assert image.get_attribute("src") != before

@@ -3,32 +3,24 @@
 Also as pages without a kernel.
 """
 
-import json
 import re
 
 import numpy as np
 import pytest
-from paths import NOTEBOOKS
-from test_browser import (  # noqa: F401, fixtures are found by their names
+from browsing import (
     DRAWN,
     IDLE,
-    SMALLEST,
     THEMES,
     VIEW,
     barriers,
-    browser,
-    driver,
-    faint,
-    lab,
-    messages,
-    offline,
-    opened,
+    check_barriers,
+    check_read,
+    check_themes,
+    needed,
+    notebooks,
     pixels,
-    pytestmark,
     run_notebook,
-    saved,
     serious,
-    themed,
     visible,
     watched,
 )
@@ -39,6 +31,7 @@ from s4a.widgets import Median, Modes, Region
 from s4a_morphometrics.structures_panel import Structures
 from s4a_morphometrics.synthetic import example_structures
 
+pytestmark = needed
 KINDS = ("Maps", "Region", "Structures", "Comparison", "Progress")
 CELL = """
 import ipywidgets
@@ -74,17 +67,12 @@ for kind in {kinds!r}:
 @pytest.fixture(scope="module")
 def folder(study_folder, tmp_path_factory):
     folder = tmp_path_factory.mktemp("panels")
-    notebook = json.loads((NOTEBOOKS / "00_explore.ipynb").read_text(encoding="utf-8"))
-    cell = next(c for c in notebook["cells"] if c["cell_type"] == "code")
     source = CELL.format(study=str(study_folder), run=str(folder / "run"), kinds=KINDS)
-    notebook["cells"] = [cell | {"source": source, "id": "panels"}]
-    (folder / "panels.ipynb").write_text(json.dumps(notebook), encoding="utf-8")
-    (folder / "app").mkdir()
-    return folder
+    return notebooks(folder, panels=[source])
 
 
 @pytest.fixture(scope="module")
-def page(browser, lab, messages):  # noqa: F811
+def page(browser, lab, messages):
     """A notebook with every panel, in a cell of 360 pixels and in a wide one."""
     page = watched(browser.new_page(viewport={"width": 1920, "height": 1080}), messages)
     page.set_default_timeout(60_000)
@@ -111,25 +99,15 @@ def views(panel):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_cell_of_360_pixels_has_a_surface_of_300_and_cuts_nothing(page, kind):
+def test_a_panel_is_read_and_uncut_in_a_cell_of_360_pixels_and_from_afar(page, kind):
     panel = panel_of(page, kind, wide=False)
-    assert panel.bounding_box()["width"] <= 360
-    assert all(canvas.bounding_box()["width"] >= 300 for canvas in views(panel).all())
+    check_read(panel, 11, width=360)
     assert (views(panel).count() == 0) == (kind == "Progress")
     right = panel.bounding_box()["x"] + panel.bounding_box()["width"]
     for part in panel.locator("input, select, button, progress, .progress").all():
         if part.is_visible():
             assert part.bounding_box()["x"] + part.bounding_box()["width"] <= right + 1
-    assert panel.evaluate("(e) => e.scrollWidth <= e.clientWidth + 2")
-    assert panel.evaluate(SMALLEST)[0] > 11
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_screen_of_1920_pixels_is_filled_and_read_from_afar(page, kind):
-    panel = panel_of(page, kind, wide=True)
-    assert panel.bounding_box()["width"] >= 1500
-    smallest, text = panel.evaluate(SMALLEST)
-    assert smallest >= 16, text
+    check_read(panel_of(page, kind, wide=True), 16)
 
 
 # controls whose tooltip is missing, is their name again, or is that of another one
@@ -154,23 +132,13 @@ def test_every_control_says_what_it_is_and_no_two_say_the_same(page, kind):
 def test_a_panel_has_no_serious_barrier(page, kind):
     panel = panel_of(page, kind, wide=True)
     assert panel.get_attribute("role") == "region", "a landmark"
-    panel.evaluate("(e) => (e.id = 'looked-at')")
-    assert barriers(page, "#looked-at") == []
-    panel.evaluate("(e) => e.removeAttribute('id')")
+    check_barriers(page, panel)
 
 
 @pytest.mark.parametrize("theme", THEMES)
 def test_every_text_of_every_panel_is_read_in_every_theme(page, theme):
-    with themed(page, theme):
-        for kind in KINDS:
-            panel = panel_of(page, kind, wide=True)
-            n, unread = faint(panel)
-            assert n > 5
-            assert unread == [], kind
-            if theme == "JupyterLab Dark":
-                panel.evaluate("(e) => (e.id = 'looked-at')")
-                assert barriers(page, "#looked-at") == []
-                panel.evaluate("(e) => e.removeAttribute('id')")
+    panels = {kind: lambda kind=kind: panel_of(page, kind, wide=True) for kind in KINDS}
+    check_themes(page, theme, panels, 5)
 
 
 def test_a_level_makes_the_map_grey_and_a_click_tells_the_values(page):
@@ -182,9 +150,9 @@ def test_a_level_makes_the_map_grey_and_a_click_tells_the_values(page):
     assert pixels(canvas) != before
     box = canvas.bounding_box()
     page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
-    said = panel.locator(".s4a-readout").filter(has_text="directional asymmetry")
+    said = panel.locator(".s4a-readout").filter(has_text="effect, along the normals")
     said.wait_for()
-    assert re.match(r"vertex \d+: directional asymmetry .* mm; p = ", said.inner_text())
+    assert re.match(r"vertex \d+: effect, along the normals .*; p = ", said.inner_text())
 
 
 def test_the_controls_of_a_region_stand_in_one_row_of_a_wide_screen(page):
@@ -237,19 +205,15 @@ def test_structures_are_hidden_and_coloured_and_their_poses_moved(page):
     assert pixels(views(panel).first) != still
 
 
-def test_the_console_has_no_errors(page, messages):  # noqa: F811
+def test_the_console_has_no_errors(page, messages):
     assert serious(messages) == []
 
 
 # ---- without a kernel
 
 
-def test_the_page_of_structures_has_every_level_and_no_control_that_does_nothing(
-    offline,  # noqa: F811
-    tmp_path,
-):
-    page, errors = opened(offline, saved(Structures(example_structures()), tmp_path / "all.html"))
-    page.wait_for_function(DRAWN)
+def test_the_page_of_structures_has_every_level_and_no_control_that_does_nothing(show):
+    page = show(Structures(example_structures()))
     assert page.get_by_text("#4477aa").count() == 0
     before = np.array(visible(page, VIEW).first.evaluate("(c) => [...c.view.surfaces[0].position]"))
     for level in (1, 2):
@@ -260,22 +224,17 @@ def test_the_page_of_structures_has_every_level_and_no_control_that_does_nothing
         moved = visible(page, VIEW).first.evaluate("(c) => [...c.view.surfaces[0].position]")
         assert np.abs(np.array(moved) - before).max() > 0.5
     assert barriers(page) == []
-    assert errors == []
-    page.close()
 
 
-def test_the_page_of_a_region_says_that_drawing_needs_python(offline, study, tmp_path):  # noqa: F811
-    page, errors = opened(offline, saved(Region(study), tmp_path / "region.html"))
-    page.wait_for_function(DRAWN)
+def test_the_page_of_a_region_says_that_drawing_needs_python(show, study):
+    page = show(Region(study))
     assert "drawing a region" in page.locator(".note:not(#not-kept)").inner_text()
     assert page.get_by_text("lasso").count() == 0
     assert barriers(page) == []
-    assert errors == []
-    page.close()
 
 
-def test_the_numbers_beside_bars_are_not_cut_in_a_narrow_panel(offline, study, tmp_path):  # noqa: F811
-    page, _ = opened(offline, saved(Median(study), tmp_path / "median.html"))
+def test_the_numbers_beside_bars_are_not_cut_in_a_narrow_panel(show, study):
+    page = show(Median(study))
     for width in (380, 700):
         page.set_viewport_size({"width": width, "height": 900})
         page.wait_for_timeout(300)
@@ -286,21 +245,19 @@ def test_the_numbers_beside_bars_are_not_cut_in_a_narrow_panel(offline, study, t
         assert max(ends) <= right
         numbers = [text for text in svg.locator("rect ~ text").all_text_contents() if "." in text]
         assert len({len(text.partition(".")[2]) for text in numbers}) == 1, numbers
-    page.close()
 
 
 def boxes_of(locator):
     return [one.bounding_box() for one in locator.all()]
 
 
-def test_no_name_of_a_shape_lies_under_the_cross_of_the_sliders(offline, study, tmp_path):  # noqa: F811
+def test_no_name_of_a_shape_lies_under_the_cross_of_the_sliders(show, study):
     tree = study.copy()
     pca = tree["pca"].to_dataset()
     score = pca["score"].values.copy()
     score[0, :2] = [-0.3, -0.15]  # its name would reach over the mean
     tree["pca"].dataset = pca.assign(score=(pca["score"].dims, score, pca["score"].attrs))
-    page, _ = opened(offline, saved(Modes(tree), tmp_path / "modes.html"))
-    page.wait_for_function(DRAWN)
+    page = show(Modes(tree))
     page.locator(".s4a-cross").wait_for(state="visible")
     cross = page.locator(".s4a-cross").bounding_box()
     names = boxes_of(page.locator(".s4a-cross").locator("xpath=..").locator("text.s4a-small"))
@@ -309,19 +266,15 @@ def test_no_name_of_a_shape_lies_under_the_cross_of_the_sliders(offline, study, 
         beside = name["x"] > cross["x"] + cross["width"] or name["x"] + name["width"] < cross["x"]
         above = name["y"] + name["height"] < cross["y"] + 3
         assert beside or above or name["y"] > cross["y"] + cross["height"] - 3
-    page.close()
 
 
-def test_pictures_side_by_side_are_of_one_size_however_many_lines_they_take(
-    offline,  # noqa: F811
-    tmp_path,
-):
+def test_pictures_side_by_side_are_of_one_size_however_many_lines_they_take(show, tmp_path):
     ball = s4a.synthetic.sphere(100)
     titles = ["one", "two", "three", "four"]
     heights = dict.fromkeys(titles, ball["position"].values[:, 2])
     html = charts.surfaces(dict.fromkeys(titles, ball), heights, label="height").html()
     (tmp_path / "parts.html").write_text(f"<body>{html}</body>", encoding="utf-8")
-    page, _ = opened(offline, tmp_path / "parts.html")
+    page = show(tmp_path / "parts.html", drawn=False)
     lines, shares = [], []
     for width in (2000, 1000, 640, 330):
         page.set_viewport_size({"width": width, "height": 900})
@@ -333,4 +286,3 @@ def test_pictures_side_by_side_are_of_one_size_however_many_lines_they_take(
         lines.append(len({round(picture["y"]) for picture in pictures}))
     assert lines == [1, 1, 2, 4]
     assert shares == pytest.approx([shares[0]] * 4, rel=0.02), "of one scale"
-    page.close()

@@ -5,18 +5,13 @@ import io
 
 import numpy as np
 import pytest
+from browsing import needed
 from PIL import Image
-from test_browser import (  # noqa: F401, fixtures are found by their names
-    DRAWN,
-    browser,
-    driver,
-    offline,
-    opened,
-    pytestmark,
-)
 
 import s4a
 from s4a import widgets
+
+pytestmark = needed
 
 
 @pytest.fixture(scope="module")
@@ -25,16 +20,11 @@ def study():
 
 
 @pytest.fixture
-def page(offline, study, tmp_path, request):  # noqa: F811
+def page(show, study, request):
     """The page of a panel, none of whose values are recorded."""
-    panel = getattr(widgets, request.param)(study)
-    page, errors = opened(offline, panel.save_html(tmp_path / "panel.html", limit=0))
-    panel.close()
-    page.wait_for_function(DRAWN)
+    page = show(getattr(widgets, request.param)(study), limit=0)
     page.get_by_role("button", name="save a picture or a film").first.click()
-    yield page
-    assert errors == []
-    page.close()
+    return page
 
 
 def downloaded(page, button, **choices):

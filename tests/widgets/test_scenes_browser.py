@@ -1,25 +1,15 @@
 """Scenes of pythreejs in a real JupyterLab: which pixels are drawn, and what the kernel hears."""
 
 import io
-import json
 
 import numpy as np
 import pytest
-from paths import NOTEBOOKS
+from browsing import IDLE, needed, notebooks, run_notebook, serious, watched
 from PIL import Image
-from test_browser import (  # noqa: F401, fixtures are found by their names
-    IDLE,
-    browser,
-    driver,
-    lab,
-    pytestmark,
-    run_notebook,
-    serious,
-    watched,
-)
 
 import s4a
 
+pytestmark = needed
 CELL = """
 import ipywidgets
 import numpy as np
@@ -88,24 +78,12 @@ MODES, HALVES, LANDMARKS, PAIR, NETWORK = range(5)
 
 @pytest.fixture(scope="module")
 def folder(study_folder, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scenes")
-    notebook = json.loads((NOTEBOOKS / "00_explore.ipynb").read_text(encoding="utf-8"))
-    cell = next(c for c in notebook["cells"] if c["cell_type"] == "code")
-    sources = [CELL.format(store=str(study_folder)), *CELLS]
-    notebook["cells"] = [
-        cell | {"source": source, "id": f"cell{i}"} for i, source in enumerate(sources)
-    ]
-    (folder / "scenes.ipynb").write_text(json.dumps(notebook), encoding="utf-8")
-    sources = [LARGE, "deforming.sliders"]
-    notebook["cells"] = [
-        cell | {"source": source, "id": f"cell{i}"} for i, source in enumerate(sources)
-    ]
-    (folder / "large.ipynb").write_text(json.dumps(notebook), encoding="utf-8")
-    (folder / "app").mkdir()
-    return folder
+    scenes = [CELL.format(store=str(study_folder)), *CELLS]
+    large = [LARGE, "deforming.sliders"]
+    return notebooks(tmp_path_factory.mktemp("scenes"), scenes=scenes, large=large)
 
 
-def opened(browser, lab, name):  # noqa: F811
+def opened(browser, lab, name):
     """A page with a notebook whose cells ran; it keeps its errors and what it sends the kernel."""
     messages = []
     page = watched(browser.new_page(viewport={"width": 1280, "height": 3600}), messages)
@@ -119,7 +97,7 @@ def opened(browser, lab, name):  # noqa: F811
 
 
 @pytest.fixture(scope="module")
-def page(browser, lab):  # noqa: F811
+def page(browser, lab):
     page = opened(browser, lab, "scenes.ipynb")
     for i in range(5):
         drawn(page, i, lambda picture: body(picture).mean() > 0.05)
@@ -274,7 +252,7 @@ async (steps) => {
 """
 
 
-def test_ten_modes_of_100000_vertices_move_without_the_kernel(browser, lab, record_property):  # noqa: F811
+def test_ten_modes_of_100000_vertices_move_without_the_kernel(browser, lab, record_property):
     page = opened(browser, lab, "large.ipynb")
     before = drawn(page, 0, lambda picture: body(picture).mean() > 0.05)
     assert page.locator(".s4a-scores input").count() == 10

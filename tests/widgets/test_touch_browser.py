@@ -2,20 +2,12 @@
 
 import numpy as np
 import pytest
-from test_browser import (  # noqa: F401, fixtures are found by their names
-    DRAWN,
-    VIEW,
-    browser,
-    driver,
-    offline,
-    opened,
-    playwright,
-    pytestmark,
-    saved,
-    visible,
-)
+from browsing import DRAWN, VIEW, needed, visible, watched
 
 from s4a import widgets
+
+pytestmark = needed
+expect = pytest.importorskip("playwright.sync_api").expect
 
 WIDTH, HEIGHT = 390, 844
 CAMERA = "(c) => ({ turn: [...c.view.camera.turn], zoom: c.view.camera.zoom })"
@@ -23,7 +15,7 @@ PICKED = "(c, [x, y]) => c.view.pick({ clientX: x, clientY: y })?.point"
 
 
 @pytest.fixture(scope="module")
-def phone(browser):  # noqa: F811
+def phone(browser):
     """A browser with fingers and no mouse."""
     context = browser.new_context(
         viewport={"width": WIDTH, "height": HEIGHT}, has_touch=True, is_mobile=True, offline=True
@@ -35,12 +27,16 @@ def phone(browser):  # noqa: F811
 @pytest.fixture(scope="module")
 def matches(phone, study, tmp_path_factory):
     """The page of correspondences on the phone, where all places of a surface can be picked."""
-    path = saved(widgets.Correspondence(study), tmp_path_factory.mktemp("touch") / "page.html")
-    page, errors = opened(phone, path)
+    path, panel = tmp_path_factory.mktemp("touch") / "page.html", widgets.Correspondence(study)
+    panel.save_html(path)
+    panel.close()
+    errors = []
+    page = watched(phone.new_page(), errors)
+    page.goto(path.as_uri())
     page.wait_for_function(DRAWN)
     yield page
-    assert errors == []
     page.close()
+    assert errors == []
 
 
 def touch(page, *paths, steps=10):
@@ -89,12 +85,12 @@ def test_one_finger_scrolls_the_page_until_it_is_told_to_turn(matches, surface):
     matches.evaluate("scrollTo(0, 0)")
     button = matches.get_by_role("button", name="one finger turns the surface").first
     tap(button)
-    assert button.get_attribute("aria-pressed") == "true"
+    expect(button).to_have_attribute("aria-pressed", "true")
     touch(matches, (middle + [0, 60], middle - [0, 120]))
     assert matches.evaluate("scrollY") == 0
     assert not np.allclose(canvas.evaluate(CAMERA)["turn"], before["turn"])
     tap(button)
-    assert button.get_attribute("aria-pressed") == "false"
+    expect(button).to_have_attribute("aria-pressed", "false")
 
 
 def test_what_two_fingers_hold_stays_under_them(matches, surface):
@@ -149,16 +145,11 @@ SMALL = """() => [...document.querySelectorAll("button, select, input:not([type=
 
 
 @pytest.mark.parametrize("kind", ["Modes", "Network", "Spectrum"])
-def test_controls_are_24_pixels_high_and_nothing_is_wider_than_the_phone(
-    phone, study, tmp_path, kind
-):
-    page, errors = opened(phone, saved(getattr(widgets, kind)(study), tmp_path / "page.html"))
-    page.wait_for_function(DRAWN)
+def test_controls_are_24_pixels_high_and_nothing_is_wider_than_the_phone(show, phone, study, kind):
+    page = show(getattr(widgets, kind)(study), phone)
     assert page.locator("input[type=range]").count() > 0
     assert page.evaluate(SMALL) == []
     assert page.evaluate("document.documentElement.scrollWidth") <= WIDTH
-    assert errors == []
-    page.close()
 
 
 FOCUSED = "document.activeElement.getAttribute('aria-label')"
@@ -169,18 +160,8 @@ AGAIN = """(old) => {
 
 
 @pytest.mark.parametrize("kind, marks", [("Median", "rect.s4a-mark"), ("Network", "[data-node]")])
-def test_a_clicked_mark_keeps_the_focus_and_the_arrow_keys_go_on_from_it(
-    offline,  # noqa: F811
-    study,
-    tmp_path,
-    kind,
-    marks,
-):
-    panel = getattr(widgets, kind)(study)
-    panel.save_html(tmp_path / "page.html", limit=800_000)
-    panel.close()
-    page, errors = opened(offline, tmp_path / "page.html")
-    page.wait_for_function(DRAWN)
+def test_a_clicked_mark_keeps_the_focus_and_the_arrow_keys_go_on_from_it(show, study, kind, marks):
+    page = show(getattr(widgets, kind)(study), limit=800_000)
     mark = visible(page, marks).nth(2)
     name = mark.get_attribute("aria-label").split(":")[0].split(",")[0]
     mark.evaluate("(at) => (window.clicked = at)")
@@ -198,5 +179,3 @@ def test_a_clicked_mark_keeps_the_focus_and_the_arrow_keys_go_on_from_it(
         "document.activeElement.closest('svg').querySelectorAll('[tabindex=\"0\"]').length"
     )
     assert stops == 1, "one tab stop"
-    assert errors == []
-    page.close()

@@ -3,7 +3,6 @@
 import json
 
 import pytest
-from test_browser import browser, driver  # noqa: F401, fixtures are found by their names
 
 from s4a.show.browser import FRAME
 
@@ -71,7 +70,7 @@ window.ready = true;
 
 
 @pytest.fixture
-def framed(browser):  # noqa: F811
+def framed(browser):
     """Opens a frame in a page whose time is ours."""
     page = browser.new_page()
     page.clock.install()
@@ -120,7 +119,7 @@ def test_python_answers_what_it_is_asked(study):
     panel.close()
 
 
-def test_a_click_on_what_a_saved_page_did_not_keep_says_so(browser, study, tmp_path):  # noqa: F811
+def test_a_click_on_what_a_saved_page_did_not_keep_says_so(browser, study, tmp_path):
     panel = widgets.Median(study)
     path = panel.save_html(tmp_path / "median.html", limit=0)
     panel.close()
