@@ -256,7 +256,7 @@ def _nearest(shape, places):
     return zip(nearest.reshape(each), gap.reshape(each), strict=True)
 
 
-def try_tilts(source: Cloud, target: Cloud, start: End) -> End:
+def _try_tilts(source: Cloud, target: Cloud, start: End) -> End:
     """ICP again from its end tilted about each axis of the target, as long as that ends nearer.
 
     ICP alone ends wherever no pair changes: on folded surfaces up to 20 degrees from the best
@@ -327,11 +327,11 @@ def align(X: Array, area: Array, Y: Array, area_y: Array) -> End:
         list(itertools.compress(turned, side)) for side in (as_posed, np.invert(as_posed))
     )
     best, other = (
-        try_tilts(source, target, min(ends, key=residual_of)) if ends else None
+        _try_tilts(source, target, min(ends, key=residual_of)) if ends else None
         for ends in (upright, upside_down)
     )
     if best is None or CLEARLY * residual_of(best) > residual_of(posed):
-        best = try_tilts(source, target, posed)
+        best = _try_tilts(source, target, posed)
     if other is not None and residual_of(other) < PREFER * residual_of(best):
         best = other
     R, t, _ = best

@@ -125,7 +125,7 @@ def unique_edges(T: Array, n: int | None = None) -> tuple[Array, Array, Array]:
     start = np.asarray(T).T.astype(np.int64).ravel()  # as in directed_edges
     end = np.roll(start, -len(T))
     n = max(int(start.max(initial=0)) + 1 if n is None else n, 1)
-    check_numbers(start, n)
+    _check_numbers(start, n)
     key = np.minimum(start, end) * n + np.maximum(start, end)
     edge, edge_of, count = np.unique(key, return_inverse=True, return_counts=True)
     return np.stack(np.divmod(edge, n), axis=1), edge_of, count

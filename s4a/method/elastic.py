@@ -53,7 +53,7 @@ _N_STEPS = 8
 _N_FURTHER = 5  # steps at most, where the last was nearly in vain
 # Of each step: from 1e-4 to 1e-7 by equal factors, and on.  Chosen on a pair of faces, of brains
 # and of skulls and two cortex templates, reported on others: docs/decisions.md
-STIFFNESS = 1e-4 * 1e-3 ** (np.arange(N_STEPS + N_FURTHER) / (N_STEPS - 1))
+STIFFNESS = 1e-4 * 1e-3 ** (np.arange(_N_STEPS + _N_FURTHER) / (_N_STEPS - 1))
 # Of the first two steps, in which different starts meet, and of the others, in which vertices must
 # not drift along the surface any more
 SLIDE = (0.01, 0.1)
@@ -62,9 +62,9 @@ RIM_WEIGHT = 0.01  # share of sqrt(area): of distances at the boundary, by its l
 _RIM_NEAR = 0.03  # share of sqrt(area): boundaries that are farther apart may be cut anywhere
 _LANDMARK_WEIGHT = 1e-3  # of each landmark: as much as this share of the area
 MEET = 0.01  # share of sqrt(area): starts that end nearer to each other than that go on as one
-TIME = (2e-2, 2e-4)  # of local rounds: smooth over 0.2, then over 0.02 of sqrt(area)
-LOCAL_SLIDE = 0.5
-N_LOCAL_ROUNDS = 10
+_TIME = (2e-2, 2e-4)  # of local rounds: smooth over 0.2, then over 0.02 of sqrt(area)
+_LOCAL_SLIDE = 0.5
+_N_LOCAL_ROUNDS = 10
 
 
 class Schedule(NamedTuple):
@@ -76,7 +76,7 @@ class Schedule(NamedTuple):
     still: float  # share of sqrt(area): a step ends with a round that moves less
 
 
-FOLLOWING = Schedule(STIFFNESS, N_FURTHER, 8, 1e-3)
+FOLLOWING = Schedule(STIFFNESS, _N_FURTHER, 8, 1e-3)
 # Before, from each start: so stiff that starts meet.  Chosen on heads 2 to 10, with nothing left to
 # report on but other collections
 MEETING = Schedule(np.array([1e-2, 1e-3]), 0, 32, 1e-4)
@@ -270,7 +270,7 @@ def elastic_rounds(
     warp: Warp,
     schedule: Schedule = FOLLOWING,
     *,
-    vertices: Rows = ALL,
+    vertices: Rows = _ALL,
     landmarks: Landmarks | None = None,
 ) -> Warp:
     """The warp after rounds in which the target's displacement becomes less and less stiff.
@@ -317,13 +317,13 @@ def elastic_rounds(
     mass = F.T @ (area[:, None] * F)
     sure = len(schedule.stiffness) - schedule.further
     for step, stiff in enumerate(schedule.stiffness):
-        if step >= sure and energies[-1] > SETTLED * energies[-2]:
+        if step >= sure and energies[-1] > _SETTLED * energies[-2]:
             break
         price = np.kron(np.eye(3), apart.T @ (stiff * bending * apart))
         # nothing may be left of the start: a little keeps the matrix definite then
         price[np.diag_indices_from(price)] += 1e-12
         for _ in range(schedule.rounds):
-            y, m = points_ahead(source, target, X, vertices)
+            y, m = _points_ahead(source, target, X, vertices)
             # of what w is to change by, so that rounding is of the step and not of what it leads to
             matrix, right = normal_equations(F, area, m, y - X[vertices], SLIDE[step >= 2], mass)
             rim = rim_ahead(source, target, X) if step >= 2 else None
@@ -369,12 +369,9 @@ def starts_that_meet(
     dict
         Starts that end within :data:`MEET` of the first of some are one, by its name.
     """
-    spread = target.spread_vertices()
+    options: dict[str, Any] = {"vertices": target.spread_vertices(), "landmarks": landmarks}
     met: dict[str, list[Warp]] = {}
-    stiff: dict[str, Any] = {"rounds": N_MEETING, "still": STILLEST, "further": 0}
-    stiff |= {"vertices": spread, "landmarks": landmarks}
     for name, start in starts.items():
-        options: dict[str, Any] = {"vertices": spread, "landmarks": landmarks}
         warp = elastic_rounds(source, target, start, MEETING, **options)
         X = move(target, warp)
         near = (

@@ -26,11 +26,11 @@ N_LANDMARKS = 10  # of step 3
 SEARCHED = tuple(itertools.product(("hks+wks", "wks", "hks"), (0.5, 1.0, 1.5), (1.0, 10.0)))
 N_ENDS, N_ENDS_OTHER = 5, 7  # extremities of one shape, and of the other among which they are
 N_PAIRED = 8  # the likeliest ways to pair them
-CURVATURE = 3.0  # its weight by that of a signature
-ON_A_LINE = 0.02  # of sqrt(area): landmarks as near to a line say nothing of turns about it
-BENT = 0.3  # weight of the gap of curvatures in that score
+_CURVATURE = 3.0  # its weight by that of a signature
+_ON_A_LINE = 0.02  # of sqrt(area): landmarks as near to a line say nothing of turns about it
+_BENT = 0.3  # weight of the gap of curvatures in that score
 SHORT = 60  # functions of the short ZoomOut that a map is scored after
-FOUND = 0.07  # score at which the search ends; of wrong maps between bodies it is 0.11 or more
+_FOUND = 0.07  # score at which the search ends; of wrong maps between bodies it is 0.11 or more
 
 
 class _FirstMap(NamedTuple):
@@ -106,7 +106,7 @@ def map_after_motion(
     init: str = "dense",
     ahead: bool = True,
     n_spread: int = 0,
-) -> FirstMap:
+) -> _FirstMap:
     """First functional map of a directed pair (4.1, steps 3 and 4).
 
     Parameters
@@ -128,7 +128,7 @@ def map_after_motion(
         source, target, motion, k_init=k_init, init=init, near=near
     )
     C = fmap.refine_once(source, target, fitted, n_spread) if ahead else fitted
-    return FirstMap(init, C, fitted, near, landmarks)
+    return _FirstMap(init, C, fitted, near, landmarks)
 
 
 def stretch(target: Basis, X: Array) -> float:
@@ -287,7 +287,7 @@ def _have_signatures(source, target, k):
 
 def first_map(
     source: Basis, target: Basis, motion: Motion, *, search: bool = False, **options: Any
-) -> FirstMap:
+) -> _FirstMap:
     """:func:`map_after_motion`, or :func:`best_first_map` where poses are far apart.
 
     The latter only where `init` is dense and there are signatures, ``_have_signatures``.
@@ -303,7 +303,7 @@ def first_map(
     """
     first = map_after_motion(source, target, motion, **options)
     far = first.name == "dense" and joint.far_apart(source, target, first.near)
-    if not (far and have_signatures(source, target, len(first.C))):
+    if not (far and _have_signatures(source, target, len(first.C))):
         return first
     name, C, fitted = best_first_map(source, target, first.C, first.fitted, search=search)
-    return FirstMap(name, C, fitted, first.near, None)
+    return _FirstMap(name, C, fitted, first.near, None)

@@ -222,7 +222,7 @@ def orientation(T: Array, Phi: Array, f: Array) -> Array:
 
 LAPLACIAN = 1e-3  # weight of the term that the Laplacians commute
 EVERY = 5  # of 100 energies or times every fifth is used: neighbours are nearly equal
-FILTERS = {"wks": wave_filter, "hks": heat_filter}
+_FILTERS = {"wks": wave_filter, "hks": heat_filter}
 SCALES = (20, 40, 60, 90)  # functions that mean curvatures are of
 
 
@@ -462,7 +462,7 @@ def fmap_from_descriptors(
     """
     F, products, turns = [], [], []  # of source and target
     for end, other, landmark in zip((source, target), (target, source), landmarks, strict=True):
-        filters = [FILTERS[one](end.eigenvalue, other.eigenvalue) for one in kind.split("+")]
+        filters = [_FILTERS[one](end.eigenvalue, other.eigenvalue) for one in kind.split("+")]
         kernel = np.concatenate([values[::EVERY] for values in filters])
         given = [signature(end.Phi, kernel)]  # (n, d)
         if landmark is not None:
@@ -484,8 +484,8 @@ def fmap_from_descriptors(
         if weight
     ]
     size = np.linalg.norm(F[0])
-    penalty = LAPLACIAN * commutator(source.eigenvalue[:k], target.eigenvalue[:k])
-    constant = constant_to_constant(source, target)
+    penalty = LAPLACIAN * _commutator(source.eigenvalue[:k], target.eigenvalue[:k])
+    constant = _constant_to_constant(source, target)
     return fit(F[0] / size, F[1] / size, penalty=penalty, operators=operators, constant=constant)
 
 

@@ -359,7 +359,7 @@ def register(
     return in_unit(registration, common_unit(source.original, target.original))
 
 
-def motion_in_unit(
+def _motion_in_unit(
     source: Shape, target: Shape, motion: Motion, scale: bool
 ) -> tuple[Array, Array, float, float]:
     """A rigid motion between the frames of two shapes as one between their files: R, t and s.
@@ -453,12 +453,12 @@ def register_surface(
         whole = {n: candidates[n].warp for n in names if candidates[n].warp[0].ndim == 2}
         names = [name for name in names if name not in whole]  # by parts
         surfaces = elastic_surfaces(source, target, whole)
-        ends = {f"{name}+elastic": scored_alone(M, N, X) for name, X in surfaces.items()}
-        limit = TORN * (1 - SMEARED if len(target.low.X) < FEW else 1)
-        if ends and tear(ends[best_of(ends)][1], N) > limit:
-            torn = ends[best_of(ends)]
+        ends = {f"{name}+elastic": _scored_alone(M, N, X) for name, X in surfaces.items()}
+        limit = TORN * (1 - _SMEARED if len(target.low.X) < FEW else 1)
+        if ends and tear(ends[_best_of(ends)][1], N) > limit:
+            torn = ends[_best_of(ends)]
             again = elastic_surfaces(source, target, whole, looser=True)
-            scored = {f"{name}+looser": scored_alone(M, N, X) for name, X in again.items()}
+            scored = {f"{name}+looser": _scored_alone(M, N, X) for name, X in again.items()}
             ends |= {name: end for name, end in scored.items() if mends(end, torn, N)}
     for name in names:
         if name == "intrinsic":
@@ -469,8 +469,8 @@ def register_surface(
         else:
             part, warp = joint.dense_rounds(M, N, candidates[name].warp)
         if elastic:  # here by parts
-            X = after_local_rounds(source, target, warp)
-            ends[f"{name}+local"] = scored_alone(M, N, X)
+            X = _after_local_rounds(source, target, warp)
+            ends[f"{name}+local"] = _scored_alone(M, N, X)
         else:
             moved = N.moved_to(joint.move(N, warp))
             ends[name] = joint.registration_score(M, N, part, moved), moved
@@ -523,14 +523,14 @@ def elastic_surfaces(
     of that lies on a fold beside the one on which a start was right, rounds from the starts
     themselves that begin less stiff, `looser`, may end on the right one.
     """
-    M, N, landmarks = source.full, target.low_on_surface, common_landmarks(source, target)
+    M, N, landmarks = source.full, target.low_on_surface, _common_landmarks(source, target)
     if not looser:
         starts = starts_that_meet(M, N, starts, landmarks)
-    schedule = FOLLOWING._replace(stiffness=STIFFNESS[LOOSER if looser else 0 :])
+    schedule = FOLLOWING._replace(stiffness=STIFFNESS[_LOOSER if looser else 0 :])
     surfaces = {}
     for name, start in starts.items():
         warp = elastic_rounds(M, N, start, schedule, landmarks=landmarks)
-        surfaces[name] = after_local_rounds(source, target, warp)
+        surfaces[name] = _after_local_rounds(source, target, warp)
     return surfaces
 
 
@@ -548,9 +548,9 @@ def _common_landmarks(source, target):
     return Landmarks(Basis(B @ N.X, none, B @ N.area, target.low.Phi, U=B @ target.U), y)
 
 
-def after_local_rounds(source: Shape, target: Shape, warp: joint.Warp) -> Array:
+def _after_local_rounds(source: Shape, target: Shape, warp: joint.Warp) -> Array:
     """The template ``(n_target, 3)`` after a warp, by parts or not, and local rounds."""
-    low, landmarks = target.low_on_surface, common_landmarks(source, target)
+    low, landmarks = target.low_on_surface, _common_landmarks(source, target)
     pull = landmarks and (landmarks[0].U, landmarks.y - joint.move(landmarks.on_target, warp))
     d = local_rounds(source.full, low, target.diffusion, joint.move(low, warp), pull=pull)
     return joint.move(target.full, warp) + target.U @ d

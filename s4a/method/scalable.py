@@ -79,7 +79,7 @@ def spread(X: Array, T: Array, p: int, seed: int = 0) -> tuple[Array, Array, flo
     E, _, count = unique_edges(T, len(X))
     G = edge_graph(X, E)
     first = sample_surface(X, T, G, E[count == 1], np.zeros(len(X), bool), min(p, len(X)), seed)
-    radius = RADIUS * np.sqrt(vertex_areas(X, T).sum() / (np.pi * len(first)))
+    radius = _RADIUS * np.sqrt(vertex_areas(X, T).sum() / (np.pi * len(first)))
     state = voronoi_cells(G, first)
     while len(far := np.flatnonzero(state.distance > 0.75 * radius)):
         state = add_samples(G, farthest_of_each(state.cell[far], far, state.distance), state)

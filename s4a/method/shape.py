@@ -303,7 +303,7 @@ class Shape:
         mass = unit_mass(self.coarse) if self.is_sampled else None
         low = Basis(self.to_frame(X), T, unit_area(self.coarse), Phi, eigenvalue, mass)
         low = replace(low, landmarks=vertices_of_landmarks(self.coarse))
-        return replace(low, fields=smooth_fields(self.coarse, low))
+        return replace(low, fields=_smooth_fields(self.coarse, low))
 
     @cached_property
     def W(self) -> sp.csr_matrix:

@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 from s4a.geometry.align import Motion, align, motion_between, realign
 from s4a.method import fmap, network
 from s4a.method.first_map import first_map, map_after_motion, motion_onto
-from s4a.method.latent import WIDE, consistent_zoomout
+from s4a.method.latent import WIDE, consistent_zoomout, nearest_spectra, place
 from s4a.method.median import median_shape
 from s4a.method.register import from_latent, identity, match_functions, match_low
 from s4a.method.shape import Basis, Shape
