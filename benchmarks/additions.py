@@ -114,10 +114,7 @@ INSTEAD = {
         "s4a.method.remesh.sample_surface": geodesic_farthest,
     },
     "ICP from one start": {"s4a.method.first_map.align": one_start},
-    "first maps of pyFM": {
-        "s4a.method.first_map.fit_after_motion": pyfm_fit,
-        "s4a.method.steps.fit_after_motion": pyfm_fit,
-    },
+    "first maps of pyFM": {"s4a.method.first_map.fit_after_motion": pyfm_fit},
     "weights of the linear program": {"s4a.method.latent.cycle_errors": program_errors},
 }
 PAPER = PRESETS["paper"]

@@ -118,7 +118,7 @@ def our_spectrum(coarse):
 
 
 def our_first_map(a, b, motion):
-    return map_after_motion(a, b, motion, k_init=K_INIT)
+    return map_after_motion(a, b, motion, k_init=K_INIT).C
 
 
 def our_zoomout(C, a, b):
@@ -403,7 +403,7 @@ def network_table():
             low[j],
             align(low[i].X, low[i].area, low[j].X, low[j].area)[:2],
             k_init=K_INIT,
-        )
+        ).C
         for i, j in zip(source, target, strict=True)
     ]
     given = np.stack(first), source, target
@@ -698,7 +698,7 @@ def certificates(folder, n_checked=1000):
         meshes = [s4a.read_shape(file) for file in files]
         M, N = (Shape(mesh, s4a.spectrum(s4a.coarsen(mesh), k=K)) for mesh in meshes)
         motion = align(M.low.X, M.low.area, N.low.X, N.low.area)[:2]
-        C = map_after_motion(M.low, N.low, motion, k_init=K_INIT)
+        C = map_after_motion(M.low, N.low, motion, k_init=K_INIT).C
         C = fmap.zoomout(M.low, N.low, C, min(K, M.low.k, N.low.k))[0]
         F = M.low.Phi[:, : C.shape[1]] @ C.T, N.low.Phi[:, : C.shape[0]]
         begin = time.process_time()

@@ -39,7 +39,7 @@ def simple_matches(source: Shape, target: Shape, *, k_init: int = 20) -> dict[st
     M, N = source.low, target.low
     R, t, _ = align(M.X, M.area, N.X, N.area)
     near = nearest_after_motion(source.full, target.full, (R, t))
-    C = map_after_motion(M, N, (R, t), k_init=k_init)
+    C = map_after_motion(M, N, (R, t), k_init=k_init).C
     k = min(M.k, N.k)
     C, _ = fmap.zoomout(M, N, C, k)
     match, *_ = match_functions(source, target, M.Phi[:, :k] @ C.T, N.Phi[:, :k])

@@ -562,8 +562,8 @@ def first_maps(bases: list[Basis], options: Options) -> tuple[np.ndarray, np.nda
     for i, j in network.choose_pairs(distance, options.n_pairs):
         M, N = bases[i], bases[j]
         R, t = realign(M.cloud, N.cloud, motion_between(motions[i], motions[j]))
-        maps.append(map_after_motion(M, N, (R, t), **settings))
-        maps.append(map_after_motion(N, M, (R.T, -R.T @ t), **settings))
+        maps.append(map_after_motion(M, N, (R, t), **settings).C)
+        maps.append(map_after_motion(N, M, (R.T, -R.T @ t), **settings).C)
         ends += [(i, j), (j, i)]
     return *np.array(ends).T, np.stack(maps)
 

@@ -4,8 +4,8 @@ A motion ``R, t`` carries x to R x + t, rows of X to ``X @ R.T + t``.
 """
 
 import itertools
-from dataclasses import dataclass
-from typing import Any
+from operator import itemgetter
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -18,10 +18,14 @@ Motion = tuple[Array, Array]  # R (3, 3), t (3,)
 End = tuple[Array, Array, float]  # of an ICP: R, t and the residual
 
 ROUGH = 2e-5  # tolerance where few points are paired, or ends are only compared: twice icp's own
+N_POINTS = 300  # spread vertices of each shape by which starts are compared
+CLEARLY, PREFER = 0.98, 0.9  # see align
+TRIM = 0.1
+TILT = 15.0  # degrees, tried both ways
+residual_of = itemgetter(2)  # the residual of an ICP's end
 
 
-@dataclass(frozen=True)
-class Cloud:
+class Cloud(NamedTuple):
     """The vertices of a shape as ICP takes them; see :func:`cloud`."""
 
     X: Array  # (n, 3)
@@ -196,19 +200,13 @@ def icp(source: Cloud, target: Cloud, R: Array, t: Array, **options: Any) -> End
 
 
 def icp_each(
-    source: Cloud,
-    target: Cloud,
-    starts: list[Motion],
-    *,
-    rounds: int = 60,
-    tolerance: float = 1e-5,
-    trim: float = 0.1,
+    source: Cloud, target: Cloud, starts: list[Motion], *, rounds: int = 60, tolerance: float = 1e-5
 ) -> list[End]:
     """Iterative closest points (Besl & McKay 1992) from each of some starts: moves the source.
 
     Each round pairs vertices of the source with the nearest of all of the target and vertices of
-    the target with the nearest of all of the source, leaves out the `trim` farthest pairs, and
-    solves for the motion, weighted by area.  Starts that still move are looked up together.
+    the target with the nearest of all of the source, leaves out the farthest ``TRIM`` of the pairs,
+    and solves for the motion, weighted by area.  Starts that still move are looked up together.
 
     Parameters
     ----------
@@ -219,7 +217,6 @@ def icp_each(
         At least 1.
     tolerance : float
         The end comes when the residual falls by less, as a share of sqrt(area of the source).
-    trim : float
 
     Returns
     -------
@@ -241,7 +238,7 @@ def icp_each(
             Q = np.concatenate([target.X[there], Y])
             gap = np.concatenate([forth_gap, back_gap])
             # two that are each other's nearest stay or go together, whatever the rounding
-            keep = gap <= (1 + 1e-9) * quantile(gap, 1 - trim)
+            keep = gap <= (1 + 1e-9) * np.quantile(gap, 1 - TRIM)
             residual = float(np.sqrt(weight[keep] @ gap[keep] ** 2 / weight[keep].sum()))
             R, t, _ = rigid_transform(P[keep], Q[keep], weight[keep])
             if ends[i][2] - residual >= least:
@@ -259,31 +256,7 @@ def _nearest(shape, places):
     return zip(nearest.reshape(each), gap.reshape(each), strict=True)
 
 
-def quantile(values: Array, share: float) -> float:
-    """``np.quantile`` of a few hundred values ``(n,)``, to the bit and much faster.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from s4a.geometry.align import quantile
-    >>> quantile(np.array([4.0, 1.0, 2.0]), 0.75)
-    3.0
-    """
-    at = share * (len(values) - 1)
-    below = min(int(at), len(values) - 1)
-    above = min(below + 1, len(values) - 1)
-    part = np.partition(values, (below, above))
-    a, b, t = float(part[below]), float(part[above]), at - below
-    # from the nearer of both, as NumPy does
-    return b - (b - a) * (1 - t) if t >= 0.5 else a + (b - a) * t
-
-
-def residual_of(end: End) -> float:
-    """The residual of an ICP's end."""
-    return end[2]
-
-
-def _try_tilts(source, target, start, *, degrees=15.0, **options):
+def _try_tilts(source: Cloud, target: Cloud, start: End) -> End:
     """ICP again from its end tilted about each axis of the target, as long as that ends nearer.
 
     ICP alone ends wherever no pair changes: on folded surfaces up to 20 degrees from the best
@@ -293,11 +266,7 @@ def _try_tilts(source, target, start, *, degrees=15.0, **options):
     ----------
     source, target : Cloud
     start : tuple (R, t, residual)
-        The end of an ICP with the same `options`.
-    degrees : float
-        Of a tilt, tried both ways.
-    **options
-        Of :func:`icp_each`.
+        The end of an ICP.
 
     Returns
     -------
@@ -305,7 +274,7 @@ def _try_tilts(source, target, start, *, degrees=15.0, **options):
     """
     _, axes = principal_axes(target.X, target.area)
     tilts = [
-        axes @ Rotation.from_euler(axis, sign * degrees, degrees=True).as_matrix() @ axes.T
+        axes @ Rotation.from_euler(axis, sign * TILT, degrees=True).as_matrix() @ axes.T
         for axis in "xyz"
         for sign in (1, -1)
     ]
@@ -315,34 +284,24 @@ def _try_tilts(source, target, start, *, degrees=15.0, **options):
         R, t, residual = best
         middle = R @ center + t  # the tilts turn X about where its centre has come to lie
         starts = [(tilt @ R, tilt @ (t - middle) + middle) for tilt in tilts]
-        ends = icp_each(source, target, starts, **options)
-        end = min(ends, key=residual_of)
+        end = min(icp_each(source, target, starts, tolerance=ROUGH), key=residual_of)
         if residual_of(end) > 0.999 * residual:
             return best
         best = end
     return best
 
 
-def align(
-    X: Array,
-    area: Array,
-    Y: Array,
-    area_y: Array,
-    *,
-    n_points: int = 300,
-    clearly: float = 0.98,
-    prefer: float = 0.9,
-) -> End:
+def align(X: Array, area: Array, Y: Array, area_y: Array) -> End:
     """Rigid motion of X onto Y by ICP, from the pose as given and from the turns of principal axes.
 
-    The starts are compared by pairing `n_points` spread vertices of each shape.  Two go on, tilted:
-    of the four turns that align principal axes, the best that ends within 90 degrees of where the
-    pose as given (centred) ends, and the best of the others.  The former is kept unless the latter
-    ends below `prefer` times its residual: near-symmetric shapes would otherwise be turned over by
-    noise.  The pose as given takes its place only where that ends below `clearly` times its
-    residual, as with shapes whose principal axes mean little; so the end does not depend on how the
-    shapes were turned, as long as they lie within about 90 degrees of each other.  What is kept is
-    then refined on all vertices.
+    The starts are compared by pairing ``N_POINTS`` spread vertices of each shape.  Two go on,
+    tilted: of the four turns that align principal axes, the best that ends within 90 degrees of
+    where the pose as given (centred) ends, and the best of the others.  The former is kept unless
+    the latter ends below ``PREFER`` times its residual: near-symmetric shapes would otherwise be
+    turned over by noise.  The pose as given takes its place only where that ends below ``CLEARLY``
+    times its residual, as with shapes whose principal axes mean little; so the end does not depend
+    on how the shapes were turned, as long as they lie within about 90 degrees of each other.  What
+    is kept is then refined on all vertices.
 
     Parameters
     ----------
@@ -360,22 +319,21 @@ def align(
     flips = [np.diag(d) for d in itertools.product((1, -1), repeat=3) if np.prod(d) == 1]
     turns = [np.eye(3)] + [B @ flip @ A.T for flip in flips]
     starts = [(R, center_y - R @ center) for R in turns]
-    source, target = cloud(X, area, n_points), cloud(Y, area_y, n_points)
+    source, target = cloud(X, area, N_POINTS), cloud(Y, area_y, N_POINTS)
     posed, *turned = icp_each(source, target, starts, tolerance=ROUGH)
     # the trace of a rotation is 1 + 2 cos(angle): 1 at 90 degrees
-    upright = [end for end in turned if np.trace(end[0].T @ posed[0]) >= 1]
-    upside_down = [end for end in turned if np.trace(end[0].T @ posed[0]) < 1]
-
-    def tilt(start: End) -> End:
-        return _try_tilts(source, target, start, tolerance=ROUGH)
-
-    best = tilt(min(upright, key=residual_of)) if upright else None
-    if best is None or clearly * residual_of(best) > residual_of(posed):
-        best = tilt(posed)
-    if upside_down:
-        other = tilt(min(upside_down, key=residual_of))
-        if residual_of(other) < prefer * residual_of(best):
-            best = other
+    as_posed = [np.trace(R.T @ posed[0]) >= 1 for R, _, _ in turned]
+    upright, upside_down = (
+        list(itertools.compress(turned, side)) for side in (as_posed, np.invert(as_posed))
+    )
+    best, other = (
+        _try_tilts(source, target, min(ends, key=residual_of)) if ends else None
+        for ends in (upright, upside_down)
+    )
+    if best is None or CLEARLY * residual_of(best) > residual_of(posed):
+        best = _try_tilts(source, target, posed)
+    if other is not None and residual_of(other) < PREFER * residual_of(best):
+        best = other
     R, t, _ = best
     return icp(cloud(X, area), cloud(Y, area_y), R, t)
 

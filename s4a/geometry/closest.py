@@ -46,26 +46,24 @@ def interpolation_matrix(T: Array, triangle: Array, weights: Array, n: int) -> s
 
 def closest_point(P: Array, X: Array, T: Array) -> tuple[Array, Array]:
     """The point of a surface closest to each row of P: triangle ``(p,)``, weights ``(p, 3)``."""
-    P = np.ascontiguousarray(P, np.float64)
-    X = np.ascontiguousarray(X, np.float64)
-    T = np.ascontiguousarray(T, np.int64)
+    P, X = np.asarray(P, float), np.asarray(X, float)
     if not igl:
         return closest_of_all(P, X, T)
-    triangle = igl.point_mesh_squared_distance(P, X, T)[1].reshape(-1)
-    a, b, c = T[triangle].T
-    return triangle, closest_point_on_triangles(P, X[a], X[b], X[c])
+    triangle = _by_libigl(P, X, T)[1].reshape(-1)
+    return triangle, closest_point_on_triangles(P, *(X[corner] for corner in T[triangle].T))
+
+
+def _by_libigl(P, X, T):
+    """Squared distances ``(p,)``, triangles, and the points that are closest."""
+    P, X = (np.ascontiguousarray(points, np.float64) for points in (P, X))
+    return igl.point_mesh_squared_distance(P, X, np.ascontiguousarray(T, np.int64))
 
 
 def distance_to_surface(P: Array, X: Array, T: Array) -> Array:
     """Distances ``(p,)`` of points from a surface."""
     if not igl:
         return np.linalg.norm(interpolate(X, T, *closest_of_all(P, X, T)) - P, axis=1)
-    squared = igl.point_mesh_squared_distance(
-        np.ascontiguousarray(P, np.float64),
-        np.ascontiguousarray(X, np.float64),
-        np.ascontiguousarray(T, np.int64),
-    )[0]
-    return np.sqrt(np.maximum(squared, 0))
+    return np.sqrt(np.maximum(_by_libigl(P, X, T)[0], 0))
 
 
 def closest_of_all(P: Array, X: Array, T: Array) -> tuple[Array, Array]:

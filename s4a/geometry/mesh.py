@@ -19,12 +19,8 @@ def as_dataset(
     points: Array, triangles: Array, attrs: dict[str, Any] | None = None, **variables: Any
 ) -> xr.Dataset:
     """A mesh Dataset: ``position(vertex, xyz)``, ``corner_vertex(triangle, corner)``."""
-    return dataset(
-        attrs,
-        position=np.asarray(points, float),
-        corner_vertex=np.asarray(triangles, np.int32),
-        **variables,
-    )
+    X, T = np.asarray(points, float), np.asarray(triangles, np.int32)
+    return dataset(attrs, position=X, corner_vertex=T, **variables)
 
 
 def as_arrays(mesh: xr.Dataset) -> tuple[Array, Array]:
@@ -128,26 +124,11 @@ def unique_edges(T: Array, n: int | None = None) -> tuple[Array, Array, Array]:
     """
     start = np.asarray(T).T.astype(np.int64).ravel()  # as in directed_edges
     end = np.roll(start, -len(T))
-    if n is None:
-        n = int(start.max(initial=-1)) + 1
+    n = max(int(start.max(initial=0)) + 1 if n is None else n, 1)
     _check_numbers(start, n)
-    m, bits = len(start), n.bit_length()
-    edge = np.minimum(start, end) << bits | np.maximum(start, end)  # both in one word
-    places = m.bit_length()
-    if 2 * bits + places < 64:  # and the place of the half-edge, which is faster than argsort
-        sorted_words = np.sort(edge << places | np.arange(m))
-        order, edge = sorted_words & ((1 << places) - 1), sorted_words >> places
-    else:
-        order = np.argsort(edge)
-        edge = edge.take(order)
-    new = np.ones(m, bool)
-    np.not_equal(edge[1:], edge[:-1], out=new[1:])
-    edge_of = np.empty(m, np.int64)
-    edge_of[order] = np.cumsum(new) - 1
-    head = np.flatnonzero(new)
-    edge = edge.take(head)
-    E = np.stack([edge >> bits, edge & ((1 << bits) - 1)], axis=1)
-    return E, edge_of, np.diff(head, append=m)
+    key = np.minimum(start, end) * n + np.maximum(start, end)
+    edge, edge_of, count = np.unique(key, return_inverse=True, return_counts=True)
+    return np.stack(np.divmod(edge, n), axis=1), edge_of, count
 
 
 def _check_numbers(key, n):

@@ -59,9 +59,7 @@ def farthest_of_each(group: Array, vertex: Array, distance: Array) -> Array:
     return vertex[order[last]]
 
 
-def add_samples(
-    G: sp.csr_matrix, new: Array, sample: Array, cell: Array, distance: Array
-) -> Voronoi:
+def add_samples(G: sp.csr_matrix, new: Array, state: Voronoi) -> Voronoi:
     """Voronoi cells along edges after new samples: only vertices nearer to one of these change.
 
     Parameters
@@ -70,8 +68,9 @@ def add_samples(
         Lengths of the edges, :func:`s4a.geometry.mesh.edge_graph`.
     new : int ndarray
         Vertices to add.
-    sample, cell, distance : of :class:`Voronoi`
+    state : Voronoi
     """
+    sample, cell, distance = state
     to_new, _, nearest = dijkstra(
         G, indices=new, min_only=True, return_predecessors=True, limit=distance.max()
     )
@@ -90,7 +89,8 @@ def voronoi_cells(G: sp.csr_matrix, sample: Array) -> Voronoi:
     _, part = connected_components(G, directed=False)
     _, first = np.unique(part, return_index=True)
     sample = np.union1d(sample, first[~np.isin(part[first], part[sample])])
-    return add_samples(G, sample, np.empty(0, np.int64), np.full(n, -1), np.full(n, np.inf))
+    none = Voronoi(np.empty(0, np.int64), np.full(n, -1), np.full(n, np.inf))
+    return add_samples(G, sample, none)
 
 
 def dual(T: Array, cell: Array) -> Array:
@@ -270,7 +270,7 @@ def refine(
         if len(new) == 0 or len(sample) > most:
             return state, rounds, len(new) > 0
         new = farthest_of_each(cell[new], new, distance)  # one in each cell
-        state = add_samples(graph.G, new, *state)
+        state = add_samples(graph.G, new, state)
         moved = state.cell != cell
         # every fault had a new sample in one of its cells, so others than these have no faults
         changed = np.zeros(len(state.sample), bool)

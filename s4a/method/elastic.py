@@ -54,9 +54,6 @@ _N_FURTHER = 5  # steps at most, where the last was nearly in vain
 # Of each step: from 1e-4 to 1e-7 by equal factors, and on.  Chosen on a pair of faces, of brains
 # and of skulls and two cortex templates, reported on others: docs/decisions.md
 STIFFNESS = 1e-4 * 1e-3 ** (np.arange(_N_STEPS + _N_FURTHER) / (_N_STEPS - 1))
-# Before, from each start: so stiff that starts meet, in rounds until they are as still as this.
-# Chosen on heads 2 to 10, with nothing left to report on but other collections
-STIFFEST, N_MEETING, STILLEST = np.array([1e-2, 1e-3]), 32, 1e-4
 # Of the first two steps, in which different starts meet, and of the others, in which vertices must
 # not drift along the surface any more
 SLIDE = (0.01, 0.1)
@@ -65,12 +62,24 @@ RIM_WEIGHT = 0.01  # share of sqrt(area): of distances at the boundary, by its l
 _RIM_NEAR = 0.03  # share of sqrt(area): boundaries that are farther apart may be cut anywhere
 _LANDMARK_WEIGHT = 1e-3  # of each landmark: as much as this share of the area
 MEET = 0.01  # share of sqrt(area): starts that end nearer to each other than that go on as one
-N_ROUNDS = 8
-STILL = 1e-3  # share of sqrt(area): a step ends with a round that moves less
 _TIME = (2e-2, 2e-4)  # of local rounds: smooth over 0.2, then over 0.02 of sqrt(area)
 _LOCAL_SLIDE = 0.5
 _N_LOCAL_ROUNDS = 10
 
+
+class Schedule(NamedTuple):
+    """How stiff the steps of elastic rounds are, and how long each of them lasts."""
+
+    stiffness: Array  # (steps,), of each step
+    further: int  # so many, the last ones, only while the bending energy has not settled
+    rounds: int  # of a step, at most
+    still: float  # share of sqrt(area): a step ends with a round that moves less
+
+
+FOLLOWING = Schedule(STIFFNESS, _N_FURTHER, 8, 1e-3)
+# Before, from each start: so stiff that starts meet.  Chosen on heads 2 to 10, with nothing left to
+# report on but other collections
+MEETING = Schedule(np.array([1e-2, 1e-3]), 0, 32, 1e-4)
 Rows = Array | slice
 _ALL = slice(None)
 
@@ -259,12 +268,8 @@ def elastic_rounds(
     source: Basis,
     target: Basis,
     warp: Warp,
+    schedule: Schedule = FOLLOWING,
     *,
-    stiffness: Array = STIFFNESS,
-    further: int = _N_FURTHER,
-    slide: tuple[float, float] = SLIDE,
-    rounds: int = N_ROUNDS,
-    still: float = STILL,
     vertices: Rows = _ALL,
     landmarks: Landmarks | None = None,
 ) -> Warp:
@@ -279,18 +284,9 @@ def elastic_rounds(
         :attr:`s4a.method.shape.Shape.low_on_surface`.
     warp : tuple (R, t, c)
         Where to begin, with one motion for all: bending is counted from there.
-    stiffness : float ndarray (steps,)
-        Of each step.
-    further : int
-        How many of the steps, the last ones, are made only as long as the one before let the
-        bending energy grow by less than a fifth.
-    slide : tuple of float
-        Weight of the distance along the surface in the first two steps, and in the others; that
-        across it weighs 1.
-    rounds : int
-        With each value at most; fewer where nothing moves any more.
-    still : float
-        Share of sqrt(area): the root mean square of what a round moves, below which it is the last.
+    schedule : Schedule
+        Its further steps are made only as long as the one before let the bending energy grow by
+        less than a fifth.
     vertices : int ndarray (s,), optional
         Those of the target that are drawn, each for the area around it; all by default.
     landmarks : Landmarks, optional
@@ -319,16 +315,17 @@ def elastic_rounds(
     area = target.area if isinstance(vertices, slice) else _spread_area(target, vertices)
     F = unlike[vertices]
     mass = F.T @ (area[:, None] * F)
-    for step, stiff in enumerate(stiffness):
-        if step >= len(stiffness) - further and energies[-1] > _SETTLED * energies[-2]:
+    sure = len(schedule.stiffness) - schedule.further
+    for step, stiff in enumerate(schedule.stiffness):
+        if step >= sure and energies[-1] > _SETTLED * energies[-2]:
             break
         price = np.kron(np.eye(3), apart.T @ (stiff * bending * apart))
         # nothing may be left of the start: a little keeps the matrix definite then
         price[np.diag_indices_from(price)] += 1e-12
-        for _ in range(rounds):
+        for _ in range(schedule.rounds):
             y, m = _points_ahead(source, target, X, vertices)
             # of what w is to change by, so that rounding is of the step and not of what it leads to
-            matrix, right = normal_equations(F, area, m, y - X[vertices], slide[step >= 2], mass)
+            matrix, right = normal_equations(F, area, m, y - X[vertices], SLIDE[step >= 2], mass)
             rim = rim_ahead(source, target, X) if step >= 2 else None
             if rim is not None:
                 vertex, length, across, y = rim
@@ -345,7 +342,7 @@ def elastic_rounds(
             change = step_of(matrix + price, right)
             w = w + apart @ change.reshape(3, -1).T
             before, X = X, E @ w
-            if target.area @ ((X - before) ** 2).sum(1) < still**2:
+            if target.area @ ((X - before) ** 2).sum(1) < schedule.still**2:
                 break
         energies.append((bending * w**2).sum())
     A = w[-4:-1].T  # (3, 3)
@@ -372,12 +369,10 @@ def starts_that_meet(
     dict
         Starts that end within :data:`MEET` of the first of some are one, by its name.
     """
-    spread = target.spread_vertices()
+    options: dict[str, Any] = {"vertices": target.spread_vertices(), "landmarks": landmarks}
     met: dict[str, list[Warp]] = {}
-    stiff: dict[str, Any] = {"rounds": N_MEETING, "still": STILLEST, "further": 0}
-    stiff |= {"vertices": spread, "landmarks": landmarks}
     for name, start in starts.items():
-        warp = elastic_rounds(source, target, start, stiffness=STIFFEST, **stiff)
+        warp = elastic_rounds(source, target, start, MEETING, **options)
         X = move(target, warp)
         near = (
             one

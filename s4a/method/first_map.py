@@ -29,6 +29,7 @@ N_PAIRED = 8  # the likeliest ways to pair them
 _CURVATURE = 3.0  # its weight by that of a signature
 _ON_A_LINE = 0.02  # of sqrt(area): landmarks as near to a line say nothing of turns about it
 _BENT = 0.3  # weight of the gap of curvatures in that score
+SHORT = 60  # functions of the short ZoomOut that a map is scored after
 _FOUND = 0.07  # score at which the search ends; of wrong maps between bodies it is 0.11 or more
 
 
@@ -70,10 +71,8 @@ def nearest_after_motion(source: Basis, target: Basis, motion: Motion) -> Array:
     return cKDTree(P).query(Q)[1]
 
 
-def landmarks_after_motion(
-    X: Array, Y: Array, motion: Motion, n: int = N_LANDMARKS
-) -> tuple[Array, Array]:
-    """Step 3: n spread vertices of the source, and the vertices of the target nearest to them.
+def landmarks_after_motion(X: Array, Y: Array, motion: Motion) -> tuple[Array, Array]:
+    """Step 3: ten spread vertices of the source, and the vertices of the target nearest to them.
 
     Parameters
     ----------
@@ -81,23 +80,34 @@ def landmarks_after_motion(
         Vertices of source and target.
     motion : tuple (R, t)
         Rigid motion of the source onto the target.
-    n : int
     """
     R, t = motion
-    landmark = farthest_points(X, n)
+    landmark = farthest_points(X, N_LANDMARKS)
     return landmark, cKDTree(Y).query(X[landmark] @ R.T + t)[1]
 
 
 def fit_after_motion(
+    source: Basis, target: Basis, motion: Motion, *, k_init: int, init: str, near: Array
+) -> tuple[Array, tuple[Array, Array] | None]:
+    """The map as it is fitted, and with ``init="landmarks"`` the landmarks of both."""
+    M, N = source.first(k_init), target.first(k_init)
+    if init == "dense":
+        return fmap.fmap_from_match(M.Phi, N.Phi, N.mass, near), None
+    landmarks = landmarks_after_motion(M.X, N.X, motion)
+    return fmap.fmap_from_landmarks(M, N, *landmarks), landmarks
+
+
+def map_after_motion(
     source: Basis,
     target: Basis,
     motion: Motion,
     *,
     k_init: int = 20,
     init: str = "dense",
-    near: Array | None = None,
-) -> tuple[Array, tuple[Array, Array] | None]:
-    """First functional map of a directed pair as it is fitted (4.1, steps 3 and 4).
+    ahead: bool = True,
+    n_spread: int = 0,
+) -> _FirstMap:
+    """First functional map of a directed pair (4.1, steps 3 and 4).
 
     Parameters
     ----------
@@ -107,42 +117,18 @@ def fit_after_motion(
         Rigid motion of the source onto the target (step 2).
     init : {"dense", "landmarks"}
         From all vertices' nearest neighbours, or the paper's fit on 10 farthest points.
-    near : int ndarray (n_target,), optional
-        :func:`nearest_after_motion`, where it is known.
-
-    Returns
-    -------
-    C : float ndarray (k_init, k_init)
-    landmarks : tuple of int ndarray (10,), or None
-        Of source and target, where it was fitted on them.
+    ahead : bool
+        Whether one step of ZoomOut is done ahead (4.2).
+    n_spread : int
+        Of that step, see :func:`s4a.method.fmap.refine_once`.
     """
     check("init", init)
-    source = source.first(k_init)
-    target = target.first(k_init)
-    if init == "landmarks":
-        landmarks = landmarks_after_motion(source.X, target.X, motion)
-        return fmap.fmap_from_landmarks(source, target, *landmarks), landmarks
-    near = nearest_after_motion(source, target, motion) if near is None else near
-    return fmap.fmap_from_match(source.Phi, target.Phi, target.mass, near), None
-
-
-def map_after_motion(
-    source: Basis,
-    target: Basis,
-    motion: Motion,
-    *,
-    ahead: bool = True,
-    n_spread: int = 0,
-    **options: Any,
-) -> Array:
-    """:func:`fit_after_motion` of these options, and `ahead` one step of ZoomOut (4.2).
-
-    Returns
-    -------
-    C : float ndarray (k_init, k_init)
-    """
-    C, _ = fit_after_motion(source, target, motion, **options)
-    return fmap.refine_once(source, target, C, n_spread) if ahead else C
+    near = nearest_after_motion(source, target, motion)
+    fitted, landmarks = fit_after_motion(
+        source, target, motion, k_init=k_init, init=init, near=near
+    )
+    C = fmap.refine_once(source, target, fitted, n_spread) if ahead else fitted
+    return _FirstMap(init, C, fitted, near, landmarks)
 
 
 def stretch(target: Basis, X: Array) -> float:
@@ -155,14 +141,7 @@ def stretch(target: Basis, X: Array) -> float:
 
 
 def best_first_map(
-    source: Basis,
-    target: Basis,
-    C: Array,
-    fitted: Array | None = None,
-    *,
-    k: int = 60,
-    step: int = 10,
-    search: bool = False,
+    source: Basis, target: Basis, C: Array, fitted: Array | None = None, *, search: bool = False
 ) -> tuple[str, Array, Array]:
     """The best of a first map and of those from heat and from wave kernels, which no pose changes.
 
@@ -182,8 +161,6 @@ def best_first_map(
         First map from ICP.
     fitted : float ndarray (k_init, k_init), optional
         That map before its step of ZoomOut; C where there was none.
-    k, step : int
-        Of the short ZoomOut.
     search : bool
         Whether to go on through :func:`paired_extremities` and :data:`SEARCHED` until the first two
         terms of a score are below ``_FOUND``.
@@ -196,13 +173,13 @@ def best_first_map(
     C, fitted : float ndarray (k_init, k_init)
         The map, and as it was before its step of ZoomOut.
     """
-    k = min(k, source.k, target.k)
+    k = min(SHORT, source.k, target.k)
     maps = [("icp", C, C if fitted is None else fitted)]
     maps += _map_of_landmarks(source, target, len(C))
     best = np.inf
     tried = []  # score, name, map, fit
     for one in itertools.chain(maps, maps_of_signatures(source, target, len(C), search)):
-        match = fmap.zoomout(source, target, one[1], k, step=step)[1]
+        match = fmap.zoomout(source, target, one[1], k, step=10)[1]
         end = joint.low_rounds(source, target, match, k_first=20, step=20, rounds=1, by_parts=True)
         image = joint.move(target, end[1])
         gap = joint.registration_score(source, target, end[0], target.moved_to(image))
@@ -309,15 +286,7 @@ def _have_signatures(source, target, k):
 
 
 def first_map(
-    source: Basis,
-    target: Basis,
-    motion: Motion,
-    *,
-    k_init: int = 20,
-    init: str = "dense",
-    ahead: bool = True,
-    n_spread: int = 0,
-    search: bool = False,
+    source: Basis, target: Basis, motion: Motion, *, search: bool = False, **options: Any
 ) -> _FirstMap:
     """:func:`map_after_motion`, or :func:`best_first_map` where poses are far apart.
 
@@ -325,24 +294,16 @@ def first_map(
 
     Parameters
     ----------
-    source, target : Basis
-        At low resolution.
-    motion : tuple (R, t)
-        Rigid motion of the source onto the target.
-    k_init, init, ahead : see :func:`map_after_motion`
-    n_spread : int
-        Of the step ahead, see :func:`s4a.method.fmap.refine_once`; maps of far poses, which are
-        looked for in other ways, take all vertices.
+    source, target, motion : see :func:`map_after_motion`
     search : bool
         See :func:`best_first_map`; for pairs alone, as Consistent ZoomOut mends those of a network.
+    **options
+        Of :func:`map_after_motion`; maps of far poses, which are looked for in other ways, take all
+        vertices.
     """
-    near = nearest_after_motion(source, target, motion)
-    fitted, landmarks = fit_after_motion(
-        source, target, motion, k_init=k_init, init=init, near=near
-    )
-    C = fmap.refine_once(source, target, fitted, n_spread) if ahead else fitted
-    far = init == "dense" and joint.far_apart(source, target, near)
-    if far and _have_signatures(source, target, k_init):
-        name, C, fitted = best_first_map(source, target, C, fitted, search=search)
-        return _FirstMap(name, C, fitted, near, None)
-    return _FirstMap(init, C, fitted, near, landmarks)
+    first = map_after_motion(source, target, motion, **options)
+    far = first.name == "dense" and joint.far_apart(source, target, first.near)
+    if not (far and _have_signatures(source, target, len(first.C))):
+        return first
+    name, C, fitted = best_first_map(source, target, first.C, first.fitted, search=search)
+    return _FirstMap(name, C, fitted, first.near, None)

@@ -220,6 +220,8 @@ def orientation(T: Array, Phi: Array, f: Array) -> Array:
     return np.stack(operators)
 
 
+LAPLACIAN = 1e-3  # weight of the term that the Laplacians commute
+EVERY = 5  # of 100 energies or times every fifth is used: neighbours are nearly equal
 _FILTERS = {"wks": wave_filter, "hks": heat_filter}
 SCALES = (20, 40, 60, 90)  # functions that mean curvatures are of
 
@@ -396,7 +398,7 @@ def fmap_from_landmarks(
     landmark_source: Array,
     landmark_target: Array,
     *,
-    commute: float = 1e-3,
+    commute: float = LAPLACIAN,
 ) -> Array:
     """C from landmark pairs (step 4 of 4.1): heat kernels around them kept, Laplacians commute.
 
@@ -414,11 +416,8 @@ def fmap_from_landmarks(
     -------
     C : float ndarray (k, k)
     """
-    coefficients = []
-    for end, other, landmark in (
-        (source, target, landmark_source),
-        (target, source, landmark_target),
-    ):
+    coefficients, landmarks = [], (landmark_source, landmark_target)
+    for end, other, landmark in zip((source, target), (target, source), landmarks, strict=True):
         kernel = heat_filter(end.eigenvalue, other.eigenvalue, n=8)  # (8, k)
         F = landmark_coefficients(end.Phi, kernel, landmark)  # (k, 8 p)
         coefficients.append(F / np.linalg.norm(F, axis=0))
@@ -434,17 +433,13 @@ def fmap_from_descriptors(
     k: int = 20,
     landmarks: Sequence[Array] | tuple[None, None] = (None, None),
     kind: str = "wks",
-    n: int = 100,
-    every: int = 5,
-    laplacian: float = 1e-3,
-    commute: float = 1.0,
     oriented: float = 1.0,
     curvature: float = 0.0,
 ) -> Array:
     """C ``(k, k)`` fitted on descriptors, with or without landmarks (step 4 of 4.1).
 
-    :func:`fit` of E(C) = |C F - G|^2 / |F|^2 + laplacian sum (mu_i - lambda_j)^2 C_ij^2 /
-    lambda_max^2 + commute sum |C P - Q C|^2 / sum |P|^2, where F and G are the coefficients of the
+    :func:`fit` of E(C) = |C F - G|^2 / |F|^2 + 1e-3 sum (mu_i - lambda_j)^2 C_ij^2 /
+    lambda_max^2 + sum |C P - Q C|^2 / sum |P|^2, where F and G are the coefficients of the
     descriptors, P and Q the products with them, and the same once more with `oriented` for the
     operators that a mirror image turns over.  Descriptors are taken with all functions that there
     are, less their mean, scaled to norm 1.
@@ -460,50 +455,38 @@ def fmap_from_descriptors(
         Corresponding vertices; descriptors around each are added to those of the shapes.
     kind : {"wks", "hks", "hks+wks"}
         Wave or heat kernel signatures, or both.
-    n, every : int
-        Of n energies or times every `every`-th is used: neighbours are nearly equal.
-    laplacian, commute, oriented : float
-        Weights against that of preserving the descriptors; 0 leaves a term out.
+    oriented : float
+        Weight against that of preserving the descriptors; 0 leaves the term out.
     curvature : float
         Weight of signed mean curvatures at four scales beside a signature.
     """
     F, products, turns = [], [], []  # of source and target
     for end, other, landmark in zip((source, target), (target, source), landmarks, strict=True):
-        kernel = np.concatenate(
-            [
-                _FILTERS[one](end.eigenvalue, other.eigenvalue, n=n)[::every]
-                for one in kind.split("+")
-            ]
-        )
-        f = signature(end.Phi, kernel)  # (n, d)
+        filters = [_FILTERS[one](end.eigenvalue, other.eigenvalue) for one in kind.split("+")]
+        kernel = np.concatenate([values[::EVERY] for values in filters])
+        given = [signature(end.Phi, kernel)]  # (n, d)
         if landmark is not None:
-            f = np.column_stack([f, landmark_signature(end.Phi, kernel, landmark)])
-        f = np.column_stack([f, *(end.fields[name] for name in common_fields(source, target))])
-        if curvature:
-            f = np.column_stack([f, *curvatures(end)])
+            given.append(landmark_signature(end.Phi, kernel, landmark))
+        given += [end.fields[name] for name in common_fields(source, target)]
+        f = np.column_stack([*given, *(curvatures(end) if curvature else [])])
         f = f - end.area @ f
         f /= np.sqrt(end.area @ f**2)
         if curvature:
             f[:, -len(SCALES) :] *= np.sqrt(curvature)
         Phi = end.Phi[:, :k]
         F.append(Phi.T @ (end.area[:, None] * f))  # (k, d)
-        if commute:
-            products.append(multiplication(Phi, end.area, f))
+        products.append(multiplication(Phi, end.area, f))
         if oriented:
             turns.append(orientation(end.T, Phi, f))
-    operators = []
-    for weight, ends in ((commute, products), (oriented, turns)):
-        if weight:
-            P, Q = ends
-            operators.append((weight / (P**2).sum(), P, Q))
+    operators = [
+        (weight / (ends[0] ** 2).sum(), *ends)
+        for weight, ends in ((1.0, products), (oriented, turns))
+        if weight
+    ]
     size = np.linalg.norm(F[0])
-    return fit(
-        F[0] / size,
-        F[1] / size,
-        penalty=laplacian * _commutator(source.eigenvalue[:k], target.eigenvalue[:k]),
-        operators=operators,
-        constant=_constant_to_constant(source, target),
-    )
+    penalty = LAPLACIAN * _commutator(source.eigenvalue[:k], target.eigenvalue[:k])
+    constant = _constant_to_constant(source, target)
+    return fit(F[0] / size, F[1] / size, penalty=penalty, operators=operators, constant=constant)
 
 
 def curvature_gap(source: Basis, target: Basis, match: Array) -> float:
@@ -551,22 +534,18 @@ def off_diagonal_mass(C: Array) -> float:
     return float(1 - (np.diag(C) ** 2).sum() / (C**2).sum())
 
 
-def swapped_blocks(
-    C: Array, *, longest: int = 6, inside: float = 0.75, diagonal: float = 0.5
-) -> list[tuple[int, int]]:
+def swapped_blocks(C: Array) -> list[tuple[int, int]]:
     """Runs of modes that the map exchanges among each other (Fig. 2).
 
     Those of symmetric shapes do so, whose eigenvalues are nearly equal.
 
-    A run counts when at least the share `inside` of the squared entries of its rows and columns
-    lies in its diagonal block, and less than the share `diagonal` of that on the diagonal itself;
-    the shortest runs come first.
+    A run of at most six counts when at least three quarters of the squared entries of its rows and
+    columns lie in its diagonal block, and less than half of that on the diagonal itself; the
+    shortest runs come first.
 
     Parameters
     ----------
     C : float ndarray (k, k)
-    longest : int
-        Modes in the longest run that is looked for.
 
     Returns
     -------
@@ -583,13 +562,13 @@ def swapped_blocks(
     S = np.asarray(C, float) ** 2
     runs = []
     taken = set()
-    for length in range(2, longest + 1):
+    for length in range(2, 7):
         for first in range(min(S.shape) - length + 1):
             run = slice(first, first + length)
             block = S[run, run]
             around = (S[run].sum() + S[:, run].sum()) / 2
-            closed = around > 0 and block.sum() >= inside * around
-            exchanged = np.trace(block) < diagonal * block.sum()
+            closed = around > 0 and block.sum() >= 0.75 * around
+            exchanged = np.trace(block) < 0.5 * block.sum()
             modes = range(first, first + length)
             if closed and exchanged and taken.isdisjoint(modes):
                 runs.append((first, first + length - 1))

@@ -4,7 +4,7 @@ The source is the shape M_i, the target the template, the paper's median shape: 
 every vertex of the template, a vertex of the shape.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -14,7 +14,14 @@ from s4a.geometry.closest import closest_point_in_star, interpolate, match_surfa
 from s4a.geometry.mesh import as_arrays, triangle_areas, vertex_areas
 from s4a.method import joint
 from s4a.method.deform import displacement_in_template, distortion
-from s4a.method.elastic import STIFFNESS, Landmarks, elastic_rounds, local_rounds, starts_that_meet
+from s4a.method.elastic import (
+    FOLLOWING,
+    STIFFNESS,
+    Landmarks,
+    elastic_rounds,
+    local_rounds,
+    starts_that_meet,
+)
 from s4a.method.first_map import nearest_after_motion
 from s4a.method.fmap import fmap_from_match
 from s4a.method.nearest import nearest_in_cells, nearest_of_few, nearest_rows
@@ -155,25 +162,18 @@ def match_low(
     check("how", how)
     Y_source, Y_target = bases  # (k, m) each
     k = len(Y_source)
-    Phi = source.low.Phi[:, :k]
-    Psi = target.low.Phi[:, :k]
+    Phi, Psi = source.low.Phi[:, :k], target.low.Phi[:, :k]
     match = nearest_rows(Psi @ Y_target, Phi @ Y_source)  # eq. 6
-    if how == "standard":
-        return match, _mapped_functions(source, target, match, k)
-    return match, latent_functions(source, target, bases)
+    if how == "ours":
+        return match, latent_functions(source, target, bases)
+    C = fmap_from_match(Phi, Psi, target.low.mass, match)  # of eq. 3, for eq. 4
+    return match, (source.functions(C.T), target.functions(np.eye(k)))
 
 
 def latent_functions(source: Shape, target: Shape, bases: Functions) -> Functions:
     """The latent functions Phi Y of both, whose rows eq. 7 compares."""
     Y_source, Y_target = bases
     return source.functions(Y_source), target.functions(Y_target)
-
-
-def _mapped_functions(source, target, match, k):
-    """Phi C^T and Psi with the k x k map C of the match of eq. 3: the standard way's, for eq. 4."""
-    Phi = source.low.Phi[:, :k]
-    C = fmap_from_match(Phi, target.low.Phi[:, :k], target.low.mass, match)
-    return source.functions(C.T), target.functions(np.eye(k))
 
 
 def match_functions(
@@ -317,13 +317,9 @@ def register(
     candidates = find_candidates(source, target, starts, k=k, refine=refine, parts=parts)
     by_icp = _motion_in_unit(source, target, motion, scale) if alignment == "icp" else None
     # image = R x + t + U Phi c, smooth already: the line after eq. 8; or of elastic rounds
+    placed, elastic = by_icp and (motion, by_icp[3]), refine == "elastic"
     match, moved, attrs = register_surface(
-        source,
-        target,
-        candidates,
-        functions,
-        by_icp and (motion, by_icp.ratio),
-        elastic=refine == "elastic",
+        source, target, candidates, functions, placed, elastic=elastic
     )
     image = source.from_frame(moved.X)
     triangle, barycentric = way_back(source.full, moved)
@@ -363,17 +359,12 @@ def register(
     return in_unit(registration, common_unit(source.original, target.original))
 
 
-class _Placed(NamedTuple):
-    """A motion s R x + t in the unit of the input, and the ratio of sizes that it leaves."""
+def _motion_in_unit(
+    source: Shape, target: Shape, motion: Motion, scale: bool
+) -> tuple[Array, Array, float, float]:
+    """A rigid motion between the frames of two shapes as one between their files: R, t and s.
 
-    R: Array
-    t: Array
-    s: float
-    ratio: float
-
-
-def _motion_in_unit(source, target, motion, scale):
-    """A rigid motion between the frames of two shapes as one between their files.
+    And the ratio of sizes that it leaves.
 
     Without `scale` each keeps its size: the motion turns the source about its centre and carries
     that to where it belongs.
@@ -381,7 +372,7 @@ def _motion_in_unit(source, target, motion, scale):
     (center, size), (center_target, size_target) = source.frame, target.frame
     R, t = motion
     s = size_target / size if scale else 1.0
-    return _Placed(R, center_target + size_target * t - s * R @ center, s, s * size / size_target)
+    return R, center_target + size_target * t - s * R @ center, s, s * size / size_target
 
 
 def find_candidates(
@@ -450,25 +441,23 @@ def register_surface(
     attrs : dict
         See :func:`register`.
     """
-    M = source.full
-    N = target.full
+    M, N = source.full, target.full
     attrs: dict[str, float | str] = {
         f"score_{name}": candidate.score for name, candidate in candidates.items()
     }
-    ends = {}  # name -> score and registered template
+    ends: dict[str, tuple[float, Basis]] = {}
     # starts as they are tell less of their ends than joint rounds do
     margin = 2.0 if elastic else 1.25
     names = joint.finalists(candidates, margin=margin) if candidates else ["intrinsic"]
-    landmarks = _common_landmarks(source, target)
     if elastic:
         whole = {n: candidates[n].warp for n in names if candidates[n].warp[0].ndim == 2}
         names = [name for name in names if name not in whole]  # by parts
-        for name, X in elastic_surfaces(source, target, whole, landmarks).items():
-            ends[f"{name}+elastic"] = _scored_alone(M, N, X)
+        surfaces = elastic_surfaces(source, target, whole)
+        ends = {f"{name}+elastic": _scored_alone(M, N, X) for name, X in surfaces.items()}
         limit = TORN * (1 - _SMEARED if len(target.low.X) < FEW else 1)
         if ends and tear(ends[_best_of(ends)][1], N) > limit:
             torn = ends[_best_of(ends)]
-            again = elastic_surfaces(source, target, whole, landmarks, looser=True)
+            again = elastic_surfaces(source, target, whole, looser=True)
             scored = {f"{name}+looser": _scored_alone(M, N, X) for name, X in again.items()}
             ends |= {name: end for name, end in scored.items() if mends(end, torn, N)}
     for name in names:
@@ -480,7 +469,7 @@ def register_surface(
         else:
             part, warp = joint.dense_rounds(M, N, candidates[name].warp)
         if elastic:  # here by parts
-            X = _after_local_rounds(source, target, warp, landmarks)
+            X = _after_local_rounds(source, target, warp)
             ends[f"{name}+local"] = _scored_alone(M, N, X)
         else:
             moved = N.moved_to(joint.move(N, warp))
@@ -526,12 +515,7 @@ def _scored_alone(source, target, X):
 
 
 def elastic_surfaces(
-    source: Shape,
-    target: Shape,
-    starts: dict[str, joint.Warp],
-    landmarks: Landmarks | None = None,
-    *,
-    looser: bool = False,
+    source: Shape, target: Shape, starts: dict[str, joint.Warp], *, looser: bool = False
 ) -> dict[str, Array]:
     """The template ``(n_target, 3)`` after elastic rounds from several starts, and local ones.
 
@@ -539,14 +523,14 @@ def elastic_surfaces(
     of that lies on a fold beside the one on which a start was right, rounds from the starts
     themselves that begin less stiff, `looser`, may end on the right one.
     """
-    M, N = source.full, target.low_on_surface
+    M, N, landmarks = source.full, target.low_on_surface, _common_landmarks(source, target)
     if not looser:
         starts = starts_that_meet(M, N, starts, landmarks)
-    stiffness = STIFFNESS[_LOOSER if looser else 0 :]
+    schedule = FOLLOWING._replace(stiffness=STIFFNESS[_LOOSER if looser else 0 :])
     surfaces = {}
     for name, start in starts.items():
-        warp = elastic_rounds(M, N, start, stiffness=stiffness, landmarks=landmarks)
-        surfaces[name] = _after_local_rounds(source, target, warp, landmarks)
+        warp = elastic_rounds(M, N, start, schedule, landmarks=landmarks)
+        surfaces[name] = _after_local_rounds(source, target, warp)
     return surfaces
 
 
@@ -564,13 +548,10 @@ def _common_landmarks(source, target):
     return Landmarks(Basis(B @ N.X, none, B @ N.area, target.low.Phi, U=B @ target.U), y)
 
 
-def _after_local_rounds(source, target, warp, landmarks=None):
+def _after_local_rounds(source: Shape, target: Shape, warp: joint.Warp) -> Array:
     """The template ``(n_target, 3)`` after a warp, by parts or not, and local rounds."""
-    low = target.low_on_surface
-    pull = None
-    if landmarks is not None:
-        at, y = landmarks
-        pull = at.U, y - joint.move(at, warp)
+    low, landmarks = target.low_on_surface, _common_landmarks(source, target)
+    pull = landmarks and (landmarks[0].U, landmarks.y - joint.move(landmarks.on_target, warp))
     d = local_rounds(source.full, low, target.diffusion, joint.move(low, warp), pull=pull)
     return joint.move(target.full, warp) + target.U @ d
 

@@ -80,13 +80,10 @@ def spread(X: Array, T: Array, p: int, seed: int = 0) -> tuple[Array, Array, flo
     G = edge_graph(X, E)
     first = sample_surface(X, T, G, E[count == 1], np.zeros(len(X), bool), min(p, len(X)), seed)
     radius = _RADIUS * np.sqrt(vertex_areas(X, T).sum() / (np.pi * len(first)))
-    sample, cell, distance = voronoi_cells(G, first)
-    while (distance > 0.75 * radius).any():
-        far = np.flatnonzero(distance > 0.75 * radius)
-        sample, cell, distance = add_samples(
-            G, farthest_of_each(cell[far], far, distance), sample, cell, distance
-        )
-    return sample, cell, radius, G
+    state = voronoi_cells(G, first)
+    while len(far := np.flatnonzero(state.distance > 0.75 * radius)):
+        state = add_samples(G, farthest_of_each(state.cell[far], far, state.distance), state)
+    return state.sample, state.cell, radius, G
 
 
 def local_functions(X: Array, G: sp.csr_array, sample: Array, radius: float) -> sp.csr_array:

@@ -13,22 +13,13 @@ import scipy.sparse as sp
 import xarray as xr
 from scipy.spatial import cKDTree
 
+from s4a.geometry import mesh as surface
 from s4a.geometry.align import Cloud, farthest_points, many_farthest_points, rigid_transform
-from s4a.geometry.closest import Stars, features, stars, tree_over
-from s4a.geometry.mesh import (
-    as_arrays,
-    directed_edges,
-    edge_graph,
-    edges,
-    stiffness,
-    turned,
-    unique_edges,
-    vertex_areas,
-    vertex_normals,
-)
+from s4a.geometry.closest import Stars, features, interpolation_matrix, stars, tree_over
+from s4a.geometry.mesh import as_arrays, vertex_areas, vertex_normals
 from s4a.method.deform import smoother
 from s4a.method.remesh import laplacian
-from s4a.method.spectral import Diffusion, project, unit_mass
+from s4a.method.spectral import Diffusion, project, unit_area, unit_mass
 from s4a.options import N_CENTRAL, N_SPREAD
 from s4a.schema import Array
 
@@ -176,7 +167,7 @@ class Basis:
         if self.surface_normals is None:
             return moved
         R, _, _ = rigid_transform(self.X, X, self.area)
-        return turned(self.surface_normals @ R.T, self.normals @ R.T, moved)
+        return surface.turned(self.surface_normals @ R.T, self.normals @ R.T, moved)
 
     @cached_property
     def stars(self) -> Stars:
@@ -186,8 +177,8 @@ class Basis:
     @cached_property
     def rim(self) -> Array:
         """Boundary edges ``(r, 2)``, in the direction in which their triangles go around."""
-        _, edge_of, count = unique_edges(self.T, len(self.X))
-        return directed_edges(self.T)[count[edge_of] == 1]
+        _, edge_of, count = surface.unique_edges(self.T, len(self.X))
+        return surface.directed_edges(self.T)[count[edge_of] == 1]
 
     @cached_property
     def rim_tree(self) -> cKDTree:
@@ -197,7 +188,7 @@ class Basis:
     @cached_property
     def graph(self) -> sp.csr_matrix:
         """Lengths of the edges as a sparse matrix ``(n, n)``."""
-        return edge_graph(self.X, edges(self.T))
+        return surface.edge_graph(self.X, surface.edges(self.T))
 
     @cached_property
     def outwards(self) -> Array:
@@ -276,13 +267,10 @@ class Shape:
             )
             shape = self.coarse.sizes["original_vertex"], self.coarse.sizes["vertex"]
             return sp.csr_matrix((weight, (row, column)), shape)
-        columns = self.coarse["coarse_vertex"].values  # (n, 3)
+        corners = self.coarse["coarse_vertex"].values  # (n, 3)
         weights = self.coarse["coarse_weight"].values  # (n, 3), rows of sum 1
-        n, corners = columns.shape
-        rows = np.repeat(np.arange(n), corners)
-        return sp.csr_matrix(
-            (weights.ravel(), (rows, columns.ravel())), (n, self.coarse.sizes["vertex"])
-        )
+        every = np.arange(len(corners))
+        return interpolation_matrix(corners, every, weights, self.coarse.sizes["vertex"])
 
     @cached_property
     def landmarks(self) -> tuple[list[str], sp.csr_matrix]:
@@ -292,13 +280,8 @@ class Shape:
             return [], sp.csr_matrix((0, mesh.sizes["vertex"]))
         _, T = as_arrays(mesh)
         names = mesh["guide_name"].values.tolist()
-        columns = T[mesh["guide_triangle"].values]  # (l, 3)
-        weights = mesh["guide_barycentric"].values
-        rows = np.repeat(np.arange(len(names)), 3)
-        weights = sp.csr_matrix(
-            (weights.ravel(), (rows, columns.ravel())), (len(names), mesh.sizes["vertex"])
-        )
-        return names, weights
+        place = mesh["guide_triangle"].values, mesh["guide_barycentric"].values
+        return names, interpolation_matrix(T, *place, mesh.sizes["vertex"])
 
     @cached_property
     def cell(self) -> Array:
@@ -316,13 +299,10 @@ class Shape:
     def low(self) -> Basis:
         """The coarse mesh and its eigenfunctions."""
         X, T = as_arrays(self.coarse)
-        area = self.coarse["vertex_area"].values
-        Phi = self.coarse["eigenfunction"].values
-        eigenvalue = self.coarse["eigenvalue"].values
+        Phi, eigenvalue = (self.coarse[f"eigen{part}"].values for part in ("function", "value"))
         mass = unit_mass(self.coarse) if self.is_sampled else None
-        area = area / area.sum()
-        X, landmarks = self.to_frame(X), vertices_of_landmarks(self.coarse)
-        low = Basis(X, T, area, Phi, eigenvalue, mass, landmarks=landmarks)
+        low = Basis(self.to_frame(X), T, unit_area(self.coarse), Phi, eigenvalue, mass)
+        low = replace(low, landmarks=vertices_of_landmarks(self.coarse))
         return replace(low, fields=_smooth_fields(self.coarse, low))
 
     @cached_property
@@ -335,7 +315,7 @@ class Shape:
             E, w = (self.coarse[name].values for name in ("edge_vertex", "cotan_weight"))
         else:
             E, w, *_ = laplacian(*as_arrays(self.coarse), self.coarse["vertex_area"].values)
-        return stiffness(E, w, self.coarse.sizes["vertex"])
+        return surface.stiffness(E, w, self.coarse.sizes["vertex"])
 
     @cached_property
     def diffusion(self) -> Diffusion:
@@ -358,17 +338,13 @@ class Shape:
     @cached_property
     def full(self) -> Basis:
         """The original mesh and the functions U Phi, or lifted ones; its areas, of sum 1."""
-        X, T = as_arrays(self.original)
-        X = self.to_frame(X)
-        low = self.low
-        area = self._area / self._area.sum()
-        lifted = self.is_lifted
+        (X, T), low, lifted = as_arrays(self.original), self.low, self.is_lifted
+        X, area = self.to_frame(X), self._area / self._area.sum()
         Phi = self.coarse["lifted_eigenfunction"].values if lifted else low.Phi
-        functions = Phi, low.eigenvalue, low.mass, self.U
-        projection = self.near_coarse, self.area_weighted, lifted
-        landmarks = vertices_of_landmarks(self.original)
+        functions = Phi, low.eigenvalue, low.mass, self.U, self.near_coarse
+        full = Basis(X, T, area, *functions, self.area_weighted, lifted)
         fields = {name: self.U @ values for name, values in low.fields.items()}
-        return Basis(X, T, area, *functions, *projection, landmarks=landmarks, fields=fields)
+        return replace(full, landmarks=vertices_of_landmarks(self.original), fields=fields)
 
     @property
     def is_sampled(self) -> bool:

@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from s4a.geometry.align import Motion, align, motion_between, realign
 from s4a.method import fmap, network
-from s4a.method.first_map import first_map, fit_after_motion, motion_onto
+from s4a.method.first_map import first_map, map_after_motion, motion_onto
 from s4a.method.latent import WIDE, consistent_zoomout, nearest_spectra, place
 from s4a.method.median import median_shape
 from s4a.method.register import from_latent, identity, match_functions, match_low
@@ -118,38 +118,26 @@ def map_pairs(
         the step ahead; ``pair_rotation``, ``pair_translation``, the motion of ICP; with landmarks
         ``landmark_of_source(pair, landmark)`` and ``landmark_of_target``.
     """
-    source, target, maps, fits, turns, shifts, marks = [], [], [], [], [], [], []
+    options = {"k_init": k_init, "init": init, "ahead": ahead, "n_spread": n_spread}
+    rows: list[tuple[Any, ...]] = []
     for a, b in pairs:
         M, N = bases[a], bases[b]
         start = motion_between(motions[a], motions[b])
         R, t = realign(M.cloud, N.cloud, start)
-        back_motion = R.T, -R.T @ t
-        first = first_map(M, N, (R, t), k_init=k_init, init=init, ahead=ahead, n_spread=n_spread)
-        if first.name == init:
-            fitted, landmarks = fit_after_motion(N, M, back_motion, k_init=k_init, init=init)
-            back = fmap.refine_once(N, M, fitted, n_spread) if ahead else fitted
-        else:  # of far poses: the other direction must tell the same limbs apart
-            fitted, landmarks = first.C.T, None
-            back = fmap.refine_once(N, M, fitted)
-        source += [a, b]
-        target += [b, a]
-        maps += [first.C, back]
-        fits += [first.fitted, fitted]
-        turns += [R, R.T]
-        shifts += [t, back_motion[1]]
-        marks += [first.landmarks, landmarks]
-    found = dataset(
-        source=np.array(source),
-        target=np.array(target),
-        fmap_initial=np.stack(maps),
-        fmap_fitted=np.stack(fits),
-        pair_rotation=np.stack(turns),
-        pair_translation=np.stack(shifts),
-    )
+        R_back, t_back = R.T, -R.T @ t
+        first = first_map(M, N, (R, t), **options)
+        back = map_after_motion(N, M, (R_back, t_back), **options)
+        if first.name != init:  # far poses: the other direction must tell the same limbs apart
+            back = back._replace(C=fmap.refine_once(N, M, first.C.T), fitted=first.C.T)
+        rows.append((a, b, first.C, first.fitted, R, t, first.landmarks))
+        rows.append((b, a, back.C, back.fitted, R_back, t_back, back.landmarks))
+    names = ("source", "target", "fmap_initial", "fmap_fitted", "pair_rotation", "pair_translation")
+    *columns, marks = map(np.array, zip(*rows, strict=True))
+    found = dataset(None, **dict(zip(names, columns, strict=True)))
     if init != "landmarks":
         return found
-    ends = np.array(marks)  # (p, 2, landmarks)
-    return found.merge(dataset(landmark_of_source=ends[:, 0], landmark_of_target=ends[:, 1]))
+    # marks (p, 2, landmarks)
+    return found.merge(dataset(landmark_of_source=marks[:, 0], landmark_of_target=marks[:, 1]))
 
 
 def build_network(
