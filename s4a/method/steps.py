@@ -118,7 +118,8 @@ def map_pairs(
         the step ahead; ``pair_rotation``, ``pair_translation``, the motion of ICP; with landmarks
         ``landmark_of_source(pair, landmark)`` and ``landmark_of_target``.
     """
-    options = {"k_init": k_init, "init": init, "ahead": ahead, "n_spread": n_spread}
+    options: dict[str, Any] = {"k_init": k_init, "init": init, "ahead": ahead}
+    options["n_spread"] = n_spread
     rows: list[tuple[Any, ...]] = []
     for a, b in pairs:
         M, N = bases[a], bases[b]
