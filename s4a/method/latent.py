@@ -364,12 +364,11 @@ def consistent_zoomout(
 class _Sampled(NamedTuple):
     """What Consistent ZoomOut holds of a shape in memory: its functions at its samples.
 
-    ``eigenvalue (k,)``; its vertices ``at (s,)``, ``Phi (s, >= k)`` and ``area (s,)`` there; the
-    vertices nearest to each, ``around (s, w)``.
+    ``eigenvalue (k,)``; ``Phi (s, >= k)`` and ``area (s,)`` there; the vertices nearest to each
+    sample, ``around (s, w)``.
     """
 
     eigenvalue: Array
-    at: Array
     Phi: Array
     area: Array
     around: Array
@@ -379,7 +378,7 @@ class _Sampled(NamedTuple):
 def _check_samples(sampled, k):
     """ValueError where a shape has samples, not all its vertices, too few for k functions."""
     least = PER_FUNCTION * k
-    fewest = min((len(one.at) for one in sampled if len(one.at) < one.n), default=least)
+    fewest = min((len(one.area) for one in sampled if len(one.area) < one.n), default=least)
     if fewest < least:
         raise ValueError(
             f"maps of k = {k} functions need {least} spread vertices or more; found {fewest}: "
@@ -389,16 +388,13 @@ def _check_samples(sampled, k):
 
 def sample(basis: Basis, vertex: Array | None, k: int, n_around: int) -> _Sampled:
     """A shape at some of its vertices, or at all where None, and so many around each."""
-    eigenvalue = basis.eigenvalue[:k]
-    if vertex is None:
-        every = np.arange(len(basis.area))
-        return _Sampled(eigenvalue, every, basis.Phi, basis.area, every[:, None], len(every))
+    vertex = np.arange(len(basis.area)) if vertex is None else vertex
     around = vertex[:, None]
     if n_around > 1:
         first = np.arange(1, min(n_around, len(basis.X)) + 1)
         around = cKDTree(basis.X).query(basis.X[vertex], first)[1]
-    Phi, area = basis.Phi[vertex], basis.area[vertex]
-    return _Sampled(eigenvalue, vertex, Phi, area, around, len(basis.area))
+    functions = basis.eigenvalue[:k], basis.Phi[vertex], basis.area[vertex]
+    return _Sampled(*functions, around, len(basis.area))
 
 
 def _larger_maps(sampled, Y, source, target, k, bases, n_jobs=1):

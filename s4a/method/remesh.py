@@ -24,34 +24,13 @@ import xarray as xr
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
+from s4a.geometry import mesh as surface
+from s4a.geometry import voronoi
 from s4a.geometry.align import many_farthest_points
 from s4a.geometry.closest import closest_point_in_star
 from s4a.geometry.compiled import robust_laplacian
-from s4a.geometry.mesh import (
-    as_arrays,
-    components,
-    directed_edges,
-    edge_graph,
-    edges,
-    euler_characteristic,
-    half_cotangents,
-    lexical_order,
-    n_used,
-    triangle_areas,
-    unique_edges,
-    vertex_areas,
-    vertex_normals,
-)
-from s4a.geometry.voronoi import (
-    between_rims,
-    cut_handles,
-    dual,
-    mesh_graph,
-    refine,
-    thin_regions,
-    voronoi_cells,
-)
-from s4a.schema import Array, dataset, require
+from s4a.geometry.mesh import as_arrays, triangle_areas, vertex_areas, vertex_normals
+from s4a.schema import Array, check_count, dataset, require
 from s4a.seeds import RNG, seed_of
 
 GL = "install the system's libgl1 and libopengl0, or see `s4a doctor`"
@@ -117,14 +96,14 @@ def laplacian(X: Array, T: Array, area: Array) -> tuple[Array, Array, Array, str
         "robust" (Sharp & Crane 2020) where triangles are degenerate or edges not manifold.
     """
     area = np.maximum(area, 1e-3 * area.mean())
-    E, edge_of, count = unique_edges(T, len(X))
-    half = directed_edges(T)
+    E, edge_of, count = surface.unique_edges(T, len(X))
+    half = surface.directed_edges(T)
     squared = ((X[half[:, 0]] - X[half[:, 1]]) ** 2).sum(1).reshape(3, -1)  # (3, m)
     degenerate = triangle_areas(X, T) < 1e-6 * squared.max(0)
     if (count > 2).any() or degenerate.any():
         L = sp.triu(robust_laplacian.mesh_laplacian(X, T)[0], 1).tocoo()
         return np.stack([L.row, L.col], axis=1), -L.data, area, "robust"
-    return E, np.bincount(edge_of, half_cotangents(X, T), len(E)), area, "cotan"
+    return E, np.bincount(edge_of, surface.half_cotangents(X, T), len(E)), area, "cotan"
 
 
 def _sorted_mesh(X, T):
@@ -132,14 +111,14 @@ def _sorted_mesh(X, T):
 
     The same surface gives the same coarse mesh, however its file numbers it.
     """
-    order = lexical_order(X[:, ::-1])
+    order = surface.lexical_order(X[:, ::-1])
     rank = np.empty(len(X), np.int64)
     rank[order] = np.arange(len(X))
     T = rank[T]
     turn = (T.argmin(1)[:, None] + np.arange(3)) % 3  # the least corner first, the turn kept
     T = np.take_along_axis(T, turn, axis=1)
     first_two = T[:, 0] * len(X) + T[:, 1]
-    return X[order], T[lexical_order(np.stack([T[:, 2], first_two], axis=1))], order
+    return X[order], T[surface.lexical_order(np.stack([T[:, 2], first_two], axis=1))], order
 
 
 def _coarse_surface(X, T, n_coarse, seed=0):
@@ -158,17 +137,17 @@ def _coarse_surface(X, T, n_coarse, seed=0):
     V, F = X, T  # the surface as far as handles have been cut
     origin = np.arange(len(X))  # vertex of X that each of V is, -1 for the centre of a fan
     for most in [MOST * n_coarse] * _CUTS + [np.inf]:
-        graph = mesh_graph(V, F)
+        graph = voronoi.mesh_graph(V, F)
         centre = origin < 0
         n_first = max(4, round(FIRST * n_coarse))
         first = sample_surface(V, F, graph.G, graph.E[graph.is_open], centre, n_first, seed)
-        start = voronoi_cells(graph.G, first)
-        state, rounds, faulty = refine(graph, start, most, centre)
+        start = voronoi.voronoi_cells(graph.G, first)
+        state, rounds, faulty = voronoi.refine(graph, start, most, centre)
         if not faulty:
             break
-        region = thin_regions(graph, start)
+        region = voronoi.thin_regions(graph, start)
         crumb = triangle_areas(V, F).sum() / n_coarse  # the area of a cell
-        V, F, came_from = cut_handles(V, F, between_rims(graph.G, F, region), crumb)
+        V, F, came_from = voronoi.cut_handles(V, F, voronoi.between_rims(graph.G, F, region), crumb)
         origin = np.where(came_from >= 0, origin[came_from], -1)
     cell = np.full(len(X), -1)
     kept = np.flatnonzero(origin >= 0)
@@ -181,12 +160,12 @@ def _coarse_surface(X, T, n_coarse, seed=0):
     }
     if attrs["vertices_cut"]:
         cell = cell[_nearest_along_edges(X, T, np.flatnonzero(cell >= 0))]
-    return V[state.sample], dual(F, state.cell), origin[state.sample], cell, attrs
+    return V[state.sample], voronoi.dual(F, state.cell), origin[state.sample], cell, attrs
 
 
 def _nearest_along_edges(X, T, among):
     """The vertex of `among` that is nearest to each vertex along edges ``(n,)``."""
-    G = edge_graph(X, edges(T))
+    G = surface.edge_graph(X, surface.edges(T))
     return dijkstra(G, indices=among, min_only=True, return_predecessors=True)[2]
 
 
@@ -245,11 +224,11 @@ def _nearest_with_normal(X, T, V, F):
 
 def topology(T: Array) -> dict[str, int]:
     """Euler characteristic, number of boundary loops, and of edges with three or more triangles."""
-    E, _, count = unique_edges(T)
+    E, _, count = surface.unique_edges(T)
     rim, vertex = np.unique(E[count == 1], return_inverse=True)
-    loop = components(vertex.reshape(-1, 2), len(rim))
+    loop = surface.components(vertex.reshape(-1, 2), len(rim))
     return {
-        "euler_characteristic": euler_characteristic(T, E),
+        "euler_characteristic": surface.euler_characteristic(T, E),
         "boundary_loops": int(loop.max(initial=-1) + 1),
         "nonmanifold_edges": int((count > 2).sum()),
     }
@@ -269,7 +248,7 @@ def check_clean(X: Array, T: Array) -> dict[str, int]:
             "clean the mesh first"
         )
     counts = topology(T)
-    idle, knots = len(X) - n_used(T), counts["nonmanifold_edges"]
+    idle, knots = len(X) - surface.n_used(T), counts["nonmanifold_edges"]
     if idle or knots:
         raise ValueError(
             "coarsen needs a manifold mesh without idle vertices; "
@@ -351,8 +330,7 @@ def coarsen(
     """
     seed = seed_of(seed, rng)
     require(mesh, "position", "corner_vertex", what="mesh")
-    if int(n_coarse) != n_coarse or n_coarse < 4:
-        raise ValueError(f"n_coarse must be an integer of at least 4, found {n_coarse!r}")
+    check_count("n_coarse", n_coarse, 4)
     before = check_clean(*as_arrays(mesh))
     attrs: dict[str, int | str] = {
         "n_coarse": int(n_coarse),

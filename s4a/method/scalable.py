@@ -26,7 +26,7 @@ from s4a.geometry.voronoi import add_samples, dual, farthest_of_each, voronoi_ce
 from s4a.method.remesh import check_clean, laplacian, sample_surface
 from s4a.method.shape import Basis, Shape
 from s4a.method.spectral import factor, with_constant_first
-from s4a.schema import Array, dataset, in_unit, require, unit_of
+from s4a.schema import Array, check_count, dataset, in_unit, require, unit_of
 
 log = logging.getLogger(__name__)
 
@@ -259,9 +259,8 @@ def reduced(mesh: xr.Dataset, *, n_coarse: int = 6000, k: int = 100, seed: int =
     True
     """
     require(mesh, "position", "corner_vertex", what="mesh")
-    for name, value, least in (("n_coarse", n_coarse, 4), ("k", k, 1)):
-        if int(value) != value or value < least:
-            raise ValueError(f"{name} must be an integer of at least {least}, found {value!r}")
+    check_count("n_coarse", n_coarse, 4)
+    check_count("k", k, 1)
     X, T = as_arrays(mesh)
     check_clean(X, T)
     sample, cell, U = local_space(mesh, n_coarse, seed)

@@ -184,8 +184,7 @@ def spectrum(mesh: xr.Dataset, *, k: int = 100) -> xr.Dataset:
     <Parts ...>
     """
     require(mesh, "vertex_area", "edge_vertex", "cotan_weight", what="mesh")
-    if int(k) != k or k < 1:
-        raise ValueError(f"k must be a positive integer, found {k!r}")
+    check_count("k", k, 1)
     if "edge_mass" in mesh:
         raise ValueError(
             "a low-resolution mesh of s4a.coarsen needed; samples of SCALABLE come with their "

@@ -159,7 +159,7 @@ def test_the_latent_size_is_the_nearest_whole_number_to_its_share(k, expected):
 
 
 def test_starts_that_end_within_a_hundredth_of_each_other_go_on_as_their_mean(surface, monkeypatch):
-    monkeypatch.setattr(elastic, "elastic_rounds", lambda _source, _target, start, **_: start)
+    monkeypatch.setattr(elastic, "elastic_rounds", lambda _source, _target, start, *_, **__: start)
 
     def start(x):
         return np.eye(3), np.array([x, 0.0, 0.0]), np.zeros((1, 3))

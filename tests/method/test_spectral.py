@@ -187,7 +187,7 @@ def test_samples_of_scalable_keep_the_spectrum_that_they_come_with():
 
 @pytest.mark.parametrize("k", [0, -3, 2.5])
 def test_k_out_of_range_is_refused(ellipsoid, k):
-    with pytest.raises(ValueError, match="k must be a positive integer"):
+    with pytest.raises(ValueError, match="k must be an integer of at least 1"):
         spectrum(ellipsoid.drop_vars(["eigenvalue", "eigenfunction"]), k=k)
 
 
