@@ -126,7 +126,7 @@ def module_map(modules):
 LEFT, WIDTH, ROW, COLUMN = 24, 640, 27, 38
 COLORS = (
     "#86654b #4e6e81 #6d7f8a #3d7ea6 #2a9d8f #d1495b #8f5d9c #c77d1e #7a8b3c #b0577b #4c6ef5 "
-    "#5f7d4f #6b6b6b"
+    "#5f7d4f #a0522d #6b6b6b"
 ).split()
 
 

@@ -118,17 +118,8 @@ def map_pairs(
         the step ahead; ``pair_rotation``, ``pair_translation``, the motion of ICP; with landmarks
         ``landmark_of_source(pair, landmark)`` and ``landmark_of_target``.
     """
-<<<<<<< HEAD
-    options: dict[str, Any] = {
-        "k_init": k_init,
-        "init": init,
-        "ahead": ahead,
-        "n_spread": n_spread,
-    }
-=======
     options: dict[str, Any] = {"k_init": k_init, "init": init, "ahead": ahead}
     options["n_spread"] = n_spread
->>>>>>> f1f81baf4f81508fccd087eeea5d3669dd2f0328
     rows: list[tuple[Any, ...]] = []
     for a, b in pairs:
         M, N = bases[a], bases[b]
