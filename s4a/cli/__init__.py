@@ -25,7 +25,8 @@ def parser(only: str | None = None) -> argparse.ArgumentParser:
     )
     top.add_argument("--version", action="version", version=f"s4a {version('s4a')}")
     subparsers = top.add_subparsers(required=True, metavar="command")
-    for name, one in (extensions("s4a.commands") | COMMANDS).items():
+    # those of the core first, and no extension takes their names
+    for name, one in (COMMANDS | extensions("s4a.commands") | COMMANDS).items():
         text = one.run.__doc__
         sub = subparsers.add_parser(name, help=text, description=text)
         sub.set_defaults(function=one.run)
