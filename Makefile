@@ -24,7 +24,7 @@ coverage: $(VENV)/.test
 
 # the quick tests with every direct dependency in the oldest version that pyproject.toml allows, and with the newest of
 # all; PYTHON=... names another Python. Old versions warn of newer ones below them, so that warnings are no errors there
-QUICK := s4a tests/geometry tests/method tests/input/test_files.py tests/study/test_store.py tests/cli
+QUICK := s4a tests/geometry tests/method tests/input/test_mesh_files.py tests/study/test_store.py tests/cli
 test-lowest: $(VENV)-lowest/.ready
 	OMP_NUM_THREADS=1 $(VENV)-lowest/bin/python -m pytest -W default $(QUICK)
 

@@ -171,9 +171,12 @@ def read_part(
     options = Options.from_report(study).changed(given)
     if isinstance(part, str | Path) and not Path(part).exists():
         raise ValueError(f"{shown(part)}: there is no such file")
-    meshes, _ = read_new(part if isinstance(part, str | Path) else {"part": part}, options)
+    meshes, attrs = read_new(part if isinstance(part, str | Path) else {"part": part}, options)
     if len(meshes) != 1:
-        raise ValueError(f"one part needed, found {len(meshes)}: {', '.join(meshes)}")
+        reasons = [f"{name}: {one['reason']}" for name, one in attrs.items() if name not in meshes]
+        raise ValueError(
+            f"one part needed, found {len(meshes)}: {', '.join(meshes)}{'; '.join(reasons)}"
+        )
     (mesh,) = meshes.values()
     return mesh if landmarks is None else with_landmarks(mesh, landmarks)
 

@@ -532,7 +532,7 @@ def _raw_brain(truth, shape, n_vertices=40_000, seed=0, *, rng=None):
     >>> import numpy as np
     >>> import s4a
     >>> truth = s4a.synthetic.plant(2)
-    >>> points, triangles, reference_point = s4a.synthetic.raw_brain(truth, "brain_01", 500)
+    >>> points, triangles, reference_point = _raw_brain(truth, "brain_01", 500)
     >>> len(points) > 500, bool(np.isnan(reference_point).any())
     (True, True)
     """

@@ -64,7 +64,6 @@ def write_page(
     --------
     >>> import tempfile
     >>> from pathlib import Path
-    from typing import Any
     >>> import xarray as xr
     >>> import s4a
     >>> folder = Path(tempfile.mkdtemp())

@@ -155,7 +155,7 @@ PUBLIC = {  # module -> what a lesson may take of it; None: whatever has no unde
     "s4a": {*s4a.__all__, "course", "widgets"},
     "s4a.course": {*course.__all__},
     "s4a.widgets": {*widgets.__all__, "threejs"},
-    "s4a_morphometrics": None,
+    **dict.fromkeys(("s4a_morphometrics", "s4a_morphometrics.synthetic")),
     **{f"s4a.{name}": None for name in ("compare", "metrics", "statistics", "synthetic")},
 }
 
