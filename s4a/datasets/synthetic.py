@@ -531,6 +531,7 @@ def _raw_brain(truth, shape, n_vertices=40_000, seed=0, *, rng=None):
     --------
     >>> import numpy as np
     >>> import s4a
+    >>> from s4a.datasets.synthetic import _raw_brain
     >>> truth = s4a.synthetic.plant(2)
     >>> points, triangles, reference_point = _raw_brain(truth, "brain_01", 500)
     >>> len(points) > 500, bool(np.isnan(reference_point).any())
