@@ -10,7 +10,6 @@ from s4a.show.charts import BLUE, GREY, LOOK, ORANGE
 from s4a.show.draw import SIGNED
 from s4a.show.parts import Parts
 
-GREEN = "#009e73"
 SOFT = {"blue": "#cfe4f2", "orange": "#f7d9c4", "grey": "#eeeeee", "green": "#cdebe0"}
 
 

@@ -18,7 +18,7 @@ OBJ and 29 OFF files as whole ones that are refused here, gives an STL three ver
 and knows neither GIFTI, VTK nor VTP; meshio 5.3 reads 28 PLY, 13 OFF and 5 STL files so, hangs on
 some, refuses OBJ with unused texture coordinates and ends the process on VTK's polygonal data.  Of
 a torus of 100,000 vertices PLY takes 12 ms here, 40 in trimesh and 57 in meshio; OBJ 0.5, 0.3 and
-0.7 s; OFF 0.4, 0.8 and 0.2 s.  nibabel's reader of GIFTI unpacks whatever a file holds.
+0.7 s; OFF 0.4, 0.8 and 0.2 s.  (GIFTI by nibabel was not measured.)
 """
 
 import base64
