@@ -28,6 +28,7 @@ BENCHMARKS = ROOT / "benchmarks"
 TABLES = ROOT / "docs" / "tables"
 PAGES = (
     "README.md",
+    "docs/accuracy.md",
     "docs/claims.md",
     "docs/clusters.md",
     "docs/comparison.md",

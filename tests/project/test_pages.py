@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from paths import DOCS
+from paths import DOCS, ROOT
 
 import s4a
 from s4a.geometry.mesh import as_arrays
@@ -49,6 +49,18 @@ def test_every_cell_of_a_page_runs_and_shows_a_picture(page, tmp_path, monkeypat
             canvas = FigureCanvasAgg(shown)
             canvas.draw()
             assert (np.asarray(canvas.buffer_rgba())[..., :3] < 240).mean() > 0.01, code
+
+
+def test_the_quickstart_of_readme_prints_what_it_shows(tmp_path, monkeypatch, capsys):
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    code, printed = re.search(
+        r"```python\n(.*?)```\n\n```text\n(.*?)```", readme, re.DOTALL
+    ).groups()
+    monkeypatch.chdir(tmp_path)
+    exec(code, {})
+    assert capsys.readouterr().out == printed
+    assert {path.name for path in tmp_path.iterdir()} == {"brains", "larger.ply", "modes.png"}
+    assert len(readme.split()) <= 750
 
 
 @pytest.fixture
