@@ -28,7 +28,6 @@ BENCHMARKS = ROOT / "benchmarks"
 TABLES = ROOT / "docs" / "tables"
 PAGES = (
     "README.md",
-    "docs/accuracy.md",
     "docs/claims.md",
     "docs/clusters.md",
     "docs/comparison.md",
@@ -36,7 +35,7 @@ PAGES = (
     "docs/differences.md",
     "docs/doubtful.md",
     "docs/frontends.md",
-    "docs/howto.md",
+    "docs/howto/options.md",
     "docs/install.md",
     "docs/plausibility.md",
     "paper/paper.md",
