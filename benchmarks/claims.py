@@ -110,7 +110,7 @@ def discretization(given):
         shapes = synthetic.brains(6, n_vertices, 3)
         study = s4a.analyse(shapes, n_coarse=2000, preset="paper", n_jobs=1)
         latent = study["latent"]
-        energy = ", ".join(f"{one:.4f}" for one in latent["distance_to_median"].values)
+        energy = ", ".join(f"{one:.4f}" for one in latent["distance_to_limit"].values)
         say(f"{n_vertices:7} vertices: median {latent.attrs['median']}; {energy}")
 
 

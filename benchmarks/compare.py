@@ -344,8 +344,8 @@ def where(source, seen):
 # first maps and Consistent ZoomOut of Table 2
 FIRST = {
     "paper": ("landmarks (the paper)", {"preset": "paper"}),
-    "landmarks": ("landmarks, our rounds", {"init": "landmarks"}),
-    "nearest": ("nearest neighbours, our rounds", {}),
+    "landmarks": ("landmarks, our iterations", {"init": "landmarks"}),
+    "nearest": ("nearest neighbours, our iterations", {}),
 }
 
 
@@ -365,7 +365,7 @@ def table_2(given=None, first=tuple(FIRST)):
                 gap = f"{100 * chamfer.sel(way=way, how=how).item():.4f}"
                 shape = found["median_shape"].sel(way=way).item()
                 all_rows.append([way, what, how, gap, *cells, shape])
-            distance = found["distance_to_median"].sel(way=way).values
+            distance = found["distance_to_limit"].sel(way=way).values
             distances.append([way, what, *(f"{d:.4f}" for d in distance)])
         say(f"\nfirst maps: {what}")
         verdict_2(found)

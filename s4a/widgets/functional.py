@@ -47,7 +47,7 @@ class FunctionalMap(Panel):
         """Choices, matrix and the two surfaces."""
         network = self.study["network"].dataset
         self.source, self.target = (network[key].values.astype(str) for key in ("source", "target"))
-        first, last = network.sizes["mode_source_initial"], network.sizes["mode_source"]
+        first, last = network.sizes["eigenpair_source_initial"], network.sizes["eigenpair_source"]
         ends = zip(self.source, self.target, strict=True)
         options = [(f"{source} → {target}", i) for i, (source, target) in enumerate(ends)]
         self.choice = dropdown("pair", "the shape from which the map goes, and to which", options)

@@ -6,7 +6,7 @@ from small import OPTIONS
 
 import s4a
 from s4a.geometry.mesh import as_arrays, as_dataset
-from s4a.method.lift import low_resolution
+from s4a.method.refined_eigenfunctions import low_resolution
 from s4a.method.shape import Shape, common_fields
 
 
