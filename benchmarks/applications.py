@@ -91,7 +91,9 @@ def brains(folder):
         "nearest vertex after ICP": labels["fsa5"][cKDTree(X @ R.T + t).query(Y)[1]],
     }
     for both in (False, True):
-        study = transfer.register_pairs(meshes["fsa5"], {"conte69": meshes["conte69"]}, both=both)
+        study = transfer.register_pairs(
+            meshes["fsa5"], {"conte69": meshes["conte69"]}, bidirectional=both
+        )
         name = "S4A, matched both ways" if both else "S4A, one way"
         found[name] = s4a.transfer_labels(study, labels["fsa5"])["conte69"]["label"].values
     for name, label in found.items():

@@ -7,7 +7,7 @@ correlation of confidence and error, and the share of the worst tenth that is am
 tenth (0.1 by chance); and in bins of confidence, the share that is right.  Bodies, and cats, share
 their connectivity; nothing here looks at that.
 
-``confidence.py failures`` registers random pairs of bodies without the search for first maps, of
+``confidence.py failures`` registers random pairs of bodies without the search for initial maps, of
 which many end with limbs exchanged, and says how well these are told by their mean confidence, by
 the way there and back, and by registration_error and distortion, which a study looks at, too.
 """

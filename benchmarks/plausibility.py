@@ -1,10 +1,10 @@
-"""What is told of an odd shape, and what cannot be: oddities simulated in collections, one at a time.
+"""Which unusual shapes are flagged: oddities simulated in collections, one at a time.
 
 Synthetic brains, and real collections where the shared data are beside the checkout; the first
 four, on which the thresholds were chosen, and others. ``plausibility.py [COLLECTION ...]``.
 
 ``plausibility.py registrations [COLLECTION ...]`` registers shapes of known correspondence, one
-template to the others of its collection, once as by default and once from first maps of 10
+template to the others of its collection, once as by default and once from initial maps of 10
 landmarks, which fail in far poses; and counts of which failed registrations a run would tell.
 
 ``plausibility.py simulated [COLLECTION ...]`` begins one registration at a time at a wrong
@@ -177,7 +177,7 @@ class Collection:
                 self.seconds += time.process_time() - start
                 self.pairs[id(a), id(b)] = found, a, b  # held, so that their ids stay theirs
             seen.append(self.pairs[id(a), id(b)][0].assign_coords(reference=[other]))
-        both = ["fit", "fit_mirrored", "hand"]
+        both = ["fit", "fit_mirrored", "chirality"]
         return (
             seen[0]
             .drop_dims("reference")
@@ -260,12 +260,14 @@ def error_of(template, shape, match, known):
 
 
 def registered(name, folder, at, way):
-    """Of every other shape of a collection: error, registration_error, mean |distortion|, what is told."""
+    """For each other shape: error, registration error, mean |distortion| and the flags."""
     part, numbers, _ = PAIRS[name]
     files = sorted((folder / part).glob("*.ply"))
     shapes = {files[i].stem: s4a.read_shape(files[i]) for i in numbers}
     template = shapes.pop(files[numbers[at]].stem)
-    study = s4a.register_pairs(template, shapes, both=False, n_coarse=3000, n_jobs=1, **WAYS[way])
+    study = s4a.register_pairs(
+        template, shapes, bidirectional=False, n_coarse=3000, n_jobs=1, **WAYS[way]
+    )
     found = study["registration"].to_dataset().load()
     registration_error = dict(
         zip(shapes, found["registration_error"].sel(shape=list(shapes)).values, strict=True)
@@ -303,7 +305,7 @@ def registrations(names):
     tuned = [one for (name, _), of in table.items() if name in PAIRS_CHOSEN_ON for one in of]
     others = [one for (name, _), of in table.items() if name not in PAIRS_CHOSEN_ON for one in of]
     table["all on which thresholds were chosen", ""], table["all others", ""] = tuned, others
-    head = ["collection", "first maps", "pairs", f"failed, over {FAILED:.0f} %"]
+    head = ["collection", "initial maps", "pairs", f"failed, over {FAILED:.0f} %"]
     head += ["of these flagged", "only warned of", f"right, under {RIGHT:.0f} %"]
     head += ["of these flagged", "only warned of", "between, told"]
     sys.stdout.write(f"\n| {' | '.join(head)} |\n{'|---' * len(head)}|\n")
@@ -319,7 +321,7 @@ def registrations(names):
 
 
 def turned(signs):
-    """In place of :func:`s4a.method.initial_map.transform_onto`: its transform, then a wrong one."""
+    """Replace :func:`s4a.method.initial_map.transform_onto`: first as usual, then wrong."""
     usual = pair.transform_onto
 
     def transform(source, target):
@@ -341,9 +343,9 @@ def judged(name, at, meshes, shapes):
     template, *others = [list(shapes)[at], *(n for i, n in enumerate(shapes) if i != at)]
     error, registration_error, distortion = {}, {}, {}
     for way in ("as by default", *TURNS):
-        # a first map of landmarks, as the dense one is mended by a search
+        # a initial map of landmarks, as the dense one is mended by a search
         more = {"init": "landmarks"} if way in TURNS else {}
-        options = Options(both=False, n_coarse=3000, **more)
+        options = Options(bidirectional=False, n_coarse=3000, **more)
         for other in others:
             usual = pair.transform_onto
             try:
@@ -411,7 +413,7 @@ def simulated(names):
         parts = sorted({PLANTED_IN[name][0] for name in names})
         command = [sys.executable, DATA / "unpack.py", folder, *parts]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-        options = Options(both=False, n_coarse=3000)
+        options = Options(bidirectional=False, n_coarse=3000)
         for name in names:
             part, numbers, places = PLANTED_IN[name]
             files = sorted((Path(folder) / part).glob("*.ply"))

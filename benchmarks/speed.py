@@ -353,7 +353,7 @@ def stages(folder):
     landmark = farthest_points(a.X @ R.T + t, 10)
     near = nearest_rows(a.X[landmark] @ R.T + t, b.X)
     C, _ = beside(
-        f"first map, k = {K_INIT}",
+        f"initial map, k = {K_INIT}",
         ("s4a: dense, one round more", our_first_map, a, b, (R, t)),
         ("pyFM fit, WKS + 10 landmarks", other_first_map, *few, np.c_[landmark, near]),
     )
@@ -560,12 +560,12 @@ def growth(folder):
 def seconds_of_pairs(coarse, n_pairs, options):
     """CPU seconds of the stages that look at pairs, on low-resolution meshes that are there."""
     begin = time.process_time()
-    first = s4a.build_network(coarse, n_pairs=n_pairs, **options.of("first maps"))
+    first = s4a.build_network(coarse, n_pairs=n_pairs, **options.of("initial maps"))
     between = time.process_time()
-    names = ("weights", "n_samples", "wide")
+    names = ("weights", "n_samples", "dense_iterations")
     s4a.refine_network(coarse, first, k=K, **{name: getattr(options, name) for name in names})
     return {
-        "alignment and first maps": between - begin,
+        "alignment and initial maps": between - begin,
         "Consistent ZoomOut and median": time.process_time() - between,
     }
 
@@ -672,7 +672,9 @@ def study_errors(study, image):
     far = ["", ""]
     if image is not None:
         error = accuracy.accuracy(study, image)["error"].mean("shape")
-        far = [f"{100 * error.sel(way=way):.3f}" for way in (accuracy.MATCH, accuracy.SURFACE)]
+        far = [
+            f"{100 * error.sel(algorithm=way):.3f}" for way in (accuracy.MATCH, accuracy.SURFACE)
+        ]
     trip = data["round_trip"].values.mean(1).sum() / (data.sizes["shape"] - 1)
     return [*far, f"{100 * np.mean(chamfer):.4f}", f"{100 * trip:.3f}"]
 

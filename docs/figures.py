@@ -153,7 +153,7 @@ def pipeline(study):
 
 
 def swapped(vertices=6000, n_coarse=1500, stretch=1.2):
-    """Figure 2: a first map, and eigenfunctions that change places."""
+    """Figure 2: a initial map, and eigenfunctions that change places."""
     brains = s4a.synthetic.brains(2, vertices)
     source, target = (brains[f"original/brain_0{i}"].to_dataset() for i in (1, 2))
     high = target.assign(position=target["position"] * [1, 1, stretch])
@@ -194,10 +194,11 @@ def seconds(vertices=PAIR):
     brains = s4a.synthetic.brains(2, vertices, seed=0)
     source, target = (brains[f"original/brain_0{i}"].to_dataset() for i in (1, 2))
     found = s4a.compare.pairs(source, {"brain_02": target})["block_seconds"].isel(pair=0)
-    found = found.drop_sel(way="registered surface")  # the same run as "registered"
+    found = found.drop_sel(algorithm="registered surface")  # the same run as "registered"
     blocks = [str(name) for name in found["block"].values]
     return write(
-        charts.stacked([str(w) for w in found["way"].values], blocks, found.values), "figure_3"
+        charts.stacked([str(w) for w in found["algorithm"].values], blocks, found.values),
+        "figure_3",
     )
 
 

@@ -74,9 +74,9 @@ local_sample | entry | 1 | sample that it lives around: column of that entry
 local_weight | entry | 1 | its value there: the entry, rows of U sum to 1
 edge_mass | edge | L2 | integral of the product of two local functions: entry of U^T A U, whose rows
     sum to the vertex areas
-eigenvalue | mode | unit area | eigenvalue of the Laplace-Beltrami operator
-eigenfunction | vertex mode | unit area | eigenfunction, orthonormal in the vertex areas
-refined_eigenfunction | original_vertex mode | unit area | eigenfunction of the original mesh,
+eigenvalue | eigenpair | unit area | eigenvalue of the Laplace-Beltrami operator
+eigenfunction | vertex eigenpair | unit area | eigenfunction, orthonormal in the vertex areas
+refined_eigenfunction | original_vertex eigenpair | unit area | eigenfunction of the original mesh,
     nearly, by a step of inverse iteration
 # one pair (4.1)
 match | vertex | 1 | on each vertex of the target, the matched vertex of the source
@@ -109,7 +109,7 @@ fmap_fitted | pair eigenpair_target_initial eigenpair_source_initial | 1 | that 
 pair_rotation | pair xyz xyz_2 | 1 | rotation R of ICP, source to target, between their frames (4.1,
     step 2)
 pair_translation | pair xyz | share | translation t of ICP, source to target
-landmark_of_source | pair landmark | 1 | landmarks of the first map: coarse vertices of the source
+landmark_of_source | pair landmark | 1 | landmarks of the initial map: coarse vertices of the source
     (4.1, step 3)
 landmark_of_target | pair landmark | 1 | the coarse vertices of the target that are nearest to them
     after ICP
@@ -119,7 +119,7 @@ cycle_error | pair | 1 | mean |C_cycle - I|_F over the 3-cycles through the pair
     modes, by sqrt(k_init)
 cycle_error_initial | pair | 1 | the same before Consistent ZoomOut
 # latent basis and median (3.4 - 3.6, eq. 3 and 5)
-latent_basis | shape mode latent | 1 | consistent latent basis Y of each shape
+latent_basis | shape eigenpair latent | 1 | consistent latent basis Y of each shape
 latent_eigenvalue | latent | unit area | eigenvalue of the latent (limit) shape
 area_difference | shape latent latent_2 | 1 | area-based shape difference D = Y^T Y
 conformal_difference | shape latent latent_2 | 1 | conformal shape difference
@@ -140,7 +140,7 @@ registered_match_low | shape low_vertex | 1 | on each coarse vertex of the templ
     coarse vertex of the shape (eq. 6)
 displacement_low | shape low_vertex xyz | L | matched vertex of the aligned coarse shape minus
     coarse template (eq. 6)
-displacement_coefficient | shape mode xyz | L | coefficients of the displacement in the functions U
+displacement_coefficient | shape eigenpair xyz | L | coefficients of the displacement in the functions U
     Phi of the template (6.1)
 icp_rotation | shape xyz xyz_2 | 1 | rotation R of ICP, shape to template or reference, between
     their frames (4.1, step 2)
@@ -150,7 +150,7 @@ confidence | shape vertex | 1 | share of such vertices that are within 1 % of sq
 round_trip | shape vertex | share | cycle error: way from the vertex to the shape and back
 distortion | shape vertex | 1 | log of the vertex's share of the area, on the shape over on the
     template
-method | shape | 1 | start of the match that was kept
+initialisation | shape | 1 | start of the match that was kept
 registration_error | shape | share | round trip and gaps between the surfaces, mean
 template_triangle | original_vertex | 1 | template triangle on which the vertex of the shape lies
 template_barycentric | original_vertex corner | 1 | barycentric weights in that triangle
@@ -225,25 +225,25 @@ noise_width | shape noise_region | mm | their widths
 noise_translation | shape noise_region xyz | mm | their translations
 landmark_reference | landmark xyz | 1 | point of the unit sphere that the landmark is the image of
 # the comparison (Table 1, Fig. 3, Table 2)
-way_match | way vertex | 1 | on each vertex of the target, the vertex of the source that the method
+algorithm_match | algorithm vertex | 1 | on each vertex of the target, the vertex of the source that the method
     matches
-way_reverse | way source_vertex | 1 | on each vertex of the source, the vertex of the target that
+algorithm_reverse | algorithm source_vertex | 1 | on each vertex of the source, the vertex of the target that
     the method matches
-way_image | way vertex xyz | L | where the method puts a vertex of the target
-way_area | way vertex | 1 | log of the vertex's share of the area after and before the method moves
+algorithm_image | algorithm vertex xyz | L | where the method puts a vertex of the target
+algorithm_area_change | algorithm vertex | 1 | log of the vertex's share of the area after and before the method moves
     it
-way_fmap | way eigenpair_target eigenpair_source | 1 | refined functional map of the method, source functions
+algorithm_fmap | algorithm eigenpair_target eigenpair_source | 1 | refined functional map of the method, source functions
     to target functions
-way_fmap_initial | way eigenpair_target_initial eigenpair_source_initial | 1 | first functional map of the
+algorithm_fmap_initial | algorithm eigenpair_target_initial eigenpair_source_initial | 1 | initial functional map of the
     method
-way_error | way vertex | share | distance in a straight line of image and true position
+algorithm_error | algorithm vertex | share | distance in a straight line of image and true position
 true_position | vertex xyz | L | where the vertex truly lies on the source
 true_match | vertex | 1 | vertex of the source nearest to there, -1 where unknown
-block_seconds | way pair block | s | CPU time of the block, of one core
-collection_chamfer | way how shape | share | Chamfer distance of the shape and the image of the
+block_seconds | algorithm pair block | s | CPU time of the block, of one core
+collection_chamfer | algorithm dense_match shape | share | Chamfer distance of the shape and the image of the
     template (eq. 9)
-collection_seconds | way how block | s | CPU time of the block for the whole collection, of one core
-median_shape | way | 1 | median shape (eq. 5)
+collection_seconds | algorithm dense_match block | s | CPU time of the block for the whole collection, of one core
+median_shape | algorithm | 1 | median shape (eq. 5)
 # what holds of a study's files
 state | file | 1 | whole, damaged, missing, stale, left over or foreign, see s4a.verify
 fault | file | 1 | what is wrong with the file; empty where nothing is
@@ -256,7 +256,7 @@ descriptor_asymmetry | point | 1 | how far the shape's mirror image lies above t
 moment | axis | 1 | share of the second moment along each principal axis
 fit | reference | 1 | residual of ICP onto the reference, both of unit root mean square radius
 fit_mirrored | reference | 1 | the same of the shape's mirror image
-hand | reference | 1 | positive where the shape is of the reference's hand, negative where its
+chirality | reference | 1 | positive where the shape is of the reference's hand, negative where its
     mirror image is
 mean_chirality | shape | 1 | mean of hand beside the references: positive as most shapes, negative as
     their mirror images
@@ -329,11 +329,11 @@ TABLE = Table(ROWS)
 # variables of indices: the dim that they point into; -1 points nowhere
 _OF_DIM = {
     "vertex": "corner_vertex edge_vertex vertex_of_file coarse_vertex guide_vertex "
-    "sample_cell local_sample way_reverse",
+    "sample_cell local_sample algorithm_reverse",
     "file_vertex_index": "file_vertex",
     "original_vertex": "sample_vertex local_vertex registered_match",
     "triangle": "template_triangle",
-    "source_vertex": "way_match true_match",
+    "source_vertex": "algorithm_match true_match",
 }
 POINTS_INTO = {name: dim for dim, names in _OF_DIM.items() for name in names.split()}
 NOWHERE = {"vertex_of_file", "sample_vertex", "true_match"}
@@ -360,10 +360,10 @@ HOLDS = {
         "",
         SEEN,
     ),
-    "network/look": ("moment fit fit_mirrored hand", "", SEEN),
-    "network/hands": ("shape mean_chirality reflected", "told", ""),
-    "network/transform": ("rotation translation", "reference", ""),
-    "network/first": ("source target fmap_initial", "", ""),
+    "network/comparison": ("moment fit fit_mirrored chirality", "", SEEN),
+    "network/chirality": ("shape mean_chirality reflected", "told", ""),
+    "network/alignment": ("rotation translation", "reference", ""),
+    "network/initial": ("source target fmap_initial", "", ""),
     "network": ("source target fmap_initial fmap weight cycle_error", "", ""),
     "latent": (
         "shape latent_basis latent_eigenvalue area_difference conformal_difference "
@@ -381,7 +381,7 @@ HOLDS = {
     "registration/shape": (
         "registered_match displacement rotation translation scale confidence template_triangle "
         "template_barycentric",
-        "method",
+        "initialisation",
         "score",
     ),
     "pca": (

@@ -2,7 +2,7 @@
 
 Every method works on a :class:`s4a.method.shape.Shape`: ZO and FMAP+ZO on one whose functions are
 the eigenfunctions of the dense mesh, SCALABLE on that of :mod:`s4a.method.scalable`, RE-MATCH on
-the coarse mesh with U Phi, as in the paper.  Ours are RE-MATCH lifted, with functions of
+the coarse mesh with U Phi, as in the paper.  Ours are RE-MATCH refined, with functions of
 :mod:`s4a.method.refined_eigenfunctions`, and registered, which is RE-MATCH and the registration of
 :mod:`s4a.method.register` after it; its image are the matched vertices, as of all, and that of
 registered surface is the smooth surface on which they were looked up, which lies between them.
@@ -32,7 +32,7 @@ from s4a.method.nearest import (
     nearest_in_cells,
     nearest_rows,
 )
-from s4a.method.refined_eigenfunctions import SPARE, lifted
+from s4a.method.refined_eigenfunctions import SPARE, with_refined_eigenfunctions
 from s4a.method.register import find_candidates, refine_at_full_resolution, register_surface
 from s4a.method.remesh import coarsen, laplacian
 from s4a.method.scalable import local_space, spectral_space
@@ -40,15 +40,15 @@ from s4a.method.shape import Basis, Shape
 from s4a.method.spectral import eigenpairs, spectrum
 
 PAPER_METHODS = ("kNN", "ZO", "FMAP+ZO", "SCALABLE", "RE-MATCH")
-OUR_METHODS = ("RE-MATCH lifted", "registered", "registered surface")
+OUR_METHODS = ("RE-MATCH refined", "registered", "registered surface")
 METHODS = (*PAPER_METHODS, *OUR_METHODS)
 # the shape of Spaces whose functions a method compares; registration begins with RE-MATCH's match
 KINDS = {"ZO": "dense", "FMAP+ZO": "dense", "SCALABLE": "local", "RE-MATCH": "coarse"}
-KINDS |= {"RE-MATCH lifted": "lifted", "registered": "coarse", "registered surface": "coarse"}
+KINDS |= {"RE-MATCH refined": "lifted", "registered": "coarse", "registered surface": "coarse"}
 # of Fig. 3
 BLOCKS = ("load and clean", "align", "sample", "basis", "map", "refine", "full resolution")
 N_SAMPLES = 3000  # points of each shape by which it is aligned, and that group dense searches
-INITS = ("landmarks", "descriptors")  # fits of first maps
+INITS = ("landmarks", "descriptors")  # fits of initial maps
 
 Matches = tuple[np.ndarray, np.ndarray]
 
@@ -136,12 +136,14 @@ class Spaces:
         return Shape(self.mesh, self.clock("coarse basis", spectrum, self.sampled, k=self.k))
 
     @cached_property
-    def lifted(self) -> Shape:
+    def with_refined_eigenfunctions(self) -> Shape:
         """The low-resolution mesh with functions that were brought to all vertices and back."""
         return Shape(self.mesh, self.clock("lifted basis", self._lifted))
 
     def _lifted(self):
-        return lifted(self.mesh, spectrum(self.sampled, k=self.k + SPARE), self.k)
+        return with_refined_eigenfunctions(
+            self.mesh, spectrum(self.sampled, k=self.k + SPARE), self.k
+        )
 
 
 def functions_at_all_vertices(shape: Shape, C: np.ndarray | None = None) -> np.ndarray:
@@ -169,7 +171,7 @@ def at_low_resolution(M: Shape, N: Shape, landmarks: Matches) -> list[np.ndarray
 
 
 def fit_map(M: Shape, N: Shape, landmarks: Matches, k: int) -> np.ndarray:
-    """First map ``(k, k)`` from landmarks and wave kernels, see `fmap.fmap_from_descriptors`."""
+    """Initial map ``(k, k)`` from landmarks and wave kernels, see `fmap.fmap_from_descriptors`."""
     at_source, at_target = at_low_resolution(M, N, landmarks)
     bases = [replace(shape.low, area=shape.low.area / shape.low.area.sum()) for shape in (M, N)]
     return fmap.fmap_from_descriptors(*bases, k=k, landmarks=(at_source, at_target), oriented=0)
@@ -182,7 +184,7 @@ class Outcome(NamedTuple):
     image: np.ndarray | None  # (n_target, 3), where the method gives more than vertices
     reverse: Any  # (n_source,), the match the other way
     seconds: dict[str, float]
-    first: np.ndarray | None = None  # (k_init, k_init), the first map
+    first: np.ndarray | None = None  # (k_init, k_init), the initial map
     fmap: Any = None  # (k, k), the refined one
     functions: Any = None  # at all vertices, of source and target
     low_match: Any = None  # (n_low_target,)
@@ -200,9 +202,9 @@ class Pair:
     k_init, k, step : int
         Of the maps.
     full_resolution_iterations : int
-        Last iterations of RE-MATCH lifted that look among all vertices.
+        Last iterations of RE-MATCH refined that look among all vertices.
     init : {"landmarks", "descriptors"}
-        First maps as :func:`s4a.method.fmap.fmap_from_landmarks`, or from wave kernels of the
+        Initial maps as :func:`s4a.method.fmap.fmap_from_landmarks`, or from wave kernels of the
         shapes and around landmarks.
     """
 
@@ -276,7 +278,7 @@ class Pair:
     def match_spectrally(
         self, method: str, transform: RigidTransform, landmarks: Matches
     ) -> Outcome:
-        """A method of functions: first map, ZoomOut and match at full resolution."""
+        """A method of functions: initial map, ZoomOut and match at full resolution."""
         if method not in self.spectral:
             self.spectral[method] = self._match_spectrally(method, transform, landmarks)
         return self.spectral[method]

@@ -37,7 +37,7 @@ class Cloud(NamedTuple):
 def rigid_transform(
     P: Array, Q: Array, weight: Array | None = None, *, scale: bool = False
 ) -> tuple[Array, Array, float]:
-    """The transform s R x + t that brings points P closest to Q in the (weighted) least-squares sense.
+    """Return s R x + t that maps points P to Q with least (weighted) squared error.
 
     Kabsch's solution by the SVD of the cross-covariance; with ``scale=True`` Umeyama's (1991).
 
@@ -299,7 +299,7 @@ def _try_tilts(source: Cloud, target: Cloud, start: End) -> End:
 
 
 def align(X: Array, area: Array, Y: Array, area_y: Array) -> End:
-    """Rigid transform of X onto Y by ICP, from the pose as given and from the turns of principal axes.
+    """Rigid transform of X onto Y by ICP from several initial rotations.
 
     The starts are compared by pairing ``N_POINTS`` spread vertices of each shape.  Two go on,
     tilted: of the four turns that align principal axes, the best that ends within 90 degrees of

@@ -296,7 +296,7 @@ def thin_regions(graph: _MeshGraph, state: Voronoi) -> Array:
 
 
 def between_boundaries(G: sp.csr_matrix, T: Array, region: Array) -> Array:
-    """Triangles half-way between the boundaries of a region ``(m,)``: without them, a tube is cut."""
+    """Triangles ``(m,)`` half-way between the boundaries of a region, where a tube is cut."""
     triangle, vertex, boundary, _ = boundaries(T, region)
     boundary_of = np.full(len(region), -1)
     boundary_of[vertex[::-1]] = boundary[::-1]  # a vertex in several boundaries goes to the first

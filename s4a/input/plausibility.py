@@ -40,7 +40,7 @@ _HALF_TURNS = [np.diag(d) for d in itertools.product((1.0, -1.0), repeat=3) if n
 
 
 def describe(mesh: xr.Dataset, *, intersections: bool = True) -> xr.Dataset:
-    """A shape on its own: a descriptor of some vertices, and numbers that no rigid transform changes.
+    """Descriptor of one shape: some of its vertices and rigidly invariant numbers.
 
     Parameters
     ----------
@@ -256,7 +256,7 @@ def compare(name: str, descriptor: xr.Dataset, references: dict[str, xr.Dataset]
     own = descriptor.drop_vars(
         [str(v) for v in descriptor.data_vars if str(v).startswith("sketch_")]
     )
-    beside = dataset(fit=fit, fit_mirrored=fit_mirrored, hand=hand)
+    beside = dataset(fit=fit, fit_mirrored=fit_mirrored, chirality=hand)
     return own.assign(beside.variables).assign_coords(reference=list(references))
 
 

@@ -34,7 +34,7 @@ _FOUND = 0.07  # score at which the search ends; of wrong maps between bodies it
 
 
 class _InitialMap(NamedTuple):
-    """A first map of a directed pair, and what it was made of."""
+    """A initial map of a directed pair, and what it was made of."""
 
     name: str  # "dense", "landmarks", or of far poses that of best_initial_map
     C: Array  # (k_init, k_init)
@@ -104,7 +104,7 @@ def map_after_alignment(
     *,
     k_init: int = 20,
     init: str = "dense",
-    ahead: bool = True,
+    initial_refinement: bool = True,
     n_samples: int = 0,
 ) -> _InitialMap:
     """First functional map of a directed pair (4.1, steps 3 and 4).
@@ -117,7 +117,7 @@ def map_after_alignment(
         Rigid transform of the source onto the target (step 2).
     init : {"dense", "landmarks"}
         From all vertices' nearest neighbours, or the paper's fit on 10 farthest points.
-    ahead : bool
+    initial_refinement : bool
         Whether one step of ZoomOut is done ahead (4.2).
     n_samples : int
         Of that step, see :func:`s4a.method.fmap.refine_once`.
@@ -127,7 +127,7 @@ def map_after_alignment(
     fitted, landmarks = fit_after_alignment(
         source, target, transform, k_init=k_init, init=init, near=near
     )
-    C = fmap.refine_once(source, target, fitted, n_samples) if ahead else fitted
+    C = fmap.refine_once(source, target, fitted, n_samples) if initial_refinement else fitted
     return _InitialMap(init, C, fitted, near, landmarks)
 
 
@@ -143,7 +143,7 @@ def stretch(target: Basis, X: Array) -> float:
 def best_initial_map(
     source: Basis, target: Basis, C: Array, fitted: Array | None = None, *, search: bool = False
 ) -> tuple[str, Array, Array]:
-    """The best of a first map and of those from heat and from wave kernels, which no pose changes.
+    """The best of a initial map and of those from heat and from wave kernels, which no pose changes.
 
     Where both have landmarks, also of one from wave kernels and these.
 
@@ -159,7 +159,7 @@ def best_initial_map(
     source, target : Basis
         At low resolution.
     C : float ndarray (k_init, k_init)
-        First map from ICP.
+        Initial map from ICP.
     fitted : float ndarray (k_init, k_init), optional
         That map before its step of ZoomOut; C where there was none.
     search : bool
@@ -196,7 +196,7 @@ def best_initial_map(
 
 
 def _map_from_landmarks(source, target, k):
-    """Name, first map and its fit ``(k, k)`` of wave kernels and landmarks, if both have three."""
+    """Name, initial map and its fit ``(k, k)`` of wave kernels and landmarks, if both have three."""
     landmarks = corresponding_landmarks(source, target)
     if len(landmarks[0]) < 3:
         return []
@@ -207,7 +207,7 @@ def _map_from_landmarks(source, target, k):
 def maps_from_signatures(
     source: Basis, target: Basis, k: int, search: bool
 ) -> Iterator[tuple[str, Array, Array]]:
-    """Name, first map and its fit ``(k, k)`` of heat and of wave kernels, and of a search more.
+    """Name, initial map and its fit ``(k, k)`` of heat and of wave kernels, and of a search more.
 
     The search begins with wave kernels and extremities as landmarks.
     """

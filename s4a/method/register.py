@@ -141,7 +141,7 @@ Functions = tuple[Array, Array]  # of source and target, rows of which are compa
 
 
 def match_low(
-    source: Shape, target: Shape, bases: Functions, *, how: str = "ours"
+    source: Shape, target: Shape, bases: Functions, *, dense_match: str = "latent"
 ) -> tuple[Array, Functions]:
     """Match at low resolution (eq. 6), and the functions whose rows full resolution compares.
 
@@ -150,7 +150,7 @@ def match_low(
     source, target : Shape
     bases : tuple of float ndarray (k, m)
         Consistent latent bases Y of source and target.
-    how : {"ours", "standard"}
+    dense_match : {"latent", "fmap"}
         Functions Phi Y for eq. 7, or those of the functional map of the match for eq. 4.
 
     Returns
@@ -159,12 +159,12 @@ def match_low(
     functions : tuple of float ndarray (n_coarse, m)
         At all vertices where they are lifted.
     """
-    check("how", how)
+    check("dense_match", dense_match)
     Y_source, Y_target = bases  # (k, m) each
     k = len(Y_source)
     Phi, Psi = source.low.Phi[:, :k], target.low.Phi[:, :k]
     match = nearest_rows(Psi @ Y_target, Phi @ Y_source)  # eq. 6
-    if how == "ours":
+    if dense_match == "latent":
         return match, latent_functions(source, target, bases)
     C = fmap_from_match(Phi, Psi, target.low.mass, match)  # of eq. 3, for eq. 4
     return match, (source.functions(C.T), target.functions(np.eye(k)))
@@ -229,7 +229,7 @@ def from_latent(
     bases: Functions,
     transform: RigidTransform,
     *,
-    how: str = "ours",
+    dense_match: str = "latent",
     **options: Any,
 ) -> xr.Dataset:
     """One shape registered by the latent bases of a network (eq. 6, 7 and 8).
@@ -246,7 +246,7 @@ def from_latent(
         Their consistent latent bases Y.
     transform : tuple (R, t)
         Rigid transform of the shape onto the template (4.1, step 2), between their frames.
-    how : {"ours", "standard"}
+    dense_match : {"latent", "fmap"}
         Eq. 7, or eq. 3 and 4.
     **options
         Of :func:`register`.
@@ -256,7 +256,7 @@ def from_latent(
     xarray.Dataset
         As of :func:`register`.
     """
-    match, functions = match_low(source, target, bases, how=how)
+    match, functions = match_low(source, target, bases, dense_match=dense_match)
     near = nearest_after_alignment(source.low, target.low, transform)
     starts = {"intrinsic": match, "icp": near}
     return register(source, target, starts, functions, transform, k=len(bases[0]), **options)
@@ -271,8 +271,8 @@ def register(
     *,
     k: int = 100,
     refine: str = "elastic",
-    scale: bool = False,
-    parts: bool = True,
+    remove_size: bool = False,
+    articulated: bool = True,
     alignment: str = "fitted",
 ) -> xr.Dataset:
     """The registration of one shape: match, displacement, transform, confidence and the way back.
@@ -290,13 +290,13 @@ def register(
         Rigid transform of the shape onto the template found by ICP, between their frames.
     k : int
         Functions in which the displacement lives.
-    refine : {"elastic", "joint", "intrinsic"}
+    refine : {"elastic", "spectral_icp", "intrinsic"}
         Elastic and local iterations, after joint ones in far poses; joint iterations; or the
         spectral match alone.  After local iterations the displacement is not only in the first k
         functions; ``displacement_coefficient`` is its part there.
-    scale : bool
+    remove_size : bool
         Whether size is taken out of the displacement.
-    parts : bool
+    articulated : bool
         Whether in far poses joint iterations may turn the parts of a shape on their own.
     alignment : {"fitted", "icp"}
         The displacement is measured after the transform that fits the registered surface best, or
@@ -308,7 +308,7 @@ def register(
         ``registered_match(vertex)``, ``displacement(vertex, xyz)``, ``displacement_raw``,
         ``registered_match_low(low_vertex)``, the start "intrinsic" (of eq. 6, or of ZoomOut where a
         pair is matched on its own), and ``displacement_low(low_vertex, xyz)`` of it;
-        ``displacement_coefficient(mode, xyz)`` of the displacement in U Phi of the template;
+        ``displacement_coefficient(eigenpair, xyz)`` of the displacement in U Phi of the template;
         ``icp_rotation``, ``icp_translation`` as given; ``rotation``, ``translation``, ``scale``,
         ``confidence(vertex)``, ``round_trip``, ``distortion``,
         ``template_triangle(original_vertex)``, ``template_barycentric``; displacements in the unit
@@ -316,8 +316,12 @@ def register(
         ``score``, its score at full resolution, and ``score_<candidate>`` at low resolution.
     """
     check("alignment", alignment)
-    candidates = find_candidates(source, target, starts, k=k, refine=refine, parts=parts)
-    by_icp = _transform_in_unit(source, target, transform, scale) if alignment == "icp" else None
+    candidates = find_candidates(
+        source, target, starts, k=k, refine=refine, articulated=articulated
+    )
+    by_icp = (
+        _transform_in_unit(source, target, transform, remove_size) if alignment == "icp" else None
+    )
     # image = R x + t + U Phi c, smooth already: the line after eq. 8; or of elastic iterations
     placed, elastic = by_icp and (transform, by_icp[3]), refine == "elastic"
     match, moved, attrs = register_surface(
@@ -330,7 +334,9 @@ def register(
         R, t, s, _ = by_icp
         displacement = s * image @ R.T + t - X
     else:
-        displacement, R, t, s = displacement_in_template(X, image, target.full.area, scale=scale)
+        displacement, R, t, s = displacement_in_template(
+            X, image, target.full.area, scale=remove_size
+        )
     raw = s * source.original["position"].values[match] @ R.T + t - X
     X_low = target.coarse["position"].values
     low = s * source.coarse["position"].values[starts["intrinsic"]] @ R.T + t - X_low
@@ -362,18 +368,18 @@ def register(
 
 
 def _transform_in_unit(
-    source: Shape, target: Shape, transform: RigidTransform, scale: bool
+    source: Shape, target: Shape, transform: RigidTransform, remove_size: bool
 ) -> tuple[Array, Array, float, float]:
     """A rigid transform between the frames of two shapes as one between their files: R, t and s.
 
     And the ratio of sizes that it leaves.
 
-    Without `scale` each keeps its size: the transform turns the source about its centre and carries
-    that to where it belongs.
+    Without `remove_size` each keeps its size: the transform turns the source about its centre and
+    carries that to where it belongs.
     """
     (center, size), (center_target, size_target) = source.frame, target.frame
     R, t = transform
-    s = size_target / size if scale else 1.0
+    s = size_target / size if remove_size else 1.0
     return R, center_target + size_target * t - s * R @ center, s, s * size / size_target
 
 
@@ -384,7 +390,7 @@ def find_candidates(
     *,
     k: int = 100,
     refine: str = "elastic",
-    parts: bool = True,
+    articulated: bool = True,
 ) -> dict[str, spectral_icp.Candidate]:
     """Where registration at full resolution may begin: of low resolution, with scores.
 
@@ -394,7 +400,7 @@ def find_candidates(
 
     Parameters
     ----------
-    source, target, starts, k, refine, parts : see :func:`register`
+    source, target, starts, k, refine, articulated : see :func:`register`
 
     Returns
     -------
@@ -405,8 +411,10 @@ def find_candidates(
     if refine == "intrinsic":
         return {}
     M, N = source.low, target.low
-    if refine == "joint" or all(spectral_icp.far_apart(M, N, match) for match in starts.values()):
-        return spectral_icp.candidates(M, N, starts, k=k, parts=parts)
+    if refine == "spectral_icp" or all(
+        spectral_icp.far_apart(M, N, match) for match in starts.values()
+    ):
+        return spectral_icp.candidates(M, N, starts, k=k, articulated=articulated)
     return spectral_icp.as_given(M, N, starts)
 
 
@@ -485,7 +493,7 @@ def register_surface(
     score, moved = ends[method]
     if method != "intrinsic":
         match = match_surfaces(moved.X, moved.normals, M.X, M.normals)
-    attrs |= {"method": method, "score": score}
+    attrs |= {"initialisation": method, "score": score}
     return match, moved, attrs
 
 
@@ -636,10 +644,10 @@ def identity(template: Shape) -> xr.Dataset:
         n_low = template.coarse.sizes["vertex"]
         low["displacement_low"] = np.zeros((n_low, 3), np.float32)
         low["registered_match_low"] = np.arange(n_low, dtype=np.int32)
-        if "mode" in template.coarse.sizes:
-            low["displacement_coefficient"] = np.zeros((template.coarse.sizes["mode"], 3))
+        if "eigenpair" in template.coarse.sizes:
+            low["displacement_coefficient"] = np.zeros((template.coarse.sizes["eigenpair"], 3))
     registration = dataset(
-        {"method": "template", "score": 0.0},
+        {"initialisation": "template", "score": 0.0},
         registered_match=np.arange(len(X), dtype=np.int32),
         displacement=zero,
         displacement_raw=zero,

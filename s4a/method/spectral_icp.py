@@ -263,7 +263,7 @@ def candidates(
     *,
     k: int = 100,
     far: float = 0.03,
-    parts: bool = True,
+    articulated: bool = True,
 ) -> dict[str, Candidate]:
     """Registrations at low resolution: every start as it is, and after joint iterations.
 
@@ -277,7 +277,7 @@ def candidates(
         At low resolution.
     starts : dict
         Name -> match (n_target,).
-    parts : bool
+    articulated : bool
         Whether to try iterations by parts.
 
     Returns
@@ -294,7 +294,7 @@ def candidates(
     for name, match in starts.items():
         enter(f"{name}+joint", *coarse_spectral_icp(source, target, match, k=k))
     best = min(starts, key=lambda name: tried[f"{name}+joint"].score)
-    if parts and all(far_apart(source, target, match) for match in starts.values()):
+    if articulated and all(far_apart(source, target, match) for match in starts.values()):
         end = coarse_spectral_icp(
             source, target, starts[best], k_first=20, k=k, iterations=1, spectral=0.2, by_parts=True
         )

@@ -312,9 +312,9 @@ def _insert_one(mesh, frozen, options, references):
     (of_template,) = latent_bases(study, names[0])
     k = len(of_template)
     coarse = low_resolution(mesh, **options.of("low resolution") | {"k": k})
-    if coarse.sizes["mode"] < k:
+    if coarse.sizes["eigenpair"] < k:
         raise ValueError(
-            f"the study needs {k} eigenfunctions, this shape has only {coarse.sizes['mode']}"
+            f"the study needs {k} eigenfunctions, this shape has only {coarse.sizes['eigenpair']}"
         )
     shape = Shape(mesh, coarse, **options.of("projection"))
     R, t = transform_onto(shape.low, template.low)
@@ -326,9 +326,9 @@ def _insert_one(mesh, frozen, options, references):
         lambda name: (turn.sel(shape=name).values.T @ R, np.zeros(3)),
         k_init=min(options.k_init, k),
         step=options.step,
-        **options.of("first maps"),
+        **options.of("initial maps"),
     )
-    settings = {"how": options.how, **options.of("registration")}
+    settings = {"dense_match": options.dense_match, **options.of("registration")}
     registration = from_latent(shape, template, (Y, of_template), (R, t), **settings)
     seen = None
     if references is not None:

@@ -23,7 +23,7 @@ STAGES = (
     "compare",
     "remesh and spectrum",
     "align",
-    "first maps",
+    "initial maps",
     "consistent ZoomOut and median",
     "registration",
     "modes",

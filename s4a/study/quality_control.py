@@ -50,7 +50,13 @@ def comparisons_of(run: Run, original: Keys, options: Options) -> dict[str, xr.D
     settings = (can_count(options.intersections),)
     counted = ("exactly",) if settings[0] else settings
     todo = [
-        Task(n, f"network/sketch_{n}.nc", portray_shape, (run.folder, n, *settings), (key, counted))
+        Task(
+            n,
+            f"network/descriptor_{n}.nc",
+            portray_shape,
+            (run.folder, n, *settings),
+            (key, counted),
+        )
         for n, key in original.items()
     ]
     descriptors = run.do("descriptor", todo)
@@ -59,7 +65,7 @@ def comparisons_of(run: Run, original: Keys, options: Options) -> dict[str, xr.D
     todo = [
         Task(
             n,
-            f"network/look_{n}.nc",
+            f"network/comparison_{n}.nc",
             compare_shape,
             (run.folder, n, references),
             (reference_key, key),
@@ -75,18 +81,19 @@ def references_of(run: Run, descriptors: Keys, k: int) -> list[str]:
     vertices = {n: open_file(run.folder / f"original/{n}.nc").sizes["vertex"] for n in descriptors}
     least = usable_k(list(vertices.values()), k)
     fine = [name for name in descriptors if vertices[name] >= least]
-    descriptors = {n: read(run.folder / f"network/sketch_{n}.nc") for n in fine or descriptors}
-    return pick_references(descriptors)
+    return pick_references(
+        {n: read(run.folder / f"network/descriptor_{n}.nc") for n in fine or descriptors}
+    )
 
 
 def comparison_of(run: Run, name: str) -> xr.Dataset:
     """What :func:`s4a.input.plausibility.compare` saw in a shape."""
-    return read(run.folder / f"network/look_{name}.nc")
+    return read(run.folder / f"network/comparison_{name}.nc")
 
 
 def stop_if_flagged(flags: Flags, options: Options) -> None:
     """ValueError where a shape is flagged and the run shall stop at that."""
-    if options.flagged != "stop":
+    if options.quality_control != "stop":
         return
     kinds = {
         name: " ".join(dict.fromkeys(flag.kind for flag in of_shape if flag.flagged))
@@ -97,9 +104,9 @@ def stop_if_flagged(flags: Flags, options: Options) -> None:
     if kinds:
         lines = "\n".join(f"  {line}" for line in flagged_lines(kinds))
         raise ValueError(
-            f"{len(kinds)} of {len(flags)} shapes are flagged, and flagged='stop' ends the run "
-            f"before its long stages:\n{lines}\nmend these files or take them away, "
-            "or give flagged='apart' to go on with these shapes beside the others"
+            f"{len(kinds)} of {len(flags)} shapes are flagged, and quality_control='stop' ends the "
+            f"run before its long stages:\n{lines}\nrepair or remove these files, or pass "
+            "quality_control='exclude' to exclude them from the network"
         )
 
 

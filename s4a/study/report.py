@@ -55,7 +55,7 @@ def write_report(
         {name: of_shape(run, name, source, options) for name, (source, _) in sources.items()},
         flags,
         [
-            *reduced_k(options.k, latent.sizes["mode"], spectra),
+            *reduced_k(options.k, latent.sizes["eigenpair"], spectra),
             *remarks,
             *reduced_pairs(options.n_pairs, network.sizes["pair"] // 2, len(spectra)),
             *tied(together, latent["distance_to_limit"].values),
@@ -104,7 +104,7 @@ def chirality_evidence(run: Run, names: list[str], options: Options) -> xr.Datas
     ]
     found = dataset(reflected=np.array(reflected))
     if options.reflect == AUTO:
-        choice = read(run.folder / "network/hands.nc")
+        choice = read(run.folder / "network/chirality.nc")
         found = found.merge(
             dataset(mean_chirality=choice["mean_chirality"].reindex(shape=names).values)
         )

@@ -62,7 +62,7 @@ def stack_registration(
     """
     shapes = [files[name] for name in names]
     mesh = template[[v for v in ("position", "corner_vertex", "vertex_area") if v in template]]
-    kept = ("template", "apart")
+    kept = ("template", "excluded")
     attrs = {key: template.attrs[key] for key in kept if key in template.attrs}
     data = mesh.assign_attrs(attrs)
     for name in STACKED:
@@ -73,7 +73,9 @@ def stack_registration(
                 data[name] = xr.Variable(like.dims, stacked(each), like.attrs)
             else:
                 data[name] = variable(name, np.stack([one.values for one in each]))
-    data["method"] = variable("method", [shape.attrs.get("method", "") for shape in shapes])
+    data["initialisation"] = variable(
+        "initialisation", [shape.attrs.get("initialisation", "") for shape in shapes]
+    )
     data["registration_error"] = variable(
         "registration_error", [shape.attrs.get("score", np.nan) for shape in shapes]
     )
@@ -231,7 +233,7 @@ def open_study(folder: Path | str) -> xr.DataTree:
 
 def excluded_of(registration: xr.Dataset) -> list[str]:
     """The shapes that are registered and stand apart from the network, as they are flagged."""
-    return str(registration.attrs.get("apart", "")).split()
+    return str(registration.attrs.get("excluded", "")).split()
 
 
 def seconds_of(report: xr.Dataset) -> str:

@@ -196,7 +196,7 @@ def test_of_searched_maps_that_fit_alike_the_one_that_keeps_curvatures_is_taken(
 
     def found(search):
         scores, gaps = iter([0.10, 0.11, 0.5]), iter([0.1, 0.0, 0.0])
-        monkeypatch.setattr(joint, "registration_score", lambda *_: next(scores))
+        monkeypatch.setattr(spectral_icp, "registration_score", lambda *_: next(scores))
         monkeypatch.setattr(initial_map.fmap, "curvature_difference", lambda *_: next(gaps))
         return initial_map.best_initial_map(surface, surface, C, search=search)[0]
 

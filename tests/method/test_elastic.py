@@ -117,7 +117,7 @@ def test_nearest_points_lie_on_the_surface_and_no_farther_than_nearest_vertices(
 
 @pytest.fixture(scope="module")
 def local(pair, ends):
-    """Where elastic iterations end at low resolution, and the displacement of local iterations after."""
+    """Result of elastic iterations at low resolution, then displacement of local ones."""
     template, shape, _ = pair
     X = spectral_icp.move(template.low, ends[0])
     return X, elastic.local_iterations(shape.full, template.low, template.diffusion, X)
@@ -184,7 +184,10 @@ def test_where_parts_turned_on_their_own_local_rounds_alone_follow(pair, monkeyp
         asked: register_surface(shape, template, {"icp+parts": candidate}, functions, elastic=asked)
         for asked in (True, False)
     }
-    assert {attrs["method"] for _, _, attrs in found.values()} == {"icp+parts", "icp+parts+local"}
+    assert {attrs["initialisation"] for _, _, attrs in found.values()} == {
+        "icp+parts",
+        "icp+parts+local",
+    }
     far = {asked: gap(end.X, shape) for asked, (_, end, _) in found.items()}
     assert far[True] < 0.8 * far[False]
 
@@ -221,7 +224,7 @@ def test_rounds_that_begin_less_stiff_are_nearer_where_the_template_is_torn(
         image = template["position"] + found["displacement"] - found["translation"]
         image = image.values @ found["rotation"].values / found["scale"].item()
         torn = np.quantile(abs(found["distortion"]), 0.99)
-        return found.attrs["method"], torn, np.linalg.norm(image - true, axis=1).mean()
+        return found.attrs["initialisation"], torn, np.linalg.norm(image - true, axis=1).mean()
 
     method, torn, error = registered()
     monkeypatch.setattr("s4a.method.register.TORN", np.inf)

@@ -1,4 +1,4 @@
-"""Shapes in far poses: parts that turn on their own, first maps that no pose changes.
+"""Shapes in far poses: parts that turn on their own, initial maps that no pose changes.
 
 And who pays for them.
 """
@@ -53,10 +53,10 @@ def shapes(bent):
 
 def test_a_far_pose_is_matched_where_nearest_neighbours_begin_wrong(bent, monkeypatch):
     found = match_pair(*bent, n_coarse=1000, k=50)
-    assert found.attrs["method"] == "intrinsic+parts+local"
+    assert found.attrs["initialisation"] == "intrinsic+parts+local"
     assert found.attrs["initial_map"].split(",")[0] in ("hks", "wks", "hks+wks", "extremities 1")
     assert error(found, bent[0]) < 0.002
-    monkeypatch.setattr(joint, "far_apart", lambda *_: False)
+    monkeypatch.setattr(spectral_icp, "far_apart", lambda *_: False)
     assert error(match_pair(*bent, n_coarse=1000, k=50), bent[0]) > 0.05
 
 

@@ -30,7 +30,7 @@ def exact(shape):
     return *eigenpairs(E, w, area, K), area / area.sum(), stiffness(E, w, len(X))
 
 
-def lifted(shape):
+def with_refined_eigenfunctions(shape):
     mesh, scan = shape
     X, T = as_arrays(mesh)
     return lift.lift(X, T, vertex_areas(X, T), scan.U, scan.coarse, K)
@@ -44,7 +44,7 @@ def outside(B, Phi, area):
 
 def test_lifted_functions_are_eigenfunctions_of_the_mesh_where_projected_ones_are_not(shape, exact):
     eigenvalue, Phi, area, _ = exact
-    found, B = lifted(shape)
+    found, B = with_refined_eigenfunctions(shape)
     _, scan = shape
     projected = scan.U @ scan.coarse["eigenfunction"].values[:, :K]
     assert outside(B.astype(float), Phi, area) < 0.35 * outside(projected, Phi, area)
@@ -56,7 +56,7 @@ def test_lifted_functions_are_eigenfunctions_of_the_mesh_where_projected_ones_ar
 
 def test_lifted_functions_are_orthonormal_and_the_first_is_constant(shape, exact):
     area = exact[2]
-    _, B = lifted(shape)
+    _, B = with_refined_eigenfunctions(shape)
     assert np.allclose(B.T @ (area[:, None] * B), np.eye(K), atol=1e-4)
     assert np.allclose(B[:, 0], 1, atol=1e-4)
 
@@ -64,7 +64,7 @@ def test_lifted_functions_are_orthonormal_and_the_first_is_constant(shape, exact
 def test_the_eigenvalue_of_constants_is_zero_so_that_descriptors_do_not_take_it_for_a_frequency(
     shape,
 ):
-    found, _ = lifted(shape)
+    found, _ = with_refined_eigenfunctions(shape)
     assert found[0] == 0
     assert found[1] > 1
 
@@ -86,7 +86,7 @@ def test_a_mesh_of_obtuse_triangles_is_lifted_too(shape):
     E, w, area, _ = laplacian(X, T, vertex_areas(X, T))
     assert (w < 0).mean() > 0.02
     eigenvalue, _ = eigenpairs(E, w, area, K)
-    found, B = lifted((flat, scan))
+    found, B = with_refined_eigenfunctions((flat, scan))
     assert np.isfinite(B).all()
     assert np.abs(found[1:] / eigenvalue[1:] - 1).max() < 0.01
 

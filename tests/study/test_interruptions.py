@@ -196,10 +196,10 @@ sys.exit(code)
 """
 KILLS = [
     "original/brain_02.nc",  # read and clean
-    "network/look_brain_02.nc",  # compare
+    "network/comparison_brain_02.nc",  # compare
     "coarse/brain_02.nc",  # remesh and spectrum
-    "network/motion_brain_02.nc",  # align
-    "network/first_000.nc",  # first maps
+    "network/alignment_brain_02.nc",  # align
+    "network/initial_000.nc",  # initial maps
     "network.nc",  # consistent ZoomOut and median
     "latent.nc",
     "registration.nc",  # registration

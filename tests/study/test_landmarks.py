@@ -220,8 +220,10 @@ def test_landmarks_of_a_mirrored_shape_lie_where_they_lay(marked):
 
 def test_landmarks_without_elastic_rounds_are_refused(marked):
     meshes, folder = marked
-    with pytest.raises(ValueError, match="landmarks pull elastic iterations, and refine='joint'"):
-        analyse(meshes, landmarks=folder, refine="joint")
+    with pytest.raises(
+        ValueError, match="landmarks pull elastic iterations, and refine='spectral_icp'"
+    ):
+        analyse(meshes, landmarks=folder, refine="spectral_icp")
 
 
 def test_the_command_line_takes_them_for_a_study_and_for_new_shapes(marked, tmp_path, capsys):

@@ -1,4 +1,4 @@
-"""What must not change the result: rigid transform, the unit, the numbering of vertices and faces."""
+"""Invariance of the result to rigid transforms, the unit and the numbering."""
 
 import numpy as np
 import pytest
