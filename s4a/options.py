@@ -498,11 +498,9 @@ class Options:
         >>> options = s4a.Options(k=50).changed({"preset": "paper"})
         >>> options.k, options.refine
         (50, 'intrinsic')
-        >>> options.changed({"refine": "spectral_icp"})
+        >>> options.changed({"n_samples": 500})
         Traceback (most recent call last):
-        ValueError: preset 'paper' sets refine='intrinsic'; found refine='spectral_icp': leave out
-        one of \
-both
+        ValueError: preset 'paper' sets n_samples=0; found n_samples=500: leave out one of the two
         """
         unset: dict[str, None] = {}
         if "preset" in given:

@@ -242,8 +242,8 @@ def pairs(
         Rounds of ZoomOut of RE-MATCH refined that look among all vertices of the source, 2 by
         default.
     init : {"landmarks", "descriptors"}, optional
-        Initial maps of all methods but kNN and ZO from heat kernels around landmarks (default), as in
-        :func:`s4a.match_pair` with the preset, or from wave kernels of the shapes and around
+        Initial maps of all methods but kNN and ZO from heat kernels around landmarks (default), as
+        in :func:`s4a.match_pair` with the preset, or from wave kernels of the shapes and around
         landmarks, as pyFM has them.
     n_geodesic : int
         See :func:`s4a.evaluation.metrics.evaluate`.
@@ -472,8 +472,8 @@ def collection(
         ``"paper"`` sets init="landmarks", n_samples=0 and dense_iterations=0; another value of
         these is refused.
     init, n_samples, dense_iterations
-        Initial maps, those of nearest neighbours after alignment by default, and Consistent ZoomOut,
-        see :func:`s4a.analyse`.
+        Initial maps, those of nearest neighbours after alignment by default, and Consistent
+        ZoomOut, see :func:`s4a.analyse`.
 
     Returns
     -------
