@@ -231,12 +231,12 @@ Each alone, on top of the paper (errors: matched, surface):
 
 {additions}
 
-Elastic iterations beside joint ones on other sets: [what was measured](decisions.md).
-`articulated` and `dense_iterations` are shown with what they need: elastic iterations, and 1,000 spread vertices. Where
-poses are far apart elastic iterations need `articulated`: without, bodies end farther from the truth than by
-the paper alone. Of shapes of 10,000 vertices the 25,000 of `n_projected` would be all; it is
-measured with 2,500, as 25,000 are of 100,000.
-`initial_refinement`, `full_resolution_iterations` and `bidirectional` concern pairs that are matched on their own.
+Elastic iterations and spectral non-rigid ICP on other sets: [measurements](decisions.md).
+`articulated` and `dense_iterations` are shown with the options that they need: elastic iterations
+and 1,000 samples. Where poses differ a lot, elastic iterations need `articulated`: without it,
+bodies have larger errors than with the paper alone. `n_projected` is measured with 2,500 of 10,000
+vertices, the same share as 25,000 of 100,000.
+`initial_refinement`, `full_resolution_iterations` and `bidirectional` concern single pairs.
 
 ## Pairs that are matched on their own (4.1, 6.2)
 

@@ -284,7 +284,8 @@ def registered(name, folder, at, way):
         sys.stdout.write(
             f"    {name}, {way}, {files[numbers[at]].stem} -> {other}: error {error:.2f} %, "
             f"registration_error {registration_error[other]:.4f}, times |distortion| "
-            f"{registration_error[other] * distortion[other]:.5f}: {told or '-'}{' (all)' if of_all else ''}\n"
+            f"{registration_error[other] * distortion[other]:.5f}: "
+            f"{told or '-'}{' (all)' if of_all else ''}\n"
         )
         sys.stdout.flush()
         yield error, told
@@ -343,7 +344,7 @@ def judged(name, at, meshes, shapes):
     template, *others = [list(shapes)[at], *(n for i, n in enumerate(shapes) if i != at)]
     error, registration_error, distortion = {}, {}, {}
     for way in ("as by default", *TURNS):
-        # a initial map of landmarks, as the dense one is mended by a search
+        # an initial map of landmarks, as the dense one is mended by a search
         more = {"init": "landmarks"} if way in TURNS else {}
         options = Options(bidirectional=False, n_coarse=3000, **more)
         for other in others:
@@ -423,8 +424,8 @@ def simulated(names):
                 for way, other, error, told, (score, size) in judged(name, at, meshes, shapes):
                     table.setdefault((name, way), []).append((error, told))
                     sys.stdout.write(
-                        f"    {name}, {at}, {way}, {other}: error {error:.2f} %, registration_error "
-                        f"{score:.4f}, |distortion| {size:.4f}: {told or '-'}\n"
+                        f"    {name}, {at}, {way}, {other}: error {error:.2f} %, "
+                        f"registration_error {score:.4f}, |distortion| {size:.4f}: {told or '-'}\n"
                     )
                     sys.stdout.flush()
     head = "| collection | begun | failed | told | right | told in vain | between |"

@@ -85,7 +85,7 @@ def report(files, pairs, n_landmarks, field):
         errors.append(error_of(target.original, source.original, match, len(match)))
         sys.stdout.write(
             f"{files[i].stem} -> {files[j].stem}: {errors[-1]:.2f} %, {spent:.1f} CPU s, "
-            f"initial map {found.attrs['initial_map']}, registration_error {found.attrs['score']:.4f}\n"
+            f"initial map {found.attrs['initial_map']}, score {found.attrs['score']:.4f}\n"
         )
         sys.stdout.flush()
     summary(errors)

@@ -153,7 +153,7 @@ def pipeline(study):
 
 
 def swapped(vertices=6000, n_coarse=1500, stretch=1.2):
-    """Figure 2: a initial map, and eigenfunctions that change places."""
+    """Figure 2: an initial map, and eigenfunctions that change places."""
     brains = s4a.synthetic.brains(2, vertices)
     source, target = (brains[f"original/brain_0{i}"].to_dataset() for i in (1, 2))
     high = target.assign(position=target["position"] * [1, 1, stretch])

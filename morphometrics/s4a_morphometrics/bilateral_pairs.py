@@ -119,7 +119,7 @@ def symmetry(study: xr.DataTree) -> xr.Dataset:
     }
     if max(attrs["gap"], attrs["registration_error"]) > FAR:
         log.warning(
-            "the template and its mirror image do not lie on each other (registration_error %.3f, involution "
+            "the template and its mirror image differ (registration error %.3f, involution "
             "to %.3f of sqrt(area)): is it symmetric? Of left and right shapes give subject and "
             "side",
             attrs["registration_error"],

@@ -88,7 +88,8 @@ def seen_together(looks: Looks) -> dict[str, xr.Dataset]:
     >>> from s4a.schema import dataset
     >>> from s4a_morphometrics.mirrored import seen_together
     >>> a = dataset(chirality=[0.6]).assign_coords(reference=["b"])
-    >>> seen_together({"left": {"a": a}, "right": {"a": a}})["a"]["chirality"].round(2).values.tolist()
+    >>> both = seen_together({"left": {"a": a}, "right": {"a": a}})
+    >>> both["a"]["chirality"].round(2).values.tolist()
     [0.85]
     """
     subjects = sorted({name for of in looks.values() for name in of})

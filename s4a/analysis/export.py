@@ -102,7 +102,7 @@ def write_registered(
         )
     if frame == "shape" and "rotation" not in registration:
         raise ValueError(
-            "frame='shape' needs the transform of every shape, and this study has none: write it in "
+            "frame='shape' needs the transform of every shape, and this study has none: write in "
             "the frame of the template"
         )
     folder = Path(folder)

@@ -34,7 +34,7 @@ _FOUND = 0.07  # score at which the search ends; of wrong maps between bodies it
 
 
 class _InitialMap(NamedTuple):
-    """A initial map of a directed pair, and what it was made of."""
+    """An initial map of a directed pair, and what it was made of."""
 
     name: str  # "dense", "landmarks", or of far poses that of best_initial_map
     C: Array  # (k_init, k_init)
@@ -143,7 +143,7 @@ def stretch(target: Basis, X: Array) -> float:
 def best_initial_map(
     source: Basis, target: Basis, C: Array, fitted: Array | None = None, *, search: bool = False
 ) -> tuple[str, Array, Array]:
-    """The best of a initial map and of those from heat and from wave kernels, which no pose changes.
+    """Return the best of an initial map and of those from heat and wave kernels.
 
     Where both have landmarks, also of one from wave kernels and these.
 
@@ -196,7 +196,7 @@ def best_initial_map(
 
 
 def _map_from_landmarks(source, target, k):
-    """Name, initial map and its fit ``(k, k)`` of wave kernels and landmarks, if both have three."""
+    """Name, initial map and its fit ``(k, k)`` of wave kernels and three landmarks."""
     landmarks = corresponding_landmarks(source, target)
     if len(landmarks[0]) < 3:
         return []

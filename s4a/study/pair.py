@@ -23,8 +23,8 @@ def match_pair(
 ) -> xr.Dataset:
     """Correspondence of two shapes at full resolution (4.1).
 
-    In far poses a search for a initial map takes several seconds; where more than two shapes are at
-    hand, a network finds the way more surely: :func:`s4a.analyse`, then
+    In far poses a search for an initial map takes several seconds; where more than two shapes are
+    at hand, a network finds the way more surely: :func:`s4a.analyse`, then
     :func:`s4a.register_shape`.  Landmarks (:func:`s4a.with_landmarks`) guide every step.
 
     Parameters

@@ -238,7 +238,7 @@ FAULTS = [
     Fault("duplicate vertices", "duplicate_vertices.obj", duplicate_vertices, "repaired",
           "1488 vertices welded", "welded at 1e-7 of the bounding box, `file_vertex` kept",
           "nothing to do"),
-    Fault("STL unconnected", "unconnected.stl", of(8), "ok", "^$", "corners in the same place are one vertex",
+    Fault("STL unconnected", "unconnected.stl", of(8), "ok", "^$", "equal corners are one vertex",
           "nothing to do"),
     Fault("zero-area faces", "flat.ply", flat, "repaired", "zero-area triangles",
           "long edges flipped, so that no crack opens; else dropped", "nothing to do"),

@@ -376,7 +376,7 @@ def test_one_usable_shape_is_not_enough_and_the_reasons_are_named(arrays):
         ),
         (
             {"preset": "paper", "dense_iterations": 2},
-            r"preset 'paper' sets dense_iterations=0; found dense_iterations=2: leave out one of the two",
+            r"preset 'paper' sets dense_iterations=0; found dense_iterations=2: leave out one",
         ),
         ({"refined_eigenfunctions": 1}, r"refined_eigenfunctions must be True or False; found 1"),
         ({"n_samples": -1}, r"n_samples must be an integer of at least 0; found -1"),

@@ -225,9 +225,7 @@ def test_votes_for_labels_spread_unless_the_study_or_its_pairs_are_of_the_paper(
 def test_a_transfer_refuses_by_name_what_its_preset_fixes(what, study, paper, meshes, seen):
     external = meshes["brain_04"]
     carry = transfers(external)[what]
-    message = (
-        "preset 'paper' sets bidirectional=False; found bidirectional=True: leave out one of the two"
-    )
+    message = "preset 'paper' sets bidirectional=False; found bidirectional=True: leave out one"
     with pytest.raises(ValueError, match=message):
         carry(study, source=external, preset="paper", bidirectional=True)
     with s4a.open_study(paper) as fixed:
