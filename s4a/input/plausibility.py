@@ -392,7 +392,7 @@ KINDS = {
     "kind": (False, "unlike the others: {what} {spreads:.0f} times the usual spread away; another "
         "kind of shape, stretched, or a part? Look at it, and leave it out if it does not belong",
         "take the files away, if of another kind"),
-    "registration": (True, "{sure} registered wrongly (error score {registration_error:.3f}{distortion}): "
+    "registration": (True, "{sure} registered wrongly ({registration_error:.3f}{distortion}): "
         "look at it in s4a view, compare its file with the template's, or leave it out",
         "look at the page; a larger --n-coarse may help"),
 }

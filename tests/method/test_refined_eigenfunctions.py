@@ -6,7 +6,7 @@ import pytest
 import s4a
 from s4a import synthetic
 from s4a.geometry.mesh import as_arrays, stiffness, vertex_areas
-from s4a.method import lift
+from s4a.method import refined_eigenfunctions
 from s4a.method.remesh import laplacian
 from s4a.method.shape import Shape
 from s4a.method.spectral import eigenpairs
@@ -33,7 +33,9 @@ def exact(shape):
 def with_refined_eigenfunctions(shape):
     mesh, scan = shape
     X, T = as_arrays(mesh)
-    return lift.lift(X, T, vertex_areas(X, T), scan.U, scan.coarse, K)
+    return refined_eigenfunctions.refine_eigenfunctions(
+        X, T, vertex_areas(X, T), scan.U, scan.coarse, K
+    )
 
 
 def outside(B, Phi, area):
@@ -71,7 +73,7 @@ def test_the_eigenvalue_of_constants_is_zero_so_that_descriptors_do_not_take_it_
 
 def test_the_smoother_damps_what_is_rough_and_enlarges_nothing():
     rates = np.linspace(0, 1, 101)
-    left = lift.smooth(
+    left = refined_eigenfunctions.smooth(
         np.diag(rates), np.zeros((101, 1)), np.ones((101, 1)), iterations=4, least=0.05
     ).ravel()
     assert np.abs(left).max() <= 1
@@ -97,7 +99,9 @@ def test_every_piece_of_a_mesh_keeps_its_constant():
     two = s4a.geometry.mesh.as_dataset(np.r_[X, X + [3, 0, 0]], np.r_[T, T + len(X)])
     scan = Shape(two, s4a.spectrum(s4a.coarsen(two, n_coarse=400), k=12))
     X, T = as_arrays(two)
-    eigenvalue, B = lift.lift(X, T, vertex_areas(X, T), scan.U, scan.coarse, 6)
+    eigenvalue, B = refined_eigenfunctions.refine_eigenfunctions(
+        X, T, vertex_areas(X, T), scan.U, scan.coarse, 6
+    )
     assert np.allclose(eigenvalue[:2], 0, atol=1e-3)
     assert eigenvalue[2] > 20
     assert np.ptp(B[:1500, :2], axis=0).max() < 1e-3
