@@ -6,7 +6,7 @@ import pytest
 import s4a
 from s4a import synthetic
 from s4a.geometry.mesh import as_arrays, stiffness, vertex_areas
-from s4a.method import refined_eigenfunctions
+from s4a.method.refined_eigenfunctions import SPARE, refine_eigenfunctions, smooth
 from s4a.method.remesh import laplacian
 from s4a.method.shape import Shape
 from s4a.method.spectral import eigenpairs
@@ -20,7 +20,7 @@ def shape():
     X, _ = as_arrays(mesh)
     X = X * (1 + 0.1 * np.cos(5 * X[:, :1]) * np.sin(4 * X[:, 1:2]))
     mesh = mesh.assign(position=(mesh["position"].dims, X))
-    return mesh, Shape(mesh, s4a.spectrum(s4a.coarsen(mesh, n_coarse=500), k=K + lift.SPARE))
+    return mesh, Shape(mesh, s4a.spectrum(s4a.coarsen(mesh, n_coarse=500), k=K + SPARE))
 
 
 @pytest.fixture(scope="module")
@@ -33,9 +33,7 @@ def exact(shape):
 def with_refined_eigenfunctions(shape):
     mesh, scan = shape
     X, T = as_arrays(mesh)
-    return refined_eigenfunctions.refine_eigenfunctions(
-        X, T, vertex_areas(X, T), scan.U, scan.coarse, K
-    )
+    return refine_eigenfunctions(X, T, vertex_areas(X, T), scan.U, scan.coarse, K)
 
 
 def outside(B, Phi, area):
@@ -73,7 +71,7 @@ def test_the_eigenvalue_of_constants_is_zero_so_that_descriptors_do_not_take_it_
 
 def test_the_smoother_damps_what_is_rough_and_enlarges_nothing():
     rates = np.linspace(0, 1, 101)
-    left = refined_eigenfunctions.smooth(
+    left = smooth(
         np.diag(rates), np.zeros((101, 1)), np.ones((101, 1)), iterations=4, least=0.05
     ).ravel()
     assert np.abs(left).max() <= 1
@@ -83,7 +81,7 @@ def test_the_smoother_damps_what_is_rough_and_enlarges_nothing():
 def test_a_mesh_of_obtuse_triangles_is_lifted_too(shape):
     mesh, _ = shape
     flat = mesh.assign(position=mesh["position"] * [1.0, 1.0, 0.15])
-    scan = Shape(flat, s4a.spectrum(s4a.coarsen(flat, n_coarse=500), k=K + lift.SPARE))
+    scan = Shape(flat, s4a.spectrum(s4a.coarsen(flat, n_coarse=500), k=K + SPARE))
     X, T = as_arrays(flat)
     E, w, area, _ = laplacian(X, T, vertex_areas(X, T))
     assert (w < 0).mean() > 0.02
@@ -99,9 +97,7 @@ def test_every_piece_of_a_mesh_keeps_its_constant():
     two = s4a.geometry.mesh.as_dataset(np.r_[X, X + [3, 0, 0]], np.r_[T, T + len(X)])
     scan = Shape(two, s4a.spectrum(s4a.coarsen(two, n_coarse=400), k=12))
     X, T = as_arrays(two)
-    eigenvalue, B = refined_eigenfunctions.refine_eigenfunctions(
-        X, T, vertex_areas(X, T), scan.U, scan.coarse, 6
-    )
+    eigenvalue, B = refine_eigenfunctions(X, T, vertex_areas(X, T), scan.U, scan.coarse, 6)
     assert np.allclose(eigenvalue[:2], 0, atol=1e-3)
     assert eigenvalue[2] > 20
     assert np.ptp(B[:1500, :2], axis=0).max() < 1e-3

@@ -381,7 +381,7 @@ def assert_equal_but_paths(folder, whole):
 def test_an_error_in_the_task_of_one_shape_costs_that_shape_and_is_told(
     files, tmp_path, monkeypatch, capsys, error, stage
 ):
-    module = {"compare_shape": flags}.get(stage, pipeline)
+    module = {"compare_shape": quality_control}.get(stage, pipeline)
     task = getattr(module, stage)
 
     def wrong(*arguments):
