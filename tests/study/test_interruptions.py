@@ -19,7 +19,7 @@ import pytest
 
 from s4a import analyse, cli, open_study, synthetic
 from s4a.schema import dataset
-from s4a.study import netcdf, pipeline, processes, sources, store, tasks
+from s4a.study import netcdf, pipeline, processes, quality_control, sources, store, tasks
 from s4a.study.progress import FILE
 from s4a.study.runner import Run
 
