@@ -38,6 +38,7 @@ PAGES = (
     "docs/howto/options.md",
     "docs/install.md",
     "docs/plausibility.md",
+    "docs/scaling.md",
     "paper/paper.md",
     "paper/jose.md",
 )
