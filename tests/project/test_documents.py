@@ -13,7 +13,8 @@ from s4a.schema import TABLE
 
 figures = script(DOCS / "figures.py")
 paper = script(ROOT / "tools" / "paper.py")
-PAGES = [page for name in (".", "api", "explanation") for page in sorted((DOCS / name).glob("*.md"))]
+KINDS = (".", "api", "explanation")
+PAGES = [page for kind in KINDS for page in sorted((DOCS / kind).glob("*.md"))]
 READ = [*PAGES, NOTEBOOKS / "README.md", *LESSONS, ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 CODE = [ROOT / "s4a", ROOT / "morphometrics", TESTS, ROOT / "benchmarks"]
 
