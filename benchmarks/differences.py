@@ -24,7 +24,7 @@ LACKING = "not yet"  # in the place of a figure that was not measured
 
 
 # additions that are another value of an option than its default, and rows of their own
-OTHER = {"joint": "refine"}
+OTHER = {"spectral_icp": "refine"}
 MORE = {  # what the table also says of a value
     "lift": "; `RE-MATCH lifted` of `s4a.compare`: True",
     "full_resolution_iterations": "; `RE-MATCH lifted` of `s4a.compare`: 2",
@@ -49,7 +49,7 @@ READINGS = [
         "4.2",
         "two methods for full resolution, *standard* and *ours*",
         "*ours*, eq. 7",
-        '`how="standard"`: eq. 3 and 4',
+        '`dense_match="fmap"`: eq. 3 and 4',
         ("how=standard",),
     ),
     Reading(
@@ -413,9 +413,9 @@ def page(found):
     rows |= {
         "default": "all of them, the default",
         "default without init": "the default without `init`",
-        "default without parts": "the default without `parts`",
-        "default, joint": 'the default with `refine="joint"`',
-        "default, lift": "the default and `lift`",
+        "default without parts": "the default without `articulated`",
+        "default, joint": 'the default with `refine="spectral_icp"`',
+        "default, lift": "the default and `refined_eigenfunctions`",
     }
     read = {"paper": "the paper as read here"}
     for number, reading in enumerate(READINGS, 1):
