@@ -26,8 +26,8 @@ LACKING = "not yet"  # in the place of a figure that was not measured
 # additions that are another value of an option than its default, and rows of their own
 OTHER = {"spectral_icp": "refine"}
 MORE = {  # what the table also says of a value
-    "lift": "; `RE-MATCH lifted` of `s4a.compare`: True",
-    "full_resolution_iterations": "; `RE-MATCH lifted` of `s4a.compare`: 2",
+    "refined_eigenfunctions": "; `RE-MATCH refined` of `s4a.compare`: True",
+    "full_resolution_iterations": "; `RE-MATCH refined` of `s4a.compare`: 2",
     "n_samples": ", all",
     "n_projected": ", all",
 }
@@ -50,7 +50,7 @@ READINGS = [
         "two methods for full resolution, *standard* and *ours*",
         "*ours*, eq. 7",
         '`dense_match="fmap"`: eq. 3 and 4',
-        ("how=standard",),
+        ("dense_match=fmap",),
     ),
     Reading(
         "4.1",
@@ -63,8 +63,8 @@ READINGS = [
         "4.2",
         "Consistent ZoomOut without a step of ZoomOut before it is unsatisfactory",
         "one step of ZoomOut before",
-        '`ahead="never"`',
-        ("ahead=never",),
+        '`initial_refinement="never"`',
+        ("initial_refinement=never",),
     ),
     Reading(
         "eq. 3",
@@ -232,11 +232,11 @@ Each addition alone, on top of the paper (errors: matched, surface):
 {additions}
 
 [Design decisions](decisions.md) compares elastic registration with spectral ICP on other sets.
-`parts` and `wide` are shown together with the additions that they need: elastic registration, and
-1,000 farthest-point samples. If pose differences are large, elastic registration needs `parts`:
-without, bodies are less accurate than with the paper alone. Shapes of 10,000 vertices have fewer
-than the 25,000 of `n_projected`; it is measured with 2,500, as 25,000 are of 100,000.
-`ahead`, `full_resolution_iterations` and `both` concern single pairs.
+`articulated` and `dense_iterations` are shown together with the additions that they need: elastic
+registration, and 1,000 farthest-point samples. If pose differences are large, elastic registration
+needs `articulated`: without it, bodies are less accurate than with the paper alone. `n_projected`
+is measured with 2,500 of 10,000 vertices, the same share as 25,000 of 100,000.
+`initial_refinement`, `full_resolution_iterations` and `bidirectional` concern single pairs.
 
 ## Single pairs (4.1, 6.2)
 
@@ -258,9 +258,9 @@ Each other reading on top of the paper:
 
 **The norm of eq. 5.** The paper writes the norm of the Sobolev space $H_0^2$, in which $\\lVert f
 \\rVert = \\lVert \\Lambda^0 f \\rVert$ with the eigenvalues $\\Lambda^0$ of the limit shape. It
-does not say between which spaces $D_i - I$ is an operator. `norm` has five readings. The choice decides
-which shape is the median, and therefore the template, and nothing else. Errors are those of the
-registration to that median.
+does not say between which spaces $D_i - I$ is an operator. `norm` has five readings. The choice
+decides which shape is the median, and therefore the template, and nothing else. Errors are those
+of the registration to that median.
 
 {norms}
 
@@ -282,15 +282,15 @@ PAIRS = {
     "pairs: paper": "the paper",
     "pairs: paper, refine": "and `refine`",
     "pairs: paper, init": "and `init`",
-    "pairs: paper, ahead": "and `ahead`",
+    "pairs: paper, initial_refinement": "and `initial_refinement`",
     "pairs: paper, full_resolution_iterations": "and `full_resolution_iterations`",
-    "pairs: paper, both": "and `both`",
+    "pairs: paper, bidirectional": "and `bidirectional`",
     "pairs: default": "all of them, the default",
     "pairs: default without refine": "without `refine`",
     "pairs: default without init": "without `init`",
-    "pairs: default without ahead": "without `ahead`",
+    "pairs: default without initial_refinement": "without `initial_refinement`",
     "pairs: default without full_resolution_iterations": "without `full_resolution_iterations`",
-    "pairs: default without both": "without `both`",
+    "pairs: default without bidirectional": "without `bidirectional`",
 }
 
 
@@ -413,9 +413,9 @@ def page(found):
     rows |= {
         "default": "all of them, the default",
         "default without init": "the default without `init`",
-        "default without parts": "the default without `articulated`",
-        "default, joint": 'the default with `refine="spectral_icp"`',
-        "default, lift": "the default and `refined_eigenfunctions`",
+        "default without articulated": "the default without `articulated`",
+        "default, spectral_icp": 'the default with `refine="spectral_icp"`',
+        "default, refined_eigenfunctions": "the default and `refined_eigenfunctions`",
     }
     read = {"paper": "the paper as read here"}
     for number, reading in enumerate(READINGS, 1):
