@@ -668,8 +668,8 @@ def compare_collection(
 ) -> "xr.Dataset":
     """Table 2."""
     k_init = min(Options.k_init, options["k"])
-    methods = methods or list(s4a.compare.COLLECTION_METHODS)
-    return s4a.compare.collection(paths, methods=methods, n_pairs=n_pairs, k_init=k_init, **options)
+    methods = methods or list(s4a.evaluation.comparison.COLLECTION_METHODS)
+    return s4a.compare_collection(paths, methods=methods, n_pairs=n_pairs, k_init=k_init, **options)
 
 
 def compare_pairs(
@@ -692,8 +692,11 @@ def compare_pairs(
         raise ValueError(
             f"--truth needs a file for each of the {len(files)} targets, found {len(truth)}"
         )
-    known = {name: s4a.compare.read_truth(f) for name, f in zip(names, truth or [], strict=False)}
-    return s4a.compare.pairs(
+    known = {
+        name: s4a.evaluation.comparison.read_truth(f)
+        for name, f in zip(names, truth or [], strict=False)
+    }
+    return s4a.compare(
         source,
         dict(zip(names, files, strict=True)),
         truth=known or None,
