@@ -32,7 +32,7 @@ from s4a.evaluation.methods import (
 )
 from s4a.geometry.align import align, motion_between, realign
 from s4a.geometry.mesh import as_arrays, vertex_areas
-from s4a.input.collection import read_shape, read_shapes
+from s4a.input.collection import Mesh, as_mesh, read_shapes
 from s4a.input.raw import content, npy, shown, text_of
 from s4a.method import latent, median, network
 from s4a.method.first_map import map_after_motion
@@ -40,7 +40,7 @@ from s4a.method.register import latent_functions, log_area_ratio, match_function
 from s4a.method.shape import Basis, Shape
 from s4a.options import PRESETS as STUDY_PRESETS
 from s4a.options import Options, apply_preset
-from s4a.schema import check_choice, check_count, check_switch, dataset, require, variable
+from s4a.schema import check_choice, check_count, check_switch, dataset, variable
 from s4a.seeds import RNG, seed_of
 
 log = logging.getLogger(__name__)
@@ -78,17 +78,11 @@ def checked_methods(methods: Sequence[str] | None, preset: str | None) -> Sequen
     return methods
 
 
-def load_mesh(shape: Path | str | xr.Dataset, what: str) -> tuple[xr.Dataset, float]:
-    """A mesh and the seconds it took to read and clean it.
-
-    A Dataset is taken as clean and costs none.
-    """
-    if isinstance(shape, xr.Dataset):
-        require(shape, "position", "corner_vertex", what=what)
-        return shape, 0.0
+def load_mesh(shape: Mesh, what: str) -> tuple[xr.Dataset, float]:
+    """Return a mesh and the seconds that it took to read and clean it; a Dataset takes none."""
     begin = time.process_time()
-    mesh = read_shape(shape)
-    return mesh, time.process_time() - begin
+    mesh = as_mesh(shape, what)
+    return mesh, 0.0 if mesh is shape else time.process_time() - begin
 
 
 def in_mesh(vertices: np.ndarray, mesh: xr.Dataset) -> np.ndarray:
@@ -143,7 +137,7 @@ def read_truth(path: Path | str) -> np.ndarray:
 
 
 def compare(
-    source: Path | str | xr.Dataset,
+    source: Mesh,
     target: Any,
     *,
     methods: Sequence[str] | None = None,
@@ -244,9 +238,8 @@ def compare(
     0.0
     """
     if not isinstance(target, dict):
-        target, truth, landmarks = (
-            None if one is None else {"pair": one} for one in (target, truth, landmarks)
-        )
+        target = {"pair": target}
+        truth, landmarks = (x if x is None else {"pair": x} for x in (truth, landmarks))
     settings = apply_preset(preset, {"sharpen": sharpen, "init": init}, PRESETS)
     seed = seed_of(seed, rng)
     check_count("sharpen", settings["sharpen"])

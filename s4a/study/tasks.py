@@ -164,7 +164,8 @@ def consistent_maps(
     first = steps.with_motions(first, motions, reference)
     coarse = {name: study[f"coarse/{name}"] for name in names}
     k_init = first.sizes["mode_source_initial"]
-    bar = run.show("consistent ZoomOut", options.k - k_init)
+    k = min(options.k, *(mesh.sizes["mode"] for mesh in coarse.values()))
+    bar = run.show("consistent ZoomOut", k - k_init)
     return steps.refine_network(
         coarse,
         first,
