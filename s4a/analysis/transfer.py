@@ -137,7 +137,7 @@ def transfer_along(route: Route, triangle: np.ndarray, weights: np.ndarray) -> P
     """Places on the last mesh of points on the first."""
     confidence = np.ones(len(triangle))
     for step, way in route:
-        triangle, weights, own = getattr(step, f"carry_{way}")(triangle, weights)
+        triangle, weights, own = getattr(step, f"transfer_{way}")(triangle, weights)
         confidence = confidence * own
     return triangle, weights, confidence
 

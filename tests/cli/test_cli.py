@@ -172,7 +172,7 @@ def test_help_of_a_run_has_groups_defaults_examples_and_a_link(capsys):
     assert "https://" in said
     text = " ".join(said.split())
     assert "-k N, --k N size of the refined functional maps (default: 100)" in text
-    assert "close every hole by a fan of triangles (default: no)" in text
+    assert "close each hole with a fan of triangles (default: no)" in text
 
 
 def test_a_flag_means_one_thing_in_all_commands():
