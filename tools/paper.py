@@ -33,11 +33,12 @@ PAGES = (
     "docs/comparison.md",
     "docs/decisions.md",
     "docs/differences.md",
-    "docs/quality_control.md",
     "docs/frontends.md",
     "docs/howto.md",
     "docs/install.md",
     "docs/plausibility.md",
+    "docs/quality_control.md",
+    "docs/results.md",
     "paper/paper.md",
     "paper/jose.md",
 )
