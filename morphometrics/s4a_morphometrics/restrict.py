@@ -65,9 +65,10 @@ def within(
     With the ``study`` of six small brains; the right half:
 
     >>> import s4a
+    >>> import s4a_morphometrics
     >>> study = s4a.synthetic.example_study()
     >>> right = study["registration"]["position"].values[:, 0] > 0
-    >>> half = s4a.statistics.within(study, right)
+    >>> half = s4a_morphometrics.within(study, right)
     >>> half["registration"].sizes["vertex"] == right.sum()
     np.True_
     """
@@ -174,9 +175,10 @@ def without(study: xr.DataTree, nuisance: Values | dict[str, Values] | list[str]
 
     >>> import numpy as np
     >>> import s4a
+    >>> import s4a_morphometrics
     >>> study = s4a.synthetic.example_study()
     >>> first = study["pca"]["score"].values[:, 0]
-    >>> rest = s4a.statistics.without(study, first)
+    >>> rest = s4a_morphometrics.without(study, first)
     >>> bool(abs(np.corrcoef(rest["pca"]["score"].values.T, first)[-1, :-1]).max() < 1e-3)
     True
     """
@@ -233,7 +235,8 @@ def with_size(study: xr.DataTree) -> xr.DataTree:
     With the ``study`` of six small brains, which kept their sizes:
 
     >>> import s4a
-    >>> s4a.statistics.with_size(s4a.synthetic.example_study())
+    >>> import s4a_morphometrics
+    >>> s4a_morphometrics.with_size(s4a.synthetic.example_study())
     Traceback (most recent call last):
     ValueError: size was not taken out of these displacements: it is in them (scale=False)
     """
