@@ -204,6 +204,8 @@ class FieldSample(NamedTuple):
 
     def whole(self, values: np.ndarray) -> np.ndarray:
         """Values ``(..., m)`` at all vertices ``(..., n)``, NaN where not all shapes have some."""
+        if self.keep.all():
+            return values
         found = np.full((*values.shape[:-1], len(self.keep)), np.nan)
         found[..., self.keep] = values
         return found
