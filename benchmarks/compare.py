@@ -341,16 +341,16 @@ def where(source, seen):
     figure.savefig(PICTURE, dpi=110)
 
 
-# first maps and Consistent ZoomOut of Table 2
+# initial maps and Consistent ZoomOut of Table 2
 FIRST = {
     "paper": ("landmarks (the paper)", {"preset": "paper"}),
-    "landmarks": ("landmarks, our rounds", {"init": "landmarks"}),
-    "nearest": ("nearest neighbours, our rounds", {}),
+    "landmarks": ("landmarks, our iterations", {"init": "landmarks"}),
+    "nearest": ("nearest neighbours, our iterations", {}),
 }
 
 
 def table_2(given=None, first=tuple(FIRST)):
-    """Ten real heads, with the paper's first maps and with ours."""
+    """Ten real heads, with the paper's initial maps and with ours."""
     say("\nTable 2 on ten real heads")
     with tempfile.TemporaryDirectory() as folder:
         shapes = s4a.read_shapes(files_of("heads", folder, given))
@@ -365,16 +365,16 @@ def table_2(given=None, first=tuple(FIRST)):
                 gap = f"{100 * chamfer.sel(way=way, how=how).item():.4f}"
                 shape = found["median_shape"].sel(way=way).item()
                 all_rows.append([way, what, how, gap, *cells, shape])
-            distance = found["distance_to_median"].sel(way=way).values
+            distance = found["distance_to_limit"].sel(way=way).values
             distances.append([way, what, *(f"{d:.4f}" for d in distance)])
         say(f"\nfirst maps: {what}")
         verdict_2(found)
     blocks = [block for block in found["block"].values if block != "load and clean"]
     say("")
-    head = ["", "first maps", "way up", "Chamfer to the template", *blocks, "all", "median shape"]
+    head = ["", "initial maps", "way up", "Chamfer to the template", *blocks, "all", "median shape"]
     markdown(all_rows, head)
     say("\nDistance to the limit shape (eq. 5):\n")
-    markdown(distances, ["", "first maps", *found["shape"].values])
+    markdown(distances, ["", "initial maps", *found["shape"].values])
 
 
 def verdict_2(found):
@@ -404,7 +404,7 @@ if __name__ == "__main__":
     known = [*PARTS, *SETS, "brains"]
     parser.add_argument("parts", nargs="*", metavar="PART", help=", ".join(known))
     parser.add_argument("--data", type=Path, help="a folder of meshes for each set")
-    parser.add_argument("--init", choices=INITS, help="first maps of registered and more")
+    parser.add_argument("--init", choices=INITS, help="initial maps of registered and more")
     parser.add_argument("--first", nargs="+", choices=FIRST, default=[*FIRST], help="of collection")
     parser.add_argument("--methods", nargs="+", default=compare.METHODS, help="of Table 1")
     parser.add_argument("--pairs", type=int, help="of more, and of heads: 5 by default")

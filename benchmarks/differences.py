@@ -27,8 +27,8 @@ LACKING = "not yet"  # in the place of a figure that was not measured
 OTHER = {"joint": "refine"}
 MORE = {  # what the table also says of a value
     "lift": "; `RE-MATCH lifted` of `s4a.compare`: True",
-    "sharpen": "; `RE-MATCH lifted` of `s4a.compare`: 2",
-    "n_spread": ", all",
+    "full_resolution_iterations": "; `RE-MATCH lifted` of `s4a.compare`: 2",
+    "n_samples": ", all",
     "n_projected": ", all",
 }
 
@@ -112,7 +112,7 @@ READINGS = [
         "a map is optimised with landmarks; the code is based on pyFM",
         "heat kernels around the landmarks kept at 8 times, and $C$ commutes with the Laplacians",
         "pyFM's fit: wave kernels of the shapes and around the landmarks (no option)",
-        ("first maps of pyFM",),
+        ("initial maps of pyFM",),
     ),
 ]
 
@@ -231,12 +231,12 @@ Each alone, on top of the paper (errors: matched, surface):
 
 {additions}
 
-Elastic rounds beside joint ones on other sets: [what was measured](decisions.md).
-`parts` and `wide` are shown with what they need: elastic rounds, and 1,000 spread vertices. Where
-poses are far apart elastic rounds need `parts`: without, bodies end farther from the truth than by
+Elastic iterations beside joint ones on other sets: [what was measured](decisions.md).
+`parts` and `wide` are shown with what they need: elastic iterations, and 1,000 spread vertices. Where
+poses are far apart elastic iterations need `parts`: without, bodies end farther from the truth than by
 the paper alone. Of shapes of 10,000 vertices the 25,000 of `n_projected` would be all; it is
 measured with 2,500, as 25,000 are of 100,000.
-`ahead`, `sharpen` and `both` concern pairs that are matched on their own.
+`ahead`, `full_resolution_iterations` and `both` concern pairs that are matched on their own.
 
 ## Pairs that are matched on their own (4.1, 6.2)
 
@@ -283,13 +283,13 @@ PAIRS = {
     "pairs: paper, refine": "and `refine`",
     "pairs: paper, init": "and `init`",
     "pairs: paper, ahead": "and `ahead`",
-    "pairs: paper, sharpen": "and `sharpen`",
+    "pairs: paper, full_resolution_iterations": "and `full_resolution_iterations`",
     "pairs: paper, both": "and `both`",
     "pairs: default": "all of them, the default",
     "pairs: default without refine": "without `refine`",
     "pairs: default without init": "without `init`",
     "pairs: default without ahead": "without `ahead`",
-    "pairs: default without sharpen": "without `sharpen`",
+    "pairs: default without full_resolution_iterations": "without `full_resolution_iterations`",
     "pairs: default without both": "without `both`",
 }
 

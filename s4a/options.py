@@ -22,7 +22,7 @@ if TYPE_CHECKING:  # imported when they are first needed, so that a command star
     import xarray as xr
 
 N_COARSE = 6000  # vertices of a low-resolution mesh, where no preset says another number
-N_SPREAD = 1000  # spread vertices of a shape on which Consistent ZoomOut looks for matches
+N_SAMPLES = 1000  # spread vertices of a shape on which Consistent ZoomOut looks for matches
 N_CENTRAL = 25_000  # vertices by which a field on a shape is projected
 PER_FUNCTION = 2  # samples, at least: the least squares of fewer are poor, or have no one solution
 FEATURE = re.compile(r"[A-Za-z0-9_-]{1,100}")  # as a file can be named
@@ -204,7 +204,7 @@ def apply_preset(
     Examples
     --------
     >>> from s4a.options import PRESETS, apply_preset
-    >>> apply_preset("paper", {"sharpen": None}, PRESETS)["sharpen"]
+    >>> apply_preset("paper", {"full_resolution_iterations": None}, PRESETS)["full_resolution_iterations"]
     0
     """
     if preset not in presets:
@@ -270,7 +270,7 @@ class Options:
         more="x becomes -x in the coordinates of their files, and triangles are turned over, so "
         "that left and right ones are of one hand.  A column may also have 1 and 0; ``auto`` "
         "are those of the rarer hand by ICP of pairs, as they are and mirrored "
-        "(:func:`s4a.input.hands.of_other_hand`).  ``/report`` says of each whether it was")
+        "(:func:`s4a.input.chirality.mirrored_shapes`).  ``/report`` says of each whether it was")
     table: Path | str | None = reading(None,
         "CSV with a column 'shape', covariates and groups, for the statistics",
         more="See :func:`s4a.input.subjects.read_table`; they become ``/subjects``.  Nothing "
@@ -297,28 +297,28 @@ class Options:
         of="low resolution")
     lift: bool = network(False,
         "eigenfunctions of the original meshes, nearly, instead of U Phi", paper=False,
-        section="eq. 4, 7, 8", instead="$U \\phi$", see="method/lift", of="low resolution",
+        section="eq. 4, 7, 8", instead="$U \\phi$", see="method/refined_eigenfunctions", of="low resolution",
         pair=True,
         more="By inverse iteration, in eq. 4, 7 and the smoothing of eq. 8.  They are kept in "
         "``/coarse``: 40 MB for 100,000 vertices")
-    k_init: int = network(20, "size of the first functional maps", least=4, section="5.1",
+    k_init: int = network(20, "size of the initial functional maps", least=4, section="5.1",
         pair=True)
     k: int = network(100, "size of the refined functional maps", least=4, section="5.1",
         of="low resolution", pair=True)
     n_pairs: int = network(500, "pairs of the network, each with maps both ways", least=1,
         section="5.1", more="All pairs where there are fewer")
     init: str = network("dense",
-        "first maps from all nearest neighbours, or the paper's fit on 10 landmarks",
+        "initial maps from all nearest neighbours, or the paper's fit on 10 landmarks",
         choices=("dense", "landmarks"), paper="landmarks", section="4.1, steps 3 and 4",
-        instead="first map fitted on 10 landmarks", see="method/first_map", of="first maps",
+        instead="initial map fitted on 10 landmarks", see="method/initial_map", of="initial maps",
         pair=True,
         more="The former after ICP; in far poses the best of several maps, see "
         ":func:`s4a.match_pair`")
     ahead: str = network("always",
-        "a step of ZoomOut without growth for all first maps, for those of the network alone, "
+        "a step of ZoomOut without growth for all initial maps, for those of the network alone, "
         "or none", choices=("always", "network", "never"), paper="network", section="4.2",
-        instead="a step of ZoomOut ahead of Consistent ZoomOut", see="method/first_map",
-        of="first maps", given_as="never".__ne__, pair=True,
+        instead="a step of ZoomOut ahead of Consistent ZoomOut", see="method/initial_map",
+        of="initial maps", given_as="never".__ne__, pair=True,
         more="All are also those of a pair that is matched on its own (4.1)")
     step: int = network(5, "growth of the maps per round of Consistent ZoomOut", least=1,
         section="4.2", pair=True)
@@ -326,41 +326,41 @@ class Options:
         section="eq. 3")
     weights: str = network("cycles", "of the maps: by how far their cycles close, or 1",
         choices=("cycles", "equal"), section="eq. 3", see="method/network")
-    n_spread: int = network(N_SPREAD,
+    n_samples: int = network(N_SAMPLES,
         "vertices at which the network looks for matches; 0 for all", paper=0, fast=500,
         section="eq. 3", instead="for all vertices in every round", see="method/latent",
-        of="first maps",
+        of="initial maps",
         more="In the step ahead of near poses, too, which saves time; 2 k at least")
-    wide: int = network(4, "its last rounds in which these look between the samples, too",
+    wide: int = network(4, "its last iterations in which these look between the samples, too",
         paper=0, fast=0, section="eq. 3", see="method/latent")
     norm: str = network("h2", "norm that decides which shape is the median",
         choices=("h2", "h1", "frobenius", "h2_image", "h2_both"), section="eq. 5",
         more="See :func:`s4a.method.median.distance_to_identity`")
-    keep_rounds: bool = network(False,
+    keep_iterations: bool = network(False,
         "keep the maps and latent bases of every round of Consistent ZoomOut",
-        more="They are ``/rounds``")
+        more="They are ``/iterations``")
     template: str | None = registration(None,
         "name of the shape to register to; the median shape by default")
     how: str = registration("ours", "full resolution by eq. 7, or by eq. 3 and 4",
         choices=("ours", "standard"), section="4.2",
         more='Unless ``refine="intrinsic"`` that match is one candidate among others')
     refine: str = registration("elastic",
-        "elastic rounds, joint ones, or the paper's spectral match alone",
+        "elastic iterations, joint ones, or the paper's spectral match alone",
         choices=("elastic", "joint", "intrinsic"), paper="intrinsic", section="eq. 7, 4",
         instead="the match as it is", see="method/elastic", of="registration", pair=True,
-        more="A price on bending and distances across the surface; in far poses joint rounds "
-        "before (:mod:`s4a.method.joint`).  Joint alone: the best of several ends")
-    parts: bool = registration(True, "in far poses joint rounds turn every part on its own",
+        more="A price on bending and distances across the surface; in far poses joint iterations "
+        "before (:mod:`s4a.method.spectral_icp`).  Joint alone: the best of several ends")
+    parts: bool = registration(True, "in far poses joint iterations turn every part on its own",
         paper=False, section="eq. 8", see="method/deform", of="registration", pair=True)
-    sharpen: int = registration(1,
-        "rounds of ZoomOut of a single pair that look among all vertices of the source", paper=0,
+    full_resolution_iterations: int = registration(1,
+        "iterations of ZoomOut of a single pair that look among all vertices of the source", paper=0,
         section="eq. 4", instead="after ZoomOut on coarse vertices", see="method/register",
         pair=True, more="External meshes of a transfer are single pairs, too")
     both: bool = registration(True, "match single pairs both ways and transfer along both",
         paper=False, section="6.2", instead="a template registered to a shape",
         see="analysis/transfer", pair=True, more="The mean of both, see :func:`s4a.register_pairs`")
     alignment: str = registration("fitted",
-        "displacements after the motion that fits the registered surface best, or after that of "
+        "displacements after the transform that fits the registered surface best, or after that of "
         "ICP", choices=("fitted", "icp"), paper="icp", section="eq. 8",
         instead="after ICP (4.1, step 2)", see="method/deform", of="registration", pair=True)
     area_weighted: bool = registration(True,
@@ -373,13 +373,13 @@ class Options:
         pair=True)
     scale: bool = registration(False, "take size out of the displacements", of="registration")
     intersections: bool = quality(True, "count triangles that pass through others")
-    doubtful: str = quality("apart",
-        "what becomes of doubtful shapes: they stay apart, or the run stops",
+    flagged: str = quality("apart",
+        "what becomes of flagged shapes: they stay apart, or the run stops",
         choices=("apart", "stop"),
         more="Such are shapes mirrored or of another unit.  Apart they are placed beside the "
         "network of all others and registered, so that nothing changes for these.  A run stops "
         "before the long stages")
-    keep_doubtful: bool = quality(False, "take doubtful shapes into modes and statistics")
+    include_flagged: bool = quality(False, "take flagged shapes into modes and statistics")
     # fmt: on
 
     def __post_init__(self):
@@ -392,8 +392,8 @@ class Options:
         if self.n_latent is not None and self.n_latent > self.k:
             raise ValueError(f"n_latent must be at most k = {self.k}; found {self.n_latent}")
         # pairs, of any k, take no notice of a default
-        if self.n_spread != (PRESETS[None] | PRESETS[self.preset])["n_spread"]:
-            self.check_spread()
+        if self.n_samples != (PRESETS[None] | PRESETS[self.preset])["n_samples"]:
+            self.check_n_samples()
         wrong = [name for name in self.feature_names if not FEATURE.fullmatch(name)]
         if wrong:
             raise ValueError(f"features need names of letters, digits, _ and -, found {wrong[0]!r}")
@@ -409,27 +409,27 @@ class Options:
                 "volumes, whose vertices nobody knows before"
             )
         elif self.landmarks is not None and self.refine != "elastic":
-            why = f"landmarks pull elastic rounds, and refine={self.refine!r} makes none"
+            why = f"landmarks pull elastic iterations, and refine={self.refine!r} makes none"
         elif self.method == "scalable" and without:
             why = (
                 f"method='scalable' has no coarse mesh, and {without[0]}=True "
                 f"{WITHOUT_MESH[without[0]]}"
             )
-        elif self.keep_doubtful and self.doubtful == "stop":
+        elif self.include_flagged and self.flagged == "stop":
             why = (
-                "keep_doubtful=True takes doubtful shapes in and doubtful='stop' ends the run "
+                "include_flagged=True takes flagged shapes in and flagged='stop' ends the run "
                 "where there are any"
             )
         if why:
             raise ValueError(f"{why}: leave out one of both")
 
-    def check_spread(self) -> None:
+    def check_n_samples(self) -> None:
         """ValueError where Consistent ZoomOut would have too few spread vertices for k."""
         least = min(PER_FUNCTION * self.k, self.n_coarse)
-        if 0 < self.n_spread < least:
+        if 0 < self.n_samples < least:
             raise ValueError(
-                f"n_spread must be 0, for all vertices, or at least {least}, for k = {self.k}; "
-                f"found {self.n_spread}"
+                f"n_samples must be 0, for all vertices, or at least {least}, for k = {self.k}; "
+                f"found {self.n_samples}"
             )
 
     def check_against(self, names: list[str]) -> None:
@@ -453,7 +453,7 @@ class Options:
 
         Parameters
         ----------
-        step : {"cleaning", "low resolution", "first maps", "projection", "registration"}
+        step : {"cleaning", "low resolution", "initial maps", "projection", "registration"}
 
         Examples
         --------
@@ -474,7 +474,7 @@ class Options:
         return self.features.split(",") if isinstance(self.features, str) else []
 
     def changed(self, given: dict[str, Any]) -> Self:
-        """These options with some given otherwise; a `preset` that is given sets its own anew.
+        """These options with some given otherwise; a `preset` that is given sets its own again.
 
         What the preset before it set stands as the default again.
 

@@ -76,7 +76,7 @@ edge_mass | edge | L2 | integral of the product of two local functions: entry of
     sum to the vertex areas
 eigenvalue | mode | unit area | eigenvalue of the Laplace-Beltrami operator
 eigenfunction | vertex mode | unit area | eigenfunction, orthonormal in the vertex areas
-lifted_eigenfunction | original_vertex mode | unit area | eigenfunction of the original mesh,
+refined_eigenfunction | original_vertex mode | unit area | eigenfunction of the original mesh,
     nearly, by a step of inverse iteration
 # one pair (4.1)
 match | vertex | 1 | on each vertex of the target, the matched vertex of the source
@@ -93,7 +93,7 @@ conformal_distortion | | 1 | log(s1 / s2) of the maps of triangles that do not c
 area_distortion | | 1 | |log(area of image / area)| of them, surfaces of unit area, median by area
 collapsed_share | | 1 | share of the target's area in triangles whose image has no area
 geodesic_error | | share | distance along edges of matched and true vertices, mean
-straight_error | | share | distance in a straight line of image and true position, mean
+euclidean_error | | share | distance in a straight line of image and true position, mean
 error_curve | threshold | 1 | share of the vertices whose geodesic error is no larger
 label_accuracy | | 1 | share of the area that gets its own label
 label_dice | | 1 | Dice's overlap by area, mean over the labels of the target
@@ -101,15 +101,15 @@ landmark_error | | share | distance in a straight line of carried and given land
 # the network of maps (3.4)
 source | pair | 1 | shape whose functions the map takes
 target | pair | 1 | shape on which the map gives functions
-fmap | pair mode_target mode_source | 1 | functional map, source functions to target functions
-fmap_initial | pair mode_target_initial mode_source_initial | 1 | functional map before Consistent
+fmap | pair eigenpair_target eigenpair_source | 1 | functional map, source functions to target functions
+fmap_initial | pair eigenpair_target_initial eigenpair_source_initial | 1 | functional map before Consistent
     ZoomOut
-fmap_fitted | pair mode_target_initial mode_source_initial | 1 | that map before the step of ZoomOut
+fmap_fitted | pair eigenpair_target_initial eigenpair_source_initial | 1 | that map before the step of ZoomOut
     ahead (4.2)
 pair_rotation | pair xyz xyz_2 | 1 | rotation R of ICP, source to target, between their frames (4.1,
     step 2)
 pair_translation | pair xyz | share | translation t of ICP, source to target
-landmark_of_source | pair landmark | 1 | landmarks of the first map: coarse vertices of the source
+landmark_of_source | pair landmark | 1 | landmarks of the initial map: coarse vertices of the source
     (4.1, step 3)
 landmark_of_target | pair landmark | 1 | the coarse vertices of the target that are nearest to them
     after ICP
@@ -123,7 +123,7 @@ latent_basis | shape mode latent | 1 | consistent latent basis Y of each shape
 latent_eigenvalue | latent | unit area | eigenvalue of the latent (limit) shape
 area_difference | shape latent latent_2 | 1 | area-based shape difference D = Y^T Y
 conformal_difference | shape latent latent_2 | 1 | conformal shape difference
-distance_to_median | shape | 1 | distance |D_i - I| of each shape to the limit shape (eq. 5)
+distance_to_limit | shape | 1 | distance |D_i - I| of each shape to the limit shape (eq. 5)
 area_score | shape difference_component | 1 | PCA scores of the area-based shape differences
 conformal_score | shape difference_component | 1 | PCA scores of the conformal shape differences
 area_variance_ratio | difference_component | 1 | share of variance of the area-based differences
@@ -144,14 +144,14 @@ displacement_coefficient | shape mode xyz | L | coefficients of the displacement
     Phi of the template (6.1)
 icp_rotation | shape xyz xyz_2 | 1 | rotation R of ICP, shape to template or reference, between
     their frames (4.1, step 2)
-icp_translation | shape xyz | share | translation t of that motion
+icp_translation | shape xyz | share | translation t of that transform
 confidence | shape vertex | 1 | share of such vertices that are within 1 % of sqrt(area) of the
     truth, by their evidence
 round_trip | shape vertex | share | cycle error: way from the vertex to the shape and back
 distortion | shape vertex | 1 | log of the vertex's share of the area, on the shape over on the
     template
 method | shape | 1 | start of the match that was kept
-badness | shape | share | round trip and gaps between the surfaces, mean
+registration_error | shape | share | round trip and gaps between the surfaces, mean
 template_triangle | original_vertex | 1 | template triangle on which the vertex of the shape lies
 template_barycentric | original_vertex corner | 1 | barycentric weights in that triangle
 # what travels along a registration (6.2)
@@ -162,14 +162,14 @@ landmark_triangle | landmark | 1 | triangle of the mesh on which the landmark li
 landmark_barycentric | landmark corner | 1 | barycentric weights of the landmark in that triangle
 landmark_confidence | landmark | 1 | confidence of the match at the landmark, 0 to 1
 landmark_distance | landmark | L | distance of the given landmark from the surface it is marked on
-landmark_spread | landmark | L | distance between the positions that different ways of transfer give
+landmark_disagreement | landmark | L | distance between the positions that different ways of transfer give
 # modes (6.1)
 mean_displacement | vertex xyz | L | mean of the displacements
 deformation | component vertex xyz | L | deformation of one standard deviation along the component
 standard_deviation | component | L | standard deviation of the component (area-weighted RMS)
 score | shape component | 1 | score of each shape, in standard deviations
 reconstruction_error | shape | L | root mean square over the area of what the modes do not describe
-score_apart | shape_apart component | 1 | score, in standard deviations, of each doubtful shape that
+score_excluded | shape_excluded component | 1 | score, in standard deviations, of each flagged shape that
     the modes are made without
 explained_variance_ratio | component | 1 | share of the variance at full resolution
 explained_variance_ratio_low | component | 1 | share of the variance at low resolution, of the
@@ -209,17 +209,17 @@ outlier | shape | 1 | whether one of both is beyond its threshold
 predicted | shape | 1 | class predicted while the shape was left out
 accuracy | fold | 1 | balanced accuracy on the left-out shapes
 # fields on the template
-carried_field | shape vertex | field | field of the shape, carried to the template
+transferred_field | shape vertex | field | field of the shape, carried to the template
 # the truth of a synthetic collection
 reference_point | vertex xyz | 1 | point of the unit sphere that the vertex is the image of
-planted_score | shape planted_mode | 1 | planted score of each shape, in standard deviations
-planted_centre | planted_part xyz | mm | centre of each localised field of the planted modes
-planted_width | planted_part | mm | its width, the standard deviation of a Gaussian
-planted_push | planted_mode planted_part xyz | mm | its translation in each planted mode
-planted_turn | planted_mode planted_part xyz | rad | its rotation in each planted mode
-own_centre | shape own_part xyz | mm | centres of the noise and, last, of the tumour of each shape
-own_width | shape own_part | mm | their widths
-own_push | shape own_part xyz | mm | their translations
+true_score | shape true_mode | 1 | simulated score of each shape, in standard deviations
+true_centre | true_region xyz | mm | centre of each localised field of the simulated modes
+true_width | true_region | mm | its width, the standard deviation of a Gaussian
+true_translation | true_mode true_region xyz | mm | its translation in each simulated mode
+true_rotation | true_mode true_region xyz | rad | its rotation in each simulated mode
+noise_centre | shape noise_region xyz | mm | centres of the noise and, last, of the tumour of each shape
+noise_width | shape noise_region | mm | their widths
+noise_translation | shape noise_region xyz | mm | their translations
 landmark_reference | landmark xyz | 1 | point of the unit sphere that the landmark is the image of
 # the comparison (Table 1, Fig. 3, Table 2)
 way_match | way vertex | 1 | on each vertex of the target, the vertex of the source that the method
@@ -229,9 +229,9 @@ way_reverse | way source_vertex | 1 | on each vertex of the source, the vertex o
 way_image | way vertex xyz | L | where the method puts a vertex of the target
 way_area | way vertex | 1 | log of the vertex's share of the area after and before the method moves
     it
-way_fmap | way mode_target mode_source | 1 | refined functional map of the method, source functions
+way_fmap | way eigenpair_target eigenpair_source | 1 | refined functional map of the method, source functions
     to target functions
-way_fmap_initial | way mode_target_initial mode_source_initial | 1 | first functional map of the
+way_fmap_initial | way eigenpair_target_initial eigenpair_source_initial | 1 | initial functional map of the
     method
 way_error | way vertex | share | distance in a straight line of image and true position
 true_position | vertex xyz | L | where the vertex truly lies on the source
@@ -245,24 +245,24 @@ median_shape | way | 1 | median shape (eq. 5)
 state | file | 1 | whole, damaged, missing, stale, left over or foreign, see s4a.verify
 fault | file | 1 | what is wrong with the file; empty where nothing is
 # plausibility (5.1): a shape on its own and beside others of its collection
-sketch_position | point xyz | 1 | some vertices of the shape, centred, of unit root mean square
+descriptor_position | point xyz | 1 | some vertices of the shape, centred, of unit root mean square
     radius
-sketch_area | point | 1 | their shares of the area
-sketch_normal | point xyz | 1 | their normals
-sketch_asymmetry | point | 1 | how far the shape's mirror image lies above the vertex
+descriptor_area | point | 1 | their shares of the area
+descriptor_normal | point xyz | 1 | their normals
+descriptor_asymmetry | point | 1 | how far the shape's mirror image lies above the vertex
 moment | axis | 1 | share of the second moment along each principal axis
 fit | reference | 1 | residual of ICP onto the reference, both of unit root mean square radius
 fit_mirrored | reference | 1 | the same of the shape's mirror image
 hand | reference | 1 | positive where the shape is of the reference's hand, negative where its
     mirror image is
-handedness | shape | 1 | mean of hand beside the references: positive as most shapes, negative as
+mean_chirality | shape | 1 | mean of hand beside the references: positive as most shapes, negative as
     their mirror images
 reflected | shape | 1 | whether the mirror image of the shape was taken (reflect=)
 # the report
-status | shape | 1 | ok, repaired, doubtful or excluded
+status | shape | 1 | ok, repaired, flagged or excluded
 reason | shape | 1 | what was found and done
 warning | shape | 1 | what looks wrong and was left as it is
-doubtful_kinds | shape | 1 | what makes the shape doubtful, a word for each
+flag_kinds | shape | 1 | what makes the shape flagged, a word for each
 warning_kinds | shape | 1 | what else was warned of, a word for each
 path | shape | 1 | file of the shape
 area | shape | L2 | area of the surface
@@ -352,28 +352,28 @@ HOLDS = {
         "laplacian",
         "wrapped kept_whole",
     ),
-    "network/sketch": (
-        "sketch_position sketch_area sketch_normal sketch_asymmetry moment",
+    "network/descriptor": (
+        "descriptor_position descriptor_area descriptor_normal descriptor_asymmetry moment",
         "",
         SEEN,
     ),
     "network/look": ("moment fit fit_mirrored hand", "", SEEN),
-    "network/hands": ("shape handedness reflected", "told", ""),
-    "network/motion": ("rotation translation", "reference", ""),
+    "network/hands": ("shape mean_chirality reflected", "told", ""),
+    "network/transform": ("rotation translation", "reference", ""),
     "network/first": ("source target fmap_initial", "", ""),
     "network": ("source target fmap_initial fmap weight cycle_error", "", ""),
     "latent": (
         "shape latent_basis latent_eigenvalue area_difference conformal_difference "
-        "distance_to_median",
+        "distance_to_limit",
         "median",
         "",
     ),
     "latent/shape": (
-        "latent_basis area_difference conformal_difference distance_to_median",
+        "latent_basis area_difference conformal_difference distance_to_limit",
         "",
         "",
     ),
-    "rounds": ("shape fmap latent_basis latent_eigenvalue", "", ""),
+    "iterations": ("shape fmap latent_basis latent_eigenvalue", "", ""),
     "registration": ("position corner_vertex vertex_area", "template", ""),
     "registration/shape": (
         "registered_match displacement rotation translation scale confidence template_triangle "
@@ -386,7 +386,7 @@ HOLDS = {
         "",
         "",
     ),
-    "fields": ("shape carried_field", "", ""),
+    "fields": ("shape transferred_field", "", ""),
     "subjects": ("shape", "", ""),
     "report": (
         "shape stage status reason warning path area seconds",

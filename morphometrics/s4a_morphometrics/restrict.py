@@ -253,7 +253,7 @@ def with_size(study: xr.DataTree) -> xr.DataTree:
     sized = (X + d - center) / s[:, None, None] + center - X
     part = _displaced(registration, sized.astype(d.dtype))
     part["scale"] = registration["scale"].copy(data=np.ones_like(s))
-    if "translation" in registration:  # of the motion x -> R x + t' that leaves sizes as they are
+    if "translation" in registration:  # of the transform x -> R x + t' that leaves sizes as they are
         t = registration["translation"]
         part["translation"] = t.copy(data=(t.values - center) / s[:, None] + center)
     return _study(study, part)

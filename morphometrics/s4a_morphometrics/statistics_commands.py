@@ -35,7 +35,7 @@ def fields(
 
     tree = m.with_field(s4a.open_study(study), name, folder, unit=unit, partial=partial)
     path = m.write_field(tree, name, study)
-    field = tree["fields"][name].to_dataset()["carried_field"]
+    field = tree["fields"][name].to_dataset()["transferred_field"]
     known = np.isfinite(field.values)
     write(
         f"{name} of {known.any(1).sum()} of {len(known)} shapes, "
@@ -56,7 +56,7 @@ def field_statistics(
     covariates: list[str] | None = None,
     table: str | None = None,
     variances: Literal["equal", "unequal"] = "equal",
-    keep_doubtful: bool = False,
+    include_flagged: bool = False,
     permutations: int | None = None,
     out: str | None = None,
     seed: int,
@@ -79,8 +79,8 @@ def field_statistics(
         in place of the table of the study
     variances
         of the fields around what is tested; unequal where groups scatter differently
-    keep_doubtful
-        take doubtful shapes in
+    include_flagged
+        take flagged shapes in
     permutations : N
         of every test (default: 9999, at every vertex 999, of classes 99)
     out : DIR
@@ -90,14 +90,14 @@ def field_statistics(
 
     if not (group or variable):
         raise ValueError("something to test needed: give --group COLUMN or --variable COLUMN")
-    tree, out = study_to_test(study, out, table, keep_doubtful)
+    tree, out = study_to_test(study, out, table, include_flagged)
     n = {} if permutations is None else {"n_permutations": permutations}
     options: dict[str, Any] = {"covariates": covariates, "variances": variances, "seed": seed} | n
     results = {}
     if group:
         results["group"] = m.field_group_test(tree, field, group, **options)
         results["group_map"] = m.field_group_map(tree, field, group, **options)
-        few = {"n_permutations": min(permutations or 99, 99), "seed": seed}  # each trains anew
+        few = {"n_permutations": min(permutations or 99, 99), "seed": seed}  # each trains again
         results["classification"] = m.field_classify(tree, field, group, **few)
         of = f"{field} in groups of {group}"
         write(tables.significance(results["group"], results["group_map"], of, tree))
@@ -124,7 +124,7 @@ def region_statistics(
     covariates: list[str] | None = None,
     table: str | None = None,
     variances: Literal["equal", "unequal"] = "equal",
-    keep_doubtful: bool = False,
+    include_flagged: bool = False,
     permutations: int | None = None,
     out: str | None = None,
     seed: int,
@@ -155,8 +155,8 @@ def region_statistics(
         in place of the table of the study
     variances
         of the shapes around what is tested; unequal where groups scatter differently
-    keep_doubtful
-        take doubtful shapes in
+    include_flagged
+        take flagged shapes in
     permutations : N
         of every test (default: 9999, at every vertex 999, of classes 99)
     out : DIR
@@ -164,7 +164,7 @@ def region_statistics(
     """
     if labels and not label:
         raise ValueError("--labels is where --label looks: give --label LABEL..., or leave it out")
-    tree, out = study_to_test(study, out, table, keep_doubtful)
+    tree, out = study_to_test(study, out, table, include_flagged)
     tree = restricted(tree, size_back, without, label, labels, least_confidence)
     options = {"covariates": covariates, "seed": seed, "variances": variances}
     write_statistics(tree, out, group, variable, permutations, options)
@@ -210,25 +210,25 @@ def template_labels(study: "xr.DataTree", file: str | None) -> "np.ndarray | Non
 def generalization(
     study: str,
     *,
-    keep_doubtful: bool = False,
+    include_flagged: bool = False,
     out: str | None = None,
     n_jobs: int,
     seed: int,
 ) -> int:
-    """Generalization of the modes, with the correspondences of each left-out shape found anew.
+    """Generalization of the modes, with the correspondences of each left-out shape found again.
 
     Parameters
     ----------
     study : STUDY
         its folder
-    keep_doubtful
-        take doubtful shapes in
+    include_flagged
+        take flagged shapes in
     out : DIR
         for netCDF and CSV (default: STUDY/statistics)
     """
     import s4a_morphometrics as m
 
-    tree, out = study_to_test(study, out, None, keep_doubtful)
+    tree, out = study_to_test(study, out, None, include_flagged)
     found = m.generalization(tree, n_jobs=n_jobs, seed=seed)
     s4a.analysis.export.write_results(found, out, "generalization")
     names = ("generalization", "generalization_surface")

@@ -37,7 +37,7 @@ from s4a.analysis.inputs import (
     displacements_of,
     group_sizes,
     sample_of,
-    with_doubtful,
+    with_flagged,
 )
 from s4a.analysis.model import KEPT, count_components, evaluate, leave_one_out, sample
 from s4a.analysis.permutation import Model, check_permutations, indicators
@@ -58,7 +58,7 @@ __all__ = [
     "regression",
     "regression_modes",
     "sample",
-    "with_doubtful",
+    "with_flagged",
 ]
 
 

@@ -76,7 +76,7 @@ def run(
     full = within(out, "report.txt")
     with on_cluster(cluster), lines_or_bars():
         study = s4a.analyse([*paths], store=out, **options)
-    again = shlex.join(["s4a", *(word for word in words if word != "--keep-doubtful")])
+    again = shlex.join(["s4a", *(word for word in words if word != "--include-flagged")])
     report = study["report"].to_dataset()
     lines = [tables.report_table(report), *tables.cost_lines(report)]
     full.write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -168,7 +168,7 @@ def demo(
     errors = s4a.evaluation.accuracy.accuracy(study, image, n_jobs=options["n_jobs"])
     write("", tables.error_table(errors))
     if "pca" in study:
-        write(tables.planted_line(study["pca"].to_dataset(), truth.to_dataset()))
+        write(tables.true_line(study["pca"].to_dataset(), truth.to_dataset()))
     page = Path(out) / "study.html"
     s4a.write_page(study, page, title="Synthetic brains")
     write(f"\npage: {page}")
@@ -239,7 +239,7 @@ def statistics(
     covariates: list[str] | None = None,
     table: str | None = None,
     variances: Literal["equal", "unequal"] = "equal",
-    keep_doubtful: bool = False,
+    include_flagged: bool = False,
     permutations: int | None = None,
     out: str | None = None,
     seed: int,
@@ -262,14 +262,14 @@ def statistics(
         in place of the table of the study
     variances
         of the shapes around what is tested; unequal where groups scatter differently
-    keep_doubtful
-        take doubtful shapes in
+    include_flagged
+        take flagged shapes in
     permutations : N
         of every test (default: 9999, at every vertex 999, of classes 99)
     out : DIR
         for netCDF and CSV (default: STUDY/statistics)
     """
-    tree, out = study_to_test(study, out, table, keep_doubtful)
+    tree, out = study_to_test(study, out, table, include_flagged)
     options = {"covariates": covariates, "seed": seed, "variances": variances}
     write_statistics(tree, out, group, variable, permutations, options)
     return 0
@@ -314,16 +314,16 @@ def write_moving(study: "xr.DataTree", regression: "xr.Dataset", name: str, out:
 
 
 def study_to_test(
-    study: str, out: str | None, table: str | None, keep_doubtful: bool
+    study: str, out: str | None, table: str | None, include_flagged: bool
 ) -> "tuple[xr.DataTree, str]":
     """The study with the table and the shapes that are asked for, and the folder of results."""
     tree, out = s4a.open_study(study), out or str(within(study, "statistics"))
     tree = s4a.input.subjects.with_table(tree, table) if table else tree
-    tree = s4a.statistics.with_doubtful(tree) if keep_doubtful else tree
-    if doubtful := s4a.study.tree.left_out(tree):
+    tree = s4a.statistics.with_flagged(tree) if include_flagged else tree
+    if flagged := s4a.study.tree.left_out(tree):
         write(
-            f"{len(doubtful)} doubtful shapes are left out, --keep-doubtful takes them in: "
-            f"{s4a.input.plausibility.listed(doubtful, 200)}\n"
+            f"{len(flagged)} flagged shapes are left out, --include-flagged takes them in: "
+            f"{s4a.input.plausibility.listed(flagged, 200)}\n"
         )
     return tree, out
 
@@ -345,7 +345,7 @@ def tests_of(
     of_classes = {"seed": options["seed"]}
     if permutations is not None:
         options = options | {"n_permutations": permutations}
-        of_classes["n_permutations"] = min(permutations, 99)  # each trains anew
+        of_classes["n_permutations"] = min(permutations, 99)  # each trains again
     results = {}
     if group:
         results["group"] = s4a.statistics.group_test(study, group, **options)
@@ -488,7 +488,7 @@ def transferred_rows(
         if "landmarks" in carried:
             landmarks = carried["landmarks"][name].to_dataset()
             place = landmarks["landmark_position"]
-            X = s4a.input.hands.in_file(mesh, place.values)
+            X = s4a.input.chirality.in_file(mesh, place.values)
             landmarks["landmark_position"] = place.copy(data=X)
             s4a.input.annotations.write_landmarks(out / f"{stem}.landmarks.csv", landmarks)
             of_points = tables.landmark_cells(landmarks)
@@ -511,7 +511,7 @@ def file_points(mesh: "xr.Dataset") -> "np.ndarray":
     path, label = mesh.attrs.get("path") or "", mesh.attrs.get("label")
     if Path(path).is_file():
         read = s4a.input.labels.read_volume(path, label) if label else s4a.read_mesh(path)
-        return s4a.input.hands.in_file(mesh, read[0])
+        return s4a.input.chirality.in_file(mesh, read[0])
     points = np.full((mesh.sizes["file_vertex_index"], 3), np.nan)
     points[mesh["file_vertex"].values] = mesh["position"].values
     return points
@@ -608,7 +608,7 @@ def compare_pairs(
         raise ValueError(
             f"--truth needs a file for each of the {len(files)} targets, found {len(truth)}"
         )
-    known = {name: s4a.compare.read_truth(f) for name, f in zip(names, truth or [], strict=False)}
+    known = {name: s4a.compare.read_ground_truth(f) for name, f in zip(names, truth or [], strict=False)}
     return s4a.compare.pairs(
         source,
         dict(zip(names, files, strict=True)),

@@ -26,9 +26,9 @@ def cotangents() -> Figure:
     >>> len(cotangents().axes)
     3
     """
-    figure, ((inside, rim, area),) = _plain(cotangents, 3, 9.5, 3.1)
+    figure, ((inside, boundary, area),) = _plain(cotangents, 3, 9.5, 3.1)
     i, j, above, below = np.array([[0.25, 0.5], [1.0, 0.62], [0.52, 1.05], [0.78, 0.08]])
-    for ax, corners in ((inside, (above, below)), (rim, (above,))):
+    for ax, corners in ((inside, (above, below)), (boundary, (above,))):
         for corner, color, name in zip(corners, (BLUE, ORANGE), ("α", "β"), strict=False):
             ax.add_patch(Polygon([i, j, corner], fc=SOFT["grey"], ec=GREY))
             _angle(ax, corner, i, j, color, name)
@@ -39,11 +39,11 @@ def cotangents() -> Figure:
             ax.text(*(place + shift), name, ha="center", va="center", fontsize=11, style="italic")
     inside.set_title("an edge inside has two triangles")
     inside.text(0.6, -0.12, r"$w_{ij} = \frac{1}{2}\,(\cot\alpha + \cot\beta)$", ha="center")
-    rim.set_title("an edge on the boundary has one")
-    rim.text(0.66, 0.37, "no triangle here", ha="center", color=GREY)
-    rim.text(0.6, -0.12, r"$w_{ij} = \frac{1}{2}\,\cot\alpha$", ha="center")
+    boundary.set_title("an edge on the boundary has one")
+    boundary.text(0.66, 0.37, "no triangle here", ha="center", color=GREY)
+    boundary.text(0.6, -0.12, r"$w_{ij} = \frac{1}{2}\,\cot\alpha$", ha="center")
     _areas_around(area)
-    for ax in (inside, rim, area):
+    for ax in (inside, boundary, area):
         ax.set(xlim=(0.08, 1.18), ylim=(-0.22, 1.15))
         ax.set_aspect("equal")
     return figure

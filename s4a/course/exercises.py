@@ -188,7 +188,7 @@ def _loop(Y, *cycle):
     return np.linalg.norm(C - np.eye(len(C))) / np.sqrt(len(C))
 
 
-def _correlation_carried(pair, field):
+def _correlation_transferred(pair, field):
     there = transfer_scalars(pair, field.parts["left"], source="left")["right/field"]
     return np.corrcoef(np.asarray(there), field.parts["right"])[0, 1]
 
@@ -206,7 +206,7 @@ def _moved_by_age(fit, years):
 # what is right, of what the cell gives after the answer: a value, or a function of the answer that
 # says whether it is
 EXERCISES: dict[str, Any] = {
-    "00.1": lambda study: study["latent"]["distance_to_median"].idxmin().item(),
+    "00.1": lambda study: study["latent"]["distance_to_limit"].idxmin().item(),
     "00.2": lambda study: study["pca"]["explained_variance_ratio"].values[:2].sum(),
     "00.3": lambda study: abs(study["pca"]["score"][:, 0]).idxmax().item(),
     "01.1": lambda report: report["components"].sel(shape="brain_01").item(),
@@ -237,7 +237,7 @@ EXERCISES: dict[str, Any] = {
         lambda mean: np.shape(mean) == D.shape[1:] and np.allclose(mean, D.mean(0), atol=1e-6)
     ),
     "07.2": lambda: lambda d: abs(d) < 1e-12,
-    "07.3": lambda latent: latent["distance_to_median"].values,
+    "07.3": lambda latent: latent["distance_to_limit"].values,
     "08.1": 10**10,
     "08.2": lambda: lambda gap: 0 <= gap < 1e-6,
     "08.3": lambda match, n: 1 - np.unique(match).size / n,
@@ -271,7 +271,7 @@ EXERCISES: dict[str, Any] = {
     ),
     "13.3": lambda study: study["coarse/subject_4/eigenfunction"].shape[0],
     "14.1": lambda mesh: triangle_areas(*as_arrays(mesh)).sum() / 100,
-    "14.2": _correlation_carried,
+    "14.2": _correlation_transferred,
     "14.3": lambda field, own, confidence: np.corrcoef(
         *(v[confidence <= np.median(confidence)] for v in (field, own))
     )[0, 1],

@@ -1,4 +1,4 @@
-"""Pictures of the notebooks that sliders draw anew, and those that sum up a lesson."""
+"""Pictures of the notebooks that sliders draw again, and those that sum up a lesson."""
 
 import io
 from collections.abc import Callable
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def slide(draw: "Callable[..., Figure]", **sliders: "ipywidgets.Widget") -> "ipywidgets.VBox":
-    """A figure that sliders draw anew.
+    """A figure that sliders draw again.
 
     Unlike ``ipywidgets.interact`` it captures no output, for which programs that run notebooks may
     wait without end; the picture is the value of an image.

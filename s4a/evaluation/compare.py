@@ -30,12 +30,12 @@ from s4a.evaluation.methods import (
     Pair,
     Spaces,
 )
-from s4a.geometry.align import align, motion_between, realign
+from s4a.geometry.align import align, relative_transform, realign
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.input.collection import read_shape, read_shapes
 from s4a.input.raw import content, npy, shown, text_of
 from s4a.method import latent, median, network
-from s4a.method.first_map import map_after_motion
+from s4a.method.initial_map import map_after_alignment
 from s4a.method.register import latent_functions, log_area_ratio, match_functions, match_low
 from s4a.method.shape import Basis, Shape
 from s4a.options import PRESETS as STUDY_PRESETS
@@ -48,12 +48,12 @@ log = logging.getLogger(__name__)
 __all__ = ["COLLECTION_METHODS", "METHODS", "collection", "pair", "pairs"]
 
 COLLECTION_METHODS = ("SCALABLE", "RE-MATCH")
-COLLECTION_BLOCKS = BLOCKS[0], "basis and first maps", "consistent ZoomOut", BLOCKS[-1]
+COLLECTION_BLOCKS = BLOCKS[0], "basis and initial maps", "consistent ZoomOut", BLOCKS[-1]
 HOW = ("standard", "ours")
-# rounds of RE-MATCH lifted, and first maps of all methods
+# iterations of RE-MATCH lifted, and initial maps of all methods
 PRESETS: dict[str | None, dict[str, Any]] = {
-    None: {"sharpen": 2, "init": "landmarks"},
-    "paper": {"sharpen": 0, "init": "landmarks"},
+    None: {"full_resolution_iterations": 2, "init": "landmarks"},
+    "paper": {"full_resolution_iterations": 0, "init": "landmarks"},
 }
 
 
@@ -102,7 +102,7 @@ def in_mesh(vertices: np.ndarray, mesh: xr.Dataset) -> np.ndarray:
     return np.where(vertices >= 0, became[np.maximum(vertices, 0)], -1)
 
 
-def truth_in_meshes(truth: np.ndarray, source: xr.Dataset, target: xr.Dataset) -> np.ndarray:
+def ground_truth_in_meshes(truth: np.ndarray, source: xr.Dataset, target: xr.Dataset) -> np.ndarray:
     """Truth over the rows of the target's file.
 
     Which are rows of the source's file or positions, for the meshes.
@@ -124,7 +124,7 @@ def truth_in_meshes(truth: np.ndarray, source: xr.Dataset, target: xr.Dataset) -
     return truth if truth.ndim == 2 else in_mesh(truth, source)
 
 
-def read_truth(path: Path | str) -> np.ndarray:
+def read_ground_truth(path: Path | str) -> np.ndarray:
     """Truth from a file, for the vertices of the target's file.
 
     NPY, or text with a number or three in each row.
@@ -190,7 +190,7 @@ def pairs(
     k: int = 100,
     step: int = 5,
     preset: str | None = None,
-    sharpen: int | None = None,
+    full_resolution_iterations: int | None = None,
     init: str | None = None,
     n_geodesic: int = 1000,
     keep: bool = False,
@@ -204,8 +204,8 @@ def pairs(
     SCALABLE: the same in the space of :mod:`s4a.method.scalable`.  RE-MATCH: the same on the
     low-resolution mesh, and eq. 4 with U Phi, as ``s4a.match_pair(..., preset="paper")``.
 
-    Ours are RE-MATCH lifted: with the eigenfunctions of :mod:`s4a.method.lift` in the place of
-    U Phi, and the last two rounds of ZoomOut look among all vertices of the source; registered:
+    Ours are RE-MATCH lifted: with the eigenfunctions of :mod:`s4a.method.refined_eigenfunctions` in the place of
+    U Phi, and the last two iterations of ZoomOut look among all vertices of the source; registered:
     the default of ``s4a.match_pair`` after RE-MATCH, of which the matched vertices are compared, as
     of all others; and registered surface: the same, of which the surface is.
 
@@ -235,13 +235,13 @@ def pairs(
         the time of that block of ZO and FMAP+ZO; on a child of 60,000 vertices in two poses they
         end 7 to 9 % farther from the truth.
     preset : {None, "paper"}
-        ``"paper"`` leaves out our methods and sets sharpen=0 and init="landmarks"; another value
+        ``"paper"`` leaves out our methods and sets full_resolution_iterations=0 and init="landmarks"; another value
         of these is refused.
-    sharpen : int, optional
+    full_resolution_iterations : int, optional
         Rounds of ZoomOut of RE-MATCH lifted that look among all vertices of the source, 2 by
         default.
     init : {"landmarks", "descriptors"}, optional
-        First maps of all methods but kNN and ZO from heat kernels around landmarks (default), as in
+        Initial maps of all methods but kNN and ZO from heat kernels around landmarks (default), as in
         :func:`s4a.match_pair` with the preset, or from wave kernels of the shapes and around
         landmarks, as pyFM has them.
     n_geodesic : int
@@ -277,9 +277,9 @@ def pairs(
     >>> found["chamfer"].sel(pair="itself", way="kNN").item()
     0.0
     """
-    settings = apply_preset(preset, {"sharpen": sharpen, "init": init}, PRESETS)
+    settings = apply_preset(preset, {"full_resolution_iterations": full_resolution_iterations, "init": init}, PRESETS)
     seed = seed_of(seed, rng)
-    check_count("sharpen", settings["sharpen"])
+    check_count("full_resolution_iterations", settings["full_resolution_iterations"])
     check_choice("init", settings["init"], INITS)
     check_switch("keep", keep)
     methods = checked_methods(methods, preset)
@@ -299,7 +299,7 @@ def pairs(
             marks = None if landmarks is None else landmarks_of(landmarks[name], M, N, in_memory)
             true = None if truth is None else truth[name]
             if true is not None and not in_memory:
-                true = truth_in_meshes(true, M.mesh, N.mesh)
+                true = ground_truth_in_meshes(true, M.mesh, N.mesh)
             both = Pair(M, N, marks, **options)
             row, outcomes = metrics_of_pair(
                 both, methods, load_source + load_target, true, n_geodesic
@@ -348,7 +348,7 @@ def kept(
         target lie on the source, in its unit, ``way_reverse(way, source_vertex)``, the match the
         other way, and ``way_area(way, vertex)``, the log area ratio of
         :func:`s4a.method.register.log_area_ratio`; where a method of them has maps, ``way_fmap(way,
-        mode_target, mode_source)`` and ``way_fmap_initial``, NaN for the others; with truth
+        eigenpair_target, eigenpair_source)`` and ``way_fmap_initial``, NaN for the others; with truth
         ``true_position(vertex, xyz)``, ``true_match(vertex)`` and ``way_error(way, vertex)``, the
         distance to it in a straight line as a share of sqrt(area), NaN where it is unknown.
     """
@@ -443,7 +443,7 @@ def collection(
     step: int = 5,
     preset: str | None = None,
     init: str | None = None,
-    n_spread: int | None = None,
+    n_samples: int | None = None,
     wide: int | None = None,
     seed: int = 0,
     rng: RNG | None = None,
@@ -461,9 +461,9 @@ def collection(
     n_coarse, n_pairs, k_init, k, step, seed, rng
         See :func:`s4a.analyse`.
     preset : {None, "paper"}
-        ``"paper"`` sets init="landmarks", n_spread=0 and wide=0; another value of these is refused.
-    init, n_spread, wide
-        First maps, those of nearest neighbours after alignment by default, and Consistent ZoomOut,
+        ``"paper"`` sets init="landmarks", n_samples=0 and wide=0; another value of these is refused.
+    init, n_samples, wide
+        Initial maps, those of nearest neighbours after alignment by default, and Consistent ZoomOut,
         see :func:`s4a.analyse`.
 
     Returns
@@ -472,7 +472,7 @@ def collection(
         ``collection_chamfer(way, how, shape)``, eq. 9 between each shape and the image of the
         median shape, the template, as a share of sqrt(area), NaN for the template;
         ``collection_seconds(way, how, block)``, CPU seconds of one core, full resolution alone
-        differing by ``how``; ``median_shape(way)`` and ``distance_to_median(way, shape)``.  The
+        differing by ``how``; ``median_shape(way)`` and ``distance_to_limit(way, shape)``.  The
         attribute ``note`` says where k had to be reduced.
 
     Raises
@@ -490,7 +490,7 @@ def collection(
     ('way', 'how', 'shape')
     """
     check_some(methods, COLLECTION_METHODS)
-    given: dict[str, Any] = {"init": init, "n_spread": n_spread, "wide": wide}
+    given: dict[str, Any] = {"init": init, "n_samples": n_samples, "wide": wide}
     presets = {name: {key: STUDY_PRESETS[name][key] for key in given} for name in (None, "paper")}
     given = apply_preset(preset, given, presets) | {"seed": seed_of(seed, rng)}
     given |= {"n_coarse": n_coarse, "n_pairs": n_pairs, "k_init": k_init, "k": k, "step": step}
@@ -519,9 +519,9 @@ def one_collection(
     shapes = [space.local if way == "SCALABLE" else space.coarse for space in spaces]
     bases = [shape.low for shape in shapes]
     k = min(options.k, *(basis.k for basis in bases))
-    source, target, maps = first_maps(bases, options)
+    source, target, maps = initial_maps(bases, options)
     shared = [load, time.process_time() - begin]
-    samples = [basis.spread_vertices(options.n_spread) for basis in bases]
+    samples = [basis.sample_vertices_of(options.n_samples) for basis in bases]
     growth: dict[str, Any] = {"step": options.step, "samples": samples, "wide": options.wide}
     ends = source, target, k
     *_, Y, low = clock("latent", latent.consistent_zoomout, bases, maps, *ends, **growth)
@@ -540,30 +540,30 @@ def one_collection(
     }
     table = xr.Dataset(
         {name: variable(name, values[None]).isel(way=0) for name, values in measures.items()}
-        | {"distance_to_median": found["distance_to_median"].variable},
+        | {"distance_to_limit": found["distance_to_limit"].variable},
         attrs=note_on_k(options.k, k),
     )
     return table.assign_coords(how=list(HOW), block=list(COLLECTION_BLOCKS), shape=names)
 
 
-def first_maps(bases: list[Basis], options: Options) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """First maps of a network, both ways: sources and targets ``(p,)``, maps ``(p, k, k)``."""
+def initial_maps(bases: list[Basis], options: Options) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Initial maps of a network, both ways: sources and targets ``(p,)``, maps ``(p, k, k)``."""
     k_init = min(options.k_init, *(basis.k for basis in bases))
     distance = network.spectral_distance([basis.eigenvalue[:k_init] for basis in bases])
     reference = bases[int(np.argmin(distance.sum(1)))]
     still = np.eye(3), np.zeros(3)
-    motions = [
+    transforms = [
         still if M is reference else align(M.X, M.area, reference.X, reference.area)[:2]
         for M in bases
     ]
     settings: dict[str, Any] = {"k_init": k_init, "init": options.init}
-    settings["n_spread"] = options.n_spread
+    settings["n_samples"] = options.n_samples
     ends, maps = [], []
     for i, j in network.choose_pairs(distance, options.n_pairs):
         M, N = bases[i], bases[j]
-        R, t = realign(M.cloud, N.cloud, motion_between(motions[i], motions[j]))
-        maps.append(map_after_motion(M, N, (R, t), **settings).C)
-        maps.append(map_after_motion(N, M, (R.T, -R.T @ t), **settings).C)
+        R, t = realign(M.cloud, N.cloud, relative_transform(transforms[i], transforms[j]))
+        maps.append(map_after_alignment(M, N, (R, t), **settings).C)
+        maps.append(map_after_alignment(N, M, (R.T, -R.T @ t), **settings).C)
         ends += [(i, j), (j, i)]
     return *np.array(ends).T, np.stack(maps)
 

@@ -188,7 +188,7 @@ def spectrum(mesh: xr.Dataset, *, k: int = 100) -> xr.Dataset:
     if "edge_mass" in mesh:
         raise ValueError(
             "a low-resolution mesh of s4a.coarsen needed; samples of SCALABLE come with their "
-            "spectrum: make them anew with another k"
+            "spectrum: make them again with another k"
         )
     n = mesh.sizes["vertex"]
     possible = min(int(k), n - 2)

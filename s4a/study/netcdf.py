@@ -56,7 +56,7 @@ def damage_named(path: Path | str) -> Iterator[None]:
     except Exception as error:  # HDF5, h5py and NumPy each have their own ways with damage
         raise DamagedError(
             f"{path} cannot be read ({error}): remove it and run the analysis again, "
-            "which makes it anew and nothing else"
+            "which makes it again and nothing else"
         ) from error
 
 
@@ -157,7 +157,7 @@ class Stored(BackendArray):
         )
 
     def part(self, key: Any) -> np.ndarray:
-        """Read the selection from the file; ValueError where it was written anew."""
+        """Read the selection from the file; ValueError where it was written again."""
         with open_hdf5(self.file) as file:
             same = os.stat(self.file).st_mtime_ns == self.written  # or by the same run again
             if same := same or values_of(file, CONTENTS).tobytes() == self.stamp:
@@ -165,7 +165,7 @@ class Stored(BackendArray):
                 check_indices(Path(self.path).name, values, self.sizes)
         if not same:
             raise ValueError(
-                f"{self.file} was written anew since it was opened; open the study again"
+                f"{self.file} was written again since it was opened; open the study again"
             )
         return values[key]
 

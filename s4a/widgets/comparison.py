@@ -16,7 +16,7 @@ from s4a.show.draw import OKABE_ITO, SIGNED, position_colors, ramp_colors, signe
 from s4a.show.surfaces import mesh_of
 from s4a.widgets.correspondence import inverse
 from s4a.widgets.panel import WIDE, Panel, dropdown, grid, row
-from s4a.widgets.views import extent, round_number
+from s4a.widgets.views import extent, iteration_number
 
 SHOWN = [
     ("coordinates of the source", "place"),
@@ -39,7 +39,7 @@ FULL_AREA = 2.0  # doublings of the area that the colours reach
 MARKS = [to_rgb(OKABE_ITO[i]) for i in (5, 4, 2, 6, 0, 1, 7)]
 
 
-def with_truth(found: xr.Dataset, n_source: int) -> xr.Dataset:
+def with_ground_truth(found: xr.Dataset, n_source: int) -> xr.Dataset:
     """What was found on a pair, with the truth as one more method, where it is known."""
     if "true_position" not in found:
         return found
@@ -109,7 +109,7 @@ class Comparison(Panel):
     def build(self, methods: Any = None) -> list[ipywidgets.Widget]:
         """Choices, the source, and the target by each method."""
         self.pairs = {
-            name: with_truth(node.to_dataset(), self.study["source"].sizes["vertex"])
+            name: with_ground_truth(node.to_dataset(), self.study["source"].sizes["vertex"])
             for name, node in self.study["pairs"].children.items()
         }
         each = [one["way"].values.astype(str).tolist() for one in self.pairs.values()]
@@ -168,7 +168,7 @@ class Comparison(Panel):
     def paint(self) -> None:
         """The colours of all views."""
         X, _ = self.surfaces[0]
-        self.cell = round_number(extent(X) / CELLS)
+        self.cell = iteration_number(extent(X) / CELLS)
         checker = self.colors.value == "checker"
         plain = self.colors.value in ("area", "error")
         colors = None if plain else position_colors(X)

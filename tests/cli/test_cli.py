@@ -39,7 +39,7 @@ def test_run_ends_well_and_says_what_it_found(ran):
     assert result.returncode == 0, result.stderr
     assert (study / "pca.nc").exists()
     for words in (
-        "4 shapes: 4 ok, 0 repaired, 0 doubtful, 0 excluded",
+        "4 shapes: 4 ok, 0 repaired, 0 flagged, 0 excluded",
         "median shape: brain_",
         "variance explained:",
         " MiB",
@@ -192,7 +192,7 @@ def test_demo_finds_the_planted_modes_and_writes_its_page(tmp_path, monkeypatch,
         == 0
     )
     said = capsys.readouterr().out
-    assert "correlation of planted and recovered scores" in said
+    assert "correlation of simulated and recovered scores" in said
     assert said.index("modes.png") < said.index("S4A, registered surface")  # a picture first
     assert (out / "study.html").exists()
 

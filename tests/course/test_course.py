@@ -285,8 +285,8 @@ def test_a_diagram_is_shown_part_by_part_with_words_for_who_does_not_see_it(name
     for ax, data in zip(figure.axes, re.findall(r"base64,([^\"]+)", shown), strict=True):
         picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("L"))
         assert min(picture.shape) > 300, ax.get_title()
-        rim = np.r_[picture[0], picture[-1], picture[:, 0], picture[:, -1]]
-        assert (rim > 250).mean() > 0.99, "nothing is cut"
+        boundary = np.r_[picture[0], picture[-1], picture[:, 0], picture[:, -1]]
+        assert (boundary > 250).mean() > 0.99, "nothing is cut"
 
 
 def test_pictures_of_surfaces_wrap_in_a_row_and_stay_together_in_rows():

@@ -41,7 +41,7 @@ def test_every_method_has_every_metric_and_its_time_by_block(found):
     assert found.sizes["pair"] == 2
     for name in (
         "geodesic_error",
-        "straight_error",
+        "euclidean_error",
         "chamfer",
         "hausdorff",
         "dirichlet",
@@ -71,7 +71,7 @@ def test_maps_of_low_resolution_take_less_time_than_those_of_dense_meshes(found)
 
 
 def test_the_default_is_nearer_to_the_truth_than_every_other_method(found):
-    error = found["straight_error"].mean("pair")
+    error = found["euclidean_error"].mean("pair")
     others = error.drop_sel(way=["registered", "registered surface"])
     assert error.sel(way="registered") < 0.9 * others.min()
 
@@ -158,8 +158,8 @@ def test_what_is_wrong_is_said(three_brains):
         compare.pair(source, target, methods=["ICP"])
     with pytest.raises(ValueError, match=r"the methods kNN.*found RE-MATCH lifted, registered"):
         compare.pair(source, target, methods=["kNN", *compare.METHODS[-3:]], preset="paper")
-    with pytest.raises(ValueError, match="preset 'paper' sets sharpen=0; found sharpen=1"):
-        compare.pair(source, target, preset="paper", sharpen=1)
+    with pytest.raises(ValueError, match="preset 'paper' sets full_resolution_iterations=0; found full_resolution_iterations=1"):
+        compare.pair(source, target, preset="paper", full_resolution_iterations=1)
     with pytest.raises(ValueError, match="init must be one of 'landmarks', 'descriptors'"):
         compare.pair(source, target, init="dense")
     with pytest.raises(ValueError, match="landmarks need two arrays"):
@@ -183,7 +183,7 @@ def test_both_ways_to_full_resolution_share_all_but_the_last_block(three_brains)
         template = found["median_shape"].sel(way=way).item()
         known = found["collection_chamfer"].sel(way=way).drop_sel(shape=template)
         assert (known < 0.06).all()
-        assert found["distance_to_median"].sel(way=way).idxmin().item() == template
+        assert found["distance_to_limit"].sel(way=way).idxmin().item() == template
 
 
 def test_small_meshes_are_compared_in_as_many_functions_as_they_have_and_a_note_says_so(caplog):

@@ -1,6 +1,6 @@
 """Registration at full resolution (eq. 4, 6, 7).
 
-Itself, a planted deformation, invariance, the way back.
+Itself, a simulated deformation, invariance, the way back.
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ from s4a.method.register import confidence
 from s4a.method.shape import Shape
 
 OPTIONS = {"n_coarse": 2000, "k": 60}
-STILL = np.eye(3), np.zeros(3)  # no motion
+STILL = np.eye(3), np.zeros(3)  # no transform
 
 
 def bumps(X, size):

@@ -7,7 +7,7 @@ import s4a
 from s4a import coarsen, reconstruct, spectrum, synthetic
 from s4a.geometry.mesh import as_dataset, cotan_weights, vertex_areas
 from s4a.method import spectral
-from s4a.method.lift import low_resolution
+from s4a.method.refined_eigenfunctions import low_resolution
 from s4a.schema import dataset
 
 SPHERE = np.repeat([0.0, 2.0, 6.0, 12.0], [1, 3, 5, 7]) * 4 * np.pi  # l (l + 1), for unit area

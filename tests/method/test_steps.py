@@ -107,7 +107,7 @@ def test_words_that_options_cannot_be_are_refused_with_those_that_they_can(study
 
 def test_a_latent_space_as_large_as_maps_that_are_reduced_is_reduced_with_them():
     study = s4a.analyse(s4a.synthetic.brains(3, 300), n_coarse=100, n_latent=100)
-    k = study["network"].sizes["mode_source"]
+    k = study["network"].sizes["eigenpair_source"]
     assert k < 100
     assert study["latent"]["latent_basis"].shape == (3, k, k)
 
@@ -117,9 +117,9 @@ def test_a_latent_space_as_large_as_maps_that_are_reduced_is_reduced_with_them()
     [
         ({"step": 0}, "step must be an integer of at least 1; found 0"),
         ({"step": -1}, "step must be an integer of at least 1; found -1"),
-        ({"k": 6}, "k must be at least 10, as first maps; found 6"),
+        ({"k": 6}, "k must be at least 10, as initial maps; found 6"),
         ({"k": 12, "n_latent": 13}, "n_latent must be at most k = 12; found 13"),
-        ({"n_spread": 47}, "need 48 spread vertices or more; found 47: give n_spread=48"),
+        ({"n_samples": 47}, "need 48 spread vertices or more; found 47: give n_samples=48"),
     ],
 )
 def test_sizes_that_do_not_fit_each_other_are_refused_by_name(study, coarse, options, message):
@@ -130,30 +130,30 @@ def test_sizes_that_do_not_fit_each_other_are_refused_by_name(study, coarse, opt
 def test_as_few_spread_vertices_as_are_allowed_refine_identical_shapes_to_the_identity(coarse):
     same = dict.fromkeys("abc", coarse["brain_01"])
     first = s4a.build_network(same, k_init=10)
-    for n_spread in (48, 0):
-        maps = s4a.refine_network(same, first, k=24, n_spread=n_spread)["network/fmap"].values
+    for n_samples in (48, 0):
+        maps = s4a.refine_network(same, first, k=24, n_samples=n_samples)["network/fmap"].values
         assert np.abs(maps - np.eye(24)).max() < 1e-5
 
 
 def test_spread_vertices_are_enough_where_they_are_all_of_a_small_mesh(coarse):
     small = {name: mesh.isel(mode=slice(12)) for name, mesh in coarse.items()}
     first = s4a.build_network(small, k_init=10)
-    assert s4a.refine_network(small, first, k=100, n_spread=50)["network/fmap"].shape[1:] == (
+    assert s4a.refine_network(small, first, k=100, n_samples=50)["network/fmap"].shape[1:] == (
         12,
         12,
     )
     every = max(mesh.sizes["vertex"] for mesh in coarse.values())
     k = min(100, *(mesh.sizes["mode"] for mesh in coarse.values()))
-    s4a.refine_network(coarse, first, k=k, n_spread=every)
+    s4a.refine_network(coarse, first, k=k, n_samples=every)
 
 
 def test_options_refuse_spread_vertices_too_few_for_k_and_no_preset_of_their_own():
     with pytest.raises(
-        ValueError, match="n_spread must be 0, for all vertices, or at least 200, f"
+        ValueError, match="n_samples must be 0, for all vertices, or at least 200, f"
     ):
-        Options(n_spread=150)
-    for given in ({"n_spread": 200}, {"n_spread": 0}, {"n_coarse": 150, "n_spread": 150}):
-        assert Options(**given).n_spread == given["n_spread"]
+        Options(n_samples=150)
+    for given in ({"n_samples": 200}, {"n_samples": 0}, {"n_coarse": 150, "n_samples": 150}):
+        assert Options(**given).n_samples == given["n_samples"]
     for preset in (None, "paper", "fast"):
         assert Options(preset=preset, k=600).k == 600
 
@@ -165,10 +165,10 @@ def test_the_template_is_registered_to_itself_by_definition(study):
 
 def test_a_mesh_aligned_to_itself_stays(coarse):
     mesh = coarse["brain_01"]
-    motion = s4a.align_pair(mesh, mesh)
-    assert motion["rotation"].values == pytest.approx(np.eye(3), abs=1e-9)
-    assert motion["translation"].values == pytest.approx(np.zeros(3), abs=1e-9)
-    assert motion.attrs["residual"] == pytest.approx(0, abs=1e-9)
+    transform = s4a.align_pair(mesh, mesh)
+    assert transform["rotation"].values == pytest.approx(np.eye(3), abs=1e-9)
+    assert transform["translation"].values == pytest.approx(np.zeros(3), abs=1e-9)
+    assert transform.attrs["residual"] == pytest.approx(0, abs=1e-9)
 
 
 def test_what_lacks_is_named(study, coarse):

@@ -38,12 +38,12 @@ def assert_same(one, other):
 
 
 def files(folder):
-    """Time and size of every result of a folder; what is put together anew in each run left out."""
-    anew = ("report.nc", "registration.nc", "pca.nc", ".lock", ".progress.json")
+    """Time and size of every result of a folder; what is put together again in each run left out."""
+    again = ("report.nc", "registration.nc", "pca.nc", ".lock", ".progress.json")
     return {
         p: (p.stat().st_mtime_ns, p.stat().st_size)
         for p in folder.rglob("*")
-        if p.is_file() and p.name not in anew
+        if p.is_file() and p.name not in again
     }
 
 
@@ -54,7 +54,7 @@ def test_a_study_has_all_stages_and_says_what_it_did(study, brains):
     registration, report = study["registration"].to_dataset(), study["report"].to_dataset()
     template = registration.attrs["template"]
     assert template == study["latent"].attrs["median"]
-    assert template == study["latent"]["distance_to_median"].idxmin().item()
+    assert template == study["latent"]["distance_to_limit"].idxmin().item()
     assert registration["displacement"].sizes == {"shape": 4, "vertex": 1500, "xyz": 3}
     assert (registration["displacement"].sel(shape=template) == 0).all()
     assert (registration["confidence"].sel(shape=template) == 1).all()
@@ -293,7 +293,7 @@ def test_shapes_that_differ_in_pose_alone_do_not_differ(arrays):
     R = Rotation.from_rotvec([0.05, 0.1, 0]).as_matrix()
     tree = analyse({"a": (X, T), "b": (X, T), "c": (X @ R.T + 9, T)}, **OPTIONS)
     assert np.abs(tree["registration"]["displacement"]).max() < 1e-3
-    assert tree["latent"]["distance_to_median"].max() < 1e-3
+    assert tree["latent"]["distance_to_limit"].max() < 1e-3
     assert tree["network"]["cycle_error"].max() < 1e-3
 
 
@@ -304,8 +304,8 @@ def test_shapes_that_differ_in_pose_alone_do_not_differ(arrays):
         ("aaa", "PCA needs shapes that differ; all displacements are equal"),
         (
             "aab",
-            "PCA needs at least 3 shapes, found 2; 1 doubtful shapes are left out, "
-            "keep_doubtful=True takes them in",
+            "PCA needs at least 3 shapes, found 2; 1 flagged shapes are left out, "
+            "include_flagged=True takes them in",
         ),
     ],
 )
@@ -379,7 +379,7 @@ def test_one_usable_shape_is_not_enough_and_the_reasons_are_named(arrays):
             r"preset 'paper' sets wide=0; found wide=2: leave out one of both",
         ),
         ({"lift": 1}, r"lift must be True or False; found 1"),
-        ({"n_spread": -1}, r"n_spread must be an integer of at least 0; found -1"),
+        ({"n_samples": -1}, r"n_samples must be an integer of at least 0; found -1"),
         ({"ahead": "once"}, r"ahead must be one of 'always', 'network', 'never'"),
         ({"seed": -1}, r"seed must be an integer of at least 0; found -1"),
     ],

@@ -27,9 +27,9 @@ def three(meshes):
 
 @pytest.fixture(scope="module")
 def paper(three, tmp_path_factory):
-    """The folder of their study, as in the paper, with holes closed and rounds kept."""
+    """The folder of their study, as in the paper, with holes closed and iterations kept."""
     folder = tmp_path_factory.mktemp("paper") / "study"
-    options = {"preset": "paper", "close_holes": True, "keep_rounds": True}
+    options = {"preset": "paper", "close_holes": True, "keep_iterations": True}
     s4a.analyse(three, store=folder, **options, **OPTIONS).close()
     return folder
 
@@ -66,7 +66,7 @@ def test_an_option_that_the_preset_fixes_is_refused_by_name(meshes):
         given = {"preset": "paper", name: DEFAULTS[name]}
         with pytest.raises(ValueError, match=message):
             Options(**given)
-        if name not in ("n_spread", "wide"):  # which are of a network
+        if name not in ("n_samples", "wide"):  # which are of a network
             with pytest.raises(ValueError, match=message):
                 s4a.match_pair(source, target, **given)
             with pytest.raises(ValueError, match=message):
@@ -113,12 +113,12 @@ def test_pairs_of_the_paper_are_matched_one_way_after_icp_alone(three):
 def test_lifted_functions_are_orthonormal_on_the_original_mesh_and_are_what_is_compared(three):
     study = s4a.analyse(three, lift=True, refine="intrinsic", **OPTIONS)
     name = study["registration"].attrs["template"]
-    B = study["coarse"][name]["lifted_eigenfunction"].values
+    B = study["coarse"][name]["refined_eigenfunction"].values
     area = study["registration"]["vertex_area"].values
     assert B.T @ (area[:, None] / area.sum() * B) == pytest.approx(np.eye(B.shape[1]), abs=0.05)
     Y = study["latent"]["latent_basis"]
     for other in set(three) - {name}:
-        F = study["coarse"][other]["lifted_eigenfunction"].values @ Y.sel(shape=other).values
+        F = study["coarse"][other]["refined_eigenfunction"].values @ Y.sel(shape=other).values
         distance = cdist(B @ Y.sel(shape=name).values, F)
         match = study["registration"]["registered_match"].sel(shape=other).values
         assert np.allclose(distance[np.arange(len(B)), match], distance.min(1), rtol=1e-3)
@@ -126,12 +126,12 @@ def test_lifted_functions_are_orthonormal_on_the_original_mesh_and_are_what_is_c
 
 def test_rounds_are_opened_and_go_when_they_are_not_asked_for(three, paper, tmp_path):
     with s4a.open_study(paper) as study:
-        assert sorted(study["rounds"].children) == ["k_010", "k_015", "k_020", "k_024"]
-        assert study["rounds/k_015/fmap"].shape == (6, 15, 15)
+        assert sorted(study["iterations"].children) == ["k_010", "k_015", "k_020", "k_024"]
+        assert study["iterations/k_015/fmap"].shape == (6, 15, 15)
     again = shutil.copytree(paper, tmp_path / "again")
     with s4a.analyse(three, store=again, preset="paper", close_holes=True, **OPTIONS) as study:
-        assert "rounds" not in study.children
-    assert not list(again.glob("rounds/*"))
+        assert "iterations" not in study.children
+    assert not list(again.glob("iterations/*"))
 
 
 def test_a_new_shape_is_cleaned_and_registered_by_the_options_of_the_study(paper, meshes):
@@ -232,10 +232,10 @@ def test_a_transfer_refuses_by_name_what_its_preset_fixes(what, study, paper, me
         with pytest.raises(ValueError, match=message):
             carry(fixed, source=external, both=True)
         assert seen == []
-        carry(fixed, source=external, targets=["brain_01"], preset=None, both=False, sharpen=0)
+        carry(fixed, source=external, targets=["brain_01"], preset=None, both=False, full_resolution_iterations=0)
     assert {name: getattr(seen[0], name) for name in DEFAULTS} == DEFAULTS | {
         "both": False,
-        "sharpen": 0,
+        "full_resolution_iterations": 0,
     }
 
 
@@ -285,9 +285,9 @@ def test_the_commands_take_the_preset_between_files_and_to_a_study(
     assert (seen[0].preset, seen[0].k) == ("paper", OPTIONS["k"])
     assert main([*to[:2], str(paper), *to[2:], "--k", "20", "--preset", "paper"]) == 0
     assert (seen[1].preset, seen[1].k) == ("paper", 20)
-    assert main([*to[:2], str(paper), *to[2:], "--sharpen", "1"]) == 2
-    assert "preset 'paper' sets sharpen=0; found sharpen=1" in capsys.readouterr().err
-    assert main([*to[:2], target, *to[2:], "--preset", "paper", "--sharpen", "1"]) == 2
-    assert "preset 'paper' sets sharpen=0; found sharpen=1" in capsys.readouterr().err
+    assert main([*to[:2], str(paper), *to[2:], "--full_resolution_iterations", "1"]) == 2
+    assert "preset 'paper' sets full_resolution_iterations=0; found full_resolution_iterations=1" in capsys.readouterr().err
+    assert main([*to[:2], target, *to[2:], "--preset", "paper", "--full_resolution_iterations", "1"]) == 2
+    assert "preset 'paper' sets full_resolution_iterations=0; found full_resolution_iterations=1" in capsys.readouterr().err
     assert main(["compare", source, target, "--preset", "paper", "--methods", "registered"]) == 2
     assert "preset 'paper' has the methods kNN, ZO, FMAP+ZO" in capsys.readouterr().err

@@ -438,7 +438,7 @@ def test_verify_says_in_one_line_what_holds_and_its_exit_code_whether(folder, ca
     first, *lines = capsys.readouterr().out.splitlines()
     assert "1 damaged" in first
     assert "1 missing" in first
-    assert "the same `s4a run` again makes what is wrong anew" in first
+    assert "the same `s4a run` again makes what is wrong again" in first
     assert sorted(line.split(",")[0].strip() for line in lines) == [
         "network/motion_brain_04.nc",
         "notes.txt",

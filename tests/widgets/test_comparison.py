@@ -59,7 +59,7 @@ def test_what_is_kept_agrees_with_the_table(found):
             if way != "registered surface":
                 np.testing.assert_allclose(image, X[match], atol=1e-4)
             error = kept["way_error"].sel(way=way)
-            assert float(error.mean()) == pytest.approx(one["straight_error"].sel(way=way).item())
+            assert float(error.mean()) == pytest.approx(one["euclidean_error"].sel(way=way).item())
             Y, T = kept["position"].values, kept["corner_vertex"].values
             expected = log_area_ratio(image.values.astype(float), Y, T)
             np.testing.assert_allclose(kept["way_area"].sel(way=way), expected, atol=1e-3)
@@ -104,12 +104,12 @@ def test_errors_have_one_scale_and_the_mean_is_told(found, panel):
     bars = [scene.bar for scene in shown.scenes[1:]]
     assert bars[0] == bars[1] == bars[2]
     mean = (
-        100 * found["metrics/straight_error"].sel(way="registered surface", pair="brain_02").item()
+        100 * found["metrics/euclidean_error"].sel(way="registered surface", pair="brain_02").item()
     )
     assert shown.scenes[2].title == f"registered surface, error {mean:.2f} %"
     shown.pair.value = "brain_03"
     mean = (
-        100 * found["metrics/straight_error"].sel(way="registered surface", pair="brain_03").item()
+        100 * found["metrics/euclidean_error"].sel(way="registered surface", pair="brain_03").item()
     )
     assert shown.scenes[2].title == f"registered surface, error {mean:.2f} %"
     shown.colors.value = "area"

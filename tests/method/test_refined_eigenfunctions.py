@@ -72,7 +72,7 @@ def test_the_eigenvalue_of_constants_is_zero_so_that_descriptors_do_not_take_it_
 def test_the_smoother_damps_what_is_rough_and_enlarges_nothing():
     rates = np.linspace(0, 1, 101)
     left = lift.smooth(
-        np.diag(rates), np.zeros((101, 1)), np.ones((101, 1)), rounds=4, least=0.05
+        np.diag(rates), np.zeros((101, 1)), np.ones((101, 1)), iterations=4, least=0.05
     ).ravel()
     assert np.abs(left).max() <= 1
     assert np.abs(left[5:]).max() < 0.4

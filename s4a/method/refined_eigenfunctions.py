@@ -20,12 +20,12 @@ from s4a.method.spectral import factor, spectrum, with_constant_first
 from s4a.schema import Array, dataset
 
 SPARE = 10  # functions more than are asked for: the last ones of a span are the least exact
-ROUNDS = 4  # of the smoother
+ITERATIONS = 4  # of the smoother
 LEAST = 0.05  # it acts in LEAST..1 of its spectrum 0..1; below the coarse mesh does
 
 
 def smooth(
-    S: sp.csr_matrix, R: Array, B: Array, rounds: int = ROUNDS, least: float = LEAST
+    S: sp.csr_matrix, R: Array, B: Array, iterations: int = ITERATIONS, least: float = LEAST
 ) -> Array:
     """Chebyshev iteration for S B = R ``(n, k)``, with eigenvalues of S in 0..1, from B.
 
@@ -34,8 +34,8 @@ def smooth(
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a.method.lift import smooth
-    >>> B = smooth(np.eye(2), np.ones((2, 1)), np.zeros((2, 1)), rounds=9, least=0.5)
+    >>> from s4a.method.refined_eigenfunctions import smooth
+    >>> B = smooth(np.eye(2), np.ones((2, 1)), np.zeros((2, 1)), iterations=9, least=0.5)
     >>> B.round(6).ravel().tolist()
     [1.0, 1.0]
     """
@@ -43,7 +43,7 @@ def smooth(
     ratio = half / middle
     step = (R - S @ B) / np.float32(middle)
     B = B + step
-    for _ in range(rounds - 1):
+    for _ in range(iterations - 1):
         last, ratio = ratio, 1 / (2 * middle / half - ratio)
         rest = S @ B
         np.subtract(R, rest, out=rest)  # in place: the arrays are those of the full resolution
@@ -128,7 +128,7 @@ def lift(
     >>> import numpy as np
     >>> import s4a
     >>> from s4a.geometry.mesh import as_arrays, vertex_areas
-    >>> from s4a.method.lift import lift
+    >>> from s4a.method.refined_eigenfunctions import lift
     >>> from s4a.method.shape import Shape
     >>> ball = s4a.synthetic.sphere(2000)
     >>> shape = Shape(ball, s4a.spectrum(s4a.coarsen(ball, n_coarse=300), k=16))
@@ -171,7 +171,7 @@ def lifted(mesh: xr.Dataset, low: xr.Dataset, k: int) -> xr.Dataset:
     -------
     Dataset
         `low` with ``eigenvalue(mode)`` and ``eigenfunction(vertex, mode)`` in the place of its own,
-        and ``lifted_eigenfunction(original_vertex, mode)``.
+        and ``refined_eigenfunction(original_vertex, mode)``.
     """
     shape = Shape(mesh, low)
     X, T = as_arrays(mesh)
@@ -186,7 +186,7 @@ def lifted(mesh: xr.Dataset, low: xr.Dataset, k: int) -> xr.Dataset:
     turn = np.linalg.inv(np.linalg.cholesky(Phi.T @ (area[:, None] * Phi))).T
     B = B @ turn.astype(B.dtype)
     functions = dataset(
-        eigenvalue=eigenvalue, eigenfunction=B[vertex].astype(float), lifted_eigenfunction=B
+        eigenvalue=eigenvalue, eigenfunction=B[vertex].astype(float), refined_eigenfunction=B
     )
     mesh_alone = low.drop_vars(["eigenvalue", "eigenfunction"])
     return mesh_alone.merge(functions).assign_attrs(low.attrs)
