@@ -122,35 +122,35 @@ DEFAULTS = PRESETS[None]
 N_PROJECTED = 2500  # of 10,000 vertices, as 25,000 of 100,000
 ON_THE_PAPER = {
     "refine": {"refine": "elastic"},
-    "joint": {"refine": "joint"},
+    "joint": {"refine": "spectral_icp"},
     "init": {"init": "dense"},
-    "lift": {"lift": True},
+    "lift": {"refined_eigenfunctions": True},
     "n_samples": {"n_samples": DEFAULTS["n_samples"]},
-    "wide": {name: DEFAULTS[name] for name in ("n_samples", "wide")},
-    "parts": {"refine": "elastic", "parts": True},
+    "wide": {name: DEFAULTS[name] for name in ("n_samples", "dense_iterations")},
+    "parts": {"refine": "elastic", "articulated": True},
     "alignment": {"alignment": "fitted"},
     "area_weighted": {"area_weighted": True},
     "n_projected": {"n_projected": N_PROJECTED},
 }
 READINGS = {
-    "how": "standard",
+    "dense_match": "fmap",
     "method": "scalable",
-    "ahead": "never",
+    "initial_refinement": "never",
     "weights": "equal",
     "n_latent": 90,
     "step": 10,
 }
 NORMS = ("h2", "h1", "frobenius", "h2_image", "h2_both")
-OF_A_PAIR = ("refine", "init", "ahead", "full_resolution_iterations", "both")
+OF_A_PAIR = ("refine", "init", "initial_refinement", "full_resolution_iterations", "bidirectional")
 
 
 def study_rows():
     """Name of a row -> options of the analysis of a collection; what matters most comes first."""
     rows = {"paper": PAPER, "default": {}}
     rows |= {f"paper, {name}": PAPER | added for name, added in ON_THE_PAPER.items()}
-    rows |= {f"default without {name}": {name: PAPER[name]} for name in ("init", "parts")}
-    rows["default, joint"] = {"refine": "joint"}
-    rows["default, lift"] = {"lift": True}
+    rows |= {f"default without {name}": {name: PAPER[name]} for name in ("init", "articulated")}
+    rows["default, joint"] = {"refine": "spectral_icp"}
+    rows["default, lift"] = {"refined_eigenfunctions": True}
     rows |= {f"paper, {name}={value}": PAPER | {name: value} for name, value in READINGS.items()}
     rows |= {f"paper, {name}": PAPER for name in INSTEAD}
     rows |= {f"paper, norm={name}": PAPER | {"norm": name, "template": None} for name in NORMS}
@@ -159,7 +159,11 @@ def study_rows():
 
 def pair_rows():
     """The same of pairs that are matched on their own."""
-    paper = {name: value for name, value in PAPER.items() if name not in ("n_samples", "wide")}
+    paper = {
+        name: value
+        for name, value in PAPER.items()
+        if name not in ("n_samples", "dense_iterations")
+    }
     rows = {"pairs: paper": paper, "pairs: default": {}}
     for name in OF_A_PAIR:
         rows[f"pairs: paper, {name}"] = paper | {name: DEFAULTS[name]}

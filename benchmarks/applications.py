@@ -66,7 +66,10 @@ def variance(folder=None):
         for preset in ("paper", None):
             study = s4a.analyse(shapes, preset=preset, n_jobs=-1)
             for resolution, ratio in (
-                ("high, eq. 7" if preset else "high, elastic iterations", "explained_variance_ratio"),
+                (
+                    "high, eq. 7" if preset else "high, elastic iterations",
+                    "explained_variance_ratio",
+                ),
                 ("low, eq. 6, as smooth", "explained_variance_ratio_low"),
                 ("low, eq. 6, as it is", "explained_variance_ratio_raw"),
             ):
@@ -88,7 +91,9 @@ def brains(folder):
         "nearest vertex after ICP": labels["fsa5"][cKDTree(X @ R.T + t).query(Y)[1]],
     }
     for both in (False, True):
-        study = transfer.register_pairs(meshes["fsa5"], {"conte69": meshes["conte69"]}, both=both)
+        study = transfer.register_pairs(
+            meshes["fsa5"], {"conte69": meshes["conte69"]}, bidirectional=both
+        )
         name = "S4A, matched both ways" if both else "S4A, one way"
         found[name] = s4a.transfer_labels(study, labels["fsa5"])["conte69"]["label"].values
     for name, label in found.items():

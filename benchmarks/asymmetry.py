@@ -8,8 +8,8 @@ antisymmetry is, in every fifth run.
 
 ``asymmetry.py whole [RUNS]``: the same of :func:`s4a_morphometrics.asymmetry` as it is called:
 shapes of an ellipsoid of 500 vertices, smooth in what is alike on both sides and in what is not,
-with a bump of one side simulated; each against its mirror image, along the normals or as vectors, or
-left and right shapes of subjects.
+with a bump of one side simulated; each against its mirror image, along the normals or as vectors,
+or left and right shapes of subjects.
 
 ``asymmetry.py brains [RUNS]``: the errors of a folded brain, the same on both sides, whose partners
 are found by registration; the variation of its shapes as large as that of the ellipsoids, or less.
@@ -103,7 +103,11 @@ def ellipsoid() -> tuple[np.ndarray, np.ndarray, xr.Dataset]:
     """Vertices, triangles, and their partners as the equation of the surface gives them."""
     X, T = as_arrays(s4a.synthetic.ellipsoid(N_OF_SURFACE, (2.0, 3.0, 1.5)))
     (triangle, weights), _, gap = involution(X * [-1, 1, 1], X, T)
-    return X, T, dataset(partner_triangle=triangle, partner_barycentric=weights, partner_distance=gap)
+    return (
+        X,
+        T,
+        dataset(partner_triangle=triangle, partner_barycentric=weights, partner_distance=gap),
+    )
 
 
 def brain(n: int, seed: int) -> tuple[np.ndarray, np.ndarray, xr.Dataset]:

@@ -1,7 +1,7 @@
 """How often the score without truth picks the better candidate, on pairs with known correspondence.
 
-For every pair: the error at low resolution of each candidate of s4a.method.spectral_icp.candidates, that
-of the one picked, and that of the best.  Errors are mean straight-line distances in % of
+For every pair: the error at low resolution of each candidate of s4a.method.spectral_icp.candidates,
+that of the one picked, and that of the best.  Errors are mean straight-line distances in % of
 sqrt(area), to the image of each coarse vertex.
 """
 

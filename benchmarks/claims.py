@@ -97,7 +97,8 @@ def swaps(given):
             for shape, node in tree["original"].children.items()
         }
         options = Options(preset="paper")
-        C = s4a.build_network(coarse, k_init=20, **options.of("initial maps"))["fmap_initial"].values
+        network = s4a.build_network(coarse, k_init=20, **options.of("initial maps"))
+        C = network["fmap_initial"].values
         block = np.abs(C[:, 1:5, 1:5])
         swapped = (block.argmax(2) != np.arange(4)).any(1)
         say(f"{name}: {swapped.sum()} of {len(swapped)} maps")

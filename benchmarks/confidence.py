@@ -32,8 +32,8 @@ from s4a import synthetic
 from s4a.method import initial_map
 from s4a.method.register import RIGHT, WEIGHTS, evidence
 from s4a.options import Options
-from s4a.study.quality_control import UNSURE, WRONG
 from s4a.study.pair import match_shapes, shape_of
+from s4a.study.quality_control import UNSURE, WRONG
 
 TUNED = {
     "faces": [(0, 1)],

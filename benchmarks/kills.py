@@ -37,10 +37,10 @@ STAGES = {  # the first file of each, the last stage first
     "modes, report": "pca.nc",
     "registration": "registration.nc",
     "Consistent ZoomOut": "network.nc",
-    "initial maps": "network/first_*.nc",
-    "align": "network/motion_*.nc",
+    "initial maps": "network/initial_*.nc",
+    "align": "network/alignment_*.nc",
     "remesh": "coarse/*.nc",
-    "compare": "network/look_*.nc",
+    "compare": "network/comparison_*.nc",
     "read and clean": "original/*.nc",
     "start": "",
 }

@@ -1,4 +1,4 @@
-"""What is told of an odd shape, and what cannot be: oddities simulated in collections, one at a time.
+"""Which unusual shapes are flagged: oddities simulated in collections, one at a time.
 
 Synthetic brains, and real collections where the shared data are beside the checkout; the first
 four, on which the thresholds were chosen, and others. ``plausibility.py [COLLECTION ...]``.
@@ -7,9 +7,9 @@ four, on which the thresholds were chosen, and others. ``plausibility.py [COLLEC
 template to the others of its collection, once as by default and once from initial maps of 10
 landmarks, which fail in far poses; and counts of which failed registrations a run would tell.
 
-``plausibility.py simulated [COLLECTION ...]`` begins one registration at a time at a wrong transform,
-the others of the collection as by default.  Which of them failed the truth alone says: one that
-finds its way is a right one.
+``plausibility.py simulated [COLLECTION ...]`` begins one registration at a time at a wrong
+transform, the others of the collection as by default.  Which of them failed the truth alone says:
+one that finds its way is a right one.
 """
 
 import subprocess
@@ -177,7 +177,7 @@ class Collection:
                 self.seconds += time.process_time() - start
                 self.pairs[id(a), id(b)] = found, a, b  # held, so that their ids stay theirs
             seen.append(self.pairs[id(a), id(b)][0].assign_coords(reference=[other]))
-        both = ["fit", "fit_mirrored", "hand"]
+        both = ["fit", "fit_mirrored", "chirality"]
         return (
             seen[0]
             .drop_dims("reference")
@@ -260,14 +260,18 @@ def error_of(template, shape, match, known):
 
 
 def registered(name, folder, at, way):
-    """Of every other shape of a collection: error, registration_error, mean |distortion|, what is told."""
+    """For each other shape: error, registration error, mean |distortion| and the flags."""
     part, numbers, _ = PAIRS[name]
     files = sorted((folder / part).glob("*.ply"))
     shapes = {files[i].stem: s4a.read_shape(files[i]) for i in numbers}
     template = shapes.pop(files[numbers[at]].stem)
-    study = s4a.register_pairs(template, shapes, both=False, n_coarse=3000, n_jobs=1, **WAYS[way])
+    study = s4a.register_pairs(
+        template, shapes, bidirectional=False, n_coarse=3000, n_jobs=1, **WAYS[way]
+    )
     found = study["registration"].to_dataset().load()
-    registration_error = dict(zip(shapes, found["registration_error"].sel(shape=list(shapes)).values, strict=True))
+    registration_error = dict(
+        zip(shapes, found["registration_error"].sel(shape=list(shapes)).values, strict=True)
+    )
     size = abs(found["distortion"].sel(shape=list(shapes))).mean("vertex").values
     distortion = dict(zip(shapes, size.tolist(), strict=True))
     of_shapes, of_all = flagged(registration_error, distortion)
@@ -280,7 +284,8 @@ def registered(name, folder, at, way):
         sys.stdout.write(
             f"    {name}, {way}, {files[numbers[at]].stem} -> {other}: error {error:.2f} %, "
             f"registration_error {registration_error[other]:.4f}, times |distortion| "
-            f"{registration_error[other] * distortion[other]:.5f}: {told or '-'}{' (all)' if of_all else ''}\n"
+            f"{registration_error[other] * distortion[other]:.5f}: "
+            f"{told or '-'}{' (all)' if of_all else ''}\n"
         )
         sys.stdout.flush()
         yield error, told
@@ -317,7 +322,7 @@ def registrations(names):
 
 
 def turned(signs):
-    """In place of :func:`s4a.method.initial_map.transform_onto`: its transform, then a wrong one."""
+    """Replace :func:`s4a.method.initial_map.transform_onto`: first as usual, then wrong."""
     usual = pair.transform_onto
 
     def transform(source, target):
@@ -341,7 +346,7 @@ def judged(name, at, meshes, shapes):
     for way in ("as by default", *TURNS):
         # an initial map of landmarks, as the dense one is mended by a search
         more = {"init": "landmarks"} if way in TURNS else {}
-        options = Options(both=False, n_coarse=3000, **more)
+        options = Options(bidirectional=False, n_coarse=3000, **more)
         for other in others:
             usual = pair.transform_onto
             try:
@@ -409,7 +414,7 @@ def simulated(names):
         parts = sorted({PLANTED_IN[name][0] for name in names})
         command = [sys.executable, DATA / "unpack.py", folder, *parts]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-        options = Options(both=False, n_coarse=3000)
+        options = Options(bidirectional=False, n_coarse=3000)
         for name in names:
             part, numbers, places = PLANTED_IN[name]
             files = sorted((Path(folder) / part).glob("*.ply"))
@@ -419,8 +424,8 @@ def simulated(names):
                 for way, other, error, told, (score, size) in judged(name, at, meshes, shapes):
                     table.setdefault((name, way), []).append((error, told))
                     sys.stdout.write(
-                        f"    {name}, {at}, {way}, {other}: error {error:.2f} %, registration_error "
-                        f"{score:.4f}, |distortion| {size:.4f}: {told or '-'}\n"
+                        f"    {name}, {at}, {way}, {other}: error {error:.2f} %, "
+                        f"registration_error {score:.4f}, |distortion| {size:.4f}: {told or '-'}\n"
                     )
                     sys.stdout.flush()
     head = "| collection | begun | failed | told | right | told in vain | between |"

@@ -3,8 +3,8 @@
 ``poses.py [--seed S] [--pairs N] [--three] [--landmarks N] [--field] [--network]``: random ordered
 pairs of twenty registered bodies of the shared data (two persons in ten poses), 4,000 vertices at
 low resolution, with the mean error of each pair in % of sqrt(area); ``--three`` without the search
-for more initial maps, ``--landmarks`` with as many of the user's: the vertices of the first body that
-are farthest from each other, its head, hands and feet first; ``--field`` with a field of the
+for more initial maps, ``--landmarks`` with as many of the user's: the vertices of the first body
+that are farthest from each other, its head, hands and feet first; ``--field`` with a field of the
 user's, how far to the side of the first body each vertex lies; ``--network`` after an analysis of
 all twenty, through whose latent bases any pair is registered (:func:`s4a.register_shape`).  The
 search was tuned on the pairs of seed 7; those of seed 8 are only reported.  Registered bodies share
@@ -85,7 +85,7 @@ def report(files, pairs, n_landmarks, field):
         errors.append(error_of(target.original, source.original, match, len(match)))
         sys.stdout.write(
             f"{files[i].stem} -> {files[j].stem}: {errors[-1]:.2f} %, {spent:.1f} CPU s, "
-            f"initial map {found.attrs['initial_map']}, registration_error {found.attrs['score']:.4f}\n"
+            f"initial map {found.attrs['initial_map']}, score {found.attrs['score']:.4f}\n"
         )
         sys.stdout.flush()
     summary(errors)

@@ -562,7 +562,7 @@ def seconds_of_pairs(coarse, n_pairs, options):
     begin = time.process_time()
     first = s4a.build_network(coarse, n_pairs=n_pairs, **options.of("initial maps"))
     between = time.process_time()
-    names = ("weights", "n_samples", "wide")
+    names = ("weights", "n_samples", "dense_iterations")
     s4a.refine_network(coarse, first, k=K, **{name: getattr(options, name) for name in names})
     return {
         "alignment and initial maps": between - begin,
@@ -672,7 +672,9 @@ def study_errors(study, image):
     far = ["", ""]
     if image is not None:
         error = accuracy.accuracy(study, image)["error"].mean("shape")
-        far = [f"{100 * error.sel(way=way):.3f}" for way in (accuracy.MATCH, accuracy.SURFACE)]
+        far = [
+            f"{100 * error.sel(algorithm=way):.3f}" for way in (accuracy.MATCH, accuracy.SURFACE)
+        ]
     trip = data["round_trip"].values.mean(1).sum() / (data.sizes["shape"] - 1)
     return [*far, f"{100 * np.mean(chamfer):.4f}", f"{100 * trip:.3f}"]
 

@@ -40,7 +40,7 @@ from s4a.show.draw import (
     with_balls,
 )
 from s4a.show.pictures import mode_pictures
-from s4a.show.surfaces import transferred_colors, mesh_of, mode_arrays, network_places, surface
+from s4a.show.surfaces import mesh_of, mode_arrays, network_places, surface, transferred_colors
 
 HERE = Path(__file__).parent
 LOCAL_FOLDER = HERE / "_build"
@@ -194,10 +194,11 @@ def seconds(vertices=PAIR):
     brains = s4a.synthetic.brains(2, vertices, seed=0)
     source, target = (brains[f"original/brain_0{i}"].to_dataset() for i in (1, 2))
     found = s4a.compare.pairs(source, {"brain_02": target})["block_seconds"].isel(pair=0)
-    found = found.drop_sel(way="registered surface")  # the same run as "registered"
+    found = found.drop_sel(algorithm="registered surface")  # the same run as "registered"
     blocks = [str(name) for name in found["block"].values]
     return write(
-        charts.stacked([str(w) for w in found["way"].values], blocks, found.values), "figure_3"
+        charts.stacked([str(w) for w in found["algorithm"].values], blocks, found.values),
+        "figure_3",
     )
 
 

@@ -365,7 +365,10 @@ def spoilt(rng, X, T):
     m = len(T)
     unconnected = X[T[:80]].reshape(-1, 3)
     ways = [
-        lambda: (unconnected + jitter * rng.normal(size=unconnected.shape), np.arange(len(unconnected)).reshape(-1, 3)),
+        lambda: (
+            unconnected + jitter * rng.normal(size=unconnected.shape),
+            np.arange(len(unconnected)).reshape(-1, 3),
+        ),
         lambda: (X + jitter * rng.normal(size=X.shape), T),
         lambda: (X * 10 ** rng.uniform(-6, 6, 3), T),  # slivers
         lambda: (X, T[rng.permutation(m)[: max(1, int(m * rng.uniform(0.2, 1)))]]),

@@ -78,9 +78,10 @@ def symmetry(study: xr.DataTree) -> xr.Dataset:
     -------
     Dataset
         ``partner_triangle(vertex)`` and ``partner_barycentric(vertex, corner)``, the place of
-        tau(v); ``partner_distance(vertex)``, the distance of tau(tau(v)) and v that is left, in the unit
-        of the input.  Attributes ``gap``, its root mean square over the area as a share of
-        sqrt(area), ``gap_before`` as the registration gave it, and ``registration_error`` of the registration.
+        tau(v); ``partner_distance(vertex)``, the distance of tau(tau(v)) and v that is left, in the
+        unit of the input.  Attributes ``gap``, its root mean square over the area as a share of
+        sqrt(area), ``gap_before`` as the registration gave it, and ``registration_error`` of the
+        registration.
 
     Examples
     --------
@@ -118,7 +119,7 @@ def symmetry(study: xr.DataTree) -> xr.Dataset:
     }
     if max(attrs["gap"], attrs["registration_error"]) > FAR:
         log.warning(
-            "the template and its mirror image do not lie on each other (registration_error %.3f, involution "
+            "the template and its mirror image differ (registration error %.3f, involution "
             "to %.3f of sqrt(area)): is it symmetric? Of left and right shapes give subject and "
             "side",
             attrs["registration_error"],

@@ -280,7 +280,12 @@ def _direct_way(study, name, onto):
     bases = Y.sel(shape=name).values, Y.sel(shape=onto).values
     transform = transform_onto(source.low, target.low)
     direct = from_latent(
-        source, target, bases, transform, how=options.how, **options.of("registration")
+        source,
+        target,
+        bases,
+        transform,
+        dense_match=options.dense_match,
+        **options.of("registration"),
     )
     return image_of(direct.assign(position=target.original["position"]))
 

@@ -97,8 +97,8 @@ def complete(
         ``score(component)``, ``score_covariance(component, component_2)``; and, as in
         ``/registration``, ``displacement``, ``rotation``, ``translation`` and ``scale``.
         Attributes: ``template``; ``missing``, share of the template's area; ``residual``, the
-        distance that modes and transform leave on the part, ``usual_residual``, the largest that the
-        modes of the others leave on the same part of a shape of the study, and ``inside``, the
+        distance that modes and transform leave on the part, ``usual_residual``, the largest that
+        the modes of the others leave on the same part of a shape of the study, and ``inside``, the
         share of the part's points that lie on the whole; ``match_noise``, the deviation of a
         coordinate where the part is; where nothing is ``factor`` of what the modes leave, and
         ``added``, the deviation that comes to it of ``between_ways``, that between two ways of

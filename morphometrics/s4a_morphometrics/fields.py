@@ -66,8 +66,8 @@ def with_field(
     Returns
     -------
     DataTree
-        With ``/fields/<name>``: ``transferred_field(shape, vertex)`` on the vertices of the template,
-        NaN where over half of the weight is on NaN, and for shapes without the field.
+        With ``/fields/<name>``: ``transferred_field(shape, vertex)`` on the vertices of the
+        template, NaN where over half of the weight is on NaN, and for shapes without the field.
 
     Raises
     ------

@@ -101,8 +101,10 @@ def _register(shape, template, bases, rotation, options):
     """One registration of a shape of a study to another template, its latent basis as it is."""
     with threadpool_limits(1):
         transform = realign(shape.low.cloud, template.low.cloud, (rotation, np.zeros(3)))
-        how = options.how
-        return from_latent(shape, template, bases, transform, how=how, **options.of("registration"))
+        dense_match = options.dense_match
+        return from_latent(
+            shape, template, bases, transform, dense_match=dense_match, **options.of("registration")
+        )
 
 
 def _errors_of(study, name, n_points, seed, n_jobs):

@@ -87,8 +87,9 @@ def seen_together(looks: Looks) -> dict[str, xr.Dataset]:
     --------
     >>> from s4a.schema import dataset
     >>> from s4a_morphometrics.mirrored import seen_together
-    >>> a = dataset(hand=[0.6]).assign_coords(reference=["b"])
-    >>> seen_together({"left": {"a": a}, "right": {"a": a}})["a"]["hand"].round(2).values.tolist()
+    >>> a = dataset(chirality=[0.6]).assign_coords(reference=["b"])
+    >>> both = seen_together({"left": {"a": a}, "right": {"a": a}})
+    >>> both["a"]["chirality"].round(2).values.tolist()
     [0.85]
     """
     subjects = sorted({name for of in looks.values() for name in of})
@@ -99,7 +100,7 @@ def seen_together(looks: Looks) -> dict[str, xr.Dataset]:
     n = known.sum(0)
     whole = np.where(n, np.where(known, table, 0).sum(0) / np.sqrt(np.maximum(n, 1)), np.nan)
     return {
-        name: dataset(hand=row).assign_coords(reference=references)
+        name: dataset(chirality=row).assign_coords(reference=references)
         for name, row in zip(subjects, whole, strict=True)
     }
 
@@ -109,7 +110,7 @@ def hand_table(looks: Looks, subjects: list[str], references: list[str]) -> np.n
     table = np.full((len(looks), len(subjects), len(references)), np.nan)
     for k, of in enumerate(looks.values()):
         for name, look in of.items():
-            table[k, subjects.index(name)] = look["hand"].reindex(reference=references).values
+            table[k, subjects.index(name)] = look["chirality"].reindex(reference=references).values
     return table
 
 
@@ -123,8 +124,8 @@ def mirrored_subjects(looks: Looks) -> tuple[dict[str, float], list[str], list[s
     names : list of str
         Those of the rarer hand.
     remarks : list of str
-        In words, as of :func:`s4a.input.chirality.mirrored_shapes`; and which subjects have structures of
-        both hands, and stay as they are: each subject is named once.
+        In words, as of :func:`s4a.input.chirality.mirrored_shapes`; and which subjects have
+        structures of both hands, and stay as they are: each subject is named once.
     """
     together = seen_together(looks)
     if len(together) < 2:

@@ -1,4 +1,4 @@
-"""A part of a shape on the whole (4.2, 6.1): its transform, its match, and what of the whole it lacks.
+"""Partial shape on a complete one (4.2, 6.1): alignment, match and missing region.
 
 Points of the part look for the nearest of the mean shape moved along its modes, in position and
 normal, never the other way: what is missing asks for nothing.  Rounds of rigid ICP from many starts
@@ -63,7 +63,7 @@ class Pose(NamedTuple):
 
 
 class Part(NamedTuple):
-    """A part: vertices ``X``, triangles ``T``, normals ``N``, areas ``area``, boundary ``boundary``."""
+    """A partial shape: vertices, triangles, normals, areas and boundary."""
 
     X: Array
     T: Array
@@ -141,7 +141,7 @@ def cut(X: Array, T: Array, kept: Array) -> tuple[Array, Array]:
 def rough_starts(
     part: Part, whole: Whole, first: Pose, *, turns: str = "O"
 ) -> list[tuple[float, Pose]]:
-    """Poses after iterations of ICP of some points of the part, with their residuals, the best first.
+    """Poses after ICP of some points of the partial shape, with residuals, the best first.
 
     Parameters
     ----------
@@ -329,7 +329,7 @@ def seen(X: Array, N: Array, part: Part, placed: Array, limit: float) -> Array:
 
 
 def refine(part: Part, placed: Array, target: Shape, X_low: Array, present: Array) -> Array:
-    """The low resolution ``(n, 3)`` after elastic and local iterations of the vertices that are there.
+    """Return the coarse vertices ``(n, 3)`` after elastic and local iterations.
 
     Parameters
     ----------

@@ -68,7 +68,7 @@ def model_of(study: xr.DataTree) -> Model:
         fields,
         score.T / (len(score) - 1),
         template.low.area,
-        options.scale,
+        options.remove_size,
         modes["mean_displacement"].values / size,
         modes["deformation"].values / size,
     )

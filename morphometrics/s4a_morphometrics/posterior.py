@@ -10,8 +10,8 @@ of modes, functions and small transforms, y what is known at some vertices less 
     H = E^T W E + P,   w = H^-1 E^T W y,   cov(w) = H^-1,
 
 W the weights of these vertices by their areas, P the inverse of the variances before, and 0 of
-transforms: how a part lies is not known either.  The same is asked of every shape of the study by the
-model of the others, with the same part known: how many places of a part count as independent is
+transforms: how a part lies is not known either.  The same is asked of every shape of the study by
+the model of the others, with the same part known: how many places of a part count as independent is
 what makes these errors least.
 """
 

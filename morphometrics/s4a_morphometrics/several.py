@@ -20,9 +20,9 @@ import numpy as np
 import xarray as xr
 
 import s4a
+from s4a.input.chirality import AUTO, to_reflect
 from s4a.input.collection import remarks_on_files
 from s4a.input.files import check_names, files_named, find_meshes, slug
-from s4a.input.chirality import AUTO, to_reflect
 from s4a.input.landmarks import SUFFIXES
 from s4a.input.raw import shown
 from s4a.input.subjects import is_missing, listed, read_cells, subjects
@@ -390,9 +390,9 @@ def named_subjects(reflect: str, parts: Mapping[str, Part]) -> list[str]:
     Raises
     ------
     ValueError
-        As of :func:`s4a.input.chirality.to_reflect`; and when structures of one subject have different
-        values in the column, as one that is mirrored without the others would no longer lie where
-        it lay to them.
+        As of :func:`s4a.input.chirality.to_reflect`; and when structures of one subject have
+        different values in the column, as one that is mirrored without the others would no longer
+        lie where it lay to them.
 
     Examples
     --------

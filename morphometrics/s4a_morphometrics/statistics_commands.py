@@ -144,7 +144,7 @@ def region_statistics(
     without : COLUMN
         nuisances: what lies along their regression is taken from all shapes
     size_back
-        give size back to shapes of which --scale took it out
+        give size back to shapes of which --remove-size took it out
     group : COLUMN
         test and map of the difference between groups; classification
     variable : COLUMN

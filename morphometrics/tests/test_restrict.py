@@ -117,9 +117,9 @@ def test_size_that_was_taken_out_is_given_back():
     shapes = {name: (Y * (1 + 0.1 * i), S) for i, (name, (Y, S)) in enumerate(shapes.items())}
     options = {"n_coarse": 120, "k": 12, "k_init": 8, "n_jobs": 1, "intersections": False}
     options |= {"template": "brain_01", "include_flagged": True}
-    scaled = analyse(shapes, scale=True, **options)
+    scaled = analyse(shapes, remove_size=True, **options)
     back = with_size(scaled)
-    kept = analyse(shapes, scale=False, **options)
+    kept = analyse(shapes, remove_size=False, **options)
 
     def radius(study):
         mesh = study["registration"].to_dataset()

@@ -19,7 +19,7 @@ from s4a_morphometrics import (
     structures_modes,
     structures_of_new,
 )
-from s4a_morphometrics.mirrored import seen_together, mirrored_subjects
+from s4a_morphometrics.mirrored import mirrored_subjects, seen_together
 from s4a_morphometrics.several import Part, named_subjects, parts_of
 from s4a_morphometrics.structures_commands import named_label
 from s4a_morphometrics.synthetic import subjects
@@ -397,7 +397,7 @@ def looks(hands):
     names = list("abcd")
     table = np.outer(hands, hands) + np.diag([np.nan] * 4)
     return {
-        name: dataset(hand=row).assign_coords(reference=names)
+        name: dataset(chirality=row).assign_coords(reference=names)
         for name, row in zip(names, table, strict=True)
     }
 
@@ -427,7 +427,7 @@ def test_structures_say_together_of_which_hand_a_subject_is(left, right, chosen,
 
 def test_hands_add_up_and_one_subject_alone_is_of_no_hand():
     both = {"left": looks([0.9, 0.9, -0.9, 0.9]), "right": looks([0.9, 0.9, -0.9, 0.9])}
-    assert seen_together(both)["a"]["hand"].values[1] == pytest.approx(2 * 0.81 / np.sqrt(2))
+    assert seen_together(both)["a"]["chirality"].values[1] == pytest.approx(2 * 0.81 / np.sqrt(2))
     hand, names, told = mirrored_subjects({"left": {}, "right": {}})
     assert (hand, names) == ({}, [])
     assert "needs two shapes or more" in told[0]

@@ -147,7 +147,9 @@ def with_flagged(study: xr.DataTree) -> xr.DataTree:
     nodes = {node.path: node.to_dataset(inherit=False) for node in study.subtree}
     if "report" in study.children:
         nodes["/report"] = nodes["/report"].assign_attrs(
-            with_options(nodes["/report"].attrs, {"include_flagged": True, "flagged": "apart"})
+            with_options(
+                nodes["/report"].attrs, {"include_flagged": True, "quality_control": "exclude"}
+            )
         )
     registration = all_registered(study)
     template = registration.attrs.get("template", "")

@@ -252,10 +252,10 @@ def _shape_of(mesh, options):
 
 
 def _match_both(shape, template, options):
-    """The shape registered to the template and, with `both`, the template to the shape."""
+    """The shape registered to the template and, with `bidirectional`, the template to the shape."""
     with threadpool_limits(1):
         forth = match_shapes(shape, template, options)[0]
-        return forth, match_shapes(template, shape, options)[0] if options.both else None
+        return forth, match_shapes(template, shape, options)[0] if options.bidirectional else None
 
 
 def register_pairs(
@@ -279,16 +279,16 @@ def register_pairs(
     n_jobs : int, optional
         As in joblib; the result does not depend on it.
     preset : {None, "paper", "fast"}
-        As of :func:`s4a.match_pair`; ``"paper"`` sets both=False, too, and blur=0 of
+        As of :func:`s4a.match_pair`; ``"paper"`` sets bidirectional=False, too, and blur=0 of
         :func:`s4a.transfer_labels`.
     **options
-        Those of :func:`s4a.match_pair`, and ``both``: whether each pair is matched both ways, as by
-        default; transfer then takes the mean of both.  See :class:`s4a.Options`.
+        Those of :func:`s4a.match_pair`, and ``bidirectional``: whether each pair is matched both
+        ways, as by default; transfer then takes the mean of both.  See :class:`s4a.Options`.
 
     Returns
     -------
     DataTree
-        ``/original``, ``/registration`` and, with `both`, ``/reverse``.
+        ``/original``, ``/registration`` and, with `bidirectional`, ``/reverse``.
 
     Raises
     ------
@@ -318,7 +318,11 @@ def register_pairs(
     inside, *others = parallel(delayed(_shape_of)(mesh, settings) for mesh in meshes.values())
     pairs = parallel(delayed(_match_both)(shape, inside, settings) for shape in others)
     forth = {n: pair[0] for n, pair in zip(shapes, pairs, strict=True)}
-    back = {n: pair[1] for n, pair in zip(shapes, pairs, strict=True)} if settings.both else {}
+    back = (
+        {n: pair[1] for n, pair in zip(shapes, pairs, strict=True)}
+        if settings.bidirectional
+        else {}
+    )
     study = _study_of(name, template, shapes, forth, back)
     study["registration"].attrs["preset"] = settings.preset or ""
     return study

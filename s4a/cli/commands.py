@@ -538,7 +538,7 @@ def compare(
     collection : PATH
         Table 2 on these folders, globs or mesh files
     methods : METHOD
-        of kNN, ZO, FMAP+ZO, SCALABLE, RE-MATCH, RE-MATCH lifted, registered, registered surface
+        of kNN, ZO, FMAP+ZO, SCALABLE, RE-MATCH, RE-MATCH refined, registered, registered surface
     truth : FILE
         for each target, NPY or text: per vertex of its file that of the source's (from 0; -1:
         none), or x, y, z
@@ -558,13 +558,20 @@ def compare(
                 "--keep"
             )
         found = compare_collection(collection, methods, n_pairs, options)
-        names = [f"{way}, {how}" for way in found["way"].values for how in found["how"].values]
+        names = [
+            f"{way}, {how}"
+            for way in found["algorithm"].values
+            for how in found["dense_match"].values
+        ]
         seconds = found["collection_seconds"].values.reshape(len(names), -1)
         text, result = tables.collection_table(found), found
     else:
         result = compare_pairs(paths or [], truth, landmarks, options | {"methods": methods}, keep)
         found = result["metrics"].to_dataset() if keep else result
-        names, seconds = found["way"].values.tolist(), found["block_seconds"].mean("pair").values
+        names, seconds = (
+            found["algorithm"].values.tolist(),
+            found["block_seconds"].mean("pair").values,
+        )
         blocks = tables.block_table(names, found["block"].values.tolist(), seconds)
         text = f"{tables.comparison_table(found)}\n\n{blocks}"
     folder = new_folder(out)
@@ -608,7 +615,9 @@ def compare_pairs(
         raise ValueError(
             f"--truth needs a file for each of the {len(files)} targets, found {len(truth)}"
         )
-    known = {name: s4a.compare.read_ground_truth(f) for name, f in zip(names, truth or [], strict=False)}
+    known = {
+        name: s4a.compare.read_ground_truth(f) for name, f in zip(names, truth or [], strict=False)
+    }
     return s4a.compare.pairs(
         source,
         dict(zip(names, files, strict=True)),

@@ -415,7 +415,9 @@ def true_line(modes: "xr.Dataset", truth: "xr.Dataset") -> str:
 def error_table(errors: "xr.Dataset") -> str:
     """Mean errors of :func:`s4a.evaluation.accuracy.accuracy` over the shapes, a row per method."""
     mean = 100 * errors[["error", "geodesic_error"]].mean("shape")
-    rows = zip(*(mean[name].values for name in ("way", "error", "geodesic_error")), strict=True)
+    rows = zip(
+        *(mean[name].values for name in ("algorithm", "error", "geodesic_error")), strict=True
+    )
     return table(rows, ["mean error, % of sqrt(area)", "straight line", "along edges"], ".3f")
 
 
@@ -513,8 +515,8 @@ def comparison_table(pairs: "xr.Dataset") -> str:
     mean = pairs.mean("pair")
     columns = {name: column for name, column in METRICS.items() if name in mean}
     rows = []
-    for name in mean["way"].values:
-        method = mean.sel(way=name)
+    for name in mean["algorithm"].values:
+        method = mean.sel(algorithm=name)
         cells = [
             f"{factor * method[metric].item():.{digits}f}"
             for metric, (_, factor, digits) in columns.items()
@@ -532,8 +534,8 @@ def block_table(methods: Sequence[str], blocks: Sequence[str], seconds: "np.ndar
 def collection_table(result: "xr.Dataset") -> str:
     """Table 2: mean Chamfer distance to the template, CPU seconds by block, the median shape."""
     rows = []
-    for way, how in itertools.product(result["way"].values, result["how"].values):
-        method = result.sel(way=way, how=how)
+    for way, how in itertools.product(result["algorithm"].values, result["dense_match"].values):
+        method = result.sel(algorithm=way, dense_match=how)
         seconds = method["collection_seconds"].values
         chamfer = 100 * method["collection_chamfer"].mean().item()
         median = method["median_shape"].item()

@@ -248,7 +248,7 @@ EXERCISES: dict[str, Any] = {
     "09.3": lambda: lambda product: abs(product) < 1e-3,
     "10.1": lambda X: np.linalg.norm(X - X[0], axis=1).mean(),
     "10.2": lambda mean: (
-        mean["seconds"].sel(way="FMAP+ZO") / mean["seconds"].sel(way="RE-MATCH")
+        mean["seconds"].sel(algorithm="FMAP+ZO") / mean["seconds"].sel(algorithm="RE-MATCH")
     ).item(),
     "10.3": lambda n: lambda match: _is_wrong_everywhere_and_no_set_tells(match, n),
     "11.1": lambda carried, target: _overlap(carried, target["label"].values, "cerebellum left"),

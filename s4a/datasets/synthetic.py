@@ -253,8 +253,8 @@ def _fields(x, centre, width, push, turn):
 def _generators(n_modes):
     """Centres and widths of all parts, and their push and turn by each generator ``(g, parts, 6)``.
 
-    The generators are the six rigid transforms, of one part of infinite width, and the modes as they
-    are designed.
+    The generators are the six rigid transforms, of one part of infinite width, and the modes as
+    they are designed.
     """
     centre, width = [np.zeros(3)], [np.inf]
     moves = []  # mode, push and turn of each part after the first
@@ -277,8 +277,8 @@ def _generators(n_modes):
 def _true_modes(n_modes):
     """Centres and widths of all parts, and each mode's push and turn of them.
 
-    On the reference brain the modes are orthogonal to rigid transforms and to each other: the Cholesky
-    factor of the generators' Gram matrix is that of Gram and Schmidt.
+    On the reference brain the modes are orthogonal to rigid transforms and to each other: the
+    Cholesky factor of the generators' Gram matrix is that of Gram and Schmidt.
     """
     if not 0 <= n_modes <= len(MODES):
         raise ValueError(f"n_modes needs a number from 0 to {len(MODES)}, found {n_modes}")
@@ -417,7 +417,9 @@ def position(truth: xr.Dataset | xr.DataTree, shape: str, reference_point: Array
     turn = np.tensordot(value["true_score"], value["true_rotation"], 1)
     noise_translation = value["noise_translation"]
     moved = x + _fields(x, value["true_centre"], value["true_width"], push, turn)
-    moved += _fields(x, value["noise_centre"], value["noise_width"], noise_translation, 0 * noise_translation)
+    moved += _fields(
+        x, value["noise_centre"], value["noise_width"], noise_translation, 0 * noise_translation
+    )
     return moved @ value["rotation"].T + value["translation"]
 
 

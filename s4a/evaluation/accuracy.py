@@ -95,9 +95,9 @@ def accuracy(
     Returns
     -------
     xarray.Dataset
-        ``error(way, shape)`` in a straight line and ``geodesic_error(way, shape)``, both as shares
-        of sqrt(area).  A matched vertex cannot be nearer to the truth than the sampling of the
-        shape allows; the registered surface is not bound to vertices.
+        ``error(algorithm, shape)`` in a straight line and ``geodesic_error(algorithm, shape)``,
+        both as shares of sqrt(area).  A matched vertex cannot be nearer to the truth than the
+        sampling of the shape allows; the registered surface is not bound to vertices.
     """
     registration = study["registration"].to_dataset()
     template = registration.attrs["template"]
@@ -122,7 +122,7 @@ def accuracy(
     both = np.array(found).reshape(len(names), 4, 2).T  # (measure, method, shape)
     note = {"units": "share of sqrt(area)"}
     return xr.Dataset(
-        {"error": (("way", "shape"), both[0], note)}
-        | {"geodesic_error": (("way", "shape"), both[1], note)},
+        {"error": (("algorithm", "shape"), both[0], note)}
+        | {"geodesic_error": (("algorithm", "shape"), both[1], note)},
         {"way": [ICP, ZOOMOUT, MATCH, SURFACE], "shape": names},
     )

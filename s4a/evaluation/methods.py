@@ -2,7 +2,7 @@
 
 Every method works on a :class:`s4a.method.shape.Shape`: ZO and FMAP+ZO on one whose functions are
 the eigenfunctions of the dense mesh, SCALABLE on that of :mod:`s4a.method.scalable`, RE-MATCH on
-the coarse mesh with U Phi, as in the paper.  Ours are RE-MATCH lifted, with functions of
+the coarse mesh with U Phi, as in the paper.  Ours are RE-MATCH refined, with functions of
 :mod:`s4a.method.refined_eigenfunctions`, and registered, which is RE-MATCH and the registration of
 :mod:`s4a.method.register` after it; its image are the matched vertices, as of all, and that of
 registered surface is the smooth surface on which they were looked up, which lies between them.
@@ -25,7 +25,6 @@ from s4a.geometry.closest import match_surfaces
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.method import fmap
 from s4a.method.initial_map import landmarks_after_alignment, nearest_after_alignment
-from s4a.method.refined_eigenfunctions import SPARE, lifted
 from s4a.method.nearest import (
     as_candidates,
     as_queries,
@@ -33,18 +32,19 @@ from s4a.method.nearest import (
     nearest_in_cells,
     nearest_rows,
 )
-from s4a.method.register import find_candidates, register_surface, refine_at_full_resolution
+from s4a.method.refined_eigenfunctions import SPARE, with_refined_eigenfunctions
+from s4a.method.register import find_candidates, refine_at_full_resolution, register_surface
 from s4a.method.remesh import coarsen, laplacian
 from s4a.method.scalable import local_space, spectral_space
 from s4a.method.shape import Basis, Shape
 from s4a.method.spectral import eigenpairs, spectrum
 
 PAPER_METHODS = ("kNN", "ZO", "FMAP+ZO", "SCALABLE", "RE-MATCH")
-OUR_METHODS = ("RE-MATCH lifted", "registered", "registered surface")
+OUR_METHODS = ("RE-MATCH refined", "registered", "registered surface")
 METHODS = (*PAPER_METHODS, *OUR_METHODS)
 # the shape of Spaces whose functions a method compares; registration begins with RE-MATCH's match
 KINDS = {"ZO": "dense", "FMAP+ZO": "dense", "SCALABLE": "local", "RE-MATCH": "coarse"}
-KINDS |= {"RE-MATCH lifted": "lifted", "registered": "coarse", "registered surface": "coarse"}
+KINDS |= {"RE-MATCH refined": "lifted", "registered": "coarse", "registered surface": "coarse"}
 # of Fig. 3
 BLOCKS = ("load and clean", "align", "sample", "basis", "map", "refine", "full resolution")
 N_SAMPLES = 3000  # points of each shape by which it is aligned, and that group dense searches
@@ -136,12 +136,14 @@ class Spaces:
         return Shape(self.mesh, self.clock("coarse basis", spectrum, self.sampled, k=self.k))
 
     @cached_property
-    def lifted(self) -> Shape:
+    def with_refined_eigenfunctions(self) -> Shape:
         """The low-resolution mesh with functions that were brought to all vertices and back."""
         return Shape(self.mesh, self.clock("lifted basis", self._lifted))
 
     def _lifted(self):
-        return lifted(self.mesh, spectrum(self.sampled, k=self.k + SPARE), self.k)
+        return with_refined_eigenfunctions(
+            self.mesh, spectrum(self.sampled, k=self.k + SPARE), self.k
+        )
 
 
 def functions_at_all_vertices(shape: Shape, C: np.ndarray | None = None) -> np.ndarray:
@@ -200,7 +202,7 @@ class Pair:
     k_init, k, step : int
         Of the maps.
     full_resolution_iterations : int
-        Last iterations of RE-MATCH lifted that look among all vertices.
+        Last iterations of RE-MATCH refined that look among all vertices.
     init : {"landmarks", "descriptors"}
         Initial maps as :func:`s4a.method.fmap.fmap_from_landmarks`, or from wave kernels of the
         shapes and around landmarks.
@@ -220,7 +222,9 @@ class Pair:
         """A method of :data:`METHODS`."""
         clock = Clock()
         remeshed = KINDS.get(method) in ("coarse", "lifted")
-        transform, landmarks, align_seconds = self.align_remeshed if remeshed else self.align_samples
+        transform, landmarks, align_seconds = (
+            self.align_remeshed if remeshed else self.align_samples
+        )
         registers = method.startswith("registered")
         aligned = self.landmarks is None or method in ("kNN", "ZO") or registers
         if aligned:
@@ -266,10 +270,14 @@ class Pair:
         R, t, _ = clock("align", align, X, area, Y, area_target)
         landmarks = self.landmarks
         if landmarks is None:
-            landmarks = clock("align", landmarks_after_alignment, self.source.X, self.target.X, (R, t))
+            landmarks = clock(
+                "align", landmarks_after_alignment, self.source.X, self.target.X, (R, t)
+            )
         return (R, t), landmarks, clock["align"]
 
-    def match_spectrally(self, method: str, transform: RigidTransform, landmarks: Matches) -> Outcome:
+    def match_spectrally(
+        self, method: str, transform: RigidTransform, landmarks: Matches
+    ) -> Outcome:
         """A method of functions: initial map, ZoomOut and match at full resolution."""
         if method not in self.spectral:
             self.spectral[method] = self._match_spectrally(method, transform, landmarks)

@@ -37,7 +37,7 @@ class Cloud(NamedTuple):
 def rigid_transform(
     P: Array, Q: Array, weight: Array | None = None, *, scale: bool = False
 ) -> tuple[Array, Array, float]:
-    """The transform s R x + t that brings points P closest to Q in the (weighted) least-squares sense.
+    """Return s R x + t that maps points P to Q with least (weighted) squared error.
 
     Kabsch's solution by the SVD of the cross-covariance; with ``scale=True`` Umeyama's (1991).
 
@@ -200,7 +200,12 @@ def icp(source: Cloud, target: Cloud, R: Array, t: Array, **options: Any) -> End
 
 
 def icp_each(
-    source: Cloud, target: Cloud, starts: list[RigidTransform], *, iterations: int = 60, tolerance: float = 1e-5
+    source: Cloud,
+    target: Cloud,
+    starts: list[RigidTransform],
+    *,
+    iterations: int = 60,
+    tolerance: float = 1e-5,
 ) -> list[End]:
     """Iterative closest points (Besl & McKay 1992) from each of some starts: moves the source.
 
@@ -233,7 +238,9 @@ def icp_each(
         forth = _nearest(target, [X @ R.T + t for R, t, _ in (ends[i] for i in moving)])
         back = _nearest(source, [(Y - t) @ R for R, t, _ in (ends[i] for i in moving)])
         moved, moving = moving, []
-        for i, (there, forth_distance), (here, back_distance) in zip(moved, forth, back, strict=True):
+        for i, (there, forth_distance), (here, back_distance) in zip(
+            moved, forth, back, strict=True
+        ):
             P = np.concatenate([X, source.X[here]])  # (pairs, 3)
             Q = np.concatenate([target.X[there], Y])
             gap = np.concatenate([forth_distance, back_distance])
@@ -292,7 +299,7 @@ def _try_tilts(source: Cloud, target: Cloud, start: End) -> End:
 
 
 def align(X: Array, area: Array, Y: Array, area_y: Array) -> End:
-    """Rigid transform of X onto Y by ICP, from the pose as given and from the turns of principal axes.
+    """Rigid transform of X onto Y by ICP from several initial rotations.
 
     The starts are compared by pairing ``N_POINTS`` spread vertices of each shape.  Two go on,
     tilted: of the four turns that align principal axes, the best that ends within 90 degrees of

@@ -111,7 +111,8 @@ def boundaries(T: Array, region: Array) -> tuple[Array, Array, Array, Array]:
     Returns
     -------
     triangle, vertex, boundary : int ndarray (r,)
-        Triangles across a boundary, a vertex in it on the region's side, and the number of the boundary.
+        Triangles across a boundary, a vertex in it on the region's side, and the number of the
+        boundary.
     owner : int ndarray
         Region of each boundary.
     """
@@ -168,7 +169,8 @@ def faults(graph: _MeshGraph, cell: Array, n: int, among: Array | None = None) -
     Returns
     -------
     cell : bool ndarray (n,)
-        No disk (V - E + F != 1) with several boundaries, several stretches of boundary, or no triangle.
+        No disk (V - E + F != 1) with several boundaries, several stretches of boundary, or no
+        triangle.
     pair : int ndarray (p, 2)
         Neighbouring cells whose common border is not one strip: it has not two ends.
     edge, edge_pair : int ndarray
@@ -197,8 +199,8 @@ def faults(graph: _MeshGraph, cell: Array, n: int, among: Array | None = None) -
 def _faulty_cells(T, ends, is_open, cell, among):
     """Which cells have no boundary, several boundaries, or several stretches of boundary ``(n,)``.
 
-    Handles and holes inside a single boundary do no harm: they vanish with the cell.  `ends` are the
-    cells at both ends of the edges ``(e, 2)``.
+    Handles and holes inside a single boundary do no harm: they vanish with the cell.  `ends` are
+    the cells at both ends of the edges ``(e, 2)``.
     """
     n, L = len(among), cell[T]
     inner = ends[:, 0] == ends[:, 1]
@@ -294,7 +296,7 @@ def thin_regions(graph: _MeshGraph, state: Voronoi) -> Array:
 
 
 def between_boundaries(G: sp.csr_matrix, T: Array, region: Array) -> Array:
-    """Triangles half-way between the boundaries of a region ``(m,)``: without them, a tube is cut."""
+    """Triangles ``(m,)`` half-way between the boundaries of a region, where a tube is cut."""
     triangle, vertex, boundary, _ = boundaries(T, region)
     boundary_of = np.full(len(region), -1)
     boundary_of[vertex[::-1]] = boundary[::-1]  # a vertex in several boundaries goes to the first

@@ -70,7 +70,7 @@ def hands(evidence: Mapping[str, xr.Dataset]) -> np.ndarray:
     """
     names = list(evidence)
     references = next(iter(evidence.values()))["reference"].values.tolist()
-    hand = np.array([seen["hand"].values for seen in evidence.values()])  # (n, references)
+    hand = np.array([seen["chirality"].values for seen in evidence.values()])  # (n, references)
     of_all = np.full((len(names), len(names)), np.nan)
     place = [names.index(name) for name in references if name in names]
     of_all[:, place] = hand[:, [name in names for name in references]]
@@ -145,9 +145,7 @@ def rarer_side(hand: Mapping[str, float]) -> tuple[list[str], list[str]]:
     return [name for name, one in hand.items() if one <= -OTHER_SIDE], [remark] * bool(weak)
 
 
-def is_mirrored(
-    name: str, look: xr.Dataset, known: Mapping[str, xr.Dataset]
-) -> tuple[bool, str]:
+def is_mirrored(name: str, look: xr.Dataset, known: Mapping[str, xr.Dataset]) -> tuple[bool, str]:
     """Whether one shape is of the rarer hand beside others, and what is told where it is not known.
 
     Parameters

@@ -182,8 +182,8 @@ def with_landmarks(mesh: xr.Dataset, landmarks: xr.Dataset | Path | str) -> xr.D
     """A mesh that knows its landmarks, so that registration holds them together.
 
     Landmarks are paired by name: those that two shapes have guide the rigid transform and, in far
-    poses, the initial map, and pull the elastic iterations (:mod:`s4a.method.elastic`).  Points of curves
-    have no partner and are left out.
+    poses, the initial map, and pull the elastic iterations (:mod:`s4a.method.elastic`).  Points of
+    curves have no partner and are left out.
 
     Parameters
     ----------

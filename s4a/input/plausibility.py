@@ -40,7 +40,7 @@ _HALF_TURNS = [np.diag(d) for d in itertools.product((1.0, -1.0), repeat=3) if n
 
 
 def describe(mesh: xr.Dataset, *, intersections: bool = True) -> xr.Dataset:
-    """A shape on its own: a descriptor of some vertices, and numbers that no rigid transform changes.
+    """Descriptor of one shape: some of its vertices and rigidly invariant numbers.
 
     Parameters
     ----------
@@ -52,13 +52,13 @@ def describe(mesh: xr.Dataset, *, intersections: bool = True) -> xr.Dataset:
     Returns
     -------
     Dataset
-        ``descriptor_position``, ``descriptor_area``, ``descriptor_normal`` of 3,000 vertices, evenly from the
-        order of the file, centred and of unit root mean square radius; ``descriptor_asymmetry``, how
-        far the mirror image lies above each; ``moment``.  Attributes: ``compactness`` (volume over
-        area^1.5), ``chirality`` (skewness along the three axes, multiplied; a mirror image has the
-        other sign), ``open_boundary`` (:func:`hole_length` over sqrt(area)), ``lattice``
-        (:func:`lattice_step` over the median edge), ``self_intersections`` and ``intersecting``
-        (their share of the triangles); -1 where they were not counted.
+        ``descriptor_position``, ``descriptor_area``, ``descriptor_normal`` of 3,000 vertices,
+        evenly from the order of the file, centred and of unit root mean square radius;
+        ``descriptor_asymmetry``, how far the mirror image lies above each; ``moment``.  Attributes:
+        ``compactness`` (volume over area^1.5), ``chirality`` (skewness along the three axes,
+        multiplied; a mirror image has the other sign), ``open_boundary`` (:func:`hole_length` over
+        sqrt(area)), ``lattice`` (:func:`lattice_step` over the median edge), ``self_intersections``
+        and ``intersecting`` (their share of the triangles); -1 where they were not counted.
 
     Examples
     --------
@@ -139,7 +139,8 @@ def lattice_step(X: np.ndarray) -> float:
 def _in_numbers(descriptors):
     """Logarithms of area, compactness and the three moments of shapes (n, 5)."""
     rows = [
-        [one.attrs["surface"], one.attrs["compactness"], *one["moment"].values] for one in descriptors
+        [one.attrs["surface"], one.attrs["compactness"], *one["moment"].values]
+        for one in descriptors
     ]
     return np.log(np.maximum(rows, 1e-300)).reshape(-1, 5)
 
@@ -252,8 +253,10 @@ def compare(name: str, descriptor: xr.Dataset, references: dict[str, xr.Dataset]
         nearer = np.log(max(gap_mirrored, _TINY) / max(gap, _TINY))
         rows.append((fit, fit_mirrored, alike - alike_mirrored + nearer))
     fit, fit_mirrored, hand = np.array(rows).reshape(-1, 3).T
-    own = descriptor.drop_vars([str(v) for v in descriptor.data_vars if str(v).startswith("sketch_")])
-    beside = dataset(fit=fit, fit_mirrored=fit_mirrored, hand=hand)
+    own = descriptor.drop_vars(
+        [str(v) for v in descriptor.data_vars if str(v).startswith("sketch_")]
+    )
+    beside = dataset(fit=fit, fit_mirrored=fit_mirrored, chirality=hand)
     return own.assign(beside.variables).assign_coords(reference=list(references))
 
 
@@ -389,8 +392,8 @@ KINDS = {
     "kind": (False, "unlike the others: {what} {spreads:.0f} times the usual spread away; another "
         "kind of shape, stretched, or a part? Look at it, and leave it out if it does not belong",
         "take the files away, if of another kind"),
-    "registration": (True, "{sure} registered wrongly (registration_error {registration_error:.3f}{distortion}): look at "
-        "it in s4a view, compare its file with the template's, or leave it out",
+    "registration": (True, "{sure} registered wrongly ({registration_error:.3f}{distortion}): "
+        "look at it in s4a view, compare its file with the template's, or leave it out",
         "look at the page; a larger --n-coarse may help"),
 }
 # fmt: on

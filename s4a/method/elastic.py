@@ -1,8 +1,8 @@
 """Elastic registration: the smoothing of the displacement (4.2, eq. 8) with a price on bending.
 
 The paper cuts a displacement off after K eigenfunctions of the template N; within these every
-tangential shift costs nothing, so that iterations of nearest neighbours drift along the surface.  Here
-the coefficients c (K, 3) and a linear map A x + b of what the first iterations left minimise
+tangential shift costs nothing, so that iterations of nearest neighbours drift along the surface.
+Here the coefficients c (K, 3) and a linear map A x + b of what the first iterations left minimise
 
     sum_i a_i |z_i - y_i|^2_i + stiffness * sum_k lambda_k^2 |c_k|^2,   z = A x + b + Phi c,
 
@@ -14,8 +14,8 @@ the bending energy, the integral of |Laplacian|^2 of the displacement.  The stif
 round to round, as in the non-rigid ICP of Amberg, Romdhani and Vetter (CVPR 2007), and on where the
 bending energy has settled: there the template follows the shape, and what the price shrinks is the
 displacement alone.  Where each step bends it more, it would follow noise.  Before all that each
-start is made so stiff that near starts meet, and their mean goes on (:func:`converging_initialisations`).
-Lengths are for surfaces of unit area.
+start is made so stiff that near starts meet, and their mean goes on
+(:func:`converging_initialisations`). Lengths are for surfaces of unit area.
 
 Nothing above keeps a surface from shifting along itself over its own boundary.  Where both
 boundaries lie on each other already they are taken for one line, and the squared distances from it
@@ -25,8 +25,8 @@ Landmarks that a user marked on both surfaces add their squared distances, each 
 Fields that a user gives on both, such as sulcal depth, count beside position and normal in what is
 nearest.
 
-What K functions cannot follow is left to local iterations: a displacement d (n, 3) of the vertices of
-low resolution, beyond the warp, that minimises
+What K functions cannot follow is left to local iterations: a displacement d (n, 3) of the vertices
+of low resolution, beyond the warp, that minimises
 
     sum_i a_i |d_i - r_i|^2 + time * integral |grad d|^2,
 
@@ -44,9 +44,9 @@ import scipy.sparse as sp
 from scipy.spatial import cKDTree
 
 from s4a.geometry.closest import closest_point_in_star, features, interpolate
-from s4a.method.spectral_icp import Warp, move, turn
 from s4a.method.shape import Basis, common_fields, field_columns
 from s4a.method.spectral import Diffusion
+from s4a.method.spectral_icp import Warp, move, turn
 from s4a.schema import Array
 
 _N_STEPS = 8
@@ -143,7 +143,9 @@ class Landmarks(NamedTuple):
     y: Array  # (l, 3), on the source
 
 
-def boundary_ahead(source: Basis, target: Basis, X: Array) -> tuple[Array, Array, Array, Array] | None:
+def boundary_ahead(
+    source: Basis, target: Basis, X: Array
+) -> tuple[Array, Array, Array, Array] | None:
     """Where the target's boundary, its vertices at X, is drawn, if both boundaries are one line.
 
     They are where nine tenths of the vertices of each lie within ``_BOUNDARY_NEAR`` of the other.

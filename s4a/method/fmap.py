@@ -299,8 +299,8 @@ def refine_once(source: Basis, target: Basis, C: Array, n_samples: int = 0) -> A
     """One step of ZoomOut without growth (4.2): C -> match -> C of the same size.
 
     Where `n_samples` is not 0, matches are looked for at as many spread vertices of the target, and
-    C is the least squares there, as in the iterations of Consistent ZoomOut; at all of them where they
-    are fewer than the functions, which cannot be told apart then.
+    C is the least squares there, as in the iterations of Consistent ZoomOut; at all of them where
+    they are fewer than the functions, which cannot be told apart then.
     """
     Phi = source.Phi[:, : C.shape[1]]
     Psi = target.Phi[:, : len(C)]

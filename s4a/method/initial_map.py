@@ -104,7 +104,7 @@ def map_after_alignment(
     *,
     k_init: int = 20,
     init: str = "dense",
-    ahead: bool = True,
+    initial_refinement: bool = True,
     n_samples: int = 0,
 ) -> _InitialMap:
     """First functional map of a directed pair (4.1, steps 3 and 4).
@@ -117,7 +117,7 @@ def map_after_alignment(
         Rigid transform of the source onto the target (step 2).
     init : {"dense", "landmarks"}
         From all vertices' nearest neighbours, or the paper's fit on 10 farthest points.
-    ahead : bool
+    initial_refinement : bool
         Whether one step of ZoomOut is done ahead (4.2).
     n_samples : int
         Of that step, see :func:`s4a.method.fmap.refine_once`.
@@ -127,7 +127,7 @@ def map_after_alignment(
     fitted, landmarks = fit_after_alignment(
         source, target, transform, k_init=k_init, init=init, near=near
     )
-    C = fmap.refine_once(source, target, fitted, n_samples) if ahead else fitted
+    C = fmap.refine_once(source, target, fitted, n_samples) if initial_refinement else fitted
     return _InitialMap(init, C, fitted, near, landmarks)
 
 
@@ -143,15 +143,16 @@ def stretch(target: Basis, X: Array) -> float:
 def best_initial_map(
     source: Basis, target: Basis, C: Array, fitted: Array | None = None, *, search: bool = False
 ) -> tuple[str, Array, Array]:
-    """The best of an initial map and of those from heat and from wave kernels, which no pose changes.
+    """Return the best of an initial map and of those from heat and wave kernels.
 
     Where both have landmarks, also of one from wave kernels and these.
 
     Either kind alone fails on some pairs: shapes that nearly are their own mirror image are turned
     over, or limbs exchanged.  Each map is refined by a short ZoomOut and a few iterations of
     :func:`s4a.method.spectral_icp.coarse_spectral_icp` by parts; their end is scored without truth,
-    :func:`s4a.method.spectral_icp.registration_score` + :func:`stretch`, as a pose hardly stretches the
-    surface, + in a search 0.3 :func:`s4a.method.fmap.curvature_difference`, which tells front from back.
+    :func:`s4a.method.spectral_icp.registration_score` + :func:`stretch`, as a pose hardly stretches
+    the surface, + in a search 0.3 :func:`s4a.method.fmap.curvature_difference`, which tells front
+    from back.
 
     Parameters
     ----------
@@ -180,7 +181,9 @@ def best_initial_map(
     tried = []  # score, name, map, fit
     for one in itertools.chain(maps, maps_from_signatures(source, target, len(C), search)):
         match = fmap.zoomout(source, target, one[1], k, step=10)[1]
-        end = spectral_icp.coarse_spectral_icp(source, target, match, k_first=20, step=20, iterations=1, by_parts=True)
+        end = spectral_icp.coarse_spectral_icp(
+            source, target, match, k_first=20, step=20, iterations=1, by_parts=True
+        )
         image = spectral_icp.move(target, end[1])
         gap = spectral_icp.registration_score(source, target, end[0], target.moved_to(image))
         score = gap + stretch(target, image)
@@ -193,7 +196,7 @@ def best_initial_map(
 
 
 def _map_from_landmarks(source, target, k):
-    """Name, initial map and its fit ``(k, k)`` of wave kernels and landmarks, if both have three."""
+    """Name, initial map and its fit ``(k, k)`` of wave kernels and three landmarks."""
     landmarks = corresponding_landmarks(source, target)
     if len(landmarks[0]) < 3:
         return []
@@ -296,10 +299,11 @@ def initial_map(
     ----------
     source, target, transform : see :func:`map_after_alignment`
     search : bool
-        See :func:`best_initial_map`; for pairs alone, as Consistent ZoomOut mends those of a network.
+        See :func:`best_initial_map`; for pairs alone, as Consistent ZoomOut mends those of a
+        network.
     **options
-        Of :func:`map_after_alignment`; maps of far poses, which are looked for in other ways, take all
-        vertices.
+        Of :func:`map_after_alignment`; maps of far poses, which are looked for in other ways, take
+        all vertices.
     """
     first = map_after_alignment(source, target, transform, **options)
     far = first.name == "dense" and spectral_icp.far_apart(source, target, first.near)

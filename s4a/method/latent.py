@@ -17,8 +17,8 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 from scipy.spatial import cKDTree
 
 from s4a.geometry.align import RigidTransform, realign
-from s4a.method.initial_map import initial_map
 from s4a.method.fmap import fmap_from_match
+from s4a.method.initial_map import initial_map
 from s4a.method.median import area_differences, conformal_differences, distance_to_identity
 from s4a.method.nearest import (
     as_candidates,
@@ -43,7 +43,7 @@ log = logging.getLogger(__name__)
 
 _FINAL = 3  # shapes of a study in the last iterations of a new one, on all vertices
 TARGETS = 256  # shapes whose least squares are held at once, 0.3 GB of them
-WIDE = 4  # last iterations of Consistent ZoomOut, which look between the samples, too
+DENSE_ITERATIONS = 4  # last iterations of Consistent ZoomOut, which look between the samples, too
 N_AROUND = 32  # vertices around a sample among which they look
 ROUGH, FINE = 1e-4, 1e-6  # tolerances of the latent basis: on the way, and at the end
 
@@ -273,7 +273,7 @@ def consistent_zoomout(
     n_latent: int | None = None,
     weights: str = "cycles",
     samples: list[Array] | None = None,
-    wide: int = WIDE,
+    dense_iterations: int = DENSE_ITERATIONS,
     n_jobs: int | None = 1,
     progress: Callable[..., Any] | None = None,
     keep: Callable[..., Any] | None = None,
@@ -284,15 +284,16 @@ def consistent_zoomout(
     neighbours for every map (eq. 3) and solves for the next larger maps in the least-squares sense,
     on `samples` only, whose least squares are factored once a round and target shape; on
     samples Phi^T A of eq. 1 is no inverse of Phi.  Among the source's samples matches are off by
-    the spacing of these: in the `wide` last iterations they are looked for among the ``N_AROUND``
-    vertices around the sample that was found, too.  With all vertices as samples it is the paper's.
-    The latent basis is found to ``ROUGH`` on the way and to ``FINE`` at the end.
+    the spacing of these: in the `dense_iterations` last iterations they are looked for among the
+    ``N_AROUND`` vertices around the sample that was found, too.  With all vertices as samples it is
+    the paper's. The latent basis is found to ``ROUGH`` on the way and to ``FINE`` at the end.
 
     Parameters
     ----------
     bases : sequence of Basis
         The shapes of the network at low resolution, with k functions or more.  Each is asked for
-        once, and in the `wide` last iterations again: it may be read from its file then.
+        once, and in the `dense_iterations` last iterations again: it may be read from its file
+        then.
     C : float ndarray (p, k_init, k_init)
     source, target : int ndarray (p,)
         Which shape's functions each map takes, and on which it gives functions.
@@ -307,7 +308,7 @@ def consistent_zoomout(
     samples : list of int ndarray, optional
         Spread vertices of every shape, 2 k or more of them where these are not all; all vertices by
         default.
-    wide : int
+    dense_iterations : int
         Last iterations that look between the samples.
     n_jobs : int
         Threads; the result does not depend on it.
@@ -329,8 +330,8 @@ def consistent_zoomout(
         When samples are too few for maps of k functions.
     """
     cycles = three_cycles(source.tolist(), target.tolist())
-    wide = 0 if samples is None else wide
-    n_around = N_AROUND if wide else 1
+    dense_iterations = 0 if samples is None else dense_iterations
+    n_around = N_AROUND if dense_iterations else 1
     sampled = [
         sample(basis, None if samples is None else samples[i], k, n_around)
         for i, basis in enumerate(bases)
@@ -339,7 +340,7 @@ def consistent_zoomout(
     sizes = [*range(C.shape[1], k, step), k]
     if samples is not None and len(sizes) > 1:
         _check_samples(sampled, k)
-    wide_sizes = sizes[:-1][max(len(sizes) - 1 - wide, 0) :]
+    dense_sizes = sizes[:-1][max(len(sizes) - 1 - dense_iterations, 0) :]
     for size, next_size in zip(
         sizes, [*sizes[1:], None], strict=True
     ):  # the last only solves for Y
@@ -356,7 +357,7 @@ def consistent_zoomout(
             keep(C, Y, latent_eigenvalue)
         if next_size:
             del C  # those of two sizes need not be in memory
-            of_all = bases if size in wide_sizes else None
+            of_all = bases if size in dense_sizes else None
             C = _larger_maps(sampled, Y, source, target, next_size, of_all, n_jobs)
     return C, weight, error, Y, latent_eigenvalue
 

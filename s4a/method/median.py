@@ -91,8 +91,8 @@ def median_shape(latent: xr.Dataset, eigenvalues: Array, *, norm: str = "h2") ->
     Parameters
     ----------
     latent : xarray.Dataset
-        With ``latent_basis(shape, mode, latent)`` and ``latent_eigenvalue(latent)``.
-    eigenvalues : float ndarray (shape, mode)
+        With ``latent_basis(shape, eigenpair, latent)`` and ``latent_eigenvalue(latent)``.
+    eigenvalues : float ndarray (shape, eigenpair)
         Laplacian eigenvalues of the shapes, for unit area.
     norm : {"h2", "h1", "frobenius", "h2_image", "h2_both"}
         See :func:`distance_to_identity`.

@@ -408,7 +408,8 @@ def pca_without(
     Returns
     -------
     xarray.Dataset
-        Of :func:`pca`; where there are shapes apart, also ``score_excluded(shape_excluded, component)``.
+        Of :func:`pca`; where there are shapes apart, also ``score_excluded(shape_excluded,
+        component)``.
 
     Raises
     ------

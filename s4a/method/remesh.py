@@ -147,7 +147,9 @@ def _coarse_surface(X, T, n_coarse, seed=0):
             break
         region = voronoi.thin_regions(graph, start)
         crumb = triangle_areas(V, F).sum() / n_coarse  # the area of a cell
-        V, F, came_from = voronoi.cut_handles(V, F, voronoi.between_boundaries(graph.G, F, region), crumb)
+        V, F, came_from = voronoi.cut_handles(
+            V, F, voronoi.between_boundaries(graph.G, F, region), crumb
+        )
         origin = np.where(came_from >= 0, origin[came_from], -1)
     cell = np.full(len(X), -1)
     kept = np.flatnonzero(origin >= 0)
@@ -343,7 +345,9 @@ def coarsen(
     if len(V) <= n_coarse:
         Y, C = V, F
         sample = cell = np.arange(len(V))
-        attrs.update(kept_whole=1, samples_first=len(V), samples_added=0, iterations=0, vertices_cut=0)
+        attrs.update(
+            kept_whole=1, samples_first=len(V), samples_added=0, iterations=0, vertices_cut=0
+        )
     else:
         Y, C, sample, cell, counts = _coarse_surface(V, F, n_coarse, seed)
         attrs |= counts

@@ -212,8 +212,9 @@ class Shape:
     original : xarray.Dataset, optional
         The clean mesh: ``position``, ``corner_vertex``; empty where no step needs it.
     coarse : xarray.Dataset, optional
-        As :func:`s4a.coarsen` and :func:`s4a.spectrum` make it, or :func:`s4a.method.refined_eigenfunctions.lifted`,
-        or :func:`s4a.method.scalable.reduced`: then what is called coarse are samples.
+        As :func:`s4a.coarsen` and :func:`s4a.spectrum` make it, or
+        :func:`s4a.method.refined_eigenfunctions.lifted`, or :func:`s4a.method.scalable.reduced`:
+        then what is called coarse are samples.
     n_projected : int
         Vertices of ``full`` by which fields are projected, those nearest to coarse ones; 0 for all.
     area_weighted : bool

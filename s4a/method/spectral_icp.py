@@ -68,7 +68,9 @@ def fit_warp(source: Basis, target: Basis, match: Array) -> Warp:
     return onto(target.X[rows], source.X[match], target.area[rows], target.coefficients)
 
 
-def warp_after(source: Basis, target: Basis, match: Array, transform: RigidTransform, ratio: float) -> Warp:
+def warp_after(
+    source: Basis, target: Basis, match: Array, transform: RigidTransform, ratio: float
+) -> Warp:
     """The warp after a given transform instead of a fitted one: eq. 8 and the line after it.
 
     The source moves by ``ratio R x + t``; what is left to its vertices, matched by the target's
@@ -190,8 +192,8 @@ def registration_score(
     The round trip goes from a vertex of the target to its match and back to the vertex whose
     registered position (in position and normal) is nearest, measured along the edges of the target
     and cut at `limit`; the gaps are the mean distances of the registered target and the source, at
-    the vertices near coarse ones of each; to them comes ``_landmark_distance``.  Lengths are for unit
-    area.
+    the vertices near coarse ones of each; to them comes ``_landmark_distance``.  Lengths are for
+    unit area.
 
     Stretch of edges is left out: on heads and brains with known warps it prefers maps that move
     nothing.
@@ -214,7 +216,9 @@ def registration_score(
     sample = target.outwards[np.linspace(0, len(match) - 1, n_samples).astype(int)]
     end = tree.query(source.tree.data[match[sample]])[1]
     trip = path_lengths(target.graph, rows[sample], end, limit)
-    return float(trip.mean() + gap.mean() + back_distance.mean() + _landmark_distance(source, target, X))
+    return float(
+        trip.mean() + gap.mean() + back_distance.mean() + _landmark_distance(source, target, X)
+    )
 
 
 def _landmark_distance(source, target, X):
@@ -259,7 +263,7 @@ def candidates(
     *,
     k: int = 100,
     far: float = 0.03,
-    parts: bool = True,
+    articulated: bool = True,
 ) -> dict[str, Candidate]:
     """Registrations at low resolution: every start as it is, and after joint iterations.
 
@@ -273,7 +277,7 @@ def candidates(
         At low resolution.
     starts : dict
         Name -> match (n_target,).
-    parts : bool
+    articulated : bool
         Whether to try iterations by parts.
 
     Returns
@@ -290,7 +294,7 @@ def candidates(
     for name, match in starts.items():
         enter(f"{name}+joint", *coarse_spectral_icp(source, target, match, k=k))
     best = min(starts, key=lambda name: tried[f"{name}+joint"].score)
-    if parts and all(far_apart(source, target, match) for match in starts.values()):
+    if articulated and all(far_apart(source, target, match) for match in starts.values()):
         end = coarse_spectral_icp(
             source, target, starts[best], k_first=20, k=k, iterations=1, spectral=0.2, by_parts=True
         )

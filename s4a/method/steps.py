@@ -11,10 +11,10 @@ import numpy as np
 import xarray as xr
 from threadpoolctl import threadpool_limits
 
-from s4a.geometry.align import RigidTransform, align, relative_transform, realign
+from s4a.geometry.align import RigidTransform, align, realign, relative_transform
 from s4a.method import fmap, network
 from s4a.method.initial_map import initial_map, map_after_alignment, transform_onto
-from s4a.method.latent import WIDE, consistent_zoomout, nearest_spectra, place
+from s4a.method.latent import DENSE_ITERATIONS, consistent_zoomout, nearest_spectra, place
 from s4a.method.median import median_shape
 from s4a.method.register import from_latent, identity, match_functions, match_low
 from s4a.method.shape import Basis, Shape
@@ -24,7 +24,7 @@ from s4a.schema import check_count, dataset, require
 PROJECTION = [name for name, one in DECLARED.items() if one.metadata["of"] == "projection"]
 REGISTRATION = [
     *(name for name, one in DECLARED.items() if one.metadata["of"] == "registration"),
-    "how",
+    "dense_match",
     *PROJECTION,
 ]
 LOW = ("position", "corner_vertex", "vertex_area", "eigenvalue", "eigenfunction")
@@ -93,7 +93,7 @@ def map_pairs(
     *,
     k_init: int = 20,
     init: str = "dense",
-    ahead: bool = True,
+    initial_refinement: bool = True,
     n_samples: int = N_SAMPLES,
 ) -> xr.Dataset:
     """Initial maps of some pairs, in both directions (4.1, steps 3 and 4).
@@ -106,7 +106,7 @@ def map_pairs(
         Name -> transform (R, t) onto a common reference.
     pairs : sequence of (str, str)
     k_init, init : see :func:`s4a.analyse`
-    ahead : bool
+    initial_refinement : bool
         Whether a step of ZoomOut is done ahead (4.2).
     n_samples : int
         Spread vertices on which that step looks for matches in near poses; 0 for all.
@@ -115,10 +115,14 @@ def map_pairs(
     -------
     xarray.Dataset
         ``source(pair)``, ``target(pair)`` and ``fmap_initial``; ``fmap_fitted``, the same before
-        the step ahead; ``pair_rotation``, ``pair_translation``, the transform of ICP; with landmarks
-        ``landmark_of_source(pair, landmark)`` and ``landmark_of_target``.
+        the step ahead; ``pair_rotation``, ``pair_translation``, the transform of ICP; with
+        landmarks ``landmark_of_source(pair, landmark)`` and ``landmark_of_target``.
     """
-    options: dict[str, Any] = {"k_init": k_init, "init": init, "ahead": ahead}
+    options: dict[str, Any] = {
+        "k_init": k_init,
+        "init": init,
+        "initial_refinement": initial_refinement,
+    }
     options["n_samples"] = n_samples
     rows: list[tuple[Any, ...]] = []
     for a, b in pairs:
@@ -147,7 +151,7 @@ def build_network(
     n_pairs: int = 500,
     k_init: int = 20,
     init: str = "dense",
-    ahead: bool = True,
+    initial_refinement: bool = True,
     n_samples: int = N_SAMPLES,
 ) -> xr.Dataset:
     """The network of initial maps of a collection (3.4, 4.1): its pairs, and a map each way.
@@ -156,7 +160,7 @@ def build_network(
     ----------
     coarse : dict of str to xarray.Dataset
         Name -> low-resolution mesh with its spectrum.
-    n_pairs, k_init, init, ahead, n_samples : see :func:`map_pairs`
+    n_pairs, k_init, init, initial_refinement, n_samples : see :func:`map_pairs`
 
     Returns
     -------
@@ -206,12 +210,20 @@ def build_network(
     transforms[reference] = np.eye(3), np.zeros(3)
     pairs = [(names[i], names[j]) for i, j in network.choose_pairs(distance, n_pairs)]
     maps = map_pairs(
-        bases, transforms, pairs, k_init=k_init, init=init, ahead=ahead, n_samples=n_samples
+        bases,
+        transforms,
+        pairs,
+        k_init=k_init,
+        init=init,
+        initial_refinement=initial_refinement,
+        n_samples=n_samples,
     )
     return with_transforms(maps, {name: transforms[name] for name in names}, reference)
 
 
-def with_transforms(maps: xr.Dataset, transforms: dict[str, RigidTransform], reference: str) -> xr.Dataset:
+def with_transforms(
+    maps: xr.Dataset, transforms: dict[str, RigidTransform], reference: str
+) -> xr.Dataset:
     """A network with the transforms of its shapes onto the `reference`."""
     R, t = (np.stack(values) for values in zip(*transforms.values(), strict=True))
     placed = dataset(icp_rotation=R, icp_translation=t).assign_coords(shape=list(transforms))
@@ -227,7 +239,7 @@ def refine_network(
     n_latent: int | None = None,
     weights: str = "cycles",
     n_samples: int = N_SAMPLES,
-    wide: int = WIDE,
+    dense_iterations: int = DENSE_ITERATIONS,
     norm: str = "h2",
     keep_iterations: bool = False,
     n_jobs: int | None = 1,
@@ -241,7 +253,8 @@ def refine_network(
         Name -> low-resolution mesh with its spectrum.
     first : xarray.Dataset
         As of :func:`build_network`.
-    k, step, n_latent, weights, n_samples, wide, norm, keep_iterations : see :func:`s4a.analyse`
+    k, step, n_latent, weights, n_samples, dense_iterations, norm, keep_iterations : see
+    :func:`s4a.analyse`
     n_jobs : int
         Threads; the result does not depend on it.
     progress : callable, optional
@@ -289,7 +302,7 @@ def refine_network(
     for name, mesh in coarse.items():
         require(mesh, *LOW, what=f"coarse mesh {name}")
     bases, names = LowBases(coarse), list(coarse)
-    k = min([k, *(mesh.sizes["mode"] for mesh in coarse.values())])
+    k = min([k, *(mesh.sizes["eigenpair"] for mesh in coarse.values())])
     source = np.array([names.index(name) for name in first["source"].values])
     target = np.array([names.index(name) for name in first["target"].values])
     C_initial = first["fmap_initial"].values  # (p, k_init, k_init)
@@ -314,7 +327,7 @@ def refine_network(
             n_latent=n_latent,
             weights=weights,
             samples=[basis.sample_vertices_of(n_samples) for basis in bases],
-            wide=wide,
+            dense_iterations=dense_iterations,
             n_jobs=n_jobs,
             progress=progress,
             keep=keep if keep_iterations else None,
@@ -389,12 +402,12 @@ def template_of(study: xr.DataTree) -> str:
 
 
 def transform_in(study: Study, name: str) -> Any:
-    """RigidTransform (R, t) of a shape onto the reference of the network; None where there are none.
+    """Rigid transform (R, t) of a shape onto the reference of the network, or None.
 
     A shape apart from the network is moved there now, if that is not in the study.
     """
-    if f"network/motion_{name}" in study:
-        own = study[f"network/motion_{name}"]
+    if f"network/alignment_{name}" in study:
+        own = study[f"network/alignment_{name}"]
         return own["rotation"].values, own["translation"].values
     network = study["network"] if "network" in study else xr.Dataset()
     if "icp_rotation" not in network:
@@ -402,7 +415,9 @@ def transform_in(study: Study, name: str) -> Any:
     if name in network["shape"]:
         own = network.sel(shape=name)
         return own["icp_rotation"].values, own["icp_translation"].values
-    return transform_onto(shape_in(study, name).low, shape_in(study, network.attrs["reference"]).low)
+    return transform_onto(
+        shape_in(study, name).low, shape_in(study, network.attrs["reference"]).low
+    )
 
 
 def latent_bases(study: Study, *names: str) -> tuple[Any, ...]:
@@ -474,7 +489,7 @@ def register_in(
 
 
 def latent_match(
-    study: xr.DataTree, source: str, target: str, *, how: str = "ours", full: bool = True
+    study: xr.DataTree, source: str, target: str, *, dense_match: str = "latent", full: bool = True
 ) -> xr.Dataset:
     """Match of any two shapes of a network by their latent bases (eq. 3 and 6; eq. 7 or 4).
 
@@ -484,7 +499,7 @@ def latent_match(
         With ``/original``, ``/coarse`` and ``/latent``.
     source, target : str
         Names of shapes.
-    how : {"ours", "standard"}
+    dense_match : {"latent", "fmap"}
         At full resolution eq. 7, or eq. 4 with the functional map of the match of eq. 3.
     full : bool
         Whether original vertices are matched, or those of low resolution by eq. 3.
@@ -497,7 +512,7 @@ def latent_match(
     Raises
     ------
     ValueError
-        When a shape is not in the study, or `how` is another word.
+        When a shape is not in the study, or `dense_match` is another word.
 
     Examples
     --------
@@ -509,7 +524,9 @@ def latent_match(
     """
     nodes = Study(study)
     shapes = shape_in(nodes, source), shape_in(nodes, target)
-    match, functions = match_low(*shapes, latent_bases(nodes, source, target), how=how)
+    match, functions = match_low(
+        *shapes, latent_bases(nodes, source, target), dense_match=dense_match
+    )
     if full:
         match, *_ = match_functions(*shapes, *functions)
     return dataset(match=match)
@@ -559,7 +576,7 @@ def register_shape(
     template: str | None = None,
     *,
     start: RigidTransform | None = None,
-    how: str | None = None,
+    dense_match: str | None = None,
     **options: Any,
 ) -> xr.Dataset:
     """One shape of a study registered to the template (4.2; eq. 6, 7 and 8).
@@ -574,15 +591,16 @@ def register_shape(
     name, template : str
         The template of the study by default; the median shape, where nothing is registered yet.
     start : tuple (R, t), optional
-        About the rigid transform of the shape onto the template, between their frames; by default that
-        by which the network is aligned, or where there is none that of ICP from the principal axes.
-    how : {"ours", "standard"}, optional
+        About the rigid transform of the shape onto the template, between their frames; by default
+        that by which the network is aligned, or where there is none that of ICP from the principal
+        axes.
+    dense_match : {"latent", "fmap"}, optional
         Eq. 7, or eq. 3 and 4.
     **options
-        ``refine``, ``scale``, ``parts`` and ``alignment`` of
+        ``refine``, ``remove_size``, ``articulated`` and ``alignment`` of
         :func:`s4a.method.register.register`; ``n_projected`` and ``area_weighted`` of
         :class:`s4a.method.shape.Shape`.  One that is not given, or as None, is that of the study's
-        report, as `how` is; their own defaults hold where it names none.
+        report, as `dense_match` is; their own defaults hold where it names none.
 
     Returns
     -------
@@ -609,7 +627,11 @@ def register_shape(
             f"unexpected options {', '.join(wrong)}; those of a registration are "
             f"{', '.join(REGISTRATION)}"
         )
-    given = {key: value for key, value in (options | {"how": how}).items() if value is not None}
+    given = {
+        key: value
+        for key, value in (options | {"dense_match": dense_match}).items()
+        if value is not None
+    }
     options = options_of_registration(study) | given
     for option in options.keys() & {"refine", "alignment", "how"}:
         check(option, options[option])

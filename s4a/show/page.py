@@ -16,7 +16,6 @@ from s4a.show.pictures import N_MODES, PANEL, SIGMA, mode_pictures, shared_frame
 from s4a.show.surfaces import (
     N_LIVE,
     attribute,
-    transferred_colors,
     has,
     labelled,
     low_text,
@@ -28,6 +27,7 @@ from s4a.show.surfaces import (
     score_state,
     surface,
     template_coarse,
+    transferred_colors,
 )
 from s4a.study.tree import left_out, seconds_of
 

@@ -12,17 +12,17 @@ from threadpoolctl import threadpool_limits
 from s4a.geometry.crossing import can_count
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.input import plausibility
+from s4a.input.chirality import AUTO, is_mirrored, mirror_image
 from s4a.input.collection import shape_report
 from s4a.input.files import SUFFIXES as MESHES
 from s4a.input.files import files_named, suffix_of
-from s4a.input.chirality import AUTO, is_mirrored, mirror_image
 from s4a.input.landmarks import SUFFIXES
 from s4a.input.plausibility import find_warnings
 from s4a.input.subjects import listed
 from s4a.method.initial_map import transform_onto
 from s4a.method.latent import latent_of_new
-from s4a.method.refined_eigenfunctions import low_resolution
 from s4a.method.pca import project_scores
+from s4a.method.refined_eigenfunctions import low_resolution
 from s4a.method.register import from_latent
 from s4a.method.shape import Shape
 from s4a.method.steps import Study, latent_bases, place_in
@@ -85,9 +85,9 @@ def insert(
         commas between them, or ``"auto"``, those of the other hand than the shapes of the study as
         they are in it.  Without it none is mirrored, and `compare` tells those of the other hand.
     compare : bool
-        Whether each new shape is compared with those of the study: unit, mean_chirality, pose, genus,
-        as :func:`s4a.read_shapes` does it; what looks wrong is named in ``/report`` and left as it
-        is.
+        Whether each new shape is compared with those of the study: unit, mean_chirality, pose,
+        genus, as :func:`s4a.read_shapes` does it; what looks wrong is named in ``/report`` and left
+        as it is.
     n_jobs : int, optional
         As in joblib; the result does not depend on it.
 
@@ -226,9 +226,13 @@ def compare_chirality(
     meshes: dict[str, xr.Dataset], descriptors: dict[str, xr.Dataset]
 ) -> tuple[dict[str, xr.Dataset], dict[str, xr.Dataset]]:
     """:func:`s4a.input.plausibility.compare` of shapes of the study, and of new ones."""
-    known = {name: plausibility.compare(name, seen, descriptors) for name, seen in descriptors.items()}
+    known = {
+        name: plausibility.compare(name, seen, descriptors) for name, seen in descriptors.items()
+    }
     looks = {
-        name: plausibility.compare("", plausibility.describe(mesh, intersections=False), descriptors)
+        name: plausibility.compare(
+            "", plausibility.describe(mesh, intersections=False), descriptors
+        )
         for name, mesh in meshes.items()
     }
     return known, looks
@@ -308,9 +312,9 @@ def _insert_one(mesh, frozen, options, references):
     (of_template,) = latent_bases(study, names[0])
     k = len(of_template)
     coarse = low_resolution(mesh, **options.of("low resolution") | {"k": k})
-    if coarse.sizes["mode"] < k:
+    if coarse.sizes["eigenpair"] < k:
         raise ValueError(
-            f"the study needs {k} eigenfunctions, this shape has only {coarse.sizes['mode']}"
+            f"the study needs {k} eigenfunctions, this shape has only {coarse.sizes['eigenpair']}"
         )
     shape = Shape(mesh, coarse, **options.of("projection"))
     R, t = transform_onto(shape.low, template.low)
@@ -324,7 +328,7 @@ def _insert_one(mesh, frozen, options, references):
         step=options.step,
         **options.of("initial maps"),
     )
-    settings = {"how": options.how, **options.of("registration")}
+    settings = {"dense_match": options.dense_match, **options.of("registration")}
     registration = from_latent(shape, template, (Y, of_template), (R, t), **settings)
     seen = None
     if references is not None:
@@ -389,5 +393,7 @@ def scores_of_new(modes: xr.Dataset, registration: xr.Dataset, area: np.ndarray)
         area,
     )
     new = in_unit(dataset(score=score, reconstruction_error=left), unit_of(modes["deformation"]))
-    frozen = modes.drop_vars(["score", "shape", "score_excluded", "shape_excluded"], errors="ignore")
+    frozen = modes.drop_vars(
+        ["score", "shape", "score_excluded", "shape_excluded"], errors="ignore"
+    )
     return frozen.merge(new).assign_coords(shape=registration["shape"])

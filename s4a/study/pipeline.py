@@ -14,8 +14,8 @@ import numpy as np
 import xarray as xr
 from joblib import effective_n_jobs, parallel_config
 
-from s4a.input.collection import remarks_on_files
 from s4a.input.chirality import AUTO, hands, mirrored_shapes, to_reflect
+from s4a.input.collection import remarks_on_files
 from s4a.input.plausibility import Flags
 from s4a.input.subjects import read_table
 from s4a.method.network import choose_pairs, spectral_distance
@@ -23,16 +23,16 @@ from s4a.method.pca import pca_without
 from s4a.method.remesh import check_wrap
 from s4a.options import Options, given_options
 from s4a.schema import dataset
+from s4a.study.netcdf import arrays, attributes, is_done, open_file, read
+from s4a.study.processes import temporary_folder
 from s4a.study.quality_control import (
     check_plausibility,
-    check_usable,
     check_registrations,
+    check_usable,
     comparisons_of,
     exclude_flagged,
     stop_if_flagged,
 )
-from s4a.study.netcdf import arrays, attributes, is_done, open_file, read
-from s4a.study.processes import temporary_folder
 from s4a.study.report import write_report
 from s4a.study.runner import Keys, Run, Task
 from s4a.study.sources import (
@@ -61,7 +61,7 @@ from s4a.study.tree import open_study, stack_registration, template_mesh
 
 log = logging.getLogger(__name__)
 
-CHOICE = "network/hands.nc"
+CHOICE = "network/chirality.nc"
 
 
 def analyse(
@@ -76,7 +76,7 @@ def analyse(
     table: Path | str | None = None,
     landmarks: Path | str | None = None,
     template: str | None = None,
-    scale: bool | None = None,
+    remove_size: bool | None = None,
     options: Options | None = None,
     store: Path | str | None = None,
     n_jobs: int | None = None,
@@ -112,7 +112,7 @@ def analyse(
     ------
     ValueError
         When an option is out of range, or fewer than 2 shapes can be used; the reasons are named.
-        With ``flagged="stop"``, when a shape is flagged.
+        With ``quality_control="stop"``, when a shape is flagged.
     TypeError
         When an option is given that there is not.
 
@@ -141,7 +141,7 @@ def analyse(
         "table": table,
         "landmarks": landmarks,
         "template": template,
-        "scale": scale,
+        "remove_size": remove_size,
     }
     given = {name: value for name, value in shown.items() if value is not None}
     settings = given_options(given | others, options)
@@ -179,9 +179,9 @@ def run_steps(
     """All steps of the paper in turn; each looks up which of its files are done."""
     # what each file is made from; a key holds the keys of all before it:
     #
-    #   original/* -> coarse/* -> network/motion_* -> network/first_* -> network, latent
+    #   original/* -> coarse/* -> network/alignment_* -> network/initial_* -> network, latent
     #       |                                                                  |
-    #   network/sketch_*, look_*  latent/* of those apart -> registration/* <- registration
+    #   network/descriptor_*, look_*  latent/* of those apart -> registration/* <- registration
     #                                                     |
     #                                                pca, report
     reflected, chirality_evidence = choose_reflected(run, sources, marked, options)
@@ -227,7 +227,7 @@ def choose_reflected(
     """The shapes whose mirror images are taken, and what is told of the choice.
 
     Where the shapes themselves shall say (``reflect="auto"``), they are looked at as they are
-    first; ``network/hands`` keeps the choice.
+    first; ``network/chirality`` keeps the choice.
     """
     if options.reflect is None:
         return [], []
@@ -260,8 +260,8 @@ def choose_reflected(
 def remesh(run: Run, original: Keys, options: Options) -> Keys:
     """Low-resolution meshes and their spectra (4.1, step 1): ``/coarse``."""
     settings: tuple[Any, ...] = (options.n_coarse, options.wrap, options.seed, options.k)
-    if options.lift:
-        settings = (*settings, "lift")
+    if options.refined_eigenfunctions:
+        settings = (*settings, "refined eigenfunctions")
     if options.method != "rematch":
         settings = (*settings, options.method)
     todo = [
@@ -297,7 +297,7 @@ def align(run: Run, coarse: Keys, options: Options) -> tuple[Keys, tuple[str, st
     reference = names[int(np.argmin(spectral_distance(spectra).sum(1)))]
     aligned = task_key(list(coarse.values()), names, reference)
     todo = [
-        Task(n, f"network/motion_{n}.nc", align_shape, (run.folder, n, reference), (aligned, n))
+        Task(n, f"network/alignment_{n}.nc", align_shape, (run.folder, n, reference), (aligned, n))
         for n in names
     ]
     moved = {name: coarse[name] for name in run.do("align", todo)}
@@ -312,7 +312,7 @@ def initial_maps(run: Run, coarse: Keys, aligned: str, options: Options) -> Keys
     pairs = choose_pairs(spectral_distance(spectra), options.n_pairs)
     batches = in_batches([[names[i], names[j]] for i, j in pairs])
     settings = (k_init, options.of("initial maps"))
-    files = {f"network/first_{i:03d}.nc": batch for i, batch in enumerate(batches)}
+    files = {f"network/initial_{i:03d}.nc": batch for i, batch in enumerate(batches)}
     todo = [
         Task(f, f, map_pairs, (run.folder, batch, *settings), (aligned, batch, *settings))
         for f, batch in files.items()
@@ -342,7 +342,12 @@ def consistent_zoomout(run: Run, coarse: Keys, first: Keys, options: Options) ->
         The key of both.
     """
     settings = (options.k, options.step, options.n_latent, options.norm)
-    iteration_settings = (options.weights, options.n_samples, options.wide, options.keep_iterations)
+    iteration_settings = (
+        options.weights,
+        options.n_samples,
+        options.dense_iterations,
+        options.keep_iterations,
+    )
     key = task_key(list(first.values()), *settings, *iteration_settings)
     kept = list((run.folder / "iterations").glob("k_*.nc")) if options.keep_iterations else []
     files = [run.folder / "network.nc", run.folder / "latent.nc", *kept]
@@ -356,7 +361,11 @@ def consistent_zoomout(run: Run, coarse: Keys, first: Keys, options: Options) ->
         tree = consistent_maps(run, list(coarse), maps, options, n_threads)
         for old in (run.folder / "iterations").glob("k_*.nc"):  # of other maps
             old.unlink()
-        iterations = [f"iterations/{name}" for name in tree["iterations"].children] if "iterations" in tree else []
+        iterations = (
+            [f"iterations/{name}" for name in tree["iterations"].children]
+            if "iterations" in tree
+            else []
+        )
         for node in [*iterations, "network", "latent"]:
             write(tree[node].to_dataset(), run.folder / f"{node}.nc", key, coarse.values())
     return key
@@ -376,7 +385,9 @@ def place(run: Run, apart: Keys, reference: tuple[str, str], latent: str, option
     """
     name, reference_key = reference
     todo = [
-        Task(n, f"network/motion_{n}.nc", align_shape, (run.folder, n, name), (reference_key, key))
+        Task(
+            n, f"network/alignment_{n}.nc", align_shape, (run.folder, n, name), (reference_key, key)
+        )
         for n, key in apart.items()
     ]
     aligned = run.do("align flagged shapes", todo) if apart else {}
@@ -399,11 +410,11 @@ def register(run: Run, coarse: Keys, placed: Keys, latent: str, options: Options
     """Every shape registered to the template, the median shape by default (4.2, eq. 6 to 8)."""
     template = options.template or attributes(run.folder / "latent.nc")["median"]
     projection = (options.area_weighted, options.n_projected)
-    way = (template, options.how, options.of("registration"), projection)
+    way = (template, options.dense_match, options.of("registration"), projection)
     template_key = task_key(latent, way)
     mesh = template_mesh(read(run.folder / f"original/{template}.nc"), template)
     if placed:
-        mesh.attrs["apart"] = " ".join(placed)
+        mesh.attrs["excluded"] = " ".join(placed)
     write(mesh, run.folder / "registration.nc", template_key, [latent])
     todo = []
     for n, key in sorted(coarse.items()):

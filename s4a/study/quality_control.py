@@ -10,25 +10,24 @@ import numpy as np
 import xarray as xr
 
 from s4a.geometry.crossing import can_count
-from s4a.input.plausibility import Flags, flag, flagged_lines, find_warnings, pick_references
+from s4a.input.plausibility import Flags, find_warnings, flag, flagged_lines, pick_references
 from s4a.options import Options
 from s4a.study.netcdf import arrays, attributes, open_file, read
 from s4a.study.runner import Keys, Run, Task
 from s4a.study.store import task_key
 from s4a.study.tasks import compare_shape, portray_shape
 
-# registration_error: of one kind 0.02 to 0.03, in far poses 0.01 to 0.03, of a cat and a man 0.14 to 0.16
+# registration_error: of one kind 0.02 to 0.03, in far poses 0.01 to 0.03, of a cat and a man 0.14
+# to 0.16
 FLAGGED = 0.06
-# registration_error times mean |distortion|: of pairs of bodies and cats that are right 0.0002 to 0.005, of
-# those that failed 0.0033 to 0.08 (docs/plausibility.md)
+# registration_error times mean |distortion|: of pairs of bodies and cats that are right 0.0002 to
+# 0.005, of those that failed 0.0033 to 0.08 (docs/plausibility.md)
 WRONG, UNSURE = 0.0065, 0.004
 # and times the median of the collection, as coarse meshes raise the product of all shapes
 WRONG_BESIDE, UNSURE_BESIDE = 2.0, 1.5
 
 
-def check_plausibility(
-    run: Run, original: Keys, options: Options
-) -> tuple[Keys, Flags, list[str]]:
+def check_plausibility(run: Run, original: Keys, options: Options) -> tuple[Keys, Flags, list[str]]:
     """What looks wrong with each shape beside the others, and with all of them.
 
     Returns
@@ -51,7 +50,13 @@ def comparisons_of(run: Run, original: Keys, options: Options) -> dict[str, xr.D
     settings = (can_count(options.intersections),)
     counted = ("exactly",) if settings[0] else settings
     todo = [
-        Task(n, f"network/sketch_{n}.nc", portray_shape, (run.folder, n, *settings), (key, counted))
+        Task(
+            n,
+            f"network/descriptor_{n}.nc",
+            portray_shape,
+            (run.folder, n, *settings),
+            (key, counted),
+        )
         for n, key in original.items()
     ]
     descriptors = run.do("descriptor", todo)
@@ -60,7 +65,7 @@ def comparisons_of(run: Run, original: Keys, options: Options) -> dict[str, xr.D
     todo = [
         Task(
             n,
-            f"network/look_{n}.nc",
+            f"network/comparison_{n}.nc",
             compare_shape,
             (run.folder, n, references),
             (reference_key, key),
@@ -76,18 +81,19 @@ def references_of(run: Run, descriptors: Keys, k: int) -> list[str]:
     vertices = {n: open_file(run.folder / f"original/{n}.nc").sizes["vertex"] for n in descriptors}
     least = usable_k(list(vertices.values()), k)
     fine = [name for name in descriptors if vertices[name] >= least]
-    descriptors = {n: read(run.folder / f"network/sketch_{n}.nc") for n in fine or descriptors}
-    return pick_references(descriptors)
+    return pick_references(
+        {n: read(run.folder / f"network/descriptor_{n}.nc") for n in fine or descriptors}
+    )
 
 
 def comparison_of(run: Run, name: str) -> xr.Dataset:
     """What :func:`s4a.input.plausibility.compare` saw in a shape."""
-    return read(run.folder / f"network/look_{name}.nc")
+    return read(run.folder / f"network/comparison_{name}.nc")
 
 
 def stop_if_flagged(flags: Flags, options: Options) -> None:
     """ValueError where a shape is flagged and the run shall stop at that."""
-    if options.flagged != "stop":
+    if options.quality_control != "stop":
         return
     kinds = {
         name: " ".join(dict.fromkeys(flag.kind for flag in of_shape if flag.flagged))
@@ -98,9 +104,9 @@ def stop_if_flagged(flags: Flags, options: Options) -> None:
     if kinds:
         lines = "\n".join(f"  {line}" for line in flagged_lines(kinds))
         raise ValueError(
-            f"{len(kinds)} of {len(flags)} shapes are flagged, and flagged='stop' ends the run "
-            f"before its long stages:\n{lines}\nmend these files or take them away, "
-            "or give flagged='apart' to go on with these shapes beside the others"
+            f"{len(kinds)} of {len(flags)} shapes are flagged, and quality_control='stop' ends the "
+            f"run before its long stages:\n{lines}\nrepair or remove these files, or pass "
+            "quality_control='exclude' to exclude them from the network"
         )
 
 
@@ -125,9 +131,7 @@ def exclude_flagged(
     sure = [n for n in coarse if n == named or not is_flagged[n]]
     remarks = []
     if len(sure) < 2:
-        flags = {
-            n: [flag._replace(flagged=False) for flag in flags.get(n, [])] for n in flags
-        }
+        flags = {n: [flag._replace(flagged=False) for flag in flags.get(n, [])] for n in flags}
         if len(coarse) > 1:
             remarks = [
                 f"{len(coarse) - len(sure)} of {len(coarse)} shapes are flagged, and fewer than "
@@ -218,10 +222,14 @@ def flagged(
     (['wrong'], [])
     """
     distortion = distortion or {}
-    product = {name: score * distortion.get(name, 0.0) for name, score in registration_error.items()}
+    product = {
+        name: score * distortion.get(name, 0.0) for name, score in registration_error.items()
+    }
     usual = float(np.median([one for one in product.values() if one > 0] or [0.0]))
     far, near = max(WRONG, WRONG_BESIDE * usual), max(UNSURE, UNSURE_BESIDE * usual)
-    wrong = {n: score for n, score in registration_error.items() if score > FLAGGED or product[n] > far}
+    wrong = {
+        n: score for n, score in registration_error.items() if score > FLAGGED or product[n] > far
+    }
     if len(registration_error) > 2 and len(wrong) > len(registration_error) / 2:
         return {}, [
             f"{len(wrong)} of {len(registration_error)} registrations are flagged "
@@ -234,6 +242,8 @@ def flagged(
             continue
         sure = "probably" if name in wrong else "maybe, in places,"
         also = f", mean |distortion| {distortion[name]:.2f}" if name in distortion else ""
-        said = flag("registration", name in wrong, sure=sure, registration_error=score, distortion=also)
+        said = flag(
+            "registration", name in wrong, sure=sure, registration_error=score, distortion=also
+        )
         found[name] = [said]
     return found, []

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from s4a.input.collection import shape_report
 from s4a.input.chirality import AUTO
+from s4a.input.collection import shape_report
 from s4a.input.plausibility import Flags
 from s4a.options import Options, with_options
 from s4a.schema import dataset
-from s4a.study.quality_control import comparison_of
 from s4a.study.netcdf import arrays, attributes, read
+from s4a.study.quality_control import comparison_of
 from s4a.study.runner import Run
 from s4a.study.sources import Sources
 from s4a.study.store import write
@@ -55,7 +55,7 @@ def write_report(
         {name: of_shape(run, name, source, options) for name, (source, _) in sources.items()},
         flags,
         [
-            *reduced_k(options.k, latent.sizes["mode"], spectra),
+            *reduced_k(options.k, latent.sizes["eigenpair"], spectra),
             *remarks,
             *reduced_pairs(options.n_pairs, network.sizes["pair"] // 2, len(spectra)),
             *tied(together, latent["distance_to_limit"].values),
@@ -104,8 +104,10 @@ def chirality_evidence(run: Run, names: list[str], options: Options) -> xr.Datas
     ]
     found = dataset(reflected=np.array(reflected))
     if options.reflect == AUTO:
-        choice = read(run.folder / "network/hands.nc")
-        found = found.merge(dataset(mean_chirality=choice["mean_chirality"].reindex(shape=names).values))
+        choice = read(run.folder / "network/chirality.nc")
+        found = found.merge(
+            dataset(mean_chirality=choice["mean_chirality"].reindex(shape=names).values)
+        )
     return found
 
 

@@ -15,9 +15,9 @@ from s4a.geometry.align import relative_transform
 from s4a.geometry.mesh import as_arrays, triangle_areas
 from s4a.input import plausibility
 from s4a.input.annotations import labels_of_mesh, read_scalars, with_features
+from s4a.input.chirality import mirror_image
 from s4a.input.clean import check_range, clean
 from s4a.input.collection import read_shape
-from s4a.input.chirality import mirror_image
 from s4a.input.landmarks import guides_of, with_landmarks
 from s4a.method import steps
 from s4a.method.initial_map import transform_onto
@@ -104,7 +104,7 @@ def portray_shape(folder: Path, name: str, intersections: bool) -> xr.Dataset:
 
 def compare_shape(folder: Path, name: str, references: list[str]) -> xr.Dataset:
     """What :func:`s4a.input.plausibility.compare` sees in a shape beside the references."""
-    descriptors = {n: read(folder / f"network/sketch_{n}.nc") for n in {*references, name}}
+    descriptors = {n: read(folder / f"network/descriptor_{n}.nc") for n in {*references, name}}
     return plausibility.compare(name, descriptors[name], {n: descriptors[n] for n in references})
 
 
@@ -139,7 +139,7 @@ def template_of(folder: Path, name: str, options: Options) -> Shape:
 
 
 def align_shape(folder: Path, name: str, reference: str) -> xr.Dataset:
-    """Rigid transform of a shape onto the reference, both centred and for unit area (4.1, step 2)."""
+    """Rigid transform of a shape onto the reference, centred and of unit area (4.1, step 2)."""
     R, t = np.eye(3), np.zeros(3)
     if name != reference:
         R, t = transform_onto(*(steps.basis_in(Folder(folder), n) for n in (name, reference)))
@@ -160,7 +160,7 @@ def consistent_maps(
     """Consistent ZoomOut over the network and the median (4.2): ``/network`` and ``/latent``."""
     study = Folder(run.folder)
     transforms = {name: steps.transform_in(study, name) for name in names}
-    reference = study[f"network/motion_{names[0]}"].attrs["reference"]
+    reference = study[f"network/alignment_{names[0]}"].attrs["reference"]
     first = steps.with_transforms(first, transforms, reference)
     coarse = {name: study[f"coarse/{name}"] for name in names}
     k_init = first.sizes["eigenpair_source_initial"]
@@ -173,7 +173,7 @@ def consistent_maps(
         n_latent=options.n_latent,
         weights=options.weights,
         n_samples=options.n_samples,
-        wide=options.wide,
+        dense_iterations=options.dense_iterations,
         norm=options.norm,
         keep_iterations=options.keep_iterations,
         n_jobs=n_jobs,
@@ -192,7 +192,7 @@ def place_shape(folder: Path, name: str, options: Options) -> xr.Dataset:
         names,
         basis,
         lambda other: relative_transform(transform, steps.transform_in(study, other)),
-        k_init=min(options.k_init, latent.sizes["mode"]),
+        k_init=min(options.k_init, latent.sizes["eigenpair"]),
         step=options.step,
         **options.of("initial maps"),
     )
@@ -205,5 +205,5 @@ def place_shape(folder: Path, name: str, options: Options) -> xr.Dataset:
 def register_shape(folder: Path, name: str, template: str, options: Options) -> xr.Dataset:
     """One shape registered to the template: eq. 6 at low resolution, then eq. 7 or eq. 3 and 4."""
     target = template_of(folder, template, options)
-    settings = {"how": options.how, **options.of("registration")}
+    settings = {"dense_match": options.dense_match, **options.of("registration")}
     return steps.register_in(Folder(folder), name, template, target, **settings)

@@ -62,7 +62,7 @@ def stack_registration(
     """
     shapes = [files[name] for name in names]
     mesh = template[[v for v in ("position", "corner_vertex", "vertex_area") if v in template]]
-    kept = ("template", "apart")
+    kept = ("template", "excluded")
     attrs = {key: template.attrs[key] for key in kept if key in template.attrs}
     data = mesh.assign_attrs(attrs)
     for name in STACKED:
@@ -73,8 +73,12 @@ def stack_registration(
                 data[name] = xr.Variable(like.dims, stacked(each), like.attrs)
             else:
                 data[name] = variable(name, np.stack([one.values for one in each]))
-    data["method"] = variable("method", [shape.attrs.get("method", "") for shape in shapes])
-    data["registration_error"] = variable("registration_error", [shape.attrs.get("score", np.nan) for shape in shapes])
+    data["initialisation"] = variable(
+        "initialisation", [shape.attrs.get("initialisation", "") for shape in shapes]
+    )
+    data["registration_error"] = variable(
+        "registration_error", [shape.attrs.get("score", np.nan) for shape in shapes]
+    )
     units = {unit_of(shape["displacement"]) for shape in shapes}
     data = in_unit(data, units.pop() if len(units) == 1 else INPUT).assign_coords(shape=names)
     nodes = {"registration": data}
@@ -207,7 +211,9 @@ def open_study(folder: Path | str) -> xr.DataTree:
     names = sorted(path.stem for path in (folder / "original").glob("[!.]*.nc"))
     nodes = reader.read(f"{stage}/{name}" for stage in ("original", "coarse") for name in names)
     nodes |= reader.read(["network", "latent"])
-    nodes |= reader.read(f"iterations/{path.stem}" for path in sorted(folder.glob("iterations/k_*.nc")))
+    nodes |= reader.read(
+        f"iterations/{path.stem}" for path in sorted(folder.glob("iterations/k_*.nc"))
+    )
     template = reader.read(["registration"], read)
     if template and "latent" in nodes:
         apart = excluded_of(template["registration"])
@@ -227,7 +233,7 @@ def open_study(folder: Path | str) -> xr.DataTree:
 
 def excluded_of(registration: xr.Dataset) -> list[str]:
     """The shapes that are registered and stand apart from the network, as they are flagged."""
-    return str(registration.attrs.get("apart", "")).split()
+    return str(registration.attrs.get("excluded", "")).split()
 
 
 def seconds_of(report: xr.Dataset) -> str:

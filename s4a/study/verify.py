@@ -13,7 +13,7 @@ from s4a.study.tree import Reader, excluded_of
 
 OF_SHAPE = (
     *("original/", "coarse/", "registration/"),
-    *("network/sketch_", "network/look_", "network/motion_"),
+    *("network/descriptor_", "network/comparison_", "network/alignment_"),
 )
 OF_ALL = ("network", "latent", "registration", "report")
 OWN = {*STAGES, ".lock", "study.html", "report.txt", "modes.png", "statistics"}

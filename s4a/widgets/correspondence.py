@@ -7,7 +7,6 @@ import traitlets
 from s4a.show.browser import color_scale
 from s4a.show.draw import position_colors, ramp_colors
 from s4a.show.surfaces import (
-    transferred_colors,
     has,
     labelled,
     latent_match,
@@ -15,6 +14,7 @@ from s4a.show.surfaces import (
     names_of,
     surface,
     template_vertices,
+    transferred_colors,
     unit_text,
 )
 from s4a.widgets.panel import Panel, beside, dropdown, row

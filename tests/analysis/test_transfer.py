@@ -170,7 +170,9 @@ def test_fields_are_interpolated_and_unknown_values_stay_unknown(study, meshes, 
 
 
 def test_matching_both_ways_is_symmetric_and_one_way_is_possible(study, meshes):
-    one = register_pairs(meshes["brain_01"], {"a": meshes["brain_02"]}, both=False, **OPTIONS)
+    one = register_pairs(
+        meshes["brain_01"], {"a": meshes["brain_02"]}, bidirectional=False, **OPTIONS
+    )
     assert "reverse" not in one.children
     label = meshes["brain_01"]["label"].values
     a = transfer_labels(one, label)["a"]["label"].values

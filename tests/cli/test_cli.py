@@ -142,9 +142,15 @@ def test_every_option_of_analyse_is_a_flag_of_run_with_the_same_default():
 
 
 def test_flags_give_the_options_their_values():
-    flags = "--n-coarse 500 --n-latent 40 --init landmarks --scale --no-strict --label 1,2"
+    flags = "--n-coarse 500 --n-latent 40 --init landmarks --remove-size --no-strict --label 1,2"
     found, _ = parsed(*flags.split(), *"--components 2 --template None --seed 7".split())
-    given = {"n_coarse": 500, "n_latent": 40, "init": "landmarks", "scale": True, "label": "1,2"}
+    given = {
+        "n_coarse": 500,
+        "n_latent": 40,
+        "init": "landmarks",
+        "remove_size": True,
+        "label": "1,2",
+    }
     given |= {"components": 2, "template": "None", "seed": 7}
     assert Options(**found) == Options(**given)
 

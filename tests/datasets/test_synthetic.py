@@ -69,7 +69,9 @@ def test_vertices_are_exactly_where_the_truth_says(clean_tree):
 def test_the_same_seed_gives_the_same_bits():
     one, two = (synthetic.brains(2, 800, seed=5, dirty=True) for _ in range(2))
     assert one.identical(two)
-    assert not np.array_equal(synthetic.plant(2, 6)["noise_translation"], one["truth/noise_translation"])
+    assert not np.array_equal(
+        synthetic.plant(2, 6)["noise_translation"], one["truth/noise_translation"]
+    )
 
 
 def test_the_population_does_not_depend_on_resolution():

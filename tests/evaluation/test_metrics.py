@@ -226,13 +226,17 @@ def test_where_the_truth_is_unknown_nothing_is_measured(ball, shuffled):
 def test_evaluations_stack_over_ways_and_pairs(ball, shuffled):
     same = np.arange(len(shuffled))
     rows = [
-        xr.concat([metrics.evaluate(ball, ball, m, truth=same) for m in (same, shuffled)], "way")
+        xr.concat(
+            [metrics.evaluate(ball, ball, m, truth=same) for m in (same, shuffled)], "algorithm"
+        )
         for _ in range(2)
     ]
     table = xr.concat(rows, "pair")
     assert dict(table["chamfer"].sizes) == {"pair": 2, "way": 2}
     assert table["chamfer"].attrs["units"] == "share of sqrt(area)"
-    assert (table["geodesic_error"].isel(way=0) < table["geodesic_error"].isel(way=1)).all()
+    assert (
+        table["geodesic_error"].isel(algorithm=0) < table["geodesic_error"].isel(algorithm=1)
+    ).all()
 
 
 @pytest.mark.parametrize(

@@ -117,7 +117,9 @@ def nan(path):
 
 def duplicate_vertices(path):
     X, T = shape(7)
-    unconnected = X[T].reshape(-1, 3) + np.random.default_rng(0).uniform(-1e-6, 1e-6, (3 * len(T), 3))
+    unconnected = X[T].reshape(-1, 3) + np.random.default_rng(0).uniform(
+        -1e-6, 1e-6, (3 * len(T), 3)
+    )
     path.write_bytes(WRITERS[".obj"](unconnected, np.arange(len(unconnected)).reshape(-1, 3), {}))
 
 
@@ -236,7 +238,7 @@ FAULTS = [
     Fault("duplicate vertices", "duplicate_vertices.obj", duplicate_vertices, "repaired",
           "1488 vertices welded", "welded at 1e-7 of the bounding box, `file_vertex` kept",
           "nothing to do"),
-    Fault("STL unconnected", "unconnected.stl", of(8), "ok", "^$", "corners in the same place are one vertex",
+    Fault("STL unconnected", "unconnected.stl", of(8), "ok", "^$", "equal corners are one vertex",
           "nothing to do"),
     Fault("zero-area faces", "flat.ply", flat, "repaired", "zero-area triangles",
           "long edges flipped, so that no crack opens; else dropped", "nothing to do"),

@@ -6,12 +6,12 @@ import pytest
 from s4a.geometry.mesh import directed_edges
 from s4a.geometry.voronoi import (
     between_boundaries,
+    boundaries,
     cut_handles,
     dual,
     faults,
     mesh_graph,
     refine,
-    boundaries,
     voronoi_cells,
 )
 
@@ -143,7 +143,9 @@ def test_what_would_cut_off_more_than_a_crumb_stays():
 def test_a_piece_of_a_region_that_no_rim_bounds_is_not_cut():
     X, T, _ = ball()
     n = len(X)
-    assert not between_boundaries(mesh_graph(X, T).G, T, np.zeros(n, int)).any()  # closed, all one region
+    assert not between_boundaries(
+        mesh_graph(X, T).G, T, np.zeros(n, int)
+    ).any()  # closed, all one region
     two = mesh_graph(np.r_[X, X + 9], np.r_[T, T + n])  # beside one that has two boundaries
     height = np.r_[X[:, 2], np.full(n, 0.0)]
     removed = between_boundaries(two.G, two.T, np.where(np.abs(height) < 0.5, 0, -1))

@@ -8,8 +8,8 @@ from paths import DATA
 import s4a
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_normals, volume
 from s4a.input import plausibility
-from s4a.input.clean import clean
 from s4a.input.chirality import hands, in_file, mirror_image, mirrored_shapes, signs, to_reflect
+from s4a.input.clean import clean
 from s4a.input.subjects import subjects
 
 NAMES = ["a", "b", "c"]
@@ -73,7 +73,7 @@ def test_shapes_that_are_their_own_mirror_image_are_left_and_that_is_said():
 
 def test_a_shape_of_weak_evidence_is_named_and_stays(handed):
     seen = plausibility.examine(handed, intersections=False)
-    weak = seen["s4"].assign(hand=0.1 * seen["s4"]["hand"])
+    weak = seen["s4"].assign(chirality=0.1 * seen["s4"]["chirality"])
     names, (remark,) = mirrored_shapes(seen | {"s4": weak})
     assert names == ["s1"]
     assert "cannot tell the hand of s4, which stayed as it is: look at it" in remark
@@ -118,7 +118,7 @@ def test_all_fifteen_pairs_of_six_femurs_are_told_apart():
     for name, one in seen.items():
         beside = plausibility.compare(name, one, {n: seen[n] for n in seen if n != name})
         for other in beside["reference"].values.tolist():
-            hand = beside["hand"].sel(reference=other).item()
+            hand = beside["chirality"].sel(reference=other).item()
             assert (hand > 0) == (is_left[name] == is_left[other])
             assert abs(hand) > 1
     names, remarks = mirrored_shapes(plausibility.examine(meshes, intersections=False))

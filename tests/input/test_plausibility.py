@@ -78,7 +78,9 @@ def test_a_turned_shape_is_not_told_as_the_alignment_turns_it(descriptors):
     assert told(descriptors | {"s3": descriptor(X * [1, -1, -1], T)}) == ({}, [])
 
 
-def test_of_half_a_collection_of_the_other_hand_the_half_without_the_first_name_is_told(descriptors):
+def test_of_half_a_collection_of_the_other_hand_the_half_without_the_first_name_is_told(
+    descriptors,
+):
     odd = {name: descriptor(*mirrored(*SHAPES[name])) for name in ("s1", "s3", "s5", "s7")}
     found, (remark,) = told(descriptors | odd)
     assert found == {name: ["mirrored!"] for name in odd}

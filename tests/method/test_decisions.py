@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from s4a import coarsen, spectrum, synthetic
 from s4a.geometry.mesh import as_arrays, vertex_areas
-from s4a.method import elastic, initial_map, spectral_icp, latent
+from s4a.method import elastic, initial_map, latent, spectral_icp
 from s4a.method.shape import Basis, Shape
 
 # ---- the score of a registration: round trip, distances in both directions, landmarks
@@ -159,7 +159,9 @@ def test_the_latent_size_is_the_nearest_whole_number_to_its_share(k, expected):
 
 
 def test_starts_that_end_within_a_hundredth_of_each_other_go_on_as_their_mean(surface, monkeypatch):
-    monkeypatch.setattr(elastic, "elastic_iterations", lambda _source, _target, start, *_, **__: start)
+    monkeypatch.setattr(
+        elastic, "elastic_iterations", lambda _source, _target, start, *_, **__: start
+    )
 
     def start(x):
         return np.eye(3), np.array([x, 0.0, 0.0]), np.zeros((1, 3))
@@ -194,7 +196,7 @@ def test_of_searched_maps_that_fit_alike_the_one_that_keeps_curvatures_is_taken(
 
     def found(search):
         scores, gaps = iter([0.10, 0.11, 0.5]), iter([0.1, 0.0, 0.0])
-        monkeypatch.setattr(joint, "registration_score", lambda *_: next(scores))
+        monkeypatch.setattr(spectral_icp, "registration_score", lambda *_: next(scores))
         monkeypatch.setattr(initial_map.fmap, "curvature_difference", lambda *_: next(gaps))
         return initial_map.best_initial_map(surface, surface, C, search=search)[0]
 

@@ -46,7 +46,8 @@ def error(image, truth):
 def ends(pair):
     template, shape, _ = pair
     return [
-        elastic.elastic_iterations(shape.full, template.low, warp) for warp in starts(template, shape)
+        elastic.elastic_iterations(shape.full, template.low, warp)
+        for warp in starts(template, shape)
     ]
 
 
@@ -116,7 +117,7 @@ def test_nearest_points_lie_on_the_surface_and_no_farther_than_nearest_vertices(
 
 @pytest.fixture(scope="module")
 def local(pair, ends):
-    """Where elastic iterations end at low resolution, and the displacement of local iterations after."""
+    """Result of elastic iterations at low resolution, then displacement of local ones."""
     template, shape, _ = pair
     X = spectral_icp.move(template.low, ends[0])
     return X, elastic.local_iterations(shape.full, template.low, template.diffusion, X)
@@ -183,7 +184,10 @@ def test_where_parts_turned_on_their_own_local_rounds_alone_follow(pair, monkeyp
         asked: register_surface(shape, template, {"icp+parts": candidate}, functions, elastic=asked)
         for asked in (True, False)
     }
-    assert {attrs["method"] for _, _, attrs in found.values()} == {"icp+parts", "icp+parts+local"}
+    assert {attrs["initialisation"] for _, _, attrs in found.values()} == {
+        "icp+parts",
+        "icp+parts+local",
+    }
     far = {asked: gap(end.X, shape) for asked, (_, end, _) in found.items()}
     assert far[True] < 0.8 * far[False]
 
@@ -220,7 +224,7 @@ def test_rounds_that_begin_less_stiff_are_nearer_where_the_template_is_torn(
         image = template["position"] + found["displacement"] - found["translation"]
         image = image.values @ found["rotation"].values / found["scale"].item()
         torn = np.quantile(abs(found["distortion"]), 0.99)
-        return found.attrs["method"], torn, np.linalg.norm(image - true, axis=1).mean()
+        return found.attrs["initialisation"], torn, np.linalg.norm(image - true, axis=1).mean()
 
     method, torn, error = registered()
     monkeypatch.setattr("s4a.method.register.TORN", np.inf)
@@ -294,9 +298,13 @@ def bowl(n_vertices, height=0.0):
 
 def rim_height(template, shape):
     """Mean height of the boundary of the registered template above that of the shape."""
-    warp = spectral_icp.fit_warp(shape.low, template.low, shape.low.tree.query(template.low.tree.data)[1])
+    warp = spectral_icp.fit_warp(
+        shape.low, template.low, shape.low.tree.query(template.low.tree.data)[1]
+    )
     end = elastic.elastic_iterations(shape.full, template.low_on_surface, warp)
-    top = shape.from_frame(spectral_icp.move(template.low, end))[np.unique(template.low.boundary), 2]
+    top = shape.from_frame(spectral_icp.move(template.low, end))[
+        np.unique(template.low.boundary), 2
+    ]
     return np.abs(top - shape.from_frame(shape.full.boundary_tree.data)[:, 2].mean()).mean()
 
 

@@ -53,10 +53,10 @@ def shapes(bent):
 
 def test_a_far_pose_is_matched_where_nearest_neighbours_begin_wrong(bent, monkeypatch):
     found = match_pair(*bent, n_coarse=1000, k=50)
-    assert found.attrs["method"] == "intrinsic+parts+local"
+    assert found.attrs["initialisation"] == "intrinsic+parts+local"
     assert found.attrs["initial_map"].split(",")[0] in ("hks", "wks", "hks+wks", "extremities 1")
     assert error(found, bent[0]) < 0.002
-    monkeypatch.setattr(joint, "far_apart", lambda *_: False)
+    monkeypatch.setattr(spectral_icp, "far_apart", lambda *_: False)
     assert error(match_pair(*bent, n_coarse=1000, k=50), bent[0]) > 0.05
 
 
@@ -90,7 +90,9 @@ def test_the_parts_of_the_full_resolution_are_those_of_its_coarse_vertices(shape
         low.X, 2 * low.X[:, [1, 0, 2]] * [1, -1, 1], low.area, low.Phi, low.eigenvalue
     )
     at = shapes[0].coarse["sample_vertex"].values
-    assert spectral_icp.turn(full, R, t)[at] == pytest.approx(spectral_icp.turn(low, R, t), abs=1e-6)
+    assert spectral_icp.turn(full, R, t)[at] == pytest.approx(
+        spectral_icp.turn(low, R, t), abs=1e-6
+    )
 
 
 def test_shapes_in_one_pose_pay_nothing_and_keep_their_first_map(monkeypatch):

@@ -178,7 +178,7 @@ def test_wide_rounds_look_between_the_samples_near_the_one_that_is_found(
 
     def maps(wide, n_around=latent.N_AROUND):
         monkeypatch.setattr(latent, "N_AROUND", n_around)
-        return zoomed(shapes, first, samples=samples, wide=wide)[0]
+        return zoomed(shapes, first, samples=samples, dense_iterations=wide)[0]
 
     of_all = zoomed(shapes, first)[0]
     far = {wide: np.linalg.norm(maps(wide) - of_all) for wide in (0, 2)}

@@ -30,7 +30,7 @@ def paper(brains):
 @pytest.fixture(scope="module")
 def standard(brains):
     """The study of the paper by the standard way, eq. 3 and 4, and the size taken out."""
-    return s4a.analyse(brains, preset="paper", how="standard", scale=True, **OPTIONS)
+    return s4a.analyse(brains, preset="paper", dense_match="fmap", remove_size=True, **OPTIONS)
 
 
 def others(study):
@@ -102,10 +102,10 @@ def test_the_step_ahead_is_one_match_and_back(paper):
 
 def test_every_round_of_consistent_zoomout_is_equation_3_and_a_larger_map(paper):
     iterations = list(paper["iterations"].children.values())
-    assert [node.sizes["mode"] for node in iterations] == [10, 15, 20, 24]
+    assert [node.sizes["eigenpair"] for node in iterations] == [10, 15, 20, 24]
     network = paper["network"]
     for now, following in itertools.pairwise(iterations):
-        size, larger = now.sizes["mode"], following.sizes["mode"]
+        size, larger = now.sizes["eigenpair"], following.sizes["eigenpair"]
         for p, (i, j) in enumerate(
             zip(network["source"].values, network["target"].values, strict=True)
         ):

@@ -46,7 +46,9 @@ def test_a_planted_deformation_is_recovered_and_far_better_than_by_nearest_neigh
 ):
     source = moved(surface, surface.X + bumps(surface.X))
     start = cKDTree(source.X).query(surface.X)[1]
-    match, transform = spectral_icp.coarse_spectral_icp(source, surface, start, k=60, spectral=spectral_weight)
+    match, transform = spectral_icp.coarse_spectral_icp(
+        source, surface, start, k=60, spectral=spectral_weight
+    )
     error = np.linalg.norm(spectral_icp.move(surface, transform) - source.X, axis=1).mean()
     nearest = np.linalg.norm(source.X[start] - source.X, axis=1).mean()
     assert nearest > 0.015
@@ -58,7 +60,9 @@ def test_a_planted_deformation_is_recovered_and_far_better_than_by_nearest_neigh
 def test_a_rigid_motion_is_recovered_exactly_without_any_deformation(surface):
     R = Rotation.from_rotvec([0.3, 0.2, -0.1]).as_matrix()
     source = moved(surface, surface.X @ R.T + 0.2)
-    _, (found, t, c) = spectral_icp.coarse_spectral_icp(source, surface, np.arange(len(surface.X)), k=40)
+    _, (found, t, c) = spectral_icp.coarse_spectral_icp(
+        source, surface, np.arange(len(surface.X)), k=40
+    )
     assert found == pytest.approx(R, abs=1e-9)
     assert t == pytest.approx([0.2] * 3, abs=1e-9)
     assert np.abs(c).max() < 1e-9
@@ -68,7 +72,9 @@ def test_the_dense_rounds_keep_a_planted_deformation_of_the_span(surface):
     c = np.zeros((60, 3))
     c[4:12] = np.random.default_rng(0).normal(0, 0.008, (8, 3))
     source = moved(surface, surface.X + surface.Phi @ c)
-    match, transform = spectral_icp.dense_spectral_icp(source, surface, (np.eye(3), np.zeros(3), 0.9 * c))
+    match, transform = spectral_icp.dense_spectral_icp(
+        source, surface, (np.eye(3), np.zeros(3), 0.9 * c)
+    )
     assert (match == np.arange(len(match))).mean() > 0.95
     assert np.linalg.norm(spectral_icp.move(surface, transform) - source.X, axis=1).mean() < 2e-3
 

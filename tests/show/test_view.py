@@ -87,7 +87,7 @@ def make_study(n=366):
         explained_variance_ratio_low=[0.6, 0.25, 0.15],
     ).assign_coords(named)
     tree["report"] = dataset(
-        {"n_coarse": 6000, "k": 100, "refine": "joint", "made_from": 7 * f"{'0' * 32} "},
+        {"n_coarse": 6000, "k": 100, "refine": "spectral_icp", "made_from": 7 * f"{'0' * 32} "},
         status=["ok"] * 5 + ["repaired", "excluded"],
         reason=[""] * 5
         + ["3 duplicate triangles removed", "not a surface: <script>alert('&')</script>"],

@@ -130,5 +130,5 @@ def test_a_field_that_no_file_has_is_an_error(files):
 
 
 def test_features_of_label_volumes_are_refused():
-    with pytest.raises(ValueError, match="leave out one of both"):
+    with pytest.raises(ValueError, match="leave out one of the two"):
         s4a.analyse("nowhere", features="sulc", label=1)

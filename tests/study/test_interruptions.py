@@ -19,7 +19,7 @@ import pytest
 
 from s4a import analyse, cli, open_study, synthetic
 from s4a.schema import dataset
-from s4a.study import flags, netcdf, pipeline, processes, sources, store, tasks
+from s4a.study import netcdf, pipeline, processes, quality_control, sources, store, tasks
 from s4a.study.progress import FILE
 from s4a.study.runner import Run
 
@@ -196,10 +196,10 @@ sys.exit(code)
 """
 KILLS = [
     "original/brain_02.nc",  # read and clean
-    "network/look_brain_02.nc",  # compare
+    "network/comparison_brain_02.nc",  # compare
     "coarse/brain_02.nc",  # remesh and spectrum
-    "network/motion_brain_02.nc",  # align
-    "network/first_000.nc",  # initial maps
+    "network/alignment_brain_02.nc",  # align
+    "network/initial_000.nc",  # initial maps
     "network.nc",  # consistent ZoomOut and median
     "latent.nc",
     "registration.nc",  # registration
@@ -381,7 +381,7 @@ def assert_equal_but_paths(folder, whole):
 def test_an_error_in_the_task_of_one_shape_costs_that_shape_and_is_told(
     files, tmp_path, monkeypatch, capsys, error, stage
 ):
-    module = {"compare_shape": flags}.get(stage, pipeline)
+    module = {"compare_shape": quality_control}.get(stage, pipeline)
     task = getattr(module, stage)
 
     def wrong(*arguments):

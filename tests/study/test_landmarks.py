@@ -24,8 +24,8 @@ from s4a import (
 from s4a.geometry.closest import interpolate
 from s4a.geometry.mesh import as_arrays
 from s4a.input.annotations import write_landmarks
-from s4a.input.files import files_named
 from s4a.input.chirality import mirror_image
+from s4a.input.files import files_named
 from s4a.input.landmarks import SUFFIXES
 from s4a.method.initial_map import transform_onto
 from s4a.method.refined_eigenfunctions import low_resolution
@@ -220,8 +220,10 @@ def test_landmarks_of_a_mirrored_shape_lie_where_they_lay(marked):
 
 def test_landmarks_without_elastic_rounds_are_refused(marked):
     meshes, folder = marked
-    with pytest.raises(ValueError, match="landmarks pull elastic iterations, and refine='joint'"):
-        analyse(meshes, landmarks=folder, refine="joint")
+    with pytest.raises(
+        ValueError, match="landmarks pull elastic iterations, and refine='spectral_icp'"
+    ):
+        analyse(meshes, landmarks=folder, refine="spectral_icp")
 
 
 def test_the_command_line_takes_them_for_a_study_and_for_new_shapes(marked, tmp_path, capsys):

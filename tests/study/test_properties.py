@@ -1,4 +1,4 @@
-"""What must not change the result: rigid transform, the unit, the numbering of vertices and faces."""
+"""Invariance of the result to rigid transforms, the unit and the numbering."""
 
 import numpy as np
 import pytest
@@ -151,7 +151,9 @@ def test_the_study_of_a_collection(collection, transforms, unit, seed, order):
     names, given, old_vertex = list(shapes), {}, {}
     for i in order:
         X, T = shapes[names[i]]
-        *given[names[i]], old_vertex[names[i]] = renumbered(moved(X, transforms[i], unit), T, seed + i)
+        *given[names[i]], old_vertex[names[i]] = renumbered(
+            moved(X, transforms[i], unit), T, seed + i
+        )
     other = analyse(given, **OF_STUDY)
     template = one["registration"].attrs["template"]
     assert other["latent"].attrs["median"] == other["registration"].attrs["template"] == template

@@ -120,10 +120,10 @@ def test_a_run_can_stop_at_them_before_its_long_stages(mixed, tmp_path):
     with pytest.raises(
         ValueError, match=r"(?s)3 of 8 shapes are flagged.*3 unit: a_metre, corner, z_inch"
     ):
-        analyse(mixed, store=tmp_path / "study", flagged="stop", **OPTIONS)
+        analyse(mixed, store=tmp_path / "study", quality_control="stop", **OPTIONS)
     assert not (tmp_path / "study" / "coarse").exists()
-    with pytest.raises(ValueError, match="leave out one of both"):
-        analyse(mixed, flagged="stop", include_flagged=True, **OPTIONS)
+    with pytest.raises(ValueError, match="leave out one of the two"):
+        analyse(mixed, quality_control="stop", include_flagged=True, **OPTIONS)
 
 
 def test_a_doubtful_shape_is_the_template_where_it_is_named(mixed):

@@ -139,7 +139,7 @@ def write_tree(folder, names, template):
     """A small finished study written by hand."""
     X, T = as_arrays(synthetic.sphere(50))
     mesh = {"position": X, "corner_vertex": T}
-    sizes = {"vertex": 50, "original_vertex": 50, "corner": 3, "xyz": 3, "xyz_2": 3, "mode": 2}
+    sizes = {"vertex": 50, "original_vertex": 50, "corner": 3, "xyz": 3, "xyz_2": 3, "eigenpair": 2}
     sizes |= {"edge": 144, "end": 2}
     for name in names:
         original = zeros("original", sizes, {"reason": name}, **mesh)
@@ -155,7 +155,7 @@ def write_tree(folder, names, template):
         data = zeros(
             "registration/shape",
             sizes,
-            {"method": "icp", "score": 0.1 * i},
+            {"initialisation": "icp", "score": 0.1 * i},
             displacement=np.full((50, 3), i, np.float32),
         )
         store.write(data, folder / "registration" / f"{name}.nc")
