@@ -1,8 +1,8 @@
 from .bilateral import asymmetry, asymmetry_modes
+from .bilateral_pairs import symmetric_template, symmetry
 from .completion import complete, write_completed
 from .field_tests import field_classify, field_group_map, field_group_test, field_regression
 from .fields import with_field, write_field
-from .bilateral_pairs import symmetric_template, symmetry
 from .leave_one_out import generalization
 from .longitudinal import growth
 from .poses import structures, structures_modes, structures_of_new

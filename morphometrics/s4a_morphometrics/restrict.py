@@ -31,7 +31,7 @@ def within(
     region: np.ndarray | xr.DataArray | int | str | Sequence[bool | int | str] | None = None,
     *,
     labels: np.ndarray | None = None,
-    least_confidence: float = 0.0,
+    min_confidence: float = 0.0,
 ) -> xr.DataTree:
     """The study of a region of the template.
 
@@ -44,7 +44,7 @@ def within(
     labels : ndarray (vertex,), optional
         The labels of the template's vertices; by default those of ``/original/<template>``, which
         has some where the mesh was given in memory with ``label``.
-    least_confidence : float
+    min_confidence : float
         Vertices whose mean ``confidence`` over the shapes is lower are left out, 0 to 1.
 
     Returns
@@ -74,8 +74,8 @@ def within(
     """
     registration = registration_of(study)
     keep = _mask_of(study, registration, region, labels)
-    if least_confidence:
-        keep = keep & (registration["confidence"].mean("shape").values >= least_confidence)
+    if min_confidence:
+        keep = keep & (registration["confidence"].mean("shape").values >= min_confidence)
     triangles = registration["corner_vertex"].values
     inside = keep[triangles].all(axis=1)
     keep = np.isin(np.arange(len(keep)), triangles[inside])  # of a triangle in the region

@@ -52,7 +52,7 @@ def field_statistics(
     field: str,
     *,
     group: str | None = None,
-    variable: str | None = None,
+    regress_on: str | None = None,
     covariates: list[str] | None = None,
     table: str | None = None,
     variances: Literal["equal", "unequal"] = "equal",
@@ -71,7 +71,7 @@ def field_statistics(
         name of a field of s4a fields
     group : COLUMN
         test and map of the difference between groups; classification
-    variable : COLUMN
+    regress_on : COLUMN
         regression of the field on a number, such as age
     covariates : COLUMN
         accounted for in both
@@ -88,8 +88,8 @@ def field_statistics(
     """
     import s4a_morphometrics as m
 
-    if not (group or variable):
-        raise ValueError("something to test needed: give --group COLUMN or --variable COLUMN")
+    if not (group or regress_on):
+        raise ValueError("something to test needed: give --group COLUMN or --regress-on COLUMN")
     tree, out = study_to_test(study, out, table, include_flagged)
     n = {} if permutations is None else {"n_permutations": permutations}
     options: dict[str, Any] = {"covariates": covariates, "variances": variances, "seed": seed} | n
@@ -102,9 +102,9 @@ def field_statistics(
         of = f"{field} in groups of {group}"
         write(tables.significance(results["group"], results["group_map"], of, tree))
         write(tables.classification_line(results["classification"]), "")
-    if variable:
-        results["regression"] = found = m.field_regression(tree, field, variable, **options)
-        write(tables.significance(found, found, f"{field} on {variable}", tree), "")
+    if regress_on:
+        results["regression"] = found = m.field_regression(tree, field, regress_on, **options)
+        write(tables.significance(found, found, f"{field} on {regress_on}", tree), "")
     for name, result in results.items():
         s4a.analysis.export.write_results(result, out, f"{field}_{name}")
     write(f"results: {out}")
@@ -116,11 +116,11 @@ def region_statistics(
     *,
     label: list[int | str] | None = None,
     labels: str | None = None,
-    least_confidence: float = 0.0,
-    without: list[str] | None = None,
-    size_back: bool = False,
+    min_confidence: float = 0.0,
+    regress_out: list[str] | None = None,
+    restore_size: bool = False,
     group: str | None = None,
-    variable: str | None = None,
+    regress_on: str | None = None,
     covariates: list[str] | None = None,
     table: str | None = None,
     variances: Literal["equal", "unequal"] = "equal",
@@ -139,15 +139,15 @@ def region_statistics(
         only vertices of the template with these labels
     labels : FILE
         labels of the template's file for --label: NPY, NPZ (FILE:NAME), CSV, GIFTI or annot
-    least_confidence : SHARE
+    min_confidence : SHARE
         only vertices whose mean confidence is this large, 0 to 1
-    without : COLUMN
+    regress_out : COLUMN
         nuisances: what lies along their regression is taken from all shapes
-    size_back
+    restore_size
         give size back to shapes of which --remove-size took it out
     group : COLUMN
         test and map of the difference between groups; classification
-    variable : COLUMN
+    regress_on : COLUMN
         regression of shape on a number, such as age; its animation
     covariates : COLUMN
         accounted for in both
@@ -165,34 +165,34 @@ def region_statistics(
     if labels and not label:
         raise ValueError("--labels is where --label looks: give --label LABEL..., or leave it out")
     tree, out = study_to_test(study, out, table, include_flagged)
-    tree = restricted(tree, size_back, without, label, labels, least_confidence)
+    tree = restricted(tree, restore_size, regress_out, label, labels, min_confidence)
     options = {"covariates": covariates, "seed": seed, "variances": variances}
-    write_statistics(tree, out, group, variable, permutations, options)
+    write_statistics(tree, out, group, regress_on, permutations, options)
     return 0
 
 
 def restricted(
     study: "xr.DataTree",
-    size_back: bool,
-    without: list[str] | None,
+    restore_size: bool,
+    regress_out: list[str] | None,
     label: list[int | str] | None,
     labels: str | None,
-    least_confidence: float,
+    min_confidence: float,
 ) -> "xr.DataTree":
     """The study of the part of what varies that is asked for."""
     import s4a_morphometrics as m
 
     said = []
-    if size_back:
+    if restore_size:
         study = m.with_size(study)
         said.append("with size given back")
-    if without:
-        study = m.without(study, without)
-        said.append(f"without {', '.join(without)}")
-    if label or least_confidence:
+    if regress_out:
+        study = m.without(study, regress_out)
+        said.append(f"without {', '.join(regress_out)}")
+    if label or min_confidence:
         whole = study["registration"].sizes["vertex"]
         of = template_labels(study, labels)
-        study = m.within(study, label, labels=of, least_confidence=least_confidence)
+        study = m.within(study, label, labels=of, min_confidence=min_confidence)
         said.append(f"{study['registration'].sizes['vertex']} of {whole} vertices")
     if said:
         write("; ".join(said) + "\n")

@@ -208,7 +208,7 @@ def test_the_command_takes_a_field_in_place_of_shape(tmp_path, study_folder):
     table = tmp_path / "t.csv"
     rows = [f"{name},{i + i * i}" for i, name in enumerate(values)]
     table.write_text("\n".join(["shape,age", *rows]))
-    words = ["--variable", "age", "--table", str(table), "--permutations", "19"]
+    words = ["--regress-on", "age", "--table", str(table), "--permutations", "19"]
     assert cli.main(["field-statistics", str(folder), "noise", *words]) == 0
     out = folder / "statistics"
     assert "field_effect" in (out / "noise_regression.vertex.csv").read_text().splitlines()[0]

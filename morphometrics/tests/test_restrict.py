@@ -37,7 +37,7 @@ def test_a_region_has_its_vertices_their_displacements_and_modes_of_its_own(simu
     assert part["pca"].to_dataset().equals(expected)
     labelled = within(simulated, 7)
     assert labelled["registration"].equals(part["registration"])
-    sure = within(simulated, least_confidence=0.5)
+    sure = within(simulated, min_confidence=0.5)
     assert sure["registration"].equals(part["registration"])
     assert within(simulated)["registration"].sizes["vertex"] == len(X)
 
@@ -150,7 +150,7 @@ def test_the_command_takes_a_region_and_a_nuisance(study_folder, tmp_path, capsy
         "--out",
         str(tmp_path / "o"),
     ]
-    assert cli.main([*command, "--without", "age", "--min-confidence", "0.2"]) == 0
+    assert cli.main([*command, "--regress-out", "age", "--min-confidence", "0.2"]) == 0
     assert "without age" in capsys.readouterr().out
     assert cli.main([*command, "--label", "999"]) == 2
     assert "no vertex of the template has the label 999" in capsys.readouterr().err
