@@ -1,6 +1,6 @@
-"""Scalar fields of the shapes (6.1, 6.2), such as thickness: carried to the template, and kept.
+"""Scalar fields of the shapes (6.1, 6.2), such as thickness, transferred to the template.
 
-Every vertex of the template takes the value at the place of the shape that it was registered to,
+Every vertex of the template takes the value at the point of the shape that it was registered to,
 linear inside triangles (:mod:`s4a.analysis.transfer`), so that the fields of all shapes can be
 compared vertex by vertex: :mod:`s4a_morphometrics.field_tests`.
 """
@@ -46,7 +46,7 @@ def with_field(
     unit: str | None = None,
     partial: bool = False,
 ) -> xr.DataTree:
-    """A study with a scalar field of every shape, carried to the template.
+    """Return the study with a scalar field of every shape, transferred to the template.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ def _by_shape(values, shapes, name, study):
 
 
 def write_field(study: xr.DataTree, name: str, folder: Path | str) -> Path:
-    """Keep a field of :func:`with_field` in the folder of its study.
+    """Write a field of :func:`with_field` to the folder of its study.
 
     :func:`s4a.open_study` has it in ``/fields`` as long as the registrations are those that it was
     carried along.
@@ -179,7 +179,7 @@ def write_field(study: xr.DataTree, name: str, folder: Path | str) -> Path:
     (3, 200)
     """
     if "fields" not in study.children or name not in study["fields"].children:
-        raise ValueError(f"the study has no field {name!r}; with_field carries one")
+        raise ValueError(f"the study has no field {name!r}; with_field adds one")
     field = study["fields"][name].to_dataset()
     registered = study["registration"].children
     keys = [registered[one].attrs.get("task_key", "") for one in field["shape"].values.tolist()]
@@ -236,7 +236,7 @@ def field_of(study: xr.DataTree, name: str, shapes: Sequence[str]) -> tuple[np.n
     if name not in there:
         raise ValueError(
             f"the study has no field {name!r}; it has {listed(there) or 'none'}: "
-            "s4a_morphometrics.with_field, or s4a fields, carries one"
+            "s4a_morphometrics.with_field, or s4a fields, adds one"
         )
     values = study["fields"][name].to_dataset()["transferred_field"]
     return values.reindex(shape=list(shapes)).values, str(values.attrs["units"])
@@ -249,7 +249,7 @@ def field_sample(
     what: str,
     covariates: Values | dict[str, Values] | list[str] | None = None,
 ) -> FieldSample:
-    """:func:`s4a.analysis.inputs.sample_of` the shapes that have a field, with that field as d."""
+    """Return the shapes of a test that have a field, see :func:`s4a.analysis.inputs.sample_of`."""
     names = registration_of(study)["shape"].values.tolist()
     of_field, unit = field_of(study, field, names)
     has = np.where(np.isnan(of_field).all(1), np.nan, 0.0)

@@ -1,4 +1,4 @@
-"""Studies of a part of what varies (6.1): a region, without a nuisance, with size given back.
+"""Studies of a part of the variation (6.1): a region, without a nuisance, with size restored.
 
 Each takes a study and gives one, with modes of its own, so that every test, measure, page and panel
 takes it; the study given stays as it is.  The alignment is that of the whole shapes.
@@ -33,7 +33,7 @@ def within(
     labels: np.ndarray | None = None,
     min_confidence: float = 0.0,
 ) -> xr.DataTree:
-    """The study of a region of the template.
+    """Return the study of a region of the template.
 
     Parameters
     ----------
@@ -210,7 +210,7 @@ def without(study: xr.DataTree, nuisance: Values | dict[str, Values] | list[str]
 
 
 def with_size(study: xr.DataTree) -> xr.DataTree:
-    """The study with size given back to shapes that were aligned with it taken out.
+    """Return the study with the size restored that the alignment removed.
 
     Boas coordinates (Bookstein 2021): a shape that x -> s R x + t made as large as the template is
     divided by its s around the centre of the template.

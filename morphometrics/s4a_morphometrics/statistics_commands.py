@@ -61,7 +61,7 @@ def field_statistics(
     out: str | None = None,
     seed: int,
 ) -> int:
-    """Tests of groups and variables of the table on a field of s4a fields in place of shape.
+    """Test groups and variables of the table on a field in place of shape.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def region_statistics(
     out: str | None = None,
     seed: int,
 ) -> int:
-    """Statistics of a region of the template, without nuisances, or with size given back.
+    """Evaluate and test a region of the template, without nuisances, or with size restored.
 
     Parameters
     ----------
@@ -142,9 +142,9 @@ def region_statistics(
     min_confidence : SHARE
         only vertices whose mean confidence is this large, 0 to 1
     regress_out : COLUMN
-        nuisances: what lies along their regression is taken from all shapes
+        nuisances: the variation along their regression is removed from all shapes
     restore_size
-        give size back to shapes of which --remove-size took it out
+        restore the size that --remove-size removed
     group : COLUMN
         test and map of the difference between groups; classification
     regress_on : COLUMN
@@ -163,7 +163,7 @@ def region_statistics(
         for netCDF and CSV (default: STUDY/statistics)
     """
     if labels and not label:
-        raise ValueError("--labels is where --label looks: give --label LABEL..., or leave it out")
+        raise ValueError("--labels needs --label LABEL...: give both, or leave it out")
     tree, out = study_to_test(study, out, table, include_flagged)
     tree = restricted(tree, restore_size, regress_out, label, labels, min_confidence)
     options = {"covariates": covariates, "seed": seed, "variances": variances}
@@ -179,13 +179,13 @@ def restricted(
     labels: str | None,
     min_confidence: float,
 ) -> "xr.DataTree":
-    """The study of the part of what varies that is asked for."""
+    """Return the study restricted to a region, without nuisances, or with size restored."""
     import s4a_morphometrics as m
 
     said = []
     if restore_size:
         study = m.with_size(study)
-        said.append("with size given back")
+        said.append("with size restored")
     if regress_out:
         study = m.without(study, regress_out)
         said.append(f"without {', '.join(regress_out)}")
@@ -200,7 +200,7 @@ def restricted(
 
 
 def template_labels(study: "xr.DataTree", file: str | None) -> "np.ndarray | None":
-    """Labels of the template, from a file with one for each vertex of its file."""
+    """Return the labels of the template, from a file with one for each vertex of its file."""
     if file is None:
         return None
     template = s4a.analysis.inputs.all_registered(study).attrs["template"]

@@ -136,7 +136,7 @@ def test_a_field_that_does_not_fit_is_refused_by_shape(study, caplog):
     values = found["fields/f"].to_dataset()["transferred_field"]
     assert np.isnan(values.sel(shape=first)).all()
     assert np.isfinite(values.sel(shape=second)).all()
-    with pytest.raises(ValueError, match="no field 'g'; with_field carries one"):
+    with pytest.raises(ValueError, match="no field 'g'; with_field adds one"):
         write_field(found, "g", "nowhere")
 
 

@@ -58,7 +58,7 @@ def test_without_its_template_a_study_is_registered_to_the_next(study):
     assert same.identical(study["registration"].to_dataset().drop_sel(shape=kept))
 
 
-def test_doubtful_shapes_are_left_out_or_taken_in_on_demand():
+def test_flagged_shapes_are_left_out_or_included_on_demand():
     tree = synthetic.brains(5, 600, seed=2)["original"]
     good = {name: as_arrays(node.to_dataset()) for name, node in tree.children.items()}
     (X, T), (Y, S) = good["brain_01"], good["brain_02"]

@@ -162,7 +162,7 @@ def test_the_command_takes_a_region_and_a_nuisance(study_folder, tmp_path, capsy
     assert cli.main([*command, *halves]) == 0
     assert f" of {len(Y)} vertices" in capsys.readouterr().out
     assert cli.main([*command, *halves[2:]]) == 2
-    assert "--labels is where --label looks" in capsys.readouterr().err
+    assert "--labels needs --label" in capsys.readouterr().err
 
 
 def test_a_mirrored_shape_of_a_region_is_written_on_the_side_of_its_file(study, tmp_path):
