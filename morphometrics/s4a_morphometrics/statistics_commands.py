@@ -162,6 +162,8 @@ def region_statistics(
     out : DIR
         for netCDF and CSV (default: STUDY/statistics)
     """
+    if covariates and not (group or regress_on):
+        raise ValueError("--covariates are of a test: give --group or --regress-on")
     if labels and not label:
         raise ValueError("--labels needs --label LABEL...: give both, or leave it out")
     tree, out = study_to_test(study, out, table, include_flagged)

@@ -269,6 +269,8 @@ def statistics(
     out : DIR
         for netCDF and CSV (default: STUDY/statistics)
     """
+    if covariates and not (group or variable):
+        raise ValueError("--covariates are of a test: give --group or --variable")
     tree, out = study_to_test(study, out, table, include_flagged)
     options = {"covariates": covariates, "seed": seed, "variances": variances}
     write_statistics(tree, out, group, variable, permutations, options)
@@ -284,8 +286,6 @@ def write_statistics(
     options: dict[str, Any],
 ) -> None:
     """Evaluate and test a study, write the results to a folder, and print them."""
-    if options["covariates"] and not (group or variable):
-        raise ValueError("--covariates are of a test: give --group or --variable")
     results = tests_of(tree, group, variable, permutations, options)  # first: these may be refused
     results["evaluation"] = s4a.statistics.evaluate(tree, seed=options["seed"])
     results["outliers"] = s4a.statistics.outliers(tree)
