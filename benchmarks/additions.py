@@ -3,7 +3,7 @@
 ``additions.py [brains] [faces] [bodies] [--only ROW...] [--data FOLDER] [--write]``: mean distances
 to the truth in % of sqrt(area), of the matched vertices and of the registered surface, and CPU
 seconds.  With ``--write`` they go into ``docs/differences.csv``, and from there into the page
-``docs/differences.md``, which ``differences.py --write`` makes anew without running anything.
+``docs/differences.md``, which ``differences.py --write`` makes again without running anything.
 ``--only`` runs the rows of these names, or that have one of the words in their name, ``--missing``
 those without a result.  Faces and bodies are those of the shared data beside the checkout, or in a
 folder that ``--data`` names, a folder of PLY files for each set.  Each is remeshed once: what comes
@@ -33,7 +33,7 @@ from s4a import synthetic
 from s4a.geometry.align import cloud, icp
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
-from s4a.method.first_map import landmarks_after_motion
+from s4a.method.initial_map import landmarks_after_alignment
 from s4a.method.remesh import silence
 from s4a.options import PRESETS
 from s4a.schema import dataset
@@ -47,7 +47,7 @@ CARRIED = 300  # vertices of the template that are carried over as landmarks
 # ------------------------------------------------------------------------------ what the paper had
 
 
-def geodesic_farthest(X, T, G, rim, avoid, k, seed=0):
+def geodesic_farthest(X, T, G, boundary, avoid, k, seed=0):
     """ReMatching's samples: farthest points along the edges, one at a time."""
     start = np.flatnonzero(~avoid)[0]
     distance = dijkstra(G, indices=start)
@@ -79,12 +79,12 @@ def program_errors(C, cycles, k=None, *, n_jobs=1):
     return found.x
 
 
-def pyfm_fit(source, target, motion, *, k_init=20, init="landmarks", near=None):
-    """PyFM's first map: wave kernels of the shapes and around the landmarks, its own weights."""
+def pyfm_fit(source, target, transform, *, k_init=20, init="landmarks", near=None):
+    """PyFM's initial map: wave kernels of the shapes and around the landmarks, its own weights."""
     from pyFM.functional import FunctionalMapping
     from pyFM.mesh import TriMesh
 
-    landmarks = landmarks_after_motion(source.X, target.X, motion)
+    landmarks = landmarks_after_alignment(source.X, target.X, transform)
     meshes = []
     for basis in (source, target):
         mesh = TriMesh(basis.X, basis.T)
@@ -113,8 +113,8 @@ INSTEAD = {
         "s4a.method.remesh.closest_point_in_star": closest_in_space,
         "s4a.method.remesh.sample_surface": geodesic_farthest,
     },
-    "ICP from one start": {"s4a.method.first_map.align": one_start},
-    "first maps of pyFM": {"s4a.method.first_map.fit_after_motion": pyfm_fit},
+    "ICP from one start": {"s4a.method.initial_map.align": one_start},
+    "initial maps of pyFM": {"s4a.method.initial_map.fit_after_alignment": pyfm_fit},
     "weights of the linear program": {"s4a.method.latent.cycle_errors": program_errors},
 }
 PAPER = PRESETS["paper"]
@@ -122,35 +122,35 @@ DEFAULTS = PRESETS[None]
 N_PROJECTED = 2500  # of 10,000 vertices, as 25,000 of 100,000
 ON_THE_PAPER = {
     "refine": {"refine": "elastic"},
-    "joint": {"refine": "joint"},
+    "joint": {"refine": "spectral_icp"},
     "init": {"init": "dense"},
-    "lift": {"lift": True},
-    "n_spread": {"n_spread": DEFAULTS["n_spread"]},
-    "wide": {name: DEFAULTS[name] for name in ("n_spread", "wide")},
-    "parts": {"refine": "elastic", "parts": True},
+    "lift": {"refined_eigenfunctions": True},
+    "n_samples": {"n_samples": DEFAULTS["n_samples"]},
+    "wide": {name: DEFAULTS[name] for name in ("n_samples", "dense_iterations")},
+    "parts": {"refine": "elastic", "articulated": True},
     "alignment": {"alignment": "fitted"},
     "area_weighted": {"area_weighted": True},
     "n_projected": {"n_projected": N_PROJECTED},
 }
 READINGS = {
-    "how": "standard",
+    "dense_match": "fmap",
     "method": "scalable",
-    "ahead": "never",
+    "initial_refinement": "never",
     "weights": "equal",
     "n_latent": 90,
     "step": 10,
 }
 NORMS = ("h2", "h1", "frobenius", "h2_image", "h2_both")
-OF_A_PAIR = ("refine", "init", "ahead", "sharpen", "both")
+OF_A_PAIR = ("refine", "init", "initial_refinement", "full_resolution_iterations", "bidirectional")
 
 
 def study_rows():
     """Name of a row -> options of the analysis of a collection; what matters most comes first."""
     rows = {"paper": PAPER, "default": {}}
     rows |= {f"paper, {name}": PAPER | added for name, added in ON_THE_PAPER.items()}
-    rows |= {f"default without {name}": {name: PAPER[name]} for name in ("init", "parts")}
-    rows["default, joint"] = {"refine": "joint"}
-    rows["default, lift"] = {"lift": True}
+    rows |= {f"default without {name}": {name: PAPER[name]} for name in ("init", "articulated")}
+    rows["default, joint"] = {"refine": "spectral_icp"}
+    rows["default, lift"] = {"refined_eigenfunctions": True}
     rows |= {f"paper, {name}={value}": PAPER | {name: value} for name, value in READINGS.items()}
     rows |= {f"paper, {name}": PAPER for name in INSTEAD}
     rows |= {f"paper, norm={name}": PAPER | {"norm": name, "template": None} for name in NORMS}
@@ -159,7 +159,11 @@ def study_rows():
 
 def pair_rows():
     """The same of pairs that are matched on their own."""
-    paper = {name: value for name, value in PAPER.items() if name not in ("n_spread", "wide")}
+    paper = {
+        name: value
+        for name, value in PAPER.items()
+        if name not in ("n_samples", "dense_iterations")
+    }
     rows = {"pairs: paper": paper, "pairs: default": {}}
     for name in OF_A_PAIR:
         rows[f"pairs: paper, {name}"] = paper | {name: DEFAULTS[name]}
@@ -308,7 +312,7 @@ def measure(row, options, meshes, image, folder):
         seconds = time.process_time() - begin
         carried = f"{carried_error(study, image):.3f}"
     else:
-        given = {"template": first, "n_coarse": N_COARSE, "keep_doubtful": True, "n_jobs": 1}
+        given = {"template": first, "n_coarse": N_COARSE, "include_flagged": True, "n_jobs": 1}
         if "norm=" in row:
             given["store"] = folder
         with in_place(INSTEAD.get(row.removeprefix("paper, "), {})):

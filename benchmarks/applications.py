@@ -3,7 +3,7 @@
 ``applications.py [ellipsoids groups variance brains skulls faces heads template points parcels
 volumes]``.
 
-A one-mode family against the closed form, planted groups, the variance explained at both
+A one-mode family against the closed form, simulated groups, the variance explained at both
 resolutions (Fig. 5), transfer between two brain templates and between skulls, displacements and
 modes of faces against the published ones, a tenth head inserted into a study of nine, labels and
 landmarks of a template that is none of the collection (Fig. 6 and 7), 35 regions on remeshed
@@ -66,7 +66,10 @@ def variance(folder=None):
         for preset in ("paper", None):
             study = s4a.analyse(shapes, preset=preset, n_jobs=-1)
             for resolution, ratio in (
-                ("high, eq. 7" if preset else "high, elastic rounds", "explained_variance_ratio"),
+                (
+                    "high, eq. 7" if preset else "high, elastic iterations",
+                    "explained_variance_ratio",
+                ),
                 ("low, eq. 6, as smooth", "explained_variance_ratio_low"),
                 ("low, eq. 6, as it is", "explained_variance_ratio_raw"),
             ):
@@ -88,7 +91,9 @@ def brains(folder):
         "nearest vertex after ICP": labels["fsa5"][cKDTree(X @ R.T + t).query(Y)[1]],
     }
     for both in (False, True):
-        study = transfer.register_pairs(meshes["fsa5"], {"conte69": meshes["conte69"]}, both=both)
+        study = transfer.register_pairs(
+            meshes["fsa5"], {"conte69": meshes["conte69"]}, bidirectional=both
+        )
         name = "S4A, matched both ways" if both else "S4A, one way"
         found[name] = s4a.transfer_labels(study, labels["fsa5"])["conte69"]["label"].values
     for name, label in found.items():
@@ -411,13 +416,13 @@ def ellipsoids():
 def groups():
     tree = synthetic.brains(24, 5000, seed=11)
     truth = tree["truth"]
-    group = np.where(truth["planted_score"].values[:, 1] > 0, "high", "low")
+    group = np.where(truth["true_score"].values[:, 1] > 0, "high", "low")
     shapes = {name: node.to_dataset() for name, node in tree["original"].children.items()}
     study = s4a.analyse(shapes, n_coarse=1500, k=60, n_jobs=-1)
     group = dict(zip(truth["shape"].values.tolist(), group.tolist(), strict=True))
-    kept, anew = statistics.evaluate(study), statistics.generalization(study, n_jobs=-1)
+    kept, again = statistics.evaluate(study), statistics.generalization(study, n_jobs=-1)
     for measure in ("generalization", "generalization_surface"):
-        for which, found in (("kept: optimistic", kept), ("recomputed", anew)):
+        for which, found in (("kept: optimistic", kept), ("recomputed", again)):
             value, error = (found[f"{measure}{e}"].values for e in ("", "_error"))
             row = ", ".join(f"{value[c - 1]:.3f} ± {error[c - 1]:.3f} by {c}" for c in (1, 3, 10))
             say(f"{measure} in mm, correspondences {which}: {row}")
@@ -430,7 +435,7 @@ def groups():
     )
     whole = statistics.group_test(study, group)
     say(
-        f"planted groups: p = {whole['p_value'].item():.4f}, "
+        f"simulated groups: p = {whole['p_value'].item():.4f}, "
         f"least possible {whole.attrs['smallest_p']:.4f}"
     )
     where = statistics.group_map(study, group)
@@ -447,7 +452,7 @@ def groups():
         )
     effect = where["effect"].values
     cosine = abs(np.vdot(effect, field)) / np.linalg.norm(effect) / np.linalg.norm(field)
-    say(f"effect and planted mode: cosine {cosine:.2f}")
+    say(f"effect and simulated mode: cosine {cosine:.2f}")
     x, p = np.repeat([0.0, 1.0], [8, 10]), []
     for seed in range(100):
         scores = np.random.default_rng(seed).standard_t(5, size=(18, 4))

@@ -1,15 +1,15 @@
 """Left against right (6.1): error and power of the tests of asymmetry; real shapes.
 
 ``python benchmarks/asymmetry.py [RUNS]``: asymmetries of 40 vertices with nothing to find or
-a planted effect.  Error is how often something is found at 0.05 where nothing is: directional
+a simulated effect.  Error is how often something is found at 0.05 where nothing is: directional
 asymmetry at the vertices after the correction for all, and of the whole shape; antisymmetry.  Power
-is the share of four planted vertices that are found, how often the whole shape is, and how often
+is the share of four simulated vertices that are found, how often the whole shape is, and how often
 antisymmetry is, in every fifth run.
 
 ``asymmetry.py whole [RUNS]``: the same of :func:`s4a_morphometrics.asymmetry` as it is called:
 shapes of an ellipsoid of 500 vertices, smooth in what is alike on both sides and in what is not,
-with a bump of one side planted; each against its mirror image, along the normals or as vectors, or
-left and right shapes of subjects.
+with a bump of one side simulated; each against its mirror image, along the normals or as vectors,
+or left and right shapes of subjects.
 
 ``asymmetry.py brains [RUNS]``: the errors of a folded brain, the same on both sides, whose partners
 are found by registration; the variation of its shapes as large as that of the ellipsoids, or less.
@@ -33,7 +33,7 @@ from s4a.analysis.permutation import Model
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas, vertex_normals
 from s4a.schema import dataset
 from s4a_morphometrics.bilateral import antisymmetry_test, both_sides, sides_test
-from s4a_morphometrics.halves import involution
+from s4a_morphometrics.bilateral_pairs import involution
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 N_VERTICES, N_PLANTED = 40, 4
@@ -66,12 +66,12 @@ def draw(rng: np.random.Generator, n: int, kind: str) -> np.ndarray:
     return (noise @ (W / np.linalg.norm(W, axis=0)))[..., None]
 
 
-def found(a: np.ndarray, run: int, *, planted: bool) -> list[float]:
+def found(a: np.ndarray, run: int, *, simulated: bool) -> list[float]:
     """Whether, or where, directional asymmetry and antisymmetry are found."""
     model = Model.of_mean(len(a), N_PERMUTATIONS, run)
     p_max = model.vertex_test(a)[2]
     rows = a[..., 0]
-    at = (p_max[:N_PLANTED] <= 0.05).mean() if planted else p_max.min() <= 0.05
+    at = (p_max[:N_PLANTED] <= 0.05).mean() if simulated else p_max.min() <= 0.05
     whole = sides_test(rows @ rows.T, model)[1] <= 0.05
     return [at, whole]
 
@@ -87,13 +87,13 @@ def rates(n: int, kind: str, runs: int) -> np.ndarray:
     for run in range(runs):
         rng = np.random.default_rng([run, n, *map(ord, kind)])
         a = draw(rng, n, kind)
-        said[run, :2] = found(a, run, planted=False)
+        said[run, :2] = found(a, run, simulated=False)
         said[run, 2] = antisymmetric(a[..., 0], run)
         if run % 5:
             continue
         shifted = a.copy()
         shifted[:, :N_PLANTED] += EFFECT
-        said[run, 3:5] = found(shifted, run, planted=True)
+        said[run, 3:5] = found(shifted, run, simulated=True)
         a[:, : 2 * N_PLANTED, 0] += HUMPS * rng.choice([-1, 1], n)[:, None]
         said[run, 5] = antisymmetric(a[..., 0], run)
     return np.nanmean(said, axis=0)
@@ -103,7 +103,11 @@ def ellipsoid() -> tuple[np.ndarray, np.ndarray, xr.Dataset]:
     """Vertices, triangles, and their partners as the equation of the surface gives them."""
     X, T = as_arrays(s4a.synthetic.ellipsoid(N_OF_SURFACE, (2.0, 3.0, 1.5)))
     (triangle, weights), _, gap = involution(X * [-1, 1, 1], X, T)
-    return X, T, dataset(partner_triangle=triangle, partner_barycentric=weights, partner_gap=gap)
+    return (
+        X,
+        T,
+        dataset(partner_triangle=triangle, partner_barycentric=weights, partner_distance=gap),
+    )
 
 
 def brain(n: int, seed: int) -> tuple[np.ndarray, np.ndarray, xr.Dataset]:
@@ -145,7 +149,7 @@ def whole_rates(
 ) -> np.ndarray:
     """Error at vertices, of the whole shape and of antisymmetry; power of the first two.
 
-    Shapes vary by `size` times as much; for `power` the bump is planted in every fifth run.
+    Shapes vary by `size` times as much; for `power` the bump is simulated in every fifth run.
     """
     X, T, halves = surface
     height = np.exp(-((X - [1.7, 1.0, 0.6]) ** 2).sum(1) / 0.5)
@@ -160,10 +164,10 @@ def whole_rates(
     for run in range(runs):
         drawn = draw_shapes(np.random.default_rng([run, n, 7]), X, n)
         alike, odd = (size * part for part in drawn)
-        for planted in (False, True)[: 1 + (power and run % 5 == 0)]:
-            d = alike + odd + planted * push
+        for simulated in (False, True)[: 1 + (power and run % 5 == 0)]:
+            d = alike + odd + simulated * push
             if way == "sides":
-                half = odd + planted * push / 2
+                half = odd + simulated * push / 2
                 d = np.concatenate([alike - half, alike + half])
             mesh = as_dataset(X, T, {"template": names[0]}).merge(dataset(displacement=d))
             study = xr.DataTree.from_dict({"registration": mesh.assign_coords(shape=names)})
@@ -172,7 +176,7 @@ def whole_rates(
                 study["report"] = xr.DataTree(report.assign_coords(shape=names))
             found = s4a_morphometrics.asymmetry(study, seed=run, **options)
             p, p_value = found["p_family_wise"].values, found["p_value"].item()
-            if planted:
+            if simulated:
                 said[run, 3:] = (p[high] <= 0.05).mean(), p_value <= 0.05
             else:
                 of_humps = found["antisymmetry_p"].item()
@@ -219,7 +223,7 @@ def real() -> None:
             X, T = arrays["V"], arrays["F"]
         meshes[f"{file.stem}_a"] = X, T
         meshes[f"{file.stem}_b"] = X * [-1, 1, 1], T[:, ::-1]
-    femurs = s4a.analyse(meshes, reflect="auto", keep_doubtful=True, **options)
+    femurs = s4a.analyse(meshes, reflect="auto", include_flagged=True, **options)
     report = femurs["report"].to_dataset()
     names = report["shape"].values.tolist()
     write(f"mirrored of {len(names)} femurs and mirror images: {int(report['reflected'].sum())}")

@@ -1,7 +1,7 @@
 """How often the score without truth picks the better candidate, on pairs with known correspondence.
 
-For every pair: the error at low resolution of each candidate of s4a.method.joint.candidates, that
-of the one picked, and that of the best.  Errors are mean straight-line distances in % of
+For every pair: the error at low resolution of each candidate of s4a.method.spectral_icp.candidates,
+that of the one picked, and that of the best.  Errors are mean straight-line distances in % of
 sqrt(area), to the image of each coarse vertex.
 """
 
@@ -18,8 +18,8 @@ from threadpoolctl import threadpool_limits
 import s4a
 from s4a import synthetic
 from s4a.geometry.align import align
-from s4a.method import fmap, joint
-from s4a.method.first_map import first_map
+from s4a.method import fmap, spectral_icp
+from s4a.method.initial_map import initial_map
 from s4a.method.shape import Shape
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -38,7 +38,7 @@ def errors(source, target, image):
     """
     with threadpool_limits(1):
         M, N = shape_of(source), shape_of(target)
-        first = first_map(M.low, N.low, align(M.low.X, M.low.area, N.low.X, N.low.area)[:2])
+        first = initial_map(M.low, N.low, align(M.low.X, M.low.area, N.low.X, N.low.area)[:2])
         starts = {
             "intrinsic": fmap.zoomout(M.low, N.low, first.C, 100)[1],
             "icp": first.near,
@@ -48,7 +48,7 @@ def errors(source, target, image):
         true = (np.where(sample[:, None] >= 0, image[sample], np.nan) - center) / size
         return {
             name: (score, 100 * np.nanmean(np.linalg.norm(M.low.X[match] - true, axis=1)))
-            for name, (score, match, _) in joint.candidates(M.low, N.low, starts).items()
+            for name, (score, match, _) in spectral_icp.candidates(M.low, N.low, starts).items()
         }
 
 

@@ -23,14 +23,18 @@ from s4a.evaluation import accuracy
 OPTIONS = {
     "default": {},
     "n_coarse=3000": {"n_coarse": 3000},
-    "wide=0, n_spread=500": {"wide": 0, "n_spread": 500},
+    "dense_iterations=0, n_samples=500": {"dense_iterations": 0, "n_samples": 500},
     'preset="fast"': {"preset": "fast"},
-    'refine="joint"': {"refine": "joint"},
-    'refine="joint", wide=0, n_spread=500': {"refine": "joint", "wide": 0, "n_spread": 500},
+    'refine="spectral_icp"': {"refine": "spectral_icp"},
+    'refine="spectral_icp", dense_iterations=0, n_samples=500': {
+        "refine": "spectral_icp",
+        "dense_iterations": 0,
+        "n_samples": 500,
+    },
     "n_coarse=9000, k=150": {"n_coarse": 9000, "k": 150},
     "k=60": {"k": 60},
-    "lift=True": {"lift": True},
-    "n_spread=0": {"n_spread": 0},
+    "refined_eigenfunctions=True": {"refined_eigenfunctions": True},
+    "n_samples=0": {"n_samples": 0},
 }
 
 
@@ -60,10 +64,10 @@ def main(n=6, n_vertices=12_000):
     sys.stdout.write(f"{'options':36} {'CPU s':>7} {'match %':>8} {'surface %':>9}\n")
     for name, options in OPTIONS.items():
         begin = time.process_time()
-        study = s4a.analyse(brains, template="brain_01", keep_doubtful=True, n_jobs=1, **options)
+        study = s4a.analyse(brains, template="brain_01", include_flagged=True, n_jobs=1, **options)
         spent = time.process_time() - begin
         error = 100 * accuracy.accuracy(study, image)["error"].mean(["shape"])
-        match, surface = (float(error.sel(way=w)) for w in (accuracy.MATCH, accuracy.SURFACE))
+        match, surface = (float(error.sel(algorithm=w)) for w in (accuracy.MATCH, accuracy.SURFACE))
         sys.stdout.write(f"{name:36} {spent:7.1f} {match:8.3f} {surface:9.3f}\n")
         sys.stdout.flush()
 

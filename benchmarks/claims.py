@@ -1,7 +1,7 @@
 """What no other benchmark prints of the paper's claims: figures of ``docs/claims.md``.
 
 ``claims.py [remesh] [swaps] [discretization] [transfer] [--data FOLDER]``: what a low resolution
-loses (4.1), exchanged eigenfunctions in first maps (Fig. 2), the same shapes in other vertices
+loses (4.1), exchanged eigenfunctions in initial maps (Fig. 2), the same shapes in other vertices
 (4.2), and both ways of a transfer (6.2).  Heads and faces are those of the shared data beside the
 checkout, or in a folder that ``--data`` names, a folder of PLY files for each set; without them
 these rows are left out.
@@ -83,21 +83,22 @@ def lost_share(dense, F):
 
 
 def swaps(given):
-    """In how many first maps two of the first four eigenfunctions that vary are exchanged."""
+    """In how many initial maps two of the first four eigenfunctions that vary are exchanged."""
     collections = {"six synthetic brains": synthetic.brains(6, 10_000, 3)}
     with tempfile.TemporaryDirectory() as folder:
         for name, count in (("heads", 6), ("faces", 6)):
             files = files_of(name, folder, given)[:count]
             if files:
                 collections[f"six {name}"] = s4a.read_shapes(files, compare=False)
-    say("\nFig. 2: first maps of the paper whose largest entry of a row is off the diagonal")
+    say("\nFig. 2: initial maps of the paper whose largest entry of a row is off the diagonal")
     for name, tree in collections.items():
         coarse = {
             shape: s4a.spectrum(s4a.coarsen(node.to_dataset(), n_coarse=2000), k=20)
             for shape, node in tree["original"].children.items()
         }
         options = Options(preset="paper")
-        C = s4a.build_network(coarse, k_init=20, **options.of("first maps"))["fmap_initial"].values
+        network = s4a.build_network(coarse, k_init=20, **options.of("initial maps"))
+        C = network["fmap_initial"].values
         block = np.abs(C[:, 1:5, 1:5])
         swapped = (block.argmax(2) != np.arange(4)).any(1)
         say(f"{name}: {swapped.sum()} of {len(swapped)} maps")
@@ -110,7 +111,7 @@ def discretization(given):
         shapes = synthetic.brains(6, n_vertices, 3)
         study = s4a.analyse(shapes, n_coarse=2000, preset="paper", n_jobs=1)
         latent = study["latent"]
-        energy = ", ".join(f"{one:.4f}" for one in latent["distance_to_median"].values)
+        energy = ", ".join(f"{one:.4f}" for one in latent["distance_to_limit"].values)
         say(f"{n_vertices:7} vertices: median {latent.attrs['median']}; {energy}")
 
 

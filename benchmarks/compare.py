@@ -35,7 +35,7 @@ DATA = Path(__file__).parents[2] / "shared" / "data"
 CORRESPONDING = {"faust15k": 6890}  # of these only the first vertices correspond
 SETS = {"faces": 2, "faust15k": 2, "cats": 2, "kids": 1}  # pairs
 SHOWN = ("geodesic_error", "chamfer", "hausdorff", "dirichlet", "coverage", "bijectivity")
-COMPARED = ("FMAP+ZO", "RE-MATCH", "RE-MATCH lifted", "registered")  # on more pairs
+COMPARED = ("FMAP+ZO", "RE-MATCH", "RE-MATCH refined", "registered")  # on more pairs
 N_LANDMARKS = 10
 LOOKED_AT = ("RE-MATCH", "registered", "registered surface")
 FAR_GAP = 3  # % of sqrt(area), full yellow in the picture
@@ -74,7 +74,7 @@ def peer(source, target, landmarks, truth, k_init=20, k=100, step=5):
     found = metrics.evaluate(source, target, match, truth=truth)
     spent = np.zeros((1, len(compare.BLOCKS)))
     spent[0, -1] = seconds
-    found["block_seconds"] = variable("block_seconds", spent[None]).isel(way=0, pair=0)
+    found["block_seconds"] = variable("block_seconds", spent[None]).isel(algorithm=0, pair=0)
     return found
 
 
@@ -124,8 +124,8 @@ def table_1(found, names=None):
     mean = found.mean("pair")
     columns = {name: METRICS[name] for name in names or METRICS if name in mean}
     rows = []
-    for way in mean["way"].values:
-        one = mean.sel(way=way)
+    for way in mean["algorithm"].values:
+        one = mean.sel(algorithm=way)
         cells = [
             "" if np.isnan(one[name].item()) else f"{factor * one[name].item():.{digits}f}"
             for name, (_, factor, digits) in columns.items()
@@ -145,8 +145,8 @@ def registered(name, n_pairs, given=None, init=None, peers=False, methods=compar
             with threadpool_limits(1):
                 line = peer(source, target, marks, truth)
             line = line.expand_dims(pair=1)
-            line = line.assign_coords(way="pyFM (FMAP+ZO)", block=list(compare.BLOCKS))
-            found = xr.concat([found, line.assign_coords(pair=found["pair"])], "way")
+            line = line.assign_coords(algorithm="pyFM (FMAP+ZO)", block=list(compare.BLOCKS))
+            found = xr.concat([found, line.assign_coords(pair=found["pair"])], "algorithm")
         rows.append(found)
     found, n = xr.concat(rows, "pair"), source.sizes["vertex"]
     say(
@@ -173,16 +173,16 @@ def more(pairs, what, init=None):
     say(f"\n{what}: {found.sizes['pair']} pairs of {target.sizes['vertex']} vertices\n")
     first, rows = COMPARED[0], []
     for way in COMPARED:
-        one, spent = error.sel(way=way), seconds.sel(way=way)
-        by_pair = one / error.sel(way=first)
+        one, spent = error.sel(algorithm=way), seconds.sel(algorithm=way)
+        by_pair = one / error.sel(algorithm=first)
         rows.append(
             [
                 way,
                 f"{one.mean():.3f}",
-                f"{one.mean() / error.sel(way=first).mean():.3f}",
+                f"{one.mean() / error.sel(algorithm=first).mean():.3f}",
                 f"{by_pair.min():.2f} to {by_pair.max():.2f}",
                 f"{spent.mean():.1f}",
-                f"{spent.mean() / seconds.sel(way=first).mean():.3f}",
+                f"{spent.mean() / seconds.sel(algorithm=first).mean():.3f}",
             ]
         )
     markdown(rows, ["", "error", f"by {first}", "by pair", "CPU s", f"by {first}"])
@@ -197,11 +197,11 @@ def verdict(found):
     """What holds of the paper's claims (5.2), and of ours, on the means of these pairs."""
     mean = found.mean("pair")
     of = {
-        name: dict(zip(mean["way"].values, mean[name].values, strict=True))
+        name: dict(zip(mean["algorithm"].values, mean[name].values, strict=True))
         for name in METRICS
         if name in mean
     }
-    time_of = dict(zip(mean["way"].values, seconds_of(mean).values, strict=True))
+    time_of = dict(zip(mean["algorithm"].values, seconds_of(mean).values, strict=True))
     five = compare.PAPER_METHODS
     spectral = [way for way in five if way != "kNN"]
     low = {name: min(five, key=of[name].get) for name in ("chamfer", "hausdorff")}
@@ -225,7 +225,7 @@ def verdict(found):
     }
     if "geodesic_error" in of:
         error = of["geodesic_error"]
-        worse = {way: error[way] / error["FMAP+ZO"] for way in ("RE-MATCH", "RE-MATCH lifted")}
+        worse = {way: error[way] / error["FMAP+ZO"] for way in ("RE-MATCH", "RE-MATCH refined")}
         by_error = sorted(five, key=error.get)
         claims["kNN is the farthest from the truth of the five"] = by_error[-1] == "kNN"
         for way, times in worse.items():
@@ -261,7 +261,7 @@ def figure_3(found):
     """Say the CPU seconds by block."""
     say("\nCPU seconds by block (Fig. 3):\n")
     blocks_table(
-        found["way"].values, found["block"].values, found["block_seconds"].mean("pair").values
+        found["algorithm"].values, found["block"].values, found["block_seconds"].mean("pair").values
     )
 
 
@@ -341,16 +341,16 @@ def where(source, seen):
     figure.savefig(PICTURE, dpi=110)
 
 
-# first maps and Consistent ZoomOut of Table 2
+# initial maps and Consistent ZoomOut of Table 2
 FIRST = {
     "paper": ("landmarks (the paper)", {"preset": "paper"}),
-    "landmarks": ("landmarks, our rounds", {"init": "landmarks"}),
-    "nearest": ("nearest neighbours, our rounds", {}),
+    "landmarks": ("landmarks, our iterations", {"init": "landmarks"}),
+    "nearest": ("nearest neighbours, our iterations", {}),
 }
 
 
 def table_2(given=None, first=tuple(FIRST)):
-    """Ten real heads, with the paper's first maps and with ours."""
+    """Ten real heads, with the paper's initial maps and with ours."""
     say("\nTable 2 on ten real heads")
     with tempfile.TemporaryDirectory() as folder:
         shapes = s4a.read_shapes(files_of("heads", folder, given))
@@ -358,23 +358,27 @@ def table_2(given=None, first=tuple(FIRST)):
     for what, options in (FIRST[name] for name in first):
         found = compare.collection(shapes, **options)
         seconds, chamfer = found["collection_seconds"], found["collection_chamfer"].mean("shape")
-        for way in found["way"].values:
-            for how in found["how"].values:
-                spent = seconds.sel(way=way, how=how).drop_sel(block="load and clean").values
+        for way in found["algorithm"].values:
+            for how in found["dense_match"].values:
+                spent = (
+                    seconds.sel(algorithm=way, dense_match=how)
+                    .drop_sel(block="load and clean")
+                    .values
+                )
                 cells = [f"{s:.1f}" for s in (*spent, spent.sum())]
-                gap = f"{100 * chamfer.sel(way=way, how=how).item():.4f}"
-                shape = found["median_shape"].sel(way=way).item()
+                gap = f"{100 * chamfer.sel(algorithm=way, dense_match=how).item():.4f}"
+                shape = found["median_shape"].sel(algorithm=way).item()
                 all_rows.append([way, what, how, gap, *cells, shape])
-            distance = found["distance_to_median"].sel(way=way).values
+            distance = found["distance_to_limit"].sel(algorithm=way).values
             distances.append([way, what, *(f"{d:.4f}" for d in distance)])
         say(f"\nfirst maps: {what}")
         verdict_2(found)
     blocks = [block for block in found["block"].values if block != "load and clean"]
     say("")
-    head = ["", "first maps", "way up", "Chamfer to the template", *blocks, "all", "median shape"]
+    head = ["", "initial maps", "way up", "Chamfer to the template", *blocks, "all", "median shape"]
     markdown(all_rows, head)
     say("\nDistance to the limit shape (eq. 5):\n")
-    markdown(distances, ["", "first maps", *found["shape"].values])
+    markdown(distances, ["", "initial maps", *found["shape"].values])
 
 
 def verdict_2(found):
@@ -384,13 +388,13 @@ def verdict_2(found):
     claims = {
         "both methods have the same median shape": len(set(found["median_shape"].values)) == 1,
         "ours takes less time than the standard way": bool(
-            (seconds.sel(how="ours") < seconds.sel(how="standard")).all()
+            (seconds.sel(dense_match="latent") < seconds.sel(dense_match="fmap")).all()
         ),
         "ours has the smaller Chamfer distance": bool(
-            (chamfer.sel(how="ours") < chamfer.sel(how="standard")).all()
+            (chamfer.sel(dense_match="latent") < chamfer.sel(dense_match="fmap")).all()
         ),
         "RE-MATCH takes less time than SCALABLE": bool(
-            (seconds.sel(way="RE-MATCH") < seconds.sel(way="SCALABLE")).all()
+            (seconds.sel(algorithm="RE-MATCH") < seconds.sel(algorithm="SCALABLE")).all()
         ),
     }
     for claim, holds in claims.items():
@@ -404,7 +408,7 @@ if __name__ == "__main__":
     known = [*PARTS, *SETS, "brains"]
     parser.add_argument("parts", nargs="*", metavar="PART", help=", ".join(known))
     parser.add_argument("--data", type=Path, help="a folder of meshes for each set")
-    parser.add_argument("--init", choices=INITS, help="first maps of registered and more")
+    parser.add_argument("--init", choices=INITS, help="initial maps of registered and more")
     parser.add_argument("--first", nargs="+", choices=FIRST, default=[*FIRST], help="of collection")
     parser.add_argument("--methods", nargs="+", default=compare.METHODS, help="of Table 1")
     parser.add_argument("--pairs", type=int, help="of more, and of heads: 5 by default")

@@ -7,9 +7,9 @@ correlation of confidence and error, and the share of the worst tenth that is am
 tenth (0.1 by chance); and in bins of confidence, the share that is right.  Bodies, and cats, share
 their connectivity; nothing here looks at that.
 
-``confidence.py failures`` registers random pairs of bodies without the search for first maps, of
+``confidence.py failures`` registers random pairs of bodies without the search for initial maps, of
 which many end with limbs exchanged, and says how well these are told by their mean confidence, by
-the way there and back, and by badness and distortion, which a study looks at, too.
+the way there and back, and by registration_error and distortion, which a study looks at, too.
 """
 
 import subprocess
@@ -29,11 +29,11 @@ from sklearn.metrics import roc_auc_score
 
 import s4a
 from s4a import synthetic
-from s4a.method import first_map
+from s4a.method import initial_map
 from s4a.method.register import RIGHT, WEIGHTS, evidence
 from s4a.options import Options
-from s4a.study.doubts import UNSURE, WRONG
 from s4a.study.pair import match_shapes, shape_of
+from s4a.study.quality_control import UNSURE, WRONG
 
 TUNED = {
     "faces": [(0, 1)],
@@ -53,7 +53,7 @@ SIGNS = {  # of a registration; what is high is a sign of failure
     "mean confidence": lambda found: -found["confidence"].values.mean(),
     "there and back": lambda found: found["round_trip"].values.mean(),
     "distortion": lambda found: abs(found["distortion"].values).mean(),
-    "badness": lambda found: found.attrs["score"],
+    "registration_error": lambda found: found.attrs["score"],
 }
 
 
@@ -152,7 +152,7 @@ def report(names, results):
 def failures(folder):
     """Whether a registration that failed is told from those that are right, and by what."""
     errors, signs = [], {name: [] for name in SIGNS}
-    with mock.patch.multiple(first_map, SEARCHED=(), N_PAIRED=0):
+    with mock.patch.multiple(initial_map, SEARCHED=(), N_PAIRED=0):
         for seed in FAILING:
             chosen = {"faces": [], "brains": [], "cats": [], "faust": [seed, 30]}
             for pair in pairs_of(folder, chosen):
@@ -162,7 +162,7 @@ def failures(folder):
                     signs[name].append(float(sign(found)))
     errors = np.array(errors)
     signs = {name: np.array(values) for name, values in signs.items()}
-    signs["badness x distortion"] = signs["badness"] * signs["distortion"]
+    signs["registration_error x distortion"] = signs["registration_error"] * signs["distortion"]
     signs["there and back x distortion"] = signs["there and back"] * signs["distortion"]
     failed, right = errors > plausibility.FAILED, errors < plausibility.RIGHT
     sys.stdout.write(
@@ -175,8 +175,8 @@ def failures(folder):
         limit = np.quantile(sign[right], 0.95)
         caught = (sign[failed] > limit).mean()
         sys.stdout.write(f"{name:28} {area:16.3f} {caught:14.2f}, beyond {abs(limit):.4f}\n")
-    for what, limit in (("doubtful", WRONG), ("a warning", UNSURE)):
-        told = signs["badness x distortion"] > limit
+    for what, limit in (("flagged", WRONG), ("a warning", UNSURE)):
+        told = signs["registration_error x distortion"] > limit
         sys.stdout.write(
             f"{what}, beyond {limit}: {told[failed].sum()} of {failed.sum()} failed, "
             f"{told[right].sum()} of {right.sum()} right\n"

@@ -3,7 +3,7 @@
     python benchmarks/deform.py [VERTICES ...] [--modes 10]
 
 at 30,000 and 100,000 vertices if none are given, in Chromium with a software renderer.  A step of a
-slider moves all modes: *script* sums them, makes the exact normals anew (those of ``surface.js``)
+slider moves all modes: *script* sums them, makes the exact normals again (those of ``surface.js``)
 and uploads both; *shader* reads displacement and first-order change of the normal, two texels a
 mode, *place alone* only the displacement, which leaves the normals wrong.  A turn draws what is
 there once more: the shader adds up the modes for it again.  Milliseconds, the least and the median

@@ -24,11 +24,11 @@ LACKING = "not yet"  # in the place of a figure that was not measured
 
 
 # additions that are another value of an option than its default, and rows of their own
-OTHER = {"joint": "refine"}
+OTHER = {"spectral_icp": "refine"}
 MORE = {  # what the table also says of a value
-    "lift": "; `RE-MATCH lifted` of `s4a.compare`: True",
-    "sharpen": "; `RE-MATCH lifted` of `s4a.compare`: 2",
-    "n_spread": ", all",
+    "lift": "; `RE-MATCH refined` of `s4a.compare`: True",
+    "full_resolution_iterations": "; `RE-MATCH refined` of `s4a.compare`: 2",
+    "n_samples": ", all",
     "n_projected": ", all",
 }
 
@@ -49,7 +49,7 @@ READINGS = [
         "4.2",
         "two ways to full resolution, *standard* and *ours*",
         "*ours*, eq. 7",
-        '`how="standard"`: eq. 3 and 4',
+        '`dense_match="fmap"`: eq. 3 and 4',
         ("how=standard",),
     ),
     Reading(
@@ -63,8 +63,8 @@ READINGS = [
         "4.2",
         "Consistent ZoomOut without a step of ZoomOut ahead is unsatisfactory",
         "a step ahead",
-        '`ahead="never"`',
-        ("ahead=never",),
+        '`initial_refinement="never"`',
+        ("initial_refinement=never",),
     ),
     Reading(
         "eq. 3",
@@ -112,7 +112,7 @@ READINGS = [
         "a map is optimised with landmarks; the code is based on pyFM",
         "heat kernels around the landmarks kept at 8 times, and $C$ commutes with the Laplacians",
         "pyFM's fit: wave kernels of the shapes and around the landmarks (no option)",
-        ("first maps of pyFM",),
+        ("initial maps of pyFM",),
     ),
 ]
 
@@ -231,12 +231,12 @@ Each alone, on top of the paper (errors: matched, surface):
 
 {additions}
 
-Elastic rounds beside joint ones on other sets: [what was measured](decisions.md).
-`parts` and `wide` are shown with what they need: elastic rounds, and 1,000 spread vertices. Where
-poses are far apart elastic rounds need `parts`: without, bodies end farther from the truth than by
-the paper alone. Of shapes of 10,000 vertices the 25,000 of `n_projected` would be all; it is
-measured with 2,500, as 25,000 are of 100,000.
-`ahead`, `sharpen` and `both` concern pairs that are matched on their own.
+Elastic iterations and spectral non-rigid ICP on other sets: [measurements](decisions.md).
+`articulated` and `dense_iterations` are shown with the options that they need: elastic iterations
+and 1,000 samples. Where poses differ a lot, elastic iterations need `articulated`: without it,
+bodies have larger errors than with the paper alone. `n_projected` is measured with 2,500 of 10,000
+vertices, the same share as 25,000 of 100,000.
+`initial_refinement`, `full_resolution_iterations` and `bidirectional` concern single pairs.
 
 ## Pairs that are matched on their own (4.1, 6.2)
 
@@ -282,15 +282,15 @@ PAIRS = {
     "pairs: paper": "the paper",
     "pairs: paper, refine": "and `refine`",
     "pairs: paper, init": "and `init`",
-    "pairs: paper, ahead": "and `ahead`",
-    "pairs: paper, sharpen": "and `sharpen`",
-    "pairs: paper, both": "and `both`",
+    "pairs: paper, ahead": "and `initial_refinement`",
+    "pairs: paper, full_resolution_iterations": "and `full_resolution_iterations`",
+    "pairs: paper, both": "and `bidirectional`",
     "pairs: default": "all of them, the default",
     "pairs: default without refine": "without `refine`",
     "pairs: default without init": "without `init`",
-    "pairs: default without ahead": "without `ahead`",
-    "pairs: default without sharpen": "without `sharpen`",
-    "pairs: default without both": "without `both`",
+    "pairs: default without ahead": "without `initial_refinement`",
+    "pairs: default without full_resolution_iterations": "without `full_resolution_iterations`",
+    "pairs: default without both": "without `bidirectional`",
 }
 
 
@@ -413,9 +413,9 @@ def page(found):
     rows |= {
         "default": "all of them, the default",
         "default without init": "the default without `init`",
-        "default without parts": "the default without `parts`",
-        "default, joint": 'the default with `refine="joint"`',
-        "default, lift": "the default and `lift`",
+        "default without parts": "the default without `articulated`",
+        "default, joint": 'the default with `refine="spectral_icp"`',
+        "default, lift": "the default and `refined_eigenfunctions`",
     }
     read = {"paper": "the paper as read here"}
     for number, reading in enumerate(READINGS, 1):

@@ -4,7 +4,7 @@
 vertices.  Error is how often something is found at 0.05 where nothing is: groups at any vertex
 after the correction for all, and by the whole field; field against shape by the correlation of the
 first pair (r-PLS), its covariance, and RV.  Power is the share of the vertices of a sixth of the
-area where groups differ that are found, and how often the others find what is planted, in every
+area where groups differ that are found, and how often the others find what is simulated, in every
 fifth run.
 """
 
@@ -60,7 +60,7 @@ def draw(
         field += FOLLOWS * score[:, None] * X[:, 0]
     names = [f"shape_{i:02d}" for i in range(n)]
     mesh = as_dataset(X, T, {"template": names[0]}).merge(dataset(displacement=d))
-    nodes = {"registration": mesh, "fields/thickness": dataset(carried_field=field)}
+    nodes = {"registration": mesh, "fields/thickness": dataset(transferred_field=field)}
     nodes = {path: node.assign_coords(shape=names) for path, node in nodes.items()}
     return xr.DataTree.from_dict(nodes), group, Z
 

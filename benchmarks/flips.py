@@ -35,7 +35,7 @@ from s4a import analyse, cli, open_study, synthetic
 from s4a.show import draw, page, pictures
 
 N_SHAPES, N_VERTICES = 6, 400
-OPTIONS = {"n_coarse": 150, "k_init": 8, "k": 12, "intersections": False, "keep_doubtful": True}
+OPTIONS = {"n_coarse": 150, "k_init": 8, "k": 12, "intersections": False, "include_flagged": True}
 LIMIT, END = 60, 600  # seconds of CPU of a command, and of the clock
 MEMORY = 4 * 2**30  # bytes that it may ask for more than it has
 NAMED, SAME, WRONG = "named error", "same result", "wrong"

@@ -1,10 +1,10 @@
 """How often a registered brain lies on a fold beside the right one.
 
 ``folds.py SEED ...``: all ordered pairs of five synthetic brains of each seed, 20,000 vertices, as
-they are matched alone by default, and without the rounds that begin less stiff where the template
-is torn.  ``folds.py --studies SEED ...``: the same in studies of sixteen brains of 2,500 vertices,
-600 of low resolution and 50 functions, where folds are as wide as a few edges.  Errors are mean
-distances of the registered template's vertices from the truth, % of sqrt(area).
+they are matched alone by default, and without the iterations that begin less stiff where the
+template is torn.  ``folds.py --studies SEED ...``: the same in studies of sixteen brains of 2,500
+vertices, 600 of low resolution and 50 functions, where folds are as wide as a few edges.  Errors
+are mean distances of the registered template's vertices from the truth, % of sqrt(area).
 """
 
 import sys

@@ -4,7 +4,7 @@
 intercepts as large as the residuals, seen two to four times.  Error is how often a change is found
 at 0.05 where there is none: at any vertex after the correction for all, and of the whole shape; by
 visits permuted within subjects, and by changed signs of whole subjects.  Power is the share of four
-planted vertices that are found, and how often the whole shape is, in every fifth run.
+simulated vertices that are found, and how often the whole shape is, in every fifth run.
 
 ``growth.py statsmodels`` needs that package: the largest difference of slopes, ratios of variances
 and residual variances from its MixedLM, and the time of both.

@@ -32,15 +32,15 @@ import psutil
 from s4a import cli, synthetic
 from s4a.study import netcdf
 
-SMALL = "--no-intersections --keep-doubtful --n-coarse 100 --k-init 8 --k 12".split()
+SMALL = "--no-intersections --include-flagged --n-coarse 100 --k-init 8 --k 12".split()
 STAGES = {  # the first file of each, the last stage first
     "modes, report": "pca.nc",
     "registration": "registration.nc",
     "Consistent ZoomOut": "network.nc",
-    "first maps": "network/first_*.nc",
-    "align": "network/motion_*.nc",
+    "initial maps": "network/initial_*.nc",
+    "align": "network/alignment_*.nc",
     "remesh": "coarse/*.nc",
-    "compare": "network/look_*.nc",
+    "compare": "network/comparison_*.nc",
     "read and clean": "original/*.nc",
     "start": "",
 }

@@ -1,11 +1,11 @@
 """Error and power of the tests of groups and variables (6.1), simulated.
 
 ``python benchmarks/nulls.py [RUNS [WORD]]``: fields of random vectors at 40 vertices and six
-scores, with nothing to find or with a planted effect; rows whose name holds WORD.  Error is how
+scores, with nothing to find or with a simulated effect; rows whose name holds WORD.  Error is how
 often something is found where nothing is: at the vertices a p value of at most 0.05 after the
-correction for all, or one of the whole shape.  Power is the share of four planted vertices that are
-found, and how often the whole shape is, in every fifth run.  Without WORD the tests at vertices are
-set beside a t test of each with the correction of Bonferroni, too.
+correction for all, or one of the whole shape.  Power is the share of four simulated vertices that
+are found, and how often the whole shape is, in every fifth run.  Without WORD the tests at vertices
+are set beside a t test of each with the correction of Bonferroni, too.
 """
 
 import sys

@@ -2,10 +2,10 @@
 
 ``peers.py [faces brains skulls cortex] [--tuned|--more] [--ours] [--kept]``, --ours without the
 others.
-All begin at one rigid motion, of ICP.  Distance to the truth, its mean, 90th and 99th percentile:
-faces and brains in % of sqrt(area), skulls in mm at 51 landmarks; cortex the share of vertices with
-the right label.  MeshMonk and rustcpd (Coherent Point Drift) run with three settings, the non-rigid
-ICP of Amberg et al. in trimesh with its own and with more steps; all are shown.
+All begin at one rigid transform, of ICP.  Distance to the truth, its mean, 90th and 99th
+percentile: faces and brains in % of sqrt(area), skulls in mm at 51 landmarks; cortex the share of
+vertices with the right label.  MeshMonk and rustcpd (Coherent Point Drift) run with three settings,
+the non-rigid ICP of Amberg et al. in trimesh with its own and with more steps; all are shown.
 
 Faces are registered, vertex i is vertex i; the shape is remeshed so that its vertices say nothing
 of these.  Isotropic remeshing alone keeps some: how many is said above each pair, and ``--kept``
@@ -14,12 +14,12 @@ shows what that is worth to whom.
 Each method runs in a process of its own, which is ended at 900 s of CPU or 16 GiB; then the row
 says so.
 
-The pairs that elastic rounds were tuned on are shown with ``--tuned`` and left out otherwise; of
-cortex templates there is one pair, which was tuned on.  ``--more`` shows pairs that stand in
-neither, among them every other one of the five skulls, without joint rounds and without trimesh,
-which takes 16 to 19 minutes a skull; at the end the mean of each method over the pairs of a set,
-and on how many it is nearer than S4A.  All but brains need the shared data beside the checkout; the
-others come with the extra ``bench``.
+The pairs that elastic iterations were tuned on are shown with ``--tuned`` and left out otherwise;
+of cortex templates there is one pair, which was tuned on.  ``--more`` shows pairs that stand in
+neither, among them every other one of the five skulls, without joint iterations and without
+trimesh, which takes 16 to 19 minutes a skull; at the end the mean of each method over the pairs of
+a set, and on how many it is nearer than S4A.  All but brains need the shared data beside the
+checkout; the others come with the extra ``bench``.
 """
 
 import contextlib
@@ -251,10 +251,10 @@ def amberg(template, shape, start, stiffness=None):
     return np.asarray(nricp_amberg(moved, onto, steps=steps))
 
 
-OURS = "S4A, elastic rounds (default)"
+OURS = "S4A, elastic iterations (default)"
 METHODS = {
     OURS: (ours, "elastic"),
-    "S4A, joint rounds": (ours, "joint"),
+    "S4A, joint iterations": (ours, "joint"),
     "ICP, nearest point": (nearest,),
     "MeshMonk, 80 iterations": (meshmonk, 80),
     "MeshMonk, 80, sqrt(area) 200": (meshmonk, 80, 200.0),
@@ -268,7 +268,7 @@ METHODS = {
 
 
 def begin(template, shape):
-    """The template's vertices after the rigid motion of ICP onto the shape."""
+    """The template's vertices after the rigid transform of ICP onto the shape."""
     clouds = []
     for mesh in (template, shape):
         X, T = as_arrays(mesh)

@@ -1,15 +1,15 @@
-"""What is told of an odd shape, and what cannot be: oddities planted in collections, one at a time.
+"""Which unusual shapes are flagged: oddities simulated in collections, one at a time.
 
 Synthetic brains, and real collections where the shared data are beside the checkout; the first
 four, on which the thresholds were chosen, and others. ``plausibility.py [COLLECTION ...]``.
 
 ``plausibility.py registrations [COLLECTION ...]`` registers shapes of known correspondence, one
-template to the others of its collection, once as by default and once from first maps of 10
+template to the others of its collection, once as by default and once from initial maps of 10
 landmarks, which fail in far poses; and counts of which failed registrations a run would tell.
 
-``plausibility.py planted [COLLECTION ...]`` begins one registration at a time at a wrong motion,
-the others of the collection as by default.  Which of them failed the truth alone says: one that
-finds its way is a right one.
+``plausibility.py simulated [COLLECTION ...]`` begins one registration at a time at a wrong
+transform, the others of the collection as by default.  Which of them failed the truth alone says:
+one that finds its way is a right one.
 """
 
 import subprocess
@@ -28,7 +28,7 @@ from s4a.geometry.mesh import as_arrays, as_dataset, triangle_areas, vertex_area
 from s4a.input import plausibility
 from s4a.options import Options
 from s4a.study import pair
-from s4a.study.doubts import doubtful
+from s4a.study.quality_control import flagged
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 CHOSEN_ON = ("brains", "cats", "faces", "bodies 0-9")
@@ -43,8 +43,8 @@ FILES = {  # collection: folder, those of its sorted files
     "vertebrae": ("vertebrae", slice(None)),
     "skulls": ("skulls", slice(None)),
 }
-KINDS = ("brains", "cats", "femurs", "vertebrae")  # planted in the others
-BASES = 1  # shapes of each collection that every oddity is planted in
+KINDS = ("brains", "cats", "femurs", "vertebrae")  # simulated in the others
+BASES = 1  # shapes of each collection that every oddity is simulated in
 PAIRS = {  # folder, the files of a collection, and the places of its templates among these
     "bodies 0-9": ("faust", list(range(10)), (0,)),
     "bodies 0 and 10-19": ("faust", [0, *range(10, 20)], (0,)),
@@ -53,7 +53,7 @@ PAIRS = {  # folder, the files of a collection, and the places of its templates 
     "remeshed bodies": ("faust15k", list(range(10)), (0, 5)),
     "children": ("kids", list(range(6)), (0, 3)),
 }
-PAIRS_CHOSEN_ON = tuple(PAIRS)[:3]  # as are the thresholds of s4a.study.doubts
+PAIRS_CHOSEN_ON = tuple(PAIRS)[:3]  # as are the thresholds of s4a.study.quality_control
 CORRESPONDING = {"faust15k": 6890}  # of these only the first vertices correspond
 WAYS: dict[str, dict] = {"as by default": {}, "10 landmarks": {"init": "landmarks"}}
 PLANTED_IN = {  # as PAIRS
@@ -130,7 +130,7 @@ def saved_again(X, T, seed=0):
 
 
 def oddities(X, T, others):
-    """What is planted: (row of the table, the shape in place of the one that was there)."""
+    """What is simulated: (row of the table, the shape in place of the one that was there)."""
     size = np.ptp(X, axis=0).max()
     yield "mirrored", mirrored(X, T)
     yield "turned by 180 degrees", (X * [1, -1, -1], T)
@@ -157,27 +157,27 @@ class Collection:
         self.pairs = {}
         self.seconds = 0.0
         self.shapes = shapes
-        self.portraits = {name: self.portray(mesh) for name, mesh in shapes.items()}
+        self.descriptors = {name: self.describe(mesh) for name, mesh in shapes.items()}
 
-    def portray(self, mesh):
+    def describe(self, mesh):
         mesh = s4a.clean(as_dataset(*mesh))
         start = time.process_time()
-        portrait = plausibility.portray(mesh, intersections=False)
+        descriptor = plausibility.describe(mesh, intersections=False)
         self.seconds += time.process_time() - start
-        return portrait
+        return descriptor
 
-    def compare(self, name, portraits, references):
-        """:func:`plausibility.compare`, with each pair of portraits compared once."""
+    def compare(self, name, descriptors, references):
+        """:func:`plausibility.compare`, with each pair of descriptors compared once."""
         seen = []
         for other in references:
-            a, b = portraits[name], portraits[other]
+            a, b = descriptors[name], descriptors[other]
             if (id(a), id(b)) not in self.pairs:
                 start = time.process_time()
                 found = plausibility.compare("" if a is not b else other, a, {other: b})
                 self.seconds += time.process_time() - start
                 self.pairs[id(a), id(b)] = found, a, b  # held, so that their ids stay theirs
             seen.append(self.pairs[id(a), id(b)][0].assign_coords(reference=[other]))
-        both = ["fit", "fit_mirrored", "hand"]
+        both = ["fit", "fit_mirrored", "chirality"]
         return (
             seen[0]
             .drop_dims("reference")
@@ -186,16 +186,16 @@ class Collection:
             .assign_attrs(seen[0].attrs)
         )
 
-    def told(self, **planted):
-        """Name -> kinds of doubts, those that make it doubtful with an exclamation mark."""
-        portraits = self.portraits | {name: self.portray(m) for name, m in planted.items()}
-        attrs = {name: {"area": one.attrs["surface"]} for name, one in portraits.items()}
-        references = plausibility.pick_references(portraits)
-        seen = {name: self.compare(name, portraits, references) for name in portraits}
-        doubts, _ = plausibility.find_warnings(attrs, seen)
+    def told(self, **simulated):
+        """Name -> kinds of flags, those that make it flagged with an exclamation mark."""
+        descriptors = self.descriptors | {name: self.describe(m) for name, m in simulated.items()}
+        attrs = {name: {"area": one.attrs["surface"]} for name, one in descriptors.items()}
+        references = plausibility.pick_references(descriptors)
+        seen = {name: self.compare(name, descriptors, references) for name in descriptors}
+        flags, _ = plausibility.find_warnings(attrs, seen)
         return {
-            name: {one.kind + "!" * one.doubtful for one in found}
-            for name, found in doubts.items()
+            name: {one.kind + "!" * one.flagged for one in found}
+            for name, found in flags.items()
             if found
         }
 
@@ -223,14 +223,14 @@ def rows_of(name, shapes, others):
         ("half scaled by 10", lambda *m: scaled(*m, 10)),
     ):
         told = whole.told(**{one: change(*shapes[one]) for one in half})
-        planted = [told.get(one, set()) for one in half]
+        simulated = [told.get(one, set()) for one in half]
         others_told = [told.get(one, set()) for one in names if one not in half]
         # which half is the odd one, nobody knows where both are as many
-        found[row] = max(planted, others_told, key=lambda side: sum(map(bool, side)))
+        found[row] = max(simulated, others_told, key=lambda side: sum(map(bool, side)))
     for row, kinds in found.items():
-        doubtful = sum(any(kind.endswith("!") for kind in one) for one in kinds)
-        rows[row] = f"{sum(map(bool, kinds))}/{len(kinds)}" + f" ({doubtful})" * (doubtful > 0)
-    rows["others told beside a planted one"] = str(false)
+        flagged = sum(any(kind.endswith("!") for kind in one) for one in kinds)
+        rows[row] = f"{sum(map(bool, kinds))}/{len(kinds)}" + f" ({flagged})" * (flagged > 0)
+    rows["others told beside a simulated one"] = str(false)
     sys.stdout.write(f"{name}: clean {clean}\n")
     for row, kinds in found.items():
         sys.stdout.write(f"    {row}: {[sorted(one) for one in kinds]}\n")
@@ -260,27 +260,32 @@ def error_of(template, shape, match, known):
 
 
 def registered(name, folder, at, way):
-    """Of every other shape of a collection: error, badness, mean |distortion|, what is told."""
+    """For each other shape: error, registration error, mean |distortion| and the flags."""
     part, numbers, _ = PAIRS[name]
     files = sorted((folder / part).glob("*.ply"))
     shapes = {files[i].stem: s4a.read_shape(files[i]) for i in numbers}
     template = shapes.pop(files[numbers[at]].stem)
-    study = s4a.register_pairs(template, shapes, both=False, n_coarse=3000, n_jobs=1, **WAYS[way])
+    study = s4a.register_pairs(
+        template, shapes, bidirectional=False, n_coarse=3000, n_jobs=1, **WAYS[way]
+    )
     found = study["registration"].to_dataset().load()
-    badness = dict(zip(shapes, found["badness"].sel(shape=list(shapes)).values, strict=True))
+    registration_error = dict(
+        zip(shapes, found["registration_error"].sel(shape=list(shapes)).values, strict=True)
+    )
     size = abs(found["distortion"].sel(shape=list(shapes))).mean("vertex").values
     distortion = dict(zip(shapes, size.tolist(), strict=True))
-    of_shapes, of_all = doubtful(badness, distortion)
+    of_shapes, of_all = flagged(registration_error, distortion)
     for other, mesh in shapes.items():
         known = CORRESPONDING.get(part, mesh.sizes["file_vertex_index"])
         match = found["registered_match"].sel(shape=other).values
-        told = "doubtful" if of_all or any(one.doubtful for one in of_shapes.get(other, [])) else ""
+        told = "flagged" if of_all or any(one.flagged for one in of_shapes.get(other, [])) else ""
         told = told or ("warning" if other in of_shapes else "")
         error = error_of(template, mesh, match, known)
         sys.stdout.write(
             f"    {name}, {way}, {files[numbers[at]].stem} -> {other}: error {error:.2f} %, "
-            f"badness {badness[other]:.4f}, times |distortion| "
-            f"{badness[other] * distortion[other]:.5f}: {told or '-'}{' (all)' if of_all else ''}\n"
+            f"registration_error {registration_error[other]:.4f}, times |distortion| "
+            f"{registration_error[other] * distortion[other]:.5f}: "
+            f"{told or '-'}{' (all)' if of_all else ''}\n"
         )
         sys.stdout.flush()
         yield error, told
@@ -301,9 +306,9 @@ def registrations(names):
     tuned = [one for (name, _), of in table.items() if name in PAIRS_CHOSEN_ON for one in of]
     others = [one for (name, _), of in table.items() if name not in PAIRS_CHOSEN_ON for one in of]
     table["all on which thresholds were chosen", ""], table["all others", ""] = tuned, others
-    head = ["collection", "first maps", "pairs", f"failed, over {FAILED:.0f} %"]
-    head += ["of these doubtful", "only warned of", f"right, under {RIGHT:.0f} %"]
-    head += ["of these doubtful", "only warned of", "between, told"]
+    head = ["collection", "initial maps", "pairs", f"failed, over {FAILED:.0f} %"]
+    head += ["of these flagged", "only warned of", f"right, under {RIGHT:.0f} %"]
+    head += ["of these flagged", "only warned of", "between, told"]
     sys.stdout.write(f"\n| {' | '.join(head)} |\n{'|---' * len(head)}|\n")
     for (name, way), of in table.items():
         failed = [told for error, told in of if error > FAILED]
@@ -311,48 +316,48 @@ def registrations(names):
         between = [told for error, told in of if RIGHT <= error <= FAILED]
         cells = [name, way, len(of)]
         for group in (failed, right):
-            cells += [len(group), group.count("doubtful"), group.count("warning")]
+            cells += [len(group), group.count("flagged"), group.count("warning")]
         cells.append(f"{sum(map(bool, between))}/{len(between)}")
         sys.stdout.write(f"| {' | '.join(map(str, cells))} |\n")
 
 
 def turned(signs):
-    """In place of :func:`s4a.method.first_map.motion_onto`: its motion, then a wrong one."""
-    usual = pair.motion_onto
+    """Replace :func:`s4a.method.initial_map.transform_onto`: first as usual, then wrong."""
+    usual = pair.transform_onto
 
-    def motion(source, target):
+    def transform(source, target):
         R, t = usual(source, target)
         center = target.area @ target.X / target.area.sum()
         axis = np.linalg.eigh(np.cov(target.X.T, aweights=target.area))[1]
         wrong = axis * signs @ axis.T
         return wrong @ R, wrong @ (t - center) + center
 
-    return motion
+    return transform
 
 
 def judged(name, at, meshes, shapes):
-    """Of every registration of a collection, by default and planted: way, error and what is told.
+    """Of every registration of a collection, by default and simulated: way, error and what is told.
 
-    What is planted is seen beside the registrations of the others as by default.
+    What is simulated is seen beside the registrations of the others as by default.
     """
     part = PLANTED_IN[name][0]
     template, *others = [list(shapes)[at], *(n for i, n in enumerate(shapes) if i != at)]
-    error, badness, distortion = {}, {}, {}
+    error, registration_error, distortion = {}, {}, {}
     for way in ("as by default", *TURNS):
-        # a first map of landmarks, as the dense one is mended by a search
+        # an initial map of landmarks, as the dense one is mended by a search
         more = {"init": "landmarks"} if way in TURNS else {}
-        options = Options(both=False, n_coarse=3000, **more)
+        options = Options(bidirectional=False, n_coarse=3000, **more)
         for other in others:
-            usual = pair.motion_onto
+            usual = pair.transform_onto
             try:
-                pair.motion_onto = turned(TURNS[way]) if way in TURNS else usual
+                pair.transform_onto = turned(TURNS[way]) if way in TURNS else usual
                 found, _ = pair.match_shapes(shapes[other], shapes[template], options)
             finally:
-                pair.motion_onto = usual
+                pair.transform_onto = usual
             known = CORRESPONDING.get(part, meshes[other].sizes["file_vertex_index"])
             match = found["registered_match"].values
             error[way, other] = error_of(meshes[template], meshes[other], match, known)
-            badness[way, other] = float(found.attrs["score"])
+            registration_error[way, other] = float(found.attrs["score"])
             distortion[way, other] = float(abs(found["distortion"]).mean())
             beside = {n: (way if n == other else "as by default", n) for n in others}
             if way == "as by default":
@@ -361,36 +366,36 @@ def judged(name, at, meshes, shapes):
                 way,
                 other,
                 error[way, other],
-                told_of(other, beside, badness, distortion),
+                told_of(other, beside, registration_error, distortion),
                 (
-                    badness[way, other],
+                    registration_error[way, other],
                     distortion[way, other],
                 ),
             )
         if way == "as by default":
             beside = {n: (way, n) for n in others}
             for other in others:
-                told = told_of(other, beside, badness, distortion)
+                told = told_of(other, beside, registration_error, distortion)
                 yield (
                     way,
                     other,
                     error[way, other],
                     told,
                     (
-                        badness[way, other],
+                        registration_error[way, other],
                         distortion[way, other],
                     ),
                 )
 
 
-def told_of(name, rows, badness, distortion):
+def told_of(name, rows, registration_error, distortion):
     """What a run would tell of a shape, where these are its registrations."""
-    of_shapes, of_all = doubtful(
-        {n: badness[row] for n, row in rows.items()},
+    of_shapes, of_all = flagged(
+        {n: registration_error[row] for n, row in rows.items()},
         {n: distortion[row] for n, row in rows.items()},
     )
-    if of_all or any(one.doubtful for one in of_shapes.get(name, [])):
-        return "doubtful"
+    if of_all or any(one.flagged for one in of_shapes.get(name, [])):
+        return "flagged"
     return "warning" if name in of_shapes else ""
 
 
@@ -402,14 +407,14 @@ def share(some, of):
     return f"{some}/{of} = {some / of:.3f} ({low:.3f} to {high:.3f})"
 
 
-def planted(names):
+def simulated(names):
     """Of how many registrations that were begun wrongly and failed a run would tell."""
     table = {}
     with tempfile.TemporaryDirectory() as folder:
         parts = sorted({PLANTED_IN[name][0] for name in names})
         command = [sys.executable, DATA / "unpack.py", folder, *parts]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-        options = Options(both=False, n_coarse=3000)
+        options = Options(bidirectional=False, n_coarse=3000)
         for name in names:
             part, numbers, places = PLANTED_IN[name]
             files = sorted((Path(folder) / part).glob("*.ply"))
@@ -419,8 +424,8 @@ def planted(names):
                 for way, other, error, told, (score, size) in judged(name, at, meshes, shapes):
                     table.setdefault((name, way), []).append((error, told))
                     sys.stdout.write(
-                        f"    {name}, {at}, {way}, {other}: error {error:.2f} %, badness "
-                        f"{score:.4f}, |distortion| {size:.4f}: {told or '-'}\n"
+                        f"    {name}, {at}, {way}, {other}: error {error:.2f} %, "
+                        f"registration_error {score:.4f}, |distortion| {size:.4f}: {told or '-'}\n"
                     )
                     sys.stdout.flush()
     head = "| collection | begun | failed | told | right | told in vain | between |"
@@ -475,7 +480,7 @@ def main(names):
 if __name__ == "__main__":
     if sys.argv[1:2] == ["registrations"]:
         registrations(sys.argv[2:] or list(PAIRS))
-    elif sys.argv[1:2] == ["planted"]:
-        planted(sys.argv[2:] or list(PLANTED_IN))
+    elif sys.argv[1:2] == ["simulated"]:
+        simulated(sys.argv[2:] or list(PLANTED_IN))
     else:
         main(sys.argv[1:])

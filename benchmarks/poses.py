@@ -3,8 +3,8 @@
 ``poses.py [--seed S] [--pairs N] [--three] [--landmarks N] [--field] [--network]``: random ordered
 pairs of twenty registered bodies of the shared data (two persons in ten poses), 4,000 vertices at
 low resolution, with the mean error of each pair in % of sqrt(area); ``--three`` without the search
-for more first maps, ``--landmarks`` with as many of the user's: the vertices of the first body that
-are farthest from each other, its head, hands and feet first; ``--field`` with a field of the
+for more initial maps, ``--landmarks`` with as many of the user's: the vertices of the first body
+that are farthest from each other, its head, hands and feet first; ``--field`` with a field of the
 user's, how far to the side of the first body each vertex lies; ``--network`` after an analysis of
 all twenty, through whose latent bases any pair is registered (:func:`s4a.register_shape`).  The
 search was tuned on the pairs of seed 7; those of seed 8 are only reported.  Registered bodies share
@@ -26,7 +26,7 @@ from plausibility import error_of
 
 import s4a
 from s4a.geometry.align import farthest_points
-from s4a.method import first_map
+from s4a.method import initial_map
 from s4a.options import Options
 from s4a.schema import dataset
 from s4a.study.pair import match_shapes, shape_of
@@ -50,8 +50,8 @@ def main():
         files = sorted((Path(folder) / "faust").glob("*.ply"))
         rng = np.random.default_rng(args.seed)
         pairs = [rng.choice(len(files), 2, replace=False).tolist() for _ in range(args.pairs)]
-        searched = ((), 0) if args.three else (first_map.SEARCHED, first_map.N_PAIRED)
-        with mock.patch.multiple(first_map, SEARCHED=searched[0], N_PAIRED=searched[1]):
+        searched = ((), 0) if args.three else (initial_map.SEARCHED, initial_map.N_PAIRED)
+        with mock.patch.multiple(initial_map, SEARCHED=searched[0], N_PAIRED=searched[1]):
             if args.network:
                 report_network(files, pairs)
             else:
@@ -85,7 +85,7 @@ def report(files, pairs, n_landmarks, field):
         errors.append(error_of(target.original, source.original, match, len(match)))
         sys.stdout.write(
             f"{files[i].stem} -> {files[j].stem}: {errors[-1]:.2f} %, {spent:.1f} CPU s, "
-            f"first map {found.attrs['first_map']}, badness {found.attrs['score']:.4f}\n"
+            f"initial map {found.attrs['initial_map']}, score {found.attrs['score']:.4f}\n"
         )
         sys.stdout.flush()
     summary(errors)
@@ -107,7 +107,7 @@ def report_network(files, pairs):
         errors.append(error_of(target, source, match, len(match)))
         sys.stdout.write(
             f"{files[i].stem} -> {files[j].stem}: {errors[-1]:.2f} %, {spent:.1f} CPU s, "
-            f"badness {found.attrs['score']:.4f}\n"
+            f"registration_error {found.attrs['score']:.4f}\n"
         )
         sys.stdout.flush()
     summary(errors)

@@ -84,21 +84,21 @@ def start():
 
 
 def left_out(*sizes):
-    """Leave-one-out: the components of all shapes but one from those of all, and each anew."""
-    say(f"\n{'shapes':>8} {'CPU s':>8} {'anew':>8} {'largest difference of the errors':>36}")
+    """Leave-one-out: the components of all shapes but one from those of all, and each again."""
+    say(f"\n{'shapes':>8} {'CPU s':>8} {'again':>8} {'largest difference of the errors':>36}")
     for s in sizes or (100, 200, 400):
         x = np.random.default_rng(0).normal(size=(s, 2000)) * np.linspace(1, 0.01, 2000)
         K = x @ x.T
         begin = time.process_time()
         error, _ = model.leave_one_out(K)
         between = time.process_time()
-        anew = []
+        again = []
         for i in range(s):
             others = np.delete(np.arange(s), i)
             rows = K[np.ix_(others, others)], K[i, others], K[i, i]
-            anew.append(model.describe_by_others(*rows)[0])
+            again.append(model.describe_by_others(*rows)[0])
         spent = between - begin, time.process_time() - between
-        gap = np.abs(error - anew).max() / error.max()
+        gap = np.abs(error - again).max() / error.max()
         say(f"{s:8} {spent[0]:8.2f} {spent[1]:8.2f} {gap:36.1e}")
 
 
@@ -156,8 +156,8 @@ def spent_on(n):
 
     Run.stage = timed
     with tempfile.TemporaryDirectory() as folder:
-        # of meshes as coarse as these some registrations are doubtful
-        options = {"n_coarse": 150, "k_init": 8, "k": 12, "keep_doubtful": True}
+        # of meshes as coarse as these some registrations are flagged
+        options = {"n_coarse": 150, "k_init": 8, "k": 12, "include_flagged": True}
         s4a.analyse(synthetic.brains(n, 500), store=folder, n_jobs=1, n_pairs=4 * n, **options)
         begin = time.process_time()
         study = s4a.open_study(folder)

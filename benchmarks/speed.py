@@ -35,7 +35,7 @@ from s4a.geometry.crossing import count_crossing
 from s4a.geometry.mesh import as_arrays, triangle_areas
 from s4a.input.files import find_meshes
 from s4a.method import fmap, latent
-from s4a.method.first_map import map_after_motion
+from s4a.method.initial_map import map_after_alignment
 from s4a.method.nearest import nearest_in_cells, nearest_rows
 from s4a.method.pca import gram_pca
 from s4a.method.register import match_functions
@@ -117,8 +117,8 @@ def our_spectrum(coarse):
     return s4a.spectrum(coarse, k=K)
 
 
-def our_first_map(a, b, motion):
-    return map_after_motion(a, b, motion, k_init=K_INIT).C
+def our_first_map(a, b, transform):
+    return map_after_alignment(a, b, transform, k_init=K_INIT).C
 
 
 def our_zoomout(C, a, b):
@@ -126,7 +126,7 @@ def our_zoomout(C, a, b):
 
 
 def our_network(C, source, target, shapes):
-    samples = [basis.spread_vertices() for basis in shapes]
+    samples = [basis.sample_vertices_of() for basis in shapes]
     return latent.consistent_zoomout(shapes, C, source, target, K, samples=samples)[3]
 
 
@@ -353,7 +353,7 @@ def stages(folder):
     landmark = farthest_points(a.X @ R.T + t, 10)
     near = nearest_rows(a.X[landmark] @ R.T + t, b.X)
     C, _ = beside(
-        f"first map, k = {K_INIT}",
+        f"initial map, k = {K_INIT}",
         ("s4a: dense, one round more", our_first_map, a, b, (R, t)),
         ("pyFM fit, WKS + 10 landmarks", other_first_map, *few, np.c_[landmark, near]),
     )
@@ -398,7 +398,7 @@ def network_table():
     low = [shape.low for shape in shapes]
     source, target = np.array(list(itertools.permutations(range(NETWORK), 2))).T
     first = [
-        map_after_motion(
+        map_after_alignment(
             low[i],
             low[j],
             align(low[i].X, low[i].area, low[j].X, low[j].area)[:2],
@@ -560,12 +560,12 @@ def growth(folder):
 def seconds_of_pairs(coarse, n_pairs, options):
     """CPU seconds of the stages that look at pairs, on low-resolution meshes that are there."""
     begin = time.process_time()
-    first = s4a.build_network(coarse, n_pairs=n_pairs, **options.of("first maps"))
+    first = s4a.build_network(coarse, n_pairs=n_pairs, **options.of("initial maps"))
     between = time.process_time()
-    names = ("weights", "n_spread", "wide")
+    names = ("weights", "n_samples", "dense_iterations")
     s4a.refine_network(coarse, first, k=K, **{name: getattr(options, name) for name in names})
     return {
-        "alignment and first maps": between - begin,
+        "alignment and initial maps": between - begin,
         "Consistent ZoomOut and median": time.process_time() - between,
     }
 
@@ -611,7 +611,7 @@ def one_numbering(study):
     return image
 
 
-def planted(study, truth):
+def simulated(study, truth):
     """The true image of the template's vertices on a synthetic brain."""
 
     def image(shape, template):
@@ -649,7 +649,7 @@ def methods(folder, *sets, n=10):
             _, cpu, _, memory = measured(analysed, paths, out, method, preset)
             disk = sum(path.stat().st_size for path in out.rglob("*.nc")) / 2**20
             with s4a.open_study(out) as study:
-                image = {"faces": one_numbering(study), "brains": planted(study, truth)}.get(name)
+                image = {"faces": one_numbering(study), "brains": simulated(study, truth)}.get(name)
                 widths = zip(study_errors(study, image), (8, 9, 9, 7), strict=True)
                 errors = [f"{error:>{width}}" for error, width in widths]
                 ratio = study["pca"]["explained_variance_ratio"].values[:3].sum()
@@ -672,7 +672,9 @@ def study_errors(study, image):
     far = ["", ""]
     if image is not None:
         error = accuracy.accuracy(study, image)["error"].mean("shape")
-        far = [f"{100 * error.sel(way=way):.3f}" for way in (accuracy.MATCH, accuracy.SURFACE)]
+        far = [
+            f"{100 * error.sel(algorithm=way):.3f}" for way in (accuracy.MATCH, accuracy.SURFACE)
+        ]
     trip = data["round_trip"].values.mean(1).sum() / (data.sizes["shape"] - 1)
     return [*far, f"{100 * np.mean(chamfer):.4f}", f"{100 * trip:.3f}"]
 
@@ -697,8 +699,8 @@ def certificates(folder, n_checked=1000):
             continue
         meshes = [s4a.read_shape(file) for file in files]
         M, N = (Shape(mesh, s4a.spectrum(s4a.coarsen(mesh), k=K)) for mesh in meshes)
-        motion = align(M.low.X, M.low.area, N.low.X, N.low.area)[:2]
-        C = map_after_motion(M.low, N.low, motion, k_init=K_INIT).C
+        transform = align(M.low.X, M.low.area, N.low.X, N.low.area)[:2]
+        C = map_after_alignment(M.low, N.low, transform, k_init=K_INIT).C
         C = fmap.zoomout(M.low, N.low, C, min(K, M.low.k, N.low.k))[0]
         F = M.low.Phi[:, : C.shape[1]] @ C.T, N.low.Phi[:, : C.shape[0]]
         begin = time.process_time()

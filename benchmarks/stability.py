@@ -58,7 +58,7 @@ def report(meshes, refine, folder):
     """The table."""
     names = list(meshes)
     sizes = {n: np.sqrt(vertex_areas(*as_arrays(mesh)).sum()) for n, mesh in meshes.items()}
-    options = {"template": names[0], "refine": refine, "keep_doubtful": True, "n_jobs": 2}
+    options = {"template": names[0], "refine": refine, "include_flagged": True, "n_jobs": 2}
     fewer = {name: meshes[name] for name in names[:-1]}
     usual = surfaces(s4a.analyse(meshes, **options))
     with s4a.analyse(fewer, store=folder, **options) as study:

@@ -1,4 +1,4 @@
-"""Several structures (6.1): planted poses and shapes found again, error and power of their tests.
+"""Several structures (6.1): simulated poses and shapes found again, error and power of their tests.
 
 ``python benchmarks/structures.py [RUNS]``: two beans of 120 vertices, 60 mm of scan, whose
 points correspond.  First the shares of variance between (poses) and within (shapes) where poses,
@@ -70,8 +70,8 @@ def levels(each: list[Poses]) -> list[np.ndarray]:
 
 
 def shares(runs: int) -> None:
-    """The table of planted variation."""
-    head = ["planted", "variance, mm²", "between, %", "within, %", "runs differ by, %"]
+    """The table of simulated variation."""
+    head = ["simulated", "variance, mm²", "between, %", "within, %", "runs differ by, %"]
     sys.stdout.write(f"| {' | '.join(head)} |\n|{' --- |' * len(head)}\n")
     for name, (pose, shape) in PLANTED.items():
         found = []
@@ -112,8 +112,8 @@ def registered() -> None:
     """Shares of a study beside those of the truth."""
     from scipy.interpolate import RBFInterpolator
 
-    logging.disable(logging.WARNING)  # so few and small shapes look doubtful now and then
-    head = ["planted", "between, %", "of the truth, %", "variance, mm²", "of the truth, mm²"]
+    logging.disable(logging.WARNING)  # so few and small shapes look flagged now and then
+    head = ["simulated", "between, %", "of the truth, %", "variance, mm²", "of the truth, mm²"]
     sys.stdout.write(f"| {' | '.join(head)} |\n|{' --- |' * len(head)}\n")
     for name, (pose, shape) in PLANTED.items():
         made = subjects(8, 600, pose=pose, shape=shape)

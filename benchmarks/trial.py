@@ -138,7 +138,7 @@ def differing(one, other):
     found = []
     for stage in STAGES:
         a, b = (study[stage].to_dataset().drop_attrs(deep=False) for study in (one, other))
-        b = b.drop_vars(["score_apart", "shape_apart"], errors="ignore")
+        b = b.drop_vars(["score_excluded", "shape_excluded"], errors="ignore")
         if stage == "registration":
             b = b.sel(shape=[name for name in names if name in b["shape"].values])
         if not a.identical(b):
@@ -167,7 +167,7 @@ def main(folder):
     study = open_study(folder / "study")
     report = study["report"].to_dataset()
     status = dict(zip(report["shape"].values.tolist(), report["status"].values, strict=True))
-    for kind in ("ok", "repaired", "doubtful", "excluded"):
+    for kind in ("ok", "repaired", "flagged", "excluded"):
         say(f"{kind}: {', '.join(name for name in bad if status.get(name) == kind) or 'none'}")
     spoilt = [name for name in good if status[name] != "ok"]
     say(f"good ones that are not ok: {', '.join(spoilt) or 'none'}")

@@ -61,7 +61,7 @@ def reduce(whole, small):
     """Write the study in the folder `whole`, reduced, into the folder `small`."""
     for path in sorted(Path(whole).rglob("*.nc")):
         name = path.relative_to(whole)
-        if name.parent.name != "network":  # first maps and motions, on the way to what is shown
+        if name.parent.name != "network":  # initial maps and transforms are not shown
             data = netcdf.read(path)
             key, made_from = data.attrs["task_key"], data.attrs["made_from"].split()
             store.write(reduced(data), Path(small) / name, key, made_from, compression=4)

@@ -1,4 +1,4 @@
-"""The pictures of README and pages, drawn anew: ``make figures``, or ``figures.py NAME ...``.
+"""The pictures of README and pages, drawn again: ``make figures``, or ``figures.py NAME ...``.
 
 The figures of the paper are drawn from the bundled collection, twelve synthetic brains of 40,000
 vertices, analysed with all defaults as ``s4a demo`` does; the two panels and the scene are those of
@@ -40,7 +40,7 @@ from s4a.show.draw import (
     with_balls,
 )
 from s4a.show.pictures import mode_pictures
-from s4a.show.surfaces import carried_colors, mesh_of, mode_arrays, network_places, surface
+from s4a.show.surfaces import mesh_of, mode_arrays, network_places, surface, transferred_colors
 
 HERE = Path(__file__).parent
 LOCAL_FOLDER = HERE / "_build"
@@ -120,7 +120,7 @@ def pipeline(study):
     shown = [template, *[name for name in names if name != template][:3]]
     X, T = mesh_of(study["registration"].dataset)
     colors = position_colors(X)
-    matched = [(X, T, colors), *[carried_colors(study, name, colors) for name in shown[1:]]]
+    matched = [(X, T, colors), *[transferred_colors(study, name, colors) for name in shown[1:]]]
     remeshed = [near(*surface(study, template, stage)) for stage in ("original", "coarse")]
     remeshed = [*[seen(*surface(study, template, s)) for s in ("original", "coarse")], *remeshed]
     drawn = mode_pictures(study, (-3, 3), 2, size=(240, 205), **LOOK)
@@ -153,7 +153,7 @@ def pipeline(study):
 
 
 def swapped(vertices=6000, n_coarse=1500, stretch=1.2):
-    """Figure 2: a first map, and eigenfunctions that change places."""
+    """Figure 2: an initial map, and eigenfunctions that change places."""
     brains = s4a.synthetic.brains(2, vertices)
     source, target = (brains[f"original/brain_0{i}"].to_dataset() for i in (1, 2))
     high = target.assign(position=target["position"] * [1, 1, stretch])
@@ -194,10 +194,11 @@ def seconds(vertices=PAIR):
     brains = s4a.synthetic.brains(2, vertices, seed=0)
     source, target = (brains[f"original/brain_0{i}"].to_dataset() for i in (1, 2))
     found = s4a.compare.pairs(source, {"brain_02": target})["block_seconds"].isel(pair=0)
-    found = found.drop_sel(way="registered surface")  # the same run as "registered"
+    found = found.drop_sel(algorithm="registered surface")  # the same run as "registered"
     blocks = [str(name) for name in found["block"].values]
     return write(
-        charts.stacked([str(w) for w in found["way"].values], blocks, found.values), "figure_3"
+        charts.stacked([str(w) for w in found["algorithm"].values], blocks, found.values),
+        "figure_3",
     )
 
 

@@ -1,8 +1,8 @@
-"""The options of an analysis (4, 5.1), each declared once, and all that follows from that.
+"""Options of an analysis (4, 5.1), each declared once.
 
-A field of :class:`Options` says what an option may be, what the presets set, and what it does.  The
-checks, the presets, the flags of the command line, what ``/report`` keeps, the docstring and the
-table of the page on differences are made from it.  To add an option, add a field.
+A field of :class:`Options` declares type, range, default, preset values and help of an option.  The
+validation, the presets, the command-line flags, the attributes of ``/report``, the docstring and
+the table of differences from the paper are derived from it.  To add an option, add a field.
 """
 
 import difflib
@@ -21,15 +21,15 @@ from typing import TYPE_CHECKING, Any, Self, get_args
 if TYPE_CHECKING:  # imported when they are first needed, so that a command starts at once
     import xarray as xr
 
-N_COARSE = 6000  # vertices of a low-resolution mesh, where no preset says another number
-N_SPREAD = 1000  # spread vertices of a shape on which Consistent ZoomOut looks for matches
-N_CENTRAL = 25_000  # vertices by which a field on a shape is projected
-PER_FUNCTION = 2  # samples, at least: the least squares of fewer are poor, or have no one solution
-FEATURE = re.compile(r"[A-Za-z0-9_-]{1,100}")  # as a file can be named
-# switches that method="scalable" does not have, and what each would need
+N_COARSE = 6000  # vertices of a low-resolution mesh, unless a preset sets it
+N_SAMPLES = 1000  # farthest-point samples at which Consistent ZoomOut searches
+N_CENTRAL = 25_000  # vertices used to project a field onto the eigenfunctions
+PER_FUNCTION = 2  # least number of samples per function, for a stable least-squares fit
+FEATURE = re.compile(r"[A-Za-z0-9_-]{1,100}")  # valid in file names
+# options that method="scalable" does not support, and why
 WITHOUT_MESH = {
-    "lift": "lifts the eigenfunctions of one",
-    "wrap": "makes one of a wrapped surface, on which its functions do not live",
+    "refined_eigenfunctions": "refines its eigenfunctions",
+    "wrap": "remeshes another surface, on which the local functions are not defined",
 }
 
 
@@ -51,40 +51,40 @@ def option(
     given_as: Callable[[Any], Any] | None = None,
     pair: bool = False,
 ) -> Any:
-    """An option: a field whose metadata are all that is known of it.
+    """Declare an option as a dataclass field with metadata.
 
     Parameters
     ----------
     default : object
-        What it is where neither the caller nor the preset says.
+        Default value, unless a preset sets another.
     help : str
-        What it does, in a few words: of the flag, and the first of the docstring.
+        Short description, for the flag and as first sentence of the docstring.
     group : str
-        Of options, among which the command line shows it.
+        Group under which the command line shows it.
     more : str
-        What else is to be known: of the docstring, and of the page on differences.
+        Further sentences for the docstring and the page on differences.
     choices : tuple of str
-        What a text may be.
+        Valid strings.
     least : int
-        The smallest that a number may be.
+        Smallest valid number.
     check : callable, optional
-        In place of what type, `choices` and `least` say: gives the value as it is kept.
+        Validates and converts the value, in place of `choices` and `least`.
     paper, fast : object, optional
-        What these presets set.
+        Values in these presets.
     section, instead, see : str
-        Where the paper has it, what stands there, and the module that has it here.
+        Section of the paper, what the paper does there, and the module of S4A.
     of : str
-        The step whose functions take it as a keyword, see :meth:`Options.of`.
+        Step whose functions take the option as a keyword, see :meth:`Options.of`.
     given_as : callable, optional
-        From its value to that of the keyword, where they differ.
+        Converts the value of the option to that of the keyword.
     pair : bool
-        Whether pairs that are matched on their own have it.
+        Whether the option also applies to single pairs.
     """
-    told = {name: value for name, value in locals().items() if name not in ("paper", "fast")}
-    told["presets"] = {
+    meta = {name: value for name, value in locals().items() if name not in ("paper", "fast")}
+    meta["presets"] = {
         name: value for name, value in (("paper", paper), ("fast", fast)) if value is not MISSING
     }
-    return field(default=None if told["presets"] else default, metadata=told)
+    return field(default=None if meta["presets"] else default, metadata=meta)
 
 
 # of each group
@@ -96,7 +96,7 @@ computing = partial(option, group="computing")
 
 
 def check_components(components: Any) -> str | int:
-    """`components`; ValueError unless it is "largest", "all" or a number from 1."""
+    """Return `components`; raise ValueError unless "largest", "all" or a positive number."""
     if (
         not isinstance(components, bool)
         and isinstance(components, Integral)
@@ -111,12 +111,12 @@ def check_components(components: Any) -> str | int:
 
 
 def check_label(label: Any) -> int | str | None:
-    """A label as options keep it: a number, several as ``"1,2"``, ``"all"``, or None.
+    """Return a label in normal form: a number, several as ``"1,2"``, ``"all"``, or None.
 
     Raises
     ------
     ValueError
-        When it is none of these, or scikit-image is not installed.
+        If the label is invalid, or scikit-image is not installed.
 
     Examples
     --------
@@ -150,12 +150,12 @@ def check_label(label: Any) -> int | str | None:
 
 
 def check(name: str, value: Any) -> Any:
-    """The value of an option as it is kept.
+    """Return a validated value of an option in normal form.
 
     Raises
     ------
     ValueError
-        When the option cannot be that; what it can be is named.
+        If the value is invalid; the message names the valid ones.
 
     Examples
     --------
@@ -192,20 +192,20 @@ def check(name: str, value: Any) -> Any:
 def apply_preset(
     preset: str | None, given: Mapping[str, Any], presets: Mapping[str | None, dict[str, Any]]
 ) -> dict[str, Any]:
-    """The options that presets set: that of None those that the chosen one does not.
+    """Return the options that presets set, with `given` values other than None unchanged.
 
-    An option that is `given`, and not as None, stays as it is.
+    Options that the chosen preset does not set come from the default preset, ``None``.
 
     Raises
     ------
     ValueError
-        When the chosen preset sets an option that is given otherwise, or is none.
+        If the preset is unknown, or contradicts a given value.
 
     Examples
     --------
     >>> from s4a.options import PRESETS, apply_preset
-    >>> apply_preset("paper", {"sharpen": None}, PRESETS)["sharpen"]
-    0
+    >>> apply_preset("paper", {"wrap": None}, PRESETS)["area_weighted"]
+    False
     """
     if preset not in presets:
         choices = ", ".join(map(repr, presets))
@@ -216,7 +216,7 @@ def apply_preset(
         if preset and name in presets[preset] and own is not None and own != value:
             raise ValueError(
                 f"preset {preset!r} sets {name}={value!r}; found {name}={own!r}: "
-                "leave out one of both"
+                "leave out one of the two"
             )
         settings[name] = value if own is None else own
     return settings
@@ -224,7 +224,7 @@ def apply_preset(
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """The options of :func:`s4a.analyse`, with those that the preset sets.
+    """Options of :func:`s4a.analyse`, completed by those of the preset.
 
     Parameters
     ----------
@@ -233,7 +233,7 @@ class Options:
     Raises
     ------
     ValueError
-        When one is outside its range, or contradicts the preset; the range is named.
+        If a value is invalid or contradicts the preset; the message names the valid ones.
 
     Examples
     --------
@@ -241,145 +241,157 @@ class Options:
     >>> options = s4a.Options(preset="paper", k=50)
     >>> options.refine, options.k, options.k_init
     ('intrinsic', 50, 20)
-    >>> s4a.Options(preset="paper", refine="joint")
+    >>> s4a.Options(preset="fast", n_samples=0)
     Traceback (most recent call last):
-    ValueError: preset 'paper' sets refine='intrinsic'; found refine='joint': leave out one of both
+    ValueError: preset 'fast' sets n_samples=500; found n_samples=0: leave out one of the two
     """
 
     # fmt: off
     preset: str | None = computing(None,
-        "'paper' leaves out all that is added to the paper; 'fast' halves the time",
+        "'paper' switches off everything that S4A adds to the paper; 'fast' halves the time",
         choices=("paper", "fast"), pair=True,
-        more="The errors of 'fast' are a tenth larger (``benchmarks/cheaper.py``).  Another "
-        "value of what a preset sets is refused; to add one thing to the paper, give "
-        '``s4a.options.PRESETS["paper"]`` with that changed')
-    seed: int = computing(0, "seed of all randomness", of="low resolution", pair=True,
+        more="Errors of 'fast' are about a tenth larger (``benchmarks/cheaper.py``).  A value that "
+        "contradicts the preset is refused; to add one thing to the paper, pass "
+        '``s4a.options.PRESETS["paper"]`` with that entry changed')
+    seed: int = computing(0, "seed of all random numbers", of="low resolution", pair=True,
         more="Or ``rng``, see :mod:`s4a.seeds`")
-    pattern: str | None = reading(None, "only files whose name fits, for example '*brain*'")
+    pattern: str | None = reading(None, "read only files whose name matches, such as '*brain*'")
     components: str | int = reading("largest",
-        "'largest', 'all' or how many pieces of each mesh to keep", check=check_components,
-        of="cleaning")
+        "connected components to keep of each mesh: 'largest', 'all' or a number",
+        check=check_components, of="cleaning")
     strict: bool = reading(False,
-        "exclude shapes with vertices that are not finite instead of repairing them", of="cleaning")
-    close_holes: bool = reading(False, "close every hole by a fan of triangles", of="cleaning")
+        "exclude shapes with non-finite vertices instead of repairing them", of="cleaning")
+    close_holes: bool = reading(False, "close each hole with a fan of triangles", of="cleaning")
     label: int | str | None = reading(None,
-        "the files are label volumes (NIfTI, MGH): the surface of this label, or several: 1,2",
+        "the files are label volumes (NIfTI, MGH): extract the surface of this label, or of "
+        "several (1,2)",
         check=check_label, of="cleaning", more='Or of ``"all"``, see :func:`s4a.read_labels`')
     reflect: str | list[str] | None = reading(None,
-        "shapes to mirror: their names, with commas; COLUMN=VALUE of the table; or auto",
-        more="x becomes -x in the coordinates of their files, and triangles are turned over, so "
-        "that left and right ones are of one hand.  A column may also have 1 and 0; ``auto`` "
-        "are those of the rarer hand by ICP of pairs, as they are and mirrored "
-        "(:func:`s4a.input.hands.of_other_hand`).  ``/report`` says of each whether it was")
+        "shapes to mirror: names separated by commas, COLUMN=VALUE of the table, or 'auto'",
+        more="Mirroring maps x to -x in the coordinates of the file and reverses the triangles, so "
+        "that left and right shapes get the same chirality.  A column may also hold 1 and 0.  "
+        "``auto`` mirrors the shapes of the rarer chirality, found by pairwise ICP of the shapes "
+        "and of their mirror images (:func:`s4a.input.chirality.mirrored_shapes`).  ``/report`` "
+        "says for each shape whether it was mirrored")
     table: Path | str | None = reading(None,
-        "CSV with a column 'shape', covariates and groups, for the statistics",
-        more="See :func:`s4a.input.subjects.read_table`; they become ``/subjects``.  Nothing "
-        "else depends on it.  Without one, a table given to an earlier run stays")
+        "CSV file with a column 'shape', covariates and groups for the statistics",
+        more="See :func:`s4a.input.subjects.read_table`; the columns become ``/subjects``.  "
+        "Nothing else depends on them.  Without a table, that of an earlier run is kept")
     landmarks: Path | str | None = reading(None,
-        "folder of landmark files named as the shapes, which guide registration",
-        more="3D Slicer (.mrk.json), CSV or MeshLab (.pp), for some or all shapes.  Those of "
-        "one name guide and pull registration, see :func:`s4a.with_landmarks`, which gives them "
-        "to meshes in memory")
+        "folder of landmark files, named as the shapes, that guide registration",
+        more="3D Slicer (.mrk.json), CSV or MeshLab (.pp), for all shapes or some.  Landmarks of "
+        "the same name attract each other, see :func:`s4a.with_landmarks` for meshes in memory")
     features: str | list[str] | None = reading(None,
-        "fields that guide registration, with commas: sulc is a.sulc.npy beside a.ply",
-        more="Or a.sulc, or a property of PLY (:func:`s4a.input.annotations.files_beside`); see "
-        ":func:`s4a.with_features`, which gives them to meshes in memory")
+        "scalar fields that guide registration, separated by commas: sulc is a.sulc.npy next to "
+        "a.ply",
+        more="Or a.sulc, or a PLY property (:func:`s4a.input.annotations.files_beside`); see "
+        ":func:`s4a.with_features` for meshes in memory")
     method: str = network("rematch",
-        "low resolution by remeshing, or by the local functions of SCALABLE",
+        "low resolution by remeshing (ReMatching) or by the local functions of SCALABLE",
         choices=("rematch", "scalable"), section="4.1", see="method/scalable", of="low resolution",
         pair=True,
-        more="The study has the same nodes and variables but for U, and all that takes one "
-        "takes it; what is called a coarse mesh are then samples, joined where their cells "
-        "meet.  ``lift`` and ``wrap`` need a coarse mesh and are refused")
-    n_coarse: int = network(N_COARSE, "vertices of the low-resolution meshes", least=100,
-        fast=3000, section="4.1", of="low resolution", pair=True, more="Or samples of SCALABLE")
-    wrap: bool = network(False, "wrap the shapes watertight before they are remeshed",
+        more="The study has the same nodes and variables except U.  With SCALABLE the coarse "
+        "vertices are samples, joined by an edge where their cells meet.  "
+        "``refined_eigenfunctions`` and ``wrap`` need a coarse mesh and are refused")
+    n_coarse: int = network(N_COARSE, "number of vertices of the low-resolution meshes", least=100,
+        fast=3000, section="4.1", of="low resolution", pair=True,
+        more="Or of samples with SCALABLE.  The meshes can have a few percent fewer or more "
+        "vertices")
+    wrap: bool = network(False, "wrap the shapes in a watertight surface before remeshing",
         of="low resolution")
-    lift: bool = network(False,
-        "eigenfunctions of the original meshes, nearly, instead of U Phi", paper=False,
-        section="eq. 4, 7, 8", instead="$U \\phi$", see="method/lift", of="low resolution",
-        pair=True,
-        more="By inverse iteration, in eq. 4, 7 and the smoothing of eq. 8.  They are kept in "
-        "``/coarse``: 40 MB for 100,000 vertices")
-    k_init: int = network(20, "size of the first functional maps", least=4, section="5.1",
+    refined_eigenfunctions: bool = network(False,
+        "approximate eigenfunctions of the original meshes instead of U Phi", paper=False,
+        section="eq. 4, 7, 8", instead="$U \\phi$", see="method/refined_eigenfunctions",
+        of="low resolution", pair=True,
+        more="Computed by one step of inverse iteration and used in eq. 4, 7 and the smoothing of "
+        "eq. 8.  They are stored in ``/coarse``: 40 MB for 100,000 vertices")
+    k_init: int = network(20, "size of the initial functional maps", least=4, section="5.1",
         pair=True)
     k: int = network(100, "size of the refined functional maps", least=4, section="5.1",
         of="low resolution", pair=True)
-    n_pairs: int = network(500, "pairs of the network, each with maps both ways", least=1,
-        section="5.1", more="All pairs where there are fewer")
+    n_pairs: int = network(500, "number of pairs in the network, each with maps in both directions",
+        least=1, section="5.1", more="All pairs if there are fewer")
     init: str = network("dense",
-        "first maps from all nearest neighbours, or the paper's fit on 10 landmarks",
+        "initial maps from all nearest neighbours, or from 10 landmarks as in the paper",
         choices=("dense", "landmarks"), paper="landmarks", section="4.1, steps 3 and 4",
-        instead="first map fitted on 10 landmarks", see="method/first_map", of="first maps",
+        instead="initial map fitted to 10 landmarks", see="method/initial_map", of="initial maps",
         pair=True,
-        more="The former after ICP; in far poses the best of several maps, see "
-        ":func:`s4a.match_pair`")
-    ahead: str = network("always",
-        "a step of ZoomOut without growth for all first maps, for those of the network alone, "
-        "or none", choices=("always", "network", "never"), paper="network", section="4.2",
-        instead="a step of ZoomOut ahead of Consistent ZoomOut", see="method/first_map",
-        of="first maps", given_as="never".__ne__, pair=True,
-        more="All are also those of a pair that is matched on its own (4.1)")
-    step: int = network(5, "growth of the maps per round of Consistent ZoomOut", least=1,
+        more="Nearest neighbours are those after ICP.  Where poses differ a lot, the best of "
+        "several initial maps is taken, see :func:`s4a.match_pair`")
+    initial_refinement: str = network("always",
+        "refine initial maps by one ZoomOut iteration: those of the network and of single pairs "
+        "(always), of the network only, or never",
+        choices=("always", "network", "never"), paper="network", section="4.2",
+        instead="one ZoomOut iteration before Consistent ZoomOut", see="method/initial_map",
+        of="initial maps", given_as="never".__ne__, pair=True,
+        more="The iteration keeps the size of the map.  Single pairs are matched as in 4.1")
+    step: int = network(5, "growth of the maps in each iteration of Consistent ZoomOut", least=1,
         section="4.2", pair=True)
-    n_latent: int | None = network(None, "dimension of the latent space; k by default", least=2,
+    n_latent: int | None = network(None, "dimension of the latent space; by default k", least=2,
         section="eq. 3")
-    weights: str = network("cycles", "of the maps: by how far their cycles close, or 1",
+    weights: str = network("cycles", "weights of the maps: from their cycle errors, or all 1",
         choices=("cycles", "equal"), section="eq. 3", see="method/network")
-    n_spread: int = network(N_SPREAD,
-        "vertices at which the network looks for matches; 0 for all", paper=0, fast=500,
-        section="eq. 3", instead="for all vertices in every round", see="method/latent",
-        of="first maps",
-        more="In the step ahead of near poses, too, which saves time; 2 k at least")
-    wide: int = network(4, "its last rounds in which these look between the samples, too",
+    n_samples: int = network(N_SAMPLES,
+        "farthest-point samples at which the network searches matches; 0 means all vertices",
+        paper=0, fast=500, section="eq. 3", instead="for all vertices in every iteration",
+        see="method/latent", of="initial maps",
+        more="Also used by the initial refinement where pose differences are small.  At least 2 k")
+    dense_iterations: int = network(4,
+        "number of final iterations that also search between the samples",
         paper=0, fast=0, section="eq. 3", see="method/latent")
     norm: str = network("h2", "norm that decides which shape is the median",
         choices=("h2", "h1", "frobenius", "h2_image", "h2_both"), section="eq. 5",
         more="See :func:`s4a.method.median.distance_to_identity`")
-    keep_rounds: bool = network(False,
-        "keep the maps and latent bases of every round of Consistent ZoomOut",
-        more="They are ``/rounds``")
+    keep_iterations: bool = network(False,
+        "store the maps and latent bases of every iteration of Consistent ZoomOut",
+        more="They are in ``/iterations``")
     template: str | None = registration(None,
-        "name of the shape to register to; the median shape by default")
-    how: str = registration("ours", "full resolution by eq. 7, or by eq. 3 and 4",
-        choices=("ours", "standard"), section="4.2",
-        more='Unless ``refine="intrinsic"`` that match is one candidate among others')
+        "name of the shape to register to; by default the median shape")
+    dense_match: str = registration("latent",
+        "full-resolution match by the latent bases (eq. 7) or by functional maps (eq. 3 and 4)",
+        choices=("latent", "fmap"), section="4.2",
+        more='Unless ``refine="intrinsic"``, this match is one of several initialisations')
     refine: str = registration("elastic",
-        "elastic rounds, joint ones, or the paper's spectral match alone",
-        choices=("elastic", "joint", "intrinsic"), paper="intrinsic", section="eq. 7, 4",
+        "elastic iterations, iterated spectral non-rigid ICP, or the match of the paper alone",
+        choices=("elastic", "spectral_icp", "intrinsic"), paper="intrinsic", section="eq. 7, 4",
         instead="the match as it is", see="method/elastic", of="registration", pair=True,
-        more="A price on bending and distances across the surface; in far poses joint rounds "
-        "before (:mod:`s4a.method.joint`).  Joint alone: the best of several ends")
-    parts: bool = registration(True, "in far poses joint rounds turn every part on its own",
+        more="Elastic iterations penalise bending and stretch; where poses differ a lot, spectral "
+        "non-rigid ICP comes first (:mod:`s4a.method.spectral_icp`).  Spectral non-rigid ICP alone "
+        "keeps the best of several results")
+    articulated: bool = registration(True,
+        "where poses differ a lot, spectral non-rigid ICP rotates each part on its own",
         paper=False, section="eq. 8", see="method/deform", of="registration", pair=True)
-    sharpen: int = registration(1,
-        "rounds of ZoomOut of a single pair that look among all vertices of the source", paper=0,
-        section="eq. 4", instead="after ZoomOut on coarse vertices", see="method/register",
+    full_resolution_iterations: int = registration(1,
+        "ZoomOut iterations of a single pair that search all vertices of the source",
+        paper=0, section="eq. 4", instead="after ZoomOut on coarse vertices", see="method/register",
         pair=True, more="External meshes of a transfer are single pairs, too")
-    both: bool = registration(True, "match single pairs both ways and transfer along both",
+    bidirectional: bool = registration(True,
+        "match single pairs in both directions and average the transfer over both",
         paper=False, section="6.2", instead="a template registered to a shape",
-        see="analysis/transfer", pair=True, more="The mean of both, see :func:`s4a.register_pairs`")
+        see="analysis/transfer", pair=True, more="See :func:`s4a.register_pairs`")
     alignment: str = registration("fitted",
-        "displacements after the motion that fits the registered surface best, or after that of "
-        "ICP", choices=("fitted", "icp"), paper="icp", section="eq. 8",
+        "rigid alignment before displacements are computed: fitted to the registered surface, or "
+        "by ICP",
+        choices=("fitted", "icp"), paper="icp", section="eq. 8",
         instead="after ICP (4.1, step 2)", see="method/deform", of="registration", pair=True)
     area_weighted: bool = registration(True,
-        "weigh vertices by area in the projection of displacements", paper=False,
+        "weight vertices by area when displacements are projected onto U Phi", paper=False,
         section="after eq. 8", instead="$(U \\phi)^\\dagger$ as printed", see="method/deform",
         of="projection", pair=True)
     n_projected: int = registration(N_CENTRAL,
-        "vertices, near coarse ones, by which that projection is computed; 0 for all", paper=0,
+        "vertices, near coarse ones, used for that projection; 0 means all", paper=0,
         section="after eq. 8", instead="on all vertices", see="method/shape", of="projection",
         pair=True)
-    scale: bool = registration(False, "take size out of the displacements", of="registration")
-    intersections: bool = quality(True, "count triangles that pass through others")
-    doubtful: str = quality("apart",
-        "what becomes of doubtful shapes: they stay apart, or the run stops",
-        choices=("apart", "stop"),
-        more="Such are shapes mirrored or of another unit.  Apart they are placed beside the "
-        "network of all others and registered, so that nothing changes for these.  A run stops "
-        "before the long stages")
-    keep_doubtful: bool = quality(False, "take doubtful shapes into modes and statistics")
+    remove_size: bool = registration(False, "remove size from the displacements",
+        of="registration")
+    intersections: bool = quality(True, "count triangles that intersect others")
+    quality_control: str = quality("exclude",
+        "flagged shapes are excluded from the network, or the run stops",
+        choices=("exclude", "stop"),
+        more="Mirrored shapes and shapes in another unit are examples.  An excluded shape is "
+        "mapped to the network of the others and registered, so that it does not change their "
+        "results.  With 'stop' the run ends before the long stages")
+    include_flagged: bool = quality(False, "include flagged shapes in the modes and statistics")
     # fmt: on
 
     def __post_init__(self):
@@ -391,55 +403,52 @@ class Options:
             raise ValueError(f"k must be at least k_init = {self.k_init}; found {self.k}")
         if self.n_latent is not None and self.n_latent > self.k:
             raise ValueError(f"n_latent must be at most k = {self.k}; found {self.n_latent}")
-        # pairs, of any k, take no notice of a default
-        if self.n_spread != (PRESETS[None] | PRESETS[self.preset])["n_spread"]:
-            self.check_spread()
+        # single pairs, which may have a larger k, ignore the default
+        if self.n_samples != (PRESETS[None] | PRESETS[self.preset])["n_samples"]:
+            self.check_n_samples()
         wrong = [name for name in self.feature_names if not FEATURE.fullmatch(name)]
         if wrong:
             raise ValueError(f"features need names of letters, digits, _ and -, found {wrong[0]!r}")
         self._check_together()
 
     def _check_together(self):
-        """ValueError where an option leaves another without a meaning."""
+        """Raise ValueError if two options exclude each other."""
         without = [name for name in WITHOUT_MESH if getattr(self, name)]
         why = ""
         if self.features is not None and self.label is not None:
             why = (
-                "features= are fields of the vertices of meshes, and label= makes meshes of "
-                "volumes, whose vertices nobody knows before"
+                "features= are fields on the vertices of meshes, and label= extracts meshes from "
+                "volumes, whose vertices are not known before"
             )
         elif self.landmarks is not None and self.refine != "elastic":
-            why = f"landmarks pull elastic rounds, and refine={self.refine!r} makes none"
+            why = f"landmarks guide elastic iterations, and refine={self.refine!r} has none"
         elif self.method == "scalable" and without:
             why = (
                 f"method='scalable' has no coarse mesh, and {without[0]}=True "
                 f"{WITHOUT_MESH[without[0]]}"
             )
-        elif self.keep_doubtful and self.doubtful == "stop":
+        elif self.include_flagged and self.quality_control == "stop":
             why = (
-                "keep_doubtful=True takes doubtful shapes in and doubtful='stop' ends the run "
-                "where there are any"
+                "include_flagged=True includes flagged shapes and quality_control='stop' ends the "
+                "run if there are any"
             )
         if why:
-            raise ValueError(f"{why}: leave out one of both")
+            raise ValueError(f"{why}: leave out one of the two")
 
-    def check_spread(self) -> None:
-        """ValueError where Consistent ZoomOut would have too few spread vertices for k."""
+    def check_n_samples(self) -> None:
+        """Raise ValueError if Consistent ZoomOut has too few samples for k."""
         least = min(PER_FUNCTION * self.k, self.n_coarse)
-        if 0 < self.n_spread < least:
+        if 0 < self.n_samples < least:
             raise ValueError(
-                f"n_spread must be 0, for all vertices, or at least {least}, for k = {self.k}; "
-                f"found {self.n_spread}"
+                f"n_samples must be 0, for all vertices, or at least {least}, for k = {self.k}; "
+                f"found {self.n_samples}"
             )
 
     def check_against(self, names: list[str]) -> None:
-        """Raise ValueError where the options do not fit the shapes of these names.
-
-        A template that is none of them, or too few pairs.
-        """
+        """Raise ValueError if the template is unknown, or the pairs cannot connect the shapes."""
         if self.template is not None and self.template not in names:
             raise ValueError(
-                f"template {self.template!r} is none of the shapes: {', '.join(names)}"
+                f"template {self.template!r} is not one of the shapes: {', '.join(names)}"
             )
         n = len(names)
         if self.n_pairs < n - 1:
@@ -449,11 +458,11 @@ class Options:
             )
 
     def of(self, step: str) -> dict[str, Any]:
-        """The options that the functions of a step take as keywords.
+        """Return the keyword arguments of the functions of a step.
 
         Parameters
         ----------
-        step : {"cleaning", "low resolution", "first maps", "projection", "registration"}
+        step : {"cleaning", "low resolution", "initial maps", "projection", "registration"}
 
         Examples
         --------
@@ -470,18 +479,18 @@ class Options:
 
     @property
     def feature_names(self) -> list[str]:
-        """Names of the fields that guide registration."""
+        """Names of the scalar fields that guide registration."""
         return self.features.split(",") if isinstance(self.features, str) else []
 
     def changed(self, given: dict[str, Any]) -> Self:
-        """These options with some given otherwise; a `preset` that is given sets its own anew.
+        """Return these options with the `given` ones replaced.
 
-        What the preset before it set stands as the default again.
+        A given `preset` replaces the values that the previous preset had set.
 
         Raises
         ------
         ValueError
-            When one is outside its range, or contradicts the preset, the given or the own.
+            If a value is invalid or contradicts the preset.
 
         Examples
         --------
@@ -489,10 +498,9 @@ class Options:
         >>> options = s4a.Options(k=50).changed({"preset": "paper"})
         >>> options.k, options.refine
         (50, 'intrinsic')
-        >>> options.changed({"refine": "joint"})
+        >>> options.changed({"n_samples": 500})
         Traceback (most recent call last):
-        ValueError: preset 'paper' sets refine='intrinsic'; found refine='joint': leave out one of \
-both
+        ValueError: preset 'paper' sets n_samples=0; found n_samples=500: leave out one of the two
         """
         unset: dict[str, None] = {}
         if "preset" in given:
@@ -502,7 +510,7 @@ both
 
     @classmethod
     def from_report(cls, study: "xr.DataTree | xr.Dataset") -> Self:
-        """The options of a study, or of its ``/report``; the default of one that it does not name.
+        """Return the options of a study or of its ``/report``, defaults where it names none.
 
         Examples
         --------
@@ -518,7 +526,7 @@ both
 
 
 DECLARED: dict[str, Field[Any]] = {one.name: one for one in fields(Options)}
-# options that a preset sets: one that is not given is None until then
+# values of options that presets set; such an option is None until a preset is applied
 PRESETS: dict[str | None, dict[str, Any]] = {
     None: {
         name: one.metadata["default"] for name, one in DECLARED.items() if one.metadata["presets"]
@@ -534,14 +542,14 @@ PRESETS: dict[str | None, dict[str, Any]] = {
 
 
 def kept_options(study: "xr.DataTree | xr.Dataset") -> dict[str, Any]:
-    """The options that the report of a study names, or a report itself."""
+    """Return the options stored in the report of a study, or in a report."""
     report = study["report"] if "report" in study else study
     kept = json.loads(report.attrs.get("options", "{}"))
     return {name: kept[name] for name in DECLARED if name in kept}
 
 
 def with_options(attrs: Mapping[Any, Any], options: Mapping[str, Any]) -> dict[Any, Any]:
-    """The attributes of a report with these options in place of those that it has."""
+    """Return the attributes of a report with these options replaced."""
     kept = json.loads(attrs.get("options", "{}"))
     return {**attrs, "options": json.dumps({**kept, **options})}
 
@@ -549,14 +557,14 @@ def with_options(attrs: Mapping[Any, Any], options: Mapping[str, Any]) -> dict[A
 def given_options(
     given: dict[str, Any], of: Options | None = None, *, pair: bool = False
 ) -> Options:
-    """The options from keywords, in place of some `of` these where there are any.
+    """Return options from keyword arguments, or `of` with these replaced.
 
     Raises
     ------
     TypeError
-        When one is given that there is not, or that is none of a `pair`.
+        If an option is unknown, or does not apply to a single `pair`.
     ValueError
-        When one is outside its range, or contradicts the preset.
+        If a value is invalid or contradicts the preset.
 
     Examples
     --------
@@ -577,23 +585,23 @@ def given_options(
 
 
 def _entry(one):
-    """An option in the words of the docstring."""
-    told = one.metadata
+    """Entry of an option in the docstring."""
+    meta = one.metadata
     kinds = " or ".join(kind.__name__ for kind in get_args(one.type) or (one.type,))
     kinds = kinds.replace("NoneType", "None")
-    kind = f"{{{', '.join(map(repr, told['choices']))}}}" if told["choices"] else kinds
-    presets = "".join(f", {name} {value!r}" for name, value in told["presets"].items())
-    text = f"{told['help'][0].upper()}{told['help'][1:]}"
-    text += f" ({told['section']})." if told["section"] else "."
-    text += f"  {told['more']}." if told["more"] else ""
-    module = told["see"].replace("/", ".")
+    kind = f"{{{', '.join(map(repr, meta['choices']))}}}" if meta["choices"] else kinds
+    presets = "".join(f", {name} {value!r}" for name, value in meta["presets"].items())
+    text = f"{meta['help'][0].upper()}{meta['help'][1:]}"
+    text += f" ({meta['section']})." if meta["section"] else "."
+    text += f"  {meta['more']}." if meta["more"] else ""
+    module = meta["see"].replace("/", ".")
     text += f"  See :mod:`s4a.{module}`." if module else ""
     lines = textwrap.wrap(text, 92, break_on_hyphens=False, break_long_words=False)
     return "\n".join(
-        [f"{one.name} : {kind}, default {told['default']!r}{presets}", *(f"    {x}" for x in lines)]
+        [f"{one.name} : {kind}, default {meta['default']!r}{presets}", *(f"    {x}" for x in lines)]
     )
 
 
 if Options.__doc__:  # not with python -OO
-    told = "\n".join(map(_entry, DECLARED.values()))
-    Options.__doc__ = Options.__doc__.replace("{options}", textwrap.indent(told, "    ").lstrip())
+    entries = textwrap.indent("\n".join(map(_entry, DECLARED.values())), "    ").lstrip()
+    Options.__doc__ = Options.__doc__.replace("{options}", entries)

@@ -1,4 +1,4 @@
-"""The table of every variable that a study holds: its dims, unit and meaning.
+"""Table of all variables of a study: dims, unit and meaning.
 
 Each step makes its output through :func:`variable`, so that names, dims and attributes are the same
 everywhere, and checks its input through :func:`require`.  A variable that is not in the table does
@@ -29,55 +29,55 @@ _UNITS = {
 
 
 def _rows(text):
-    """The rows ``name | dims | unit | long_name`` of a text, whose longer ones go on indented."""
+    """Parse rows ``name | dims | unit | long_name``; continuation lines are indented."""
     lines = [line for line in text.strip().replace("\n    ", " ").splitlines() if line[0] != "#"]
     cells = ([cell.strip() for cell in line.split("|", 3)] for line in lines)
     return {name: (dims, _UNITS.get(unit, unit), meaning) for name, dims, unit, meaning in cells}
 
 
-# A new variable is a new row, beside those of its step; L is the unit of the input.  In the file
-# of a single shape a leading dim `shape` is absent.
+# A new variable is a new row, next to those of its step; L is the unit of the input.  The file of a
+# single shape lacks a leading dim `shape`.
 ROWS: dict[str, tuple[str, str, str]] = _rows("""
 # a mesh, original or coarse
 position | vertex xyz | L | vertex position
 corner_vertex | triangle corner | 1 | vertex at each corner of a triangle
 file_vertex | vertex | 1 | index of the vertex in its file
-vertex_of_file | file_vertex_index | 1 | vertex that a vertex of the file became, -1 where dropped
+vertex_of_file | file_vertex_index | 1 | vertex that a vertex of the file became, -1 if it was
+    dropped
 label | vertex | 1 | label of the vertex
 landmark_name | landmark | 1 | name of the landmark
 landmark_position | landmark xyz | L | position of the landmark
-guide_name | guide | 1 | name of the landmark that guides registration
+guide_name | guide | 1 | name of a landmark that guides registration
 guide_position | guide xyz | L | its position on the surface
-guide_triangle | guide | 1 | triangle of the mesh on which it lies
+guide_triangle | guide | 1 | triangle of the mesh that contains it
 guide_barycentric | guide corner | 1 | its barycentric weights in that triangle
-guide_distance | guide | L | distance from the surface, as it was given
-guide_vertex | guide | 1 | coarse vertex at it, or nearest to it
-feature_name | feature | 1 | name of the field that guides registration
-feature_weight | feature | 1 | how much it counts beside others
+guide_distance | guide | L | distance of the given position from the surface
+guide_vertex | guide | 1 | coarse vertex nearest to it
+feature_name | feature | 1 | name of a scalar field that guides registration
+feature_weight | feature | 1 | weight of the field relative to the others
 feature_value | vertex feature | 1 | its value, in its own unit
-landmark_curve | landmark | 1 | curve of the point, in order along it; empty where it has none
+landmark_curve | landmark | 1 | curve that the landmark is on, in order along it; empty if none
 landmark_closed | landmark | 1 | whether that curve is closed
 # low resolution (4.1) and its spectrum (3.3)
 vertex_area | vertex | L2 | lumped area of the vertex, the diagonal of A
 edge_vertex | edge end | 1 | vertices at both ends of an edge
 cotan_weight | edge | 1 | cotan weight of the edge, so that the Laplacian is A^-1 W
-sample_vertex | vertex | 1 | vertex of the original mesh that the coarse vertex is, -1 where it is
-    none
-coarse_vertex | original_vertex corner | 1 | coarse vertices that carry an original vertex: columns
-    of U
+sample_vertex | vertex | 1 | vertex of the original mesh at the coarse vertex, -1 if none
+coarse_vertex | original_vertex corner | 1 | coarse vertices that interpolate an original vertex:
+    columns of U
 coarse_weight | original_vertex corner | 1 | their barycentric weights: entries of U
-# the same of SCALABLE (s4a.method.scalable), whose coarse vertices are samples
-sample_cell | original_vertex | 1 | sample that is nearest to the original vertex along edges: its
-    Voronoi cell
-local_vertex | entry | 1 | original vertex that a local function reaches: row of an entry of U
-local_sample | entry | 1 | sample that it lives around: column of that entry
-local_weight | entry | 1 | its value there: the entry, rows of U sum to 1
+# the same for SCALABLE (s4a.method.scalable), whose coarse vertices are samples
+sample_cell | original_vertex | 1 | Voronoi cell of the original vertex: the nearest sample along
+    edges
+local_vertex | entry | 1 | original vertex in the support of a local function: row of an entry of U
+local_sample | entry | 1 | sample at which the function is centred: column of that entry
+local_weight | entry | 1 | value of the function there; the rows of U sum to 1
 edge_mass | edge | L2 | integral of the product of two local functions: entry of U^T A U, whose rows
     sum to the vertex areas
-eigenvalue | mode | unit area | eigenvalue of the Laplace-Beltrami operator
-eigenfunction | vertex mode | unit area | eigenfunction, orthonormal in the vertex areas
-lifted_eigenfunction | original_vertex mode | unit area | eigenfunction of the original mesh,
-    nearly, by a step of inverse iteration
+eigenvalue | eigenpair | unit area | eigenvalue of the Laplace-Beltrami operator
+eigenfunction | vertex eigenpair | unit area | eigenfunction, orthonormal in the vertex areas
+refined_eigenfunction | original_vertex eigenpair | unit area | approximate eigenfunction of the
+    original mesh, by one step of inverse iteration
 # one pair (4.1)
 match | vertex | 1 | on each vertex of the target, the matched vertex of the source
 # metrics of a pair (5.1, eq. 9 - 11)
@@ -92,105 +92,109 @@ conformal_distortion | | 1 | log(s1 / s2) of the maps of triangles that do not c
     area
 area_distortion | | 1 | |log(area of image / area)| of them, surfaces of unit area, median by area
 collapsed_share | | 1 | share of the target's area in triangles whose image has no area
-geodesic_error | | share | distance along edges of matched and true vertices, mean
-straight_error | | share | distance in a straight line of image and true position, mean
-error_curve | threshold | 1 | share of the vertices whose geodesic error is no larger
-label_accuracy | | 1 | share of the area that gets its own label
+geodesic_error | | share | distance along edges between matched and true vertex, mean
+euclidean_error | | share | Euclidean distance between image and true position, mean
+error_curve | threshold | 1 | share of the vertices with a geodesic error up to the threshold
+label_accuracy | | 1 | share of the area with the correct label
 label_dice | | 1 | Dice's overlap by area, mean over the labels of the target
-landmark_error | | share | distance in a straight line of carried and given landmarks, mean
+landmark_error | | share | Euclidean distance between transferred and given landmarks, mean
 # the network of maps (3.4)
-source | pair | 1 | shape whose functions the map takes
-target | pair | 1 | shape on which the map gives functions
-fmap | pair mode_target mode_source | 1 | functional map, source functions to target functions
-fmap_initial | pair mode_target_initial mode_source_initial | 1 | functional map before Consistent
-    ZoomOut
-fmap_fitted | pair mode_target_initial mode_source_initial | 1 | that map before the step of ZoomOut
-    ahead (4.2)
+source | pair | 1 | source shape of the map
+target | pair | 1 | target shape of the map
+fmap | pair eigenpair_target eigenpair_source | 1 | functional map, from functions on the source to
+    functions on the target
+fmap_initial | pair eigenpair_target_initial eigenpair_source_initial | 1 | functional map before
+    Consistent ZoomOut
+fmap_fitted | pair eigenpair_target_initial eigenpair_source_initial | 1 | functional map before the
+    initial ZoomOut iteration (4.2)
 pair_rotation | pair xyz xyz_2 | 1 | rotation R of ICP, source to target, between their frames (4.1,
     step 2)
 pair_translation | pair xyz | share | translation t of ICP, source to target
-landmark_of_source | pair landmark | 1 | landmarks of the first map: coarse vertices of the source
-    (4.1, step 3)
-landmark_of_target | pair landmark | 1 | the coarse vertices of the target that are nearest to them
-    after ICP
-weight | pair | 1 | weight of the map in the consistent latent basis, by its cycle error over all
-    modes
+landmark_of_source | pair landmark | 1 | coarse vertices of the source used as landmarks for the
+    initial map (4.1, step 3)
+landmark_of_target | pair landmark | 1 | coarse vertices of the target nearest to them after ICP
+weight | pair | 1 | weight of the map in the consistent latent basis, from its cycle error over all
+    eigenfunctions
 cycle_error | pair | 1 | mean |C_cycle - I|_F over the 3-cycles through the pair, first k_init
-    modes, by sqrt(k_init)
+    eigenfunctions, divided by sqrt(k_init)
 cycle_error_initial | pair | 1 | the same before Consistent ZoomOut
 # latent basis and median (3.4 - 3.6, eq. 3 and 5)
-latent_basis | shape mode latent | 1 | consistent latent basis Y of each shape
+latent_basis | shape eigenpair latent | 1 | consistent latent basis Y of each shape
 latent_eigenvalue | latent | unit area | eigenvalue of the latent (limit) shape
 area_difference | shape latent latent_2 | 1 | area-based shape difference D = Y^T Y
 conformal_difference | shape latent latent_2 | 1 | conformal shape difference
-distance_to_median | shape | 1 | distance |D_i - I| of each shape to the limit shape (eq. 5)
+distance_to_limit | shape | 1 | distance |D_i - I| of each shape to the limit shape (eq. 5)
 area_score | shape difference_component | 1 | PCA scores of the area-based shape differences
 conformal_score | shape difference_component | 1 | PCA scores of the conformal shape differences
 area_variance_ratio | difference_component | 1 | share of variance of the area-based differences
 conformal_variance_ratio | difference_component | 1 | share of variance of the conformal differences
 # registration (eq. 6 - 8)
-registered_match | shape vertex | 1 | on each template vertex, the matched vertex of the shape
-displacement | shape vertex xyz | L | registered shape minus template, smooth (eq. 8 with the other
-    sign)
-displacement_raw | shape vertex xyz | L | matched vertex of the aligned shape minus template
+registered_match | shape vertex | 1 | vertex of the shape matched to each template vertex
+displacement | shape vertex xyz | L | registered shape minus template, smoothed (eq. 8 with the
+    other sign)
+displacement_raw | shape vertex xyz | L | matched vertex of the aligned shape minus template vertex
 rotation | shape xyz xyz_2 | 1 | rotation R of the alignment x -> s R x + t onto the template
 translation | shape xyz | L | translation t of the alignment onto the template
 scale | shape | 1 | scale s of the alignment onto the template
-registered_match_low | shape low_vertex | 1 | on each coarse vertex of the template, the matched
-    coarse vertex of the shape (eq. 6)
+registered_match_low | shape low_vertex | 1 | coarse vertex of the shape matched to each coarse
+    vertex of the template (eq. 6)
 displacement_low | shape low_vertex xyz | L | matched vertex of the aligned coarse shape minus
-    coarse template (eq. 6)
-displacement_coefficient | shape mode xyz | L | coefficients of the displacement in the functions U
-    Phi of the template (6.1)
+    coarse template vertex (eq. 6)
+displacement_coefficient | shape eigenpair xyz | L | coefficients of the displacement in the
+    functions U Phi of the template (6.1)
 icp_rotation | shape xyz xyz_2 | 1 | rotation R of ICP, shape to template or reference, between
     their frames (4.1, step 2)
-icp_translation | shape xyz | share | translation t of that motion
-confidence | shape vertex | 1 | share of such vertices that are within 1 % of sqrt(area) of the
-    truth, by their evidence
-round_trip | shape vertex | share | cycle error: way from the vertex to the shape and back
-distortion | shape vertex | 1 | log of the vertex's share of the area, on the shape over on the
-    template
-method | shape | 1 | start of the match that was kept
-badness | shape | share | round trip and gaps between the surfaces, mean
-template_triangle | original_vertex | 1 | template triangle on which the vertex of the shape lies
+icp_translation | shape xyz | share | translation t of that rigid transform
+confidence | shape vertex | 1 | estimated share of comparable vertices with an error of at most 1 %
+    of sqrt(area)
+round_trip | shape vertex | share | cycle error: distance from the vertex to itself, mapped to the
+    shape and back
+distortion | shape vertex | 1 | log ratio of the vertex's share of the area, on the shape over on
+    the template
+initialisation | shape | 1 | initialisation of the registration that was kept
+registration_error | shape | share | error score of the registration, lower is better: mean of round
+    trip and distances between the surfaces
+template_triangle | original_vertex | 1 | template triangle that contains the vertex of the shape
 template_barycentric | original_vertex corner | 1 | barycentric weights in that triangle
-# what travels along a registration (6.2)
-label_share | vertex | 1 | share of the votes that the label of the vertex has, 0 to 1
-label_vote | vertex label_value | 1 | share of the votes for every label, rows sum to 1
+# transfer along a registration (6.2)
+label_share | vertex | 1 | share of the votes for the label of the vertex, 0 to 1
+label_vote | vertex label_value | 1 | share of the votes for each label; rows sum to 1
 field | vertex | 1 | scalar field
-landmark_triangle | landmark | 1 | triangle of the mesh on which the landmark lies
+landmark_triangle | landmark | 1 | triangle of the mesh that contains the landmark
 landmark_barycentric | landmark corner | 1 | barycentric weights of the landmark in that triangle
 landmark_confidence | landmark | 1 | confidence of the match at the landmark, 0 to 1
-landmark_distance | landmark | L | distance of the given landmark from the surface it is marked on
-landmark_spread | landmark | L | distance between the positions that different ways of transfer give
+landmark_distance | landmark | L | distance of the given landmark from its surface
+landmark_disagreement | landmark | L | distance between the positions from different paths of
+    transfer
 # modes (6.1)
 mean_displacement | vertex xyz | L | mean of the displacements
 deformation | component vertex xyz | L | deformation of one standard deviation along the component
 standard_deviation | component | L | standard deviation of the component (area-weighted RMS)
 score | shape component | 1 | score of each shape, in standard deviations
-reconstruction_error | shape | L | root mean square over the area of what the modes do not describe
-score_apart | shape_apart component | 1 | score, in standard deviations, of each doubtful shape that
-    the modes are made without
+reconstruction_error | shape | L | root mean square over the area of what the components do not
+    describe
+score_excluded | shape_excluded component | 1 | score, in standard deviations, of a flagged shape
+    that was left out of the PCA
 explained_variance_ratio | component | 1 | share of the variance at full resolution
-explained_variance_ratio_low | component | 1 | share of the variance at low resolution, of the
-    matches of eq. 6, as smooth as at full
+explained_variance_ratio_low | component | 1 | share of the variance at low resolution, of smoothed
+    matches (eq. 6)
 explained_variance_ratio_raw | component | 1 | share of the variance at low resolution, of the
-    matches as they are
+    matches without smoothing
 template_vertex | vertex | 1 | vertex of the template that the vertex of a region is
 # evaluation of the model, tests and outliers (6.1)
-compactness | component | L2 | variance of the first components together
+compactness | component | L2 | cumulative variance of the first components
 compactness_error | component | L2 | its standard error
 generalization | component | L | distance of a left-out shape to its reconstruction, mean over
     shapes
 generalization_error | component | L | its standard error
-generalization_surface | component | L | the same from points to the surface, mean distance
+generalization_surface | component | L | the same, from vertices to the surface
 generalization_surface_error | component | L | its standard error
 specificity | component | L | distance of a random shape of the model to the nearest shape
 specificity_error | component | L | its standard error
-specificity_surface | component | L | the same from points to the surface, mean distance
+specificity_surface | component | L | the same, from vertices to the surface
 specificity_surface_error | component | L | its standard error
 variance_ratio | component | 1 | share of the variance, in the basis of the baseline
-variance_ratio_null | component | 1 | the same when every coefficient is permuted, mean
+variance_ratio_null | component | 1 | the same under permutation of every coefficient, mean
 variance_ratio_null_95 | component | 1 | the same, 95th percentile
 statistic | | 1 | test statistic
 p_value | | 1 | p value of the permutation test
@@ -201,75 +205,76 @@ p_family_wise | vertex | 1 | p value corrected for all vertices by the largest s
 p_false_discovery | vertex | 1 | p value adjusted for the false discovery rate
 effect_size | vertex | 1 | effect size
 effect | vertex xyz | L | difference of the groups' means, or change per unit of the variable
-intercept | vertex xyz | L | displacement where the variable is at its mean
-standard_score | shape | 1 | variable of the regression, less its mean, in standard deviations
-mahalanobis | shape | 1 | distance to the mean of all others, in their standard deviations
+intercept | vertex xyz | L | displacement at the mean of the variable
+standard_score | shape | 1 | variable of the regression, centred, in standard deviations
+mahalanobis | shape | 1 | Mahalanobis distance to the mean of all others
 outlier_p | shape | 1 | p value of that distance for a normal population
 left_out_error | shape | L | distance of the shape to its reconstruction by the model of all others
-outlier | shape | 1 | whether one of both is beyond its threshold
+outlier | shape | 1 | whether one of the two is beyond its threshold
 predicted | shape | 1 | class predicted while the shape was left out
 accuracy | fold | 1 | balanced accuracy on the left-out shapes
-# fields on the template, and field against shape
-carried_field | shape vertex | field | field of the shape, carried to the template
+# fields on the template, and covariation of field and shape
+transferred_field | shape vertex | field | field of the shape, carried to the template
 field_effect | vertex | field | difference of the groups' means, or change per unit of the variable
 field_intercept | vertex | field | field where the variable is at its mean
-# the truth of a synthetic collection
+# ground truth of a synthetic collection
 reference_point | vertex xyz | 1 | point of the unit sphere that the vertex is the image of
-planted_score | shape planted_mode | 1 | planted score of each shape, in standard deviations
-planted_centre | planted_part xyz | mm | centre of each localised field of the planted modes
-planted_width | planted_part | mm | its width, the standard deviation of a Gaussian
-planted_push | planted_mode planted_part xyz | mm | its translation in each planted mode
-planted_turn | planted_mode planted_part xyz | rad | its rotation in each planted mode
-own_centre | shape own_part xyz | mm | centres of the noise and, last, of the tumour of each shape
-own_width | shape own_part | mm | their widths
-own_push | shape own_part xyz | mm | their translations
+true_score | shape true_mode | 1 | simulated score of each shape, in standard deviations
+true_centre | true_region xyz | mm | centre of each localised field of the simulated modes
+true_width | true_region | mm | standard deviation of its Gaussian
+true_translation | true_mode true_region xyz | mm | its translation in each simulated mode
+true_rotation | true_mode true_region xyz | rad | its rotation in each simulated mode
+noise_centre | shape noise_region xyz | mm | centres of the noise and, last, of the tumour of each
+    shape
+noise_width | shape noise_region | mm | their widths
+noise_translation | shape noise_region xyz | mm | their translations
 landmark_reference | landmark xyz | 1 | point of the unit sphere that the landmark is the image of
 # the comparison (Table 1, Fig. 3, Table 2)
-way_match | way vertex | 1 | on each vertex of the target, the vertex of the source that the method
-    matches
-way_reverse | way source_vertex | 1 | on each vertex of the source, the vertex of the target that
-    the method matches
-way_image | way vertex xyz | L | where the method puts a vertex of the target
-way_area | way vertex | 1 | log of the vertex's share of the area after and before the method moves
-    it
-way_fmap | way mode_target mode_source | 1 | refined functional map of the method, source functions
-    to target functions
-way_fmap_initial | way mode_target_initial mode_source_initial | 1 | first functional map of the
-    method
-way_error | way vertex | share | distance in a straight line of image and true position
-true_position | vertex xyz | L | where the vertex truly lies on the source
-true_match | vertex | 1 | vertex of the source nearest to there, -1 where unknown
-block_seconds | way pair block | s | CPU time of the block, of one core
-collection_chamfer | way how shape | share | Chamfer distance of the shape and the image of the
-    template (eq. 9)
-collection_seconds | way how block | s | CPU time of the block for the whole collection, of one core
-median_shape | way | 1 | median shape (eq. 5)
-# what holds of a study's files
+algorithm_match | algorithm vertex | 1 | vertex of the source matched to each vertex of the target
+algorithm_reverse | algorithm source_vertex | 1 | vertex of the target matched to each vertex of the
+    source
+algorithm_image | algorithm vertex xyz | L | position of the target's vertex on the source
+algorithm_area_change | algorithm vertex | 1 | log ratio of the vertex's share of the area, after
+    over before the map
+algorithm_fmap | algorithm eigenpair_target eigenpair_source | 1 | refined functional map, from
+    functions on the source to functions on the target
+algorithm_fmap_initial | algorithm eigenpair_target_initial eigenpair_source_initial | 1 | initial
+    functional map
+algorithm_error | algorithm vertex | share | Euclidean distance between image and true position
+true_position | vertex xyz | L | true position of the vertex on the source
+true_match | vertex | 1 | vertex of the source nearest to the true position, -1 if unknown
+block_seconds | algorithm pair block | s | CPU time of the block, of one core
+collection_chamfer | algorithm dense_match shape | share | Chamfer distance between the shape and
+    the image of the template (eq. 9)
+collection_seconds | algorithm dense_match block | s | CPU time of the block for the whole
+    collection, on one core
+median_shape | algorithm | 1 | median shape (eq. 5)
+# state of the files of a study
 state | file | 1 | whole, damaged, missing, stale, left over or foreign, see s4a.verify
-fault | file | 1 | what is wrong with the file; empty where nothing is
-# plausibility (5.1): a shape on its own and beside others of its collection
-sketch_position | point xyz | 1 | some vertices of the shape, centred, of unit root mean square
-    radius
-sketch_area | point | 1 | their shares of the area
-sketch_normal | point xyz | 1 | their normals
-sketch_asymmetry | point | 1 | how far the shape's mirror image lies above the vertex
+fault | file | 1 | fault of the file; empty if none
+# plausibility (5.1): a shape alone and compared with its collection
+descriptor_position | point xyz | 1 | sampled vertices of the shape, centred, of unit root mean
+    square radius
+descriptor_area | point | 1 | their shares of the area
+descriptor_normal | point xyz | 1 | their normals
+descriptor_asymmetry | point | 1 | distance of the shape's mirror image at the vertex
 moment | axis | 1 | share of the second moment along each principal axis
 fit | reference | 1 | residual of ICP onto the reference, both of unit root mean square radius
-fit_mirrored | reference | 1 | the same of the shape's mirror image
-hand | reference | 1 | positive where the shape is of the reference's hand, negative where its
-    mirror image is
-handedness | shape | 1 | mean of hand beside the references: positive as most shapes, negative as
-    their mirror images
-reflected | shape | 1 | whether the mirror image of the shape was taken (reflect=)
+fit_mirrored | reference | 1 | the same for the mirror image of the shape
+chirality | reference | 1 | positive if the shape has the reference's chirality, negative if its
+    mirror image has
+mean_chirality | shape | 1 | mean chirality relative to the references: positive for most shapes,
+    negative for their mirror images
+reflected | shape | 1 | whether the shape was mirrored (reflect=)
 # the report
-status | shape | 1 | ok, repaired, doubtful or excluded
-reason | shape | 1 | what was found and done
-warning | shape | 1 | what looks wrong and was left as it is
-doubtful_kinds | shape | 1 | what makes the shape doubtful, a word for each
-warning_kinds | shape | 1 | what else was warned of, a word for each
+status | shape | 1 | ok, repaired, flagged or excluded
+reason | shape | 1 | findings and repairs
+warning | shape | 1 | findings that were left as they are
+flag_kinds | shape | 1 | kinds of findings for which the shape is flagged
+warning_kinds | shape | 1 | kinds of other findings
 path | shape | 1 | file of the shape
 area | shape | L2 | area of the surface
-self_intersections | shape | 1 | triangles that pass through others, -1 where not counted
+self_intersections | shape | 1 | triangles that intersect others, -1 if not counted
 file_vertices | shape | 1 | vertices in the file
 file_triangles | shape | 1 | triangles in the file
 nonfinite_vertices | shape | 1 | vertices that are not finite
@@ -281,7 +286,7 @@ flat_triangles | shape | 1 | zero-area triangles dropped
 nonmanifold_edges | shape | 1 | edges with more than two triangles
 cut_edges | shape | 1 | sides of edges that were cut open
 split_vertices | shape | 1 | vertices added where a vertex was not manifold
-inserted_vertices | shape | 1 | vertices inserted on edges where two sheets share both ends
+inserted_vertices | shape | 1 | vertices inserted on edges where two components share both ends
 reoriented_triangles | shape | 1 | triangles reoriented
 unreferenced_vertices | shape | 1 | vertices without triangles
 closed_holes | shape | 1 | holes closed
@@ -296,9 +301,9 @@ peak_memory | stage | MiB | peak resident memory of this process and its workers
 
 
 class Table(dict[str, tuple[tuple[str, ...], str, str]]):
-    """Name of a variable -> its dims, unit and meaning, of the core and of the extensions.
+    """Map the name of a variable to its dims, unit and meaning.
 
-    The rows of the extensions are added when a name is looked up that the core does not have.
+    The rows of extensions are added when a name is looked up that the core lacks.
     """
 
     def __init__(self, rows: Mapping[str, tuple[str, str, str]]):
@@ -307,7 +312,7 @@ class Table(dict[str, tuple[tuple[str, ...], str, str]]):
         self.add(rows)
 
     def add(self, rows: Mapping[str, tuple[str, str, str]]) -> None:
-        """Take rows in, with dims in one text."""
+        """Add rows, whose dims are one string."""
         for name, (dims, unit, long_name) in rows.items():
             self.setdefault(name, (tuple(dims.split()), unit, long_name))
 
@@ -326,20 +331,20 @@ class Table(dict[str, tuple[tuple[str, ...], str, str]]):
 
 TABLE = Table(ROWS)
 
-# variables of indices: the dim that they point into; -1 points nowhere
+# index variables and the dim that they refer to; -1 refers to nothing
 _OF_DIM = {
     "vertex": "corner_vertex edge_vertex vertex_of_file coarse_vertex guide_vertex "
-    "sample_cell local_sample way_reverse",
+    "sample_cell local_sample algorithm_reverse",
     "file_vertex_index": "file_vertex",
     "original_vertex": "sample_vertex local_vertex registered_match",
     "triangle": "template_triangle",
-    "source_vertex": "way_match true_match",
+    "source_vertex": "algorithm_match true_match",
 }
 POINTS_INTO = {name: dim for dim, names in _OF_DIM.items() for name in names.split()}
 NOWHERE = {"vertex_of_file", "sample_vertex", "true_match"}
 
 
-# what a file of a study holds at least: variables; attributes that are texts, and numbers
+# required contents of a file of a study: variables, text attributes, numeric attributes
 SEEN = "surface compactness chirality open_boundary lattice self_intersections intersecting"
 HOLDS = {
     "original": ("position corner_vertex file_vertex", "status reason", "area"),
@@ -355,33 +360,33 @@ HOLDS = {
         "laplacian",
         "wrapped kept_whole",
     ),
-    "network/sketch": (
-        "sketch_position sketch_area sketch_normal sketch_asymmetry moment",
+    "network/descriptor": (
+        "descriptor_position descriptor_area descriptor_normal descriptor_asymmetry moment",
         "",
         SEEN,
     ),
-    "network/look": ("moment fit fit_mirrored hand", "", SEEN),
-    "network/hands": ("shape handedness reflected", "told", ""),
-    "network/motion": ("rotation translation", "reference", ""),
-    "network/first": ("source target fmap_initial", "", ""),
+    "network/comparison": ("moment fit fit_mirrored chirality", "", SEEN),
+    "network/chirality": ("shape mean_chirality reflected", "told", ""),
+    "network/alignment": ("rotation translation", "reference", ""),
+    "network/initial": ("source target fmap_initial", "", ""),
     "network": ("source target fmap_initial fmap weight cycle_error", "", ""),
     "latent": (
         "shape latent_basis latent_eigenvalue area_difference conformal_difference "
-        "distance_to_median",
+        "distance_to_limit",
         "median",
         "",
     ),
     "latent/shape": (
-        "latent_basis area_difference conformal_difference distance_to_median",
+        "latent_basis area_difference conformal_difference distance_to_limit",
         "",
         "",
     ),
-    "rounds": ("shape fmap latent_basis latent_eigenvalue", "", ""),
+    "iterations": ("shape fmap latent_basis latent_eigenvalue", "", ""),
     "registration": ("position corner_vertex vertex_area", "template", ""),
     "registration/shape": (
         "registered_match displacement rotation translation scale confidence template_triangle "
         "template_barycentric",
-        "method",
+        "initialisation",
         "score",
     ),
     "pca": (
@@ -389,7 +394,7 @@ HOLDS = {
         "",
         "",
     ),
-    "fields": ("shape carried_field", "", ""),
+    "fields": ("shape transferred_field", "", ""),
     "subjects": ("shape", "", ""),
     "report": (
         "shape stage status reason warning path area seconds",
@@ -401,17 +406,17 @@ TEXTS = set("source target status reason warning path shape stage".split())
 
 
 def variable(name: str, data: ArrayLike, **attrs: str | float | list[str]) -> xr.Variable:
-    """A variable of the table, with its dims, unit and meaning.
+    """Return a variable of the table with its dims, unit and meaning.
 
     Parameters
     ----------
     name : str
         A name of :data:`TABLE`.
     data : array_like
-        Values; its number of axes must be that of the table, or one less where the table starts
+        Values.  The number of axes must be that of the table, or one less if the table starts
         with ``shape``.
     **attrs
-        Further attributes (str, int, float or lists of str, as netCDF holds no other).
+        Further attributes: str, int, float or lists of str, the types of netCDF.
 
     Returns
     -------
@@ -420,7 +425,7 @@ def variable(name: str, data: ArrayLike, **attrs: str | float | list[str]) -> xr
     Raises
     ------
     ValueError
-        When the name is not in the table or the number of axes differs.
+        If the name is not in the table, or the number of axes differs.
 
     Examples
     --------
@@ -440,7 +445,7 @@ def variable(name: str, data: ArrayLike, **attrs: str | float | list[str]) -> xr
 
 
 def covariate(name: str, data: ArrayLike) -> xr.Variable:
-    """A column of the table of the shapes, the one kind of variable whose names users choose.
+    """Return a column of the user's table as a variable.
 
     Examples
     --------
@@ -456,12 +461,12 @@ def covariate(name: str, data: ArrayLike) -> xr.Variable:
 
 
 def dataset(attrs: Mapping[str, Any] | None = None, **variables: ArrayLike) -> xr.Dataset:
-    """A Dataset of variables of the table, as ``dataset(position=X, corner_vertex=T)``."""
+    """Return a Dataset of variables of the table: ``dataset(position=X, corner_vertex=T)``."""
     return xr.Dataset({name: variable(name, data) for name, data in variables.items()}, attrs=attrs)
 
 
 def unit_of(values: xr.DataArray | xr.Dataset) -> str:
-    """The unit of a length, as a variable or a mesh says it; "unit of the input" where none does.
+    """Return the unit of length of a variable or mesh, or "unit of the input" if unknown.
 
     Examples
     --------
@@ -473,7 +478,7 @@ def unit_of(values: xr.DataArray | xr.Dataset) -> str:
 
 
 def in_unit(data: xr.Dataset, unit: str | None, *, of: str = INPUT) -> xr.Dataset:
-    """A Dataset with the unit in place of "unit of the input", or `of`, where the unit is known.
+    """Return a Dataset with its unit in place of "unit of the input", or of `of`.
 
     Examples
     --------
@@ -492,7 +497,7 @@ def in_unit(data: xr.Dataset, unit: str | None, *, of: str = INPUT) -> xr.Datase
 
 
 def require(data: xr.Dataset, *names: str, what: str = "dataset") -> None:
-    """ValueError unless the Dataset has all variables of these names, with the dims of the table.
+    """Raise ValueError unless the Dataset has these variables with the dims of the table.
 
     Examples
     --------
@@ -512,14 +517,14 @@ def require(data: xr.Dataset, *names: str, what: str = "dataset") -> None:
 
 
 def check_indices(name: str, values: np.ndarray, sizes: Mapping[str, int]) -> None:
-    """ValueError where a variable of :data:`POINTS_INTO` points outside of its dim.
+    """Raise ValueError if an index variable of :data:`POINTS_INTO` is out of range.
 
     Parameters
     ----------
     name : str
     values : ndarray
     sizes : dict of str to int
-        Of the dims; one that is not among them has no end.
+        Sizes of the dims; a dim that is missing has no upper limit.
 
     Examples
     --------
@@ -537,13 +542,13 @@ def check_indices(name: str, values: np.ndarray, sizes: Mapping[str, int]) -> No
 
 
 def check_switch(name: str, value: object) -> None:
-    """ValueError unless an option is True or False."""
+    """Raise ValueError unless an option is True or False."""
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name} must be True or False; found {value!r}")
 
 
 def check_choice(name: str, value: object, legal: Collection[object]) -> None:
-    """ValueError unless an option is one of the legal choices.
+    """Raise ValueError unless an option is one of the legal choices.
 
     Examples
     --------
@@ -558,7 +563,7 @@ def check_choice(name: str, value: object, legal: Collection[object]) -> None:
 
 
 def check_count(name: str, value: object, least: int = 0) -> None:
-    """ValueError unless an option is an integer from `least` to :data:`LARGEST_COUNT`.
+    """Raise ValueError unless an option is an integer from `least` to :data:`LARGEST_COUNT`.
 
     Examples
     --------
@@ -576,6 +581,6 @@ def check_count(name: str, value: object, least: int = 0) -> None:
 
 
 def check_text(name: str, value: object) -> None:
-    """ValueError unless an option is a text or None."""
+    """Raise ValueError unless an option is a text or None."""
     if not isinstance(value, str | None):
         raise ValueError(f"{name} must be a text or None; found {value!r}")

@@ -49,7 +49,7 @@ def seed_of(seed: int, rng: RNG | None) -> int:
     if rng is None:
         return seed
     if seed:
-        raise ValueError(f"seed={seed!r} and rng are given: leave out one of both")
+        raise ValueError(f"seed={seed!r} and rng are given: leave out one of the two")
     if isinstance(rng, np.random.Generator):
         return int(rng.integers(LARGEST))
     if isinstance(rng, bool) or not isinstance(rng, int | np.integer):

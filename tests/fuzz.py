@@ -363,9 +363,12 @@ def spoilt(rng, X, T):
     size = np.ptp(X, axis=0).max() or 1.0
     jitter = size * 10 ** rng.uniform(-9, -1)
     m = len(T)
-    soup = X[T[:80]].reshape(-1, 3)
+    unconnected = X[T[:80]].reshape(-1, 3)
     ways = [
-        lambda: (soup + jitter * rng.normal(size=soup.shape), np.arange(len(soup)).reshape(-1, 3)),
+        lambda: (
+            unconnected + jitter * rng.normal(size=unconnected.shape),
+            np.arange(len(unconnected)).reshape(-1, 3),
+        ),
         lambda: (X + jitter * rng.normal(size=X.shape), T),
         lambda: (X * 10 ** rng.uniform(-6, 6, 3), T),  # slivers
         lambda: (X, T[rng.permutation(m)[: max(1, int(m * rng.uniform(0.2, 1)))]]),

@@ -34,8 +34,10 @@ def noise(seed, s, size=0.1):
 
 def with_carried(study, values, unit="mm"):
     """The study with a field that is on the template already."""
-    field = dataset(carried_field=values).assign_coords(shape=study["registration"]["shape"].values)
-    field["carried_field"].attrs["units"] = unit
+    field = dataset(transferred_field=values).assign_coords(
+        shape=study["registration"]["shape"].values
+    )
+    field["transferred_field"].attrs["units"] = unit
     return xr.DataTree.from_dict(
         {n.path: n.to_dataset(inherit=False) for n in study.subtree} | {"/fields/thickness": field}
     )

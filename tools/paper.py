@@ -1,4 +1,4 @@
-"""Every table that README, documentation and papers quote, made anew: ``make paper``.
+"""Every table that README, documentation and papers quote, made again: ``make paper``.
 
 The commands are those that the pages name in backticks, such as ``speed.py growth``; they are
 scripts of ``benchmarks``. Each writes what it prints into ``docs/tables``, with day, machine
@@ -33,7 +33,7 @@ PAGES = (
     "docs/comparison.md",
     "docs/decisions.md",
     "docs/differences.md",
-    "docs/doubtful.md",
+    "docs/quality_control.md",
     "docs/frontends.md",
     "docs/howto.md",
     "docs/install.md",
@@ -101,7 +101,7 @@ def versions():
     revision = subprocess.run(
         ["git", "describe", "--always"], cwd=ROOT, capture_output=True, text=True
     ).stdout.strip()
-    code = ["s4a", "benchmarks", "pyproject.toml"]  # a picture drawn anew changes no number
+    code = ["s4a", "benchmarks", "pyproject.toml"]  # a picture drawn again changes no number
     changed = subprocess.run(
         ["git", "diff", "--quiet", "HEAD", "--", *code], cwd=ROOT, capture_output=True
     ).returncode

@@ -29,7 +29,7 @@ from s4a.method.pca import gram, gram_pca
 from s4a.schema import dataset, in_unit, require, unit_of
 from s4a.seeds import RNG, seed_of
 from s4a.study.tree import left_out
-from s4a_morphometrics.halves import ROUNDS, Mirror, plane_between, symmetry
+from s4a_morphometrics.bilateral_pairs import ITERATIONS, Mirror, plane_between, symmetry
 
 log = logging.getLogger(__name__)
 
@@ -71,7 +71,7 @@ def own_sides(Y: np.ndarray, halves: xr.Dataset, T: np.ndarray, area: np.ndarray
     plane = plane_between(mean, mean_there, area)
     consensus = (mean + plane(mean_there)) / 2
     double = np.concatenate([area, area])
-    for _ in range(ROUNDS):
+    for _ in range(ITERATIONS):
         goal = np.concatenate([consensus, plane(consensus)])
         for i, (y, other) in enumerate(zip(Y, there, strict=True)):
             R, t, _ = rigid_transform(np.concatenate([y, other]), goal, double)
@@ -131,7 +131,7 @@ def half_differences(
 def both_sides(first: np.ndarray, second: np.ndarray, T: np.ndarray, area: np.ndarray) -> Sides:
     """Shapes ``(s, n, 3)`` of one side and the other, of one hand, aligned (matching symmetry)."""
     Y = np.concatenate([first, second])
-    for _ in range(ROUNDS):
+    for _ in range(ITERATIONS):
         consensus = Y.mean(0)
         for i, y in enumerate(Y):
             R, t, _ = rigid_transform(y, consensus, area)
@@ -211,7 +211,7 @@ def asymmetry(
 
     Examples
     --------
-    With the ``study`` of six small brains, which have directional asymmetry planted nowhere:
+    With the ``study`` of six small brains, which have directional asymmetry simulated nowhere:
 
     >>> import s4a
     >>> import s4a_morphometrics
@@ -284,12 +284,12 @@ def paired(
             f"asymmetry needs at least 4 subjects with both sides, found {len(names)}"
             + (f"; one side lacks beside {listed(alone)}" if alone else "")
         )
-    _tell_hands(study, {shapes[i]: sides[i] for i in known}, two)
+    _report_sides(study, {shapes[i]: sides[i] for i in known}, two)
     first, second = ([place[name][one] for name in names] for one in two)
     return names, first, second, alone, f"{two[1]} less {two[0]}"
 
 
-def _tell_hands(study, side_of, two):
+def _report_sides(study, side_of, two):
     """Say so where the run did not mirror just the shapes of one side."""
     report = study["report"].to_dataset() if "report" in study.children else xr.Dataset()
     mirrored = set()
@@ -312,7 +312,7 @@ def measured(sides: Sides, T: np.ndarray, of: str, model: Model) -> xr.Dataset:
     if of == "normal":
         fields, error = sides.along[..., None], sides.error_along[:, None]
     resolution = BEYOND * largest_around(np.linalg.norm(error, axis=1), T)
-    fields = without_doubt(fields - error, resolution)
+    fields = unflagged(fields - error, resolution)
     size = np.sqrt((a**2).sum(-1).mean(0) @ area)
     if size <= ALIKE * np.ptp(sides.consensus, axis=0).max():
         raise ValueError("left and right are the same in all shapes: there is no asymmetry to test")
@@ -356,7 +356,7 @@ def measured(sides: Sides, T: np.ndarray, of: str, model: Model) -> xr.Dataset:
     )
 
 
-def without_doubt(fields: np.ndarray, resolution: np.ndarray) -> np.ndarray:
+def unflagged(fields: np.ndarray, resolution: np.ndarray) -> np.ndarray:
     """Fields ``(s, n, k)`` less what of their mean triangles and partners may have made.
 
     That is as long as `resolution` at most, and what is shorter than the standard error of the mean
@@ -365,15 +365,15 @@ def without_doubt(fields: np.ndarray, resolution: np.ndarray) -> np.ndarray:
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a_morphometrics.bilateral import without_doubt
-    >>> without_doubt(np.array([[[1.0]], [[3.0]]]), np.array([2.0])).tolist()
+    >>> from s4a_morphometrics.bilateral import unflagged
+    >>> unflagged(np.array([[[1.0]], [[3.0]]]), np.array([2.0])).tolist()
     [[[0.0]], [[2.0]]]
     """
     mean = fields.mean(0)
     error = np.sqrt(fields.var(0, ddof=1).sum(-1) / len(fields))
-    doubt = np.maximum(resolution - error, 0)
+    flag = np.maximum(resolution - error, 0)
     length = np.linalg.norm(mean, axis=1)
-    return fields - mean * np.minimum(1, doubt / np.where(length > 0, length, 1))[:, None]
+    return fields - mean * np.minimum(1, flag / np.where(length > 0, length, 1))[:, None]
 
 
 def sides_test(K: np.ndarray, model: Model) -> tuple[float, float]:
@@ -402,7 +402,7 @@ def sides_test(K: np.ndarray, model: Model) -> tuple[float, float]:
         S = np.array(signs)
         return np.einsum("pi,ij,pj->p", S, K, S, optimize=True) / n
 
-    of_sides = of(2 * [np.ones(n)])[0]  # of two rows: einsum rounds one alone in another way
+    of_sides = of(2 * [np.ones(n)])[0]  # of two rows: einsum iterations one alone in another way
     F = of_sides / max((total - of_sides) / (n - 1), 1e-12 * total)
     p, _ = model.p_values(of, of_sides * (1 - 1e-9), 10_000)
     return float(F), float(p)

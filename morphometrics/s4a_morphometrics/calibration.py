@@ -28,7 +28,7 @@ from s4a.analysis.inputs import registration_of
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays
 from s4a.input.plausibility import spread
-from s4a.method.first_map import motion_onto
+from s4a.method.initial_map import transform_onto
 from s4a.method.pca import gram
 from s4a.method.register import from_latent
 from s4a.method.shape import Shape
@@ -278,15 +278,20 @@ def _direct_way(study, name, onto):
     )
     Y = study["latent"].to_dataset()["latent_basis"]
     bases = Y.sel(shape=name).values, Y.sel(shape=onto).values
-    motion = motion_onto(source.low, target.low)
+    transform = transform_onto(source.low, target.low)
     direct = from_latent(
-        source, target, bases, motion, how=options.how, **options.of("registration")
+        source,
+        target,
+        bases,
+        transform,
+        dense_match=options.dense_match,
+        **options.of("registration"),
     )
     return image_of(direct.assign(position=target.original["position"]))
 
 
 def pose_of(model: Model, registered: xr.Dataset) -> Pose:
-    """The motion of a registered shape from its file into the frame of the template."""
+    """The transform of a registered shape from its file into the frame of the template."""
     center, size = model.template.frame
     t = (registered["translation"].values - center) / size
     return Pose(registered["rotation"].values, t, registered["scale"].item() / size)

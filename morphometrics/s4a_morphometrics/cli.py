@@ -34,7 +34,7 @@ def asymmetry(
     side: str | None = None,
     of: Literal["normal", "vector"] = "normal",
     table: str | None = None,
-    keep_doubtful: bool = False,
+    include_flagged: bool = False,
     permutations: int | None = None,
     out: str | None = None,
     seed: int,
@@ -55,8 +55,8 @@ def asymmetry(
         what is tested at every vertex: along the normals, or vectors
     table : FILE
         in place of the table of the study
-    keep_doubtful
-        take doubtful shapes in
+    include_flagged
+        take flagged shapes in
     permutations : N
         changes of sign (default: 999)
     out : DIR
@@ -65,7 +65,7 @@ def asymmetry(
     import s4a_morphometrics as m
     from s4a_morphometrics import words
 
-    tree, folder = study_to_test(study, out, table, keep_doubtful)
+    tree, folder = study_to_test(study, out, table, include_flagged)
     found = m.asymmetry(tree, subject=subject, side=side, of=of, **drawn(permutations, seed))
     tell(tree, found, "asymmetry", words.asymmetry_table(found), folder)
     if found.attrs["symmetry"] == "object":
@@ -87,7 +87,7 @@ def growth(
     of: Literal["vector", "normal"] = "vector",
     variances: Literal["equal", "unequal"] = "equal",
     table: str | None = None,
-    keep_doubtful: bool = False,
+    include_flagged: bool = False,
     permutations: int | None = None,
     out: str | None = None,
     seed: int,
@@ -112,8 +112,8 @@ def growth(
         unequal where subjects change differently: signs of subjects
     table : FILE
         in place of the table of the study
-    keep_doubtful
-        take doubtful shapes in
+    include_flagged
+        take flagged shapes in
     permutations : N
         of visits within subjects (default: 999)
     out : DIR
@@ -122,7 +122,7 @@ def growth(
     import s4a_morphometrics as m
     from s4a_morphometrics import words
 
-    tree, folder = study_to_test(study, out, table, keep_doubtful)
+    tree, folder = study_to_test(study, out, table, include_flagged)
     tested: dict[str, Any] = {
         "covariates": covariates,
         "field": field,
@@ -145,7 +145,7 @@ def covariation(
     *,
     covariates: list[str] | None = None,
     table: str | None = None,
-    keep_doubtful: bool = False,
+    include_flagged: bool = False,
     permutations: int | None = None,
     out: str | None = None,
     seed: int,
@@ -162,8 +162,8 @@ def covariation(
         accounted for
     table : FILE
         in place of the table of the study
-    keep_doubtful
-        take doubtful shapes in
+    include_flagged
+        take flagged shapes in
     permutations : N
         of the shapes (default: 999)
     out : DIR
@@ -172,7 +172,7 @@ def covariation(
     import s4a_morphometrics as m
     from s4a_morphometrics import words
 
-    tree, folder = study_to_test(study, out, table, keep_doubtful)
+    tree, folder = study_to_test(study, out, table, include_flagged)
     found = m.covariation(tree, field, covariates=covariates, **drawn(permutations, seed))
     tell(tree, found, "covariation", words.covariation_lines(found), folder)
     page = Path(folder) / "covariation.html"

@@ -97,8 +97,8 @@ def complete(
         ``score(component)``, ``score_covariance(component, component_2)``; and, as in
         ``/registration``, ``displacement``, ``rotation``, ``translation`` and ``scale``.
         Attributes: ``template``; ``missing``, share of the template's area; ``residual``, the
-        distance that modes and motion leave on the part, ``usual_residual``, the largest that the
-        modes of the others leave on the same part of a shape of the study, and ``inside``, the
+        distance that modes and transform leave on the part, ``usual_residual``, the largest that
+        the modes of the others leave on the same part of a shape of the study, and ``inside``, the
         share of the part's points that lie on the whole; ``match_noise``, the deviation of a
         coordinate where the part is; where nothing is ``factor`` of what the modes leave, and
         ``added``, the deviation that comes to it of ``between_ways``, that between two ways of
@@ -223,7 +223,7 @@ def left_by_others(model: Model) -> float:
 
 
 def pose_of_landmarks(mesh: xr.Dataset, model: Model, mean: np.ndarray, first: Pose) -> Pose | None:
-    """The motion of three or more landmarks that part and template have by name, if they do."""
+    """The transform of three or more landmarks that part and template have by name, if they do."""
     names, weights = model.template.landmarks
     own = mesh["guide_name"].values.tolist() if "guide_name" in mesh else []
     common = [name for name in names if name in own]

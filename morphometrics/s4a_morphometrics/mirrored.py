@@ -11,19 +11,19 @@ import numpy as np
 import xarray as xr
 
 import s4a
-from s4a.input.hands import (
-    COMMON_HAND,
-    OTHER_HAND,
+from s4a.input.chirality import (
+    COMMON_SIDE,
+    OTHER_SIDE,
     hands,
-    is_of_other_hand,
-    of_other_hand,
-    of_rarer_hand,
+    is_mirrored,
+    mirrored_shapes,
+    rarer_side,
 )
 from s4a.input.plausibility import examine
 from s4a.input.subjects import listed
 from s4a.options import Options
 from s4a.schema import dataset
-from s4a.study.insert import hands_beside, portraits_of, read_new
+from s4a.study.insert import compare_chirality, descriptors_of, read_new
 
 Looks = Mapping[str, Mapping[str, xr.Dataset]]  # structure -> subject -> comparison
 
@@ -31,7 +31,7 @@ Looks = Mapping[str, Mapping[str, xr.Dataset]]  # structure -> subject -> compar
 def find_mirrored(
     given: Mapping[str, tuple[dict[str, Any], dict[str, Any]]],
 ) -> tuple[dict[str, float], list[str], list[str]]:
-    """The subjects that ``reflect="auto"`` mirrors, see :func:`subjects_of_other_hand`.
+    """The subjects that ``reflect="auto"`` mirrors, see :func:`mirrored_subjects`.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def find_mirrored(
         original = s4a.read_shapes(shapes, compare=False, **cleaning)["original"]
         meshes = {subject: node.to_dataset() for subject, node in original.children.items()}
         looks[name] = examine(meshes, intersections=False) if len(meshes) > 1 else {}
-    return subjects_of_other_hand(looks)
+    return mirrored_subjects(looks)
 
 
 def find_mirrored_new(
@@ -59,7 +59,7 @@ def find_mirrored_new(
     beside = {}
     for name, (study, shapes) in given.items():
         meshes, _ = read_new(shapes, Options.from_report(study))
-        beside[name] = hands_beside(meshes, portraits_of(study))
+        beside[name] = compare_chirality(meshes, descriptors_of(study))
     subjects = sorted({subject for _, looks in beside.values() for subject in looks})
     chosen, told = [], []
     for subject in subjects:
@@ -68,14 +68,14 @@ def find_mirrored_new(
             {name: known | {"": looks[subject]} for name, (known, looks) in own.items()}
         )
         look = together.pop("")
-        is_other, line = is_of_other_hand(subject, look, together)
+        is_other, line = is_mirrored(subject, look, together)
         told += [line] if line else []
         chosen += [subject] if is_other else []
     return chosen, told
 
 
 def seen_together(looks: Looks) -> dict[str, xr.Dataset]:
-    """What several structures of each subject say together, for :func:`s4a.input.hands.hands`.
+    """What several structures of each subject say together, for :func:`s4a.input.chirality.hands`.
 
     Returns
     -------
@@ -87,8 +87,9 @@ def seen_together(looks: Looks) -> dict[str, xr.Dataset]:
     --------
     >>> from s4a.schema import dataset
     >>> from s4a_morphometrics.mirrored import seen_together
-    >>> a = dataset(hand=[0.6]).assign_coords(reference=["b"])
-    >>> seen_together({"left": {"a": a}, "right": {"a": a}})["a"]["hand"].round(2).values.tolist()
+    >>> a = dataset(chirality=[0.6]).assign_coords(reference=["b"])
+    >>> both = seen_together({"left": {"a": a}, "right": {"a": a}})
+    >>> both["a"]["chirality"].round(2).values.tolist()
     [0.85]
     """
     subjects = sorted({name for of in looks.values() for name in of})
@@ -99,7 +100,7 @@ def seen_together(looks: Looks) -> dict[str, xr.Dataset]:
     n = known.sum(0)
     whole = np.where(n, np.where(known, table, 0).sum(0) / np.sqrt(np.maximum(n, 1)), np.nan)
     return {
-        name: dataset(hand=row).assign_coords(reference=references)
+        name: dataset(chirality=row).assign_coords(reference=references)
         for name, row in zip(subjects, whole, strict=True)
     }
 
@@ -109,35 +110,35 @@ def hand_table(looks: Looks, subjects: list[str], references: list[str]) -> np.n
     table = np.full((len(looks), len(subjects), len(references)), np.nan)
     for k, of in enumerate(looks.values()):
         for name, look in of.items():
-            table[k, subjects.index(name)] = look["hand"].reindex(reference=references).values
+            table[k, subjects.index(name)] = look["chirality"].reindex(reference=references).values
     return table
 
 
-def subjects_of_other_hand(looks: Looks) -> tuple[dict[str, float], list[str], list[str]]:
+def mirrored_subjects(looks: Looks) -> tuple[dict[str, float], list[str], list[str]]:
     """The subjects of the rarer hand, each as a whole.
 
     Returns
     -------
     hand : dict of str to float
-        Of every subject, as of :func:`s4a.input.hands.hands`.
+        Of every subject, as of :func:`s4a.input.chirality.hands`.
     names : list of str
         Those of the rarer hand.
     remarks : list of str
-        In words, as of :func:`s4a.input.hands.of_other_hand`; and which subjects have structures of
-        both hands, and stay as they are: each subject is named once.
+        In words, as of :func:`s4a.input.chirality.mirrored_shapes`; and which subjects have
+        structures of both hands, and stay as they are: each subject is named once.
     """
     together = seen_together(looks)
     if len(together) < 2:
-        return dict.fromkeys(together, np.nan), *of_other_hand(together)
+        return dict.fromkeys(together, np.nan), *mirrored_shapes(together)
     names, mean = list(together), hands(together)
     hand = dict(zip(names, mean.tolist(), strict=True))
     table = hand_table(looks, names, names) * np.where(mean < 0, -1, 1)
     known = np.isfinite(table)
     each = np.where(known, table, 0).sum(2) / np.maximum(known.sum(2), 1)  # (structures, subjects)
-    both = (each <= -OTHER_HAND).any(0) & (each >= OTHER_HAND).any(0)
-    if np.median(np.abs(mean)) < COMMON_HAND or both.all():
-        return hand, *of_rarer_hand(hand)
-    chosen, told = of_rarer_hand({name: hand[name] for name in np.array(names)[~both]})
+    both = (each <= -OTHER_SIDE).any(0) & (each >= OTHER_SIDE).any(0)
+    if np.median(np.abs(mean)) < COMMON_SIDE or both.all():
+        return hand, *rarer_side(hand)
+    chosen, told = rarer_side({name: hand[name] for name in np.array(names)[~both]})
     for i in np.flatnonzero(both):
         said = [f"{name} {one:+.2f}" for name, one in zip(looks, each[:, i], strict=True)]
         told.append(

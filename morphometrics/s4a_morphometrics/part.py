@@ -1,9 +1,9 @@
-"""A part of a shape on the whole (4.2, 6.1): its motion, its match, and what of the whole it lacks.
+"""Partial shape on a complete one (4.2, 6.1): alignment, match and missing region.
 
 Points of the part look for the nearest of the mean shape moved along its modes, in position and
 normal, never the other way: what is missing asks for nothing.  Rounds of rigid ICP from many starts
 come first (turns of a cube; centres of pieces as large as the part); of the best, each round solves
-for a small motion and the scores b that minimise
+for a small transform and the scores b that minimise
 
     sum_j a_j |z_j + sum_c b_c B_cj - p_j|^2_j + (r^2 / N) |b|^2,
 
@@ -11,7 +11,7 @@ for a small motion and the scores b that minimise
 as many points as count as independent.  Distances far above the median are left out, and points
 whose nearest one lies on the boundary of the whole.  A vertex of the whole is there where the point
 of the part that is nearest to it is near, looks the same way and is not on the part's own boundary.
-Elastic and local rounds of those vertices alone follow.
+Elastic and local iterations of those vertices alone follow.
 """
 
 from dataclasses import replace
@@ -31,15 +31,15 @@ from s4a.geometry.closest import (
     stars,
 )
 from s4a.geometry.mesh import triangle_normals, vertex_areas, vertex_normals
-from s4a.method.elastic import elastic_rounds, local_rounds
+from s4a.method.elastic import elastic_iterations, local_iterations
 from s4a.method.shape import Basis, Shape
 from s4a.method.spectral import Diffusion
 from s4a.schema import Array
 
-N_ROUGH = 150  # points of the part in the first rounds of ICP, and
-N_ROUGH_ROUNDS = 12
+N_ROUGH = 150  # points of the part in the first iterations of ICP, and
+N_ROUGH_ITERATIONS = 12
 N_POINTS = 1500  # in those with modes
-N_ROUNDS = 40
+N_ITERATIONS = 40
 N_ANCHORS = 8  # places of the whole on which the part may begin
 N_STARTS = 16  # of ICP that go on
 N_INDEPENDENT = 100
@@ -51,7 +51,7 @@ LONGEST_TURN = 60.0  # degrees within which a pose counts as that of the study's
 
 
 class Pose(NamedTuple):
-    """The motion s R x + t of a part into the frame of the template."""
+    """The transform s R x + t of a part into the frame of the template."""
 
     R: Array
     t: Array
@@ -63,17 +63,17 @@ class Pose(NamedTuple):
 
 
 class Part(NamedTuple):
-    """A part: vertices ``X``, triangles ``T``, normals ``N``, areas ``area``, boundary ``rim``."""
+    """A partial shape: vertices, triangles, normals, areas and boundary."""
 
     X: Array
     T: Array
     N: Array
     area: Array
-    rim: Array  # (n,) of bool
+    boundary: Array  # (n,) of bool
 
     def spread(self, n: int) -> Array:
         """Vertices within, spread."""
-        inner = np.flatnonzero(~self.rim & (self.area > 0))
+        inner = np.flatnonzero(~self.boundary & (self.area > 0))
         return inner[farthest_points(self.X[inner], n)]
 
 
@@ -83,7 +83,7 @@ class Whole(NamedTuple):
     X: Array  # (n, 3)
     T: Array
     modes: Array  # (c, n, 3)
-    rim: Array  # (n,) of bool
+    boundary: Array  # (n,) of bool
 
 
 class Fit(NamedTuple):
@@ -109,9 +109,9 @@ def on_boundary(T: Array, n: int) -> Array:
     >>> on_boundary(np.array([[0, 1, 2], [1, 0, 3], [2, 1, 3], [0, 2, 3]]), 4).any()
     np.False_
     """
-    rim = Basis(np.zeros((n, 3)), T, np.ones(n), np.zeros((n, 0))).rim
+    boundary = Basis(np.zeros((n, 3)), T, np.ones(n), np.zeros((n, 0))).boundary
     found = np.zeros(n, bool)
-    found[np.unique(rim)] = True
+    found[np.unique(boundary)] = True
     return found
 
 
@@ -141,7 +141,7 @@ def cut(X: Array, T: Array, kept: Array) -> tuple[Array, Array]:
 def rough_starts(
     part: Part, whole: Whole, first: Pose, *, turns: str = "O"
 ) -> list[tuple[float, Pose]]:
-    """Poses after rounds of ICP of some points of the part, with their residuals, the best first.
+    """Poses after ICP of some points of the partial shape, with residuals, the best first.
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ def rough_starts(
         for shift in shifts:
             R, t = turn, center + shift - turn @ center
             residual = np.inf
-            for _ in range(N_ROUGH_ROUNDS):
+            for _ in range(N_ROUGH_ITERATIONS):
                 gap, nearest = tree.query(P @ R.T + t)
                 keep = gap <= np.quantile(gap, 0.9)
                 R, t, _ = rigid_transform(P[keep], whole.X[nearest[keep]])
@@ -207,15 +207,15 @@ def angle(pose: Pose, other: Pose) -> float:
 
 
 def fit_modes(
-    part: Part, whole: Whole, pose: Pose, *, rounds: int = N_ROUNDS, free_size: bool = False
+    part: Part, whole: Whole, pose: Pose, *, iterations: int = N_ITERATIONS, free_size: bool = False
 ) -> Fit:
-    """Pose and scores of a part from a start, in rounds of nearest points of the whole.
+    """Pose and scores of a part from a start, in iterations of nearest points of the whole.
 
     Parameters
     ----------
     part, whole : see :class:`Part`, :class:`Whole`
     pose : Pose
-    rounds : int
+    iterations : int
     free_size : bool
         Whether the size of the part is fitted, too.
     """
@@ -226,14 +226,14 @@ def fit_modes(
     b = np.zeros(c)
     modes = whole.modes.transpose(1, 2, 0)  # (n, 3, c)
     residual, inside, last = np.inf, 0.0, np.inf
-    for step in range(rounds):
+    for step in range(iterations):
         Z = whole.X + modes @ b
         normals = vertex_normals(Z, whole.T)
         p, m = pose(P), N @ pose.R.T
         near = feature_tree(Z, whole.T).query(features(p, m))[1]
         triangle, share = closest_point_in_star(p, near, Z, whole.T, star)
         z, n = (interpolate(values, whole.T, triangle, share) for values in (Z, normals))
-        keep = _inliers(p - z, m, n, whole.rim, whole.T[triangle], share)
+        keep = _inliers(p - z, m, n, whole.boundary, whole.T[triangle], share)
         inside = float(weight[keep].sum() / weight.sum())
         across = m + n
         across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
@@ -249,19 +249,19 @@ def fit_modes(
     return Fit(pose, b, residual, inside)
 
 
-def _inliers(way, m, n, rim, corners, share):
+def _inliers(way, m, n, boundary, corners, share):
     """Points that are near, look the same way, and are not nearest to the whole's boundary."""
     gap = np.linalg.norm(way, axis=1)
     same = np.einsum("jx,jx->j", m, n) > 0.3
-    at_rim = ((share > 1e-6) <= rim[corners]).all(1)  # all corners that count are on it
-    good = same & ~at_rim
+    at_boundary = ((share > 1e-6) <= boundary[corners]).all(1)  # all corners that count are on it
+    good = same & ~at_boundary
     limit = max(FAR * float(np.median(gap[good])) if good.any() else 0.0, LEAST_GAP)
     good &= gap <= limit
     return good if good.sum() > 30 else gap <= np.quantile(gap, 0.9)
 
 
 def _solve(pose, b, p, z, across, columns, weight, residual, free_size):
-    """One step of Gauss and Newton: small motion of the part, and new scores."""
+    """One step of Gauss and Newton: small transform of the part, and new scores."""
     c = len(b)
     center = weight @ p
     q = 7 if free_size else 6
@@ -272,7 +272,7 @@ def _solve(pose, b, p, z, across, columns, weight, residual, free_size):
     E[:, :, c + 3 : c + 6] = -np.eye(3)
     if free_size:
         E[:, :, c + 6] = center - p
-    y = p - z + columns @ b  # what modes and motion are to make up for
+    y = p - z + columns @ b  # what modes and transform are to make up for
     along = np.einsum("jx,jxq->jq", across, E)
     right = np.einsum("jx,jx->j", across, y)
     rows = (E * (SLIDE * weight)[:, None, None]).reshape(-1, c + q)
@@ -294,16 +294,16 @@ def best_fit(part: Part, whole: Whole, starts: list[Pose], first: Pose, free_siz
 
     What is compared is the distance left, over the share of the part that it is of.
     """
-    fits = [fit_modes(part, whole, start, rounds=15, free_size=free_size) for start in starts]
-    # all go on, from the mean shape again: after so few rounds the right one may be far behind
+    fits = [fit_modes(part, whole, start, iterations=15, free_size=free_size) for start in starts]
+    # all go on, from the mean shape again: after so few iterations the right one may be far behind
     fits = [fit_modes(part, whole, fit.pose, free_size=free_size) for fit in fits]
 
-    def badness(fit: Fit) -> float:
+    def registration_error(fit: Fit) -> float:
         turned = angle(fit.pose, first) > LONGEST_TURN
         worth = fit.residual / max(fit.inside, 0.05) * np.sqrt(1 + fit.b @ fit.b / N_INDEPENDENT)
         return worth / PREFER if turned else worth
 
-    return min(fits, key=badness)
+    return min(fits, key=registration_error)
 
 
 def seen(X: Array, N: Array, part: Part, placed: Array, limit: float) -> Array:
@@ -321,15 +321,15 @@ def seen(X: Array, N: Array, part: Part, placed: Array, limit: float) -> Array:
     """
     triangle, share = closest_point(X, placed, part.T)
     corners = part.T[triangle]
-    at_rim = ((share > 1e-6) <= part.rim[corners]).all(1)
-    at_rim &= (share > 1e-6).sum(1) < 3
+    at_boundary = ((share > 1e-6) <= part.boundary[corners]).all(1)
+    at_boundary &= (share > 1e-6).sum(1) < 3
     gap = np.linalg.norm(X - interpolate(placed, part.T, triangle, share), axis=1)
     facing = np.einsum("nx,nx->n", N, triangle_normals(placed, part.T)[triangle]) > 0
-    return (gap <= limit) & facing & ~at_rim
+    return (gap <= limit) & facing & ~at_boundary
 
 
 def refine(part: Part, placed: Array, target: Shape, X_low: Array, present: Array) -> Array:
-    """The low resolution ``(n, 3)`` after elastic and local rounds of the vertices that are there.
+    """Return the coarse vertices ``(n, 3)`` after elastic and local iterations.
 
     Parameters
     ----------
@@ -349,6 +349,6 @@ def refine(part: Part, placed: Array, target: Shape, X_low: Array, present: Arra
         low, X=X_low, area=np.where(present, low.area, 0.0), surface_normals=low.normals_at(X_low)
     )
     start = np.eye(3), np.zeros(3), np.zeros((target_low.k, 3))
-    R, t, c = elastic_rounds(source, target_low, start)
+    R, t, c = elastic_iterations(source, target_low, start)
     X = X_low @ R.T + t + target_low.field(c)
-    return X + local_rounds(source, target_low, Diffusion(target_low.area, target.W), X)
+    return X + local_iterations(source, target_low, Diffusion(target_low.area, target.W), X)

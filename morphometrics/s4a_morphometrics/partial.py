@@ -17,7 +17,7 @@ from s4a_morphometrics import posterior
 from s4a_morphometrics.part import Fit, Part, Whole, on_boundary, refine, seen
 
 LEAST_SHARE = 0.15  # of the template that a part must have
-N_ROUNDS = 2  # of finding what is there, and of matching it
+N_ITERATIONS = 2  # of finding what is there, and of matching it
 
 
 class Model(NamedTuple):
@@ -68,7 +68,7 @@ def model_of(study: xr.DataTree) -> Model:
         fields,
         score.T / (len(score) - 1),
         template.low.area,
-        options.scale,
+        options.remove_size,
         modes["mean_displacement"].values / size,
         modes["deformation"].values / size,
     )
@@ -95,7 +95,7 @@ def match(part: Part, model: Model, whole: Whole, fit: Fit) -> tuple[np.ndarray,
     low = whole.X + np.tensordot(fit.b, whole.modes, 1)
     placed = fit.pose(part.X)
     limit = max(0.02, 3 * fit.residual)
-    for _ in range(N_ROUNDS):
+    for _ in range(N_ITERATIONS):
         normals = model.template.low_on_surface.normals_at(low)
         present = seen(low, normals, part, placed, limit)
         if model.area @ present < LEAST_SHARE:

@@ -270,14 +270,14 @@ def structures(
         np.stack([image_in_shape(mesh[0], registered[name].sel(shape=one)) for one in shapes])
         for name, mesh in zip(names, meshes, strict=True)
     ]
-    tell_of_frames(names, Y, areas)
+    report_frames(names, Y, areas)
     counts = [len(area) for area in areas]
     places = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
     area = np.concatenate(areas)
     whole = align_wholes(np.concatenate(Y, axis=1), area, scale=scale)
     del Y
     each = [poses_of(whole[:, place], area[place]) for place in places]
-    tell_of_poses(names, shapes, each, areas, each)
+    report_poses(names, shapes, each, areas, each)
     triangles = [T + place[0] for (_, T), place in zip(meshes, places, strict=True)]
     result = measured(each, areas, n_permutations=n_permutations, seed=seed)
     mesh = as_dataset(
@@ -413,7 +413,7 @@ def structures_of_new(found: xr.Dataset, inserted: xr.DataTree) -> xr.Dataset:
         whole[i] = Y @ R.T + center
     each = [poses_on(found["position"].values[at], whole[:, at], area[at]) for _, at in places]
     usual = [poses_in(found, k, at) for k, at in places]
-    tell_of_poses(names, shapes, each, [area[at] for _, at in places], usual)
+    report_poses(names, shapes, each, [area[at] for _, at in places], usual)
     d = [
         pose_fields(one.mean, area[at], one.rotation, one.translation)
         for (_, at), one in zip(places, each, strict=True)
@@ -534,7 +534,7 @@ def shared_subjects(registered: dict[str, xr.Dataset], least: int = 4) -> list[s
     said = [f"{one} (no {listed(names)})" for one, names in lacking.items() if names]
     if said:
         log.warning(
-            "left out, as a structure is missing or doubtful: %s", listed(said, "; ", most=9)
+            "left out, as a structure is missing or flagged: %s", listed(said, "; ", most=9)
         )
     if len(shapes) < least:
         raise ValueError(
@@ -576,7 +576,7 @@ def _same(one, other):
     return np.array_equal(one.values, other.values)
 
 
-def tell_of_frames(names: list[str], Y: list[np.ndarray], areas: list[np.ndarray]) -> None:
+def report_frames(names: list[str], Y: list[np.ndarray], areas: list[np.ndarray]) -> None:
     """Warn where structures seem not to lie in one frame, or not to have one unit."""
     centre = [np.einsum("n,snx->sx", a / a.sum(), y) for y, a in zip(Y, areas, strict=True)]
     size = [
@@ -601,7 +601,7 @@ def tell_of_frames(names: list[str], Y: list[np.ndarray], areas: list[np.ndarray
             )
 
 
-def tell_of_poses(
+def report_poses(
     names: list[str],
     shapes: list[str],
     each: list[Poses],

@@ -5,13 +5,13 @@ field of the template's first functions, whose variances are those of the errors
 shape is described by all others.  All of it is normal, so that the shapes that agree with a part
 are normal again (Albrecht, Luethi, Gerig and Vetter, Medical Image Analysis 2013; the smooth field
 in addition to the modes is that of Luethi, Gerig, Jud and Vetter, TPAMI 2018).  With E the columns
-of modes, functions and small motions, y what is known at some vertices less the mean there,
+of modes, functions and small transforms, y what is known at some vertices less the mean there,
 
     H = E^T W E + P,   w = H^-1 E^T W y,   cov(w) = H^-1,
 
 W the weights of these vertices by their areas, P the inverse of the variances before, and 0 of
-motions: how a part lies is not known either.  The same is asked of every shape of the study by the
-model of the others, with the same part known: how many places of a part count as independent is
+transforms: how a part lies is not known either.  The same is asked of every shape of the study by
+the model of the others, with the same part known: how many places of a part count as independent is
 what makes these errors least.
 """
 
@@ -33,7 +33,7 @@ N_TESTED = 400  # vertices at which the errors of left-out shapes are looked at
 class Known(NamedTuple):
     """What is known of a shape, and of which kind shapes are.
 
-    ``columns (q, n, 3)``: the s fields of the study less their mean, 3 K smooth fields, motions;
+    ``columns (q, n, 3)``: the s fields of the study less their mean, 3 K smooth fields, transforms;
     ``n_fields``, ``n_smooth``, how many of the former; ``area (n,)`` of sum 1; ``present (n,)``,
     the vertices that are known; ``gram (q, q)`` of the columns there; ``variance (3 K,)`` of the
     smooth fields; ``rest``, the variance of every coordinate that none of them holds.
@@ -88,14 +88,14 @@ def smooth_variance(coefficient: Array) -> Array:
     return (total[end] - total[first]) / (end - first)
 
 
-def motions(X: Array, center: Array, *, scale: bool = False) -> Array:
-    """Small motions ``(6 or 7, n, 3)`` of points X ``(n, 3)``: turns, shifts, growth.
+def transforms(X: Array, center: Array, *, scale: bool = False) -> Array:
+    """Small transforms ``(6 or 7, n, 3)`` of points X ``(n, 3)``: turns, shifts, growth.
 
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a_morphometrics.posterior import motions
-    >>> motions(np.array([[1.0, 0, 0]]), np.zeros(3))[2].tolist()
+    >>> from s4a_morphometrics.posterior import transforms
+    >>> transforms(np.array([[1.0, 0, 0]]), np.zeros(3))[2].tolist()
     [[0.0, 1.0, 0.0]]
     """
     axes = np.eye(3)
@@ -136,7 +136,7 @@ def know(
     for x in range(3):
         each[:, x, :, x] = Phi.T
     smooth = each.reshape(-1, n, 3)
-    columns = np.concatenate([around, smooth, motions(X, area @ X, scale=scale)])
+    columns = np.concatenate([around, smooth, transforms(X, area @ X, scale=scale)])
     rows = (columns[:, present] * np.sqrt(area[present])[:, None]).reshape(len(columns), -1)
     rest = max(float(left.mean()) / 3, 1e-6 * float(np.trace(K)) / s)
     # of nothing: a number that inverts
@@ -145,7 +145,7 @@ def know(
 
 
 def weights_of(known: Known, modes: Array) -> Array:
-    """Weights of all columns ``(q, p)`` that give modes, functions and motions.
+    """Weights of all columns ``(q, p)`` that give modes, functions and transforms.
 
     Parameters
     ----------

@@ -20,9 +20,9 @@ from s4a.analysis.volumes import write_label_volumes
 from s4a.geometry.align import farthest_points
 from s4a.geometry.mesh import as_arrays, vertex_normals
 from s4a.input.annotations import write_landmarks
+from s4a.input.chirality import MIRROR, in_file
 from s4a.input.files import write_mesh
 from s4a.input.formats import vtk_bytes, vtp_bytes
-from s4a.input.hands import MIRROR, in_file
 from s4a.input.landmarks import locate
 from s4a.method.pca import synthesize
 from s4a.schema import check_count, dataset, in_unit, unit_of, variable

@@ -20,9 +20,9 @@ import numpy as np
 import xarray as xr
 
 import s4a
+from s4a.input.chirality import AUTO, to_reflect
 from s4a.input.collection import remarks_on_files
 from s4a.input.files import check_names, files_named, find_meshes, slug
-from s4a.input.hands import AUTO, to_reflect
 from s4a.input.landmarks import SUFFIXES
 from s4a.input.raw import shown
 from s4a.input.subjects import is_missing, listed, read_cells, subjects
@@ -92,7 +92,7 @@ def analyse_structures(
     xarray.DataTree
         A study of each structure in ``/structures/<name>``, see :func:`of_structure`; ``/report``
         with ``structure_status(shape, structure)`` and, with `reflect`, ``reflected(shape)`` and
-        ``handedness(shape)``; its ``remarks`` say which subject lacks a structure.
+        ``mean_chirality(shape)``; its ``remarks`` say which subject lacks a structure.
 
     Raises
     ------
@@ -390,9 +390,9 @@ def named_subjects(reflect: str, parts: Mapping[str, Part]) -> list[str]:
     Raises
     ------
     ValueError
-        As of :func:`s4a.input.hands.to_reflect`; and when structures of one subject have different
-        values in the column, as one that is mirrored without the others would no longer lie where
-        it lay to them.
+        As of :func:`s4a.input.chirality.to_reflect`; and when structures of one subject have
+        different values in the column, as one that is mirrored without the others would no longer
+        lie where it lay to them.
 
     Examples
     --------
@@ -467,7 +467,7 @@ def tree_of(studies: Mapping[str, xr.DataTree], notes: Mapping[str, Any]) -> xr.
         report = report.merge(dataset(reflected=[one in notes["mirrored"] for one in everyone]))
     if notes["hand"] is not None:
         hand = [notes["hand"].get(subject, np.nan) for subject in everyone]
-        report = report.merge(dataset(handedness=np.array(hand, float)))
+        report = report.merge(dataset(mean_chirality=np.array(hand, float)))
     report = report.assign_coords(shape=everyone, structure=list(status))
     nodes = {f"/{FOLDER}/{name}": study for name, study in studies.items()}
     return xr.DataTree.from_dict({"/report": report, **nodes})

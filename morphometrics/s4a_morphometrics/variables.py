@@ -46,7 +46,7 @@ ROWS: dict[str, tuple[str, str, str]] = {
     "partner_triangle": ("vertex", ONE,
         "template triangle on which the partner of the vertex on the other side lies"),
     "partner_barycentric": ("vertex corner", ONE, "barycentric weights in that triangle"),
-    "partner_gap": ("vertex", INPUT, "distance of the vertex and the partner of its partner"),
+    "partner_distance": ("vertex", INPUT, "distance of the vertex and the partner of its partner"),
     "asymmetry": ("individual vertex xyz", INPUT,
         "half of the shape less its mirror image, or of one side less the other"),
     "symmetric": ("individual vertex xyz", INPUT,
@@ -72,7 +72,7 @@ ROWS: dict[str, tuple[str, str, str]] = {
     "f_ratio": ("term", ONE, "mean square by that of individuals x sides"),
     # several structures of each subject
     "structure_status": ("shape structure", ONE,
-        "ok, repaired, doubtful or excluded; missing where a subject has none"),
+        "ok, repaired, flagged or excluded; missing where a subject has none"),
     "structure_of_vertex": ("vertex", ONE, "structure that the vertex is of"),
     "pose_rotation": ("shape structure xyz", "rad",
         "turn of the structure in the whole, a vector around its centroid"),

@@ -1,4 +1,4 @@
-"""Left against right (6.1): planted asymmetries are found as what they are, and no others."""
+"""Left against right (6.1): simulated asymmetries are found as what they are, and no others."""
 
 import logging
 
@@ -19,7 +19,7 @@ from s4a.show.surfaces import unit_text
 from s4a_morphometrics import asymmetry, asymmetry_modes, symmetric_template, symmetry
 from s4a_morphometrics import bilateral as left_right
 from s4a_morphometrics.bilateral import antisymmetry_test, sides_test
-from s4a_morphometrics.halves import involution, plane_between
+from s4a_morphometrics.bilateral_pairs import involution, plane_between
 
 M = np.array([-1.0, 1, 1])
 OPTIONS = {"n_permutations": 199}
@@ -65,7 +65,7 @@ def halves():
     """The partners of the vertices of the ellipsoid, as its equation gives them."""
     X, T = MESH
     (triangle, weights), _, gap = involution(X * M, X, T)
-    return dataset(partner_triangle=triangle, partner_barycentric=weights, partner_gap=gap)
+    return dataset(partner_triangle=triangle, partner_barycentric=weights, partner_distance=gap)
 
 
 def test_the_plane_is_that_between_points_and_their_mirror_images():
@@ -149,7 +149,7 @@ def test_an_error_of_the_partners_along_the_surface_is_no_asymmetry_along_the_no
     X, T = MESH
     rng = np.random.default_rng(1)
     place, _, gap = involution(X * M + 0.5 * smooth(rng, X, 1)[0], X, T)
-    wrong = dataset(partner_triangle=place[0], partner_barycentric=place[1], partner_gap=gap)
+    wrong = dataset(partner_triangle=place[0], partner_barycentric=place[1], partner_distance=gap)
     study = study_of(fields(30, 12))
     of = {}
     for kind in ("vector", "normal"):
@@ -199,7 +199,7 @@ def test_both_sides_of_subjects_are_compared_and_the_larger_side_is_found():
     X, T = MESH
     outward = (found["directional"].values * vertex_normals(X, T)).sum(1)
     assert outward[patch].mean() == pytest.approx(0.22, abs=0.06)
-    assert "partner_gap" not in found
+    assert "partner_distance" not in found
     other = matching(d + own[:9], d + own[9:])
     p = asymmetry(other, subject="subject", side="side", **OPTIONS)["p_value"]
     assert p > 0.05

@@ -72,7 +72,7 @@ def test_what_is_known_of_a_normal_vector_gives_the_rest_as_the_formula_says():
     shape = rng.normal(size=(n, 3))
     seen = np.einsum("qnx,nx,n->q", known.columns[:, present], shape[present], area[present])
     got = posterior.condition(known, weights, seen, 1.0)
-    # the same by the covariance of all coordinates, motions of a large variance
+    # the same by the covariance of all coordinates, transforms of a large variance
     E = np.einsum("qp,qnx->nxp", weights, known.columns).reshape(3 * n, -1)
     weight = K / known.rest
     before = np.concatenate([np.ones(s - 1), known.variance, np.full(6, 1e9 / weight)])

@@ -18,7 +18,7 @@ AGE = np.tile([0.0, 1, 2.5], 8) + 0.3 * SUBJECT
 
 
 @pytest.fixture(scope="module")
-def planted():
+def simulated():
     """Eight subjects of three visits who grow along x above, and differ as much again."""
     d = noise(1, 24, size=0.02) + noise(2, 8, size=0.1)[SUBJECT]
     d += 0.05 * (AGE - AGE.mean())[:, None, None] * TOP[:, None] * [1, 0, 0]
@@ -76,19 +76,19 @@ def test_unbalanced_data_have_the_likelihood_of_dense_matrices(restricted):
         assert np.allclose(fit.error[:, i], error, rtol=1e-4)
 
 
-def test_a_covariate_that_changes_nothing_changes_no_statistic(planted):
+def test_a_covariate_that_changes_nothing_changes_no_statistic(simulated):
     rng = np.random.default_rng(0)
     w, options = rng.normal(size=24), {"of": "normal", "n_permutations": 9}
     constant = np.repeat(rng.normal(size=8), 3)  # within subjects
     fits = [
-        growth(planted, "age", "person", covariates=of, **options)
+        growth(simulated, "age", "person", covariates=of, **options)
         for of in ({"w": w}, {"w": w, "constant": constant}, {"w": w, "twice": 2 * w})
     ]
     assert np.allclose([fit["statistic"] for fit in fits], fits[0]["statistic"])
 
 
-def test_a_planted_growth_is_found_where_it_is_with_its_slope(planted):
-    fit = growth(planted, "age", "person", n_permutations=199)
+def test_a_planted_growth_is_found_where_it_is_with_its_slope(simulated):
+    fit = growth(simulated, "age", "person", n_permutations=199)
     assert np.allclose(fit["effect"].values[TOP, 0].mean(), 0.05, rtol=0.15)
     assert abs(fit["effect"].values[~TOP]).mean() < 0.01
     assert (fit["p_family_wise"].values[TOP] < 0.05).mean() > 0.8
@@ -98,27 +98,27 @@ def test_a_planted_growth_is_found_where_it_is_with_its_slope(planted):
     assert np.corrcoef(fit["shape_time"], AGE)[0, 1] > 0.3
     assert fit.attrs["subjects"] == 8
     assert fit.attrs["once"] == 0
-    beside = growth(planted, "age", "person", covariates="sex", n_permutations=199)
+    beside = growth(simulated, "age", "person", covariates="sex", n_permutations=199)
     assert np.array_equal(beside["p_vertex"], fit["p_vertex"])
-    signs = growth(planted, "age", "person", of="normal", variances="unequal", n_permutations=199)
+    signs = growth(simulated, "age", "person", of="normal", variances="unequal", n_permutations=199)
     assert signs.attrs["smallest_p"] == 2**-7
     assert signs["p_value"] <= 0.02
 
 
-def test_the_trajectory_is_the_mean_shape_at_each_time_and_a_mode_that_plays(planted):
-    fit = growth(planted, "age", "person", n_permutations=99)
-    young, old = (statistics.predict(planted, fit, age)["position"].values for age in (0, 4))
+def test_the_trajectory_is_the_mean_shape_at_each_time_and_a_mode_that_plays(simulated):
+    fit = growth(simulated, "age", "person", n_permutations=99)
+    young, old = (statistics.predict(simulated, fit, age)["position"].values for age in (0, 4))
     assert np.allclose(old - young, 4 * fit["effect"])
-    moving = statistics.regression_modes(planted, fit, "age")
+    moving = statistics.regression_modes(simulated, fit, "age")
     assert moving["pca"].sizes["component"] == 1
     assert np.allclose(
         moving["pca"]["deformation"][0], fit["effect"] * fit.attrs["standard_deviation"], atol=1e-6
     )
 
 
-def test_a_field_grows_too(planted):
+def test_a_field_grows_too(simulated):
     values = noise(5, 24, size=0.1)[..., 0] + 0.4 * AGE[:, None] * TOP
-    study = with_carried(planted, values)
+    study = with_carried(simulated, values)
     fit = growth(study, "age", "person", field="thickness", n_permutations=199)
     assert np.allclose(fit["field_effect"].values[TOP], 0.4, atol=0.1)
     assert np.allclose(fit["field_within_effect"].values[TOP], 0.4, atol=0.1)
@@ -166,28 +166,28 @@ def test_changes_of_nothing_are_found_no_more_often_than_said():
     assert np.all(np.mean(found, axis=0) < 0.11)
 
 
-def test_what_is_no_repeated_measure_is_refused_or_told(planted, caplog):
+def test_what_is_no_repeated_measure_is_refused_or_told(simulated, caplog):
     caplog.set_level(logging.WARNING)
-    person = planted["subjects"]["person"].values
+    person = simulated["subjects"]["person"].values
     options = {"n_permutations": 99}
     with pytest.raises(ValueError, match="two subjects that were seen at different times, found 0"):
-        growth(planted, "age", [f"q{i}" for i in range(24)], **options)
+        growth(simulated, "age", [f"q{i}" for i in range(24)], **options)
     with pytest.raises(ValueError, match="needs a time of numbers, found text such as 'f'"):
-        growth(planted, "sex", "person", **options)
+        growth(simulated, "sex", "person", **options)
     with pytest.raises(ValueError, match="24 shapes"):
-        growth(planted, "age", ["a", "b"], **options)
+        growth(simulated, "age", ["a", "b"], **options)
     with pytest.raises(ValueError, match="combination of the covariates"):
-        growth(planted, "age", "person", covariates={"years": AGE * 2}, **options)
+        growth(simulated, "age", "person", covariates={"years": AGE * 2}, **options)
     with pytest.raises(ValueError, match="of must be 'vector' or 'normal'"):
-        growth(planted, "age", "person", of="x", **options)
+        growth(simulated, "age", "person", of="x", **options)
     caplog.clear()
     alone = np.where(np.arange(24) == 23, "alone", person)
-    fit = growth(planted, "age", alone, **options)
+    fit = growth(simulated, "age", alone, **options)
     assert "seen at one time only" in caplog.text
     assert "alone" in caplog.text
     assert fit.attrs["once"] == 1
     unknown = np.where(np.arange(24) == 5, "", person)
-    fit = growth(planted, "age", unknown, **options)
+    fit = growth(simulated, "age", unknown, **options)
     assert fit.attrs["left_out"] == "shape_05"
     assert fit.sizes["shape"] == 23
     caplog.clear()
@@ -195,7 +195,7 @@ def test_what_is_no_repeated_measure_is_refused_or_told(planted, caplog):
         np.arange(24) < 4, np.repeat([0, 1], 12)[np.arange(24) * 3 % 24], np.arange(24) + 9
     )
     few[:4] = [0, 0, 1, 1]
-    growth(planted, "age", few, of="normal", **options)
+    growth(simulated, "age", few, of="normal", **options)
     assert "allow no p value below 0.5" in caplog.text
 
 

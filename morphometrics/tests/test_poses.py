@@ -193,7 +193,7 @@ def test_a_level_is_a_study_for_what_takes_one(tmp_path):
     assert np.allclose(moved, of_level["pca"]["mean_displacement"].values + mean + 2 * step)
     assert statistics.evaluate(of_level)["generalization"].sizes["component"] > 0
     assert s4a.write_registered(of_level, tmp_path)[0].is_file()
-    with pytest.raises(ValueError, match="needs the motion of every shape"):
+    with pytest.raises(ValueError, match="needs the transform of every shape"):
         s4a.write_registered(of_level, tmp_path, frame="shape")
     part = statistics.within(of_level, found["structure_of_vertex"].values == 1)
     assert part["registration"].sizes["vertex"] == len(U)
@@ -266,7 +266,7 @@ def test_warnings_name_the_subject_that_lacks_a_structure(caplog):
     study["structures/left/registration"] = xr.DataTree(left)
     with caplog.at_level(logging.WARNING):
         assert structures(study, **FEW).sizes["shape"] == N - 1
-    assert "left out, as a structure is missing or doubtful: s00 (no left)" in caplog.text
+    assert "left out, as a structure is missing or flagged: s00 (no left)" in caplog.text
 
 
 # ---- new subjects

@@ -254,7 +254,7 @@ def test_a_file_as_slicer_writes_it_is_read_and_written_again(tmp_path, system, 
     later = points([0, 0, 0], positionStatus="undefined")
     theirs = [
         {"type": "Fiducial", "controlPoints": [*points([1.5, -92.25, 30], [61, 4.5, 8]), *later]},
-        {"type": "ClosedCurve", "name": "rim", "controlPoints": points([1, 1, 0], [2, 4, 0])},
+        {"type": "ClosedCurve", "name": "boundary", "controlPoints": points([1, 1, 0], [2, 4, 0])},
         {"type": "ROI", "roiType": "Box", "center": [0, 0, 0], "size": [9, 9, 9]},
     ]
     markups = {"markups": [one | frame for one in theirs]}

@@ -8,7 +8,7 @@ import s4a
 from s4a import cli, write_mesh
 from s4a.geometry.mesh import as_arrays, volume
 from s4a.input.annotations import write_landmarks
-from s4a.input.hands import mirror_image
+from s4a.input.chirality import mirror_image
 from s4a.schema import dataset
 from s4a_morphometrics import (
     analyse_structures,
@@ -19,7 +19,7 @@ from s4a_morphometrics import (
     structures_modes,
     structures_of_new,
 )
-from s4a_morphometrics.mirrored import seen_together, subjects_of_other_hand
+from s4a_morphometrics.mirrored import mirrored_subjects, seen_together
 from s4a_morphometrics.several import Part, named_subjects, parts_of
 from s4a_morphometrics.structures_commands import named_label
 from s4a_morphometrics.synthetic import subjects
@@ -262,7 +262,7 @@ def test_label_volumes_hold_a_structure_in_each_label(tmp_path):
         nibabel.Nifti1Image(labels, affine).to_filename(tmp_path / f"{name}.nii.gz")
     out = tmp_path / "study"
     words = ["run-structures", *(str(tmp_path / f"{name}.nii.gz") for name in "abc")]
-    words += ["--structures", "front=1", "back=2", "--keep-doubtful", "--reflect", "c"]
+    words += ["--structures", "front=1", "back=2", "--include-flagged", "--reflect", "c"]
     assert cli.main([*words, "--out", str(out), *FLAGS]) == 0
     study = open_structures(out)
     assert study["report"]["reflected"].values.tolist() == [False, False, True]
@@ -348,7 +348,7 @@ def test_poses_and_modes_of_mirrored_subjects_are_those_of_the_subjects(
         analyse_structures(one, **SMALL, **options)
         for one, options in (
             (four, {}),
-            (mixed, {"keep_doubtful": True}),
+            (mixed, {"include_flagged": True}),
             (mixed, {"reflect": ODD}),
         )
     )
@@ -362,7 +362,7 @@ def test_poses_and_modes_of_mirrored_subjects_are_those_of_the_subjects(
             np.testing.assert_allclose(result[name], true[name], atol=precision, err_msg=name)
     turn = abs(structures(wrong, n_permutations=9)["pose_rotation"]).max()
     assert turn > 1.5 * abs(true["pose_rotation"]).max()
-    hand = found["report"]["handedness"]
+    hand = found["report"]["mean_chirality"]
     assert (hand.sel(shape=ODD) < -1).all()
     assert (hand.drop_sel(shape=ODD) > 1).all()
 
@@ -397,7 +397,7 @@ def looks(hands):
     names = list("abcd")
     table = np.outer(hands, hands) + np.diag([np.nan] * 4)
     return {
-        name: dataset(hand=row).assign_coords(reference=names)
+        name: dataset(chirality=row).assign_coords(reference=names)
         for name, row in zip(names, table, strict=True)
     }
 
@@ -420,14 +420,14 @@ def looks(hands):
     ],
 )
 def test_structures_say_together_of_which_hand_a_subject_is(left, right, chosen, told):
-    _, names, lines = subjects_of_other_hand({"left": looks(left), "right": looks(right)})
+    _, names, lines = mirrored_subjects({"left": looks(left), "right": looks(right)})
     assert names == chosen
     assert all(word in line for word, line in zip(told, lines, strict=True))
 
 
 def test_hands_add_up_and_one_subject_alone_is_of_no_hand():
     both = {"left": looks([0.9, 0.9, -0.9, 0.9]), "right": looks([0.9, 0.9, -0.9, 0.9])}
-    assert seen_together(both)["a"]["hand"].values[1] == pytest.approx(2 * 0.81 / np.sqrt(2))
-    hand, names, told = subjects_of_other_hand({"left": {}, "right": {}})
+    assert seen_together(both)["a"]["chirality"].values[1] == pytest.approx(2 * 0.81 / np.sqrt(2))
+    hand, names, told = mirrored_subjects({"left": {}, "right": {}})
     assert (hand, names) == ({}, [])
     assert "needs two shapes or more" in told[0]

@@ -13,13 +13,13 @@ from s4a_morphometrics.two_block import two_block
 
 
 @pytest.fixture(scope="module")
-def planted():
+def simulated():
     return field_study()
 
 
-def test_scores_of_a_covariation_are_freed_of_its_covariates(planted):
-    z = np.random.default_rng(1).normal(size=planted["registration"].sizes["shape"])
-    found = covariation(planted, "thickness", covariates={"z": z}, n_permutations=9)
+def test_scores_of_a_covariation_are_freed_of_its_covariates(simulated):
+    z = np.random.default_rng(1).normal(size=simulated["registration"].sizes["shape"])
+    found = covariation(simulated, "thickness", covariates={"z": z}, n_permutations=9)
     for a, b, r in zip(
         found["score"].values.T,
         found["field_score"].values.T,
@@ -44,24 +44,24 @@ def test_two_blocks_are_those_of_the_singular_value_decomposition():
     assert np.isclose(found["rv"], rv)
 
 
-def test_a_field_that_follows_shape_is_found_with_its_pattern(planted):
-    found = covariation(planted, "thickness", covariates=["age", "group"], n_permutations=199)
+def test_a_field_that_follows_shape_is_found_with_its_pattern(simulated):
+    found = covariation(simulated, "thickness", covariates=["age", "group"], n_permutations=199)
     assert found["p_value"] == 0.005
     assert found["rv_p"] == 0.005
     assert abs(np.corrcoef(found["field_pattern"].values[0], HEIGHT)[0, 1]) > 0.9
     along = found["deformation"].values[0, :, 0]
     assert abs(np.corrcoef(along, X[:, 0])[0, 1]) > 0.9
     assert found["field_pattern"].attrs["units"] == "mm"
-    # both follow the planted score with the sign that it has
+    # both follow the simulated score with the sign that it has
     both = (
         np.polyfit(HEIGHT, found["field_pattern"].values[0], 1)[0]
         * np.polyfit(X[:, 0], along, 1)[0]
     )
     assert both > 0
-    moving = covariation_modes(planted, found)
+    moving = covariation_modes(simulated, found)
     assert np.allclose(moving["pca"]["deformation"], found["deformation"])
     with pytest.raises(ValueError, match="n_components needs a number from 1 to"):
-        covariation(planted, "thickness", n_components=99)
+        covariation(simulated, "thickness", n_components=99)
 
 
 def test_fields_of_noise_are_told_to_follow_shape_no_more_often_than_said():

@@ -446,11 +446,11 @@ def _test_scores(sample, model, n_components):
     scores, coordinates = scores_of(sample, n_components)
     statistic, p = model.test(scores)
     if model.variances == "equal":
-        _tell_unequal_variances(coordinates, model.x, sample)
+        _report_unequal_variances(coordinates, model.x, sample)
     return dataset({"components": scores.shape[1]}, statistic=statistic, p_value=p)
 
 
-def _tell_unequal_variances(coordinates, x, sample):
+def _report_unequal_variances(coordinates, x, sample):
     """Say where shapes scatter differently between the groups, or with the variable."""
     distance, p = scatter_test(coordinates, x, covariates=sample.Z)
     if p >= UNEQUAL:

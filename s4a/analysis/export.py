@@ -11,8 +11,8 @@ import xarray as xr
 from s4a.analysis.inputs import registration_of
 from s4a.analysis.transfer import image_in_shape
 from s4a.geometry.mesh import as_arrays
+from s4a.input.chirality import MIRROR
 from s4a.input.files import write_mesh
-from s4a.input.hands import MIRROR
 from s4a.study import store
 
 FORMATS = {"ply": ".ply", "vtk": ".vtk", "obj": ".obj", "npz": ".npz", "gifti": ".gii"}
@@ -102,7 +102,7 @@ def write_registered(
         )
     if frame == "shape" and "rotation" not in registration:
         raise ValueError(
-            "frame='shape' needs the motion of every shape, and this study has none: write it in "
+            "frame='shape' needs the transform of every shape, and this study has none: write in "
             "the frame of the template"
         )
     folder = Path(folder)

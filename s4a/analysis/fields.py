@@ -57,8 +57,8 @@ def with_field(
     Returns
     -------
     DataTree
-        With ``/fields/<name>``: ``carried_field(shape, vertex)`` on the vertices of the template,
-        NaN where over half of the weight is on NaN, and for shapes without the field.
+        With ``/fields/<name>``: ``transferred_field(shape, vertex)`` on the vertices of the
+        template, NaN where over half of the weight is on NaN, and for shapes without the field.
 
     Raises
     ------
@@ -75,7 +75,7 @@ def with_field(
     >>> meshes = study["original"].children.items()
     >>> height = {name: mesh["position"].values[:, 2] for name, mesh in meshes}
     >>> study = s4a.with_field(study, "height", height, unit="mm")
-    >>> study["fields/height/carried_field"].sizes["shape"]
+    >>> study["fields/height/transferred_field"].sizes["shape"]
     6
     """
     if slug(name) != name:
@@ -103,7 +103,7 @@ def with_field(
             field = of_vertices(given[one], mesh, f"the field {name!r} of {one}")
             carried[i] = on_template(study, one, field)
     template = registration.attrs.get("template", "")
-    of_all = dataset({"template": template}, carried_field=carried).assign_coords(shape=shapes)
+    of_all = dataset({"template": template}, transferred_field=carried).assign_coords(shape=shapes)
     of_all = in_unit(of_all, unit, of=FIELD_UNIT)
     nodes = {node.path: node.to_dataset(inherit=False) for node in study.subtree}
     return xr.DataTree.from_dict(nodes | {f"/fields/{name}": of_all}, name=study.name)
@@ -165,7 +165,7 @@ def write_field(study: xr.DataTree, name: str, folder: Path | str) -> Path:
     ... )
     >>> study = with_field(study, "noise", list(np.random.default_rng(0).normal(size=(3, 200))))
     >>> _ = write_field(study, "noise", store)
-    >>> s4a.open_study(store)["fields/noise/carried_field"].shape
+    >>> s4a.open_study(store)["fields/noise/transferred_field"].shape
     (3, 200)
     """
     if "fields" not in study.children or name not in study["fields"].children:
@@ -175,5 +175,5 @@ def write_field(study: xr.DataTree, name: str, folder: Path | str) -> Path:
     keys = [registered[one].attrs.get("task_key", "") for one in field["shape"].values.tolist()]
     path = Path(folder) / "fields" / f"{name}.nc"
     with lock(folder) as claim:
-        write(field, path, task_key(field["carried_field"].values, *keys), keys, claim)
+        write(field, path, task_key(field["transferred_field"].values, *keys), keys, claim)
     return path

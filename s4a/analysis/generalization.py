@@ -1,4 +1,4 @@
-"""True generalization (6.1): each shape left out, and found anew by the study of the others."""
+"""True generalization (6.1): each shape left out, and found again by the study of the others."""
 
 import numpy as np
 import xarray as xr
@@ -64,14 +64,14 @@ def latent_of(study: xr.DataTree, names: list[str]) -> xr.Dataset:
         latent_eigenvalue=latent["latent_eigenvalue"].values,
         area_difference=stacked("area_difference"),
         conformal_difference=stacked("conformal_difference"),
-        distance_to_median=stacked("distance_to_median"),
+        distance_to_limit=stacked("distance_to_limit"),
     ).assign_coords(shape=names)
 
 
 def _register_anew(nodes, latent, rotation, options, n_jobs):
     """Nodes of ``/registration`` onto the shape nearest to the limit shape (eq. 5)."""
     names = latent["shape"].values.tolist()
-    median = str(latent["distance_to_median"].idxmin().item())
+    median = str(latent["distance_to_limit"].idxmin().item())
     shapes = {
         n: Shape(
             nodes[f"original/{n}"].load(), nodes[f"coarse/{n}"].load(), **options.of("projection")
@@ -100,9 +100,11 @@ def _register_anew(nodes, latent, rotation, options, n_jobs):
 def _register(shape, template, bases, rotation, options):
     """One registration of a shape of a study to another template, its latent basis as it is."""
     with threadpool_limits(1):
-        motion = realign(shape.low.cloud, template.low.cloud, (rotation, np.zeros(3)))
-        how = options.how
-        return from_latent(shape, template, bases, motion, how=how, **options.of("registration"))
+        transform = realign(shape.low.cloud, template.low.cloud, (rotation, np.zeros(3)))
+        dense_match = options.dense_match
+        return from_latent(
+            shape, template, bases, transform, dense_match=dense_match, **options.of("registration")
+        )
 
 
 def _errors_of(study, name, n_points, seed, n_jobs):
@@ -138,7 +140,7 @@ def generalization(
     seed: int = 0,
     rng: RNG | None = None,
 ) -> xr.Dataset:
-    """Generalization with correspondences found anew, each shape new to the study of the others.
+    """Generalization with correspondences found again, each shape new to the study of the others.
 
     :func:`s4a.analysis.statistics.evaluate` leaves a shape out of the modes alone, which is
     optimistic: its correspondences were made with it.  Here it is also left out of the

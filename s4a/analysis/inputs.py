@@ -110,7 +110,7 @@ def field_of(study: xr.DataTree, name: str, shapes: Sequence[str]) -> tuple[np.n
             f"the study has no field {name!r}; it has {listed(there) or 'none'}: "
             "s4a.with_field, or s4a fields, carries one"
         )
-    values = study["fields"][name].to_dataset()["carried_field"]
+    values = study["fields"][name].to_dataset()["transferred_field"]
     return values.reindex(shape=list(shapes)).values, str(values.attrs["units"])
 
 
@@ -168,7 +168,7 @@ def _field_everywhere(values, field):
 
 
 def all_registered(study: xr.DataTree) -> xr.Dataset:
-    """``/registration`` of a study, doubtful shapes too; ValueError where it has none."""
+    """``/registration`` of a study, flagged shapes too; ValueError where it has none."""
     if "registration" not in study:
         raise ValueError(
             f"a registered study is needed; this one has {', '.join(study.children) or 'no nodes'}"
@@ -179,7 +179,7 @@ def all_registered(study: xr.DataTree) -> xr.Dataset:
 def registration_of(study: xr.DataTree) -> xr.Dataset:
     """``/registration`` of the shapes that enter modes and statistics.
 
-    Those are all but the doubtful ones, see :func:`with_doubtful`.
+    Those are all but the flagged ones, see :func:`with_flagged`.
 
     Raises
     ------
@@ -187,17 +187,17 @@ def registration_of(study: xr.DataTree) -> xr.Dataset:
         When the study has none.
     """
     registration = all_registered(study)
-    doubtful = left_out(study)
-    if not doubtful:
+    flagged = left_out(study)
+    if not flagged:
         return registration
     names = registration["shape"].values.tolist()
-    return registration.sel(shape=[name for name in names if name not in doubtful])
+    return registration.sel(shape=[name for name in names if name not in flagged])
 
 
-def with_doubtful(study: xr.DataTree) -> xr.DataTree:
-    """A study whose doubtful shapes enter modes and statistics; the study given stays as it is.
+def with_flagged(study: xr.DataTree) -> xr.DataTree:
+    """A study whose flagged shapes enter modes and statistics; the study given stays as it is.
 
-    What ``keep_doubtful=True`` of :func:`s4a.analyse` makes, without another run.
+    What ``include_flagged=True`` of :func:`s4a.analyse` makes, without another run.
 
     Parameters
     ----------
@@ -216,17 +216,19 @@ def with_doubtful(study: xr.DataTree) -> xr.DataTree:
 
     Examples
     --------
-    With the ``study`` of six small brains, none of which is doubtful:
+    With the ``study`` of six small brains, none of which is flagged:
 
     >>> import s4a
     >>> study = s4a.synthetic.example_study()
-    >>> s4a.statistics.with_doubtful(study)["pca"].sizes["shape"]
+    >>> s4a.statistics.with_flagged(study)["pca"].sizes["shape"]
     6
     """
     nodes = {node.path: node.to_dataset(inherit=False) for node in study.subtree}
     if "report" in study.children:
         nodes["/report"] = nodes["/report"].assign_attrs(
-            with_options(nodes["/report"].attrs, {"keep_doubtful": True, "doubtful": "apart"})
+            with_options(
+                nodes["/report"].attrs, {"include_flagged": True, "quality_control": "exclude"}
+            )
         )
     registration = all_registered(study)
     template = registration.attrs.get("template", "")
@@ -239,7 +241,7 @@ def with_doubtful(study: xr.DataTree) -> xr.DataTree:
 def displacements_of(study: xr.DataTree) -> tuple[xr.Dataset, np.ndarray, np.ndarray]:
     """:func:`registration_of`, its displacements ``(s, n, 3)``, and vertex areas of sum 1 ``(n,)``.
 
-    The log names the shapes that are left out as doubtful.
+    The log names the shapes that are left out as flagged.
 
     Raises
     ------
@@ -248,11 +250,11 @@ def displacements_of(study: xr.DataTree) -> tuple[xr.Dataset, np.ndarray, np.nda
     """
     registration = registration_of(study)
     require(registration, "displacement", "position", "corner_vertex", what="registration")
-    doubtful = left_out(study)
-    if doubtful:
-        log.warning("doubtful and left out: %s; see with_doubtful", ", ".join(doubtful))
+    flagged = left_out(study)
+    if flagged:
+        log.warning("flagged and left out: %s; see with_flagged", ", ".join(flagged))
     if registration.sizes["shape"] < 4:
-        more = f", and {len(doubtful)} doubtful: {', '.join(doubtful)}" if doubtful else ""
+        more = f", and {len(flagged)} flagged: {', '.join(flagged)}" if flagged else ""
         raise ValueError(
             f"statistics need at least 4 shapes, found {registration.sizes['shape']}{more}"
         )

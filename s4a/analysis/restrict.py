@@ -216,7 +216,7 @@ def with_size(study: xr.DataTree) -> xr.DataTree:
     Parameters
     ----------
     study : DataTree
-        Of :func:`s4a.analyse` with ``scale=True``.
+        Of :func:`s4a.analyse` with ``remove_size=True``.
 
     Returns
     -------
@@ -235,13 +235,13 @@ def with_size(study: xr.DataTree) -> xr.DataTree:
     >>> import s4a
     >>> s4a.statistics.with_size(s4a.synthetic.example_study())
     Traceback (most recent call last):
-    ValueError: size was not taken out of these displacements: it is in them (scale=False)
+    ValueError: size was not taken out of these displacements: it is in them (remove_size=False)
     """
     registration = registration_of(study)
     s = registration["scale"].values
     if abs(s - 1).max() < 1e-9:
         raise ValueError(
-            "size was not taken out of these displacements: it is in them (scale=False)"
+            "size was not taken out of these displacements: it is in them (remove_size=False)"
         )
     X, T = as_arrays(registration)
     area = vertex_areas(X, T)
@@ -250,7 +250,9 @@ def with_size(study: xr.DataTree) -> xr.DataTree:
     sized = (X + d - center) / s[:, None, None] + center - X
     part = _displaced(registration, sized.astype(d.dtype))
     part["scale"] = registration["scale"].copy(data=np.ones_like(s))
-    if "translation" in registration:  # of the motion x -> R x + t' that leaves sizes as they are
+    if (
+        "translation" in registration
+    ):  # of the transform x -> R x + t' that leaves sizes as they are
         t = registration["translation"]
         part["translation"] = t.copy(data=(t.values - center) / s[:, None] + center)
     return _study(study, part)

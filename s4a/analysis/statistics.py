@@ -32,7 +32,7 @@ from s4a.analysis.effects import (
     scores_of,
 )
 from s4a.analysis.generalization import generalization
-from s4a.analysis.inputs import Values, displacements_of, group_sizes, sample_of, with_doubtful
+from s4a.analysis.inputs import Values, displacements_of, group_sizes, sample_of, with_flagged
 from s4a.analysis.model import KEPT, count_components, evaluate, leave_one_out, sample
 from s4a.analysis.permutation import Model, check_permutations, indicators
 from s4a.analysis.restrict import with_size, within, without
@@ -54,7 +54,7 @@ __all__ = [
     "regression",
     "regression_modes",
     "sample",
-    "with_doubtful",
+    "with_flagged",
     "with_size",
     "within",
     "without",

@@ -79,7 +79,7 @@ class Link:
         place = closest_facing_point(self.image, normals, self.Y, self.S)
         return interpolation_matrix(self.S, *place, len(self.Y)), self.confidence
 
-    def carry_down(self, triangle: np.ndarray, weights: np.ndarray) -> Places:
+    def transfer_down(self, triangle: np.ndarray, weights: np.ndarray) -> Places:
         """Places on the shape of points on the template."""
         place = (self.T, triangle, weights)
         P = interpolate(self.image, *place)
@@ -87,7 +87,7 @@ class Link:
         confidence = interpolate(self.confidence[:, None], *place)[:, 0]
         return *closest_facing_point(P, N, self.Y, self.S), confidence
 
-    def carry_up(self, triangle: np.ndarray, weights: np.ndarray) -> Places:
+    def transfer_up(self, triangle: np.ndarray, weights: np.ndarray) -> Places:
         """Places on the template of points on the shape."""
         P = interpolate(self.Y, self.S, triangle, weights)
         N = interpolate(vertex_normals(self.Y, self.S), self.S, triangle, weights)
@@ -131,7 +131,7 @@ def matrix_along(route: Route, n: int) -> tuple[sp.csr_matrix, np.ndarray]:
     return W, confidence
 
 
-def carry_along(route: Route, triangle: np.ndarray, weights: np.ndarray) -> Places:
+def transfer_along(route: Route, triangle: np.ndarray, weights: np.ndarray) -> Places:
     """Places on the last mesh of points on the first."""
     confidence = np.ones(len(triangle))
     for step, way in route:
@@ -252,10 +252,10 @@ def _shape_of(mesh, options):
 
 
 def _match_both(shape, template, options):
-    """The shape registered to the template and, with `both`, the template to the shape."""
+    """The shape registered to the template and, with `bidirectional`, the template to the shape."""
     with threadpool_limits(1):
         forth = match_shapes(shape, template, options)[0]
-        return forth, match_shapes(template, shape, options)[0] if options.both else None
+        return forth, match_shapes(template, shape, options)[0] if options.bidirectional else None
 
 
 def register_pairs(
@@ -279,16 +279,16 @@ def register_pairs(
     n_jobs : int, optional
         As in joblib; the result does not depend on it.
     preset : {None, "paper", "fast"}
-        As of :func:`s4a.match_pair`; ``"paper"`` sets both=False, too, and blur=0 of
+        As of :func:`s4a.match_pair`; ``"paper"`` sets bidirectional=False, too, and blur=0 of
         :func:`s4a.transfer_labels`.
     **options
-        Those of :func:`s4a.match_pair`, and ``both``: whether each pair is matched both ways, as by
-        default; transfer then takes the mean of both.  See :class:`s4a.Options`.
+        Those of :func:`s4a.match_pair`, and ``bidirectional``: whether each pair is matched both
+        ways, as by default; transfer then takes the mean of both.  See :class:`s4a.Options`.
 
     Returns
     -------
     DataTree
-        ``/original``, ``/registration`` and, with `both`, ``/reverse``.
+        ``/original``, ``/registration`` and, with `bidirectional`, ``/reverse``.
 
     Raises
     ------
@@ -318,7 +318,11 @@ def register_pairs(
     inside, *others = parallel(delayed(_shape_of)(mesh, settings) for mesh in meshes.values())
     pairs = parallel(delayed(_match_both)(shape, inside, settings) for shape in others)
     forth = {n: pair[0] for n, pair in zip(shapes, pairs, strict=True)}
-    back = {n: pair[1] for n, pair in zip(shapes, pairs, strict=True)} if settings.both else {}
+    back = (
+        {n: pair[1] for n, pair in zip(shapes, pairs, strict=True)}
+        if settings.bidirectional
+        else {}
+    )
     study = _study_of(name, template, shapes, forth, back)
     study["registration"].attrs["preset"] = settings.preset or ""
     return study
@@ -526,7 +530,7 @@ def transfer_labels(
         W, confidence = blend_routes(routes, len(label))
         vote, value = votes_of(W, label)
         winner = elect(vote, value)
-        if blur and any(routes):  # to the source itself there is no way, nor doubt
+        if blur and any(routes):  # to the source itself there is no way, nor flag
             vote = spread_votes(vote, *as_arrays(target), blur * uncertainty(confidence))
             spread = elect(vote, value)
             lost = np.setdiff1d(winner, spread)
@@ -636,7 +640,7 @@ def transfer_landmarks(
     DataTree
         For every target ``landmark_name``, ``landmark_position(landmark, xyz)`` on its surface, in
         its coordinates, ``landmark_triangle``, ``landmark_barycentric(landmark, corner)``,
-        ``landmark_confidence`` and, where there are several routes, ``landmark_spread``, the
+        ``landmark_confidence`` and, where there are several routes, ``landmark_disagreement``, the
         largest distance of one from their mean; with curves ``landmark_curve`` and
         ``landmark_closed``, and no name for the points in between.
 
@@ -679,15 +683,15 @@ def transfer_landmarks(
     named = marked[[name for name in NAMED if name in marked]]
     carried = {}
     for name, target, routes in each:
-        carried[name] = _carry_landmarks(marked, target, routes).merge(named)
+        carried[name] = _transfer_landmarks(marked, target, routes).merge(named)
     return xr.DataTree.from_dict(carried)
 
 
-def _carry_landmarks(marked, target, routes):
+def _transfer_landmarks(marked, target, routes):
     """Landmarks at the mean of where the routes lead, weighted by confidence, on the surface."""
     X, T = as_arrays(target)
     start = marked["landmark_triangle"].values, marked["landmark_barycentric"].values
-    ends = [carry_along(route, *start) for route in routes]
+    ends = [transfer_along(route, *start) for route in routes]
     confidence = np.stack([own for *_, own in ends])  # (routes, p)
     triangle, weights, _ = ends[0]
     spread = {}
@@ -696,7 +700,7 @@ def _carry_landmarks(marked, target, routes):
         share = confidence + 1e-9
         mean = np.einsum("rp,rpx->px", share, points) / share.sum(0)[:, None]
         triangle, weights = closest_point(mean, X, T)
-        spread["landmark_spread"] = np.linalg.norm(points - mean, axis=2).max(0)
+        spread["landmark_disagreement"] = np.linalg.norm(points - mean, axis=2).max(0)
     return dataset(
         landmark_position=interpolate(X, T, triangle, weights),
         landmark_triangle=triangle.astype(np.int32),

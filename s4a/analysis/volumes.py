@@ -15,7 +15,7 @@ from s4a.analysis.transfer import transfer_labels
 from s4a.geometry.compiled import igl
 from s4a.geometry.mesh import as_arrays
 from s4a.input.annotations import MIRROR as BETWEEN_RAS_AND_LPS
-from s4a.input.hands import in_file
+from s4a.input.chirality import in_file
 from s4a.input.labels import read_grid, voxels_marked
 from s4a.schema import unit_of
 

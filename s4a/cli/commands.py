@@ -76,7 +76,7 @@ def run(
     full = within(out, "report.txt")
     with on_cluster(cluster), lines_or_bars():
         study = s4a.analyse([*paths], store=out, **options)
-    again = shlex.join(["s4a", *(word for word in words if word != "--keep-doubtful")])
+    again = shlex.join(["s4a", *(word for word in words if word != "--include-flagged")])
     report = study["report"].to_dataset()
     lines = [tables.report_table(report), *tables.cost_lines(report)]
     full.write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -168,7 +168,7 @@ def demo(
     errors = s4a.evaluation.accuracy.accuracy(study, image, n_jobs=options["n_jobs"])
     write("", tables.error_table(errors))
     if "pca" in study:
-        write(tables.planted_line(study["pca"].to_dataset(), truth.to_dataset()))
+        write(tables.true_line(study["pca"].to_dataset(), truth.to_dataset()))
     page = Path(out) / "study.html"
     s4a.write_page(study, page, title="Synthetic brains")
     write(f"\npage: {page}")
@@ -241,7 +241,7 @@ def statistics(
     table: str | None = None,
     variances: Literal["equal", "unequal"] = "equal",
     recompute: bool = False,
-    keep_doubtful: bool = False,
+    include_flagged: bool = False,
     label: list[int | str] | None = None,
     labels: str | None = None,
     least_confidence: float = 0.0,
@@ -273,9 +273,9 @@ def statistics(
     variances
         of the shapes around what is tested; unequal where groups scatter differently
     recompute
-        generalization with correspondences found anew (slow)
-    keep_doubtful
-        take doubtful shapes in
+        generalization with correspondences found again (slow)
+    include_flagged
+        take flagged shapes in
     label : LABEL
         only vertices of the template with these labels
     labels : FILE
@@ -285,7 +285,7 @@ def statistics(
     without : COLUMN
         nuisances: what lies along their regression is taken from all shapes
     size_back
-        give size back to shapes of which --scale took it out
+        give size back to shapes of which --remove-size took it out
     permutations : N
         of every test (default: 9999, at every vertex 999, of classes 99)
     out : DIR
@@ -296,8 +296,8 @@ def statistics(
     if labels and not label:
         raise ValueError("--labels is where --label looks: give --label LABEL..., or leave it out")
     if recompute and (size_back or without or label or least_confidence):
-        raise ValueError("--recompute finds whole shapes anew: leave it out, or take all of them")
-    tree, out = study_to_test(study, out, table, keep_doubtful)
+        raise ValueError("--recompute finds whole shapes again: leave it out, or take all of them")
+    tree, out = study_to_test(study, out, table, include_flagged)
     tree = restricted(tree, size_back, without, label, labels, least_confidence)
     options = {"covariates": covariates, "field": field, "seed": seed, "variances": variances}
     results = tests_of(tree, group, variable, permutations, options)  # first: these may be refused
@@ -332,16 +332,16 @@ def write_moving(study: "xr.DataTree", regression: "xr.Dataset", name: str, out:
 
 
 def study_to_test(
-    study: str, out: str | None, table: str | None, keep_doubtful: bool
+    study: str, out: str | None, table: str | None, include_flagged: bool
 ) -> "tuple[xr.DataTree, str]":
     """The study with the table and the shapes that are asked for, and the folder of results."""
     tree, out = s4a.open_study(study), out or str(within(study, "statistics"))
     tree = s4a.input.subjects.with_table(tree, table) if table else tree
-    tree = s4a.statistics.with_doubtful(tree) if keep_doubtful else tree
-    if doubtful := s4a.study.tree.left_out(tree):
+    tree = s4a.statistics.with_flagged(tree) if include_flagged else tree
+    if flagged := s4a.study.tree.left_out(tree):
         write(
-            f"{len(doubtful)} doubtful shapes are left out, --keep-doubtful takes them in: "
-            f"{s4a.input.plausibility.listed(doubtful, 200)}\n"
+            f"{len(flagged)} flagged shapes are left out, --include-flagged takes them in: "
+            f"{s4a.input.plausibility.listed(flagged, 200)}\n"
         )
     return tree, out
 
@@ -397,7 +397,7 @@ def tests_of(
     of_classes = {name: options[name] for name in ("field", "seed")}
     if permutations is not None:
         options = options | {"n_permutations": permutations}
-        of_classes["n_permutations"] = min(permutations, 99)  # each trains anew
+        of_classes["n_permutations"] = min(permutations, 99)  # each trains again
     results = {}
     if group:
         results["group"] = s4a.statistics.group_test(study, group, **options)
@@ -428,7 +428,7 @@ def fields(
     """
     tree = s4a.with_field(s4a.open_study(study), name, folder, unit=unit, partial=partial)
     path = s4a.analysis.fields.write_field(tree, name, study)
-    field = tree["fields"][name].to_dataset()["carried_field"]
+    field = tree["fields"][name].to_dataset()["transferred_field"]
     known = np.isfinite(field.values)
     write(
         f"{name} of {known.any(1).sum()} of {len(known)} shapes, "
@@ -572,7 +572,7 @@ def transferred_rows(
         if "landmarks" in carried:
             landmarks = carried["landmarks"][name].to_dataset()
             place = landmarks["landmark_position"]
-            X = s4a.input.hands.in_file(mesh, place.values)
+            X = s4a.input.chirality.in_file(mesh, place.values)
             landmarks["landmark_position"] = place.copy(data=X)
             s4a.input.annotations.write_landmarks(out / f"{stem}.landmarks.csv", landmarks)
             of_points = tables.landmark_cells(landmarks)
@@ -595,7 +595,7 @@ def file_points(mesh: "xr.Dataset") -> "np.ndarray":
     path, label = mesh.attrs.get("path") or "", mesh.attrs.get("label")
     if Path(path).is_file():
         read = s4a.input.labels.read_volume(path, label) if label else s4a.read_mesh(path)
-        return s4a.input.hands.in_file(mesh, read[0])
+        return s4a.input.chirality.in_file(mesh, read[0])
     points = np.full((mesh.sizes["file_vertex_index"], 3), np.nan)
     points[mesh["file_vertex"].values] = mesh["position"].values
     return points
@@ -622,7 +622,7 @@ def compare(
     collection : PATH
         Table 2 on these folders, globs or mesh files
     methods : METHOD
-        of kNN, ZO, FMAP+ZO, SCALABLE, RE-MATCH, RE-MATCH lifted, registered, registered surface
+        of kNN, ZO, FMAP+ZO, SCALABLE, RE-MATCH, RE-MATCH refined, registered, registered surface
     truth : FILE
         for each target, NPY or text: per vertex of its file that of the source's (from 0; -1:
         none), or x, y, z
@@ -642,13 +642,20 @@ def compare(
                 "--keep"
             )
         found = compare_collection(collection, methods, n_pairs, options)
-        names = [f"{way}, {how}" for way in found["way"].values for how in found["how"].values]
+        names = [
+            f"{way}, {how}"
+            for way in found["algorithm"].values
+            for how in found["dense_match"].values
+        ]
         seconds = found["collection_seconds"].values.reshape(len(names), -1)
         text, result = tables.collection_table(found), found
     else:
         result = compare_pairs(paths or [], truth, landmarks, options | {"methods": methods}, keep)
         found = result["metrics"].to_dataset() if keep else result
-        names, seconds = found["way"].values.tolist(), found["block_seconds"].mean("pair").values
+        names, seconds = (
+            found["algorithm"].values.tolist(),
+            found["block_seconds"].mean("pair").values,
+        )
         blocks = tables.block_table(names, found["block"].values.tolist(), seconds)
         text = f"{tables.comparison_table(found)}\n\n{blocks}"
     folder = new_folder(out)
@@ -692,7 +699,9 @@ def compare_pairs(
         raise ValueError(
             f"--truth needs a file for each of the {len(files)} targets, found {len(truth)}"
         )
-    known = {name: s4a.compare.read_truth(f) for name, f in zip(names, truth or [], strict=False)}
+    known = {
+        name: s4a.compare.read_ground_truth(f) for name, f in zip(names, truth or [], strict=False)
+    }
     return s4a.compare.pairs(
         source,
         dict(zip(names, files, strict=True)),

@@ -33,7 +33,7 @@ COUNTS = {
 # metric: (head of its column, factor, digits)
 METRICS = {
     "geodesic_error": ("error %", 100, 3),
-    "straight_error": ("straight %", 100, 3),
+    "euclidean_error": ("straight %", 100, 3),
     "chamfer": ("Chamfer %", 100, 3),
     "hausdorff": ("Hausdorff %", 100, 2),
     "dirichlet": ("Dirichlet", 1, 2),
@@ -155,7 +155,7 @@ def verify_lines(found: "xr.Dataset") -> str:
     counts = {state: states.count(state) for state in ["whole", *states]}
     line = f"{len(states)} files: {', '.join(f'{n} {state}' for state, n in counts.items())}"
     if count_faults(found):
-        line += "; the same `s4a run` again makes what is wrong anew, and nothing else"
+        line += "; the same `s4a run` again makes what is wrong again, and nothing else"
     rows = zip(found["file"].values, states, found["fault"].values, strict=True)
     return "\n".join(
         [line, *(f"  {file}, {state}: {fault}" for file, state, fault in rows if fault)]
@@ -228,7 +228,7 @@ def result_lines(study: "xr.DataTree") -> list[str]:
     """The median shape, how the shapes are registered, what the first modes explain."""
     registration = s4a.analysis.inputs.registration_of(study)
     latent = study["latent"].to_dataset()
-    distance = latent["distance_to_median"].sortby(latent["distance_to_median"])[:3]
+    distance = latent["distance_to_limit"].sortby(latent["distance_to_limit"])[:3]
     median, template, *nearest = s4a.input.plausibility.shortened(
         [latent.attrs["median"], registration.attrs["template"], *distance["shape"].values], LONGEST
     )
@@ -269,20 +269,20 @@ def place_lines(study: str, report: str) -> list[str]:
 
 
 def decision_lines(report: "xr.Dataset", again: str = "s4a run FOLDER --out STUDY") -> list[str]:
-    """Doubtful shapes by what is doubtful, what to do about it, and the commands that do it."""
-    n = int((report["status"] == "doubtful").sum())
+    """Flagged shapes by what is flagged, what to do about it, and the commands that do it."""
+    n = int((report["status"] == "flagged").sum())
     if not n:
         return []
-    kept = s4a.options.kept_options(report).get("keep_doubtful")
+    kept = s4a.options.kept_options(report).get("include_flagged")
     become = "taken in as they are" if kept else "kept apart: in no modes, no statistics, no median"
-    lines = [f"TO DECIDE: {n} of {report.sizes['shape']} shapes are doubtful, and {become}"]
+    lines = [f"TO DECIDE: {n} of {report.sizes['shape']} shapes are flagged, and {become}"]
     lines += kind_lines(s4a.input.plausibility.decisions(report))
     if kept:
-        return [*lines, *command_lines("to keep them apart:", again, "", "--keep-doubtful"), ""]
+        return [*lines, *command_lines("to keep them apart:", again, "", "--include-flagged"), ""]
     return [
         *lines,
         "  to leave one out: take its file away and run again; nothing else changes",
-        *command_lines("to take all of them in:", again, "--keep-doubtful"),
+        *command_lines("to take all of them in:", again, "--include-flagged"),
         "",
     ]
 
@@ -302,10 +302,10 @@ def command_lines(what: str, command: str, flag: str = "", without: str = "") ->
     Examples
     --------
     >>> from s4a.cli.tables import command_lines
-    >>> command_lines("to take all of them in:", "s4a run d --out s", "--keep-doubtful")
-    ['  to take all of them in: s4a run d --out s --keep-doubtful']
-    >>> command_lines("to take them in:", "s4a run " + 400 * "a.ply ", "--keep-doubtful")
-    ['  to take them in: the same command with --keep-doubtful']
+    >>> command_lines("to take all of them in:", "s4a run d --out s", "--include-flagged")
+    ['  to take all of them in: s4a run d --out s --include-flagged']
+    >>> command_lines("to take them in:", "s4a run " + 400 * "a.ply ", "--include-flagged")
+    ['  to take them in: the same command with --include-flagged']
     """
     words = [shlex.quote(word).replace(" ", "\0") for word in shlex.split(f"{command} {flag}")]
     lines = wrapped(f"  {what} {' '.join(words)}", SCREEN - 2, "", " " * 6)
@@ -383,7 +383,7 @@ def remark_lines(report: "xr.Dataset") -> list[str]:
 def status_line(report: "xr.Dataset") -> str:
     """How many shapes there are of each status."""
     status = report["status"].values
-    kinds = ("ok", "repaired", "doubtful", "excluded")
+    kinds = ("ok", "repaired", "flagged", "excluded")
     return f"{len(status)} shapes: {', '.join(f'{(status == k).sum()} {k}' for k in kinds)}"
 
 
@@ -397,25 +397,27 @@ def registration_cells(registration: "xr.Dataset") -> list[str]:
 def landmark_cells(landmarks: "xr.Dataset") -> list[str]:
     """Mean confidence and spread of landmarks that were carried over."""
     cells = [f"{landmarks['landmark_confidence'].mean().item():.2f}", "-"]
-    if "landmark_spread" in landmarks:
-        cells[1] = f"{landmarks['landmark_spread'].mean().item():.3g}"
+    if "landmark_disagreement" in landmarks:
+        cells[1] = f"{landmarks['landmark_disagreement'].mean().item():.3g}"
     return cells
 
 
-def planted_line(modes: "xr.Dataset", truth: "xr.Dataset") -> str:
+def true_line(modes: "xr.Dataset", truth: "xr.Dataset") -> str:
     """How well the scores of the modes follow those that made synthetic shapes."""
-    planted = truth["planted_score"].sel(shape=modes["shape"]).values  # (s, q)
+    simulated = truth["true_score"].sel(shape=modes["shape"]).values  # (s, q)
     score = modes["score"].values  # (s, c)
-    n = min(planted.shape[1], score.shape[1])
-    correlation = np.abs(np.corrcoef(planted[:, :n].T, score[:, :n].T)).diagonal(n)  # (n,)
+    n = min(simulated.shape[1], score.shape[1])
+    correlation = np.abs(np.corrcoef(simulated[:, :n].T, score[:, :n].T)).diagonal(n)  # (n,)
     words = ", ".join(f"{r:.3f}" for r in correlation)
-    return f"correlation of planted and recovered scores: {words}"
+    return f"correlation of simulated and recovered scores: {words}"
 
 
 def error_table(errors: "xr.Dataset") -> str:
     """Mean errors of :func:`s4a.evaluation.accuracy.accuracy` over the shapes, a row per method."""
     mean = 100 * errors[["error", "geodesic_error"]].mean("shape")
-    rows = zip(*(mean[name].values for name in ("way", "error", "geodesic_error")), strict=True)
+    rows = zip(
+        *(mean[name].values for name in ("algorithm", "error", "geodesic_error")), strict=True
+    )
     return table(rows, ["mean error, % of sqrt(area)", "straight line", "along edges"], ".3f")
 
 
@@ -459,7 +461,7 @@ def significance(whole: "xr.Dataset", where: "xr.Dataset", name: str, study: "xr
         f"{name}{groups}: p = {whole['p_value'].item():.3g} over the whole shape, "
         f"the smallest that can be reached is {attrs['smallest_p']:.2g}"
     ]
-    said = {"covariates": "accounted for", "left_out": "left out, doubtful or without a value"}
+    said = {"covariates": "accounted for", "left_out": "left out, flagged or without a value"}
     lines += [f"  {words}: {attrs[key]}" for key, words in said.items() if attrs[key]]
     corrections = {"p_family_wise": "family-wise", "p_false_discovery": "false discovery rate"}
     for variable, words in corrections.items():
@@ -487,7 +489,7 @@ def inserted_table(inserted: "xr.DataTree") -> str:
         if shape["status"].item() == "excluded":
             cells = ["-"] * 6 + [f"excluded: {shape['reason'].item()}"]
         else:
-            distance = inserted["latent"]["distance_to_median"].sel(shape=name).item()
+            distance = inserted["latent"]["distance_to_limit"].sel(shape=name).item()
             cells = [*registration_cells(registration.sel(shape=name)), f"{distance:.4f}"]
             pca = inserted.get("pca")
             cells += ["-"] * 3 if pca is None else score_cells(pca.to_dataset().sel(shape=name))
@@ -518,8 +520,8 @@ def comparison_table(pairs: "xr.Dataset") -> str:
     mean = pairs.mean("pair")
     columns = {name: column for name, column in METRICS.items() if name in mean}
     rows = []
-    for name in mean["way"].values:
-        method = mean.sel(way=name)
+    for name in mean["algorithm"].values:
+        method = mean.sel(algorithm=name)
         cells = [
             f"{factor * method[metric].item():.{digits}f}"
             for metric, (_, factor, digits) in columns.items()
@@ -537,8 +539,8 @@ def block_table(methods: Sequence[str], blocks: Sequence[str], seconds: "np.ndar
 def collection_table(result: "xr.Dataset") -> str:
     """Table 2: mean Chamfer distance to the template, CPU seconds by block, the median shape."""
     rows = []
-    for way, how in itertools.product(result["way"].values, result["how"].values):
-        method = result.sel(way=way, how=how)
+    for way, how in itertools.product(result["algorithm"].values, result["dense_match"].values):
+        method = result.sel(algorithm=way, dense_match=how)
         seconds = method["collection_seconds"].values
         chamfer = 100 * method["collection_chamfer"].mean().item()
         median = method["median_shape"].item()

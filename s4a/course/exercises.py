@@ -219,7 +219,7 @@ def _displacement_by_age(fit, years):
 # The right answer, or a function of the arguments that follow the answer in the cell.  It returns
 # the right answer, or a function of the answer that returns True if the answer is right.
 EXERCISES: dict[str, Any] = {
-    "00.1": lambda study: study["latent"]["distance_to_median"].idxmin().item(),
+    "00.1": lambda study: study["latent"]["distance_to_limit"].idxmin().item(),
     "00.2": lambda study: study["pca"]["explained_variance_ratio"].values[:2].sum(),
     "00.3": lambda study: abs(study["pca"]["score"][:, 0]).idxmax().item(),
     "01.1": lambda report: report["components"].sel(shape="brain_01").item(),
@@ -252,7 +252,7 @@ EXERCISES: dict[str, Any] = {
         lambda mean: np.shape(mean) == D.shape[1:] and np.allclose(mean, D.mean(0), atol=1e-6)
     ),
     "07.2": lambda: lambda d: abs(d) < 1e-12,
-    "07.3": lambda latent: latent["distance_to_median"].values,
+    "07.3": lambda latent: latent["distance_to_limit"].values,
     "08.1": 10**10,
     "08.2": lambda: lambda difference: 0 <= difference < 1e-6,
     "08.3": lambda match, n: 1 - np.unique(match).size / n,
@@ -263,7 +263,7 @@ EXERCISES: dict[str, Any] = {
     "09.3": lambda: lambda product: abs(product) < 1e-3,
     "10.1": lambda X: np.linalg.norm(X - X[0], axis=1).mean(),
     "10.2": lambda mean: (
-        mean["seconds"].sel(way="FMAP+ZO") / mean["seconds"].sel(way="RE-MATCH")
+        mean["seconds"].sel(algorithm="FMAP+ZO") / mean["seconds"].sel(algorithm="RE-MATCH")
     ).item(),
     "10.3": lambda n: lambda match: _is_derangement(match, n),
     "11.1": lambda labels, target: _dice(labels, target["label"].values, "cerebellum left"),

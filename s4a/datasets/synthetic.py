@@ -2,7 +2,7 @@
 
 One reference brain is a smooth embedding of the unit sphere; the folds are part of it.  Every shape
 is that brain moved by a smooth diffeomorphism of space, x -> x + sum_m s_m w_m(x) + individual
-noise + tumour, and then by a rigid motion. The fields are sums of localised slides and turns,
+noise + tumour, and then by a rigid transform. The fields are sums of localised slides and turns,
 exp(-|x - c|^2 / 2 w^2) (push + turn x (x - c)), so that :func:`position` gives the exact place of
 every reference point (a point of the unit sphere) on every shape. Millimetres, and RAS: x to the
 right, y to the front, z up.
@@ -253,8 +253,8 @@ def _fields(x, centre, width, push, turn):
 def _generators(n_modes):
     """Centres and widths of all parts, and their push and turn by each generator ``(g, parts, 6)``.
 
-    The generators are the six rigid motions, of one part of infinite width, and the modes as they
-    are designed.
+    The generators are the six rigid transforms, of one part of infinite width, and the modes as
+    they are designed.
     """
     centre, width = [np.zeros(3)], [np.inf]
     moves = []  # mode, push and turn of each part after the first
@@ -274,11 +274,11 @@ def _generators(n_modes):
     return np.array(centre), np.array(width), rows
 
 
-def _planted_modes(n_modes):
+def _true_modes(n_modes):
     """Centres and widths of all parts, and each mode's push and turn of them.
 
-    On the reference brain the modes are orthogonal to rigid motions and to each other: the Cholesky
-    factor of the generators' Gram matrix is that of Gram and Schmidt.
+    On the reference brain the modes are orthogonal to rigid transforms and to each other: the
+    Cholesky factor of the generators' Gram matrix is that of Gram and Schmidt.
     """
     if not 0 <= n_modes <= len(MODES):
         raise ValueError(f"n_modes needs a number from 0 to {len(MODES)}, found {n_modes}")
@@ -293,7 +293,7 @@ def _planted_modes(n_modes):
     return centre, width, rows[..., :3], rows[..., 3:]
 
 
-def _planted_scores(n, n_modes, rng):
+def _true_scores(n, n_modes, rng):
     """Truncated normal scores ``(n, n_modes)``; standard and uncorrelated of shapes enough."""
     while True:
         score = ndtri(rng.uniform(ndtr(-2.5), ndtr(2.5), (n, n_modes)))
@@ -305,7 +305,7 @@ def _planted_scores(n, n_modes, rng):
             return score
 
 
-def _own_parts(n, rng):
+def _noise_regions(n, rng):
     """Centres, widths and pushes ``(n, 9, ...)`` of each shape's noise and, last, of its tumour."""
     centre = reference_brain(_random_directions(rng, n * 9)).reshape(n, 9, 3)
     width = np.concatenate([rng.uniform(16, 28, (n, 8)), rng.uniform(10, 14, (n, 1))], axis=1)
@@ -322,7 +322,7 @@ def _own_parts(n, rng):
 
 
 def plant(n: int = 12, seed: int = 0, *, n_modes: int = 3, rng: RNG | None = None) -> xr.Dataset:
-    """The planted parameters of a population: all that :func:`position` needs, without any mesh.
+    """The simulated parameters of a population: all that :func:`position` needs, without any mesh.
 
     Parameters
     ----------
@@ -330,12 +330,12 @@ def plant(n: int = 12, seed: int = 0, *, n_modes: int = 3, rng: RNG | None = Non
         Number of shapes.
     seed, rng : see :mod:`s4a.seeds`
     n_modes : int
-        Number of planted modes.
+        Number of simulated modes.
 
     Returns
     -------
     Dataset
-        ``planted_score(shape, planted_mode)``, the parts of the modes, of each shape's noise and
+        ``true_score(shape, true_mode)``, the parts of the modes, of each shape's noise and
         tumour (the last part; its push is zero where there is none), its pose, and the landmarks'
         reference points.
 
@@ -348,16 +348,16 @@ def plant(n: int = 12, seed: int = 0, *, n_modes: int = 3, rng: RNG | None = Non
     --------
     >>> import s4a
     >>> truth = s4a.synthetic.plant(6, seed=1)
-    >>> truth["planted_score"].std("shape").values.round(6).tolist()
+    >>> truth["true_score"].std("shape").values.round(6).tolist()
     [1.0, 1.0, 1.0]
     """
     if n < 1:
         raise ValueError(f"a population needs n of 1 or more shapes, found {n}")
     seed = seed_of(seed, rng)
     draw = np.random.default_rng([seed, 0])
-    centre, width, push, turn = _planted_modes(n_modes)
-    score = _planted_scores(n, n_modes, draw)
-    own_centre, own_width, own_push = _own_parts(n, draw)
+    centre, width, push, turn = _true_modes(n_modes)
+    score = _true_scores(n, n_modes, draw)
+    noise_centre, noise_width, noise_translation = _noise_regions(n, draw)
     pose = Rotation.from_rotvec(
         _random_directions(draw, n) * np.deg2rad(draw.uniform(0, _POSE[0], (n, 1)))
     )
@@ -369,14 +369,14 @@ def plant(n: int = 12, seed: int = 0, *, n_modes: int = 3, rng: RNG | None = Non
             "noise_rms": _NOISE_RMS,
             "unit": "mm",
         },
-        planted_score=score,
-        planted_centre=centre,
-        planted_width=width,
-        planted_push=push,
-        planted_turn=turn,
-        own_centre=own_centre,
-        own_width=own_width,
-        own_push=own_push,
+        true_score=score,
+        true_centre=centre,
+        true_width=width,
+        true_translation=push,
+        true_rotation=turn,
+        noise_centre=noise_centre,
+        noise_width=noise_width,
+        noise_translation=noise_translation,
         rotation=pose.as_matrix(),
         translation=draw.normal(0, _POSE[1], (n, 3)),
         landmark_name=np.array(list(LANDMARKS)),
@@ -413,11 +413,13 @@ def position(truth: xr.Dataset | xr.DataTree, shape: str, reference_point: Array
     own = truth.isel(shape=_index(truth, shape))
     value = {name: v.values for name, v in own.data_vars.items()}
     x = reference_brain(reference_point)
-    push = np.tensordot(value["planted_score"], value["planted_push"], 1)  # (parts, 3)
-    turn = np.tensordot(value["planted_score"], value["planted_turn"], 1)
-    own_push = value["own_push"]
-    moved = x + _fields(x, value["planted_centre"], value["planted_width"], push, turn)
-    moved += _fields(x, value["own_centre"], value["own_width"], own_push, 0 * own_push)
+    push = np.tensordot(value["true_score"], value["true_translation"], 1)  # (parts, 3)
+    turn = np.tensordot(value["true_score"], value["true_rotation"], 1)
+    noise_translation = value["noise_translation"]
+    moved = x + _fields(x, value["true_centre"], value["true_width"], push, turn)
+    moved += _fields(
+        x, value["noise_centre"], value["noise_width"], noise_translation, 0 * noise_translation
+    )
     return moved @ value["rotation"].T + value["translation"]
 
 
@@ -563,7 +565,7 @@ def brains(
     n_modes: int = 3,
     rng: RNG | None = None,
 ) -> xr.DataTree:
-    """A population of brains with planted modes and exact correspondences.
+    """A population of brains with simulated modes and exact correspondences.
 
     Parameters
     ----------
@@ -576,7 +578,7 @@ def brains(
         Whether the meshes are those of ``_raw_brain``, cleaned; ``/raw/<shape>`` then holds them
         as they were.
     n_modes : int
-        Number of planted modes.
+        Number of simulated modes.
 
     Returns
     -------

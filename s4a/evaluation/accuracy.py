@@ -15,7 +15,7 @@ from s4a.evaluation.metrics import geodesic_error
 from s4a.geometry.align import align
 from s4a.geometry.mesh import as_arrays
 from s4a.method import fmap
-from s4a.method.first_map import map_after_motion, nearest_after_motion
+from s4a.method.initial_map import map_after_alignment, nearest_after_alignment
 from s4a.method.register import match_functions
 from s4a.method.shape import Shape
 from s4a.study.processes import workers
@@ -38,8 +38,8 @@ def simple_matches(source: Shape, target: Shape, *, k_init: int = 20) -> dict[st
     """
     M, N = source.low, target.low
     R, t, _ = align(M.X, M.area, N.X, N.area)
-    near = nearest_after_motion(source.full, target.full, (R, t))
-    C = map_after_motion(M, N, (R, t), k_init=k_init).C
+    near = nearest_after_alignment(source.full, target.full, (R, t))
+    C = map_after_alignment(M, N, (R, t), k_init=k_init).C
     k = min(M.k, N.k)
     C, _ = fmap.zoomout(M, N, C, k)
     match, *_ = match_functions(source, target, M.Phi[:, :k] @ C.T, N.Phi[:, :k])
@@ -95,9 +95,9 @@ def accuracy(
     Returns
     -------
     xarray.Dataset
-        ``error(way, shape)`` in a straight line and ``geodesic_error(way, shape)``, both as shares
-        of sqrt(area).  A matched vertex cannot be nearer to the truth than the sampling of the
-        shape allows; the registered surface is not bound to vertices.
+        ``error(algorithm, shape)`` in a straight line and ``geodesic_error(algorithm, shape)``,
+        both as shares of sqrt(area).  A matched vertex cannot be nearer to the truth than the
+        sampling of the shape allows; the registered surface is not bound to vertices.
     """
     registration = study["registration"].to_dataset()
     template = registration.attrs["template"]
@@ -122,7 +122,7 @@ def accuracy(
     both = np.array(found).reshape(len(names), 4, 2).T  # (measure, method, shape)
     note = {"units": "share of sqrt(area)"}
     return xr.Dataset(
-        {"error": (("way", "shape"), both[0], note)}
-        | {"geodesic_error": (("way", "shape"), both[1], note)},
+        {"error": (("algorithm", "shape"), both[0], note)}
+        | {"geodesic_error": (("algorithm", "shape"), both[1], note)},
         {"way": [ICP, ZOOMOUT, MATCH, SURFACE], "shape": names},
     )

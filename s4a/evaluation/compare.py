@@ -30,12 +30,12 @@ from s4a.evaluation.methods import (
     Pair,
     Spaces,
 )
-from s4a.geometry.align import align, motion_between, realign
+from s4a.geometry.align import align, realign, relative_transform
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.input.collection import read_shape, read_shapes
 from s4a.input.raw import content, npy, shown, text_of
 from s4a.method import latent, median, network
-from s4a.method.first_map import map_after_motion
+from s4a.method.initial_map import map_after_alignment
 from s4a.method.register import latent_functions, log_area_ratio, match_functions, match_low
 from s4a.method.shape import Basis, Shape
 from s4a.options import PRESETS as STUDY_PRESETS
@@ -48,12 +48,12 @@ log = logging.getLogger(__name__)
 __all__ = ["COLLECTION_METHODS", "METHODS", "collection", "pair", "pairs"]
 
 COLLECTION_METHODS = ("SCALABLE", "RE-MATCH")
-COLLECTION_BLOCKS = BLOCKS[0], "basis and first maps", "consistent ZoomOut", BLOCKS[-1]
-HOW = ("standard", "ours")
-# rounds of RE-MATCH lifted, and first maps of all methods
+COLLECTION_BLOCKS = BLOCKS[0], "basis and initial maps", "consistent ZoomOut", BLOCKS[-1]
+DENSE_MATCHES = ("fmap", "latent")
+# iterations of RE-MATCH refined, and initial maps of all methods
 PRESETS: dict[str | None, dict[str, Any]] = {
-    None: {"sharpen": 2, "init": "landmarks"},
-    "paper": {"sharpen": 0, "init": "landmarks"},
+    None: {"full_resolution_iterations": 2, "init": "landmarks"},
+    "paper": {"full_resolution_iterations": 0, "init": "landmarks"},
 }
 
 
@@ -73,7 +73,7 @@ def checked_methods(methods: Sequence[str] | None, preset: str | None) -> Sequen
     if preset == "paper" and added:
         raise ValueError(
             f"preset 'paper' has the methods {', '.join(PAPER_METHODS)}; "
-            f"found {', '.join(added)}: leave out one of both"
+            f"found {', '.join(added)}: leave out one of the two"
         )
     return methods
 
@@ -102,7 +102,7 @@ def in_mesh(vertices: np.ndarray, mesh: xr.Dataset) -> np.ndarray:
     return np.where(vertices >= 0, became[np.maximum(vertices, 0)], -1)
 
 
-def truth_in_meshes(truth: np.ndarray, source: xr.Dataset, target: xr.Dataset) -> np.ndarray:
+def ground_truth_in_meshes(truth: np.ndarray, source: xr.Dataset, target: xr.Dataset) -> np.ndarray:
     """Truth over the rows of the target's file.
 
     Which are rows of the source's file or positions, for the meshes.
@@ -124,7 +124,7 @@ def truth_in_meshes(truth: np.ndarray, source: xr.Dataset, target: xr.Dataset) -
     return truth if truth.ndim == 2 else in_mesh(truth, source)
 
 
-def read_truth(path: Path | str) -> np.ndarray:
+def read_ground_truth(path: Path | str) -> np.ndarray:
     """Truth from a file, for the vertices of the target's file.
 
     NPY, or text with a number or three in each row.
@@ -170,7 +170,7 @@ def pair(
     >>> import s4a
     >>> ball = s4a.synthetic.ellipsoid(600)
     >>> found = s4a.compare.pair(ball, ball, methods=["kNN"], truth=np.arange(600))
-    >>> float(found["geodesic_error"].sel(way="kNN").item())
+    >>> float(found["geodesic_error"].sel(algorithm="kNN").item())
     0.0
     """
     for name, value in (("truth", truth), ("landmarks", landmarks)):
@@ -190,7 +190,7 @@ def pairs(
     k: int = 100,
     step: int = 5,
     preset: str | None = None,
-    sharpen: int | None = None,
+    full_resolution_iterations: int | None = None,
     init: str | None = None,
     n_geodesic: int = 1000,
     keep: bool = False,
@@ -204,10 +204,11 @@ def pairs(
     SCALABLE: the same in the space of :mod:`s4a.method.scalable`.  RE-MATCH: the same on the
     low-resolution mesh, and eq. 4 with U Phi, as ``s4a.match_pair(..., preset="paper")``.
 
-    Ours are RE-MATCH lifted: with the eigenfunctions of :mod:`s4a.method.lift` in the place of
-    U Phi, and the last two rounds of ZoomOut look among all vertices of the source; registered:
-    the default of ``s4a.match_pair`` after RE-MATCH, of which the matched vertices are compared, as
-    of all others; and registered surface: the same, of which the surface is.
+    Ours are RE-MATCH refined: with the eigenfunctions of :mod:`s4a.method.refined_eigenfunctions`
+    in the place of U Phi, and the last two iterations of ZoomOut look among all vertices of the
+    source; registered: the default of ``s4a.match_pair`` after RE-MATCH, of which the matched
+    vertices are compared, as of all others; and registered surface: the same, of which the surface
+    is.
 
     Parameters
     ----------
@@ -235,14 +236,14 @@ def pairs(
         the time of that block of ZO and FMAP+ZO; on a child of 60,000 vertices in two poses they
         end 7 to 9 % farther from the truth.
     preset : {None, "paper"}
-        ``"paper"`` leaves out our methods and sets sharpen=0 and init="landmarks"; another value
-        of these is refused.
-    sharpen : int, optional
-        Rounds of ZoomOut of RE-MATCH lifted that look among all vertices of the source, 2 by
+        ``"paper"`` leaves out our methods and sets full_resolution_iterations=0 and
+        init="landmarks"; another value of these is refused.
+    full_resolution_iterations : int, optional
+        Rounds of ZoomOut of RE-MATCH refined that look among all vertices of the source, 2 by
         default.
     init : {"landmarks", "descriptors"}, optional
-        First maps of all methods but kNN and ZO from heat kernels around landmarks (default), as in
-        :func:`s4a.match_pair` with the preset, or from wave kernels of the shapes and around
+        Initial maps of all methods but kNN and ZO from heat kernels around landmarks (default), as
+        in :func:`s4a.match_pair` with the preset, or from wave kernels of the shapes and around
         landmarks, as pyFM has them.
     n_geodesic : int
         See :func:`s4a.evaluation.metrics.evaluate`.
@@ -255,9 +256,9 @@ def pairs(
     -------
     Dataset, or DataTree with `keep`
         Every metric of :func:`s4a.evaluation.metrics.evaluate` over ``(way, pair)``, ``way`` the
-        method, and ``block_seconds(way, pair, block)``, the blocks of Fig. 3, in CPU seconds of one
-        core.  What two methods share, as the alignment or a basis, is made once and charged to
-        both; the alignment only to those that use it, which with given landmarks are kNN, ZO and
+        method, and ``block_seconds(algorithm, pair, block)``, the blocks of Fig. 3, in CPU seconds
+        of one core.  What two methods share, as the alignment or a basis, is made once and charged
+        to both; the alignment only to those that use it, which with given landmarks are kNN, ZO and
         registered.  The attribute ``note`` says where k had to be reduced.
 
         With `keep` this is ``/metrics`` of a tree, whose ``/source`` is the source's mesh and
@@ -277,9 +278,11 @@ def pairs(
     >>> found["chamfer"].sel(pair="itself", way="kNN").item()
     0.0
     """
-    settings = apply_preset(preset, {"sharpen": sharpen, "init": init}, PRESETS)
+    settings = apply_preset(
+        preset, {"full_resolution_iterations": full_resolution_iterations, "init": init}, PRESETS
+    )
     seed = seed_of(seed, rng)
-    check_count("sharpen", settings["sharpen"])
+    check_count("full_resolution_iterations", settings["full_resolution_iterations"])
     check_choice("init", settings["init"], INITS)
     check_switch("keep", keep)
     methods = checked_methods(methods, preset)
@@ -299,7 +302,7 @@ def pairs(
             marks = None if landmarks is None else landmarks_of(landmarks[name], M, N, in_memory)
             true = None if truth is None else truth[name]
             if true is not None and not in_memory:
-                true = truth_in_meshes(true, M.mesh, N.mesh)
+                true = ground_truth_in_meshes(true, M.mesh, N.mesh)
             both = Pair(M, N, marks, **options)
             row, outcomes = metrics_of_pair(
                 both, methods, load_source + load_target, true, n_geodesic
@@ -309,7 +312,7 @@ def pairs(
             if keep:
                 nodes[f"pairs/{name}"] = kept(M.mesh, N.mesh, outcomes, true)
     table = xr.concat(rows, "pair", combine_attrs="drop_conflicts")
-    table = table.assign_coords(pair=list(targets)).transpose("way", "pair", ...)
+    table = table.assign_coords(pair=list(targets)).transpose("algorithm", "pair", ...)
     table = table.assign_attrs(options | {"n_coarse": n_coarse, "seed": seed} | told(notes))
     if not keep:
         return table
@@ -344,31 +347,36 @@ def kept(
     Returns
     -------
     Dataset
-        ``way_match(way, vertex)``, ``way_image(way, vertex, xyz)``, where the vertices of the
-        target lie on the source, in its unit, ``way_reverse(way, source_vertex)``, the match the
-        other way, and ``way_area(way, vertex)``, the log area ratio of
-        :func:`s4a.method.register.log_area_ratio`; where a method of them has maps, ``way_fmap(way,
-        mode_target, mode_source)`` and ``way_fmap_initial``, NaN for the others; with truth
-        ``true_position(vertex, xyz)``, ``true_match(vertex)`` and ``way_error(way, vertex)``, the
-        distance to it in a straight line as a share of sqrt(area), NaN where it is unknown.
+        ``algorithm_match(algorithm, vertex)``, ``algorithm_image(algorithm, vertex, xyz)``, where
+        the vertices of the target lie on the source, in its unit, ``algorithm_reverse(algorithm,
+        source_vertex)``, the match the other way, and ``algorithm_area_change(algorithm, vertex)``,
+        the log area ratio of :func:`s4a.method.register.log_area_ratio`; where a method of them has
+        maps, ``algorithm_fmap(algorithm, eigenpair_target, eigenpair_source)`` and
+        ``algorithm_fmap_initial``, NaN for the others; with truth ``true_position(vertex, xyz)``,
+        ``true_match(vertex)`` and ``algorithm_error(algorithm, vertex)``, the distance to it in a
+        straight line as a share of sqrt(area), NaN where it is unknown.
     """
     (X, T), (Y, S), each = as_arrays(source), as_arrays(target), outcomes.values()
     images = [X[one.match] if one.image is None else one.image for one in each]
     found: dict[str, ArrayLike] = {
-        "way_match": np.stack([one.match for one in each]).astype(np.int32),
-        "way_reverse": np.stack([one.reverse for one in each]).astype(np.int32),
-        "way_image": np.stack(images).astype(np.float32),
-        "way_area": np.stack([log_area_ratio(image, Y, S) for image in images]).astype(np.float32),
+        "algorithm_match": np.stack([one.match for one in each]).astype(np.int32),
+        "algorithm_reverse": np.stack([one.reverse for one in each]).astype(np.int32),
+        "algorithm_image": np.stack(images).astype(np.float32),
+        "algorithm_area_change": np.stack([log_area_ratio(image, Y, S) for image in images]).astype(
+            np.float32
+        ),
     }
     if any(one.fmap is not None for one in each):
-        found["way_fmap"] = stacked([one.fmap for one in each])
-        found["way_fmap_initial"] = stacked([one.first for one in each])
+        found["algorithm_fmap"] = stacked([one.fmap for one in each])
+        found["algorithm_fmap_initial"] = stacked([one.first for one in each])
     if truth is not None:
         true, vertex = metrics.true_positions(truth, X, len(Y))
         errors = np.linalg.norm(np.stack(images) - true, axis=2) / np.sqrt(vertex_areas(X, T).sum())
         found |= {"true_position": true, "true_match": vertex.astype(np.int32)}
-        found["way_error"] = errors.astype(np.float32)
-    return without_coords(target).merge(dataset(None, **found)).assign_coords(way=list(outcomes))
+        found["algorithm_error"] = errors.astype(np.float32)
+    return (
+        without_coords(target).merge(dataset(None, **found)).assign_coords(algorithm=list(outcomes))
+    )
 
 
 def stacked(maps: list[np.ndarray | None]) -> np.ndarray:
@@ -425,11 +433,11 @@ def metrics_of_pair(
         rows.append(metrics.evaluate(M, N, one.match, **found, **options))
         spent = {**one.seconds, BLOCKS[0]: load}
         seconds.append([spent.get(block, 0.0) for block in BLOCKS])
-    table = xr.concat(rows, "way", combine_attrs="drop_conflicts")
+    table = xr.concat(rows, "algorithm", combine_attrs="drop_conflicts")
     table["block_seconds"] = variable("block_seconds", np.array(seconds)[:, None]).isel(pair=0)
     least = min((len(one.fmap) for one in both.spectral.values()), default=both.k)
     table.attrs |= note_on_k(both.k, least)
-    return table.assign_coords(way=list(methods), block=list(BLOCKS)), outcomes
+    return table.assign_coords(algorithm=list(methods), block=list(BLOCKS)), outcomes
 
 
 def collection(
@@ -443,8 +451,8 @@ def collection(
     step: int = 5,
     preset: str | None = None,
     init: str | None = None,
-    n_spread: int | None = None,
-    wide: int | None = None,
+    n_samples: int | None = None,
+    dense_iterations: int | None = None,
     seed: int = 0,
     rng: RNG | None = None,
 ) -> xr.Dataset:
@@ -461,19 +469,21 @@ def collection(
     n_coarse, n_pairs, k_init, k, step, seed, rng
         See :func:`s4a.analyse`.
     preset : {None, "paper"}
-        ``"paper"`` sets init="landmarks", n_spread=0 and wide=0; another value of these is refused.
-    init, n_spread, wide
-        First maps, those of nearest neighbours after alignment by default, and Consistent ZoomOut,
-        see :func:`s4a.analyse`.
+        ``"paper"`` sets init="landmarks", n_samples=0 and dense_iterations=0; another value of
+        these is refused.
+    init, n_samples, dense_iterations
+        Initial maps, those of nearest neighbours after alignment by default, and Consistent
+        ZoomOut, see :func:`s4a.analyse`.
 
     Returns
     -------
     Dataset
-        ``collection_chamfer(way, how, shape)``, eq. 9 between each shape and the image of the
-        median shape, the template, as a share of sqrt(area), NaN for the template;
-        ``collection_seconds(way, how, block)``, CPU seconds of one core, full resolution alone
-        differing by ``how``; ``median_shape(way)`` and ``distance_to_median(way, shape)``.  The
-        attribute ``note`` says where k had to be reduced.
+        ``collection_chamfer(algorithm, dense_match, shape)``, eq. 9 between each shape and the
+        image of the median shape, the template, as a share of sqrt(area), NaN for the template;
+        ``collection_seconds(algorithm, dense_match, block)``, CPU seconds of one core, full
+        resolution alone differing by ``dense_match``; ``median_shape(algorithm)`` and
+        ``distance_to_limit(algorithm, shape)``.  The attribute ``note`` says where k had to be
+        reduced.
 
     Raises
     ------
@@ -487,10 +497,14 @@ def collection(
     >>> options = {"n_coarse": 100, "n_pairs": 6, "k_init": 6, "k": 10}
     >>> found = s4a.compare.collection(brains, methods=["RE-MATCH"], **options)
     >>> found["collection_chamfer"].dims
-    ('way', 'how', 'shape')
+    ('algorithm', 'dense_match', 'shape')
     """
     check_some(methods, COLLECTION_METHODS)
-    given: dict[str, Any] = {"init": init, "n_spread": n_spread, "wide": wide}
+    given: dict[str, Any] = {
+        "init": init,
+        "n_samples": n_samples,
+        "dense_iterations": dense_iterations,
+    }
     presets = {name: {key: STUDY_PRESETS[name][key] for key in given} for name in (None, "paper")}
     given = apply_preset(preset, given, presets) | {"seed": seed_of(seed, rng)}
     given |= {"n_coarse": n_coarse, "n_pairs": n_pairs, "k_init": k_init, "k": k, "step": step}
@@ -505,7 +519,7 @@ def collection(
         bar = tqdm(methods, desc="collection")
         rows = [one_collection(meshes, way, load, options) for way in bar]
     notes = {way: row.attrs.pop("note", "") for way, row in zip(methods, rows, strict=True)}
-    table = xr.concat(rows, "way").assign_coords(way=list(methods))
+    table = xr.concat(rows, "algorithm").assign_coords(algorithm=list(methods))
     return table.assign_attrs(told(notes))
 
 
@@ -519,10 +533,14 @@ def one_collection(
     shapes = [space.local if way == "SCALABLE" else space.coarse for space in spaces]
     bases = [shape.low for shape in shapes]
     k = min(options.k, *(basis.k for basis in bases))
-    source, target, maps = first_maps(bases, options)
+    source, target, maps = initial_maps(bases, options)
     shared = [load, time.process_time() - begin]
-    samples = [basis.spread_vertices(options.n_spread) for basis in bases]
-    growth: dict[str, Any] = {"step": options.step, "samples": samples, "wide": options.wide}
+    samples = [basis.sample_vertices_of(options.n_samples) for basis in bases]
+    growth: dict[str, Any] = {
+        "step": options.step,
+        "samples": samples,
+        "dense_iterations": options.dense_iterations,
+    }
     ends = source, target, k
     *_, Y, low = clock("latent", latent.consistent_zoomout, bases, maps, *ends, **growth)
     found = dataset(latent_basis=Y, latent_eigenvalue=low).assign_coords(shape=names)
@@ -531,7 +549,8 @@ def one_collection(
     shared.append(clock["latent"])
     template = names.index(found.attrs["median"])
     chamfer, full = zip(
-        *(chamfer_to_template(spaces, shapes, Y, template, how) for how in HOW), strict=True
+        *(chamfer_to_template(spaces, shapes, Y, template, how) for how in DENSE_MATCHES),
+        strict=True,
     )
     measures = {
         "collection_chamfer": np.stack(chamfer),
@@ -539,37 +558,39 @@ def one_collection(
         "median_shape": np.array(names[template]),
     }
     table = xr.Dataset(
-        {name: variable(name, values[None]).isel(way=0) for name, values in measures.items()}
-        | {"distance_to_median": found["distance_to_median"].variable},
+        {name: variable(name, values[None]).isel(algorithm=0) for name, values in measures.items()}
+        | {"distance_to_limit": found["distance_to_limit"].variable},
         attrs=note_on_k(options.k, k),
     )
-    return table.assign_coords(how=list(HOW), block=list(COLLECTION_BLOCKS), shape=names)
+    return table.assign_coords(
+        dense_match=list(DENSE_MATCHES), block=list(COLLECTION_BLOCKS), shape=names
+    )
 
 
-def first_maps(bases: list[Basis], options: Options) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """First maps of a network, both ways: sources and targets ``(p,)``, maps ``(p, k, k)``."""
+def initial_maps(bases: list[Basis], options: Options) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Initial maps of a network, both ways: sources and targets ``(p,)``, maps ``(p, k, k)``."""
     k_init = min(options.k_init, *(basis.k for basis in bases))
     distance = network.spectral_distance([basis.eigenvalue[:k_init] for basis in bases])
     reference = bases[int(np.argmin(distance.sum(1)))]
     still = np.eye(3), np.zeros(3)
-    motions = [
+    transforms = [
         still if M is reference else align(M.X, M.area, reference.X, reference.area)[:2]
         for M in bases
     ]
     settings: dict[str, Any] = {"k_init": k_init, "init": options.init}
-    settings["n_spread"] = options.n_spread
+    settings["n_samples"] = options.n_samples
     ends, maps = [], []
     for i, j in network.choose_pairs(distance, options.n_pairs):
         M, N = bases[i], bases[j]
-        R, t = realign(M.cloud, N.cloud, motion_between(motions[i], motions[j]))
-        maps.append(map_after_motion(M, N, (R, t), **settings).C)
-        maps.append(map_after_motion(N, M, (R.T, -R.T @ t), **settings).C)
+        R, t = realign(M.cloud, N.cloud, relative_transform(transforms[i], transforms[j]))
+        maps.append(map_after_alignment(M, N, (R, t), **settings).C)
+        maps.append(map_after_alignment(N, M, (R.T, -R.T @ t), **settings).C)
         ends += [(i, j), (j, i)]
     return *np.array(ends).T, np.stack(maps)
 
 
 def chamfer_to_template(
-    spaces: list[Spaces], shapes: list[Shape], Y: np.ndarray, template: int, how: str
+    spaces: list[Spaces], shapes: list[Shape], Y: np.ndarray, template: int, dense_match: str
 ) -> tuple[np.ndarray, float]:
     """Eq. 9 of each shape and the image of the template ``(n,)``, NaN for it; CPU seconds."""
     chamfer = np.full(len(shapes), np.nan)
@@ -579,7 +600,11 @@ def chamfer_to_template(
             continue
         begin = time.process_time()
         ends = shape, shapes[template], (Y[i], Y[template])
-        functions = match_low(*ends, how=how)[1] if how == HOW[0] else latent_functions(*ends)
+        functions = (
+            match_low(*ends, dense_match=dense_match)[1]
+            if dense_match == DENSE_MATCHES[0]
+            else latent_functions(*ends)
+        )
         match, *_ = match_functions(shape, shapes[template], *functions)
         seconds += time.process_time() - begin
         chamfer[i] = metrics.chamfer(space.X, space.X[match])

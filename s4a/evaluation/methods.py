@@ -2,8 +2,8 @@
 
 Every method works on a :class:`s4a.method.shape.Shape`: ZO and FMAP+ZO on one whose functions are
 the eigenfunctions of the dense mesh, SCALABLE on that of :mod:`s4a.method.scalable`, RE-MATCH on
-the coarse mesh with U Phi, as in the paper.  Ours are RE-MATCH lifted, with functions of
-:mod:`s4a.method.lift`, and registered, which is RE-MATCH and the registration of
+the coarse mesh with U Phi, as in the paper.  Ours are RE-MATCH refined, with functions of
+:mod:`s4a.method.refined_eigenfunctions`, and registered, which is RE-MATCH and the registration of
 :mod:`s4a.method.register` after it; its image are the matched vertices, as of all, and that of
 registered surface is the smooth surface on which they were looked up, which lies between them.
 Times are CPU seconds of one core, so that a busy machine changes them little.
@@ -20,12 +20,11 @@ import numpy as np
 import xarray as xr
 from scipy.spatial import cKDTree
 
-from s4a.geometry.align import Motion, align, farthest_points
+from s4a.geometry.align import RigidTransform, align, farthest_points
 from s4a.geometry.closest import match_surfaces
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.method import fmap
-from s4a.method.first_map import landmarks_after_motion, nearest_after_motion
-from s4a.method.lift import SPARE, lifted
+from s4a.method.initial_map import landmarks_after_alignment, nearest_after_alignment
 from s4a.method.nearest import (
     as_candidates,
     as_queries,
@@ -33,22 +32,23 @@ from s4a.method.nearest import (
     nearest_in_cells,
     nearest_rows,
 )
-from s4a.method.register import find_candidates, register_surface, sharpen_map
+from s4a.method.refined_eigenfunctions import SPARE, with_refined_eigenfunctions
+from s4a.method.register import find_candidates, refine_at_full_resolution, register_surface
 from s4a.method.remesh import coarsen, laplacian
 from s4a.method.scalable import local_space, spectral_space
 from s4a.method.shape import Basis, Shape
 from s4a.method.spectral import eigenpairs, spectrum
 
 PAPER_METHODS = ("kNN", "ZO", "FMAP+ZO", "SCALABLE", "RE-MATCH")
-OUR_METHODS = ("RE-MATCH lifted", "registered", "registered surface")
+OUR_METHODS = ("RE-MATCH refined", "registered", "registered surface")
 METHODS = (*PAPER_METHODS, *OUR_METHODS)
 # the shape of Spaces whose functions a method compares; registration begins with RE-MATCH's match
 KINDS = {"ZO": "dense", "FMAP+ZO": "dense", "SCALABLE": "local", "RE-MATCH": "coarse"}
-KINDS |= {"RE-MATCH lifted": "lifted", "registered": "coarse", "registered surface": "coarse"}
+KINDS |= {"RE-MATCH refined": "lifted", "registered": "coarse", "registered surface": "coarse"}
 # of Fig. 3
 BLOCKS = ("load and clean", "align", "sample", "basis", "map", "refine", "full resolution")
-N_SPREAD = 3000  # points of each shape by which it is aligned, and that group dense searches
-INITS = ("landmarks", "descriptors")  # fits of first maps
+N_SAMPLES = 3000  # points of each shape by which it is aligned, and that group dense searches
+INITS = ("landmarks", "descriptors")  # fits of initial maps
 
 Matches = tuple[np.ndarray, np.ndarray]
 
@@ -100,7 +100,7 @@ class Spaces:
 
     def _spread(self):
         X, T = as_arrays(self.mesh)
-        sample = farthest_points(self.X, N_SPREAD)
+        sample = farthest_points(self.X, N_SAMPLES)
         cell = cKDTree(self.X[sample]).query(self.X)[1]
         area = np.bincount(cell, vertex_areas(X, T), len(sample))
         return self.X[sample], area / area.sum(), cell
@@ -136,12 +136,14 @@ class Spaces:
         return Shape(self.mesh, self.clock("coarse basis", spectrum, self.sampled, k=self.k))
 
     @cached_property
-    def lifted(self) -> Shape:
+    def with_refined_eigenfunctions(self) -> Shape:
         """The low-resolution mesh with functions that were brought to all vertices and back."""
         return Shape(self.mesh, self.clock("lifted basis", self._lifted))
 
     def _lifted(self):
-        return lifted(self.mesh, spectrum(self.sampled, k=self.k + SPARE), self.k)
+        return with_refined_eigenfunctions(
+            self.mesh, spectrum(self.sampled, k=self.k + SPARE), self.k
+        )
 
 
 def functions_at_all_vertices(shape: Shape, C: np.ndarray | None = None) -> np.ndarray:
@@ -152,10 +154,10 @@ def functions_at_all_vertices(shape: Shape, C: np.ndarray | None = None) -> np.n
 
 
 def match_in_space(
-    source: Spaces, target: Spaces, motion: tuple[np.ndarray, np.ndarray]
+    source: Spaces, target: Spaces, transform: tuple[np.ndarray, np.ndarray]
 ) -> Matches:
     """kNN: nearest neighbours of the aligned shapes in space, for the target and for the source."""
-    R, t = motion
+    R, t = transform
     moved = source.X @ R.T + t
     return cKDTree(moved).query(target.X)[1], cKDTree(target.X).query(moved)[1]
 
@@ -169,7 +171,7 @@ def at_low_resolution(M: Shape, N: Shape, landmarks: Matches) -> list[np.ndarray
 
 
 def fit_map(M: Shape, N: Shape, landmarks: Matches, k: int) -> np.ndarray:
-    """First map ``(k, k)`` from landmarks and wave kernels, see `fmap.fmap_from_descriptors`."""
+    """Initial map ``(k, k)`` from landmarks and wave kernels, see `fmap.fmap_from_descriptors`."""
     at_source, at_target = at_low_resolution(M, N, landmarks)
     bases = [replace(shape.low, area=shape.low.area / shape.low.area.sum()) for shape in (M, N)]
     return fmap.fmap_from_descriptors(*bases, k=k, landmarks=(at_source, at_target), oriented=0)
@@ -182,7 +184,7 @@ class Outcome(NamedTuple):
     image: np.ndarray | None  # (n_target, 3), where the method gives more than vertices
     reverse: Any  # (n_source,), the match the other way
     seconds: dict[str, float]
-    first: np.ndarray | None = None  # (k_init, k_init), the first map
+    first: np.ndarray | None = None  # (k_init, k_init), the initial map
     fmap: Any = None  # (k, k), the refined one
     functions: Any = None  # at all vertices, of source and target
     low_match: Any = None  # (n_low_target,)
@@ -199,10 +201,10 @@ class Pair:
         Corresponding vertices; by default those of 4.1, step 3.
     k_init, k, step : int
         Of the maps.
-    sharpen : int
-        Last rounds of RE-MATCH lifted that look among all vertices.
+    full_resolution_iterations : int
+        Last iterations of RE-MATCH refined that look among all vertices.
     init : {"landmarks", "descriptors"}
-        First maps as :func:`s4a.method.fmap.fmap_from_landmarks`, or from wave kernels of the
+        Initial maps as :func:`s4a.method.fmap.fmap_from_landmarks`, or from wave kernels of the
         shapes and around landmarks.
     """
 
@@ -212,7 +214,7 @@ class Pair:
     k_init: int = 20
     k: int = 100
     step: int = 5
-    sharpen: int = 2
+    full_resolution_iterations: int = 2
     init: str = "landmarks"
     spectral: dict[str, Outcome] = field(default_factory=dict)
 
@@ -220,7 +222,9 @@ class Pair:
         """A method of :data:`METHODS`."""
         clock = Clock()
         remeshed = KINDS.get(method) in ("coarse", "lifted")
-        motion, landmarks, align_seconds = self.align_remeshed if remeshed else self.align_spread
+        transform, landmarks, align_seconds = (
+            self.align_remeshed if remeshed else self.align_samples
+        )
         registers = method.startswith("registered")
         aligned = self.landmarks is None or method in ("kNN", "ZO") or registers
         if aligned:
@@ -231,9 +235,9 @@ class Pair:
             clock["align" if aligned else "refine"] += spent
         if method == "kNN":
             ends = self.source, self.target
-            match, reverse = clock("full resolution", match_in_space, *ends, motion)
+            match, reverse = clock("full resolution", match_in_space, *ends, transform)
             return Outcome(match, None, reverse, clock)
-        spectral = self.match_spectrally("RE-MATCH" if registers else method, motion, landmarks)
+        spectral = self.match_spectrally("RE-MATCH" if registers else method, transform, landmarks)
         clock.add(spectral.seconds)
         if registers:
             found = self.registered
@@ -250,13 +254,13 @@ class Pair:
         return getattr(self.source, kind), getattr(self.target, kind)
 
     @cached_property
-    def align_spread(self) -> tuple[Motion, Matches, float]:
-        """Motion and landmarks by spread points of both, and the seconds that they took."""
+    def align_samples(self) -> tuple[RigidTransform, Matches, float]:
+        """RigidTransform and landmarks by spread points of both, and the seconds that they took."""
         (X, area, _), (Y, area_target, _) = self.source.spread, self.target.spread
         return self._align(X, area, Y, area_target)
 
     @cached_property
-    def align_remeshed(self) -> tuple[Motion, Matches, float]:
+    def align_remeshed(self) -> tuple[RigidTransform, Matches, float]:
         """The same by the low-resolution meshes."""
         M, N = self.source.coarse.low, self.target.coarse.low
         return self._align(M.X, M.area, N.X, N.area)
@@ -266,16 +270,20 @@ class Pair:
         R, t, _ = clock("align", align, X, area, Y, area_target)
         landmarks = self.landmarks
         if landmarks is None:
-            landmarks = clock("align", landmarks_after_motion, self.source.X, self.target.X, (R, t))
+            landmarks = clock(
+                "align", landmarks_after_alignment, self.source.X, self.target.X, (R, t)
+            )
         return (R, t), landmarks, clock["align"]
 
-    def match_spectrally(self, method: str, motion: Motion, landmarks: Matches) -> Outcome:
-        """A method of functions: first map, ZoomOut and match at full resolution."""
+    def match_spectrally(
+        self, method: str, transform: RigidTransform, landmarks: Matches
+    ) -> Outcome:
+        """A method of functions: initial map, ZoomOut and match at full resolution."""
         if method not in self.spectral:
-            self.spectral[method] = self._match_spectrally(method, motion, landmarks)
+            self.spectral[method] = self._match_spectrally(method, transform, landmarks)
         return self.spectral[method]
 
-    def _match_spectrally(self, method, motion, landmarks):
+    def _match_spectrally(self, method, transform, landmarks):
         clock = Clock()
         M, N = self.shapes(method)
         k = min(self.k, M.low.k, N.low.k)
@@ -286,12 +294,12 @@ class Pair:
             for end in (self.source, self.target):
                 clock[block] += sum(end.clock.get(f"{part} {block}", 0.0) for part in parts)
         if method == "ZO":
-            match, _ = clock("map", match_in_space, self.source, self.target, motion)
+            match, _ = clock("map", match_in_space, self.source, self.target, transform)
             Phi, Psi = M.low.Phi[:, :k_init], N.low.Phi[:, :k_init]
             C = clock("map", fmap.fmap_from_match, Phi, Psi, N.low.mass, match)
         elif self.init == "landmarks":
             if self.landmarks is None:  # of the meshes that the map is computed on
-                landmarks = clock("map", landmarks_after_motion, M.low.X, N.low.X, motion)
+                landmarks = clock("map", landmarks_after_alignment, M.low.X, N.low.X, transform)
             else:
                 landmarks = at_low_resolution(M, N, landmarks)
             ends = M.low.first(k_init), N.low.first(k_init)
@@ -308,8 +316,8 @@ class Pair:
         first, options = C, {"step": self.step, "nearest": nearest}
         C, low_match = clock("refine", fmap.zoomout, M.low, N.low, C, k, **options)
         if kind == "lifted":
-            for _ in range(self.sharpen):
-                C = clock("refine", sharpen_map, M, N, C, M.full.Phi)
+            for _ in range(self.full_resolution_iterations):
+                C = clock("refine", refine_at_full_resolution, M, N, C, M.full.Phi)
         F = clock("full resolution", functions_at_all_vertices, M, C)
         G = functions_at_all_vertices(N)[:, :k]
         match = low_match
@@ -322,9 +330,9 @@ class Pair:
         """Registration by default after RE-MATCH; its image is the registered surface."""
         clock = Clock()
         M, N = self.shapes("registered")
-        motion, landmarks, _ = self.align_remeshed
-        spectral = self.match_spectrally("RE-MATCH", motion, landmarks)
-        icp = nearest_after_motion(M.low, N.low, motion)
+        transform, landmarks, _ = self.align_remeshed
+        spectral = self.match_spectrally("RE-MATCH", transform, landmarks)
+        icp = nearest_after_alignment(M.low, N.low, transform)
         starts = {"intrinsic": spectral.low_match, "icp": icp}
         tried = clock("refine", find_candidates, M, N, starts, k=len(spectral.fmap))
         ends = M, N, tried, spectral.functions

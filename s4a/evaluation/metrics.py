@@ -483,7 +483,7 @@ def evaluate(
         Always ``chamfer``, ``hausdorff``, ``hausdorff_paper``, ``dirichlet``, ``coverage``,
         ``collapsed_share``, ``conformal_distortion`` and ``area_distortion`` (medians by area over
         the triangles that do not collapse). With `reverse` also ``bijectivity``; with `truth`
-        ``geodesic_error`` (of the matched vertices), ``straight_error`` (of the image) and
+        ``geodesic_error`` (of the matched vertices), ``euclidean_error`` (of the image) and
         ``error_curve(threshold)``; with labels ``label_accuracy`` (by area) and ``label_dice``
         (mean over the labels of the target); with landmarks ``landmark_error`` (mean).
 
@@ -548,7 +548,7 @@ def evaluate(
         error = geodesic_error(X, T, match[some], vertex[some])
         found |= {
             "geodesic_error": error.mean(),
-            "straight_error": np.linalg.norm(image[known] - position[known], axis=1).mean() / size,
+            "euclidean_error": np.linalg.norm(image[known] - position[known], axis=1).mean() / size,
             "error_curve": error_curve(error, thresholds),
         }
         coords["threshold"] = np.asarray(thresholds, float)

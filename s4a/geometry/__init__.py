@@ -1,4 +1,4 @@
-"""Surfaces as arrays (3.1): triangles, normals, areas, distances, rigid motions."""
+"""Surfaces as arrays (3.1): triangles, normals, areas, distances, rigid transforms."""
 
 from pkgutil import iter_modules
 

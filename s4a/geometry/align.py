@@ -1,6 +1,6 @@
 """Rigid alignment by iterative closest points (4.1, step 2), and spread points.
 
-A motion ``R, t`` carries x to R x + t, rows of X to ``X @ R.T + t``.
+A transform ``R, t`` carries x to R x + t, rows of X to ``X @ R.T + t``.
 """
 
 import itertools
@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from s4a.geometry.compiled import fpsample
 from s4a.schema import Array
 
-Motion = tuple[Array, Array]  # R (3, 3), t (3,)
+RigidTransform = tuple[Array, Array]  # R (3, 3), t (3,)
 End = tuple[Array, Array, float]  # of an ICP: R, t and the residual
 
 ROUGH = 2e-5  # tolerance where few points are paired, or ends are only compared: twice icp's own
@@ -37,7 +37,7 @@ class Cloud(NamedTuple):
 def rigid_transform(
     P: Array, Q: Array, weight: Array | None = None, *, scale: bool = False
 ) -> tuple[Array, Array, float]:
-    """The motion s R x + t that brings points P closest to Q in the (weighted) least-squares sense.
+    """Return s R x + t that maps points P to Q with least (weighted) squared error.
 
     Kabsch's solution by the SVD of the cross-covariance; with ``scale=True`` Umeyama's (1991).
 
@@ -200,20 +200,25 @@ def icp(source: Cloud, target: Cloud, R: Array, t: Array, **options: Any) -> End
 
 
 def icp_each(
-    source: Cloud, target: Cloud, starts: list[Motion], *, rounds: int = 60, tolerance: float = 1e-5
+    source: Cloud,
+    target: Cloud,
+    starts: list[RigidTransform],
+    *,
+    iterations: int = 60,
+    tolerance: float = 1e-5,
 ) -> list[End]:
     """Iterative closest points (Besl & McKay 1992) from each of some starts: moves the source.
 
     Each round pairs vertices of the source with the nearest of all of the target and vertices of
     the target with the nearest of all of the source, leaves out the farthest ``TRIM`` of the pairs,
-    and solves for the motion, weighted by area.  Starts that still move are looked up together.
+    and solves for the transform, weighted by area.  Starts that still move are looked up together.
 
     Parameters
     ----------
     source, target : Cloud
     starts : list of tuple (R, t)
         R x + t.
-    rounds : int
+    iterations : int
         At least 1.
     tolerance : float
         The end comes when the residual falls by less, as a share of sqrt(area of the source).
@@ -221,7 +226,7 @@ def icp_each(
     Returns
     -------
     list of tuple (R, t, residual)
-        The motion R x + t, and the trimmed root mean square distance of the pairs, both ways.
+        The transform R x + t, and the trimmed root mean square distance of the pairs, both ways.
     """
     X, Y = source.X[source.paired], target.X[target.paired]
     area, area_y = source.area[source.paired], target.area[target.paired]
@@ -229,14 +234,16 @@ def icp_each(
     least = tolerance * np.sqrt(source.area.sum())
     ends: list[End] = [(R, t, np.inf) for R, t in starts]
     moving = list(range(len(ends)))
-    for _ in range(rounds):
+    for _ in range(iterations):
         forth = _nearest(target, [X @ R.T + t for R, t, _ in (ends[i] for i in moving)])
         back = _nearest(source, [(Y - t) @ R for R, t, _ in (ends[i] for i in moving)])
         moved, moving = moving, []
-        for i, (there, forth_gap), (here, back_gap) in zip(moved, forth, back, strict=True):
+        for i, (there, forth_distance), (here, back_distance) in zip(
+            moved, forth, back, strict=True
+        ):
             P = np.concatenate([X, source.X[here]])  # (pairs, 3)
             Q = np.concatenate([target.X[there], Y])
-            gap = np.concatenate([forth_gap, back_gap])
+            gap = np.concatenate([forth_distance, back_distance])
             # two that are each other's nearest stay or go together, whatever the rounding
             keep = gap <= (1 + 1e-9) * np.quantile(gap, 1 - TRIM)
             residual = float(np.sqrt(weight[keep] @ gap[keep] ** 2 / weight[keep].sum()))
@@ -292,7 +299,7 @@ def _try_tilts(source: Cloud, target: Cloud, start: End) -> End:
 
 
 def align(X: Array, area: Array, Y: Array, area_y: Array) -> End:
-    """Rigid motion of X onto Y by ICP, from the pose as given and from the turns of principal axes.
+    """Rigid transform of X onto Y by ICP from several initial rotations.
 
     The starts are compared by pairing ``N_POINTS`` spread vertices of each shape.  Two go on,
     tilted: of the four turns that align principal axes, the best that ends within 90 degrees of
@@ -338,20 +345,20 @@ def align(X: Array, area: Array, Y: Array, area_y: Array) -> End:
     return icp(cloud(X, area), cloud(Y, area_y), R, t)
 
 
-def realign(source: Cloud, target: Cloud, start: Motion) -> Motion:
-    """Rigid motion (R, t) of the source onto the target by ICP from a start (R, t) near it."""
+def realign(source: Cloud, target: Cloud, start: RigidTransform) -> RigidTransform:
+    """Rigid transform (R, t) of the source onto the target by ICP from a start (R, t) near it."""
     R, t, _ = icp(source, target, *start, tolerance=ROUGH)
     return R, t
 
 
-def motion_between(source: Motion, target: Motion) -> Motion:
-    """The motion source -> target from the motions (R, t) of both onto a common reference.
+def relative_transform(source: RigidTransform, target: RigidTransform) -> RigidTransform:
+    """The transform source -> target from the transforms (R, t) of both onto a common reference.
 
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a.geometry.align import motion_between
-    >>> R, t = motion_between((np.eye(3), np.ones(3)), (np.eye(3), np.zeros(3)))
+    >>> from s4a.geometry.align import relative_transform
+    >>> R, t = relative_transform((np.eye(3), np.ones(3)), (np.eye(3), np.zeros(3)))
     >>> t.tolist()
     [1.0, 1.0, 1.0]
     """

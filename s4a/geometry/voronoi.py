@@ -1,7 +1,7 @@
 """Geodesic Voronoi cells on a surface, and their dual as a manifold mesh (4.1, step 1).
 
 The dual has a vertex for every cell, and a triangle where three cells meet.  It is a manifold when
-every cell has one rim, every two neighbouring cells share one border, and no three cells meet
+every cell has one boundary, every two neighbouring cells share one border, and no three cells meet
 twice.  Where this fails, samples are added (:func:`refine`); where that would cost too many, as on
 scans full of pin-holes, the surface itself is simplified: tubes about a cell thin are cut
 (:func:`cut_handles`).
@@ -99,7 +99,7 @@ def dual(T: Array, cell: Array) -> Array:
     return L[(L[:, 0] != L[:, 1]) & (L[:, 1] != L[:, 2]) & (L[:, 2] != L[:, 0])]
 
 
-def rims(T: Array, region: Array) -> tuple[Array, Array, Array, Array]:
+def boundaries(T: Array, region: Array) -> tuple[Array, Array, Array, Array]:
     """Rims of regions: the closed rows of edges and triangles that lead out of each region.
 
     Parameters
@@ -110,16 +110,17 @@ def rims(T: Array, region: Array) -> tuple[Array, Array, Array, Array]:
 
     Returns
     -------
-    triangle, vertex, rim : int ndarray (r,)
-        Triangles across a rim, a vertex in it on the region's side, and the number of the rim.
+    triangle, vertex, boundary : int ndarray (r,)
+        Triangles across a boundary, a vertex in it on the region's side, and the number of the
+        boundary.
     owner : int ndarray
-        Region of each rim.
+        Region of each boundary.
     """
-    # A rim goes on through a triangle from one edge (inside, outside) to the next:
+    # A boundary goes on through a triangle from one edge (inside, outside) to the next:
     #
     #          i               i inside, j and k outside: from edge (i, j) to edge (i, k)
     #         / \
-    #      --/---\--> rim      j and k inside, i outside: from edge (j, i) to edge (k, i)
+    #      --/---\--> boundary      j and k inside, i outside: from edge (j, i) to edge (k, i)
     #       j-----k
     n, L = len(region), region[T]
     whole = (L[:, 0] == L[:, 1]) & (L[:, 1] == L[:, 2])
@@ -135,10 +136,10 @@ def rims(T: Array, region: Array) -> tuple[Array, Array, Array, Array]:
         steps.append(np.stack([across, at_j * n + at_i, at_k * n + at_i], axis=1)[both])
     step = np.concatenate(steps)  # (s, 3): the triangle, the edge before, the edge after
     edge, link = np.unique(step[:, 1:], return_inverse=True)
-    rim = components(link.reshape(-1, 2), len(edge))
-    owner = np.empty(rim.max(initial=-1) + 1, np.int64)
-    owner[rim] = region[edge // n]
-    return np.repeat(step[:, 0], 2), step[:, 1:].ravel() // n, rim[link.ravel()], owner
+    boundary = components(link.reshape(-1, 2), len(edge))
+    owner = np.empty(boundary.max(initial=-1) + 1, np.int64)
+    owner[boundary] = region[edge // n]
+    return np.repeat(step[:, 0], 2), step[:, 1:].ravel() // n, boundary[link.ravel()], owner
 
 
 def faults(graph: _MeshGraph, cell: Array, n: int, among: Array | None = None) -> Faults:
@@ -146,7 +147,7 @@ def faults(graph: _MeshGraph, cell: Array, n: int, among: Array | None = None) -
 
     ::
 
-        a cell of two rims      a border in two pieces      a corner that is there twice
+        a cell of two boundaries      a border in two pieces      a corner that is there twice
          +-------------+             +-----+-----+                 .*.
          |   1         |             |     |     |               / / \ \     1, 2 and 3 cover a
          |    +---+    |             |   +---+   |              | |   | |    ball like the slices
@@ -168,7 +169,8 @@ def faults(graph: _MeshGraph, cell: Array, n: int, among: Array | None = None) -
     Returns
     -------
     cell : bool ndarray (n,)
-        No disk (V - E + F != 1) with several rims, several stretches of boundary, or no triangle.
+        No disk (V - E + F != 1) with several boundaries, several stretches of boundary, or no
+        triangle.
     pair : int ndarray (p, 2)
         Neighbouring cells whose common border is not one strip: it has not two ends.
     edge, edge_pair : int ndarray
@@ -195,10 +197,10 @@ def faults(graph: _MeshGraph, cell: Array, n: int, among: Array | None = None) -
 
 
 def _faulty_cells(T, ends, is_open, cell, among):
-    """Which cells have no rim, several rims, or several stretches of boundary ``(n,)``.
+    """Which cells have no boundary, several boundaries, or several stretches of boundary ``(n,)``.
 
-    Handles and holes inside a single rim do no harm: they vanish with the cell.  `ends` are the
-    cells at both ends of the edges ``(e, 2)``.
+    Handles and holes inside a single boundary do no harm: they vanish with the cell.  `ends` are
+    the cells at both ends of the edges ``(e, 2)``.
     """
     n, L = len(among), cell[T]
     inner = ends[:, 0] == ends[:, 1]
@@ -206,8 +208,8 @@ def _faulty_cells(T, ends, is_open, cell, among):
     euler = np.bincount(cell, minlength=n)
     euler -= np.bincount(ends[inner, 0], minlength=n)
     euler += np.bincount(L[whole, 0], minlength=n)
-    suspect = among & (euler != 1)  # only these can have another number of rims than one
-    *_, owner = rims(T, np.where(suspect[cell], cell, -1))
+    suspect = among & (euler != 1)  # only these can have another number of boundaries than one
+    *_, owner = boundaries(T, np.where(suspect[cell], cell, -1))
     stretch_ends = np.bincount(ends[is_open & ~inner].ravel(), minlength=n)
     return (suspect & (np.bincount(owner, minlength=n) != 1)) | (among & (stretch_ends > 2))
 
@@ -247,12 +249,12 @@ def refine(
     Returns
     -------
     state : Voronoi
-    rounds : int
+    iterations : int
     faulty : bool
         Whether faults are left.
     """
     changed = np.ones(len(state.sample), bool)
-    rounds = 0
+    iterations = 0
     while True:
         sample, cell, distance = state
         distance = np.where(avoid, 1e-9, 1) * distance
@@ -268,7 +270,7 @@ def refine(
         )
         new = new[distance[new] > 0]
         if len(new) == 0 or len(sample) > most:
-            return state, rounds, len(new) > 0
+            return state, iterations, len(new) > 0
         new = farthest_of_each(cell[new], new, distance)  # one in each cell
         state = add_samples(graph.G, new, state)
         moved = state.cell != cell
@@ -276,7 +278,7 @@ def refine(
         changed = np.zeros(len(state.sample), bool)
         changed[cell[moved]] = True
         changed[state.cell[moved]] = True
-        rounds += 1
+        iterations += 1
 
 
 def thin_regions(graph: _MeshGraph, state: Voronoi) -> Array:
@@ -293,24 +295,24 @@ def thin_regions(graph: _MeshGraph, state: Voronoi) -> Array:
     return region[state.cell]
 
 
-def between_rims(G: sp.csr_matrix, T: Array, region: Array) -> Array:
-    """Triangles half-way between the rims of a region ``(m,)``: without them, a tube is cut."""
-    triangle, vertex, rim, _ = rims(T, region)
-    rim_of = np.full(len(region), -1)
-    rim_of[vertex[::-1]] = rim[::-1]  # a vertex in several rims goes to the first
+def between_boundaries(G: sp.csr_matrix, T: Array, region: Array) -> Array:
+    """Triangles ``(m,)`` half-way between the boundaries of a region, where a tube is cut."""
+    triangle, vertex, boundary, _ = boundaries(T, region)
+    boundary_of = np.full(len(region), -1)
+    boundary_of[vertex[::-1]] = boundary[::-1]  # a vertex in several boundaries goes to the first
     inside = np.flatnonzero(region >= 0)
     local = G[inside][:, inside].tocoo()
     same = region[inside[local.row]] == region[inside[local.col]]
     local = sp.csr_matrix((local.data[same], (local.row[same], local.col[same])), local.shape)
-    seeds = np.flatnonzero(rim_of[inside] >= 0)
+    seeds = np.flatnonzero(boundary_of[inside] >= 0)
     _, _, nearest = dijkstra(local, indices=seeds, min_only=True, return_predecessors=True)
-    part = np.full(len(region), -1)  # the rim that is nearest within the region
-    reached = nearest >= 0  # a piece of a region that no rim bounds has no nearest one
-    part[inside[reached]] = rim_of[inside[nearest[reached]]]
+    part = np.full(len(region), -1)  # the boundary that is nearest within the region
+    reached = nearest >= 0  # a piece of a region that no boundary bounds has no nearest one
+    part[inside[reached]] = boundary_of[inside[nearest[reached]]]
     P, R = part[T], region[T]  # (m, 3)
     P_next, R_next = part[T[:, [1, 2, 0]]], region[T[:, [1, 2, 0]]]
     removed = ((R == R_next) & (R >= 0) & (P != P_next)).any(1)
-    removed[triangle[part[vertex] != rim]] = True
+    removed[triangle[part[vertex] != boundary]] = True
     return removed
 
 

@@ -587,10 +587,10 @@ def with_features(
 ) -> xr.Dataset:
     """A mesh with fields that guide its registration, such as sulcal depth or curvature.
 
-    Fields are paired by name.  Those that two shapes have are descriptors of first maps in far
-    poses, and columns beside position (and normal) where nearest points are searched: in first maps
-    after ICP and in the elastic rounds.  They are taken as the first K functions have them, and one
-    standard deviation counts as much as 2 % of sqrt(area), times `weight`
+    Fields are paired by name.  Those that two shapes have are descriptors of initial maps in far
+    poses, and columns beside position (and normal) where nearest points are searched: in initial
+    maps after ICP and in the elastic iterations.  They are taken as the first K functions have
+    them, and one standard deviation counts as much as 2 % of sqrt(area), times `weight`
     (:data:`s4a.method.shape.FIELD_WEIGHT`).
 
     Parameters

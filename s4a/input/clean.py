@@ -323,12 +323,12 @@ def _drop_repeated(F, group, counts):
     if len(first) == len(T):
         return F
     copies = np.bincount(place)
-    cancel = _touching_sheets(T[first], copies % 2 == 0)
+    cancel = _touching_components(T[first], copies % 2 == 0)
     counts["duplicate_triangles"] += int(cancel.sum())
     return F[np.sort(first[~cancel])]
 
 
-def _touching_sheets(T, even):
+def _touching_components(T, even):
     """Where two sheets touch, among the triangles that lie there an even number of times.
 
     Around a patch of them the other triangles meet in pairs, so that to keep one copy would leave a
@@ -348,7 +348,7 @@ def _touching_sheets(T, even):
     return even & (total[patch[: len(T)]] > 0)
 
 
-def _flip_flat(P, F, group, tolerance, counts, rounds=50):
+def _flip_flat(P, F, group, tolerance, counts, iterations=50):
     """Without triangles lower than the tolerance, whose middle vertex lies on the long edge.
 
     To delete one would open a crack: the long edge is flipped with the neighbour across.  Deleted
@@ -357,7 +357,7 @@ def _flip_flat(P, F, group, tolerance, counts, rounds=50):
     """
     F, alive = F.copy(), np.ones(len(F), bool)
     suspects = np.arange(len(F))
-    for _ in range(rounds):
+    for _ in range(iterations):
         suspects = suspects[alive[suspects] & (_heights(P, F[suspects])[0] <= tolerance)]
         if len(suspects) == 0:
             break
@@ -477,8 +477,8 @@ def _turn_outwards(X, T, label, n):
 
 def _count_topology(T, counts):
     E, _, count = unique_edges(T)
-    rim, ends = np.unique(E[count == 1], return_inverse=True)
-    holes = int(components(ends.reshape(-1, 2), len(rim)).max(initial=-1) + 1)
+    boundary, ends = np.unique(E[count == 1], return_inverse=True)
+    holes = int(components(ends.reshape(-1, 2), len(boundary)).max(initial=-1) + 1)
     chi = int(euler_characteristic(T, E))
     kept = counts["components"] - counts["dropped_components"]
     # chi = 2 - 2 genus - holes, of each component
@@ -742,9 +742,9 @@ def fill_holes(X: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     """
     E, n = directed_edges(T), len(X)
     E = E[~np.isin(E @ [n, 1], E[:, ::-1] @ [n, 1])]
-    rim, ends = np.unique(E, return_inverse=True)
+    boundary, ends = np.unique(E, return_inverse=True)
     ends = ends.reshape(-1, 2)
-    loop = components(ends, len(rim))
+    loop = components(ends, len(boundary))
     of, h = loop[ends[:, 0]], loop.max(initial=-1) + 1
     length = np.linalg.norm(X[E[:, 0]] - X[E[:, 1]], axis=1)
     weight = length / np.bincount(of, length, h)[of] if len(E) else length

@@ -31,7 +31,7 @@ COUNTS = [
     *REPAIRS,
     *"file_vertices file_triangles components holes genus self_intersections".split(),
 ]
-TEXTS = ("status", "reason", "warning", "doubtful_kinds", "warning_kinds", "path")
+TEXTS = ("status", "reason", "warning", "flag_kinds", "warning_kinds", "path")
 _AREAS = ("area", "area_dropped")
 
 
@@ -115,7 +115,7 @@ def read_shapes(
     label : int, several, or "all", optional
         The files are label volumes, see :func:`read_labels`.
     compare : bool
-        Whether each shape is compared with the others: unit, handedness, pose, genus
+        Whether each shape is compared with the others: unit, mean_chirality, pose, genus
         (:mod:`s4a.input.plausibility`).
     intersections : bool
         Whether triangles that pass through others are counted then.
@@ -124,7 +124,7 @@ def read_shapes(
     -------
     DataTree
         ``/original/<shape>`` for every shape that could be used, and ``/report`` over all shapes
-        with ``status`` (ok, repaired, doubtful or excluded), ``reason`` (what was found and done),
+        with ``status`` (ok, repaired, flagged or excluded), ``reason`` (what was found and done),
         ``warning`` (what looks wrong and was left as it is), ``path`` and counts; the attribute
         ``remarks`` has what concerns several shapes or none, one a line.
 
@@ -163,10 +163,10 @@ def read_shapes(
     if compare and len(meshes) > 1:
         evidence = examine(meshes, intersections=intersections)
     used = {name: said for name, said in attrs.items() if said["status"] != "excluded"}
-    doubts, remarks = plausibility.find_warnings(used, evidence)
+    flags, remarks = plausibility.find_warnings(used, evidence)
     nodes = {f"/original/{name}": mesh for name, mesh in meshes.items()}
     remarks = [*remarks, *remarks_on_files(paths, pattern, volumes=volumes)]
-    nodes["/report"] = shape_report(attrs, doubts, remarks, evidence)
+    nodes["/report"] = shape_report(attrs, flags, remarks, evidence)
     return xr.DataTree.from_dict(nodes)
 
 
@@ -240,7 +240,7 @@ def remarks_on_files(
 
 def shape_report(
     attrs: dict[str, dict[str, Any]],
-    doubts: plausibility.Doubts | None = None,
+    flags: plausibility.Flags | None = None,
     remarks: Iterable[str] = (),
     evidence: dict[str, xr.Dataset] | None = None,
 ) -> xr.Dataset:
@@ -251,19 +251,19 @@ def shape_report(
     attrs : dict
         Name of each shape -> ``status``, ``reason``, ``path`` and counts; where one was excluded,
         counts are -1 in the report.
-    doubts : dict of str to list of Doubt, optional
+    flags : dict of str to list of Doubt, optional
         What looks wrong, as of :func:`s4a.input.plausibility.find_warnings`; a shape that is not
-        excluded is doubtful where one of them says so.
+        excluded is flagged where one of them says so.
     remarks : list of str
         On the collection, the most important first.
     evidence : dict, optional
         Name -> :func:`s4a.input.plausibility.compare`, whose counts are columns.
     """
-    evidence, doubts = evidence or {}, doubts or {}
+    evidence, flags = evidence or {}, flags or {}
     rows = []
     for name, said in attrs.items():
-        of_shape = [] if said["status"] == "excluded" else doubts.get(name, [])
-        rows.append({**said, **_doubtful_columns(of_shape)})
+        of_shape = [] if said["status"] == "excluded" else flags.get(name, [])
+        rows.append({**said, **_flag_columns(of_shape)})
         if name in evidence:
             rows[-1]["self_intersections"] = evidence[name].attrs["self_intersections"]
     columns: dict[str, list[Any] | np.ndarray] = {
@@ -275,16 +275,16 @@ def shape_report(
     return report.assign_coords(shape=list(attrs))
 
 
-def _doubtful_columns(doubts):
-    """What the report says of a shape's doubts; the status only where they make it doubtful."""
-    serious = dict.fromkeys(one.kind for one in doubts if one.doubtful)
-    others = dict.fromkeys(one.kind for one in doubts if not one.doubtful)
+def _flag_columns(flags):
+    """What the report says of a shape's flags; the status only where they make it flagged."""
+    serious = dict.fromkeys(one.kind for one in flags if one.flagged)
+    others = dict.fromkeys(one.kind for one in flags if not one.flagged)
     columns = {
-        "warning": plausibility.in_words(doubts),
-        "doubtful_kinds": " ".join(serious),
+        "warning": plausibility.in_words(flags),
+        "flag_kinds": " ".join(serious),
         "warning_kinds": " ".join(others),
     }
-    return columns | ({"status": "doubtful"} if serious else {})
+    return columns | ({"status": "flagged"} if serious else {})
 
 
 def _sources(paths, pattern, volumes):

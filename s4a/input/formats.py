@@ -631,8 +631,8 @@ _STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corner", "<f4", (3, 3)), ("att
 def _read_stl(data):
     """The distinct corners in order of appearance, and triangles: STL has no shared vertices."""
     count = int.from_bytes(data[80:84], "little")
-    starts_as_text = re.match(rb"\s*solid\b", data, re.I) and b"\0" not in data[:1000]
-    if starts_as_text and len(data) != 84 + 50 * count:
+    starts_as_ascii = re.match(rb"\s*solid\b", data, re.I) and b"\0" not in data[:1000]
+    if starts_as_ascii and len(data) != 84 + 50 * count:
         found = re.findall(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", data, re.I)
         facets = len(re.findall(rb"\bfacet\b", data, re.I))
         _need(3 * facets, len(found), "vertices of facets")

@@ -19,11 +19,11 @@ from s4a.options import check_label
 
 VOLUMES = {".nii": "NIfTI", ".mgz": "MGH", ".mgh": "MGH"}
 Label = int | str | Iterable[int] | None
-ROUNDS = 20  # of smoothing
+ITERATIONS = 20  # of smoothing
 _UNPACKED = 2**29  # bytes of a volume that are never refused: labels compress well
 SHRINK, GROW = 0.5, -0.51  # steps of a round: lambda and mu of Taubin
 MILLIMETRES = {"mm": 1.0, "unknown": 1.0, "meter": 1000.0, "micron": 0.001}
-_MOST_TOLD = 30  # labels that an error lists
+_MOST_REPORTED = 30  # labels that an error lists
 
 
 def is_volume(data: bytes) -> bool:
@@ -32,7 +32,7 @@ def is_volume(data: bytes) -> bool:
 
 
 def read_volume(
-    path: str | os.PathLike[str], label: Label, *, rounds: int = ROUNDS
+    path: str | os.PathLike[str], label: Label, *, iterations: int = ITERATIONS
 ) -> tuple[np.ndarray, np.ndarray, dict[str, str]]:
     """The surface of what a label volume marks, in its world coordinates.
 
@@ -43,7 +43,7 @@ def read_volume(
         dimensions.
     label : int, several, or "all"
         Several are one structure, "all" is whatever is not 0.
-    rounds : int
+    iterations : int
         Of smoothing; 0 leaves the steps of the voxels.
 
     Returns
@@ -75,7 +75,7 @@ def read_volume(
     if at_border:
         closed = "what is marked reaches the border of the volume, where it was closed"
         attrs["note"] = "; ".join(filter(None, [attrs.get("note"), closed]))
-    return smoothed(points, triangles, rounds), np.ascontiguousarray(triangles), attrs
+    return smoothed(points, triangles, iterations), np.ascontiguousarray(triangles), attrs
 
 
 def voxels_marked(path: str | os.PathLike[str], label: Label) -> tuple[np.ndarray, np.ndarray]:
@@ -166,7 +166,7 @@ def _marked(values, label):
     wanted = found if label == "all" else [int(one) for one in str(label).split(",")]
     missing = [one for one in wanted if one not in found]
     if missing:
-        there = ", ".join(map(str, found[:_MOST_TOLD])) + " ..." * (len(found) > _MOST_TOLD)
+        there = ", ".join(map(str, found[:_MOST_REPORTED])) + " ..." * (len(found) > _MOST_REPORTED)
         raise ValueError(f"label {', '.join(map(str, missing))} expected, found {there}")
     return np.isin(values, wanted)
 
@@ -192,8 +192,8 @@ def _boundary(inside):
     return points.astype(float) + origin, triangles.astype(np.int32), at_border
 
 
-def smoothed(X: np.ndarray, T: np.ndarray, rounds: int = ROUNDS) -> np.ndarray:
-    """Points ``(n, 3)`` of a mesh after rounds of Taubin's smoothing, which keeps its volume.
+def smoothed(X: np.ndarray, T: np.ndarray, iterations: int = ITERATIONS) -> np.ndarray:
+    """Points ``(n, 3)`` of a mesh after iterations of Taubin's smoothing, which keeps its volume.
 
     A step goes towards the mean of the neighbours, the next a little farther back.
 
@@ -211,7 +211,7 @@ def smoothed(X: np.ndarray, T: np.ndarray, rounds: int = ROUNDS) -> np.ndarray:
     W = sparse.csr_array((np.ones(len(a)), (a, b)), (n, n))
     W = ((W + W.T) > 0).astype(float)
     W = sparse.diags_array(1 / np.maximum(W.sum(1), 1)) @ W  # (n, n): the mean of the neighbours
-    for _ in range(rounds):
+    for _ in range(iterations):
         for step in (SHRINK, GROW):
             X = X + step * (W @ X - X)
     return X

@@ -13,7 +13,7 @@ from s4a.input.raw import shown
 from s4a.schema import dataset, require
 
 NAMED = ("landmark_name", "landmark_curve", "landmark_closed")
-ROUNDS = 12  # halvings of a segment of a curve
+ITERATIONS = 12  # halvings of a segment of a curve
 # Of sqrt(area): a landmark farther from its surface belongs to another mesh or frame.
 FARTHEST_LANDMARK = 0.03
 # of files that may be named as a shape; the longer before those that they end with
@@ -135,7 +135,7 @@ def follow(
     """
     P = np.concatenate([P, P[:1]]) if closed else P
     is_given = np.ones(len(P), bool)
-    for _ in range(ROUNDS):
+    for _ in range(ITERATIONS):
         long = np.flatnonzero(np.linalg.norm(np.diff(P, axis=0), axis=1) > spacing)
         if not len(long):
             break
@@ -181,9 +181,9 @@ def trace_curves(landmarks: xr.Dataset, mesh: xr.Dataset) -> xr.Dataset:
 def with_landmarks(mesh: xr.Dataset, landmarks: xr.Dataset | Path | str) -> xr.Dataset:
     """A mesh that knows its landmarks, so that registration holds them together.
 
-    Landmarks are paired by name: those that two shapes have guide the rigid motion and, in far
-    poses, the first map, and pull the elastic rounds (:mod:`s4a.method.elastic`).  Points of curves
-    have no partner and are left out.
+    Landmarks are paired by name: those that two shapes have guide the rigid transform and, in far
+    poses, the initial map, and pull the elastic iterations (:mod:`s4a.method.elastic`).  Points of
+    curves have no partner and are left out.
 
     Parameters
     ----------

@@ -23,7 +23,7 @@ from s4a.geometry.mesh import (
     vertex_normals,
     volume,
 )
-from s4a.input.hands import COMMON_HAND, MIRROR, OTHER_HAND, hands
+from s4a.input.chirality import COMMON_SIDE, MIRROR, OTHER_SIDE, hands
 from s4a.input.subjects import listed as first_of
 from s4a.schema import dataset
 
@@ -39,8 +39,8 @@ _TINY = 1e-3  # gaps below it, of shapes that are the same, are no evidence
 _HALF_TURNS = [np.diag(d) for d in itertools.product((1.0, -1.0), repeat=3) if np.prod(d) == 1]
 
 
-def portray(mesh: xr.Dataset, *, intersections: bool = True) -> xr.Dataset:
-    """A shape on its own: a sketch of some vertices, and numbers that no rigid motion changes.
+def describe(mesh: xr.Dataset, *, intersections: bool = True) -> xr.Dataset:
+    """Descriptor of one shape: some of its vertices and rigidly invariant numbers.
 
     Parameters
     ----------
@@ -52,19 +52,19 @@ def portray(mesh: xr.Dataset, *, intersections: bool = True) -> xr.Dataset:
     Returns
     -------
     Dataset
-        ``sketch_position``, ``sketch_area``, ``sketch_normal`` of 3,000 vertices, evenly from the
-        order of the file, centred and of unit root mean square radius; ``sketch_asymmetry``, how
-        far the mirror image lies above each; ``moment``.  Attributes: ``compactness`` (volume over
-        area^1.5), ``chirality`` (skewness along the three axes, multiplied; a mirror image has the
-        other sign), ``open_boundary`` (:func:`hole_length` over sqrt(area)), ``lattice``
-        (:func:`lattice_step` over the median edge), ``self_intersections`` and ``intersecting``
-        (their share of the triangles); -1 where they were not counted.
+        ``descriptor_position``, ``descriptor_area``, ``descriptor_normal`` of 3,000 vertices,
+        evenly from the order of the file, centred and of unit root mean square radius;
+        ``descriptor_asymmetry``, how far the mirror image lies above each; ``moment``.  Attributes:
+        ``compactness`` (volume over area^1.5), ``chirality`` (skewness along the three axes,
+        multiplied; a mirror image has the other sign), ``open_boundary`` (:func:`hole_length` over
+        sqrt(area)), ``lattice`` (:func:`lattice_step` over the median edge), ``self_intersections``
+        and ``intersecting`` (their share of the triangles); -1 where they were not counted.
 
     Examples
     --------
     >>> import s4a
-    >>> from s4a.input.plausibility import portray
-    >>> seen = portray(s4a.synthetic.sphere(500), intersections=False)
+    >>> from s4a.input.plausibility import describe
+    >>> seen = describe(s4a.synthetic.sphere(500), intersections=False)
     >>> seen["moment"].values.round(2).tolist(), round(seen.attrs["compactness"], 3)
     ([0.33, 0.33, 0.33], 0.094)
     """
@@ -81,13 +81,13 @@ def portray(mesh: xr.Dataset, *, intersections: bool = True) -> xr.Dataset:
     edge, _, count = unique_edges(T, len(X))
     length = np.linalg.norm(X[edge[:, 0]] - X[edge[:, 1]], axis=1)
     number = count_crossing(mesh["position"].values, T) if intersections else -1
-    sketch = dataset(
-        sketch_position=X[vertex] / size,
-        sketch_area=area[vertex] / area[vertex].sum(),
-        sketch_normal=vertex_normals(X, T)[vertex],
+    descriptor = dataset(
+        descriptor_position=X[vertex] / size,
+        descriptor_area=area[vertex] / area[vertex].sum(),
+        descriptor_normal=vertex_normals(X, T)[vertex],
         moment=variance / variance.sum(),
     )
-    return sketch.assign(dataset(sketch_asymmetry=_asymmetry(sketch))).assign_attrs(
+    return descriptor.assign(dataset(descriptor_asymmetry=_asymmetry(descriptor))).assign_attrs(
         surface=float(total),
         compactness=abs(volume(X, T)) / float(total) ** 1.5,
         chirality=float(np.linalg.det(axes) * skewness.prod()),
@@ -136,10 +136,11 @@ def lattice_step(X: np.ndarray) -> float:
     return min(steps)
 
 
-def _in_numbers(portraits):
+def _in_numbers(descriptors):
     """Logarithms of area, compactness and the three moments of shapes (n, 5)."""
     rows = [
-        [one.attrs["surface"], one.attrs["compactness"], *one["moment"].values] for one in portraits
+        [one.attrs["surface"], one.attrs["compactness"], *one["moment"].values]
+        for one in descriptors
     ]
     return np.log(np.maximum(rows, 1e-300)).reshape(-1, 5)
 
@@ -175,30 +176,30 @@ def excess(values: np.ndarray, least: float | np.ndarray) -> np.ndarray:
     return found
 
 
-def pick_references(portraits: dict[str, xr.Dataset], most: int = N_REFERENCES) -> list[str]:
+def pick_references(descriptors: dict[str, xr.Dataset], most: int = N_REFERENCES) -> list[str]:
     """Names of the shapes beside which all are seen: of usual form, spread over the sizes.
 
     Examples
     --------
     >>> import s4a
-    >>> from s4a.input.plausibility import pick_references, portray
+    >>> from s4a.input.plausibility import pick_references, describe
     >>> shapes = {f"s{n}": s4a.synthetic.sphere(n) for n in (100, 150, 200, 250, 300)}
     >>> shapes["long"] = s4a.synthetic.ellipsoid(300, (9, 1, 1))
-    >>> seen = {name: portray(mesh, intersections=False) for name, mesh in shapes.items()}
+    >>> seen = {name: describe(mesh, intersections=False) for name, mesh in shapes.items()}
     >>> "long" in pick_references(seen)
     False
     """
-    numbers = _in_numbers(list(portraits.values()))
+    numbers = _in_numbers(list(descriptors.values()))
     odd = np.zeros(len(numbers), bool)
     if len(numbers) >= _ENOUGH:
         least = np.array([SIZE, COMPACTNESS, MOMENT, MOMENT, MOMENT])
         odd = np.abs(excess(numbers, least)).max(1) > _USUAL
     usual = [
         (size, name)
-        for name, size, far in zip(portraits, numbers[:, 0], odd, strict=True)
+        for name, size, far in zip(descriptors, numbers[:, 0], odd, strict=True)
         if not far
     ]
-    names = [name for _, name in sorted(usual)] or list(portraits)
+    names = [name for _, name in sorted(usual)] or list(descriptors)
     return spread(names, most)
 
 
@@ -217,34 +218,34 @@ def spread(names: list[str], most: int) -> list[str]:
     return [names[rank] for rank in ranks]
 
 
-def compare(name: str, portrait: xr.Dataset, references: dict[str, xr.Dataset]) -> xr.Dataset:
+def compare(name: str, descriptor: xr.Dataset, references: dict[str, xr.Dataset]) -> xr.Dataset:
     """A shape beside its references: how closely it fits each, and of which hand it is.
 
     Parameters
     ----------
     name : str
         Of the shape; where it is one of the references itself, its values there are NaN.
-    portrait : Dataset
-        Of :func:`portray`.
+    descriptor : Dataset
+        Of :func:`describe`.
     references : dict of str to Dataset
         Portraits of the shapes that :func:`pick_references` names.
 
     Returns
     -------
     Dataset
-        The portrait without its sketch, with ``reference`` as coordinate, ``fit`` and
+        The descriptor without its descriptor, with ``reference`` as coordinate, ``fit`` and
         ``fit_mirrored``, the residual of ICP of the shape and of its mirror image, as shares of
         the root mean square radius; ``hand``, positive where the shape is of the reference's hand
         and negative where its mirror image is, near zero where both could be.
     """
-    straight, mirrored = view(portrait), view(portrait, MIRROR)
-    own_asymmetry = portrait["sketch_asymmetry"].values
+    straight, mirrored = view(descriptor), view(descriptor, MIRROR)
+    own_asymmetry = descriptor["descriptor_asymmetry"].values
     rows = []
     for other, seen in references.items():
         if other == name:
             rows.append((np.nan,) * 3)
             continue
-        reference, asymmetry = view(seen), seen["sketch_asymmetry"].values
+        reference, asymmetry = view(seen), seen["descriptor_asymmetry"].values
         fit, gap, alike = _likeness(straight, reference, own_asymmetry, asymmetry)
         fit_mirrored, gap_mirrored, alike_mirrored = _likeness(
             mirrored, reference, own_asymmetry, asymmetry
@@ -252,8 +253,10 @@ def compare(name: str, portrait: xr.Dataset, references: dict[str, xr.Dataset]) 
         nearer = np.log(max(gap_mirrored, _TINY) / max(gap, _TINY))
         rows.append((fit, fit_mirrored, alike - alike_mirrored + nearer))
     fit, fit_mirrored, hand = np.array(rows).reshape(-1, 3).T
-    own = portrait.drop_vars([str(v) for v in portrait.data_vars if str(v).startswith("sketch_")])
-    beside = dataset(fit=fit, fit_mirrored=fit_mirrored, hand=hand)
+    own = descriptor.drop_vars(
+        [str(v) for v in descriptor.data_vars if str(v).startswith("sketch_")]
+    )
+    beside = dataset(fit=fit, fit_mirrored=fit_mirrored, chirality=hand)
     return own.assign(beside.variables).assign_coords(reference=list(references))
 
 
@@ -269,14 +272,14 @@ def examine(meshes: dict[str, xr.Dataset], *, intersections: bool = True) -> dic
     [nan, 0.23]
     """
     intersections = can_count(intersections)
-    seen = {name: portray(mesh, intersections=intersections) for name, mesh in meshes.items()}
+    seen = {name: describe(mesh, intersections=intersections) for name, mesh in meshes.items()}
     references = {name: seen[name] for name in pick_references(seen)}
     return {name: compare(name, one, references) for name, one in seen.items()}
 
 
 @dataclass(frozen=True)
 class View:
-    """A sketch as ICP takes it; see :func:`view`."""
+    """A descriptor as ICP takes it; see :func:`view`."""
 
     cloud: Cloud
     rough: Cloud  # pairs fewer of its vertices
@@ -284,13 +287,13 @@ class View:
     normal: np.ndarray  # (n, 3)
 
 
-def view(sketch: xr.Dataset, flip: np.ndarray | float = 1.0) -> View:
-    """A sketch, or with ``flip=MIRROR`` its mirror image, ready for ``_best_pose``."""
-    X, area = sketch["sketch_position"].values * flip, sketch["sketch_area"].values
+def view(descriptor: xr.Dataset, flip: np.ndarray | float = 1.0) -> View:
+    """A descriptor, or with ``flip=MIRROR`` its mirror image, ready for ``_best_pose``."""
+    X, area = descriptor["descriptor_position"].values * flip, descriptor["descriptor_area"].values
     whole = cloud(X, area, N_PAIRED)
     rough = Cloud(X, area, whole.tree, whole.paired[:N_ROUGH])
     axes = principal_axes(X, area)[1]
-    return View(whole, rough, axes, sketch["sketch_normal"].values * flip)
+    return View(whole, rough, axes, descriptor["descriptor_normal"].values * flip)
 
 
 def _best_pose(shape, reference):
@@ -303,9 +306,9 @@ def _best_pose(shape, reference):
     """
     turns = _HALF_TURNS + [reference.axes @ half_turn @ shape.axes.T for half_turn in _HALF_TURNS]
     starts = [(R, np.zeros(3)) for R in turns]
-    rough = icp_each(shape.rough, reference.rough, starts, tolerance=1e-3, rounds=5)
+    rough = icp_each(shape.rough, reference.rough, starts, tolerance=1e-3, iterations=5)
     best = [(R, t) for R, t, _ in sorted(rough, key=residual_of)[:2]]
-    ends = icp_each(shape.cloud, reference.cloud, best, tolerance=1e-4, rounds=30)
+    ends = icp_each(shape.cloud, reference.cloud, best, tolerance=1e-4, iterations=30)
     return min(ends, key=residual_of)
 
 
@@ -320,9 +323,9 @@ def _gaps(shape, reference, end):
     return above, below, there
 
 
-def _asymmetry(sketch):
-    """How far the mirror image lies above each vertex of a sketch (n,), centred, tails cut."""
-    mirror_image, own = view(sketch, MIRROR), view(sketch)
+def _asymmetry(descriptor):
+    """How far the mirror image lies above each vertex of a descriptor (n,), centred, tails cut."""
+    mirror_image, own = view(descriptor, MIRROR), view(descriptor)
     _, below, _ = _gaps(mirror_image, own, _best_pose(mirror_image, own))
     limit = np.quantile(np.abs(below), 0.95)
     height = -np.clip(below, -limit, limit)
@@ -350,7 +353,7 @@ _ODD_SIZE = 1.8  # times the size of the others, or less than one over it
 _OTHER_SIZE = 3.0  # the same, that no anatomy has
 SPREADS = 5.0  # times the usual spread of a size, a boundary or a form: a warning
 _EXTENT_SPREADS = 7.0  # the same of extents, which poses change
-FAR = 8.0  # the same: doubtful
+FAR = 8.0  # the same: flagged
 _FIT = 0.12  # least spread of the logarithm of the residual
 _BOUNDARY = 0.12  # least spread of lengths over sqrt(area)
 SAME = 1e-4  # largest difference of two files of one scan, of every number below
@@ -360,7 +363,7 @@ _MUCH_MORE = 10.0  # times the others' share of crossing triangles, or step
 CLOSE = 2.0  # times the usual residual; a part is no mirror image
 
 
-# kind: whether nobody but the user knows what is meant, so that the shape is doubtful (an honest
+# kind: whether nobody but the user knows what is meant, so that the shape is flagged (an honest
 # outlier is only named); what was found beside what; the remedy, with the flags of `s4a run`
 # fmt: off
 KINDS = {
@@ -389,8 +392,8 @@ KINDS = {
     "kind": (False, "unlike the others: {what} {spreads:.0f} times the usual spread away; another "
         "kind of shape, stretched, or a part? Look at it, and leave it out if it does not belong",
         "take the files away, if of another kind"),
-    "registration": (True, "{sure} registered wrongly (badness {badness:.3f}{distortion}): look at "
-        "it in s4a view, compare its file with the template's, or leave it out",
+    "registration": (True, "{sure} registered wrongly ({registration_error:.3f}{distortion}): "
+        "look at it in s4a view, compare its file with the template's, or leave it out",
         "look at the page; a larger --n-coarse may help"),
 }
 # fmt: on
@@ -398,40 +401,40 @@ KINDS = {
 _MUCH_MORE_OF = {"intersections": ("intersecting", _CROSSING), "spacing": ("lattice", _LATTICE)}
 
 
-class _Doubt(NamedTuple):
-    """What looks wrong with a shape: a key of :data:`KINDS`, its words, whether it is doubtful."""
+class Flag(NamedTuple):
+    """What looks wrong with a shape: a key of :data:`KINDS`, its words, whether it is flagged."""
 
     kind: str
     words: str
-    doubtful: bool
+    flagged: bool
 
 
-Doubts = dict[str, list[_Doubt]]  # name of a shape -> what looks wrong with it
+Flags = dict[str, list[Flag]]  # name of a shape -> what looks wrong with it
 
 
-def doubt(kind: str, doubtful: bool | None = None, **found: Any) -> _Doubt:
-    """A doubt of a kind, whose words take what was `found`.
+def flag(kind: str, flagged: bool | None = None, **found: Any) -> Flag:
+    """A flag of a kind, whose words take what was `found`.
 
-    The kind says whether it makes the shape doubtful, unless that is given.
+    The kind says whether it makes the shape flagged, unless that is given.
 
     Examples
     --------
-    >>> from s4a.input.plausibility import doubt
-    >>> doubt("genus", genus=1, usual=0, number=5, n=6).words
+    >>> from s4a.input.plausibility import flag
+    >>> flag("genus", genus=1, usual=0, number=5, n=6).words
     'genus 1, but 0 in 5 of 6 shapes; wrap=True closes tunnels'
     """
     usually, words, _ = KINDS[kind]
-    return _Doubt(kind, words.format(**found), usually if doubtful is None else bool(doubtful))
+    return Flag(kind, words.format(**found), usually if flagged is None else bool(flagged))
 
 
-def in_words(doubts: list[_Doubt]) -> str:
-    """The sentences of all doubts about a shape, as they stand in the report's ``warning``."""
-    return "; ".join(one.words for one in doubts)
+def in_words(flags: list[Flag]) -> str:
+    """The sentences of all flags about a shape, as they stand in the report's ``warning``."""
+    return "; ".join(one.words for one in flags)
 
 
 def find_warnings(
     attrs: dict[str, dict[str, Any]], evidence: Mapping[str, xr.Dataset]
-) -> tuple[Doubts, list[str]]:
+) -> tuple[Flags, list[str]]:
     """What looks wrong with each shape, and, in words, with the collection.
 
     Parameters
@@ -447,10 +450,10 @@ def find_warnings(
         Every name; an empty list where nothing looks wrong.
     of_all : list of str
     """
-    told: Doubts = {name: [] for name in attrs}
+    told: Flags = {name: [] for name in attrs}
     of_all: list[str] = []
     seen = {name: evidence[name] for name in attrs if name in evidence}
-    # each check yields names and doubts, and adds to `of_all` what concerns several shapes
+    # each check yields names and flags, and adds to `of_all` what concerns several shapes
     checks = [_dropped(attrs), _sizes(attrs, of_all), _genus(attrs, of_all)]
     if len(seen) > 1:
         checks += [_much_more("intersections", seen), _duplicates(seen), _mirrored(seen, of_all)]
@@ -465,7 +468,7 @@ def find_warnings(
 def _dropped(attrs):
     for name, said in attrs.items():
         if said.get("area_dropped", 0) > _AREA_DROPPED:
-            yield name, doubt("dropped", percent=100 * said["area_dropped"])
+            yield name, flag("dropped", percent=100 * said["area_dropped"])
 
 
 def _sizes(attrs, of_all):
@@ -490,7 +493,7 @@ def _sizes(attrs, of_all):
         if off >= _OTHER_SIZE or (off > _ODD_SIZE and (far[i] > SPREADS or group[i])):
             unit = next((text for factor, text in _UNITS.items() if _near(ratio, factor)), None)
             kind = "unit" if unit else "size"
-            yield names[i], doubt(kind, off > _OTHER_SIZE or bool(unit), ratio=ratio, unit=unit)
+            yield names[i], flag(kind, off > _OTHER_SIZE or bool(unit), ratio=ratio, unit=unit)
 
 
 def _near(ratio, factor):
@@ -533,7 +536,7 @@ def _genus(attrs, of_all):
     usual, number = count.most_common(1)[0]
     for name, g in genus.items():
         if g != usual and number > len(genus) / 2:
-            yield name, doubt("genus", genus=g, usual=usual, number=number, n=len(genus))
+            yield name, flag("genus", genus=g, usual=usual, number=number, n=len(genus))
 
 
 def _much_more(kind, evidence):
@@ -545,11 +548,11 @@ def _much_more(kind, evidence):
         if values[i] > max(least, _MUCH_MORE * usual):
             percent = {"percent": 100 * values[i], "usual_percent": 100 * usual}
             number = seen.attrs["self_intersections"]
-            yield name, doubt(kind, value=values[i], usual=usual, number=number, **percent)
+            yield name, flag(kind, value=values[i], usual=usual, number=number, **percent)
 
 
 def _duplicates(evidence):
-    """Shapes with the same numbers, which no motion, no order of vertices and no format changes.
+    """Shapes with the same numbers, which no transform, no order of vertices and no format changes.
 
     A reflection changes the sign of the chirality, which of a symmetric shape is none.
     """
@@ -562,7 +565,7 @@ def _duplicates(evidence):
     for j, i in first.items():
         is_symmetric = abs(chirality[i] + chirality[j]) < SAME
         mirrored = " (or its mirror image)" if is_symmetric else ""
-        yield names[j], doubt("duplicate", other=names[i], mirrored=mirrored)
+        yield names[j], flag("duplicate", other=names[i], mirrored=mirrored)
 
 
 def _mirrored(evidence, of_all):
@@ -574,8 +577,8 @@ def _mirrored(evidence, of_all):
     )
     usual = np.median(np.minimum(fit, fit_mirrored))
     close = (fit_mirrored < CLOSE * usual) | (fit_mirrored < fit / CLOSE)
-    other = (mean < -OTHER_HAND) & close
-    if np.median(np.abs(mean)) < COMMON_HAND or not other.any():
+    other = (mean < -OTHER_SIDE) & close
+    if np.median(np.abs(mean)) < COMMON_SIDE or not other.any():
         return
     if 2 * other.sum() == len(names):
         of_all.append(
@@ -586,7 +589,7 @@ def _mirrored(evidence, of_all):
         seen = evidence[name]
         beside = ~np.isin(seen["reference"].values, names[other])
         beside |= not beside.any()
-        yield name, doubt("mirrored", **{w: np.nanmedian(seen[w].values[beside]) for w in fits})
+        yield name, flag("mirrored", **{w: np.nanmedian(seen[w].values[beside]) for w in fits})
 
 
 def _boundaries(evidence):
@@ -594,7 +597,7 @@ def _boundaries(evidence):
     for i, (name, more) in enumerate(zip(evidence, excess(length, _BOUNDARY), strict=True)):
         if more > SPREADS:
             usual = np.median(np.delete(length, i))
-            yield name, doubt("partial", value=length[i], usual=usual)
+            yield name, flag("partial", value=length[i], usual=usual)
 
 
 def _forms(evidence, told):
@@ -614,7 +617,7 @@ def _forms(evidence, told):
         spreads = far[what][i]
         known = any(one.kind in ("partial", "duplicate") for one in told[name])
         if spreads > SPREADS and not known:
-            yield name, doubt("kind", spreads > FAR, what=what, spreads=spreads)
+            yield name, flag("kind", spreads > FAR, what=what, spreads=spreads)
 
 
 def _names_by(values, prefix=""):
@@ -624,7 +627,7 @@ def _names_by(values, prefix=""):
 
 
 class Decision(NamedTuple):
-    """What only the user can say of some shapes: the kind of their doubts, and what to do."""
+    """What only the user can say of some shapes: the kind of their flags, and what to do."""
 
     kind: str
     names: list[str]
@@ -642,8 +645,8 @@ def _by_kind(kinds):
     return [Decision(kind, names[kind], KINDS.get(kind, otherwise)[2]) for kind in order]
 
 
-def decisions(report: xr.Dataset, column: str = "doubtful_kinds") -> list[Decision]:
-    """What is to decide on the doubtful shapes of a report, that of most shapes first."""
+def decisions(report: xr.Dataset, column: str = "flag_kinds") -> list[Decision]:
+    """What is to decide on the flagged shapes of a report, that of most shapes first."""
     if column not in report:
         return []
     names, words = report["shape"].values.tolist(), report[column].values.tolist()
@@ -651,22 +654,22 @@ def decisions(report: xr.Dataset, column: str = "doubtful_kinds") -> list[Decisi
 
 
 def notices(report: xr.Dataset) -> list[Decision]:
-    """What else looks wrong with shapes, and makes none of them doubtful."""
+    """What else looks wrong with shapes, and makes none of them flagged."""
     return decisions(report, "warning_kinds")
 
 
-def doubtful_lines(kinds: dict[str, str]) -> list[str]:
+def flagged_lines(kinds: dict[str, str]) -> list[str]:
     """A line for each kind: how many shapes, which, what to do.
 
     Parameters
     ----------
     kinds : dict of str to str
-        Name of a shape -> the kinds of its doubts, with blanks between them.
+        Name of a shape -> the kinds of its flags, with blanks between them.
 
     Examples
     --------
-    >>> from s4a.input.plausibility import doubtful_lines
-    >>> doubtful_lines({"a": "unit", "b": "unit"})
+    >>> from s4a.input.plausibility import flagged_lines
+    >>> flagged_lines({"a": "unit", "b": "unit"})
     ['2 unit: a, b (scale the files to the unit of the others)']
     """
     return [

@@ -49,7 +49,7 @@ def regular_file(path: _AnyPath) -> Iterator[BinaryIO]:
         When it is something else, or cannot be opened or read; the file is not named.
     """
     try:
-        _check_regular(os.stat(path))  # before it is opened, as that can set a device in motion
+        _check_regular(os.stat(path))  # before it is opened, as that can set a device in transform
         flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
         with open(os.open(path, flags), "rb") as file:
             _check_regular(os.fstat(file.fileno()))  # something else may have come in its place

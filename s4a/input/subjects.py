@@ -102,7 +102,7 @@ def read_table(path: Path | str, names: list[str]) -> xr.Dataset:
         if odd := odd_cells(values.tolist()) if values.dtype.kind == "U" else []:
             log.warning("%s: the column %r %s", path, name, odd_words(odd, names, values))
         if _PERSON.fullmatch(name):
-            _tell_repeated(path, name, values, names)
+            _report_repeated(path, name, values, names)
     return subjects(columns, names, str(path))
 
 
@@ -141,7 +141,7 @@ def _values(cells):
     return numbers.astype(np.int64) if whole else numbers
 
 
-def _tell_repeated(path, column, values, names):
+def _report_repeated(path, column, values, names):
     """Say which shapes are of one person: the tests take all shapes as independent."""
     shapes_of = {}
     for name, value in zip(names, values.tolist(), strict=True):

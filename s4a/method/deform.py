@@ -55,7 +55,7 @@ def onto(
     coefficients: Callable[..., Any],
     spectrum: tuple[Array | sp.spmatrix, Array, Array] | None = None,
 ) -> tuple[Array, Array, Array]:
-    """The motion that brings X onto its image, and the displacement that it leaves, smoothed.
+    """The transform that brings X onto its image, and the displacement that it leaves, smoothed.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def onto(
     coefficients : callable
         Of a field (n, 3), as of :func:`smoother`.
     spectrum : tuple (mass, Phi, eigenvalue), optional
-        Where it is given, the motion is not one but that of :func:`rigid_parts`.
+        Where it is given, the transform is not one but that of :func:`rigid_parts`.
 
     Returns
     -------
@@ -88,7 +88,7 @@ def rigid_parts(
     *,
     spread: float = 3.0,
 ) -> tuple[Array, Array]:
-    """For every vertex the motion that brings its surroundings closest to their image.
+    """For every vertex the transform that brings its surroundings closest to their image.
 
     :func:`s4a.geometry.align.rigid_transform` at every vertex, all others weighted by the heat
     kernel around it: eq. 8 and the line after it move what K functions cannot express, such as
@@ -109,7 +109,7 @@ def rigid_parts(
     -------
     R : float ndarray (n, 3, 3)
     t : float ndarray (n, 3)
-        The motions R x + t.
+        The transforms R x + t.
     """
     largest = max(eigenvalue[-1], np.finfo(float).tiny)
     heat = np.exp(-spread * eigenvalue / largest)[:, None]  # (K, 1)
@@ -152,7 +152,7 @@ def displacement_in_template(
     Returns
     -------
     displacement : float ndarray (n, 3)
-    R, t, s : the motion s R x + t from the shape's frame to the template's
+    R, t, s : the transform s R x + t from the shape's frame to the template's
     """
     R, t, s = rigid_transform(registered, X, area, scale=scale)
     return s * registered @ R.T + t - X, R, t, s

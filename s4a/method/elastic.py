@@ -1,8 +1,8 @@
 """Elastic registration: the smoothing of the displacement (4.2, eq. 8) with a price on bending.
 
 The paper cuts a displacement off after K eigenfunctions of the template N; within these every
-tangential shift costs nothing, so that rounds of nearest neighbours drift along the surface.  Here
-the coefficients c (K, 3) and a linear map A x + b of what the first rounds left minimise
+tangential shift costs nothing, so that iterations of nearest neighbours drift along the surface.
+Here the coefficients c (K, 3) and a linear map A x + b of what the first iterations left minimise
 
     sum_i a_i |z_i - y_i|^2_i + stiffness * sum_k lambda_k^2 |c_k|^2,   z = A x + b + Phi c,
 
@@ -14,8 +14,8 @@ the bending energy, the integral of |Laplacian|^2 of the displacement.  The stif
 round to round, as in the non-rigid ICP of Amberg, Romdhani and Vetter (CVPR 2007), and on where the
 bending energy has settled: there the template follows the shape, and what the price shrinks is the
 displacement alone.  Where each step bends it more, it would follow noise.  Before all that each
-start is made so stiff that near starts meet, and their mean goes on (:func:`starts_that_meet`).
-Lengths are for surfaces of unit area.
+start is made so stiff that near starts meet, and their mean goes on
+(:func:`converging_initialisations`). Lengths are for surfaces of unit area.
 
 Nothing above keeps a surface from shifting along itself over its own boundary.  Where both
 boundaries lie on each other already they are taken for one line, and the squared distances from it
@@ -25,8 +25,8 @@ Landmarks that a user marked on both surfaces add their squared distances, each 
 Fields that a user gives on both, such as sulcal depth, count beside position and normal in what is
 nearest.
 
-What K functions cannot follow is left to local rounds: a displacement d (n, 3) of the vertices of
-low resolution, beyond the warp, that minimises
+What K functions cannot follow is left to local iterations: a displacement d (n, 3) of the vertices
+of low resolution, beyond the warp, that minimises
 
     sum_i a_i |d_i - r_i|^2 + time * integral |grad d|^2,
 
@@ -44,9 +44,9 @@ import scipy.sparse as sp
 from scipy.spatial import cKDTree
 
 from s4a.geometry.closest import closest_point_in_star, features, interpolate
-from s4a.method.joint import Warp, move, turn
 from s4a.method.shape import Basis, common_fields, field_columns
 from s4a.method.spectral import Diffusion
+from s4a.method.spectral_icp import Warp, move, turn
 from s4a.schema import Array
 
 _N_STEPS = 8
@@ -58,21 +58,21 @@ STIFFNESS = 1e-4 * 1e-3 ** (np.arange(_N_STEPS + _N_FURTHER) / (_N_STEPS - 1))
 # not drift along the surface any more
 SLIDE = (0.01, 0.1)
 _SETTLED = 1.2  # as long as a step lets the bending energy grow by less than that factor
-RIM_WEIGHT = 0.01  # share of sqrt(area): of distances at the boundary, by its length
-_RIM_NEAR = 0.03  # share of sqrt(area): boundaries that are farther apart may be cut anywhere
+BOUNDARY_WEIGHT = 0.01  # share of sqrt(area): of distances at the boundary, by its length
+_BOUNDARY_NEAR = 0.03  # share of sqrt(area): boundaries that are farther apart may be cut anywhere
 _LANDMARK_WEIGHT = 1e-3  # of each landmark: as much as this share of the area
 MEET = 0.01  # share of sqrt(area): starts that end nearer to each other than that go on as one
-_TIME = (2e-2, 2e-4)  # of local rounds: smooth over 0.2, then over 0.02 of sqrt(area)
+_TIME = (2e-2, 2e-4)  # of local iterations: smooth over 0.2, then over 0.02 of sqrt(area)
 _LOCAL_SLIDE = 0.5
-_N_LOCAL_ROUNDS = 10
+_N_LOCAL_ITERATIONS = 10
 
 
 class Schedule(NamedTuple):
-    """How stiff the steps of elastic rounds are, and how long each of them lasts."""
+    """How stiff the steps of elastic iterations are, and how long each of them lasts."""
 
     stiffness: Array  # (steps,), of each step
     further: int  # so many, the last ones, only while the bending energy has not settled
-    rounds: int  # of a step, at most
+    iterations: int  # of a step, at most
     still: float  # share of sqrt(area): a step ends with a round that moves less
 
 
@@ -143,10 +143,12 @@ class Landmarks(NamedTuple):
     y: Array  # (l, 3), on the source
 
 
-def rim_ahead(source: Basis, target: Basis, X: Array) -> tuple[Array, Array, Array, Array] | None:
+def boundary_ahead(
+    source: Basis, target: Basis, X: Array
+) -> tuple[Array, Array, Array, Array] | None:
     """Where the target's boundary, its vertices at X, is drawn, if both boundaries are one line.
 
-    They are where nine tenths of the vertices of each lie within ``_RIM_NEAR`` of the other.
+    They are where nine tenths of the vertices of each lie within ``_BOUNDARY_NEAR`` of the other.
     Scans may end anywhere, and holes are of one shape alone: such boundaries are left as they are.
 
     Returns
@@ -160,23 +162,23 @@ def rim_ahead(source: Basis, target: Basis, X: Array) -> tuple[Array, Array, Arr
     y : float ndarray (r, 3)
         The nearest vertices of the source's boundary.
     """
-    if not (len(source.rim) and len(target.rim)):
+    if not (len(source.boundary) and len(target.boundary)):
         return None
-    start, end = target.rim.T
-    vertex = np.unique(target.rim)
-    gap, nearest = source.rim_tree.query(X[vertex])
-    back = cKDTree(X[vertex]).query(source.rim_tree.data)[0]
-    if max(np.quantile(gap, 0.9), np.quantile(back, 0.9)) > _RIM_NEAR:
+    start, end = target.boundary.T
+    vertex = np.unique(target.boundary)
+    gap, nearest = source.boundary_tree.query(X[vertex])
+    back = cKDTree(X[vertex]).query(source.boundary_tree.data)[0]
+    if max(np.quantile(gap, 0.9), np.quantile(back, 0.9)) > _BOUNDARY_NEAR:
         return None
     step = X[end] - X[start]
     tangent, length = np.zeros_like(X), np.zeros(len(X))
     for corner in (start, end):
         np.add.at(tangent, corner, step)
         np.add.at(length, corner, np.linalg.norm(step, axis=1) / 2)
-    near = gap < _RIM_NEAR
+    near = gap < _BOUNDARY_NEAR
     vertex, nearest = vertex[near], nearest[near]
     across = unit(np.cross(unit(tangent[vertex]), target.normals_at(X)[vertex]))
-    return vertex, length[vertex], across, source.rim_tree.data[nearest]
+    return vertex, length[vertex], across, source.boundary_tree.data[nearest]
 
 
 def unit(vectors: Array) -> Array:
@@ -219,7 +221,7 @@ def normal_equations(
     return matrix, right.T.ravel()
 
 
-def _spread_area(target, spread):
+def _sampled_area(target, spread):
     """The area ``(s,)`` of the vertices nearest to each of some that are spread over a surface."""
     nearest = cKDTree(target.X[spread]).query(target.X)[1]
     return np.bincount(nearest, target.area, len(spread))
@@ -264,7 +266,7 @@ def step_of(matrix: Array, right: Array) -> Array:
         return Q[:, told] @ (Q[:, told].T @ right / eigenvalue[told])
 
 
-def elastic_rounds(
+def elastic_iterations(
     source: Basis,
     target: Basis,
     warp: Warp,
@@ -273,7 +275,7 @@ def elastic_rounds(
     vertices: Rows = _ALL,
     landmarks: Landmarks | None = None,
 ) -> Warp:
-    """The warp after rounds in which the target's displacement becomes less and less stiff.
+    """The warp after iterations in which the target's displacement becomes less and less stiff.
 
     Parameters
     ----------
@@ -283,7 +285,7 @@ def elastic_rounds(
         At low resolution, with the normals of the original mesh:
         :attr:`s4a.method.shape.Shape.low_on_surface`.
     warp : tuple (R, t, c)
-        Where to begin, with one motion for all: bending is counted from there.
+        Where to begin, with one transform for all: bending is counted from there.
     schedule : Schedule
         Its further steps are made only as long as the one before let the bending energy grow by
         less than a fifth.
@@ -312,7 +314,7 @@ def elastic_rounds(
     bending[: smooth.shape[1], 0] = target.eigenvalue[1:] ** 2
     X = E @ w
     energies: list[float] = []  # of bending, after each step
-    area = target.area if isinstance(vertices, slice) else _spread_area(target, vertices)
+    area = target.area if isinstance(vertices, slice) else _sampled_area(target, vertices)
     F = unlike[vertices]
     mass = F.T @ (area[:, None] * F)
     sure = len(schedule.stiffness) - schedule.further
@@ -322,15 +324,15 @@ def elastic_rounds(
         price = np.kron(np.eye(3), apart.T @ (stiff * bending * apart))
         # nothing may be left of the start: a little keeps the matrix definite then
         price[np.diag_indices_from(price)] += 1e-12
-        for _ in range(schedule.rounds):
+        for _ in range(schedule.iterations):
             y, m = _points_ahead(source, target, X, vertices)
             # of what w is to change by, so that rounding is of the step and not of what it leads to
             matrix, right = normal_equations(F, area, m, y - X[vertices], SLIDE[step >= 2], mass)
-            rim = rim_ahead(source, target, X) if step >= 2 else None
-            if rim is not None:
-                vertex, length, across, y = rim
+            boundary = boundary_ahead(source, target, X) if step >= 2 else None
+            if boundary is not None:
+                vertex, length, across, y = boundary
                 way = y - X[vertex]
-                more = normal_equations(unlike[vertex], RIM_WEIGHT * length, across, way, 0.0)
+                more = normal_equations(unlike[vertex], BOUNDARY_WEIGHT * length, across, way, 0.0)
                 matrix += more[0]
                 right += more[1]
             if len(pin):
@@ -351,28 +353,28 @@ def elastic_rounds(
     return A @ R, A @ t + b, c
 
 
-def starts_that_meet(
+def converging_initialisations(
     source: Basis, target: Basis, starts: dict[str, Warp], landmarks: Landmarks | None = None
 ) -> dict[str, Warp]:
-    """Starts of elastic rounds after steps so stiff that near ones meet; the mean of those.
+    """Starts of elastic iterations after steps so stiff that near ones meet; the mean of those.
 
     Which of them is the better, small changes of the input decide; the mean follows these.
 
     Parameters
     ----------
-    source, target, landmarks : see :func:`elastic_rounds`
+    source, target, landmarks : see :func:`elastic_iterations`
     starts : dict
-        Name -> warp (R, t, c), with one motion for all.
+        Name -> warp (R, t, c), with one transform for all.
 
     Returns
     -------
     dict
         Starts that end within :data:`MEET` of the first of some are one, by its name.
     """
-    options: dict[str, Any] = {"vertices": target.spread_vertices(), "landmarks": landmarks}
+    options: dict[str, Any] = {"vertices": target.sample_vertices_of(), "landmarks": landmarks}
     met: dict[str, list[Warp]] = {}
     for name, start in starts.items():
-        warp = elastic_rounds(source, target, start, MEETING, **options)
+        warp = elastic_iterations(source, target, start, MEETING, **options)
         X = move(target, warp)
         near = (
             one
@@ -386,7 +388,7 @@ def starts_that_meet(
     }
 
 
-def local_rounds(
+def local_iterations(
     source: Basis,
     target: Basis,
     diffusion: Diffusion,
@@ -394,24 +396,24 @@ def local_rounds(
     *,
     time: tuple[float, float] = _TIME,
     slide: float = _LOCAL_SLIDE,
-    rounds: int = _N_LOCAL_ROUNDS,
+    iterations: int = _N_LOCAL_ITERATIONS,
     pull: tuple[sp.csr_matrix, Array] | None = None,
 ) -> Array:
-    """A displacement beyond that of elastic rounds, free at every vertex of low resolution.
+    """A displacement beyond that of elastic iterations, free at every vertex of low resolution.
 
     Parameters
     ----------
     source, target : Basis
-        As of :func:`elastic_rounds`.
+        As of :func:`elastic_iterations`.
     diffusion : Diffusion
         On the target.
     X : float ndarray (n, 3)
-        The target's vertices after the elastic rounds.
+        The target's vertices after the elastic iterations.
     time : tuple of float
         Of the heat diffusion in the first and in the last round.
     slide : float
         Weight of the way along the surface.
-    rounds : int
+    iterations : int
     pull : tuple (P, missing), optional
         Weights ``(l, n)`` of landmarks on the target, and what d is to be there ``(l, 3)``.
 
@@ -426,7 +428,7 @@ def local_rounds(
         pinned = _LANDMARK_WEIGHT * P.T @ P
         toward = _LANDMARK_WEIGHT * P.T @ missing
     d = np.zeros_like(X)
-    for step in np.geomspace(*time, rounds):
+    for step in np.geomspace(*time, iterations):
         y, m = _points_ahead(source, target, X + d)
         way = y - X - d
         across = np.einsum("ni,ni->n", m, way)[:, None] * m

@@ -295,17 +295,17 @@ def zoomout(
     return C, match_from_fmap(C, source.Phi, target.Phi, nearest=nearest)
 
 
-def refine_once(source: Basis, target: Basis, C: Array, n_spread: int = 0) -> Array:
+def refine_once(source: Basis, target: Basis, C: Array, n_samples: int = 0) -> Array:
     """One step of ZoomOut without growth (4.2): C -> match -> C of the same size.
 
-    Where `n_spread` is not 0, matches are looked for at as many spread vertices of the target, and
-    C is the least squares there, as in the rounds of Consistent ZoomOut; at all of them where they
-    are fewer than the functions, which cannot be told apart then.
+    Where `n_samples` is not 0, matches are looked for at as many spread vertices of the target, and
+    C is the least squares there, as in the iterations of Consistent ZoomOut; at all of them where
+    they are fewer than the functions, which cannot be told apart then.
     """
     Phi = source.Phi[:, : C.shape[1]]
     Psi = target.Phi[:, : len(C)]
-    sampled = len(C) <= n_spread < len(Psi)
-    rows = target.spread_vertices(n_spread) if sampled else slice(None)
+    sampled = len(C) <= n_samples < len(Psi)
+    rows = target.sample_vertices_of(n_samples) if sampled else slice(None)
     match = nearest_float32(as_queries(Psi[rows]), as_candidates(Phi @ C.T))
     if not sampled:
         return fmap_from_match(Phi, Psi, target.mass, match)
@@ -489,7 +489,7 @@ def fmap_from_descriptors(
     return fit(F[0] / size, F[1] / size, penalty=penalty, operators=operators, constant=constant)
 
 
-def curvature_gap(source: Basis, target: Basis, match: Array) -> float:
+def curvature_difference(source: Basis, target: Basis, match: Array) -> float:
     """How far the signed mean curvature of matched vertices differs, by its spread on the target.
 
     0 where it is the same, about 1 where one says nothing of the other.  Front and back of a body,

@@ -16,9 +16,9 @@ from scipy.sparse.csgraph import breadth_first_order
 from scipy.sparse.linalg import LinearOperator, eigsh
 from scipy.spatial import cKDTree
 
-from s4a.geometry.align import Motion, realign
-from s4a.method.first_map import first_map
+from s4a.geometry.align import RigidTransform, realign
 from s4a.method.fmap import fmap_from_match
+from s4a.method.initial_map import initial_map
 from s4a.method.median import area_differences, conformal_differences, distance_to_identity
 from s4a.method.nearest import (
     as_candidates,
@@ -36,14 +36,14 @@ from s4a.method.network import (
     three_cycles,
 )
 from s4a.method.shape import Basis
-from s4a.options import N_SPREAD, PER_FUNCTION
+from s4a.options import N_SAMPLES, PER_FUNCTION
 from s4a.schema import Array, dataset
 
 log = logging.getLogger(__name__)
 
-_FINAL = 3  # shapes of a study in the last rounds of a new one, on all vertices
+_FINAL = 3  # shapes of a study in the last iterations of a new one, on all vertices
 TARGETS = 256  # shapes whose least squares are held at once, 0.3 GB of them
-WIDE = 4  # last rounds of Consistent ZoomOut, which look between the samples, too
+DENSE_ITERATIONS = 4  # last iterations of Consistent ZoomOut, which look between the samples, too
 N_AROUND = 32  # vertices around a sample among which they look
 ROUGH, FINE = 1e-4, 1e-6  # tolerances of the latent basis: on the way, and at the end
 
@@ -146,7 +146,7 @@ def _spanning_start(C, source, target, n):
 
 
 def smallest_eigenvectors(
-    apply: _Form, start: Array, *, tolerance: float = FINE, max_rounds: int = 100
+    apply: _Form, start: Array, *, tolerance: float = FINE, max_iterations: int = 100
 ) -> Array:
     """The eigenvectors of the smallest eigenvalues of a positive semi-definite form ``(n, m)``.
 
@@ -163,7 +163,7 @@ def smallest_eigenvectors(
         As many vectors as are wanted, near the eigenvectors if possible.
     tolerance : float
         Largest residual of a vector, as a share of the largest eigenvalue.
-    max_rounds : int
+    max_iterations : int
     """
     n, m = start.shape
     n_spare = min(n - m, max(4, m // 10))  # the last vectors of a block converge slowest
@@ -172,7 +172,7 @@ def smallest_eigenvectors(
     form = LinearOperator((n, n), lambda v: apply(v.reshape(n, 1)).ravel(), dtype=float)
     largest = eigsh(form, 1, which="LA", tol=1e-2, v0=spare[:, 0], return_eigenvectors=False)[0]
     top = 1.02 * largest  # above all eigenvalues, though `largest` is 1 % uncertain
-    for _ in range(max_rounds):
+    for _ in range(max_iterations):
         LV = apply(V)
         ritz, R = np.linalg.eigh(V.T @ LV)
         V = V @ R
@@ -180,7 +180,7 @@ def smallest_eigenvectors(
         if residual.max() <= tolerance * top:
             return V[:, :m]
         V = np.linalg.qr(_chebyshev_filter(apply, V, ritz[0], ritz[-1], top))[0]
-    log.warning("the latent basis reached %d rounds before its tolerance", max_rounds)
+    log.warning("the latent basis reached %d iterations before its tolerance", max_iterations)
     return V[:, :m]
 
 
@@ -273,7 +273,7 @@ def consistent_zoomout(
     n_latent: int | None = None,
     weights: str = "cycles",
     samples: list[Array] | None = None,
-    wide: int = WIDE,
+    dense_iterations: int = DENSE_ITERATIONS,
     n_jobs: int | None = 1,
     progress: Callable[..., Any] | None = None,
     keep: Callable[..., Any] | None = None,
@@ -284,15 +284,16 @@ def consistent_zoomout(
     neighbours for every map (eq. 3) and solves for the next larger maps in the least-squares sense,
     on `samples` only, whose least squares are factored once a round and target shape; on
     samples Phi^T A of eq. 1 is no inverse of Phi.  Among the source's samples matches are off by
-    the spacing of these: in the `wide` last rounds they are looked for among the ``N_AROUND``
-    vertices around the sample that was found, too.  With all vertices as samples it is the paper's.
-    The latent basis is found to ``ROUGH`` on the way and to ``FINE`` at the end.
+    the spacing of these: in the `dense_iterations` last iterations they are looked for among the
+    ``N_AROUND`` vertices around the sample that was found, too.  With all vertices as samples it is
+    the paper's. The latent basis is found to ``ROUGH`` on the way and to ``FINE`` at the end.
 
     Parameters
     ----------
     bases : sequence of Basis
         The shapes of the network at low resolution, with k functions or more.  Each is asked for
-        once, and in the `wide` last rounds again: it may be read from its file then.
+        once, and in the `dense_iterations` last iterations again: it may be read from its file
+        then.
     C : float ndarray (p, k_init, k_init)
     source, target : int ndarray (p,)
         Which shape's functions each map takes, and on which it gives functions.
@@ -307,8 +308,8 @@ def consistent_zoomout(
     samples : list of int ndarray, optional
         Spread vertices of every shape, 2 k or more of them where these are not all; all vertices by
         default.
-    wide : int
-        Last rounds that look between the samples.
+    dense_iterations : int
+        Last iterations that look between the samples.
     n_jobs : int
         Threads; the result does not depend on it.
     progress : callable, optional
@@ -329,8 +330,8 @@ def consistent_zoomout(
         When samples are too few for maps of k functions.
     """
     cycles = three_cycles(source.tolist(), target.tolist())
-    wide = 0 if samples is None else wide
-    n_around = N_AROUND if wide else 1
+    dense_iterations = 0 if samples is None else dense_iterations
+    n_around = N_AROUND if dense_iterations else 1
     sampled = [
         sample(basis, None if samples is None else samples[i], k, n_around)
         for i, basis in enumerate(bases)
@@ -339,7 +340,7 @@ def consistent_zoomout(
     sizes = [*range(C.shape[1], k, step), k]
     if samples is not None and len(sizes) > 1:
         _check_samples(sampled, k)
-    wide_sizes = sizes[:-1][max(len(sizes) - 1 - wide, 0) :]
+    dense_sizes = sizes[:-1][max(len(sizes) - 1 - dense_iterations, 0) :]
     for size, next_size in zip(
         sizes, [*sizes[1:], None], strict=True
     ):  # the last only solves for Y
@@ -356,7 +357,7 @@ def consistent_zoomout(
             keep(C, Y, latent_eigenvalue)
         if next_size:
             del C  # those of two sizes need not be in memory
-            of_all = bases if size in wide_sizes else None
+            of_all = bases if size in dense_sizes else None
             C = _larger_maps(sampled, Y, source, target, next_size, of_all, n_jobs)
     return C, weight, error, Y, latent_eigenvalue
 
@@ -382,7 +383,7 @@ def _check_samples(sampled, k):
     if fewest < least:
         raise ValueError(
             f"maps of k = {k} functions need {least} spread vertices or more; found {fewest}: "
-            f"give n_spread={least} or more, n_spread=0 for all vertices, or a smaller k"
+            f"give n_samples={least} or more, n_samples=0 for all vertices, or a smaller k"
         )
 
 
@@ -497,12 +498,12 @@ def frozen_basis(C_out: Array, C_in: Array, Y: Array) -> Array:
     return np.linalg.solve(left, right)
 
 
-def _latent_basis_of_new(new, others, Y, C, *, step=5, n_spread=N_SPREAD, rounds=2):
+def _latent_basis_of_new(new, others, Y, C, *, step=5, n_samples=N_SAMPLES, iterations=2):
     """Latent basis of a new shape, those of all others frozen: Consistent ZoomOut of one shape.
 
-    It starts from the first maps of the others; in every round the rows of the first latent
+    It starts from the initial maps of the others; in every round the rows of the first latent
     functions are matched with those of each of the others, on samples, and more of the functions
-    carried over; the last rounds use all vertices.
+    carried over; the last iterations use all vertices.
 
     Parameters
     ----------
@@ -511,12 +512,12 @@ def _latent_basis_of_new(new, others, Y, C, *, step=5, n_spread=N_SPREAD, rounds
     Y : float ndarray (p, k, m)
         Latent bases of the others.
     C : list of float ndarray (k_init, k_init)
-        First maps from each of the others to the new shape.
+        Initial maps from each of the others to the new shape.
     step : int
         Growth per round.
-    n_spread : int
+    n_samples : int
         Spread vertices that are the samples; 0 for all.
-    rounds : int
+    iterations : int
         Of :func:`frozen_basis`, with the first ``FINAL`` of the others.
 
     Returns
@@ -529,8 +530,8 @@ def _latent_basis_of_new(new, others, Y, C, *, step=5, n_spread=N_SPREAD, rounds
     y = np.mean(
         [c @ y[:k_init, : min(k_init, m)] for c, y in zip(C, Y, strict=True)], axis=0
     )  # (k_init, <= m)
-    samples = new.spread_vertices(n_spread)
-    among = [other.spread_vertices(n_spread) for other in others]
+    samples = new.sample_vertices_of(n_samples)
+    among = [other.sample_vertices_of(n_samples) for other in others]
     root = np.sqrt(new.area[samples])
     while len(y) < k:
         size = min(len(y) + step, k)
@@ -543,7 +544,7 @@ def _latent_basis_of_new(new, others, Y, C, *, step=5, n_spread=N_SPREAD, rounds
             carried = carried + rows[match, : min(size, m)]
         y = solve @ carried / len(others)
     Phi = new.Phi[:, :k]
-    for _ in range(rounds):
+    for _ in range(iterations):
         query = Phi @ y
         C_out, C_in = [], []
         for other, functions in zip(others[:_FINAL], F, strict=False):
@@ -577,11 +578,11 @@ def place(
     new: Basis,
     others: list[Basis],
     Y: Array,
-    starts: list[Motion],
+    starts: list[RigidTransform],
     *,
     k_init: int = 20,
     step: int = 5,
-    n_spread: int = N_SPREAD,
+    n_samples: int = N_SAMPLES,
     **options: Any,
 ) -> Array:
     """Latent basis of a new shape from its maps to others, whose bases stay.
@@ -594,10 +595,10 @@ def place(
     Y : float ndarray (p, k, m)
         Their latent bases.
     starts : list of tuple (R, t)
-        About the rigid motions of the new shape onto each of them.
-    k_init, step, n_spread : see :func:`s4a.analyse`
+        About the rigid transforms of the new shape onto each of them.
+    k_init, step, n_samples : see :func:`s4a.analyse`
     **options
-        Of :func:`s4a.method.first_map.first_map`.
+        Of :func:`s4a.method.initial_map.initial_map`.
 
     Returns
     -------
@@ -607,8 +608,8 @@ def place(
     for other, start in zip(others, starts, strict=True):
         R, t = realign(new.cloud, other.cloud, start)
         back = R.T, -R.T @ t
-        maps.append(first_map(other, new, back, k_init=k_init, n_spread=n_spread, **options).C)
-    return _latent_basis_of_new(new, others, Y, maps, step=step, n_spread=n_spread)
+        maps.append(initial_map(other, new, back, k_init=k_init, n_samples=n_samples, **options).C)
+    return _latent_basis_of_new(new, others, Y, maps, step=step, n_samples=n_samples)
 
 
 def latent_of_new(Y: Array, eigenvalues: Array, latent_eigenvalue: Array, norm: str) -> xr.Dataset:
@@ -631,5 +632,5 @@ def latent_of_new(Y: Array, eigenvalues: Array, latent_eigenvalue: Array, norm: 
         latent_eigenvalue=latent_eigenvalue,
         area_difference=D,
         conformal_difference=conformal_differences(Y, eigenvalues, latent_eigenvalue),
-        distance_to_median=np.array(distance),
+        distance_to_limit=np.array(distance),
     )

@@ -30,7 +30,7 @@ def conformal_differences(Y: Array, eigenvalues: Array, latent_eigenvalue: Array
     Constant modes are zero.
     """
     D = np.einsum("nkl,nk,nkm->nlm", Y, eigenvalues[:, : Y.shape[1]], Y)
-    constant = _constant_modes(latent_eigenvalue)
+    constant = _constant_eigenfunctions(latent_eigenvalue)
     D[:, constant] = 0
     D[:, :, constant] = 0
     return inverse(latent_eigenvalue)[None, :, None] * D
@@ -41,11 +41,11 @@ def inverse(latent_eigenvalue: Array, power: float = 1.0) -> Array:
 
     Constant modes map to 0.
     """
-    constant = _constant_modes(latent_eigenvalue)
+    constant = _constant_eigenfunctions(latent_eigenvalue)
     return np.where(constant, 0.0, np.where(constant, 1.0, latent_eigenvalue) ** -power)
 
 
-def _constant_modes(latent_eigenvalue):
+def _constant_eigenfunctions(latent_eigenvalue):
     """Which latent functions are constant on every component, ``(m,)``: one for each component."""
     constant = latent_eigenvalue < 1e-6 * np.max(latent_eigenvalue, initial=0.0)
     constant[:1] = True
@@ -68,7 +68,7 @@ def distance_to_identity(D: Array, latent_eigenvalue: Array, norm: str = "h2") -
     of_image, of_argument = NORMS[norm]
     weighted = (D - np.eye(D.shape[1])) * inverse(latent_eigenvalue, of_argument)  # (n, m, m)
     weighted = inverse(latent_eigenvalue, -of_image)[:, None] * weighted
-    varying = ~_constant_modes(latent_eigenvalue)
+    varying = ~_constant_eigenfunctions(latent_eigenvalue)
     return np.linalg.norm(weighted[:, varying][:, :, varying], axis=(1, 2))
 
 
@@ -91,8 +91,8 @@ def median_shape(latent: xr.Dataset, eigenvalues: Array, *, norm: str = "h2") ->
     Parameters
     ----------
     latent : xarray.Dataset
-        With ``latent_basis(shape, mode, latent)`` and ``latent_eigenvalue(latent)``.
-    eigenvalues : float ndarray (shape, mode)
+        With ``latent_basis(shape, eigenpair, latent)`` and ``latent_eigenvalue(latent)``.
+    eigenvalues : float ndarray (shape, eigenpair)
         Laplacian eigenvalues of the shapes, for unit area.
     norm : {"h2", "h1", "frobenius", "h2_image", "h2_both"}
         See :func:`distance_to_identity`.
@@ -100,7 +100,7 @@ def median_shape(latent: xr.Dataset, eigenvalues: Array, *, norm: str = "h2") ->
     Returns
     -------
     xarray.Dataset
-        `latent` with ``area_difference``, ``conformal_difference``, ``distance_to_median``, the PCA
+        `latent` with ``area_difference``, ``conformal_difference``, ``distance_to_limit``, the PCA
         scores of both operators, and the attributes ``median`` (name of the shape) and ``norm``.
     """
     require(latent, "latent_basis", "latent_eigenvalue", what="latent dataset")
@@ -113,7 +113,7 @@ def median_shape(latent: xr.Dataset, eigenvalues: Array, *, norm: str = "h2") ->
     differences = dataset(
         area_difference=area,
         conformal_difference=conformal,
-        distance_to_median=distance,
+        distance_to_limit=distance,
         area_score=area_score,
         area_variance_ratio=area_ratio,
         conformal_score=conformal_score,

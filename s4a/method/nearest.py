@@ -23,7 +23,7 @@ from s4a.schema import Array
 BLOCK = 512  # cells of queries whose distances to all other cells are held at once
 PAIRS = 2048  # pairs of rows at a time: their differences, 0.8 MB in 100 dims, stay in the cache
 _AROUND = 128  # queries whose rows around are gathered at once, 1.6 MB of 32 in 100 dims
-_SLACK = 1 + 1e-5  # factor on bounds, for what float32 rounds away
+_SLACK = 1 + 1e-5  # factor on bounds, for what float32 iterations away
 
 
 def nearest_rows(Q: Array, D: Array, *, block: int = 256) -> Array:

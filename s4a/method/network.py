@@ -39,7 +39,7 @@ def choose_pairs(distance: Array, n_pairs: int) -> Array:
     Parameters
     ----------
     distance : float ndarray (n, n)
-        Symmetric dissimilarity of the shapes; near pairs have better first maps.
+        Symmetric dissimilarity of the shapes; near pairs have better initial maps.
     n_pairs : int
         Budget; the clique where it is at least n (n - 1) / 2.
 

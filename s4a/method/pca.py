@@ -408,7 +408,8 @@ def pca_without(
     Returns
     -------
     xarray.Dataset
-        Of :func:`pca`; where there are shapes apart, also ``score_apart(shape_apart, component)``.
+        Of :func:`pca`; where there are shapes apart, also ``score_excluded(shape_excluded,
+        component)``.
 
     Raises
     ------
@@ -424,11 +425,11 @@ def pca_without(
         if not apart:
             raise
         raise ValueError(
-            f"{error}; {len(apart)} doubtful shapes are left out, keep_doubtful=True takes them in"
+            f"{error}; {len(apart)} flagged shapes are left out, include_flagged=True takes them in"
         ) from error
     if not apart:
         return result
     mean, deformation = result["mean_displacement"].values, result["deformation"].values
     d, sd = registration["displacement"].sel(shape=apart), result["standard_deviation"].values
     score, _ = project_scores(d.values, mean, deformation, sd, area)
-    return result.merge(dataset(score_apart=score)).assign_coords(shape_apart=apart)
+    return result.merge(dataset(score_excluded=score)).assign_coords(shape_excluded=apart)

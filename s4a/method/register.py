@@ -9,21 +9,21 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from s4a.geometry.align import Motion
+from s4a.geometry.align import RigidTransform
 from s4a.geometry.closest import closest_point_in_star, interpolate, match_surfaces
 from s4a.geometry.mesh import as_arrays, triangle_areas, vertex_areas
-from s4a.method import joint
+from s4a.method import spectral_icp
 from s4a.method.deform import displacement_in_template, distortion
 from s4a.method.elastic import (
     FOLLOWING,
     STIFFNESS,
     Landmarks,
-    elastic_rounds,
-    local_rounds,
-    starts_that_meet,
+    converging_initialisations,
+    elastic_iterations,
+    local_iterations,
 )
-from s4a.method.first_map import nearest_after_motion
 from s4a.method.fmap import fmap_from_match
+from s4a.method.initial_map import nearest_after_alignment
 from s4a.method.nearest import nearest_in_cells, nearest_of_few, nearest_rows
 from s4a.method.shape import Basis, Shape
 from s4a.options import check
@@ -98,8 +98,8 @@ def confidence(source: Shape, target: Shape, match: Array, P: Array) -> Array:
     source, target, match, P : see :func:`evidence`
     """
     w_0, *w = WEIGHTS
-    doubt = -(w_0 + evidence(source, target, match, P) @ np.array(w))
-    return 1 / (1 + np.exp(np.clip(doubt, -50, 50)))
+    flag = -(w_0 + evidence(source, target, match, P) @ np.array(w))
+    return 1 / (1 + np.exp(np.clip(flag, -50, 50)))
 
 
 def uncertainty(confidence: Array) -> Array:
@@ -132,16 +132,16 @@ def uncertainty(confidence: Array) -> Array:
 TORN = 0.65
 FEW = 2000  # vertices of low resolution: fewer smear tears
 _SMEARED = 0.3  # by this share of TORN
-_LOOSER = 4  # the step of elastic rounds with which they begin then, too
-# of score times tear: what looser rounds must leave at most.  Where they find the right fold they
-# leave 0.3 to 0.72; real heads 0.81 or more where the score falls at all (docs/decisions.md)
+_LOOSER = 4  # the step of elastic iterations with which they begin then, too
+# of score times tear: what looser iterations must leave at most.  Where they find the right fold
+# they leave 0.3 to 0.72; real heads 0.81 or more where the score falls at all (docs/decisions.md)
 _MENDED = 0.75
 
 Functions = tuple[Array, Array]  # of source and target, rows of which are compared
 
 
 def match_low(
-    source: Shape, target: Shape, bases: Functions, *, how: str = "ours"
+    source: Shape, target: Shape, bases: Functions, *, dense_match: str = "latent"
 ) -> tuple[Array, Functions]:
     """Match at low resolution (eq. 6), and the functions whose rows full resolution compares.
 
@@ -150,7 +150,7 @@ def match_low(
     source, target : Shape
     bases : tuple of float ndarray (k, m)
         Consistent latent bases Y of source and target.
-    how : {"ours", "standard"}
+    dense_match : {"latent", "fmap"}
         Functions Phi Y for eq. 7, or those of the functional map of the match for eq. 4.
 
     Returns
@@ -159,12 +159,12 @@ def match_low(
     functions : tuple of float ndarray (n_coarse, m)
         At all vertices where they are lifted.
     """
-    check("how", how)
+    check("dense_match", dense_match)
     Y_source, Y_target = bases  # (k, m) each
     k = len(Y_source)
     Phi, Psi = source.low.Phi[:, :k], target.low.Phi[:, :k]
     match = nearest_rows(Psi @ Y_target, Phi @ Y_source)  # eq. 6
-    if how == "ours":
+    if dense_match == "latent":
         return match, latent_functions(source, target, bases)
     C = fmap_from_match(Phi, Psi, target.low.mass, match)  # of eq. 3, for eq. 4
     return match, (source.functions(C.T), target.functions(np.eye(k)))
@@ -194,7 +194,9 @@ def match_functions(
     return nearest_in_cells(queries, target.cell, rows, source.cell)
 
 
-def sharpen_map(source: Shape, target: Shape, C: Array, B: Array | None = None) -> Array:
+def refine_at_full_resolution(
+    source: Shape, target: Shape, C: Array, B: Array | None = None
+) -> Array:
     """One more round of ZoomOut: coarse target vertices look among all vertices of the source.
 
     ZoomOut on the coarse meshes can only match coarse vertices, half their spacing off; that noise
@@ -225,16 +227,16 @@ def from_latent(
     source: Shape,
     target: Shape,
     bases: Functions,
-    motion: Motion,
+    transform: RigidTransform,
     *,
-    how: str = "ours",
+    dense_match: str = "latent",
     **options: Any,
 ) -> xr.Dataset:
     """One shape registered by the latent bases of a network (eq. 6, 7 and 8).
 
-    Eq. 6 gives one start and ICP another; elastic rounds refine both, and the best is kept.  Eq. 7,
-    or eq. 3 and 4, is the match at full resolution with ``refine="intrinsic"``, as in the paper, or
-    where that candidate is the best; eq. 8 follows.
+    Eq. 6 gives one start and ICP another; elastic iterations refine both, and the best is kept.
+    Eq. 7, or eq. 3 and 4, is the match at full resolution with ``refine="intrinsic"``, as in the
+    paper, or where that candidate is the best; eq. 8 follows.
 
     Parameters
     ----------
@@ -242,9 +244,9 @@ def from_latent(
         The shape and the template.
     bases : tuple of float ndarray (k, m)
         Their consistent latent bases Y.
-    motion : tuple (R, t)
-        Rigid motion of the shape onto the template (4.1, step 2), between their frames.
-    how : {"ours", "standard"}
+    transform : tuple (R, t)
+        Rigid transform of the shape onto the template (4.1, step 2), between their frames.
+    dense_match : {"latent", "fmap"}
         Eq. 7, or eq. 3 and 4.
     **options
         Of :func:`register`.
@@ -254,10 +256,10 @@ def from_latent(
     xarray.Dataset
         As of :func:`register`.
     """
-    match, functions = match_low(source, target, bases, how=how)
-    near = nearest_after_motion(source.low, target.low, motion)
+    match, functions = match_low(source, target, bases, dense_match=dense_match)
+    near = nearest_after_alignment(source.low, target.low, transform)
     starts = {"intrinsic": match, "icp": near}
-    return register(source, target, starts, functions, motion, k=len(bases[0]), **options)
+    return register(source, target, starts, functions, transform, k=len(bases[0]), **options)
 
 
 def register(
@@ -265,15 +267,15 @@ def register(
     target: Shape,
     starts: dict[str, Array],
     functions: Functions,
-    motion: Motion,
+    transform: RigidTransform,
     *,
     k: int = 100,
     refine: str = "elastic",
-    scale: bool = False,
-    parts: bool = True,
+    remove_size: bool = False,
+    articulated: bool = True,
     alignment: str = "fitted",
 ) -> xr.Dataset:
-    """The registration of one shape: match, displacement, motion, confidence and the way back.
+    """The registration of one shape: match, displacement, transform, confidence and the way back.
 
     Parameters
     ----------
@@ -284,20 +286,20 @@ def register(
     functions : tuple (F_source, F_target)
         Functions on both coarse meshes for the match at full resolution, see
         :func:`match_functions`.
-    motion : tuple (R, t)
-        Rigid motion of the shape onto the template found by ICP, between their frames.
+    transform : tuple (R, t)
+        Rigid transform of the shape onto the template found by ICP, between their frames.
     k : int
         Functions in which the displacement lives.
-    refine : {"elastic", "joint", "intrinsic"}
-        Elastic and local rounds, after joint ones in far poses; joint rounds; or the spectral match
-        alone.  After local rounds the displacement is not only in the first k functions;
-        ``displacement_coefficient`` is its part there.
-    scale : bool
+    refine : {"elastic", "spectral_icp", "intrinsic"}
+        Elastic and local iterations, after joint ones in far poses; joint iterations; or the
+        spectral match alone.  After local iterations the displacement is not only in the first k
+        functions; ``displacement_coefficient`` is its part there.
+    remove_size : bool
         Whether size is taken out of the displacement.
-    parts : bool
-        Whether in far poses joint rounds may turn the parts of a shape on their own.
+    articulated : bool
+        Whether in far poses joint iterations may turn the parts of a shape on their own.
     alignment : {"fitted", "icp"}
-        The displacement is measured after the motion that fits the registered surface best, or
+        The displacement is measured after the transform that fits the registered surface best, or
         after that of ICP, as the paper has it: then eq. 8 and (U Phi)(U Phi)^+ are as printed.
 
     Returns
@@ -306,7 +308,7 @@ def register(
         ``registered_match(vertex)``, ``displacement(vertex, xyz)``, ``displacement_raw``,
         ``registered_match_low(low_vertex)``, the start "intrinsic" (of eq. 6, or of ZoomOut where a
         pair is matched on its own), and ``displacement_low(low_vertex, xyz)`` of it;
-        ``displacement_coefficient(mode, xyz)`` of the displacement in U Phi of the template;
+        ``displacement_coefficient(eigenpair, xyz)`` of the displacement in U Phi of the template;
         ``icp_rotation``, ``icp_translation`` as given; ``rotation``, ``translation``, ``scale``,
         ``confidence(vertex)``, ``round_trip``, ``distortion``,
         ``template_triangle(original_vertex)``, ``template_barycentric``; displacements in the unit
@@ -314,10 +316,14 @@ def register(
         ``score``, its score at full resolution, and ``score_<candidate>`` at low resolution.
     """
     check("alignment", alignment)
-    candidates = find_candidates(source, target, starts, k=k, refine=refine, parts=parts)
-    by_icp = _motion_in_unit(source, target, motion, scale) if alignment == "icp" else None
-    # image = R x + t + U Phi c, smooth already: the line after eq. 8; or of elastic rounds
-    placed, elastic = by_icp and (motion, by_icp[3]), refine == "elastic"
+    candidates = find_candidates(
+        source, target, starts, k=k, refine=refine, articulated=articulated
+    )
+    by_icp = (
+        _transform_in_unit(source, target, transform, remove_size) if alignment == "icp" else None
+    )
+    # image = R x + t + U Phi c, smooth already: the line after eq. 8; or of elastic iterations
+    placed, elastic = by_icp and (transform, by_icp[3]), refine == "elastic"
     match, moved, attrs = register_surface(
         source, target, candidates, functions, placed, elastic=elastic
     )
@@ -328,7 +334,9 @@ def register(
         R, t, s, _ = by_icp
         displacement = s * image @ R.T + t - X
     else:
-        displacement, R, t, s = displacement_in_template(X, image, target.full.area, scale=scale)
+        displacement, R, t, s = displacement_in_template(
+            X, image, target.full.area, scale=remove_size
+        )
     raw = s * source.original["position"].values[match] @ R.T + t - X
     X_low = target.coarse["position"].values
     low = s * source.coarse["position"].values[starts["intrinsic"]] @ R.T + t - X_low
@@ -346,8 +354,8 @@ def register(
         rotation=R,
         translation=t,
         scale=np.array(s),
-        icp_rotation=motion[0],
-        icp_translation=motion[1],
+        icp_rotation=transform[0],
+        icp_translation=transform[1],
         confidence=sure.astype(np.float32),
         round_trip=trip.astype(np.float32),
         distortion=log_area_ratio(image, X, T).astype(np.float32),
@@ -359,19 +367,19 @@ def register(
     return in_unit(registration, common_unit(source.original, target.original))
 
 
-def _motion_in_unit(
-    source: Shape, target: Shape, motion: Motion, scale: bool
+def _transform_in_unit(
+    source: Shape, target: Shape, transform: RigidTransform, remove_size: bool
 ) -> tuple[Array, Array, float, float]:
-    """A rigid motion between the frames of two shapes as one between their files: R, t and s.
+    """A rigid transform between the frames of two shapes as one between their files: R, t and s.
 
     And the ratio of sizes that it leaves.
 
-    Without `scale` each keeps its size: the motion turns the source about its centre and carries
-    that to where it belongs.
+    Without `remove_size` each keeps its size: the transform turns the source about its centre and
+    carries that to where it belongs.
     """
     (center, size), (center_target, size_target) = source.frame, target.frame
-    R, t = motion
-    s = size_target / size if scale else 1.0
+    R, t = transform
+    s = size_target / size if remove_size else 1.0
     return R, center_target + size_target * t - s * R @ center, s, s * size / size_target
 
 
@@ -382,38 +390,40 @@ def find_candidates(
     *,
     k: int = 100,
     refine: str = "elastic",
-    parts: bool = True,
-) -> dict[str, joint.Candidate]:
+    articulated: bool = True,
+) -> dict[str, spectral_icp.Candidate]:
     """Where registration at full resolution may begin: of low resolution, with scores.
 
-    Elastic rounds need no better start than a match of the right parts: from eq. 6, from ICP and
-    from joint rounds after either they mostly end at one place (docs/decisions.md), so that joint
-    rounds are left to far poses.
+    Elastic iterations need no better start than a match of the right parts: from eq. 6, from ICP
+    and from joint iterations after either they mostly end at one place (docs/decisions.md), so that
+    joint iterations are left to far poses.
 
     Parameters
     ----------
-    source, target, starts, k, refine, parts : see :func:`register`
+    source, target, starts, k, refine, articulated : see :func:`register`
 
     Returns
     -------
     dict
-        Name -> :class:`s4a.method.joint.Candidate`; none for the spectral match alone.
+        Name -> :class:`s4a.method.spectral_icp.Candidate`; none for the spectral match alone.
     """
     check("refine", refine)
     if refine == "intrinsic":
         return {}
     M, N = source.low, target.low
-    if refine == "joint" or all(joint.far_apart(M, N, match) for match in starts.values()):
-        return joint.candidates(M, N, starts, k=k, parts=parts)
-    return joint.as_given(M, N, starts)
+    if refine == "spectral_icp" or all(
+        spectral_icp.far_apart(M, N, match) for match in starts.values()
+    ):
+        return spectral_icp.candidates(M, N, starts, k=k, articulated=articulated)
+    return spectral_icp.as_given(M, N, starts)
 
 
 def register_surface(
     source: Shape,
     target: Shape,
-    candidates: dict[str, joint.Candidate],
+    candidates: dict[str, spectral_icp.Candidate],
     functions: Functions,
-    placed: tuple[Motion, float] | None = None,
+    placed: tuple[RigidTransform, float] | None = None,
     *,
     elastic: bool = False,
 ) -> tuple[Array, Basis, dict[str, Any]]:
@@ -425,13 +435,14 @@ def register_surface(
     candidates : dict
         Of :func:`find_candidates`; empty for the spectral match alone.
     functions : see :func:`register`
-    placed : tuple (motion, ratio), optional
+    placed : tuple (transform, ratio), optional
         After which the displacement of the spectral match is smoothed, see
-        :func:`s4a.method.joint.warp_after`; by default after the motion that fits it best.
+        :func:`s4a.method.spectral_icp.warp_after`; by default after the transform that fits it
+        best.
     elastic : bool
-        Whether finalists go through :func:`elastic_surfaces`, and through looser rounds, too,
+        Whether finalists go through :func:`elastic_surfaces`, and through looser iterations, too,
         where the best end is torn (:func:`tear`); those by parts, of far poses, through local
-        rounds alone, as bodies otherwise ended farther from the truth.
+        iterations alone, as bodies otherwise ended farther from the truth.
 
     Returns
     -------
@@ -446,9 +457,9 @@ def register_surface(
         f"score_{name}": candidate.score for name, candidate in candidates.items()
     }
     ends: dict[str, tuple[float, Basis]] = {}
-    # starts as they are tell less of their ends than joint rounds do
+    # starts as they are tell less of their ends than joint iterations do
     margin = 2.0 if elastic else 1.25
-    names = joint.finalists(candidates, margin=margin) if candidates else ["intrinsic"]
+    names = spectral_icp.finalists(candidates, margin=margin) if candidates else ["intrinsic"]
     if elastic:
         whole = {n: candidates[n].warp for n in names if candidates[n].warp[0].ndim == 2}
         names = [name for name in names if name not in whole]  # by parts
@@ -465,20 +476,24 @@ def register_surface(
             match, compared, certified = match_functions(source, target, *functions)
             attrs |= {"compared_share": compared, "certified_share": certified}
             part = match[N.near_coarse]
-            warp = joint.warp_after(M, N, part, *placed) if placed else joint.fit_warp(M, N, part)
+            warp = (
+                spectral_icp.warp_after(M, N, part, *placed)
+                if placed
+                else spectral_icp.fit_warp(M, N, part)
+            )
         else:
-            part, warp = joint.dense_rounds(M, N, candidates[name].warp)
+            part, warp = spectral_icp.dense_spectral_icp(M, N, candidates[name].warp)
         if elastic:  # here by parts
-            X = _after_local_rounds(source, target, warp)
+            X = _after_local_iterations(source, target, warp)
             ends[f"{name}+local"] = _scored_alone(M, N, X)
         else:
-            moved = N.moved_to(joint.move(N, warp))
-            ends[name] = joint.registration_score(M, N, part, moved), moved
+            moved = N.moved_to(spectral_icp.move(N, warp))
+            ends[name] = spectral_icp.registration_score(M, N, part, moved), moved
     method = _best_of(ends)
     score, moved = ends[method]
     if method != "intrinsic":
         match = match_surfaces(moved.X, moved.normals, M.X, M.normals)
-    attrs |= {"method": method, "score": score}
+    attrs |= {"initialisation": method, "score": score}
     return match, moved, attrs
 
 
@@ -510,27 +525,27 @@ def mends(end: tuple[float, Basis], torn: tuple[float, Basis], target: Basis) ->
 def _scored_alone(source, target, X):
     """Score of the registered target, matched by what is nearest to it, and that target."""
     moved = target.moved_to(X)
-    match = joint.nearest_vertices(source, moved)
-    return joint.registration_score(source, target, match, moved), moved
+    match = spectral_icp.nearest_vertices(source, moved)
+    return spectral_icp.registration_score(source, target, match, moved), moved
 
 
 def elastic_surfaces(
-    source: Shape, target: Shape, starts: dict[str, joint.Warp], *, looser: bool = False
+    source: Shape, target: Shape, starts: dict[str, spectral_icp.Warp], *, looser: bool = False
 ) -> dict[str, Array]:
-    """The template ``(n_target, 3)`` after elastic rounds from several starts, and local ones.
+    """The template ``(n_target, 3)`` after elastic iterations from several starts, and local ones.
 
-    Starts that meet go on as one, see :func:`s4a.method.elastic.starts_that_meet`.  Where the end
-    of that lies on a fold beside the one on which a start was right, rounds from the starts
-    themselves that begin less stiff, `looser`, may end on the right one.
+    Starts that meet go on as one, see :func:`s4a.method.elastic.converging_initialisations`.  Where
+    the end of that lies on a fold beside the one on which a start was right, iterations from the
+    starts themselves that begin less stiff, `looser`, may end on the right one.
     """
     M, N, landmarks = source.full, target.low_on_surface, _common_landmarks(source, target)
     if not looser:
-        starts = starts_that_meet(M, N, starts, landmarks)
+        starts = converging_initialisations(M, N, starts, landmarks)
     schedule = FOLLOWING._replace(stiffness=STIFFNESS[_LOOSER if looser else 0 :])
     surfaces = {}
     for name, start in starts.items():
-        warp = elastic_rounds(M, N, start, schedule, landmarks=landmarks)
-        surfaces[name] = _after_local_rounds(source, target, warp)
+        warp = elastic_iterations(M, N, start, schedule, landmarks=landmarks)
+        surfaces[name] = _after_local_iterations(source, target, warp)
     return surfaces
 
 
@@ -548,12 +563,17 @@ def _common_landmarks(source, target):
     return Landmarks(Basis(B @ N.X, none, B @ N.area, target.low.Phi, U=B @ target.U), y)
 
 
-def _after_local_rounds(source: Shape, target: Shape, warp: joint.Warp) -> Array:
-    """The template ``(n_target, 3)`` after a warp, by parts or not, and local rounds."""
+def _after_local_iterations(source: Shape, target: Shape, warp: spectral_icp.Warp) -> Array:
+    """The template ``(n_target, 3)`` after a warp, by parts or not, and local iterations."""
     low, landmarks = target.low_on_surface, _common_landmarks(source, target)
-    pull = landmarks and (landmarks[0].U, landmarks.y - joint.move(landmarks.on_target, warp))
-    d = local_rounds(source.full, low, target.diffusion, joint.move(low, warp), pull=pull)
-    return joint.move(target.full, warp) + target.U @ d
+    pull = landmarks and (
+        landmarks[0].U,
+        landmarks.y - spectral_icp.move(landmarks.on_target, warp),
+    )
+    d = local_iterations(
+        source.full, low, target.diffusion, spectral_icp.move(low, warp), pull=pull
+    )
+    return spectral_icp.move(target.full, warp) + target.U @ d
 
 
 def way_back(source: Basis, moved: Basis) -> tuple[Array, Array]:
@@ -624,10 +644,10 @@ def identity(template: Shape) -> xr.Dataset:
         n_low = template.coarse.sizes["vertex"]
         low["displacement_low"] = np.zeros((n_low, 3), np.float32)
         low["registered_match_low"] = np.arange(n_low, dtype=np.int32)
-        if "mode" in template.coarse.sizes:
-            low["displacement_coefficient"] = np.zeros((template.coarse.sizes["mode"], 3))
+        if "eigenpair" in template.coarse.sizes:
+            low["displacement_coefficient"] = np.zeros((template.coarse.sizes["eigenpair"], 3))
     registration = dataset(
-        {"method": "template", "score": 0.0},
+        {"initialisation": "template", "score": 0.0},
         registered_match=np.arange(len(X), dtype=np.int32),
         displacement=zero,
         displacement_raw=zero,

@@ -40,9 +40,9 @@ _CUTS = 3  # how often that is tried before samples are added without limit
 
 
 def sample_surface(
-    X: Array, T: Array, G: sp.csr_matrix, rim: Array, avoid: Array, k: int, seed: int = 0
+    X: Array, T: Array, G: sp.csr_matrix, boundary: Array, avoid: Array, k: int, seed: int = 0
 ) -> Array:
-    """About k vertices spread over the surface, its boundary edges `rim` at the same spacing.
+    """About k vertices spread over the surface, its boundary edges `boundary` at the same spacing.
 
     Farthest points of (position, spacing * normal): the two sides of a thin wall count as apart,
     and bends get more.
@@ -52,7 +52,7 @@ def sample_surface(
     X, T : the mesh
     G : sparse matrix (n, n)
         :func:`s4a.geometry.mesh.edge_graph`.
-    rim : int ndarray (r, 2)
+    boundary : int ndarray (r, 2)
     avoid : bool ndarray (n,)
         Vertices that are not taken.
     k, seed : int
@@ -72,13 +72,13 @@ def sample_surface(
     P = np.c_[X / spacing, N]  # (n, 6)
     center = np.zeros(6)
     sample, free = np.empty(0, np.int64), np.flatnonzero(~avoid)
-    if len(rim):
-        length = np.linalg.norm(X[rim[:, 0]] - X[rim[:, 1]], axis=1).sum()
-        n_rim = min(int(np.ceil(length / (0.8 * spacing))), k // 2)
-        rim = np.unique(rim)
-        sample = rim[many_farthest_points(P[rim], n_rim, center=center, seed=seed)]
-        near = dijkstra(G, indices=rim, min_only=True, limit=0.6 * spacing)
-        free = np.setdiff1d(np.flatnonzero(np.isinf(near) & ~avoid), rim)
+    if len(boundary):
+        length = np.linalg.norm(X[boundary[:, 0]] - X[boundary[:, 1]], axis=1).sum()
+        n_boundary = min(int(np.ceil(length / (0.8 * spacing))), k // 2)
+        boundary = np.unique(boundary)
+        sample = boundary[many_farthest_points(P[boundary], n_boundary, center=center, seed=seed)]
+        near = dijkstra(G, indices=boundary, min_only=True, limit=0.6 * spacing)
+        free = np.setdiff1d(np.flatnonzero(np.isinf(near) & ~avoid), boundary)
     others = free[many_farthest_points(P[free], k - len(sample), center=center, seed=seed)]
     return np.sort(np.r_[sample, others])
 
@@ -132,7 +132,7 @@ def _coarse_surface(X, T, n_coarse, seed=0):
     cell : int ndarray (n,)
         Coarse vertex near each vertex of the mesh.
     attrs : dict
-        Counts of samples, rounds and vertices cut.
+        Counts of samples, iterations and vertices cut.
     """
     V, F = X, T  # the surface as far as handles have been cut
     origin = np.arange(len(X))  # vertex of X that each of V is, -1 for the centre of a fan
@@ -142,12 +142,14 @@ def _coarse_surface(X, T, n_coarse, seed=0):
         n_first = max(4, round(FIRST * n_coarse))
         first = sample_surface(V, F, graph.G, graph.E[graph.is_open], centre, n_first, seed)
         start = voronoi.voronoi_cells(graph.G, first)
-        state, rounds, faulty = voronoi.refine(graph, start, most, centre)
+        state, iterations, faulty = voronoi.refine(graph, start, most, centre)
         if not faulty:
             break
         region = voronoi.thin_regions(graph, start)
         crumb = triangle_areas(V, F).sum() / n_coarse  # the area of a cell
-        V, F, came_from = voronoi.cut_handles(V, F, voronoi.between_rims(graph.G, F, region), crumb)
+        V, F, came_from = voronoi.cut_handles(
+            V, F, voronoi.between_boundaries(graph.G, F, region), crumb
+        )
         origin = np.where(came_from >= 0, origin[came_from], -1)
     cell = np.full(len(X), -1)
     kept = np.flatnonzero(origin >= 0)
@@ -155,7 +157,7 @@ def _coarse_surface(X, T, n_coarse, seed=0):
     attrs = {
         "samples_first": len(first),
         "samples_added": len(state.sample) - len(first),
-        "rounds": rounds,
+        "iterations": iterations,
         "vertices_cut": int((cell < 0).sum()),
     }
     if attrs["vertices_cut"]:
@@ -225,8 +227,8 @@ def _nearest_with_normal(X, T, V, F):
 def topology(T: Array) -> dict[str, int]:
     """Euler characteristic, number of boundary loops, and of edges with three or more triangles."""
     E, _, count = surface.unique_edges(T)
-    rim, vertex = np.unique(E[count == 1], return_inverse=True)
-    loop = surface.components(vertex.reshape(-1, 2), len(rim))
+    boundary, vertex = np.unique(E[count == 1], return_inverse=True)
+    loop = surface.components(vertex.reshape(-1, 2), len(boundary))
     return {
         "euler_characteristic": surface.euler_characteristic(T, E),
         "boundary_loops": int(loop.max(initial=-1) + 1),
@@ -291,7 +293,7 @@ def coarsen(
         ``cotan_weight``: W;  ``vertex_area``: A, the area of the original surface carried by U, so
         that it sums to the original area (of the coarse mesh after wrapping); ``coarse_vertex``,
         ``coarse_weight (original_vertex, corner)``: U, rows non-negative of sum 1. The attributes
-        count samples, rounds, vertices that went with cut handles (U reaches them, too), Euler
+        count samples, iterations, vertices that went with cut handles (U reaches them, too), Euler
         characteristic and boundary loops, and say which Laplacian it is ("robust" where triangles
         are degenerate).
 
@@ -343,7 +345,9 @@ def coarsen(
     if len(V) <= n_coarse:
         Y, C = V, F
         sample = cell = np.arange(len(V))
-        attrs.update(kept_whole=1, samples_first=len(V), samples_added=0, rounds=0, vertices_cut=0)
+        attrs.update(
+            kept_whole=1, samples_first=len(V), samples_added=0, iterations=0, vertices_cut=0
+        )
     else:
         Y, C, sample, cell, counts = _coarse_surface(V, F, n_coarse, seed)
         attrs |= counts

@@ -20,7 +20,7 @@ from s4a.geometry.mesh import as_arrays, vertex_areas, vertex_normals
 from s4a.method.deform import smoother
 from s4a.method.remesh import laplacian
 from s4a.method.spectral import Diffusion, project, unit_area, unit_mass
-from s4a.options import N_CENTRAL, N_SPREAD
+from s4a.options import N_CENTRAL, N_SAMPLES
 from s4a.schema import Array
 
 N_PAIRED = 300  # spread vertices of a shape that rigid alignment pairs
@@ -50,7 +50,7 @@ class Basis:
     U : sparse matrix (n, p), optional
         Takes functions from the low resolution to the n vertices.  U Phi is never formed.
     near_coarse : int ndarray (s,), optional
-        Vertices by which fields are projected, and that rounds of registration look at; all by
+        Vertices by which fields are projected, and that iterations of registration look at; all by
         default.
     area_weighted : bool
         Whether these vertices weigh by their areas when a field is projected.
@@ -120,20 +120,20 @@ class Basis:
             return smoother(self.Phi[self.near_coarse], weight)
         return smoother(self.Phi, weight, self.U[self.near_coarse])
 
-    def spread_vertices(self, n: int = N_SPREAD) -> Array:
+    def sample_vertices_of(self, n: int = N_SAMPLES) -> Array:
         """Vertices ``(<= n,)`` spread over the surface; all in their order where n is 0."""
-        if N_SPREAD < len(self.X) and 0 < n <= N_SPREAD:
+        if N_SAMPLES < len(self.X) and 0 < n <= N_SAMPLES:
             return self._spread[:n]  # each is the farthest from those before it
         return farthest_points(self.X, n or len(self.X))
 
     @cached_property
     def _spread(self) -> Array:
-        return many_farthest_points(self.X, N_SPREAD, center=self.X.mean(0))
+        return many_farthest_points(self.X, N_SAMPLES, center=self.X.mean(0))
 
     @cached_property
     def cloud(self) -> Cloud:
         """The vertices as rigid alignment takes them."""
-        return Cloud(self.X, self.area, cKDTree(self.X), self.spread_vertices(N_PAIRED))
+        return Cloud(self.X, self.area, cKDTree(self.X), self.sample_vertices_of(N_PAIRED))
 
     @cached_property
     def tree(self) -> cKDTree:
@@ -175,15 +175,15 @@ class Basis:
         return stars(self.T, len(self.X))
 
     @cached_property
-    def rim(self) -> Array:
+    def boundary(self) -> Array:
         """Boundary edges ``(r, 2)``, in the direction in which their triangles go around."""
         _, edge_of, count = surface.unique_edges(self.T, len(self.X))
         return surface.directed_edges(self.T)[count[edge_of] == 1]
 
     @cached_property
-    def rim_tree(self) -> cKDTree:
+    def boundary_tree(self) -> cKDTree:
         """KD-tree over the positions of boundary vertices."""
-        return cKDTree(self.X[np.unique(self.rim)])
+        return cKDTree(self.X[np.unique(self.boundary)])
 
     @cached_property
     def graph(self) -> sp.csr_matrix:
@@ -212,8 +212,9 @@ class Shape:
     original : xarray.Dataset, optional
         The clean mesh: ``position``, ``corner_vertex``; empty where no step needs it.
     coarse : xarray.Dataset, optional
-        As :func:`s4a.coarsen` and :func:`s4a.spectrum` make it, or :func:`s4a.method.lift.lifted`,
-        or :func:`s4a.method.scalable.reduced`: then what is called coarse are samples.
+        As :func:`s4a.coarsen` and :func:`s4a.spectrum` make it, or
+        :func:`s4a.method.refined_eigenfunctions.lifted`, or :func:`s4a.method.scalable.reduced`:
+        then what is called coarse are samples.
     n_projected : int
         Vertices of ``full`` by which fields are projected, those nearest to coarse ones; 0 for all.
     area_weighted : bool
@@ -338,9 +339,9 @@ class Shape:
     @cached_property
     def full(self) -> Basis:
         """The original mesh and the functions U Phi, or lifted ones; its areas, of sum 1."""
-        (X, T), low, lifted = as_arrays(self.original), self.low, self.is_lifted
+        (X, T), low, lifted = as_arrays(self.original), self.low, self.has_refined_eigenfunctions
         X, area = self.to_frame(X), self._area / self._area.sum()
-        Phi = self.coarse["lifted_eigenfunction"].values if lifted else low.Phi
+        Phi = self.coarse["refined_eigenfunction"].values if lifted else low.Phi
         functions = Phi, low.eigenvalue, low.mass, self.U, self.near_coarse
         full = Basis(X, T, area, *functions, self.area_weighted, lifted)
         fields = {name: self.U @ values for name, values in low.fields.items()}
@@ -352,16 +353,16 @@ class Shape:
         return "local_weight" in self.coarse
 
     @property
-    def is_lifted(self) -> bool:
+    def has_refined_eigenfunctions(self) -> bool:
         """Whether the functions of ``full`` are lifted ones, and not U Phi."""
-        return "lifted_eigenfunction" in self.coarse
+        return "refined_eigenfunction" in self.coarse
 
     def functions(self, A: Array) -> Array:
         """The functions Phi A that full resolution compares, A ``(k, m)``.
 
         At coarse vertices, as U takes them from there; lifted ones at all.
         """
-        basis = self.full if self.is_lifted else self.low
+        basis = self.full if self.has_refined_eigenfunctions else self.low
         return basis.Phi[:, : len(A)] @ A.astype(basis.Phi.dtype)
 
     @cached_property

@@ -158,9 +158,9 @@ def spectrum(mesh: xr.Dataset, *, k: int = 100) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        The mesh with ``eigenvalue(mode)`` and ``eigenfunction(vertex, mode)`` for unit area: A^-1 W
-        phi = lambda phi, Phi^T A Phi = I with A of trace 1.  The attribute ``zero_eigenvalues``
-        counts the connected pieces.
+        The mesh with ``eigenvalue(eigenpair)`` and ``eigenfunction(vertex, eigenpair)`` for unit
+        area: A^-1 W phi = lambda phi, Phi^T A Phi = I with A of trace 1.  The attribute
+        ``zero_eigenvalues`` counts the connected pieces.
 
     Raises
     ------
@@ -188,7 +188,7 @@ def spectrum(mesh: xr.Dataset, *, k: int = 100) -> xr.Dataset:
     if "edge_mass" in mesh:
         raise ValueError(
             "a low-resolution mesh of s4a.coarsen needed; samples of SCALABLE come with their "
-            "spectrum: make them anew with another k"
+            "spectrum: make them again with another k"
         )
     n = mesh.sizes["vertex"]
     possible = min(int(k), n - 2)
@@ -203,7 +203,7 @@ def spectrum(mesh: xr.Dataset, *, k: int = 100) -> xr.Dataset:
         raise ValueError(
             f"no {possible} eigenpairs of a mesh with {n} vertices: {error}"
         ) from error
-    mesh = mesh.drop_dims("mode", errors="ignore")  # of the spectrum before
+    mesh = mesh.drop_dims("eigenpair", errors="ignore")  # of the spectrum before
     mesh.attrs.pop("k_reduced_from", None)
     attrs = dict(mesh.attrs, zero_eigenvalues=int((eigenvalue == 0).sum()))
     if possible < k:

@@ -11,20 +11,20 @@ import numpy as np
 import xarray as xr
 from threadpoolctl import threadpool_limits
 
-from s4a.geometry.align import Motion, align, motion_between, realign
+from s4a.geometry.align import RigidTransform, align, realign, relative_transform
 from s4a.method import fmap, network
-from s4a.method.first_map import first_map, map_after_motion, motion_onto
-from s4a.method.latent import WIDE, consistent_zoomout, nearest_spectra, place
+from s4a.method.initial_map import initial_map, map_after_alignment, transform_onto
+from s4a.method.latent import DENSE_ITERATIONS, consistent_zoomout, nearest_spectra, place
 from s4a.method.median import median_shape
 from s4a.method.register import from_latent, identity, match_functions, match_low
 from s4a.method.shape import Basis, Shape
-from s4a.options import DECLARED, N_SPREAD, check, kept_options
+from s4a.options import DECLARED, N_SAMPLES, check, kept_options
 from s4a.schema import check_count, dataset, require
 
 PROJECTION = [name for name, one in DECLARED.items() if one.metadata["of"] == "projection"]
 REGISTRATION = [
     *(name for name, one in DECLARED.items() if one.metadata["of"] == "registration"),
-    "how",
+    "dense_match",
     *PROJECTION,
 ]
 LOW = ("position", "corner_vertex", "vertex_area", "eigenvalue", "eigenfunction")
@@ -54,7 +54,7 @@ class LowBases(Sequence[Basis]):
 
 
 def align_pair(source: xr.Dataset, target: xr.Dataset) -> xr.Dataset:
-    """Rigid motion of a shape onto another by iterative closest points (4.1, step 2).
+    """Rigid transform of a shape onto another by iterative closest points (4.1, step 2).
 
     Parameters
     ----------
@@ -88,46 +88,50 @@ def align_pair(source: xr.Dataset, target: xr.Dataset) -> xr.Dataset:
 
 def map_pairs(
     bases: dict[str, Basis],
-    motions: dict[str, Motion],
+    transforms: dict[str, RigidTransform],
     pairs: Sequence[tuple[str, str]],
     *,
     k_init: int = 20,
     init: str = "dense",
-    ahead: bool = True,
-    n_spread: int = N_SPREAD,
+    initial_refinement: bool = True,
+    n_samples: int = N_SAMPLES,
 ) -> xr.Dataset:
-    """First maps of some pairs, in both directions (4.1, steps 3 and 4).
+    """Initial maps of some pairs, in both directions (4.1, steps 3 and 4).
 
     Parameters
     ----------
     bases : dict
         Name of a shape -> its low resolution.
-    motions : dict
-        Name -> motion (R, t) onto a common reference.
+    transforms : dict
+        Name -> transform (R, t) onto a common reference.
     pairs : sequence of (str, str)
     k_init, init : see :func:`s4a.analyse`
-    ahead : bool
+    initial_refinement : bool
         Whether a step of ZoomOut is done ahead (4.2).
-    n_spread : int
+    n_samples : int
         Spread vertices on which that step looks for matches in near poses; 0 for all.
 
     Returns
     -------
     xarray.Dataset
         ``source(pair)``, ``target(pair)`` and ``fmap_initial``; ``fmap_fitted``, the same before
-        the step ahead; ``pair_rotation``, ``pair_translation``, the motion of ICP; with landmarks
-        ``landmark_of_source(pair, landmark)`` and ``landmark_of_target``.
+        the step ahead; ``pair_rotation``, ``pair_translation``, the transform of ICP; with
+        landmarks ``landmark_of_source(pair, landmark)`` and ``landmark_of_target``.
     """
-    options: dict[str, Any] = {"k_init": k_init, "init": init, "ahead": ahead}
-    options["n_spread"] = n_spread
+    options: dict[str, Any] = {
+        "k_init": k_init,
+        "init": init,
+        "initial_refinement": initial_refinement,
+    }
+    options["n_samples"] = n_samples
     rows: list[tuple[Any, ...]] = []
     for a, b in pairs:
         M, N = bases[a], bases[b]
-        start = motion_between(motions[a], motions[b])
+        start = relative_transform(transforms[a], transforms[b])
         R, t = realign(M.cloud, N.cloud, start)
         R_back, t_back = R.T, -R.T @ t
-        first = first_map(M, N, (R, t), **options)
-        back = map_after_motion(N, M, (R_back, t_back), **options)
+        first = initial_map(M, N, (R, t), **options)
+        back = map_after_alignment(N, M, (R_back, t_back), **options)
         if first.name != init:  # far poses: the other direction must tell the same limbs apart
             back = back._replace(C=fmap.refine_once(N, M, first.C.T), fitted=first.C.T)
         rows.append((a, b, first.C, first.fitted, R, t, first.landmarks))
@@ -147,22 +151,22 @@ def build_network(
     n_pairs: int = 500,
     k_init: int = 20,
     init: str = "dense",
-    ahead: bool = True,
-    n_spread: int = N_SPREAD,
+    initial_refinement: bool = True,
+    n_samples: int = N_SAMPLES,
 ) -> xr.Dataset:
-    """The network of first maps of a collection (3.4, 4.1): its pairs, and a map each way.
+    """The network of initial maps of a collection (3.4, 4.1): its pairs, and a map each way.
 
     Parameters
     ----------
     coarse : dict of str to xarray.Dataset
         Name -> low-resolution mesh with its spectrum.
-    n_pairs, k_init, init, ahead, n_spread : see :func:`map_pairs`
+    n_pairs, k_init, init, initial_refinement, n_samples : see :func:`map_pairs`
 
     Returns
     -------
     xarray.Dataset
-        ``source(pair)``, ``target(pair)`` and ``fmap_initial(pair, mode_target_initial,
-        mode_source_initial)``; what else :func:`map_pairs` gives; ``icp_rotation(shape, xyz,
+        ``source(pair)``, ``target(pair)`` and ``fmap_initial(pair, eigenpair_target_initial,
+        eigenpair_source_initial)``; what else :func:`map_pairs` gives; ``icp_rotation(shape, xyz,
         xyz_2)`` and ``icp_translation(shape, xyz)`` onto the shape that all are aligned to, the
         attribute ``reference``.
 
@@ -202,19 +206,27 @@ def build_network(
     distance = network.spectral_distance([basis.eigenvalue[:k_init] for basis in bases.values()])
     reference = names[int(np.argmin(distance.sum(1)))]
     N = bases[reference]
-    motions = {name: motion_onto(M, N) for name, M in bases.items() if name != reference}
-    motions[reference] = np.eye(3), np.zeros(3)
+    transforms = {name: transform_onto(M, N) for name, M in bases.items() if name != reference}
+    transforms[reference] = np.eye(3), np.zeros(3)
     pairs = [(names[i], names[j]) for i, j in network.choose_pairs(distance, n_pairs)]
     maps = map_pairs(
-        bases, motions, pairs, k_init=k_init, init=init, ahead=ahead, n_spread=n_spread
+        bases,
+        transforms,
+        pairs,
+        k_init=k_init,
+        init=init,
+        initial_refinement=initial_refinement,
+        n_samples=n_samples,
     )
-    return with_motions(maps, {name: motions[name] for name in names}, reference)
+    return with_transforms(maps, {name: transforms[name] for name in names}, reference)
 
 
-def with_motions(maps: xr.Dataset, motions: dict[str, Motion], reference: str) -> xr.Dataset:
-    """A network with the motions of its shapes onto the `reference`."""
-    R, t = (np.stack(values) for values in zip(*motions.values(), strict=True))
-    placed = dataset(icp_rotation=R, icp_translation=t).assign_coords(shape=list(motions))
+def with_transforms(
+    maps: xr.Dataset, transforms: dict[str, RigidTransform], reference: str
+) -> xr.Dataset:
+    """A network with the transforms of its shapes onto the `reference`."""
+    R, t = (np.stack(values) for values in zip(*transforms.values(), strict=True))
+    placed = dataset(icp_rotation=R, icp_translation=t).assign_coords(shape=list(transforms))
     return maps.merge(placed).assign_attrs(reference=reference)
 
 
@@ -226,10 +238,10 @@ def refine_network(
     step: int = 5,
     n_latent: int | None = None,
     weights: str = "cycles",
-    n_spread: int = N_SPREAD,
-    wide: int = WIDE,
+    n_samples: int = N_SAMPLES,
+    dense_iterations: int = DENSE_ITERATIONS,
     norm: str = "h2",
-    keep_rounds: bool = False,
+    keep_iterations: bool = False,
     n_jobs: int | None = 1,
     progress: Callable[..., Any] | None = None,
 ) -> xr.DataTree:
@@ -241,7 +253,8 @@ def refine_network(
         Name -> low-resolution mesh with its spectrum.
     first : xarray.Dataset
         As of :func:`build_network`.
-    k, step, n_latent, weights, n_spread, wide, norm, keep_rounds : see :func:`s4a.analyse`
+    k, step, n_latent, weights, n_samples, dense_iterations, norm, keep_iterations : see
+    :func:`s4a.analyse`
     n_jobs : int
         Threads; the result does not depend on it.
     progress : callable, optional
@@ -253,14 +266,14 @@ def refine_network(
         ``/network`` with ``fmap``, ``weight``, ``cycle_error`` and ``cycle_error_initial``;
         ``/latent`` with ``latent_basis``, ``latent_eigenvalue`` and what
         :func:`s4a.method.median.median_shape` adds, the attribute ``median`` among it; with
-        `keep_rounds` ``/rounds/k_020`` and so on, ``fmap``, ``latent_basis`` and
+        `keep_iterations` ``/iterations/k_020`` and so on, ``fmap``, ``latent_basis`` and
         ``latent_eigenvalue`` of every size.
 
     Raises
     ------
     ValueError
         When a mesh or the network lacks its variables, or an option is outside its range: k is at
-        least the size of the first maps, and at most half of `n_spread` where that is not 0.
+        least the size of the initial maps, and at most half of `n_samples` where that is not 0.
 
     Examples
     --------
@@ -289,19 +302,19 @@ def refine_network(
     for name, mesh in coarse.items():
         require(mesh, *LOW, what=f"coarse mesh {name}")
     bases, names = LowBases(coarse), list(coarse)
-    k = min([k, *(mesh.sizes["mode"] for mesh in coarse.values())])
+    k = min([k, *(mesh.sizes["eigenpair"] for mesh in coarse.values())])
     source = np.array([names.index(name) for name in first["source"].values])
     target = np.array([names.index(name) for name in first["target"].values])
     C_initial = first["fmap_initial"].values  # (p, k_init, k_init)
     if k < C_initial.shape[1]:
-        raise ValueError(f"k must be at least {C_initial.shape[1]}, as first maps; found {k}")
-    rounds = {}
+        raise ValueError(f"k must be at least {C_initial.shape[1]}, as initial maps; found {k}")
+    iterations = {}
 
     def keep(C, Y, latent_eigenvalue):
         found = dataset(
             fmap=C.astype(np.float32), latent_basis=Y, latent_eigenvalue=latent_eigenvalue
         )
-        rounds[f"rounds/k_{len(Y[0]):03d}"] = found.assign_coords(shape=names)
+        iterations[f"iterations/k_{len(Y[0]):03d}"] = found.assign_coords(shape=names)
 
     with threadpool_limits(1):
         C, weight, _, Y, latent_eigenvalue = consistent_zoomout(
@@ -313,11 +326,11 @@ def refine_network(
             step=step,
             n_latent=n_latent,
             weights=weights,
-            samples=[basis.spread_vertices(n_spread) for basis in bases],
-            wide=wide,
+            samples=[basis.sample_vertices_of(n_samples) for basis in bases],
+            dense_iterations=dense_iterations,
             n_jobs=n_jobs,
             progress=progress,
-            keep=keep if keep_rounds else None,
+            keep=keep if keep_iterations else None,
         )
     cycles = network.three_cycles(source.tolist(), target.tolist())
     refined = dataset(
@@ -333,7 +346,7 @@ def refine_network(
         {
             "network": first.merge(refined),
             "latent": median_shape(latent, eigenvalues, norm=norm),
-            **rounds,
+            **iterations,
         }
     )
 
@@ -388,13 +401,13 @@ def template_of(study: xr.DataTree) -> str:
     return study["latent"].attrs["median"]
 
 
-def motion_in(study: Study, name: str) -> Any:
-    """Motion (R, t) of a shape onto the reference of the network; None where there are none.
+def transform_in(study: Study, name: str) -> Any:
+    """Rigid transform (R, t) of a shape onto the reference of the network, or None.
 
     A shape apart from the network is moved there now, if that is not in the study.
     """
-    if f"network/motion_{name}" in study:
-        own = study[f"network/motion_{name}"]
+    if f"network/alignment_{name}" in study:
+        own = study[f"network/alignment_{name}"]
         return own["rotation"].values, own["translation"].values
     network = study["network"] if "network" in study else xr.Dataset()
     if "icp_rotation" not in network:
@@ -402,7 +415,9 @@ def motion_in(study: Study, name: str) -> Any:
     if name in network["shape"]:
         own = network.sel(shape=name)
         return own["icp_rotation"].values, own["icp_translation"].values
-    return motion_onto(shape_in(study, name).low, shape_in(study, network.attrs["reference"]).low)
+    return transform_onto(
+        shape_in(study, name).low, shape_in(study, network.attrs["reference"]).low
+    )
 
 
 def latent_bases(study: Study, *names: str) -> tuple[Any, ...]:
@@ -426,7 +441,7 @@ def place_in(
     study: Study,
     names: Sequence[str],
     basis: Basis,
-    motions: Callable[[str], Motion],
+    transforms: Callable[[str], RigidTransform],
     **options: Any,
 ) -> np.ndarray:
     """The latent basis Y ``(k, m)`` of a shape beside a network that stays as it is (eq. 3).
@@ -439,8 +454,8 @@ def place_in(
         The shapes of the network, the first of them always taken.
     basis : Basis
         Low resolution of the shape.
-    motions : callable
-        Gives the motion of the shape onto one of these.
+    transforms : callable
+        Gives the transform of the shape onto one of these.
     **options
         Of :func:`s4a.method.latent.place`.
     """
@@ -448,7 +463,7 @@ def place_in(
     near = [names[i] for i in nearest_spectra(basis.eigenvalue, spectra, options["k_init"])]
     bases = [basis_in(study, name) for name in near]
     Y = np.stack(latent_bases(study, *near))
-    return place(basis, bases, Y, [motions(name) for name in near], **options)
+    return place(basis, bases, Y, [transforms(name) for name in near], **options)
 
 
 def register_in(
@@ -456,7 +471,7 @@ def register_in(
     name: str,
     template: str,
     target: Shape,
-    start: Motion | None = None,
+    start: RigidTransform | None = None,
     **options: Any,
 ) -> xr.Dataset:
     """:func:`register_shape` to the shape `target`, which is the template, with all options."""
@@ -467,14 +482,14 @@ def register_in(
     bases = latent_bases(study, name, template)
     M, N = source.low, target.low
     if start is None:
-        own, other = motion_in(study, name), motion_in(study, template)
-        start = motion_between(own, other) if own and other else None
-    motion = motion_onto(M, N) if start is None else realign(M.cloud, N.cloud, start)
-    return from_latent(source, target, bases, motion, **options)
+        own, other = transform_in(study, name), transform_in(study, template)
+        start = relative_transform(own, other) if own and other else None
+    transform = transform_onto(M, N) if start is None else realign(M.cloud, N.cloud, start)
+    return from_latent(source, target, bases, transform, **options)
 
 
 def latent_match(
-    study: xr.DataTree, source: str, target: str, *, how: str = "ours", full: bool = True
+    study: xr.DataTree, source: str, target: str, *, dense_match: str = "latent", full: bool = True
 ) -> xr.Dataset:
     """Match of any two shapes of a network by their latent bases (eq. 3 and 6; eq. 7 or 4).
 
@@ -484,7 +499,7 @@ def latent_match(
         With ``/original``, ``/coarse`` and ``/latent``.
     source, target : str
         Names of shapes.
-    how : {"ours", "standard"}
+    dense_match : {"latent", "fmap"}
         At full resolution eq. 7, or eq. 4 with the functional map of the match of eq. 3.
     full : bool
         Whether original vertices are matched, or those of low resolution by eq. 3.
@@ -497,7 +512,7 @@ def latent_match(
     Raises
     ------
     ValueError
-        When a shape is not in the study, or `how` is another word.
+        When a shape is not in the study, or `dense_match` is another word.
 
     Examples
     --------
@@ -509,7 +524,9 @@ def latent_match(
     """
     nodes = Study(study)
     shapes = shape_in(nodes, source), shape_in(nodes, target)
-    match, functions = match_low(*shapes, latent_bases(nodes, source, target), how=how)
+    match, functions = match_low(
+        *shapes, latent_bases(nodes, source, target), dense_match=dense_match
+    )
     if full:
         match, *_ = match_functions(*shapes, *functions)
     return dataset(match=match)
@@ -530,7 +547,7 @@ def latent_map(study: xr.DataTree, source: str, target: str) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        ``fmap(mode_target, mode_source)``.
+        ``fmap(eigenpair_target, eigenpair_source)``.
 
     Raises
     ------
@@ -558,8 +575,8 @@ def register_shape(
     name: str,
     template: str | None = None,
     *,
-    start: Motion | None = None,
-    how: str | None = None,
+    start: RigidTransform | None = None,
+    dense_match: str | None = None,
     **options: Any,
 ) -> xr.Dataset:
     """One shape of a study registered to the template (4.2; eq. 6, 7 and 8).
@@ -574,15 +591,16 @@ def register_shape(
     name, template : str
         The template of the study by default; the median shape, where nothing is registered yet.
     start : tuple (R, t), optional
-        About the rigid motion of the shape onto the template, between their frames; by default that
-        by which the network is aligned, or where there is none that of ICP from the principal axes.
-    how : {"ours", "standard"}, optional
+        About the rigid transform of the shape onto the template, between their frames; by default
+        that by which the network is aligned, or where there is none that of ICP from the principal
+        axes.
+    dense_match : {"latent", "fmap"}, optional
         Eq. 7, or eq. 3 and 4.
     **options
-        ``refine``, ``scale``, ``parts`` and ``alignment`` of
+        ``refine``, ``remove_size``, ``articulated`` and ``alignment`` of
         :func:`s4a.method.register.register`; ``n_projected`` and ``area_weighted`` of
         :class:`s4a.method.shape.Shape`.  One that is not given, or as None, is that of the study's
-        report, as `how` is; their own defaults hold where it names none.
+        report, as `dense_match` is; their own defaults hold where it names none.
 
     Returns
     -------
@@ -609,7 +627,11 @@ def register_shape(
             f"unexpected options {', '.join(wrong)}; those of a registration are "
             f"{', '.join(REGISTRATION)}"
         )
-    given = {key: value for key, value in (options | {"how": how}).items() if value is not None}
+    given = {
+        key: value
+        for key, value in (options | {"dense_match": dense_match}).items()
+        if value is not None
+    }
     options = options_of_registration(study) | given
     for option in options.keys() & {"refine", "alignment", "how"}:
         check(option, options[option])

@@ -338,8 +338,8 @@ def _light(N, base, crease):
     gloss = (gloss / np.linalg.norm(gloss)).astype(np.float32)
     wrap = np.clip((N @ key + 0.3) / 1.3, 0, 1)
     sky = 0.5 + 0.5 * N[:, 1]
-    rim = np.clip(1 - N[:, 2], 0, 1) ** 3
-    light = (0.47 + 0.15 * sky + 0.48 * wrap) * (1 - 0.5 * crease) * (1 - 0.3 * rim)
+    boundary = np.clip(1 - N[:, 2], 0, 1) ** 3
+    light = (0.47 + 0.15 * sky + 0.48 * wrap) * (1 - 0.5 * crease) * (1 - 0.3 * boundary)
     shine = 0.10 * np.clip(N @ gloss, 0, 1) ** 40 * (1 - crease)
     return np.clip(base * light[:, None] + shine[:, None], 0, 1)
 

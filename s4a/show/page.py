@@ -16,7 +16,6 @@ from s4a.show.pictures import N_MODES, PANEL, SIGMA, mode_pictures, shared_frame
 from s4a.show.surfaces import (
     N_LIVE,
     attribute,
-    carried_colors,
     has,
     labelled,
     low_text,
@@ -28,11 +27,12 @@ from s4a.show.surfaces import (
     score_state,
     surface,
     template_coarse,
+    transferred_colors,
 )
 from s4a.study.tree import left_out, seconds_of
 
 LARGE = 20_000  # vertices from which a page moves the low-resolution mesh
-N_CARRIED = 5  # shapes to which the template's colours are carried
+N_TRANSFERRED = 5  # shapes to which the template's colours are carried
 
 
 def write_page(
@@ -119,7 +119,7 @@ def _summary(study):
     facts = []
     if has(study, "report/status"):
         status = study["report"]["status"].values.astype(str)
-        count = {kind: (status == kind).sum() for kind in ("repaired", "doubtful", "excluded")}
+        count = {kind: (status == kind).sum() for kind in ("repaired", "flagged", "excluded")}
         counts = [f"{number} {kind}" for kind, number in count.items()]
         facts.append(f"{len(status)} shapes, {', '.join(counts)}")
     for node, key in (("latent", "median"), ("registration", "template")):
@@ -134,7 +134,7 @@ def _summary(study):
 
 
 def _warnings(study):
-    """What of the report a reader should know first: shapes left out, doubtful, odd; or nothing."""
+    """What of the report a reader should know first: shapes left out, flagged, odd; or nothing."""
     if not has(study, "report/status"):
         return Markup("")
     report, places = study["report"].dataset, _pictures(study)
@@ -143,16 +143,16 @@ def _warnings(study):
     if (status == "excluded").any():
         left = _linked(names[status == "excluded"], places)
         lines.append(("excluded", "left out, for the reasons in the table of shapes", left))
-    for kind, found in (("doubtful", decisions(report)), ("odd", notices(report))):
+    for kind, found in (("flagged", decisions(report)), ("odd", notices(report))):
         for one in found:
             lines.append((kind, f"{one.kind} ({one.remedy})", _linked(one.names, places)))
     if not lines:
         return Markup("")
-    become = "Doubtful shapes are registered, and in no modes, no statistics and no median; "
-    become += "s4a run ... --keep-doubtful takes all of them in."
-    if kept_options(report).get("keep_doubtful"):
-        become = "Doubtful shapes were taken into modes and statistics by keep_doubtful."
-    note = PARTS.note(become) if (status == "doubtful").any() else Markup("")
+    become = "Flagged shapes are registered, and in no modes, no statistics and no median; "
+    become += "s4a run ... --include-flagged takes all of them in."
+    if kept_options(report).get("include_flagged"):
+        become = "Flagged shapes were taken into modes and statistics by include_flagged."
+    note = PARTS.note(become) if (status == "flagged").any() else Markup("")
     return PARTS.warnings(lines) + note
 
 
@@ -230,7 +230,7 @@ def _maps(study, look):
 
 
 def _distances(study, look):
-    distance = study["latent"].dataset["distance_to_median"]
+    distance = study["latent"].dataset["distance_to_limit"]
     names = names_of(distance)
     median = _index(names, attribute(study, "latent", "median"))
     figure = charts.ranked(names, distance.values, "distance to the limit shape", median)
@@ -315,11 +315,11 @@ def _scores(study, look):
     figure = charts.scores(np.array(state["samples"]), names, template, faint)
     text = "scores of the shapes; the template is orange"
     if any(faint):
-        text += ", doubtful shapes are grey"
-    beyond = pca.sizes.get("shape_apart", 0) - sum(name not in names_of(pca) for name in names)
+        text += ", flagged shapes are grey"
+    beyond = pca.sizes.get("shape_excluded", 0) - sum(name not in names_of(pca) for name in names)
     note = ""
     if beyond:
-        note = PARTS.note(f"{beyond} doubtful shapes lie too far away to be drawn.")
+        note = PARTS.note(f"{beyond} flagged shapes lie too far away to be drawn.")
     return Markup(note) + PARTS.drawing(figure, text)
 
 
@@ -330,7 +330,7 @@ def _correspondence(study, look):
     template = registration.attrs.get("template", "")
     surfaces: dict[str, Any] = {f"{template}, the template": (X, T, colors)}
     others = [name for name in names_of(registration) if name != template]
-    surfaces |= {name: carried_colors(study, name, colors) for name in others[:N_CARRIED]}
+    surfaces |= {name: transferred_colors(study, name, colors) for name in others[:N_TRANSFERRED]}
     surfaces = {name: one for name, one in surfaces.items() if one is not None}
     frames = shared_frames([X for X, _, _ in surfaces.values()], look)
     figures = []
@@ -406,7 +406,7 @@ SECTIONS = (
     ("Gallery", ["coarse"], _gallery),
     ("Network of maps", ["network/source", "network/target", "network/cycle_error"], _network),
     ("Functional maps", ["network/fmap"], _maps),
-    ("Distance to the limit shape", ["latent/distance_to_median"], _distances),
+    ("Distance to the limit shape", ["latent/distance_to_limit"], _distances),
     ("Explained variance", ["pca/explained_variance_ratio"], _variance),
     ("Scores", ["pca/score"], _scores),
     ("Correspondence", ["registration/position", "registration/registered_match"], _correspondence),

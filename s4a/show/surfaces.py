@@ -14,7 +14,7 @@ from s4a.show.draw import cycle_error_limits
 
 N_LIVE = 20  # modes that panels and pages move, unless asked: of 20,000 vertices 0.3 MB each
 N_SCALED = 3  # modes that set the scale of colours
-FAR = 8  # standard deviations beyond which charts of scores leave a doubtful shape out
+FAR = 8  # standard deviations beyond which charts of scores leave a flagged shape out
 RESOLUTIONS = [("low resolution", "coarse"), ("full resolution", "original")]
 SAMPLES = "samples of SCALABLE, joined where their cells meet"
 
@@ -37,18 +37,18 @@ def names_of(data: xr.Dataset | xr.DataArray) -> list[str]:
     return [str(name) for name in data["shape"].values]
 
 
-def doubtful_names(study: xr.DataTree) -> list[str]:
-    """The shapes that the report calls doubtful."""
+def flagged_names(study: xr.DataTree) -> list[str]:
+    """The shapes that the report calls flagged."""
     if not has(study, "report/status"):
         return []
     report = study["report"].dataset
-    return names_of(report.sel(shape=report["status"].values == "doubtful"))
+    return names_of(report.sel(shape=report["status"].values == "flagged"))
 
 
 def labelled(study: xr.DataTree, names: list[str]) -> list[tuple[str, str]]:
-    """Shapes as options of a list: what is shown, which marks doubtful ones, and the name."""
-    doubtful = set(doubtful_names(study))
-    return [(f"{name} (doubtful)" if name in doubtful else name, name) for name in names]
+    """Shapes as options of a list: what is shown, which marks flagged ones, and the name."""
+    flagged = set(flagged_names(study))
+    return [(f"{name} (flagged)" if name in flagged else name, name) for name in names]
 
 
 def label_text(mesh: xr.Dataset, value: Any) -> str:
@@ -67,9 +67,9 @@ def aligned(study: xr.DataTree, name: str, X: np.ndarray) -> np.ndarray:
     registration = study["registration"].dataset if has(study, "registration/rotation") else None
     if registration is None or name not in names_of(registration):
         return X
-    motion = registration.sel(shape=name)
-    scale = motion["scale"].item() if "scale" in motion else 1.0
-    return scale * X @ motion["rotation"].values.T + motion["translation"].values
+    transform = registration.sel(shape=name)
+    scale = transform["scale"].item() if "scale" in transform else 1.0
+    return scale * X @ transform["rotation"].values.T + transform["translation"].values
 
 
 def low_text(mesh: xr.Dataset) -> str:
@@ -111,7 +111,7 @@ def barycentric_place(study: xr.DataTree, name: str) -> tuple[np.ndarray, np.nda
     return corners, place["template_barycentric"].values
 
 
-def carried_colors(
+def transferred_colors(
     study: xr.DataTree, name: str, colors: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Aligned mesh of a shape, with the colours of the template's vertices carried to it.
@@ -195,23 +195,23 @@ def score_state(study: xr.DataTree, n_modes: int | None = None) -> dict[str, Any
     pca = study["pca"].dataset.isel(component=slice(n_modes))
     low = pca.get("explained_variance_ratio_low")
     scores = dict(zip(names_of(pca), pca["score"].values.tolist(), strict=True))
-    scores |= near_apart(pca)
+    scores |= near_excluded(pca)
     return {
         "ratio": pca["explained_variance_ratio"].values.tolist(),
         "ratio_low": [] if low is None else low.values.tolist(),
         "samples": list(scores.values()),
         "names": list(scores),
-        "faint": [name in doubtful_names(study) for name in scores],
+        "faint": [name in flagged_names(study) for name in scores],
     }
 
 
-def near_apart(pca: xr.Dataset) -> dict[str, list[float]]:
+def near_excluded(pca: xr.Dataset) -> dict[str, list[float]]:
     """Scores of the shapes that the modes are made without, where a chart can show them."""
-    if "score_apart" not in pca:
+    if "score_excluded" not in pca:
         return {}
-    near = pca.sel(shape_apart=(np.abs(pca["score_apart"][:, :3].values) < FAR).all(axis=1))
-    names = [str(name) for name in near["shape_apart"].values]
-    return dict(zip(names, near["score_apart"].values.tolist(), strict=True))
+    near = pca.sel(shape_excluded=(np.abs(pca["score_excluded"][:, :3].values) < FAR).all(axis=1))
+    names = [str(name) for name in near["shape_excluded"].values]
+    return dict(zip(names, near["score_excluded"].values.tolist(), strict=True))
 
 
 def network_places(study: xr.DataTree, names: list[str]) -> np.ndarray | None:

@@ -36,8 +36,8 @@ def kind_of(name: str) -> str:
     Examples
     --------
     >>> from s4a.study.contents import kind_of
-    >>> kind_of("network/look_brain_01"), kind_of("registration/a"), kind_of("pca")
-    ('network/look', 'registration/shape', 'pca')
+    >>> kind_of("network/comparison_brain_01"), kind_of("registration/a"), kind_of("pca")
+    ('network/comparison', 'registration/shape', 'pca')
     """
     stage, _, shape = name.partition("/")
     if shape and stage == "network":
@@ -117,7 +117,7 @@ def check_names(data: xr.Dataset) -> None:
                 twice = each[counts > 1].tolist()
                 raise ValueError(f"{name} needs names that differ, found {twice} more than once")
     names = [str(data.attrs[attr]) for attr in ("template", "median") if attr in data.attrs]
-    names += str(data.attrs.get("apart", "")).split()
+    names += str(data.attrs.get("excluded", "")).split()
     names += data.coords["shape"].values.astype(str).tolist() if "shape" in data.coords else []
     wrong = [name for name in names if slug(name) != name]
     if wrong:

@@ -12,17 +12,17 @@ from threadpoolctl import threadpool_limits
 from s4a.geometry.crossing import can_count
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.input import plausibility
+from s4a.input.chirality import AUTO, is_mirrored, mirror_image
 from s4a.input.collection import shape_report
 from s4a.input.files import SUFFIXES as MESHES
 from s4a.input.files import files_named, suffix_of
-from s4a.input.hands import AUTO, is_of_other_hand, mirror_image
 from s4a.input.landmarks import SUFFIXES
 from s4a.input.plausibility import find_warnings
 from s4a.input.subjects import listed
-from s4a.method.first_map import motion_onto
+from s4a.method.initial_map import transform_onto
 from s4a.method.latent import latent_of_new
-from s4a.method.lift import low_resolution
 from s4a.method.pca import project_scores
+from s4a.method.refined_eigenfunctions import low_resolution
 from s4a.method.register import from_latent
 from s4a.method.shape import Shape
 from s4a.method.steps import Study, latent_bases, place_in
@@ -85,9 +85,9 @@ def insert(
         commas between them, or ``"auto"``, those of the other hand than the shapes of the study as
         they are in it.  Without it none is mirrored, and `compare` tells those of the other hand.
     compare : bool
-        Whether each new shape is compared with those of the study: unit, handedness, pose, genus,
-        as :func:`s4a.read_shapes` does it; what looks wrong is named in ``/report`` and left as it
-        is.
+        Whether each new shape is compared with those of the study: unit, mean_chirality, pose,
+        genus, as :func:`s4a.read_shapes` does it; what looks wrong is named in ``/report`` and left
+        as it is.
     n_jobs : int, optional
         As in joblib; the result does not depend on it.
 
@@ -96,7 +96,7 @@ def insert(
     DataTree
         As a study of the new shapes alone: ``/original``, ``/coarse``, ``/registration`` to the
         frozen template with ``confidence(shape, vertex)``; in ``/latent`` ``latent_basis(shape,
-        mode, latent)``, shape differences and ``distance_to_median(shape)``; in ``/pca``
+        mode, latent)``, shape differences and ``distance_to_limit(shape)``; in ``/pca``
         ``score(shape, component)`` on the frozen modes, these, and ``reconstruction_error(shape)``;
         ``/report``.  ``/original`` has the template's mesh too, so that labels can be transferred.
 
@@ -132,13 +132,13 @@ def insert(
     meshes, attrs = read_new(shapes, options, landmarks)
     if template in meshes:
         raise ValueError(f"new shapes need other names than the template, {template!r}; rename it")
-    portraits = portraits_of(study) if compare or reflect == AUTO else {}
-    mirrored, told = reflected_of_new(reflect, meshes, list(attrs), portraits)
+    descriptors = descriptors_of(study) if compare or reflect == AUTO else {}
+    mirrored, told = reflected_of_new(reflect, meshes, list(attrs), descriptors)
     for name in mirrored:
         meshes[name] = mirror_image(meshes[name])
         attrs[name] = attrs[name] | meshes[name].attrs
     frozen = freeze(study, options)
-    references = portraits if compare else None
+    references = descriptors if compare else None
     # in a tuple: a Dataset of its own is kept by one worker of dask, and is lost with that
     results = workers(n_jobs)(
         delayed(insert_one)((mesh,), frozen, options, references) for mesh in meshes.values()
@@ -178,7 +178,7 @@ def insert(
     report = nodes["report"].attrs
     report["remarks"] = "\n".join(filter(None, [*told, report["remarks"]]))
     # all that were given are in the result
-    report.update(with_options(report, {"keep_doubtful": True}))
+    report.update(with_options(report, {"include_flagged": True}))
     if reflect is not None:
         nodes["report"]["reflected"] = variable("reflected", [name in mirrored for name in attrs])
     return xr.DataTree.from_dict(nodes)
@@ -188,7 +188,7 @@ def reflected_of_new(
     reflect: str | list[str] | None,
     meshes: dict[str, xr.Dataset],
     given: list[str],
-    portraits: dict[str, xr.Dataset],
+    descriptors: dict[str, xr.Dataset],
 ) -> tuple[list[str], list[str]]:
     """The new shapes whose mirror images are taken, and what is told of the choice.
 
@@ -199,14 +199,14 @@ def reflected_of_new(
         The new ones that can be used.
     given : list of str
         Names of all.
-    portraits : dict of str to Dataset
-        Of shapes of the study, see :func:`portraits_of`.
+    descriptors : dict of str to Dataset
+        Of shapes of the study, see :func:`descriptors_of`.
     """
     if reflect is None:
         return [], []
     if reflect == AUTO:
-        known, looks = hands_beside(meshes, portraits)
-        said = {name: is_of_other_hand(name, look, known) for name, look in looks.items()}
+        known, looks = compare_chirality(meshes, descriptors)
+        said = {name: is_mirrored(name, look, known) for name, look in looks.items()}
         told = [line for _, line in said.values() if line]
         for line in told:
             log.warning("%s", line)
@@ -222,13 +222,17 @@ def reflected_of_new(
     return [name for name in names if name in meshes], []
 
 
-def hands_beside(
-    meshes: dict[str, xr.Dataset], portraits: dict[str, xr.Dataset]
+def compare_chirality(
+    meshes: dict[str, xr.Dataset], descriptors: dict[str, xr.Dataset]
 ) -> tuple[dict[str, xr.Dataset], dict[str, xr.Dataset]]:
     """:func:`s4a.input.plausibility.compare` of shapes of the study, and of new ones."""
-    known = {name: plausibility.compare(name, seen, portraits) for name, seen in portraits.items()}
+    known = {
+        name: plausibility.compare(name, seen, descriptors) for name, seen in descriptors.items()
+    }
     looks = {
-        name: plausibility.compare("", plausibility.portray(mesh, intersections=False), portraits)
+        name: plausibility.compare(
+            "", plausibility.describe(mesh, intersections=False), descriptors
+        )
         for name, mesh in meshes.items()
     }
     return known, looks
@@ -268,7 +272,7 @@ def are_meshes(paths: Path | str | list[Any]) -> bool:
 def freeze(study: xr.DataTree, options: Options) -> Frozen:
     """What new shapes need of a study, the template first.
 
-    Shapes that failed, and those that the study leaves out as doubtful, are not among them.
+    Shapes that failed, and those that the study leaves out as flagged, are not among them.
     """
     latent = study["latent"].to_dataset()
     require(latent, "latent_basis", "latent_eigenvalue", what="latent dataset")
@@ -308,12 +312,12 @@ def _insert_one(mesh, frozen, options, references):
     (of_template,) = latent_bases(study, names[0])
     k = len(of_template)
     coarse = low_resolution(mesh, **options.of("low resolution") | {"k": k})
-    if coarse.sizes["mode"] < k:
+    if coarse.sizes["eigenpair"] < k:
         raise ValueError(
-            f"the study needs {k} eigenfunctions, this shape has only {coarse.sizes['mode']}"
+            f"the study needs {k} eigenfunctions, this shape has only {coarse.sizes['eigenpair']}"
         )
     shape = Shape(mesh, coarse, **options.of("projection"))
-    R, t = motion_onto(shape.low, template.low)
+    R, t = transform_onto(shape.low, template.low)
     turn = study["registration"]["rotation"]  # onto the template
     Y = place_in(
         study,
@@ -322,14 +326,14 @@ def _insert_one(mesh, frozen, options, references):
         lambda name: (turn.sel(shape=name).values.T @ R, np.zeros(3)),
         k_init=min(options.k_init, k),
         step=options.step,
-        **options.of("first maps"),
+        **options.of("initial maps"),
     )
-    settings = {"how": options.how, **options.of("registration")}
+    settings = {"dense_match": options.dense_match, **options.of("registration")}
     registration = from_latent(shape, template, (Y, of_template), (R, t), **settings)
     seen = None
     if references is not None:
-        portrait = plausibility.portray(mesh, intersections=can_count(options.intersections))
-        seen = plausibility.compare("", portrait, references)
+        descriptor = plausibility.describe(mesh, intersections=can_count(options.intersections))
+        seen = plausibility.compare("", descriptor, references)
     return Inserted(coarse, Y, registration, seen)
 
 
@@ -340,20 +344,20 @@ def known_to(study: xr.DataTree) -> dict[str, dict[Any, Any]]:
     return {name: study["original"][name].attrs for name in names if name not in doubted}
 
 
-def portraits_of(study: xr.DataTree) -> dict[str, xr.Dataset]:
+def descriptors_of(study: xr.DataTree) -> dict[str, xr.Dataset]:
     """Portraits of the shapes of a study beside which new ones are seen."""
-    portraits = {}
+    descriptors = {}
     known = known_to(study)
     by_size = sorted(known, key=lambda name: known[name]["area"])
     for name in plausibility.spread(by_size, 2 * plausibility.N_REFERENCES):
         mesh = study["original"][name].to_dataset()
-        seen = plausibility.portray(mesh, intersections=False)
+        seen = plausibility.describe(mesh, intersections=False)
         if "report" in study:  # where they were counted
             number = int(study["report"]["self_intersections"].sel(shape=name))
             share = number / mesh.sizes["triangle"] if number >= 0 else -1.0
             seen = seen.assign_attrs(self_intersections=number, intersecting=share)
-        portraits[name] = seen
-    return {name: portraits[name] for name in plausibility.pick_references(portraits)}
+        descriptors[name] = seen
+    return {name: descriptors[name] for name in plausibility.pick_references(descriptors)}
 
 
 def report_beside(
@@ -367,15 +371,15 @@ def report_beside(
     known_looks = {
         name: plausibility.compare(name, seen, references) for name, seen in references.items()
     }
-    told_before = find_warnings(known, known_looks)[1]
+    reported_before = find_warnings(known, known_looks)[1]
     reports, remarks = [], {}
     for name, said in attrs.items():
         if name not in looks:  # it could not be used
             reports.append(shape_report({name: said}))
             continue
-        doubts, told = find_warnings(known | {name: said}, known_looks | {name: looks[name]})
-        reports.append(shape_report({name: said}, doubts, evidence={name: looks[name]}))
-        remarks |= dict.fromkeys(line for line in told if line not in told_before)
+        flags, told = find_warnings(known | {name: said}, known_looks | {name: looks[name]})
+        reports.append(shape_report({name: said}, flags, evidence={name: looks[name]}))
+        remarks |= dict.fromkeys(line for line in told if line not in reported_before)
     return xr.concat(reports, dim="shape").assign_attrs(remarks="\n".join(remarks))
 
 
@@ -389,5 +393,7 @@ def scores_of_new(modes: xr.Dataset, registration: xr.Dataset, area: np.ndarray)
         area,
     )
     new = in_unit(dataset(score=score, reconstruction_error=left), unit_of(modes["deformation"]))
-    frozen = modes.drop_vars(["score", "shape", "score_apart", "shape_apart"], errors="ignore")
+    frozen = modes.drop_vars(
+        ["score", "shape", "score_excluded", "shape_excluded"], errors="ignore"
+    )
     return frozen.merge(new).assign_coords(shape=registration["shape"])

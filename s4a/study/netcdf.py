@@ -2,7 +2,7 @@
 
 HDF5 takes milliseconds to tell what a file holds, and a study of a thousand shapes has three
 thousand files.  Each file therefore has its own contents as text in the variable
-``/s4a/contents_2``: JSON with the attributes, dims and types of every group, and the values of
+``/s4a/contents_3``: JSON with the attributes, dims and types of every group, and the values of
 texts and small variables.  The contents and all variables of numbers have Fletcher-32 checksums,
 which HDF5 verifies whenever it reads them; its notes of them have checksums since version 1.10.
 
@@ -31,7 +31,7 @@ from xarray.core import indexing
 
 from s4a.schema import check_indices
 
-GROUP, CONTENTS = "s4a", "s4a/contents_2"  # with the number of the format
+GROUP, CONTENTS = "s4a", "s4a/contents_3"  # with the number of the format
 SMALL = 100  # numbers up to which the contents have the values of a variable
 COMPRESSED = 1000  # numbers from which a variable is compressed where that is asked for
 LARGEST_TEXT = 2**31  # bytes of memory that the texts of a variable may need
@@ -56,7 +56,7 @@ def damage_named(path: Path | str) -> Iterator[None]:
     except Exception as error:  # HDF5, h5py and NumPy each have their own ways with damage
         raise DamagedError(
             f"{path} cannot be read ({error}): remove it and run the analysis again, "
-            "which makes it anew and nothing else"
+            "which makes it again and nothing else"
         ) from error
 
 
@@ -117,7 +117,9 @@ def opened(path: Path | str) -> Iterator[tuple[h5f.FileID, bytes, dict[str, Any]
     """
     with open_hdf5(path) as file:
         if not file.links.exists(GROUP.encode()):
-            raise OSError(f"it has no /{CONTENTS}: this version of s4a has not written it")
+            raise OSError(
+                f"it has no /{CONTENTS}: another version of s4a wrote it; run the analysis again"
+            )
         text = values_of(file, CONTENTS).tobytes()
         yield file, text, json.loads(text)
 
@@ -157,7 +159,7 @@ class Stored(BackendArray):
         )
 
     def part(self, key: Any) -> np.ndarray:
-        """Read the selection from the file; ValueError where it was written anew."""
+        """Read the selection from the file; ValueError where it was written again."""
         with open_hdf5(self.file) as file:
             same = os.stat(self.file).st_mtime_ns == self.written  # or by the same run again
             if same := same or values_of(file, CONTENTS).tobytes() == self.stamp:
@@ -165,7 +167,7 @@ class Stored(BackendArray):
                 check_indices(Path(self.path).name, values, self.sizes)
         if not same:
             raise ValueError(
-                f"{self.file} was written anew since it was opened; open the study again"
+                f"{self.file} was written again since it was opened; open the study again"
             )
         return values[key]
 

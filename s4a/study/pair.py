@@ -8,9 +8,9 @@ import xarray as xr
 from threadpoolctl import threadpool_limits
 
 from s4a.method import fmap
-from s4a.method.first_map import first_map, motion_onto
-from s4a.method.lift import low_resolution
-from s4a.method.register import register, sharpen_map
+from s4a.method.initial_map import initial_map, transform_onto
+from s4a.method.refined_eigenfunctions import low_resolution
+from s4a.method.register import refine_at_full_resolution, register
 from s4a.method.shape import Shape
 from s4a.options import Options, given_options
 from s4a.schema import dataset, require
@@ -23,8 +23,8 @@ def match_pair(
 ) -> xr.Dataset:
     """Correspondence of two shapes at full resolution (4.1).
 
-    In far poses a search for a first map takes several seconds; where more than two shapes are at
-    hand, a network finds the way more surely: :func:`s4a.analyse`, then
+    In far poses a search for an initial map takes several seconds; where more than two shapes are
+    at hand, a network finds the way more surely: :func:`s4a.analyse`, then
     :func:`s4a.register_shape`.  Landmarks (:func:`s4a.with_landmarks`) guide every step.
 
     Parameters
@@ -35,24 +35,24 @@ def match_pair(
     preset : {None, "paper", "fast"}
         ``"paper"`` leaves out all that is added to 4.1, ``"fast"`` takes n_coarse=3000.
     **options
-        ``n_coarse, k_init, k, step, init, ahead, sharpen, refine, parts, lift, alignment,
-        area_weighted, n_projected, method, seed`` or ``rng``: see :class:`s4a.Options`.  Where
-        poses are far apart :func:`s4a.method.first_map.best_first_map` is taken, which costs about
-        2 s more.
+        ``n_coarse, k_init, k, step, init, initial_refinement, full_resolution_iterations, refine,
+        articulated, refined_eigenfunctions, alignment, area_weighted, n_projected, method, seed``
+        or ``rng``: see :class:`s4a.Options`. Where poses are far apart
+        :func:`s4a.method.initial_map.best_initial_map` is taken, which costs about 2 s more.
 
     Returns
     -------
     xarray.Dataset
-        ``fmap(mode_target, mode_source)`` after ZoomOut, ``fmap_initial``, ``match(vertex)`` = on
-        each vertex of the target the matched vertex of the source, ``displacement(vertex, xyz)``
-        from the target to the source after rigid alignment (unit of the input), and what else
-        :func:`s4a.method.register.register` gives; ``fmap_fitted``, the first map before its step
-        of ZoomOut, and with landmarks ``landmark_of_source(landmark)``, ``landmark_of_target``; the
-        way back,
-        ``template_triangle(original_vertex)`` and ``template_barycentric``, from the source's
-        vertices to the target; attrs ``score`` (:func:`s4a.method.joint.registration_score`),
-        ``method``, ``first_map`` ("landmarks", "dense", or of far poses "icp", "hks" or "wks"), and
-        ``note`` where k had to be reduced.
+        ``fmap(eigenpair_target, eigenpair_source)`` after ZoomOut, ``fmap_initial``,
+        ``match(vertex)`` = on each vertex of the target the matched vertex of the source,
+        ``displacement(vertex, xyz)`` from the target to the source after rigid alignment (unit of
+        the input), and what else :func:`s4a.method.register.register` gives; ``fmap_fitted``, the
+        initial map before its step of ZoomOut, and with landmarks ``landmark_of_source(landmark)``,
+        ``landmark_of_target``; the way back, ``template_triangle(original_vertex)`` and
+        ``template_barycentric``, from the source's vertices to the target; attrs ``score``
+        (:func:`s4a.method.spectral_icp.registration_score`), ``method``, ``initial_map``
+        ("landmarks", "dense", or of far poses "icp", "hks" or "wks"), and ``note`` where k had to
+        be reduced.
 
     Raises
     ------
@@ -104,7 +104,7 @@ def shape_of(mesh: xr.Dataset, options: Options) -> Shape:
 
 
 def match_shapes(source: Shape, target: Shape, options: Options) -> tuple[xr.Dataset, xr.Dataset]:
-    """:func:`match_pair` for two shapes: steps 2 to 4 of 4.1, ZoomOut and eq. 4, elastic rounds.
+    """Match two shapes: steps 2 to 4 of 4.1, ZoomOut, eq. 4 and elastic iterations.
 
     Returns
     -------
@@ -117,19 +117,29 @@ def match_shapes(source: Shape, target: Shape, options: Options) -> tuple[xr.Dat
     N = target.low
     k = min(options.k, M.k, N.k)
     k_init = min(options.k_init, k)
-    motion = motion_onto(M, N)
-    ahead = options.ahead == "always"
-    first = first_map(M, N, motion, k_init=k_init, init=options.init, ahead=ahead, search=True)
+    transform = transform_onto(M, N)
+    initial_refinement = options.initial_refinement == "always"
+    first = initial_map(
+        M,
+        N,
+        transform,
+        k_init=k_init,
+        init=options.init,
+        initial_refinement=initial_refinement,
+        search=True,
+    )
     C, match = fmap.zoomout(M, N, first.C, k, step=options.step)
-    for _ in range(options.sharpen):
-        C = sharpen_map(source, target, C, source.full.Phi if source.is_lifted else None)
+    for _ in range(options.full_resolution_iterations):
+        C = refine_at_full_resolution(
+            source, target, C, source.full.Phi if source.has_refined_eigenfunctions else None
+        )
     starts = {"intrinsic": match, "icp": first.near}
     functions = source.functions(C.T), target.functions(np.eye(k))  # eq. 4 compares rows of both
     registration = register(
-        source, target, starts, functions, motion, k=k, **options.of("registration")
+        source, target, starts, functions, transform, k=k, **options.of("registration")
     )
     maps = dataset(fmap=C, fmap_initial=first.C, fmap_fitted=first.fitted)
     if first.landmarks is not None:
         at_source, at_target = first.landmarks
         maps = maps.merge(dataset(landmark_of_source=at_source, landmark_of_target=at_target))
-    return registration.assign_attrs(first_map=first.name), maps
+    return registration.assign_attrs(initial_map=first.name), maps

@@ -14,25 +14,25 @@ import numpy as np
 import xarray as xr
 from joblib import effective_n_jobs, parallel_config
 
+from s4a.input.chirality import AUTO, hands, mirrored_shapes, to_reflect
 from s4a.input.collection import remarks_on_files
-from s4a.input.hands import AUTO, hands, of_other_hand, to_reflect
-from s4a.input.plausibility import Doubts
+from s4a.input.plausibility import Flags
 from s4a.input.subjects import read_table
 from s4a.method.network import choose_pairs, spectral_distance
 from s4a.method.pca import pca_without
 from s4a.method.remesh import check_wrap
 from s4a.options import Options, given_options
 from s4a.schema import dataset
-from s4a.study.doubts import (
-    check_plausibility,
-    check_usable,
-    doubt_registrations,
-    looks_of,
-    set_apart,
-    stop_at_doubts,
-)
 from s4a.study.netcdf import arrays, attributes, is_done, open_file, read
 from s4a.study.processes import temporary_folder
+from s4a.study.quality_control import (
+    check_plausibility,
+    check_registrations,
+    check_usable,
+    comparisons_of,
+    exclude_flagged,
+    stop_if_flagged,
+)
 from s4a.study.report import write_report
 from s4a.study.runner import Keys, Run, Task
 from s4a.study.sources import (
@@ -61,7 +61,7 @@ from s4a.study.tree import open_study, stack_registration, template_mesh
 
 log = logging.getLogger(__name__)
 
-CHOICE = "network/hands.nc"
+CHOICE = "network/chirality.nc"
 
 
 def analyse(
@@ -76,7 +76,7 @@ def analyse(
     table: Path | str | None = None,
     landmarks: Path | str | None = None,
     template: str | None = None,
-    scale: bool | None = None,
+    remove_size: bool | None = None,
     options: Options | None = None,
     store: Path | str | None = None,
     n_jobs: int | None = None,
@@ -112,7 +112,7 @@ def analyse(
     ------
     ValueError
         When an option is out of range, or fewer than 2 shapes can be used; the reasons are named.
-        With ``doubtful="stop"``, when a shape is doubtful.
+        With ``quality_control="stop"``, when a shape is flagged.
     TypeError
         When an option is given that there is not.
 
@@ -123,7 +123,7 @@ def analyse(
     >>> list(study["pca"]["score"].dims), study["registration"].sizes["vertex"]
     (['shape', 'component'], 200)
 
-    The paper, and elastic rounds alone added to it:
+    The paper, and elastic iterations alone added to it:
 
     >>> from s4a.options import PRESETS
     >>> small = {"n_coarse": 100, "k": 10, "k_init": 6, "n_pairs": 3}
@@ -141,7 +141,7 @@ def analyse(
         "table": table,
         "landmarks": landmarks,
         "template": template,
-        "scale": scale,
+        "remove_size": remove_size,
     }
     given = {name: value for name, value in shown.items() if value is not None}
     settings = given_options(given | others, options)
@@ -150,7 +150,7 @@ def analyse(
             study = analyse(shapes, options=settings, store=folder, n_jobs=n_jobs)
             loaded = {n.path: n.to_dataset(inherit=False).load() for n in study.subtree}
             return xr.DataTree.from_dict(loaded)
-    settings.check_spread()
+    settings.check_n_samples()
     if settings.wrap:
         check_wrap()
     volumes = settings.label is not None
@@ -168,7 +168,7 @@ def analyse(
         else:
             remarks = remarks + kept_table(run.folder / "subjects.nc", sources)
         remarks = remarks + remarks_on_guides(sources, marked, settings.feature_names)
-        with run.unforeseen_told():
+        with run.report_unforeseen():
             run_steps(run, sources, marked, settings, remarks)
     return open_study(store)
 
@@ -179,27 +179,27 @@ def run_steps(
     """All steps of the paper in turn; each looks up which of its files are done."""
     # what each file is made from; a key holds the keys of all before it:
     #
-    #   original/* -> coarse/* -> network/motion_* -> network/first_* -> network, latent
+    #   original/* -> coarse/* -> network/alignment_* -> network/initial_* -> network, latent
     #       |                                                                  |
-    #   network/sketch_*, look_*  latent/* of those apart -> registration/* <- registration
+    #   network/descriptor_*, look_*  latent/* of those apart -> registration/* <- registration
     #                                                     |
     #                                                pca, report
-    reflected, of_hands = choose_reflected(run, sources, marked, options)
+    reflected, chirality_evidence = choose_reflected(run, sources, marked, options)
     original = read_and_clean(run, sources, marked, options, reflected)
-    original, doubts, told = check_plausibility(run, original, options)
-    stop_at_doubts(doubts, options)
+    original, flags, told = check_plausibility(run, original, options)
+    stop_if_flagged(flags, options)
     coarse = remesh(run, original, options)
-    doubts, coarse, apart, alone = set_apart(run, coarse, doubts, options)
+    flags, coarse, apart, alone = exclude_flagged(run, coarse, flags, options)
     coarse, reference, aligned = align(run, coarse, options)
-    first = first_maps(run, coarse, aligned, options)
+    first = initial_maps(run, coarse, aligned, options)
     latent = consistent_zoomout(run, coarse, first, options)
     placed = place(run, apart, reference, latent, options)
     registered = register(run, coarse | apart, placed, latent, options)
-    failed, of_all = doubt_registrations(run, registered, placed)
-    doubts = {name: [*doubts.get(name, []), *failed.get(name, [])] for name in registered}
-    why_no_modes = modes(run, registered, doubts, options)
-    remarks = [*of_hands, *alone, *told, *of_all, *remarks]
-    write_report(run, sources, options, remarks, why_no_modes, registered, doubts)
+    failed, of_all = check_registrations(run, registered, placed)
+    flags = {name: [*flags.get(name, []), *failed.get(name, [])] for name in registered}
+    why_no_modes = modes(run, registered, flags, options)
+    remarks = [*chirality_evidence, *alone, *told, *of_all, *remarks]
+    write_report(run, sources, options, remarks, why_no_modes, registered, flags)
 
 
 def read_and_clean(
@@ -227,7 +227,7 @@ def choose_reflected(
     """The shapes whose mirror images are taken, and what is told of the choice.
 
     Where the shapes themselves shall say (``reflect="auto"``), they are looked at as they are
-    first; ``network/hands`` keeps the choice.
+    first; ``network/chirality`` keeps the choice.
     """
     if options.reflect is None:
         return [], []
@@ -242,11 +242,11 @@ def choose_reflected(
     key = task_key(list(sources), contents, options.of("cleaning"), options.k, AUTO)
     if not is_done(file, key):
         original = read_and_clean(run, sources, marked, options, [])
-        looks = looks_of(run, original, options) if len(original) > 1 else {}
-        reflected, told = of_other_hand(looks)
+        looks = comparisons_of(run, original, options) if len(original) > 1 else {}
+        reflected, told = mirrored_shapes(looks)
         choice = dataset(
             {"told": "\n".join(told)},
-            handedness=hands(looks) if looks else np.zeros(0),
+            mean_chirality=hands(looks) if looks else np.zeros(0),
             reflected=np.array([name in reflected for name in looks], int),
         )
         write(choice.assign_coords(shape=list(looks)), file, key)
@@ -260,8 +260,8 @@ def choose_reflected(
 def remesh(run: Run, original: Keys, options: Options) -> Keys:
     """Low-resolution meshes and their spectra (4.1, step 1): ``/coarse``."""
     settings: tuple[Any, ...] = (options.n_coarse, options.wrap, options.seed, options.k)
-    if options.lift:
-        settings = (*settings, "lift")
+    if options.refined_eigenfunctions:
+        settings = (*settings, "refined eigenfunctions")
     if options.method != "rematch":
         settings = (*settings, options.method)
     todo = [
@@ -290,14 +290,14 @@ def align(run: Run, coarse: Keys, options: Options) -> tuple[Keys, tuple[str, st
     reference : tuple (name, key)
         The shape that they were moved onto.
     aligned : str
-        The key that all motions depend on.
+        The key that all transforms depend on.
     """
     names = list(coarse)
     spectra = lowest_eigenvalues(run, coarse, options.k_init)
     reference = names[int(np.argmin(spectral_distance(spectra).sum(1)))]
     aligned = task_key(list(coarse.values()), names, reference)
     todo = [
-        Task(n, f"network/motion_{n}.nc", align_shape, (run.folder, n, reference), (aligned, n))
+        Task(n, f"network/alignment_{n}.nc", align_shape, (run.folder, n, reference), (aligned, n))
         for n in names
     ]
     moved = {name: coarse[name] for name in run.do("align", todo)}
@@ -305,23 +305,23 @@ def align(run: Run, coarse: Keys, options: Options) -> tuple[Keys, tuple[str, st
     return moved, (reference, coarse[reference]), aligned
 
 
-def first_maps(run: Run, coarse: Keys, aligned: str, options: Options) -> Keys:
-    """The pairs of the network, of like spectra, and their first maps (4.1, steps 3 and 4)."""
+def initial_maps(run: Run, coarse: Keys, aligned: str, options: Options) -> Keys:
+    """The pairs of the network, of like spectra, and their initial maps (4.1, steps 3 and 4)."""
     spectra = lowest_eigenvalues(run, coarse, options.k_init)
     names, k_init = list(coarse), spectra.shape[1]
     pairs = choose_pairs(spectral_distance(spectra), options.n_pairs)
     batches = in_batches([[names[i], names[j]] for i, j in pairs])
-    settings = (k_init, options.of("first maps"))
-    files = {f"network/first_{i:03d}.nc": batch for i, batch in enumerate(batches)}
+    settings = (k_init, options.of("initial maps"))
+    files = {f"network/initial_{i:03d}.nc": batch for i, batch in enumerate(batches)}
     todo = [
         Task(f, f, map_pairs, (run.folder, batch, *settings), (aligned, batch, *settings))
         for f, batch in files.items()
     ]
-    return run.do("first maps", todo, each=False)
+    return run.do("initial maps", todo, each=False)
 
 
 def in_batches(pairs: Sequence[Any]) -> list[Any]:
-    """The pairs in batches for the tasks of the first maps: four in each, or 64 batches.
+    """The pairs in batches for the tasks of the initial maps: four in each, or 64 batches.
 
     Examples
     --------
@@ -342,11 +342,16 @@ def consistent_zoomout(run: Run, coarse: Keys, first: Keys, options: Options) ->
         The key of both.
     """
     settings = (options.k, options.step, options.n_latent, options.norm)
-    rounds_of = (options.weights, options.n_spread, options.wide, options.keep_rounds)
-    key = task_key(list(first.values()), *settings, *rounds_of)
-    kept = list((run.folder / "rounds").glob("k_*.nc")) if options.keep_rounds else []
+    iteration_settings = (
+        options.weights,
+        options.n_samples,
+        options.dense_iterations,
+        options.keep_iterations,
+    )
+    key = task_key(list(first.values()), *settings, *iteration_settings)
+    kept = list((run.folder / "iterations").glob("k_*.nc")) if options.keep_iterations else []
     files = [run.folder / "network.nc", run.folder / "latent.nc", *kept]
-    done = bool(kept) == options.keep_rounds and all(is_done(file, key) for file in files)
+    done = bool(kept) == options.keep_iterations and all(is_done(file, key) for file in files)
     with run.stage("consistent ZoomOut and median", share=float(not done), done=int(done)):
         if done:
             return key
@@ -354,10 +359,14 @@ def consistent_zoomout(run: Run, coarse: Keys, first: Keys, options: Options) ->
         with parallel_config(backend="threading"):  # here, whatever backend the tasks run on
             n_threads = effective_n_jobs(run.n_jobs)
         tree = consistent_maps(run, list(coarse), maps, options, n_threads)
-        for old in (run.folder / "rounds").glob("k_*.nc"):  # of other maps
+        for old in (run.folder / "iterations").glob("k_*.nc"):  # of other maps
             old.unlink()
-        rounds = [f"rounds/{name}" for name in tree["rounds"].children] if "rounds" in tree else []
-        for node in [*rounds, "network", "latent"]:
+        iterations = (
+            [f"iterations/{name}" for name in tree["iterations"].children]
+            if "iterations" in tree
+            else []
+        )
+        for node in [*iterations, "network", "latent"]:
             write(tree[node].to_dataset(), run.folder / f"{node}.nc", key, coarse.values())
     return key
 
@@ -376,11 +385,13 @@ def place(run: Run, apart: Keys, reference: tuple[str, str], latent: str, option
     """
     name, reference_key = reference
     todo = [
-        Task(n, f"network/motion_{n}.nc", align_shape, (run.folder, n, name), (reference_key, key))
+        Task(
+            n, f"network/alignment_{n}.nc", align_shape, (run.folder, n, name), (reference_key, key)
+        )
         for n, key in apart.items()
     ]
-    aligned = run.do("align doubtful shapes", todo) if apart else {}
-    settings = (options.k_init, options.of("first maps"), options.step, options.norm)
+    aligned = run.do("align flagged shapes", todo) if apart else {}
+    settings = (options.k_init, options.of("initial maps"), options.step, options.norm)
     todo = [
         Task(
             n,
@@ -392,18 +403,18 @@ def place(run: Run, apart: Keys, reference: tuple[str, str], latent: str, option
         )
         for n, key in aligned.items()
     ]
-    return run.do("place doubtful shapes", todo) if aligned else {}
+    return run.do("place flagged shapes", todo) if aligned else {}
 
 
 def register(run: Run, coarse: Keys, placed: Keys, latent: str, options: Options) -> Keys:
     """Every shape registered to the template, the median shape by default (4.2, eq. 6 to 8)."""
     template = options.template or attributes(run.folder / "latent.nc")["median"]
     projection = (options.area_weighted, options.n_projected)
-    way = (template, options.how, options.of("registration"), projection)
+    way = (template, options.dense_match, options.of("registration"), projection)
     template_key = task_key(latent, way)
     mesh = template_mesh(read(run.folder / f"original/{template}.nc"), template)
     if placed:
-        mesh.attrs["apart"] = " ".join(placed)
+        mesh.attrs["excluded"] = " ".join(placed)
     write(mesh, run.folder / "registration.nc", template_key, [latent])
     todo = []
     for n, key in sorted(coarse.items()):
@@ -425,10 +436,10 @@ def register(run: Run, coarse: Keys, placed: Keys, latent: str, options: Options
     return registered
 
 
-def modes(run: Run, registered: Keys, doubts: Doubts, options: Options) -> str:
+def modes(run: Run, registered: Keys, flags: Flags, options: Options) -> str:
     """The modes of the displacements (6.1): ``/pca``; the reason where there can be none.
 
-    They are made without the doubtful shapes, whose scores are measured along them.
+    They are made without the flagged shapes, whose scores are measured along them.
     """
     with run.stage("modes"):
         mesh = read(run.folder / "registration.nc")
@@ -438,9 +449,9 @@ def modes(run: Run, registered: Keys, doubts: Doubts, options: Options) -> str:
         apart = [
             name
             for name in registered
-            if name != template and any(doubt.doubtful for doubt in doubts[name])
+            if name != template and any(flag.flagged for flag in flags[name])
         ]
-        apart = [] if options.keep_doubtful else apart
+        apart = [] if options.include_flagged else apart
         coarse = read(run.folder / f"coarse/{template}.nc")
         keys = list(registered.values())
         try:

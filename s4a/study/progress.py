@@ -16,14 +16,14 @@ log = logging.getLogger(__name__)
 
 FILE = ".progress.json"
 EVERY = 1.0  # seconds between two notes of a stage
-# of every run, in order; those of doubtful shapes are in some
+# of every run, in order; those of flagged shapes are in some
 STAGES = (
     "read and clean",
-    "sketch",
+    "descriptor",
     "compare",
     "remesh and spectrum",
     "align",
-    "first maps",
+    "initial maps",
     "consistent ZoomOut and median",
     "registration",
     "modes",

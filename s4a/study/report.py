@@ -1,6 +1,6 @@
 """What a run has to say of itself: ``/report`` (4, 6.1).
 
-What was done to each shape, doubtful registrations, numbers reduced to what there is, costs.
+What was done to each shape, flagged registrations, numbers reduced to what there is, costs.
 """
 
 from typing import Any
@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from s4a.input.chirality import AUTO
 from s4a.input.collection import shape_report
-from s4a.input.hands import AUTO
-from s4a.input.plausibility import Doubts
+from s4a.input.plausibility import Flags
 from s4a.options import Options, with_options
 from s4a.schema import dataset
-from s4a.study.doubts import of_look
 from s4a.study.netcdf import arrays, attributes, read
+from s4a.study.quality_control import comparison_of
 from s4a.study.runner import Run
 from s4a.study.sources import Sources
 from s4a.study.store import write
@@ -27,7 +27,7 @@ def write_report(
     remarks: list[str],
     no_modes: str,
     registered: dict[str, str],
-    doubts: Doubts,
+    flags: Flags,
 ) -> None:
     """Write ``/report``: every shape, what looks wrong, what was reduced, costs and options.
 
@@ -43,7 +43,7 @@ def write_report(
         Why there are no modes; empty where there are.
     registered : dict of str to str
         Keys of the registrations.
-    doubts : dict of str to list of Doubt
+    flags : dict of str to list of Doubt
         About the registered shapes.
     """
     names = list(registered)
@@ -53,26 +53,26 @@ def write_report(
     spectra = {n: arrays(run.folder / f"coarse/{n}.nc", "eigenvalue")[0] for n in together}
     report = shape_report(
         {name: of_shape(run, name, source, options) for name, (source, _) in sources.items()},
-        doubts,
+        flags,
         [
-            *reduced_k(options.k, latent.sizes["mode"], spectra),
+            *reduced_k(options.k, latent.sizes["eigenpair"], spectra),
             *remarks,
             *reduced_pairs(options.n_pairs, network.sizes["pair"] // 2, len(spectra)),
-            *tied(together, latent["distance_to_median"].values),
+            *tied(together, latent["distance_to_limit"].values),
         ],
-        {name: of_look(run, name) for name in names},
+        {name: comparison_of(run, name) for name in names},
     )
     if options.reflect is not None:
-        report = report.assign(of_hands(run, list(sources), options).variables)
+        report = report.assign(chirality_evidence(run, list(sources), options).variables)
     report = report.assign(costs(run).variables)
     report = report.assign_attrs(
         with_options({"template": template, "no_modes": no_modes}, vars(options))
     )
     report.attrs["unforeseen"] = " ".join(run.unforeseen)  # names of shapes, which have no blanks
     of_template = report.sel(shape=template)
-    if of_template["status"].item() == "doubtful":
+    if of_template["status"].item() == "flagged":
         report.attrs["remarks"] += (
-            f"\nthe template {template}, which was named, is itself doubtful "
+            f"\nthe template {template}, which was named, is itself flagged "
             f"({of_template['warning'].item()})"
         )
     write(report, run.folder / "report.nc", made_from=registered.values())
@@ -96,7 +96,7 @@ def of_shape(run: Run, name: str, source: str | xr.Dataset, options: Options) ->
     return mesh | {"reason": "; ".join(done)} | path
 
 
-def of_hands(run: Run, names: list[str], options: Options) -> xr.Dataset:
+def chirality_evidence(run: Run, names: list[str], options: Options) -> xr.Dataset:
     """Which shapes were mirrored, and with ``reflect="auto"`` by how clear a hand."""
     files = {name: run.folder / f"original/{name}.nc" for name in names}
     reflected = [
@@ -104,8 +104,10 @@ def of_hands(run: Run, names: list[str], options: Options) -> xr.Dataset:
     ]
     found = dataset(reflected=np.array(reflected))
     if options.reflect == AUTO:
-        choice = read(run.folder / "network/hands.nc")
-        found = found.merge(dataset(handedness=choice["handedness"].reindex(shape=names).values))
+        choice = read(run.folder / "network/chirality.nc")
+        found = found.merge(
+            dataset(mean_chirality=choice["mean_chirality"].reindex(shape=names).values)
+        )
     return found
 
 

@@ -27,7 +27,7 @@ from s4a.study.store import LOGS, Claim, open_without_following, task_key, write
 log = logging.getLogger(__name__)
 
 Keys = dict[str, str]  # name of a shape, or file of several -> key of what was computed
-LONGEST = len("align doubtful shapes: ")  # of the names beside the progress bar
+LONGEST = len("align flagged shapes: ")  # of the names beside the progress bar
 
 
 @dataclass(frozen=True)
@@ -254,7 +254,7 @@ class Run:
         return is_done(self.folder / task.file, task.key)
 
     @contextlib.contextmanager
-    def unforeseen_told(self) -> Iterator[None]:
+    def report_unforeseen(self) -> Iterator[None]:
         """An error that nobody foresaw becomes a StageError, its traceback a file of the study.
 
         The progress bar is gone at the end.

@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 
 LOCK = ".lock"
 # folders of a study
-STAGES = ("original", "coarse", "network", "latent", "rounds", "registration", "fields")
+STAGES = ("original", "coarse", "network", "latent", "iterations", "registration", "fields")
 OF_ALL = ("network", "latent", "registration", "pca", "subjects", "report")  # files beside them
 LOGS = ".log"  # folder in that of a study: a file for each task that is at work or failed
 TEMPORARY = re.compile(r"\.[\w-]+\.nc\.\d+\.tmp")  # as `write` names them

@@ -11,18 +11,18 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from s4a.geometry.align import motion_between
+from s4a.geometry.align import relative_transform
 from s4a.geometry.mesh import as_arrays, triangle_areas
 from s4a.input import plausibility
 from s4a.input.annotations import labels_of_mesh, read_scalars, with_features
+from s4a.input.chirality import mirror_image
 from s4a.input.clean import check_range, clean
 from s4a.input.collection import read_shape
-from s4a.input.hands import mirror_image
 from s4a.input.landmarks import guides_of, with_landmarks
 from s4a.method import steps
-from s4a.method.first_map import motion_onto
+from s4a.method.initial_map import transform_onto
 from s4a.method.latent import latent_of_new
-from s4a.method.lift import low_resolution
+from s4a.method.refined_eigenfunctions import low_resolution
 from s4a.method.shape import Shape, features_of
 from s4a.options import Options
 from s4a.schema import dataset, in_unit, unit_of
@@ -98,14 +98,14 @@ def guided(mesh: xr.Dataset, source: xr.Dataset) -> xr.Dataset:
 
 
 def portray_shape(folder: Path, name: str, intersections: bool) -> xr.Dataset:
-    """What :func:`s4a.input.plausibility.portray` sees in a shape."""
-    return plausibility.portray(read(folder / f"original/{name}.nc"), intersections=intersections)
+    """What :func:`s4a.input.plausibility.describe` sees in a shape."""
+    return plausibility.describe(read(folder / f"original/{name}.nc"), intersections=intersections)
 
 
 def compare_shape(folder: Path, name: str, references: list[str]) -> xr.Dataset:
     """What :func:`s4a.input.plausibility.compare` sees in a shape beside the references."""
-    portraits = {n: read(folder / f"network/sketch_{n}.nc") for n in {*references, name}}
-    return plausibility.compare(name, portraits[name], {n: portraits[n] for n in references})
+    descriptors = {n: read(folder / f"network/descriptor_{n}.nc") for n in {*references, name}}
+    return plausibility.compare(name, descriptors[name], {n: descriptors[n] for n in references})
 
 
 def remesh_shape(folder: Path, name: str, options: Options) -> xr.Dataset:
@@ -139,19 +139,19 @@ def template_of(folder: Path, name: str, options: Options) -> Shape:
 
 
 def align_shape(folder: Path, name: str, reference: str) -> xr.Dataset:
-    """Rigid motion of a shape onto the reference, both centred and for unit area (4.1, step 2)."""
+    """Rigid transform of a shape onto the reference, centred and of unit area (4.1, step 2)."""
     R, t = np.eye(3), np.zeros(3)
     if name != reference:
-        R, t = motion_onto(*(steps.basis_in(Folder(folder), n) for n in (name, reference)))
+        R, t = transform_onto(*(steps.basis_in(Folder(folder), n) for n in (name, reference)))
     return dataset({"reference": reference}, rotation=R, translation=t)
 
 
 def map_pairs(folder: Path, pairs: list[Any], k_init: int, options: dict[str, Any]) -> xr.Dataset:
-    """First maps of some pairs, in both directions (4.1, steps 3 and 4)."""
+    """Initial maps of some pairs, in both directions (4.1, steps 3 and 4)."""
     study, names = Folder(folder), sorted({name for pair in pairs for name in pair})
     bases = {name: steps.basis_in(study, name) for name in names}
-    motions = {name: steps.motion_in(study, name) for name in names}
-    return steps.map_pairs(bases, motions, pairs, k_init=k_init, **options)
+    transforms = {name: steps.transform_in(study, name) for name in names}
+    return steps.map_pairs(bases, transforms, pairs, k_init=k_init, **options)
 
 
 def consistent_maps(
@@ -159,11 +159,11 @@ def consistent_maps(
 ) -> xr.DataTree:
     """Consistent ZoomOut over the network and the median (4.2): ``/network`` and ``/latent``."""
     study = Folder(run.folder)
-    motions = {name: steps.motion_in(study, name) for name in names}
-    reference = study[f"network/motion_{names[0]}"].attrs["reference"]
-    first = steps.with_motions(first, motions, reference)
+    transforms = {name: steps.transform_in(study, name) for name in names}
+    reference = study[f"network/alignment_{names[0]}"].attrs["reference"]
+    first = steps.with_transforms(first, transforms, reference)
     coarse = {name: study[f"coarse/{name}"] for name in names}
-    k_init = first.sizes["mode_source_initial"]
+    k_init = first.sizes["eigenpair_source_initial"]
     bar = run.show("consistent ZoomOut", options.k - k_init)
     return steps.refine_network(
         coarse,
@@ -172,10 +172,10 @@ def consistent_maps(
         step=options.step,
         n_latent=options.n_latent,
         weights=options.weights,
-        n_spread=options.n_spread,
-        wide=options.wide,
+        n_samples=options.n_samples,
+        dense_iterations=options.dense_iterations,
         norm=options.norm,
-        keep_rounds=options.keep_rounds,
+        keep_iterations=options.keep_iterations,
         n_jobs=n_jobs,
         progress=lambda size: bar.update(size - k_init - bar.n),
     )
@@ -185,16 +185,16 @@ def place_shape(folder: Path, name: str, options: Options) -> xr.Dataset:
     """The latent basis of a shape that stands apart from the network, which stays as it is."""
     study = Folder(folder)
     latent, basis = read(folder / "latent.nc"), steps.basis_in(study, name)
-    median, motion = latent.attrs["median"], steps.motion_in(study, name)
+    median, transform = latent.attrs["median"], steps.transform_in(study, name)
     names = [median, *(n for n in latent["shape"].values.tolist() if n != median)]
     Y = steps.place_in(
         study,
         names,
         basis,
-        lambda other: motion_between(motion, steps.motion_in(study, other)),
-        k_init=min(options.k_init, latent.sizes["mode"]),
+        lambda other: relative_transform(transform, steps.transform_in(study, other)),
+        k_init=min(options.k_init, latent.sizes["eigenpair"]),
         step=options.step,
-        **options.of("first maps"),
+        **options.of("initial maps"),
     )
     eigenvalues = study[f"coarse/{name}"]["eigenvalue"].values[None]
     latent_eigenvalue = latent["latent_eigenvalue"].values
@@ -205,5 +205,5 @@ def place_shape(folder: Path, name: str, options: Options) -> xr.Dataset:
 def register_shape(folder: Path, name: str, template: str, options: Options) -> xr.Dataset:
     """One shape registered to the template: eq. 6 at low resolution, then eq. 7 or eq. 3 and 4."""
     target = template_of(folder, template, options)
-    settings = {"how": options.how, **options.of("registration")}
+    settings = {"dense_match": options.dense_match, **options.of("registration")}
     return steps.register_in(Folder(folder), name, template, target, **settings)

@@ -62,7 +62,7 @@ def stack_registration(
     """
     shapes = [files[name] for name in names]
     mesh = template[[v for v in ("position", "corner_vertex", "vertex_area") if v in template]]
-    kept = ("template", "apart")
+    kept = ("template", "excluded")
     attrs = {key: template.attrs[key] for key in kept if key in template.attrs}
     data = mesh.assign_attrs(attrs)
     for name in STACKED:
@@ -73,8 +73,12 @@ def stack_registration(
                 data[name] = xr.Variable(like.dims, stacked(each), like.attrs)
             else:
                 data[name] = variable(name, np.stack([one.values for one in each]))
-    data["method"] = variable("method", [shape.attrs.get("method", "") for shape in shapes])
-    data["badness"] = variable("badness", [shape.attrs.get("score", np.nan) for shape in shapes])
+    data["initialisation"] = variable(
+        "initialisation", [shape.attrs.get("initialisation", "") for shape in shapes]
+    )
+    data["registration_error"] = variable(
+        "registration_error", [shape.attrs.get("score", np.nan) for shape in shapes]
+    )
     units = {unit_of(shape["displacement"]) for shape in shapes}
     data = in_unit(data, units.pop() if len(units) == 1 else INPUT).assign_coords(shape=names)
     nodes = {"registration": data}
@@ -207,10 +211,12 @@ def open_study(folder: Path | str) -> xr.DataTree:
     names = sorted(path.stem for path in (folder / "original").glob("[!.]*.nc"))
     nodes = reader.read(f"{stage}/{name}" for stage in ("original", "coarse") for name in names)
     nodes |= reader.read(["network", "latent"])
-    nodes |= reader.read(f"rounds/{path.stem}" for path in sorted(folder.glob("rounds/k_*.nc")))
+    nodes |= reader.read(
+        f"iterations/{path.stem}" for path in sorted(folder.glob("iterations/k_*.nc"))
+    )
     template = reader.read(["registration"], read)
     if template and "latent" in nodes:
-        apart = apart_of(template["registration"])
+        apart = excluded_of(template["registration"])
         nodes |= reader.read(f"latent/{name}" for name in apart)
         names = sorted([*nodes["latent"]["shape"].values.tolist(), *apart])
         files = reader.read(f"registration/{name}" for name in names)
@@ -225,9 +231,9 @@ def open_study(folder: Path | str) -> xr.DataTree:
     return xr.DataTree.from_dict(nodes, name=folder.name)
 
 
-def apart_of(registration: xr.Dataset) -> list[str]:
-    """The shapes that are registered and stand apart from the network, as they are doubtful."""
-    return str(registration.attrs.get("apart", "")).split()
+def excluded_of(registration: xr.Dataset) -> list[str]:
+    """The shapes that are registered and stand apart from the network, as they are flagged."""
+    return str(registration.attrs.get("excluded", "")).split()
 
 
 def seconds_of(report: xr.Dataset) -> str:
@@ -244,18 +250,18 @@ def seconds_of(report: xr.Dataset) -> str:
 
 
 def left_out(study: xr.DataTree) -> list[str]:
-    """The doubtful shapes of a study, which modes and statistics are made without.
+    """The flagged shapes of a study, which modes and statistics are made without.
 
-    None where ``keep_doubtful`` was given; a template that was named is trusted.
+    None where ``include_flagged`` was given; a template that was named is trusted.
     """
     if "report" not in study.children or "registration" not in study.children:
         return []
     report = study["report"].dataset
-    if "status" not in report or kept_options(report).get("keep_doubtful"):
+    if "status" not in report or kept_options(report).get("include_flagged"):
         return []
     template = study["registration"].attrs.get("template")
-    doubtful = report["shape"].values[report["status"].values == "doubtful"].tolist()
-    return [name for name in doubtful if name != template]
+    flagged = report["shape"].values[report["status"].values == "flagged"].tolist()
+    return [name for name in flagged if name != template]
 
 
 def reported(folder: Path) -> set[str] | None:

@@ -9,11 +9,11 @@ from s4a.schema import HOLDS, dataset
 from s4a.study.contents import kind_of
 from s4a.study.netcdf import GROUP, damage_named, open_file, open_hdf5
 from s4a.study.store import STAGES, check_is_study
-from s4a.study.tree import Reader, apart_of
+from s4a.study.tree import Reader, excluded_of
 
 OF_SHAPE = (
     *("original/", "coarse/", "registration/"),
-    *("network/sketch_", "network/look_", "network/motion_"),
+    *("network/descriptor_", "network/comparison_", "network/alignment_"),
 )
 OF_ALL = ("network", "latent", "registration", "report")
 OWN = {*STAGES, ".lock", "study.html", "report.txt", "modes.png", "statistics"}
@@ -115,7 +115,7 @@ def needed_files(report: xr.Dataset, registration: xr.Dataset | None) -> list[st
     """The files that a finished run with this report has made."""
     names = report["shape"].values[report["status"].values != "excluded"].tolist()
     of_shapes = [f"{prefix}{name}" for prefix in OF_SHAPE for name in names]
-    apart = [] if registration is None else [f"latent/{name}" for name in apart_of(registration)]
+    apart = [] if registration is None else [f"latent/{name}" for name in excluded_of(registration)]
     return [*of_shapes, *apart, *OF_ALL, *([] if report.attrs["no_modes"] else ["pca"])]
 
 

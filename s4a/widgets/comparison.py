@@ -16,7 +16,7 @@ from s4a.show.draw import OKABE_ITO, SIGNED, position_colors, ramp_colors, signe
 from s4a.show.surfaces import mesh_of
 from s4a.widgets.correspondence import inverse
 from s4a.widgets.panel import WIDE, Panel, dropdown, grid, row
-from s4a.widgets.views import extent, round_number
+from s4a.widgets.views import extent, iteration_number
 
 SHOWN = [
     ("coordinates of the source", "place"),
@@ -39,20 +39,20 @@ FULL_AREA = 2.0  # doublings of the area that the colours reach
 MARKS = [to_rgb(OKABE_ITO[i]) for i in (5, 4, 2, 6, 0, 1, 7)]
 
 
-def with_truth(found: xr.Dataset, n_source: int) -> xr.Dataset:
+def with_ground_truth(found: xr.Dataset, n_source: int) -> xr.Dataset:
     """What was found on a pair, with the truth as one more method, where it is known."""
     if "true_position" not in found:
         return found
     match = found["true_match"].values
     truth = {
-        "way_match": ("vertex", match),
-        "way_image": (("vertex", "xyz"), found["true_position"].values),
-        "way_reverse": ("source_vertex", inverse(match, n_source)),
-        "way_error": ("vertex", np.where(match >= 0, 0.0, np.nan)),
-        "way_area": ("vertex", np.full(len(match), np.nan)),
+        "algorithm_match": ("vertex", match),
+        "algorithm_image": (("vertex", "xyz"), found["true_position"].values),
+        "algorithm_reverse": ("source_vertex", inverse(match, n_source)),
+        "algorithm_error": ("vertex", np.where(match >= 0, 0.0, np.nan)),
+        "algorithm_area_change": ("vertex", np.full(len(match), np.nan)),
     }
-    known = xr.Dataset(truth).expand_dims(way=[TRUTH])
-    return found.drop_dims("way").merge(xr.concat([found[list(truth)], known], "way"))
+    known = xr.Dataset(truth).expand_dims(algorithm=[TRUTH])
+    return found.drop_dims("algorithm").merge(xr.concat([found[list(truth)], known], "algorithm"))
 
 
 class Comparison(Panel):
@@ -109,10 +109,10 @@ class Comparison(Panel):
     def build(self, methods: Any = None) -> list[ipywidgets.Widget]:
         """Choices, the source, and the target by each method."""
         self.pairs = {
-            name: with_truth(node.to_dataset(), self.study["source"].sizes["vertex"])
+            name: with_ground_truth(node.to_dataset(), self.study["source"].sizes["vertex"])
             for name, node in self.study["pairs"].children.items()
         }
-        each = [one["way"].values.astype(str).tolist() for one in self.pairs.values()]
+        each = [one["algorithm"].values.astype(str).tolist() for one in self.pairs.values()]
         known = [way for way in max(each, key=len) if all(way in ways for ways in each)]
         ways = methods
         if methods is None:
@@ -148,11 +148,11 @@ class Comparison(Panel):
 
     def of(self, name: str, way: str) -> np.ndarray:
         """A variable of what a method found: ``way_`` match, image, reverse, error or area."""
-        return self.found[f"way_{name}"].sel(way=way).values
+        return self.found[f"algorithm_{name}"].sel(algorithm=way).values
 
     def error(self, way: str) -> np.ndarray | None:
         """The error of every vertex of the target ``(n,)``; None where truth is unknown."""
-        return self.of("error", way) if "way_error" in self.found else None
+        return self.of("error", way) if "algorithm_error" in self.found else None
 
     def draw(self) -> None:
         """Both surfaces of a pair, and their colours."""
@@ -168,7 +168,7 @@ class Comparison(Panel):
     def paint(self) -> None:
         """The colours of all views."""
         X, _ = self.surfaces[0]
-        self.cell = round_number(extent(X) / CELLS)
+        self.cell = iteration_number(extent(X) / CELLS)
         checker = self.colors.value == "checker"
         plain = self.colors.value in ("area", "error")
         colors = None if plain else position_colors(X)
@@ -212,7 +212,7 @@ class Comparison(Panel):
 
     def full_error(self) -> float:
         """The error at which colours are full, the same for all methods of the pair."""
-        error = self.found["way_error"].drop_sel(way=TRUTH).values
+        error = self.found["algorithm_error"].drop_sel(algorithm=TRUTH).values
         reached = np.nanquantile(error, FULL_ERROR, axis=1)
         return float(max(np.median(reached), 1e-6))
 

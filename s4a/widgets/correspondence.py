@@ -7,7 +7,6 @@ import traitlets
 from s4a.show.browser import color_scale
 from s4a.show.draw import position_colors, ramp_colors
 from s4a.show.surfaces import (
-    carried_colors,
     has,
     labelled,
     latent_match,
@@ -15,10 +14,11 @@ from s4a.show.surfaces import (
     names_of,
     surface,
     template_vertices,
+    transferred_colors,
     unit_text,
 )
 from s4a.widgets.panel import Panel, beside, dropdown, row
-from s4a.widgets.views import extent, round_number
+from s4a.widgets.views import extent, iteration_number
 
 MAPS = [
     ("registration, full resolution", "registered"),
@@ -184,7 +184,7 @@ class Correspondence(Panel):
         """Values of the source's vertices on those of the shape, by way of the template."""
         if not self.from_template:
             values = values[self.registered_match(self.source)]
-        carried = carried_colors(self.study, self.shape, values)
+        carried = transferred_colors(self.study, self.shape, values)
         return None if carried is None else carried[2]
 
     def confidence(self) -> np.ndarray | None:
@@ -205,7 +205,7 @@ class Correspondence(Panel):
         self.pair = source, surface(self.study, self.shape, stage)
         look = self.registered_look() if self.registered else self.latent_look()
         colors, coordinates, bar, caption = look
-        cell = round_number(extent(source[0]) / CELLS)
+        cell = iteration_number(extent(source[0]) / CELLS)
         if coordinates[0] is not None:
             unit = unit_text(self.study, self.source)
             caption += f"; checkerboard of cubes of {cell:g} ({unit})"

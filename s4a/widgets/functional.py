@@ -47,7 +47,7 @@ class FunctionalMap(Panel):
         """Choices, matrix and the two surfaces."""
         network = self.study["network"].dataset
         self.source, self.target = (network[key].values.astype(str) for key in ("source", "target"))
-        first, last = network.sizes["mode_source_initial"], network.sizes["mode_source"]
+        first, last = network.sizes["eigenpair_source_initial"], network.sizes["eigenpair_source"]
         ends = zip(self.source, self.target, strict=True)
         options = [(f"{source} → {target}", i) for i, (source, target) in enumerate(ends)]
         self.choice = dropdown("pair", "the shape from which the map goes, and to which", options)
@@ -97,7 +97,7 @@ class FunctionalMap(Panel):
         self.cell = mark.get("row", self.row.value), mark.get("column", self.column.value)
 
     def take(self, pair: int) -> None:
-        """The two meshes of a pair and its first map."""
+        """The two meshes of a pair and its initial map."""
         self.meshes = [self.study["coarse"][name].to_dataset() for name in self.names()]
         self.maps = {}
         self.draw()
@@ -108,7 +108,7 @@ class FunctionalMap(Panel):
         self.show_cell(self.cell)
 
     def map_of(self, k: int) -> np.ndarray:
-        """C ``(k, k)``: cut out of the study's map, or by ZoomOut from the pair's first map."""
+        """C ``(k, k)``: cut out of the study's map, or by ZoomOut from the pair's initial map."""
         network = self.study["network"].dataset.isel(pair=self.pair)
         if self.kind.value == "study":
             return network["fmap"].values[:k, :k]

@@ -12,13 +12,13 @@ from s4a.show.browser import PARTS, color_scale
 from s4a.show.draw import CYCLE_ERROR, cycle_error_colors, position_colors
 from s4a.show.surfaces import (
     attribute,
-    doubtful_names,
+    flagged_names,
     labelled,
     network_limits,
     network_places,
     surface,
 )
-from s4a.study.tree import apart_of
+from s4a.study.tree import excluded_of
 from s4a.widgets.panel import Panel, beside, dropdown, int_slider, row
 from s4a.widgets.views import DIRECTION, Chart
 
@@ -76,9 +76,9 @@ class Network(Panel):
         self.names, self.ends = names.tolist(), ends.reshape(2, -1).T  # (map, 2)
         self.pairs = [tuple(pair) for pair in np.sort(self.ends, axis=1).tolist()]
         self.median = attribute(self.study, "latent", "median")
-        self.doubtful = set(doubtful_names(self.study))
+        self.flagged = set(flagged_names(self.study))
         spectra = [self.study["coarse"][name]["eigenvalue"].values for name in self.names]
-        k = network.sizes["mode_source_initial"]  # by as many the study chose its pairs
+        k = network.sizes["eigenpair_source_initial"]  # by as many the study chose its pairs
         self.distance = spectral_distance([values[:k] for values in spectra])
         n, self.used = len(self.names), len(set(self.pairs))  # pairs that have maps
         most = max(n - 1, n * (n - 1) // 2)
@@ -176,7 +176,7 @@ class Network(Panel):
             label="cycle error",
             unknown=UNKNOWN,
             title=f"Click a shape or a map{part}",
-            faint=[name in self.doubtful for name in names],
+            faint=[name in self.flagged for name in names],
             highlight=names.index(self.median) if self.median in names else -1,
             node=names.index(self.node) if self.node in names else -1,
             edge=self.edge,
@@ -189,7 +189,7 @@ class Network(Panel):
     def tell(self, pairs: np.ndarray, values: np.ndarray) -> None:
         """Numbers of the graph of some pairs, whose maps have these cycle errors."""
         facts, known = connectivity(pairs, len(self.names)), values[np.isfinite(values)]
-        apart = apart_of(self.study["registration"]) if "registration" in self.study else []
+        apart = excluded_of(self.study["registration"]) if "registration" in self.study else []
         few = len(self.allowed) < 2 * len(pairs)
         words = [
             f"{len(pairs)} pairs" + f", {len(self.allowed)} maps of them in the study" * few,
@@ -202,7 +202,7 @@ class Network(Panel):
             words.append(f"; cycle errors {known.min():.3f} to {known.max():.3f}, ")
             words.append(f"median {np.median(known):.3f}")
         if apart:
-            words.append(f"; beside it, doubtful: {', '.join(apart)}")
+            words.append(f"; beside it, flagged: {', '.join(apart)}")
         self.facts.value = PARTS.paragraph("".join(words))
 
     def change_stage(self) -> None:

@@ -17,7 +17,7 @@ from s4a.show.browser import PARTS
 from s4a.show.draw import label_colors
 from s4a.show.surfaces import aligned, label_text, labelled, names_of, unit_text
 from s4a.widgets.panel import Panel, beside, check, dropdown, file_name, row
-from s4a.widgets.views import extent, round_number
+from s4a.widgets.views import extent, iteration_number
 
 COLUMNS = ["name", "x", "y", "z", "confidence"]
 OF = "labels and landmarks are of this shape"
@@ -69,7 +69,7 @@ class Transfer(Panel):
         self.name = ipywidgets.Combobox(**words)
         self.remove = self.button("Remove", lambda: self.drop(self.landmark), NAMED)
         self.radius = ipywidgets.BoundedFloatText(
-            round_number(extent(registration["position"].values) / 60),
+            iteration_number(extent(registration["position"].values) / 60),
             min=0,
             max=1e9,
             step=0.5,

@@ -48,13 +48,13 @@ def extent(points: np.ndarray) -> float:
     return float(np.linalg.norm(np.ptp(points, axis=0)))
 
 
-def round_number(x: float) -> float:
+def iteration_number(x: float) -> float:
     """The next number below that is 1, 2 or 5 times a power of ten.
 
     Examples
     --------
-    >>> from s4a.widgets.views import round_number
-    >>> round_number(17.3), round_number(0.6)
+    >>> from s4a.widgets.views import iteration_number
+    >>> iteration_number(17.3), iteration_number(0.6)
     (10.0, 0.5)
     """
     power = 10.0 ** np.floor(np.log10(x))

@@ -14,7 +14,7 @@ from s4a.input.annotations import read_scalars
 
 
 @pytest.fixture(scope="module")
-def planted():
+def simulated():
     return field_study()
 
 
@@ -22,7 +22,7 @@ def test_a_field_of_the_coordinates_is_carried_to_where_the_template_was_registe
     meshes = study["original"].children.items()
     heights = {name: mesh["position"].values[:, 2] for name, mesh in meshes}
     found = with_field(study, "height", heights, unit="mm")
-    field = found["fields/height"].to_dataset()["carried_field"]
+    field = found["fields/height"].to_dataset()["transferred_field"]
     assert field.dims == ("shape", "vertex")
     assert field.attrs["units"] == "mm"
     mesh = study["registration"].to_dataset()
@@ -46,12 +46,12 @@ def test_a_field_is_kept_in_the_folder_of_its_study(study_folder, tmp_path, caps
         np.save(files / f"{name}.npy", rng.normal(size=mesh.sizes["file_vertex_index"]))
     assert cli.main(["fields", str(folder), str(files), "--name", "noise", "--unit", "um"]) == 0
     assert "noise of 4 of 4 shapes" in capsys.readouterr().out
-    kept = open_study(folder)["fields/noise"].to_dataset()["carried_field"]
+    kept = open_study(folder)["fields/noise"].to_dataset()["transferred_field"]
     assert kept.attrs["units"] == "um"
     assert np.isfinite(kept).all()
     assert set(verify(folder)["state"].values.tolist()) == {"whole"}
     first = folder / "registration" / f"{kept['shape'].values[0]}.nc"
-    first.unlink()  # a study that is registered anew has no field of the old registration
+    first.unlink()  # a study that is registered again has no field of the old registration
     assert "fields" not in open_study(folder).children
 
 
@@ -123,51 +123,51 @@ def test_a_field_that_does_not_fit_is_refused_by_shape(study, caplog):
     assert f"of {first} is 2.5 everywhere: is it the right file?" in caplog.text
     found = with_field(study, "f", good | {first: None}, partial=True)
     assert f"left out of its tests: {first}" in caplog.text
-    values = found["fields/f"].to_dataset()["carried_field"]
+    values = found["fields/f"].to_dataset()["transferred_field"]
     assert np.isnan(values.sel(shape=first)).all()
     assert np.isfinite(values.sel(shape=second)).all()
     with pytest.raises(ValueError, match="no field 'g'; with_field carries one"):
         write_field(found, "g", "nowhere")
 
 
-def test_groups_that_differ_in_a_field_are_told_where_they_do(planted):
+def test_groups_that_differ_in_a_field_are_told_where_they_do(simulated):
     options = {"field": "thickness", "covariates": ["age", "score"], "n_permutations": 199}
-    where = statistics.group_map(planted, "group", **options)
+    where = statistics.group_map(simulated, "group", **options)
     assert where["field_effect"].attrs["units"] == "mm"
     assert abs(where["field_effect"].values[TOP].mean() - 4) < 0.5
     assert (where["p_family_wise"].values[TOP] < 0.05).mean() > 0.9
     assert (where["p_family_wise"].values[~TOP] < 0.05).mean() < 0.05
     assert "effect" not in where
-    assert statistics.group_test(planted, "group", **options)["p_value"] < 0.02
+    assert statistics.group_test(simulated, "group", **options)["p_value"] < 0.02
     shape = {**options, "field": None}
-    assert statistics.group_test(planted, "group", **shape)["p_value"] > 0.05
-    classes = statistics.classify(planted, "group", field="thickness", n_permutations=9)
+    assert statistics.group_test(simulated, "group", **shape)["p_value"] > 0.05
+    classes = statistics.classify(simulated, "group", field="thickness", n_permutations=9)
     assert classes.attrs["balanced_accuracy"] > 0.8
 
 
-def test_the_slope_of_a_field_is_that_of_least_squares(planted):
+def test_the_slope_of_a_field_is_that_of_least_squares(simulated):
     fit = statistics.regression(
-        planted, "age", field="thickness", covariates=["group", "score"], n_permutations=199
+        simulated, "age", field="thickness", covariates=["group", "score"], n_permutations=199
     )
-    table = planted["subjects"]
+    table = simulated["subjects"]
     columns = [np.ones(20), table["age"], table["group"] == "b", table["score"]]
-    values = planted["fields/thickness/carried_field"].values
+    values = simulated["fields/thickness/transferred_field"].values
     slope = np.linalg.lstsq(np.column_stack(columns).astype(float), values, rcond=None)[0][1]
     assert np.allclose(fit["field_effect"], slope)
     assert (fit["p_false_discovery"].values[~TOP] < 0.05).mean() > 0.9
     for refused in (statistics.predict, statistics.regression_modes):
         with pytest.raises(ValueError, match="that of a field, which moves no vertex"):
-            refused(planted, fit, *([1.0] if refused is statistics.predict else []))
+            refused(simulated, fit, *([1.0] if refused is statistics.predict else []))
     with pytest.raises(ValueError, match="a field has no part along the normals"):
-        statistics.regression(planted, "age", field="thickness", of="normal")
+        statistics.regression(simulated, "age", field="thickness", of="normal")
 
 
-def test_vertices_and_shapes_without_a_field_are_left_out_and_told(planted, caplog):
+def test_vertices_and_shapes_without_a_field_are_left_out_and_told(simulated, caplog):
     caplog.set_level(logging.WARNING)
-    values = planted["fields/thickness/carried_field"].values.copy()
+    values = simulated["fields/thickness/transferred_field"].values.copy()
     values[3, :5] = np.nan
     values[7] = np.nan
-    holed = with_carried(planted, values)
+    holed = with_carried(simulated, values)
     where = statistics.group_map(holed, "group", field="thickness", n_permutations=99)
     assert "lacks in some shape at 5 of" in caplog.text
     assert "field 'thickness' has no value for 1 of 20 shapes" in caplog.text
@@ -175,17 +175,17 @@ def test_vertices_and_shapes_without_a_field_are_left_out_and_told(planted, capl
     assert np.isnan(where["p_family_wise"].values[:5]).all()
     assert np.isfinite(where["p_family_wise"].values[5:]).all()
     with pytest.raises(ValueError, match=r"no field 'curv'; it has thickness"):
-        statistics.group_map(planted, "group", field="curv")
-    same = with_carried(planted, np.ones_like(values))
+        statistics.group_map(simulated, "group", field="curv")
+    same = with_carried(simulated, np.ones_like(values))
     with pytest.raises(ValueError, match="the same in all shapes: there is nothing to test"):
         statistics.group_map(same, "group", field="thickness")
 
 
-def test_a_field_follows_its_vertices_into_a_region(planted):
-    part = statistics.within(planted, TOP)
+def test_a_field_follows_its_vertices_into_a_region(simulated):
+    part = statistics.within(simulated, TOP)
     vertex = part["registration"]["template_vertex"].values
-    values = planted["fields/thickness/carried_field"].values
-    assert np.array_equal(part["fields/thickness/carried_field"].values, values[:, vertex])
+    values = simulated["fields/thickness/transferred_field"].values
+    assert np.array_equal(part["fields/thickness/transferred_field"].values, values[:, vertex])
     again = statistics.without(part, "age")
     assert again["fields/thickness"].equals(part["fields/thickness"])
 

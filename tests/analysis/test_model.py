@@ -1,4 +1,4 @@
-"""Components of all shapes but one, from those of all, beside those computed anew."""
+"""Components of all shapes but one, from those of all, beside those computed again."""
 
 import numpy as np
 import pytest

@@ -11,7 +11,7 @@ from s4a.method.pca import gram, pca
 
 
 @pytest.fixture(scope="module")
-def planted():
+def simulated():
     """Twenty shapes: groups differ above, age moves all, as strongly as nothing else."""
     rng = np.random.default_rng(0)
     group = np.repeat(["a", "b"], 10)
@@ -20,35 +20,35 @@ def planted():
     return study_of(d + 0.05 * age[:, None, None] * X * [1, 0, 0], group=group, age=age)
 
 
-def test_a_region_has_its_vertices_their_displacements_and_modes_of_its_own(planted):
-    part = statistics.within(planted, TOP)
+def test_a_region_has_its_vertices_their_displacements_and_modes_of_its_own(simulated):
+    part = statistics.within(simulated, TOP)
     mesh = part["registration"].to_dataset()
     vertex = mesh["template_vertex"].values
     assert set(vertex) <= set(np.flatnonzero(TOP))
     assert len(vertex) > 0.95 * TOP.sum()
     assert np.array_equal(mesh["position"].values, X[vertex])
-    whole = planted["registration"]["displacement"].values
+    whole = simulated["registration"]["displacement"].values
     assert np.array_equal(mesh["displacement"].values, whole[:, vertex])
     triangles = vertex[mesh["corner_vertex"].values]
     assert {tuple(t) for t in triangles} == {tuple(t) for t in T[TOP[T].all(axis=1)]}
     expected = pca(mesh, vertex_areas(*as_arrays(mesh)))
     assert part["pca"].to_dataset().equals(expected)
-    labelled = statistics.within(planted, 7)
+    labelled = statistics.within(simulated, 7)
     assert labelled["registration"].equals(part["registration"])
-    sure = statistics.within(planted, least_confidence=0.5)
+    sure = statistics.within(simulated, least_confidence=0.5)
     assert sure["registration"].equals(part["registration"])
-    assert statistics.within(planted)["registration"].sizes["vertex"] == len(X)
+    assert statistics.within(simulated)["registration"].sizes["vertex"] == len(X)
 
 
-def test_an_effect_is_found_in_its_region_and_not_in_the_other(planted):
+def test_an_effect_is_found_in_its_region_and_not_in_the_other(simulated):
     options = {"covariates": ["age"], "n_permutations": 199}
     inside, outside = (
-        statistics.group_test(statistics.within(planted, label), "group", **options)["p_value"]
+        statistics.group_test(statistics.within(simulated, label), "group", **options)["p_value"]
         for label in (7, 3)
     )
     assert inside <= 0.05 < outside
-    found = statistics.group_map(statistics.within(planted, 7), "group", **options)
-    assert found.sizes["vertex"] == statistics.within(planted, 7)["registration"].sizes["vertex"]
+    found = statistics.group_map(statistics.within(simulated, 7), "group", **options)
+    assert found.sizes["vertex"] == statistics.within(simulated, 7)["registration"].sizes["vertex"]
 
 
 @pytest.mark.parametrize(
@@ -59,32 +59,32 @@ def test_an_effect_is_found_in_its_region_and_not_in_the_other(planted):
         (np.arange(400) < 3, "at least 12 vertices with triangles among them, found"),
     ],
 )
-def test_a_region_that_is_none_is_an_error(planted, region, words):
+def test_a_region_that_is_none_is_an_error(simulated, region, words):
     with pytest.raises(ValueError, match=words):
-        statistics.within(planted, region)
+        statistics.within(simulated, region)
 
 
-def test_a_region_of_a_region_says_which_vertices_of_the_template_it_has(planted):
-    top = statistics.within(planted, TOP.tolist())
+def test_a_region_of_a_region_says_which_vertices_of_the_template_it_has(simulated):
+    top = statistics.within(simulated, TOP.tolist())
     mesh = top["registration"].to_dataset()
     half = statistics.within(top, mesh["position"][:, 0] > 0)["registration"].to_dataset()
     assert np.array_equal(half["position"].values, X[half["template_vertex"].values])
 
 
-def test_labels_of_a_region_can_be_given(planted):
+def test_labels_of_a_region_can_be_given(simulated):
     labels = np.where(TOP, "top", "rest")
-    named = statistics.within(planted, "top", labels=labels)
-    assert named["registration"].equals(statistics.within(planted, 7)["registration"])
+    named = statistics.within(simulated, "top", labels=labels)
+    assert named["registration"].equals(statistics.within(simulated, 7)["registration"])
     with pytest.raises(ValueError, match=r"for each of the template's 400 vertices, found \(3,\)"):
-        statistics.within(planted, "top", labels=labels[:3])
-    bare = planted.filter(lambda node: "label" not in node)
+        statistics.within(simulated, "top", labels=labels[:3])
+    bare = simulated.filter(lambda node: "label" not in node)
     with pytest.raises(ValueError, match=r"has no labels; give them as labels= \(--labels FILE\)"):
         statistics.within(bare, 7)
 
 
-def test_without_a_nuisance_nothing_follows_it_and_no_mode_lies_along_it(planted):
-    rest = statistics.without(planted, "age")
-    fit = statistics.regression(planted, "age", n_permutations=9)
+def test_without_a_nuisance_nothing_follows_it_and_no_mode_lies_along_it(simulated):
+    rest = statistics.without(simulated, "age")
+    fit = statistics.regression(simulated, "age", n_permutations=9)
     after = statistics.regression(rest, "age", n_permutations=99)
     assert abs(after["effect"]).max() < 1e-6 * abs(fit["effect"]).max()
     assert after["p_value"] > 0.9
@@ -93,18 +93,18 @@ def test_without_a_nuisance_nothing_follows_it_and_no_mode_lies_along_it(planted
     along = np.einsum("cnx,nx,n->c", modes, fit["effect"].values, area)
     size = np.sqrt(np.einsum("nx,nx,n->", fit["effect"].values, fit["effect"].values, area))
     assert abs(along).max() < 1e-6 * size
-    assert planted["pca"]["explained_variance_ratio"].values[0] > 0.5
-    two = statistics.without(planted, ["age", "group"])
+    assert simulated["pca"]["explained_variance_ratio"].values[0] > 0.5
+    two = statistics.without(simulated, ["age", "group"])
     assert (
         gram(two["registration"]["displacement"].values, area).trace()
         < gram(rest["registration"]["displacement"].values, area).trace()
     )
     with pytest.raises(ValueError, match="the nuisance is constant"):
-        statistics.without(planted, np.ones(20))
+        statistics.without(simulated, np.ones(20))
     with pytest.raises(ValueError, match="value for every shape; covariate lacks shape_00"):
-        statistics.without(planted, [np.nan, *range(19)])
+        statistics.without(simulated, [np.nan, *range(19)])
     with pytest.raises(ValueError, match="value for every shape; covariate lacks shape_18"):
-        statistics.without(planted, np.array([*"ab" * 9, "NA", "a"]))
+        statistics.without(simulated, np.array([*"ab" * 9, "NA", "a"]))
 
 
 def test_size_that_was_taken_out_is_given_back():
@@ -114,10 +114,10 @@ def test_size_that_was_taken_out_is_given_back():
     }
     shapes = {name: (Y * (1 + 0.1 * i), S) for i, (name, (Y, S)) in enumerate(shapes.items())}
     options = {"n_coarse": 120, "k": 12, "k_init": 8, "n_jobs": 1, "intersections": False}
-    options |= {"template": "brain_01", "keep_doubtful": True}
-    scaled = analyse(shapes, scale=True, **options)
+    options |= {"template": "brain_01", "include_flagged": True}
+    scaled = analyse(shapes, remove_size=True, **options)
     back = statistics.with_size(scaled)
-    kept = analyse(shapes, scale=False, **options)
+    kept = analyse(shapes, remove_size=False, **options)
 
     def radius(study):
         mesh = study["registration"].to_dataset()
@@ -141,7 +141,7 @@ def test_the_command_takes_a_region_and_a_nuisance(study_folder, tmp_path, capsy
         names = [path.stem for path in sorted((study_folder / "original").glob("*.nc"))]
         file.write("shape,age\n" + "\n".join(f"{n},{20 + i**2}" for i, n in enumerate(names)))
     command = ["statistics", str(study_folder), "--table", str(table), "--out", str(tmp_path / "o")]
-    assert cli.main([*command, "--without", "age", "--least-confidence", "0.2"]) == 0
+    assert cli.main([*command, "--without", "age", "--min-confidence", "0.2"]) == 0
     assert "without age" in capsys.readouterr().out
     assert cli.main([*command, "--label", "999"]) == 2
     assert "no vertex of the template has the label 999" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Statistics (6.1): closed forms of a one-mode family, planted groups.
+"""Statistics (6.1): closed forms of a one-mode family, simulated groups.
 
 And p values under no difference.
 """
@@ -59,8 +59,8 @@ def smooth_noise(rng, u, s, size=0.1, waves=12):
     )
 
 
-def test_a_mode_of_a_regression_explains_what_covariates_leave_of_its_variable(planted):
-    whole = planted[0]
+def test_a_mode_of_a_regression_explains_what_covariates_leave_of_its_variable(simulated):
+    whole = simulated[0]
     _, d, _ = displacements_of(whole)
     rng = np.random.default_rng(0)
     z = rng.normal(size=len(d))
@@ -110,7 +110,7 @@ def test_values_with_names_are_taken_by_name_in_whatever_order_they_come(family)
 
 
 @pytest.fixture(scope="module")
-def planted():
+def simulated():
     """30 spheres with noise.
 
     In every other one a patch is pushed out.  Study, groups, patch, age.
@@ -201,9 +201,9 @@ def test_only_components_above_chance_explain_more_than_permuted_coefficients():
     assert not above[1:].any()
 
 
-def test_the_evaluation_of_many_modes_is_ordered(planted):
+def test_the_evaluation_of_many_modes_is_ordered(simulated):
     found = statistics.evaluate(
-        planted[0], n_samples=200, n_permutations=20, n_points=100, n_surface=5
+        simulated[0], n_samples=200, n_permutations=20, n_points=100, n_surface=5
     )
     assert (np.diff(found["compactness"]) > 0).all()
     left = found["generalization"].values
@@ -217,25 +217,25 @@ def test_the_evaluation_of_many_modes_is_ordered(planted):
     assert (found["variance_ratio_null"].values <= null + 1e-12).all()
 
 
-def test_samples_have_the_drawn_scores(planted):
-    drawn = statistics.sample(planted[0], 4, n_components=3, seed=1)
+def test_samples_have_the_drawn_scores(simulated):
+    drawn = statistics.sample(simulated[0], 4, n_components=3, seed=1)
     assert drawn["score"].shape == (4, 3)
     assert set(drawn.children) == {f"sample_{i}" for i in range(1, 5)}
     template = (
-        planted[0]["registration"]["position"].values
-        + planted[0]["pca"]["mean_displacement"].values
+        simulated[0]["registration"]["position"].values
+        + simulated[0]["pca"]["mean_displacement"].values
     )
-    moved = np.tensordot(drawn["score"].values[0], planted[0]["pca"]["deformation"].values[:3], 1)
+    moved = np.tensordot(drawn["score"].values[0], simulated[0]["pca"]["deformation"].values[:3], 1)
     assert drawn["sample_1"]["position"].values == pytest.approx(template + moved, abs=1e-6)
     with pytest.raises(ValueError, match="a number from 1 to 29, found 30"):
-        statistics.sample(planted[0], 2, n_components=30)
+        statistics.sample(simulated[0], 2, n_components=30)
 
 
 # groups and variables
 
 
-def test_planted_groups_are_found_and_the_map_marks_the_patch(planted):
-    study, group, patch, _ = planted
+def test_planted_groups_are_found_and_the_map_marks_the_patch(simulated):
+    study, group, patch, _ = simulated
     whole = statistics.group_test(study, "group", covariates={"age": "age"}, n_permutations=999)
     assert whole["p_value"].item() == whole.attrs["smallest_p"] == 0.001
     assert whole.attrs["groups"] == "control: 15, patient: 15"
@@ -251,15 +251,15 @@ def test_planted_groups_are_found_and_the_map_marks_the_patch(planted):
     assert found["effect_size"].values[patch].min() > 1
 
 
-def test_groups_without_a_difference_are_not_found(planted):
-    study, group, _, _ = planted
+def test_groups_without_a_difference_are_not_found(simulated):
+    study, group, _, _ = simulated
     shuffled = np.random.default_rng(5).permutation(group)
     assert statistics.group_test(study, shuffled, n_permutations=199)["p_value"] > 0.02
     assert statistics.group_map(study, shuffled, n_permutations=199)["p_family_wise"].min() > 0.02
 
 
-def test_a_continuous_variable_is_found_with_its_slope_and_its_shapes_move(planted):
-    study, group, _, age = planted
+def test_a_continuous_variable_is_found_with_its_slope_and_its_shapes_move(simulated):
+    study, group, _, age = simulated
     found = statistics.regression(
         study, "age", covariates={"group": (group == "patient").astype(float)}
     )
@@ -556,8 +556,8 @@ def test_distances_of_a_normal_population_have_uniform_p_values():
     assert np.mean(p < 0.05) < 0.1
 
 
-def test_planted_groups_are_classified_and_shuffled_ones_are_not(planted):
-    study, group, _, _ = planted
+def test_planted_groups_are_classified_and_shuffled_ones_are_not(simulated):
+    study, group, _, _ = simulated
     found = statistics.classify(study, group, n_permutations=19)
     assert found.attrs["balanced_accuracy"] > 0.85
     assert found["p_value"] == pytest.approx(0.05)
@@ -571,8 +571,8 @@ def test_planted_groups_are_classified_and_shuffled_ones_are_not(planted):
     assert 0.35 < np.mean(by_chance) < 0.6
 
 
-def test_a_regression_is_a_mode_that_page_panel_and_animation_show(planted, tmp_path):
-    study, _, _, age = planted
+def test_a_regression_is_a_mode_that_page_panel_and_animation_show(simulated, tmp_path):
+    study, _, _, age = simulated
     fit = statistics.regression(study, "age", n_permutations=9)
     moving = statistics.regression_modes(study, fit, "age")
     assert moving["pca"]["score"].values[:, 0] == pytest.approx(

@@ -134,7 +134,7 @@ def test_landmarks_lie_inside_triangles_of_the_shape_and_near_the_truth(study, m
         nearest_vertex = distance(X[cKDTree(X).query(meshes[name]["landmark_position"])[1]], point)
         assert error.mean() < 0.01 * size
         assert nearest_vertex.min() > 0
-        assert (node["landmark_spread"].values < 0.03 * size).all()
+        assert (node["landmark_disagreement"].values < 0.03 * size).all()
 
 
 def test_a_shape_gives_its_labels_through_the_template_to_the_others(study, meshes):
@@ -170,7 +170,9 @@ def test_fields_are_interpolated_and_unknown_values_stay_unknown(study, meshes, 
 
 
 def test_matching_both_ways_is_symmetric_and_one_way_is_possible(study, meshes):
-    one = register_pairs(meshes["brain_01"], {"a": meshes["brain_02"]}, both=False, **OPTIONS)
+    one = register_pairs(
+        meshes["brain_01"], {"a": meshes["brain_02"]}, bidirectional=False, **OPTIONS
+    )
     assert "reverse" not in one.children
     label = meshes["brain_01"]["label"].values
     a = transfer_labels(one, label)["a"]["label"].values
@@ -420,11 +422,11 @@ def test_curves_of_slicer_and_of_tables_come_out_of_their_files_in_order(tmp_pat
     def control(*points):
         return [{"label": f"p{i}", "position": p} for i, p in enumerate(points)]
 
-    sulcus, rim = [[0, 0, 0], [1, 0, 0], [2, 1, 0]], [[0, 0, 1], [1, 0, 1], [1, 1, 1]]
+    sulcus, boundary = [[0, 0, 0], [1, 0, 0], [2, 1, 0]], [[0, 0, 1], [1, 0, 1], [1, 1, 1]]
     lists = [
         {"type": "Fiducial", "controlPoints": control([5, 5, 5])},
         {"type": "Curve", "name": "sulcus", "controlPoints": control(*sulcus)},
-        {"type": "ClosedCurve", "controlPoints": control(*rim)},
+        {"type": "ClosedCurve", "controlPoints": control(*boundary)},
     ]
     markups = {"markups": [m | {"coordinateSystem": "RAS"} for m in lists]}
     (tmp_path / "a.mrk.json").write_text(json.dumps(markups))
@@ -435,9 +437,9 @@ def test_curves_of_slicer_and_of_tables_come_out_of_their_files_in_order(tmp_pat
     assert (tmp_path / "a.csv").read_text().splitlines()[0] == "name,x,y,z,curve,closed"
     again = read_landmarks(tmp_path / "a.csv")
     assert again.drop_attrs().identical(found.drop_attrs())
-    (tmp_path / "one.csv").write_text("name,x,y,z,curve\na,1,2,3,rim\n")
+    (tmp_path / "one.csv").write_text("name,x,y,z,curve\na,1,2,3,boundary\n")
     with pytest.raises(
-        ValueError, match=r"one.csv .* a curve needs two points or more; 'rim' has one"
+        ValueError, match=r"one.csv .* a curve needs two points or more; 'boundary' has one"
     ):
         read_landmarks(tmp_path / "one.csv")
 

@@ -39,7 +39,7 @@ def test_run_ends_well_and_says_what_it_found(ran):
     assert result.returncode == 0, result.stderr
     assert (study / "pca.nc").exists()
     for words in (
-        "4 shapes: 4 ok, 0 repaired, 0 doubtful, 0 excluded",
+        "4 shapes: 4 ok, 0 repaired, 0 flagged, 0 excluded",
         "median shape: brain_",
         "variance explained:",
         " MiB",
@@ -142,9 +142,15 @@ def test_every_option_of_analyse_is_a_flag_of_run_with_the_same_default():
 
 
 def test_flags_give_the_options_their_values():
-    flags = "--n-coarse 500 --n-latent 40 --init landmarks --scale --no-strict --label 1,2"
+    flags = "--n-coarse 500 --n-latent 40 --init landmarks --remove-size --no-strict --label 1,2"
     found, _ = parsed(*flags.split(), *"--components 2 --template None --seed 7".split())
-    given = {"n_coarse": 500, "n_latent": 40, "init": "landmarks", "scale": True, "label": "1,2"}
+    given = {
+        "n_coarse": 500,
+        "n_latent": 40,
+        "init": "landmarks",
+        "remove_size": True,
+        "label": "1,2",
+    }
     given |= {"components": 2, "template": "None", "seed": 7}
     assert Options(**found) == Options(**given)
 
@@ -192,7 +198,7 @@ def test_demo_finds_the_planted_modes_and_writes_its_page(tmp_path, monkeypatch,
         == 0
     )
     said = capsys.readouterr().out
-    assert "correlation of planted and recovered scores" in said
+    assert "correlation of simulated and recovered scores" in said
     assert said.index("modes.png") < said.index("S4A, registered surface")  # a picture first
     assert (out / "study.html").exists()
 

@@ -23,9 +23,9 @@ def dirty_tree():
 
 
 def at_scores(truth, scores):
-    """The truth with these planted scores at its first shape."""
+    """The truth with these simulated scores at its first shape."""
     truth = truth.copy(deep=True)
-    truth["planted_score"].values[0] = scores
+    truth["true_score"].values[0] = scores
     return truth
 
 
@@ -69,7 +69,9 @@ def test_vertices_are_exactly_where_the_truth_says(clean_tree):
 def test_the_same_seed_gives_the_same_bits():
     one, two = (synthetic.brains(2, 800, seed=5, dirty=True) for _ in range(2))
     assert one.identical(two)
-    assert not np.array_equal(synthetic.plant(2, 6)["own_push"], one["truth/own_push"])
+    assert not np.array_equal(
+        synthetic.plant(2, 6)["noise_translation"], one["truth/noise_translation"]
+    )
 
 
 def test_the_population_does_not_depend_on_resolution():
@@ -81,7 +83,7 @@ def test_the_population_does_not_depend_on_resolution():
 
 @pytest.mark.parametrize("n", [6, 12, 51])
 def test_planted_scores_are_standardised_bounded_and_uncorrelated(n):
-    score = synthetic.plant(n, seed=2)["planted_score"].values
+    score = synthetic.plant(n, seed=2)["true_score"].values
     assert np.allclose(score.T @ score / n, np.eye(3), atol=1e-12)
     assert np.allclose(score.mean(0), 0, atol=1e-12)
     assert np.abs(score).max() <= 2.5
@@ -91,7 +93,7 @@ def test_planted_modes_are_orthogonal_free_of_rigid_motion_and_fall_by_the_ratio
     u, T = synthetic._sphere(6000)
     x = synthetic.reference_brain(u)
     area = mesh.vertex_areas(x, T)
-    centre, width, push, turn = synthetic._planted_modes(3)
+    centre, width, push, turn = synthetic._true_modes(3)
     fields = [synthetic._fields(x, centre, width, a, b) for a, b in zip(push, turn, strict=True)]
     rigid = [np.broadcast_to(e, x.shape) for e in np.eye(3)] + [np.cross(e, x) for e in np.eye(3)]
     gram = np.einsum("apx,bpx,p->ab", fields, fields, area / area.sum())
@@ -105,7 +107,7 @@ def test_planted_modes_are_orthogonal_free_of_rigid_motion_and_fall_by_the_ratio
 
 @pytest.mark.parametrize("n_modes", [3, 6])
 def test_space_is_nowhere_folded_at_three_standard_deviations(n_modes):
-    centre, width, push, turn = synthetic._planted_modes(n_modes)
+    centre, width, push, turn = synthetic._true_modes(n_modes)
     x = np.stack(np.meshgrid(*[np.linspace(-110, 110, 18)] * 3), axis=-1).reshape(-1, 3)
     h = 1e-3 * np.eye(3)
     fields = [
@@ -163,7 +165,7 @@ def test_nearest_neighbours_after_icp_are_wrong_by_two_to_four_percent():
             align.cloud(X, area),
             align.cloud(Y, area_b),
             *align.rigid_transform(X, exact)[:2],
-            rounds=3,
+            iterations=3,
         )
         nearest = cKDTree(Y).query(X @ R.T + t)[1]
         error.append(
@@ -182,7 +184,7 @@ def test_labels_cover_every_region_and_landmarks_lie_on_the_surface(clean_tree):
 
 
 def test_a_third_of_the_shapes_has_a_tumour_of_the_stated_height():
-    height = np.linalg.norm(synthetic.plant(12)["own_push"][:, -1], axis=1)
+    height = np.linalg.norm(synthetic.plant(12)["noise_translation"][:, -1], axis=1)
     assert (height > 0).sum() == 4
     assert height[height > 0].min() >= 4
     assert height.max() <= 7

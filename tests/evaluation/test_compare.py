@@ -35,76 +35,76 @@ def found(three_brains):
 
 
 def test_every_method_has_every_metric_and_its_time_by_block(found):
-    assert found["way"].values.tolist() == list(compare.METHODS)
-    assert found["chamfer"].dims == found["geodesic_error"].dims == ("way", "pair")
-    assert found["block_seconds"].dims == ("way", "pair", "block")
+    assert found["algorithm"].values.tolist() == list(compare.METHODS)
+    assert found["chamfer"].dims == found["geodesic_error"].dims == ("algorithm", "pair")
+    assert found["block_seconds"].dims == ("algorithm", "pair", "block")
     assert found.sizes["pair"] == 2
     for name in (
         "geodesic_error",
-        "straight_error",
+        "euclidean_error",
         "chamfer",
         "hausdorff",
         "dirichlet",
         "coverage",
         "bijectivity",
     ):
-        assert set(found[name].dims) == {"way", "pair"}, name
+        assert set(found[name].dims) == {"algorithm", "pair"}, name
         assert np.isfinite(found[name]).all(), name
     spent = found["block_seconds"].mean("pair")
-    assert spent.dims == ("way", "block")
-    assert (spent.sel(block="sample").sel(way=["kNN", "ZO", "FMAP+ZO"]) == 0).all()
-    assert (spent.sel(block="sample").sel(way=["SCALABLE", "RE-MATCH"]) > 0).all()
-    assert (spent.sel(block=["basis", "map", "refine"]).sel(way="FMAP+ZO") > 0).all()
+    assert spent.dims == ("algorithm", "block")
+    assert (spent.sel(block="sample").sel(algorithm=["kNN", "ZO", "FMAP+ZO"]) == 0).all()
+    assert (spent.sel(block="sample").sel(algorithm=["SCALABLE", "RE-MATCH"]) > 0).all()
+    assert (spent.sel(block=["basis", "map", "refine"]).sel(algorithm="FMAP+ZO") > 0).all()
     assert (spent.sel(block="align") > 0).all()
-    assert spent.sel(way="registered").sum() > spent.sel(way="RE-MATCH").sum()
+    assert spent.sel(algorithm="registered").sum() > spent.sel(algorithm="RE-MATCH").sum()
 
 
 def test_nearest_neighbours_in_space_have_the_largest_chamfer_distance_of_the_papers(found):
-    chamfer = found["chamfer"].sel(way=list(compare.PAPER_METHODS))
-    assert (chamfer.idxmax("way") == "kNN").all()
+    chamfer = found["chamfer"].sel(algorithm=list(compare.PAPER_METHODS))
+    assert (chamfer.idxmax("algorithm") == "kNN").all()
 
 
 def test_maps_of_low_resolution_take_less_time_than_those_of_dense_meshes(found):
     seconds = found["block_seconds"].sum("block").mean("pair")
-    dense = seconds.sel(way=["ZO", "FMAP+ZO"]).min("way")
-    assert (seconds.sel(way=["SCALABLE", "RE-MATCH"]) < dense).all()
+    dense = seconds.sel(algorithm=["ZO", "FMAP+ZO"]).min("algorithm")
+    assert (seconds.sel(algorithm=["SCALABLE", "RE-MATCH"]) < dense).all()
 
 
 def test_the_default_is_nearer_to_the_truth_than_every_other_method(found):
-    error = found["straight_error"].mean("pair")
-    others = error.drop_sel(way=["registered", "registered surface"])
-    assert error.sel(way="registered") < 0.9 * others.min()
+    error = found["euclidean_error"].mean("pair")
+    others = error.drop_sel(algorithm=["registered", "registered surface"])
+    assert error.sel(algorithm="registered") < 0.9 * others.min()
 
 
 def test_on_equal_terms_the_default_ends_on_the_source_and_its_surface_between_vertices(found):
     chamfer = found["chamfer"].mean("pair")
-    assert chamfer.sel(way="registered") < 1.1 * chamfer.sel(way="RE-MATCH")
-    assert chamfer.sel(way="registered surface") > 2 * chamfer.sel(way="registered")
+    assert chamfer.sel(algorithm="registered") < 1.1 * chamfer.sel(algorithm="RE-MATCH")
+    assert chamfer.sel(algorithm="registered surface") > 2 * chamfer.sel(algorithm="registered")
     smooth = found["dirichlet"].mean("pair")
-    assert smooth.sel(way="registered surface") < smooth.sel(way="registered")
+    assert smooth.sel(algorithm="registered surface") < smooth.sel(algorithm="registered")
     for name in ("geodesic_error", "coverage", "bijectivity"):  # of the match, which is one
-        matched, surface = found[name].sel(way=["registered", "registered surface"]).values
+        matched, surface = found[name].sel(algorithm=["registered", "registered surface"]).values
         assert np.array_equal(matched, surface)
 
 
 def test_rematch_is_the_papers_with_and_without_the_preset(three_brains):
     source, targets, _ = three_brains
     target = next(iter(targets.values()))
-    two = {"methods": ["RE-MATCH", "RE-MATCH lifted"]}
+    two = {"methods": ["RE-MATCH", "RE-MATCH refined"]}
     ours = compare.pair(source, target, **two, **SMALL)
     paper = compare.pair(source, target, preset="paper", methods=["RE-MATCH"], **SMALL)
-    assert paper["chamfer"].item() == ours["chamfer"].sel(way="RE-MATCH").item()
-    assert paper["chamfer"].item() != ours["chamfer"].sel(way="RE-MATCH lifted").item()
+    assert paper["chamfer"].item() == ours["chamfer"].sel(algorithm="RE-MATCH").item()
+    assert paper["chamfer"].item() != ours["chamfer"].sel(algorithm="RE-MATCH refined").item()
 
 
 def test_every_method_finds_a_shape_in_itself(meshes):
     mesh = meshes["brain_01"]
     same = np.arange(mesh.sizes["vertex"])
     found = compare.pair(mesh, mesh, truth=same, **SMALL)
-    exact = [way for way in compare.METHODS if way not in ("RE-MATCH lifted", "SCALABLE")]
-    assert (found["geodesic_error"].sel(way=exact) == 0).all()
+    exact = [way for way in compare.METHODS if way not in ("RE-MATCH refined", "SCALABLE")]
+    assert (found["geodesic_error"].sel(algorithm=exact) == 0).all()
     assert (found["geodesic_error"] < 0.005).all()
-    assert (found["bijectivity"].sel(way=exact) == 0).all()
+    assert (found["bijectivity"].sel(algorithm=exact) == 0).all()
 
 
 def test_an_alignment_that_given_landmarks_make_needless_is_not_charged(three_brains):
@@ -115,8 +115,8 @@ def test_an_alignment_that_given_landmarks_make_needless_is_not_charged(three_br
         source, target, landmarks=marks, methods=["kNN", "FMAP+ZO", "RE-MATCH"], **SMALL
     )
     align = found["block_seconds"].sel(block="align").isel(pair=0)
-    assert align.sel(way="kNN") > 0
-    assert (align.sel(way=["FMAP+ZO", "RE-MATCH"]) == 0).all()
+    assert align.sel(algorithm="kNN") > 0
+    assert (align.sel(algorithm=["FMAP+ZO", "RE-MATCH"]) == 0).all()
 
 
 def test_given_landmarks_make_up_for_a_rigid_alignment_that_is_wrong():
@@ -156,10 +156,13 @@ def test_what_is_wrong_is_said(three_brains):
     target = next(iter(targets.values()))
     with pytest.raises(ValueError, match="methods must be some of kNN"):
         compare.pair(source, target, methods=["ICP"])
-    with pytest.raises(ValueError, match=r"the methods kNN.*found RE-MATCH lifted, registered"):
+    with pytest.raises(ValueError, match=r"the methods kNN.*found RE-MATCH refined, registered"):
         compare.pair(source, target, methods=["kNN", *compare.METHODS[-3:]], preset="paper")
-    with pytest.raises(ValueError, match="preset 'paper' sets sharpen=0; found sharpen=1"):
-        compare.pair(source, target, preset="paper", sharpen=1)
+    with pytest.raises(
+        ValueError,
+        match="preset 'paper' sets full_resolution_iterations=0",
+    ):
+        compare.pair(source, target, preset="paper", full_resolution_iterations=1)
     with pytest.raises(ValueError, match="init must be one of 'landmarks', 'descriptors'"):
         compare.pair(source, target, init="dense")
     with pytest.raises(ValueError, match="landmarks need two arrays"):
@@ -175,28 +178,28 @@ def test_what_is_wrong_is_said(three_brains):
 def test_both_ways_to_full_resolution_share_all_but_the_last_block(three_brains):
     source, targets, _ = three_brains
     found = compare.collection({"brain_01": source, **targets}, n_coarse=400, k=30)
-    assert found["collection_chamfer"].dims == ("way", "how", "shape")
+    assert found["collection_chamfer"].dims == ("algorithm", "dense_match", "shape")
     seconds = found["collection_seconds"]
     shared = seconds.drop_sel(block="full resolution")
-    assert (shared.sel(how="standard") == shared.sel(how="ours")).all()
-    for way in found["way"].values:
-        template = found["median_shape"].sel(way=way).item()
-        known = found["collection_chamfer"].sel(way=way).drop_sel(shape=template)
+    assert (shared.sel(dense_match="fmap") == shared.sel(dense_match="latent")).all()
+    for way in found["algorithm"].values:
+        template = found["median_shape"].sel(algorithm=way).item()
+        known = found["collection_chamfer"].sel(algorithm=way).drop_sel(shape=template)
         assert (known < 0.06).all()
-        assert found["distance_to_median"].sel(way=way).idxmin().item() == template
+        assert found["distance_to_limit"].sel(algorithm=way).idxmin().item() == template
 
 
 def test_small_meshes_are_compared_in_as_many_functions_as_they_have_and_a_note_says_so(caplog):
     few, more = synthetic.ellipsoid(60), synthetic.ellipsoid(90, (1.3, 1.1, 1.0))
     for source, target in ((few, more), (more, few)):
         found = compare.pair(source, target, n_geodesic=20)
-        assert found["way"].values.tolist() == list(compare.METHODS)
+        assert found["algorithm"].values.tolist() == list(compare.METHODS)
         assert np.isfinite(found["chamfer"]).all()
         note = "pair: k = 100 reduced to 58, the eigenfunctions that the smaller mesh has"
         assert found.attrs["note"] == note
         assert note in caplog.text
     itself = compare.pair(few, few, truth=np.arange(60), n_geodesic=20)
-    assert (itself["geodesic_error"].sel(way=["ZO", "RE-MATCH", "registered"]) == 0).all()
+    assert (itself["geodesic_error"].sel(algorithm=["ZO", "RE-MATCH", "registered"]) == 0).all()
     enough = compare.pair(few, more, methods=["ZO"], k=20, n_geodesic=20)
     assert "note" not in enough.attrs
 
@@ -244,7 +247,7 @@ def test_the_command_writes_table_file_and_figure(tmp_path, capsys):
     assert "RE-MATCH" in text
     assert "CPU seconds" in text
     with xr.open_dataset(out / "compare.nc") as found:
-        assert found["way"].values.tolist() == ["kNN", "RE-MATCH"]
+        assert found["algorithm"].values.tolist() == ["kNN", "RE-MATCH"]
         assert "geodesic_error" in found
     assert (out / "compare.png").stat().st_size > 5000
 

@@ -34,7 +34,7 @@ def test_a_random_permutation_scores_0_on_chamfer_and_hausdorff_and_badly_where_
         assert wrong[name] == 0, name
     assert wrong["coverage"] == 1
     assert wrong["geodesic_error"] > 0.3
-    assert wrong["straight_error"] > 0.3
+    assert wrong["euclidean_error"] > 0.3
     assert wrong["dirichlet"] > 100
     assert wrong["conformal_distortion"] > 0.5
 
@@ -43,7 +43,7 @@ def test_the_identity_is_perfect_by_every_metric(ball):
     same = np.arange(ball.sizes["vertex"])
     found = metrics.evaluate(ball, ball, same, reverse=same, truth=ball["position"].values)
     zero = "chamfer hausdorff hausdorff_paper bijectivity".split()
-    zero += "collapsed_share geodesic_error straight_error".split()
+    zero += "collapsed_share geodesic_error euclidean_error".split()
     for name in [*zero, "conformal_distortion", "area_distortion"]:
         assert found[name] == pytest.approx(0, abs=1e-6), name
     assert found["coverage"] == 1
@@ -206,8 +206,8 @@ def test_an_image_between_vertices_scores_better_than_its_vertices(ball):
     X, n = ball["position"].values, ball.sizes["vertex"]
     turn = np.array([[np.cos(0.02), -np.sin(0.02), 0], [np.sin(0.02), np.cos(0.02), 0], [0, 0, 1]])
     found = metrics.evaluate(ball, ball, np.arange(n), image=X @ turn.T, truth=X @ turn.T)
-    assert found["straight_error"] == pytest.approx(0, abs=1e-12)
-    assert metrics.evaluate(ball, ball, np.arange(n), truth=X @ turn.T)["straight_error"] > 0.003
+    assert found["euclidean_error"] == pytest.approx(0, abs=1e-12)
+    assert metrics.evaluate(ball, ball, np.arange(n), truth=X @ turn.T)["euclidean_error"] > 0.003
 
 
 def test_where_the_truth_is_unknown_nothing_is_measured(ball, shuffled):
@@ -218,7 +218,7 @@ def test_where_the_truth_is_unknown_nothing_is_measured(ball, shuffled):
     vertex[: n // 2], position[: n // 2] = -1, np.nan
     for truth in (vertex, position):
         found = metrics.evaluate(ball, ball, match, truth=truth)
-        assert found["geodesic_error"] == found["straight_error"] == 0
+        assert found["geodesic_error"] == found["euclidean_error"] == 0
     with pytest.raises(ValueError, match="unknown at every vertex"):
         metrics.evaluate(ball, ball, match, truth=np.full(n, -1))
 
@@ -226,13 +226,17 @@ def test_where_the_truth_is_unknown_nothing_is_measured(ball, shuffled):
 def test_evaluations_stack_over_ways_and_pairs(ball, shuffled):
     same = np.arange(len(shuffled))
     rows = [
-        xr.concat([metrics.evaluate(ball, ball, m, truth=same) for m in (same, shuffled)], "way")
+        xr.concat(
+            [metrics.evaluate(ball, ball, m, truth=same) for m in (same, shuffled)], "algorithm"
+        )
         for _ in range(2)
     ]
     table = xr.concat(rows, "pair")
     assert dict(table["chamfer"].sizes) == {"pair": 2, "way": 2}
     assert table["chamfer"].attrs["units"] == "share of sqrt(area)"
-    assert (table["geodesic_error"].isel(way=0) < table["geodesic_error"].isel(way=1)).all()
+    assert (
+        table["geodesic_error"].isel(algorithm=0) < table["geodesic_error"].isel(algorithm=1)
+    ).all()
 
 
 @pytest.mark.parametrize(

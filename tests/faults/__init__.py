@@ -1,1 +1,1 @@
-"""Faults of meshes, made anew for every test: what is wrong, and what must become of it."""
+"""Faults of meshes, made again for every test: what is wrong, and what must become of it."""

@@ -117,8 +117,10 @@ def nan(path):
 
 def duplicate_vertices(path):
     X, T = shape(7)
-    soup = X[T].reshape(-1, 3) + np.random.default_rng(0).uniform(-1e-6, 1e-6, (3 * len(T), 3))
-    path.write_bytes(WRITERS[".obj"](soup, np.arange(len(soup)).reshape(-1, 3), {}))
+    unconnected = X[T].reshape(-1, 3) + np.random.default_rng(0).uniform(
+        -1e-6, 1e-6, (3 * len(T), 3)
+    )
+    path.write_bytes(WRITERS[".obj"](unconnected, np.arange(len(unconnected)).reshape(-1, 3), {}))
 
 
 def flat(path):
@@ -236,7 +238,7 @@ FAULTS = [
     Fault("duplicate vertices", "duplicate_vertices.obj", duplicate_vertices, "repaired",
           "1488 vertices welded", "welded at 1e-7 of the bounding box, `file_vertex` kept",
           "nothing to do"),
-    Fault("STL soup", "soup.stl", of(8), "ok", "^$", "corners in the same place are one vertex",
+    Fault("STL unconnected", "unconnected.stl", of(8), "ok", "^$", "equal corners are one vertex",
           "nothing to do"),
     Fault("zero-area faces", "flat.ply", flat, "repaired", "zero-area triangles",
           "long edges flipped, so that no crack opens; else dropped", "nothing to do"),
@@ -273,14 +275,14 @@ FAULTS = [
           "counted; warned above 1 % and ten times what the others have",
           "`wrap=True` makes a surface without; `intersections=False` does not look for them",
           where="warning"),
-    Fault("genus other than the rest", "handle.ply", handle, "doubtful", "genus 1, but 0 in",
+    Fault("genus other than the rest", "handle.ply", handle, "flagged", "genus 1, but 0 in",
           "warned, with the table of genus", "`wrap=True` closes tunnels; or leave the shape out",
           where="warning"),
-    Fault("shape in other units", "metres.ply", of(19, lambda X, T: (X / 1000, T)), "doubtful",
+    Fault("shape in other units", "metres.ply", of(19, lambda X, T: (X / 1000, T)), "flagged",
           r"times the size of the others, near 10\^-3", "warned with the factor; size is kept",
           "scale the file", where="warning"),
     Fault("mirrored shape", "mirrored.ply", of(20, lambda X, T: (X * [-1, 1, 1], T[:, ::-1])),
-          "doubtful", "fits as a mirror image",
+          "flagged", "fits as a mirror image",
           "warned with both ICP residuals; kept as it is; "
           "one of a nearly symmetric kind cannot be told from the others",
           "reflect= mirrors it; or leave it out", where="warning"),
@@ -288,36 +290,36 @@ FAULTS = [
           "^$", "the alignment starts from several turns", "nothing to do"),
     Fault("a part is cut off", "part.ply",
           of(30, lambda X, T: (X, T[(X[T, 2] < np.quantile(X[:, 2], 0.7)).all(axis=1)])),
-          "doubtful",
+          "flagged",
           r"its holes are [0-9.]+ of sqrt\(area\) long, of the others 0: is a part cut off",
-          "doubtful: beside five shapes or more, where its holes are much longer",
+          "flagged: beside five shapes or more, where its holes are much longer",
           "complete the scan, or leave it out", where="warning"),
     Fault("shape stretched by 3", "stretched.ply", of(31, lambda X, T: (X * [3, 1, 1], T)),
-          "doubtful", "unlike the others: .* times the usual spread away; .* stretched",
-          "warned by its form beside five shapes or more; doubtful where it is far from all others",
+          "flagged", "unlike the others: .* times the usual spread away; .* stretched",
+          "warned by its form beside five shapes or more; flagged where it is far from all others",
           "look at it; leave it out if it does not belong", where="warning"),
-    Fault("another kind of shape", "rod.ply", rod, "doubtful",
+    Fault("another kind of shape", "rod.ply", rod, "flagged",
           "unlike the others: .* times the usual spread away; another kind of shape", "the same",
           "leave it out", where="warning"),
     Fault("the same scan under two names", "same_as_packed.obj",
-          of(3, lambda X, T: (np.round(X[::-1], 3) + 500, len(X) - 1 - T[::-1])), "doubtful",
+          of(3, lambda X, T: (np.round(X[::-1], 3) + 500, len(X) - 1 - T[::-1])), "flagged",
           "the same surface as packed, under two names",
-          "doubtful: told by size, moments and volume, in whatever order, pose and format",
+          "flagged: told by size, moments and volume, in whatever order, pose and format",
           "leave one of them out", where="warning"),
     Fault("coordinates rounded", "rounded.ply", of(32, lambda X, T: (np.round(X / 4) * 4, T)), "ok",
           r"its coordinates are rounded, to 0\.[0-9]+ of an edge",
           "warned, where the others' are not", "export it with more digits", where="warning"),
-    Fault("inches among centimetres", "inches.ply", of(33, lambda X, T: (2.54 * X, T)), "doubtful",
+    Fault("inches among centimetres", "inches.ply", of(33, lambda X, T: (2.54 * X, T)), "flagged",
           r"2\.[45][0-9]* times the size of the others, near 2.54",
-          "doubtful, beside five shapes or more; its size is kept", "scale the file",
+          "flagged, beside five shapes or more; its size is kept", "scale the file",
           where="warning"),
     Fault("coordinates offset by 1e6", "far.obj", far, "ok", "^$", "the same as centred",
           "nothing to do"),
-    Fault("scale 1e-9", "tiny.obj", of(23, lambda X, T: (X * 1e-9, T)), "doubtful",
+    Fault("scale 1e-9", "tiny.obj", of(23, lambda X, T: (X * 1e-9, T)), "flagged",
           "1e-09 times the size of the others|e-10 times the size of the others",
           "the same as scaled, in the input's units; warned as another unit", "scale the file",
           where="warning"),
-    Fault("scale 1e9", "huge.obj", of(24, lambda X, T: (X * 1e9, T)), "doubtful",
+    Fault("scale 1e9", "huge.obj", of(24, lambda X, T: (X * 1e9, T)), "flagged",
           r"e\+0?[89] times the size of the others",
           "the same as scaled, in the input's units; warned as another unit", "scale the file",
           where="warning"),

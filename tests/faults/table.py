@@ -20,10 +20,10 @@ PAGE = DOCS / "faults.md"
 HEAD = """# What becomes of faulty input
 
 A run over a collection goes on with the shapes that can be used. `s4a check`, `s4a run` and
-`s4a.read_shapes` give each shape a status (ok, repaired, doubtful, excluded), a reason (what was
+`s4a.read_shapes` give each shape a status (ok, repaired, flagged, excluded), a reason (what was
 found and done) and a warning (what looks wrong and was left as it is); what concerns several
-shapes, or files that are no shapes, stands in the remarks below. Doubtful shapes are registered,
-and [stay apart](doubtful.md): the others' results are the same without them.
+shapes, or files that are no shapes, stands in the remarks below. Flagged shapes are registered,
+and [stay apart](quality_control.md): the others' results are the same without them.
 
 This page is made from the entries that the tests run over (`tests/faults`); every row is tested.
 

@@ -1,4 +1,4 @@
-"""Rigid alignment (4.1, step 2): motions that are known come back."""
+"""Rigid alignment (4.1, step 2): transforms that are known come back."""
 
 import numpy as np
 import pytest

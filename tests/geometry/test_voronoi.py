@@ -5,13 +5,13 @@ import pytest
 
 from s4a.geometry.mesh import directed_edges
 from s4a.geometry.voronoi import (
-    between_rims,
+    between_boundaries,
+    boundaries,
     cut_handles,
     dual,
     faults,
     mesh_graph,
     refine,
-    rims,
     voronoi_cells,
 )
 
@@ -96,8 +96,8 @@ def test_more_samples_mend_what_is_faulty():
     slices = [np.abs(longitude[: len(X) - 2] - angle).argmin() for angle in (0, 2.1, 4.2)]
     start = voronoi_cells(graph.G, np.array(slices) + 24 * 12)
     assert len(faults(graph, start.cell, 3).triangle) == 2
-    state, rounds, faulty = refine(graph, start, 50, np.zeros(len(X), bool))
-    assert (rounds > 0, faulty) == (True, False)
+    state, iterations, faulty = refine(graph, start, 50, np.zeros(len(X), bool))
+    assert (iterations > 0, faulty) == (True, False)
     found = faults(graph, state.cell, len(state.sample))
     assert not found.cell.any()
     assert len(found.pair) == len(found.triangle) == 0
@@ -106,10 +106,10 @@ def test_more_samples_mend_what_is_faulty():
 @pytest.mark.parametrize("rows, n_rims", [(("000", "010", "000"), 2), (("00", "00"), 0)])
 def test_rims_lead_out_of_a_region(rows, n_rims):
     graph, cell, _ = sheet(*rows)
-    triangle, vertex, rim, owner = rims(graph.T, cell)
+    triangle, vertex, boundary, owner = boundaries(graph.T, cell)
     assert len(owner) == n_rims
     assert sorted(owner.tolist()) == list(range(n_rims))
-    assert (cell[vertex] == owner[rim]).all()
+    assert (cell[vertex] == owner[boundary]).all()
     assert set(triangle) <= set(range(len(graph.T)))
 
 
@@ -143,9 +143,11 @@ def test_what_would_cut_off_more_than_a_crumb_stays():
 def test_a_piece_of_a_region_that_no_rim_bounds_is_not_cut():
     X, T, _ = ball()
     n = len(X)
-    assert not between_rims(mesh_graph(X, T).G, T, np.zeros(n, int)).any()  # closed, all one region
-    two = mesh_graph(np.r_[X, X + 9], np.r_[T, T + n])  # beside one that has two rims
+    assert not between_boundaries(
+        mesh_graph(X, T).G, T, np.zeros(n, int)
+    ).any()  # closed, all one region
+    two = mesh_graph(np.r_[X, X + 9], np.r_[T, T + n])  # beside one that has two boundaries
     height = np.r_[X[:, 2], np.full(n, 0.0)]
-    removed = between_rims(two.G, two.T, np.where(np.abs(height) < 0.5, 0, -1))
+    removed = between_boundaries(two.G, two.T, np.where(np.abs(height) < 0.5, 0, -1))
     assert removed[: len(T)].any()
     assert not removed[len(T) :].any()

@@ -121,12 +121,12 @@ def test_holes_and_genus_are_counted():
 def test_a_triangle_soup_is_welded():
     X, T = sphere()
     noise = 1e-8 * np.random.default_rng(0).normal(size=(3 * len(T), 3))
-    for soup in (
+    for unconnected in (
         X[T].reshape(-1, 3),
         X[T].reshape(-1, 3) + noise,
         X[T].reshape(-1, 3).astype(np.float32),
     ):
-        Y, _, counts = cleaned(soup, np.arange(3 * len(T)).reshape(-1, 3))
+        Y, _, counts = cleaned(unconnected, np.arange(3 * len(T)).reshape(-1, 3))
         assert (len(Y), counts["components"], counts["genus"], counts["holes"]) == (len(X), 1, 0, 0)
 
 
@@ -311,7 +311,7 @@ def test_an_open_shape_faces_outwards_too():
 def test_a_moebius_strip_is_cut_into_one_that_has_two_sides():
     n = 20
     u = 2 * np.pi * np.arange(n) / n
-    rim = [
+    boundary = [
         np.stack(
             [
                 (3 + s * np.cos(u / 2)) * np.cos(u),
@@ -325,7 +325,7 @@ def test_a_moebius_strip_is_cut_into_one_that_has_two_sides():
     a, b = np.arange(n), n + np.arange(n)
     c, d = np.r_[a[1:], b[0]], np.r_[b[1:], a[0]]
     T = np.concatenate([np.stack([a, c, d], axis=1), np.stack([a, d, b], axis=1)])
-    _, S, counts = cleaned(np.concatenate(rim), T)
+    _, S, counts = cleaned(np.concatenate(boundary), T)
     assert (len(S), counts["components"], counts["holes"], counts["euler_characteristic"]) == (
         2 * n,
         1,

@@ -16,7 +16,7 @@ from paths import ROOT, TESTS
 from s4a import analyse, cli, insert, open_study, read_shapes
 from s4a.geometry.mesh import as_dataset, euler_characteristic
 from s4a.show.page import study_html
-from s4a.study.doubts import doubtful
+from s4a.study.quality_control import flagged
 from s4a.study.report import tied
 
 SMALL = {"n_coarse": 100, "k_init": 6, "k": 10, "step": 4, "refine": "intrinsic"}
@@ -79,11 +79,11 @@ def test_every_fault_has_its_outcome(name, in_python, checked, ran):
         else:
             row = report.sel(shape=name)
             # ten functions on 100 vertices register some shapes wrongly, which a run says
-            wrong = report is in_run and "registration" in row["doubtful_kinds"].item()
-            assert row["status"].item() == ("doubtful" if wrong else one.status)
+            wrong = report is in_run and "registration" in row["flag_kinds"].item()
+            assert row["status"].item() == ("flagged" if wrong else one.status)
         if not (silent and report is in_run):  # a run has other things to say of them
             assert re.search(one.said, said(report, one))
-    used = one.status in ("ok", "repaired", "doubtful")
+    used = one.status in ("ok", "repaired", "flagged")
     assert (name in ran[2]["registration"]["shape"].values) == used
     for _, text, *_ in (checked, ran):
         assert name in text or silent
@@ -270,12 +270,12 @@ def test_a_triangle_and_a_tetrahedron_end_no_run():
 
 
 def test_a_wrong_registration_is_told():
-    wrong, remarks = doubtful({"a": 0.0, "b": 0.02, "c": 0.1})
+    wrong, remarks = flagged({"a": 0.0, "b": 0.02, "c": 0.1})
     assert list(wrong) == ["c"]
-    assert [(one.kind, one.doubtful) for one in wrong["c"]] == [("registration", True)]
-    assert "badness 0.100" in wrong["c"][0].words
+    assert [(one.kind, one.flagged) for one in wrong["c"]] == [("registration", True)]
+    assert "registration_error 0.100" in wrong["c"][0].words
     assert remarks == []
-    assert doubtful({"a": 0.0, "b": 0.12, "c": 0.1})[0] == {}
+    assert flagged({"a": 0.0, "b": 0.12, "c": 0.1})[0] == {}
 
 
 def test_two_shapes_share_the_median_and_it_is_told():

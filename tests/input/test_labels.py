@@ -52,7 +52,7 @@ def test_a_ball_lies_where_its_affine_puts_it_and_keeps_its_volume(tmp_path, nam
 def test_smoothing_takes_the_steps_of_the_voxels_and_does_not_shrink(tmp_path):
     inside, middle = ball()
     path = write(tmp_path / "a.nii", inside.astype(np.uint8), np.eye(4))
-    (steps, T, _), (smooth, _, _) = (read_volume(path, 1, rounds=n) for n in (0, 20))
+    (steps, T, _), (smooth, _, _) = (read_volume(path, 1, iterations=n) for n in (0, 20))
     rough, fine = (np.linalg.norm(X - middle, axis=1) for X in (steps, smooth))
     assert fine.std() < 0.5 * rough.std()
     assert fine.mean() == pytest.approx(rough.mean(), rel=0.005)

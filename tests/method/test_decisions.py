@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from s4a import coarsen, spectrum, synthetic
 from s4a.geometry.mesh import as_arrays, vertex_areas
-from s4a.method import elastic, first_map, joint, latent
+from s4a.method import elastic, initial_map, latent, spectral_icp
 from s4a.method.shape import Basis, Shape
 
 # ---- the score of a registration: round trip, distances in both directions, landmarks
@@ -51,12 +51,12 @@ def far(X, Y):
 
 
 def test_the_identity_scores_zero(sphere):
-    assert joint.registration_score(sphere, sphere, np.arange(len(sphere.X)), sphere) == 0
+    assert spectral_icp.registration_score(sphere, sphere, np.arange(len(sphere.X)), sphere) == 0
 
 
 def test_what_the_target_does_not_cover_of_the_source_is_in_the_score(sphere):
     half, at = hemisphere(sphere)
-    score = joint.registration_score(sphere, half, at, half)
+    score = spectral_icp.registration_score(sphere, half, at, half)
     assert score == pytest.approx(far(sphere.X, half.X).mean(), rel=0.25)
     assert score > 0.05
 
@@ -66,7 +66,7 @@ def test_what_the_source_lacks_of_the_target_is_in_the_score(sphere):
     match = half.tree.query(sphere.tree.data)[1]
     gap = np.linalg.norm(sphere.X - half.X[match], axis=1).mean()
     assert gap > 0.05
-    assert joint.registration_score(half, sphere, match, sphere) >= gap
+    assert spectral_icp.registration_score(half, sphere, match, sphere) >= gap
 
 
 def test_a_match_that_slides_is_in_the_score_by_its_distance_and_by_its_path(sphere):
@@ -76,20 +76,20 @@ def test_a_match_that_slides_is_in_the_score_by_its_distance_and_by_its_path(sph
     match = np.argmin(np.linalg.norm(slid[:, None] - sphere.X[None], axis=2), axis=1)
     gap = np.linalg.norm(sphere.X - sphere.X[match], axis=1).mean()
     # a path along edges is up to a tenth longer than the arc
-    score = joint.registration_score(sphere, sphere, match, sphere)
+    score = spectral_icp.registration_score(sphere, sphere, match, sphere)
     assert 1.95 * gap < score < 2.3 * gap
 
 
 def test_a_round_trip_is_counted_up_to_half_the_size_of_the_surface(sphere):
     antipode = np.argmin(np.linalg.norm(sphere.X[:, None] + sphere.X[None], axis=2), axis=1)
     diameter = 2 / np.sqrt(4 * np.pi)
-    score = joint.registration_score(sphere, sphere, antipode, sphere)
+    score = spectral_icp.registration_score(sphere, sphere, antipode, sphere)
     assert score == pytest.approx(0.5 + diameter, rel=0.01)
 
 
 def test_the_distance_of_landmarks_is_added_to_the_score(sphere):
     ends = [basis(sphere.X, sphere.T, landmarks={"tip": at}) for at in (0, 1000)]
-    score = joint.registration_score(*ends, np.arange(len(sphere.X)), ends[1])
+    score = spectral_icp.registration_score(*ends, np.arange(len(sphere.X)), ends[1])
     assert score == pytest.approx(np.linalg.norm(sphere.X[0] - sphere.X[1000]))
 
 
@@ -99,16 +99,16 @@ def test_poses_are_far_apart_from_0_035_and_four_tenths_of_the_spacing_on(sphere
     gap = np.quantile(np.abs(stretched - sphere.X)[:, 2], 0.9)
     factor = share * (0.035 + 0.4 / np.sqrt(len(sphere.X))) / gap
     source = sphere.moved_to(sphere.X * [1, 1, 1 + factor])
-    assert joint.far_apart(source, sphere, np.arange(len(sphere.X))) == expected
+    assert spectral_icp.far_apart(source, sphere, np.arange(len(sphere.X))) == expected
 
 
 def test_two_candidates_within_the_margin_are_finalists_the_better_one_first():
     tried = {
-        name: joint.Candidate(score, None, None)
+        name: spectral_icp.Candidate(score, None, None)
         for name, score in {"a": 1.2, "b": 1.0, "c": 1.1, "d": 3.0}.items()
     }
-    assert joint.finalists(tried, margin=1.25) == ["b", "c"]
-    assert joint.finalists(tried, margin=1.05) == ["b"]
+    assert spectral_icp.finalists(tried, margin=1.25) == ["b", "c"]
+    assert spectral_icp.finalists(tried, margin=1.05) == ["b"]
 
 
 # ---- elastic iterations
@@ -125,8 +125,8 @@ def ends(surface, X, **changed):
     """Where the vertices of a surface end on the same surface moved to X."""
     begin = np.eye(3), np.zeros(3), np.zeros((1, 3))
     schedule = elastic.FOLLOWING._replace(**changed)
-    return joint.move(
-        surface, elastic.elastic_rounds(surface.moved_to(X), surface, begin, schedule)
+    return spectral_icp.move(
+        surface, elastic.elastic_iterations(surface.moved_to(X), surface, begin, schedule)
     )
 
 
@@ -159,13 +159,15 @@ def test_the_latent_size_is_the_nearest_whole_number_to_its_share(k, expected):
 
 
 def test_starts_that_end_within_a_hundredth_of_each_other_go_on_as_their_mean(surface, monkeypatch):
-    monkeypatch.setattr(elastic, "elastic_rounds", lambda _source, _target, start, *_, **__: start)
+    monkeypatch.setattr(
+        elastic, "elastic_iterations", lambda _source, _target, start, *_, **__: start
+    )
 
     def start(x):
         return np.eye(3), np.array([x, 0.0, 0.0]), np.zeros((1, 3))
 
     starts = {"a": start(0.0), "b": start(0.008), "c": start(0.02)}
-    met = elastic.starts_that_meet(surface, surface, starts)
+    met = elastic.converging_initialisations(surface, surface, starts)
     assert list(met) == ["a", "c"]
     assert met["a"][1] == pytest.approx([0.004, 0, 0])
 
@@ -180,7 +182,7 @@ def test_landmarks_on_a_line_do_not_decide_the_turn_about_it(surface):
     _, around = tree.query(X[ends[0]], 3)
     one, other = ({"a": ends[0], "b": ends[1], "c": third} for third in around[1:])
     bases = [replace(surface, landmarks=marks) for marks in (one, other)]
-    R, t = first_map.motion_onto(*bases)
+    R, t = initial_map.transform_onto(*bases)
     np.testing.assert_allclose(R, np.eye(3), atol=1e-6)
     np.testing.assert_allclose(t, 0, atol=1e-6)
 
@@ -189,14 +191,14 @@ def test_of_searched_maps_that_fit_alike_the_one_that_keeps_curvatures_is_taken(
     surface, monkeypatch
 ):
     C = np.eye(10)
-    monkeypatch.setattr(first_map, "maps_of_signatures", lambda *_: iter([("other", C, C)] * 2))
-    monkeypatch.setattr(first_map, "stretch", lambda *_: 0.0)
+    monkeypatch.setattr(initial_map, "maps_from_signatures", lambda *_: iter([("other", C, C)] * 2))
+    monkeypatch.setattr(initial_map, "stretch", lambda *_: 0.0)
 
     def found(search):
         scores, gaps = iter([0.10, 0.11, 0.5]), iter([0.1, 0.0, 0.0])
-        monkeypatch.setattr(joint, "registration_score", lambda *_: next(scores))
-        monkeypatch.setattr(first_map.fmap, "curvature_gap", lambda *_: next(gaps))
-        return first_map.best_first_map(surface, surface, C, search=search)[0]
+        monkeypatch.setattr(spectral_icp, "registration_score", lambda *_: next(scores))
+        monkeypatch.setattr(initial_map.fmap, "curvature_difference", lambda *_: next(gaps))
+        return initial_map.best_initial_map(surface, surface, C, search=search)[0]
 
     assert found(search=False) == "icp"
     assert found(search=True) == "other"

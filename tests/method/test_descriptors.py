@@ -105,7 +105,7 @@ def test_both_spectra_of_a_pair_are_filtered_at_the_same_times_and_energies():
 
 def test_a_shape_fits_itself_with_fewer_functions_by_either_kernel(brains):
     mesh = brains[0]
-    few = mesh.isel(mode=slice(20))
+    few = mesh.isel(eigenpair=slice(20))
     for kind in ("hks", "wks"):
         C = fmap.fmap_from_descriptors(low(few), low(mesh), k=20, kind=kind)
         assert np.linalg.norm(C - np.eye(20)) < 0.01, kind
@@ -233,7 +233,10 @@ def test_the_fit_is_where_that_of_pyfm_ends(brains, oriented):
 def test_the_fit_on_descriptors_of_a_shape_and_itself_renumbered_is_the_map_between_them(brains):
     mesh = brains[0]
     rng = np.random.default_rng(0)
-    order, sign = rng.permutation(mesh.sizes["vertex"]), rng.choice([-1, 1], mesh.sizes["mode"])
+    order, sign = (
+        rng.permutation(mesh.sizes["vertex"]),
+        rng.choice([-1, 1], mesh.sizes["eigenpair"]),
+    )
     sign[0] = 1
     other = mesh.isel(vertex=order).assign(
         corner_vertex=(mesh["corner_vertex"].dims, np.argsort(order)[mesh["corner_vertex"].values])

@@ -1,4 +1,4 @@
-"""Elastic rounds: what they minimise, what they find again, and that they stay at the truth."""
+"""Elastic iterations: what they minimise, what they find again, and that they stay at the truth."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ import scipy.linalg
 from s4a import analyse, match_pair, synthetic
 from s4a.geometry.closest import distance_to_surface
 from s4a.geometry.mesh import as_dataset, cotan_weights, stiffness, triangle_normals, vertex_normals
-from s4a.method import elastic, joint
+from s4a.method import elastic, spectral_icp
 from s4a.method.register import TORN, elastic_surfaces, mends, register_surface, tear
 from s4a.method.remesh import laplacian
 from s4a.method.shape import Basis
@@ -35,7 +35,7 @@ def starts(template, shape):
     """Two starts: the shapes as they lie, and a match that is 0.1 off everywhere."""
     near = shape.low.tree.query(template.low.tree.data)[1]
     off = shape.low.tree.query(template.low.tree.data + [0.5, 0, 0, 0, 0, 0])[1]
-    return [joint.fit_warp(shape.low, template.low, match) for match in (near, off)]
+    return [spectral_icp.fit_warp(shape.low, template.low, match) for match in (near, off)]
 
 
 def error(image, truth):
@@ -46,31 +46,32 @@ def error(image, truth):
 def ends(pair):
     template, shape, _ = pair
     return [
-        elastic.elastic_rounds(shape.full, template.low, warp) for warp in starts(template, shape)
+        elastic.elastic_iterations(shape.full, template.low, warp)
+        for warp in starts(template, shape)
     ]
 
 
 def test_they_end_nearer_to_the_truth_than_joint_rounds(pair, ends):
     template, shape, truth = pair
     near = shape.low.tree.query(template.low.tree.data)[1]
-    warp = joint.low_rounds(shape.low, template.low, near, k=60)[1]
-    warp = joint.dense_rounds(shape.full, template.full, warp)[1]
-    by_joint = error(joint.move(template.full, warp), truth)
-    by_elastic = error(joint.move(template.full, ends[0]), truth)
+    warp = spectral_icp.coarse_spectral_icp(shape.low, template.low, near, k=60)[1]
+    warp = spectral_icp.dense_spectral_icp(shape.full, template.full, warp)[1]
+    by_joint = error(spectral_icp.move(template.full, warp), truth)
+    by_elastic = error(spectral_icp.move(template.full, ends[0]), truth)
     assert by_elastic < 0.5 * by_joint
 
 
 def test_two_starts_end_at_one_place(pair, ends):
     template, shape, _ = pair
-    begin = [joint.move(template.full, warp) for warp in starts(template, shape)]
-    end = [joint.move(template.full, warp) for warp in ends]
+    begin = [spectral_icp.move(template.full, warp) for warp in starts(template, shape)]
+    end = [spectral_icp.move(template.full, warp) for warp in ends]
     assert error(*end) < 0.05 * error(*begin)
 
 
 def test_no_triangle_is_turned_over(pair, ends):
     template, _, _ = pair
     T = template.full.T
-    image = joint.move(template.full, ends[0])
+    image = spectral_icp.move(template.full, ends[0])
     around = vertex_normals(image, T)[T].mean(axis=1)
     assert (np.einsum("tx,tx->t", triangle_normals(image, T), around) > 0).all()
 
@@ -80,7 +81,7 @@ def test_a_linear_map_bends_nothing_and_stays(pair):
     A = np.array([[1.1, 0.1, 0.0], [0.0, 0.95, 0.05], [-0.1, 0.0, 1.0]])
     source = replace(template.low, X=template.low.X @ A.T + 0.1)
     begin = A, np.full(3, 0.1), np.zeros((1, 3))
-    R, t, c = elastic.elastic_rounds(source, template.low, begin)
+    R, t, c = elastic.elastic_iterations(source, template.low, begin)
     assert R == pytest.approx(A, abs=1e-6)
     assert t == pytest.approx(0.1, abs=1e-6)
     assert np.abs(c).max() < 1e-6
@@ -109,17 +110,17 @@ def test_nearest_points_lie_on_the_surface_and_no_farther_than_nearest_vertices(
     points, normals = elastic.nearest_on_surface(shape.full, X, vertex_normals(X, T))
     assert distance_to_surface(points, shape.full.X, shape.full.T).max() < 1e-9
     assert np.linalg.norm(normals, axis=1) == pytest.approx(1)
-    vertex = joint.nearest_vertices(shape.full, template.low.moved_to(X))
+    vertex = spectral_icp.nearest_vertices(shape.full, template.low.moved_to(X))
     gap = np.linalg.norm(points - X, axis=1).mean()
     assert gap < 0.9 * np.linalg.norm(shape.full.X[vertex] - X, axis=1).mean()
 
 
 @pytest.fixture(scope="module")
 def local(pair, ends):
-    """Where elastic rounds end at low resolution, and the displacement of local rounds after."""
+    """Result of elastic iterations at low resolution, then displacement of local ones."""
     template, shape, _ = pair
-    X = joint.move(template.low, ends[0])
-    return X, elastic.local_rounds(shape.full, template.low, template.diffusion, X)
+    X = spectral_icp.move(template.low, ends[0])
+    return X, elastic.local_iterations(shape.full, template.low, template.diffusion, X)
 
 
 def gap(X, shape):
@@ -130,9 +131,9 @@ def test_local_rounds_come_nearer_to_the_surface_and_stay_as_near_to_the_truth(p
     template, shape, truth = pair
     X, d = local
     assert gap(X + d, shape) < 0.8 * gap(X, shape)
-    before = joint.move(template.full, ends[0])
+    before = spectral_icp.move(template.full, ends[0])
     after = before + template.U @ d
-    # what elastic rounds have followed to its end is as smooth as the truth; the rest is noise
+    # what elastic iterations have followed to its end is as smooth as the truth; the rest is noise
     assert error(after, truth) < 1.2 * error(before, truth)
 
 
@@ -142,7 +143,7 @@ def test_local_rounds_find_a_bump_that_no_function_of_the_basis_has(pair):
     place = low.X[100]
     bump = 0.01 * np.exp(-((low.X - place) ** 2).sum(1) / (2 * 0.05**2))[:, None] * low.normals
     source = replace(low, X=low.X + bump)
-    d = elastic.local_rounds(source, low, template.diffusion, low.X)
+    d = elastic.local_iterations(source, low, template.diffusion, low.X)
     assert np.linalg.norm(d - bump, axis=1).max() < 0.4 * np.linalg.norm(bump, axis=1).max()
     coarse = low.first(10)
     left = bump - coarse.field(coarse.coefficients(bump))
@@ -152,8 +153,8 @@ def test_local_rounds_find_a_bump_that_no_function_of_the_basis_has(pair):
 def test_a_local_round_is_a_step_of_heat_diffusion(pair):
     template, shape, _ = pair
     low, time = template.low, 0.01
-    d = elastic.local_rounds(
-        shape.full, low, template.diffusion, low.X, time=(time, time), slide=1.0, rounds=1
+    d = elastic.local_iterations(
+        shape.full, low, template.diffusion, low.X, time=(time, time), slide=1.0, iterations=1
     )
     y, _ = elastic.nearest_on_surface(shape.full, low.X, vertex_normals(low.X, low.T))
     W = stiffness(*cotan_weights(low.X, low.T), len(low.X))
@@ -164,26 +165,29 @@ def test_a_local_round_is_a_step_of_heat_diffusion(pair):
 def test_on_the_surface_itself_nothing_is_left_to_do(pair):
     template, _, _ = pair
     low = template.low
-    assert np.abs(elastic.local_rounds(low, low, template.diffusion, low.X)).max() < 1e-12
+    assert np.abs(elastic.local_iterations(low, low, template.diffusion, low.X)).max() < 1e-12
 
 
 def test_where_parts_turned_on_their_own_local_rounds_alone_follow(pair, monkeypatch):
     template, shape, _ = pair
 
     def never(*_args, **_options):
-        raise AssertionError("elastic rounds begin at one motion for all")
+        raise AssertionError("elastic iterations begin at one transform for all")
 
     one = starts(template, shape)[0]
     n = len(template.low.X)
     parts = np.repeat(one[0][None], n, 0), np.repeat(one[1][None], n, 0), one[2]
-    candidate = joint.Candidate(0.0, np.zeros(n, int), parts)
-    monkeypatch.setattr("s4a.method.register.elastic_rounds", never)
+    candidate = spectral_icp.Candidate(0.0, np.zeros(n, int), parts)
+    monkeypatch.setattr("s4a.method.register.elastic_iterations", never)
     functions = shape.low.Phi, template.low.Phi
     found = {
         asked: register_surface(shape, template, {"icp+parts": candidate}, functions, elastic=asked)
         for asked in (True, False)
     }
-    assert {attrs["method"] for _, _, attrs in found.values()} == {"icp+parts", "icp+parts+local"}
+    assert {attrs["initialisation"] for _, _, attrs in found.values()} == {
+        "icp+parts",
+        "icp+parts+local",
+    }
     far = {asked: gap(end.X, shape) for asked, (_, end, _) in found.items()}
     assert far[True] < 0.8 * far[False]
 
@@ -220,7 +224,7 @@ def test_rounds_that_begin_less_stiff_are_nearer_where_the_template_is_torn(
         image = template["position"] + found["displacement"] - found["translation"]
         image = image.values @ found["rotation"].values / found["scale"].item()
         torn = np.quantile(abs(found["distortion"]), 0.99)
-        return found.attrs["method"], torn, np.linalg.norm(image - true, axis=1).mean()
+        return found.attrs["initialisation"], torn, np.linalg.norm(image - true, axis=1).mean()
 
     method, torn, error = registered()
     monkeypatch.setattr("s4a.method.register.TORN", np.inf)
@@ -256,8 +260,8 @@ def test_a_coarse_triangle_without_area_is_no_obstacle(pair):
     assert kind == "robust"
     spoilt = coarse.drop_vars(["edge_vertex", "cotan_weight"])
     spoilt = replace(template, coarse=spoilt.assign(dataset(edge_vertex=E, cotan_weight=w)))
-    start = joint.fit_warp(
-        shape.low, spoilt.low, joint.nearest_vertices(shape.low, spoilt.low.moved_to(X))
+    start = spectral_icp.fit_warp(
+        shape.low, spoilt.low, spectral_icp.nearest_vertices(shape.low, spoilt.low.moved_to(X))
     )
     surface = elastic_surfaces(shape, spoilt, {"icp": start})["icp"]
     assert np.isfinite(surface).all()
@@ -287,37 +291,41 @@ def bowl(n_vertices, height=0.0):
     T = T[(X[:, 2] < height)[T].all(axis=1)]
     used = np.unique(T)
     X, T = X[used], np.searchsorted(used, T)
-    rim = Basis(X, T, np.ones(len(X)), X).rim
-    X[np.unique(rim), 2] = height
+    boundary = Basis(X, T, np.ones(len(X)), X).boundary
+    X[np.unique(boundary), 2] = height
     return as_dataset(X, T)
 
 
 def rim_height(template, shape):
     """Mean height of the boundary of the registered template above that of the shape."""
-    warp = joint.fit_warp(shape.low, template.low, shape.low.tree.query(template.low.tree.data)[1])
-    end = elastic.elastic_rounds(shape.full, template.low_on_surface, warp)
-    top = shape.from_frame(joint.move(template.low, end))[np.unique(template.low.rim), 2]
-    return np.abs(top - shape.from_frame(shape.full.rim_tree.data)[:, 2].mean()).mean()
+    warp = spectral_icp.fit_warp(
+        shape.low, template.low, shape.low.tree.query(template.low.tree.data)[1]
+    )
+    end = elastic.elastic_iterations(shape.full, template.low_on_surface, warp)
+    top = shape.from_frame(spectral_icp.move(template.low, end))[
+        np.unique(template.low.boundary), 2
+    ]
+    return np.abs(top - shape.from_frame(shape.full.boundary_tree.data)[:, 2].mean()).mean()
 
 
 def test_boundaries_that_lie_on_each_other_end_on_each_other(monkeypatch):
     options = Options(n_coarse=800, k=40)
     template, shape = (shape_of(bowl(*how), options) for how in ((2000,), (2600, 0.05)))
     drawn = rim_height(template, shape)
-    monkeypatch.setattr(elastic, "RIM_WEIGHT", 0.0)
+    monkeypatch.setattr(elastic, "BOUNDARY_WEIGHT", 0.0)
     assert drawn < 0.5 * rim_height(template, shape)
 
 
 def test_a_shape_that_ends_elsewhere_keeps_its_boundary(monkeypatch):
     options = Options(n_coarse=800, k=40)
     template, shape = (shape_of(bowl(*how), options) for how in ((2000,), (2600, 0.2)))
-    assert elastic.rim_ahead(shape.full, template.low, template.low.X) is None
+    assert elastic.boundary_ahead(shape.full, template.low, template.low.X) is None
     kept = rim_height(template, shape)
-    monkeypatch.setattr(elastic, "RIM_WEIGHT", 0.0)
+    monkeypatch.setattr(elastic, "BOUNDARY_WEIGHT", 0.0)
     assert kept == rim_height(template, shape)
     closed = shape_of(synthetic.ellipsoid(1000), options)
-    assert elastic.rim_ahead(closed.full, template.low, template.low.X) is None
-    assert elastic.rim_ahead(template.full, closed.low, closed.low.X) is None
+    assert elastic.boundary_ahead(closed.full, template.low, template.low.X) is None
+    assert elastic.boundary_ahead(template.full, closed.low, closed.low.X) is None
 
 
 @pytest.mark.parametrize("below", [-1e-11, -1e-7])

@@ -11,7 +11,7 @@ import scipy.linalg
 
 from s4a import coarsen, spectrum, synthetic
 from s4a.method import latent, median, network
-from s4a.method.first_map import map_after_motion
+from s4a.method.initial_map import map_after_alignment
 from s4a.method.shape import Basis, Shape
 
 
@@ -142,7 +142,7 @@ def first(shapes):
     low = [Shape(coarse=mesh).low for mesh in shapes]
     still = (np.eye(3), np.zeros(3))
     return np.stack(
-        [map_after_motion(low[i], low[j], still, k_init=12).C for i, j in complete(3).T]
+        [map_after_alignment(low[i], low[j], still, k_init=12).C for i, j in complete(3).T]
     )
 
 
@@ -174,11 +174,11 @@ def test_consistent_zoomout_does_not_depend_on_the_workers_or_on_what_is_held(
 def test_wide_rounds_look_between_the_samples_near_the_one_that_is_found(
     shapes, first, monkeypatch
 ):
-    samples = [Shape(coarse=shape).low.spread_vertices(150) for shape in shapes]  # of 600
+    samples = [Shape(coarse=shape).low.sample_vertices_of(150) for shape in shapes]  # of 600
 
     def maps(wide, n_around=latent.N_AROUND):
         monkeypatch.setattr(latent, "N_AROUND", n_around)
-        return zoomed(shapes, first, samples=samples, wide=wide)[0]
+        return zoomed(shapes, first, samples=samples, dense_iterations=wide)[0]
 
     of_all = zoomed(shapes, first)[0]
     far = {wide: np.linalg.norm(maps(wide) - of_all) for wide in (0, 2)}

@@ -71,7 +71,7 @@ def test_the_conformal_difference_of_the_limit_shape_is_the_identity_but_for_the
 def test_the_median_is_the_nearest_and_a_stretched_shape_the_farthest():
     found = median.median_shape(collection(three_shapes()), np.stack([EIGENVALUES] * 3), norm="h1")
     assert found.attrs == {"made": "by hand", "median": "same", "norm": "h1"}
-    assert found["distance_to_median"].idxmax().item() == "stretched"
+    assert found["distance_to_limit"].idxmax().item() == "stretched"
     assert found["latent_basis"].shape == (3, 3, 3)
     assert found["area_variance_ratio"].values[0] == pytest.approx(1)
 

@@ -1,4 +1,4 @@
-"""The network of maps (3.4): which pairs, first maps, cycles."""
+"""The network of maps (3.4): which pairs, initial maps, cycles."""
 
 import itertools
 from dataclasses import replace
@@ -8,7 +8,7 @@ import pytest
 from scipy.sparse.csgraph import connected_components
 
 from s4a.method import network
-from s4a.method.first_map import map_after_motion
+from s4a.method.initial_map import map_after_alignment
 from s4a.method.shape import Shape
 
 
@@ -130,7 +130,7 @@ def low(low_brain):
 @pytest.mark.parametrize("init", ["dense", "landmarks"])
 def test_the_first_map_of_a_shape_to_itself_moved_is_the_identity(low, init):
     R, t = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 2, 3])
-    first = map_after_motion(low, replace(low, X=low.X @ R.T + t), (R, t), k_init=20, init=init)
+    first = map_after_alignment(low, replace(low, X=low.X @ R.T + t), (R, t), k_init=20, init=init)
     assert pytest.approx(np.eye(20), abs=1e-9) == first.C
 
 

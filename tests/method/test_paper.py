@@ -23,14 +23,14 @@ from s4a.method.shape import Shape
 
 @pytest.fixture(scope="module")
 def paper(brains):
-    """The study of the paper, eq. 7, with the rounds of Consistent ZoomOut."""
-    return s4a.analyse(brains, preset="paper", keep_rounds=True, **OPTIONS)
+    """The study of the paper, eq. 7, with the iterations of Consistent ZoomOut."""
+    return s4a.analyse(brains, preset="paper", keep_iterations=True, **OPTIONS)
 
 
 @pytest.fixture(scope="module")
 def standard(brains):
     """The study of the paper by the standard way, eq. 3 and 4, and the size taken out."""
-    return s4a.analyse(brains, preset="paper", how="standard", scale=True, **OPTIONS)
+    return s4a.analyse(brains, preset="paper", dense_match="fmap", remove_size=True, **OPTIONS)
 
 
 def others(study):
@@ -101,11 +101,11 @@ def test_the_step_ahead_is_one_match_and_back(paper):
 
 
 def test_every_round_of_consistent_zoomout_is_equation_3_and_a_larger_map(paper):
-    rounds = list(paper["rounds"].children.values())
-    assert [node.sizes["mode"] for node in rounds] == [10, 15, 20, 24]
+    iterations = list(paper["iterations"].children.values())
+    assert [node.sizes["eigenpair"] for node in iterations] == [10, 15, 20, 24]
     network = paper["network"]
-    for now, following in itertools.pairwise(rounds):
-        size, larger = now.sizes["mode"], following.sizes["mode"]
+    for now, following in itertools.pairwise(iterations):
+        size, larger = now.sizes["eigenpair"], following.sizes["eigenpair"]
         for p, (i, j) in enumerate(
             zip(network["source"].values, network["target"].values, strict=True)
         ):
@@ -114,8 +114,8 @@ def test_every_round_of_consistent_zoomout_is_equation_3_and_a_larger_map(paper)
             match = cdist(Psi[:, :size] @ Y_j, Phi[:, :size] @ Y_i).argmin(1)  # eq. 3
             C = Psi[:, :larger].T @ A @ Phi[match, :larger]
             assert following["fmap"].values[p] == pytest.approx(C, abs=1e-3)
-    assert np.array_equal(rounds[-1]["fmap"], network["fmap"])
-    assert np.array_equal(rounds[-1]["latent_basis"], paper["latent"]["latent_basis"])
+    assert np.array_equal(iterations[-1]["fmap"], network["fmap"])
+    assert np.array_equal(iterations[-1]["latent_basis"], paper["latent"]["latent_basis"])
 
 
 def test_the_latent_bases_span_the_least_inconsistency(paper):
@@ -143,7 +143,7 @@ def test_the_median_has_the_least_energy_of_equation_5(paper):
     for Y in node["latent_basis"].values:
         D = Y.T @ Y
         energy.append(np.linalg.norm(((D - np.eye(len(D))) * inverse)[1:, 1:]))
-    assert node["distance_to_median"].values == pytest.approx(energy)
+    assert node["distance_to_limit"].values == pytest.approx(energy)
     assert node.attrs["median"] == node["shape"].values[np.argmin(energy)]
 
 

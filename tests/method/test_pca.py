@@ -1,4 +1,4 @@
-"""Principal modes (6.1): planted modes come back with their variances.
+"""Principal modes (6.1): simulated modes come back with their variances.
 
 Every shape is made again from its scores.
 """
@@ -17,7 +17,7 @@ DEVIATIONS = np.array([3.0, 1.5, 0.5])
 
 
 @pytest.fixture(scope="module")
-def planted():
+def simulated():
     """Ten displacement fields of three area-orthonormal modes with uncorrelated scores.
 
     And a mean.
@@ -39,27 +39,27 @@ def planted():
 
 
 @pytest.fixture(scope="module")
-def modes(planted):
-    return pca.pca(planted[0], planted[1])
+def modes(simulated):
+    return pca.pca(simulated[0], simulated[1])
 
 
-def test_planted_modes_come_back_with_their_standard_deviations_and_shares(planted, modes):
+def test_planted_modes_come_back_with_their_standard_deviations_and_shares(simulated, modes):
     variance = DEVIATIONS**2
     assert modes["standard_deviation"].values[:3] == pytest.approx(DEVIATIONS, rel=1e-5)
     assert modes["explained_variance_ratio"].values[:3] == pytest.approx(
         variance / variance.sum(), rel=1e-5
     )
-    assert modes["mean_displacement"].values == pytest.approx(planted[4], abs=1e-5)
+    assert modes["mean_displacement"].values == pytest.approx(simulated[4], abs=1e-5)
 
 
-def test_planted_scores_come_back(planted, modes):
-    score, found = planted[3], modes["score"].values[:, :3]
+def test_planted_scores_come_back(simulated, modes):
+    score, found = simulated[3], modes["score"].values[:, :3]
     assert np.abs(np.corrcoef(score.T, found.T)[:3, 3:]) == pytest.approx(np.eye(3), abs=1e-5)
     assert np.abs(found) == pytest.approx(np.abs(score), abs=1e-4)
 
 
-def test_a_deformation_is_the_mode_times_its_standard_deviation(planted, modes):
-    _, area, mode, _, _ = planted
+def test_a_deformation_is_the_mode_times_its_standard_deviation(simulated, modes):
+    _, area, mode, _, _ = simulated
     deformation = modes["deformation"].values[:3].astype(float)
     w = area / area.sum()
     assert np.sqrt(np.einsum("cnx,cnx,n->c", deformation, deformation, w)) == pytest.approx(
@@ -80,8 +80,8 @@ def study_of(registration, modes):
     return xr.DataTree.from_dict({"registration": registration, "pca": modes})
 
 
-def test_every_shape_is_made_again_from_its_scores(planted, modes):
-    registration = planted[0]
+def test_every_shape_is_made_again_from_its_scores(simulated, modes):
+    registration = simulated[0]
     study = study_of(registration, modes)
     for shape in registration["shape"].values:
         made = synthesize(study, modes["score"].sel(shape=shape))
@@ -90,19 +90,19 @@ def test_every_shape_is_made_again_from_its_scores(planted, modes):
     assert np.array_equal(made["corner_vertex"], registration["corner_vertex"])
 
 
-def test_scores_of_the_first_components_are_enough(planted, modes):
-    study = study_of(planted[0], modes)
-    mean = planted[0]["position"].values + planted[4]
+def test_scores_of_the_first_components_are_enough(simulated, modes):
+    study = study_of(simulated[0], modes)
+    mean = simulated[0]["position"].values + simulated[4]
     assert synthesize(study, [0.0])["position"].values == pytest.approx(mean, abs=1e-5)
     one = synthesize(study, [2.0])["position"].values - mean
     assert one == pytest.approx(2 * modes["deformation"].values[0], abs=1e-5)
 
 
-def test_too_many_scores_are_refused(planted, modes):
+def test_too_many_scores_are_refused(simulated, modes):
     with pytest.raises(
         ValueError, match=f"at most {modes.sizes['component']} numbers, found shape"
     ):
-        synthesize(study_of(planted[0], modes), np.zeros(modes.sizes["component"] + 1))
+        synthesize(study_of(simulated[0], modes), np.zeros(modes.sizes["component"] + 1))
 
 
 def test_components_are_at_most_one_less_than_shapes():
@@ -123,10 +123,10 @@ def test_the_unit_of_the_area_does_not_matter_and_that_of_the_input_scales():
     assert two[4] == pytest.approx(one[4])
 
 
-def test_the_order_of_the_shapes_only_orders_the_scores(planted):
+def test_the_order_of_the_shapes_only_orders_the_scores(simulated):
     order = np.random.default_rng(3).permutation(10)
     one, two = (
-        pca.gram_pca(planted[0]["displacement"].values[i], planted[1])
+        pca.gram_pca(simulated[0]["displacement"].values[i], simulated[1])
         for i in (np.arange(10), order)
     )
     assert two[3][:, :3] == pytest.approx(one[3][order, :3], abs=1e-4)
@@ -150,25 +150,25 @@ def test_low_vertices_are_those_that_u_weighs_most():
     assert pca.low_vertices(coarse).tolist() == [2, 1]
 
 
-def test_two_shapes_are_refused_with_the_reason(planted):
+def test_two_shapes_are_refused_with_the_reason(simulated):
     with pytest.raises(ValueError, match="at least 3 shapes, found 2"):
-        pca.pca(planted[0].isel(shape=[0, 1]), planted[1])
+        pca.pca(simulated[0].isel(shape=[0, 1]), simulated[1])
 
 
 @pytest.mark.parametrize("shift", [0.0, 5.0])
-def test_identical_shapes_are_refused_with_the_reason(planted, shift):
-    same = planted[0].assign(displacement=xr.full_like(planted[0]["displacement"], shift))
+def test_identical_shapes_are_refused_with_the_reason(simulated, shift):
+    same = simulated[0].assign(displacement=xr.full_like(simulated[0]["displacement"], shift))
     with pytest.raises(ValueError, match="all displacements are equal"):
-        pca.pca(same, planted[1])
+        pca.pca(same, simulated[1])
 
 
-def test_a_registration_without_displacement_is_refused_by_name(planted):
+def test_a_registration_without_displacement_is_refused_by_name(simulated):
     with pytest.raises(ValueError, match="lacks displacement"):
-        pca.pca(planted[0].drop_vars("displacement"), planted[1])
+        pca.pca(simulated[0].drop_vars("displacement"), simulated[1])
 
 
-def test_modes_by_blocks_of_vertices_are_those_of_the_whole(planted, monkeypatch):
-    registration, area, *_ = planted
+def test_modes_by_blocks_of_vertices_are_those_of_the_whole(simulated, monkeypatch):
+    registration, area, *_ = simulated
     d = registration["displacement"].values
     whole, K = pca.gram_pca(d, area), pca.gram(d, area)
     monkeypatch.setattr(pca, "BLOCK", 10 * 3 * 37)  # 800 vertices are 21 blocks and a part of one

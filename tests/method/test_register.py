@@ -1,6 +1,6 @@
 """Registration at full resolution (eq. 4, 6, 7).
 
-Itself, a planted deformation, invariance, the way back.
+Itself, a simulated deformation, invariance, the way back.
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ from s4a.method.register import confidence
 from s4a.method.shape import Shape
 
 OPTIONS = {"n_coarse": 2000, "k": 60}
-STILL = np.eye(3), np.zeros(3)  # no motion
+STILL = np.eye(3), np.zeros(3)  # no transform
 
 
 def bumps(X, size):
@@ -91,7 +91,7 @@ def test_the_displacement_brings_the_template_onto_the_matched_vertices(pair, te
 
 def test_the_paper_way_finds_a_correspondence_too_and_says_so(template, deformed, size):
     found = match_pair(deformed, template, refine="intrinsic", init="landmarks", **OPTIONS)
-    assert found.attrs["method"] == "intrinsic"
+    assert found.attrs["initialisation"] == "intrinsic"
     assert 0 < found.attrs["compared_share"] < 1
     assert 0 < found.attrs["certified_share"] <= 1
     gap = deformed["position"].values[found["match"].values] - deformed["position"].values
@@ -201,7 +201,7 @@ def test_size_can_be_taken_out_of_the_displacement(shapes):
     start = {"intrinsic": cKDTree(source.low.X).query(target.low.X)[1]}
     functions = source.low.Phi, target.low.Phi
     with_size = register.register(source, target, start, functions, STILL, k=30)
-    without = register.register(source, target, start, functions, STILL, k=30, scale=True)
+    without = register.register(source, target, start, functions, STILL, k=30, remove_size=True)
     assert without["scale"].item() == pytest.approx(1 / 1.2, rel=1e-3)
     radius = np.linalg.norm(X - X.mean(0), axis=1).mean()
     assert np.linalg.norm(without["displacement"].values, axis=1).mean() < 0.005 * radius
@@ -213,7 +213,10 @@ def test_size_can_be_taken_out_of_the_displacement(shapes):
 @pytest.mark.parametrize(
     "options, message",
     [
-        ({"refine": "both"}, "refine must be one of 'elastic', 'joint', 'intrinsic'; found 'both'"),
+        (
+            {"refine": "both"},
+            "refine must be one of 'elastic', 'spectral_icp', 'intrinsic'; found 'both'",
+        ),
         ({"init": "random"}, "init must be one of 'dense', 'landmarks'; found 'random'"),
         ({"k_init": 0}, "k_init must be an integer of at least 4; found 0"),
         ({"k": 10}, "k must be at least k_init = 20; found 10"),

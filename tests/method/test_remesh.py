@@ -192,8 +192,8 @@ def test_boundaries_are_kept_where_they_are():
     coarse = coarsen(as_dataset(X, T), n_coarse=500)
     assert_manifold(coarse, euler=0)
     assert coarse.attrs["boundary_loops"] == coarse.attrs["boundary_loops_original"] == 2
-    rim = boundary_vertices(coarse["corner_vertex"].values)
-    assert np.isin(coarse["sample_vertex"].values[rim], boundary_vertices(T)).mean() > 0.95
+    boundary = boundary_vertices(coarse["corner_vertex"].values)
+    assert np.isin(coarse["sample_vertex"].values[boundary], boundary_vertices(T)).mean() > 0.95
     Y, C = as_arrays(coarse)
     assert abs(vertex_areas(Y, C).sum() / vertex_areas(X, T).sum() - 1) < 0.02
 

@@ -7,7 +7,7 @@ import s4a
 from s4a import coarsen, reconstruct, spectrum, synthetic
 from s4a.geometry.mesh import as_dataset, cotan_weights, vertex_areas
 from s4a.method import spectral
-from s4a.method.lift import low_resolution
+from s4a.method.refined_eigenfunctions import low_resolution
 from s4a.schema import dataset
 
 SPHERE = np.repeat([0.0, 2.0, 6.0, 12.0], [1, 3, 5, 7]) * 4 * np.pi  # l (l + 1), for unit area
@@ -140,7 +140,7 @@ def pieces(*places, n=150):
     return as_dataset(np.concatenate(X), np.concatenate([T + i * n for i in range(len(places))]))
 
 
-@pytest.mark.parametrize("options", [{}, {"method": "scalable"}, {"lift": True}])
+@pytest.mark.parametrize("options", [{}, {"method": "scalable"}, {"refined_eigenfunctions": True}])
 @pytest.mark.parametrize("k", [2, 10])
 def test_the_first_function_of_several_pieces_is_the_constant_whatever_the_space(options, k):
     low = low_resolution(pieces(0, 4, 9), n_coarse=300, k=k, **options)
@@ -158,7 +158,7 @@ def test_landmark_maps_of_shapes_of_several_pieces_carry_constants_to_constants(
         n: spectral.unit_area(mesh) @ mesh["eigenfunction"].values[:, :6]
         for n, mesh in coarse.items()
     }
-    network = s4a.build_network(coarse, k_init=6, init="landmarks", ahead=False)
+    network = s4a.build_network(coarse, k_init=6, init="landmarks", initial_refinement=False)
     for i, j, C in zip(
         *(network[name].values for name in ("source", "target", "fmap_initial")), strict=True
     ):
@@ -167,7 +167,7 @@ def test_landmark_maps_of_shapes_of_several_pieces_carry_constants_to_constants(
 
 def test_a_mesh_with_fewer_vertices_than_k_gives_what_it_can_and_says_so(caplog):
     mesh = spectrum(prepared(*arrays(synthetic.sphere(30))), k=100)
-    assert mesh.sizes["mode"] == 28
+    assert mesh.sizes["eigenpair"] == 28
     assert mesh.attrs["k_reduced_from"] == 100
     assert "28" in caplog.text
 

@@ -58,8 +58,8 @@ def test_a_shape_registered_alone_ends_where_the_analysis_has_it(study):
     [
         {},
         {"preset": "paper"},
-        {"refine": "intrinsic", "area_weighted": False, "n_projected": 0, "how": "standard"},
-        {"scale": True, "refine": "joint", "template": "brain_04"},
+        {"refine": "intrinsic", "area_weighted": False, "n_projected": 0, "dense_match": "fmap"},
+        {"remove_size": True, "refine": "spectral_icp", "template": "brain_04"},
     ],
 )
 def test_a_shape_is_registered_alone_as_its_study_did_it_whatever_the_options(options):
@@ -73,7 +73,7 @@ def test_a_shape_is_registered_alone_as_its_study_did_it_whatever_the_options(op
 
 def test_options_that_are_given_win_over_those_of_the_study(study):
     there = s4a.analyse(s4a.synthetic.brains(4, 1000), **OPTIONS, preset="paper")
-    own = {"refine": "intrinsic", "parts": False, "alignment": "icp", "how": "ours"}
+    own = {"refine": "intrinsic", "articulated": False, "alignment": "icp", "dense_match": "latent"}
     name, median = "brain_02", there["latent"].attrs["median"]
     given = own | {"area_weighted": False, "n_projected": 0}
     tree = xr.DataTree.from_dict(
@@ -83,17 +83,21 @@ def test_options_that_are_given_win_over_those_of_the_study(study):
     of_study = there["registration"]["displacement"].sel(shape=name)
     np.testing.assert_array_equal(alone["displacement"], of_study)
     other = s4a.register_shape(there, name, refine="elastic")
-    assert other.attrs["method"].endswith("elastic")
+    assert other.attrs["initialisation"].endswith("elastic")
 
 
 def test_words_that_options_cannot_be_are_refused_with_those_that_they_can(study, coarse):
     for name in ("brain_02", study["latent"].attrs["median"]):
-        with pytest.raises(ValueError, match="refine must be one of 'elastic', 'joint', 'intrins"):
+        with pytest.raises(
+            ValueError, match="refine must be one of 'elastic', 'spectral_icp', 'intrins"
+        ):
             s4a.register_shape(study, name, refine="intrinsc")
         with pytest.raises(ValueError, match="alignment must be one of 'fitted', 'icp'; found"):
             s4a.register_shape(study, name, alignment="ICP")
-        with pytest.raises(ValueError, match="how must be one of 'ours', 'standard'; found 'our'"):
-            s4a.register_shape(study, name, how="our")
+        with pytest.raises(
+            ValueError, match="dense_match must be one of 'latent', 'fmap'; found 'our'"
+        ):
+            s4a.register_shape(study, name, dense_match="our")
         with pytest.raises(TypeError, match="unexpected options projected; those of a registrat"):
             s4a.register_shape(study, name, projected=3)
     with pytest.raises(ValueError, match="init must be one of 'dense', 'landmarks'; found"):
@@ -107,7 +111,7 @@ def test_words_that_options_cannot_be_are_refused_with_those_that_they_can(study
 
 def test_a_latent_space_as_large_as_maps_that_are_reduced_is_reduced_with_them():
     study = s4a.analyse(s4a.synthetic.brains(3, 300), n_coarse=100, n_latent=100)
-    k = study["network"].sizes["mode_source"]
+    k = study["network"].sizes["eigenpair_source"]
     assert k < 100
     assert study["latent"]["latent_basis"].shape == (3, k, k)
 
@@ -117,9 +121,9 @@ def test_a_latent_space_as_large_as_maps_that_are_reduced_is_reduced_with_them()
     [
         ({"step": 0}, "step must be an integer of at least 1; found 0"),
         ({"step": -1}, "step must be an integer of at least 1; found -1"),
-        ({"k": 6}, "k must be at least 10, as first maps; found 6"),
+        ({"k": 6}, "k must be at least 10, as initial maps; found 6"),
         ({"k": 12, "n_latent": 13}, "n_latent must be at most k = 12; found 13"),
-        ({"n_spread": 47}, "need 48 spread vertices or more; found 47: give n_spread=48"),
+        ({"n_samples": 47}, "need 48 spread vertices or more; found 47: give n_samples=48"),
     ],
 )
 def test_sizes_that_do_not_fit_each_other_are_refused_by_name(study, coarse, options, message):
@@ -130,45 +134,45 @@ def test_sizes_that_do_not_fit_each_other_are_refused_by_name(study, coarse, opt
 def test_as_few_spread_vertices_as_are_allowed_refine_identical_shapes_to_the_identity(coarse):
     same = dict.fromkeys("abc", coarse["brain_01"])
     first = s4a.build_network(same, k_init=10)
-    for n_spread in (48, 0):
-        maps = s4a.refine_network(same, first, k=24, n_spread=n_spread)["network/fmap"].values
+    for n_samples in (48, 0):
+        maps = s4a.refine_network(same, first, k=24, n_samples=n_samples)["network/fmap"].values
         assert np.abs(maps - np.eye(24)).max() < 1e-5
 
 
 def test_spread_vertices_are_enough_where_they_are_all_of_a_small_mesh(coarse):
-    small = {name: mesh.isel(mode=slice(12)) for name, mesh in coarse.items()}
+    small = {name: mesh.isel(eigenpair=slice(12)) for name, mesh in coarse.items()}
     first = s4a.build_network(small, k_init=10)
-    assert s4a.refine_network(small, first, k=100, n_spread=50)["network/fmap"].shape[1:] == (
+    assert s4a.refine_network(small, first, k=100, n_samples=50)["network/fmap"].shape[1:] == (
         12,
         12,
     )
     every = max(mesh.sizes["vertex"] for mesh in coarse.values())
-    k = min(100, *(mesh.sizes["mode"] for mesh in coarse.values()))
-    s4a.refine_network(coarse, first, k=k, n_spread=every)
+    k = min(100, *(mesh.sizes["eigenpair"] for mesh in coarse.values()))
+    s4a.refine_network(coarse, first, k=k, n_samples=every)
 
 
 def test_options_refuse_spread_vertices_too_few_for_k_and_no_preset_of_their_own():
     with pytest.raises(
-        ValueError, match="n_spread must be 0, for all vertices, or at least 200, f"
+        ValueError, match="n_samples must be 0, for all vertices, or at least 200, f"
     ):
-        Options(n_spread=150)
-    for given in ({"n_spread": 200}, {"n_spread": 0}, {"n_coarse": 150, "n_spread": 150}):
-        assert Options(**given).n_spread == given["n_spread"]
+        Options(n_samples=150)
+    for given in ({"n_samples": 200}, {"n_samples": 0}, {"n_coarse": 150, "n_samples": 150}):
+        assert Options(**given).n_samples == given["n_samples"]
     for preset in (None, "paper", "fast"):
         assert Options(preset=preset, k=600).k == 600
 
 
 def test_the_template_is_registered_to_itself_by_definition(study):
     median = study["latent"].attrs["median"]
-    assert s4a.register_shape(study, median).attrs["method"] == "template"
+    assert s4a.register_shape(study, median).attrs["initialisation"] == "template"
 
 
 def test_a_mesh_aligned_to_itself_stays(coarse):
     mesh = coarse["brain_01"]
-    motion = s4a.align_pair(mesh, mesh)
-    assert motion["rotation"].values == pytest.approx(np.eye(3), abs=1e-9)
-    assert motion["translation"].values == pytest.approx(np.zeros(3), abs=1e-9)
-    assert motion.attrs["residual"] == pytest.approx(0, abs=1e-9)
+    transform = s4a.align_pair(mesh, mesh)
+    assert transform["rotation"].values == pytest.approx(np.eye(3), abs=1e-9)
+    assert transform["translation"].values == pytest.approx(np.zeros(3), abs=1e-9)
+    assert transform.attrs["residual"] == pytest.approx(0, abs=1e-9)
 
 
 def test_what_lacks_is_named(study, coarse):
@@ -177,4 +181,4 @@ def test_what_lacks_is_named(study, coarse):
     with pytest.raises(ValueError, match="/original/nobody is needed; this one has none"):
         s4a.latent_match(study, "nobody", "brain_01")
     with pytest.raises(ValueError, match="how must be"):
-        s4a.latent_match(study, "brain_01", "brain_02", how="both")
+        s4a.latent_match(study, "brain_01", "brain_02", dense_match="both")

@@ -204,7 +204,7 @@ def test_the_study_that_binder_makes_is_compressed_exact_to_four_digits_and_has_
     tmp_path, monkeypatch
 ):
     prepare = script(BINDER / "prepare.py")
-    options = {"n_coarse": 100, "n_pairs": 3, "k": 20, "keep_doubtful": True}
+    options = {"n_coarse": 100, "n_pairs": 3, "k": 20, "include_flagged": True}
     whole = tmp_path / "whole"
     (tmp_path / "new").mkdir()
     exact = s4a.analyse(s4a.synthetic.brains(3, 300), **options, store=whole)

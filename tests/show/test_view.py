@@ -65,7 +65,7 @@ def make_study(n=366):
     )
     named = {"shape": names}
     tree["latent"] = dataset(
-        {"median": "shape-2"}, distance_to_median=np.abs(score[:, 0]), area_score=score
+        {"median": "shape-2"}, distance_to_limit=np.abs(score[:, 0]), area_score=score
     ).assign_coords(named)
     tree["registration"] = dataset(
         {"template": "shape-2"},
@@ -87,7 +87,7 @@ def make_study(n=366):
         explained_variance_ratio_low=[0.6, 0.25, 0.15],
     ).assign_coords(named)
     tree["report"] = dataset(
-        {"n_coarse": 6000, "k": 100, "refine": "joint", "made_from": 7 * f"{'0' * 32} "},
+        {"n_coarse": 6000, "k": 100, "refine": "spectral_icp", "made_from": 7 * f"{'0' * 32} "},
         status=["ok"] * 5 + ["repaired", "excluded"],
         reason=[""] * 5
         + ["3 duplicate triangles removed", "not a surface: <script>alert('&')</script>"],
@@ -212,9 +212,9 @@ def test_warnings_stand_at_the_top_and_every_shape_leads_to_its_picture(study):
     kinds = ["", "mirrored", "", "", "", "", ""]
     part["report"] = xr.DataTree(
         report.assign(
-            doubtful_kinds=("shape", kinds),
+            flag_kinds=("shape", kinds),
             warning_kinds=("shape", ["", "", "", "size", "", "", ""]),
-            status=("shape", ["ok", "doubtful", "ok", "ok", "ok", "repaired", "excluded"]),
+            status=("shape", ["ok", "flagged", "ok", "ok", "ok", "repaired", "excluded"]),
         )
     )
     text = page.study_html(part)
@@ -238,7 +238,7 @@ def test_text_of_the_study_is_escaped(html):
 
 
 def test_the_page_says_what_the_study_says(html):
-    summary = "7 shapes, 1 repaired, 0 doubtful, 1 excluded; median shape-2; template shape-2; "
+    summary = "7 shapes, 1 repaired, 0 flagged, 1 excluded; median shape-2; template shape-2; "
     summary += "the first 3 components hold 100%"
     for text in (
         summary,

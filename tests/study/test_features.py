@@ -1,4 +1,4 @@
-"""Fields that a user gives guide first maps and registration, as landmarks do."""
+"""Fields that a user gives guide initial maps and registration, as landmarks do."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from small import OPTIONS
 
 import s4a
 from s4a.geometry.mesh import as_arrays, as_dataset
-from s4a.method.lift import low_resolution
+from s4a.method.refined_eigenfunctions import low_resolution
 from s4a.method.shape import Shape, common_fields
 
 
@@ -130,5 +130,5 @@ def test_a_field_that_no_file_has_is_an_error(files):
 
 
 def test_features_of_label_volumes_are_refused():
-    with pytest.raises(ValueError, match="leave out one of both"):
+    with pytest.raises(ValueError, match="leave out one of the two"):
         s4a.analyse("nowhere", features="sulc", label=1)

@@ -70,8 +70,8 @@ def test_a_new_shape_is_close_to_what_a_full_recomputation_gives(meshes, study, 
     assert inserted["pca"]["score"].values[0, :2] == pytest.approx(again[0, :2], abs=0.25)
     gap = np.linalg.norm(inserted["registration"]["displacement"].values - d, axis=2)[0]
     assert gap.mean() < 0.006 * np.sqrt(area.sum())
-    assert inserted["latent"]["distance_to_median"].item() == pytest.approx(
-        full["latent"]["distance_to_median"].sel(shape="brain_07").item(), rel=0.6
+    assert inserted["latent"]["distance_to_limit"].item() == pytest.approx(
+        full["latent"]["distance_to_limit"].sel(shape="brain_07").item(), rel=0.6
     )
 
 
@@ -87,7 +87,7 @@ def test_the_study_stays_as_it_is_and_the_result_does_not_depend_on_other_new_sh
     for name, values in inserted["registration"].to_dataset().isel(shape=0).data_vars.items():
         np.testing.assert_array_equal(one[name].values, values.values, err_msg=name)
     assert (both["pca"]["score"].sel(shape="brain_07") == inserted["pca"]["score"][0]).all()
-    for name in ("latent_basis", "area_difference", "conformal_difference", "distance_to_median"):
+    for name in ("latent_basis", "area_difference", "conformal_difference", "distance_to_limit"):
         of_both = both["latent"][name].sel(shape="brain_07").values
         np.testing.assert_array_equal(of_both, inserted["latent"][name].values[0], err_msg=name)
 
@@ -96,7 +96,7 @@ def test_a_shape_of_the_study_gets_its_own_scores_back(study, meshes):
     template = study["registration"].attrs["template"]
     name = next(n for n in meshes if n not in (template, "brain_07"))
     found = insert(study, {"copy": meshes[name]})
-    assert found["report"]["doubtful_kinds"].item() == "duplicate"
+    assert found["report"]["flag_kinds"].item() == "duplicate"
     assert found["pca"]["score"].values[0, :2] == pytest.approx(
         study["pca"]["score"].sel(shape=name).values[:2], abs=0.25
     )

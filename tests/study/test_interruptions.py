@@ -19,13 +19,13 @@ import pytest
 
 from s4a import analyse, cli, open_study, synthetic
 from s4a.schema import dataset
-from s4a.study import doubts, netcdf, pipeline, processes, sources, store, tasks
+from s4a.study import netcdf, pipeline, processes, quality_control, sources, store, tasks
 from s4a.study.progress import FILE
 from s4a.study.runner import Run
 
-# of meshes as coarse as these, some registrations are doubtful; so there are modes all the same
-OPTIONS = {"n_coarse": 150, "k_init": 8, "k": 12, "keep_doubtful": True}
-FLAGS = "--n-coarse 150 --k-init 8 --k 12 --keep-doubtful --n-jobs 1".split()
+# of meshes as coarse as these, some registrations are flagged; so there are modes all the same
+OPTIONS = {"n_coarse": 150, "k_init": 8, "k": 12, "include_flagged": True}
+FLAGS = "--n-coarse 150 --k-init 8 --k 12 --include-flagged --n-jobs 1".split()
 # a task that holds Python's lock in native code
 RUN = """
 import ctypes, signal, sys
@@ -196,10 +196,10 @@ sys.exit(code)
 """
 KILLS = [
     "original/brain_02.nc",  # read and clean
-    "network/look_brain_02.nc",  # compare
+    "network/comparison_brain_02.nc",  # compare
     "coarse/brain_02.nc",  # remesh and spectrum
-    "network/motion_brain_02.nc",  # align
-    "network/first_000.nc",  # first maps
+    "network/alignment_brain_02.nc",  # align
+    "network/initial_000.nc",  # initial maps
     "network.nc",  # consistent ZoomOut and median
     "latent.nc",
     "registration.nc",  # registration
@@ -381,7 +381,7 @@ def assert_equal_but_paths(folder, whole):
 def test_an_error_in_the_task_of_one_shape_costs_that_shape_and_is_told(
     files, tmp_path, monkeypatch, capsys, error, stage
 ):
-    module = {"compare_shape": doubts}.get(stage, pipeline)
+    module = {"compare_shape": quality_control}.get(stage, pipeline)
     task = getattr(module, stage)
 
     def wrong(*arguments):
@@ -476,7 +476,7 @@ def crash(folder, name, *arguments, task=pipeline.register_shape):
 if __name__ == "__main__":
     pipeline.remesh_shape, pipeline.register_shape = killed_once, crash
     options = {"n_coarse": 150, "k_init": 8, "k": 12, "n_jobs": 2, "intersections": False}
-    options |= {"template": "brain_01", "keep_doubtful": True}
+    options |= {"template": "brain_01", "include_flagged": True}
     analyse(sys.argv[2:], store=sys.argv[1], **options)
 """
 

@@ -24,11 +24,11 @@ from s4a import (
 from s4a.geometry.closest import interpolate
 from s4a.geometry.mesh import as_arrays
 from s4a.input.annotations import write_landmarks
+from s4a.input.chirality import mirror_image
 from s4a.input.files import files_named
-from s4a.input.hands import mirror_image
 from s4a.input.landmarks import SUFFIXES
-from s4a.method.first_map import motion_onto
-from s4a.method.lift import low_resolution
+from s4a.method.initial_map import transform_onto
+from s4a.method.refined_eigenfunctions import low_resolution
 from s4a.method.shape import Shape
 from s4a.schema import dataset
 
@@ -103,7 +103,7 @@ def test_three_landmarks_say_how_a_shape_lies_that_its_form_does_not_tell(n):
         Shape(coarse=low_resolution(with_landmarks(mesh, points(P)), n_coarse=300, k=10)).low
         for P in (there, there @ turn.T)
     ]
-    R, _ = motion_onto(*lows)
+    R, _ = transform_onto(*lows)
     # an ellipsoid lies on itself after each half turn; as it lies, by its form alone
     assert np.allclose(R, turn if n == 3 else np.eye(3), atol=0.15)
 
@@ -114,7 +114,7 @@ def test_three_landmarks_on_a_line_say_nothing_of_turns_about_it():
     near = [int(np.argmin(np.linalg.norm(X - [x, 0, 0], axis=1))) for x in (-3, 3)]
     row = points(X[[near[0], near[1], near[0]]] + [[0, 0, 0], [0, 0, 0], [0.01, 0, 0]])
     low = Shape(coarse=low_resolution(with_landmarks(mesh, row), n_coarse=300, k=10)).low
-    R, _ = motion_onto(low, low)
+    R, _ = transform_onto(low, low)
     assert np.allclose(R, np.eye(3), atol=0.02)  # of ICP, as without
 
 
@@ -220,8 +220,10 @@ def test_landmarks_of_a_mirrored_shape_lie_where_they_lay(marked):
 
 def test_landmarks_without_elastic_rounds_are_refused(marked):
     meshes, folder = marked
-    with pytest.raises(ValueError, match="landmarks pull elastic rounds, and refine='joint'"):
-        analyse(meshes, landmarks=folder, refine="joint")
+    with pytest.raises(
+        ValueError, match="landmarks pull elastic iterations, and refine='spectral_icp'"
+    ):
+        analyse(meshes, landmarks=folder, refine="spectral_icp")
 
 
 def test_the_command_line_takes_them_for_a_study_and_for_new_shapes(marked, tmp_path, capsys):
@@ -252,5 +254,5 @@ def test_five_landmarks_decide_a_pair_of_bodies_that_fails_without(tmp_path):
     found = match_pair(*pair, n_coarse=2000, k=60)
     X = pair[0]["position"].values
     error = np.linalg.norm(X[found["match"].values] - X, axis=1).mean()
-    assert found.attrs["first_map"] == "marked"
+    assert found.attrs["initial_map"] == "marked"
     assert error < 0.02 * np.sqrt(pair[0].attrs["area"])

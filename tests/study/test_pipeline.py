@@ -38,12 +38,12 @@ def assert_same(one, other):
 
 
 def files(folder):
-    """Time and size of every result of a folder; what is put together anew in each run left out."""
-    anew = ("report.nc", "registration.nc", "pca.nc", ".lock", ".progress.json")
+    """Time and size of every result in a folder, without the files that each run assembles."""
+    again = ("report.nc", "registration.nc", "pca.nc", ".lock", ".progress.json")
     return {
         p: (p.stat().st_mtime_ns, p.stat().st_size)
         for p in folder.rglob("*")
-        if p.is_file() and p.name not in anew
+        if p.is_file() and p.name not in again
     }
 
 
@@ -54,7 +54,7 @@ def test_a_study_has_all_stages_and_says_what_it_did(study, brains):
     registration, report = study["registration"].to_dataset(), study["report"].to_dataset()
     template = registration.attrs["template"]
     assert template == study["latent"].attrs["median"]
-    assert template == study["latent"]["distance_to_median"].idxmin().item()
+    assert template == study["latent"]["distance_to_limit"].idxmin().item()
     assert registration["displacement"].sizes == {"shape": 4, "vertex": 1500, "xyz": 3}
     assert (registration["displacement"].sel(shape=template) == 0).all()
     assert (registration["confidence"].sel(shape=template) == 1).all()
@@ -67,7 +67,7 @@ def test_a_study_has_all_stages_and_says_what_it_did(study, brains):
     assert registration["vertex_area"].sum() == pytest.approx(
         vertex_areas(*as_arrays(study["original"][template].to_dataset())).sum()
     )
-    assert set(registration["method"].values) >= {"template"}
+    assert set(registration["initialisation"].values) >= {"template"}
 
 
 def test_lengths_have_the_unit_that_all_shapes_say(study):
@@ -193,7 +193,7 @@ def test_an_option_changes_what_depends_on_it_and_nothing_else(brains, study_fol
     work = copied(study_folder, tmp_path / "study")
     before = files(work)
     with analyse(brains, store=work, **OPTIONS | {"refine": "intrinsic"}) as other:
-        assert set(other["registration"]["method"].values) == {"template", "intrinsic"}
+        assert set(other["registration"]["initialisation"].values) == {"template", "intrinsic"}
     changed = {
         p.relative_to(work).parts[0] for p, state in files(work).items() if before.get(p) != state
     }
@@ -235,7 +235,7 @@ def test_a_killed_run_goes_on_where_it_was(brain_files, study_of_files, tmp_path
 def test_the_paper_preset_runs_the_paper_way(brains):
     tree = analyse(brains, preset="paper", **OPTIONS)
     registration, report = tree["registration"].to_dataset(), tree["report"].to_dataset()
-    assert set(registration["method"].values) == {"template", "intrinsic"}
+    assert set(registration["initialisation"].values) == {"template", "intrinsic"}
     kept = {name: value for name, value in OPTIONS.items() if name != "n_jobs"}
     assert Options.from_report(report) == Options(preset="paper", **kept)
     assert tree["pca"]["explained_variance_ratio"].sum() == pytest.approx(1)
@@ -244,11 +244,11 @@ def test_the_paper_preset_runs_the_paper_way(brains):
 def test_the_standard_way_runs(brains):
     tree = analyse(
         brains,
-        how="standard",
+        dense_match="fmap",
         refine="intrinsic",
         template="brain_02",
         n_latent=20,
-        scale=True,
+        remove_size=True,
         **OPTIONS,
     )
     assert tree["latent"].sizes["latent"] == 20
@@ -293,7 +293,7 @@ def test_shapes_that_differ_in_pose_alone_do_not_differ(arrays):
     R = Rotation.from_rotvec([0.05, 0.1, 0]).as_matrix()
     tree = analyse({"a": (X, T), "b": (X, T), "c": (X @ R.T + 9, T)}, **OPTIONS)
     assert np.abs(tree["registration"]["displacement"]).max() < 1e-3
-    assert tree["latent"]["distance_to_median"].max() < 1e-3
+    assert tree["latent"]["distance_to_limit"].max() < 1e-3
     assert tree["network"]["cycle_error"].max() < 1e-3
 
 
@@ -304,8 +304,8 @@ def test_shapes_that_differ_in_pose_alone_do_not_differ(arrays):
         ("aaa", "PCA needs shapes that differ; all displacements are equal"),
         (
             "aab",
-            "PCA needs at least 3 shapes, found 2; 1 doubtful shapes are left out, "
-            "keep_doubtful=True takes them in",
+            "PCA needs at least 3 shapes, found 2; 1 flagged shapes are left out, "
+            "include_flagged=True takes them in",
         ),
     ],
 )
@@ -342,8 +342,8 @@ def test_one_usable_shape_is_not_enough_and_the_reasons_are_named(arrays):
     "options, message",
     [
         ({"init": "random"}, r"init must be one of 'dense', 'landmarks'; found 'random'"),
-        ({"refine": 1}, r"refine must be one of 'elastic', 'joint', 'intrinsic'"),
-        ({"how": "mine"}, r"how must be one of 'ours', 'standard'"),
+        ({"refine": 1}, r"refine must be one of 'elastic', 'spectral_icp', 'intrinsic'"),
+        ({"dense_match": "mine"}, r"how must be one of 'ours', 'standard'"),
         ({"norm": "l2"}, r"norm must be one of 'h2', 'h1', 'frobenius', 'h2_image'"),
         ({"preset": "best"}, r"preset must be one of None, 'paper'"),
         ({"n_coarse": 99}, r"n_coarse must be an integer of at least 100; found 99"),
@@ -360,7 +360,7 @@ def test_one_usable_shape_is_not_enough_and_the_reasons_are_named(arrays):
         ({"n_latent": 25}, r"n_latent must be at most k = 24; found 25"),
         ({"n_latent": 1}, r"n_latent must be an integer of at least 2; found 1"),
         ({"strict": "no"}, r"strict must be True or False; found 'no'"),
-        ({"scale": 1}, r"scale must be True or False; found 1"),
+        ({"remove_size": 1}, r"remove_size must be True or False; found 1"),
         (
             {"components": "foo"},
             r'components needs to be "largest", "all" or a number from 1; found \'foo\'',
@@ -371,16 +371,19 @@ def test_one_usable_shape_is_not_enough_and_the_reasons_are_named(arrays):
         ),
         ({"pattern": 3}, r"pattern must be a text or None; found 3"),
         (
-            {"preset": "paper", "refine": "joint"},
-            r"preset 'paper' sets refine='intrinsic'; found refine='joint'",
+            {"preset": "paper", "refine": "spectral_icp"},
+            r"preset 'paper' sets refine='intrinsic'; found refine='spectral_icp'",
         ),
         (
-            {"preset": "paper", "wide": 2},
-            r"preset 'paper' sets wide=0; found wide=2: leave out one of both",
+            {"preset": "paper", "dense_iterations": 2},
+            r"preset 'paper' sets dense_iterations=0; found dense_iterations=2: leave out one",
         ),
-        ({"lift": 1}, r"lift must be True or False; found 1"),
-        ({"n_spread": -1}, r"n_spread must be an integer of at least 0; found -1"),
-        ({"ahead": "once"}, r"ahead must be one of 'always', 'network', 'never'"),
+        ({"refined_eigenfunctions": 1}, r"refined_eigenfunctions must be True or False; found 1"),
+        ({"n_samples": -1}, r"n_samples must be an integer of at least 0; found -1"),
+        (
+            {"initial_refinement": "once"},
+            r"initial_refinement must be one of 'always', 'network', 'never'",
+        ),
         ({"seed": -1}, r"seed must be an integer of at least 0; found -1"),
     ],
 )
@@ -414,7 +417,7 @@ def test_the_registered_surface_is_four_times_nearer_to_the_truth_than_nearest_n
         ),
     )["error"]
     methods = (accuracy.SURFACE, accuracy.MATCH, accuracy.ZOOMOUT, accuracy.ICP)
-    surface, matched, zoomout, icp = (errors.sel(way=m).values for m in methods)
+    surface, matched, zoomout, icp = (errors.sel(algorithm=m).values for m in methods)
     assert surface.mean() < icp.mean() / 4
     assert matched.mean() < zoomout.mean() / 2
     assert (surface < matched).all()

@@ -27,15 +27,15 @@ def three(meshes):
 
 @pytest.fixture(scope="module")
 def paper(three, tmp_path_factory):
-    """The folder of their study, as in the paper, with holes closed and rounds kept."""
+    """The folder of their study, as in the paper, with holes closed and iterations kept."""
     folder = tmp_path_factory.mktemp("paper") / "study"
-    options = {"preset": "paper", "close_holes": True, "keep_rounds": True}
+    options = {"preset": "paper", "close_holes": True, "keep_iterations": True}
     s4a.analyse(three, store=folder, **options, **OPTIONS).close()
     return folder
 
 
 def test_the_fast_preset_sets_what_it_is_for_and_leaves_the_rest():
-    options = Options(preset="fast", refine="joint")
+    options = Options(preset="fast", refine="spectral_icp")
     assert {name: getattr(options, name) for name in FAST} == FAST
     assert options.refine == "joint"
     with pytest.raises(ValueError, match="preset 'fast' sets n_coarse=3000; found n_coarse=500"):
@@ -66,7 +66,7 @@ def test_an_option_that_the_preset_fixes_is_refused_by_name(meshes):
         given = {"preset": "paper", name: DEFAULTS[name]}
         with pytest.raises(ValueError, match=message):
             Options(**given)
-        if name not in ("n_spread", "wide"):  # which are of a network
+        if name not in ("n_samples", "dense_iterations"):  # which are of a network
             with pytest.raises(ValueError, match=message):
                 s4a.match_pair(source, target, **given)
             with pytest.raises(ValueError, match=message):
@@ -80,7 +80,7 @@ def test_options_are_kept_with_their_types_and_come_back():
         "table": Path("t.csv"),
         "seed": np.int64(3),
     }
-    options = Options(preset="paper", k=np.int32(50), components=2, scale=np.True_, **given)
+    options = Options(preset="paper", k=np.int32(50), components=2, remove_size=np.True_, **given)
     report = xr.Dataset(attrs=with_options({"template": "the median"}, vars(options)))
     assert Options.from_report(report) == options
     assert Options.from_report(xr.DataTree.from_dict({"report": report})) == options
@@ -104,21 +104,21 @@ def test_pairs_of_the_paper_are_matched_one_way_after_icp_alone(three):
     study = s4a.register_pairs(template, {other: shape}, name=name, preset="paper", **PAIR)
     assert "reverse" not in study.children
     one = study["registration"].to_dataset().sel(shape=other)
-    assert one["method"] == "intrinsic"
+    assert one["initialisation"] == "intrinsic"
     assert np.array_equal(one["rotation"], one["icp_rotation"])
     fitted = s4a.match_pair(shape, template, refine="intrinsic", **PAIR)
     assert not np.allclose(fitted["rotation"], fitted["icp_rotation"])
 
 
 def test_lifted_functions_are_orthonormal_on_the_original_mesh_and_are_what_is_compared(three):
-    study = s4a.analyse(three, lift=True, refine="intrinsic", **OPTIONS)
+    study = s4a.analyse(three, refined_eigenfunctions=True, refine="intrinsic", **OPTIONS)
     name = study["registration"].attrs["template"]
-    B = study["coarse"][name]["lifted_eigenfunction"].values
+    B = study["coarse"][name]["refined_eigenfunction"].values
     area = study["registration"]["vertex_area"].values
     assert B.T @ (area[:, None] / area.sum() * B) == pytest.approx(np.eye(B.shape[1]), abs=0.05)
     Y = study["latent"]["latent_basis"]
     for other in set(three) - {name}:
-        F = study["coarse"][other]["lifted_eigenfunction"].values @ Y.sel(shape=other).values
+        F = study["coarse"][other]["refined_eigenfunction"].values @ Y.sel(shape=other).values
         distance = cdist(B @ Y.sel(shape=name).values, F)
         match = study["registration"]["registered_match"].sel(shape=other).values
         assert np.allclose(distance[np.arange(len(B)), match], distance.min(1), rtol=1e-3)
@@ -126,12 +126,12 @@ def test_lifted_functions_are_orthonormal_on_the_original_mesh_and_are_what_is_c
 
 def test_rounds_are_opened_and_go_when_they_are_not_asked_for(three, paper, tmp_path):
     with s4a.open_study(paper) as study:
-        assert sorted(study["rounds"].children) == ["k_010", "k_015", "k_020", "k_024"]
-        assert study["rounds/k_015/fmap"].shape == (6, 15, 15)
+        assert sorted(study["iterations"].children) == ["k_010", "k_015", "k_020", "k_024"]
+        assert study["iterations/k_015/fmap"].shape == (6, 15, 15)
     again = shutil.copytree(paper, tmp_path / "again")
     with s4a.analyse(three, store=again, preset="paper", close_holes=True, **OPTIONS) as study:
-        assert "rounds" not in study.children
-    assert not list(again.glob("rounds/*"))
+        assert "iterations" not in study.children
+    assert not list(again.glob("iterations/*"))
 
 
 def test_a_new_shape_is_cleaned_and_registered_by_the_options_of_the_study(paper, meshes):
@@ -142,7 +142,7 @@ def test_a_new_shape_is_cleaned_and_registered_by_the_options_of_the_study(paper
         new = s4a.insert(study, {"new": with_hole})
     assert new["original/new"].attrs["closed_holes"] == 1
     one = new["registration"].to_dataset().sel(shape="new")
-    assert one["method"] == "intrinsic"
+    assert one["initialisation"] == "intrinsic"
     assert np.array_equal(one["rotation"], one["icp_rotation"])
 
 
@@ -225,17 +225,24 @@ def test_votes_for_labels_spread_unless_the_study_or_its_pairs_are_of_the_paper(
 def test_a_transfer_refuses_by_name_what_its_preset_fixes(what, study, paper, meshes, seen):
     external = meshes["brain_04"]
     carry = transfers(external)[what]
-    message = "preset 'paper' sets both=False; found both=True: leave out one of both"
+    message = "preset 'paper' sets bidirectional=False; found bidirectional=True: leave out one"
     with pytest.raises(ValueError, match=message):
-        carry(study, source=external, preset="paper", both=True)
+        carry(study, source=external, preset="paper", bidirectional=True)
     with s4a.open_study(paper) as fixed:
         with pytest.raises(ValueError, match=message):
-            carry(fixed, source=external, both=True)
+            carry(fixed, source=external, bidirectional=True)
         assert seen == []
-        carry(fixed, source=external, targets=["brain_01"], preset=None, both=False, sharpen=0)
+        carry(
+            fixed,
+            source=external,
+            targets=["brain_01"],
+            preset=None,
+            bidirectional=False,
+            full_resolution_iterations=0,
+        )
     assert {name: getattr(seen[0], name) for name in DEFAULTS} == DEFAULTS | {
-        "both": False,
-        "sharpen": 0,
+        "bidirectional": False,
+        "full_resolution_iterations": 0,
     }
 
 
@@ -257,10 +264,17 @@ def test_another_low_resolution_than_that_of_the_study_is_made_for_its_template(
     monkeypatch.setattr(transfer, "shape_of", lambda *given: made.append(given) or low(*given))
     external = meshes["brain_04"]
     carry = transfers(external)["scalars"]
-    same = carry(study, source=external, targets=["brain_01"], refine="intrinsic", both=False)
+    same = carry(
+        study, source=external, targets=["brain_01"], refine="intrinsic", bidirectional=False
+    )
     assert len(made) == 1
     coarser = carry(
-        study, source=external, targets=["brain_01"], refine="intrinsic", both=False, n_coarse=150
+        study,
+        source=external,
+        targets=["brain_01"],
+        refine="intrinsic",
+        bidirectional=False,
+        n_coarse=150,
     )
     assert len(made) == 3
     assert made[1][1].n_coarse == made[2][1].n_coarse == 150
@@ -269,7 +283,7 @@ def test_another_low_resolution_than_that_of_the_study_is_made_for_its_template(
 
 def test_an_external_mesh_needs_more_than_a_study_of_pairs(three):
     (name, template), (other, shape), (_, external) = three.items()
-    study = s4a.register_pairs(template, {other: shape}, name=name, both=False, **PAIR)
+    study = s4a.register_pairs(template, {other: shape}, name=name, bidirectional=False, **PAIR)
     with pytest.raises(ValueError, match="needs /coarse; this study of pairs has none"):
         s4a.transfer_labels(study, external["label"].values, source=external)
 
@@ -285,9 +299,18 @@ def test_the_commands_take_the_preset_between_files_and_to_a_study(
     assert (seen[0].preset, seen[0].k) == ("paper", OPTIONS["k"])
     assert main([*to[:2], str(paper), *to[2:], "--k", "20", "--preset", "paper"]) == 0
     assert (seen[1].preset, seen[1].k) == ("paper", 20)
-    assert main([*to[:2], str(paper), *to[2:], "--sharpen", "1"]) == 2
-    assert "preset 'paper' sets sharpen=0; found sharpen=1" in capsys.readouterr().err
-    assert main([*to[:2], target, *to[2:], "--preset", "paper", "--sharpen", "1"]) == 2
-    assert "preset 'paper' sets sharpen=0; found sharpen=1" in capsys.readouterr().err
+    assert main([*to[:2], str(paper), *to[2:], "--full_resolution_iterations", "1"]) == 2
+    assert (
+        "preset 'paper' sets full_resolution_iterations=0; found full_resolution_iterations=1"
+        in capsys.readouterr().err
+    )
+    assert (
+        main([*to[:2], target, *to[2:], "--preset", "paper", "--full_resolution_iterations", "1"])
+        == 2
+    )
+    assert (
+        "preset 'paper' sets full_resolution_iterations=0; found full_resolution_iterations=1"
+        in capsys.readouterr().err
+    )
     assert main(["compare", source, target, "--preset", "paper", "--methods", "registered"]) == 2
     assert "preset 'paper' has the methods kNN, ZO, FMAP+ZO" in capsys.readouterr().err

@@ -45,11 +45,11 @@ def test_the_study_of_left_and_right_shapes_is_that_of_right_ones(right, mixed, 
             for name in LEFT:
                 assert study["original"][name].attrs["reflected"] == 1
                 assert "mirrored" in report["reason"].sel(shape=name).item()
-        hand = found["report"]["handedness"]
+        hand = found["report"]["mean_chirality"]
         assert (hand.sel(shape=LEFT) < -0.5).all()
         assert (hand.drop_sel(shape=LEFT) > 0.5).all()
         assert "mirrored, as reflect= says" in study_html(found)
-    assert "handedness" not in named["report"]
+    assert "mean_chirality" not in named["report"]
     assert s4a.Options.from_report(named).reflect == "s1,s3"
 
 
@@ -64,7 +64,7 @@ def test_a_finished_study_is_not_computed_again_and_holds(mixed, folder):
 def test_without_mirroring_the_left_ones_are_told_and_the_report_has_no_column(mixed, folder):
     study = analyse(mixed, **OPTIONS)
     report = study["report"].to_dataset()
-    assert report["shape"].values[report["status"].values == "doubtful"].tolist() == LEFT
+    assert report["shape"].values[report["status"].values == "flagged"].tolist() == LEFT
     assert "reflect= mirrors it" in report["warning"].sel(shape="s1").item()
     assert "reflected" not in report
 
@@ -123,7 +123,7 @@ def test_a_new_shape_of_the_other_hand_is_told_where_nothing_is_asked(newcomer, 
     with open_study(folder) as study:
         found = s4a.insert(study, {"s9": newcomer[1]}, n_jobs=1)
     report = found["report"].sel(shape="s9")
-    assert report["status"].item() == "doubtful"
+    assert report["status"].item() == "flagged"
     assert "reflect= mirrors it" in report["warning"].item()
     assert "reflected" not in found["report"]
 

@@ -86,17 +86,17 @@ def test_the_low_resolution_is_the_reduced_basis_of_scalable(sampled):
 
 def test_the_paper_on_scalable_is_what_table_2_compares(brains, paper):
     names = {"n_coarse": 400, "k_init": 10, "k": 24, "methods": ["SCALABLE"]}
-    found = s4a.compare.collection(brains, preset="paper", **names).isel(way=0)
+    found = s4a.compare.collection(brains, preset="paper", **names).isel(algorithm=0)
     assert paper["latent"].attrs["median"] == found["median_shape"].item()
-    assert found["distance_to_median"].values == pytest.approx(
-        paper["latent/distance_to_median"].values, rel=1e-3
+    assert found["distance_to_limit"].values == pytest.approx(
+        paper["latent/distance_to_limit"].values, rel=1e-3
     )
     registration = paper["registration"].to_dataset()
     for name in set(registration["shape"].values.tolist()) - {registration.attrs["template"]}:
         X = Shape(paper["original"][name].to_dataset())
         X = X.to_frame(X.original["position"].values)
         match = registration["registered_match"].sel(shape=name).values
-        theirs = found["collection_chamfer"].sel(how="ours", shape=name).item()
+        theirs = found["collection_chamfer"].sel(dense_match="latent", shape=name).item()
         assert metrics.chamfer(X, X[match]) == pytest.approx(theirs, rel=0.01)
 
 
@@ -132,9 +132,9 @@ def test_it_is_as_near_to_the_truth_as_a_study_of_rematch(sampled, study_of_file
         return s4a.synthetic.position(truth, shape, truth[template]["reference_point"].values)
 
     errors = [accuracy.accuracy(tree, image)["error"] for tree in (sampled, study_of_files)]
-    ours, theirs = (error.sel(way=accuracy.SURFACE).mean().item() for error in errors)
+    ours, theirs = (error.sel(algorithm=accuracy.SURFACE).mean().item() for error in errors)
     assert ours < 1.5 * theirs
-    assert ours < 0.7 * errors[0].sel(way=accuracy.ICP).mean()
+    assert ours < 0.7 * errors[0].sel(algorithm=accuracy.ICP).mean()
 
 
 def test_the_commands_take_it(folder, brain_files, sampled, tmp_path):
@@ -168,7 +168,9 @@ def test_pairs_are_matched_by_it(meshes):
     small = {name: OPTIONS[name] for name in ("n_coarse", "k_init", "k")}
     found = s4a.match_pair(source, source, method="scalable", **small)
     assert (found["match"].values == np.arange(1500)).all()
-    study = s4a.register_pairs(source, {"other": target}, method="scalable", both=False, **small)
+    study = s4a.register_pairs(
+        source, {"other": target}, method="scalable", bidirectional=False, **small
+    )
     assert study["registration"].sizes["shape"] == 2
 
 
@@ -189,8 +191,10 @@ def test_an_external_mesh_is_matched_by_it(paper, meshes, monkeypatch):
 def test_what_it_cannot_have_is_refused_by_name(brain_files, tmp_path, capsys):
     with pytest.raises(ValueError, match="method must be one of 'rematch', 'scalable'; found 'zo'"):
         Options(method="zo")
-    with pytest.raises(ValueError, match="no coarse mesh, and lift=True lifts the eigenfunctions"):
-        Options(method="scalable", lift=True)
+    with pytest.raises(
+        ValueError, match="no coarse mesh, and refined_eigenfunctions=True lifts the eigenfunctions"
+    ):
+        Options(method="scalable", refined_eigenfunctions=True)
     words = ["run", str(brain_files[0]), "--out", str(tmp_path / "no"), "--method", "scalable"]
     assert main([*words, "--wrap"]) == 2
     assert (

@@ -59,7 +59,7 @@ def test_a_pair_takes_rng_and_refuses_both():
     small = {"n_coarse": 100, "k": 10, "k_init": 6}
     by_seed = s4a.match_pair(ball, ball, **small, seed=1)
     assert by_seed.identical(s4a.match_pair(ball, ball, **small, rng=1))
-    with pytest.raises(ValueError, match="leave out one of both"):
+    with pytest.raises(ValueError, match="leave out one of the two"):
         s4a.match_pair(ball, ball, **small, seed=1, rng=2)
 
 

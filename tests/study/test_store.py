@@ -139,7 +139,7 @@ def write_tree(folder, names, template):
     """A small finished study written by hand."""
     X, T = as_arrays(synthetic.sphere(50))
     mesh = {"position": X, "corner_vertex": T}
-    sizes = {"vertex": 50, "original_vertex": 50, "corner": 3, "xyz": 3, "xyz_2": 3, "mode": 2}
+    sizes = {"vertex": 50, "original_vertex": 50, "corner": 3, "xyz": 3, "xyz_2": 3, "eigenpair": 2}
     sizes |= {"edge": 144, "end": 2}
     for name in names:
         original = zeros("original", sizes, {"reason": name}, **mesh)
@@ -155,7 +155,7 @@ def write_tree(folder, names, template):
         data = zeros(
             "registration/shape",
             sizes,
-            {"method": "icp", "score": 0.1 * i},
+            {"initialisation": "icp", "score": 0.1 * i},
             displacement=np.full((50, 3), i, np.float32),
         )
         store.write(data, folder / "registration" / f"{name}.nc")
@@ -180,7 +180,7 @@ def test_a_tree_survives_the_round_trip(tmp_path):
     assert registration["displacement"].dims == ("shape", "vertex", "xyz")
     assert registration["displacement"].mean(("vertex", "xyz")).values.tolist() == [0, 1, 2]
     assert registration["displacement"].attrs["units"] == "unit of the input"
-    assert registration["badness"].values == pytest.approx([0, 0.1, 0.2])
+    assert registration["registration_error"].values == pytest.approx([0, 0.1, 0.2])
     assert registration.attrs["template"] == "a"
     assert tree["registration/c"].to_dataset(inherit=False)["template_triangle"].shape == (50,)
     assert tree["original/b"].attrs["reason"] == "b"
@@ -272,7 +272,7 @@ def test_a_file_written_anew_after_it_was_opened_is_refused(tmp_path):
     store.write(dataset(position=np.zeros((700, 3))), tmp_path / "a.nc", "k")
     found = netcdf.open_file(tmp_path / "a.nc")
     store.write(dataset(position=np.ones((700, 3))), tmp_path / "a.nc", "other")
-    with pytest.raises(ValueError, match="written anew since it was opened; open the study again"):
+    with pytest.raises(ValueError, match="written again since it was opened; open the study again"):
         found.load()
 
 

@@ -431,16 +431,16 @@ def test_verify_says_in_one_line_what_holds_and_its_exit_code_whether(folder, ca
     assert f"{n} files: {n} whole" in capsys.readouterr().out
     (folder / "notes.txt").write_text("mine")
     shutil.copy(folder / "original/brain_01.nc", folder / "original/other.nc")
-    (folder / "network/motion_brain_04.nc").unlink()
+    (folder / "network/alignment_brain_04.nc").unlink()
     path = folder / "pca.nc"
     path.write_bytes(path.read_bytes()[:-9])
     assert cli.main(["verify", str(folder)]) == 1
     first, *lines = capsys.readouterr().out.splitlines()
     assert "1 damaged" in first
     assert "1 missing" in first
-    assert "the same `s4a run` again makes what is wrong anew" in first
+    assert "the same `s4a run` again makes what is wrong again" in first
     assert sorted(line.split(",")[0].strip() for line in lines) == [
-        "network/motion_brain_04.nc",
+        "network/alignment_brain_04.nc",
         "notes.txt",
         "original/other.nc",
         "pca.nc",

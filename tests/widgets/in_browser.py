@@ -123,7 +123,7 @@ def main():
             done["panels"].append(title)
         done["lesson"] = run_lesson("00", study)
     brains = s4a.synthetic.brains(3, 300)
-    made = s4a.analyse(brains, n_coarse=100, k=10, k_init=6, keep_doubtful=True)
+    made = s4a.analyse(brains, n_coarse=100, k=10, k_init=6, include_flagged=True)
     done["modes"] = made["pca"].sizes["component"]
     done["refusals"] = dict(refusals(brains))
     sys.stdout.write(json.dumps(done))

@@ -1025,17 +1025,17 @@ def test_the_page_of_methods_marks_a_place_in_all_views(show, compared):
 
     at = cursor(visible(page, VIEW).nth(1), "ArrowRight")
     kept = compared["pairs/pair"].dataset
-    match = [*kept["way_match"].values[:, at], kept["true_match"].values[at]]
+    match = [*kept["algorithm_match"].values[:, at], kept["true_match"].values[at]]
     views = visible(page, VIEW)
     there = views.first.evaluate("(c) => c.view.points.map((p) => p.slice(0, 3))")
     np.testing.assert_allclose(there, compared["source/position"].values[match], rtol=1e-5)
     said = [text.inner_text() for text in visible(page, ".s4a-readout").all()[1:]]
-    error = 100 * kept["way_error"].values[1, at]
+    error = 100 * kept["algorithm_error"].values[1, at]
     assert said[1] == f"target vertex {at} → source vertex {match[1]}, error {error:.2f} %"
     assert said[2] == f"target vertex {at} → source vertex {match[2]}, error 0.00 %"
 
     at = cursor(views.first, "ArrowLeft")
-    back = kept["way_reverse"].values[:, at]
+    back = kept["algorithm_reverse"].values[:, at]
     for i in range(2):
         there = views.nth(1 + i).evaluate("(c) => c.view.points[0].slice(0, 3)")
         np.testing.assert_allclose(there, kept["position"].values[back[i]], rtol=1e-5)

@@ -55,19 +55,26 @@ def test_what_is_kept_agrees_with_the_table(found):
         kept, X = node.to_dataset(), found["source/position"].values
         one = table.sel(pair=name)
         for way in METHODS:
-            match, image = kept["way_match"].sel(way=way), kept["way_image"].sel(way=way)
+            match, image = (
+                kept["algorithm_match"].sel(algorithm=way),
+                kept["algorithm_image"].sel(algorithm=way),
+            )
             if way != "registered surface":
                 np.testing.assert_allclose(image, X[match], atol=1e-4)
-            error = kept["way_error"].sel(way=way)
-            assert float(error.mean()) == pytest.approx(one["straight_error"].sel(way=way).item())
+            error = kept["algorithm_error"].sel(algorithm=way)
+            assert float(error.mean()) == pytest.approx(
+                one["euclidean_error"].sel(algorithm=way).item()
+            )
             Y, T = kept["position"].values, kept["corner_vertex"].values
             expected = log_area_ratio(image.values.astype(float), Y, T)
-            np.testing.assert_allclose(kept["way_area"].sel(way=way), expected, atol=1e-3)
+            np.testing.assert_allclose(
+                kept["algorithm_area_change"].sel(algorithm=way), expected, atol=1e-3
+            )
         assert np.isnan(kept["true_position"][-100:]).all()
         assert (kept["true_match"][-100:] == -1).all()
-        assert np.isnan(kept["way_fmap"].sel(way=["kNN", "registered surface"])).all()
-        assert np.isfinite(kept["way_fmap"].sel(way="RE-MATCH")).all()
-        assert kept["way_fmap_initial"].shape == (3, 10, 10)
+        assert np.isnan(kept["algorithm_fmap"].sel(algorithm=["kNN", "registered surface"])).all()
+        assert np.isfinite(kept["algorithm_fmap"].sel(algorithm="RE-MATCH")).all()
+        assert kept["algorithm_fmap_initial"].shape == (3, 10, 10)
 
 
 def test_without_keep_there_is_the_table_alone(found):
@@ -85,7 +92,7 @@ def test_the_target_has_the_colours_of_the_places_where_a_method_puts_it(found, 
     kept = found["pairs/brain_02"].to_dataset()
     colors = [np.frombuffer(scene.color, np.uint8).reshape(-1, 3) for scene in shown.scenes]
     np.testing.assert_allclose(colors[0], expected, atol=1)
-    match = kept["way_match"].sel(way="RE-MATCH").values
+    match = kept["algorithm_match"].sel(algorithm="RE-MATCH").values
     np.testing.assert_allclose(colors[1], expected[match], atol=1)
     assert (colors[2][-100:] == 153).all()  # where the truth is unknown
     shown.colors.value = "checker"
@@ -93,7 +100,7 @@ def test_the_target_has_the_colours_of_the_places_where_a_method_puts_it(found, 
     np.testing.assert_allclose(floats(shown.scenes[1].coordinate), X[match], atol=1e-4)
     assert shown.scenes[1].cell == shown.scenes[0].cell > 0
     shown.way0.value = "registered surface"
-    image = kept["way_image"].sel(way="registered surface").values
+    image = kept["algorithm_image"].sel(algorithm="registered surface").values
     np.testing.assert_allclose(floats(shown.scenes[1].coordinate), image, atol=1e-4)
 
 
@@ -104,12 +111,18 @@ def test_errors_have_one_scale_and_the_mean_is_told(found, panel):
     bars = [scene.bar for scene in shown.scenes[1:]]
     assert bars[0] == bars[1] == bars[2]
     mean = (
-        100 * found["metrics/straight_error"].sel(way="registered surface", pair="brain_02").item()
+        100
+        * found["metrics/euclidean_error"]
+        .sel(algorithm="registered surface", pair="brain_02")
+        .item()
     )
     assert shown.scenes[2].title == f"registered surface, error {mean:.2f} %"
     shown.pair.value = "brain_03"
     mean = (
-        100 * found["metrics/straight_error"].sel(way="registered surface", pair="brain_03").item()
+        100
+        * found["metrics/euclidean_error"]
+        .sel(algorithm="registered surface", pair="brain_03")
+        .item()
     )
     assert shown.scenes[2].title == f"registered surface, error {mean:.2f} %"
     shown.colors.value = "area"
@@ -122,16 +135,16 @@ def test_a_point_is_marked_where_each_method_has_it(found, panel):
     kept = found["pairs/brain_02"].to_dataset()
     X, Y = found["source/position"].values, kept["position"].values
     shown.scenes[2].picked = {"vertex": 17, "count": 1}
-    match = kept["way_match"].sel(way=["kNN", "registered surface"]).values[:, 17]
+    match = kept["algorithm_match"].sel(algorithm=["kNN", "registered surface"]).values[:, 17]
     places = np.array([place[:3] for place in shown.scenes[0].points])
     np.testing.assert_allclose(places, X[match])
     assert shown.scenes[1].points[0][:3] == Y[17].tolist()
-    error = 100 * kept["way_error"].sel(way="registered surface").values[17]
+    error = 100 * kept["algorithm_error"].sel(algorithm="registered surface").values[17]
     assert shown.scenes[2].caption == (
         f"target vertex 17 → source vertex {match[1]}, error {error:.2f} %"
     )
     shown.scenes[0].picked = {"vertex": 40, "count": 1}
-    back = kept["way_reverse"].sel(way="kNN").values[40]
+    back = kept["algorithm_reverse"].sel(algorithm="kNN").values[40]
     assert shown.scenes[1].points[0][:3] == Y[back].tolist()
     shown.scenes[1].picked = {"vertex": 650, "count": 1}
     assert shown.scenes[1].caption.endswith("error unknown %")
@@ -140,7 +153,7 @@ def test_a_point_is_marked_where_each_method_has_it(found, panel):
 def test_a_place_of_the_source_stays_marked_where_another_method_has_it(found, panel):
     shown = panel(methods=["kNN", "RE-MATCH"])
     kept = found["pairs/brain_02"].to_dataset()
-    way_back = kept["way_reverse"].sel(way="registered surface").values
+    way_back = kept["algorithm_reverse"].sel(algorithm="registered surface").values
     vertex = int(np.argmax(way_back >= 0))
     shown.scenes[0].picked = {"vertex": vertex, "count": 1}
     shown.way0.value = "registered surface"
@@ -170,10 +183,10 @@ def test_a_saved_page_leaves_the_place_that_was_picked(panel, tmp_path):
 
 def test_the_browser_knows_both_ways_and_the_errors(found, panel):
     scene = panel(methods=["RE-MATCH"]).scenes[1]
-    kept = found["pairs/brain_02"].to_dataset().sel(way="RE-MATCH")
-    assert (np.frombuffer(scene.link, "<i4") == kept["way_match"]).all()
-    assert (np.frombuffer(scene.link_back, "<i4") == kept["way_reverse"]).all()
-    np.testing.assert_array_equal(np.frombuffer(scene.link_values, "<f4"), kept["way_error"])
+    kept = found["pairs/brain_02"].to_dataset().sel(algorithm="RE-MATCH")
+    assert (np.frombuffer(scene.link, "<i4") == kept["algorithm_match"]).all()
+    assert (np.frombuffer(scene.link_back, "<i4") == kept["algorithm_reverse"]).all()
+    np.testing.assert_array_equal(np.frombuffer(scene.link_values, "<f4"), kept["algorithm_error"])
 
 
 def test_without_truth_there_is_no_error(found, panel):

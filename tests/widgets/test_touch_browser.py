@@ -61,7 +61,7 @@ def touch(page, *paths, steps=10):
 
 
 def tap(button, pressed):
-    """Tap until the button shows its new state: a busy browser takes a tap for the end of a scroll."""
+    """Tap until the button shows its new state; a busy browser may lose a tap."""
     for _ in range(5):
         button.tap()
         button.page.wait_for_timeout(300)  # the browser makes a click of it

@@ -352,7 +352,7 @@ def test_bars_are_the_stored_distances_in_rising_order(study, panel):
     median = panel(Median)
     latent = study["latent"].dataset
     np.testing.assert_allclose(
-        median.bars.spec["values"], np.sort(latent["distance_to_median"].values)
+        median.bars.spec["values"], np.sort(latent["distance_to_limit"].values)
     )
     assert median.median == latent.attrs["median"] == median.selected
     median.bars.picked = {"index": 2, "count": 1}

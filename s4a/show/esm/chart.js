@@ -142,7 +142,7 @@ function scatter(parent, spec, pick) {
   const frame = plot(parent, { width, height, x: bounds([...x, ...(spec.reach || [0])]), y: bounds([...y, ...(spec.reach || [0])]), xlabel, ylabel, title });
   const marks = x.map((_, i) => {
     const at = node(frame.svg, "circle", { cx: frame.X(x[i]), cy: frame.Y(y[i]), r: i === selected ? 7 : 5, fill: i === selected ? ORANGE : faint[i] ? PALE : BLUE, stroke: "#fff" });
-    return { at, value: { index: i, name: names[i] }, text: `${names[i]}${faint[i] ? " (doubtful)" : ""}: ${short(x[i])}, ${short(y[i])}` };
+    return { at, value: { index: i, name: names[i] }, text: `${names[i]}${faint[i] ? " (flagged)" : ""}: ${short(x[i])}, ${short(y[i])}` };
   });
   labels(frame.svg, { x: x.map(frame.X), y: y.map(frame.Y), names, width, height: frame.bottom, start: frame.left, avoid: [[frame.X(0), frame.Y(0)]], class: "s4a-small" }); // where the cross is at first
   const cross = node(frame.svg, "path", { d: "M-7 0H7M0 -7V7", stroke: ORANGE, "stroke-width": 2, visibility: "hidden", class: "s4a-cross" });
@@ -217,7 +217,7 @@ function graph(parent, spec, pick) {
     const at = node(svg, "g", { "data-node": i });
     if (i === highlight) node(at, "circle", { cx: X[i], cy: Y[i], r: 12, fill: "none", stroke: ORANGE, "stroke-width": 3 });
     node(at, "circle", { cx: X[i], cy: Y[i], r: 8, fill: i === chosen ? ORANGE : faint[i] ? PALE : INK, stroke: "#fff" });
-    return { at, value: { node: name }, text: `${name}${i === highlight ? ", the median" : ""}${faint[i] ? " (doubtful)" : ""}` };
+    return { at, value: { node: name }, text: `${name}${i === highlight ? ", the median" : ""}${faint[i] ? " (flagged)" : ""}` };
   }));
   const sides = (i) => { // names stand outside of the ring
     const out = X[i] < width / 2 - 20 ? -1 : 1, down = Y[i] < height / 2 ? -5 : 13;

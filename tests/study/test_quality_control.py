@@ -1,4 +1,4 @@
-"""Doubtful shapes stay apart (5.1): registered and told, and the others know nothing of them."""
+"""Flagged shapes stay apart (5.1): registered and told, and the others know nothing of them."""
 
 import numpy as np
 import pytest
@@ -8,11 +8,11 @@ from s4a import analyse, explore, insert, latent_match, open_study, statistics, 
 from s4a.cli import tables
 from s4a.geometry.mesh import as_arrays
 from s4a.show.page import study_html
-from s4a.study.tree import apart_of, left_out
+from s4a.study.tree import excluded_of, left_out
 
 OPTIONS = {"n_coarse": 200, "k_init": 8, "k": 20, "n_jobs": 1, "intersections": False}
 TETRAHEDRON = 60 * np.eye(4, 3), np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
-DOUBTFUL = ["a_metre", "z_inch"]
+FLAGGED = ["a_metre", "z_inch"]
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def alone(good):
 @pytest.fixture(scope="module")
 def folder(mixed, tmp_path_factory):
     """The folder of the study of all."""
-    folder = tmp_path_factory.mktemp("doubtful") / "study"
+    folder = tmp_path_factory.mktemp("flagged") / "study"
     analyse(mixed, store=folder, **OPTIONS).close()
     return folder
 
@@ -51,9 +51,9 @@ def study(folder):
 
 
 def results(study, stage):
-    """A stage without what is said of doubtful shapes."""
+    """A stage without what is said of flagged shapes."""
     data = study[stage].to_dataset().drop_attrs(deep=False)
-    return data.drop_vars(["score_apart", "shape_apart"], errors="ignore")
+    return data.drop_vars(["score_excluded", "shape_excluded"], errors="ignore")
 
 
 def test_the_results_of_the_others_are_the_same_to_the_bit_as_without(alone, study):
@@ -73,15 +73,15 @@ def test_a_shape_with_too_few_eigenfunctions_is_excluded_and_takes_no_k_from_the
 
 
 def test_doubtful_shapes_are_registered_and_named(study):
-    report = study["report"].to_dataset().sel(shape=DOUBTFUL)
-    assert report["status"].values.tolist() == ["doubtful"] * 2
-    assert report["doubtful_kinds"].values.tolist() == ["unit"] * 2
-    assert apart_of(study["registration"].to_dataset()) == left_out(study) == DOUBTFUL
-    registration = study["registration"].to_dataset().sel(shape=DOUBTFUL)
+    report = study["report"].to_dataset().sel(shape=FLAGGED)
+    assert report["status"].values.tolist() == ["flagged"] * 2
+    assert report["flag_kinds"].values.tolist() == ["unit"] * 2
+    assert excluded_of(study["registration"].to_dataset()) == left_out(study) == FLAGGED
+    registration = study["registration"].to_dataset().sel(shape=FLAGGED)
     assert np.isfinite(registration["displacement"]).all()
-    assert (registration["badness"] < 0.06).all()
-    assert list(study["latent"].children) == DOUBTFUL
-    assert study["pca"]["score_apart"].dims == ("shape_apart", "component")
+    assert (registration["registration_error"] < 0.06).all()
+    assert list(study["latent"].children) == FLAGGED
+    assert study["pca"]["score_excluded"].dims == ("shape_excluded", "component")
     match = latent_match(study, "a_metre", "brain_01", full=False)["match"]
     assert (match.values == np.arange(match.size)).mean() > 0.9  # the same surface, smaller
 
@@ -91,13 +91,13 @@ def test_a_finished_study_with_doubtful_shapes_is_not_computed_again(folder, mix
     before = {path: path.stat().st_mtime_ns for path in kept}
     analyse(mixed, store=folder, **OPTIONS).close()
     assert {path: path.stat().st_mtime_ns for path in kept} == before
-    assert len(before) == len(DOUBTFUL) + 7
+    assert len(before) == len(FLAGGED) + 7
 
 
 def test_statistics_leave_them_out_and_say_whom(alone, study, caplog):
     found = statistics.outliers(study)
     assert found.identical(statistics.outliers(alone))
-    assert "doubtful and left out: a_metre, z_inch" in caplog.text
+    assert "flagged and left out: a_metre, z_inch" in caplog.text
     values = dict(zip(study["registration"]["shape"].values.tolist(), range(7), strict=True))
     test = statistics.regression(study, values, n_permutations=9)
     assert test.sizes["shape"] == 5
@@ -108,11 +108,11 @@ def test_statistics_leave_them_out_and_say_whom(alone, study, caplog):
 
 
 def test_they_enter_modes_and_statistics_on_demand(folder, mixed, study):
-    kept = statistics.with_doubtful(study)
+    kept = statistics.with_flagged(study)
     assert kept["pca"].sizes["shape"] == statistics.outliers(kept).sizes["shape"] == 7
     assert left_out(kept) == []
     assert statistics.generalization(kept, n_points=0).attrs["shapes"] == 7
-    with analyse(mixed, store=folder, keep_doubtful=True, **OPTIONS) as again:
+    with analyse(mixed, store=folder, include_flagged=True, **OPTIONS) as again:
         assert results(again, "pca").identical(results(kept, "pca"))
         assert results(again, "latent").identical(results(study, "latent"))
     analyse(mixed, store=folder, **OPTIONS).close()
@@ -120,26 +120,26 @@ def test_they_enter_modes_and_statistics_on_demand(folder, mixed, study):
 
 def test_a_run_can_stop_at_them_before_its_long_stages(mixed, tmp_path):
     with pytest.raises(
-        ValueError, match=r"(?s)3 of 8 shapes are doubtful.*3 unit: a_metre, corner, z_inch"
+        ValueError, match=r"(?s)3 of 8 shapes are flagged.*3 unit: a_metre, corner, z_inch"
     ):
-        analyse(mixed, store=tmp_path / "study", doubtful="stop", **OPTIONS)
+        analyse(mixed, store=tmp_path / "study", quality_control="stop", **OPTIONS)
     assert not (tmp_path / "study" / "coarse").exists()
-    with pytest.raises(ValueError, match="leave out one of both"):
-        analyse(mixed, doubtful="stop", keep_doubtful=True, **OPTIONS)
+    with pytest.raises(ValueError, match="leave out one of the two"):
+        analyse(mixed, quality_control="stop", include_flagged=True, **OPTIONS)
 
 
 def test_a_doubtful_shape_is_the_template_where_it_is_named(mixed):
     study = analyse(mixed, template="a_metre", **OPTIONS)
     assert study["registration"].attrs["template"] == "a_metre"
     assert left_out(study) == ["z_inch"]
-    assert "a_metre, which was named, is itself doubtful" in study["report"].attrs["remarks"]
+    assert "a_metre, which was named, is itself flagged" in study["report"].attrs["remarks"]
 
 
 def test_where_fewer_than_two_are_beyond_doubt_all_are_treated_alike(good):
     (X, T), (Y, S), (Z, U) = list(good.values())[:3]
     study = analyse({"mm": (X, T), "m": (Y / 1000, S), "km": (Z / 1e6, U)}, **OPTIONS)
     assert study["latent"].sizes["shape"] == 3
-    assert "doubtful" not in study["report"]["status"].values
+    assert "flagged" not in study["report"]["status"].values
 
 
 def test_a_new_shape_is_placed_as_in_the_study_of_the_others(alone, study, good):
@@ -147,7 +147,7 @@ def test_a_new_shape_is_placed_as_in_the_study_of_the_others(alone, study, good)
     a, b = (insert(one, new) for one in (alone, study))
     assert a["pca"]["score"].equals(b["pca"]["score"])
     X, T = good["brain_03"]
-    assert insert(study, {"new": (X / 1000, T)})["report"]["status"].item() == "doubtful"
+    assert insert(study, {"new": (X / 1000, T)})["report"]["status"].item() == "flagged"
 
 
 def test_panels_and_page_mark_them(study):
@@ -155,22 +155,22 @@ def test_panels_and_page_mark_them(study):
     for title in tabs.tabs.titles:
         tabs[title]
     texts = [text for text, _ in tabs["Correspondence"].choice.options]
-    assert {"a_metre (doubtful)", "brain_02"} <= set(texts)
-    assert "beside it, doubtful: a_metre, z_inch" in tabs["Network"].facts.value
+    assert {"a_metre (flagged)", "brain_02"} <= set(texts)
+    assert "beside it, flagged: a_metre, z_inch" in tabs["Network"].facts.value
     tabs["Correspondence"].map.value = "low"
     tabs["Correspondence"].shape = "z_inch"
     assert not tabs["Correspondence"].failed
     tabs.close()
     html = study_html(study)
     assert "scale the files to the unit of the others" in html
-    assert "z_inch (doubtful)" in html
+    assert "z_inch (flagged)" in html
 
 
 def test_the_summary_begins_with_what_to_decide_and_fits_on_a_screen(study):
     lines = tables.run_summary(study, again="s4a run d --out s").splitlines()
-    assert lines[1].startswith("TO DECIDE: 2 of 8 shapes are doubtful")
+    assert lines[1].startswith("TO DECIDE: 2 of 8 shapes are flagged")
     assert lines[2].startswith("  2 unit  a_metre, z_inch  -> scale the files")
-    assert any("s4a run d --out s --keep-doubtful" in line for line in lines)
+    assert any("s4a run d --out s --include-flagged" in line for line in lines)
     assert len(lines) < 40
     assert max(map(len, lines)) <= 100
 
@@ -180,14 +180,14 @@ def test_a_summary_of_many_doubts_long_names_and_long_commands_fits_on_a_screen_
     n = 60
     names = [f"{i:03d}_{'of_a_very_long_name_' * 4}" for i in range(n)]
     kinds = ["unit", "size", "mirrored", "partial", "kind", "duplicate", "registration"]
-    status = np.array(["doubtful", "excluded", "ok"])[np.arange(n) % 3]
+    status = np.array(["flagged", "excluded", "ok"])[np.arange(n) % 3]
     reason = "cannot be read as mesh: one of PLY, OBJ, OFF, STL, VTK, GIFTI expected, found 7 bytes"
     many = report.isel(shape=np.arange(n) % 5).assign_coords(shape=names)
     many = many.assign(
         status=("shape", status),
         reason=("shape", [reason + 40 * " more" if one == "excluded" else "" for one in status]),
         path=("shape", [f"folder/{name}.ply" for name in names]),
-        doubtful_kinds=("shape", [kinds[i % 7] if i % 3 == 0 else "" for i in range(n)]),
+        flag_kinds=("shape", [kinds[i % 7] if i % 3 == 0 else "" for i in range(n)]),
         warning_kinds=("shape", [["genus", "spacing", "dropped"][i % 3] for i in range(n)]),
     ).assign_attrs(remarks="\n".join(9 * ["a remark of many words " * 20]))
     other = study.copy()
@@ -201,5 +201,5 @@ def test_a_summary_of_many_doubts_long_names_and_long_commands_fits_on_a_screen_
         assert max(map(len, text.splitlines())) <= 100
         assert len(text.splitlines()) <= 50
         assert text.count("s4a run 'my scans'") == shown
-        assert ("the same command with --keep-doubtful" in text) != shown
+        assert ("the same command with --include-flagged" in text) != shown
     assert {*names, *reason.split()} <= set(tables.report_table(many).split())

@@ -8,8 +8,8 @@ from paths import DATA
 import s4a
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_normals, volume
 from s4a.input import plausibility
+from s4a.input.chirality import hands, in_file, mirror_image, mirrored_shapes, signs, to_reflect
 from s4a.input.clean import clean
-from s4a.input.hands import hands, in_file, mirror_image, of_other_hand, signs, to_reflect
 from s4a.input.subjects import subjects
 
 NAMES = ["a", "b", "c"]
@@ -52,7 +52,7 @@ def test_signs_are_those_that_agree_with_most_pairs_whatever_their_order():
 
 def test_the_shapes_of_the_rarer_hand_are_found_and_their_evidence_is_clear(handed):
     seen = plausibility.examine(handed, intersections=False)
-    assert of_other_hand(seen) == (["s1", "s4"], [])
+    assert mirrored_shapes(seen) == (["s1", "s4"], [])
     mean = dict(zip(seen, hands(seen), strict=True))
     assert all(abs(one) > 0.8 for one in mean.values())
     assert {name for name, one in mean.items() if one < 0} == {"s1", "s4"}
@@ -60,24 +60,24 @@ def test_the_shapes_of_the_rarer_hand_are_found_and_their_evidence_is_clear(hand
 
 def test_of_as_many_left_as_right_those_stay_that_are_of_the_first_name(handed):
     four = {name: handed[name] for name in ("s0", "s1", "s2", "s4")}
-    assert of_other_hand(plausibility.examine(four, intersections=False)) == (["s1", "s4"], [])
+    assert mirrored_shapes(plausibility.examine(four, intersections=False)) == (["s1", "s4"], [])
 
 
 def test_shapes_that_are_their_own_mirror_image_are_left_and_that_is_said():
     X, T = as_arrays(s4a.synthetic.sphere(400))
     alike = {f"e{i}": as_dataset(X * [10, 20 + i, 30], T) for i in range(4)}
-    names, (remark,) = of_other_hand(plausibility.examine(alike, intersections=False))
+    names, (remark,) = mirrored_shapes(plausibility.examine(alike, intersections=False))
     assert names == []
     assert "mirrored none: the shapes are too like their own mirror images" in remark
 
 
 def test_a_shape_of_weak_evidence_is_named_and_stays(handed):
     seen = plausibility.examine(handed, intersections=False)
-    weak = seen["s4"].assign(hand=0.1 * seen["s4"]["hand"])
-    names, (remark,) = of_other_hand(seen | {"s4": weak})
+    weak = seen["s4"].assign(chirality=0.1 * seen["s4"]["chirality"])
+    names, (remark,) = mirrored_shapes(seen | {"s4": weak})
     assert names == ["s1"]
     assert "cannot tell the hand of s4, which stayed as it is: look at it" in remark
-    assert of_other_hand({"s0": seen["s0"]})[0] == []
+    assert mirrored_shapes({"s0": seen["s0"]})[0] == []
 
 
 @pytest.mark.parametrize(
@@ -113,14 +113,14 @@ def test_all_fifteen_pairs_of_six_femurs_are_told_apart():
     for file in files:
         with np.load(file) as arrays:
             meshes[file.stem] = clean(as_dataset(arrays["V"], arrays["F"]))
-    seen = {name: plausibility.portray(mesh, intersections=False) for name, mesh in meshes.items()}
+    seen = {name: plausibility.describe(mesh, intersections=False) for name, mesh in meshes.items()}
     is_left = {name: name.endswith("_l") for name in seen}
     for name, one in seen.items():
         beside = plausibility.compare(name, one, {n: seen[n] for n in seen if n != name})
         for other in beside["reference"].values.tolist():
-            hand = beside["hand"].sel(reference=other).item()
+            hand = beside["chirality"].sel(reference=other).item()
             assert (hand > 0) == (is_left[name] == is_left[other])
             assert abs(hand) > 1
-    names, remarks = of_other_hand(plausibility.examine(meshes, intersections=False))
+    names, remarks = mirrored_shapes(plausibility.examine(meshes, intersections=False))
     assert names == [name for name in seen if is_left[name]]
     assert remarks == []

@@ -6,7 +6,7 @@ import pytest
 import s4a
 from s4a import synthetic
 from s4a.geometry.mesh import as_arrays, stiffness, vertex_areas
-from s4a.method import lift
+from s4a.method.refined_eigenfunctions import SPARE, refine_eigenfunctions, smooth
 from s4a.method.remesh import laplacian
 from s4a.method.shape import Shape
 from s4a.method.spectral import eigenpairs
@@ -20,7 +20,7 @@ def shape():
     X, _ = as_arrays(mesh)
     X = X * (1 + 0.1 * np.cos(5 * X[:, :1]) * np.sin(4 * X[:, 1:2]))
     mesh = mesh.assign(position=(mesh["position"].dims, X))
-    return mesh, Shape(mesh, s4a.spectrum(s4a.coarsen(mesh, n_coarse=500), k=K + lift.SPARE))
+    return mesh, Shape(mesh, s4a.spectrum(s4a.coarsen(mesh, n_coarse=500), k=K + SPARE))
 
 
 @pytest.fixture(scope="module")
@@ -30,10 +30,10 @@ def exact(shape):
     return *eigenpairs(E, w, area, K), area / area.sum(), stiffness(E, w, len(X))
 
 
-def lifted(shape):
+def with_refined_eigenfunctions(shape):
     mesh, scan = shape
     X, T = as_arrays(mesh)
-    return lift.lift(X, T, vertex_areas(X, T), scan.U, scan.coarse, K)
+    return refine_eigenfunctions(X, T, vertex_areas(X, T), scan.U, scan.coarse, K)
 
 
 def outside(B, Phi, area):
@@ -44,7 +44,7 @@ def outside(B, Phi, area):
 
 def test_lifted_functions_are_eigenfunctions_of_the_mesh_where_projected_ones_are_not(shape, exact):
     eigenvalue, Phi, area, _ = exact
-    found, B = lifted(shape)
+    found, B = with_refined_eigenfunctions(shape)
     _, scan = shape
     projected = scan.U @ scan.coarse["eigenfunction"].values[:, :K]
     assert outside(B.astype(float), Phi, area) < 0.35 * outside(projected, Phi, area)
@@ -56,7 +56,7 @@ def test_lifted_functions_are_eigenfunctions_of_the_mesh_where_projected_ones_ar
 
 def test_lifted_functions_are_orthonormal_and_the_first_is_constant(shape, exact):
     area = exact[2]
-    _, B = lifted(shape)
+    _, B = with_refined_eigenfunctions(shape)
     assert np.allclose(B.T @ (area[:, None] * B), np.eye(K), atol=1e-4)
     assert np.allclose(B[:, 0], 1, atol=1e-4)
 
@@ -64,15 +64,15 @@ def test_lifted_functions_are_orthonormal_and_the_first_is_constant(shape, exact
 def test_the_eigenvalue_of_constants_is_zero_so_that_descriptors_do_not_take_it_for_a_frequency(
     shape,
 ):
-    found, _ = lifted(shape)
+    found, _ = with_refined_eigenfunctions(shape)
     assert found[0] == 0
     assert found[1] > 1
 
 
 def test_the_smoother_damps_what_is_rough_and_enlarges_nothing():
     rates = np.linspace(0, 1, 101)
-    left = lift.smooth(
-        np.diag(rates), np.zeros((101, 1)), np.ones((101, 1)), rounds=4, least=0.05
+    left = smooth(
+        np.diag(rates), np.zeros((101, 1)), np.ones((101, 1)), iterations=4, least=0.05
     ).ravel()
     assert np.abs(left).max() <= 1
     assert np.abs(left[5:]).max() < 0.4
@@ -81,12 +81,12 @@ def test_the_smoother_damps_what_is_rough_and_enlarges_nothing():
 def test_a_mesh_of_obtuse_triangles_is_lifted_too(shape):
     mesh, _ = shape
     flat = mesh.assign(position=mesh["position"] * [1.0, 1.0, 0.15])
-    scan = Shape(flat, s4a.spectrum(s4a.coarsen(flat, n_coarse=500), k=K + lift.SPARE))
+    scan = Shape(flat, s4a.spectrum(s4a.coarsen(flat, n_coarse=500), k=K + SPARE))
     X, T = as_arrays(flat)
     E, w, area, _ = laplacian(X, T, vertex_areas(X, T))
     assert (w < 0).mean() > 0.02
     eigenvalue, _ = eigenpairs(E, w, area, K)
-    found, B = lifted((flat, scan))
+    found, B = with_refined_eigenfunctions((flat, scan))
     assert np.isfinite(B).all()
     assert np.abs(found[1:] / eigenvalue[1:] - 1).max() < 0.01
 
@@ -97,7 +97,7 @@ def test_every_piece_of_a_mesh_keeps_its_constant():
     two = s4a.geometry.mesh.as_dataset(np.r_[X, X + [3, 0, 0]], np.r_[T, T + len(X)])
     scan = Shape(two, s4a.spectrum(s4a.coarsen(two, n_coarse=400), k=12))
     X, T = as_arrays(two)
-    eigenvalue, B = lift.lift(X, T, vertex_areas(X, T), scan.U, scan.coarse, 6)
+    eigenvalue, B = refine_eigenfunctions(X, T, vertex_areas(X, T), scan.U, scan.coarse, 6)
     assert np.allclose(eigenvalue[:2], 0, atol=1e-3)
     assert eigenvalue[2] > 20
     assert np.ptp(B[:1500, :2], axis=0).max() < 1e-3

@@ -1,4 +1,4 @@
-"""Joint rounds: the smoothing of the displacement (4.2, eq. 8 and the line after it), iterated.
+"""Joint iterations: the smoothing of the displacement (4.2, eq. 8 and the line after it), iterated.
 
 The target N carries the match, the source M is searched.  A round moves N onto M with a
 displacement that lives in the first K eigenfunctions of N, then asks for the nearest neighbours in
@@ -7,14 +7,14 @@ coupling both is that of Smooth Shells (Eisenberger, Laehner, Cremers, CVPR 2020
 far apart, every part of N turns on its own before.  All lengths are for surfaces of unit area.
 
 A *warp* (R, t, c) takes N to R x + t + Phi c, with one R (3, 3) and t (3,) for all of N, or one
-for each vertex of low resolution; R is a rotation, after elastic rounds any linear map.
+for each vertex of low resolution; R is a rotation, after elastic iterations any linear map.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 
-from s4a.geometry.align import Motion, rigid_transform
+from s4a.geometry.align import RigidTransform, rigid_transform
 from s4a.geometry.closest import features
 from s4a.geometry.mesh import path_lengths, vertex_normals
 from s4a.method.deform import onto
@@ -68,8 +68,10 @@ def fit_warp(source: Basis, target: Basis, match: Array) -> Warp:
     return onto(target.X[rows], source.X[match], target.area[rows], target.coefficients)
 
 
-def warp_after(source: Basis, target: Basis, match: Array, motion: Motion, ratio: float) -> Warp:
-    """The warp after a given motion instead of a fitted one: eq. 8 and the line after it.
+def warp_after(
+    source: Basis, target: Basis, match: Array, transform: RigidTransform, ratio: float
+) -> Warp:
+    """The warp after a given transform instead of a fitted one: eq. 8 and the line after it.
 
     The source moves by ``ratio R x + t``; what is left to its vertices, matched by the target's
     vertices near coarse ones ``(s,)``, is smoothed.  The warp is that of the target, backwards.
@@ -78,18 +80,18 @@ def warp_after(source: Basis, target: Basis, match: Array, motion: Motion, ratio
     ----------
     source, target : Basis
     match : int ndarray (s,)
-    motion : tuple (R, t)
-        Rigid motion of the source onto the target, between their frames.
+    transform : tuple (R, t)
+        Rigid transform of the source onto the target, between their frames.
     ratio : float
         Size of the source by that of the target; 1 where it is to be taken out.
     """
-    R, t = motion
+    R, t = transform
     moved = ratio * source.X[match] @ R.T + t
     c = target.coefficients(moved - target.X[target.near_coarse])  # (k, 3)
     return R.T / ratio, -R.T @ t / ratio, c @ R / ratio
 
 
-def low_rounds(
+def coarse_spectral_icp(
     source: Basis,
     target: Basis,
     match: Array,
@@ -97,11 +99,11 @@ def low_rounds(
     k_first: int = 30,
     k: int = 100,
     step: int = 5,
-    rounds: int = 2,
+    iterations: int = 2,
     spectral: float = 0.0,
     by_parts: bool = False,
 ) -> tuple[Array, Warp]:
-    """Joint rounds on low-resolution meshes, for K = k_first, k_first + step, ..., k.
+    """Joint iterations on low-resolution meshes, for K = k_first, k_first + step, ..., k.
 
     Parameters
     ----------
@@ -129,7 +131,7 @@ def low_rounds(
         def coefficients(d, Phi=Phi):
             return project(Phi, target.mass, d)  # (K, 3)
 
-        for _ in range(rounds):
+        for _ in range(iterations):
             warp = onto(target.X, source.X[match], target.area, coefficients, spectrum)
             X = move(target, warp)
             if not spectral:
@@ -144,17 +146,17 @@ def low_rounds(
     return match, warp
 
 
-def dense_rounds(
-    source: Basis, target: Basis, warp: Warp, *, rounds: int = 3
+def dense_spectral_icp(
+    source: Basis, target: Basis, warp: Warp, *, iterations: int = 3
 ) -> tuple[Array, Warp]:
-    """Joint rounds at full resolution, on vertices near coarse ones; motions of parts stay.
+    """Joint iterations at full resolution, on vertices near coarse ones; transforms of parts stay.
 
     Parameters
     ----------
     source, target : Basis
         At full resolution.
     warp : tuple (R, t, c)
-        The end of the low rounds.
+        The end of the low iterations.
 
     Returns
     -------
@@ -163,7 +165,7 @@ def dense_rounds(
     """
     match = nearest_vertices(source, target.moved_to(move(target, warp)))
     R, t, _ = warp
-    for _ in range(rounds):
+    for _ in range(iterations):
         if R.ndim == 2:
             warp = fit_warp(source, target, match)
         else:
@@ -190,8 +192,8 @@ def registration_score(
     The round trip goes from a vertex of the target to its match and back to the vertex whose
     registered position (in position and normal) is nearest, measured along the edges of the target
     and cut at `limit`; the gaps are the mean distances of the registered target and the source, at
-    the vertices near coarse ones of each; to them comes ``_landmark_gap``.  Lengths are for unit
-    area.
+    the vertices near coarse ones of each; to them comes ``_landmark_distance``.  Lengths are for
+    unit area.
 
     Stretch of edges is left out: on heads and brains with known warps it prefers maps that move
     nothing.
@@ -208,16 +210,18 @@ def registration_score(
     X, tree = moved.X, moved.tree
     rows = np.arange(len(X))[target.near_coarse]
     back = X[tree.query(source.tree.data[source.near_coarse])[1]]
-    back_gap = np.linalg.norm(source.X[source.near_coarse] - back, axis=1)
+    back_distance = np.linalg.norm(source.X[source.near_coarse] - back, axis=1)
     gap = np.linalg.norm(X[rows] - source.X[match], axis=1)
     n_samples = min(n_samples, len(match))
     sample = target.outwards[np.linspace(0, len(match) - 1, n_samples).astype(int)]
     end = tree.query(source.tree.data[match[sample]])[1]
     trip = path_lengths(target.graph, rows[sample], end, limit)
-    return float(trip.mean() + gap.mean() + back_gap.mean() + _landmark_gap(source, target, X))
+    return float(
+        trip.mean() + gap.mean() + back_distance.mean() + _landmark_distance(source, target, X)
+    )
 
 
-def _landmark_gap(source, target, X):
+def _landmark_distance(source, target, X):
     """Mean distance of the landmarks that both have, the target's vertices at X; 0 without any."""
     at_source, at_target = corresponding_landmarks(source, target)
     if len(at_source) == 0:
@@ -226,7 +230,7 @@ def _landmark_gap(source, target, X):
 
 
 def far_apart(source: Basis, target: Basis, match: Array) -> bool:
-    """Whether poses differ: a tenth of the target lies far from its match after a rigid motion.
+    """Whether poses differ: a tenth of the target lies far from its match after a rigid transform.
 
     Far is 0.035 and 0.4 of the mean spacing 1 / sqrt(n) of the source's vertices, which alone keeps
     matches apart: 0.04 for 6,000.  For nearest neighbours after ICP that tenth lies 0.005 to 0.031
@@ -259,11 +263,11 @@ def candidates(
     *,
     k: int = 100,
     far: float = 0.03,
-    parts: bool = True,
+    articulated: bool = True,
 ) -> dict[str, Candidate]:
-    """Registrations at low resolution: every start as it is, and after joint rounds.
+    """Registrations at low resolution: every start as it is, and after joint iterations.
 
-    From the better start more rounds, with spectral coordinates, are tried: by parts where all
+    From the better start more iterations, with spectral coordinates, are tried: by parts where all
     starts say that the poses are :func:`far_apart`, else in one piece where the best of these still
     scores above `far`, as the shapes then differ much.
 
@@ -273,8 +277,8 @@ def candidates(
         At low resolution.
     starts : dict
         Name -> match (n_target,).
-    parts : bool
-        Whether to try rounds by parts.
+    articulated : bool
+        Whether to try iterations by parts.
 
     Returns
     -------
@@ -288,15 +292,15 @@ def candidates(
         tried[name] = scored(source, target, match, warp)
 
     for name, match in starts.items():
-        enter(f"{name}+joint", *low_rounds(source, target, match, k=k))
+        enter(f"{name}+joint", *coarse_spectral_icp(source, target, match, k=k))
     best = min(starts, key=lambda name: tried[f"{name}+joint"].score)
-    if parts and all(far_apart(source, target, match) for match in starts.values()):
-        end = low_rounds(
-            source, target, starts[best], k_first=20, k=k, rounds=1, spectral=0.2, by_parts=True
+    if articulated and all(far_apart(source, target, match) for match in starts.values()):
+        end = coarse_spectral_icp(
+            source, target, starts[best], k_first=20, k=k, iterations=1, spectral=0.2, by_parts=True
         )
         enter(f"{best}+parts", *end)
     elif min(candidate.score for candidate in tried.values()) > far:
-        end = low_rounds(source, target, starts[best], k=k, spectral=0.1)
+        end = coarse_spectral_icp(source, target, starts[best], k=k, spectral=0.1)
         enter(f"{best}+joint+spectral", *end)
     return tried
 

@@ -14,7 +14,7 @@ from s4a.analysis.inputs import registration_of
 from s4a.analysis.transfer import image_in_shape
 from s4a.geometry.closest import closest_facing_point, interpolate
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas, vertex_normals
-from s4a.input.hands import MIRROR, mirror_image
+from s4a.input.chirality import MIRROR, mirror_image
 from s4a.method.shape import Shape
 from s4a.options import Options
 from s4a.schema import dataset, in_unit, require, unit_of
@@ -22,7 +22,7 @@ from s4a.study.pair import match_shapes, shape_of
 
 log = logging.getLogger(__name__)
 
-ROUNDS = 5  # of the consensus, and of the involution
+ITERATIONS = 5  # of the consensus, and of the involution
 # Mean gap of the involution, of sqrt(area), from which the template is told as asymmetric
 FAR = 0.05
 
@@ -51,7 +51,7 @@ def plane_between(X: np.ndarray, Y: np.ndarray, area: np.ndarray) -> Mirror:
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a_morphometrics.halves import plane_between
+    >>> from s4a_morphometrics.bilateral_pairs import plane_between
     >>> X = np.array([[1.0, 0, 0], [2, 1, 0], [3, 0, 4]])
     >>> abs(plane_between(X, X * [-1, 1, 1], np.ones(3)).normal).round(6).tolist()
     [1.0, 0.0, 0.0]
@@ -78,9 +78,10 @@ def symmetry(study: xr.DataTree) -> xr.Dataset:
     -------
     Dataset
         ``partner_triangle(vertex)`` and ``partner_barycentric(vertex, corner)``, the place of
-        tau(v); ``partner_gap(vertex)``, the distance of tau(tau(v)) and v that is left, in the unit
-        of the input.  Attributes ``gap``, its root mean square over the area as a share of
-        sqrt(area), ``gap_before`` as the registration gave it, and ``badness`` of the registration.
+        tau(v); ``partner_distance(vertex)``, the distance of tau(tau(v)) and v that is left, in the
+        unit of the input.  Attributes ``gap``, its root mean square over the area as a share of
+        sqrt(area), ``gap_before`` as the registration gave it, and ``registration_error`` of the
+        registration.
 
     Examples
     --------
@@ -114,18 +115,18 @@ def symmetry(study: xr.DataTree) -> xr.Dataset:
     attrs = {
         "gap": rms(gap, area) / size,
         "gap_before": rms(gap_before, area) / size,
-        "badness": float(found.attrs["score"]),
+        "registration_error": float(found.attrs["score"]),
     }
-    if max(attrs["gap"], attrs["badness"]) > FAR:
+    if max(attrs["gap"], attrs["registration_error"]) > FAR:
         log.warning(
-            "the template and its mirror image do not lie on each other (badness %.3f, involution "
+            "the template and its mirror image differ (registration error %.3f, involution "
             "to %.3f of sqrt(area)): is it symmetric? Of left and right shapes give subject and "
             "side",
-            attrs["badness"],
+            attrs["registration_error"],
             attrs["gap"],
         )
     result = dataset(attrs, partner_triangle=place[0], partner_barycentric=place[1])
-    result = result.merge(dataset(partner_gap=gap))
+    result = result.merge(dataset(partner_distance=gap))
     return in_unit(result, unit_of(registration["position"]))
 
 
@@ -203,7 +204,7 @@ def involution(
     place, plane = on_surface(P)
     misses = []
     best = place
-    for _ in range(ROUNDS):
+    for _ in range(ITERATIONS):
         there = interpolate(X, T, *place)
         miss = X - interpolate(there, T, *place)  # e = v - tau(tau(v))
         misses.append(np.linalg.norm(miss, axis=1))

@@ -13,7 +13,7 @@ import xarray as xr
 from s4a.input.subjects import listed
 
 MIRROR = np.array([-1.0, 1.0, 1.0])
-COMMON_HAND, OTHER_HAND = 0.8, 0.5  # of the mean of `hand` over the references
+COMMON_SIDE, OTHER_SIDE = 0.8, 0.5  # of the mean of `hand` over the references
 AUTO = "auto"
 MANY = ("they are", "them", "all that are")
 YES, NO = ("1", "1.0", "true", "yes"), ("0", "0.0", "false", "no")
@@ -28,7 +28,7 @@ def mirror_image(mesh: xr.Dataset) -> xr.Dataset:
     --------
     >>> import s4a
     >>> from s4a.geometry.mesh import as_arrays, volume
-    >>> from s4a.input.hands import mirror_image
+    >>> from s4a.input.chirality import mirror_image
     >>> mesh = s4a.synthetic.sphere(100)
     >>> image = mirror_image(mesh)
     >>> bool((image["position"][:, 0] == -mesh["position"][:, 0]).all())
@@ -70,7 +70,7 @@ def hands(evidence: Mapping[str, xr.Dataset]) -> np.ndarray:
     """
     names = list(evidence)
     references = next(iter(evidence.values()))["reference"].values.tolist()
-    hand = np.array([seen["hand"].values for seen in evidence.values()])  # (n, references)
+    hand = np.array([seen["chirality"].values for seen in evidence.values()])  # (n, references)
     of_all = np.full((len(names), len(names)), np.nan)
     place = [names.index(name) for name in references if name in names]
     of_all[:, place] = hand[:, [name in names for name in references]]
@@ -96,7 +96,7 @@ def signs(likeness: np.ndarray) -> np.ndarray:
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a.input.hands import signs
+    >>> from s4a.input.chirality import signs
     >>> signs(np.array([[np.nan, -2, 1], [-2, np.nan, np.nan], [1, -0.1, np.nan]])).tolist()
     [1, -1, 1]
     """
@@ -113,7 +113,7 @@ def _mean(hand):
     return np.where(known, hand, 0).sum(1) / np.maximum(known.sum(1), 1)
 
 
-def of_other_hand(evidence: Mapping[str, xr.Dataset]) -> tuple[list[str], list[str]]:
+def mirrored_shapes(evidence: Mapping[str, xr.Dataset]) -> tuple[list[str], list[str]]:
     """The shapes that ``reflect="auto"`` mirrors: those of the rarer hand; and what is told.
 
     Returns
@@ -125,29 +125,27 @@ def of_other_hand(evidence: Mapping[str, xr.Dataset]) -> tuple[list[str], list[s
     """
     if len(evidence) < 2:
         return [], ["reflect='auto' needs two shapes or more to hold against each other"]
-    return of_rarer_hand(dict(zip(evidence, hands(evidence).tolist(), strict=True)))
+    return rarer_side(dict(zip(evidence, hands(evidence).tolist(), strict=True)))
 
 
-def of_rarer_hand(hand: Mapping[str, float]) -> tuple[list[str], list[str]]:
+def rarer_side(hand: Mapping[str, float]) -> tuple[list[str], list[str]]:
     """Those of the rarer hand, by :func:`hands` of each, and what is told."""
     clear = float(np.median(np.abs(list(hand.values()))))
-    if clear < COMMON_HAND:
+    if clear < COMMON_SIDE:
         return [], [
             "reflect='auto' mirrored none: the shapes are too like their own mirror images to tell "
-            f"(mean hand {clear:.2f}, {COMMON_HAND} needed); name those to mirror"
+            f"(mean hand {clear:.2f}, {COMMON_SIDE} needed); name those to mirror"
         ]
-    weak = [name for name, one in hand.items() if abs(one) < OTHER_HAND]
+    weak = [name for name, one in hand.items() if abs(one) < OTHER_SIDE]
     they, them, which = ("it is", "it", "it if it is") if len(weak) == 1 else MANY
     remark = (
         f"reflect='auto' cannot tell the hand of {listed(weak, most=20)}, which stayed as {they}: "
         f"look at {them}, and name {which} to be mirrored"
     )
-    return [name for name, one in hand.items() if one <= -OTHER_HAND], [remark] * bool(weak)
+    return [name for name, one in hand.items() if one <= -OTHER_SIDE], [remark] * bool(weak)
 
 
-def is_of_other_hand(
-    name: str, look: xr.Dataset, known: Mapping[str, xr.Dataset]
-) -> tuple[bool, str]:
+def is_mirrored(name: str, look: xr.Dataset, known: Mapping[str, xr.Dataset]) -> tuple[bool, str]:
     """Whether one shape is of the rarer hand beside others, and what is told where it is not known.
 
     Parameters
@@ -160,17 +158,17 @@ def is_of_other_hand(
     """
     *others, own = hands({**known, "": look})
     common = float(np.median(np.abs(others)))
-    if common < COMMON_HAND:
+    if common < COMMON_SIDE:
         return False, (
             f"reflect='auto' left {name} as it is: the shapes of the study are too like their own "
-            f"mirror images to tell (mean hand {common:.2f}, {COMMON_HAND} needed)"
+            f"mirror images to tell (mean hand {common:.2f}, {COMMON_SIDE} needed)"
         )
-    if abs(own) < OTHER_HAND:
+    if abs(own) < OTHER_SIDE:
         return False, (
             f"reflect='auto' cannot tell the hand of {name}, which stayed as it is: look at it, "
             "and name it if it is to be mirrored"
         )
-    return bool(own <= -OTHER_HAND), ""
+    return bool(own <= -OTHER_SIDE), ""
 
 
 def to_reflect(reflect: str, names: Sequence[str], table: xr.Dataset | None) -> list[str]:
@@ -194,7 +192,7 @@ def to_reflect(reflect: str, names: Sequence[str], table: xr.Dataset | None) -> 
 
     Examples
     --------
-    >>> from s4a.input.hands import to_reflect
+    >>> from s4a.input.chirality import to_reflect
     >>> from s4a.input.subjects import subjects
     >>> table = subjects({"side": ["left", "right"]}, ["a", "b"])
     >>> to_reflect("side=left", ["a", "b"], table), to_reflect("b", ["a", "b"], None)

@@ -1,4 +1,4 @@
-"""Joint refinement and displacement (eq. 8): planted deformations, and the score of a match."""
+"""Joint refinement and displacement (eq. 8): simulated deformations, and the score of a match."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from s4a import coarsen, spectrum, synthetic
 from s4a.geometry.mesh import as_arrays, vertex_areas, vertex_normals
-from s4a.method import deform, joint
+from s4a.method import deform, spectral_icp
 from s4a.method.shape import Shape
 
 
@@ -35,9 +35,9 @@ def moved(surface, X):
 
 def test_the_joint_rounds_leave_the_identity_alone(surface):
     every = np.arange(len(surface.X))
-    match, motion = joint.low_rounds(surface, surface, every, k=60)
+    match, transform = spectral_icp.coarse_spectral_icp(surface, surface, every, k=60)
     assert (match == every).all()
-    assert joint.move(surface, motion) == pytest.approx(surface.X, abs=1e-12)
+    assert spectral_icp.move(surface, transform) == pytest.approx(surface.X, abs=1e-12)
 
 
 @pytest.mark.parametrize("spectral_weight", [0.0, 0.1])
@@ -46,8 +46,10 @@ def test_a_planted_deformation_is_recovered_and_far_better_than_by_nearest_neigh
 ):
     source = moved(surface, surface.X + bumps(surface.X))
     start = cKDTree(source.X).query(surface.X)[1]
-    match, motion = joint.low_rounds(source, surface, start, k=60, spectral=spectral_weight)
-    error = np.linalg.norm(joint.move(surface, motion) - source.X, axis=1).mean()
+    match, transform = spectral_icp.coarse_spectral_icp(
+        source, surface, start, k=60, spectral=spectral_weight
+    )
+    error = np.linalg.norm(spectral_icp.move(surface, transform) - source.X, axis=1).mean()
     nearest = np.linalg.norm(source.X[start] - source.X, axis=1).mean()
     assert nearest > 0.015
     assert error < 0.005
@@ -58,7 +60,9 @@ def test_a_planted_deformation_is_recovered_and_far_better_than_by_nearest_neigh
 def test_a_rigid_motion_is_recovered_exactly_without_any_deformation(surface):
     R = Rotation.from_rotvec([0.3, 0.2, -0.1]).as_matrix()
     source = moved(surface, surface.X @ R.T + 0.2)
-    _, (found, t, c) = joint.low_rounds(source, surface, np.arange(len(surface.X)), k=40)
+    _, (found, t, c) = spectral_icp.coarse_spectral_icp(
+        source, surface, np.arange(len(surface.X)), k=40
+    )
     assert found == pytest.approx(R, abs=1e-9)
     assert t == pytest.approx([0.2] * 3, abs=1e-9)
     assert np.abs(c).max() < 1e-9
@@ -68,9 +72,11 @@ def test_the_dense_rounds_keep_a_planted_deformation_of_the_span(surface):
     c = np.zeros((60, 3))
     c[4:12] = np.random.default_rng(0).normal(0, 0.008, (8, 3))
     source = moved(surface, surface.X + surface.Phi @ c)
-    match, motion = joint.dense_rounds(source, surface, (np.eye(3), np.zeros(3), 0.9 * c))
+    match, transform = spectral_icp.dense_spectral_icp(
+        source, surface, (np.eye(3), np.zeros(3), 0.9 * c)
+    )
     assert (match == np.arange(len(match))).mean() > 0.95
-    assert np.linalg.norm(joint.move(surface, motion) - source.X, axis=1).mean() < 2e-3
+    assert np.linalg.norm(spectral_icp.move(surface, transform) - source.X, axis=1).mean() < 2e-3
 
 
 def test_a_wrong_match_scores_worse_than_a_right_one(surface):
@@ -79,8 +85,8 @@ def test_a_wrong_match_scores_worse_than_a_right_one(surface):
 
     def score(match):
         warp = deform.onto(surface.X, source.X[match], surface.area, surface.coefficients)
-        return joint.registration_score(
-            source, surface, match, surface.moved_to(joint.move(surface, warp))
+        return spectral_icp.registration_score(
+            source, surface, match, surface.moved_to(spectral_icp.move(surface, warp))
         )
 
     right = score(every)
@@ -93,15 +99,15 @@ def test_the_finalists_are_the_candidates_of_least_score(surface):
     source = moved(surface, surface.X + bumps(surface.X))
     near = cKDTree(source.X).query(surface.X)[1]
     bad = np.zeros(len(near), int)
-    found = joint.candidates(source, surface, {"bad": bad, "icp": near}, k=60)
+    found = spectral_icp.candidates(source, surface, {"bad": bad, "icp": near}, k=60)
     assert {"bad", "icp", "bad+joint", "icp+joint"} <= set(found)
-    name, *others = joint.finalists(found, margin=1.25)
+    name, *others = spectral_icp.finalists(found, margin=1.25)
     assert name == "icp+joint"
-    score, match, motion = found[name]
+    score, match, transform = found[name]
     assert score == min(s for s, *_ in found.values())
     assert all(found[other][0] <= 1.25 * score for other in others)
     assert "bad" not in others
-    assert np.linalg.norm(joint.move(surface, motion) - source.X, axis=1).mean() < 0.005
+    assert np.linalg.norm(spectral_icp.move(surface, transform) - source.X, axis=1).mean() < 0.005
     assert len(match) == len(surface.X)
 
 

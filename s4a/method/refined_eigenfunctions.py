@@ -20,12 +20,12 @@ from s4a.method.spectral import factor, spectrum, with_constant_first
 from s4a.schema import Array, dataset
 
 SPARE = 10  # functions more than are asked for: the last ones of a span are the least exact
-ROUNDS = 4  # of the smoother
+ITERATIONS = 4  # of the smoother
 LEAST = 0.05  # it acts in LEAST..1 of its spectrum 0..1; below the coarse mesh does
 
 
 def smooth(
-    S: sp.csr_matrix, R: Array, B: Array, rounds: int = ROUNDS, least: float = LEAST
+    S: sp.csr_matrix, R: Array, B: Array, iterations: int = ITERATIONS, least: float = LEAST
 ) -> Array:
     """Chebyshev iteration for S B = R ``(n, k)``, with eigenvalues of S in 0..1, from B.
 
@@ -34,8 +34,8 @@ def smooth(
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a.method.lift import smooth
-    >>> B = smooth(np.eye(2), np.ones((2, 1)), np.zeros((2, 1)), rounds=9, least=0.5)
+    >>> from s4a.method.refined_eigenfunctions import smooth
+    >>> B = smooth(np.eye(2), np.ones((2, 1)), np.zeros((2, 1)), iterations=9, least=0.5)
     >>> B.round(6).ravel().tolist()
     [1.0, 1.0]
     """
@@ -43,7 +43,7 @@ def smooth(
     ratio = half / middle
     step = (R - S @ B) / np.float32(middle)
     B = B + step
-    for _ in range(rounds - 1):
+    for _ in range(iterations - 1):
         last, ratio = ratio, 1 / (2 * middle / half - ratio)
         rest = S @ B
         np.subtract(R, rest, out=rest)  # in place: the arrays are those of the full resolution
@@ -102,7 +102,7 @@ def _rayleigh_ritz(W, area, B, k):
     return eigenvalue[:k], B @ V[:, :k].astype(B.dtype)
 
 
-def lift(
+def refine_eigenfunctions(
     X: Array, T: Array, area: Array, U: sp.csr_matrix, coarse: xr.Dataset, k: int
 ) -> tuple[Array, Array]:
     """The first k eigenfunctions of a mesh, nearly, from k or more of its coarse mesh.
@@ -128,12 +128,12 @@ def lift(
     >>> import numpy as np
     >>> import s4a
     >>> from s4a.geometry.mesh import as_arrays, vertex_areas
-    >>> from s4a.method.lift import lift
+    >>> from s4a.method.refined_eigenfunctions import refine_eigenfunctions
     >>> from s4a.method.shape import Shape
     >>> ball = s4a.synthetic.sphere(2000)
     >>> shape = Shape(ball, s4a.spectrum(s4a.coarsen(ball, n_coarse=300), k=16))
     >>> X, T = as_arrays(ball)
-    >>> eigenvalue, _ = lift(X, T, vertex_areas(X, T), shape.U, shape.coarse, 9)
+    >>> eigenvalue, _ = refine_eigenfunctions(X, T, vertex_areas(X, T), shape.U, shape.coarse, 9)
     >>> (eigenvalue / (4 * np.pi)).round(1).tolist()
     [0.0, 2.0, 2.0, 2.0, 6.0, 6.0, 6.0, 6.0, 6.0]
     """
@@ -154,8 +154,8 @@ def lift(
     return np.maximum(eigenvalue, 0.0), B
 
 
-def lifted(mesh: xr.Dataset, low: xr.Dataset, k: int) -> xr.Dataset:
-    """A low-resolution mesh with k functions of :func:`lift`, at coarse vertices and at all.
+def with_refined_eigenfunctions(mesh: xr.Dataset, low: xr.Dataset, k: int) -> xr.Dataset:
+    """Low-resolution mesh with k refined eigenfunctions, at coarse and at all vertices.
 
     They are orthonormal for the areas of the low-resolution mesh, as ZoomOut needs it.
 
@@ -170,12 +170,12 @@ def lifted(mesh: xr.Dataset, low: xr.Dataset, k: int) -> xr.Dataset:
     Returns
     -------
     Dataset
-        `low` with ``eigenvalue(mode)`` and ``eigenfunction(vertex, mode)`` in the place of its own,
-        and ``lifted_eigenfunction(original_vertex, mode)``.
+        `low` with ``eigenvalue(eigenpair)`` and ``eigenfunction(vertex, eigenpair)`` in the place
+        of its own, and ``refined_eigenfunction(original_vertex, eigenpair)``.
     """
     shape = Shape(mesh, low)
     X, T = as_arrays(mesh)
-    eigenvalue, B = lift(X, T, vertex_areas(X, T), shape.U, low, k)  # (n, k)
+    eigenvalue, B = refine_eigenfunctions(X, T, vertex_areas(X, T), shape.U, low, k)  # (n, k)
     vertex = low["sample_vertex"].values.copy()
     cell, nearest = np.unique(shape.cell, return_index=True)
     # the centres of closed openings are no vertices: the first of their cells stands for them
@@ -186,7 +186,7 @@ def lifted(mesh: xr.Dataset, low: xr.Dataset, k: int) -> xr.Dataset:
     turn = np.linalg.inv(np.linalg.cholesky(Phi.T @ (area[:, None] * Phi))).T
     B = B @ turn.astype(B.dtype)
     functions = dataset(
-        eigenvalue=eigenvalue, eigenfunction=B[vertex].astype(float), lifted_eigenfunction=B
+        eigenvalue=eigenvalue, eigenfunction=B[vertex].astype(float), refined_eigenfunction=B
     )
     mesh_alone = low.drop_vars(["eigenvalue", "eigenfunction"])
     return mesh_alone.merge(functions).assign_attrs(low.attrs)
@@ -198,23 +198,23 @@ def low_resolution(
     method: str = "rematch",
     n_coarse: int = 6000,
     k: int = 100,
-    lift: bool = False,
+    refined_eigenfunctions: bool = False,
     wrap: bool = False,
     seed: int = 0,
 ) -> xr.Dataset:
     """The low-resolution mesh with its functions: :func:`s4a.coarsen`, :func:`s4a.spectrum`.
 
-    With `lift` also :func:`lifted`.  With ``method="scalable"`` :func:`s4a.method.scalable.reduced`
-    is in their place, which can neither be lifted nor wrapped.  Of landmarks that guide it has
-    ``guide_vertex``, the coarse vertices that weigh most in U there; of fields that guide their
-    means by the weights of U.
+    With `refined_eigenfunctions` also :func:`with_refined_eigenfunctions`.  With
+    ``method="scalable"`` :func:`s4a.method.scalable.reduced` is in their place, which can neither
+    be lifted nor wrapped.  Of landmarks that guide it has ``guide_vertex``, the coarse vertices
+    that weigh most in U there; of fields that guide their means by the weights of U.
     """
     if method == "scalable":
         low = reduced(mesh, n_coarse=n_coarse, k=k, seed=seed)
     else:
         coarse = coarsen(mesh, n_coarse=n_coarse, wrap=wrap, seed=seed)
-        low = spectrum(coarse, k=k + SPARE) if lift else spectrum(coarse, k=k)
-        low = lifted(mesh, low, k) if lift else low
+        low = spectrum(coarse, k=k + SPARE) if refined_eigenfunctions else spectrum(coarse, k=k)
+        low = with_refined_eigenfunctions(mesh, low, k) if refined_eigenfunctions else low
     shape, landmarks, fields = Shape(mesh, low), vertices_of_landmarks(mesh), features_of(mesh)
     if landmarks:
         vertex = shape.cell[list(landmarks.values())]

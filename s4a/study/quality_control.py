@@ -10,127 +10,131 @@ import numpy as np
 import xarray as xr
 
 from s4a.geometry.crossing import can_count
-from s4a.input.plausibility import Doubts, doubt, doubtful_lines, find_warnings, pick_references
+from s4a.input.plausibility import Flags, find_warnings, flag, flagged_lines, pick_references
 from s4a.options import Options
 from s4a.study.netcdf import arrays, attributes, open_file, read
 from s4a.study.runner import Keys, Run, Task
 from s4a.study.store import task_key
 from s4a.study.tasks import compare_shape, portray_shape
 
-# badness: of one kind 0.02 to 0.03, in far poses 0.01 to 0.03, of a cat and a man 0.14 to 0.16
-DOUBTFUL = 0.06
-# badness times mean |distortion|: of pairs of bodies and cats that are right 0.0002 to 0.005, of
-# those that failed 0.0033 to 0.08 (docs/plausibility.md)
+# registration_error: of one kind 0.02 to 0.03, in far poses 0.01 to 0.03, of a cat and a man 0.14
+# to 0.16
+FLAGGED = 0.06
+# registration_error times mean |distortion|: of pairs of bodies and cats that are right 0.0002 to
+# 0.005, of those that failed 0.0033 to 0.08 (docs/plausibility.md)
 WRONG, UNSURE = 0.0065, 0.004
 # and times the median of the collection, as coarse meshes raise the product of all shapes
 WRONG_BESIDE, UNSURE_BESIDE = 2.0, 1.5
 
 
-def check_plausibility(
-    run: Run, original: Keys, options: Options
-) -> tuple[Keys, Doubts, list[str]]:
+def check_plausibility(run: Run, original: Keys, options: Options) -> tuple[Keys, Flags, list[str]]:
     """What looks wrong with each shape beside the others, and with all of them.
 
     Returns
     -------
     original : dict of str to str
         Keys of the shapes that could be compared.
-    doubts : dict of str to list of Doubt
+    flags : dict of str to list of Doubt
     remarks : list of str
     """
     if len(original) < 2:
         return original, {}, []
     attrs = {n: attributes(run.folder / f"original/{n}.nc") for n in original}
-    looks = looks_of(run, original, options)
+    looks = comparisons_of(run, original, options)
     return {n: original[n] for n in looks}, *find_warnings({n: attrs[n] for n in looks}, looks)
 
 
-def looks_of(run: Run, original: Keys, options: Options) -> dict[str, xr.Dataset]:
+def comparisons_of(run: Run, original: Keys, options: Options) -> dict[str, xr.Dataset]:
     """What :func:`s4a.input.plausibility.compare` sees in each shape that could be compared."""
     # how they are counted is part of the key: by PyMeshLab, as once, they were others
     settings = (can_count(options.intersections),)
     counted = ("exactly",) if settings[0] else settings
     todo = [
-        Task(n, f"network/sketch_{n}.nc", portray_shape, (run.folder, n, *settings), (key, counted))
+        Task(
+            n,
+            f"network/descriptor_{n}.nc",
+            portray_shape,
+            (run.folder, n, *settings),
+            (key, counted),
+        )
         for n, key in original.items()
     ]
-    sketches = run.do("sketch", todo)
-    references = references_of(run, sketches, options.k)
-    reference_key = task_key(*(sketches[n] for n in references))
+    descriptors = run.do("descriptor", todo)
+    references = references_of(run, descriptors, options.k)
+    reference_key = task_key(*(descriptors[n] for n in references))
     todo = [
         Task(
             n,
-            f"network/look_{n}.nc",
+            f"network/comparison_{n}.nc",
             compare_shape,
             (run.folder, n, references),
             (reference_key, key),
         )
-        for n, key in sketches.items()
+        for n, key in descriptors.items()
     ]
     compared = run.do("compare", todo)
-    return {name: of_look(run, name) for name in compared}
+    return {name: comparison_of(run, name) for name in compared}
 
 
-def references_of(run: Run, sketches: Keys, k: int) -> list[str]:
+def references_of(run: Run, descriptors: Keys, k: int) -> list[str]:
     """The shapes beside which all are seen: of usual form, fine enough for k."""
-    vertices = {n: open_file(run.folder / f"original/{n}.nc").sizes["vertex"] for n in sketches}
+    vertices = {n: open_file(run.folder / f"original/{n}.nc").sizes["vertex"] for n in descriptors}
     least = usable_k(list(vertices.values()), k)
-    fine = [name for name in sketches if vertices[name] >= least]
-    portraits = {n: read(run.folder / f"network/sketch_{n}.nc") for n in fine or sketches}
-    return pick_references(portraits)
+    fine = [name for name in descriptors if vertices[name] >= least]
+    return pick_references(
+        {n: read(run.folder / f"network/descriptor_{n}.nc") for n in fine or descriptors}
+    )
 
 
-def of_look(run: Run, name: str) -> xr.Dataset:
+def comparison_of(run: Run, name: str) -> xr.Dataset:
     """What :func:`s4a.input.plausibility.compare` saw in a shape."""
-    return read(run.folder / f"network/look_{name}.nc")
+    return read(run.folder / f"network/comparison_{name}.nc")
 
 
-def stop_at_doubts(doubts: Doubts, options: Options) -> None:
-    """ValueError where a shape is doubtful and the run shall stop at that."""
-    if options.doubtful != "stop":
+def stop_if_flagged(flags: Flags, options: Options) -> None:
+    """ValueError where a shape is flagged and the run shall stop at that."""
+    if options.quality_control != "stop":
         return
     kinds = {
-        name: " ".join(dict.fromkeys(doubt.kind for doubt in of_shape if doubt.doubtful))
-        for name, of_shape in doubts.items()
+        name: " ".join(dict.fromkeys(flag.kind for flag in of_shape if flag.flagged))
+        for name, of_shape in flags.items()
         if name != options.template
     }
     kinds = {name: words for name, words in kinds.items() if words}
     if kinds:
-        lines = "\n".join(f"  {line}" for line in doubtful_lines(kinds))
+        lines = "\n".join(f"  {line}" for line in flagged_lines(kinds))
         raise ValueError(
-            f"{len(kinds)} of {len(doubts)} shapes are doubtful, and doubtful='stop' ends the run "
-            f"before its long stages:\n{lines}\nmend these files or take them away, "
-            "or give doubtful='apart' to go on with these shapes beside the others"
+            f"{len(kinds)} of {len(flags)} shapes are flagged, and quality_control='stop' ends the "
+            f"run before its long stages:\n{lines}\nrepair or remove these files, or pass "
+            "quality_control='exclude' to exclude them from the network"
         )
 
 
-def set_apart(
-    run: Run, coarse: Keys, doubts: Doubts, options: Options
-) -> tuple[Doubts, Keys, Keys, list[str]]:
-    """The shapes that make the network, and the doubtful ones, which stand apart from it.
+def exclude_flagged(
+    run: Run, coarse: Keys, flags: Flags, options: Options
+) -> tuple[Flags, Keys, Keys, list[str]]:
+    """The shapes that make the network, and the flagged ones, which stand apart from it.
 
     Those with fewer eigenfunctions than most others are left out.  Where fewer than two are beyond
-    doubt, none is doubtful: there is nothing to hold them against.
+    flag, none is flagged: there is nothing to hold them against.
 
     Returns
     -------
-    doubts : dict of str to list of Doubt
+    flags : dict of str to list of Doubt
     coarse, apart : dict of str to str
         Keys of the low-resolution meshes of both.
     remarks : list of str
     """
     count = {n: len(arrays(run.folder / f"coarse/{n}.nc", "eigenvalue")[0]) for n in coarse}
     named = options.template  # who names a template trusts it
-    is_doubtful = {n: any(doubt.doubtful for doubt in doubts.get(n, [])) for n in coarse}
-    sure = [n for n in coarse if n == named or not is_doubtful[n]]
+    is_flagged = {n: any(flag.flagged for flag in flags.get(n, [])) for n in coarse}
+    sure = [n for n in coarse if n == named or not is_flagged[n]]
     remarks = []
     if len(sure) < 2:
-        doubts = {
-            n: [doubt._replace(doubtful=False) for doubt in doubts.get(n, [])] for n in doubts
-        }
+        flags = {n: [flag._replace(flagged=False) for flag in flags.get(n, [])] for n in flags}
         if len(coarse) > 1:
             remarks = [
-                f"{len(coarse) - len(sure)} of {len(coarse)} shapes are doubtful, and fewer than "
+                f"{len(coarse) - len(sure)} of {len(coarse)} shapes are flagged, and fewer than "
                 "two are not: all are treated alike"
             ]
         sure = list(coarse)
@@ -145,7 +149,7 @@ def set_apart(
     network = {n: coarse[n] for n in sure if count[n] >= k}
     apart = {n: coarse[n] for n in coarse if n not in sure and count[n] >= k}
     check_usable(run, network, options)
-    return doubts, network, apart, remarks
+    return flags, network, apart, remarks
 
 
 def usable_k(counts: Sequence[int], k: int) -> int:
@@ -156,7 +160,7 @@ def usable_k(counts: Sequence[int], k: int) -> int:
 
     Examples
     --------
-    >>> from s4a.study.doubts import usable_k
+    >>> from s4a.study.quality_control import usable_k
     >>> usable_k([100, 100, 2], 100), usable_k([58, 2, 48, 62], 100)
     (100, 48)
     """
@@ -179,26 +183,26 @@ def check_usable(run: Run, coarse: Keys, options: Options) -> None:
         raise ValueError(f"template {options.template!r} cannot be used: {why}")
 
 
-def doubt_registrations(run: Run, registered: Keys, placed: Keys) -> tuple[Doubts, list[str]]:
-    """What is doubtful of the registrations within the network."""
+def check_registrations(run: Run, registered: Keys, placed: Keys) -> tuple[Flags, list[str]]:
+    """What is flagged of the registrations within the network."""
     names = [name for name in registered if name not in placed]
     files = {name: run.folder / f"registration/{name}.nc" for name in names}
-    badness = {name: attributes(file)["score"] for name, file in files.items()}
+    registration_error = {name: attributes(file)["score"] for name, file in files.items()}
     distortion = {
         name: float(np.abs(arrays(file, "distortion")[0]).mean()) for name, file in files.items()
     }
-    return doubtful(badness, distortion)
+    return flagged(registration_error, distortion)
 
 
-def doubtful(
-    badness: dict[str, float], distortion: dict[str, float] | None = None
-) -> tuple[Doubts, list[str]]:
-    """Doubts about the shapes whose registration scores badly, or for all of them.
+def flagged(
+    registration_error: dict[str, float], distortion: dict[str, float] | None = None
+) -> tuple[Flags, list[str]]:
+    """Flags about the shapes whose registration scores badly, or for all of them.
 
     Parameters
     ----------
-    badness : dict of str to float
-        See :func:`s4a.method.joint.registration_score`.
+    registration_error : dict of str to float
+        See :func:`s4a.method.spectral_icp.registration_score`.
     distortion : dict of str to float, optional
         Mean size of the distortion.  A wrong map both misses the surface and distorts: the product
         is told where neither number alone is.
@@ -208,32 +212,38 @@ def doubtful(
     of_shapes : dict of str to list of Doubt
         Of the kind ``registration``; only names that have one.
     of_all : list of str
-        In place of the former where most shapes are doubtful: then the template or the options are.
+        In place of the former where most shapes are flagged: then the template or the options are.
 
     Examples
     --------
-    >>> from s4a.study.doubts import doubtful
-    >>> of_shapes, of_all = doubtful({"template": 0.0, "good": 0.02, "wrong": 0.12})
+    >>> from s4a.study.quality_control import flagged
+    >>> of_shapes, of_all = flagged({"template": 0.0, "good": 0.02, "wrong": 0.12})
     >>> list(of_shapes), of_all
     (['wrong'], [])
     """
     distortion = distortion or {}
-    product = {name: score * distortion.get(name, 0.0) for name, score in badness.items()}
+    product = {
+        name: score * distortion.get(name, 0.0) for name, score in registration_error.items()
+    }
     usual = float(np.median([one for one in product.values() if one > 0] or [0.0]))
     far, near = max(WRONG, WRONG_BESIDE * usual), max(UNSURE, UNSURE_BESIDE * usual)
-    wrong = {n: score for n, score in badness.items() if score > DOUBTFUL or product[n] > far}
-    if len(badness) > 2 and len(wrong) > len(badness) / 2:
+    wrong = {
+        n: score for n, score in registration_error.items() if score > FLAGGED or product[n] > far
+    }
+    if len(registration_error) > 2 and len(wrong) > len(registration_error) / 2:
         return {}, [
-            f"{len(wrong)} of {len(badness)} registrations are doubtful "
-            f"(badness {min(wrong.values()):.3f} to {max(wrong.values()):.3f}): "
+            f"{len(wrong)} of {len(registration_error)} registrations are flagged "
+            f"(registration_error {min(wrong.values()):.3f} to {max(wrong.values()):.3f}): "
             "try another template, a larger n_coarse or k"
         ]
-    found: Doubts = {}
-    for name, score in badness.items():
+    found: Flags = {}
+    for name, score in registration_error.items():
         if name not in wrong and product[name] <= near:
             continue
         sure = "probably" if name in wrong else "maybe, in places,"
         also = f", mean |distortion| {distortion[name]:.2f}" if name in distortion else ""
-        said = doubt("registration", name in wrong, sure=sure, badness=score, distortion=also)
+        said = flag(
+            "registration", name in wrong, sure=sure, registration_error=score, distortion=also
+        )
         found[name] = [said]
     return found, []

@@ -12,10 +12,10 @@ import numpy as np
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
-from s4a.geometry.align import Motion, align, farthest_points, realign, rigid_transform
+from s4a.geometry.align import RigidTransform, align, farthest_points, realign, rigid_transform
 from s4a.geometry.closest import POSITION_WEIGHT
 from s4a.geometry.mesh import edges
-from s4a.method import fmap, joint
+from s4a.method import fmap, spectral_icp
 from s4a.method.shape import Basis, common_fields, corresponding_landmarks, field_columns
 from s4a.options import check
 from s4a.schema import Array
@@ -33,18 +33,18 @@ SHORT = 60  # functions of the short ZoomOut that a map is scored after
 _FOUND = 0.07  # score at which the search ends; of wrong maps between bodies it is 0.11 or more
 
 
-class _FirstMap(NamedTuple):
-    """A first map of a directed pair, and what it was made of."""
+class _InitialMap(NamedTuple):
+    """An initial map of a directed pair, and what it was made of."""
 
-    name: str  # "dense", "landmarks", or of far poses that of best_first_map
+    name: str  # "dense", "landmarks", or of far poses that of best_initial_map
     C: Array  # (k_init, k_init)
     fitted: Array  # (k_init, k_init), before the step of ZoomOut ahead
-    near: Array  # (n_target,), nearest neighbours in space after the motion
+    near: Array  # (n_target,), nearest neighbours in space after the transform
     landmarks: tuple[Array, Array] | None  # of source and target, where it was fitted so
 
 
-def motion_onto(source: Basis, target: Basis) -> Motion:
-    """Rigid motion (R, t) of the source onto the target by ICP (4.1, step 2).
+def transform_onto(source: Basis, target: Basis) -> RigidTransform:
+    """Rigid transform (R, t) of the source onto the target by ICP (4.1, step 2).
 
     It begins where landmarks say, if both have three or more that do not lie on one line.
     """
@@ -57,12 +57,12 @@ def motion_onto(source: Basis, target: Basis) -> Motion:
     return realign(source.cloud, target.cloud, (R, t))
 
 
-def nearest_after_motion(source: Basis, target: Basis, motion: Motion) -> Array:
+def nearest_after_alignment(source: Basis, target: Basis, transform: RigidTransform) -> Array:
     """The vertex of the moved source nearest to every vertex of the target ``(n_target,)``.
 
     Nearest in position and in the fields that guide both.
     """
-    R, t = motion
+    R, t = transform
     P, Q = source.X @ R.T + t, target.X
     names = common_fields(source, target)
     if names:
@@ -71,64 +71,64 @@ def nearest_after_motion(source: Basis, target: Basis, motion: Motion) -> Array:
     return cKDTree(P).query(Q)[1]
 
 
-def landmarks_after_motion(X: Array, Y: Array, motion: Motion) -> tuple[Array, Array]:
+def landmarks_after_alignment(X: Array, Y: Array, transform: RigidTransform) -> tuple[Array, Array]:
     """Step 3: ten spread vertices of the source, and the vertices of the target nearest to them.
 
     Parameters
     ----------
     X, Y : float ndarray (n_source, 3), (n_target, 3)
         Vertices of source and target.
-    motion : tuple (R, t)
-        Rigid motion of the source onto the target.
+    transform : tuple (R, t)
+        Rigid transform of the source onto the target.
     """
-    R, t = motion
+    R, t = transform
     landmark = farthest_points(X, N_LANDMARKS)
     return landmark, cKDTree(Y).query(X[landmark] @ R.T + t)[1]
 
 
-def fit_after_motion(
-    source: Basis, target: Basis, motion: Motion, *, k_init: int, init: str, near: Array
+def fit_after_alignment(
+    source: Basis, target: Basis, transform: RigidTransform, *, k_init: int, init: str, near: Array
 ) -> tuple[Array, tuple[Array, Array] | None]:
     """The map as it is fitted, and with ``init="landmarks"`` the landmarks of both."""
     M, N = source.first(k_init), target.first(k_init)
     if init == "dense":
         return fmap.fmap_from_match(M.Phi, N.Phi, N.mass, near), None
-    landmarks = landmarks_after_motion(M.X, N.X, motion)
+    landmarks = landmarks_after_alignment(M.X, N.X, transform)
     return fmap.fmap_from_landmarks(M, N, *landmarks), landmarks
 
 
-def map_after_motion(
+def map_after_alignment(
     source: Basis,
     target: Basis,
-    motion: Motion,
+    transform: RigidTransform,
     *,
     k_init: int = 20,
     init: str = "dense",
-    ahead: bool = True,
-    n_spread: int = 0,
-) -> _FirstMap:
+    initial_refinement: bool = True,
+    n_samples: int = 0,
+) -> _InitialMap:
     """First functional map of a directed pair (4.1, steps 3 and 4).
 
     Parameters
     ----------
     source, target : Basis
         At low resolution.
-    motion : tuple (R, t)
-        Rigid motion of the source onto the target (step 2).
+    transform : tuple (R, t)
+        Rigid transform of the source onto the target (step 2).
     init : {"dense", "landmarks"}
         From all vertices' nearest neighbours, or the paper's fit on 10 farthest points.
-    ahead : bool
+    initial_refinement : bool
         Whether one step of ZoomOut is done ahead (4.2).
-    n_spread : int
+    n_samples : int
         Of that step, see :func:`s4a.method.fmap.refine_once`.
     """
     check("init", init)
-    near = nearest_after_motion(source, target, motion)
-    fitted, landmarks = fit_after_motion(
-        source, target, motion, k_init=k_init, init=init, near=near
+    near = nearest_after_alignment(source, target, transform)
+    fitted, landmarks = fit_after_alignment(
+        source, target, transform, k_init=k_init, init=init, near=near
     )
-    C = fmap.refine_once(source, target, fitted, n_spread) if ahead else fitted
-    return _FirstMap(init, C, fitted, near, landmarks)
+    C = fmap.refine_once(source, target, fitted, n_samples) if initial_refinement else fitted
+    return _InitialMap(init, C, fitted, near, landmarks)
 
 
 def stretch(target: Basis, X: Array) -> float:
@@ -140,25 +140,26 @@ def stretch(target: Basis, X: Array) -> float:
     return float(np.median(np.abs(np.log(after / before))))
 
 
-def best_first_map(
+def best_initial_map(
     source: Basis, target: Basis, C: Array, fitted: Array | None = None, *, search: bool = False
 ) -> tuple[str, Array, Array]:
-    """The best of a first map and of those from heat and from wave kernels, which no pose changes.
+    """Return the best of an initial map and of those from heat and wave kernels.
 
     Where both have landmarks, also of one from wave kernels and these.
 
     Either kind alone fails on some pairs: shapes that nearly are their own mirror image are turned
-    over, or limbs exchanged.  Each map is refined by a short ZoomOut and a few rounds of
-    :func:`s4a.method.joint.low_rounds` by parts; their end is scored without truth,
-    :func:`s4a.method.joint.registration_score` + :func:`stretch`, as a pose hardly stretches the
-    surface, + in a search 0.3 :func:`s4a.method.fmap.curvature_gap`, which tells front from back.
+    over, or limbs exchanged.  Each map is refined by a short ZoomOut and a few iterations of
+    :func:`s4a.method.spectral_icp.coarse_spectral_icp` by parts; their end is scored without truth,
+    :func:`s4a.method.spectral_icp.registration_score` + :func:`stretch`, as a pose hardly stretches
+    the surface, + in a search 0.3 :func:`s4a.method.fmap.curvature_difference`, which tells front
+    from back.
 
     Parameters
     ----------
     source, target : Basis
         At low resolution.
     C : float ndarray (k_init, k_init)
-        First map from ICP.
+        Initial map from ICP.
     fitted : float ndarray (k_init, k_init), optional
         That map before its step of ZoomOut; C where there was none.
     search : bool
@@ -175,25 +176,27 @@ def best_first_map(
     """
     k = min(SHORT, source.k, target.k)
     maps = [("icp", C, C if fitted is None else fitted)]
-    maps += _map_of_landmarks(source, target, len(C))
+    maps += _map_from_landmarks(source, target, len(C))
     best = np.inf
     tried = []  # score, name, map, fit
-    for one in itertools.chain(maps, maps_of_signatures(source, target, len(C), search)):
+    for one in itertools.chain(maps, maps_from_signatures(source, target, len(C), search)):
         match = fmap.zoomout(source, target, one[1], k, step=10)[1]
-        end = joint.low_rounds(source, target, match, k_first=20, step=20, rounds=1, by_parts=True)
-        image = joint.move(target, end[1])
-        gap = joint.registration_score(source, target, end[0], target.moved_to(image))
+        end = spectral_icp.coarse_spectral_icp(
+            source, target, match, k_first=20, step=20, iterations=1, by_parts=True
+        )
+        image = spectral_icp.move(target, end[1])
+        gap = spectral_icp.registration_score(source, target, end[0], target.moved_to(image))
         score = gap + stretch(target, image)
         best = min(best, score)
-        bent = _BENT * fmap.curvature_gap(source, target, end[0]) if search else 0.0
+        bent = _BENT * fmap.curvature_difference(source, target, end[0]) if search else 0.0
         tried.append((score + bent, *one))
         if len(tried) >= 2 + len(maps) and best < _FOUND:
             break
     return min(tried, key=lambda one: one[0])[1:]
 
 
-def _map_of_landmarks(source, target, k):
-    """Name, first map and its fit ``(k, k)`` of wave kernels and landmarks, if both have three."""
+def _map_from_landmarks(source, target, k):
+    """Name, initial map and its fit ``(k, k)`` of wave kernels and three landmarks."""
     landmarks = corresponding_landmarks(source, target)
     if len(landmarks[0]) < 3:
         return []
@@ -201,10 +204,10 @@ def _map_of_landmarks(source, target, k):
     return [("marked", fmap.refine_once(source, target, fitted), fitted)]
 
 
-def maps_of_signatures(
+def maps_from_signatures(
     source: Basis, target: Basis, k: int, search: bool
 ) -> Iterator[tuple[str, Array, Array]]:
-    """Name, first map and its fit ``(k, k)`` of heat and of wave kernels, and of a search more.
+    """Name, initial map and its fit ``(k, k)`` of heat and of wave kernels, and of a search more.
 
     The search begins with wave kernels and extremities as landmarks.
     """
@@ -285,25 +288,26 @@ def _have_signatures(source, target, k):
     return bool(1.01 * least < min(value[k - 1] for value in ends))
 
 
-def first_map(
-    source: Basis, target: Basis, motion: Motion, *, search: bool = False, **options: Any
-) -> _FirstMap:
-    """:func:`map_after_motion`, or :func:`best_first_map` where poses are far apart.
+def initial_map(
+    source: Basis, target: Basis, transform: RigidTransform, *, search: bool = False, **options: Any
+) -> _InitialMap:
+    """:func:`map_after_alignment`, or :func:`best_initial_map` where poses are far apart.
 
     The latter only where `init` is dense and there are signatures, ``_have_signatures``.
 
     Parameters
     ----------
-    source, target, motion : see :func:`map_after_motion`
+    source, target, transform : see :func:`map_after_alignment`
     search : bool
-        See :func:`best_first_map`; for pairs alone, as Consistent ZoomOut mends those of a network.
+        See :func:`best_initial_map`; for pairs alone, as Consistent ZoomOut mends those of a
+        network.
     **options
-        Of :func:`map_after_motion`; maps of far poses, which are looked for in other ways, take all
-        vertices.
+        Of :func:`map_after_alignment`; maps of far poses, which are looked for in other ways, take
+        all vertices.
     """
-    first = map_after_motion(source, target, motion, **options)
-    far = first.name == "dense" and joint.far_apart(source, target, first.near)
+    first = map_after_alignment(source, target, transform, **options)
+    far = first.name == "dense" and spectral_icp.far_apart(source, target, first.near)
     if not (far and _have_signatures(source, target, len(first.C))):
         return first
-    name, C, fitted = best_first_map(source, target, first.C, first.fitted, search=search)
-    return _FirstMap(name, C, fitted, first.near, None)
+    name, C, fitted = best_initial_map(source, target, first.C, first.fitted, search=search)
+    return _InitialMap(name, C, fitted, first.near, None)

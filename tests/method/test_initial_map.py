@@ -1,4 +1,4 @@
-"""Shapes in far poses: parts that turn on their own, first maps that no pose changes.
+"""Shapes in far poses: parts that turn on their own, initial maps that no pose changes.
 
 And who pays for them.
 """
@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from s4a import analyse, insert, match_pair, synthetic
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
-from s4a.method import deform, first_map, joint
+from s4a.method import deform, initial_map, spectral_icp
 from s4a.method.remesh import coarsen
 from s4a.method.shape import Shape
 from s4a.method.spectral import spectrum
@@ -53,10 +53,10 @@ def shapes(bent):
 
 def test_a_far_pose_is_matched_where_nearest_neighbours_begin_wrong(bent, monkeypatch):
     found = match_pair(*bent, n_coarse=1000, k=50)
-    assert found.attrs["method"] == "intrinsic+parts+local"
-    assert found.attrs["first_map"].split(",")[0] in ("hks", "wks", "hks+wks", "extremities 1")
+    assert found.attrs["initialisation"] == "intrinsic+parts+local"
+    assert found.attrs["initial_map"].split(",")[0] in ("hks", "wks", "hks+wks", "extremities 1")
     assert error(found, bent[0]) < 0.002
-    monkeypatch.setattr(joint, "far_apart", lambda *_: False)
+    monkeypatch.setattr(spectral_icp, "far_apart", lambda *_: False)
     assert error(match_pair(*bent, n_coarse=1000, k=50), bent[0]) > 0.05
 
 
@@ -79,7 +79,7 @@ def test_parts_follow_a_bend_that_displacements_alone_cannot(shapes):
         R, t, c = deform.onto(
             straight.X, X, straight.area, lambda d: few.T @ (straight.area[:, None] * d), spectrum
         )
-        return np.linalg.norm(joint.move(straight, (R, t, c)) - X, axis=1).mean()
+        return np.linalg.norm(spectral_icp.move(straight, (R, t, c)) - X, axis=1).mean()
 
     assert gap((straight.area, few, straight.eigenvalue[:20])) < 0.25 * gap(None)
 
@@ -90,7 +90,9 @@ def test_the_parts_of_the_full_resolution_are_those_of_its_coarse_vertices(shape
         low.X, 2 * low.X[:, [1, 0, 2]] * [1, -1, 1], low.area, low.Phi, low.eigenvalue
     )
     at = shapes[0].coarse["sample_vertex"].values
-    assert joint.turn(full, R, t)[at] == pytest.approx(joint.turn(low, R, t), abs=1e-6)
+    assert spectral_icp.turn(full, R, t)[at] == pytest.approx(
+        spectral_icp.turn(low, R, t), abs=1e-6
+    )
 
 
 def test_shapes_in_one_pose_pay_nothing_and_keep_their_first_map(monkeypatch):
@@ -100,19 +102,19 @@ def test_shapes_in_one_pose_pay_nothing_and_keep_their_first_map(monkeypatch):
     def refuse(*_):
         raise AssertionError
 
-    monkeypatch.setattr(first_map, "best_first_map", refuse)
-    assert match_pair(source, target, n_coarse=600, k=40).attrs["first_map"] == "dense"
+    monkeypatch.setattr(initial_map, "best_initial_map", refuse)
+    assert match_pair(source, target, n_coarse=600, k=40).attrs["initial_map"] == "dense"
 
 
 def test_poses_are_far_apart_only_where_no_rigid_motion_brings_the_shapes_together(shapes):
     M, N = (s.low for s in shapes)
-    assert not joint.far_apart(M, M, np.arange(len(M.X)))
-    assert joint.far_apart(M, N, cKDTree(M.X).query(N.X)[1])
+    assert not spectral_icp.far_apart(M, M, np.arange(len(M.X)))
+    assert spectral_icp.far_apart(M, N, cKDTree(M.X).query(N.X)[1])
 
 
 def test_of_first_maps_the_one_that_fits_is_taken(shapes):
     low = shapes[0].low
-    name, C, _ = first_map.best_first_map(low, low, np.diag((-1.0) ** np.arange(20)))
+    name, C, _ = initial_map.best_initial_map(low, low, np.diag((-1.0) ** np.arange(20)))
     assert name in ("hks", "wks")
     assert np.diag(C).min() > 0.9
 
@@ -120,14 +122,14 @@ def test_of_first_maps_the_one_that_fits_is_taken(shapes):
 def test_a_search_goes_on_to_maps_of_signatures_and_curvature_until_one_fits(shapes, monkeypatch):
     low = shapes[0].low
     turned_over = np.diag((-1.0) ** np.arange(20))
-    fit = first_map.fmap.fmap_from_descriptors
+    fit = initial_map.fmap.fmap_from_descriptors
 
     def spoilt(*ends, curvature=0.0, **options):
         return fit(*ends, curvature=curvature, **options) if curvature else turned_over
 
-    monkeypatch.setattr(first_map.fmap, "fmap_from_descriptors", spoilt)
-    assert np.diag(first_map.best_first_map(low, low, turned_over)[1]).min() < 0
-    name, C, fitted = first_map.best_first_map(low, low, turned_over, search=True)
+    monkeypatch.setattr(initial_map.fmap, "fmap_from_descriptors", spoilt)
+    assert np.diag(initial_map.best_initial_map(low, low, turned_over)[1]).min() < 0
+    name, C, fitted = initial_map.best_initial_map(low, low, turned_over, search=True)
     assert name == "hks+wks, curvature, k 10, oriented 1"
     assert np.diag(C).min() > 0.9
     assert C.shape == fitted.shape == (20, 20)
@@ -136,7 +138,7 @@ def test_a_search_goes_on_to_maps_of_signatures_and_curvature_until_one_fits(sha
 def test_extremities_are_the_ends_of_a_worm_in_any_pose(shapes):
     for shape in shapes:
         low = shape.low
-        vertex, distance = first_map.extremities(low, 3)
+        vertex, distance = initial_map.extremities(low, 3)
         along = shape.coarse["sample_vertex"].values[vertex]  # the sphere's vertex, whose x is 4 s
         s = as_arrays(synthetic.sphere(2500))[0][along, 0]
         assert sorted(s[:2].round(1)) == [-1.0, 1.0]
@@ -153,7 +155,7 @@ def test_a_piece_that_is_not_connected_has_no_extremity(shapes):
         T=np.concatenate([low.T, low.T + n]),
         area=np.concatenate([low.area, low.area]) / 2,
     )
-    vertex, distance = first_map.extremities(two, 4)
+    vertex, distance = initial_map.extremities(two, 4)
     assert len({int(v) // n for v in vertex}) == 1
     assert np.isfinite(distance).all()
 
@@ -163,16 +165,16 @@ def test_extremities_are_paired_by_their_distances_whatever_the_order_of_the_ver
     order = np.random.default_rng(0).permutation(len(low.X))
     place = np.argsort(order)
     other = replace(low, X=low.X[order], T=place[low.T], area=low.area[order])
-    a, b = first_map.paired_extremities(low, other)[0]
-    assert len(a) == first_map.N_ENDS
+    a, b = initial_map.paired_extremities(low, other)[0]
+    assert len(a) == initial_map.N_ENDS
     assert (order[b] == a).all()
 
 
 def test_all_maps_of_a_search_carry_a_shape_to_itself(shapes):
     low = shapes[0].low
-    found = {name: C for name, C, _ in first_map.maps_of_signatures(low, low, 20, True)}
-    others = [f"extremities {i}" for i in range(2, first_map.N_PAIRED + 1)]  # not with themselves
-    assert len(found) == 3 + len(others) + len(first_map.SEARCHED)
+    found = {name: C for name, C, _ in initial_map.maps_from_signatures(low, low, 20, True)}
+    others = [f"extremities {i}" for i in range(2, initial_map.N_PAIRED + 1)]  # not with themselves
+    assert len(found) == 3 + len(others) + len(initial_map.SEARCHED)
     for name, C in found.items():
         if name in others:
             continue
@@ -223,7 +225,7 @@ def test_of_more_pieces_than_functions_the_first_map_is_that_of_nearest_neighbou
         spheres(np.c_[0 * i, i**2 / 2, i % 3], [4, 1, 0.7]),
     )
     found = match_pair(source, target, n_coarse=750, k=k)
-    assert found.attrs["first_map"] == "dense"
+    assert found.attrs["initial_map"] == "dense"
     assert np.isfinite(found["displacement"]).all()
 
 
