@@ -19,8 +19,9 @@ from .analysis.transfer import transfer_landmarks as transfer_landmarks
 from .analysis.transfer import transfer_scalars as transfer_scalars
 from .analysis.volumes import write_label_volumes as write_label_volumes
 from .datasets import synthetic as synthetic
-from .evaluation import compare as compare
 from .evaluation import metrics as metrics
+from .evaluation.comparison import compare as compare
+from .evaluation.comparison import compare_collection as compare_collection
 from .input.annotations import with_features as with_features
 from .input.clean import clean as clean
 from .input.collection import read_labels as read_labels

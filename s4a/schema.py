@@ -496,14 +496,38 @@ def in_unit(data: xr.Dataset, unit: str | None, *, of: str = INPUT) -> xr.Datase
     return data
 
 
+EXPECTED: dict[type, str] = {
+    xr.Dataset: "a Dataset, such as a mesh that s4a.read_shape returns",
+    xr.DataTree: "a DataTree, such as s4a.analyse or s4a.open_study returns",
+    dict: "a dict of names to meshes",
+}
+
+
+def check_type(value: object, kind: type, what: str = "study", expected: str = "") -> None:
+    """Raise TypeError unless an argument is of a type; it says what is `expected`.
+
+    Examples
+    --------
+    >>> import xarray as xr
+    >>> from s4a.schema import check_type
+    >>> check_type("brains", xr.DataTree)
+    Traceback (most recent call last):
+    TypeError: study must be a DataTree, such as s4a.analyse or s4a.open_study returns; found str
+    """
+    if not isinstance(value, kind):
+        expected = expected or EXPECTED[kind]
+        raise TypeError(f"{what} must be {expected}; found {type(value).__name__}")
+
+
 def require(data: xr.Dataset, *names: str, what: str = "dataset") -> None:
-    """Raise ValueError unless the Dataset has these variables with the dims of the table.
+    """Raise an error unless `data` is a Dataset with these variables and the dims of the table.
 
     Examples
     --------
     >>> from s4a.schema import dataset, require
     >>> require(dataset(position=[[0.0, 0.0, 1.0]]), "position")
     """
+    check_type(data, xr.Dataset, what)
     missing = [name for name in names if name not in data]
     if missing:
         raise ValueError(

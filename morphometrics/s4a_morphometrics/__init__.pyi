@@ -1,6 +1,6 @@
 from .bilateral import asymmetry, asymmetry_modes
-from .completion import complete, write_completed
 from .bilateral_pairs import symmetric_template, symmetry
+from .completion import complete, write_completed
 from .longitudinal import growth
 from .poses import structures, structures_modes, structures_of_new
 from .programs import write_for, write_training_set

@@ -25,7 +25,7 @@ from s4a.analysis.permutation import (
 from s4a.geometry.mesh import as_arrays, vertex_normals
 from s4a.method.deform import normal_displacement
 from s4a.method.pca import gram, principal_components
-from s4a.schema import FIELD_UNIT, INPUT, dataset, in_unit, unit_of
+from s4a.schema import FIELD_UNIT, INPUT, check_type, dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
 
 log = logging.getLogger(__name__)
@@ -423,6 +423,7 @@ def modes_study(
 
 def check_moves(fit: xr.Dataset) -> None:
     """ValueError where a result is of a field, which moves no vertex."""
+    check_type(fit, xr.Dataset, "fit", "a Dataset, such as s4a.statistics.regression returns")
     if "effect" not in fit:
         raise ValueError(
             "a regression of displacements needed, found that of a field, which moves no vertex: "

@@ -13,7 +13,7 @@ from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.input.subjects import is_missing, is_plain_number, listed, odd_cells, odd_words
 from s4a.method.pca import pca_without
 from s4a.options import Options, with_options
-from s4a.schema import require, unit_of
+from s4a.schema import check_type, require, unit_of
 from s4a.study.tree import left_out
 
 log = logging.getLogger(__name__)
@@ -169,6 +169,7 @@ def _field_everywhere(values, field):
 
 def all_registered(study: xr.DataTree) -> xr.Dataset:
     """``/registration`` of a study, flagged shapes too; ValueError where it has none."""
+    check_type(study, xr.DataTree)
     if "registration" not in study:
         raise ValueError(
             f"a registered study is needed; this one has {', '.join(study.children) or 'no nodes'}"
@@ -223,6 +224,7 @@ def with_flagged(study: xr.DataTree) -> xr.DataTree:
     >>> s4a.statistics.with_flagged(study)["pca"].sizes["shape"]
     6
     """
+    check_type(study, xr.DataTree)
     nodes = {node.path: node.to_dataset(inherit=False) for node in study.subtree}
     if "report" in study.children:
         nodes["/report"] = nodes["/report"].assign_attrs(

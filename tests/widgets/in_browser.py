@@ -86,7 +86,7 @@ def panels_of(study):
     yield "Structures", widgets.Structures(example_structures())
     pair = [node.to_dataset() for node in synthetic.brains(2, 300)["original"].children.values()]
     options = {"n_coarse": 200, "k": 20, "k_init": 10, "n_geodesic": 50}
-    compared = compare.pair(*pair, methods=["kNN", "RE-MATCH"], keep=True, **options)
+    compared = compare(*pair, methods=["kNN", "RE-MATCH"], keep=True, **options)
     yield "Comparison", widgets.Comparison(compared)
 
 

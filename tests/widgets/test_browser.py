@@ -1006,7 +1006,7 @@ def compared():
     reference = brains["truth/brain_02/reference_point"].values
     truth = np.asarray(s4a.synthetic.position(brains["truth"], "brain_01", reference))
     options = {"n_coarse": 200, "k": 20, "k_init": 10, "n_geodesic": 50, "keep": True}
-    return s4a.compare.pair(one, two, truth=truth, methods=["kNN", "RE-MATCH"], **options)
+    return s4a.compare(one, two, truth=truth, methods=["kNN", "RE-MATCH"], **options)
 
 
 def test_the_page_of_methods_marks_a_place_in_all_views(show, compared):

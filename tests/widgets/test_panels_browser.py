@@ -49,7 +49,7 @@ p = np.where(np.arange(found.sizes["vertex"]) % 3, 0.4, 0.02)
 found = found.assign(p_family_wise=found["p_family_wise"].copy(data=p))
 several = example_structures()
 ball = s4a.synthetic.ellipsoid(300)
-compared = s4a.compare.pair(ball, ball, methods=["kNN"], keep=True)
+compared = s4a.compare(ball, ball, methods=["kNN"], keep=True)
 brains = s4a.synthetic.brains(3, 300, seed=1)
 make = {{
     "Maps": lambda: Maps(study, found),
