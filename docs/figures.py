@@ -194,7 +194,7 @@ def seconds(vertices=PAIR):
     """Figure 3: CPU seconds of every step of the methods on one pair."""
     brains = s4a.synthetic.brains(2, vertices, seed=0)
     source, target = (brains[f"original/brain_0{i}"].to_dataset() for i in (1, 2))
-    found = s4a.compare.pairs(source, {"brain_02": target})["block_seconds"].isel(pair=0)
+    found = s4a.compare(source, {"brain_02": target})["block_seconds"].isel(pair=0)
     found = found.drop_sel(algorithm="registered surface")  # the same run as "registered"
     blocks = [str(name) for name in found["block"].values]
     return write(
