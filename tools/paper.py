@@ -34,11 +34,12 @@ PAGES = (
     "docs/decisions.md",
     "docs/differences.md",
     "docs/frontends.md",
-    "docs/howto.md",
+    "docs/howto/options.md",
     "docs/install.md",
     "docs/plausibility.md",
     "docs/quality_control.md",
     "docs/results.md",
+    "docs/scaling.md",
     "paper/paper.md",
     "paper/jose.md",
 )
