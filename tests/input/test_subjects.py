@@ -207,6 +207,7 @@ def test_a_table_can_take_the_place_of_the_first(folder):
         assert "sex" in study["subjects"]
 
 
+@pytest.mark.usefixtures("short_films")
 def test_the_command_prints_tables_and_writes_files(folder, capsys, monkeypatch):
     monkeypatch.setattr(
         "s4a.write_page",
