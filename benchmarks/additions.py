@@ -1,4 +1,4 @@
-"""What each deviation from the paper contributes, one at a time and all together, on sets with truth.
+"""Effect of each deviation from the paper, alone and together, on sets with ground truth.
 
 ``additions.py [brains] [faces] [bodies] [--only ROW...] [--data FOLDER] [--write]``: mean distances
 to the truth in % of sqrt(area), of the matched vertices and of the registered surface, and CPU

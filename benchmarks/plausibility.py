@@ -337,9 +337,9 @@ def turned(signs):
 
 
 def judged(name, at, meshes, shapes):
-    """Of every registration of a collection, by default and simulated: way, error and what is reported.
+    """Method, error and flags of each registration of a collection, by default and simulated.
 
-    What is simulated is seen beside the registrations of the others as by default.
+    A simulated failure is compared with the default registrations of the others.
     """
     part = PLANTED_IN[name][0]
     template, *others = [list(shapes)[at], *(n for i, n in enumerate(shapes) if i != at)]

@@ -411,7 +411,7 @@ def named_subjects(reflect: str, parts: Mapping[str, Part]) -> list[str]:
             each = [f"{cell!r} ({name})" for name, cell in said.items()]
             raise ValueError(
                 f"reflect={reflect!r}: all structures of a subject are mirrored together, so that "
-                f"they lie relative to each other as before, and need one value in the column {column!r}; "
+                f"their relative pose is kept, and need one value in the column {column!r}; "
                 f"{subject} has {listed(each)}. Structures of both sides as one kind are a study "
                 "of one structure: s4a.analyse, without the column 'structure'"
             )
