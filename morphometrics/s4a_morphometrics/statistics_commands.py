@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 def fields(
     study: str, folder: str, *, name: str, unit: str | None = None, partial: bool = False
 ) -> int:
-    """A number per vertex of every shape, such as thickness, carried to the template and kept.
+    """A number per vertex of every shape, such as thickness, transferred to the template and kept.
 
     Parameters
     ----------
