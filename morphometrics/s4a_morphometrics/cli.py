@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import s4a
 from s4a.cli import command
-from s4a.cli.commands import study_to_test, template_labels, write
+from s4a.cli.commands import study_to_test, write
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -257,6 +257,7 @@ def export(
         nifti: volume whose voxels are labelled (default: that each shape was made of)
     """
     from s4a_morphometrics import write_for
+    from s4a_morphometrics.statistics_commands import template_labels
 
     tree = s4a.open_study(study)
     read = s4a.input.annotations.read_landmarks

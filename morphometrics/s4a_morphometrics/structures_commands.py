@@ -51,7 +51,7 @@ def insert(args: Namespace) -> int:
 
 
 def compare(args: Namespace) -> int:
-    """How structures vary in how they lie to each other, and each in its shape."""
+    """How structures vary in how they lie relative to each other, and each in its shape."""
     from s4a.analysis.effects import group_test
     from s4a.analysis.export import write_results, write_scores
     from s4a.show.page import write_page

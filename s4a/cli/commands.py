@@ -229,19 +229,11 @@ def statistics(
     group: str | None = None,
     variable: str | None = None,
     covariates: list[str] | None = None,
-    field: str | None = None,
     table: str | None = None,
     variances: Literal["equal", "unequal"] = "equal",
-    recompute: bool = False,
     include_flagged: bool = False,
-    label: list[int | str] | None = None,
-    labels: str | None = None,
-    least_confidence: float = 0.0,
-    without: list[str] | None = None,
-    size_back: bool = False,
     permutations: int | None = None,
     out: str | None = None,
-    n_jobs: int,
     seed: int,
 ) -> int:
     """Evaluation of the modes and outliers of a study.
@@ -258,48 +250,40 @@ def statistics(
         regression of shape on a number, such as age; its animation
     covariates : COLUMN
         accounted for in both
-    field : NAME
-        a field of s4a fields in place of shape in both
     table : PATH
         CSV with a column 'shape', in place of the table of the study
     variances
         of the shapes around what is tested; unequal where groups scatter differently
-    recompute
-        generalization with correspondences found again (slow)
     include_flagged
         take flagged shapes in
-    label : LABEL
-        only vertices of the template with these labels
-    labels : FILE
-        labels of the template's file for --label: NPY, NPZ (FILE:NAME), CSV, GIFTI or annot
-    least_confidence : SHARE
-        only vertices whose mean confidence is this large, 0 to 1
-    without : COLUMN
-        nuisances: what lies along their regression is taken from all shapes
-    size_back
-        give size back to shapes of which --remove-size took it out
     permutations : N
         of every test (default: 9999, at every vertex 999, of classes 99)
     out : FOLDER
         for netCDF and CSV (default: STUDY/statistics)
     """
-    if (covariates or field) and not (group or variable):
-        raise ValueError("--covariates and --field are of a test: give --group or --variable")
-    if labels and not label:
-        raise ValueError("--labels is where --label looks: give --label LABEL..., or leave it out")
-    if recompute and (size_back or without or label or least_confidence):
-        raise ValueError("--recompute finds whole shapes again: leave it out, or take all of them")
+    if covariates and not (group or variable):
+        raise ValueError("--covariates are of a test: give --group or --variable")
     tree, out = study_to_test(study, out, table, include_flagged)
-    tree = restricted(tree, size_back, without, label, labels, least_confidence)
-    options = {"covariates": covariates, "field": field, "seed": seed, "variances": variances}
+    options = {"covariates": covariates, "seed": seed, "variances": variances}
+    write_statistics(tree, out, group, variable, permutations, options)
+    return 0
+
+
+def write_statistics(
+    tree: "xr.DataTree",
+    out: str,
+    group: str | None,
+    variable: str | None,
+    permutations: int | None,
+    options: dict[str, Any],
+) -> None:
+    """Evaluate and test a study, write the results to a folder, and print them."""
     results = tests_of(tree, group, variable, permutations, options)  # first: these may be refused
-    results["evaluation"] = s4a.statistics.evaluate(tree, seed=seed)
+    results["evaluation"] = s4a.statistics.evaluate(tree, seed=options["seed"])
     results["outliers"] = s4a.statistics.outliers(tree)
-    if recompute:
-        results["generalization"] = s4a.statistics.generalization(tree, n_jobs=n_jobs, seed=seed)
     for name, result in results.items():
         s4a.analysis.export.write_results(result, out, name)
-    write(tables.evaluation_table(results["evaluation"], results.get("generalization")))
+    write(tables.evaluation_table(results["evaluation"]))
     outlier = results["outliers"]["outlier"]
     write(f"\noutliers: {', '.join(outlier['shape'].values[outlier.values]) or 'none'}")
     if group:
@@ -309,11 +293,9 @@ def statistics(
     if variable:
         regression = results["regression"]
         write("", tables.significance(regression, regression, variable, tree))
-        if not field:
-            write_moving(tree, regression, variable, Path(out))
+        write_moving(tree, regression, variable, Path(out))
     confidence = tree["registration"]["confidence"].mean().item()
     write(f"\nmean confidence of the registration {confidence:.2f}; results: {out}")
-    return 0
 
 
 def write_moving(study: "xr.DataTree", regression: "xr.Dataset", name: str, out: Path) -> None:
@@ -338,40 +320,6 @@ def study_to_test(
     return tree, out
 
 
-def restricted(
-    study: "xr.DataTree",
-    size_back: bool,
-    without: list[str] | None,
-    label: list[int | str] | None,
-    labels: str | None,
-    least_confidence: float,
-) -> "xr.DataTree":
-    """The study of the part of what varies that is asked for."""
-    said = []
-    if size_back:
-        study = s4a.statistics.with_size(study)
-        said.append("with size given back")
-    if without:
-        study = s4a.statistics.without(study, without)
-        said.append(f"without {', '.join(without)}")
-    if label or least_confidence:
-        whole = study["registration"].sizes["vertex"]
-        of = template_labels(study, labels)
-        study = s4a.statistics.within(study, label, labels=of, least_confidence=least_confidence)
-        said.append(f"{study['registration'].sizes['vertex']} of {whole} vertices")
-    if said:
-        write("; ".join(said) + "\n")
-    return study
-
-
-def template_labels(study: "xr.DataTree", file: str | None) -> "np.ndarray | None":
-    """Labels of the template, from a file with one for each vertex of its file."""
-    if file is None:
-        return None
-    template = s4a.analysis.inputs.all_registered(study).attrs["template"]
-    return labels_in(file, study["original"][template].to_dataset())
-
-
 def labels_in(file: str, mesh: "xr.Dataset") -> "np.ndarray":
     """Labels of a mesh, from a file with one for each vertex of its file."""
     label = s4a.input.annotations.read_labels(file, mesh.sizes["file_vertex_index"])
@@ -386,7 +334,7 @@ def tests_of(
     options: dict[str, Any],
 ) -> "dict[str, xr.Dataset]":
     """The tests of the group and the variable that are asked for."""
-    of_classes = {name: options[name] for name in ("field", "seed")}
+    of_classes = {"seed": options["seed"]}
     if permutations is not None:
         options = options | {"n_permutations": permutations}
         of_classes["n_permutations"] = min(permutations, 99)  # each trains again
@@ -398,38 +346,6 @@ def tests_of(
     if variable:
         results["regression"] = s4a.statistics.regression(study, variable, **options)
     return results
-
-
-def fields(
-    study: str, folder: str, *, name: str, unit: str | None = None, partial: bool = False
-) -> int:
-    """A number per vertex of every shape, such as thickness, carried to the template and kept.
-
-    Parameters
-    ----------
-    study : STUDY
-        its folder
-    folder : FOLDER
-        with a file for each shape: NPY, NPZ, PLY, CSV, GIFTI or FreeSurfer's curv
-    name : NAME
-        of the field; also of its array, column or property in the files
-    unit : UNIT
-        of its numbers, such as mm
-    partial
-        shapes may lack it; tests leave these out
-    """
-    tree = s4a.with_field(s4a.open_study(study), name, folder, unit=unit, partial=partial)
-    path = s4a.analysis.fields.write_field(tree, name, study)
-    field = tree["fields"][name].to_dataset()["transferred_field"]
-    known = np.isfinite(field.values)
-    write(
-        f"{name} of {known.any(1).sum()} of {len(known)} shapes, "
-        f"{np.nanmin(field):.4g} to {np.nanmax(field):.4g} {field.attrs['units']}, mean "
-        f"{np.nanmean(field):.4g}, at {100 * known.mean():.0f} % of the template's vertices: "
-        f"{path}",
-        f"s4a statistics {study} --field {name} takes it in place of shape",
-    )
-    return 0
 
 
 def insert(
@@ -771,8 +687,7 @@ COMMANDS = {
     "status": command(status),
     "demo": command(demo, ("preset", "n_jobs", "seed")),
     "view": command(view),
-    "statistics": command(statistics, ("n_jobs", "seed")),
-    "fields": command(fields),
+    "statistics": command(statistics, ("seed",)),
     "insert": command(insert, ("n_jobs",)),
     "transfer": command(transfer, (*OF_PAIRS, "n_jobs"), unset=True),
     "compare": command(compare, ("n_coarse", "n_pairs", "k", "preset", "seed")),

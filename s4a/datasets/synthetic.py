@@ -248,13 +248,13 @@ def _fields(x, centre, width, translation, rotation):
 
 
 def _generators(n_modes):
-    """Centres and widths of all regions, and their motion by each generator ``(g, regions, 6)``.
+    """Centres and widths of all regions, and their transform by each generator ``(g, regions, 6)``.
 
-    The generators are the six rigid motions, as one region of infinite width, and the designed
+    The generators are the six rigid transforms, as one region of infinite width, and the designed
     modes.  Three columns are the translation, three the rotation.
     """
     centre, width = [np.zeros(3)], [np.inf]
-    moves = []  # mode and motion of each region after the first
+    moves = []  # mode and transform of each region after the first
     for m, mode in enumerate(MODES[:n_modes]):
         for c, w, translation, rotation, mirror in mode:
             for side in (1,) if mirror == 0 else (1, -1):
@@ -274,7 +274,7 @@ def _generators(n_modes):
 def _true_modes(n_modes):
     """Centres and widths of all regions, and their translation and rotation in each mode.
 
-    On the reference brain the modes are orthogonal to rigid motions and to each other, by a
+    On the reference brain the modes are orthogonal to rigid transforms and to each other, by a
     Cholesky factor of the Gram matrix of the generators.
     """
     if not 0 <= n_modes <= len(MODES):
@@ -424,9 +424,7 @@ def _index(truth, shape):
     """Row of a shape in the ground truth."""
     names = truth["shape"].values.tolist()
     if shape not in names:
-        raise ValueError(
-            f"shape must be one of {', '.join(names)}; found {shape!r}"
-        )
+        raise ValueError(f"shape must be one of {', '.join(names)}; found {shape!r}")
     return names.index(shape)
 
 

@@ -95,7 +95,8 @@ def as_mesh(shape: Mesh, what: str = "mesh") -> xr.Dataset:
     """Return a mesh that is given as a Dataset, or read and clean its file if a path is given."""
     if isinstance(shape, str | os.PathLike):
         return read_shape(shape)
-    check_type(shape, xr.Dataset, what, "a path or a Dataset, such as s4a.read_shape returns")
+    expected = "a path or a Dataset, such as s4a.read_shape returns"
+    check_type(shape, xr.Dataset | xr.DataTree, what, expected)
     require(shape, "position", "corner_vertex", what=what)
     return shape
 

@@ -640,7 +640,7 @@ def register_shape(
         if value is not None
     }
     options = options_of_registration(study) | given
-    for option in options.keys() & {"refine", "alignment", "how"}:
+    for option in options.keys() & {"refine", "alignment", "dense_match"}:
         check(option, options[option])
     projection = {key: options.pop(key) for key in PROJECTION if key in options}
     template = template_of(study) if template is None else template

@@ -64,6 +64,13 @@ def test_run_writes_a_line_for_each_stage_where_there_is_no_terminal(ran):
     assert "it/s" not in result.stderr
 
 
+def test_a_quiet_run_writes_no_stages_and_no_warnings(folder, tmp_path):
+    arguments = [sys.executable, "-m", "s4a", "run", str(folder), "-q", "-o", str(tmp_path / "s")]
+    result = subprocess.run([*arguments, *FLAGS], capture_output=True, text=True, check=False)
+    assert result.returncode == 0
+    assert result.stderr == ""
+
+
 def test_view_writes_a_page_into_the_study_or_where_it_is_told(ran, tmp_path, monkeypatch, capsys):
     study, _ = ran
     page = tmp_path / "page.html"

@@ -180,5 +180,5 @@ def test_what_lacks_is_named(study, coarse):
         s4a.build_network({"a": coarse["brain_01"].drop_vars("eigenvalue")})
     with pytest.raises(ValueError, match="/original/nobody is needed; this one has none"):
         s4a.latent_match(study, "nobody", "brain_01")
-    with pytest.raises(ValueError, match="how must be"):
+    with pytest.raises(ValueError, match="dense_match must be"):
         s4a.latent_match(study, "brain_01", "brain_02", dense_match="both")

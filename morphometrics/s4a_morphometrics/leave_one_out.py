@@ -177,7 +177,7 @@ def generalization(
     With the ``study`` of six small brains:
 
     >>> import s4a
-    >>> from s4a.analysis.generalization import generalization
+    >>> from s4a_morphometrics import generalization
     >>> study = s4a.synthetic.example_study()
     >>> generalization(study).attrs["shapes"]
     6
