@@ -28,7 +28,7 @@ def other_modules(tmp_path, monkeypatch):
 def test_on_this_machine_nothing_is_lacking_and_nothing_is_left_behind(tmp_path, capsys):
     assert cli.main(["doctor", str(tmp_path)]) == 0
     said = capsys.readouterr().out
-    assert "0 lacking" in said
+    assert "0 missing" in said
     assert "lacks  " not in said
     assert list(tmp_path.iterdir()) == []
 
@@ -39,7 +39,7 @@ def test_what_is_lacking_makes_the_exit_code_1(monkeypatch, capsys):
     assert cli.main(["doctor"]) == 1
     said = capsys.readouterr().out
     assert "-> mend a" in said
-    assert said.endswith("1 lacking, 1 to know\n")
+    assert said.endswith("1 missing, 1 to know\n")
 
 
 @pytest.mark.parametrize(

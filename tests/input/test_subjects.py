@@ -236,7 +236,7 @@ def test_the_command_prints_tables_and_writes_files(folder, capsys, monkeypatch)
         str(folder / "study"),
         "--group",
         "sex",
-        "--variable",
+        "--regress-on",
         "age",
         "--permutations",
         "19",
