@@ -52,10 +52,10 @@ def doctor(folder: str = ".") -> int:
         where studies will be written (default: here)
     """
     findings = examine(folder)
-    lacking = sum(finding.state == "lacks" for finding in findings)
+    missing = sum(finding.state == "missing" for finding in findings)
     notes = sum(finding.state == "note" for finding in findings)
-    write(*lines(findings), f"{lacking} missing, {notes} to know")
-    return 1 if lacking else 0
+    write(*lines(findings), f"{missing} missing, {notes} to know")
+    return 1 if missing else 0
 
 
 def run(
