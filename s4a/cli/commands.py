@@ -6,6 +6,7 @@ appears at once.
 """
 
 import contextlib
+import itertools
 import re
 import shlex
 import sys
@@ -289,16 +290,12 @@ def write_statistics(
     if variable:
         regression = results["regression"]
         write("", tables.significance(regression, regression, variable, tree))
-        write_moving(tree, regression, variable, Path(out))
+        moving = s4a.statistics.regression_modes(tree, regression, variable)
+        page = Path(out) / "regression.html"
+        s4a.write_page(moving, page, title=f"Regression on {variable}")
+        s4a.write_film(moving, page.with_suffix(".gif"))
     confidence = tree["registration"]["confidence"].mean().item()
     write(f"\nmean confidence of the registration {confidence:.2f}; results: {out}")
-
-
-def write_moving(study: "xr.DataTree", regression: "xr.Dataset", name: str, out: Path) -> None:
-    """The regression on a variable as a page and as a film."""
-    moving = s4a.statistics.regression_modes(study, regression, name)
-    s4a.write_page(moving, out / "regression.html", title=f"Regression on {name}")
-    s4a.write_film(moving, out / "regression.gif")
 
 
 def study_to_test(
@@ -544,21 +541,18 @@ def compare(
                 "--collection takes the shapes alone: no SOURCE, TARGET, --truth, --landmarks or "
                 "--keep"
             )
-        found = compare_collection(collection, methods, n_pairs, options)
-        names = [
-            f"{way}, {how}"
-            for way in found["algorithm"].values
-            for how in found["dense_match"].values
-        ]
+        options |= {"n_pairs": n_pairs, "k_init": min(Options.k_init, options["k"])}
+        options |= {"methods": methods} if methods else {}
+        result = found = s4a.compare_collection(collection, **options)
+        ways = itertools.product(found["algorithm"].values, found["dense_match"].values)
+        names = [", ".join(way) for way in ways]
         seconds = found["collection_seconds"].values.reshape(len(names), -1)
-        text, result = tables.collection_table(found), found
+        text = tables.collection_table(found)
     else:
         result = compare_pairs(paths or [], truth, landmarks, options | {"methods": methods}, keep)
         found = result["metrics"].to_dataset() if keep else result
-        names, seconds = (
-            found["algorithm"].values.tolist(),
-            found["block_seconds"].mean("pair").values,
-        )
+        names = found["algorithm"].values.tolist()
+        seconds = found["block_seconds"].mean("pair").values
         blocks = tables.block_table(names, found["block"].values.tolist(), seconds)
         text = f"{tables.comparison_table(found)}\n\n{blocks}"
     folder = new_folder(out)
@@ -571,15 +565,6 @@ def compare(
         f"in {folder}: compare.nc, compare.png",
     )
     return 0
-
-
-def compare_collection(
-    paths: list[str], methods: list[str] | None, n_pairs: int, options: dict[str, Any]
-) -> "xr.Dataset":
-    """Return Table 2 of a collection."""
-    k_init = min(Options.k_init, options["k"])
-    methods = methods or list(s4a.evaluation.comparison.COLLECTION_METHODS)
-    return s4a.compare_collection(paths, methods=methods, n_pairs=n_pairs, k_init=k_init, **options)
 
 
 def compare_pairs(
@@ -602,14 +587,11 @@ def compare_pairs(
         raise ValueError(
             f"--truth needs a file for each of the {len(files)} targets, found {len(truth)}"
         )
-    known = {
-        name: s4a.evaluation.comparison.read_ground_truth(f)
-        for name, f in zip(names, truth or [], strict=False)
-    }
+    known = map(s4a.evaluation.comparison.read_ground_truth, truth or [])
     return s4a.compare(
         source,
         dict(zip(names, files, strict=True)),
-        truth=known or None,
+        truth=dict(zip(names, known, strict=True)) if truth else None,
         landmarks=landmark_pairs(landmarks, names),
         keep=keep,
         **options,
