@@ -11,7 +11,7 @@ from s4a.widgets.views import MARK
 
 ADD, REMOVE = "add", "take away"
 LASSO = "while it is pressed a drag draws around vertices, and does not turn the surface"
-HOW = "what becomes of the vertices that are drawn around, of those that are seen"
+HOW = "what happens to the vertices that are drawn around, of those that are seen"
 NO_LABEL = ()  # the value of "none" in the list, which cannot hold None
 LABEL = "the region of a label of the template, to begin with"
 
