@@ -182,7 +182,7 @@ def best_initial_map(
     for one in itertools.chain(maps, maps_from_signatures(source, target, len(C), search)):
         match = fmap.zoomout(source, target, one[1], k, step=10)[1]
         end = spectral_icp.coarse_spectral_icp(
-            source, target, match, k_first=20, step=20, iterations=1, by_parts=True
+            source, target, match, k_first=20, step=20, iterations=1, articulated=True
         )
         image = spectral_icp.move(target, end[1])
         gap = spectral_icp.registration_score(source, target, end[0], target.moved_to(image))
@@ -306,7 +306,7 @@ def initial_map(
         all vertices.
     """
     first = map_after_alignment(source, target, transform, **options)
-    far = first.name == "dense" and spectral_icp.far_apart(source, target, first.near)
+    far = first.name == "dense" and spectral_icp.poses_differ(source, target, first.near)
     if not (far and _have_signatures(source, target, len(first.C))):
         return first
     name, C, fitted = best_initial_map(source, target, first.C, first.fitted, search=search)

@@ -88,7 +88,7 @@ def nearest_float32(q: Array, d: Array) -> Array:
     return np.concatenate([score.argmax(axis=1) for _, score in _scores_in_blocks(q, d)])
 
 
-def nearest_both_ways(q: Array, d: Array) -> tuple[Array, Array]:
+def nearest_bidirectional(q: Array, d: Array) -> tuple[Array, Array]:
     """For every row of q the nearest of d, and the other way, from one matrix product.
 
     The first as of :func:`nearest_float32`; of the second, d's term of the distance is the same for
@@ -97,9 +97,9 @@ def nearest_both_ways(q: Array, d: Array) -> tuple[Array, Array]:
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a.method.nearest import as_candidates, as_queries, nearest_both_ways
+    >>> from s4a.method.nearest import as_candidates, as_queries, nearest_bidirectional
     >>> Q, D = np.array([[0.1], [4.0]]), np.array([[0.0], [5.0], [0.3]])
-    >>> [found.tolist() for found in nearest_both_ways(as_queries(Q), as_candidates(D))]
+    >>> [found.tolist() for found in nearest_bidirectional(as_queries(Q), as_candidates(D))]
     [[0, 1], [0, 1, 0]]
     """
     half = np.einsum("ij,ij->i", q[:, :-1], q[:, :-1]) / 2

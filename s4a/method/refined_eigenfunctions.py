@@ -206,7 +206,7 @@ def low_resolution(
 
     With `refined_eigenfunctions` also :func:`with_refined_eigenfunctions`.  With
     ``method="scalable"`` :func:`s4a.method.scalable.reduced` is in their place, which can neither
-    be lifted nor wrapped.  Of landmarks that guide it has ``guide_vertex``, the coarse vertices
+    be refined nor wrapped.  Of landmarks that guide it has ``guide_vertex``, the coarse vertices
     that weigh most in U there; of fields that guide their means by the weights of U.
     """
     if method == "scalable":

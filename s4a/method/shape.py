@@ -54,7 +54,7 @@ class Basis:
         default.
     area_weighted : bool
         Whether these vertices weigh by their areas when a field is projected.
-    lifted : bool
+    refined : bool
         Whether Phi has a row for each of the n vertices although there is U.
     surface_normals : float ndarray (n, 3), optional
         Unit normals of the finer surface that the vertices are of; by default those of the mesh.
@@ -73,7 +73,7 @@ class Basis:
     U: sp.csr_matrix | None = None
     near_coarse: Array | slice | None = None
     area_weighted: bool = True
-    lifted: bool = False
+    refined: bool = False
     surface_normals: Array | None = None
     landmarks: dict[str, int] = field(default_factory=dict)
     fields: dict[str, Array] = field(default_factory=dict)
@@ -109,14 +109,14 @@ class Basis:
     def field(self, c: Array) -> Array:
         """The field U Phi c ``(n, 3)`` with coefficients c ``(q, 3)`` of the first functions."""
         low = self.Phi[:, : len(c)] @ c
-        return low if self.U is None or self.lifted else self.U @ low
+        return low if self.U is None or self.refined else self.U @ low
 
     @cached_property
     def coefficients(self) -> Callable[..., Any]:
         """Coefficients of a field given at the vertices near coarse ones, see :func:`smoother`."""
         area = self.area[self.near_coarse]
         weight = area if self.area_weighted else np.ones_like(area)
-        if self.U is None or self.lifted:
+        if self.U is None or self.refined:
             return smoother(self.Phi[self.near_coarse], weight)
         return smoother(self.Phi, weight, self.U[self.near_coarse])
 
@@ -213,7 +213,7 @@ class Shape:
         The clean mesh: ``position``, ``corner_vertex``; empty where no step needs it.
     coarse : xarray.Dataset, optional
         As :func:`s4a.coarsen` and :func:`s4a.spectrum` make it, or
-        :func:`s4a.method.refined_eigenfunctions.lifted`, or :func:`s4a.method.scalable.reduced`:
+        :func:`s4a.method.refined_eigenfunctions.refined`, or :func:`s4a.method.scalable.reduced`:
         then what is called coarse are samples.
     n_projected : int
         Vertices of ``full`` by which fields are projected, those nearest to coarse ones; 0 for all.
@@ -338,12 +338,12 @@ class Shape:
 
     @cached_property
     def full(self) -> Basis:
-        """The original mesh and the functions U Phi, or lifted ones; its areas, of sum 1."""
-        (X, T), low, lifted = as_arrays(self.original), self.low, self.has_refined_eigenfunctions
+        """The original mesh and the functions U Phi, or refined ones; its areas, of sum 1."""
+        (X, T), low, refined = as_arrays(self.original), self.low, self.has_refined_eigenfunctions
         X, area = self.to_frame(X), self._area / self._area.sum()
-        Phi = self.coarse["refined_eigenfunction"].values if lifted else low.Phi
+        Phi = self.coarse["refined_eigenfunction"].values if refined else low.Phi
         functions = Phi, low.eigenvalue, low.mass, self.U, self.near_coarse
-        full = Basis(X, T, area, *functions, self.area_weighted, lifted)
+        full = Basis(X, T, area, *functions, self.area_weighted, refined)
         fields = {name: self.U @ values for name, values in low.fields.items()}
         return replace(full, landmarks=vertices_of_landmarks(self.original), fields=fields)
 
@@ -354,13 +354,13 @@ class Shape:
 
     @property
     def has_refined_eigenfunctions(self) -> bool:
-        """Whether the functions of ``full`` are lifted ones, and not U Phi."""
+        """Whether the functions of ``full`` are refined ones, and not U Phi."""
         return "refined_eigenfunction" in self.coarse
 
     def functions(self, A: Array) -> Array:
         """The functions Phi A that full resolution compares, A ``(k, m)``.
 
-        At coarse vertices, as U takes them from there; lifted ones at all.
+        At coarse vertices, as U takes them from there; refined ones at all.
         """
         basis = self.full if self.has_refined_eigenfunctions else self.low
         return basis.Phi[:, : len(A)] @ A.astype(basis.Phi.dtype)

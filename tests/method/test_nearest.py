@@ -13,7 +13,7 @@ from s4a.method.nearest import (
     as_queries,
     into_cells,
     nearest_around,
-    nearest_both_ways,
+    nearest_bidirectional,
     nearest_float32,
     nearest_in_cells,
     nearest_of_few,
@@ -176,7 +176,7 @@ def test_a_search_around_what_is_found_among_some_gives_nearly_what_is_nearest_o
 def test_one_product_gives_the_nearest_both_ways(n, m):
     rng = np.random.default_rng(n)
     A, B = rng.normal(size=(n, 20)) + 3, rng.normal(size=(m, 20)) * [[1], [4]][n % 2] + 3
-    of_a, of_b = nearest_both_ways(as_queries(A), as_candidates(B))
+    of_a, of_b = nearest_bidirectional(as_queries(A), as_candidates(B))
     gap = np.linalg.norm(A[:, None] - B, axis=2)
     assert np.array_equal(of_a, gap.argmin(1))
     assert np.array_equal(of_b, gap.argmin(0))
@@ -184,7 +184,7 @@ def test_one_product_gives_the_nearest_both_ways(n, m):
 
 def test_both_ways_take_the_first_of_rows_that_are_equally_near():
     A = np.random.default_rng(5).integers(0, 3, (400, 3)).astype(float)
-    of_a, of_b = nearest_both_ways(as_queries(A), as_candidates(A))
+    of_a, of_b = nearest_bidirectional(as_queries(A), as_candidates(A))
     first = (A[:, None] == A).all(2).argmax(1)
     assert np.array_equal(of_a, first)
     assert np.array_equal(of_b, first)
