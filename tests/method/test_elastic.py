@@ -151,7 +151,7 @@ def test_local_rounds_find_a_bump_that_no_function_of_the_basis_has(pair):
     source = replace(low, X=low.X + bump)
     d = elastic.local_iterations(source, low, template.diffusion, low.X)
     assert np.linalg.norm(d - bump, axis=1).max() < 0.4 * np.linalg.norm(bump, axis=1).max()
-    coarse = low.first(10)
+    coarse = low.truncated(10)
     left = bump - coarse.field(coarse.coefficients(bump))
     assert np.linalg.norm(d - bump, axis=1).mean() < 0.5 * np.linalg.norm(left, axis=1).mean()
 
