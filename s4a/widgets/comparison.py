@@ -16,7 +16,7 @@ from s4a.show.draw import OKABE_ITO, SIGNED, position_colors, ramp_colors, signe
 from s4a.show.surfaces import mesh_of
 from s4a.widgets.correspondence import inverse
 from s4a.widgets.panel import WIDE, Panel, dropdown, grid, row
-from s4a.widgets.views import extent, iteration_number
+from s4a.widgets.views import extent, round_down
 
 SHOWN = [
     ("coordinates of the source", "place"),
@@ -168,7 +168,7 @@ class Comparison(Panel):
     def paint(self) -> None:
         """The colours of all views."""
         X, _ = self.surfaces[0]
-        self.cell = iteration_number(extent(X) / CELLS)
+        self.cell = round_down(extent(X) / CELLS)
         checker = self.colors.value == "checker"
         plain = self.colors.value in ("area", "error")
         colors = None if plain else position_colors(X)

@@ -17,8 +17,8 @@ from s4a.show.surfaces import (
     transferred_colors,
     unit_text,
 )
-from s4a.widgets.panel import Panel, beside, dropdown, row
-from s4a.widgets.views import extent, iteration_number
+from s4a.widgets.panel import Panel, columns, dropdown, row
+from s4a.widgets.views import extent, round_down
 
 MAPS = [
     ("registration, full resolution", "registered"),
@@ -110,7 +110,7 @@ class Correspondence(Panel):
         self.redraw(self.change_pair, "source", "shape")
         self.show_pair(self.template, self.names[0])
         choices = row(self.left, self.choice, self.map)
-        return [choices, row(self.colors, self.hover), beside(*self.scenes)]
+        return [choices, row(self.colors, self.hover), columns(*self.scenes)]
 
     def selection(self) -> dict:
         """The pair that is shown, in the direction in which another tab has it."""
@@ -205,7 +205,7 @@ class Correspondence(Panel):
         self.pair = source, surface(self.study, self.shape, stage)
         look = self.registered_look() if self.registered else self.latent_look()
         colors, coordinates, bar, caption = look
-        cell = iteration_number(extent(source[0]) / CELLS)
+        cell = round_down(extent(source[0]) / CELLS)
         if coordinates[0] is not None:
             unit = unit_text(self.study, self.source)
             caption += f"; checkerboard of cubes of {cell:g} ({unit})"
@@ -269,7 +269,7 @@ class Correspondence(Panel):
     def point(self, found: int, other: str, place: str) -> None:
         """Mark the vertex and its image, and say which they are, or that nothing was `found`."""
         if found < 0:
-            self.say(f"no vertex of {other} is matched to {place}")
+            self.show_message(f"no vertex of {other} is matched to {place}")
             return
         text, sure = self.linked(self.vertex, self.image), self.confidence()
         if sure is not None:

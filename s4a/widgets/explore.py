@@ -17,7 +17,7 @@ from s4a.widgets.functional import FunctionalMap
 from s4a.widgets.median import Median
 from s4a.widgets.modes import Modes
 from s4a.widgets.network import Network
-from s4a.widgets.panel import OfKernel, Panel, close_all, layout_of
+from s4a.widgets.panel import KernelWidget, Panel, close_all, panel_layout
 from s4a.widgets.spectrum import Spectrum
 from s4a.widgets.transfer import Transfer
 
@@ -52,7 +52,7 @@ def running_cell() -> str | None:
     return kernel.get_parent().get("metadata", {}).get("cellId") if kernel else None
 
 
-class Explore(OfKernel):
+class Explore(KernelWidget):
     """Tabs over a study.
 
     Parameters
@@ -87,7 +87,7 @@ class Explore(OfKernel):
         boxes = [ipywidgets.VBox([ipywidgets.HTML(later)]) for _ in self.kinds]
         self.tabs = ipywidgets.Tab(children=boxes, titles=list(self.kinds))
         self.tabs.add_class("s4a-tabs")  # in style.css
-        super().__init__([self.tabs], layout=layout_of(width))
+        super().__init__([self.tabs], layout=panel_layout(width))
         self.shape = attribute(study, "latent", "median")
         self.tabs.observe(self.fill, "selected_index")
         self.observe(lambda _: self.give(), ["pair", "shape"])

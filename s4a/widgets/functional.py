@@ -8,7 +8,7 @@ from s4a.method.fmap import off_diagonal_mass, orthogonality_error, swapped_bloc
 from s4a.method.shape import Shape
 from s4a.show.browser import PARTS
 from s4a.show.surfaces import low_text, surface
-from s4a.widgets.panel import WIDE, Panel, beside, check, dropdown, int_slider, row
+from s4a.widgets.panel import WIDE, Panel, checkbox, columns, dropdown, int_slider, row
 from s4a.widgets.views import DIRECTION, Chart, signed_limit
 
 STEP = 5
@@ -57,7 +57,7 @@ class FunctionalMap(Panel):
         self.k = ipywidgets.SelectionSlider(
             options=sizes, value=last, description="size k", **slider
         )
-        self.block = check("first ten only", "the upper left corner of the matrix, magnified")
+        self.block = checkbox("first ten only", "the upper left corner of the matrix, magnified")
         narrow = {"layout": {"width": "23em"}}
         self.row = int_slider("target ψ", ROW, 1, 0, last - 1, **narrow)
         self.column = int_slider("source φ", COLUMN, 1, 0, last - 1, **narrow)
@@ -76,7 +76,7 @@ class FunctionalMap(Panel):
             row(self.choice, self.kind, self.k, self.block),
             row(self.column, self.row),
             self.numbers,
-            beside(self.matrix, *self.scenes, least="20em"),
+            columns(self.matrix, *self.scenes, min_width="20em"),
         ]
 
     def selection(self) -> dict:

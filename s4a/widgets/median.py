@@ -7,7 +7,7 @@ import traitlets
 from s4a.method.median import NORMS, distance_to_identity, near_ties
 from s4a.show.browser import PARTS
 from s4a.show.surfaces import labelled, names_of, resolutions, surface
-from s4a.widgets.panel import Panel, beside, dropdown, int_slider, row
+from s4a.widgets.panel import Panel, columns, dropdown, int_slider, row
 from s4a.widgets.views import Chart
 
 OPERATOR = (
@@ -42,11 +42,11 @@ class Median(Panel):
         latent = self.study["latent"].dataset
         self.names, n_modes = names_of(latent), latent.sizes["latent"]
         norm, options = str(latent.attrs.get("norm", "h2")), labelled(self.study, self.names)
-        self.operator = self.choose(dropdown("operator", OPERATOR, list(OPERATORS)), self.rank)
-        self.norm = self.choose(dropdown("norm", NORM, list(NORMS), value=norm), self.rank)
-        self.modes = self.choose(int_slider("modes K", MODES, n_modes, 2, n_modes), self.rank)
+        self.operator = self.redrawing(dropdown("operator", OPERATOR, list(OPERATORS)), self.rank)
+        self.norm = self.redrawing(dropdown("norm", NORM, list(NORMS), value=norm), self.rank)
+        self.modes = self.redrawing(int_slider("modes K", MODES, n_modes, 2, n_modes), self.rank)
         stages = dropdown("surfaces", "which meshes are drawn", resolutions(self.study))
-        self.stage = self.choose(stages, self.show)
+        self.stage = self.redrawing(stages, self.show)
         self.shape = dropdown("shape", "what is shown beside the bars", options)
         self.bars, self.ties = Chart(), ipywidgets.HTML()
         self.scene = self.new_scene(420)
@@ -59,7 +59,7 @@ class Median(Panel):
             row(self.operator, self.norm, self.modes),
             row(self.shape, self.stage),
             self.ties,
-            beside(self.bars, self.scene),
+            columns(self.bars, self.scene),
         ]
 
     def selection(self) -> dict:
@@ -117,5 +117,5 @@ class Median(Panel):
             caption += "; blue, shining through: the median"
             ghost = surface(self.study, self.median, stage)
         self.scene.show(*surface(self.study, name, stage), title=title)
-        self.scene.over(*ghost)
+        self.scene.overlay(*ghost)
         self.scene.caption = caption

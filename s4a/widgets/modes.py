@@ -152,9 +152,11 @@ class Modes(Panel):
         self.on_change(self.resolution, lambda name: self.view.change_mesh(*self.arrays(name)))
         self.path = file_name("shape.ply")
         mesh_help = "the shape as it stands, at full resolution"
-        self.ply = self.saving("Save mesh", lambda: self.save_mesh(self.path.value), mesh_help)
+        self.ply = self.save_button("Save mesh", lambda: self.save_mesh(self.path.value), mesh_help)
         page_help = "one HTML file with these sliders, for offline"
-        self.html = self.saving("Save page", lambda: self.save_html(self.page_path()), page_help)
+        self.html = self.save_button(
+            "Save page", lambda: self.save_html(self.page_path()), page_help
+        )
         return [self.view, row(self.resolution, self.path, self.ply, self.html)]
 
     def arrays(self, resolution: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -19,7 +19,7 @@ from s4a.show.surfaces import (
     surface,
 )
 from s4a.study.tree import excluded_of
-from s4a.widgets.panel import Panel, beside, dropdown, int_slider, row
+from s4a.widgets.panel import Panel, columns, dropdown, int_slider, row
 from s4a.widgets.views import DIRECTION, Chart
 
 STAGES = [
@@ -101,11 +101,11 @@ class Network(Panel):
         self.on_change(self, self.show_node, "node")
         self.draw()
         self.node = self.median or self.names[0]
-        columns = ipywidgets.VBox([self.graph, self.bar]), self.matrix, ipywidgets.VBox(self.scenes)
+        parts = ipywidgets.VBox([self.graph, self.bar]), self.matrix, ipywidgets.VBox(self.scenes)
         return [
             row(self.stage, self.choice, self.where),
             row(self.budget, self.facts),
-            beside(*columns, least="20em"),
+            columns(*parts, min_width="20em"),
         ]
 
     def selection(self) -> dict:

@@ -88,7 +88,7 @@ class Progress(Panel):
 
     def start(self) -> None:
         """Run, from the beginning or where it stopped."""
-        self.say("")
+        self.show_message("")
         self.view.disabled = not self.ready()
         self.state, self.stopped, self.started = "running", threading.Event(), time.monotonic()
         context = multiprocessing.get_context("spawn")
@@ -170,7 +170,7 @@ class Progress(Panel):
             self.state = {"": "finished", "cancelled": "cancelled"}.get(said, "failed")
         self.look()
         if self.state == "failed":
-            self.say(said, error=True)
+            self.show_message(said, error=True)
         self.stop.disabled, self.go_on.disabled = True, self.state == "finished"
 
     def cancel(self) -> None:
@@ -181,7 +181,7 @@ class Progress(Panel):
             self.process.join(5)
             if self.process.is_alive():
                 self.process.terminate()
-        self.say("cancelled; Resume, or the same store, goes on where it stopped")
+        self.show_message("cancelled; Resume, or the same store, goes on where it stopped")
 
     def show(self) -> None:
         """Open the panels of what is finished; they fill as other stages end."""

@@ -92,9 +92,9 @@ class Region(Panel):
         """The vertices that were drawn around are added, or taken away."""
         within = vertices_within(self.X, self.T, drawn["polygon"], drawn["turn"])
         if not within.any():
-            self.say("no vertex is seen within what was drawn")
+            self.show_message("no vertex is seen within what was drawn")
             return
-        self.say("")
+        self.show_message("")
         self.take(
             self.region | within if self.how.value == ADD else self.region & ~within, NO_LABEL
         )

@@ -9,7 +9,7 @@ import traitlets
 from s4a.method.spectral import reconstruct, weyl
 from s4a.show.charts import BLUE, GREY, ORANGE
 from s4a.show.surfaces import labelled, low_text, surface, unit_text
-from s4a.widgets.panel import Panel, beside, dropdown, int_slider, row
+from s4a.widgets.panel import Panel, columns, dropdown, int_slider, row
 from s4a.widgets.views import Chart
 
 MOST = 100  # curves in a chart
@@ -58,7 +58,7 @@ class Spectrum(Panel):
         self.shape = self.names[0]
         modes = ipywidgets.VBox([self.mode, self.function])
         rebuilt = ipywidgets.VBox([self.k, self.rebuilt])
-        return [row(self.choice), beside(self.curves, self.gaps), beside(modes, rebuilt)]
+        return [row(self.choice), columns(self.curves, self.gaps), columns(modes, rebuilt)]
 
     def selection(self) -> dict:
         """The shape whose functions are shown."""

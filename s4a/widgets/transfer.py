@@ -16,8 +16,8 @@ from s4a.schema import dataset
 from s4a.show.browser import PARTS
 from s4a.show.draw import label_colors
 from s4a.show.surfaces import aligned, label_text, labelled, names_of, unit_text
-from s4a.widgets.panel import Panel, beside, check, dropdown, file_name, row
-from s4a.widgets.views import extent, iteration_number
+from s4a.widgets.panel import Panel, checkbox, columns, dropdown, file_name, row
+from s4a.widgets.views import extent, round_down
 
 COLUMNS = ["name", "x", "y", "z", "confidence"]
 OF = "labels and landmarks are of this shape"
@@ -64,12 +64,12 @@ class Transfer(Panel):
             "source": dropdown("source", OF, shapes[0], value=source),
             "target": dropdown("target", "they are carried to this shape", shapes[1]),
         }
-        self.labels = check("labels", "colour both surfaces by the labels of the source", True)
+        self.labels = checkbox("labels", "colour both surfaces by the labels of the source", True)
         words = {"description": "landmark", "placeholder": "a name, then click", "tooltip": NAME}
         self.name = ipywidgets.Combobox(**words)
         self.remove = self.button("Remove", lambda: self.drop(self.landmark), NAMED)
         self.radius = ipywidgets.BoundedFloatText(
-            iteration_number(extent(registration["position"].values) / 60),
+            round_down(extent(registration["position"].values) / 60),
             min=0,
             max=1e9,
             step=0.5,
@@ -79,7 +79,7 @@ class Transfer(Panel):
             layout={"width": "24em"},
         )
         self.path = file_name("landmarks.csv")
-        self.csv = self.saving("Save CSV", lambda: self.save_csv(self.path.value), SAVED)
+        self.csv = self.save_button("Save CSV", lambda: self.save_csv(self.path.value), SAVED)
         self.legend, self.table = ipywidgets.HTML(), ipywidgets.HTML()
         self.scenes = [self.new_scene(380, clickable=True), self.new_scene(380)]
         self.on_change(self, self.begin_marks, "source")
@@ -95,7 +95,7 @@ class Transfer(Panel):
         return [
             row(*self.choices.values(), self.labels),
             row(self.name, self.remove, self.radius, self.path, self.csv),
-            beside(*self.scenes),
+            columns(*self.scenes),
             self.legend,
             self.table,
         ]

@@ -83,7 +83,7 @@ def test_a_scene_holds_the_arrays_as_float32_and_uint32():
     assert (floats(view.position) == X.astype(np.float32)).all()
     assert (np.frombuffer(view.corner, "<u4").reshape(-1, 3) == T).all()
     assert len(view.color) == 12
-    view.over(X + 1, T)
+    view.overlay(X + 1, T)
     assert (floats(view.ghost_position) == X + 1).all()
     view.close()
 
@@ -514,7 +514,7 @@ def test_names_of_labels_and_landmarks_are_text_in_panels_and_saved_pages(study,
         both.table.value,
         both.save_html(tmp_path / "page.html").read_text(encoding="utf-8"),
     ]
-    both.say(bad, error=True)
+    both.show_message(bad, error=True)
     for text in [*texts, both.message.value]:
         assert "&lt;img src=x" in text
         assert "<img src=x" not in text
