@@ -420,7 +420,7 @@ def groups():
     shapes = {name: node.to_dataset() for name, node in tree["original"].children.items()}
     study = s4a.analyse(shapes, n_coarse=1500, k=60, n_jobs=-1)
     group = dict(zip(truth["shape"].values.tolist(), group.tolist(), strict=True))
-    kept, again = statistics.evaluate(study), statistics.generalization(study, n_jobs=-1)
+    kept, again = statistics.evaluate(study), s4a_morphometrics.generalization(study, n_jobs=-1)
     for measure in ("generalization", "generalization_surface"):
         for which, found in (("kept: optimistic", kept), ("recomputed", again)):
             value, error = (found[f"{measure}{e}"].values for e in ("", "_error"))

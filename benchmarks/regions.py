@@ -17,6 +17,7 @@ from s4a import statistics
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.method.pca import pca
 from s4a.schema import dataset
+from s4a_morphometrics import within, without
 
 X, T = as_arrays(s4a.synthetic.ellipsoid(200))
 REGION = X[:, 2] > np.quantile(X[:, 2], 5 / 6)
@@ -46,9 +47,9 @@ def draw(run: int, effect: float) -> tuple[xr.DataTree, np.ndarray]:
 
 WAYS = {
     "whole": lambda study, opening: study,
-    "region": lambda study, opening: statistics.within(study, REGION),
-    "without the nuisance": statistics.without,
-    "both": lambda study, opening: statistics.within(statistics.without(study, opening), REGION),
+    "region": lambda study, opening: within(study, REGION),
+    "without the nuisance": without,
+    "both": lambda study, opening: within(without(study, opening), REGION),
 }
 
 

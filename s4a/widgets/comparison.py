@@ -65,8 +65,8 @@ class Comparison(Panel):
     Parameters
     ----------
     comparison : xarray.DataTree
-        Result of :func:`s4a.compare.pairs` with ``keep=True``, or opened from the ``compare.nc``
-        of ``s4a compare --keep``.
+        Result of :func:`s4a.compare` with ``keep=True``, or opened from the ``compare.nc`` of
+        ``s4a compare --keep``.
     methods : sequence of str, optional
         At most seven methods of the comparison; by default SCALABLE, RE-MATCH and registered
         surface.  "truth" is the ground truth, if it is known.
@@ -93,7 +93,7 @@ class Comparison(Panel):
     >>> import s4a
     >>> from s4a.widgets import Comparison
     >>> ball = s4a.synthetic.ellipsoid(300)
-    >>> comparison = s4a.compare.pair(ball, ball, methods=["kNN"], keep=True)
+    >>> comparison = s4a.compare(ball, ball, methods=["kNN"], keep=True)
     >>> panel = Comparison(comparison)
     >>> [scene.title for scene in panel.scenes[1:]]
     ['kNN']

@@ -43,6 +43,7 @@ from paths import NOTEBOOKS
 import s4a
 from s4a.show.draw import vertices_within
 from s4a.show.surfaces import aligned
+from s4a_morphometrics.region_panel import Region
 
 pytest.importorskip("playwright.sync_api")
 pytest.importorskip("jupyterlab")
@@ -741,7 +742,7 @@ def test_one_mode_has_no_chart_of_the_variance_of_many(show, study, components):
 
 
 def test_a_lasso_takes_what_is_seen_within_it(show, study):
-    panel = widgets.Region(study, view="top")
+    panel = Region(study, view="top")
     panel.lasso.value = True
     X, T = panel.X, panel.T
     page = show(panel)
@@ -1006,7 +1007,7 @@ def compared():
     reference = brains["truth/brain_02/reference_point"].values
     truth = np.asarray(s4a.synthetic.position(brains["truth"], "brain_01", reference))
     options = {"n_coarse": 200, "k": 20, "k_init": 10, "n_geodesic": 50, "keep": True}
-    return s4a.compare.pair(one, two, truth=truth, methods=["kNN", "RE-MATCH"], **options)
+    return s4a.compare(one, two, truth=truth, methods=["kNN", "RE-MATCH"], **options)
 
 
 def test_the_page_of_methods_marks_a_place_in_all_views(show, compared):

@@ -27,7 +27,8 @@ from browsing import (
 
 import s4a
 from s4a.show import charts
-from s4a.widgets import Median, Modes, Region
+from s4a.widgets import Median, Modes
+from s4a_morphometrics.region_panel import Region
 from s4a_morphometrics.structures_panel import Structures
 from s4a_morphometrics.synthetic import example_structures
 
@@ -39,9 +40,10 @@ import numpy as np
 from IPython.display import display
 
 import s4a
+from s4a_morphometrics.region_panel import Region
 from s4a_morphometrics.structures_panel import Structures
 from s4a_morphometrics.synthetic import example_structures
-from s4a.widgets import Comparison, Maps, Progress, Region
+from s4a.widgets import Comparison, Maps, Progress
 
 study = s4a.open_study({study!r})
 found = s4a.statistics.regression(study, range(4), of="normal", n_permutations=15)
@@ -49,7 +51,7 @@ p = np.where(np.arange(found.sizes["vertex"]) % 3, 0.4, 0.02)
 found = found.assign(p_family_wise=found["p_family_wise"].copy(data=p))
 several = example_structures()
 ball = s4a.synthetic.ellipsoid(300)
-compared = s4a.compare.pair(ball, ball, methods=["kNN"], keep=True)
+compared = s4a.compare(ball, ball, methods=["kNN"], keep=True)
 brains = s4a.synthetic.brains(3, 300, seed=1)
 make = {{
     "Maps": lambda: Maps(study, found),

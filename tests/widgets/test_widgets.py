@@ -923,9 +923,7 @@ def test_a_shape_that_nothing_can_be_carried_to_is_told(inserted):
     nodes = {node.path: node.to_dataset(inherit=False) for node in inserted.subtree}
     del nodes[f"/original/{template}"]
     alone = xr.DataTree.from_dict(nodes)
-    with pytest.raises(
-        ValueError, match="a second shape to transfer to; .* only brain_07"
-    ):
+    with pytest.raises(ValueError, match="needs a second shape to transfer to"):
         Transfer(alone)
 
 

@@ -29,23 +29,23 @@ class Region(Panel):
     Attributes
     ----------
     region : bool ndarray (vertex,)
-        Mask of the selected vertices of the template, for :func:`s4a.statistics.within`.
+        Mask of the selected vertices of the template, for :func:`s4a_morphometrics.within`.
 
     See Also
     --------
-    s4a.statistics.within : a study restricted to a region.
+    s4a_morphometrics.within : a study restricted to a region.
 
     Examples
     --------
     With a study of six small brains; the square is a lasso selection:
 
     >>> import s4a
-    >>> from s4a.widgets import Region
+    >>> from s4a_morphometrics import Region, within
     >>> study = s4a.synthetic.example_study()
     >>> panel = Region(study, view="top")
     >>> square = [[0, -99], [99, -99], [99, 99], [0, 99]]
     >>> panel.scene.drawn_around = {"polygon": square, "turn": panel.scene.turn, "count": 1}
-    >>> right = s4a.statistics.within(study, panel.region)
+    >>> right = within(study, panel.region)
     >>> bool(right["registration"]["position"].values[:, 0].min() >= 0)
     True
     >>> panel.close()
@@ -119,5 +119,5 @@ class Region(Panel):
         share = self.area[region].sum() / self.area.sum()
         self.scene.caption = (
             f"{region.sum():,} of {len(region):,} vertices, {share:.1%} of the area: "
-            "statistics.within(study, panel.region)"
+            "s4a_morphometrics.within(study, panel.region)"
         )
