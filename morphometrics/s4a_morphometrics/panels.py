@@ -57,7 +57,7 @@ class Asymmetry(Maps):
     def build(self, **options: Any) -> list[ipywidgets.Widget]:
         """Choices, of an individual too, and the surface."""
         self.known = [*self.known, ("of one individual", INDIVIDUAL)]
-        names = self.found["individual"].values.tolist()
+        names = self.result["individual"].values.tolist()
         self.individual = dropdown("individual", OF, names, layout=WIDE)
         _, *below = super().build(**options)
         self.redraw(self.paint, self.individual)
@@ -65,13 +65,13 @@ class Asymmetry(Maps):
 
     def surface(self) -> xr.DataArray:
         """The symmetric consensus, of which asymmetries are differences."""
-        return self.found["symmetric_position"]
+        return self.result["symmetric_position"]
 
     def values(self) -> tuple[np.ndarray, bool, str]:
         """The map ``(n,)``, whether it has signs, and its unit."""
         if self.map.value != INDIVIDUAL:
             return super().values()
-        own = self.found["asymmetry"].sel(individual=self.individual.value)
+        own = self.result["asymmetry"].sel(individual=self.individual.value)
         return (own.values * self.normals).sum(1), True, unit_of(own)
 
     def paint(self) -> None:
@@ -82,5 +82,5 @@ class Asymmetry(Maps):
 
     def summary(self, shown: np.ndarray) -> str:
         """How much of the area is significant, p of the whole shape and of antisymmetry."""
-        p = self.found["antisymmetry_p"].item()
+        p = self.result["antisymmetry_p"].item()
         return f"{super().summary(shown)}; antisymmetry p = {p:.3g}"
