@@ -166,7 +166,7 @@ def list_options():
         values = [f"`{value}`" for value in known["choices"]] or kinds
         presets = "".join(f"; {preset}: `{value}`" for preset, value in known["presets"].items())
         text = f"{known['help']}. {known['more']}".strip().replace("|", "\\|").replace("``", "`")
-        text = re.sub(r":\w+:`", "`", f"{text[0].upper()}{text[1:]}")
+        text = re.sub(r":\w+:`", "`", f"{text[0].upper()}{text[1:]}").replace("*", r"\*")
         lines.append(
             f"| `{name}` | `{known['default']}`{presets} | {' or '.join(values)} | {text} |"
         )
