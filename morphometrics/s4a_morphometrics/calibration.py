@@ -27,7 +27,7 @@ import xarray as xr
 from s4a.analysis.inputs import registration_of
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays
-from s4a.input.plausibility import spread
+from s4a.input.plausibility import evenly_chosen
 from s4a.method.initial_map import transform_onto
 from s4a.method.pca import gram
 from s4a.method.register import from_latent
@@ -217,7 +217,7 @@ def gaps_between_ways(model: Model) -> Gaps:
 
 def _rematched(registration):
     """Shapes of the study whose part is matched again."""
-    return spread(_others(registration), N_REMATCHED)
+    return evenly_chosen(_others(registration), N_REMATCHED)
 
 
 def _others(registration):
@@ -232,7 +232,7 @@ def _pairs_of(study):
     """
     registration, network = registration_of(study), study["latent"]["shape"].values.tolist()
     others = [name for name in _others(registration) if name in network]
-    chosen = spread([name for name in _rematched(registration) if name in network], N_WAYS)
+    chosen = evenly_chosen([name for name in _rematched(registration) if name in network], N_WAYS)
     if len(others) < 2:
         return []
     half = len(others) // 2

@@ -350,7 +350,7 @@ def descriptors_of(study: xr.DataTree) -> dict[str, xr.Dataset]:
     descriptors = {}
     known = known_to(study)
     by_size = sorted(known, key=lambda name: known[name]["area"])
-    for name in plausibility.spread(by_size, 2 * plausibility.N_REFERENCES):
+    for name in plausibility.evenly_chosen(by_size, 2 * plausibility.N_REFERENCES):
         mesh = study["original"][name].to_dataset()
         seen = plausibility.describe(mesh, intersections=False)
         if "report" in study:  # where they were counted
@@ -379,7 +379,7 @@ def report_beside(
             reports.append(shape_report({name: said}))
             continue
         flags, told = find_warnings(known | {name: said}, known_looks | {name: looks[name]})
-        reports.append(shape_report({name: said}, flags, evidence={name: looks[name]}))
+        reports.append(shape_report({name: said}, flags, comparisons={name: looks[name]}))
         remarks |= dict.fromkeys(line for line in told if line not in reported_before)
     return xr.concat(reports, dim="shape").assign_attrs(remarks="\n".join(remarks))
 

@@ -93,7 +93,7 @@ window.WebSocket = class extends Real {
 def study(tmp_path_factory):
     folder = tmp_path_factory.mktemp("study")
     return s4a.analyse(
-        s4a.synthetic.brains(5, 1200, seed=1), n_coarse=400, k=24, k_init=10, store=folder, n_jobs=1
+        s4a.synthetic.brains(5, 2000, seed=1), n_coarse=500, k=24, k_init=10, store=folder, n_jobs=1
     )
 
 
