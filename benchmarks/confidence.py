@@ -30,7 +30,7 @@ from sklearn.metrics import roc_auc_score
 import s4a
 from s4a import synthetic
 from s4a.method import initial_map
-from s4a.method.register import RIGHT, WEIGHTS, evidence
+from s4a.method.register import RADIUS, WEIGHTS, confidence_features
 from s4a.options import Options
 from s4a.study.pair import match_shapes, shape_of
 from s4a.study.quality_control import UNSURE, WRONG
@@ -100,14 +100,14 @@ def same_vertices(folder, part, pairs):
 
 
 def measured(pair):
-    """Error of every vertex, share of sqrt(area); evidence; the registration."""
+    """Error of every vertex, share of sqrt(area); confidence_features; the registration."""
     options = Options(n_coarse=4000)
     source, target = (shape_of(mesh, options) for mesh in (pair.shape, pair.template))
     found, _ = match_shapes(source, target, options)
     image = image_of(found, pair.template)
     error = np.linalg.norm(image - pair.true, axis=1) / source.frame[1]
-    seen = evidence(source, target, found["registered_match"].values, source.to_frame(image))
-    return error, seen, found
+    match = found["registered_match"].values
+    return error, confidence_features(source, target, match, source.to_frame(image)), found
 
 
 def fit(results):
@@ -117,7 +117,7 @@ def fit(results):
     for error, evidence_of_pair, _ in results:
         some = rng.choice(len(error), EACH)
         seen.append(evidence_of_pair[some])
-        right.append(error[some] < RIGHT)
+        right.append(error[some] < RADIUS)
     model = LogisticRegression(C=1e3, max_iter=1000)
     model.fit(np.concatenate(seen), np.concatenate(right))
     return model.intercept_[0], *model.coef_[0]
@@ -134,12 +134,12 @@ def report(names, results):
     say(f"{'pair':16} {'error %':>8} {'right':>6} {'sure':>6} {'Spearman':>9} {'caught':>7}\n")
     for name, (error, _, found) in zip(names, results, strict=True):
         sure = found["confidence"].values
-        right, rank = (error < RIGHT).mean(), spearmanr(-sure, error)[0]
+        right, rank = (error < RADIUS).mean(), spearmanr(-sure, error)[0]
         cells = f"{100 * error.mean():8.3f} {right:6.2f} {sure.mean():6.2f} {rank:9.2f}"
         say(f"{name:16} {cells} {caught(error, sure):7.2f}\n")
     error = np.concatenate([error for error, *_ in results])
     sure = np.concatenate([found["confidence"].values for *_, found in results])
-    right, bins = error < RIGHT, np.clip((10 * sure).astype(int), 0, 9)
+    right, bins = error < RADIUS, np.clip((10 * sure).astype(int), 0, 9)
     say("confidence in the mean, share that is right, share of the vertices:\n")
     for b in np.unique(bins):
         say(
