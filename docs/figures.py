@@ -41,7 +41,7 @@ from s4a.show.draw import (
     with_balls,
 )
 from s4a.show.pictures import mode_pictures
-from s4a.show.surfaces import mesh_of, mode_arrays, network_places, surface, transferred_colors
+from s4a.show.surfaces import mesh_of, mode_arrays, network_positions, surface, transferred_colors
 
 HERE = Path(__file__).parent
 LOCAL_FOLDER = HERE / "_build"
@@ -142,7 +142,7 @@ def pipeline(study):
         if picture is not None:
             ax.imshow(picture)
     pairs = study["network"].dataset
-    places = network_places(study, names)
+    places = network_positions(study, names)
     ends = [[names.index(str(n)) for n in pairs[end].values] for end in ("source", "target")]
     lines = np.stack([places[ends[0]], places[ends[1]]])  # (2, pair, 2)
     axes[2].plot(lines[..., 0], lines[..., 1], color=charts.BLUE, linewidth=0.8, alpha=0.6)
@@ -221,9 +221,10 @@ def variance(study):
     registration = study["registration"].to_dataset()
     names = registration["shape"].values.tolist()
     R, t = registration["icp_rotation"].values, registration["icp_translation"].values
+    options = {"refine": "intrinsic", "alignment": "icp"}
     fields = [
-        s4a.register_shape(study, name, start=start, refine="intrinsic", alignment="icp")
-        for name, *start in zip(names, R, t, strict=True)
+        s4a.register_shape(study, name, initial_transform=transform, **options)
+        for name, *transform in zip(names, R, t, strict=True)
     ]
     fields = xr.concat([f[["displacement", "displacement_low"]] for f in fields], "shape")
     area = s4a.geometry.mesh.vertex_areas(*mesh_of(registration))

@@ -28,7 +28,7 @@ from s4a.show.panel_page import panel_html
 from s4a.show.parts import Parts
 from s4a.widgets import threejs
 from s4a.widgets.explore import Explore
-from s4a.widgets.panel import OfKernel
+from s4a.widgets.panel import KernelWidget
 
 LIMIT = 1_500_000  # recorded characters of the panels of a cell, together
 MOST = 3_700_000  # letters of their pages, compressed: with pictures a page has less than 5 MB
@@ -132,7 +132,7 @@ def packed(panel, limit):
     return base64.b64encode(gzip.compress(html, mtime=0)).decode()
 
 
-OfKernel.without_kernel = framed
+KernelWidget.without_kernel = framed
 begin_bar = bar.__init__
 
 

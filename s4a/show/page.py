@@ -24,7 +24,7 @@ from s4a.show.surfaces import (
     mode_arrays,
     mode_limits,
     names_of,
-    network_places,
+    network_positions,
     score_state,
     surface,
     template_coarse,
@@ -198,7 +198,7 @@ def _network(study, look):
     pairs = study["network"].dataset
     source, target = (pairs[key].values.astype(str) for key in ("source", "target"))
     names = np.unique(np.r_[source, target]).tolist()
-    places = network_places(study, names)
+    places = network_positions(study, names)
     where = "placed by the first two components of their area-based shape differences"
     if places is None:
         places, where = charts.on_circle(len(names)), "on a circle"

@@ -214,7 +214,7 @@ def near_excluded(pca: xr.Dataset) -> dict[str, list[float]]:
     return dict(zip(names, near["score_excluded"].values.tolist(), strict=True))
 
 
-def network_places(study: xr.DataTree, names: list[str]) -> np.ndarray | None:
+def network_positions(study: xr.DataTree, names: list[str]) -> np.ndarray | None:
     """Places ``(n, 2)`` of shapes: the first two components of their area-based differences.
 
     None where the study has not both for each of them.

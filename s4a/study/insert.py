@@ -20,12 +20,12 @@ from s4a.input.landmarks import SUFFIXES
 from s4a.input.plausibility import find_warnings
 from s4a.input.subjects import listed
 from s4a.method.initial_map import transform_onto
-from s4a.method.latent import latent_of_new
+from s4a.method.latent import out_of_sample_latent
 from s4a.method.pca import project_scores
 from s4a.method.refined_eigenfunctions import low_resolution
 from s4a.method.register import from_latent
 from s4a.method.shape import Shape
-from s4a.method.steps import Study, latent_bases, place_in
+from s4a.method.steps import Study, latent_bases, out_of_sample_basis_in
 from s4a.options import Options, with_options
 from s4a.schema import check_type, dataset, in_unit, require, unit_of, variable
 from s4a.study.processes import workers
@@ -158,7 +158,7 @@ def insert(
     nodes = {f"original/{name}": meshes[name] for name in inserted}
     nodes[f"original/{template}"] = frozen.template.original
     nodes |= {f"coarse/{name}": result.coarse for name, result in inserted.items()}
-    nodes["latent"] = latent_of_new(
+    nodes["latent"] = out_of_sample_latent(
         np.stack([result.Y for result in inserted.values()]),
         np.stack([result.coarse["eigenvalue"].values for result in inserted.values()]),
         study["latent"].dataset["latent_eigenvalue"].values,
@@ -316,7 +316,7 @@ def _insert_one(mesh, frozen, options, references):
     shape = Shape(mesh, coarse, **options.of("projection"))
     R, t = transform_onto(shape.low, template.low)
     rotation = study["registration"]["rotation"]  # onto the template
-    Y = place_in(
+    Y = out_of_sample_basis_in(
         study,
         names,
         Shape(coarse=coarse).low,

@@ -280,7 +280,7 @@ def test_the_panel_of_a_run_counts_volumes(volumes, tmp_path):
 
     panel = Progress(volumes, tmp_path / "study", label=17, **OPTIONS)
     panel.process.join(120)
-    panel.look()
+    panel.update()
     assert panel.bars["read and clean"].max == 5
     panel.close()
     assert list(s4a.open_study(tmp_path / "study")["original"]) == [f"scan_{i}" for i in range(5)]

@@ -93,7 +93,7 @@ window.WebSocket = class extends Real {
 def study(tmp_path_factory):
     folder = tmp_path_factory.mktemp("study")
     return s4a.analyse(
-        s4a.synthetic.brains(5, 1200, seed=1), n_coarse=400, k=24, k_init=10, store=folder, n_jobs=1
+        s4a.synthetic.brains(5, 2000, seed=1), n_coarse=500, k=24, k_init=10, store=folder, n_jobs=1
     )
 
 
@@ -515,7 +515,7 @@ def test_sliders_keep_their_arrow_keys_in_notebook_7(sizes):
     sizes.keyboard.press("ArrowRight")
     assert float(slider.input_value()) == pytest.approx(0.05)
     handle = panel_of(tabs_of(sizes, 3, "Spectrum")).locator("[role=slider]").first
-    assert handle.get_attribute("aria-label") == "mode"
+    assert handle.get_attribute("aria-label") == "eigenfunction"
     before = float(handle.get_attribute("aria-valuenow"))
     handle.focus()
     sizes.keyboard.press("ArrowRight")
@@ -1047,9 +1047,9 @@ def test_the_page_of_methods_marks_a_place_in_all_views(show, compared):
         assert len({round(box["x"]) for box in boxes}) == columns
         assert max(box["x"] + box["width"] for box in boxes) <= width
     chosen(page, "colors", "error")
-    chosen(page, "way1", "truth")
+    chosen(page, "method1", "truth")
     visible(page, ".s4a-title").filter(has_text=re.compile("^truth$")).nth(1).wait_for()
-    chosen(page, "way1", "RE-MATCH")
+    chosen(page, "method1", "RE-MATCH")
 
     at = cursor(visible(page, VIEW).nth(1), "ArrowRight")
     kept = compared["pairs/pair"].dataset

@@ -99,14 +99,14 @@ def test_the_target_has_the_colours_of_the_places_where_a_method_puts_it(found, 
     assert (floats(shown.scenes[0].coordinate) == X.astype(np.float32)).all()
     np.testing.assert_allclose(floats(shown.scenes[1].coordinate), X[match], atol=1e-4)
     assert shown.scenes[1].cell == shown.scenes[0].cell > 0
-    shown.way0.value = "registered surface"
+    shown.method0.value = "registered surface"
     image = kept["algorithm_image"].sel(algorithm="registered surface").values
     np.testing.assert_allclose(floats(shown.scenes[1].coordinate), image, atol=1e-4)
 
 
 def test_errors_have_one_scale_and_the_mean_is_told(found, panel):
     shown = panel()
-    assert [choice.value for choice in shown.ways] == ["RE-MATCH", "registered surface", "kNN"]
+    assert [choice.value for choice in shown.methods] == ["RE-MATCH", "registered surface", "kNN"]
     shown.colors.value = "error"
     bars = [scene.bar for scene in shown.scenes[1:]]
     assert bars[0] == bars[1] == bars[2]
@@ -156,7 +156,7 @@ def test_a_place_of_the_source_stays_marked_where_another_method_has_it(found, p
     way_back = kept["algorithm_reverse"].sel(algorithm="registered surface").values
     vertex = int(np.argmax(way_back >= 0))
     shown.scenes[0].picked = {"vertex": vertex, "count": 1}
-    shown.way0.value = "registered surface"
+    shown.method0.value = "registered surface"
     assert shown.scenes[1].points[0][:3] == kept["position"].values[way_back[vertex]].tolist()
     assert shown.scenes[1].caption.startswith(f"target vertex {way_back[vertex]} → ")
     assert shown.scenes[0].points[0][:3] == found["source/position"].values[vertex].tolist()
@@ -169,7 +169,7 @@ def test_nothing_is_marked_or_said_of_another_pair(panel, side):
     assert "vertex" in shown.scenes[1].caption
     shown.pair.value = "brain_03"
     assert [scene.points for scene in shown.scenes] == [[], [], []]
-    assert [scene.caption for scene in shown.scenes] == ["colours are coordinates", "", ""]
+    assert [scene.caption for scene in shown.scenes] == ["coordinates as colours", "", ""]
 
 
 def test_a_saved_page_leaves_the_place_that_was_picked(panel, tmp_path):

@@ -49,7 +49,7 @@ def test_it_is_grey_where_nothing_is_significant_and_says_how_much_is(panel, fou
     np.testing.assert_allclose(one.scene.colors[significant], expected[significant], atol=1e-6)
     area = vertex_areas(X, T)
     share = 100 * area[significant].sum() / area.sum()
-    assert f"{share:.1f} % of the area at p ≤ 0.05 (family-wise), smallest 0.02" in (
+    assert f"{share:.1f} % of the area at p ≤ 0.05 (family-wise), smallest p 0.02" in (
         one.scene.caption
     )
     one.level.value = 0.01
@@ -82,7 +82,7 @@ def test_the_map_of_groups_is_shown_too(panel, study):
 
 def test_a_result_without_maps_or_of_another_template_is_refused(panel, study, found):
     for result, words in {
-        "none": (found[["p_value"]], "found p_value at no: give what a test"),
+        "none": (found[["p_value"]], "found p_value at no vertices: give the result"),
         "other": (found.isel(vertex=slice(10)), "at the 1500 vertices of the template; .* at 10"),
     }.values():
         with pytest.raises(ValueError, match=words):

@@ -182,7 +182,7 @@ def test_a_lasso_tells_python_what_is_within_it(page):
     said = panel.locator(".s4a-readout").filter(has_text=re.compile("^[1-9]"))
     said.wait_for()
     assert pixels(canvas) != before
-    panel.get_by_role("button", name="nothing").click()
+    panel.get_by_role("button", name="clear").click()
     panel.locator(".s4a-readout").filter(has_text=re.compile("^0 of")).wait_for()
 
 

@@ -256,5 +256,5 @@ def test_what_cannot_be_shown_is_refused():
         threejs.network(xr.DataTree())
     with pytest.raises(ValueError, match="finite"):
         threejs.surface(mesh.assign(position=mesh["position"] * np.nan))
-    with pytest.raises(ValueError, match="at least one surface"):
+    with pytest.raises(ValueError, match="at least one object"):
         threejs.renderer()

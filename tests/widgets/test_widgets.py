@@ -83,7 +83,7 @@ def test_a_scene_holds_the_arrays_as_float32_and_uint32():
     assert (floats(view.position) == X.astype(np.float32)).all()
     assert (np.frombuffer(view.corner, "<u4").reshape(-1, 3) == T).all()
     assert len(view.color) == 12
-    view.over(X + 1, T)
+    view.overlay(X + 1, T)
     assert (floats(view.ghost_position) == X + 1).all()
     view.close()
 
@@ -364,7 +364,7 @@ def test_bars_are_the_stored_distances_in_rising_order(study, panel):
 def test_the_median_can_be_ranked_by_other_operators_norms_and_modes(study, panel):
     median = panel(Median)
     values = median.bars.spec["values"]
-    median.operator.value, median.modes.value = "conformal", 12
+    median.operator.value, median.size.value = "conformal", 12
     D = study["latent"]["conformal_difference"].values[:, :12, :12]
     expected = s4a.method.median.distance_to_identity(
         D, study["latent"]["latent_eigenvalue"].values[:12]
@@ -394,7 +394,7 @@ def test_two_shapes_are_matched_by_way_of_the_template(study, panel):
     registered = study["registration"]["registered_match"]
     X, Y = both.pair[0][0], both.pair[1][0]
     assert len(X) == study["original"][source].sizes["vertex"]
-    there, back = both.match(), both.way_back()
+    there, back = both.match(), both.reverse_match()
     # a vertex of the template, carried to both shapes, is one place
     on_source, on_shape = (registered.sel(shape=name).values for name in (source, shape))
     size = np.ptp(Y, axis=0).max()
@@ -446,7 +446,7 @@ def test_the_checkerboard_is_evaluated_from_the_templates_coordinates(study, pan
     both.map.value = "low"
     template, shape = (floats(view.coordinate) for view in both.scenes)
     assert (template == shape[both.match()]).all()
-    both.colors.value = "place"
+    both.colors.value = "position"
     assert both.scenes[0].coordinate == b""
     assert both.scenes[0].cell == 0
 
@@ -514,7 +514,7 @@ def test_names_of_labels_and_landmarks_are_text_in_panels_and_saved_pages(study,
         both.table.value,
         both.save_html(tmp_path / "page.html").read_text(encoding="utf-8"),
     ]
-    both.say(bad, error=True)
+    both.show_message(bad, error=True)
     for text in [*texts, both.message.value]:
         assert "&lt;img src=x" in text
         assert "<img src=x" not in text
@@ -574,11 +574,11 @@ def test_a_saved_page_leaves_the_point_that_was_picked(panel, tmp_path):
 
 def test_nothing_is_said_of_labels_that_are_not_shown(study, panel):
     both = panel(Transfer)
-    assert both.scenes[1].caption.startswith("labels carried from ")
+    assert both.scenes[1].caption.startswith("labels transferred from ")
     both.labels.value = False
     assert [scene.caption for scene in both.scenes] == ["", ""]
     both.labels.value = True
-    assert both.scenes[1].caption.startswith("labels carried from ")
+    assert both.scenes[1].caption.startswith("labels transferred from ")
     tree = study.copy()
     tree[f"original/{both.target}"].dataset = (
         tree[f"original/{both.target}"].to_dataset().drop_vars("label")
@@ -598,9 +598,9 @@ def test_the_spectrum_shows_every_shape_beside_weyls_line(study, panel):
     spectrum.curves.picked = {"series": "brain_03", "count": 1}
     assert spectrum.shape == "brain_03"
     spectrum.k.value = 24
-    all_of_it = float(re.search(r"surface ([\d.e-]+)", spectrum.rebuilt.caption)[1])
+    all_of_it = float(re.search(r"surface ([\d.e-]+)", spectrum.reconstruction.caption)[1])
     spectrum.k.value = 5
-    assert float(re.search(r"surface ([\d.e-]+)", spectrum.rebuilt.caption)[1]) > all_of_it
+    assert float(re.search(r"surface ([\d.e-]+)", spectrum.reconstruction.caption)[1]) > all_of_it
 
 
 # ---- many shapes
@@ -694,7 +694,7 @@ def test_a_resumed_analysis_is_not_called_cancelled(tmp_path):
     panel.stop.click()
     assert "cancelled" in panel.message.value
     assert ended(panel) == "cancelled"
-    panel.go_on.click()
+    panel.resume.click()
     assert panel.state == "running"
     assert panel.message.value == ""
     assert panel.view.disabled == (not panel.ready())
@@ -905,7 +905,7 @@ def test_labels_of_the_template_are_carried_to_an_inserted_shape(inserted, tmp_p
     assert (both.source, both.target) == (template, "brain_07")
     label = inserted[f"original/{template}"]["label"].values
     expected = s4a.transfer_labels(inserted, label, source=template, targets=["brain_07"])
-    assert (both.carried["label"].values == expected["brain_07"]["label"].values).all()
+    assert (both.transferred["label"].values == expected["brain_07"]["label"].values).all()
     assert [value for _, value in both.choices["target"].options] == ["brain_07"]
     both.save_html(tmp_path / "page.html")
     assert both.message.value == ""
@@ -923,7 +923,7 @@ def test_a_shape_that_nothing_can_be_carried_to_is_told(inserted):
     nodes = {node.path: node.to_dataset(inherit=False) for node in inserted.subtree}
     del nodes[f"/original/{template}"]
     alone = xr.DataTree.from_dict(nodes)
-    with pytest.raises(ValueError, match="needs a shape to carry to beside brain_07"):
+    with pytest.raises(ValueError, match="needs a second shape to transfer to"):
         Transfer(alone)
 
 

@@ -8,10 +8,10 @@ function askKernel(model, el) {
   const asked = Date.now(), working = ["busy", "starting", "restarting", "autorestarting"];
   const note = html(el, "div", { role: "status", hidden: "", style: "flex: 1" }, "Python does not answer: this panel is interactive with a running kernel; its save_html writes a page that works without one.");
   const wait = setInterval(() => { note.hidden = working.includes(model.widget_manager?.kernel?.status); }, PATIENCE);
-  const heard = () => { if (model.get("heard") >= asked) end(); };
-  const end = () => { clearInterval(wait); note.remove(); model.off("change:heard", heard); };
-  model.on("change:heard", heard);
-  model.set("asked", asked);
+  const heard = () => { if (model.get("pong") >= asked) end(); };
+  const end = () => { clearInterval(wait); note.remove(); model.off("change:pong", heard); };
+  model.on("change:pong", heard);
+  model.set("ping", asked);
   model.save_changes();
   return end;
 }

@@ -93,7 +93,7 @@ function modesWidget({ model, el }) {
   };
   button("Reset", () => set(scores().fill(0)), "all scores to 0: the mean shape");
   const play = button("Play", () => toggle(), "moves the marked mode back and forth");
-  const beside = button("−3 · mean · +3", () => tell("beside", !model.get("beside")), "the marked mode at both ends, side by side");
+  const threeButton = button("−3 · mean · +3", () => tell("side_by_side", !model.get("side_by_side")), "the marked mode at both ends, side by side");
   button("Random", () => set(scores().map(() => {
     let z = range + 1; // one normal number each, those beyond the sliders drawn again
     while (Math.abs(z) > range) z = Math.sqrt(-2 * Math.log(1 - Math.random())) * Math.cos(2 * Math.PI * Math.random());
@@ -147,9 +147,9 @@ function modesWidget({ model, el }) {
   const arrange = () => {
     shown.forEach((view) => view.dispose());
     views.replaceChildren();
-    const three = model.get("beside");
-    beside.setAttribute("aria-pressed", three);
-    box.classList.toggle("s4a-beside", three);
+    const three = model.get("side_by_side");
+    threeButton.setAttribute("aria-pressed", three);
+    box.classList.toggle("s4a-side-by-side", three);
     shown = (three ? [-range, 0, range] : [null]).map((at) => {
       const part = html(views, "div"), caption = html(part, "div", { class: "s4a-title" });
       const view = new View(part, { turn: model.get("turn"), group: model.get("group"), height: model.get("height"), label: "shape" });
@@ -204,7 +204,7 @@ function modesWidget({ model, el }) {
   };
   const reload = () => { modes.load(); arrange(); };
   const on = {
-    "change:scores": told, "change:colors": update, "change:beside": arrange, "change:deformation": reload, "change:corner": () => { modes.load(); update(); }, "change:own": () => { modes.load(); update(); },
+    "change:scores": told, "change:colors": update, "change:side_by_side": arrange, "change:deformation": reload, "change:corner": () => { modes.load(); update(); }, "change:own": () => { modes.load(); update(); },
     "change:still": picture, "change:turn": () => shown[0].reset(model.get("turn")),
   };
   Object.entries(on).forEach(([event, act]) => model.on(event, act));
