@@ -375,7 +375,7 @@ def twelve():
         (np.array(["2020-01-01"] * 12, "M8[D]"), "found dates; a date can be given as a number"),
         (np.arange(12) * 1j, "found complex numbers"),
         (np.zeros((12, 2)), "one number for each shape"),
-        (["31", "?", *map(str, range(10))], "1 of its 12 cells are none .shape_01: '\\?'"),
+        (["31", "?", *map(str, range(10))], "1 of 12 cells are not .shape_01: '\\?'"),
     ],
 )
 def test_a_variable_of_no_use_is_refused_with_what_to_do(variable, words, twelve):
