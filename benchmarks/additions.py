@@ -1,4 +1,4 @@
-"""What each deviation from the paper is worth, one at a time and all together, on sets with truth.
+"""Effect of each deviation from the paper, alone and together, on sets with ground truth.
 
 ``additions.py [brains] [faces] [bodies] [--only ROW...] [--data FOLDER] [--write]``: mean distances
 to the truth in % of sqrt(area), of the matched vertices and of the registered surface, and CPU
@@ -42,7 +42,7 @@ DATA = Path(__file__).parents[2] / "shared" / "data"
 CACHE = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "s4a-benchmarks"
 N_COARSE = 2000
 N_VERTICES = 10_000  # of a shape that is remeshed
-CARRIED = 300  # vertices of the template that are carried over as landmarks
+CARRIED = 300  # vertices of the template that are transferred as landmarks
 
 # ------------------------------------------------------------------------------ what the paper had
 
@@ -122,12 +122,12 @@ DEFAULTS = PRESETS[None]
 N_PROJECTED = 2500  # of 10,000 vertices, as 25,000 of 100,000
 ON_THE_PAPER = {
     "refine": {"refine": "elastic"},
-    "joint": {"refine": "spectral_icp"},
+    "spectral_icp": {"refine": "spectral_icp"},
     "init": {"init": "dense"},
-    "lift": {"refined_eigenfunctions": True},
+    "refined_eigenfunctions": {"refined_eigenfunctions": True},
     "n_samples": {"n_samples": DEFAULTS["n_samples"]},
-    "wide": {name: DEFAULTS[name] for name in ("n_samples", "dense_iterations")},
-    "parts": {"refine": "elastic", "articulated": True},
+    "dense_iterations": {name: DEFAULTS[name] for name in ("n_samples", "dense_iterations")},
+    "articulated": {"refine": "elastic", "articulated": True},
     "alignment": {"alignment": "fitted"},
     "area_weighted": {"area_weighted": True},
     "n_projected": {"n_projected": N_PROJECTED},
@@ -149,8 +149,8 @@ def study_rows():
     rows = {"paper": PAPER, "default": {}}
     rows |= {f"paper, {name}": PAPER | added for name, added in ON_THE_PAPER.items()}
     rows |= {f"default without {name}": {name: PAPER[name]} for name in ("init", "articulated")}
-    rows["default, joint"] = {"refine": "spectral_icp"}
-    rows["default, lift"] = {"refined_eigenfunctions": True}
+    rows["default, spectral_icp"] = {"refine": "spectral_icp"}
+    rows["default, refined_eigenfunctions"] = {"refined_eigenfunctions": True}
     rows |= {f"paper, {name}={value}": PAPER | {name: value} for name, value in READINGS.items()}
     rows |= {f"paper, {name}": PAPER for name in INSTEAD}
     rows |= {f"paper, norm={name}": PAPER | {"norm": name, "template": None} for name in NORMS}
@@ -284,7 +284,7 @@ def errors(study, image):
 
 
 def carried_error(study, image):
-    """Mean error of vertices of the template that are carried over, both ways where there are."""
+    """Mean error of vertices of the template that are transferred, both ways where there are."""
     registration = study["registration"].to_dataset()
     template = registration.attrs["template"]
     size = np.sqrt(registration["vertex_area"].values.sum())

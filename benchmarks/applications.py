@@ -48,7 +48,7 @@ def say(text):
 
 
 def icp_motion(source, target):
-    """R, t of ICP on up to 6,000 spread vertices, in the unit of the input."""
+    """R, t of ICP on up to 6,000 samples, in the unit of the input."""
     low = []
     for mesh in (source, target):
         X, T = as_arrays(mesh)
@@ -327,7 +327,7 @@ def points(folder):
 def parcels(folder):
     """35 regions on remeshed faces, bodies and cats, by how far votes count.
 
-    Regions are nearest to spread vertices of the source, along its edges.  The truth on the target
+    Regions are nearest to samples of the source, along its edges.  The truth on the target
     is where it lies on the mesh before it was remeshed, whose vertices are those of the source: its
     borders lie between vertices as distances say (smooth), or around them (by vertex), as those
     that are carried.
@@ -420,7 +420,7 @@ def groups():
     shapes = {name: node.to_dataset() for name, node in tree["original"].children.items()}
     study = s4a.analyse(shapes, n_coarse=1500, k=60, n_jobs=-1)
     group = dict(zip(truth["shape"].values.tolist(), group.tolist(), strict=True))
-    kept, again = statistics.evaluate(study), statistics.generalization(study, n_jobs=-1)
+    kept, again = statistics.evaluate(study), s4a_morphometrics.generalization(study, n_jobs=-1)
     for measure in ("generalization", "generalization_surface"):
         for which, found in (("kept: optimistic", kept), ("recomputed", again)):
             value, error = (found[f"{measure}{e}"].values for e in ("", "_error"))

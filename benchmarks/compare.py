@@ -22,8 +22,9 @@ import xarray as xr
 from threadpoolctl import threadpool_limits
 
 import s4a
-from s4a import compare, metrics, synthetic
+from s4a import metrics, synthetic
 from s4a.cli.tables import METRICS
+from s4a.evaluation import comparison
 from s4a.evaluation.methods import INITS
 from s4a.geometry.align import farthest_points
 from s4a.geometry.mesh import as_arrays, vertex_areas
@@ -72,7 +73,7 @@ def peer(source, target, landmarks, truth, k_init=20, k=100, step=5):
     match = model.get_p2p(refined)
     seconds = time.process_time() - begin
     found = metrics.evaluate(source, target, match, truth=truth)
-    spent = np.zeros((1, len(compare.BLOCKS)))
+    spent = np.zeros((1, len(comparison.BLOCKS)))
     spent[0, -1] = seconds
     found["block_seconds"] = variable("block_seconds", spent[None]).isel(algorithm=0, pair=0)
     return found
@@ -102,7 +103,7 @@ def registered_pairs(name, n_pairs, given=None):
 
 
 def embedded_pairs(n_vertices, n_pairs):
-    """The same for the embedded collection, the truth as positions."""
+    """The same for the sample data, the truth as positions."""
     tree = synthetic.brains(n_pairs + 1, n_vertices)
     meshes = {name: node.to_dataset() for name, node in tree["original"].children.items()}
     for (name, source), (other, target) in pairwise(meshes.items()):
@@ -135,17 +136,17 @@ def table_1(found, names=None):
     markdown(rows, ["", "CPU s", *heads])
 
 
-def registered(name, n_pairs, given=None, init=None, peers=False, methods=compare.METHODS):
+def registered(name, n_pairs, given=None, init=None, peers=False, methods=comparison.METHODS):
     """All methods, or some, and the peer on registered shapes."""
     rows = []
     for source, target, truth, marks in registered_pairs(name, n_pairs, given):
         options = {"methods": methods, "init": init}
-        found = compare.pair(source, target, truth=truth, landmarks=marks, **options)
+        found = s4a.compare(source, target, truth=truth, landmarks=marks, **options)
         if peers and importlib.util.find_spec("pyFM"):
             with threadpool_limits(1):
                 line = peer(source, target, marks, truth)
             line = line.expand_dims(pair=1)
-            line = line.assign_coords(algorithm="pyFM (FMAP+ZO)", block=list(compare.BLOCKS))
+            line = line.assign_coords(algorithm="pyFM (FMAP+ZO)", block=list(comparison.BLOCKS))
             found = xr.concat([found, line.assign_coords(pair=found["pair"])], "algorithm")
         rows.append(found)
     found, n = xr.concat(rows, "pair"), source.sizes["vertex"]
@@ -155,7 +156,7 @@ def registered(name, n_pairs, given=None, init=None, peers=False, methods=compar
     )
     table_1(found, SHOWN)
     figure_3(found)
-    if set(compare.METHODS) <= set(methods):
+    if set(comparison.METHODS) <= set(methods):
         verdict(found)
 
 
@@ -163,7 +164,7 @@ def more(pairs, what, init=None):
     """FMAP+ZO and the three of RE-MATCH on more pairs: errors and seconds, by that of FMAP+ZO."""
     found, options = [], {"methods": COMPARED, "init": init}
     for source, target, truth, marks in pairs:
-        one = compare.pair(source, target, truth=truth, landmarks=marks, **options)
+        one = s4a.compare(source, target, truth=truth, landmarks=marks, **options)
         found.append(one)
         one = one.isel(pair=0)
         cells = zip(COMPARED, one["geodesic_error"].values, seconds_of(one).values, strict=True)
@@ -202,7 +203,7 @@ def verdict(found):
         if name in mean
     }
     time_of = dict(zip(mean["algorithm"].values, seconds_of(mean).values, strict=True))
-    five = compare.PAPER_METHODS
+    five = comparison.PAPER_METHODS
     spectral = [way for way in five if way != "kNN"]
     low = {name: min(five, key=of[name].get) for name in ("chamfer", "hausdorff")}
     fastest = min(spectral, key=time_of.get)
@@ -235,7 +236,7 @@ def verdict(found):
         claims |= {
             f"RE-MATCH is the nearest to the truth of the five ({by_error[0]} is)": by_error[0]
             == "RE-MATCH",
-            "our registration is nearer to the truth than all five": error["registered"]
+            "our registration is more accurate than all five": error["registered"]
             < error[by_error[0]],
             "the order by Chamfer distance is the order by the truth": sorted(
                 five, key=of["chamfer"].get
@@ -265,8 +266,8 @@ def figure_3(found):
     )
 
 
-def embedded(n_vertices=20_000, methods=compare.METHODS):
-    """Five pairs of the embedded collection, with truth."""
+def embedded(n_vertices=20_000, methods=comparison.METHODS):
+    """Five pairs of the sample data, with truth."""
     tree = synthetic.brains(6, n_vertices)
     meshes = {name: node.to_dataset() for name, node in tree["original"].children.items()}
     (reference, source), *others = meshes.items()
@@ -275,18 +276,18 @@ def embedded(n_vertices=20_000, methods=compare.METHODS):
         for n, _ in others
     }
     truth = {n: np.asarray(t) for n, t in truth.items()}
-    found = compare.pairs(source, dict(others), truth=truth, methods=methods)
+    found = s4a.compare(source, dict(others), truth=truth, methods=methods)
     say(
-        f"\nTable 1 on the embedded collection: 5 pairs of {n_vertices} vertices, "
+        f"\nTable 1 on the sample data: 5 pairs of {n_vertices} vertices, "
         "landmarks as in 4.1\n"
     )
     table_1(found)
     figure_3(found)
-    if set(compare.METHODS) <= set(methods):
+    if set(comparison.METHODS) <= set(methods):
         verdict(found)
 
 
-def heads(given=None, methods=compare.METHODS, n_pairs=5):
+def heads(given=None, methods=comparison.METHODS, n_pairs=5):
     """One real head and others; no truth.  Every pair is printed when it is done.
 
     And the picture of where the images of two are far from the source.
@@ -295,12 +296,12 @@ def heads(given=None, methods=compare.METHODS, n_pairs=5):
     rows, seen = [], {}
     with tempfile.TemporaryDirectory() as folder, threadpool_limits(1):
         first, *others = files_of("heads", folder, given)[: n_pairs + 1]
-        mesh, load = compare.load_mesh(first, "source")
-        reference = compare.Spaces(mesh)
+        mesh, load = comparison.load_mesh(first, "source")
+        reference = comparison.Spaces(mesh)
         for path in others:
-            mesh, seconds = compare.load_mesh(path, "target")
-            target, begin = compare.Spaces(mesh), load + seconds
-            row, outcomes = compare.metrics_of_pair(
+            mesh, seconds = comparison.load_mesh(path, "target")
+            target, begin = comparison.Spaces(mesh), load + seconds
+            row, outcomes = comparison.metrics_of_pair(
                 reference, target, methods, None, begin, None, 300, options
             )
             rows.append(row)
@@ -313,7 +314,7 @@ def heads(given=None, methods=compare.METHODS, n_pairs=5):
     say(f"\nTable 1 on real heads: {n_pairs} pairs of 130,000 to 160,000 vertices, no truth\n")
     table_1(found)
     figure_3(found)
-    if set(compare.PAPER_METHODS) <= set(methods):
+    if set(comparison.PAPER_METHODS) <= set(methods):
         verdict(found)
     if set(LOOKED_AT) <= set(methods):
         where(reference.mesh, seen)
@@ -356,7 +357,7 @@ def table_2(given=None, first=tuple(FIRST)):
         shapes = s4a.read_shapes(files_of("heads", folder, given))
     all_rows, distances = [], []
     for what, options in (FIRST[name] for name in first):
-        found = compare.collection(shapes, **options)
+        found = s4a.compare_collection(shapes, **options)
         seconds, chamfer = found["collection_seconds"], found["collection_chamfer"].mean("shape")
         for way in found["algorithm"].values:
             for how in found["dense_match"].values:
@@ -410,7 +411,7 @@ if __name__ == "__main__":
     parser.add_argument("--data", type=Path, help="a folder of meshes for each set")
     parser.add_argument("--init", choices=INITS, help="initial maps of registered and more")
     parser.add_argument("--first", nargs="+", choices=FIRST, default=[*FIRST], help="of collection")
-    parser.add_argument("--methods", nargs="+", default=compare.METHODS, help="of Table 1")
+    parser.add_argument("--methods", nargs="+", default=comparison.METHODS, help="of Table 1")
     parser.add_argument("--pairs", type=int, help="of more, and of heads: 5 by default")
     parser.add_argument("--peer", action="store_true", help="pyFM beside registered shapes, too")
     args = parser.parse_args()

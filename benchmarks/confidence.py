@@ -8,8 +8,8 @@ tenth (0.1 by chance); and in bins of confidence, the share that is right.  Bodi
 their connectivity; nothing here looks at that.
 
 ``confidence.py failures`` registers random pairs of bodies without the search for initial maps, of
-which many end with limbs exchanged, and says how well these are told by their mean confidence, by
-the way there and back, and by registration_error and distortion, which a study looks at, too.
+which many end with limbs exchanged, and says how well these are reported by their mean confidence,
+by the way bidirectional, and by registration_error and distortion, which a study looks at, too.
 """
 
 import subprocess
@@ -51,7 +51,7 @@ EACH = 2000  # vertices of a pair in the fit
 FAILING = range(8, 14)  # seeds of pairs
 SIGNS = {  # of a registration; what is high is a sign of failure
     "mean confidence": lambda found: -found["confidence"].values.mean(),
-    "there and back": lambda found: found["round_trip"].values.mean(),
+    "bidirectional": lambda found: found["round_trip"].values.mean(),
     "distortion": lambda found: abs(found["distortion"].values).mean(),
     "registration_error": lambda found: found.attrs["score"],
 }
@@ -150,7 +150,7 @@ def report(names, results):
 
 
 def failures(folder):
-    """Whether a registration that failed is told from those that are right, and by what."""
+    """Whether a registration that failed is reported from those that are right, and by what."""
     errors, signs = [], {name: [] for name in SIGNS}
     with mock.patch.multiple(initial_map, SEARCHED=(), N_PAIRED=0):
         for seed in FAILING:
@@ -163,7 +163,7 @@ def failures(folder):
     errors = np.array(errors)
     signs = {name: np.array(values) for name, values in signs.items()}
     signs["registration_error x distortion"] = signs["registration_error"] * signs["distortion"]
-    signs["there and back x distortion"] = signs["there and back"] * signs["distortion"]
+    signs["bidirectional x distortion"] = signs["bidirectional"] * signs["distortion"]
     failed, right = errors > plausibility.FAILED, errors < plausibility.RIGHT
     sys.stdout.write(
         f"{len(errors)} pairs: {failed.sum()} failed, more than {plausibility.FAILED:.0f} %; "

@@ -19,14 +19,14 @@ RESULTS = DOCS / "differences.csv"
 PAGE = DOCS / "differences.md"
 HEAD = ["set", "row", "matched", "surface", "carried", "seconds", "template"]
 SETS = ("brains", "faces", "bodies")
-SWITCH = ["equation", "in the paper", "here", "where", "option: default, in the paper"]
+SWITCH = ["equation", "in the paper", "in S4A", "where", "option: default, in the paper"]
 LACKING = "not yet"  # in the place of a figure that was not measured
 
 
 # additions that are another value of an option than its default, and rows of their own
 OTHER = {"spectral_icp": "refine"}
 MORE = {  # what the table also says of a value
-    "lift": "; `RE-MATCH refined` of `s4a.compare`: True",
+    "refined_eigenfunctions": "; `RE-MATCH refined` of `s4a.compare`: True",
     "full_resolution_iterations": "; `RE-MATCH refined` of `s4a.compare`: 2",
     "n_samples": ", all",
     "n_projected": ", all",
@@ -47,10 +47,10 @@ class Reading(NamedTuple):
 READINGS = [
     Reading(
         "4.2",
-        "two ways to full resolution, *standard* and *ours*",
+        "two methods for full resolution, *standard* and *ours*",
         "*ours*, eq. 7",
         '`dense_match="fmap"`: eq. 3 and 4',
-        ("how=standard",),
+        ("dense_match=fmap",),
     ),
     Reading(
         "4.1",
@@ -61,17 +61,17 @@ READINGS = [
     ),
     Reading(
         "4.2",
-        "Consistent ZoomOut without a step of ZoomOut ahead is unsatisfactory",
-        "a step ahead",
+        "Consistent ZoomOut without a step of ZoomOut before it is unsatisfactory",
+        "one step of ZoomOut before",
         '`initial_refinement="never"`',
         ("initial_refinement=never",),
     ),
     Reading(
         "eq. 3",
         "no weights of the maps",
-        "$\\exp(-(e / s)^2 / 2)$ with $e$ the mean over the 3-cycles of a map of what these "
-        "lack, $s$ its median",
-        '`weights="equal"`; pyFM and Huang et al. (2020): the same with $e$ by a linear program',
+        "$\\exp(-(e / s)^2 / 2)$, with $e$ the mean error of the 3-cycles of a map and $s$ its "
+        "median",
+        '`weights="equal"`; pyFM and Huang et al. (2020): the same with $e$ from a linear program',
         ("weights=equal", "weights of the linear program"),
     ),
     Reading(
@@ -83,7 +83,7 @@ READINGS = [
     ),
     Reading(
         "4.2",
-        "no growth per round",
+        "no growth per iteration",
         "5 functions",
         "`step=10`",
         ("step=10",),
@@ -92,25 +92,25 @@ READINGS = [
         "4.1, step 1",
         "ReMatching's mesh: the dual of geodesic Voronoi cells of farthest points along the "
         "surface; $U$ from the point of the coarse mesh that is closest in space",
-        "the same dual; farthest points of position *and normal*, further ones where it is no "
+        "the same dual; farthest points of position *and normal*, more samples where it is not "
         "manifold, thin handles cut; $U$ from the coarse triangles around the vertex's own cell, "
-        "so that it never looks across a thin wall",
+        "so that it never interpolates across a thin wall",
         "$U$, then samples and $U$, as ReMatching has them (no option)",
         ("U by closest points in space", "samples and U of ReMatching"),
     ),
     Reading(
         "4.1, step 2",
         "ICP",
-        "point to point, both ways, the farthest tenth of the pairs left out, from the pose as "
-        "given, from turns of principal axes and tilted; onto a reference, then again for each "
-        "pair",
-        "ICP from the pose as given alone (no option)",
+        "point to point, in both directions, without the farthest tenth of the pairs, starting "
+        "from the given pose, from rotations of the principal axes and tilted; to a reference, "
+        "then again for each pair",
+        "ICP from the given pose only (no option)",
         ("ICP from one start",),
     ),
     Reading(
         "4.1, step 4",
         "a map is optimised with landmarks; the code is based on pyFM",
-        "heat kernels around the landmarks kept at 8 times, and $C$ commutes with the Laplacians",
+        "heat kernels around the landmarks at 8 times, and $C$ commutes with the Laplacians",
         "pyFM's fit: wave kernels of the shapes and around the landmarks (no option)",
         ("initial maps of pyFM",),
     ),
@@ -120,29 +120,29 @@ OTHERS = [
     (
         "4.1, step 3",
         "10 points are sampled",
-        "10 farthest points, so that the same shape gives the same",
+        "10 farthest-point samples, which are the same for the same shape",
         "not measured",
     ),
     (
         "3.4, 5.1",
         "500 edges of 1,275, connected",
-        "a tree of shapes that are near by their spectra, triangles on it, then the nearest pairs; "
-        "each pair has a map both ways",
-        "none on these sets, whose 15 pairs are all taken",
+        "a spanning tree of shapes with similar spectra, edges that close triangles, then the "
+        "nearest pairs; each pair has a map in both directions",
+        "none on these sets, where all 15 pairs are used",
     ),
     (
         "3.5, eq. 5",
         "$Y_i$ as they come",
-        "turned so that the mean of $Y_i^\\top \\Lambda_i Y_i$ is diagonal, as in the canonical "
+        "rotated such that the mean of $Y_i^\\top \\Lambda_i Y_i$ is diagonal, as in the canonical "
         "basis of Huang et al. (2019)",
-        "none on matches: eq. 3, 6 and 7 do not see a turn",
+        "none on matches: eq. 3, 6 and 7 are invariant to rotation",
     ),
     (
         "4.1, SCALABLE",
         "eigenvalues of the Laplacian restricted to the local functions",
         "the same; they are too large, by 5 % on a sphere and 12 to 15 % on a head "
-        "(`method/scalable`), as the functions cannot follow a linear one exactly",
-        "on eq. 5 and on the choice of pairs alone; no match is made of eigenvalues",
+        "(`method/scalable`), because the functions cannot represent a linear one exactly",
+        "on eq. 5 and on the choice of pairs only; no match uses eigenvalues",
     ),
     (
         "eq. 8",
@@ -155,100 +155,100 @@ OTHERS = [
         "PCA of the fields in the truncated basis",
         "PCA of the smooth fields, vertices weighted by area; the $K \\times 3$ coefficients are "
         "kept as `displacement_coefficient`",
-        "on modes alone, none on matches",
+        "on modes only, none on matches",
     ),
     (
         "6.2",
         "a vertex gets the label of its match",
-        "the label with most votes of the corners that it lies between, and of those around, as "
-        "far as its match may be wrong; with `s4a.transfer_labels(..., blur=0)` of the corners "
-        "alone",
-        "on labels alone: 0 to 3 points (`applications.py parcels`, [decisions](decisions.md))",
+        "the label with most votes of the corners of its triangle and of those around, within "
+        "the uncertainty of the match; with `s4a.transfer_labels(..., blur=0)` of the corners "
+        "only",
+        "on labels only: 0 to 3 points (`applications.py parcels`, [decisions](decisions.md))",
     ),
     (
         "eq. 10",
         "the second maximum is divided by $n_{\\mathcal N}$",
         "the usual Hausdorff distance; as printed: `hausdorff_paper`, "
         '`s4a.metrics.hausdorff(..., formula="paper")`',
-        "on the metric alone",
+        "on the metric only",
     ),
     (
         "eq. 11",
         "$f^\\top A L f$, $L$ the Laplacian",
         "$L = A^{-1} W$, so that it is $f^\\top W f$",
-        "on the metric alone",
+        "on the metric only",
     ),
     (
         "5.2",
         "a preprocessing cleans the meshes",
-        "the same cleaning for all methods, each repair in the report; lengths in parts of the "
-        "square root of the area",
-        "none on clean meshes, as these are",
+        "the same cleaning for all methods, with each repair in the report; lengths relative to "
+        "the square root of the area",
+        "none on clean meshes such as these",
     ),
 ]
 
-TEXT = """# What differs from the paper
+TEXT = """# Differences from the paper: additions, readings, effect of each
 
-`preset="paper"` is the paper: in `s4a.analyse`, `s4a.match_pair`, `s4a.register_pairs`,
-`s4a.compare`, every transfer of an external mesh, and as `--preset paper`. This page has what is
-done otherwise by default, what the paper leaves open and how it is read here, and what each is
-worth. To run the paper with one addition:
-`s4a.analyse(shapes, **s4a.options.PRESETS["paper"] | {{"refine": "elastic"}})`. Equations and
-sections are those of the paper; that its equations hold for arrays is tested by brute force
-(`tests/method/test_paper.py`). What holds of the paper's claims stands on [a page of its
-own](claims.md).
+This validation page lists the differences between the defaults of S4A and the paper: additions,
+open points of the paper and their reading here, and the measured effect of each. Equations and
+sections are those of the paper. [The paper's claims](claims.md) are on another page.
 
-**How it is measured.** Six shapes of about 10,000 vertices, 2,000 at low resolution, all else as
-in 5.1; all are registered to the first. Of every vertex of the template the distance between where
-it is carried and where it truly is, mean over vertices and shapes, in % of the square root of the
-area: to the *matched* vertex of the shape (eq. 4, 7), which cannot be nearer than the vertices lie
-apart, and to the registered *surface*, template + displacement (eq. 8 and the line after it). CPU
-seconds are of the whole analysis, in one run beside another program: differences of less than a
-fifth say nothing. All else is as by default, or as the paper has it.
+`preset="paper"` switches all additions off: in `s4a.analyse`, `s4a.match_pair`,
+`s4a.register_pairs`, `s4a.compare`, every transfer of an external mesh, and as `--preset paper`.
+To run the paper with one addition:
+`s4a.analyse(shapes, **s4a.options.PRESETS["paper"] | {{"refine": "elastic"}})`. A test compares the
+equations with brute force on arrays (`tests/method/test_paper.py`).
 
-- *brains*: synthetic, in the same pose, each of 10,000 vertices of its own.
-- *faces*: six identities of a published face model (006 to 011; of those before, 002 is so
-  symmetric that it is taken for its own mirror image and would stand apart), registered, so that
-  vertex i is vertex i. As they are given they share their vertices, which favours whatever looks
-  for nearest neighbours. So each is **remeshed on its own** (PyMeshLab's isotropic remeshing; the
-  mesh is subdivided first, as the remesher otherwise keeps vertices, the same ones of each shape),
-  and the truth carried through the common triangles.
-- *bodies*: one person in six poses that are far apart (FAUST registrations), remeshed in the same
-  way.
+**Data.** Six shapes of about 10,000 vertices, 2,000 at low resolution, all else as in 5.1; all are
+registered to the first.
 
-`python benchmarks/additions.py --write` measures all of it into `docs/differences.csv` and
-makes this page from it; `python benchmarks/differences.py --write` makes the page alone.
+- *brains*: synthetic, in the same pose, each with 10,000 vertices of its own.
+- *faces*: six identities of a published face model (006 to 011; of the earlier ones, 002 is so
+  symmetric that it is flagged as its own mirror image). Vertex i corresponds to vertex i, which
+  favours every nearest-neighbour search. Therefore each face is **remeshed on its own**
+  (PyMeshLab's isotropic remeshing after subdivision, because the remesher otherwise keeps the same
+  vertices of each shape), and the ground truth is interpolated in the common triangles.
+- *bodies*: one person in six different poses (FAUST registrations), remeshed in the same way.
 
-## All together
+**Error.** Mean distance between the image of a template vertex and its true position, over vertices
+and shapes, in % of the square root of the area. It is measured to the *matched* vertex of the shape
+(eq. 4, 7), which cannot be more accurate than the vertex spacing, and to the registered *surface*,
+template + displacement (eq. 8 and the line after it). CPU seconds are of the whole analysis, in one
+run next to another program: differences of less than a fifth have no meaning.
+
+`python benchmarks/additions.py --write` measures everything into `docs/differences.csv` and
+writes this page; `python benchmarks/differences.py --write` writes the page only.
+
+## All additions together
 
 {summary}
 
-## Additions, each with a switch
+## Additions, each with an option
 
 {switches}
 
-Each alone, on top of the paper (errors: matched, surface):
+Each addition alone, on top of the paper (errors: matched, surface):
 
 {additions}
 
-Elastic iterations and spectral non-rigid ICP on other sets: [measurements](decisions.md).
-`articulated` and `dense_iterations` are shown with the options that they need: elastic iterations
-and 1,000 samples. Where poses differ a lot, elastic iterations need `articulated`: without it,
-bodies have larger errors than with the paper alone. `n_projected` is measured with 2,500 of 10,000
-vertices, the same share as 25,000 of 100,000.
+[Design decisions](decisions.md) compares elastic registration with spectral ICP on other sets.
+`articulated` and `dense_iterations` are shown together with the additions that they need: elastic
+registration, and 1,000 farthest-point samples. If pose differences are large, elastic registration
+needs `articulated`: without it, bodies are less accurate than with the paper alone. `n_projected`
+is measured with 2,500 of 10,000 vertices, the same share as 25,000 of 100,000.
 `initial_refinement`, `full_resolution_iterations` and `bidirectional` concern single pairs.
 
-## Pairs that are matched on their own (4.1, 6.2)
+## Single pairs (4.1, 6.2)
 
-The first shape registered to each of the others by `s4a.register_pairs`, with ZoomOut in the place
-of Consistent ZoomOut. *Carried* is the error of 300 vertices of the template that are carried over
-as landmarks (`s4a.transfer_landmarks`), along both matches of a pair where there are two.
+The first shape registered to each of the others by `s4a.register_pairs`, with ZoomOut in place
+of Consistent ZoomOut. *Transferred* is the error of 300 vertices of the template transferred
+as landmarks (`s4a.transfer_landmarks`), along both matches of a pair if there are two.
 
 {pairs}
 
 ## What the paper leaves open
 
-| | equation | in the paper | read here as | another reading |
+| | equation | in the paper | reading of S4A | another reading |
 | --- | --- | --- | --- | --- |
 {readings}
 
@@ -256,17 +256,17 @@ Each other reading on top of the paper:
 
 {read}
 
-**The norm of eq. 5.** The paper writes that of the Sobolev space $H_0^2$, in which $\\lVert f
-\\rVert = \\lVert \\Lambda^0 f \\rVert$ with the eigenvalues $\\Lambda^0$ of the limit shape, and
-does not say of what $D_i - I$ is an operator. `norm` has five readings; the choice decides which
-shape is the median, and so the template, and nothing else. Errors are those of the registration to
-that median.
+**The norm of eq. 5.** The paper writes the norm of the Sobolev space $H_0^2$, in which $\\lVert f
+\\rVert = \\lVert \\Lambda^0 f \\rVert$ with the eigenvalues $\\Lambda^0$ of the limit shape. It
+does not say between which spaces $D_i - I$ is an operator. `norm` has five readings. The choice
+decides which shape is the median, and therefore the template, and nothing else. Errors are those
+of the registration to that median.
 
 {norms}
 
-## Where there is no other reading to run
+## Differences without another reading to run
 
-| equation | in the paper | here | effect |
+| equation | in the paper | S4A | effect |
 | --- | --- | --- | --- |
 {others}
 """
@@ -282,15 +282,15 @@ PAIRS = {
     "pairs: paper": "the paper",
     "pairs: paper, refine": "and `refine`",
     "pairs: paper, init": "and `init`",
-    "pairs: paper, ahead": "and `initial_refinement`",
+    "pairs: paper, initial_refinement": "and `initial_refinement`",
     "pairs: paper, full_resolution_iterations": "and `full_resolution_iterations`",
-    "pairs: paper, both": "and `bidirectional`",
+    "pairs: paper, bidirectional": "and `bidirectional`",
     "pairs: default": "all of them, the default",
     "pairs: default without refine": "without `refine`",
     "pairs: default without init": "without `init`",
-    "pairs: default without ahead": "without `initial_refinement`",
+    "pairs: default without initial_refinement": "without `initial_refinement`",
     "pairs: default without full_resolution_iterations": "without `full_resolution_iterations`",
-    "pairs: default without both": "without `bidirectional`",
+    "pairs: default without bidirectional": "without `bidirectional`",
 }
 
 
@@ -332,7 +332,7 @@ def table(head, rows):
 
 def measured(found, rows, columns=("matched", "surface", "seconds")):
     """A table of these rows (name in the results -> name on the page), three columns a set."""
-    short = {"matched": "", "surface": "", "carried": "carried", "seconds": "CPU s"}
+    short = {"matched": "", "surface": "", "carried": "transferred", "seconds": "CPU s"}
     head = [""]
     for which in SETS:
         head += [f"{which} {short[column]}".strip() for column in columns]
@@ -368,13 +368,13 @@ def summary(found):
         times = {row: of[row] / paper for row in single if row in of}
         best, worst = min(times, key=times.get), max(times, key=times.get)
         seconds = [float(found[which, row]["seconds"]) for row in ("paper", "default")]
-        verdict = "nearer to the truth" if default < paper else "**farther from the truth**"
+        verdict = "more accurate" if default < paper else "**less accurate**"
         line = (
             f"- *{which}*: the registered surface of the default is {verdict} than that of the "
-            f"paper, {default:.3f} for {paper:.3f} ({default / paper:.2f} times), in "
-            f"{seconds[1]:.1f} for {seconds[0]:.1f} CPU seconds."
+            f"paper: error {default:.3f}, paper {paper:.3f} ({default / paper:.2f} times); "
+            f"{seconds[1]:.1f} CPU seconds, paper {seconds[0]:.1f}."
         )
-        for row, what in ((best, "takes most off"), (worst, "adds most")):
+        for row, what in ((best, "reduces the error most"), (worst, "increases it most")):
             if (times[row] < 0.99) if row == best else (times[row] > 1.01):
                 line += f" Of the single additions {single[row]} {what} ({times[row]:.2f} times)."
         lines.append(line)
@@ -413,9 +413,9 @@ def page(found):
     rows |= {
         "default": "all of them, the default",
         "default without init": "the default without `init`",
-        "default without parts": "the default without `articulated`",
-        "default, joint": 'the default with `refine="spectral_icp"`',
-        "default, lift": "the default and `refined_eigenfunctions`",
+        "default without articulated": "the default without `articulated`",
+        "default, spectral_icp": 'the default with `refine="spectral_icp"`',
+        "default, refined_eigenfunctions": "the default and `refined_eigenfunctions`",
     }
     read = {"paper": "the paper as read here"}
     for number, reading in enumerate(READINGS, 1):

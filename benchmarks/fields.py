@@ -14,14 +14,13 @@ import numpy as np
 import xarray as xr
 
 import s4a
-from s4a import statistics
 from s4a.geometry.mesh import as_arrays, as_dataset
 from s4a.schema import dataset
-from s4a_morphometrics import covariation
+from s4a_morphometrics import covariation, field_group_map, field_group_test
 
 X, T = as_arrays(s4a.synthetic.ellipsoid(200))
 REGION = X[:, 2] > np.quantile(X[:, 2], 5 / 6)
-OPTIONS = {"field": "thickness", "n_permutations": 99}
+FIELD, OPTIONS = "thickness", {"n_permutations": 99}
 EFFECT, FOLLOWS = 1.5, 0.3  # of the group; of the score of shape
 HEAD = [
     "", "error, vertices", "error, whole", "error, r-PLS", "error, covariance", "error, RV",
@@ -69,10 +68,10 @@ def found(run: int, setting: tuple[int, int, str], effect: float) -> list[float]
     """Whether, or where, the five tests find something."""
     study, group, Z = draw(run, setting, effect)
     options = {**OPTIONS, "covariates": Z, "seed": run}
-    p = statistics.group_map(study, group, **options)["p_family_wise"].values
+    p = field_group_map(study, FIELD, group, **options)["p_family_wise"].values
     at = (p[REGION] <= 0.05).mean() if effect else p.min() <= 0.05
-    whole = statistics.group_test(study, group, **options)["p_value"].item() <= 0.05
-    pairs = covariation(study, **options)
+    whole = field_group_test(study, FIELD, group, **options)["p_value"].item() <= 0.05
+    pairs = covariation(study, FIELD, **options)
     by = (pairs["p_value"], pairs["singular_p"][0], pairs["rv_p"])
     return [at, whole, *(p.item() <= 0.05 for p in by)]
 

@@ -2,9 +2,9 @@
 
 ``python benchmarks/regions.py [RUNS]``: smooth fields on an ellipsoid of 200 vertices, two
 groups of ten that differ in a region of a sixth of the area, or nowhere, and a nuisance that moves
-all.  Error is how often groups are told apart at 0.05, as whole shapes and at any vertex after the
-correction for all, where nothing is; power how often as whole shapes, and the share of the region's
-vertices, in every fifth run.
+all.  Error is how often groups are reported apart at 0.05, as whole shapes and at any vertex after
+the correction for all, where nothing is; power how often as whole shapes, and the share of the
+region's vertices, in every fifth run.
 """
 
 import sys
@@ -17,6 +17,7 @@ from s4a import statistics
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.method.pca import pca
 from s4a.schema import dataset
+from s4a_morphometrics import within, without
 
 X, T = as_arrays(s4a.synthetic.ellipsoid(200))
 REGION = X[:, 2] > np.quantile(X[:, 2], 5 / 6)
@@ -46,9 +47,9 @@ def draw(run: int, effect: float) -> tuple[xr.DataTree, np.ndarray]:
 
 WAYS = {
     "whole": lambda study, opening: study,
-    "region": lambda study, opening: statistics.within(study, REGION),
-    "without the nuisance": statistics.without,
-    "both": lambda study, opening: statistics.within(statistics.without(study, opening), REGION),
+    "region": lambda study, opening: within(study, REGION),
+    "without the nuisance": without,
+    "both": lambda study, opening: within(without(study, opening), REGION),
 }
 
 

@@ -10,6 +10,8 @@ import re
 import sys
 from importlib.metadata import version as version_of
 from pathlib import Path
+from types import NoneType
+from typing import get_args
 
 import nbformat
 from docutils import nodes
@@ -25,6 +27,7 @@ from slides import WITHOUT_KERNEL
 import paper
 import s4a
 from s4a import cli
+from s4a.options import DECLARED
 from s4a.schema import TABLE
 
 HERE = Path(__file__).parent
@@ -41,7 +44,14 @@ copyright = author
 release = version_of("s4a")
 extensions = ["sphinx.ext.autodoc", "sphinx.ext.napoleon", "myst_nb"]
 extensions += [] if os.environ.get("S4A_DOCS") == "off" else ["sphinx.ext.viewcode"]
-exclude_patterns = ["_build", "_variables.md", "_commands.md", "_performance.md", "_tables.md"]
+exclude_patterns = [
+    "_build",
+    "_variables.md",
+    "_commands.md",
+    "_options.md",
+    "_performance.md",
+    "_tables.md",
+]
 exclude_patterns += ["performance", "tables"]
 root_doc = "index"
 
@@ -133,22 +143,45 @@ def list_commands():
     (commands,) = (
         action for action in cli.parser()._actions if hasattr(action, "choices") and action.choices
     )
-    parts = [
-        f"### s4a {name}\n\n```text\n{sub.format_help()}```\n"
-        for name, sub in commands.choices.items()
-    ]
+    rows = ["| command | |", "|---|---|"]
+    for one in commands._choices_actions:
+        rows.append(f"| [`s4a {one.dest}`](#s4a-{one.dest}) | {one.help.splitlines()[0]} |")
+    parts = ["\n".join(rows) + "\n"]
+    for name, sub in commands.choices.items():
+        parts.append(f"## s4a {name}\n\n```text\n{sub.format_help()}```\n")
     write(HERE / "_commands.md", "\n".join(parts))
+
+
+def list_options():
+    """The options of an analysis, from where they are declared."""
+    lines, group = [], None
+    for name, one in DECLARED.items():
+        known = one.metadata
+        if known["group"] != group:
+            group = known["group"]
+            head = "| option | default | values | meaning |\n|---|---|---|---|"
+            lines.append(f"\n## {group.capitalize()}\n\n{head}")
+        kinds = get_args(one.type) or (one.type,)
+        kinds = [getattr(kind, "__name__", "list of str") for kind in kinds if kind is not NoneType]
+        values = [f"`{value}`" for value in known["choices"]] or kinds
+        presets = "".join(f"; {preset}: `{value}`" for preset, value in known["presets"].items())
+        text = f"{known['help']}. {known['more']}".strip().replace("|", "\\|").replace("``", "`")
+        text = re.sub(r":\w+:`", "`", f"{text[0].upper()}{text[1:]}")
+        lines.append(
+            f"| `{name}` | `{known['default']}`{presets} | {' or '.join(values)} | {text} |"
+        )
+    write(HERE / "_options.md", "\n".join(lines) + "\n")
 
 
 def list_tables():
     """What the commands of speed, and those of all pages, printed when each was run last."""
     others = [command for command in paper.commands() if command not in paper.SPEED]
-    for name, head, commands in (("performance", "###", paper.SPEED), ("tables", "##", others)):
+    for name, commands in (("performance", paper.SPEED), ("tables", others)):
         files = [paper.kept(command) for command in commands]
         texts = [path.read_text(encoding="utf-8") for path in files if path.exists()]
         # what a command printed keeps its headings, below that of the command
-        texts = [re.sub("^#(?=#* )", f"{head}#", text, flags=re.MULTILINE) for text in texts]
-        text = "\n".join(text.replace(f"{head}# `", f"{head} `", 1) for text in texts)
+        texts = [re.sub("^#(?=#* )", "###", text, flags=re.MULTILINE) for text in texts]
+        text = "\n".join(text.replace("### `", "## `", 1) for text in texts)
         write(HERE / f"_{name}.md", text)
 
 
@@ -240,6 +273,7 @@ def setup(app):
     take_course()
     list_variables()
     list_commands()
+    list_options()
     list_tables()
     app.add_html_math_renderer("mathml", (formula, None), (formula, None))
     app.connect("source-read", show_panels)

@@ -13,6 +13,7 @@ the data lie beside the checkout, into ``docs/_build``, which is not kept: ``str
 import re
 import sys
 import tempfile
+from contextlib import chdir
 from functools import cache
 from pathlib import Path
 
@@ -193,7 +194,7 @@ def seconds(vertices=PAIR):
     """Figure 3: CPU seconds of every step of the methods on one pair."""
     brains = s4a.synthetic.brains(2, vertices, seed=0)
     source, target = (brains[f"original/brain_0{i}"].to_dataset() for i in (1, 2))
-    found = s4a.compare.pairs(source, {"brain_02": target})["block_seconds"].isel(pair=0)
+    found = s4a.compare(source, {"brain_02": target})["block_seconds"].isel(pair=0)
     found = found.drop_sel(algorithm="registered surface")  # the same run as "registered"
     blocks = [str(name) for name in found["block"].values]
     return write(
@@ -455,7 +456,20 @@ def joint_modes(study, what, name, folder=LOCAL_FOLDER, n_modes=3):
     return write(figure, name, folder=folder)
 
 
+def quickstart():
+    """Run the quickstart of README; the picture that it writes."""
+    readme = (HERE.parent / "README.md").read_text(encoding="utf-8")
+    code = re.search(r"```python\n(.*?)```", readme, re.DOTALL)[1]
+    path = HERE / "quickstart.png"
+    with tempfile.TemporaryDirectory() as folder, chdir(folder):
+        exec(code, {})
+        path.write_bytes(Path("modes.png").read_bytes())
+    reduce(path)
+    return path
+
+
 PICTURES = {
+    "quickstart": quickstart,
     "figure_1": lambda: pipeline(analysed()),
     "figure_2": swapped,
     "figure_3": seconds,

@@ -10,7 +10,7 @@ reading and cleaning      :func:`read_shapes`, :func:`read_shape`, :func:`read_l
 3.3 spectrum              :func:`spectrum`, :func:`reconstruct`
 4.1 pairs                 :func:`match_pair`
 5.1 metrics               :mod:`s4a.metrics`
-5.2, 5.3 comparison       :mod:`s4a.compare`
+5.2, 5.3 comparison       :func:`compare`, :func:`compare_collection`
 4.1, 4.2 step by step     :func:`align_pair`, :func:`build_network`, :func:`refine_network`,
                           :func:`latent_match`, :func:`latent_map`, :func:`register_shape`
 4.2, 6.1 collections      :func:`analyse`, :class:`Options`, :func:`open_study`,
@@ -20,7 +20,7 @@ pictures, films           :func:`write_picture`, :func:`write_film`
 new shapes                :func:`insert`
 6.1 statistics            :mod:`s4a.statistics`
 6.2 transfer              :func:`transfer_labels`, :func:`transfer_landmarks`,
-                          :func:`transfer_scalars`, :func:`register_pairs`, :func:`with_field`
+                          :func:`transfer_scalars`, :func:`register_pairs`
 for other programs        :func:`write_registered`, :func:`write_label_volumes`
 the bundled collection    :mod:`s4a.synthetic`
 ========================  ====================================================================

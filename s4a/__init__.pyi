@@ -12,15 +12,15 @@ from . import widgets as widgets
 from .accessor import explore as explore
 from .analysis import statistics as statistics
 from .analysis.export import write_registered as write_registered
-from .analysis.fields import with_field as with_field
 from .analysis.transfer import register_pairs as register_pairs
 from .analysis.transfer import transfer_labels as transfer_labels
 from .analysis.transfer import transfer_landmarks as transfer_landmarks
 from .analysis.transfer import transfer_scalars as transfer_scalars
 from .analysis.volumes import write_label_volumes as write_label_volumes
 from .datasets import synthetic as synthetic
-from .evaluation import compare as compare
 from .evaluation import metrics as metrics
+from .evaluation.comparison import compare as compare
+from .evaluation.comparison import compare_collection as compare_collection
 from .input.annotations import with_features as with_features
 from .input.clean import clean as clean
 from .input.collection import read_labels as read_labels

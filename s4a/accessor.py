@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import xarray as xr
 
+from s4a.schema import check_type
+
 if TYPE_CHECKING:
     from s4a.widgets.explore import Explore
 
@@ -57,6 +59,7 @@ def explore(
     >>> s4a.explore(study).tabs.titles[:3]
     ('Modes', 'Network', 'Functional map')
     """
+    check_type(study, xr.DataTree)
     options = {"width": width, "font": font, "view": view, "up": up}
     return import_module("s4a.widgets.explore").explore(study, **options)
 

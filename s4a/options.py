@@ -89,7 +89,7 @@ def option(
 
 # of each group
 reading = partial(option, group="input")
-network = partial(option, group="low resolution and network")
+network = partial(option, group="network")
 registration = partial(option, group="registration")
 quality = partial(option, group="quality control")
 computing = partial(option, group="computing")

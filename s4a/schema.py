@@ -180,7 +180,6 @@ explained_variance_ratio_low | component | 1 | share of the variance at low reso
     matches (eq. 6)
 explained_variance_ratio_raw | component | 1 | share of the variance at low resolution, of the
     matches without smoothing
-template_vertex | vertex | 1 | vertex of the template that the vertex of a region is
 # evaluation of the model, tests and outliers (6.1)
 compactness | component | L2 | cumulative variance of the first components
 compactness_error | component | L2 | its standard error
@@ -213,10 +212,8 @@ left_out_error | shape | L | distance of the shape to its reconstruction by the 
 outlier | shape | 1 | whether one of the two is beyond its threshold
 predicted | shape | 1 | class predicted while the shape was left out
 accuracy | fold | 1 | balanced accuracy on the left-out shapes
-# fields on the template, and covariation of field and shape
+# fields on the template
 transferred_field | shape vertex | field | field of the shape, carried to the template
-field_effect | vertex | field | difference of the groups' means, or change per unit of the variable
-field_intercept | vertex | field | field where the variable is at its mean
 # ground truth of a synthetic collection
 reference_point | vertex xyz | 1 | point of the unit sphere that the vertex is the image of
 true_score | shape true_mode | 1 | simulated score of each shape, in standard deviations
@@ -496,14 +493,38 @@ def in_unit(data: xr.Dataset, unit: str | None, *, of: str = INPUT) -> xr.Datase
     return data
 
 
+EXPECTED: dict[type, str] = {
+    xr.Dataset: "a Dataset, such as a mesh that s4a.read_shape returns",
+    xr.DataTree: "a DataTree, such as s4a.analyse or s4a.open_study returns",
+    dict: "a dict of names to meshes",
+}
+
+
+def check_type(value: object, kind: Any, what: str = "study", expected: str = "") -> None:
+    """Raise TypeError unless an argument is of a type; it says what is `expected`.
+
+    Examples
+    --------
+    >>> import xarray as xr
+    >>> from s4a.schema import check_type
+    >>> check_type("brains", xr.DataTree)
+    Traceback (most recent call last):
+    TypeError: study must be a DataTree, such as s4a.analyse or s4a.open_study returns; found str
+    """
+    if not isinstance(value, kind):
+        expected = expected or EXPECTED[kind]
+        raise TypeError(f"{what} must be {expected}; found {type(value).__name__}")
+
+
 def require(data: xr.Dataset, *names: str, what: str = "dataset") -> None:
-    """Raise ValueError unless the Dataset has these variables with the dims of the table.
+    """Raise an error unless `data` is a Dataset with these variables and the dims of the table.
 
     Examples
     --------
     >>> from s4a.schema import dataset, require
     >>> require(dataset(position=[[0.0, 0.0, 1.0]]), "position")
     """
+    check_type(data, xr.Dataset | xr.DataTree, what, EXPECTED[xr.Dataset])
     missing = [name for name in names if name not in data]
     if missing:
         raise ValueError(

@@ -4,7 +4,11 @@
 left and right         :func:`asymmetry`, :func:`asymmetry_modes`, :func:`symmetry`,
                        :func:`symmetric_template`
 several visits         :func:`growth`
-fields against shape   :func:`covariation`, :func:`covariation_modes`
+fields on the shapes   :func:`with_field`, :func:`write_field`, :func:`field_group_test`,
+                       :func:`field_group_map`, :func:`field_regression`,
+                       :func:`field_classify`, :func:`covariation`, :func:`covariation_modes`
+regions, nuisances     :func:`within`, :func:`without`, :func:`with_size`, :class:`Region`
+model measures         :func:`generalization`
 parts of shapes        :func:`complete`, :func:`write_completed`
 several structures     :func:`analyse_structures`, :func:`open_structures`,
                        :func:`insert_structures`, :func:`of_structure`, :func:`structures`,

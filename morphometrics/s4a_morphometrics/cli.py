@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import s4a
 from s4a.cli import command
-from s4a.cli.commands import study_to_test, template_labels, write
+from s4a.cli.commands import study_to_test, write
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -32,7 +32,7 @@ def asymmetry(
     *,
     subject: str | None = None,
     side: str | None = None,
-    of: Literal["normal", "vector"] = "normal",
+    of: Literal["vector", "normal"] = "normal",
     table: str | None = None,
     include_flagged: bool = False,
     permutations: int | None = None,
@@ -53,13 +53,13 @@ def asymmetry(
         and of which side
     of
         what is tested at every vertex: along the normals, or vectors
-    table : FILE
-        in place of the table of the study
+    table : PATH
+        CSV with a column 'shape', in place of the table of the study
     include_flagged
         take flagged shapes in
     permutations : N
         changes of sign (default: 999)
-    out : DIR
+    out : FOLDER
         for netCDF, CSV, the page (default: STUDY/statistics)
     """
     import s4a_morphometrics as m
@@ -110,13 +110,13 @@ def growth(
         what is tested at every vertex: vectors, or along the normals
     variances
         unequal where subjects change differently: signs of subjects
-    table : FILE
-        in place of the table of the study
+    table : PATH
+        CSV with a column 'shape', in place of the table of the study
     include_flagged
         take flagged shapes in
     permutations : N
         of visits within subjects (default: 999)
-    out : DIR
+    out : FOLDER
         for netCDF, CSV, the page (default: STUDY/statistics)
     """
     import s4a_morphometrics as m
@@ -160,13 +160,13 @@ def covariation(
         name of a field of s4a fields
     covariates : COLUMN
         accounted for
-    table : FILE
-        in place of the table of the study
+    table : PATH
+        CSV with a column 'shape', in place of the table of the study
     include_flagged
         take flagged shapes in
     permutations : N
         of the shapes (default: 999)
-    out : DIR
+    out : FOLDER
         for netCDF, CSV, the page (default: STUDY/statistics)
     """
     import s4a_morphometrics as m
@@ -199,14 +199,14 @@ def complete(
         its folder
     part : PART
         mesh file of a part of a shape
-    out : DIR
+    out : FOLDER
         for completed.nc and PLY
-    landmarks : FILE
-        landmarks of the part by the names of the template's, three or more: how it lies
+    landmarks : PATH
+        landmarks of the part, three or more with names of the template's, which guide registration
     samples : N
         shapes drawn from all that agree with the part
-    components : N
-        pieces of the part to keep, or 'largest' (default: as in the study)
+    components : COMPONENTS
+        'largest', 'all' or how many pieces of the part to keep (default: as in the study)
     """
     import s4a_morphometrics as m
     from s4a_morphometrics import words
@@ -230,7 +230,7 @@ def export(
     out: str,
     points: int | None = None,
     modes: int | None = None,
-    landmarks: str | None = None,
+    template_landmarks: str | None = None,
     labels: str | None = None,
     grid: str | None = None,
 ) -> int:
@@ -242,24 +242,26 @@ def export(
         its folder
     to
         for which program
-    out : DIR
+    out : FOLDER
         for its files
     points : N
         slicer, shapeworks, r: vertices that are points or particles, as far apart as can be
         (default: 500)
     modes : N
         scalismo, paraview: the first modes (default: all; paraview: 3)
-    landmarks : FILE
-        slicer: landmarks of the template's file, carried to all shapes (default: its own)
+    template_landmarks : FILE
+        slicer: landmarks of the template, transferred to all shapes (default: its own)
     labels : FILE
-        nifti: labels of the template's file, whole numbers (default: its own)
+        nifti: labels of the template's vertices, whole numbers (default: its own)
     grid : FILE
         nifti: volume whose voxels are labelled (default: that each shape was made of)
     """
     from s4a_morphometrics import write_for
+    from s4a_morphometrics.statistics_commands import template_labels
 
     tree = s4a.open_study(study)
-    marks = s4a.input.annotations.read_landmarks(landmarks) if landmarks else None
+    read = s4a.input.annotations.read_landmarks
+    marks = read(template_landmarks) if template_landmarks else None
     label = template_labels(tree, labels)
     asked = {"n_points": points, "n_modes": modes, "landmarks": marks, "label": label, "grid": grid}
     options = {name: value for name, value in asked.items() if value is not None}

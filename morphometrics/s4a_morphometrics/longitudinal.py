@@ -29,8 +29,9 @@ from s4a.analysis.model import count_components
 from s4a.analysis.permutation import Model, check_options, standardize
 from s4a.input.subjects import listed
 from s4a.method.pca import gram, principal_components
-from s4a.schema import FIELD_UNIT, dataset, in_unit
+from s4a.schema import dataset, in_unit
 from s4a.seeds import RNG, seed_of
+from s4a_morphometrics.fields import field_sample
 
 log = logging.getLogger(__name__)
 
@@ -246,7 +247,14 @@ def growth(
     (('vertex', 'xyz'), 3, 0.25)
     """
     options = check_options(n_permutations, variances, seed_of(seed, rng))
-    sample = sample_of(study, time, "time", covariates, field)
+    of_field = None
+    if field is None:
+        sample = sample_of(study, time, "time", covariates)
+    elif of == "normal":
+        raise ValueError("a field has no part along the normals: leave out of='normal'")
+    else:
+        of_field = field_sample(study, field, time, "time", covariates)
+        sample = of_field.sample
     numbers_of(sample.values, "time")
     sample, whose = _with_subjects(study, sample, subject)
     t = sample.values.astype(float)
@@ -260,7 +268,7 @@ def growth(
     test = _test(sample, t, whose, seen, of, n_components, options)
     test.update(_estimates(sample, mixed, t, whose, seen))
     result = dataset(test.pop("attrs"), **test)
-    result = in_unit(in_unit(result, sample.unit), sample.unit, of=FIELD_UNIT)
+    result = in_unit(result, sample.unit) if of_field is None else of_field.on_template(result)
     shapes = sample.registration["shape"].values
     return result.assign_coords(shape=shapes).assign_attrs(
         mean=float(t.mean()),
@@ -356,7 +364,7 @@ def _test(sample, t, subject, seen, of, n_components, options):
             f"{fields.shape[2]} coordinates at a vertex: more visits needed, or of='normal'"
         )
     model = Model(x, Z, blocks=subject, **options)
-    found = vertex_results(model.vertex_test(fields), sample)
+    found = vertex_results(model.vertex_test(fields))
     variance, V = principal_components(gram(E, sample.area))
     if not len(variance):
         raise ValueError("growth needs shapes that differ within subjects; all visits are equal")
@@ -374,12 +382,6 @@ def _test(sample, t, subject, seen, of, n_components, options):
 def _estimates(sample, mixed, t, subject, seen):
     """Slopes, their errors, variances, and where on the trajectory each shape is."""
     k = sample.d.shape[2]
-
-    def on_template(values):
-        """Numbers (m k,) at all vertices: (n, k), of a field (n,)."""
-        found = sample.whole(values.reshape(-1, k).T).T
-        return found[:, 0] if k == 1 else found
-
     x = within_subjects(t[seen], subject[seen])
     E = within_subjects(sample.d[seen].astype(float), subject[seen]).reshape(len(x), -1)
     columns = [x]
@@ -398,15 +400,10 @@ def _estimates(sample, mixed, t, subject, seen):
     share = between / np.where(between + residual > 0, between + residual, 1)
     named = {"effect": slope, "effect_error": mixed.error[1], "within_effect": within}
     named["intercept"] = intercept
-    if k == 1:
-        named = {f"field_{name.removeprefix('effect_')}": one for name, one in named.items()}
-    found = {name: on_template(values) for name, values in named.items()}
-    variances = {"subject_variance": between, "residual_variance": residual}
-    if k == 1:
-        variances = {f"field_{name}": one for name, one in variances.items()}
-    found |= {name: sample.whole(values) for name, values in variances.items()}
-    return found | {
-        "intraclass_correlation": sample.whole(share),
+    return {name: values.reshape(-1, k) for name, values in named.items()} | {
+        "subject_variance": between,
+        "residual_variance": residual,
+        "intraclass_correlation": share,
         "standard_score": (t - t.mean()) / t.std(ddof=1),
         "shape_time": shape_time,
     }

@@ -49,7 +49,7 @@ def find_mirrored(
 def find_mirrored_new(
     given: Mapping[str, tuple[xr.DataTree, dict[str, Any]]],
 ) -> tuple[list[str], list[str]]:
-    """The new subjects of the other hand than those of a study, and what is told of them.
+    """The new subjects of the other side than those of a study, and what is reported of them.
 
     Parameters
     ----------
@@ -115,14 +115,14 @@ def hand_table(looks: Looks, subjects: list[str], references: list[str]) -> np.n
 
 
 def mirrored_subjects(looks: Looks) -> tuple[dict[str, float], list[str], list[str]]:
-    """The subjects of the rarer hand, each as a whole.
+    """The subjects of the rarer side, each as a whole.
 
     Returns
     -------
     hand : dict of str to float
         Of every subject, as of :func:`s4a.input.chirality.hands`.
     names : list of str
-        Those of the rarer hand.
+        Those of the rarer side.
     remarks : list of str
         In words, as of :func:`s4a.input.chirality.mirrored_shapes`; and which subjects have
         structures of both hands, and stay as they are: each subject is named once.

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from s4a.cli.commands import lines_or_bars, new_folder, on_cluster, within, write
+from s4a.cli.commands import new_folder, on_cluster, within, write
 from s4a.cli.flags import Command, add_options, whole
 from s4a.options import DECLARED
 
@@ -21,7 +21,7 @@ def run(args: Namespace) -> int:
 
     given = dict(args.structures) if args.structures else None
     options = {name: getattr(args, name) for name in OPTIONS}
-    with on_cluster(args.cluster), lines_or_bars():
+    with on_cluster(args.cluster):
         study = analyse_structures(args.paths, store=args.out, structures=given, **options)
     parts = study["structures"].children
     for name, part in parts.items():
@@ -51,7 +51,7 @@ def insert(args: Namespace) -> int:
 
 
 def compare(args: Namespace) -> int:
-    """How structures vary in how they lie to each other, and each in its shape."""
+    """How structures vary in how they lie relative to each other, and each in its shape."""
     from s4a.analysis.effects import group_test
     from s4a.analysis.export import write_results, write_scores
     from s4a.show.page import write_page
@@ -102,7 +102,7 @@ def named_label(text: str) -> tuple[str, str]:
 def _run(add: Callable[..., Any]) -> None:
     add("paths", nargs="+", metavar="PATH", help="folders, globs or mesh files, or label volumes")
     text = "folder of the study; an unfinished one is resumed"
-    add("--out", required=True, metavar="STUDY", help=text)
+    add("-o", "--out", required=True, metavar="FOLDER", help=text)
     text = "dask scheduler tcp://host:port, or local:N worker processes"
     add("--cluster", metavar="ADDRESS", help=text)
     text = "label volumes that each hold several structures: left=17 right=53"
@@ -114,11 +114,11 @@ def _insert(add: Callable[..., Any]) -> None:
     add("study", metavar="STUDY")
     add("shapes", nargs="+", metavar="SHAPE", help="mesh files, label volumes, folders or globs")
     text = "for inserted.nc, registered meshes and scores"
-    add("--out", required=True, metavar="DIR", help=text)
-    add("--landmarks", metavar="DIR", help=FOLDERS)
+    add("-o", "--out", required=True, metavar="FOLDER", help=text)
+    add("--landmarks", metavar="PATH", help=FOLDERS)
     text = "new subjects to mirror: names, with commas; COLUMN=VALUE of the table; or auto"
     add("--reflect", metavar="NAMES", help=text)
-    add("--table", metavar="CSV", help=TABLE)
+    add("--table", metavar="PATH", help=TABLE)
     add_options(add, ["n_jobs"])
 
 
@@ -129,8 +129,9 @@ def _compare(add: Callable[..., Any]) -> None:
     add("--group", metavar="COLUMN", help=text)
     text = "folder of s4a insert-structures, or its inserted.nc: poses and scores of new subjects"
     add("--new", metavar="DIR", help=text)
-    add("--permutations", type=whole, help="of the subjects (default: 999)")
-    add("--out", metavar="DIR", help="for netCDF, CSV, the pages (default: STUDY/statistics)")
+    add("--permutations", type=whole, metavar="N", help="of the subjects (default: 999)")
+    text = "for netCDF, CSV, the pages (default: STUDY/statistics)"
+    add("-o", "--out", metavar="FOLDER", help=text)
     add_options(add, ["seed"])
 
 

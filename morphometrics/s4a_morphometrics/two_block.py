@@ -13,11 +13,12 @@ import numpy as np
 import xarray as xr
 
 from s4a.analysis.effects import modes_study
-from s4a.analysis.inputs import Values, field_sample
+from s4a.analysis.inputs import Values, registration_of
 from s4a.analysis.permutation import check_permutations, design, p_values
 from s4a.method.pca import gram, principal_components
 from s4a.schema import FIELD_UNIT, dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
+from s4a_morphometrics.fields import field_sample
 
 
 def two_block(
@@ -114,7 +115,7 @@ def covariation(
     ----------
     study : DataTree
     field : str
-        Name in ``/fields``, see :func:`s4a.with_field`.
+        Name in ``/fields``, see :func:`s4a_morphometrics.with_field`.
     covariates : see :func:`s4a.statistics.group_test`
         Taken from shape and field.
     n_components : int, optional
@@ -153,16 +154,17 @@ def covariation(
     >>> study = s4a.synthetic.example_study()
     >>> meshes = study["original"].children.items()
     >>> height = {name: mesh["position"].values[:, 2] for name, mesh in meshes}
-    >>> study = s4a.with_field(study, "height", height, unit="mm")
+    >>> study = s4a_morphometrics.with_field(study, "height", height, unit="mm")
     >>> found = s4a_morphometrics.covariation(study, "height", n_permutations=99)
     >>> bool(0 < found["rv"] < 1), found["field_pattern"].dims
     (True, ('component', 'vertex'))
     """
     seed = seed_of(seed, rng)
     check_permutations(n_permutations)
-    of_field = field_sample(study, field, covariates)
-    of_shape = field_sample(study, field, covariates, as_shape=True)
-    A, B = coordinates(of_shape.d, of_shape.area), coordinates(of_field.d, of_field.area)
+    anything = np.zeros(registration_of(study).sizes["shape"])
+    blocks = field_sample(study, field, anything, "", covariates)
+    of_field = blocks.sample
+    A, B = coordinates(blocks.shape, blocks.shape_area), coordinates(of_field.d, of_field.area)
     found = two_block(A, B, covariates=of_field.Z, n_permutations=n_permutations, seed=seed)
     most = len(found["singular"])
     c = min(most, 10) if n_components is None else n_components
@@ -171,18 +173,18 @@ def covariation(
     n = len(A)
     Z = basis_of(of_field.Z, n)
     scores, deviations, axes = [], [], []
-    for sample, M, axis in ((of_shape, A, found["U"]), (of_field, B, found["V"])):
+    for d, M, axis in ((blocks.shape, A, found["U"]), (of_field.d, B, found["V"])):
         M = free(M, Z)
         score = M @ axis[:, :c]
         deviation = score.std(axis=0, ddof=1)
         deviation[deviation == 0] = 1
-        around = free(sample.d.reshape(n, -1).astype(float), Z).reshape(sample.d.shape)
+        around = free(d.reshape(n, -1).astype(float), Z).reshape(d.shape)
         # an axis in coordinates is sum_s of the shapes: M^T (M M^T)^-1 brings it back to them
         weight = np.linalg.pinv(M).T @ axis[:, :c]  # (s, c)
         axes.append(np.einsum("sc,snk->cnk", weight * deviation, around, optimize=True))
         scores.append(score / deviation)
         deviations.append(deviation)
-    pattern = of_field.whole(axes[1][..., 0])
+    pattern = blocks.whole(axes[1][..., 0])
     squared = found["singular"] ** 2
     result = dataset(
         deformation=axes[0].astype(np.float32),
@@ -199,7 +201,7 @@ def covariation(
         rv=found["rv"],
         rv_p=found["rv_p"],
     )
-    result = in_unit(result, unit_of(of_shape.registration["displacement"]))
+    result = in_unit(result, unit_of(of_field.registration["displacement"]))
     result = in_unit(result, of_field.unit, of=FIELD_UNIT)
     return result.assign_coords(shape=of_field.registration["shape"].values).assign_attrs(
         field=field,
@@ -251,7 +253,7 @@ def covariation_modes(study: xr.DataTree, found: xr.Dataset) -> xr.DataTree:
     >>> study = s4a.synthetic.example_study()
     >>> meshes = study["original"].children.items()
     >>> height = {name: mesh["position"].values[:, 2] for name, mesh in meshes}
-    >>> study = s4a.with_field(study, "height", height)
+    >>> study = s4a_morphometrics.with_field(study, "height", height)
     >>> found = s4a_morphometrics.covariation(study, "height", n_permutations=99)
     >>> moving = s4a_morphometrics.covariation_modes(study, found)
     >>> moving["pca"].sizes["component"] == found.sizes["component"]

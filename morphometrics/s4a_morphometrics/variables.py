@@ -16,6 +16,11 @@ ROWS: dict[str, tuple[str, str, str]] = {
         "shapes drawn from all that agree with the part, where it lies in its file"),
     "score_covariance": ("component component_2", ONE,
         "covariance of the scores of a completed shape"),
+    # regions, and fields on the template
+    "template_vertex": ("vertex", ONE, "vertex of the template that the vertex of a region is"),
+    "field_effect": ("vertex", FIELD_UNIT,
+        "difference of the groups' means, or change per unit of the variable"),
+    "field_intercept": ("vertex", FIELD_UNIT, "field where the variable is at its mean"),
     "field_pattern": ("component vertex", FIELD_UNIT,
         "change of the field with one standard deviation of its score"),
     "field_score": ("shape component", ONE,

@@ -13,7 +13,7 @@ from s4a import statistics
 from s4a.geometry.mesh import vertex_areas
 from s4a.input.subjects import subjects as table_of
 from s4a.schema import dataset, in_unit
-from s4a_morphometrics import of_structure, structures, structures_modes, structures_of_new
+from s4a_morphometrics import of_structure, structures, structures_modes, structures_of_new, within
 from s4a_morphometrics.poses import align_wholes, measured, pose_fields, poses_of
 from s4a_morphometrics.synthetic import bean, subjects
 
@@ -195,7 +195,7 @@ def test_a_level_is_a_study_for_what_takes_one(tmp_path):
     assert s4a.write_registered(of_level, tmp_path)[0].is_file()
     with pytest.raises(ValueError, match="needs the transform of every shape"):
         s4a.write_registered(of_level, tmp_path, frame="shape")
-    part = statistics.within(of_level, found["structure_of_vertex"].values == 1)
+    part = within(of_level, found["structure_of_vertex"].values == 1)
     assert part["registration"].sizes["vertex"] == len(U)
     with pytest.raises(ValueError, match="level must be one of joint, between, within"):
         structures_modes(study, found, "poses")
@@ -204,7 +204,7 @@ def test_a_level_is_a_study_for_what_takes_one(tmp_path):
         structures_modes(study, found, "within")
 
 
-# ---- what is told
+# ---- what is reported
 
 
 def far_away(Y):

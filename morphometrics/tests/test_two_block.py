@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from simulated import HEIGHT, X, field_study
 
-from s4a import cli, open_study, with_field
-from s4a.analysis.fields import write_field
-from s4a_morphometrics import covariation, covariation_modes
+from s4a import cli, open_study
+from s4a_morphometrics import covariation, covariation_modes, with_field, write_field
 from s4a_morphometrics.two_block import two_block
 
 

@@ -1,6 +1,7 @@
 """Groups and variables (6.1): do shapes differ with them, and where on the template?"""
 
 import logging
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -25,7 +26,7 @@ from s4a.analysis.permutation import (
 from s4a.geometry.mesh import as_arrays, vertex_normals
 from s4a.method.deform import normal_displacement
 from s4a.method.pca import gram, principal_components
-from s4a.schema import FIELD_UNIT, INPUT, dataset, in_unit, unit_of
+from s4a.schema import check_type, dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
 
 log = logging.getLogger(__name__)
@@ -40,7 +41,6 @@ def group_test(
     group: Values,
     *,
     covariates: Values | None = None,
-    field: str | None = None,
     n_components: int | None = None,
     n_permutations: int = 9999,
     variances: str = "equal",
@@ -58,9 +58,6 @@ def group_test(
     covariates : as `group`, a dict of name to these, or an array_like (shape, covariate)
         Or a list of names in /subjects.  Accounted for after Freedman and Lane (1983); text as
         indicators of its values.  A shape without a value is left out, with a warning.
-    field : str, optional
-        Name in ``/fields`` (:func:`s4a.with_field`): what is tested is that field in place of the
-        displacements.
     n_components : int, optional
         As many as hold 90 % of the variance by default, at most half of the number of shapes.
     n_permutations : int
@@ -95,7 +92,13 @@ def group_test(
     ('a: 3, b: 3', True)
     """
     options = check_options(n_permutations, variances, seed_of(seed, rng))
-    sample = sample_of(study, group, "group", covariates, field)
+    return compare_groups(sample_of(study, group, "group", covariates), options, n_components)
+
+
+def compare_groups(
+    sample: Sample, options: dict[str, Any], n_components: int | None = None
+) -> xr.Dataset:
+    """Test groups as :func:`group_test` does, with `options` of a :class:`Model`."""
     sizes = group_sizes(sample.values)
     model = Model(indicators(sample.values)[1], sample.Z, **options)
     test = _test_scores(sample, model, n_components)
@@ -107,7 +110,6 @@ def group_map(
     group: Values,
     *,
     covariates: Values | None = None,
-    field: str | None = None,
     of: str = "vector",
     n_permutations: int = 999,
     variances: str = "equal",
@@ -118,7 +120,7 @@ def group_map(
 
     Parameters
     ----------
-    study, group, covariates, field, n_permutations, variances, seed, rng
+    study, group, covariates, n_permutations, variances, seed, rng
         See :func:`group_test`.
     of : {"vector", "normal"}
         The displacements, or their part along the normals.
@@ -129,8 +131,7 @@ def group_map(
         ``explained_share(vertex)``, ``p_vertex``, ``p_family_wise`` (max-T), ``p_false_discovery``
         (Benjamini and Hochberg), ``effect(vertex, xyz)`` = mean of the second group minus that of
         the first, in sorted order, and ``effect_size``: Mahalanobis distance of two groups' means,
-        Cohen's f of several.  Of a field ``field_effect(vertex)`` in place of ``effect``; NaN where
-        not all shapes have it.
+        Cohen's f of several.
 
     Raises
     ------
@@ -156,7 +157,11 @@ def group_map(
     <Parts ...>
     """
     options = check_options(n_permutations, variances, seed_of(seed, rng))
-    sample = sample_of(study, group, "group", covariates, field)
+    return map_groups(sample_of(study, group, "group", covariates), options, of)
+
+
+def map_groups(sample: Sample, options: dict[str, Any], of: str = "vector") -> xr.Dataset:
+    """Test groups at every vertex as :func:`group_map` does, with `options` of a :class:`Model`."""
     sizes = group_sizes(sample.values)
     names, x = indicators(sample.values)
     model = Model(x, sample.Z, **options)
@@ -175,7 +180,6 @@ def regression(
     variable: Values,
     *,
     covariates: Values | None = None,
-    field: str | None = None,
     of: str = "vector",
     n_components: int | None = None,
     n_permutations: int = 999,
@@ -189,7 +193,7 @@ def regression(
     ----------
     study : DataTree
     variable : array_like (shape,), dict of shape to value, or name in /subjects
-    covariates, field, n_components, n_permutations, variances, seed, rng
+    covariates, n_components, n_permutations, variances, seed, rng
         See :func:`group_test`.
     of : see :func:`group_map`
 
@@ -198,8 +202,8 @@ def regression(
     Dataset
         The global test, ``statistic`` and ``p_value``, as of :func:`group_test`; the test at every
         vertex as of :func:`group_map`, ``effect(vertex, xyz)`` per unit of the variable,
-        ``effect_size`` = Cohen's f, and ``intercept(vertex, xyz)``, of a field ``field_effect`` and
-        ``field_intercept``; ``standard_score(shape)`` of the variable.  Attributes ``mean``,
+        ``effect_size`` = Cohen's f, and ``intercept(vertex, xyz)``; ``standard_score(shape)`` of
+        the variable.  Attributes ``mean``,
         ``standard_deviation``, ``lowest`` and ``highest`` of the variable, ``freed_deviation`` of
         what the covariates leave of it, and those of :func:`group_test`.
 
@@ -221,7 +225,14 @@ def regression(
     True
     """
     options = check_options(n_permutations, variances, seed_of(seed, rng))
-    sample = sample_of(study, variable, "variable", covariates, field)
+    sample = sample_of(study, variable, "variable", covariates)
+    return regress(sample, options, n_components, of)
+
+
+def regress(
+    sample: Sample, options: dict[str, Any], n_components: int | None = None, of: str = "vector"
+) -> xr.Dataset:
+    """Regress as :func:`regression` does, with `options` of a :class:`Model`."""
     x = numbers_of(sample.values)
     model = Model(x, sample.Z, **options)
     test = _test_scores(sample, model, n_components)
@@ -422,11 +433,12 @@ def modes_study(
 
 
 def check_moves(fit: xr.Dataset) -> None:
-    """ValueError where a result is of a field, which moves no vertex."""
+    """Raise ValueError unless a result has an effect that moves vertices."""
+    check_type(fit, xr.Dataset, "fit", "a Dataset, such as s4a.statistics.regression returns")
     if "effect" not in fit:
         raise ValueError(
-            "a regression of displacements needed, found that of a field, which moves no vertex: "
-            "show its field_effect as colours"
+            f"a regression of displacements needed, found {', '.join(map(str, fit)) or 'nothing'}; "
+            "a field moves no vertex: show its field_effect as colours"
         )
 
 
@@ -479,21 +491,17 @@ def fields_to_test(d: np.ndarray, registration: xr.Dataset, of: str) -> np.ndarr
         raise ValueError(f"of must be 'vector' or 'normal', found {of!r}")
     if of == "vector":
         return d
-    if d.shape[2] == 1:
-        raise ValueError("a field has no part along the normals: leave out of='normal'")
     return normal_displacement(d, vertex_normals(*as_arrays(registration)))[..., None]
 
 
-def vertex_results(
-    found: tuple[np.ndarray, np.ndarray, np.ndarray], sample: Sample
-) -> dict[str, np.ndarray]:
+def vertex_results(found: tuple[np.ndarray, np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:
     """What a test at every vertex found, by the names of its variables."""
     share, p, p_max = found
     return {
-        "explained_share": sample.whole(share),
-        "p_vertex": sample.whole(p),
-        "p_family_wise": sample.whole(p_max),
-        "p_false_discovery": sample.whole(stats.false_discovery_control(p)),
+        "explained_share": share,
+        "p_vertex": p,
+        "p_family_wise": p_max,
+        "p_false_discovery": stats.false_discovery_control(p),
     }
 
 
@@ -507,13 +515,8 @@ def _test_vertices(sample, model, of):
     size[size == 0] = 1
     B = np.linalg.pinv(columns / size, rcond=1e-10) @ d.reshape(len(d), -1).astype(float)
     intercept, slope = (B / size[:, None])[:2].reshape(2, -1, k)
-    if k == 1:
-        effect = {"field_effect": slope[:, 0], "field_intercept": intercept[:, 0]}
-    else:
-        effect = {"effect": slope, "intercept": intercept}
-    effect = {name: sample.whole(values.T).T for name, values in effect.items()}
-    result = dataset(None, **vertex_results(found, sample), **effect)
-    return in_unit(result, sample.unit, of=FIELD_UNIT if k == 1 else INPUT)
+    result = dataset(None, **vertex_results(found), effect=slope, intercept=intercept)
+    return in_unit(result, sample.unit)
 
 
 def squared_cohen_f(share: np.ndarray) -> np.ndarray:

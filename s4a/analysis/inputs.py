@@ -13,7 +13,7 @@ from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.input.subjects import is_missing, is_plain_number, listed, odd_cells, odd_words
 from s4a.method.pca import pca_without
 from s4a.options import Options, with_options
-from s4a.schema import require, unit_of
+from s4a.schema import check_type, require, unit_of
 from s4a.study.tree import left_out
 
 log = logging.getLogger(__name__)
@@ -29,8 +29,7 @@ IDENTIFIER = re.compile(r"(\b|_)(id|nr|code)'?$", re.IGNORECASE)  # how names of
 class Sample(NamedTuple):
     """The shapes of a test, those with all values, and what the test needs to know of them.
 
-    ``registration``, ``d (s, n, 3)`` and ``area (n,)`` as of :func:`displacements_of`, or of a
-    field ``d (s, m, 1)`` and ``area (m,)`` at the vertices ``keep (n,)`` where all shapes have it;
+    ``registration``, ``d (s, n, 3)`` and ``area (n,)`` as of :func:`displacements_of`;
     ``values (s,)`` are tested, ``Z (s, c)`` is accounted for, or None; ``said`` are attributes of a
     result: the covariates in words, and which shapes are left out; ``unit`` is that of d.
     """
@@ -41,16 +40,7 @@ class Sample(NamedTuple):
     values: np.ndarray
     Z: np.ndarray | None
     said: dict[str, str]
-    keep: np.ndarray
     unit: str
-
-    def whole(self, values: np.ndarray) -> np.ndarray:
-        """Values ``(..., m)`` at all vertices ``(..., n)``, NaN where not all shapes have some."""
-        if self.keep.all():
-            return values
-        found = np.full((*values.shape[:-1], len(self.keep)), np.nan)
-        found[..., self.keep] = values
-        return found
 
 
 def sample_of(
@@ -58,11 +48,11 @@ def sample_of(
     values: Values,
     what: str,
     covariates: Values | dict[str, Values] | list[str] | None = None,
-    field: str | None = None,
+    needed: dict[str, np.ndarray] | None = None,
 ) -> Sample:
     """The shapes that have all values; those that lack one are left out, with a warning.
 
-    With `field`, the name of one in ``/fields``, d is that field in place of the displacements.
+    A shape must also have the values ``(s,)`` of `needed`, by what they are, which are not used.
 
     Raises
     ------
@@ -73,56 +63,8 @@ def sample_of(
     tested = f"{what} {values!r}" if isinstance(values, str) else what
     columns = {tested: values_of(study, values, what)}
     columns |= covariates_of(study, covariates)
-    return _sample(study, registration, d, area, columns, tested, field)
-
-
-def field_sample(
-    study: xr.DataTree,
-    field: str,
-    covariates: Values | dict[str, Values] | list[str] | None = None,
-    *,
-    as_shape: bool = False,
-) -> Sample:
-    """The shapes that have a field and all covariates: of the field, or of their displacements."""
-    registration, d, area = displacements_of(study)
-    columns = {"": np.zeros(len(d))} | covariates_of(study, covariates)
-    sample = _sample(study, registration, d, area, columns, "", field)
-    if not as_shape:
-        return sample
-    kept = registration["shape"].isin(sample.registration["shape"]).values
-    everywhere = np.ones_like(sample.keep)
-    return sample._replace(
-        d=d[kept], area=area, keep=everywhere, unit=unit_of(registration["displacement"])
-    )
-
-
-def field_of(study: xr.DataTree, name: str, shapes: Sequence[str]) -> tuple[np.ndarray, str]:
-    """A field of ``/fields`` of these shapes ``(s, n)``, NaN where one has none, and its unit.
-
-    Raises
-    ------
-    ValueError
-        When the study has no field of that name; those that it has are named.
-    """
-    there = list(study["fields"].children) if "fields" in study.children else []
-    if name not in there:
-        raise ValueError(
-            f"the study has no field {name!r}; it has {listed(there) or 'none'}: "
-            "s4a.with_field, or s4a fields, carries one"
-        )
-    values = study["fields"][name].to_dataset()["transferred_field"]
-    return values.reindex(shape=list(shapes)).values, str(values.attrs["units"])
-
-
-def _sample(study, registration, d, area, columns, tested, field):
-    """The sample of shapes that have all of these columns and, where one is named, the field."""
     names = registration["shape"].values
-    unit = unit_of(registration["displacement"])
-    keep = np.ones(d.shape[1], bool)
-    if field is not None:
-        values, unit = field_of(study, field, names)
-        columns = columns | {f"field {field!r}": np.where(np.isnan(values).all(1), np.nan, 0.0)}
-    unknown = {column: is_unknown(of) for column, of in columns.items()}
+    unknown = {column: is_unknown(of) for column, of in (columns | (needed or {})).items()}
     for column, of in unknown.items():
         if of.any():
             log.warning(
@@ -141,34 +83,14 @@ def _sample(study, registration, d, area, columns, tested, field):
     if not known.all():
         registration, d = registration.isel(shape=known), d[known]
     of_tested = columns.pop(tested)[known]
-    if field is not None:
-        del columns[f"field {field!r}"]
-        d, keep = _field_everywhere(values[known], field)
-        area = area[keep] / area[keep].sum()
     Z, said["covariates"] = columns_of({name: of[known] for name, of in columns.items()})
-    return Sample(registration, d, area, of_tested, Z, said, keep, unit)
-
-
-def _field_everywhere(values, field):
-    """A field ``(s, m, 1)`` at the vertices ``(n,)`` where all shapes have it."""
-    keep = np.isfinite(values).all(0)
-    if not keep.any():
-        raise ValueError(f"the field {field!r} has no vertex of the template in all shapes")
-    if not keep.all():
-        log.warning(
-            "the field %r lacks in some shape at %d of %d vertices, which are not tested",
-            field,
-            (~keep).sum(),
-            len(keep),
-        )
-    values = values[:, keep]
-    if np.ptp(values, axis=0).max() <= 1e-12 * abs(values).max():
-        raise ValueError(f"the field {field!r} is the same in all shapes: there is nothing to test")
-    return values[..., None], keep
+    unit = unit_of(registration["displacement"])
+    return Sample(registration, d, area, of_tested, Z, said, unit)
 
 
 def all_registered(study: xr.DataTree) -> xr.Dataset:
     """``/registration`` of a study, flagged shapes too; ValueError where it has none."""
+    check_type(study, xr.DataTree)
     if "registration" not in study:
         raise ValueError(
             f"a registered study is needed; this one has {', '.join(study.children) or 'no nodes'}"
@@ -223,6 +145,7 @@ def with_flagged(study: xr.DataTree) -> xr.DataTree:
     >>> s4a.statistics.with_flagged(study)["pca"].sizes["shape"]
     6
     """
+    check_type(study, xr.DataTree)
     nodes = {node.path: node.to_dataset(inherit=False) for node in study.subtree}
     if "report" in study.children:
         nodes["/report"] = nodes["/report"].assign_attrs(
@@ -364,7 +287,7 @@ def _kind(values):
 
 
 def _column(study, name, what):
-    """A column of ``/subjects``, by the shapes."""
+    """Return a column of ``/subjects`` by shape; the value of a shape without a row is missing."""
     table = study["subjects"].to_dataset() if "subjects" in study.children else xr.Dataset()
     if name not in table:
         raise ValueError(
@@ -372,7 +295,9 @@ def _column(study, name, what):
             f"{', '.join(map(str, table.data_vars)) or 'none'}; "
             "give a table, or the values themselves"
         )
-    return dict(zip(table["shape"].values.tolist(), table[name].values.tolist(), strict=True))
+    everyone = all_registered(study)["shape"].values.tolist()
+    known = dict(zip(table["shape"].values.tolist(), table[name].values.tolist(), strict=True))
+    return {shape: known.get(shape) for shape in everyone}
 
 
 def is_unknown(values: np.ndarray) -> np.ndarray:

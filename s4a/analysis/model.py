@@ -17,7 +17,7 @@ from s4a.geometry.mesh import as_arrays
 from s4a.method.deform import smoother
 from s4a.method.pca import center_gram, gram, principal_components, synthesize
 from s4a.method.shape import Shape
-from s4a.schema import dataset, in_unit, unit_of
+from s4a.schema import check_type, dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
 
 KEPT = "kept from the whole collection: optimistic"
@@ -500,6 +500,7 @@ def sample(
     >>> sample(study, 2)["score"].dims
     ('shape', 'component')
     """
+    check_type(study, xr.DataTree)
     most = study["pca"].sizes["component"]
     c = most if n_components is None else n_components
     if not 1 <= c <= most:

@@ -2,8 +2,8 @@
 
 All take a study and give a Dataset.  What works on plain arrays is in
 :mod:`s4a.analysis.permutation` and :mod:`s4a.analysis.model`; groups and variables are in
-:mod:`s4a.analysis.effects`.  Asymmetry, growth and fields against shape are in the extension
-``s4a_morphometrics``.
+:mod:`s4a.analysis.effects`.  Asymmetry, growth, fields, regions and generalization with new
+correspondences are in the extension ``s4a_morphometrics``.
 
 To add a statistic:
 
@@ -31,11 +31,16 @@ from s4a.analysis.effects import (
     regression_modes,
     scores_of,
 )
-from s4a.analysis.generalization import generalization
-from s4a.analysis.inputs import Values, displacements_of, group_sizes, sample_of, with_flagged
+from s4a.analysis.inputs import (
+    Sample,
+    Values,
+    displacements_of,
+    group_sizes,
+    sample_of,
+    with_flagged,
+)
 from s4a.analysis.model import KEPT, count_components, evaluate, leave_one_out, sample
 from s4a.analysis.permutation import Model, check_permutations, indicators
-from s4a.analysis.restrict import with_size, within, without
 from s4a.method.pca import gram, principal_components
 from s4a.schema import dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
@@ -46,7 +51,6 @@ if TYPE_CHECKING:
 __all__ = [
     "classify",
     "evaluate",
-    "generalization",
     "group_map",
     "group_test",
     "outliers",
@@ -55,9 +59,6 @@ __all__ = [
     "regression_modes",
     "sample",
     "with_flagged",
-    "with_size",
-    "within",
-    "without",
 ]
 
 
@@ -130,7 +131,6 @@ def classify(
     group: Values,
     estimator: "ClassifierMixin | None" = None,
     *,
-    field: str | None = None,
     n_components: int | None = None,
     n_folds: int = 5,
     n_permutations: int = 99,
@@ -151,7 +151,6 @@ def classify(
     group : see :func:`group_test`
     estimator : scikit-learn classifier, optional
         Logistic regression by default; it is cloned.
-    field : see :func:`group_test`
     n_components : int, optional
         As in :func:`group_test`, at most what the training shapes carry.
     n_folds : int
@@ -181,6 +180,21 @@ def classify(
     >>> classes["predicted"].sizes["shape"], classes.attrs["chance"]
     (6, 0.5)
     """
+    seed = seed_of(seed, rng)
+    check_permutations(n_permutations)
+    sample = sample_of(study, group, "group")
+    return classify_sample(sample, estimator, n_components, n_folds, n_permutations, seed)
+
+
+def classify_sample(
+    sample: Sample,
+    estimator: "ClassifierMixin | None",
+    n_components: int | None,
+    n_folds: int,
+    n_permutations: int,
+    seed: int,
+) -> xr.Dataset:
+    """Classify as :func:`classify` does."""
     # here, as nothing else needs scikit-learn
     from sklearn.base import clone
     from sklearn.decomposition import PCA
@@ -190,11 +204,8 @@ def classify(
     from sklearn.pipeline import make_pipeline
     from sklearn.preprocessing import StandardScaler
 
-    seed = seed_of(seed, rng)
-    check_permutations(n_permutations)
     if n_folds < 2:
         raise ValueError(f"n_folds needs a number from 2, found {n_folds}")
-    sample = sample_of(study, group, "group", field=field)
     group, sizes = sample.values, group_sizes(sample.values)
     names, count = np.unique(group, return_counts=True)
     n_folds = min(n_folds, int(count.min()))

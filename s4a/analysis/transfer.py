@@ -13,6 +13,7 @@ template; up, every vertex of the template takes those at the closest point of t
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,12 +31,13 @@ from s4a.geometry.closest import (
     interpolation_matrix,
 )
 from s4a.geometry.mesh import as_arrays, stiffness, vertex_areas, vertex_normals
-from s4a.input.landmarks import FARTHEST_LANDMARK, NAMED, locate, trace_curves
+from s4a.input.collection import Mesh, as_mesh
+from s4a.input.landmarks import FARTHEST_LANDMARK, NAMED, as_landmarks, locate, trace_curves
 from s4a.method.register import identity, uncertainty
 from s4a.method.remesh import laplacian
 from s4a.method.shape import Shape
 from s4a.options import Options, given_options
-from s4a.schema import dataset, require
+from s4a.schema import check_type, dataset, require
 from s4a.study.pair import match_shapes, shape_of
 from s4a.study.processes import workers
 from s4a.study.tree import stack_registration, template_mesh
@@ -135,7 +137,7 @@ def transfer_along(route: Route, triangle: np.ndarray, weights: np.ndarray) -> P
     """Places on the last mesh of points on the first."""
     confidence = np.ones(len(triangle))
     for step, way in route:
-        triangle, weights, own = getattr(step, f"carry_{way}")(triangle, weights)
+        triangle, weights, own = getattr(step, f"transfer_{way}")(triangle, weights)
         confidence = confidence * own
     return triangle, weights, confidence
 
@@ -259,8 +261,8 @@ def _match_both(shape, template, options):
 
 
 def register_pairs(
-    template: xr.Dataset,
-    shapes: dict[str, xr.Dataset],
+    template: Mesh,
+    shapes: dict[str, Mesh],
     *,
     name: str = "template",
     n_jobs: int | None = None,
@@ -271,9 +273,9 @@ def register_pairs(
 
     Parameters
     ----------
-    template : Dataset
-        Clean mesh, as of :func:`s4a.read_shape`.
-    shapes : dict of str to Dataset
+    template : path or Dataset
+        Mesh file, or clean mesh, such as :func:`s4a.read_shape` returns.
+    shapes : dict of str to path or Dataset
     name : str
         Of the template among the shapes.
     n_jobs : int, optional
@@ -306,13 +308,12 @@ def register_pairs(
     >>> s4a.transfer_labels(pairs, source["label"].values)["brain_02"]["label"].sizes["vertex"]
     200
     """
+    check_type(shapes, dict, "shapes")
     if name in shapes or not shapes:
         raise ValueError(
             f"shapes other than the template, {name!r}, needed; found {', '.join(shapes) or 'none'}"
         )
-    meshes = {name: template, **shapes}
-    for what, mesh in meshes.items():
-        require(mesh, "position", "corner_vertex", what=f"mesh {what}")
+    meshes = {n: as_mesh(mesh, f"mesh {n}") for n, mesh in {name: template, **shapes}.items()}
     settings = given_options({"preset": preset, **options}, pair=True)
     parallel = workers(n_jobs)
     inside, *others = parallel(delayed(_shape_of)(mesh, settings) for mesh in meshes.values())
@@ -323,7 +324,7 @@ def register_pairs(
         if settings.bidirectional
         else {}
     )
-    study = _study_of(name, template, shapes, forth, back)
+    study = _study_of(name, meshes.pop(name), meshes, forth, back)
     study["registration"].attrs["preset"] = settings.preset or ""
     return study
 
@@ -617,7 +618,7 @@ def _per_vertex(values, mesh, what):
 
 def transfer_landmarks(
     study: xr.DataTree,
-    landmarks: xr.Dataset,
+    landmarks: xr.Dataset | Path | str,
     *,
     source: str | xr.Dataset | None = None,
     targets: list[str] | None = None,
@@ -633,7 +634,10 @@ def transfer_landmarks(
     Parameters
     ----------
     study, source, targets, **options : see :func:`transfer_labels`
-    landmarks, farthest : see :func:`s4a.input.landmarks.locate`
+    landmarks : path or Dataset
+        A landmark file, or what :func:`s4a.input.annotations.read_landmarks` returns.
+    farthest : float
+        See :func:`s4a.input.landmarks.locate`.
 
     Returns
     -------
@@ -677,6 +681,7 @@ def transfer_landmarks(
     <Parts ...>
     """
     mesh, each = plan(study, source, targets, options)
+    landmarks = as_landmarks(landmarks)
     marked = locate(landmarks, mesh, farthest=farthest)
     if "landmark_curve" in landmarks:
         marked = trace_curves(marked, mesh)

@@ -6,7 +6,6 @@ none waits for what the others need.
 """
 
 import contextlib
-import logging
 import re
 import shlex
 import sys
@@ -62,19 +61,25 @@ def doctor(folder: str = ".") -> int:
 def run(
     paths: list[str], *, out: str, cluster: str | None = None, words: list[str], **options: Any
 ) -> int:
-    """The whole analysis over a folder of meshes.
+    """Analyse a folder of meshes: correspondences, median shape, modes of variation.
 
     Parameters
     ----------
     paths : PATH
         folders, globs or mesh files
-    out : STUDY
+    out : FOLDER
         folder of the study; an unfinished one is resumed
     cluster : ADDRESS
         dask scheduler tcp://host:port, or local:N worker processes
+
+    Examples
+    --------
+    s4a run meshes -o study
+    s4a run meshes -o study --table subjects.csv -j 4 --n-coarse 3000
+    s4a run scans -o study --label 17 --preset fast
     """
     full = within(out, "report.txt")
-    with on_cluster(cluster), lines_or_bars():
+    with on_cluster(cluster):
         study = s4a.analyse([*paths], store=out, **options)
     again = shlex.join(["s4a", *(word for word in words if word != "--include-flagged")])
     report = study["report"].to_dataset()
@@ -82,19 +87,6 @@ def run(
     full.write_text("\n".join(lines) + "\n", encoding="utf-8")
     write(tables.run_summary(study, again=again), *tables.place_lines(out, str(full)))
     return 1 if study["report"].attrs["unforeseen"] else 0
-
-
-@contextlib.contextmanager
-def lines_or_bars() -> Iterator[None]:
-    """A line of the log for each stage meanwhile, in place of bars, where there is no terminal."""
-    log = logging.getLogger("s4a.study.runner")
-    before = log.level
-    if not sys.stderr.isatty():
-        log.setLevel(logging.INFO)
-    try:
-        yield
-    finally:
-        log.setLevel(before)
 
 
 @contextlib.contextmanager
@@ -144,7 +136,7 @@ def demo(
 
     Parameters
     ----------
-    out : STUDY
+    out : FOLDER
         folder of the study
     shapes : N
         number of shapes
@@ -205,7 +197,7 @@ def status(study: str) -> int:
 def view(
     study: str,
     *,
-    out: str | None = None,
+    page: str | None = None,
     title: str | None = None,
     view: str = "corner",
     up: Literal["x", "y", "z"] = "z",
@@ -216,8 +208,8 @@ def view(
     ----------
     study : STUDY
         its folder
-    out : PAGE
-        file of the page (default: STUDY/study.html)
+    page : FILE
+        file to write (default: STUDY/study.html)
     title : TITLE
         of the page (default: name of the folder)
     view : VIEW
@@ -225,9 +217,9 @@ def view(
     up
         axis that points up
     """
-    page = Path(out) if out else within(study, "study.html")
-    s4a.write_page(s4a.open_study(study), page, title=title or Path(study).name, view=view, up=up)
-    write(f"wrote {page} ({page.stat().st_size / 1e6:.1f} MB)")
+    file = Path(page) if page else within(study, "study.html")
+    s4a.write_page(s4a.open_study(study), file, title=title or Path(study).name, view=view, up=up)
+    write(f"wrote {file} ({file.stat().st_size / 1e6:.1f} MB)")
     return 0
 
 
@@ -237,19 +229,11 @@ def statistics(
     group: str | None = None,
     variable: str | None = None,
     covariates: list[str] | None = None,
-    field: str | None = None,
     table: str | None = None,
     variances: Literal["equal", "unequal"] = "equal",
-    recompute: bool = False,
     include_flagged: bool = False,
-    label: list[int | str] | None = None,
-    labels: str | None = None,
-    least_confidence: float = 0.0,
-    without: list[str] | None = None,
-    size_back: bool = False,
     permutations: int | None = None,
     out: str | None = None,
-    n_jobs: int,
     seed: int,
 ) -> int:
     """Evaluation of the modes and outliers of a study.
@@ -266,48 +250,40 @@ def statistics(
         regression of shape on a number, such as age; its animation
     covariates : COLUMN
         accounted for in both
-    field : NAME
-        a field of s4a fields in place of shape in both
-    table : FILE
-        in place of the table of the study
+    table : PATH
+        CSV with a column 'shape', in place of the table of the study
     variances
         of the shapes around what is tested; unequal where groups scatter differently
-    recompute
-        generalization with correspondences found again (slow)
     include_flagged
         take flagged shapes in
-    label : LABEL
-        only vertices of the template with these labels
-    labels : FILE
-        labels of the template's file for --label: NPY, NPZ (FILE:NAME), CSV, GIFTI or annot
-    least_confidence : SHARE
-        only vertices whose mean confidence is this large, 0 to 1
-    without : COLUMN
-        nuisances: what lies along their regression is taken from all shapes
-    size_back
-        give size back to shapes of which --remove-size took it out
     permutations : N
         of every test (default: 9999, at every vertex 999, of classes 99)
-    out : DIR
+    out : FOLDER
         for netCDF and CSV (default: STUDY/statistics)
     """
-    if (covariates or field) and not (group or variable):
-        raise ValueError("--covariates and --field are of a test: give --group or --variable")
-    if labels and not label:
-        raise ValueError("--labels is where --label looks: give --label LABEL..., or leave it out")
-    if recompute and (size_back or without or label or least_confidence):
-        raise ValueError("--recompute finds whole shapes again: leave it out, or take all of them")
+    if covariates and not (group or variable):
+        raise ValueError("--covariates are of a test: give --group or --variable")
     tree, out = study_to_test(study, out, table, include_flagged)
-    tree = restricted(tree, size_back, without, label, labels, least_confidence)
-    options = {"covariates": covariates, "field": field, "seed": seed, "variances": variances}
+    options = {"covariates": covariates, "seed": seed, "variances": variances}
+    write_statistics(tree, out, group, variable, permutations, options)
+    return 0
+
+
+def write_statistics(
+    tree: "xr.DataTree",
+    out: str,
+    group: str | None,
+    variable: str | None,
+    permutations: int | None,
+    options: dict[str, Any],
+) -> None:
+    """Evaluate and test a study, write the results to a folder, and print them."""
     results = tests_of(tree, group, variable, permutations, options)  # first: these may be refused
-    results["evaluation"] = s4a.statistics.evaluate(tree, seed=seed)
+    results["evaluation"] = s4a.statistics.evaluate(tree, seed=options["seed"])
     results["outliers"] = s4a.statistics.outliers(tree)
-    if recompute:
-        results["generalization"] = s4a.statistics.generalization(tree, n_jobs=n_jobs, seed=seed)
     for name, result in results.items():
         s4a.analysis.export.write_results(result, out, name)
-    write(tables.evaluation_table(results["evaluation"], results.get("generalization")))
+    write(tables.evaluation_table(results["evaluation"]))
     outlier = results["outliers"]["outlier"]
     write(f"\noutliers: {', '.join(outlier['shape'].values[outlier.values]) or 'none'}")
     if group:
@@ -317,11 +293,9 @@ def statistics(
     if variable:
         regression = results["regression"]
         write("", tables.significance(regression, regression, variable, tree))
-        if not field:
-            write_moving(tree, regression, variable, Path(out))
+        write_moving(tree, regression, variable, Path(out))
     confidence = tree["registration"]["confidence"].mean().item()
     write(f"\nmean confidence of the registration {confidence:.2f}; results: {out}")
-    return 0
 
 
 def write_moving(study: "xr.DataTree", regression: "xr.Dataset", name: str, out: Path) -> None:
@@ -346,40 +320,6 @@ def study_to_test(
     return tree, out
 
 
-def restricted(
-    study: "xr.DataTree",
-    size_back: bool,
-    without: list[str] | None,
-    label: list[int | str] | None,
-    labels: str | None,
-    least_confidence: float,
-) -> "xr.DataTree":
-    """The study of the part of what varies that is asked for."""
-    said = []
-    if size_back:
-        study = s4a.statistics.with_size(study)
-        said.append("with size given back")
-    if without:
-        study = s4a.statistics.without(study, without)
-        said.append(f"without {', '.join(without)}")
-    if label or least_confidence:
-        whole = study["registration"].sizes["vertex"]
-        of = template_labels(study, labels)
-        study = s4a.statistics.within(study, label, labels=of, least_confidence=least_confidence)
-        said.append(f"{study['registration'].sizes['vertex']} of {whole} vertices")
-    if said:
-        write("; ".join(said) + "\n")
-    return study
-
-
-def template_labels(study: "xr.DataTree", file: str | None) -> "np.ndarray | None":
-    """Labels of the template, from a file with one for each vertex of its file."""
-    if file is None:
-        return None
-    template = s4a.analysis.inputs.all_registered(study).attrs["template"]
-    return labels_in(file, study["original"][template].to_dataset())
-
-
 def labels_in(file: str, mesh: "xr.Dataset") -> "np.ndarray":
     """Labels of a mesh, from a file with one for each vertex of its file."""
     label = s4a.input.annotations.read_labels(file, mesh.sizes["file_vertex_index"])
@@ -394,7 +334,7 @@ def tests_of(
     options: dict[str, Any],
 ) -> "dict[str, xr.Dataset]":
     """The tests of the group and the variable that are asked for."""
-    of_classes = {name: options[name] for name in ("field", "seed")}
+    of_classes = {"seed": options["seed"]}
     if permutations is not None:
         options = options | {"n_permutations": permutations}
         of_classes["n_permutations"] = min(permutations, 99)  # each trains again
@@ -406,38 +346,6 @@ def tests_of(
     if variable:
         results["regression"] = s4a.statistics.regression(study, variable, **options)
     return results
-
-
-def fields(
-    study: str, folder: str, *, name: str, unit: str | None = None, partial: bool = False
-) -> int:
-    """A number per vertex of every shape, such as thickness, carried to the template and kept.
-
-    Parameters
-    ----------
-    study : STUDY
-        its folder
-    folder : FOLDER
-        with a file for each shape: NPY, NPZ, PLY, CSV, GIFTI or FreeSurfer's curv
-    name : NAME
-        of the field; also of its array, column or property in the files
-    unit : UNIT
-        of its numbers, such as mm
-    partial
-        shapes may lack it; tests leave these out
-    """
-    tree = s4a.with_field(s4a.open_study(study), name, folder, unit=unit, partial=partial)
-    path = s4a.analysis.fields.write_field(tree, name, study)
-    field = tree["fields"][name].to_dataset()["transferred_field"]
-    known = np.isfinite(field.values)
-    write(
-        f"{name} of {known.any(1).sum()} of {len(known)} shapes, "
-        f"{np.nanmin(field):.4g} to {np.nanmax(field):.4g} {field.attrs['units']}, mean "
-        f"{np.nanmean(field):.4g}, at {100 * known.mean():.0f} % of the template's vertices: "
-        f"{path}",
-        f"s4a statistics {study} --field {name} takes it in place of shape",
-    )
-    return 0
 
 
 def insert(
@@ -457,12 +365,12 @@ def insert(
         its folder
     shapes : SHAPE
         mesh files, label volumes, folders or globs
-    out : DIR
+    out : FOLDER
         for inserted.nc, registered meshes and scores
-    landmarks : DIR
-        folder of landmark files named as the shapes
+    landmarks : PATH
+        folder of landmark files named as the shapes, which guide registration
     reflect : NAMES
-        new shapes to mirror: names, with commas; or auto, those of the other hand
+        new shapes to mirror: names, with commas; or auto, those of the rarer side
     """
     tree = s4a.open_study(study)
     inserted = s4a.insert(tree, shapes, landmarks=landmarks, reflect=reflect, n_jobs=n_jobs)
@@ -479,7 +387,7 @@ def transfer(
     targets: list[str],
     *,
     labels: str | None = None,
-    landmarks: str | None = None,
+    source_landmarks: str | None = None,
     out: str,
     blur: float | None = None,
     n_jobs: int,
@@ -494,29 +402,28 @@ def transfer(
     targets : TARGET
         mesh files, folders or globs; or one study folder, whose options hold unless given
     labels : FILE
-        NPY, NPZ (FILE:NAME), CSV, GIFTI label or FreeSurfer annot, also .gz
-    landmarks : FILE
-        points and curves: Slicer .mrk.json, CSV or MeshLab .pp
-    out : DIR
+        labels of the source's vertices: NPY, NPZ (FILE:NAME), CSV, GIFTI label or FreeSurfer
+        annot, also .gz
+    source_landmarks : FILE
+        landmarks and curves of the source: Slicer .mrk.json, CSV or MeshLab .pp
+    out : FOLDER
         for <target>.labels.npy, .confidence.npy, .landmarks.csv
-    blur : MULTIPLE
-        how far around votes for labels count, in multiples of how far matches may be wrong
-        (default: 1; 0, not, with --preset paper)
+    blur : X
+        radius within which votes for labels count, in multiples of the uncertainty of the match
+        (default: 1; 0 with --preset paper)
     """
-    if not (labels or landmarks):
-        raise ValueError(
-            "something to transfer needed: give --labels FILE, --landmarks FILE or both"
-        )
+    if not (labels or source_landmarks):
+        raise ValueError("nothing to transfer: give --labels FILE, --source-landmarks FILE or both")
     if blur is not None and not labels:
-        raise ValueError("--blur is of labels: give --labels FILE, or leave it out")
+        raise ValueError("--blur needs labels: give --labels FILE, or leave it out")
     into_study = len(targets) == 1 and any(Path(targets[0]).glob("**/registration.nc"))
     if into_study:
         s4a.study.store.check_is_study(Path(targets[0]))
     mesh, label, points = s4a.read_shape(source), None, None
     if labels:
         label = labels_in(labels, mesh)
-    if landmarks:
-        points = s4a.input.annotations.read_landmarks(landmarks)
+    if source_landmarks:
+        points = s4a.input.annotations.read_landmarks(source_landmarks)
         distance = s4a.input.landmarks.locate(points, mesh)["landmark_distance"].values
         far = f"at most {distance.max():.3g} from the surface of {source}"
         write(f"{len(distance)} landmarks, {far}")
@@ -626,12 +533,12 @@ def compare(
     truth : FILE
         for each target, NPY or text: per vertex of its file that of the source's (from 0; -1:
         none), or x, y, z
-    landmarks : FILE
-        points by name, of the source's file and of each target's: Slicer .mrk.json, CSV or
-        MeshLab .pp
+    landmarks : PATH
+        landmark files of the source and of each target, whose common names guide registration:
+        Slicer .mrk.json, CSV or MeshLab .pp
     keep
         meshes, matches and maps are in compare.nc, too, for the panel that shows them
-    out : DIR
+    out : FOLDER
         for compare.nc and compare.png
     """
     options["n_coarse"] = options["n_coarse"] or N_COARSE
@@ -675,8 +582,8 @@ def compare_collection(
 ) -> "xr.Dataset":
     """Table 2."""
     k_init = min(Options.k_init, options["k"])
-    methods = methods or list(s4a.compare.COLLECTION_METHODS)
-    return s4a.compare.collection(paths, methods=methods, n_pairs=n_pairs, k_init=k_init, **options)
+    methods = methods or list(s4a.evaluation.comparison.COLLECTION_METHODS)
+    return s4a.compare_collection(paths, methods=methods, n_pairs=n_pairs, k_init=k_init, **options)
 
 
 def compare_pairs(
@@ -700,9 +607,10 @@ def compare_pairs(
             f"--truth needs a file for each of the {len(files)} targets, found {len(truth)}"
         )
     known = {
-        name: s4a.compare.read_ground_truth(f) for name, f in zip(names, truth or [], strict=False)
+        name: s4a.evaluation.comparison.read_ground_truth(f)
+        for name, f in zip(names, truth or [], strict=False)
     }
-    return s4a.compare.pairs(
+    return s4a.compare(
         source,
         dict(zip(names, files, strict=True)),
         truth=known or None,
@@ -779,8 +687,7 @@ COMMANDS = {
     "status": command(status),
     "demo": command(demo, ("preset", "n_jobs", "seed")),
     "view": command(view),
-    "statistics": command(statistics, ("n_jobs", "seed")),
-    "fields": command(fields),
+    "statistics": command(statistics, ("seed",)),
     "insert": command(insert, ("n_jobs",)),
     "transfer": command(transfer, (*OF_PAIRS, "n_jobs"), unset=True),
     "compare": command(compare, ("n_coarse", "n_pairs", "k", "preset", "seed")),

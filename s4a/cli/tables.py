@@ -421,23 +421,18 @@ def error_table(errors: "xr.Dataset") -> str:
     return table(rows, ["mean error, % of sqrt(area)", "straight line", "along edges"], ".3f")
 
 
-def evaluation_table(evaluation: "xr.Dataset", recomputed: "xr.Dataset | None") -> str:
+def evaluation_table(evaluation: "xr.Dataset") -> str:
     """Measures by number of components, with their standard errors.
 
     Parameters
     ----------
     evaluation : Dataset
         See :func:`s4a.analysis.statistics.evaluate`.
-    recomputed : Dataset or None
-        See :func:`s4a.analysis.statistics.generalization`.
     """
-    columns = {"compactness": evaluation, "generalization, kept: optimistic": evaluation}
-    if recomputed is not None:
-        columns["generalization, recomputed"] = recomputed
-    columns["specificity"] = evaluation
+    columns = ["compactness", "generalization, kept: optimistic", "specificity"]
     rows = []
     for c in range(min(10, evaluation.sizes["component"])):
-        cells = [measure_cell(data, head.partition(",")[0], c) for head, data in columns.items()]
+        cells = [measure_cell(evaluation, head.partition(",")[0], c) for head in columns]
         rows.append([c + 1, *cells])
     unit = evaluation["generalization"].attrs["units"]
     return f"lengths in {unit}, ± standard error\n{table(rows, ['components', *columns])}"

@@ -1,7 +1,7 @@
-"""The course (notebooks/): exercises that check themselves, quizzes, sliders, diagrams.
+"""The course (notebooks/): self-checking exercises, quizzes, sliders and diagrams.
 
-With them stand the few functions on plain arrays that lessons call besides the public ones: charts,
-what a mesh is made of, closest points, and KnnSearch.
+It also exports the functions on plain arrays that lessons use: charts, meshes as arrays, areas and
+normals, closest points, and KnnSearch.
 """
 
 from s4a.course import diagrams

@@ -1,4 +1,7 @@
-"""Diagrams of the notebooks, where a picture says more than words."""
+"""Diagrams of the notebooks.
+
+The second paragraph of a docstring is the alternative text of its diagram.
+"""
 
 import numpy as np
 from matplotlib import colormaps, rc_context
@@ -14,11 +17,11 @@ SOFT = {"blue": "#cfe4f2", "orange": "#f7d9c4", "grey": "#eeeeee", "green": "#cd
 
 
 def cotangents() -> Figure:
-    """Cotangent weights: of an edge inside, of an edge on the boundary, and a vertex's area.
+    """Cotangent weights of an interior edge and a boundary edge, and the area of a vertex.
 
-    An edge i j inside has a triangle on each side, with the angles alpha and beta opposite to
-    it: its weight is half the sum of their cotangents. An edge on the boundary has one
-    triangle, and half its one cotangent. A vertex has a third of each triangle around it.
+    An interior edge i j has two triangles, with the opposite angles alpha and beta. Its weight
+    is half the sum of their cotangents. A boundary edge has one triangle, and its weight is half
+    of one cotangent. The area of a vertex is a third of the area of the triangles around it.
 
     Examples
     --------
@@ -33,13 +36,13 @@ def cotangents() -> Figure:
             ax.add_patch(Polygon([i, j, corner], fc=SOFT["grey"], ec=GREY))
             _angle(ax, corner, i, j, color, name)
         ax.plot(*np.c_[i, j], color="black", lw=3, zorder=3)
-        for place, name in ((i, "i"), (j, "j")):
-            ax.plot(*place, "o", color="black", ms=6, zorder=4)
+        for point, name in ((i, "i"), (j, "j")):
+            ax.plot(*point, "o", color="black", ms=6, zorder=4)
             shift = [-0.07, -0.01] if name == "i" else [0.06, 0]
-            ax.text(*(place + shift), name, ha="center", va="center", fontsize=11, style="italic")
-    inside.set_title("an edge inside has two triangles")
+            ax.text(*(point + shift), name, ha="center", va="center", fontsize=11, style="italic")
+    inside.set_title("interior edge: two triangles")
     inside.text(0.6, -0.12, r"$w_{ij} = \frac{1}{2}\,(\cot\alpha + \cot\beta)$", ha="center")
-    boundary.set_title("an edge on the boundary has one")
+    boundary.set_title("boundary edge: one triangle")
     boundary.text(0.66, 0.37, "no triangle here", ha="center", color=GREY)
     boundary.text(0.6, -0.12, r"$w_{ij} = \frac{1}{2}\,\cot\alpha$", ha="center")
     _areas_around(area)
@@ -50,21 +53,22 @@ def cotangents() -> Figure:
 
 
 def dual(n_samples: int = 12) -> Figure:
-    """Voronoi cells of a flat mesh, where three of them meet, and the triangles of the dual.
+    """Voronoi cells of a flat mesh, the triangles where three cells meet, and the dual mesh.
 
-    A flat mesh with twelve samples. First every vertex is coloured as its nearest sample.
-    Then the triangles where three colours meet are black. At last each black triangle is a
-    large triangle of the dual, which joins the three samples.
+    A flat mesh has twelve samples. In the first picture every vertex has the colour of its
+    nearest sample. In the second, the triangles where three colours meet are black. In the
+    third, each black triangle has become a large triangle of the dual, which joins the samples.
 
     Parameters
     ----------
     n_samples : int
+        Number of farthest-point samples.
 
     Examples
     --------
     >>> from s4a.course.diagrams import dual
     >>> [ax.get_title() for ax in dual().axes]
-    ['1. every vertex joins a sample', '2. three cells meet: a triangle', '3. ...']
+    ['1. assign vertices to samples', '2. find where three cells meet', '3. join the three samples']
     """
     rng = np.random.default_rng(4)
     rows = np.stack(np.meshgrid(*2 * [np.linspace(0, 1, 30)]), -1).reshape(-1, 2)
@@ -73,36 +77,36 @@ def dual(n_samples: int = 12) -> Figure:
     T = Delaunay(X).simplices
     sample = [int(np.linalg.norm(X - 0.5, axis=1).argmin())]
     while len(sample) < n_samples:  # farthest points
-        gap = np.linalg.norm(X[:, None] - X[sample], axis=2).min(1)
-        sample.append(int(gap.argmax()))
+        distance = np.linalg.norm(X[:, None] - X[sample], axis=2).min(1)
+        sample.append(int(distance.argmax()))
     cell = np.linalg.norm(X[:, None] - X[sample], axis=2).argmin(1)
     corners = [np.unique(cell[t]) for t in T]
     meeting = np.array([len(c) == 3 for c in corners])
     triangles = np.unique([c for c in corners if len(c) == 3], axis=0)
     shades = colormaps["Set3"]
-    figure, ((one, two, three),) = _plain(dual, 3, 9.5, 3.4)
-    for ax, strength in ((one, 1.0), (two, 1.0), (three, 0.35)):
-        alone = np.array([len(c) == 1 for c in corners])
-        shade = cell[T[alone, 0]]
-        ax.tripcolor(*X.T, T[alone], shade, cmap=shades, vmin=0, vmax=11, alpha=strength)
+    figure, ((first, second, third),) = _plain(dual, 3, 9.5, 3.4)
+    for ax, alpha in ((first, 1.0), (second, 1.0), (third, 0.35)):
+        interior = np.array([len(c) == 1 for c in corners])
+        shade = cell[T[interior, 0]]
+        ax.tripcolor(*X.T, T[interior], shade, cmap=shades, vmin=0, vmax=11, alpha=alpha)
         ax.triplot(*X.T, T, color="white", lw=0.4)
         ax.plot(*X[sample].T, "o", color="black", ms=5, zorder=5)
         ax.set_aspect("equal")
     for t in T[meeting]:
-        two.add_patch(Polygon(X[t], fc="black", ec="black", zorder=4))
-    three.triplot(*X[sample].T, triangles, color=BLUE, lw=1.8, zorder=4)
-    one.set_title("1. every vertex joins a sample")
-    two.set_title("2. three cells meet: a triangle")
-    three.set_title("3. it joins the three samples")
+        second.add_patch(Polygon(X[t], fc="black", ec="black", zorder=4))
+    third.triplot(*X[sample].T, triangles, color=BLUE, lw=1.8, zorder=4)
+    first.set_title("1. assign vertices to samples")
+    second.set_title("2. find where three cells meet")
+    third.set_title("3. join the three samples")
     return figure
 
 
 def pull_back() -> Figure:
-    """A match goes from target to source, functions go from source to target; C does the same.
+    """Pull-back of a function by a match, and the same as a functional map.
 
-    Left: an arrow goes from a point y of the target N back to T of y on the source M; the
-    value of f comes back along it. Right: a square. T F goes from f on M to f of T on N;
-    below, C goes from the coefficients a to b; Phi and Psi go down. Both ways end at b.
+    Left: an arrow leads from a point y of the target N to T of y on the source M, and a second
+    arrow takes the value of f back to y. Right: a commutative square. T F maps f on M to f of T
+    on N. Below it, C maps the coefficients a to b. Phi and Psi map functions to coefficients.
 
     Examples
     --------
@@ -119,12 +123,12 @@ def pull_back() -> Figure:
         Y = u[..., 1] * (1 - 0.3 * bend) + bend * (u[..., 0] ** 2 - 0.4)
         shapes.pcolormesh(X, Y, f, cmap=SIGNED, vmin=-1.3, vmax=1.3, shading="gouraud")
         shapes.text(left, -1.5, name, ha="center", fontsize=11)
-    here, there = np.array([3.455, 0.195]), np.array([0.4, 0.35])
-    for place, name, shift in ((here, "y", (0.14, -0.2)), (there, "T(y)", (0, -0.27))):
-        shapes.plot(*place, "o", color="black", ms=6)
-        shapes.text(*(place + shift), name, ha="center", fontsize=11, style="italic")
-    _arrow(shapes, here, there, "1. where does y come from?", bend=0.28, rise=0.62)
-    _arrow(shapes, (0.75, -0.75), (2.4, -0.75), "2. the value goes with it", bend=0.2, rise=-0.4)
+    y, T_y = np.array([3.455, 0.195]), np.array([0.4, 0.35])
+    for point, name, shift in ((y, "y", (0.14, -0.2)), (T_y, "T(y)", (0, -0.27))):
+        shapes.plot(*point, "o", color="black", ms=6)
+        shapes.text(*(point + shift), name, ha="center", fontsize=11, style="italic")
+    _arrow(shapes, y, T_y, "1. the match takes y to T(y)", bend=0.28, rise=0.62)
+    _arrow(shapes, (0.75, -0.75), (2.4, -0.75), "2. y gets the value f(T(y))", bend=0.2, rise=-0.4)
     shapes.text(-0.5, 1.1, "f", ha="center", fontsize=12, style="italic", color=BLUE)
     shapes.text(3.5, 1.1, "f(T(y))", ha="center", fontsize=12, style="italic", color=BLUE)
     shapes.set(xlim=(-1.2, 4.3), ylim=(-1.75, 1.6))
@@ -137,20 +141,20 @@ def pull_back() -> Figure:
             _box(square, (across, up), text, SOFT[kind], (1.0, 0.42))
     _arrow(square, (0.55, 1), (1.65, 1), "$T_F$", rise=0.12)
     _arrow(square, (0.55, 0), (1.65, 0), "C", rise=0.1)
-    _arrow(square, (0, 0.76), (0, 0.24), "$\\Phi^T A$", rise=0, aside=-0.28)
-    _arrow(square, (2.2, 0.76), (2.2, 0.24), "$\\Psi^T A$", rise=0, aside=0.28)
+    _arrow(square, (0, 0.76), (0, 0.24), "$\\Phi^T A$", rise=0, across=-0.28)
+    _arrow(square, (2.2, 0.76), (2.2, 0.24), "$\\Psi^T A$", rise=0, across=0.28)
     square.set(xlim=(-0.7, 2.9), ylim=(-0.4, 1.5))
-    square.set_title("both ways round end at b")
+    square.set_title("both paths lead to b")
     return figure
 
 
 def latent_space() -> Figure:
-    """One space for three shapes, and the matrix whose eigenvectors are its functions.
+    """Latent space of three shapes, and the matrix whose eigenvectors are its basis.
 
-    Left: three shapes around a latent space. The maps Y 1 to Y 3 go from it to the shapes,
-    the maps C 12, C 23 and C 31 from shape to shape. Right: the matrix L in nine blocks, with
-    products of the maps on its diagonal and the maps themselves beside it, and Y 1 to Y 3
-    below each other.
+    Left: three shapes around a latent space. The maps Y 1 to Y 3 lead from the latent space to
+    the shapes, the maps C 12, C 23 and C 31 from shape to shape. Right: the matrix L in nine
+    blocks. Its diagonal has products of the maps, the other blocks have the maps themselves. Next
+    to it are Y 1 to Y 3, stacked.
 
     Examples
     --------
@@ -160,14 +164,14 @@ def latent_space() -> Figure:
     """
     figure, ((star, matrix),) = _plain(latent_space, 2, 9.5, 3.7)
     angle = np.deg2rad([90, 210, 330])
-    places = 1.25 * np.c_[np.cos(angle), np.sin(angle)]
-    for i, place in enumerate(places):
-        _box(star, place, f"shape {i + 1}", SOFT["blue"], (0.8, 0.3))
-        beside = [(0.2, 0), (-0.12, 0.14), (0.12, 0.14)][i]
-        ends = 0.3 * place, 0.82 * place
-        _arrow(star, *ends, f"$Y_{i + 1}$", color=ORANGE, aside=beside[0], rise=beside[1])
+    nodes = 1.25 * np.c_[np.cos(angle), np.sin(angle)]
+    for i, node in enumerate(nodes):
+        _box(star, node, f"shape {i + 1}", SOFT["blue"], (0.8, 0.3))
+        across, up = [(0.2, 0), (-0.12, 0.14), (0.12, 0.14)][i]
+        ends = 0.3 * node, 0.82 * node
+        _arrow(star, *ends, f"$Y_{i + 1}$", color=ORANGE, across=across, rise=up)
     for i, j in ((0, 1), (1, 2), (2, 0)):
-        begin, end = 0.76 * places[i] + 0.24 * places[j], 0.24 * places[i] + 0.76 * places[j]
+        begin, end = 0.76 * nodes[i] + 0.24 * nodes[j], 0.24 * nodes[i] + 0.76 * nodes[j]
         outwards = (begin + end) / np.linalg.norm(begin + end)
         _arrow(star, begin + 0.12 * outwards, end + 0.12 * outwards, "", color=BLUE)
         x, y = (begin + end) / 2 + 0.32 * outwards
@@ -176,7 +180,7 @@ def latent_space() -> Figure:
     _box(star, (0, 0), "latent\nspace", SOFT["orange"], (0.5, 0.36))
     star.set(xlim=(-1.8, 1.8), ylim=(-1.1, 1.6))
     star.set_aspect("equal")
-    star.set_title(r"wanted: $C_{ij}\, Y_i = Y_j$ along every arrow")
+    star.set_title(r"goal: $C_{ij}\, Y_i = Y_j$ for every map")
     blocks = [
         [r"$C_{12}^T C_{12} + I$", r"$-C_{12}^T$", r"$-C_{31}$"],
         [r"$-C_{12}$", r"$C_{23}^T C_{23} + I$", r"$-C_{23}^T$"],
@@ -194,47 +198,47 @@ def latent_space() -> Figure:
     return figure
 
 
-def two_ways() -> Figure:
-    """From the latent functions to a match at full resolution: the standard way, and eq. 7.
+def two_methods() -> Figure:
+    """Two methods from latent functions to a match at full resolution: eq. 3 and 4, and eq. 7.
 
-    Two squares of template and shape, each at low and at full resolution, U going up. The
-    standard way searches at low resolution, fits C, and searches again at full resolution.
-    Equation 7 searches once, at full resolution, with U Phi Y.
+    Each method has template and shape at low and at full resolution, and U from low to full. The
+    standard method searches at low resolution, converts the match to C, and searches again at full
+    resolution. Equation 7 searches once, at full resolution, with U Phi Y.
 
     Examples
     --------
-    >>> from s4a.course.diagrams import two_ways
-    >>> [ax.get_title() for ax in two_ways().axes]
-    ['standard: two searches and a fit', 'eq. 7: one search']
+    >>> from s4a.course.diagrams import two_methods
+    >>> [ax.get_title() for ax in two_methods().axes]
+    ['standard (eq. 3 and 4): two searches', 'eq. 7: one search']
     """
-    figure, ((standard, ours),) = _plain(two_ways, 2, 9.5, 3.3)
-    for ax, low in ((standard, SOFT["orange"]), (ours, SOFT["grey"])):
+    figure, ((standard, latent),) = _plain(two_methods, 2, 9.5, 3.3)
+    for ax, low in ((standard, SOFT["orange"]), (latent, SOFT["grey"])):
         for x, name in ((0, "template"), (2.6, "shape")):
             _box(ax, (x, 0), f"{name}, low\n$\\Phi\\, Y$", low, (1.05, 0.42))
             up = "$U \\Phi$" if ax is standard else "$U \\Phi\\, Y$"
             _box(ax, (x, 1.15), f"{name}, full\n{up}", SOFT["blue"], (1.05, 0.42))
-            _arrow(ax, (x, 0.25), (x, 0.9), "U", rise=0, aside=0.14)
+            _arrow(ax, (x, 0.25), (x, 0.9), "U", rise=0, across=0.14)
         ax.set(xlim=(-0.7, 3.3), ylim=(-0.45, 1.6))
     _arrow(standard, (0.58, 0), (2.02, 0), "search: eq. 3", rise=0.1, color=ORANGE)
-    _arrow(standard, (1.3, 0.24), (1.3, 0.92), "fit C", rise=0, aside=0.27, color=ORANGE)
+    _arrow(standard, (1.3, 0.24), (1.3, 0.92), "map C", rise=0, across=0.29, color=ORANGE)
     _arrow(standard, (0.58, 1.15), (2.02, 1.15), "search: eq. 4", rise=0.1, color=ORANGE)
-    _arrow(ours, (0.58, 1.15), (2.02, 1.15), "search: eq. 7", rise=0.1, color=ORANGE)
-    standard.set_title("standard: two searches and a fit")
-    ours.set_title("eq. 7: one search")
+    _arrow(latent, (0.58, 1.15), (2.02, 1.15), "search: eq. 7", rise=0.1, color=ORANGE)
+    standard.set_title("standard (eq. 3 and 4): two searches")
+    latent.set_title("eq. 7: one search")
     return figure
 
 
 def slid() -> Figure:
-    """A match that slid along folds is still on the surface.
+    """Match with a tangential error: it slid along a fold, and is still on the surface.
 
-    Two folds of a surface from the side. The true position of a point is a crest; its match
-    has slid down the flank, and is still on the surface.
+    Two folds of a surface, seen from the side. The true position of a point is the crest of a
+    fold. The match of this point has slid down the flank, and is still on the surface.
 
     Examples
     --------
     >>> from s4a.course.diagrams import slid
     >>> [ax.get_title() for ax in slid().axes]
-    ['slid: still on the surface']
+    ['a slide: still on the surface']
     """
     figure, ((folds,),) = _plain(slid, 1, 5, 3.1)
     u = np.linspace(0, 2, 200)
@@ -250,12 +254,12 @@ def slid() -> Figure:
         folds.text(u[i] + shift[0], height[i] + shift[1], name, ha="center", color=color)
     folds.text(1, -0.15, "surface of the source", ha="center", color=GREY)
     folds.set(xlim=(-0.05, 2.05), ylim=(-0.3, 0.95))
-    folds.set_title("slid: still on the surface")
+    folds.set_title("a slide: still on the surface")
     return figure
 
 
 def _plain(draw, columns, width, height):
-    """Axes without frames; what they show is said in the second paragraph on the drawing."""
+    """Return axes without frames; the alternative text comes from the docstring of `draw`."""
     with rc_context(LOOK):
         figure = Parts(figsize=(width, height), layout="constrained", dpi=120)
         axes = figure.subplots(1, columns, squeeze=False)
@@ -267,7 +271,7 @@ def _plain(draw, columns, width, height):
 
 
 def _angle(ax, corner, i, j, color, name):
-    """The angle of a triangle at a corner, opposite to the edge from i to j."""
+    """Draw the angle of a triangle at a corner, opposite to the edge from i to j."""
     ends = np.array([np.arctan2(*(p - corner)[::-1]) for p in (i, j)])
     ends = np.unwrap(np.sort(ends))
     if ends[1] - ends[0] > np.pi:
@@ -280,7 +284,7 @@ def _angle(ax, corner, i, j, color, name):
 
 
 def _areas_around(ax):
-    """A third of every triangle around a vertex."""
+    """Draw a third of every triangle around a vertex."""
     center = np.array([0.62, 0.56])
     angle = np.deg2rad([10, 75, 130, 200, 255, 310])
     length = np.array([0.5, 0.46, 0.52, 0.48, 0.47, 0.5])
@@ -291,7 +295,7 @@ def _areas_around(ax):
         part = [center, (center + a) / 2, middle, (center + b) / 2]
         ax.add_patch(Polygon(part, fc=BLUE, alpha=0.35, ec="none"))
     ax.plot(*center, "o", color="black", ms=6)
-    ax.set_title("a vertex has a third of each triangle")
+    ax.set_title("vertex area: a third of each triangle")
     ax.text(0.6, -0.12, r"$a_i = \frac{1}{3} \sum$ areas around", ha="center")
 
 
@@ -302,10 +306,10 @@ def _box(ax, center, text, color, size):
     ax.text(*center, text, ha="center", va="center", zorder=3, fontsize=10)
 
 
-def _arrow(ax, begin, end, text, *, bend=0.0, rise=0.1, aside=0.0, color="black"):
-    """An arrow, and words beside its middle."""
+def _arrow(ax, begin, end, text, *, bend=0.0, rise=0.1, across=0.0, color="black"):
+    """Draw an arrow with a text, which is `across` and `rise` from the middle of the arrow."""
     style = {"arrowstyle": "-|>", "mutation_scale": 14, "lw": 1.6, "color": color}
     curve = f"arc3,rad={bend}"
     ax.add_patch(FancyArrowPatch(begin, end, **style, connectionstyle=curve, zorder=4))
     x, y = np.add(begin, end) / 2
-    ax.text(x + aside, y + rise, text, ha="center", va="center", color=color, fontsize=10)
+    ax.text(x + across, y + rise, text, ha="center", va="center", color=color, fontsize=10)

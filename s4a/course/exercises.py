@@ -1,7 +1,7 @@
-"""Exercises of the notebooks: what the right answer to each of them is.
+"""Exercises of the notebooks: right answers, and the check of a reader's answer.
 
-A cell leaves ``answer = ...`` open.  What the reader puts there is checked here, so that the cell
-itself does not tell.
+A cell has ``answer = ...``, which the reader replaces.  The right answers are here, so that the
+cell does not show them.
 """
 
 import html
@@ -20,14 +20,14 @@ from s4a.method.spectral import project, reconstruct, unit_area
 SOURCE = Path(__file__).parent / "hints.md"
 
 
-class Said(str):
-    """What is said of an answer, which a notebook shows as words and not as a value."""
+class Feedback(str):
+    """Feedback on an answer, which a notebook shows as text instead of a quoted string."""
 
     __slots__ = ()
 
     def _repr_html_(self) -> str:
-        words = re.sub(r"`([^`]+)`", r"<code>\1</code>", html.escape(self))
-        return f"<p>{words}</p>"
+        text = re.sub(r"`([^`]+)`", r"<code>\1</code>", html.escape(self))
+        return f"<p>{text}</p>"
 
 
 def check(number: str, answer: Any, *given: Any) -> str:
@@ -36,27 +36,31 @@ def check(number: str, answer: Any, *given: Any) -> str:
     Parameters
     ----------
     number : str
-        Of lesson and exercise, such as ``"02.1"``.
+        Number of lesson and exercise, such as ``"02.1"``.
     answer : object
-        ``...`` stands for none.
+        Answer of the reader; ``...`` stands for none.
     *given : object
-        What the right answer depends on, as the cell of the exercise has it.
+        Variables of the lesson from which the right answer is computed.
 
     Returns
     -------
     str
-        That it is right, or that there is none yet and where to look: an open exercise is no error.
+        ``"Right."``, or a hint if there is no answer yet, which is not an error.
 
     Raises
     ------
     AssertionError
-        When the answer is not the right one.
+        If the answer is wrong.
+
+    See Also
+    --------
+    judge : check an answer to an exercise of your own
 
     Examples
     --------
     >>> from s4a.course import check
     >>> check("02.1", ...)
-    'No answer yet: put yours in the place of the dots of `answer = ...`. Hint: ...'
+    'No answer yet: replace the dots in `answer = ...`. Hint: ...'
     >>> check("02.1", 9)
     Traceback (most recent call last):
     ...
@@ -69,34 +73,38 @@ def check(number: str, answer: Any, *given: Any) -> str:
 
 
 def hints() -> dict[str, str]:
-    """Where to look for the answer of each exercise, from ``hints.md``."""
-    lines = SOURCE.read_text(encoding="utf-8")
-    return dict(re.findall(r"^- (\d\d\.\d): (.+)$", lines, re.MULTILINE))
+    """Return the hint of each exercise, from ``hints.md``."""
+    text = SOURCE.read_text(encoding="utf-8")
+    return dict(re.findall(r"^- (\d\d\.\d): (.+)$", text, re.MULTILINE))
 
 
 def judge(answer: Any, expected: Any, hint: str = "", *, within: float = 0.01) -> str:
-    """Compare an answer with what is expected of it, for exercises of your own.
+    """Check an answer to an exercise of your own.
 
     Parameters
     ----------
     answer : object
-        ``...`` stands for none.
+        Answer of the reader; ``...`` stands for none.
     expected : array_like, str, bool or callable
-        The right answer, or a function of the answer that says whether it is right.
+        Right answer, or a function of the answer that returns True if it is right.
     hint : str
-        Where to look; said when the answer is missing or wrong.
+        Hint that is shown if the answer is missing or wrong.
     within : float
-        How far numbers may be from the right ones, as a share of the largest of these.
+        Tolerance of numbers, relative to the largest absolute value of `expected`.
 
     Returns
     -------
     str
-        That it is right, or that there is none yet and where to look.
+        ``"Right."``, or the hint if there is no answer yet.
 
     Raises
     ------
     AssertionError
-        When the answer is not the right one.
+        If the answer is wrong.
+
+    See Also
+    --------
+    check : check an answer to an exercise of the course
 
     Examples
     --------
@@ -111,37 +119,37 @@ def judge(answer: Any, expected: Any, hint: str = "", *, within: float = 0.01) -
     """
     hint = f" Hint: {hint}{'' if hint.endswith(('.', '?')) else '.'}" if hint else ""
     if answer is ...:
-        return Said(f"No answer yet: put yours in the place of the dots of `answer = ...`.{hint}")
+        return Feedback(f"No answer yet: replace the dots in `answer = ...`.{hint}")
     if callable(expected):
         try:
             right = bool(expected(answer))
-        except (TypeError, ValueError, IndexError, AttributeError):  # of an answer of another kind
+        except (TypeError, ValueError, IndexError, AttributeError):  # an answer of another type
             right = False
     elif np.asarray(expected).dtype.kind in "iuf":
-        right = _near(answer, np.asarray(expected, float), within)
+        right = _is_close(answer, np.asarray(expected, float), within)
     else:
         right = np.array_equal(answer, expected)
     if not right:
-        raise _shown(f"Not yet: the answer is {_told(answer)}.{hint}")
-    return Said("Right.")
+        raise _without_traceback(f"Not yet: the answer is {_summary(answer)}.{hint}")
+    return Feedback("Right.")
 
 
-def _shown(message):
-    """The error, which IPython shows without the way it took through this file."""
+def _without_traceback(message):
+    """Return an error that IPython shows without a traceback."""
     error = AssertionError(message)
     setattr(error, "_render_traceback_", lambda: [message])  # noqa: B010, IPython looks for it
     return error
 
 
 def _shape(answer):
-    """The shape of an answer as an array; None where its rows are of several lengths."""
+    """Return the shape of an answer as an array, or None if its rows differ in length."""
     try:
         return np.shape(answer)
     except ValueError:
         return None
 
 
-def _near(answer, expected, within):
+def _is_close(answer, expected, within):
     if _shape(answer) != expected.shape:
         return False
     answer = np.asarray(answer)
@@ -150,38 +158,41 @@ def _near(answer, expected, within):
     return bool((np.abs(answer - expected) <= within * np.abs(expected).max(initial=0)).all())
 
 
-def _told(answer):
-    """The answer in a few words."""
+def _summary(answer):
+    """Return the answer, shortened, or the shape of an array."""
     shape = _shape(answer) if not isinstance(answer, str | dict | set) else ()
     return f"an array of shape {shape}" if shape else f"{answer!r:.60}"
 
 
-def _rms(brain, k):
-    """How far `k` functions leave the vertices from their places, a share of sqrt(area)."""
-    gap = reconstruct(brain, brain["position"].values, k=k) - brain["position"].values
+def _reconstruction_error(brain, k):
+    """Return the RMS error of positions from `k` eigenfunctions, as a share of sqrt(area)."""
+    error = reconstruct(brain, brain["position"].values, k=k) - brain["position"].values
     size = brain["vertex_area"].values.sum() ** 0.5
-    return np.sqrt(unit_area(brain) @ (gap**2).sum(1)) / size
+    return np.sqrt(unit_area(brain) @ (error**2).sum(1)) / size
 
 
-def _deviation_of_details(U, brain, coarse):
-    gap = U @ coarse["position"].values - brain["position"].values
+def _rms_distance(U, brain, coarse):
+    """Return the RMS distance between the vertices and the coarse positions transferred by U."""
+    difference = U @ coarse["position"].values - brain["position"].values
     area = vertex_areas(*as_arrays(brain))
-    return np.sqrt(area @ (gap**2).sum(1) / area.sum())
+    return np.sqrt(area @ (difference**2).sum(1) / area.sum())
 
 
-def _is_wrong_everywhere_and_no_set_tells(match, n):
+def _is_derangement(match, n):
+    """Return True for a permutation of the vertices that leaves none in place."""
     match = np.asarray(match)
     moved = match.shape == (n,) and bool((match != np.arange(n)).all())
     return moved and np.array_equal(np.unique(match), np.arange(n))
 
 
-def _overlap(carried, own, name):
-    ours, theirs = (labels == LABELS.index(name) for labels in (carried, own))
-    return 2 * (ours & theirs).sum() / (ours.sum() + theirs.sum())
+def _dice(transferred, own, name):
+    """Return Dice's overlap of a region, by vertices."""
+    a, b = (labels == LABELS.index(name) for labels in (transferred, own))
+    return 2 * (a & b).sum() / (a.sum() + b.sum())
 
 
-def _loop(Y, *cycle):
-    """The cycle error of the maps of the latent space."""
+def _cycle_error(Y, *cycle):
+    """Return the cycle error of the maps through the latent space."""
     C = np.eye(Y.shape[1])
     for i, j in zip(cycle, (*cycle[1:], cycle[0]), strict=True):
         C = Y[j] @ np.linalg.pinv(Y[i]) @ C
@@ -189,22 +200,24 @@ def _loop(Y, *cycle):
 
 
 def _correlation_transferred(pair, field):
-    there = transfer_scalars(pair, field.parts["left"], source="left")["right/field"]
-    return np.corrcoef(np.asarray(there), field.parts["right"])[0, 1]
+    """Return the correlation of a field that is transferred from left to right with its own."""
+    transferred = transfer_scalars(pair, field.parts["left"], source="left")["right/field"]
+    return np.corrcoef(np.asarray(transferred), field.parts["right"])[0, 1]
 
 
-def _directional_share(found):
-    """Of the sums of squares of sides, and of individuals x sides."""
-    _, sides, rest = found["sum_of_squares"].values
+def _directional_share(asymmetries):
+    """Return the share of directional asymmetry in the variance within individuals."""
+    _, sides, rest = asymmetries["sum_of_squares"].values
     return sides / (sides + rest)
 
 
-def _moved_by_age(fit, years):
+def _displacement_by_age(fit, years):
+    """Return the largest displacement of a vertex over some years."""
     return years * np.linalg.norm(fit["effect"].values, axis=1).max()
 
 
-# what is right, of what the cell gives after the answer: a value, or a function of the answer that
-# says whether it is
+# The right answer, or a function of the arguments that follow the answer in the cell.  It returns
+# the right answer, or a function of the answer that returns True if the answer is right.
 EXERCISES: dict[str, Any] = {
     "00.1": lambda study: study["latent"]["distance_to_limit"].idxmin().item(),
     "00.2": lambda study: study["pca"]["explained_variance_ratio"].values[:2].sum(),
@@ -216,30 +229,32 @@ EXERCISES: dict[str, Any] = {
     "02.2": lambda sphere: (
         sphere["eigenfunction"].values.T @ (unit_area(sphere) * sphere["position"].values[:, 2])
     ),
-    "02.3": lambda brain: lambda k: _rms(brain, k) < 0.01 <= _rms(brain, k - 1),
+    "02.3": lambda brain: (
+        lambda k: _reconstruction_error(brain, k) < 0.01 <= _reconstruction_error(brain, k - 1)
+    ),
     "03.1": lambda U: U.shape[0] * U.shape[1] / U.nnz,
     "03.2": lambda coarse: coarse["vertex_area"].values,
-    "03.3": _deviation_of_details,
+    "03.3": _rms_distance,
     "04.1": lambda C, a, Psi, area: lambda g: np.allclose(project(Psi[:, :20], area, g), C @ a),
     "04.2": lambda C, back: np.linalg.norm(back @ C - np.eye(20)) / np.sqrt(20),
     "04.3": lambda C, C_mirror: (
-        lambda modes: sorted(modes) == [i for i in range(1, 9) if C[i, i] * C_mirror[i, i] < 0]
+        lambda odd: sorted(odd) == [i for i in range(1, 9) if C[i, i] * C_mirror[i, i] < 0]
     ),
     "05.1": 17,
     "05.2": lambda Phi, Psi, A, C: (
         Psi[:, :25].T @ (A[:, None] * Phi[nearest_rows(Psi[:, :20], Phi[:, :20] @ C.T), :25])
     ),
-    "05.3": lambda gap: np.mean(gap > 5),
+    "05.3": lambda error: np.mean(error > 5),
     "06.1": 20_825,
     "06.2": lambda Y: lambda C: np.shape(C) == (60, 60) and np.allclose(C @ Y[0], Y[3], atol=1e-6),
-    "06.3": lambda Y: lambda e: abs(e - _loop(Y, 0, 3, 5)) < 1e-6,
+    "06.3": lambda Y: lambda e: abs(e - _cycle_error(Y, 0, 3, 5)) < 1e-6,
     "07.1": lambda D: (
         lambda mean: np.shape(mean) == D.shape[1:] and np.allclose(mean, D.mean(0), atol=1e-6)
     ),
     "07.2": lambda: lambda d: abs(d) < 1e-12,
     "07.3": lambda latent: latent["distance_to_limit"].values,
     "08.1": 10**10,
-    "08.2": lambda: lambda gap: 0 <= gap < 1e-6,
+    "08.2": lambda: lambda difference: 0 <= difference < 1e-6,
     "08.3": lambda match, n: 1 - np.unique(match).size / n,
     "09.1": lambda pca: 1 + np.searchsorted(np.cumsum(pca["explained_variance_ratio"].values), 0.9),
     "09.2": lambda registration: (
@@ -250,21 +265,20 @@ EXERCISES: dict[str, Any] = {
     "10.2": lambda mean: (
         mean["seconds"].sel(algorithm="FMAP+ZO") / mean["seconds"].sel(algorithm="RE-MATCH")
     ).item(),
-    "10.3": lambda n: lambda match: _is_wrong_everywhere_and_no_set_tells(match, n),
-    "11.1": lambda carried, target: _overlap(carried, target["label"].values, "cerebellum left"),
-    "11.2": lambda carried, target: (
-        np.bincount(carried, vertex_areas(*as_arrays(target)))[LABELS.index("occipital right")]
-        / 100
+    "10.3": lambda n: lambda match: _is_derangement(match, n),
+    "11.1": lambda labels, target: _dice(labels, target["label"].values, "cerebellum left"),
+    "11.2": lambda labels, target: (
+        np.bincount(labels, vertex_areas(*as_arrays(target)))[LABELS.index("occipital right")] / 100
     ),
     "11.3": lambda brains, target: np.corrcoef(
         position(brains["truth"], "brain_05", brains["truth/brain_02/reference_point"].values).T[2],
         target["position"].values.T[2],
     )[0, 1],
     "12.1": 0.1,
-    "12.2": lambda found: (
-        np.mean(found["p_vertex"].values < 0.05) - np.mean(found["p_family_wise"].values < 0.05)
+    "12.2": lambda test: (
+        np.mean(test["p_vertex"].values < 0.05) - np.mean(test["p_family_wise"].values < 0.05)
     ),
-    "12.3": lambda fit: _moved_by_age(fit, 10),
+    "12.3": lambda fit: _displacement_by_age(fit, 10),
     "13.1": lambda report: report["shape"].values[report["status"].values != "ok"].tolist(),
     "13.2": lambda image: (
         (np.asarray(image.dataobj) == 1).sum() * abs(np.linalg.det(image.affine)) / 1000
@@ -277,16 +291,16 @@ EXERCISES: dict[str, Any] = {
     )[0, 1],
     "15.1": 6,
     "15.2": _directional_share,
-    "15.3": lambda found: found["fluctuating_size"].idxmax().item(),
+    "15.3": lambda asymmetries: asymmetries["fluctuating_size"].idxmax().item(),
     "16.1": lambda half, truth: np.linalg.norm(half["position"] - truth, axis=1)[
         half["present"].values == 1
     ].mean(),
-    "16.2": lambda found: found["level_share"].sel(level="between").sum().item(),
-    "16.3": lambda found: np.degrees(np.sqrt((found["pose_rotation"].values ** 2).sum(2)).max()),
+    "16.2": lambda poses: poses["level_share"].sel(level="between").sum().item(),
+    "16.3": lambda poses: np.degrees(np.sqrt((poses["pose_rotation"].values ** 2).sum(2)).max()),
     "17.1": 6,
     "17.2": lambda fit: float((fit["effect"].values ** 2).sum(1).max() ** 0.5),
     "17.3": lambda thick: (thick["p_false_discovery"] <= 0.05).mean().item(),
 }
-# how far numbers may be from the right ones, where it is not 0.01
+# tolerances (`within` of `judge`) other than 0.01
 WITHIN = dict.fromkeys(("02.1", "05.1", "06.1", "08.1", "13.3", "15.1", "17.1"), 0.0)
 WITHIN |= {"08.3": 0.001, "09.2": 0.0001, "11.3": 0.02, "14.3": 0.002, "16.2": 0.005}

@@ -1,7 +1,7 @@
-"""Quizzes of the notebooks: questions that say, for every answer, why it is right or wrong.
+"""Quizzes of the notebooks: questions with an explanation of every answer.
 
-They stand in ``quizzes.md``, a heading for each lesson, a paragraph for each question and a task
-list of its answers, of which the right one is ticked.  What is said of an answer follows it on the
+The questions are in ``quizzes.md``: a heading for each lesson, a paragraph for each question, and a
+task list of its answers, in which the right one is ticked.  The explanation of an answer is on the
 next line.  A quiz is plain HTML: it works without a kernel, on a page and in a slide.
 """
 
@@ -18,22 +18,22 @@ PAGE = SOURCE.with_name("quiz.html")
 
 
 class Answer(NamedTuple):
-    """A possible answer, and what is said to it."""
+    """Possible answer to a question, and its explanation."""
 
     text: str
     right: bool
-    said: str
+    explanation: str
 
 
 class Question(NamedTuple):
-    """A question and its possible answers."""
+    """Question and its possible answers."""
 
     text: str
     answers: tuple[Answer, ...]
 
 
 class Quiz:
-    """Questions that a notebook and a page show; an answer that is clicked says what it is."""
+    """Questions of a lesson; a click on an answer shows its explanation."""
 
     def __init__(self, lesson: str, questions: list[Question]) -> None:
         self.lesson = lesson
@@ -56,22 +56,22 @@ class Quiz:
 
 
 def quiz(lesson: str) -> Quiz:
-    """Three questions on a lesson; a click on an answer says whether it is right, and why.
+    """Return the three questions of a lesson; a click on an answer shows why it is right or wrong.
 
     Parameters
     ----------
     lesson : str
-        Its number, such as ``"02"``.
+        Number of the lesson, such as ``"02"``.
 
     Returns
     -------
     Quiz
-        Its HTML needs no kernel; as text it has the questions and their answers.
+        Questions and answers, as HTML that needs no kernel, or as text.
 
     Raises
     ------
     ValueError
-        For a lesson without a quiz.
+        If the lesson has no quiz.
 
     Examples
     --------
@@ -82,31 +82,31 @@ def quiz(lesson: str) -> Quiz:
     """
     known = read(SOURCE.read_text(encoding="utf-8"))
     if lesson not in known:
-        raise ValueError(f"no quiz of lesson {lesson!r}; there are those of {', '.join(known)}")
+        raise ValueError(f"no quiz of lesson {lesson!r}; the lessons are {', '.join(known)}")
     return Quiz(lesson, known[lesson])
 
 
 def read(text: str) -> dict[str, list[Question]]:
-    """The questions of each lesson, from Markdown as in ``quizzes.md``."""
-    found: dict[str, list[Question]] = {}
+    """Read the questions of each lesson from Markdown as in ``quizzes.md``."""
+    lessons: dict[str, list[Question]] = {}
     for part in re.split(r"^## ", text, flags=re.MULTILINE)[1:]:
         lesson, *blocks = re.split(r"\n\s*\n", part.strip())
         questions = []
-        for words, listed in zip(blocks[::2], blocks[1::2], strict=True):
-            asked = " ".join(words.split())
-            each = re.findall(r"- \[([ x])\] (.*)\n  (.*)", listed)
-            told = [Answer(given, mark == "x", said) for mark, given, said in each]
-            questions.append(Question(asked, _shuffled(asked, told)))
-        found[lesson.split()[0]] = questions
-    return found
+        for paragraph, task_list in zip(blocks[::2], blocks[1::2], strict=True):
+            question = " ".join(paragraph.split())
+            items = re.findall(r"- \[([ x])\] (.*)\n  (.*)", task_list)
+            answers = [Answer(text, mark == "x", explanation) for mark, text, explanation in items]
+            questions.append(Question(question, _shuffled(question, answers)))
+        lessons[lesson.split()[0]] = questions
+    return lessons
 
 
-def _shuffled(asked, answers):
-    """The answers in an order that is always the same, and tells nothing."""
-    return tuple(sorted(answers, key=lambda a: sha256(f"0{asked}{a.text}".encode()).digest()))
+def _shuffled(question, answers):
+    """Return the answers in a fixed order that is independent of which one is right."""
+    return tuple(sorted(answers, key=lambda a: sha256(f"0{question}{a.text}".encode()).digest()))
 
 
 def _marked(text):
-    """A line of Markdown as HTML: what is code, and what is stressed."""
+    """Convert code and emphasis in a line of Markdown to HTML."""
     text = re.sub(r"`(.+?)`", r"<code>\1</code>", html.escape(text, quote=False))
     return Markup(re.sub(r"\*(.+?)\*", r"<em>\1</em>", text))

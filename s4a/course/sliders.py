@@ -1,4 +1,4 @@
-"""Pictures of the notebooks that sliders draw again, and those that sum up a lesson."""
+"""Figures of the notebooks with sliders, and the summary figure of a lesson."""
 
 import io
 from collections.abc import Callable
@@ -12,22 +12,26 @@ if TYPE_CHECKING:
 
 
 def slide(draw: "Callable[..., Figure]", **sliders: "ipywidgets.Widget") -> "ipywidgets.VBox":
-    """A figure that sliders draw again.
+    """Return a figure with sliders that redraw it.
 
-    Unlike ``ipywidgets.interact`` it captures no output, for which programs that run notebooks may
-    wait without end; the picture is the value of an image.
+    Unlike ``ipywidgets.interact`` it captures no output, which can block programs that run
+    notebooks; the picture is the value of an image widget.
 
     Parameters
     ----------
     draw : callable
-        Takes the values of the sliders by name, and gives a matplotlib Figure.
+        Function of the values of the sliders, by name, that returns a matplotlib Figure.
     **sliders : ipywidgets.Widget
-        Each with a ``value``; one without a description gets its name.
+        Widgets with a ``value``; the default description is the name.
 
     Returns
     -------
     ipywidgets.VBox
-        The sliders, the picture and, where `draw` fails, its error.
+        The sliders, the error message if `draw` fails, and the picture.
+
+    See Also
+    --------
+    takeaway : summary figure of a lesson
 
     Examples
     --------
@@ -60,7 +64,7 @@ def slide(draw: "Callable[..., Figure]", **sliders: "ipywidgets.Widget") -> "ipy
             picture.value, width = _png(figure)
             picture.layout.width = f"min(100%, {round(GROW * width)}px)"
             message.value = ""
-        except Exception as error:  # a callback has no cell to show it
+        except Exception as error:  # shown here: a callback has no cell
             message.value = f"<pre>{html.escape(f'{type(error).__name__}: {error}')}</pre>"
 
     for name, slider in sliders.items():
@@ -70,60 +74,66 @@ def slide(draw: "Callable[..., Figure]", **sliders: "ipywidgets.Widget") -> "ipy
     return ipywidgets.VBox([*sliders.values(), message, picture])
 
 
-LEAST = 0.8  # of the size of a figure in a take-away
+MIN_SCALE = 0.8  # of a figure in a take-away
 
 
 def _png(figure):
-    """A figure as PNG of twice the pixels that it is shown with, and that width."""
+    """Return a figure as PNG with two pixels per shown pixel, and its shown width."""
     target = io.BytesIO()
     figure.savefig(target, format="png", dpi=2 * figure.dpi, bbox_inches="tight")
     data = target.getvalue()
-    width = int.from_bytes(data[16:20], "big")  # of the header of a PNG
+    width = int.from_bytes(data[16:20], "big")  # in the header of a PNG
     return data, width // 2
 
 
 def takeaway(sentence: str, *figures: "Figure") -> "Figure":
-    """What to remember of a lesson: some figures in a row, below a sentence.
+    """Return the summary figure of a lesson: a sentence above a row of figures.
 
-    In a narrow cell the figures stand below each other.
+    In a narrow cell the figures are below each other.
 
     Parameters
     ----------
     sentence : str
-        Written above the pictures.
+        Title of the summary figure.
     *figures : matplotlib.figure.Figure
-        Drawn as they are, all of one height.
+        Figures, which are scaled to one height.
 
     Returns
     -------
     matplotlib.figure.Figure
 
+    See Also
+    --------
+    slide : figure with sliders
+
     Examples
     --------
     >>> from s4a.course import takeaway
     >>> from s4a.show.charts import variance
-    >>> whole = takeaway("Few modes hold most of it.", variance([0.7, 0.2, 0.1]))
-    >>> whole.get_suptitle()
-    'Few modes hold most of it.'
+    >>> summary = takeaway("Few modes explain most of the variance.", variance([0.7, 0.2, 0.1]))
+    >>> summary.get_suptitle()
+    'Few modes explain most of the variance.'
     """
     from PIL import Image
 
     from s4a.show.parts import Parts
 
     pictures = [np.asarray(Image.open(io.BytesIO(_png(figure)[0]))) for figure in figures]
-    shares = [picture.shape[1] / picture.shape[0] for picture in pictures]
-    natural = [len(one) / (2 * of.dpi) for one, of in zip(pictures, figures, strict=True)]
-    width, gap = 9.5, 0.1
-    # smaller than they are drawn only so far as their words can still be read
-    height = min(3.2, (width - gap * len(shares)) / sum(shares))
-    height = max(height, LEAST * max(natural))
-    whole = Parts(figsize=(height * sum(shares) + gap * (len(shares) - 1), height + 0.35))
-    room = {"left": 0, "right": 1, "bottom": 0, "top": height / (height + 0.35)}
-    room["wspace"] = gap * len(shares) / whole.get_figwidth()
-    axes = whole.subplots(1, len(shares), squeeze=False, width_ratios=shares, gridspec_kw=room)
+    ratios = [picture.shape[1] / picture.shape[0] for picture in pictures]
+    heights = [
+        len(picture) / (2 * figure.dpi) for picture, figure in zip(pictures, figures, strict=True)
+    ]
+    width, space = 9.5, 0.1
+    # a smaller scale would make the text of the figures too small to read
+    height = min(3.2, (width - space * len(ratios)) / sum(ratios))
+    height = max(height, MIN_SCALE * max(heights))
+    summary = Parts(figsize=(height * sum(ratios) + space * (len(ratios) - 1), height + 0.35))
+    grid = {"left": 0, "right": 1, "bottom": 0, "top": height / (height + 0.35)}
+    grid["wspace"] = space * len(ratios) / summary.get_figwidth()
+    axes = summary.subplots(1, len(ratios), squeeze=False, width_ratios=ratios, gridspec_kw=grid)
     for ax, picture in zip(axes.flat, pictures, strict=True):
         ax.imshow(picture, interpolation="lanczos")
         ax.set_axis_off()
-    whole.set_dpi(150)
-    whole.suptitle(sentence, y=0.99, va="top", fontsize=11, fontweight="bold")
-    return whole
+    summary.set_dpi(150)
+    summary.suptitle(sentence, y=0.99, va="top", fontsize=11, fontweight="bold")
+    return summary

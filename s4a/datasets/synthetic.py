@@ -1,11 +1,11 @@
-"""Brain-like collections of known correspondences and modes; small surfaces with known answers.
+"""Synthetic brains with ground-truth correspondences and modes, and small test surfaces.
 
-One reference brain is a smooth embedding of the unit sphere; the folds are part of it.  Every shape
-is that brain moved by a smooth diffeomorphism of space, x -> x + sum_m s_m w_m(x) + individual
-noise + tumour, and then by a rigid transform. The fields are sums of localised slides and turns,
-exp(-|x - c|^2 / 2 w^2) (push + turn x (x - c)), so that :func:`position` gives the exact place of
-every reference point (a point of the unit sphere) on every shape. Millimetres, and RAS: x to the
-right, y to the front, z up.
+The reference brain is a smooth embedding of the unit sphere, including folds.  Every shape is the
+reference brain after a smooth diffeomorphism of space, x -> x + sum_m s_m w_m(x) + individual noise
++ tumour, and a rigid transform.  The fields are sums of localised translations and rotations,
+exp(-|x - c|^2 / 2 w^2) (translation + rotation x (x - c)), so that :func:`position` gives the exact
+position of every reference point (a point of the unit sphere) on every shape.  Units are mm, axes
+RAS: x to the right, y to the front, z up.
 """
 
 from pathlib import Path
@@ -28,20 +28,20 @@ from s4a.seeds import RNG, seed_of
 from s4a.study.pipeline import analyse
 
 
-def _soil(X, T, u, rng):
-    """A clean mesh made as dirty as a file from a scanner.
+def _add_artefacts(X, T, u, rng):
+    """Add artefacts of scanner files to a clean mesh.
 
-    4 loose components of 12 to 60 vertices; 3 holes of 10 to 60 triangles; one bow-tie vertex for
-    8,000 triangles; and one for 2,000 triangles of each of these: non-manifold edges, duplicate
-    vertices (a seam half around the vertex), split edges with two zero-area triangles, duplicate
-    triangles, flipped triangles, unreferenced vertices; of all of these at least 3.  Vertices and
-    triangles are shuffled.
+    4 loose components of 12 to 60 vertices; 3 holes of 10 to 60 triangles; one bow-tie vertex per
+    8,000 triangles; and one per 2,000 triangles, at least 3, of each of these: non-manifold edges,
+    duplicate vertices (a seam half around the vertex), split edges with two zero-area triangles,
+    duplicate triangles, flipped triangles, unreferenced vertices.  Vertices and triangles are
+    shuffled.
 
     Parameters
     ----------
     X, T : the mesh
     u : float ndarray (n, 3)
-        Points of the unit sphere that the vertices are images of.
+        Reference points of the vertices on the unit sphere.
     rng : numpy.random.Generator
 
     Returns
@@ -65,9 +65,9 @@ def _soil(X, T, u, rng):
 
 
 def _tear(T, u, few, rng):
-    """The triangles but for holes, and but for pairs at a vertex, whose star is a bow-tie then.
+    """Remove triangles to make holes and bow-tie vertices.
 
-    The two have that vertex alone in common.
+    At a bow-tie, two triangles of a star with only that vertex in common are removed.
     """
     keep = np.ones(len(T), bool)
     middles = cKDTree(u[T].mean(1))
@@ -75,16 +75,16 @@ def _tear(T, u, few, rng):
         keep[middles.query(u[rng.integers(len(u))], size)[1]] = False
     for v in rng.choice(len(u), max(3, few // 4), replace=False):
         star = np.flatnonzero((T == v).any(1))
-        apart = [t for t in star if len(np.intersect1d(T[t], T[star[0]])) == 1]
-        keep[[star[0], *apart[:1]]] = False
+        opposite = [t for t in star if len(np.intersect1d(T[t], T[star[0]])) == 1]
+        keep[[star[0], *opposite[:1]]] = False
     return T[keep]
 
 
 def _duplicate_vertices(X, T, u, few, rng):
-    """Triangles that use copies of some vertices, and the original of every vertex.
+    """Duplicate some vertices; return the triangles and the original of every vertex.
 
-    A seam: half of the star of v gets a copy.  A split edge: a b c becomes m b c, a m c and a b m,
-    m a copy of a.
+    Seam: half of the star of v gets a copy.  Split edge: a b c becomes m b c, a m c and a b m,
+    where m is a copy of a.
     """
     T, original = T.copy(), np.arange(len(X))
     for v in rng.choice(np.unique(T), few, replace=False):
@@ -101,10 +101,7 @@ def _duplicate_vertices(X, T, u, few, rng):
 
 
 def _disorder(T, u, few, rng):
-    """Triangles of which some are there twice, and some flipped.
-
-    Some edges have a third triangle then.
-    """
+    """Duplicate and flip some triangles, and add a third one to some edges."""
     third, twice, flipped = rng.choice(len(T), (3, few), replace=False)
     beyond = cKDTree(u).query(u[T[third]].mean(1), 15)[1][:, -1]
     more = [np.c_[T[third, :2], beyond], np.roll(T[twice], 1, axis=1)]
@@ -114,21 +111,21 @@ def _disorder(T, u, few, rng):
 
 
 def _debris(near, rng):
-    """A small loose ellipsoid."""
+    """Return a small loose ellipsoid."""
     u = rng.normal(size=(int(rng.integers(12, 61)), 3))
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     return near * rng.uniform(0.8, 1.15) + u * rng.uniform(0.8, 3, 3), ConvexHull(u).simplices
 
 
 _MODE_RMS = 4.5  # mm, root mean square displacement of mode 1 at one standard deviation
-_MODE_RATIO = 0.6  # of each mode to the one before it
-_NOISE_RMS = 0.4  # mm, of the individual noise: 8 slides 16 to 28 mm wide
-_TUMOUR = (4.0, 7.0)  # mm, least and largest height, on a third of the shapes; 10 to 14 mm wide
+_MODE_RATIO = 0.6  # ratio of each mode to the previous one
+_NOISE_RMS = 0.4  # mm, individual noise: 8 translations 16 to 28 mm wide
+_TUMOUR = (4.0, 7.0)  # mm, smallest and largest height, on a third of the shapes; 10 to 14 mm wide
 _POSE = (10.0, 8.0)  # largest rotation in degrees, standard deviation of the translation in mm
 _SEMI_AXES = np.array([64.0, 86.0, 61.0])
 
-# Centre, width, push, turn and mirror of the slides and turns of each mode, on the right side; a
-# mirror of 1 repeats it on the left as in a mirror, -1 with the opposite sign, 0 not at all.
+# Centre, width, translation, rotation and mirror of the fields of each mode, on the right side; a
+# mirror of 1 repeats the field on the left as in a mirror, -1 with the opposite sign, 0 does not.
 MODES: list[list[Any]] = [
     [((62, 0, 5), 44, (0, 0, 0), (1, 0, 0), 1)],
     [((0, 60, 10), 38, (0, 0, 0), (0, 1, 0), 0), ((0, -60, 10), 38, (0, 0, 0), (0, -1, 0), 0)],
@@ -168,19 +165,19 @@ LANDMARKS = {
 
 
 def _bump(u, centre, sharpness):
-    """exp(sharpness (cos angle - 1)) around a direction."""
+    """Return exp(sharpness (cos angle - 1)) around a direction."""
     return np.exp(sharpness * (u @ _unit(centre) - 1))
 
 
 def _step(x, width):
-    """From 0 to 1 around x = 0."""
+    """Smooth step from 0 to 1 around x = 0."""
     return 0.5 * (1 + np.tanh(x / width))
 
 
 def _fold_noise(p, wavelength=30.0, waves=48):
-    """A random field of one wavelength whose zeros are the sulci, of unit variance.
+    """Random field of one wavelength and unit variance, whose zeros are the sulci.
 
-    It is nearly mirror-symmetric in x.
+    The field is nearly mirror-symmetric in x.
     """
     rng = np.random.default_rng(20)
     k = rng.normal(size=(waves, 3))
@@ -194,7 +191,7 @@ def _fold_noise(p, wavelength=30.0, waves=48):
 
 
 def reference_brain(u: ArrayLike) -> np.ndarray:
-    """Positions (p, 3) in mm of points u (p, 3) of the unit sphere on the reference brain."""
+    """Map points u (p, 3) of the unit sphere to the reference brain: (p, 3) in mm."""
     u = np.asarray(u, float)
     x, y, z = u.T
     side = np.abs(x)
@@ -204,7 +201,7 @@ def reference_brain(u: ArrayLike) -> np.ndarray:
     stem = _bump(u, (0, -0.36, -0.93), 110.0)
     base = _bump(u, (0, 0.35, -0.94), 6.0)
     temporal = _bump(mirrored, (0.72, 0.25, -0.62), 10.0)
-    # grooves: longitudinal fissure, Sylvian fissure, gap between cerebrum and cerebellum
+    # grooves: longitudinal fissure, Sylvian fissure, cleft between cerebrum and cerebellum
     top = _step(z + 0.25, 0.2) + 0.7 * _step(-0.6 - z, 0.1) * _step(y - 0.2, 0.1)
     fissure = np.exp(-((x / 0.07) ** 2)) * top
     sylvian = (
@@ -240,10 +237,10 @@ def reference_brain(u: ArrayLike) -> np.ndarray:
     return p
 
 
-def _fields(x, centre, width, push, turn):
-    """Sum over the parts of exp(-|x - c|^2 / 2 w^2) (push + turn x (x - c)) at points x (p, 3)."""
+def _fields(x, centre, width, translation, rotation):
+    """Sum exp(-|x - c|^2 / 2 w^2) (translation + rotation x (x - c)) at points x (p, 3)."""
     total = np.zeros_like(x)
-    for c, w, a, b in zip(centre, width, push, turn, strict=True):
+    for c, w, a, b in zip(centre, width, translation, rotation, strict=True):
         d = x - c
         local = np.exp(np.einsum("px,px->p", d, d) * (-0.5 / w**2))
         total += local[:, None] * (a + d @ np.cross(b, np.eye(3)))
@@ -251,34 +248,34 @@ def _fields(x, centre, width, push, turn):
 
 
 def _generators(n_modes):
-    """Centres and widths of all parts, and their push and turn by each generator ``(g, parts, 6)``.
+    """Centres and widths of all regions, and their transform by each generator ``(g, regions, 6)``.
 
-    The generators are the six rigid transforms, of one part of infinite width, and the modes as
-    they are designed.
+    The generators are the six rigid transforms, as one region of infinite width, and the designed
+    modes.  Three columns are the translation, three the rotation.
     """
     centre, width = [np.zeros(3)], [np.inf]
-    moves = []  # mode, push and turn of each part after the first
+    moves = []  # mode and transform of each region after the first
     for m, mode in enumerate(MODES[:n_modes]):
-        for c, w, push, turn, mirror in mode:
+        for c, w, translation, rotation, mirror in mode:
             for side in (1,) if mirror == 0 else (1, -1):
                 flip = np.array([side, 1, 1])
                 sign = 1 if side == 1 else mirror
                 centre.append(flip * c)
                 width.append(w)
-                # a turn is mirrored as an axial vector: what flips it also changes its sense
-                moves.append((m, sign * np.r_[flip * push, side * flip * turn]))
+                # a rotation is an axial vector: a reflection also changes its sign
+                moves.append((m, sign * np.r_[flip * translation, side * flip * rotation]))
     rows = np.zeros((6 + n_modes, len(centre), 6))
     rows[:6, 0] = np.eye(6)
-    for part, (m, move) in enumerate(moves, start=1):
-        rows[6 + m, part] = move
+    for region, (m, move) in enumerate(moves, start=1):
+        rows[6 + m, region] = move
     return np.array(centre), np.array(width), rows
 
 
 def _true_modes(n_modes):
-    """Centres and widths of all parts, and each mode's push and turn of them.
+    """Centres and widths of all regions, and their translation and rotation in each mode.
 
-    On the reference brain the modes are orthogonal to rigid transforms and to each other: the
-    Cholesky factor of the generators' Gram matrix is that of Gram and Schmidt.
+    On the reference brain the modes are orthogonal to rigid transforms and to each other, by a
+    Cholesky factor of the Gram matrix of the generators.
     """
     if not 0 <= n_modes <= len(MODES):
         raise ValueError(f"n_modes needs a number from 0 to {len(MODES)}, found {n_modes}")
@@ -294,7 +291,7 @@ def _true_modes(n_modes):
 
 
 def _true_scores(n, n_modes, rng):
-    """Truncated normal scores ``(n, n_modes)``; standard and uncorrelated of shapes enough."""
+    """Truncated normal scores ``(n, n_modes)``, standardised and uncorrelated if possible."""
     while True:
         score = ndtri(rng.uniform(ndtr(-2.5), ndtr(2.5), (n, n_modes)))
         if n <= n_modes + 1:
@@ -306,23 +303,23 @@ def _true_scores(n, n_modes, rng):
 
 
 def _noise_regions(n, rng):
-    """Centres, widths and pushes ``(n, 9, ...)`` of each shape's noise and, last, of its tumour."""
+    """Centres, widths and translations ``(n, 9, ...)`` of the noise and, last, of the tumour."""
     centre = reference_brain(_random_directions(rng, n * 9)).reshape(n, 9, 3)
     width = np.concatenate([rng.uniform(16, 28, (n, 8)), rng.uniform(10, 14, (n, 1))], axis=1)
-    push = rng.normal(size=(n, 9, 3))
+    translation = rng.normal(size=(n, 9, 3))
     outwards = _random_directions(rng, n)
     outwards[:, 2] = np.abs(outwards[:, 2])  # a tumour is on the upper half
     centre[:, 8] = reference_brain(outwards)
     height = rng.uniform(*_TUMOUR, n) * (rng.permutation(n) < n // 3)
-    push[:, 8] = outwards * height[:, None]
+    translation[:, 8] = outwards * height[:, None]
     x = reference_brain(_sphere(4000)[0])
-    for c, w, a in zip(centre[:, :8], width[:, :8], push[:, :8], strict=True):
-        a *= _NOISE_RMS / np.sqrt((_fields(x, c, w, a, 0 * a) ** 2).sum(1).mean())  # in push itself
-    return centre, width, push
+    for c, w, a in zip(centre[:, :8], width[:, :8], translation[:, :8], strict=True):
+        a *= _NOISE_RMS / np.sqrt((_fields(x, c, w, a, 0 * a) ** 2).sum(1).mean())  # in place
+    return centre, width, translation
 
 
-def plant(n: int = 12, seed: int = 0, *, n_modes: int = 3, rng: RNG | None = None) -> xr.Dataset:
-    """The simulated parameters of a population: all that :func:`position` needs, without any mesh.
+def simulate(n: int = 12, seed: int = 0, *, n_modes: int = 3, rng: RNG | None = None) -> xr.Dataset:
+    """Simulate the parameters of a population, without meshes.
 
     Parameters
     ----------
@@ -335,27 +332,27 @@ def plant(n: int = 12, seed: int = 0, *, n_modes: int = 3, rng: RNG | None = Non
     Returns
     -------
     Dataset
-        ``true_score(shape, true_mode)``, the parts of the modes, of each shape's noise and
-        tumour (the last part; its push is zero where there is none), its pose, and the landmarks'
-        reference points.
+        ``true_score(shape, true_mode)``; the regions of the modes; the regions of the noise and,
+        last, of the tumour of each shape (with zero translation if there is none); the pose; and
+        the reference points of the landmarks.  :func:`position` needs nothing else.
 
     Raises
     ------
     ValueError
-        When there is no shape.
+        If `n` is less than 1.
 
     Examples
     --------
     >>> import s4a
-    >>> truth = s4a.synthetic.plant(6, seed=1)
+    >>> truth = s4a.synthetic.simulate(6, seed=1)
     >>> truth["true_score"].std("shape").values.round(6).tolist()
     [1.0, 1.0, 1.0]
     """
     if n < 1:
-        raise ValueError(f"a population needs n of 1 or more shapes, found {n}")
+        raise ValueError(f"n, the number of shapes, must be at least 1; found {n}")
     seed = seed_of(seed, rng)
     draw = np.random.default_rng([seed, 0])
-    centre, width, push, turn = _true_modes(n_modes)
+    centre, width, translation, rotation = _true_modes(n_modes)
     score = _true_scores(n, n_modes, draw)
     noise_centre, noise_width, noise_translation = _noise_regions(n, draw)
     pose = Rotation.from_rotvec(
@@ -372,8 +369,8 @@ def plant(n: int = 12, seed: int = 0, *, n_modes: int = 3, rng: RNG | None = Non
         true_score=score,
         true_centre=centre,
         true_width=width,
-        true_translation=push,
-        true_rotation=turn,
+        true_translation=translation,
+        true_rotation=rotation,
         noise_centre=noise_centre,
         noise_width=noise_width,
         noise_translation=noise_translation,
@@ -388,12 +385,12 @@ def plant(n: int = 12, seed: int = 0, *, n_modes: int = 3, rng: RNG | None = Non
 
 
 def position(truth: xr.Dataset | xr.DataTree, shape: str, reference_point: ArrayLike) -> np.ndarray:
-    """Exact positions of reference points on a shape.
+    """Return the exact positions of reference points on a shape.
 
     Parameters
     ----------
     truth : DataTree or Dataset
-        ``tree["truth"]`` of :func:`brains`, or of :func:`plant`.
+        ``tree["truth"]`` of :func:`brains`, or the result of :func:`simulate`.
     shape : str
     reference_point : (p, 3)
         Points of the unit sphere.
@@ -401,22 +398,22 @@ def position(truth: xr.Dataset | xr.DataTree, shape: str, reference_point: Array
     Returns
     -------
     float ndarray (p, 3)
-        In mm; a row of NaN stays one.
+        In mm; NaN for rows of NaN.
 
     Examples
     --------
     >>> import s4a
-    >>> s4a.synthetic.position(s4a.synthetic.plant(4), "brain_02", [[0, 1, 0], [0, -1, 0]]).shape
+    >>> s4a.synthetic.position(s4a.synthetic.simulate(4), "brain_02", [[0, 1, 0], [0, -1, 0]]).shape
     (2, 3)
     """
     truth = truth.to_dataset() if isinstance(truth, xr.DataTree) else truth
-    own = truth.isel(shape=_index(truth, shape))
-    value = {name: v.values for name, v in own.data_vars.items()}
+    row = truth.isel(shape=_index(truth, shape))
+    value = {name: v.values for name, v in row.data_vars.items()}
     x = reference_brain(reference_point)
-    push = np.tensordot(value["true_score"], value["true_translation"], 1)  # (parts, 3)
-    turn = np.tensordot(value["true_score"], value["true_rotation"], 1)
+    translation = np.tensordot(value["true_score"], value["true_translation"], 1)  # (regions, 3)
+    rotation = np.tensordot(value["true_score"], value["true_rotation"], 1)
     noise_translation = value["noise_translation"]
-    moved = x + _fields(x, value["true_centre"], value["true_width"], push, turn)
+    moved = x + _fields(x, value["true_centre"], value["true_width"], translation, rotation)
     moved += _fields(
         x, value["noise_centre"], value["noise_width"], noise_translation, 0 * noise_translation
     )
@@ -424,12 +421,10 @@ def position(truth: xr.Dataset | xr.DataTree, shape: str, reference_point: Array
 
 
 def _index(truth, shape):
-    """Row of a shape in the truth."""
+    """Row of a shape in the ground truth."""
     names = truth["shape"].values.tolist()
     if shape not in names:
-        raise ValueError(
-            f"the truth needs the shape; found {shape!r}, and {', '.join(names)} in the truth"
-        )
+        raise ValueError(f"shape must be one of {', '.join(names)}; found {shape!r}")
     return names.index(shape)
 
 
@@ -443,7 +438,7 @@ def _random_directions(rng, n):
 
 
 def _fibonacci(n):
-    """Points spread evenly over the unit sphere along a spiral, n of them."""
+    """Return n points evenly distributed over the unit sphere along a spiral."""
     i = np.arange(n) + 0.5
     z = 1 - 2 * i / n
     angle = np.pi * (1 + np.sqrt(5)) * i  # by the golden section
@@ -452,7 +447,7 @@ def _fibonacci(n):
 
 
 def _delaunay(u):
-    """Delaunay triangles of points of the unit sphere: their convex hull, oriented outwards."""
+    """Triangulate points of the unit sphere by their convex hull, oriented outwards."""
     T = ConvexHull(u).simplices
     inwards = np.einsum("ij,ij->i", np.cross(u[T[:, 0]], u[T[:, 1]]), u[T[:, 2]]) < 0
     T[inwards] = T[inwards][:, ::-1]
@@ -460,21 +455,21 @@ def _delaunay(u):
 
 
 def _sphere(n):
-    """Points ``(n, 3)`` and triangles of the unit sphere."""
+    """Return points ``(n, 3)`` and triangles of the unit sphere."""
     u = _fibonacci(n)
     return u, _delaunay(u)
 
 
 def _mesh(truth, shape, n_vertices, rng):
-    """Reference points and their triangles, the farthest on the shape of five times as many."""
+    """Sample reference points by farthest points on the shape, and triangulate them."""
     if n_vertices < 4:
-        raise ValueError(f"a closed mesh needs n_vertices of 4 or more, found {n_vertices}")
+        raise ValueError(f"n_vertices must be at least 4 for a closed mesh; found {n_vertices}")
     u = _fibonacci(5 * n_vertices) @ Rotation.random(random_state=rng).as_matrix().T
     u = _unit(u + rng.normal(0, 0.3 * np.sqrt(4 * np.pi / len(u)), u.shape))
     x = position(truth, shape, u).astype(np.float32)
     start = int(rng.integers(len(u)))
     if fpsample:
-        h = min(7, int(np.log2(len(u))))  # levels of its tree, whose leaves must not be empty
+        h = min(7, int(np.log2(len(u))))  # levels of the tree; no leaf may be empty
         sample = fpsample.bucket_fps_kdline_sampling(x, n_vertices, h=h, start_idx=start)
     else:
         sample = farthest_samples(x, n_vertices, start)
@@ -483,7 +478,7 @@ def _mesh(truth, shape, n_vertices, rng):
 
 
 def labels(reference_point: ArrayLike) -> np.ndarray:
-    """Labels of reference points: the index in :data:`LABELS` of the nearest seed, 0 where NaN.
+    """Return labels of reference points: indices in :data:`LABELS`, 0 for NaN.
 
     Examples
     --------
@@ -502,24 +497,24 @@ def labels(reference_point: ArrayLike) -> np.ndarray:
 
 
 def _annotate(mesh, truth, shape, reference_point):
-    """The mesh with labels and landmarks."""
-    extra = dataset(
+    """Add labels and landmarks to a mesh."""
+    annotations = dataset(
         label=labels(reference_point),
         landmark_name=truth["landmark_name"].values,
         landmark_position=position(truth, shape, truth["landmark_reference"].values),
     )
-    extra["label"].attrs["names"] = LABELS
-    return in_unit(mesh.merge(extra).assign_attrs(unit="mm", coordinate_system="RAS"), "mm")
+    annotations["label"].attrs["names"] = LABELS
+    return in_unit(mesh.merge(annotations).assign_attrs(unit="mm", coordinate_system="RAS"), "mm")
 
 
 def _raw_brain(truth, shape, n_vertices=40_000, seed=0, *, rng=None):
-    """A brain with the artefacts of ``_soil``, as it could lie in a file.
+    """Return a brain with the artefacts of :func:`_add_artefacts`.
 
     Parameters
     ----------
-    truth, shape : as of :func:`position`
+    truth, shape : as for :func:`position`
     n_vertices : int
-        Before the artefacts are put in.
+        Without the artefacts.
     seed, rng : see :mod:`s4a.seeds`
 
     Returns
@@ -534,7 +529,7 @@ def _raw_brain(truth, shape, n_vertices=40_000, seed=0, *, rng=None):
     >>> import numpy as np
     >>> import s4a
     >>> from s4a.datasets.synthetic import _raw_brain
-    >>> truth = s4a.synthetic.plant(2)
+    >>> truth = s4a.synthetic.simulate(2)
     >>> points, triangles, reference_point = _raw_brain(truth, "brain_01", 500)
     >>> len(points) > 500, bool(np.isnan(reference_point).any())
     (True, True)
@@ -542,11 +537,11 @@ def _raw_brain(truth, shape, n_vertices=40_000, seed=0, *, rng=None):
     seed = seed_of(seed, rng)
     i = _index(truth, shape)
     u, T = _mesh(truth, shape, n_vertices, np.random.default_rng([seed, 1, i]))
-    return _soil(position(truth, shape, u), T, u, np.random.default_rng([seed, 2, i]))
+    return _add_artefacts(position(truth, shape, u), T, u, np.random.default_rng([seed, 2, i]))
 
 
 def _reference_after_cleaning(mesh, raw, reference_point):
-    """Reference points of the cleaned vertices; its neighbours' mean where a vertex was moved."""
+    """Reference points after cleaning; moved vertices get the mean of their neighbours."""
     X, T = as_arrays(mesh)
     file_vertex = mesh["file_vertex"].values
     u = reference_point[file_vertex]
@@ -565,34 +560,38 @@ def brains(
     n_modes: int = 3,
     rng: RNG | None = None,
 ) -> xr.DataTree:
-    """A population of brains with simulated modes and exact correspondences.
+    """Simulate a population of brains with known modes and exact correspondences.
 
     Parameters
     ----------
     n : int
         Number of shapes.
     n_vertices : int
-        Vertices of each, exactly unless `dirty`.  The population does not depend on it.
+        Vertices of each shape, exact unless `dirty`.  The population does not depend on it.
     seed, rng : see :mod:`s4a.seeds`
     dirty : bool
-        Whether the meshes are those of ``_raw_brain``, cleaned; ``/raw/<shape>`` then holds them
-        as they were.
+        Whether to add artefacts of scanner files and clean the meshes; ``/raw/<shape>`` then has
+        the meshes before cleaning.
     n_modes : int
         Number of simulated modes.
 
     Returns
     -------
     DataTree
-        ``/original/<shape>`` and ``/report`` as of ``read_shapes``, with labels and landmarks;
-        ``/truth``, see :func:`plant`; and in ``/truth/<shape>`` the ``reference_point(vertex,
-        xyz)`` of every vertex.  Of the few vertices that cleaning puts on an edge it is that of a
-        point nearby, all others are exact.
+        ``/original/<shape>`` and ``/report`` as from :func:`s4a.read_shapes`, with labels and
+        landmarks; ``/truth``, see :func:`simulate`; and in ``/truth/<shape>`` the
+        ``reference_point(vertex, xyz)`` of every vertex.  It is approximate for the few vertices
+        that cleaning inserts on an edge, and exact for all others.
 
     Notes
     -----
-    Modes slide material along the surface, so that the nearest vertex after a rigid alignment is
-    wrong by 2.5 % of sqrt(area) in the mean over the pairs of 12 shapes; the folds move along, and
-    give the truth away.
+    Modes move material along the surface, so the nearest vertex after rigid alignment has a mean
+    error of 2.5 % of sqrt(area) over the pairs of 12 shapes.  The folds move with the material.
+
+    See Also
+    --------
+    simulate : the parameters alone.
+    position : exact positions of any reference point.
 
     Examples
     --------
@@ -604,14 +603,14 @@ def brains(
     >>> np.abs(exact - mesh["position"]).max().item() < 1e-9
     True
 
-    Four of them:
+    Four brains:
 
     >>> shapes = s4a.synthetic.brains(4, 3000)["original"].children
     >>> s4a.show.charts.surfaces({name: mesh.to_dataset() for name, mesh in shapes.items()})
     <Parts ...>
     """
     seed = seed_of(seed, rng)
-    truth = plant(n, seed, n_modes=n_modes)
+    truth = simulate(n, seed, n_modes=n_modes)
     raw = {}
     for i, shape in enumerate(truth["shape"].values.tolist()):
         if dirty:
@@ -632,20 +631,21 @@ def brains(
 
 
 def write(tree: xr.DataTree, folder: Path | str) -> list[Path]:
-    """Write a collection as files: ``<shape>.ply`` with labels, and ``truth.nc``.
+    """Write a collection to files: ``<shape>.ply`` with labels, and ``truth.nc``.
 
     Parameters
     ----------
     tree : DataTree
-        Of :func:`brains`; the raw meshes are written where it has them.
+        From :func:`brains`; the raw meshes are written if there are any.
     folder : path
-        Made where it is missing.
+        Created if missing.
 
     Returns
     -------
     list of Path
-        The PLY files.  ``xarray.open_datatree("truth.nc")`` is the truth for :func:`position`, with
-        each file's ``reference_point`` in the order of its vertices, and its landmarks.
+        The PLY files.  ``xarray.open_datatree("truth.nc")`` is the ground truth for
+        :func:`position`, with the ``reference_point`` of each file in the order of its vertices,
+        and its landmarks.
 
     Examples
     --------
@@ -675,12 +675,12 @@ def write(tree: xr.DataTree, folder: Path | str) -> list[Path]:
 
 
 def example_study() -> xr.DataTree:
-    """A small study to try things on: six brains of 200 vertices and their three modes.
+    """Analyse a small collection for examples: six brains of 200 vertices, three modes.
 
     Returns
     -------
     DataTree
-        As of ``s4a.analyse``, in memory, made in two to four seconds; the same every time.
+        As from :func:`s4a.analyse`, in memory; the same in every call.
 
     Examples
     --------
@@ -693,7 +693,7 @@ def example_study() -> xr.DataTree:
 
 
 def sphere(n_vertices: int = 2562, radius: float = 1.0) -> xr.Dataset:
-    """A sphere with vertices along a Fibonacci spiral, triangles nearly equilateral.
+    """Return a sphere with vertices along a Fibonacci spiral and nearly equilateral triangles.
 
     Examples
     --------
@@ -707,7 +707,7 @@ def sphere(n_vertices: int = 2562, radius: float = 1.0) -> xr.Dataset:
 def ellipsoid(
     n_vertices: int = 2562, semi_axes: tuple[float, float, float] = (3.0, 2.0, 1.0)
 ) -> xr.Dataset:
-    """An ellipsoid, the affine image of :func:`sphere`.
+    """Return an ellipsoid, the affine image of :func:`sphere`.
 
     Examples
     --------
@@ -722,15 +722,15 @@ def ellipsoid(
 def torus(
     n_around: int = 72, n_across: int = 36, radius: float = 3.0, thickness: float = 1.0
 ) -> xr.Dataset:
-    """A torus around the z axis: a grid of `n_around` by `n_across` vertices.
+    """Return a torus around the z axis with a grid of `n_around` by `n_across` vertices.
 
-    Area 4 pi^2 radius thickness.
+    Its area is 4 pi^2 radius thickness.
 
     Parameters
     ----------
     n_around, n_across : int
     radius, thickness : float
-        Of the circle in the middle of the tube, and of the tube.
+        Radii of the centre line and of the tube.
 
     Examples
     --------

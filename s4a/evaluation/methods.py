@@ -44,7 +44,7 @@ OUR_METHODS = ("RE-MATCH refined", "registered", "registered surface")
 METHODS = (*PAPER_METHODS, *OUR_METHODS)
 # the shape of Spaces whose functions a method compares; registration begins with RE-MATCH's match
 KINDS = {"ZO": "dense", "FMAP+ZO": "dense", "SCALABLE": "local", "RE-MATCH": "coarse"}
-KINDS |= {"RE-MATCH refined": "lifted", "registered": "coarse", "registered surface": "coarse"}
+KINDS |= {"RE-MATCH refined": "refined", "registered": "coarse", "registered surface": "coarse"}
 # of Fig. 3
 BLOCKS = ("load and clean", "align", "sample", "basis", "map", "refine", "full resolution")
 N_SAMPLES = 3000  # points of each shape by which it is aligned, and that group dense searches
@@ -136,11 +136,11 @@ class Spaces:
         return Shape(self.mesh, self.clock("coarse basis", spectrum, self.sampled, k=self.k))
 
     @cached_property
-    def with_refined_eigenfunctions(self) -> Shape:
+    def refined(self) -> Shape:
         """The low-resolution mesh with functions that were brought to all vertices and back."""
-        return Shape(self.mesh, self.clock("lifted basis", self._lifted))
+        return Shape(self.mesh, self.clock("refined basis", self._refined))
 
-    def _lifted(self):
+    def _refined(self):
         return with_refined_eigenfunctions(
             self.mesh, spectrum(self.sampled, k=self.k + SPARE), self.k
         )
@@ -221,7 +221,7 @@ class Pair:
     def run(self, method: str) -> Outcome:
         """A method of :data:`METHODS`."""
         clock = Clock()
-        remeshed = KINDS.get(method) in ("coarse", "lifted")
+        remeshed = KINDS.get(method) in ("coarse", "refined")
         transform, landmarks, align_seconds = (
             self.align_remeshed if remeshed else self.align_samples
         )
@@ -289,7 +289,7 @@ class Pair:
         k = min(self.k, M.low.k, N.low.k)
         k_init = min(self.k_init, k)
         kind = KINDS[method]
-        parts = ("remeshed", kind) if kind in ("coarse", "lifted") else (kind,)
+        parts = ("remeshed", kind) if kind in ("coarse", "refined") else (kind,)
         for block in ("sample", "basis"):
             for end in (self.source, self.target):
                 clock[block] += sum(end.clock.get(f"{part} {block}", 0.0) for part in parts)
@@ -311,11 +311,11 @@ class Pair:
             "local": nearest_rows,
             "coarse": nearest_rows,
             # other searches follow, so that near ties do not matter
-            "lifted": lambda Q, D: nearest_float32(as_queries(Q), as_candidates(D)),
+            "refined": lambda Q, D: nearest_float32(as_queries(Q), as_candidates(D)),
         }[kind]
         first, options = C, {"step": self.step, "nearest": nearest}
         C, low_match = clock("refine", fmap.zoomout, M.low, N.low, C, k, **options)
-        if kind == "lifted":
+        if kind == "refined":
             for _ in range(self.full_resolution_iterations):
                 C = clock("refine", refine_at_full_resolution, M, N, C, M.full.Phi)
         F = clock("full resolution", functions_at_all_vertices, M, C)

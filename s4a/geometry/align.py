@@ -1,6 +1,6 @@
-"""Rigid alignment by iterative closest points (4.1, step 2), and spread points.
+"""Rigid alignment by iterative closest points (4.1, step 2) and farthest-point sampling.
 
-A transform ``R, t`` carries x to R x + t, rows of X to ``X @ R.T + t``.
+A transform ``R, t`` maps x to R x + t, rows of X to ``X @ R.T + t``.
 """
 
 import itertools
@@ -15,31 +15,32 @@ from s4a.geometry.compiled import fpsample
 from s4a.schema import Array
 
 RigidTransform = tuple[Array, Array]  # R (3, 3), t (3,)
-End = tuple[Array, Array, float]  # of an ICP: R, t and the residual
+IcpResult = tuple[Array, Array, float]  # R, t and the residual
 
-ROUGH = 2e-5  # tolerance where few points are paired, or ends are only compared: twice icp's own
-N_POINTS = 300  # spread vertices of each shape by which starts are compared
+ROUGH = 2e-5  # tolerance for few points, or for results that are only compared: twice the default
+N_POINTS = 300  # farthest-point samples of each shape used to compare initialisations
 CLEARLY, PREFER = 0.98, 0.9  # see align
 TRIM = 0.1
-TILT = 15.0  # degrees, tried both ways
-residual_of = itemgetter(2)  # the residual of an ICP's end
+TILT = 15.0  # degrees, in both directions
+residual_of = itemgetter(2)  # the residual of an ICP result
 
 
 class Cloud(NamedTuple):
-    """The vertices of a shape as ICP takes them; see :func:`cloud`."""
+    """Vertices of a shape prepared for ICP; see :func:`cloud`."""
 
     X: Array  # (n, 3)
     area: Array  # (n,)
     tree: cKDTree  # of all vertices
-    paired: Array  # indices of those that are paired with the other shape's nearest
+    paired: Array  # indices of the vertices paired with their nearest neighbours
 
 
 def rigid_transform(
     P: Array, Q: Array, weight: Array | None = None, *, scale: bool = False
 ) -> tuple[Array, Array, float]:
-    """Return s R x + t that maps points P to Q with least (weighted) squared error.
+    """Fit s R x + t that maps points P to Q with least (weighted) squared error.
 
-    Kabsch's solution by the SVD of the cross-covariance; with ``scale=True`` Umeyama's (1991).
+    The solution of Kabsch by the SVD of the cross-covariance, or with ``scale=True`` that of
+    Umeyama.
 
     Parameters
     ----------
@@ -47,13 +48,18 @@ def rigid_transform(
         Corresponding points.
     weight : float ndarray (n,), optional
     scale : bool
-        Whether a uniform scale is fitted as well.
+        Whether to fit a uniform scale as well.
 
     Returns
     -------
     R : (3, 3) proper rotation
     t : (3,)
     s : float, 1.0 without `scale`
+
+    References
+    ----------
+    S. Umeyama (1991), Least-squares estimation of transformation parameters between two point
+    patterns, IEEE TPAMI 13(4).
 
     Examples
     --------
@@ -75,10 +81,10 @@ def rigid_transform(
 
 
 def farthest_points(P: Array, k: int) -> Array:
-    """Indices of k points, each as far as possible from those before it (Euclidean).
+    """Return indices of k farthest-point samples (Euclidean).
 
-    The first is the point farthest from the mean, so that the choice follows the shape and not its
-    numbering.  Where there are no more than k points, all are given in their own order.
+    The first sample is the point farthest from the mean, so the samples do not depend on the
+    numbering.  If there are at most k points, all are returned in their order.
 
     Parameters
     ----------
@@ -106,7 +112,7 @@ def farthest_points(P: Array, k: int) -> Array:
 
 
 def farthest_samples(P: Array, k: int, start: int) -> Array:
-    """Farthest points from the point `start` on, by comparing all; fewer where points coincide.
+    """Farthest-point samples from the point `start`, by brute force; fewer if points coincide.
 
     Parameters
     ----------
@@ -121,32 +127,36 @@ def farthest_samples(P: Array, k: int, start: int) -> Array:
     [0, 2, 1]
     """
     columns = np.ascontiguousarray(P.T, float)
-    sample, gap = [start], np.full(len(P), np.inf)
+    sample, distance2 = [start], np.full(len(P), np.inf)
     while True:
-        way = columns - columns[:, sample[-1:]]
-        np.minimum(gap, (way * way).sum(0), out=gap)
-        if len(sample) >= k or gap.max() == 0:
+        offset = columns - columns[:, sample[-1:]]
+        np.minimum(distance2, (offset * offset).sum(0), out=distance2)
+        if len(sample) >= k or distance2.max() == 0:
             break
-        sample.append(int(gap.argmax()))
+        sample.append(int(distance2.argmax()))
     return np.array(sample, np.int64)
 
 
 def many_farthest_points(P: Array, k: int, *, center: Array, seed: int = 0) -> Array:
-    """:func:`farthest_points` for thousands of points, by buckets; near ties may fall otherwise.
+    """Farthest-point samples of many points, by buckets; near ties may differ.
 
     Parameters
     ----------
     P : float ndarray (n, d)
     k : int
     center : float ndarray (d,)
-        The first point is the farthest from it.
+        The first sample is the point farthest from it.
     seed : int
-        Another seed starts elsewhere, near the seed-th farthest point.
+        Another seed starts near the seed-th farthest point.
 
     Returns
     -------
     int ndarray (k,)
-        In the order of sampling; fewer where the points are fewer, or coincide.
+        In the order of sampling; fewer if there are fewer points, or points coincide.
+
+    See Also
+    --------
+    farthest_points : exact, for smaller sets.
     """
     if k >= len(P):
         return np.arange(len(P))
@@ -159,21 +169,22 @@ def many_farthest_points(P: Array, k: int, *, center: Array, seed: int = 0) -> A
             opposite = P[np.argsort(-radius, kind="stable")[seed % len(P)]]
             radius = np.linalg.norm(P + opposite, axis=1)
         return farthest_samples(P, k, int(radius.argmax()))
-    # fpsample starts at a place in a tree of its own.  So a beacon is added, far away in one more
-    # dimension; it may be taken again when all others coincide with samples, but goes in any case.
-    beacon = np.zeros((1, P.shape[1] + 1))
-    beacon[0, -1] = -8 * radius.max() - 1
+    # fpsample starts at a node of its own tree.  So a first point is added, far away in an
+    # additional dimension; it may be sampled again when all others coincide with samples, and is
+    # removed.
+    extra = np.zeros((1, P.shape[1] + 1))
+    extra[0, -1] = -8 * radius.max() - 1
     if seed:
-        beacon[0, :-1] = -P[np.argsort(-radius, kind="stable")[seed % len(P)]]
-    points = np.concatenate([beacon, np.c_[P, np.zeros(len(P))]])  # (n + 1, d + 1)
-    height = min(7, int(np.log2(len(points))))  # of the tree; every leaf needs a point
+        extra[0, :-1] = -P[np.argsort(-radius, kind="stable")[seed % len(P)]]
+    points = np.concatenate([extra, np.c_[P, np.zeros(len(P))]])  # (n + 1, d + 1)
+    height = min(7, int(np.log2(len(points))))  # of the tree; each leaf needs a point
     sample = fpsample.bucket_fps_kdline_sampling(points, k + 1, h=height, start_idx=0)
     _, first = np.unique(sample, return_index=True)
     return sample[np.sort(first)][1:].astype(np.int64) - 1
 
 
 def principal_axes(X: Array, area: Array) -> tuple[Array, Array]:
-    """Centroid and principal axes of an area-weighted point set.
+    """Return centroid and principal axes of an area-weighted point set.
 
     Returns
     -------
@@ -189,13 +200,13 @@ def principal_axes(X: Array, area: Array) -> tuple[Array, Array]:
 
 
 def cloud(X: Array, area: Array, n_points: int | None = None) -> Cloud:
-    """A shape's vertices and areas for ICP, which pairs `n_points` spread ones of it (or all)."""
+    """Prepare vertices and areas for ICP, which pairs `n_points` samples of them (or all)."""
     paired = np.arange(len(X)) if n_points is None else farthest_points(X, n_points)
     return Cloud(X, area, cKDTree(X), paired)
 
 
-def icp(source: Cloud, target: Cloud, R: Array, t: Array, **options: Any) -> End:
-    """:func:`icp_each` from one start R x + t."""
+def icp(source: Cloud, target: Cloud, R: Array, t: Array, **options: Any) -> IcpResult:
+    """Run :func:`icp_each` from one initial transform R x + t."""
     return icp_each(source, target, [(R, t)], **options)[0]
 
 
@@ -206,33 +217,39 @@ def icp_each(
     *,
     iterations: int = 60,
     tolerance: float = 1e-5,
-) -> list[End]:
-    """Iterative closest points (Besl & McKay 1992) from each of some starts: moves the source.
+) -> list[IcpResult]:
+    """Trimmed, bidirectional iterative closest points from several initial transforms.
 
-    Each round pairs vertices of the source with the nearest of all of the target and vertices of
-    the target with the nearest of all of the source, leaves out the farthest ``TRIM`` of the pairs,
-    and solves for the transform, weighted by area.  Starts that still move are looked up together.
+    Each iteration pairs vertices of the source with the nearest of the target and vertices of the
+    target with the nearest of the source, drops the farthest ``TRIM`` of the pairs, and solves for
+    the transform of the source, weighted by area.  Neighbours of all initialisations that have not
+    converged are queried together.
 
     Parameters
     ----------
     source, target : Cloud
     starts : list of tuple (R, t)
-        R x + t.
+        Initial transforms R x + t.
     iterations : int
         At least 1.
     tolerance : float
-        The end comes when the residual falls by less, as a share of sqrt(area of the source).
+        Stop when the residual decreases by less, as a share of sqrt(area of the source).
 
     Returns
     -------
     list of tuple (R, t, residual)
-        The transform R x + t, and the trimmed root mean square distance of the pairs, both ways.
+        The transform R x + t, and the trimmed root mean square distance of the pairs in both
+        directions.
+
+    References
+    ----------
+    P. Besl and N. McKay (1992), A method for registration of 3-D shapes, IEEE TPAMI 14(2).
     """
     X, Y = source.X[source.paired], target.X[target.paired]
     area, area_y = source.area[source.paired], target.area[target.paired]
     weight = np.concatenate([area / area.sum(), area_y / area_y.sum()])
     least = tolerance * np.sqrt(source.area.sum())
-    ends: list[End] = [(R, t, np.inf) for R, t in starts]
+    ends: list[IcpResult] = [(R, t, np.inf) for R, t in starts]
     moving = list(range(len(ends)))
     for _ in range(iterations):
         forth = _nearest(target, [X @ R.T + t for R, t, _ in (ends[i] for i in moving)])
@@ -243,10 +260,10 @@ def icp_each(
         ):
             P = np.concatenate([X, source.X[here]])  # (pairs, 3)
             Q = np.concatenate([target.X[there], Y])
-            gap = np.concatenate([forth_distance, back_distance])
-            # two that are each other's nearest stay or go together, whatever the rounding
-            keep = gap <= (1 + 1e-9) * np.quantile(gap, 1 - TRIM)
-            residual = float(np.sqrt(weight[keep] @ gap[keep] ** 2 / weight[keep].sum()))
+            distance = np.concatenate([forth_distance, back_distance])
+            # mutual nearest neighbours are kept or dropped together, whatever the rounding
+            keep = distance <= (1 + 1e-9) * np.quantile(distance, 1 - TRIM)
+            residual = float(np.sqrt(weight[keep] @ distance[keep] ** 2 / weight[keep].sum()))
             R, t, _ = rigid_transform(P[keep], Q[keep], weight[keep])
             if ends[i][2] - residual >= least:
                 moving.append(i)
@@ -256,24 +273,25 @@ def icp_each(
     return ends
 
 
-def _nearest(shape, places):
-    """The nearest vertices of a cloud and their distances, for each of some arrays (p, 3)."""
-    gap, nearest = shape.tree.query(np.concatenate(places))
-    each = (len(places), -1)
-    return zip(nearest.reshape(each), gap.reshape(each), strict=True)
+def _nearest(shape, points):
+    """Nearest vertices of a cloud and their distances, for each array (p, 3) of a list."""
+    distance, nearest = shape.tree.query(np.concatenate(points))
+    each = (len(points), -1)
+    return zip(nearest.reshape(each), distance.reshape(each), strict=True)
 
 
-def _try_tilts(source: Cloud, target: Cloud, start: End) -> End:
-    """ICP again from its end tilted about each axis of the target, as long as that ends nearer.
+def _try_tilts(source: Cloud, target: Cloud, start: IcpResult) -> IcpResult:
+    """Repeat ICP from its result tilted about each principal axis, as long as it improves.
 
-    ICP alone ends wherever no pair changes: on folded surfaces up to 20 degrees from the best
-    rotation.  The axes are the principal ones, so that the end does not depend on how both lie.
+    ICP alone stops when no pair changes: on folded surfaces up to 20 degrees from the best
+    rotation. With the principal axes of the target the result does not depend on the poses of the
+    files.
 
     Parameters
     ----------
     source, target : Cloud
     start : tuple (R, t, residual)
-        The end of an ICP.
+        Result of an ICP.
 
     Returns
     -------
@@ -289,7 +307,7 @@ def _try_tilts(source: Cloud, target: Cloud, start: End) -> End:
     best = start
     for _ in range(5):
         R, t, residual = best
-        middle = R @ center + t  # the tilts turn X about where its centre has come to lie
+        middle = R @ center + t  # the tilts rotate X about its moved centre
         starts = [(tilt @ R, tilt @ (t - middle) + middle) for tilt in tilts]
         end = min(icp_each(source, target, starts, tolerance=ROUGH), key=residual_of)
         if residual_of(end) > 0.999 * residual:
@@ -298,17 +316,17 @@ def _try_tilts(source: Cloud, target: Cloud, start: End) -> End:
     return best
 
 
-def align(X: Array, area: Array, Y: Array, area_y: Array) -> End:
+def align(X: Array, area: Array, Y: Array, area_y: Array) -> IcpResult:
     """Rigid transform of X onto Y by ICP from several initial rotations.
 
-    The starts are compared by pairing ``N_POINTS`` spread vertices of each shape.  Two go on,
-    tilted: of the four turns that align principal axes, the best that ends within 90 degrees of
-    where the pose as given (centred) ends, and the best of the others.  The former is kept unless
-    the latter ends below ``PREFER`` times its residual: near-symmetric shapes would otherwise be
-    turned over by noise.  The pose as given takes its place only where that ends below ``CLEARLY``
-    times its residual, as with shapes whose principal axes mean little; so the end does not depend
-    on how the shapes were turned, as long as they lie within about 90 degrees of each other.  What
-    is kept is then refined on all vertices.
+    The initialisations are compared with ``N_POINTS`` samples of each shape.  Two are refined with
+    tilts: of the four rotations that align principal axes, the best result within 90 degrees of the
+    result from the pose as given (centred), and the best of the others.  The former is kept unless
+    the residual of the latter is below ``PREFER`` times its own, since noise would otherwise flip
+    nearly symmetric shapes.  The pose as given replaces it only if the residual is below
+    ``CLEARLY`` times its own, as for shapes with ambiguous principal axes.  So the result does not
+    depend on the rotation of the files, if they lie within about 90 degrees of each other.  The
+    final result is refined on all vertices.
 
     Parameters
     ----------
@@ -319,19 +337,24 @@ def align(X: Array, area: Array, Y: Array, area_y: Array) -> End:
 
     Returns
     -------
-    R, t, residual : as of :func:`icp_each`
+    R, t, residual : as for :func:`icp_each`
+
+    See Also
+    --------
+    icp : ICP from one initial transform.
+    rigid_transform : least-squares transform of corresponding points.
     """
     center, A = principal_axes(X, area)
     center_y, B = principal_axes(Y, area_y)
     flips = [np.diag(d) for d in itertools.product((1, -1), repeat=3) if np.prod(d) == 1]
-    turns = [np.eye(3)] + [B @ flip @ A.T for flip in flips]
-    starts = [(R, center_y - R @ center) for R in turns]
+    rotations = [np.eye(3)] + [B @ flip @ A.T for flip in flips]
+    starts = [(R, center_y - R @ center) for R in rotations]
     source, target = cloud(X, area, N_POINTS), cloud(Y, area_y, N_POINTS)
-    posed, *turned = icp_each(source, target, starts, tolerance=ROUGH)
+    posed, *rotated = icp_each(source, target, starts, tolerance=ROUGH)
     # the trace of a rotation is 1 + 2 cos(angle): 1 at 90 degrees
-    as_posed = [np.trace(R.T @ posed[0]) >= 1 for R, _, _ in turned]
+    as_posed = [np.trace(R.T @ posed[0]) >= 1 for R, _, _ in rotated]
     upright, upside_down = (
-        list(itertools.compress(turned, side)) for side in (as_posed, np.invert(as_posed))
+        list(itertools.compress(rotated, side)) for side in (as_posed, np.invert(as_posed))
     )
     best, other = (
         _try_tilts(source, target, min(ends, key=residual_of)) if ends else None
@@ -346,13 +369,13 @@ def align(X: Array, area: Array, Y: Array, area_y: Array) -> End:
 
 
 def realign(source: Cloud, target: Cloud, start: RigidTransform) -> RigidTransform:
-    """Rigid transform (R, t) of the source onto the target by ICP from a start (R, t) near it."""
+    """Rigid transform (R, t) of the source onto the target by ICP from a close one."""
     R, t, _ = icp(source, target, *start, tolerance=ROUGH)
     return R, t
 
 
 def relative_transform(source: RigidTransform, target: RigidTransform) -> RigidTransform:
-    """The transform source -> target from the transforms (R, t) of both onto a common reference.
+    """Return the transform source -> target from those of the two onto a common reference.
 
     Examples
     --------

@@ -1,14 +1,14 @@
-"""Compiled packages that a kernel in the browser lacks: each is imported here and nowhere else.
+"""Compiled packages that a kernel in the browser lacks, imported only here.
 
-``from s4a.geometry.compiled import igl`` is the package, or where it cannot be imported a
-:class:`Missing` one, which is false and says what to do when something is asked of it. Small steps
-have a second way in NumPy (``if igl: ...``); the results of both agree up to ties and rounding.
+``from s4a.geometry.compiled import igl`` gives the package or, if it cannot be imported, a falsy
+:class:`Missing` that raises ImportError with a remedy on use.  Small steps have an alternative in
+NumPy (``if igl: ...``); both give the same results up to ties and rounding.
 """
 
 from importlib import import_module
 from typing import Any
 
-# name of the module -> the name to install, what is imported
+# name of the module -> name to install, modules to import
 PACKAGES = {
     "fpsample": ("fpsample", ("fpsample",)),
     "igl": ("libigl", ("igl", "igl.predicates")),
@@ -18,12 +18,12 @@ PACKAGES = {
 
 
 class Missing:
-    """What stands for a package that cannot be imported.
+    """Placeholder for a package that cannot be imported.
 
     Parameters
     ----------
     name : str
-        By which it is installed.
+        Name by which pip installs it.
     error : ImportError
 
     Examples
@@ -47,7 +47,7 @@ class Missing:
         return False
 
     def __getattr__(self, asked: str) -> Any:
-        if asked.startswith("__"):  # copy, pickle and inspect ask for those
+        if asked.startswith("__"):  # requested by copy, pickle and inspect
             raise AttributeError(asked)
         raise ImportError(
             f"{asked} needs the package {self._name}, which cannot be imported here "
@@ -57,7 +57,7 @@ class Missing:
 
 
 def __getattr__(name: str) -> Any:
-    """A package, imported when it is first asked for."""
+    """Import a package on first use."""
     if name not in PACKAGES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     install, modules = PACKAGES[name]

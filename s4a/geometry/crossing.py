@@ -1,7 +1,7 @@
-"""Triangles of a surface that pass through others (3.1: a surface embedded in space has none).
+"""Self-intersections of a surface (3.1: an embedded surface has none).
 
-Which pairs meet is decided with exact predicates (Shewchuk 1997, in libigl), so that neither the
-unit nor rounding matters.
+Exact predicates (Shewchuk 1997, in libigl) decide which triangles intersect, so neither the unit
+nor rounding matters.
 """
 
 import logging
@@ -14,44 +14,43 @@ from s4a.schema import Array
 
 log = logging.getLogger(__name__)
 
-# Pairs that cross are held at once, 40 bytes each: of a surface crumpled into a ball they are all
+# intersecting pairs are in memory together, 40 bytes each
 _MOST_PAIRS = 10_000_000
-N_PROBED, N_BESIDE = 200, 5000  # triangles whose boxes are compared to foresee how many there are
+N_PROBED, N_OTHERS = 200, 5000  # triangles whose boxes are compared to estimate the number
 
 
 def count_crossing(X: Array, T: Array, *, most_pairs: int = _MOST_PAIRS) -> int:
-    """How many triangles pass through another, or touch one that has no corner in common with it.
+    """Return the number of triangles that intersect another without a common corner.
 
-    Corners at the same place are one, as where a surface that is not manifold was cut into sheets:
-    these touch there and do not cross.
+    Corners at the same position count as one, so that components of a non-manifold surface that
+    was cut open touch and do not intersect.
 
     Parameters
     ----------
     X : float ndarray (n, 3)
     T : int ndarray (m, 3)
     most_pairs : int
-        Where more pairs of boxes overlap, the triangles of a sample speak for all, without those
-        that cross nothing but triangles with which they have a corner in common: it is no more than
-        a lower bound then, of what is far above any number that matters.
+        If more pairs of boxes overlap, the number is estimated from a sample of triangles.  The
+        estimate is a lower bound, as it leaves out intersections of triangles with a common corner.
 
     Examples
     --------
-    A triangle through another, and one beside them:
+    A triangle through another, and one next to them:
 
     >>> import numpy as np
     >>> from s4a.geometry.crossing import count_crossing
     >>> X = np.array([[0, 0, 0], [4, 0, 0], [0, 4, 0], [1, 1, -1], [1, 1, 1], [3, 3, 1.0]])
-    >>> beside = X[:3] + [9, 0, 0]
-    >>> count_crossing(np.concatenate([X, beside]), np.arange(9).reshape(3, 3))
+    >>> other = X[:3] + [9, 0, 0]
+    >>> count_crossing(np.concatenate([X, other]), np.arange(9).reshape(3, 3))
     2
     """
     if len(T) == 0:
         return 0
     X = np.asarray(X, np.float64)
-    first, place = equal_rows(X)
+    first, group = equal_rows(X)
     X = np.ascontiguousarray(X[first])
-    T = np.ascontiguousarray(place[T], np.int64)
-    T = T[order_in_space(X[T].mean(1))]  # in no order at all the search takes three times as long
+    T = np.ascontiguousarray(group[T], np.int64)
+    T = T[order_in_space(X[T].mean(1))]  # without this order the search takes three times as long
     expected = expected_pairs(X, T)
     if expected <= most_pairs:
         _, pair, _ = igl.predicates.find_self_intersections(X, T)
@@ -59,12 +58,12 @@ def count_crossing(X: Array, T: Array, *, most_pairs: int = _MOST_PAIRS) -> int:
     sample = evenly(len(T), max(10, int(len(T) * most_pairs / (2 * expected))))
     some = np.ascontiguousarray(T[sample])
     _, pair, _ = igl.predicates.find_intersections(X, some, X, T)
-    apart = (some[pair[:, 0], :, None] != T[pair[:, 1], None, :]).all((1, 2))
-    return round(len(np.unique(pair[apart, 0])) / len(sample) * len(T))
+    disjoint = (some[pair[:, 0], :, None] != T[pair[:, 1], None, :]).all((1, 2))
+    return round(len(np.unique(pair[disjoint, 0])) / len(sample) * len(T))
 
 
 def can_count(asked: bool) -> bool:
-    """Return `asked`, or False with a warning where libigl is missing.
+    """Return `asked`, or False with a warning if libigl is missing.
 
     Examples
     --------
@@ -73,14 +72,14 @@ def can_count(asked: bool) -> bool:
     (True, False)
     """
     if asked and not igl:
-        log.warning("self-intersections are not counted, as libigl cannot be imported here")
+        log.warning("self-intersections are not counted because libigl cannot be imported")
         return False
     return asked
 
 
 def expected_pairs(X: Array, T: Array) -> float:
-    """About how many pairs of triangles have boxes that overlap, from some beside some others."""
-    some, others = evenly(len(T), N_PROBED), evenly(len(T), N_BESIDE)
+    """Estimate the number of pairs of triangles with overlapping boxes, from samples."""
+    some, others = evenly(len(T), N_PROBED), evenly(len(T), N_OTHERS)
     low, high = X[T[some]].min(1), X[T[some]].max(1)  # (some, 3)
     low_other, high_other = X[T[others]].min(1), X[T[others]].max(1)
     overlap = np.ones((len(some), len(others)), bool)
@@ -92,5 +91,5 @@ def expected_pairs(X: Array, T: Array) -> float:
 
 
 def evenly(n: int, most: int) -> Array:
-    """At most so many of the numbers 0 to n - 1, evenly spread."""
+    """Return at most `most` evenly spaced integers from 0 to n - 1."""
     return np.linspace(0, n - 1, min(n, most)).astype(int)

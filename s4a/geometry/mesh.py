@@ -1,4 +1,4 @@
-"""Discrete surfaces (3.1): a mesh (X, T) as arrays, its areas, normals, edges and cotan weights.
+"""Triangle meshes (3.1): areas, normals, edges and cotangent weights of a mesh (X, T).
 
 X holds the positions of the n vertices ``(n, 3)``, T the corners of the m triangles ``(m, 3)``,
 counter-clockwise as seen from outside.
@@ -18,13 +18,13 @@ from s4a.schema import Array, dataset
 def as_dataset(
     points: Array, triangles: Array, attrs: dict[str, Any] | None = None, **variables: Any
 ) -> xr.Dataset:
-    """A mesh Dataset: ``position(vertex, xyz)``, ``corner_vertex(triangle, corner)``."""
+    """Return a mesh Dataset: ``position(vertex, xyz)``, ``corner_vertex(triangle, corner)``."""
     X, T = np.asarray(points, float), np.asarray(triangles, np.int32)
     return dataset(attrs, position=X, corner_vertex=T, **variables)
 
 
 def as_arrays(mesh: xr.Dataset) -> tuple[Array, Array]:
-    """Positions ``(n, 3)`` float64 and triangles ``(m, 3)`` int32 of a mesh Dataset."""
+    """Return positions ``(n, 3)`` float64 and triangles ``(m, 3)`` int32 of a mesh Dataset."""
     X, T = mesh["position"].values, mesh["corner_vertex"].values
     return (
         X.astype(np.float64, casting="same_kind", copy=False),
@@ -33,27 +33,27 @@ def as_arrays(mesh: xr.Dataset) -> tuple[Array, Array]:
 
 
 def triangle_normals(X: Array, T: Array) -> Array:
-    """Normals of the triangles ``(m, 3)``, as long as twice their area."""
+    """Return normals of the triangles ``(m, 3)``, with twice their area as length."""
     X = np.asarray(X, float)  # products of integers may overflow
     a, b, c = (X.take(corner, axis=0) for corner in T.T)
     ux, uy, uz = (b - a).T
     vx, vy, vz = (c - a).T
-    # written out: np.cross gives the same bits in twice the time
+    # written out: np.cross gives the same bits and takes twice as long
     return np.stack([uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx], axis=1)
 
 
 def triangle_areas(X: Array, T: Array) -> Array:
-    """Areas of the triangles ``(m,)``."""
+    """Return the areas of the triangles ``(m,)``."""
     return 0.5 * np.linalg.norm(triangle_normals(X, T), axis=1)
 
 
 def vertex_areas(X: Array, T: Array) -> Array:
-    """Lumped (barycentric) area of every vertex ``(n,)``: a third of each incident triangle."""
+    """Return lumped (barycentric) vertex areas ``(n,)``: a third of each incident triangle."""
     return np.bincount(T.ravel(), np.repeat(triangle_areas(X, T) / 3, 3), len(X))
 
 
 def normal_sums(X: Array, T: Array) -> Array:
-    """Sums ``(n, 3)`` of :func:`triangle_normals` around each vertex: quadratic in X.
+    """Return sums ``(n, 3)`` of :func:`triangle_normals` around each vertex.
 
     Examples
     --------
@@ -68,21 +68,21 @@ def normal_sums(X: Array, T: Array) -> Array:
 
 
 def vertex_normals(X: Array, T: Array) -> Array:
-    """Unit normals of the vertices ``(n, 3)``, area-weighted; zero where a vertex has no area."""
+    """Return area-weighted unit normals of the vertices ``(n, 3)``; zero without area."""
     N = normal_sums(X, T)
     length = np.linalg.norm(N, axis=1, keepdims=True)
     return N / np.where(length > 0, length, 1)
 
 
-def turned(vectors: Array, start: Array, end: Array) -> Array:
-    """Vectors ``(n, 3)`` after the least rotations that take unit vectors `start` to `end`.
+def rotated(vectors: Array, start: Array, end: Array) -> Array:
+    """Rotate vectors ``(n, 3)`` by the smallest rotations from unit vectors `start` to `end`.
 
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a.geometry.mesh import turned
+    >>> from s4a.geometry.mesh import rotated
     >>> x, y, z = np.eye(3)[:, None]
-    >>> turned(x, x, y).tolist(), turned(z, x, y).tolist()
+    >>> rotated(x, x, y).tolist(), rotated(z, x, y).tolist()
     ([[0.0, 1.0, 0.0]], [[0.0, 0.0, 1.0]])
     """
     # Rodrigues: v cos + (a x v) sin + a (a . v) (1 - cos), with the axis a sin = start x end
@@ -93,12 +93,16 @@ def turned(vectors: Array, start: Array, end: Array) -> Array:
 
 
 def directed_edges(T: Array) -> Array:
-    """The half-edges ``(3 m, 2)`` of the triangles: corners 0-1 of all, then 1-2, then 2-0."""
+    """Return the half-edges ``(3 m, 2)``: corners 0-1 of all triangles, then 1-2, then 2-0."""
     return np.concatenate([T[:, [0, 1]], T[:, [1, 2]], T[:, [2, 0]]])
 
 
 def edges(T: Array) -> Array:
-    """The undirected edges ``(e, 2)``, each once, smaller index first, sorted.
+    """Return the undirected edges ``(e, 2)``, smaller index first, sorted.
+
+    See Also
+    --------
+    unique_edges : also returns the edge of each half-edge and the triangles per edge.
 
     Examples
     --------
@@ -111,7 +115,13 @@ def edges(T: Array) -> Array:
 
 
 def unique_edges(T: Array, n: int | None = None) -> tuple[Array, Array, Array]:
-    """The undirected edges and what belongs to each; n is the number of vertices, if at hand.
+    """Return the undirected edges, the edge of each half-edge and the triangles per edge.
+
+    Parameters
+    ----------
+    T : int ndarray (m, 3)
+    n : int, optional
+        Number of vertices.
 
     Returns
     -------
@@ -120,7 +130,7 @@ def unique_edges(T: Array, n: int | None = None) -> tuple[Array, Array, Array]:
     edge_of : int ndarray (3 m,)
         Row of E of each half-edge, in the order of :func:`directed_edges`.
     count : int ndarray (e,)
-        Triangles at the edge: 2 inside of a manifold, 1 on its boundary.
+        Triangles at the edge: 2 in the interior of a manifold, 1 on its boundary.
     """
     start = np.asarray(T).T.astype(np.int64).ravel()  # as in directed_edges
     end = np.roll(start, -len(T))
@@ -132,15 +142,15 @@ def unique_edges(T: Array, n: int | None = None) -> tuple[Array, Array, Array]:
 
 
 def _check_numbers(key, n):
-    """IndexError unless all are numbers from 0 to n - 1."""
+    """Raise IndexError unless all numbers are from 0 to n - 1."""
     if len(key) and not 0 <= key.min() <= key.max() < n:
         raise IndexError(f"numbers from 0 to {n - 1} needed, found {key.min()} to {key.max()}")
 
 
 def counting_order(key: Array, n: int) -> Array:
-    """The order ``(m,)`` that sorts numbers 0 to n - 1; equal ones stay in their order.
+    """Return the stable order ``(m,)`` that sorts integers from 0 to n - 1.
 
-    In linear time, as a sparse matrix is transposed: 5 ms for 600,000, of which a sort takes 60.
+    Counting sort in linear time, by the transpose of a sparse matrix.
 
     Examples
     --------
@@ -149,16 +159,16 @@ def counting_order(key: Array, n: int) -> Array:
     >>> counting_order(np.array([2, 0, 1, 0]), 3).tolist()
     [1, 3, 2, 0]
     """
-    _check_numbers(key, n)  # what follows would write beside its memory
+    _check_numbers(key, n)  # others would be written outside of the arrays
     m = len(key)
-    one_a_row = sp.csr_matrix((np.ones(m, np.int8), key, np.arange(m + 1)), (m, n))
-    return one_a_row.tocsc().indices.astype(np.int64)
+    indicator = sp.csr_matrix((np.ones(m, np.int8), key, np.arange(m + 1)), (m, n))
+    return indicator.tocsc().indices.astype(np.int64)
 
 
 def order_in_space(X: Array) -> Array:
-    """An order of points in which neighbours mostly follow each other, that of a KD-tree ``(n,)``.
+    """Return an order of points ``(n,)`` in which neighbours mostly follow each other.
 
-    What takes them in this order finds most in the cache, whatever the order of their file.
+    The order is that of the leaves of a KD-tree and makes memory access local.
 
     Examples
     --------
@@ -173,9 +183,9 @@ def order_in_space(X: Array) -> Array:
 
 
 def lexical_order(A: Array) -> Array:
-    """The order of rows ``(n, k)``, the last column first; equal rows stay in their order ``(n,)``.
+    """Return the stable order ``(n,)`` of rows ``(n, k)``, with the last column as first key.
 
-    That of :func:`numpy.lexsort`, which is asked for rows alone whose last columns are equal.
+    Equal to :func:`numpy.lexsort`, which only sorts the rows with equal last columns.
 
     Examples
     --------
@@ -196,14 +206,14 @@ def lexical_order(A: Array) -> Array:
 
 
 def equal_rows(A: Array) -> tuple[Array, Array]:
-    """Which rows of an array ``(n, k)`` are equal; NaN equals nothing.
+    """Group equal rows of an array ``(n, k)``; NaN equals nothing.
 
     Returns
     -------
     first : int ndarray (g,)
-        The first row of each group of equal ones, the groups sorted by the last column first.
+        First row of each group; groups are sorted with the last column as first key.
     group : int ndarray (n,)
-        The group of each row.
+        Group of each row.
 
     Examples
     --------
@@ -227,13 +237,13 @@ def equal_rows(A: Array) -> tuple[Array, Array]:
 
 
 def components(pairs: Array, n: int) -> Array:
-    """Connected component of each of n nodes that the pairs ``(p, 2)`` link, numbered from 0."""
+    """Return the connected component of each of n nodes linked by pairs ``(p, 2)``, from 0."""
     links = sp.coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), (n, n))
     return connected_components(links, directed=False)[1]
 
 
 def edge_graph(X: Array, E: Array) -> sp.csr_matrix:
-    """Lengths of the edges E ``(e, 2)`` as a symmetric matrix ``(n, n)``: Dijkstra's graph."""
+    """Return the lengths of the edges E ``(e, 2)`` as a symmetric sparse matrix ``(n, n)``."""
     i, j = E.T
     length = np.linalg.norm(X[i] - X[j], axis=1)  # (e,)
     least = 1e-12 * (length.max(initial=0) or 1)  # an explicit zero would count as no edge
@@ -242,10 +252,10 @@ def edge_graph(X: Array, E: Array) -> sp.csr_matrix:
 
 
 def path_lengths(G: sp.csr_matrix, start: Array, end: Array, limit: float) -> Array:
-    """Lengths of the shortest paths along edges between pairs of vertices ``(p,)``, cut at `limit`.
+    """Return lengths of shortest edge paths between pairs of vertices ``(p,)``, at most `limit`.
 
-    An edge is the shortest path between its ends.  Of the others short paths are looked for first,
-    and a few starts at a time, so that neither time nor memory grow with the whole surface.
+    An edge is the shortest path between its ends.  For other pairs, short paths are searched first,
+    from a few vertices at a time, so time and memory do not grow with the whole surface.
 
     Parameters
     ----------
@@ -279,7 +289,7 @@ def path_lengths(G: sp.csr_matrix, start: Array, end: Array, limit: float) -> Ar
 
 
 def half_cotangents(X: Array, T: Array) -> Array:
-    """Half the cotangent of the angle opposite to each half-edge ``(3 m,)``.
+    """Return half the cotangent of the angle opposite to each half-edge ``(3 m,)``.
 
     Half-edges are in the order of :func:`directed_edges`.
     """
@@ -297,37 +307,42 @@ def half_cotangents(X: Array, T: Array) -> Array:
 
 
 def cotan_weights(X: Array, T: Array) -> tuple[Array, Array]:
-    """Cotan weights of the edges: half the sum of the cotangents of the opposite angles.
+    """Return cotangent weights: half the sum of the cotangents of the opposite angles.
 
     Returns
     -------
     E : int ndarray (e, 2)
     w : float ndarray (e,)
-        The stiffness matrix has ``-w`` off the diagonal and row sums 0, and L = A^-1 W (Pinkall &
-        Polthier 1993).
+        The stiffness matrix W has ``-w`` off the diagonal and row sums 0, so it is positive
+        semidefinite, and L = A^-1 W.
+
+    References
+    ----------
+    U. Pinkall and K. Polthier (1993), Computing discrete minimal surfaces and their conjugates,
+    Experimental Mathematics 2(1).
     """
     E, edge_of, _ = unique_edges(T, len(X))
     return E, np.bincount(edge_of, half_cotangents(X, T), len(E))
 
 
 def stiffness(E: Array, w: Array, n: int) -> sp.csr_matrix:
-    """Sparse symmetric stiffness matrix W ``(n, n)`` of the edges' weights."""
+    """Return the sparse symmetric stiffness matrix W ``(n, n)`` of edge weights."""
     i, j = E.T
     W = sp.coo_matrix((-np.r_[w, w], (np.r_[i, j], np.r_[j, i])), (n, n)).tocsr()
     return W - sp.diags(np.asarray(W.sum(axis=1)).ravel())
 
 
 def n_used(T: Array) -> int:
-    """How many vertices triangles have."""
+    """Return the number of vertices that triangles use."""
     return int(np.count_nonzero(np.bincount(T.ravel())))
 
 
 def euler_characteristic(T: Array, E: Array | None = None) -> int:
-    """V - E + F over the vertices in use; E the edges, where they are at hand."""
+    """Return V - E + F over the used vertices; E are the edges, if computed before."""
     return n_used(T) - len(edges(T) if E is None else E) + len(T)
 
 
 def volume(X: Array, T: Array) -> float:
-    """Signed enclosed volume; positive when the normals point outwards."""
+    """Return the signed enclosed volume, positive if the normals point outwards."""
     a, b, c = (X.take(corner, axis=0) for corner in T.T)
     return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)

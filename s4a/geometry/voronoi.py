@@ -1,12 +1,12 @@
 """Geodesic Voronoi cells on a surface, and their dual as a manifold mesh (4.1, step 1).
 
-The dual has a vertex for every cell, and a triangle where three cells meet.  It is a manifold when
+The dual has a vertex for every cell and a triangle where three cells meet.  It is a manifold if
 every cell has one boundary, every two neighbouring cells share one border, and no three cells meet
-twice.  Where this fails, samples are added (:func:`refine`); where that would cost too many, as on
-scans full of pin-holes, the surface itself is simplified: tubes about a cell thin are cut
+twice.  Otherwise samples are added (:func:`refine`).  If that needs too many, as on scans with many
+pin-holes, the surface itself is simplified: tubes thinner than a cell are cut
 (:func:`cut_handles`).
 
-A region, a cell or a part is an array with a number for each vertex.
+Regions, cells and components are arrays with a number for each vertex.
 """
 
 from typing import NamedTuple
@@ -29,15 +29,15 @@ class _MeshGraph(NamedTuple):
 
 
 class Voronoi(NamedTuple):
-    """Samples of a surface and what is nearest to each along edges."""
+    """Samples of a surface and their Voronoi cells along edges."""
 
-    sample: Array  # (samples,) vertex that each sample is
+    sample: Array  # (samples,) vertex of each sample
     cell: Array  # (n,) number of each vertex's nearest sample
     distance: Array  # (n,) to that sample
 
 
 class Faults(NamedTuple):
-    """What keeps the dual of cells from being a manifold; see :func:`faults`."""
+    """Obstacles to a manifold dual; see :func:`faults`."""
 
     cell: Array
     pair: Array
@@ -47,20 +47,20 @@ class Faults(NamedTuple):
 
 
 def mesh_graph(X: Array, T: Array) -> _MeshGraph:
-    """The edges of a mesh, which of them are open, and the graph of their lengths."""
+    """Return the edges of a mesh, whether they are open, and the graph of their lengths."""
     E, _, count = unique_edges(T, len(X))
     return _MeshGraph(T, E, count == 1, edge_graph(X, E))
 
 
 def farthest_of_each(group: Array, vertex: Array, distance: Array) -> Array:
-    """The vertex of greatest distance in every group; `group` and `vertex` go side by side."""
+    """Return the vertex of greatest distance in each group; `group` belongs to `vertex`."""
     order = np.lexsort((distance[vertex], group))
     last = np.append(np.diff(group[order]) != 0, True)[: len(order)]
     return vertex[order[last]]
 
 
 def add_samples(G: sp.csr_matrix, new: Array, state: Voronoi) -> Voronoi:
-    """Voronoi cells along edges after new samples: only vertices nearer to one of these change.
+    """Add samples to Voronoi cells along edges; only vertices closer to a new sample change.
 
     Parameters
     ----------
@@ -84,39 +84,39 @@ def add_samples(G: sp.csr_matrix, new: Array, state: Voronoi) -> Voronoi:
 
 
 def voronoi_cells(G: sp.csr_matrix, sample: Array) -> Voronoi:
-    """Voronoi cells of samples, and of one sample more in every component that had none."""
+    """Return Voronoi cells of samples, with a sample added in each component without one."""
     n = G.shape[0]
-    _, part = connected_components(G, directed=False)
-    _, first = np.unique(part, return_index=True)
-    sample = np.union1d(sample, first[~np.isin(part[first], part[sample])])
-    none = Voronoi(np.empty(0, np.int64), np.full(n, -1), np.full(n, np.inf))
-    return add_samples(G, sample, none)
+    _, component = connected_components(G, directed=False)
+    _, first = np.unique(component, return_index=True)
+    sample = np.union1d(sample, first[~np.isin(component[first], component[sample])])
+    empty = Voronoi(np.empty(0, np.int64), np.full(n, -1), np.full(n, np.inf))
+    return add_samples(G, sample, empty)
 
 
 def dual(T: Array, cell: Array) -> Array:
-    """Triangles between cells: one for each triangle of T whose corners lie in three cells."""
+    """Return the dual triangles: one for each triangle with corners in three cells."""
     L = cell[T]
     return L[(L[:, 0] != L[:, 1]) & (L[:, 1] != L[:, 2]) & (L[:, 2] != L[:, 0])]
 
 
 def boundaries(T: Array, region: Array) -> tuple[Array, Array, Array, Array]:
-    """Rims of regions: the closed rows of edges and triangles that lead out of each region.
+    """Return the boundaries of regions: closed strips of edges and triangles that leave them.
 
     Parameters
     ----------
     T : int ndarray (m, 3)
     region : int ndarray (n,)
-        Region of each vertex, -1 outside of all.
+        Region of each vertex, -1 outside of all regions.
 
     Returns
     -------
     triangle, vertex, boundary : int ndarray (r,)
-        Triangles across a boundary, a vertex in it on the region's side, and the number of the
+        Triangles across a boundary, a vertex of each inside the region, and the number of the
         boundary.
     owner : int ndarray
         Region of each boundary.
     """
-    # A boundary goes on through a triangle from one edge (inside, outside) to the next:
+    # A boundary continues through a triangle from one edge (inside, outside) to the next:
     #
     #          i               i inside, j and k outside: from edge (i, j) to edge (i, k)
     #         / \
@@ -129,11 +129,11 @@ def boundaries(T: Array, region: Array) -> tuple[Array, Array, Array, Array]:
     steps = []
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         at_i, at_j, at_k = corners[:, i], corners[:, j], corners[:, k]
-        apart = (L[:, i] != L[:, j]) & (L[:, i] != L[:, k])
-        alone = apart & (L[:, i] >= 0)
-        both = apart & (L[:, j] == L[:, k]) & (L[:, j] >= 0)
+        differs = (L[:, i] != L[:, j]) & (L[:, i] != L[:, k])
+        alone = differs & (L[:, i] >= 0)
+        opposite = differs & (L[:, j] == L[:, k]) & (L[:, j] >= 0)
         steps.append(np.stack([across, at_i * n + at_j, at_i * n + at_k], axis=1)[alone])
-        steps.append(np.stack([across, at_j * n + at_i, at_k * n + at_i], axis=1)[both])
+        steps.append(np.stack([across, at_j * n + at_i, at_k * n + at_i], axis=1)[opposite])
     step = np.concatenate(steps)  # (s, 3): the triangle, the edge before, the edge after
     edge, link = np.unique(step[:, 1:], return_inverse=True)
     boundary = components(link.reshape(-1, 2), len(edge))
@@ -143,11 +143,11 @@ def boundaries(T: Array, region: Array) -> tuple[Array, Array, Array, Array]:
 
 
 def faults(graph: _MeshGraph, cell: Array, n: int, among: Array | None = None) -> Faults:
-    r"""Cells, pairs of cells and triangles that keep the dual from being a manifold.
+    r"""Return cells, pairs of cells and triangles at which the dual is not a manifold.
 
     ::
 
-        a cell of two boundaries      a border in two pieces      a corner that is there twice
+        a cell of two boundaries      a border in two pieces      a corner that occurs twice
          +-------------+             +-----+-----+                 .*.
          |   1         |             |     |     |               / / \ \     1, 2 and 3 cover a
          |    +---+    |             |   +---+   |              | |   | |    ball like the slices
@@ -163,20 +163,19 @@ def faults(graph: _MeshGraph, cell: Array, n: int, among: Array | None = None) -
     n : int
         Number of cells.
     among : bool ndarray (n,), optional
-        Faults in which none of these cells takes part are not looked for, but their neighbours
-        without triangle are.
+        Only faults that involve one of these cells are searched, and neighbours without triangle.
 
     Returns
     -------
     cell : bool ndarray (n,)
-        No disk (V - E + F != 1) with several boundaries, several stretches of boundary, or no
+        Not a disk (V - E + F != 1), with several boundaries, several stretches of boundary, or no
         triangle.
     pair : int ndarray (p, 2)
-        Neighbouring cells whose common border is not one strip: it has not two ends.
+        Neighbouring cells whose common border is not one strip with two ends.
     edge, edge_pair : int ndarray
-        Edges across those borders and the row of `pair` they belong to.
+        Edges across those borders and their row of `pair`.
     triangle : int ndarray
-        Triangles of the mesh whose three cells meet elsewhere, too.
+        Triangles of the mesh whose three cells also meet elsewhere.
     """
     T, E, is_open, _ = graph
     among = np.ones(n, bool) if among is None else among
@@ -190,17 +189,17 @@ def faults(graph: _MeshGraph, cell: Array, n: int, among: Array | None = None) -
 
     bad = _faulty_cells(T_near, ends, is_open, cell, among)
     lone = (np.bincount(ends.ravel(), minlength=n) > 0) & (np.bincount(C.ravel(), minlength=n) == 0)
-    if (lone & ~among).any():  # of neighbours not all triangles were looked at
+    if (lone & ~among).any():  # not all triangles of neighbours were examined
         lone[dual(T, cell)] = False
     pair, across, row = _faulty_borders(ends, is_open, C, among)
     return Faults(bad | lone, pair, edge[across], row, triangle[corner[_is_repeated(C, n)]])
 
 
 def _faulty_cells(T, ends, is_open, cell, among):
-    """Which cells have no boundary, several boundaries, or several stretches of boundary ``(n,)``.
+    """Find cells with no boundary, several boundaries, or several stretches of boundary ``(n,)``.
 
-    Handles and holes inside a single boundary do no harm: they vanish with the cell.  `ends` are
-    the cells at both ends of the edges ``(e, 2)``.
+    Handles and holes inside a single boundary are harmless, as they vanish with the cell.  `ends`
+    are the cells at both ends of the edges ``(e, 2)``.
     """
     n, L = len(among), cell[T]
     inner = ends[:, 0] == ends[:, 1]
@@ -208,16 +207,16 @@ def _faulty_cells(T, ends, is_open, cell, among):
     euler = np.bincount(cell, minlength=n)
     euler -= np.bincount(ends[inner, 0], minlength=n)
     euler += np.bincount(L[whole, 0], minlength=n)
-    suspect = among & (euler != 1)  # only these can have another number of boundaries than one
+    suspect = among & (euler != 1)  # only these can have a number of boundaries other than one
     *_, owner = boundaries(T, np.where(suspect[cell], cell, -1))
     stretch_ends = np.bincount(ends[is_open & ~inner].ravel(), minlength=n)
     return (suspect & (np.bincount(owner, minlength=n) != 1)) | (among & (stretch_ends > 2))
 
 
 def _faulty_borders(ends, is_open, C, among):
-    """Pairs of cells ``(p, 2)`` whose border is not one strip, edges across, and their rows.
+    """Find pairs of cells ``(p, 2)`` whose border is not one strip, edges across, and their rows.
 
-    A strip of edges ends at a corner or at an open edge; a border in one piece has two such ends.
+    A strip of edges ends at a corner or at an open edge; a connected border has two such ends.
     """
     n = len(among)
     across = np.flatnonzero(ends[:, 0] != ends[:, 1])
@@ -233,7 +232,7 @@ def _faulty_borders(ends, is_open, C, among):
 
 
 def _is_repeated(C, n):
-    """Which corners ``(c, 3)`` are of three cells that meet more than once."""
+    """Find corners ``(c, 3)`` whose three cells meet more than once."""
     key = np.sort(C, axis=1) @ [n * n, n, 1]
     _, triple, count = np.unique(key, return_inverse=True, return_counts=True)
     return count[triple] > 1
@@ -242,16 +241,16 @@ def _is_repeated(C, n):
 def refine(
     graph: _MeshGraph, state: Voronoi, most: float, avoid: Array
 ) -> tuple[Voronoi, int, bool]:
-    """Add samples where the dual is no manifold, until it is or there are more than `most`.
+    """Add samples until the dual is a manifold, or there are more than `most`.
 
-    The vertices to avoid are only taken where there are no others.
+    Vertices to `avoid` are only sampled if there are no others.
 
     Returns
     -------
     state : Voronoi
     iterations : int
     faulty : bool
-        Whether faults are left.
+        Whether faults remain.
     """
     changed = np.ones(len(state.sample), bool)
     iterations = 0
@@ -274,7 +273,7 @@ def refine(
         new = farthest_of_each(cell[new], new, distance)  # one in each cell
         state = add_samples(graph.G, new, state)
         moved = state.cell != cell
-        # every fault had a new sample in one of its cells, so others than these have no faults
+        # each fault got a sample in one of its cells, so all other cells have no faults
         changed = np.zeros(len(state.sample), bool)
         changed[cell[moved]] = True
         changed[state.cell[moved]] = True
@@ -282,12 +281,12 @@ def refine(
 
 
 def thin_regions(graph: _MeshGraph, state: Voronoi) -> Array:
-    """Cells that are no disk, and pairs of cells that are none together, as disjoint regions."""
+    """Return cells and pairs of cells that are not disks, as disjoint regions."""
     n = len(state.sample)
     fault = faults(graph, state.cell, n)
     pair = fault.pair[~fault.cell[fault.pair].any(1)]
     number = np.arange(len(pair))
-    first = np.full(n, len(pair))  # pair of lowest number in which a cell takes part
+    first = np.full(n, len(pair))  # first pair that contains the cell
     np.minimum.at(first, pair.ravel(), np.repeat(number, 2))
     pair = pair[(first[pair] == number[:, None]).all(1)]
     region = np.where(fault.cell, np.arange(n), -1)
@@ -296,44 +295,44 @@ def thin_regions(graph: _MeshGraph, state: Voronoi) -> Array:
 
 
 def between_boundaries(G: sp.csr_matrix, T: Array, region: Array) -> Array:
-    """Triangles ``(m,)`` half-way between the boundaries of a region, where a tube is cut."""
+    """Find triangles ``(m,)`` half-way between boundaries of a region, to cut a tube."""
     triangle, vertex, boundary, _ = boundaries(T, region)
     boundary_of = np.full(len(region), -1)
-    boundary_of[vertex[::-1]] = boundary[::-1]  # a vertex in several boundaries goes to the first
+    boundary_of[vertex[::-1]] = boundary[::-1]  # the first of several wins
     inside = np.flatnonzero(region >= 0)
     local = G[inside][:, inside].tocoo()
     same = region[inside[local.row]] == region[inside[local.col]]
     local = sp.csr_matrix((local.data[same], (local.row[same], local.col[same])), local.shape)
     seeds = np.flatnonzero(boundary_of[inside] >= 0)
     _, _, nearest = dijkstra(local, indices=seeds, min_only=True, return_predecessors=True)
-    part = np.full(len(region), -1)  # the boundary that is nearest within the region
-    reached = nearest >= 0  # a piece of a region that no boundary bounds has no nearest one
-    part[inside[reached]] = boundary_of[inside[nearest[reached]]]
-    P, R = part[T], region[T]  # (m, 3)
-    P_next, R_next = part[T[:, [1, 2, 0]]], region[T[:, [1, 2, 0]]]
+    closest = np.full(len(region), -1)  # nearest boundary within the region
+    reached = nearest >= 0  # a component of a region without boundary has no nearest one
+    closest[inside[reached]] = boundary_of[inside[nearest[reached]]]
+    P, R = closest[T], region[T]  # (m, 3)
+    P_next, R_next = closest[T[:, [1, 2, 0]]], region[T[:, [1, 2, 0]]]
     removed = ((R == R_next) & (R >= 0) & (P != P_next)).any(1)
-    removed[triangle[part[vertex] != boundary]] = True
+    removed[triangle[closest[vertex] != boundary]] = True
     return removed
 
 
 def cut_handles(X: Array, T: Array, removed: Array, crumb: float) -> tuple[Array, Array, Array]:
-    """The surface without some triangles, the openings closed by a fan around their centre.
+    """Remove triangles from a surface and close the openings with fans around their centres.
 
-    Vertices where sheets would touch go, too; pieces of less area than `crumb` that come off are
-    dropped, and what would cut off more is not removed.
+    Vertices at which components would touch are removed, too.  Separated components with an area
+    below `crumb` are dropped; triangles whose removal would separate more are kept.
 
     Returns
     -------
     X, T : the new mesh
     origin : int ndarray
-        Vertex of the given mesh that each vertex was, -1 for the centres.
+        Index of each vertex in the given mesh, -1 for the centres.
     """
     n, area = len(X), triangle_areas(X, T)
     E, edge_of, count = unique_edges(T, n)
     component = components(E, n)
 
     def left_at_edge():
-        """How many triangles of each edge are left."""
+        """Return the number of remaining triangles at each edge."""
         return np.bincount(edge_of, np.tile(~removed, 3), len(E)).astype(int)
 
     while removed.any():
@@ -346,10 +345,10 @@ def cut_handles(X: Array, T: Array, removed: Array, crumb: float) -> tuple[Array
         small = part_area < crumb
         small[farthest_of_each(component, part, part_area)] = False  # the largest of a component
         small &= np.isin(np.arange(n), part[T[removed]])
-        gone = removed | small[part[T[:, 0]]]
-        restored = gone & _cuts_apart(T, gone, part)
+        dropped = removed | small[part[T[:, 0]]]
+        restored = dropped & _separates(T, dropped, part)
         if not restored.any():
-            removed = gone
+            removed = dropped
             break
         removed = removed & ~restored
     was_closed = (left_at_edge() == 1) & (count == 2)
@@ -357,17 +356,17 @@ def cut_handles(X: Array, T: Array, removed: Array, crumb: float) -> tuple[Array
     return _close_with_fans(X, T[~removed], directed_edges(T)[opened])
 
 
-def _cuts_apart(T, gone, part):
-    """Triangles ``(m,)`` at holes of the triangles `gone` that touch several parts that stay."""
-    hole = components(directed_edges(T[gone]), len(part))
-    vertex = np.unique(T[gone])
-    vertex = vertex[np.isin(part[vertex], part[T[~gone, 0]])]
+def _separates(T, dropped, part):
+    """Find triangles ``(m,)`` of holes in the removed ones that touch several remaining parts."""
+    hole = components(directed_edges(T[dropped]), len(part))
+    vertex = np.unique(T[dropped])
+    vertex = vertex[np.isin(part[vertex], part[T[~dropped, 0]])]
     touching = np.unique(np.stack([hole[vertex], part[vertex]], axis=1), axis=0)  # (hole, part)
     return (np.bincount(touching[:, 0], minlength=len(part)) > 1)[hole[T[:, 0]]]
 
 
 def _close_with_fans(X, T, half):
-    """The mesh with every loop of the open half-edges ``(h, 2)`` closed by a fan."""
+    """Close each loop of the open half-edges ``(h, 2)`` with a fan."""
     n = len(X)
     corner, link = np.unique(half, return_inverse=True)
     link = link.reshape(-1, 2)

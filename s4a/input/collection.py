@@ -24,7 +24,7 @@ from s4a.input.labels import Label, read_volume
 from s4a.input.plausibility import examine
 from s4a.input.raw import shown
 from s4a.options import check, check_label
-from s4a.schema import dataset, in_unit
+from s4a.schema import check_type, dataset, in_unit, require
 
 # columns of the report
 COUNTS = [
@@ -32,6 +32,7 @@ COUNTS = [
     *"file_vertices file_triangles components holes genus self_intersections".split(),
 ]
 TEXTS = ("status", "reason", "warning", "flag_kinds", "warning_kinds", "path")
+Mesh = Path | str | xr.Dataset  # a file, or a clean mesh
 _AREAS = ("area", "area_dropped")
 
 
@@ -88,6 +89,16 @@ def read_shape(
         reasons = [mesh.attrs.pop("note"), mesh.attrs["reason"]]
         mesh.attrs["reason"] = "; ".join(filter(None, reasons))
     return in_unit(mesh, mesh.attrs.get("unit"))
+
+
+def as_mesh(shape: Mesh, what: str = "mesh") -> xr.Dataset:
+    """Return a mesh that is given as a Dataset, or read and clean its file if a path is given."""
+    if isinstance(shape, str | os.PathLike):
+        return read_shape(shape)
+    expected = "a path or a Dataset, such as s4a.read_shape returns"
+    check_type(shape, xr.Dataset | xr.DataTree, what, expected)
+    require(shape, "position", "corner_vertex", what=what)
+    return shape
 
 
 def read_shapes(

@@ -252,7 +252,13 @@ def was_cut(file: Path, name: str) -> bool:
 
 
 def _listed(paths):
-    return [paths] if isinstance(paths, str | os.PathLike) else list(paths)
+    paths = [paths] if isinstance(paths, str | os.PathLike) else paths
+    if not isinstance(paths, Iterable) or not all(isinstance(p, str | os.PathLike) for p in paths):
+        raise TypeError(
+            "shapes must be a path or a list of paths, a dict of names to paths or meshes, or a "
+            f"DataTree, such as s4a.read_shapes returns; found {type(paths).__name__}"
+        )
+    return list(paths)
 
 
 def _suffixes(volumes):

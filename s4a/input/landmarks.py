@@ -10,7 +10,7 @@ from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays, edge_graph, edges, triangle_areas
 from s4a.input.annotations import MIRROR, read_landmarks
 from s4a.input.raw import shown
-from s4a.schema import dataset, require
+from s4a.schema import check_type, dataset, require
 
 NAMED = ("landmark_name", "landmark_curve", "landmark_closed")
 ITERATIONS = 12  # halvings of a segment of a curve
@@ -18,6 +18,16 @@ ITERATIONS = 12  # halvings of a segment of a curve
 FARTHEST_LANDMARK = 0.03
 # of files that may be named as a shape; the longer before those that they end with
 SUFFIXES = (".landmarks.csv", ".mrk.json", ".json", ".csv", ".pp")
+
+
+def as_landmarks(landmarks: xr.Dataset | Path | str) -> xr.Dataset:
+    """Return landmarks that are given as a Dataset, or read their file if a path is given."""
+    if isinstance(landmarks, str | Path):
+        return read_landmarks(landmarks)
+    read = "a landmark file, or what s4a.input.annotations.read_landmarks returns"
+    check_type(landmarks, xr.Dataset | xr.DataTree, "landmarks", read)
+    require(landmarks, "landmark_name", "landmark_position", what="landmarks")
+    return landmarks
 
 
 def locate(
@@ -49,7 +59,7 @@ def locate(
         When a landmark is not finite or farther from the surface than `farthest`; it names the
         worst.
     """
-    require(landmarks, "landmark_name", "landmark_position", what="landmarks")
+    landmarks = as_landmarks(landmarks)
     require(mesh, "position", "corner_vertex", what="mesh")
     X, T = as_arrays(mesh)
     limit = farthest * np.sqrt(triangle_areas(X, T).sum())
@@ -214,9 +224,8 @@ def with_landmarks(mesh: xr.Dataset, landmarks: xr.Dataset | Path | str) -> xr.D
     >>> s4a.with_landmarks(mesh, top)["guide_name"].values.tolist()
     ['top']
     """
-    given = landmarks if isinstance(landmarks, xr.Dataset) else read_landmarks(landmarks)
+    given = as_landmarks(landmarks)
     where = "landmarks" if isinstance(landmarks, xr.Dataset) else shown(landmarks)
-    require(given, "landmark_name", "landmark_position", what="landmarks")
     if "landmark_curve" in given:
         given = given.isel(landmark=given["landmark_curve"].values == "")
         given = given.drop_vars(["landmark_curve", "landmark_closed"])

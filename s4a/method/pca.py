@@ -13,7 +13,7 @@ import xarray as xr
 
 from s4a.geometry.mesh import vertex_normals
 from s4a.method.deform import normal_displacement, smoother
-from s4a.schema import Array, dataset, in_unit, require, unit_of
+from s4a.schema import Array, check_type, dataset, in_unit, require, unit_of
 
 BLOCK = 2**24  # numbers of all fields in a block of vertices: 128 MiB
 N_READ = 8  # blocks that are read from files at once, in single precision
@@ -297,6 +297,7 @@ def synthesize(study: xr.DataTree, scores: Array) -> xr.Dataset:
     >>> s4a.show.charts.surfaces(along, view="left")
     <Parts ...>
     """
+    check_type(study, xr.DataTree)
     scores = np.atleast_1d(np.asarray(scores, float))
     if "pca" not in study.children:
         reason = study["report"].attrs.get("no_modes") if "report" in study.children else ""

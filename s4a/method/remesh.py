@@ -30,7 +30,8 @@ from s4a.geometry.align import many_farthest_points
 from s4a.geometry.closest import closest_point_in_star
 from s4a.geometry.compiled import robust_laplacian
 from s4a.geometry.mesh import as_arrays, triangle_areas, vertex_areas, vertex_normals
-from s4a.schema import Array, check_count, dataset, require
+from s4a.input.collection import Mesh, as_mesh
+from s4a.schema import Array, check_count, dataset
 from s4a.seeds import RNG, seed_of
 
 GL = "install the system's libgl1 and libopengl0, or see `s4a doctor`"
@@ -262,7 +263,7 @@ def check_clean(X: Array, T: Array) -> dict[str, int]:
 
 
 def coarsen(
-    mesh: xr.Dataset,
+    mesh: Mesh,
     *,
     n_coarse: int = 6000,
     wrap: bool = False,
@@ -344,7 +345,7 @@ def coarsen(
     <Parts ...>
     """
     seed = seed_of(seed, rng)
-    require(mesh, "position", "corner_vertex", what="mesh")
+    mesh = as_mesh(mesh)
     check_count("n_coarse", n_coarse, 4)
     before = check_clean(*as_arrays(mesh))
     attrs: dict[str, int | str] = {

@@ -166,7 +166,7 @@ class Basis:
         if self.surface_normals is None:
             return moved
         R, _, _ = rigid_transform(self.X, X, self.area)
-        return surface.turned(self.surface_normals @ R.T, self.normals @ R.T, moved)
+        return surface.rotated(self.surface_normals @ R.T, self.normals @ R.T, moved)
 
     @cached_property
     def stars(self) -> Stars:

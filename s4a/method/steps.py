@@ -24,7 +24,7 @@ from s4a.method.median import median_shape
 from s4a.method.register import from_latent, identity, match_functions, match_low
 from s4a.method.shape import Basis, Shape
 from s4a.options import DECLARED, N_SAMPLES, check, kept_options
-from s4a.schema import check_count, dataset, require
+from s4a.schema import check_count, check_type, dataset, require
 
 PROJECTION = [name for name, option in DECLARED.items() if option.metadata["of"] == "projection"]
 REGISTRATION = [
@@ -35,10 +35,16 @@ REGISTRATION = [
 LOW = ("position", "corner_vertex", "vertex_area", "eigenvalue", "eigenfunction")
 
 
-def bases_of(coarse: dict[str, xr.Dataset]) -> dict[str, Basis]:
-    """Return the low-resolution meshes of a collection, each in its frame, after a check."""
+def check_coarse(coarse: dict[str, xr.Dataset]) -> None:
+    """Raise an error unless `coarse` has low-resolution meshes with their spectra by name."""
+    check_type(coarse, dict, "coarse")
     for name, mesh in coarse.items():
         require(mesh, *LOW, what=f"coarse mesh {name}")
+
+
+def bases_of(coarse: dict[str, xr.Dataset]) -> dict[str, Basis]:
+    """Return the low-resolution meshes of a collection, each in its frame, after a check."""
+    check_coarse(coarse)
     return {name: Shape(coarse=mesh).low for name, mesh in coarse.items()}
 
 
@@ -334,8 +340,7 @@ def refine_network(
     if n_latent is not None and n_latent > k:
         raise ValueError(f"n_latent must be at most k = {k}; found {n_latent}")
     require(initial, "source", "target", "fmap_initial", what="network")
-    for name, mesh in coarse.items():
-        require(mesh, *LOW, what=f"coarse mesh {name}")
+    check_coarse(coarse)
     bases, names = LazyBases(coarse), list(coarse)
     k = min([k, *(mesh.sizes["eigenpair"] for mesh in coarse.values())])
     source = np.array([names.index(name) for name in initial["source"].values])
@@ -399,6 +404,7 @@ class Study:
     """
 
     def __init__(self, tree: xr.DataTree):
+        check_type(tree, xr.DataTree)
         self.tree = tree
 
     def __contains__(self, node: str) -> bool:
@@ -428,6 +434,7 @@ def basis_in(study: Study, name: str) -> Basis:
 
 def options_of_registration(study: xr.DataTree) -> dict[str, Any]:
     """Return the options of registration that the report of a study names."""
+    check_type(study, xr.DataTree)
     return {name: v for name, v in kept_options(study).items() if name in REGISTRATION}
 
 

@@ -9,6 +9,7 @@ from markupsafe import Markup
 
 from s4a.input.plausibility import decisions, notices
 from s4a.options import kept_options
+from s4a.schema import check_type
 from s4a.show import charts
 from s4a.show.browser import MODES, PARTS, TEMPLATES, look_state, mesh_state, webp_uri
 from s4a.show.draw import SIGNED, Viewpoint, opposite, position_colors, ramp_colors, render
@@ -83,6 +84,7 @@ def study_html(
     up: str = "z",
 ) -> str:
     """The HTML of a study; see :func:`write_page`."""
+    check_type(study, xr.DataTree)
     sections = []
     for heading, needs, section in SECTIONS:
         lacking = [name for name in needs if not has(study, name)]

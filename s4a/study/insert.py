@@ -27,7 +27,7 @@ from s4a.method.register import from_latent
 from s4a.method.shape import Shape
 from s4a.method.steps import Study, latent_bases, out_of_sample_basis_in
 from s4a.options import Options, with_options
-from s4a.schema import dataset, in_unit, require, unit_of, variable
+from s4a.schema import check_type, dataset, in_unit, require, unit_of, variable
 from s4a.study.processes import workers
 from s4a.study.sources import find_sources, guides_of_shape
 from s4a.study.tasks import clean_shape
@@ -122,6 +122,7 @@ def insert(
     >>> s4a.show.charts.scores(score, names, highlight=names.index("brain_04"))
     <Figure ...>
     """
+    check_type(study, xr.DataTree)
     shapes = {"new": shapes} if isinstance(shapes, xr.Dataset) else shapes
     needed = ("original", "coarse", "latent", "registration")
     missing = [name for name in needed if name not in study.children]

@@ -7,19 +7,20 @@ import numpy as np
 import xarray as xr
 from threadpoolctl import threadpool_limits
 
+from s4a.input.collection import Mesh, as_mesh
 from s4a.method import fmap
 from s4a.method.initial_map import initial_map, transform_onto
 from s4a.method.refined_eigenfunctions import low_resolution
 from s4a.method.register import refine_at_full_resolution, register
 from s4a.method.shape import Shape
 from s4a.options import Options, given_options
-from s4a.schema import dataset, require
+from s4a.schema import dataset
 
 log = logging.getLogger(__name__)
 
 
 def match_pair(
-    source: xr.Dataset, target: xr.Dataset, *, preset: str | None = None, **options: Any
+    source: Mesh, target: Mesh, *, preset: str | None = None, **options: Any
 ) -> xr.Dataset:
     """Correspondence of two shapes at full resolution (4.1).
 
@@ -29,9 +30,8 @@ def match_pair(
 
     Parameters
     ----------
-    source, target : xarray.Dataset
-        Clean meshes (``position``, ``corner_vertex``), as of :func:`s4a.read_shapes` or
-        :func:`s4a.clean`.
+    source, target : path or xarray.Dataset
+        Mesh files, or clean meshes, such as :func:`s4a.read_shape` returns.
     preset : {None, "paper", "fast"}
         ``"paper"`` leaves out all that is added to 4.1, ``"fast"`` takes n_coarse=3000.
     **options
@@ -82,10 +82,9 @@ def match_pair(
     <Parts ...>
     """
     settings = given_options({"preset": preset, **options}, pair=True)
-    for mesh, what in ((source, "source"), (target, "target")):
-        require(mesh, "position", "corner_vertex", what=what)
+    meshes = as_mesh(source, "source"), as_mesh(target, "target")
     with threadpool_limits(1):  # products of a pair are small: more threads of BLAS take longer
-        M, N = (shape_of(mesh, settings) for mesh in (source, target))
+        M, N = (shape_of(mesh, settings) for mesh in meshes)
         registration, maps = match_shapes(M, N, settings)
     least = min(M.low.k, N.low.k)
     if least < settings.k:

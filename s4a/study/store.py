@@ -155,9 +155,14 @@ def check_is_study(folder: Path) -> None:
             raise ValueError(
                 f"{folder} has studies in it: give one of them, such as {inner[0].parent}"
             )
+        if not folder.is_dir():
+            raise ValueError(
+                f"{folder} is not a study folder: there is no such folder; give the one that "
+                "`s4a run PATH... --out FOLDER` has written"
+            )
         raise ValueError(
-            f"{folder} is not a study folder: it has no folder {STAGES[0]!r}; "
-            f"run `s4a run ... --out {folder}`"
+            f"{folder} is not a study folder: it has no folder {STAGES[0]!r}; to analyse meshes "
+            f"in it, run `s4a run {folder} --out FOLDER` and give that folder"
         )
     refuse_links(folder)
 

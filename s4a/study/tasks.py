@@ -164,7 +164,8 @@ def consistent_maps(
     first = steps.with_transforms(first, transforms, reference)
     coarse = {name: study[f"coarse/{name}"] for name in names}
     k_init = first.sizes["eigenpair_source_initial"]
-    bar = run.show("consistent ZoomOut", options.k - k_init)
+    k = min(options.k, *(mesh.sizes["eigenpair"] for mesh in coarse.values()))
+    bar = run.show("consistent ZoomOut", k - k_init)
     return steps.refine_network(
         coarse,
         first,

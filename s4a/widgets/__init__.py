@@ -22,7 +22,6 @@ from s4a.widgets.modes import Modes
 from s4a.widgets.network import Network
 from s4a.widgets.panel import Panel
 from s4a.widgets.progress import Progress
-from s4a.widgets.region import Region
 from s4a.widgets.spectrum import Spectrum
 from s4a.widgets.transfer import Transfer
 
@@ -37,7 +36,6 @@ __all__ = [
     "Network",
     "Panel",
     "Progress",
-    "Region",
     "Spectrum",
     "Transfer",
 ]

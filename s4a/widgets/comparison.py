@@ -64,7 +64,7 @@ class Comparison(Panel):
     Parameters
     ----------
     found : xarray.DataTree
-        Of :func:`s4a.compare.pairs` with ``keep=True``, or opened from the ``compare.nc`` of
+        Of :func:`s4a.compare` with ``keep=True``, or opened from the ``compare.nc`` of
         ``s4a compare --keep``.
     methods : sequence of str, optional
         At most seven methods of it, shown first; SCALABLE, RE-MATCH and registered surface by
@@ -87,7 +87,7 @@ class Comparison(Panel):
     >>> import s4a
     >>> from s4a.widgets import Comparison
     >>> ball = s4a.synthetic.ellipsoid(300)
-    >>> found = s4a.compare.pair(ball, ball, methods=["kNN"], keep=True)
+    >>> found = s4a.compare(ball, ball, methods=["kNN"], keep=True)
     >>> panel = Comparison(found)
     >>> [scene.title for scene in panel.scenes[1:]]
     ['kNN']

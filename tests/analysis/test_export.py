@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from s4a import read_mesh, statistics, write_registered
+from s4a import read_mesh, write_registered
 from s4a.geometry.mesh import as_arrays
 from s4a_morphometrics import write_training_set
 
@@ -48,19 +48,6 @@ def test_in_the_frame_of_the_shape_the_registered_surface_lies_on_it(study, mesh
         points, _, _ = read_mesh(tmp_path / f"{name}.ply")
         gap = points - mesh["position"].values[matched.sel(shape=name).values]
         assert np.linalg.norm(gap, axis=1).mean() < 8  # mm, few modes on few vertices
-
-
-def test_a_mirrored_shape_of_a_region_is_written_on_the_side_of_its_file(study, tmp_path):
-    mirrored = study.copy(deep=True)
-    name = study["registration"]["shape"].values[1]
-    mirrored["original"][name].attrs["reflected"] = 1
-    shapes = study["report"]["shape"]
-    mirrored["report"]["reflected"] = xr.DataArray(shapes.values == name, {"shape": shapes.values})
-    for tree, folder in ((mirrored, "whole"), (statistics.within(mirrored), "part")):
-        write_registered(tree, tmp_path / folder, frame="shape")
-    (X, T, _), (Y, S, _) = (read_mesh(tmp_path / way / f"{name}.ply") for way in ("whole", "part"))
-    assert np.array_equal(X, Y)
-    assert np.array_equal(T, S)
 
 
 def test_a_training_set_has_meshes_labels_landmarks_and_a_split(study, meshes, tmp_path):

@@ -508,7 +508,7 @@ def test_the_command_writes_labels_per_vertex_of_the_file_and_landmarks(tmp_path
     files = [tmp_path / "source.ply", tmp_path / "target one.obj"]
     shared = ["--labels", tmp_path / "labels.npy", "--n-coarse", 1200, "--k", 60, "--n-jobs", 1]
     command = [str(a) for a in ["transfer", *files, *shared]]
-    marks = ["--landmarks", str(tmp_path / "marks.csv"), "--out", str(tmp_path / "out")]
+    marks = ["--source-landmarks", str(tmp_path / "marks.csv"), "--out", str(tmp_path / "out")]
     assert cli.main([*command, *marks]) == 0
     assert "50" in capsys.readouterr().out.splitlines()[-1].split()
     label = np.load(tmp_path / "out" / "target one.labels.npy")
@@ -528,6 +528,6 @@ def test_the_command_writes_labels_per_vertex_of_the_file_and_landmarks(tmp_path
     )
     assert cli.main(["transfer", "a.ply", "b.ply", "--out", str(tmp_path)]) == 2
     assert "--labels FILE" in capsys.readouterr().err
-    points = ["--landmarks", str(tmp_path / "marks.csv"), "--blur", "1"]
+    points = ["--source-landmarks", str(tmp_path / "marks.csv"), "--blur", "1"]
     assert cli.main(["transfer", *map(str, files), *points, "--out", str(tmp_path / "no")]) == 2
-    assert "--blur is of labels" in capsys.readouterr().err
+    assert "--blur needs labels" in capsys.readouterr().err

@@ -1,6 +1,5 @@
 """The command line: what it prints, how it ends, and that its options are those of `analyse`."""
 
-import argparse
 import os
 import re
 import subprocess
@@ -12,8 +11,9 @@ import pytest
 from small import FLAGS
 
 from s4a import Options, cli, synthetic, write_mesh
-from s4a.cli import Groups, tables
+from s4a.cli import Parser, tables
 from s4a.cli.commands import COMMANDS
+from s4a.extensions import extensions
 from s4a.geometry.mesh import as_arrays
 from s4a.options import DECLARED
 from s4a.study.progress import STAGES
@@ -64,6 +64,13 @@ def test_run_writes_a_line_for_each_stage_where_there_is_no_terminal(ran):
     assert "it/s" not in result.stderr
 
 
+def test_a_quiet_run_writes_no_stages_and_no_warnings(folder, tmp_path):
+    arguments = [sys.executable, "-m", "s4a", "run", str(folder), "-q", "-o", str(tmp_path / "s")]
+    result = subprocess.run([*arguments, *FLAGS], capture_output=True, text=True, check=False)
+    assert result.returncode == 0
+    assert result.stderr == ""
+
+
 def test_view_writes_a_page_into_the_study_or_where_it_is_told(ran, tmp_path, monkeypatch, capsys):
     study, _ = ran
     page = tmp_path / "page.html"
@@ -72,7 +79,7 @@ def test_view_writes_a_page_into_the_study_or_where_it_is_told(ran, tmp_path, mo
         lambda tree, file, **_: file.write_text(f"{len(tree['original'])} shapes"),
     )
     assert cli.main(["view", str(study)]) == 0
-    assert cli.main(["view", str(study), "--out", str(page)]) == 0
+    assert cli.main(["view", str(study), "--page", str(page)]) == 0
     assert (study / "study.html").read_text() == page.read_text() == "4 shapes"
     assert f"wrote {page}" in capsys.readouterr().out
 
@@ -102,7 +109,7 @@ def test_check_lists_every_shape_that_fits_and_ends_with_1_where_one_is_excluded
         (["statistics", "nowhere", "--covariates", "age"], "give --group or --variable"),
         (
             ["run", "nowhere", "--out", "study", "--k", "3"],
-            "k must be an integer of at least 4; found 3",
+            "s4a: --k must be an integer of at least 4; found 3",
         ),
     ],
 )
@@ -129,6 +136,65 @@ def test_wrong_usage_ends_with_2_says_how_and_leaves_the_log_as_it_was(arguments
     assert "usage: s4a" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    "arguments, said",
+    [
+        (["rnu", "x"], "'rnu' is not a command; did you mean run?"),
+        (["run", "x", "--ncoarse", "3"], "unknown flag --ncoarse; did you mean --n-coarse?"),
+        (["run", "x", "--ot=y"], "unknown flag --ot; did you mean --out?"),
+        (["run", "x", "-o", "y", "-z"], "unknown flag -z"),
+    ],
+)
+def test_an_unknown_command_or_flag_gets_a_suggestion_and_one_line_of_usage(
+    arguments, said, capsys
+):
+    with pytest.raises(SystemExit) as end:
+        cli.main(arguments)
+    assert end.value.code == 2
+    usage, message = capsys.readouterr().err.splitlines()
+    assert usage.startswith("usage: s4a")
+    assert message == f"s4a: {said}"
+
+
+def test_an_error_of_an_option_names_its_flag():
+    flags = ["--k", "--k-init", "--lift", "--method", "--both", "--permutations"]
+    for message, said in {
+        "k must be at least k_init = 20; found 5": "--k must be at least --k-init 20; found 5",
+        "method='scalable' has no mesh, and lift=True needs one": (
+            "--method 'scalable' has no mesh, and --lift needs one"
+        ),
+        "preset sets both=False; a.k must stay": "preset sets --no-both; a.k must stay",
+        "n_permutations must be 9": "--permutations must be 9",
+    }.items():
+        assert cli.as_flags(message, flags) == said
+
+
+def test_help_of_a_run_has_groups_defaults_examples_and_a_link(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["run", "--help"])
+    said = capsys.readouterr().out
+    heads = ["input:", "network:", "registration:", "quality control:", "computing:", "examples:"]
+    assert [line for line in said.splitlines() if line in heads] == heads
+    assert said.count("  s4a run ") == 3
+    assert "https://" in said
+    text = " ".join(said.split())
+    assert "-k N, --k N size of the refined functional maps (default: 100)" in text
+    assert "close each hole with a fan of triangles (default: no)" in text
+
+
+def test_a_flag_means_one_thing_in_all_commands():
+    found = {}
+    for name, one in (COMMANDS | extensions("s4a.commands")).items():
+
+        def add(*names, name=name, **settings):
+            kind = settings.get("metavar"), settings.get("choices"), names
+            if names[-1].startswith("--"):
+                found.setdefault(names[-1], {}).setdefault(kind, []).append(name)
+
+        one.flags(add)
+    assert {flag: kinds for flag, kinds in found.items() if len(kinds) > 1} == {}
+
+
 def parsed(*flags):
     """The options of a run from flags, and its other arguments."""
     args = vars(cli.parser().parse_args(["run", "a", "--out", "study", *flags]))
@@ -142,10 +208,13 @@ def test_every_option_of_analyse_is_a_flag_of_run_with_the_same_default():
 
 
 def test_flags_give_the_options_their_values():
-    flags = "--n-coarse 500 --n-latent 40 --init landmarks --remove-size --no-strict --label 1,2"
+    flags = (
+        "--n-coarse 500 -k 50 --n-latent 40 --init landmarks --remove-size --no-strict --label 1,2"
+    )
     found, _ = parsed(*flags.split(), *"--components 2 --template None --seed 7".split())
     given = {
         "n_coarse": 500,
+        "k": 50,
         "n_latent": 40,
         "init": "landmarks",
         "remove_size": True,
@@ -179,8 +248,8 @@ def test_flags_and_their_help_follow_from_a_function():
         return len(numbers) * n + k
 
     found = cli.command(double, ("k",))
-    top = argparse.ArgumentParser(description=found.run.__doc__)
-    found.flags(Groups(top))
+    top = Parser(description=found.run.__doc__)
+    found.flags(top)
     args = top.parse_args(["1", "2", "--to", "x", "--n", "3", "--k", "7"])
     assert vars(args) == {"numbers": [1, 2], "minus": False, "to": "x", "n": 3, "k": 7}
     assert found.run(args) == 13
@@ -247,10 +316,10 @@ def test_a_mesh_written_by_the_library_passes_the_check(tmp_path, capsys):
     [
         (["--n-pairs", "10^22"], "a whole number of at most 18 digits needed, found '10^22'"),
         (["--n-pairs", "9" * 5000], "a whole number of at most 18 digits needed, found '999"),
-        (["--n-pairs", "99999999999"], "n_pairs must be an integer of at most 2147483647"),
+        (["--n-pairs", "99999999999"], "--n-pairs must be an integer of at most 2147483647"),
         (["--k", "NaN"], "a whole number of at most 18 digits needed, found 'NaN'"),
         (["--seed", "1e3"], "a whole number of at most 18 digits needed, found '1e3'"),
-        (["--seed", "-1"], "seed must be an integer of at least 0; found -1"),
+        (["--seed", "-1"], "--seed must be an integer of at least 0; found -1"),
         (["--n-coarse", "²"], "a whole number of at most 18 digits needed, found '²'"),
         (["--components", "²"], "found '²'"),
         (["--n-jobs", "0"], "a number from 1 to 1000 needed, or -1 for all cores, found 0"),

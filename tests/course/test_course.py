@@ -1,7 +1,4 @@
-"""Exercises, quizzes and pictures of the course.
-
-What is missing or wrong is told, what is right passes.
-"""
+"""Exercises, quizzes and pictures of the course."""
 
 import base64
 import io
@@ -20,12 +17,12 @@ from s4a.datasets.synthetic import sphere
 from s4a.method.latent import consistency_form
 from s4a.show.charts import PALE, matrices, network, on_circle, surfaces, variance
 
-DIAGRAMS = ["cotangents", "dual", "pull_back", "latent_space", "two_ways", "slid"]
+DIAGRAMS = ["cotangents", "dual", "pull_back", "latent_space", "two_methods", "slid"]
 
 
 def test_an_open_exercise_says_what_to_do_and_hints():
-    said = judge(..., 3, "count them")
-    assert re.fullmatch(r"No answer yet: .*dots.* Hint: count them\.", said)
+    feedback = judge(..., 3, "count them")
+    assert re.fullmatch(r"No answer yet: .*dots.* Hint: count them\.", feedback)
 
 
 @pytest.mark.parametrize(
@@ -67,12 +64,12 @@ def test_a_wrong_answer_fails_with_itself_and_the_hint(answer, expected):
         judge(answer, expected, "look again")
 
 
-def test_an_array_is_told_by_its_shape():
+def test_an_array_is_reported_by_its_shape():
     with pytest.raises(AssertionError, match=r"an array of shape \(2, 3\)"):
         judge(np.zeros((2, 3)), np.zeros(3))
 
 
-def test_a_slider_draws_its_picture_anew_without_a_cell_that_captures():
+def test_a_slider_redraws_its_picture_without_a_cell_that_captures_output():
     ipywidgets = pytest.importorskip("ipywidgets")
     drawn = []
 
@@ -152,7 +149,7 @@ def test_a_wrong_answer_of_another_kind_gets_the_hint(number, answer, given):
         check(number, answer, *given)
 
 
-def test_the_odd_modes_may_be_a_list_or_a_set():
+def test_the_odd_eigenfunctions_may_be_a_list_or_a_set():
     C = np.diag([1.0, 1, -1, 1, -1, 1, 1, 1, 1])
     for answer in ([2, 4], {2, 4}, np.array([2, 4])):
         assert check("04.3", answer, C, np.eye(9)) == "Right."
@@ -197,13 +194,13 @@ def test_a_quiz_has_three_questions_of_which_one_answer_is_right_and_all_say_why
         assert sum(answer.right for answer in question.answers) == 1
         for answer in question.answers:
             assert re.fullmatch(r".*\w.*[.?]", answer.text)
-            assert re.fullmatch(r".{9,}[.?]", answer.said)
+            assert re.fullmatch(r".{9,}[.?]", answer.explanation)
 
 
-def test_the_place_of_an_answer_does_not_tell_whether_it_is_right():
+def test_right_answers_occur_at_all_positions():
     questions = [question for lesson in LESSONS.values() for question in lesson]
-    places = [[a.right for a in question.answers].index(True) for question in questions]
-    assert min(places.count(place) for place in range(3)) > len(questions) / 6
+    positions = [[a.right for a in question.answers].index(True) for question in questions]
+    assert min(positions.count(position) for position in range(3)) > len(questions) / 6
 
 
 def test_a_quiz_is_shut_until_an_answer_is_clicked_and_needs_no_script():
@@ -214,25 +211,25 @@ def test_a_quiz_is_shut_until_an_answer_is_clicked_and_needs_no_script():
     assert shown.count("<b>Right.</b>") == 3
     names = re.findall(r'name="([^"]+)"', shown)
     assert sorted(set(names)) == ["quiz-02-1", "quiz-02-2", "quiz-02-3"], "one open at a time"
-    told = repr(quiz("02"))
+    text = repr(quiz("02"))
     for question in LESSONS["02"]:
-        assert question.text in told
-        assert all(answer.text in told for answer in question.answers)
-        assert not any(answer.said in told for answer in question.answers)
+        assert question.text in text
+        assert all(answer.text in text for answer in question.answers)
+        assert not any(answer.explanation in text for answer in question.answers)
 
 
 def test_a_quiz_of_no_lesson_is_an_error():
-    with pytest.raises(ValueError, match=r"no quiz of lesson '77'; there are those of 00, 01"):
+    with pytest.raises(ValueError, match=r"no quiz of lesson '77'; the lessons are 00, 01"):
         quiz("77")
 
 
-def test_a_question_is_read_from_a_task_list_and_its_signs_are_no_markup():
+def test_a_question_is_read_from_a_task_list_and_its_text_is_escaped():
     text = (
         "# T\n\n## 01\n\nIs 1 < 2\nby `f(x)`?\n\n- [ ] *No*.\n  It is.\n- [x] Yes.\n  So it is.\n"
     )
     [question] = read(text)["01"]
     assert question.text == "Is 1 < 2 by `f(x)`?"
-    assert sorted((a.text, a.right, a.said) for a in question.answers) == [
+    assert sorted((a.text, a.right, a.explanation) for a in question.answers) == [
         ("*No*.", False, "It is."),
         ("Yes.", True, "So it is."),
     ]
@@ -258,24 +255,24 @@ def test_a_takeaway_has_its_pictures_side_by_side_and_none_of_them_small():
 
 
 @pytest.mark.parametrize("name", DIAGRAMS)
-def test_no_words_of_a_diagram_lie_over_each_other_or_outside(name):
+def test_texts_of_a_diagram_do_not_overlap_and_are_inside(name):
     figure = getattr(diagrams, name)()
     figure.canvas.draw()
     for ax in figure.axes:
-        words = [text for text in (*ax.texts, ax.title) if text.get_text()]
-        assert words
-        boxes = [text.get_window_extent() for text in words]
+        texts = [text for text in (*ax.texts, ax.title) if text.get_text()]
+        assert texts
+        boxes = [text.get_window_extent() for text in texts]
         for i, box in enumerate(boxes):
-            assert figure.bbox.x0 <= box.x0, words[i]
-            assert box.x1 <= figure.bbox.x1, words[i]
-            assert figure.bbox.y0 <= box.y0, words[i]
-            assert box.y1 <= figure.bbox.y1, words[i]
+            assert figure.bbox.x0 <= box.x0, texts[i]
+            assert box.x1 <= figure.bbox.x1, texts[i]
+            assert figure.bbox.y0 <= box.y0, texts[i]
+            assert box.y1 <= figure.bbox.y1, texts[i]
             for j in range(i):
-                assert not box.overlaps(boxes[j]), (words[i], words[j])
+                assert not box.overlaps(boxes[j]), (texts[i], texts[j])
 
 
 @pytest.mark.parametrize("name", DIAGRAMS)
-def test_a_diagram_is_shown_part_by_part_with_words_for_who_does_not_see_it(name):
+def test_a_diagram_is_shown_in_parts_with_an_alternative_text(name):
     figure = getattr(diagrams, name)()
     shown = figure.html()
     assert shown.count("<img") == len(figure.axes)
@@ -304,20 +301,20 @@ def test_pictures_in_one_frame_show_which_surface_is_larger():
     ball = sphere(162)
     shapes = {"whole": ball, "half": ball.assign(position=0.5 * ball["position"])}
 
-    def seen(figure):
+    def pixels(figure):
         return [np.count_nonzero(ax.images[0].get_array()[..., 3]) for ax in figure.axes]
 
-    whole, half = seen(surfaces(shapes))
+    whole, half = pixels(surfaces(shapes))
     assert half == pytest.approx(whole, rel=0.02)
-    whole, half = seen(surfaces(shapes, one_frame=True))
+    whole, half = pixels(surfaces(shapes, one_frame=True))
     assert half == pytest.approx(whole / 4, rel=0.05)
 
 
-def test_what_is_said_of_an_answer_is_shown_as_words():
+def test_feedback_is_shown_as_text():
     assert judge(3, 3)._repr_html_() == "<p>Right.</p>"
-    said = check("03.1", ...)._repr_html_()
-    assert said.startswith("<p>No answer yet:")
-    assert "<code>answer = ...</code>" in said
+    feedback = check("03.1", ...)._repr_html_()
+    assert feedback.startswith("<p>No answer yet:")
+    assert "<code>answer = ...</code>" in feedback
     assert "<b" not in judge(..., 3, "is 2 <b 3?")._repr_html_()
 
 

@@ -70,7 +70,7 @@ def test_the_same_seed_gives_the_same_bits():
     one, two = (synthetic.brains(2, 800, seed=5, dirty=True) for _ in range(2))
     assert one.identical(two)
     assert not np.array_equal(
-        synthetic.plant(2, 6)["noise_translation"], one["truth/noise_translation"]
+        synthetic.simulate(2, 6)["noise_translation"], one["truth/noise_translation"]
     )
 
 
@@ -83,7 +83,7 @@ def test_the_population_does_not_depend_on_resolution():
 
 @pytest.mark.parametrize("n", [6, 12, 51])
 def test_planted_scores_are_standardised_bounded_and_uncorrelated(n):
-    score = synthetic.plant(n, seed=2)["true_score"].values
+    score = synthetic.simulate(n, seed=2)["true_score"].values
     assert np.allclose(score.T @ score / n, np.eye(3), atol=1e-12)
     assert np.allclose(score.mean(0), 0, atol=1e-12)
     assert np.abs(score).max() <= 2.5
@@ -136,7 +136,7 @@ def inverted(truth, shape, n_vertices):
 
 
 def test_no_triangle_of_the_population_is_inverted():
-    truth = synthetic.plant(12)
+    truth = synthetic.simulate(12)
     assert [inverted(truth, shape, 12_000) for shape in ("brain_01", "brain_05", "brain_09")] == [
         0,
         0,
@@ -147,7 +147,7 @@ def test_no_triangle_of_the_population_is_inverted():
 @pytest.mark.parametrize("scores", [(3, 3, 3), (-3, 3, -3), (3, -3, -3), (-3, -3, 3)])
 def test_hardly_a_triangle_is_inverted_where_all_scores_are_three(scores):
     # space is not folded there (above); what is left are slivers across the bottom of a sulcus
-    assert inverted(at_scores(synthetic.plant(6), scores), "brain_01", 12_000) < 1e-3
+    assert inverted(at_scores(synthetic.simulate(6), scores), "brain_01", 12_000) < 1e-3
 
 
 def test_nearest_neighbours_after_icp_are_wrong_by_two_to_four_percent():
@@ -184,7 +184,7 @@ def test_labels_cover_every_region_and_landmarks_lie_on_the_surface(clean_tree):
 
 
 def test_a_third_of_the_shapes_has_a_tumour_of_the_stated_height():
-    height = np.linalg.norm(synthetic.plant(12)["noise_translation"][:, -1], axis=1)
+    height = np.linalg.norm(synthetic.simulate(12)["noise_translation"][:, -1], axis=1)
     assert (height > 0).sum() == 4
     assert height[height > 0].min() >= 4
     assert height.max() <= 7
@@ -279,10 +279,10 @@ def test_known_surfaces_have_their_area_volume_and_genus():
 
 
 @pytest.mark.parametrize("call, message", [
-    (lambda: synthetic.plant(0), "1 or more"),
-    (lambda: synthetic.plant(3, n_modes=9), "from 0 to 6"),
-    (lambda: synthetic.brains(1, 3), "4 or more"),
-    (lambda: synthetic.position(synthetic.plant(2), "brain_99", [[0, 0, 1]]), "brain_99"),
+    (lambda: synthetic.simulate(0), "at least 1"),
+    (lambda: synthetic.simulate(3, n_modes=9), "from 0 to 6"),
+    (lambda: synthetic.brains(1, 3), "at least 4"),
+    (lambda: synthetic.position(synthetic.simulate(2), "brain_99", [[0, 0, 1]]), "brain_99"),
 ])  # fmt: skip
 def test_wrong_arguments_say_what_is_needed(call, message):
     with pytest.raises(ValueError, match=message):

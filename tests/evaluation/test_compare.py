@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from s4a import compare, synthetic
+from s4a import compare, compare_collection, synthetic
 from s4a.cli import main
+from s4a.evaluation import comparison
 from s4a.evaluation.methods import Spaces
 from s4a.geometry.mesh import as_arrays
 from s4a.input.files import write_mesh
@@ -31,11 +32,11 @@ def three_brains(brains, meshes):
 @pytest.fixture(scope="module")
 def found(three_brains):
     source, targets, truth = three_brains
-    return compare.pairs(source, targets, truth=truth, **SMALL)
+    return compare(source, targets, truth=truth, **SMALL)
 
 
 def test_every_method_has_every_metric_and_its_time_by_block(found):
-    assert found["algorithm"].values.tolist() == list(compare.METHODS)
+    assert found["algorithm"].values.tolist() == list(comparison.METHODS)
     assert found["chamfer"].dims == found["geodesic_error"].dims == ("algorithm", "pair")
     assert found["block_seconds"].dims == ("algorithm", "pair", "block")
     assert found.sizes["pair"] == 2
@@ -60,7 +61,7 @@ def test_every_method_has_every_metric_and_its_time_by_block(found):
 
 
 def test_nearest_neighbours_in_space_have_the_largest_chamfer_distance_of_the_papers(found):
-    chamfer = found["chamfer"].sel(algorithm=list(compare.PAPER_METHODS))
+    chamfer = found["chamfer"].sel(algorithm=list(comparison.PAPER_METHODS))
     assert (chamfer.idxmax("algorithm") == "kNN").all()
 
 
@@ -91,8 +92,8 @@ def test_rematch_is_the_papers_with_and_without_the_preset(three_brains):
     source, targets, _ = three_brains
     target = next(iter(targets.values()))
     two = {"methods": ["RE-MATCH", "RE-MATCH refined"]}
-    ours = compare.pair(source, target, **two, **SMALL)
-    paper = compare.pair(source, target, preset="paper", methods=["RE-MATCH"], **SMALL)
+    ours = compare(source, target, **two, **SMALL)
+    paper = compare(source, target, preset="paper", methods=["RE-MATCH"], **SMALL)
     assert paper["chamfer"].item() == ours["chamfer"].sel(algorithm="RE-MATCH").item()
     assert paper["chamfer"].item() != ours["chamfer"].sel(algorithm="RE-MATCH refined").item()
 
@@ -100,8 +101,8 @@ def test_rematch_is_the_papers_with_and_without_the_preset(three_brains):
 def test_every_method_finds_a_shape_in_itself(meshes):
     mesh = meshes["brain_01"]
     same = np.arange(mesh.sizes["vertex"])
-    found = compare.pair(mesh, mesh, truth=same, **SMALL)
-    exact = [way for way in compare.METHODS if way not in ("RE-MATCH refined", "SCALABLE")]
+    found = compare(mesh, mesh, truth=same, **SMALL)
+    exact = [way for way in comparison.METHODS if way not in ("RE-MATCH refined", "SCALABLE")]
     assert (found["geodesic_error"].sel(algorithm=exact) == 0).all()
     assert (found["geodesic_error"] < 0.005).all()
     assert (found["bijectivity"].sel(algorithm=exact) == 0).all()
@@ -111,7 +112,7 @@ def test_an_alignment_that_given_landmarks_make_needless_is_not_charged(three_br
     source, targets, _ = three_brains
     target = next(iter(targets.values()))
     marks = np.arange(0, 50, 10), np.arange(0, 50, 10)
-    found = compare.pair(
+    found = compare(
         source, target, landmarks=marks, methods=["kNN", "FMAP+ZO", "RE-MATCH"], **SMALL
     )
     align = found["block_seconds"].sel(block="align").isel(pair=0)
@@ -125,12 +126,12 @@ def test_given_landmarks_make_up_for_a_rigid_alignment_that_is_wrong():
     turned = wavy.assign(position=wavy["position"] * [-1.0, -1.0, 1.0])
     same = np.arange(1500)
     some = same[::150]
-    found = compare.pair(
+    found = compare(
         wavy, turned, truth=same, landmarks=(some, some), methods=["RE-MATCH"], **SMALL | {"k": 40}
     )
     assert found["geodesic_error"].item() < 0.02
     places = wavy["position"].values[some], turned["position"].values[some]
-    again = compare.pair(
+    again = compare(
         wavy, turned, truth=same, landmarks=places, methods=["RE-MATCH"], **SMALL | {"k": 40}
     )
     assert again["geodesic_error"].item() == found["geodesic_error"].item()
@@ -144,7 +145,7 @@ def test_truth_and_landmarks_of_files_count_the_rows_of_the_files(tmp_path):
         tmp_path / "a.ply", np.r_[[[9e3, 0, 0]], X], T + 1
     )  # an idle vertex first: it is dropped
     write_mesh(tmp_path / "b.ply", X[order], rank[T])
-    found = compare.pair(
+    found = compare(
         tmp_path / "a.ply", tmp_path / "b.ply", truth=order + 1, methods=["kNN"], n_geodesic=100
     )
     assert found["geodesic_error"].item() == 0
@@ -155,29 +156,29 @@ def test_what_is_wrong_is_said(three_brains):
     source, targets, _ = three_brains
     target = next(iter(targets.values()))
     with pytest.raises(ValueError, match="methods must be some of kNN"):
-        compare.pair(source, target, methods=["ICP"])
+        compare(source, target, methods=["ICP"])
     with pytest.raises(ValueError, match=r"the methods kNN.*found RE-MATCH refined, registered"):
-        compare.pair(source, target, methods=["kNN", *compare.METHODS[-3:]], preset="paper")
+        compare(source, target, methods=["kNN", *comparison.METHODS[-3:]], preset="paper")
     with pytest.raises(
         ValueError,
         match="preset 'paper' sets full_resolution_iterations=0",
     ):
-        compare.pair(source, target, preset="paper", full_resolution_iterations=1)
+        compare(source, target, preset="paper", full_resolution_iterations=1)
     with pytest.raises(ValueError, match="init must be one of 'landmarks', 'descriptors'"):
-        compare.pair(source, target, init="dense")
+        compare(source, target, init="dense")
     with pytest.raises(ValueError, match="landmarks need two arrays"):
-        compare.pair(source, target, landmarks=(np.arange(4), np.arange(5)), methods=["kNN"])
+        compare(source, target, landmarks=(np.arange(4), np.arange(5)), methods=["kNN"])
     with pytest.raises(ValueError, match="all paths or all Datasets"):
-        compare.pair(source, "b.ply")
+        compare(source, "b.ply")
     with pytest.raises(ValueError, match="at least 2 shapes"):
-        compare.collection({"only": source})
+        compare_collection({"only": source})
     with pytest.raises(ValueError, match="methods must be some of SCALABLE"):
-        compare.collection({"a": source, "b": target}, methods=["kNN"])
+        compare_collection({"a": source, "b": target}, methods=["kNN"])
 
 
 def test_both_ways_to_full_resolution_share_all_but_the_last_block(three_brains):
     source, targets, _ = three_brains
-    found = compare.collection({"brain_01": source, **targets}, n_coarse=400, k=30)
+    found = compare_collection({"brain_01": source, **targets}, n_coarse=400, k=30)
     assert found["collection_chamfer"].dims == ("algorithm", "dense_match", "shape")
     seconds = found["collection_seconds"]
     shared = seconds.drop_sel(block="full resolution")
@@ -192,24 +193,24 @@ def test_both_ways_to_full_resolution_share_all_but_the_last_block(three_brains)
 def test_small_meshes_are_compared_in_as_many_functions_as_they_have_and_a_note_says_so(caplog):
     few, more = synthetic.ellipsoid(60), synthetic.ellipsoid(90, (1.3, 1.1, 1.0))
     for source, target in ((few, more), (more, few)):
-        found = compare.pair(source, target, n_geodesic=20)
-        assert found["algorithm"].values.tolist() == list(compare.METHODS)
+        found = compare(source, target, n_geodesic=20)
+        assert found["algorithm"].values.tolist() == list(comparison.METHODS)
         assert np.isfinite(found["chamfer"]).all()
         note = "pair: k = 100 reduced to 58, the eigenfunctions that the smaller mesh has"
         assert found.attrs["note"] == note
         assert note in caplog.text
-    itself = compare.pair(few, few, truth=np.arange(60), n_geodesic=20)
+    itself = compare(few, few, truth=np.arange(60), n_geodesic=20)
     assert (itself["geodesic_error"].sel(algorithm=["ZO", "RE-MATCH", "registered"]) == 0).all()
-    enough = compare.pair(few, more, methods=["ZO"], k=20, n_geodesic=20)
+    enough = compare(few, more, methods=["ZO"], k=20, n_geodesic=20)
     assert "note" not in enough.attrs
 
 
 def test_a_collection_of_small_meshes_is_compared_in_as_many_functions_as_all_have(caplog):
-    found = compare.collection(synthetic.brains(3, 300), n_coarse=100)
+    found = compare_collection(synthetic.brains(3, 300), n_coarse=100)
     assert found["collection_chamfer"].notnull().sum() == 8
     assert "RE-MATCH: k = 100 reduced to" in found.attrs["note"]
     assert found.attrs["note"] in caplog.text
-    few = compare.collection(synthetic.brains(3, 300), n_coarse=100, k=30)
+    few = compare_collection(synthetic.brains(3, 300), n_coarse=100, k=30)
     assert "note" not in few.attrs
 
 

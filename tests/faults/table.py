@@ -17,15 +17,16 @@ from faults.shapes import FAULTS, make
 from s4a import read_shapes
 
 PAGE = DOCS / "faults.md"
-HEAD = """# What becomes of faulty input
+HEAD = """# Faulty input: meshes, tables, options and studies
 
-A run over a collection goes on with the shapes that can be used. `s4a check`, `s4a run` and
+This page lists the faults that S4A handles: what is done, what the report says, and how to change
+it. The page is written from the entries that the tests use (`tests/faults`); every row is tested.
+
+A run over a collection continues with the shapes that can be used. `s4a check`, `s4a run` and
 `s4a.read_shapes` give each shape a status (ok, repaired, flagged, excluded), a reason (what was
-found and done) and a warning (what looks wrong and was left as it is); what concerns several
-shapes, or files that are no shapes, stands in the remarks below. Flagged shapes are registered,
-and [stay apart](quality_control.md): the others' results are the same without them.
-
-This page is made from the entries that the tests run over (`tests/faults`); every row is tested.
+found and done) and a warning (what looks wrong and was not changed). Messages about several
+shapes, or about files that are not shapes, are in the remarks. [Flagged
+shapes](quality_control.md) are registered but do not affect the results of the others.
 
 ## Meshes
 

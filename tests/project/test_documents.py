@@ -13,7 +13,8 @@ from s4a.schema import TABLE
 
 figures = script(DOCS / "figures.py")
 paper = script(ROOT / "tools" / "paper.py")
-PAGES = sorted(DOCS.glob("*.md")) + sorted((DOCS / "api").glob("*.md"))
+KINDS = (".", "api", "explanation", "howto")
+PAGES = [page for kind in KINDS for page in sorted((DOCS / kind).glob("*.md"))]
 READ = [*PAGES, NOTEBOOKS / "README.md", *LESSONS, ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 CODE = [ROOT / "s4a", ROOT / "morphometrics", TESTS, ROOT / "benchmarks"]
 
@@ -23,14 +24,16 @@ def text(path):
 
 
 def test_every_page_is_reached_and_every_link_between_pages_leads_somewhere():
-    contents = text(DOCS / "index.md") + text(DOCS / "api" / "index.md")
-    inside = "\n".join(re.findall(r"```\{toctree\}\n(.*?)```", contents, re.DOTALL)).split()
+    lists = ("index.md", "api/index.md", "howto/index.md", "method.md")
+    contents = "".join(text(DOCS / name) for name in lists)
+    inside = "\n".join(re.findall(r"```\{toctree\}\n(.*?)```", contents, re.DOTALL))
+    inside = inside.replace("explanation/", "").split()
     apart = [page.name for page in PAGES if page.stem not in ("index", *inside)]
     assert [name for name in apart if name[0] != "_"] == []
     broken, lessons = [], {path.name for path in LESSONS}
     for page in [*PAGES, ROOT / "README.md"]:
         for link in re.findall(r"\]\((?!http|#)([^)#]+)[^)]*\)", text(page)):
-            name = link.removeprefix("course/").replace("index.md", "README.md")
+            name = link.rpartition("course/")[2].replace("index.md", "README.md")
             if not (
                 (page.parent / link).exists() or (NOTEBOOKS / name).exists() or name in lessons
             ):
@@ -85,7 +88,7 @@ FIGURE = re.compile(
 )
 LIMIT = re.compile(r"`[\w/]*test_\w+\.py")  # a figure that a test holds is a limit
 # sections whose figures are limits in the code, or measured once, as their page says
-EXEMPT = {("docs/plausibility.md", "# What is told of an odd shape, and what cannot be")}
+EXEMPT = {("docs/plausibility.md", "# Validation of quality control")}
 
 
 def test_a_section_that_quotes_a_figure_names_a_command_or_the_test_that_holds_it():
@@ -166,7 +169,7 @@ def test_what_a_command_prints_is_kept_with_its_machine_and_one_that_takes_too_l
 
 
 def test_every_picture_of_the_pages_is_drawn_by_a_command_and_the_film_is_small():
-    pages = [ROOT / "README.md", *DOCS.glob("*.md")]
+    pages = [ROOT / "README.md", *PAGES]
     links = [
         link for page in pages for link in re.findall(r"!\[[^\]]*\]\((?!http)([^)]+)\)", text(page))
     ]
@@ -192,6 +195,22 @@ def test_the_figures_of_the_paper_are_drawn_from_a_study(study_folder, tmp_path,
     with Image.open(figures.film(study, n_frames=2)) as film:
         assert (film.n_frames, film.width) == (2, 720)
     assert len([*tmp_path.iterdir()]) == 4, "not over the pictures of the pages"
+
+
+def test_every_public_name_is_in_the_table_of_names():
+    public = re.findall(r"import (\w+) as \1$", text(ROOT / "s4a/__init__.pyi"), re.MULTILINE)
+    packages = {path.parent.name for path in (ROOT / "s4a").glob("*/__init__.py")}
+    page = text(DOCS / "names.md")
+    assert [n for n in public if f"`s4a.{n}`" not in page and n not in packages] == []
+
+
+def test_the_drawing_of_a_study_agrees_with_the_schema():
+    units = {"L": "unit of the input", "√area": "share of sqrt(area)"}
+    rows = re.findall(r"^[│ ]+(\w+) +\((.*?)\) +(\S+)", text(DOCS / "data_model.md"), re.MULTILINE)
+    for name, dims, unit in rows:
+        assert TABLE[name][0] == tuple(dims.split(", ")), name
+        assert TABLE[name][1].split(",")[0] == units.get(unit, unit), name
+    assert len(rows) > 30
 
 
 def test_the_glossary_agrees_with_the_schema_and_has_every_equation():

@@ -20,7 +20,7 @@ GRAPH = {name: structure.imports_of(path) & {*MODULES} - {name} for name, path i
 # what the extension may use: docs/extensions.md names the modules, all without an underscore
 PUBLIC = re.compile(
     r"(schema|seeds|extensions|cli(\.(commands|flags|tables))?|(geometry|input|method|analysis|evaluation|show|widgets"
-    r"|datasets)(\.\w+)*|options|study\.(tree|insert|pair|pipeline))(\.\w+)?"
+    r"|datasets)(\.\w+)*|options|study\.(tree|insert|pair|pipeline|processes|store))(\.\w+)?"
 )
 
 

@@ -156,7 +156,7 @@ PUBLIC = {  # module -> what a lesson may take of it; None: whatever has no unde
     "s4a.course": {*course.__all__},
     "s4a.widgets": {*widgets.__all__, "threejs"},
     **dict.fromkeys(("s4a_morphometrics", "s4a_morphometrics.synthetic")),
-    **{f"s4a.{name}": None for name in ("compare", "metrics", "statistics", "synthetic")},
+    **{f"s4a.{name}": None for name in ("metrics", "statistics", "synthetic")},
 }
 
 

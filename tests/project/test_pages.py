@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from paths import DOCS
+from paths import DOCS, ROOT
 
 import s4a
 from s4a.geometry.mesh import as_arrays
@@ -29,13 +29,12 @@ def value_of(code, names):
     return eval(last, names)
 
 
-@pytest.mark.parametrize("page", ["howto.md", "gallery.md"])
-def test_every_cell_of_a_page_runs_and_shows_a_picture(page, tmp_path, monkeypatch):
+def test_every_cell_of_the_gallery_runs_and_shows_a_picture(tmp_path, monkeypatch):
     pytest.importorskip("skimage")
     pytest.importorskip("anywidget")
     matplotlib.use("agg")
     monkeypatch.chdir(tmp_path)
-    first, *questions = cells(page)
+    first, *questions = cells("gallery.md")
     names = {}
     exec(first, names)
     assert len(questions) >= 6
@@ -49,6 +48,42 @@ def test_every_cell_of_a_page_runs_and_shows_a_picture(page, tmp_path, monkeypat
             canvas = FigureCanvasAgg(shown)
             canvas.draw()
             assert (np.asarray(canvas.buffer_rgba())[..., :3] < 240).mean() > 0.01, code
+
+
+@pytest.mark.parametrize("page", ["data", "options", "results", "programs"])
+def test_every_recipe_is_a_question_and_runs_in_at_most_fifteen_lines(page, tmp_path, monkeypatch):
+    pytest.importorskip("skimage")
+    matplotlib.use("agg")
+    monkeypatch.chdir(tmp_path)
+    text = (DOCS / "howto" / f"{page}.md").read_text(encoding="utf-8")
+    assert [title for title in re.findall("^## (.*)", text, re.MULTILINE) if "?" not in title] == []
+    first, *recipes = cells(f"howto/{page}.md")
+    assert [code for code in recipes if len(code.strip().splitlines()) > 15] == []
+    names = {}
+    for code in (first, *recipes):
+        exec(code, names)
+
+
+def test_the_tutorial_finds_the_simulated_group_difference(tmp_path, monkeypatch):
+    matplotlib.use("agg")
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    for code in cells("tutorial.md"):
+        exec(code, names)
+    assert names["test"]["p_value"] < 0.01
+    assert names["significant"].mean() > 0.2
+
+
+def test_the_quickstart_of_readme_prints_what_it_shows(tmp_path, monkeypatch, capsys):
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    code, printed = re.search(
+        r"```python\n(.*?)```\n\n```text\n(.*?)```", readme, re.DOTALL
+    ).groups()
+    monkeypatch.chdir(tmp_path)
+    exec(code, {})
+    assert capsys.readouterr().out == printed
+    assert {path.name for path in tmp_path.iterdir()} == {"brains", "larger.ply", "modes.png"}
+    assert len(readme.split()) <= 750
 
 
 @pytest.fixture

@@ -104,14 +104,12 @@ def test_statistics_leave_them_out_and_say_whom(alone, study, caplog):
     assert test.attrs["left_out"] == "a_metre, z_inch"
     as_array = statistics.regression(study, list(values.values()), n_permutations=9)
     assert as_array["standard_score"].equals(test["standard_score"])
-    assert statistics.generalization(study).identical(statistics.generalization(alone))
 
 
 def test_they_enter_modes_and_statistics_on_demand(folder, mixed, study):
     kept = statistics.with_flagged(study)
     assert kept["pca"].sizes["shape"] == statistics.outliers(kept).sizes["shape"] == 7
     assert left_out(kept) == []
-    assert statistics.generalization(kept, n_points=0).attrs["shapes"] == 7
     with analyse(mixed, store=folder, include_flagged=True, **OPTIONS) as again:
         assert results(again, "pca").identical(results(kept, "pca"))
         assert results(again, "latent").identical(results(study, "latent"))

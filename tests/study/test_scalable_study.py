@@ -86,7 +86,7 @@ def test_the_low_resolution_is_the_reduced_basis_of_scalable(sampled):
 
 def test_the_paper_on_scalable_is_what_table_2_compares(brains, paper):
     names = {"n_coarse": 400, "k_init": 10, "k": 24, "methods": ["SCALABLE"]}
-    found = s4a.compare.collection(brains, preset="paper", **names).isel(algorithm=0)
+    found = s4a.compare_collection(brains, preset="paper", **names).isel(algorithm=0)
     assert paper["latent"].attrs["median"] == found["median_shape"].item()
     assert found["distance_to_limit"].values == pytest.approx(
         paper["latent/distance_to_limit"].values, rel=1e-3

@@ -73,11 +73,12 @@ def run_lesson(name, study):
 def panels_of(study):
     """Every panel and its title; those of a comparison, a test and structures are of small ones."""
     from s4a import compare, statistics, synthetic, widgets
+    from s4a_morphometrics import Region
     from s4a_morphometrics.synthetic import example_structures
 
     for title, kind in widgets.explore.PANELS.items():
         yield title, kind(study)
-    yield "Region", widgets.Region(study)
+    yield "Region", Region(study)
     numbers = range(study["registration"].sizes["shape"])
     yield (
         "Maps",
@@ -86,7 +87,7 @@ def panels_of(study):
     yield "Structures", widgets.Structures(example_structures())
     pair = [node.to_dataset() for node in synthetic.brains(2, 300)["original"].children.values()]
     options = {"n_coarse": 200, "k": 20, "k_init": 10, "n_geodesic": 50}
-    compared = compare.pair(*pair, methods=["kNN", "RE-MATCH"], keep=True, **options)
+    compared = compare(*pair, methods=["kNN", "RE-MATCH"], keep=True, **options)
     yield "Comparison", widgets.Comparison(compared)
 
 

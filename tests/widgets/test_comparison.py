@@ -28,7 +28,7 @@ def found():
         truth[name] = np.asarray(synthetic.position(brains["truth"], names[0], reference))
         truth[name][-100:] = np.nan
     pairs = dict(zip(names[1:], targets, strict=True))
-    return compare.pairs(source, pairs, methods=METHODS, truth=truth, keep=True, **SMALL)
+    return compare(source, pairs, methods=METHODS, truth=truth, keep=True, **SMALL)
 
 
 @pytest.fixture
@@ -79,7 +79,7 @@ def test_what_is_kept_agrees_with_the_table(found):
 
 def test_without_keep_there_is_the_table_alone(found):
     source, target = found["source"].to_dataset(), found["pairs/brain_02"].to_dataset()
-    alone = compare.pair(source, target[["position", "corner_vertex"]], methods=["kNN"], **SMALL)
+    alone = compare(source, target[["position", "corner_vertex"]], methods=["kNN"], **SMALL)
     assert isinstance(alone, xr.Dataset)
     with pytest.raises(ValueError, match="keep=True"):
         Comparison(alone)
@@ -192,7 +192,7 @@ def test_the_browser_knows_both_ways_and_the_errors(found, panel):
 def test_without_truth_there_is_no_error(found, panel):
     source, target = found["source"].to_dataset(), found["pairs/brain_02"].to_dataset()
     mesh = target[["position", "corner_vertex"]]
-    one = Comparison(compare.pair(source, mesh, methods=["kNN"], keep=True, **SMALL))
+    one = Comparison(compare(source, mesh, methods=["kNN"], keep=True, **SMALL))
     assert "error" not in [value for _, value in one.colors.options]
     assert one.scenes[1].title == "kNN"
     one.scenes[1].picked = {"vertex": 3, "count": 1}

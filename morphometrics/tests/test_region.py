@@ -6,11 +6,11 @@ import pytest
 pytest.importorskip("anywidget")
 
 import s4a
-from s4a import statistics
 from s4a.geometry.mesh import as_arrays
 from s4a.show.draw import rotation, vertices_within
-from s4a.widgets import Region
-from s4a.widgets.region import ADD, REMOVE
+from s4a_morphometrics import Region
+from s4a_morphometrics import within as within_region
+from s4a_morphometrics.region_panel import ADD, REMOVE
 
 WIDE = [[-9e3, -9e3], [9e3, -9e3], [9e3, 9e3], [-9e3, 9e3]]
 
@@ -54,7 +54,7 @@ def test_drags_add_and_take_away_and_the_region_goes_into_statistics(panel, stud
     left = panel.region
     assert 0 < left.sum() <= above.sum()
     assert f"{left.sum():,} of" in panel.scene.caption
-    within = statistics.within(study, left)
+    within = within_region(study, left)
     assert within["registration"].sizes["vertex"] <= left.sum()
     panel.others.click()
     np.testing.assert_array_equal(panel.region, ~left)

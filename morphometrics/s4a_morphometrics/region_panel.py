@@ -11,7 +11,7 @@ from s4a.widgets.views import MARK
 
 ADD, REMOVE = "add", "take away"
 LASSO = "while it is pressed a drag draws around vertices, and does not turn the surface"
-HOW = "what becomes of the vertices that are drawn around, of those that are seen"
+HOW = "what happens to the vertices that are drawn around, of those that are seen"
 NO_LABEL = ()  # the value of "none" in the list, which cannot hold None
 LABEL = "the region of a label of the template, to begin with"
 
@@ -29,19 +29,19 @@ class Region(Panel):
     Attributes
     ----------
     region : bool ndarray (vertex,)
-        The vertices of the template that were chosen, as :func:`s4a.statistics.within` takes them.
+        The chosen vertices of the template, as :func:`s4a_morphometrics.within` takes them.
 
     Examples
     --------
     With the ``study`` of six small brains; the square is what a drag draws:
 
     >>> import s4a
-    >>> from s4a.widgets import Region
+    >>> from s4a_morphometrics import Region, within
     >>> study = s4a.synthetic.example_study()
     >>> panel = Region(study, view="top")
     >>> square = [[0, -99], [99, -99], [99, 99], [0, 99]]
     >>> panel.scene.drawn_around = {"polygon": square, "turn": panel.scene.turn, "count": 1}
-    >>> right = s4a.statistics.within(study, panel.region)
+    >>> right = within(study, panel.region)
     >>> bool(right["registration"]["position"].values[:, 0].min() >= 0)
     True
     >>> panel.close()
@@ -116,5 +116,5 @@ class Region(Panel):
         share = self.area[region].sum() / self.area.sum()
         self.scene.caption = (
             f"{region.sum():,} of {len(region):,} vertices, {share:.1%} of the area: "
-            "statistics.within(study, panel.region)"
+            "s4a_morphometrics.within(study, panel.region)"
         )

@@ -1,4 +1,4 @@
-"""Studies of a part of what varies (6.1): a region, without a nuisance, with size given back.
+"""Studies of a part of the variation (6.1): a region, without a nuisance, with size restored.
 
 Each takes a study and gives one, with modes of its own, so that every test, measure, page and panel
 takes it; the study given stays as it is.  The alignment is that of the whole shapes.
@@ -31,9 +31,9 @@ def within(
     region: np.ndarray | xr.DataArray | int | str | Sequence[bool | int | str] | None = None,
     *,
     labels: np.ndarray | None = None,
-    least_confidence: float = 0.0,
+    min_confidence: float = 0.0,
 ) -> xr.DataTree:
-    """The study of a region of the template.
+    """Return the study of a region of the template.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def within(
     labels : ndarray (vertex,), optional
         The labels of the template's vertices; by default those of ``/original/<template>``, which
         has some where the mesh was given in memory with ``label``.
-    least_confidence : float
+    min_confidence : float
         Vertices whose mean ``confidence`` over the shapes is lower are left out, 0 to 1.
 
     Returns
@@ -65,16 +65,17 @@ def within(
     With the ``study`` of six small brains; the right half:
 
     >>> import s4a
+    >>> import s4a_morphometrics
     >>> study = s4a.synthetic.example_study()
     >>> right = study["registration"]["position"].values[:, 0] > 0
-    >>> half = s4a.statistics.within(study, right)
+    >>> half = s4a_morphometrics.within(study, right)
     >>> half["registration"].sizes["vertex"] == right.sum()
     np.True_
     """
     registration = registration_of(study)
     keep = _mask_of(study, registration, region, labels)
-    if least_confidence:
-        keep = keep & (registration["confidence"].mean("shape").values >= least_confidence)
+    if min_confidence:
+        keep = keep & (registration["confidence"].mean("shape").values >= min_confidence)
     triangles = registration["corner_vertex"].values
     inside = keep[triangles].all(axis=1)
     keep = np.isin(np.arange(len(keep)), triangles[inside])  # of a triangle in the region
@@ -174,9 +175,10 @@ def without(study: xr.DataTree, nuisance: Values | dict[str, Values] | list[str]
 
     >>> import numpy as np
     >>> import s4a
+    >>> import s4a_morphometrics
     >>> study = s4a.synthetic.example_study()
     >>> first = study["pca"]["score"].values[:, 0]
-    >>> rest = s4a.statistics.without(study, first)
+    >>> rest = s4a_morphometrics.without(study, first)
     >>> bool(abs(np.corrcoef(rest["pca"]["score"].values.T, first)[-1, :-1]).max() < 1e-3)
     True
     """
@@ -208,7 +210,7 @@ def without(study: xr.DataTree, nuisance: Values | dict[str, Values] | list[str]
 
 
 def with_size(study: xr.DataTree) -> xr.DataTree:
-    """The study with size given back to shapes that were aligned with it taken out.
+    """Return the study with the size restored that the alignment removed.
 
     Boas coordinates (Bookstein 2021): a shape that x -> s R x + t made as large as the template is
     divided by its s around the centre of the template.
@@ -233,7 +235,8 @@ def with_size(study: xr.DataTree) -> xr.DataTree:
     With the ``study`` of six small brains, which kept their sizes:
 
     >>> import s4a
-    >>> s4a.statistics.with_size(s4a.synthetic.example_study())
+    >>> import s4a_morphometrics
+    >>> s4a_morphometrics.with_size(s4a.synthetic.example_study())
     Traceback (most recent call last):
     ValueError: size was not taken out of these displacements: it is in them (remove_size=False)
     """

@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+import xarray as xr
 from simulated import TOP, T, X, noise, study_of
 
-from s4a import analyse, cli, open_study, statistics, synthetic
+from s4a import analyse, cli, open_study, read_mesh, statistics, synthetic, write_registered
 from s4a.analysis.transfer import image_in_shape
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.method.pca import gram, pca
+from s4a_morphometrics import with_size, within, without
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +23,7 @@ def simulated():
 
 
 def test_a_region_has_its_vertices_their_displacements_and_modes_of_its_own(simulated):
-    part = statistics.within(simulated, TOP)
+    part = within(simulated, TOP)
     mesh = part["registration"].to_dataset()
     vertex = mesh["template_vertex"].values
     assert set(vertex) <= set(np.flatnonzero(TOP))
@@ -33,22 +35,22 @@ def test_a_region_has_its_vertices_their_displacements_and_modes_of_its_own(simu
     assert {tuple(t) for t in triangles} == {tuple(t) for t in T[TOP[T].all(axis=1)]}
     expected = pca(mesh, vertex_areas(*as_arrays(mesh)))
     assert part["pca"].to_dataset().equals(expected)
-    labelled = statistics.within(simulated, 7)
+    labelled = within(simulated, 7)
     assert labelled["registration"].equals(part["registration"])
-    sure = statistics.within(simulated, least_confidence=0.5)
+    sure = within(simulated, min_confidence=0.5)
     assert sure["registration"].equals(part["registration"])
-    assert statistics.within(simulated)["registration"].sizes["vertex"] == len(X)
+    assert within(simulated)["registration"].sizes["vertex"] == len(X)
 
 
 def test_an_effect_is_found_in_its_region_and_not_in_the_other(simulated):
     options = {"covariates": ["age"], "n_permutations": 199}
     inside, outside = (
-        statistics.group_test(statistics.within(simulated, label), "group", **options)["p_value"]
+        statistics.group_test(within(simulated, label), "group", **options)["p_value"]
         for label in (7, 3)
     )
     assert inside <= 0.05 < outside
-    found = statistics.group_map(statistics.within(simulated, 7), "group", **options)
-    assert found.sizes["vertex"] == statistics.within(simulated, 7)["registration"].sizes["vertex"]
+    found = statistics.group_map(within(simulated, 7), "group", **options)
+    assert found.sizes["vertex"] == within(simulated, 7)["registration"].sizes["vertex"]
 
 
 @pytest.mark.parametrize(
@@ -61,29 +63,29 @@ def test_an_effect_is_found_in_its_region_and_not_in_the_other(simulated):
 )
 def test_a_region_that_is_none_is_an_error(simulated, region, words):
     with pytest.raises(ValueError, match=words):
-        statistics.within(simulated, region)
+        within(simulated, region)
 
 
 def test_a_region_of_a_region_says_which_vertices_of_the_template_it_has(simulated):
-    top = statistics.within(simulated, TOP.tolist())
+    top = within(simulated, TOP.tolist())
     mesh = top["registration"].to_dataset()
-    half = statistics.within(top, mesh["position"][:, 0] > 0)["registration"].to_dataset()
+    half = within(top, mesh["position"][:, 0] > 0)["registration"].to_dataset()
     assert np.array_equal(half["position"].values, X[half["template_vertex"].values])
 
 
 def test_labels_of_a_region_can_be_given(simulated):
     labels = np.where(TOP, "top", "rest")
-    named = statistics.within(simulated, "top", labels=labels)
-    assert named["registration"].equals(statistics.within(simulated, 7)["registration"])
+    named = within(simulated, "top", labels=labels)
+    assert named["registration"].equals(within(simulated, 7)["registration"])
     with pytest.raises(ValueError, match=r"for each of the template's 400 vertices, found \(3,\)"):
-        statistics.within(simulated, "top", labels=labels[:3])
+        within(simulated, "top", labels=labels[:3])
     bare = simulated.filter(lambda node: "label" not in node)
     with pytest.raises(ValueError, match=r"has no labels; give them as labels= \(--labels FILE\)"):
-        statistics.within(bare, 7)
+        within(bare, 7)
 
 
 def test_without_a_nuisance_nothing_follows_it_and_no_mode_lies_along_it(simulated):
-    rest = statistics.without(simulated, "age")
+    rest = without(simulated, "age")
     fit = statistics.regression(simulated, "age", n_permutations=9)
     after = statistics.regression(rest, "age", n_permutations=99)
     assert abs(after["effect"]).max() < 1e-6 * abs(fit["effect"]).max()
@@ -94,17 +96,17 @@ def test_without_a_nuisance_nothing_follows_it_and_no_mode_lies_along_it(simulat
     size = np.sqrt(np.einsum("nx,nx,n->", fit["effect"].values, fit["effect"].values, area))
     assert abs(along).max() < 1e-6 * size
     assert simulated["pca"]["explained_variance_ratio"].values[0] > 0.5
-    two = statistics.without(simulated, ["age", "group"])
+    two = without(simulated, ["age", "group"])
     assert (
         gram(two["registration"]["displacement"].values, area).trace()
         < gram(rest["registration"]["displacement"].values, area).trace()
     )
     with pytest.raises(ValueError, match="the nuisance is constant"):
-        statistics.without(simulated, np.ones(20))
+        without(simulated, np.ones(20))
     with pytest.raises(ValueError, match="value for every shape; covariate lacks shape_00"):
-        statistics.without(simulated, [np.nan, *range(19)])
+        without(simulated, [np.nan, *range(19)])
     with pytest.raises(ValueError, match="value for every shape; covariate lacks shape_18"):
-        statistics.without(simulated, np.array([*"ab" * 9, "NA", "a"]))
+        without(simulated, np.array([*"ab" * 9, "NA", "a"]))
 
 
 def test_size_that_was_taken_out_is_given_back():
@@ -116,7 +118,7 @@ def test_size_that_was_taken_out_is_given_back():
     options = {"n_coarse": 120, "k": 12, "k_init": 8, "n_jobs": 1, "intersections": False}
     options |= {"template": "brain_01", "include_flagged": True}
     scaled = analyse(shapes, remove_size=True, **options)
-    back = statistics.with_size(scaled)
+    back = with_size(scaled)
     kept = analyse(shapes, remove_size=False, **options)
 
     def radius(study):
@@ -132,7 +134,7 @@ def test_size_that_was_taken_out_is_given_back():
         ends = [image_in_shape(position, s["registration"].sel(shape=name)) for s in (scaled, back)]
         assert np.allclose(*ends, atol=1e-4)
     with pytest.raises(ValueError, match="size was not taken out"):
-        statistics.with_size(kept)
+        with_size(kept)
 
 
 def test_the_command_takes_a_region_and_a_nuisance(study_folder, tmp_path, capsys):
@@ -140,8 +142,15 @@ def test_the_command_takes_a_region_and_a_nuisance(study_folder, tmp_path, capsy
     with open(table, "w") as file:
         names = [path.stem for path in sorted((study_folder / "original").glob("*.nc"))]
         file.write("shape,age\n" + "\n".join(f"{n},{20 + i**2}" for i, n in enumerate(names)))
-    command = ["statistics", str(study_folder), "--table", str(table), "--out", str(tmp_path / "o")]
-    assert cli.main([*command, "--without", "age", "--min-confidence", "0.2"]) == 0
+    command = [
+        "region-statistics",
+        str(study_folder),
+        "--table",
+        str(table),
+        "--out",
+        str(tmp_path / "o"),
+    ]
+    assert cli.main([*command, "--regress-out", "age", "--min-confidence", "0.2"]) == 0
     assert "without age" in capsys.readouterr().out
     assert cli.main([*command, "--label", "999"]) == 2
     assert "no vertex of the template has the label 999" in capsys.readouterr().err
@@ -153,4 +162,17 @@ def test_the_command_takes_a_region_and_a_nuisance(study_folder, tmp_path, capsy
     assert cli.main([*command, *halves]) == 0
     assert f" of {len(Y)} vertices" in capsys.readouterr().out
     assert cli.main([*command, *halves[2:]]) == 2
-    assert "--labels is where --label looks" in capsys.readouterr().err
+    assert "--labels needs --label" in capsys.readouterr().err
+
+
+def test_a_mirrored_shape_of_a_region_is_written_on_the_side_of_its_file(study, tmp_path):
+    mirrored = study.copy(deep=True)
+    name = study["registration"]["shape"].values[1]
+    mirrored["original"][name].attrs["reflected"] = 1
+    shapes = study["report"]["shape"]
+    mirrored["report"]["reflected"] = xr.DataArray(shapes.values == name, {"shape": shapes.values})
+    for tree, folder in ((mirrored, "whole"), (within(mirrored), "part")):
+        write_registered(tree, tmp_path / folder, frame="shape")
+    (X, T, _), (Y, S, _) = (read_mesh(tmp_path / way / f"{name}.ply") for way in ("whole", "part"))
+    assert np.array_equal(X, Y)
+    assert np.array_equal(T, S)

@@ -32,7 +32,7 @@ from s4a.evaluation.methods import (
 )
 from s4a.geometry.align import align, realign, relative_transform
 from s4a.geometry.mesh import as_arrays, vertex_areas
-from s4a.input.collection import read_shape, read_shapes
+from s4a.input.collection import Mesh, as_mesh, read_shapes
 from s4a.input.raw import content, npy, shown, text_of
 from s4a.method import latent, median, network
 from s4a.method.initial_map import map_after_alignment
@@ -40,12 +40,12 @@ from s4a.method.register import latent_functions, log_area_ratio, match_function
 from s4a.method.shape import Basis, Shape
 from s4a.options import PRESETS as STUDY_PRESETS
 from s4a.options import Options, apply_preset
-from s4a.schema import check_choice, check_count, check_switch, dataset, require, variable
+from s4a.schema import check_choice, check_count, check_switch, dataset, variable
 from s4a.seeds import RNG, seed_of
 
 log = logging.getLogger(__name__)
 
-__all__ = ["COLLECTION_METHODS", "METHODS", "collection", "pair", "pairs"]
+__all__ = ["COLLECTION_METHODS", "METHODS", "compare", "compare_collection"]
 
 COLLECTION_METHODS = ("SCALABLE", "RE-MATCH")
 COLLECTION_BLOCKS = BLOCKS[0], "basis and initial maps", "consistent ZoomOut", BLOCKS[-1]
@@ -78,17 +78,11 @@ def checked_methods(methods: Sequence[str] | None, preset: str | None) -> Sequen
     return methods
 
 
-def load_mesh(shape: Path | str | xr.Dataset, what: str) -> tuple[xr.Dataset, float]:
-    """A mesh and the seconds it took to read and clean it.
-
-    A Dataset is taken as clean and costs none.
-    """
-    if isinstance(shape, xr.Dataset):
-        require(shape, "position", "corner_vertex", what=what)
-        return shape, 0.0
+def load_mesh(shape: Mesh, what: str) -> tuple[xr.Dataset, float]:
+    """Return a mesh and the seconds that it took to read and clean it; a Dataset takes none."""
     begin = time.process_time()
-    mesh = read_shape(shape)
-    return mesh, time.process_time() - begin
+    mesh = as_mesh(shape, what)
+    return mesh, 0.0 if mesh is shape else time.process_time() - begin
 
 
 def in_mesh(vertices: np.ndarray, mesh: xr.Dataset) -> np.ndarray:
@@ -142,45 +136,9 @@ def read_ground_truth(path: Path | str) -> np.ndarray:
     return found.astype(np.int64) if whole else found
 
 
-def pair(
-    source: Path | str | xr.Dataset,
-    target: Path | str | xr.Dataset,
-    *,
-    methods: Sequence[str] | None = None,
-    truth: Any = None,
-    landmarks: Any = None,
-    **options: Any,
-) -> xr.Dataset | xr.DataTree:
-    """Table 1 for one pair: see :func:`pairs`.
-
-    Parameters
-    ----------
-    source, target : path or Dataset
-    methods, truth, landmarks, **options
-        As of :func:`pairs`; truth and landmarks as its values.
-
-    Returns
-    -------
-    Dataset
-        Of :func:`pairs`, with one `pair`.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import s4a
-    >>> ball = s4a.synthetic.ellipsoid(600)
-    >>> found = s4a.compare.pair(ball, ball, methods=["kNN"], truth=np.arange(600))
-    >>> float(found["geodesic_error"].sel(algorithm="kNN").item())
-    0.0
-    """
-    for name, value in (("truth", truth), ("landmarks", landmarks)):
-        options[name] = None if value is None else {"pair": value}
-    return pairs(source, {"pair": target}, methods=methods, **options)
-
-
-def pairs(
-    source: Path | str | xr.Dataset,
-    targets: Mapping[str, Path | str | xr.Dataset],
+def compare(
+    source: Mesh,
+    target: Any,
     *,
     methods: Sequence[str] | None = None,
     truth: Any = None,
@@ -197,7 +155,9 @@ def pairs(
     seed: int = 0,
     rng: RNG | None = None,
 ) -> xr.Dataset | xr.DataTree:
-    """The five pair methods of Table 1, and three of ours, on the same cleaned input.
+    """Compare the five methods of Table 1, and three of S4A, on one pair of meshes or several.
+
+    All methods take the same cleaned meshes.
 
     kNN: nearest neighbour in space after rigid alignment.  ZO: from that match, ZoomOut at full
     resolution.  FMAP+ZO: functional map fitted on landmarks at full resolution, then ZoomOut.
@@ -214,18 +174,18 @@ def pairs(
     ----------
     source : path or Dataset
         The reference; every match holds its vertices.
-    targets : dict
-        Name of the pair -> path or Dataset.
+    target : path, Dataset, or dict of str to path or Dataset
+        One mesh, or several with a name for each pair.
     methods : sequence of str, optional
         Some of :data:`METHODS`; all by default, the paper's five with the preset.
-    truth : dict, optional
-        Name of the pair -> true vertices or positions, as of
-        :func:`s4a.evaluation.metrics.evaluate`; for shapes given as paths all vertices, here and in
-        `landmarks`, are those of the files.
-    landmarks : dict, optional
-        Name of the pair -> corresponding vertices or positions ``(p, 3)`` (of the source, of the
-        target); by default 10 spread vertices of the source and the vertices of the target that are
-        nearest after alignment (4.1, step 3).
+    truth : array, or dict of str to array, optional
+        Ground truth: vertices or positions of the source, as in
+        :func:`s4a.evaluation.metrics.evaluate`; a dict if `target` is one.  If shapes are given as
+        paths, all vertices, here and in `landmarks`, are those of the files.
+    landmarks : tuple, or dict of str to tuple, optional
+        Corresponding vertices or positions ``(p, 3)`` (of the source, of the target); a dict if
+        `target` is one.  By default 10 farthest-point samples of the source and the vertices of the
+        target that are nearest after alignment (4.1, step 3).
     n_coarse : int
         Vertices of the low-resolution mesh, and samples of SCALABLE.
     k_init, k : int
@@ -274,10 +234,13 @@ def pairs(
     >>> import s4a
     >>> ball = s4a.synthetic.ellipsoid(300)
     >>> options = {"n_coarse": 100, "k_init": 6, "k": 10}
-    >>> found = s4a.compare.pairs(ball, {"itself": ball}, methods=["kNN", "RE-MATCH"], **options)
-    >>> found["chamfer"].sel(pair="itself", way="kNN").item()
+    >>> found = s4a.compare(ball, ball, methods=["kNN", "RE-MATCH"], **options)
+    >>> found["chamfer"].sel(pair="pair", algorithm="kNN").item()
     0.0
     """
+    if not isinstance(target, dict):
+        target = {"pair": target}
+        truth, landmarks = (x if x is None else {"pair": x} for x in (truth, landmarks))
     settings = apply_preset(
         preset, {"full_resolution_iterations": full_resolution_iterations, "init": init}, PRESETS
     )
@@ -287,17 +250,17 @@ def pairs(
     check_switch("keep", keep)
     methods = checked_methods(methods, preset)
     in_memory = isinstance(source, xr.Dataset)
-    if any(isinstance(target, xr.Dataset) != in_memory for target in targets.values()):
+    if any(isinstance(mesh, xr.Dataset) != in_memory for mesh in target.values()):
         raise ValueError("source and targets need to be all paths or all Datasets")
-    if keep and any("/" in str(name) for name in targets):
-        raise ValueError(f"with keep=True names of pairs hold no '/'; found {', '.join(targets)}")
+    if keep and any("/" in str(name) for name in target):
+        raise ValueError(f"with keep=True names of pairs hold no '/'; found {', '.join(target)}")
     options: dict[str, Any] = {"k_init": k_init, "k": k, "step": step} | settings
     rows, nodes, notes = [], {}, {}
     with threadpool_limits(1):
         mesh, load_source = load_mesh(source, "source")
         M = Spaces(mesh, n_coarse, k, seed)
-        for name, target in tqdm(targets.items(), desc="pairs", disable=len(targets) < 2):
-            mesh, load_target = load_mesh(target, f"target {name}")
+        for name, shape in tqdm(target.items(), desc="pairs", disable=len(target) < 2):
+            mesh, load_target = load_mesh(shape, f"target {name}")
             N = Spaces(mesh, n_coarse, k, seed)
             marks = None if landmarks is None else landmarks_of(landmarks[name], M, N, in_memory)
             true = None if truth is None else truth[name]
@@ -312,7 +275,7 @@ def pairs(
             if keep:
                 nodes[f"pairs/{name}"] = kept(M.mesh, N.mesh, outcomes, true)
     table = xr.concat(rows, "pair", combine_attrs="drop_conflicts")
-    table = table.assign_coords(pair=list(targets)).transpose("algorithm", "pair", ...)
+    table = table.assign_coords(pair=list(target)).transpose("algorithm", "pair", ...)
     table = table.assign_attrs(options | {"n_coarse": n_coarse, "seed": seed} | told(notes))
     if not keep:
         return table
@@ -385,7 +348,7 @@ def stacked(maps: list[np.ndarray | None]) -> np.ndarray:
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a.evaluation.compare import stacked
+    >>> from s4a.evaluation.comparison import stacked
     >>> stacked([None, np.eye(2)]).shape
     (2, 2, 2)
     """
@@ -440,7 +403,7 @@ def metrics_of_pair(
     return table.assign_coords(algorithm=list(methods), block=list(BLOCKS)), outcomes
 
 
-def collection(
+def compare_collection(
     shapes: Any,
     *,
     methods: Sequence[str] = COLLECTION_METHODS,
@@ -495,7 +458,7 @@ def collection(
     >>> import s4a
     >>> brains = s4a.synthetic.brains(6, 200)
     >>> options = {"n_coarse": 100, "n_pairs": 6, "k_init": 6, "k": 10}
-    >>> found = s4a.compare.collection(brains, methods=["RE-MATCH"], **options)
+    >>> found = s4a.compare_collection(brains, methods=["RE-MATCH"], **options)
     >>> found["collection_chamfer"].dims
     ('algorithm', 'dense_match', 'shape')
     """

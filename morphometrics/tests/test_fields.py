@@ -1,4 +1,4 @@
-"""Scalar fields carried to the template, tests of them, and field against shape."""
+"""Scalar fields transferred to the template, tests of them, and field against shape."""
 
 import logging
 import shutil
@@ -8,9 +8,19 @@ import pytest
 from simulated import TOP, field_study, with_carried
 
 import s4a
-from s4a import cli, open_study, statistics, verify, with_field
-from s4a.analysis.fields import write_field
+from s4a import cli, open_study, statistics, verify
 from s4a.input.annotations import read_scalars
+from s4a_morphometrics import (
+    field_classify,
+    field_group_map,
+    field_group_test,
+    field_regression,
+    growth,
+    with_field,
+    within,
+    without,
+    write_field,
+)
 
 
 @pytest.fixture(scope="module")
@@ -126,28 +136,27 @@ def test_a_field_that_does_not_fit_is_refused_by_shape(study, caplog):
     values = found["fields/f"].to_dataset()["transferred_field"]
     assert np.isnan(values.sel(shape=first)).all()
     assert np.isfinite(values.sel(shape=second)).all()
-    with pytest.raises(ValueError, match="no field 'g'; with_field carries one"):
+    with pytest.raises(ValueError, match="no field 'g'; with_field adds one"):
         write_field(found, "g", "nowhere")
 
 
 def test_groups_that_differ_in_a_field_are_told_where_they_do(simulated):
-    options = {"field": "thickness", "covariates": ["age", "score"], "n_permutations": 199}
-    where = statistics.group_map(simulated, "group", **options)
+    options = {"covariates": ["age", "score"], "n_permutations": 199}
+    where = field_group_map(simulated, "thickness", "group", **options)
     assert where["field_effect"].attrs["units"] == "mm"
     assert abs(where["field_effect"].values[TOP].mean() - 4) < 0.5
     assert (where["p_family_wise"].values[TOP] < 0.05).mean() > 0.9
     assert (where["p_family_wise"].values[~TOP] < 0.05).mean() < 0.05
     assert "effect" not in where
-    assert statistics.group_test(simulated, "group", **options)["p_value"] < 0.02
-    shape = {**options, "field": None}
-    assert statistics.group_test(simulated, "group", **shape)["p_value"] > 0.05
-    classes = statistics.classify(simulated, "group", field="thickness", n_permutations=9)
+    assert field_group_test(simulated, "thickness", "group", **options)["p_value"] < 0.02
+    assert statistics.group_test(simulated, "group", **options)["p_value"] > 0.05
+    classes = field_classify(simulated, "thickness", "group", n_permutations=9)
     assert classes.attrs["balanced_accuracy"] > 0.8
 
 
 def test_the_slope_of_a_field_is_that_of_least_squares(simulated):
-    fit = statistics.regression(
-        simulated, "age", field="thickness", covariates=["group", "score"], n_permutations=199
+    fit = field_regression(
+        simulated, "thickness", "age", covariates=["group", "score"], n_permutations=199
     )
     table = simulated["subjects"]
     columns = [np.ones(20), table["age"], table["group"] == "b", table["score"]]
@@ -156,10 +165,10 @@ def test_the_slope_of_a_field_is_that_of_least_squares(simulated):
     assert np.allclose(fit["field_effect"], slope)
     assert (fit["p_false_discovery"].values[~TOP] < 0.05).mean() > 0.9
     for refused in (statistics.predict, statistics.regression_modes):
-        with pytest.raises(ValueError, match="that of a field, which moves no vertex"):
+        with pytest.raises(ValueError, match="a field moves no vertex"):
             refused(simulated, fit, *([1.0] if refused is statistics.predict else []))
     with pytest.raises(ValueError, match="a field has no part along the normals"):
-        statistics.regression(simulated, "age", field="thickness", of="normal")
+        growth(simulated, "age", "group", field="thickness", of="normal")
 
 
 def test_vertices_and_shapes_without_a_field_are_left_out_and_told(simulated, caplog):
@@ -168,25 +177,25 @@ def test_vertices_and_shapes_without_a_field_are_left_out_and_told(simulated, ca
     values[3, :5] = np.nan
     values[7] = np.nan
     holed = with_carried(simulated, values)
-    where = statistics.group_map(holed, "group", field="thickness", n_permutations=99)
+    where = field_group_map(holed, "thickness", "group", n_permutations=99)
     assert "lacks in some shape at 5 of" in caplog.text
     assert "field 'thickness' has no value for 1 of 20 shapes" in caplog.text
     assert where.attrs["left_out"] == "shape_07"
     assert np.isnan(where["p_family_wise"].values[:5]).all()
     assert np.isfinite(where["p_family_wise"].values[5:]).all()
     with pytest.raises(ValueError, match=r"no field 'curv'; it has thickness"):
-        statistics.group_map(simulated, "group", field="curv")
+        field_group_map(simulated, "curv", "group")
     same = with_carried(simulated, np.ones_like(values))
     with pytest.raises(ValueError, match="the same in all shapes: there is nothing to test"):
-        statistics.group_map(same, "group", field="thickness")
+        field_group_map(same, "thickness", "group")
 
 
 def test_a_field_follows_its_vertices_into_a_region(simulated):
-    part = statistics.within(simulated, TOP)
+    part = within(simulated, TOP)
     vertex = part["registration"]["template_vertex"].values
     values = simulated["fields/thickness/transferred_field"].values
     assert np.array_equal(part["fields/thickness/transferred_field"].values, values[:, vertex])
-    again = statistics.without(part, "age")
+    again = without(part, "age")
     assert again["fields/thickness"].equals(part["fields/thickness"])
 
 
@@ -199,8 +208,8 @@ def test_the_command_takes_a_field_in_place_of_shape(tmp_path, study_folder):
     table = tmp_path / "t.csv"
     rows = [f"{name},{i + i * i}" for i, name in enumerate(values)]
     table.write_text("\n".join(["shape,age", *rows]))
-    words = ["--variable", "age", "--table", str(table), "--permutations", "19"]
-    assert cli.main(["statistics", str(folder), *words, "--field", "noise"]) == 0
+    words = ["--regress-on", "age", "--table", str(table), "--permutations", "19"]
+    assert cli.main(["field-statistics", str(folder), "noise", *words]) == 0
     out = folder / "statistics"
-    assert "field_effect" in (out / "regression.vertex.csv").read_text().splitlines()[0]
+    assert "field_effect" in (out / "noise_regression.vertex.csv").read_text().splitlines()[0]
     assert not (out / "regression.html").exists()

@@ -177,16 +177,16 @@ def generalization(
     With the ``study`` of six small brains:
 
     >>> import s4a
-    >>> from s4a.analysis.generalization import generalization
+    >>> from s4a_morphometrics import generalization
     >>> study = s4a.synthetic.example_study()
     >>> generalization(study).attrs["shapes"]
     6
     """
+    registration = registration_of(study)
     nodes = ("original", "coarse", "latent", "registration", "report")
     missing = [node for node in nodes if node not in study.children]
     if missing:
         raise ValueError(f"a finished study is needed; this one lacks {', '.join(missing)}")
-    registration = registration_of(study)
     names = registration["shape"].values.tolist()
     if len(names) < 5:
         raise ValueError(f"at least 5 shapes needed to leave one out, found {len(names)}")

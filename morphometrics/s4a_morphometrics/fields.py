@@ -1,20 +1,19 @@
-"""Scalar fields of the shapes (6.1, 6.2), such as thickness: carried to the template, and kept.
+"""Scalar fields of the shapes (6.1, 6.2), such as thickness, transferred to the template.
 
-Every vertex of the template takes the value at the place of the shape that it was registered to,
+Every vertex of the template takes the value at the point of the shape that it was registered to,
 linear inside triangles (:mod:`s4a.analysis.transfer`), so that the fields of all shapes can be
-compared vertex by vertex.  Tests take a field by its name: ``field=`` of
-:mod:`s4a.analysis.effects`.
+compared vertex by vertex: :mod:`s4a_morphometrics.field_tests`.
 """
 
 import logging
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
 
-from s4a.analysis.inputs import all_registered
+from s4a.analysis.inputs import Sample, Values, all_registered, registration_of, sample_of
 from s4a.analysis.transfer import on_template
 from s4a.input.annotations import SUFFIXES, of_vertices, read_scalars
 from s4a.input.files import files_named, slug
@@ -28,6 +27,16 @@ log = logging.getLogger(__name__)
 # One array for each shape, by name or in the order of the study; or a folder of files.
 Fields = dict[str, Any] | Sequence[Any] | np.ndarray | Path | str
 
+# what a test calls the effect on displacements, and what on a field
+NAMES = {
+    "effect": "field_effect",
+    "effect_error": "field_error",
+    "within_effect": "field_within_effect",
+    "intercept": "field_intercept",
+    "subject_variance": "field_subject_variance",
+    "residual_variance": "field_residual_variance",
+}
+
 
 def with_field(
     study: xr.DataTree,
@@ -37,7 +46,7 @@ def with_field(
     unit: str | None = None,
     partial: bool = False,
 ) -> xr.DataTree:
-    """A study with a scalar field of every shape, carried to the template.
+    """Return the study with a scalar field of every shape, transferred to the template.
 
     Parameters
     ----------
@@ -71,10 +80,11 @@ def with_field(
     With the ``study`` of six small brains; the height of every vertex:
 
     >>> import s4a
+    >>> import s4a_morphometrics
     >>> study = s4a.synthetic.example_study()
     >>> meshes = study["original"].children.items()
     >>> height = {name: mesh["position"].values[:, 2] for name, mesh in meshes}
-    >>> study = s4a.with_field(study, "height", height, unit="mm")
+    >>> study = s4a_morphometrics.with_field(study, "height", height, unit="mm")
     >>> study["fields/height/transferred_field"].sizes["shape"]
     6
     """
@@ -131,7 +141,7 @@ def _by_shape(values, shapes, name, study):
 
 
 def write_field(study: xr.DataTree, name: str, folder: Path | str) -> Path:
-    """Keep a field of :func:`with_field` in the folder of its study.
+    """Write a field of :func:`with_field` to the folder of its study.
 
     :func:`s4a.open_study` has it in ``/fields`` as long as the registrations are those that it was
     carried along.
@@ -158,7 +168,7 @@ def write_field(study: xr.DataTree, name: str, folder: Path | str) -> Path:
     >>> import tempfile
     >>> import numpy as np
     >>> import s4a
-    >>> from s4a.analysis.fields import with_field, write_field
+    >>> from s4a_morphometrics.fields import with_field, write_field
     >>> store = tempfile.mkdtemp()
     >>> study = s4a.analyse(
     ...     s4a.synthetic.brains(3, 200), n_coarse=100, k=10, k_init=6, n_pairs=3, store=store
@@ -169,7 +179,7 @@ def write_field(study: xr.DataTree, name: str, folder: Path | str) -> Path:
     (3, 200)
     """
     if "fields" not in study.children or name not in study["fields"].children:
-        raise ValueError(f"the study has no field {name!r}; with_field carries one")
+        raise ValueError(f"the study has no field {name!r}; with_field adds one")
     field = study["fields"][name].to_dataset()
     registered = study["registration"].children
     keys = [registered[one].attrs.get("task_key", "") for one in field["shape"].values.tolist()]
@@ -177,3 +187,92 @@ def write_field(study: xr.DataTree, name: str, folder: Path | str) -> Path:
     with lock(folder) as claim:
         write(field, path, task_key(field["transferred_field"].values, *keys), keys, claim)
     return path
+
+
+class FieldSample(NamedTuple):
+    """The shapes of a test that have a field.
+
+    ``sample`` has the field as ``d (s, m, 1)`` and ``area (m,)``, at the vertices ``keep (n,)`` of
+    the template where all shapes have it; ``shape (s, n, 3)`` are their displacements, and
+    ``shape_area (n,)`` the areas of all vertices.
+    """
+
+    sample: Sample
+    keep: np.ndarray
+    shape: np.ndarray
+    shape_area: np.ndarray
+
+    def whole(self, values: np.ndarray) -> np.ndarray:
+        """Values ``(..., m)`` at all vertices ``(..., n)``, NaN where not all shapes have some."""
+        if self.keep.all():
+            return values
+        found = np.full((*values.shape[:-1], len(self.keep)), np.nan)
+        found[..., self.keep] = values
+        return found
+
+    def on_template(self, result: xr.Dataset) -> xr.Dataset:
+        """A result at all vertices of the template, its effects as those of a field."""
+        found = {}
+        for name, values in result.items():
+            data = values.values
+            if values.dims == ("vertex", "xyz"):
+                data = data[:, 0]
+            if "vertex" in values.dims:
+                data = self.whole(data)
+            found[NAMES.get(str(name), str(name))] = data
+        of_field = dataset(result.attrs, **found).assign_coords(result.coords)
+        return in_unit(of_field, self.sample.unit, of=FIELD_UNIT)
+
+
+def field_of(study: xr.DataTree, name: str, shapes: Sequence[str]) -> tuple[np.ndarray, str]:
+    """A field of ``/fields`` of these shapes ``(s, n)``, NaN where one has none, and its unit.
+
+    Raises
+    ------
+    ValueError
+        When the study has no field of that name; those that it has are named.
+    """
+    there = list(study["fields"].children) if "fields" in study.children else []
+    if name not in there:
+        raise ValueError(
+            f"the study has no field {name!r}; it has {listed(there) or 'none'}: "
+            "s4a_morphometrics.with_field, or s4a fields, adds one"
+        )
+    values = study["fields"][name].to_dataset()["transferred_field"]
+    return values.reindex(shape=list(shapes)).values, str(values.attrs["units"])
+
+
+def field_sample(
+    study: xr.DataTree,
+    field: str,
+    values: Values,
+    what: str,
+    covariates: Values | dict[str, Values] | list[str] | None = None,
+) -> FieldSample:
+    """Return the shapes of a test that have a field, see :func:`s4a.analysis.inputs.sample_of`."""
+    names = registration_of(study)["shape"].values.tolist()
+    of_field, unit = field_of(study, field, names)
+    has = np.where(np.isnan(of_field).all(1), np.nan, 0.0)
+    sample = sample_of(study, values, what, covariates, {f"field {field!r}": has})
+    known = np.isin(names, sample.registration["shape"].values)
+    d, keep = _everywhere(of_field[known], field)
+    area = sample.area[keep] / sample.area[keep].sum()
+    return FieldSample(sample._replace(d=d, area=area, unit=unit), keep, sample.d, sample.area)
+
+
+def _everywhere(values, field):
+    """A field ``(s, m, 1)`` at the vertices ``(n,)`` where all shapes have it."""
+    keep = np.isfinite(values).all(0)
+    if not keep.any():
+        raise ValueError(f"the field {field!r} has no vertex of the template in all shapes")
+    if not keep.all():
+        log.warning(
+            "the field %r lacks in some shape at %d of %d vertices, which are not tested",
+            field,
+            (~keep).sum(),
+            len(keep),
+        )
+    values = values[:, keep]
+    if np.ptp(values, axis=0).max() <= 1e-12 * abs(values).max():
+        raise ValueError(f"the field {field!r} is the same in all shapes: there is nothing to test")
+    return values[..., None], keep

@@ -1,0 +1,250 @@
+"""The commands of fields, regions, nuisances and of generalization with new correspondences."""
+
+from typing import TYPE_CHECKING, Any, Literal
+
+import s4a
+from s4a.cli import command, tables
+from s4a.cli.commands import labels_in, study_to_test, write, write_statistics
+
+if TYPE_CHECKING:
+    import numpy as np
+    import xarray as xr
+
+
+def fields(
+    study: str, folder: str, *, name: str, unit: str | None = None, partial: bool = False
+) -> int:
+    """A number per vertex of every shape, such as thickness, transferred to the template and kept.
+
+    Parameters
+    ----------
+    study : STUDY
+        its folder
+    folder : FOLDER
+        with a file for each shape: NPY, NPZ, PLY, CSV, GIFTI or FreeSurfer's curv
+    name : NAME
+        of the field; also of its array, column or property in the files
+    unit : UNIT
+        of its numbers, such as mm
+    partial
+        shapes may lack it; tests leave these out
+    """
+    import numpy as np
+
+    import s4a_morphometrics as m
+
+    tree = m.with_field(s4a.open_study(study), name, folder, unit=unit, partial=partial)
+    path = m.write_field(tree, name, study)
+    field = tree["fields"][name].to_dataset()["transferred_field"]
+    known = np.isfinite(field.values)
+    write(
+        f"{name} of {known.any(1).sum()} of {len(known)} shapes, "
+        f"{np.nanmin(field):.4g} to {np.nanmax(field):.4g} {field.attrs['units']}, mean "
+        f"{np.nanmean(field):.4g}, at {100 * known.mean():.0f} % of the template's vertices: "
+        f"{path}",
+        f"s4a field-statistics {study} {name} --group COLUMN tests it",
+    )
+    return 0
+
+
+def field_statistics(
+    study: str,
+    field: str,
+    *,
+    group: str | None = None,
+    regress_on: str | None = None,
+    covariates: list[str] | None = None,
+    table: str | None = None,
+    variances: Literal["equal", "unequal"] = "equal",
+    include_flagged: bool = False,
+    permutations: int | None = None,
+    out: str | None = None,
+    seed: int,
+) -> int:
+    """Test groups and variables of the table on a field in place of shape.
+
+    Parameters
+    ----------
+    study : STUDY
+        its folder
+    field : FIELD
+        name of a field of s4a fields
+    group : COLUMN
+        test and map of the difference between groups; classification
+    regress_on : COLUMN
+        regression of the field on a number, such as age
+    covariates : COLUMN
+        accounted for in both
+    table : FILE
+        in place of the table of the study
+    variances
+        of the fields around what is tested; unequal where groups scatter differently
+    include_flagged
+        take flagged shapes in
+    permutations : N
+        of every test (default: 9999, at every vertex 999, of classes 99)
+    out : DIR
+        for netCDF and CSV (default: STUDY/statistics)
+    """
+    import s4a_morphometrics as m
+
+    if not (group or regress_on):
+        raise ValueError("something to test needed: give --group COLUMN or --regress-on COLUMN")
+    tree, out = study_to_test(study, out, table, include_flagged)
+    n = {} if permutations is None else {"n_permutations": permutations}
+    options: dict[str, Any] = {"covariates": covariates, "variances": variances, "seed": seed} | n
+    results = {}
+    if group:
+        results["group"] = m.field_group_test(tree, field, group, **options)
+        results["group_map"] = m.field_group_map(tree, field, group, **options)
+        few = {"n_permutations": min(permutations or 99, 99), "seed": seed}  # each trains again
+        results["classification"] = m.field_classify(tree, field, group, **few)
+        of = f"{field} in groups of {group}"
+        write(tables.significance(results["group"], results["group_map"], of, tree))
+        write(tables.classification_line(results["classification"]), "")
+    if regress_on:
+        results["regression"] = found = m.field_regression(tree, field, regress_on, **options)
+        write(tables.significance(found, found, f"{field} on {regress_on}", tree), "")
+    for name, result in results.items():
+        s4a.analysis.export.write_results(result, out, f"{field}_{name}")
+    write(f"results: {out}")
+    return 0
+
+
+def region_statistics(
+    study: str,
+    *,
+    label: list[int | str] | None = None,
+    labels: str | None = None,
+    min_confidence: float = 0.0,
+    regress_out: list[str] | None = None,
+    restore_size: bool = False,
+    group: str | None = None,
+    regress_on: str | None = None,
+    covariates: list[str] | None = None,
+    table: str | None = None,
+    variances: Literal["equal", "unequal"] = "equal",
+    include_flagged: bool = False,
+    permutations: int | None = None,
+    out: str | None = None,
+    seed: int,
+) -> int:
+    """Evaluate and test a region of the template, without nuisances, or with size restored.
+
+    Parameters
+    ----------
+    study : STUDY
+        its folder
+    label : LABEL
+        only vertices of the template with these labels
+    labels : FILE
+        labels of the template's file for --label: NPY, NPZ (FILE:NAME), CSV, GIFTI or annot
+    min_confidence : SHARE
+        only vertices whose mean confidence is this large, 0 to 1
+    regress_out : COLUMN
+        nuisances: the variation along their regression is removed from all shapes
+    restore_size
+        restore the size that --remove-size removed
+    group : COLUMN
+        test and map of the difference between groups; classification
+    regress_on : COLUMN
+        regression of shape on a number, such as age; its animation
+    covariates : COLUMN
+        accounted for in both
+    table : FILE
+        in place of the table of the study
+    variances
+        of the shapes around what is tested; unequal where groups scatter differently
+    include_flagged
+        take flagged shapes in
+    permutations : N
+        of every test (default: 9999, at every vertex 999, of classes 99)
+    out : DIR
+        for netCDF and CSV (default: STUDY/statistics)
+    """
+    if covariates and not (group or regress_on):
+        raise ValueError("--covariates are of a test: give --group or --regress-on")
+    if labels and not label:
+        raise ValueError("--labels needs --label LABEL...: give both, or leave it out")
+    tree, out = study_to_test(study, out, table, include_flagged)
+    tree = restricted(tree, restore_size, regress_out, label, labels, min_confidence)
+    options = {"covariates": covariates, "seed": seed, "variances": variances}
+    write_statistics(tree, out, group, regress_on, permutations, options)
+    return 0
+
+
+def restricted(
+    study: "xr.DataTree",
+    restore_size: bool,
+    regress_out: list[str] | None,
+    label: list[int | str] | None,
+    labels: str | None,
+    min_confidence: float,
+) -> "xr.DataTree":
+    """Return the study restricted to a region, without nuisances, or with size restored."""
+    import s4a_morphometrics as m
+
+    said = []
+    if restore_size:
+        study = m.with_size(study)
+        said.append("with size restored")
+    if regress_out:
+        study = m.without(study, regress_out)
+        said.append(f"without {', '.join(regress_out)}")
+    if label or min_confidence:
+        whole = study["registration"].sizes["vertex"]
+        of = template_labels(study, labels)
+        study = m.within(study, label, labels=of, min_confidence=min_confidence)
+        said.append(f"{study['registration'].sizes['vertex']} of {whole} vertices")
+    if said:
+        write("; ".join(said) + "\n")
+    return study
+
+
+def template_labels(study: "xr.DataTree", file: str | None) -> "np.ndarray | None":
+    """Return the labels of the template, from a file with one for each vertex of its file."""
+    if file is None:
+        return None
+    template = s4a.analysis.inputs.all_registered(study).attrs["template"]
+    return labels_in(file, study["original"][template].to_dataset())
+
+
+def generalization(
+    study: str,
+    *,
+    include_flagged: bool = False,
+    out: str | None = None,
+    n_jobs: int,
+    seed: int,
+) -> int:
+    """Generalization of the modes, with the correspondences of each left-out shape found again.
+
+    Parameters
+    ----------
+    study : STUDY
+        its folder
+    include_flagged
+        take flagged shapes in
+    out : DIR
+        for netCDF and CSV (default: STUDY/statistics)
+    """
+    import s4a_morphometrics as m
+
+    tree, out = study_to_test(study, out, None, include_flagged)
+    found = m.generalization(tree, n_jobs=n_jobs, seed=seed)
+    s4a.analysis.export.write_results(found, out, "generalization")
+    names = ("generalization", "generalization_surface")
+    rows = [
+        [c + 1, *(tables.measure_cell(found, name, c) for name in names)]
+        for c in range(min(10, found.sizes["component"]))
+    ]
+    heads = ["components", "between vertices", "to the surface"]
+    write(f"lengths in {found['generalization'].attrs['units']}, ± standard error")
+    write(tables.table(rows, heads), f"\nresults: {out}")
+    return 0
+
+
+FIELDS = command(fields)
+FIELD_STATISTICS = command(field_statistics, ("seed",))
+REGION_STATISTICS = command(region_statistics, ("seed",))
+GENERALIZATION = command(generalization, ("n_jobs", "seed"))
