@@ -519,7 +519,7 @@ def transfer_labels(
     ...     {"template": colors[label], "carried": colors[found]},
     ...     flat=True,
     ... )
-    <Parts ...>
+    <TiledFigure ...>
     """
     if blur is not None and not 0 <= blur <= 10:
         raise ValueError(f"blur needs a factor from 0 to 10; found {blur}")
@@ -678,7 +678,7 @@ def transfer_landmarks(
     ...     Y, S, colors[name] = with_balls(X, T, None, np.c_[places, hues, radii].tolist())
     ...     shown[name] = s4a.geometry.mesh.as_dataset(Y, S)
     >>> s4a.show.charts.surfaces(shown, colors)
-    <Parts ...>
+    <TiledFigure ...>
     """
     mesh, each = plan(study, source, targets, options)
     landmarks = as_landmarks(landmarks)

@@ -195,12 +195,12 @@ def test_the_page_is_one_file_without_any_address_outside(html):
     assert "http" not in re.sub(r"data:[^\"]*|http://www.w3.org/2000/svg", "", html)
     assert len(html) < 8e6
     assert html.count("<section>") == len(page.SECTIONS)
-    assert "Not there" not in html
+    assert "Missing:" not in html
 
 
 def test_sliders_come_first_and_the_contents_lead_to_every_section(html):
     headings = re.findall(r'<h2 id="(section-\d+)">(.*?)</h2>', html)
-    assert headings[0][1] == "Move the modes"
+    assert headings[0][1] == "Explore the modes of variation"
     contents = re.search(r'<nav aria-label="contents">(.*?)</nav>', html, re.DOTALL)[1]
     assert re.findall(r'<a href="#(.*?)">(.*?)</a>', contents) == headings
     assert len(headings) == len(page.SECTIONS)
@@ -239,13 +239,13 @@ def test_text_of_the_study_is_escaped(html):
 
 def test_the_page_says_what_the_study_says(html):
     summary = "7 shapes, 1 repaired, 0 flagged, 1 excluded; median shape-2; template shape-2; "
-    summary += "the first 3 components hold 100%"
+    summary += "the first 3 modes explain 100%"
     for text in (
         summary,
         "shape-2, the median",
         "n_coarse",
         "1,200",
-        "component 3, +3 σ, from behind",
+        "mode 3, +3 σ, from behind",
         "70.0% of the variance",
     ):
         assert text in html
@@ -261,7 +261,7 @@ def test_the_page_holds_the_modes_as_they_are(study, html):
     deformation = np.frombuffer(base64.b64decode(state["deformation"]["base64"]), "<f4")
     assert (deformation == study["pca"]["deformation"].values.ravel().astype(np.float32)).all()
     assert state["ratio"] == [0.7, 0.2, 0.1]
-    assert 'id="modes-instead"' in html.replace("'", '"')
+    assert 'id="modes-fallback"' in html.replace("'", '"')
 
 
 def test_sliders_and_pictures_of_a_page_have_the_same_scale(study, html):
@@ -289,7 +289,7 @@ def test_of_many_modes_the_page_holds_the_first(study, monkeypatch):
     deformation = np.frombuffer(base64.b64decode(state["deformation"]["base64"]), "<f4")
     assert (deformation == study["pca"]["deformation"].values[:2].ravel().astype("<f4")).all()
     assert {len(scores) for scores in state["samples"]} == {len(state["ratio"])} == {2}
-    assert "the first 2 components" in html
+    assert "the first 2 modes" in html
 
 
 def test_the_page_is_the_same_every_time(study, html):
@@ -307,7 +307,7 @@ def test_an_unfinished_study_shows_what_there_is(study, node, tmp_path, monkeypa
     part = study.copy()
     del part[node]
     text = page.write_page(part, tmp_path / "page.html").read_text(encoding="utf-8")
-    assert ("Not there" in text) == (node != "original")
+    assert ("Missing:" in text) == (node != "original")
     assert text.count("<section>") == len(page.SECTIONS)
 
 
@@ -332,7 +332,7 @@ def test_a_vertex_of_unknown_distortion_leaves_the_others_their_colours(study, m
 def test_an_empty_study_gives_a_page_too():
     text = page.study_html(xr.DataTree())
     assert "The study is empty." in text
-    assert text.count("Not there") == len(page.SECTIONS)
+    assert text.count("Missing:") == len(page.SECTIONS)
 
 
 def test_modes_that_could_not_be_are_explained(study):

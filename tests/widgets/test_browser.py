@@ -176,10 +176,11 @@ def test_both_ends_of_a_mode_side_by_side(page):
     )
     shown = visible(page, VIEW)
     assert len({pixels(shown.nth(i)) for i in range(3)}) == 3
-    turned = shown.nth(2).evaluate("(c) => [...c.view.camera.turn]")
+    rotation = "(c) => [...c.view.camera.rotation]"
+    turned = shown.nth(2).evaluate(rotation)
     shown.nth(0).focus()
     page.keyboard.press("ArrowLeft")
-    assert shown.nth(2).evaluate("(c) => [...c.view.camera.turn]") != turned, "cameras are linked"
+    assert shown.nth(2).evaluate(rotation) != turned, "cameras are linked"
     button.click()
 
 
@@ -245,7 +246,7 @@ def test_the_keyboard_places_a_landmark(page, study):
     count = canvas.evaluate("(c) => c.view.points.length")
     start, moved = cursor(canvas), cursor(canvas, *["ArrowRight"] * 4)
     X = vertices(canvas)
-    right = canvas.evaluate("(c) => c.view.camera.turn.slice(0, 3)")
+    right = canvas.evaluate("(c) => c.view.camera.rotation.slice(0, 3)")
     assert (X[moved] - X[start]) @ right > 0.05 * np.ptp(X, axis=0).max(), (
         "the arrow keys move the cursor"
     )
@@ -462,7 +463,7 @@ def test_both_ends_of_a_mode_take_the_full_width_and_stay_in_the_picture(sizes):
     )
     outside = """(c) => {
       const view = c.view, { w, h, scale } = view.placement(), P = view.surfaces[0].position;
-      const R = view.camera.turn, m = view.frame.centre;
+      const R = view.camera.rotation, m = view.frame.centre;
       let most = 0;
       for (let i = 0; i < P.length; i += 3) {
         const p = [0, 1, 2].map((k) => P[i + k] - m[k]);
@@ -757,19 +758,19 @@ def test_a_lasso_takes_what_is_seen_within_it(show, study):
     drawn = page.evaluate(
         "Object.values(s4aModels).map((m) => m.get('drawn_around')).find((d) => d && d.polygon)"
     )
-    found = vertices_within(X, T, drawn["polygon"], drawn["turn"])
+    found = vertices_within(X, T, drawn["polygon"], drawn["rotation"])
     middle = (X[:, 0].max() + X[:, 0].min()) / 2
     assert found.mean() > 0.15
     assert X[found, 0].min() > middle - 3
     # without the lasso the same drag turns the surface
-    before = page.evaluate(f"{SEEN}[0].camera.turn")
-    assert np.allclose(before, drawn["turn"])
+    before = page.evaluate(f"{SEEN}[0].camera.rotation")
+    assert np.allclose(before, drawn["rotation"])
     page.evaluate(f"{SEEN}[0].lasso = false")
     page.mouse.move(x, y)
     page.mouse.down()
     page.mouse.move(x + 60, y, steps=4)
     page.mouse.up()
-    assert not np.allclose(page.evaluate(f"{SEEN}[0].camera.turn"), before)
+    assert not np.allclose(page.evaluate(f"{SEEN}[0].camera.rotation"), before)
 
 
 SMOOTH = "(c) => c.view.smooth"
@@ -829,7 +830,7 @@ def test_the_page_of_a_study_fills_a_wide_screen_one_idea_at_a_time(
 def test_the_page_of_a_study_has_live_sliders(show, study, study_page):
     page = show(study_page)
     check_sliders(page, study)
-    assert not page.locator("#modes-instead").is_visible()
+    assert not page.locator("#modes-fallback").is_visible()
 
 
 def test_the_page_of_a_study_has_no_serious_barrier_and_one_screen_an_idea(show, study_page):
@@ -1044,7 +1045,7 @@ def test_the_page_of_methods_marks_a_place_in_all_views(show, compared):
 
 def test_the_page_of_a_transfer_says_what_needs_python(show, study):
     page = show(widgets.Transfer(study))
-    assert "placing landmarks" in page.locator(".note:not(#not-kept)").inner_text()
+    assert "placing landmarks" in page.locator(".note:not(#not-recorded)").inner_text()
     chosen(page, "target", "brain_05")
     visible(page, ".s4a-title").filter(has_text="brain_05, the target").wait_for()
     page.wait_for_selector("text=Landmarks on brain_05")
@@ -1057,7 +1058,7 @@ def test_without_webgl_pages_have_still_pictures(show, flat, study, study_page):
             "[...document.querySelectorAll('img')].some((i) => i.naturalWidth > 100)"
         )
         assert visible(page, VIEW).count() == 0
-    image = page.locator("#modes-instead img").first
+    image = page.locator("#modes-fallback img").first
     before = image.get_attribute("src")
-    move(page.locator("#modes-instead input").first, 0)
+    move(page.locator("#modes-fallback input").first, 0)
     assert image.get_attribute("src") != before

@@ -230,7 +230,7 @@ def test_the_page_of_structures_has_every_level_and_no_control_that_does_nothing
 
 def test_the_page_of_a_region_says_that_drawing_needs_python(show, study):
     page = show(Region(study))
-    assert "drawing a region" in page.locator(".note:not(#not-kept)").inner_text()
+    assert "drawing a region" in page.locator(".note:not(#not-recorded)").inner_text()
     assert page.get_by_text("lasso").count() == 0
     assert barriers(page) == []
 

@@ -96,7 +96,7 @@ def test_a_film_of_a_slider_goes_from_one_end_to_the_other_and_back(page):
 @two
 def test_both_surfaces_of_a_panel_turn_once_in_one_film(page):
     page.get_by_label("surfaces").select_option("all")
-    with Image.open(io.BytesIO(downloaded(page, "Save film", transform="turn"))) as film:
+    with Image.open(io.BytesIO(downloaded(page, "Save film", motion="turn"))) as film:
         frames = []
         for i in (0, 25):
             film.seek(i)

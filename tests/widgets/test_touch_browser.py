@@ -10,7 +10,7 @@ pytestmark = needed
 expect = pytest.importorskip("playwright.sync_api").expect
 
 WIDTH, HEIGHT = 390, 844
-CAMERA = "(c) => ({ turn: [...c.view.camera.turn], zoom: c.view.camera.zoom })"
+CAMERA = "(c) => ({ rotation: [...c.view.camera.rotation], zoom: c.view.camera.zoom })"
 PICKED = "(c, [x, y]) => c.view.pick({ clientX: x, clientY: y })?.point"
 
 
@@ -93,7 +93,7 @@ def test_one_finger_scrolls_the_page_until_it_is_told_to_turn(matches, surface):
     tap(button, lambda: button.get_attribute("aria-pressed") == "true")
     touch(matches, (middle + [0, 60], middle - [0, 120]))
     assert matches.evaluate("scrollY") == 0
-    assert not np.allclose(canvas.evaluate(CAMERA)["turn"], before["turn"])
+    assert not np.allclose(canvas.evaluate(CAMERA)["rotation"], before["rotation"])
     tap(button, lambda: button.get_attribute("aria-pressed") == "false")
 
 
@@ -105,7 +105,7 @@ def test_what_two_fingers_hold_stays_under_them(matches, surface):
     touch(matches, *[(start + s * np.array([30, 0]), end + s * np.array([60, 0])) for s in (-1, 1)])
     after = canvas.evaluate(CAMERA)
     assert after["zoom"] == pytest.approx(2 * before["zoom"], rel=0.02)
-    assert after["turn"] == before["turn"]
+    assert after["rotation"] == before["rotation"]
     there = canvas.evaluate(PICKED, end.tolist())
     size = np.ptp(canvas.evaluate("(c) => [...c.view.surfaces[0].position]"))
     np.testing.assert_allclose(there, held, atol=0.02 * size)

@@ -972,7 +972,7 @@ def test_a_full_page_says_what_it_does_not_keep(panel, tmp_path):
     data = recording(text)
     shapes = next(control for control in data["controls"] if control["id"] == "c-choice")
     assert shapes["open"] == [0]
-    assert "Needs Python" in text
+    assert "Only in a notebook" in text
     assert "changing shape" in text
 
 

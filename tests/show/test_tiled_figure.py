@@ -10,7 +10,7 @@ from PIL import Image
 
 import s4a
 from s4a.show import charts
-from s4a.show.parts import Parts
+from s4a.show.tiled_figure import TiledFigure
 
 
 def pictures(figure):
@@ -20,7 +20,7 @@ def pictures(figure):
 
 
 def test_no_part_shows_what_reaches_over_from_its_neighbour():
-    figure = Parts(figsize=(4, 2))
+    figure = TiledFigure(figsize=(4, 2))
     wide, plain = figure.subplots(1, 2)
     for ax in (wide, plain):
         ax.imshow(np.ones((4, 4)), cmap="gray", vmin=0, vmax=1)
